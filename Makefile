@@ -32,10 +32,10 @@ help:
 	@echo 'make clean   remove what was computed (.venv and the cache stay)'
 
 demo: spark
-	@$(RUN) python -m jobs.demo
+	@$(RUN) python -m truesky.commands.demo
 
 pilot: spark
-	@$(RUN) python -m jobs.demo --request requests/pilot_one_observation.toml --out out/pilot
+	@$(RUN) python -m truesky.commands.demo --request requests/pilot_one_observation.toml --out out/pilot
 
 test: .venv/installed-test spark
 	@$(RUN) python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
@@ -58,7 +58,7 @@ clean:
 
 # Java is looked at every time (0.1 s): it may have come, gone or changed since.
 spark: .venv/installed
-	@.venv/bin/python jobs/commands/prepare_spark.py
+	@.venv/bin/python truesky/commands/prepare_spark.py
 
 .venv/installed: .venv/bin/python pyproject.toml requirements/build.txt requirements/run.txt
 	$(KNOWN) requirements/build.txt

@@ -15,12 +15,12 @@ from scipy.special import gammaincinv
 
 from benchmarks import _scenes as scenes
 from benchmarks._scenes import Scene
-from jobs.render.drawing import stamp_sizes, stamps
-from jobs.render.drawing.settings import Settings
-from jobs.render.psf import model
-from jobs.render.sources import galaxy_shapes
-from jobs.render.sources.source_list import Sources
 from lake_schema.arrays import Float, Int
+from truesky.render.drawing import stamp_sizes, stamps
+from truesky.render.drawing.settings import Settings
+from truesky.render.psf import model
+from truesky.render.sources import galaxy_shapes
+from truesky.render.sources.source_list import Sources
 
 # The paper's: folding threshold; half-light radii below which galaxies are exponential, above which they are sampled
 # down, arcsec. The magnitude that a galaxy is fainter than to have one component is VIS's limit there; ours has half

@@ -11,13 +11,13 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from benchmarks import report
-from jobs import shell
-from jobs.render import render_exposures
-from jobs.render.exposure import render, rendered
-from jobs.request.schema import Request
-from jobs.session import session
 from lake_schema.store import layout, read
 from lake_schema.store.plan import Json
+from truesky.render import render_exposures
+from truesky.render.exposure import render, rendered
+from truesky.request.schema import Request
+from truesky.running import shell
+from truesky.running.session import session
 
 # Load average below which a machine of two cores is quiet.
 QUIET = 0.5

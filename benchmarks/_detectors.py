@@ -11,16 +11,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from jobs import cache
-from jobs.catalogue import build_galaxies, build_stars
-from jobs.fluxes import compute_fluxes
-from jobs.measured import forget_peak, peak_gb
-from jobs.render import plan_exposures, render_exposures
-from jobs.render.effects.effect import Effect
-from jobs.request.from_toml import parse
-from jobs.request.schema import Request
 from lake_schema.store import layout, publish
 from lake_schema.store.plan import Json
+from truesky.catalogue import build_galaxies, build_stars
+from truesky.fluxes import compute_fluxes
+from truesky.numerics import cache
+from truesky.render import plan_exposures, render_exposures
+from truesky.render.effects.effect import Effect
+from truesky.request.from_toml import parse
+from truesky.request.schema import Request
+from truesky.running.measured import forget_peak, peak_gb
 
 ROOT = Path(__file__).resolve().parents[1]
 # As far from an exposure's centre as sources of one of its detectors may lie, deg.

@@ -15,15 +15,15 @@ import numpy as np
 from benchmarks import _scenes as scenes
 from benchmarks import report
 from benchmarks._scenes import NISP
-from jobs.fluxes import passbands
-from jobs.render.camera import detectors, traces
-from jobs.render.dispersing import draw, images
-from jobs.render.dispersing.draw import Dispersed, Order, Settings
-from jobs.render.psf import euclid
-from jobs.render.psf.model import Psf
-from jobs.render.sources.source_list import Sources
 from lake_schema.arrays import Float, Float32
 from lake_schema.mission.configuration import resolve
+from truesky.fluxes import passbands
+from truesky.render.camera import detectors, traces
+from truesky.render.dispersing import draw, images
+from truesky.render.dispersing.draw import Dispersed, Order, Settings
+from truesky.render.psf import euclid
+from truesky.render.psf.model import Psf
+from truesky.render.sources.source_list import Sources
 
 # Electrons a pixel, of the sky of an exposure through the red grism.
 NOISE = 28.0

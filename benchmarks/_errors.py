@@ -15,11 +15,11 @@ import numpy as np
 from benchmarks import _references as references
 from benchmarks import _scenes as scenes
 from benchmarks._scenes import BINS, Scene
-from jobs.render.drawing.settings import Settings
-from jobs.render.psf import model
-from jobs.render.sources import galaxy_shapes
-from jobs.render.sources.source_list import Sources
 from lake_schema.arrays import Float, Int
+from truesky.render.drawing.settings import Settings
+from truesky.render.psf import model
+from truesky.render.sources import galaxy_shapes
+from truesky.render.sources.source_list import Sources
 
 Found = TypeVar("Found")
 # galsim asks for more than any machine has where a bulge is steep: bytes of address space.

@@ -9,14 +9,14 @@ import numpy as np
 
 from benchmarks import _scenes as scenes
 from benchmarks._scenes import BINS, Scene
-from jobs.catalogue.halos import luminosity_function
-from jobs.fluxes import cosmology
-from jobs.render.drawing import transfer
-from jobs.render.psf import model
-from jobs.render.sources import galaxy_shapes
-from jobs.render.sources.source_list import Sources
 from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
+from truesky.catalogue.halos import luminosity_function
+from truesky.fluxes import cosmology
+from truesky.render.drawing import transfer
+from truesky.render.psf import model
+from truesky.render.sources import galaxy_shapes
+from truesky.render.sources.source_list import Sources
 
 # Side of a PSF's image for galsim, samples: 10".
 _SIDE = 301

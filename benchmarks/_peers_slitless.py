@@ -12,17 +12,17 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import _scenes as scenes
-from jobs.accuracy import SURVEY
-from jobs.fluxes import passbands
-from jobs.render.camera import traces
-from jobs.render.camera.detectors import detector
-from jobs.render.dispersing import draw, grism_files, images
-from jobs.render.dispersing.draw import Dispersed, Order
-from jobs.render.psf import euclid
-from jobs.render.psf.model import Psf
-from jobs.render.sources.source_list import Sources
 from lake_schema.arrays import Float
 from lake_schema.mission.configuration import resolve
+from truesky.fluxes import passbands
+from truesky.render.camera import traces
+from truesky.render.camera.detectors import detector
+from truesky.render.dispersing import draw, grism_files, images
+from truesky.render.dispersing.draw import Dispersed, Order
+from truesky.render.psf import euclid
+from truesky.render.psf.model import Psf
+from truesky.render.sources.source_list import Sources
+from truesky.request.accuracy import SURVEY
 
 # Names the Python of an environment with slitlessutils, which wants an older numpy than this one's.
 VARIABLE = "TRUESKY_SLITLESSUTILS"

@@ -15,11 +15,11 @@ import numpy as np
 from benchmarks import _errors as errors
 from benchmarks import _scenes as scenes
 from benchmarks._scenes import NISP, VIS, Scene
-from jobs import cache
-from jobs.render.camera import detectors
-from jobs.render.psf import euclid, model, sub_bands
 from lake_schema.arrays import Float
 from lake_schema.mission.configuration import resolve
+from truesky.numerics import cache
+from truesky.render.camera import detectors
+from truesky.render.psf import euclid, model, sub_bands
 
 # Stars that the errors are of, by a seed of their own.
 STARS, _SEED = 24, 5

@@ -7,12 +7,12 @@ from dataclasses import fields
 import galsim
 import numpy as np
 
-from jobs import cache
-from jobs.render.drawing import reference
-from jobs.render.psf import model
-from jobs.render.sources import galaxy_shapes
-from jobs.render.sources.source_list import Sources
 from lake_schema.arrays import Float
+from truesky.numerics import cache
+from truesky.render.drawing import reference
+from truesky.render.psf import model
+from truesky.render.sources import galaxy_shapes
+from truesky.render.sources.source_list import Sources
 
 # Thresholds of folding and of the largest frequency.
 ACCURACY = 1e-4

@@ -10,15 +10,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jobs.fluxes import passbands
-from jobs.render.camera import detectors
-from jobs.render.drawing import stamp_sizes, stamps, transfer
-from jobs.render.drawing.settings import Settings
-from jobs.render.psf import euclid, ground, model, sub_bands
-from jobs.render.sources.galaxy_shapes import Shapes
-from jobs.render.sources.source_list import Sources
 from lake_schema.arrays import Float, Int
 from lake_schema.mission.configuration import resolve
+from truesky.fluxes import passbands
+from truesky.render.camera import detectors
+from truesky.render.drawing import stamp_sizes, stamps, transfer
+from truesky.render.drawing.settings import Settings
+from truesky.render.psf import euclid, ground, model, sub_bands
+from truesky.render.sources.galaxy_shapes import Shapes
+from truesky.render.sources.source_list import Sources
 
 # Edges of the magnitude bins that errors are told by.
 BINS = (17.0, 20.0, 22.0, 23.0, 24.0, 25.0, 26.0)

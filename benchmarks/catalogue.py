@@ -20,23 +20,23 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from jobs.request.schema import Universe
+from truesky.request.schema import Universe
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
 from benchmarks import _peers, report
-from jobs.catalogue import build_galaxies
-from jobs.catalogue.galaxies import band_ratios, galaxies
-from jobs.catalogue.halos import matching, population
-from jobs.fluxes import cosmology
-from jobs.fluxes.libraries import templates
-from jobs.measured import forget_peak, peak_gb
 from lake_schema import sky
 from lake_schema.store import layout, parquet
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.halos import HALOS
+from truesky.catalogue import build_galaxies
+from truesky.catalogue.galaxies import band_ratios, galaxies
+from truesky.catalogue.halos import matching, population
+from truesky.fluxes import cosmology
+from truesky.fluxes.libraries import templates
+from truesky.running.measured import forget_peak, peak_gb
 
 ROOT = Path(__file__).resolve().parents[1]
 SEED = 7

@@ -14,7 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-FILE = Path(__file__).resolve().parents[1] / "tests" / "jobs" / "render" / "effects" / "readout" / "cti_reference.npz"
+FILE = (
+    Path(__file__).resolve().parents[1] / "tests" / "truesky" / "render" / "effects" / "readout" / "cti_reference.npz"
+)
 ROWS, OVERSCAN, COLUMNS, SKY = 2086, 20, 32, 130.0
 # Israel et al. 2015, end of the mission; well of the arCTIc examples for Euclid.
 DENSITY, RELEASE, FULL_WELL, POWER = (0.02, 0.03, 0.95), (0.8, 3.5, 20.0), 2e5, 0.58

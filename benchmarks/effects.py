@@ -15,21 +15,21 @@ from functools import partial
 import numpy as np
 
 from benchmarks import _scenes, report
-from jobs.fluxes import passbands
-from jobs.render.camera import detectors
-from jobs.render.camera.detectors import Detector
-from jobs.render.channels import vis
-from jobs.render.drawing import stamps
-from jobs.render.effects.charge import cosmic_rays
-from jobs.render.effects.effect import Effect
-from jobs.render.effects.light import ghosts
-from jobs.render.effects.readout import quadrants, readout_cosmic_rays
-from jobs.render.effects.scene import Frame, Lights, Scene
-from jobs.render.psf import euclid, model, sub_bands
-from jobs.render.sources.galaxy_shapes import Shapes
-from jobs.render.sources.source_list import Sources
-from jobs.rng import stream
 from lake_schema.mission.configuration import resolve
+from truesky.fluxes import passbands
+from truesky.randomness.rng import stream
+from truesky.render.camera import detectors
+from truesky.render.camera.detectors import Detector
+from truesky.render.channels import vis
+from truesky.render.drawing import stamps
+from truesky.render.effects.charge import cosmic_rays
+from truesky.render.effects.effect import Effect
+from truesky.render.effects.light import ghosts
+from truesky.render.effects.readout import quadrants, readout_cosmic_rays
+from truesky.render.effects.scene import Frame, Lights, Scene
+from truesky.render.psf import euclid, model, sub_bands
+from truesky.render.sources.galaxy_shapes import Shapes
+from truesky.render.sources.source_list import Sources
 
 # Sources of the scene, and the brightest light, electrons.
 _SOURCES, _STARS, _LIGHT = 30_000, 200, 1e9

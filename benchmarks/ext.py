@@ -18,13 +18,13 @@ from pathlib import Path
 from benchmarks import _detectors as one_detector
 from benchmarks import report
 from benchmarks._detectors import ROOT, prepared, rendered
-from jobs.accuracy import preset
-from jobs.render import render_exposures
-from jobs.render.channels import ground
-from jobs.render.forecasting import speed
-from jobs.request.from_toml import parse
-from jobs.request.schema import Effects, Request
 from lake_schema.store import read
+from truesky.render import render_exposures
+from truesky.render.channels import ground
+from truesky.render.forecasting import speed
+from truesky.request.accuracy import preset
+from truesky.request.from_toml import parse
+from truesky.request.schema import Effects, Request
 
 RESULTS = ROOT / "benchmarks" / "results" / "ext.json"
 # As far from the field's centre as sources of JPCam's detectors may lie, and of LSSTCam's all; of one in haste; deg.

@@ -1,6 +1,6 @@
 """How fast and how right the band fluxes are: python -m benchmarks.fluxes [--quick] [--json FILE] [--measure FILE].
 
---measure  writes the errors of all settings in all bands, jobs/fluxes/tables/flux_errors.csv, from which the job
+--measure  writes the errors of all settings in all bands, truesky/fluxes/tables/flux_errors.csv, from which the job
 chooses
 
 Galaxies in two components with their lines, over the whole of the parameter space that the tables cover, in the 22
@@ -26,16 +26,16 @@ import numpy as np
 import pyarrow as pa
 
 from benchmarks.report import best, machine
-from jobs.accuracy import DRAFT, SURVEY, Accuracy
-from jobs.fluxes import band_fluxes, integration, passbands
-from jobs.fluxes.libraries import templates
-from jobs.fluxes.libraries.templates import Library
-from jobs.fluxes.sources import Galaxies, galaxies_of
-from jobs.fluxes.spectra import lines
-from jobs.fluxes.tables import build_tables, flux_tables
-from jobs.fluxes.tables.settings import CANDIDATES, choose
 from lake_schema.arrays import Float
 from lake_schema.store.provenance import git_commit
+from truesky.fluxes import band_fluxes, integration, passbands
+from truesky.fluxes.libraries import templates
+from truesky.fluxes.libraries.templates import Library
+from truesky.fluxes.sources import Galaxies, galaxies_of
+from truesky.fluxes.spectra import lines
+from truesky.fluxes.tables import build_tables, flux_tables
+from truesky.fluxes.tables.settings import CANDIDATES, choose
+from truesky.request.accuracy import DRAFT, SURVEY, Accuracy
 
 BANDS = (
     "euclid_vis", "euclid_y", "euclid_j", "euclid_h", "gaia_g", "gaia_bp", "gaia_rp", "des_g", "des_r", "des_i",
@@ -143,11 +143,11 @@ def oracle(n: int, library: Library) -> float:
 
 def job(n: int) -> float:
     """Galaxies a second of a core, from Parquet to published Parquet, 22 bands, without Spark."""
-    from jobs.fluxes import compute_fluxes
-    from jobs.request import from_toml
     from lake_schema import ids, sky
     from lake_schema.store import layout, plan, publish
     from lake_schema.tables.galaxies import GALAXIES
+    from truesky.fluxes import compute_fluxes
+    from truesky.request import from_toml
 
     drawn = sample(n, _SEED_SPEED)
     index, ra, dec = sky.random_in_cell(5, 1607, n, np.random.default_rng(_SEED_SPEED))
@@ -177,7 +177,7 @@ def job(n: int) -> float:
 
 def stars(n: int) -> dict[str, float]:
     """Speed and error of the stars."""
-    from jobs.fluxes.sources import Stars
+    from truesky.fluxes.sources import Stars
 
     library = templates.stellar_library()
     rng = np.random.default_rng(_SEED_TEST)

@@ -24,11 +24,11 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import lake_schema  # noqa: F401
 from benchmarks import _detectors, catalogue, fluxes, nisp_s, report, vis
-from jobs.accuracy import SURVEY
-from jobs.fluxes.libraries import templates
-from jobs.fluxes.sources import galaxies_of
-from jobs.request.from_toml import parse
 from lake_schema import instruction_set
+from truesky.fluxes.libraries import templates
+from truesky.fluxes.sources import galaxies_of
+from truesky.request.accuracy import SURVEY
+from truesky.request.from_toml import parse
 
 SETTINGS = (instruction_set.PORTABLE, instruction_set.NATIVE)
 _GALAXIES, _GENERATION_CELLS = 200_000, 4

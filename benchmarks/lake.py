@@ -24,13 +24,13 @@ import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 
 from benchmarks import report
-from jobs.explore.explorer import Explorer
 from lake_schema import sky
 from lake_schema.columns import Column, Table
 from lake_schema.store import layout, parquet, publish, read
 from lake_schema.store.plan import Json, Output, Part, Plan
 from lake_schema.store.stage import write_part
 from lake_schema.tables.common import DEC, HEALPIX_29, ID, RA
+from truesky.explore.explorer import Explorer
 
 # Nested neighbours of order 5: about the Chandra Deep Field South.
 FIRST_CELL, CELLS, ROWS = 8976, 20, 250_000
@@ -123,7 +123,7 @@ def writing(folder: Path, rows: pa.Table, repeats: int) -> dict[str, float]:
 
 def _spark_writer(folder: Path, file: Path, repeats: int) -> float:
     """s of Spark's own writer on the same rows, held in its memory, in one task."""
-    from jobs.session import session
+    from truesky.running.session import session
 
     frame = session("benchmarks.lake").read.parquet(str(file)).coalesce(1).cache()
     frame.count()
@@ -201,7 +201,9 @@ def verifying(version: read.Version, repeats: int) -> dict[str, float]:
     }
 
 
-_SESSION = "import time; t = time.time(); from jobs.session import session; session('x'); print(time.time() - t)"
+_SESSION = (
+    "import time; t = time.time(); from truesky.running.session import session; session('x'); print(time.time() - t)"
+)
 
 
 def starting(repeats: int) -> dict[str, float]:

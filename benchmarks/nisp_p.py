@@ -16,10 +16,10 @@ from pathlib import Path
 from benchmarks import _detectors as one_detector
 from benchmarks import report
 from benchmarks._detectors import FIELD, ROOT, prepared, rendered
-from jobs.accuracy import preset
-from jobs.render.channels import nisp_p
-from jobs.request.from_toml import parse
-from jobs.request.schema import Effects, Request
+from truesky.render.channels import nisp_p
+from truesky.request.accuracy import preset
+from truesky.request.from_toml import parse
+from truesky.request.schema import Effects, Request
 
 RESULTS = ROOT / "benchmarks" / "results" / "nisp_p.json"
 # Folders of the PSF's planes in the cache.

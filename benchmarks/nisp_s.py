@@ -24,14 +24,14 @@ import numpy as np
 from benchmarks import _detectors as one_detector
 from benchmarks import _dispersion, _peers_slitless, report
 from benchmarks._detectors import FIELD, ROOT, prepared, rendered
-from jobs.accuracy import preset
-from jobs.render.channels import nisp_s
-from jobs.render.dispersing import draw
-from jobs.render.drawing import transfer
-from jobs.render.sources import galaxy_shapes, spectra
-from jobs.request.from_toml import parse
-from jobs.request.schema import Effects, Request
 from lake_schema.store.plan import Json
+from truesky.render.channels import nisp_s
+from truesky.render.dispersing import draw
+from truesky.render.drawing import transfer
+from truesky.render.sources import galaxy_shapes, spectra
+from truesky.request.accuracy import preset
+from truesky.request.from_toml import parse
+from truesky.request.schema import Effects, Request
 
 RESULTS = ROOT / "benchmarks" / "results" / "nisp_s.json"
 # Folders of the PSF's planes in the cache.

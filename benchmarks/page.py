@@ -30,12 +30,12 @@ import pyarrow as pa
 
 from benchmarks import _browser, report
 from benchmarks.lake import plan, work
-from jobs.explore.counting import Chart, Held, counted, held
-from jobs.page.charts import PART, answered
 from lake_schema.fits import images
 from lake_schema.store import publish
 from lake_schema.store.plan import Output, Part, Plan
 from lake_schema.tables.products import PRODUCTS
+from truesky.explore.counting import Chart, Held, counted, held
+from truesky.page.charts import PART, answered
 
 ROWS, MANY_ROWS, MOST_ROWS, DOWNLOADED, LARGE = 1_000_000, 50_000_000, 100_000_000, 10_000_000, 10_000_000
 QUICK_ROWS, QUICK_MANY, QUICK_MOST, QUICK_DOWNLOADED, QUICK_LARGE = 100_000, 500_000, 1_000_000, 200_000, 200_000
@@ -184,7 +184,7 @@ def serving(lake: Path, rows: int, downloaded: int, side: int, repeats: int) -> 
     """A server over a made lake: asked over HTTP, and in a browser."""
     made_lake(lake, rows, side)
     started = time.perf_counter()
-    command = [sys.executable, "-m", "jobs.page", str(lake), "--no-open", "--token", TOKEN]
+    command = [sys.executable, "-m", "truesky.page", str(lake), "--no-open", "--token", TOKEN]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         try:
             assert server.stdout is not None
@@ -224,7 +224,7 @@ def filled(asker: Asker, lake: str, part: int) -> float:
 def large(lake: Path, rows: int, repeats: int) -> dict[str, float]:
     """A lake of many rows: the first answer of a sample, and a cone among them."""
     made_lake(lake, rows, QUICK_SIDE)
-    command = [sys.executable, "-m", "jobs.page", str(lake), "--no-open", "--token", TOKEN]
+    command = [sys.executable, "-m", "truesky.page", str(lake), "--no-open", "--token", TOKEN]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         try:
             assert server.stdout is not None

@@ -1,7 +1,7 @@
 """Planning: seconds of a plan, errors of the forecast.
 
 Detectors of VIS and LSST are rendered as a job renders them, of three skies: the demo's, one of few sources and one of
-many stars. What they take are the costs in jobs/render/channels.
+many stars. What they take are the costs in truesky/render/channels.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from typing import Any
 
 from benchmarks import _around, report
 from benchmarks import lake as bulk
-from jobs.catalogue import build_galaxies, build_stars
-from jobs.fluxes import compute_fluxes
-from jobs.measured import forget_peak, peak_gb
-from jobs.render import plan_exposures, render_exposures
-from jobs.render.exposure import truth_maps, visible_sources
-from jobs.render.forecasting import speed
-from jobs.request.from_toml import from_table, parse
-from jobs.request.schema import Request
 from lake_schema import sky
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store import layout, publish, read
 from lake_schema.store.plan import Json, Part
+from truesky.catalogue import build_galaxies, build_stars
+from truesky.fluxes import compute_fluxes
+from truesky.render import plan_exposures, render_exposures
+from truesky.render.exposure import truth_maps, visible_sources
+from truesky.render.forecasting import speed
+from truesky.request.from_toml import from_table, parse
+from truesky.request.schema import Request
+from truesky.running.measured import forget_peak, peak_gb
 
 ROOT = Path(__file__).resolve().parents[1]
 # Rows of a crowded cell, and those of its columns that a detector reads.

@@ -1,6 +1,6 @@
 """A production of the eighth science challenge: core-hours by channel and a square degree, and what surrounds them.
 
-The costs are those of the forecast, measured channel by channel on an Intel Xeon of 2.5 GHz (jobs/render/channels,
+The costs are those of the forecast, measured channel by channel on an Intel Xeon of 2.5 GHz (truesky/render/channels,
 python -m benchmarks.planner). Of each camera and band a dozen exposures, evenly spaced in the plan, are priced detector
 by detector, and stand for all.
 """
@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import _around, planner, report, scheduler
-from jobs.render.planning import planned_exposures, source_counts, survey, tasks, variants
-from jobs.render.planning.mission import mission_of, user_filters
-from jobs.request.from_toml import parse
-from jobs.validation.suite import inventory, running
+from truesky.render.planning import planned_exposures, source_counts, survey, tasks, variants
+from truesky.render.planning.mission import mission_of, user_filters
+from truesky.request.from_toml import parse
+from truesky.validation.lake.suite import inventory, running
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "production.json"

@@ -18,9 +18,10 @@ from benchmarks import _peers as peers
 from benchmarks import _scenes as scenes
 from benchmarks import report
 from benchmarks._scenes import LSST, VIS, Scene
-from jobs import accuracy, cache
-from jobs.render.drawing.settings import Settings, settings_for
-from jobs.render.psf import model
+from truesky.numerics import cache
+from truesky.render.drawing.settings import Settings, settings_for
+from truesky.render.psf import model
+from truesky.request import accuracy
 
 # Galaxies whose errors are quoted, by a seed of their own, of them sheared in pairs; galsim's, a magnitude bin.
 HOLD_OUT, PAIRED, PEERS = 204, 0.25, 8
@@ -41,7 +42,7 @@ _NOTES = {
     "aperture_mag_rms": '1" aperture (target 1e-4)',
     "aperture_mag_worst": "(target 1e-3)",
     "centroid_mas_rms": "(target 0.002)",
-    "r2_rms": "(target 1e-4), through the same PSF: how well that is known, jobs/render/drawing/psf_positions.csv",
+    "r2_rms": "(target 1e-4), through the same PSF: how well that is known, truesky/render/drawing/psf_positions.csv",
     "r2_worst": "(target 1e-3)",
     "ellipticity_rms": "(target 2e-5)",
     "ellipticity_worst": "(target 1e-4)",

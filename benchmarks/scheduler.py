@@ -23,16 +23,16 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import report
-from jobs.render import plan_exposures
-from jobs.render.planning import tasks as planned
-from jobs.render.products.keys import part_name
-from jobs.request.from_toml import parse
-from jobs.session import session
-from jobs.shell import _collect
 from lake_schema.arrays import Float, Int
 from lake_schema.store import layout, manifest, publish, reuse, stage
 from lake_schema.store.plan import Json, Part, Plan
 from lake_schema.tables.products import PRODUCTS
+from truesky.render import plan_exposures
+from truesky.render.planning import tasks as planned
+from truesky.render.products.keys import part_name
+from truesky.request.from_toml import parse
+from truesky.running.session import session
+from truesky.running.shell import _collect
 
 ROOT = Path(__file__).resolve().parents[1]
 CORES = (100, 300, 1000, 3000, 10_000)

@@ -24,16 +24,16 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from benchmarks import report
-from jobs.catalogue import build_stars, dust_map
-from jobs.catalogue.stars import gaia, stars
-from jobs.fluxes import band_fluxes, compute_fluxes, passbands
-from jobs.fluxes.libraries import templates
-from jobs.fluxes.libraries.vega import vega_magnitude
-from jobs.request.from_toml import from_table
-from jobs.validation import star_counts
 from lake_schema import sky, units
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store import layout, publish, read
+from truesky.catalogue import build_stars, dust_map
+from truesky.catalogue.stars import gaia, stars
+from truesky.fluxes import band_fluxes, compute_fluxes, passbands
+from truesky.fluxes.libraries import templates
+from truesky.fluxes.libraries.vega import vega_magnitude
+from truesky.request.from_toml import from_table
+from truesky.validation.model import star_counts
 
 BANDS = [f"euclid_{b}" for b in ("vis", "y", "j", "h")] + [f"lsst_{b}" for b in "ugrizy"]
 # Stars to H < 26 at |b| > 20 deg by the same laws.

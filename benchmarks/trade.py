@@ -30,10 +30,10 @@ from benchmarks import _scenes as scenes
 from benchmarks import report
 from benchmarks._approximations import NONE, Approximation
 from benchmarks._scenes import VIS
-from jobs.render.drawing.settings import Settings
-from jobs.render.psf import model
-from jobs.render.sources.source_list import Sources
 from lake_schema.arrays import Bool, Float
+from truesky.render.drawing.settings import Settings
+from truesky.render.psf import model
+from truesky.render.sources.source_list import Sources
 
 Row = dict[str, str | float]
 # From quicklook to reference; then the survey's with one setting changed at a time.
@@ -303,7 +303,7 @@ def write(rows: list[Row], file: Path) -> None:
 
 
 def settings_table(rows: list[Row]) -> str:
-    """The table that jobs.accuracy reads, of the rows of trade.csv."""
+    """The table that truesky.request.accuracy reads, of the rows of trade.csv."""
     names = _SETTINGS.splitlines()[-1].split(",")
     some = [row for row in rows if row["kind"] == "settings"]
     lines = [",".join(f"{float(row[name]):.4g}" for name in names) for row in some]

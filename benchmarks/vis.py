@@ -19,13 +19,13 @@ from typing import Any
 from benchmarks import _detectors as one_detector
 from benchmarks import report
 from benchmarks._detectors import FIELD, ROOT, lake, prepared, rendered, timed
-from jobs.accuracy import preset
-from jobs.render.channels import vis
-from jobs.render.drawing import stamps
-from jobs.render.exposure import visible_sources
-from jobs.render.sources import catalogue_rows
-from jobs.request.from_toml import parse
-from jobs.request.schema import Effects, Request
+from truesky.render.channels import vis
+from truesky.render.drawing import stamps
+from truesky.render.exposure import visible_sources
+from truesky.render.sources import catalogue_rows
+from truesky.request.accuracy import preset
+from truesky.request.from_toml import parse
+from truesky.request.schema import Effects, Request
 
 RESULTS = ROOT / "benchmarks" / "results" / "vis.json"
 _PRESETS = ("draft", "survey", "quicklook", "reference")

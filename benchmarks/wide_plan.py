@@ -20,12 +20,12 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from benchmarks import report
-from jobs.measured import forget_peak, peak_gb
-from jobs.render import plan_exposures
-from jobs.render.forecasting import speed
-from jobs.render.planning import parts
-from jobs.request.from_toml import parse
 from lake_schema.store import layout, read
+from truesky.render import plan_exposures
+from truesky.render.forecasting import speed
+from truesky.render.planning import parts
+from truesky.request.from_toml import parse
+from truesky.running.measured import forget_peak, peak_gb
 
 ROOT = Path(__file__).resolve().parents[1]
 FIELDS, QUICK_FIELDS = 34_000, 600
@@ -77,7 +77,7 @@ def _held(pid: int) -> dict[str, float]:
             held = int(Path(f"/proc/{own}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e9
         except (OSError, IndexError):
             continue
-        if "jobs.spark_workers" in name:
+        if "truesky.running.spark_workers" in name:
             worker = max(worker, held)
         elif "plan_exposures.py" in name and "java" in name.split(" ")[0]:
             java += held

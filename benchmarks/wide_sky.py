@@ -13,14 +13,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import j0
 
-from jobs.catalogue.galaxies import galaxies
-from jobs.catalogue.halos import halos, luminosity_function, population
-from jobs.catalogue.halos.population import Population
-from jobs.catalogue.matter import density_box
-from jobs.fluxes import cosmology
-from jobs.request.schema import Universe
 from lake_schema import sky
 from lake_schema.arrays import Bool, Float, Int
+from truesky.catalogue.galaxies import galaxies
+from truesky.catalogue.halos import halos, luminosity_function, population
+from truesky.catalogue.halos.population import Population
+from truesky.catalogue.matter import density_box
+from truesky.fluxes import cosmology
+from truesky.request.schema import Universe
 
 BLOCK_ORDER, PIXEL_ORDER = 4, 9
 LIMIT = 22.0

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from lake_schema import __version__, command, listing, tables
 from lake_schema.errors import BadInput
-from lake_schema.s3 import Folder
 from lake_schema.store import garbage, layout, names, read
+from lake_schema.store.object_storage.s3 import Folder
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -30,7 +30,7 @@ _IN_BLOCK_BITS = 23
 BLOCKS = 7 << 14
 FIRST_NUMBER = BLOCKS << _IN_BLOCK_BITS >> MEMBER_BITS
 # Bits of a member of halos of at least this log10 mass, Msun/h: four times what they have above 10^9.1 are identified,
-# and the densest block of the sky has room for its halos (tests/jobs/catalogue/halos/test_halos.py).
+# and the densest block of the sky has room for its halos (tests/truesky/catalogue/halos/test_halos.py).
 _BITS_FROM = ((0.0, 7), (11.5, 10), (12.5, 13), (13.5, 17), (14.5, 18), (15.0, 20))
 
 

@@ -11,8 +11,8 @@ from datetime import UTC, datetime
 from typing import Any
 
 from lake_schema.errors import BadInput, LakeError
-from lake_schema.s3 import MANIFEST, Folder
 from lake_schema.store import garbage, layout, manifest, names
+from lake_schema.store.object_storage.s3 import MANIFEST, Folder
 
 _HEADS = ("names", "table", "version", "current", "published", "rows", "bytes", "made of")
 _RIGHT = {"rows", "bytes"}

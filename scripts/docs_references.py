@@ -15,23 +15,27 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from benchmarks import effects as scene_of_effects
-from jobs import accuracy
-from jobs.fluxes import passbands
-from jobs.render.camera import detectors, traces
-from jobs.render.channels import ground, nisp_p, nisp_s, registry, vis
-from jobs.render.channels.aim import Aim
-from jobs.render.effects.charge import bleeding
-from jobs.render.effects.effect import Effect
-from jobs.render.effects.readout import quadrants
-from jobs.render.effects.scene import Elsewhere, Frame, Lights, Scene
-from jobs.render.exposure import spread_sky
-from jobs.request import from_toml, observations, schema, toml_values
-from jobs.rng import stream
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import ExposureRow
+from truesky.fluxes import passbands
+from truesky.randomness.rng import stream
+from truesky.render.camera import detectors, traces
+from truesky.render.channels import ground, nisp_p, nisp_s, registry, vis
+from truesky.render.channels.aim import Aim
+from truesky.render.effects.charge import bleeding
+from truesky.render.effects.effect import Effect
+from truesky.render.effects.readout import quadrants
+from truesky.render.effects.scene import Elsewhere, Frame, Lights, Scene
+from truesky.render.exposure import spread_sky
+from truesky.request import accuracy, from_toml, observations, schema, toml_values
 
 # What readers of a lake import.
-API = ("lake_schema.store.read", "lake_schema.store.layout", "jobs.explore.explorer", "jobs.render.products.read_back")
+API = (
+    "lake_schema.store.read",
+    "lake_schema.store.layout",
+    "truesky.explore.explorer",
+    "truesky.render.products.read_back",
+)
 # Side of the frame that effects are shown on, pixels.
 _SIDE = 320
 

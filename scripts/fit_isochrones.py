@@ -1,4 +1,4 @@
-"""Make jobs/catalogue/stars/isochrones.csv, a fit to a table of isochrones.
+"""Make truesky/catalogue/stars/isochrones.csv, a fit to a table of isochrones.
 
     python scripts/fit_isochrones.py ISOCHRONES [--test OTHER ...] [--out FILE]
 
@@ -20,8 +20,8 @@ import pyarrow.parquet
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from jobs.catalogue.stars import isochrones as model
 from lake_schema.arrays import Float
+from truesky.catalogue.stars import isochrones as model
 
 NAMES = ("metallicity", "log_age", "eep", "initial_mass", "log_teff", "log_l")
 SOURCE = """# Fit to MIST isochrones, v/v_crit = 0.4: Choi et al. 2016, ApJ 823, 102; Dotter 2016, ApJS 222, 8.

@@ -1,4 +1,4 @@
-"""Make jobs/fluxes/libraries/model_stars.csv: colours and bolometric corrections of model atmospheres.
+"""Make truesky/fluxes/libraries/model_stars.csv: colours and bolometric corrections of model atmospheres.
 
     python scripts/fit_stellar_colours.py GRID [--out FILE]
 
@@ -18,10 +18,10 @@ from scipy.interpolate import RegularGridInterpolator
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from jobs.fluxes import passbands
-from jobs.fluxes.libraries import model_stars
 from lake_schema.arrays import Float
 from lake_schema.units import LIGHT_ANGSTROM_S
+from truesky.fluxes import passbands
+from truesky.fluxes.libraries import model_stars
 
 # Title in the grid of each band of model_stars.BANDS.
 TITLES = {

@@ -1,4 +1,4 @@
-"""Make jobs/catalogue/galaxies/halpha_matching.csv: which H alpha luminosity a star formation rate's stands for.
+"""Make truesky/catalogue/galaxies/halpha_matching.csv: which H alpha luminosity a star formation rate's stands for.
 
     python scripts/match_halpha.py [--cells 120]
 
@@ -19,12 +19,12 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 
-from jobs.catalogue.galaxies import emission_lines, galaxies
-from jobs.fluxes import cosmology
-from jobs.request.schema import Universe
-from jobs.validation import mean_sky
 from lake_schema import sky
 from lake_schema.ids import GENERATION_ORDER
+from truesky.catalogue.galaxies import emission_lines, galaxies
+from truesky.fluxes import cosmology
+from truesky.request.schema import Universe
+from truesky.validation.model import mean_sky
 
 SEED, WANTED = 2016, Universe(galaxy_limit=26.0, z_max=6.0, lensing=(0.0, 0.0), box_cells=192)
 EDGES = np.concatenate([[0.03, 0.2], np.arange(0.3, 3.01, 0.1), [3.3, 3.7, 4.2, 5.0, 6.0]])

@@ -34,7 +34,7 @@ def missing() -> str:
 @contextmanager
 def served(lake: Path) -> Iterator[str]:
     """Address of a page over a lake, while the block lasts."""
-    command = [sys.executable, "-m", "jobs.page", str(lake), "--no-open", "--token", _TOKEN]
+    command = [sys.executable, "-m", "truesky.page", str(lake), "--no-open", "--token", _TOKEN]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as server:
         try:
             assert server.stdout is not None

@@ -13,19 +13,19 @@ import numpy as np
 import pyarrow as pa
 from matplotlib import image
 
-from jobs.accuracy import SURVEY
-from jobs.fluxes import passbands
-from jobs.render.camera import astrometry, detectors
-from jobs.render.camera.pointing import boresight_for
-from jobs.render.drawing import stamp_sizes, stamps
-from jobs.render.drawing.settings import settings_for
-from jobs.render.psf import euclid
-from jobs.render.sources import disc_structure, galaxy_shapes
-from jobs.render.sources.disc_structure import DiscStructure
-from jobs.render.sources.source_list import Sources
-from jobs.request.structure import Arms
 from lake_schema.arrays import Float
 from lake_schema.mission.configuration import resolve
+from truesky.fluxes import passbands
+from truesky.render.camera import astrometry, detectors
+from truesky.render.camera.pointing import boresight_for
+from truesky.render.drawing import stamp_sizes, stamps
+from truesky.render.drawing.settings import settings_for
+from truesky.render.psf import euclid
+from truesky.render.sources import disc_structure, galaxy_shapes
+from truesky.render.sources.disc_structure import DiscStructure
+from truesky.render.sources.source_list import Sources
+from truesky.request.accuracy import SURVEY
+from truesky.request.structure import Arms
 
 ROOT = Path(__file__).resolve().parents[1]
 # Side of a panel, pixels; electrons of a galaxy, of a pixel's noise, and of the softest and the brightest grey.

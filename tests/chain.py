@@ -15,21 +15,21 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from jobs import cache, sums
-from jobs.accuracy import DRAFT
-from jobs.catalogue import build_galaxies, build_stars
-from jobs.fluxes import compute_fluxes, cosmology, integration, passbands
-from jobs.fluxes.libraries import templates
-from jobs.fluxes.sources import galaxies_of
-from jobs.fluxes.tables import build_tables, settings
-from jobs.render import plan_exposures, render_exposures
-from jobs.render.psf import euclid
-from jobs.render.sources import galaxy_shapes, sersic
-from jobs.request.from_toml import from_table
 from lake_schema import sky
 from lake_schema.fits.images import read_images
 from lake_schema.store import layout, publish, read
-from tests.jobs.render import fields
+from tests.truesky.render import fields
+from truesky.catalogue import build_galaxies, build_stars
+from truesky.fluxes import compute_fluxes, cosmology, integration, passbands
+from truesky.fluxes.libraries import templates
+from truesky.fluxes.sources import galaxies_of
+from truesky.fluxes.tables import build_tables, settings
+from truesky.numerics import cache, sums
+from truesky.render import plan_exposures, render_exposures
+from truesky.render.psf import euclid
+from truesky.render.sources import galaxy_shapes, sersic
+from truesky.request.accuracy import DRAFT
+from truesky.request.from_toml import from_table
 
 BANDS = ("euclid_vis", "lsst_r")
 REQUEST = {

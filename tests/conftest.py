@@ -25,12 +25,12 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci" if os.environ.ge
 # Where tests run in several processes (pytest-xdist, --dist loadfile), a file stays in one, and so do these together:
 # what shares the Spark session, and what shares the drawn sky. They begin first, for they take longest.
 _SPARK = (
-    "tests/faults/test_spark.py", "tests/jobs/test_session.py", "tests/test_field.py",
-    "tests/jobs/render/test_render_exposures_calibration.py",
-    "tests/jobs/render/test_render_exposures_infrared.py", "tests/jobs/render/test_render_exposures_spectra.py",
-    "tests/jobs/render/test_sequence.py",
+    "tests/faults/test_spark.py", "tests/truesky/running/test_session.py", "tests/test_field.py",
+    "tests/truesky/render/test_render_exposures_calibration.py",
+    "tests/truesky/render/test_render_exposures_infrared.py", "tests/truesky/render/test_render_exposures_spectra.py",
+    "tests/truesky/render/test_sequence.py",
 )  # fmt: skip
-_SKY = ("tests/jobs/catalogue/", "tests/jobs/validation/")
+_SKY = ("tests/truesky/catalogue/", "tests/truesky/validation/")
 
 
 def _scope(file):
@@ -72,7 +72,7 @@ def _no_waiting_for_the_disc():
 @pytest.fixture(scope="session")
 def spark():
     """One local session for the whole run, on the Java that the environment chose."""
-    from jobs.session import session
+    from truesky.running.session import session
 
     running = session("tests")
     yield running

@@ -5,8 +5,8 @@ import json
 import pytest
 
 from benchmarks import ext as benchmark
-from jobs.render.products import run_log
-from jobs.request.from_toml import parse
+from truesky.render.products import run_log
+from truesky.request.from_toml import parse
 
 
 def test_a_field_that_all_sites_see(tmp_path):

@@ -10,7 +10,7 @@ import pytest
 from nbclient import NotebookClient
 
 from benchmarks import fluxes as benchmark
-from jobs.accuracy import SURVEY
+from truesky.request.accuracy import SURVEY
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOK = ROOT / "notebooks" / "02_speed_for_accuracy.ipynb"

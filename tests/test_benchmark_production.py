@@ -3,7 +3,7 @@
 import pytest
 
 from benchmarks import production as benchmark
-from tests.jobs.validation.suite import lakes
+from tests.truesky.validation.lake.suite import lakes
 
 
 def test_a_few_exposures_stand_for_all():

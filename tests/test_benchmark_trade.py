@@ -10,11 +10,11 @@ from benchmarks import _approximations as approximations
 from benchmarks import _scenes as scenes
 from benchmarks import trade
 from benchmarks._scenes import VIS
-from jobs import accuracy
-from jobs.accuracy import SURVEY
-from jobs.render.drawing.settings import settings_for
-from jobs.render.sources import galaxy_shapes
 from tests.benchmarks import run
+from truesky.render.drawing.settings import settings_for
+from truesky.render.sources import galaxy_shapes
+from truesky.request import accuracy
+from truesky.request.accuracy import SURVEY
 
 RESULTS = Path(trade.__file__).with_name("results")
 BY_NAME = {each.name: each for each in approximations.ALL}

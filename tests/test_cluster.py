@@ -9,13 +9,15 @@ import time
 
 import pytest
 
-from jobs.commands import run
 from lake_schema.store import layout
 from tests.cluster import ROOT, command, different, environment, events, running, submit, told
+from truesky.commands import run
 
 pytestmark = [pytest.mark.spark, pytest.mark.nightly]
 
-JOBS = [stage.file for stage in (*run.CATALOGUES, *run.IMAGES)]
+JOBS = [
+    f"jobs/{stage.module.removeprefix('truesky.').replace('.', '/')}.py" for stage in (*run.CATALOGUES, *run.IMAGES)
+]
 # Which of them have something for workers to do.
 SHARED = [script for script in JOBS if "plan" not in script]
 

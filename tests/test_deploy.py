@@ -271,7 +271,7 @@ def test_a_packed_environment_runs_from_another_folder(tmp_path):
     shutil.rmtree(source)
     with tarfile.open(packed) as archive:
         archive.extractall(there, filter="tar")
-    ask = "import lake_schema, pyarrow; from jobs.render import render_exposures; print(lake_schema.__file__)"
+    ask = "import lake_schema, pyarrow; from truesky.render import render_exposures; print(lake_schema.__file__)"
     done = subprocess.run(
         [there / "bin" / "python", "-c", ask],
         capture_output=True,

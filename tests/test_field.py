@@ -17,24 +17,24 @@ from astropy.wcs import WCS, FITSFixedWarning
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from jobs import shell
-from jobs.catalogue import build_galaxies, build_stars
-from jobs.fluxes import compute_fluxes
-from jobs.render import archive, plan_exposures, render_exposures
-from jobs.render.camera import detectors
-from jobs.render.channels import registry
-from jobs.render.effects.light import pixel_area
-from jobs.render.effects.readout import charge_transfer, quadrants
-from jobs.render.effects.scene import Scene
-from jobs.render.products import preview_labels, read_back
-from jobs.render.sources import catalogue_rows
-from jobs.request.from_toml import parse
 from lake_schema import sky
 from lake_schema.mission.configuration import resolve
 from lake_schema.store import layout, read
 from lake_schema.store.provenance import libraries, machine
-from tests.jobs.render import calibrated
-from tests.jobs.render.exposure.test_render import render as small
+from tests.truesky.render import calibrated
+from tests.truesky.render.exposure.test_render import render as small
+from truesky.catalogue import build_galaxies, build_stars
+from truesky.fluxes import compute_fluxes
+from truesky.render import archive, plan_exposures, render_exposures
+from truesky.render.camera import detectors
+from truesky.render.channels import registry
+from truesky.render.effects.light import pixel_area
+from truesky.render.effects.readout import charge_transfer, quadrants
+from truesky.render.effects.scene import Scene
+from truesky.render.products import preview_labels, read_back
+from truesky.render.sources import catalogue_rows
+from truesky.request.from_toml import parse
+from truesky.running import shell
 
 pytestmark = pytest.mark.spark
 

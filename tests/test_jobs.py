@@ -8,13 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from jobs import demo, shell
-from jobs.catalogue import build_gaia, build_galaxies, build_stars, build_strong_lenses
-from jobs.fluxes import compute_fluxes
-from jobs.render import plan_exposures, render_exposures
-from jobs.request.from_toml import from_table
 from lake_schema.store import layout, read
 from tests import requests
+from truesky.catalogue import build_gaia, build_galaxies, build_stars, build_strong_lenses
+from truesky.commands import demo
+from truesky.fluxes import compute_fluxes
+from truesky.render import plan_exposures, render_exposures
+from truesky.request.from_toml import from_table
+from truesky.running import shell
 
 ROOT = Path(__file__).parents[1]
 FIRST = (build_galaxies.JOB, build_stars.JOB)
@@ -59,7 +60,10 @@ def submit(*arguments):
 
 def test_no_job_is_forgotten():
     """Here, and in the table of docs/jobs.md."""
-    found = {path for path in (ROOT / "jobs").rglob("*.py") if "\nJOB = Job(" in path.read_text()}
+    found = set((ROOT / "jobs").rglob("*.py"))
+    modules = {path.stem for path in (ROOT / "truesky").rglob("*.py") if "\nJOB = Job(" in path.read_text()}
+    assert {path.stem for path in found} == modules
+    assert all(len(path.read_text().splitlines()) < 15 for path in found)
     assert {path.stem for path in found} == {job.name for job in JOBS}
     table = (ROOT / "docs" / "jobs.md").read_text()
     assert [path for path in found if f"| `{path.relative_to(ROOT).as_posix()}` |" not in table] == []
@@ -116,9 +120,9 @@ def test_the_same_request_gives_the_same_bytes_under_any_master(tmp_path):
     script.write_text(f"""
 import sys
 sys.path[0] = {str(ROOT)!r}
-from jobs import demo, request, shell
-from jobs.catalogue import build_galaxies, build_stars
-from jobs.fluxes import compute_fluxes
+from truesky.running import shell
+from truesky.catalogue import build_galaxies, build_stars
+from truesky.fluxes import compute_fluxes
 sys.exit(max(shell.main(m.JOB, sys.argv[1:]) for m in (build_galaxies, build_stars, compute_fluxes)))
 """)
     manifests = []

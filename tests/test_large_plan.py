@@ -11,23 +11,23 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
-from jobs import report
-from jobs.measured import forget_peak, peak_gb
-from jobs.page import runs, sky_maps
-from jobs.page.opened import Lake
-from jobs.render import coverage, plan_exposures
-from jobs.render.exposure import persistence
-from jobs.render.forecasting import speed, taken
-from jobs.render.planning import parts, variants
-from jobs.render.planning import tasks as planning
-from jobs.render.planning.mission import mission_of
-from jobs.request.from_toml import from_table
 from lake_schema.store import layout, publish, read, reuse
 from lake_schema.store.plan import Output, Part, Plan
 from lake_schema.tables.exposures import EXPOSURES, ExposureRow
 from lake_schema.tables.products import PRODUCTS
 from lake_schema.tables.tasks import TASKS
 from tests.universe import rows_of
+from truesky.commands import report
+from truesky.page import runs, sky_maps
+from truesky.page.opened import Lake
+from truesky.render import coverage, plan_exposures
+from truesky.render.exposure import persistence
+from truesky.render.forecasting import speed, taken
+from truesky.render.planning import parts, variants
+from truesky.render.planning import tasks as planning
+from truesky.render.planning.mission import mission_of
+from truesky.request.from_toml import from_table
+from truesky.running.measured import forget_peak, peak_gb
 
 BLOCK = {"channels": ["VIS", "NISP-P"], "fields": 1, "dither": "none", "mjd": 60400.0}
 AREA = {"cone": {"ra": 60.0, "dec": -50.0, "radius": 1.0}}

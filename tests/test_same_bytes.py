@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from jobs import cache
 from lake_schema.store.provenance import machine
+from truesky.numerics import cache
 
 ROOT = Path(__file__).parents[1]
 # OpenBLAS chooses its kernels by processor; any x86-64 of today runs these two.

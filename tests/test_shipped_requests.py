@@ -11,17 +11,17 @@ from pathlib import Path
 
 import pytest
 
-from jobs import shell
-from jobs.catalogue import build_galaxies, build_stars
-from jobs.fluxes import compute_fluxes
-from jobs.render import plan_exposures, render_exposures
-from jobs.render.camera import detectors
-from jobs.render.planning import ground_surveys, survey
-from jobs.request.from_toml import from_table, parse
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import resolve
 from lake_schema.store import layout, read
 from lake_schema.tables.exposures import RENDERED
+from truesky.catalogue import build_galaxies, build_stars
+from truesky.fluxes import compute_fluxes
+from truesky.render import plan_exposures, render_exposures
+from truesky.render.camera import detectors
+from truesky.render.planning import ground_surveys, survey
+from truesky.request.from_toml import from_table, parse
+from truesky.running import shell
 
 REQUESTS = Path(__file__).parents[1] / "requests"
 MODULES = (build_galaxies, build_stars, compute_fluxes, plan_exposures)

@@ -1,64 +1,11 @@
-"""Build the table `gaia` of a lake's stars: spark-submit jobs/catalogue/build_gaia.py --lake LAKE --request REQUEST.
+"""Build the table `gaia` of a lake's stars.
 
-The request's fluxes.bands must have held gaia_g, gaia_bp and gaia_rp.
+spark-submit jobs/catalogue/build_gaia.py --lake LAKE --request REQUEST
 """
 
-import sys
-from pathlib import Path
-
-if __name__ == "__main__":
-    # spark-submit puts this folder first, where our modules would hide the standard library's.
-    sys.path[0] = str(Path(__file__).resolve().parents[2])
-    # Limits numpy, before it is imported below.
-    import lake_schema  # noqa: F401
-
-import pyarrow as pa
-import pyarrow.compute as pc
-
-from jobs.catalogue.stars import gaia
-from jobs.request import universe
-from jobs.request.schema import Request
-from jobs.shell import Job, Step, main
-from lake_schema import command, sky
-from lake_schema.errors import BadInput
-from lake_schema.store import layout, read
-from lake_schema.store.plan import Json, Output, Part, Plan
-from lake_schema.store.provenance import code_version
-from lake_schema.tables.gaia import GAIA
-
-
-def steps(lake: Path, request: Request) -> list[Step]:
-    """One part a file of the stars."""
-    stars, fluxes = (read.for_request(lake, name, request.name) for name in ("stars", "star_fluxes"))
-    universe.refuse_other([stars], request)
-    if missing := [name for name in gaia.FLUX_COLUMNS if name not in fluxes.schema.names]:
-        raise BadInput(
-            f"table star_fluxes has no column {', '.join(missing)}: put {', '.join(gaia.BANDS)} into fluxes.bands and "
-            "run compute_fluxes"
-        )
-    if fluxes.manifest["facts"].get("input") != stars.key:
-        raise BadInput("table star_fluxes was computed from another version of stars: run compute_fluxes first")
-    facts = {"seed": request.seed, "stars": stars.key, "star_fluxes": fluxes.key, "code": code_version()}
-    parts = tuple(Part(name, {"part": name}) for name in stars.parts)
-    return [Step(Plan(GAIA, facts, parts), work)]
-
-
-def work(lake: Path, facts: Json) -> Output:
-    """What Gaia finds in a file's cell: also stars from beside it, whose measured place may lie inside."""
-    part = facts["part"]
-    stars = _rows(read.version(lake, "stars", facts["stars"]), part, gaia.STAR_COLUMNS)
-    fluxes = _rows(read.version(lake, "star_fluxes", facts["star_fluxes"]), part, gaia.FLUX_COLUMNS)
-    rows = gaia.observe(stars, fluxes, facts["seed"])
-    first, last = sky.cell_range(*layout.cell_of_file(part))
-    index = rows["_healpix_29"]
-    return Output(rows.filter(pc.and_(pc.greater_equal(index, first), pc.less(index, last))))
-
-
-def _rows(version: read.Version, part: str, columns: list[str]) -> pa.Table:
-    return pa.concat_tables([version.rows(columns, [part]), version.margin(part, columns)])
-
-
-JOB = Job("build_gaia", "List the stars as Gaia would.", steps)
+from lake_schema import command
+from truesky.catalogue.build_gaia import JOB
+from truesky.running.shell import main
 
 if __name__ == "__main__":
     command.leave(main, JOB)

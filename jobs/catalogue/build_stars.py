@@ -1,94 +1,11 @@
-"""Build the table `stars` of a request: spark-submit jobs/catalogue/build_stars.py --lake LAKE --request REQUEST."""
+"""Build the table `stars` of a request.
 
-import sys
-from pathlib import Path
+spark-submit jobs/catalogue/build_stars.py --lake LAKE --request REQUEST
+"""
 
-if __name__ == "__main__":
-    # spark-submit puts this folder first, where our modules would hide the standard library's.
-    sys.path[0] = str(Path(__file__).resolve().parents[2])
-    # Limits numpy, before it is imported below.
-    import lake_schema  # noqa: F401
-
-import math
-from functools import partial
-
-import numpy as np
-
-from jobs.catalogue import cells, dust_map, given_sources, request_checks
-from jobs.catalogue.stars import stars
-from jobs.request.area import Area
-from jobs.request.checks import check_rendered
-from jobs.request.files import DustMap, GivenSources
-from jobs.request.schema import Request, Stars
-from jobs.shell import Job, Step, main
 from lake_schema import command
-from lake_schema.store.plan import Json, Output, Plan
-from lake_schema.store.provenance import code_version
-from lake_schema.tables.stars import STARS
-
-# Lowest order of a file: 54 deg2, what a bright limit leaves in them is soon drawn.
-_LARGEST = 3
-
-
-def steps(lake: Path, request: Request) -> list[Step]:
-    """Files of about as many rows, made of the generation cells that the request's area touches."""
-    check_rendered(request)
-    choice = request.stars
-    if request.sources is not None:
-        return [_given(request, request.sources)]
-    facts = {
-        "seed": request.seed,
-        "star_limit": request.universe.star_limit,
-        "plane_limit": choice.plane_limit,
-        "bright_limit": choice.bright_limit,
-        "density": choice.density,
-        "brown_dwarf_boost": choice.brown_dwarf_boost,
-        **request_checks.star_files(choice),
-        **dust_map.facts(request.ingest.dust),
-        "code": code_version(),
-    }
-    drawn = request.area.cells()
-    numbers = stars.numbers(drawn, request_checks.star_model(facts["star_limit"], choice, facts))
-    parts = cells.by_number(drawn, numbers, choice.rows_a_file, _LARGEST)
-    return [Step(Plan(STARS, facts, parts), partial(work, choice=choice, own=request.ingest.dust))]
-
-
-def _given(request: Request, own: GivenSources) -> Step:
-    facts = {"seed": request.seed, "sources": own.facts(request.area.bounds()), "code": code_version()}
-    model = _given_model(own, request.area)
-    drawn = request.area.cells()
-    parts = cells.by_number(drawn, stars.numbers(drawn, model), request.stars.rows_a_file, _LARGEST)
-    return Step(Plan(STARS, facts, parts), partial(given_work, own=own, area=request.area))
-
-
-def given_work(lake: Path, facts: Json, own: GivenSources, area: Area) -> Output:
-    """The stars of a request that names them all, of one file's cell.
-
-    lake  : not used;  facts : of the part
-    own   : the tables;  area : of the request
-    """
-    model, dust = _given_model(own, area, facts["sources"]), np.zeros(12, np.float32)
-    return Output(cells.rows(facts, STARS, lambda cell: stars.draw(cell, facts["seed"], model, dust)))
-
-
-def _given_model(own: GivenSources, area: Area, planned: Json | None = None) -> stars.StarModel:
-    """Each star, however faint and wherever it is."""
-    catalogue = given_sources.stars(given_sources.load(own, area, planned), own.band)
-    return stars.model(math.inf, math.inf, brown_dwarf_boost=0.0, catalogue=catalogue)
-
-
-def work(lake: Path, facts: Json, choice: Stars, own: DustMap | None = None) -> Output:
-    """The stars of one file's cell.
-
-    lake   : folder of the lake;  facts : of the plan and of the part, which has its cell
-    choice : section `stars` of the request;  own : an external map of dust, None = the embedded one
-    """
-    model = request_checks.star_model(facts["star_limit"], choice, facts)
-    dust = dust_map.chosen(facts["seed"], own)
-    return Output(cells.rows(facts, STARS, lambda cell: stars.draw(cell, facts["seed"], model, dust)))
-
-
-JOB = Job("build_stars", "Draw the Milky Way's stars of a sky area.", steps)
+from truesky.catalogue.build_stars import JOB
+from truesky.running.shell import main
 
 if __name__ == "__main__":
     command.leave(main, JOB)

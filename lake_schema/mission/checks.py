@@ -14,8 +14,8 @@ import numpy as np
 
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.mission.detector_overrides import split
 from lake_schema.mission.parameter import CAMERAS, convert, read_all
-from lake_schema.mission.places import split
 from lake_schema.ramps import MOST_FRAMES, frames
 
 # Quantities of which no chosen value may be worse than what is required, and which way worse is.

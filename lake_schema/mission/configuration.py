@@ -21,10 +21,10 @@ from pathlib import Path
 from typing import TypeVar
 
 from lake_schema.errors import BadInput, OutOfRange
-from lake_schema.mission import model, places
+from lake_schema.mission import detector_overrides, model
+from lake_schema.mission.detector_overrides import Place
 from lake_schema.mission.model import Model, read_models
 from lake_schema.mission.parameter import STATUSES, Parameter, convert, read_all
-from lake_schema.mission.places import Place
 from lake_schema.tables.mission import LADDER
 
 __all__ = ["LADDER", "MissionConfiguration", "difference", "resolve"]
@@ -55,7 +55,7 @@ class MissionConfiguration:
         object.__setattr__(self, "_files", {m.key: m for m in self.models})
         placed: dict[str, tuple[Place, ...]] = {}
         for name in self.overridden:
-            key, place = places.split(name, self._index)
+            key, place = detector_overrides.split(name, self._index)
             if key != name:
                 placed[key] = (*placed.get(key, ()), place)
         object.__setattr__(self, "_placed", placed)
@@ -83,13 +83,13 @@ class MissionConfiguration:
 
     def is_own(self, key: str, place: Place) -> bool:
         """Whether a detector or an amplifier has a value of its own, beside the camera's."""
-        return any(narrow in self for narrow in places.names(key, place)[:-1])
+        return any(narrow in self for narrow in detector_overrides.names(key, place)[:-1])
 
     def value(self, key: str, unit: str | None = None, place: Place | None = None) -> float:
         """The value of a name, in `unit` where one is given, else in its record's own; place : where."""
         record = self.parameter(key)
         if place and key in self._placed:
-            record = next(self._index[name] for name in places.names(key, place) if name in self._index)
+            record = next(self._index[name] for name in detector_overrides.names(key, place) if name in self._index)
         if unit is None or unit == record.unit:
             return record.value
         return convert(record.value, record.unit, unit, f"mission parameter {key}")
@@ -98,7 +98,7 @@ class MissionConfiguration:
         """The value for each amplifier of a detector, in the order in which they are read; one where all have it."""
         if not any(place.amplifier and place.detector in ("", detector) for place in self._placed.get(key, ())):
             return (self.value(key, unit, Place(detector)),)
-        names = places.amplifiers(places.section_of(key), self)
+        names = detector_overrides.amplifiers(detector_overrides.section_of(key), self)
         values = tuple(self.value(key, unit, Place(detector, name)) for name in names)
         return values if len(set(values)) > 1 else values[:1]
 
@@ -115,12 +115,12 @@ class MissionConfiguration:
         chosen = dict(self._index)
         for name, (value, unit) in overrides.items():
             chosen[name] = _overridden(self._index, name, value, unit)
-            _check_bounds(chosen[name], places.split(name, self._index)[0])
+            _check_bounds(chosen[name], detector_overrides.split(name, self._index)[0])
         names = tuple(sorted({*self.overridden, *overrides}))
         found = replace(self, parameters=tuple(chosen[key] for key in sorted(chosen)), overridden=names)
         for name in names:
-            if places.split(name, chosen)[0] != name:
-                places.check(name, found)
+            if detector_overrides.split(name, chosen)[0] != name:
+                detector_overrides.check(name, found)
         return found
 
     @property
@@ -192,7 +192,7 @@ def _choose(key: str, group: Sequence[Chosen], ladder: Sequence[str], mjd: float
 
 def _overridden(known: Mapping[str, Parameter], name: str, value: float, unit: str) -> Parameter:
     where = f"mission override {name}"
-    key, _ = places.split(name, known)
+    key, _ = detector_overrides.split(name, known)
     if key not in known:
         raise BadInput(f"{where}: the mission database has no such parameter")
     if not math.isfinite(value):

@@ -11,7 +11,7 @@ from dataclasses import astuple, dataclass
 from fnmatch import fnmatchcase
 
 from lake_schema.errors import BadInput
-from lake_schema.mission import places
+from lake_schema.mission import detector_overrides
 from lake_schema.mission.configuration import MissionConfiguration, bounds_of
 from lake_schema.mission.model import Model
 from lake_schema.mission.parameter import Parameter, convert
@@ -50,9 +50,11 @@ def listed(configuration: MissionConfiguration, pattern: str = "*") -> list[Entr
 def _entry(record: Parameter | Model, configuration: MissionConfiguration) -> Entry:
     about = (record.status, record.confidence, record.source)
     if isinstance(record, Model):
-        return Entry(record.key, record.file, "", None, places.CAMERA, *about)
-    key, _ = places.split(record.key, configuration)
-    return Entry(record.key, record.value, record.unit, _bounds(key, record.unit), places.scope(key), *about)
+        return Entry(record.key, record.file, "", None, detector_overrides.CAMERA, *about)
+    key, _ = detector_overrides.split(record.key, configuration)
+    return Entry(
+        record.key, record.value, record.unit, _bounds(key, record.unit), detector_overrides.scope(key), *about
+    )
 
 
 def _bounds(key: str, unit: str) -> tuple[float, float] | None:

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from lake_schema.errors import Damaged
-from lake_schema.s3 import Folder, Place
+from lake_schema.store.object_storage.s3 import Folder, Place
 from lake_schema.store.plan import Json
 from lake_schema.store.provenance import file_sha256
 

@@ -18,8 +18,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from lake_schema.errors import BadInput, Damaged, Superseded
-from lake_schema.s3 import Folder
 from lake_schema.store import layout, locks, manifest, names
+from lake_schema.store.object_storage.s3 import Folder
 from lake_schema.store.stage import receipts
 
 # What stands in a table's folder by a version's key; and what was on its way out.

@@ -20,9 +20,10 @@ import re
 from pathlib import Path
 from urllib.parse import unquote
 
-from lake_schema import s3, user_files
+from lake_schema import user_files
 from lake_schema.errors import BadInput, Damaged
-from lake_schema.s3 import Below, Folder, Place
+from lake_schema.store.object_storage import s3
+from lake_schema.store.object_storage.s3 import Below, Folder, Place
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}", re.ASCII)
 _CELL = re.compile(r"Norder=(\d+)/Dir=\d+/Npix=(\d+)\.parquet", re.ASCII)

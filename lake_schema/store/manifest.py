@@ -22,8 +22,8 @@ import pyarrow as pa
 
 from lake_schema import sky
 from lake_schema.errors import Damaged
-from lake_schema.s3 import MANIFEST, Folder, Place
 from lake_schema.store import blocks, layout, parquet
+from lake_schema.store.object_storage.s3 import MANIFEST, Folder, Place
 from lake_schema.store.plan import Json
 from lake_schema.store.provenance import canonical, digest, file_sha256
 

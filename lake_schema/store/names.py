@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from lake_schema.errors import BadInput
-from lake_schema.s3 import Folder
 from lake_schema.store import layout
 from lake_schema.store.manifest import sync
+from lake_schema.store.object_storage.s3 import Folder
 
 _KEY = re.compile(r"[0-9a-f]{16}", re.ASCII)
 

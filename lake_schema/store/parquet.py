@@ -18,8 +18,8 @@ import pyarrow.parquet as pq
 from lake_schema import votable
 from lake_schema.columns import Table
 from lake_schema.errors import Damaged
-from lake_schema.s3 import Folder
 from lake_schema.store import blocks
+from lake_schema.store.object_storage.s3 import Folder
 from lake_schema.store.plan import Json
 
 # Sorted by position, 65,536 rows a group is where small cones are fast and the footer still small (tried: 4k to 262k).

@@ -12,10 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from lake_schema import instruction_set
-from lake_schema.s3 import Folder
+from lake_schema.store.object_storage.s3 import Folder
 
 _ROOT = Path(__file__).resolve().parents[2]
-_PACKAGES = ("lake_schema", "jobs")
+_PACKAGES = ("lake_schema", "truesky")
+# Examples, which a wheel has in the package and a clone has not.
+_NO_CODE = {"requests", "notebooks"}
 _DATA = {".py", ".csv", ".toml"}
 # Libraries whose version can change a byte of a product.
 _LIBRARIES = (
@@ -56,7 +58,9 @@ def code_version(root: Path = _ROOT) -> str:
         path
         for package in _PACKAGES
         for path in (root / package).rglob("*")
-        if path.suffix in _DATA and "__pycache__" not in path.parts
+        if path.suffix in _DATA
+        and "__pycache__" not in path.parts
+        and path.relative_to(root / package).parts[0] not in _NO_CODE
     )
     sums = {path.relative_to(root).as_posix(): file_sha256(path) for path in files}
     return digest({"files": sums, "libraries": libraries()})

@@ -22,13 +22,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as ds
 
-from lake_schema import places, sky
+from lake_schema import position_columns, sky
 from lake_schema import tables as declarations
 from lake_schema.arrays import Int
 from lake_schema.columns import Table
 from lake_schema.errors import BadInput, Damaged, VersionMismatch
-from lake_schema.s3 import Folder, Place
 from lake_schema.store import layout, manifest, names, parquet
+from lake_schema.store.object_storage.s3 import Folder, Place
 from lake_schema.store.provenance import digest
 
 # So many stretches of _healpix_29 go into the filter of one file; the rest of its rows are left out after reading.
@@ -178,7 +178,7 @@ class Version:
 
     def _own(self, asked: Sequence[str]) -> list[str]:
         """What columns are called that may be asked for by an earlier name.  Errors: BadInput names an unknown one"""
-        own = places.named(self.table, asked, self.schema.names)
+        own = position_columns.named(self.table, asked, self.schema.names)
         for name in own:
             if name not in self.schema.names:
                 raise BadInput(f"table {self.table} has no column {name}")
@@ -223,8 +223,8 @@ class Version:
         return rows if columns is None else rows.select(list(columns))
 
     def place(self, on: str = "observed") -> tuple[str, str]:
-        """Columns of ra and dec of a catalogue's observed or true positions.  Errors: as of places.columns"""
-        return places.columns(self, self.schema.names, on)
+        """Columns of ra and dec of a catalogue's observed or true positions.  Errors: as of position_columns.columns"""
+        return position_columns.columns(self, self.schema.names, on)
 
     def padding(self, on: str = "observed") -> float:
         """How far beyond the cells of a place its sources may lie, deg: files go by ra and dec."""

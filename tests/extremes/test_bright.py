@@ -8,17 +8,17 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from jobs.accuracy import DRAFT, SURVEY
-from jobs.render.drawing import reference, stamp_sizes, stamps
-from jobs.render.drawing.kernels import fourier, frame
-from jobs.render.drawing.settings import settings_for
-from jobs.render.psf.seeing import ground_psf
 from lake_schema.errors import BadInput
 from lake_schema.store import validate
 from lake_schema.tables.galaxies import GALAXIES
 from tests.extremes.test_stamps import source_of
-from tests.jobs.render import nominal
-from tests.jobs.render.fields import psf_of, small
+from tests.truesky.render import nominal
+from tests.truesky.render.fields import psf_of, small
+from truesky.render.drawing import reference, stamp_sizes, stamps
+from truesky.render.drawing.kernels import fourier, frame
+from truesky.render.drawing.settings import settings_for
+from truesky.render.psf.seeing import ground_psf
+from truesky.request.accuracy import DRAFT, SURVEY
 
 NOISE = {"vis": 12.0, "lsstcam": 38.0}
 # Magnitudes from the Moon's to faint stars', in no time and in eleven days: electrons.

@@ -5,12 +5,12 @@ import time
 import numpy as np
 import pytest
 
-from jobs.render.effects.charge import bleeding, cosmic_rays, poisson
-from jobs.render.effects.readout import charge_transfer, readout_cosmic_rays, traps
-from jobs.render.effects.readout.traps import Sweeps
-from jobs.render.effects.scene import Scene
 from lake_schema.mission.configuration import resolve
-from tests.jobs.render.effects.battery import CASES, END_OF_LIFE, call
+from tests.truesky.render.effects.battery import CASES, END_OF_LIFE, call
+from truesky.render.effects.charge import bleeding, cosmic_rays, poisson
+from truesky.render.effects.readout import charge_transfer, readout_cosmic_rays, traps
+from truesky.render.effects.readout.traps import Sweeps
+from truesky.render.effects.scene import Scene
 
 SIDE = 256
 # Seconds of processor time: the slowest effect takes 0.05 for a frame of SIDE x SIDE, what does not end takes for ever.

@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jobs.accuracy import REFERENCE, SURVEY
-from jobs.fluxes import band_fluxes, cosmology, high_redshift, passbands, sources
-from jobs.fluxes.libraries import templates
-from jobs.fluxes.passbands import Passband
-from jobs.fluxes.spectra import extinction, lines
 from lake_schema import units
 from lake_schema.errors import BadInput, OutOfRange
+from truesky.fluxes import band_fluxes, cosmology, high_redshift, passbands, sources
+from truesky.fluxes.libraries import templates
+from truesky.fluxes.passbands import Passband
+from truesky.fluxes.spectra import extinction, lines
+from truesky.request.accuracy import REFERENCE, SURVEY
 
 BANDS = ("euclid_vis", "lsst_u", "euclid_h")
 PLAIN = {

@@ -15,19 +15,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import gammaincinv
 
-from jobs.accuracy import DRAFT, SURVEY
-from jobs.fluxes import passbands
-from jobs.render.camera.astrometry import sky_of_pixel, wcs
-from jobs.render.camera.pointing import boresight_for
-from jobs.render.drawing import cost, stamp_sizes, stamps
-from jobs.render.drawing.kernels import frame
-from jobs.render.drawing.settings import settings_for
-from jobs.render.exposure import visible_sources
-from jobs.render.exposure.records import Rows
-from jobs.render.sources import galaxy_shapes, source_list
-from jobs.render.sources.galaxy_shapes import EXPONENTIAL_RADIUS
 from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
-from tests.jobs.render.fields import aimed, galaxies, moments, one_source, psf_of, small, stars
+from tests.truesky.render.fields import aimed, galaxies, moments, one_source, psf_of, small, stars
+from truesky.fluxes import passbands
+from truesky.render.camera.astrometry import sky_of_pixel, wcs
+from truesky.render.camera.pointing import boresight_for
+from truesky.render.drawing import cost, stamp_sizes, stamps
+from truesky.render.drawing.kernels import frame
+from truesky.render.drawing.settings import settings_for
+from truesky.render.exposure import visible_sources
+from truesky.render.exposure.records import Rows
+from truesky.render.sources import galaxy_shapes, source_list
+from truesky.render.sources.galaxy_shapes import EXPONENTIAL_RADIUS
+from truesky.request.accuracy import DRAFT, SURVEY
 
 NOISE = 12.0
 # Seconds of processor time: a large galaxy takes 1, what does not end takes for ever.

@@ -8,20 +8,20 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from jobs.catalogue import build_galaxies, dust_map
-from jobs.catalogue.external import mapping
-from jobs.catalogue.galaxies import galaxies, halo_lensing, lensing
-from jobs.catalogue.halos import halo_catalogue, population
-from jobs.catalogue.stars import stars
-from jobs.fluxes import cosmology
-from jobs.request.schema import Universe
 from lake_schema import ids, sky
 from lake_schema.store import validate
 from lake_schema.store.provenance import file_sha256
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.halos import HALOS
 from lake_schema.tables.stars import STARS
-from tests.jobs.catalogue.conftest import SEED, SMALL
+from tests.truesky.catalogue.conftest import SEED, SMALL
+from truesky.catalogue import build_galaxies, dust_map
+from truesky.catalogue.external import mapping
+from truesky.catalogue.galaxies import galaxies, halo_lensing, lensing
+from truesky.catalogue.halos import halo_catalogue, population
+from truesky.catalogue.stars import stars
+from truesky.fluxes import cosmology
+from truesky.request.schema import Universe
 
 CELL = 303_117
 FIRST, LAST = 0, 2**63 - 1

@@ -6,18 +6,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jobs.accuracy import SURVEY
-from jobs.render.channels import vis
-from jobs.render.effects.charge import bleeding
-from jobs.render.effects.effect import apply_all
-from jobs.render.effects.readout import quadrants, traps
-from jobs.render.effects.scene import Lights, Scene
-from jobs.rng import stream
 from lake_schema.errors import OutOfRange
 from lake_schema.mission.configuration import bounds_of, is_whole, resolve
 from tests.extremes.test_effects import scenes
-from tests.jobs.render import nominal
-from tests.jobs.render.fields import small
+from tests.truesky.render import nominal
+from tests.truesky.render.fields import small
+from truesky.randomness.rng import stream
+from truesky.render.channels import vis
+from truesky.render.effects.charge import bleeding
+from truesky.render.effects.effect import apply_all
+from truesky.render.effects.readout import quadrants, traps
+from truesky.render.effects.scene import Lights, Scene
+from truesky.request.accuracy import SURVEY
 
 SIDE = 128
 # Seconds of processor time: a frame of SIDE x SIDE takes 0.1 through all of a channel, an endless one any number.

@@ -12,20 +12,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from astropy.io import fits
 
-from jobs.catalogue import dust_map
-from jobs.catalogue.external import mapping
-from jobs.catalogue.stars import bright_stars, from_catalogue
-from jobs.explore import guard
-from jobs.fluxes import passbands
-from jobs.fluxes.libraries import from_files, stars_from_files
-from jobs.render import archive
-from jobs.render.camera import detectors
-from jobs.render.planning import ground_surveys
-from jobs.render.psf import from_file
-from jobs.render.sources import ephemerides, galaxy_stamps
-from jobs.request import area, files
-from jobs.request.from_toml import parse
-from jobs.request.observations import Observation
 from lake_schema import user_files
 from lake_schema.errors import BadInput
 from lake_schema.external import files as external_files
@@ -34,8 +20,22 @@ from lake_schema.mission.configuration import resolve
 from lake_schema.store import layout, publish, read
 from lake_schema.store.provenance import digest
 from tests import requests
-from tests.jobs.explore.test_hostile_sql import GOOD
+from tests.truesky.explore.test_hostile_sql import GOOD
 from tests.universe import plain_plan, plain_work
+from truesky.catalogue import dust_map
+from truesky.catalogue.external import mapping
+from truesky.catalogue.stars import bright_stars, from_catalogue
+from truesky.explore import guard
+from truesky.fluxes import passbands
+from truesky.fluxes.libraries import from_files, stars_from_files
+from truesky.render import archive
+from truesky.render.camera import detectors
+from truesky.render.planning import ground_surveys
+from truesky.render.psf import from_file
+from truesky.render.sources import ephemerides, galaxy_stamps
+from truesky.request import area, files
+from truesky.request.from_toml import parse
+from truesky.request.observations import Observation
 
 ROOT = Path(__file__).resolve().parents[2]
 RNG = np.random.default_rng(7)

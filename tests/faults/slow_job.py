@@ -10,8 +10,8 @@ if __name__ == "__main__":
     import lake_schema  # noqa: F401
 
 
-from jobs.shell import Job, Step, main
 from tests.universe import plain_plan, plain_work
+from truesky.running.shell import Job, Step, main
 
 # Parts, and s a part: a driver that is to be stopped must still be at work.
 PARTS, SLOW = 12, 1.5

@@ -11,8 +11,14 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 
-from jobs import demo, report, shell
-from jobs.catalogue import (
+from lake_schema import __main__ as lake_schema
+from lake_schema import user_files
+from lake_schema.errors import BadInput
+from lake_schema.store import publish
+from lake_schema.tables.mission import LADDER
+from tests import requests
+from tests.universe import plain_plan, plain_work
+from truesky.catalogue import (
     build_gaia,
     build_galaxies,
     build_stars,
@@ -22,23 +28,16 @@ from jobs.catalogue import (
     export_galaxies,
     request_checks,
 )
-from jobs.commands import run as whole
-from jobs.commands import submit
-from jobs.explore import __main__ as explore
-from jobs.fluxes import compute_fluxes, inputs
-from jobs.render import archive, coverage, plan_exposures, render_exposures
-from jobs.render.products import keys
-from jobs.render.psf import from_file
-from jobs.request import __main__
-from jobs.request.files import UserCurves
-from jobs.request.from_toml import parse
-from lake_schema import __main__ as lake_schema
-from lake_schema import user_files
-from lake_schema.errors import BadInput
-from lake_schema.store import publish
-from lake_schema.tables.mission import LADDER
-from tests import requests
-from tests.universe import plain_plan, plain_work
+from truesky.commands import check, demo, report, submit
+from truesky.commands import run as whole
+from truesky.explore import __main__ as explore
+from truesky.fluxes import compute_fluxes, inputs
+from truesky.render import archive, coverage, plan_exposures, render_exposures
+from truesky.render.products import keys
+from truesky.render.psf import from_file
+from truesky.request.files import UserCurves
+from truesky.request.from_toml import parse
+from truesky.running import shell
 
 # What has no bound takes minutes; a slow machine's imports take seconds.
 MOST_SECONDS = 30.0
@@ -72,7 +71,7 @@ OF_LAKE = {
 }
 OF_REQUEST = {
     **{name: (lambda path, new, name=name: run(name, new, path)) for name in JOBS},
-    "request check": lambda path, new: __main__.main(["check", path]),
+    "request check": lambda path, new: check.main(["check", path]),
     "demo": lambda path, new: demo.main(["--request", path, "--out", new]),
     "run": lambda path, new: whole.main([path, "--lake", new], pytest.fail),
     "mission diff": lambda path, new: lake_schema.main(["mission", "diff", path, ",".join(LADDER)]),
@@ -324,7 +323,7 @@ def test_names_that_lost_their_letters_are_refused(tmp_path, capsys, monkeypatch
 def test_a_question_mark_is_a_letter_where_no_java_was(tmp_path, name, words):
     environment = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0"}
     environment.pop("PYSPARK_GATEWAY_PORT", None)
-    asked = [sys.executable, "-m", "jobs.render.plan_exposures", "--lake", tmp_path / "lake"]
+    asked = [sys.executable, "-m", "truesky.render.plan_exposures", "--lake", tmp_path / "lake"]
     done = subprocess.run([*asked, "--request", bytes(tmp_path / "x") + name], env=environment, capture_output=True)
     assert (done.returncode, done.stderr.count(b"\n")) == (2, 1)
     assert words in done.stderr

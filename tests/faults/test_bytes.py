@@ -14,11 +14,6 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from jobs.catalogue.build_galaxies import quarantine_file, quarantine_work
-from jobs.explore.guard import checked
-from jobs.explore.session import Session
-from jobs.render.products.beside import truth_file
-from jobs.render.render_exposures import truth_work
 from lake_schema.errors import Damaged
 from lake_schema.fits import images
 from lake_schema.store import blocks, layout, manifest, parquet, publish, read
@@ -26,6 +21,11 @@ from lake_schema.store.plan import Output, Part, Plan
 from lake_schema.tables import declared
 from tests.make_old_lake import OLD_LAKE
 from tests.universe import PLAIN, TOY, plain_plan, plain_work, rows_of, toy_rows
+from truesky.catalogue.build_galaxies import quarantine_file, quarantine_work
+from truesky.explore.guard import checked
+from truesky.explore.session import Session
+from truesky.render.products.beside import truth_file
+from truesky.render.render_exposures import truth_work
 
 TABLES = declared(["vis"])
 CELL = layout.cell_file(5, 1607)

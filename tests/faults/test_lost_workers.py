@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from jobs.commands import run
 from lake_schema.store import layout, read
 from tests import requests
 from tests.cluster import below, command, different, environment, events, running, submit, told
+from truesky.commands import run
 
 pytestmark = [pytest.mark.spark, pytest.mark.nightly]
 

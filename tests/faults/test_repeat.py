@@ -143,22 +143,22 @@ def test_a_table_made_from_another_knows_it(lake):
 
 
 def test_a_byte_of_code_or_data_is_another_code(tmp_path):
-    for package in ("lake_schema", "jobs"):
+    for package in ("lake_schema", "truesky"):
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
     before = code_version(tmp_path)
     assert before == code_version(ROOT)
     for name in (
-        "jobs/fluxes/passbands.csv",
+        "truesky/fluxes/passbands.csv",
         "lake_schema/mission/vis.csv",
-        "jobs/rng.py",
-        "jobs/catalogue/milky_way.toml",
+        "truesky/randomness/rng.py",
+        "truesky/catalogue/milky_way.toml",
     ):
         path = tmp_path / name
         whole = path.read_bytes()
         path.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
         assert code_version(tmp_path) != before, name
         path.write_bytes(whole)
-    (tmp_path / "jobs" / "notes.txt").write_text("not code")
+    (tmp_path / "truesky" / "notes.txt").write_text("not code")
     assert code_version(tmp_path) == before
     assert len(before) == len(hashlib.sha256().hexdigest())
 

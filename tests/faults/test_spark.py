@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from jobs import shell
-from jobs.shell import Job, Step
 from lake_schema.store import layout
 from tests import requests
 from tests.cluster import below
 from tests.faults import promise, slow_job
 from tests.universe import plain_plan, plain_work
+from truesky.running import shell
+from truesky.running.shell import Job, Step
 
 pytestmark = pytest.mark.spark
 
@@ -67,7 +67,7 @@ def wanted(tmp_path_factory):
     ("harm", "words"),
     [
         ("raise-1", "1.parquet: ValueError: row 17: no such template"),
-        # Four workers die, one after the other; by day tests/jobs/test_shell.py has what is said of them.
+        # Four workers die, one after the other; by day tests/truesky/running/test_shell.py has what is said of them.
         pytest.param("die-1", "1.parquet: its worker died", marks=pytest.mark.nightly),
     ],
 )

@@ -28,7 +28,7 @@ def imported(tree):
     """Names -> what of ours they are imported as; none of those that the file gives another meaning, too."""
     names = {}
     for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in ("jobs", "lake_schema"):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in ("lake_schema", "truesky"):
             names |= {alias.asname or alias.name: (node.module, alias.name) for alias in node.names}
     again = {n.id for n in ast.walk(tree) if isinstance(n, ast.Name) and not isinstance(n.ctx, ast.Load)}
     again |= {node.arg for node in ast.walk(tree) if isinstance(node, ast.arg)}
@@ -71,7 +71,7 @@ def faults(tree):
         elif isinstance(function, ast.Attribute) and isinstance(function.value, ast.Name):
             called = getattr(ours.get(function.value.id), function.attr, None)
         # Classes of others' libraries may say nothing of their arguments.
-        ours_too = (getattr(called, "__module__", None) or "").split(".")[0] in ("jobs", "lake_schema")
+        ours_too = (getattr(called, "__module__", None) or "").split(".")[0] in ("lake_schema", "truesky")
         if ours_too and all(keyword.arg for keyword in node.keywords):
             try:
                 inspect.signature(called).bind(*node.args, **{keyword.arg: None for keyword in node.keywords})
@@ -87,10 +87,10 @@ def test_what_is_called_is_there(path):
 @pytest.mark.parametrize(
     "text",
     [
-        "from jobs import nothing",
-        "from jobs import rng\nrng.nothing",
-        "from jobs import rng\nrng.name_of(seed=1)",
-        "from jobs.rng import stream\nstream(1, nothing=2, seed=3)",
+        "from truesky.randomness import nothing",
+        "from truesky.randomness import rng\nrng.nothing",
+        "from truesky.randomness import rng\nrng.name_of(seed=1)",
+        "from truesky.randomness.rng import stream\nstream(1, nothing=2, seed=3)",
         "from lake_schema.store import nothing",
     ],
 )

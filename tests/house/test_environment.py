@@ -14,11 +14,11 @@ from pathlib import Path
 
 import pytest
 
-from jobs.commands import run
+from truesky.commands import run
 
 ROOT = Path(__file__).resolve().parents[2]
-SCRIPT = ROOT / "jobs" / "commands" / "prepare_spark.py"
-SUBMITTED = sorted(path for path in (ROOT / "jobs").rglob("*.py") if "\nJOB = Job(" in path.read_text())
+SCRIPT = ROOT / "truesky" / "commands" / "prepare_spark.py"
+SUBMITTED = sorted((ROOT / "jobs").rglob("*.py"))
 # Draws on a worker, complains once and ends like a job that was given a bad request.
 TINY = """
 import sys
@@ -275,7 +275,7 @@ import os, sys
 sys.path[0] = sys.argv[1]
 import psutil
 import pyarrow as pa
-from jobs.session import session
+from truesky.running.session import session
 spark = session("listening")
 
 def pythons(batches):
@@ -293,7 +293,7 @@ print(conf.get("spark.authenticate"), conf.get("spark.ui.enabled"))
 """
 
 
-# What a session itself listens to: tests/jobs/test_session.py.
+# What a session itself listens to: tests/truesky/running/test_session.py.
 @pytest.mark.spark
 @pytest.mark.nightly
 def test_a_session_is_closed_to_others_and_finds_its_python_without_any_configuration(tmp_path):
@@ -323,7 +323,8 @@ def test_submitted_files_answer_from_anywhere(environment, some):
         environment = Path(sys.prefix)
     else:
         prepared(environment)
-    assert {ROOT / stage.file for stage in (*run.CATALOGUES, *run.IMAGES)} < set(SUBMITTED)
+    modules = {f"truesky.{path.parent.name}.{path.stem}" for path in SUBMITTED}
+    assert {stage.module for stage in (*run.CATALOGUES, *run.IMAGES)} < modules
     # What spark-submit runs is this Python; a Java for each file would say nothing more.
     files = SUBMITTED[some]
     starters = ["spark-submit", *["python"] * (len(files) - 1)]

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-SOURCES = sorted(path for package in ("lake_schema", "jobs") for path in (ROOT / package).rglob("*.py"))
+SOURCES = sorted(path for package in ("lake_schema", "truesky") for path in (ROOT / package).rglob("*.py"))
 # Formats that run code when they are read.
 UNSAFE_MODULES = {"pickle", "cPickle", "dill", "cloudpickle", "marshal", "shelve", "joblib"}
 UNSAFE_CALLS = {
@@ -105,8 +105,8 @@ def test_every_module_has_its_layer():
     """A module that is new is refused until pyproject.toml says what it may import; each package of jobs has layers."""
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
     within = {one["containers"][0]: one for one in contracts if "containers" in one}
-    packages = {f"jobs.{path.parent.name}" for path in (ROOT / "jobs").glob("*/__init__.py")}
-    assert within.keys() >= packages | {"jobs", "lake_schema"}
+    packages = {f"truesky.{path.parent.name}" for path in (ROOT / "truesky").glob("*/__init__.py")}
+    assert within.keys() >= packages | {"truesky", "lake_schema"}
     assert [name for name, one in within.items() if not one.get("exhaustive") or "exhaustive_ignores" in one] == []
 
 
@@ -120,7 +120,7 @@ def test_parquet_is_read_through_one_door():
     """Whoever else read it would take a changed byte for a number."""
     found = {name: set(readings) for name, tree in trees().items() if (readings := parquet_readings(tree))}
     # Rows that a process was handed in a file of Arrow's own, which is removed with it.
-    handed = found.pop("jobs/explore/session.py")
+    handed = found.pop("truesky/explore/session.py")
     assert handed == {"pyarrow.dataset.dataset", "pyarrow.dataset.Dataset"}
     assert found.keys() == PARQUET_READERS
 

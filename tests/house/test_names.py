@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 # spark-submit puts the folder of the submitted file first in sys.path.
-FOLDERS = ("lake_schema", "jobs", "benchmarks", "scripts")
+FOLDERS = ("lake_schema", "truesky", "benchmarks", "scripts")
 MODULES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py") if path.stem[:2] != "__")
 ELSEWHERE = re.compile(r"(?<![\w.~])/(?:home|root|Users|work)/\w|\.\./shared|\bissues? #?\d", re.IGNORECASE)
 # A file or folder of the tree, and a module by its file's name alone.

@@ -25,7 +25,7 @@ from lake_schema.store import provenance
 
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
-PACKAGES = ("lake_schema", "jobs", "truesky")
+PACKAGES = ("lake_schema", "truesky")
 # Whatever else lies in the packages is no part of them.
 NOT_SHIPPED = {".pyc"}
 
@@ -52,15 +52,16 @@ def wheel(built):
 
 
 def test_everything_of_the_packages_ships(wheel):
-    of_packages = {path for name in ("lake_schema", "jobs") for path in (ROOT / name).rglob("*") if path.is_file()}
+    of_packages = {path for name in PACKAGES for path in (ROOT / name).rglob("*") if path.is_file()}
     there = {path.relative_to(ROOT) for path in of_packages if path.suffix not in NOT_SHIPPED}
     examples = {path.relative_to(ROOT) for folder in ("requests", "notebooks") for path in (ROOT / folder).iterdir()}
     expected = {path.as_posix() for path in there} | {f"truesky/{path.as_posix()}" for path in examples}
     # It wants a clone.
-    expected = expected - {"truesky/notebooks/02_speed_for_accuracy.ipynb"} | {"truesky/__init__.py"}
+    expected -= {"truesky/notebooks/02_speed_for_accuracy.ipynb"}
     shipped = {name for name in wheel.namelist() if ".dist-info/" not in name}
     assert shipped == expected
-    assert {"lake_schema/py.typed", "jobs/py.typed", "lake_schema/mission/vis.csv"} <= shipped
+    assert {"lake_schema/py.typed", "truesky/py.typed", "lake_schema/mission/vis.csv"} <= shipped
+    assert {name.split("/")[0] for name in shipped} == {"lake_schema", "truesky"}
 
 
 def test_metadata(wheel):
@@ -187,7 +188,7 @@ def test_what_is_wanted_is_pinned_within_its_range():
 PARTS = {"llvmlite", "py4j", "botocore"}
 
 
-@pytest.mark.parametrize(("folders", "extras"), [(("lake_schema", "jobs"), ("s3",)), (("tests",), ("test", "s3"))])
+@pytest.mark.parametrize(("folders", "extras"), [(("lake_schema", "truesky"), ("s3",)), (("tests",), ("test", "s3"))])
 def test_what_is_imported_is_named(folders, extras):
     """Not only what comes with another package, which may do without it tomorrow; in programs kept as text, too."""
     project = PROJECT["project"]

@@ -12,22 +12,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jobs.accuracy import SURVEY
-from jobs.render.camera import detectors
-from jobs.render.channels import ground, registry
-from jobs.render.effects.effect import Effect
-from jobs.render.planning import planned_exposures, survey, tasks
-from jobs.render.planning.source_counts import Densities
-from jobs.render.products import fits_files, read_back
-from jobs.request.from_toml import from_table
-from jobs.request.schema import Universe
 from lake_schema.errors import BadInput
 from lake_schema.mission import model, parameter
 from lake_schema.mission.configuration import resolve
 from lake_schema.tables.exposures import CHANNELS
+from truesky.render.camera import detectors
+from truesky.render.channels import ground, registry
+from truesky.render.effects.effect import Effect
+from truesky.render.planning import planned_exposures, survey, tasks
+from truesky.render.planning.source_counts import Densities
+from truesky.render.products import fits_files, read_back
+from truesky.request.accuracy import SURVEY
+from truesky.request.from_toml import from_table
+from truesky.request.schema import Universe
 
 ROOT = Path(__file__).resolve().parents[2]
-SOURCES = sorted(path for package in ("lake_schema", "jobs") for path in (ROOT / package).rglob("*.py"))
+SOURCES = sorted(path for package in ("lake_schema", "truesky") for path in (ROOT / package).rglob("*.py"))
 MODULES, LINES, FUNCTION, PARAMETERS = 16, 400, 60, 8
 
 
@@ -69,10 +69,10 @@ def test_functions_are_measured():
 def test_channels_are_named_where_they_are_made():
     """Whatever differs from channel to channel is asked of the channel, not of its name."""
     name = re.compile("|".join(f"[\"']{code}[\"']" for code, _ in CHANNELS))
-    own = [ROOT / "jobs" / "render" / room for room in ("channels", "planning", "camera")]
+    own = [ROOT / "truesky" / "render" / room for room in ("channels", "planning", "camera")]
     found = [
         path.relative_to(ROOT).as_posix()
-        for path in (ROOT / "jobs" / "render").rglob("*.py")
+        for path in (ROOT / "truesky" / "render").rglob("*.py")
         if not any(path.is_relative_to(room) for room in own) and name.search(path.read_text())
     ]
     assert found == []
@@ -96,10 +96,10 @@ CAMERA = re.compile(r"(vis|nisp|ext)(\.|$)")
 
 def test_cameras_are_named_where_they_are_made():
     """A parameter of a camera is asked for by the detector's own section of the mission database."""
-    own = [ROOT / "jobs" / "render" / room for room in ("channels", "planning", "camera")]
+    own = [ROOT / "truesky" / "render" / room for room in ("channels", "planning", "camera")]
     named = {
         path.relative_to(ROOT).as_posix(): found
-        for path in (ROOT / "jobs" / "render").rglob("*.py")
+        for path in (ROOT / "truesky" / "render").rglob("*.py")
         if not any(path.is_relative_to(room) for room in own)
         and (found := [text for text in texts(ast.parse(path.read_text())) if CAMERA.match(text)])
     }
@@ -115,7 +115,7 @@ def test_what_names_a_camera_is_found():
 
 def test_quadrants_are_known_where_they_are_read():
     """What is assembled from a readout is asked of the channel's readout mode."""
-    render = ROOT / "jobs" / "render"
+    render = ROOT / "truesky" / "render"
     quadrants = render / "effects" / "readout" / "quadrants.py"
     knowing = {path.relative_to(render).parts[0] for path in render.rglob("*.py") if quadrants in imported(path)}
     assert knowing == {"channels"}
@@ -124,13 +124,13 @@ def test_quadrants_are_known_where_they_are_read():
 # A channel with one effect; and the camera that it is of, which is declared in lake_schema: LSSTCam under another name.
 DUMMY = '''"""A channel that makes everything three times as bright."""
 
-from jobs.render.camera import bands
-from jobs.render.channels import readout
-from jobs.render.channels.channel import Channel
-from jobs.render.channels.cost import Cost
-from jobs.render.effects.effect import Effect
-from jobs.render.psf import seeing
-from jobs.render.sky import diffuse_light
+from truesky.render.camera import bands
+from truesky.render.channels import readout
+from truesky.render.channels.channel import Channel
+from truesky.render.channels.cost import Cost
+from truesky.render.effects.effect import Effect
+from truesky.render.psf import seeing
+from truesky.render.sky import diffuse_light
 
 def apply(frame, factor, rng):
     return frame * factor
@@ -152,14 +152,14 @@ TOUCHED = {"channels/dummy.py": DUMMY, "channels/registry.py": None}
 
 def with_the_dummy(monkeypatch):
     """The renderer with the files of TOUCHED, and nothing else, added or changed; the dummy's module."""
-    text = (ROOT / "jobs" / "render" / "channels" / "registry.py").read_text()
+    text = (ROOT / "truesky" / "render" / "channels" / "registry.py").read_text()
     for old, new in (
         ("import ground", "import dummy, ground"),
         ('= {\n    "VIS"', '= {\n    "DUMMY": dummy.CHANNEL,\n    "VIS"'),
     ):
         assert text.count(old) == 1
         text = text.replace(old, new)
-    made = {name: types.ModuleType(f"jobs.render.channels.{name}") for name in ("dummy", "registry")}
+    made = {name: types.ModuleType(f"truesky.render.channels.{name}") for name in ("dummy", "registry")}
     for path, source in {**TOUCHED, "channels/registry.py": text}.items():
         module = made[Path(path).stem]
         exec(compile(source, path, "exec"), module.__dict__)
@@ -176,7 +176,7 @@ def with_its_camera(monkeypatch):
         own = [r for r in records if r.key.startswith("ext.lsstcam.")]
         return [*records, *(replace(r, key=r.key.replace("ext.lsstcam.", "ext.dummycam.")) for r in own)]
 
-    for module in [m for name, m in sys.modules.items() if name.startswith(("jobs.", "lake_schema."))]:
+    for module in [m for name, m in sys.modules.items() if name.startswith(("truesky.", "lake_schema."))]:
         if hasattr(module, "CAMERAS"):
             monkeypatch.setattr(module, "CAMERAS", (*parameter.CAMERAS, "dummycam"))
     return resolve(copied(parameter.read_all()), models=copied(model.read_models()))
@@ -184,8 +184,8 @@ def with_its_camera(monkeypatch):
 
 def test_a_channel_touches_two_files_of_the_renderer(monkeypatch, tmp_path):
     """One of one effect and one camera is planned, forecast, rendered, written and read with no more than these."""
-    from tests.jobs.render import fields
-    from tests.jobs.render.exposure.test_render import field
+    from tests.truesky.render import fields
+    from tests.truesky.render.exposure.test_render import field
 
     assert len(TOUCHED) == 2
     mission = with_its_camera(monkeypatch)
@@ -242,7 +242,7 @@ def test_array_types_are_named_once():
 def imported(path):
     """Modules of the project that a file imports, at its top or within functions."""
     for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in ("jobs", "lake_schema"):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in ("lake_schema", "truesky"):
             for name in node.names:
                 inner = ROOT / (f"{node.module}.{name.name}".replace(".", "/") + ".py")
                 outer = ROOT / (node.module.replace(".", "/") + ".py")

@@ -8,8 +8,8 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import pytest
 
-from jobs.render.channels import registry
 from scripts import docs_references, make_docs
+from truesky.render.channels import registry
 
 ROOT = Path(__file__).resolve().parents[2]
 EFFECTS = {e.name for channel in registry.CHANNELS.values() for kind in channel.effects.values() for e in kind}

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-SOURCES = sorted(path for folder in ("jobs", "lake_schema") for path in (ROOT / folder).rglob("*.py"))
+SOURCES = sorted(path for folder in ("lake_schema", "truesky") for path in (ROOT / folder).rglob("*.py"))
 # What numpy and scipy hand to BLAS or LAPACK.
 NAMES = {
     "dot", "vdot", "matmul", "matvec", "vecmat", "tensordot", "linalg", "convolve", "correlate", "cov", "corrcoef",
@@ -38,4 +38,4 @@ def test_what_would_be_found(text):
 
 def test_products_are_those_of_sums():
     found = [f"{p.relative_to(ROOT)}:{line}" for p in SOURCES for line in faults(ast.parse(p.read_text()))]
-    assert found == [], "jobs/sums.py has products and solutions whose last bit is the same everywhere"
+    assert found == [], "truesky/numerics/sums.py has products and solutions whose last bit is the same everywhere"

@@ -7,7 +7,6 @@ from typing import get_type_hints
 import numpy as np
 import pytest
 
-from jobs.fluxes import passbands as responses
 from lake_schema import __main__, tables
 from lake_schema.errors import BadInput
 from lake_schema.mission import published
@@ -20,6 +19,7 @@ from lake_schema.store.validate import check
 from lake_schema.tables import mission, passbands, templates
 from lake_schema.tables.common import Origin
 from lake_schema.tables.exposures import EXPOSURES, ExposureRow
+from truesky.fluxes import passbands as responses
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "tables.md"
 

@@ -42,7 +42,7 @@ def literal(part, names):
 def names_in_code():
     """(strings, pattern of formatted strings) of all modules, and of tests, which hold images to values."""
     strings, formatted = set(), set()
-    paths = {path for room in ("jobs", "lake_schema", "tests") for path in (ROOT / room).rglob("*.py")}
+    paths = {path for room in ("lake_schema", "truesky", "tests") for path in (ROOT / room).rglob("*.py")}
     for path in paths - {Path(__file__)}:
         tree = ast.parse(path.read_text())
         names = named(tree)
@@ -58,7 +58,7 @@ def names_in_code():
 
 
 def test_every_row_is_asked_for():
-    """Those of ground cameras are held by tests/jobs/render/channels/test_ground_parameters.py."""
+    """Those of ground cameras are held by tests/truesky/render/channels/test_ground_parameters.py."""
     strings, formatted = names_in_code()
 
     def asked(key):

@@ -8,12 +8,12 @@ from hypothesis import strategies as st
 
 from lake_schema import __main__
 from lake_schema.errors import BadInput, OutOfRange
-from lake_schema.mission import listing, places
+from lake_schema.mission import detector_overrides, listing
 from lake_schema.mission.checks import faults
 from lake_schema.mission.configuration import resolve
+from lake_schema.mission.detector_overrides import Place
 from lake_schema.mission.model import read_models
 from lake_schema.mission.parameter import CAMERAS, read_all
-from lake_schema.mission.places import Place
 
 GAIN = "electron / adu"
 MISSION = resolve()
@@ -24,14 +24,14 @@ def test_names_of_places_are_no_names_of_parameters():
     keys = {record.key for record in (*read_all(), *read_models())}
     assert not {key for key in keys if "@" in key or key.rpartition(".")[0] in keys}
     for section in CAMERA_SECTIONS:
-        found = places.detectors(section, MISSION)
+        found = detector_overrides.detectors(section, MISSION)
         assert len(set(found)) == len(found) > 10
         assert not [name for name in found if "." in name or "@" in name]
     for section, count in (("vis", 4), ("nisp", 0), ("ext.decam", 2), ("ext.lsstcam", 16), ("ext.gpc1", 64)):
-        assert len(places.amplifiers(section, MISSION)) == count
+        assert len(detector_overrides.amplifiers(section, MISSION)) == count
 
 
-@pytest.mark.parametrize("pattern", [pattern for pattern, _ in places._scopes()])
+@pytest.mark.parametrize("pattern", [pattern for pattern, _ in detector_overrides._scopes()])
 def test_each_pattern_is_of_some_parameter(pattern):
     assert [record.key for record in read_all() if pattern.fullmatch(record.key)]
 
@@ -95,7 +95,7 @@ def test_each_camera_has_its_detectors():
     ],
 )
 def test_a_place_that_is_not_there_is_refused_by_name(name, words):
-    key = places.split(name, MISSION)[0]
+    key = detector_overrides.split(name, MISSION)[0]
     unit = MISSION.parameter(key).unit if key in [record.key for record in read_all()] else ""
     with pytest.raises(BadInput, match=words) as error:
         resolve(overrides={name: (3.0, unit)})

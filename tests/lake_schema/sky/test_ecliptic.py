@@ -7,10 +7,10 @@ from astropy.coordinates import BarycentricMeanEcliptic, SkyCoord
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jobs.request import area
 from lake_schema import sky
 from lake_schema.errors import BadInput, OutOfRange
 from lake_schema.sky.ecliptic import ecliptic, equatorial, tile_corners, tile_count, tile_of
+from truesky.request import area
 
 
 def everywhere(n, seed=1):

@@ -1,0 +1,1 @@
+"""Lakes on S3-compatible object storage."""

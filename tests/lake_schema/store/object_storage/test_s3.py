@@ -1,0 +1,110 @@
+"""Where a lake on object storage lies, and how it is refused where none is."""
+
+import time
+
+import pytest
+
+from lake_schema import __main__
+from lake_schema.errors import BadInput, Damaged
+from lake_schema.store import layout, publish, read
+from lake_schema.store.object_storage import push, s3
+from tests.universe import plain_plan, plain_work, toy_plan, toy_work
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["s3://sky", "s3://sky/a/b", "s3://sky/a?endpoint_override=http://127.0.0.1:9000", "s3://sky/a?region=eu-west-1"],
+)
+def test_an_address_is_written_as_it_is_read(text):
+    assert str(s3.address(text)) == text
+    assert str(layout.opened(text)) == text
+    assert layout.opened(layout.opened(text)) == layout.opened(text)
+
+
+def test_an_endpoint_is_what_is_asked_for_or_named_or_in_the_environment(monkeypatch):
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://environment")
+    named = "s3://sky/a?endpoint_override=http://address"
+    assert s3.address("s3://sky/a").service == "http://environment"
+    assert s3.address(named).service == "http://address"
+    assert s3.address(named, "http://option").service == "http://option"
+    assert s3.address("s3://sky/a").key("galaxies", "x") == "a/galaxies/x"
+    assert s3.address("s3://sky").key("galaxies", "x") == "galaxies/x"
+    with pytest.raises(BadInput, match="an endpoint does not go with it"):
+        layout.opened("/lake", "http://option")
+
+
+@pytest.mark.parametrize(
+    ("text", "endpoint"),
+    [
+        ("s3://AKIA:hidden@sky/a", None),
+        ("s3://sky/a?access_key=AKIA&secret_key=hidden&region=eu-west-1", None),
+        ("s3://sky/a?endpoint_override=https://AKIA:hidden@host", None),
+        ("s3://sky/a", "https://AKIA:hidden@host"),
+        ("s3://AKIA:hidden@sky/a/../b", None),
+    ],
+)
+def test_no_credentials_are_shown(text, endpoint):
+    for open_it in (lambda: s3.address(text, endpoint), lambda: layout.lake(text)):
+        with pytest.raises(BadInput) as refused:
+            open_it()
+        assert "hidden" not in str(refused.value)
+        assert "AKIA" not in str(refused.value)
+        assert "s3://" in str(refused.value) or "host" in str(refused.value)
+
+
+def test_what_is_published_is_written_as_it_is_read():
+    told = s3.Published({"galaxies": "0" * 16}, {"demo": {"galaxies": "1" * 16}})
+    assert s3.published(told.written(), "here") == told
+    assert told.links() == {"galaxies/current": "v-" + "0" * 16, "names/demo/galaxies": "../../galaxies/v-" + "1" * 16}
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"", b"[]", b"{}", b'{"tables": {"a": "1"}, "names": {}}', b'{"tables": {"..": "0123456789abcdef"}, "names": {}}'],
+)
+def test_what_is_of_another_form_is_refused(data):
+    with pytest.raises(Damaged, match="here does not say"):
+        s3.published(data, "here")
+
+
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        ("s3://{}/nothing", "no lake was pushed there"),
+        ("s3://no-such-bucket/lake", "the bucket is another"),
+        ("s3://sky/lake?endpoint_override=http://127.0.0.1:9", "http://127.0.0.1:9 does not answer"),
+    ],
+)
+def test_where_no_lake_is_one_line_says_so(bucket, capsys, place, words):
+    began = time.monotonic()
+    assert __main__.main(["verify", place.format(bucket[1])]) == 2
+    said = capsys.readouterr().err
+    assert words in said
+    assert said.count("\n") == 1
+    assert time.monotonic() - began < 20
+
+
+def test_a_lake_is_looked_after_where_it_is(lake, bucket, capsys):
+    publish.make(lake, toy_plan(cells=((1607, 30),)), toy_work)
+    publish.make(lake, plain_plan(1), plain_work, name="first")
+    place = f"s3://{bucket[1]}"
+    assert push.main([str(lake), place]) == 0
+    capsys.readouterr()
+    for word in (["verify", "--deep"], ["describe"]):
+        said = []
+        for root in (place, str(lake)):
+            assert __main__.main([word[0], root, *word[1:]]) == 0
+            said.append(capsys.readouterr().out)
+        assert said[0] == said[1]
+    assert __main__.main(["list", place]) == 0
+    assert read.version(lake, "plain").key in capsys.readouterr().out
+    service, name = bucket
+    key = next(key for key in service.names(name) if key.endswith("/2.parquet"))
+    service.client.put_object(Bucket=name, Key=f"{key}.more", Body=b"x")
+    service.client.put_object(Bucket=name, Key=key, Body=b"x")
+    assert __main__.main(["verify", place]) == 1
+    said = capsys.readouterr().out
+    assert f"s3://{name}/{key} has 1 bytes" in said
+    assert f"s3://{name}/{key}.more is not in the manifest" in said
+    assert __main__.main(["gc", place]) == 2
+    assert "POSIX" in capsys.readouterr().err

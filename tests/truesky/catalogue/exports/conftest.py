@@ -1,0 +1,165 @@
+"""A small lake of galaxies of every kind and of stars, with their fluxes in LSST's bands."""
+
+from dataclasses import replace
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from lake_schema import ids, sky, units
+from lake_schema.store import layout, publish, read
+from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.tables.fluxes import fluxes
+from lake_schema.tables.galaxies import GALAXIES
+from lake_schema.tables.stars import STARS
+from lake_schema.units import LIGHT_ANGSTROM_S
+from truesky.fluxes import band_fluxes, passbands
+from truesky.fluxes.libraries import templates
+
+CELL = 8989
+BANDS = [f"lsst_{band}" for band in "ugrizy"]
+# So many galaxies are seen across the border of the cell in which they are kept.
+STRAYS = 3
+# Rows of three galaxies of given shapes, from and to.
+DRAWN = 12, 15
+
+
+def bands():
+    """LSST's passbands without what is below a thousandth of their peak, which the package leaves out of its own."""
+    found = []
+    for name in BANDS:
+        band = passbands.load(name)
+        inside = np.flatnonzero(band.response >= 1e-3 * band.response.max())
+        kept = slice(inside[0], inside[-1] + 1)
+        found.append(replace(band, wavelength=band.wavelength[kept], response=band.response[kept]))
+    return found
+
+
+def galaxies(n=40, seed=4):
+    """Rows of one cell: of four kinds, with lines of up to 100 A of continuum, sheared, behind dust."""
+    rng = np.random.default_rng(seed)
+    index, ra, dec = sky.random_in_cell(5, CELL, n, rng)
+    kind = rng.choice([0, 1, 2, 3], n, p=[0.5, 0.4, 0.05, 0.05])
+    kind[:4], kind[slice(*DRAWN)] = range(4), 0
+    far, mag = kind >= 2, rng.uniform(17.0, 26.0, n)
+    continuum = units.cgs_of_ujy(units.f_nu_of_mag(mag)) * LIGHT_ANGSTROM_S / 7000.0**2
+    z = np.where(far, rng.uniform(6.0, 6.5, n), rng.uniform(0.02, 2.3, n))
+    values = {c.name: np.full(n, max(c.lo or 0.0, 0.0)) for c in GALAXIES.earlier.columns if c.type.startswith("float")}
+    values |= {
+        "id": np.array([ids.source_id(int(k), CELL << 6, i) for i, k in enumerate(kind)]).ravel(),
+        "halo_id": np.arange(n),
+        "ra": ra,
+        "dec": dec,
+        "_healpix_29": index,
+        "ra_lensed": ra.copy(),
+        "dec_lensed": dec.copy(),
+        "kind": kind,
+        "density_boost": np.ones(n),
+        "z_true": z,
+        "z_obs": z + 1e-3 * (1 + z) * rng.normal(size=n),
+        "mag_r01": mag,
+        "abs_mag_r01": rng.uniform(-23.0, -16.0, n),
+        "frac_1": np.where(far, 1.0, rng.uniform(0.0, 1.0, n)),
+        "bulge_half_light_radius": rng.uniform(0.05, 0.5, n),
+        "disk_half_light_radius": rng.uniform(0.3, 1.5, n),
+        "bulge_fraction": rng.uniform(0.0, 1.0, n),
+        "bulge_color": np.full(n, 0.25),
+        "bulge_sersic_index": rng.uniform(0.5, 6.0, n),
+        "bulge_axis_ratio": rng.uniform(0.4, 1.0, n),
+        "disk_axis_ratio": rng.uniform(0.2, 1.0, n),
+        "position_angle": rng.uniform(0.0, 180.0, n),
+        "kappa": rng.normal(0.0, 0.03, n),
+        "gamma1": rng.normal(0.0, 0.03, n),
+        "gamma2": rng.normal(0.0, 0.03, n),
+        "a_v": rng.uniform(0.0, 0.5, n),
+    }
+    values["frac_2"] = 1.0 - values["frac_1"]
+    for k in (1, 2):
+        values[f"sed_{k}"] = np.where(far, rng.integers(0, 9, n), rng.integers(0, 31, n))
+        values[f"ext_law_{k}"] = np.where(far, 0, rng.integers(0, 5, n))
+        values[f"ebv_{k}"] = np.where(far, 0.0, rng.uniform(0.0, 0.5, n))
+    for name in ("halpha", "hbeta", "oii", "oiii", "nii", "sii"):
+        values[f"flux_{name}"] = continuum * rng.choice([0.0, 5.0, 30.0, 100.0], n)
+    # Some without a bulge at all, and with the sizes of nothing.
+    values["bulge_fraction"][5:8] = values["bulge_half_light_radius"][5:8] = 0.0
+    neighbour = sky.cell_centre(5, CELL + 1)
+    values["ra_lensed"][8 : 8 + STRAYS], values["dec_lensed"][8 : 8 + STRAYS] = neighbour
+    _to_be_drawn(values, slice(*DRAWN))
+    return GALAXIES.earlier.build(values)
+
+
+def _to_be_drawn(values, rows):
+    """One that is long and not lensed, two that are round and sheared; their light ends soon."""
+    values["bulge_fraction"][rows], values["bulge_sersic_index"][rows] = 0.3, 1.0
+    values["bulge_half_light_radius"][rows], values["disk_half_light_radius"][rows] = 0.3, 0.5
+    values["bulge_color"][rows] = 0.0
+    values["bulge_axis_ratio"][rows] = values["disk_axis_ratio"][rows] = [0.4, 1.0, 1.0]
+    values["position_angle"][rows] = 25.0
+    values["kappa"][rows], values["gamma1"][rows], values["gamma2"][rows] = 0.0, [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]
+
+
+def stars(n=30, seed=5):
+    """Rows of one cell: any template, behind up to 0.3 mag of dust."""
+    rng = np.random.default_rng(seed)
+    index, ra, dec = sky.random_in_cell(5, CELL, n, rng)
+    order = np.argsort(index)
+    return STARS.build(
+        {
+            "id": ids.source_id(5, CELL << 6, np.arange(n)),
+            "ra": ra[order],
+            "dec": dec[order],
+            "_healpix_29": index[order],
+            "component": np.zeros(n, int),
+            "sed": rng.integers(0, 444, n),
+            "mag_h": rng.uniform(10.0, 24.0, n),
+            "a_v": rng.uniform(0.0, 0.3, n),
+            "density_boost": np.ones(n),
+        }
+    )
+
+
+def published(lake, table, rows, order, facts):
+    plan = Plan(table, facts, (Part(layout.cell_file(order, CELL >> 2 * (5 - order)), {}),))
+    publish.make(lake, plan, lambda root, facts: Output(rows))
+    return plan.key
+
+
+def by_observed(rows, table):
+    """Rows of an earlier lake, in parts of CELL and the next as a lake of now has them: where they are seen."""
+    seen = {"ra": rows["ra_lensed"], "dec": rows["dec_lensed"], "ra_true": rows["ra"], "dec_true": rows["dec"]}
+    index = sky.healpix_29(rows["ra_lensed"].to_numpy(), rows["dec_lensed"].to_numpy())
+    values = seen | {"_healpix_29": index}
+    whole = table.build({name: values[name] if name in values else rows[name] for name in table.names}).sort_by(
+        "_healpix_29"
+    )
+    cells = sky.parent(whole["_healpix_29"].to_numpy(), sky.DEEPEST, 5)
+    return {layout.cell_file(5, cell): whole.filter(pa.array(cells == cell)) for cell in (CELL, CELL + 1)}
+
+
+def _published_parts(lake, table, parts, facts):
+    plan = Plan(table, facts, tuple(Part(name, {"name": name}) for name in parts))
+    publish.make(lake, plan, lambda root, facts: Output(parts[facts["name"]]))
+    return plan.key
+
+
+def lake_of_now(root):
+    """The same galaxies by observed positions, with their fluxes."""
+    rows = by_observed(galaxies(), GALAXIES)
+    light = {name: band_fluxes.galaxy_fluxes(some, bands(), templates.galaxy_library()) for name, some in rows.items()}
+    key = _published_parts(root, GALAXIES, rows, {})
+    _published_parts(root, fluxes("galaxy", BANDS), light, {"input": key})
+    return root
+
+
+@pytest.fixture(scope="module")
+def lake(tmp_path_factory):
+    root = tmp_path_factory.mktemp("lake")
+    rows, points = galaxies(), stars()
+    light = band_fluxes.galaxy_fluxes(rows, bands(), templates.galaxy_library())
+    published(
+        root, fluxes("galaxy", BANDS).earlier, light, 5, {"input": published(root, GALAXIES.earlier, rows, 5, {})}
+    )
+    light = band_fluxes.star_fluxes(points, bands(), templates.stellar_library())
+    published(root, fluxes("star", BANDS), light, 3, {"input": published(root, STARS, points, 3, {})})
+    assert read.version(root, "star_fluxes").num_rows == points.num_rows
+    return root

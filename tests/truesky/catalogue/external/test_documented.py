@@ -1,0 +1,20 @@
+"""docs/ingest.md names every column that a shipped format reads."""
+
+from pathlib import Path
+
+from truesky.catalogue.external import mapping
+
+PAGE = Path(__file__).resolve().parents[4] / "docs" / "ingest.md"
+
+
+def test_every_column_of_every_format_is_in_its_table():
+    rows = [
+        [cell.strip() for cell in line.split("|")[1:-1]] for line in PAGE.read_text().splitlines() if line[:1] == "|"
+    ]
+    found = {row[0].strip("`"): dict(zip(rows[0][1:], row[1:], strict=True)) for row in rows[2:]}
+    for form in mapping.formats():
+        columns = mapping.galaxies(form, {})
+        for key, field in columns.fields.items():
+            assert [name for name in field.titles() if f"`{name}`" not in found[key][form]] == [], (form, key)
+            assert field.unit in found[key][form]
+        assert {key for key, row in found.items() if row[form]} == set(columns.fields)

@@ -1,0 +1,92 @@
+"""The command: which job or module a word is, what is handed on, and what is refused."""
+
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from lake_schema import __version__
+from tests import requests
+from truesky.commands import __main__ as truesky
+from truesky.commands import submit
+from truesky.running import shell
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+@pytest.fixture
+def called(monkeypatch):
+    """What spark-submit would be given; every job but the second succeeds."""
+    calls = []
+
+    def call(command):
+        calls.append(command[1:])
+        return 7 * (len(calls) == 2)
+
+    monkeypatch.setattr(submit, "_call", call)
+    monkeypatch.setattr(submit, "_environment", lambda: Path("/environment"))
+    return calls
+
+
+def test_every_job_has_a_word():
+    modules = {f"truesky.{path.parent.name}.{path.stem}" for path in ROOT.glob("jobs/*/*.py")}
+    assert {module for modules in truesky.JOBS.values() for module in modules} == modules
+    assert all(callable(import_module(module).main) for module, _ in truesky.MODULES.values())
+    assert all(f" {word} " in f"{truesky.__doc__} " for word in (*truesky.JOBS, *truesky.MODULES))
+
+
+def test_a_job_is_given_what_the_command_is(called):
+    assert truesky.main(["fluxes", "--lake", "a b", "--request", "r", "--", "--master", "local[1]"]) == 0
+    file = str(ROOT / "truesky" / "running" / "submitted.py")
+    assert called == [
+        ["--master", "local[1]", file, "truesky.fluxes.compute_fluxes", "--lake", "a b", "--request", "r"]
+    ]
+
+
+def test_jobs_follow_one_another_until_one_fails(called):
+    words = ["build", "r.toml", "--lake", "x"]
+    assert truesky.main(words) == 7
+    assert truesky.main(words) == 0
+    assert [command[1].rpartition(".")[2] for command in called] == ["build_galaxies", "build_stars"] * 2
+    assert {tuple(command[2:]) for command in called} == {("--request", "r.toml", "--lake", "x")}
+
+
+def test_a_job_in_this_process_says_and_returns_the_same(tmp_path, capsys, called):
+    path = requests.written(tmp_path, "colour = 3")
+    words = ["--lake", str(tmp_path / "lake"), "--request", str(path)]
+    assert truesky.main(["--local", "plan", *words]) == 2
+    said = capsys.readouterr()
+    assert shell.main(import_module("truesky.render.plan_exposures").JOB, words) == 2
+    assert capsys.readouterr() == said
+    assert "colour" in said.err
+    assert called == []
+
+
+def test_help_and_forecasts_want_no_spark(capsys, called, tmp_path):
+    with pytest.raises(SystemExit, match="0"):
+        truesky.main(["render", "--help"])
+    assert "--detectors" in capsys.readouterr().out
+    words = ["plan", str(ROOT / "requests" / "demo.toml"), "--lake", str(tmp_path / "lake"), "--dry-run"]
+    assert truesky.main(words) == 0
+    assert "core-hours" in capsys.readouterr().out
+    assert called == []
+
+
+def test_modules_are_their_own(capsys, tmp_path):
+    assert truesky.main(["check", str(ROOT / "requests" / "demo.toml")]) == 0
+    assert capsys.readouterr().out.startswith("demo: good")
+    assert truesky.main(["mission", "diff", "CBE,BLT,DES,REQ,SIM", "CBE,BLT,DES,REQ,SIM"]) == 0
+    for words, start in ((["verify", str(tmp_path)], "lake_schema: "), (["sql", "--lake", "s3://x/y"], "explore: ")):
+        assert truesky.main(words) == 2
+        assert capsys.readouterr().err.startswith(start)
+
+
+def test_what_is_no_command_is_refused(capsys):
+    assert truesky.main(["rendr"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("truesky: rendr is no command of truesky: build, check,")
+    assert truesky.main(["--local", "render", "--", "--master", "local"]) == 2
+    assert "no spark-submit is called" in capsys.readouterr().err
+    for words in ([], ["--help"], ["--version"]):
+        assert truesky.main(words) == 0
+        assert f"truesky {__version__}" in capsys.readouterr().out

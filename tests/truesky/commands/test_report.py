@@ -1,0 +1,120 @@
+"""The report of a lake's runs: what is summed, what is not known, what is refused."""
+
+import json
+
+import pytest
+
+from lake_schema.errors import BadInput, Damaged, PartsFailed
+from lake_schema.store import layout, publish
+from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.tables.products import PRODUCTS
+from lake_schema.tables.tasks import TASKS
+from tests import requests
+from tests.universe import plain_plan, plain_work, rows_of
+from truesky.commands import report
+from truesky.request.from_toml import parse
+from truesky.running.shell import Job, Step
+from truesky.running.shell import run as run_job
+
+
+def log(root, name, *lines):
+    (folder := layout.runs(root)).mkdir(parents=True, exist_ok=True)
+    (folder / f"{name}.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
+def part(name, **about):
+    return {"job": "draw", "part": name, "seconds": 2.0, "cpu_s": 1.5, "peak_gb": 0.5, **about}
+
+
+def test_runs_add_up(lake):
+    first = {"job": "draw", "table": "x", "prepare_s": 3.0, "prepare_cpu_s": 2.0}
+    log(
+        lake,
+        "1-x-1",
+        first,
+        part("a", rows=10, bytes=2 * 10**9),
+        part("b", error="no"),
+        {"seconds": 5.0, "status": "failed"},
+    )
+    log(lake, "2-x-1", first, part("b", rows=5, bytes=10**9, peak_gb=0.75), {"seconds": 4.0, "status": "done"})
+    log(lake, "3-y-1", {"job": "other"}, part("c", rows=1))
+    one, other, total = report.rows(lake)
+    assert (one.job, one.runs, one.failed_runs, one.stopped, one.parts, one.failed) == ("draw", 2, 1, 0, 2, 1)
+    assert (one.rows, one.seconds, one.cpu_s, one.gb, one.peak_gb) == (15, 15.0, 8.5, 3.0, 0.75)
+    assert (other.job, other.stopped, other.parts, other.seconds) == ("other", 1, 1, 0.0)
+    assert (total.job, total.runs, total.parts, total.rows, total.peak_gb) == ("all", 3, 3, 16, 0.75)
+
+
+def test_a_run_makes_several_tables(lake):
+    """A log each; the number of its process ends their names, and may come again."""
+    for name in ("1-x-7", "2-y-7", "3-x-8", "4-x-7"):
+        log(lake, name, {"job": "draw", "table": name[2]}, part("a", rows=1), {"seconds": 1.0, "status": "done"})
+    assert (report.rows(lake)[0].runs, report.rows(lake)[0].parts) == (3, 4)
+
+
+def test_what_is_not_known_is_said(lake, capsys):
+    log(lake, "1-x-1", {"job": "draw"}, part("a", rows=10), {"seconds": 5.0, "status": "done"})
+    assert report.main([str(lake)]) == 0
+    head, line, total = capsys.readouterr().out.splitlines()
+    assert len({len(head), len(line), len(total)}) == 1
+    assert line.split()[-4:] == ["-", "-", "-", "0.50"]
+    assert report.main([str(lake), "--json"]) == 0
+    first, _ = map(json.loads, capsys.readouterr().out.splitlines())
+    assert (first["job"], first["rows"], first["gb"], first["forecast_s"]) == ("draw", 10, None, None)
+
+
+def test_what_a_job_writes_is_read(tmp_path):
+    """By the shell that writes the logs: every part, its bytes, and what came before the first."""
+    root, request = tmp_path / "lake", requests.written(tmp_path)
+    plan = plain_plan(1, parts=3)
+    job = Job("toy", "", lambda lake, request: [Step(plan, plain_work, on_driver=True)])
+    run_job(job, root, parse(request))
+    line, _ = report.rows(root)
+    version = layout.version(root, plan.table.name, plan.key)
+    size = sum(path.stat().st_size for path in (version / "dataset").iterdir())
+    assert (line.job, line.runs, line.parts, line.failed) == ("toy", 1, 3, 0)
+    assert line.gb * 1e9 == pytest.approx(size)
+    assert line.seconds > 0.0
+
+    def fails(lake, facts):
+        raise BadInput("no")
+
+    other = Job("toy", "", lambda lake, request: [Step(plain_plan(2, parts=3), fails, on_driver=True)])
+    with pytest.raises(PartsFailed):
+        run_job(other, root, parse(request))
+    line, _ = report.rows(root)
+    assert (line.runs, line.failed_runs, line.parts, line.failed) == (2, 1, 3, 3)
+
+
+def rendered(lake, name, detectors):
+    """A lake's products of some detectors of exposure 0, (name, digest of what shapes it) each, and their tasks."""
+    n = len(detectors)
+    columns = {key: rows_of(TASKS, n)[key] for key in TASKS.names}
+    columns |= {"exposure_id": [0] * n, "detector": [detector for detector, _ in detectors]}
+    tasks = TASKS.build({**columns, "seconds": [10.0] * n, "bytes": [10**9] * n})
+    planned = Plan(TASKS, {"of": name}, (Part("all.parquet", {}),))
+    publish.make(lake, planned, lambda root, facts: Output(tasks), name=name)
+    parts = (Part(f"{d}.parquet", {"exposure_id": 0, "detector": d, "product": shape}) for d, shape in detectors)
+    plan = Plan(PRODUCTS, {"inputs": {"tasks": planned.key}}, tuple(parts))
+    publish.make(lake, plan, lambda root, facts: Output(PRODUCTS.empty()), name=name)
+
+
+def test_the_forecast_is_of_all_requests(lake):
+    """A detector that is the same in two of them is made once."""
+    log(lake, "1-products-1", {"job": "render_exposures"}, part("a", rows=1), {"seconds": 5.0, "status": "done"})
+    rendered(lake, "a", [("3-4", "x"), ("3-5", "y")])
+    line, _ = report.rows(lake)
+    factor = line.forecast_s / 20.0
+    assert line.forecast_gb == pytest.approx(2.0)
+    rendered(lake, "b", [("3-4", "x"), ("3-5", "z")])
+    line, total = report.rows(lake)
+    assert (line.forecast_s, line.forecast_gb) == pytest.approx((30.0 * factor, 3.0))
+    assert total.forecast_gb == pytest.approx(3.0)
+
+
+def test_a_lake_without_logs_and_a_damaged_log_are_refused(lake, capsys):
+    assert report.main([str(lake)]) == 2
+    assert "no run has left a log" in capsys.readouterr().err
+    log(lake, "1-x-1", {"job": "draw"}, part("a", rows="ten"), {"status": "done"})
+    with pytest.raises(Damaged, match="line 2 is not what a run writes"):
+        report.rows(lake)

@@ -1,0 +1,124 @@
+"""A whole run: which jobs a request needs, what is refused before the first of them, what it ends with."""
+
+import re
+from collections import namedtuple
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from lake_schema.errors import BadInput
+from lake_schema.store import layout
+from tests import requests
+from truesky.commands import run, space
+from truesky.numerics import cache
+from truesky.render import plan_exposures
+from truesky.request.from_toml import parse
+
+DEMO = Path(__file__).resolve().parents[3] / "requests" / "demo.toml"
+Disc = namedtuple("Disc", "total used free")
+
+
+def names(stages):
+    return [stage.name for stage in stages]
+
+
+def test_the_jobs_of_a_request(tmp_path):
+    images, catalogues = parse(DEMO), parse(requests.written(tmp_path))
+    drawn = ["build_galaxies", "build_stars", "compute_fluxes"]
+    assert names(run.stages(catalogues)) == drawn
+    assert names(run.stages(images)) == [*drawn, "plan_exposures", "render_exposures"]
+    wanted = run.stages(replace(images, detectors=("3-4",), limit=2), lenses=True, with_gaia=True)
+    assert names(wanted)[2:5] == ["build_strong_lenses", "compute_fluxes", "build_gaia"]
+    told = {stage.name: stage.options for stage in wanted}
+    assert told["compute_fluxes"] == ("--bands", *images.bands, "gaia_g", "gaia_bp", "gaia_rp")
+    assert told["render_exposures"] == ("--detectors", "3-4", "--limit", "2")
+    assert told["plan_exposures"] == ()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--detectors", "3-4", "9-9"], "detectors: 9-9 is not in the plan of request demo, which has 3-4"),
+        (["--limit", "0"], "limit = 0"),
+        (["--pictures", str(DEMO)], "demo.toml"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_before_the_first_job(tmp_path, capsys, words, said):
+    lake = tmp_path / "lake"
+    assert run.main([str(DEMO), "--lake", str(lake), *words], pytest.fail) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("truesky: ")
+    assert said in line
+    assert not lake.exists()
+
+
+def test_a_disc_without_room_is_refused_before_the_first_job(tmp_path, capsys, monkeypatch):
+    asked = []
+    monkeypatch.setattr(space.shutil, "disk_usage", lambda path: asked.append(path) or Disc(1e12, 1e12 - 4e8, 4e8))
+    lake, words = tmp_path / "not" / "there", ["--pictures", str(tmp_path / "pictures")]
+    assert run.main([str(DEMO), "--lake", str(lake), *words], pytest.fail) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "0.40 GB are free, the forecast is 0." in line
+    assert asked == [tmp_path]
+    # One detector of LSST's, and there is room.
+    assert run.main([str(DEMO), "--lake", str(lake), "--detectors", "R22_S11"], lambda *job: 5) == 5
+
+
+def test_what_an_earlier_run_of_the_name_left_is_no_room(lake, monkeypatch):
+    """A version that the request would not make, whatever its name, makes none of its forecast true."""
+    request, free = parse(DEMO), 2e8
+    monkeypatch.setattr(space.shutil, "disk_usage", lambda path: Disc(1e12, 1e12 - free, free))
+    folder = layout.stage(lake, "products", "c" * 16)
+    folder.mkdir(parents=True)
+    with (folder / "x").open("wb") as stream:
+        stream.truncate(int(3e8))
+    (runs := layout.runs(lake)).mkdir(exist_ok=True)
+    (runs / "1.jsonl").write_text(f'{{"request": "demo", "table": "products", "key": "{"c" * 16}"}}\n')
+    with pytest.raises(BadInput, match=r"0\.20 GB are free"):
+        space.check(lake, request, run.plan_exposures.plan(lake, request)[1:])
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_run_ends_with_the_first_job_that_fails(tmp_path, capsys, monkeypatch, compiled):
+    started, planned = [], plan_exposures.check
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "code"))
+
+    def compiling(*known):
+        """Planning compiles a little, and so it may once have done something of the renderer."""
+        (folder := cache.machine_code_dir() / "kernels_0").mkdir(parents=True, exist_ok=True)
+        (folder / "some.nbi").touch()
+        return planned(*known)
+
+    if compiled:
+        compiling(parse(DEMO), layout.lake(tmp_path / "lake"))
+    monkeypatch.setattr(plan_exposures, "check", compiling)
+
+    def start(module, arguments):
+        started.append((module.rpartition(".")[2], *arguments))
+        return 3 * (len(started) == 2)
+
+    root = layout.lake(tmp_path / "lake")
+    assert run.main([str(DEMO), "--lake", str(root)], start) == 3
+    told = ("--lake", str(root), "--request", str(DEMO))
+    assert started == [("build_galaxies", *told), ("build_stars", *told)]
+    first, *others = capsys.readouterr().out.splitlines()
+    # What it will take is said first.
+    assert re.fullmatch(
+        r"forecast: 2 detectors, 0\.\d\d core-hours of this machine \(.*\), 0\.\d\d h on 2 cores; 0\.\d\d GB to write, "
+        r"[\d.]+ GB are free",
+        first,
+    )
+    # And that it takes longer the first time.
+    if not compiled:
+        assert "not been compiled" in others.pop(0)
+    assert others == ["", "build_galaxies ...", "build_stars ..."]
+
+
+def test_what_a_later_job_would_refuse_is_refused_first(tmp_path, capsys):
+    """An area without the detectors' sky, which the last job would find out."""
+    path = tmp_path / "small.toml"
+    path.write_text(DEMO.read_text().replace("radius = 0.2", "radius = 0.001"))
+    assert run.main([str(path), "--lake", str(tmp_path / "lake")], pytest.fail) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "area" in line

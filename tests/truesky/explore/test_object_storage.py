@@ -1,0 +1,82 @@
+"""A lake on object storage, asked as one in a folder is, and by what others read lakes with."""
+
+import pytest
+
+from lake_schema.errors import BadInput, Damaged
+from lake_schema.store import layout, read
+from lake_schema.store.object_storage import push, s3
+from truesky.explore import __main__
+from truesky.explore.explorer import Explorer
+from truesky.explore.object_storage import catalogue
+
+
+@pytest.fixture
+def there(explored, bucket):
+    """Address of the lake of this folder, pushed."""
+    place = s3.address(f"s3://{bucket[1]}/lake", bucket[0].url)
+    list(push.push(explored, place))
+    return str(place)
+
+
+def test_questions_have_the_same_answers(explored, there, monkeypatch):
+    # The address alone says which service it is.
+    monkeypatch.delenv("AWS_ENDPOINT_URL")
+    joined = (
+        "SELECT count(*) AS n, sum(f_nu_euclid_vis) AS s FROM galaxies JOIN galaxy_fluxes USING (id) WHERE z_obs > 1"
+    )
+    with Explorer(explored) as near, Explorer(there) as far:
+        for text in (joined, "SELECT * FROM galaxies ORDER BY id", "SELECT * FROM plain ORDER BY id"):
+            here = near.sql(text, into="arrow")
+            assert far.sql(text, into="arrow").equals(here, check_metadata=True)
+        ra, dec = (near.sql(f"SELECT {name} FROM galaxies LIMIT 1")[name][0] for name in ("ra", "dec"))
+        assert far.cone("galaxies", ra, dec, 0.2).equals(near.cone("galaxies", ra, dec, 0.2))
+        assert far.tables().equals(near.tables())
+        with pytest.raises(BadInput, match="has no table nothing"):
+            far.describe("nothing")
+
+
+def test_the_command_takes_an_address(there, capsys, bucket):
+    place, _, _ = there.partition("?")
+    assert __main__.main(["SELECT count(*) AS n FROM galaxies", "--lake", place, "--endpoint-url", bucket[0].url]) == 0
+    assert "500" in capsys.readouterr().out
+    assert __main__.main(["SELECT 1", "--lake", f"{place}/other"]) == 2
+    assert "no lake was pushed there" in capsys.readouterr().err
+
+
+def test_a_changed_object_is_refused_by_name_in_sql(there, bucket):
+    service, name = bucket
+    with Explorer(there) as lake:
+        assert lake.sql("SELECT count(*) AS n FROM plain")["n"][0] == 60
+        key = next(key for key in service.names(name) if key.endswith("/1.parquet"))
+        data = service.data(name, key)
+        service.client.put_object(Bucket=name, Key=key, Body=data[:50] + bytes([data[50] ^ 1]) + data[51:])
+        with pytest.raises(Damaged, match=f"s3://{name}/{key} "):
+            lake.sql("SELECT sum(value) FROM plain")
+
+
+def test_lsdb_reads_it_through_pyarrow(explored, there, monkeypatch):
+    import lsdb
+
+    monkeypatch.delenv("AWS_ENDPOINT_URL")
+    galaxies = lsdb.open_catalog(catalogue(there, "galaxies"), columns="all")
+    assert len(galaxies.compute()) == 500
+    here = read.version(explored, "galaxies")
+    ra, dec = (here.rows()[name][0].as_py() for name in ("ra", "dec"))
+    found = galaxies.cone_search(ra, dec, 1800.0).compute()
+    assert sorted(found["id"]) == sorted(here.cone(ra, dec, 0.5)["id"].to_pylist())
+    assert 0 < len(found) < 500
+    with pytest.raises(BadInput, match="plain is no catalogue"):
+        catalogue(there, "plain")
+    with pytest.raises(BadInput, match="is no address"):
+        catalogue(str(explored), "galaxies")
+
+
+def test_duckdb_reads_it_through_a_dataset(explored, there):
+    import duckdb
+
+    rows = read.version(layout.opened(there), "galaxies").dataset()
+    assert rows.count_rows() == 500
+    n, least = duckdb.sql("SELECT count(*), min(z_obs) FROM rows").fetchall()[0]
+    here = read.version(explored, "galaxies").rows(["z_obs"])["z_obs"].to_numpy()
+    assert n == 500
+    assert least == here.min()

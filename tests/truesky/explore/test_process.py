@@ -1,0 +1,104 @@
+"""The process of queries: results piece by piece, its session kept open, and nothing of one answer in the next."""
+
+import pytest
+
+from lake_schema.errors import BadInput, Damaged
+from lake_schema.store import publish, read
+from tests.universe import plain_plan, plain_work
+from truesky.explore.process import Process
+from truesky.explore.session import Session
+
+
+@pytest.fixture(scope="module")
+def process(explored):
+    process = Process(explored, [f"plain={read.version(explored, 'plain').key}"], 1e9)
+    yield process
+    process.close()
+
+
+def numbers(batches):
+    return [value for batch in batches for value in batch.column(0).to_pylist()]
+
+
+def test_so_many_rows(process):
+    assert numbers(process.batches("SELECT * FROM range(1000000)", rows=100_001)) == list(range(100_001))
+    assert numbers(process.batches("SELECT * FROM range(5)", rows=9)) == list(range(5))
+    (empty,) = process.batches("SELECT 1::HUGEINT AS a WHERE false")
+    assert (empty.num_rows, str(empty.schema.field("a").type)) == (0, "int64")
+
+
+def test_a_result_that_is_too_large(process):
+    with pytest.raises(BadInput, match="needs more memory"):
+        list(process.batches("SELECT * FROM range(10000000)", most_bytes=1_000_000))
+
+
+def test_an_error_in_the_midst(process):
+    """Some pieces have come before it is known; the same process then answers the next question."""
+    process.ask("SELECT 1", {})
+    worker, got = process._worker, []
+    late = "SELECT CASE WHEN range = 4900000 THEN error('no') ELSE range END FROM range(5000000)"
+
+    def read_on():
+        for batch in process.batches(late):
+            got.append(batch.num_rows)
+
+    with pytest.raises(BadInput, match=r"SQL: .*no"):
+        read_on()
+    assert 0 < sum(got) < 5_000_000
+    assert process.ask("SELECT 7 AS a", {})["a"].to_pylist() == [7]
+    assert process._worker is worker
+
+
+def test_who_reads_no_further_meets_no_rest(process):
+    batches = process.batches("SELECT range + 100 FROM range(100000000)")
+    assert next(batches).num_rows >= 0
+    batches.close()
+    assert numbers(process.batches("SELECT 7 AS a")) == [7]
+
+
+def test_what_is_read_no_further_ends_no_later_answer(process):
+    """However late it is found out: a generator that failed is kept alive by the traceback of its error."""
+    given_up = process.batches("SELECT range + 100 FROM range(100000000)")
+    assert next(given_up).num_rows >= 0
+    later = process.batches("SELECT range FROM range(3000000)")
+    first = next(later)
+    worker = process._worker
+    given_up.close()
+    assert process._worker is worker
+    assert numbers([first, *later]) == list(range(3_000_000))
+
+
+def test_it_is_stopped_while_it_sends(process):
+    slow = "SELECT count(*) FROM range(100000) a, range(100000) b WHERE a.range * b.range % 7 = 3"
+    with pytest.raises(BadInput, match=r"stopped after 0\.3 s"):
+        list(process.batches(slow, timeout=0.3))
+    assert numbers(process.batches("SELECT 7 AS a")) == [7]
+
+
+def test_the_session_is_kept_and_begins_anew_after_an_error(lake):
+    publish.make(lake, plain_plan(), plain_work)
+    version = read.version(lake, "plain")
+    session = Session(lake, {"plain": version.key}, 1 << 30)
+
+    def ask(text):
+        return numbers(session.run(session.checked(text), {}))
+
+    assert ask("SELECT count(*) FROM plain") == [60]
+    kept = session._database
+    assert ask("SELECT sum(value) FROM plain") == [60.0]
+    assert session._database is kept
+    with pytest.raises(BadInput, match="nothing"):
+        ask("SELECT nothing FROM plain")
+    assert session._database is None
+    assert ask("SELECT count(*) FROM plain") == [60]
+    # A page that was compared for one question is compared again for the next.
+    path = version.path("1.parquet")
+    data = bytearray(path.read_bytes())
+    data[60] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(Damaged):
+        ask("SELECT sum(value), sum(id) FROM plain")
+    data[60] ^= 1
+    path.write_bytes(data)
+    assert ask("SELECT sum(value) FROM plain") == [60.0]
+    session.close()

@@ -1,0 +1,212 @@
+"""The cache: one make a key, published whole, mapped read-only."""
+
+import os
+
+import numpy as np
+import pytest
+
+from lake_schema.errors import BadInput
+from lake_schema.store import blocks
+from truesky.numerics import cache
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("TRUESKY_CACHE", str(tmp_path / "cache"))
+
+
+def test_folder_is_named_by_the_environment(monkeypatch, tmp_path):
+    assert cache.cache_dir() == tmp_path / "cache"
+    monkeypatch.delenv("TRUESKY_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    assert cache.cache_dir() == tmp_path / "xdg" / "truesky"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert cache.cache_dir() == tmp_path / ".cache" / "truesky"
+
+
+def test_keys_tell_parts_types_and_shapes_apart():
+    flat = np.arange(6.0)
+    keys = [
+        cache.content_key("ab", "c"),
+        cache.content_key("a", "bc"),
+        cache.content_key(b"ab", "c"),
+        cache.content_key("abc"),
+        cache.content_key(1),
+        cache.content_key(1.0),
+        cache.content_key("1"),
+        cache.content_key(flat),
+        cache.content_key(flat.reshape(2, 3)),
+        cache.content_key(flat.astype(np.float32)),
+        cache.content_key(flat, flat),
+    ]
+    assert len(set(keys)) == len(keys)
+
+
+def test_key_is_of_the_content_not_of_the_memory_layout():
+    square = np.arange(9.0).reshape(3, 3)
+    assert cache.content_key(square.T) == cache.content_key(np.ascontiguousarray(square.T))
+    assert cache.content_key(square.T) != cache.content_key(square)
+
+
+@pytest.mark.parametrize("part", [None, True, {"a": 1}, np.array([object()])])
+def test_keys_refuse_what_has_no_canonical_bytes(part):
+    with pytest.raises(BadInput):
+        cache.content_key(part)
+
+
+def test_made_once_then_mapped():
+    calls = []
+
+    def make():
+        calls.append(1)
+        return {"flux": np.arange(5.0), "names": np.array(["a", "b"])}
+
+    first = cache.cached_arrays("thing", cache.content_key("k"), make)
+    again = cache.cached_arrays("thing", cache.content_key("k"), make)
+    assert len(calls) == 1
+    np.testing.assert_array_equal(first["flux"], again["flux"])
+    assert list(again["names"]) == ["a", "b"]
+    with pytest.raises(ValueError, match="read-only"):
+        again["flux"][0] = 1.0
+    cache.cached_arrays("thing", cache.content_key("other"), make)
+    assert len(calls) == 2
+
+
+def test_a_failed_make_leaves_nothing():
+    def make():
+        raise RuntimeError("no")
+
+    with pytest.raises(RuntimeError):
+        cache.cached_arrays("thing", "0" * 64, make)
+    with pytest.raises(ValueError, match="allow_pickle"):
+        cache.cached_arrays("thing", "0" * 64, lambda: {"a": np.ones(2), "b": np.array([object()])})
+    with pytest.raises(BadInput, match="nothing to store"):
+        cache.cached_arrays("thing", "0" * 64, dict)
+    assert os.listdir(cache.cache_dir()) == []
+
+
+def test_the_loser_of_a_race_uses_the_winners_arrays():
+    key = "1" * 64
+
+    def slow():
+        cache.cached_arrays("thing", key, lambda: {"a": np.full(3, 1.0)})
+        return {"a": np.full(3, 2.0)}
+
+    assert cache.cached_arrays("thing", key, slow)["a"].tolist() == [1.0, 1.0, 1.0]
+    assert len(os.listdir(cache.cache_dir())) == 1
+
+
+def test_an_array_cut_short_is_made_again():
+    key = "2" * 64
+    cache.cached_arrays("thing", key, lambda: {"a": np.arange(1000.0)})
+    (file,) = cache.cache_dir().glob("*/a.npy")
+    file.write_bytes(file.read_bytes()[:200])
+    assert cache.cached_arrays("thing", key, lambda: {"a": np.zeros(3)})["a"].tolist() == [0.0] * 3
+
+
+def made_again(key, value):
+    """The arrays of a key, made of this value where they are made."""
+    return cache.cached_arrays("thing", key, lambda: {"a": np.full(1000, value), "b": np.full(3, value)})
+
+
+@pytest.mark.parametrize("step", [1009, pytest.param(7, marks=pytest.mark.nightly)])
+def test_a_changed_bit_is_made_again_and_said(caplog, monkeypatch, step):
+    """Of the arrays, their headers, and the list of their checksums."""
+    monkeypatch.setattr(os, "fsync", lambda descriptor: None)
+    key, files = "4" * 64, 0
+    made_again(key, 1.0)
+    for path in sorted(cache.cache_dir().glob("*/*")):
+        whole = path.read_bytes()
+        for bit in range(0, 8 * len(whole), step):
+            data = bytearray(whole)
+            data[bit // 8] ^= 1 << bit % 8
+            path.write_bytes(data)
+            caplog.clear()
+            found = made_again(key, 2.0)
+            if path.suffix == ".npy" or found["a"][0] == 2.0:
+                assert set(found["a"].tolist()) == set(found["b"].tolist()) == {2.0}, f"bit {bit} of {path}"
+                (line,) = (record.getMessage() for record in caplog.records)
+                assert str(path.parent) in line
+                assert line.endswith(": made again")
+                assert "\n" not in line
+            else:
+                # White space of the list.
+                assert set(found["a"].tolist()) == set(found["b"].tolist()) == {1.0}
+            made = cache.cache_dir() / path.parent.name
+            assert sorted(os.listdir(cache.cache_dir())) == [made.name]
+            if found["a"][0] == 2.0:
+                for file in made.iterdir():
+                    file.unlink()
+                made.rmdir()
+            else:
+                path.write_bytes(whole)
+            made_again(key, 1.0)
+        files += 1
+    assert files == 3
+
+
+def test_zeroed_blocks_are_made_again():
+    key = "5" * 64
+    cache.cached_arrays("thing", key, lambda: {"a": np.arange(1e5)})
+    (file,) = cache.cache_dir().glob("*/a.npy")
+    with file.open("r+b") as stream:
+        stream.seek(4096 * 20)
+        stream.write(bytes(4096))
+    again = cache.cached_arrays("thing", key, lambda: {"a": np.arange(1e5)})
+    np.testing.assert_array_equal(again["a"], np.arange(1e5))
+
+
+def test_a_process_compares_a_file_once(monkeypatch):
+    key, seen = "6" * 64, []
+    made_again(key, 1.0)
+    real = blocks.crc32
+    monkeypatch.setattr(blocks, "crc32", lambda path: seen.append(path.name) or real(path))
+    for _ in range(3):
+        made_again(key, 2.0)
+    assert seen == []
+    for path in cache.cache_dir().glob("*/*.npy"):
+        os.utime(path)
+    for _ in range(3):
+        assert made_again(key, 2.0)["a"][0] == 1.0
+    assert sorted(seen) == ["a.npy", "b.npy"]
+
+
+def test_what_is_stored_is_synced_before_it_has_its_name(monkeypatch):
+    calls = []
+    rename, fsync = os.rename, os.fsync
+    monkeypatch.setattr(os, "fsync", lambda fd: calls.append(os.readlink(f"/proc/self/fd/{fd}")) or fsync(fd))
+    monkeypatch.setattr(os, "rename", lambda a, b: calls.append(f"rename {b}") or rename(a, b))
+    made_again("7" * 64, 1.0)
+    (last,) = (i for i, call in enumerate(calls) if call.startswith("rename"))
+    synced = {os.path.basename(call) for call in calls[:last]}
+    assert {"a.npy", "b.npy"} <= synced
+    assert any(call.endswith((".tmp", "sums.json")) for call in calls[:last])
+    assert str(cache.cache_dir()) in calls[last:]
+
+
+def test_arrays_of_an_older_version_are_made_again_in_silence(caplog):
+    key = "8" * 64
+    made_again(key, 0.0)
+    (seal,) = cache.cache_dir().glob("*/sums.json")
+    seal.rename(seal.with_name("arrays.txt"))
+    assert made_again(key, 1.0)["a"][0] == 1.0
+    assert caplog.records == []
+
+
+@pytest.mark.parametrize("name", ["../evil", "a/b", "", ".hidden"])
+def test_names_stay_inside(name):
+    with pytest.raises(BadInput):
+        cache.cached_arrays(name, "3" * 64, lambda: {"a": np.zeros(1)})
+    with pytest.raises(BadInput):
+        cache.cached_arrays("fine", "3" * 64, lambda: {name: np.zeros(1)})
+
+
+def test_another_kind_of_machine_makes_its_own(monkeypatch):
+    def made(value):
+        return cache.cached_arrays("toy", "k" * 32, lambda: {"a": np.array([value])})["a"][0]
+
+    assert [made(1), made(2)] == [1, 1]
+    monkeypatch.setattr(cache, "machine", lambda: "another")
+    assert [made(3), made(4)] == [3, 3]
+    monkeypatch.undo()

@@ -1,0 +1,59 @@
+"""What is compiled gives the same bytes, whether a process compiles it or finds it in the cache."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from truesky.numerics import cache
+
+# A kernel whose inner function sums in any order.
+SCRIPT = """
+import hashlib
+import numpy as np
+from truesky.render.effects.readout.traps import Sweeps, Traps, shifted
+frame = np.random.default_rng(1).poisson(100, (2000, 300)).astype(float)
+moved, held = shifted(frame, Traps((0.02, 0.03, 0.95), (0.8, 3.5, 20.0), 2e5, 0.0, 0.58), Sweeps(1, 2), -2)
+print(hashlib.sha256(moved.tobytes()).hexdigest(), held.hex())
+"""
+
+
+def test_machine_code_is_kept_in_the_cache(tmp_path):
+    """Beside the sources it would be looked up by its own file alone, whatever is compiled into it."""
+    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    code = "from truesky.numerics import cache, compiling; import numba; "
+    code += "print(cache.machine_code_dir(), numba.config.CACHE_DIR)"
+    command = [sys.executable, "-c", code]
+    environment["TRUESKY_CACHE"] = str(tmp_path)
+    wanted, used = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.split()
+    assert used == wanted
+    assert Path(used).is_relative_to(tmp_path)
+
+
+@pytest.mark.nightly
+def test_compiled_here_or_found_in_the_cache(tmp_path):
+    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    environment["TRUESKY_CACHE"] = str(tmp_path)
+    command = [sys.executable, "-c", SCRIPT]
+    first, second = (
+        subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout for _ in range(2)
+    )
+    assert list(tmp_path.glob("numba/**/*.nbc"))
+    assert first == second
+    assert len(first.split()) == 2
+
+
+def test_machine_code_is_of_the_sources_as_they_are(tmp_path):
+    """Also of those that are compiled into others."""
+    assert cache.machine_code_dir().name == cache.sources_key()[:16]
+    (tmp_path / "effects").mkdir()
+    inner, plain = tmp_path / "effects" / "pixel_random.py", tmp_path / "units.py"
+    inner.write_text("from truesky.numerics.compiling import jit\n")
+    plain.write_text("")
+    first = cache.sources_key(tmp_path)
+    plain.write_text("MILE = 1609.344\n")
+    assert cache.sources_key(tmp_path) == first
+    inner.write_text("from truesky.numerics.compiling import jit\n\n")
+    assert cache.sources_key(tmp_path) != first

@@ -1,0 +1,210 @@
+"""The page in a browser: every view, the address, themes, keys; no error, and no request to another host."""
+
+import re
+import time
+from pathlib import Path
+
+import pytest
+
+import truesky.page as page_package
+from lake_schema.store import publish
+from tests.truesky.page.browsing import VIEWS, canvas_colours, tab_of, until
+from tests.truesky.page.conftest import published, serving
+from tests.universe import plain_plan, plain_work
+
+
+def test_every_view_is_drawn(tab):
+    for number, view in enumerate(VIEWS, start=1):
+        tab.keyboard.press(str(number))
+        until(tab, f"!document.getElementById('{view}').hidden")
+        assert tab.get_attribute(f"#tab-{view}", "aria-selected") == "true"
+        if view == "sky":
+            until(tab, "document.getElementById('sky-legend').textContent.includes('deg')")
+            assert canvas_colours(tab, "#sky .stage") > 30
+        if view == "plots":
+            until(tab, "document.getElementById('plot-state').textContent.includes('rows')")
+            assert canvas_colours(tab, "#plot-grid figure.map canvas") > 20
+        if view == "sql":
+            until(tab, "document.querySelectorAll('#sql-result td').length > 0")
+        if view == "images":
+            until(tab, "document.getElementById('image-one').childElementCount === 3")
+            time.sleep(1.0)
+            assert canvas_colours(tab, "#image-canvas") > 30
+        if view == "runs":
+            until(tab, "document.querySelectorAll('#runs-content h2').length > 2")
+
+
+def test_all_modules_are_asked_for_at_once():
+    static = Path(page_package.__file__).with_name("static")
+    text = (static / "index.html").read_text()
+    assert set(re.findall(r'modulepreload" href="/static/(\w+)\.js"', text)) | {"app"} == {
+        path.stem for path in static.glob("*.js")
+    }
+
+
+def test_the_first_sky_waits_for_no_other_question(tab):
+    asked = "performance.getEntriesByType('resource').filter((one) => /(regions|bands|parts)$/.test(one.name))"
+    until(tab, f"{asked}.length === 3 && {asked}.every((one) => one.responseEnd > 0)")
+    times = tab.evaluate(f"Object.fromEntries({asked}.map((one) => [one.name.split('/').pop(), one.startTime]))")
+    assert times["parts"] == min(times.values())
+
+
+def test_a_lake_that_is_published_anew_is_announced(browser, tmp_path):
+    root = tmp_path / "lake"
+    root.mkdir()
+    published(root)
+    with serving(root) as page, tab_of(browser, page) as tab:
+        assert tab.locator("#changed").is_hidden()
+        old = page.server.lake.key
+        publish.make(root, plain_plan(2), plain_work)
+        # The page looks by itself every half a minute, and whenever it is loaded.
+        tab.reload()
+        until(tab, "!document.getElementById('changed').hidden")
+        assert page.server.lake.key == old
+        tab.click("#reopen")
+        until(tab, "document.body.dataset.ready === '1' && document.getElementById('changed').hidden")
+        assert page.server.lake.key != old
+        assert page.server.lake.key in tab.inner_text("#version")
+
+
+def test_a_tab_is_told_of_what_another_has_opened(browser, tmp_path):
+    root = tmp_path / "lake"
+    root.mkdir()
+    published(root)
+    with serving(root) as page, tab_of(browser, page) as tab, tab_of(browser, page) as other:
+        old = page.server.lake.key
+        publish.make(root, plain_plan(2), plain_work)
+        tab.reload()
+        until(tab, "!document.getElementById('changed').hidden")
+        tab.click("#reopen")
+        until(tab, "document.body.dataset.ready === '1' && document.getElementById('changed').hidden")
+        assert page.server.lake.key != old
+        # What the page does every half a minute: nothing of the new lake gets between what is shown of the old one.
+        learnt = "import('/static/api.js').then((api) => api.open()).then((lake) => lake.key)"
+        assert [other.evaluate(learnt) for _ in range(2)] == [old] * 2
+        assert other.is_visible("#changed")
+
+
+def test_the_address_holds_the_view(browser, page):
+    with tab_of(browser, page) as tab:
+        tab.keyboard.press("4")
+        until(tab, "document.getElementById('image-one').childElementCount === 3")
+        tab.select_option("#image-one", "1")
+        tab.select_option("#image-map", "magma")
+        tab.click("#theme")
+        for _ in range(3):
+            tab.keyboard.press("+")
+        time.sleep(0.6)
+        address = tab.evaluate("location.hash")
+        assert page.gate.token not in address
+        was = tab.evaluate("JSON.parse(decodeURIComponent(location.hash.slice(1))).images")
+    with tab_of(browser, page, f"/{address}") as tab:
+        until(tab, "!document.getElementById('images').hidden")
+        until(tab, "document.getElementById('image-one').value === '1'")
+        time.sleep(0.6)
+        assert tab.evaluate("document.documentElement.dataset.theme") == "light"
+        assert tab.evaluate("JSON.parse(decodeURIComponent(location.hash.slice(1))).images") == was
+
+
+CONTRAST = """() => {
+  const part = (v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
+  const style = getComputedStyle(document.documentElement);
+  const luminance = (name) => {
+    const hex = style.getPropertyValue('--' + name).trim();
+    return [1, 3, 5].map((k) => part(parseInt(hex.substr(k, 2), 16) / 255))
+      .reduce((sum, v, k) => sum + v * [0.2126, 0.7152, 0.0722][k], 0);
+  };
+  const ratio = (a, b) => (Math.max(luminance(a), luminance(b)) + 0.05) / (Math.min(luminance(a), luminance(b)) + 0.05);
+  return ['ink', 'quiet', 'accent', 'second', 'bad', 'good']
+    .flatMap((a) => ['paper', 'panel', 'raised'].map((b) => [a, b, ratio(a, b)]));
+}"""
+
+
+@pytest.mark.parametrize("theme", ["dark", "light"])
+def test_contrast(tab, theme):
+    if tab.evaluate("document.documentElement.dataset.theme") != theme:
+        tab.click("#theme")
+    assert [found for found in tab.evaluate(CONTRAST) if found[2] < 4.5] == []
+
+
+NAMELESS = """() => [...document.querySelectorAll('button, input, select, textarea, canvas:not([aria-hidden])')]
+  .filter((one) => one.checkVisibility() && !(one.labels?.length || one.textContent.trim() || one.title
+    || one.getAttribute('aria-label') || one.closest('label'))).map((one) => one.outerHTML)"""
+
+
+def test_every_control_has_a_name(tab):
+    for number, view in enumerate(VIEWS, start=1):
+        tab.keyboard.press(str(number))
+        until(tab, f"!document.getElementById('{view}').hidden")
+        time.sleep(0.5)
+        assert tab.evaluate(NAMELESS) == []
+
+
+# Text of each visible element against what lies behind it; a picture behind text has its own ground.
+SEEN = """() => {
+  const part = (v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
+  const rgb = (text) => text.match(/[\\d.]+/g).map(Number);
+  const luminance = (c) => c.slice(0, 3).map((v) => part(v / 255))
+    .reduce((s, v, k) => s + v * [0.2126, 0.7152, 0.0722][k], 0);
+  const behind = (one) => {
+    for (let at = one; at; at = at.parentElement) {
+      const c = rgb(getComputedStyle(at).backgroundColor);
+      if (c.length < 4 || c[3] === 1) return c;
+    }
+    return [255, 255, 255];
+  };
+  return [...document.querySelectorAll('body *')].filter((one) => one.checkVisibility() && !one.disabled
+      && [...one.childNodes].some((n) => n.nodeType === 3 && n.textContent.trim()))
+    .map((one) => {
+      const a = luminance(rgb(getComputedStyle(one).color)), b = luminance(behind(one));
+      return [one.tagName, one.textContent.slice(0, 40), (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05)];
+    }).filter((one) => one[2] < 4.5);
+}"""
+
+
+@pytest.mark.parametrize("theme", ["dark", "light"])
+def test_text_can_be_read_where_it_stands(tab, theme):
+    if tab.evaluate("document.documentElement.dataset.theme") != theme:
+        tab.click("#theme")
+    for number, view in enumerate(VIEWS, start=1):
+        tab.keyboard.press(str(number))
+        until(tab, f"!document.getElementById('{view}').hidden")
+        time.sleep(0.4)
+        assert tab.evaluate(SEEN) == []
+
+
+@pytest.mark.nightly
+def test_everything_is_reached_by_keys(tab):
+    """Tab leads to every control of a view, and what has the focus can be seen."""
+    for view in VIEWS:
+        tab.click(f"#tab-{view}")
+        time.sleep(0.8)
+        wanted = tab.evaluate(
+            f"[...document.querySelectorAll('#{view} button, #{view} input, #{view} select, "
+            f"#{view} canvas[tabindex], #{view} summary')]"
+            ".filter((one) => one.checkVisibility() && !one.disabled).length"
+        )
+        reached = set()
+        for _ in range(wanted + 40):
+            tab.keyboard.press("Tab")
+            reached.add(tab.evaluate(
+                f"(() => {{ const a = document.activeElement, all = [...document.querySelectorAll('#{view} *')];"
+                "return all.indexOf(a); })()"
+            ))  # fmt: skip
+            if tab.evaluate("document.activeElement !== document.body"):
+                assert tab.evaluate("getComputedStyle(document.activeElement).outlineStyle !== 'none'")
+        assert len(reached - {-1}) >= wanted
+
+
+@pytest.mark.nightly
+def test_nothing_moves_where_that_is_asked_for(browser, page):
+    with tab_of(browser, page, reduced_motion="reduce") as tab:
+        tab.keyboard.press("4")
+        until(tab, "document.getElementById('image-one').childElementCount === 3")
+        tab.select_option("#image-two", "1")
+        time.sleep(1.0)
+        tab.click("#image-blink")
+        time.sleep(0.8)
+        once = tab.locator("#image-canvas").screenshot()
+        time.sleep(1.7)
+        assert tab.locator("#image-canvas").screenshot() == once

@@ -1,0 +1,88 @@
+"""Queries in a browser: what they answer, to the last digit, and what is refused."""
+
+from tests.truesky.page.browsing import tab_of, until
+
+
+def test_numbers_keep_their_digits(tab):
+    tab.keyboard.press("3")
+    whole = [999999999999, 1000000000001, 4503599627370497, 9007199254740991, 9007199254740993, -1234567890123]
+    query = f"SELECT unnest({whole}) AS id, 150.1234567891::DOUBLE AS ra, 0.1::FLOAT AS x"
+    tab.fill("#sql-text", query)
+    tab.click("#sql-run")
+    cells = (
+        "[...document.querySelectorAll('#sql-result tbody td')].map((one) => one.textContent.replaceAll('\u202f', ''))"
+    )
+    until(tab, f"{cells}.length === 18")
+    found = tab.evaluate(cells)
+    assert found[::3] == [str(number) for number in whole]
+    assert set(found[1::3]) == {"150.123456789"}
+    assert set(found[2::3]) == {"0.1"}
+
+
+def test_a_query_and_its_refusal(browser, page):
+    with tab_of(browser, page) as tab:
+        tab.keyboard.press("3")
+        tab.fill("#sql-text", "SELECT id, ra, '<b>x</b>' AS text FROM galaxies ORDER BY id LIMIT 3")
+        tab.press("#sql-text", "Control+Enter")
+        until(tab, "document.getElementById('sql-state').textContent.startsWith('3 rows')")
+        assert "ra deg" in tab.inner_text("#sql-result thead").replace("\t", " ").replace("\n", " ")
+        # Text stays text.
+        assert tab.locator("#sql-result b").count() == 0
+        first = tab.inner_text("#sql-result tbody tr td")
+        assert first.isdigit()
+        assert len(first) > 16
+        tab.click("#sql-plot")
+        until(tab, "document.querySelectorAll('#plot-grid figure').length >= 1")
+        until(tab, "document.getElementById('plot-state').textContent.startsWith('3 rows')")
+
+
+def test_names_have_their_ucds_beside_them(tab):
+    tab.keyboard.press("3")
+    until(tab, "document.querySelectorAll('#sql-result td').length > 0")
+    assert "pos.eq.ra" in tab.inner_text("#sql-result thead")
+    tab.locator("#sql-schema summary", has_text="galaxies").click()
+    assert "pos.eq.dec" in tab.locator("#sql-schema details[open]").inner_text()
+
+
+def test_a_download_that_is_refused_says_why(browser, page):
+    with tab_of(browser, page, refused="/export?", accept_downloads=True) as tab:
+        tab.keyboard.press("3")
+        until(tab, "document.querySelectorAll('#sql-result td').length > 0")
+        came = []
+        tab.on("download", lambda download: came.append(download))
+        state = "document.getElementById('sql-state').textContent"
+        tab.fill("#sql-text", "SELECT nothing FROM galaxies")
+        tab.click("[data-format=csv]")
+        until(tab, f"{state}.includes('nothing')")
+        assert "bad-text" in tab.get_attribute("#sql-state", "class")
+        assert came == []
+        tab.fill("#sql-text", "SELECT 7 AS seven")
+        with tab.expect_download() as begun:
+            tab.click("[data-format=csv]")
+        assert begun.value.suggested_filename == "result.csv"
+        with open(begun.value.path(), encoding="utf-8") as file:
+            assert file.read().split() == ['"seven"', "7"]
+
+
+def test_a_large_download_goes_past_the_page(browser, page):
+    with tab_of(browser, page, accept_downloads=True) as tab:
+        tab.keyboard.press("3")
+        until(tab, "document.querySelectorAll('#sql-result td').length > 0")
+        tab.fill("#sql-text", "SELECT repeat('0123456789', 100) AS x FROM range(40000)")
+        with tab.expect_download() as begun:
+            tab.click("[data-format=csv]")
+        assert begun.value.url.startswith("http")
+        assert begun.value.path().stat().st_size > 40_000_000
+
+
+def test_of_overlapping_queries_the_last_is_shown(tab):
+    tab.keyboard.press("3")
+    until(tab, "document.querySelectorAll('#sql-result td').length > 0")
+    tab.fill("#sql-text", "SELECT sum(a.range * b.range) AS slow FROM range(40000) a, range(10000) b")
+    tab.click("#sql-run")
+    tab.fill("#sql-text", "SELECT 1 AS fast")
+    with tab.expect_response(lambda answer: "/sql" in answer.url and "slow" in answer.request.post_data):
+        tab.click("#sql-run")
+        until(tab, "document.querySelector('#sql-result th').textContent === 'fast'")
+    tab.wait_for_timeout(200)
+    assert tab.inner_text("#sql-result th") == "fast"

@@ -1,0 +1,102 @@
+"""The command: what it prints, and what it refuses in one line."""
+
+import http.client
+import signal
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from truesky.page.__main__ import main
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            ["--host", "0.0.0.0", "--token", "0123456789abcdef"],
+            "--host 0.0.0.0 accepts connections from other machines: give --called NAME, the name or address that they",
+        ),
+        (["--host", "0.0.0.0", "--called", "here.example"], "a --token of your own is wanted"),
+        (["--called", "here.example"], "a --token of your own is wanted"),
+        (["--host", "0.0.0.0", "--called", "a b"], "'a b' is no name"),
+        (["--host", "192.0.2.1"], "a --token of your own is wanted"),
+        (["--token", "short"], "wanted 16 to 256"),
+        (["--token", "0123456789abcde"], "wanted 16 to 256"),
+        (["--token", "0123456789abcdef;"], "wanted 16 to 256"),
+        (["--token", ""], "wanted 16 to 256"),
+        (["--lake", "another"], "the folder of one lake"),
+        (["--port", "70000"], "--port 70000: wanted 0 to 65535"),
+        (["--timeout", "-1"], "timeout = -1.0 is outside"),
+        (["--name", "nobody"], "has no request nobody"),
+    ],
+)
+def test_refusals(shown, capsys, words, said):
+    assert main([str(shown), "--no-open", *words]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("page: ")
+    assert said in line
+
+
+def test_a_folder_that_is_no_lake(tmp_path, capsys):
+    assert main([str(tmp_path), "--no-open"]) == 2
+    assert "holds no table" in capsys.readouterr().err
+
+
+def test_a_port_that_is_taken(page, shown, capsys):
+    assert main([str(shown), "--no-open", "--port", str(page.gate.port)]) == 1
+    assert "in use" in capsys.readouterr().err
+
+
+def test_no_lake(capsys):
+    assert main(["--no-open"]) == 2
+    assert "the folder of one lake" in capsys.readouterr().err
+
+
+def test_others_are_let_in_by_the_name_that_is_said(shown):
+    """At every address of this machine: by a name that was given, or from this machine itself; by no other."""
+    command = [sys.executable, "-m", "truesky.page", "--lake", str(shown), "--no-open", "--host", "0.0.0.0"]
+    command += ["--called", "Sky.example", "--called", "192.0.2.7", "--token", "a-token-of-the-tests"]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as server:
+        try:
+            address = server.stdout.readline().split()[-1]
+            site, _, token = address.partition("/?token=")
+            assert (site.rpartition(":")[0], token) == ("http://sky.example", "a-token-of-the-tests")
+            port = int(site.rpartition(":")[2])
+            for name, status in (
+                ("sky.example", 303), ("192.0.2.7", 303), ("127.0.0.1", 303), ("0.0.0.0", 403), ("evil.example", 403),
+            ):  # fmt: skip
+                connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+                connection.request("GET", f"/?token={token}", headers={"Host": f"{name}:{port}"})
+                assert (name, connection.getresponse().status) == (name, status)
+                connection.close()
+        finally:
+            server.send_signal(signal.SIGINT)
+
+
+def test_it_answers_until_it_is_stopped(shown):
+    command = [sys.executable, "-m", "truesky.page", str(shown), "--no-open"]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as server:
+        address = server.stdout.readline().split()[-1]
+        tap = server.stdout.readline().split()[-1]
+        assert urllib.request.urlopen(f"{tap}/availability", timeout=30).status == 200
+        with pytest.raises(urllib.error.HTTPError, match="401"):
+            urllib.request.urlopen(address.partition("?")[0], timeout=30)
+        server.send_signal(signal.SIGINT)
+        assert server.wait(30) == 0
+        assert server.stderr.read() == ""
+
+
+def test_the_first_sky_waits_for_nothing_that_draws_images():
+    """Of the libraries that take longer to load than the page none is loaded before it listens."""
+    slow = ("astropy", "galsim", "healpy", "matplotlib", "numba", "scipy")
+    text = f"import sys, truesky.page.__main__; print([name for name in {slow} if name in sys.modules])"
+    done = subprocess.run(
+        [sys.executable, "-c", text], cwd=ROOT, capture_output=True, text=True, timeout=60, check=True
+    )
+    assert done.stdout == "[]\n"

@@ -1,0 +1,270 @@
+"""Processes that end, questions that are given up, and lakes that are published anew."""
+
+import asyncio
+import http.client
+import json
+import os
+import re
+import signal
+import socket
+import threading
+import time
+from contextlib import asynccontextmanager
+from pathlib import Path
+from urllib.parse import quote
+
+import pytest
+
+from lake_schema.store import layout, publish
+from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.tables.stars import STARS
+from tests.truesky.page.conftest import GALAXIES_N, asked, published, serving, star_rows
+from tests.universe import plain_plan, plain_work
+from truesky.explore.process import Process
+from truesky.page.opened import Closed, Lane
+from truesky.page.tap.queries import Jobs
+
+
+def killed(lane):
+    """Kill the processes of a lane, as the system does where memory is short."""
+    found = [process._worker for process in lane._all if process._worker is not None]
+    for worker in found:
+        os.kill(worker.pid, signal.SIGKILL)
+        worker.wait(30.0)
+    return len(found)
+
+
+def until(condition, seconds=30.0):
+    ended = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < ended
+        time.sleep(0.02)
+
+
+def test_a_killed_process_is_replaced(page):
+    lake, question = page.server.lake, {"method": "POST", "body": b'{"sql": "SELECT 7 AS a"}'}
+    until(page.server._warming.done)
+    chart = {"source": "galaxies", "axes": ["dec + 1"], "charts": [{"axes": [0], "bins": [5]}]}
+    assert killed(lake.questions)
+    assert killed(lake.own)
+    for _ in range(3):
+        assert page.json("sql", **question)["rows"] == [[7]]
+    assert asked(page, **chart)[0]["rows"] == GALAXIES_N
+
+
+def test_a_process_is_stopped_while_it_ends():
+    """Another thread forgets the worker between two looks at it."""
+    killed = []
+
+    class Worker:
+        def kill(self):
+            killed.append(self)
+
+    class Ending(Process):
+        looks = 0
+
+        @property
+        def _worker(self):
+            self.looks += 1
+            return Worker() if self.looks == 1 else None
+
+        @_worker.setter
+        def _worker(self, worker):
+            """Of the constructor."""
+
+    Ending(Path(), []).stop()
+    assert len(killed) == 1
+
+
+def test_who_asked_a_killed_process_is_told(page):
+    """In the midst of a question: one line, and the next question is answered."""
+    until(page.server._warming.done)
+    body = json.dumps({"sql": "SELECT count(*) FROM range(100000000000) a, range(100) b"}).encode()
+    told = []
+    asking = threading.Thread(target=lambda: told.append(page.of_lake("sql", method="POST", body=body)))
+    asking.start()
+    time.sleep(1.0)
+    assert killed(page.server.lake.questions)
+    asking.join(30.0)
+    ((status, _, answer),) = told
+    assert status == 400
+    assert "brought its process down" in json.loads(answer)["error"]
+    assert page.json("sql", method="POST", body=b'{"sql": "SELECT 1 AS a"}')["rows"] == [[1]]
+
+
+def test_who_goes_away_stops_the_query(page):
+    body = json.dumps({"sql": "SELECT count(*) FROM range(100000000000) a, range(100) b"}).encode()
+    lane = page.server.lake.questions
+    until(lambda: page.server._warming.done() and lane._free.qsize() == 2)
+    with socket.create_connection(("127.0.0.1", page.gate.port)) as connection:
+        head = f"POST /api/{page.server.lake.key}/sql HTTP/1.1\r\nHost: 127.0.0.1:{page.gate.port}\r\n"
+        connection.sendall(f"{head}Cookie: {page.cookie}\r\nContent-Length: {len(body)}\r\n\r\n".encode() + body)
+        until(lambda: lane._free.qsize() == 1)
+    # The query itself would take days.
+    until(lambda: lane._free.qsize() == 2)
+    assert page.json("sql", method="POST", body=b'{"sql": "SELECT 1 AS a"}')["rows"] == [[1]]
+
+
+def test_a_lake_that_is_published_anew_is_announced(tmp_path):
+    root = tmp_path / "lake"
+    root.mkdir()
+    published(root)
+    with serving(root) as page:
+        old = page.server.lake.key
+        assert json.loads(page.ask("/api/lake")[2])["is_changed"] is False
+        publish.make(root, plain_plan(2), plain_work)
+        told = json.loads(page.ask("/api/lake")[2])
+        assert (told["is_changed"], told["key"]) == (True, old)
+        sums = b'{"sql": "SELECT sum(value) AS s FROM plain"}'
+        assert page.json("sql", method="POST", body=sums)["rows"] == [[60.0]]
+        status, _, body = page.ask("/api/reopen", method="POST", body=b"")
+        told = json.loads(body)
+        assert (status, told["is_changed"]) == (200, False)
+        assert told["key"] != old
+        assert page.ask(f"/api/{old}/sql", method="POST", body=sums)[0] == 409
+        assert page.json("sql", method="POST", body=sums)["rows"] == [[120.0]]
+
+
+def test_a_table_that_is_new_is_announced(tmp_path):
+    root = tmp_path / "lake"
+    root.mkdir()
+    publish.make(root, plain_plan(), plain_work)
+    with serving(root) as page:
+        assert json.loads(page.ask("/api/lake")[2])["is_changed"] is False
+        part = Part(layout.cell_file(5, 1607), {})
+        publish.make(root, Plan(STARS, {}, (part,)), lambda lake, facts: Output(star_rows()[0]))
+        assert json.loads(page.ask("/api/lake")[2])["is_changed"] is True
+
+
+def test_a_lake_is_opened_anew_beside_what_is_being_answered(tmp_path):
+    """A download ends with all of its rows, though two ask at once to open the lake anew; nothing is left open."""
+    root = tmp_path / "lake"
+    root.mkdir()
+    publish.make(root, plain_plan(), plain_work)
+    with serving(root) as page:
+        server, opened = page.server, []
+        before, open_ = server.lake, server._open
+        server._open = lambda: opened.append(open_()) or opened[-1]
+        connection = http.client.HTTPConnection("127.0.0.1", page.gate.port, timeout=60)
+        address = f"/api/{before.key}/export?format=csv&sql=" + quote("SELECT range AS a FROM range(3000000)")
+        connection.request("GET", address, headers={"Cookie": page.cookie})
+        answer = connection.getresponse()
+        first = answer.read(1000)
+        publish.make(root, plain_plan(2), plain_work)
+        both = [threading.Thread(target=page.ask, args=("/api/reopen", "POST", b"")) for _ in range(2)]
+        for one in both:
+            one.start()
+        for one in both:
+            one.join(30.0)
+        assert opened == [server.lake]
+        assert server.lake is not before
+        assert (first + answer.read()).count(b"\n") == 3_000_001
+        connection.close()
+        ended = time.monotonic() + 30.0
+        while any(one._worker is not None and one._worker.poll() is None for one in before.questions._all):
+            assert time.monotonic() < ended
+            time.sleep(0.05)
+
+
+def test_a_lane_that_is_closed_gives_no_process():
+    async def run():
+        lane = Lane(lambda: Process(Path(), []), 1)
+        async with lane.process():
+            waiting = asyncio.create_task(anext(aiter_of(lane)))
+            await asyncio.sleep(0)
+            lane.close()
+        for one in (waiting, anext(aiter_of(lane))):
+            with pytest.raises(Closed):
+                await one
+
+    async def aiter_of(lane):
+        async with lane.process() as process:
+            yield process
+
+    asyncio.run(run())
+
+
+def test_a_lake_of_two_requests(tmp_path):
+    """Tables that both have go by the names of both."""
+    root = tmp_path / "lake"
+    root.mkdir()
+    for name, seed in (("a", 1), ("my-b", 2)):
+        publish.make(root, plain_plan(seed), plain_work, name=name)
+    with serving(root) as page:
+        told = json.loads(page.ask("/api/lake")[2])
+        assert [table["name"] for table in told["tables"]] == ["a.plain", "my-b.plain"]
+        for source, value in (("a.plain", 1.0), ('"my-b".plain', 2.0)):
+            chart = {"axes": [0], "bins": [1], "spans": [[value - 0.1, value + 0.1]]}
+            head, (counts,) = asked(page, source=source, axes=["value"], charts=[chart])
+            assert (head["rows"], counts.tolist()) == (60, [60])
+        status, _, body = page.ask(
+            f"/tap/{page.gate.tap_token}/sync?LANG=ADQL&QUERY=" + quote('SELECT TOP 1 "value" FROM "my-b".plain'),
+            cookie="",
+        )
+        assert (status, b"<TD>2.0</TD>" in body) == (200, True)
+        status, _, body = page.ask(f"/tap/{page.gate.tap_token}/tables", cookie="")
+        assert b"<name>&quot;my-b&quot;.plain</name>" in body or b'<name>"my-b".plain</name>' in body
+
+
+@pytest.mark.parametrize(
+    ("question", "words"),
+    [
+        ({"axes": "z"}, "axes"),
+        ({"axes": 7}, "axes"),
+        ({"charts": {"axes": [0]}}, "charts"),
+        ({"charts": 7}, "charts"),
+        ({"charts": [7]}, "charts"),
+        ({"charts": [{"axes": [0], "bins": [2**40]}]}, "bins"),
+        ({"charts": [{"axes": [0, 0], "bins": [2**40, 2**24]}]}, "bins"),
+        ({"charts": [{"axes": [0], "bins": [1e999]}]}, "infinity"),
+        ({"charts": [{"axes": [0], "bins": [3], "points": 1e999}]}, "infinity"),
+        ({"charts": [{"axes": [-1], "bins": [3]}]}, "no expression"),
+        ({"charts": [{"axes": [1], "bins": [3]}]}, "index"),
+        ({"charts": [{"axes": [0], "bins": [8_000_000]}] * 2}, "together"),
+        ({"limits": [[3, 0, 1]]}, "no expression"),
+        ({"limits": 7}, "limits|iterable"),
+    ],
+)
+def test_charts_that_are_none(page, question, words):
+    usual = {"source": "galaxies", "axes": ["z_obs"], "charts": [{"axes": [0], "bins": [3]}]}
+    status, _, body = page.of_lake("charts", method="POST", body=json.dumps({**usual, **question}).encode())
+    assert status == 400
+    assert re.search(words, json.loads(body)["error"])
+
+
+@pytest.mark.parametrize("value", ["TIMESTAMP '20000-01-01'", "'infinity'::TIMESTAMP", "'infinity'::DATE"])
+def test_moments_that_python_lacks(page, value):
+    question = json.dumps({"sql": f"SELECT {value} AS moment"}).encode()
+    status, _, body = page.of_lake("sql", method="POST", body=question)
+    assert status == 400
+    assert "column moment" in json.loads(body)["error"]
+    tap = f"/tap/{page.gate.tap_token}"
+    form = f"LANG=ADQL&PHASE=RUN&QUERY={quote(f'SELECT {value} AS moment')}".encode()
+    status, headers, _ = page.ask(
+        f"{tap}/async", method="POST", body=form, cookie="", Content_Type="application/x-www-form-urlencoded"
+    )
+    assert status == 303
+    job = headers["Location"].removeprefix(page.origin)
+    ended = time.monotonic() + 30.0
+    while (phase := page.ask(f"{job}/phase", cookie="")[2]) != b"ERROR":
+        assert time.monotonic() < ended, phase
+        time.sleep(0.05)
+    assert b"column moment" in page.ask(f"{job}/error", cookie="")[2]
+
+
+def test_a_job_ends_whatever_goes_wrong():
+    @asynccontextmanager
+    async def broken(parameters, seconds):
+        raise IndexError("of a fault of our own")
+        yield
+
+    async def run():
+        jobs = Jobs(broken)
+        job = jobs.add({}, 1.0)
+        jobs.start(job)
+        await asyncio.wait_for(asyncio.gather(job.task, return_exceptions=True), 10.0)
+        found = job.phase, job.error
+        await jobs.close()
+        return found
+
+    assert asyncio.run(run()) == ("ERROR", "IndexError: of a fault of our own")

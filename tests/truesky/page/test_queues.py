@@ -1,0 +1,282 @@
+"""Who waits for what, how many may, and what becomes of those beyond."""
+
+import asyncio
+import io
+import json
+import socket
+import threading
+import time
+from contextlib import asynccontextmanager
+from pathlib import Path
+from urllib.parse import quote
+
+import pytest
+
+from truesky.explore.process import Process
+from truesky.page import downloads, pictures, sky_maps
+from truesky.page.opened import MOST_IN_LINE, MOST_WAITING, PIXEL_THREADS, Busy, Closed, Lane, Pool
+from truesky.page.tap import queries
+from truesky.page.tap.queries import AT_ONCE, Jobs
+
+
+def test_a_pool_refuses_beyond_its_bound_and_takes_others_when_done():
+    go = threading.Event()
+
+    async def run():
+        pool = Pool(2, 3)
+        asked = [asyncio.create_task(pool.run(go.wait)) for _ in range(5)]
+        await asyncio.sleep(0)
+        with pytest.raises(Busy, match="3 questions are waiting"):
+            await pool.run(go.wait)
+        # One of those that wait goes away: its place is free.
+        asked[4].cancel()
+        await asyncio.gather(asked[4], return_exceptions=True)
+        sixth = asyncio.create_task(pool.run(go.wait))
+        await asyncio.sleep(0)
+        with pytest.raises(Busy):
+            await pool.run(go.wait)
+        go.set()
+        assert await asyncio.gather(*asked[:4], sixth) == [True] * 5
+        with pytest.raises(ZeroDivisionError):
+            await pool.run(divmod, 1, 0)
+        assert [await pool.run(divmod, 7, k) for k in range(1, 9)][-1] == (0, 7)
+        pool.close()
+        with pytest.raises(Closed):
+            await pool.run(divmod, 1, 1)
+
+    asyncio.run(run())
+
+
+def test_a_thread_whose_user_has_gone_is_in_use_until_it_is_done():
+    go = threading.Event()
+
+    async def run():
+        pool = Pool(1, 0)
+        asked = asyncio.create_task(pool.run(go.wait))
+        await asyncio.sleep(0.05)
+        asked.cancel()
+        await asyncio.gather(asked, return_exceptions=True)
+        with pytest.raises(Busy):
+            await pool.run(divmod, 1, 1)
+        go.set()
+        ended = time.monotonic() + 10.0
+        while pool._places._value == 0:
+            assert time.monotonic() < ended
+            await asyncio.sleep(0.01)
+        assert await pool.run(divmod, 1, 1) == (1, 0)
+
+    asyncio.run(run())
+
+
+def test_tiles_are_refused_beyond_the_queue_and_hold_up_nothing_else(page, monkeypatch):
+    """All threads of tiles at work, the line full: 429, while maps of the sky are made."""
+    go, started = threading.Event(), []
+    real = pictures.picture
+    monkeypatch.setattr(pictures, "picture", lambda *given: started.append(1) or (go.wait(30.0) and real(*given)))
+    told = []
+    number = PIXEL_THREADS + MOST_IN_LINE
+    asking = [
+        threading.Thread(target=lambda: told.append(page.of_lake("tile/0/0/0/0")[0]), daemon=True)
+        for _ in range(number)
+    ]
+    for one in asking:
+        one.start()
+    try:
+        ended = time.monotonic() + 30.0
+        while page.server.lake.pixels._places._value:
+            assert time.monotonic() < ended
+            time.sleep(0.02)
+        status, _, body = page.of_lake("tile/0/0/0/0")
+        assert (status, "waiting" in json.loads(body)["error"]) == (429, True)
+        assert page.of_lake("source/1")[0] == 429
+        assert page.of_lake("regions")[0] == page.of_lake("sky/galaxies/parts")[0] == 200
+        assert len(started) == PIXEL_THREADS
+    finally:
+        go.set()
+    for one in asking:
+        one.join(30.0)
+    assert told == [200] * number
+    assert page.of_lake("tile/0/0/0/0")[0] == 200
+
+
+def test_the_rest_has_a_queue_of_its_own(page, monkeypatch):
+    go = threading.Event()
+    monkeypatch.setattr(sky_maps, "coverage", lambda *given: go.wait(30.0) and b"")
+    asking = [threading.Thread(target=page.of_lake, args=("coverage?order=5",), daemon=True) for _ in range(4)]
+    for one in asking:
+        one.start()
+    try:
+        assert page.of_lake("tile/0/0/0/0")[0] == 200
+    finally:
+        go.set()
+        for one in asking:
+            one.join(30.0)
+
+
+# ------------------------------------------------------------------------------------------------ jobs
+
+
+def test_jobs_beyond_those_that_run_are_queued():
+    go, running = asyncio.Event(), []
+
+    @asynccontextmanager
+    async def run_one(parameters, seconds):
+        running.append(parameters["number"])
+
+        async def pieces():
+            await go.wait()
+            yield b"x" * parameters["number"]
+
+        yield "text/plain", pieces()
+
+    async def run():
+        jobs = Jobs(run_one)
+        many = [jobs.add({"number": k}, 1.0) for k in range(AT_ONCE + MOST_WAITING + 5)]
+        for job in many:
+            jobs.start(job)
+        await asyncio.sleep(0.05)
+        assert [job.phase for job in many] == ["EXECUTING"] * AT_ONCE + ["QUEUED"] * (len(many) - AT_ONCE)
+        assert all(job.started is None for job in many[AT_ONCE:])
+        jobs.abort(many[AT_ONCE])
+        go.set()
+        await asyncio.gather(*(job.task for job in many), return_exceptions=True)
+        phases = [job.phase for job in many]
+        assert phases.pop(AT_ONCE) == "ABORTED"
+        assert set(phases) == {"COMPLETED"}
+        assert AT_ONCE not in running
+        assert jobs.file(many[7]).read_bytes() == b"x" * 7
+        await jobs.close()
+
+    asyncio.run(run())
+
+
+def test_the_patient_are_not_refused():
+    async def run():
+        lane = Lane(lambda: Process(Path(), []), 1)
+
+        async def one(is_patient):
+            async with lane.process(is_patient):
+                return True
+
+        async with lane.process():
+            patient = [asyncio.create_task(one(True)) for _ in range(MOST_WAITING + 4)]
+            await asyncio.sleep(0)
+            others = [asyncio.create_task(one(False)) for _ in range(MOST_WAITING + 1)]
+            await asyncio.sleep(0)
+        found = await asyncio.gather(*patient, *others, return_exceptions=True)
+        assert [type(one) for one in found] == [bool] * (len(found) - 1) + [Busy]
+
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize(("bounds", "words"), [((50, 1000), "the result has more"), ((1000, 150), "results of jobs")])
+def test_results_have_a_bound(monkeypatch, bounds, words):
+    monkeypatch.setattr(queries, "MOST_BYTES", bounds[0])
+    monkeypatch.setattr(queries, "MOST_BYTES_IN_ALL", bounds[1])
+
+    @asynccontextmanager
+    async def run_one(parameters, seconds):
+        async def pieces():
+            for _ in range(parameters["pieces"]):
+                yield b"x" * 10
+
+        yield "text/plain", pieces()
+
+    async def run():
+        jobs = Jobs(run_one)
+        few, lots = jobs.add({"pieces": 5}, 1.0), jobs.add({"pieces": 99}, 1.0)
+        for job in (few, lots):
+            jobs.start(job)
+            await job.task
+        assert (few.phase, lots.phase) == ("COMPLETED", "ERROR")
+        assert words in lots.error
+        assert jobs.file(few).stat().st_size == 50
+        assert not jobs.file(lots).exists()
+        again = jobs.add({"pieces": 5}, 1.0)
+        jobs.start(again)
+        await again.task
+        assert again.phase == "COMPLETED"
+        await jobs.close()
+
+    asyncio.run(run())
+
+
+def test_of_a_job_that_is_aborted_nothing_stays():
+    """Neither its file nor its bytes among those of all jobs."""
+    waiting = asyncio.Event()
+
+    @asynccontextmanager
+    async def run_one(parameters, seconds):
+        async def pieces():
+            yield b"x" * 1000
+            waiting.set()
+            await asyncio.Event().wait()
+
+        yield "text/plain", pieces()
+
+    async def run():
+        jobs = Jobs(run_one)
+        job = jobs.add({}, 1.0)
+        jobs.start(job)
+        await waiting.wait()
+        assert (job.size, jobs.file(job).exists()) == (1000, True)
+        jobs.abort(job)
+        await asyncio.gather(job.task, return_exceptions=True)
+        assert (job.phase, job.size, jobs.file(job).exists()) == ("ABORTED", 0, False)
+        await jobs.close()
+
+    asyncio.run(run())
+
+
+def test_others_are_answered_while_a_result_is_written(monkeypatch):
+    go = threading.Event()
+
+    class Slow(io.BytesIO):
+        def write(self, piece):
+            assert go.wait(10.0)
+            return super().write(piece)
+
+    monkeypatch.setattr(Path, "open", lambda self, mode: Slow())
+
+    @asynccontextmanager
+    async def run_one(parameters, seconds):
+        async def pieces():
+            yield b"x"
+
+        yield "text/plain", pieces()
+
+    async def run():
+        jobs = Jobs(run_one)
+        job = jobs.add({}, 1.0)
+        jobs.start(job)
+        # The loop goes on: else nobody would ever let the file be written.
+        await asyncio.sleep(0.05)
+        assert job.phase == "EXECUTING"
+        go.set()
+        await job.task
+        assert (job.phase, job.size) == ("COMPLETED", 1)
+        await jobs.close()
+
+    asyncio.run(run())
+
+
+def test_who_takes_nothing_loses_the_process(page, monkeypatch):
+    """A reader that stands still is let go, and others are answered by as many processes as before."""
+    monkeypatch.setattr(downloads, "STALLED", 0.5)
+    lane = page.server.lake.questions
+    ended = time.monotonic() + 30.0
+    while not (page.server._warming.done() and lane._free.qsize() == 2):
+        assert time.monotonic() < ended
+        time.sleep(0.02)
+    sql = quote("SELECT range AS a FROM range(100000000)")
+    head = (
+        f"GET /api/{page.server.lake.key}/export?format=csv&sql={sql} HTTP/1.1\r\nHost: 127.0.0.1:{page.gate.port}\r\n"
+    )
+    with socket.create_connection(("127.0.0.1", page.gate.port)) as connection:
+        connection.sendall(f"{head}Cookie: {page.cookie}\r\n\r\n".encode())
+        assert connection.recv(100).startswith(b"HTTP/1.1 200")
+        assert lane._free.qsize() == 1
+        while lane._free.qsize() < 2:
+            assert time.monotonic() < ended
+            time.sleep(0.02)
+    assert page.json("sql", method="POST", body=b'{"sql": "SELECT 1 AS a"}')["rows"] == [[1]]

@@ -1,0 +1,110 @@
+"""Images as they are rendered: the truth lies where the light is."""
+
+import numpy as np
+import pytest
+
+from lake_schema.store import layout, publish
+from tests import requests
+from tests.truesky.page.conftest import serving, unpacked
+from truesky.catalogue import build_galaxies, build_stars
+from truesky.fluxes import compute_fluxes
+from truesky.page import pictures
+from truesky.page.opened import Lake
+from truesky.render import plan_exposures, render_exposures
+from truesky.request.from_toml import parse
+
+SIDE, COUNT, STARS = 1024, 260, 200
+POINTING = """
+[[pointing]]
+channel = "{}"
+camera = "{}"
+band = "{}"
+ra = 53.117
+dec = -27.808
+mjd = 60905.0
+detectors = ["{}"]
+centre_on = "{}"
+"""
+TEXT = f"""
+accuracy = "draft"
+[mission]
+overrides = {{"vis.fpa.nx" = {{value = {SIDE}, unit = "pix"}}, "vis.fpa.ny" = {{value = {SIDE}, unit = "pix"}}}}
+[sources]
+only = "table"
+band = "euclid_vis"
+stars = "stars.csv"
+[products]
+truth = ["noise_free"]
+"""
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory):
+    """A lake with a VIS detector and one through the grism, of the same stars."""
+    folder, rng = tmp_path_factory.mktemp("rendered"), np.random.default_rng(11)
+    x, y = rng.uniform(-0.48, 0.48, (2, COUNT)) * SIDE * 0.1 / 3600.0
+    ra, dec, mags = 53.117 + x / np.cos(np.radians(-27.808)), -27.808 + y, rng.uniform(15.0, 22.0, COUNT)
+    lines = [f"{a},{d},{m}" for a, d, m in zip(ra, dec, mags, strict=True)]
+    (folder / "stars.csv").write_text("\n".join(["ra,dec,mag", *lines]) + "\n")
+    pointings = POINTING.format("VIS", "vis", "euclid_vis", "3-4", "3-4")
+    pointings += POINTING.format("NISP-S", "nisp", "nisp_red", "DET22", "DET22")
+    request = parse(requests.written(folder, TEXT + pointings, requests.FIELD.format(0.25), seed=5))
+    root = layout.lake(folder / "lake")
+    for module in (build_galaxies, build_stars, compute_fluxes, plan_exposures, render_exposures):
+        for step in module.steps(root, request):
+            publish.make(root, step.plan, step.work)
+    return root
+
+
+def peak(image, x, y):
+    """Where the light peaks near a place: of a parabola through the brightest pixel's neighbours, in magnitudes."""
+    column, row = round(x), round(y)
+    near = image[row - 2 : row + 3, column - 2 : column + 3].astype(float)
+    r, c = np.unravel_index(near.argmax(), near.shape)
+    r, c = row - 2 + r, column - 2 + c
+
+    def between(three):
+        left, middle, right = np.log(three)
+        return 0.5 * (left - right) / (left - 2.0 * middle + right)
+
+    return c + between(image[r, c - 1 : c + 2]), r + between(image[r - 1 : r + 2, c])
+
+
+@pytest.mark.nightly
+def test_the_brightest_stars_are_where_the_truth_says(rendered):
+    """In the noise-free image: saturation, trails of charge and noise move the peaks of a raw one."""
+    lake = Lake(rendered, memory=1e9)
+    try:
+        (number,) = (
+            n for n, one in enumerate(pictures.pictures(lake))
+            if (one.row["content"], one.row["channel"]) == ("noise_free", "VIS")
+        )  # fmt: skip
+        image, truth = pictures.picture(lake, number).levels()[0], pictures.truth(lake, number)
+    finally:
+        lake.close()
+    place = np.array([truth["x"], truth["y"]]).T
+    inside = ((place > 6) & (place < SIDE - 7)).all(axis=1)
+    # Rows of charge injection hold no light.
+    dark = np.flatnonzero((image == 0.0).all(axis=1))
+    inside &= (np.abs(place[:, 1, None] - dark) > 3.0).all(axis=1)
+    # Whoever lies in the light of a brighter one has no peak of its own.
+    apart = np.array([all(np.hypot(*(place[:k] - at).T) > 12.0) for k, at in enumerate(place)])
+    brightest = place[inside & apart][:STARS]
+    assert len(brightest) == STARS
+    away = np.array([peak(image, *at) - at for at in brightest])
+    # Ten times closer than the half pixel by which the brightest pixel alone may miss it.
+    assert np.abs(away).max() <= 0.05
+
+
+@pytest.mark.nightly
+def test_the_trace_lies_on_the_spectrum(rendered):
+    with serving(rendered) as page:
+        listed = page.json("images")
+        number = next(one["number"] for one in listed if (one["channel"], one["content"]) == ("NISP-S", "noise_free"))
+        brightest = page.json(f"truth/{number}")["id"][:12]
+        strips = [unpacked(page.of_lake(f"trace/{number}/{one}?order=1")[2]) for one in brightest]
+    for head, rest in strips:
+        pixels = np.frombuffer(rest, "<f4").reshape(head["rows"], head["columns"])
+        middle = head["rows"] // 2
+        # Of the rows next to it the trace's own has the most light; beyond may lie others.
+        assert np.nanmedian(pixels, axis=1)[middle - 3 : middle + 4].argmax() == 3

@@ -1,0 +1,104 @@
+"""Raw frames of a part of a ground camera's detector, with stars apart, and what an observer's own masters would be."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from astropy.io import fits
+from astropy.wcs import WCS
+
+from lake_schema.mission.configuration import resolve
+from tests.truesky.render import calibrated, fields, nominal
+from truesky.fluxes import passbands
+from truesky.reduction import files
+from truesky.reduction import frames as frames_of
+from truesky.reduction.frames import Frame
+from truesky.render.camera import astrometry, detectors
+from truesky.render.camera.pointing import boresight_for
+from truesky.render.effects.readout import bias_structure
+from truesky.render.exposure.rendered import Rendered
+from truesky.render.products import fits_files, head_files, read_back, truth_table
+from truesky.render.psf import to_psfex
+from truesky.request.accuracy import SURVEY
+
+SEED, SECONDS, ZERO_POINT = 1, 100.0, 27.0
+BANDS = {
+    "decam": "des_r", "lsstcam": "lsst_r", "megacam": "cfis_r", "jpcam": "jedis_g", "gpc1": "ps1_i", "hsc": "hsc_z",
+}  # fmt: skip
+TRUTH = ("saturation", "cosmic_rays", "sky")
+
+
+@dataclass(frozen=True)
+class Ground:
+    """A rendered part of a detector, its raw frame, and a folder with masters for it."""
+
+    one: Rendered
+    frame: Frame
+    masters: Path
+    wcs: WCS
+
+
+def made(folder, camera, side, electrons, pitch, sky=8.0, rays=1.0, forced=None, overrides=None):
+    """Stars of so many electrons, (least, most) in a logarithmic scale, on a lattice.
+
+    pitch  : pixels from star to star;  sky : e-/s in a pixel;  rays : of the camera's rate of cosmic rays
+    forced : effects on or off;  overrides : of the mission
+    """
+    usual = fields.MISSION.value(f"ext.{camera}.cosmic_rays.rate", "1 / s")
+    mission = resolve(overrides={f"ext.{camera}.cosmic_rays.rate": (rays * usual, "1 / s"), **(overrides or {})})
+    detector = replace(detectors.detectors(camera, mission)[4], nx=side, ny=side, middle=0)
+    ra, dec, angle = boresight_for(detector, 53.1, -27.8, 12.0)
+    system = astrometry.wcs(detector, ra, dec, angle)
+    where = astrometry.sky_of_pixel(system, *nominal.lattice(side, pitch))
+    least, most = np.log10(electrons)
+    light = 10.0 ** np.random.default_rng(2).uniform(least, most, len(where[0]))
+    f_nu = 10 ** (-0.4 * (ZERO_POINT - 2.5 * np.log10(light / SECONDS) - 23.9))
+    band, none, points = BANDS[camera], fields.galaxies([], []), fields.stars(*where)
+    exposed = {
+        "channel": "EXT", "camera": camera, "band": band, "ra": ra, "dec": dec, "position_angle": angle, "seeing": 0.8,
+        "sky": sky, "zero_point": ZERO_POINT, "exposure_time_s": SECONDS,
+    }  # fmt: skip
+    tables = none, fields.fluxes(none, band, 0.0), points, fields.fluxes(points, band, f_nu)
+    own = passbands.load(band)
+    one = fields.rendered(exposed, detector, tables, mission, SURVEY, SEED, forced, truth=TRUTH, passband=own)
+    return _written(folder, one)
+
+
+def _written(folder, one):
+    rows, writers = fits_files.products(one, ())
+    path, psf = folder / "raw.fits", folder / "raw.psf"
+    name = rows["path"][0].as_py()
+    writers[name](path)
+    writers[head_files.beside(name)](path.with_suffix(".head"))
+    to_psfex.written(one.psf, one.detector, psf)
+    cards = read_back.header(path)
+    scene = replace(one.scene, band=passbands.load(one.exposure.band))
+    frame = Frame(path, one.exposure, scene, frames_of._applied(cards), cards, psf)
+    masters = folder / "masters"
+    masters.mkdir()
+    # What an observer has: images without a word of ours, the flat of light that came through the telescope.
+    flat = calibrated.flat(scene, SEED, frame.applied)
+    for kind, values in (("flat", flat), ("bias", bias(frame))):
+        fits.writeto(files.master_name(masters, frame, kind), values.astype(np.float32))
+    return Ground(one, frame, masters, one.wcs)
+
+
+def bias(frame):
+    """e- above the overscan."""
+    scene, layout = frame.scene, frame.scene.layout
+    if "bias_structure" not in frame.applied:
+        return np.zeros((scene.ny, scene.nx))
+    camera, name = calibrated.camera_of(scene), bias_structure.EFFECT.name
+    rng = calibrated.stream(SEED, camera, scene.detector.name, name)
+    width = layout.scans + layout.width
+    columns = bias_structure.structure(len(layout.amplifiers), width, *bias_structure.EFFECT.parameters(scene), rng)
+    behind = columns[:, layout.prescan + layout.width :] if layout.overscan else columns[:, : layout.prescan]
+    columns = columns - behind.mean(axis=1, keepdims=True)
+    return layout.together(np.repeat(columns[:, None], layout.height + layout.rows, axis=1))
+
+
+def truth(ground):
+    """Columns of the table `rendered_truth`, with the places of the stars' centroids."""
+    rows = truth_table.truth(ground.one)
+    found = {name: np.asarray(rows[name]) for name in ("x", "y", "psf_x", "psf_y", "mag")}
+    return found["x"] + found["psf_x"], found["y"] + found["psf_y"], found["mag"]

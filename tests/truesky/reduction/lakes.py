@@ -1,0 +1,38 @@
+"""A lake with calibration frames and dithers of a small detector, rendered by the jobs."""
+
+import tomllib
+
+from lake_schema.store import publish
+from tests import requests
+from tests.truesky.render.test_render_exposures_calibration import BLOCK, MODULES, small_detectors
+from truesky.render import plan_exposures, render_exposures
+from truesky.request.from_toml import from_table
+
+RAYS_OFF = ["cosmic_rays", "readout_cosmic_rays"]
+
+
+def request(
+    bias=8, dark=4, flat=12, off=(), truth=("noise_free", "sky"), overrides=None, depth=(19.0, 19.0), dither="S"
+):
+    """A visit of a field in four dithers, or in others, and frames that calibrate it."""
+    blocks = [{**BLOCK, "fields": 1, "dither": dither, "short": False, "flat": False}]
+    for kind, count in (("bias", bias), ("dark", dark), ("flat", flat)):
+        blocks += [{**BLOCK, "image_type": kind, "exposures": count}] if count else []
+        if kind == "dark" and count:
+            blocks[-1]["exposure_time_s"] = 1000.0
+    keys = f'accuracy = "draft"\n{requests.shallow(*depth)}[fluxes]\nbands = ["euclid_vis"]\n'
+    table = tomllib.loads(requests.text(keys, requests.FIELD.format(0.2), seed=7))
+    mission = {"mission": {"overrides": overrides}} if overrides else {}
+    products = {"products": {"truth": list(truth)}, "effects": {"off": list(off)}}
+    return from_table({**table, **mission, **products, "observation": blocks})
+
+
+def make(lake, wanted, side, name=None):
+    """All jobs of a request, detectors of side x side pixels; name : of the request, None = of none."""
+    with small_detectors(side):
+        for job in MODULES:
+            for step in job.steps(lake, wanted):
+                publish.make(lake, step.plan, step.work, name=name)
+
+
+__all__ = ["RAYS_OFF", "make", "plan_exposures", "render_exposures", "request"]

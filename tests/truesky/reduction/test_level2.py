@@ -1,0 +1,430 @@
+"""Level 2 of ground cameras: what a survey's own pipeline gives, against the truth of what was rendered."""
+
+import re
+import shutil
+import subprocess
+import warnings
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
+from astropy.wcs import WCS
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from lake_schema.fits import images
+from lake_schema.ids import kind_of
+from lake_schema.store import layout, publish, read
+from tests import requests
+from tests.truesky.reduction import ground_frames
+from tests.truesky.render.products import test_tools
+from tests.truesky.render.test_render_exposures_calibration import MODULES
+from truesky.reduction import calibration, files, masters, reduce, stack
+from truesky.reduction import frames as frames_of
+from truesky.reduction.calibration import COSMIC_RAY, EDGE, NO_DATA, SATURATED
+from truesky.render.camera import astrometry, detectors
+from truesky.request.from_toml import parse
+
+BLOCK = 64
+# Standard deviations of a star's light that count, and above which its place is known to 5 mas.
+SIGNAL, SHARP = 50.0, 200.0
+
+
+@dataclass(frozen=True)
+class Made:
+    """What was rendered, and what level 2 has of it."""
+
+    ground: ground_frames.Ground
+    folder: object
+    path: object
+    image: files.ImageFile
+
+    @property
+    def catalogue(self):
+        return fits.getdata(self.path.with_suffix(".cat"), "LDAC_OBJECTS")
+
+
+def reduced(ground, out, *more, wanted=0):
+    """Level 2 by the command, of a frame as if a lake had it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(frames_of, "of_lake", lambda *_: {("camera", "detector"): [ground.frame]})
+        call = ["--lake", str(out.parent), "--masters", str(ground.masters), "--without", "dark", "--out", str(out)]
+        assert reduce.main([*call, *more]) == wanted
+    return out / f"{ground.frame.stem}.fits"
+
+
+def of(folder, camera, side, **field):
+    ground = ground_frames.made(folder, camera, side, **field)
+    path = reduced(ground, folder / "level2", "--level2")
+    return Made(ground, folder, path, files.read_image(path))
+
+
+@pytest.fixture(scope="module")
+def jpcam(tmp_path_factory):
+    """Stars from faint to saturated, and fifty times as many cosmic rays as there are."""
+    field = {"electrons": (2e4, 4e5), "pitch": 64, "rays": 50.0}
+    return of(tmp_path_factory.mktemp("level2"), "jpcam", 448, **field)
+
+
+def check_files(made):
+    """Four files, which are as their standards want them."""
+    names = sorted(path.name for path in made.path.parent.iterdir())
+    assert names == sorted(made.path.with_suffix(end).name for end in (".fits", ".cat", ".psf", ".head"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for end in (".fits", ".cat", ".psf"):
+            with fits.open(made.path.with_suffix(end), checksum=True) as units:
+                units.verify("exception")
+    with fits.open(made.path.with_suffix(".cat")) as units:
+        assert [unit.name for unit in units] == ["PRIMARY", "LDAC_IMHEAD", "LDAC_OBJECTS"]
+        raw = units["LDAC_IMHEAD"].fileinfo()
+    # As readers in C take it: cards of 80 characters, up to END.
+    with made.path.with_suffix(".cat").open("rb") as stream:
+        stream.seek(raw["datLoc"])
+        text = stream.read(raw["datSpan"]).rstrip(b"\0").decode("ascii")
+    assert len(text) % 80 == 0
+    assert text[-80:] == "END".ljust(80)
+    header, image = fits.Header.fromstring(text), fits.getheader(made.path, "SCI")
+    assert header["NDETECT"] == len(made.catalogue)
+    assert [header[f"NAXIS{i}"] for i in (1, 2)] == [image[f"NAXIS{i}"] for i in (1, 2)]
+    assert header["GAIN"] == made.image.card("GAIN")
+    for system in (header, image):
+        there = WCS(system).all_pix2world([[7.0, 90.0]], 0)
+        assert 3.6e6 * np.abs(there - np.transpose(astrometry.sky_of_pixel(made.ground.wcs, [7.0], [90.0]))).max() < 0.1
+
+
+def check_flags(made):
+    """They agree with the truth in 99 % of the pixels, and where the truth has something."""
+    flags, maps = made.image.reduced.flags, made.ground.one.maps
+    full = maps["saturation"] > 0
+    said = flags & SATURATED > 0
+    assert np.mean(said == full) >= 0.99
+    if full.any():
+        assert np.mean(said[full]) >= 0.95
+    sigma = noise(made) * made.image.card("GAIN")
+    hits = maps["cosmic_rays"]
+    found = flags & COSMIC_RAY > 0
+    assert np.mean(found == (hits > 5.0 * sigma)) >= 0.99
+    clear = (hits > 10.0 * sigma) & ~full & (made.ground.one.noise_free < sigma)
+    if clear.sum() > 20:
+        assert np.mean(found[clear]) >= 0.9
+    # No core of a star; a hot pixel is as sharp as a ray.
+    near = ndimage.binary_dilation(hits > 0.0, np.ones((3, 3), bool))
+    assert np.mean(found & ~near) < 1e-4
+    assert np.all((flags & NO_DATA > 0) == made.ground.frame.scene.layout.streets)
+    inner = flags[10:-10, 10:-10]
+    assert not (inner & EDGE).any()
+    assert np.all(flags[:10][flags[:10] & NO_DATA == 0] & EDGE)
+    weight = made.image.reduced.weight
+    assert np.all((weight > 0.0) == (flags & ~np.uint8(EDGE) == 0))
+
+
+def noise(made):
+    """Of a pixel of the sky, in the image's unit."""
+    weight = made.image.reduced.weight
+    return float(np.sqrt(1.0 / np.median(weight[weight > 0.0])))
+
+
+def check_stars(made, least):
+    """Isolated ones: magnitudes, their scatter, places; least : how many there are."""
+    rows, (x, y, mag) = made.catalogue, ground_frames.truth(made.ground)
+    distance, which = cKDTree(np.transpose([x, y])).query(np.transpose([rows["XWIN_IMAGE"], rows["YWIN_IMAGE"]]) - 1.0)
+    signal = rows["FLUX_APER"] / rows["FLUXERR_APER"]
+    clean = (distance < 1.5) & (rows["FLAGS"] == 0) & (rows["IMAFLAGS_ISO"] == 0) & (signal > SIGNAL)
+    assert clean.sum() >= least
+    off = rows["MAG_APER"] + made.image.card("APERCOR") - mag[which]
+    pull = (off / rows["MAGERR_APER"])[clean]
+    spread = float(np.std(pull[np.abs(pull) < 5.0]))
+    east = (rows["ALPHAWIN_J2000"] - astrometry.sky_of_pixel(made.ground.wcs, x[which], y[which])[0]) * np.cos(
+        np.radians(rows["DELTA_J2000"])
+    )
+    north = rows["DELTAWIN_J2000"] - astrometry.sky_of_pixel(made.ground.wcs, x[which], y[which])[1]
+    sharp = clean & (signal > SHARP)
+    places = 3.6e6 * np.sqrt(np.mean(east[sharp] ** 2 + north[sharp] ** 2) / 2.0)
+    print(
+        f"{clean.sum()} stars: {np.median(off[clean]):.4f} mag, scatter {spread:.2f}; {sharp.sum()}: {places:.2f} mas"
+    )
+    assert abs(np.median(off[clean])) < 0.01
+    # So few stars know their own scatter to the root of 1 / 2 n.
+    assert 0.9 - np.sqrt(2.0 / clean.sum()) < spread < 1.3
+    assert sharp.sum() >= least // 3
+    assert places < 5.0
+    # Of a Gaussian of the star's second moments, the isophote cuts its wings.
+    width = np.median(rows["FWHM_IMAGE"][sharp]) * made.image.card("PIXSCALE")
+    assert width == pytest.approx(made.image.card("PSFFWHM"), rel=0.15)
+
+
+def check_sky(made):
+    """Without steps, and as noisy as the weights say."""
+    found, maps = made.image.reduced, made.ground.one.maps
+    gain, light, sky = made.image.card("GAIN"), made.ground.one.noise_free, float(np.median(maps["sky"]))
+    sources = ndimage.binary_dilation(light > 1e-3 * sky, iterations=2)
+    good = (found.weight > 0.0) & ~sources & (maps["cosmic_rays"] == 0)
+    left = np.where(good, found.image * gain - light - maps["sky"], np.nan)
+    dark = made.ground.one.scene.dark_electrons * ("dark_current" in made.ground.frame.applied)
+    left = left - dark
+    product = np.nanmean((left - np.nanmedian(left)) ** 2 * found.weight / gain**2)
+    ny, nx = (n // BLOCK for n in left.shape)
+    each = left[: ny * BLOCK, : nx * BLOCK].reshape(ny, BLOCK, nx, BLOCK)
+    count = np.isfinite(each).sum(axis=(1, 3))
+    means = np.nansum(each, axis=(1, 3)) / np.maximum(count, 1)
+    enough = count > 0.25 * BLOCK**2
+    relative = (means / sky)[enough]
+    print(f"{enough.sum()} blocks: mean {relative.mean():.5f}, largest {np.abs(relative).max():.5f}; {product:.4f}")
+    assert enough.sum() >= 5
+    # Noise alone leaves as much in a block.
+    alone = noise(made) * gain / sky / np.sqrt(count[enough])
+    assert np.all(np.abs(relative) <= 0.003 + 2.0 * alone)
+    assert product == pytest.approx(1.0, abs=0.03)
+
+
+def test_files_lie_together(jpcam):
+    check_files(jpcam)
+
+
+def test_scamp_reads_the_catalogue(jpcam, tmp_path):
+    """With the head file beside it: places of its rows are those that the catalogue says itself."""
+    command = test_tools.tool("scamp")
+    for end in (".cat", ".head"):
+        shutil.copy(jpcam.path.with_suffix(end), tmp_path / f"a{end}")
+    rows = jpcam.catalogue
+    clean = rows[(rows["FLAGS"] == 0) & (rows["FLUX_AUTO"] > 100.0 * rows["FLUXERR_AUTO"])]
+    stars = SkyCoord(clean["ALPHA_J2000"], clean["DELTA_J2000"], unit="deg")
+    test_tools.reference(tmp_path / "reference.cat", stars)
+    done = subprocess.run(
+        [command, "a.cat", "-c", "none", "-AHEADER_SUFFIX", ".head", "-HEADER_SUFFIX", ".out",
+         "-ASTREF_CATALOG", "FILE", "-ASTREFCAT_NAME", "reference.cat", "-MATCH", "N", "-SOLVE_ASTROM", "N",
+         "-SOLVE_PHOTOM", "N", "-CENTROID_KEYS", "X_IMAGE,Y_IMAGE", "-DISTORT_KEYS", "X_IMAGE,Y_IMAGE",
+         "-CENTROIDERR_KEYS", "ERRA_IMAGE,ERRB_IMAGE,ERRTHETA_IMAGE", "-CHECKPLOT_TYPE", "NONE",
+         "-CROSSID_RADIUS", "1", "-WRITE_XML", "N", "-VERBOSE_TYPE", "NORMAL"],
+        cwd=tmp_path, check=True, capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    external = (done.stdout + done.stderr).split("(external)")[1]
+    across, up, _, many = re.search(r"Group +1: ([\d.e+-]+)\" ([\d.e+-]+)\" +([\d.e+-]+) +(\d+)", external).groups()
+    assert int(many) == len(clean) > 20
+    assert max(float(across), float(up)) < 1e-4
+
+
+def test_flags_are_those_of_the_truth(jpcam):
+    check_flags(jpcam)
+
+
+def test_stars_are_where_and_as_bright_as_they_are(jpcam):
+    check_stars(jpcam, 20)
+
+
+def test_the_sky_is_flat_and_as_noisy_as_the_weights_say(jpcam):
+    check_sky(jpcam)
+
+
+def test_the_catalogue_is_of_the_pixels_alone(jpcam, tmp_path):
+    """Without a source in the truth there are as many in the catalogue; of what is not there, none."""
+    rows = jpcam.catalogue
+    assert len(rows) >= len(ground_frames.truth(jpcam.ground)[0]) - 5
+    path = reduced(jpcam.ground, tmp_path / "out", "--level2", "--threshold", "30", "--aperture", "4")
+    bright = fits.getdata(path.with_suffix(".cat"), "LDAC_OBJECTS")
+    assert 0 < len(bright) < len(rows)
+    assert bright["FLUX_MAX"].min() > 20.0 * noise(jpcam)
+    header = fits.getheader(path)
+    assert header["APERDIAM"] == pytest.approx(4.0 / header["PIXSCALE"], rel=1e-5)
+    # More of a star's light is in a larger aperture.
+    assert jpcam.image.card("APERCOR") < header["APERCOR"] < 0.0
+
+
+def test_counts_are_electrons_over_the_mean_gain(jpcam, tmp_path):
+    path = reduced(jpcam.ground, tmp_path / "out")
+    electrons = files.read_image(path)
+    assert (electrons.card("BUNIT"), jpcam.image.card("BUNIT")) == ("electron", "adu")
+    assert sorted(file.suffix for file in path.parent.iterdir()) == [".fits"]
+    gain = float(np.mean(jpcam.ground.frame.scene.of_amplifiers("gain", "electron / adu")))
+    assert jpcam.image.card("GAIN") == pytest.approx(gain)
+    np.testing.assert_allclose(jpcam.image.reduced.image * gain, electrons.reduced.image, rtol=1e-5)
+    assert jpcam.image.card("MAGZERO") == pytest.approx(electrons.card("MAGZERO") - 2.5 * np.log10(gain))
+    rates = [stack.rate(image).image for image in (jpcam.image, electrons)]
+    np.testing.assert_allclose(*rates, rtol=1e-5)
+    assert not any(key.startswith(("DSEC", "CSEC", "BSEC", "DATASEC")) for key, *_ in electrons.cards)
+
+
+def test_fringes_of_the_sky_are_taken_off(tmp_path):
+    """They are those that were drawn; what is left of them is lost in the noise."""
+    found = {}
+    for name, on in (("with", True), ("none", False)):
+        (tmp_path / name).mkdir()
+        field = {"electrons": (2e4, 1e5), "pitch": 128, "forced": {"fringes": on}}
+        found[name] = ground_frames.made(
+            tmp_path / name, "hsc", 256, overrides={"ext.hsc.hsc_z.fringes": (0.05, "")}, **field
+        )
+    own, none = found["with"], found["none"]
+    pattern = own.frame.fringes()
+    drawn = own.one.maps["sky"] / none.one.maps["sky"] - 1.0
+    np.testing.assert_allclose(pattern, drawn, atol=1e-5)
+    assert none.frame.fringes() is None
+    left = []
+    for more in (["--without", "bias", "dark", "fringes"], []):
+        image, other = (
+            files.read_image(reduced(one, tmp_path / f"{len(more)}{name}", *more)) for name, one in found.items()
+        )
+        good = (image.reduced.weight > 0.0) & (other.reduced.weight > 0.0) & (own.one.noise_free < 1.0)
+        more_light = (image.reduced.image - other.reduced.image)[good] / np.median(other.reduced.image[good])
+        left.append(float(np.polyfit(pattern[good], more_light, 1)[0]))
+        assert (image.card("CALFRING"), other.card("CALFRING")) == (not more, False)
+    assert left == pytest.approx([1.0, 0.0], abs=0.05)
+
+
+def test_what_is_left_as_it_is_is_said(jpcam, tmp_path):
+    path = reduced(jpcam.ground, tmp_path / "out", "--without", "bias", "dark", "flat", "crosstalk", "nonlinearity")
+    found = files.read_image(path)
+    assert not any(found.card(key) for key in ("CALBIAS", "CALDARK", "CALFLAT", "CALXTALK", "CALLIN"))
+    assert jpcam.image.card("CALFLAT")
+    applied = jpcam.ground.frame.applied
+    assert (jpcam.image.card("CALXTALK"), jpcam.image.card("CALLIN")) == ("crosstalk" in applied, True)
+    assert "nonlinearity" in applied
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (["--level2", "--rate"], "--rate: images of level 2 are in counts"),
+        (["--level2", "--threshold", "0"], "--threshold = 0.0 is outside"),
+        (["--level2", "--least-pixels", "0"], "--least-pixels = 0 is outside"),
+        (["--level2", "--aperture", "-1"], "--aperture = -1.0 is outside"),
+        (["--cosmic-rays", "0.1"], "--cosmic-rays = 0.1 is outside"),
+        (["--threshold", "3"], "without --level2 there is no catalogue"),
+        (["--level2", "--masters", "nowhere"], "nowhere/jpcam_jedis_g_"),
+    ],
+)
+def test_what_makes_no_level2_is_refused_in_a_line(jpcam, tmp_path, capsys, more, words):
+    out = tmp_path / "out"
+    reduced(jpcam.ground, out, "--without", "bias", "dark", *more, wanted=2)
+    said = capsys.readouterr().err
+    assert (words in said, said.count("\n")) == (True, 1), said
+    assert not out.exists() or not list(out.iterdir())
+
+
+@pytest.mark.parametrize(("channel", "why"), [("EXT", "an older version rendered it"), ("VIS", "of ground cameras")])
+def test_without_a_psf_nothing_is_written(jpcam, tmp_path, capsys, channel, why):
+    exposure = replace(jpcam.ground.frame.exposure, channel=channel)
+    ground = replace(jpcam.ground, frame=replace(jpcam.ground.frame, psf=None, exposure=exposure))
+    reduced(ground, tmp_path / "out", "--level2", wanted=2)
+    said = capsys.readouterr().err
+    assert (why in said, said.count("\n")) == (True, 1), said
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_master_of_another_size_is_refused(jpcam, tmp_path, capsys):
+    fits.writeto(files.master_name(tmp_path, jpcam.ground.frame, "flat"), np.ones((5, 7), np.float32))
+    reduced(jpcam.ground, tmp_path / "out", "--without", "bias", "dark", "--masters", str(tmp_path), wanted=2)
+    assert "flat.fits: (5, 7) pixels, the frame has (448, 448)" in capsys.readouterr().err
+
+
+def test_where_a_flat_of_yours_says_nothing_a_pixel_is_not_used(jpcam):
+    found = files.masters(jpcam.ground.masters, jpcam.ground.frame, ("dark",))
+    blind = ~np.isfinite(fits.getdata(files.master_name(jpcam.ground.masters, jpcam.ground.frame, "flat")))
+    assert blind.any()
+    assert np.all(found.flags[blind] & calibration.UNSURE)
+    assert np.all(jpcam.image.reduced.weight[blind] == 0.0)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("camera", [*ground_frames.BANDS])
+def test_every_camera(tmp_path, camera):
+    made = of(tmp_path, camera, 1024, electrons=(2e4, 3e5), pitch=96, rays=10.0)
+    for check in (check_files, check_flags, check_sky):
+        check(made)
+    check_stars(made, 40)
+
+
+LAKE = """
+accuracy = "survey"
+[universe]
+galaxy_limit = 21.0
+star_limit = 22.5
+box_cells = 192
+lensing_nside = 64
+[fluxes]
+bands = ["{band}"]
+[[pointing]]
+channel = "EXT"
+camera = "{camera}"
+band = "{band}"
+ra = 53.117
+dec = -27.808
+centre_on = "{detector}"
+detectors = ["{detector}"]
+mjd = {mjd}
+[[observation]]
+channels = ["EXT"]
+survey = "{survey}"
+image_type = "bias"
+exposures = 8
+detectors = ["{detector}"]
+[[observation]]
+channels = ["EXT"]
+survey = "{survey}"
+image_type = "flat"
+exposures = 12
+bands = ["{band}"]
+detectors = ["{detector}"]
+[products]
+truth = ["noise_free", "sky", "cosmic_rays"]
+"""
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(
+    ("survey", "camera", "band", "detector", "mjd", "size"),
+    [
+        ("jedis", "jpcam", "jedis_g", "ccd05", 60905.08, 1024),
+        # Its pixels are smaller, and more of its stars saturated.
+        ("whigs", "hsc", "hsc_g", "1_00", 60905.6, 2048),
+    ],
+)
+def test_of_a_lake_with_masters_of_its_own_frames(tmp_path, survey, camera, band, detector, mjd, size):
+    """From a request: biases and dome flats, a master flat that has its band's name, sources of the catalogues."""
+    root, listed = layout.lake(tmp_path / "lake"), detectors._listed
+    text = LAKE.format(survey=survey, camera=camera, band=band, detector=detector, mjd=mjd)
+    wanted = parse(requests.written(tmp_path, text, requests.FIELD.format(0.2), seed=11))
+    with pytest.MonkeyPatch.context() as patch:
+        small = {"nx": size, "ny": size}
+        patch.setattr(detectors, "_listed", lambda *of: tuple(replace(d, **small) for d in listed(*of)))
+        for job in MODULES:
+            for step in job.steps(root, wanted):
+                publish.make(root, step.plan, step.work)
+        own, out = str(tmp_path / "masters"), tmp_path / "level2"
+        assert masters.main(["--lake", str(root), "--out", own]) == 0
+        call = ["--lake", str(root), "--masters", own, "--without", "dark", "--out", str(out), "--level2"]
+        assert reduce.main(call) == 0
+    assert sorted(path.name for path in Path(own).iterdir()) == [
+        f"{camera}_{detector}_bias.fits", f"{camera}_{band}_{detector}_flat.fits"
+    ]  # fmt: skip
+    (path,) = out.glob("*.fits")
+    found, version = files.read_image(path), read.version(root, "products")
+    image = next(row["path"] for row in version.rows().to_pylist() if row["path"].endswith("_sky.fits"))
+    sky, light, rays = (
+        images.read_images(version.file(image.replace("_sky", kind)))[0].data
+        for kind in ("_sky", "_noise_free", "_cosmic_rays")
+    )
+    # Outer light of galaxies is everywhere.
+    good = (found.reduced.weight > 0.0) & (light < 0.01 * np.median(sky)) & (rays == 0)
+    dark = found.card("DARKRATE") * found.card("EXPTIME")
+    left = np.where(good, found.reduced.image * found.card("GAIN") - light - sky - dark, np.nan)
+    each = left.reshape(size // BLOCK, BLOCK, size // BLOCK, BLOCK)
+    count = np.isfinite(each).sum(axis=(1, 3))
+    means = (np.nansum(each, axis=(1, 3)) / np.maximum(count, 1))[count > 0.5 * BLOCK**2] / np.median(sky)
+    print(f"{len(means)} blocks: mean {means.mean():.5f}, rms {means.std():.5f}, largest {np.abs(means).max():.5f}")
+    assert len(means) > 100
+    assert np.mean(np.abs(means) <= 0.003) >= 0.98
+    truth = read.version(root, "rendered_truth").rows().to_pylist()
+    stars = [row for row in truth if row["expected"] and kind_of(row["id"]) == 5 and 17.0 < row["mag"] < 21.0]
+    rows = fits.getdata(path.with_suffix(".cat"), "LDAC_OBJECTS")
+    distance, which = cKDTree(np.transpose([rows["XWIN_IMAGE"], rows["YWIN_IMAGE"]]) - 1.0).query(
+        [(row["x"] + row["psf_x"], row["y"] + row["psf_y"]) for row in stars]
+    )
+    seen = (distance < 1.0) & (rows["FLAGS"][which] == 0) & (rows["IMAFLAGS_ISO"][which] == 0)
+    off = rows["MAG_APER"][which] + found.card("APERCOR") - [row["mag"] for row in stars]
+    print(f"{seen.sum()} of {len(stars)} stars: {np.median(off[seen]):.4f} mag")
+    assert seen.sum() >= 5
+    assert abs(np.median(off[seen])) < 0.02

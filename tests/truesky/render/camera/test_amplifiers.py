@@ -1,0 +1,142 @@
+"""Amplifiers of the ground cameras: no pixel is read twice or forgotten, and the raw file says where each lies."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import resolve
+from lake_schema.mission.parameter import CAMERAS
+from tests.truesky.render.fields import MISSION
+from truesky.render.camera import amplifiers, detectors
+from truesky.render.camera.sections import Section
+
+GAIN = "electron / adu"
+# Of raw files, as published: rows and columns.
+RAW = {"decam": (4146, 2160), "megacam": (4644, 2112), "hsc": (4241, 2144)}
+
+
+def first(camera, **changed):
+    return replace(detectors.detectors(camera, MISSION)[0], **changed)
+
+
+def layout_of(detector, mission=MISSION):
+    return amplifiers.layout(detector, mission)
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_every_pixel_is_read_once_and_found_again(camera):
+    """In the planes, in the raw file, and in the sections that its header names."""
+    own = layout_of(first(camera, nx=96, ny=80))
+    frame = np.arange(1, 96 * 80 + 1).reshape(80, 96)
+    planes = own.apart(frame)
+    there = ~own.streets
+    np.testing.assert_array_equal(own.together(planes), np.where(there, frame, 0))
+    assert np.count_nonzero(planes) == there.sum()
+    # Pre- and overscan, too, are in the file once, each of them.
+    marked = np.arange(1, planes.size + 1).reshape(planes.shape)
+    raw = own.raw(marked)
+    np.testing.assert_array_equal(np.sort(raw[raw > 0]), marked.ravel())
+    data = own.raw(planes)
+    np.testing.assert_array_equal(data[own.data.slices], np.where(there, frame, 0))
+    for number, amplifier in enumerate(own.amplifiers):
+        np.testing.assert_array_equal(data[own.pixels_of(number).slices], frame[amplifier.pixels.slices])
+        bias = raw[own.bias_of(number).slices]
+        height, pixels = own.height, own.prescan + own.width
+        read = marked[number, :height, pixels:] if own.overscan else marked[number, :height, : own.prescan]
+        np.testing.assert_array_equal(np.sort(bias, axis=None), np.sort(read, axis=None))
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_the_first_pixel_to_be_read_is_at_its_corner(camera):
+    own = layout_of(first(camera, nx=96, ny=80))
+    frame = np.arange(96 * 80).reshape(80, 96)
+    for plane, amplifier in zip(own.apart(frame), own.amplifiers, strict=True):
+        part = frame[amplifier.pixels.slices]
+        assert plane[0, own.prescan] == part[-int(amplifier.read_top), -int(amplifier.read_right)]
+
+
+@pytest.mark.parametrize("camera", RAW)
+def test_raw_files_have_their_published_size(camera):
+    assert layout_of(first(camera)).raw_shape == RAW[camera]
+
+
+def test_sensors_of_two_makers_are_read_in_their_own_ways():
+    """Rubin Observatory: segments of 576 x 2048 (e2v) or 576 x 2048 with other scans (ITL); gains 1.47 and 1.57."""
+    makers = {d.kind: d for d in detectors.detectors("lsstcam", MISSION)}
+    e2v, itl = (layout_of(makers[kind]) for kind in ("e2v", "itl"))
+    for own in (e2v, itl):
+        assert (own.width + own.scans, own.height + own.rows) == (576, 2048)
+        assert len(own.amplifiers) == 16
+    still = resolve(overrides={"ext.lsstcam.gain_spread": (0.0, GAIN)})
+    gains = [amplifiers.values("gain", GAIN, makers[k], still, own) for k, own in (("e2v", e2v), ("itl", itl))]
+    assert gains == pytest.approx([1.47, 1.57])
+
+
+@given(st.tuples(*[st.integers(0, 5000)] * 2), st.tuples(*[st.integers(1, 5000)] * 2))
+def test_sections_are_written_and_read(start, size):
+    section = Section(*start, *size)
+    assert Section.of(section.text) == section
+    assert Section.of("[1:1024,51:4146]") == Section(0, 50, 1024, 4096)
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_each_amplifier_has_its_own_gain_the_same_in_every_lake(camera):
+    one = first(camera)
+    own = layout_of(one)
+    gain = amplifiers.values("gain", GAIN, one, MISSION, own)
+    np.testing.assert_array_equal(gain, amplifiers.values("gain", GAIN, one, MISSION, own))
+    assert len(set(gain)) == len(own.amplifiers)
+    mean, spread = (MISSION.value(f"ext.{camera}.{key}", GAIN) for key in ("gain", "gain_spread"))
+    assert np.abs(gain / mean - 1.0).max() <= 3.0 * spread / mean * max(a.relative[0] for a in own.amplifiers) + 0.1
+    other = detectors.detectors(camera, MISSION)[1]
+    assert (gain != amplifiers.values("gain", GAIN, other, MISSION, layout_of(other))).all()
+
+
+def test_what_a_request_gives_is_taken_as_it_is():
+    one = detectors.detector("decam", "S29", MISSION)
+    own = layout_of(one)
+    for overrides, wanted in (
+        ({"ext.decam.gain": 3.0}, 3.0),
+        ({"ext.decam.gain@S29": 3.5}, 3.5),
+        ({"ext.decam.gain@S29": 3.5, "ext.decam.gain.B": 2.0}, 3.5),
+        ({"ext.decam.gain@S29.A": 1.0, "ext.decam.gain.B": 2.0}, [1.0, 2.0]),
+    ):
+        mission = resolve(overrides={key: (value, GAIN) for key, value in overrides.items()})
+        np.testing.assert_array_equal(amplifiers.values("gain", GAIN, one, mission, own), wanted)
+
+
+def test_a_detector_too_small_for_its_amplifiers_is_refused():
+    with pytest.raises(BadInput, match=r"detector S29: 1 x 8 pixels for 2 amplifiers"):
+        layout_of(replace(detectors.detector("decam", "S29", MISSION), nx=1, ny=8))
+
+
+def test_crosstalk_beyond_neighbours_is_as_little_as_measured():
+    """Rubin Observatory, LSSTCam: 1.5e-4 to 2.9e-4 between neighbours, less than 5e-5 between others."""
+    for one in detectors.detectors("lsstcam", MISSION)[:60]:
+        own = layout_of(one)
+        found = amplifiers.couplings(2.2e-4, 2.9e-4, one, own)
+        columns, top = np.array([(a.pixels.x // own.width, a.read_top) for a in own.amplifiers]).T
+        neighbours = (np.abs(columns[:, None] - columns) == 1) & (top[:, None] == top)
+        assert 1.4e-4 < found[neighbours].min() < found[neighbours].max() <= 2.9e-4
+        assert 0.0 < found[~neighbours].max() < 5e-5
+
+
+def test_amplifiers_that_would_have_no_gain_are_refused():
+    """Exactly those: a spread that is wide, and a camera whose own amplifiers all lie on one side of it."""
+    every, key = detectors.detectors("decam", MISSION), "ext.decam.gain_spread"
+    amplifiers.refuse_spread(every, MISSION)
+    for rms in (0.5, 1.0, 1.35, 1.5, 2.0, 3.0):
+        mission = resolve(overrides={key: (rms, GAIN)})
+        lowest = min(np.min(amplifiers.values("gain", GAIN, d, mission, layout_of(d))) for d in every)
+        if lowest >= 1e-3:
+            amplifiers.refuse_spread(every, mission)
+            continue
+        with pytest.raises(BadInput, match=rf"^mission: {key} = {rms:g}: amplifier [AB] of detector \w+ would have -"):
+            amplifiers.refuse_spread(every, mission)
+    assert lowest < 0.0
+    with pytest.raises(BadInput, match="read_noise_spread = 9: amplifier"):
+        amplifiers.refuse_spread(every, resolve(overrides={"ext.decam.read_noise_spread": (9.0, "electron")}))

@@ -1,0 +1,196 @@
+"""Distortion of the optics, and mounting rotation of detectors: as large as the mission says, undone, or absent."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
+from astropy.wcs import WCS
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import resolve
+from lake_schema.mission.parameter import CAMERAS as GROUND
+from truesky.render.camera import astrometry, distortion, observatories, tpv
+from truesky.render.camera.astrometry import pixel_of_sky, sky_of_pixel, wcs
+from truesky.render.camera.detectors import detectors
+from truesky.render.camera.pointing import boresight_for, outline, sky_of_plane
+
+MISSION = resolve()
+VIS, NISP = detectors("vis", MISSION), detectors("nisp", MISSION)
+CAMERAS = pytest.mark.parametrize("camera", [VIS, NISP], ids=["vis", "nisp"])
+FARTHEST = [max(detectors(camera, MISSION), key=lambda d: np.hypot(d.x, d.y)) for camera in GROUND]
+# Half of the field of each, arcsec.
+HALF = {"vis": (1260, 1400), "nisp": (1300, 1376)}
+HALF |= {d.section: (abs(d.x) + 500, abs(d.y) + 500) for d in FARTHEST}
+
+
+def field(camera, n):
+    return np.meshgrid(*(np.linspace(-half, half, n) for half in HALF[camera[0].section]))
+
+
+def scales(x, y, terms, step=0.05):
+    """Singular values of the distortion's derivative, from differences."""
+    columns = [
+        np.subtract(distortion.bent(x + a, y + b, terms), distortion.bent(x - a, y - b, terms)) / (2 * step)
+        for a, b in ((step, 0.0), (0.0, step))
+    ]
+    return np.linalg.svd(np.moveaxis(np.array(columns), (0, 1), (-1, -2)), compute_uv=False)
+
+
+@CAMERAS
+def test_the_scale_changes_by_as_much_as_the_mission_says(camera):
+    terms = camera[0].bending
+    change = scales(*field(camera, 41), terms) - 1.0
+    said = MISSION.value(f"{camera[0].section}.fpa.distortion")
+    assert np.abs(change).max() == pytest.approx(said, rel=0.01)
+    np.testing.assert_allclose(scales(np.zeros(1), np.zeros(1), terms), 1.0, atol=1e-9)
+    assert distortion.bent(0.0, 0.0, terms) == (0.0, 0.0)
+
+
+@CAMERAS
+def test_it_is_a_cubic_about_the_telescope_s_axis(camera):
+    """Which the field lies beside: D = k r^2 r, less what shifts and scales the whole field."""
+    axis = MISSION.value("plm.vis_field_offset_y", "arcsec")
+    x, y = field(camera, 9)
+
+    def cubic(x, y):
+        return np.stack([x, y + axis]) * (x**2 + (y + axis) ** 2)
+
+    # The cubic's own shift and scales at the centre.
+    slope = np.array([axis**2 * x, 3 * axis**2 * y])
+    wanted = cubic(x, y) - cubic(0.0, 0.0)[:, None, None] - slope
+    found = np.array(distortion.bent(x, y, camera[0].bending)) - np.stack([x, y])
+    strength = (found * wanted).sum() / (wanted**2).sum()
+    np.testing.assert_allclose(found, strength * wanted, atol=2e-3 * np.abs(found).max())
+
+
+@pytest.mark.parametrize(
+    ("camera", "radius", "seen"),
+    # What a place so many mm from the axis sees over what a perfect camera of the scale on the axis has there, by the
+    # camera's description; HSC's polynomial of ninth order in the mean of ten directions.
+    [
+        ("decam", 225.0, (8.5165e-5 * 225.0 - 4.5014e-12 * 225.0**3) / (8.5165e-5 * 225.0)),
+        ("lsstcam", 317.0, 1 - 8.337e-9 * 317.0**2 - 1.41e-15 * 317.0**4),
+        ("hsc", 150.0, 0.9890356 / 0.9995944),
+        ("hsc", 240.0, 0.9709013 / 0.9995944),
+    ],
+)
+def test_a_ground_camera_sees_what_its_description_says(camera, radius, seen):
+    one = detectors(camera, MISSION)[0]
+    plate = one.pixel_scale / MISSION.value(f"ext.{camera}.fpa.pixel_size", "mm / pix")
+    for angle in (0.0, 0.4, 2.0):
+        x, y = radius * plate * np.array([np.cos(angle), np.sin(angle)])
+        found = np.hypot(*distortion.bent(x, y, one.bending))
+        # 0.1 arcsec at HSC's edge; the others are exact.
+        assert found / (radius * plate) == pytest.approx(seen, abs=4e-5 if camera == "hsc" else 1e-7)
+
+
+def test_megacam_sees_less_at_the_edge():
+    """0.187 arcsec a pixel at the centre, 0.185 half a degree away."""
+    one = detectors("megacam", MISSION)[0]
+    edge = scales(np.array([1800.0]), np.array([0.0]), one.bending)[0]
+    assert one.pixel_scale == pytest.approx(0.187)
+    assert one.pixel_scale * np.sqrt(edge.prod()) == pytest.approx(0.185, abs=1e-3)
+
+
+@pytest.mark.parametrize("d", FARTHEST, ids=GROUND)
+def test_a_ground_camera_s_header_is_where_sources_are_drawn(d, tmp_path):
+    """In the form of its pipeline, as astropy reads it, on the detector that the optics distort most."""
+    camera = d.section.removeprefix("ext.")
+    ra, dec, angle = boresight_for(d, 53.1, -27.8, 12.0)
+    system = wcs(d, ra, dec, angle)
+    cards = astrometry.cards(system)
+    if observatories.of(camera).convention == "tpv":
+        cards = tpv.cards(cards)
+    fits.PrimaryHDU(header=fits.Header([fits.Card(*card) for card in cards])).writeto(tmp_path / "one.fits")
+    theirs = WCS(fits.getheader(tmp_path / "one.fits"))
+    lon, lat = (axis.ravel() for axis in np.meshgrid(np.linspace(52.9, 53.3, 9), np.linspace(-28.0, -27.6, 9)))
+    column, row = pixel_of_sky(system, lon, lat)
+    here = (column > -0.5) & (column < d.nx - 0.5) & (row > -0.5) & (row < d.ny - 0.5)
+    assert here.sum() > 5
+    there = SkyCoord(*theirs.all_pix2world(column, row, 0), unit="deg")
+    assert there.separation(SkyCoord(lon, lat, unit="deg")).to_value("mas")[here].max() < 1e-2
+    # Without the distortion they would lie arcseconds off.
+    flat = pixel_of_sky(wcs(replace(d, bending=()), ra, dec, angle), lon, lat)
+    assert np.hypot(flat[0] - column, flat[1] - row)[here].min() * d.pixel_scale > 2.0
+
+
+@pytest.mark.parametrize("d", FARTHEST, ids=GROUND)
+def test_the_outline_of_a_field_is_its_detectors(d):
+    pointing = (150.0, 2.0, 33.0)
+    x, y = (axis[0] for axis in outline([d]))
+    corners = SkyCoord(*astrometry.corners(d, wcs(d, *pointing)).T, unit="deg")
+    planned = SkyCoord(*sky_of_plane(x[1:], y[1:], *pointing), unit="deg")
+    assert corners.separation(planned).to_value("mas").max() < 1e-3
+
+
+@given(st.sampled_from([*VIS, *NISP, *FARTHEST]), st.floats(-1, 1), st.floats(-1, 1), st.floats(-180, 180))
+def test_the_header_s_polynomial_is_the_focal_plane_s(d, across, up, angle):
+    """What a place of the focal plane sees: by the polynomial there, and by the detector's SIP."""
+    pointing = (150.0, 2.0, angle)
+    turn = np.radians(d.rotation)
+    x, y = across * HALF[d.section][0], up * HALF[d.section][1]
+    across, up = x - d.x, y - d.y
+    column = (np.cos(turn) * across + np.sin(turn) * up) / d.pixel_scale + (d.nx - 1) / 2
+    row = (np.cos(turn) * up - np.sin(turn) * across) / d.pixel_scale + (d.ny - 1) / 2
+    here = SkyCoord(*sky_of_pixel(wcs(d, *pointing), [column], [row]), unit="deg")
+    there = SkyCoord(*sky_of_plane(*distortion.bent([x], [y], d.bending), *pointing), unit="deg")
+    assert here.separation(there).to_value("mas")[0] < 1e-3
+
+
+@given(st.sampled_from([*VIS, *NISP, *FARTHEST]), st.floats(-4000, 8000), st.floats(-4000, 8000))
+def test_the_inverse_is_exact(d, column, row):
+    """To a hundredth of a milliarcsecond, and a thousand times better; and as astropy's own."""
+    system = wcs(d, *boresight_for(d, 53.1, -27.8, 12.0))
+    sky = sky_of_pixel(system, [column], [row])
+    found = pixel_of_sky(system, *sky)
+    assert np.hypot(found[0][0] - column, found[1][0] - row) * 1e3 * d.pixel_scale < 1e-5
+    np.testing.assert_allclose(found, system.all_world2pix(*sky, 0, tolerance=1e-9), atol=1e-7)
+
+
+def test_what_no_camera_sees_is_left_where_it_is():
+    system = wcs(VIS[20], *boresight_for(VIS[20], 53.1, -27.8, 0.0))
+    far = pixel_of_sky(system, [63.1, 233.1], [-27.8, 27.8])
+    np.testing.assert_array_equal(far, system.wcs_world2pix([63.1, 233.1], [-27.8, 27.8], 0))
+
+
+@pytest.mark.parametrize(("camera", "columns", "pitch"), [("vis", 6, 409.6 + 12.7), ("nisp", 4, 612.0 + 50.6)])
+def test_it_can_be_switched_off(camera, columns, pitch):
+    unbent = {f"{camera}.fpa.distortion": (0.0, "")}
+    moves = {f"{camera}.fpa.metrology_{kind}": (0.0, unit) for kind, unit in (("shift", "pix"), ("rotation", "deg"))}
+    straight, on_grid = (detectors(camera, resolve(overrides=o)) for o in (unbent, unbent | moves))
+    assert not any(d.bending for d in straight)
+    cards = dict((keyword, value) for keyword, value, _ in astrometry.cards(wcs(straight[0], 10.0, 20.0, 0.0)))
+    assert cards["CTYPE1"] == "RA---TAN"
+    assert not any(keyword.startswith("A_") for keyword in cards)
+    moved = np.array([[b.x - a.x, b.y - a.y, b.rotation - a.rotation] for a, b in zip(on_grid, straight, strict=True)])
+    rms = np.sqrt(np.mean(moved**2, axis=0))
+    scale = straight[0].pixel_scale
+    np.testing.assert_allclose(rms, [2 * scale, 2 * scale, 0.02], rtol=1e-2)
+    assert {round(d.rotation, 12) for d in on_grid} == {0.0, 180.0}
+    # One pixel along the grid is one pixel.
+    np.testing.assert_allclose(np.diff([d.x for d in on_grid[:columns]]), pitch, rtol=1e-12)
+
+
+@pytest.mark.parametrize("far", [1.3, 2.0, 6.0, 40.0])
+def test_what_lies_beyond_where_places_are_seen_twice_is_left(far):
+    """HSC's distortion folds 1.7 deg from its axis, where there is no detector."""
+    system = wcs(FARTHEST[-1], 150.0, 2.0, 0.0)
+    place = [150.0], [2.0 + far]
+    inside = far < 1.4
+    column, row = pixel_of_sky(system, *place)
+    straight = system.wcs_world2pix(*place, 0)
+    assert np.allclose((column, row), straight, atol=1e-6) != inside
+    if inside:
+        np.testing.assert_allclose(sky_of_pixel(system, column, row), place, rtol=1e-12)
+    # Far from every detector.
+    assert max(abs(column[0]), abs(row[0])) > 7000
+
+
+def test_what_cannot_be_undone_is_refused():
+    folded = resolve(overrides={"ext.hsc.fpa.distortion_r2": (-1e-5, "1 / mm2")})
+    with pytest.raises(BadInput, match="camera hsc: its distortion is so strong"):
+        detectors("hsc", folded)

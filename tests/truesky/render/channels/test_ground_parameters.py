@@ -1,0 +1,71 @@
+"""Every parameter of a ground camera is asked for by what plans or renders it."""
+
+from fnmatch import fnmatchcase
+from types import SimpleNamespace
+
+import pytest
+
+from lake_schema.mission.configuration import MissionConfiguration, resolve
+from lake_schema.mission.parameter import CAMERAS
+from tests.truesky.render import fields
+from truesky.fluxes import passbands
+from truesky.render.camera import bands, detectors
+from truesky.render.channels import ground
+from truesky.render.effects.scene import Scene
+from truesky.render.exposure import elsewhere
+from truesky.render.planning import calibration_frames, ground_surveys, planned_exposures
+from truesky.render.products import raw_pointing
+from truesky.request.area import Area
+from truesky.request.observations import Observation
+
+# Declared, and asked for by nothing that renders: what zero points are checked with.
+WAITING = ("*.collecting_area", "*.throughput")
+
+
+def seen(method, found):
+    """The method, which adds the name that it is asked for."""
+
+    def see(self, key):
+        found.add(key)
+        return method(self, key)
+
+    return see
+
+
+def asked(camera, mission, monkeypatch):
+    """Names that planning and rendering a camera in all its bands ask for."""
+    found = set()
+    for name in ("parameter", "model"):
+        monkeypatch.setattr(MissionConfiguration, name, seen(getattr(MissionConfiguration, name), found))
+    for band in bands.of_ground(camera, mission):
+        exposed = {"channel": "EXT", "camera": camera, "band": band, "seeing": 0.8}
+        planned_exposures._Band.of(SimpleNamespace(**exposed), mission, None)
+        planned_exposures.exposure_time("EXT", camera, band, mission)
+        one = detectors.detectors(camera, mission)[0]
+        shown = fields.exposure(**exposed, airmass=1.3, zenith=20.0)
+        for profile in (1.0, 2.0):
+            own = mission.overridden_with({f"ext.{camera}.psf.profile": (profile, "")})
+            ground.CHANNEL.psf(shown, one, passbands.load(band), own, 1)
+    raw_pointing.believed(shown, one, mission, 1)
+    surveys = [row["survey"] for row in mission.rows("survey.external") if row["camera"] == camera]
+    block = Observation(("EXT",), survey=surveys[0], exposures=1)
+    assert [*ground_surveys.exposures(block, Area(ra=60.0, dec=0.0, radius=1.0), mission, 1, 60500.0)]
+    flat = Observation(("EXT",), "flat", surveys[0], exposures=1)
+    assert [*calibration_frames.exposures(flat, camera, (60.0, 0.0), mission, 1, 60500.0)]
+    elsewhere.neighbours(camera, one.name, mission)
+    crossed = mission.overridden_with({"survey.satellites.rate": (0.1, "1 / (deg s)")})
+    every = {effect.name: effect for effects in ground.EFFECTS.values() for effect in effects}
+    for band in bands.of_ground(camera, mission):
+        scene = Scene(crossed, one.section, 90.0, 10.0, 1e6, one, band=passbands.load(band))
+        for effect in every.values():
+            effect.parameters(scene)
+            effect.contribution(scene)
+    return found
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_every_parameter_is_asked_for(camera, monkeypatch):
+    mission = resolve()
+    keys = {record.key for record in (*mission.parameters, *mission.models) if record.key.startswith(f"ext.{camera}.")}
+    unasked = keys - asked(camera, mission, monkeypatch)
+    assert {key for key in unasked if not any(fnmatchcase(key, pattern) for pattern in WAITING)} == set()

@@ -1,0 +1,357 @@
+"""Wings of bright stars beyond the PSF's plane: against Airy's pattern, the pupil's own transform, and the light."""
+
+from dataclasses import replace
+
+import galsim
+import numpy as np
+import pytest
+
+from lake_schema.mission.configuration import resolve
+from tests.truesky.render.fields import one_source, small
+from tests.truesky.render.nominal import COSMIC_RAYS, TIME, off, psf_of, rendered
+from truesky.fluxes import passbands
+from truesky.render.camera.astrometry import wcs
+from truesky.render.camera.pointing import boresight_for
+from truesky.render.drawing import cost, far_light, stamp_sizes, stamps
+from truesky.render.drawing.kernels.far_light import left_compiled, remove_aliased_compiled
+from truesky.render.drawing.kernels.frame import FIXED_POINT
+from truesky.render.drawing.settings import settings_for
+from truesky.render.psf import diffraction, spikes, sub_bands
+from truesky.render.psf.model import SIDE
+from truesky.request.accuracy import SURVEY
+
+MISSION = resolve()
+PARTS = sub_bands.sub_bands(passbands.load("euclid_vis"))
+EQUAL = np.full(len(PARTS), 1.0 / len(PARTS))
+NOISE = 12.7
+ARCSEC = np.pi / 648000
+# A star of 6 mag in a nominal exposure.
+BRIGHT = 5e10
+
+
+def of_pupil(blur=0.034, pixel_scale=0.1, parts=PARTS):
+    return spikes.of_pupil(parts, blur, pixel_scale, 2048 / 3, MISSION)
+
+
+@pytest.fixture(scope="module")
+def vis():
+    # As in other tests, so that they share the planes.
+    return psf_of(small("vis", "3-4", 256))
+
+
+def shone(psf, side, column, row, electrons=BRIGHT, least=0.0):
+    """What `add` adds to an empty frame, electrons."""
+    frame = np.zeros((side, side), np.int64)
+    far_light.add(frame, far_light.Star(column, row, electrons, None, SIDE, least, psf.edges))
+    return frame / FIXED_POINT
+
+
+def off_spikes(psf, dx, dy, clear):
+    """Pixels more than `clear` from the middle of every spike."""
+    along = [np.abs(dx * np.cos(a) + dy * np.sin(a)) for a in psf.edges.bars[:, 0]]
+    return np.min(along, axis=0) > clear
+
+
+@pytest.mark.parametrize("wavelength", [5500.0, 9000.0])
+def test_the_ring_is_airy_s(wavelength):
+    """Two circles: the mean of an obscured Airy pattern over its rings."""
+    own = replace(of_pupil(), wavelength=np.array([[wavelength]]))
+    clear = np.pi * (600.0**2 - 197.5**2)
+    airy = galsim.Airy(lam=wavelength / 10, diam=1.2, obscuration=197.5 / 600.0)
+    radius = np.linspace(20.0, 60.0, 40001)
+    mean = np.mean([airy.xValue(r, 0.0) * r**3 for r in radius])
+    # In pixels of 0.1"; the bars leave less of the light, and none of the edges.
+    ours = spikes.ring(own, np.ones(1)) * own.area / clear * 0.1
+    assert ours == pytest.approx(mean, rel=0.01)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("bar", [0, 1, 2])
+def test_a_spike_is_the_pupil_s_transform(bar):
+    """Along a spike the transform of the pupil is that of its projection; neighbouring edges beat, and are averaged."""
+    own = of_pupil(blur=0.0, pixel_scale=0.02)
+    turn, step, along = own.bars[bar, 0], 0.25, 1.0
+    axis, other = np.arange(-602.0, 602.1, step), np.arange(-602.0, 602.1, along)
+    u, v = np.meshgrid(other, axis)
+    clear = diffraction.pupil(u * np.cos(turn) - v * np.sin(turn), u * np.sin(turn) + v * np.cos(turn), step, MISSION)
+    projected = clear.sum(axis=1) * along
+    radius = np.linspace(30.0, 60.0, 61)
+    found = np.zeros(len(radius))
+    for wavelength in own.wavelength[:, 1::3].ravel() * 1e-7:
+        turns = np.exp(-2j * np.pi * np.outer(radius * ARCSEC / wavelength, axis))
+        found += np.abs(turns @ projected * step) ** 2 / (wavelength**2 * projected.sum() * step)
+    theirs = found / own.wavelength[:, 1::3].size * (0.02 * ARCSEC) ** 2
+    line = spikes.spikes(own, EQUAL, 70.0 / 0.02)[bar, :, 0]
+    ours = np.interp(radius / 0.02, 8.0 * np.arange(len(line)), line) + spikes.ring(own, EQUAL) / (radius / 0.02) ** 3
+    assert (ours * radius**2).mean() == pytest.approx((theirs * radius**2).mean(), rel=0.05)
+
+
+def test_wings_are_those_of_the_mission_database(vis):
+    """The embedded pupil's azimuthal mean, at 1", where bars shine as much as circles that are as long."""
+    own = of_pupil()
+    circles = (
+        2 * np.pi * (MISSION.value("plm.aperture_diameter", "mm") / 2 + MISSION.value("plm.pupil.stop_radius", "mm"))
+    )
+    bars = 2 * own.bars[:, 2].sum()
+    # Of light in a pixel, at ten pixels; per square arcsec.
+    strength = spikes.ring(own, EQUAL) / 10.0**3 / 0.1**2 * (circles + bars) / circles
+    assert strength == pytest.approx(MISSION.value("vis.psf.wing_strength"), rel=0.03)
+    frame = shone(vis, 1401, 700.0, 700.0)
+    y, x = np.mgrid[-700:701, -700:701].astype(float)
+    radius, clear = np.hypot(x, y), off_spikes(vis, x, y, 60.0)
+    far = np.array([400.0, 500.0, 600.0])
+    light = [frame[clear & (np.abs(radius - r) < 3.0)].mean() for r in far]
+    slope = np.polyfit(np.log(far), np.log(light), 1)[0]
+    assert slope == pytest.approx(MISSION.value("vis.psf.wing_slope"), abs=0.05)
+
+
+def test_no_light_is_lost_beyond_the_plane(vis):
+    """The plane has what the pupil sends there: outside lies the rest of all light."""
+    side = 3000
+    light = shone(vis, side, side / 2, side / 2).sum() / BRIGHT
+    # What the frame does not show of r^-3 around a square, and of the spikes, whose fringes leave a half of r^-2.
+    beyond = spikes.ring(vis.edges, EQUAL) * 4 * np.sqrt(2) / (side / 2)
+    wavelength = vis.edges.wavelength.mean() * 1e-7
+    for turn, _, length in vis.edges.bars:
+        border = side / 2 / max(abs(np.cos(turn)), abs(np.sin(turn)))
+        beyond += 2 * length * wavelength / (2 * np.pi**2 * vis.edges.area * 0.1 * ARCSEC * border)
+    left = far_light.left(SIDE, 3, vis.planes.images.shape[1])
+    kept = (vis.planes.images.mean(axis=0, dtype=float) * left[:, None] * left).sum()
+    assert 0.997 < kept < 0.998
+    assert light + beyond == pytest.approx(1 - kept, rel=0.05)
+
+
+def test_the_frame_has_no_seam(vis):
+    """Between spikes the mean light of a 6 mag star falls as r^-3, through the border of its plane."""
+    field = replace(small("vis", "3-4", 1200), nx=1200, ny=1200)
+    source = one_source(field, wcs(field, *boresight_for(field, 10.0, 0.0, 0.0)), BRIGHT, 600.3, 599.8)
+    image = stamps.draw(source, np.array([SIDE]), vis, 1200, 1200)
+    y, x = np.mgrid[:1200, :1200]
+    dx, dy = x - 600.3, y - 599.8
+    radius, clear = np.hypot(dx, dy), off_spikes(vis, dx, dy, 40.0)
+    law = spikes.ring(vis.edges, EQUAL) * BRIGHT
+    for inner, outer in ((150, 200), (200, 250), (250, 300), (300, 360), (360, 420), (420, 560)):
+        here = clear & (radius >= inner) & (radius < outer)
+        assert (image * radius**3)[here].mean() == pytest.approx(law, rel=0.06)
+    # Nor holes in the sky, where the plane ends or its transform had put light of elsewhere.
+    assert image.min() > -1e-3 * NOISE
+    # A spike goes on as it was.
+    turn = vis.edges.bars[2, 0]
+    out = np.arange(225, 285)
+    along = [image[round(599.8 + r * np.cos(turn)), round(600.3 - r * np.sin(turn))] for r in out]
+    smooth = np.convolve(np.array(along) * out**2.0, np.ones(9) / 9, "valid")
+    assert smooth.max() / smooth.min() < 2.0
+
+
+@pytest.mark.parametrize("length", [30.0, 94.0])
+def test_the_frame_of_a_trail_has_no_seam(vis, length):
+    """A moving body's light is a star's along its trail, without holes where planes of its pieces end."""
+    side, middle, angle = 1000, (500.3, 499.8), 0.4
+    field = replace(small("vis", "3-4", side), nx=side, ny=side)
+    source = one_source(field, wcs(field, *boresight_for(field, 10.0, 0.0, 0.0)), BRIGHT, *middle)
+    trail = length * np.array([np.cos(angle), np.sin(angle)])
+    moving = replace(source, trail=trail[None])
+    size = stamp_sizes.stamp_sizes(
+        moving.electrons, moving.shape, moving.shapes, vis, NOISE, settings_for(SURVEY),
+        stamp_sizes.piece_length(moving.length),
+    )  # fmt: skip
+    assert size[0] > SIDE
+    image = stamps.draw(moving, size, vis, side, side)
+    assert image.min() > -1e-3 * NOISE
+    # Independent of pieces: stars at rest, each with its share.
+    along = np.arange(-0.5, 0.5, 1 / 16) + 1 / 32
+    y, x = np.mgrid[:side, :side]
+    law, clear = np.zeros((side, side)), np.ones((side, side), bool)
+    for a in along:
+        dx, dy = x - middle[0] - a * trail[0], y - middle[1] - a * trail[1]
+        law += spikes.ring(vis.edges, EQUAL) * BRIGHT / len(along) / np.maximum(np.hypot(dx, dy), 1.0) ** 3
+        clear &= off_spikes(vis, dx, dy, 40.0)
+    radius = np.hypot(x - middle[0], y - middle[1])
+    for inner, outer in ((150, 200), (200, 230), (230, 260), (260, 290), (290, 330), (330, 400), (400, 500)):
+        here = clear & (radius >= inner) & (radius < outer)
+        assert image[here].sum() == pytest.approx(law[here].sum(), rel=0.06)
+
+
+def test_a_trail_s_spikes_are_no_comb(vis):
+    """A spike smeared along a trail is even: four times as many points draw the same."""
+    side, x, y, trail, points = 300, 150.3, -290.2, np.array([60.0, 10.0]), 100
+    even, many = np.zeros((side, side), np.int64), np.zeros((side, side), np.int64)
+    far_light.add(even, far_light.Star(x, y, BRIGHT, None, SIDE, 0.0, vis.edges, trail))
+    for a in (np.arange(points) + 0.5) / points - 0.5:
+        far_light.add(
+            many, far_light.Star(x + a * trail[0], y + a * trail[1], BRIGHT / points, None, SIDE, 0.0, vis.edges)
+        )
+    # A spike's table ends 40 pixels from its middle: there a point more or less is a step.
+    wrong = np.abs(even / many - 1.0)
+    assert np.quantile(wrong, 0.99) < 0.03
+    assert wrong.max() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "trail"),
+    [
+        (150.3, -290.2, (60.0, 10.0)),
+        (150.3, 150.2, (40.0, 25.0)),
+        (-500.0, 40.0, (600.0, 3.0)),
+        (60.0, 700.0, (0.0, 400.0)),
+    ],
+)
+def test_a_line_of_light_is_many_points(vis, x, y, trail):
+    """In the squares' borders, outside them and on the trail's own line: as points closer than any fringe draw it."""
+    side, points = 200, int(np.hypot(*trail))
+    line, many = np.zeros((side, side), np.int64), np.zeros((side, side), np.int64)
+    far_light.add(line, far_light.Star(x, y, BRIGHT, None, SIDE, 0.0, vis.edges, np.array(trail)))
+    for a in (np.arange(points) + 0.5) / points - 0.5:
+        far_light.add(
+            many, far_light.Star(x + a * trail[0], y + a * trail[1], BRIGHT / points, None, SIDE, 0.0, vis.edges)
+        )
+    level = BRIGHT * spikes.ring(vis.edges, EQUAL) / 400.0**3 * FIXED_POINT
+    wrong = np.abs(line - many) / np.maximum(many, level)
+    assert np.quantile(wrong, 0.99) < 0.02
+    assert wrong.max() < 0.06
+    assert line.sum() == pytest.approx(many.sum(), rel=2e-3)
+
+
+def test_a_trail_is_unfolded_as_its_points_are(vis):
+    """A piece's share of light that belongs elsewhere, from its lines and from points closer than any fringe."""
+    size, corner, trail, points = 640, 160, np.array([50.0, 30.0]), 60
+    along, inner = (np.arange(points) + 0.5) / points - 0.5, SIDE / 2 - 2.0
+    # The corner that has most of it.
+    x, y = 260.2 + along * trail[0], 259.7 + along * trail[1]
+    level = BRIGHT / points * spikes.ring(vis.edges, EQUAL)
+    pixels = np.arange(corner)
+    light = np.zeros((corner, corner))
+    for px, py in zip(x, y, strict=True):
+        faded = [[left_compiled(float(abs(p - at)), inner) for p in pixels] for at in (px, py)]
+        light += np.outer(faded[1], faded[0]) * level / np.hypot(pixels - px, pixels[:, None] - py) ** 3
+    fast, slow = np.ones((size, size)), light.copy()
+    fast[60 : 60 + corner, 60 : 60 + corner] = light
+    star = far_light.Star(320.2, 319.7, BRIGHT, None, SIDE, 0.0, vis.edges, trail)
+    far_light.remove_aliased(star, fast, 0, 0, size, size)
+    turned = np.stack([np.cos(vis.edges.bars[:, 0]), np.sin(vis.edges.bars[:, 0])], axis=1)
+    lines = BRIGHT / points * spikes.spikes(vis.edges, EQUAL, vis.edges.period)
+    remove_aliased_compiled(slow, x, y, inner, level, turned, lines, vis.edges.period)
+    whole = points * level / np.hypot(pixels - 260.2, pixels[:, None] - 259.7) ** 3
+    assert ((light - slow) / whole).max() > 0.05
+    wrong = np.abs(fast[60 : 60 + corner, 60 : 60 + corner] - slow) / whole
+    assert wrong.max() < 0.04
+    assert wrong.mean() < 3e-3
+
+
+def test_the_time_a_bright_trail_takes_is_foreseen(vis):
+    """It goes with the frame, the trail, and its pieces' stamps; exposures that would take hours are refused by it."""
+    field = replace(small("vis", "3-4"), nx=4096, ny=4096)
+    source = one_source(field, wcs(field, *boresight_for(field, 10.0, 0.0, 0.0)), 1e10, 2048.0, 2048.0)
+    sizes = np.array([640])
+    # CPU s that were measured on a full detector.
+    for length, took in ((94.0, 3.3), (470.0, 16.3), (1880.0, 63.6)):
+        moving = replace(source, trail=length * np.array([[1.0, 0.3]]))
+        assert took / 2 < cost.seconds(moving, sizes, vis, 4096, 4096) < 2 * took
+    faint = replace(moving, electrons=np.array([1e6]))
+    assert cost.seconds(faint, sizes, vis, 4096, 4096) < 0.5 * took
+
+
+def test_colours_differ(vis):
+    """The ring goes with the wavelength: a red star's is brighter."""
+    red, blue = np.zeros(len(PARTS)), np.zeros(len(PARTS))
+    red[-1], blue[0] = 1.0, 1.0
+    ratio = spikes.ring(vis.edges, red) / spikes.ring(vis.edges, blue)
+    assert ratio == pytest.approx(vis.planes.wavelength[-1] / vis.planes.wavelength[0], rel=0.01)
+
+
+def stars(column, row, electrons, side):
+    field = replace(small("vis", "3-4"), nx=side, ny=side)
+    system = wcs(field, *boresight_for(field, 10.0, 0.0, 0.0))
+    some = [one_source(field, system, e, x, y) for x, y, e in zip(column, row, electrons, strict=True)]
+    together = {n: np.concatenate([getattr(s, n) for s in some]) for n in ("column", "row", "jacobian", "electrons")}
+    return replace(some[0], **together, ids=np.arange(len(some)), shape=np.full(len(some), -1))
+
+
+def drawn(sources, psf, side):
+    settings = settings_for(SURVEY)
+    sizes = stamp_sizes.stamp_sizes(sources.electrons, sources.shape, sources.shapes, psf, NOISE, settings)
+    neglected = stamp_sizes.neglected_flux(sources.electrons, NOISE, settings)
+    return stamps.draw(sources, sizes, psf, side, side, None, neglected)
+
+
+def test_only_bright_points_shine_so_far(vis):
+    """Others are drawn as they were, bit by bit."""
+    faint = stars([200.0, 90.0, 310.5], [200.0, 400.0, 11.0], [1e3, 1e5, 5e6], 512)
+    np.testing.assert_array_equal(drawn(faint, vis, 512), drawn(faint, replace(vis, edges=None), 512))
+    sizes, shape = np.array([SIDE, SIDE, 384, SIDE]), np.array([-1, 0, -1, -1])
+    found = stamp_sizes.has_far_light(np.array([1e9, 1e9, 1e9, 1e6]), sizes, shape, None, vis)
+    np.testing.assert_array_equal(found, [True, False, False, False])
+
+
+def test_a_frame_is_the_sum_of_its_stars_in_any_order(vis):
+    column, row, electrons = [100.2, 500.0, 900.7], [300.0, 800.4, -700.0], [3e8, 2e9, 4e10]
+    whole = drawn(stars(column, row, electrons, 1000), vis, 1000)
+    turned = drawn(stars(column[::-1], row[::-1], electrons[::-1], 1000), vis, 1000)
+    np.testing.assert_array_equal(whole, turned)
+    parts = [drawn(stars([x], [y], [e], 1000), vis, 1000) for x, y, e in zip(column, row, electrons, strict=True)]
+    np.testing.assert_allclose(whole, sum(parts), rtol=1e-12, atol=1e-5)
+    # The last has its stamp below the frame, and shines there nevertheless.
+    assert parts[2][:200].min() > 1.0
+
+
+def test_light_is_drawn_to_where_it_is_lost_in_the_noise(vis):
+    """Less accuracy, a smaller circle: what is left out is below what may be."""
+    least = 0.1 * NOISE
+    whole, cut = (shone(vis, 2000, 300.0, 300.0, 1e9, part) for part in (0.0, least))
+    assert np.count_nonzero(cut) < 0.5 * np.count_nonzero(whole)
+    assert 0.0 < (whole - cut).max() < least
+
+
+def test_the_farthest_pixel_of_a_frame_is_lit(vis):
+    """To its corner, however the distance is rounded."""
+    for x, y in ((132.7667590299948, 168.83949347535636), (-40.3, -70.2), (108.82925776227592, 122.95520170604388)):
+        frame = np.zeros((100, 100), np.int64)
+        far_light.add(frame, far_light.Star(x, y, 1e13, None, 32, 0.0, vis.edges))
+        assert frame.min() > 0
+
+
+def spike(away, bar=2, middle=128.0):
+    """A place so many pixels from the middle of a frame, one of whose spikes goes through it."""
+    turn = of_pupil().bars[bar, 0]
+    return middle + away * np.sin(turn), middle - away * np.cos(turn)
+
+
+def test_spikes_reach_as_far_as_they_are_noticed(vis):
+    """Where a star's brightest spike is said to have sunk to a level the spike that is drawn has."""
+    least = 0.1 * NOISE
+    electrons = np.array([1e8, 1e9, 1e11])
+    far = spikes.reach(vis.edges, electrons, least)
+    np.testing.assert_allclose(far[:2], far[0] * np.sqrt(electrons[:2] / 1e8), rtol=1e-12)
+    assert far[2] == spikes.FARTHEST / 0.1
+    for bright, away in zip(electrons[:2], far[:2], strict=True):
+        middle = bright * spikes.spikes(vis.edges, EQUAL, 5000.0)[:, :, 0]
+        here = round(away / 8.0)
+        # Over some fringes.
+        assert middle[:, here - 25 : here + 26].mean(axis=1).max() == pytest.approx(least, rel=0.15)
+
+
+def test_spikes_of_a_star_far_from_the_detector_show(vis):
+    """Bright stars are drawn from farther away than others, until their spikes are lost in the noise."""
+    field, away = small("vis", "3-4", 256), 4000.0
+    bright = 25.93 - 2.5 * np.log10(2e10 / TIME)
+    places = np.array([spike(away), spike(away, 1)]).T
+    one = rendered(field, [bright, bright + 6.0], *places, forced=off(*COSMIC_RAYS))
+    assert one.sources.electrons == pytest.approx([2e10], rel=0.01)
+    x, y = one.sources.column[0], one.sources.row[0]
+    law = shone(vis, 256, x, y, one.sources.electrons[0])
+    assert law.max() > 0.5 * NOISE
+    assert law[:, 100:156].max(axis=0).min() > 0.5 * NOISE
+    np.testing.assert_allclose(one.noise_free, law, atol=0.1 * NOISE)
+    # And one whose spikes miss the detector changes nothing that is noticed.
+    beside = rendered(field, [bright], [128.0 + away], [128.0], forced=off(*COSMIC_RAYS))
+    assert beside.noise_free.max() < 0.1 * NOISE
+
+
+@pytest.mark.parametrize("away", [500.0, 1400.0])
+def test_a_star_beside_the_detector_shines_in(away):
+    """Its stamp of 51" ends before the frame does: an exposure draws its light nevertheless, from up to 145"."""
+    field = small("vis", "3-4", 256)
+    found = rendered(field, [5.0], [-away], [200.0], forced=off(*COSMIC_RAYS))
+    law = 10 ** (0.4 * (found.zero_point - 5.0)) * TIME * spikes.ring(found.psf.edges, EQUAL)
+    assert found.noise_free[190:211, 0].mean() == pytest.approx(law / away**3, rel=0.3)
+    assert found.noise_free.min() > 0.5 * law / (away + 330.0) ** 3

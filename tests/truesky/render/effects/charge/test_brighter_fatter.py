@@ -1,0 +1,182 @@
+"""Brighter-fatter: charge only moves, stars widen in proportion to their peaks, flats lose variance as predicted."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lake_schema.errors import OutOfRange
+from lake_schema.mission.configuration import resolve
+from tests.truesky.render.fields import small
+from truesky.render.effects.charge import brighter_fatter
+from truesky.render.effects.scene import Scene
+from truesky.request import accuracy
+
+SHIFT, SOFT, FULL = 1.2e-7, 0.5, 2e5
+
+
+def widths(image):
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
+    total = image.sum()
+    dx, dy = x - (image * x).sum() / total, y - (image * y).sum() / total
+    return np.sqrt([(image * dx * dx).sum() / total, (image * dy * dy).sum() / total])
+
+
+def star(peak):
+    y, x = np.mgrid[:25, :25]
+    return np.rint(peak * np.exp(-((x - 12.2) ** 2 + (y - 11.9) ** 2) / (2 * 0.7**2)))
+
+
+def test_a_star_at_full_well_is_one_to_two_per_cent_wider():
+    growth = {}
+    for peak in (5e4, 2e5):
+        image = star(peak)
+        mean = np.mean(
+            [brighter_fatter.apply(image, SHIFT, SOFT, FULL, 0.0, 0, np.random.default_rng(i)) for i in range(50)],
+            axis=0,
+        )
+        growth[peak] = widths(mean) / widths(image) - 1
+    assert (growth[2e5] > 0.01).all()
+    assert (growth[2e5] < 0.02).all()
+    np.testing.assert_allclose(growth[5e4], growth[2e5] / 4, rtol=0.1)
+
+
+def test_variance_of_a_flat_falls_as_predicted():
+    level = 1e5
+    flat = np.random.default_rng(1).poisson(level, (1200, 1200)).astype(float)
+    out = brighter_fatter.apply(flat, SHIFT, SOFT, FULL, 0.0, 0, np.random.default_rng(2))
+    assert out.sum() == flat.sum()
+    lost = 1 - out.var() / flat.var()
+    assert lost == pytest.approx(brighter_fatter.curvature(SHIFT, SOFT) * level, rel=0.1)
+    # What a pixel loses of its fluctuation its neighbours get.
+    rest = out - out.mean()
+    assert (rest[:, 1:] * rest[:, :-1]).mean() > 0.0015 * level
+    assert (rest[1:] * rest[:-1]).mean() > 0.0015 * level
+
+
+def test_rows_and_columns_are_alike():
+    image = star(1e5)
+    one = np.mean(
+        [brighter_fatter.apply(image, SHIFT, SOFT, FULL, 0.0, 0, np.random.default_rng(i)) for i in range(60)], 0
+    )
+    two = np.mean(
+        [brighter_fatter.apply(image.T, SHIFT, SOFT, FULL, 0.0, 0, np.random.default_rng(i)) for i in range(60)], 0
+    )
+    assert np.abs(one - two.T).max() < 1.0
+
+
+def test_kernel_falls_off():
+    weights = brighter_fatter.kernel(SHIFT, SOFT)
+    assert weights.shape == (5, 2)
+    assert weights[2, 0] == SHIFT
+    assert (np.diff(weights[2:, 0]) < 0).all()
+    np.testing.assert_array_equal(weights, weights[::-1])
+
+
+def test_what_no_pixel_holds_does_not_repel():
+    image = star(1e9)
+    out = brighter_fatter.apply(image, SHIFT, SOFT, FULL, 0.0, 0, np.random.default_rng(1))
+    assert out.min() >= 0
+    assert out.sum() == image.sum()
+
+
+def through(light, between):
+    """As a detector with rows of charge injection does it, all borders followed."""
+    detector = replace(small("vis", "3-4", 2), nx=light.shape[1], ny=len(light), middle=between)
+    one = Scene(resolve(), "vis", 560.53, 0.25, 1e5, detector)
+    *parameters, _, rows = brighter_fatter.EFFECT.parameters(one)
+    return brighter_fatter.EFFECT.apply(light, *parameters, 0.0, rows, rng=np.random.default_rng(5))
+
+
+def test_rows_of_charge_injection_hold_nothing_that_repels():
+    """Neither half knows what shone between them, or on the other; each loses to them as its charge says."""
+    level, rng = 1e5, np.random.default_rng(1)
+    flat = rng.poisson(level, (40, 2000)).astype(float)
+    lit = flat.copy()
+    lit[19:21], lit[22:] = 1.9e5, 0.0
+    out, other = (through(light, 4) for light in (flat, lit))
+    np.testing.assert_array_equal(out[:18], other[:18])
+    assert out.sum() == flat.sum()
+    change = (out - flat).mean(axis=1)
+    # The field of one side alone at the border, half of it on average while light falls; less what comes from behind.
+    weights = brighter_fatter.kernel(SHIFT, SOFT)
+    lost = 0.5 * weights.sum() * level**2
+    passed = 0.5 * weights[:, 1].sum() * level**2
+    error = 5 * np.sqrt(0.05 * level / 2000)
+    for last, before, beside in ((17, 16, 18), (22, 23, 21)):
+        assert change[last] == pytest.approx(passed - lost, rel=0.02, abs=error)
+        assert change[before] == pytest.approx(-passed, rel=0.05, abs=error)
+        assert change[beside] == pytest.approx(lost, rel=0.02, abs=error)
+    assert 0.008 * level < -change[17] < 0.01 * level
+    assert np.abs(change[[2, 10, 30, 37]]).max() < error
+    # Where there are no such rows the halves are neighbours.
+    assert np.abs((through(flat, 0) - flat).mean(axis=1)).max() < error
+
+
+def test_what_is_not_noticed_is_left_out():
+    """Faint pixels stay as they are; about a bright star the same electrons cross as if all were followed."""
+    light = np.random.default_rng(3).poisson(140.0, (300, 400)).astype(float)
+    light[100:125, 200:225] += star(1.5e5)
+    light[297:, 397:] += 5e4
+    every, some = (
+        brighter_fatter.apply(light, SHIFT, SOFT, FULL, dim, 0, np.random.default_rng(4)) for dim in (0.0, 700.0)
+    )
+    assert some.sum() == light.sum()
+    np.testing.assert_array_equal(every[105:120, 205:220], some[105:120, 205:220])
+    np.testing.assert_array_equal(every[298:, 398:], some[298:, 398:])
+    assert (some != light)[100:125, 200:225].sum() > 20
+    np.testing.assert_array_equal(some[:90], light[:90])
+    left_out = every - some
+    assert 0 < np.sqrt(np.mean(left_out**2)) < 0.1 * np.sqrt(140.0 + 4.4**2)
+    assert np.abs(left_out).max() <= 1.0
+
+
+@pytest.mark.parametrize("preset", ["draft", "survey", "reference"])
+def test_what_is_left_out_is_within_the_accuracy(preset):
+    """Of a star just too dim to be followed: its size; and what would cross the borders of its pixels."""
+    wanted = accuracy.preset(preset)
+    scene = Scene(resolve(), "vis", 560.53, 0.25, 1e4, accuracy=wanted)
+    shift, softening, full, dim, _ = brighter_fatter.EFFECT.parameters(scene)
+    bright = star(2e5)
+    mean = np.mean(
+        [brighter_fatter.apply(bright, shift, softening, full, 0.0, 0, np.random.default_rng(i)) for i in range(50)],
+        axis=0,
+    )
+    growth = (widths(mean) ** 2).sum() / (widths(bright) ** 2).sum() - 1
+    assert 0 < growth * dim / 2e5 <= wanted.shape
+    # Pixels of as much that lose over four borders, to empty neighbours: so little that it is not noticed.
+    frame = np.zeros((400, 400))
+    frame[2::5, 2::5] = np.floor(dim)
+    left_alone, followed = (
+        brighter_fatter.apply(frame, shift, softening, full, least, 0, np.random.default_rng(6)) for least in (dim, 0.0)
+    )
+    np.testing.assert_array_equal(left_alone, frame)
+    noticed = wanted.background * scene.pixel_noise
+    lost = (frame - followed)[2::5, 2::5].mean()
+    assert 0 < lost <= noticed
+    # Nor is more followed than need be: by the accuracy that a background asks for, or a star's size.
+    assert lost > 0.1 * noticed or growth * dim / 2e5 > 0.3 * wanted.shape
+
+
+def test_a_pixel_never_gives_more_than_it_can_spare():
+    """At the largest shift borders would move past whole pixels: each gives a fifth over each of four."""
+    frame = np.zeros((9, 9))
+    frame[4, 4] = 1e5
+    out = brighter_fatter.apply(frame, 1e-4, SOFT, FULL, 0.0, 0, np.random.default_rng(1))
+    assert out.min() >= 0
+    assert out.sum() == frame.sum()
+    # One border after the other, each of what is left.
+    assert out[4, 4] == pytest.approx(1e5 * (1 - brighter_fatter.MOST) ** 4, abs=4)
+    assert out[4, 3] == brighter_fatter.MOST * 1e5
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        (-1.0, 0.5, 2e5, 0.0), (np.nan, 0.5, 2e5, 0.0), (1e-7, -1.0, 2e5, 0.0), (1e-7, 0.5, 0.0, 0.0),
+        (1e-7, 0.5, 2e5, np.nan),
+    ],
+)  # fmt: skip
+def test_nonsense_is_refused(wrong):
+    with pytest.raises(OutOfRange, match=r"brighter|full well"):
+        brighter_fatter.apply(np.ones((3, 3)), *wrong, 0, np.random.default_rng(1))

@@ -1,0 +1,116 @@
+"""What every effect owes: off it does nothing, it writes no argument, loses no number, and keeps its promises."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.truesky.render.effects.battery import CASES, CUT, SHAPES, call, frame_of, shapes_of
+from truesky.render import effects
+from truesky.render.channels import ground, nisp_p, vis
+from truesky.render.effects.light import intra_pixel
+
+MOST = 4 * max(ny * nx for ny, nx in SHAPES)
+
+
+def electrons(seed, empty, decades):
+    """Whole electrons, some none, the rest over some decades."""
+    rng = np.random.default_rng(seed)
+    return np.floor(10 ** (decades * rng.random(MOST))) * (rng.random(MOST) >= empty)
+
+
+# Drawn by numpy: hypothesis takes a second for a frame of its own.
+ELECTRONS = st.builds(
+    electrons, st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.5, 0.95]), st.sampled_from([0.5, 2.5, 8.0])
+)
+named = pytest.mark.parametrize("name", CASES)
+
+
+def promising(promise):
+    return pytest.mark.parametrize("name", [name for name, case in CASES.items() if getattr(case, promise)])
+
+
+def test_no_effect_is_forgotten():
+    """Every file of the package with an `apply`, and every effect of a channel."""
+    from importlib import import_module
+    from pkgutil import walk_packages
+
+    found = set()
+    for module in walk_packages(effects.__path__, "truesky.render.effects."):
+        for key, value in vars(import_module(module.name)).items():
+            if key.startswith("apply") and key != "apply_all" and value.__module__ == module.name:
+                found.add(value)
+    # Part of the pixel's transfer function: it acts before there is a frame.
+    assert found == {case.apply for case in CASES.values()} | {intra_pixel.apply}
+    assert {e.apply for kind in (vis, nisp_p, ground) for effects in kind.EFFECTS.values() for e in effects} <= found
+
+
+@named
+@given(data=st.data(), electrons=ELECTRONS)
+def test_arguments_are_not_written_and_numbers_stay_finite(name, data, electrons):
+    case = CASES[name]
+    frame = frame_of(case, data.draw(st.sampled_from(shapes_of(name))), electrons)
+    before = frame.copy()
+    after = call(case, frame)
+    np.testing.assert_array_equal(frame, before)
+    assert after is not frame
+    assert after.dtype == case.dtype
+    assert np.isfinite(after).all()
+    if name not in CUT and not case.reshapes:
+        assert after.shape == frame.shape
+    if case.positive:
+        assert after.min() >= 0
+    if case.whole:
+        np.testing.assert_array_equal(after, np.rint(after))
+
+
+@named
+@given(electrons=ELECTRONS)
+def test_switched_off_it_is_the_identity(name, electrons):
+    case = CASES[name]
+    if case.off is None:
+        return
+    for shape in SHAPES:
+        frame = frame_of(case, shape, electrons)
+        np.testing.assert_array_equal(call(case, frame, off=True), frame)
+
+
+@promising("zero")
+def test_nothing_comes_of_nothing(name):
+    case = CASES[name]
+    for shape in shapes_of(name):
+        assert (call(case, frame_of(case, shape, np.zeros(MOST))) == 0).all()
+
+
+@promising("conserves")
+@given(electrons=ELECTRONS)
+def test_the_sum_stays(name, electrons):
+    case = CASES[name]
+    for shape in shapes_of(name):
+        frame = frame_of(case, shape, electrons)
+        assert call(case, frame).sum() == pytest.approx(frame.sum(), rel=1e-12)
+
+
+@promising("linear")
+@given(electrons=ELECTRONS, factor=st.floats(1e-3, 1e3))
+def test_linear_where_claimed(name, electrons, factor):
+    case = CASES[name]
+    for shape in shapes_of(name):
+        frame = frame_of(case, shape, electrons)
+        base = factor * call(case, frame)
+        np.testing.assert_allclose(call(case, factor * frame), base, rtol=1e-12, atol=1e-12 * (1 + np.abs(base).max()))
+
+
+@named
+def test_the_same_numbers_give_the_same_frame(name):
+    case = CASES[name]
+    frame = frame_of(case, (12, 10), np.random.default_rng(1).integers(0, 3000, MOST))
+    np.testing.assert_array_equal(call(case, frame), call(case, frame))
+
+
+@named
+def test_it_does_something(name):
+    case = CASES[name]
+    frame = frame_of(case, (12, 10), np.random.default_rng(1).integers(0, 400_000, MOST))
+    after = call(case, frame)
+    assert after.shape != frame.shape or (after != frame).any()

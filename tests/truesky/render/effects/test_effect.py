@@ -1,0 +1,173 @@
+"""The loop over effects: what a scene needs, what a request forces, and who draws which numbers."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import resolve
+from truesky.randomness.rng import stream
+from truesky.render.channels import ground, nisp_p, nisp_s, registry, vis
+from truesky.render.effects.effect import apply_all, decide
+from truesky.render.effects.scene import Scene
+from truesky.request import schema
+
+SCENE = Scene(resolve(), "vis", 560.0, 0.25, 1e4)
+NAMES = ["background", "poisson", "dark_current", "bleeding", "read_noise", "adc"]
+# Of a detector that is read as one frame.
+SOME = tuple(effect for effect in ground.SKY if effect.name in NAMES)
+
+
+def run(effects, frame, scene=SCENE, forced=None, seed=1):
+    scene = replace(scene, forced=forced or {})
+    return apply_all(frame, effects, scene, lambda effect: stream(seed, 7, "3-4", effect.name))
+
+
+# What each chain names comes in this order, where a channel has it.
+ORDER = (
+    # Light falls on pixels, is counted once, and is charge from then on.
+    (
+        "ghosts",
+        "background",
+        "illumination",
+        "shutter",
+        "pixel_response",
+        "tree_rings",
+        "edge_displacement",
+        "poisson",
+        "brighter_fatter",
+        "dark_current",
+    ),
+    ("straylight", "illumination"),
+    ("ghosts", "filter_ghosts", "background"),
+    ("background", "pixel_area", "pixel_response"),
+    # A fixed part of the sky's light, which vignetting dims as it does satellites'.
+    ("satellite_trails", "background", "pixel_area", "fringes", "illumination", "poisson"),
+    ("readout_trail", "poisson"),
+    ("calibration_lamp", "pixel_response"),
+    # All charge fills wells before it is read; what hits the register meanwhile misses the way down the columns.
+    ("dark_current", "hot_pixels", "bleeding"),
+    ("poisson", "cosmic_rays", "bleeding", "quadrants", "parallel_cti", "readout_cosmic_rays", "serial_cti"),
+    ("charge_injection", "injection_noise", "trap_pumping", "dark_current", "bleeding"),
+    ("dark_current", "bleeding", "amplifiers", "parallel_loss", "serial_loss", "nonlinearity"),
+    # Charge is read before it is amplified and converted.
+    ("serial_cti", "nonlinearity", "crosstalk", "detector_crosstalk", "bias_structure", "read_noise", "adc"),
+    # A ramp counts all that is expected, and what hits meanwhile; a pixel's capacity bends what it holds.
+    (
+        "background",
+        "dispersed_sky",
+        "pixel_area",
+        "chromatic_response",
+        "pixel_response",
+        "dark_map",
+        "persistence",
+        "ramp_cosmic_rays",
+        "ramp",
+    ),
+    ("calibration_lamp", "lamp_response", "pixel_response", "dark_map"),
+    ("ramp_cosmic_rays", "ramp_nonlinearity", "ramp", "ipc"),
+    # Neighbours see charge, not the noise of reading; the signal is estimated of groups as read, then converted.
+    ("ramp", "ipc", "reset_level", "group_noise", "drift", "output_gain", "macc", "signal_nonlinearity"),
+    ("macc", "signal_adc"),
+)
+
+
+CHAINS = dict.fromkeys(effects for channel in (vis, nisp_p, nisp_s, ground) for effects in channel.EFFECTS.values())
+
+
+@pytest.mark.parametrize("effects", CHAINS)
+def test_the_order_of_physics(effects):
+    names = [effect.name for effect in effects]
+    assert len(set(names)) == len(names)
+    assert names[-1] in ("adc", "signal_adc")
+    for chain in ORDER:
+        assert [name for name in names if name in chain] == [name for name in chain if name in names]
+
+
+def test_every_effect_has_its_place():
+    named = {name for chain in ORDER for name in chain} | {vis.DRAWN.name}
+    assert named == set(schema.EFFECTS)
+    for effects in vis.EFFECTS.values():
+        assert effects[-len(vis.EFFECTS["bias"]) :] == vis.EFFECTS["bias"]
+
+
+def test_a_request_may_name_every_effect():
+    """Of every channel, those that act while sources are drawn among them; and no other."""
+    channels = registry.CHANNELS.values()
+    found = [effect for channel in channels for effects in channel.effects.values() for effect in effects]
+    found += [channel.drawn for channel in channels if channel.drawn is not None]
+    assert sorted(schema.EFFECTS) == sorted({effect.name for effect in found})
+    assert set(schema.ALWAYS) == {effect.name for effect in found if not effect.optional}
+
+
+def test_pixel_noise_is_sky_dark_and_reading():
+    mission = SCENE.mission
+    dark, read = mission.value("vis.dark_current"), mission.value("vis.read_noise")
+    assert SCENE.pixel_noise == pytest.approx(np.sqrt(0.25 * 560 + dark * 560 + read**2))
+
+
+def test_a_frame_becomes_adu():
+    frame = np.full((300, 300), 50.0)
+    image, decisions = run(SOME, frame)
+    assert [d.name for d in decisions] == NAMES
+    assert (frame == 50.0).all()
+    assert (image == np.rint(image)).all()
+    expected = (50.0 + 140.0) / 3.48 + 1000
+    assert image.mean() == pytest.approx(expected, abs=0.1)
+    noise = np.sqrt(190.0 + 4.4**2) / 3.48
+    assert image.std() == pytest.approx(np.hypot(noise, 12**-0.5), rel=0.02)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_numbers_are_the_effects_own(seed):
+    """Switching the dark current on leaves the shot noise and the read noise as they were."""
+    frame = np.full((50, 50), 100.0)
+    without, _ = run(SOME[:5], frame, forced={"dark_current": False}, seed=seed)
+    with_dark, _ = run(SOME[:5], frame, forced={"dark_current": True}, seed=seed)
+    extra = with_dark - without
+    np.testing.assert_allclose(extra, np.rint(extra), atol=1e-9)
+    assert 0 < extra.mean() < 1
+    again, _ = run(SOME[:5], frame, forced={"dark_current": False}, seed=seed)
+    np.testing.assert_array_equal(without, again)
+    other, _ = run(SOME[:5], frame, forced={"dark_current": False}, seed=seed + 10)
+    assert (other != without).any()
+
+
+def test_what_a_request_forces_is_recorded():
+    decisions = {d.name: d for d in decide(SOME, replace(SCENE, forced={"poisson": False, "dark_current": True}))}
+    assert not decisions["poisson"].applied
+    assert decisions["poisson"].forced
+    assert decisions["dark_current"].applied
+    assert decisions["read_noise"].applied
+    assert not decisions["read_noise"].forced
+
+
+def test_strange_or_impossible_wishes_are_refused():
+    # Of another channel.
+    assert len(decide(SOME, replace(SCENE, forced={"ghosts": True}))) == len(SOME)
+    with pytest.raises(BadInput, match="adc"):
+        decide(SOME, replace(SCENE, forced={"adc": False}))
+
+
+def test_without_noise_all_is_noticed():
+    """A bias of an amplifier without noise."""
+    silent = resolve(overrides={"vis.read_noise": (0.0, "electron")})
+    bias = Scene(silent, "vis", 0.0, 0.0, 0.0)
+    assert bias.pixel_noise == 0.0
+    margins = {decision.name: decision.margin for decision in decide(vis.EFFECTS["bias"], bias)}
+    assert margins["bias_structure"] == np.inf
+    assert margins["read_noise"] == 0.0
+
+
+def test_margins_tell_the_ratio():
+    (dark,) = (e for e in ground.SKY if e.name == "dark_current")
+    d = SCENE.dark_electrons
+    # Of a mean of 1024 frames, which keeps the mean and little of the noise.
+    assert dark.margin(SCENE) == pytest.approx(32.0 * d / (0.1 * SCENE.pixel_noise))
+    (counted,) = (e for e in ground.SKY if e.name == "poisson")
+    counts = np.sqrt(SCENE.peak_electrons + SCENE.sky_electrons)
+    assert counted.margin(SCENE) == pytest.approx(counts / (0.1 * SCENE.pixel_noise))
+    longer = replace(SCENE, exposure_time_s=1e5, sky_rate=0.0)
+    assert dark.needed_if(longer)
+    assert not dark.needed_if(replace(SCENE, exposure_time_s=0.1))

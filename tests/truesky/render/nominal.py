@@ -1,0 +1,76 @@
+"""Nominal exposures of a VIS detector, or of a part of one, with what a test lays on its pixels."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from tests.truesky.render import fields
+from tests.truesky.render.fields import MISSION, fluxes, galaxies, stars
+from truesky.fluxes import passbands
+from truesky.render.camera import astrometry
+from truesky.render.camera.pointing import boresight_for
+from truesky.render.planning import planned_exposures
+from truesky.render.psf import euclid
+from truesky.request.accuracy import SURVEY
+
+TIME = MISSION.value("vis.exposure_time", "s")
+SKY, SEED = 0.25, 1
+COSMIC_RAYS = ("cosmic_rays", "readout_cosmic_rays")
+# What moves charge, or squeezes it: all that calibration does not undo.
+CHARGE = ("parallel_cti", "serial_cti", "brighter_fatter")
+
+
+def off(*names):
+    """A request's wish: effects that are off."""
+    return dict.fromkeys(names, False)
+
+
+@cache
+def psf_of(detector):
+    """The detector's PSF, for all of its exposures."""
+    return euclid.vis_psf(detector, passbands.load("euclid_vis"), MISSION)
+
+
+@cache
+def pointing(detector):
+    """Where the telescope looks so that the detector sees a field at high latitude; turned a little."""
+    return boresight_for(detector, 53.1, -27.8, 12.0)
+
+
+def rendered(
+    detector, mags, x, y, body=None, mission=MISSION, forced=None, accuracy=SURVEY, seconds=TIME, sky=SKY,
+    kind="science", number=1, truth=(), asteroids=None,
+):  # fmt: skip
+    """Stars (or galaxies: `body`, their columns) of AB magnitudes `mags` at pixels x, y.
+
+    number : of the exposure: its noise; the detector stays the same
+    """
+    ra, dec, angle = pointing(detector)
+    exposed = {
+        "exposure_id": number, "channel": "VIS", "camera": "vis", "band": "euclid_vis", "image_type": kind,
+        "ra": ra, "dec": dec, "position_angle": angle, "mjd": 60905.0 + number, "exposure_time_s": seconds,
+        "seeing": 0.0, "sky": sky, "zero_point": planned_exposures.zero_point_of("vis", "euclid_vis", mission),
+    }  # fmt: skip
+    system = astrometry.wcs(detector, ra, dec, angle)
+    where = astrometry.sky_of_pixel(system, np.atleast_1d(x).astype(float), np.atleast_1d(y).astype(float))
+    bodies, points = galaxies(*where, **(body or {})), stars(*where)
+    bodies, points = (bodies, points.slice(0, 0)) if body else (bodies.slice(0, 0), points)
+    f_nu = 10 ** (-0.4 * (np.atleast_1d(mags) - 23.9))
+    with pytest.MonkeyPatch.context() as patch:
+        if mission is MISSION:
+            own = psf_of(detector)
+            patch.setattr(euclid, "vis_psf", lambda *_: own)
+        tables = (
+            bodies, fluxes(bodies, "euclid_vis", f_nu if body else 0.0),
+            points, fluxes(points, "euclid_vis", 0.0 if body else f_nu),
+        )  # fmt: skip
+        return fields.rendered(exposed, detector, tables, mission, accuracy, SEED, forced, truth, bodies=asteroids)
+
+
+def lattice(side, pitch, seed=1):
+    """x, y of places a pitch apart, each at its own fraction of a pixel."""
+    rng = np.random.default_rng(seed)
+    middle = np.arange(pitch / 2, side, pitch)
+    x, y = (axis.ravel() for axis in np.meshgrid(middle, middle))
+    return x + rng.uniform(-0.5, 0.5, len(x)), y + rng.uniform(-0.5, 0.5, len(y))

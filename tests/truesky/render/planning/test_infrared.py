@@ -1,0 +1,327 @@
+"""What NISP-P is asked for: flats by lamps in bands that see them, ramps of a block's own, and what is refused."""
+
+import copy
+from collections import Counter
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+
+from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import resolve
+from truesky.fluxes import passbands
+from truesky.render.camera.lamps import LAMPS
+from truesky.render.channels import image_types
+from truesky.render.effects.light import calibration_lamp
+from truesky.render.plan_exposures import plan
+from truesky.render.planning import survey, variants
+from truesky.render.planning.planned_exposures import elapsed_time
+from truesky.request import observations
+from truesky.request.from_toml import from_table
+
+MISSION = resolve()
+BASE = {"name": "x", "seed": 7, "area": {"cone": {"ra": 150.0, "dec": 20.0, "radius": 0.5}}}
+FLAT = {"channels": ["NISP-P"], "image_type": "flat"}
+POINTING = {"channel": "NISP-P", "band": "euclid_h", "ra": 53.117, "dec": -27.808, "mjd": 60905.0}
+
+
+def exposures(*blocks, **sections):
+    wanted = from_table(copy.deepcopy({**BASE, "observation": list(blocks), **sections}))
+    return survey.exposures(wanted, MISSION)
+
+
+def flats(**more):
+    return Counter((e.lamp, e.band) for e, _ in exposures({**FLAT, **more}))
+
+
+def test_a_lamp_shines_in_bands_that_see_it():
+    """All lamps as often as one another; 1190 nm, where Y and J overlap, in both."""
+    assert flats(exposures=10) == {
+        (1, "euclid_y"): 2, (2, "euclid_j"): 1, (2, "euclid_y"): 1, (3, "euclid_j"): 2, (4, "euclid_h"): 2,
+        (5, "euclid_h"): 2,
+    }  # fmt: skip
+    assert flats(exposures=4, bands=["euclid_h"]) == {(4, "euclid_h"): 2, (5, "euclid_h"): 2}
+    assert flats(exposures=4, lamps=[5, 3]) == {(5, "euclid_h"): 2, (3, "euclid_j"): 2}
+    for lamp, band in flats(exposures=30):
+        assert calibration_lamp.seen_in(passbands.load(band), lamp, "nisp", MISSION) > 0.05
+
+
+def test_lamps_that_cannot_be_lit():
+    with pytest.raises(BadInput, match=r"observation\[0\]: lamps: 5 does not shine in euclid_y"):
+        flats(exposures=1, bands=["euclid_y"], lamps=[5])
+    for lamps, message in (
+        ([6], "6 is not a whole number from 1 to 5"),
+        ([1, 1], "names a lamp twice"),
+        ([], "is not"),
+    ):
+        with pytest.raises(BadInput, match=rf"observation\[0\]\.lamps.*{message}"):
+            flats(exposures=1, lamps=lamps)
+    with pytest.raises(BadInput, match="lamps is not for dark: used by flat"):
+        exposures({"channels": ["NISP-P"], "image_type": "dark", "exposures": 1, "lamps": [1]})
+
+
+def test_requests_know_how_many_lamps_there_are():
+    assert {"VIS": LAMPS["vis"][0], "NISP-P": LAMPS["nisp"][0], "NISP-S": LAMPS["nisp"][0]} == observations.LAMPS
+
+
+def test_calibrations_without_a_date_follow_one_another():
+    """A dark taken while a flat is would show what that leaves in the detector."""
+    found = exposures(
+        {**FLAT, "exposures": 3}, {"channels": ["NISP-P"], "image_type": "dark", "exposures": 2},
+        {"channels": ["VIS"], "image_type": "dark", "exposures": 1},
+        {"channels": ["NISP-P"], "image_type": "dark", "exposures": 1, "mjd": 60200.0},
+        {"channels": ["NISP-P"], "image_type": "self_calibration", "exposures": 1},
+    )  # fmt: skip
+    launch, hours = MISSION.value("svm.launch", "d"), MISSION.value("nisp.persistence.window", "d")
+    flats, darks, (vis,), (dated,), sky = (
+        [e for e, _ in found[i:j]] for i, j in ((0, 3), (3, 5), (5, 6), (6, 7), (7, 10))
+    )
+    assert flats[0].mjd == vis.mjd == launch
+    assert dated.mjd == 60200.0
+    assert darks[0].mjd >= flats[-1].mjd + flats[-1].exposure_time_s / 86400 + hours
+    assert sky[0].mjd >= 60200.0 + hours
+
+
+def test_no_two_undated_blocks_expose_nisp_at_once():
+    """Fields and calibrations in whatever order: each begins when what is before it has ended, and is forgotten."""
+    field = {"channels": ["NISP-P"], "ra": 53.117, "dec": -27.808, "dither": "none"}
+    sky = {"channels": ["NISP-P"], "image_type": "self_calibration", "exposures": 2}
+    dark = {"channels": ["NISP-P"], "image_type": "dark", "exposures": 2}
+    hours = MISSION.value("nisp.persistence.window", "d")
+    for blocks in ((field, sky, dark), (dark, field, field, sky)):
+        wanted = from_table(copy.deepcopy({**BASE, "observation": list(blocks)}))
+        ends = -1.0
+        for i in range(len(blocks)):
+            before = survey.exposures(replace(wanted, observations=wanted.observations[:i]), MISSION) if i else []
+            upto = survey.exposures(replace(wanted, observations=wanted.observations[: i + 1]), MISSION)
+            own = [e for e, _ in upto[len(before) :]]
+            assert min(e.mjd for e in own) >= ends
+            ends = max(e.mjd + e.exposure_time_s / 86400 for e in own) + hours
+    # VIS has no such memory.
+    dates = [e.mjd for e, _ in exposures({**field, "channels": ["VIS"]}, {**field, "channels": ["VIS"]})]
+    assert dates[: len(dates) // 2] == dates[len(dates) // 2 :]
+
+
+def test_exposures_of_long_ramps_follow_one_another():
+    """Ramps that take longer to read than to integrate; spectra's numbers in filters."""
+    dark = {"channels": ["NISP-P"], "image_type": "dark", "exposures": 3}
+    fields = {"channels": ["NISP-P"], "fields": 1, "dither": "none"}
+    for block, macc in ((dark, [2, 1000, 0]), (fields, [15, 16, 11])):
+        found = [e for e, _ in exposures({**block, "macc": macc})]
+        groups, reads, drops = macc
+        frames = groups * reads + (groups - 1) * drops
+        for before, now in pairwise(found):
+            assert now.mjd - before.mjd > frames * MISSION.value("nisp.frame_time", "s") / 86400 - 1e-9
+
+
+def test_spectra_of_a_block_with_a_ramp_leave_what_they_leave():
+    """The same settings: a block's own exposures are in one another's past."""
+    fields = {"channels": ["NISP-P", "NISP-S"], "fields": 1, "dither": "none", "macc": [4, 16, 5]}
+    found = [e for e, _ in exposures(fields)]
+    assert {e.channel for e in found} == {"NISP-P", "NISP-S"}
+    assert len({e.settings for e in found}) == 1
+    (spectrum,) = (e for e in found if e.channel == "NISP-S")
+    assert spectrum.exposure_time_s == pytest.approx(378 * MISSION.value("nisp.frame_time", "s"))
+
+
+@pytest.mark.parametrize(("macc", "seconds"), [([4, 16, 4], 200.0), ([2, 1, 0], 2.0)])
+def test_a_ramp_and_another_exposure_time_are_refused(macc, seconds):
+    block = {"channels": ["NISP-P"], "image_type": "dark", "exposures": 1, "macc": macc}
+    with pytest.raises(BadInput, match=r"observation\[0\]: macc = .* takes .* s, not exposure_time_s"):
+        exposures({**block, "exposure_time_s": seconds})
+    own = (macc[0] - 1) * (macc[1] + macc[2]) * MISSION.value("nisp.frame_time", "s")
+    ((found, _),) = exposures({**block, "exposure_time_s": round(own, 2)})
+    assert found.exposure_time_s == pytest.approx(own, abs=0.01)
+
+
+def test_an_exposure_time_between_two_ramps_is_refused():
+    """98.1 s are 67.5 frames in three differences of 16 reads: 22 or 23 frames each are 2 % off."""
+    with pytest.raises(BadInput, match=r"exposure time 98\.1 s: MACC\(4,16,6\) takes 95\.96 s, .* more than 2%"):
+        exposures({**FLAT, "exposures": 1, "exposure_time_s": 98.1})
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "unit"),
+    [("nisp.frame_time", 0.0, "s"), ("nisp.ipc.side", 0.11, ""), ("nisp.ipc.diagonal", 0.2, "")],
+)
+def test_numbers_that_no_ramp_can_be_drawn_with_are_refused_with_the_request(key, value, unit):
+    overrides = {key: {"value": value, "unit": unit}}
+    with pytest.raises(BadInput, match=key):
+        from_table({**BASE, "pointing": [POINTING], "mission": {"overrides": overrides}})
+
+
+def test_too_much_capacitance_is_refused_with_the_request():
+    overrides = {f"nisp.ipc.{part}": {"value": 0.07, "unit": ""} for part in ("side", "diagonal")}
+    with pytest.raises(BadInput, match=r"nisp\.ipc: 0\.56 of a pixel's charge"):
+        from_table({**BASE, "pointing": [POINTING], "mission": {"overrides": overrides}})
+
+
+def test_a_block_has_its_own_ramp():
+    """So long are its exposures; VIS, beside it, and other blocks know nothing of it."""
+    dark = {"channels": ["NISP-P"], "image_type": "dark", "exposures": 1}
+    fields = {"channels": ["VIS", "NISP-P"], "fields": 1, "dither": "none", "short": False, "flat": False}
+    found = exposures({**dark, "macc": [15, 16, 11]}, dark, {**fields, "macc": [2, 1, 0]})
+    frame = MISSION.value("nisp.frame_time", "s")
+    times = [(e.channel, e.exposure_time_s) for e, _ in found]
+    assert times[:2] == [("NISP-P", pytest.approx(378 * frame)), ("NISP-P", pytest.approx(60 * frame))]
+    assert [time for channel, time in times[2:] if channel == "NISP-P"] == [pytest.approx(frame)] * 3
+    for exposure, own in found:
+        with_own = variants.variant(exposure.settings, MISSION, None, {}).mission
+        assert with_own.fingerprint == own.fingerprint
+        assert (exposure.settings is None) == (exposure.channel == "VIS" or exposure is found[1][0])
+
+
+def test_an_exploration_and_a_block_s_ramp():
+    dark = {"channels": ["NISP-P"], "image_type": "dark", "exposures": 1, "macc": [3, 2, 1]}
+    explored = {"nisp.gain": {"values": [1.0, 2.0], "unit": "electron / adu"}}
+    own = [mission for _, mission in exposures(dark, explore=explored)]
+    assert [mission.value("nisp.gain") for mission in own] == [1.0, 2.0]
+    assert {mission.value("nisp.macc.photometric.groups") for mission in own} == {3.0}
+
+
+MACC = r"observation\[0\]\.macc"
+
+
+@pytest.mark.parametrize(
+    ("macc", "message"),
+    [
+        ([0, 16, 4], rf"{MACC}: groups = 0 is not a whole number from 2 to 1000"),
+        ([4, 16, -1], rf"{MACC}: drops = -1 is not"),
+        ([4, 16.0, 4], rf"{MACC}: reads = 16.0 is not"),
+        ([4, True, 4], rf"{MACC}: reads = True is not"),
+        ([4, 16], rf"{MACC} = \[4, 16\] is not \[groups, reads, drops\]"),
+        ("4,16,4", rf"{MACC} = '4,16,4' is not"),
+        ([100, 30, 30], rf"{MACC} = \[100, 30, 30\] has 5970 frames, more than 4000"),
+    ],
+)
+def test_ramps_that_cannot_be_asked_for(macc, message):
+    with pytest.raises(BadInput, match=message):
+        exposures({**FLAT, "exposures": 1, "macc": macc})
+
+
+def test_only_nisp_has_a_ramp_of_a_request():
+    with pytest.raises(BadInput, match="macc is not for VIS: used by NISP-P, NISP-S"):
+        exposures({"channels": ["VIS"], "image_type": "dark", "exposures": 1, "macc": [4, 16, 4]})
+
+
+@pytest.mark.parametrize(
+    "block",
+    [
+        {"image_type": "dark", "exposures": 1}, {"image_type": "flat", "exposures": 1},
+        {"image_type": "standard_star", "exposures": 1}, {"image_type": "persistence"},
+        {"ra": 53.117, "dec": -27.808, "dither": "none"},
+    ],
+)  # fmt: skip
+def test_a_block_of_spectra_has_its_own_ramp(block):
+    """Of spectra alone: so long are they; NISP-P's ramp is the mission's."""
+    found = exposures({"channels": ["NISP-S"], "macc": [8, 16, 11], **block})
+    seconds = 7 * 27 * MISSION.value("nisp.frame_time", "s")
+    for exposure, mission in found:
+        assert exposure.exposure_time_s == pytest.approx(seconds)
+        assert mission.value("nisp.macc.spectroscopic.groups") == 8.0
+        assert mission.value("nisp.macc.photometric.groups") == 4.0
+        assert image_types.family(exposure.settings) is None
+
+
+def test_flats_at_intensities():
+    """As many frames of each; the lamp's level is the exposure's own."""
+    found = exposures({**FLAT, "exposures": 2, "lamps": [3, 5], "intensities": [0.1, 1.0, 2.5]})
+    level = MISSION.value("nisp.flat.signal")
+    assert [(e.lamp, mission.value("nisp.flat.signal") / level) for e, mission in found] == [
+        (lamp, pytest.approx(share)) for lamp in (3, 5) for share in (0.1, 1.0, 2.5)
+    ]
+    assert [e.settings is None for e, _ in found] == [False, True, False] * 2
+    of_vis = exposures({"channels": ["VIS"], "image_type": "flat", "exposures": 1, "intensities": [0.5]})
+    assert of_vis[0][1].value("vis.flat.signal") == 0.5 * MISSION.value("vis.flat.signal")
+    # What is explored is each variant's; a lamp's intensity is over that.
+    explored = {"nisp.flat.signal": {"values": [1e4, 2e4], "unit": "electron"}}
+    two = exposures({**FLAT, "exposures": 1, "lamps": [3], "intensities": [3.0]}, explore=explored)
+    assert [mission.value("nisp.flat.signal") for _, mission in two] == [3e4, 6e4]
+    assert len({image_types.family(e.settings) for e, _ in two}) == 2
+    for values, message in (([], "not a list"), ([0.0], r"intensities\[0\]"), ([1.0, 1.0], "twice")):
+        with pytest.raises(BadInput, match=rf"observation\[0\]\.intensities.*{message}|{message}"):
+            exposures({**FLAT, "exposures": 1, "intensities": values})
+    with pytest.raises(BadInput, match="intensities is not for dark: used by flat, persistence"):
+        exposures({"channels": ["NISP-P"], "image_type": "dark", "exposures": 1, "intensities": [1.0]})
+
+
+REMEMBERED = {"channels": ["NISP-P"], "image_type": "persistence"}
+
+
+def test_darks_after_a_bright_exposure():
+    """From 100 s to two hours after its end; the next bright one when it is forgotten, and so the next channel."""
+    found = [e for e, _ in exposures({**REMEMBERED, "channels": ["NISP-P", "NISP-S"], "exposures": 2, "lamps": [3]})]
+    window, at = MISSION.value("nisp.persistence.window", "d"), 0
+    for size in (8, 8, 5, 5):
+        bright, *darks = found[at : at + size]
+        at += size
+        ends = bright.mjd + elapsed_time(bright, MISSION) / 86400.0
+        after = [round((dark.mjd - ends) * 86400.0) for dark in darks]
+        listed = [100, 300, 600, 1200, 2400, 4800, 7000]
+        # Ramps of spectra take 573 s.
+        assert after == (listed if bright.channel == "NISP-P" else [100, 1200, 2400, 4800])
+        assert (bright.image_type, bright.lamp) == ("flat", 3)
+        assert {(dark.image_type, dark.lamp, dark.channel) for dark in darks} == {("persistence", None, bright.channel)}
+        if at < len(found):
+            assert found[at].mjd >= darks[-1].mjd + elapsed_time(darks[-1], MISSION) / 86400.0 + window - 1e-9
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"delays_s": [100.0, 150.0]}, r"delays_s: a dark at 150 s begins before that at 100 s, of 110\.5 s, ends"),
+        ({"delays_s": [7200.0]}, "delays_s: 7200 s is more than nisp.persistence.window looks back"),
+        ({"bright": "sky", "lamps": [3]}, "lamps: bright = 'sky' has no lamp"),
+        ({"bright": "moon"}, "bright"),
+        ({"image_type": "dark", "exposures": 1, "delays_s": [100.0]}, "delays_s is not for dark: used by persistence"),
+        ({"channels": ["VIS"]}, "image_type = 'persistence' is none of VIS's"),
+    ],
+)
+def test_darks_that_cannot_be_asked_for(more, message):
+    with pytest.raises(BadInput, match=message):
+        exposures({**REMEMBERED, **more})
+
+
+def test_a_field_of_stars_may_be_what_is_bright():
+    """In its image, or through the grism."""
+    sky = {**REMEMBERED, "bright": "sky", "delays_s": [300.0]}
+    photometry = [e for e, _ in exposures({**sky, "exposures": 2, "bands": ["euclid_h"]})]
+    assert [e.image_type for e in photometry] == ["self_calibration", "persistence"] * 2
+    assert {e.band for e in photometry[::2]} == {"euclid_h"}
+    spectra = [e for e, _ in exposures({**sky, "channels": ["NISP-S"]})]
+    assert [(e.image_type, e.grism) for e in spectra] == [("science", "RGS000"), ("persistence", None)]
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0, -4.0, 3.5])
+def test_the_mission_s_ramp_is_of_whole_numbers(value):
+    """A request that overrides it, or explores it, is refused before anything is made."""
+    key = "nisp.macc.photometric.groups"
+    for sections in (
+        {"mission": {"overrides": {key: {"value": value, "unit": ""}}}},
+        {"explore": {key: {"values": [value], "unit": ""}}},
+    ):
+        with pytest.raises(BadInput, match=key):
+            from_table({**BASE, "pointing": [POINTING], **sections})
+
+
+def test_a_ramp_of_too_many_frames_is_refused_with_the_request():
+    overrides = {"nisp.macc.photometric.groups": {"value": 400, "unit": ""}}
+    with pytest.raises(BadInput, match=r"nisp\.macc\.photometric: MACC\(400,16,4\) has 7996 frames, more than 4000"):
+        from_table({**BASE, "pointing": [POINTING], "mission": {"overrides": overrides}})
+
+
+@pytest.mark.parametrize(("seconds", "message"), [(20.0, "takes 69.79 s without any drops"), (1e5, "more than 1000")])
+def test_an_exposure_time_that_no_ramp_has_is_refused_by_name(tmp_path, seconds, message):
+    one = from_table({**BASE, "pointing": [{**POINTING, "exposure_time_s": seconds}]})
+    with pytest.raises(BadInput, match=rf"pointing\[0\]: exposure time .*{message}"):
+        plan(tmp_path, one)
+    with pytest.raises(BadInput, match=rf"observation\[0\]: exposure time .*{message}"):
+        exposures({**FLAT, "exposures": 1, "exposure_time_s": seconds})
+
+
+def test_darks_are_in_bands_that_the_block_names():
+    """Fluxes are computed in no others."""
+    dark = {"channels": ["NISP-P"], "image_type": "dark", "exposures": 2}
+    assert [e.band for e, _ in exposures(dark)] == ["euclid_y", "euclid_y"]
+    assert [e.band for e, _ in exposures({**dark, "bands": ["euclid_h"]})] == ["euclid_h", "euclid_h"]
+    assert {e.band for e, _ in exposures({**REMEMBERED, "bands": ["euclid_j"], "delays_s": [100.0]})} == {"euclid_j"}

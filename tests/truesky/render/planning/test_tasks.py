@@ -1,0 +1,77 @@
+"""Which of a plan's detectors are rendered now."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import resolve
+from tests.truesky.render.planning.test_survey import VIS, planned
+from truesky.render.channels import registry
+from truesky.render.planning import tasks
+from truesky.request.from_toml import parse
+
+DEMO = Path(__file__).parents[4] / "requests" / "demo.toml"
+
+
+@pytest.fixture(scope="module")
+def plan(tmp_path_factory):
+    """Three detectors of two exposures."""
+    pointings = [{**VIS, "detectors": ["3-4", "1-1", "6-6"], "ra": ra} for ra in (53.0, 54.0)]
+    return planned(tmp_path_factory.mktemp("plan"), pointing=pointings)[1]
+
+
+def places(plan, **wanted):
+    return [(row["exposure_id"], row["detector"]) for row in tasks.part(plan, replace(parse(DEMO), **wanted))]
+
+
+def test_all_of_a_plan_unless_a_part_is_asked_for(plan):
+    whole = places(plan)
+    assert len(whole) == 6
+    assert whole == [(row["exposure_id"], row["detector"]) for row in plan.to_pylist()]
+    assert places(plan, detectors=("6-6",)) == [place for place in whole if place[1] == "6-6"]
+    # The first by exposure and name, wherever they stand in the plan, and in its order.
+    assert sorted(places(plan, limit=2)) == sorted(whole)[:2]
+    assert sorted(places(plan, limit=4)) == sorted(whole)[:4]
+    assert places(plan, limit=4) == [place for place in whole if place in sorted(whole)[:4]]
+    assert len(places(plan, detectors=("3-4", "6-6"), limit=3)) == 3
+    assert places(plan, limit=99) == whole
+
+
+@pytest.mark.parametrize(
+    ("wanted", "said"), [({"detectors": ("3-4", "7-7")}, "7-7 is not in the plan"), ({"limit": 0}, "limit = 0")]
+)
+def test_what_is_not_in_a_plan_is_refused(plan, wanted, said):
+    with pytest.raises(BadInput, match=said):
+        places(plan, **wanted)
+
+
+def test_what_earlier_exposures_left_is_drawn_again_and_takes_its_time(tmp_path, monkeypatch):
+    """Of NISP each image of the sky in the window before; of VIS none, nor of frames without a sky."""
+    blocks = [
+        {"channels": ["VIS", "NISP-P", "NISP-S"], "fields": 1, "mjd": 60400.0, "short": False, "flat": False},
+        {"channels": ["NISP-P"], "image_type": "dark", "exposures": 2},
+    ]
+    exposures, rows = planned(tmp_path, observation=blocks)
+    with monkeypatch.context() as patch:
+        patch.setattr(tasks, "remembering", lambda rows, *_: rows)
+        _, alone = planned(tmp_path, observation=blocks)
+    without = {(row["exposure_id"], row["detector"]): row["seconds"] for row in alone.to_pylist()}
+    every, days = exposures.to_pylist(), resolve().value("nisp.persistence.window", "d")
+    added = {}
+    for row in rows.to_pylist():
+        (own,) = (one for one in every if one["exposure_id"] == row["exposure_id"])
+        before = [
+            registry.CHANNELS[one["channel"]].cost.again_s
+            for one in every
+            if own["camera"] == one["camera"] == "nisp"
+            and own["mjd"] - days <= one["mjd"] < own["mjd"]
+            and one["image_type"] == "science"
+        ]
+        more = row["seconds"] - without[row["exposure_id"], row["detector"]]
+        assert more == pytest.approx(sum(before), abs=1e-6)
+        added[own["channel"], row["exposure_id"]] = more
+    assert len({round(more, 3) for more in added.values()}) > 10
+    assert max(more for (channel, _), more in added.items() if channel == "VIS") == 0.0
+    assert rows["seconds"].to_pylist() == sorted(rows["seconds"].to_pylist(), reverse=True)

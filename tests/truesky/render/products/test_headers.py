@@ -1,0 +1,118 @@
+"""Headers: what tools look for, in every array, and true."""
+
+import re
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.time import Time
+
+from tests.truesky.render import fields, nominal
+from tests.truesky.render.exposure.test_render import render
+from tests.truesky.render.fields import MISSION, small
+from truesky.render.camera import detectors
+from truesky.render.products import fits_files
+from truesky.request.accuracy import SURVEY
+
+IN_EACH = {
+    "EXPTIME", "FILTER", "DATE-OBS", "MJD-OBS", "TIMESYS", "GAIN", "RDNOISE", "RDNDRAWN", "SATURATE", "BUNIT",
+    "DATASEC", "TRIMSEC", "CCDSEC", "DETSEC",
+}  # fmt: skip
+FIRST = {
+    "TELESCOP",
+    "INSTRUME",
+    "OBJECT",
+    "RA",
+    "DEC",
+    "DATE-OBS",
+    "MJD-OBS",
+    "TIMESYS",
+    "EXPTIME",
+    "FILTER",
+    "DETSIZE",
+}
+
+
+def science(one, tmp_path, **options):
+    rows, writers = fits_files.products(one, (), **options)
+    path = tmp_path / "science.fits"
+    writers[rows["path"][0].as_py()](path)
+    return fits.open(path)
+
+
+def window(text):
+    """A section as slices of an array."""
+    x0, x1, y0, y1 = (int(n) for n in re.fullmatch(r"\[(\d+):(\d+),(\d+):(\d+)\]", text).groups())
+    return slice(y0 - 1, y1), slice(x0 - 1, x1)
+
+
+@pytest.mark.parametrize("rice", [False, True])
+@pytest.mark.parametrize("channel", ["VIS", "EXT"])
+def test_every_array_has_what_tools_look_for(channel, rice, tmp_path):
+    one = render(channel, exposed={"airmass": None if channel == "VIS" else 1.2})
+    with science(one, tmp_path, rice=rice) as units:
+        arrays = [unit.header for unit in units if unit.header["NAXIS"]]
+        assert len(arrays) == (4 if channel == "VIS" else 1)
+        for header in arrays:
+            assert set(header) >= IN_EACH
+            assert (header["EXPTIME"], header["BUNIT"]) == (100.0, "adu")
+            assert header["GAIN"] == pytest.approx(np.mean(one.scene.of_amplifiers("gain", "electron / adu")))
+            if channel == "VIS":
+                assert header["INHERIT"] is True
+        first = units[0].header if channel == "VIS" else arrays[0]
+        assert set(first) >= FIRST
+        assert (first["RA"], first["DEC"], first["OBJECT"]) == (one.exposure.ra, one.exposure.dec, "test")
+        assert first["INSTRUME"] == {"VIS": "VIS", "EXT": "LSSTCam"}[channel]
+        assert first.get("AIRMASS") == one.exposure.airmass
+
+
+def test_sections_of_quadrants_put_the_detector_together(tmp_path):
+    """And none of its pixels is taken for the bias."""
+    one = render("VIS")
+    found = np.zeros_like(one.science)
+    with science(one, tmp_path) as units:
+        for unit in units[1:]:
+            data, bias = (window(unit.header[key]) for key in ("DATASEC", "BIASSEC"))
+            found[window(unit.header["CCDSEC"])] = unit.data[data]
+            assert unit.header["TRIMSEC"] == unit.header["DATASEC"]
+            light = np.zeros(unit.data.shape, bool)
+            light[data] = True
+            assert not light[bias].any()
+            assert unit.data[bias].shape == (len(unit.data), 14)
+            assert np.median(unit.data[bias]) == pytest.approx(1000.0, abs=50.0)
+    np.testing.assert_array_equal(found, one.science)
+
+
+def test_times_of_lsst_are_tai(tmp_path):
+    one = render("EXT")
+    with science(one, tmp_path) as units:
+        header = units[0].header
+    start = Time(one.exposure.mjd, format="mjd", scale="utc").tai
+    assert header["TIMESYS"] == "TAI"
+    assert header["MJD-OBS"] == pytest.approx(start.mjd, abs=1e-9)
+    assert abs(Time(header["DATE-OBS"], scale="tai") - start).sec < 1e-3
+    assert start.mjd - one.exposure.mjd > 30.0 / 86400.0
+
+
+def test_read_noise_is_the_detectors_though_it_was_not_drawn(tmp_path):
+    """As where a request forbids it."""
+    for forced, drawn in (({}, 1.0), (nominal.off("read_noise"), 0.0)):
+        one = render("EXT", forced=forced, exposed={"sky": 0.0})
+        of_detector = np.mean(one.scene.of_amplifiers("read_noise", "electron"))
+        with science(one, tmp_path) as units:
+            assert 4.0 < units[0].header["RDNOISE"] == pytest.approx(of_detector)
+            assert units[0].header["RDNDRAWN"] == pytest.approx(drawn * of_detector, abs=1e-9)
+
+
+def test_where_a_bright_sky_hides_the_read_noise(tmp_path):
+    """HSC in z: the effect switches itself off, the detector has it all the same."""
+    detector = small("hsc", detectors.detectors("hsc", MISSION)[50].name, 128)
+    none = fields.galaxies([], []), fields.stars([], [])
+    exposed = {"channel": "EXT", "camera": "hsc", "band": "hsc_z", "exposure_time_s": 200.0, "sky": 34.0, "seeing": 0.7}
+    tables = none[0], fields.fluxes(none[0], "hsc_z", []), none[1], fields.fluxes(none[1], "hsc_z", [])
+    one = fields.rendered(exposed, detector, tables, MISSION, SURVEY)
+    assert "read_noise" not in {decision.name for decision in one.decisions if decision.applied}
+    with science(one, tmp_path) as units:
+        of_detector = np.mean(one.scene.of_amplifiers("read_noise", "electron"))
+        assert 4.0 < units[0].header["RDNOISE"] == pytest.approx(of_detector)
+        assert units[0].header["RDNDRAWN"] == 0.0

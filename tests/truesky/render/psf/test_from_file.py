@@ -1,0 +1,264 @@
+"""A PSF of the user's own in place of ours: drawn as galsim draws it, read by galsim.des, refused by name."""
+
+from dataclasses import replace
+
+import galsim
+import galsim.des
+import numpy as np
+import pytest
+from astropy.io import fits
+from scipy.special import ndtr
+
+from lake_schema.errors import BadInput, LakeError
+from lake_schema.mission.configuration import resolve
+from tests.truesky.render.exposure.test_render import field, render
+from tests.truesky.render.fields import moments, one_source, small
+from truesky.fluxes import passbands
+from truesky.render import plan_exposures
+from truesky.render.camera.astrometry import wcs
+from truesky.render.camera.pointing import boresight_for
+from truesky.render.drawing import reference, stamps
+from truesky.render.planning import survey
+from truesky.render.psf import from_file
+from truesky.request.accuracy import REFERENCE
+from truesky.request.from_toml import from_table
+
+BAND, GROUND = passbands.load("euclid_vis"), passbands.load("lsst_r")
+# Samples of the cubes, arcsec.
+STEP = 0.05
+CARDS = {"CDELT1": STEP, "CDELT2": STEP, "CUNIT1": "arcsec"}
+COLOURS = {"CRVAL3": 500.0, "CDELT3": 100.0, "CUNIT3": "nm"}
+
+
+def cube(path, planes, **cards):
+    unit = fits.PrimaryHDU(np.asarray(planes, np.float32))
+    unit.header.update({**CARDS, **cards})
+    unit.writeto(path, overwrite=True)
+    return path
+
+
+def gaussian(*sigmas, side=161, x=0.0, y=0.0, stretch=1.0):
+    """Planes of unit flux of Gaussians, sigma in arcsec, about (x, y) arcsec from the middle."""
+    v, u = (np.mgrid[:side, :side] - (side - 1) / 2) * STEP
+    planes = [np.exp(-0.5 * (((u - x) / s) ** 2 + ((v - y) / s / stretch) ** 2)) for s in sigmas]
+    return np.array([plane / plane.sum() for plane in planes])
+
+
+def star(psf, detector, column=80.3, row=77.6, photons=None):
+    system = wcs(detector, *boresight_for(detector, 10.0, 20.0, 33.0))
+    one = one_source(detector, system, 1e5, column, row)
+    return stamps.draw(replace(one, photons=photons), np.array([128]), psf, 160, 160)
+
+
+def test_a_cube_of_one_plane(tmp_path):
+    detector = small("vis", "2-3")
+    psf = from_file.read(cube(tmp_path / "a.fits", gaussian(0.12, stretch=1.4, x=0.03)[0]), detector, BAND)
+    # A Gaussian's share of a pixel is known.
+    edges = np.arange(161) - 0.5
+    x, y = (np.diff(ndtr((edges - middle) / sigma)) for middle, sigma in ((80.3 + 0.3, 1.2), (77.6, 1.2 * 1.4)))
+    theirs = 1e5 * y[:, None] * x
+    np.testing.assert_allclose(star(psf, detector), theirs, atol=2e-4 * theirs.max())
+    one = one_source(detector, wcs(detector, 10.0, 20.0, 0.0), 1e5, 80.3, 77.6, inclination=50.0)
+    ours, theirs = stamps.draw(one, np.array([128]), psf, 160, 160), reference.reference(one, 0, psf, 160)
+    theirs = np.roll(theirs, (78 - 80, 80 - 80), (0, 1))
+    assert np.abs(ours - theirs)[10:-10, 10:-10].max() < 2e-4 * theirs.max()
+
+
+def test_the_pixel_may_be_in_it(tmp_path):
+    detector = small("vis", "2-3")
+    psf = from_file.read(cube(tmp_path / "a.fits", gaussian(0.15), PIXEL=True), detector, BAND)
+    _, second = moments(star(psf, detector)[60:96, 62:98])
+    np.testing.assert_allclose(second * 0.01, 0.15**2 * np.eye(2), atol=2e-4)
+
+
+@pytest.mark.parametrize("how", ["axis", "cards"])
+def test_colours_are_interpolated_between_planes(tmp_path, how):
+    """sigma^2 goes linearly with wavelength: so does the second moment of whatever colour."""
+    waves = np.array([500.0, 600.0, 700.0, 800.0, 900.0, 1000.0])
+    variance = 0.01 + 1e-5 * (waves - 500)
+    cards = COLOURS if how == "axis" else {"CUNIT3": "nm", **{f"WAVE{i + 1}": w for i, w in enumerate(waves)}}
+    detector = small("vis", "2-3")
+    psf = from_file.read(cube(tmp_path / "a.fits", gaussian(*np.sqrt(variance)), **cards), detector, BAND)
+    n = len(psf.planes.wavelength)
+    for k in (0, n - 1):
+        _, second = moments(star(psf, detector, photons=np.eye(n)[k : k + 1])[50:106, 52:108])
+        sigma2 = 0.01 + 1e-6 * (psf.planes.wavelength[k] - 5000)
+        assert np.trace(second) / 2 * 0.01 == pytest.approx(sigma2 + 0.01 / 12, rel=2e-3)
+
+
+def test_a_detector_that_is_mounted_turned_sees_it_turned(tmp_path):
+    path = cube(tmp_path / "a.fits", gaussian(0.15, x=0.3, y=0.1))
+    upright, turned = (from_file.read(path, small("vis", name), BAND) for name in ("2-3", "2-4"))
+    centre, _ = moments(star(upright, small("vis", "2-3")))
+    other, _ = moments(star(turned, small("vis", "2-4")))
+    np.testing.assert_allclose(centre - (80.3, 77.6), (3.0, 1.0), atol=0.01)
+    np.testing.assert_allclose(other - (80.3, 77.6), (-3.0, -1.0), atol=0.01)
+    # As wide as if it lay in the middle: sigma and pixel.
+    width = 2.3548 * np.hypot(0.15, 0.1 / 12**0.5)
+    assert (upright.fwhm, turned.fwhm) == pytest.approx((width, width), rel=0.02)
+    # The chief ray's place may be told.
+    centred = cube(tmp_path / "b.fits", gaussian(0.15, x=0.3, y=0.1), CRPIX1=81.0 + 6, CRPIX2=81.0 + 2)
+    found, _ = moments(star(from_file.read(centred, small("vis", "2-3"), BAND), small("vis", "2-3")))
+    np.testing.assert_allclose(found, (80.3, 77.6), atol=0.01)
+
+
+# ------------------------------------------------------------------------------------------------ PSFEx
+
+
+def psfex(path, degree=2, samples=0.65, side=33, **cards):
+    """What PSFEx would write of a Moffat that changes across a detector of 160 pixels."""
+    y, x = np.mgrid[:side, :side] - side // 2
+    terms = [(i, j) for j in range(degree + 1) for i in range(degree + 1 - j)]
+    basis = []
+    for i, j in terms:
+        wide = (1 + ((x * samples) ** 2 + (1 + 0.1 * (i > j)) * (y * samples) ** 2) / (3.0 + i + 0.5 * j)) ** -3
+        basis.append(
+            (1.0 if i + j == 0 else 0.04 / (1 + i + j)) * (wide / wide.sum() - (i + j > 0) * (x * x < 40) * 1e-3)
+        )
+    mask = np.array(basis, np.float32)[None]
+    column = fits.Column("PSF_MASK", f"{mask.size}E", dim=f"({side},{side},{len(terms)})", array=mask)
+    unit = fits.BinTableHDU.from_columns([column], name="PSF_DATA")
+    unit.header.update(
+        {
+            "POLNAXIS": 2, "POLGRP1": 1, "POLNAME1": "X_IMAGE", "POLZERO1": 70.0, "POLSCAL1": 150.0, "POLGRP2": 1,
+            "POLNAME2": "Y_IMAGE", "POLZERO2": 90.0, "POLSCAL2": 140.0, "POLNGRP": 1, "POLDEG1": degree, "PSFNAXIS": 3,
+            "PSFAXIS1": side, "PSFAXIS2": side, "PSFAXIS3": len(terms), "PSF_SAMP": samples, **cards,
+        }
+    )  # fmt: skip
+    fits.HDUList([fits.PrimaryHDU(), unit]).writeto(path, overwrite=True)
+    return path
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize(("column", "row"), [(80.3, 77.6), (30.1, 120.4), (131.7, 25.2)])
+def test_a_psfex_file_is_what_galsim_reads(tmp_path, degree, column, row):
+    """Position by position, and without another pixel: of a small body, as sharp as pixels show.
+
+    The interpolant rings at frequencies that three samples a pixel do not hold; in galsim's star they are seen.
+    """
+    path, detector = psfex(tmp_path / "a.psf", degree), small("lsstcam", "R22_S11")
+    psf, sigma = from_file.read(path, detector, GROUND), 0.6
+    source = one_source(
+        detector, wcs(detector, 10.0, 20.0, 0.0), 1e5, column, row, bulge_fraction=1.0, bulge_sersic_index=0.5,
+        bulge_half_light_radius=sigma * np.sqrt(2 * np.log(2)) * detector.pixel_scale,
+    )  # fmt: skip
+    ours = stamps.draw(source, np.array([128]), psf, 160, 160)
+    # galsim counts pixels from 1.
+    place = galsim.PositionD(column + 1, row + 1)
+    whole = galsim.Convolve(galsim.des.DES_PSFEx(str(path)).getPSF(place), galsim.Gaussian(sigma=sigma))
+    image = galsim.ImageD(160, 160, scale=1.0)
+    theirs = 1e5 * whole.drawImage(image, method="no_pixel", center=place).array
+    np.testing.assert_allclose(ours, theirs, atol=1e-3 * theirs.max())
+    assert ours.sum() == pytest.approx(1e5, rel=2e-3)
+    sharp = 1e5 * galsim.des.DES_PSFEx(str(path)).getPSF(place).drawImage(image, method="no_pixel", center=place).array
+    np.testing.assert_allclose(star(psf, detector, column, row), sharp, atol=5e-3 * sharp.max())
+
+
+def test_galaxies_through_a_psfex_file(tmp_path):
+    """galsim's own convolution, with no pixel besides."""
+    path, detector = psfex(tmp_path / "a.psf", 1), small("lsstcam", "R22_S11")
+    psf = from_file.read(path, detector, GROUND)
+    system = wcs(detector, *boresight_for(detector, 10.0, 20.0, 33.0))
+    source = one_source(detector, system, 1e5, 80.3, 77.6, inclination=50.0, disk_half_light_radius=1.2)
+    ours = stamps.draw(source, np.array([128]), psf, 160, 160)
+    theirs = np.roll(reference.reference(source, 0, psf, 160), (78 - 80, 80 - 80), (0, 1))
+    assert np.abs(ours - theirs)[10:-10, 10:-10].max() < 2e-4 * theirs.max()
+
+
+# ------------------------------------------------------------------------------------------------ refusals
+
+
+BAD = {
+    "sum": (lambda p: cube(p, 7 * gaussian(0.1, 0.1), **COLOURS), r"plane 1 sums to 7, wanted what it holds of 1"),
+    "nan": (lambda p: cube(p, gaussian(0.1) * np.nan), "holds values that are not numbers"),
+    "unit": (lambda p: cube(p, gaussian(0.1), CUNIT1="furlong"), "CUNIT1 = 'furlong' is not one of arcsec, mas, deg"),
+    "step": (lambda p: cube(p, gaussian(0.1), CDELT2=0.06), "CDELT1 and CDELT2 are not the same distance"),
+    "coarse": (lambda p: cube(p, gaussian(0.1), CUNIT1="deg"), "samples are 1800 pixels apart"),
+    "text": (lambda p: cube(p, gaussian(0.1), CDELT1="x"), "CDELT1 = 'x' is not a number"),
+    "colour": (lambda p: cube(p, gaussian(0.1, 0.1), **{**COLOURS, "CDELT3": -1.0}), "wavelengths do not increase"),
+    "reach": (lambda p: cube(p, gaussian(0.1, 0.1), **COLOURS), "planes reach from 5000 to 6000 A, band euclid_vis"),
+    "no colour": (lambda p: cube(p, gaussian(0.1, 0.1)), "CUNIT3 = '' is not one of Angstrom"),
+    "pixel": (lambda p: cube(p, gaussian(0.1), PIXEL="yes"), "PIXEL = 'yes' is not T or F"),
+    "degree": (lambda p: psfex(p, 2, POLDEG1=3), r"PSF_MASK has \[6, 33, 33\] samples, wanted 10 planes of degree 3"),
+    "places": (lambda p: psfex(p, 1, POLNAME1="MAG_AUTO"), "polynomials are of MAG_AUTO, Y_IMAGE"),
+    "scale": (lambda p: psfex(p, 1, POLSCAL1=0.0), "POLSCAL1 or POLSCAL2 is 0"),
+    "four axes": (lambda p: cube(p, gaussian(0.1)[None]), "no image of two or three axes and no table with a column"),
+    "no file": (lambda p: None, "no such file"),
+    "no FITS": (lambda p: p.write_text("hello"), "a.fits: "),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_files_are_refused_by_name(tmp_path, case):
+    make, said = BAD[case]
+    make(tmp_path / "a.fits")
+    with pytest.raises(LakeError, match=said) as refused:
+        from_file.read(tmp_path / "a.fits", small("vis", "2-3"), BAND)
+    assert str(refused.value).startswith(f"{tmp_path / 'a.fits'}: ")
+    assert "\n" not in str(refused.value)
+
+
+# ------------------------------------------------------------------------------------------------ by the request
+
+POINTING = {
+    "channel": "EXT", "camera": "lsstcam", "band": "lsst_r", "ra": 53.117, "dec": -27.808, "mjd": 60905.0,
+    "detectors": ["R22_S11", "R22_S12"], "centre_on": "R22_S11",
+}  # fmt: skip
+
+
+def asked(folder, **psf):
+    table = {"name": "x", "seed": 1, "area": {"cone": {"ra": 53.117, "dec": -27.808, "radius": 0.1}}}
+    return from_table({**table, "pointing": [POINTING], "psf": psf}, folder)
+
+
+def test_a_request_names_it_by_band_and_detector(lake, tmp_path):
+    for name in ("R22_S11", "R22_S12"):
+        psfex(tmp_path / f"{name}.psf")
+    _, exposures, _ = plan_exposures.plan(lake, asked(tmp_path, lsst_r="{detector}.psf"))
+    (row,) = exposures.to_pylist()
+    assert from_file.file_of(row["psf"], "R22_S12") == tmp_path / "R22_S12.psf"
+    (tmp_path / "R22_S12.psf").unlink()
+    with pytest.raises(BadInput, match=r"R22_S12.psf: no such file"):
+        plan_exposures.plan(lake, asked(tmp_path, lsst_r="{detector}.psf"))
+    with pytest.raises(BadInput, match=r"psf.lsst_i: no exposure is taken in this band"):
+        plan_exposures.plan(lake, asked(tmp_path, lsst_i="R22_S11.psf"))
+    with pytest.raises(BadInput, match=r"psf.lsst_r wants text, got 3"):
+        asked(tmp_path, lsst_r=3)
+
+
+def test_of_a_set_each_exposure_has_one(tmp_path):
+    """At random, and the same whatever else is exposed."""
+    names = [f"{i}_{{detector}}.psf" for i in range(3)]
+    table = {"name": "x", "seed": 1, "area": {"cone": {"ra": 53.117, "dec": -27.808, "radius": 0.1}}}
+    pointings = [{**POINTING, "mjd": 60905.0 + 0.1 * i} for i in range(60)]
+    mission = resolve()
+
+    def drawn(some, seed=1):
+        request = from_table({**table, "seed": seed, "pointing": some, "psf": {"lsst_r": names}}, tmp_path)
+        return [exposure.psf for exposure, _ in survey.exposures(request, mission)]
+
+    found = drawn(pointings)
+    counts = [found.count(str(tmp_path / name)) for name in names]
+    assert sum(counts) == 60
+    assert min(counts) > 8
+    assert drawn(pointings[::-1]) == found[::-1]
+    assert drawn(pointings, 2) != found
+    with pytest.raises(BadInput, match=r"psf.lsst_r names no file"):
+        asked(tmp_path, lsst_r=[])
+    with pytest.raises(BadInput, match=r"psf.lsst_r wants a list of texts"):
+        asked(tmp_path, lsst_r=[3])
+
+
+@pytest.mark.parametrize("channel", ["VIS", "EXT"])
+def test_an_exposure_is_drawn_through_it(tmp_path, monkeypatch, channel):
+    """Wider than ours, by the request's file alone."""
+    path = cube(tmp_path / "a.fits", gaussian(0.5)[0])
+    task, exposed, body, points = field(channel)
+    monkeypatch.setattr(
+        "tests.truesky.render.exposure.test_render.field",
+        lambda channel: (task, {**exposed, "psf": str(path)}, body, points),
+    )
+    found = render(channel, body.slice(0, 0), points.slice(20, 20), accuracy=REFERENCE)
+    pixel = found.detector.pixel_scale
+    assert found.psf.fwhm == pytest.approx(2.355 * np.hypot(0.5, pixel / 12**0.5), rel=0.01)
+    assert found.sources.electrons.sum() > 0

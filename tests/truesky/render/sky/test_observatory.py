@@ -1,0 +1,82 @@
+"""Sun, Moon and fields above an observatory: against astropy; night, and what a field is taken as that is not up."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lake_schema.mission.configuration import resolve
+from lake_schema.sky import separation
+from truesky.render.sky import observatory
+
+MISSION = resolve()
+LSST, CFHT = (observatory.Site.of(f"ext.{camera}", MISSION) for camera in ("lsstcam", "megacam"))
+
+
+@pytest.mark.parametrize("site", [LSST, CFHT], ids=["south", "north"])
+def test_altitudes_and_zenith_are_astropy_s(site):
+    import astropy.units as u
+    from astropy.coordinates import AltAz, EarthLocation, SkyCoord, get_body
+    from astropy.time import Time
+    from astropy.utils import iers
+
+    with iers.conf.set_temp("auto_download", False):
+        times = Time(np.linspace(60905.0, 60935.0, 25), format="mjd")
+        place = EarthLocation.from_geodetic(site.longitude, site.latitude, site.height)
+        frame = AltAz(obstime=times, location=place)
+        field = SkyCoord(53.1, -27.8, unit="deg")
+        seen = field.transform_to(frame)
+        assert np.abs(seen.alt.deg - site.altitude(53.1, -27.8, times.mjd)).max() < 0.2
+        higher = AltAz(az=seen.az, alt=seen.alt + 0.1 * u.deg, obstime=times, location=place)
+        theirs = field.position_angle(SkyCoord(higher).transform_to("icrs")).deg
+        ours = np.array([site.zenith(53.1, -27.8, mjd) for mjd in times.mjd])
+        assert np.abs((ours - theirs + 180.0) % 360.0 - 180.0).max() < 0.4
+        body = get_body("moon", times)
+        ra, dec, phase = observatory.moon(times.mjd)
+        assert separation(ra, dec, body.ra.deg, body.dec.deg).max() < 0.5
+        moon = get_body("moon", times, place).transform_to(frame)
+        assert np.abs(moon.alt.deg - observatory.moon_altitude(times.mjd, site)).max() < 0.5
+    # Full on 7 September 2025, new on 21 September.
+    days = times.mjd[[np.argmin(phase), np.argmax(phase)]]
+    assert abs(days[0] - 60925.76) < 1.3
+    assert phase.min() < 15.0 < 165.0 < phase.max()
+
+
+def test_airmass():
+    np.testing.assert_allclose(
+        observatory.airmass(np.array([90.0, 60.0, 30.0, 10.0])), [1.0, 1.154, 1.994, 5.59], atol=0.01
+    )
+
+
+@given(st.floats(0.0, 359.9), st.floats(-90.0, 90.0), st.floats(60000.0, 62000.0), st.sampled_from([LSST, CFHT]))
+def test_every_field_has_an_airmass(ra, dec, mjd, site):
+    found, zenith = observatory.aloft(ra, dec, mjd, site)
+    assert 1.0 <= found <= observatory.HIGHEST_AIRMASS
+    assert -180.0 <= zenith <= 180.0
+
+
+@pytest.mark.parametrize("start", [60000.0, 60100.3, 60290.9])
+def test_surveys_wait_for_the_night(start):
+    found = observatory.next_dark(53.1, -27.8, start, LSST)
+    assert start <= found < start + 120.0
+    sun = observatory.equatorial(observatory.sun_longitude(found), 0.0)
+    assert LSST.altitude(*sun, found) < -15.0
+    assert observatory.aloft(53.1, -27.8, found, LSST)[0] <= 2.0
+    ra, dec, _ = observatory.moon(found)
+    assert observatory.moon_altitude(found, LSST) < 0.0 or separation(53.1, -27.8, ra, dec) > 30.0
+    # The pole star is never seen from there.
+    assert observatory.next_dark(30.0, 89.0, start, LSST) == start
+
+
+def test_a_field_that_never_rises_is_not_waited_for(monkeypatch):
+    """400 days of each of a survey's exposures would be looked through in vain."""
+    looked = []
+    monkeypatch.setattr(observatory, "_dark", lambda ra, dec, mjd, site: looked.append(mjd) or np.zeros(len(mjd), bool))
+    assert observatory.next_dark(30.0, 80.0, 60000.3, LSST) == 60000.3
+    assert observatory.next_dark(30.0, -60.0, 60000.3, CFHT) == 60000.3
+    assert looked == []
+    # One that does is, whether it is high or just high enough.
+    for dec in (-30.0, 29.0):
+        observatory.next_dark(30.0, dec, 60000.3, LSST)
+        assert looked
+        looked.clear()

@@ -1,0 +1,191 @@
+"""An exposure of DECam in one file, by the jobs: CCDs in the order of their numbers, with what DECam says of each."""
+
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
+from astropy.wcs import WCS
+
+from lake_schema.fits import images
+from lake_schema.store import layout, publish, read
+from tests import requests
+from tests.truesky.render.fields import MISSION
+from tests.truesky.render.products import test_tools as tools
+from truesky.catalogue import build_galaxies, build_stars
+from truesky.fluxes import compute_fluxes
+from truesky.render import plan_exposures, render_exposures
+from truesky.render.camera import astrometry, detectors
+from truesky.render.camera.pointing import boresight_for
+from truesky.render.products import head_files, read_back
+from truesky.request.from_toml import parse
+
+SIDE, PLACE = 64, (53.117, -27.808)
+# Their names are in another order.
+NUMBERS = {"S29": 1, "S25": 4}
+TEXT = """
+accuracy = "draft"
+[sources]
+only = "table"
+band = "des_r"
+stars = "stars.csv"
+[products]
+truth = []
+files = "exposure"
+[[pointing]]
+channel = "EXT"
+camera = "decam"
+band = "des_r"
+ra = 53.117
+dec = -27.808
+mjd = 60905.0
+detectors = ["S25", "S29"]
+centre_on = "S29"
+"""
+
+
+@pytest.fixture(scope="module")
+def lake(tmp_path_factory):
+    folder, listed = tmp_path_factory.mktemp("decam"), detectors._listed
+
+    def smaller(*args):
+        return tuple(replace(d, nx=SIDE, ny=SIDE) for d in listed(*args))
+
+    # The last is bright, and in the middle of a CCD that is read with the first.
+    other = detectors.detector("decam", "S30", MISSION)
+    ra, dec, angle = boresight_for(detectors.detector("decam", "S29", MISSION), *PLACE, 0.0)
+    ra, dec = astrometry.centre(other, astrometry.wcs(other, ra, dec, angle))
+    rows = f"53.117,-27.808,18.0\n53.1172,-27.8082,20.0\n{ra:.7f},{dec:.7f},12.0\n"
+    (folder / "stars.csv").write_text(f"ra,dec,mag\n{rows}")
+    request = parse(requests.written(folder, TEXT, requests.FIELD.format(0.45), seed=5))
+    root = layout.lake(folder / "lake")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(detectors, "_listed", smaller)
+        for module in (build_galaxies, build_stars, compute_fluxes, plan_exposures, render_exposures):
+            make(root, module.steps(root, request))
+        yield root
+
+
+def make(root, steps, mapper=map):
+    for step in steps:
+        publish.make(root, step.plan, step.work, mapper, name="x")
+
+
+@pytest.fixture(scope="module")
+def whole(lake):
+    version = read.version(lake, "exposure_files")
+    (row,) = version.rows().to_pylist()
+    return row, version.file(row["path"])
+
+
+def test_the_ccds_are_in_the_order_of_their_numbers(lake, whole):
+    row, path = whole
+    assert (row["detectors"], row["planned"]) == (2, 2)
+    products = read.version(lake, "products")
+    files = {one["detector"]: products.file(one["path"]) for one in products.rows().to_pylist()}
+    with fits.open(path, checksum=True) as units:
+        units.verify("exception")
+        first, *ccds = units
+        assert first.data is None
+        assert (first.header["INSTRUME"], first.header["OBSTYPE"], first.header["NDETECT"]) == ("DECam", "object", 2)
+        assert not {"CCDNUM", "DETPOS", "GAINA", "CRVAL1"} & set(first.header)
+        assert [(unit.name, unit.header["CCDNUM"]) for unit in ccds] == list(NUMBERS.items())
+        for unit in ccds:
+            (own,) = images.read_images(files[unit.name])
+            np.testing.assert_array_equal(unit.data, own.data)
+            said = {key: value for key, value, _ in own.cards}
+            assert {key: {**first.header, **unit.header}[key] for key in said} == said
+            for letter in "AB":
+                assert {f"{key}{letter}" for key in ("DATASEC", "BIASSEC", "GAIN", "RDNOISE", "SATURAT")} <= set(
+                    unit.header
+                )
+        gaps = [unit.header["DETSEC"] for unit in ccds]
+        assert gaps[0] != gaps[1]
+
+
+def test_it_knows_where_it_looks_only_from_beside(lake, whole):
+    """The same error in all CCDs; the text beside it has them in the order of the file."""
+    path = whole[1]
+    heads = path.with_suffix(".head").read_text("ascii").split("END\n")[:-1]
+    exposure = read.version(lake, "exposures").rows().to_pylist()[0]
+    with fits.open(path) as units:
+        off = []
+        for text, unit in zip(heads, units[1:], strict=True):
+            true = fits.Header.fromstring(text, sep="\n")
+            assert true["CRPIX1"] == pytest.approx(unit.header["CRPIX1"])
+            assert (true["CRVAL1"], true["CRVAL2"]) == pytest.approx((exposure["ra"], exposure["dec"]), abs=1e-9)
+            seen = [SkyCoord(*WCS(h).all_pix2world([100.0], [20.0], 0), unit="deg") for h in (true, unit.header)]
+            off.append(seen[0].separation(seen[1]).arcsec[0])
+            assert unit.header["CSYER1"] == pytest.approx(3.0 / 3600.0)
+    assert 0.5 < min(off) <= max(off) < 20.0
+    # Rotated by half an arcminute, neighbours differ by a tenth of an arcsecond.
+    assert np.ptp(off) < 0.5
+
+
+def test_ccdproc_reduces_it_by_its_header(whole):
+    found = list(tools.reduced(whole[1]))
+    assert len(found) == 4
+    for text, image in found:
+        assert image.unit == "electron"
+        assert image.shape == images_shape(text)
+    levels = [np.median(image.data) for _, image in found]
+    assert min(levels) > 100.0
+    assert np.ptp(levels) < 0.05 * np.mean(levels)
+
+
+def test_amplifiers_apart_are_extensions_of_their_ccds(lake, whole, tmp_path):
+    """Asked for by the request; the pixels are the same."""
+    root = layout.lake(shutil.copytree(lake, tmp_path / "lake", symlinks=True))
+    make(root, render_exposures.steps(root, replace(parse(lake.parent / "r.toml"), readout="amplifiers")))
+    version = read.version(root, "exposure_files")
+    (row,) = version.rows().to_pylist()
+    with fits.open(version.file(row["path"]), checksum=True) as units, fits.open(whole[1]) as together:
+        assert [unit.name for unit in units[1:]] == [f"{name}.{letter}" for name in NUMBERS for letter in "AB"]
+        for number, unit in enumerate(units[1:]):
+            ccd, letter = together[1 + number // 2], "AB"[number % 2]
+            own, there = tools.window(unit.header["DATASEC"]), tools.window(ccd.header[f"DATASEC{letter}"])
+            np.testing.assert_array_equal(unit.data[own], ccd.data[there])
+            assert unit.header["GAIN"] == pytest.approx(ccd.header[f"GAIN{letter}"])
+            assert unit.header["DETSEC"] == ccd.header[f"DETSEC{letter}"]
+
+
+def images_shape(text):
+    rows, columns = tools.window(text)
+    return rows.stop - rows.start, columns.stop - columns.start
+
+
+def test_what_is_read_back_has_the_true_place(lake):
+    products = read.version(lake, "products")
+    exposure = read.version(lake, "exposures").rows().to_pylist()[0]
+    for row in products.rows().to_pylist():
+        cards = {key: value for key, value, _ in read_back.frame(products.file(row["path"])).cards}
+        assert (cards["CRVAL1"], cards["CRVAL2"]) == pytest.approx((exposure["ra"], exposure["dec"]), abs=1e-9)
+        assert products.file(head_files.beside(row["path"])).is_file()
+
+
+def test_what_ccds_see_of_each_other_is_the_same_whoever_is_rendered_with_whom(lake, tmp_path):
+    """One after another, two at a time the other way about, and alone."""
+    wanted = parse(lake.parent / "r.toml")
+    (pointing,) = wanted.pointings
+    wanted = replace(wanted, files="detector", pointings=(replace(pointing, detectors=("S29", "S30")),))
+
+    def together(function, parts):
+        with ThreadPoolExecutor(2) as pool:
+            yield from pool.map(function, [*parts][::-1])
+
+    found = []
+    for name, mapper, some in (("one", map, ()), ("two", together, ()), ("alone", map, ("S29",))):
+        root = layout.lake(shutil.copytree(lake, tmp_path / name, symlinks=True))
+        shutil.rmtree(layout.table(root, "products"))
+        make(root, plan_exposures.steps(root, wanted))
+        make(root, render_exposures.steps(root, replace(wanted, detectors=some)), mapper)
+        version = read.version(root, "products")
+        found.append({row["detector"]: version.file(row["path"]) for row in version.rows().to_pylist()})
+    one, two, alone = ({key: path.read_bytes() for key, path in files.items()} for files in found)
+    assert one == two
+    assert (len(one), alone) == (2, {"S29": one["S29"]})
+    said = [value for key, value, _ in read_back.header(found[0]["S29"]) if key.startswith("EFFECT")]
+    assert any(str(value).startswith("detector_crosstalk: on") for value in said)

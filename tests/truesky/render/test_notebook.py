@@ -1,0 +1,158 @@
+"""Notebooks that render: a field of small detectors, the shear of known galaxies, spectra; they show what they say.
+
+What they ask of the packages is looked at every day, in tests/house/test_calls.py.
+"""
+
+import re
+from pathlib import Path
+
+import nbformat
+import numpy as np
+import pytest
+from nbclient import NotebookClient
+
+from truesky.request.accuracy import PRESETS
+
+ROOT = Path(__file__).resolve().parents[3]
+NOTEBOOKS = ROOT / "notebooks"
+# The detectors of the focal plane cut to a tenth of their area, two of them.
+SMALL = """
+name = "small"
+seed = 7
+accuracy = "draft"
+[area]
+cone = { ra = 53.117, dec = -27.808, radius = 0.2 }
+[universe]
+galaxy_limit = 22.0
+star_limit = 22.0
+box_cells = 192
+lensing_nside = 64
+[mission.overrides]
+"vis.fpa.nx" = { value = 1300, unit = "pix" }
+"vis.fpa.ny" = { value = 1306, unit = "pix" }
+"vis.ghost.offset_y" = { value = 250, unit = "pix" }
+[[pointing]]
+channel = "VIS"
+camera = "vis"
+band = "euclid_vis"
+ra = 53.117
+dec = -27.808
+detectors = ["3-3", "3-4"]
+position_angle = 0.0
+mjd = 60905.0
+[products]
+truth = []
+"""
+# Two of NISP's, as small, and a dark.
+INFRARED = (
+    SMALL.replace("vis.fpa.nx", "nisp.fpa.nx").replace("vis.fpa.ny", "nisp.fpa.ny").replace("130", "60")
+    .replace('"vis.ghost.offset_y" = { value = 250', '"nisp.ghost.offset_y" = { value = 100')
+    .replace('"VIS"', '"NISP-P"').replace('"vis"', '"nisp"').replace("euclid_vis", "euclid_h")
+    .replace('["3-3", "3-4"]\nposition_angle = 0.0', '["DET22"]')
+    + """
+[[observation]]
+channels = ["NISP-P"]
+image_type = "dark"
+exposures = 1
+detectors = ["DET22"]
+"""
+)  # fmt: skip
+
+# The shipped field of spectra, its detector cut to a strip; without VIS, faint stars and some of the faint galaxies.
+SPECTRA = (NOTEBOOKS.parent / "requests" / "slitless.toml").read_text()
+STRIP = re.sub(r"# Twice.*?\n\n", "", SPECTRA, flags=re.DOTALL)
+for usual, small in (
+    ("galaxy_limit = 25.5", "galaxy_limit = 24.0"), ("star_limit = 25.0", "star_limit = 16.0"),
+    ("lensing_nside = 256", "lensing_nside = 64"),
+    ("[products]", '[mission.overrides]\n"nisp.fpa.nx" = { value = 760, unit = "pix" }\n'
+     '"nisp.fpa.ny" = { value = 160, unit = "pix" }\n[products]'),
+):  # fmt: skip
+    assert STRIP.count(usual) == 1
+    STRIP = STRIP.replace(usual, small)
+
+
+def printed(outputs):
+    """What cells print."""
+    return "".join(output.text for output in outputs if output.output_type == "stream" and output.name == "stdout")
+
+
+def run(monkeypatch, name, **environment):
+    """The outputs of a notebook's cells."""
+    environment |= {"MPLBACKEND": "module://matplotlib_inline.backend_inline", "PYTHONPATH": ROOT}
+    for key, value in environment.items():
+        monkeypatch.setenv(key, str(value))
+    notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
+    NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(NOTEBOOKS)}}).execute()
+    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    assert [output for output in outputs if output.output_type == "error"] == []
+    return outputs
+
+
+@pytest.mark.nightly
+def test_the_shear_of_known_galaxies_is_measured_as_in_galsim_s_images(tmp_path, monkeypatch):
+    """The renderer's own m and c, less GalSim's, are within what each accuracy allows."""
+    outputs = run(monkeypatch, "04_measure_shear", TRUESKY_LAKE=tmp_path / "shear")
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == 1
+    text = printed(outputs)
+    rows = [line.split() for line in text.partition("less GalSim, without noise")[2].splitlines() if line]
+    found = {name: [float(value) for value in values[::3]] for name, *values in rows}
+    assert list(found) == ["quicklook", "survey"]
+    for name, biases in found.items():
+        assert np.abs(biases).max() < PRESETS[name].shape
+    (m,) = (float(line.split()[3]) for line in text.splitlines() if line.startswith("GalSim "))
+    # Re-Gaussianisation is no better than some per cent; without the pairs it would be far off.
+    assert -0.05 < m < 0.01
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("request_text", [SMALL, INFRARED], ids=["VIS", "NISP-P"])
+def test_every_cell_runs(tmp_path, monkeypatch, request_text):
+    (tmp_path / "small.toml").write_text(request_text)
+    outputs = run(
+        monkeypatch,
+        "03_render_one_field",
+        TRUESKY_REQUEST=tmp_path / "small.toml",
+        TRUESKY_LAKE=tmp_path / "lake",
+        TRUESKY_PICTURE=tmp_path / "field.jpg",
+    )
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == 3
+    texts = [
+        " ".join(output.data["text/plain"].split()) for output in outputs if "text/plain" in output.get("data", {})
+    ]
+    assert any("'tasks': 2, 'products': 2" in text for text in texts)
+    assert 10_000 < (tmp_path / "field.jpg").stat().st_size < 500_000
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("whole", [False, True], ids=["strip", "detector"])
+def test_redshifts_and_fluxes_of_lines_are_those_of_the_catalogue(tmp_path, monkeypatch, whole):
+    """Of the shipped field those that are claimed; in a strip of it every cell runs."""
+    (tmp_path / "spectra.toml").write_text(SPECTRA if whole else STRIP)
+    outputs = run(
+        monkeypatch,
+        "05_slitless",
+        TRUESKY_REQUEST=tmp_path / "spectra.toml",
+        TRUESKY_LAKE=tmp_path / "lake",
+        TRUESKY_PICTURE=tmp_path / "spectra.jpg",
+    )
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == 3
+    assert 10_000 < (tmp_path / "spectra.jpg").stat().st_size < 150_000
+    text = printed(outputs)
+    emitters = int(re.search(r"(\d+) galaxies with H alpha", text)[1])
+    seen, claimed, right = map(
+        int, re.search(r"(\d+) galaxies in all 4 .* (\d+) claimed, (\d+) of them right", text).groups()
+    )
+    assert 0 <= right <= claimed <= seen <= emitters
+    if not whole:
+        assert emitters >= 3
+        return
+    assert claimed >= 50
+    assert right >= 0.93 * claimed
+    offset, scatter, flux, snr = (
+        float(re.search(rf"{name} ([-+.\de]+)", text)[1])
+        for name in ("median", "scatter", "measured / true", "exposures:")
+    )
+    assert abs(offset) < 2e-4
+    assert scatter < 4e-4
+    assert flux == pytest.approx(1.0, abs=0.06)
+    assert snr == pytest.approx(1.0, abs=0.2)

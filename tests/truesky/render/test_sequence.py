@@ -1,0 +1,237 @@
+"""A sequence of exposures whose detectors remember those before: by the job, in any order, whatever is asked for."""
+
+import os
+import shutil
+import signal
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lake_schema.fits import images
+from lake_schema.store import layout, publish, read
+from lake_schema.tables.exposures import ExposureRow
+from tests import requests
+from tests.faults.victims import CONTEXT
+from truesky.catalogue import build_galaxies, build_stars
+from truesky.fluxes import compute_fluxes
+from truesky.randomness.rng import stream
+from truesky.render import plan_exposures, render_exposures
+from truesky.render.effects.charge.persistence import Traps, pixels_of
+from truesky.render.exposure import persistence, scene_of
+from truesky.render.exposure.records import EarlierSky, Variant
+from truesky.render.planning.mission import mission_of
+from truesky.request.from_toml import parse
+from truesky.running import shell
+
+SIDE, COUNT = 256, 120
+# Where the telescope looked first, and then.
+FIELDS = (57.5, -27.808), (53.117, -27.808)
+SECOND = 1.0 / 86400.0
+# Channel, band, field, seconds before the last.  More than two hours before nothing counts.
+SEQUENCE = [
+    ("NISP-P", "euclid_y", 0, 9000.0), ("NISP-S", "nisp_red", 1, 900.0), ("NISP-P", "euclid_y", 0, 268.0),
+    ("NISP-P", "euclid_j", 1, 134.0), ("NISP-P", "euclid_h", 1, 0.0),
+]  # fmt: skip
+BEFORE = {1: [], 2: [], 3: [2], 4: [2, 3], 5: [2, 3, 4]}
+POINTING = """
+[[pointing]]
+channel = "{}"
+camera = "nisp"
+band = "{}"
+ra = {}
+dec = {}
+mjd = {!r}
+detectors = ["DET22"]
+centre_on = "DET22"
+"""
+TEXT = f"""
+accuracy = "draft"
+[mission]
+overrides = {{"nisp.fpa.nx" = {{value = {SIDE}, unit = "pix"}}, "nisp.fpa.ny" = {{value = {SIDE}, unit = "pix"}}}}
+[sources]
+only = "table"
+band = "euclid_h"
+stars = "stars.csv"
+[products]
+truth = ["noise_free", "sky", "ghosts", "persistence"]
+files = "exposure"
+"""
+
+
+def pointings(sequence):
+    return "".join(
+        POINTING.format(channel, band, *FIELDS[field], 60905.0 - before * SECOND)
+        for channel, band, field, before in sequence
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A request's folder: stars of AB 13 to 24 in both fields."""
+    folder, rng = tmp_path_factory.mktemp("sequence"), np.random.default_rng(3)
+    lines = ["ra,dec,mag"]
+    for ra, dec in FIELDS:
+        x, y = rng.uniform(-0.5, 0.5, (2, COUNT)) * SIDE * 0.3 / 3600.0
+        mags = rng.uniform(13.0, 24.0, COUNT)
+        lines += [f"{ra + i / np.cos(np.radians(dec))},{dec + j},{m}" for i, j, m in zip(x, y, mags, strict=True)]
+    (folder / "stars.csv").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def wanted(folder, sequence=SEQUENCE):
+    area = f"patches = [{', '.join(f'[{ra}, {dec}, 0.15]' for ra, dec in FIELDS)}]"
+    return parse(requests.written(folder, TEXT + pointings(sequence), area, seed=5))
+
+
+@pytest.fixture(scope="module")
+def planned(folder):
+    """A lake with everything but images."""
+    root, request = layout.lake(folder / "lake"), wanted(folder)
+    for module in (build_galaxies, build_stars, compute_fluxes, plan_exposures):
+        for step in module.steps(root, request):
+            publish.make(root, step.plan, step.work)
+    return root
+
+
+def backwards(function, parts):
+    return [function(part) for part in reversed(parts)]
+
+
+@pytest.fixture(scope="module")
+def whole(planned, folder):
+    """With all of them, the last first."""
+    root = layout.lake(shutil.copytree(planned, folder / "whole", symlinks=True))
+    for step in render_exposures.steps(root, wanted(folder)):
+        publish.make(root, step.plan, step.work, backwards)
+    return root
+
+
+@pytest.fixture
+def lake(planned, tmp_path):
+    return layout.lake(shutil.copytree(planned, tmp_path / "lake", symlinks=True))
+
+
+def _killed(root, request):
+    """Render in a process that is killed while it writes an image of the last exposure but one."""
+    step = render_exposures.steps(root, request)[0]
+
+    def work(lake, facts):
+        output = step.work(lake, facts)
+
+        def torn(target):
+            target.write_bytes(b"SIMPLE")
+            os.kill(os.getpid(), signal.SIGKILL)
+
+        return replace(output, files=dict.fromkeys(output.files, torn)) if facts["exposure_id"] == 4 else output
+
+    publish.make(root, step.plan, work)
+
+
+@pytest.mark.spark
+@pytest.mark.nightly
+def test_the_same_bytes_in_any_order_and_after_a_kill(spark, lake, whole, folder):
+    request = wanted(folder)
+    child = CONTEXT.Process(target=_killed, args=(lake, request))
+    child.start()
+    child.join()
+    assert child.exitcode == -signal.SIGKILL
+    left = len(list(layout.table(lake, "products").glob(".receipts-*/[!.]*.json")))
+    assert 0 < left < len(BEFORE)
+    shell.run(render_exposures.JOB, lake, request)
+    for name in ("products", "rendered_truth", "rendered_spectra", "exposure_files"):
+        assert read.version(lake, name).manifest == read.version(whole, name).manifest
+        assert read.verify(read.version(lake, name), deep=True) == []
+
+
+def parts(root, request):
+    step = render_exposures.steps(root, request)[0]
+    return step, {part.facts["exposure_id"]: part for part in step.plan.parts}
+
+
+def test_the_last_alone_is_what_it_is_after_the_others(lake, whole, folder):
+    step, found = parts(lake, wanted(folder))
+    publish.make(lake, replace(step.plan, parts=(found[5],)), step.work)
+    alone, among = (read.version(root, "products") for root in (lake, whole))
+    rows = alone.rows().to_pylist()
+    assert {row["content"] for row in rows} == {"science", "noise_free", "sky", "ghosts", "persistence"}
+    assert all(alone.sha256(row["path"]) == among.sha256(row["path"]) for row in rows)
+
+
+def keys(root, request):
+    return {number: part.facts["product"] for number, part in parts(root, request)[1].items()}
+
+
+def changed(lake, folder, sequence):
+    """Exposures whose products another sequence makes others."""
+    before, request = keys(lake, wanted(folder)), wanted(folder, sequence)
+    for step in plan_exposures.steps(lake, request):
+        publish.make(lake, step.plan, step.work)
+    after = keys(lake, request)
+    return {number for number in before if before[number] != after[number]}
+
+
+@pytest.mark.parametrize("number", range(1, len(SEQUENCE) + 1))
+def test_products_change_with_exposures_before_them(lake, folder, number):
+    """And with no others."""
+    channel, band, field, before = SEQUENCE[number - 1]
+    other = [*SEQUENCE[: number - 1], (channel, band, field, before + 20.0), *SEQUENCE[number:]]
+    later = {one for one, some in BEFORE.items() if number in some}
+    assert changed(lake, folder, other) == later | {number}
+
+
+def test_products_change_with_the_catalogue_about_exposures_before_them(lake, folder, monkeypatch):
+    """Where the first and the third looked; then where the others did."""
+    request = wanted(folder)
+    before = keys(lake, request)
+    stars = read.version(lake, "stars").manifest["parts"]
+    tasks = {task["exposure_id"]: set(task["cells"]) for task in read.version(lake, "tasks").rows().to_pylist()}
+    there = {part["name"] for part in stars if set(part["facts"]["generation_cells"]) & tasks[3]}
+    here = {part["name"] for part in stars if set(part["facts"]["generation_cells"]) & tasks[5]}
+    assert there
+    assert not there & here
+    sums = read.Version.part_sha256
+
+    def other(self, part):
+        return "another" if self.table == "stars" and part in there else sums(self, part)
+
+    monkeypatch.setattr(read.Version, "part_sha256", other)
+    after = keys(lake, request)
+    assert {number for number in before if before[number] != after[number]} == {1, 3, 4, 5}
+    monkeypatch.setattr(
+        read.Version,
+        "part_sha256",
+        lambda self, part: "another" if self.table == "stars" and part in here else sums(self, part),
+    )
+    after = keys(lake, request)
+    assert {number for number in before if before[number] != after[number]} == {2, 3, 4, 5}
+
+
+def test_what_is_left_is_what_whole_images_leave(whole, folder):
+    """Of everything that each earlier image expects, spectra among them: to 1.5 e- in any pixel."""
+    inputs, mission = render_exposures.inputs_of(whole, wanted(folder)), mission_of(wanted(folder).mission)
+    exposures = {row.exposure_id: row for row in map(ExposureRow.of, inputs["exposures"].rows().to_pylist())}
+    tasks = {task["exposure_id"]: task for task in inputs["tasks"].rows().to_pylist()}
+    version = read.version(whole, "products")
+    files = {(row["exposure_id"], row["content"]): version.file(row["path"]) for row in version.rows().to_pylist()}
+    now = exposures[5]
+    earlier = render_exposures._earlier(whole, inputs, now, tasks[5], mission, 5)
+    assert [before.exposure.exposure_id for before in earlier] == BEFORE[5]
+    assert not any(isinstance(before, EarlierSky) for before in earlier)
+    aim = replace(earlier[-1].aim, exposure=now)
+    variant = Variant(mission, wanted(folder).accuracy, {})
+    found = persistence.remembered(aim, earlier, variant, 5)
+    scene = scene_of.of_aim(aim, variant)
+    traps, expected = Traps.of(scene), np.zeros_like(found)
+    own = pixels_of(scene, stream(5, "nisp", aim.detector.name, "persistence_pixels"))
+    for number in BEFORE[5]:
+        row = exposures[number]
+        maps = [files.get((number, content)) for content in ("noise_free", "sky", "ghosts")]
+        light = sum(images.read_images(file)[0].data.astype(float) for file in maps if file is not None)
+        times = (now.mjd - row.mjd) / SECOND, now.exposure_time_s, row.exposure_time_s
+        expected += traps.left(light, *times, own)
+    assert expected.max() > 100.0
+    assert np.abs(found - expected).max() < 1.5
+    # Its own share of each pixel is in the image.
+    shown = images.read_images(files[5, "persistence"])[0].data
+    assert shown.mean() == pytest.approx(found.mean(), rel=0.05)

@@ -1,0 +1,92 @@
+"""The knob: each of its numbers decides, what it promises was measured, what cannot be had is refused."""
+
+import tomllib
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+
+import pytest
+
+from lake_schema.errors import BadInput
+from truesky.request import accuracy
+from truesky.request.accuracy import DRAFT, PRESETS, QUICKLOOK, SURVEY, Accuracy
+from truesky.request.from_toml import from_table
+
+NUMBERS = [field.name for field in fields(Accuracy)]
+ANYTHING = Accuracy(1.0, 1.0, 1.0, 1.0)
+GOOD = tomllib.loads((Path(__file__).parents[3] / "requests" / "demo.toml").read_text())
+
+
+def error(row, name):
+    return max(row[name], row[f"{name}_held"])
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_each_number_alone_decides(name):
+    """Whatever the others allow, a finer number takes another row, of more time."""
+    asked = sorted((error(row, name) for row in accuracy.rows()), reverse=True)
+    seconds = [accuracy.row_for(replace(ANYTHING, **{name: value}))["seconds"] for value in asked]
+    assert seconds == sorted(seconds)
+    assert len(set(seconds)) >= 4, seconds
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_a_number_of_its_own_takes_what_it_needs(name):
+    """Asked for no more than a row has, that row or a cheaper one; a little less, another."""
+    for row in accuracy.rows():
+        own = accuracy.row_for(replace(ANYTHING, **{name: error(row, name)}))
+        assert own["seconds"] <= row["seconds"]
+        assert error(own, name) <= error(row, name)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_presets_are_held_by_both_samples(preset):
+    """By sources that the settings were chosen on, and by those that they were not."""
+    row, wanted = accuracy.row_for(PRESETS[preset]), asdict(PRESETS[preset])
+    for name, value in wanted.items():
+        assert row[name] <= value
+        assert row[f"{name}_held"] <= value
+    told = asdict(accuracy.reached(PRESETS[preset]))
+    assert told == {name: row[f"{name}_held"] for name in wanted}
+
+
+def test_no_cheaper_row_would_do():
+    for wanted in PRESETS.values():
+        mine = accuracy.row_for(wanted)
+        for row in accuracy.rows():
+            within = all(error(row, name) <= value for name, value in asdict(wanted).items())
+            assert not within or row["seconds"] >= mine["seconds"]
+
+
+def test_a_quicklook_takes_half_of_a_draft_at_most():
+    quick, draft = (accuracy.row_for(wanted)["seconds"] for wanted in (QUICKLOOK, DRAFT))
+    assert 0.0 < quick <= 0.5 * draft
+    assert accuracy.row_for(ANYTHING)["seconds"] <= quick
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_beyond_reach_is_refused_with_the_best_there_is(name):
+    with pytest.raises(BadInput, match=rf"^accuracy\.{name} = 1e-12 is beyond reach, the best is \S+$") as refusal:
+        accuracy.row_for(replace(SURVEY, **{name: 1e-12}))
+    best = float(str(refusal.value).rpartition(" ")[2])
+    row = accuracy.row_for(replace(ANYTHING, **{name: best}))
+    assert error(row, name) <= best <= 1.2 * error(accuracy.rows()[-1], name)
+
+
+def test_every_number_that_is_beyond_reach_is_named():
+    with pytest.raises(BadInput) as refusal:
+        accuracy.row_for(Accuracy(1e-12, 1e-12, 1e-12, 1e-12))
+    assert all(f"accuracy.{name} = 1e-12" in str(refusal.value) for name in NUMBERS)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("where", ["accuracy", "explore"])
+def test_a_request_is_refused_before_anything_is_made(where):
+    own = asdict(SURVEY) | {"shape": 1e-9}
+    wanted = {**GOOD, "accuracy": own} if where == "accuracy" else {**GOOD, "explore": {"accuracy": [own]}}
+    with pytest.raises(BadInput, match=r"accuracy\.shape = 1e-09 is beyond reach, the best is"):
+        from_table(wanted)
+
+
+def test_the_best_is_rounded_so_that_it_can_be_asked_for():
+    for value in (1.01e-5, 9.96e-5, 2.0e-3, 0.0949, 1.0):
+        assert value <= float(accuracy._up(value)) <= 1.11 * value

@@ -1,0 +1,130 @@
+"""What nothing renders is planned and named, and skipped; a request of nothing else is refused."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import resolve
+from lake_schema.tables.exposures import EUCLID_BANDS, RENDERED
+from tests import requests
+from truesky.catalogue import build_galaxies, build_stars
+from truesky.commands import check
+from truesky.render import plan_exposures
+from truesky.render.channels import registry
+from truesky.render.planning.planned_exposures import bands_of
+from truesky.request import checks, observations
+from truesky.request.from_toml import parse
+from truesky.running import shell
+
+REQUESTS = Path(__file__).resolve().parents[3] / "requests"
+# Euclid's three channels, and calibrations of NISP.
+SURVEY = REQUESTS / "sc8_pilot.toml"
+
+
+def test_what_is_said_to_be_rendered_has_effects():
+    assert {name: set(kinds) for name, kinds in RENDERED.items()} == {
+        name: set(channel.effects) for name, channel in registry.CHANNELS.items()
+    }
+
+
+# The main run's half a million detectors take a minute.
+SHIPPED = [
+    pytest.param(path, marks=[pytest.mark.nightly] if path.stem == "sc8_main" else [], id=path.stem)
+    for path in sorted(REQUESTS.glob("*.toml"))
+]
+
+
+@pytest.mark.parametrize("channel", observations.CHANNELS)
+def test_what_is_rendered_can_be_asked_for(channel):
+    asked = {*observations._SKY_TYPES, *observations._CALIBRATIONS[channel]}
+    assert set(RENDERED.get(channel, ())) <= asked <= set(observations.IMAGE_TYPES)
+
+
+def test_requests_know_the_bands_that_the_planner_knows():
+    cameras = {"VIS": "vis", "NISP-P": "nisp", "NISP-S": "nisp"}
+    assert {name: bands_of(name, camera, resolve()) for name, camera in cameras.items()} == EUCLID_BANDS
+
+
+@pytest.mark.parametrize("path", SHIPPED)
+def test_the_check_takes_every_request(path, capsys):
+    assert check.main(["check", str(path)]) == 0
+    said = capsys.readouterr()
+    assert said.err == ""
+    (good,) = said.out.splitlines()
+    assert good.startswith(f"{path.stem}: good: ")
+
+
+def only(channels, kind):
+    """A request for one block."""
+    request = parse(SURVEY)
+    return replace(request, observations=(replace(request.observations[0], channels=channels, image_type=kind),))
+
+
+@pytest.mark.parametrize(
+    ("channels", "kind", "first"),
+    [(("EXT",), "self_calibration", "EXT"), (("VIS",), "standard_star", "VIS")],
+)
+def test_a_request_of_which_nothing_is_rendered_is_refused_by_the_check_and_the_first_job(
+    channels, kind, first, tmp_path
+):
+    wanted = f"^observation\\[0\\].channels: no simulator renders {first} {kind} yet: it can be planned alone$"
+    for refuse in (
+        checks.check_rendered,
+        plan_exposures.check,
+        lambda request: plan_exposures.dry_run(tmp_path, request),
+        lambda request: build_galaxies.JOB.steps(tmp_path, request),
+        lambda request: build_stars.JOB.steps(tmp_path, request),
+    ):
+        with pytest.raises(BadInput, match=wanted):
+            refuse(only(channels, kind))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("channels", "kind", "said"),
+    [(("EXT",), "science", ""), (("VIS", "EXT"), "self_calibration", "EXT"), (("VIS",), "bias", ""), ((), "", "")],
+)
+def test_what_is_rendered_in_part_is_refused_and_the_rest_named(channels, kind, said):
+    request = only(channels, kind)
+    if said:
+        with pytest.raises(BadInput, match=f"no simulator renders {said} {kind}"):
+            checks.check_rendered(request)
+    else:
+        checks.check_rendered(request)
+    assert checks.skipped(request).startswith(said)
+    assert bool(checks.skipped(request)) == bool(said)
+
+
+def stars_by_decam(folder):
+    """A block for what can be planned alone, by a table of pointings."""
+    (folder / "p.csv").write_text("ra,dec,mjd,band,image_type\n53.1,-27.8,60905.0,des_r,standard_star\n")
+    return '[[observation]]\nchannels = ["EXT"]\nsurvey = "des"\npointings = "p.csv"\n'
+
+
+def test_the_command_refuses_in_one_line_and_plans_on_demand(tmp_path, capsys):
+    # Beside what can be rendered, too.
+    path = requests.written(tmp_path, '[[observation]]\nchannels = ["VIS"]\nfields = 1\n' + stars_by_decam(tmp_path))
+    assert check.main(["check", str(path)]) == 2
+    said = capsys.readouterr().err
+    text = r"request: .*observation\[1\]\.pointings: no simulator renders EXT standard_star yet: .*\n"
+    assert re.fullmatch(text, said)
+    assert check.main(["check", str(path), "--plan"]) == 0
+    assert "EXT standard_star: planned and forecast, skipped by rendering" in capsys.readouterr().out
+
+
+def test_every_job_says_what_is_only_planned(tmp_path, capsys):
+    path = requests.written(tmp_path, '[[observation]]\nchannels = ["VIS"]\n' + stars_by_decam(tmp_path))
+    job = shell.Job("sleep", "", lambda lake, request: [])
+    assert shell.main(job, ["--lake", str(tmp_path / "lake"), "--request", str(path)]) == 0
+    assert capsys.readouterr().err == (
+        "sleep: EXT standard_star: planned and forecast, skipped by rendering (no simulator yet)\n"
+    )
+
+
+@pytest.mark.parametrize("words", [[], ["check"], ["check", "a", "--plans"], ["check", "a", "b"], ["a", "b", "--plan"]])
+def test_other_words_show_the_usage(words, capsys):
+    assert check.main(words) == 2
+    assert capsys.readouterr().err == "usage: truesky check REQUEST [--plan]\n"

@@ -1,0 +1,172 @@
+"""Mistakes that users make: the check and the forecast refuse each in one line, before anything is written."""
+
+import pytest
+
+from truesky.commands import check
+from truesky.render import plan_exposures
+from truesky.running import shell
+
+HEAD = 'name = "x"\nseed = 1\n'
+AREA = "[area]\ncone = { ra = 53.117, dec = -27.808, radius = 0.2 }\n"
+POINT = """[[pointing]]
+channel = "VIS"
+band = "euclid_vis"
+ra = 53.117
+dec = -27.808
+centre_on = "3-4"
+detectors = ["3-4"]
+mjd = 60905.0
+"""
+GOOD = HEAD + AREA + POINT
+WIDE = HEAD + "[area]\ncone = { ra = 53.117, dec = -27.808, radius = 4.0 }\n"
+OWN = WIDE + '[[observation]]\nchannels = ["VIS"]\nra = 53.117\ndec = -27.808\n'
+GROUND = WIDE + '[[observation]]\nchannels = ["EXT"]\nsurvey = "des"\nra = 53.117\ndec = -27.808\n'
+TABLE = WIDE + '[[observation]]\nchannels = ["VIS"]\npointings = "p.csv"\n'
+CENTRE = POINT.replace("53.117", "266.4").replace("-27.808", "-28.9").replace("60905", "60760")
+
+BLOCK = WIDE + '[[observation]]\nchannels = ["VIS"]\n'
+EXT = WIDE + '[[observation]]\nchannels = ["EXT"]\nsurvey = "des"\n'
+BIAS = BLOCK + 'image_type = "bias"\nexposures = 2\n'
+
+
+def pointed(old, new):
+    return GOOD.replace(old, new)
+
+
+MISTAKES = {
+    "a detector misspelt": (pointed('detectors = ["3-4"]', 'detectors = ["3_4"]'), "no detector '3_4'"),
+    "a detector of another camera": (
+        pointed('detectors = ["3-4"]', 'detectors = ["R22_S11"]'), "no detector 'R22_S11'",
+    ),
+    "centred on no detector": (pointed('centre_on = "3-4"', 'centre_on = "7-7"'), "pointing[0].centre_on"),
+    "a band misspelt": (pointed("euclid_vis", "euclid_viz"), "no band 'euclid_viz'"),
+    "a band of another camera": (pointed("euclid_vis", "lsst_r"), "pointing[0].band"),
+    "a camera misspelt": (GOOD + 'camera = "viz"\n', "pointing[0].camera"),
+    "a pointing in hours": (pointed("ra = 53.117\ndec", 'ra = "03:32:28"\ndec'), "pointing[0].ra wants a number"),
+    "a Julian date": (pointed("60905.0", "2460905.5"), "pointing[0].mjd = 2460905.5 is outside"),
+    "no date": (pointed("mjd = 60905.0\n", ""), "pointing[0].mjd is missing"),
+    "towards the Sun": (pointed("60905.0", "60950.0"), "next allowed: MJD 61042.8 (2026-01-02) to"),
+    "an area too small": (pointed("0.2 }", "0.01 }"), "this would do: [area] cone = { ra = 53.117, dec = -27.808,"),
+    "an area elsewhere": (
+        pointed("cone = { ra = 53.117", "cone = { ra = 10.0"), "1 of 1 places of detectors see sky outside",
+    ),
+    "in the Galactic plane": (
+        HEAD + AREA.replace("53.117", "266.4").replace("-27.808", "-28.9") + CENTRE, "stars.plane_limit",
+    ),
+    "a flux's band misspelt": (GOOD + '[fluxes]\nbands = ["euclid_viz"]\n', "fluxes.bands: 'euclid_viz'"),
+    "no file of a filter": (
+        GOOD + '[fluxes.passbands.mine]\nfile = "none.txt"\nmedium = "air"\nformat = "passband_ascii"\n', "none.txt",
+    ),
+    "no file of galaxies' spectra": (
+        GOOD + '[fluxes.templates]\nformat = "cosmos"\nfiles = ["none.sed"]\n', "none.sed",
+    ),
+    "no file of an extinction law": (
+        GOOD + '[fluxes.extinction.3]\nformat = "extinction"\nfile = "none.ext"\n', "none.ext",
+    ),
+    "no file of a PSF": (GOOD + '[psf]\neuclid_vis = "none.fits"\n', "none.fits"),
+    "a PSF in a band that is not observed": (GOOD + '[psf]\nlsst_r = "none.fits"\n', "psf.lsst_r: no exposure"),
+    "no file of moving bodies": (GOOD + '[solar_system]\nbodies = "none.csv"\n', "none.csv"),
+    "no file of stars": (
+        GOOD + '[stars.catalogue]\nfile = "none.csv"\ncolumns = { ra = "a", dec = "b", mag_h = "h", teff = "t" }\n',
+        "none.csv",
+    ),
+    "no file of Tycho-2": (GOOD + '[stars]\ntycho2 = ["none.dat"]\n', "none.dat"),
+    "no catalogue of galaxies": (
+        GOOD + '[ingest.galaxies]\nformat = "flagship2"\nfiles = ["none.parquet"]\n', "none.parquet",
+    ),
+    "a format of no name": (GOOD + '[ingest.galaxies]\nformat = "flagship9"\nfiles = ["none.parquet"]\n', "flagship9"),
+    "no file of halos": (GOOD + '[ingest.halos]\nfiles = ["none.parquet"]\n', "ingest.halos"),
+    "no map of dust": (GOOD + '[ingest.dust]\nfile = "none.fits"\ncolumn = "EBV"\n', "none.fits"),
+    "a limit in no band": (GOOD + '[universe]\ngalaxy_band = "I"\n', "universe.galaxy_band = 'I'"),
+    "a limit too faint": (GOOD + "[universe]\ngalaxy_limit = 40\n", "universe.galaxy_limit = 40"),
+    "a parameter misspelt": (GOOD + '[mission.overrides]\n"vis.gian" = { value = 3.0, unit = "" }\n', "vis.gian"),
+    "a value out of range": (
+        GOOD + '[explore]\n"vis.read_noise" = { values = [-1.0], unit = "electron" }\n',
+        "explore.vis.read_noise",
+    ),
+    "an effect misspelt": (GOOD + '[effects]\noff = ["cosmics"]\n', "effects.off"),
+    "a box the wrong way round": (
+        HEAD + "[area]\nbox = { ra = [54, 52], dec = [-29, -27] }\n" + POINT, "the second must lie to the east",
+    ),
+    "a survey's band in another survey": (
+        GROUND + 'bands = ["lsst_r"]\n', "observation[0].bands: survey des has no band",
+    ),
+    "a filter that VIS has not": (OWN + 'bands = ["euclid_j"]\n', "observation[0].bands: VIS has no band 'euclid_j'"),
+    "a block's detector misspelt": (OWN + 'detectors = ["9-9"]\n', "no detector '9-9'"),
+    "half a place": (OWN.replace("dec = -27.808\n", ""), "observation[0].dec is missing"),
+    "a place and an area": (OWN + "area = { tile = 1 }\n", "observation[0]: ra and area exclude each other"),
+    "a place and fields": (OWN + "fields = 3\n", "observation[0]: ra and fields exclude each other"),
+    "a place and a table": (OWN + 'pointings = "p.csv"\n', "observation[0]: ra and pointings exclude each other"),
+    "an angle of the survey's fields": (
+        WIDE + '[[observation]]\nchannels = ["VIS"]\nposition_angle = 3.0\n', "observation[0].position_angle wants ra",
+    ),
+    "a pattern of no name": (OWN + 'dither = "X"\n', "observation[0].dither = 'X'"),
+    "Euclid's pattern on the ground": (
+        GROUND + 'dither = "S"\n', "observation[0].dither = 'S' is a pattern of Euclid's",
+    ),
+    "an offset of three numbers": (OWN + "dither = [[0, 0, 0]]\n", "observation[0].dither wants"),
+    "a field towards the Sun": (OWN + "mjd = 60950.0\n", "observation[0]: mjd: 126."),
+    "no survey": (GROUND.replace('survey = "des"\n', ""), "observation[0].survey"),
+    "Euclid and the ground together": (OWN.replace('"VIS"', '"VIS", "EXT"'), "EXT stands alone"),
+    "no number of frames": (OWN + 'image_type = "bias"\n', "wants exposures"),
+    "a calibration of another channel": (OWN + 'image_type = "standard_star"\n', "observation[0].image_type"),
+    "fields that see more than the area": (
+        HEAD + AREA + '[[observation]]\nchannels = ["VIS"]\nfields = 1\n', "this would do: [area] cone",
+    ),
+    "dithers of a ground survey": (EXT + "dither = [[0, 0], [9, 9]]\n", "[0].dither is not for a ground survey's"),
+    "fields of a ground survey": (EXT + "fields = 2\n", "observation[0].fields is not for a ground survey's pattern"),
+    "visits from the ground": (GROUND + "visits = 3\n", "observation[0].visits is not for a ground camera's field"),
+    "visits of a bias": (BIAS + "visits = 5\n", "observation[0].visits is not for bias, charge_injection and "),
+    "dithers of a bias": (BIAS + 'dither = "J"\n', "observation[0].dither is not for bias, charge_injection and "),
+    "a long bias": (BIAS + "exposure_time_s = 9\n", "observation[0].exposure_time_s is not for bias, charge_"),
+    "frames of a survey's fields": (BLOCK + "exposures = 3\n", "[0].exposures is not for fields of a Euclid survey"),
+    "a longer exposure of a survey": (BLOCK + "exposure_time_s = 9\n", "[0].exposure_time_s is not for fields of a"),
+    "a survey of a place": (OWN + 'survey = "deep"\n', "observation[0].survey is not for a Euclid field at ra, dec"),
+    "the blue grism of VIS": (OWN + "blue = true\n", "observation[0].blue is not for VIS: used by NISP-S"),
+    "no table of pointings": (TABLE.replace("p.csv", "q.csv"), "observation[0].pointings"),
+}  # fmt: skip
+TABLES = {
+    "no declination": ("ra,mjd\n53.1,60905\n", "column dec is missing"),
+    "a column of no name": ("ra,dec,mjd,angle\n53.1,-27.8,60905,0\n", "column angle is not known"),
+    "another channel's line": ("ra,dec,channel\n53.1,-27.8,EXT\n", "line 2: channel = 'EXT' is none of"),
+    "another camera's band": ("ra,dec,band\n53.1,-27.8,lsst_r\n", "line 2: camera vis has no band 'lsst_r'"),
+    "a line towards the Sun": ("ra,dec,mjd\n53.1,-27.8,60950\n", "pointings: 126."),
+    "a line beyond the area": ("ra,dec,mjd\n63.1,-27.8,60905\n", "this would do: [area] cone"),
+    "a line's detector": ("ra,dec,detectors\n53.1,-27.8,9-9\n", "no detector '9-9'"),
+}
+CASES = {name: (text, "", words) for name, (text, words) in MISTAKES.items()}
+CASES |= {name: (TABLE, rows, words) for name, (rows, words) in TABLES.items()}
+UNUSED = {
+    "visits": 2, "dither": '"J"', "exposures": 2, "bands": '["euclid_vis"]', "short": "false", "flat": "false",
+    "blue": "true",
+}  # fmt: skip
+CASES |= {
+    f"{key} of a table": (
+        f"{TABLE}{key} = {value}\n", "ra,dec\n53.1,-27.8\n", f"[0].{key} is not for a table of pointings: used by "
+    )
+    for key, value in UNUSED.items()
+}  # fmt: skip
+
+
+def test_what_the_mistakes_are_made_in_is_good(tmp_path, capsys):
+    (tmp_path / "p.csv").write_text("ra,dec\n53.1,-27.8\n")
+    for number, text in enumerate((GOOD, OWN, GROUND, TABLE)):
+        (tmp_path / f"{number}.toml").write_text(text)
+        assert check.main(["check", str(tmp_path / f"{number}.toml")]) == 0, capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("text", "rows", "words"), CASES.values(), ids=CASES)
+def test_a_mistake_is_refused_in_one_line_and_nothing_is_written(tmp_path, capsys, text, rows, words):
+    path, lake = tmp_path / "x.toml", tmp_path / "lake"
+    path.write_text(text)
+    (tmp_path / "p.csv").write_text(rows)
+    before = sorted(tmp_path.iterdir())
+    for call in (
+        lambda: check.main(["check", str(path)]),
+        lambda: shell.main(plan_exposures.JOB, ["--lake", str(lake), "--request", str(path), "--dry-run"]),
+    ):
+        assert call() == 2
+        said = capsys.readouterr()
+        assert words in said.err
+        assert (said.out, said.err.count("\n")) == ("", 1)
+    assert sorted(tmp_path.iterdir()) == before

@@ -1,0 +1,186 @@
+"""Catalogues of one universe are used together, those of two are not."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from lake_schema.errors import BadInput
+from lake_schema.store import layout, publish, read
+from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.provenance import file_sha256
+from lake_schema.tables.galaxies import GALAXIES
+from lake_schema.tables.stars import STARS
+from tests import requests
+from tests.universe import rows_of
+from truesky.catalogue import build_galaxies, build_stars
+from truesky.request import universe
+from truesky.request.files import Catalogue, DustMap, Ingest
+from truesky.request.from_toml import from_table, parse
+from truesky.running import shell
+
+TABLES = {"galaxies": GALAXIES, "stars": STARS}
+# What a build job adds to the request's own.
+ADDED = {"code", "lensing_l_max"}
+
+
+@cache
+def keys():
+    """Of each catalogue, the keys of the facts that its job writes down."""
+    root, request = Path("/no/lake"), wanted()
+    with pytest.MonkeyPatch.context() as patch:
+        # The box would be made here; what is in the plan does not depend on it.
+        patch.setattr(build_galaxies, "_universe", lambda *args: None)
+        steps = [*build_galaxies.steps(root, request), *build_stars.steps(root, request)]
+    return {step.plan.table.name: step.plan.facts.keys() - ADDED for step in steps if step.plan.table.name in TABLES}
+
+
+def wanted(name="a", seed=11, **depth):
+    area = {"cone": {"ra": 53.0, "dec": -27.0, "radius": 0.1}}
+    return from_table({"name": name, "seed": seed, "area": area, "universe": depth})
+
+
+def catalogue(lake, table, request, name=None, without=(), **facts):
+    """A catalogue as a build job would publish it for a request; without : keys that an older one had not."""
+    own = {key: value for key, value in universe.wanted(request).items() if key in keys()[table] - {*without}}
+    plan = Plan(TABLES[table], {**own, **facts}, (Part(layout.cell_file(5, 1607), {}),))
+    publish.make(lake, plan, lambda root, facts: Output(rows_of(TABLES[table], 3)), name=name)
+    return read.version(lake, table, plan.key)
+
+
+def test_what_shapes_a_catalogue_is_in_the_universe():
+    """A key that a build job writes down and this does not know would never be compared."""
+    known = universe.wanted(wanted())
+    assert set().union(*keys().values()) <= known.keys()
+    assert not known.keys() & {"rows_a_file", "tycho2", "catalogue", "columns"}
+
+
+@pytest.mark.parametrize(
+    ("table", "other", "words"),
+    [
+        ("galaxies", wanted(seed=12), "table galaxies has seed 11, the request 12: run build_galaxies first"),
+        ("galaxies", wanted(galaxy_limit=24.0), "table galaxies has galaxy_limit 26.0, the request 24.0"),
+        ("stars", wanted(seed=12), "table stars has seed 11, the request 12: run build_stars first, then compute_fl"),
+        ("stars", wanted(star_limit=20.0), "table stars has star_limit 26.0, the request 20.0"),
+        (
+            "stars",
+            replace(wanted(), stars=replace(wanted().stars, density="besancon")),
+            "table stars has density juric, the request besancon",
+        ),
+    ],
+)
+def test_another_universe_is_refused_by_what_differs(lake, table, other, words):
+    version = catalogue(lake, table, wanted())
+    universe.refuse_other([version], wanted())
+    with pytest.raises(BadInput, match=words):
+        universe.refuse_other([version], other)
+
+
+@pytest.mark.parametrize("depth", [{"lensing": "none"}, {"rotation": 90.0}, {"alignment": 2.0}])
+def test_a_catalogue_of_before_there_was_the_key(lake, depth):
+    version = catalogue(lake, "galaxies", wanted(), without=depth)
+    assert not depth.keys() & version.manifest["facts"].keys()
+    with pytest.raises(BadInput, match=f"table galaxies has {next(iter(depth))} (None|0.0), the request"):
+        universe.refuse_other([version], wanted(**depth))
+
+
+def test_what_shapes_only_the_other_catalogue_is_no_difference(lake):
+    universe.refuse_other([catalogue(lake, "galaxies", wanted())], wanted(star_limit=20.0))
+
+
+def test_files_are_compared_by_what_they_hold(lake, tmp_path):
+    file, same, other = (tmp_path / f"{name}.csv" for name in ("file", "same", "other"))
+    for path, text in ((file, "1"), (same, "1"), (other, "2")):
+        path.write_text(text)
+
+    def request(*paths):
+        return replace(wanted(), ingest=Ingest(galaxies=Catalogue(paths, "euclid")))
+
+    version = catalogue(lake, "galaxies", wanted(), ingest={"sha256": [file_sha256(file)], "format": "euclid"})
+    for path in (file, same):
+        universe.refuse_other([version], request(path))
+    with pytest.raises(BadInput, match="table galaxies has other files of ingest than the request"):
+        universe.refuse_other([version], request(other))
+    with pytest.raises(BadInput, match="table galaxies has files of ingest, the request none"):
+        universe.refuse_other([version], wanted())
+    # One more, or one fewer, is another catalogue.
+    with pytest.raises(BadInput, match="table galaxies has other files of ingest than the request"):
+        universe.refuse_other([version], request(file, other))
+    two = catalogue(lake, "galaxies", wanted(), ingest={"sha256": [file_sha256(f) for f in (file, other)]})
+    with pytest.raises(BadInput, match="table galaxies has other files of ingest than the request"):
+        universe.refuse_other([two], request(file))
+    file.unlink()
+    universe.refuse_other([version], request(file))
+
+
+def test_files_are_compared_by_how_they_are_read(lake, tmp_path):
+    (file := tmp_path / "file.csv").write_text("1")
+    sums = {"sha256": [file_sha256(file)]}
+
+    def request(columns, form="euclid", **kind):
+        given = Catalogue((file,), form, (("z_true", columns),))
+        return replace(wanted(), ingest=Ingest(**{kind.get("kind", "galaxies"): given}))
+
+    about = {**sums, "format": "euclid", "columns": {"z_true": '"z"'}}
+    version = catalogue(lake, "galaxies", wanted(), ingest=about)
+    universe.refuse_other([version], request('"z"'))
+    with pytest.raises(BadInput, match="table galaxies has format of ingest euclid, the request flagship2: run"):
+        universe.refuse_other([version], request('"z"', "flagship2"))
+    with pytest.raises(BadInput, match=r"table galaxies has columns of ingest .*, the request .*zz"):
+        universe.refuse_other([version], request('"zz"'))
+    for kind in ("halos", "training"):
+        version = catalogue(lake, "galaxies", wanted(), **{kind: {**sums, "columns": {"z_true": '"z"'}}})
+        universe.refuse_other([version], request('"z"', "", kind=kind))
+        with pytest.raises(BadInput, match=f"table galaxies has columns of {kind} "):
+            universe.refuse_other([version], request('"zz"', "", kind=kind))
+
+
+@pytest.mark.parametrize("listed", [True, False])
+def test_files_in_pairs_and_others_in_their_folder(lake, tmp_path, listed):
+    names = ("galaxy_1.parquet", "galaxy_flux_1.parquet", "pointsource_1.parquet")
+    for name in names:
+        (tmp_path / name).write_text(name)
+    sums = [file_sha256(tmp_path / name) for name in names[:2]]
+    version = catalogue(lake, "galaxies", wanted(), ingest={"sha256": sums, "format": "skycatalogs", "columns": {}})
+    given = Catalogue((tmp_path / names[0] if listed else tmp_path,), "skycatalogs")
+    request = replace(wanted(), ingest=Ingest(galaxies=given))
+    universe.refuse_other([version], request)
+    (tmp_path / names[1]).write_text("other")
+    with pytest.raises(BadInput, match="other files of ingest"):
+        universe.refuse_other([version], request)
+
+
+def test_dust_is_of_both_catalogues(lake, tmp_path):
+    (tmp_path / "dust.fits").write_text("x")
+    dust = Ingest(dust=DustMap(tmp_path / "dust.fits", "EBV", "ebv", "", ""))
+    for table in TABLES:
+        with pytest.raises(BadInput, match=f"table {table} has no files of dust, the request some"):
+            universe.refuse_other([catalogue(lake, table, wanted())], replace(wanted(), ingest=dust))
+
+
+def test_a_lake_holds_one_universe(lake):
+    for table in TABLES:
+        catalogue(lake, table, wanted("a"), name="a")
+    universe.refuse_others(lake, wanted("b"))
+    with pytest.raises(
+        BadInput, match=r"holds the universe of request a: its galaxies have seed 11, the request 12: use"
+    ):
+        universe.refuse_others(lake, wanted("b", seed=12))
+    with pytest.raises(BadInput, match=r"its stars have star_limit 26.0, .*: use another folder for request b"):
+        universe.refuse_others(lake, wanted("b", star_limit=20.0))
+    # Alone in its lake, a request may change its own.
+    universe.refuse_others(lake, wanted("a", seed=12))
+
+
+def test_every_job_looks_before_it_computes(lake, tmp_path, capsys):
+    catalogue(lake, "stars", wanted("a"), name="a")
+    before = sorted(lake.rglob("*"))
+    job = shell.Job("toy", "", lambda root, request: pytest.fail("it began"))
+    file = requests.written(tmp_path, seed=12)
+    assert shell.main(job, ["--lake", str(lake), "--request", str(file)]) == 2
+    assert capsys.readouterr().err.endswith(
+        f"lake {lake} holds the universe of request a: its stars have seed 11, the request 12: use another folder for "
+        f"request {parse(file).name}\n"
+    )
+    assert sorted(lake.rglob("*")) == before

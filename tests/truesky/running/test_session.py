@@ -1,0 +1,45 @@
+"""The Spark session: one, and it reads a lake's files as every other reader does."""
+
+from pathlib import Path
+
+import duckdb
+import psutil
+import pytest
+
+from lake_schema.store import publish, read
+from tests.universe import CELLS, toy_plan, toy_work
+from truesky.running.session import session
+
+pytestmark = pytest.mark.spark
+
+
+def test_other_readers_find_the_same_rows(spark, lake):
+    publish.make(lake, toy_plan(), toy_work)
+    version = read.version(lake, "toy")
+    ours, files = version.rows().sort_by("id"), [str(version.path(part)) for part in version.parts]
+    toy = spark.read.parquet(*files)
+    assert toy.columns == ours.column_names
+    assert toy.orderBy("id").toArrow().equals(ours.cast(toy.toArrow().schema))
+    theirs = duckdb.sql("SELECT * FROM read_parquet($files) ORDER BY id", params={"files": files}).to_arrow_table()
+    assert theirs.select(ours.column_names).cast(ours.schema).equals(ours)
+    assert toy.count() == sum(n for _, n in CELLS)
+
+
+def test_nobody_else_can_reach_it(spark):
+    """All that its processes listen to is on this machine alone, and they ask each other for a secret."""
+    assert spark.range(0, 4, 1, numPartitions=2).mapInArrow(lambda batches: batches, "id long").count() == 4
+    processes = psutil.Process().children(recursive=True)
+    ends = {end.laddr.ip for p in processes for end in p.net_connections("inet") if end.status == psutil.CONN_LISTEN}
+    assert {end.removeprefix("::ffff:") for end in ends} == {"127.0.0.1"}
+    # Sockets without an address lie where only their owner may look.
+    places = {Path(end.laddr) for p in processes for end in p.net_connections("unix") if end.laddr.endswith(".sock")}
+    assert places
+    assert {place.parent.stat().st_mode & 0o777 for place in places} == {0o700}
+    # Nor do its workers print a traceback where they are dropped.
+    assert any("truesky.running.spark_workers" in p.cmdline() for p in processes)
+    conf = spark.sparkContext.getConf()
+    assert (conf.get("spark.authenticate"), conf.get("spark.ui.enabled")) == ("true", "false")
+
+
+def test_there_is_one_session(spark):
+    assert session("another").sparkContext is spark.sparkContext

@@ -1,0 +1,156 @@
+"""Clustering and shear of mock galaxies whose correlations are known, and what each fault makes of the verdicts."""
+
+import numpy as np
+import pytest
+from scipy.special import j0
+
+from tests.truesky.validation.lake.catalogues import mocks
+from tests.truesky.validation.lake.catalogues.test_faults import Version
+from truesky.validation.lake.catalogues import angular_clustering, cosmic_shear
+from truesky.validation.lake.measure import two_points
+from truesky.validation.lake.measure.rows import FAIL, NOT_APPLICABLE, PASS
+from truesky.validation.lake.measure.two_points import ARCMIN
+
+
+def verdicts(result):
+    return {row.quantity: row.verdict for row in result.rows}
+
+
+def failed(result):
+    return {name for name, verdict in verdicts(result).items() if verdict == FAIL}
+
+
+@pytest.fixture(scope="module")
+def shear():
+    return mocks.sheared()
+
+
+@pytest.fixture(scope="module")
+def galaxies():
+    return mocks.clustered()
+
+
+@pytest.fixture
+def to_24(monkeypatch):
+    monkeypatch.setattr(angular_clustering, "LIMITS", (24.0,))
+
+
+# ------------------------------------------------------------------------------------------------ shear
+
+
+def test_shear_of_a_potential_passes(shear):
+    found = verdicts(cosmic_shear.compared(shear, mocks.FIELD))
+    assert FAIL not in found.values()
+    passed = {name for name, verdict in found.items() if verdict == PASS}
+    assert passed >= {"xi_plus_0.6", "xi_plus_1.2", "b_share_4.8", "cross_1.2", "cross_4.8", "about_convergence_1.2"}
+
+
+def test_shear_that_is_turned_by_45_degrees(shear):
+    """E modes become B modes; xi+ stays."""
+    turned = shear | {"gamma1": -shear["gamma2"], "gamma2": shear["gamma1"]}
+    wrong = failed(cosmic_shear.compared(turned, mocks.FIELD))
+    assert {"b_share_4.8", "b_share_9.6", "xi_minus_1.2", "about_convergence_1.2"} <= wrong
+    assert not any(name.startswith("xi_plus") for name in wrong)
+
+
+@pytest.mark.parametrize("column", ["gamma1", "gamma2"])
+def test_one_component_of_shear_with_the_wrong_sign(shear, column):
+    assert "b_share_4.8" in failed(cosmic_shear.compared(shear | {column: -shear[column]}, mocks.FIELD))
+
+
+def test_shear_of_the_wrong_sign(shear):
+    """Two points of shear do not see it."""
+    minus = shear | {name: -shear[name] for name in ("gamma1", "gamma2")}
+    wrong = failed(cosmic_shear.compared(minus, mocks.FIELD))
+    assert {"about_convergence_0.6", "about_convergence_1.2", "about_convergence_2.4"} <= wrong
+    assert not any(name.startswith(("xi", "b_share")) for name in wrong)
+
+
+def test_shear_that_is_half_as_large_again(shear):
+    large = shear | {name: 1.5 * shear[name] for name in ("gamma1", "gamma2")}
+    assert {"about_convergence_1.2", "xi_plus_0.6", "xi_plus_1.2"} <= failed(cosmic_shear.compared(large, mocks.FIELD))
+
+
+def test_no_shear_is_no_failure(shear):
+    equal = shear | {"gamma1": np.full(len(shear["id"]), 0.05), "gamma2": np.zeros(len(shear["id"]))}
+    few = {name: values[:1] for name, values in shear.items()}
+    none = {name: values[:0] for name, values in shear.items()}
+    for columns, words in ((equal, "the same shear"), (few, "1 galaxies"), (none, "0 galaxies")):
+        (row,) = cosmic_shear.compared(columns, mocks.FIELD).rows
+        assert (row.verdict, words in row.note) == (NOT_APPLICABLE, True)
+    without = Version("galaxies", {name: values for name, values in shear.items() if name != "gamma1"})
+    (row,) = cosmic_shear.measured(without).rows
+    assert row.note == "galaxies have no gamma1"
+    (row,) = cosmic_shear.measured(Version("galaxies", none, ())).rows
+    assert row.verdict == NOT_APPLICABLE
+
+
+def test_shear_of_a_lake_is_that_of_its_columns(shear):
+    rows = cosmic_shear.measured(Version("galaxies", shear, mocks.CELLS)).rows
+    assert rows[0].value == pytest.approx(cosmic_shear.compared(shear, mocks.FIELD).rows[0].value, rel=1e-9)
+
+
+# ------------------------------------------------------------------------------------------------ clustering
+
+
+def test_w_is_that_of_the_field(galaxies):
+    """Of a log-normal field: exp of that of the Gaussian one, less what its own mean hides."""
+    columns, (ell, variance) = galaxies
+    edges = np.array([0.6, 1.2, 2.4, 4.8]) * ARCMIN
+    own = (columns[name] for name in ("id", "ra", "dec", "_healpix_29"))
+    found = two_points.angular(*own, mocks.FIELD, edges)
+    wanted = np.array([np.expm1(np.sum(variance * j0(ell * theta))) for theta in found.theta])
+    assert found.error[0] / wanted == pytest.approx(np.full(3, 0.15), abs=0.14)
+    assert np.all(np.abs(found.value[0] - wanted) < 4.0 * found.error[0] + 0.1 * wanted)
+
+
+def test_galaxies_that_cluster_as_their_halos_pass(galaxies, to_24):
+    result = angular_clustering.compared(galaxies[0], mocks.FIELD)
+    found = verdicts(result)
+    assert FAIL not in found.values()
+    assert {name for name, verdict in found.items() if verdict == PASS} >= {"w_vis_24_0.6", "w_vis_24_1.2"}
+    assert found["w_m20"] == NOT_APPLICABLE
+    assert set(result.series) == {"w_24", "w_theory_24"}
+
+
+def test_places_that_are_shuffled(galaxies, to_24):
+    columns, _ = galaxies
+    index, ra, dec = mocks.scattered(np.random.default_rng(5), len(columns["id"]))
+    kept = {name: values[: len(ra)] for name, values in columns.items()}
+    result = angular_clustering.compared(kept | {"ra": ra, "dec": dec, "_healpix_29": index}, mocks.FIELD)
+    assert {"w_vis_24_1.2", "w_vis_24_2.4"} <= failed(result)
+
+
+def test_galaxies_of_other_halos(galaxies, to_24):
+    """Of clusters: they should cluster ten times as much."""
+    columns, _ = galaxies
+    heavy = columns | {"log_halo_mass": columns["log_halo_mass"] + 1.8}
+    assert {"w_vis_24_0.6", "w_vis_24_1.2"} <= failed(angular_clustering.compared(heavy, mocks.FIELD))
+
+
+def test_clustering_of_luminous_galaxies_that_are_shuffled(galaxies, monkeypatch):
+    """At 0.4 < z < 0.6 and M_r < -20."""
+    monkeypatch.setattr(angular_clustering, "LIMITS", (26.0,))
+    monkeypatch.setattr(angular_clustering, "_LUMINOUS", 20.0)
+    columns, _ = galaxies
+    index, ra, dec = mocks.scattered(np.random.default_rng(6), len(columns["id"]))
+    own = {name: values[: len(ra)] for name, values in columns.items()}
+    own |= {"ra": ra, "dec": dec, "_healpix_29": index, "z_true": own["z_true"] - np.float32(0.2)}
+    own["abs_mag_r01"] = np.full(len(ra), -20.5)
+    result = angular_clustering.compared(own, mocks.FIELD)
+    assert "w_m20_0.16" in failed(result)
+
+
+def test_too_little_to_cluster_is_no_failure(galaxies):
+    columns, _ = galaxies
+    for n in (0, 1):
+        (row,) = angular_clustering.compared({name: v[:n] for name, v in columns.items()}, mocks.FIELD).rows
+        assert (row.verdict, f"{n} galaxies" in row.note) == (NOT_APPLICABLE, True)
+    (row,) = angular_clustering.measured(Version("galaxies", {"id": np.arange(3)})).rows
+    assert row.note.startswith("galaxies have no ra and dec")
+    # A catalogue that ends before the limits, and halos whose masses nobody knows.
+    bright = columns["abs_mag_r01"] < -21.0
+    rows = angular_clustering.compared({name: v[bright] for name, v in columns.items()}, mocks.FIELD).rows
+    assert {row.verdict for row in rows if row.quantity == "w_vis_24"} == {NOT_APPLICABLE}
+    unknown = columns | {"log_halo_mass": np.full(len(columns["id"]), np.nan)}
+    assert {row.verdict for row in angular_clustering.compared(unknown, mocks.FIELD).rows} == {NOT_APPLICABLE}

@@ -1,0 +1,52 @@
+"""What a program finds of the sources that are there, and of those that only the truth knows."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.truesky.validation.lake import made
+from truesky.validation.lake.images.completeness import COMPLETENESS
+from truesky.validation.lake.measure.rows import FAIL, NOT_APPLICABLE, PASS
+
+
+@pytest.fixture(scope="module")
+def faint(tmp_path_factory):
+    """Points down to what nobody finds."""
+    of = made.scene(np.random.default_rng(3), 900, faintest=28.5)
+    return made.vis(tmp_path_factory.mktemp("faint"), of=of)[0]
+
+
+def test_half_are_found_where_noise_says(faint):
+    assert made.verdicts(COMPLETENESS, faint) == {"half": PASS, "bright": PASS}
+
+
+def test_sources_that_were_not_drawn(faint):
+    """Every third is somewhere else."""
+    known = faint.known
+    off = np.where(np.arange(len(known)) % 3 == 0, 14.0, 0.0)
+    wrong = replace(faint, known=replace(known, x=known.x + off), series={})
+    assert made.verdicts(COMPLETENESS, wrong)["bright"] == FAIL
+
+
+def test_an_image_of_another_sky(faint):
+    """Nothing is where it should be: there is no magnitude at which half are found, and that is no excuse."""
+    known = faint.known
+    wrong = replace(faint, known=replace(known, x=known.x + 14.0), series={})
+    assert made.verdicts(COMPLETENESS, wrong) == {"bright": FAIL}
+
+
+def test_sources_that_are_fainter_than_they_should_be(faint):
+    known = faint.known
+    wrong = replace(faint, known=replace(known, expected=6.0 * known.expected), series={})
+    assert made.verdicts(COMPLETENESS, wrong)["half"] == FAIL
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("noise", "why"), [(0.07, "objects cover"), (0.01, "sep: internal pixel buffer full")])
+def test_objects_that_cover_everything_tell_nothing(faint, noise, why):
+    """Of a noise that is too small most pixels are of objects, and of one that is far too small more than sep holds."""
+    wrong = replace(faint, noise=noise * faint.noise, series={})
+    (row,) = COMPLETENESS.of(wrong)
+    assert row.verdict == NOT_APPLICABLE
+    assert why in row.note

@@ -1,0 +1,76 @@
+"""Spectra that are made here: traces, light and lines as foreseen, and each of them off."""
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from lake_schema.store import validate
+from lake_schema.tables.validation import VALIDATION
+from tests.truesky.validation.lake import made
+from truesky.validation.lake.images.spectra import SPECTRA
+from truesky.validation.lake.measure.frames import Frame
+from truesky.validation.lake.measure.rows import FAIL, NOT_APPLICABLE, PASS, Place
+from truesky.validation.lake.measure.seen import Seen
+from truesky.validation.lake.suite import publishing
+
+SIDE, LONG, FIRST, LAST, LINE = 700, 500, 12_500.0, 18_500.0, 15_300.0
+
+
+def frame(up=0.0, brighter=1.0, redder=0.0, n=12):
+    """(a frame of slightly sloping traces, what the lake says of them); up, redder : pixels, brighter : a factor."""
+    rng = np.random.default_rng(2)
+    image = rng.poisson(np.full((SIDE, SIDE), 100.0)).astype(float)
+    rows, axis = [], np.arange(SIDE)
+    for i in range(n):
+        x0, y0, light = 60.0 + 7.3 * i, 40.0 + 53.37 * i, 2e5
+        t = (axis - x0) / LONG
+        inside = (t >= 0.0) & (t < 1.0)
+        y = y0 + 3.0 * t + up
+        place = x0 + LONG * (LINE - FIRST) / (LAST - FIRST) + redder
+        spectrum = brighter * light * (0.9 * inside / LONG + 0.1 * made_gauss(axis, place, 1.0))
+        image += rng.poisson(np.maximum(spectrum * made_gauss(axis[:, None], y, 0.8), 0.0))
+        rows.append({
+            "id": i, "order": 1, "wavelength_first": FIRST, "wavelength_last": LAST, "x_first": x0, "y_first": y0,
+            "x_last": x0 + LONG, "y_last": y0 + 3.0, "trace_x": [x0, LONG], "trace_y": [y0, 3.0], "expected": light,
+            "drawn": light, "overlapped": 0.0, "line_wavelength": [LINE], "line_snr": [50.0],
+        })  # fmt: skip
+    header = {"CHANNEL": "NISP-S", "IMAGETYP": "science"}
+    still = np.zeros(n)
+    known = made.known(still, still, still + 20.0)
+    known.id[:] = np.arange(n)
+    of = Seen(Place("NISP-S", "nisp_red", 1, "DET11"), Frame(image.astype(np.float32), (), None, header, None), known)
+    of.spectra, of.noise = pa.Table.from_pylist(rows), 10.0
+    return of
+
+
+def made_gauss(x, middle, sigma):
+    return np.exp(-0.5 * ((x - middle) / sigma) ** 2) / (np.sqrt(2.0 * np.pi) * sigma)
+
+
+def test_spectra_as_foreseen():
+    assert made.verdicts(SPECTRA, frame()) == dict.fromkeys(("flux", "trace", "wavelength", "lines"), PASS)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "quantity"), [({"up": 0.3}, "trace"), ({"brighter": 1.1}, "flux"), ({"redder": 0.8}, "wavelength")]
+)
+def test_what_is_off_is_found(wrong, quantity):
+    found = made.verdicts(SPECTRA, frame(**wrong))
+    assert found.pop(quantity) == FAIL
+    assert set(found.values()) == {PASS}
+
+
+@pytest.mark.parametrize("redder", [5.0, 8.0, -20.0])
+def test_lines_far_from_their_places_are_missed(redder):
+    """What lies at the foreseen places then is noise, whose centroids scatter about 0."""
+    found = made.verdicts(SPECTRA, frame(redder=redder))
+    assert found["lines"] == FAIL
+    assert found["wavelength"] != PASS
+
+
+def test_too_few_are_said():
+    found = SPECTRA.of(frame(n=2))
+    assert [row.verdict for row in found] == [NOT_APPLICABLE] * 3
+    assert found[0].note.startswith("flux: 2 spectra")
+    # They are rows of a table, whose keys differ.
+    validate.check(publishing.table(found), VALIDATION)

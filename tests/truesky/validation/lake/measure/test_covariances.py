@@ -1,0 +1,25 @@
+"""A pixel's own variance, where neighbours share it and rows, columns and slopes add to it."""
+
+import numpy as np
+import pytest
+import scipy.ndimage
+
+from truesky.validation.lake.measure.covariances import own_variance
+
+
+@pytest.mark.parametrize("near", [0, 1, 2])
+def test_the_variance_that_neighbours_share(near):
+    """Also where rows and columns have offsets of their own, and a slope lies over it; half of the pixels count."""
+    rng = np.random.default_rng(5)
+    size, reach = 2 * near + 1, 0.02
+    kernel = np.full((size, size), reach / max(size**2 - 1, 1))
+    kernel[near, near] = 1.0 - reach if near else 1.0
+    values = scipy.ndimage.convolve(rng.standard_normal((200, 64, 64)) * 7.0, kernel[None], mode="reflect")
+    values += 2.0 * rng.standard_normal((200, 64, 1)) + 1.5 * rng.standard_normal((200, 1, 64))
+    values += np.linspace(-5.0, 5.0, 64)
+    kept = rng.random(values.shape) < 0.5
+    plain = float(np.var(values[kept]))
+    value, error = own_variance(np.where(kept, values, 1e6), kept, near)
+    assert value == pytest.approx(49.0, abs=4.0 * error)
+    assert error < 2.0
+    assert abs(plain - 49.0) > 5.0 * error

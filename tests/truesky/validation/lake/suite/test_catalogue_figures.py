@@ -1,0 +1,57 @@
+"""Figures of the catalogue: what they show, that axes say of what, and that there is none of nothing."""
+
+import numpy as np
+import pytest
+
+from truesky.validation.lake.measure.rows import Place, Row
+from truesky.validation.lake.measure.seen import Result
+from truesky.validation.lake.suite import catalogue_figures, report
+from truesky.validation.lake.suite.running import Found
+
+
+def count(mag, value, error=0.03):
+    return Row("observed", f"log_i_{mag:g}", Place(), value, error, 3.0, 0.06, "", "a survey")
+
+
+ROWS = [count(19.25, 3.0), count(19.75, 3.1, np.nan), count(26.0, -np.inf)]
+THETA = np.array([0.4, 0.8, 1.6])
+
+
+@pytest.fixture
+def series():
+    edges = np.linspace(0.0, 3.0, 31)
+    number = np.exp(-((edges[1:] - 0.9) ** 2))
+    ones = np.ones(3)
+    return {
+        "redshifts": np.stack([edges[:-1], edges[1:], number, 0.1 * number]),
+        "colours": np.stack([np.array([0.1, 0.3, 0.5]), *(ones * k for k in range(5)), 0.1 * ones]),
+        "colour_edges": np.linspace(-0.5, 2.5, 91), "colour_colour": np.eye(90),
+        "w_22": np.stack([THETA, [0.1, 0.05, -0.01], 0.01 * ones, [0.1, 0.05, 0.02]]),
+        "w_theory_22": np.stack([THETA, [0.1, 0.05, 0.02]]),
+        "shear": np.stack([THETA, 1e-4 * ones, 2e-5 * ones, 1e-6 * ones, 1e-5 * ones, np.full(3, np.nan), 1e-6 * ones]),
+        "shear_theory": np.stack([THETA, 1e-4 * ones, 2e-5 * ones]),
+    }  # fmt: skip
+
+
+def test_each_axis_says_what_it_is_and_points_have_errors(series):
+    drawn = list(catalogue_figures.drawn(ROWS, series))
+    assert len(drawn) == 5
+    for caption, figure in drawn:
+        assert caption.startswith("galaxies: ")
+        assert all(axis.get_xlabel() or axis.get_label() == "<colorbar>" for axis in figure.axes)
+        assert all(axis.get_ylabel() for axis in figure.axes)
+    points = [axis for caption, figure in drawn if "colours of the fluxes" not in caption for axis in figure.axes]
+    assert all(axis.containers for axis in points)
+
+
+def test_what_was_not_measured_is_not_drawn():
+    assert list(catalogue_figures.drawn([], {})) == []
+    assert list(catalogue_figures.drawn(ROWS[2:], {})) == []
+    (one,) = catalogue_figures.drawn(ROWS, {})
+    assert "a survey" in one[0]
+
+
+def test_the_report_has_them(series):
+    text = report.page("lake", Found(ROWS, [], [Result(Place(), ROWS, series)]))
+    assert text.count("src='data:image/png;base64,") == 5
+    assert "non-linear theory" in text

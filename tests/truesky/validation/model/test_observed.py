@@ -1,0 +1,208 @@
+"""The mean sky beside what was observed, and what a wrong recipe does to it."""
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from lake_schema import sky
+from lake_schema.ids import GENERATION_ORDER
+from lake_schema.store import layout, publish, read
+from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.tables.galaxies import GALAXIES
+from tests.truesky.catalogue.conftest import FLAT_CELLS, flat_sky, made
+from truesky.catalogue.galaxies import high_redshift
+from truesky.catalogue.halos import quenching
+from truesky.validation import __main__, checks
+from truesky.validation.lake.catalogues import observed_sky
+from truesky.validation.lake.measure.rows import FAIL, PASS
+from truesky.validation.model import mean_sky, observed
+
+LIST = Path(observed.__file__).with_suffix(".csv")
+# Cells that tell a wrong recipe.
+FEW = 4
+
+
+def seen(rows, cells):
+    return observed.sky_of(rows, cells * sky.cell_area(GENERATION_ORDER))
+
+
+@pytest.fixture(scope="module")
+def flat():
+    return mean_sky.flat(made())
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return observed.figures(seen(flat_sky(), FLAT_CELLS))
+
+
+def off(figures):
+    """Names of what is not as observed."""
+    return {check.name for check in checks.checks(figures, 2.0) if not check.passed}
+
+
+def test_the_list_says_where_its_numbers_are_from():
+    rows = list(csv.DictReader(LIST.open(newline="")))
+    assert len(rows) >= 60
+    assert len({row["name"] for row in rows}) == len(rows)
+    assert {row["confidence"] for row in rows} == {"P", "M"}
+    assert sum(row["confidence"] == "P" for row in rows) >= 40
+    assert all(row["source"] and row["why"] and float(row["tolerance"]) > 0.0 for row in rows)
+
+
+def test_every_row_is_measured(whole):
+    rows = list(csv.DictReader(LIST.open(newline="")))
+    assert {row["name"] for row in rows} <= set(whole)
+
+
+def test_the_mean_sky_is_as_observed(whole):
+    """1.7 deg2: within two Poisson errors more than the list says."""
+    results = checks.checks(whole, 2.0)
+    assert [(check.name, check.found) for check in results if check.unexpected] == []
+    # Numbers from memory gate nothing one by one; were many of them off, so would be the sky.
+    remembered = [check for check in results if not check.gates]
+    assert sum(check.passed for check in remembered) > 0.85 * len(remembered)
+
+
+def test_a_lake_is_compared(flat, tmp_path, capsys):
+    """By the command: the same figures as of the rows themselves, in the table that it publishes."""
+    rows = mean_sky.rows(flat, 0, 2)
+    plan = Plan(GALAXIES, {}, (Part(layout.cell_file(5, 0), {}),))
+    publish.make(tmp_path, plan, lambda root, facts: Output(rows))
+    seen, _ = observed.in_version(read.version(tmp_path, "galaxies"))
+    found = observed.figures(seen)
+    assert found == observed.figures(observed.sky_of(rows, 2 * sky.cell_area(GENERATION_ORDER)))
+    status = __main__.main(["--lake", str(tmp_path)])
+    table = [row for row in read.version(tmp_path, "validation").rows().to_pylist() if row["check_name"] == "observed"]
+    assert {row["quantity"]: row["value"] for row in table if row["value"] is not None} == {
+        check.name: check.found for check in checks.checks(found) if np.isfinite(check.found)
+    }
+    # Two cells are too few to tell an error of.
+    assert {row["verdict"] for row in table} == {"undecided"}
+    assert status == 0
+    assert "undecided" in capsys.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def patch():
+    """(a lake's sky of eight cells, the cell of each galaxy)."""
+    rows = flat_sky()
+    cell = rows["_healpix_29"].to_numpy() >> 2 * (sky.DEEPEST - GENERATION_ORDER)
+    part = rows.filter(pa.array(cell < 2 * FEW))
+    return seen(part, 2 * FEW), cell[(cell < 2 * FEW) & (rows["kind"].to_numpy() < 2)]
+
+
+def verdicts(seen, cell):
+    return {row.quantity: row.verdict for row in observed_sky.compared(seen, cell)}
+
+
+def failed(seen, cell):
+    return {name for name, verdict in verdicts(seen, cell).items() if verdict == FAIL}
+
+
+def columns(seen, **changed):
+    """A sky with some columns multiplied (fluxes) or shifted (the others)."""
+    return replace(seen, rows={**seen.rows, **{name: change(seen.rows[name]) for name, change in changed.items()}})
+
+
+def test_a_lake_of_the_mean_sky_passes(patch):
+    found = verdicts(*patch)
+    decided = {name for name, verdict in found.items() if verdict == PASS}
+    assert {"log_i_20.25", "mass_function_10_z0.95", "main_sequence_z1.0", "halpha_nii_2e-16"} <= decided
+    assert failed(*patch) == set()
+
+
+def test_a_band_whose_magnitudes_are_shifted_in_a_lake(patch):
+    """By 0.3 mag, of which counts make 0.1 dex; the other band's are as they were."""
+    sky_, cell = patch
+    found = failed(replace(sky_, mags={**sky_.mags, "lsst_i": sky_.mags["lsst_i"] + 0.3}), cell)
+    assert found
+    assert all(name.startswith("log_i_") for name in found)
+
+
+def test_masses_rates_and_lines_that_are_off_in_a_lake(patch):
+    sky_, cell = patch
+    wrong = columns(
+        sky_,
+        log_stellar_mass=lambda values: values + 0.5,
+        log_sfr=lambda values: values - 0.6,
+        flux_halpha=lambda values: 0.5 * values,
+        flux_nii=lambda values: 0.5 * values,
+    )
+    found = failed(wrong, cell)
+    assert {"halpha_nii_2e-16", "main_sequence_z1.0", "mass_function_11_z0.95"} <= found
+
+
+def test_a_lake_that_counts_its_area_twice(patch):
+    """As where every cell's galaxies are there a second time, with places and identifiers of their own."""
+    sky_, cell = patch
+    found = failed(replace(sky_, area=0.5 * sky_.area), cell)
+    assert {"log_i_22.25", "mass_function_10_z0.65", "halpha_nii_2e-16"} <= found
+    assert "main_sequence_z1.0" not in found
+
+
+def old_metals(flat):
+    """Two scales of metallicity in one: 0.25 dex apart."""
+    return replace(flat, lines=replace(flat.lines, metals=replace(flat.lines.metals, sun=8.44)))
+
+
+def unmatched_lines(flat):
+    return replace(flat, lines=replace(flat.lines, shift=np.zeros_like(flat.lines.shift)))
+
+
+def light_stars(flat):
+    """Mass-to-light ratios of half of what they are."""
+    return replace(flat, masses=replace(flat.masses, intercept=flat.masses.intercept - 0.3))
+
+
+def template_rates(flat):
+    """The rates that the ultraviolet light of empirical templates gives are lower."""
+    return replace(flat, star_formation=replace(flat.star_formation, median=-0.6))
+
+
+def wide_colours(flat):
+    """Doubled scatters of the sequences."""
+    law = flat.colours.sequence
+    wide = replace(
+        law, red_scatter=0.14, red_scatter_limits=(0.06, 0.20), blue_scatter=0.24, blue_scatter_limits=(0.10, 0.40)
+    )
+    return replace(flat, colours=replace(flat.colours, sequence=wide))
+
+
+def idle_halos(flat):
+    """Halos that quench nothing."""
+    law = replace(flat.halo_shares.law, highest=0.0)
+    shares = quenching.shares(law, flat.population.masses, flat.population.halos.matching.occupation)
+    return replace(flat, halo_shares=shares)
+
+
+def hole(flat):
+    """Nothing from z = 2.3 on."""
+    return replace(flat, population=replace(flat.population, halos=replace(flat.population.halos, far=3844.0)))
+
+
+def far_quasars(flat):
+    """None below z = 6."""
+    return replace(flat, distant=high_redshift.model(0.0, 1.0, 26.0, 0.3))
+
+
+@pytest.mark.parametrize(
+    ("mutant", "name"),
+    [
+        (old_metals, "oiii_2e-16"),
+        (unmatched_lines, "halpha_nii_2e-16"),
+        (light_stars, "mass_function_11_z0.95"),
+        (template_rates, "main_sequence_z1.0"),
+        (wide_colours, "main_sequence_scatter_z0.4"),
+        (idle_halos, "red_centrals_13.5_z1"),
+        (hole, "uv_21_z3.8"),
+        (far_quasars, "quasars_r_22.5"),
+    ],
+)
+def test_a_wrong_recipe_is_seen(flat, whole, mutant, name):
+    assert name not in off(whole)
+    assert name in off(observed.figures(seen(mean_sky.rows(mutant(flat), 0, FEW), FEW)))

@@ -1,0 +1,91 @@
+"""Stars against observed numbers: all groups pass, and each turns red when its recipe is wrong."""
+
+import csv
+import dataclasses
+
+import numpy as np
+import pytest
+
+from truesky.catalogue.stars import companions, isochrones, kinematics, milky_way, stars
+from truesky.validation.model import observed_stars
+
+
+@pytest.fixture(scope="module")
+def universe():
+    return stars.model(brown_dwarf_boost=0.0)
+
+
+def failed(found):
+    """Names by group of checks that fail and gate."""
+    return {group: names for group, checks in observed_stars.checks(found).items()
+            if (names := [check.name for check in checks if check.unexpected])}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def figures(universe, dust):
+    return observed_stars.figures(universe, dust, 244)
+
+
+def test_all_groups_pass(figures):
+    assert failed(figures) == {}
+
+
+def test_remembered_numbers_are_near_too(figures):
+    far = [c.name for checks in observed_stars.checks(figures).values() for c in checks if not c.passed]
+    assert set(far) <= {"giants_local"}
+
+
+def test_rows_are_from_outside_and_say_why():
+    with observed_stars.LIST.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) >= 20
+    assert len({row["name"] for row in rows}) == len(rows)
+    assert all(row["source"] and row["why"] and row["confidence"] in "PM" for row in rows)
+    assert sum(row["confidence"] == "P" for row in rows) >= 10
+
+
+# ------------------------------------------------------------------------------------------------ wrong recipes
+
+
+def test_without_isochrones_of_old_stars_the_turn_off_fails(monkeypatch, figures):
+    """Solar metals for all: the halo turns off 900 K too cool."""
+    solar = isochrones.isochrones
+    monkeypatch.setattr(isochrones, "isochrones", lambda age, metals: solar(age, 0.0 * np.asarray(metals)))
+    assert set(failed(figures | observed_stars.evolved())) == {"halo_turn_off"}
+
+
+def test_a_fifth_more_stars_fail_the_counts(universe, figures):
+    more = dataclasses.replace(universe.galaxy.pieces, number=1.2 * universe.galaxy.pieces.number)
+    galaxy = dataclasses.replace(universe.galaxy, pieces=more)
+    mutant = dataclasses.replace(universe, galaxy=galaxy)
+    limits = (15.0, 18.0, 20.0)
+    found = observed_stars.star_counts.brighter(mutant, (0.0, 90.0), limits)
+    counts = {f"pole_v{limit:g}": value for limit, value in zip(limits, found, strict=True)}
+    assert "pole_v20" in failed(figures | counts)["star_counts"]
+    assert "systems_local" in failed(figures | observed_stars.nearby(mutant))["stars_near_the_sun"]
+
+
+def test_without_companions_the_neighbourhood_fails(monkeypatch, figures, universe):
+    law = companions._law()
+    monkeypatch.setattr(companions, "_law", lambda: law | {"fraction": tuple(0.5 * f for f in law["fraction"])})
+    single = dataclasses.replace(universe, galaxy=milky_way.milky_way())
+    assert failed(figures | observed_stars.nearby(single)) == {"stars_near_the_sun": ["companions_per_star"]}
+
+
+def test_a_halo_that_turns_with_the_disc_fails(monkeypatch, figures):
+    table, *others = kinematics._numbers()
+    still = table.copy()
+    still[3] = 0.0
+    monkeypatch.setattr(kinematics, "_numbers", lambda: (still, *others))
+    (lag,) = (
+        c for c in observed_stars.checks(figures | observed_stars.motions())["kinematics"] if c.name == "sun_v_lag"
+    )
+    assert not lag.passed
+    # A remembered number shows it, and gates nothing.
+    assert not lag.unexpected
+
+
+def test_giants_a_magnitude_too_faint_fail(monkeypatch, figures, universe):
+    faint = dataclasses.replace(universe.galaxy.pieces, m_h=universe.galaxy.pieces.m_h + 0.5)
+    mutant = dataclasses.replace(universe, galaxy=dataclasses.replace(universe.galaxy, pieces=faint))
+    assert "clump_m_h" in failed(figures | observed_stars.nearby(mutant))["giants"]

@@ -1,0 +1,54 @@
+"""Clustering at the size of halos: pairs of known points, the power law, and a few cells of the universe."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from tests.truesky.catalogue.conftest import BOX_CELLS, SEED
+from truesky.catalogue.halos import matching
+from truesky.validation import checks
+from truesky.validation.model import small_scales
+
+CELLS = 8
+
+
+def test_pairs_are_counted_by_their_separation():
+    ra, dec = np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.01, 0.04])
+    theta = np.radians([0.005, 0.02, 0.035, 0.1])
+    assert small_scales._pairs(ra, dec, theta).tolist() == [2.0, 2.0, 2.0]
+
+
+def test_the_power_law_is_the_integral_along_the_line_of_sight():
+    """Of galaxies between two distances with a constant number at each: twice the integral of xi over the line."""
+    chi, theta = np.linspace(1100.0, 1500.0, 400_001), np.array([3.0e-4, 3.001e-4])
+    length, slope, near, far = small_scales.LENGTH, small_scales.SLOPE, 1100.0, 1500.0
+
+    def along(at):
+        across = at * theta.mean()
+        return 2.0 * quad(lambda pi: (np.hypot(across, pi) / length) ** -slope, 0.0, np.inf, limit=200)[0]
+
+    expected = quad(along, near, far)[0] / (far - near) ** 2
+    assert small_scales.power_law(chi, theta)[0] == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.fixture(scope="module")
+def found():
+    return small_scales.figures(small_scales.universe_of(SEED, BOX_CELLS), CELLS)
+
+
+def test_galaxies_cluster_as_observed(found):
+    """A few cells: within two of their errors more than the list says."""
+    results = [check for check in checks.checks(found, 2.0) if check.name.startswith("w_m20")]
+    assert len(results) == 3
+    assert [(check.name, check.found) for check in results if check.unexpected] == []
+
+
+def test_with_the_satellites_of_today_they_would_cluster_less(found, monkeypatch):
+    monkeypatch.setattr(matching, "Occupation", lambda **values: replace(_OCCUPATION(**values), ratio_z=0.0))
+    fewer = small_scales.figures(small_scales.universe_of(SEED, BOX_CELLS), CELLS)
+    assert fewer["w_m20_0.04"] < 0.85 * found["w_m20_0.04"]
+
+
+_OCCUPATION = matching.Occupation

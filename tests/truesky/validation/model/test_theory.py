@@ -1,0 +1,62 @@
+"""Correlations of theory against what they must be whatever the power."""
+
+import numpy as np
+import pytest
+from scipy.special import j0, jv
+
+from truesky.fluxes import cosmology
+from truesky.validation.model import theory
+
+ARCMIN = np.radians(1 / 60)
+
+
+def test_the_aperture_mass_of_waves():
+    """Of one multipole: 24 J4(x) / x^2 squared; and nothing of it is a B mode.  Ref: Schneider et al. 1998"""
+    edges, radius = np.linspace(0.0, 20.0, 4001), 10.0
+    theta = 0.5 * (edges[1:] + edges[:-1])
+    for ell in (0.2, 0.5, 1.0):
+        mass, cross = theory.aperture(edges, j0(ell * theta), jv(4, ell * theta), radius)
+        wanted = (24.0 * jv(4, ell * radius) / (ell * radius) ** 2) ** 2
+        assert mass == pytest.approx(wanted, rel=1e-3, abs=1e-6)
+        assert cross == pytest.approx(0.0, abs=2e-5)
+        mass, cross = theory.aperture(edges, j0(ell * theta), -jv(4, ell * theta), radius)
+        assert cross == pytest.approx(wanted, rel=1e-3, abs=1e-6)
+
+
+def test_bessel_s_function_is_that_of_scipy():
+    x = np.geomspace(1e-4, 1e4, 3000)
+    assert theory._j4(x) == pytest.approx(jv(4, x), rel=1e-6, abs=1e-11)
+
+
+def test_a_power_law_has_the_correlation_that_it_must():
+    """C_l = l^-1.2: w = theta^-0.8 2^-0.2 Gamma(0.4) / (2 pi Gamma(0.6))."""
+    from math import gamma
+
+    theta = np.array([1.0, 3.0, 10.0]) * ARCMIN
+    ell = np.geomspace(1e-2, 2e5, 2000)
+    wanted = theta**-0.8 * 2**-0.2 * gamma(0.4) / (2 * np.pi * gamma(0.6))
+    assert theory.correlation(theta, ell, ell**-1.2) == pytest.approx(wanted, rel=0.01)
+
+
+def test_power_is_linear_where_structure_is():
+    """And eight times that and more within halos, by the published fit."""
+    k = np.array([0.01, 0.02, 5.0])
+    ratio = theory.power(k, 0.5) / theory.linear(k, 0.5)
+    assert ratio[:2] == pytest.approx(np.ones(2), abs=0.03)
+    assert 8.0 < ratio[2] < 40.0
+
+
+def test_sources_at_two_distances_are_between_those_at_each():
+    chi, ell = np.asarray(cosmology.comoving_distance(np.array([0.8, 1.2]))), np.array([100.0, 1000.0])
+    near, far, both = (
+        theory.convergence(ell, chi, np.array(weight)) for weight in ((1.0, 1e-9), (1e-9, 1.0), (1.0, 1.0))
+    )
+    assert np.all((near < both) & (both < far))
+    # Two screens that see the same matter: no less than the geometric mean of both.
+    assert np.all(both > np.sqrt(near * far) * 0.9)
+
+
+def test_galaxies_of_twice_the_bias_cluster_four_times_as_much():
+    edges, ell = np.array([1500.0, 1600.0, 1700.0]), np.array([300.0])
+    one, two = (theory.galaxies(ell, edges, np.array([1.0, 2.0]), np.full(2, bias)) for bias in (1.0, 2.0))
+    assert two == pytest.approx(4 * one, rel=1e-12, abs=0.0)

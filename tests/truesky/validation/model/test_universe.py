@@ -1,0 +1,151 @@
+"""The universe against its list of expectations: at a few cells, and whole at night.
+
+A few cells hold a few structures: here every tolerance is as wide as the list says and two errors of the blocks more.
+"""
+
+import json
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from lake_schema import sky
+from lake_schema.ids import GENERATION_ORDER
+from tests.truesky.catalogue.galaxies.test_lensing import limber
+from truesky.catalogue.halos import luminosity_function
+from truesky.fluxes import cosmology
+from truesky.validation import __main__, checks
+from truesky.validation.model import census, clustering, shear
+from truesky.validation.model import universe as measured
+
+
+@pytest.fixture(scope="module")
+def seen(drawn):
+    """The drawn sky, as the validation counts it."""
+    first = np.array(drawn.places[::4]) // 4
+    deepest = 2 * (sky.DEEPEST - GENERATION_ORDER) + 2
+
+    def block(index):
+        return np.searchsorted(first, index >> deepest)
+
+    halos = {name: drawn.halos[name].to_numpy() for name in census.HALO_COLUMNS}
+    return census.Census(
+        blocks=first.size,
+        area=drawn.area,
+        limit=26.0,
+        rows=drawn.columns,
+        block=block(drawn.columns["_healpix_29"]),
+        mags=drawn.mags,
+        halos=halos,
+        halo_block=block(drawn.halos["_healpix_29"].to_numpy()),
+    )
+
+
+def failed(figures):
+    return [(check.name, check.found) for check in checks.checks(figures, 2.0) if not check.passed]
+
+
+def test_colours(seen):
+    assert failed(census.colours(seen)) == []
+
+
+def test_sizes(seen):
+    assert failed(census.sizes(seen)) == []
+
+
+def test_halpha(seen):
+    assert failed(census.halpha(seen)) == []
+
+
+def test_halos(seen):
+    assert failed(census.halos(seen, measured.published_halos())) == []
+
+
+def test_luminosities(seen):
+    figures = census.luminosities(seen, luminosity_function.schechter(), 0.0, 1.5)
+    assert len(figures) == 6
+    assert failed(figures) == []
+
+
+def test_a_figure_that_is_off_fails():
+    good = {"sigma_8": 0.833, "half_light_worst": 0.009, "log_i_21.75": 4.0}
+    bad = {"sigma_8": 0.81, "log_i_21.75": 3.9}
+    assert failed({**good, "log_i_21.75_error": 0.0}) == []
+    assert [name for name, _ in failed({**bad, "log_i_21.75_error": 0.03})] == ["sigma_8", "log_i_21.75"]
+    # The share of emitters is given the error of their number.
+    counted = {"halpha_2e-16_0.9_1.8": 1.07, "halpha_2e-16_0.9_1.8_error": 0.03}
+    (check,) = checks.checks(counted)
+    assert check.passed
+    assert check.most == pytest.approx(1.08)
+
+
+@pytest.fixture
+def coarse(monkeypatch):
+    """Pixels of 27 arcmin in blocks of 54 deg2."""
+    monkeypatch.setattr(clustering, "DEPTH", 4)
+
+
+def points(ra, dec):
+    none = np.zeros(ra.size)
+    return clustering.Tracers(ra, dec, none, none, none > 0, none, none, none)
+
+
+def test_uniform_points_are_not_correlated(coarse, rng):
+    edges, order, blocks = np.array([0.6, 1.0, 2.0]), clustering.BLOCK_ORDER, []
+    for cell in (3, 100, 500, 767):
+        _, ra, dec = sky.random_in_cell(order, cell, 40_000, rng)
+        blocks.append((cell, (points(ra, dec),)))
+    (found,) = clustering.correlation(blocks, order, edges)
+    assert np.all((found.theta > edges[:-1]) & (found.theta < edges[1:]))
+    assert np.abs(found.w).max() < 2e-3
+    pairs = found.pairs
+    assert 3.0 < pairs.nodes @ pairs.of_all < 5.0
+    assert pairs.of_bin @ pairs.nodes == pytest.approx(found.theta, rel=0.03)
+
+
+def test_what_the_mean_of_a_block_takes_away(coarse):
+    """Against the covariance of all its pixels, each less the mean."""
+    edges, order, cell = np.array([0.6, 1.0, 2.0]), clustering.BLOCK_ORDER, 100
+    pairs = clustering._pairs(order, cell, edges)
+    place = clustering._vectors(order, cell)
+    theta = np.degrees(np.arccos(np.clip(place @ place.T, -1.0, 1.0)))
+    many = len(place)
+    less = np.eye(many) - 1.0 / many
+    left = less @ np.exp(-theta) @ less
+    found, wanted = pairs.left(np.exp(-pairs.nodes)), []
+    for first, last in pairwise(edges):
+        inside = (theta > first) & (theta < last)
+        wanted.append((np.exp(-theta[inside]).mean(), left[inside].mean()))
+    assert np.transpose(found) == pytest.approx(np.array(wanted), rel=0.02)
+    # A pixel that has neighbours at a separation lies further inside than most: the mean of all pairs takes too little.
+    assert np.all(found[1] < found[0] - pairs.of_all @ np.exp(-pairs.nodes))
+
+
+def test_points_of_a_dense_half_are_correlated(coarse, rng):
+    """Half of a block has three times the density of the other: delta is +-1/2; 16 of 480 neighbours lie across."""
+    edges, order, blocks = np.array([0.4, 0.6]), clustering.BLOCK_ORDER, []
+    for cell in (3, 100, 500, 767):
+        _, ra, dec = sky.random_in_cell(order, cell, 60_000, rng)
+        dense = sky.cell_of(ra, dec, order + 1) % 4 < 2
+        kept = dense | (rng.random(ra.size) < 1 / 3)
+        blocks.append((cell, (points(ra[kept], dec[kept]),)))
+    (found,) = clustering.correlation(blocks, order, edges)
+    assert found.w[0] == pytest.approx(0.25 * (1 - 2 * 16 / 480), abs=0.02)
+
+
+def test_theories_agree():
+    """Of C_l with the sums of the lensing tests; of a band with itself."""
+    ell = np.array([50.0, 200.0, 400.0])
+    chi = float(cosmology.comoving_distance(1.0))
+    assert shear.theory(ell, chi) == pytest.approx(limber(ell, chi), rel=0.02)
+    power = np.concatenate([np.zeros(30), shear.theory(np.arange(30.0, 129.0), chi)])
+    assert shear.bands(power, chi, (30, 64, 128)) == pytest.approx([1.0, 1.0], abs=1e-3)
+
+
+@pytest.mark.nightly
+def test_the_fuller_report(tmp_path):
+    """Every expectation, at the settings that a request has by default: a quarter of an hour of one core."""
+    file = tmp_path / "universe.json"
+    assert __main__.main(["--json", str(file), "--figures", str(tmp_path)]) == 0
+    assert json.loads(file.read_text())["checks"] > 130
+    assert (tmp_path / "universe.png").stat().st_size > 10_000

@@ -1,0 +1,104 @@
+"""The command that compares a universe with its expectations: exit status and files, of figures that are given."""
+
+import json
+import math
+import os
+from pathlib import Path
+
+import pytest
+
+from truesky.validation import __main__, checks
+from truesky.validation.model import universe
+
+RECORDED = Path(universe.__file__).with_name("results.json")
+GOOD = {"sigma_8": 0.83, "chi_2.3": 3844.0, "galaxies": 17.0}
+
+
+@pytest.fixture
+def found(monkeypatch):
+    """The figures that the long computation is to have found."""
+    figures = dict(GOOD)
+    monkeypatch.setattr(universe, "run", lambda size, folder: figures)
+    return figures
+
+
+def test_all_as_expected(found, tmp_path, capsys):
+    file = tmp_path / "figures.json"
+    assert __main__.main(["--json", str(file)]) == 0
+    written = json.loads(file.read_text())
+    assert {name: written[name] for name in GOOD} == GOOD
+    assert (written["checks"], written["failed"]) == (2, "")
+    assert os.listdir(tmp_path) == [file.name]
+    assert "2 of 2 as expected" in capsys.readouterr().out
+
+
+def test_a_check_that_fails_is_the_exit_status(found, tmp_path, capsys):
+    found["sigma_8"] = 0.7
+    file = tmp_path / "figures.json"
+    assert __main__.main(["--json", str(file)]) == 1
+    assert json.loads(file.read_text())["failed"] == "sigma_8"
+    assert "  not: sigma_8\n" in capsys.readouterr().out
+
+
+def test_a_figure_that_is_no_number_fails(found, tmp_path):
+    found["sigma_8"] = math.nan
+    file = tmp_path / "figures.json"
+    assert __main__.main(["--json", str(file)]) == 1
+    assert json.loads(file.read_text())["sigma_8"] is None
+
+
+def test_what_is_known_to_fail_is_reported_with_its_reason(found, tmp_path, monkeypatch, capsys):
+    (tmp_path / "list.csv").write_text(
+        "name,expected,kind,tolerance,source,known_to_fail\ngalaxies,20,absolute,1,a survey,it was cloudy\n"
+    )
+    monkeypatch.setattr(checks, "_LISTS", (tmp_path / "list.csv",))
+    assert __main__.main([]) == 0
+    said = capsys.readouterr().out
+    assert "FAIL galaxies" in said
+    assert "not: galaxies, known to fail: it was cloudy" in said
+    found["galaxies"] = 20.5
+    assert __main__.main([]) == 0
+    assert "listed as known to fail: galaxies" in capsys.readouterr().out
+
+
+def test_remembered_numbers_gate_nothing(found, tmp_path, monkeypatch, capsys):
+    head = "name,expected,kind,tolerance,source,known_to_fail,confidence\n"
+    for confidence, status in (("M", 0), ("P", 1)):
+        (tmp_path / "list.csv").write_text(f"{head}galaxies,40,factor,2,a survey,,{confidence}\n")
+        monkeypatch.setattr(checks, "_LISTS", (tmp_path / "list.csv",))
+        assert __main__.main([]) == status
+    found["galaxies"] = 21.0
+    assert __main__.main([]) == 0
+
+
+@pytest.mark.parametrize(
+    ("option", "name", "said"),
+    [
+        ("--json", "none/figures.json", "its folder is not there"),
+        ("--json", ".", "is no file"),
+        ("--figures", "file", "is no folder"),
+        ("--figures", "file/below", "is no folder"),
+        ("--json", "locked/figures.json", "cannot be written to"),
+        ("--figures", "locked/figures", "cannot be written to"),
+    ],
+)
+def test_paths_are_checked_before_anything_is_computed(monkeypatch, tmp_path, capsys, option, name, said):
+    monkeypatch.setattr(universe, "run", lambda *_: pytest.fail("computed"))
+    (tmp_path / "file").touch()
+    (tmp_path / "locked").mkdir()
+    # As another user than root finds it.
+    monkeypatch.setattr(os, "access", lambda folder, mode: "locked" not in str(folder))
+    assert __main__.main([option, str(tmp_path / name)]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert name in lines[0] or name == "."
+    assert said in lines[0]
+
+
+def test_the_recorded_figures_are_as_expected():
+    """Of the last full run: every expectation was measured, and what fails is what is known to."""
+    figures = json.loads(RECORDED.read_text())
+    results = checks.checks({name: value for name, value in figures.items() if isinstance(value, float)})
+    assert len(results) == figures["checks"]
+    assert [check.name for check in results if not check.passed] == [check.name for check in results if check.known]
+    assert figures["failed"].split(", ") == [check.name for check in results if not check.passed]

@@ -1,0 +1,1 @@
+"""Python interface: open a lake, run and check requests."""

@@ -1,0 +1,119 @@
+"""Check and run simulation requests from Python."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from lake_schema import user_files
+from lake_schema.errors import BadInput
+from lake_schema.store import layout
+from truesky.api.lake import Lake
+from truesky.commands import check as check_command
+from truesky.commands import run as run_command
+from truesky.commands import space, submit
+from truesky.render import plan_exposures
+from truesky.request import universe
+from truesky.request.from_toml import from_table, parse
+from truesky.request.schema import Request
+from truesky.running import shell
+
+
+def check(request: str | Path | Mapping[str, Any]) -> Request:
+    """Check a request as completely as the jobs do, without writing anything.
+
+    Parameters
+    ----------
+    request : str, Path or mapping
+        A TOML file, or the same keys as a dictionary. Relative file names in a dictionary start at the current folder.
+
+    Returns
+    -------
+    Request
+        The parsed request.
+
+    Raises
+    ------
+    BadInput
+        If any job would refuse the request. The message names the key and what is allowed.
+
+    Examples
+    --------
+    >>> import truesky
+    >>> area = {"cone": {"ra": 53.1, "dec": -27.8, "radius": 0.1}}
+    >>> truesky.check({"name": "field", "seed": 1, "area": area, "fluxes": {"bands": ["euclid_vis"]}}).seed
+    1
+    """
+    parsed = _parsed(request)
+    try:
+        check_command.refuse(parsed)
+    except BadInput as error:
+        raise BadInput(f"{_name(request)}: {error}") from None
+    return parsed
+
+
+def run(
+    request: str | Path | Mapping[str, Any],
+    lake: str | Path,
+    detectors: Sequence[str] = (),
+    limit: int | None = None,
+    lenses: bool = False,
+    gaia: bool = False,
+) -> Lake:
+    """Compute everything that a request asks for: catalogues, fluxes, the plan of the exposures, images.
+
+    The jobs share one Spark session in this process. Tables that the lake already has are kept, so a second call
+    continues where an interrupted one ended.
+
+    Parameters
+    ----------
+    request : str, Path or mapping
+        A TOML file, or the same keys as a dictionary.
+    lake : str or Path
+        Folder of the lake. It is created if it does not exist.
+    detectors : sequence of str, optional
+        Names of the detectors to render. The default is all planned detectors.
+    limit : int, optional
+        Largest number of detectors to render.
+    lenses : bool, optional
+        Also compute the table of strong lenses.
+    gaia : bool, optional
+        Also compute the stars as Gaia DR2 would list them.
+
+    Returns
+    -------
+    Lake
+        The lake, opened for this request.
+
+    Raises
+    ------
+    BadInput
+        If the request is wrong, the lake belongs to another universe, or the disc has too little room. Nothing is
+        computed then.
+    LakeError
+        If a job fails.
+    """
+    wanted = replace(check(request), detectors=tuple(detectors), limit=limit)
+    root = layout.lake(os.fspath(lake))
+    universe.refuse_others(root, wanted)
+    stages = run_command.stages(wanted, lenses, gaia)
+    rendered = stages[-1].name == run_command.IMAGES[-1].name
+    space.check(root, wanted, plan_exposures.check(wanted, root) if rendered else None)
+    submit.use_environment()
+    for stage in stages:
+        shell.run(import_module(stage.module).JOB, root, stage.request(wanted))
+    return Lake(root, request=wanted.name)
+
+
+def _parsed(request: str | Path | Mapping[str, Any]) -> Request:
+    if isinstance(request, Mapping):
+        return from_table(dict(request))
+    return parse(Path(request))
+
+
+def _name(request: str | Path | Mapping[str, Any]) -> str:
+    return "request" if isinstance(request, Mapping) else f"request {user_files.shown(Path(request))}"

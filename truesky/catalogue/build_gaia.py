@@ -1,0 +1,54 @@
+"""Build the table `gaia` of a lake's stars: spark-submit jobs/catalogue/build_gaia.py --lake LAKE --request REQUEST.
+
+The request's fluxes.bands must have held gaia_g, gaia_bp and gaia_rp.
+"""
+
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from lake_schema import sky
+from lake_schema.errors import BadInput
+from lake_schema.store import layout, read
+from lake_schema.store.plan import Json, Output, Part, Plan
+from lake_schema.store.provenance import code_version
+from lake_schema.tables.gaia import GAIA
+from truesky.catalogue.stars import gaia
+from truesky.request import universe
+from truesky.request.schema import Request
+from truesky.running.shell import Job, Step
+
+
+def steps(lake: Path, request: Request) -> list[Step]:
+    """One part a file of the stars."""
+    stars, fluxes = (read.for_request(lake, name, request.name) for name in ("stars", "star_fluxes"))
+    universe.refuse_other([stars], request)
+    if missing := [name for name in gaia.FLUX_COLUMNS if name not in fluxes.schema.names]:
+        raise BadInput(
+            f"table star_fluxes has no column {', '.join(missing)}: put {', '.join(gaia.BANDS)} into fluxes.bands and "
+            "run compute_fluxes"
+        )
+    if fluxes.manifest["facts"].get("input") != stars.key:
+        raise BadInput("table star_fluxes was computed from another version of stars: run compute_fluxes first")
+    facts = {"seed": request.seed, "stars": stars.key, "star_fluxes": fluxes.key, "code": code_version()}
+    parts = tuple(Part(name, {"part": name}) for name in stars.parts)
+    return [Step(Plan(GAIA, facts, parts), work)]
+
+
+def work(lake: Path, facts: Json) -> Output:
+    """What Gaia finds in a file's cell: also stars from beside it, whose measured place may lie inside."""
+    part = facts["part"]
+    stars = _rows(read.version(lake, "stars", facts["stars"]), part, gaia.STAR_COLUMNS)
+    fluxes = _rows(read.version(lake, "star_fluxes", facts["star_fluxes"]), part, gaia.FLUX_COLUMNS)
+    rows = gaia.observe(stars, fluxes, facts["seed"])
+    first, last = sky.cell_range(*layout.cell_of_file(part))
+    index = rows["_healpix_29"]
+    return Output(rows.filter(pc.and_(pc.greater_equal(index, first), pc.less(index, last))))
+
+
+def _rows(version: read.Version, part: str, columns: list[str]) -> pa.Table:
+    return pa.concat_tables([version.rows(columns, [part]), version.margin(part, columns)])
+
+
+JOB = Job("build_gaia", "List the stars as Gaia would.", steps)

@@ -1,0 +1,137 @@
+"""Write the table `gaia` for others: python -m truesky.catalogue.export_gaia --lake LAKE --out FILE
+
+table  CSV or FITS under the names of Gaia's archive, --release dr3 with DR3's columns in its order
+ldac   FITS_LDAC as SCAMP reads it (ASTREF_CATALOG FILE), with its own names of columns
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from pyarrow import csv
+
+from lake_schema import __version__, command, sky, user_files
+from lake_schema.columns import Table
+from lake_schema.errors import BadInput
+from lake_schema.fits.tables import table_to_fits
+from lake_schema.store import layout, read
+from lake_schema.tables.gaia import EXPORT, EXPORT_DR3, PARAMETERS
+from truesky.catalogue import parameters
+from truesky.catalogue.exports import ldac
+from truesky.catalogue.stars import gaia
+
+RELEASES = {"dr2": EXPORT, "dr3": EXPORT_DR3}
+FORMS = {"table": (".csv", ".fits"), "ldac": (".fits", ".cat", ".ldac")}
+_MAS = np.pi / 180.0 / 3.6e6
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Exit status: 0 done, 1 something is wrong with the lake, 2 the call is wrong."""
+    parser = argparse.ArgumentParser(
+        prog="export_gaia",
+        description=__doc__,
+        epilog=f"truesky {__version__}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--lake", required=True, help="folder of the lake")
+    parser.add_argument("--name", help="of the request whose stars are meant, where the lake has several")
+    parser.add_argument("--out", required=True, type=Path, help="file to write: .csv or .fits; ldac .fits, .cat, .ldac")
+    parser.add_argument("--form", default="table", choices=FORMS)
+    parser.add_argument("--release", default="dr2", choices=RELEASES, help="whose columns; the values are those of DR2")
+    parser.add_argument("--epoch", type=float, help="year to which stars are carried by their measured motions: "
+                        "for programs that take references where they are")  # fmt: skip
+    options = parser.parse_args(argv)
+
+    def exported() -> int:
+        lake, declared = layout.lake(options.lake), RELEASES[options.release]
+        rows = export(lake, options.out, declared, options.form, options.epoch, options.name)
+        print(f"{options.out}: {rows:,} stars")
+        return 0
+
+    return command.status("export_gaia", exported)
+
+
+def export(
+    lake: Path, path: Path, declared: Table = EXPORT, form: str = "table", epoch: float | None = None,
+    request: str | None = None,
+) -> int:  # fmt: skip
+    """Write the published table `gaia` to a file, replaced in one rename; returns its rows.
+
+    lake     : root of the lake
+    path     : of the file, with an ending of its form
+    declared : the columns of form "table"
+    form     : "table" or "ldac"
+    epoch    : year to which stars are carried by their proper motions, None = that of the catalogue
+    request  : whose stars, where a lake has those of several
+    Errors   : BadInput for another ending than those of FORMS, an epoch that no proper motion reaches, and where the
+               table is one without proper motions
+    """
+    user_files.target(path, FORMS[form])
+    if epoch is not None and not 1900.0 <= epoch <= 2100.0:
+        raise BadInput(f"epoch {epoch:g} is not in [1900, 2100]")
+    version = read.version(lake, "gaia", request=request)
+    parts = (_named(version, part, epoch) for part in version.parts)
+    if form == "ldac":
+        ldac.write(path, pa.concat_tables(list(parts)))
+    elif path.suffix.lower() == ".fits":
+        table_to_fits(path, pa.concat_tables([part.select(declared.names) for part in parts]), declared)
+    else:
+        with user_files.staged(path) as temporary, csv.CSVWriter(temporary, declared.arrow()) as writer:
+            for part in parts:
+                writer.write_table(_as(part, declared))
+    return version.num_rows
+
+
+def _as(rows: pa.Table, declared: Table) -> pa.Table:
+    return declared.build({name: rows[name] for name in declared.names})
+
+
+def _named(version: read.Version, part: str, epoch: float | None) -> pa.Table:
+    """Rows of a part with every column that any release has."""
+    rows = version.rows(parts=[part])
+    if rows.num_rows and rows["ruwe"].null_count:
+        raise BadInput("table gaia has no proper motions: it was built before it had them; run build_gaia again")
+    columns: dict[str, Any] = {name: rows[name] for name in rows.column_names}
+    columns |= {"source_id": rows["id"], "bp_rp": pc.subtract(rows["phot_bp_mean_mag"], rows["phot_rp_mean_mag"])}
+    own_epoch = parameters.section("gaia.toml", "astrometry")["epoch"]
+    columns["ref_epoch"] = pa.array(np.full(rows.num_rows, own_epoch if epoch is None else epoch))
+    if epoch is not None:
+        columns["ra"], columns["dec"] = map(pa.array, _after(rows, epoch - own_epoch))
+    known = pc.is_valid(rows["pmra"])
+    columns |= _correlations(known)
+    for band, short in enumerate(("g", "bp", "rp")):
+        name = f"phot_{short}_mean"
+        flux = gaia.mean_flux(pc.fill_null(rows[f"{name}_mag"], np.nan).to_numpy(), band)
+        error = flux / pc.fill_null(rows[f"{name}_flux_over_error"], np.nan).to_numpy()
+        columns |= {
+            f"{name}_flux": pa.array(flux, mask=np.isnan(flux)),
+            f"{name}_flux_error": pa.array(error, mask=np.isnan(flux)),
+        }
+    columns["parallax_over_error"] = pc.divide(rows["parallax"], rows["parallax_error"]).cast(pa.float32())
+    columns["pm"] = pc.sqrt(pc.add(pc.power(rows["pmra"], 2), pc.power(rows["pmdec"], 2))).cast(pa.float32())
+    columns["astrometric_params_solved"] = pc.if_else(known, 31, 3).cast(pa.int16())
+    return pa.table(columns)
+
+
+def _correlations(known: pa.ChunkedArray) -> dict[str, Any]:
+    """Errors are drawn one by one: where all five parameters are known their correlations are 0."""
+    zero = pc.if_else(known, pa.scalar(0.0, pa.float32()), pa.scalar(None, pa.float32()))
+    pairs = [(one, other) for i, one in enumerate(PARAMETERS) for other in PARAMETERS[i + 1 :]]
+    position = pa.array(np.zeros(len(known), np.float32))
+    return {f"{one}_{other}_corr": position if (one, other) == ("ra", "dec") else zero for one, other in pairs}
+
+
+def _after(rows: pa.Table, years: float) -> tuple[Any, Any]:
+    """Positions to which the proper motions lead in so many years."""
+    east, north = (_MAS * years * pc.fill_null(rows[name], 0.0).to_numpy() for name in ("pmra", "pmdec"))
+    return sky.displaced(rows["ra"].to_numpy(), rows["dec"].to_numpy(), east, north)
+
+
+if __name__ == "__main__":
+    command.leave(main)

@@ -1,0 +1,309 @@
+"""Galaxies and stars of a lake as LSST DESC skyCatalogs 2 (schema 1.3.0) opens them.
+
+write    galaxy_N.parquet, galaxy_flux_N.parquet, pointsource_N.parquet, pointsource_flux_N.parquet for each Nside-32
+         pixel N (ring) of the place that is observed, seds/ with the spectra of the stars, and skyCatalog.yaml
+
+Components of a galaxy are bulge and disk, whose spectra add up to the galaxy's; there are no knots. The reader computes
+fluxes from the spectra, and takes those of the flux files where it is asked for an LSST band that they have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import yaml
+
+from lake_schema import __version__, position_columns, sky, user_files
+from lake_schema.arrays import Float
+from lake_schema.errors import BadInput
+from lake_schema.store import layout, names, read
+from lake_schema.units import LIGHT_KM_S, electron_rate
+from truesky.catalogue.exports import stellar_spectra, tophat
+from truesky.fluxes import bulges, cosmology, inputs, passbands
+from truesky.fluxes.spectra.extinction import MILKY_WAY_R_V
+
+# Of the pixels: Nside 32.
+ORDER = 5
+# Rows of a row group, of which the reader takes one at a time.
+_GROUP = 20_000
+# What GalSim draws has a size, arcsec.
+_SMALLEST = 1e-3
+_Maker = Callable[[pa.Table], pa.Table]
+
+
+@dataclass(frozen=True, slots=True)
+class _Catalogue:
+    """A table of the lake beside its fluxes, row by row; place : columns of the observed position."""
+
+    rows: read.Version
+    fluxes: read.Version
+    place: tuple[str, str]
+    bands: list[str] = field(default_factory=list)
+
+    def part(self, name: str) -> pa.Table:
+        """Rows of a part, with the columns f_nu_<band> behind them."""
+        rows = self.rows.rows(parts=[name])
+        found = self.fluxes.rows(["id", *(f"f_nu_{band}" for band in self.bands)], [name])
+        if not found["id"].equals(rows["id"]):
+            raise BadInput(f"table {self.fluxes.table}: {name} does not hold the rows of table {self.rows.table}")
+        for band in self.bands:
+            rows = rows.append_column(f"f_nu_{band}", found[f"f_nu_{band}"])
+        return rows
+
+    def pixels(self, rows: pa.Table) -> np.ndarray:
+        """Nested pixel[n] of rows."""
+        ra, dec = (rows[name].to_numpy() for name in self.place)
+        return sky.cell_of(ra, dec, ORDER)
+
+
+def write(lake: Path, folder: Path, request: str | None = None) -> list[Path]:
+    """Write the set, each file replaced in one rename, the document last; returns the files.
+
+    Errors: BadInput where fluxes are missing, or those of other rows
+    """
+    found = {kind: _catalogue(lake, kind, request) for kind in ("galaxy", "star") if _has(lake, kind, request)}
+    if "galaxy" not in found:
+        raise BadInput(f"lake {lake} has no table galaxies")
+    folder.mkdir(parents=True, exist_ok=True)
+    written, about, templates = [], {}, set[int]()
+    for kind, catalogue in found.items():
+        makers = _galaxy_rows(lake, catalogue) if kind == "galaxy" else _star_rows(lake, catalogue)
+        stem = {"galaxy": "galaxy", "star": "pointsource"}[kind]
+        for pixel, rows in _by_pixel(catalogue):
+            number = sky.ring_of(ORDER, pixel)
+            if kind == "star":
+                templates.update(np.unique(rows["sed"].to_numpy()).tolist())
+            for name, maker in zip((f"{stem}_{number}", f"{stem}_flux_{number}"), makers, strict=True):
+                written.append(_parquet(folder / f"{name}.parquet", rows, maker))
+        about[kind] = _object_type(kind, stem)
+    if "star" in found:
+        library = inputs.stars_of(lake, found["star"].fluxes.manifest["facts"])
+        written += stellar_spectra.write(folder, library, sorted(templates))
+    document = folder / "skyCatalog.yaml"
+    text = f"# Written by truesky {__version__}\n" + yaml.safe_dump(_document(about), sort_keys=False)
+    written.append(_replaced(document, lambda path: path.write_text(text, encoding="utf-8")))
+    return written
+
+
+# ------------------------------------------------------------------------------------------------ rows by pixel
+
+
+def _has(lake: Path, kind: str, request: str | None) -> bool:
+    table = {"galaxy": "galaxies", "star": "stars"}[kind]
+    own = (
+        layout.current_key(lake, table) if request is None else names.key_of(lake, names.checked(lake, request), table)
+    )
+    return own is not None
+
+
+def _catalogue(lake: Path, kind: str, request: str | None) -> _Catalogue:
+    rows = read.version(lake, {"galaxy": "galaxies", "star": "stars"}[kind], request=request)
+    fluxes = read.version(lake, f"{kind}_fluxes", request=request)
+    if fluxes.manifest["facts"].get("input") != rows.key:
+        raise BadInput(
+            f"table {fluxes.table} was computed from another version of {rows.table}: run compute_fluxes first"
+        )
+    bands = [name.removeprefix("f_nu_") for name in fluxes.schema.names if name.startswith("f_nu_lsst_")]
+    if not bands:
+        raise BadInput(f"table {fluxes.table} has no LSST band: put lsst_r into fluxes.bands and run compute_fluxes")
+    position_columns.refuse_mixed([rows, fluxes])
+    return _Catalogue(rows, fluxes, rows.place(), bands)
+
+
+def _by_pixel(catalogue: _Catalogue) -> Iterator[tuple[int, pa.Table]]:
+    """(nested pixel, its rows) of every pixel that has some."""
+    strays = _strays(catalogue)
+    for parts in _together(catalogue.rows.parts).values():
+        rows = pa.concat_tables([catalogue.part(part) for part in parts])
+        at, own = catalogue.pixels(rows), _pixels_of(parts[0])
+        for pixel in np.unique(at[(at >= own[0]) & (at < own[1])]).tolist():
+            yield pixel, pa.concat_tables([rows.filter(pa.array(at == pixel)), *strays.pop(pixel, [])])
+    for pixel, tables in sorted(strays.items()):
+        yield pixel, pa.concat_tables(tables)
+
+
+def _strays(catalogue: _Catalogue) -> dict[int, list[pa.Table]]:
+    """Rows by the pixel in which they are seen, of those that an earlier lake keeps where they would be unlensed."""
+    found: dict[int, list[pa.Table]] = {}
+    if catalogue.place == ("ra", "dec"):
+        return found
+    for part in catalogue.rows.parts:
+        at, own = catalogue.pixels(catalogue.rows.rows(list(catalogue.place), [part])), _pixels_of(part)
+        away = (at < own[0]) | (at >= own[1])
+        if away.any():
+            rows = catalogue.part(part).filter(pa.array(away))
+            for pixel in np.unique(at[away]).tolist():
+                found.setdefault(pixel, []).append(rows.filter(pa.array(at[away] == pixel)))
+    return found
+
+
+def _together(parts: Iterable[str]) -> dict[tuple[int, int], list[str]]:
+    """Parts that lie in one pixel, or alone where they are larger."""
+    found: dict[tuple[int, int], list[str]] = {}
+    for part in parts:
+        order, cell = layout.cell_of_file(part)
+        coarse = min(order, ORDER)
+        found.setdefault((coarse, cell >> 2 * (order - coarse)), []).append(part)
+    return found
+
+
+def _pixels_of(part: str) -> tuple[int, int]:
+    """First pixel of those inside a part's cell, and the one after the last; the pixel around a smaller cell."""
+    order, cell = layout.cell_of_file(part)
+    if order > ORDER:
+        order, cell = ORDER, cell >> 2 * (order - ORDER)
+    return cell << 2 * (ORDER - order), (cell + 1) << 2 * (ORDER - order)
+
+
+# ------------------------------------------------------------------------------------------------ columns
+
+
+def _galaxy_rows(lake: Path, catalogue: _Catalogue) -> tuple[_Maker, _Maker]:
+    library = inputs.library_of(lake, catalogue.fluxes.manifest["facts"])
+
+    def rows(given: pa.Table) -> pa.Table:
+        light = tophat.luminosities(given, library)
+        share = bulges.in_bins(given, tophat.templates_in_bins(library), library)
+        spectra = {"sed_val_bulge": _lists(light * share), "sed_val_disk": _lists(light * (1.0 - share))}
+        return pa.table({**_shapes(given, catalogue.place), **spectra})
+
+    return rows, _fluxes("galaxy_id", catalogue.bands)
+
+
+def _shapes(given: pa.Table, place: tuple[str, str]) -> dict[str, Any]:
+    """Columns of galaxies but for their spectra; place : columns of the observed position.
+
+    Sizes are half-light radii; shears are in GalSim's frame, whose x axis points west. Ellipticities are
+    (a - b) / (a + b) along north and north-east: the reader turns them by 90 degrees.
+    """
+    c: dict[str, Any] = {name: given[name].to_numpy() for name in given.column_names if not given[name].null_count}
+    angle = c["position_angle"].astype(float)
+    columns = {
+        "galaxy_id": c["id"],
+        "ra": c[place[0]],
+        "dec": c[place[1]],
+        "redshift": c["z_obs"].astype(np.float64),
+        "redshift_hubble": np.maximum(c["z_true"].astype(np.float64), tophat.NEAREST),
+        "peculiar_velocity": LIGHT_KM_S * ((1.0 + c["z_obs"].astype(float)) / (1.0 + c["z_true"]) - 1.0),
+        "shear_1": c["gamma1"].astype(np.float64),
+        "shear_2": -c["gamma2"].astype(np.float64),
+        "convergence": c["kappa"].astype(np.float64),
+        "position_angle_unlensed": (angle + 90.0) % 180.0,
+        "MW_rv": np.full_like(c["a_v"], MILKY_WAY_R_V),
+        "MW_av": c["a_v"],
+        "sersic_bulge": c["bulge_sersic_index"],
+        "sersic_disk": np.ones_like(c["a_v"]),
+    }
+    for name in ("bulge", "disk"):
+        size, ratio = np.maximum(c[f"{name}_half_light_radius"], np.float32(_SMALLEST)), c[f"{name}_axis_ratio"]
+        ellipticity = (1.0 - ratio.astype(float)) / (1.0 + ratio.astype(float))
+        columns[f"size_{name}_true"] = size
+        columns[f"size_minor_{name}_true"] = size * ratio
+        columns[f"ellipticity_1_{name}_true"] = ellipticity * np.cos(2.0 * np.radians(angle))
+        columns[f"ellipticity_2_{name}_true"] = ellipticity * np.sin(2.0 * np.radians(angle))
+    return columns
+
+
+def _star_rows(lake: Path, catalogue: _Catalogue) -> tuple[_Maker, _Maker]:
+    library = inputs.stars_of(lake, catalogue.fluxes.manifest["facts"])
+
+    def rows(given: pa.Table) -> pa.Table:
+        n, sed = given.num_rows, given["sed"].to_numpy()
+        return pa.table(
+            {
+                "object_type": pa.array(["star"] * n),
+                "id": given["id"],
+                "ra": given["ra"],
+                "dec": given["dec"],
+                "magnorm": stellar_spectra.magnorm(given, library),
+                "MW_rv": np.full(n, MILKY_WAY_R_V, np.float32),
+                "MW_av": given["a_v"],
+                "sed_filepath": pa.array([stellar_spectra.file_of(k) for k in sed.tolist()]),
+            }
+        )
+
+    return rows, _fluxes("id", catalogue.bands)
+
+
+def _fluxes(identifier: str, bands: list[str]) -> _Maker:
+    """Photons per second and cm2 through the whole system, magnified and behind the dust on the way."""
+    width = {band: passbands.log_width(passbands.load(band)) for band in bands}
+
+    def rows(given: pa.Table) -> pa.Table:
+        columns = {
+            f"lsst_flux_{band[-1]}": electron_rate(given[f"f_nu_{band}"].to_numpy(), 1.0, width[band]) for band in bands
+        }
+        return pa.table({identifier: given["id"], **{k: v.astype(np.float32) for k, v in columns.items()}})
+
+    return rows
+
+
+def _lists(values: Float) -> pa.Array:
+    offsets = np.arange(len(values) + 1, dtype=np.int32) * np.int32(values.shape[1])
+    return pa.ListArray.from_arrays(offsets, values.astype(np.float32).ravel())
+
+
+# ------------------------------------------------------------------------------------------------ files
+
+
+def _document(object_types: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "catalog_name": "skyCatalog",
+        "catalog_dir": ".",
+        "skycatalog_root": ".",
+        "schema_version": "1.3.0",
+        "object_types": object_types,
+    }
+
+
+def _object_type(kind: str, stem: str) -> dict[str, Any]:
+    common = {
+        "file_template": rf"{stem}_(?P<healpix>\d+).parquet",
+        "flux_file_template": rf"{stem}_flux_(?P<healpix>\d+).parquet",
+        "data_file_type": "parquet",
+        "area_partition": {"type": "healpix", "ordering": "ring", "nside": 1 << ORDER},
+        "MW_extinction": "F19",
+        "provenance": {"versioning": {"schema_version": "1.3.0", "code_version": f"truesky {__version__}"}},
+    }
+    if kind == "star":
+        spectra = {"sed_model": "file_nm", "file_nm": {"units": "nm"}, "sed_file_root_env_var": "SIMS_SED_LIBRARY_DIR"}
+        return {**common, **spectra, "internal_extinction": "None"}
+    edges = tophat.edges()
+    bins = np.stack([edges[:-1], np.diff(edges)], axis=1).tolist()
+    return {
+        **common,
+        "composite": {"bulge": "required", "disk": "required"},
+        "Cosmology": {
+            "H0": 100.0 * cosmology.HUBBLE,
+            "Om0": cosmology.OMEGA_M,
+            "Ob0": cosmology.OMEGA_B,
+            "sigma8": cosmology.SIGMA_8,
+            "n_s": cosmology.SPECTRAL_INDEX,
+        },
+        "tophat": {"units": "angstrom", "bin_parameters": ["start", "width"], "bins": bins},
+    }
+
+
+def _parquet(path: Path, rows: pa.Table, maker: _Maker) -> Path:
+    """A file whose row groups are those of the file beside it, made one at a time."""
+
+    def fill(temporary: Path) -> None:
+        first = maker(rows.slice(0, _GROUP))
+        with pq.ParquetWriter(temporary, first.schema, compression="zstd") as out:
+            out.write_table(first, row_group_size=_GROUP)
+            for start in range(_GROUP, rows.num_rows, _GROUP):
+                out.write_table(maker(rows.slice(start, _GROUP)), row_group_size=_GROUP)
+
+    return _replaced(path, fill)
+
+
+def _replaced(path: Path, fill: Callable[[Path], Any]) -> Path:
+    with user_files.staged(path) as temporary:
+        fill(temporary)
+    return path

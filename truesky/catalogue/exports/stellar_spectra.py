@@ -1,0 +1,70 @@
+"""Spectra of stars as skyCatalogs reads them: a text file a template, and the magnitude that each star scales it to.
+
+write       seds/star_K.txt, a line each 1 nm: wavelength nm, f_lambda
+file_of     its path below the folder that SIMS_SED_LIBRARY_DIR names
+magnorm     AB magnitude of each star at 500 nm, before extinction
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from lake_schema import units, user_files
+from lake_schema.arrays import Float
+from lake_schema.units import LIGHT_ANGSTROM_S
+from truesky.fluxes.calibration import star_scale
+from truesky.fluxes.libraries.templates import Library
+from truesky.fluxes.sources import stars_of
+
+# Samples of a template, 1 A apart, that make one of the file; where its level is taken, A.
+_EACH, _LEVEL = 10, 5000.0
+# Of a template's highest sample, the least that a sample is.
+_DARK = 1e-12
+
+
+def file_of(sed: int) -> str:
+    """The path of a template's file."""
+    return f"seds/star_{sed:03d}.txt"
+
+
+def write(folder: Path, library: Library, templates: Sequence[int]) -> list[Path]:
+    """Write some templates of a library, each replaced in one rename; returns the files."""
+    wavelength, flux = _sampled(library)
+    (folder / "seds").mkdir(exist_ok=True)
+    written = []
+    for k in templates:
+        path = folder / file_of(k)
+        lines = (f"{at:.1f} {value:.7e}" for at, value in zip(wavelength / 10.0, flux[k], strict=True))
+        with user_files.staged(path) as temporary:
+            temporary.write_text(f"# {library.names[k]}: nm, f_lambda\n" + "\n".join(lines) + "\n", encoding="utf-8")
+        written.append(path)
+    return written
+
+
+def magnorm(stars: pa.Table, library: Library) -> Float:
+    """float64[n] mag of rows of the table `stars`."""
+    rows = stars_of(stars, library)
+    wavelength, flux = _sampled(library)
+    level = flux[:, int(np.searchsorted(wavelength, _LEVEL))]
+    f_nu = star_scale(rows, library) * (rows.frac * level[rows.sed]).sum(0) * _LEVEL**2 / LIGHT_ANGSTROM_S
+    return np.asarray(-2.5 * np.log10(f_nu) - units.AB_CGS)
+
+
+def _sampled(library: Library) -> tuple[Float, Float]:
+    """(A; f_lambda[template]) every 10 A, the mean of the samples about each."""
+    half = _EACH // 2
+    start = int((_LEVEL - library.wavelength[0] - half) % _EACH)
+    count = (library.flux.shape[1] - start - 1) // _EACH
+    # The two samples at the ends of a stretch belong half to its neighbours.
+    weights = np.full(_EACH + 1, 1.0 / _EACH)
+    weights[[0, -1]] *= 0.5
+    flux = np.zeros((len(library), count))
+    for k, weight in enumerate(weights):
+        flux += weight * library.flux[:, start + k : start + k + _EACH * count : _EACH]
+    # A template that is dark where its level is taken has one all the same.
+    flux = np.maximum(flux, _DARK * flux.max(axis=1, keepdims=True))
+    return library.wavelength[start + half :: _EACH][:count], flux

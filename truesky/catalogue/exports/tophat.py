@@ -1,0 +1,217 @@
+"""Spectra of galaxies as skyCatalogs holds them: the luminosity in each of a row of rest-frame bins.
+
+edges          of the bins: equal in the logarithm between breaks and windows about the emission lines
+luminosities   rows of `galaxies` -> L_nu of each bin
+templates_in_bins   of a library, behind no dust
+
+The reader makes f_lambda constant in each bin, dims it by its luminosity distance, redshifts it, and puts the Milky
+Way's dust before it. A bin holds the photons of the spectrum inside it, so a band that is smooth over a bin sees
+what it would see of the spectrum itself.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import pyarrow as pa
+
+from lake_schema.arrays import Float, Float32
+from lake_schema.units import LIGHT_ANGSTROM_S
+from truesky.fluxes import cosmology, high_redshift, passbands
+from truesky.fluxes.calibration import continuum_scale
+from truesky.fluxes.libraries.templates import Library
+from truesky.fluxes.sources import GALAXY_KINDS, Galaxies, column, galaxies_of
+from truesky.fluxes.spectra import extinction, intergalactic, lines
+from truesky.fluxes.spectra.continuum import COMPONENTS, REFERENCE_BAND, amplitudes, dust_of, observed_shape, within
+from truesky.numerics import sums
+
+# Of the first and last bin, A: the ultraviolet of galaxies at z = 6, the infrared of near ones.
+FIRST, LAST = 450.5, 24499.5
+# Of a bin, in ln(wavelength); half a window about a line, a fraction of its wavelength: 4 sigma of 300 km/s.
+_STEP, _WINDOW = 0.02, 0.004
+# Where spectra break, A: the Lyman limit, the lines of its series, redward of which hydrogen on the way absorbs less,
+# Lyman alpha with the red half of its line, narrow or wide, the Balmer limit.
+_SERIES = (917.5, 919.5, 920.5, 923.5, 926.5, 930.5, 937.5, 949.5, 972.5, 1025.5)
+_RED_OF_ALPHA = (1216.5, 1217.5, 1219.5, 1222.5, 1226.5, 1231.5, 1236.5, 1241.5, 1246.5, 1251.5, 1260.5)
+_BREAKS = tuple((at, at) for at in (912.0, *_SERIES, 1215.5, *_RED_OF_ALPHA, 3646.0))
+# L_nu is in units of this, W/Hz: GCR Catalogs, SCHEMA.md.
+TOPHAT_W_HZ = 4.4659e13
+_MPC_CM = 3.085677581491367e24
+_ERG_W = 1e7
+# Nearer than this no luminosity distance is worth the name.
+NEAREST = 1e-5
+# Rows whose spectra are made at a time: 25 MB an array.
+_BLOCK = 128
+# Of Fitzpatrick et al. 2019, A.
+_F19_RANGE, _F19_STEP = (1150.0, 33333.0), 5.0
+_LYMAN_ALPHA = 1215.67
+
+
+@lru_cache(maxsize=1)
+def edges() -> Float:
+    """float64[n + 1] A, half-way between the samples of the templates."""
+    lowest, highest = (1.0 + sign * _WINDOW for sign in (-1.0, 1.0))
+    about = [(line.vacuum * lowest, line.vacuum * highest) for line in lines.line_list()]
+    windows: list[list[float]] = []
+    for low, high in sorted([*about, *_BREAKS]):
+        if windows and low < windows[-1][1]:
+            windows[-1][1] = high
+        else:
+            windows.append([low, high])
+    found, at = [FIRST], FIRST
+    for low, high in [*windows, [LAST, LAST]]:
+        count = int(np.ceil(np.log(low / at) / _STEP))
+        found += [*np.geomspace(at, low, count + 1)[1:].tolist(), high]
+        at = high
+    return np.unique(np.floor(np.array(found)) + 0.5)
+
+
+def luminosities(galaxies: pa.Table, library: Library) -> Float:
+    """L_nu of the light of rows of `galaxies`, float64[n, bins] in 4.4659e13 W/Hz, before magnification.
+
+    galaxies : of any kind;  library : of the kinds central, satellite and strong lens
+    The Milky Way's law is the reader's (Fitzpatrick et al. 2019): what ours has more at a bin's wavelength is in here.
+    """
+    out = np.empty((galaxies.num_rows, len(edges()) - 1))
+    for start in range(0, galaxies.num_rows, _BLOCK):
+        rows = galaxies.slice(start, _BLOCK)
+        z, a_v = column(rows, "z_obs"), column(rows, "a_v")
+        usual = np.isin(column(rows, "kind"), GALAXY_KINDS)
+        f_lambda = np.empty((len(z), out.shape[1]))
+        if usual.any():
+            f_lambda[usual] = _galaxies(galaxies_of(rows.filter(pa.array(usual)), library), library)
+        if not usual.all():
+            f_lambda[~usual] = _high_redshift(rows.filter(pa.array(~usual)))
+        f_lambda *= extinction.transmitted(_excess(z), a_v[:, None])
+        out[start : start + _BLOCK] = f_lambda * _to_l_nu(z, column(rows, "z_true"))
+    return out
+
+
+def _galaxies(rows: Galaxies, library: Library) -> Float:
+    """f_lambda as observed, before magnification and the Milky Way, in each bin: float64[n, bins] erg s-1 cm-2 A-1."""
+    reference, dust = passbands.load(REFERENCE_BAND), dust_of(library)
+    amplitude = amplitudes(rows.mix, reference, library, dust)
+    # Of order 1 whatever the units, so that single precision does not underflow.
+    amplitude /= amplitude.sum(0)
+    spectra, dust_in_bins = _in_bins(library)
+    total = np.zeros((len(rows), len(edges()) - 1))
+    for k in range(len(COMPONENTS)):
+        behind = extinction.transmitted(dust_in_bins[rows.mix.law[k]], rows.mix.ebv[k][:, None])
+        total += amplitude[k][:, None] * spectra[rows.mix.sed[k]] * behind
+    count = len(reference.wavelength)
+    shape = observed_shape(rows.mix, amplitude, library, dust, int(reference.wavelength[0]), count)
+    scale = continuum_scale(rows.mag_r01, sums.product(shape, passbands.weights(reference)))
+    z = rows.mix.z_obs
+    total *= (scale / (1.0 + z))[:, None]
+    if library.intergalactic:
+        total *= _between_galaxies(z)
+    return total + _line_light(rows.lines) / (1.0 + z)[:, None]
+
+
+def templates_in_bins(library: Library) -> Float:
+    """f_lambda of each template in each bin, float64[template, bins]."""
+    return _in_bins(library)[0]
+
+
+@lru_cache(maxsize=2)
+def _in_bins(library: Library) -> tuple[Float, Float]:
+    """Templates and their laws of dust in bins: dust is smooth over one, so its mean is what it does."""
+    return binned(library.flux, library.wavelength), binned(dust_of(library), library.wavelength)
+
+
+def _high_redshift(galaxies: pa.Table) -> Float:
+    """The same of quasars and of galaxies beyond z = 6."""
+    kind, z, mag, sed = (column(galaxies, name) for name in ("kind", "z_obs", "mag_r01", "sed_1"))
+    out = np.empty((len(z), len(edges()) - 1))
+    for code in high_redshift.MAGNITUDE_AT:
+        here = kind == code
+        templates, spectra = _templates(code)
+        which = sed[here].astype(np.int64)
+        within("sed_1", sed[here], 0, len(templates) - 1)
+        out[here] = high_redshift.scale(code, templates, which, mag[here], z[here])[:, None] * spectra[which]
+        if code == high_redshift.QUASAR and here.any():
+            out[here] *= _between_galaxies(z[here])
+    return out
+
+
+@lru_cache(maxsize=2)
+def _templates(kind: int) -> tuple[Library, Float]:
+    """The library of a kind beyond the galaxies', and its spectra in bins."""
+    made = high_redshift.quasar_library if kind == high_redshift.QUASAR else high_redshift.high_redshift_library
+    library = made()
+    return library, binned(library.flux, library.wavelength)
+
+
+def binned(spectra: Float32, wavelength: Float) -> Float:
+    """f_lambda that gives each bin the photons of the spectra in it: float64[n, bins].
+
+    spectra : [n, m] f_lambda at wavelength[m], whole A in steps of 1
+    """
+    starts = np.floor(edges() + 0.5 - wavelength[0]).astype(np.int64)
+    inside, at = slice(starts[0], starts[-1]), starts[:-1] - starts[0]
+    photons = np.add.reduceat(spectra[:, inside] * wavelength[inside], at, axis=1)
+    return np.asarray(photons / np.add.reduceat(wavelength[inside], at))
+
+
+def _line_light(fluxes: Float) -> Float:
+    """f_lambda[n, bins] of lines whose photons all fall into the bin of their wavelength, rest frame.
+
+    fluxes : float64[n, lines] erg s-1 cm-2
+    """
+    vacuum = np.array([line.vacuum for line in lines.line_list()])
+    which = np.searchsorted(edges(), vacuum) - 1
+    low, high = edges()[which], edges()[which + 1]
+    out = np.zeros((len(fluxes), len(edges()) - 1))
+    for k, place in enumerate(which.tolist()):
+        out[:, place] += fluxes[:, k] * vacuum[k] / (0.5 * (high[k] ** 2 - low[k] ** 2))
+    return out
+
+
+def _between_galaxies(z: Float) -> Float:
+    """Mean transmission of the intergalactic medium in each bin: float64[n, bins]."""
+    at = np.arange(1.0, np.ceil(_LYMAN_ALPHA * (1.0 + z.max())) + 2.0)
+    passed = intergalactic.transmission(at, z)
+    out = np.empty((len(z), len(edges()) - 1))
+    for i, seen in enumerate(passed):
+        # Beyond the series nothing absorbs.
+        total = np.append(0.0, np.cumsum(seen))
+        reach = edges() * (1.0 + z[i])
+        inside = np.interp(reach, np.append(at, at[-1] + 1.0) - 0.5, total)
+        inside += np.maximum(reach - at[-1] - 0.5, 0.0)
+        out[i] = np.diff(inside) / np.diff(reach)
+    return out
+
+
+def _excess(z: Float) -> Float:
+    """A(lambda) / A(V) of ours less the reader's at each bin's observed wavelength: float64[n, bins]."""
+    middle = _middle() * (1.0 + z)[:, None]
+    grid, difference = _laws()
+    return np.interp(middle, grid, difference)
+
+
+@lru_cache(maxsize=1)
+def _laws() -> tuple[Float, Float]:
+    """(A; A(lambda) / A(V) of ours less Fitzpatrick et al. 2019), R_V = 3.1, where that law is defined."""
+    # Slow to import.
+    import astropy.units as u
+    from dust_extinction.parameter_averages import F19
+
+    grid = np.arange(*_F19_RANGE, _F19_STEP)
+    curve = F19(Rv=extinction.MILKY_WAY_R_V)
+    return grid, extinction.milky_way(grid) - np.asarray(curve(1e4 / grid / u.um), float)
+
+
+def _to_l_nu(z_obs: Float, z_true: Float) -> Float:
+    """What turns f_lambda as observed (erg s-1 cm-2 A-1) into L_nu of a bin: float64[n, bins]."""
+    low, high = edges()[:-1], edges()[1:]
+    width = (high - low) / (LIGHT_ANGSTROM_S * (1.0 / low - 1.0 / high))
+    distance = cosmology.luminosity_distance(np.maximum(z_true, NEAREST)) / cosmology.HUBBLE * _MPC_CM
+    dimming = 4.0 * np.pi * distance**2 * (1.0 + z_obs) / (_ERG_W * TOPHAT_W_HZ)
+    return np.asarray(dimming[:, None] * width)
+
+
+def _middle() -> Float:
+    """Mean wavelength of each bin's photons, A."""
+    low, high = edges()[:-1], edges()[1:]
+    return 2.0 / 3.0 * (high**3 - low**3) / (high**2 - low**2)

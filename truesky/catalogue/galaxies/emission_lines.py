@@ -1,0 +1,321 @@
+"""Emission lines: H alpha from the star formation rate, matched to the observed counts; the others by ratios.
+
+model            the numbers and the stored table of the matching
+raw_halpha       log L of H alpha as the star formation rate gives it, behind the dust of the gas
+matched          the same, as many per redshift as are observed: a stored monotone table
+metallicity      of the gas, from stellar mass and star formation rate
+fluxes           observed fluxes of the catalogued lines
+added            mean f_nu of the lines in a band;  brightened : magnitudes with it
+expected_counts  galaxies per deg2 above an H alpha flux (Pozzetti et al. 2016, model 3)
+
+The table (halpha_matching.csv) is made by scripts/match_halpha.py from a sample without structure. All ratios are of
+one scale of metallicity: mixing two puts [O III] / H beta off by an order of magnitude.
+Ref: Kennicutt & Evans 2012; Garn & Best 2010; Curti et al. 2020; Pozzetti et al. 2016, A&A 590, A3; the numbers are
+in emission_lines.toml.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lake_schema.arrays import Bool, Float
+from lake_schema.units import AB_CGS, LIGHT_KM_S
+from truesky.catalogue import parameters
+from truesky.catalogue.interpolation import bracket
+from truesky.fluxes import cosmology, passbands
+from truesky.fluxes.passbands import Passband
+from truesky.fluxes.spectra import extinction, lines
+from truesky.randomness.keyed import Draws
+
+_FILE = "emission_lines.toml"
+MATCHING = Path(__file__).with_name("halpha_matching.csv")
+# Normal deviates of a galaxy: dust, H alpha, metallicity, N2, R3, R2, S2, [S III], He I.
+_DEVIATES = 9
+_CM_PER_MPC = 3.0856775814913673e24
+_L_NODES = np.linspace(38.0, 45.0, 1401)
+_Z_NODES = 400
+
+
+@dataclass(frozen=True, slots=True)
+class Halpha:
+    """emission_lines.toml, [halpha]."""
+
+    per_sfr: float
+    scatter: float
+    red_sfr: float
+
+
+@dataclass(frozen=True, slots=True)
+class Gas:
+    """emission_lines.toml, [gas]."""
+
+    pivot: float
+    limits: tuple[float, float]
+    polynomial: tuple[float, ...]
+    least: float
+    scatter: float
+
+
+@dataclass(frozen=True, slots=True)
+class Metals:
+    """emission_lines.toml, [metals]."""
+
+    highest: float
+    turn: float
+    sharpness: float
+    mass: float
+    mass_sfr: float
+    scatter: float
+    limits: tuple[float, float]
+    sun: float
+
+
+@dataclass(frozen=True, slots=True)
+class Ratios:
+    """emission_lines.toml, [ratios]."""
+
+    n2: tuple[float, ...]
+    n2_scatter: float
+    r3: tuple[float, ...]
+    r3_z: float
+    r3_z_last: float
+    r3_scatter: float
+    r2: tuple[float, ...]
+    r2_r3: float
+    r2_scatter: float
+    s2: tuple[float, ...]
+    s2_scatter: float
+
+
+@dataclass(frozen=True, slots=True)
+class Others:
+    """emission_lines.toml, [others]."""
+
+    siii: float
+    siii_scatter: float
+    siii_pair: float
+    hei: float
+    hei_5877: float
+    hei_scatter: float
+
+
+@dataclass(frozen=True, slots=True)
+class Pozzetti:
+    """emission_lines.toml, [pozzetti]."""
+
+    alpha: float
+    delta: float
+    log_phi: float
+    l_inf: float
+    beta: float
+    l_half: float
+    z_fit: float
+    hubble: float
+    omega_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LineModel:
+    """What lines are drawn from.
+
+    hydrogen : of each line over H beta, without dust
+    dust     : k of each column over that of H alpha
+    z : [r], log_l : [c], shift : [r, c] dex that the matching adds to log L
+    """
+
+    halpha: Halpha
+    gas: Gas
+    metals: Metals
+    ratios: Ratios
+    hydrogen: dict[str, float]
+    others: Others
+    dust: dict[str, float]
+    z: Float
+    log_l: Float
+    shift: Float
+
+
+def model(matching: Path = MATCHING) -> LineModel:
+    """The lines of the embedded universe."""
+    table = np.loadtxt(matching, delimiter=",")
+    return unmatched(table[1:, 0], table[0, 1:], table[1:, 1:])
+
+
+def unmatched(z: Float, log_l: Float, shift: Float) -> LineModel:
+    """The lines with a table of one's own; a shift of nothing leaves H alpha as it is drawn.
+
+    z : float[r];  log_l : float[l] log10 erg/s;  shift : float[r, l] dex
+    """
+    primaries = {line.column: line.vacuum for line in reversed(lines.line_list())}
+    k = extinction.laws(np.array(list(primaries.values())))[extinction.CALZETTI]
+    relative = dict(zip(primaries, (k / k[list(primaries).index("flux_halpha")]).tolist(), strict=True))
+    return LineModel(
+        Halpha(**parameters.section(_FILE, "halpha")),
+        Gas(**parameters.section(_FILE, "gas")),
+        Metals(**parameters.section(_FILE, "metals")),
+        Ratios(**parameters.section(_FILE, "ratios")),
+        parameters.section(_FILE, "hydrogen"),
+        Others(**parameters.section(_FILE, "others")),
+        relative,
+        z,
+        log_l,
+        shift,
+    )
+
+
+def dimming(gas: Gas, log_mass: Float, normal: Float) -> Float:
+    """A(H alpha)[n] mag of the gas.
+
+    gas : constants;  log_mass : float[n] log10 Msun;  normal : float[n] normal deviates
+    Ref: Garn & Best 2010, eq. 6
+    """
+    mean = np.polynomial.polynomial.polyval(np.clip(log_mass - gas.pivot, *gas.limits), gas.polynomial)
+    return np.asarray(np.maximum(mean, gas.least) * np.exp(gas.scatter * normal))
+
+
+def raw_halpha(law: Halpha, log_sfr: Float, dimmed: Float, normal: Float) -> Float:
+    """log10 of the observed H alpha luminosity[n], erg/s.
+
+    log_sfr : float[n] log10 Msun/yr, Kroupa;  dimmed : float[n] A(H alpha) mag
+    law     : constants of the calibration;  normal : float[n] normal deviates
+    Ref: Kennicutt & Evans 2012
+    """
+    return np.asarray(log_sfr + law.per_sfr + law.scatter * normal - 0.4 * dimmed)
+
+
+def matched(lines: LineModel, z: Float, log_l: Float) -> Float:
+    """log10 L[n] with the observed abundance; bilinear in z and log L, held at the table's edges.
+
+    z : float[n];  log_l : float[n] log10 erg/s
+    """
+    row, part = bracket(lines.z, z)
+    column, share = bracket(lines.log_l, log_l)
+    low = lines.shift[row, column] * (1.0 - share) + lines.shift[row, column + 1] * share
+    high = lines.shift[row + 1, column] * (1.0 - share) + lines.shift[row + 1, column + 1] * share
+    return np.asarray(log_l + low * (1.0 - part) + high * part)
+
+
+def shines(law: Halpha, log_sfr: Float, red: Bool) -> Bool:
+    """Whether a galaxy has lines, bool[n].
+
+    law : constants;  log_sfr : float[n] log10 Msun/yr;  red : bool[n] on the red sequence
+    """
+    return np.asarray(~(red & (log_sfr < np.log10(law.red_sfr))))
+
+
+def metallicity(law: Metals, log_mass: Float, log_sfr: Float, normal: Float) -> Float:
+    """12 + log(O/H) [n] of the gas.
+
+    log_mass, log_sfr : float[n] log10 Msun, log10 Msun/yr;  law : constants;  normal : float[n] normal deviates
+    Ref: Curti et al. 2020, eqs. 2 and 5
+    """
+    below = law.sharpness * (law.mass + law.mass_sfr * log_sfr - log_mass)
+    # log10(1 + 10^x) without overflow.
+    fall = np.logaddexp(0.0, np.log(10.0) * below) / np.log(10.0)
+    return np.asarray(np.clip(law.highest - law.turn * fall + law.scatter * normal, *law.limits))
+
+
+def fluxes(own: LineModel, z: Float, log_mass: Float, log_sfr: Float, red: Bool, rng: Draws) -> dict[str, Float]:
+    """Flux[n] of the primary component of each line, erg s-1 cm-2, before magnification and the Milky Way.
+
+    z : float[n] true redshift;  log_mass, log_sfr : float[n] log10 Msun, log10 Msun/yr (Chabrier, Kroupa)
+    red : bool[n] on the red sequence;  rng : of dust, luminosities and ratios
+    own : constants and matching;  returns : by column of table `galaxies`
+    """
+    normals = np.stack([rng.standard_normal(z.size) for _ in range(_DEVIATES)])
+    dimmed = dimming(own.gas, log_mass, normals[0])
+    observed = matched(own, z, raw_halpha(own.halpha, log_sfr, dimmed, normals[1]))
+    excess = metallicity(own.metals, log_mass, log_sfr, normals[2]) - own.metals.sun
+    log_l = _luminosities(own, z, observed + 0.4 * dimmed, excess, normals[3:])
+    area = np.log10(4.0 * np.pi) + 2.0 * np.log10(cosmology.luminosity_distance(z) / cosmology.HUBBLE * _CM_PER_MPC)
+    seen = np.where(shines(own.halpha, log_sfr, red), -area, -np.inf)
+    return {column: 10.0 ** (log_l[column] - 0.4 * k * dimmed + seen) for column, k in own.dust.items()}
+
+
+def added(band: Passband, z_obs: Float, fluxes: Mapping[str, Float]) -> Float:
+    """f_nu[n] erg s-1 cm-2 Hz-1, averaged over the band, of all lines.
+
+    band : that they are seen through;  z_obs : float[n];  fluxes : float[n] erg s-1 cm-2 by column of table `galaxies`
+    """
+    weights = np.pad(passbands.weights(band), 1)
+    total = np.zeros(z_obs.size)
+    for line in lines.line_list():
+        # The flux of a line falls into bins of 1 A; beyond the band there is none.
+        at = line.vacuum * (1.0 + z_obs) - band.wavelength[0] + 1.0
+        place = np.clip(at, 0.0, weights.size - 1.0)
+        below = np.minimum(place.astype(np.int64), weights.size - 2)
+        seen = weights[below] + (place - below) * (weights[below + 1] - weights[below])
+        total += line.ratio * fluxes[line.column] * seen
+    return total
+
+
+def brightened(magnitude: Float, light: Float) -> Float:
+    """AB magnitudes[n] of sources with more light.
+
+    magnitude : float[n] AB, without it;  light : float[n] f_nu, erg s-1 cm-2 Hz-1
+    """
+    return np.asarray(magnitude - 2.5 * np.log10(1.0 + light * 10.0 ** (0.4 * (magnitude + AB_CGS))))
+
+
+def expected_counts(flux: Float, near: float, far: float) -> Float:
+    """Galaxies[n] per deg2 above H alpha fluxes[n], erg s-1 cm-2, between two redshifts.
+
+    flux : float[n] erg s-1 cm-2
+    Ref: Pozzetti et al. 2016, A&A 590, A3, model 3, in the cosmology of that paper
+    """
+    law = Pozzetti(**parameters.section(_FILE, "pozzetti"))
+    z = np.linspace(near, far, _Z_NODES)
+    rate = np.sqrt(law.omega_m * (1.0 + z) ** 3 + 1.0 - law.omega_m)
+    fine = np.linspace(0.0, far, 20 * _Z_NODES)
+    inverse = 1.0 / np.sqrt(law.omega_m * (1.0 + fine) ** 3 + 1.0 - law.omega_m)
+    hubble_distance = LIGHT_KM_S / (100.0 * law.hubble)
+    steps = 0.5 * (inverse[1:] + inverse[:-1]) * np.diff(fine)
+    chi = hubble_distance * np.interp(z, fine, np.concatenate([[0.0], np.cumsum(steps)]))
+    volume = chi**2 * hubble_distance / rate * np.radians(1.0) ** 2
+    area = 4.0 * np.pi * ((1.0 + z) * chi * _CM_PER_MPC) ** 2
+    totals = [np.trapezoid(volume * _brighter(law, z, np.log10(f * area)), z) for f in np.atleast_1d(flux)]
+    return np.array(totals)
+
+
+def _brighter(law: Pozzetti, z: Float, log_l: Float) -> Float:
+    """n(> L)[n], Mpc^-3."""
+    fitted = np.maximum(z, law.z_fit)
+    log_star = law.l_inf + (1.5 / (1.0 + fitted)) ** law.beta * (law.l_half - law.l_inf)
+    log_y = _L_NODES - 42.0
+    y = 10.0**log_y
+    density = np.log(10.0) * 10.0**law.log_phi * y ** (law.alpha + 1.0) / (1.0 + (np.e - 1.0) * y**law.delta)
+    pieces = 0.5 * (density[1:] + density[:-1]) * np.diff(log_y)
+    above = np.concatenate([np.cumsum(pieces[::-1])[::-1], [0.0]])
+    return np.asarray(np.interp(log_l - log_star, log_y, above))
+
+
+def _luminosities(own: LineModel, z: Float, halpha: Float, excess: Float, normals: Float) -> dict[str, Float]:
+    """log10 of the intrinsic luminosities[n] by column; excess : 12 + log(O/H) less the Sun's."""
+    ratios, others = own.ratios, own.others
+    n2, r3, r2, s2 = (_ratio(numbers, excess) for numbers in (ratios.n2, ratios.r3, ratios.r2, ratios.s2))
+    hbeta = halpha - np.log10(own.hydrogen["halpha"])
+    r3 = r3 + ratios.r3_z * np.minimum(z, ratios.r3_z_last) + ratios.r3_scatter * normals[1]
+    r2 = r2 + ratios.r2_r3 * normals[1] + ratios.r2_scatter * normals[2]
+    sii = halpha + s2 + ratios.s2_scatter * normals[3]
+    siii = sii + others.siii + others.siii_scatter * normals[4]
+    helium = hbeta + others.hei_scatter * normals[5]
+    return {
+        **{f"flux_{line}": hbeta + np.log10(ratio) for line, ratio in own.hydrogen.items()},
+        "flux_hbeta": hbeta,
+        # The catalogue holds one line of each pair: half of the doublets of equal lines, the stronger of the others.
+        "flux_oii": hbeta + r2 + np.log10(0.5),
+        "flux_oiii": hbeta + r3,
+        "flux_nii": halpha + n2 + ratios.n2_scatter * normals[0],
+        "flux_sii": sii + np.log10(0.5),
+        "flux_siii": siii + np.log10(others.siii_pair / (1.0 + others.siii_pair)),
+        "flux_hei": helium + np.log10(others.hei),
+        "flux_hei_5877": helium + np.log10(others.hei_5877),
+    }
+
+
+def _ratio(polynomial: Sequence[float], excess: Float) -> Float:
+    return np.asarray(np.polynomial.polynomial.polyval(excess, polynomial))

@@ -1,0 +1,363 @@
+"""Galaxies of one generation cell: table `galaxies`, a pure function of (seed, cell, model); and its halos.
+
+model        every table that the draws need, made once
+draw         members of halos -> colours, dust, spectra, masses, lines -> selection -> shapes, lensing
+halo_table   table `halos` of the same cell;  halo_limits : from which mass on all are in it
+
+Numbers are keyed by galaxy and step, so that a new column leaves the others as they are, and so does a deeper request.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from lake_schema import sky
+from lake_schema.arrays import Bool, Complex, Float, Float32, Int
+from lake_schema.tables.galaxies import GALAXIES
+from lake_schema.tables.halos import HALO_LIMITS, HALOS
+from truesky.catalogue import dust_map
+from truesky.catalogue.cells import in_order
+from truesky.catalogue.galaxies import (
+    alignments,
+    band_ratios,
+    emission_lines,
+    halo_lensing,
+    high_redshift,
+    lensing,
+    morphology,
+    nearest_sed,
+    sequences,
+    stellar_mass,
+)
+from truesky.catalogue.galaxies.alignments import Alignments
+from truesky.catalogue.galaxies.band_ratios import BandRatios, Sed
+from truesky.catalogue.galaxies.emission_lines import LineModel
+from truesky.catalogue.galaxies.halo_lensing import Neighbourhood
+from truesky.catalogue.galaxies.high_redshift import Kind, Near
+from truesky.catalogue.galaxies.lensing import Lens, Shear
+from truesky.catalogue.galaxies.morphology import Shapes
+from truesky.catalogue.galaxies.nearest_sed import Training
+from truesky.catalogue.galaxies.sequences import Colour, Colours, Limits
+from truesky.catalogue.halos import luminosity_function, matching, population, quenching
+from truesky.catalogue.halos.halo_catalogue import LightCone
+from truesky.catalogue.halos.luminosity_function import Schechter
+from truesky.catalogue.halos.population import Cells, Members, Population
+from truesky.fluxes import cosmology, passbands
+from truesky.fluxes.libraries import templates
+from truesky.fluxes.passbands import Passband
+from truesky.randomness.keyed import Keyed
+from truesky.request.schema import Universe
+
+# Candidates are drawn this much deeper than the brightest SED needs, mag: emission lines brighten them, but for one
+# galaxy in 10^4 by no more (tests).  Of candidates, those are given lines whose continuum is so near to the limit.
+_MARGIN, _LINES = 0.25, 0.75
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GalaxyModel:
+    """Everything that galaxies are drawn from; a few MB, made once by `model`.
+
+    limit     : faintest magnitude, AB, before the Milky Way's dust and intergalactic hydrogen, with emission lines
+    band      : the limit's;  rotation : deg, added to every position angle, before lensing
+    selection : the limit's band against redshift; reference : 0.1r against redshift; colour : 0.1g at rest
+    ends : of the templates' colours;  halo_shares : what halos make red
+    training  : observed galaxies whose spectra ours have, None = spectra that have the colours
+    alignments : with the matter about galaxies, None = none
+    """
+
+    limit: float
+    band: Passband
+    population: Population
+    lens: Lens
+    rotation: float
+    alignments: Alignments | None
+    luminosities: Schechter
+    colours: Colours
+    ends: Limits
+    halo_shares: quenching.Shares
+    selection: BandRatios
+    reference: BandRatios
+    colour: BandRatios
+    shapes: Shapes
+    masses: stellar_mass.MassToLight
+    star_formation: stellar_mass.StarFormation
+    lines: LineModel
+    distant: tuple[Kind, ...]
+    training: Training | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drawn:
+    """Selected galaxies, [n]: rows of members, z, M_r, as of `apparent`, colours that the spectra have, spectra."""
+
+    row: Int
+    z: Float
+    m_r: Float
+    magnitude: Float
+    colour: Colour
+    sed: Sed
+
+    def part(self, keep: Bool) -> Drawn:
+        """The galaxies that are kept: keep : bool[n]."""
+        found = self.row[keep], self.z[keep], self.m_r[keep], self.magnitude[keep]
+        return Drawn(*found, self.colour.part(keep), self.sed.part(keep))
+
+
+def model(
+    seed: int, wanted: Universe, light_cone: LightCone | None = None, training: Training | None = None
+) -> GalaxyModel:
+    """The embedded universe of a seed: its galaxies brighter than a limit in a band, and with z < z_max.
+
+    light_cone, training : external tables of halos and of observed galaxies, in place of ours
+    Halos and galaxies of a nearer or shallower universe are those of a deeper one, bit by bit: whatever is drawn from
+    is the same for all, and numbers are keyed by what is drawn.
+    1 s, and with an empty cache as long as the box and its lensing take (density_box.load, lensing.load).
+    seed                   : of the request;  wanted : section `universe` of the request
+    """
+    library, colours = templates.galaxy_library(), sequences.model()
+    selection = _selection(wanted, training)
+    dustiest = float(selection.ebv[-1])
+    found = halos_and_galaxies(seed, wanted, light_cone, training)
+    boosts = wanted.high_redshift_boost, wanted.quasar_boost
+    distant = high_redshift.model(*boosts, wanted.galaxy_limit, wanted.z_max)
+    colour = band_ratios.load(library, "sdss_g01", 0.0, dustiest)
+    return GalaxyModel(
+        limit=wanted.galaxy_limit,
+        band=passbands.load(wanted.galaxy_band),
+        population=found,
+        lens=_lens(found, wanted, far=bool(distant)),
+        rotation=wanted.rotation,
+        alignments=alignments.model(found.halos.box, found.halos.turned, wanted.alignment),
+        luminosities=luminosity_function.schechter(),
+        colours=colours,
+        ends=sequences.limits(colour, colours.dust),
+        halo_shares=quenching.shares(quenching.model(), found.masses, found.halos.matching.occupation),
+        selection=selection,
+        reference=band_ratios.load(library, band_ratios.REFERENCE_BAND, matching.Z_LAST, dustiest),
+        colour=colour,
+        shapes=morphology.shapes(),
+        masses=stellar_mass.mass_to_light(),
+        star_formation=stellar_mass.star_formation(),
+        lines=emission_lines.model(),
+        distant=distant,
+        training=training,
+    )
+
+
+def halos_and_galaxies(
+    seed: int, wanted: Universe, light_cone: LightCone | None = None, training: Training | None = None
+) -> Population:
+    """The population that a limit can be asked of: halos with their galaxies, before these have colours.
+
+    seed, wanted, light_cone, training : as of `model`
+    """
+    nodes, brightest = band_ratios.brightest(_selection(wanted, training))
+
+    def faintest(z: Float) -> Float:
+        return wanted.galaxy_limit + _MARGIN - cosmology.distance_modulus(z) - np.interp(z, nodes, brightest)
+
+    inverse = luminosity_function.inverse(luminosity_function.schechter(), matching.Z_LAST)
+    volume = luminosity_function.volume(wanted.z_max)
+    return population.model(seed, wanted.box_cells, volume, inverse, faintest, light_cone)
+
+
+def _lens(found: Population, wanted: Universe, far: bool) -> Lens:
+    if wanted.lensing is not None:
+        return Shear(*wanted.lensing)
+    return lensing.load(found.halos.box, wanted.lensing_nside, far)
+
+
+def _selection(wanted: Universe, training: Training | None) -> BandRatios:
+    dustiest = max(sequences.model().dust.highest, training.dustiest if training else 0.0)
+    return band_ratios.load(templates.galaxy_library(), wanted.galaxy_band, matching.Z_LAST, dustiest)
+
+
+def draw(cell: int, universe: GalaxyModel, cells: Cells, dust: Float32) -> pa.Table:
+    """Rows of table `galaxies` that are truly in one order-8 cell, sorted by _healpix_29 of where they are seen.
+
+    cells : what has been drawn of the universe's population
+    dust  : float32[pixel] mag, map of the Milky Way's A(V) (truesky.catalogue.dust_map)
+    """
+    lens = halo_lensing.around(universe.lens, cells, cell)
+    return of_members(cell, universe, population.members(cells, cell), lens, dust)
+
+
+def of_members(
+    cell: int,
+    universe: GalaxyModel,
+    members: Members,
+    lens: Lens | Neighbourhood,
+    dust: Float32,
+    near: Near | None = None,
+) -> pa.Table:
+    """Those of them that are bright enough, and quasars and galaxies beyond the light-cone.
+
+    members : of the cell, or some of them;  lens : of the cell
+    near    : which true places the second are wanted at, None = all
+    cell, universe, dust : as of `draw`
+    """
+    seed = universe.population.seed
+    drawn, physical = _bright(universe, members, select(universe, *_light(seed, universe, members), _LINES))
+    distance_modulus = cosmology.distance_modulus(drawn.z)
+    columns = {
+        **_places(lens, members, drawn.row, dust),
+        "abs_mag_r01": drawn.m_r,
+        "mag_r01": drawn.m_r + distance_modulus + band_ratios.offset(universe.reference, drawn.z, drawn.sed),
+        "color_gr_01": drawn.colour.colour,
+        **physical,
+        **band_ratios.columns(drawn.sed),
+        **_shape_columns(universe, members, drawn, physical["log_stellar_mass"]),
+    }
+    rows = [GALAXIES.build(columns)]
+    rows += [high_redshift.draw(cell, seed, kind, lens, dust, near) for kind in universe.distant]
+    return in_order(lensing.turned(pa.concat_tables(rows), universe.rotation))
+
+
+def halo_table(cell: int, universe: Population, cells: Cells) -> pa.Table:
+    """Table `halos` of one order-8 cell, sorted by _healpix_29."""
+    hosts = population.halos_of(cells, cell)
+    ra, dec = sky.positions(hosts.index)
+    z = universe.halos.distances.redshift(hosts.chi)
+    return HALOS.build(
+        {
+            "id": hosts.id,
+            "ra": ra,
+            "dec": dec,
+            "_healpix_29": hosts.index,
+            "z_true": z,
+            "z_obs": population.observed_redshift(z, hosts.velocity),
+            "log_mass": hosts.log_mass,
+            "concentration": universe.masses.at(universe.masses.concentration, z, hosts.log_mass),
+        }
+    )
+
+
+def halo_limits(universe: Population) -> pa.Table:
+    """Table `halo_limits`, from the nearest halos to the request's end."""
+    chi = universe.halos.line.middle
+    chi = np.append(chi[chi < universe.halos.far], universe.halos.far)
+    return HALO_LIMITS.build(
+        {
+            "z_true": universe.halos.distances.redshift(chi),
+            "log_mass": universe.halos.mass_limit(chi) + universe.halos.host_offset,
+        }
+    )
+
+
+def select(universe: GalaxyModel, z: Float, m_r: Float, colour: Colour, sed: Sed, deeper: float = 0.0) -> Drawn:
+    """The galaxies whose continuum is brighter than the limit, with their realised colours.
+
+    z, m_r : float[n] redshift, M_r mag;  colour, sed : of n galaxies, their colours as drawn and spectra
+    universe : whose limit and passband hold;  deeper : mag, beyond the limit
+    """
+    magnitude = apparent(universe, z, m_r, sed)
+    row = np.flatnonzero(magnitude < universe.limit + deeper)
+    kept = sed.part(row)
+    realised = replace(colour.part(row), colour=band_ratios.colours(universe.colour, kept))
+    return Drawn(row, z[row], m_r[row], magnitude[row], realised, kept)
+
+
+def _bright(universe: GalaxyModel, members: Members, drawn: Drawn) -> tuple[Drawn, dict[str, Float]]:
+    """Those that are brighter than the limit with their lines; their masses, star formation rates and line fluxes."""
+    seed, own_ids, colour = universe.population.seed, members.id[drawn.row], drawn.colour
+    log_mass = stellar_mass.log_stellar_mass(universe.masses, drawn.m_r, colour.colour, drawn.z)
+    main = stellar_mass.main_sequence(universe.star_formation, log_mass, drawn.z)
+    rng = Keyed(own_ids, seed, "galaxies.star_formation")
+    log_sfr = stellar_mass.log_sfr(universe.star_formation, main, colour.sequence, colour.deviate, rng)
+    rng = Keyed(own_ids, seed, "galaxies.lines")
+    fluxes = emission_lines.fluxes(universe.lines, drawn.z, log_mass, log_sfr, colour.red, rng)
+    light = emission_lines.added(universe.band, members.z_obs[drawn.row], fluxes)
+    kept = emission_lines.brightened(drawn.magnitude, light) < universe.limit
+    columns = {"log_stellar_mass": log_mass, "log_sfr": log_sfr, **fluxes}
+    return drawn.part(kept), {name: column[kept] for name, column in columns.items()}
+
+
+def apparent(universe: GalaxyModel, z: Float, m_r: Float, sed: Sed) -> Float:
+    """Magnitude[n] of the continuum in the limit's band, AB, unmagnified, before hydrogen and dust on the way to us.
+
+    z, m_r : float[n] redshift, M_r mag;  sed : n spectra
+    universe : whose passband holds
+    Error: < 0.001 mag (tests/truesky/catalogue/galaxies/test_band_ratios.py)
+    """
+    return m_r + cosmology.distance_modulus(z) + band_ratios.offset(universe.selection, z, sed)
+
+
+def _light(seed: int, universe: GalaxyModel, members: Members) -> tuple[Float, Float, Colour, Sed]:
+    """Candidates of a cell: z, M_r, colours, spectra."""
+    z, colours, ends = members.z, universe.colours, universe.ends
+    m_r = universe.population.halos.matching.magnitude(z, members.proxy)
+    satellites = quenching.satellite_share(universe.halo_shares, members)
+    share = sequences.red_fraction(colours.fraction, m_r, z, satellites)
+    odds = quenching.odds(universe.halo_shares, members, share)
+    found = sequences.draw(colours, ends, m_r, z, odds, Keyed(members.id, seed, "galaxies.colour"))
+    if universe.training is not None:
+        rng = Keyed(members.id, seed, "galaxies.nearest")
+        return z, m_r, found, nearest_sed.assign(universe.training, found.colour, m_r, z, rng)
+    law, ebv = sequences.dust(colours, ends, m_r, z, found, Keyed(members.id, seed, "galaxies.dust"))
+    return z, m_r, found, band_ratios.invert(universe.colour, found.colour, law, ebv)
+
+
+def _places(
+    lens: Lens | Neighbourhood, members: Members, row: Int, dust: Float32
+) -> dict[str, npt.NDArray[np.generic]]:
+    places = halo_lensing.columns(lens, members.ra[row], members.dec[row], members.chi[row])
+    return {
+        "id": members.id[row],
+        "halo_id": members.halo_id[row],
+        **places,
+        "kind": members.kind[row],
+        "density_boost": np.ones(row.size),
+        "z_true": members.z[row],
+        "z_obs": members.z_obs[row],
+        "log_halo_mass": members.host_mass[row],
+        "a_v": dust_map.a_v(dust, places["ra"], places["dec"]),
+    }
+
+
+def _shape_columns(
+    universe: GalaxyModel, members: Members, drawn: Drawn, log_mass: Float
+) -> dict[str, npt.NDArray[np.generic]]:
+    source, seed, shapes = members.id[drawn.row], universe.population.seed, universe.shapes
+    scale = cosmology.kpc_per_arcsec(drawn.z)
+    rng = Keyed(source, seed, "galaxies.size")
+    radius = morphology.half_light_radius(shapes.size, drawn.z, log_mass, drawn.colour.red, scale, rng)
+    rng = Keyed(source, seed, "galaxies.bulge")
+    fraction = morphology.bulge_fraction(shapes.bulge, log_mass, drawn.colour.red, rng)
+    sersic = morphology.sersic_index(shapes.bulge, drawn.colour.red, rng)
+    ratio = morphology.radius_ratio(shapes.bulge, drawn.colour.red, rng)
+    bulge_radius, disc_radius = morphology.component_radii(shapes, radius, fraction, ratio, sersic)
+    colour = morphology.bulge_colour(shapes.bulge, source.size, Keyed(source, seed, "galaxies.bulge_colour"))
+    rng = Keyed(source, seed, "galaxies.shape")
+    disc_ratio = morphology.disc_axis_ratio(shapes, drawn.z.size, rng)
+    return {
+        "bulge_half_light_radius": bulge_radius,
+        "disk_half_light_radius": disc_radius,
+        "bulge_fraction": fraction,
+        "bulge_color": colour,
+        "bulge_sersic_index": sersic,
+        "bulge_axis_ratio": morphology.bulge_axis_ratio(shapes.bulge, drawn.z.size, rng),
+        "disk_axis_ratio": disc_ratio,
+        "inclination": morphology.inclination(disc_ratio, shapes.scale_height),
+        "position_angle": alignments.position_angles(
+            universe.alignments, rng.random(drawn.z.size), _aligned(universe, members, drawn), drawn.colour.red
+        ),
+    }
+
+
+def _aligned(universe: GalaxyModel, members: Members, drawn: Drawn) -> Complex:
+    """Mean ellipticities that the places of galaxies ask for."""
+    mean, own = np.zeros(drawn.row.size, complex), universe.alignments
+    if own is None:
+        return mean
+    lone = members.kind[drawn.row] == population.CENTRAL
+    row, red = drawn.row[lone], drawn.colour.red[lone]
+    mean[lone] = alignments.of_centrals(own, members.ra[row], members.dec[row], members.chi[row], drawn.m_r[lone], red)
+    row, red = drawn.row[~lone], drawn.colour.red[~lone]
+    towards, apart = alignments.direction(members.ra[row], members.dec[row], members.host_index[row])
+    radius = universe.population.masses.radius(members.host_mass[row]) / members.chi[row]
+    mean[~lone] = alignments.of_satellites(own, towards, apart / radius, red)
+    return mean

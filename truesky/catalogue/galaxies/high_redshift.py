@@ -1,0 +1,234 @@
+"""Quasars, and galaxies beyond redshift 6: rows of table `galaxies` of kinds 2 and 3.
+
+model       the luminosity functions, tabulated
+draw        rows of one generation cell
+per_deg2    how many there are
+
+They are drawn at random places: no structure. `density_boost` says how many times more were drawn than there are. Each
+magnitude is drawn by itself, so that a shallower request has the brighter ones of a deeper one.
+Ref: Palanque-Delabrouille et al. 2016; Bouwens et al. 2021, AJ 162, 47; Matsuoka et al. 2018, ApJ 869, 150; the numbers
+are in high_redshift.toml.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from lake_schema import ids, sky
+from lake_schema.arrays import Bool, Float, Float32, Int
+from lake_schema.ids import GENERATION_ORDER
+from lake_schema.tables.galaxies import GALAXIES
+from truesky.catalogue import dust_map, parameters
+from truesky.catalogue.galaxies import halo_lensing, morphology
+from truesky.catalogue.galaxies.halo_lensing import Neighbourhood
+from truesky.catalogue.galaxies.lensing import Lens
+from truesky.fluxes import cosmology
+from truesky.fluxes.high_redshift import (
+    HIGH_REDSHIFT,
+    HIGH_REDSHIFT_SLOPES,
+    LYMAN_ALPHA_WIDTHS,
+    QUASAR,
+    QUASAR_OFFSETS,
+    QUASAR_STRENGTHS,
+    ultraviolet_magnitude,
+)
+from truesky.randomness.keyed import Draws, Keyed
+from truesky.randomness.rng import stream
+
+_FILE = "high_redshift.toml"
+_STREAM = {HIGH_REDSHIFT: "high_redshift", QUASAR: "quasars"}
+# ra, dec [n] deg -> which of them.
+Near = Callable[[Float, Float], Bool]
+_Z_STEP, _M_STEP, _M_BRIGHTEST = 0.02, 0.02, -32.0
+# Where the light-cone of galaxies ends and other populations begin, and the brightest magnitude that is drawn.
+_BEYOND, _FIRST_MAGNITUDE = 6.0, 10
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Kind:
+    """One of the two kinds: numbers of the file, and counts per deg2 of cells of (z, M), by apparent magnitude.
+
+    limit : faintest ultraviolet magnitude, AB;  z_end : redshift at which a nearer universe ends (what is beyond
+            z = 6 stays)
+    z : [r] lower edges;  m : [c] lower edges;  first : of the magnitudes
+    cells, counts : of each whole magnitude, int[k] places in [r, c] and float[k] their numbers, cumulative
+    """
+
+    code: int
+    numbers: dict[str, Any]
+    boost: float
+    z: Float
+    m: Float
+    limit: float
+    z_end: float
+    first: int
+    cells: tuple[Int, ...]
+    counts: tuple[Float, ...]
+
+    def per_deg2(self, near: float = 0.0, far: float = np.inf) -> float:
+        """How many there are in nature between two redshifts, deg-2: near, far, of whole steps of the table."""
+        number = 0.0
+        for cells, counts in zip(self.cells, self.counts, strict=True):
+            z, m = (nodes[i] for nodes, i in zip((self.z, self.m), np.divmod(cells, self.m.size), strict=True))
+            seen = ultraviolet_magnitude(m + 0.5 * _M_STEP, z + 0.5 * _Z_STEP) < self.limit
+            kept = (z > near - 1e-6) & (z < far - 1e-6) & ((z < self.z_end) | (z > _BEYOND - 1e-6)) & seen
+            number += float(np.diff(counts, prepend=0.0)[kept].sum())
+        return number
+
+
+def model(
+    galaxy_boost: float = 1.0, quasar_boost: float = 1.0, limit: float = 26.0, z_end: float = 6.0
+) -> tuple[Kind, ...]:
+    """The kinds that are drawn; a boost of 0 leaves one out.
+
+    galaxy_boost, quasar_boost : how many times denser than in nature
+    limit : faintest magnitude, AB, at 1500 or 1450 A in the rest frame;  z_end : of the universe's galaxies
+    """
+    wanted = ((HIGH_REDSHIFT, "galaxies", galaxy_boost), (QUASAR, "quasars", quasar_boost))
+    drawn = ((code, parameters.section(_FILE, name), boost) for code, name, boost in wanted if boost > 0.0)
+    return tuple(_kind(*about, limit, z_end) for about in drawn)
+
+
+def draw(
+    cell: int, seed: int, kind: Kind, lens: Lens | Neighbourhood, dust: Float32, near: Near | None = None
+) -> pa.Table:
+    """Rows of one kind that are truly in a generation cell.
+
+    dust : float32[pixel] map of A(V), mag (truesky.catalogue.dust_map)
+    cell   : nested index at order 8;  seed : of the request;  kind : the objects' luminosity function and boost
+    lens   : halos and maps, maps alone, or one shear for all
+    near   : which true places are wanted, None = all
+    """
+    found = [_of_magnitude(cell, seed, kind, step) for step in range(len(kind.cells))]
+    z, m, ra, dec = (np.concatenate(column) for column in zip(*found, strict=True))
+    kept = (ultraviolet_magnitude(m, z) < kind.limit) & ((z < kind.z_end) | (z >= _BEYOND))
+    if near is not None:
+        kept &= near(ra, dec)
+    # Numbered with those that are left out.
+    own = ids.FIRST_NUMBER + np.flatnonzero(kept)
+    z, m, ra, dec = z[kept], m[kept], ra[kept], dec[kept]
+    source = ids.source_id(np.full(own.size, kind.code), cell, own)
+    rng = Keyed(source, seed, _STREAM[kind.code])
+    zeros = np.zeros(own.size)
+    places = halo_lensing.columns(lens, ra, dec, cosmology.comoving_distance(z))
+    columns = {
+        "id": source,
+        "halo_id": ids.halo_of(source),
+        **places,
+        "kind": np.full(own.size, kind.code),
+        "density_boost": np.full(own.size, kind.boost),
+        "z_true": z,
+        "z_obs": z,
+        "abs_mag_r01": m - 5.0 * np.log10(cosmology.HUBBLE),
+        "mag_r01": ultraviolet_magnitude(m, z),
+        "sed_1": _templates(kind, m, rng),
+        "frac_1": zeros + 1.0,
+        "sed_2": zeros.astype(int),
+        "frac_2": zeros,
+        **{name: zeros.astype(int) for name in ("ext_law_1", "ext_law_2")},
+        **{name: zeros for name in ("ebv_1", "ebv_2")},
+        **_shapes(kind, z, m, rng),
+        "a_v": dust_map.a_v(dust, places["ra"], places["dec"]),
+    }
+    return GALAXIES.build(columns)
+
+
+def _of_magnitude(cell: int, seed: int, kind: Kind, step: int) -> tuple[Float, Float, Float, Float]:
+    """Redshifts[n], M[n], ra[n] and dec[n], deg, of one whole magnitude."""
+    rng, counts = stream(seed, _STREAM[kind.code], cell, kind.first + step), kind.counts[step]
+    total = float(counts[-1]) if counts.size else 0.0
+    n = int(rng.poisson(kind.boost * total * sky.cell_area(GENERATION_ORDER)))
+    at = np.searchsorted(counts, rng.random(n) * total, side="right")
+    row, column = np.divmod(kind.cells[step][np.minimum(at, counts.size - 1)], kind.m.size)
+    z, m = kind.z[row] + _Z_STEP * rng.random(n), kind.m[column] + _M_STEP * rng.random(n)
+    _, ra, dec = sky.random_in_cell(GENERATION_ORDER, cell, n, rng)
+    return z, m, ra, dec
+
+
+def density(code: int, numbers: dict[str, Any], m: Float, z: Float) -> Float:
+    """dn/dM, Mpc^-3 mag^-1.
+
+    m : float[...] absolute ultraviolet AB mag;  z : float[...]
+    code    : kind of object;  numbers : constants of its luminosity function
+    """
+    since = z - _BEYOND
+    if code == QUASAR:
+        beyond = numbers["phi"] * 10.0 ** (numbers["rate"] * since)
+        far = _double_power(beyond, numbers, m - numbers["m_star"])
+        return np.where(since < 0.0, _near_quasars(parameters.section(_FILE, "near_quasars"), m, z), far)
+    star = numbers["m_star"] + numbers["m_star_rate"] * since
+    phi = numbers["phi_star"] * 10.0 ** (numbers["phi_rate"] * since + numbers["phi_curve"] * since**2)
+    alpha = numbers["alpha"] + numbers["alpha_rate"] * since
+    ln_x = -0.4 * np.log(10.0) * (m - star)
+    return np.asarray(0.4 * np.log(10.0) * phi * np.exp((alpha + 1.0) * ln_x - np.exp(ln_x)))
+
+
+def _near_quasars(numbers: dict[str, Any], m: Float, z: Float) -> Float:
+    d = z - numbers["z_pivot"]
+    before, after = np.minimum(d, 0.0), np.maximum(d, 0.0)
+    star = numbers["m_star"] + numbers["near_rate"] * before + numbers["near_curve"] * before**2
+    star = star + numbers["far_rate"] * after
+    log_phi = numbers["log_phi"] + numbers["phi_rate"] * after + numbers["phi_curve"] * after**2
+    return _double_power(10.0**log_phi, numbers, m - star)
+
+
+def _double_power(phi: Float, numbers: dict[str, Any], brighter: Float) -> Float:
+    x = 0.4 * brighter
+    return np.asarray(phi / (10.0 ** ((numbers["faint"] + 1.0) * x) + 10.0 ** ((numbers["bright"] + 1.0) * x)))
+
+
+def _kind(code: int, numbers: dict[str, Any], boost: float, limit: float, z_end: float) -> Kind:
+    near = parameters.section(_FILE, "near_quasars")["z_min"] if code == QUASAR else _BEYOND
+    z = np.arange(near, numbers["z_max"] - 1e-9, _Z_STEP)
+    m = np.arange(_M_BRIGHTEST, -12.0, _M_STEP)
+    middle_z, middle_m = z[:, None] + 0.5 * _Z_STEP, m[None, :] + 0.5 * _M_STEP
+    volume = cosmology.comoving_volume(z, z + _Z_STEP)[:, None] * np.radians(1.0) ** 2 / cosmology.HUBBLE**3
+    counts = density(code, numbers, middle_m, middle_z) * volume * _M_STEP
+    # Of a whole magnitude all are drawn, a little more than the limit takes.
+    mag = np.floor(ultraviolet_magnitude(middle_m, middle_z))
+    last = int(np.ceil(limit + 2.0 * _M_STEP))
+    cells = tuple(np.flatnonzero(mag == step) for step in range(_FIRST_MAGNITUDE, last))
+    each = tuple(np.cumsum(counts.ravel()[place]) for place in cells)
+    return Kind(code, numbers, boost, z, m, limit, z_end, _FIRST_MAGNITUDE, cells, each)
+
+
+def _templates(kind: Kind, m: Float, rng: Draws) -> Int:
+    """Index of the template: slope, then strength of the lines."""
+    if kind.code == QUASAR:
+        slope = rng.integers(0, len(QUASAR_OFFSETS), m.size)
+        return np.asarray(slope * len(QUASAR_STRENGTHS) + rng.integers(0, len(QUASAR_STRENGTHS), m.size), np.int64)
+    law = kind.numbers
+    beta = law["slope"] + law["slope_rate"] * (m + law["slope_pivot"])
+    beta = beta + law["slope_scatter"] * rng.standard_normal(m.size)
+    nearest = np.abs(beta[:, None] - np.array(HIGH_REDSHIFT_SLOPES)).argmin(1) if m.size else np.zeros(0, int)
+    odds = np.cumsum(law["lyman_odds"])
+    width = np.searchsorted(odds[:-1], rng.random(m.size) * odds[-1], side="right")
+    return np.asarray(nearest * len(LYMAN_ALPHA_WIDTHS) + width, np.int64)
+
+
+def _shapes(kind: Kind, z: Float, m: Float, rng: Draws) -> dict[str, npt.NDArray[np.generic]]:
+    """One Sersic component: everything is in the bulge."""
+    law, n = kind.numbers, z.size
+    if kind.code == QUASAR:
+        radius, ratio, sersic = np.full(n, law["radius"]), np.ones(n), 1.0
+    else:
+        mean = law["radius"] * ((1.0 + z) / 7.0) ** law["radius_z"] * 10.0 ** (-0.4 * law["radius_m"] * (m + 21.0))
+        kpc = mean * 10.0 ** (law["radius_scatter"] * rng.standard_normal(n))
+        radius, sersic = kpc / cosmology.kpc_per_arcsec(z), law["sersic"]
+        ratio = law["axis_ratio"][0] + (law["axis_ratio"][1] - law["axis_ratio"][0]) * rng.random(n)
+    return {
+        "bulge_half_light_radius": radius,
+        "disk_half_light_radius": radius,
+        "bulge_fraction": np.ones(n),
+        "bulge_sersic_index": np.full(n, sersic),
+        "bulge_axis_ratio": ratio,
+        "disk_axis_ratio": ratio,
+        "inclination": morphology.inclination(ratio, 0.1),
+        "position_angle": morphology.position_angle(n, rng),
+    }

@@ -1,0 +1,193 @@
+"""The sources of a request that names them all: small tables, at places of their own or on a grid.
+
+load      all of them, checked
+galaxies  rows of table `galaxies` of a generation cell, as for a catalogue of others
+stars     what stands for the Milky Way
+
+A table is CSV with a line of titles; a column that is not there has the value of GALAXIES or STARS. mag is AB, in the
+request's band, before magnification and the Milky Way's dust a_v. Emission lines are not added.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from lake_schema import sky, units, user_files
+from lake_schema.arrays import Array, Float, Float32, Int
+from lake_schema.errors import BadInput
+from lake_schema.external import rows as external_rows
+from lake_schema.ids import GENERATION_ORDER
+from lake_schema.store.plan import Json
+from lake_schema.store.provenance import canonical
+from truesky.catalogue.external.ingest import Split
+from truesky.catalogue.external.mapping import GALAXY_BOUNDS, Columns, Field
+from truesky.catalogue.galaxies import from_catalogue, lensing
+from truesky.catalogue.galaxies.from_catalogue import IngestModel
+from truesky.catalogue.stars.from_catalogue import KEYS, StarCatalogue
+from truesky.catalogue.stars.stars import nearest_template
+from truesky.fluxes import integration, passbands
+from truesky.fluxes.libraries import stellar, templates
+from truesky.fluxes.sources import Stars
+from truesky.request.area import Area
+from truesky.request.files import SOURCES, GivenSources
+from truesky.request.schema import MOST_SHEAR
+
+_PLACE = ("ra", "dec")
+# What a column holds that is not there; None = it has to be there. Units and frames are those of table `galaxies`.
+GALAXIES: Mapping[str, float | None] = {
+    "mag": None, "z_true": 0.2, "sed": 15.0, "ext_law": 0.0, "ebv": 0.0, "bulge_fraction": 0.0,
+    "bulge_half_light_radius": 0.3, "disk_half_light_radius": 0.3, "bulge_sersic_index": 4.0, "bulge_axis_ratio": 1.0,
+    "disk_axis_ratio": 1.0, "position_angle": 0.0, "kappa": 0.0, "gamma1": 0.0, "gamma2": 0.0, "a_v": 0.0,
+    "stamp": -1.0,
+}  # fmt: skip
+STARS: Mapping[str, float | None] = {"mag": None, "teff": 5800.0, "a_v": 0.0}
+_GALAXY_BOUNDS = {**GALAXY_BOUNDS, "sed": (0.0, 30.0), "stamp": (-1.0, GALAXY_BOUNDS["stamp"][1])}
+# Columns of whole numbers.
+_WHOLE = ("ext_law", "stamp")
+_STAR_BOUNDS = {**KEYS, "mag": GALAXY_BOUNDS["mag"]}
+# Of a grid, on the square about the area.
+_MOST_PLACES = 4_000_000
+# Each galaxy says how much there is before it.
+_NO_DUST: Float32 = np.zeros(12, np.float32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Given:
+    """Sources by column, [n] each, ascending in index (order-29 cell); origin_id : row of the table, from 1."""
+
+    galaxies: Mapping[str, Array]
+    stars: Mapping[str, Array]
+
+
+def load(own: GivenSources, area: Area, planned: Json | None = None) -> Given:
+    """The sources, from their files; BadInput names the file, and the column and the row that is wrong.
+
+    planned : facts of the plan that they are read for
+    """
+    if planned is not None and canonical(own.facts(area.bounds())) != canonical(planned):
+        raise BadInput("sources: a table has changed since the job began")
+    if own.band not in passbands.names():
+        raise BadInput(f"sources.band = {own.band!r} is not one of {', '.join(passbands.names())}")
+    places = () if own.spacing else _PLACE
+    found = {
+        "galaxies": _read(own.galaxies, {**dict.fromkeys(places), **GALAXIES}, _GALAXY_BOUNDS),
+        "stars": _read(own.stars, {**dict.fromkeys(places), **STARS}, _STAR_BOUNDS),
+    }
+    if own.spacing:
+        found = _on_grid(found, area, own.spacing)
+    _refuse_caustics(own.galaxies, found["galaxies"])
+    for file, values in zip((own.galaxies, own.stars), found.values(), strict=True):
+        values["ra"] = sky.wrapped(values["ra"])
+        cell = sky.cell_of(values["ra"], values["dec"], GENERATION_ORDER)
+        outside = ~np.isin(cell, area.cells(GENERATION_ORDER))
+        if outside.any():
+            row = values["origin_id"][outside.argmax()]
+            raise BadInput(f"{file}: ra, dec of row {row} are not in the request's area")
+        values["index"] = sky.healpix_29(values["ra"], values["dec"])
+    return Given(*(_sorted(values) for values in found.values()))
+
+
+def model(seed: int, own: GivenSources, given: Given, lens: lensing.Shear | None, rotation: float) -> IngestModel:
+    """What `galaxies` takes.
+
+    seed, own      : of the request
+    given          : of `load`
+    lens, rotation : in place of the rows' lensing, None = as they say; deg, added to position angles
+    """
+    columns = Columns({"mag": Field(column="mag")}, GALAXY_BOUNDS, band=own.band)
+    most = [float(given.galaxies[name].max(initial=0.0)) for name in ("z_true", "ebv")]
+    return from_catalogue.model(seed, columns, Split(Path(), {}, 0, *most), lens, rotation)
+
+
+def galaxies(cell: int, given: Given, universe: IngestModel) -> pa.Table:
+    """Table `galaxies` of one generation cell."""
+    first, last = np.searchsorted(given.galaxies["index"], sky.cell_range(GENERATION_ORDER, cell))
+    rows = {name: values[first:last] for name, values in given.galaxies.items()}
+    return from_catalogue.draw(cell, {**rows, "flux_halpha": np.full(last - first, np.nan)}, universe, _NO_DUST)
+
+
+def stars(given: Given, band: str) -> StarCatalogue:
+    """The stars with their H, of the spectrum of the nearest temperature."""
+    library, values = templates.stellar_library(), dict(given.stars)
+    temperatures = stellar.types().teff
+    none = np.zeros(temperatures.size)
+    rows = Stars.of_templates(np.arange(none.size), none, none)
+    ab = units.mag_of_f_nu(integration.stars(rows, [passbands.load(band)], library)[:, 0])
+    values["mag_h"] = values.pop("mag") - ab[nearest_template(temperatures, values["teff"])]
+    return StarCatalogue(values.pop("index"), values)
+
+
+def _read(
+    file: Path | None, known: Mapping[str, float | None], bounds: Mapping[str, tuple[float, float]]
+) -> dict[str, Array]:
+    """The columns of a table that are known, with those that it lacks; of no table: none of each."""
+    if file is None:
+        return {name: np.zeros(0) for name in known} | {"origin_id": np.zeros(0, np.int64)}
+    titles = external_rows.titles(file, SOURCES)
+    for title in titles:
+        if title not in known:
+            raise BadInput(f"{user_files.shown(file)}: column {title} is none of {', '.join(known)}")
+    for name, value in known.items():
+        if value is None and name not in titles:
+            raise BadInput(f"{user_files.shown(file)}: column {name} is missing")
+    pieces = list(external_rows.pieces(file, titles, kind=SOURCES))
+    found = {title: np.concatenate([np.zeros(0), *(piece.columns[title] for piece in pieces)]) for title in titles}
+    n = len(found["mag"])
+    if n == 0:
+        raise BadInput(f"{user_files.shown(file)}: holds no source")
+    for title, values in found.items():
+        external_rows.within(file, title, values, bounds[title])
+    for title in _WHOLE:
+        if (half := found.get(title, np.zeros(n)) % 1.0 != 0.0).any():
+            raise BadInput(f"{user_files.shown(file)}: {title} of row {half.argmax() + 1} is not a whole number")
+    found |= {name: np.full(n, value) for name, value in known.items() if name not in found}
+    found |= {name: found[name].astype(np.int64) for name in _WHOLE if name in found}
+    return found | {"origin_id": np.arange(1, n + 1)}
+
+
+def _refuse_caustics(file: Path | None, values: Mapping[str, Array]) -> None:
+    """What is no ellipse would be left out of the images, or be less sheared than it says."""
+    kappa, gamma1, gamma2 = (values[name] for name in ("kappa", "gamma1", "gamma2"))
+    bad = lensing.near_caustic(kappa, gamma1, gamma2, lensing.settings().caustic)
+    bad |= np.hypot(gamma1, gamma2) > MOST_SHEAR * np.abs(1.0 - kappa)
+    if bad.any():
+        row, what = values["origin_id"][bad.argmax()], "kappa, gamma1, gamma2"
+        raise BadInput(f"{file}: {what} of row {row} are near a caustic: images are ellipses up to |g| = {MOST_SHEAR}")
+
+
+def _on_grid(found: Mapping[str, dict[str, Array]], area: Area, spacing: float) -> dict[str, dict[str, Array]]:
+    """The rows of all tables in turn at the places of a grid."""
+    ra, dec = _grid(area, spacing)
+    numbers = np.cumsum([0, *(len(values["mag"]) for values in found.values())])
+    which = np.arange(ra.size) % numbers[-1]
+    out = {}
+    for (name, values), first, last in zip(found.items(), numbers[:-1], numbers[1:], strict=True):
+        here = np.flatnonzero((which >= first) & (which < last))
+        rows = {key: column[which[here] - first] for key, column in values.items()}
+        out[name] = {**rows, "ra": ra[here], "dec": dec[here]}
+    return out
+
+
+def _grid(area: Area, spacing: float) -> tuple[Float, Float]:
+    """Places in an area, `spacing` arcsec apart to the east and north of its middle, from the south, west to east."""
+    ra, dec, radius = area.bounds()
+    half = int(radius * 3600.0 / spacing)
+    if (2 * half + 1) ** 2 > _MOST_PLACES:
+        raise BadInput(f"sources.spacing = {spacing:g}: the square about the area has more than {_MOST_PLACES} places")
+    steps = np.radians(np.arange(-half, half + 1) * spacing / 3600.0)
+    north, east = (axis.ravel() for axis in np.meshgrid(steps, steps, indexing="ij"))
+    places = lensing.displaced(np.full(east.size, ra), np.full(east.size, dec), east, north)
+    inside = area.contains(*places)
+    if not inside.any():
+        raise BadInput("sources: no place of the grid lies in the area")
+    return places[0][inside], places[1][inside]
+
+
+def _sorted(values: Mapping[str, Array]) -> dict[str, Array]:
+    order: Int = np.lexsort((values["origin_id"], values["index"]))
+    return {name: column[order] for name, column in values.items()}

@@ -1,0 +1,177 @@
+"""The evolving luminosity function of galaxies, and its inverse.
+
+number_density      n(< M, z), closed form
+inverse, magnitude  the table that turns n(< M, z) back into M
+
+Absolute magnitudes are M_r = M(0.1r) - 5 log10 h, volumes comoving (Mpc/h)^3.
+Ref: Schechter 1976, ApJ 203, 297; the numbers and their sources are in luminosity_function.toml.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import gamma, gammaincc
+
+from lake_schema.arrays import Float
+from lake_schema.errors import OutOfRange
+from truesky.catalogue import parameters
+from truesky.catalogue.interpolation import bracket
+
+_LN10_04 = 0.4 * np.log(10.0)
+# Beyond this redshift the universe has a population of its own (Serrano et al. 2024, "Galaxy catalogues").
+_Z_MAX_LIMIT = 6.0
+
+# Resolution of the tables: chosen so that the stated errors hold.
+_SMALLEST_A = 1e-5
+_ONE_STEP = -0.95
+_A_NODES, _A_MARGIN = 384, 0.01
+_LN_X_RANGE, _X_NODES, _X_STEP = (-20.0, 6.4), 3001, 5
+
+
+@dataclass(frozen=True, slots=True)
+class Schechter:
+    """A Schechter function whose parameters vary with redshift (luminosity_function.toml, [schechter])."""
+
+    z_anchor: float
+    m_star: float
+    m_star_rate: float
+    m_star_scale: float
+    phi_star: float
+    phi_star_rate: float
+    alpha: float
+    alpha_rate: float
+    alpha_z_max: float
+    far_z: tuple[float, ...]
+    far_m_star: tuple[float, ...]
+    far_phi_star: tuple[float, ...]
+    far_alpha: tuple[float, ...]
+
+    def at(self, z: npt.ArrayLike) -> tuple[Float, Float, Float]:
+        """z[n] -> M*[n] mag, phi*[n] (Mpc/h)^-3, alpha[n]."""
+        redshift = np.asarray(z, float)
+        since = redshift - self.z_anchor
+        m_star = self.m_star + self.m_star_rate * self.m_star_scale * np.expm1(-since / self.m_star_scale)
+        phi_star = self.phi_star * 10.0 ** (-self.phi_star_rate * since)
+        alpha = self.alpha - self.alpha_rate * np.minimum(redshift, self.alpha_z_max)
+        far = redshift > self.far_z[0]
+        if not far.any():
+            return m_star, phi_star, alpha
+        knots = (self.far_m_star, np.log(self.far_phi_star), self.far_alpha)
+        m_far, ln_phi_far, alpha_far = (np.interp(redshift, self.far_z, knot) for knot in knots)
+        beyond = ((m_far, m_star), (np.exp(ln_phi_far), phi_star), (alpha_far, alpha))
+        m_star, phi_star, alpha = (np.where(far, there, here) for there, here in beyond)
+        return m_star, phi_star, alpha
+
+
+@dataclass(frozen=True, slots=True)
+class Volume:
+    """The redshifts that are filled, and the faintest M_r drawn (luminosity_function.toml, [volume])."""
+
+    z_min: float
+    z_max: float
+    m_faintest: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Inverse:
+    """The luminosity of a number density: ln x of Gamma(a, x) = g, x = L/L*, a = alpha + 1.
+
+    a : [k], uniform; ln_g : [m], ascending; ln_x : [k, m]
+    """
+
+    schechter: Schechter
+    a: Float
+    ln_g: Float
+    ln_x: Float
+
+
+def schechter() -> Schechter:
+    """The luminosity function of the embedded universe."""
+    return Schechter(**parameters.section("luminosity_function.toml", "schechter"))
+
+
+def volume(z_max: float | None = None) -> Volume:
+    """The redshift range of the embedded universe, or one with another far end.
+
+    Errors: OutOfRange for z_max outside (z_min, 6]
+    """
+    numbers = parameters.section("luminosity_function.toml", "volume")
+    if z_max is not None:
+        if not numbers["z_min"] < z_max <= _Z_MAX_LIMIT:
+            raise OutOfRange("z_max", z_max, numbers["z_min"], _Z_MAX_LIMIT)
+        numbers["z_max"] = z_max
+    return Volume(**numbers)
+
+
+def density(lf: Schechter, m: npt.ArrayLike, z: npt.ArrayLike) -> Float:
+    """dn/dM at M, z, (Mpc/h)^-3 mag^-1.
+
+    m : float[n] M_r mag;  z : float[n]
+    Ref: Schechter 1976
+    """
+    m_star, phi_star, alpha = lf.at(z)
+    ln_x = -_LN10_04 * (np.asarray(m, float) - m_star)
+    return np.asarray(_LN10_04 * phi_star * np.exp((alpha + 1.0) * ln_x - np.exp(ln_x)))
+
+
+def number_density(lf: Schechter, m: npt.ArrayLike, z: npt.ArrayLike) -> Float:
+    """n(< M, z): galaxies brighter than M, (Mpc/h)^-3, phi* Gamma(alpha + 1, L/L*).
+
+    m : float[n] M_r mag;  z : float[n]
+    """
+    m_star, phi_star, alpha = lf.at(z)
+    x = np.exp(-_LN10_04 * (np.asarray(m, float) - m_star))
+    return phi_star * upper_gamma(alpha + 1.0, x)
+
+
+def upper_gamma(a: npt.ArrayLike, x: npt.ArrayLike) -> Float:
+    """Gamma(a, x) for a > -2 and x > 0; scipy's own needs a > 0.
+
+    a, x : float[...]
+    Error: relative 1e-9 where |a|, |a + 1| > 1e-2 and x < 300 (a > -0.9) or x < 30, 1e-4 where |a|, |a + 1| < 1e-5
+           (tests/truesky/catalogue/halos/test_luminosity_function.py)
+    Ref: Abramowitz & Stegun 1972, 6.5.22: Gamma(a, x) = [Gamma(a + 1, x) - x^a e^-x] / a
+    """
+    order, at = np.asarray(a, float), np.asarray(x, float)
+    if order.size and order.min() <= -2.0:
+        raise OutOfRange("a", float(order.min()), -2.0, "infinity")
+    # At a = 0 and -1 the recurrence divides zero by zero; so small a step moves Gamma by less than 1e-4.
+    order = np.where(np.abs(order) < _SMALLEST_A, _SMALLEST_A, order)
+    order = np.where(np.abs(order + 1.0) < _SMALLEST_A, _SMALLEST_A - 1.0, order)
+    # Each step up loses digits at large x: two only where one would not do.
+    second = order < _ONE_STEP
+    start = np.where(second, order + 2.0, order + 1.0)
+    above = gamma(start) * gammaincc(start, at)
+    middle = np.where(second, order + 1.0, 1.0)
+    above = np.where(second, (above - np.exp(middle * np.log(at) - at)) / middle, above)
+    return np.asarray(np.maximum((above - np.exp(order * np.log(at) - at)) / order, 0.0))
+
+
+def inverse(lf: Schechter, z_max: float = _Z_MAX_LIMIT) -> Inverse:
+    """The table that `magnitude` reads: ln(L/L*) where Gamma(a, L/L*) = g."""
+    alpha = lf.at(np.linspace(0.0, z_max, _A_NODES))[2]
+    a = np.linspace(alpha.min(), alpha.max() + _A_MARGIN, _A_NODES) + 1.0
+    ln_x = np.linspace(*_LN_X_RANGE, _X_NODES)
+    with np.errstate(divide="ignore"):
+        ln_g = np.log(upper_gamma(a[:, None], np.exp(ln_x)[None, :]))
+    # The nodes are those of the steepest function: they span what all the others reach.
+    nodes = ln_g[0, ::-_X_STEP][np.isfinite(ln_g[0, ::-_X_STEP])]
+    rows = [np.interp(nodes, row[::-1], ln_x[::-1]) for row in ln_g]
+    return Inverse(lf, a, nodes, np.stack(rows))
+
+
+def magnitude(table: Inverse, number: npt.ArrayLike, z: npt.ArrayLike) -> Float:
+    """M[n] such that n(< M, z) = number[n] (Mpc/h)^-3.
+
+    number : float[n] comoving (Mpc/h)^-3;  z : float[n]
+    Error: < 0.003 mag over 1e-12 .. 1 (Mpc/h)^-3 (tests/truesky/catalogue/halos/test_luminosity_function.py)
+    """
+    m_star, phi_star, alpha = table.schechter.at(z)
+    row, above_row = bracket(table.a, alpha + 1.0)
+    col, above_col = bracket(table.ln_g, np.log(np.asarray(number, float) / phi_star))
+    low = table.ln_x[row, col] * (1.0 - above_col) + table.ln_x[row, col + 1] * above_col
+    high = table.ln_x[row + 1, col] * (1.0 - above_col) + table.ln_x[row + 1, col + 1] * above_col
+    return np.asarray(m_star - (low * (1.0 - above_row) + high * above_row) / _LN10_04)

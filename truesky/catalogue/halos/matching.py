@@ -1,0 +1,219 @@
+"""Which galaxy a halo or sub-halo holds: masses matched to luminosities by their abundance.
+
+masses      abundance, bias, concentration and size of halos
+matching    M_r of a proxy mass: n_tot(> m', z) = n(< M_r, z), so that the luminosity function comes out exactly
+
+The proxy mass m' of a central is its halo's mass, that of a satellite its sub-mass, both with a log-normal scatter;
+n_tot counts centrals and satellites after the scatter, so nothing has to be deconvolved.
+Ref: Carretero et al. 2015, MNRAS 447, 646; the numbers are in halos.toml.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from lake_schema.arrays import Float, Int
+from truesky.catalogue import parameters
+from truesky.catalogue.halos import luminosity_function
+from truesky.catalogue.halos.luminosity_function import Inverse
+from truesky.catalogue.matter import linear_theory
+from truesky.fluxes import cosmology
+from truesky.numerics import sums
+
+# Tables reach beyond redshift 6, uniform in ln(1 + z), and 0.02 dex.
+Z_LAST, _Z_NODES = 6.1, 69
+_LOG_MASS = np.linspace(8.0, 16.4, 421)
+
+
+@dataclass(frozen=True, slots=True)
+class Occupation:
+    """Satellites of a halo (halos.toml, [occupation])."""
+
+    least: float
+    ratio: float
+    ratio_z: float
+    z_pivot: float
+    z_last: float
+    scatter: float
+    depth: float
+    concentration: float
+
+    def ratio_at(self, z: Float) -> Float:
+        """Of the halo's mass to a sub-mass, by which the mean number of satellites above that rises by one, [n].
+
+        z : float[n] of the halo
+        """
+        stretch = (1.0 + self.z_pivot) / (1.0 + np.minimum(z, self.z_last))
+        return np.asarray(self.ratio * stretch**self.ratio_z)
+
+
+@dataclass(frozen=True, slots=True)
+class HaloShape:
+    """Sizes and velocities of halos (halos.toml, [halo])."""
+
+    overdensity: float
+    critical_density: float
+    sigma_15: float
+    slope: float
+    critical: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Masses:
+    """Tables of halos on redshift (uniform in ln(1 + z)) and mass (uniform in the logarithm).
+
+    log_mass : [m];  ln_density : [z, m] ln dn/dlog10 M, comoving (Mpc/h)^-3;  bias : [z, m];
+    concentration : [coarse z, m] c_200m
+    """
+
+    log_mass: Float
+    z: Float
+    ln_density: Float
+    bias: Float
+    concentration: Float
+    shape: HaloShape
+
+    def interpolate(self, table: Float, z: Float, log_mass: Float) -> Float:
+        """[len(z), len(log_mass)], linear in ln(1 + z) and log10 M.
+
+        table : float[z nodes, masses];  z : float[a];  log_mass : float[b] log10 Msun/h
+        """
+        row, part = _place(z, table.shape[0])
+        column, share = _column(log_mass, self.log_mass)
+        along = table[:, column] * (1.0 - share) + table[:, column + 1] * share
+        return np.asarray(along[row] * (1.0 - part)[:, None] + along[row + 1] * part[:, None])
+
+    def at(self, table: Float, z: Float, log_mass: Float) -> Float:
+        """[n] of pairs (z[n], log_mass[n]).
+
+        table : float[z nodes, masses];  z, log_mass : float[n] redshift, log10 Msun/h
+        """
+        return _pairs(table, self.log_mass, z, log_mass)
+
+    def radius(self, log_mass: Float) -> Float:
+        """R_200m[n], comoving Mpc/h.
+
+        log_mass : float[n] log10 Msun/h
+        """
+        density = self.shape.overdensity * cosmology.OMEGA_M * self.shape.critical_density
+        return np.asarray(np.cbrt(3.0 * 10.0**log_mass / (4.0 * np.pi * density)))
+
+    def dispersion(self, log_mass: Float, z: Float) -> Float:
+        """One-dimensional velocity dispersion[n] of satellites, km/s.
+
+        log_mass : float[n] log10 Msun/h;  z : float[n]
+        Ref: Evrard et al. 2008
+        """
+        mass = self.shape.critical * cosmology.expansion_rate(z) * 10.0 ** (log_mass - 15.0)
+        return np.asarray(self.shape.sigma_15 * mass**self.shape.slope)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Matching:
+    """m_r : [z, m] M_r of proxy masses log_mass[m], z uniform in ln(1 + z)."""
+
+    log_mass: Float
+    m_r: Float
+    occupation: Occupation
+
+    def magnitude(self, z: Float, proxy: Float) -> Float:
+        """M_r[n] of log10 proxy masses[n].
+
+        z : float[n];  proxy : float[n] log10 Msun/h
+        """
+        return _pairs(self.m_r, self.log_mass, z, proxy)
+
+    def mass_of(self, z: Float, m_r: Float) -> Float:
+        """log10 of the proxy mass[n] of galaxies of M_r[n].
+
+        z : float[n];  m_r : float[n] mag
+        """
+        row, part = _place(z, self.m_r.shape[0])
+        curves = self.m_r[row] * (1.0 - part)[:, None] + self.m_r[row + 1] * part[:, None]
+        return np.array([np.interp(-m, -curve, self.log_mass) for m, curve in zip(m_r, curves, strict=True)])
+
+
+def masses() -> Masses:
+    """The halos of the embedded universe, 0 <= z <= 6.1."""
+    z = np.expm1(np.linspace(0.0, np.log1p(Z_LAST), _Z_NODES))
+    tables = linear_theory.halo_tables(_LOG_MASS, z)
+    shape = HaloShape(**parameters.section("halos.toml", "halo"))
+    density = np.log(np.maximum(tables["density"], 1e-300))
+    return Masses(_LOG_MASS, z, density, tables["bias"], tables["concentration"], shape)
+
+
+def matching(halos: Masses, luminosities: Inverse) -> Matching:
+    """M_r of every proxy mass and redshift."""
+    occupation = Occupation(**parameters.section("halos.toml", "occupation"))
+    rows = [
+        luminosity_function.magnitude(luminosities, number, np.full(number.size, z))
+        for z, number in zip(halos.z, proxies(halos, occupation), strict=True)
+    ]
+    # Where nothing is left of the mass function the magnitudes stay at the brightest.
+    return Matching(halos.log_mass, np.minimum.accumulate(np.array(rows), axis=1), occupation)
+
+
+def proxies(halos: Masses, occupation: Occupation) -> Float:
+    """n_tot(> m'), [z, m] comoving (Mpc/h)^-3: centrals and satellites, scattered."""
+    step = halos.log_mass[1] - halos.log_mass[0]
+    number = np.exp(halos.ln_density) * step
+    satellites = sums.product(number, satellites_above(halos.log_mass, occupation).T)
+    satellites *= satellites_at(halos.z, occupation)[:, None]
+    # Of the cumulative count of satellites, what lies in each interval.
+    inside = number + np.concatenate([satellites[:, :-1] - satellites[:, 1:], satellites[:, -1:]], axis=1)
+    smooth = scattered(inside, step, occupation)
+    above = np.cumsum(smooth[:, ::-1], axis=1)[:, ::-1]
+    return np.maximum(above - 0.5 * smooth, 1e-30)
+
+
+def scattered(number: Float, step: float, occupation: Occupation) -> Float:
+    """[z, m] in bins of the proxy mass, of numbers in bins of the mass.
+
+    number : float[z, m];  step : width of a bin, dex;  occupation : of which the scatter is
+    """
+    half = round(occupation.depth / step)
+    kernel = np.exp(-0.5 * (np.arange(-half, half + 1) * step / occupation.scatter) ** 2)
+    kernel /= kernel.sum()
+    padded = np.pad(number, ((0, 0), (half, half)), mode="reflect", reflect_type="odd")
+    smooth: Float = sums.product(sliding_window_view(np.maximum(padded, 0.0), kernel.size, axis=1), kernel)
+    return smooth
+
+
+def satellites_above(log_mass: Float, occupation: Occupation) -> Float:
+    """Mean number of satellites above m[i] in a halo of mass M[j] at z = z_pivot, [i, j].
+
+    log_mass : float[m] log10 Msun/h, of halos and of sub-masses
+    """
+    over = 10.0 ** (log_mass[None, :] - log_mass[:, None])
+    return np.asarray(np.maximum(over - occupation.least, 0.0) / occupation.ratio)
+
+
+def satellites_at(z: Float, occupation: Occupation) -> Float:
+    """How many times more satellites a halo has than one at z = z_pivot, [n].
+
+    z : float[n]
+    """
+    return np.asarray(occupation.ratio / occupation.ratio_at(z))
+
+
+def _place(z: Float, nodes: int) -> tuple[Int, Float]:
+    step = np.log1p(np.asarray(z, float)) * ((nodes - 1) / np.log1p(Z_LAST))
+    row = np.clip(step.astype(np.int64), 0, nodes - 2)
+    return row, step - row
+
+
+def _column(log_mass: Float, nodes: Float) -> tuple[Int, Float]:
+    step = (np.asarray(log_mass, float) - nodes[0]) / (nodes[1] - nodes[0])
+    column = np.clip(step.astype(np.int64), 0, nodes.size - 2)
+    return column, step - column
+
+
+def _pairs(table: Float, nodes: Float, z: Float, log_mass: Float) -> Float:
+    row, part = _place(z, table.shape[0])
+    column, share = _column(log_mass, nodes)
+    low = table[row, column] * (1.0 - share) + table[row, column + 1] * share
+    high = table[row + 1, column] * (1.0 - share) + table[row + 1, column + 1] * share
+    return np.asarray(low * (1.0 - part) + high * part)

@@ -1,0 +1,272 @@
+"""The convergence of the box's matter on source planes: sums along straight lines of sight.
+
+convergence    kappa of sources at several distances
+transfer       what its multipoles are multiplied by to have the power of linear theory
+
+Error: Born approximation; matter is constant within the cells of the box, or within as many of them as a pixel is
+       wide, which takes power away at the scales of cells; the transfer gives it back, not the structure
+Ref: Bartelmann & Schneider 2001, Phys. Rep. 340, 291, eq. 6.16 ff.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields
+from itertools import groupby
+
+import numpy as np
+
+from lake_schema.arrays import Float, Float32, Int
+from truesky.catalogue.matter import density_box, lightcone
+from truesky.catalogue.matter.density_box import Box, BoxModel
+from truesky.fluxes import cosmology
+from truesky.numerics import sums
+from truesky.numerics.compiling import exact_jit
+
+# Tables reach this redshift, however near the last plane is: it leaves the nearer ones as they are.
+_Z_LAST = 12.0
+_GAIN_NODES, _ELL_NODES, _K_BINS, _K_NODES = 9, 60, 24, 48
+# The window is averaged over so many directions, with images on so many sides, up to this many times the highest k.
+_DIRECTIONS, _IMAGES, _WINDOWS = 48, 2, 8.0
+# Where more power than this is missing, in amplitude, it stays so: sources at z < 0.3.
+_MOST_TRANSFER = 2.0
+# Pixels whose sums are taken together: few enough that the cells of the box they share stay in the processor's cache.
+_PATCH = 1024
+# Patches that a thread takes at a time.
+_PATCHES = 48
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Layers:
+    """Layers of matter, near to far; arrays [s].
+
+    middle, factor : Mpc/h, and cells of the box a side that matter is averaged over
+    stretch        : number of the stretch of one growth;  growth : D that its matter is averaged at
+    now, gain      : D here, and what delta is multiplied by to have the power of linear theory
+    weight         : of linear delta / D in the convergence, without the distances of the sources
+    """
+
+    middle: Float
+    factor: Int
+    stretch: Int
+    growth: Float
+    now: Float
+    gain: Float
+    weight: Float
+
+    def part(self, cut: slice) -> Layers:
+        """The layers of a cut."""
+        return Layers(*(getattr(self, field.name)[cut] for field in fields(self)))
+
+
+def convergence(box: Box, direction: Float32, width: float, chi: Float, coarsest: int, stretch: float) -> Float32:
+    """kappa[p, n] of sources at chi[p] Mpc/h, ascending, in n directions.
+
+    kappa = 3/2 Om (H0 / c)^2 int dchi' chi' (chi - chi') / chi (1 + z') delta
+    direction : float32[3, n] unit vectors, neighbours close to each other, n a multiple of 1024
+    width     : of a pixel, rad
+    coarsest  : most cells a side that matter is averaged over;  stretch : Mpc/h in which its growth is linear
+    box       : of matter
+    """
+    direction = np.ascontiguousarray(direction.reshape(3, -1, _PATCH).swapaxes(0, 1))
+    turned = lightcone.replicas(box, float(chi[-1]))
+    slabs = layers(box, width, float(chi[-1]), coarsest, stretch)
+    # kappa(chi) = first - second / chi: two sums serve every plane.
+    sums = np.zeros((len(direction), 2, _PATCH), np.float32)
+    planes = np.empty((chi.size, len(direction), _PATCH), np.float32)
+    done = 0
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, 4)) as pool:
+        for cut in _together(slabs, np.searchsorted(chi, slabs.middle)):
+            while done < chi.size and chi[done] <= slabs.middle[cut.start]:
+                planes[done] = sums[:, 0] - sums[:, 1] / np.float32(chi[done])
+                done += 1
+            _add(box, turned, slabs.part(cut), direction, sums, pool)
+    planes[done:] = sums[:, 0] - sums[:, 1] / chi[done:, None, None].astype(np.float32)
+    return planes.reshape(chi.size, -1)
+
+
+def layers(box: Box, width: float, far: float, coarsest: int, stretch: float) -> Layers:
+    """Layers out to `far` Mpc/h, as thick as the cells that a pixel of `width` rad is averaged over.
+
+    box : of matter;  coarsest, stretch : as of `convergence`
+    """
+    middle, factor, at = [], [], 0.0
+    while at < far:
+        cells = min(1 << max(int(np.log2(max(width * at / box.model.cell, 1.0))), 0), coarsest)
+        middle.append(at + 0.5 * cells * box.model.cell)
+        factor.append(cells)
+        at += cells * box.model.cell
+    chi, thick = np.array(middle), np.array(factor)
+    table = lightcone.distances(_Z_LAST)
+    number = (chi / stretch).astype(np.int64)
+    growth = density_box.growth(table.redshift((number + 0.5) * stretch))
+    z = table.redshift(chi)
+    now = density_box.growth(z)
+    nodes = np.linspace(float(density_box.growth(table.z[-1])), 1.0, _GAIN_NODES)
+    gain = np.interp(now, nodes, density_box.matter_gain(box.model, nodes))
+    weight = 1.5 * cosmology.OMEGA_M / cosmology.HUBBLE_DISTANCE**2 * thick * box.model.cell * chi * (1.0 + z)
+    return Layers(chi, thick, number, growth, now, gain, weight)
+
+
+def transfer(box: Box, width: float, chi: Float, l_max: int, coarsest: int, stretch: float) -> Float:
+    """sqrt(C_l of linear theory / C_l of the box), [p, l_max + 1], at most 2; arguments as of `convergence`.
+
+    Both by Limber's approximation, which holds for the ratio where it matters: it is 1 for small l.
+    chi : float[p] Mpc/h, ascending
+    box, width, coarsest, stretch : as of `convergence`;  l_max : highest multipole
+    Error: 5 % in power for l < nside and z > 0.4 (tests)
+    """
+    slabs = layers(box, width, float(chi[-1]), coarsest, stretch)
+    ell = np.unique(np.concatenate([np.arange(32), np.geomspace(32, l_max, _ELL_NODES).astype(int)]))
+    k = (ell[:, None] + 0.5) / slabs.middle
+    linear = density_box.linear_power(k.ravel()).reshape(k.shape)
+    seen = linear * _seen(box.model, slabs, k)
+    rows = []
+    for far in chi:
+        lens = slabs.weight * slabs.now * np.maximum(1.0 - slabs.middle / far, 0.0)
+        share = lens**2 / (slabs.middle**2 * slabs.factor)
+        ratio = np.sqrt(sums.product(linear, share) / sums.product(seen, share))
+        rows.append(np.interp(np.arange(l_max + 1), ell, np.minimum(ratio, _MOST_TRANSFER)))
+    return np.array(rows)
+
+
+def _seen(model: BoxModel, slabs: Layers, k: Float) -> Float:
+    """Power of the matter that lines of sight meet / linear power, [l, s]."""
+    growths = np.linspace(float(slabs.now.min()), 1.0, _GAIN_NODES)
+    edges = np.linspace(0.0, np.pi / model.cell, _K_BINS + 1)
+    at, share = density_box.linear_share(model, growths, edges)
+    nodes = np.geomspace(1e-3, _WINDOWS * np.pi / model.cell, _K_NODES)
+    ratio = np.empty(k.shape)
+    for factor in np.unique(slabs.factor).tolist():
+        here = slabs.factor == factor
+        ratio[:, here] = np.interp(k[:, here], nodes, window(model.cell, factor, nodes))
+    for s, now in enumerate(slabs.now):
+        by_k = [np.interp(now, growths, column) for column in share.T]
+        ratio[:, s] *= slabs.gain[s] ** 2 * np.interp(k[:, s], at, by_k)
+    return ratio
+
+
+def window(cell: float, factor: int, k: Float) -> Float:
+    """Power[k] of matter that is averaged over, and constant within, cubes of factor^3 cells / linear power.
+
+    Modes up to the highest of the cells' lattice, and the images of them that constant cubes make; averaged over
+    directions.
+    cell : Mpc/h;  factor : cells a side;  k : float[n] h/Mpc
+    """
+    wide = cell * factor
+    number = np.arange(_DIRECTIONS) + 0.5
+    up, turn = 1.0 - 2.0 * number / _DIRECTIONS, np.pi * (1.0 + np.sqrt(5.0)) * number
+    flat = np.sqrt(1.0 - up**2)
+    direction = np.stack([flat * np.cos(turn), flat * np.sin(turn), up], 1)
+    order = np.arange(-_IMAGES, _IMAGES + 1) * 2.0 * np.pi / wide
+    image = np.stack(np.meshgrid(order, order, order, indexing="ij"), -1).reshape(-1, 3)
+    ln_k = np.linspace(np.log(1e-4), np.log(np.sqrt(3.0) * np.pi / cell), 400)
+    ln_power = np.log(density_box.linear_power(np.exp(ln_k)))
+    mean = np.empty(k.size)
+    for i, size in enumerate(k):
+        wave = size * direction
+        source = wave[:, None] - image
+        # np.sinc(x) is sin(pi x) / (pi x).
+        average = np.sinc(source * wide / (2.0 * np.pi)) / np.sinc(source * cell / (2.0 * np.pi))
+        length = np.sqrt((source**2).sum(-1))
+        known = np.all(np.abs(source) < np.pi / cell, -1)
+        power = np.where(known, np.exp(np.interp(np.log(np.maximum(length, 1e-4)), ln_k, ln_power)), 0.0)
+        held = np.prod(np.sinc(wave * wide / (2.0 * np.pi)) ** 2, -1)
+        mean[i] = np.mean(held * np.sum(power * np.prod(average**2, -1), 1))
+    return mean / density_box.linear_power(k)
+
+
+def averaged(box: Box, growth: float, factor: int, pool: ThreadPoolExecutor) -> Float32:
+    """Matter overdensity at a growth, in cubes of factor^3 cells: float32[(n / factor)^3].
+
+    box  : of n^3 cells;  growth : of linear density, 1 today;  factor : cells a side that are averaged
+    pool : threads that share the slabs
+    """
+    n = box.n // factor
+    mean = np.empty((n, n, n), np.float32)
+    offset = np.float32(0.5 * growth**2 * box.variance[0])
+
+    def slab(x: int) -> None:
+        delta = np.expm1(np.float32(growth) * box.smoothed[0][x * factor : (x + 1) * factor] - offset)
+        # Adding whole rows is faster than numpy's mean over several axes.
+        rows = delta.sum(0) if factor > 1 else delta[0]
+        rows = sum((rows[y::factor] for y in range(1, factor)), rows[::factor])
+        mean[x] = sum((rows[:, z::factor] for z in range(1, factor)), rows[:, ::factor]) / np.float32(factor**3)
+
+    list(pool.map(slab, range(n)))
+    return mean
+
+
+def _together(slabs: Layers, plane: Int) -> Iterator[slice]:
+    """Stretches of layers that share their matter and the planes behind them."""
+    same = zip(slabs.stretch.tolist(), slabs.factor.tolist(), plane.tolist(), strict=True)
+    at = 0
+    for _, group in groupby(same):
+        size = sum(1 for _ in group)
+        yield slice(at, at + size)
+        at += size
+
+
+def _add(
+    box: Box, turned: lightcone.Replicas, slabs: Layers, direction: Float32, sums: Float32, pool: ThreadPoolExecutor
+) -> None:
+    """Add layers of one growth and factor to both sums."""
+    factor = int(slabs.factor[0])
+    delta = averaged(box, float(slabs.growth[0]), factor, pool).ravel()
+    shell = (slabs.middle // box.length).astype(np.int64)
+    scale = (turned.sign[shell] * (slabs.middle / box.length)[:, None]).astype(np.float32)
+    shift = (turned.shift[shell] / box.length).astype(np.float32)
+    axes = turned.axes[shell]
+    weight = slabs.weight * slabs.gain * slabs.now / slabs.growth
+    weights = np.stack([weight, weight * slabs.middle]).astype(np.float32)
+
+    def part(first: int) -> None:
+        cut = slice(first, first + _PATCHES)
+        add_layers(direction[cut], delta, box.n // factor, axes, scale, shift, weights, sums[cut])
+
+    list(pool.map(part, range(0, len(direction), _PATCHES)))
+
+
+@exact_jit
+def add_layers(
+    direction: Float32,
+    delta: Float32,
+    n: int,
+    axes: Int,
+    scale: Float32,
+    shift: Float32,
+    weights: Float32,
+    sums: Float32,
+) -> None:
+    """sums[:, k, p] += sum over layers s of weights[k, s] delta(cell that direction[:, :, p] meets in layer s).
+
+    direction : [patch, 3, p];  sums : [patch, 2, p];  delta : [n^3], periodic
+    axes, scale, shift : [s, 3], place in units of the box = direction[axes] scale + shift
+    """
+    pixels = direction.shape[2]
+    index = np.empty(pixels, np.int64)
+    for patch in range(direction.shape[0]):
+        first, second = sums[patch, 0], sums[patch, 1]
+        for s in range(weights.shape[1]):
+            along_x, along_y, along_z = (
+                direction[patch, axes[s, 0]],
+                direction[patch, axes[s, 1]],
+                direction[patch, axes[s, 2]],
+            )
+            scale_x, scale_y, scale_z = scale[s]
+            shift_x, shift_y, shift_z = shift[s]
+            for p in range(pixels):
+                x = along_x[p] * scale_x + shift_x
+                y = along_y[p] * scale_y + shift_y
+                z = along_z[p] * scale_z + shift_z
+                x, y, z = x - np.floor(x), y - np.floor(y), z - np.floor(z)
+                # In single precision a little less than 0 is 1 above the integer below it: the last cell, none after.
+                i, j, k = min(int(x * n), n - 1), min(int(y * n), n - 1), min(int(z * n), n - 1)
+                index[p] = (i * n + j) * n + k
+            one, other = weights[0, s], weights[1, s]
+            for p in range(pixels):
+                found = delta[index[p]]
+                first[p] += one * found
+                second[p] += other * found

@@ -1,0 +1,175 @@
+"""Stars of an external model, such as an output of the Besancon model, instead of ours.
+
+load       a text or FITS table whose columns the request names -> stars by generation cell
+numbers, of_cell    of cells
+KEYS       what can be named, with its unit
+
+A text table is one of blank-separated or comma-separated fields under a line that holds the titles; lines before it,
+and after the first one that has another number of fields, are not part of it.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Mapping
+from dataclasses import dataclass
+from io import TextIOWrapper
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from lake_schema import sky, user_files
+from lake_schema.arrays import Array, Float, Int
+from lake_schema.errors import BadInput
+from lake_schema.external import rows as external_rows
+from lake_schema.fits import external
+from lake_schema.ids import GENERATION_ORDER
+from lake_schema.store.provenance import canonical
+from truesky.catalogue import parameters
+from truesky.numerics.cache import cached_arrays, content_key
+from truesky.numerics.code_keys import code_key
+
+# Key -> lowest and highest legal value.  Of keys with a bar between them one is enough.
+KEYS = {
+    "ra": (-360.0, 360.0), "dec": (-90.0, 90.0),  # deg, ICRS
+    "l": (-360.0, 360.0), "b": (-90.0, 90.0),  # deg, Galactic
+    "mag_h": (-10.0, 40.0),  # 2MASS H, Vega, before extinction
+    "mag_h_seen": (-10.0, 60.0),  # the same with the extinction a_v
+    "teff": (300.0, 1e5),  # K
+    "log_teff": (2.4, 5.0),
+    "distance": (0.0, 1e6),  # pc
+    "distance_kpc": (0.0, 1e3),
+    "log_g": (-1.0, 10.0),
+    "metallicity": (-5.0, 1.5),  # [M/H]
+    "a_v": (0.0, 40.0),  # mag, R_V = 3.1; by default our own dust
+    "age_class": (1.0, 10.0),  # the Besancon model's: 1-7 thin disc, 8 thick disc, 9 spheroid, 10 bulge
+    "luminosity_class": (1.0, 7.0),  # its own: 1-3 giants, 4 5 7 main sequence, 6 white dwarfs
+}  # fmt: skip
+_NEEDED = (("ra", "l"), ("dec", "b"), ("mag_h", "mag_h_seen"), ("teff", "log_teff"))
+_COMPONENT = np.array([0] * 8 + [1, 2, 5])
+_STAGE = np.array([0, 1, 1, 1, 0, 0, 2, 0])
+_LONGEST_LINE = 100_000
+# Lines before that of the titles: what a model of the Galaxy was run with.
+_MOST_BEFORE = 10_000
+KIND = "catalogue of stars"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StarCatalogue:
+    """n stars by cell and position: index (order-29), and the values by key (deg, mag, K, pc) that the file has."""
+
+    index: Int
+    values: Mapping[str, Array]
+
+
+def checked_columns(columns: Mapping[str, str]) -> None:
+    """Refuse a mapping of our keys to titles that does not say enough."""
+    for key in columns:
+        if key not in KEYS:
+            raise BadInput(f"stars.catalogue.columns.{key} is not one of {', '.join(KEYS)}")
+    for either in _NEEDED:
+        if sum(key in columns for key in either) != 1:
+            raise BadInput(f"stars.catalogue.columns wants one of {' and '.join(either)}")
+    if ("ra" in columns) != ("dec" in columns):
+        raise BadInput("stars.catalogue.columns wants ra and dec, or l and b")
+    if "mag_h_seen" in columns and "a_v" not in columns:
+        raise BadInput("stars.catalogue.columns: mag_h_seen wants a_v beside it")
+
+
+def load(file: Path, sha256: str, columns: Mapping[str, str]) -> StarCatalogue:
+    """The stars of a file; from the cache or read now.
+
+    columns : key -> title in the file
+    Errors  : BadInput names the file, the column and the first row of what is missing or out of bounds, and how many
+    """
+    key = content_key(code_key(__name__), sha256, canonical(dict(columns)))
+    arrays = cached_arrays("star_catalogue", key, lambda: _read(file, columns))
+    return StarCatalogue(arrays["index"], {name: values for name, values in arrays.items() if name != "index"})
+
+
+def numbers(stars: StarCatalogue, cells: npt.ArrayLike) -> Float:
+    """Stars[n] of order-8 cells.
+
+    cells : int[n] nested
+    """
+    edges = np.stack([np.asarray(cells, np.int64), np.asarray(cells, np.int64) + 1])
+    first, last = np.searchsorted(stars.index, edges << 2 * (sky.DEEPEST - GENERATION_ORDER))
+    return np.asarray(last - first, float)
+
+
+def of_cell(stars: StarCatalogue, cell: int) -> dict[str, Array]:
+    """The values of an order-8 cell's stars, with `index`.
+
+    returns : [n] each, in the units of `load`
+    """
+    rows = slice(*np.searchsorted(stars.index, sky.cell_range(GENERATION_ORDER, cell)))
+    return {"index": stars.index[rows], **{name: values[rows] for name, values in stars.values.items()}}
+
+
+def _read(file: Path, columns: Mapping[str, str]) -> dict[str, Array]:
+    table = _table(file, list(columns.values()))
+    values: dict[str, Array] = {
+        key: external_rows.within(file, f"{title} ({key})", table[title], KEYS[key]) for key, title in columns.items()
+    }
+    if "l" in values:
+        values["ra"], values["dec"] = sky.equatorial(values.pop("l"), values.pop("b"))
+    values["ra"], values["dec"] = sky.checked(values["ra"], values["dec"])
+    if "log_teff" in values:
+        values["teff"] = 10.0 ** values.pop("log_teff")
+    if "distance_kpc" in values:
+        values["distance"] = 1e3 * values.pop("distance_kpc")
+    if "mag_h_seen" in values:
+        values["mag_h"] = values.pop("mag_h_seen") - _h_over_v() * values["a_v"]
+    if "age_class" in values:
+        values["component"] = _COMPONENT[values.pop("age_class").astype(int)]
+    if "luminosity_class" in values:
+        values["stage"] = _STAGE[values.pop("luminosity_class").astype(int)]
+    values["index"] = sky.healpix_29(values["ra"], values["dec"])
+    order = np.argsort(values["index"], kind="stable")
+    return {key: column[order] for key, column in values.items()}
+
+
+def _h_over_v() -> float:
+    return float(parameters.section("milky_way.toml", "extinction")["h_over_v"])
+
+
+def _table(file: Path, titles: list[str]) -> Mapping[str, Float]:
+    if file.suffix.lower() in (".fits", ".fit"):
+        found = external.read_numbers(file, KIND)
+        if absent := [title for title in titles if title not in found]:
+            raise BadInput(f"{file}: has no column {', '.join(absent)}; it has {', '.join(found)}")
+        return found
+    return _text(file, titles)
+
+
+def _text(file: Path, titles: list[str]) -> Mapping[str, Float]:
+    with user_files.opened(file, KIND) as opened, TextIOWrapper(opened, "utf-8", "replace") as stream:
+        lines = iter(lambda: stream.readline(_LONGEST_LINE), "")
+        head: list[str] = next(
+            (found for line in islice(lines, _MOST_BEFORE) if set(titles) <= set(found := _fields(line))), []
+        )
+        if not head:
+            raise BadInput(f"{file}: none of the first {_MOST_BEFORE} lines holds the titles {', '.join(titles)}")
+        if twice := [title for title in titles if head.count(title) > 1]:
+            raise BadInput(f"{file}: the title {twice[0]} stands twice in its line")
+        values = {title: array("d") for title in titles}
+        for line in lines:
+            fields = _fields(line)
+            if len(fields) != len(head):
+                break
+            for title in titles:
+                values[title].append(_number(file, title, fields[head.index(title)], len(values[title]) + 1))
+    return {title: np.array(column) for title, column in values.items()}
+
+
+def _fields(line: str) -> list[str]:
+    return [field.strip() for field in line.split(",")] if "," in line else line.split()
+
+
+def _number(file: Path, title: str, text: str, row: int) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise BadInput(f"{file}: {title} of row {row} is {text[:40]!r}, no number") from None

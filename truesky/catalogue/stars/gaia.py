@@ -1,0 +1,154 @@
+"""The stars as Gaia's second data release would list them: table `gaia`, row by row a function of (seed, star).
+
+observe    stars and their fluxes in BANDS -> what Gaia measures
+astrometric_errors, proper_motion_errors, photometric_errors, completeness   at a magnitude
+mean_flux  of a magnitude as measured
+ab_minus_vega   of BANDS
+
+Random numbers are keyed by the star, so that it is measured alike in whichever file it lies; errors are not correlated.
+Positions and proper motions are those of table `stars`, which has DR2's epoch.
+Ref: Gaia Collaboration, Brown et al. 2018; the numbers and their sources are in gaia.toml.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.compute as pc
+from scipy.special import chdtri, erfc, ndtri
+
+from lake_schema import sky, units
+from lake_schema.arrays import Float
+from lake_schema.tables.gaia import GAIA
+from truesky.catalogue import parameters
+from truesky.randomness.rng import uniforms
+
+BANDS = ("gaia_g", "gaia_bp", "gaia_rp")
+STAR_COLUMNS = ["id", "ra", "dec", "distance", "pm_ra", "pm_dec"]
+FLUX_COLUMNS = [f"f_nu_{band}" for band in BANDS]
+_FILE = "gaia.toml"
+_MAS = 1.0 / 3.6e6
+_MAG_OVER_FLUX = 2.5 / np.log(10.0)
+# Of a star's random numbers.
+_RA, _DEC, _PARALLAX, _G, _BP, _RP, _LISTED, _PMRA, _PMDEC, _RUWE = range(10)
+_COUNT = _RUWE + 1
+
+
+def observe(stars: pa.Table, fluxes: pa.Table, seed: int) -> pa.Table:
+    """Table `gaia` of stars, sorted by where they are measured.
+
+    stars, fluxes : columns STAR_COLUMNS, FLUX_COLUMNS, row by row
+    """
+    ids = stars["id"].to_numpy()
+    chance = uniforms(ids, _COUNT, seed, "gaia")
+    true = [units.mag_of_f_nu(fluxes[name].to_numpy().astype(float)) for name in FLUX_COLUMNS]
+    vega = ab_minus_vega()
+    g = true[0] - vega[0]
+    listed = np.flatnonzero(chance[_LISTED] < completeness(g))
+    noise, seen = ndtri(chance[:, listed]), stars.take(pa.array(listed))
+    columns: dict[str, Any] = {"id": ids[listed], **_astrometry(seen, g[listed], noise)}
+    columns |= _motion(seen, g[listed], noise)
+    columns["ruwe"] = _ruwe(chance[_RUWE, listed])
+    for k, (short, kind) in enumerate((("g", "g"), ("bp", "xp"), ("rp", "xp"))):
+        columns |= _photometry(short, true[k][listed], vega[k], kind, noise[_G + k])
+    order = np.lexsort((columns["id"], columns["_healpix_29"]))
+    return GAIA.build({name: values[order] for name, values in columns.items()})
+
+
+def ab_minus_vega() -> tuple[float, ...]:
+    """AB - Vega magnitude in each of BANDS, as Gaia defines them; 0.04 mag from what Vega's spectrum gives."""
+    return tuple(parameters.section(_FILE, "zero_points")["ab_minus_vega"])
+
+
+def completeness(g: npt.ArrayLike) -> Float:
+    """Part of the stars[n] of a magnitude G (Vega) that is listed.
+
+    g : float[n] mag, Vega
+    """
+    law = parameters.section(_FILE, "completeness")
+    return np.asarray(0.5 * erfc((np.asarray(g, float) - law["half"]) / (np.sqrt(2.0) * law["width"])))
+
+
+def astrometric_errors(g: npt.ArrayLike) -> tuple[Float, Float, Float]:
+    """Standard errors[n] of right ascension times cos(dec), declination and parallax, mas, at G (Vega).
+
+    g : float[n] mag, Vega
+    """
+    law = parameters.section(_FILE, "astrometry")
+    z = 10.0 ** (0.4 * (np.maximum(np.asarray(g, float), law["bright"]) - 15.0))
+    parallax = 1e-3 * law["scale"] * np.sqrt(law["c0"] + law["c1"] * z + law["c2"] * z**2)
+    ra, dec, own = (np.maximum(factor * parallax, law["floor"]) for factor in (law["ra"], law["dec"], 1.0))
+    return ra, dec, own
+
+
+def proper_motion_errors(g: npt.ArrayLike) -> tuple[Float, Float]:
+    """Standard errors[n] of the proper motions in right ascension times cos(dec) and declination, mas/yr, at G (Vega).
+
+    g : float[n] mag, Vega
+    """
+    law, (_, _, parallax) = parameters.section(_FILE, "proper_motion"), astrometric_errors(g)
+    return law["ra"] * parallax, law["dec"] * parallax
+
+
+def mean_flux(mag: npt.ArrayLike, band: int) -> Float:
+    """Electrons per second of magnitudes[n] (Vega) in G, BP or RP, by number in BANDS."""
+    zero = parameters.section(_FILE, "flux_zero_points")["vega"][band]
+    return np.asarray(10.0 ** (0.4 * (zero - np.asarray(mag, float))))
+
+
+def photometric_errors(mag: npt.ArrayLike, kind: str) -> Float:
+    """Standard error[n], mag, at a magnitude (Vega) in its own band; kind: "g", or "xp" for BP and RP."""
+    law = parameters.section(_FILE, "photometry")
+    at, error = np.array(law[kind]), np.log(law[f"{kind}_error"])
+    slope = np.diff(error) / np.diff(at)
+    magnitude = np.asarray(mag, float)
+    beyond = slope[-1] * np.maximum(magnitude - at[-1], 0.0) + slope[0] * np.minimum(magnitude - at[0], 0.0)
+    return np.asarray(np.exp(np.interp(magnitude, at, error) + beyond))
+
+
+def _astrometry(stars: pa.Table, g: Float, noise: Float) -> dict[str, Any]:
+    errors = astrometric_errors(g)
+    east, north = (_MAS * error * noise[k] for error, k in zip(errors[:2], (_RA, _DEC), strict=True))
+    ra, dec = sky.displaced(stars["ra"].to_numpy(), stars["dec"].to_numpy(), np.radians(east), np.radians(north))
+    distance = np.asarray(pc.fill_null(stars["distance"], np.nan).to_numpy(), float)
+    parallax = 1e3 / distance + errors[2] * noise[_PARALLAX]
+    return {
+        "ra": ra,
+        "dec": dec,
+        "_healpix_29": sky.healpix_29(ra, dec),
+        "ra_error": errors[0],
+        "dec_error": errors[1],
+        "parallax": np.ma.masked_invalid(parallax),
+        "parallax_error": errors[2],
+    }
+
+
+def _motion(stars: pa.Table, g: Float, noise: Float) -> dict[str, Any]:
+    """Of stars that have none nothing is known."""
+    true = [np.asarray(pc.fill_null(stars[name], np.nan).to_numpy(), float) for name in ("pm_ra", "pm_dec")]
+    errors, found = proper_motion_errors(g), {}
+    for name, value, error, own in zip(("pmra", "pmdec"), true, errors, noise[_PMRA : _PMDEC + 1], strict=True):
+        found[name] = np.ma.masked_invalid(value + error * own)
+        found[f"{name}_error"] = np.ma.MaskedArray(error, mask=np.isnan(value))
+    return found
+
+
+def _ruwe(chance: Float) -> Float:
+    degrees = parameters.section(_FILE, "goodness")["degrees"]
+    return np.asarray(np.sqrt(chdtri(degrees, chance) / degrees))
+
+
+def _photometry(short: str, true_ab: Float, vega: float, kind: str, noise: Float) -> dict[str, Any]:
+    """The flux is what has a normal error: a faint star's may come out negative, and has no magnitude then."""
+    error = photometric_errors(true_ab - vega, kind) / _MAG_OVER_FLUX
+    flux = 1.0 + error * noise
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mag = np.ma.masked_invalid(true_ab - 2.5 * np.log10(flux))
+    return {
+        f"mag_{short}_ab": mag,
+        f"phot_{short}_mean_mag": mag - vega,
+        f"phot_{short}_mean_flux_over_error": np.ma.MaskedArray(flux / error, mask=np.ma.getmaskarray(mag)),
+    }

@@ -1,0 +1,343 @@
+"""The Milky Way's stars: how many there are along a line of sight, and draws of them.
+
+milky_way       the components, by one of the models MODELS, and their stars
+numbers         stars of many cells
+expected        stars of a cell in every (component, shell of distance, bin of M_H)
+draw            Poisson sample of it
+
+A component's stars are stretches of isochrones, of its ages and metallicities, and white dwarfs.  The numbers and their
+sources are in milky_way.toml.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lake_schema.arrays import Bool, Float, Int
+from truesky.catalogue import parameters
+from truesky.catalogue.stars import companions, stellar_populations
+from truesky.catalogue.stars.density_laws import (
+    Aged,
+    Bar,
+    CoredPowerLaw,
+    Exponential,
+    Law,
+    Parabolic,
+    PowerLaw,
+    Sun,
+    Young,
+    density,
+)
+from truesky.catalogue.stars.stellar_populations import MassFunction, Pieces, Population, Tracks
+from truesky.numerics import sums
+
+MODELS = ("juric", "besancon")
+THIN, THICK, HALO, BULGE = 0, 1, 2, 5
+_FILE = "milky_way.toml"
+_SR_PER_DEG2 = np.radians(1.0) ** 2
+# So that the shells of all of them take 20 MB.
+_CELLS_AT_A_TIME = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class Component:
+    """A law of density and its stars.
+
+    share      : in the systems below a solar mass at the Sun; of the bulge, at the centre, in units of all of these
+    code       : THIN, THICK, HALO or BULGE;  population : ages and metallicities
+    """
+
+    law: Law
+    share: float
+    code: int
+    population: Population
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MilkyWay:
+    """Everything that stars are drawn from, made once by `milky_way`.
+
+    tracks     : isochrones of all components;  component_width : [k] of each one's cell in [M/H]
+    limits     : of [M/H]
+    distance   : [s + 1] pc, edges of the shells; m_h : [b + 1] mag, edges of the bins
+    pieces     : stretches of isochrones, those of each component by bin
+    first      : [c, b + 1] which of them are in a bin;  below : [n + 1] pc^-3, numbers of those before
+    local      : [c, b] pc^-3 where the law of density is 1: single stars and primaries
+    companions : [c, b] pc^-3 the same of companions
+    """
+
+    sun: Sun
+    components: tuple[Component, ...]
+    tracks: Tracks
+    width: Float
+    limits: tuple[float, float]
+    distance: Float
+    m_h: Float
+    pieces: Pieces
+    first: Int
+    below: Float
+    local: Float
+    companions: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sample:
+    """n stars: component THIN, .., stage stellar_populations.DWARF, .., track among the isochrones (-1 = none).
+
+    distance pc, m_h mag (Vega), mass Msun at birth (NaN of white dwarfs), teff K, log_g cm s-2, metallicity [M/H], age
+    Gyr (NaN of white dwarfs)
+    """
+
+    component: Int
+    stage: Int
+    track: Int
+    distance: Float
+    m_h: Float
+    mass: Float
+    teff: Float
+    log_g: Float
+    metallicity: Float
+    age: Float
+
+
+def milky_way(model: str = "juric") -> MilkyWay:
+    """The Milky Way of the embedded universe: numbers read, tables made (0.2 s)."""
+    sampling = parameters.section(_FILE, "sampling")
+    sun, components = _juric() if model == "juric" else _besancon()
+    masses = MassFunction(**parameters.section(_FILE, "mass_function"))
+    every = Population(*(np.concatenate(v) for v in zip(*map(_cells, components), strict=True)))
+    tracks = stellar_populations.tracks(every.age, every.metallicity)
+    m_h = sampling["brightest"] + sampling["bin_mag"] * np.arange(sampling["bins"] + 1)
+    owner = np.repeat(np.arange(len(components)), [c.population.age.size for c in components])
+    pieces = stellar_populations.pieces_of(tracks, every.share, masses, m_h)
+    # As many systems live below a solar mass as are counted near the Sun.
+    of = owner[pieces.track]
+    share = np.array([component.share for component in components])
+    living = np.bincount(of, pieces.number * (pieces.log_mass.mean(0) < np.log10(masses.reference)), share.size)
+    scale = masses.local * share / living
+    dwarfs = stellar_populations.white_dwarfs(m_h)
+    parts, starts, begun = [], [], 0
+    second = np.zeros((share.size, m_h.size - 1))
+    for k in range(share.size):
+        own = pieces.take(of == k)
+        own = own.take(np.argsort(own.bin, kind="stable"))
+        own = _times(own, float(scale[k]))
+        second[k] = companions.expected(tracks, own, m_h)
+        own = stellar_populations.joined([own, _times(dwarfs, float(share[k]))])
+        own = own.take(np.argsort(own.bin, kind="stable"))
+        starts.append(begun + np.searchsorted(own.bin, np.arange(m_h.size)))
+        begun += own.bin.size
+        parts.append(own)
+    whole, first = stellar_populations.joined(parts), np.stack(starts)
+    below = np.concatenate([[0.0], np.cumsum(whole.number)])
+    distance = np.geomspace(sampling["nearest"], sampling["farthest"], sampling["shells"] + 1)
+    limits = parameters.section(_FILE, "metallicity")["limits"]
+    local = below[first[:, 1:]] - below[first[:, :-1]]
+    return MilkyWay(
+        sun, components, tracks, every.width, limits, distance, m_h, whole, first, below, local, second
+    )  # fmt: skip
+
+
+def _cells(component: Component) -> tuple[Float, Float, Float, Float]:
+    own = component.population
+    return own.age, own.metallicity, own.width, own.share
+
+
+def _times(pieces: Pieces, factor: float) -> Pieces:
+    return replace(pieces, number=pieces.number * factor)
+
+
+def _populations(model: str) -> dict[str, Any]:
+    return parameters.section(_FILE, f"{model}_populations")
+
+
+def _thin(numbers: dict[str, Any], bins: slice) -> Population:
+    """Born at a constant rate over some of the bins of age."""
+    law = parameters.section(_FILE, "metallicity")
+    edges, parts = np.array(law["thin_age"]), np.array(law["thin_parts"])
+    ages, shares, of = [], [], []
+    for k in range(parts.size)[bins]:
+        inner = np.linspace(edges[k], edges[k + 1], parts[k] + 1)
+        ages += list(0.5 * (inner[1:] + inner[:-1]))
+        shares += list(np.diff(inner))
+        of += [k] * int(parts[k])
+    mean, scatter = (np.array(numbers[name])[of] for name in ("thin_metallicity", "thin_scatter"))
+    return stellar_populations.population(np.array(ages), np.array(shares), mean, scatter, law["thin_cells"])
+
+
+def _old(numbers: dict[str, Any], name: str) -> Population:
+    """Of one age."""
+    law = parameters.section(_FILE, "metallicity")
+    age, mean, scatter = (np.array([numbers[f"{name}_{what}"]]) for what in ("age", "metallicity", "scatter"))
+    return stellar_populations.population(age, np.ones(1), mean, scatter, law["old_cells"])
+
+
+def _bulge() -> Component:
+    """Ref: Robin et al. 2012"""
+    number: dict[str, Any] = parameters.section(_FILE, "bulge")
+    masses = MassFunction(**parameters.section(_FILE, "mass_function"))
+    share = number["central_density"] * number["systems_per_mass"] / masses.local
+    law = Bar(*(number[name] for name in ("angle", "length", "width", "height", "parallel", "perpendicular")))
+    return Component(law, share, BULGE, _old(number, "bulge"))
+
+
+def _juric() -> tuple[Sun, tuple[Component, ...]]:
+    """Ref: Juric et al. 2008"""
+    number: dict[str, Any] = parameters.section(_FILE, "juric")
+    born = _populations("juric")
+    thin = Exponential(number["thin_length"], number["thin_height"])
+    thick = Exponential(number["thick_length"], number["thick_height"])
+    halo = PowerLaw(number["halo_flattening"], number["halo_slope"], number["halo_core"])
+    share = np.array([1.0, number["thick_share"], number["halo_share"]])
+    share /= share.sum()
+    components = (
+        Component(thin, float(share[0]), THIN, _thin(born, slice(None))),
+        Component(thick, float(share[1]), THICK, _old(born, "thick")),
+        Component(halo, float(share[2]), HALO, _old(born, "halo")),
+        _bulge(),
+    )
+    return Sun(number["sun_radius"], number["sun_height"]), components
+
+
+def _besancon() -> tuple[Sun, tuple[Component, ...]]:
+    """Ref: Robin et al. 2003"""
+    number: dict[str, Any] = parameters.section(_FILE, "besancon")
+    born = _populations("besancon")
+    flattening = number["thin_flattening"]
+    thin: list[Law] = [Aged(value, number["outer"], number["inner"]) for value in flattening]
+    thin[0] = Young(flattening[0], number["young_outer"], number["young_inner"])
+    thick = Parabolic(number["thick_length"], number["thick_height"], number["thick_joint"])
+    halo = CoredPowerLaw(number["halo_flattening"], number["halo_slope"], number["halo_core"])
+    local = np.array([*number["thin_local"], number["thick_local"], number["halo_local"]])
+    share = (local / local.sum()).tolist()
+    components = [Component(law, share[k], THIN, _thin(born, slice(k, k + 1))) for k, law in enumerate(thin)]
+    components += [
+        Component(thick, share[-2], THICK, _old(born, "thick")), Component(halo, share[-1], HALO, _old(born, "halo")),
+        _bulge(),
+    ]  # fmt: skip
+    return Sun(number["sun_radius"], number["sun_height"]), tuple(components)
+
+
+def cylindrical(
+    galaxy: MilkyWay, lon: npt.ArrayLike, lat: npt.ArrayLike, distance: Float
+) -> tuple[Float, Float, Float]:
+    """Galactocentric R, z pc, azimuth rad at heliocentric distances along Galactic (l, b) deg, all of them broadcast.
+
+    lon, lat : float[...] deg;  distance : float[...] pc
+    galaxy   : where the Sun is in it
+    """
+    l_rad, b_rad = np.radians(lon), np.radians(lat)
+    across = distance * np.cos(b_rad)
+    x, y = galaxy.sun.radius - across * np.cos(l_rad), across * np.sin(l_rad)
+    return np.hypot(x, y), galaxy.sun.height + distance * np.sin(b_rad), np.arctan2(y, x)
+
+
+def numbers(galaxy: MilkyWay, lon: Float, lat: Float, area: float, h_limit: Float) -> Float:
+    """Stars[n] of cells before their dust: the sum of `expected` of each, and of their companions.
+
+    lon, lat : [n] Galactic, of the cells' centres, deg; area : of one of them, deg2; h_limit : [n]
+    galaxy   : components, their populations and laws
+    """
+    total, local = np.zeros(lon.size), galaxy.local + galaxy.companions
+    for limit in np.unique(h_limit):
+        chosen = np.flatnonzero(h_limit == limit)
+        per_shell = sums.product(_seen(galaxy, float(limit)), local.T) * volumes(galaxy, area)[:, None]
+        for some in np.array_split(chosen, -(-chosen.size // _CELLS_AT_A_TIME)):
+            r, z, azimuth = cylindrical(galaxy, lon[some, None], lat[some, None], middles(galaxy))
+            for component, weights in zip(galaxy.components, per_shell.T, strict=True):
+                total[some] += sums.product(density(component.law, galaxy.sun, r, z, azimuth), weights)
+    return total
+
+
+def expected(galaxy: MilkyWay, lon: float, lat: float, area: float, h_limit: float) -> Float:
+    """Single stars and primaries of a cell in every (component, shell, bin), [c, s, b]; 0 where all are too faint.
+
+    lon, lat : Galactic, of the cell's centre, deg; area : deg2
+    galaxy   : components, their populations and laws;  h_limit : mag, Vega
+    """
+    r, z, azimuth = cylindrical(galaxy, lon, lat, middles(galaxy))
+    relative = np.stack([density(component.law, galaxy.sun, r, z, azimuth) for component in galaxy.components])
+    per_shell = relative * volumes(galaxy, area)
+    return np.where(_seen(galaxy, h_limit), per_shell[:, :, None] * galaxy.local[:, None, :], 0.0)
+
+
+def middles(galaxy: MilkyWay) -> Float:
+    """Where in a shell its density is taken, [s] pc."""
+    return np.asarray(np.sqrt(galaxy.distance[:-1] * galaxy.distance[1:]))
+
+
+def volumes(galaxy: MilkyWay, area: float) -> Float:
+    """Of the shells within an area, deg2, [s] pc^3."""
+    near, far = galaxy.distance[:-1], galaxy.distance[1:]
+    return np.asarray(area * _SR_PER_DEG2 * (far - near) * (far**2 + far * near + near**2) / 3.0)
+
+
+def _seen(galaxy: MilkyWay, h_limit: float) -> Bool:
+    """[s, b] whether a star of the bin may be brighter than the limit in the shell."""
+    return np.asarray(galaxy.m_h[None, :-1] + 5.0 * np.log10(galaxy.distance[:-1, None]) - 5.0 < h_limit)
+
+
+def draw(galaxy: MilkyWay, mean: Float, rng: np.random.Generator, labels: np.random.Generator) -> Sample:
+    """Poisson sample of `expected` numbers; uniform in volume within a shell, on its stretch of an isochrone.
+
+    galaxy, rng : what is drawn from, of numbers, distances and magnitudes
+    mean        : float[c, s, b]
+    labels      : of metallicities within their cells
+    """
+    drawn = _boxes(mean, rng)
+    owner, shell, m_bin = np.unravel_index(drawn, mean.shape)
+    distance = _distance(galaxy, shell, rng)
+    first, last = galaxy.below[galaxy.first[owner, m_bin]], galaxy.below[galaxy.first[owner, m_bin + 1]]
+    piece = np.searchsorted(galaxy.below, first + (last - first) * rng.random(drawn.size), side="right") - 1
+    # The product may round up to the end itself.
+    piece = np.clip(piece, galaxy.first[owner, m_bin], galaxy.first[owner, m_bin + 1] - 1)
+    own, along = galaxy.pieces, rng.random(drawn.size)
+
+    def at(ends: Float) -> Float:
+        low = ends[0, piece]
+        return np.asarray(low + (ends[1, piece] - low) * along)
+
+    track = own.track[piece]
+    cooling = track < 0
+    metals = galaxy.tracks.metallicity[track] + galaxy.width[track] * (labels.random(drawn.size) - 0.5)
+    codes = np.array([component.code for component in galaxy.components])
+    return Sample(
+        component=codes[owner],
+        stage=own.stage[piece],
+        track=track,
+        distance=distance,
+        m_h=at(own.m_h),
+        mass=np.where(cooling, np.nan, 10.0 ** at(own.log_mass)),
+        teff=10.0 ** at(own.log_teff),
+        log_g=at(own.log_g),
+        metallicity=np.clip(metals, *galaxy.limits),
+        age=np.where(cooling, np.nan, galaxy.tracks.age[track]),
+    )
+
+
+def in_shells(galaxy: MilkyWay, mean: Float, rng: np.random.Generator) -> tuple[Int, Float]:
+    """Poisson sample of expected numbers [k, s] of k kinds: kind[n], distance[n] pc, uniform in volume in a shell.
+
+    mean : float[k, s]
+    """
+    kind, shell = np.unravel_index(_boxes(mean, rng), mean.shape)
+    return np.asarray(kind), _distance(galaxy, shell, rng)
+
+
+def _boxes(mean: Float, rng: np.random.Generator) -> Int:
+    """Flat index[n] of the box that each of a Poisson number of draws falls into."""
+    boxes = np.flatnonzero(mean)
+    cumulative = np.cumsum(mean.ravel()[boxes])
+    total = float(cumulative[-1]) if boxes.size else 0.0
+    n = int(rng.poisson(total))
+    # The product may round up to the total itself.
+    return boxes[np.minimum(np.searchsorted(cumulative, rng.random(n) * total, side="right"), max(boxes.size - 1, 0))]
+
+
+def _distance(galaxy: MilkyWay, shell: Int, rng: np.random.Generator) -> Float:
+    near3, far3 = galaxy.distance[shell] ** 3, galaxy.distance[shell + 1] ** 3
+    return np.asarray(np.cbrt(near3 + (far3 - near3) * rng.random(shell.size)))

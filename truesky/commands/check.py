@@ -1,0 +1,64 @@
+"""truesky check REQUEST [--plan]: report whether any job would refuse a request, or --plan, whether planning would."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from lake_schema import command, user_files
+from lake_schema.errors import BadInput
+from truesky.request import checks
+from truesky.request.from_toml import parse
+from truesky.request.schema import Request
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """0 and a line where the request is good, 2 and the key that is not; --plan : it is to be planned alone."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    alone = arguments[2:] == ["--plan"]
+    if len(arguments) != 2 + alone or arguments[0] != "check":
+        print("usage: truesky check REQUEST [--plan]", file=sys.stderr)
+        return 2
+    return command.status("request", lambda: _check(Path(arguments[1]), alone))
+
+
+def _check(path: Path, alone: bool) -> int:
+    request = parse(path)
+    try:
+        refuse(request, alone)
+    except BadInput as error:
+        raise BadInput(f"request {user_files.shown(path)}: {error}") from None
+    variants = sum(1 for _ in request.variants())
+    counts = f"{len(request.pointings)} pointings, {len(request.observations)} observations, {variants} variants"
+    print(f"{request.name}: good: {counts}")
+    if skipped := checks.skipped(request):
+        print(f"{request.name}: {skipped}")
+    return 0
+
+
+def refuse(request: Request, alone: bool = False) -> None:
+    """Raise BadInput if any job would refuse the request.
+
+    Parameters
+    ----------
+    request : Request
+        The parsed request.
+    alone : bool, optional
+        Check the plan only, not the catalogues.
+    """
+    # What reads files and plans takes seconds to import: only a request whose keys are good is worth them.
+    from truesky.render import plan_exposures
+
+    if not request.pointings and not request.observations:
+        plan_exposures.check_catalogues(request)
+    elif alone:
+        for _ in plan_exposures.Planner.of(None, request).tables():
+            pass
+    else:
+        for _ in plan_exposures.checked(request):
+            pass
+
+
+if __name__ == "__main__":
+    command.leave(main)

@@ -1,0 +1,37 @@
+"""A whole field on one machine: `truesky run` of the demo's request, with the lake and the pictures in one folder.
+
+python -m truesky.commands.demo [--request requests/demo.toml] [--out out/demo]
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from lake_schema import __version__, command
+from lake_schema.store import layout
+from truesky.commands import examples, run, submit
+from truesky.request.from_toml import parse
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the jobs; the exit status is 0, or that of the first job that fails; 130/143 stopped."""
+    parser = argparse.ArgumentParser(
+        prog="python -m truesky.commands.demo",
+        description="Simulate a field: five jobs, a table, pictures.",
+        epilog=f"truesky {__version__}",
+    )
+    parser.add_argument("--request", type=Path, default=examples.request("demo"), help="simulation request")
+    parser.add_argument("--out", default="out/demo", help="folder of the lake and the pictures")
+    options = parser.parse_args(argv)
+
+    def demonstrated() -> int:
+        out, request = layout.lake(options.out), parse(options.request)
+        return run.run(layout.lake(out / "lake"), options.request, run.stages(request), request, submit.submit, out)
+
+    with submit.stopping("demo"):
+        return command.status("demo", demonstrated)
+
+
+if __name__ == "__main__":
+    command.leave(main)

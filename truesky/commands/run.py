@@ -1,0 +1,203 @@
+"""truesky run REQUEST --lake LAKE: all that a request needs, one job after another, then a table and pictures.
+
+    truesky run REQUEST --lake LAKE [--detectors NAME ...] [--limit N] [--lenses] [--gaia] [--pictures FOLDER]
+
+run      the jobs that a request needs, each as `start` starts it
+stages   which these are
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
+
+import pyarrow as pa
+
+from lake_schema import __version__, command, user_files
+from lake_schema.store import layout, read
+from truesky.catalogue.stars import gaia
+from truesky.commands import space
+from truesky.numerics import cache
+from truesky.render import plan_exposures
+from truesky.render.forecasting import catalogue_forecast, speed
+from truesky.render.planning import preconditions, tasks
+from truesky.request import universe
+from truesky.request.from_toml import parse
+from truesky.request.schema import Request
+
+# A picture takes some 3 s to draw.
+_PICTURES = 12
+_FIRST = "the renderer has not been compiled on this machine yet: the first detectors take about a minute longer, once"
+# Run a job: the name of its module, its arguments -> its exit status.
+Start = Callable[[str, Sequence[str]], int]
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """One job of a run.
+
+    Parameters
+    ----------
+    module : str
+        Name of the module that has the job as `JOB`.
+    tables : tuple of str
+        Tables that the closing table lists.
+    changes : tuple of (str, tuple of str or int)
+        Fields of the request that are different for this job.
+    """
+
+    module: str
+    tables: tuple[str, ...]
+    changes: tuple[tuple[str, tuple[str, ...] | int], ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Name of the job."""
+        return self.module.rpartition(".")[2]
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """The changes as options of the job's command line."""
+        words = ((f"--{name}", *(value if isinstance(value, tuple) else (str(value),))) for name, value in self.changes)
+        return tuple(chain.from_iterable(words))
+
+    def request(self, request: Request) -> Request:
+        """The request with the changes."""
+        return replace(request, **dict(self.changes))  # type: ignore[arg-type]
+
+
+CATALOGUES = (
+    Stage("truesky.catalogue.build_galaxies", ("galaxies",)),
+    Stage("truesky.catalogue.build_stars", ("stars",)),
+    Stage("truesky.fluxes.compute_fluxes", ("galaxy_fluxes", "star_fluxes")),
+)
+_LENSES = Stage("truesky.catalogue.build_strong_lenses", ("strong_lenses",))
+_GAIA = Stage("truesky.catalogue.build_gaia", ("gaia",))
+IMAGES = (
+    Stage("truesky.render.plan_exposures", ("exposures", "tasks")),
+    Stage("truesky.render.render_exposures", ("products",)),
+)
+
+
+def stages(request: Request, lenses: bool = False, with_gaia: bool = False) -> list[Stage]:
+    """The jobs of a request, in their order.
+
+    lenses : strong lenses, too;  with_gaia : Gaia's view of the stars, too, in whose bands fluxes are computed then
+    """
+    *found, fluxes = CATALOGUES
+    if with_gaia:
+        fluxes = replace(fluxes, changes=(("bands", tuple(dict.fromkeys((*request.bands, *gaia.BANDS)))),))
+    found += [_LENSES] * lenses + [fluxes] + [_GAIA] * with_gaia
+    if not request.pointings and not request.observations:
+        return found
+    plan, render = IMAGES
+    changes: tuple[tuple[str, tuple[str, ...] | int], ...] = ()
+    if request.detectors:
+        changes += (("detectors", request.detectors),)
+    if request.limit is not None:
+        changes += (("limit", request.limit),)
+    tables = (*render.tables, "exposure_files") if request.files == "exposure" else render.tables
+    return [*found, plan, replace(render, tables=tables, changes=changes)]
+
+
+def main(argv: Sequence[str], start: Start) -> int:
+    """Exit status: 0, that of the first job that fails, 2 the call, the request or the disc's room is refused."""
+    parser = argparse.ArgumentParser(
+        prog="truesky run",
+        description="All that a request needs: catalogues, fluxes, plan, images; then a table and pictures.",
+        epilog=f"What follows a -- goes to spark-submit. truesky {__version__}",
+    )
+    parser.add_argument("request", type=Path, help="simulation request, a TOML file")
+    parser.add_argument("--lake", required=True, help="folder of the lake (made where it is not there)")
+    parser.add_argument("--detectors", nargs="+", default=(), metavar="NAME", help="render these of every exposure")
+    parser.add_argument("--limit", type=int, metavar="N", help="render so many detectors at most")
+    parser.add_argument("--lenses", action="store_true", help="strong lenses, too")
+    parser.add_argument("--gaia", action="store_true", help="the stars as Gaia lists them, too")
+    parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="of the pictures (default: LAKE/pictures)")
+    options = parser.parse_args(argv)
+
+    def ran() -> int:
+        root = layout.lake(options.lake)
+        out = user_files.folder(options.pictures or root / "pictures")
+        request = replace(parse(options.request), detectors=tuple(options.detectors), limit=options.limit)
+        return run(root, options.request, stages(request, options.lenses, options.gaia), request, start, out)
+
+    return command.status("truesky", ran)
+
+
+def run(root: Path, file: Path, wanted: Sequence[Stage], request: Request, start: Start, out: Path) -> int:
+    """Exit status of the first job that fails; 0 and a table and pictures where none does.
+
+    root : of the lake;  file : of the request;  wanted : its stages;  request : what the file says, and the part
+    that is to be rendered;  start : starts a job;  out : folder of the pictures
+    """
+    # Whatever is wrong with the request, or with the room on the disc, is said before the first job runs.
+    universe.refuse_others(root, request)
+    # Asked before anything is planned, which compiles a little.
+    compiled = any(cache.machine_code_dir().glob("kernels_*/*.nbi"))
+    rendered = wanted[-1].name == IMAGES[-1].name
+    plan = None
+    if rendered:
+        plan = plan_exposures.check(request, root)
+    else:
+        plan_exposures.check_catalogues(request)
+    wanted_gb, free_gb = space.check(root, request, plan)
+    count = _foretell(root, request, plan, wanted_gb, free_gb)
+    print(f"{_FIRST}\n" if count and not compiled else "", flush=True)
+    rows, began = [], time.perf_counter()
+    for stage in wanted:
+        started = time.perf_counter()
+        print(f"{stage.name} ...", flush=True)
+        if status := start(stage.module, ["--lake", str(root), "--request", str(file), *stage.options]):
+            return status
+        rows.append((stage, time.perf_counter() - started))
+    _table(root, request.name, rows, time.perf_counter() - began)
+    if rendered:
+        _show(root, out, request.name)
+    return 0
+
+
+def _foretell(
+    root: Path, request: Request, plan: tuple[pa.Table, pa.Table] | None, wanted_gb: float, free_gb: float
+) -> int:
+    """Detectors. Says what all of it will take; what the lake has already is taken off the room alone."""
+    machine = speed.of_machine(root)
+    seconds = sum(line.seconds for line in catalogue_forecast.of_request(request, machine.factor))
+    count = 0
+    if plan is not None:
+        asked = tasks.part(preconditions.rendered(*plan), request)
+        count, seconds = len(asked), seconds + machine.factor * sum(task["seconds"] for task in asked)
+    hours, cores = seconds / 3600.0, catalogue_forecast.WORKERS
+    print(
+        f"forecast: {count:,} detectors, {hours:.2f} core-hours of this machine ({machine.source}), "
+        f"{hours / cores:.2f} h on {cores} cores; {wanted_gb:.2f} GB to write, {free_gb:.2f} GB are free"
+    )
+    return count
+
+
+def _table(root: Path, request: str, stages: Sequence[tuple[Stage, float]], total: float) -> None:
+    print(f"\n{'stage':20} {'table':14} {'rows':>10} {'rows/s':>10} {'MB':>8} {'seconds':>8}")
+    for stage, seconds in stages:
+        versions = [read.version(root, name, request=request) for name in stage.tables]
+        rows = sum(version.num_rows for version in versions)
+        for i, version in enumerate(versions):
+            size = sum(entry["bytes"] for entry in version.manifest["files"]) / 1e6
+            pace = f"{rows / seconds:10,.1f} {size:8.1f} {seconds:8.1f}" if i == 0 else f"{'':10} {size:8.1f}"
+            print(f"{stage.name if i == 0 else '':20} {version.table:14} {version.num_rows:10,} {pace}")
+    print(f"{'all':20} {'':14} {'':10} {'':10} {'':8} {total:8.1f}\n")
+
+
+def _show(root: Path, out: Path, request: str) -> None:
+    # All that renders: seconds that the first job need not wait for.
+    from truesky.render.forecasting import taken
+    from truesky.render.products import preview, same_sky
+
+    for line in taken.text(taken.rows(root, request, speed.of_machine(root).factor)):
+        print(line)
+    print()
+    for picture in (*preview.previews(root, out, _PICTURES, request), *same_sky.draw(root, out, request)):
+        print(picture)

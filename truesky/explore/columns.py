@@ -1,0 +1,122 @@
+"""Columns of a lake's tables, or expressions of them, kept as float32 files in the cache: what charts are counted from.
+
+Selection   which rows
+Kept        columns of some rows, row by row the same
+kept        load them, or fill and load them
+trim        remove the oldest
+
+The rows of a join come in another order each time, so that all its columns are filled by one query. Those of a table
+are filled one by one, each with a sum of its rows' keys that would differ in another order: it is compared.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+import pyarrow as pa
+
+from lake_schema.arrays import Array, Float32
+from truesky.numerics import cache
+from truesky.numerics.code_keys import code_key
+
+# (query, texts that must each be an expression) -> its rows
+Ask = Callable[[str, Sequence[str]], Iterable[pa.RecordBatch]]
+_NAME = "columns"
+_ORDER = "order"
+MOST_BYTES = 4e9
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """Some rows of a lake.
+
+    lake   : key of the versions of its tables
+    source : what may follow FROM;  where : condition of the rows
+    keys   : columns that tell the rows of a table apart; none: the source is no table, or has no keys
+    part   : one row in so many, chosen by its keys
+    """
+
+    lake: str
+    source: str
+    where: str = "true"
+    keys: tuple[str, ...] = ()
+    part: int = 1
+
+    def condition(self) -> str:
+        sampled = f" AND hash({', '.join(self.keys)}) % {self.part} = 0" if self.part > 1 else ""
+        return f"({self.where}\n){sampled}"
+
+
+def kept(selection: Selection, expressions: Sequence[str], ask: Ask) -> list[Float32]:
+    """float32[n] of each expression, NaN where it is missing, row by row of the same rows; mapped from disc.
+
+    ask    : runs a query
+    Errors : BadInput for what is no expression
+    """
+    if selection.keys:
+        found = [_column(selection, [text], ask) for text in expressions]
+        if len({int(one[_ORDER][0]) for one in found}) <= 1:
+            return [one["0"] for one in found]
+    together = _column(selection, expressions, ask)
+    return [together[str(number)] for number in range(len(expressions))]
+
+
+def _column(selection: Selection, expressions: Sequence[str], ask: Ask) -> dict[str, Array]:
+    about: tuple[str | int, ...] = (selection.lake, selection.source, selection.where, *selection.keys, selection.part)
+    key = cache.content_key(code_key(__name__), *about, "of", *expressions)
+    return cache.cached_arrays(_NAME, key, lambda: _filled(selection, expressions, ask))
+
+
+def _filled(selection: Selection, expressions: Sequence[str], ask: Ask) -> dict[str, Array]:
+    wanted = [f"TRY_CAST(({text}\n) AS FLOAT) AS v{number}" for number, text in enumerate(expressions)]
+    order = f"hash({', '.join(selection.keys)})" if selection.keys else "0::UBIGINT"
+    query = f"SELECT {', '.join(wanted)}, {order} AS own FROM {selection.source} WHERE {selection.condition()}"
+    cache.cache_dir().mkdir(parents=True, exist_ok=True)
+    # On disc, not in memory: of a large table a column is gigabytes.
+    with ExitStack() as opened:
+        files = [opened.enter_context(tempfile.TemporaryFile(dir=cache.cache_dir())) for _ in expressions]
+        return _collected(ask(query, [*expressions, selection.where]), files)
+
+
+def _collected(batches: Iterable[pa.RecordBatch], files: Sequence[IO[bytes]]) -> dict[str, Array]:
+    """Columns, each through its file, and the sum that tells their order; the last column is the rows' keys."""
+    total, rows = np.zeros(1, np.uint64), 0
+    for batch in batches:
+        for number, file in enumerate(files):
+            file.write(batch.column(number).to_numpy(zero_copy_only=False).astype(np.float32).tobytes())
+        places = np.arange(rows + 1, rows + 1 + batch.num_rows, dtype=np.uint64)
+        total += np.sum(places * batch.column(len(files)).to_numpy(), dtype=np.uint64)
+        rows += batch.num_rows
+    arrays: dict[str, Array] = {_ORDER: np.append(total, np.uint64(rows))}
+    for number, file in enumerate(files):
+        file.flush()
+        arrays[str(number)] = np.memmap(file, np.float32, "r", shape=(rows,)) if rows else np.zeros(0, np.float32)
+    return arrays
+
+
+def trim(most: float = MOST_BYTES, folder: Path | None = None) -> int:
+    """Remove kept columns, the oldest first, until they take at most `most` bytes.
+
+    folder  : of the cache, None = the project's
+    returns : how many were removed
+    """
+    folders = [path for path in (folder or cache.cache_dir()).glob(f"{_NAME}-*") if path.is_dir()]
+    sizes = {path: sum(file.stat().st_size for file in path.iterdir()) for path in folders}
+    removed, total = 0, sum(sizes.values())
+    for path in sorted(folders, key=_age):
+        if total <= most:
+            break
+        shutil.rmtree(path, ignore_errors=True)
+        removed, total = removed + 1, total - sizes[path]
+    return removed
+
+
+def _age(folder: Path) -> float:
+    return folder.stat().st_mtime

@@ -1,0 +1,245 @@
+"""What becomes of a result: pandas, astropy or Arrow in a notebook, a file on disc."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import pandas as pd
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet as pq
+
+from lake_schema import user_files
+from lake_schema.columns import Column, Table
+from lake_schema.errors import BadInput
+from truesky.explore import votables
+
+# That a FITS file is made of, and that it may have: of other files no more than a piece is kept.
+MOST_FITS_BYTES, _PIECE = 8 << 30, 1 << 20
+INTO = ("pandas", "astropy", "arrow")
+# Where some are missing: pandas' own way is to make floats of integers, which rounds an identifier.
+_NULLABLE: dict[pa.DataType, Any] = {pa.bool_(): pd.BooleanDtype()}
+_NULLABLE |= {
+    pa.type_for_alias(kind.lower()): pd.api.types.pandas_dtype(kind)
+    for kind in ("Int8", "Int16", "Int32", "Int64", "UInt8", "UInt16", "UInt32", "UInt64")
+}
+
+
+def converted(rows: pa.Table, into: str) -> Any:
+    """The rows as a pandas DataFrame, an astropy Table with units, or as they are."""
+    if into == "pandas":
+        gaps = {column.type for column in rows.columns if column.null_count}
+        return rows.to_pandas(types_mapper=lambda kind: _NULLABLE.get(kind) if kind in gaps else None)
+    if into == "arrow":
+        return rows
+    if into == "astropy":
+        return _astropy(rows)
+    raise BadInput(f"into = {into!r} is not one of {', '.join(INTO)}")
+
+
+def _astropy(rows: pa.Table) -> Any:
+    from astropy.table import Column as AstropyColumn
+    from astropy.table import MaskedColumn
+    from astropy.table import Table as AstropyTable
+
+    _refuse_same_names(rows)
+    table = AstropyTable()
+    for field, values in zip(rows.schema, rows.columns, strict=True):
+        facts = _facts(field)
+        about: dict[str, Any] = {"unit": facts.get("unit") or None, "description": facts.get("description")}
+        # As astropy does with those of a VOTable.
+        about |= {"meta": {"ucd": facts["ucd"]}} if facts.get("ucd") else {}
+        if values.null_count:
+            filled = values.fill_null(pa.scalar(0).cast(field.type)) if field.type in _NULLABLE else values
+            table[field.name] = MaskedColumn(filled.to_numpy(), mask=values.is_null().to_numpy(), **about)
+        else:
+            table[field.name] = AstropyColumn(values.to_numpy(), **about)
+    return table
+
+
+def _facts(field: pa.Field) -> dict[str, str]:
+    return {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
+
+
+def write(rows: pa.Table, path: Path) -> None:
+    """Write rows to a file of the kind that its ending says: .csv, .parquet, .fits or .vot; replaced in one rename.
+
+    Errors : BadInput for another ending, or names the column that such a file cannot hold; OSError where the disc
+             refuses
+    """
+    writer = _WRITERS[user_files.target(path, ENDINGS).suffix.lower()]
+    _refuse_same_names(rows)
+    with user_files.staged(path) as temporary:
+        if error := _refusal(writer, rows, temporary):
+            column = next((name for name in rows.column_names if _refusal(writer, rows.select([name]), temporary)), "")
+            raise BadInput(f"{path}: column {column}: {' '.join(str(error).split())[:300]}") from None
+
+
+def _refusal(writer: Callable[[pa.Table, Path], None], rows: pa.Table, path: Path) -> Exception | None:
+    """Why a kind of file cannot hold the rows, if it cannot."""
+    try:
+        writer(rows, path)
+    except (pa.ArrowException, ValueError, TypeError, OverflowError) as error:
+        return error
+    return None
+
+
+def _refuse_same_names(rows: pa.Table) -> None:
+    if len(set(rows.column_names)) != rows.num_columns:
+        raise BadInput("two columns of the result have the same name; give one of them another with AS")
+
+
+def _csv(rows: pa.Table, path: Path) -> None:
+    pa.csv.write_csv(rows, path)
+
+
+def _parquet(rows: pa.Table, path: Path) -> None:
+    pq.write_table(rows, path, compression="zstd", write_page_checksum=True)
+
+
+def _fits(rows: pa.Table, path: Path) -> None:
+    # astropy's import takes longer than a page of the sky.
+    from lake_schema.fits.tables import table_to_fits
+
+    declared = _declared(rows.schema)
+    table_to_fits(path, rows.cast(declared.arrow()), declared)
+
+
+def _declared(schema: pa.Schema) -> Table:
+    return Table("result", 1, tuple(_column(field) for field in schema), "Result of a query.", key=())
+
+
+def _column(field: pa.Field) -> Column:
+    """A declaration that suits a result's column."""
+    facts, kind = _facts(field), _kind(field.type)
+    return Column(
+        field.name, kind, facts.get("unit", ""), facts.get("ucd", ""), facts.get("description", ""), nullable=True
+    )
+
+
+def _kind(kind: pa.DataType) -> str:
+    if pa.types.is_list(kind):
+        inner = _kind(kind.value_type)
+        return f"list<{'int64' if inner.startswith('int') else inner}>"
+    if pa.types.is_integer(kind):
+        return str(kind) if pa.types.is_signed_integer(kind) else "int64"
+    if pa.types.is_floating(kind):
+        return "float64" if kind == pa.float64() else "float32"
+    return "bool" if pa.types.is_boolean(kind) else "string"
+
+
+def _votable(rows: pa.Table, path: Path) -> None:
+    with path.open("wb") as file:
+        for piece in votables.pieces([pa.RecordBatch.from_pylist([], rows.schema), *rows.to_batches()]):
+            file.write(piece)
+
+
+_WRITERS: dict[str, Callable[[pa.Table, Path], None]] = {
+    ".csv": _csv, ".parquet": _parquet, ".fits": _fits, ".vot": _votable,
+}  # fmt: skip
+ENDINGS = tuple(_WRITERS)
+
+
+def streamed(batches: Iterator[pa.RecordBatch], ending: str) -> Iterator[bytes]:
+    """The bytes of a .csv, .parquet, .vot or .fits file of any number of rows, piece by piece.
+
+    batches : at least one; for FITS all of them are read before the first piece
+    Errors  : BadInput before the first piece where such a file cannot hold the columns
+    """
+    first = next(batches)
+    _refuse_same_names(pa.Table.from_batches([first]))
+    both = itertools.chain([first], batches)
+    if ending == ".vot":
+        yield from votables.pieces(both)
+    elif ending == ".csv":
+        yield from _written(both, lambda sink: pa.csv.CSVWriter(sink, first.schema))
+    elif ending == ".parquet":
+        yield from _written(both, lambda sink: _groups(sink, first.schema))
+    elif ending == ".fits":
+        yield from _fits_pieces(both, first.schema)
+    else:
+        raise BadInput(f"a file of {ending} is not written piece by piece")
+
+
+def _fits_pieces(batches: Iterator[pa.RecordBatch], schema: pa.Schema) -> Iterator[bytes]:
+    """A file whose header tells the number of rows and the longest text: through files on disc, not in memory."""
+    from lake_schema.fits.tables import stream_to_fits
+
+    declared = _declared(schema)
+    with tempfile.TemporaryFile() as spool, tempfile.TemporaryFile() as file:
+        _spool(batches, spool, declared.arrow())
+
+        def again() -> Iterator[pa.RecordBatch]:
+            spool.seek(0)
+            yield from pa.ipc.open_stream(spool)
+
+        stream_to_fits(file, again, declared, MOST_FITS_BYTES)
+        file.seek(0)
+        while piece := file.read(_PIECE):
+            yield piece
+
+
+def _spool(batches: Iterator[pa.RecordBatch], spool: IO[bytes], schema: pa.Schema) -> None:
+    """Keep batches on disc, of other types.  Errors: BadInput where they are too many, or names a column"""
+    with pa.ipc.new_stream(spool, schema) as writer:
+        for batch in batches:
+            columns = []
+            for field, values in zip(schema, batch.columns, strict=True):
+                try:
+                    columns.append(values.cast(field.type))
+                except pa.ArrowException as error:
+                    said = " ".join(str(error).split())[:300]
+                    raise BadInput(f"column {field.name}: FITS cannot hold it: {said}") from None
+            writer.write_batch(pa.RecordBatch.from_arrays(columns, schema=schema))
+            if spool.tell() > MOST_FITS_BYTES:
+                raise BadInput(
+                    f"the result has more than {MOST_FITS_BYTES / 1e9:.3g} GB: ask for less, or another kind"
+                )
+
+
+def _groups(sink: Any, schema: pa.Schema) -> pq.ParquetWriter:
+    return pq.ParquetWriter(sink, schema, compression="zstd", write_page_checksum=True)
+
+
+def _written(batches: Iterator[pa.RecordBatch], opened: Callable[[Any], Any]) -> Iterator[bytes]:
+    """What a writer puts into its file, as it comes."""
+    sink = _Sink()
+    try:
+        writer = opened(sink)
+        for batch in batches:
+            writer.write_batch(batch)
+            if piece := sink.taken():
+                yield piece
+    except (pa.ArrowException, TypeError) as error:
+        raise BadInput(f"such a file cannot hold the result: {' '.join(str(error).split())[:300]}") from None
+    writer.close()
+    yield sink.taken()
+
+
+class _Sink(io.RawIOBase):
+    """Keeps what is written until it is taken."""
+
+    def __init__(self) -> None:
+        self._kept, self._at = bytearray(), 0
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: Any) -> int:
+        self._kept += data
+        self._at += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        return self._at
+
+    def taken(self) -> bytes:
+        """What was written since it was last asked."""
+        piece = bytes(self._kept)
+        self._kept.clear()
+        return piece

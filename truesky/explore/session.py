@@ -1,0 +1,208 @@
+"""A session of DuckDB over the tables of a lake: locked, kept open from question to question, read in batches."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from typing import TypeAlias
+
+import duckdb
+import pyarrow as pa
+import pyarrow.dataset as ds
+
+from lake_schema import position_columns
+from lake_schema.errors import BadInput, Damaged
+from lake_schema.store import read
+from lake_schema.store.object_storage.s3 import Folder
+from truesky.explore import adql
+from truesky.explore.guard import Query, check_expression, checked, one_line, parser
+
+_MACROS = (
+    # Great-circle distance by the haversine, deg.
+    """CREATE MACRO separation(ra1, dec1, ra2, dec2) AS degrees(2 * asin(least(1.0, sqrt(
+       pow(sin(radians(dec2 - dec1) / 2), 2)
+       + cos(radians(dec1)) * cos(radians(dec2)) * pow(sin(radians(ra2 - ra1) / 2), 2)))))""",
+    # AB magnitude of f_nu in microjansky, NULL where there is no flux.
+    "CREATE MACRO mag_ab(f_nu) AS 23.9 - 2.5 * log10(CASE WHEN f_nu > 0 THEN f_nu END)",
+)
+# From here on the session can reach nothing but what is registered, and can change nothing of this.
+_LOCKS = (
+    "SET python_enable_replacements = false",
+    "SET autoload_known_extensions = false",
+    "SET autoinstall_known_extensions = false",
+    "SET allow_community_extensions = false",
+    "SET enable_external_access = false",
+    "SET lock_configuration = true",
+)
+# Of the memory of a query the part that DuckDB may fill, and that its result may.
+_SHARE = 0.5
+TOO_LARGE = "SQL: the query or its result needs more memory than it may have: ask for less"
+Opened: TypeAlias = read.Version | ds.Dataset
+
+
+class Session:
+    """Answers queries one after another; after an error it begins anew.
+
+    root   : of the lake
+    tables : NAME or REQUEST.NAME -> key of a version, ?REQUEST of one that could not be opened, @FILE of Arrow rows
+    memory : bytes that a query and its result may take together
+    """
+
+    def __init__(self, root: Folder, tables: Mapping[str, str], memory: int) -> None:
+        self.root, self.known = root, tables
+        self.most = int(memory * _SHARE)
+        self.opened: dict[str, Opened] = {}
+        self._rows: dict[str, ds.Dataset] = {}
+        # Tables that queries can name, with the earlier names of columns that they have there.
+        self._shown: dict[str, tuple[tuple[str, str], ...]] = {}
+        self._database: duckdb.DuckDBPyConnection | None = None
+        self._parser = parser()
+
+    def checked(self, text: str) -> Query:
+        """The query, if it may run.  Errors: BadInput"""
+        return checked(text, self.known, self._parser)
+
+    def check_expression(self, text: str) -> None:
+        """Refuse what is not one expression.  Errors: BadInput"""
+        check_expression(text, self._parser)
+
+    def close(self) -> None:
+        """Forget every table; the next query opens those that it names."""
+        self.opened.clear()
+        self._rows.clear()
+        self._shown.clear()
+        if self._database is not None:
+            self._database.close()
+            self._database = None
+
+    def run(self, query: Query, parameters: Mapping[str, object]) -> Iterator[pa.RecordBatch]:
+        """The rows in batches, with the units of columns that a table has as they are; at least one, maybe empty.
+
+        Errors : BadInput for what cannot be run; Damaged names a file that is not as it was written; of either some
+                 batches may have come before
+        """
+        whole = False
+        try:
+            for name in query.tables:
+                self._open(name, query.text)
+                for file in getattr(self._rows[name], "read_from", ()):
+                    file.forget()
+            position_columns.refuse_mixed(
+                one for name in query.tables if isinstance(one := self.opened[name], read.Version)
+            )
+            relation = self._connected().sql(query.text, params=dict(parameters) or None)
+            if relation is None:
+                raise BadInput("SQL: gives no rows")
+            batches = pa.RecordBatchReader.from_stream(relation)
+            schema = self._with_units(_exportable(batches.schema), query)
+            yield pa.RecordBatch.from_pylist([], schema)
+            for batch in batches:
+                yield _cast(batch, schema)
+            whole = True
+        except duckdb.OutOfMemoryException:
+            raise BadInput(TOO_LARGE) from None
+        except (duckdb.Error, OSError, pa.ArrowException) as error:
+            # Arrow and DuckDB pass the refusal of a file on as an error of their own.
+            if fault := next((fault for rows in self._rows.values() if (fault := getattr(rows, "fault", ""))), ""):
+                raise Damaged(fault) from None
+            raise BadInput(f"SQL: {one_line(error)}") from None
+        finally:
+            if not whole:
+                self.close()
+
+    def _connected(self) -> duckdb.DuckDBPyConnection:
+        if self._database is None:
+            config: dict[str, str | bool | int | float | list[str]] = {
+                "memory_limit": f"{self.most // 1_000_000}MB",
+                "temp_directory": "",
+                "threads": os.cpu_count() or 1,
+            }
+            self._database = duckdb.connect(":memory:", config=config)
+            for command in (*_MACROS, *adql.MACROS, *_LOCKS):
+                self._database.execute(command)
+        return self._database
+
+    def _open(self, name: str, text: str) -> None:
+        """A table by its name, one of a request in a schema of the request's name.
+
+        Columns are there by earlier names as well for a query that has one: none sees them that does not ask.
+        """
+        if name not in self._rows:
+            opened = _table(self.root, name, self.known[name])
+            self.opened[name], self._rows[name] = (
+                opened,
+                opened.dataset() if isinstance(opened, read.Version) else opened,
+            )
+        opened = self.opened[name]
+        aliases = (
+            position_columns.aliases_in(opened.table, opened.schema.names, text)
+            if isinstance(opened, read.Version)
+            else ()
+        )
+        if self._shown.get(name) == aliases:
+            return
+        database = self._connected()
+        stored = f"{name} as stored" if aliases else name
+        if name in self._shown:
+            database.unregister(name)
+            database.execute(f'DROP VIEW IF EXISTS "{name}"')
+        database.register(stored, self._rows[name])
+        chosen = ", ".join(["*", *(f'"{own}" AS "{earlier}"' for earlier, own in aliases)])
+        if aliases:
+            database.execute(f'CREATE OR REPLACE TEMP VIEW "{name}" AS SELECT {chosen} FROM "{stored}"')
+        if "." in name:
+            request, _, table = name.partition(".")
+            database.execute(f'CREATE SCHEMA IF NOT EXISTS "{request}"')
+            database.execute(f'CREATE OR REPLACE VIEW "{request}"."{table}" AS SELECT * FROM "{name}"')
+        self._shown[name] = aliases
+
+    def _with_units(self, schema: pa.Schema, query: Query) -> pa.Schema:
+        """Give the columns that came unchanged from a table its unit and description."""
+        fields = []
+        for field in schema:
+            name = field.name.lower()
+            tables = [self.opened[table].schema for table in query.tables]
+            columns = [column for table in tables for column in table if column.name.lower() == name]
+            own = [dict(c.metadata or {}).items() for c in columns if _kind(c.type) == _kind(field.type)]
+            # Which of several tables it is from is not known: what they all say holds.
+            facts = dict(set.intersection(*map(set, own))) if own and name in query.columns else None
+            fields.append(field.with_metadata(facts) if facts else field)
+        return pa.schema(fields)
+
+
+def _table(root: Folder, name: str, what: str) -> Opened:
+    if what.startswith("@"):
+        return ds.dataset(what[1:], format="ipc")
+    table = name.rpartition(".")[2]
+    if what.startswith("?"):
+        # Whatever was wrong with it is said again.
+        return read.version(root, table, request=what[1:] or None)
+    return read.version(root, table, what)
+
+
+def _exportable(schema: pa.Schema) -> pa.Schema:
+    """Sums of integers come as 128-bit decimals, which no file format of astronomy has."""
+    return pa.schema(
+        [
+            field.with_type(pa.float64() if field.type.scale else pa.int64())
+            if pa.types.is_decimal(field.type)
+            else field
+            for field in schema
+        ]
+    )
+
+
+def _cast(batch: pa.RecordBatch, schema: pa.Schema) -> pa.RecordBatch:
+    columns = []
+    for field, column in zip(schema, batch.columns, strict=True):
+        try:
+            columns.append(column.cast(field.type) if pa.types.is_decimal(column.type) else column)
+        except pa.ArrowInvalid:
+            name = field.name
+            raise BadInput(f"SQL: column {name} holds integers beyond 64 bits; make it {name}::DOUBLE") from None
+    return pa.RecordBatch.from_arrays(columns, schema=schema)
+
+
+def _kind(kind: pa.DataType) -> pa.DataType:
+    """A type without the name that the elements of a list have: DuckDB has one of its own."""
+    return pa.list_(_kind(kind.value_type)) if pa.types.is_list(kind) else kind

@@ -1,0 +1,106 @@
+"""The process that runs queries: python -m truesky.explore.worker LAKE MEMORY TABLE=KEY|@FILE ...; answers on stdout.
+
+DuckDB counts neither the memory of every function nor its result, and some functions do not stop when told to; a
+process has a limit of memory that holds, and can be killed.  A query is a line of JSON on stdin; an answer is a line of
+JSON, then, if it is a result, an Arrow stream, and a line of JSON that says whether the stream is whole.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from typing import IO, Any
+
+import pyarrow as pa
+
+from lake_schema import command
+from lake_schema.errors import BadInput, Damaged, LakeError
+from lake_schema.store import layout
+from truesky.explore.session import TOO_LARGE, Session
+
+# What Python and the libraries take before any query.
+_BASE_BYTES = 1 << 30
+# Bytes that are sent at a time, and that a row may have.
+_PIECE_BYTES, _MOST_ROW_BYTES = 8 << 20, 64 << 20
+
+
+def main(argv: Sequence[str]) -> int:
+    """Answer queries until stdin ends.
+
+    argv : lake, most bytes of memory, TABLE=KEY or REQUEST.TABLE=KEY of each table, =?REQUEST of one that could not be
+           opened, TABLE=@FILE of rows in an Arrow file
+    """
+    root, memory = layout.opened(argv[0]), int(argv[1])
+    command.limit_resource("RLIMIT_DATA", memory + _BASE_BYTES)
+    command.limit_resource("RLIMIT_CORE", 0)
+    session = Session(root, dict(entry.split("=", 1) for entry in argv[2:]), memory)
+    # Whatever a library prints must not get between the answers.
+    out = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    for line in sys.stdin:
+        _answer(out, session, json.loads(line))
+    return 0
+
+
+def _answer(out: IO[bytes], session: Session, question: dict[str, Any]) -> None:
+    fault: dict[str, str] = {}
+    batches = _batches(session, question)
+    try:
+        # Whatever is wrong with the text is found before the first of these two.
+        first = list(itertools.islice(batches, 2))
+        out.write(b"{}\n")
+        with pa.ipc.new_stream(out, first[0].schema) as stream:
+            try:
+                for batch in itertools.chain(first, batches):
+                    stream.write_batch(batch)
+            except (LakeError, MemoryError) as error:
+                fault = _said(error)
+    except (LakeError, MemoryError) as error:
+        fault = _said(error)
+    out.write(json.dumps(fault).encode() + b"\n")
+    out.flush()
+
+
+def _batches(session: Session, question: dict[str, Any]) -> Iterator[pa.RecordBatch]:
+    """The answer up to its row `rows`, if that is given; BadInput where it is larger than `bytes`, if that is."""
+    most_rows, most_bytes = question.get("rows"), question.get("bytes")
+    rows = size = 0
+    for text in question.get("expressions", ()):
+        session.check_expression(text)
+    for batch in session.run(session.checked(question["sql"]), question["parameters"]):
+        whole = batch if most_rows is None else batch.slice(0, most_rows - rows)
+        rows, size = rows + whole.num_rows, size + whole.nbytes
+        if most_bytes is not None and size > most_bytes:
+            raise BadInput(TOO_LARGE)
+        yield from _pieces(whole, _MOST_ROW_BYTES if most_bytes is None else most_bytes)
+        if rows == most_rows:
+            return
+
+
+def _pieces(batch: pa.RecordBatch, most: int) -> Iterator[pa.RecordBatch]:
+    """The batch in parts of few bytes each: whoever passes them on holds one at a time.
+
+    Errors : BadInput where a row has more bytes than `most`
+    """
+    if batch.nbytes <= _PIECE_BYTES:
+        yield batch
+    elif batch.num_rows > 1:
+        half = batch.num_rows // 2
+        yield from _pieces(batch.slice(0, half), most)
+        yield from _pieces(batch.slice(half), most)
+    elif batch.nbytes <= most:
+        yield batch
+    else:
+        raise BadInput(f"SQL: a row of the result has more than {most >> 20} MB")
+
+
+def _said(error: BaseException) -> dict[str, str]:
+    kind = "Damaged" if isinstance(error, Damaged) else "BadInput"
+    return {"error": TOO_LARGE if isinstance(error, MemoryError) else str(error), "kind": kind}
+
+
+if __name__ == "__main__":
+    command.leave(main, sys.argv[1:])

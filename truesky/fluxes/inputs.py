@@ -1,0 +1,297 @@
+"""What fluxes are made with: the embedded spectra, laws and passbands, and a request's own; all of it as lake tables.
+
+Own, read             the files that a request names, checked;  filters : those of passbands alone
+curves                passbands by name
+template_rows, law_rows, line_rows, passband_rows   tables `templates`, `extinction_laws`, `emission_lines`, `passbands`
+library_of, stars_of, passband_of     back from these tables, wherever a worker runs
+published_library, published_stars, published_passband
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from lake_schema.arrays import Array
+from lake_schema.errors import BadInput
+from lake_schema.store import read as lake_read
+from lake_schema.store.object_storage.s3 import Folder
+from lake_schema.store.provenance import file_sha256
+from lake_schema.tables import galaxies as line_table
+from lake_schema.tables import passbands as passband_table
+from lake_schema.tables import templates as template_table
+from lake_schema.tables.common import Origin
+from truesky.fluxes import high_redshift, passbands
+from truesky.fluxes.libraries import (
+    brown_dwarfs,
+    from_files,
+    model_stars,
+    standards,
+    stars_from_files,
+    stellar,
+    templates,
+)
+from truesky.fluxes.libraries.templates import Library
+from truesky.fluxes.libraries.vega import spectrum_file, vega_magnitudes
+from truesky.fluxes.passbands import Passband
+from truesky.fluxes.spectra import extinction, lines
+from truesky.fluxes.spectra.continuum import dust_of
+from truesky.numerics import cache
+from truesky.numerics.code_keys import code_key
+from truesky.request.files import Curves, UserCurves
+
+# Beginnings of the keys of a request's own files.
+FILTER, _TEMPLATES, _LAWS, _STARS = (f"fluxes.{part}." for part in ("passbands", "templates", "extinction", "stars"))
+
+
+@dataclass(frozen=True, slots=True)
+class Own:
+    """passbands : by name;  library : galaxies with their laws;  stars;  origins : of files, by the key in the request.
+
+    dwarfs : origins of the first of the stars, () = embedded
+    """
+
+    passbands: Mapping[str, Passband]
+    library: Library
+    stars: Library
+    origins: Mapping[str, Origin]
+    dwarfs: Sequence[Origin] = ()
+
+    def sha256(self) -> dict[str, str]:
+        """What names the files' contents in a plan."""
+        return {key: origin.sha256 for key, origin in self.origins.items()}
+
+
+def read(given: UserCurves) -> Own:
+    """The embedded library with whatever the request puts in its place, and its passbands.
+
+    Errors: BadInput names the key of the request, the file, and the row where there is one
+    """
+    found, origins = filters(given)
+    library = templates.galaxy_library()
+    if given.templates is not None:
+        with _named("fluxes.templates"):
+            library = from_files.library(given.templates.files, given.templates.format)
+            each = (replace(given.templates, files=(file,)) for file in given.templates.files)
+            origins |= {f"{_TEMPLATES}{k}": _origin_of(curves) for k, curves in enumerate(each)}
+    if given.extinction:
+        dust = dust_of(library).copy()
+        for code, curves in given.extinction:
+            key = f"{_LAWS}{code}"
+            with _named(key):
+                dust[code] = from_files.law(curves.files[0], curves.format, library.wavelength)
+                origins[key] = _origin_of(curves)
+        library = replace(library, dust=dust, own=True)
+    if given.intergalactic:
+        library = replace(library, intergalactic=True)
+    stars, of_stars, dwarfs = _stars(given)
+    return Own(found, library, stars, origins | of_stars, dwarfs)
+
+
+def filters(given: UserCurves) -> tuple[dict[str, Passband], dict[str, Origin]]:
+    """The request's own passbands by name, and their origins by key; errors as of `read`."""
+    found, origins = {}, {}
+    for name, curves in given.passbands:
+        key = f"{FILTER}{name}"
+        if name in passbands.names():
+            raise BadInput(f"{key}: there is a passband of this name: choose another")
+        with _named(key):
+            found[name] = from_files.passband(curves.files[0], name, curves.medium, curves.format)
+            origins[key] = _origin_of(curves)
+    return found, origins
+
+
+def _stars(given: UserCurves) -> tuple[Library, dict[str, Origin], list[Origin]]:
+    """Stars, the request's files by key, and what each of its own dwarfs was made of."""
+    if given.basel is None and not given.irtf:
+        return templates.stellar_library(), {}, []
+    low, how, origins = stellar.table_file(), "Pecaut & Mamajek 2013, as MeanStars has them", {}
+    with _named("fluxes.stars"):
+        library, infrared = stars_from_files.library(given.basel, given.irtf)
+        if given.basel is not None:
+            low, how = given.basel, "read as basel"
+            origins[f"{_STARS}basel"] = _origin(how, low)
+        origins |= {f"{_STARS}irtf.{k}": _origin("read as irtf", file) for k, file in enumerate(given.irtf)}
+        spliced = f"{how}; the last, read as irtf, in the infrared"
+        dwarfs = [_origin(how, low) if k < 0 else _origin(spliced, low, given.irtf[k]) for k in infrared]
+    return library, origins, dwarfs
+
+
+def curves(names: Sequence[str], own: Mapping[str, Passband]) -> list[Passband]:
+    """Passbands by name.  Errors: BadInput for one that is not there"""
+    known = (*passbands.names(), *own)
+    for name in names:
+        if name not in known:
+            raise BadInput(f"fluxes.bands: {name!r} is not one of {', '.join(known)}")
+    return [own[name] if name in own else passbands.load(name) for name in names]
+
+
+def template_rows(own: Own) -> pa.Table:
+    """Table `templates`: galaxies (the request's own where it has them), quasars, high-redshift galaxies, stars."""
+    libraries = {
+        "galaxy": own.library,
+        "qso": high_redshift.quasar_library(),
+        "high_redshift": high_redshift.high_redshift_library(),
+        "star": own.stars,
+    }
+    given = [origin for key, origin in own.origins.items() if key.startswith(_TEMPLATES)]
+    quasars = _origin("Vanden Berk et al. 2001", high_redshift.QUASAR_LINES)
+    origins = {
+        "galaxy": given or [_galaxy_origin(k) for k in range(len(own.library))],
+        "qso": [quasars] * len(libraries["qso"]),
+        "high_redshift": [_origin("power laws", Path(high_redshift.__file__))] * len(libraries["high_redshift"]),
+        "star": _star_origins(own.dwarfs),
+    }
+    return template_table.rows(libraries, origins)
+
+
+def law_rows(own: Own) -> pa.Table:
+    """Table `extinction_laws`, on the wavelengths of the galaxies."""
+    code = Path(extinction.__file__)
+    embedded = (
+        _origin("no dust", code),
+        _origin("Prevot et al. 1984, Bouchet et al. 1985", extinction.PREVOT_TABLE),
+        _origin("Calzetti et al. 2000", code),
+        *(_origin("Calzetti et al. 2000 with the bump of Fitzpatrick & Massa 1986", code) for _ in range(2)),
+    )
+    origins = [own.origins.get(f"{_LAWS}{law}", origin) for law, origin in enumerate(embedded)]
+    return template_table.law_rows(own.library.wavelength, dust_of(own.library), origins)
+
+
+def line_rows(own: Own) -> pa.Table:
+    """Table `emission_lines`; own : the request's files, none of which are lines."""
+    found = lines.line_list()
+    return line_table.line_rows(found, lines.width_law(), [_origin(line.source, lines.TABLE) for line in found])
+
+
+def passband_rows(own: Own) -> pa.Table:
+    """Table `passbands`: the embedded ones, and the request's own."""
+    bands = [*(passbands.load(name) for name in passbands.names()), *own.passbands.values()]
+    origins = [_passband_origin(name) for name in passbands.names()]
+    origins += [own.origins[f"{FILTER}{name}"] for name in own.passbands]
+    pivots, widths = [passbands.pivot_wavelength(b) for b in bands], [passbands.log_width(b) for b in bands]
+    return passband_table.rows(bands, pivots, widths, origins, vega_magnitudes(bands))
+
+
+def library_of(lake: Folder, facts: Mapping[str, Any]) -> Library:
+    """The galaxies that a table of fluxes was, or is to be, made with; facts : of its plan."""
+    library = templates.galaxy_library()
+    if any(key.startswith((_TEMPLATES, _LAWS)) for key in facts.get("files", ())):
+        library = published_library(lake, facts["sources"]["templates"], facts["sources"]["extinction_laws"])
+    return replace(library, intergalactic=True) if facts.get("intergalactic") else library
+
+
+def stars_of(lake: Folder, facts: Mapping[str, Any]) -> Library:
+    """The same of stars."""
+    if not any(key.startswith(_STARS) for key in facts.get("files", ())):
+        return templates.stellar_library()
+    return published_stars(lake, facts["sources"]["templates"])
+
+
+def passband_of(lake: Folder, facts: Mapping[str, Any], name: str) -> Passband:
+    """The same of a passband."""
+    if f"{FILTER}{name}" not in facts.get("files", ()):
+        return passbands.load(name)
+    return published_passband(lake, facts["sources"]["passbands"], name)
+
+
+@lru_cache(maxsize=2)
+def published_library(lake: Folder, templates_key: str, laws_key: str) -> Library:
+    """The galaxies of published versions of `templates` and `extinction_laws`, kept in the cache and mapped."""
+
+    def read_rows() -> dict[str, Array]:
+        rows = lake_read.version(lake, "templates", templates_key).rows(where=pc.field("library") == "galaxy")
+        rows = rows.sort_by("sed")
+        laws = lake_read.version(lake, "extinction_laws", laws_key).rows().sort_by("law")
+        flux, dust = (np.stack(column.to_numpy()).astype(np.float32) for column in (rows["flux"], laws["k"]))
+        first, step = (float(rows[name][0].as_py()) for name in ("first_wavelength", "wavelength_step"))
+        return {"wavelength": first + step * np.arange(flux.shape[1]), "flux": flux, "dust": dust}
+
+    key = cache.content_key(templates_key, laws_key, code_key(__name__))
+    arrays = cache.cached_arrays("published_library", key, read_rows)
+    names = tuple(str(k) for k in range(len(arrays["flux"])))
+    return Library(arrays["wavelength"], arrays["flux"], names, dust=arrays["dust"], own=True)
+
+
+@lru_cache(maxsize=2)
+def published_stars(lake: Folder, templates_key: str) -> Library:
+    """The stars of a published version of `templates`, kept in the cache and mapped."""
+
+    def read_rows() -> dict[str, Array]:
+        rows = lake_read.version(lake, "templates", templates_key).rows(where=pc.field("library") == "star")
+        return {"flux": np.stack(rows.sort_by("sed")["flux"].to_numpy()).astype(np.float32)}
+
+    key = cache.content_key(templates_key, code_key(__name__))
+    return replace(
+        templates.stellar_library(), flux=cache.cached_arrays("published_stars", key, read_rows)["flux"], own=True
+    )
+
+
+def published_passband(lake: Folder, key: str, name: str) -> Passband:
+    """A passband of a published version of `passbands`."""
+    row = lake_read.version(lake, "passbands", key).rows(where=pc.field("name") == name).to_pylist()[0]
+    response = np.array(row["response"])
+    wavelength = row["first_wavelength"] + row["wavelength_step"] * np.arange(len(response))
+    return Passband(name, wavelength, response, row["medium"])
+
+
+@contextmanager
+def _named(key: str) -> Iterator[None]:
+    """Whatever is refused is refused with the key of the request."""
+    try:
+        yield
+    except (BadInput, OSError, ValueError) as error:
+        raise BadInput(f"{key}: {' '.join(str(error).split())}") from None
+
+
+def _origin_of(curves: Curves) -> Origin:
+    (file,) = curves.files
+    return Origin(f"{file.name}, read as {curves.format}", file_sha256(file))
+
+
+def _origin(reference: str, *files: Path) -> Origin:
+    digest = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+    return Origin(f"{', '.join(file.name for file in files)}: {reference}", digest)
+
+
+def _galaxy_origin(template: int) -> Origin:
+    code, young = Path(templates.__file__), templates.YOUNG
+    files = [code if name == young else spectrum_file(f"CWW_{name}_ext.sed") for name in templates.anchors_of(template)]
+    return _origin("Coleman, Wu & Weedman 1980, as GalSim has them" + ", and a burst" * (code in files), *files)
+
+
+def _star_origins(own: Sequence[Origin]) -> list[Origin]:
+    """Of the stellar library; own : of its dwarfs, () = embedded."""
+    dwarfs = _origin("Pecaut & Mamajek 2013, as MeanStars has them", stellar.table_file())
+    first = [*own] or [dwarfs] * len(stellar.types().names)
+    colours = _origin("Castelli & Kurucz 2003, as astroARIADNE has them", model_stars.TABLE)
+    # Models go over into dwarfs; a request's own dwarfs stand for them, or lend them their infrared.
+    models = (
+        [own[k] for k in model_stars.nearest_dwarfs(stellar.types())] if own else [colours] * len(model_stars.names())
+    )
+    vega = _origin("CALSPEC alpha_lyr_mod_001, as GalSim has it; lambda^-3.95 beyond it", spectrum_file("vega.txt"))
+    white_dwarf = _origin("Bohlin, Hubeny & Rauch 2020", Path(standards.__file__))
+    nebula = _origin("the references in the file", standards.NEBULA)
+    return [*first, *[dwarfs] * brown_dwarfs.COUNT, vega, white_dwarf, nebula, *models]
+
+
+def _passband_origin(name: str) -> Origin:
+    source, note = passbands.published(name)
+    kind, _, detail = source.partition(":")
+    if kind != "speclite":
+        return _origin(f"{source}, {note}", passbands.TABLE)
+    spec = importlib.util.find_spec("speclite")
+    if spec is None or not spec.submodule_search_locations:
+        raise BadInput("speclite is not installed: its passbands are needed")
+    folder = Path(spec.submodule_search_locations[0]) / "data" / "filters"
+    return _origin(f"{note}, as speclite has it", folder / f"{detail}.ecsv")

@@ -1,0 +1,134 @@
+"""Spectra of L and T dwarfs: 365 templates, 19 subtypes with about 19 realisations of their scatter in colour.
+
+subtypes        L0 .. T8 with their temperatures, magnitudes and colours
+template_names  which subtype each template is
+templates       their temperatures and magnitudes
+spectra         f_lambda of all templates
+
+The mean colours are those of Pecaut & Mamajek 2013: i - z (AB) and J - H, H - Ks (Vega); z - J from z - Y, with Y - J
+adopted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lake_schema.arrays import Float, Int
+from truesky.fluxes import passbands
+from truesky.fluxes.libraries import stellar
+from truesky.randomness.rng import stream
+
+COUNT = 365
+_FIRST, _LAST = "L0V", "T8V"
+_BANDS = ("sdss_i", "sdss_z", "twomass_j", "twomass_h", "twomass_ks")
+_J = _BANDS.index("twomass_j")
+# AB magnitudes; Y - J of UKIDSS varies between 0.7 and 0.9 along the sequence (Hewett et al. 2006).
+_COLOR_YJ = 0.8
+# Scatter of J - H and H - Ks within a subtype, mag (adopted).
+_SCATTER = 0.07
+_UNTIL = 1e-4, 200
+# Bands of methane and water: centre, width, A, and depth (adopted: texture, the colours come after).
+_METHANE = ((11_500.0, 700.0, 0.6), (16_700.0, 900.0, 0.8), (22_500.0, 1200.0, 0.8))
+_WATER = ((9_300.0, 300.0, 0.4), (14_000.0, 700.0, 0.7), (18_700.0, 900.0, 0.8))
+
+
+@dataclass(frozen=True, slots=True)
+class Subtypes:
+    """n subtypes: teff K; abs_mag_j Vega; colors float64[n, 5], m_band - m_J, AB, of i z J H Ks."""
+
+    names: tuple[str, ...]
+    teff: Float
+    abs_mag_j: Float
+    colors: Float
+
+
+def subtypes() -> Subtypes:
+    """L0 .. T8 of Pecaut & Mamajek 2013."""
+    names, column = stellar.table(_FIRST, _LAST)
+    # T4.5, T5.5 and T7.5 are in the table, too.
+    whole = np.array(["." not in name for name in names])
+    names, column = tuple(np.array(names)[whole].tolist()), {title: values[whole] for title, values in column.items()}
+    j, h, ks = (_vega(band) for band in _BANDS[_J:])
+    zj = column["z-Y"] + _COLOR_YJ
+    jh, hk = column["J-H"] + j - h, column["H-Ks"] + h - ks
+    colors = np.stack([column["i-z"] + zj, zj, 0.0 * zj, -jh, -jh - hk], 1)
+    return Subtypes(tuple(name.removesuffix("V") for name in names), column["Teff"], column["M_J"], colors)
+
+
+def template_names() -> tuple[str, ...]:
+    """Subtype and number ("L0-00") of the 365 templates, subtype after subtype; 00 is the mean."""
+    names = subtypes().names
+    counts = [COUNT // len(names) + (k < COUNT % len(names)) for k in range(len(names))]
+    return tuple(f"{name}-{m:02d}" for name, count in zip(names, counts, strict=True) for m in range(count))
+
+
+@dataclass(frozen=True, slots=True)
+class Templates:
+    """The 365 templates: number[365] of the subtype, teff K, abs_mag_j, abs_mag_h (Vega)."""
+
+    subtype: Int
+    teff: Float
+    abs_mag_j: Float
+    abs_mag_h: Float
+
+
+def templates() -> Templates:
+    """What is known of the templates; realisations of a subtype have its M_J."""
+    types = subtypes()
+    labels = [name.partition("-")[::2] for name in template_names()]
+    subtype = np.array([types.names.index(name) for name, _ in labels])
+    jh = -types.colors[subtype] - np.stack([_scatter(name, int(number)) for name, number in labels])
+    abs_mag_j = types.abs_mag_j[subtype]
+    return Templates(
+        subtype, types.teff[subtype], abs_mag_j, abs_mag_j - jh[:, _J + 1] + _vega("twomass_j") - _vega("twomass_h")
+    )
+
+
+def spectra() -> Float:
+    """f_lambda on the grid of passbands.grid(), float64[365, 23401], mean 1 between 5450 and 5550 A.
+
+    Error: colours within 1e-4 mag
+    """
+    grid, types = passbands.grid(), subtypes()
+    bands = [passbands.load(name) for name in _BANDS]
+    seen = np.zeros((len(grid), len(bands)))
+    for k, band in enumerate(bands):
+        seen[band.first : band.first + len(band.wavelength), k] = passbands.weights(band)
+    pivots = np.log([passbands.pivot_wavelength(band) for band in bands])
+    out, mean = [], np.zeros(len(bands))
+    for name in template_names():
+        subtype, _, number = name.partition("-")
+        k = types.names.index(subtype)
+        start = stellar.planck(grid, types.teff[k]) * _absorbed(grid, k / (len(types.names) - 1.0))
+        colors = types.colors[k] + _scatter(subtype, int(number))
+        found = stellar.matching(np.log(grid), start, seen, pivots, colors, _J, _UNTIL, mean)
+        if number == "00":
+            mean = found
+        out.append(stellar.corrected(np.log(grid), start, pivots, found))
+    return stellar.normalised(grid, np.stack(out))
+
+
+def _scatter(subtype: str, number: int) -> Float:
+    """What is added to the colours m_band - m_J of a realisation; number 0 is the mean."""
+    if number == 0:
+        return np.zeros(len(_BANDS))
+    jh, hk = _SCATTER * stream("brown dwarfs", subtype, number).standard_normal(2)
+    return np.array([0.0, 0.0, 0.0, -jh, -jh - hk])
+
+
+def _absorbed(wavelength: Float, place: float) -> Float:
+    """Transmission of water, all along the sequence, and methane, in its second half; place = 0 at L0, 1 at T8."""
+    transmission = np.ones_like(wavelength)
+    for bands, strength in ((_WATER, 0.5 + 0.5 * place), (_METHANE, max(2.0 * place - 1.0, 0.0))):
+        for centre, width, depth in bands:
+            transmission *= 1.0 - strength * depth * np.exp(-0.5 * ((wavelength - centre) / width) ** 2)
+    return transmission
+
+
+def _vega(band: str) -> float:
+    # calibration needs the library of which this is a part.
+    from truesky.fluxes.libraries.vega import vega_magnitude
+
+    return vega_magnitude(passbands.load(band))

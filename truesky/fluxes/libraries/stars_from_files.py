@@ -1,0 +1,172 @@
+"""Stars from external files, in place of the embedded dwarfs.
+
+library    the stellar library with its dwarfs from models, with infrared spectra spliced on, or both
+basel      model spectra of Lejeune, Cuisinier & Buser 1997 (.cor)
+dwarfs     of these, each dwarf of the embedded sequence at its temperature and gravity
+splice     IRTF spectra of stars onto those of low resolution, by their Y - H colour
+
+Every refusal is a BadInput that names the file.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from lake_schema import user_files
+from lake_schema.arrays import Float, Int
+from lake_schema.errors import BadInput
+from lake_schema.units import LIGHT_ANGSTROM_S
+from truesky.fluxes import passbands
+from truesky.fluxes.libraries import from_files, model_stars, stellar, templates
+from truesky.fluxes.libraries.from_files import ANGSTROM, Curve, check, resampled
+from truesky.fluxes.libraries.stellar import StellarTypes, normalised
+from truesky.fluxes.libraries.templates import Library
+from truesky.fluxes.passbands import Passband
+
+# Lejeune, Cuisinier & Buser 1997, ReadMe: 1221 wavelengths in nm, 8 of 10 characters a line; models in blocks of a
+# header "2I6,4F6.2" and 1221 values of H_nu, 7 of 11 characters a line; f_lambda = 4 pi H_nu c / lambda^2 / pi.
+_BASEL_COUNT, _BASEL_WAVELENGTH_WIDTH, _BASEL_FLUX_WIDTH = 1221, 10, 11
+_BASEL_HEADER = (0, 6, 12, 18, 24)
+
+# Where spectra are normalised, A.
+_VISUAL = float(np.mean(stellar.NORMALISED))
+
+# The colour by which stars are compared, and the stretch of IRTF spectra that is used, A.
+SPLICE_BANDS = ("euclid_y", "euclid_h")
+_SPLICE_FROM, _SPLICE_TO, _SPLICE_JOIN = 8_200.0, 24_000.0, 200.0
+
+
+@dataclass(frozen=True, slots=True)
+class BaselModels:
+    """wavelength float64[1221] A; teff K, log_g, metallicity float64[n]; flux float64[n, 1221] f_lambda."""
+
+    wavelength: Float
+    teff: Float
+    log_g: Float
+    metallicity: Float
+    flux: Float
+
+
+def library(models: Path | None, infrared: Sequence[Path]) -> tuple[Library, Int]:
+    """The stellar library, its dwarfs of a BaSeL file and with the infrared of IRTF files where these are given.
+
+    returns : the library, and which infrared file each dwarf has, int64[n] (-1 = none)
+    """
+    embedded, types = templates.stellar_library(), stellar.types()
+    grid, n = embedded.wavelength, len(types.names)
+    flux = embedded.flux[:n].astype(float) if models is None else dwarfs(models, types, grid)
+    chosen = np.full(n, -1)
+    first = templates.first_model()
+    others = embedded.flux[first:].astype(float)
+    if infrared:
+        curves = [from_files.read(path, "irtf") for path in infrared]
+        flux, chosen = splice(grid, flux, curves)
+        others, _ = splice(grid, others, curves)
+    flux = normalised(grid, flux)
+    if models is not None:
+        # A file is of one metallicity: its dwarfs stand for the stars of any.
+        others = model_stars.of_dwarfs(flux, types)
+    own = np.concatenate([flux, embedded.flux[n:first], normalised(grid, others)]).astype(np.float32)
+    return replace(embedded, flux=own, own=True), chosen
+
+
+def dwarfs(path: Path, types: StellarTypes, grid: Float) -> Float:
+    """f_lambda of each type, float64[n, n_lambda], normalised, from the models of a BaSeL file.
+
+    Of the metallicity nearest to the Sun's; at each model temperature the gravity nearest to the type's; in between
+    ln f is linear in 1 / T, as of black bodies.
+    """
+    found = basel(path)
+    solar = np.abs(found.metallicity)
+    usable = np.flatnonzero(solar == solar.min())
+    known = np.unique(found.teff[usable])
+    if types.teff.min() < known[0] or types.teff.max() > known[-1]:
+        ends = f"{types.teff.min():g} .. {types.teff.max():g} K"
+        raise BadInput(f"{path}: models of {known[0]:g} .. {known[-1]:g} K do not cover the dwarfs' {ends}")
+
+    def model(teff: float, log_g: float) -> int:
+        same = usable[found.teff[usable] == teff]
+        return int(same[np.argmin(np.abs(found.log_g[same] - log_g))])
+
+    @cache
+    def ln_flux(k: int) -> Float:
+        spectrum = resampled(grid, Curve(found.wavelength, found.flux[k]))
+        if not np.interp(_VISUAL, grid, spectrum) > 0.0:
+            raise BadInput(f"{path}: the model of {found.teff[k]:g} K, log g = {found.log_g[k]:g} is dark at 5500 A")
+        return np.asarray(np.log(np.maximum(normalised(grid, spectrum), np.finfo(np.float32).tiny)))
+
+    out = np.empty((len(types.teff), len(grid)))
+    for spectrum, teff, log_g in zip(out, types.teff, types.log_g, strict=True):
+        hot = int(np.clip(np.searchsorted(known, teff), 1, len(known) - 1))
+        cool, warm = known[hot - 1], known[hot]
+        share = (1.0 / cool - 1.0 / teff) / (1.0 / cool - 1.0 / warm)
+        spectrum[:] = np.exp((1.0 - share) * ln_flux(model(cool, log_g)) + share * ln_flux(model(warm, log_g)))
+    return normalised(grid, out)
+
+
+def basel(path: Path) -> BaselModels:
+    """All models of a BaSeL file, lcb[mp]NN.cor."""
+    try:
+        lines = user_files.text(path, "library of spectra").splitlines()
+        wavelength, at = _numbers(lines, 0, _BASEL_COUNT, _BASEL_WAVELENGTH_WIDTH)
+        labels, spectra = [], []
+        while at < len(lines) and lines[at].strip():
+            head = lines[at]
+            labels.append([float(head[a:b]) for a, b in zip(_BASEL_HEADER[1:], (*_BASEL_HEADER[2:], 30), strict=True)])
+            h_nu, at = _numbers(lines, at + 1, _BASEL_COUNT, _BASEL_FLUX_WIDTH)
+            spectra.append(h_nu)
+    except (ValueError, IndexError) as error:
+        raise BadInput(f"{path}: cannot be read as BaSeL: {error}") from None
+    if not spectra:
+        raise BadInput(f"{path}: holds no model")
+    angstrom = wavelength * ANGSTROM["nm"]
+    for h_nu in spectra:
+        check(path, angstrom, h_nu, {"bounds": [1.0, 1e8], "covers": [2000.0, 20000.0], "largest_gap": 0.1})
+    teff, log_g, metallicity = np.array(labels)[:, :3].T
+    flux = 4.0 * np.stack(spectra) * LIGHT_ANGSTROM_S / angstrom**2
+    return BaselModels(angstrom, teff, log_g, metallicity, flux)
+
+
+def splice(wavelength: Float, flux: Float, stars: Sequence[Curve]) -> tuple[Float, Int]:
+    """Low-resolution spectra float64[n, n_lambda] with the infrared of the stars that are nearest in Y - H.
+
+    The IRTF spectrum is scaled to meet the other at both ends; the broad shape stays that of the low resolution.
+    returns : the spectra, and which star each was given, int64[n]
+    """
+    infrared = [np.interp(wavelength, star.wavelength, star.value) for star in stars]
+    ends = [(max(star.wavelength[0], _SPLICE_FROM), min(star.wavelength[-1], _SPLICE_TO)) for star in stars]
+    bands = [passbands.load(name) for name in SPLICE_BANDS]
+    colors = np.array([_color(bands, wavelength, each) for each in infrared])
+    out = np.array(flux, float)
+    nearest = np.array([np.argmin(np.abs(colors - _color(bands, wavelength, spectrum))) for spectrum in out])
+    for spectrum, k in zip(out, nearest, strict=True):
+        blue, red = ends[k]
+        inside = (wavelength >= blue) & (wavelength <= red)
+        joins = [inside & (np.abs(wavelength - end) <= _SPLICE_JOIN) for end in (blue, red)]
+        scale = [float(spectrum[join].mean() / infrared[k][join].mean()) for join in joins]
+        share = (wavelength[inside] - blue) / (red - blue)
+        spectrum[inside] = infrared[k][inside] * (scale[0] * (1.0 - share) + scale[1] * share)
+    return out, nearest
+
+
+def _color(bands: Sequence[Passband], wavelength: Float, flux: Float) -> float:
+    y, h = (float(passbands.ab_flux(band, wavelength, flux)) for band in bands)
+    return -2.5 * math.log10(y / h)
+
+
+def _numbers(lines: Sequence[str], at: int, count: int, width: int) -> tuple[Float, int]:
+    """`count` numbers of fixed width from line `at` on, and the line after them."""
+    found: list[float] = []
+    while len(found) < count:
+        line = lines[at].rstrip()
+        found += [float(line[k : k + width]) for k in range(0, len(line), width)]
+        at += 1
+    if len(found) != count:
+        raise ValueError(f"line {at} holds too many numbers")
+    return np.array(found), at

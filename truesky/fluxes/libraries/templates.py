@@ -1,0 +1,157 @@
+"""The embedded libraries of spectra: 31 galaxies, and the stars.
+
+galaxy_library     early to late, mixed from the four spectra of Coleman, Wu & Weedman 1980 and a young burst
+stellar_library    O9 to T8, shaped until their colours are those of Pecaut & Mamajek 2013, standards, and models by
+                   temperature, gravity and metallicity;  first_model : where these begin
+GALAXY_LIBRARY_SIZE, rest_grid, emission_wavelengths
+anchors_of, spectrum_file   what they are made of
+
+Both are made once (seconds), kept in the cache, and afterwards mapped from disc.
+"""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.resources import files
+
+import numpy as np
+
+from lake_schema.arrays import Float, Float32
+from truesky.fluxes import passbands
+from truesky.fluxes.libraries import brown_dwarfs, model_stars, rest_grid, standards, stellar, vega
+from truesky.fluxes.libraries.stellar import normalised, planck
+from truesky.numerics import cache
+from truesky.numerics.code_keys import code_key
+
+_ANCHORS = ("E", "Sbc", "Scd", "Im")
+# The published spectra end at 22050 A.
+_INFRARED_SLOPE = -3.2
+# The weak lines in the observed spectra are bridged by a straight line this far on both sides.
+_LINE_MASK = 40.0
+
+# The sequence: first and last template k, earlier and later anchor, offset, denominator and factor of
+# x = factor (k - offset) / denominator, spectrum = (1 - x) earlier + x later. Adopted, to span the colours
+# of the 31 templates of Ilbert et al. 2009 (NUV - r from 5.7 to -0.7).
+YOUNG = "young"
+_SEQUENCE = (
+    (0, 7, "E", "Sbc", 0, 7, 0.72),
+    (8, 13, "Sbc", "Scd", 8, 5, 1.0),
+    (14, 19, "Scd", "Im", 13, 6, 1.0),
+    (20, 30, "Im", YOUNG, 19, 11, 0.95),
+)
+GALAXY_LIBRARY_SIZE = 31
+# The young end, adopted: Planck spectra (K, share of f_lambda at 5500 A, factor below the Balmer edge).
+_YOUNG = ((28000.0, 0.70, 1.0), (9500.0, 0.22, 0.45), (4200.0, 0.08, 1.0))
+_BALMER_EDGE, _LYMAN_EDGE, _BELOW_LYMAN = 3646.0, 912.0, 0.02
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Library:
+    """Template spectra, all on one grid; never changed, and the same only as itself.
+
+    wavelength : float64[n_lambda] A, whole numbers in steps of 1
+    flux       : float32[n, n_lambda] f_lambda, mean 1 between 5450 and 5550 A
+    names      : n labels
+    types      : what is known of the first stars, the dwarf sequence; None for galaxies
+    dust       : float32[5, n_lambda] k(lambda) of the laws in front of galaxies, None = those of extinction.laws
+    own        : read from external files: what was measured of the embedded one says nothing about it
+    intergalactic : what is between the galaxies absorbs (truesky.fluxes.spectra.intergalactic)
+    """
+
+    wavelength: Float
+    flux: Float32
+    names: tuple[str, ...]
+    types: stellar.StellarTypes | None = None
+    dust: Float32 | None = None
+    own: bool = False
+    intergalactic: bool = False
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+@lru_cache(maxsize=1)
+def galaxy_library() -> Library:
+    """The 31 galaxy templates, from 0, elliptical, to 30, starburst; 80 .. 24500 A, rest frame."""
+    key = cache.content_key(
+        code_key(__name__),
+        emission_wavelengths(),
+        *(vega.spectrum_file(f"CWW_{name}_ext.sed").read_bytes() for name in _ANCHORS),
+    )
+    wavelength = rest_grid.rest_grid()
+    arrays = cache.cached_arrays("galaxy_library", key, lambda: {"flux": galaxies(wavelength).astype(np.float32)})
+    names = tuple(
+        name for first, last, early, late, *_ in _SEQUENCE for name in [f"{early}-{late}"] * (last - first + 1)
+    )
+    return Library(wavelength, arrays["flux"], tuple(f"{k:02d} {name}" for k, name in enumerate(names)))
+
+
+def anchors_of(template: int) -> tuple[str, str]:
+    """Names of the two spectra that a galaxy template is mixed of."""
+    row = next(row for row in _SEQUENCE if row[0] <= template <= row[1])
+    return row[2], row[3]
+
+
+@lru_cache(maxsize=1)
+def stellar_library() -> Library:
+    """On the observed grid: 0 .. 75 the dwarfs O9V .. M9V, hottest first (with their table of types), 76 .. 440 the L
+    and T dwarfs, 441 .. 443 Vega, a white dwarf, a planetary nebula, from 444 the models of model_stars.
+    """
+    types = stellar.types()
+    names = (*types.names, *brown_dwarfs.template_names(), *standards.NAMES, *model_stars.names())
+    files = vega.spectrum_file("vega.txt").read_bytes(), model_stars.TABLE.read_bytes()
+    key = cache.content_key(code_key(__name__), *files, stellar.fingerprint())
+    arrays = cache.cached_arrays("stellar_library", key, lambda: {"flux": _stars(types)})
+    return Library(passbands.grid(), arrays["flux"], names, types)
+
+
+def first_model() -> int:
+    """Index of the first of model_stars in the stellar library."""
+    return len(stellar.types().names) + brown_dwarfs.COUNT + len(standards.NAMES)
+
+
+def _stars(types: stellar.StellarTypes) -> Float32:
+    dwarfs = stellar.spectra(types, *vega.vega())
+    parts = [dwarfs, brown_dwarfs.spectra(), standards.spectra(*vega.vega()), model_stars.spectra(dwarfs, types)]
+    return np.concatenate(parts).astype(np.float32)
+
+
+def emission_wavelengths() -> Float:
+    """Vacuum wavelengths of the lines that the observed spectra show and are freed of, float64[10] A (lines.csv)."""
+    with (files("truesky.fluxes.spectra") / "lines.csv").open(encoding="utf-8") as file:
+        return np.array([float(row["vacuum"]) for row in csv.DictReader(file) if int(row["bridged"])])
+
+
+def galaxies(wavelength: Float, bridged: float = _LINE_MASK) -> Float:
+    """f_lambda of the sequence, float64[31, n_lambda].
+
+    bridged : a straight line stands in place of the spectrum so far about each emission line, A; < 0 = nowhere
+    """
+    anchors = {name: _anchor(name, wavelength, bridged) for name in _ANCHORS}
+    anchors[YOUNG] = _young(wavelength)
+    spectra = []
+    for first, last, early, late, offset, denominator, factor in _SEQUENCE:
+        for k in range(first, last + 1):
+            x = factor * (k - offset) / denominator
+            spectra.append((1.0 - x) * anchors[early] + x * anchors[late])
+    return normalised(wavelength, np.stack(spectra))
+
+
+def _anchor(name: str, wavelength: Float, bridged: float) -> Float:
+    table = np.loadtxt(vega.spectrum_file(f"CWW_{name}_ext.sed").read_text().splitlines())
+    at, flux = table[:, 0], table[:, 1]
+    # In the logarithm: the ultraviolet is sampled every 100 A, over which an elliptical fades by half.
+    sampled = np.exp(np.interp(wavelength, at, np.log(flux), left=-np.inf))
+    sampled = np.where(wavelength > at[-1], flux[-1] * (wavelength / at[-1]) ** _INFRARED_SLOPE, sampled)
+    away = (np.abs(wavelength[:, None] - emission_wavelengths()) > bridged).all(1)
+    return normalised(wavelength, np.interp(wavelength, wavelength[away], sampled[away]))
+
+
+def _young(wavelength: Float) -> Float:
+    parts = [
+        share * planck(wavelength, temperature) * np.where(wavelength < _BALMER_EDGE, factor, 1.0)
+        for temperature, share, factor in _YOUNG
+    ]
+    return normalised(wavelength, np.sum(parts, 0) * np.where(wavelength < _LYMAN_EDGE, _BELOW_LYMAN, 1.0))

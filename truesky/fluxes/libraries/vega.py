@@ -1,0 +1,67 @@
+"""Vega: its spectrum, and magnitudes relative to it.
+
+vega_magnitude   AB magnitude of Vega;  vega_magnitudes : in many bands, wherever its spectrum reaches
+vega             the spectrum of Vega, for magnitudes that are not AB
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from lake_schema import units
+from lake_schema.arrays import Float
+from lake_schema.errors import BadInput
+from truesky.fluxes import passbands
+from truesky.fluxes.libraries.rest_grid import REST_LAST
+from truesky.fluxes.passbands import Passband
+
+
+def vega_magnitude(band: Passband) -> float:
+    """AB magnitude of Vega: m_AB = m_Vega + this (2MASS J 0.9001, H 1.3753, Ks 1.8474).
+
+    Photons are counted, as for all fluxes: were it energy, H would be 1.3718.
+    """
+    return _magnitude(band, *vega())
+
+
+def vega_magnitudes(bands: Sequence[Passband]) -> list[float | None]:
+    """The same of each band, None where Vega's spectrum does not reach over it."""
+    wavelength, flux = vega()
+    return [
+        _magnitude(band, wavelength, flux)
+        if wavelength[0] <= band.wavelength[0] and band.wavelength[-1] <= wavelength[-1]
+        else None
+        for band in bands
+    ]
+
+
+def _magnitude(band: Passband, wavelength: Float, flux: Float) -> float:
+    return float(units.mag_of_f_nu(units.ujy_of_cgs(passbands.ab_flux(band, wavelength, flux))))
+
+
+# Vega's Rayleigh-Jeans tail beyond the end of the CALSPEC extract, 22008 A.
+_VEGA_SLOPE = -3.95
+
+
+def vega() -> tuple[Float, Float]:
+    """Vega: wavelength A and f_lambda erg s-1 cm-2 A-1, 900 .. 24500 A.
+
+    Ref: CALSPEC alpha_lyr_mod_001, as shipped by GalSim
+    """
+    table = np.loadtxt(spectrum_file("vega.txt").read_text().splitlines())
+    # The file is in nm and per nm.
+    wavelength, flux = table[:, 0] * 10.0, table[:, 1] / 10.0
+    tail = np.arange(np.ceil(wavelength[-1]), REST_LAST + 1.0)[1:]
+    return np.append(wavelength, tail), np.append(flux, flux[-1] * (tail / wavelength[-1]) ** _VEGA_SLOPE)
+
+
+def spectrum_file(name: str) -> Path:
+    """A spectrum that GalSim ships; GalSim itself, slow to import, is not loaded."""
+    spec = importlib.util.find_spec("galsim")
+    if spec is None or not spec.submodule_search_locations:
+        raise BadInput("GalSim is not installed: its spectra of galaxies and Vega are needed")
+    return Path(spec.submodule_search_locations[0]) / "share" / "SEDs" / name

@@ -1,0 +1,170 @@
+"""Passbands on the one wavelength grid, and what a spectrum gives through them.
+
+grid            the observed-frame grid of all spectra: 600 .. 24000 A in steps of 1 A
+names, load     what there is (passbands.csv), and one of them
+published       where it is from
+weights         f_nu = weights @ f_lambda
+log_width, pivot_wavelength, ab_flux
+"""
+
+from __future__ import annotations
+
+import csv
+import importlib.metadata
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from lake_schema.arrays import Float
+from lake_schema.errors import BadInput
+from lake_schema.units import LIGHT_ANGSTROM_S
+from truesky.numerics import cache, sums
+from truesky.numerics.code_keys import code_key
+
+# Serrano et al. 2024, appendix B: every spectrum and response is homogenised to this range and step.
+GRID_FIRST, GRID_LAST = 600, 24000
+# Each end of a curve is cut where this fraction of the photons of a source of constant f_lambda would be
+# detected outside. Never inside: behind dust, a red leak is most of what ultraviolet bands see.
+END_PHOTONS = 1e-7
+# How far out a logistic edge is tabulated, in widths: exp(-20) is below any use.
+_LOGISTIC_REACH = 20.0
+
+TABLE = Path(__file__).with_suffix(".csv")
+
+
+@dataclass(frozen=True, slots=True)
+class Passband:
+    """A photon response.
+
+    wavelength : float64[n] A, whole numbers in steps of 1, inside the grid, in the band's own medium
+    response   : float64[n], detected per arriving photon (some published curves are on an arbitrary scale)
+    medium     : "air" (from the ground) or "vacuum" (from space): decides where emission lines are seen
+    """
+
+    name: str
+    wavelength: Float
+    response: Float
+    medium: str
+
+    @property
+    def first(self) -> int:
+        """Index on the grid of the first wavelength."""
+        return int(self.wavelength[0]) - GRID_FIRST
+
+
+def grid() -> Float:
+    """The observed-frame grid, float64[23401] A."""
+    return np.arange(GRID_FIRST, GRID_LAST + 1, dtype=float)
+
+
+def names() -> tuple[str, ...]:
+    """All passbands, in the order of passbands.csv."""
+    return tuple(_rows())
+
+
+def load(name: str) -> Passband:
+    """A passband by name, resampled linearly to 1 A.  Errors: BadInput for an unknown name."""
+    rows = _rows()
+    if name not in rows:
+        raise BadInput(f"passband {name!r} is not one of {', '.join(rows)}")
+    row = rows[name]
+    key = cache.content_key(code_key(__name__), repr(row), _speclite())
+    arrays = cache.cached_arrays(f"passband_{name}", key, lambda: _curve(row["source"], float(row["shift"])))
+    return Passband(name, arrays["wavelength"], arrays["response"], row["medium"])
+
+
+def published(name: str) -> tuple[str, str]:
+    """Where a passband is from: its source as passbands.csv has it, and a note."""
+    row = _rows()[name]
+    return row["source"], row["note"]
+
+
+def weights(band: Passband) -> Float:
+    """float64[n] such that f_nu = weights @ f_lambda(band.wavelength), erg s-1 cm-2 Hz-1 for f_lambda per A.
+
+    f_nu = (int f_lambda R lambda dlambda / c) / (int R dlambda / lambda).
+    Ref: Serrano et al. 2024, appendix B, eq. f_nu
+    """
+    photons = band.response * band.wavelength
+    return photons / (LIGHT_ANGSTROM_S * float(np.sum(band.response / band.wavelength)))
+
+
+def log_width(band: Passband) -> float:
+    """int R dln(lambda): what turns f_nu into detected photons (lake_schema.units.electron_rate)."""
+    return float(np.sum(band.response / band.wavelength))
+
+
+def pivot_wavelength(band: Passband) -> float:
+    """sqrt(int R lambda dlambda / int R dlambda / lambda), A: f_nu = f_lambda lambda^2 / c on average."""
+    return float(np.sqrt(np.sum(band.response * band.wavelength) / np.sum(band.response / band.wavelength)))
+
+
+def ab_flux(band: Passband, wavelength: npt.ArrayLike, f_lambda: npt.ArrayLike) -> Float:
+    """Band-averaged f_nu of spectra given on any grid that covers the band.
+
+    wavelength : [m] A, ascending;  f_lambda : [..., m] erg s-1 cm-2 A-1
+    returns    : [...] erg s-1 cm-2 Hz-1.  Errors: BadInput where the spectra do not reach over the band
+    """
+    at = np.asarray(wavelength, float)
+    spectra = np.asarray(f_lambda, float)
+    if at[0] > band.wavelength[0] or at[-1] < band.wavelength[-1]:
+        raise BadInput(f"spectrum {at[0]:g}-{at[-1]:g} A does not cover passband {band.name}")
+    index = np.clip(np.searchsorted(at, band.wavelength, "right") - 1, 0, len(at) - 2)
+    part = (band.wavelength - at[index]) / (at[index + 1] - at[index])
+    between = spectra[..., index] * (1.0 - part) + spectra[..., index + 1] * part
+    return np.asarray(sums.product(between, weights(band)))
+
+
+@lru_cache
+def _speclite() -> str:
+    return importlib.metadata.version("speclite")
+
+
+def _rows() -> dict[str, dict[str, str]]:
+    found: dict[str, dict[str, str]] = {}
+    with TABLE.open(newline="", encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            if row["name"] in found:
+                raise BadInput(f"{TABLE.name}: passband {row['name']} stands twice: choose another name")
+            found[row["name"]] = row
+    return found
+
+
+def _curve(source: str, shift: float) -> dict[str, Float]:
+    """The response on whole angstroms; `shift` above 1 is to the blue: R_new(lambda) = R(shift lambda)."""
+    kind, _, detail = source.partition(":")
+    wavelength, response = _published(detail) if kind == "speclite" else _logistic(detail)
+    whole, resampled_response = resampled(wavelength / shift, response)
+    return {"wavelength": whole, "response": resampled_response}
+
+
+def resampled(wavelength: Float, response: Float) -> tuple[Float, Float]:
+    """A curve on the whole angstroms of the grid, linearly, without its ends; empty where it lies outside."""
+    whole = np.arange(np.ceil(wavelength[0]), np.floor(wavelength[-1]) + 1.0)
+    whole = whole[(whole >= GRID_FIRST) & (whole <= GRID_LAST)]
+    if not len(whole):
+        return whole, whole
+    at_whole = np.interp(whole, wavelength, response)
+    photons = np.cumsum(at_whole * whole)
+    first, last = np.searchsorted(photons, np.array([END_PHOTONS, 1.0 - END_PHOTONS]) * photons[-1])
+    return whole[first : last + 1], at_whole[first : last + 1]
+
+
+def _published(name: str) -> tuple[Float, Float]:
+    # Slow to import, and needed only when a band is not in the cache.
+    from speclite.filters import load_filter
+
+    # load_filter converts to A; the files themselves are in A, nm or um.
+    response = load_filter(name)
+    return np.asarray(response.wavelength, float), np.clip(np.asarray(response.response, float), 0.0, None)
+
+
+def _logistic(detail: str) -> tuple[Float, Float]:
+    """A top hat with logistic edges: "blue edge:red edge:width of the edges:peak", A."""
+    blue, red, width, peak = (float(part) for part in detail.split(":"))
+    wavelength = np.arange(np.floor(blue - _LOGISTIC_REACH * width), np.ceil(red + _LOGISTIC_REACH * width) + 1.0)
+    edges = 1.0 / ((1.0 + np.exp(-(wavelength - blue) / width)) * (1.0 + np.exp((wavelength - red) / width)))
+    return wavelength, peak * edges

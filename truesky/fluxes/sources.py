@@ -1,0 +1,223 @@
+"""Rows of the catalogue tables as checked arrays: what the spectra are made from.
+
+Galaxies, galaxies_of
+Stars, stars_of
+magnification, magnification_of   of the gravitational lens
+column, ids_of          a column without gaps, the identifiers
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from lake_schema.arrays import Float, Int
+from lake_schema.errors import BadInput, OutOfRange
+from lake_schema.tables.galaxies import GALAXIES
+from lake_schema.tables.stars import STARS
+from truesky.fluxes.libraries.templates import Library
+from truesky.fluxes.spectra import lines
+from truesky.fluxes.spectra.continuum import COMPONENTS, Mix, mix_of, picked, within
+
+MAGNIFICATION_MAX = 100.0
+# Numbers of the templates that a star's spectrum is mixed of beside `sed`.
+STAR_PARTS = (2, 3, 4)
+# Kinds whose templates are in the galaxy library: central, satellite, strong lens.
+GALAXY_KINDS = (0, 1, 4)
+
+
+@dataclass(frozen=True, slots=True)
+class Galaxies:
+    """n galaxies.
+
+    mag_r01, abs_mag_r01 : float64[n] apparent and absolute (- 5 log10 h) magnitude in the reference band
+    lines                : float64[n, n_line] flux of each line of lines.line_list(), 0 where there is none
+    magnification, a_v   : float64[n]
+    """
+
+    mix: Mix
+    abs_mag_r01: Float
+    mag_r01: Float
+    lines: Float
+    magnification: Float
+    a_v: Float
+
+    def __post_init__(self) -> None:
+        # Compiled code reads all of them, and looks at no bounds.
+        wanted = len(self.mix), len(lines.line_list())
+        if self.lines.shape != wanted:
+            raise ValueError(f"lines are of shape {self.lines.shape}, not {wanted}")
+
+    def __len__(self) -> int:
+        return len(self.mix)
+
+    def rows(self, chosen: Int | slice) -> Galaxies:
+        return Galaxies(
+            self.mix.rows(chosen),
+            picked(self.abs_mag_r01, chosen),
+            picked(self.mag_r01, chosen),
+            self.lines[chosen] if isinstance(chosen, slice) else np.take(self.lines, chosen, 0),
+            picked(self.magnification, chosen),
+            picked(self.a_v, chosen),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Stars:
+    """n stars: mag_h (Vega, before extinction), a_v float64[n].
+
+    sed, frac : int64[k, n] templates that a spectrum is mixed of, float64[k, n] their shares of f_lambda at 5500 A
+    """
+
+    sed: Int
+    frac: Float
+    mag_h: Float
+    a_v: Float
+
+    def __len__(self) -> int:
+        return len(self.mag_h)
+
+    def rows(self, chosen: Int | slice) -> Stars:
+        return Stars(self.sed[:, chosen], self.frac[:, chosen], self.mag_h[chosen], self.a_v[chosen])
+
+    @classmethod
+    def of_templates(cls, sed: Int, mag_h: Float, a_v: Float) -> Stars:
+        """Of one template each."""
+        return cls(sed[None, :], np.ones((1, sed.size)), mag_h, a_v)
+
+
+def galaxies_of(table: pa.Table, library: Library) -> Galaxies:
+    """Rows of the table `galaxies`, checked.
+
+    Errors: BadInput names the column and the source of a missing value or NaN, OutOfRange the column
+    """
+    _refuse_other_kinds(table)
+    names = ["z_obs", *(f"{name}_{k}" for name in ("sed", "frac", "ext_law", "ebv") for k in COMPONENTS)]
+    columns = {name: column(table, name) for name in names}
+    a_v = column(table, "a_v")
+    _declared("a_v", a_v)
+    return Galaxies(
+        mix_of(columns, library),
+        _declared("abs_mag_r01", column(table, "abs_mag_r01")),
+        _declared("mag_r01", column(table, "mag_r01")),
+        _line_fluxes(table),
+        magnification_of(table),
+        a_v,
+    )
+
+
+def stars_of(table: pa.Table, library: Library) -> Stars:
+    """Rows of the table `stars`, checked; errors as `galaxies_of`."""
+    mag_h, a_v = (column(table, name) for name in ("mag_h", "a_v"))
+    for name, values in (("mag_h", mag_h), ("a_v", a_v)):
+        declared = STARS.column(name)
+        within(name, values, _bound(declared.lo), _bound(declared.hi))
+    sed, frac = [column(table, "sed")], []
+    within("sed", sed[0], 0, len(library) - 1)
+    for k in STAR_PARTS:
+        if f"sed_{k}" not in table.column_names or table[f"sed_{k}"].null_count == table.num_rows:
+            continue
+        frac.append(np.nan_to_num(_floats(table, f"frac_{k}"), nan=0.0, posinf=np.inf))
+        within(f"frac_{k}", frac[-1], 0.0, 1.0)
+        sed.append(np.where(frac[-1] > 0.0, _floats(table, f"sed_{k}"), sed[0]))
+        within(f"sed_{k}", sed[-1], 0, len(library) - 1)
+    shares = np.stack([np.ones(table.num_rows), *frac])
+    shares[0] = 1.0 - shares[1:].sum(0)
+    within("what frac_2, frac_3, frac_4 leave to sed", shares[0], -1e-6, 1.0)
+    return Stars(np.stack(sed).astype(np.int64), np.maximum(shares, 0.0), mag_h, a_v)
+
+
+def magnification(
+    kappa: npt.ArrayLike, gamma1: npt.ArrayLike, gamma2: npt.ArrayLike, ids: Sequence[int] | Int
+) -> Float:
+    """mu = 1 / ((1 - kappa)^2 - gamma^2), float64[n].
+
+    kappa, gamma1, gamma2 : float64[n] convergence and shear;  ids : of the sources, named in the refusal
+    Errors: OutOfRange names the source where mu is not in (0, 100], at and inside the critical curve
+    Ref: Serrano et al. 2024, eq. magnification_factor
+    """
+    with np.errstate(divide="ignore"):
+        mu = 1.0 / determinant(kappa, gamma1, gamma2)
+    bad = ~((mu > 0.0) & (mu <= MAGNIFICATION_MAX))
+    if bad.any():
+        first = int(np.flatnonzero(bad)[0])
+        raise OutOfRange(f"magnification of source {int(ids[first])}", float(mu[first]), 0.0, MAGNIFICATION_MAX)
+    return np.asarray(mu)
+
+
+def determinant(kappa: npt.ArrayLike, gamma1: npt.ArrayLike, gamma2: npt.ArrayLike) -> Float:
+    """(1 - kappa)^2 - gamma^2, float64[n]: one over the magnification."""
+    stretch = 1.0 - np.asarray(kappa, float)
+    shear = np.hypot(np.asarray(gamma1, float), np.asarray(gamma2, float))
+    # A product of differences keeps its digits where the difference of squares loses them.
+    return np.asarray((stretch - shear) * (stretch + shear))
+
+
+def magnification_of(table: pa.Table) -> Float:
+    """`magnification` of the rows of the table `galaxies`."""
+    kappa, gamma1, gamma2 = (column(table, name) for name in ("kappa", "gamma1", "gamma2"))
+    return magnification(kappa, gamma1, gamma2, ids_of(table))
+
+
+def _line_fluxes(table: pa.Table) -> Float:
+    """Fluxes of all lines; a missing column, null or NaN is a line that was not modelled."""
+    out = np.zeros((table.num_rows, len(lines.line_list())))
+    for k, line in enumerate(lines.line_list()):
+        if line.column not in table.column_names:
+            continue
+        flux = np.nan_to_num(_floats(table, line.column), nan=0.0, posinf=np.inf)
+        declared = GALAXIES.column(line.column)
+        within(line.column, flux, _bound(declared.lo), _bound(declared.hi))
+        out[:, k] = flux * line.ratio
+    return out
+
+
+def _declared(name: str, values: Float) -> Float:
+    declared = GALAXIES.column(name)
+    within(name, values, _bound(declared.lo), _bound(declared.hi))
+    return values
+
+
+def _bound(value: float | None) -> float:
+    if value is None:
+        raise BadInput("a column that is read for its spectrum has no bounds")
+    return value
+
+
+def _refuse_other_kinds(table: pa.Table) -> None:
+    if "kind" not in table.column_names:
+        return
+    kinds = column(table, "kind")
+    other = ~np.isin(kinds, GALAXY_KINDS)
+    if other.any():
+        first = int(np.flatnonzero(other)[0])
+        source = int(ids_of(table)[first])
+        raise BadInput(f"galaxies: source {source} has kind {int(kinds[first])}: not in the galaxy library")
+
+
+def ids_of(table: pa.Table) -> Int:
+    if "id" not in table.column_names:
+        return np.arange(table.num_rows, dtype=np.int64)
+    return np.asarray(table["id"].to_numpy(), np.int64)
+
+
+def column(table: pa.Table, name: str) -> Float:
+    """A column as floats without gaps."""
+    values = _floats(table, name)
+    gap = np.isnan(values)
+    if gap.any():
+        first = int(np.flatnonzero(gap)[0])
+        raise BadInput(f"column {name} is missing in the row of source {int(ids_of(table)[first])}")
+    return values
+
+
+def _floats(table: pa.Table, name: str) -> Float:
+    """A column as float64, null -> NaN."""
+    if name not in table.column_names:
+        raise BadInput(f"column {name} is missing")
+    return np.asarray(pc.cast(table[name], pa.float64()).to_numpy(), float)

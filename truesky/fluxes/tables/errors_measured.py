@@ -1,0 +1,95 @@
+"""How wrong the tables are for external spectra and passbands, for which nothing was measured in advance.
+
+choose     setting and error of each band: looked up (flux_errors.csv), or measured here
+measured   the error of one setting, kept in the cache
+drawn      galaxies at random, over all that the tables cover
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lake_schema.arrays import Array
+from truesky.fluxes import integration
+from truesky.fluxes.libraries.templates import Library
+from truesky.fluxes.passbands import Passband
+from truesky.fluxes.sources import Galaxies
+from truesky.fluxes.spectra import extinction, intergalactic, lines
+from truesky.fluxes.spectra.continuum import Mix
+from truesky.fluxes.tables import build_tables, flux_tables, settings
+from truesky.fluxes.tables.build_tables import Setting
+from truesky.fluxes.tables.settings import CANDIDATES, MARGIN, Choice
+from truesky.numerics import cache
+from truesky.numerics.code_keys import code_key
+from truesky.request.accuracy import Accuracy
+
+# The largest error of so few is less than that of many; the margin is for that.
+_SAMPLE, _SEED = 4000, 5
+
+
+def choose(bands: Sequence[Passband], accuracy: Accuracy, library: Library) -> tuple[Choice, ...]:
+    """For each band the smallest setting that is fine enough, see settings.choose.
+
+    For an external passband or library, or one behind absorbing gas, the errors of 4000 random galaxies decide, from
+    the setting upwards that is fine enough for all bands with the embedded library.
+    """
+    known = settings.choose([band.name for band in bands], accuracy)
+    return tuple(
+        _fine_enough(band, choice, accuracy, library)
+        if library.own or band.name not in settings.known() or _is_absorbed(band, library)
+        else choice
+        for band, choice in zip(bands, known, strict=True)
+    )
+
+
+def _is_absorbed(band: Passband, library: Library) -> bool:
+    return library.intergalactic and intergalactic.sees(band, build_tables.Z_LAST)
+
+
+def measured(band: Passband, setting: Setting, library: Library) -> Choice:
+    """Errors of a setting, rms and largest, against integration."""
+    library_key = build_tables.library_key(library)
+    numbers = (setting.step, setting.n_ebv, setting.n_av)
+    about = (*numbers, band.wavelength, band.response, band.medium, _SAMPLE, _SEED)
+    key = cache.content_key(code_key(__name__), library_key, *about)
+
+    def make() -> dict[str, Array]:
+        rows = drawn(_SAMPLE, len(library), np.random.default_rng(_SEED))
+        fast = flux_tables.galaxies(rows, flux_tables.open_grid([band], [setting], library))
+        error = np.abs(fast / integration.galaxies(rows, [band], library) - 1.0)
+        return {"errors": np.array([np.sqrt(np.mean(error**2)), error.max()])}
+
+    rms, largest = cache.cached_arrays(f"flux_errors_{band.name}", key, make)["errors"]
+    return Choice(setting, float(f"{rms:.2e}"), float(f"{largest:.2e}"))
+
+
+def drawn(n: int, n_template: int, rng: np.random.Generator) -> Galaxies:
+    """Galaxies in two components with all their lines, uniform over all that the tables cover."""
+    frac = rng.uniform(0.0, 1.0, n)
+    mix = Mix(
+        rng.uniform(build_tables.Z_FIRST, build_tables.Z_LAST, n),
+        rng.integers(0, n_template, (2, n)),
+        rng.integers(0, extinction.LAW_COUNT, (2, n)),
+        np.stack([frac, 1.0 - frac]),
+        rng.uniform(0.0, build_tables.EBV_LAST, (2, n)),
+    )
+    return Galaxies(
+        mix,
+        rng.uniform(-23.0, -16.0, n),
+        rng.uniform(18.0, 26.0, n),
+        10.0 ** rng.uniform(-18.0, -15.5, (n, len(lines.line_list()))),
+        np.ones(n),
+        rng.uniform(0.0, build_tables.A_V_LAST, n),
+    )
+
+
+def _fine_enough(band: Passband, first: Choice, accuracy: Accuracy, library: Library) -> Choice:
+    if first.setting is None:
+        return first
+    for setting in CANDIDATES[CANDIDATES.index(first.setting) :]:
+        choice = measured(band, setting, library)
+        if MARGIN * choice.largest <= accuracy.flux:
+            return choice
+    return settings.INTEGRATED

@@ -1,0 +1,210 @@
+"""Tables that a TAP service has beside the lake's own: what there is to ask (TAP_SCHEMA), the images (ivoa.obscore).
+
+written     them all as Arrow files that a process of queries reads
+
+Ref: IVOA Recommendations TAP 1.1, section 4; ObsCore 1.1, table 1 and appendix B
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+from pyarrow import feather
+
+from lake_schema.store import read
+from truesky.explore.votables import datatype, facts_of
+
+LAKE = "lake"
+_LIGHT_M = 1e-10
+Json = dict[str, Any]
+
+
+def _f(name: str, kind: pa.DataType, ucd: str, description: str) -> pa.Field:
+    facts = {"ucd": ucd, "description": description}
+    return pa.field(name, kind, metadata={key: value for key, value in facts.items() if value})
+
+
+_S, _I = pa.string(), pa.int32()
+_SCHEMAS: dict[str, tuple[str, pa.Schema]] = {
+    "tap_schema.schemas": ("The schemas.", pa.schema([
+        _f("schema_name", _S, "meta.id", "name of the schema"), _f("utype", _S, "", "utype"),
+        _f("description", _S, "", "what it holds"), _f("schema_index", _I, "", "order in which it is listed"),
+    ])),
+    "tap_schema.tables": ("The tables.", pa.schema([
+        _f("schema_name", _S, "", "schema that it is in"), _f("table_name", _S, "", "name, as it stands in a query"),
+        _f("table_type", _S, "", "table or view"), _f("utype", _S, "", "utype"),
+        _f("description", _S, "", "what it holds"), _f("table_index", _I, "", "order in which it is listed"),
+    ])),
+    "tap_schema.columns": ("The columns.", pa.schema([
+        _f("table_name", _S, "", "table that it is in"), _f("column_name", _S, "", "name, as it stands in a query"),
+        _f("datatype", _S, "", "type, of VOTable"), _f("arraysize", _S, "", "shape, of VOTable"),
+        _f("xtype", _S, "", "what a text stands for"), _f("size", _I, "", "length, not used any more"),
+        _f("description", _S, "", "meaning"), _f("utype", _S, "", "utype"), _f("unit", _S, "", "unit"),
+        _f("ucd", _S, "", "UCD"), _f("indexed", _I, "", "1 where rows are found fast by it"),
+        _f("principal", _I, "", "1 where it is among the most important"),
+        _f("std", _I, "", "1 where a standard defines it"),
+        _f("column_index", _I, "", "order in which it is listed"),
+    ])),
+    "tap_schema.keys": ("The foreign keys.", pa.schema([
+        _f("key_id", _S, "", "identifier of the key"), _f("from_table", _S, "", "table that it is in"),
+        _f("target_table", _S, "", "table that it leads to"), _f("description", _S, "", "meaning"),
+        _f("utype", _S, "", "utype"),
+    ])),
+    "tap_schema.key_columns": ("The columns of the foreign keys.", pa.schema([
+        _f("key_id", _S, "", "identifier of the key"), _f("from_column", _S, "", "column that leads"),
+        _f("target_column", _S, "", "column that it leads to"),
+    ])),
+}  # fmt: skip
+
+
+def _obscore() -> pa.Schema:
+    """The columns of ivoa.obscore, from the table beside this module: ObsCore 1.1, table 1, and two of our own."""
+    with Path(__file__).with_name("obscore.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    known = ("unit", "ucd", "utype", "xtype", "description")
+    return pa.schema(
+        [
+            pa.field(row["name"], pa.type_for_alias(row["type"]), metadata={key: row[key] for key in known if row[key]})
+            for row in rows
+        ]
+    )
+
+
+_SCHEMAS["ivoa.obscore"] = ("The images, as ObsCore describes observations.", _obscore())
+
+
+@dataclass(frozen=True, slots=True)
+class Listed:
+    """A table as TAP_SCHEMA and VOSI list it.
+
+    name : as it stands in a query
+    """
+
+    schema: str
+    name: str
+    description: str
+    fields: pa.Schema
+    is_standard: bool
+
+
+def listed(versions: Mapping[str, read.Version]) -> list[Listed]:
+    """All tables, those of the lake first."""
+    own = [
+        Listed(
+            name.rpartition(".")[0] or LAKE, ".".join(map(column_name, name.split("."))),
+            (version.schema.metadata or {}).get(b"description", b"").decode(), version.schema, False,
+        )
+        for name, version in versions.items()
+        if version.schema.names
+    ]  # fmt: skip
+    return own + [
+        Listed(name.partition(".")[0], name, about, fields, True) for name, (about, fields) in _SCHEMAS.items()
+    ]
+
+
+_RESERVED = {
+    "value", "distance", "size", "values", "point", "circle", "area", "box", "region", "contains", "date", "time",
+    "year", "month", "day", "zone", "user", "order", "group", "key", "position", "session", "current", "constant",
+    "level", "section", "names", "column", "table", "schema", "from", "to", "select", "where", "top", "by", "in",
+    "is", "on", "or", "and", "not", "min", "max", "sum", "count", "avg", "log", "exp", "power", "mod", "floor",
+    "ceiling", "round", "sign", "character", "language", "second", "minute", "hour", "timestamp", "interval",
+    "first", "last", "next", "exposure", "read", "source",
+}  # fmt: skip
+
+
+def column_name(name: str) -> str:
+    """A name as it stands in ADQL: one that is not plain, or a word of the language, in quotes."""
+    plain = name.isascii() and name.replace("_", "a").isalnum() and name[0].isalpha()
+    return name if plain and name.lower() not in _RESERVED else f'"{name}"'
+
+
+def columns_of(table: Listed) -> Iterator[Json]:
+    """The columns of a table as TAP_SCHEMA.columns has them."""
+    for number, field in enumerate(table.fields, start=1):
+        about = facts_of(field)
+        kind, size = datatype(field.type)
+        yield {
+            "table_name": table.name, "column_name": column_name(field.name), "datatype": kind,
+            "arraysize": size or None,
+            "xtype": about.xtype or None, "size": None, "description": about.description or None,
+            "utype": about.utype or None,
+            "unit": about.unit or None, "ucd": about.ucd or None,
+            "indexed": int(field.name in ("_healpix_29",)), "principal": int(number <= 12),
+            "std": int(table.is_standard), "column_index": number,
+        }  # fmt: skip
+
+
+# Of TAP_SCHEMA's own tables: key, table, column, table that it leads to, column.
+KEYS = (
+    ("tables_schema", "tap_schema.tables", "schema_name", "tap_schema.schemas", "schema_name"),
+    ("columns_table", "tap_schema.columns", "table_name", "tap_schema.tables", "table_name"),
+    ("keys_from", "tap_schema.keys", "from_table", "tap_schema.tables", "table_name"),
+    ("keys_target", "tap_schema.keys", "target_table", "tap_schema.tables", "table_name"),
+    ("key_columns_key", "tap_schema.key_columns", "key_id", "tap_schema.keys", "key_id"),
+)
+SCHEMAS = {
+    LAKE: "Tables that all requests of the lake share.",
+    "tap_schema": "What there is to ask.",
+    "ivoa": "Tables of the Virtual Observatory.",
+}
+
+
+def written(versions: Mapping[str, read.Version], images: list[Json], folder: Path) -> list[str]:
+    """NAME=@FILE of every table, as a process of queries wants them.
+
+    versions : of the lake's tables;  images : rows of ivoa.obscore;  folder : where the files go
+    """
+    tables = listed(versions)
+    names = list(dict.fromkeys(table.schema for table in tables))
+    rows: dict[str, list[Json]] = {
+        "tap_schema.schemas": [
+            {"schema_name": name, "description": SCHEMAS.get(name, f"Tables of request {name}."), "schema_index": k}
+            for k, name in enumerate(names, start=1)
+        ],
+        "tap_schema.tables": [
+            {"schema_name": table.schema, "table_name": table.name, "table_type": "table",
+             "description": table.description, "table_index": k}
+            for k, table in enumerate(tables, start=1)
+        ],
+        "tap_schema.columns": [column for table in tables for column in columns_of(table)],
+        "tap_schema.keys": [{"key_id": key, "from_table": a, "target_table": b} for key, a, _, b, _ in KEYS],
+        "tap_schema.key_columns": [{"key_id": key, "from_column": a, "target_column": b} for key, _, a, _, b in KEYS],
+        "ivoa.obscore": images,
+    }  # fmt: skip
+    found = []
+    for name, (_, schema) in _SCHEMAS.items():
+        file = folder / f"{name}.arrow"
+        feather.write_feather(pa.Table.from_pylist(rows[name], schema), file, compression="uncompressed")
+        found.append(f"{name}=@{file}")
+    return found
+
+
+def image_row(number: int, row: Mapping[str, Any], exposure: Mapping[str, Any], file: Mapping[str, Any]) -> Json:
+    """An image as a row of ivoa.obscore.
+
+    number   : by which it can be had;  row : of `products`;  exposure : its row of `exposures`, {} where there is none
+    file     : url, kbyte, nx, ny, fov (deg), wavelengths (shortest and longest, angstrom, or None), version; exposure,
+               by which it is told from all others
+    """
+    start, seconds = exposure.get("mjd"), exposure.get("exposure_time_s")
+    wavelengths = file["wavelengths"] or (None, None)
+    return {
+        "dataproduct_type": "image", "dataproduct_subtype": row["content"], "calib_level": 1,
+        "obs_collection": exposure.get("survey") or "truesky", "obs_id": file["exposure"],
+        "obs_publisher_did": f"ivo://truesky.local/{file['version']}?{row['path']}", "access_url": file["url"],
+        "access_format": "application/fits", "access_estsize": file["kbyte"], "target_name": None,
+        "s_ra": row["ra"], "s_dec": row["dec"], "s_fov": file["fov"], "s_region": row["s_region"],
+        "s_resolution": exposure.get("seeing") or None, "s_xel1": file["nx"], "s_xel2": file["ny"],
+        "t_min": start, "t_max": None if start is None or seconds is None else start + seconds / 86400.0,
+        "t_exptime": seconds, "t_resolution": seconds, "t_xel": 1,
+        "em_min": wavelengths[0] and wavelengths[0] * _LIGHT_M, "em_max": wavelengths[1] and wavelengths[1] * _LIGHT_M,
+        "em_res_power": None, "em_xel": 1, "o_ucd": "phot.count", "pol_states": None, "pol_xel": None,
+        "facility_name": "Euclid" if not str(row["channel"]).startswith("EXT") else str(exposure.get("camera", "")),
+        "instrument_name": str(exposure.get("camera") or row["channel"]),
+        "band_name": row["band"], "detector": row["detector"],
+    }  # fmt: skip

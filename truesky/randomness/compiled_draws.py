@@ -1,0 +1,149 @@
+"""Random numbers from keys, compiled: a key is a word of 64 bits, and the same key gives the same number anywhere.
+
+following     the key of what is drawn next: a step of SplitMix64
+uniform       in (0, 1);  normal : by the inverse of the cumulative distribution;  exponential, poisson, gamma
+uniforms, normals, gammas   of many keys
+
+Ref: Steele, Lea & Flood 2014 (SplitMix64); Wichura 1988, Applied Statistics 37, 477 (AS 241); Marsaglia & Tsang 2000,
+     ACM TOMS 26, 363
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from truesky.numerics.compiling import exact_jit
+from truesky.randomness.rng import GOLDEN, mixed
+
+# Rational approximations of AS 241, PPND16, lowest power first: in the middle, in the tails, and far out.
+_MIDDLE = (
+    (
+        3.3871328727963666080e0, 1.3314166789178437745e2, 1.9715909503065514427e3, 1.3731693765509461125e4,
+        4.5921953931549871457e4, 6.7265770927008700853e4, 3.3430575583588128105e4, 2.5090809287301226727e3,
+    ),
+    (
+        1.0, 4.2313330701600911252e1, 6.8718700749205790830e2, 5.3941960214247511077e3,
+        2.1213794301586595867e4, 3.9307895800092710610e4, 2.8729085735721942674e4, 5.2264952788528545610e3,
+    ),
+)  # fmt: skip
+_TAIL = (
+    (
+        1.42343711074968357734e0, 4.63033784615654529590e0, 5.76949722146069140550e0, 3.64784832476320460504e0,
+        1.27045825245236838258e0, 2.41780725177450611770e-1, 2.27238449892691845833e-2, 7.74545014278341407640e-4,
+    ),
+    (
+        1.0, 2.05319162663775882187e0, 1.67638483018380384940e0, 6.89767334985100004550e-1,
+        1.48103976427480074590e-1, 1.51986665636164571966e-2, 5.47593808499534494600e-4, 1.05075007164441684324e-9,
+    ),
+)  # fmt: skip
+_FAR = (
+    (
+        6.65790464350110377720e0, 5.46378491116411436990e0, 1.78482653991729133580e0, 2.96560571828504891230e-1,
+        2.65321895265761230930e-2, 1.24266094738807843860e-3, 2.71155556874348757815e-5, 2.01033439929228813265e-7,
+    ),
+    (
+        1.0, 5.99832206555887937690e-1, 1.36929880922735805310e-1, 1.48753612908506148525e-2,
+        7.86869131145613259100e-4, 1.84631831751005468180e-5, 1.42151175831644588870e-7, 2.04426310338993978564e-15,
+    ),
+)  # fmt: skip
+# exp(-mean) is still a normal number here: larger means are sums of several.
+_LARGEST_MEAN = 600.0
+_S12 = np.uint64(12)
+
+_mixed = exact_jit(mixed)
+
+
+@exact_jit
+def following(key: Any, number: Any) -> Any:
+    """The key of one of the things that belong to a key; number : int, from 0."""
+    return _mixed(key + (np.uint64(number) + np.uint64(1)) * GOLDEN)
+
+
+@exact_jit
+def uniform(key: Any) -> Any:
+    """52 bits and a half: neither 0 nor, rounded, 1."""
+    return (np.float64(key >> _S12) + 0.5) * 2.0**-52
+
+
+@exact_jit
+def normal(key: Any) -> Any:
+    """Standard normal.  Error: 1e-15 relative, of the inverse of `uniform`"""
+    u = uniform(key)
+    q = u - 0.5
+    if abs(q) <= 0.425:
+        return q * _ratio(_MIDDLE, 0.180625 - q * q)
+    r = np.sqrt(-np.log(u if q < 0.0 else 1.0 - u))
+    x = _ratio(_TAIL, r - 1.6) if r <= 5.0 else _ratio(_FAR, r - 5.0)
+    return -x if q < 0.0 else x
+
+
+@exact_jit
+def _ratio(of: Any, x: Any) -> Any:
+    above, below = of[0][7], of[1][7]
+    for i in range(6, -1, -1):
+        above = above * x + of[0][i]
+        below = below * x + of[1][i]
+    return above / below
+
+
+@exact_jit
+def poisson(key: Any, mean: Any) -> Any:
+    """A Poisson number, by inversion."""
+    pieces = int(mean / _LARGEST_MEAN) + 1
+    part = mean / pieces
+    found = 0
+    for piece in range(pieces):
+        u = uniform(following(key, piece))
+        share = np.exp(-part)
+        below, number = share, 0
+        # The sum stops growing before it is 1 where u is so near to it that no number has this probability.
+        while u > below and share > 0.0:
+            number += 1
+            share *= part / number
+            below += share
+        found += number
+    return found
+
+
+@exact_jit
+def gamma(key: Any, shape: Any) -> Any:
+    """Standard gamma of a shape > 0, by as many trials as it takes; Marsaglia & Tsang 2000."""
+    d = (shape if shape >= 1.0 else shape + 1.0) - 1.0 / 3.0
+    c = 1.0 / np.sqrt(9.0 * d)
+    trial = 1
+    while True:
+        x = normal(following(key, trial))
+        v = (1.0 + c * x) ** 3
+        if v > 0.0 and np.log(uniform(following(key, trial + 1))) < 0.5 * x * x + d - d * v + d * np.log(v):
+            break
+        trial += 2
+    return d * v if shape >= 1.0 else d * v * uniform(following(key, 0)) ** (1.0 / shape)
+
+
+@exact_jit
+def uniforms(keys: Any, number: Any, out: Any) -> None:
+    """Fills out, float64[n], with the uniform of each key's `number`-th following; keys : uint64[n]."""
+    for i in range(keys.size):
+        out[i] = uniform(following(keys[i], number))
+
+
+@exact_jit
+def normals(keys: Any, number: Any, out: Any) -> None:
+    """The same of normal numbers.
+
+    keys : uint64[n];  number : int;  out : float64[n]
+    """
+    for i in range(keys.size):
+        out[i] = normal(following(keys[i], number))
+
+
+@exact_jit
+def gammas(keys: Any, number: Any, shapes: Any, out: Any) -> None:
+    """The same of gamma numbers; shapes : float64[n].
+
+    keys : uint64[n];  number : int;  out : float64[n]
+    """
+    for i in range(keys.size):
+        out[i] = gamma(following(keys[i], number), shapes[i])

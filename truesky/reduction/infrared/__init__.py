@@ -1,0 +1,1 @@
+"""Reduce NISP frames: ramps, linearity, lamps, persistence."""

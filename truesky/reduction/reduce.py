@@ -1,0 +1,167 @@
+"""Calibrated images from the raw frames of a lake: bias, dark, response of the amplifiers, flat, vignetting.
+
+    python -m truesky.reduction.reduce --lake LAKE [--name REQUEST] --masters FOLDER --out FOLDER [--detectors ..]
+                                 [--exposures ..] [--rate] [--without ..] [--cosmic-rays SIGMA]
+                                 [--level2 [--aperture ARCSEC] [--threshold SIGMA] [--least-pixels N]]
+
+A file a frame that sees the sky, with the extensions SCI (electrons, e-/s or, of level 2, counts of the mean gain), WHT
+(inverse variance) and FLG (bits). Of level 2 a catalogue of its sources, its PSF and a .head lie beside it.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lake_schema import command, user_files
+from lake_schema.errors import BadInput
+from lake_schema.fits.images import Card
+from lake_schema.store import layout
+from truesky.reduction import calibration, cosmic_rays, files, level2
+from truesky.reduction import frames as frames_of
+from truesky.reduction.calibration import Masters, Reduced
+from truesky.reduction.catalogue import Limits
+from truesky.reduction.frames import Frame
+from truesky.reduction.infrared import nisp
+from truesky.reduction.infrared.foreseen import Foreseen
+from truesky.render.channels import registry
+from truesky.render.channels.image_types import SKY_TYPES
+
+# Of a level 2 where none is asked for: van Dokkum 2001.
+_LIMIT = 4.5
+
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """What is made of a frame.
+
+    unit        : of the pixels: electron, electron/s or adu
+    without     : of files.UNDONE what is left as it is
+    cosmic_rays : standard deviations above which they are found, 0 = they are not looked for
+    """
+
+    unit: str = "electron"
+    without: tuple[str, ...] = ()
+    cosmic_rays: float = 0.0
+
+
+def reduced(
+    frame: Frame, masters: Masters, wish: Wish, foreseen: Foreseen | None = None
+) -> tuple[Reduced, tuple[Card, ...]]:
+    """A frame with the masters of its detector: the image and its header.
+
+    frame, masters, wish : what is made of it with what
+    foreseen : what earlier exposures leave in a detector of NISP; None: that is left as it is
+    """
+    electrons = {"electron": 1.0, "electron/s": frame.scene.exposure_time_s}.get(wish.unit) or frame.mean_gain
+    undone = frame.applied - set(wish.without)
+    if frame.scene.ramp:
+        bent = () if "nonlinearity" in wish.without else tuple(undone)
+        found = nisp.reduced(frame, masters, foreseen, bent, electrons)
+    else:
+        fringes = frame.fringes() if "fringes" in undone else None
+        found = calibration.reduced(frame.electrons(), frame.full(), masters, frame.scene, undone, electrons, fringes)
+    if wish.cosmic_rays:
+        found = cosmic_rays.flagged(found, cosmic_rays.found(found, wish.cosmic_rays))
+    return found, files.reduced_cards(frame, wish.unit, electrons, wish.without)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Prints a line an image."""
+    parser = argparse.ArgumentParser(prog="truesky reduce", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--lake", required=True, help="folder of the lake, with rendered frames")
+    parser.add_argument("--name", help="of the request whose frames are meant, where the lake has several")
+    parser.add_argument(
+        "--masters", type=Path, help="folder that truesky.reduction.masters has written, or of your own"
+    )
+    parser.add_argument("--out", type=Path, required=True, help="folder of the calibrated images")
+    parser.add_argument("--detectors", nargs="+", default=[], metavar="NAME", help="default: all")
+    parser.add_argument("--exposures", nargs="+", type=int, default=[], metavar="ID", help="default: all")
+    parser.add_argument("--rate", action="store_true", help="electrons a second instead of those of the exposure")
+    parser.add_argument("--without", nargs="+", default=[], choices=files.UNDONE, help="what is left as it is")
+    parser.add_argument(
+        "--cosmic-rays", type=float, metavar="SIGMA", help=f"flag them; with --level2 {_LIMIT:g}, 0 = no"
+    )
+    parser.add_argument("--level2", action="store_true", help="in counts, with sources, PSF and .head beside")
+    parser.add_argument("--aperture", type=float, metavar="ARCSEC", help="diameter of MAG_APER (3 FWHM)")
+    parser.add_argument("--threshold", type=float, default=Limits().threshold, metavar="SIGMA", help="of sources (1.5)")
+    parser.add_argument("--least-pixels", type=int, default=Limits().pixels, metavar="N", help="of a source (5)")
+    options = parser.parse_args(argv)
+    return command.status("reduce", lambda: _written(options))
+
+
+def _written(options: argparse.Namespace) -> int:
+    out = user_files.folder(options.out)
+    wish, settings = _wish(options), _settings(options)
+    root = layout.lake(options.lake)
+    found = frames_of.of_lake(root, options.detectors, options.exposures, options.name)
+    science = [own for frames in found.values() if (own := [frame for frame in frames if _sees_sky(frame)])]
+    if not science:
+        raise BadInput(f"lake {options.lake} has no such frame that sees the sky")
+    if settings is not None:
+        level2.refuse([frame for frames in science for frame in frames])
+    out.mkdir(parents=True, exist_ok=True)
+    every = frames_of.of_lake(root, options.detectors, (), options.name) if options.exposures else found
+    for frames in science:
+        exposed, foreseen = frames[0].exposure, None
+        if frames[0].scene.ramp and "persistence" not in wish.without:
+            foreseen = Foreseen(every[exposed.camera, frames[0].detector])
+        for frame, masters in _with_masters(frames, options.masters, wish.without):
+            made, cards = reduced(frame, masters, wish, foreseen)
+            path = out / f"{frame.stem}.fits"
+            more = ""
+            if settings is None:
+                files.write_image(path, made, cards)
+            else:
+                more = f", {level2.written(path, frame, made, cards, settings)} sources"
+            good = made.weight > 0.0
+            shown = f"sky {np.median(made.image[good]):.5g}" if good.any() else "no pixel is good"
+            print(f"{path}: {shown}, {100.0 * good.mean():.2f} % of the pixels are good{more}")
+    return 0
+
+
+def _with_masters(
+    frames: Sequence[Frame], folder: Path | None, without: Sequence[str]
+) -> Iterator[tuple[Frame, Masters]]:
+    """Frames of a detector with its masters, which are read once a band, and a ramp."""
+    alike = [(frame.exposure.band, frame.ramp if frame.scene.ramp else ()) for frame in frames]
+    for kind in dict.fromkeys(alike):
+        own = [frame for frame, its in zip(frames, alike, strict=True) if its == kind]
+        needed = files.kinds(own[0])
+        if folder is None and not {*without} >= {*needed}:
+            raise BadInput(f"--masters: which folder? Or --without {' '.join(needed)}")
+        masters = (nisp.of_frame if own[0].scene.ramp else files.masters)(folder or Path(), own[0], without)
+        yield from ((frame, masters) for frame in own)
+
+
+def _sees_sky(frame: Frame) -> bool:
+    """Of NISP standard stars and nebulae, too."""
+    kind = frame.exposure.image_type
+    return kind in SKY_TYPES or (bool(frame.scene.ramp) and registry.CHANNELS[frame.exposure.channel].sees_sky(kind))
+
+
+def _wish(options: argparse.Namespace) -> Wish:
+    if options.level2 and options.rate:
+        raise BadInput("--rate: images of level 2 are in counts")
+    limit = options.cosmic_rays
+    if limit is None:
+        limit = _LIMIT if options.level2 else 0.0
+    if limit:
+        cosmic_rays.check(limit)
+    unit = "adu" if options.level2 else "electron/s" if options.rate else "electron"
+    return Wish(unit, tuple(options.without), limit)
+
+
+def _settings(options: argparse.Namespace) -> level2.Settings | None:
+    limits = Limits(options.threshold, options.least_pixels)
+    if not options.level2 and (limits != Limits() or options.aperture is not None):
+        raise BadInput("--aperture, --threshold, --least-pixels: without --level2 there is no catalogue")
+    return level2.Settings(limits, options.aperture) if options.level2 else None
+
+
+if __name__ == "__main__":
+    command.leave(main)

@@ -1,0 +1,193 @@
+"""Calibrated images of one field, in one band, onto one map of the sky.
+
+    python -m truesky.reduction.stack FILE .. --out FILE.fits [--scale ARCSEC] [--lake LAKE [--name REQUEST]]
+
+The extensions are SCI (e-/s a pixel, the sky in it), WHT (inverse variance a pixel of sums over many pixels), FLG, and
+with --lake PSF: what a point source in the middle is, three samples a pixel. Neighbouring pixels share noise: the
+variance of a pixel alone is less than 1 / WHT by the factor in the card CORRVAR.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from astropy.wcs import WCS
+from scipy import ndimage
+
+from lake_schema import __version__, command, user_files
+from lake_schema.arrays import Float
+from lake_schema.errors import BadInput
+from lake_schema.fits.images import Card, Image
+from lake_schema.store import layout
+from truesky.reduction import files, point_sources, stacking
+from truesky.reduction import frames as frames_of
+from truesky.reduction.calibration import COSMIC_RAY, Reduced
+from truesky.reduction.files import ImageFile
+from truesky.reduction.frames import Frame
+from truesky.reduction.resampling import Grid, Resampled, grid_of, pixel_map, resampled
+from truesky.reduction.stacking import Contribution, Stack
+from truesky.render.camera import astrometry
+
+# What all images of a stack share.
+_SAME = ("INSTRUME", "CHANNEL", "FILTER", "ZEROPNT")
+# What each of them says besides; the second are numbers above 0.
+_SAID, _NUMBERS = ("IMAGETYP", "DETECTOR"), ("EXPOSURE", "EXPTIME", "GAIN", "PIXSCALE")
+
+
+def rate(image: ImageFile) -> Reduced:
+    """The image in e-/s."""
+    if image.card("BUNIT") == "electron/s":
+        return image.reduced
+    # Seconds in which there is one unit for each e-/s.
+    time = float(image.card("EXPTIME")) / float(image.card("GAIN"))
+    one = image.reduced
+    return Reduced((one.image / time).astype(np.float32), (one.weight * time**2).astype(np.float32), one.flags)
+
+
+def stacked(images: Sequence[tuple[Reduced, WCS]], scale: float) -> tuple[Stack, Grid, list[float]]:
+    """Images in e-/s, with their systems -> their stack, its grid, their weights; scale : arcsec a pixel."""
+    grid = grid_of([(system, image.image.shape) for image, system in images], scale)
+    placed: list[Resampled] = []
+    weights = []
+    for image, system in images:
+        pixmap, area = pixel_map(system, image.image.shape, grid)
+        placed.append(resampled(image, pixmap, area, grid.shape))
+        good = image.weight > 0.0
+        weights.append(float(np.median(image.weight[good])) if good.any() else 0.0)
+    return stacking.combined(placed, weights), grid, weights
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Prints a line about the stack."""
+    parser = argparse.ArgumentParser(prog="truesky stack", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("images", nargs="+", type=Path, help="files that truesky.reduction.reduce has written")
+    parser.add_argument("--out", type=Path, required=True, help="FITS file of the stack")
+    parser.add_argument("--scale", type=float, help="arcsec a pixel (default: the detectors')")
+    parser.add_argument("--lake", help="folder of the lake that the images are of: for the PSF")
+    parser.add_argument("--name", help="of the request whose frames are meant, where the lake has several")
+    options = parser.parse_args(argv)
+    return command.status("stack", lambda: _written(options))
+
+
+def _written(options: argparse.Namespace) -> int:
+    out = user_files.target(options.out, (".fits",))
+    found = [files.read_image(path) for path in options.images]
+    _refuse_different(options.images, found)
+    systems = [astrometry.from_cards(image.cards) for image in found]
+    scale = float(found[0].card("PIXSCALE")) if options.scale is None else options.scale
+    shapes = [image.reduced.image.shape for image in found]
+    stack, grid, weights = stacked(list(zip(map(rate, found), systems, strict=True)), scale)
+    more = []
+    if options.lake:
+        frames = _frames(layout.lake(options.lake), found, options.name)
+        parts = [
+            Contribution(system, shape, point_sources.profile(frame), frame.scene.detector.pixel_scale, weight)
+            for system, shape, frame, weight in zip(systems, shapes, frames, weights, strict=True)
+            if frame.scene.detector is not None
+        ]
+        more.append(_psf_of(parts, grid, stack))
+    correlation = stacking.noise_correlation(stack)
+    files.write_image(out, stack.reduced, _cards(found, grid, scale, correlation), more)
+    ny, nx = grid.shape
+    hit = float(((stack.reduced.flags & COSMIC_RAY) > 0).mean())
+    print(
+        f"{out}: {len(found)} images on {ny} x {nx} pixels of {scale:g} arcsec, "
+        f"{100 * hit:.2f} % with a value rejected, "
+        f"variance of 8x8 sums {correlation:.2f} times that of as many pixels alone"
+    )
+    return 0
+
+
+def _refuse_different(paths: Sequence[Path], found: Sequence[ImageFile]) -> None:
+    for path, image in zip(paths, found, strict=True):
+        _refuse_other(path, image)
+        for keyword in _SAME:
+            if image.card(keyword) != found[0].card(keyword):
+                what = f"{keyword} = {image.card(keyword)}, that of {paths[0].name} is {found[0].card(keyword)}"
+                raise BadInput(f"{user_files.shown(path)}: {what}: they make no stack")
+    seen = [(image.card("EXPOSURE"), image.card("DETECTOR")) for image in found]
+    for path, one in zip(paths, seen, strict=True):
+        if seen.count(one) > 1:
+            raise BadInput(f"{user_files.shown(path)}: exposure {one[0]}, detector {one[1]} is given twice")
+
+
+def _refuse_other(path: Path, image: ImageFile) -> None:
+    """What is no image of truesky.reduction.reduce."""
+    if image.card("IMAGETYP") == "stack":
+        raise BadInput(f"{user_files.shown(path)}: is a stack: give the images that it was made of")
+    for keyword in (*_SAME, *_SAID, *_NUMBERS):
+        value = image.card(keyword)
+        if value is None:
+            raise BadInput(f"{user_files.shown(path)}: has no card {keyword}")
+        if keyword in _NUMBERS and not (isinstance(value, int | float) and 0.0 < value < np.inf):
+            raise BadInput(f"{user_files.shown(path)}: {keyword} = {value!r} is no number above 0")
+
+
+def _frames(root: Path, found: Sequence[ImageFile], request: str | None) -> list[Frame]:
+    """The lake's frames of the images."""
+    numbers = {int(image.card("EXPOSURE")) for image in found}
+    names = sorted({str(image.card("DETECTOR")) for image in found})
+    known = {
+        (frame.exposure.exposure_id, frame.detector): frame
+        for frames in frames_of.of_lake(root, names, numbers, request).values()
+        for frame in frames
+    }
+    asked = [(int(image.card("EXPOSURE")), str(image.card("DETECTOR"))) for image in found]
+    for number, detector in asked:
+        if (number, detector) not in known:
+            raise BadInput(f"lake {root}: table products has no image of exposure {number}, detector {detector}")
+    return [known[one] for one in asked]
+
+
+def _psf_of(parts: Sequence[Contribution], grid: Grid, stack: Stack) -> Image:
+    """Where the stack is deepest, as near to its middle as can be."""
+    x, y = _middle(stack.reduced.weight)
+    ra, dec = astrometry.sky_of_pixel(grid.wcs, [x], [y])
+    cards: tuple[Card, ...] = (
+        ("PSFSAMP", stacking.PSF_SAMPLES, "samples a pixel"),
+        ("PSFRA", float(ra[0]), "[deg] place that it is of"),
+        ("PSFDEC", float(dec[0]), "[deg] place that it is of"),
+    )
+    return Image(stacking.effective_psf(parts, grid, x, y).astype(np.float32), cards, "PSF")
+
+
+def _middle(weight: Float) -> tuple[float, float]:
+    """(x, y): of the deepest quarter of the pixels, away from edges if some are, the one nearest to their mean."""
+    if not weight.any():
+        return 0.0, 0.0
+    deep = weight >= np.percentile(weight[weight > 0.0], 75.0)
+    inside = deep & ndimage.binary_erosion(weight > 0.0, np.ones((3, 3), bool), iterations=stacking.PSF_SIDE // 2)
+    rows, columns = np.nonzero(inside if inside.any() else deep)
+    nearest = int(np.argmin((columns - columns.mean()) ** 2 + (rows - rows.mean()) ** 2))
+    return float(columns[nearest]), float(rows[nearest])
+
+
+def _cards(found: Sequence[ImageFile], grid: Grid, scale: float, correlation: float) -> tuple[Card, ...]:
+    first = found[0]
+    kept = {key: (key, value, comment) for key, value, comment in first.cards if key in (*_SAME, "SEED", "MISSION")}
+    exposures = sorted({(int(image.card("EXPOSURE")), float(image.card("EXPTIME"))) for image in found})
+    return (
+        *kept.values(),
+        ("IMAGETYP", "stack", "image type"),
+        ("BUNIT", "electron/s", "unit of SCI; of WHT its inverse square"),
+        ("GAIN", sum(time for _, time in exposures), "[electron/(electron/s)] of the deepest places"),
+        ("NCOMBINE", len(found), "images"),
+        ("TEXPTIME", sum(time for _, time in exposures), "[s] of all exposures"),
+        ("PIXSCALE", scale, "[arcsec/pix] pixel scale"),
+        *(
+            ()
+            if np.isnan(correlation)
+            else (("CORRVAR", round(correlation, 4), "variance of 8x8 sums / 64 x pixel's"),)
+        ),
+        *((f"EXPOS{i}", number, "exposure") for i, (number, _) in enumerate(exposures, start=1)),
+        *astrometry.cards(grid.wcs),
+        *files.flag_cards(),
+        ("TRUESKY", __version__, "version of the simulator"),
+    )
+
+
+if __name__ == "__main__":
+    command.leave(main)

@@ -1,0 +1,195 @@
+"""Astrometry: the world coordinate system of a detector, from pixels to the sky and back.
+
+Focal-plane coordinates (x, y) are arcsec on the tangent plane about the boresight, as the sky is seen from
+inside: with y to the north, x points west (east is left).  Where the optics distort, they are those of the
+detectors' own places, and `distortion` tells what is seen there.  Pixel coordinates (column, row) are 0-based,
+and whole at a pixel's centre.
+
+wcs             the world coordinate system of a detector (astropy): TAN, with SIP where the optics distort
+sky_of_pixel, pixel_of_sky, jacobian   by a system
+corners, centre, s_region      of a detector on the sky
+cards, shifted, from_cards     a system as FITS cards, and back
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from astropy.wcs import WCS, Sip
+
+from lake_schema import sky
+from lake_schema.arrays import Float
+from lake_schema.errors import BadInput
+from truesky.numerics import sums
+from truesky.render.camera import distortion, pointing, tpv
+from truesky.render.camera.detectors import Detector
+from truesky.render.camera.pointing import ARCSEC
+
+# ------------------------------------------------------------------------------------------------ pixels
+
+
+def wcs(detector: Detector, ra: float, dec: float, position_angle: float) -> WCS:
+    """The world coordinate system of a detector: ICRS, TAN about the boresight, and the distortion as SIP.
+
+    ra, dec        : deg, boresight
+    position_angle : deg, of the focal plane's y axis at the boresight, north through east
+    """
+    angle, turn = np.radians(position_angle), np.radians(detector.rotation)
+    # Columns: the directions (east, north) of the focal plane's x and y axes.
+    axes = np.array([[-np.cos(angle), np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    from_centre = sums.product(rotation.T, np.array([-detector.x, -detector.y])) / detector.pixel_scale
+    system = WCS(naxis=2)
+    bends = bool(detector.bending)
+    system.wcs.ctype = [f"{axis}{_PROJECTIONS[bends]}" for axis in ("RA---", "DEC--")]
+    system.wcs.cunit = ["deg", "deg"]
+    system.wcs.crval = [ra, dec]
+    system.wcs.crpix = [(detector.nx + 1) / 2 + from_centre[0], (detector.ny + 1) / 2 + from_centre[1]]
+    system.wcs.cd = sums.product(axes, rotation) * detector.pixel_scale / 3600.0
+    system.wcs.radesys = "ICRS"
+    # Else north would be turned by 180 deg for a boresight at the pole itself.
+    system.wcs.lonpole = 180.0
+    if bends:
+        system.sip = Sip(*distortion.sip(detector.bending, detector.pixel_scale * rotation), None, None, _crpix(system))
+    system.wcs.set()
+    return system
+
+
+# Without and with SIP.
+_PROJECTIONS = ("TAN", "TAN-SIP")
+
+
+def _crpix(system: WCS) -> Float:
+    return np.asarray(system.wcs.crpix, float)
+
+
+def sky_of_pixel(system: WCS, column: npt.ArrayLike, row: npt.ArrayLike) -> tuple[Float, Float]:
+    """0-based pixel coordinates [n] -> ra [n] in [0, 360), dec [n], deg."""
+    ra, dec = system.all_pix2world(np.asarray(column, float), np.asarray(row, float), 0)
+    return sky.wrapped(ra), np.asarray(dec)
+
+
+def pixel_of_sky(system: WCS, ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:
+    """ra, dec [n] deg -> 0-based column [n], row [n]; only for positions within 90 deg of the boresight.
+
+    Error : 1e-8 pixels (rounding)
+    """
+    column, row = system.wcs_world2pix(np.asarray(ra, float), np.asarray(dec, float), 0)
+    if system.sip is None:
+        return np.asarray(column), np.asarray(row)
+    x0, y0 = _crpix(system) - 1.0
+    u, v = distortion.straight(column - x0, row - y0, system.sip.a, system.sip.b)
+    return u + x0, v + y0
+
+
+def jacobian(system: WCS, column: npt.ArrayLike, row: npt.ArrayLike) -> Float:
+    """Derivative of the local tangent plane (u west, v north), arcsec, by pixel coordinates.
+
+    column, row : [n] 0-based
+    returns     : [n, 2, 2] ((du/dx, du/dy), (dv/dx, dv/dy))
+    Error       : 2e-8 relative (central difference of one pixel; rounding of the positions)
+    """
+    x, y = np.asarray(column, float), np.asarray(row, float)
+    east, north, _ = pointing.basis(*sky_of_pixel(system, x, y))
+    step_x = _direction(system, x + 0.5, y) - _direction(system, x - 0.5, y)
+    step_y = _direction(system, x, y + 0.5) - _direction(system, x, y - 0.5)
+    rows = [
+        [-np.sum(east * step, 0) for step in (step_x, step_y)],
+        [np.sum(north * step, 0) for step in (step_x, step_y)],
+    ]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1)) / ARCSEC
+
+
+def _direction(system: WCS, x: Float, y: Float) -> Float:
+    return pointing.basis(*sky_of_pixel(system, x, y))[2]
+
+
+def corners(detector: Detector, system: WCS) -> Float:
+    """[4, 2] ra, dec deg of the detector's outer corners, in order around it."""
+    x = np.array([-0.5, detector.nx - 0.5, detector.nx - 0.5, -0.5])
+    y = np.array([-0.5, -0.5, detector.ny - 0.5, detector.ny - 0.5])
+    return np.stack(sky_of_pixel(system, x, y), axis=1)
+
+
+def centre(detector: Detector, system: WCS) -> tuple[float, float]:
+    """ra, dec of the detector's centre, deg."""
+    ra, dec = sky_of_pixel(system, [(detector.nx - 1) / 2], [(detector.ny - 1) / 2])
+    return float(ra[0]), float(dec[0])
+
+
+def s_region(detector: Detector, system: WCS) -> str:
+    """The footprint as an STC-S polygon.  Error: its sides are straight; VIS's are bent by 2 pixels, HSC's by 7."""
+    return "POLYGON ICRS " + " ".join(f"{value:.7f}" for value in corners(detector, system).ravel())
+
+
+def cards(system: WCS) -> tuple[tuple[str, Any, str], ...]:
+    """The world coordinate system as FITS cards (a card holds 16 characters of a number: 1e-14)."""
+    header, bends = system.wcs, system.sip is not None
+    projection = "gnomonic projection" + (", distortion as SIP" if bends else "")
+    return (
+        ("WCSAXES", 2, "number of world coordinate axes"),
+        ("CTYPE1", f"RA---{_PROJECTIONS[bends]}", projection),
+        ("CTYPE2", f"DEC--{_PROJECTIONS[bends]}", projection),
+        ("CUNIT1", "deg", "unit of CRVAL1, CD1_1, CD1_2"),
+        ("CUNIT2", "deg", "unit of CRVAL2, CD2_1, CD2_2"),
+        ("CRVAL1", float(header.crval[0]), "[deg] boresight right ascension"),
+        ("CRVAL2", float(header.crval[1]), "[deg] boresight declination"),
+        ("CRPIX1", float(header.crpix[0]), "[pix] boresight, first pixel = 1"),
+        ("CRPIX2", float(header.crpix[1]), "[pix] boresight, first pixel = 1"),
+        ("CD1_1", float(header.cd[0, 0]), "[deg/pix]"),
+        ("CD1_2", float(header.cd[0, 1]), "[deg/pix]"),
+        ("CD2_1", float(header.cd[1, 0]), "[deg/pix]"),
+        ("CD2_2", float(header.cd[1, 1]), "[deg/pix]"),
+        ("LONPOLE", 180.0, "[deg] native longitude of the celestial pole"),
+        ("RADESYS", "ICRS", "celestial reference system"),
+        *(_sip_cards(system.sip) if bends else ()),
+    )
+
+
+def _sip_cards(sip: Sip) -> Iterator[tuple[str, Any, str]]:
+    """Polynomials of SIP, terms that are not 0."""
+    for name, coefficients in (("A", sip.a), ("B", sip.b)):
+        yield f"{name}_ORDER", len(coefficients) - 1, f"distortion of {'columns' if name == 'A' else 'rows'}"
+        for p, q in np.argwhere(coefficients).tolist():
+            yield f"{name}_{p}_{q}", float(coefficients[p, q]), f"[pix] times u^{p} v^{q}"
+
+
+def shifted(system: WCS, columns: float, rows: float) -> WCS:
+    """The same sky on a frame in which every pixel lies so many columns and rows farther on."""
+    out = system.deepcopy()
+    out.wcs.crpix = [out.wcs.crpix[0] + columns, out.wcs.crpix[1] + rows]
+    if out.sip is not None:
+        out.sip = Sip(out.sip.a, out.sip.b, None, None, _crpix(out))
+    out.wcs.set()
+    return out
+
+
+def from_cards(header: Iterable[tuple[str, Any, str]]) -> WCS:
+    """The world coordinate system that `cards` wrote, or `tpv.cards` of them."""
+    values = {keyword: value for keyword, value, _ in header}
+    try:
+        system = WCS(naxis=2)
+        system.wcs.ctype = [values["CTYPE1"], values["CTYPE2"]]
+        system.wcs.cunit = [values["CUNIT1"], values["CUNIT2"]]
+        system.wcs.crval = [values["CRVAL1"], values["CRVAL2"]]
+        system.wcs.crpix = [values["CRPIX1"], values["CRPIX2"]]
+        system.wcs.cd = [[values["CD1_1"], values["CD1_2"]], [values["CD2_1"], values["CD2_2"]]]
+        system.wcs.lonpole = values["LONPOLE"]
+        system.wcs.radesys = values["RADESYS"]
+        if str(values["CTYPE1"]).endswith("-SIP"):
+            system.sip = Sip(*(_coefficients(values, name) for name in "AB"), None, None, _crpix(system))
+        if str(values["CTYPE1"]).endswith("-TPV"):
+            system.wcs.ctype = [f"{axis}{_PROJECTIONS[True]}" for axis in ("RA---", "DEC--")]
+            system.sip = Sip(*tpv.sip_of(values), None, None, _crpix(system))
+    except KeyError as error:
+        raise BadInput(f"the header has no card {error.args[0]}") from None
+    system.wcs.set()
+    return system
+
+
+def _coefficients(values: dict[str, Any], name: str) -> Float:
+    side = int(values[f"{name}_ORDER"]) + 1
+    return np.array([[float(values.get(f"{name}_{p}_{q}", 0.0)) for q in range(side)] for p in range(side)])

@@ -1,0 +1,206 @@
+"""A camera's detectors: where they lie in the focal plane, how they are turned, how many pixels they have.
+
+detectors       the detectors of a camera, from the layout rules
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lake_schema.errors import BadInput
+from lake_schema.mission import detector_overrides
+from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.mission.parameter import CAMERAS
+from truesky.render.camera import distortion
+
+# VIS CCDs of the right half of the focal plane are mounted upside down (Euclid Data Product Description
+# Document, LE1 VIS).
+_VIS_FIRST_ROTATED_COLUMN = 4
+# NISP detectors of the lower half likewise (Euclid Data Product Description Document, LE1 NISP).
+_NISP_FIRST_ROTATED_ROW = 3
+
+
+@dataclass(frozen=True, slots=True)
+class FilterWheel:
+    """What a tilt of a camera's filter does (filter_wheel.py).
+
+    error : rad rms;  shift : arcsec on the sky for a tilt of 1 rad
+    bend  : the same times the square of the distance from the axis, rad on the sky
+    """
+
+    error: float
+    shift: float
+    bend: float
+
+
+@dataclass(frozen=True, slots=True)
+class Detector:
+    """One detector of a camera.
+
+    section     : prefix of its parameters in the mission database, "vis", "nisp" or "ext.lsstcam"
+    nx, ny      : columns and rows of its image
+    middle      : of the rows, those of charge injection between its halves, which are not read
+    x, y        : arcsec, its centre in the focal plane
+    rotation    : deg, of its columns-rows axes against the focal plane's, from x to y
+    pixel_scale : arcsec
+    bending     : distortion of its camera's optics
+    wheel       : of its camera's filters; None: they stand still
+    kind        : of a ground camera's, what its layout calls its type
+    """
+
+    name: str
+    section: str
+    nx: int
+    ny: int
+    x: float
+    y: float
+    rotation: float
+    pixel_scale: float
+    bending: distortion.Terms = ()
+    middle: int = 0
+    wheel: FilterWheel | None = None
+    kind: str = ""
+
+    @property
+    def upside_down(self) -> bool:
+        """Whether it is mounted so."""
+        return float(np.cos(np.radians(self.rotation))) < 0.0
+
+    @property
+    def half_diagonal(self) -> float:
+        """Centre to corner, arcsec."""
+        return 0.5 * self.pixel_scale * float(np.hypot(self.nx, self.ny))
+
+
+def detectors(camera: str, mission: MissionConfiguration) -> tuple[Detector, ...]:
+    """The detectors of a camera, in the order of its layout: "vis", "nisp" or a ground camera.
+
+    Ref : VIS and NISP, Scaramella et al. 2022, Table 1 (gaps); ground cameras, the mission database's layouts
+    """
+    found = _of_camera(camera, mission)
+    farthest = max(float(np.hypot(d.x, d.y)) + d.half_diagonal for d in found)
+    scale = found[0].pixel_scale
+    distortion.refuse_folded(found[0].bending, farthest / scale, scale, camera)
+    return found
+
+
+def _of_camera(camera: str, mission: MissionConfiguration) -> tuple[Detector, ...]:
+    if camera == "vis":
+        _refuse_odd("vis", mission)
+        return _of_grid("vis", lambda row, column: column >= _VIS_FIRST_ROTATED_COLUMN, mission)
+    if camera == "nisp":
+        return _of_grid("nisp", lambda row, column: row >= _NISP_FIRST_ROTATED_ROW, mission)
+    if camera in CAMERAS:
+        return _listed(f"ext.{camera}", mission)
+    raise BadInput(f"camera {camera!r} is not one of vis, nisp, {', '.join(CAMERAS)}")
+
+
+def detector(camera: str, name: str, mission: MissionConfiguration) -> Detector:
+    """One detector of a camera by name."""
+    for candidate in detectors(camera, mission):
+        if candidate.name == name:
+            return candidate
+    raise BadInput(f"camera {camera} has no detector {name!r}")
+
+
+def _refuse_odd(section: str, mission: MissionConfiguration) -> None:
+    """Detectors are read as four equal quadrants."""
+    for name in ("nx", "ny", "charge_injection_rows"):
+        count = mission.value(f"{section}.fpa.{name}", "pix")
+        if count % 2.0:
+            raise BadInput(f"mission parameter {section}.fpa.{name} = {count:g}: must be an even number")
+
+
+def _of_grid(
+    section: str, upside_down: Callable[[int, int], bool], mission: MissionConfiguration
+) -> tuple[Detector, ...]:
+    """As mounted, behind the optics of their camera."""
+    planned, bending = _grid(mission, section, upside_down), distortion.terms(section, mission)
+    wheel = _wheel(section, mission)
+    return tuple(replace(d, bending=bending, wheel=wheel) for d in _mounted(planned, section, mission))
+
+
+def _wheel(section: str, mission: MissionConfiguration) -> FilterWheel | None:
+    """A filter is a plane-parallel plate in the beam between collimator and camera."""
+    if f"{section}.filter_wheel_error" not in mission:
+        return None
+    thickness, n = (
+        mission.value(f"{section}.filter.thickness", "mm"),
+        mission.value(f"{section}.filter.refractive_index"),
+    )
+    plate_scale = mission.value(f"{section}.fpa.pixel_scale", "arcsec / pix") / mission.value(
+        f"{section}.fpa.pixel_size", "mm / pix"
+    )
+    wider = mission.value("plm.focal_length", "m") / mission.value(f"{section}.collimator_focal_length", "m")
+    third = (n**2 - 1.0) / (2.0 * n**3)
+    error = mission.value(f"{section}.filter_wheel_error", "rad")
+    return FilterWheel(error, plate_scale * thickness * (1.0 - 1.0 / n), plate_scale * thickness * third * wider**2)
+
+
+def _grid(mission: MissionConfiguration, section: str, upside_down: Callable[[int, int], bool]) -> Iterator[Detector]:
+    """Rows from the top, columns from the left; upside_down : row, column -> whether one is mounted so.
+
+    The pitch is of the published rows, without those of charge injection, and gaps: VIS fills 0.7781 deg.
+    Error : VIS, 0.4": so much less than the published gap is left between the images of neighbours in a column
+    """
+    scale = mission.value(f"{section}.fpa.pixel_scale", "arcsec / pix")
+    nx, ny, rows, columns = (int(mission.value(f"{section}.fpa.{key}")) for key in ("nx", "ny", "rows", "columns"))
+    key = f"{section}.fpa.charge_injection_rows"
+    middle = int(mission.value(key, "pix")) if key in mission else 0
+    pitch_x = nx * scale + mission.value(f"{section}.fpa.gap_x", "arcsec")
+    pitch_y = ny * scale + mission.value(f"{section}.fpa.gap_y", "arcsec")
+    for row in range(1, rows + 1):
+        for column in range(1, columns + 1):
+            yield Detector(
+                name=detector_overrides.GRID_NAMES[section].format(row=row, column=column),
+                section=section,
+                nx=nx,
+                ny=ny + middle,
+                x=(column - (columns + 1) / 2) * pitch_x,
+                y=((rows + 1) / 2 - row) * pitch_y,
+                rotation=180.0 if upside_down(row, column) else 0.0,
+                pixel_scale=scale,
+                middle=middle,
+            )
+
+
+def _mounted(planned: Iterable[Detector], section: str, mission: MissionConfiguration) -> Iterator[Detector]:
+    """Detectors as they were mounted: shifted and turned a little, each in its own way."""
+    key = f"{section}.fpa.metrology"
+    if key not in mission:
+        yield from planned
+        return
+    measured = {row["detector"]: row for row in mission.rows(key)}
+    shift, turn = (mission.value(f"{key}_{kind}", unit) for kind, unit in (("shift", "pix"), ("rotation", "deg")))
+    for d in planned:
+        row = measured.get(d.name)
+        if row is None:
+            yield d
+            continue
+        x, y = (d.pixel_scale * shift * float(row[f"shift_{axis}"]) for axis in "xy")
+        yield replace(d, x=d.x + x, y=d.y + y, rotation=d.rotation + turn * float(row["rotation"]))
+
+
+def _listed(section: str, mission: MissionConfiguration) -> tuple[Detector, ...]:
+    """Detectors of a layout in millimetres."""
+    bending = distortion.terms(section, mission)
+    scale = mission.value(f"{section}.fpa.pixel_scale", "arcsec / pix")
+    plate_scale = scale / mission.value(f"{section}.fpa.pixel_size", "mm / pix")
+    return tuple(
+        Detector(
+            name=row["detector"],
+            section=section,
+            nx=int(row["nx"]),
+            ny=int(row["ny"]),
+            x=float(row["x_mm"]) * plate_scale,
+            y=float(row["y_mm"]) * plate_scale,
+            rotation=float(row["rotation_deg"]),
+            pixel_scale=scale,
+            bending=bending,
+            kind=row["type"],
+        )
+        for row in mission.rows(f"{section}.layout")
+    )

@@ -1,0 +1,32 @@
+"""Footprints of detectors on the sky.
+
+counts     of places: how many of the planned detectors see each
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from lake_schema.arrays import Int
+from truesky.numerics import sums
+from truesky.render.camera import pointing
+
+
+def counts(tasks: pa.Table, ra: npt.ArrayLike, dec: npt.ArrayLike) -> Int:
+    """[n] How many footprints of the tasks hold each place, gaps between detectors left out; ra, dec : [n] deg."""
+    from scipy.spatial import cKDTree
+
+    places = pointing.basis(np.asarray(ra, float), np.asarray(dec, float))[2].T
+    found = np.zeros(len(places), np.int64)
+    centres = pointing.basis(tasks["ra"].to_numpy(), tasks["dec"].to_numpy())[2].T
+    chords = 2.0 * np.sin(np.radians(tasks["radius"].to_numpy()) / 2.0)
+    nearby = cKDTree(places).query_ball_point(centres, chords) if len(tasks) else []
+    for near, region in zip(nearby, tasks["s_region"].to_pylist(), strict=True):
+        if near:
+            corners = np.array(region.split()[2:], float).reshape(-1, 2)
+            edges = pointing.basis(corners[:, 0], corners[:, 1])[2].T
+            side = sums.product(places[near], np.cross(edges, np.roll(edges, -1, axis=0)).T)
+            found[near] += (side >= 0).all(axis=1) | (side <= 0).all(axis=1)
+    return found

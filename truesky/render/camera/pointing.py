@@ -1,0 +1,96 @@
+"""From a boresight to the sky: the tangent plane, its basis, the outline of a field.
+
+boresight_for   the pointing that puts a detector's centre on a target
+sky_of_plane, outline    all detectors of an exposure at once
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from lake_schema.arrays import Float
+from truesky.numerics import sums
+from truesky.render.camera import distortion
+from truesky.render.camera.detectors import Detector
+
+ARCSEC = np.pi / 180.0 / 3600.0
+
+
+# ------------------------------------------------------------------------------------------------ pointing
+
+
+def boresight_for(detector: Detector, ra: float, dec: float, position_angle: float) -> tuple[float, float, float]:
+    """The pointing that puts a detector's centre on a target.
+
+    ra, dec        : deg, target
+    position_angle : deg, of the focal plane's y axis *at the target*, north through east
+    returns        : ra, dec, position angle of the boresight, deg; the angle differs from the one at the
+                     target because meridians converge; defined everywhere, poles included
+    """
+    # Right-handed: (east-like = -x, y, outward).
+    x, y = (float(place) for place in distortion.bent(detector.x, detector.y, detector.bending))
+    centre = np.array([-x * ARCSEC, y * ARCSEC, 1.0])
+    camera = _triad(centre, np.array([0.0, 1.0, 0.0]))
+    east, north, out = basis(ra, dec)
+    angle = np.radians(position_angle)
+    sky = _triad(out, np.sin(angle) * east + np.cos(angle) * north)
+    rotation = sums.product(sky, camera.T)
+    boresight, up = rotation[:, 2], rotation[:, 1]
+    ra0 = float(np.degrees(np.arctan2(boresight[1], boresight[0])) % 360.0)
+    dec0 = float(np.degrees(np.arctan2(boresight[2], np.hypot(boresight[0], boresight[1]))))
+    east0, north0, _ = basis(ra0, dec0)
+    return ra0, dec0, float(np.degrees(np.arctan2(sums.product(up, east0), sums.product(up, north0))))
+
+
+def sky_of_plane(
+    x: npt.ArrayLike, y: npt.ArrayLike, ra: float, dec: float, position_angle: float
+) -> tuple[Float, Float]:
+    """Focal-plane coordinates [n] arcsec on the tangent plane -> ra [n] in [0, 360), dec [n], deg.
+
+    ra, dec, position_angle : deg, of the boresight and of the y axis there
+    x, y                    : arcsec, x to the west where the position angle is 0
+    """
+    angle = np.radians(position_angle)
+    u, v = np.asarray(x, float) * ARCSEC, np.asarray(y, float) * ARCSEC
+    east, north, out = basis(ra, dec)
+    to_east, to_north = np.sin(angle) * v - np.cos(angle) * u, np.cos(angle) * v + np.sin(angle) * u
+    to = out[:, None] + east[:, None] * to_east.ravel() + north[:, None] * to_north.ravel()
+    lon = np.degrees(np.arctan2(to[1], to[0])) % 360.0
+    lat = np.degrees(np.arctan2(to[2], np.hypot(to[0], to[1])))
+    return lon.reshape(u.shape), lat.reshape(u.shape)
+
+
+def outline(some: Sequence[Detector]) -> tuple[Float, Float]:
+    """x, y [n, 5] arcsec on the tangent plane: what each detector's centre and corners see; corners as of `corners`."""
+    column = np.array([0.0, -0.5, 0.5, 0.5, -0.5])
+    row = np.array([0.0, -0.5, -0.5, 0.5, 0.5])
+    width = np.array([[d.nx * d.pixel_scale] for d in some]) * column
+    height = np.array([[d.ny * d.pixel_scale] for d in some]) * row
+    turn = np.radians([[d.rotation] for d in some])
+    x = np.array([[d.x] for d in some]) + np.cos(turn) * width - np.sin(turn) * height
+    y = np.array([[d.y] for d in some]) + np.sin(turn) * width + np.cos(turn) * height
+    for bending in {d.bending for d in some if d.bending}:
+        bends = np.array([d.bending == bending for d in some])
+        x[bends], y[bends] = distortion.bent(x[bends], y[bends], bending)
+    return x, y
+
+
+def basis(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float, Float]:
+    """East, north and outward unit vectors [3, ...] at sky positions, deg."""
+    lon, lat = np.radians(np.asarray(ra, float)), np.radians(np.asarray(dec, float))
+    zero = np.zeros_like(lon * lat)
+    east = np.stack([-np.sin(lon) + zero, np.cos(lon) + zero, zero])
+    north = np.stack([-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat) + zero])
+    out = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat) + zero])
+    return east, north, out
+
+
+def _triad(direction: Float, along: Float) -> Float:
+    """Orthonormal columns: direction, `along` made perpendicular to it, their cross product."""
+    first = direction / np.sqrt(sums.product(direction, direction))
+    second = along - first * sums.product(first, along)
+    second = second / np.sqrt(sums.product(second, second))
+    return np.stack([first, second, np.cross(first, second)], axis=1)

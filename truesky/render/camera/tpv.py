@@ -1,0 +1,115 @@
+"""The world coordinate system TAN-SIP as TPV, which SourceExtractor, SCAMP and SWarp read: they pass over SIP.
+
+SIP bends pixels (u, v), CD turns them into the tangent plane; TPV bends the tangent plane.  With x = CD (u, v) the
+polynomials of SIP are rewritten in x, and CD applied to them: a linear map of coefficients, exact, as its inverse is.
+
+cards       SIP cards -> TPV cards
+sip_of      TPV cards -> coefficients of SIP
+
+Ref : Shupe et al. 2005 (SIP); Shupe et al. 2012 (TPV)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from lake_schema.arrays import Float
+from lake_schema.errors import BadInput
+from truesky.numerics import sums
+from truesky.render.camera import distortion
+
+Card = tuple[str, Any, str]
+
+CONVENTIONS = ("sip", "tpv")
+# Number of the first PV of each order; within an order by the power of the second coordinate. Between them lie those of
+# the radius, which are not used.
+_FIRST = (0, 1, 4, 7, 12, 17, 24, 31)
+
+
+def cards(header: Sequence[Card]) -> tuple[Card, ...]:
+    """A header with SIP -> the same with TPV in its place; a header without SIP as it is.
+
+    header : cards of an image
+    Errors : BadInput where the polynomial is of a higher order than TPV has
+    """
+    values = {keyword: value for keyword, value, _ in header}
+    if not str(values.get("CTYPE1", "")).endswith("-SIP"):
+        return tuple(header)
+    # From the tangent plane to pixels.
+    inverse = sums.inverse(_cd(values))
+    bent = _rewritten(_sip(values, "A"), _sip(values, "B"), inverse)
+    order = len(bent[0]) - 1
+    if order >= len(_FIRST):
+        raise BadInput(f"the distortion is of order {order}: TPV has orders up to {len(_FIRST) - 1}; take SIP")
+    out: list[Card] = []
+    for keyword, value, comment in header:
+        if keyword in ("CTYPE1", "CTYPE2"):
+            out.append((keyword, f"{str(value)[:5]}TPV", "gnomonic projection, distortion as PV"))
+        elif not is_sip(keyword):
+            out.append((keyword, value, comment))
+        elif keyword == "A_ORDER":
+            out += [card for axis in (1, 2) for card in _pv_cards(axis, bent[axis - 1])]
+    return tuple(out)
+
+
+def sip_of(values: Mapping[str, Any]) -> tuple[Float, Float]:
+    """Coefficients [n, n] of u^p v^q that SIP has where a header has these PV."""
+    found = [_of_pv(values, axis) for axis in (1, 2)]
+    side = max(len(each) for each in found)
+    to_x, to_y = (np.pad(each, (0, side - len(each))) for each in found)
+    # What PV has of first order beyond the identity is the plane itself.
+    to_x[1, 0] -= 1.0
+    to_y[0, 1] -= 1.0
+    return _rewritten(to_x, to_y, _cd(values))
+
+
+def _rewritten(to_x: Float, to_y: Float, matrix: Float) -> tuple[Float, Float]:
+    """Polynomials added to a vector, written in another basis: matrix [2, 2] from the new coordinates to the old."""
+    terms = tuple(
+        (int(p), int(q), float(to_x[p, q]), float(to_y[p, q])) for p, q in np.argwhere((to_x != 0) | (to_y != 0))
+    )
+    return distortion.sip(terms, matrix) if terms else (np.zeros((2, 2)), np.zeros((2, 2)))
+
+
+def _cd(values: Mapping[str, Any]) -> Float:
+    return np.array([[values["CD1_1"], values["CD1_2"]], [values["CD2_1"], values["CD2_2"]]], float)
+
+
+def _sip(values: Mapping[str, Any], name: str) -> Float:
+    side = max(int(values[f"{other}_ORDER"]) for other in "AB") + 1
+    return np.array([[float(values.get(f"{name}_{p}_{q}", 0.0)) for q in range(side)] for p in range(side)])
+
+
+def is_sip(keyword: str) -> bool:
+    """Whether a card is of a distortion as SIP."""
+    name, *powers = keyword.split("_")
+    return name in ("A", "B") and (powers == ["ORDER"] or (len(powers) == 2 and all(p.isdigit() for p in powers)))
+
+
+def _pv_cards(axis: int, coefficients: Float) -> list[Card]:
+    """PV of an axis, whose own coordinate comes first, with the identity; terms that are not 0."""
+    full = np.array(coefficients if axis == 1 else coefficients.T)
+    full[1, 0] += 1.0
+    own, other = ("xi", "eta") if axis == 1 else ("eta", "xi")
+    return [
+        (f"PV{axis}_{_FIRST[p + q] + q}", float(full[p, q]), f"times {own}^{p} {other}^{q}")
+        for p, q in sorted(np.argwhere(full).tolist(), key=lambda power: _FIRST[sum(power)] + power[1])
+    ]
+
+
+def _of_pv(values: Mapping[str, Any], axis: int) -> Float:
+    """Coefficients [n, n] by the powers of the first and the second coordinate."""
+    found = {
+        (order - q, q): float(values[key])
+        for order, first in enumerate(_FIRST)
+        for q in range(order + 1)
+        if (key := f"PV{axis}_{first + q}") in values
+    }
+    side = max((sum(power) for power in found), default=1) + 1
+    out = np.zeros((max(side, 2), max(side, 2)))
+    for (p, q), value in found.items():
+        out[p, q] = value
+    return out if axis == 1 else np.array(out.T)

@@ -1,0 +1,102 @@
+"""Ground cameras: the order of physics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from truesky.render.camera import bands
+from truesky.render.channels import readout
+from truesky.render.channels.channel import Channel
+from truesky.render.channels.cost import Cost
+from truesky.render.effects.charge import (
+    bleeding,
+    brighter_fatter,
+    cosmic_rays,
+    dark_current,
+    pixel_borders,
+    pixel_response,
+    poisson,
+)
+from truesky.render.effects.effect import Effect
+from truesky.render.effects.light import (
+    background,
+    calibration_lamp,
+    fringes,
+    illumination,
+    pixel_area,
+    satellite_trails,
+)
+from truesky.render.effects.readout import (
+    adc,
+    bias_structure,
+    charge_transfer,
+    crosstalk,
+    detector_crosstalk,
+    nonlinearity,
+    quadrants,
+    read_noise,
+)
+from truesky.render.psf import seeing
+from truesky.render.sky import diffuse_light
+
+SKY = (
+    satellite_trails.EFFECT,
+    background.EFFECT,
+    pixel_area.EFFECT,
+    fringes.EFFECT,
+    illumination.EFFECT,
+    pixel_response.EFFECT,
+    pixel_borders.RINGS,
+    pixel_borders.EDGES,
+    poisson.EFFECT,
+    brighter_fatter.EFFECT,
+    dark_current.EFFECT,
+    dark_current.HOT,
+    cosmic_rays.EFFECT,
+    bleeding.EFFECT,
+    quadrants.AMPLIFIERS,
+    charge_transfer.PARALLEL_LOSS,
+    charge_transfer.SERIAL_LOSS,
+    nonlinearity.EFFECT,
+    crosstalk.EFFECT,
+    detector_crosstalk.EFFECT,
+    bias_structure.EFFECT,
+    read_noise.EFFECT,
+    adc.EFFECT,
+)
+
+
+def _from(first: Effect) -> tuple[Effect, ...]:
+    """Of the effects on the sky's light this one, and those after it."""
+    return SKY[SKY.index(first) :]
+
+
+# Of the dome, by day: no sky, and no stars. The lamp's light comes through the telescope, as theirs does.
+FLAT = (calibration_lamp.EFFECT, illumination.EFFECT, *_from(pixel_response.EFFECT))
+
+EFFECTS: Mapping[str, tuple[Effect, ...]] = {
+    "science": SKY,
+    "deep": SKY,
+    "flat": FLAT,
+    "dark": _from(dark_current.EFFECT),
+    "bias": _from(quadrants.AMPLIFIERS),
+}
+
+
+# As VIS, of a detector of each camera but HSC with every effect (benchmarks/ext.py; 1.1e4 to 1.4e5 sources): most of
+# sky_s is reading of catalogues, colours of galaxies, PSFs.
+COST = Cost(frame_s=0.2, sky_s=1.9, galaxy_s=2.5e-5, star_s=4.5e-5, base_gb=0.8, held=33.0, held_sky=34.0, written=2.0)
+
+CHANNEL = Channel(
+    effects=EFFECTS,
+    psf=seeing.of_exposure,
+    readout=readout.AMPLIFIERS,
+    bands=bands.of_ground,
+    sky=diffuse_light.ground_sky,
+    cost=COST,
+    on_ground=True,
+    own_light=(calibration_lamp.EFFECT, satellite_trails.EFFECT),
+    tracks=(cosmic_rays.EFFECT,),
+    pupil=seeing.edges_of,
+    readouts={"amplifiers": readout.BY_AMPLIFIER, "electrons": readout.ELECTRONS},
+)

@@ -1,0 +1,151 @@
+"""Euclid NISP-S: the light of all sources, spread out by a grism; then as NISP-P, up a longer ramp.
+
+No ghosts and no stray light about bright sources: what they would be through a grism is not known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from lake_schema.arrays import Float
+from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.tables.exposures import CHOSEN_BY, ExposureRow
+from truesky.fluxes.passbands import Passband
+from truesky.render.camera import bands, grism_wheel, traces
+from truesky.render.camera.detectors import Detector, detectors
+from truesky.render.camera.traces import Trace
+from truesky.render.channels import image_types, nisp_p, readout
+from truesky.render.channels.channel import Channel, Dispersion
+from truesky.render.channels.cost import Cost
+from truesky.render.channels.image_types import SKY_TYPES
+from truesky.render.effects.charge import persistence, pixel_response
+from truesky.render.effects.effect import Effect
+from truesky.render.effects.light import background, calibration_lamp, chromatic_response, dispersed_sky, pixel_area
+from truesky.render.psf import double_gaussian, euclid
+from truesky.render.psf.model import Psf
+from truesky.render.sky import diffuse_light
+
+SKY = (
+    background.EFFECT,
+    dispersed_sky.EFFECT,
+    pixel_area.EFFECT,
+    chromatic_response.EFFECT,
+    pixel_response.EFFECT,
+    *nisp_p.CURRENT,
+    *nisp_p.RAMP,
+)
+# With the grism in: of a lamp that lights the whole field evenly its orders overlap, and a pixel sees all of it.
+FLAT = (calibration_lamp.EFFECT, chromatic_response.LAMP, pixel_response.EFFECT, *nisp_p.CURRENT, *nisp_p.RAMP)
+DARK = (*nisp_p.CURRENT, *nisp_p.RAMP)
+
+EFFECTS: Mapping[str, tuple[Effect, ...]] = {
+    "science": SKY,
+    "deep": SKY,
+    "standard_star": SKY,
+    "planetary_nebula": SKY,
+    "flat": FLAT,
+    "dark": DARK,
+    "persistence": DARK,
+}
+
+
+def _turned(exposure: ExposureRow, section: str, mission: MissionConfiguration) -> tuple[str, float]:
+    """(grism, the tilt that was asked for, deg); BadInput for an exposure without a grism, or one that is across."""
+    where = f"exposure {exposure.exposure_id}"
+    if exposure.grism is None or exposure.grism_angle is None:
+        raise BadInput(f"{where}: a spectrum wants a grism and its angle")
+    asked = grism_wheel.tilt(exposure.grism, exposure.grism_angle, section, mission)
+    if abs(asked) > grism_wheel.MOST_TURNED:
+        angle = f"grism_angle = {exposure.grism_angle:g} deg"
+        raise BadInput(
+            f"{where}: {angle} turns {exposure.grism} by {asked:g} deg, more than {grism_wheel.MOST_TURNED:g}"
+        )
+    return exposure.grism, asked
+
+
+def _traces(exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, seed: int) -> tuple[Trace, ...]:
+    grism, asked = _turned(exposure, detector.section, mission)
+    # Exposures that differ in their noise alone see alike.
+    identity = image_types.identity(replace(exposure, realisation=None))
+    return traces.traces(grism, grism_wheel.turned(asked, identity, detector.section, mission, seed), detector, mission)
+
+
+def _throughput(
+    exposure: ExposureRow, order: int, wavelength: Float, detector: Detector, mission: MissionConfiguration
+) -> Float:
+    grism, _ = _turned(exposure, detector.section, mission)
+    return traces.throughput(grism, order, wavelength, detector, mission)
+
+
+def _vignetted(
+    exposure: ExposureRow, detector: Detector, column: Float, row: Float, mission: MissionConfiguration
+) -> Float:
+    _, asked = _turned(exposure, detector.section, mission)
+    angle = np.radians(detector.rotation)
+    u = (column - (detector.nx - 1) / 2) * detector.pixel_scale
+    v = (row - (detector.ny - 1) / 2) * detector.pixel_scale
+    x = detector.x + np.cos(angle) * u - np.sin(angle) * v
+    y = detector.y + np.sin(angle) * u + np.cos(angle) * v
+    return grism_wheel.vignetted(x, y, float(exposure.grism_angle or 0.0), asked, detector.section, mission)
+
+
+def _reach(section: str, mission: MissionConfiguration) -> float:
+    """Of the first order of any of the grisms."""
+    first = detectors(section, mission)[0]
+    found = [
+        abs(edge - inside)
+        for grism in sorted({row["grism"] for row in mission.rows(f"{section}.traces")})
+        for trace in traces.traces(grism, 0.0, first, mission)
+        if trace.order == 1
+        for edge, inside in zip(
+            traces.source_rectangle(trace, first.nx, first.ny, (trace.first, trace.last)),
+            (0.0, first.nx - 1.0, 0.0, first.ny - 1.0),
+            strict=True,
+        )
+    ]
+    return max(found) * first.pixel_scale
+
+
+def _psf(
+    exposure: ExposureRow, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int
+) -> Psf:
+    """Of the middle of a band."""
+    middle = np.array([np.average(band.wavelength, weights=band.response)])
+    return _psf_at(detector, middle, mission, positions)
+
+
+def _psf_at(detector: Detector, waves: Float, mission: MissionConfiguration, positions: int) -> Psf:
+    """Diffraction at the pupil, or the two Gaussians of Serrano et al. 2024, as the mission says."""
+    if mission.value(f"{detector.section}.spectra.psf", "") < 0.5:
+        return euclid.nisp_psf_at(detector, waves, mission, positions)
+    return double_gaussian.psf_at(detector, waves, mission)
+
+
+# Of the demo's sky (1.1e4 predicted sources, as many drawn): 17.2 s of CPU, 1.3 s of it spectra, and 1.5 GB on a busy
+# AMD EPYC, which takes half of the time of the machine that costs are of (forecasting/speed.py); 16.9 s and 1.6 GB are
+# foreseen.  By Spark, with eight maps of truth of which four are orders: 1.55 to 1.71 GB; darks and flats with four
+# maps 1.39 to 1.49 GB.  Again: as nisp_p.py says.
+COST = Cost(
+    frame_s=0.05, sky_s=0.5, galaxy_s=3.2e-3, star_s=3.2e-3, base_gb=0.6, held=190.0, held_sky=240.0, written=3.0,
+    again_s=0.65,
+)  # fmt: skip
+
+CHANNEL = Channel(
+    effects=EFFECTS,
+    psf=_psf,
+    readout=readout.RAMP_AND_CHI2,
+    bands=bands.of_one("nisp", "nisp_red", "nisp_blue"),
+    sky=diffuse_light.thermal_sky,
+    cost=COST,
+    sky_types=(*SKY_TYPES, "standard_star", "planetary_nebula"),
+    moving=True,
+    own_light=(calibration_lamp.EFFECT,),
+    ramp="spectroscopic",
+    coloured=chromatic_response.EFFECT,
+    remembers=persistence.EFFECT,
+    disperses=Dispersion(_traces, _throughput, _vignetted, _psf_at, _reach, CHOSEN_BY["NISP-S"]),
+)

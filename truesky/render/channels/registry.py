@@ -1,0 +1,38 @@
+"""The channels that are rendered, by their name in the table `exposures`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from lake_schema.errors import BadInput
+from truesky.render.channels import ground, nisp_p, nisp_s, vis
+from truesky.render.channels.channel import Channel
+from truesky.render.effects.effect import Effect
+
+CHANNELS: Mapping[str, Channel] = {
+    "VIS": vis.CHANNEL,
+    "NISP-P": nisp_p.CHANNEL,
+    "NISP-S": nisp_s.CHANNEL,
+    "EXT": ground.CHANNEL,
+}
+
+
+def channel_of(name: str, image_type: str, where: str) -> Channel:
+    """A channel by its name; BadInput where nothing renders this kind of image."""
+    if name not in CHANNELS:
+        raise BadInput(f"{where}: channel {name!r} is not one of {', '.join(CHANNELS)}")
+    kinds = CHANNELS[name].effects
+    if image_type not in kinds:
+        raise BadInput(f"{where}: {name} has no image type {image_type!r}, only {', '.join(kinds)}")
+    return CHANNELS[name]
+
+
+def effects_of(name: str, image_type: str, where: str) -> tuple[Effect, ...]:
+    """The effects of a kind of image, in their order; BadInput where nothing renders it."""
+    return channel_of(name, image_type, where).effects[image_type]
+
+
+def effects_or_none(name: str, image_type: str) -> tuple[Effect, ...] | None:
+    """The same, None where nothing renders it."""
+    channel = CHANNELS.get(name)
+    return None if channel is None else channel.effects.get(image_type)

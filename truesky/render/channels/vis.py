@@ -1,0 +1,147 @@
+"""Euclid VIS: the order of physics.
+
+Light is expected electrons until it is counted; then charge, whole electrons on the detector; then four quadrants in
+the order in which they are read; then what the electronics make of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.tables.exposures import ExposureRow
+from truesky.fluxes.passbands import Passband
+from truesky.render.camera import bands
+from truesky.render.camera.detectors import Detector
+from truesky.render.channels import readout
+from truesky.render.channels.channel import Channel
+from truesky.render.channels.cost import Cost
+from truesky.render.channels.image_types import SKY_TYPES
+from truesky.render.effects.charge import (
+    bleeding,
+    brighter_fatter,
+    charge_injection,
+    cosmic_rays,
+    dark_current,
+    pixel_response,
+    poisson,
+)
+from truesky.render.effects.effect import Effect
+from truesky.render.effects.light import (
+    background,
+    calibration_lamp,
+    ghosts,
+    illumination,
+    intra_pixel,
+    pixel_area,
+    straylight,
+)
+from truesky.render.effects.readout import (
+    adc,
+    bias_structure,
+    charge_transfer,
+    crosstalk,
+    detector_crosstalk,
+    nonlinearity,
+    quadrants,
+    read_noise,
+    readout_cosmic_rays,
+    readout_trail,
+    trap_pumping,
+)
+from truesky.render.psf import euclid
+from truesky.render.psf.model import Psf
+from truesky.render.sky import diffuse_light
+
+# What the pixels do to the light while sources are drawn: part of their transfer function.
+DRAWN = intra_pixel.EFFECT
+
+_LIGHT = (
+    ghosts.EFFECT,
+    straylight.EFFECT,
+    background.EFFECT,
+    pixel_area.EFFECT,
+    illumination.EFFECT,
+)
+_COUNTED = (
+    pixel_response.EFFECT,
+    poisson.EFFECT,
+    brighter_fatter.EFFECT,
+)
+_CHARGE = (
+    dark_current.EFFECT,
+    dark_current.HOT,
+    cosmic_rays.EFFECT,
+    bleeding.EFFECT,
+)
+_READOUT = (
+    quadrants.EFFECT,
+    charge_transfer.PARALLEL,
+    readout_cosmic_rays.READOUT,
+    charge_transfer.SERIAL,
+    nonlinearity.EFFECT,
+    crosstalk.EFFECT,
+    detector_crosstalk.EFFECT,
+    bias_structure.EFFECT,
+    read_noise.EFFECT,
+    adc.EFFECT,
+)
+
+SKY = (*_LIGHT, illumination.SHUTTER, *_COUNTED, *_CHARGE, *_READOUT)
+# The shutter stays open: sky and stars are in a flat, and what they leave on the way to the register; the lamp is out
+# by then, and how long it shone is its own affair.
+FLAT = (
+    *_LIGHT,
+    readout_trail.EFFECT,
+    calibration_lamp.EFFECT,
+    *_COUNTED,
+    *_CHARGE,
+    *_READOUT,
+)
+DARK = (*_CHARGE, *_READOUT)
+_INJECTED = (charge_injection.EFFECT, charge_injection.NOISE)
+INJECTION = (*_INJECTED, bleeding.EFFECT, *_READOUT)
+# It takes minutes, behind a closed shutter.
+PUMPING = (*_INJECTED, trap_pumping.EFFECT, *_CHARGE, *_READOUT)
+# Besides surveys and self-calibration, what the sky is looked at for.
+_CHECKS = ("defocus", "bleeding", "stray_light", "white_dwarf")
+
+EFFECTS: Mapping[str, tuple[Effect, ...]] = {
+    "science": SKY,
+    "deep": SKY,
+    "self_calibration": SKY,
+    "flat": FLAT,
+    "dark": DARK,
+    "charge_injection": INJECTION,
+    "trap_pumping": PUMPING,
+    **dict.fromkeys(_CHECKS, SKY),
+    "bias": _READOUT,
+}
+
+
+def _psf(
+    exposure: ExposureRow, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int
+) -> Psf:
+    return euclid.vis_psf(detector, band, mission, positions)
+
+
+# CPU of the demo's detector 3-4 (5.5e3 predicted sources), of others with 3e2 and 2.7e4, of bias, dark and flat frames:
+# Intel Xeon 2.5 GHz, 2 shared cores.
+COST = Cost(frame_s=0.05, sky_s=1.5, galaxy_s=5.0e-4, star_s=8.5e-4, base_gb=0.5, held=48.0, held_sky=57.0, written=2.1)
+
+CHANNEL = Channel(
+    effects=EFFECTS,
+    psf=_psf,
+    readout=readout.QUADRANTS,
+    bands=bands.of_one("vis", "euclid_vis"),
+    sky=diffuse_light.starlit_sky,
+    cost=COST,
+    # A flat is taken with the shutter open.
+    sky_types=(*SKY_TYPES, *_CHECKS, "flat"),
+    drawn=DRAWN,
+    pupil=euclid.vis_edges,
+    moving=True,
+    own_light=(calibration_lamp.EFFECT, *_INJECTED, trap_pumping.EFFECT),
+    tracks=(cosmic_rays.EFFECT, readout_cosmic_rays.READOUT),
+    scattered=True,
+)

@@ -1,0 +1,87 @@
+"""Traces and sensitivities of a grism as files that extraction software reads: grismconf's text and its FITS tables.
+
+configuration   the text file
+sensitivity     of an order, a table of two columns
+write           all of them into a folder
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from lake_schema import user_files
+from lake_schema.arrays import Float
+from lake_schema.columns import Column, Table
+from lake_schema.fits.tables import table_to_fits
+from truesky.render.camera.traces import Trace
+from truesky.render.dispersing.draw import Order
+
+SENSITIVITY = Table(
+    "sensitivity",
+    1,
+    (
+        Column("WAVELENGTH", "float64", "Angstrom", "em.wl", "vacuum wavelength"),
+        Column("SENSITIVITY", "float64", "electron cm2 erg-1", "instr.sensitivity", "in a bin of 1 A"),
+        Column("ERROR", "float64", "electron cm2 erg-1", "stat.error", "of the sensitivity: there is none"),
+    ),
+    "Electrons a second for each erg s-1 cm-2 A-1, of an order of a grism.",
+    key=("WAVELENGTH",),
+)
+# Of 1, x, y, x^2, x y, y^2: grismconf has no polynomial of four powers of t without the squares.
+_TERMS = 6
+
+
+def configuration(name: str, traces: Sequence[Trace], shape: tuple[int, int], files: Sequence[str]) -> str:
+    """Text of a configuration.
+
+    name, traces : of the grism and detector, and its orders;  shape : ny, nx
+    files        : of the sensitivity of each order
+    Offsets are from the undispersed image's place, 0-based pixels; wavelengths in A.
+    """
+    ny, nx = shape
+    lines = [f"# {name}, simulated", f"NAXIS {ny} {nx}"]
+    for trace, file in zip(traces, files, strict=True):
+        label = f"{trace.order:+d}" if trace.order else "0"
+        # A source may lie outside the detector and its light on it.
+        reach = float(np.abs(trace.polynomials(0.0, 0.0)[0]).sum())
+        lines += ["", f"BEAM_{label}", f"SENSITIVITY_{label} {file}"]
+        lines += [f"XRANGE_{label} {-reach:.1f} {reach:.1f}", f"YRANGE_{label} {-reach:.1f} {reach:.1f}"]
+        for axis, rows in (("X", trace.x), ("Y", trace.y)):
+            lines += [f"DISP{axis}_{label}_{i} {_terms(row)}" for i, row in enumerate(rows)]
+        lines += [f"DISPL_{label}_0 {trace.first!r}", f"DISPL_{label}_1 {trace.last - trace.first!r}"]
+    return "\n".join(lines) + "\n"
+
+
+def _terms(row: Float) -> str:
+    return " ".join(repr(float(value)) for value in np.pad(row, (0, _TERMS - len(row))))
+
+
+def sensitivity(order: Order) -> pa.Table:
+    """Rows of SENSITIVITY.
+
+    order : whose response is electrons a second in 1 A for each erg s-1 cm-2 A-1
+    The first and the last two values are 0: extraction software sets them so.
+    """
+    response = np.pad(order.response, 2)
+    wavelength = order.first - 2 + np.arange(float(len(response)))
+    none = np.zeros(len(response))
+    return SENSITIVITY.build({"WAVELENGTH": wavelength, "SENSITIVITY": response, "ERROR": none})
+
+
+def write(folder: Path, name: str, orders: Sequence[Order], shape: tuple[int, int]) -> Path:
+    """Writes tables and, after them, their configuration, each replaced in one rename; returns the configuration.
+
+    folder : where to;  name : of its files;  orders : as of `sensitivity`;  shape : ny, nx
+    """
+    files = [f"{name}_{order.trace.order:+d}.fits" for order in orders]
+    for order, file in zip(orders, files, strict=True):
+        table_to_fits(folder / file, sensitivity(order), SENSITIVITY)
+    path = folder / f"{name}.conf"
+    with user_files.staged(path) as temporary:
+        text = configuration(name, [order.trace for order in orders], shape, files)
+        temporary.write_text(text, encoding="utf-8")
+    return path

@@ -1,0 +1,147 @@
+"""The inner loops of dispersing before light is on a frame, compiled.
+
+zones      profile x PSF of sources on a stamp's Fourier grid
+brightest  how bright spectra are in a column
+lay        what is detected of a spectrum onto the samples of its trace, by quintic splines
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lake_schema.arrays import Bool, Float, Float32, Int
+from truesky.numerics.compiling import jit
+from truesky.render.drawing.kernels import fourier
+from truesky.render.drawing.kernels.frame import smaller
+
+# Wavelengths that are taken together.
+_WAVES = 64
+
+
+@jit
+def zones(
+    planes: Any, weights: Float32, ku: Float32, kv: Float32, body: Bool, fraction: Float, bulge: Float, disk: Float,
+    thick: Float, sersic: Float32, row: Int, row_weights: Float, out: Any,
+) -> None:  # fmt: skip
+    """Fills out [m, b, rows, columns] with profile x sum of planes [p, rows, columns] by weights [m, b, p].
+
+    ku, kv : [rows], [columns] radian / pixel
+    body, fraction, bulge, disk, thick, sersic, row, row_weights : [m] of fourier.nyquist_zones
+    """
+    rows, columns = len(ku), len(kv)
+    square, high = np.empty(columns, np.float32), np.empty(columns, np.float32)
+    bits, table = square.view(np.int32), np.empty(sersic.shape[1], np.float32)
+    profile = np.empty(columns, np.float32)
+    step, reach = kv[1], 1.01 * (np.max(np.abs(ku)) ** 2 + kv[columns - 1] ** 2 + kv[1] ** 2) * 4.0
+    for m in range(len(weights)):
+        profile[:] = np.float32(1.0)
+        if body[m] and fraction[m] > 0.0:
+            fourier.interpolate(
+                sersic, row[m], row_weights[m], 0.99 * step**2 * smaller(bulge[m]), reach * np.sum(bulge[m] ** 2), table
+            )
+        for r in range(rows):
+            if body[m]:
+                high[:] = ku[r]
+                fourier.profile_at(fraction[m], bulge[m], disk[m], thick[m], table, high, kv, square, bits, profile)
+            for b in range(weights.shape[1]):
+                line = out[m, b, r]
+                line[:] = np.complex64(0.0)
+                for p in range(len(planes)):
+                    w = weights[m, b, p]
+                    if w != 0.0:
+                        plane = planes[p, r]
+                        for c in range(columns):
+                            line[c] += w * plane[c]
+                for c in range(columns):
+                    line[c] *= profile[c]
+
+
+@jit
+def brightest(spectra: Float32, factor: Float, response: Float, window: int, peak: Float, total: Float) -> None:
+    """Fills [k] with the electrons of spectra [k, w], and with the most among `window` neighbours, by half windows.
+
+    factor : [k] of each spectrum;  response : [w] electrons for each of its units, or less than none
+    peak, total : [k], all of them counted as electrons
+    """
+    half = max(window // 2, 1)
+    for k in range(len(spectra)):
+        most, everything, before, start = 0.0, 0.0, 0.0, 0
+        while start < len(response):
+            some, through = spectra[k, start : start + half], response[start : start + half]
+            own = 0.0
+            for i in range(len(some)):
+                own += abs(some[i] * through[i])
+            most = max(most, before + own)
+            everything += own
+            before, start = own, start + half
+        peak[k], total[k] = factor[k] * most, factor[k] * everything
+
+
+@jit
+def lay(
+    electrons: Float, along: Float, times: tuple[float, float], start: float, samples: int, share: Float, first: int,
+    out: Float,
+) -> None:  # fmt: skip
+    """Adds electrons [w] of each wavelength to the samples of a trace, out [b, m], by shares [b, w].
+
+    along   : coefficients of t^i, pixels from `start`;  times : t of the first wavelength, and its step
+    samples : a pixel;  first : place of out's first sample, in samples;  share : of each PSF, by wavelength
+    A quintic spline keeps the total, the mean and the higher moments.
+    """
+    count, places, low = out.shape[1], np.empty(_WAVES), np.empty(_WAVES, np.int64)
+    weights = np.empty((6, _WAVES))
+    w0, w1, w2, w3, w4, w5 = weights
+    for begin in range(0, len(electrons), _WAVES):
+        some = electrons[begin : begin + _WAVES]
+        if np.max(np.abs(some)) == 0.0:
+            continue
+        # By whole vectors; then each to its samples.
+        places[:] = along[len(along) - 1]
+        for j in range(len(along) - 2, -1, -1):
+            for i in range(_WAVES):
+                places[i] = places[i] * (times[0] + times[1] * (begin + i)) + along[j]
+        for i in range(len(some)):
+            place = samples * (start + places[i])
+            whole = np.floor(place)
+            low[i] = np.int64(whole) - 2 - first
+            t = place - whole
+            s, e = 1.0 - t, some[i] / 120.0
+            t2, s2 = t * t, s * s
+            w0[i], w5[i] = e * s2 * s2 * s, e * t2 * t2 * t
+            w1[i] = e * (26.0 + t * (-50.0 + t * (20.0 + t * (20.0 + t * (-20.0 + 5.0 * t)))))
+            w4[i] = e * (26.0 + s * (-50.0 + s * (20.0 + s * (20.0 + s * (-20.0 + 5.0 * s)))))
+            w2[i] = e * (66.0 + t2 * (-60.0 + t2 * (30.0 - 10.0 * t)))
+            w3[i] = e * (66.0 + s2 * (-60.0 + s2 * (30.0 - 10.0 * s)))
+        start_of, stop = 0, 0
+        while start_of < len(some):
+            # Those that lie between the same samples are added up first.
+            at, stop = low[start_of], start_of + 1
+            while stop < len(some) and low[stop] == at:
+                stop += 1
+            if 0 <= at <= count - 6:
+                for b in range(out.shape[0]):
+                    _add(weights[:, start_of:stop], share[b, begin + start_of : begin + stop], out[b, at : at + 6])
+            start_of = stop
+
+
+@jit
+def _add(weights: Float, share: Float, out: Float) -> None:
+    """Adds weights [6, k] by shares [k] to out [6]."""
+    w0, w1, w2, w3, w4, w5 = weights
+    s0 = s1 = s2 = s3 = s4 = s5 = 0.0
+    for i in range(len(share)):
+        own = share[i]
+        s0 += own * w0[i]
+        s1 += own * w1[i]
+        s2 += own * w2[i]
+        s3 += own * w3[i]
+        s4 += own * w4[i]
+        s5 += own * w5[i]
+    out[0] += s0
+    out[1] += s1
+    out[2] += s2
+    out[3] += s3
+    out[4] += s4
+    out[5] += s5

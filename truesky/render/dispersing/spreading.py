@@ -1,0 +1,348 @@
+"""A source's image spread along the trace of an order, onto a frame, compiled.
+
+follow     a source's image at every sample of its trace, each in its own rows
+convolve   a source's image, along a straight trace, by a few samples at a time;  settle : into rows
+spread     a source's order onto the frame, in one of the two ways
+add        a piece of the image onto the frame, in fixed point
+refine     a frame of wider pixels onto the frame
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lake_schema.arrays import Float, Float32, Int
+from truesky.numerics.compiling import jit
+from truesky.render.dispersing.kernels import lay
+
+# Places along a trace between which it is taken as straight.
+_NODES = 129
+# Pixels of a trace that are taken together; numbers of an image seen through one PSF that are held close at hand.
+STEP, _CLOSE = 4, 24_000
+
+
+@jit
+def _path(along: Float, across: Float, times: tuple[float, float], count: int, start: tuple[float, float]) -> Float:
+    """[3, nodes] columns, ascending, rows and numbers of wavelengths at places of a trace."""
+    out = np.empty((3, _NODES))
+    for i in range(_NODES):
+        number = (count - 1.0) * i / (_NODES - 1.0)
+        t = times[0] + times[1] * number
+        x, y = along[len(along) - 1], across[len(across) - 1]
+        for j in range(len(along) - 2, -1, -1):
+            x = x * t + along[j]
+        for j in range(len(across) - 2, -1, -1):
+            y = y * t + across[j]
+        out[0, i], out[1, i], out[2, i] = start[0] + x, start[1] + y, number
+    if out[0, _NODES - 1] < out[0, 0]:
+        return np.ascontiguousarray(out[:, ::-1])
+    return out
+
+
+@jit
+def _between(path: Float, x: float, ends: tuple[float, float]) -> tuple[float, float, float]:
+    """(row, number of the wavelength, rows a column) of a path at column x; ends : rows a column before and behind."""
+    columns = path[0]
+    last = len(columns) - 1
+    if x <= columns[0]:
+        return path[1, 0] + ends[0] * (x - columns[0]), path[2, 0], ends[0]
+    if x >= columns[last]:
+        return path[1, last] + ends[1] * (x - columns[last]), path[2, last], ends[1]
+    low, high = 0, last
+    while high - low > 1:
+        middle = (low + high) // 2
+        if columns[middle] <= x:
+            low = middle
+        else:
+            high = middle
+    width = columns[high] - columns[low]
+    part = (x - columns[low]) / width
+    rise = path[1, high] - path[1, low]
+    return path[1, low] + part * rise, path[2, low] + part * (path[2, high] - path[2, low]), rise / width
+
+
+@jit
+def _slope(path: Float, i: int) -> float:
+    """Rows a column from place i of a path to the next."""
+    return float((path[1, i + 1] - path[1, i]) / max(path[0, i + 1] - path[0, i], 1e-12))
+
+
+@jit
+def follow(
+    images: Float32, laid: Float, first: int, path: Float, slope: float, shear: float, shape: tuple[int, int, int],
+    corner: tuple[int, int], out: Float32,
+) -> None:  # fmt: skip
+    """Adds a source's image at every sample of its trace to out [h, w], with a PSF and rows of its own.
+
+    images : [b, n along, n across] spline coefficients of the source seen through PSF b, of a stamp of n pixels; the
+             stamp's middle is sample n / 2 of each axis
+    laid   : [b, m] electrons;  first : place of its first sample, in samples along
+    path   : of `_path`;  slope : rows a column before and behind it;  shear : by which a row of the image rises
+    shape  : n, samples a pixel along, across;  corner : column and row of out's first pixel
+    """
+    n, ox, oy = shape
+    line = np.empty(n * oy, np.float32)
+    wrapped, fine = np.empty(n * oy + oy + 4, np.float32), np.empty(n * oy, np.float32)
+    for m in range(laid.shape[1]):
+        electrons = 0.0
+        for b in range(len(laid)):
+            electrons += abs(laid[b, m])
+        place = first + m - (n // 2) * ox
+        phase = (-place) % ox
+        left = (place + phase) // ox - corner[0]
+        if electrons == 0.0 or left >= out.shape[1] or left + n <= 0:
+            continue
+        row, _, _ = _between(path, (first + m) / ox, (slope, slope))
+        for i in range(max(0, -left), min(n, out.shape[1] - left)):
+            line[:] = np.float32(0.0)
+            for b in range(len(laid)):
+                weight, some = np.float32(laid[b, m]), images[b, i * ox + phase]
+                for v in range(len(line)):
+                    line[v] += weight * some[v]
+            aside = shear * (corner[0] + left + i - (first + m) / ox)
+            _add_line(line, row + aside, n, oy, corner[1], wrapped, fine, out[:, left + i])
+
+
+@jit
+def _add_line(
+    line: Float32, row: float, n: int, oy: int, low: int, wrapped: Float32, fine: Float32, out: Float32
+) -> None:
+    """Adds a column of an image, oy samples a row, its middle at `row`, to out [h] from row `low` on."""
+    tall, begin = len(line), int(np.ceil(row - n // 2))
+    v = oy * (begin - row + n // 2)
+    whole = int(np.floor(v))
+    t = v - whole
+    s = 1.0 - t
+    w0, w3 = np.float32(s * s * s / 6.0), np.float32(t * t * t / 6.0)
+    w1 = np.float32((4.0 + t * t * (3.0 * t - 6.0)) / 6.0)
+    w2 = np.float32((4.0 + s * s * (3.0 * s - 6.0)) / 6.0)
+    # Periodic.
+    wrapped[0] = line[tall - 1]
+    wrapped[1 : tall + 1] = line
+    wrapped[tall + 1 :] = line[: len(wrapped) - tall - 1]
+    a0, a1, a2, a3 = wrapped[whole:], wrapped[whole + 1 :], wrapped[whole + 2 :], wrapped[whole + 3 :]
+    # Of every sample, in whole vectors, which is faster than of every row.
+    for i in range(len(fine) - oy + 1):
+        fine[i] = w0 * a0[i] + w1 * a1[i] + w2 * a2[i] + w3 * a3[i]
+    for r in range(max(0, low - begin), min(n, low + len(out) - begin)):
+        out[begin + r - low] += fine[r * oy]
+
+
+@jit
+def convolve(
+    images: Float32, laid: Float, first: int, path: Float, slope: float, share: Float, shape: tuple[int, int, int],
+    tile: int, low: int, out: Float32,
+) -> None:  # fmt: skip
+    """Adds a source's image at every sample of its trace to out [w, n across]: columns from `low` on, about the trace.
+
+    images : of `follow`, in coordinates that rise by `slope` rows a column;  laid : [m] electrons
+    first, path, shape : of `follow`
+    share  : [wavelengths, b] of each PSF;  tile : pixels that share one, a multiple of STEP
+    """
+    n, ox, oy = shape
+    tall = n * oy
+    steep = np.empty((n * ox, tall), np.float32)
+    _steep(images[len(images) // 2], ox, oy, steep)
+    count = (n * ox * tall + _CLOSE - 1) // _CLOSE
+    for k in range(count):
+        # By some of the samples across, which then stay in the processor's cache.
+        begin, end = k * tall // count, (k + 1) * tall // count
+        parts = _by_phase(images, steep, ox, begin, end)
+        lines = np.zeros((len(out), end - begin), np.float32)
+        _convolve(parts, laid, first, path, slope, share, shape, tile, low, lines)
+        out[:, begin:end] += lines
+
+
+@jit
+def _by_phase(images: Float32, steep: Float32, ox: int, begin: int, end: int) -> Float32:
+    """[b + 1, ox, n x samples across] some samples across of images [b, n along, n across], and `steep`."""
+    n, wide = images.shape[1] // ox, end - begin
+    out = np.empty((len(images) + 1, ox, n * wide), np.float32)
+    for b in range(len(out)):
+        image = steep if b == len(images) else images[b]
+        for j in range(n * ox):
+            out[b, j % ox, j // ox * wide : (j // ox + 1) * wide] = image[j, begin:end]
+    return out
+
+
+@jit
+def _convolve(
+    parts: Float32, laid: Float, first: int, path: Float, slope: float, share: Float, shape: tuple[int, int, int],
+    tile: int, low: int, out: Float32,
+) -> None:  # fmt: skip
+    """Adds to out [w, wide] what `convolve` does, of parts [b + 1, ox, n x wide] of `_by_phase`."""
+    n, ox, _ = shape
+    tall, pad = out.shape[1], STEP - 1
+    mixed, amounts = np.zeros((ox, (n + 2 * pad) * tall), np.float32), np.empty(len(parts), np.float32)
+    flat, weights, all_of_them = out.reshape(-1), np.empty(tile, np.float32), len(laid)
+    ends = _slope(path, 0), _slope(path, _NODES - 2)
+    for q in range(first // ox, (first + all_of_them - 1) // ox + 2, tile):
+        left = q - n // 2 - low
+        if left < 0 or (left + n + tile + pad) * tall > len(flat):
+            continue
+        total, mean = 0.0, 0.0
+        for m in range(max(ox * (q - 1) + 1 - first, 0), min(ox * (q + tile - 1) + 1 - first, all_of_them)):
+            total += abs(laid[m])
+            mean += m * abs(laid[m])
+        if total == 0.0:
+            continue
+        _, number, rise = _between(path, (first + mean / total) / ox, ends)
+        # A trace that is steeper by d than the image's rows has I(u, v + d u) for its image: I + d u dI / dv.
+        amounts[:-1], amounts[-1] = share[int(number)], rise - slope
+        for phase in range(ox):
+            _mix(parts, phase, amounts, mixed[phase, pad * tall : (pad + n) * tall])
+        for phase in range(ox):
+            for k in range(tile):
+                m = ox * (q + k) - phase - first
+                weights[k] = np.float32(laid[m]) if 0 <= m < all_of_them else np.float32(0.0)
+            for k in range(0, tile, STEP):
+                w0, w1, w2, w3 = weights[k], weights[k + 1], weights[k + 2], weights[k + 3]
+                if abs(w0) + abs(w1) + abs(w2) + abs(w3) == 0.0:
+                    continue
+                length = (n + pad) * tall
+                some, source = flat[(left + k) * tall : (left + k) * tall + length], mixed[phase]
+                a0, a1 = source[3 * tall : 3 * tall + length], source[2 * tall : 2 * tall + length]
+                a2, a3 = source[tall : tall + length], source[:length]
+                for e in range(np.uint64(length)):
+                    some[e] += w0 * a0[e] + w1 * a1[e] + w2 * a2[e] + w3 * a3[e]
+
+
+@jit
+def _steep(image: Float32, ox: int, oy: int, out: Float32) -> None:
+    """Fills out [n along, n across] with u dI / dv of an image I: what it gains where its trace is steeper."""
+    tall = image.shape[1]
+    out[:] = np.float32(0.0)
+    for j in range(len(image)):
+        one, moved = image[j], np.float32((j - len(image) // 2) / ox * oy / 12.0)
+        inner, up, down = out[j, 2 : tall - 2], one[3 : tall - 1], one[1 : tall - 3]
+        for v in range(len(inner)):
+            inner[v] = up[v] - down[v]
+        higher, lower = one[4:tall], one[: tall - 4]
+        for v in range(len(inner)):
+            inner[v] = moved * (np.float32(8.0) * inner[v] - (higher[v] - lower[v]))
+
+
+@jit
+def _mix(parts: Float32, phase: int, amounts: Float32, out: Float32) -> None:
+    """Fills out [e] with the sum of parts [k, phase, e] by amounts [k]: of three at a time."""
+    last = len(parts) - 1
+    for k in range(0, len(parts), 3):
+        a0, a1, a2 = parts[k, phase], parts[min(k + 1, last), phase], parts[min(k + 2, last), phase]
+        w0 = amounts[k]
+        w1 = amounts[k + 1] if k + 1 <= last else np.float32(0.0)
+        w2 = amounts[k + 2] if k + 2 <= last else np.float32(0.0)
+        if k == 0:
+            for e in range(len(out)):
+                out[e] = w0 * a0[e] + w1 * a1[e] + w2 * a2[e]
+        else:
+            for e in range(len(out)):
+                out[e] += w0 * a0[e] + w1 * a1[e] + w2 * a2[e]
+
+
+@jit
+def settle(
+    lines: Float32, low: int, path: Float, shape: tuple[int, int, int], corner: tuple[int, int], out: Float32
+) -> None:
+    """Adds columns of `convolve`, the first column `low`, to out [h, w], where the trace has them.
+
+    lines : [w, n across];  path, shape, corner : of `follow`
+    """
+    n, _, oy = shape
+    wrapped, fine = np.empty(n * oy + oy + 4, np.float32), np.empty(n * oy, np.float32)
+    ends = _slope(path, 0), _slope(path, _NODES - 2)
+    for c in range(out.shape[1]):
+        row, _, _ = _between(path, float(corner[0] + c), ends)
+        _add_line(lines[corner[0] + c - low], row, n, oy, corner[1], wrapped, fine, out[:, c])
+
+
+@jit
+def add(piece: Float32, corner: tuple[int, int], unit: float, frame: Int) -> float:
+    """Adds piece [h, w] with its first pixel at corner (column, row) to the frame, `unit` to an electron.
+
+    returns : electrons that fell there
+    """
+    ny, nx = frame.shape
+    left, right = max(0, -corner[0]), min(piece.shape[1], nx - corner[0])
+    total = np.int64(0)
+    for r in range(max(0, -corner[1]), min(piece.shape[0], ny - corner[1])):
+        if left < right:
+            some, out = piece[r, left:right], frame[corner[1] + r, corner[0] + left : corner[0] + right]
+            for c in range(len(some)):
+                units = np.int64(np.rint(np.float64(some[c]) * unit))
+                out[c] += units
+                total += units
+    return total / unit
+
+
+@jit
+def refine(coarse: Int, step: int, frame: Int) -> int:
+    """Adds a cubic spline to the frame: coarse [h, w] its coefficients, of pixels as wide as `step` of the frame's.
+
+    The frame's first pixel is at (1, 1), and what is added to it is a share of a coarse one; returns the units added.
+    """
+    ny, nx = frame.shape
+    weights, wide, total = np.empty((step, 4)), np.empty(coarse.shape[1]), np.int64(0)
+    for k in range(step):
+        t = k / step
+        s = 1.0 - t
+        weights[k, 0], weights[k, 3] = s * s * s / 6.0, t * t * t / 6.0
+        weights[k, 1], weights[k, 2] = (4.0 + t * t * (3.0 * t - 6.0)) / 6.0, (4.0 + s * s * (3.0 * s - 6.0)) / 6.0
+    for y in range(ny):
+        own, some = weights[y % step] / step**2, coarse[y // step : y // step + 4]
+        for c in range(len(wide)):
+            wide[c] = own[0] * some[0, c] + own[1] * some[1, c] + own[2] * some[2, c] + own[3] * some[3, c]
+        if np.max(np.abs(wide)) == 0.0:
+            continue
+        for k in range(step):
+            w0, w1, w2, w3 = weights[k]
+            for q in range((nx - k + step - 1) // step):
+                light = w0 * wide[q] + w1 * wide[q + 1] + w2 * wide[q + 2] + w3 * wide[q + 3]
+                units = np.int64(np.rint(light))
+                frame[y, q * step + k] += units
+                total += units
+    return int(total)
+
+
+@jit
+def spread(
+    images: Float32, spectrum: Float32, factor: float, response: Float, share: Float, along: Float, across: Float,
+    times: tuple[float, float], start: tuple[float, float], slope: float, shear: float, shape: tuple[int, int, int],
+    tile: int, unit: float, frame: Int,
+) -> float:  # fmt: skip
+    """An order of a source onto the frame, `unit` to an electron; returns the electrons that fell there.
+
+    images   : of `follow`, or of `convolve` for tile > 0: the pixels that share a PSF
+    spectrum : [w], `factor` x `response` [w] electrons for each unit;  share : [w, b] of each PSF
+    along, across, times : of kernels.lay, and the same of rows;  start : column and row of the undispersed image
+    slope    : rows a column of the trace before and behind it;  shear : of a row of the images
+    shape    : n, samples a pixel along, across
+    """
+    n, ox, oy = shape
+    ny, nx = frame.shape
+    electrons = np.empty(len(response))
+    for i in range(len(response)):
+        electrons[i] = factor * np.float64(spectrum[i]) * response[i]
+    path = _path(along, across, times, len(response), start)
+    left, right = path[0, 0], path[0, _NODES - 1]
+    bottom, top = np.min(path[1]), np.max(path[1])
+    first = int(np.floor(ox * left)) - 3
+    laid = np.zeros((1 if tile > 0 else share.shape[1], int(np.ceil(ox * right)) + 4 - first))
+    # One that is straight has the shares of its tiles.
+    own = np.ones((1, len(response))) if tile > 0 else np.ascontiguousarray(share.T)
+    lay(electrons, along, times, start[0], ox, own, first, laid)
+    steepest = max(np.abs(_slope(path, 0)), np.abs(_slope(path, _NODES - 2)))
+    wing = (steepest if tile > 0 else abs(shear)) * (n // 2 + 2.0)
+    begin = max(int(np.floor(left)) - n // 2 - 2, 0), max(int(np.floor(bottom - wing)) - n // 2 - 1, 0)
+    width = min(int(np.ceil(right)) + n // 2 + 3, nx) - begin[0]
+    height = min(int(np.ceil(top + wing)) + n // 2 + 2, ny) - begin[1]
+    if width <= 0 or height <= 0:
+        return 0.0
+    piece = np.zeros((height, width), np.float32)
+    if tile == 0:
+        follow(images, laid, first, path, slope, shear, shape, begin, piece)
+    else:
+        low = begin[0] - n - 2 * tile
+        lines = np.zeros((width + 2 * n + 4 * tile + 2 * STEP, n * oy), np.float32)
+        convolve(images, laid[0], first, path, shear, share, shape, tile, low, lines)
+        settle(lines, low, path, shape, begin, piece)
+    return add(piece, begin, unit, frame)

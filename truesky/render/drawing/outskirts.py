@@ -1,0 +1,400 @@
+"""The outer light of the largest galaxies, in real space: those that the largest stamp does not hold.
+
+A stamp is periodic. Of a galaxy that outgrows it, what comes in at its edges is taken off, and what belongs outside is
+drawn there, pixel by pixel: there is no limit to how large a galaxy may be. So far out its profile is smooth on the
+scale of a pixel, and is evaluated in closed form (a bulge) or from a table (a disc, integrated along the line of
+sight). What the PSF does to it is small and smoother still: on blocks of pixels.
+
+Outskirts     of one galaxy;  of_galaxy : the profile, PSF and all
+take_in       what came into its stamp, taken off;  add : what belongs outside, onto a frame
+surface_disk  light of an inclined disc of finite thickness
+reach         how far out a galaxy is noticed;  least_electrons : and what it takes
+
+Ref : van der Kruit & Searle 1981 (the disc's scale height)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import RectBivariateSpline
+from scipy.signal import fftconvolve
+from scipy.special import gammaincc, gammaln
+
+from lake_schema.arrays import Array, Float, Int
+from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
+from truesky.numerics import sums
+from truesky.numerics.compiling import jit
+from truesky.render.drawing import transfer
+from truesky.render.drawing.kernels.frame import BULGE, BULGE_FORM, DISK, DISK_FORM, POWER
+from truesky.render.psf.model import SAMPLES, Psf
+from truesky.render.sources import galaxy_shapes
+from truesky.render.sources.galaxy_shapes import Forms, Shapes
+from truesky.render.sources.selection import FARTHEST
+
+# CPU s, measured (2.5 GHz, one core), of a frame's pixel and of one of the stamp.
+FRAME_S, STAMP_S = 6e-8, 4e-7
+# Part of a pixel's noise that is noticed of a galaxy: less than of an effect, for it is the same in many pixels.
+_NOTICED = 1e-2
+# Pixels between the nodes of what the PSF does, at most and at least; axis ratio for which the most will do; so many
+# nodes from a galaxy to the end of its light at most, if they are nearer to each other than that.
+_BLOCK, _FINEST_BLOCK, _SLIM, _MOST_NODES = 8, 2, 0.025, 1536
+# Images of a galaxy are summed ring by ring about its stamp, to the last at most, until so many rings like one would
+# differ from even light by less than this, electrons a pixel.
+_RINGS, _UNEVEN = 64, 0.05
+# Pixels between the nodes of a ring: at least, of a stamp's side at most, and of the width of an ellipse so far out.
+_FINEST, _COARSEST, _PART = 4, 1.0 / 16.0, 0.2
+# A PSF without planes is looked at so far, pixels: behind an atmosphere 1e-5 of the light lies farther out.
+_MOFFAT = 128
+# Of a disc's table: nodes a direction, t of u = sinh t between them, points along the line of sight, scale lengths and
+# scale heights as far as which there is light, the least of it.
+_NODES, _STEP, _POINTS, _LENGTHS, _HEIGHTS, _DARK = 76, 1.0 / 16.0, 512, 45.0, 20.0, 1e-40
+# Light that is less than this, electrons a pixel, is left out.
+_NONE = 1e-4
+# Axis ratio of the thinnest sources, bulges.
+_THINNEST = 0.02
+# Directions in which a profile is summed beyond a square.
+_DIRECTIONS = 1440
+
+
+@dataclass(frozen=True, slots=True)
+class Outskirts:
+    """Of one galaxy, by pixels (x, y) from its middle.
+
+    light  : float64[11] of galaxy_shapes.on_the_sky, electrons; of the disc, matrix and light of the disc face-on
+    disk   : float64[n, n] log of the disc's light by u, v = sinh of the nodes;  across : v over the table's
+    blurred : float64[m, m] what the PSF adds to each pixel, on nodes `block` pixels apart, the galaxy in the middle
+    """
+
+    light: Float
+    disk: Float
+    across: float
+    blurred: Float
+    block: int
+
+
+def of_galaxy(shape: Shapes, form: Forms, electrons: float, psf: Psf, weights: Float, farthest: float) -> Outskirts:
+    """Of a galaxy, the only one of `shape` and `form`.
+
+    electrons : expected;  psf : of the detector;  weights : [planes] of transfer.basis_weights
+    farthest  : pixels, along columns or rows, that it is asked for
+    Error     : next to the stamp 1e-3 of the light there; of bulges slimmer than 1 : 50 along the axis a few per cent
+    """
+    light = galaxy_shapes.on_the_sky(shape, form)[0].copy()
+    inclination = float(shape.inclination[0])
+    cosine, sine = np.cos(np.radians(inclination)), np.sin(np.radians(inclination))
+    across = form.disk[0, :, 1] * cosine + form.thick[0] / (0.5 * np.pi * DISK_SCALE_HEIGHT) * sine
+    matrix = np.column_stack([form.disk[0, :, 0], across])
+    area = abs(float(sums.determinant(matrix)))
+    if light[DISK] > 0.0:
+        light[DISK] = (1.0 - shape.bulge_fraction[0]) / area
+        light[DISK_FORM : DISK_FORM + 4] = sums.inverse(matrix).ravel()
+    light[[BULGE, DISK]] *= electrons
+    disk, wide = surface_disk(inclination)
+    block = _block(slimness(light, wide), farthest)
+    cells = _cells(psf, weights, block)
+    half = int(np.ceil(farthest / block)) + 1 + len(cells) // 2
+    alone = np.zeros((2 * half + 1, 2 * half + 1))
+    _sample(light, disk, wide, float(half * block), float(half * block), float(block), alone)
+    return Outskirts(light, disk, wide, fftconvolve(alone, cells, mode="valid"), block)
+
+
+@lru_cache(maxsize=16)
+def surface_disk(inclination: float) -> tuple[Float, float]:
+    """(log of the light of a disc of scale length 1 and flux 1 at u, v = (sinh t, w sinh t); w).
+
+    exp(-R) sech^2(z / h) along the line of sight; t from -1 step on: the table goes on beyond its axes
+    inclination : deg;  returns : float64[u, v], along the major and the minor axis
+    Error : 1e-4, at the axes within half a scale length of the middle 3e-3, at the cusp of a disc seen face-on, which
+            lies in the stamp, 8e-3 within a fifth of a scale length
+    """
+    cosine, sine = (float(f(np.radians(inclination))) for f in (np.cos, np.sin))
+    wide = float(np.hypot(cosine, DISK_SCALE_HEIGHT))
+    along = np.sinh(_STEP * np.abs(np.arange(-1, _NODES - 1)))
+    u, v = along[:, None, None], wide * along[None, :, None]
+    # Where the line of sight is in the disc.
+    thick = _HEIGHTS * DISK_SCALE_HEIGHT
+    inverse = 1.0 / max(cosine, 1e-9), 1.0 / max(sine, 1e-9)
+    first = np.maximum((-thick - v * sine) * inverse[0], (v * cosine - _LENGTHS) * inverse[1])
+    last = np.minimum((thick - v * sine) * inverse[0], (v * cosine + _LENGTHS) * inverse[1])
+    length = np.maximum(last - first, 0.0)
+    s = first + length * (np.arange(_POINTS) + 0.5) / _POINTS
+    height = np.abs(v * sine + s * cosine) / DISK_SCALE_HEIGHT
+    # sech^2, without an overflow.
+    fading = np.exp(-2.0 * height)
+    light = np.exp(-np.hypot(u, v * cosine - s * sine)) * 4.0 * fading / (1.0 + fading) ** 2
+    total = light.sum(axis=2) * length[..., 0] / _POINTS / (4.0 * np.pi * DISK_SCALE_HEIGHT)
+    return np.log(np.maximum(total, _DARK)), wide
+
+
+def _block(slim: float, farthest: float) -> int:
+    """Pixels between the nodes of what the PSF does to a galaxy of axis ratio `slim`, drawn to `farthest` pixels."""
+    block = _BLOCK
+    while block > _FINEST_BLOCK and slim < _SLIM * block / _BLOCK and farthest <= _MOST_NODES * (block // 2):
+        block //= 2
+    return block
+
+
+def _cells(psf: Psf, weights: Float, block: int) -> Float:
+    """What a PSF does to light on nodes `block` apart: itself, without what stays where it is.
+
+    Each of its samples is shared among five nodes a direction, its moments up to the fourth kept, the pixel's added.
+    """
+    if psf.planes is None:
+        side = 2 * _MOFFAT * SAMPLES + 1
+        drawn = psf.profile.drawImage(nx=side, ny=side, scale=psf.pixel_scale / SAMPLES, method="no_pixel")
+        image = drawn.array / drawn.array.sum(dtype=float)
+    else:
+        image = np.asarray(transfer.image_of(psf.planes, weights), float)
+    samples = SAMPLES if psf.planes is None else psf.planes.samples
+    sides = [_shares(length, block, samples) for length in image.shape]
+    out: Float = sums.product(sides[0].T, sums.product(image, sides[1]))
+    out[len(out) // 2, len(out) // 2] -= 1.0
+    return np.asarray(out)
+
+
+def _shares(length: int, block: int, samples: int) -> Float:
+    """[length, nodes] of a line of samples about its middle one, `samples` of them a pixel."""
+    place = (np.arange(length) - length // 2) / (samples * block)
+    node = np.rint(place).astype(int)
+    off, pixel = place - node, 1.0 / (12.0 * block**2)
+    half = int(np.abs(node).max()) + 2
+    out = np.zeros((length, 2 * half + 1))
+    # The moments of a pixel about the sample.
+    first, second, third = off, off**2 + pixel, off**3 + 3.0 * off * pixel
+    fourth = off**4 + 6.0 * off**2 * pixel + 1.8 * pixel**2
+    for step, share in (
+        (-2, (2.0 * first - second - 2.0 * third + fourth) / 24.0),
+        (-1, (-4.0 * first + 4.0 * second + third - fourth) / 6.0),
+        (0, 1.0 - (5.0 * second - fourth) / 4.0),
+        (1, (4.0 * first + 4.0 * second - third - fourth) / 6.0),
+        (2, (-2.0 * first - second + 2.0 * third + fourth) / 24.0),
+    ):
+        out[np.arange(length), node + half + step] = share
+    return out
+
+
+def take_in(some: Outskirts, stamp: Array, x: float, y: float) -> None:
+    """Takes off a stamp [N, N], in place, what has come in at its edges of `some` galaxy at (x, y) of it, pixels."""
+    size, middle = len(stamp), some.block * (len(some.blurred) // 2)
+    more, blurred, pixels = from_afar(some, size, x, y), _spline(some.blurred, some.block), np.arange(size)
+    for up in (-size, 0, size):
+        for right in (-size, 0, size):
+            if up or right:
+                more += blurred(pixels - y - up + middle, pixels - x - right + middle)
+    _take_in(some.light, some.disk, some.across, more, x, y, stamp)
+
+
+def from_afar(some: Outskirts, size: int, x: float, y: float) -> Float:
+    """What comes into a stamp of a galaxy at (x, y) from all of its images but those in the eight stamps next to it.
+
+    An ellipse's images are even light only where they are as wide as a stamp: the slimmer it is, the farther out.
+    size    : a power of two;  returns : float64[size, size] electrons
+    some    : the galaxy's outskirts
+    Error   : 0.05 electrons; of axis ratio 0.02 1e-3 of the light
+    """
+    slim, pixels = slimness(some.light, some.across), np.arange(size)
+    out, onto, step = np.zeros((size, size)), np.zeros((1, 1)), 0
+    left = _beyond(some.light, some.across, 1.5 * size) / size**2
+    for ring in range(2, _RINGS + 1):
+        wanted = 2 ** int(np.log2(np.clip(_PART * slim * ring * size, _FINEST, _COARSEST * size)))
+        if wanted != step:
+            if step:
+                out += _spline(onto, step)(pixels, pixels)
+            step, onto = wanted, np.zeros((size // wanted + 1, size // wanted + 1))
+        one = np.zeros(onto.shape)
+        for up in range(-ring, ring + 1):
+            for right in range(-ring, ring + 1) if abs(up) == ring else (-ring, ring):
+                _sample(some.light, some.disk, some.across, x + right * size, y + up * size, float(step), one)
+        onto += one
+        even, left = left, _beyond(some.light, some.across, (ring + 0.5) * size) / size**2
+        if ring * np.abs(one - (even - left)).max() < _UNEVEN:
+            break
+    out += _spline(onto + left, step)(pixels, pixels)
+    return out
+
+
+def _spline(values: Float, step: int) -> RectBivariateSpline:
+    """Through nodes `step` apart, the first at 0, in both directions."""
+    nodes = step * np.arange(len(values))
+    return RectBivariateSpline(nodes, nodes, values)
+
+
+def slimness(light: Float, across: float) -> float:
+    """Axis ratio on the pixels of the slimmer component;  light, across : of Outskirts."""
+    out = 1.0
+    for middle, first, width in ((BULGE, BULGE_FORM, 1.0), (DISK, DISK_FORM, across)):
+        if light[middle] > 0.0:
+            matrix = light[first : first + 4].reshape(2, 2) / np.array([[1.0], [width]])
+            half, area = 0.5 * float((matrix**2).sum()), abs(float(sums.determinant(matrix)))
+            out = min(out, area / (half + np.sqrt(max(half**2 - area**2, 0.0))))
+    return out
+
+
+def add(
+    some: Outskirts, frame: Int, column: float, row: float, hole: tuple[int, int, int], unread: tuple[int, int],
+    unit: float,
+) -> int:  # fmt: skip
+    """Adds a galaxy at (column, row) to a frame of `unit` an electron, but for a stamp; returns how many units.
+
+    hole : the stamp's first column and row, its side;  unread : rows of the frame that do not count, as of stamps.draw
+    some : the galaxy's outskirts;  frame : integers
+    """
+    return int(
+        _add(some.light, some.disk, some.across, some.blurred, some.block, frame, column, row, hole, unread, unit)
+    )  # fmt: skip
+
+
+def reach(electrons: Float, shapes: Shapes, pixel_scale: float, noise: float, least: float) -> Float:
+    """float64[n] arcsec as far as which galaxies are noticed, from `least` in steps of a tenth, at most FARTHEST.
+
+    electrons   : float64[n] expected;  shapes : of the n galaxies
+    pixel_scale : arcsec;  noise : of a pixel, electrons;  least : arcsec
+    """
+    out, left = np.full(len(electrons), min(least, FARTHEST)), np.arange(len(electrons))
+    while len(left):
+        found = galaxy_shapes.surface(shapes.take(left), out[left[:1]])[:, 0] * pixel_scale**2 * electrons[left]
+        left = left[(found > _NOTICED * noise) & (out[left] < FARTHEST)]
+        out[left] = np.minimum(1.1 * out[left], FARTHEST)
+    return out
+
+
+def least_electrons(distance: float, pixel_scale: float, noise: float) -> float:
+    """Electrons of a galaxy that may be noticed at a distance, arcsec: no profile rises outward."""
+    return float(_NOTICED * noise * np.pi * _THINNEST * (distance / pixel_scale) ** 2)
+
+
+def _beyond(light: Float, across: float, half: float) -> float:
+    """Electrons outside a square of a half side about the middle, pixels.
+
+    across : of Outskirts. Error : the disc is thin
+    """
+    angle = 2 * np.pi * (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
+    ray = np.stack([np.cos(angle), np.sin(angle)])
+    total = 0.0
+    if light[BULGE] > 0.0:
+        n, inverse = 0.5 / light[POWER], light[BULGE_FORM : BULGE_FORM + 4].reshape(2, 2)
+        edge = half / np.abs(sums.product(sums.inverse(inverse), ray)).max(axis=0)
+        whole = light[BULGE] * np.exp(_log_whole(n)) / abs(float(sums.determinant(inverse)))
+        total += whole * float(gammaincc(2 * n, edge ** (1.0 / n)).mean())
+    if light[DISK] > 0.0:
+        inverse = light[DISK_FORM : DISK_FORM + 4].reshape(2, 2)
+        edge = half / np.abs(sums.product(sums.inverse(inverse), ray * [[1.0], [across]])).max(axis=0)
+        total += light[DISK] / abs(float(sums.determinant(inverse))) * float(((1.0 + edge) * np.exp(-edge)).mean())
+    return total
+
+
+def _log_whole(n: float) -> float:
+    """Log of all of a bulge's light over that in the middle, where exp(-(u^2 + v^2)^p), p = 1 / 2n."""
+    return float(np.log(2 * np.pi * n) + gammaln(2 * n))
+
+
+@jit
+def _light(light: Float, disk: Float, across: float, x: float, y: float) -> Any:
+    """Electrons in a pixel at (x, y) of a galaxy's middle, as if there were no PSF."""
+    out = 0.0
+    if light[BULGE] > 0.0:
+        u = light[BULGE_FORM] * x + light[BULGE_FORM + 1] * y
+        v = light[BULGE_FORM + 2] * x + light[BULGE_FORM + 3] * y
+        out += light[BULGE] * np.exp(-np.exp(light[POWER] * np.log(u * u + v * v + 1e-300)))
+    if light[DISK] > 0.0:
+        u = abs(light[DISK_FORM] * x + light[DISK_FORM + 1] * y)
+        if light[DISK] * np.exp(-u) > _NONE:
+            v = abs(light[DISK_FORM + 2] * x + light[DISK_FORM + 3] * y) / across
+            out += light[DISK] * _from_table(disk, np.log(u + np.sqrt(u * u + 1.0)), np.log(v + np.sqrt(v * v + 1.0)))
+    return out
+
+
+@jit
+def _from_table(disk: Float, u: float, v: float) -> Any:
+    """exp of the table between its nodes, cubic in both directions; nothing beyond it."""
+    # The first node lies one before the axis.
+    a, b = u / _STEP + 1.0, v / _STEP + 1.0
+    i, j = int(a), int(b)
+    if i + 2 >= len(disk) or j + 2 >= len(disk):
+        return 0.0
+    a, b = a - i, b - j
+    total = 0.0
+    for r in range(4):
+        line = disk[i - 1 + r]
+        some = 0.0
+        for c in range(4):
+            some += _cubic(b, c) * line[j - 1 + c]
+        total += _cubic(a, r) * some
+    return np.exp(total)
+
+
+@jit
+def _cubic(part: float, node: int) -> Any:
+    """Share of a node, of four, in what lies `part` of the way from the second to the third."""
+    if node == 0:
+        return -part * (part - 1.0) * (part - 2.0) / 6.0
+    if node == 1:
+        return (part + 1.0) * (part - 1.0) * (part - 2.0) / 2.0
+    if node == 2:
+        return -(part + 1.0) * part * (part - 2.0) / 2.0
+    return (part + 1.0) * part * (part - 1.0) / 6.0
+
+
+@jit
+def _between(nodes: Float, x: float, y: float) -> Any:
+    """Linear between nodes a pixel of theirs apart; nothing beyond them."""
+    i, j = int(np.floor(y)), int(np.floor(x))
+    if i < 0 or j < 0 or i + 1 >= nodes.shape[0] or j + 1 >= nodes.shape[1]:
+        return 0.0
+    up, right = y - i, x - j
+    low = (1.0 - right) * nodes[i, j] + right * nodes[i, j + 1]
+    return (1.0 - up) * low + up * ((1.0 - right) * nodes[i + 1, j] + right * nodes[i + 1, j + 1])
+
+
+@jit
+def _seen(light: Float, disk: Float, across: float, blurred: Float, block: int, x: float, y: float) -> Any:
+    """Electrons in a pixel at (x, y) from a galaxy's middle."""
+    middle = blurred.shape[0] // 2
+    more = _between(blurred, x / block + middle, y / block + middle)
+    return max(_light(light, disk, across, x, y) + more, 0.0)
+
+
+@jit
+def _sample(light: Float, disk: Float, across: float, x: float, y: float, step: float, out: Float) -> None:
+    """Adds the light of a galaxy at (x, y) to nodes `step` pixels apart, the first at 0."""
+    for r in range(out.shape[0]):
+        for c in range(out.shape[1]):
+            out[r, c] += _light(light, disk, across, step * c - x, step * r - y)
+
+
+@jit
+def _take_in(light: Float, disk: Float, across: float, more: Float, x: float, y: float, stamp: Any) -> None:
+    size = stamp.shape[0]
+    for r in range(size):
+        for c in range(size):
+            some = more[r, c]
+            for up in (-size, 0, size):
+                for right in (-size, 0, size):
+                    if up != 0 or right != 0:
+                        some += _light(light, disk, across, c - x - right, r - y - up)
+            stamp[r, c] -= some
+
+
+@jit
+def _add(
+    light: Float, disk: Float, across: float, blurred: Float, block: int, frame: Int, x: float, y: float,
+    hole: tuple[int, int, int], unread: tuple[int, int], unit: float,
+) -> Any:  # fmt: skip
+    ny, nx = frame.shape
+    left, low, size = hole
+    total = np.int64(0)
+    for r in range(ny):
+        inside = low <= r < low + size
+        read = not unread[0] <= r < unread[1]
+        for c in range(nx):
+            if inside and left <= c < left + size:
+                continue
+            some = np.int64(np.rint(_seen(light, disk, across, blurred, block, c - x, r - y) * unit))
+            frame[r, c] += some
+            if read:
+                total += some
+    return total

@@ -1,0 +1,68 @@
+"""One source by GalSim's drawImage: what `stamps.draw` is held against.
+
+reference       one source by galsim's own drawImage: what `draw` is held against
+"""
+
+from __future__ import annotations
+
+import galsim
+import numpy as np
+
+from lake_schema.arrays import Float, Float32
+from truesky.render.drawing import transfer
+from truesky.render.psf.model import Psf
+from truesky.render.sources import galaxy_shapes
+from truesky.render.sources.lensed_arcs import Picture
+from truesky.render.sources.source_list import Sources
+
+# What galsim takes for a point in the reference, arcsec.
+_POINT = 1e-6
+
+
+def reference(sources: Sources, i: int, psf: Psf, size: int, folding: float = 1e-4, highest: float = 1e-4) -> Float:
+    """Source i by galsim.Convolve and drawImage, tight thresholds: slow, with none of `draw`'s transforms.
+
+    folding, highest : galsim's folding_threshold and maxk_threshold; what is cut at 1e-4 shows as 3e-3 of the noise in
+                        the middle of bright discs
+    sources, i : the list, and which of it;  psf : of the detector;  size : side of the image, pixels
+    returns : float64[size, size], lower left pixel at round(position) - size / 2
+    """
+    settings = galsim.GSParams(
+        folding_threshold=folding, maxk_threshold=highest, kvalue_accuracy=1e-7, maximum_fft_size=16384
+    )
+    weights = transfer.basis_weights(psf, sources.photons, sources.column, sources.row)[i]
+    pixel = [] if psf.intra_pixel is None else [galsim.Pixel(1.0)]
+    parts = [transfer.profile_of(psf, weights).dilate(1.0 / psf.pixel_scale), *pixel]
+    picture = sources.picture_of(i)
+    if sources.shape[i] >= 0 or picture is not None:
+        profile = _profile(sources, i)
+        # World frame, arcsec -> pixels, the flux kept.
+        parts.append(galsim.JacobianWCS(*sources.jacobian[i].ravel()).toImage(profile))
+    whole = galsim.Convolve(parts, gsparams=settings) * float(sources.electrons[i])
+    x0, y0 = (int(np.rint(position[i])) - size // 2 for position in (sources.column, sources.row))
+    centre = galsim.PositionD(sources.column[i] - x0, sources.row[i] - y0)
+    image = galsim.ImageD(galsim.BoundsI(0, size - 1, 0, size - 1), scale=1.0)
+    whole.drawImage(image, center=centre, method="no_pixel")
+    return np.asarray(image.array)
+
+
+def _profile(sources: Sources, i: int) -> galsim.GSObject:
+    """Of flux 1, world frame, arcsec; the structure of a disc as if it were thin."""
+    picture = sources.picture_of(i)
+    if sources.shape[i] < 0 and picture is not None:
+        return _of(picture, picture.image)
+    shape, which = sources.shapes, int(sources.shape[i])
+    smooth = galaxy_shapes.profile(shape, which, _POINT)
+    if picture is None:
+        return smooth
+    # galsim has no image of flux 0: what is added, and what is taken.
+    more, less = (_of(picture, np.maximum(sign * picture.image, 0.0)) for sign in (1.0, -1.0))
+    return smooth + (more - less) * (1.0 - float(shape.bulge_fraction[which]))
+
+
+def _of(picture: Picture, pixels: Float32) -> galsim.GSObject:
+    """Some pixels of a picture as galsim interpolates them, world frame (u to the west), of the flux that they have."""
+    image = galsim.Image(np.ascontiguousarray(pixels, float), scale=1.0)
+    # Padded more than by default: the transform is as good as the reference should be.
+    plain = galsim.InterpolatedImage(image, x_interpolant="quintic", pad_factor=8.0)
+    return plain.transform(*picture.matrix.ravel()).withFlux(float(pixels.sum(dtype=float)))

@@ -1,0 +1,124 @@
+"""What an effect is, what it may know of an exposure, and the loop that applies a channel's effects."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lake_schema.errors import BadInput
+from truesky.render.effects.scene import NOTICEABLE, STACK, Frame, Scene
+
+
+@dataclass(frozen=True, slots=True)
+class Effect:
+    """One physical effect.
+
+    apply        : (frame, *parameters, rng) -> frame; never writes its argument
+    parameters   : scene -> the numbers that `apply` wants
+    contribution : scene -> its largest change of a pixel, electrons; rms, of what is random
+    repeated     : scene -> the part of it that a mean over frames or pixels keeps, electrons; None = all of it
+    optional     : False where the frame is no product without it
+    fixed        : a pattern of the detector itself: its random numbers are the same in every exposure
+    shared       : one thing for all detectors of an exposure: its random numbers are the same on each
+    numbers      : the effect whose random numbers it takes, "" = its own
+    cost         : seconds a million pixels take on one core (benchmarks/effects.py); a channel has none of 0
+    """
+
+    name: str
+    apply: Callable[..., Frame]
+    parameters: Callable[[Scene], tuple[Any, ...]]
+    contribution: Callable[[Scene], float]
+    optional: bool = True
+    fixed: bool = False
+    shared: bool = False
+    numbers: str = ""
+    cost: float = 0.0
+    repeated: Callable[[Scene], float] | None = None
+
+    def margin(self, scene: Scene) -> float:
+        """Contribution over what would be noticed, in a pixel or in a mean: above 1 the effect is needed."""
+        repeated = float((self.repeated or self.contribution)(scene))
+        change = max(float(self.contribution(scene)), math.sqrt(STACK) * repeated)
+        noise = NOTICEABLE * scene.pixel_noise
+        # Without any noise everything is noticed.
+        return change / noise if noise > 0.0 else math.inf if change > 0.0 else 0.0
+
+    def needed_if(self, scene: Scene) -> bool:
+        """Whether the scene needs it, or no frame can do without it, whatever a request forces."""
+        return not self.optional or self.margin(scene) > 1.0
+
+    def applied(self, scene: Scene) -> bool:
+        """Whether it is applied to the scene: as its request forces it, else as the scene needs it."""
+        return scene.forced.get(self.name, self.needed_if(scene))
+
+
+def nothing(scene: Scene) -> float:
+    """Of a contribution what a mean keeps, where it is noise."""
+    return 0.0
+
+
+def by_pixel(kernel: Callable[..., None], frame: Frame, *numbers: Any) -> Frame:
+    """A new frame of the same shape, in which a compiled kernel(before [n], after [n], *numbers) has set each pixel.
+
+    numbers : each for the frame, or [q] for its q amplifiers, which are then set one by one: frame [q, ..]
+    """
+    out = np.empty(frame.shape)
+    before, after = np.ascontiguousarray(frame, dtype=float).reshape(-1), out.reshape(-1)
+    parts = max(np.size(number) for number in numbers)
+    if parts == 1:
+        kernel(before, after, *numbers)
+        return out
+    if frame.shape[0] != parts:
+        raise BadInput(f"numbers of {parts} amplifiers for a frame of {frame.shape[0]}")
+    for number, (one, other) in enumerate(zip(np.split(before, parts), np.split(after, parts), strict=True)):
+        kernel(one, other, *(n[number] if np.ndim(n) else n for n in numbers))
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """Whether an effect was applied, why, and by which margin."""
+
+    name: str
+    applied: bool
+    forced: bool
+    margin: float
+
+
+def decide(effects: Sequence[Effect], scene: Scene) -> tuple[Decision, ...]:
+    """What a scene needs, and what is forced on or off in it (effects of other channels do nothing)."""
+    for effect in effects:
+        if not effect.optional and not effect.applied(scene):
+            raise BadInput(f"effect {effect.name} cannot be switched off")
+    return tuple(
+        Decision(effect.name, effect.applied(scene), effect.name in scene.forced, effect.margin(scene))
+        for effect in effects
+    )
+
+
+def apply_all(
+    frame: Frame,
+    effects: Sequence[Effect],
+    scene: Scene,
+    stream: Callable[[Effect], np.random.Generator],
+    watch: Callable[[str, Frame, Frame], None] | None = None,
+) -> tuple[Frame, tuple[Decision, ...]]:
+    """Apply a channel's effects in their order.
+
+    stream : effect -> its own generator, so that switching one effect off leaves the draws of the others as they were
+    watch  : sees the name of an effect that is applied, and the frame before and after it
+    frame  : [ny, nx];  effects : in the order of the channel;  scene : what their parameters are taken from
+    """
+    decisions = decide(effects, scene)
+    for effect, decision in zip(effects, decisions, strict=True):
+        if decision.applied:
+            before, frame = frame, effect.apply(frame, *effect.parameters(scene), rng=stream(effect))
+            if watch is not None:
+                watch(effect.name, before, frame)
+            # Frames are large: the next effect needs one.
+            del before
+    return frame, decisions

@@ -1,0 +1,19 @@
+"""The diffuse sky: the same expected electrons in every pixel."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lake_schema.errors import OutOfRange
+from truesky.render.effects.effect import Effect
+from truesky.render.effects.scene import Frame
+
+
+def apply(frame: Frame, electrons: float, rng: np.random.Generator | None = None) -> Frame:
+    """frame [ny, nx] e- -> frame + electrons."""
+    if not 0.0 <= electrons < np.inf:
+        raise OutOfRange("sky electrons", electrons, 0.0, np.inf)
+    return frame + electrons
+
+
+EFFECT = Effect("background", apply, lambda scene: (scene.sky_electrons,), lambda scene: scene.sky_electrons, cost=3e-3)

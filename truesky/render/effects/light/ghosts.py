@@ -1,0 +1,162 @@
+"""Ghosts: light that is reflected twice in a plate makes a defocused image of the pupil beside each bright star.
+
+An annulus with the gaps of the three arms that hold the secondary mirror; of even surface brightness.
+
+EFFECT    of the dichroic
+FILTER    of the filter
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lake_schema.errors import OutOfRange
+from truesky.numerics.compiling import jit
+from truesky.render.effects.effect import Effect
+from truesky.render.effects.scene import NOTICEABLE, Frame, Lights, Scene
+
+# Samples across a pixel of the border, for pixels that are cut.
+_FINE = 4
+
+
+class Pupil(NamedTuple):
+    """The image of the pupil, pixels.
+
+    radius : of the outer edge;  hole : the inner radius over the outer
+    arms   : of each its middle's column and row from the centre, its angle from x to y (degrees), half its length
+    width  : of all arms
+    """
+
+    radius: float
+    hole: float
+    arms: tuple[tuple[float, float, float, float], ...]
+    width: float
+
+
+def apply(
+    frame: Frame, lights: Lights, ratio: float, offset: tuple[float, float], pupil: Pupil,
+    rng: np.random.Generator | None = None,
+) -> Frame:  # fmt: skip
+    """frame [ny, nx] e- -> plus the ghost of every light, also of those outside the frame.
+
+    ratio : light of a ghost over its star's;  offset : (columns, rows) from star to ghost
+    lights : positions and electrons of stars;  pupil : shape of a ghost;  rng : not used
+    """
+    radius, hole, arms, width = pupil
+    for name, value, least, most in (
+        ("ghost ratio", ratio, 0.0, 1.0), ("ghost radius", radius, 0.5, 1e4), ("ghost hole", hole, 0.0, 0.99),
+        ("ghost arms", width, 0.0, radius),
+    ):  # fmt: skip
+        if not least <= value <= most:
+            raise OutOfRange(name, value, least, most)
+    out = np.array(frame, dtype=float, order="C")
+    if ratio == 0.0 or out.size == 0 or not len(lights.electrons):
+        return out
+    stamp = _pupil(radius, hole, np.array(arms, float).reshape(-1, 4), width)
+    stamp /= stamp.sum()
+    _add(out, lights.column + offset[0], lights.row + offset[1], ratio * lights.electrons, stamp)
+    return out
+
+
+@jit
+def _pupil(radius: float, hole: float, arms: Any, width: float) -> Any:
+    """What of each pixel is lit: [n, n], n odd, its middle the centre."""
+    half = int(np.ceil(radius)) + 1
+    stamp = np.zeros((2 * half + 1, 2 * half + 1))
+    for r in range(2 * half + 1):
+        for c in range(2 * half + 1):
+            lit = 0
+            for i in range(_FINE):
+                for j in range(_FINE):
+                    x, y = c - half + (j + 0.5) / _FINE - 0.5, r - half + (i + 0.5) / _FINE - 0.5
+                    distance = np.hypot(x, y)
+                    inside = hole * radius <= distance <= radius
+                    for arm in arms:
+                        dx, dy, angle = x - arm[0], y - arm[1], np.radians(arm[2])
+                        across = dy * np.cos(angle) - dx * np.sin(angle)
+                        inside = inside and not (np.hypot(dx, dy) <= arm[3] and abs(across) < 0.5 * width)
+                    lit += inside
+            stamp[r, c] = lit / (_FINE * _FINE)
+    return stamp
+
+
+@jit
+def _add(frame: Any, column: Any, row: Any, electrons: Any, stamp: Any) -> None:
+    """Adds stamps, shifted by parts of a pixel: shares of four pixels each."""
+    ny, nx = frame.shape
+    half = len(stamp) // 2
+    for i in range(len(column)):
+        if not (-half - 2.0 < column[i] < nx + half + 2.0 and -half - 2.0 < row[i] < ny + half + 2.0):
+            continue
+        x0, y0 = int(np.floor(column[i])), int(np.floor(row[i]))
+        fx, fy = column[i] - x0, row[i] - y0
+        for r in range(max(0, y0 - half), min(ny, y0 + half + 2)):
+            for c in range(max(0, x0 - half), min(nx, x0 + half + 2)):
+                light = 0.0
+                for dr in range(2):
+                    for dc in range(2):
+                        sr, sc = r - y0 + half - dr, c - x0 + half - dc
+                        if 0 <= sr < len(stamp) and 0 <= sc < len(stamp):
+                            light += (fy if dr else 1.0 - fy) * (fx if dc else 1.0 - fx) * stamp[sr, sc]
+                frame[r, c] += electrons[i] * light
+
+
+def parameters(scene: Scene, plate: str = "ghost") -> tuple[Any, ...]:
+    """Of the mission database; the offset is along the focal plane's y axis, and the arms are the pupil's.
+
+    plate : whose ghosts, a prefix of their parameters
+    """
+    turn = scene.detector.rotation if scene.detector is not None else 0.0
+    cosine, sine = float(np.cos(np.radians(turn))), float(np.sin(np.radians(turn)))
+    length = scene.value(f"{plate}.offset_y", "pix")
+    radius = scene.value(f"{plate}.radius_out", "pix")
+    aperture = 0.5 * scene.mission.value("plm.aperture_diameter", "mm")
+
+    def of(key: str, unit: str) -> float:
+        return scene.mission.value(f"plm.pupil.{key}", unit)
+
+    scale = radius / aperture
+    reach = scale * of("spider_half_length", "mm")
+    places = [[scale * of(f"spider{number}.{axis}", "mm") for axis in "xy"] for number in (1, 2, 3)]
+    # From the focal plane's axes to the detector's.
+    arms = tuple(
+        (x * cosine + y * sine, y * cosine - x * sine, of(f"spider{number}.angle", "deg") - turn, reach)
+        for number, (x, y) in enumerate(places, start=1)
+    )
+    width = scale * of("spider_width", "mm")
+    ratio, hole = scene.value(f"{plate}.flux_ratio", ""), scene.value(f"{plate}.radius_in_ratio", "")
+    return noticeable(scene, ratio, plate), ratio, (length * sine, length * cosine), Pupil(radius, hole, arms, width)
+
+
+def noticeable(scene: Scene, ratio: float, plate: str = "ghost") -> Lights:
+    """The lights whose ghost, taken as a whole, is not lost in the noise of the pixels it covers."""
+    area = np.pi * scene.value(f"{plate}.radius_out", "pix") ** 2
+    lights = scene.lights
+    bright = ratio * lights.electrons > NOTICEABLE * scene.pixel_noise * np.sqrt(area)
+    return Lights(lights.column[bright], lights.row[bright], lights.electrons[bright])
+
+
+def _contribution(scene: Scene, plate: str = "ghost") -> float:
+    """In a pixel, times the root of the pixels that share it: a ghost is one thing."""
+    ratio, radius = scene.value(f"{plate}.flux_ratio", ""), scene.value(f"{plate}.radius_out", "pix")
+    brightest = float(scene.lights.electrons.max(initial=0.0))
+    return ratio * brightest / float(np.sqrt(np.pi) * radius)
+
+
+def _level(scene: Scene, plate: str = "ghost") -> float:
+    """In a pixel: a mean over as many as share it is what it is judged by already."""
+    return _contribution(scene, plate) / float(np.sqrt(np.pi) * scene.value(f"{plate}.radius_out", "pix"))
+
+
+EFFECT = Effect("ghosts", apply, parameters, _contribution, cost=4.5e-3, repeated=_level)
+FILTER = Effect(
+    "filter_ghosts",
+    apply,
+    partial(parameters, plate="filter_ghost"),
+    partial(_contribution, plate="filter_ghost"),
+    cost=4.5e-3,
+    repeated=partial(_level, plate="filter_ghost"),
+)

@@ -1,0 +1,92 @@
+"""Illumination: how much light the optics bring to each place of the focal plane, and for how long.
+
+Every map here is 1 + f(column) + g(row): a paraboloid and a slope across the focal plane, in whatever way a detector is
+turned.
+
+pattern     such a map for one detector
+EFFECT      vignetting; SHUTTER: its blades open over one side of the focal plane first, and close over the other
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lake_schema.errors import BadInput, OutOfRange
+from truesky.render.camera import detectors as camera_detectors
+from truesky.render.effects.effect import Effect
+from truesky.render.effects.scene import Frame, Scene
+
+
+def apply(frame: Frame, columns: Frame, rows: Frame, rng: np.random.Generator | None = None) -> Frame:
+    """frame [ny, nx] e- -> times 1 + columns [nx] + rows [ny].
+
+    rng : not used
+    """
+    if frame.shape[-2:] != (len(rows), len(columns)):
+        raise BadInput(f"an illumination of {len(rows)} x {len(columns)} pixels for a frame of {frame.shape[-2:]}")
+    if frame.size and not (1.0 + columns.min() + rows.min() >= 0.0 and columns.max() + rows.max() < np.inf):
+        raise OutOfRange("illumination", 1.0 + float(columns.min() + rows.min()), 0.0, np.inf)
+    out = np.asarray(columns + rows[:, None])
+    out += 1.0
+    return np.multiply(frame, out, out=out) if frame.ndim == 2 else frame * out
+
+
+def pattern(scene: Scene, nx: int, ny: int, bowl: float, slope: tuple[float, float]) -> tuple[Frame, Frame]:
+    """(columns [nx], rows [ny]) of 1 - bowl r^2 + slope . (x, y); x, y, r = 1 at the edges and corners of the field.
+
+    scene       : with the detector's place in the field;  nx, ny : its pixels
+    bowl, slope : fractions at the corners and edges of the field
+    """
+    half_x, half_y = _half_sides(scene)
+    corner = float(np.hypot(half_x, half_y))
+    detector = scene.detector
+    x0, y0, scale, turn = (0.0, 0.0, 1.0, 0.0)
+    if detector is not None:
+        x0, y0, scale, turn = detector.x, detector.y, detector.pixel_scale, np.radians(detector.rotation)
+    along, up = scale * (np.arange(nx) - (nx - 1) / 2), scale * (np.arange(ny) - (ny - 1) / 2)
+    cosine, sine = np.cos(turn), np.sin(turn)
+    sx, sy = slope[0] / half_x, slope[1] / half_y
+    # |c + R d|^2 = |c|^2 + 2 c . R d + |d|^2: no product of column and row.
+    columns = -bowl * (2 * along * (x0 * cosine + y0 * sine) + along**2) / corner**2
+    rows = -bowl * (2 * up * (y0 * cosine - x0 * sine) + up**2) / corner**2
+    columns += along * (sx * cosine + sy * sine)
+    rows += up * (sy * cosine - sx * sine)
+    return columns, rows + (x0 * sx + y0 * sy) - bowl * (x0**2 + y0**2) / corner**2
+
+
+def _half_sides(scene: Scene) -> tuple[float, float]:
+    """Half the focal plane's sides, arcsec."""
+    detectors = camera_detectors.detectors(scene.section.rpartition(".")[2], scene.mission)
+    scale, nx, ny = detectors[0].pixel_scale, detectors[0].nx, detectors[0].ny
+    return (
+        max(abs(d.x) for d in detectors) + scale * nx / 2,
+        max(abs(d.y) for d in detectors) + scale * ny / 2,
+    )
+
+
+def _vignetting(scene: Scene) -> tuple[Frame, Frame]:
+    return pattern(scene, scene.nx, scene.ny, scene.value("illumination", ""), (0.0, 0.0))
+
+
+def _shutter(scene: Scene) -> tuple[Frame, Frame]:
+    return pattern(scene, scene.nx, scene.ny, 0.0, (0.0, _longer(scene)))
+
+
+def _longer(scene: Scene) -> float:
+    """At the side of the focal plane, of the exposure time: the blades take as long whatever that is."""
+    time = scene.exposure_time_s
+    return float(np.clip(scene.value("shutter_map", "s") / time, -1.0, 1.0)) if time > 0.0 else 0.0
+
+
+def _brightest(scene: Scene) -> float:
+    return scene.peak_electrons + scene.sky_electrons
+
+
+EFFECT = Effect(
+    "illumination",
+    apply,
+    _vignetting,
+    lambda scene: abs(scene.value("illumination", "")) * _brightest(scene),
+    cost=5e-3,
+)
+SHUTTER = Effect("shutter", apply, _shutter, lambda scene: abs(_longer(scene)) * _brightest(scene), cost=5e-3)

@@ -1,0 +1,89 @@
+"""In-field straylight: a wide faint halo about every bright star.
+
+I(r) = F f / (2 pi s^2) (1 + (r / s)^2)^(-3/2), F the star's light, f the halo's part of it, s its scale
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lake_schema.errors import OutOfRange
+from truesky.numerics.compiling import jit
+from truesky.render.effects.effect import Effect
+from truesky.render.effects.scene import NOTICEABLE, Frame, Lights, Scene
+
+# The halo is drawn at nodes this part of its scale apart and interpolated linearly: 2e-3 of it.
+_NODES = 1.0 / 16.0
+_MOST_STEP = 256
+
+
+def apply(frame: Frame, lights: Lights, fraction: float, scale: float, rng: np.random.Generator | None = None) -> Frame:
+    """frame [ny, nx] e- -> plus the halos of all lights, also of those outside.
+
+    fraction : of a light in its halo;  scale : pixels
+    lights   : positions and electrons of stars;  rng : not used
+    """
+    if not 0.0 <= fraction <= 1.0:
+        raise OutOfRange("straylight fraction", fraction, 0.0, 1.0)
+    if not 1.0 <= scale <= 1e6:
+        raise OutOfRange("straylight scale", scale, 1.0, 1e6)
+    out = np.array(frame, dtype=float, order="C")
+    if fraction == 0.0 or out.size == 0 or not len(lights.electrons):
+        return out
+    step = int(np.clip(scale * _NODES, 1, _MOST_STEP))
+    ny, nx = out.shape
+    nodes = np.zeros(((ny - 1) // step + 2, (nx - 1) // step + 2))
+    height = lights.electrons * fraction / (2.0 * np.pi * scale**2)
+    _halos(nodes, step, lights.column, lights.row, height, 1.0 / scale**2)
+    _interpolate(out, nodes, step)
+    return out
+
+
+@jit
+def _halos(nodes: Any, step: int, column: Any, row: Any, height: Any, inverse: float) -> None:
+    for i in range(len(column)):
+        for r in range(nodes.shape[0]):
+            dy = r * step - row[i]
+            for c in range(nodes.shape[1]):
+                dx = c * step - column[i]
+                u = 1.0 + (dx * dx + dy * dy) * inverse
+                nodes[r, c] += height[i] / (u * np.sqrt(u))
+
+
+@jit
+def _interpolate(frame: Any, nodes: Any, step: int) -> None:
+    ny, nx = frame.shape
+    line = np.empty(nodes.shape[1])
+    for r in range(ny):
+        low, part = r // step, (r % step) / step
+        for k in range(len(line)):
+            line[k] = nodes[low, k] + part * (nodes[low + 1, k] - nodes[low, k])
+        for k in range(len(line) - 1):
+            some, slope = frame[r, k * step : min((k + 1) * step, nx)], (line[k + 1] - line[k]) / step
+            for c in range(len(some)):
+                some[c] += line[k] + c * slope
+
+
+def _halo(scene: Scene) -> tuple[float, float]:
+    """Fraction, scale in pixels."""
+    pixel_scale = scene.value("fpa.pixel_scale", "arcsec / pix")
+    return scene.value("halo.fraction", ""), scene.value("halo.radius", "arcsec") / pixel_scale
+
+
+def _parameters(scene: Scene) -> tuple[Any, ...]:
+    fraction, scale = _halo(scene)
+    lights = scene.lights
+    # A thousand halos that are each below a thousandth of what would be noticed are left out.
+    height = fraction * lights.electrons / (2.0 * np.pi * scale**2)
+    bright = height > 1e-3 * NOTICEABLE * scene.pixel_noise
+    return Lights(lights.column[bright], lights.row[bright], lights.electrons[bright]), fraction, scale
+
+
+def _contribution(scene: Scene) -> float:
+    fraction, scale = _halo(scene)
+    return fraction * float(scene.lights.electrons.sum()) / (2.0 * np.pi * scale**2)
+
+
+EFFECT = Effect("straylight", apply, _parameters, _contribution, cost=5e-3)

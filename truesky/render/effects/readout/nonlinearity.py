@@ -1,0 +1,103 @@
+"""Non-linearity of the output amplifier: its gain falls towards saturation, and for the first electrons.
+
+measured = s - b n0 (1 - exp(-s / n0)),  s = n / (1 + a n / saturation)
+
+apply         electrons -> what the amplifier gives, in electrons
+linearised    its inverse: what a calibration does
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lake_schema.arrays import Float
+from lake_schema.errors import OutOfRange
+from truesky.numerics.compiling import jit
+from truesky.render.effects.effect import Effect, by_pixel
+from truesky.render.effects.scene import Frame, Scene
+from truesky.render.effects.series import SMALL, small_expm1
+
+# Newton's rule doubles the digits; the function is smooth and its slope between 1 - b and 1.
+_ITERATIONS = 6
+
+
+Number = float | Float
+
+
+def apply(
+    frame: Frame, high: Number, saturation: Number, low: Number, knee: Number, rng: np.random.Generator | None = None
+) -> Frame:
+    """frame [..] e- >= 0 -> e-, monotonic; each number may be [q] of the amplifiers of a frame [q, ..].
+
+    high : a, what is missing at `saturation` e-;  low : b, what is missing of the first electrons;  knee : n0, e-
+    rng  : not used
+    """
+    _check(high, saturation, low, knee)
+    return by_pixel(_respond, frame, high / saturation, low * knee, 1.0 / knee)
+
+
+@jit
+def _respond(light: Any, signal: Any, high: float, low: float, inverse: float) -> None:
+    """high : per electron, low : electrons, inverse : of the knee."""
+    for i in range(len(light)):
+        response = max(light[i], 0.0) / (1.0 + high * max(light[i], 0.0))
+        signal[i] = min(light[i], 0.0) + response + low * small_expm1(-response * inverse)
+    # Most pixels are faint: a branch above would cost more than the few that are done twice.
+    for i in range(len(light)):
+        if light[i] * inverse > SMALL:
+            response = light[i] / (1.0 + high * light[i])
+            signal[i] = response + low * np.expm1(-response * inverse)
+
+
+def linearised(measured: Frame, high: Number, saturation: Number, low: Number, knee: Number) -> Frame:
+    """The electrons that `apply` made into `measured`; beyond what it can give: infinite.
+
+    measured : e-;  high, saturation, low, knee : as of `apply`
+    """
+    _check(high, saturation, low, knee)
+    high, saturation, low, knee = (
+        np.reshape(n, (-1, *[1] * (measured.ndim - 1))) if np.ndim(n) else n for n in (high, saturation, low, knee)
+    )
+    light = np.maximum(measured, 0.0)
+    response = light / (1.0 - low * np.exp(-light / knee))
+    for _ in range(_ITERATIONS):
+        wrong = response + low * knee * np.expm1(-response / knee) - light
+        response = np.maximum(response - wrong / (1.0 - low * np.exp(-response / knee)), 0.0)
+    left = 1.0 - high / saturation * response
+    with np.errstate(divide="ignore"):
+        out = np.where(left > 0.0, response / np.maximum(left, 0.0), np.inf)
+    return np.asarray(out + np.minimum(measured, 0.0))
+
+
+def _check(high: Number, saturation: Number, low: Number, knee: Number) -> None:
+    for name, value, least, most in (
+        ("non-linearity at saturation", high, 0.0, 10.0),
+        ("amplifier saturation", saturation, 1.0, 1e9),
+        ("non-linearity of low signals", low, 0.0, 0.99),
+        ("non-linearity knee", knee, 1e-3, 1e9),
+    ):
+        if not (np.min(value) >= least and np.max(value) <= most):
+            raise OutOfRange(name, value, least, most)
+
+
+def parameters(scene: Scene) -> tuple[Number, Number, Number, Number]:
+    """high, saturation, low, knee: the converter's range is the amplifier's."""
+    saturation = scene.of_amplifiers("adc_max", "adu") * scene.of_amplifiers("gain", "electron / adu")
+    return (
+        scene.of_amplifiers("nonlinearity.high", ""),
+        saturation,
+        scene.of_amplifiers("nonlinearity.low", ""),
+        scene.of_amplifiers("nonlinearity.low_scale", "electron"),
+    )
+
+
+def _contribution(scene: Scene) -> float:
+    there = min(scene.brightest_electrons, scene.value("full_well", "electron") + scene.sky_electrons)
+    curve = parameters(scene)
+    light = np.full(max(np.size(number) for number in curve), there)
+    return float(np.max(light - apply(light, *curve)))
+
+
+EFFECT = Effect("nonlinearity", apply, parameters, _contribution, cost=6e-3)

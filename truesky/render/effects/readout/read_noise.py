@@ -1,0 +1,43 @@
+"""Read noise: the output amplifier adds a Gaussian to every pixel."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lake_schema.arrays import Float
+from lake_schema.errors import OutOfRange
+from truesky.numerics.compiling import jit
+from truesky.render.effects import pixel_random
+from truesky.render.effects.effect import Effect, by_pixel, nothing
+from truesky.render.effects.scene import Frame, Scene
+
+
+def apply(frame: Frame, sigma: float | Float, rng: np.random.Generator) -> Frame:
+    """frame [ny, nx] e- -> frame + N(0, sigma) e-; sigma : may be [q] of the amplifiers of a frame [q, ny, nx]."""
+    if not (np.min(sigma) >= 0.0 and np.max(sigma) < np.inf):
+        raise OutOfRange("read noise", sigma, 0.0, np.inf)
+    # The number of an amplifier's first pixel in the frame.
+    first = np.arange(len(frame)) * frame[0].size if np.ndim(sigma) else 0
+    return by_pixel(_add, frame, sigma, pixel_random.key(rng), first)
+
+
+@jit
+def _add(frame: Any, out: Any, sigma: float, key: Any, first: int) -> None:
+    for i in range(len(frame)):
+        out[i] = frame[i] + sigma * pixel_random.normal(pixel_random.word(key, first + i))
+
+
+def _sigma(scene: Scene) -> float | Float:
+    return scene.of_amplifiers("read_noise", "electron")
+
+
+EFFECT = Effect(
+    "read_noise",
+    apply,
+    lambda scene: (_sigma(scene),),
+    lambda scene: float(np.max(_sigma(scene))),
+    cost=9e-3,
+    repeated=nothing,
+)

@@ -1,0 +1,326 @@
+"""Charge traps that a line of pixels is shifted over: who captures, who releases, what is left behind.
+
+Model: a cloud of n electrons fills the fraction V(n) of a pixel's volume and at once every trap in it; each trap
+gives its electron back with its species' time scale, into whichever packet lies there then.
+
+A line is n packets; packet i is shifted over the pixels i, i - 1 .. 0. Taken one pixel at a time this is exact and
+slow. Here many pixels are taken together: all see the same packets, so one stack of watermarks (the heights up to which
+clouds have filled traps, and when) serves them all, and every species.
+
+Let m pixels see packet i, of n electrons, and let species s have rho_s traps in a pixel, of time scale tau_s in
+transfers. At height z of the volume the m pixels were last filled by packet j(z), when there were m(z) of them: pixel i
+joins empty when packet i arrives. Of the traps in dz, rho_s m(z) exp(-(i - j(z)) / tau_s) are full, H_s in all.
+One transfer on,
+
+    released   G = sum_s rho_s H_s (1 - exp(-1 / tau_s)), each pixel its share of it;
+    reached    V(n + G / m);
+    captured   C = integral from 0 to V of sum_s rho_s (m - m(z) exp(-(i - j(z)) / tau_s)) dz, at most n + G;
+    left over  n + G - C, and m(z) = m, j(z) = i below V.
+
+Both m(z) and j(z) are steps, the lower the newer, so that a packet looks at those below V alone and replaces them by
+one: the cost of a line is that of its packets, not of packets times pixels. What is left out is that packets change
+on their way: the second order in the losses. Heun's rule brings it in, with the change c of a sweep,
+n' = n + (c(n) + c(n + c(n))) / 2, and further steps along the line make it as small as wanted. Each electron is counted
+once, captured or not: charge is conserved.
+
+Ref : Massey et al. 2014 (volume and watermarks), Massey et al. 2010
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lake_schema.arrays import Float
+from lake_schema.errors import BadInput, OutOfRange
+from truesky.numerics.compiling import jit
+from truesky.render.effects.readout import trap_levels
+
+# Lines that are copied together where a line's packets do not lie next to each other in memory.
+_BLOCK = 64
+# Species are followed together, in one register; those that are missing have no traps.
+_SPECIES = 3
+# Of a packet, what it may be wrong by where the height of its cloud is told: 0.6 of it in V.
+_SMALL = 1e-4
+# V(n) is tabulated: 2^6 linear segments of an octave of n, and octaves below the full well.
+_SEGMENT_BITS, _OCTAVES = 6, 60
+
+
+@dataclass(frozen=True, slots=True)
+class Traps:
+    """The traps of one direction of transfer.
+
+    density   : traps of each species in a pixel;  release : their time scales, in transfers
+    full_well : electrons that fill the pixel's volume;  notch : electrons that meet no trap
+    power     : of V = ((n - notch) / (full_well - notch))^power
+    """
+
+    density: tuple[float, ...]
+    release: tuple[float, ...]
+    full_well: float
+    notch: float
+    power: float
+
+    def __post_init__(self) -> None:
+        if len(self.density) != len(self.release) or not 1 <= len(self.density) <= _SPECIES:
+            raise BadInput(
+                f"traps: {len(self.density)} densities, {len(self.release)} release times, wanted are 1 to {_SPECIES}"
+            )
+        for name, values, lo, hi in (
+            ("trap density", self.density, 0.0, 1e6),
+            ("trap release time", self.release, 1e-6, 1e9),
+            ("trap well-filling power", (self.power,), 1e-3, 10.0),
+            ("trap notch", (self.notch,), 0.0, 1e8),
+            ("trap full well", (self.full_well,), 1.0, 1e9),
+        ):
+            for value in values:
+                if not lo <= value <= hi:
+                    raise OutOfRange(name, value, lo, hi)
+        if self.notch >= self.full_well:
+            raise OutOfRange("trap notch", self.notch, 0.0, self.full_well)
+
+    def volume(self, electrons: npt.ArrayLike) -> Float:
+        """Fraction of a pixel's traps that a cloud reaches."""
+        part = (np.asarray(electrons, float) - self.notch) / (self.full_well - self.notch)
+        return np.asarray(np.clip(part, 0.0, 1.0) ** self.power)
+
+
+@dataclass(frozen=True, slots=True)
+class Sweeps:
+    """How a line is followed: steps along it, and sweeps a step (1: packets as they were; 2: Heun's rule).
+
+    levels : 0, or into how many levels the traps of a pixel are put instead of watermarks, in one sweep of one step
+    """
+
+    steps: int
+    order: int
+    levels: int = 0
+
+    def __post_init__(self) -> None:
+        if self.levels and not trap_levels.FEWEST <= self.levels <= 1000:
+            raise OutOfRange("levels of traps", self.levels, trap_levels.FEWEST, 1000)
+        if self.levels and (self.steps, self.order) != (1, 1):
+            raise BadInput(f"{self.levels} levels of traps take one sweep of one step")
+        if not 1 <= self.steps <= 10_000:
+            raise OutOfRange("steps of a transfer", self.steps, 1, 10_000)
+        if self.order not in (1, 2):
+            raise OutOfRange("sweeps a step", self.order, 1, 2)
+
+
+def shifted(frame: Float, traps: Traps, sweeps: Sweeps, axis: int, pixels: int | None = None) -> tuple[Float, float]:
+    """Read out lines of packets over traps.
+
+    frame  : float64[.., ny, nx] electrons >= 0; the output lies at index 0 of `axis` (-2: rows, -1: columns)
+    pixels : how many packets of a line start in a pixel; those after (overscan) follow through all of them
+    traps  : their density and release times;  sweeps : how closely charge is followed
+    returns: frame, and the electrons still trapped when the last packet has passed
+    """
+    if axis not in (-1, -2):
+        raise OutOfRange("axis of transfer", axis, -2, -1)
+    out = np.array(frame, dtype=np.float64, order="C")
+    n = out.shape[axis]
+    physical = n if pixels is None else pixels
+    if not 0 <= physical <= n:
+        raise OutOfRange("pixels of a line", physical, 0, n)
+    if not any(traps.density) or out.size == 0:
+        return out, 0.0
+    missing = _SPECIES - len(traps.density)
+    density, release = np.array(traps.density + (0.0,) * missing), np.array(traps.release + (1.0,) * missing)
+    # What a species' traps in a pixel that were filled so many transfers ago still hold.
+    left = density * np.exp(-np.arange(n + 1)[:, None] / release)
+    # 1 - exp(-1 / tau) without the difference of almost equal numbers.
+    released = -np.expm1(-1.0 / release)
+    edges = np.rint(np.linspace(physical, 0, min(sweeps.steps, max(physical, 1)) + 1)).astype(np.int64)
+    volumes = _volumes(traps)
+    ends = trap_levels.heights(out, traps.notch, sweeps.levels) if sweeps.levels else None
+    trapped = 0.0
+    for plane in out.reshape(-1, *out.shape[-2:]):
+        if ends is not None:
+            trapped += trap_levels.shift(plane, axis, physical, density, released, ends, traps.volume(ends))
+        elif axis == -1:
+            trapped += _shift(plane, density, left, released, *volumes, edges, sweeps.order)
+        else:
+            # Some columns at a time: their packets lie far apart in memory.
+            lines = np.empty((_BLOCK, n))
+            for start in range(0, plane.shape[1], _BLOCK):
+                some = lines[: plane.shape[1] - start]
+                some[:] = plane[:, start : start + _BLOCK].T
+                trapped += _shift(some, density, left, released, *volumes, edges, sweeps.order)
+                plane[:, start : start + _BLOCK] = some.T
+    return out, trapped
+
+
+def _volumes(traps: Traps) -> tuple[Float, float, float]:
+    """V at the ends of the segments of (n - notch) / (full_well - notch), from 2^-_OCTAVES to 1; notch; 1 / range."""
+    octave = np.arange(_OCTAVES)[:, None] - _OCTAVES
+    part = np.ldexp(1.0 + np.arange(1 << _SEGMENT_BITS) / (1 << _SEGMENT_BITS), octave).ravel()
+    # Twice the last: a full well is the start of a segment, too.
+    return np.concatenate([part, [1.0, 1.0]]) ** traps.power, traps.notch, 1.0 / (traps.full_well - traps.notch)
+
+
+@jit
+def _shift(
+    lines: Any, density: Float, left: Float, released: Float, volumes: Float, notch: float, scale: float, edges: Any,
+    order: int,
+) -> float:  # fmt: skip
+    """Every line lines[k, :], in place; returns what is still trapped."""
+    n = lines.shape[1]
+    first, second = np.empty(n), np.empty(n)
+    seen, inverse, reached, part = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    height, full, since = np.empty(n + 2), np.empty(n + 2), np.empty(n + 2, np.int64)
+    trapped = 0.0
+    for line in lines:
+        if line.max() <= notch:
+            continue
+        for e in range(len(edges) - 1):
+            high, low = edges[e], edges[e + 1]
+            for i in range(low, n):
+                seen[i] = min(min(i, edges[0] - 1) + 1, high) - low
+                inverse[i] = 1.0 / max(seen[i], 1.0)
+            _reach(line, volumes, notch, scale, part, part.view(np.int64), reached)
+            held_back = _sweep(line, first, low, seen, inverse, reached, density, left, released, volumes, notch, scale,
+                               height, full, since, part)  # fmt: skip
+            for i in range(n):
+                first[i] += line[i]
+            if order == 2:
+                _reach(first, volumes, notch, scale, part, part.view(np.int64), reached)
+                again = _sweep(first, second, low, seen, inverse, reached, density, left, released, volumes, notch,
+                               scale, height, full, since, part)  # fmt: skip
+                held_back = 0.5 * (held_back + again)
+                for i in range(n):
+                    line[i] = 0.5 * (line[i] + first[i] + second[i])
+            else:
+                line[:] = first
+            trapped += held_back
+    return trapped
+
+
+@jit
+def _sweep(
+    line: Any, change: Any, low: int, seen: Float, inverse: Float, reached: Float, density: Float, left: Float,
+    released: Float, volumes: Float, notch: float, scale: float, height: Float, full: Float, since: Any, part: Float,
+) -> float:  # fmt: skip
+    """Fills `change` with what pixels from `low` on do to the packets; returns what they hold at the end.
+
+    seen, inverse       : how many of them see each packet, and 1 over that
+    reached             : V of each packet as it comes
+    height, full, since : the stack of watermarks, lowest last: up to which height, how many pixels, from which row
+    """
+    # Species by species, in registers: an array would be read and written at every packet.
+    d0, d1, d2 = density[0], density[1], density[2]
+    r0, r1, r2 = released[0], released[1], released[2]
+    h0, h1, h2 = 0.0, 0.0, 0.0
+    total, held = d0 + d1 + d2, 0.0
+    # The lowest watermark in registers, too. Below all no pixel is full: that of a cloud that nothing reaches.
+    th, tf, ti = np.inf, 0.0, 0
+    depth = -1
+    for i in range(min(low, len(line))):
+        change[i] = 0.0
+    for i in range(low, len(line)):
+        count, top = seen[i], reached[i]
+        h0, h1, h2 = h0 - h0 * r0, h1 - h1 * r1, h2 - h2 * r2
+        after = h0 + h1 + h2
+        gain = held - after
+        # What a pixel gives back makes a cloud hardly larger: where it does not, which watermarks a cloud reaches is
+        # known before what the traps hold, and the processor need not wait for that.
+        if gain * inverse[i] > _SMALL * line[i]:
+            top = _volume(line[i] + gain * inverse[i], volumes, notch, scale, part, part.view(np.int64))
+        if top <= 0.0:
+            change[i], held = gain, after
+            continue
+        e0, e1, e2, bottom = 0.0, 0.0, 0.0, 0.0
+        most = line[i] + gain
+        if top * count * total <= most:
+            if th > top:
+                emptied, age = top * tf, i - ti
+                e0, e1, e2 = _more(e0, e1, e2, emptied, left, age)
+                depth += 1
+                height[depth], full[depth], since[depth] = th, tf, ti
+            else:
+                emptied, age = th * tf, i - ti
+                e0, e1, e2 = _more(e0, e1, e2, emptied, left, age)
+                bottom = th
+                while height[depth] <= top:
+                    emptied, age = (height[depth] - bottom) * full[depth], i - since[depth]
+                    e0, e1, e2 = _more(e0, e1, e2, emptied, left, age)
+                    bottom = height[depth]
+                    depth -= 1
+                emptied, age = (top - bottom) * full[depth], i - since[depth]
+                e0, e1, e2 = _more(e0, e1, e2, emptied, left, age)
+        else:
+            # Never more than the packet has: the cloud then ends lower.
+            depth += 1
+            height[depth], full[depth], since[depth] = th, tf, ti
+            top, depth, e0, e1, e2 = _short(most, top, count * total, i, depth, left, height, full, since)
+        if top <= 0.0:
+            th, tf, ti = height[depth], full[depth], since[depth]
+            depth -= 1
+        else:
+            th, tf, ti = top, count, i
+            filled = top * count
+            h0, h1, h2 = h0 + (filled * d0 - e0), h1 + (filled * d1 - e1), h2 + (filled * d2 - e2)
+        after = h0 + h1 + h2
+        change[i], held = held - after, after
+    return float(held)
+
+
+@jit
+def _more(e0: float, e1: float, e2: float, emptied: float, left: Float, age: int) -> tuple[float, float, float]:
+    """Of each species what pixels held that a cloud has filled again: plus so many, last filled so long ago."""
+    return e0 + emptied * left[age, 0], e1 + emptied * left[age, 1], e2 + emptied * left[age, 2]
+
+
+@jit
+def _short(
+    most: float, top: float, empty: float, i: int, depth: int, left: Float, height: Float, full: Float, since: Any
+) -> tuple[float, int, float, float, float]:
+    """What a packet takes that may have less than its cloud would reach: where it ends, the stack's depth, the rest.
+
+    empty : electrons that all traps hold;  most : electrons of the packet
+    """
+    e0, e1, e2, taken, bottom = 0.0, 0.0, 0.0, 0.0, 0.0
+    while bottom < top:
+        end, age = height[depth], i - since[depth]
+        still = left[age, 0] + left[age, 1] + left[age, 2]
+        free, step = empty - full[depth] * still, min(end, top) - bottom
+        if taken + step * free > most:
+            step = (most - taken) / free
+            top = bottom + step
+        taken += step * free
+        emptied = step * full[depth]
+        e0, e1, e2 = _more(e0, e1, e2, emptied, left, age)
+        if end > top:
+            break
+        bottom = end
+        depth -= 1
+    return top, depth, e0, e1, e2
+
+
+@jit
+def _reach(line: Any, volumes: Float, notch: float, scale: float, part: Float, bits: Any, reached: Float) -> None:
+    """V of every packet of a line, as `_volume`;  part, bits : scratch, numbers and their binary form."""
+    for i in range(len(line)):
+        part[i] = min(max((line[i] - notch) * scale, 0.0), 1.0)
+    for i in range(len(line)):
+        at = (bits[i] >> (52 - _SEGMENT_BITS)) - ((1023 - _OCTAVES) << _SEGMENT_BITS)
+        beyond = (bits[i] & ((1 << (52 - _SEGMENT_BITS)) - 1)) * 2.0 ** (_SEGMENT_BITS - 52)
+        here = max(at, 0)
+        volume = volumes[here] + beyond * (volumes[here + 1] - volumes[here])
+        reached[i] = volume if at >= 0 else 0.0
+
+
+@jit
+def _volume(electrons: float, volumes: Float, notch: float, scale: float, part: Float, bits: Any) -> float:
+    """V from its table: linear between the segments' ends (1e-4 of V), and none below the last octave.
+
+    part, bits : scratch, one number and its binary form: exponent and first bits of the mantissa tell the segment
+    """
+    part[0] = min(max((electrons - notch) * scale, 0.0), 1.0)
+    at = (bits[0] >> (52 - _SEGMENT_BITS)) - ((1023 - _OCTAVES) << _SEGMENT_BITS)
+    if at < 0:
+        return 0.0
+    beyond = (bits[0] & ((1 << (52 - _SEGMENT_BITS)) - 1)) * 2.0 ** (_SEGMENT_BITS - 52)
+    return float(volumes[at] + beyond * (volumes[at + 1] - volumes[at]))

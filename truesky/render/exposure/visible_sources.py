@@ -1,0 +1,358 @@
+"""The catalogue rows that shine onto a detector, as sources to be drawn.
+
+least_flux      what a source beyond the margin must have to be read
+spike_flux, outer_flux   and a star, a galaxy still farther out
+sources_of      the rows that shine onto the detector, as what is drawn
+Listed, listed  all rows, as what may be drawn
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pyarrow as pa
+
+from lake_schema.arrays import Bool, Float, Int
+from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.tables.exposures import ExposureRow
+from lake_schema.tables.strong_lenses import STRONG_LENSES
+from truesky.fluxes import bulges
+from truesky.fluxes.libraries import templates
+from truesky.fluxes.passbands import Passband
+from truesky.render.camera import astrometry
+from truesky.render.camera.detectors import Detector
+from truesky.render.channels import registry
+from truesky.render.channels.aim import Aim, electron_rate
+from truesky.render.dispersing.draw import Dispersed
+from truesky.render.drawing import outskirts, stamp_sizes
+from truesky.render.drawing.settings import Settings, settings_for
+from truesky.render.effects.effect import Decision, decide
+from truesky.render.effects.scene import NOTICEABLE, Lights, Scene
+from truesky.render.exposure import bright_lights, scene_of, standard_stars
+from truesky.render.exposure.records import Rows
+from truesky.render.psf import from_file, spikes, sub_bands
+from truesky.render.psf.model import Psf, of_colours
+from truesky.render.sources import (
+    catalogue_rows,
+    colours,
+    disc_structure,
+    galaxy_shapes,
+    galaxy_stamps,
+    lensed_arcs,
+    selection,
+    solar_system,
+)
+from truesky.render.sources.source_list import Sources
+from truesky.request.accuracy import Accuracy
+
+# What is read of the catalogues; fluxes are read besides.
+SHAPE_COLUMNS = ("id", "kind", "ra", "dec", *galaxy_shapes.COLUMNS)
+GALAXY_COLUMNS = tuple(dict.fromkeys((*SHAPE_COLUMNS, galaxy_stamps.COLUMN, *colours.GALAXY_COLUMNS, *bulges.COLUMNS)))
+STAR_COLUMNS = ("id", "ra", "dec", "pm_ra", "pm_dec", *colours.STAR_COLUMNS)
+# Of a source: more would leave the frame's integers to a tenth of an electron (fourier.units_of).
+_MOST_ELECTRONS = 1e17
+# Light of a spectrum that may be noticed, of a pixel's noise: all in one line it has a signal-to-noise ratio of 0.7.
+LEAST_SPECTRUM = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """What shines onto a detector.
+
+    sources, sizes : and int[n] sides of their stamps
+    neglected : float64[n] Fourier samples that may be left out
+    psf       : None in the dark
+    scene     : with bright sources on and about the detector
+    decisions : of effects that act while sources are drawn
+    dispersed : what a grism makes of the sources; None: there is none
+    of        : int[n] whose spectrum each has: the row, counted from the galaxies on to the stars; -1 = the Sun's
+    let_through : float64[n] part of its light that the grism lets through
+    """
+
+    sources: Sources
+    sizes: Int
+    neglected: Float
+    psf: Psf | None
+    scene: Scene
+    decisions: tuple[Decision, ...] = ()
+    dispersed: Dispersed | None = None
+    of: Int = field(default_factory=lambda: np.zeros(0, np.int64))
+    let_through: Float = field(default_factory=lambda: np.zeros(0))
+
+
+@dataclass(frozen=True, slots=True)
+class Listed:
+    """Galaxies, stars and arcs, [n] each; form : of all galaxies, those that are drawn as pictures among them.
+
+    electrons : expected;  shape, picture : as of Sources
+    of        : whose spectrum each has, counted from the galaxies on to the stars
+    """
+
+    ids: Int
+    ra: Float
+    dec: Float
+    electrons: Float
+    shape: Int
+    picture: Int
+    of: Int
+    form: galaxy_shapes.Shapes
+    pictures: tuple[lensed_arcs.Picture, ...]
+
+
+def listed(rows: Rows, electrons: tuple[Float, Float]) -> Listed:
+    """All rows, as what may be drawn; electrons : expected of each of the galaxies, and of the stars.
+
+    Errors : BadInput where a source is given twice, or shines too brightly
+    """
+    catalogue, points = rows.galaxies, rows.stars
+    form, n, stars = galaxy_shapes.shapes(catalogue), len(catalogue), len(points)
+    arcs = _arcs(rows.lenses, catalogue, electrons[0], form)
+    stamp, stamps = galaxy_stamps.of_rows(catalogue, _of_all_bands(form, rows), rows.stamps)
+    ids = np.concatenate([catalogue["id"].to_numpy(), points["id"].to_numpy(), arcs.ids]).astype(np.int64)
+    light = np.concatenate([*electrons, arcs.electrons])
+    _check(ids, light)
+    return Listed(
+        ids,
+        np.concatenate([catalogue["ra"].to_numpy(), points["ra"].to_numpy(), arcs.ra]),
+        np.concatenate([catalogue["dec"].to_numpy(), points["dec"].to_numpy(), arcs.dec]),
+        light,
+        np.concatenate([np.where(stamp < 0, np.arange(n), -1), np.full(stars + len(arcs.ids), -1)]).astype(np.int64),
+        np.concatenate([stamp, np.full(stars, -1), len(stamps) + np.arange(len(arcs.ids))]).astype(np.int64),
+        # Arcs have the colour of what they are an image of.
+        np.concatenate([np.arange(n + stars), arcs.source]).astype(np.int64),
+        form,
+        (*stamps, *arcs.pictures),
+    )
+
+
+def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
+    """All that shines onto a detector, or nothing where it does not see the sky.
+
+    aim   : the exposure and detector;  rows : catalogue rows that it may see
+    scene : before anything is drawn;  seed : of the request
+    """
+    if not aim.sees_sky:
+        return Light(_no_sources(rows.galaxies), np.zeros(0, np.int64), np.zeros(0), None, scene)
+    rows, column = rows_of(rows, aim, scene.mission), f"f_nu_{aim.exposure.band}"
+    pairs = ((rows.galaxies, rows.galaxy_fluxes), (rows.stars, rows.star_fluxes))
+    galaxies, stars = (fluxes_of(*pair, column) * electron_rate(aim.exposure) * scene.exposure_time_s for pair in pairs)
+    settings, noise = settings_for(scene.accuracy), scene.pixel_noise
+    psf = psf_of(aim, scene, settings)
+    sources, sizes = sources_of(rows, (galaxies, stars), aim, psf, noise, settings)
+    bright = Lights()
+    if aim.channel.moving:
+        sources, sizes, bright = _with_moving((sources, sizes), aim, rows, scene, psf, settings, seed)
+    if aim.channel.scattered:
+        around = bright_lights.bright_lights((rows.galaxies, galaxies), (rows.stars, stars), aim.wcs)
+        scene = replace(scene, lights=around.joined(bright))
+    psf, decisions = _with_pixels(aim, scene, psf, sources.electrons[touching(sources, sizes, aim.detector)])
+    neglected = stamp_sizes.neglected_flux(sources.electrons, noise, settings)
+    return Light(sources, sizes, neglected, psf, scene, decisions)
+
+
+def rows_of(rows: Rows, aim: Aim, mission: MissionConfiguration) -> Rows:
+    """Rows as an exposure sees them.
+
+    Bulges have their share of the light in its band, stars are where they are in its middle, and the standard star's
+    is there if it is of one.
+
+    rows : of the catalogues;  aim : the exposure and detector;  mission : the mission database
+    Errors : BadInput for a target that is no standard star
+    """
+    middle = aim.exposure.mjd + 0.5 * aim.exposure.exposure_time_s / 86400.0
+    galaxies = bulges.in_band(rows.galaxies, aim.band, rows.library or templates.galaxy_library())
+    shares = np.asarray(rows.galaxies["bulge_fraction"].to_numpy(), float)
+    rows = replace(rows, galaxies=galaxies, stars=catalogue_rows.at_time(rows.stars, middle), bulges=shares)
+    return standard_stars.with_standards(rows, aim, mission)
+
+
+def psf_of(aim: Aim, scene: Scene, settings: Settings) -> Psf:
+    """The exposure's own, or its channel's; of as many places and colours as the settings say."""
+    if aim.exposure.psf:
+        found = from_file.read(from_file.file_of(aim.exposure.psf, aim.detector.name), aim.detector, aim.band)
+    else:
+        found = aim.channel.psf(aim.exposure, aim.detector, aim.band, scene.mission, settings.positions)
+    return of_colours(found, settings.colours)
+
+
+def _with_pixels(aim: Aim, scene: Scene, psf: Psf, electrons: Float) -> tuple[Psf, tuple[Decision, ...]]:
+    """(PSF with the effect that acts while sources are drawn, decision); electrons : of what is on the frame."""
+    drawn = aim.channel.drawn
+    if drawn is None:
+        return psf, ()
+    peak = float(psf.surface[0]) * float(electrons.max(initial=0.0))
+    scene = replace(scene, peak_electrons=peak)
+    decisions = decide((drawn,), scene)
+    if decisions[0].applied and psf.intra_pixel is not None:
+        (strength,) = drawn.parameters(scene)
+        psf = replace(psf, intra_pixel=strength)
+    return psf, decisions
+
+
+def _no_sources(galaxies: pa.Table) -> Sources:
+    none, whole = np.zeros(0), np.zeros(0, np.int64)
+    return Sources(whole, none, none, np.zeros((0, 2, 2)), none, whole, galaxy_shapes.shapes(galaxies.slice(0, 0)))
+
+
+def least_flux(exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy) -> float:
+    """f_nu of the faintest source that reaches the detector from beyond its selection margin, microjansky.
+
+    Infinite where no source shows: in the dark, or in no time.
+    exposure : its row;  detector : of its camera
+    mission  : the mission database;  accuracy : of the request
+    Error : of the fainter out there each leaves out less than the settings' `edge` of a pixel's noise
+    """
+    time, channel = exposure.exposure_time_s, registry.CHANNELS[exposure.channel]
+    if time == 0.0 or not channel.sees_sky(exposure.image_type):
+        return float("inf")
+    if channel.disperses is not None:
+        noise = scene_of.scene_of(exposure, detector, mission, accuracy).pixel_noise
+        return LEAST_SPECTRUM * noise / (electron_rate(exposure) * time)
+    margin = mission.value("survey.selection_margin", "arcsec")
+    noise = scene_of.scene_of(exposure, detector, mission, accuracy).pixel_noise
+    return stamp_sizes.least_electrons(margin, detector.pixel_scale, noise, settings_for(accuracy)) / (
+        electron_rate(exposure) * time
+    )
+
+
+def spike_flux(
+    exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy, band: Passband
+) -> float:
+    """f_nu of the faintest star whose spikes are noticed from beyond what else is read, microjansky; or infinite.
+
+    exposure, detector, mission, accuracy : as of `least_flux`;  band : passband
+    """
+    time = exposure.exposure_time_s
+    channel = registry.CHANNELS[exposure.channel]
+    pupil_of = channel.pupil
+    if time == 0.0 or not channel.sees_sky(exposure.image_type) or pupil_of is None or exposure.psf:
+        return float("inf")
+    noise = scene_of.scene_of(exposure, detector, mission, accuracy).pixel_noise
+    pupil = pupil_of(detector, band, mission)
+    if pupil is None:
+        return float("inf")
+    (one,) = spikes.reach(pupil, np.ones(1), NOTICEABLE * noise)
+    return float((stamp_sizes.reach(1.0) / one) ** 2 / (electron_rate(exposure) * time))
+
+
+def outer_flux(exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy) -> float:
+    """f_nu of the faintest galaxy that may be noticed from beyond what else is read, microjansky; or infinite.
+
+    exposure, detector, mission, accuracy : as of `least_flux`
+    """
+    time, channel = exposure.exposure_time_s, registry.CHANNELS[exposure.channel]
+    if time == 0.0 or not channel.sees_sky(exposure.image_type) or channel.disperses is not None:
+        return float("inf")
+    noise, scale = scene_of.scene_of(exposure, detector, mission, accuracy).pixel_noise, detector.pixel_scale
+    return outskirts.least_electrons(stamp_sizes.reach(scale), scale, noise) / (electron_rate(exposure) * time)
+
+
+def sources_of(
+    rows: Rows, electrons: tuple[Float, Float], aim: Aim, psf: Psf, noise: float, settings: Settings
+) -> tuple[Sources, Int]:
+    """Everything that shines onto the detector, with its stamp or beyond it, ascending id, and the stamps' sides.
+
+    electrons : expected of each of the galaxies, and of the stars;  noise : of a pixel, e-
+    rows : catalogue rows that the detector may see;  aim : the exposure and detector
+    psf  : of the detector;  settings : of the accuracy
+    """
+    detector, system, every = aim.detector, aim.wcs, listed(rows, electrons)
+    light, shape, picture, form = every.electrons, every.shape, every.picture, every.form
+    farthest = np.where((shape < 0) & (picture < 0), _spikes(light, detector, psf, noise), 0.0)
+    farthest[: len(form)] = _outskirts(light[: len(form)], form, detector, noise)
+    reach = detector.half_diagonal + np.maximum(farthest, stamp_sizes.reach(detector.pixel_scale))
+    seen = selection.near(every.ra, every.dec, astrometry.centre(detector, system), reach / 3600.0) & (light > 0)
+    kept = np.flatnonzero(seen)[np.argsort(every.ids[seen], kind="stable")]
+    column, row = astrometry.pixel_of_sky(system, every.ra[kept], every.dec[kept])
+    wide = np.array([0.0, *(found.diagonal for found in every.pictures)])[picture[kept] + 1] / detector.pixel_scale
+    sizes = stamp_sizes.stamp_sizes(light[kept], shape[kept], form, psf, noise, settings, wide)
+    structure = np.append(disc_structure.sides(_of_all_bands(form, rows), rows.discs), 0.0)[shape[kept]]
+    sizes = stamp_sizes.holding(sizes, structure / detector.pixel_scale)
+    found = Sources(
+        every.ids[kept], column, row, np.zeros((len(kept), 2, 2)), light[kept], shape[kept], form, None,
+        picture[kept], every.pictures,
+    )  # fmt: skip
+    here = stamp_sizes.touching_frame(found, sizes, psf, noise, detector.nx, detector.ny)
+    kept, found = kept[here], found.take(here)
+    colourful = psf.planes is not None and len(psf.planes.wavelength) > 1
+    photons = _colours(every.of[kept], rows, aim.band) if colourful else None
+    jacobian = astrometry.jacobian(system, found.column, found.row)
+    found = replace(found, jacobian=jacobian, photons=photons)
+    return disc_structure.added(found, _of_all_bands(form, rows), rows.discs), sizes[here]
+
+
+def _of_all_bands(form: galaxy_shapes.Shapes, rows: Rows) -> galaxy_shapes.Shapes:
+    """Galaxies with what they have of bulges in the catalogue: what they look like is not another thing in a band."""
+    return form if rows.bulges is None else replace(form, bulge_fraction=rows.bulges)
+
+
+def _spikes(electrons: Float, detector: Detector, psf: Psf, noise: float) -> Float:
+    """[n] arcsec as far as which points' spikes are noticed."""
+    if psf.edges is None:
+        return np.zeros(len(electrons))
+    return spikes.reach(psf.edges, electrons, NOTICEABLE * noise) * detector.pixel_scale
+
+
+def _outskirts(electrons: Float, form: galaxy_shapes.Shapes, detector: Detector, noise: float) -> Float:
+    """[n] arcsec as far as which galaxies are noticed that may be from beyond what else is read, 0 of others."""
+    out, least = np.zeros(len(electrons)), stamp_sizes.reach(detector.pixel_scale)
+    some = np.flatnonzero(electrons > outskirts.least_electrons(least, detector.pixel_scale, noise))
+    out[some] = outskirts.reach(electrons[some], form.take(some), detector.pixel_scale, noise, least)
+    return out
+
+
+def _arcs(
+    lenses: pa.Table | None, galaxies: pa.Table, electrons: Float, form: galaxy_shapes.Shapes
+) -> lensed_arcs.Arcs:
+    """Those of strong lenses: their pictures magnify what the galaxy shines by itself."""
+    rows = STRONG_LENSES.empty().select(lensed_arcs.ARC_COLUMNS) if lenses is None else lenses
+    return lensed_arcs.arcs(rows, galaxies["id"].to_numpy(), electrons / form.magnification)
+
+
+def _with_moving(
+    still: tuple[Sources, Int], aim: Aim, rows: Rows, scene: Scene, psf: Psf, settings: Settings, seed: int
+) -> tuple[Sources, Int, Lights]:
+    """The sources with those that move, whose identifiers are the largest; and bright ones around, as far as read."""
+    (sources, sizes), detector = still, aim.detector
+    reach = (detector.half_diagonal + stamp_sizes.reach(detector.pixel_scale)) / 3600.0
+    found = solar_system.sources(aim, scene.mission, seed, reach, sources.shapes, rows.bodies)
+    length = stamp_sizes.piece_length(found.length)
+    own = stamp_sizes.stamp_sizes(found.electrons, found.shape, found.shapes, psf, scene.pixel_noise, settings, length)
+    wide = stamp_sizes.reaches(found.electrons, own, found.shape, None, psf, scene.pixel_noise, found.length)
+    here = selection.touching(found.column, found.row, wide, detector.nx, detector.ny) & (found.electrons > 0)
+    if not here.any():
+        return sources, sizes, bright_lights.trails(found)
+    return sources.with_moving(found.take(here)), np.concatenate([sizes, own[here]]), bright_lights.trails(found)
+
+
+def touching(sources: Sources, sizes: Int, detector: Detector) -> Bool:
+    """Sources with a stamp on the detector."""
+    return selection.touching(sources.column, sources.row, sizes + sources.length, detector.nx, detector.ny)
+
+
+def _colours(kept: Int, rows: Rows, band: Passband) -> Float:
+    """Photon fractions of the rows that are drawn; `kept` counts on from the galaxies to the stars."""
+    of_galaxy = kept < len(rows.galaxies)
+    out = np.empty((len(kept), sub_bands.PARTS))
+    out[of_galaxy] = colours.galaxies(rows.galaxies.take(kept[of_galaxy]), band, rows.library)
+    out[~of_galaxy] = colours.stars(rows.stars.take(kept[~of_galaxy] - len(rows.galaxies)), band, rows.stellar)
+    return out
+
+
+def _check(ids: Int, electrons: Float) -> None:
+    if len(np.unique(ids)) != len(ids):
+        raise BadInput("a source is given twice")
+    bad = ~((electrons >= 0) & (electrons <= _MOST_ELECTRONS))
+    if bad.any():
+        raise BadInput(f"source {ids[np.argmax(bad)]}: {electrons[np.argmax(bad)]} electrons, outside 0 .. 1e17")
+
+
+def fluxes_of(rows: pa.Table, fluxes: pa.Table, column: str) -> Float:
+    """float64[n] f_nu of catalogue rows, microjansky; BadInput where the flux table is not of the same rows."""
+    if column not in fluxes.column_names:
+        raise BadInput(f"the flux table has no column {column}")
+    if len(rows) != len(fluxes) or not np.array_equal(rows["id"].to_numpy(), fluxes["id"].to_numpy()):
+        raise BadInput("the flux table is not of the same rows as its catalogue")
+    return np.asarray(fluxes[column].to_numpy(), float)

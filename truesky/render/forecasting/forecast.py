@@ -1,0 +1,114 @@
+"""What a plan will cost, before anything is rendered.
+
+rows     a line a channel, survey and image type, one a channel, one in all: exposures, detectors, core-hours, storage
+of_parts the same of a plan in parts
+text     the table that a person reads
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import pyarrow as pa
+
+from truesky.render.forecasting.speed import Speed
+
+# Columns of `tasks` that a forecast adds up; what stands for all surveys of a channel.
+SUMMED = ("sources", "seconds", "bytes", "memory")
+_ALL = "all"
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One kind of exposure."""
+
+    channel: str
+    survey: str
+    image_type: str
+    exposures: int
+    detectors: int
+    sources: int
+    core_hours: float
+    gigabytes: float
+    memory_gb: float
+
+
+def rows(exposures: pa.Table, tasks: pa.Table, factor: float = 1.0) -> list[Line]:
+    """Sums by channel, survey and image type, in that order; by channel; of everything.
+
+    factor : CPU s of the machine that is asked about over those of `tasks` (speed.of_machine)
+    """
+    about = exposures.select(["exposure_id", "survey", "image_type"])
+    joined = tasks.select(["exposure_id", "detector", "channel", *SUMMED]).join(about, "exposure_id")
+    keys = ["channel", "survey", "image_type"]
+    sums = joined.group_by(keys).aggregate(
+        [
+            ("exposure_id", "count_distinct"),
+            ("detector", "count"),
+            ("sources", "sum"),
+            ("seconds", "sum"),
+            ("bytes", "sum"),
+            ("memory", "max"),
+        ]
+    )
+    return _with_sums([_line(row, factor) for row in sums.to_pylist()])
+
+
+def of_parts(parts: Iterable[tuple[pa.Table, pa.Table]], factor: float = 1.0) -> list[Line]:
+    """As `rows`, of a plan of which a part comes after the other: exposures, and the tasks of these."""
+    return _with_sums([line for own in parts for line in rows(*own, factor) if line.survey != _ALL])
+
+
+def _with_sums(lines: list[Line]) -> list[Line]:
+    own: dict[tuple[str, str, str], list[Line]] = defaultdict(list)
+    for line in lines:
+        own[line.channel, line.survey, line.image_type].append(line)
+    kinds = [_sum(*key, some) for key, some in sorted(own.items())]
+    channels = sorted({line.channel for line in kinds})
+    of_channels = [_sum(name, _ALL, "", [line for line in kinds if line.channel == name]) for name in channels]
+    return [*kinds, *of_channels, _sum("all", _ALL, "", kinds)]
+
+
+def _sum(channel: str, survey: str, image_type: str, lines: list[Line]) -> Line:
+    return Line(
+        channel,
+        survey,
+        image_type,
+        sum(line.exposures for line in lines),
+        sum(line.detectors for line in lines),
+        sum(line.sources for line in lines),
+        sum(line.core_hours for line in lines),
+        sum(line.gigabytes for line in lines),
+        max((line.memory_gb for line in lines), default=0.0),
+    )
+
+
+def _line(row: dict[str, Any], factor: float) -> Line:
+    return Line(
+        row["channel"],
+        row["survey"],
+        row["image_type"],
+        row["exposure_id_count_distinct"],
+        row["detector_count"],
+        row["sources_sum"],
+        row["seconds_sum"] * factor / 3600.0,
+        row["bytes_sum"] / 1e9,
+        row["memory_max"],
+    )
+
+
+def text(lines: list[Line], speed: Speed) -> Iterator[str]:
+    """The forecast as lines of text; the last says whose core-hours they are."""
+    yield (
+        f"{'channel':8} {'survey':12} {'image type':17} {'exposures':>10} {'detectors':>10} {'sources':>14} "
+        f"{'core-hours':>11} {'GB':>10} {'peak GB':>8}"
+    )
+    for line in lines:
+        yield (
+            f"{line.channel:8} {line.survey:12} {line.image_type:17} {line.exposures:10,} {line.detectors:10,} "
+            f"{line.sources:14,} {line.core_hours:11,.2f} {line.gigabytes:10,.2f} {line.memory_gb:8.2f}"
+        )
+    yield f"core-hours are of this machine, {speed.source}: {speed.factor:.2f} of those of the channels' costs"

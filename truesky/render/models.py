@@ -1,0 +1,106 @@
+"""Expected light of single sources in a published image of spectra: to test how well they are told from one another.
+
+    python -m truesky.render.models --lake LAKE [--name REQUEST] --exposure N --detector NAME --sources ID ..
+                                 [--orders] --out FILE.fits
+
+Each source is drawn as it was in the image, by itself.  The file has an extension a source, SRC_ID, cut to the pixels
+that have light; its first pixel is at (X0, Y0) of the detector, 0-based.  With --orders it has one for each order.
+The sum of all sources is the image's truth map `noise_free` to the rounding of float32 in files, 1e-7; the float64
+frames of `models` add up exactly to the float64 noise-free frame.
+
+models    of an image of a lake
+frame     an extension as a whole frame
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from lake_schema import command, user_files
+from lake_schema.arrays import Float
+from lake_schema.errors import BadInput
+from lake_schema.fits.images import Image, write_images
+from lake_schema.store import layout, read
+from truesky.render import render_exposures
+from truesky.render.exposure import alone
+from truesky.render.exposure.alone import Alone
+
+
+def models(
+    root: Path, exposure: int, detector: str, ids: Sequence[int] | None = None, request: str | None = None
+) -> Iterator[Alone]:
+    """Of sources of a published image, None = of all.
+
+    root : folder of the lake;  exposure, detector : of the image;  ids : of the sources
+    request : whose image, where a lake has those of several
+    Errors  : BadInput where there is no such image, or no light of a source in it
+    """
+    version = read.version(root, "products", request=request)
+    wanted = {"exposure_id": exposure, "detector": detector}
+    parts = [part["facts"] for part in version.manifest["parts"] if wanted.items() <= part["facts"].items()]
+    if not parts:
+        raise BadInput(f"table products has no detector {detector} of exposure {exposure}")
+    facts = {**version.manifest["facts"], **parts[0]}
+    aim, rows, own = render_exposures.prepared(root, facts)
+    return alone.spectra(aim, rows, own, facts["request"]["seed"], ids)
+
+
+def frame(image: Image, shape: tuple[int, int]) -> Float:
+    """float64[ny, nx] electrons of an extension; shape : ny, nx of the detector."""
+    out, cards = np.zeros(shape), {key: value for key, value, _ in image.cards}
+    if image.data is not None:
+        (height, width), left, low = image.data.shape, int(cards["X0"]), int(cards["Y0"])
+        out[low : low + height, left : left + width] = image.data
+    return out
+
+
+def _extension(number: int, order: int | None, light: Float) -> Image:
+    """Cut to what is not dark, one pixel at least."""
+    rows, columns = (np.flatnonzero((light != 0.0).any(axis=axis)) for axis in (1, 0))
+    low, high = (rows[0], rows[-1] + 1) if len(rows) else (0, 1)
+    left, right = (columns[0], columns[-1] + 1) if len(columns) else (0, 1)
+    cards = (
+        ("SRC_ID", number, "source"),
+        *((("ORDER", order, "of the grism"),) if order is not None else ()),
+        ("X0", int(left), "column of the first pixel, 0-based"),
+        ("Y0", int(low), "row of the first pixel, 0-based"),
+        ("BUNIT", "electron", "unit of the pixels: expected, of this source"),
+    )
+    name = f"{number}" if order is None else f"{number}.{order}"
+    return Image(light[low:high, left:right].astype(np.float32), cards, name)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Prints a line a source: its electrons on the detector."""
+    parser = argparse.ArgumentParser(
+        prog="python -m truesky.render.models", description=(__doc__ or "").splitlines()[0]
+    )
+    parser.add_argument("--lake", required=True, help="folder of the lake, with rendered images of spectra")
+    parser.add_argument("--name", help="of the request whose images are meant, where the lake has several")
+    parser.add_argument("--exposure", type=int, required=True, help="number of the exposure")
+    parser.add_argument("--detector", required=True, help="name of the detector")
+    parser.add_argument("--sources", type=int, nargs="+", required=True, metavar="ID", help="identifiers")
+    parser.add_argument("--orders", action="store_true", help="an extension for each order of each source")
+    parser.add_argument("--out", type=Path, required=True, help="FITS file")
+    options = parser.parse_args(argv)
+    return command.status("models", lambda: _written(options))
+
+
+def _written(options: argparse.Namespace) -> int:
+    out = user_files.target(options.out, (".fits",))
+    ids = list(dict.fromkeys(options.sources))
+    images = [Image(None, (("EXPOSURE", options.exposure, "exposure"), ("DETECTOR", options.detector, "detector")))]
+    for one in models(layout.lake(options.lake), options.exposure, options.detector, ids, options.name):
+        layers = one.orders.items() if options.orders else [(None, one.frame)]
+        images += [_extension(one.id, order, light) for order, light in layers]
+        print(f"{one.id}: {one.frame.sum():.6g} electrons")
+    write_images(out, images)
+    return 0
+
+
+if __name__ == "__main__":
+    command.leave(main)

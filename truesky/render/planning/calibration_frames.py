@@ -1,0 +1,200 @@
+"""Calibration exposures: bias, dark, flat, injected charge, and what the sky is looked at for besides surveys.
+
+exposures   what an observation block of one of these types asks for
+TARGETS     what an image type is of
+
+Ref : Serrano et al. 2024, section 5.1 and the table of the pilot phase's products
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+from lake_schema.arrays import Float
+from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import MissionConfiguration
+from truesky.randomness import rng
+from truesky.render.camera import pointing
+from truesky.render.camera.lamps import LAMPS
+from truesky.render.channels import image_types, registry
+from truesky.render.effects.readout import trap_pumping
+from truesky.render.planning import after_bright, lit_flats
+from truesky.render.planning.observing_sequence import FILTERS, RED, SETTINGS, offsets
+from truesky.render.planning.planned_exposures import Exposure, bands_of, elapsed_time, exposure_time, through_grism
+from truesky.render.sky.solar_aspect import check_aspect, next_allowed, position_angle
+from truesky.request.observations import Observation
+
+_DAY_S = 86400.0
+# What an image type is of (two standard stars: Serrano et al. 2024).
+TARGETS = {
+    "standard_star": ("Vega", "white dwarf DA"),
+    "planetary_nebula": ("planetary nebula",),
+    "bleeding": ("Vega",),
+    "stray_light": ("Vega",),
+    "white_dwarf": ("white dwarf DA",),
+}
+# Of an image type what every one of its exposures may be asked for: key of the request, of the mission, and unit.
+_ASKED = (("magnitude", "magnitude", "mag"), ("distance_deg", "distance", "deg"))
+# Frames of trap pumping that the mission lists.
+_PHASE_TIMES = 4
+# From the end of a frame to the start of the next, s: the slowest of the read-outs.
+_PAUSE = 90.0
+
+
+def exposures(
+    block: Observation, camera: str, centre: tuple[float, float], mission: MissionConfiguration, seed: int, start: float
+) -> Iterator[Exposure]:
+    """Exposures of each channel of a calibration block, one after another.
+
+    camera : of the ground survey, where the channel is EXT
+    centre : ra, dec deg of the block's own field or of the request's area
+    block  : of the request;  mission : the mission database;  seed : of the request;  start : MJD
+    """
+    own = [registry.CHANNELS[channel] for channel in block.channels]
+    of_sky = block.image_type == "persistence" and block.bright == "sky"
+    if of_sky or any(not channel.on_ground and block.image_type in channel.sky_types for channel in own):
+        if block.mjd is None:
+            start = next_allowed(*centre, start, mission)
+        check_aspect(*centre, start, mission, "mjd")
+    now = start
+    for channel in block.channels:
+        name = camera if channel == "EXT" else "vis" if channel == "VIS" else "nisp"
+        angle = block.position_angle
+        if angle is None:
+            angle = 0.0 if channel == "EXT" else position_angle(*centre, start)
+        first = Exposure(
+            channel, name, "", block.image_type, *centre, angle, start, 0.0, "calibration", detectors=block.detectors
+        )
+        if block.image_type == "persistence":
+            for frame in after_bright.exposures(first, block, mission, now):
+                yield frame
+                now = after_bright.forgotten(frame, mission)
+            continue
+        for frame in _frames(first, block, mission, seed):
+            yield replace(frame, mjd=now)
+            # A ramp is read out meanwhile, and longer where it has few groups.
+            now += max(frame.exposure_time_s + _PAUSE, elapsed_time(frame, mission)) / _DAY_S
+
+
+def _frames(first: Exposure, block: Observation, mission: MissionConfiguration, seed: int) -> Iterator[Exposure]:
+    in_bands = [
+        replace(first, band=band, exposure_time_s=_seconds(first, band, block, mission))
+        for band in lit_flats.chosen(block.bands, _bands(first, block, mission))
+    ]
+    if first.image_type == "self_calibration":
+        dithers = block.exposures or int(mission.value("survey.self_calibration.dithers"))
+        for i, (x, y) in enumerate(_scattered(first.camera, dithers, mission, seed)):
+            yield from (replace(_moved(frame, x, y), dither=i + 1) for frame in in_bands)
+    elif first.image_type in TARGETS:
+        yield from _targets([_asked(frame, block) for frame in in_bands], block, mission, seed)
+    elif first.image_type == "defocus":
+        yield from _out_of_focus(in_bands, block, mission, seed)
+    elif first.image_type == "trap_pumping":
+        yield from _pumped(in_bands[0], block, mission)
+    elif not block.exposures:
+        raise BadInput(f"an observation of image_type {first.image_type} wants exposures = how many frames")
+    elif first.image_type == "flat" and first.camera in LAMPS:
+        lit = lit_flats.by_lamp(in_bands, block, mission)
+        for i in range(block.exposures):
+            turn, own = i // len(lit), lit[i % len(lit)]
+            yield from lit_flats.at_levels(own[turn % len(own)], block, mission)
+    else:
+        lamp = 1 if first.image_type == "flat" else None
+        for i in range(block.exposures):
+            frame = replace(in_bands[i % len(in_bands)], lamp=lamp)
+            yield from lit_flats.at_levels(frame, block, mission) if lamp else [frame]
+
+
+def _pumped(frame: Exposure, block: Observation, mission: MissionConfiguration) -> Iterator[Exposure]:
+    """Frames without rows between the injected ones; charge has time to gather while it is pumped."""
+    section = image_types.section(frame.camera)
+    listed = [mission.value(f"{section}.pumping.phase_time_{i + 1}", "s") for i in range(_PHASE_TIMES)]
+    for phase in block.phase_times_s or listed:
+        own = ((f"{section}.injection.off", 0.0, "pix"), (f"{section}.pumping.phase_time", phase, "s"))
+        seconds = trap_pumping.duration(phase, section, mission)
+        for _ in range(block.exposures or 1):
+            yield replace(frame, exposure_time_s=seconds, parameters=own)
+
+
+def _out_of_focus(
+    in_bands: Sequence[Exposure], block: Observation, mission: MissionConfiguration, seed: int
+) -> Iterator[Exposure]:
+    """At each place all wavefronts, one after the other."""
+    nominal = mission.value("survey.defocus.wavefront", "nm")
+    for frame in _dithered(in_bands, block, mission, seed):
+        key = f"{image_types.section(frame.camera)}.psf.defocus"
+        for nm in block.defocus_nm or (-nominal, nominal):
+            yield replace(frame, parameters=((key, nm, "nm"),))
+
+
+def _asked(frame: Exposure, block: Observation) -> Exposure:
+    """With what the block asks of its target instead of what the mission says."""
+    values = ((getattr(block, asked), key, unit) for asked, key, unit in _ASKED)
+    own = tuple((f"survey.{block.image_type}.{key}", value, unit) for value, key, unit in values if value is not None)
+    return replace(frame, parameters=own)
+
+
+def _seconds(first: Exposure, band: str, block: Observation, mission: MissionConfiguration) -> float:
+    if first.image_type in ("bias", "charge_injection", "trap_pumping"):
+        return 0.0
+    if block.exposure_time_s is not None:
+        return block.exposure_time_s
+    key = f"{image_types.section(first.camera)}.exposure_time_flat"
+    if first.image_type == "flat" and key in mission:
+        return mission.value(key, "s")
+    return exposure_time(first.channel, first.camera, band, mission)
+
+
+def _bands(first: Exposure, block: Observation, mission: MissionConfiguration) -> tuple[str, ...]:
+    if first.channel == "NISP-P":
+        # A dark needs no filter; the closing position is that of the last, or of those that are named.
+        return FILTERS[-1:] if first.image_type == "dark" and not block.bands else FILTERS
+    if first.channel == "NISP-S":
+        return (RED,)
+    return bands_of(first.channel, first.camera, mission)[
+        : 1 if first.image_type in ("bias", "dark", "charge_injection", "trap_pumping") else None
+    ]
+
+
+def _targets(
+    in_bands: Sequence[Exposure], block: Observation, mission: MissionConfiguration, seed: int
+) -> Iterator[Exposure]:
+    """Each target in each band, or in each setting of the grisms, dithered."""
+    kind, channel = in_bands[0].image_type, in_bands[0].channel
+    # A nebula is seen in every setting, a star in one a dither.
+    settings = SETTINGS if kind == "planetary_nebula" else 1
+    for target in TARGETS[kind]:
+        for setting in range(settings):
+            for frame in _dithered(in_bands, block, mission, seed):
+                moved = replace(frame, target=target)
+                number = setting if settings > 1 else ((frame.dither or 1) - 1) % SETTINGS
+                yield _through_grism(moved, number, mission) if channel == "NISP-S" else moved
+
+
+def _dithered(
+    in_bands: Sequence[Exposure], block: Observation, mission: MissionConfiguration, seed: int
+) -> Iterator[Exposure]:
+    """All bands at each place of the pattern."""
+    kind, channel = in_bands[0].image_type, in_bands[0].channel
+    steps = offsets("S", mission, seed, kind, channel)
+    for i in range(block.exposures or int(mission.value(f"survey.{kind}.dithers"))):
+        for frame in in_bands:
+            yield replace(_moved(frame, *steps[i % len(steps)]), dither=i + 1)
+
+
+def _through_grism(frame: Exposure, number: int, mission: MissionConfiguration) -> Exposure:
+    key = f"survey.grism_angle_{number + 1}"
+    return through_grism(frame, mission.value(key, "deg"), mission, key)
+
+
+def _scattered(camera: str, dithers: int, mission: MissionConfiguration, seed: int) -> Float:
+    """[dithers, 2] arcsec: uniform within half a detector and its gap, both ways."""
+    fpa = {key: mission.value(f"{camera}.fpa.{key}") for key in ("nx", "ny", "pixel_scale", "gap_x", "gap_y")}
+    half = [0.5 * (fpa[f"n{axis}"] * fpa["pixel_scale"] + fpa[f"gap_{axis}"]) for axis in "xy"]
+    return rng.stream(seed, "self_calibration", camera).uniform(-1.0, 1.0, (dithers, 2)) * half
+
+
+def _moved(frame: Exposure, x: float, y: float) -> Exposure:
+    ra, dec = pointing.sky_of_plane([x], [y], frame.ra, frame.dec, frame.position_angle)
+    return replace(frame, ra=float(ra[0]), dec=float(dec[0]))

@@ -1,0 +1,262 @@
+"""Ground surveys: pointings from each survey's rule, or from a user's table.
+
+exposures    of one survey over an area
+read         a table of pointings, CSV
+by_day       what of a plan is dated when it is not night, as a line
+
+Ref : Serrano et al. 2024, appendix on the survey files of the eighth science challenge
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import MissionConfiguration
+from truesky.randomness import rng
+from truesky.render.camera import detectors as camera_detectors
+from truesky.render.camera import pointing
+from truesky.render.camera.detectors import Detector
+from truesky.render.channels import image_types, registry
+from truesky.render.planning import calibration_frames
+from truesky.render.planning.planned_exposures import Exposure, bands_of, exposure_time, through_grism
+from truesky.render.sky.observatory import Site, next_dark, sun_altitude
+from truesky.render.sky.solar_aspect import next_allowed, position_angle
+from truesky.request import pointing_tables
+from truesky.request.area import Area
+from truesky.request.observations import Observation
+from truesky.request.pointing_tables import Row
+
+_DAY_S, _OVERHEAD_S = 86400.0, 30.0
+# Nautical twilight: the Sun brightens the sky while it is higher, deg.
+_NIGHT = -12.0
+
+
+def camera_of(survey: str, mission: MissionConfiguration) -> str:
+    """The camera of a survey."""
+    return _rules(survey, mission)[0]["camera"]
+
+
+def exposures(
+    block: Observation, area: Area, mission: MissionConfiguration, seed: int, start: float
+) -> Iterator[Exposure]:
+    """The exposures of a survey over an area: as many as are asked for, else one layer; or of a field of its own.
+
+    Bands that the survey takes together are taken at the same places. They follow one another from the start on;
+    without a date of the block's, each when its field is next up at night. The telescope misses its place by the
+    survey's error.
+    block   : of the request, with its survey and bands;  area : of the request
+    mission : the mission database;  seed : of the request;  start : MJD
+    """
+    now = start
+    rules = _rules(block.survey, mission)
+    groups = [tuple(rule["bands"].split()) for rule in rules]
+    if block.bands:
+        groups = [tuple(band for band in group if band in block.bands) for group in groups]
+    for rule, bands in zip(rules, groups, strict=True):
+        if not bands:
+            continue
+        section = image_types.section(rule["camera"])
+        site, error = Site.of(section, mission), mission.value(f"{section}.pointing_error", "arcsec")
+        places = _places(rule, block, area, mission, seed) if block.place is None else _own(block)
+        for i, (ra, dec) in enumerate(places):
+            # Where the survey shares its exposures among bands, they take turns.
+            whole = rule["shared"] == "0" or (block.place is not None and not block.exposures)
+            turn = bands if whole else (bands[i % len(bands)],)
+            for band in turn:
+                seconds = _seconds(rule, band, mission) if block.exposure_time_s is None else block.exposure_time_s
+                now = next_dark(ra, dec, now, site) if block.mjd is None else now
+                there = _missed((ra, dec), error, rng.stream(seed, "pointing", block.survey, band, i))
+                yield Exposure(
+                    channel="EXT",
+                    camera=rule["camera"],
+                    band=band,
+                    image_type=block.image_type,
+                    ra=there[0],
+                    dec=there[1],
+                    position_angle=block.position_angle or 0.0,
+                    mjd=now,
+                    exposure_time_s=seconds,
+                    survey=block.survey,
+                    field=i + 1,
+                    detectors=block.detectors,
+                )
+                now += (seconds + _OVERHEAD_S) / _DAY_S
+
+
+def _seconds(rule: Mapping[str, str], band: str, mission: MissionConfiguration) -> float:
+    """Exposure time of a survey in a band: the band's own, where the camera has one."""
+    own = f"{image_types.section(rule['camera'])}.{band}.exposure_time"
+    return mission.value(own, "s") if own in mission else float(rule["exposure_time_s"])
+
+
+def _missed(place: tuple[float, float], error: float, rng: np.random.Generator) -> tuple[float, float]:
+    """Where a telescope points that misses a place by an error, arcsec rms of each coordinate; as it is without one."""
+    if error == 0.0:
+        return place
+    east, north = error * rng.standard_normal(2)
+    ra, dec = pointing.sky_of_plane(np.array([-east]), np.array([north]), *place, 0.0)
+    return float(ra[0]), float(dec[0])
+
+
+def _rules(survey: str, mission: MissionConfiguration) -> list[Mapping[str, str]]:
+    return [row for row in mission.rows("survey.external") if row["survey"] == survey]
+
+
+def _places(
+    rule: Mapping[str, str], block: Observation, area: Area, mission: MissionConfiguration, seed: int
+) -> list[tuple[float, float]]:
+    """Pointings of a pattern, in passes over the area, those nearest to it kept."""
+    detectors = camera_detectors.detectors(rule["camera"], mission)
+    x, y = pointing.outline(detectors)
+    half = [0.5 * float(axis.max() - axis.min()) / 3600.0 for axis in (x, y)]
+    margin = float(rule["margin_deg"])
+    if rule["pattern"] == "chips":
+        return _by_chips(detectors, half, block.exposures, area, margin)
+    count = block.exposures
+    # As large a step as the filled part of a round field allows: neighbours just touch.
+    filled = 0.9
+    passes = max(int(rule["passes"]), 1)
+    if not count:
+        return [place for k in range(passes) for place in _pass(area, half, filled, margin, k, seed, rule["survey"])]
+    lo, hi = 0.02, 20.0
+    for _ in range(40):
+        middle = np.sqrt(lo * hi)
+        found = sum(len(_pass(area, half, middle, margin, k, seed, rule["survey"])) for k in range(passes))
+        lo, hi = (middle, hi) if found >= count else (lo, middle)
+    places = [place for k in range(passes) for place in _pass(area, half, lo, margin, k, seed, rule["survey"])]
+    depth = area.depth(*np.array(places).T)
+    kept = np.sort(np.argsort(-depth, kind="stable")[:count])
+    return [places[i] for i in kept]
+
+
+def _own(block: Observation) -> list[tuple[float, float]]:
+    """The place of an observation's own with its dithers, as often as exposures are asked for, else once each."""
+    assert block.place is not None
+    steps = np.zeros((1, 2)) if isinstance(block.dither, str) else np.array(block.dither)
+    ra, dec = pointing.sky_of_plane(steps[:, 0], steps[:, 1], *block.place, block.position_angle or 0.0)
+    count = block.exposures or len(steps)
+    return [(float(ra[i % len(steps)]), float(dec[i % len(steps)])) for i in range(count)]
+
+
+def _pass(
+    area: Area, half: list[float], step: float, margin: float, number: int, seed: int, survey: str
+) -> list[tuple[float, float]]:
+    """One pass: rows of declination, each row equally spaced, the whole shifted at random from pass to pass."""
+    ra0, dec0, radius = area.bounds()
+    reach = radius + margin
+    step_x, step_y = 2 * half[0] * step, 2 * half[1] * step
+    shift = rng.stream(seed, "pattern", survey, number).random(2)
+    rows = dec0 + (np.arange(np.floor(-reach / step_y) - 1, np.ceil(reach / step_y) + 1) + shift[1]) * step_y
+    lon, lat = [], []
+    for dec in rows[np.abs(rows) < 90.0]:
+        width = step_x / max(np.cos(np.radians(dec)), 1e-3)
+        across = min(reach / max(np.cos(np.radians(min(abs(dec), 89.0))), 1e-3), 180.0)
+        row = ra0 + (np.arange(np.floor(-across / width), np.ceil(across / width) + 1) + shift[0]) * width
+        row = row[: int(np.ceil(360.0 / width))]
+        lon.append(row % 360.0)
+        lat.append(np.full(row.size, dec))
+    if not lon:
+        return []
+    ra, dec = np.concatenate(lon), np.concatenate(lat)
+    near = area.contains(ra, dec, margin)
+    return list(zip(ra[near].tolist(), dec[near].tolist(), strict=True))
+
+
+def _by_chips(
+    detectors: tuple[Detector, ...], half: list[float], count: int, area: Area, margin: float
+) -> list[tuple[float, float]]:
+    """Each pointing as often as there are detectors, shifted so that every one of them sees its centre."""
+    base = _pass(area, half, 1.0, margin, 0, 0, "chips")
+    wanted = int(np.ceil(count / len(detectors))) if count else len(base)
+    lo, hi = 0.02, 20.0
+    for _ in range(40):
+        middle = np.sqrt(lo * hi)
+        lo, hi = (middle, hi) if len(_pass(area, half, middle, margin, 0, 0, "chips")) >= wanted else (lo, middle)
+    base = _pass(area, half, lo, margin, 0, 0, "chips") if count else base
+    depth = area.depth(*np.array(base).T)
+    base = [base[i] for i in np.sort(np.argsort(-depth, kind="stable")[:wanted])]
+    places = []
+    for ra, dec in base:
+        x, y = np.array([[-d.x, -d.y] for d in detectors]).T
+        lon, lat = pointing.sky_of_plane(x, y, ra, dec, 0.0)
+        places += list(zip(lon.tolist(), lat.tolist(), strict=True))
+    return places[:count] if count else places
+
+
+def by_day(exposures: Iterable[Exposure], mission: MissionConfiguration) -> str:
+    """A line about ground exposures of the sky that are dated by day or in twilight, empty where there are none."""
+    found, count = [], 0
+    sites: dict[str, Site] = {}
+    for row in exposures:
+        own = registry.CHANNELS[row.channel]
+        if not (own.on_ground and own.sees_sky(row.image_type)):
+            continue
+        count += 1
+        if row.camera not in sites:
+            sites[row.camera] = Site.of(image_types.section(row.camera), mission)
+        high = float(sun_altitude(np.array([row.mjd]), sites[row.camera])[0])
+        if high > _NIGHT:
+            found.append((high, row))
+    if not found:
+        return ""
+    high, row = max(found, key=lambda one: one[0])
+    what = f"{len(found)} of {count} exposures of the sky are dated when the Sun is above {_NIGHT:g} deg"
+    where = f"{row.camera} on MJD {row.mjd:.3f}, the Sun at {high:+.0f} deg"
+    return f"EXT: {what} ({where}): their sky has no light of the Sun; without a date a survey observes at night"
+
+
+# ------------------------------------------------------------------------------------------------ tables
+
+
+def read(path: Path, block: Observation, mission: MissionConfiguration) -> list[Exposure]:
+    """Exposures of a table of pointings (truesky.request.pointing_tables), with what its rows leave to the mission.
+
+    Errors : BadInput names the file, the line and the column
+    """
+    rows = pointing_tables.read(path, block.channels, block.image_type)
+    return [_of_row(row, number, block, mission) for number, row in enumerate(rows, start=1)]
+
+
+def _of_row(row: Row, number: int, block: Observation, mission: MissionConfiguration) -> Exposure:
+    camera = row.camera or camera_of(block.survey, mission)
+    try:
+        bands = bands_of(row.channel, camera, mission)
+    except BadInput as error:
+        raise BadInput(f"{row.where}: {error}") from None
+    if row.band not in bands:
+        raise BadInput(f"{row.where}: camera {camera} has no band {row.band!r} ({', '.join(bands)})")
+    mjd, angle = row.mjd if row.mjd is not None else block.mjd, row.position_angle
+    euclid = row.channel != "EXT"
+    if mjd is None:
+        mjd = mission.value("svm.launch", "d")
+        if euclid:
+            mjd = next_allowed(row.ra, row.dec, mjd, mission)
+        else:
+            mjd = next_dark(row.ra, row.dec, mjd, Site.of(image_types.section(camera), mission))
+    if angle is None:
+        angle = position_angle(row.ra, row.dec, mjd) if euclid else 0.0
+    seconds = block.exposure_time_s if row.exposure_time_s is None else row.exposure_time_s
+    found = Exposure(
+        channel=row.channel,
+        camera=camera,
+        band=row.band,
+        image_type=row.image_type,
+        ra=row.ra,
+        dec=row.dec,
+        position_angle=angle,
+        mjd=mjd,
+        exposure_time_s=exposure_time(row.channel, camera, row.band, mission) if seconds is None else seconds,
+        survey=block.survey,
+        field=number,
+        target=calibration_frames.TARGETS.get(row.image_type, (None,))[0],
+        sky=row.sky,
+        seeing=row.seeing,
+        zero_point=row.zero_point,
+        psf=row.psf,
+        detectors=row.detectors or block.detectors,
+    )
+    return through_grism(found, row.grism_angle, mission, f"{row.where}: grism_angle")

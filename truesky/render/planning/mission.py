@@ -1,0 +1,31 @@
+"""The mission configuration and the user's passbands of a request."""
+
+from lake_schema.errors import BadInput
+from lake_schema.mission import configuration
+from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.store.plan import Json
+from truesky.fluxes import inputs
+from truesky.fluxes.passbands import Passband
+from truesky.request.files import UserCurves
+from truesky.request.schema import MissionChoice, Request
+
+# What of a request decides which exposures are taken and what they cost.
+PARTS = ("seed", "area", "universe", "pointings", "observations", "explore", "truth", "psfs")
+
+
+def mission_of(choice: MissionChoice) -> MissionConfiguration:
+    """The mission configuration that a request chooses."""
+    overrides = {key: (override.value, override.unit) for key, override in choice.overrides}
+    return configuration.resolve(ladder=choice.ladder, overrides=overrides)
+
+
+def user_filters(request: Request) -> tuple[dict[str, Passband], Json]:
+    """The request's own passbands that it points in, by name, and their sha256 as facts of a plan."""
+    wanted = {pointing.band for pointing in request.pointings}
+    given = UserCurves(tuple(own for own in request.curves.passbands if own[0] in wanted))
+    found, origins = inputs.filters(given)
+    for name, band in found.items():
+        if band.response.max() > 1.0:
+            what = f"responds with {band.response.max():.4g}: a pointing wants the fraction of photons detected"
+            raise BadInput(f"{inputs.FILTER}{name}: {what}")
+    return found, {"files": {key: origin.sha256 for key, origin in origins.items()}} if found else {}

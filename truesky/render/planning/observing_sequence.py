@@ -1,0 +1,164 @@
+"""The observing sequence of a field: dithers, and in each of them VIS with NISP-S, then the filters.
+
+offsets     where the dithers of a pattern point, with the errors of the steps
+sequence    the exposures of one visit of a field
+
+Ref : Serrano et al. 2024, section 3.2 and the figure of the observing sequence
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lake_schema.arrays import Float
+from lake_schema.mission.configuration import MissionConfiguration
+from truesky.randomness import rng
+from truesky.render.camera import pointing
+from truesky.render.camera.lamps import LEDS
+from truesky.render.effects.charge import ramp
+from truesky.render.planning.planned_exposures import Exposure, exposure_time, through_grism
+from truesky.render.planning.reference_survey import Field
+from truesky.request.observations import Observation
+
+_DAY_S = 86400.0
+# The filters in the order they come after the grism, and the passband of each grism.
+FILTERS = ("euclid_j", "euclid_h", "euclid_y")
+RED, BLUE = "nisp_red", "nisp_blue"
+# Angles at which spectra run in turn: survey.grism_angle_1 and so on.
+SETTINGS = 4
+
+
+def offsets(pattern: str, mission: MissionConfiguration, seed: int, *key: int | str) -> Float:
+    """[dithers, 2] arcsec along the focal plane's x and y from the field's own pointing.
+
+    pattern : "S", "J" or "none";  key : what the errors of the steps are drawn for
+    """
+    if pattern == "none":
+        return np.zeros((1, 2))
+    names = ["dither_1", "dither_2", "dither_3", "dither_4" if pattern == "S" else "dither_j_4"]
+    planned = np.array([[mission.value(f"survey.{name}.{axis}", "arcsec") for axis in "xy"] for name in names])
+    # Three sigma of each step; the first pointing is where it was asked for.
+    sigma = mission.value("svm.aocs.pointing_error", "arcsec") / 3.0
+    errors = rng.stream(seed, "dithers", *key).normal(0.0, sigma, planned.shape)
+    errors[0] = 0.0
+    return planned + np.cumsum(errors, axis=0)
+
+
+def sequence(
+    field: Field, block: Observation, survey: str, mission: MissionConfiguration, seed: int
+) -> Iterator[Exposure]:
+    """The exposures of one visit of a field, in the order they begin.
+
+    field   : where, and when it is visited;  block : of the request;  survey : name that exposures have
+    mission : the mission database;  seed : of the request
+    """
+    if isinstance(block.dither, str):
+        # Fields of the user's own have no number: their places tell them apart.
+        place = () if block.place is None else tuple(angle.hex() for angle in block.place)
+        steps = offsets(block.dither, mission, seed, survey, field.number, field.visit, *place)
+        # The pattern is laid about the field's centre.
+        steps = steps - steps.mean(axis=0)
+    else:
+        # Of the user's own: taken as they are.
+        steps = np.array(block.dither)
+    ra, dec = pointing.sky_of_plane(steps[:, 0], steps[:, 1], field.ra, field.dec, field.position_angle)
+    length = _dither_time(mission)
+    for i in range(len(steps)):
+        start = field.mjd + i * (length + mission.value("svm.dither_slew_time", "s")) / _DAY_S
+        at = _At(block, field, survey, mission, float(ra[i]), float(dec[i]), start, i + 1)
+        yield from at.exposures(last=i + 1 == len(steps))
+
+
+def _dither_time(mission: MissionConfiguration) -> float:
+    """Seconds from the start of a dither to the end of its last filter."""
+    spectrum, photometry = (_commanded(kind, mission) for kind in ("spectroscopic", "photometric"))
+    settle, to_filter, wheel = _moves(mission)
+    return settle + spectrum + to_filter + len(FILTERS) * photometry + (len(FILTERS) - 1) * wheel
+
+
+def _commanded(kind: str, mission: MissionConfiguration) -> float:
+    """Seconds that NISP is commanded to take; more where its ramps take longer."""
+    seconds = exposure_time("NISP-S" if kind == "spectroscopic" else "NISP-P", "nisp", "", mission)
+    return max(mission.value(f"nisp.commanded_time_{kind}", "s"), ramp.elapsed(kind, seconds, "nisp", mission))
+
+
+def _moves(mission: MissionConfiguration) -> tuple[float, float, float]:
+    return (
+        mission.value("svm.settle_time", "s"),
+        mission.value("nisp.grism_to_filter_time", "s"),
+        mission.value("nisp.wheel_time", "s"),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _At:
+    """One dither: where it points (deg), when it starts (MJD), its number from 1."""
+
+    block: Observation
+    field: Field
+    survey: str
+    mission: MissionConfiguration
+    ra: float
+    dec: float
+    start: float
+    dither: int
+
+    def exposures(self, last: bool) -> Iterator[Exposure]:
+        block, mission = self.block, self.mission
+        # A block may name some of the filters; VIS has but one.
+        bands = set(block.bands) & set(FILTERS) or set(FILTERS)
+        settle, to_filter, wheel = _moves(mission)
+        if "VIS" in block.channels:
+            yield self._one("VIS", "euclid_vis", settle)
+        if "NISP-S" in block.channels:
+            yield self._spectrum(settle)
+        begin = settle + _commanded("spectroscopic", mission) + to_filter
+        step = _commanded("photometric", mission) + wheel
+        for i, band in enumerate(FILTERS):
+            if "NISP-P" in block.channels and band in bands:
+                yield self._one("NISP-P", band, begin + i * step)
+        if "VIS" in block.channels and block.short and self.dither == 1:
+            # Beside the last filter (Serrano et al. 2024: in the first dither only).
+            seconds = mission.value("vis.exposure_time_short", "s")
+            yield self._one("VIS", "euclid_vis", begin + (len(FILTERS) - 1) * step, seconds)
+        if "VIS" in block.channels and block.flat and last:
+            seconds = mission.value("vis.exposure_time_flat", "s")
+            # One LED after the other, from field to field and from visit to visit.
+            lamp = (self.field.number + self.field.visit) % LEDS + 1
+            flat = self._one("VIS", "euclid_vis", _dither_time(mission), seconds)
+            yield replace(flat, image_type="flat", lamp=lamp)
+
+    def _spectrum(self, after: float) -> Exposure:
+        if self.block.blue and self.field.visit % 2 == 0:
+            return through_grism(self._one("NISP-S", BLUE, after), None, self.mission)
+        number = (self.dither - 1) % SETTINGS + 1
+        angle = self.mission.value(f"survey.grism_angle_{number}", "deg")
+        return through_grism(self._one("NISP-S", RED, after), angle, self.mission, f"survey.grism_angle_{number}")
+
+    def _one(self, channel: str, band: str, after: float, seconds: float | None = None) -> Exposure:
+        """One that begins `after` seconds of the dither's start;  seconds : it takes, None = the mission's."""
+        camera = "vis" if channel == "VIS" else "nisp"
+        nominal = exposure_time(channel, camera, band, self.mission)
+        return Exposure(
+            channel=channel,
+            camera=camera,
+            band=band,
+            image_type=self.block.image_type,
+            ra=self.ra,
+            dec=self.dec,
+            position_angle=self.field.position_angle,
+            mjd=self.start + after / _DAY_S,
+            exposure_time_s=nominal if seconds is None else seconds,
+            survey=self.survey,
+            field=self.field.number,
+            visit=self.field.visit,
+            dither=self.dither,
+            detectors=self.block.detectors if channel == "VIS" or not _is_vis(self.block.detectors) else (),
+        )
+
+
+def _is_vis(detectors: Sequence[str]) -> bool:
+    return any("-" in name for name in detectors)

@@ -1,0 +1,42 @@
+"""The user's PSF files are checked when exposures are planned.
+
+check       those of planned exposures
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import product
+from pathlib import Path
+
+from lake_schema.mission.configuration import MissionConfiguration
+from truesky.fluxes import passbands
+from truesky.fluxes.passbands import Passband
+from truesky.render.camera import detectors
+from truesky.render.planning.planned_exposures import Exposure
+from truesky.render.psf import from_file
+
+
+def check(
+    exposures: Iterable[tuple[Exposure, MissionConfiguration]],
+    own: Mapping[str, Passband],
+    given: Sequence[tuple[str, str]] = (),
+) -> None:
+    """Refuse exposures whose detectors have no PSF that can be read.
+
+    exposures : of every kind there is, each with the mission that it is planned with
+    own       : passbands besides the embedded ones
+    given     : band and file of each PSF that the request draws an exposure's from
+    """
+    seen: set[tuple[str, str, Path]] = set()
+    for exposure, mission in exposures:
+        if exposure.psf is None:
+            continue
+        drawn = [file for band, file in given if band == exposure.band]
+        files = drawn if exposure.psf in drawn else [exposure.psf]
+        for file, detector in product(files, detectors.detectors(exposure.camera, mission)):
+            path = from_file.file_of(file, detector.name)
+            wanted = not exposure.detectors or detector.name in exposure.detectors
+            if wanted and (exposure.camera, exposure.band, path) not in seen:
+                seen.add((exposure.camera, exposure.band, path))
+                from_file.read(path, detector, own.get(exposure.band) or passbands.load(exposure.band))

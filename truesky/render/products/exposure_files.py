@@ -1,0 +1,110 @@
+"""Science images of an exposure's detectors -> one file of the exposure: a header, and every array of each detector.
+
+plan   the plan of the table `exposure_files`: one part an exposure
+work   makes one of them, from files of a version of the table `products`
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pyarrow.compute as pc
+
+from lake_schema.errors import Damaged
+from lake_schema.fits import joined
+from lake_schema.fits.images import Card
+from lake_schema.mission.published import read_back
+from lake_schema.store import read, reuse
+from lake_schema.store.plan import Json, Output, Part, Plan
+from lake_schema.store.provenance import digest
+from lake_schema.tables.products import EXPOSURE_FILES
+from truesky.render.camera import detectors
+from truesky.render.planning.parts import rows as planned_rows
+from truesky.render.products import head_files, headers
+from truesky.render.products.keys import part_name
+
+# Keywords of detectors' headers that are the exposure's.
+_OF_EXPOSURE = (
+    "TELESCOP", "INSTRUME", "OBJECT", "RA", "DEC", "AIRMASS", "DETSIZE", "CHANNEL", "FILTER", "IMAGETYP", "LAMP",
+    "TARGET", "EXPOSURE", "EXPTIME", "DATE-OBS", "MJD-OBS", "TIMESYS", "SEEING", "ZEROPNT", "SEED", "NOISSEED",
+    "REALIS", "MISSION", "TRUESKY", "ACCFLUX", "ACCSHAPE", "ACCPOS", "ACCBACK", "READMODE", "NG", "NR", "ND", "FRTIME",
+    "ELAPTIME", "REFPIX", "QUALLIM", "PRESCAN", "OVERSCAN", "OVERROWS", "INJROWS", "BUNIT", "OBSTYPE",
+    "PROCTYPE", "PRODTYPE", "EXPNUM", "OBSID", "SEQNUM", "IMGTYPE", "CONTRLLR", "ROTPA", "ROTCOORD", "RASTART",
+    "DECSTART", "AMSTART", "SHUTTIME", "DARKTIME", "INJLEVEL", "INJON", "INJOFF", "NSHUFFLE", "PHASETIM", "DEFOCUS",
+    "TARGMAG", "TARGBAND", "TARGDIST",
+)  # fmt: skip
+
+
+def plan(products: Plan, planned: Mapping[int, int]) -> Plan:
+    """One part an exposure, of the detectors that the products' plan has of it, by name.
+
+    products : the plan of the detectors' files;  planned : how many are planned of each exposure
+    """
+    held: dict[int, dict[str, str]] = defaultdict(dict)
+    for part in products.parts:
+        held[part.facts["exposure_id"]][part.facts["detector"]] = part.facts[reuse.PRODUCT]
+    parts = []
+    for number, keys in sorted(held.items()):
+        names = sorted(keys)
+        about = {"exposure_id": number, "detectors": names, "planned": planned[number]}
+        key = digest({**about, "products": [keys[name] for name in names]})
+        parts.append(Part(f"{number:06d}.parquet", {**about, reuse.PRODUCT: key}))
+    return Plan(EXPOSURE_FILES, {"products": products.key}, tuple(parts))
+
+
+def work(lake: Path, facts: Json) -> Output:
+    """One exposure's file, from those of its detectors."""
+    products = read.version(lake, "products", facts["products"])
+    here = pc.field("exposure_id") == facts["exposure_id"]
+    # Of 100,000 files only its own are opened.
+    own = {part_name({"exposure_id": facts["exposure_id"], "detector": name}) for name in facts["detectors"]}
+    held = [name for name in products.parts if name in own]
+    found = products.rows(parts=held, where=here & (pc.field("content") == "science"))
+    rows = {row["detector"]: row for row in found.to_pylist()}
+    if sorted(rows) != facts["detectors"]:
+        raise Damaged(f"table products: version {products.key} lacks detectors of exposure {facts['exposure_id']}")
+    exposures = read.version(lake, "exposures", products.manifest["facts"]["inputs"]["exposures"])
+    (exposure,) = planned_rows(exposures, [facts["exposure_id"]], where=here).to_pylist()
+    first = rows[facts["detectors"][0]]
+    path = f"images/{exposure['exposure_id']:06d}/{exposure['channel']}_{exposure['band']}_science.fits"
+    table = EXPOSURE_FILES.build(
+        {
+            "path": [path],
+            **{name: [exposure[name]] for name in ("exposure_id", "channel", "band", "ra", "dec")},
+            "detectors": [len(rows)],
+            "planned": [facts["planned"]],
+            "mission": [first["mission"]],
+            "sources": [sum(row["sources"] for row in rows.values())],
+        }
+    )
+    order = _in_order(lake, products, exposure["camera"], facts["detectors"])
+    files = [(name, products.file(rows[name]["path"])) for name in order]
+    heads = [products.file(head_files.beside(rows[name]["path"])) for name in order]
+    writers = {path: partial(_write, files, _cards(exposure, facts)), head_files.beside(path): partial(_heads, heads)}
+    return Output(table, writers)
+
+
+def _in_order(lake: Path, products: read.Version, camera: str, names: Sequence[str]) -> list[str]:
+    """Detectors as the camera's layout numbers them."""
+    mission = read_back(read.version(lake, "mission", products.manifest["facts"]["inputs"]["mission"]))
+    return [one.name for one in detectors.detectors(camera, mission) if one.name in names]
+
+
+def _cards(exposure: dict[str, Any], facts: Json) -> tuple[Card, ...]:
+    return (
+        ("POSANGLE", exposure["position_angle"], "[deg] of the focal plane, north through east"),
+        ("NDETECT", len(facts["detectors"]), "detectors in this file"),
+        ("NPLANNED", facts["planned"], "detectors of the exposure that are planned"),
+    )
+
+
+def _heads(files: Sequence[Path], path: Path) -> None:
+    head_files.write((file.read_text(encoding="ascii") for file in files), path)
+
+
+def _write(files: Sequence[tuple[str, Path]], cards: Sequence[Card], path: Path) -> None:
+    joined.join(path, files, _OF_EXPOSURE, cards, headers.IN_EACH)

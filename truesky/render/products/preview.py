@@ -1,0 +1,275 @@
+"""Pictures of rendered images: asinh stretch, the brightest sources labelled, scale bar, compass, close-ups.
+
+picture     one image -> a PNG
+previews    science images of a lake -> PNGs, without the cosmic rays whose truth the lake has
+shown       which of them, where they are many
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.wcs import WCS
+
+from lake_schema.arrays import Array, Bool, Float
+from lake_schema.fits import images
+from lake_schema.fits.images import Card
+from lake_schema.store import read
+from truesky.numerics import sums
+from truesky.render.camera import astrometry
+from truesky.render.products import preview_labels, read_back
+from truesky.render.products.preview_labels import CLOSE_UP_ARCSEC, CLOSE_UP_SHAPE, CLOSE_UPS, LABELS, Label
+
+_INCHES, _DPI = (13.2, 9.6), 100
+# Largest side of the overview, pixels; close-ups are shown at full resolution.  Labels a kind.
+_OVERVIEW = 1000
+# Room that a label takes, of the image's width and height.
+_TEXT = (0.14, 0.035)
+# Pixels on each side that mend a cosmic ray.
+_MEND = 2
+# Pixels that tell sky and noise of a whole image.
+_STRIDE = 8
+# Black this many sigma below the sky; the stretch turns from linear to logarithmic at _KNEE sigma; white at
+# _WHITE.
+_BLACK, _KNEE, _WHITE = -1.5, 4.0, 400.0
+_INK, _PAPER, _GALAXY, _STAR = "#e8e6df", "#0b0d12", "#ffd27d", "#9fd3ff"
+_SCALE_BARS = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600)
+
+
+def previews(root: Path, out: Path, most: int | None = None, request: str | None = None) -> list[Path]:
+    """A PNG beside each other in `out` for the science images of a request, or of the lake; returns their paths.
+
+    root : of the lake;  most : so many of them, as `shown` chooses, None = all
+    request : its name, where the lake has several
+    """
+    version = read.version(root, "products", request=request)
+    made_of = version.manifest["facts"]["inputs"]
+    made, rows = [], version.rows().to_pylist()
+    hits = {_frame_of(row): row["path"] for row in rows if row["content"] == "cosmic_rays"}
+    for row in shown([row for row in rows if row["content"] == "science"], most):
+        image = read_back.electrons(version.file(row["path"]))
+        if _frame_of(row) in hits:
+            (truth,) = images.read_images(version.file(hits[_frame_of(row)]))
+            image = images.Image(mended(np.asarray(image.data), np.asarray(truth.data) > 0), image.cards)
+        path = out / f"{row['channel']}_{row['band']}_{row['detector']}_{row['exposure_id']}.png".lower()
+        picture(path, np.asarray(image.data), image.cards, preview_labels.labels(root, row, image, made_of))
+        made.append(path)
+    return made
+
+
+def shown(rows: Sequence[dict[str, Any]], most: int | None) -> list[dict[str, Any]]:
+    """So many rows of `products`, in their order: one of every channel and band before a second one of any."""
+    seen: Counter[tuple[str, str]] = Counter()
+    turn = []
+    for i, row in enumerate(rows):
+        kind = row["channel"], row["band"]
+        turn.append((seen[kind], i))
+        seen[kind] += 1
+    return [rows[i] for i in sorted(i for _, i in sorted(turn)[:most])]
+
+
+def _frame_of(row: dict[str, Any]) -> tuple[Any, ...]:
+    return row["exposure_id"], row["detector"]
+
+
+def mended(image: Float, hit: Bool) -> Float:
+    """Pixels that cosmic rays hit take the median of those around them that none did."""
+    rows, columns = np.nonzero(hit)
+    whole = np.where(hit, np.nan, image)
+    step = np.arange(-_MEND, _MEND + 1)
+    r = np.clip(rows[:, None, None] + step[:, None], 0, image.shape[0] - 1)
+    c = np.clip(columns[:, None, None] + step, 0, image.shape[1] - 1)
+    around = np.sort(whole[r, c].reshape(len(rows), step.size**2), axis=1)
+    # Sorted, what is missing comes last.
+    count = np.isfinite(around).sum(axis=1)
+    middle = around[np.arange(len(rows)), np.maximum(count - 1, 0) // 2]
+    out = image.copy()
+    out[rows, columns] = np.where(count > 0, middle, image[rows, columns])
+    return out
+
+
+# ------------------------------------------------------------------------------------------------ drawing
+
+
+def picture(path: Path, image: Array, cards: Sequence[Card], names: Sequence[Label]) -> None:
+    """Draw one image.
+
+    image : [ny, nx] electrons or ADU;  cards : its header;  names : sources, brightest first
+    path  : of the PNG
+    """
+    # A canvas of its own: no window system, and no state shared with a caller's figures.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    header: dict[str, Any] = {keyword: value for keyword, value, _ in cards}
+    system = astrometry.from_cards(cards)
+    figure = Figure(figsize=_INCHES, dpi=_DPI, facecolor=_PAPER)
+    FigureCanvasAgg(figure)
+    upside_down = astrometry.jacobian(system, [0.0], [0.0])[0, 1, 1] < 0
+    main = figure.add_axes((0.01, 0.01, 0.715, 0.93))
+    block = max(1, int(np.ceil(max(image.shape) / _OVERVIEW)))
+    _show(main, _shrunk(image, block), block, image.shape, upside_down)
+    text_x, text_y = _TEXT[0] * image.shape[1], _TEXT[1] * image.shape[0]
+    _annotate(main, preview_labels.moved_apart(names, text_x, text_y, LABELS), image.shape, upside_down)
+    _scale_bar(main, header["PIXSCALE"], image.shape, image.shape[1] / 6)
+    _compass(main, system, image.shape)
+    for number, label in enumerate(preview_labels.close_ups(names, image.shape, header["PIXSCALE"])):
+        axes = figure.add_axes((0.735, 0.01 + (0.93 + 0.008) / CLOSE_UPS * (CLOSE_UPS - 1 - number), 0.255, 0.305))
+        _close_up(axes, main, image, label, header["PIXSCALE"], upside_down, "abc"[number])
+    title = f"{header['INSTRUME'].upper()} {header['DETECTOR']}   {header['FILTER']}   {header['EXPTIME']:g} s"
+    figure.text(0.012, 0.958, title, color=_INK, fontsize=15, fontweight="bold")
+    figure.text(0.988, 0.958, _caption(header, system, image.shape), color=_INK, fontsize=10.5, ha="right")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, facecolor=_PAPER, metadata={"Software": None})
+
+
+def _caption(header: dict[str, Any], system: WCS, shape: tuple[int, ...]) -> str:
+    ra, dec = astrometry.sky_of_pixel(system, [(shape[1] - 1) / 2], [(shape[0] - 1) / 2])
+    size = [n * header["PIXSCALE"] / 60.0 for n in shape[::-1]]
+    return (
+        f"RA {ra[0]:.4f}  Dec {dec[0]:+.4f}   {size[0]:.1f}' x {size[1]:.1f}'   PSF {header['PSFFWHM']:.2f}\""
+        f"   {header['NSOURCES']:,} sources   truesky {header['TRUESKY']}"
+    )
+
+
+def _shrunk(image: Array, block: int) -> Float:
+    ny, nx = (n // block for n in image.shape)
+    return np.asarray(image[: ny * block, : nx * block].reshape(ny, block, nx, block).mean((1, 3), dtype=float))
+
+
+def _show(axes: Any, image: Float, block: int, shape: tuple[int, ...], upside_down: bool) -> None:
+    ny, nx = (n * block for n in image.shape)
+    extent = (-0.5, nx - 0.5, -0.5, ny - 0.5)
+    shown = _stretched(image, *_levels(image))
+    axes.imshow(shown, origin="lower", extent=extent, cmap="gray", vmin=0, vmax=1, interpolation="none")
+    _frame(axes, (-0.5, shape[1] - 0.5), (-0.5, shape[0] - 0.5), upside_down)
+
+
+def _frame(axes: Any, x: tuple[float, float], y: tuple[float, float], upside_down: bool) -> None:
+    """North up: a detector that is mounted upside down is shown turned by 180 deg."""
+    axes.set_xlim(x[::-1] if upside_down else x)
+    axes.set_ylim(y[::-1] if upside_down else y)
+    axes.set_anchor("W")
+    axes.set_facecolor(_PAPER)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for side in axes.spines.values():
+        side.set_edgecolor("#3a4150")
+
+
+def _levels(image: Array) -> tuple[float, float]:
+    """Sky and noise, from the median and the pixels below it."""
+    level = float(np.median(image))
+    below = image[image < level] - level
+    return level, float(np.sqrt(np.mean(below**2))) if below.size else 1.0
+
+
+def _stretched(image: Array, level: float, noise: float) -> Float:
+    """Electrons or ADU -> 0 .. 1 by asinh."""
+    signal = np.clip((image - level) / noise, _BLACK, _WHITE)
+    lo, hi = np.arcsinh(_BLACK / _KNEE), np.arcsinh(_WHITE / _KNEE)
+    return np.asarray((np.arcsinh(signal / _KNEE) - lo) / (hi - lo))
+
+
+def _annotate(axes: Any, names: Sequence[Label], shape: tuple[int, ...], upside_down: bool) -> None:
+    from matplotlib.patches import Circle
+
+    for label in names:
+        across, up = label.column / shape[1], label.row / shape[0]
+        if upside_down:
+            across, up = 1 - across, 1 - up
+        if up < 0.12 and not 0.25 < across < 0.85:
+            # Scale bar and compass stand there.
+            continue
+        colour = _GALAXY if label.kind == "galaxy" else _STAR
+        circle = Circle(
+            (label.column, label.row), shape[1] / 110, fill=False, edgecolor=colour, linewidth=0.9, alpha=0.9
+        )
+        axes.add_patch(circle)
+        text = axes.annotate(
+            f"{label.kind} {label.text}",
+            (label.column, label.row),
+            (-9 if across > 0.85 else 9, 5 if up < 0.96 else -12),
+            textcoords="offset points",
+            ha="right" if across > 0.85 else "left",
+            color=colour,
+            fontsize=8.5,
+        )
+        text.set_path_effects(_outline())
+
+
+def _outline() -> list[Any]:
+    """A dark edge, so that text is legible on a bright star."""
+    from matplotlib import patheffects
+
+    return [patheffects.withStroke(linewidth=2.0, foreground=_PAPER)]
+
+
+def _scale_bar(axes: Any, pixel_scale: float, shape: tuple[int, ...], longest: float) -> None:
+    """In axes coordinates, lower left."""
+    arcsec = max((bar for bar in _SCALE_BARS if bar <= longest * pixel_scale), default=_SCALE_BARS[0])
+    width = arcsec / pixel_scale / shape[1]
+    axes.plot([0.03, 0.03 + width], [0.035, 0.035], color=_INK, linewidth=2.2, transform=axes.transAxes)
+    text = f'{arcsec:g}"' if arcsec < 60 else f"{arcsec / 60:g}'"
+    label = axes.text(0.03 + width / 2, 0.045, text, color=_INK, fontsize=11, ha="center", transform=axes.transAxes)
+    label.set_path_effects(_outline())
+
+
+def _compass(axes: Any, system: WCS, shape: tuple[int, ...]) -> None:
+    """North and east as they are at the centre, lower right."""
+    x, y = (shape[1] - 1) / 2, (shape[0] - 1) / 2
+    inverse = sums.inverse(astrometry.jacobian(system, [x], [y])[0])
+    flip = np.array([1 if lim[0] < lim[1] else -1 for lim in (axes.get_xlim(), axes.get_ylim())])
+    origin = np.array([0.93, 0.05])
+    # u points west.
+    for name, world in (("N", (0.0, 1.0)), ("E", (-1.0, 0.0))):
+        step = sums.product(inverse, np.array(world)) * flip
+        step = step / np.hypot(*step) * 0.055
+        axes.annotate(
+            "",
+            origin + step,
+            origin,
+            xycoords="axes fraction",
+            arrowprops={"arrowstyle": "-|>", "color": _INK, "linewidth": 1.4, "shrinkA": 0, "shrinkB": 0},
+        )
+        axes.text(
+            *(origin + 1.3 * step),
+            name,
+            color=_INK,
+            fontsize=11,
+            ha="center",
+            va="center",
+            transform=axes.transAxes,
+        )
+
+
+def _close_up(
+    axes: Any,
+    main: Any,
+    image: Array,
+    label: Label,
+    pixel_scale: float,
+    upside_down: bool,
+    letter: str,
+) -> None:
+    from matplotlib.patches import Rectangle
+
+    half_y = CLOSE_UP_ARCSEC / pixel_scale / 2
+    half_x = half_y * CLOSE_UP_SHAPE
+    x0, x1 = max(round(label.column - half_x), 0), min(round(label.column + half_x), image.shape[1])
+    y0, y1 = max(round(label.row - half_y), 0), min(round(label.row + half_y), image.shape[0])
+    shown = _stretched(image[y0:y1, x0:x1], *_levels(image[::_STRIDE, ::_STRIDE]))
+    extent = (x0 - 0.5, x1 - 0.5, y0 - 0.5, y1 - 0.5)
+    axes.imshow(shown, origin="lower", extent=extent, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+    _frame(axes, extent[:2], extent[2:], upside_down)
+    text = f"{letter}   {label.kind} {label.text}"
+    axes.text(0.04, 0.92, text, color=_GALAXY, fontsize=10, transform=axes.transAxes).set_path_effects(_outline())
+    _scale_bar(axes, pixel_scale, (y1 - y0, x1 - x0), (x1 - x0) / 4)
+    main.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=_INK, linewidth=0.8, alpha=0.8))
+    corner = (x0, y1) if upside_down else (x1, y0)
+    mark = main.annotate(letter, corner, (2, -2), textcoords="offset points", color=_INK, fontsize=10, va="top")
+    mark.set_path_effects(_outline())

@@ -1,0 +1,101 @@
+"""What is labelled in a preview, and which sources are shown enlarged."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from astropy.wcs import WCS
+
+from lake_schema import sky, units
+from lake_schema.arrays import Float
+from lake_schema.fits import images
+from lake_schema.ids import GENERATION_ORDER
+from lake_schema.store import read
+from truesky.render.camera import astrometry
+
+LABELS, CLOSE_UPS = 8, 3
+# Height, and width / height.
+CLOSE_UP_ARCSEC, CLOSE_UP_SHAPE = 14.0, 1.145
+
+
+@dataclass(frozen=True, slots=True)
+class Label:
+    """A source worth a name.
+
+    column, row : 0-based pixel position
+    kind        : "galaxy" or "star"
+    """
+
+    column: float
+    row: float
+    kind: str
+    mag: float
+    text: str
+
+
+def labels(root: Path, product: dict[str, Any], image: images.Image, made_of: Mapping[str, str]) -> list[Label]:
+    """The brightest sources inside a product's frame, brightest first.
+
+    root    : of the lake;  product, image : a row of `products`, and what its file holds
+    made_of : table -> key of the versions that the product was made of
+    """
+    system = astrometry.from_cards(image.cards)
+    ny, nx = np.asarray(image.data).shape
+    column = f"f_nu_{product['band']}"
+    centre = (product["ra"], product["dec"])
+    corner = astrometry.sky_of_pixel(system, [-0.5], [-0.5])
+    radius = float(sky.separation(*centre, *corner)[0])
+    cells = sky.cells_in_cone(*centre, radius, GENERATION_ORDER).tolist()
+    found: list[Label] = []
+    for kind, table in (("galaxy", "galaxies"), ("star", "stars")):
+        version = read.version(root, table, made_of[table])
+        position = version.place()
+        columns = ["id", *position] + (["z_obs"] if kind == "galaxy" else [])
+        rows = version.in_cells(cells, GENERATION_ORDER, columns)
+        fluxes = read.version(root, f"{kind}_fluxes", made_of[f"{kind}_fluxes"])
+        flux = fluxes.in_cells(cells, GENERATION_ORDER, ["id", column])
+        near = sky.separation(*centre, *(rows[name].to_numpy() for name in position)) < radius
+        near &= flux[column].to_numpy() > 0
+        if near.any():
+            found += _labels_of(kind, rows.filter(near), flux[column].to_numpy()[near], position, system, (ny, nx))
+    return sorted(found, key=lambda label: label.mag)
+
+
+def _labels_of(
+    kind: str, rows: pa.Table, flux: Float, position: tuple[str, str], system: WCS, shape: tuple[int, int]
+) -> list[Label]:
+    column, row = astrometry.pixel_of_sky(system, *(rows[name].to_numpy() for name in position))
+    inside = np.flatnonzero((column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0]))
+    brightest = inside[np.argsort(-flux[inside])[: 4 * LABELS]]
+    column, row = column[brightest], row[brightest]
+    mag = units.mag_of_f_nu(flux[brightest])
+    z = rows["z_obs"].to_numpy()[brightest] if kind == "galaxy" else np.full(len(mag), np.nan)
+    texts = [f"{m:.1f}" if np.isnan(zi) else f"{m:.1f}  z {zi:.2f}" for m, zi in zip(mag, z, strict=True)]
+    return [Label(float(x), float(y), kind, float(m), t) for x, y, m, t in zip(column, row, mag, texts, strict=True)]
+
+
+def moved_apart(names: Sequence[Label], wide: float, high: float, most: int) -> list[Label]:
+    """Labels that do not cover each other, brightest first, at most so many of a kind; wide and high in pixels.
+
+    names : where they are to point, brightest first;  most : of a kind
+    """
+    kept: list[Label] = []
+    for label in names:
+        free = all(abs(label.column - x.column) > wide or abs(label.row - x.row) > high for x in kept)
+        if free and sum(x.kind == label.kind for x in kept) < most:
+            kept.append(label)
+    return kept
+
+
+def close_ups(names: Sequence[Label], shape: tuple[int, ...], pixel_scale: float) -> list[Label]:
+    """The brightest galaxies that lie well inside the frame."""
+    half = CLOSE_UP_ARCSEC / pixel_scale / 2
+    inside = [
+        x for x in names if x.kind == "galaxy" and half < x.column < shape[1] - half and half < x.row < shape[0] - half
+    ]
+    return moved_apart(inside, 2 * half, 2 * half, CLOSE_UPS)

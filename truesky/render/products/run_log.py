@@ -1,0 +1,65 @@
+"""What the logs of runs say of the parts that they made.
+
+of_lake         the logs of all runs, oldest first
+of_products     those of runs that made the table `products`
+lines           one of them: an object for its start, one a part, one for its end
+"""
+
+from __future__ import annotations
+
+import json
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+from lake_schema import user_files
+from lake_schema.errors import Damaged
+from lake_schema.store import layout
+from lake_schema.store.object_storage.s3 import Folder, Place
+
+Json = dict[str, Any]
+# What a line says: of a run, of a part.
+_SAID: dict[str, tuple[type, ...]] = {
+    "job": (str,), "status": (str,), "prepare_s": (float, int), "prepare_cpu_s": (float, int),
+    "part": (str,), "error": (str,), "attempt": (int,), "seconds": (float, int), "cpu_s": (float, int),
+    "peak_gb": (float, int), "rows": (int,), "bytes": (int,),
+}  # fmt: skip
+_MOST = 1e15
+
+
+def of_lake(root: Folder) -> list[Path]:
+    """The files, in the order of their runs; none of a lake on object storage: they stay where the jobs ran."""
+    return [] if isinstance(root, Place) else sorted(layout.runs(root).glob("*.jsonl"))
+
+
+def of_products(root: Folder) -> list[Path]:
+    """The same of table `products`."""
+    return [path for path in of_lake(root) if fnmatch(path.name, "*-products-*.jsonl")]
+
+
+def lines(path: Path) -> list[dict[str, Any]]:
+    """The lines of a log; the last one of a run that was killed may be anything, and is left out then.
+
+    Errors : Damaged names the line that no run writes
+    """
+    with user_files.opened(path, "run log") as stream:
+        texts = stream.read().split(b"\n")
+    found = []
+    for number, text in enumerate(texts, start=1):
+        try:
+            found.append(_checked(json.loads(text)))
+        except (ValueError, RecursionError, TypeError):
+            if any(texts[number:]):
+                raise Damaged(f"{user_files.shown(path)} line {number} is not what a run writes") from None
+    return found
+
+
+def _checked(line: Any) -> dict[str, Any]:
+    """The line; TypeError where it is not one that a run writes."""
+    if not isinstance(line, dict):
+        raise TypeError
+    for name, kinds in _SAID.items():
+        value = line.get(name, kinds[0]())
+        if type(value) not in kinds or (kinds != (str,) and not 0 <= value < _MOST):
+            raise TypeError
+    return line

@@ -1,0 +1,212 @@
+"""A point-spread function of the user's own: a cube of planes, or a file that PSFEx wrote.
+
+read        a file -> Psf of a detector
+file_of     which file a detector's is
+
+A cube   : FITS, the first image of two axes, or of three with the wavelengths along the third. Each plane sums to
+           what it holds of 1. CDELT1 = CDELT2 and CUNIT1 (arcsec, mas or deg) tell the distance of samples, CRPIX1 and
+           CRPIX2 the chief ray, else the middle; CRVAL3, CDELT3, CRPIX3 or WAVE1 .. WAVEn the wavelengths, in CUNIT3
+           (Angstrom, nm, um or m); PIXEL = T that the detector's pixel is in it. In the focal plane's axes, x to the
+           right: a detector that is mounted turned sees it turned.
+PSFEx    : its own pixels, the pixel's response in it, polynomials of the place on the detector.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import comb
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lake_schema.arrays import Float
+from lake_schema.errors import BadInput
+from lake_schema.fits import external
+from truesky.fluxes.passbands import Passband
+from truesky.numerics import sums
+from truesky.render.camera.detectors import Detector
+from truesky.render.psf.model import SAMPLES, SIDE, Planes, Psf, sampled
+from truesky.render.psf.sub_bands import sub_bands
+
+_ARCSEC = {"arcsec": 1.0, "mas": 1e-3, "deg": 3600.0}
+_ANGSTROM = {"Angstrom": 1.0, "nm": 10.0, "um": 1e4, "m": 1e10}
+# What a plane may sum to: less is no PSF, more is not of flux 1.
+_LEAST_SUM, _MOST_SUM = 0.5, 1.001
+# Smallest and largest distance of samples, pixels.
+_SPACING = (0.02, 2.0)
+# Largest number in a card, and degree of polynomials.
+_LARGEST, _MOST_DEGREE = 1e300, 20
+# Least side of a plane, samples.
+_LEAST_SIDE = 3 * 66 + 1
+# Lobes of the interpolant: PSFEx's models are made for three; of a cube nothing but its samples is known.
+_OF_PSFEX, _OF_CUBES = 3, 15
+
+
+def file_of(name: str, detector: str) -> Path:
+    """A PSF's file for a detector: {detector} in its name stands for the detector's."""
+    return Path(name.replace("{detector}", detector))
+
+
+def read(path: Path, detector: Detector, band: Passband) -> Psf:
+    """The PSF of a file for a detector and a band.  BadInput names the file and what is wrong with it.
+
+    Error : of the interpolation, 5e-5 of the peak of a cube whose samples are finer than half its width, 1e-3 of
+            PSFEx's (its interpolant rings at frequencies that planes of three samples a pixel do not hold)
+    """
+    data, header = external.read_planes(path, "PSF_MASK")
+    try:
+        if not np.isfinite(data).all():
+            raise BadInput("holds values that are not numbers")
+        if "POLNAXIS" in header:
+            return sampled(_psfex(data, header, detector), detector.pixel_scale, has_pixel=True)
+        return sampled(_cube(data, header, detector, band), detector.pixel_scale, has_pixel=_has_pixel(header))
+    except BadInput as error:
+        raise BadInput(f"{path}: {error}") from None
+
+
+# ------------------------------------------------------------------------------------------------ cubes
+
+
+def _cube(data: Float, header: Mapping[str, Any], detector: Detector, band: Passband) -> Planes:
+    planes = data if data.ndim == 3 else data[None]
+    for number, total in enumerate(planes.sum(axis=(1, 2)), start=1):
+        if not _LEAST_SUM <= total <= _MOST_SUM:
+            raise BadInput(f"plane {number} sums to {total:.4g}, wanted what it holds of 1")
+    step = _card(header, "CDELT1") * _unit(header, "CUNIT1", _ARCSEC)
+    if step <= 0.0 or _card(header, "CDELT2") != _card(header, "CDELT1"):
+        raise BadInput("CDELT1 and CDELT2 are not the same distance")
+    middle = [
+        _number(header, f"CRPIX{axis}", (n + 1) / 2) - 1 for axis, n in ((2, data.shape[-2]), (1, data.shape[-1]))
+    ]
+    waves, weights = _colours(header, len(planes), band)
+    spaced = sums.product(weights, planes.reshape(len(planes), -1)).reshape(-1, *planes.shape[1:])
+    turns = round(detector.rotation / 90.0)
+    images = np.stack([np.rot90(_resampled(p, step / detector.pixel_scale, middle, _OF_CUBES), turns) for p in spaced])
+    return Planes(waves, images.astype(np.float32), np.zeros((0, *images.shape[1:]), np.float32), _half(detector))
+
+
+def _has_pixel(header: Mapping[str, Any]) -> bool:
+    found = header.get("PIXEL", False)
+    if not isinstance(found, bool):
+        raise BadInput(f"PIXEL = {found!r} is not T or F")
+    return found
+
+
+def _colours(header: Mapping[str, Any], count: int, band: Passband) -> tuple[Float, Float]:
+    """Wavelengths of the planes that are drawn, A, and what each takes of the cube's, [planes, count]."""
+    parts = sub_bands(band)
+    means: Float = np.array([np.average(p.wavelength, weights=p.response / p.wavelength) for p in parts])
+    if count == 1:
+        return means[:1], np.ones((1, 1))
+    unit = _unit(header, "CUNIT3", _ANGSTROM)
+    if "WAVE1" in header:
+        waves: Float = unit * np.array([_card(header, f"WAVE{i}") for i in range(1, count + 1)])
+    else:
+        number: Float = np.arange(1.0, count + 1) - _number(header, "CRPIX3", 1.0)
+        waves = np.asarray(unit * (_card(header, "CRVAL3") + number * _card(header, "CDELT3")))
+    if (np.diff(waves) <= 0).any():
+        raise BadInput("its wavelengths do not increase")
+    if waves[0] > means[0] or waves[-1] < means[-1]:
+        reach = f"{waves[0]:.0f} to {waves[-1]:.0f} A, band {band.name} wants {means[0]:.0f} to {means[-1]:.0f}"
+        raise BadInput(f"its planes reach from {reach}")
+    hats = [np.stack([np.interp(p.wavelength, waves, row) for row in np.eye(count)]) for p in parts]
+    return means, np.stack(
+        [np.average(hat, axis=1, weights=p.response / p.wavelength) for hat, p in zip(hats, parts, strict=True)]
+    )
+
+
+# ------------------------------------------------------------------------------------------------ PSFEx
+
+
+def _psfex(data: Float, header: Mapping[str, Any], detector: Detector) -> Planes:
+    """Polynomials of the place are those of Planes, about the detector's middle.
+
+    Error : the total, 1 in the middle, is held everywhere to first order
+    Ref   : Bertin 2011, ASPC 442, 435; galsim.des.DES_PSFEx (the order of terms)
+    """
+    degree, groups = (int(_card(header, key)) for key in ("POLDEG1", "POLNGRP"))
+    names = [str(header.get(f"POLNAME{i}", "")).strip() for i in (1, 2)]
+    places = all(n.startswith(axis) and n.endswith("IMAGE") for n, axis in zip(names, "XY", strict=True))
+    if int(_card(header, "POLNAXIS")) != 2 or groups != 1 or not places:
+        raise BadInput(f"its polynomials are of {', '.join(names)} in {groups} groups, wanted X and Y of the image")
+    if not 0 <= degree <= _MOST_DEGREE:
+        raise BadInput(f"its polynomials are of degree {degree}, wanted 0 to {_MOST_DEGREE}")
+    powers = [(i, j) for j in range(degree + 1) for i in range(degree + 1 - j)]
+    if data.ndim != 3 or len(data) != len(powers):
+        raise BadInput(f"PSF_MASK has {list(data.shape)} samples, wanted {len(powers)} planes of degree {degree}")
+    half = _half(detector)
+    # (x - zero) / scale = shift + stretch * (place as Planes has it).
+    zero, scale = ([_card(header, f"POL{what}{axis}") for axis in (1, 2)] for what in ("ZERO", "SCAL"))
+    if not all(scale):
+        raise BadInput("POLSCAL1 or POLSCAL2 is 0")
+    shift = [(half[k] + 1.0 - zero[k]) / scale[k] for k in (0, 1)]
+    stretch = [(half[k] + 0.5) / scale[k] for k in (0, 1)]
+    middle = [(n - 1) / 2 for n in data.shape[1:]]
+    planes = np.zeros_like(data)
+    for number, (p, q) in enumerate(powers):
+        for (i, j), term in zip(powers, data, strict=True):
+            if i >= p and j >= q:
+                along = comb(i, p) * shift[0] ** (i - p) * stretch[0] ** p
+                planes[number] += along * comb(j, q) * shift[1] ** (j - q) * stretch[1] ** q * term
+    drawn = np.stack([_resampled(plane, _card(header, "PSF_SAMP"), middle, _OF_PSFEX) for plane in planes])
+    totals = drawn.sum(axis=(1, 2))
+    if not totals[0] > 0.0:
+        raise BadInput(f"its PSF in the middle of the detector sums to {totals[0]:.4g}")
+    image = drawn[0] / totals[0]
+    drift = (drawn[1:] - totals[1:, None, None] * image) / totals[0]
+    return Planes(
+        np.zeros(1),
+        image[None].astype(np.float32),
+        drift.astype(np.float32),
+        half,
+        tuple((i, j, 0) for i, j in powers[1:]),
+    )
+
+
+# ------------------------------------------------------------------------------------------------ samples
+
+
+def _resampled(plane: Float, spacing: float, middle: list[float], lobes: int) -> Float:
+    """A plane of samples `spacing` pixels apart about `middle` (row, column) -> that of Planes."""
+    if not _SPACING[0] <= spacing <= _SPACING[1]:
+        raise BadInput(f"its samples are {spacing:.4g} pixels apart, wanted {_SPACING[0]:g} to {_SPACING[1]:g}")
+    reach = max(max(m, n - 1 - m) for m, n in zip(middle, plane.shape, strict=True)) + lobes
+    half = max(min(int(reach * spacing * SAMPLES), SIDE * SAMPLES // 2), _LEAST_SIDE // 2)
+    at = np.arange(-half, half + 1) / (SAMPLES * spacing)
+    rows, columns = (_interpolant(at + m, n, lobes) for m, n in zip(middle, plane.shape, strict=True))
+    return np.asarray(sums.product(rows, sums.product(plane, columns.T)) / (SAMPLES * spacing) ** 2)
+
+
+def _interpolant(at: Float, count: int, lobes: int) -> Float:
+    """[n, count] what each sample brings to the places `at`: Lanczos' kernel, a constant kept."""
+    distance = at[:, None] - np.arange(count)
+    kernel = np.where(np.abs(distance) < lobes, np.sinc(distance) * np.sinc(distance / lobes), 0.0)
+    # The kernel's sum over all samples, were there some everywhere.
+    steps = (at % 1.0)[:, None] - np.arange(1 - lobes, lobes + 1)
+    whole = (np.sinc(steps) * np.sinc(steps / lobes)).sum(axis=1, keepdims=True)
+    return np.asarray(kernel / whole)
+
+
+def _half(detector: Detector) -> tuple[float, float]:
+    return (detector.nx - 1) / 2, (detector.ny - 1) / 2
+
+
+def _card(header: Mapping[str, Any], key: str) -> float:
+    if key not in header:
+        raise BadInput(f"has no card {key}")
+    return _number(header, key, 0.0)
+
+
+def _number(header: Mapping[str, Any], key: str, default: float) -> float:
+    found = header.get(key, default)
+    if isinstance(found, bool) or not isinstance(found, (int, float)) or not abs(found) < _LARGEST:
+        raise BadInput(f"{key} = {found!r} is not a number")
+    return float(found)
+
+
+def _unit(header: Mapping[str, Any], key: str, known: Mapping[str, float]) -> float:
+    found = str(header.get(key, "")).strip()
+    if found not in known:
+        raise BadInput(f"{key} = {found!r} is not one of {', '.join(known)}")
+    return known[found]

@@ -1,0 +1,318 @@
+"""The PSF of a ground telescope: turbulent air, and the optics with their aberrations.
+
+through_air   -> Psf: planes by wavelength and place;  edges : what shines beyond them
+Air           what differs from exposure to exposure;  air_of : of an exposure
+
+A plane is the Fourier transform of the product of
+
+    transfer(rho)       of the air at rho = wavelength x frequency (psf/atmosphere.py), for the wavelength's seeing
+    clear(rho)          the part of an unaberrated annular pupil that overlaps with itself moved by rho
+    ratio(rho)          mean of exp(i difference of phase) over that overlap: the optics' aberrations
+
+The air leaves nothing beyond a few Fried lengths, a small part of the pupil; there the ratio is smooth, and known on a
+coarse lattice it is interpolated.  Its phase at small rho is taken off, for astrometry is calibrated by centroids.  To
+the planes are added the aureole, A / (r^2 + c^2) of a star's light in an arcsec2, and the spikes of the spider's vanes.
+A plane holds a star's light: this is what photometry calls its flux; what lies beyond comes on top of it.
+
+Ref : King 1971, PASP 83, 199, and Racine 1996, PASP 108, 699 (aureole)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.fft
+from scipy.interpolate import make_interp_spline
+from scipy.ndimage import map_coordinates
+
+from lake_schema.arrays import Array, Complex, Float, Float32
+from lake_schema.errors import OutOfRange
+from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.tables.exposures import ExposureRow
+from truesky.fluxes.passbands import Passband
+from truesky.numerics import sums
+from truesky.randomness import rng
+from truesky.render.camera.detectors import Detector, detectors
+from truesky.render.psf import atmosphere, euclid, model, spikes
+from truesky.render.psf.aberrations import FARTHEST, Ratio, Telescope, clear
+from truesky.render.psf.model import Planes, Psf
+from truesky.render.psf.spikes import ARCSEC, LONG, STEP, Edges
+from truesky.render.psf.sub_bands import PARTS, sub_bands
+
+# Of the planes, and of what changes across a detector, pixels: beyond them the aureole is nearly all there is.
+SIDE, _DRIFT_SIDE = 256, 64
+# Samples of a FWHM, at least: beyond their Nyquist frequency the air passes less than 1e-7. Samples of a pixel.
+_SAMPLES_OF_FWHM, _LEAST_SAMPLES, _MOST_SAMPLES = 6.0, 2, 6
+# Bands whose light is redder are drawn by half as many wavelengths: refraction changes less there; A.
+_REDDER = 5300.0
+# Of a seeing, arcsec: planes hold no more.
+_WORST = 10.0
+# Steps of the radial table.
+_TABLE = 4000
+# FWHM of a Gaussian in its standard deviations.
+_FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
+
+
+@dataclass(frozen=True, slots=True)
+class Air:
+    """What differs from exposure to exposure, in a detector's axes.
+
+    seeing : FWHM, arcsec, at the mean wavelength of the band
+    shear  : (e1, e2) ellipticity of what the air does: along columns, along their diagonal
+    slope  : of the seeing's dependence on wavelength, a power
+    lift   : tangent of the zenith distance;  zenith : radian, where it lies, from x to y
+    height : of the observatory, m
+    """
+
+    seeing: float
+    shear: tuple[float, float] = (0.0, 0.0)
+    slope: float = 0.0
+    lift: float = 0.0
+    zenith: float = 0.0
+    height: float = 0.0
+
+
+def air_of(exposure: ExposureRow, detector: Detector, mission: MissionConfiguration) -> Air:
+    """The air of an exposure; its ellipticity is drawn, the same for all detectors.
+
+    exposure : its row;  detector : of its camera;  mission : the mission database
+    """
+    section = detector.section
+    # The seeing is drawn with the request's seed.
+    identity = (exposure.camera, exposure.band, *(x.hex() for x in (exposure.ra, exposure.dec, exposure.mjd)))
+    rms = mission.value(f"{section}.psf.air_ellipticity", "")
+    size, turn = rng.stream("psf.air", exposure.seeing.hex(), *identity).random(2)
+    # Two normal components have a size whose square is exponential.
+    size = min(rms * float(np.sqrt(-2.0 * np.log1p(-size))), 0.5)
+    angle = 2.0 * (np.pi * float(turn) - np.radians(detector.rotation))
+    shear = size * float(np.cos(angle)), size * float(np.sin(angle))
+    slope = mission.value(f"{section}.psf.seeing_slope", "")
+    if exposure.airmass is None or exposure.zenith is None:
+        return Air(exposure.seeing, shear, slope)
+    # At position angle 0 the focal plane's x axis runs west.
+    zenith = float(np.radians(90.0 + exposure.zenith - exposure.position_angle - detector.rotation))
+    lift = float(np.sqrt(max(exposure.airmass**2 - 1.0, 0.0))) * mission.value(f"{section}.psf.refraction", "")
+    return Air(exposure.seeing, shear, slope, lift, zenith, mission.value(f"{section}.site.height", "m"))
+
+
+def check(seeing: float, detector: Detector, band: Passband, mission: MissionConfiguration) -> None:
+    """Refuse a seeing, arcsec, finer than a pixel or than turbulence makes, and a pupil that has no such area.
+
+    detector : of the camera;  band : passband;  mission : the mission database
+    """
+    outer, slope = Telescope.of(detector.section, mission).outer, mission.value(f"{detector.section}.psf.seeing_slope")
+    waves = _waves(band, Air(seeing, slope=slope, lift=1.0))
+    best = max(atmosphere.finest(wave, outer) * (wave / waves.mean()) ** -slope for wave in waves.tolist())
+    if not max(best, detector.pixel_scale) <= seeing <= _WORST:
+        name = f"seeing of {detector.section} through a turbulent atmosphere, arcsec"
+        raise OutOfRange(name, seeing, max(best, detector.pixel_scale), _WORST)
+
+
+def through_air(air: Air, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int) -> Psf:
+    """The PSF of a detector of a ground camera.
+
+    air       : of the exposure;  positions : where it is computed, one of euclid.DEGREES; polynomials lie between
+    detector  : of the camera;  band : passband;  mission : the mission database
+    Errors    : OutOfRange for a seeing of less than a pixel, or that its air does not make
+    Error     : 1e-3 of the peak from the pupil's samples
+    """
+    check(air.seeing, detector, band, mission)
+    scale = detector.pixel_scale
+    waves = _waves(band, air)
+    widths = air.seeing * (waves / waves.mean()) ** air.slope
+    telescope = Telescope.of(detector.section, mission)
+    fried = [
+        atmosphere.fried_length(width, wave, telescope.outer)
+        for width, wave in zip(widths.tolist(), waves.tolist(), strict=True)
+    ]
+    samples = int(np.clip(np.ceil(_SAMPLES_OF_FWHM * scale / widths.min()), _LEAST_SAMPLES, _MOST_SAMPLES))
+    whole = _Grid.of(SIDE, samples, scale)
+    lifts = atmosphere.refraction(waves, air.height) * air.lift
+    middle, turn = _wavefront(detector, 0.0, 0.0, mission), float(np.radians(detector.rotation))
+    images = []
+    for wave, length, lift in zip(waves, fried, lifts - lifts.mean(), strict=True):
+        ratio = Ratio.of(middle, telescope, float(wave), length, turn)
+        passed = whole.passed(float(wave), length, telescope, air) * whole.interpolated(ratio, float(wave))
+        if lift != 0.0:
+            passed *= whole.moved(lift * ARCSEC * np.cos(air.zenith), lift * ARCSEC * np.sin(air.zenith))
+        images.append(whole.image(passed))
+    halo, around = _around(air, detector, band, mission, samples)
+    total = 1.0 + float(around.sum())
+    halo = _going_on(halo, np.mean(images, axis=0), samples)
+    planes = ((np.stack(images) + around) / total).astype(np.float32)
+    drift = _drift(air, detector, float(waves.mean()), positions, telescope, samples, mission) / total
+    half = ((detector.nx - 1) / 2, (detector.ny - 1) / 2)
+    found = Planes(waves, planes, drift.astype(np.float32), half, _powers(positions), samples)
+    psf = model.sampled(found, scale, has_pixel=False, side=SIDE)
+    return replace(psf, edges=replace(halo, halo=(halo.halo[0] / total, halo.halo[1])))
+
+
+def edges(air: Air, detector: Detector, band: Passband, mission: MissionConfiguration) -> Edges:
+    """What shines beyond the planes: rings of the pupil's circles, spikes of the spider, the aureole.
+
+    air, detector, band, mission : as of `through_air`
+    """
+    section, telescope = detector.section, Telescope.of(detector.section, mission)
+    vanes = int(mission.value(f"{section}.pupil.vanes"))
+    width = mission.value(f"{section}.pupil.vane_width", "mm")
+    # Of an altazimuth mount the spider keeps its place against the zenith.
+    turn = air.zenith if mission.value(f"{section}.pupil.altazimuth") == 1.0 else -np.radians(detector.rotation)
+    first = mission.value(f"{section}.pupil.vane_angle", "rad") + turn
+    length = 1e3 * (telescope.radius - telescope.inner)
+    bars = np.array([(first + 2.0 * np.pi * i / vanes, width, length) for i in range(vanes)]).reshape(vanes, 3)
+    area = 1e6 * np.pi * (telescope.radius**2 - telescope.inner**2)
+    circles = 2e3 * np.pi * (telescope.radius + telescope.inner)
+    halo = tuple(mission.value(f"{section}.psf.aureole{part}", unit) for part, unit in (("", ""), ("_core", "arcsec")))
+    return Edges(
+        spikes.wavelengths(sub_bands(band)), area, circles, bars, air.seeing / _FWHM, detector.pixel_scale, 0.0,
+        (halo[0], halo[1]),
+    )  # fmt: skip
+
+
+def _waves(band: Passband, air: Air) -> Float:
+    """[w] A: means of as many photons of flat f_nu; one where the air does the same to all."""
+    photons = band.response / band.wavelength
+    mean = float((photons * band.wavelength).sum() / photons.sum())
+    count = 1 if air.slope == 0.0 and air.lift == 0.0 else PARTS // 2 if mean > _REDDER else PARTS
+    parts = sub_bands(band, count)
+    return np.array([np.average(p.wavelength, weights=p.response / p.wavelength) for p in parts])
+
+
+def _wavefront(detector: Detector, x: float, y: float, mission: MissionConfiguration) -> Float:
+    """By Noll number, nm, at a place on a detector in half sides from its middle."""
+    turn, scale = np.radians(detector.rotation), detector.pixel_scale
+    u, v = x * detector.nx * scale / 2, y * detector.ny * scale / 2
+    at = (detector.x + np.cos(turn) * u - np.sin(turn) * v, detector.y + np.sin(turn) * u + np.cos(turn) * v)
+    reach = max(np.hypot(abs(d.x), abs(d.y)) + d.half_diagonal for d in detectors(detector.section[4:], mission))
+    return euclid.wavefront(at[0] / reach, at[1] / reach, detector.section, mission)
+
+
+# ------------------------------------------------------------------------------------------------ planes
+
+
+@dataclass(frozen=True, slots=True)
+class _Grid:
+    """Frequencies of a plane, cycles a radian: across [n / 2 + 1], along [n]."""
+
+    across: Float
+    along: Float
+
+    @classmethod
+    def of(cls, side: int, samples: int, scale: float) -> _Grid:
+        """Of a plane of `side` pixels of `scale` arcsec, `samples` a pixel."""
+        step = scale * ARCSEC / samples
+        n = side * samples
+        return cls(np.asarray(np.fft.rfftfreq(n, step), float), np.asarray(np.fft.fftfreq(n, step), float))
+
+    def passed(self, wave: float, fried: float, telescope: Telescope, air: Air) -> Float:
+        """Of air and of perfect optics: wave : A;  fried : m."""
+        farthest = FARTHEST * fried
+        rho = np.linspace(0.0, farthest, _TABLE)
+        table = atmosphere.transfer(rho, fried, telescope.outer) * clear(rho, telescope.radius, telescope.inner)
+        (e1, e2), metres = air.shear, wave * 1e-10
+        x, y = metres * self.across, metres * self.along[:, None]
+        distance = np.sqrt((1.0 + e1) * x * x + (1.0 - e1) * y * y + 2.0 * e2 * x * y)
+        return np.interp(distance, rho, table, right=0.0)
+
+    def interpolated(self, ratio: Ratio, wave: float) -> Complex:
+        """Between the lags of a ratio; beyond them it is not wanted.  wave : A."""
+        count = (len(ratio.values) - 1) // 2
+        lags = ratio.step * (np.arange(len(ratio.values)) - count)
+        rows, columns = (_spline(np.asarray(lags, float), wave * 1e-10 * axis) for axis in (self.along, self.across))
+        parts = [sums.product(rows, sums.product(part, columns.T)) for part in (ratio.values.real, ratio.values.imag)]
+        return np.asarray(parts[0] + 1j * parts[1])
+
+    def moved(self, x: float, y: float) -> Complex:
+        """What moves an image by x, y radian."""
+        return np.asarray(np.exp(-2j * np.pi * x * self.across) * np.exp(-2j * np.pi * y * self.along[:, None]))
+
+    def image(self, passed: Array) -> Float:
+        """[n + 1, n + 1] about the middle sample; what lies on the border belongs to both sides."""
+        n = len(self.along)
+        whole = np.fft.fftshift(scipy.fft.irfft2(passed, (n, n)))
+        out = np.pad(whole, ((0, 1), (0, 1)), mode="wrap")
+        out[[0, -1]] *= 0.5
+        out[:, [0, -1]] *= 0.5
+        return np.asarray(out)
+
+
+def _spline(lags: Float, at: Float) -> Float:
+    """[n, lags] what each lag brings to the places `at`: a cubic spline's, nothing beyond."""
+    inside = np.abs(at) <= lags[-1]
+    out = np.zeros((len(at), len(lags)))
+    out[inside] = make_interp_spline(lags, np.eye(len(lags)), k=3)(at[inside])
+    return out
+
+
+def _degree(positions: int) -> int:
+    """Of the drift: more than two degrees change nothing (1e-5 of a size)."""
+    return min(euclid.DEGREES[positions][0], 2)
+
+
+def _powers(positions: int) -> tuple[tuple[int, int, int], ...]:
+    """Of the drift, which is of no colour."""
+    return tuple((k - j, j, 0) for k in range(1, _degree(positions) + 1) for j in range(k + 1))
+
+
+def _nodes(positions: int) -> tuple[tuple[float, float], ...]:
+    """Where the optics are looked at across a detector, in half sides from its middle."""
+    axis = np.linspace(-1.0, 1.0, _degree(positions) + 1).tolist() if _degree(positions) else []
+    return tuple((x, y) for y in axis for x in axis)
+
+
+def _drift(
+    air: Air, detector: Detector, wave: float, positions: int, telescope: Telescope, samples: int,
+    mission: MissionConfiguration,
+) -> Float:  # fmt: skip
+    """Planes of Planes.drift, by least squares of the optics' ratio at the nodes, at the mean wavelength."""
+    powers, nodes = _powers(positions), _nodes(positions)
+    grid = _Grid.of(_DRIFT_SIDE, samples, detector.pixel_scale)
+    if not powers:
+        return np.zeros((0, len(grid.along) + 1, len(grid.along) + 1))
+    fried = atmosphere.fried_length(air.seeing, wave, telescope.outer)
+    turn = float(np.radians(detector.rotation))
+    fronts = [_wavefront(detector, *at, mission) for at in ((0.0, 0.0), *nodes)]
+    ratios = [Ratio.of(front, telescope, wave, fried, turn) for front in fronts]
+    x, y = np.array(nodes).T
+    from_nodes = sums.least_squares(np.stack([x**i * y**j for i, j, _ in powers], axis=1), np.eye(len(nodes)))
+    off = np.stack([r.values - ratios[0].values for r in ratios[1:]])
+    flat = off.reshape(len(nodes), -1)
+    terms = sums.product(from_nodes, flat.real) + 1j * sums.product(from_nodes, flat.imag)
+    passed = grid.passed(wave, fried, telescope, air)
+    changes = terms.reshape(-1, *off.shape[1:])
+    return np.stack(
+        [grid.image(passed * grid.interpolated(replace(ratios[0], values=change), wave)) for change in changes]
+    )
+
+
+def _going_on(edges_: Edges, image: Float, samples: int) -> Edges:
+    """With rings that are as bright where the plane ends as what is in it, the wings of the air.
+
+    Error : these fall as r^-11/3; twice as far out they are too bright by a half
+    """
+    axis = (np.arange(len(image)) - len(image) // 2) / samples
+    r = np.hypot(axis, axis[:, None])
+    some = (r > 0.4 * SIDE) & (r < 0.48 * SIDE)
+    level = float((image[some] * r[some] ** 3).mean()) * samples**2
+    now = spikes.ring(edges_, np.full(PARTS, 1.0 / PARTS))
+    return replace(edges_, round=edges_.round * max(level / now, 1.0))
+
+
+def _around(
+    air: Air, detector: Detector, band: Passband, mission: MissionConfiguration, samples: int
+) -> tuple[Edges, Float32]:
+    """(edges, [n + 1, n + 1] their light inside a plane, but for the rings that its optics have)."""
+    found = edges(air, detector, band, mission)
+    step = 1.0 / samples
+    axis = (np.arange(SIDE * samples + 1) - SIDE * samples // 2) * step
+    x, y = axis, axis[:, None]
+    amplitude, core = found.halo
+    light = amplitude / (x * x + y * y + (core / found.pixel_scale) ** 2)
+    photons = np.full(PARTS, 1.0 / PARTS)
+    for (angle, _, _), line in zip(found.bars, spikes.spikes(found, photons, SIDE), strict=True):
+        t, r = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
+        near = np.abs(t) < STEP * (line.shape[1] - 1)
+        places = np.stack([np.abs(r[near]) / LONG, np.abs(t[near]) / STEP])
+        light[near] += map_coordinates(line, places, order=1, mode="nearest")
+    return found, (light * step**2).astype(np.float32)

@@ -1,0 +1,228 @@
+"""Galaxies of a library of the user's, drawn in place of profiles.
+
+Library, read   stamps of a file, checked and measured
+GalaxyStamps    what is asked for;  of_rows : which galaxies have which picture
+
+A library : FITS, its first image of three axes: columns, rows, and stamps that the column `stamp` of table `galaxies`
+            counts from 0. A stamp is a galaxy about its middle, on nothing, with margins as wide as it is seen. Its
+            scale, flux and orientation are free: it is drawn with the flux of the row, its half-light semi-major axis
+            as large as the mean of the row's bulge and disc, its major axis at the row's position angle, and lensed.
+            Its axis ratio and hand stay. All bands have the same picture.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from lake_schema.arrays import Array, Float, Float32, Int
+from lake_schema.errors import BadInput
+from lake_schema.fits import external
+from lake_schema.store.provenance import file_sha256
+from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
+from truesky.numerics import sums
+from truesky.randomness import rng
+from truesky.render.sources import galaxy_shapes
+from truesky.render.sources.galaxy_shapes import EXPONENTIAL_RADIUS, Shapes
+from truesky.render.sources.lensed_arcs import Picture
+from truesky.request.structure import Stamps
+
+# Of a pixel, so that no sum is without end.
+_LARGEST = 1e30
+# A kind of lake_schema.user_files; the column that counts stamps.
+KIND, COLUMN = "library of galaxies", "stamp"
+# Sides of a stamp, pixels; part of its light that may be missing, as light below 0; least half-light radius, pixels.
+_SIDE_BOUNDS, _BELOW, _COARSEST = (16, 1024), 0.01, 1.5
+# Rounds in which a Gaussian weight takes the shape of the light under it, until it changes by less, on pixels that are
+# joined to so many a side; and the slimmest that it may have.
+_ROUNDS, _SETTLED, _JOINED, _SLIMMEST = 60, 1e-5, 128, 0.05
+# Of the nearest in shape one is drawn; arcsec that a stamp is narrower than, so that the largest of the finest pixels
+# holds it.
+_NEAREST, _WIDEST = 8, 180.0
+
+
+@dataclass(frozen=True, slots=True)
+class Library:
+    """n stamps.
+
+    images : float32[n, ny, nx] of sum 1 each
+    radius : float64[n] half-light semi-major axis, pixels;  ratio, angle : of the axes, and of the major one from the
+             columns towards the rows, radian;  inner : light within half of the radius
+    """
+
+    file: Path
+    images: Float32
+    radius: Float
+    ratio: Float
+    angle: Float
+    inner: Float
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+
+@lru_cache(maxsize=1)
+def read(file: Path, sha256: str) -> Library:
+    """A library of stamps; BadInput names the file and the stamp that is wrong.  sha256 : of the file
+
+    Error : of a stamp's half-light radius, 1 % where it is 3 pixels or more, besides what lies beyond its margins
+    """
+    data, _ = external.read_planes(file, "", KIND)
+    try:
+        if data.ndim != 3:
+            raise BadInput(f"is an image of {data.ndim} axes, wanted three: columns, rows, stamps")
+        if not all(_SIDE_BOUNDS[0] <= side <= _SIDE_BOUNDS[1] for side in data.shape[1:]):
+            wanted = f"{_SIDE_BOUNDS[0]} to {_SIDE_BOUNDS[1]}"
+            raise BadInput(f"its stamps are of {data.shape[2]} x {data.shape[1]} pixels, wanted {wanted}")
+        measured = np.array([_measured(number, stamp) for number, stamp in enumerate(data)])
+    except BadInput as error:
+        raise BadInput(f"{file}: {error}") from None
+    for stamp in data:
+        np.maximum(stamp, 0.0, out=stamp)
+        stamp /= stamp.sum()
+    return Library(file, data.astype(np.float32), *measured.T)
+
+
+def _measured(number: int, stamp: Float) -> tuple[float, float, float, float]:
+    """(radius, ratio, angle, inner) of Library."""
+    if not (np.abs(stamp) < _LARGEST).all():
+        raise BadInput(f"stamp {number} holds values that are not numbers below {_LARGEST:g}")
+    total = float(stamp.sum())
+    if not total > 1.0 / _LARGEST:
+        raise BadInput(f"stamp {number} sums to {total:.4g}, wanted some light")
+    if -float(stamp[stamp < 0.0].sum()) > _BELOW * total:
+        raise BadInput(f"stamp {number} is below 0 by more than {_BELOW:g} of its light: wanted no noise")
+    light = np.maximum(stamp, 0.0)
+    ratio, angle = _ellipse(light)
+    y, x = _places(light)
+    along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
+    radius = np.hypot(along, across / ratio).ravel()
+    order = np.argsort(radius, kind="stable")
+    grown = np.cumsum(light.ravel()[order])
+    grown = (grown - 0.5 * light.ravel()[order]) / grown[-1]
+    half = float(np.interp(0.5, grown, radius[order]))
+    if half < _COARSEST:
+        raise BadInput(f"stamp {number}: half of its light is within {half:.3g} pixels, wanted at least {_COARSEST:g}")
+    return half, ratio, angle, float(np.interp(0.5 * half, radius[order], grown))
+
+
+def _places(light: Float) -> Float:
+    """[2, ny, nx] rows and columns of pixels from the middle."""
+    return np.asarray(np.mgrid[: light.shape[0], : light.shape[1]] - 0.5 * (np.array(light.shape)[:, None, None] - 1))
+
+
+def _joined(light: Float) -> Float:
+    """Pixels, some of them added up where there are many, about the same middle."""
+    some = max(min(light.shape) // _JOINED, 1)
+    cut = [(side % some) // 2 for side in light.shape]
+    rows, columns = (side // some for side in light.shape)
+    kept = light[cut[0] : cut[0] + rows * some, cut[1] : cut[1] + columns * some]
+    return np.asarray(kept.reshape(rows, some, columns, some).sum(axis=(1, 3)))
+
+
+def _ellipse(light: Float) -> tuple[float, float]:
+    """(axis ratio, angle of the major axis) under a Gaussian of the same shape.
+
+    Ref : Bernstein & Jarvis 2002, AJ 123, 583 (adaptive moments)
+    """
+    light = _joined(light)
+    y, x = _places(light)
+    xx, xy, yy = (0.05 * light.shape[1]) ** 2, 0.0, (0.05 * light.shape[0]) ** 2
+    for _ in range(_ROUNDS):
+        before, area = (xx, xy, yy), xx * yy - xy**2
+        weight = np.exp(-0.5 * (yy * x**2 - 2 * xy * x * y + xx * y**2) / area) * light
+        total = weight.sum()
+        if not total > 0.0:
+            return 1.0, 0.0
+        xx, xy, yy = (2.0 * float((weight * part).sum() / total) for part in (x * x, x * y, y * y))
+        # A Gaussian that has shrunk to less than a pixel weighs nothing.
+        xx, yy = max(xx, 0.5), max(yy, 0.5)
+        xy = float(np.clip(xy, -0.99 * np.sqrt(xx * yy), 0.99 * np.sqrt(xx * yy)))
+        if max(abs(now - then) for now, then in zip((xx, xy, yy), before, strict=True)) < _SETTLED * (xx + yy):
+            break
+    mean, half = 0.5 * (xx + yy), float(np.hypot(0.5 * (xx - yy), xy))
+    ratio = float(np.sqrt(max(mean - half, 0.0) / (mean + half)))
+    return max(ratio, _SLIMMEST), 0.5 * float(np.arctan2(2 * xy, xx - yy))
+
+
+@dataclass(frozen=True, slots=True)
+class GalaxyStamps:
+    """What is drawn in place of profiles; wanted : of the request;  seed : of the request"""
+
+    library: Library
+    wanted: Stamps
+    seed: int
+
+
+def of_file(wanted: Stamps, seed: int, sha256: str) -> GalaxyStamps:
+    """The same of a file that has to be as it was; wanted, seed : of the request;  sha256 : of the file then."""
+    if file_sha256(wanted.file) != sha256:
+        raise BadInput(f"{wanted.file}: has changed since the rendering began")
+    return GalaxyStamps(read(wanted.file, sha256), wanted, seed)
+
+
+def of_rows(galaxies: pa.Table, shape: Shapes, stamps: GalaxyStamps | None) -> tuple[Int, tuple[Picture, ...]]:
+    """(number of its picture of each galaxy, -1 = it has none; the pictures).
+
+    galaxies : rows of the table;  shape : theirs;  stamps : None: there are none
+    Errors   : BadInput for a stamp that the library does not have
+    """
+    number = np.full(len(galaxies), -1)
+    if stamps is None or not len(galaxies):
+        return number, ()
+    ids, library = galaxies["id"].to_numpy().astype(np.int64), stamps.library
+    stamp = _named(galaxies, library)
+    if stamps.wanted.nearest:
+        own = shape.bulge_fraction * shape.bulge_radius + (1 - shape.bulge_fraction) * shape.disk_radius
+        free = np.flatnonzero((stamp < 0) & (own >= stamps.wanted.least_radius))
+        stamp[free] = _drawn(ids[free], shape.take(free), library, stamps.seed)
+    some = np.flatnonzero(stamp >= 0)
+    matrices = _matrices(shape.take(some), library, stamp[some])
+    found = [Picture(library.images[which], matrix) for which, matrix in zip(stamp[some], matrices, strict=True)]
+    fits = np.array([picture.diagonal < _WIDEST for picture in found], bool)
+    number[some[fits]] = np.arange(int(fits.sum()))
+    return number, tuple(picture for picture, fit in zip(found, fits, strict=True) if fit)
+
+
+def _named(galaxies: pa.Table, library: Library) -> Int:
+    """int64[n] stamps that rows name, -1 = none."""
+    if COLUMN not in galaxies.column_names:
+        return np.full(len(galaxies), -1)
+    named: Array = galaxies[COLUMN].fill_null(-1).to_numpy().astype(np.int64)
+    if (bad := named >= len(library)).any():
+        one = int(bad.argmax())
+        which = f"galaxy {galaxies['id'][one].as_py()}: stamp {named[one]}"
+        raise BadInput(f"{which} is not one of the {len(library)} of {library.file}, counted from 0")
+    return named
+
+
+def _drawn(ids: Int, shape: Shapes, library: Library, seed: int) -> Int:
+    """int64[n] stamps drawn among those nearest in axis ratio and concentration."""
+    fraction = shape.bulge_fraction
+    disk = np.hypot(np.cos(np.radians(shape.inclination)), DISK_SCALE_HEIGHT)
+    ratio = fraction * shape.bulge_axis_ratio + (1 - fraction) * np.minimum(disk, 1.0)
+    inner = 1.0 - galaxy_shapes.outside(shape, 0.5 * galaxy_shapes.half_light(shape))
+    count = min(_NEAREST, len(library))
+    turn = (rng.uniforms(ids, 1, seed, "galaxy stamps")[0] * count).astype(np.int64)
+    stamp = np.empty(len(ids), np.int64)
+    for i in range(len(ids)):
+        apart = (library.ratio - ratio[i]) ** 2 + (library.inner - inner[i]) ** 2
+        stamp[i] = np.argsort(apart, kind="stable")[turn[i]]
+    return stamp
+
+
+def _matrices(shape: Shapes, library: Library, stamp: Int) -> Float:
+    """float64[n, 2, 2] of Picture, of stamps [n] on galaxies [n]."""
+    own = shape.bulge_fraction * shape.bulge_radius + (1 - shape.bulge_fraction) * shape.disk_radius
+    face_on = Shapes(
+        np.zeros(len(own)), own * EXPONENTIAL_RADIUS / library.radius[stamp], np.zeros(len(own)), shape.sersic_index,
+        shape.bulge_axis_ratio, np.zeros(len(own)), shape.beta, shape.g1, shape.g2, shape.magnification,
+    )  # fmt: skip
+    turned = galaxy_shapes.forms(face_on, np.broadcast_to(np.eye(2), (len(own), 2, 2))).disk
+    cosine, sine = np.cos(library.angle[stamp]), np.sin(library.angle[stamp])
+    back = np.stack([np.stack([cosine, sine], -1), np.stack([-sine, cosine], -1)], -2)
+    return np.asarray(sums.product(turned, back))

@@ -1,0 +1,208 @@
+"""Solar-system objects: an embedded population of small bodies, each a straight trail while an exposure lasts.
+
+Population   where they are on a date, how they move, how bright they are
+population   those near a place: drawn by day and order-5 cell, so that all exposures of a day see the same bodies
+sources      those of an exposure that a detector may see, as what is drawn
+
+Near the ecliptic they are dense, and most of them move along it, at the pace of the main belt; a few are fast and go
+anywhere. They shine like the Sun. At midnight UTC another population takes over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lake_schema import sky, units
+from lake_schema.arrays import Bool, Float, Int
+from lake_schema.ids import FILE_ORDER, GENERATION_ORDER, source_id
+from lake_schema.mission.configuration import MissionConfiguration
+from lake_schema.sky.ecliptic import ecliptic, equatorial
+from truesky.fluxes import passbands
+from truesky.fluxes.passbands import Passband
+from truesky.randomness import rng
+from truesky.render.camera import astrometry, pointing
+from truesky.render.channels.aim import Aim
+from truesky.render.sky.diffuse_light import solar
+from truesky.render.sources import colours
+from truesky.render.sources.galaxy_shapes import Shapes
+from truesky.render.sources.source_list import Sources
+
+# Kind of an identifier; its member is the day.
+KIND = 6
+_DAY_S, _HOUR_S = 86400.0, 3600.0
+_KEY = "env.solar_system"
+# Their magnitudes are of this band.
+_BAND = "euclid_vis"
+# Motion along a circle of latitude is followed up to here.
+_LEAST_COSINE = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Population:
+    """n bodies on one day.
+
+    lon, lat   : deg, ecliptic, at noon UTC;  east, north : arcsec / h along them
+    mag        : I_E, AB
+    hour       : after noon, at which they are there
+    """
+
+    ids: Int
+    lon: Float
+    lat: Float
+    east: Float
+    north: Float
+    mag: Float
+    hour: float | Float = 0.0
+
+    def after(self, hours: float | Float) -> tuple[Float, Float]:
+        """ra, dec [n] deg so many hours after noon."""
+        across = np.maximum(np.cos(np.radians(self.lat)), _LEAST_COSINE)
+        since = (hours - self.hour) / 3600.0
+        return equatorial(self.lon + self.east * since / across, np.clip(self.lat + self.north * since, -90.0, 90.0))
+
+    def take(self, some: Bool | Int) -> Population:
+        """Some of the bodies."""
+        return Population(
+            *(np.broadcast_to(getattr(self, field.name), self.ids.shape)[some] for field in fields(Population))
+        )
+
+
+def nobody(day: int) -> Population:
+    """The bodies of a day on which there are none."""
+    none = np.zeros(0)
+    return Population(np.zeros(0, np.int64), none, none, none, none, none)
+
+
+def population(
+    ra: float, dec: float, radius: float, day: int, mission: MissionConfiguration, seed: int, hours: float = 12.0
+) -> Population:
+    """Everything that is within `radius` deg of a place at some time of a day (MJD), so many hours around its noon.
+
+    ra, dec : of the place, deg;  mission : the mission database;  seed : of the request
+    """
+    fastest = max(mission.value(f"{_KEY}.{key}", "arcsec / h") for key in ("rate_max", "fast_rate_max"))
+    # Away from where it is at noon.
+    reach = min(radius + hours * fastest / 3600.0, 180.0)
+    # A database without a faintest magnitude is of a sky without them.
+    some = f"{_KEY}.faintest" in mission and mission.value(f"{_KEY}.density") > 0.0
+    cells = sky.cells_in_cone(ra, dec, reach, FILE_ORDER).tolist() if some else []
+    parts = [_of_cell(cell, day, mission, seed) for cell in cells]
+    if not parts:
+        none = np.zeros(0)
+        return Population(np.zeros(0, np.int64), none, none, none, none, none)
+    return Population(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+def density(latitude: npt.ArrayLike, mission: MissionConfiguration) -> Float:
+    """deg-2 down to the faintest magnitude, at an ecliptic latitude, deg."""
+    value = {name: mission.value(f"{_KEY}.latitude_{name}", "deg") for name in ("zero", "scale", "cap")}
+    fainter = mission.value(f"{_KEY}.faintest", "mag") - mission.value(f"{_KEY}.reference_magnitude", "mag")
+    total = mission.value(f"{_KEY}.density", "deg-2") * 10.0 ** (_slope(mission) * fainter)
+    height = np.minimum(np.abs(np.asarray(latitude, float)), value["cap"])
+    return np.asarray(total * np.exp(-(height - value["zero"]) / value["scale"]))
+
+
+def _slope(mission: MissionConfiguration) -> float:
+    return mission.value(f"{_KEY}.counts_slope", "dex / mag")
+
+
+def _of_cell(cell: int, day: int, mission: MissionConfiguration, seed: int) -> tuple[Any, ...]:
+    """ids and columns of Population of an order-5 cell."""
+    own = rng.stream(seed, "solar_system", day, cell)
+    centre = ecliptic(*sky.cell_centre(FILE_ORDER, cell))[1]
+    most = float(density(max(abs(float(centre)) - sky.cell_radius(FILE_ORDER), 0.0), mission))
+    count = int(own.poisson(most * sky.cell_area(FILE_ORDER)))
+    _, ra, dec = sky.random_in_cell(FILE_ORDER, cell, count, own)
+    lon, lat = ecliptic(ra, dec)
+    chosen, brightness, fast, pace, angle = own.random((5, count))
+    here = np.flatnonzero(chosen * most < density(lat, mission))
+    lon, lat, brightness, fast, pace, angle = (x[here] for x in (lon, lat, brightness, fast, pace, angle))
+    slow, usual, fastest = (
+        mission.value(f"{_KEY}.{key}", "arcsec / h") for key in ("rate_min", "rate_max", "fast_rate_max")
+    )
+    is_fast = fast < mission.value(f"{_KEY}.fast_fraction", "")
+    # Fast ones: as many in every octave.
+    rate = np.where(is_fast, usual * (fastest / usual) ** pace, slow + (usual - slow) * pace)
+    turn = np.where(is_fast, 2.0 * np.pi * angle, 0.0)
+    # 1 - u lies in (0, 1].
+    mag = mission.value(f"{_KEY}.faintest", "mag") + np.log10(1.0 - brightness) / _slope(mission)
+    sub_cells = 4 ** (GENERATION_ORDER - FILE_ORDER)
+    ids = source_id(KIND, cell * sub_cells, np.arange(len(here)), day)
+    return ids, lon, lat, rate * np.cos(turn), rate * np.sin(turn), mag
+
+
+def sources(
+    aim: Aim,
+    mission: MissionConfiguration,
+    seed: int,
+    reach: float,
+    shapes: Shapes,
+    own: Callable[[int], Population] | None = None,
+) -> Sources:
+    """Bodies whose trail comes within `reach` deg of a detector's centre, ascending id.
+
+    Of a trail longer than twice `reach` it is as long a part about where it is nearest, with its share of the light.
+    shapes : of the sources that they are drawn with
+    own      : a day's (MJD) bodies in place of the embedded population
+    aim      : the exposure and detector;  mission : the mission database;  seed : of the request
+    """
+    exposure, system, band = aim.exposure, aim.wcs, aim.band
+    start, seconds = exposure.mjd, exposure.exposure_time_s
+    centre = astrometry.centre(aim.detector, system)
+    # An exposure belongs to the day that it begins on.
+    day = int(np.floor(start))
+    since = 24.0 * (start - day - 0.5)
+    until = max(12.0, since + seconds / _HOUR_S)
+    found = own(day) if own else population(*centre, reach, day, mission, seed, until)
+    near, first, last = _passing(found.after(since), found.after(since + seconds / _HOUR_S), centre, reach)
+    order = np.argsort(found.ids[near])
+    near, first, last = near[order], first[order], last[order]
+    some = found.take(near)
+    begin, middle, end = (
+        astrometry.pixel_of_sky(system, *some.after(since + part * seconds / _HOUR_S))
+        for part in (first, 0.5 * (first + last), last)
+    )
+    photons = colours.of_spectrum(band, solar(band.wavelength / 10.0, mission))
+    return Sources(
+        some.ids,
+        *middle,
+        astrometry.jacobian(system, *middle),
+        aim.electrons * flux(some.mag, band, mission) * (last - first),
+        np.full(len(near), -1),
+        shapes,
+        np.tile(photons, (len(near), 1)),
+        trail=np.stack(end, axis=1) - np.stack(begin, axis=1),
+    )
+
+
+def _passing(
+    begin: tuple[Float, Float], end: tuple[Float, Float], centre: tuple[float, float], reach: float
+) -> tuple[Int, Float, Float]:
+    """(bodies that come within `reach` deg of a centre on their way, parts of it from which to which they are kept)."""
+    there, start, stop = (pointing.basis(*place)[2] for place in (np.reshape(centre, (2, 1)), begin, end))
+    way = stop - start
+    length = np.sqrt(np.sum(way**2, axis=0))
+    nearest = np.sum((there - start) * way, axis=0) / np.maximum(length, 1e-30) ** 2
+    place = start + np.clip(nearest, 0.0, 1.0) * way
+    away = np.sqrt(np.sum((place / np.sqrt(np.sum(place**2, axis=0)) - there) ** 2, axis=0))
+    radius = 2.0 * np.sin(0.5 * np.radians(min(reach, 180.0)))
+    near = np.flatnonzero(away <= radius)
+    length, nearest, away = length[near], nearest[near], away[near]
+    half = np.where(length > 2.0 * radius, radius / np.maximum(length, 1e-30), np.inf)
+    return near, np.maximum(nearest - half, 0.0), np.minimum(nearest + half, 1.0)
+
+
+def flux(mag: Float, band: Passband, mission: MissionConfiguration) -> Float:
+    """f_nu [n] in a band, microjansky, of bodies of a magnitude in I_E."""
+    own, reference = (_sun(b, mission) for b in (band, passbands.load(_BAND)))
+    return np.asarray(10.0 ** (0.4 * (units.AB_UJY - mag)) * own / reference)
+
+
+def _sun(band: Passband, mission: MissionConfiguration) -> float:
+    wavelength = band.wavelength / 10.0
+    return float(passbands.ab_flux(band, band.wavelength, solar(wavelength, mission)))

@@ -1,0 +1,194 @@
+"""A part of the sky that a request asks for: which HEALPix cells it touches, and which places lie in it.
+
+Area       its form
+parse      [area] of a request -> Area
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lake_schema import sky
+from lake_schema.arrays import Bool, Float
+from lake_schema.errors import BadInput
+from lake_schema.ids import GENERATION_ORDER
+from lake_schema.sky.ecliptic import ecliptic, tile_corners, tile_count
+from truesky.numerics import sums
+from truesky.request.toml_values import Toml, boolean, checked_number, integer, number, pair, table_of
+
+_FORMS = ("polygon", "cone", "box", "tile", "patches", "wide")
+# The wide survey leaves out what lies nearer to the Galactic and the ecliptic plane, deg: limits that leave about the
+# 15 000 deg2 of Serrano et al. 2024 (adopted; its own region follows maps of stars, dust and zodiacal light).
+_GALACTIC_MIN, _ECLIPTIC_MIN = 30.0, 15.0
+_MOST_VERTICES, _MOST_PATCHES = 1000, 1000
+_RA, _DEC = ("ra", -360.0, 360.0), ("dec", -90.0, 90.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Area:
+    """A convex spherical polygon (vertices), a box (west, east, south, north), a circle (ra, dec, radius), deg.
+
+    patches : circles (ra, dec, radius);  wide : the sky of the wide survey
+    """
+
+    vertices: tuple[tuple[float, float], ...] = ()
+    box: tuple[float, float, float, float] | None = None
+    ra: float = 0.0
+    dec: float = 0.0
+    radius: float = 0.0
+    patches: tuple[tuple[float, float, float], ...] = ()
+    wide: bool = False
+
+    def cells(self, order: int = GENERATION_ORDER) -> list[int]:
+        """Nested cells of `order` that the area touches, ascending."""
+        if self.wide:
+            every = np.arange(12 << (2 * order))
+            touched = self.contains(*sky.cell_centres(order, every), 2 * sky.cell_radius(order))
+            return [int(cell) for cell in every[touched]]
+        if self.patches:
+            found = [sky.cells_in_cone(*patch, order) for patch in self.patches]
+            return [int(cell) for cell in np.unique(np.concatenate(found))]
+        if self.box is not None:
+            return [int(cell) for cell in sky.cells_in_box(*self.box, order)]
+        if self.vertices:
+            return [int(cell) for cell in sky.cells_in_polygon(self.vertices, order)]
+        return [int(cell) for cell in sky.cells_in_cone(self.ra, self.dec, self.radius, order)]
+
+    def contains(self, ra: npt.ArrayLike, dec: npt.ArrayLike, margin: float = 0.0) -> Bool:
+        """[n] Which places lie in the area, or not farther than `margin` deg from it."""
+        return np.asarray(self.depth(ra, dec) >= -margin)
+
+    def depth(self, ra: npt.ArrayLike, dec: npt.ArrayLike) -> Float:
+        """[n] deg from each place to the area's edge, negative outside.
+
+        Error : outside a corner of a polygon or a box the true distance is larger
+        """
+        lon, lat = np.asarray(ra, float), np.asarray(dec, float)
+        if self.wide:
+            b, beta = sky.galactic(lon, lat)[1], ecliptic(lon, lat)[1]
+            return np.asarray(np.minimum(np.abs(b) - _GALACTIC_MIN, np.abs(beta) - _ECLIPTIC_MIN))
+        if self.patches:
+            distance = [radius - sky.separation(lon, lat, x, y) for x, y, radius in self.patches]
+            return np.asarray(np.max(distance, axis=0))
+        if self.box is not None:
+            west, east, south, north = self.box
+            middle, half = west + 0.5 * ((east - west) % 360.0), 0.5 * ((east - west) % 360.0)
+            across = np.abs((lon - middle + 180.0) % 360.0 - 180.0)
+            along = (half - across) * np.cos(np.radians(lat))
+            return np.asarray(np.minimum(along, np.minimum(lat - south, north - lat)))
+        if self.vertices:
+            return _polygon_depth(self.vertices, lon, lat)
+        return self.radius - sky.separation(lon, lat, self.ra, self.dec)
+
+    def bounds(self) -> tuple[float, float, float]:
+        """ra, dec, radius of a circle that holds the area, deg."""
+        if self.wide:
+            return 0.0, 0.0, 180.0
+        corners = np.array([patch[:2] for patch in self.patches] or self.vertices or _corners_of(self.box))
+        if not corners.size:
+            return self.ra, self.dec, self.radius
+        x, y, z = sky.unit_vectors(corners[:, 0], corners[:, 1]).sum(0)
+        ra, dec = float(np.degrees(np.arctan2(y, x)) % 360.0), float(np.degrees(np.arctan2(z, np.hypot(x, y))))
+        reach = sky.separation(corners[:, 0], corners[:, 1], ra, dec)
+        return ra, dec, min(float((reach + np.array([p[2] for p in self.patches] or [0.0])).max()) * 1.05, 180.0)
+
+
+def _corners_of(box: tuple[float, float, float, float] | None) -> list[tuple[float, float]]:
+    if box is None:
+        return []
+    west, east, south, north = box
+    lon = west + np.linspace(0.0, (east - west) % 360.0, 9)
+    return [(float(x) % 360.0, y) for x in lon for y in (south, north)]
+
+
+def _polygon_depth(vertices: Sequence[tuple[float, float]], ra: Float, dec: Float) -> Float:
+    corners = sky.unit_vectors(*np.array(vertices).T)
+    sides = np.cross(corners, np.roll(corners, -1, 0))
+    sides /= np.sqrt(np.sum(sides**2, axis=1, keepdims=True))
+    # Vertices may run either way round.
+    sides *= np.sign(sums.product(sides[0], corners[2]))
+    x, y = np.radians(ra), np.radians(dec)
+    place = np.stack([np.cos(y) * np.cos(x), np.cos(y) * np.sin(x), np.sin(y)])
+    depth = np.degrees(np.arcsin(np.clip(sums.product(sides, place.reshape(3, -1)), -1.0, 1.0))).min(axis=0)
+    return np.asarray(depth.reshape(np.shape(ra)))
+
+
+# ------------------------------------------------------------------------------------------------ reading
+
+
+def parse(table: Toml, path: str = "area") -> Area:
+    """A parsed [area] -> Area; BadInput names the key."""
+    table = table_of(table, path, set(_FORMS))
+    if len(table) != 1:
+        raise BadInput(f"{path} wants exactly one of {', '.join(_FORMS)}")
+    readers = {
+        "polygon": lambda: _polygon(table["polygon"], f"{path}.polygon"),
+        "cone": lambda: _cone(table["cone"], f"{path}.cone"),
+        "box": lambda: _box(table["box"], f"{path}.box"),
+        "tile": lambda: _tile(integer(table, f"{path}.tile", 0, tile_count() - 1)),
+        "patches": lambda: _patches(table["patches"], f"{path}.patches"),
+        "wide": lambda: _wide(boolean(table, f"{path}.wide", True), path),
+    }
+    return readers[next(iter(table))]()
+
+
+def _cone(found: object, path: str) -> Area:
+    cone = table_of(found, path, {"ra", "dec", "radius"})
+    ra = number(cone, f"{path}.ra", -360.0, 360.0) % 360.0
+    return Area(ra=ra, dec=number(cone, f"{path}.dec", -90.0, 90.0), radius=number(cone, f"{path}.radius", 0.0, 180.0))
+
+
+def _box(found: object, path: str) -> Area:
+    box = table_of(found, path, {"ra", "dec"})
+    west, east = pair(box, f"{path}.ra", -360.0, 720.0)
+    south, north = pair(box, f"{path}.dec", -90.0, 90.0)
+    # [350, 10] crosses 0.
+    width = east - west + (360.0 if east < west else 0.0)
+    if not 0.0 < width < 180.0:
+        raise BadInput(f"{path}.ra = [{west}, {east}]: the second must lie to the east of the first, by less than 180")
+    if not north > south:
+        raise BadInput(f"{path}.dec = [{south}, {north}]: the second must be larger")
+    return Area(box=(west % 360.0, east % 360.0, south, north))
+
+
+def _polygon(found: object, path: str) -> Area:
+    vertices = tuple((ra, dec) for ra, dec in _places(found, path, 3, _MOST_VERTICES, _RA, _DEC))
+    try:
+        sky.cells_in_polygon(vertices, 0)
+    except BadInput as error:
+        raise BadInput(f"{path}: {error}") from None
+    return Area(vertices=vertices)
+
+
+def _tile(tile: int) -> Area:
+    return Area(vertices=tuple((float(ra), float(dec)) for ra, dec in tile_corners(tile)))
+
+
+def _patches(found: object, path: str) -> Area:
+    circles = _places(found, path, 1, _MOST_PATCHES, _RA, _DEC, ("radius", 0.0, 90.0))
+    return Area(patches=tuple((ra, dec, radius) for ra, dec, radius in circles))
+
+
+def _places(found: object, path: str, least: int, most: int, *bounds: tuple[str, float, float]) -> list[list[float]]:
+    """A list of lists of numbers, right ascension first; bounds : name, from, to of each number."""
+    form = f"[{', '.join(name for name, _, _ in bounds)}]"
+    if not isinstance(found, list) or not least <= len(found) <= most:
+        raise BadInput(f"{path} wants a list of {least} to {most} {form}")
+    places = []
+    for i, place in enumerate(found):
+        if not isinstance(place, list) or len(place) != len(bounds):
+            raise BadInput(f"{path}[{i}] wants {form}")
+        numbers = zip(place, bounds, strict=True)
+        ra, *others = (checked_number(number, f"{path}[{i}].{name}", lo, hi) for number, (name, lo, hi) in numbers)
+        places.append([ra % 360.0, *others])
+    return places
+
+
+def _wide(wanted: bool, path: str) -> Area:
+    if not wanted:
+        raise BadInput(f"{path}.wide = false asks for nothing")
+    return Area(wide=True)

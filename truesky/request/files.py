@@ -1,0 +1,218 @@
+"""External files that a request names.
+
+UserCurves, curves  spectra, filters and extinction laws: the section `fluxes`
+Ingest, ingest      catalogues, halos, a map of dust: the section `ingest`
+psfs                point-spread functions: the section `psf`
+GivenSources, sources   tables of all sources that there are: the section `sources`
+file_of             a file beside the request
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lake_schema import user_files
+from lake_schema.errors import BadInput
+from lake_schema.store import layout
+from lake_schema.store.provenance import file_sha256
+from truesky.request.toml_values import Toml, boolean, number, shown, string, strings, table_of
+
+# A kind of lake_schema.user_files.
+SOURCES = "table of sources"
+
+
+@dataclass(frozen=True, slots=True)
+class Curves:
+    """Files of spectra, of a filter or of an extinction law; medium : of a filter's wavelengths, "air" or "vacuum"."""
+
+    files: tuple[Path, ...]
+    format: str
+    medium: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class UserCurves:
+    """What stands beside the embedded passbands, and in place of the embedded galaxies, extinction laws and dwarfs.
+
+    basel : models of dwarfs;  irtf : spectra of stars whose infrared the dwarfs are given
+    intergalactic : galaxies are seen through the hydrogen between them
+    """
+
+    passbands: tuple[tuple[str, Curves], ...] = ()
+    templates: Curves | None = None
+    extinction: tuple[tuple[int, Curves], ...] = ()
+    basel: Path | None = None
+    irtf: tuple[Path, ...] = ()
+    intergalactic: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Catalogue:
+    """Files of an external catalogue; columns : (our key, JSON of what stands for it) beside those of the format."""
+
+    files: tuple[Path, ...]
+    format: str = ""
+    columns: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class DustMap:
+    """A HEALPix map of E(B-V) or A(V); ordering, coordinates : what its header must say, or does not say."""
+
+    file: Path
+    column: str
+    quantity: str = "ebv"
+    ordering: str = ""
+    coordinates: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Ingest:
+    """What is taken from others instead of being made; training : galaxies whose spectra ours have."""
+
+    galaxies: Catalogue | None = None
+    halos: Catalogue | None = None
+    training: Catalogue | None = None
+    dust: DustMap | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class GivenSources:
+    """Tables of the only sources that there are (truesky/catalogue/given_sources.py).
+
+    band    : of their magnitudes
+    spacing : arcsec, of the grid on which their rows stand in turn; 0 = at places of their own
+    """
+
+    galaxies: Path | None
+    stars: Path | None
+    band: str
+    spacing: float
+
+    def facts(self, bounds: tuple[float, float, float]) -> dict[str, Any]:
+        """What tells these sources from others in the key of a plan; bounds : of the request's area."""
+        files = {"galaxies": self.galaxies, "stars": self.stars}
+        sums = {name: file_sha256(_csv(file, f"sources.{name}")) for name, file in files.items() if file is not None}
+        grid = {"spacing": self.spacing, "bounds": list(bounds)} if self.spacing else {}
+        return {"sha256": sums, "band": self.band, **grid}
+
+
+def _csv(file: Path, key: str) -> Path:
+    if file.suffix.lower() != ".csv":
+        raise BadInput(f"{key}: {user_files.shown(file)}: the ending is not .csv")
+    return user_files.checked(file, SOURCES, key)
+
+
+def file_of(folder: Path, name: str) -> Path:
+    """A file by its name, found from the request's folder."""
+    return user_files.expanded(name, folder)
+
+
+def curves(table: Toml, folder: Path) -> UserCurves:
+    """The section `fluxes`; files are found from `folder`.  BadInput names the key."""
+    filters = table_of(table.get("passbands", {}), "fluxes.passbands", None)
+    laws = table_of(table.get("extinction", {}), "fluxes.extinction", set("1234"))
+    passbands = [_curves(value, f"fluxes.passbands.{layout.name(key)}", folder, True) for key, value in filters.items()]
+    extinction = [_curves(value, f"fluxes.extinction.{key}", folder) for key, value in laws.items()]
+    templates = None
+    if "templates" in table:
+        path = "fluxes.templates"
+        given = table_of(table["templates"], path, {"files", "format"})
+        files = strings(given, f"{path}.files", distinct=False)
+        if not files:
+            raise BadInput(f"{path}.files is missing")
+        templates = Curves(tuple(file_of(folder, file) for file in files), string(given, f"{path}.format"))
+    stars = table_of(table.get("stars", {}), "fluxes.stars", {"basel", "irtf"})
+    if "stars" in table and not stars:
+        raise BadInput("fluxes.stars names neither basel nor irtf")
+    return UserCurves(
+        tuple(zip(filters, passbands, strict=True)),
+        templates,
+        tuple(zip(map(int, laws), extinction, strict=True)),
+        file_of(folder, string(stars, "fluxes.stars.basel")) if "basel" in stars else None,
+        tuple(file_of(folder, name) for name in strings(stars, "fluxes.stars.irtf")),
+        boolean(table, "fluxes.intergalactic", False),
+    )
+
+
+def _curves(value: object, path: str, folder: Path, has_medium: bool = False) -> Curves:
+    table = table_of(value, path, {"file", "format", *(["medium"] if has_medium else [])})
+    medium = string(table, f"{path}.medium", ("air", "vacuum")) if has_medium else ""
+    return Curves((file_of(folder, string(table, f"{path}.file")),), string(table, f"{path}.format"), medium)
+
+
+def ingest(table: Toml, folder: Path) -> Ingest:
+    """The section `ingest`; files are found from `folder`.  BadInput names the key."""
+    galaxies = _catalogue(table["galaxies"], "ingest.galaxies", folder) if "galaxies" in table else None
+    halos, training = (
+        _catalogue(table[name], f"ingest.{name}", folder) if name in table else None for name in ("halos", "training")
+    )
+    if galaxies and halos:
+        raise BadInput("ingest.halos: a finished catalogue of galaxies wants no halos")
+    if galaxies and training:
+        raise BadInput("ingest.training: the galaxies of a finished catalogue have their own spectra")
+    dust = None
+    if "dust" in table:
+        given = table_of(table["dust"], "ingest.dust", set(DustMap.__slots__))
+        dust = DustMap(
+            file_of(folder, string(given, "ingest.dust.file")),
+            string(given, "ingest.dust.column"),
+            string(given, "ingest.dust.quantity", ("ebv", "a_v"), "ebv"),
+            string(given, "ingest.dust.ordering", ("RING", "NESTED"), "RING") if "ordering" in given else "",
+            string(given, "ingest.dust.coordinates", ("G", "C"), "G") if "coordinates" in given else "",
+        )
+    return Ingest(galaxies, halos, training, dust)
+
+
+def psfs(table: Toml, folder: Path) -> tuple[tuple[str, str], ...]:
+    """The section `psf`: (band, file), found from `folder`; a band once for each file of a list.
+
+    Errors : BadInput names the key
+    """
+    found = []
+    for band in sorted(table):
+        path = f"psf.{band}"
+        several = isinstance(table[band], list)
+        names = strings(table, path) if several else (string(table, path),)
+        if not names:
+            raise BadInput(f"{path} names no file")
+        found += [(layout.name(band), str(file_of(folder, name))) for name in names]
+    return tuple(found)
+
+
+def sources(table: Toml, folder: Path) -> GivenSources | None:
+    """The section `sources`; files are found from `folder`.  BadInput names the key."""
+    if not table:
+        return None
+    grid = string(table, "sources.only", ("table", "grid")) == "grid"
+    if "spacing" in table and not grid:
+        raise BadInput('sources.spacing wants only = "grid": the sources of a table have places of their own')
+    spacing = number(table, "sources.spacing", 0.01, 3600.0) if grid else 0.0
+    files = {name: file_of(folder, string(table, f"sources.{name}")) for name in ("galaxies", "stars") if name in table}
+    if not files:
+        raise BadInput("sources names neither galaxies nor stars")
+    band = string(table, "sources.band", default="euclid_vis")
+    return GivenSources(files.get("galaxies"), files.get("stars"), band, spacing)
+
+
+def _catalogue(value: object, path: str, folder: Path) -> Catalogue:
+    table = table_of(value, path, {"files", "columns", *(["format"] if path.endswith("galaxies") else [])})
+    files = strings(table, f"{path}.files")
+    if not files:
+        raise BadInput(f"{path}.files is missing or empty")
+    columns = table_of(table.get("columns", {}), f"{path}.columns", None)
+    return Catalogue(
+        tuple(file_of(folder, name) for name in files),
+        string(table, f"{path}.format", default=""),
+        tuple((key, _json(columns[key], f"{path}.columns.{key}")) for key in sorted(columns)),
+    )
+
+
+def _json(value: object, path: str) -> str:
+    try:
+        return json.dumps(value, sort_keys=True, allow_nan=False)
+    except (TypeError, ValueError):
+        raise BadInput(f"{path} wants texts, numbers and tables, got {shown(value)}") from None

@@ -1,0 +1,341 @@
+"""The simulation request: a TOML file of at most a screen, read into frozen records; every number has bounds.
+
+    name = "demo"      seed = 2024      noise_seed = 1 (default: seed)
+    accuracy = "survey" | "quicklook" | "draft" | "reference" | {flux = ..}
+    [area]         polygon = [[ra, dec], ..] | cone = {ra, dec, radius} | box = {ra = [from, to], dec = [from, to]}
+                   tile = number | patches = [[ra, dec, radius], ..] | wide = true
+    [universe]     galaxy_limit, galaxy_band, star_limit (H, Vega), z_max, box_cells, lensing_nside
+                   high_redshift_boost, quasar_boost, alignment
+                   lensing = "box" | "none" | {g1, g2}   a constant reduced shear of all galaxies, frame (east, north)
+                   rotation       deg, added to the position angle of every galaxy, before lensing
+    [stars]        density, brown_dwarf_boost, tycho2 = [..], catalogue = {file, columns}, plane_limit, rows_a_file
+                   bright_limit   H (Vega, as observed), brighter stars are left out
+    [ingest.galaxies]  files = [..]  a finished catalogue instead of ours: Parquet, FITS, CSV, HDF5, a HATS folder
+                       format = "flagship1" | "flagship2" | "euclid" | "skycatalogs" | "opencosmo"
+                       columns = {ours = theirs, ..}
+    [ingest.halos]     files = [..]  columns = {ra, dec, z_true, log_mass, ..}   a halo light-cone instead of ours
+    [ingest.training]  files = [..]  columns = {z_true, abs_mag_r01, color_gr_01, sed, ext_law, ebv}
+                       observed galaxies: each of ours has the spectrum of one like it
+    [ingest.dust]      file, column, quantity = "ebv" | "a_v"   a HEALPix map of the Milky Way's dust instead of ours
+    [sources]      only = "table" | "grid"   galaxies = "file.csv"  stars = "file.csv"   these and no others
+                   band   of their magnitudes (AB), default: "euclid_vis"   spacing   arcsec, of a grid
+    [structure]    arms = true | {contrast, knots, number, least_radius}   spiral arms and knots of large discs
+                   (truesky/request/structure.py), default: discs are smooth
+                   stamps = {file, nearest, least_radius}   your own galaxies (truesky/render/sources/galaxy_stamps.py)
+    [strong_lenses]  boost   how many times denser than in nature they are drawn
+    [mission]      ladder = ["CBE", ..]   overrides = {"vis.read_noise" = {value = 5.0, unit = "electron"}}
+                   of one detector "vis.dark_current@3-4", amplifier "vis.gain.E", or both "vis.gain@3-4.E"
+    [fluxes]       bands = [..]           default: the bands of the pointings and observations
+                   intergalactic = true   galaxies are seen through the hydrogen between them
+    [fluxes.passbands.NAME]        your own filter, column f_nu_NAME: file, medium = "air" | "vacuum", format
+    [fluxes.templates]             your own galaxies, earliest first, counted by sed_1 and sed_2: files, format
+    [fluxes.stars]                 your own dwarfs: basel (models, .cor), irtf = [..] (their infrared, by Y - H)
+    [fluxes.extinction.CODE]       your own law in place of law 1 .. 4: file, format
+    [psf]          BAND = "file.fits"   your own PSF in a band: a cube of planes or PSFEx's; of a list of files each
+                   exposure has one, drawn at random
+                   (truesky/render/psf/from_file.py); {detector} in the name stands for the detector's
+    [solar_system] bodies = "file"      your own moving bodies in place of ours (truesky/render/sources/ephemerides.py)
+    [effects]      on = [..]  off = [..]  effects forced on or off, default: what a scene needs
+                   off = ["all"]          all that are not in `on`, but for the conversion to whole numbers
+    [explore]      accuracy = [..]  "effects.<name>" = [true, false]  "vis.gain" = {values = [..], unit = ".."}
+    [[pointing]]   channel, camera, band, ra, dec, position_angle, mjd, detectors, centre_on, exposure_time_s,
+                   grism_angle    of NISP-S, deg at which spectra run in the focal plane: -4, 0, 180, 184
+                   realisations   how many exposures, which differ in their noise alone
+    [[observation]]
+        channels = ["VIS", "NISP-P", "NISP-S"] | ["EXT"]
+        image_type = "science" | "deep" | "bias" | "dark" | "flat" | "charge_injection" | "self_calibration"
+                     | "standard_star" | "planetary_nebula" | "trap_pumping" | "defocus" | "bleeding"
+                     | "stray_light" | "white_dwarf" | "persistence"
+        survey = "wide" | "deep" | "edf_north" | .. | "des" | ..     area = {..}   default: the request's
+        ra, dec, position_angle    a field of your own instead of the survey's (docs/own_field.md)
+        pointings = "file.csv"     a table of pointings instead of either (truesky/request/pointing_tables.py)
+        dither = "S" | "J" | "none" | [[x, y], ..] arcsec   fields, visits, exposures, short, flat, blue, bands,
+        detectors, mjd, exposure_time_s, realisations
+        lamps = [..], intensities = [..] of flats      macc = [groups, reads, drops] of NISP-P, or of NISP-S alone
+        delays_s = [..], bright = "flat" | "sky" of persistence
+        phase_times_s = [..] of trap_pumping     defocus_nm = [..] of defocus
+        magnitude of bleeding, white_dwarf, stray_light     distance_deg of stray_light
+    [products]     truth = ["noise_free", "stars", "sky", "cosmic_rays", "ghosts", "satellites", "saturation",
+                            "persistence", "ramp", "order_1", "order_0", "order_2", "order_m1"]
+                   compression = "none" | "rice"   of images of whole numbers, without loss
+                   wcs = "sip" | "tpv"   how headers tell the distortion, default: as the instrument's pipeline;
+                                         source-extractor, SCAMP and SWarp read TPV, or .head beside the image
+                   files = "detector" | "exposure"   also one file of all of an exposure's science images
+                   readout = "raw" | "amplifiers" | "electrons"   of ground cameras: one array, an extension each
+                                         amplifier, or electrons before they are read
+
+Files are found from the folder of the request; their formats are in truesky/fluxes/libraries/spectrum_formats.toml.
+A key that is not here, a wrong type or a number out of bounds is refused with the key's full path:
+
+    truesky check FILE [--plan]
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, replace
+from pathlib import Path
+
+from lake_schema import user_files
+from lake_schema.errors import BadInput
+from lake_schema.store import layout
+from truesky.request import area as areas
+from truesky.request import bands as passbands
+from truesky.request import checks, files, observations, structure
+from truesky.request.accuracy import SURVEY, Accuracy, preset, row_for
+from truesky.request.area import Area
+from truesky.request.files import GivenSources
+from truesky.request.schema import (
+    ALWAYS,
+    BOX_CELLS,
+    COMPRESSIONS,
+    CONVENTIONS,
+    DENSITIES,
+    EFFECTS,
+    FILES,
+    LADDER,
+    LENSING_NSIDES,
+    MOST_SHEAR,
+    READOUTS,
+    STATUSES,
+    TRUTH,
+    Effects,
+    MissionChoice,
+    Override,
+    Request,
+    Stars,
+    Universe,
+)
+from truesky.request.toml_values import Toml
+from truesky.request.toml_values import boolean as _boolean
+from truesky.request.toml_values import checked_number as _checked_number
+from truesky.request.toml_values import choice as _choice
+from truesky.request.toml_values import integer as _integer
+from truesky.request.toml_values import known as _known
+from truesky.request.toml_values import number as _number
+from truesky.request.toml_values import optional as _optional
+from truesky.request.toml_values import section as _section
+from truesky.request.toml_values import shown as _shown
+from truesky.request.toml_values import string as _string
+from truesky.request.toml_values import strings as _strings
+from truesky.request.toml_values import table_of as _table
+from truesky.request.toml_values import value as _value
+
+__all__ = ["Area", "Override", "Request", "parse"]
+
+_MOST_VARIANTS = 10_000
+_LARGEST_SEED = 2**63 - 1
+_ALL = "all"
+# A request's tables are a schema of its name in SQL (truesky/explore), where these have a meaning of their own.
+_TAKEN = ("information_schema", "main", "memory", "pg_catalog", "system", "temp")
+
+
+def parse(path: Path) -> Request:
+    """Read and check a request file.
+
+    Errors : BadInput, one line that names the file and the key
+    """
+    try:
+        table = user_files.toml(path, "request")
+    except BadInput as error:
+        raise BadInput(f"request {error}") from None
+    try:
+        return from_table(table, path.resolve().parent)
+    except BadInput as error:
+        raise BadInput(f"request {user_files.shown(path)}: {error}") from None
+
+
+def _name(table: Toml) -> str:
+    found = layout.name(_string(table, "name"))
+    if found in _TAKEN:
+        raise BadInput(f"name = {found!r} has a meaning of its own in SQL, with {', '.join(_TAKEN)}: take another")
+    return found
+
+
+def from_table(table: Toml, folder: Path = Path()) -> Request:
+    """A parsed TOML table -> Request; files are found from `folder`.  BadInput names the key."""
+    sections = {
+        "area",
+        "universe",
+        "stars",
+        "ingest",
+        "sources",
+        "strong_lenses",
+        "structure",
+        "mission",
+        "fluxes",
+        "psf",
+        "solar_system",
+        "effects",
+        "explore",
+        "products",
+    }
+    _known(table, "", {"name", "seed", "noise_seed", "accuracy", "pointing", "observation", *sections})
+    asked, blocks = observations.pointings(table), observations.observations(table, folder)
+    fluxes = _section(table, "fluxes", {"bands", "intergalactic", "passbands", "templates", "stars", "extinction"})
+    curves = files.curves(fluxes, folder)
+    bands = _strings(fluxes, "fluxes.bands")
+    mission = _mission(_section(table, "mission", {"ladder", "overrides"}))
+    products_ = _section(table, "products", {"truth", "compression", "wcs", "files", "readout"})
+    solar_system = _section(table, "solar_system", {"bodies"})
+    bodies = files.file_of(folder, _string(solar_system, "solar_system.bodies")) if solar_system else None
+    universe = _universe(_section(table, "universe", set(Universe.__slots__)))
+    request = Request(
+        name=_name(table),
+        seed=_integer(table, "seed", 0, _LARGEST_SEED),
+        accuracy=_accuracy(table.get("accuracy"), "accuracy"),
+        area=areas.parse(_section(table, "area", None)),
+        universe=universe,
+        stars=_stars(_section(table, "stars", set(Stars.__slots__) - {"columns"}), folder, universe.star_limit),
+        mission=mission,
+        bands=bands,
+        pointings=asked,
+        truth=_truth(products_),
+        compression=_string(products_, "products.compression", COMPRESSIONS, "none"),
+        wcs=_string(products_, "products.wcs", CONVENTIONS) if "wcs" in products_ else None,
+        files=_string(products_, "products.files", FILES, "detector"),
+        readout=_string(products_, "products.readout", READOUTS, "raw"),
+        curves=curves,
+        observations=blocks,
+        effects=_effects(_section(table, "effects", {"on", "off"})),
+        explore=_explore(_section(table, "explore", None)),
+        ingest=files.ingest(_section(table, "ingest", {"galaxies", "halos", "training", "dust"}), folder),
+        bodies=bodies,
+        sources=files.sources(_section(table, "sources", {"only", *GivenSources.__slots__}), folder),
+        structure=structure.parse(_section(table, "structure", set(structure.Structure.__slots__)), folder),
+        noise_seed=_integer(table, "noise_seed", 0, _LARGEST_SEED) if "noise_seed" in table else None,
+        psfs=files.psfs(_section(table, "psf", None), folder),
+        strong_lens_boost=_number(_section(table, "strong_lenses", {"boost"}), "strong_lenses.boost", 1e-3, 1e5, 1.0),
+    )
+    checks.check_sources(request)
+    checks.check_bands(request)
+    found = passbands.of_request(request, checks.check_mission(request))
+    own = (name for name, _ in curves.passbands)
+    return replace(request, bands=tuple(dict.fromkeys((*(bands or found), *own))))
+
+
+# ------------------------------------------------------------------------------------------------ sections
+
+
+def _accuracy(value: object, path: str) -> Accuracy:
+    if value is None:
+        return SURVEY
+    if isinstance(value, str):
+        return preset(value)
+    table = _table(value, path, {"flux", "shape", "position", "background"})
+    own = Accuracy(**{key: _number(table, f"{path}.{key}", 1e-12, 1.0) for key in Accuracy.__slots__})
+    # What cannot be had is refused before anything is made.
+    row_for(own)
+    return own
+
+
+def _universe(table: Toml) -> Universe:
+    default = Universe()
+    return Universe(
+        galaxy_limit=_number(table, "universe.galaxy_limit", 10.0, 30.0, default.galaxy_limit),
+        galaxy_band=_string(table, "universe.galaxy_band", default=default.galaxy_band),
+        star_limit=_number(table, "universe.star_limit", 0.0, 30.0, default.star_limit),
+        z_max=_number(table, "universe.z_max", 0.01, 6.0, default.z_max),
+        box_cells=_choice(table, "universe.box_cells", BOX_CELLS, default.box_cells),
+        high_redshift_boost=_number(table, "universe.high_redshift_boost", 0.0, 1e5, default.high_redshift_boost),
+        quasar_boost=_number(table, "universe.quasar_boost", 0.0, 1e5, default.quasar_boost),
+        lensing_nside=_choice(table, "universe.lensing_nside", LENSING_NSIDES, default.lensing_nside),
+        lensing=_lensing(table.get("lensing", "box")),
+        alignment=_number(table, "universe.alignment", 0.0, 10.0, default.alignment),
+        rotation=_number(table, "universe.rotation", -360.0, 360.0, default.rotation),
+    )
+
+
+def _lensing(value: object) -> tuple[float, float] | None:
+    """None of the box's lensing; else a constant shear, 0 for "none"."""
+    path = "universe.lensing"
+    if isinstance(value, str):
+        return None if _string({"lensing": value}, path, ("box", "none")) == "box" else (0.0, 0.0)
+    table = _table(value, path, {"g1", "g2"})
+    g1, g2 = (_number(table, f"{path}.{key}", -1.0, 1.0) for key in ("g1", "g2"))
+    if (size := math.hypot(g1, g2)) > MOST_SHEAR:
+        raise BadInput(f"{path} = {_shown(value)}: |g| = {size:.4g}, images are ellipses up to {MOST_SHEAR}")
+    return g1, g2
+
+
+def _stars(table: Toml, folder: Path, star_limit: float) -> Stars:
+    default = Stars()
+    bright_limit = _optional(table, "stars.bright_limit", -10.0, 30.0)
+    if bright_limit is not None and bright_limit >= star_limit:
+        raise BadInput(f"stars.bright_limit = {bright_limit:g} leaves no star up to star_limit = {star_limit:g}")
+    rows = _integer(table, "stars.rows_a_file", 1, 3_000_000) if "rows_a_file" in table else default.rows_a_file
+    plane_limit = _number(table, "stars.plane_limit", 0.0, 30.0, math.nan)
+    given = _table(table.get("catalogue", {}), "stars.catalogue", {"file", "columns"})
+    columns = _table(given.get("columns", {}), "stars.catalogue.columns", None)
+    return Stars(
+        density=_string(table, "stars.density", DENSITIES) if "density" in table else default.density,
+        brown_dwarf_boost=_number(table, "stars.brown_dwarf_boost", 0.0, 1e4, default.brown_dwarf_boost),
+        tycho2=tuple(files.file_of(folder, name) for name in _strings(table, "stars.tycho2")),
+        catalogue=files.file_of(folder, _string(given, "stars.catalogue.file")) if given else None,
+        columns=tuple((key, _string(columns, f"stars.catalogue.columns.{key}")) for key in sorted(columns)),
+        plane_limit=None if math.isnan(plane_limit) else plane_limit,
+        bright_limit=bright_limit,
+        rows_a_file=rows,
+    )
+
+
+def _mission(table: Toml) -> MissionChoice:
+    ladder = _strings(table, "mission.ladder", STATUSES) or LADDER
+    overrides = _table(table.get("overrides", {}), "mission.overrides", None)
+    return MissionChoice(ladder, tuple(sorted((key, _override(value, key)) for key, value in overrides.items())))
+
+
+def _override(value: object, key: str) -> Override:
+    path = f"mission.overrides.{key}"
+    table = _table(value, path, {"value", "unit"})
+    return Override(_number(table, f"{path}.value", -math.inf, math.inf), _string(table, f"{path}.unit"))
+
+
+def _truth(table: Toml) -> tuple[str, ...]:
+    return _strings(table, "products.truth", TRUTH)
+
+
+def _effects(table: Toml) -> Effects:
+    on, off = _strings(table, "effects.on", EFFECTS), _strings(table, "effects.off", (_ALL, *EFFECTS))
+    if off == (_ALL,):
+        return Effects(on, tuple(name for name in EFFECTS if name not in (*ALWAYS, *on)))
+    if _ALL in off:
+        raise BadInput("effects.off: 'all' stands alone")
+    if both := sorted(set(on) & set(off)):
+        raise BadInput(f"effects: {both[0]!r} is both on and off")
+    return Effects(on, off)
+
+
+def _explore(table: Toml) -> tuple[tuple[str, tuple[str, ...]], ...]:
+    found, count = [], 1
+    for key in sorted(table):
+        values = _choices(key, table[key])
+        if not values:
+            raise BadInput(f"explore.{key} names no value")
+        if len(set(values)) != len(values):
+            raise BadInput(f"explore.{key} names a value twice")
+        count *= len(values)
+        if count > _MOST_VARIANTS:
+            raise BadInput(f"explore.{key}: the product of the values is more than {_MOST_VARIANTS} requests")
+        found.append((key, values))
+    return tuple(found)
+
+
+def _choices(key: str, value: object) -> tuple[str, ...]:
+    """The values of one explored parameter, as JSON."""
+    path = f"explore.{key}"
+    if key != "accuracy" and not key.startswith("effects."):
+        table = _table(value, path, {"values", "unit"})
+        unit, numbers = _string(table, f"{path}.unit"), _value(table, f"{path}.values")
+        if not isinstance(numbers, list):
+            raise BadInput(f"{path}.values wants a list of numbers, got {_shown(numbers)}")
+        checked = [_checked_number(n, f"{path}.values[{i}]", -math.inf, math.inf) for i, n in enumerate(numbers)]
+        return tuple(json.dumps([number, unit]) for number in checked)
+    if not isinstance(value, list):
+        raise BadInput(f"{path} wants a list, got {_shown(value)}")
+    if key == "accuracy":
+        return tuple(json.dumps(asdict(_accuracy(item, f"{path}[{i}]"))) for i, item in enumerate(value))
+    if key.removeprefix("effects.") not in EFFECTS:
+        raise BadInput(f"{path} is not one of the effects {', '.join(EFFECTS)}")
+    return tuple(json.dumps(_boolean({"x": item}, f"{path}[{i}].x", True)) for i, item in enumerate(value))

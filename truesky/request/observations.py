@@ -1,0 +1,393 @@
+"""What a request wants observed: single pointings, and blocks of exposures that the planner lays out.
+
+Pointing, pointings            the list `pointing`
+Observation, observations      the list `observation`
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from lake_schema import ramps, user_files
+from lake_schema.errors import BadInput
+from lake_schema.store import layout
+from truesky.request import area as areas
+from truesky.request import pointing_tables
+from truesky.request.area import Area
+from truesky.request.pointing_tables import CHANNELS, IMAGE_TYPES, Contents
+from truesky.request.toml_values import (
+    Toml,
+    boolean,
+    checked_number,
+    has,
+    integer,
+    number,
+    optional,
+    section,
+    shown,
+    string,
+    strings,
+    table_of,
+    tables,
+)
+
+_MOST_POINTINGS, _MOST_OBSERVATIONS, _MOST_REALISATIONS = 100_000, 1000, 10_000
+# Frames of a sequence whose parameter is listed.
+_MOST_VALUES = 1000
+# Dithers of an observation's own: how many, and how far from its place, arcsec.
+_MOST_DITHERS, _FARTHEST = 1000, 36_000.0
+DITHERS = ("S", "J", "none")
+EUCLID_SURVEYS = ("wide", "deep", "edf_north", "edf_south", "edf_fornax")
+GROUND_SURVEYS = ("des", "lsst", "cfis", "jedis", "ps1", "wishes", "whigs")
+# What each channel can be asked for besides the sky. Not derived from what is rendered: more than that can be planned
+# (test_checks.py: all that is rendered is in it).
+_CALIBRATIONS = {
+    "VIS": (
+        "bias", "dark", "flat", "charge_injection", "trap_pumping", "self_calibration", "defocus", "bleeding",
+        "stray_light", "white_dwarf",
+    ),
+    "NISP-P": ("dark", "flat", "persistence", "self_calibration", "standard_star"),
+    "NISP-S": ("dark", "flat", "persistence", "standard_star", "planetary_nebula"),
+    "EXT": ("bias", "dark", "flat"),
+}  # fmt: skip
+_SKY_TYPES = ("science", "deep")
+# Kinds of block, as messages call them.
+_SURVEY, _OWN = "fields of a Euclid survey", "a Euclid field at ra, dec"
+_GROUND, _GROUND_OWN = "a ground survey's pattern", "a ground camera's field at ra, dec"
+_TIMED, _UNTIMED = "dark and flat frames", "bias, charge_injection and trap_pumping frames"
+_DITHERED, _TABLE = "calibrations on the sky", "a table of pointings"
+_CALIBRATION = (_TIMED, _UNTIMED, _DITHERED)
+# The kinds that use a key; a key that is not here is used by all. EXT always has a survey, for its camera.
+_USERS = {
+    "survey": (_SURVEY, _TABLE),
+    "area": (_SURVEY, _GROUND, *_CALIBRATION),
+    "fields": (_SURVEY,),
+    "visits": (_SURVEY, _OWN),
+    "exposures": (_GROUND, _GROUND_OWN, *_CALIBRATION),
+    "dither": (_SURVEY, _OWN, _GROUND_OWN),
+    "short": (_SURVEY, _OWN),
+    "flat": (_SURVEY, _OWN),
+    "blue": (_SURVEY, _OWN),
+    "bands": (_SURVEY, _OWN, _GROUND, _GROUND_OWN, *_CALIBRATION),
+    "lamps": (_TIMED,),
+    "phase_times_s": (_UNTIMED,),
+    "defocus_nm": (_DITHERED,),
+    "magnitude": (_DITHERED,),
+    "distance_deg": (_DITHERED,),
+    "intensities": (_TIMED,),
+    "delays_s": (_TIMED,),
+    "bright": (_TIMED,),
+    "macc": (_SURVEY, _OWN, _TIMED, _DITHERED, _TABLE),
+    "exposure_time_s": (_GROUND, _GROUND_OWN, _TIMED, _DITHERED, _TABLE),
+}
+# Exposures that only one channel has.
+_CHANNELS_OF = {"short": ("VIS",), "flat": ("VIS",), "blue": ("NISP-S",), "macc": ("NISP-P", "NISP-S")}
+# Image types that a key of calibrations is for.
+_TYPES_OF = {
+    "lamps": ("flat", "persistence"),
+    "intensities": ("flat", "persistence"),
+    "delays_s": ("persistence",),
+    "bright": ("persistence",),
+    "phase_times_s": ("trap_pumping",),
+    "defocus_nm": ("defocus",),
+    "magnitude": ("bleeding", "white_dwarf", "stray_light"),
+    "distance_deg": ("stray_light",),
+}
+# What is bright before darks that show what it left.
+BRIGHT = ("flat", "sky")
+# LEDs of a calibration unit. A copy, since requests are read below the renderer (test_survey.py holds it to the lamps).
+LAMPS = {"VIS": 6, "NISP-P": 5, "NISP-S": 5}
+
+
+@dataclass(frozen=True, slots=True)
+class Pointing:
+    """One exposure that is asked for.
+
+    ra, dec         : deg, of the boresight, or of the centre of detector `centre_on` where that is given
+    position_angle  : deg, of the focal plane's y axis, north through east
+    detectors       : names, () = all of the camera
+    exposure_time_s : None = the mission's
+    realisations    : how many exposures, which differ in their noise alone
+    grism_angle     : deg, of NISP-S, at which spectra run in the focal plane, None = 0
+    """
+
+    channel: str
+    camera: str
+    band: str
+    ra: float
+    dec: float
+    position_angle: float
+    mjd: float
+    detectors: tuple[str, ...] = ()
+    centre_on: str | None = None
+    exposure_time_s: float | None = None
+    realisations: int = 1
+    grism_angle: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """A block of exposures that the planner lays out.
+
+    survey    : whose pattern
+    pointings : a table of pointings (path) instead;  table : what it holds
+    ra, dec   : deg, the centre of a field of its own instead of the survey's; None = the survey's
+    position_angle : deg, of the focal plane's y axis there, None = Euclid's as the Sun asks, 0 of a ground camera
+    area      : where, None = the request's
+    fields    : how many fields at most, those deepest in the area, 0 = all
+    visits    : how often each field is observed, 0 = the survey's
+    exposures : of a ground survey, in all bands together of which the positions are its own; of calibrations, frames
+    dither    : pattern within a field, or its own offsets (x, y) arcsec along the focal plane's axes
+    short, flat : with the short VIS exposure, the closing flat
+    blue      : with the blue grism besides the red ones
+    mjd       : the earliest date, None = the mission's launch
+    realisations : how many of each exposure, which differ in their noise alone
+    lamps     : of flats, numbers of the LEDs in their turn, () = all;  each in bands that see it
+    macc      : (groups, reads, drops) of NISP-P's ramps, of NISP-S's without NISP-P, () = the mission's
+    intensities : of flats, over the mission's level of the lamp, each for `exposures` frames; () = 1
+    delays_s  : of persistence, s from the end of the bright exposure to the start of each dark, () = the mission's
+    bright    : of persistence, what is bright: of BRIGHT
+    phase_times_s : of trap pumping, s that charge stays under an electrode, a frame each, () = the mission's
+    defocus_nm : of exposures out of focus, rms of the wavefront, one each, () = the mission's, on both sides
+    magnitude  : of calibration stars, AB in the exposure's band, None = the mission's
+    distance_deg : of a star beside the field from the boresight, None = the mission's
+    """
+
+    channels: tuple[str, ...]
+    image_type: str = "science"
+    survey: str = "wide"
+    pointings: str = ""
+    table: Contents | None = None
+    ra: float | None = None
+    dec: float | None = None
+    position_angle: float | None = None
+    area: Area | None = None
+    fields: int = 0
+    visits: int = 0
+    exposures: int = 0
+    dither: str | tuple[tuple[float, float], ...] = "S"
+    short: bool = True
+    flat: bool = True
+    blue: bool = False
+    bands: tuple[str, ...] = ()
+    detectors: tuple[str, ...] = ()
+    mjd: float | None = None
+    exposure_time_s: float | None = None
+    realisations: int = 1
+    lamps: tuple[int, ...] = ()
+    macc: tuple[int, ...] = ()
+    phase_times_s: tuple[float, ...] = ()
+    defocus_nm: tuple[float, ...] = ()
+    magnitude: float | None = None
+    distance_deg: float | None = None
+    intensities: tuple[float, ...] = ()
+    delays_s: tuple[float, ...] = ()
+    bright: str = BRIGHT[0]
+
+    @property
+    def place(self) -> tuple[float, float] | None:
+        """ra, dec deg of the observation's own field, None where it has none."""
+        return None if self.ra is None or self.dec is None else (self.ra, self.dec)
+
+
+def pointings(table: Toml) -> tuple[Pointing, ...]:
+    """Of a request's table.  BadInput names the key."""
+    found = tables(table, "pointing", _MOST_POINTINGS)
+    return tuple(_pointing(value, f"pointing[{i}]") for i, value in enumerate(found))
+
+
+def _pointing(value: object, path: str) -> Pointing:
+    table = table_of(value, path, set(Pointing.__slots__))
+    channel = string(table, f"{path}.channel", CHANNELS)
+    return Pointing(
+        channel=channel,
+        camera=layout.name(string(table, f"{path}.camera", default=channel.lower().partition("-")[0])),
+        band=layout.name(string(table, f"{path}.band")),
+        ra=number(table, f"{path}.ra", -360.0, 360.0) % 360.0,
+        dec=number(table, f"{path}.dec", -90.0, 90.0),
+        position_angle=number(table, f"{path}.position_angle", -360.0, 360.0, 0.0),
+        mjd=number(table, f"{path}.mjd", 40_000.0, 100_000.0),
+        detectors=strings(table, f"{path}.detectors"),
+        centre_on=string(table, f"{path}.centre_on") if "centre_on" in table else None,
+        exposure_time_s=optional(table, f"{path}.exposure_time_s", 0.0, 1e6),
+        realisations=integer(table, f"{path}.realisations", 1, _MOST_REALISATIONS, 1),
+        grism_angle=optional(table, f"{path}.grism_angle", -360.0, 360.0),
+    )
+
+
+def observations(table: Toml, folder: Path = Path()) -> tuple[Observation, ...]:
+    """Of a request's table; tables of pointings lie in `folder` or below.  BadInput names the key."""
+    found = tables(table, "observation", _MOST_OBSERVATIONS)
+    return tuple(_observation(value, f"observation[{i}]", folder) for i, value in enumerate(found))
+
+
+def _observation(value: object, path: str, folder: Path) -> Observation:
+    table = table_of(value, path, set(Observation.__slots__) - {"table"})
+    channels = strings(table, f"{path}.channels", CHANNELS)
+    if not channels:
+        raise BadInput(f"{path}.channels is missing or empty")
+    ground = "EXT" in channels
+    if ground and len(channels) > 1:
+        raise BadInput(f"{path}.channels: EXT stands alone")
+    image_type = string(table, f"{path}.image_type", IMAGE_TYPES, "science")
+    if image_type not in _SKY_TYPES:
+        for channel in channels:
+            if image_type not in _CALIBRATIONS[channel]:
+                legal = ", ".join((*_SKY_TYPES, *_CALIBRATIONS[channel]))
+                raise BadInput(f"{path}.image_type = {image_type!r} is none of {channel}'s: {legal}")
+    surveys = GROUND_SURVEYS if ground else EUCLID_SURVEYS
+    _refuse_two_places(table, path)
+    _refuse_unused(table, channels, image_type, path)
+    file = _file(table, path, folder)
+    return Observation(
+        channels=channels,
+        image_type=image_type,
+        survey=string(table, f"{path}.survey", surveys, None if ground else "wide"),
+        pointings="" if file is None else str(file),
+        table=None if file is None else _contents(file, channels, image_type, path),
+        ra=_turn(optional(table, f"{path}.ra", -360.0, 360.0)),
+        dec=optional(table, f"{path}.dec", -90.0, 90.0),
+        position_angle=optional(table, f"{path}.position_angle", -360.0, 360.0),
+        area=areas.parse(section(table, "area", None), f"{path}.area") if has(table, f"{path}.area") else None,
+        fields=integer(table, f"{path}.fields", 1, 1_000_000, 0),
+        visits=integer(table, f"{path}.visits", 1, 1000, 0),
+        exposures=integer(table, f"{path}.exposures", 1, 1_000_000, 0),
+        dither=_dither(table, f"{path}.dither", ground),
+        short=boolean(table, f"{path}.short", True),
+        flat=boolean(table, f"{path}.flat", True),
+        blue=boolean(table, f"{path}.blue", False),
+        bands=tuple(layout.name(band) for band in strings(table, f"{path}.bands")),
+        detectors=strings(table, f"{path}.detectors"),
+        mjd=optional(table, f"{path}.mjd", 40_000.0, 100_000.0),
+        exposure_time_s=optional(table, f"{path}.exposure_time_s", 0.0, 1e6),
+        realisations=integer(table, f"{path}.realisations", 1, _MOST_REALISATIONS, 1),
+        lamps=_lamps(table, f"{path}.lamps", channels),
+        macc=_macc(table, f"{path}.macc"),
+        phase_times_s=_numbers(table, f"{path}.phase_times_s", 1e-6, 100.0),
+        defocus_nm=_numbers(table, f"{path}.defocus_nm", -2000.0, 2000.0),
+        magnitude=optional(table, f"{path}.magnitude", -10.0, 30.0),
+        distance_deg=optional(table, f"{path}.distance_deg", 0.0, 10.0),
+        intensities=_numbers(table, f"{path}.intensities", 1e-4, 1e4),
+        delays_s=_numbers(table, f"{path}.delays_s", 1.0, 1e6),
+        bright=string(table, f"{path}.bright", BRIGHT, BRIGHT[0]),
+    )
+
+
+def _lamps(table: Toml, path: str, channels: tuple[str, ...]) -> tuple[int, ...]:
+    """Numbers of LEDs that all of the channels have."""
+    most = min(LAMPS.get(channel, 1) for channel in channels)
+    found = _integers(table, path, (), ((1, most),) * most)
+    if len(set(found)) < len(found):
+        raise BadInput(f"{path} = {shown(list(found))} names a lamp twice")
+    return found
+
+
+def _macc(table: Toml, path: str) -> tuple[int, ...]:
+    found = _integers(table, path, ("groups", "reads", "drops"), ((2, 1000), (1, 1000), (0, 1000)))
+    if found and (frames := ramps.frames(*found)) > ramps.MOST_FRAMES:
+        raise BadInput(f"{path} = {shown(list(found))} has {frames} frames, more than {ramps.MOST_FRAMES}")
+    return found
+
+
+def _integers(table: Toml, path: str, names: tuple[str, ...], bounds: tuple[tuple[int, int], ...]) -> tuple[int, ...]:
+    """A list of whole numbers: as many as are named, or up to as many as have bounds; () where there is none."""
+    found = table.get(path.rpartition(".")[2])
+    if found is None:
+        return ()
+    if not isinstance(found, list) or not found or len(found) > len(bounds) or (names and len(found) != len(names)):
+        raise BadInput(f"{path} = {shown(found)} is not [{', '.join(names) or 'numbers'}]")
+    numbers = []
+    for i, (value, (least, most)) in enumerate(zip(found, bounds, strict=False)):
+        if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+            name = f"{names[i]} = " if names else ""
+            raise BadInput(f"{path}: {name}{shown(value)} is not a whole number from {least} to {most}")
+        numbers.append(value)
+    return tuple(numbers)
+
+
+def _numbers(table: Toml, path: str, lo: float, hi: float) -> tuple[float, ...]:
+    """A list of different numbers; () where there is none."""
+    found = table.get(path.rpartition(".")[2])
+    if found is None:
+        return ()
+    if not isinstance(found, list) or not 1 <= len(found) <= _MOST_VALUES:
+        raise BadInput(f"{path} = {shown(found)} is not a list of 1 to {_MOST_VALUES} numbers")
+    numbers = tuple(checked_number(value, f"{path}[{i}]", lo, hi) for i, value in enumerate(found))
+    if len(set(numbers)) < len(numbers):
+        raise BadInput(f"{path} = {shown(found)} names a number twice")
+    return numbers
+
+
+def _turn(ra: float | None) -> float | None:
+    return None if ra is None else ra % 360.0
+
+
+def _refuse_two_places(table: Toml, path: str) -> None:
+    """A place of the observation's own, a table of pointings and an area with a survey's fields exclude one another."""
+    if ("ra" in table) != ("dec" in table):
+        raise BadInput(f"{path}.{'dec' if 'ra' in table else 'ra'} is missing: a field has both")
+    if "position_angle" in table and "ra" not in table:
+        raise BadInput(f"{path}.position_angle wants ra and dec: a survey's fields have their own")
+    for key in ("ra", "pointings"):
+        for other in ("pointings", "area", "fields"):
+            if key != other and key in table and other in table:
+                raise BadInput(f"{path}: {key} and {other} exclude each other")
+
+
+def _refuse_unused(table: Toml, channels: tuple[str, ...], image_type: str, path: str) -> None:
+    """A key that would change nothing."""
+    ground = "EXT" in channels
+    kind = _kind(table, ground, image_type)
+    for key in table:
+        users = _USERS.get(key, (kind,))
+        if kind not in users and not (ground and key == "survey"):
+            raise BadInput(f"{path}.{key} is not for {kind}: used by {', '.join(users)}")
+        if key in _TYPES_OF and image_type not in _TYPES_OF[key]:
+            raise BadInput(f"{path}.{key} is not for {image_type}: used by {', '.join(_TYPES_OF[key])}")
+        if (some := _CHANNELS_OF.get(key)) is not None and not {*some} & {*channels}:
+            raise BadInput(f"{path}.{key} is not for {', '.join(channels)}: used by {', '.join(some)}")
+
+
+def _kind(table: Toml, ground: bool, image_type: str) -> str:
+    if "pointings" in table:
+        return _TABLE
+    if image_type not in _SKY_TYPES:
+        timed = dict.fromkeys(("dark", "flat", "persistence"), _TIMED)
+        untimed = dict.fromkeys(("bias", "charge_injection", "trap_pumping"), _UNTIMED)
+        return {**timed, **untimed}.get(image_type, _DITHERED)
+    if ground:
+        return _GROUND_OWN if "ra" in table else _GROUND
+    return _OWN if "ra" in table else _SURVEY
+
+
+def _file(table: Toml, path: str, folder: Path) -> Path | None:
+    """The table of pointings, which may not lie outside the request's folder."""
+    if not string(table, f"{path}.pointings", default=""):
+        return None
+    file = folder / string(table, f"{path}.pointings")
+    try:
+        return user_files.checked(layout.within(folder, file), "table of pointings")
+    except BadInput as error:
+        raise BadInput(f"{path}.pointings: {error}") from None
+
+
+def _contents(file: Path, channels: tuple[str, ...], image_type: str, path: str) -> Contents:
+    try:
+        return pointing_tables.contents(file, channels, image_type)
+    except BadInput as error:
+        raise BadInput(f"{path}.pointings: {error}") from None
+
+
+def _dither(table: Toml, path: str, ground: bool) -> str | tuple[tuple[float, float], ...]:
+    """A pattern's name, or offsets."""
+    found = table.get("dither", "none" if ground else "S")
+    if not isinstance(found, list):
+        pattern = string({"dither": found}, path, DITHERS)
+        if ground and pattern != "none":
+            raise BadInput(f"{path} = {shown(found)} is a pattern of Euclid's: name offsets in arcsec, [[x, y], ..]")
+        return pattern
+    if not 1 <= len(found) <= _MOST_DITHERS or not all(isinstance(step, list) and len(step) == 2 for step in found):
+        raise BadInput(f"{path} wants one of {', '.join(DITHERS)}, or 1 to {_MOST_DITHERS} offsets [x, y] in arcsec")
+    steps = [[checked_number(n, f"{path}[{i}]", -_FARTHEST, _FARTHEST) for n in step] for i, step in enumerate(found)]
+    return tuple((x, y) for x, y in steps)

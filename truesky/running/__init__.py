@@ -1,0 +1,1 @@
+"""Run jobs: the command line of a job, the Spark session and its workers, time and memory of tasks."""

@@ -1,0 +1,15 @@
+"""Run one job under spark-submit: submitted.py MODULE --lake LAKE --request REQUEST.
+
+The command `truesky` submits this file, since a wheel contains no `jobs/` folder.
+"""
+
+import sys
+from importlib import import_module
+
+if __name__ == "__main__":
+    # spark-submit puts the folder of this file first, where its modules could hide others of the same name.
+    del sys.path[0]
+    from lake_schema import command
+    from truesky.running.shell import main
+
+    command.leave(main, import_module(sys.argv[1]).JOB, sys.argv[2:])

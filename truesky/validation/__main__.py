@@ -1,0 +1,106 @@
+"""Is what is simulated what it should be: python -m truesky.validation [--lake LAKE ..] [--quick] [--json FILE] ..
+
+--lake LAKE   measures what the lake holds, by its published files alone, publishes the table `validation` of it and
+              a report.html beside it. The exit status is 1 where a figure fails that is not known to.
+Without it the universe is drawn, and each figure that expectations.csv has an expectation of, or observed.csv an
+observation, is printed with it and with PASS or FAIL; near or far, where the number is remembered and gates nothing.
+The exit status is 1 where one fails that its column known_to_fail gives no reason for. results.json holds the figures
+of the last full run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import shutil
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+# Before numpy is imported by anything.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+from lake_schema import command, user_files
+from lake_schema.errors import BadInput
+from lake_schema.store import layout, manifest, provenance
+from truesky.validation import checks
+from truesky.validation.lake.measure.rows import FAIL, UNDECIDED
+from truesky.validation.lake.suite import publishing
+from truesky.validation.model import universe
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Exit status: 0, 1 a check fails that is not known to fail or the disc refuses, 2 the call is wrong."""
+    parser = argparse.ArgumentParser(
+        prog="python -m truesky.validation",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--lake", metavar="LAKE", help="validate what this lake holds")
+    parser.add_argument("--name", help="of the request whose tables are taken, where the lake has those of several")
+    parser.add_argument("--exposures", nargs="+", type=int, default=[], metavar="ID", help="of the lake; default: all")
+    parser.add_argument("--report", type=Path, metavar="FILE", help="copy the report of the lake to this file, too")
+    parser.add_argument("--processes", type=int, default=os.cpu_count() or 1, metavar="N", help="default: all cores")
+    parser.add_argument(
+        "--quick", action="store_true", help="a few small blocks and no second box: 20 s, and too little sky to pass"
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures of the universe to this file")
+    parser.add_argument("--figures", type=Path, metavar="FOLDER", help="draw those of the universe into this folder")
+    options = parser.parse_args(argv)
+    return command.status("validation", lambda: _validated(options))
+
+
+def _validated(options: argparse.Namespace) -> int:
+    if options.lake is not None:
+        return _of_lake(options)
+    for name in ("name", "exposures", "report"):
+        if getattr(options, name):
+            raise BadInput(f"--{name}: of which --lake?")
+    # What is computed takes a quarter of an hour: where it is to go is looked at before.
+    if options.json is not None:
+        user_files.target(options.json)
+    if options.figures is not None:
+        user_files.folder(options.figures)
+    figures = universe.run(universe.QUICK if options.quick else universe.FULL, options.figures)
+    results = checks.checks(figures)
+    failed = checks.report(figures, results)
+    if options.json is not None:
+        about = {"name": "validation", "commit": provenance.git_commit(), "machine": provenance.machine(), "repeats": 1}
+        summary = {"checks": len(results), "failed": ", ".join(failed), "load_average": round(os.getloadavg()[0], 2)}
+        found = {name: float(value) if math.isfinite(value) else None for name, value in figures.items()}
+        manifest.write_json(options.json, {**about, **summary, **found})
+    return int(any(check.unexpected for check in results))
+
+
+def _of_lake(options: argparse.Namespace) -> int:
+    """Prints what fails or is undecided, and where the report is."""
+    for name in ("json", "figures", "quick"):
+        if getattr(options, name):
+            raise BadInput(f"--{name}: of a lake the table and the report have it all")
+    if options.processes < 1:
+        raise BadInput(f"--processes: {options.processes} is less than 1")
+    if options.report is not None:
+        user_files.target(options.report)
+    version = publishing.published(layout.lake(options.lake), options.name, options.exposures, options.processes)
+    rows = version.rows().to_pylist()
+    for row in sorted(rows, key=lambda row: row["verdict"]):
+        if row["verdict"] in (FAIL, UNDECIDED):
+            what = f"{row['verdict']:10} {row['place']:40} {row['check_name']} {row['quantity']}"
+            if row["value"] is None or row["error"] is None:
+                print(f"{what}: {row['note']}")
+                continue
+            bound = f"{row['kind']} {row['expected']:.4g}, tolerance {row['tolerance']:.3g}"
+            known = f", known to fail: {row['known']}" if row["known"] else ""
+            print(f"{what}: {row['value']:.4g} +- {row['error']:.2g} {row['value_unit']} ({bound}){known}")
+    counted = Counter(row["verdict"] for row in rows)
+    print(", ".join(f"{number} {verdict.replace('_', ' ')}" for verdict, number in sorted(counted.items())))
+    report = version.file(publishing.REPORT)
+    if options.report is not None:
+        shutil.copyfile(report, options.report)
+    print(options.report or report)
+    return int(any(row["verdict"] == FAIL and not row["known"] for row in rows))
+
+
+if __name__ == "__main__":
+    command.leave(main)

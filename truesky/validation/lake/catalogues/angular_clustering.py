@@ -1,0 +1,153 @@
+"""How a lake's galaxies cluster on the sky: w(theta) to a magnitude, and of luminous galaxies at z = 0.5.
+
+To a magnitude in I_E w is that of non-linear matter by Limber's approximation, with the galaxies' own redshifts and the
+bias of their halos. From 0.3 deg on it is good to 20 %; below, the galaxies of one halo and the cells of the box
+decide, and only a factor is asked for. Luminous galaxies are held against the power law that surveys found.
+Ref: Limber 1953, ApJ 117, 134; Tinker et al. 2010, ApJ 724, 878; Landy & Szalay 1993, ApJ 412, 64
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from lake_schema.arrays import Array, Bool, Float
+from lake_schema.store import read
+from truesky.catalogue.halos import matching
+from truesky.fluxes import cosmology
+from truesky.validation import checks
+from truesky.validation.lake.measure import field as fields
+from truesky.validation.lake.measure import two_points
+from truesky.validation.lake.measure.field import Field
+from truesky.validation.lake.measure.rows import Place, Row, not_applicable
+from truesky.validation.lake.measure.seen import Result
+from truesky.validation.lake.measure.two_points import ARCMIN, Measured
+from truesky.validation.model import observed, small_scales, theory
+
+NAME = "clustering"
+SOURCE = "Limber's approximation with the bias of the galaxies' halos (Tinker et al. 2010, ApJ 724, 878)"
+BAND, LIMITS = "euclid_vis", (22.0, 23.0, 24.0)
+_SED = ("abs_mag_r01", "sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")
+COLUMNS = ("id", "ra", "dec", "_healpix_29", "kind", "z_true", "mag_r01", "log_halo_mass", *_SED)
+# How much fainter than in I_E galaxies may be in their reference band, at 5600 A; how far short a catalogue may fall.
+_REDDEST, _SHORT = 3.0, 0.1
+_FEWEST = 200
+# Separations, arcmin; from where on theory is good to the smaller tolerance.
+EDGES = np.array([0.3, 0.6, 1.2, 2.4, 4.8, 9.6, 18.0, 36.0, 60.0, 90.0])
+_LINEAR, _NEAR_TOLERANCE, _FAR_TOLERANCE = 18.0, 0.5, 0.2
+# Shells of distance, Mpc/h.
+_SHELL = 100.0
+# I_E that luminous galaxies at z < 0.6 have at most.
+_LUMINOUS = 23.5
+
+
+def measured(galaxies: read.Version) -> Result:
+    """Of a lake's galaxies."""
+    missing = [name for name in COLUMNS if name not in galaxies.schema.names]
+    if missing:
+        return _none(f"galaxies have no {' and '.join(missing)}")
+    table = galaxies.rows(list(COLUMNS))
+    index, bright = table["_healpix_29"].to_numpy(), table["mag_r01"].to_numpy() < max(LIMITS) + _REDDEST
+    field = fields.of_version(galaxies, index)
+    bright &= table["kind"].to_numpy() < 2
+    return compared({name: table[name].to_numpy()[bright] for name in COLUMNS}, field)
+
+
+def compared(columns: Mapping[str, Array], field: Field) -> Result:
+    """Of columns[n] by name, of all galaxies that may be brighter than the faintest limit, in a field."""
+    if len(columns["id"]) < _FEWEST:
+        return _none(f"{len(columns['id'])} galaxies brighter than {max(LIMITS):g}; {_FEWEST} are wanted")
+    edges = EDGES[60.0 * field.side * (1 + 1e-9) >= EDGES]
+    if len(edges) < 3:
+        return _none(f"patches of the field are {60.0 * field.side:.1f}' wide: too small")
+    mag = observed.apparent(columns, BAND)
+    deepest, rows, series = float(np.percentile(mag, 99.5)), [], {}
+    for limit in LIMITS:
+        kept = mag < limit
+        if deepest < limit - _SHORT or np.count_nonzero(kept) < _FEWEST:
+            why = f"{np.count_nonzero(kept)} galaxies with I_E < {limit:g}; the catalogue reaches {deepest:.2f}"
+            rows.append(not_applicable(NAME, Place(), why, SOURCE, f"w_vis_{limit:g}"))
+            continue
+        found = _of(columns, kept, field, edges * ARCMIN)
+        known = kept & np.isfinite(columns["log_halo_mass"])
+        if np.count_nonzero(known) < 0.9 * np.count_nonzero(kept):
+            why = "the halos' masses, and so the bias of the galaxies, are not known"
+            rows.append(not_applicable(NAME, Place(), why, SOURCE, f"w_vis_{limit:g}"))
+            continue
+        curve, wanted = expected(columns, known, field, found)
+        note = f"{np.count_nonzero(kept)} galaxies with I_E < {limit:g}, {field.area:.3g} deg2"
+        rows += _rows(f"w_vis_{limit:g}", found, wanted, note)
+        series[f"w_{limit:g}"] = np.stack([found.theta / ARCMIN, found.value[0], found.error[0], wanted])
+        series[f"w_theory_{limit:g}"] = np.stack(curve)
+    rows += _luminous(columns, field, deepest)
+    return Result(Place(), rows, series)
+
+
+def _of(columns: Mapping[str, Array], kept: Bool, field: Field, edges: Float) -> Measured:
+    ids, ra, dec, index = (columns[name][kept] for name in ("id", "ra", "dec", "_healpix_29"))
+    return two_points.angular(ids, ra, dec, index, field, edges)
+
+
+def _rows(name: str, found: Measured, wanted: Float, note: str) -> list[Row]:
+    rows = []
+    for k, low in enumerate(found.edges[:-1] / ARCMIN):
+        tolerance = _FAR_TOLERANCE if low > _LINEAR * 0.99 else _NEAR_TOLERANCE
+        about = f"{found.value[0, k]:.3g}, by theory {wanted[k]:.3g}; {note}"
+        value, error = found.value[0, k] / wanted[k], found.error[0, k] / wanted[k]
+        rows.append(
+            Row(NAME, f"{name}_{low:g}", Place(), float(value), float(error), 1.0, tolerance, "", SOURCE, note=about)
+        )
+    return rows
+
+
+def expected(
+    columns: Mapping[str, Array], kept: Bool, field: Field, found: Measured
+) -> tuple[tuple[Float, Float], Float]:
+    """(separations, arcmin, and w there, as a field that knows its own mean alone shows it; w[bin]).
+
+    columns, kept : galaxies;  field : where;  found : of the bins
+    """
+    z, mass = columns["z_true"][kept].astype(float), columns["log_halo_mass"][kept].astype(float)
+    chi, halos = np.asarray(cosmology.comoving_distance(z)), matching.masses()
+    bias = halos.at(halos.bias, z, mass)
+    edges = np.arange(chi.min() * 0.999, chi.max() + _SHELL, _SHELL)
+    number = np.histogram(chi, edges)[0].astype(float)
+    mean = np.histogram(chi, edges, weights=bias)[0] / np.maximum(number, 1.0)
+    c_l = theory.galaxies(theory.ELL, edges, number, mean)
+    curve = np.geomspace(EDGES[0] * ARCMIN, np.radians(20.0), 80)
+    w = theory.correlation(curve, theory.ELL, c_l)
+    # A field's own mean hides what all of its pairs have in common.
+    hidden = two_points.of_all_pairs(field, curve, w)
+    shown = curve < found.edges[-1]
+    return (curve[shown] / ARCMIN, w[shown] - hidden), np.interp(found.theta, curve, w) - hidden
+
+
+def _luminous(columns: Mapping[str, Array], field: Field, deepest: float) -> list[Row]:
+    """Galaxies of M_r - 5 log h < -20 at 0.4 < z < 0.6, over the power law."""
+    near, far = small_scales.NEAR, small_scales.FAR
+    z = columns["z_true"].astype(float)
+    kept = (columns["abs_mag_r01"] < small_scales.BRIGHT) & (z > near) & (z < far)
+    many = int(np.count_nonzero(kept))
+    low, high = (float(cosmology.comoving_distance(at)) for at in (near, far))
+    edges = small_scales.EDGES / (0.75 * (high**4 - low**4) / (high**3 - low**3))
+    edges = edges[edges <= np.radians(field.side)]
+    names = [f"w_m20_{edge:g}" for edge in small_scales.EDGES[: len(edges) - 1]]
+    if deepest < _LUMINOUS - _SHORT or many < _FEWEST or not names:
+        why = f"{many} galaxies of M_r < -20 at 0.4 < z < 0.6; the catalogue reaches I_E = {deepest:.2f}"
+        return [not_applicable(NAME, Place(), why, SOURCE, "w_m20")]
+    found = _of(columns, kept, field, edges)
+    law = small_scales.power_law(np.asarray(cosmology.comoving_distance(z[kept])), edges)
+    value = dict(zip(names, (found.value[0] / law).tolist(), strict=True))
+    error = dict(zip(names, (found.error[0] / law).tolist(), strict=True))
+    rows = []
+    for check in checks.checks(value):
+        middle, half = 0.5 * (check.least + check.most), 0.5 * (check.most - check.least)
+        note = f"{many} galaxies of M_r - 5 log h < -20 at 0.4 < z < 0.6, from {check.name[6:]} Mpc/h on"
+        rows.append(Row(NAME, check.name, Place(), check.found, error[check.name], middle, half, "", check.source,
+                        note=note, known=check.known))  # fmt: skip
+    return rows
+
+
+def _none(why: str) -> Result:
+    return Result(Place(), [not_applicable(NAME, Place(), why, SOURCE)], {})

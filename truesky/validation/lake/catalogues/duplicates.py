@@ -1,0 +1,37 @@
+"""No source twice: by identifier, by place, and no cell with far more sources than the others."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lake_schema.ids import GENERATION_ORDER
+from lake_schema.sky import DEEPEST
+from lake_schema.store import read
+from truesky.validation.lake.measure.rows import Place, Row, not_applicable
+
+NAME, SOURCE = "duplicates", "a source has one identifier and one place"
+# Of the galaxies of a cell over the median of the cells: 0.05 deg2 of the deepest sky vary by 20 %.
+_MOST = 0.6
+
+
+def rows(catalogue: read.Version) -> list[Row]:
+    """Of a catalogue; catalogue : `galaxies` or `stars`."""
+    table = catalogue.rows(["id", "ra", "dec", "_healpix_29"])
+    if not table.num_rows:
+        return [not_applicable(NAME, Place(), f"table {catalogue.table} has no rows", SOURCE, catalogue.table)]
+    ids, ra, dec = (table[name].to_numpy() for name in ("id", "ra", "dec"))
+    place = np.stack([ra, dec], axis=1).view(np.complex128).ravel()
+    out = [
+        Row(NAME, f"{catalogue.table}_{name}", Place(), float(len(values) - len(np.unique(values))), 0.0, 0.0, 0.0,
+            "", SOURCE, note=f"{len(ids)} rows")
+        for name, values in (("ids", ids), ("places", place))
+    ]  # fmt: skip
+    cell = table["_healpix_29"].to_numpy() >> 2 * (DEEPEST - GENERATION_ORDER)
+    drawn = [c for part in catalogue.manifest["parts"] for c in part["facts"].get("generation_cells", ())]
+    _, count = np.unique(cell, return_counts=True)
+    if len(count) >= 4 and catalogue.table == "galaxies":
+        middle = float(np.median(count))
+        most = float(count.max()) / middle
+        out.append(Row(NAME, f"{catalogue.table}_densest_cell", Place(), most, 1.0 / np.sqrt(middle), 1.0, _MOST, "",
+                       SOURCE, note=f"{len(count)} of {len(set(drawn)) or len(count)} cells with sources"))  # fmt: skip
+    return out

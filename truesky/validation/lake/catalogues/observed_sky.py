@@ -1,0 +1,124 @@
+"""Counts, redshifts, masses, star formation, lines and colours of a lake's galaxies against what surveys observed.
+
+The list is observed.csv, that of the universe; errors are those of the lake's own patches of sky, left out in turn.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+
+from lake_schema.arrays import Float, Int
+from lake_schema.store import read
+from truesky.validation import checks
+from truesky.validation.lake.measure import field as fields
+from truesky.validation.lake.measure.rows import AROUND, LEAST, MOST, Place, Row, not_applicable
+from truesky.validation.lake.measure.seen import Result
+from truesky.validation.model import observed
+from truesky.validation.model.observed import Sky
+
+NAME = "observed"
+# Patches that are left out in turn.
+_PATCHES = 8
+# Counts to a magnitude, i, r or I_E; how much fainter in I_E a galaxy of it may be; depth that all others want, and
+# by how much a catalogue's faintest galaxy may fall short of its limit.
+_LIMIT = re.compile(r"(?:log_)?(?:z_)?(?:i|r|vis)_([0-9.]+)")
+_REDDER, _WHOLE, _SHORT = 0.5, 26.0, 0.1
+
+
+# Bins of redshift, and limits in I_E and i, of what is drawn; percentiles of colours, and galaxies that have some.
+_REDSHIFTS, _REDSHIFT_LIMIT = np.linspace(0.0, 3.0, 31), 24.5
+_COLOUR_BINS, _COLOUR_LIMIT, _LEVELS, _SOME = np.linspace(0.0, 1.2, 25), 22.5, (5, 16, 50, 84, 95), 30
+
+
+def measured(galaxies: read.Version) -> Result:
+    """A row a figure that observed.csv has; galaxies : of the lake."""
+    seen, cell = observed.in_version(galaxies)
+    return Result(Place(), compared(seen, cell), _series(seen, cell) if len(cell) else {})
+
+
+def _series(seen: Sky, cell: Int) -> dict[str, Float]:
+    """Redshifts of galaxies, arcmin-2 per unit z, and colours against redshift, with errors of the lake's patches."""
+    groups = _groups(cell)
+    patch = np.zeros(len(cell), np.int64)
+    for number, group in enumerate(groups):
+        patch[np.isin(cell, group)] = number
+    z, number = seen["z_true"], len(groups)
+    faint = seen.mags["euclid_vis"] < _REDSHIFT_LIMIT
+    low, high = _REDSHIFTS[:-1], _REDSHIFTS[1:]
+    per = seen.area * observed.ARCMIN2 * (high - low)
+    count = np.array([np.histogram(z[faint & (patch == one)], _REDSHIFTS)[0] for one in range(number)], float)
+    area = np.array([len(group) for group in groups], float)[:, None] / len(np.unique(cell))
+    without = (count.sum(0) - count) / (1.0 - area) if number > 1 else count
+    bright, colour = seen.mags["lsst_i"] < _COLOUR_LIMIT, seen.mags["lsst_r"] - seen.mags["lsst_i"]
+    place, lines = np.digitize(z, _COLOUR_BINS) - 1, []
+    for one in range(len(_COLOUR_BINS) - 1):
+        own = np.flatnonzero(bright & (place == one))
+        if len(own) >= _SOME:
+            rest = [np.median(left) for left in (colour[own[patch[own] != left_out]] for left_out in range(number))
+                    if len(left)]  # fmt: skip
+            middle = 0.5 * (_COLOUR_BINS[one] + _COLOUR_BINS[one + 1])
+            lines.append([middle, *np.percentile(colour[own], _LEVELS), float(fields.spread(rest))])
+    series = {"redshifts": np.stack([low, high, count.sum(0) / per, fields.spread(without) / per])}
+    return series | ({"colours": np.array(lines).T} if lines else {})
+
+
+def compared(seen: Sky, cell: Int) -> list[Row]:
+    """The same of a sky; cell : the generation cell of each of its galaxies."""
+    found = observed.figures(seen)
+    errors = _errors(seen, cell)
+    out = []
+    # Magnitudes here are before magnification: some are fainter than the catalogue's limit.
+    deepest = float(np.percentile(seen.mags["euclid_vis"], 99.0)) if len(cell) else 0.0
+    for check in checks.checks(found):
+        if (needed := _needed(check.name)) > deepest + _SHORT:
+            why = f"{check.name} wants galaxies to I_E = {needed:g}; 99 % are brighter than {deepest:.2f}"
+            out.append(replace(not_applicable(NAME, Place(), why, check.source), quantity=check.name))
+            continue
+        middle, half, kind = 0.5 * (check.least + check.most), 0.5 * (check.most - check.least), AROUND
+        if math.isinf(half):
+            kind = LEAST if math.isfinite(check.least) else MOST
+            middle, half = (check.least if kind == LEAST else check.most), 0.0
+        note = "" if check.gates else "a remembered number: it decides nothing"
+        error = errors.get(check.name, math.nan) if check.gates else math.nan
+        out.append(Row(NAME, check.name, Place(), check.found, error, middle, half, "", check.source, kind, note,
+                       known=check.known))  # fmt: skip
+    return out
+
+
+def _needed(name: str) -> float:
+    """I_E of the faintest galaxies that a figure is of; a sky to 26 tells all of them."""
+    match = _LIMIT.fullmatch(name)
+    return min(float(match[1]) + _REDDER, _WHOLE) if match else _WHOLE
+
+
+def _groups(cell: Int) -> list[Int]:
+    cells = np.unique(cell)
+    return [group for group in np.array_split(cells, min(_PATCHES, len(cells))) if len(group)]
+
+
+def _errors(seen: Sky, cell: Int) -> dict[str, float]:
+    """Standard error by figure; none where there are too few cells to tell."""
+    cells, groups = np.unique(cell), _groups(cell)
+    if len(groups) < 4:
+        return {}
+    found = []
+    for group in groups:
+        kept = ~np.isin(cell, group)
+        part = Sky(
+            {name: values[kept] for name, values in seen.rows.items()},
+            {band: values[kept] for band, values in seen.mags.items()},
+            seen.ultraviolet[kept], seen.area * (1.0 - len(group) / len(cells)), seen.quasars,
+        )  # fmt: skip
+        found.append(observed.figures(part))
+    n = len(groups)
+    errors = {}
+    for name in found[0]:
+        values = np.array([each.get(name, math.nan) for each in found])
+        error = float(np.sqrt((n - 1) * np.mean((values - values.mean()) ** 2)))
+        if math.isfinite(error) and error > 0.0:
+            errors[name] = error
+    return errors

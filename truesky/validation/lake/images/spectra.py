@@ -1,0 +1,183 @@
+"""Spectra without a slit: the light of first orders, where their traces lie, and where their lines do.
+
+Of points whose first order nobody overlaps, light is summed across the trace, above the level on both sides of it. Of
+any source whose lines are bright enough, a line is the light above its spectrum's own median, and its place is told by
+its centroid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow.compute as pc
+
+from lake_schema.arrays import Float, Int
+from truesky.validation.lake.measure.rows import LEAST, Row, not_applicable
+from truesky.validation.lake.measure.seen import DISPERSED, Check, Seen
+
+SOURCE = "rendered_spectra of the lake; the extracted flux of stars: Serrano et al. 2024, app. C"
+# Of the light over what is expected, pixels of the trace, part of a pixel of a line's wavelength.
+_FLUX, _TRACE, _LINE = 0.05, 0.1, 0.3
+# Half the height that is summed, and where the level is taken, pixels on either side.
+_HALF, _FROM, _TO = 6, 9, 15
+# S/N of a spectrum and of a line that are used, and how much of a trace may be overlapped.
+_LEAST_SNR, _LEAST_LINE, _OVERLAPPED, _LEAST, _MOST = 60.0, 8.0, 0.1, 5, 150
+# Pixels about a line that its light and its level are told by.
+_NEAR, _AROUND = 3, 12
+# Standard deviations from which a line is there, and the part of those foreseen that may be missed.
+_SEEN, _MISSED = 3.0, 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Extracted:
+    """Along a trace, a value a pixel: t of the trace, e- of the source, and its centroid across minus the trace."""
+
+    t: Float
+    light: Float
+    off: float
+
+
+def check(of: Seen) -> list[Row]:
+    """Of a frame's first orders."""
+    # Of other orders, where they are among the rows, the overlap is null.
+    kept = (pc.field("order") == 1) & (pc.field("overlapped") < _OVERLAPPED)
+    first = of.spectra.filter(kept).to_pylist()
+    points = set(of.known.id[of.known.point].tolist())
+    alone = [row for row in first if row["id"] in points and row["drawn"] > 0.9 * row["expected"]]
+    alone = sorted(alone, key=lambda row: -row["expected"])[:_MOST]
+    ratios, offs = [], []
+    for row in alone:
+        found = extracted(of.frame.electrons, row)
+        snr = row["drawn"] / np.sqrt(row["drawn"] + (2 * _HALF + 1) * 512 * of.noise**2)
+        if found is not None and snr > _LEAST_SNR:
+            ratios.append(float(found.light.sum()) / row["drawn"])
+            offs.append(found.off)
+    looked = np.array([line for row in first for line in _lines(of, row)])
+    lines = looked[np.isfinite(looked)].tolist()
+    out = []
+    if len(looked) >= _LEAST:
+        # Where wavelengths are far off, nothing is left at the foreseen places that a shift could be told by.
+        part = len(lines) / len(looked)
+        near = (len(lines) + 2.0) / (len(looked) + 4.0)
+        out.append(
+            Row(
+                "spectra",
+                "lines",
+                of.place,
+                part,
+                float(np.sqrt(near * (1.0 - near) / (len(looked) + 4.0))),
+                1.0,
+                _MISSED,
+                "",
+                SOURCE,
+                LEAST,
+                f"{len(looked)} lines foreseen at S/N > {_LEAST_LINE:g}",
+            )
+        )
+    for name, values, expected, tolerance, unit in (
+        ("flux", ratios, 1.0, _FLUX, ""), ("trace", offs, 0.0, _TRACE, "pix"), ("wavelength", lines, 0.0, _LINE, "pix"),
+    ):  # fmt: skip
+        if len(values) < _LEAST:
+            why = f"{name}: {len(values)} spectra or lines alone and bright enough; {_LEAST} are wanted"
+            out.append(not_applicable("spectra", of.place, why, SOURCE, name))
+            continue
+        found_values = np.array(values)
+        middle = float(np.median(found_values))
+        error = 1.2533 * 1.4826 * float(np.median(np.abs(found_values - middle))) / np.sqrt(len(values))
+        out.append(Row("spectra", name, of.place, middle, error, expected, tolerance, unit, SOURCE,
+                       note=f"{len(values)} of them, median"))  # fmt: skip
+    of.series["spectra"] = np.array(ratios)
+    return out
+
+
+def extracted(image: Any, row: Mapping[str, Any]) -> Extracted | None:
+    """The light along a first order; None where it is not wholly on the detector, or lies along rows and columns both.
+
+    image : float[ny, nx] e-;  row : of `rendered_spectra`
+    """
+    along_x = abs(row["x_last"] - row["x_first"]) >= abs(row["y_last"] - row["y_first"])
+    plane = image if along_x else image.T
+    names = ("trace_x", "trace_y") if along_x else ("trace_y", "trace_x")
+    main, across = (np.array(row[name]) for name in names)
+    t = np.linspace(0.0, 1.0, 1025)
+    where = _polynomial(main, t)
+    low, high = sorted((where[0], where[-1]))
+    columns = np.arange(int(np.ceil(low)), int(np.floor(high)) + 1)
+    order = np.argsort(where, kind="stable")
+    at = np.interp(columns, where[order], t[order])
+    middle = _polynomial(across, at)
+    ny, nx = plane.shape
+    near = np.rint(middle).astype(int)
+    if len(columns) < 50 or columns[0] < 0 or columns[-1] >= nx or near.min() < _TO or near.max() >= ny - _TO:
+        return None
+    offsets: Int = np.arange(-_TO, _TO + 1)
+    strip = plane[near[None, :] + offsets[:, None], columns[None, :]].astype(float)
+    level = np.median(strip[np.abs(offsets) >= _FROM], axis=0)
+    inner = strip[np.abs(offsets) <= _HALF] - level
+    # One row after the other: light is where the trace is, and what is far from it is of a cosmic ray.
+    inner = _cleaned(inner)
+    weight = inner.sum(axis=1)
+    centre = (weight * np.arange(-_HALF, _HALF + 1)).sum() / weight.sum() if weight.sum() > 0.0 else np.nan
+    return Extracted(at, inner.sum(axis=0), float(centre + np.mean(near - middle)))
+
+
+def _cleaned(inner: Float) -> Float:
+    """[rows, columns] without single pixels far above their neighbours along the row."""
+    usual = np.median(np.stack([np.roll(inner, step, axis=1) for step in (-3, -2, -1, 1, 2, 3)]), axis=0)
+    spread = 1.4826 * np.median(np.abs(inner - usual))
+    far = inner > usual + 8.0 * spread + 1.0 * np.abs(usual)
+    # A line is bright in several rows.
+    return np.where(far & (far.sum(axis=0) <= 2), usual, inner)
+
+
+def _polynomial(coefficients: Float, t: Float) -> Float:
+    out = np.zeros_like(t)
+    for coefficient in coefficients[::-1]:
+        out = out * t + coefficient
+    return out
+
+
+def _lines(of: Seen, row: Mapping[str, Any]) -> list[float]:
+    """Of a spectrum's bright lines: measured place minus the foreseen, pixels along the trace; NaN where none is."""
+    bright = [
+        wavelength
+        for wavelength, snr in zip(row["line_wavelength"] or (), row["line_snr"] or (), strict=True)
+        if snr > _LEAST_LINE
+    ]
+    if not bright or (found := extracted(of.frame.electrons, row)) is None:
+        return []
+    step = (row["wavelength_last"] - row["wavelength_first"]) * np.abs(np.diff(found.t)).mean()
+    wavelength = row["wavelength_first"] + (row["wavelength_last"] - row["wavelength_first"]) * found.t
+    out = []
+    for line in bright:
+        pixel = (wavelength - line) / step
+        around = np.abs(pixel) < _AROUND
+        others = [other for other in row["line_wavelength"] if other != line]
+        if any(abs(other - line) < 2 * _NEAR * step for other in others) or around.sum() < 2 * _AROUND - 1:
+            continue
+        beside = found.light[around & (np.abs(pixel) > _NEAR)]
+        level = np.median(beside)
+        noise = 1.4826 * np.median(np.abs(beside - level))
+        # About the place that was found, until it stays: light of the continuum pulls to the middle of the window.
+        centre, significance = 0.0, 0.0
+        for _ in range(10):
+            window = np.exp(-0.5 * ((pixel - centre) / 1.2) ** 2)
+            above = np.where(around, found.light - level, 0.0) * window
+            significance = above.sum() / max(noise * float(np.sqrt((window[around] ** 2).sum())), 1e-9)
+            if significance <= 0.0:
+                break
+            centre += float(np.clip(2.0 * (above * (pixel - centre)).sum() / above.sum(), -1.0, 1.0))
+        out.append(centre if abs(centre) < _NEAR and significance > _SEEN else np.nan)
+    return out
+
+
+def _applies(of: Seen) -> str:
+    if of.channel != DISPERSED:
+        return "no spectra"
+    return "" if of.spectra is not None and len(of.spectra) else "the lake's rendered_spectra have no first order on it"
+
+
+SPECTRA = Check("spectra", SOURCE, _applies, check)

@@ -1,0 +1,72 @@
+"""Sums over pairs of places on the sky, compiled: what `pairs` hands over."""
+
+from __future__ import annotations
+
+from lake_schema.arrays import Float, Int
+from truesky.numerics.compiling import exact_jit
+
+
+@exact_jit
+def counted(first: Int, pair: Int, place: Float, kind: Int, patch: Int, edge: Float, sums: Float) -> None:
+    """Pairs by the patches of both ends, separation, and kind: sums[patch, patch, bin, kind + kind].
+
+    first : [c + 1] rows at which cubes begin;  pair : [2, m] cubes whose places may be near, each pair once
+    place : [n, 3] unit vectors;  kind : 0 or 1;  edge : squared chords, ascending
+    """
+    last = edge.size - 1
+    for p in range(pair.shape[1]):
+        a, b = pair[0, p], pair[1, p]
+        for i in range(first[a], first[a + 1]):
+            for j in range(i + 1 if a == b else first[b], first[b + 1]):
+                dx, dy, dz = place[i, 0] - place[j, 0], place[i, 1] - place[j, 1], place[i, 2] - place[j, 2]
+                square = dx * dx + dy * dy + dz * dz
+                if square >= edge[last] or square < edge[0]:
+                    continue
+                k = last - 1
+                while square < edge[k]:
+                    k -= 1
+                sums[patch[i], patch[j], k, kind[i] + kind[j]] += 1.0
+
+
+@exact_jit
+def sheared(first: Int, pair: Int, frame: Float, shear: Float, patch: Int, edge: Float, sums: Float) -> None:
+    """The same of products of shear: number, xi+, xi-, cross, and of convergence with convergence, gamma_t, gamma_x.
+
+    frame : [n, 3, 3] east, north and direction of each place;  shear : [n, 3] gamma1, gamma2, kappa
+    sums  : [patch, patch, bin, 7];  first, pair, patch, edge : as of `counted`
+    """
+    last = edge.size - 1
+    for p in range(pair.shape[1]):
+        a, b = pair[0, p], pair[1, p]
+        for i in range(first[a], first[a + 1]):
+            for j in range(i + 1 if a == b else first[b], first[b + 1]):
+                dx = frame[j, 2, 0] - frame[i, 2, 0]
+                dy = frame[j, 2, 1] - frame[i, 2, 1]
+                dz = frame[j, 2, 2] - frame[i, 2, 2]
+                square = dx * dx + dy * dy + dz * dz
+                if square >= edge[last] or square < edge[0] or square == 0.0:
+                    continue
+                k = last - 1
+                while square < edge[k]:
+                    k -= 1
+                # Towards the other, in the frame of each.
+                x = frame[i, 0, 0] * dx + frame[i, 0, 1] * dy + frame[i, 0, 2] * dz
+                y = frame[i, 1, 0] * dx + frame[i, 1, 1] * dy + frame[i, 1, 2] * dz
+                u = frame[j, 0, 0] * dx + frame[j, 0, 1] * dy + frame[j, 0, 2] * dz
+                v = frame[j, 1, 0] * dx + frame[j, 1, 1] * dy + frame[j, 1, 2] * dz
+                r2, s2 = 1.0 / (x * x + y * y), 1.0 / (u * u + v * v)
+                cos_i, sin_i = (x * x - y * y) * r2, 2.0 * x * y * r2
+                cos_j, sin_j = (u * u - v * v) * s2, 2.0 * u * v * s2
+                t_i = -(shear[i, 0] * cos_i + shear[i, 1] * sin_i)
+                x_i = -(shear[i, 1] * cos_i - shear[i, 0] * sin_i)
+                t_j = -(shear[j, 0] * cos_j + shear[j, 1] * sin_j)
+                x_j = -(shear[j, 1] * cos_j - shear[j, 0] * sin_j)
+                one, other = shear[i, 2], shear[j, 2]
+                own = sums[patch[i], patch[j], k]
+                own[0] += 1.0
+                own[1] += t_i * t_j + x_i * x_j
+                own[2] += t_i * t_j - x_i * x_j
+                own[3] += 0.5 * (t_i * x_j + x_i * t_j)
+                own[4] += one * other
+                own[5] += 0.5 * (one * t_j + other * t_i)
+                own[6] += 0.5 * (one * x_j + other * x_i)

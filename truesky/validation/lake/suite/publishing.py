@@ -1,0 +1,82 @@
+"""From a lake to its table `validation`, published as every table is, and the report beside it.
+
+plan      what the table is made of
+publish   makes it where it is not there yet; returns the version
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from lake_schema.store import publish as store
+from lake_schema.store import read
+from lake_schema.store.plan import Json, Output, Part, Plan
+from lake_schema.store.provenance import code_version
+from lake_schema.tables.validation import VALIDATION
+from truesky.validation.lake.measure.rows import Row
+from truesky.validation.lake.suite import inventory, report, running
+from truesky.validation.lake.suite.inventory import Held
+
+REPORT = "report.html"
+_PART = "all.parquet"
+
+
+def plan(held: Held, exposures: Sequence[int] = ()) -> Plan:
+    """Of what a lake holds; exposures : only these, () = all."""
+    facts = {"inputs": held.keys, "exposures": sorted(exposures), "code": code_version()}
+    return Plan(VALIDATION, facts, (Part(_PART, {}),))
+
+
+def published(
+    root: Path, request: str | None = None, exposures: Sequence[int] = (), processes: int = 2
+) -> read.Version:
+    """The table of a lake, made where it is not there yet.
+
+    root      : of the lake;  request : whose tables, where it has those of several
+    exposures : only these, () = all;  processes : that look at frames and catalogues at a time
+    Errors    : as of `inventory.look`
+    """
+    held = inventory.look(root, request, exposures)
+    wanted = plan(held, exposures)
+
+    def work(lake: Path, facts: Json) -> Output:
+        found = running.validated(held, processes)
+        page = report.page(lake.name, found)
+
+        def write(path: Path) -> None:
+            path.write_text(page, encoding="utf-8")
+
+        return Output(table(found.rows), {REPORT: write})
+
+    store.make(root, wanted, work, name=request)
+    return read.version(root, VALIDATION.name, wanted.key)
+
+
+def table(rows: Sequence[Row]) -> pa.Table:
+    """Rows of the table `validation`."""
+    numbers = {
+        name: np.ma.masked_invalid(np.array([getattr(row, name) for row in rows], float))
+        for name in ("value", "error", "expected", "tolerance")
+    }
+    places = {
+        name: [getattr(row.place, name) for row in rows] for name in ("channel", "band", "exposure_id", "detector")
+    }
+    return VALIDATION.build(
+        {
+            "check_name": [row.check for row in rows],
+            "quantity": [row.quantity for row in rows],
+            "place": [row.place.text for row in rows],
+            **places,
+            **numbers,
+            "kind": [row.kind for row in rows],
+            "value_unit": [row.unit for row in rows],
+            "source": [row.source for row in rows],
+            "note": [row.note for row in rows],
+            "known": [row.known for row in rows],
+            "verdict": [row.verdict for row in rows],
+        }
+    )

@@ -1,0 +1,102 @@
+"""The report: one HTML file with its figures in it, which a browser opens without a network.
+
+page   of what was found
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from html import escape
+
+from lake_schema import __version__
+from truesky.validation.lake.measure.rows import FAIL, NOT_APPLICABLE, PASS, UNDECIDED, Row
+from truesky.validation.lake.suite import figures
+from truesky.validation.lake.suite.running import Found
+
+_ORDER = (FAIL, UNDECIDED, PASS, NOT_APPLICABLE)
+_STYLE = """
+body { font: 15px/1.45 system-ui, sans-serif; margin: 2em auto; max-width: 1150px; padding: 0 1em; color: #1a1a1a; }
+table { border-collapse: collapse; margin: .6em 0 1.6em; } th, td { padding: .2em .7em; text-align: left; }
+tr { border-bottom: 1px solid #ddd; } td.n { text-align: right; font-variant-numeric: tabular-nums; }
+.pass { color: #176f2c; } .fail { color: #b00020; font-weight: 700; } .undecided { color: #8a5a00; }
+.not_applicable { color: #666; } img { max-width: 100%; } figure { margin: 1em 0 2em; } figcaption { color: #444; }
+details { margin-bottom: 1em; } summary { cursor: pointer; }
+"""
+
+
+def page(name: str, found: Found) -> str:
+    """HTML; name : of the lake."""
+    counted = Counter(row.verdict for row in found.rows)
+    said = ", ".join(f'<span class="{v}">{counted[v]} {v.replace("_", " ")}</span>' for v in _ORDER)
+    parts = [
+        f"<!DOCTYPE html><html lang='en'><head><meta charset='utf-8'><title>Validation of {escape(name)}</title>",
+        f"<style>{_STYLE}</style></head><body><h1>Validation of {escape(name)}</h1>",
+        f"<p>truesky {__version__}: {len(found.rows)} figures, {said}.</p>",
+        "<p>A figure fails where it is more than three standard errors beyond its tolerance; it is undecided where its "
+        "error is too large to tell.</p>",
+        _summary(found.rows),
+        *(
+            f"<figure><img alt='{escape(text)}' src='data:image/png;base64,{image}'><figcaption>{escape(text)}"
+            "</figcaption></figure>"
+            for text, image in figures.drawn(found)
+        ),
+        _details("What fails", [row for row in found.rows if row.verdict == FAIL], True),
+        _details("What is undecided", [row for row in found.rows if row.verdict == UNDECIDED], False),
+        _details("What does not apply, and why", [row for row in found.rows if row.verdict == NOT_APPLICABLE], False),
+        _details("What passes", [row for row in found.rows if row.verdict == PASS], False),
+        "</body></html>",
+    ]
+    return "\n".join(parts)
+
+
+def _summary(rows: Sequence[Row]) -> str:
+    """Verdicts by check and channel."""
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row.check, " ".join(filter(None, (row.place.channel, row.place.band)))), []).append(row)
+    head = "<table><tr><th>check</th><th>of</th>" + "".join(f"<th>{v.replace('_', ' ')}</th>" for v in _ORDER)
+    lines = [f"{head}<th>source</th></tr>"]
+    for (check, place), own in sorted(groups.items()):
+        counted = Counter(row.verdict for row in own)
+        cells = "".join(f"<td class='n {v if counted[v] else ''}'>{counted[v] or ''}</td>" for v in _ORDER)
+        source = escape("; ".join(dict.fromkeys(row.source for row in own)))
+        lines.append(f"<tr><td>{escape(check)}</td><td>{escape(place)}</td>{cells}<td>{source}</td></tr>")
+    return "\n".join([*lines, "</table>"])
+
+
+def _details(title: str, rows: Sequence[Row], unfolded: bool) -> str:
+    if not rows:
+        return ""
+    head = "<tr><th>check</th><th>quantity</th><th>where</th><th>value</th><th>expected</th><th>note</th></tr>"
+    lines = "\n".join(_line(row) for row in rows)
+    return (
+        f"<details{' open' if unfolded else ''}><summary>{title}: {len(rows)}</summary><table>{head}{lines}</table>"
+        "</details>"
+    )
+
+
+def _line(row: Row) -> str:
+    cells: Iterable[str] = (row.check, row.quantity, row.place.text, shown(row), expected(row), _noted(row))
+    first, *rest = (f"<td>{escape(cell)}</td>" for cell in cells)
+    return f"<tr class='{row.verdict}'>{first}{''.join(rest)}</tr>"
+
+
+def _noted(row: Row) -> str:
+    return "; ".join(filter(None, (row.note, row.known and f"known to fail: {row.known}")))
+
+
+def shown(row: Row) -> str:
+    """A value with its error; "" of what was not measured."""
+    if row.value != row.value:
+        return ""
+    error = f" ± {row.error:.2g}" if row.error == row.error and row.error > 0.0 else ""
+    return f"{row.value:.5g}{error} {row.unit}".strip()
+
+
+def expected(row: Row) -> str:
+    """What a value should be; "" of what does not apply."""
+    if not row.applies:
+        return ""
+    sign = {"around": "±", "least": "at least, −", "most": "at most, +"}[row.kind]
+    return f"{row.expected:.5g} {sign} {row.tolerance:.3g}"

@@ -1,0 +1,1 @@
+"""Draw a universe and compare its statistics with published observations and with theory."""

@@ -1,0 +1,234 @@
+"""Galaxies of many small blocks of the sky, counted: counts, colours, sizes, H alpha, luminosities, halos.
+
+draw      galaxies and halos of blocks of generation cells
+figures   what is counted, by name; a count's own error, from the scatter of the blocks, under name + "_error"
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+
+from lake_schema import sky
+from lake_schema.arrays import Array, Bool, Float, Float32, Int
+from lake_schema.ids import GENERATION_ORDER
+from truesky.catalogue.galaxies import band_ratios, emission_lines, galaxies, morphology
+from truesky.catalogue.galaxies.galaxies import GalaxyModel
+from truesky.catalogue.halos import luminosity_function, matching, population
+from truesky.fluxes import cosmology
+from truesky.fluxes.libraries import templates
+from truesky.validation.model import observed
+
+ARCMIN2 = 3600.0
+AREA = sky.cell_area(GENERATION_ORDER)
+BANDS = ("euclid_vis", "euclid_y", "euclid_j", "euclid_h", "lsst_g", "lsst_r", "lsst_i", "lsst_z")
+COLUMNS = (
+    *observed.COLUMNS, "ra", "dec", "z_obs", "bulge_half_light_radius", "disk_half_light_radius", "bulge_fraction",
+    "bulge_sersic_index",
+)  # fmt: skip
+HALO_COLUMNS = ("z_true", "log_mass")
+HALPHA_LIMITS, HALPHA_SHELLS = (5e-17, 1e-16, 2e-16, 3e-16), ((0.9, 1.8), (0.4, 1.8), (0.7, 2.0))
+SIZE_BINS = ((19, 20), (21, 22), (22, 23), (23, 24), (24, 24.5), (25, 26))
+# Redshift, half width, and the reddest I_E - M_r - DM there, which every galaxy that is counted has to afford.
+SHELLS = ((0.1, 0.05, 0.2), (0.5, 0.1, 0.4), (1.0, 0.15, 1.5), (2.0, 0.15, 4.0))
+HALO_MASSES, HALO_SHELLS = (11.0, 12.0, 13.0), ((0.5, 0.1), (1.0, 0.1), (2.0, 0.1))
+_SIZED = 20_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Census:
+    """Galaxies of the light-cone and halos: columns by name, the block of each row, and magnitudes by band."""
+
+    blocks: int
+    area: float
+    limit: float
+    rows: Mapping[str, Array]
+    block: Int
+    mags: Mapping[str, Array]
+    halos: Mapping[str, Array]
+    halo_block: Int
+
+    def per_deg2(self, kept: Bool) -> Float:
+        """Galaxies[block] deg-2."""
+        return np.asarray(np.bincount(self.block[kept], minlength=self.blocks) * (self.blocks / self.area))
+
+
+def blocks(count: int, side_order: int) -> list[list[int]]:
+    """Nested blocks of 4^side_order generation cells, spread over the sky."""
+    many, inside = 12 << 2 * (GENERATION_ORDER - side_order), 1 << 2 * side_order
+    first = ((np.arange(count) + 0.31) * many / count).astype(int)
+    return [[int(block) * inside + i for i in range(inside)] for block in first]
+
+
+def draw(universe: GalaxyModel, dust: Float32, places: Sequence[Sequence[int]]) -> Census:
+    """What the catalogue holds in the blocks."""
+    drawn, library = population.Cells(universe.population), templates.galaxy_library()
+    rows, hosts, mags = [], [], []
+    for place in places:
+        found = pa.concat_tables([galaxies.draw(cell, universe, drawn, dust).select(COLUMNS) for cell in place])
+        found = found.filter(pa.array(found["kind"].to_numpy() < 2))
+        rows.append({name: found[name].to_numpy() for name in COLUMNS})
+        mags.append(magnitudes(rows[-1], library, matching.Z_LAST))
+        table = pa.concat_tables([galaxies.halo_table(cell, universe.population, drawn) for cell in place])
+        hosts.append({name: table[name].to_numpy() for name in HALO_COLUMNS})
+
+    def together(parts: Sequence[Mapping[str, Array]]) -> Mapping[str, Array]:
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+    def which(parts: Sequence[Mapping[str, Array]]) -> Int:
+        return np.repeat(np.arange(len(parts)), [part["z_true"].size for part in parts])
+
+    area = sum(len(place) for place in places) * AREA
+    return Census(
+        len(places), area, universe.limit, together(rows), which(rows), together(mags), together(hosts), which(hosts)
+    )
+
+
+def magnitudes(rows: Mapping[str, Array], library: templates.Library, z_max: float) -> Mapping[str, Array]:
+    """Magnitudes by band, AB, unlensed and before the Milky Way's dust."""
+    names = ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")
+    sed = band_ratios.Sed(*(rows[name] for name in names))
+    z = rows["z_true"].astype(float)
+    plain = rows["abs_mag_r01"] + cosmology.distance_modulus(z)
+    return {
+        band: (plain + band_ratios.offset(band_ratios.load(library, band, z_max, 0.5), z, sed)).astype(np.float32)
+        for band in BANDS
+    }
+
+
+def _mean(values: Float) -> tuple[float, float]:
+    return float(values.mean()), float(values.std(ddof=1) / np.sqrt(values.size))
+
+
+def _with_errors(found: dict[str, Float]) -> dict[str, float]:
+    figures: dict[str, float] = {}
+    for name, values in found.items():
+        figures[name], figures[f"{name}_error"] = _mean(values)
+    return figures
+
+
+def counts(census: Census) -> dict[str, float]:
+    """Galaxies per arcmin2, their slope, and how many are satellites."""
+    vis = census.mags["euclid_vis"]
+    found = {"vis_26": census.per_deg2(vis < 26.0) / ARCMIN2}
+    bright = vis < 24.5
+    number = [np.sum(np.abs(vis - at) < 0.5) for at in (20, 21, 22, 23)]
+    return _with_errors(found) | {
+        "vis_slope_20_23": float(np.mean(np.diff(np.log10(number)))),
+        "satellites_24.5": float(np.mean(census.rows["kind"][bright])),
+    }
+
+
+def colours(census: Census) -> dict[str, float]:
+    """Medians of I_E < 24.5."""
+    mags = census.mags
+    bright = mags["euclid_vis"] < 24.5
+    pairs = {
+        "g_r": ("lsst_g", "lsst_r"), "r_i": ("lsst_r", "lsst_i"), "vis_h": ("euclid_vis", "euclid_h"),
+        "j_h": ("euclid_j", "euclid_h"),
+    }  # fmt: skip
+    return {
+        f"median_{name}": float(np.median(mags[blue][bright] - mags[red][bright]))
+        for name, (blue, red) in pairs.items()
+    }
+
+
+def half_light(rows: Mapping[str, Array], part: Int) -> Float:
+    """Half-light radius[n] of both components together, arcsec, by bisection."""
+    names = ("bulge_half_light_radius", "disk_half_light_radius", "bulge_fraction", "bulge_sersic_index")
+    bulge, disc, fraction, sersic = (rows[name][part].astype(float) for name in names)
+    return bisected(bulge, disc, fraction, sersic)
+
+
+def bisected(bulge: Float, disc: Float, fraction: Float, sersic: Float) -> Float:
+    """Half-light radius[n] of a bulge and an exponential disc together, arcsec, by bisection.
+
+    bulge, disc : float[n] half-light radii of the components, arcsec
+    fraction    : float[n] bulge / total;  sersic : float[n] index of the bulge
+    """
+    low, high = np.minimum(bulge, disc), np.maximum(bulge, disc)
+    for _ in range(30):
+        middle = np.sqrt(low * high)
+        light = fraction * morphology.light_within(middle, bulge, sersic)
+        light += (1 - fraction) * morphology.light_within(middle, disc, 1.0)
+        low, high = np.where(light < 0.5, middle, low), np.where(light < 0.5, high, middle)
+    return np.asarray(np.sqrt(low * high))
+
+
+def sizes(census: Census) -> dict[str, float]:
+    """Median radii by magnitude, the range of the Sersic index, and how well two components have the total's radius."""
+    vis, figures = census.mags["euclid_vis"], {}
+    for bright, faint in SIZE_BINS:
+        inside = np.flatnonzero((vis >= bright) & (vis < faint))
+        some = inside[:: max(inside.size // _SIZED, 1)]
+        figures[f"size_{bright}_{faint}"] = float(np.median(half_light(census.rows, some)))
+    sersic = census.rows["bulge_sersic_index"]
+    figures |= {"sersic_least": float(sersic.min()), "sersic_most": float(sersic.max())}
+    rng, n, shapes = np.random.default_rng(3), _SIZED, morphology.shapes()
+    bulge = shapes.bulge
+    fraction, radius = rng.random(n), np.exp(rng.uniform(np.log(0.01), np.log(10.0), n))
+    red = rng.random(n) < 0.3
+    index, ratio = morphology.sersic_index(bulge, red, rng), morphology.radius_ratio(bulge, red, rng)
+    both = morphology.component_radii(shapes, radius, fraction, ratio, index)
+    figures["half_light_worst"] = float(np.abs(bisected(*both, fraction, index) / radius - 1.0).max())
+    return figures
+
+
+def halpha(census: Census) -> dict[str, float]:
+    """H alpha emitters / the published numbers, with Poisson's error."""
+    z, flux = census.rows["z_true"], census.rows["flux_halpha"]
+    figures = {}
+    for near, far in HALPHA_SHELLS:
+        for limit in HALPHA_LIMITS:
+            expected = float(emission_lines.expected_counts(np.array([limit]), near, far)[0]) * census.area
+            found = float(np.sum((z > near) & (z < far) & (flux > limit)))
+            name = f"halpha_{limit:g}_{near}_{far}"
+            figures[name], figures[f"{name}_error"] = found / expected, np.sqrt(found) / expected
+    return figures
+
+
+def luminosities(census: Census, law: luminosity_function.Schechter, near: float, far: float) -> dict[str, float]:
+    """Galaxies / those of the luminosity function, where all spectra beat the limit; shells between near and far.
+
+    census : what was drawn;  law : the luminosity function;  near, far : redshifts
+    """
+    z, m = census.rows["z_true"], census.rows["abs_mag_r01"]
+    found = {}
+    for at, half, reddest in SHELLS:
+        if not near < at < far:
+            continue
+        faintest = min(census.limit - float(cosmology.distance_modulus(at + half)) - reddest, -16.0)
+        number = per_deg2(lambda shell, m=faintest: luminosity_function.number_density(law, m, shell), at, half)  # type: ignore[misc]
+        found[f"luminosity_function_z{at}"] = census.per_deg2((np.abs(z - at) < half) & (m < faintest)) / number
+    return _with_errors(found)
+
+
+def per_deg2(density: Callable[[Float], Float], at: float, half: float) -> float:
+    """Objects deg-2 in a shell of redshift, of a comoving density (Mpc/h)^-3."""
+    grid = np.linspace(at - half, at + half, 41)
+    value = density(grid)
+    shells = cosmology.comoving_volume(grid[:-1], grid[1:]) * np.radians(1.0) ** 2
+    return float(np.sum(0.5 * (value[1:] + value[:-1]) * shells))
+
+
+def halos(census: Census, published: Callable[[float, float], float]) -> dict[str, float]:
+    """Halos above a mass / the published number density(mass, z), in thin shells."""
+    z, mass = census.halos["z_true"], census.halos["log_mass"]
+    found = {}
+    for at, half in HALO_SHELLS:
+        volume = float(cosmology.comoving_volume(at - half, at + half)) * np.radians(1.0) ** 2
+        for least in HALO_MASSES:
+            kept = (np.abs(z - at) < half) & (mass > least)
+            each = np.bincount(census.halo_block[kept], minlength=census.blocks) * (census.blocks / census.area)
+            found[f"halos_{least:g}_z{at}"] = each / (volume * published(least, at))
+    return _with_errors(found)
+
+
+def redshifts(census: Census) -> tuple[Float, Float]:
+    """n(z) of I_E < 24.5, in shares of 0.2: (edges, shares)."""
+    edges = np.arange(0.0, 2.41, 0.2)
+    number = np.histogram(census.rows["z_true"][census.mags["euclid_vis"] < 24.5], edges)[0]
+    return edges, number / number.sum()

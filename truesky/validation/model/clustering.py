@@ -1,0 +1,305 @@
+"""How the embedded universe clusters: power of the box, bias of its halos, and w(theta) beside Limber's approximation.
+
+box_power         P(k) of the box over that of linear theory;  halo_bias : bias of the fields that halos are drawn from
+velocities        of centrals at z = 0
+population_above  halos and galaxies of a mass or more between two redshifts, to be drawn over hundreds of deg2
+tracers           them, in one block of the sky
+correlation       w(theta) of counts in pixels;  limber : what linear bias makes of linear power
+structure         the Gaussian field along the same lines of sight, whose w(theta) says what the blocks happen to hold
+
+Ref: Limber 1953, ApJ 117, 134; Landy & Szalay 1993, ApJ 412, 64 (in pixels their estimator is <delta delta'>)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import fft
+from scipy.special import j0
+
+from lake_schema import sky
+from lake_schema.arrays import Bool, Float, Int
+from truesky.catalogue.halos import halos, luminosity_function, matching, population, satellites
+from truesky.catalogue.halos.luminosity_function import Volume
+from truesky.catalogue.halos.population import Population
+from truesky.catalogue.matter import convergence, density_box, lightcone
+from truesky.catalogue.matter.density_box import Box
+from truesky.fluxes import cosmology
+from truesky.numerics import sums
+
+# Blocks are cells of this order (53.7 deg2), in pixels of 6.9 arcmin; small separations are counted in one piece of
+# each, in pixels of 0.9 arcmin: DEPTH orders finer.
+BLOCK_ORDER, PIECE_ORDER, DEPTH = 3, 6, 6
+_ROWS, _SPARSE = 512, 16
+# Nodes of separations: of the pairs of a bin, and of w where it is summed.
+_NODES, _THETAS = 2000, 300
+# Shells in which the redshift distribution and the bias are taken, Mpc/h, and multipoles.
+_SHELL, _ELL_MOST = 80.0, 20_000
+# Cells a side that the power of the Gaussian field is tabulated on.
+_MODES = 128
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracers:
+    """n points: deg, Mpc/h, bias times growth of the halo, and is it a satellite, log10 of halo and proxy mass."""
+
+    ra: Float
+    dec: Float
+    chi: Float
+    x: Float
+    satellite: Bool
+    log_mass: Float
+    proxy: Float
+    velocity: Float
+
+    def part(self, keep: npt.NDArray[np.generic]) -> Tracers:
+        return Tracers(*(getattr(self, name)[keep] for name in self.__slots__))
+
+
+def joined(parts: Sequence[Tracers]) -> Tracers:
+    return Tracers(*(np.concatenate([getattr(part, name) for part in parts]) for name in Tracers.__slots__))
+
+
+# ------------------------------------------------------------------------------------------------ the box
+
+
+def _binned(field: npt.NDArray[np.floating], cell: float, edges: Float) -> Float:
+    """P(k)[bin] of a cube, k h/Mpc between edges."""
+    n = field.shape[0]
+    power = (np.abs(fft.rfftn(field)) ** 2).ravel() * (cell**3 / n**3)
+    axis, half = 2 * np.pi * fft.fftfreq(n, cell), 2 * np.pi * fft.rfftfreq(n, cell)
+    k = np.sqrt(axis[:, None, None] ** 2 + axis[None, :, None] ** 2 + half**2)
+    weight = np.full(k.shape, 2.0)
+    weight[..., 0] = weight[..., -1] = 1.0
+    place = np.digitize(k.ravel(), edges)
+    linear = density_box.linear_power(np.maximum(k.ravel(), 1e-4))
+    total = [np.bincount(place, weight.ravel() * value, edges.size + 1)[1:-1] for value in (power, linear)]
+    return np.asarray(total[0] / total[1])
+
+
+def box_power(box: Box, edges: Float) -> Float:
+    """P(k) / P_linear(k)[bin] of the matter at z = 0."""
+    return _binned(np.expm1(box.smoothed[0] - np.float32(0.5 * box.variance[0])), box.model.cell, edges)
+
+
+def halo_bias(box: Box, x: Sequence[float], edges: Float) -> Float:
+    """Bias[x, bin] that the fields of halos of x = b D have against the matter's own, / x."""
+    matter = box_power(box, edges)
+    field, amplitude = density_box.biased(box.model, np.array(x))
+    rows = []
+    for i, times in zip(field.tolist(), amplitude.tolist(), strict=True):
+        number = np.exp(np.float32(times) * box.smoothed[i] - np.float32(0.5 * times**2 * box.variance[i]))
+        rows.append(np.sqrt(_binned(number, box.model.cell, edges) / matter))
+    return np.asarray(np.array(rows) / np.array(x)[:, None])
+
+
+def velocities(box: Box, x: float) -> float:
+    """rms of one component of the velocity, km/s, of halos of bias x at z = 0, anywhere in the box."""
+    field, amplitude = (value[0] for value in density_box.biased(box.model, np.array([x])))
+    weight = np.exp(np.float32(amplitude) * box.smoothed[int(field)])
+    square = [np.average(u**2, weights=weight) for u in box.velocity]
+    return float(density_box.velocity_factor(box.model, 0.0) * np.sqrt(np.mean(square)))
+
+
+# ------------------------------------------------------------------------------------------------ on the sky
+
+
+def population_above(seed: int, box_cells: int, near: float, far: float, log_mass: float) -> Population:
+    """Halos, and galaxies of a proxy mass, above log_mass.
+
+    seed, box_cells : of the box of matter, and its cells a side
+    near, far       : redshifts;  log_mass : log10 of the least mass, as of table `halos`
+    """
+    table, inverse = matching.masses(), luminosity_function.inverse(luminosity_function.schechter(), matching.Z_LAST)
+    matched = matching.matching(table, inverse)
+    volume = Volume(near, far, 0.0)
+    return population.model(
+        seed, box_cells, volume, inverse, lambda z: matched.magnitude(z, np.full(np.size(z), log_mass))
+    )
+
+
+def tracers(universe: Population, order: int, block: int) -> Tracers:
+    """Halos of a cell of any order, and their satellites that lie in it."""
+    parts = []
+    for level in halos.LEVELS:
+        many = 1 << 2 * max(level - order, 0)
+        first = block << 2 * (level - order) if level >= order else block >> 2 * (order - level)
+        for cell in range(first, first + many):
+            hosts = halos.draw(universe.halos, universe.seed, level, cell)
+            found = satellites.draw(universe.halos, universe.masses, hosts, universe.seed)
+            ra, dec = sky.positions(hosts.index)
+            z = universe.halos.distances.redshift(hosts.chi)
+            x = universe.masses.at(universe.masses.bias, z, hosts.log_mass) * density_box.growth(z)
+            is_satellite = np.repeat([False, True], [ra.size, found.ra.size])
+            host = np.concatenate([np.arange(ra.size), found.host])
+            pairs = ((ra, found.ra), (dec, found.dec), (hosts.chi, found.chi), (hosts.proxy, found.proxy))
+            ra, dec, chi, proxy = (np.concatenate(pair) for pair in pairs)
+            speed = np.concatenate([hosts.velocity, found.velocity])
+            inside = sky.cell_of(ra, dec, order) == block
+            parts.append(Tracers(ra, dec, chi, x[host], is_satellite, hosts.log_mass[host], proxy, speed).part(inside))
+    return joined(parts)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Correlation:
+    """theta[bin] deg; w against each block's own mean, and its error from the scatter of the blocks.
+
+    pairs : the separations that w is an average over
+    """
+
+    theta: Float
+    w: Float
+    error: Float
+    pairs: Pairs
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pairs:
+    """Separations of the pairs of pixels of a block: nodes[m] deg, and the shares of pairs that have them.
+
+    of_bin : [bins, m] of the pairs of a bin;  of_pixel : [bins, m] of the pixels of these pairs with the whole block
+    of_all : [m] of all pairs of the block
+    """
+
+    nodes: Float
+    of_bin: Float
+    of_pixel: Float
+    of_all: Float
+
+    def left(self, w: Float) -> tuple[Float, Float]:
+        """w[m] at the nodes -> (w[bin], what is left of it[bin] where each pixel is held against the block's mean)."""
+        mean, pixel, every = (sums.product(pairs, w) for pairs in (self.of_bin, self.of_pixel, self.of_all))
+        return mean, mean - 2.0 * pixel + every
+
+
+def correlation(blocks: Sequence[tuple[int, Sequence[Tracers | Float]]], order: int, edges: Float) -> list[Correlation]:
+    """w(theta) of each kind of tracer in blocks, cells of an order; or of maps of their pixels."""
+    found = [[_delta(one, order, cell) for one in given] for cell, given in blocks]
+    delta, chance = (np.array([[pair[i] for pair in row] for row in found]) for i in range(2))
+    bins, kinds = edges.size - 1, delta.shape[1]
+    product, number, angle = np.zeros((len(blocks), kinds, bins)), np.zeros((len(blocks), bins)), np.zeros(bins)
+    for row, (cell, _) in enumerate(blocks):
+        place = _vectors(order, cell)
+        for first in range(0, len(place), _ROWS):
+            part = slice(first, first + _ROWS)
+            which, theta = _separations(place[part], place, edges)
+            kept = np.flatnonzero((which >= 0) & (which < bins))
+            number[row] += np.bincount(which[kept], minlength=bins)
+            angle += np.bincount(which[kept], theta[kept], bins)
+            for kind in range(kinds):
+                both = (delta[row, kind, part, None] * delta[row, kind][None, :]).ravel()[kept]
+                product[row, kind] += np.bincount(which[kept], both, bins)
+    pairs = _pairs(order, blocks[0][0], edges)
+    product += chance[:, :, None] * number[:, None]
+    scatter = np.std(product / number[:, None], axis=0, ddof=1) / np.sqrt(len(blocks))
+    total = product.sum(0) / number.sum(0)
+    return [Correlation(angle / number.sum(0), w, error, pairs) for w, error in zip(total, scatter, strict=True)]
+
+
+def _separations(some: Float, every: Float, edges: Float) -> tuple[Int, Float]:
+    """Bin of the separation of each pair, -1 or the number of bins outside; and the separation, deg."""
+    theta = np.degrees(np.arccos(np.clip(sums.product(some, every.T), -1.0, 1.0))).ravel()
+    return np.searchsorted(edges, theta) - 1, theta
+
+
+def _pairs(order: int, cell: int, edges: Float) -> Pairs:
+    """Of every _SPARSE-th pixel with all."""
+    place, bins = _vectors(order, cell), edges.size - 1
+    fine = np.linspace(0.0, 3.0 * sky.cell_radius(order), _NODES + 1)
+    of_bin, of_pixel, of_all = np.zeros((bins, _NODES)), np.zeros((bins, _NODES)), np.zeros(_NODES)
+    for one in place[::_SPARSE]:
+        which, theta = _separations(one[None, :], place, edges)
+        node = np.searchsorted(fine, theta, side="right") - 1
+        every = np.bincount(node, minlength=_NODES)
+        of_all += every
+        for i in range(bins):
+            inside = node[which == i]
+            of_bin[i] += np.bincount(inside, minlength=_NODES)
+            of_pixel[i] += inside.size * every
+    shares = [part / part.sum(-1, keepdims=True) for part in (of_bin, of_pixel, of_all)]
+    return Pairs(0.5 * (fine[1:] + fine[:-1]), *shares)
+
+
+def _delta(one: Tracers | Float, order: int, cell: int) -> tuple[Float, float]:
+    """Overdensity of the pixels, and what n points, which are nowhere else, keep from one another: 1 / n.
+
+    What is common to a block says nothing of its inside, and is most of the noise.
+    """
+    if not isinstance(one, Tracers):
+        return np.asarray(one - one.mean()), 0.0
+    pixel = sky.cell_of(one.ra, one.dec, order + DEPTH) - (cell << 2 * DEPTH)
+    inside = (pixel >= 0) & (pixel < 1 << 2 * DEPTH)
+    number = np.bincount(pixel[inside], minlength=1 << 2 * DEPTH)
+    return np.asarray(number / number.mean() - 1.0), 1.0 / float(number.sum())
+
+
+def _vectors(order: int, cell: int) -> Float:
+    return sky.unit_vectors(*sky.cell_centres(order + DEPTH, (cell << 2 * DEPTH) + np.arange(1 << 2 * DEPTH)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shells:
+    """Comoving distances[s] and widths, Mpc/h, share of the tracers a Mpc/h times their bias and growth."""
+
+    chi: Float
+    wide: Float
+    weight: Float
+
+
+def shells(everything: Tracers, near: float, far: float) -> Shells:
+    """The tracers' own redshifts and biases."""
+    first, last = (float(cosmology.comoving_distance(z)) for z in (near, far))
+    edges = np.linspace(first, last, int(np.ceil((last - first) / _SHELL)) + 1)
+    number = np.histogram(everything.chi, edges)[0]
+    x = np.histogram(everything.chi, edges, weights=everything.x)[0] / number
+    wide = np.diff(edges)
+    return Shells(0.5 * (edges[1:] + edges[:-1]), wide, number / number.sum() / wide * x)
+
+
+def limber(seen: Shells, found: Correlation, power: Callable[[Float], Float]) -> tuple[Float, Float]:
+    """w of a power P(k) over the pairs of each bin, and what is left of it in blocks whose means are their own."""
+    ell = np.geomspace(1.0, _ELL_MOST, 400)
+    k = (ell[:, None] + 0.5) / seen.chi
+    c_l = np.sum(seen.wide * (seen.weight / seen.chi) ** 2 * power(k.ravel()).reshape(k.shape), 1)
+    every = np.arange(1, _ELL_MOST + 1)
+    # Beyond the multipoles of the smallest separation the sum ends softly.
+    weight = (2 * every + 1) / (4 * np.pi) * np.interp(np.log(every), np.log(ell), c_l)
+    weight *= np.exp(-((every / (0.5 * _ELL_MOST)) ** 2))
+    nodes = found.pairs.nodes
+    theta = np.geomspace(nodes[0], nodes[-1], _THETAS)
+    w = np.array([np.sum(weight * j0((every + 0.5) * np.radians(at))) for at in theta])
+    return found.pairs.left(np.interp(np.log(nodes), np.log(theta), w))
+
+
+def structure(box: Box, order: int, cell: int, seen: Shells) -> Float:
+    """The Gaussian field of the box along the lines of sight of a block's pixels, weighted as the tracers are.
+
+    box         : of matter;  order, cell : of the nested block
+    seen        : the tracers' numbers by distance
+    """
+    turned, direction = lightcone.replicas(box, float(seen.chi[-1] + seen.wide[-1])), _vectors(order, cell)
+    step, g, total = box.model.cell, box.smoothed[0].ravel(), np.zeros(len(direction))
+    ends = seen.chi[0] - 0.5 * seen.wide[0], seen.chi[-1] + 0.5 * seen.wide[-1]
+    for chi in np.arange(ends[0] + 0.5 * step, ends[1], step):
+        place, _ = lightcone.box_cells(box, turned, direction, np.full(len(direction), chi))
+        total += step * np.interp(chi, seen.chi, seen.weight) * g[place]
+    return total
+
+
+def gaussian_power(k: Float) -> Float:
+    """P(k) of the Gaussian field, (Mpc/h)^3, constant within the cells of the box."""
+    cell = density_box.box_model().cell
+    on_modes = density_box._log_power(_MODES, cell).ravel()
+    length = np.sqrt(density_box._k_squared(_MODES, cell)).ravel()
+    edges = np.concatenate([[0.0], (np.arange(8) + 0.5) * 2 * np.pi / (_MODES * cell), np.geomspace(0.12, 1.3, 40)])
+    place = np.digitize(length[1:], edges)
+    number = np.maximum(np.bincount(place), 1)
+    at, share = (np.bincount(place, value) / number for value in (length[1:], on_modes[1:]))
+    kept = at > 0
+    ratio = np.interp(k, at[kept], share[kept] / density_box.linear_power(at[kept]))
+    nodes = np.geomspace(1e-3, 1.2, 40)
+    ratio *= np.interp(k, nodes, convergence.window(cell, 1, nodes))
+    return np.where(k < 1.2, density_box.linear_power(k) * ratio, 0.0)

@@ -1,0 +1,258 @@
+"""The galaxies of a sky beside what surveys observed: observed.csv, whose every row is from outside this project.
+
+sky_of      columns and magnitudes of rows of table `galaxies`
+figures     what is measured of them, by the names of the list; Poisson errors of densities under name + "_error"
+in_version  the sky of a lake
+
+Rows of confidence P are published numbers that were looked up; those of M are remembered or read off a figure: they are
+shown, and gate nothing. Magnitudes are before magnification and the Milky Way, as surveys correct theirs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from lake_schema import sky, units
+from lake_schema.arrays import Array, Bool, Float, Int
+from lake_schema.ids import GENERATION_ORDER
+from lake_schema.store import read
+from truesky.catalogue.galaxies import band_ratios
+from truesky.catalogue.halos import matching
+from truesky.fluxes import cosmology, passbands
+from truesky.fluxes.high_redshift import QUASAR
+from truesky.fluxes.libraries import templates
+
+BANDS = ("euclid_vis", "lsst_r", "lsst_i")
+ARCMIN2 = 3600.0
+MASS_SHELLS = {0.35: (0.2, 0.5), 0.65: (0.5, 0.8), 0.95: (0.8, 1.1), 1.3: (1.1, 1.5), 1.75: (1.5, 2.0)}
+MASSES, MASS_HALF = (9.5, 10.0, 10.5, 11.0), 0.1
+RED_SHELLS, RED_MASSES, RED_HALF = {0.35: (0.2, 0.5), 0.95: (0.8, 1.1)}, (10.1, 10.6, 11.1), 0.25
+STAR_FORMATION_SHELLS = ((0.05, 0.3), (0.3, 0.7), (0.7, 1.2), (1.2, 1.8), (1.8, 2.5), (2.5, 3.5), (3.5, 4.5))
+ULTRAVIOLET = {3.0: (-22, -21, -20), 3.8: (-22, -21), 4.9: (-22, -21), 5.9: (-22,)}
+# Rest-frame wavelength of ultraviolet magnitudes, A, and the band that is seen there from a redshift.
+_ULTRAVIOLET_AT, _ULTRAVIOLET_BAND = 1500.0, "lsst_i"
+_R_PIVOT = 6200.0
+# H alpha, A, in a vacuum, and the band that its continuum is taken from.
+_HALPHA, _NEAR_INFRARED = 6564.6, "euclid_h"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sky:
+    """Galaxies of kinds 0 and 1: columns, magnitudes by band, M_UV, area deg2; quasars deg-2 of r < 22.5, if known."""
+
+    rows: Mapping[str, Array]
+    mags: Mapping[str, Float]
+    ultraviolet: Float
+    area: float
+    quasars: float | None = None
+
+    def __getitem__(self, name: str) -> Float:
+        return np.asarray(self.rows[name], float)
+
+    def per_deg2(self, kept: Bool) -> float:
+        """Of the galaxies that are kept: kept : bool[n]."""
+        return float(np.count_nonzero(kept) / self.area)
+
+    def volume(self, near: float, far: float) -> float:
+        """Mpc^3 (h = 0.67) between two redshifts."""
+        steradian = self.area * np.radians(1.0) ** 2
+        return float(cosmology.comoving_volume(near, far) * steradian / cosmology.HUBBLE**3)
+
+
+COLUMNS = (
+    "kind", "density_boost", "mag_r01", "z_true", "abs_mag_r01", "color_gr_01", "log_stellar_mass", "log_sfr",
+    "log_halo_mass", "sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1", "flux_halpha", "flux_hbeta",
+    "flux_oiii", "flux_nii",
+)  # fmt: skip
+
+
+def in_version(galaxies: read.Version) -> tuple[Sky, Int]:
+    """(galaxies of a version of the table, the generation cell of each that is no quasar).
+
+    The area is that of the cells which it was drawn in.
+    """
+    table = galaxies.rows([*COLUMNS, "_healpix_29"])
+    cell = table["_healpix_29"].to_numpy() >> 2 * (sky.DEEPEST - GENERATION_ORDER)
+    drawn = [cell for part in galaxies.manifest["parts"] for cell in part["facts"].get("generation_cells", ())]
+    number = len(set(drawn)) or np.unique(cell).size
+    return sky_of(table, number * sky.cell_area(GENERATION_ORDER)), cell[table["kind"].to_numpy() < 2]
+
+
+def sky_of(table: pa.Table, area: float) -> Sky:
+    """Of rows of table `galaxies` with COLUMNS; area : deg2."""
+    galaxies = table.filter(pa.array(table["kind"].to_numpy() < 2))
+    seen = of_columns({name: galaxies[name].to_numpy() for name in COLUMNS}, area)
+    quasars = table.filter(pa.array(table["kind"].to_numpy() == QUASAR))
+    mag, z, boost = (quasars[name].to_numpy().astype(float) for name in ("mag_r01", "z_true", "density_boost"))
+    # f_nu ~ nu^-0.5 from 1450 A to the middle of r.
+    red = mag - 1.25 * np.log10(_R_PIVOT / (1450.0 * (1.0 + z)))
+    return replace(seen, quasars=float(np.sum((red < 22.5) / boost)) / area)
+
+
+def of_columns(rows: Mapping[str, Array], area: float, z_max: float = matching.Z_LAST) -> Sky:
+    """Of columns[n] by name, of galaxies of kinds 0 and 1.
+
+    rows : COLUMNS of table `galaxies`;  area : deg2;  z_max : at least the largest redshift
+    """
+    library = templates.galaxy_library()
+    sed = _spectra(rows)
+    z, m_r = rows["z_true"].astype(float), rows["abs_mag_r01"].astype(float)
+    dustiest = _dustiest(sed)
+    mags = {band: apparent(rows, band, z_max) for band in BANDS}
+    seen = band_ratios.load(library, _ULTRAVIOLET_BAND, z_max, dustiest)
+    curve = passbands.load(_ULTRAVIOLET_BAND)
+    from_z = passbands.pivot_wavelength(curve) / _ULTRAVIOLET_AT - 1.0
+    rest = m_r + band_ratios.offset(seen, np.full(z.size, from_z), sed) + 2.5 * np.log10(1.0 + from_z)
+    return Sky(rows, mags, rest + 5.0 * np.log10(cosmology.HUBBLE), area)
+
+
+def apparent(rows: Mapping[str, Array], band: str, z_max: float = matching.Z_LAST) -> Float:
+    """AB[n] in a band, before lines, magnification and the Milky Way; rows, z_max : as of `of_columns`."""
+    sed, z = _spectra(rows), rows["z_true"].astype(float)
+    table = band_ratios.load(templates.galaxy_library(), band, z_max, _dustiest(sed))
+    return np.asarray(rows["abs_mag_r01"] + cosmology.distance_modulus(z) + band_ratios.offset(table, z, sed))
+
+
+def figures(seen: Sky) -> dict[str, float]:
+    """Everything that the list has a row for, as far as a sky to I_E < 26 tells."""
+    return {
+        **counts(seen),
+        **masses(seen),
+        **star_formation(seen),
+        **lines(seen),
+        **environment(seen),
+        **ultraviolet(seen),
+        **({} if seen.quasars is None else {"quasars_r_22.5": seen.quasars}),
+    }
+
+
+def counts(seen: Sky) -> dict[str, float]:
+    """Galaxies by magnitude, and their redshifts."""
+    i_band, r_band, vis, z = seen.mags["lsst_i"], seen.mags["lsst_r"], seen.mags["euclid_vis"], seen["z_true"]
+    found = {f"i_{limit}": seen.per_deg2(i_band < limit) / ARCMIN2 for limit in range(20, 27)}
+    for at in 19.25 + 0.5 * np.arange(11):
+        found |= _log(f"log_i_{at:g}", np.count_nonzero(np.abs(i_band - at) < 0.25), 0.5 * seen.area)
+    found |= {f"r_{limit:g}": seen.per_deg2(r_band < limit) for limit in (17.77, 19.5, 19.8, 20.175)}
+    found["vis_24.5"] = seen.per_deg2(vis < 24.5) / ARCMIN2
+    return found | {"z_vis_24.5": _median(z[vis < 24.5]), "z_i_22.5": _median(z[i_band < 22.5])}
+
+
+def masses(seen: Sky) -> dict[str, float]:
+    """log10 of galaxies / Mpc^3 dex, and the share of red ones, by stellar mass and redshift."""
+    z, mass, red = seen["z_true"], seen["log_stellar_mass"], is_red(seen)
+    found: dict[str, float] = {}
+    for at, (near, far) in MASS_SHELLS.items():
+        inside = (z > near) & (z < far)
+        for m in MASSES:
+            number = np.count_nonzero(inside & (np.abs(mass - m) < MASS_HALF))
+            found |= _log(f"mass_function_{m:g}_z{at}", number, 2.0 * MASS_HALF * seen.volume(near, far))
+    for at, (near, far) in RED_SHELLS.items():
+        for m in RED_MASSES:
+            here = (z > near) & (z < far) & (np.abs(mass - m) < RED_HALF)
+            found[f"red_{m:g}_z{at}"] = float(np.mean(red[here])) if here.any() else np.nan
+    return found
+
+
+def star_formation(seen: Sky) -> dict[str, float]:
+    """log10 of Msun/yr/Mpc^3 by redshift; median and scatter of the main sequence at 10^10 Msun."""
+    z, mass, rate, forming = seen["z_true"], seen["log_stellar_mass"], seen["log_sfr"], is_blue(seen)
+    found = {}
+    for near, far in STAR_FORMATION_SHELLS:
+        inside = (z > near) & (z < far)
+        total = float(np.sum(10.0 ** rate[inside]))
+        found[f"sfrd_{near}_{far}"] = float(np.log10(max(total, 1e-30) / seen.volume(near, far)))
+    for at in (0.4, 1.0, 2.0):
+        here = forming & (np.abs(z - at) < 0.15) & (np.abs(mass - 10.0) < 0.1)
+        found[f"main_sequence_z{at}"] = _median(rate[here])
+        found[f"main_sequence_scatter_z{at}"] = float(np.std(rate[here])) if here.any() else np.nan
+    return found
+
+
+def lines(seen: Sky) -> dict[str, float]:
+    """Emitters deg-2, the ratio [O III] / H beta by mass, and the equivalent width of the brightest."""
+    z, mass = seen["z_true"], seen["log_stellar_mass"]
+    oiii, both = seen["flux_oiii"], seen["flux_halpha"] + (1.0 + 1.0 / 3.05) * seen["flux_nii"]
+    near, far = (z > 0.9) & (z < 1.6), (z > 1.5) & (z < 2.3)
+    found = {
+        "halpha_nii_2e-16": seen.per_deg2(near & (both > 2e-16)),
+        "oiii_2e-16": seen.per_deg2(far & (oiii > 2e-16)),
+        "oiii_1e-16": seen.per_deg2(far & (oiii > 1e-16)),
+    }
+    bright = (z > 1.3) & (z < 1.6) & (both > 2e-16)
+    found["ew_halpha_nii"] = _median(both[bright] / (_continuum(seen, bright) * (1.0 + z[bright])))
+    r3 = np.log10(np.maximum(oiii, 1e-30) / np.maximum(seen["flux_hbeta"], 1e-30))
+    for at, low, high in ((1.6, 1.3, 1.8), (2.3, 2.0, 2.6)):
+        for m in (9.5, 10.0, 10.5):
+            here = (z > low) & (z < high) & (np.abs(mass - m) < 0.15) & (oiii > 0.0)
+            found[f"r3_{m:g}_z{at}"] = _median(r3[here])
+    return found
+
+
+def environment(seen: Sky) -> dict[str, float]:
+    """Red centrals of groups and clusters."""
+    halo, z, red = seen["log_halo_mass"], seen["z_true"], is_red(seen)
+    centrals = (seen.rows["kind"] == 0) & (halo > 13.5) & (z > 0.8) & (z < 1.2)
+    return {"red_centrals_13.5_z1": float(np.mean(red[centrals])) if centrals.any() else np.nan}
+
+
+def ultraviolet(seen: Sky) -> dict[str, float]:
+    """Galaxies / Mpc^3 mag at 1500 A, log10, where I_E < 26 sees them all."""
+    z = seen["z_true"]
+    found: dict[str, float] = {}
+    for at, magnitudes in ULTRAVIOLET.items():
+        near, far = at - 0.3, min(at + 0.3, 6.0)
+        inside = (z > near) & (z < far)
+        for m in magnitudes:
+            number = np.count_nonzero(inside & (np.abs(seen.ultraviolet - m) < 0.25))
+            found |= _log(f"uv_{-m}_z{at}", number, 0.5 * seen.volume(near, far))
+    return found
+
+
+def is_red(seen: Sky) -> Bool:
+    """Redder than what lies half-way between the sequences."""
+    return np.asarray(seen["color_gr_01"] > 0.78 - 0.02 * (seen["abs_mag_r01"] + 20.0))
+
+
+def is_blue(seen: Sky) -> Bool:
+    """Bluer than the valley between the sequences."""
+    since = np.clip(seen["z_true"] - 0.1, 0.0, 1.6)
+    return np.asarray(seen["color_gr_01"] < 0.80 - 0.07 * (seen["abs_mag_r01"] + 20.0) - 0.16 * since)
+
+
+def _continuum(seen: Sky, kept: Bool) -> Float:
+    """Observed f_lambda[n] at redshifted H alpha, erg s-1 cm-2 A-1."""
+    library, rows = templates.galaxy_library(), {name: values[kept] for name, values in seen.rows.items()}
+    sed = _spectra(rows)
+    z = rows["z_true"].astype(float)
+    # Seen in a band from the redshift at which H alpha is at its middle.
+    at = passbands.pivot_wavelength(passbands.load(_NEAR_INFRARED)) / _HALPHA - 1.0
+    table = band_ratios.load(library, _NEAR_INFRARED, matching.Z_LAST, _dustiest(sed))
+    rest = rows["abs_mag_r01"] + band_ratios.offset(table, np.full(z.size, at), sed) + 2.5 * np.log10(1.0 + at)
+    apparent = rest + cosmology.distance_modulus(z) - 2.5 * np.log10(1.0 + z)
+    f_nu = 10.0 ** (-0.4 * (apparent + units.AB_CGS))
+    return np.asarray(f_nu * units.LIGHT_ANGSTROM_S / (_HALPHA * (1.0 + z)) ** 2)
+
+
+def _spectra(rows: Mapping[str, Array]) -> band_ratios.Sed:
+    return band_ratios.Sed(*(rows[name] for name in ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")))
+
+
+def _dustiest(sed: band_ratios.Sed) -> float:
+    """As far as tables of E(B-V) are to reach: spectra of another library may be dustier than ours."""
+    return max(0.5, float(sed.ebv.max(initial=0.0)))
+
+
+def _median(values: Sequence[float] | Float) -> float:
+    return float(np.median(values)) if len(values) else np.nan
+
+
+def _log(name: str, number: int | np.signedinteger[Any], per: float) -> dict[str, float]:
+    """A logarithmic density and its Poisson error."""
+    if not number:
+        return {name: -np.inf}
+    return {name: float(np.log10(number / per)), f"{name}_error": float(1.0 / (np.log(10.0) * np.sqrt(number)))}

@@ -1,0 +1,185 @@
+"""The Milky Way's stars beside what was observed: observed_stars.csv, whose every row is from outside this project.
+
+figures   what is measured of a model of stars, by the names of the list
+checks    of these; rows of confidence M are remembered numbers, which gate nothing
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from lake_schema import sky
+from lake_schema.arrays import Float, Float32
+from truesky.catalogue.stars import isochrones, kinematics, milky_way, stars
+from truesky.catalogue.stars.stellar_populations import DWARF, GIANT, WHITE_DWARF, tracks
+from truesky.fluxes import passbands
+from truesky.fluxes.libraries import model_stars, templates
+from truesky.fluxes.libraries.vega import vega_magnitude
+from truesky.numerics import sums
+from truesky.randomness.rng import stream
+from truesky.validation.checks import Check
+from truesky.validation.model import star_counts
+
+LIST = Path(__file__).with_name("observed_stars.csv")
+_REMEMBERED = "a remembered number gates nothing"
+_BULGE = ((1, -4), (10, -10))
+# Msun.
+_WHITE_DWARF_MASS = 0.6
+_SUN_M_BOL = 4.74
+# Distance, pc, at which Oort's constants are read off.
+_NEAR = 50.0
+
+
+def figures(universe: stars.StarModel, dust: Float32, step: int = 61) -> dict[str, float]:
+    """Everything that the list has a row for (2 s).
+
+    dust : float32[pixel] map of A(V), mag;  step : of the cells in which the whole sky is looked at
+    """
+    limits = (15.0, 18.0, 20.0)
+    pole = star_counts.brighter(universe, (0.0, 90.0), limits)
+    return {
+        **{f"pole_v{limit:g}": float(value) for limit, value in zip(limits, pole, strict=True)},
+        "sky_v11": star_counts.whole_sky(universe, 11.0, dust, step),
+        **nearby(universe),
+        **evolved(),
+        **colours(universe),
+        **motions(),
+        **bulge(universe.galaxy),
+    }
+
+
+def checks(found: Mapping[str, float]) -> dict[str, list[Check]]:
+    """Every row of the list by its group."""
+    groups: dict[str, list[Check]] = {}
+    with LIST.open(newline="", encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            expected, around = float(row["expected"]), float(row["tolerance"])
+            around *= abs(expected) if row["kind"] == "relative" else 1.0
+            known = row["known_to_fail"] or (_REMEMBERED if row["confidence"] == "M" else "")
+            check = Check(row["name"], found[row["name"]], expected - around, expected + around, row["source"], known)
+            groups.setdefault(row["group"], []).append(check)
+    return groups
+
+
+def nearby(universe: stars.StarModel) -> dict[str, float]:
+    """Densities at the Sun, pc^-3."""
+    galaxy, own = universe.galaxy, universe.galaxy.pieces
+    at_sun = np.arange(own.number.size) < galaxy.first[-1, 0]
+    number, stage = own.number * at_sun, own.stage
+    light = (own.log_mass.mean(0) < 0.0) & (stage != WHITE_DWARF)
+    giants = stage == GIANT
+    return {
+        "systems_local": float(number[light].sum()),
+        "companions_per_star": float(galaxy.companions[:-1].sum() / number[stage != WHITE_DWARF].sum()),
+        "giants_local": float(number[giants].sum()),
+        "giants_bright_local": float(number[giants & (star_counts.absolute_v(universe) < 1.0)].sum()),
+        "white_dwarfs_local": float(number[stage == WHITE_DWARF].sum()),
+        "clump_m_h": _clump(galaxy),
+    }
+
+
+def _clump(galaxy: milky_way.MilkyWay) -> float:
+    """M_H that most of the thin disc's giants between -3 and 0 have."""
+    own, thin = galaxy.pieces, np.arange(galaxy.pieces.number.size) < galaxy.first[1, 0]
+    edges = np.arange(-3.0, 0.01, 0.1)
+    number, _ = np.histogram(own.m_h.mean(0), edges, weights=own.number * thin * (own.stage == GIANT))
+    smooth = number + np.append(0.0, number[:-1]) + np.append(number[1:], 0.0)
+    return float(edges[smooth.argmax()] + 0.05)
+
+
+def evolved() -> dict[str, float]:
+    """Points of isochrones."""
+    old = isochrones.isochrones([12.5, 10.0, 4.6], [-1.5, -0.5, 0.0])
+    main = old.main_sequence + 4
+    hot = old.log_teff[:, :main].argmax(1)
+    tip = old.main_sequence - 1 + isochrones.FLASH
+    sun = tracks(np.array([4.6]), np.zeros(1))
+    return {
+        "halo_turn_off_teff": float(10.0 ** old.log_teff[0, hot[0]]),
+        "halo_turn_off_mass": float(old.mass[0, hot[0]]),
+        "thick_turn_off_teff": float(10.0 ** old.log_teff[1, hot[1]]),
+        "tip_m_bol": float(_SUN_M_BOL - 2.5 * old.log_l[0, tip]),
+        "sun_m_h": float(np.interp(0.0, sun.log_mass[0, : sun.evolved], sun.m_h[0, : sun.evolved])),
+    }
+
+
+def colours(universe: stars.StarModel, area: float = 40.0) -> dict[str, float]:
+    """g - r (SDSS) of the stars of so many deg2 at b = 60 with 18 < r < 19.5, without dust."""
+    galaxy = universe.galaxy
+    rngs = (stream(star_counts.SEED, "colours", name) for name in ("number", "labels"))
+    drawn = milky_way.draw(galaxy, milky_way.expected(galaxy, 90.0, 60.0, area, 21.0), *rngs)
+    found = model_stars.mixture(universe.types, universe.models, drawn.teff, drawn.log_g, drawn.metallicity)
+    library = templates.stellar_library()
+    light = {}
+    for name in ("sdss_g", "sdss_r", "twomass_h"):
+        band = passbands.load(name)
+        seen = library.flux[:, band.first : band.first + len(band.wavelength)].astype(float)
+        each = sums.product(seen, passbands.weights(band))
+        light[name] = (found.frac * each[found.sed]).sum(0)
+    mag_h = drawn.m_h + 5.0 * np.log10(drawn.distance) - 5.0 + vega_magnitude(passbands.load("twomass_h"))
+    mag_r = mag_h - 2.5 * np.log10(light["sdss_r"] / light["twomass_h"])
+    color = -2.5 * np.log10(light["sdss_g"] / light["sdss_r"])
+    seen = (mag_r > 18.0) & (mag_r < 19.5)
+    halo = seen & (drawn.component == milky_way.HALO) & (color < 0.6)
+    number, edges = np.histogram(color[halo], np.arange(0.0, 0.61, 0.04))
+    dwarfs = seen & (drawn.component == milky_way.HALO) & (drawn.stage == DWARF)
+    return {
+        "gr_b60_below_0.5": float(np.mean(color[seen] < 0.5)),
+        "gr_b60_mode": float(edges[number.argmax()] + 0.02),
+        "gr_b60_edge": float(np.quantile(color[dwarfs], 0.05)),
+    }
+
+
+def motions() -> dict[str, float]:
+    """Oort's constants, km/s/kpc, of the youngest stars' mean, and the halo's lag and dispersion, km/s."""
+    lon = np.arange(0.0, 360.0, 5.0)
+    none, young = np.zeros((3, lon.size)), np.full(lon.size, 0.1)
+    mean = [_along(lon, far, none, young) for far in (_NEAR, 0.5 * _NEAR)]
+    rotation = 4.74047 * (2.0 * mean[0] - mean[1])
+    rng, n = stream(star_counts.SEED, "motions"), 20_000
+    ra, dec = sky.equatorial(np.array([0.0, 90.0]), np.array([0.0, 0.0]))
+    halo = np.full(n, milky_way.HALO)
+    speeds = [
+        kinematics.velocities(
+            np.full(n, ra[k]),
+            np.full(n, dec[k]),
+            np.full(n, 10.0),
+            halo,
+            np.full(n, np.nan),
+            rng.standard_normal((3, n)),
+        )[2]
+        for k in range(2)
+    ]
+    return {
+        "oort_a": float(2.0 * (rotation * np.cos(2.0 * np.radians(lon))).mean()),
+        "oort_b": float(rotation.mean()),
+        "sun_v_lag": float(-speeds[1].mean() - kinematics.sun_motion()[1]),
+        "halo_dispersion": float(speeds[0].std()),
+    }
+
+
+def _along(lon: Float, far: float, deviates: Float, age: Float) -> Float:
+    """Proper motion along Galactic longitude, mas/yr, in the plane: by a step of it."""
+    ra, dec = sky.equatorial(lon, np.zeros(lon.size))
+    distance, thin = np.full(lon.size, far), np.zeros(lon.size, np.int64)
+    east, north, _ = kinematics.velocities(ra, dec, distance, thin, age, deviates)
+    beside = sky.equatorial(lon + 1e-3, np.zeros(lon.size))
+    step = np.stack([((beside[0] - ra + 180.0) % 360.0 - 180.0) * np.cos(np.radians(dec)), beside[1] - dec])
+    step /= np.hypot(*step)
+    return np.asarray(east * step[0] + north * step[1])
+
+
+def bulge(galaxy: milky_way.MilkyWay) -> dict[str, float]:
+    """Msun deg^-2 along lines of sight."""
+    own, inside = galaxy.pieces, np.arange(galaxy.pieces.number.size) >= galaxy.first[-1, 0]
+    each = np.where(own.stage == WHITE_DWARF, _WHITE_DWARF_MASS, 10.0 ** own.log_mass.mean(0))
+    mass = float((each * own.number * inside).sum() / galaxy.local[-1].sum())
+    found = {}
+    for lon, lat in _BULGE:
+        number = milky_way.expected(galaxy, float(lon), float(lat), 1.0, 60.0)[-1].sum()
+        found[f"bulge_mass_{lon}_{lat}"] = mass * float(number)
+    return found

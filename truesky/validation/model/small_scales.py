@@ -1,0 +1,84 @@
+"""Clustering at and within the size of halos: w(theta) of bright galaxies over that of a power law.
+
+figures   at separations of EDGES, of galaxies of M_r < -20 at z = 0.5
+
+Pairs of galaxies in order-5 cells against pairs of random points there, both beside the mean density of all cells: no
+cell's own mean is taken from it. The power law goes by Limber's equation over the galaxies' own distances.
+Error: pairs across the borders of cells are in neither count
+Ref  : Limber 1953, ApJ 117, 134; Peebles 1980, The Large-Scale Structure of the Universe, eq. 52.7
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.special import gamma
+
+from lake_schema import sky
+from lake_schema.arrays import Float
+from truesky.catalogue.halos import luminosity_function, matching, population
+from truesky.catalogue.halos.luminosity_function import Volume
+from truesky.catalogue.halos.population import Population
+from truesky.fluxes import cosmology
+from truesky.randomness.rng import stream
+from truesky.validation.model import clustering
+
+# Projected separations, Mpc/h; the galaxies' redshifts and luminosities; the power law's length, Mpc/h, and slope.
+EDGES = np.array([0.04, 0.16, 0.32, 1.28, 5.12])
+NEAR, FAR, BRIGHT = 0.4, 0.6, -20.0
+LENGTH, SLOPE = 5.5, 1.8
+ORDER = 5
+# Random points of a cell, and bins of distance.
+_RANDOM, _BINS = 20_000, 40
+
+
+def universe_of(seed: int, box_cells: int) -> Population:
+    """Halos with galaxies as bright as that; seed, box_cells : of the box."""
+    matched = luminosity_function.inverse(luminosity_function.schechter(), matching.Z_LAST)
+    space = Volume(NEAR - 0.05, FAR + 0.05, BRIGHT)
+    return population.model(seed, box_cells, space, matched, lambda z: np.full(np.size(z), BRIGHT))
+
+
+def figures(universe: Population, count: int) -> dict[str, float]:
+    """w over the power law's by the lower edge of each bin, and its error from the scatter of the cells.
+
+    universe : of `universe_of`;  count : order-5 cells, spread over the sky
+    """
+    low, high = (float(cosmology.comoving_distance(z)) for z in (NEAR, FAR))
+    theta = EDGES / (0.75 * (high**4 - low**4) / (high**3 - low**3))
+    cells = ((np.arange(count) + 0.31) * (12 << 2 * ORDER) / count).astype(int).tolist()
+    pairs, chance, number, chi = np.zeros((count, 4)), np.zeros((count, 4)), np.zeros(count), []
+    for row, cell in enumerate(cells):
+        found = clustering.tracers(universe, ORDER, cell)
+        z = universe.halos.distances.redshift(found.chi)
+        bright = universe.halos.matching.magnitude(z, found.proxy) < BRIGHT
+        found = found.part(bright & (found.chi > low) & (found.chi < high))
+        number[row] = found.chi.size
+        chi.append(found.chi)
+        pairs[row] = _pairs(found.ra, found.dec, theta)
+        _, ra, dec = sky.random_in_cell(ORDER, cell, _RANDOM, stream(universe.seed, "small_scales", cell))
+        chance[row] = _pairs(ra, dec, theta) / _RANDOM**2
+    expected = chance.mean(0) * number.mean() ** 2
+    ratio = (pairs / expected - 1.0) / power_law(np.concatenate(chi), theta)
+    names = [f"w_m20_{edge:g}" for edge in EDGES[:-1]]
+    error = ratio.std(0, ddof=1) / np.sqrt(count)
+    return {
+        **dict(zip(names, ratio.mean(0).tolist(), strict=True)),
+        **{f"{name}_error": value for name, value in zip(names, error.tolist(), strict=True)},
+    }
+
+
+def _pairs(ra: Float, dec: Float, theta: Float) -> Float:
+    """Ordered pairs in each bin of separation, edges theta in rad."""
+    tree = cKDTree(sky.unit_vectors(ra, dec))
+    return np.asarray(np.diff(tree.count_neighbors(tree, 2.0 * np.sin(0.5 * theta))), float)
+
+
+def power_law(chi: Float, theta: Float) -> Float:
+    """w of xi = (r / LENGTH)^-SLOPE, mean over the pairs of each bin, of galaxies at comoving distances chi."""
+    share, edges = np.histogram(chi, _BINS, density=True)
+    middle, step = 0.5 * (edges[1:] + edges[:-1]), edges[1] - edges[0]
+    depth = float(np.sum(share**2 * middle ** (1.0 - SLOPE)) * step)
+    level = gamma(0.5) * gamma(0.5 * (SLOPE - 1.0)) / gamma(0.5 * SLOPE) * LENGTH**SLOPE * depth
+    power = 3.0 - SLOPE
+    return np.asarray(level * 2.0 / power * np.diff(theta**power) / np.diff(theta**2))

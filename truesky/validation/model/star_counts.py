@@ -1,0 +1,129 @@
+"""Stars and dwarfs drawn, against counts that other code published.
+
+counts, dwarf_counts : a deg2 at a Galactic latitude, as in COUNTS and DWARFS;  around : the cells that are drawn
+brighter, whole_sky  : to expect brighter than V, a deg2 and on the whole sky;  absolute_v : M_V of what is drawn
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lake_schema import sky
+from lake_schema.arrays import Float, Float32
+from lake_schema.ids import GENERATION_ORDER
+from truesky.catalogue import dust_map
+from truesky.catalogue.stars import brown_dwarfs, milky_way, stars
+from truesky.catalogue.stars.density_laws import density
+from truesky.catalogue.stars.stellar_populations import BROWN_DWARF, WHITE_DWARF
+from truesky.fluxes.libraries import brown_dwarfs as spectra_of_dwarfs
+from truesky.fluxes.libraries import model_stars
+from truesky.randomness.rng import stream
+
+SEED = 7
+AREA = sky.cell_area(GENERATION_ORDER)
+# Of the cells in which the whole sky is looked at.
+_SKY_ORDER = 4
+# Northern latitude -> stars deg-2 to H = 18, 22, 26 (Vega), mean over longitude, without dust, companions and white
+# dwarfs: the same laws of density and masses, with the tables of BaSTI (Pietrinferni et al. 2004) above 0.55 Msun.
+COUNTS = {
+    90: (1997, 10951, 36048),
+    60: (2650, 14683, 46733),
+    45: (3938, 22341, 66843),
+    30: (7664, 46523, 123315),
+    20: (15541, 104005, 247463),
+}
+LIMITS = (18.0, 22.0, 26.0)
+# L, then T dwarfs deg-2 to J = 22, 24, 26 (Vega).
+DWARFS = {30: (62, 267, 458, 6, 60, 330), 60: (32, 81, 105, 5, 35, 116), 90: (25, 57, 69, 5, 29, 83)}
+# mas at G = 15, 17, 20: the law of PyGaia scaled to DR2, which publishes 0.04, 0.1, 0.7.
+PARALLAX = {15.0: 0.037, 17.0: 0.098, 20.0: 0.765}
+
+
+def around(b: float, cells: int, south: bool = False) -> list[int]:
+    """Generation cells at Galactic latitude b, evenly in longitude; with `south`, every other one at -b.
+
+    The Sun stands north of the plane, so that there are more stars in the south.
+    """
+    lon = np.arange(cells) * 360.0 / cells
+    # At a pole the parallel is too short for them.
+    lat = np.minimum(b, 89.9 - 0.1 * np.arange(cells)) * np.where(south & (np.arange(cells) % 2 == 1), -1.0, 1.0)
+    return sorted({int(cell) for cell in sky.cell_of(*sky.equatorial(lon, lat), GENERATION_ORDER)})
+
+
+def counts(b: float, cells: int, universe: stars.StarModel, dust: Float32) -> Float:
+    """Stars drawn deg-2 at a latitude, as in COUNTS: primaries and single ones.
+
+    b        : Galactic latitude, deg;  cells : that are drawn there
+    universe : the model of stars;  dust : float32[pixel] map of A(V), mag
+    """
+    drawn, total = around(b, cells), np.zeros(len(LIMITS))
+    for cell in drawn:
+        rows = stars.draw(cell, SEED, universe, dust)
+        stage = rows["stage"].fill_null(0).to_numpy()
+        wanted = rows["companion_of"].is_null().to_numpy() & ~np.isin(stage, (WHITE_DWARF, BROWN_DWARF))
+        h = rows["mag_h"].to_numpy()[wanted]
+        total += [np.sum(h < limit) for limit in LIMITS]
+    return np.asarray(total / (len(drawn) * AREA))
+
+
+def absolute_v(universe: stars.StarModel) -> Float:
+    """M_V[n] of the stretches of isochrones and of white dwarfs that stars are drawn on, in their middles."""
+    galaxy, own = universe.galaxy, universe.galaxy.pieces
+    metals = np.where(own.track < 0, 0.0, galaxy.tracks.metallicity[own.track])
+    teff, log_g = 10.0 ** own.log_teff.mean(0), own.log_g.mean(0)
+    found = model_stars.mixture(universe.types, universe.models, teff, log_g, metals)
+    lot = {
+        f"{name}_{k + 1}": values[k] for name, values in (("sed", found.sed), ("frac", found.frac)) for k in range(4)
+    }
+    return stars.mag_v(universe, lot | {"sed": found.sed[0], "mag_h": own.m_h.mean(0), "a_v": np.zeros(teff.size)})
+
+
+def brighter(
+    universe: stars.StarModel, place: tuple[float, float], limits: Sequence[float], a_v: Float | None = None
+) -> Float:
+    """Single stars and primaries deg-2 to expect brighter than V (Vega), [limit].
+
+    universe : the model of stars;  place : Galactic l, b, deg
+    limits   : V, mag;  a_v : [s] mag of dust before the shells of distance, None = there is none
+    """
+    galaxy = universe.galaxy
+    m_v, owner = (
+        absolute_v(universe),
+        np.searchsorted(galaxy.first[:, 0], np.arange(galaxy.pieces.number.size), "right") - 1,
+    )
+    r, z, azimuth = milky_way.cylindrical(galaxy, *place, milky_way.middles(galaxy))
+    volume, total = milky_way.volumes(galaxy, 1.0), np.zeros(len(limits))
+    far = 5.0 * np.log10(galaxy.distance) - 5.0 + (0.0 if a_v is None else np.append(a_v, a_v[-1]))
+    for k, component in enumerate(galaxy.components):
+        inside = np.append(0.0, np.cumsum(density(component.law, galaxy.sun, r, z, azimuth) * volume))
+        own = owner == k
+        for i, limit in enumerate(limits):
+            total[i] += (galaxy.pieces.number[own] * np.interp(limit - m_v[own], far, inside)).sum()
+    return total
+
+
+def whole_sky(universe: stars.StarModel, limit: float, dust: Float32, step: int) -> float:
+    """Single stars and primaries of the whole sky to expect brighter than V, behind the dust, from every step-th cell.
+
+    universe : the model of stars;  limit : V, mag;  dust : float32[pixel] map of A(V), mag;  step : of order-4 cells
+    """
+    cells, total = np.arange(step // 2, 12 << 2 * _SKY_ORDER, step), 0.0
+    distance = milky_way.middles(universe.galaxy)
+    for ra, dec in zip(*sky.cell_centres(_SKY_ORDER, cells), strict=True):
+        lon, lat = sky.galactic([ra], [dec])
+        far = dust_map.a_v(dust, np.array([ra]), np.array([dec]))
+        a_v = dust_map.a_v_at(far, distance, lat, universe.layer, universe.sin_b_min)
+        total += float(brighter(universe, (float(lon[0]), float(lat[0])), [limit], a_v)[0])
+    return total * sky.cell_area(_SKY_ORDER) * (12 << 2 * _SKY_ORDER) / cells.size
+
+
+def dwarf_counts(b: float, area: float) -> Float:
+    """L and T dwarfs drawn deg-2 at a latitude, as in DWARFS: one draw over so many deg2, without dust."""
+    galaxy, dwarfs, types = milky_way.milky_way(), brown_dwarfs.brown_dwarfs(1.0), spectra_of_dwarfs.templates()
+    found = brown_dwarfs.draw(dwarfs, galaxy, 90.0, b, area, 28.0, stream(SEED, "benchmark", int(b)))
+    j = types.abs_mag_j[found.template] + 5.0 * np.log10(found.distance) - 5.0
+    is_t = types.subtype[found.template] >= 10
+    total = [np.sum(~is_t & (j < m)) for m in (22, 24, 26)] + [np.sum(is_t & (j < m)) for m in (22, 24, 26)]
+    return np.array(total) / area

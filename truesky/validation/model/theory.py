@@ -1,0 +1,144 @@
+"""What non-linear theory expects of two points on the sky: shear, and galaxies of known bias.
+
+power                non-linear P(k) of matter;  linear : that of linear theory
+convergence          C_l of the convergence of sources at many distances
+galaxies             C_l of the numbers of galaxies
+shear_correlations   xi+ and xi- of C_l;  correlation : w of C_l
+aperture             mean squares of the aperture mass and of its cross component, of xi+ and xi-
+
+Error: power within 1 % of the same in CAMB for 0.01 < k < 50 h/Mpc and z < 1; Limber's approximation
+Ref: Smith et al. 2003, MNRAS 341, 1311, with the numbers of Takahashi et al. 2012, ApJ 761, 152; Limber 1953, ApJ 117,
+     134; Bartelmann & Schneider 2001, Phys. Rep. 340, 291, eqs. 6.57 ff.; Schneider, van Waerbeke & Mellier 2002,
+     A&A 389, 729, eqs. 32 ff.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+from scipy.optimize import brentq
+from scipy.special import j0, j1
+
+from lake_schema.arrays import Float
+from truesky.catalogue.matter import density_box
+from truesky.fluxes import cosmology
+
+_LN_K = np.linspace(np.log(1e-4), np.log(1e5), 4000)
+# Distances between observer and sources, and nodes of the transforms in ln l.
+_STEPS, _FINE = 100, 40_000
+# Multipoles that C_l is made at.
+ELL = np.geomspace(1.0, 2e5, 160)
+
+
+def power(k: Float, z: float) -> Float:
+    """P(k)[n], (Mpc/h)^3, at one redshift; k : float[n] h/Mpc."""
+    nodes, today = np.exp(_LN_K), float(density_box.growth(z)) ** 2
+    delta = nodes**3 * _today() * today / (2 * np.pi**2)
+
+    def sigma2(ln_r: float) -> float:
+        return float(np.trapezoid(delta * np.exp(-((nodes * np.exp(ln_r)) ** 2)), _LN_K))
+
+    ln_r = brentq(lambda x: np.log(sigma2(x)), np.log(1e-5), np.log(20.0))
+    y2 = (nodes * np.exp(ln_r)) ** 2
+    first, second = (np.trapezoid(delta * part * np.exp(-y2), _LN_K) for part in (2 * y2, 4 * y2 - 4 * y2**2))
+    n, c = first - 3.0, first**2 + second
+    om = cosmology.OMEGA_M * (1 + z) ** 3 / float(cosmology.expansion_rate(z)) ** 2
+    a = 10 ** (1.5222 + 2.8553 * n + 2.3706 * n**2 + 0.9903 * n**3 + 0.2250 * n**4 - 0.6038 * c)
+    b = 10 ** (-0.5642 + 0.5864 * n + 0.5716 * n**2 - 1.5474 * c)
+    g = 10 ** (0.3698 + 2.0404 * n + 0.8161 * n**2 + 0.5869 * c)
+    gamma = 0.1971 - 0.0843 * n + 0.8460 * c
+    alpha = abs(6.0835 + 1.3373 * n - 0.1959 * n**2 - 5.5274 * c)
+    beta = 2.0379 - 0.7354 * n + 0.3157 * n**2 + 1.2490 * n**3 + 0.3980 * n**4 - 0.1682 * c
+    nu = 10 ** (5.2105 + 3.6902 * n)
+    f1, f2, f3 = om**-0.0307, om**-0.0585, om**0.0743
+    smooth = k**3 * today * np.exp(np.interp(np.log(k), _LN_K, np.log(_today()))) / (2 * np.pi**2)
+    y = k * np.exp(ln_r)
+    quasi = smooth * (1 + smooth) ** beta / (1 + alpha * smooth) * np.exp(-(y / 4 + y**2 / 8))
+    halo = a * y ** (3 * f1) / (1 + b * y**f2 + (g * f3 * y) ** (3 - gamma)) / (1 + nu / y**2)
+    return np.asarray(2 * np.pi**2 * (quasi + halo) / k**3)
+
+
+def linear(k: Float, z: float) -> Float:
+    """P(k)[n] of linear theory, (Mpc/h)^3, at one redshift; k : float[n] h/Mpc."""
+    return np.asarray(density_box.linear_power(k) * float(density_box.growth(z)) ** 2)
+
+
+@cache
+def _today() -> Float:
+    """Linear power at the nodes, z = 0: read-only."""
+    found = np.asarray(density_box.linear_power(np.exp(_LN_K)), float)
+    found.flags.writeable = False
+    return found
+
+
+def convergence(ell: Float, chi: Float, weight: Float, of: Callable[[Float, float], Float] = power) -> Float:
+    """C_l[n] of the convergence.
+
+    ell : float[n];  chi, weight : float[s] of the sources, Mpc/h, and how many lie there;  of : P(k, z)
+    """
+    x = np.linspace(5.0, float(chi.max()) - 1.0, _STEPS)
+    z = np.asarray(cosmology.redshift(x))
+    efficiency = np.maximum(1.0 - x[:, None] / chi, 0.0)
+    lens = 1.5 * cosmology.OMEGA_M / cosmology.HUBBLE_DISTANCE**2 * x * (1 + z)
+    lens = lens * np.sum(efficiency * weight, axis=1) / weight.sum()
+    rows = [(w / d) ** 2 * of((ell + 0.5) / d, float(at)) for w, d, at in zip(lens, x, z, strict=True)]
+    return np.asarray(np.trapezoid(np.array(rows), x, axis=0))
+
+
+def galaxies(ell: Float, edges: Float, number: Float, bias: Float) -> Float:
+    """C_l[n] of galaxies.
+
+    ell : float[n];  edges : float[s + 1] of shells, Mpc/h;  number, bias : float[s] of the galaxies in each
+    """
+    x, wide = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
+    share = number / number.sum() / wide * bias
+    total = np.zeros(len(ell))
+    for at, step, one in zip(x, wide, share, strict=True):
+        if one > 0.0:
+            total += step * (one / at) ** 2 * power((ell + 0.5) / at, float(cosmology.redshift(at)))
+    return total
+
+
+def correlation(theta: Float, ell: Float, c_l: Float) -> Float:
+    """w[n] at theta rad, of C_l at ascending ell."""
+    return _transformed(theta, ell, c_l, j0)
+
+
+def shear_correlations(theta: Float, ell: Float, c_l: Float) -> tuple[Float, Float]:
+    """xi+, xi- [n] at theta rad, of C_l at ascending ell."""
+    return _transformed(theta, ell, c_l, j0), _transformed(theta, ell, c_l, _j4)
+
+
+def _transformed(theta: Float, ell: Float, c_l: Float, bessel: Callable[[Float], Float]) -> Float:
+    fine = np.geomspace(ell[0], ell[-1], _FINE)
+    weight = fine**2 * np.exp(np.interp(np.log(fine), np.log(ell), np.log(np.maximum(c_l, 1e-300)))) / (2 * np.pi)
+    # The sum ends softly: no ringing at small separations.
+    weight = weight * np.exp(-((fine / (0.5 * ell[-1])) ** 2))
+    step = np.log(fine[1] / fine[0])
+    return np.array([step * np.sum(weight * bessel(fine * t)) for t in theta])
+
+
+def _j4(x: Float) -> Float:
+    """Bessel's function of order 4 by those of 0 and 1, which are ten times as fast; by its series where x is small."""
+    far = np.maximum(x, 0.5)
+    found = (48.0 / far**3 - 8.0 / far) * j1(far) - (24.0 / far**2 - 1.0) * j0(far)
+    return np.where(x < 0.5, x**4 / 384.0 * (1.0 - x**2 / 20.0 + x**4 / 960.0), found)
+
+
+def aperture(edges: Float, plus: Float, minus: Float, radius: float) -> tuple[Float, Float]:
+    """Mean square of the aperture mass and of its cross component, the latter 0 where there are no B modes.
+
+    edges : float[n + 1] of bins of separation, from 0 on;  plus, minus : float[..., n] xi+ and xi- of each
+    radius : in the unit of the edges, at most half the last edge
+    """
+    middle, wide = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
+    x = np.minimum(middle / radius, 2.0)
+    measure = np.where(edges[1:] <= 2.0 * radius * (1 + 1e-9), middle * wide / radius**2, 0.0)
+    t_plus = 1.2 * (2 - 15 * x**2) * (1 - 2 / np.pi * np.arcsin(x / 2))
+    poly = 120 + 2320 * x**2 - 754 * x**4 + 132 * x**6 - 9 * x**8
+    t_plus = t_plus + x * np.sqrt(4 - x**2) / (100 * np.pi) * poly
+    t_minus = 192 / (35 * np.pi) * x**3 * (1 - x**2 / 4) ** 3.5
+    one, other = np.sum(measure * t_plus * plus, -1), np.sum(measure * t_minus * minus, -1)
+    return 0.5 * (one + other), 0.5 * (one - other)
