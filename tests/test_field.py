@@ -17,6 +17,7 @@ from astropy.wcs import WCS, FITSFixedWarning
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+import truesky
 from lake_schema import sky
 from lake_schema.mission.configuration import resolve
 from lake_schema.store import layout, read
@@ -98,6 +99,33 @@ def test_the_tables_are_those_that_the_documentation_lists(field):
         found[table] = hashlib.sha256(content).hexdigest()
     assert len(found) == 5
     assert found == published_digests(), "where a change of the results is intended, update docs/promises.md"
+
+
+def test_python_reads_images_and_truth(field):
+    with truesky.open(field) as lake:
+        images = lake.images()
+        assert sorted(images["channel"]) == ["EXT", "VIS"]
+        assert all((field / file).is_file() for file in images["file"])
+        first = images.iloc[0]
+        stored, electrons = lake.image(first["path"]), lake.image(first["path"], electrons=True)
+        assert stored.data.shape == electrons.data.shape
+        assert 0 < np.median(electrons.data) < np.median(stored.data)
+        truth = lake.truth(first["exposure_id"], first["detector"])
+        assert len(truth) > 1000
+        assert set(truth["detector"]) == {first["detector"]}
+        with pytest.raises(truesky.BadInput, match="nothing was rendered for detector 9-9"):
+            lake.truth(1, "9-9")
+        ra, dec = 53.117, -27.808
+        near = lake.cone("galaxies", ra, dec, 0.02, ["id", "ra", "dec"], into="pandas")
+        assert len(near) > 100
+        assert sky.separation(near["ra"].to_numpy(), near["dec"].to_numpy(), ra, dec).max() <= 0.02
+
+
+def test_python_runs_a_request_and_keeps_what_is_there(field):
+    before = {path.name for path in field.glob("*/v-*")}
+    with truesky.run(DEMO, field) as lake:
+        assert lake.sql("SELECT count(*) AS n FROM tasks")["n"].tolist() == [2]
+    assert {path.name for path in field.glob("*/v-*")} == before
 
 
 def product(field, channel, content):
