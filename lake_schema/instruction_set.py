@@ -105,7 +105,7 @@ def numba_target() -> tuple[str, str]:
         _, name, features = cpu_target.target_context.codegen().magic_tuple()
         if str(features) == os.environ.get(_NUMBA_FEATURES, ""):
             return str(name), str(features)
-        # Those of this CPU, by name of some hundred characters.
+        # The names of all features of this CPU take hundreds of characters.
         return str(name), "" if _NUMBA_FEATURES not in os.environ else "with features of this CPU"
     import llvmlite.binding
 
@@ -138,12 +138,12 @@ def check() -> str | None:
             else "numpy was imported before truesky, or this version of numpy ignores the limit"
         )
         raise BadInput(
-            f"numpy uses {' '.join(above)}, so the results would differ from those of other machines: {why}; "
+            f"numpy uses {' '.join(above)}, so the results would differ between machines: {why}; "
             f"import truesky first and unset {_NUMPY_ENABLE}, or set {SETTING}={NATIVE}"
         )
     if _arrow_in_use() == "avx512":
         raise BadInput(
-            f"Arrow uses AVX-512, so the results could differ from those of other machines: import truesky before "
+            f"Arrow uses AVX-512, so the results could differ between machines: import truesky before "
             f"pyarrow and set {_ARROW} to {_ARROW_LEVEL} or unset it, or set {SETTING}={NATIVE}"
         )
     if kind().startswith(LEVEL):
@@ -151,7 +151,7 @@ def check() -> str | None:
     names = (_NUMPY_DISABLE, _NUMPY_ENABLE, _ARROW, _NUMBA_CPU, _NUMBA_FEATURES)
     changed = {name: os.environ[name] for name in names if os.environ.get(name) not in (None, _DEFAULTS.get(name))}
     given = ", ".join(f"{name}={value!r}" for name, value in changed.items()) or "numba was imported before truesky"
-    return f"last bits may differ from those of other machines: this process computes as {kind()} ({given})"
+    return f"last bits may differ between machines: this process computes as {kind()} ({given})"
 
 
 def _is_x86() -> bool:

@@ -46,7 +46,7 @@ CHAPTERS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("Contributing", ("contributing.md",)),
 )
 _DEMO, _DEMO_LAKE = ROOT / "requests" / "demo.toml", ROOT / "out" / "demo" / "lake"
-_FOLDERS = "deploy|jobs|lake_schema|requests|benchmarks|tests|scripts"
+_FOLDERS = "deploy|jobs|truesky|lake_schema|requests|benchmarks|tests|scripts"
 _FILE = re.compile(rf"\[([^\]]*)\]\((?:\.\./)*(?:(?:{_FOLDERS})/|README)[^)]*\)")
 _NOTEBOOK = re.compile(r"\]\((?:\.\./)*notebooks/([^)]*)\.ipynb\)")
 

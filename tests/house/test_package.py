@@ -36,7 +36,7 @@ def built(tmp_path_factory):
     copy = tmp_path_factory.mktemp("wheel")
     for name in (*PACKAGES, "requests", "notebooks"):
         shutil.copytree(ROOT / name, copy / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "LICENSE"):
+    for name in ("pyproject.toml", "LICENSE", "README.md"):
         shutil.copy(ROOT / name, copy)
     command = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "--no-index", "--quiet", "."]
     done = subprocess.run(command, cwd=copy, capture_output=True, text=True)

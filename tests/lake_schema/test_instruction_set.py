@@ -83,7 +83,7 @@ def test_another_choice_of_the_user_is_respected_and_reported(name, value, word)
     assert word in kind
     assert not kind.startswith("x86-64-v3")
     assert difference == (
-        f"last bits may differ from those of other machines: this process computes as {kind} "
+        f"last bits may differ between machines: this process computes as {kind} "
         f"({name}='{value}{' AVX512_ICL AVX512_SPR' * name.endswith('DISABLE_CPU_FEATURES')}')"
     )
 

@@ -278,14 +278,14 @@ def test_a_process_that_breaks_the_promise_makes_nothing(run, lake, monkeypatch,
     monkeypatch.delenv("TRUESKY_CPU", raising=False)
     assert run(plain_work) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("toy_job: numpy uses X86_V4, so the results would differ from those of other machines")
+    assert line.startswith("toy_job: numpy uses X86_V4, so the results would differ between machines")
     assert list(lake.iterdir()) == []
 
 
 def test_a_choice_of_the_user_is_reported_once(run, monkeypatch, capsys):
-    monkeypatch.setattr(instruction_set, "check", lambda: "last bits may differ from those of other machines")
+    monkeypatch.setattr(instruction_set, "check", lambda: "last bits may differ between machines")
     assert run(plain_work) == 0
-    assert capsys.readouterr().err == "toy_job: last bits may differ from those of other machines\n"
+    assert capsys.readouterr().err == "toy_job: last bits may differ between machines\n"
 
 
 @pytest.mark.parametrize("kinds", [["here"], ["there"], ["here", "there"]])
