@@ -78,7 +78,8 @@ def main() -> None:
         # All together decide the versions, once; each list then takes its own of them.
         every = compiled([project, builders], known, "--all-extras")
         known.write_text("\n".join(versions(every)))
-        made = {"run": compiled([project], known), "build": compiled([builders], known)}
+        run = compiled([project], known, "--extra", "page", "--extra", "reduction")
+        made = {"run": run, "build": compiled([builders], known)}
         for extra in ("test", "bench", "s3"):
             wanted = compiled([project], known, "--extra", extra)
             # What run.txt has for some machines alone may here be wanted on all.

@@ -55,6 +55,9 @@ MODULES = {
     "page": ("truesky.page.__main__", False),
     "examples": ("truesky.commands.examples", False),
 }
+# Command -> the extra of the package that it requires.
+EXTRAS = {"masters": "reduction", "page": "page", "push": "s3", "reduce": "reduction", "stack": "reduction"}
+EXTRAS |= {"validate": "reduction"}
 # What a job answers without Spark.
 _WITHOUT = {"-h", "--help", "--dry-run"}
 
@@ -71,9 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"truesky {__version__}")
         return 0
     if word in MODULES:
-        module, wanted = MODULES[word]
-        status: int = import_module(module).main([word, *rest] if wanted else rest)
-        return status
+        return _module_command(word, rest)
     if word not in JOBS and word != "run":
         known = ", ".join(sorted({"run", *JOBS, *MODULES}))
         return command.say("truesky", f"{word} is no command of truesky: {known}; truesky --help says more", 2)
@@ -82,6 +83,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     if here and options:
         return command.say("truesky", f"--local: no spark-submit is called that could take {options[0]}", 2)
     return _started(word, own, options, here or not _WITHOUT.isdisjoint(own))
+
+
+def _module_command(word: str, rest: Sequence[str]) -> int:
+    """Run a command that is a module; returns its exit status, or 2 if an optional package is missing."""
+    module, with_word = MODULES[word]
+    try:
+        status: int = import_module(module).main([word, *rest] if with_word else rest)
+    except ModuleNotFoundError as error:
+        if word not in EXTRAS or (error.name or "").startswith(("truesky", "lake_schema")):
+            raise
+        remedy = f"pip install 'truesky[{EXTRAS[word]}]'"
+        return command.say("truesky", f"{word} requires the package {error.name}, which is not installed: {remedy}", 2)
+    return status
 
 
 def _started(word: str, own: Sequence[str], options: Sequence[str], here: bool) -> int:

@@ -90,3 +90,24 @@ def test_what_is_no_command_is_refused(capsys):
     for words in ([], ["--help"], ["--version"]):
         assert truesky.main(words) == 0
         assert f"truesky {__version__}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("word", "extra"), sorted(truesky.EXTRAS.items()))
+def test_a_missing_optional_package_is_named_with_its_remedy(word, extra, monkeypatch, capsys):
+    def missing(module):
+        raise ModuleNotFoundError("No module named 'drizzle'", name="drizzle")
+
+    monkeypatch.setattr(truesky, "import_module", missing)
+    assert truesky.main([word, "lake"]) == 2
+    assert capsys.readouterr().err == (
+        f"truesky: {word} requires the package drizzle, which is not installed: pip install 'truesky[{extra}]'\n"
+    )
+
+
+def test_a_module_of_ours_that_is_missing_is_no_matter_of_extras(monkeypatch):
+    def missing(module):
+        raise ModuleNotFoundError("No module named 'truesky.nothing'", name="truesky.nothing")
+
+    monkeypatch.setattr(truesky, "import_module", missing)
+    with pytest.raises(ModuleNotFoundError):
+        truesky.main(["page", "lake"])
