@@ -39,6 +39,7 @@ from truesky.request.files import UserCurves
 from truesky.request.from_toml import parse
 from truesky.running import shell
 
+JOB = Path(__file__).resolve().parents[2] / "jobs" / "render" / "plan_exposures.py"
 # What has no bound takes minutes; a slow machine's imports take seconds.
 MOST_SECONDS = 30.0
 JOBS = {
@@ -323,7 +324,7 @@ def test_names_that_lost_their_letters_are_refused(tmp_path, capsys, monkeypatch
 def test_a_question_mark_is_a_letter_where_no_java_was(tmp_path, name, words):
     environment = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0"}
     environment.pop("PYSPARK_GATEWAY_PORT", None)
-    asked = [sys.executable, "-m", "truesky.render.plan_exposures", "--lake", tmp_path / "lake"]
+    asked = [sys.executable, JOB, "--lake", tmp_path / "lake"]
     done = subprocess.run([*asked, "--request", bytes(tmp_path / "x") + name], env=environment, capture_output=True)
     assert (done.returncode, done.stderr.count(b"\n")) == (2, 1)
     assert words in done.stderr
