@@ -190,7 +190,9 @@ EXTRAS = ("page", "reduction", "s3")
 PARTS = {"llvmlite", "py4j", "botocore"}
 
 
-@pytest.mark.parametrize(("folders", "extras"), [(("lake_schema", "truesky"), EXTRAS), (("tests",), ("test", "docs", *EXTRAS))])
+@pytest.mark.parametrize(
+    ("folders", "extras"), [(("lake_schema", "truesky"), EXTRAS), (("tests",), ("test", "docs", *EXTRAS))]
+)
 def test_what_is_imported_is_named(folders, extras):
     """Not only what comes with another package, which may do without it tomorrow; in programs kept as text, too."""
     project = PROJECT["project"]
