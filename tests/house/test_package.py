@@ -181,6 +181,9 @@ def test_what_is_wanted_is_pinned_within_its_range():
     wanted += PROJECT["build-system"]["requires"]
     for line in wanted:
         requirement = Requirement(line)
+        if requirement.name == "truesky":
+            assert requirement.extras <= project["optional-dependencies"].keys(), line
+            continue
         assert requirement.specifier.contains(pins()[canonicalize_name(requirement.name)]), line
 
 

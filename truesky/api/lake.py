@@ -247,4 +247,4 @@ class Lake:
                 f"lake {self._explorer.root}: nothing was rendered for detector {detector} of exposure {exposure_id}"
             )
         query = "SELECT * FROM rendered_truth WHERE exposure_id = $exposure AND detector = $detector"
-        return self.sql(query, exposure=exposure_id, detector=detector)
+        return self.sql(query, exposure=int(exposure_id), detector=str(detector))

@@ -21,7 +21,7 @@ from truesky.validation.lake.catalogues import observed_sky
 from truesky.validation.lake.measure.rows import FAIL, PASS
 from truesky.validation.model import mean_sky, observed
 
-LIST = Path(observed.__file__).with_suffix(".csv")
+LIST = Path(checks.__file__).with_name("observed.csv")
 # Cells that tell a wrong recipe.
 FEW = 4
 
