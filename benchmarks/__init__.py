@@ -1,0 +1,2 @@
+# Limits numpy to the common instruction set, before any benchmark imports it.
+import lake_schema  # noqa: F401

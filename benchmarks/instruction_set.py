@@ -100,7 +100,11 @@ def compare(subject: str, repeats: int, quick: bool) -> dict[str, float]:
         `<subject>_portable_s`, `<subject>_native_s`.
     """
     command = [sys.executable, "-m", "benchmarks.instruction_set", "--serve", subject, *["--quick"] * quick]
-    unset = {name: os.environ[name] for name in os.environ if not name.startswith(("NPY_", "NUMBA_CPU", "ARROW_USER"))}
+    unset = {
+        name: os.environ[name]
+        for name in os.environ
+        if not name.startswith(("NPY_", "NUMBA_CPU", "NUMBA_DISABLE", "ARROW_USER"))
+    }
     with ExitStack() as stack:
         children = {
             setting: stack.enter_context(
@@ -138,7 +142,7 @@ def _ask(child: subprocess.Popen[str]) -> float:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measure every subject, or those that are named, and print the ratios."""
+    """Measure the subjects and print the ratios."""
     own = argparse.ArgumentParser(add_help=False)
     own.add_argument("--subjects", nargs="+", choices=SUBJECTS, default=list(SUBJECTS))
     own.add_argument("--repeats", type=int, default=7, help="of each measurement")

@@ -2,7 +2,7 @@
 
 Charts are answered as the page answers them, over made columns that it keeps; the server is asked over HTTP, over a
 made lake of 1 M rows and an image, and over one of 10 M rows of which nothing is kept; a browser moves brushes over the
-first, where one is installed (extra `browser`, and chromium).
+first, where one is installed (extra `test`, and chromium).
 """
 
 from __future__ import annotations

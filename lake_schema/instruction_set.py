@@ -1,18 +1,20 @@
 """Limit numerical libraries to x86-64-v3 instructions, so that every x86-64 CPU computes the same bytes.
 
-numpy, numba and Arrow use AVX-512 where the CPU has it, and their AVX-512 code rounds some last bits differently.
-Importing `lake_schema` therefore limits them to x86-64-v3 (AVX2 and FMA, in all CPUs since about 2015). This must
-happen before numpy is imported. The environment variable TRUESKY_CPU=native removes the limit.
+numpy, numba, Arrow and OpenBLAS use AVX-512 if the CPU has it, and their AVX-512 code rounds last bits differently.
+Importing `lake_schema` therefore limits them to x86-64-v3 (AVX2 and FMA, in nearly all desktop and server CPUs since
+2015). This must happen before numpy is imported. The environment variable TRUESKY_CPU=native removes the limit.
 
 The module uses the standard library only when it is imported.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
 import platform
 import sys
 from functools import cache
+from pathlib import Path
 
 from lake_schema.errors import BadInput
 
@@ -24,25 +26,46 @@ _NUMPY_ABOVE = ("X86_V4", "AVX512_ICL", "AVX512_SPR")
 _NUMPY_DISABLE, _NUMPY_ENABLE = "NPY_DISABLE_CPU_FEATURES", "NPY_ENABLE_CPU_FEATURES"
 _ARROW, _ARROW_LEVEL = "ARROW_USER_SIMD_LEVEL", "AVX2"
 _NUMBA_CPU, _NUMBA_FEATURES, _NUMBA_SVML = "NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES", "NUMBA_DISABLE_INTEL_SVML"
+_BLAS, _BLAS_CORE = "OPENBLAS_CORETYPE", "Haswell"
 _DEFAULTS = {
     _NUMPY_DISABLE: " ".join(_NUMPY_ABOVE),
     _ARROW: _ARROW_LEVEL,
     _NUMBA_CPU: LEVEL,
     _NUMBA_FEATURES: "",
     _NUMBA_SVML: "1",
+    _BLAS: _BLAS_CORE,
 }
+# Variables that must fit the CPU: code for x86-64-v3 does not run on an older one.
+_FOR_THIS_CPU = (_NUMBA_CPU, _NUMBA_FEATURES, _NUMBA_SVML, _BLAS)
+# Other settings of numba that change the order of sums or the functions that are used.
+_NUMBA_OTHERS = (
+    "NUMBA_DISABLE_JIT", "NUMBA_ENABLE_AVX", "NUMBA_LOOP_VECTORIZE", "NUMBA_OPT", "NUMBA_SLP_VECTORIZE",
+)  # fmt: skip
 # LLVM's names of the features that x86-64-v3 adds to v2. https://gitlab.com/x86-psABIs/x86-64-ABI, table 3.1
 _LEVEL_FEATURES = ("avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe")
+# Linux's names of the same features.
+_CPUINFO, _FLAGS = Path("/proc/cpuinfo"), {"avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe"}
 
 
 def is_portable() -> bool:
     """Return True unless the user asked for all instructions of this CPU."""
-    return os.environ.get(SETTING, PORTABLE) != NATIVE
+    return _setting() != NATIVE
 
 
 def limit() -> None:
-    """Set the environment variables of numpy and Arrow; call this before they are imported."""
+    """Set the environment variables of the libraries; call this before they are imported."""
     os.environ.update(variables())
+    if is_portable() and _linux_says_level():
+        _limit_for_this_cpu()
+
+
+def _setting() -> str:
+    return os.environ.get(SETTING) or PORTABLE
+
+
+def _limit_for_this_cpu() -> None:
+    for name in _FOR_THIS_CPU:
+        os.environ.setdefault(name, _DEFAULTS[name])
 
 
 def variables() -> dict[str, str]:
@@ -64,12 +87,11 @@ def variables() -> dict[str, str]:
 def limit_numba() -> None:
     """Set the environment variables of numba; call this before numba is imported.
 
-    Unlike `variables`, these must fit the CPU: code for x86-64-v3 does not run on an older one.
+    `limit` has done so already where the operating system lists the features of the CPU quickly.
     """
     if not is_portable() or not _has_level():
         return
-    for name in (_NUMBA_CPU, _NUMBA_FEATURES, _NUMBA_SVML):
-        os.environ.setdefault(name, _DEFAULTS[name])
+    _limit_for_this_cpu()
     if "numba" in sys.modules:
         # Too late for functions that are compiled already; `check` reports that.
         sys.modules["numba"].config.reload_config()
@@ -89,27 +111,44 @@ def kind() -> str:
     """
     system = [word for word in platform.libc_ver() if word] or [platform.system(), platform.release()]
     target, features = numba_target()
-    numpy, arrow = _numpy_in_use(), _arrow_in_use()
-    if (target, features, numpy, arrow) == (LEVEL, "", ("X86_V3",), _ARROW_LEVEL.lower()):
+    numpy, arrow, others = _numpy_in_use(), _arrow_in_use(), _other_numba_settings()
+    if (target, features, numpy, arrow, others) == (LEVEL, "", ("X86_V3",), _ARROW_LEVEL.lower(), ()):
         return " ".join((LEVEL, *system))
-    words = [platform.machine(), target, features, f"numpy({' '.join(numpy)})", f"arrow({arrow})", *system]
+    words = [platform.machine(), target, features, *others, f"numpy({' '.join(numpy)})", f"arrow({arrow})", *system]
     return " ".join(word for word in words if word)
 
 
 def numba_target() -> tuple[str, str]:
-    """CPU name and features for which numba compiles in this process."""
+    """CPU name and features for which numba compiles in this process.
+
+    Returns
+    -------
+    name : str
+        Name of the CPU as LLVM knows it.
+    features : str
+        Empty if the name determines the features; else what the user chose, or a hash of the features of this CPU,
+        whose names take hundreds of characters.
+    """
     limit_numba()
     if "numba" in sys.modules:
         from numba.core.registry import cpu_target
 
-        _, name, features = cpu_target.target_context.codegen().magic_tuple()
-        if str(features) == os.environ.get(_NUMBA_FEATURES, ""):
-            return str(name), str(features)
-        # The names of all features of this CPU take hundreds of characters.
-        return str(name), "" if _NUMBA_FEATURES not in os.environ else "with features of this CPU"
+        _, name, found = (str(word) for word in cpu_target.target_context.codegen().magic_tuple())
+        chosen = os.environ.get(_NUMBA_FEATURES)
+        if found == chosen or (chosen is None and name != LEVEL):
+            return name, chosen or ""
+        return name, f"features:{hashlib.sha256(found.encode()).hexdigest()[:8]}"
     import llvmlite.binding
 
     return os.environ.get(_NUMBA_CPU) or llvmlite.binding.get_host_cpu_name(), os.environ.get(_NUMBA_FEATURES, "")
+
+
+def _other_numba_settings() -> tuple[str, ...]:
+    """Further settings of numba in the environment that are not the defaults."""
+    found = [f"{name}={os.environ[name]}" for name in _NUMBA_OTHERS if name in os.environ]
+    if os.environ.get(_NUMBA_SVML, _DEFAULTS[_NUMBA_SVML]) != _DEFAULTS[_NUMBA_SVML]:
+        found.append(f"{_NUMBA_SVML}={os.environ[_NUMBA_SVML]}")
+    return tuple(found)
 
 
 def check() -> str | None:
@@ -118,44 +157,62 @@ def check() -> str | None:
     Returns
     -------
     str or None
-        A line about what differs from the standard kind, if the user's environment variables cause a difference.
+        A line about the difference from the standard kind, if the user's environment variables cause one.
 
     Raises
     ------
     BadInput
-        If TRUESKY_CPU has an unknown value, or if numpy or Arrow uses instructions above x86-64-v3 nevertheless.
+        If TRUESKY_CPU has an unknown value, or if numpy, numba or Arrow uses instructions above x86-64-v3
+        nevertheless.
     """
-    setting = os.environ.get(SETTING, PORTABLE)
-    if setting not in (PORTABLE, NATIVE):
-        raise BadInput(f"{SETTING} must be {PORTABLE} or {NATIVE}, got {setting!r}")
-    if setting == NATIVE or not _has_level():
+    if _setting() not in (PORTABLE, NATIVE):
+        raise BadInput(f"{SETTING} must be {PORTABLE} or {NATIVE}, got {_setting()!r}")
+    if not is_portable() or not _has_level():
         return None
+    remedy = f"import truesky first, or set {SETTING}={NATIVE}"
     above = [name for name in _numpy_in_use() if name in _NUMPY_ABOVE or name.startswith("AVX512")]
     if above:
-        why = (
-            f"{_NUMPY_ENABLE} is set"
-            if _NUMPY_ENABLE in os.environ
-            else "numpy was imported before truesky, or this version of numpy ignores the limit"
-        )
-        raise BadInput(
-            f"numpy uses {' '.join(above)}, so the results would differ between machines: {why}; "
-            f"import truesky first and unset {_NUMPY_ENABLE}, or set {SETTING}={NATIVE}"
-        )
+        why = "numpy was imported before truesky, or this version of numpy ignores the limit"
+        if _NUMPY_ENABLE in os.environ:
+            why, remedy = f"{_NUMPY_ENABLE} is set", f"unset it, or set {SETTING}={NATIVE}"
+        raise BadInput(f"numpy uses {' '.join(above)}, so results would differ between machines: {why}; {remedy}")
     if _arrow_in_use() == "avx512":
-        raise BadInput(
-            f"Arrow uses AVX-512, so the results could differ between machines: import truesky before "
-            f"pyarrow and set {_ARROW} to {_ARROW_LEVEL} or unset it, or set {SETTING}={NATIVE}"
-        )
+        why = "pyarrow was imported before truesky"
+        if os.environ.get(_ARROW, _ARROW_LEVEL) != _ARROW_LEVEL:
+            why, remedy = f"{_ARROW} is {os.environ[_ARROW]!r}", f"unset it, or set {SETTING}={NATIVE}"
+        raise BadInput(f"Arrow uses AVX-512, so results could differ between machines: {why}; {remedy}")
+    if numba_target()[1].startswith("features:") and not os.environ.get(_NUMBA_FEATURES):
+        why = "numba compiles for all instructions of this CPU, because it was used before truesky was imported"
+        raise BadInput(f"{why}, so results would differ between machines; {remedy}")
     if kind().startswith(LEVEL):
         return None
-    names = (_NUMPY_DISABLE, _NUMPY_ENABLE, _ARROW, _NUMBA_CPU, _NUMBA_FEATURES)
+    names = (_NUMPY_DISABLE, _NUMPY_ENABLE, _ARROW, _NUMBA_CPU, _NUMBA_FEATURES, _NUMBA_SVML, *_NUMBA_OTHERS)
     changed = {name: os.environ[name] for name in names if os.environ.get(name) not in (None, _DEFAULTS.get(name))}
-    given = ", ".join(f"{name}={value!r}" for name, value in changed.items()) or "numba was imported before truesky"
-    return f"last bits may differ between machines: this process computes as {kind()} ({given})"
+    given = ", ".join(f"{name}={value!r}" for name, value in changed.items())
+    line = f"last bits may differ between machines: this process computes as {kind()}"
+    return f"{line} ({given})" if given else line
+
+
+@cache
+def require_limit() -> None:
+    """Raise BadInput, as `check` does, if this process must not compute published bytes; looks once per process."""
+    check()
 
 
 def _is_x86() -> bool:
     return platform.machine().lower() in ("x86_64", "amd64")
+
+
+def _linux_says_level() -> bool:
+    """Return True if Linux lists all features of x86-64-v3 for this CPU; quick, needs no other package."""
+    if not _is_x86():
+        return False
+    try:
+        with _CPUINFO.open() as lines:
+            flags = next((line for line in lines if line.startswith("flags")), "")
+    except OSError:
+        return False
+    return set(flags.split()) >= _FLAGS
 
 
 @cache

@@ -350,7 +350,7 @@ def accuracy_page(into: Path) -> str:
 
 
 def api_page() -> str:
-    lines = ["# Reading a lake from Python", ""]
+    lines = ["# Python interface", ""]
     for module in API:
         lines += [f"## {module}", "", "```{eval-rst}", f".. automodule:: {module}", "```", ""]
     return "\n".join(lines)

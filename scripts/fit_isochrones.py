@@ -18,6 +18,8 @@ import numpy as np
 import pyarrow.csv
 import pyarrow.parquet
 
+import lake_schema  # noqa: F401  (limits numpy, which is imported below)
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from lake_schema.arrays import Float

@@ -16,6 +16,8 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
+import lake_schema  # noqa: F401  (limits numpy, which is imported below)
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from lake_schema.arrays import Float

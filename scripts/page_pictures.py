@@ -1,6 +1,6 @@
 """Pictures of the page over the lake of `make demo`, for the documentation: python -m scripts.page_pictures FOLDER.
 
-They are taken in a chromium of the system's, driven by playwright (extra `browser`); without these there are none.
+They are taken in a chromium of the system's, driven by playwright (extra `test`); without these there are none.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ on_avx2 = pytest.mark.skipif(
 
 def environment(setting):
     """This process's variables with others of the instruction set."""
-    chosen = ("TRUESKY_CPU", "NPY_", "NUMBA_CPU", "ARROW_USER")
+    chosen = ("TRUESKY_CPU", "NPY_", "NUMBA_CPU", "NUMBA_DISABLE", "ARROW_USER")
     return {**{name: value for name, value in os.environ.items() if not name.startswith(chosen)}, **setting}
 
 

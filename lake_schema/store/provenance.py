@@ -53,7 +53,7 @@ def file_sha256(path: Folder) -> str:
 
 
 def code_version(root: Path = _ROOT) -> str:
-    """Fingerprint of the code: every source and data file of lake_schema and jobs, and the libraries' versions."""
+    """Fingerprint of the code: every source and data file of lake_schema and truesky, and the libraries' versions."""
     files = sorted(
         path
         for package in _PACKAGES

@@ -18,7 +18,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from lake_schema import sky
+from lake_schema import instruction_set, sky
 from lake_schema.columns import Table
 from lake_schema.errors import BadInput, LakeError, Superseded
 from lake_schema.ids import BLOCK_BITS, kind_of
@@ -46,6 +46,7 @@ def attempt(root: Path, key: str, table: Table, facts: Json, work: Work, part: P
     if is_done(stage, part):
         return receipt_of(stage, part.name) or {}
     try:
+        instruction_set.require_limit()
         output = work(root, {**facts, **part.facts})
         if is_done(stage, part):
             # Another copy of this task was faster.

@@ -72,7 +72,7 @@ OF_LAKE = {
 }
 OF_REQUEST = {
     **{name: (lambda path, new, name=name: run(name, new, path)) for name in JOBS},
-    "request check": lambda path, new: check.main(["check", path]),
+    "request check": lambda path, new: check.main([path]),
     "demo": lambda path, new: demo.main(["--request", path, "--out", new]),
     "run": lambda path, new: whole.main([path, "--lake", new], pytest.fail),
     "mission diff": lambda path, new: lake_schema.main(["mission", "diff", path, ",".join(LADDER)]),

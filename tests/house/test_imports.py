@@ -102,7 +102,7 @@ def test_contracts():
 
 
 def test_every_module_has_its_layer():
-    """A module that is new is refused until pyproject.toml says what it may import; each package of jobs has layers."""
+    """A new module is refused until pyproject.toml says what it may import; each package of truesky has layers."""
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
     within = {one["containers"][0]: one for one in contracts if "containers" in one}
     packages = {f"truesky.{path.parent.name}" for path in (ROOT / "truesky").glob("*/__init__.py")}

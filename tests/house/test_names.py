@@ -15,7 +15,8 @@ FOLDERS = ("lake_schema", "truesky", "benchmarks", "scripts")
 MODULES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py") if path.stem[:2] != "__")
 ELSEWHERE = re.compile(r"(?<![\w.~])/(?:home|root|Users|work)/\w|\.\./shared|\bissues? #?\d", re.IGNORECASE)
 # A file or folder of the tree, and a module by its file's name alone.
-NAMED = re.compile(r"(?<![\w./])(?:benchmarks|docs|jobs|lake_schema|notebooks|requests|scripts|tests)/[\w/.-]*\w")
+TOP = "benchmarks|deploy|docs|jobs|lake_schema|notebooks|requests|scripts|tests|truesky"
+NAMED = re.compile(rf"(?<![\w./])(?:{TOP})/[\w/.-]*\w")
 MODULE = re.compile(r"(?<![\w/.-])[a-z_0-9]+\.py\b")
 MAX_BYTES = 1_000_000
 

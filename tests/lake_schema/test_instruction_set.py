@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 
 from lake_schema import instruction_set
-from lake_schema.errors import BadInput
+from lake_schema.errors import BadInput, PartsFailed
+from lake_schema.store import publish, read
 from lake_schema.store.provenance import machine
+from tests.universe import plain_plan, plain_work
 
-NAMES = ("TRUESKY_CPU", "NPY_", "NUMBA_CPU", "ARROW_USER")
+NAMES = ("TRUESKY_CPU", "NPY_", "NUMBA_CPU", "NUMBA_DISABLE", "NUMBA_OPT", "ARROW_USER", "OPENBLAS_CORE")
 on_x86 = pytest.mark.skipif(platform.machine() != "x86_64", reason="limits the instructions of x86-64 CPUs")
+LIMITED = {"NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR", "ARROW_USER_SIMD_LEVEL": "AVX2"}
 KIND = "from lake_schema import instruction_set as i; print(i.kind()); print(i.check())"
 
 
@@ -74,6 +77,9 @@ def test_native_uses_and_records_all_instructions():
         ("NPY_DISABLE_CPU_FEATURES", "X86_V3 X86_V4", "numpy()"),
         ("ARROW_USER_SIMD_LEVEL", "SSE4_2", "arrow(sse4_2)"),
         ("NPY_ENABLE_CPU_FEATURES", "X86_V2", "numpy()"),
+        ("NUMBA_OPT", "0", "NUMBA_OPT=0"),
+        ("NUMBA_DISABLE_JIT", "1", "NUMBA_DISABLE_JIT=1"),
+        ("NUMBA_DISABLE_INTEL_SVML", "0", "NUMBA_DISABLE_INTEL_SVML=0"),
     ],
 )
 def test_another_choice_of_the_user_is_respected_and_reported(name, value, word):
@@ -94,7 +100,9 @@ def test_a_limit_without_effect_is_refused(monkeypatch, above):
     monkeypatch.setattr(instruction_set, "_has_level", lambda: True)
     monkeypatch.setattr(instruction_set, "_numpy_in_use", lambda: above)
     monkeypatch.delenv("TRUESKY_CPU", raising=False)
-    with pytest.raises(BadInput, match=r"numpy uses \S*(X86_V4|AVX512_SKX)\S*, .*import truesky first .*native$"):
+    with pytest.raises(
+        BadInput, match=r"numpy uses \S*(X86_V4|AVX512_SKX)\S*, .*import truesky first, or set TRUESKY_CPU=native$"
+    ):
         instruction_set.check()
     monkeypatch.setenv("TRUESKY_CPU", "native")
     assert instruction_set.check() is None
@@ -105,7 +113,9 @@ def test_arrow_without_the_limit_is_refused(monkeypatch):
     monkeypatch.setattr(instruction_set, "_numpy_in_use", lambda: ("X86_V3",))
     monkeypatch.setattr(instruction_set, "_arrow_in_use", lambda: "avx512")
     monkeypatch.delenv("TRUESKY_CPU", raising=False)
-    with pytest.raises(BadInput, match=r"Arrow uses AVX-512, .*ARROW_USER_SIMD_LEVEL"):
+    with pytest.raises(
+        BadInput, match=r"Arrow uses AVX-512, .*pyarrow was imported before truesky; import truesky first"
+    ):
         instruction_set.check()
 
 
@@ -114,6 +124,42 @@ def test_numpy_imported_first_is_refused_on_a_cpu_with_more():
     native = told(KIND, TRUESKY_CPU="native")[0]
     line = told("import numpy; from lake_schema import instruction_set as i; print(i.check())")[-1]
     assert ("numpy was imported before truesky" in line) == ("X86_V4" in native)
+
+
+@on_x86
+@pytest.mark.parametrize("before", ["import numba; numba.njit(lambda x: x)(1)", "import numba"])
+def test_numba_that_was_used_first_is_refused(before):
+    """numba that was only imported first is limited still; so is numba that is imported after truesky."""
+    if not has_level():
+        pytest.skip("this CPU has no AVX2")
+    code = f"import os; os.environ.update({LIMITED!r}); {before}\n"
+    line = told(code + "import truesky; from lake_schema import instruction_set as i; print(i.check())")[-1]
+    if before.endswith("(1)"):
+        assert "numba compiles for all instructions of this CPU, because it was used before truesky" in line
+    else:
+        assert line == "None"
+    after = "import truesky, numba; numba.njit(lambda x: x)(1); " + KIND
+    assert told(after) == [" ".join(("x86-64-v3", *platform.libc_ver())), "None"]
+
+
+def test_an_empty_setting_is_the_default(monkeypatch):
+    monkeypatch.setenv("TRUESKY_CPU", "")
+    assert instruction_set.is_portable()
+    instruction_set.check()
+
+
+def test_a_worker_without_the_limit_makes_nothing(lake, monkeypatch):
+    """A Spark session of the user's own may have workers that imported numpy before any module of ours."""
+    instruction_set.require_limit.cache_clear()
+    monkeypatch.setattr(instruction_set, "_has_level", lambda: True)
+    monkeypatch.setattr(instruction_set, "_numpy_in_use", lambda: ("X86_V3", "X86_V4"))
+    monkeypatch.delenv("TRUESKY_CPU", raising=False)
+    try:
+        with pytest.raises(PartsFailed, match="numpy uses X86_V4"):
+            publish.make(lake, plain_plan(1), plain_work)
+    finally:
+        instruction_set.require_limit.cache_clear()
+    assert read.tables(lake) == []
 
 
 def test_an_unknown_setting_is_refused(monkeypatch):

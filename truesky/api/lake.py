@@ -93,15 +93,15 @@ class Lake:
         """
         return self._explorer.describe(table)
 
-    def table(self, name: str, columns: Sequence[str] | None = None, into: str = "arrow") -> Any:
+    def table(self, name: str, columns: str | Sequence[str] | None = None, into: str = "arrow") -> Any:
         """Read a table.
 
         Parameters
         ----------
         name : str
             Name of the table.
-        columns : sequence of str, optional
-            Names of the columns to read. The default is all of them.
+        columns : str or sequence of str, optional
+            Names of the columns to read. The default is all columns.
         into : {"arrow", "pandas", "astropy"}, optional
             Kind of the result. An astropy table has units.
 
@@ -111,7 +111,7 @@ class Lake:
         """
         from truesky.explore import results
 
-        return results.converted(self._explorer._version(name).rows(columns), into)
+        return results.converted(self._explorer._version(name).rows(_names(columns)), into)
 
     def sql(self, query: str, /, into: str = "pandas", **parameters: object) -> Any:
         """Run one SELECT over the tables of the lake.
@@ -145,7 +145,7 @@ class Lake:
         ra: float,
         dec: float,
         radius: float,
-        columns: Sequence[str] | None = None,
+        columns: str | Sequence[str] | None = None,
         on: str = "observed",
         into: str = "arrow",
     ) -> Any:
@@ -159,8 +159,8 @@ class Lake:
             Centre of the circle, ICRS, in degrees.
         radius : float
             Radius of the circle in degrees.
-        columns : sequence of str, optional
-            Names of the columns to read. The default is all of them.
+        columns : str or sequence of str, optional
+            Names of the columns to read. The default is all columns.
         on : {"observed", "true"}, optional
             Select by observed positions, or by the true ones without gravitational lensing.
         into : {"arrow", "pandas", "astropy"}, optional
@@ -170,7 +170,7 @@ class Lake:
         -------
         pyarrow.Table, pandas.DataFrame or astropy.table.Table
         """
-        return self._explorer.cone(table, ra, dec, radius, columns, on, into)
+        return self._explorer.cone(table, ra, dec, radius, _names(columns), on, into)
 
     # ------------------------------------------------------------------------------------------------ images
 
@@ -248,3 +248,7 @@ class Lake:
             )
         query = "SELECT * FROM rendered_truth WHERE exposure_id = $exposure AND detector = $detector"
         return self.sql(query, exposure=int(exposure_id), detector=str(detector))
+
+
+def _names(columns: str | Sequence[str] | None) -> Sequence[str] | None:
+    return [columns] if isinstance(columns, str) else columns

@@ -9,14 +9,13 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from lake_schema import user_files
+from lake_schema import instruction_set, user_files
 from lake_schema.errors import BadInput
 from lake_schema.store import layout
 from truesky.api.lake import Lake
 from truesky.commands import check as check_command
 from truesky.commands import run as run_command
 from truesky.commands import space, submit
-from truesky.render import plan_exposures
 from truesky.request import universe
 from truesky.request.from_toml import from_table, parse
 from truesky.request.schema import Request
@@ -59,15 +58,15 @@ def check(request: str | Path | Mapping[str, Any]) -> Request:
 def run(
     request: str | Path | Mapping[str, Any],
     lake: str | Path,
-    detectors: Sequence[str] = (),
+    detectors: str | Sequence[str] = (),
     limit: int | None = None,
     lenses: bool = False,
     gaia: bool = False,
 ) -> Lake:
     """Compute everything that a request asks for: catalogues, fluxes, the plan of the exposures, images.
 
-    The jobs share one Spark session in this process. Tables that the lake already has are kept, so a second call
-    continues where an interrupted one ended.
+    The jobs share one Spark session: the active one of this process, else a local session. Tables that the lake
+    already has are kept, so a second call continues where an interrupted one ended.
 
     Parameters
     ----------
@@ -75,7 +74,7 @@ def run(
         A TOML file, or the same keys as a dictionary.
     lake : str or Path
         Folder of the lake. It is created if it does not exist.
-    detectors : sequence of str, optional
+    detectors : str or sequence of str, optional
         Names of the detectors to render. The default is all planned detectors.
     limit : int, optional
         Largest number of detectors to render.
@@ -97,13 +96,19 @@ def run(
     LakeError
         If a job fails.
     """
-    wanted = replace(check(request), detectors=tuple(detectors), limit=limit)
+    names = (detectors,) if isinstance(detectors, str) else tuple(detectors)
+    wanted = replace(_parsed(request), detectors=names, limit=limit)
+    instruction_set.check()
     root = layout.lake(os.fspath(lake))
     universe.refuse_others(root, wanted)
     stages = run_command.stages(wanted, lenses, gaia)
-    rendered = stages[-1].name == run_command.IMAGES[-1].name
-    space.check(root, wanted, plan_exposures.check(wanted, root) if rendered else None)
-    submit.use_environment()
+    try:
+        plan = run_command.checked_plan(root, wanted, stages)
+    except BadInput as error:
+        raise BadInput(f"{_name(request)}: {error}") from None
+    space.check(root, wanted, plan)
+    if not shell.has_session():
+        submit.use_environment()
     for stage in stages:
         shell.run(import_module(stage.module).JOB, root, stage.request(wanted))
     return Lake(root, request=wanted.name)

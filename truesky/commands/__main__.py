@@ -39,7 +39,7 @@ JOBS = {
 }
 # Command -> the module whose `main` it is, and whether that module wants the command's word, too.
 MODULES = {
-    "check": ("truesky.commands.check", True),
+    "check": ("truesky.commands.check", False),
     "sql": ("truesky.explore.__main__", False),
     "list": ("lake_schema.__main__", True),
     "verify": ("lake_schema.__main__", True),

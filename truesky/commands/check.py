@@ -16,11 +16,11 @@ from truesky.request.schema import Request
 def main(argv: Sequence[str] | None = None) -> int:
     """0 and a line where the request is good, 2 and the key that is not; --plan : it is to be planned alone."""
     arguments = list(sys.argv[1:] if argv is None else argv)
-    alone = arguments[2:] == ["--plan"]
-    if len(arguments) != 2 + alone or arguments[0] != "check":
+    alone = arguments[1:] == ["--plan"]
+    if len(arguments) != 1 + alone or arguments[0].startswith("--"):
         print("usage: truesky check REQUEST [--plan]", file=sys.stderr)
         return 2
-    return command.status("request", lambda: _check(Path(arguments[1]), alone))
+    return command.status("request", lambda: _check(Path(arguments[0]), alone))
 
 
 def _check(path: Path, alone: bool) -> int:

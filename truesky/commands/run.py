@@ -139,12 +139,7 @@ def run(root: Path, file: Path, wanted: Sequence[Stage], request: Request, start
     universe.refuse_others(root, request)
     # Asked before anything is planned, which compiles a little.
     compiled = any(cache.machine_code_dir().glob("kernels_*/*.nbi"))
-    rendered = wanted[-1].name == IMAGES[-1].name
-    plan = None
-    if rendered:
-        plan = plan_exposures.check(request, root)
-    else:
-        plan_exposures.check_catalogues(request)
+    plan = checked_plan(root, request, wanted)
     wanted_gb, free_gb = space.check(root, request, plan)
     count = _foretell(root, request, plan, wanted_gb, free_gb)
     print(f"{_FIRST}\n" if count and not compiled else "", flush=True)
@@ -156,9 +151,23 @@ def run(root: Path, file: Path, wanted: Sequence[Stage], request: Request, start
             return status
         rows.append((stage, time.perf_counter() - started))
     _table(root, request.name, rows, time.perf_counter() - began)
-    if rendered:
+    if plan is not None:
         _show(root, out, request.name)
     return 0
+
+
+def checked_plan(root: Path, request: Request, stages: Sequence[Stage]) -> tuple[pa.Table, pa.Table] | None:
+    """Raise BadInput if any of the stages would refuse the request.
+
+    Returns
+    -------
+    tuple of pyarrow.Table or None
+        The rows of `exposures` and `tasks` if images are rendered.
+    """
+    if stages[-1].name == IMAGES[-1].name:
+        return plan_exposures.check(request, root)
+    plan_exposures.check_catalogues(request)
+    return None
 
 
 def _foretell(

@@ -40,7 +40,7 @@ def code_key(module: str) -> str:
 
 
 def data_files(module: str) -> tuple[Path, ...]:
-    """Tables of numbers that the code of a module and of what it imports names, wherever in `jobs` they lie; sorted.
+    """Tables of numbers that the code of a module and of what it imports names, wherever in `truesky` they lie; sorted.
 
     A file is named by its whole name as a constant, or by the ending alone where it has the module's own name.
     """
@@ -76,7 +76,7 @@ def _content(file: Path) -> bytes:
 
 @lru_cache
 def _data() -> dict[str, Path]:
-    """Every table of `jobs` by its name."""
+    """Every table of `truesky` by its name."""
     return {file.name: file for file in (_ROOT / "truesky").rglob("*") if file.suffix in _ENDINGS}
 
 

@@ -331,6 +331,15 @@ def _spark_map(function: Callable[[Part], Json], parts: Sequence[Part], name: st
     return [r for some in (parts[:half], parts[half:]) for r in _spark_map(function, some, name, verbose)]
 
 
+def has_session() -> bool:
+    """Return True if this process has an active Spark session already."""
+    if "pyspark" not in sys.modules:
+        return False
+    from pyspark.sql import SparkSession
+
+    return SparkSession.getActiveSession() is not None
+
+
 @contextmanager
 def _hushed() -> Iterator[None]:
     """No log lines of libraries: the bridge to Java writes a traceback for every call that is interrupted."""

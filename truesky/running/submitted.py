@@ -5,10 +5,12 @@ The command `truesky` submits this file, since a wheel contains no `jobs/` folde
 
 import sys
 from importlib import import_module
+from pathlib import Path
 
 if __name__ == "__main__":
-    # spark-submit puts the folder of this file first, where its modules could hide others of the same name.
-    del sys.path[0]
+    # Python puts the folder of this file first, where its modules could hide others of the same name.
+    if sys.path[:1] == [str(Path(__file__).resolve().parent)]:
+        del sys.path[0]
     from lake_schema import command
     from truesky.running.shell import main
 

@@ -109,7 +109,7 @@ def test_a_malformed_request_is_refused_by_the_check_and_by_every_job(tmp_path, 
     path, lake = tmp_path / "x.toml", tmp_path / "lake"
     path.write_text(text)
     started = time.process_time()
-    assert check.main(["check", str(path)]) == 2
+    assert check.main([str(path)]) == 2
     assert time.process_time() - started < HANGS
     said = capsys.readouterr().err
     assert words in said
@@ -124,7 +124,7 @@ def test_what_the_malformed_ones_are_made_of_is_good(tmp_path, capsys):
     for number, text in enumerate((GOOD, GOOD + POINT, GOOD + BLOCK)):
         (tmp_path / f"{number}.toml").write_text(text)
         # Their area is smaller than the field of view.
-        assert check.main(["check", str(tmp_path / f"{number}.toml"), "--plan"]) == 0
+        assert check.main([str(tmp_path / f"{number}.toml"), "--plan"]) == 0
     assert capsys.readouterr().out.startswith("x: good: 0 pointings, 0 observations, 1 variants\n")
 
 
@@ -133,7 +133,7 @@ def test_the_check_from_a_shell_imports_nothing_slow(tmp_path):
     path = tmp_path / "x.toml"
     path.write_text(BAD["magnitude 99"][0])
     code = "import sys; from truesky.commands.check import main; print(main(sys.argv[1:]), *sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code, "check", path], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True)
     status, *modules = done.stdout.split()
     assert (status, done.stderr.count("\n")) == ("2", 1)
     assert "universe.galaxy_limit = 99" in done.stderr

@@ -50,7 +50,7 @@ def test_requests_know_the_bands_that_the_planner_knows():
 
 @pytest.mark.parametrize("path", SHIPPED)
 def test_the_check_takes_every_request(path, capsys):
-    assert check.main(["check", str(path)]) == 0
+    assert check.main([str(path)]) == 0
     said = capsys.readouterr()
     assert said.err == ""
     (good,) = said.out.splitlines()
@@ -107,11 +107,11 @@ def stars_by_decam(folder):
 def test_the_command_refuses_in_one_line_and_plans_on_demand(tmp_path, capsys):
     # Beside what can be rendered, too.
     path = requests.written(tmp_path, '[[observation]]\nchannels = ["VIS"]\nfields = 1\n' + stars_by_decam(tmp_path))
-    assert check.main(["check", str(path)]) == 2
+    assert check.main([str(path)]) == 2
     said = capsys.readouterr().err
     text = r"request: .*observation\[1\]\.pointings: no simulator renders EXT standard_star yet: .*\n"
     assert re.fullmatch(text, said)
-    assert check.main(["check", str(path), "--plan"]) == 0
+    assert check.main([str(path), "--plan"]) == 0
     assert "EXT standard_star: planned and forecast, skipped by rendering" in capsys.readouterr().out
 
 
@@ -124,7 +124,7 @@ def test_every_job_says_what_is_only_planned(tmp_path, capsys):
     )
 
 
-@pytest.mark.parametrize("words", [[], ["check"], ["check", "a", "--plans"], ["check", "a", "b"], ["a", "b", "--plan"]])
+@pytest.mark.parametrize("words", [[], ["--plan"], ["a", "--plans"], ["a", "b"], ["a", "b", "--plan"]])
 def test_other_words_show_the_usage(words, capsys):
     assert check.main(words) == 2
     assert capsys.readouterr().err == "usage: truesky check REQUEST [--plan]\n"

@@ -152,7 +152,7 @@ def test_what_the_mistakes_are_made_in_is_good(tmp_path, capsys):
     (tmp_path / "p.csv").write_text("ra,dec\n53.1,-27.8\n")
     for number, text in enumerate((GOOD, OWN, GROUND, TABLE)):
         (tmp_path / f"{number}.toml").write_text(text)
-        assert check.main(["check", str(tmp_path / f"{number}.toml")]) == 0, capsys.readouterr().err
+        assert check.main([str(tmp_path / f"{number}.toml")]) == 0, capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("text", "rows", "words"), CASES.values(), ids=CASES)
@@ -162,7 +162,7 @@ def test_a_mistake_is_refused_in_one_line_and_nothing_is_written(tmp_path, capsy
     (tmp_path / "p.csv").write_text(rows)
     before = sorted(tmp_path.iterdir())
     for call in (
-        lambda: check.main(["check", str(path)]),
+        lambda: check.main([str(path)]),
         lambda: shell.main(plan_exposures.JOB, ["--lake", str(lake), "--request", str(path), "--dry-run"]),
     ):
         assert call() == 2

@@ -278,7 +278,7 @@ def test_a_process_that_breaks_the_promise_makes_nothing(run, lake, monkeypatch,
     monkeypatch.delenv("TRUESKY_CPU", raising=False)
     assert run(plain_work) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("toy_job: numpy uses X86_V4, so the results would differ between machines")
+    assert line.startswith("toy_job: numpy uses X86_V4, so results would differ between machines")
     assert list(lake.iterdir()) == []
 
 
