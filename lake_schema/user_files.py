@@ -40,6 +40,7 @@ LARGEST = {
     "catalogue of stars": 2 * _GB,
     "table of bodies": 4 * _GB,
     "table of sources": 64 * _MB,
+    "table of a camera": 4 * _MB,
     "catalogue": 1 << 42,
     "run log": _GB,
     "master frame": _GB,

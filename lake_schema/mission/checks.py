@@ -3,6 +3,7 @@
 check    raise BadInput with the first fault of a configuration
 faults   all of them, a sentence each
 ramps    those of its ramps
+camera_faults   those of a ground camera
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.detector_overrides import split
-from lake_schema.mission.parameter import CAMERAS, convert, read_all
+from lake_schema.mission.parameter import convert, read_all
 from lake_schema.ramps import MOST_FRAMES, frames
 
 # Quantities of which no chosen value may be worse than what is required, and which way worse is.
@@ -35,9 +36,8 @@ def check(configuration: MissionConfiguration) -> None:
 def faults(configuration: MissionConfiguration) -> Iterator[str]:
     """Sentences, each naming a parameter or model; none where all is well."""
     yield from _worse_than_required(configuration)
-    for camera in CAMERAS:
-        yield from _layout(f"ext.{camera}", configuration)
-        yield from _amplifiers(f"ext.{camera}.amplifiers", configuration)
+    for camera in configuration.ground_cameras:
+        yield from camera_faults(camera, configuration)
     yield from _amplifiers("vis.amplifiers", configuration)
     yield from _pitch("vis", configuration)
     yield from _pitch("nisp", configuration)
@@ -46,6 +46,12 @@ def faults(configuration: MissionConfiguration) -> Iterator[str]:
         if m.key.endswith(".throughput"):
             yield from _throughput(m.key, configuration)
     yield from _quantiles("env.cosmic_rays.vis_tracks", configuration)
+
+
+def camera_faults(camera: str, configuration: MissionConfiguration) -> Iterator[str]:
+    """Detectors of a ground camera that overlap, and amplifiers that cannot be read."""
+    yield from _layout(f"ext.{camera}", configuration)
+    yield from _amplifiers(f"ext.{camera}.amplifiers", configuration)
 
 
 def _worse_than_required(configuration: MissionConfiguration) -> Iterator[str]:

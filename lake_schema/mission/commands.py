@@ -1,4 +1,4 @@
-"""Look into the mission database: python -m lake_schema mission list [PATTERN] | diff A [B].
+"""Look into the mission database: python -m lake_schema mission list [PATTERN] | diff A [B] | camera FOLDER.
 
 A configuration is named by a ladder (CBE,BLT,DES,REQ,SIM), a request file, or LAKE or LAKE@KEY of its table mission.
 """
@@ -9,9 +9,11 @@ import argparse
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
+from pathlib import Path
 
 from lake_schema import command
-from lake_schema.mission import compare, listing
+from lake_schema.mission import camera_template, compare, listing
+from lake_schema.mission.parameter import CAMERAS
 from lake_schema.tables.mission import LADDER
 
 _DEFAULT = ",".join(LADDER)
@@ -21,7 +23,7 @@ _WHAT = "a ladder (CBE,BLT,DES,REQ,SIM), a request file, or LAKE or LAKE@KEY of 
 def main(argv: Sequence[str]) -> int:
     """Exit status: 2 the call is wrong; of diff as of diff: 0 the same, 1 different."""
     parser = argparse.ArgumentParser(prog="python -m lake_schema mission", description="Look into the mission database")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="list|diff")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="list|diff|camera")
     one = commands.add_parser("list", help="names, values, units, bounds, status and source")
     one.add_argument("pattern", nargs="?", default="*", help="of names, as vis.* or *gain*; without * a part of them")
     one.add_argument("--of", default=_DEFAULT, metavar="WHAT", help=f"{_WHAT} (default: {_DEFAULT})")
@@ -29,8 +31,11 @@ def main(argv: Sequence[str]) -> int:
     two = commands.add_parser("diff", help="what differs between two configurations")
     two.add_argument("first", help=_WHAT)
     two.add_argument("second", nargs="?", default=_DEFAULT, help=f"the same (default: {_DEFAULT})")
+    three = commands.add_parser("camera", help="write the folder of a ground camera, to be edited")
+    three.add_argument("folder", type=Path, help="folder that is made; its name is the camera's name")
+    three.add_argument("--like", required=True, choices=CAMERAS, help="camera whose numbers it has at first")
     options = parser.parse_args(argv)
-    body = _listed if options.command == "list" else _compared
+    body = {"list": _listed, "diff": _compared, "camera": _camera_written}[options.command]
     return command.status("lake_schema", lambda: body(options))
 
 
@@ -41,6 +46,12 @@ def _listed(options: argparse.Namespace) -> int:
         return 0
     for line in listing.aligned(entries):
         print(line)
+    return 0
+
+
+def _camera_written(options: argparse.Namespace) -> int:
+    for path in camera_template.write_like(options.like, options.folder):
+        print(path)
     return 0
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from lake_schema import user_files
 from lake_schema.errors import BadInput
+from lake_schema.mission import camera_folder
 from lake_schema.mission.configuration import MissionConfiguration, difference, resolve
 from lake_schema.mission.parameter import STATUSES
 from lake_schema.mission.published import read_back
@@ -55,6 +56,8 @@ def _of_request(path: Path) -> MissionConfiguration:
         overrides = {
             key: (float(value["value"]), str(value["unit"])) for key, value in section.get("overrides", {}).items()
         }
-        return resolve(ladder=tuple(section.get("ladder", LADDER)), overrides=overrides)
+        folders = [user_files.expanded(str(name), path.parent) for name in section.get("cameras", ())]
+        cameras = [camera_folder.read(folder) for folder in folders]
+        return resolve(ladder=tuple(section.get("ladder", LADDER)), overrides=overrides, cameras=cameras)
     except (AttributeError, TypeError, KeyError, ValueError, OverflowError) as error:
         raise BadInput(f"request {user_files.shown(path)}: {' '.join(str(error).split())[:300]}") from None

@@ -22,6 +22,7 @@ from typing import TypeVar
 
 from lake_schema.errors import BadInput, OutOfRange
 from lake_schema.mission import detector_overrides, model
+from lake_schema.mission.camera_folder import Camera
 from lake_schema.mission.detector_overrides import Place
 from lake_schema.mission.model import Model, read_models
 from lake_schema.mission.parameter import STATUSES, Parameter, convert, read_all
@@ -38,6 +39,8 @@ class MissionConfiguration:
 
     overridden : names whose value a request replaced
     folder     : where the files of its models lie, if they are not the package's
+    contents   : (sha256, bytes) of models that are neither there nor in the package: those of a user's cameras
+    ground_cameras : names of the cameras with a layout
     """
 
     parameters: tuple[Parameter, ...]
@@ -45,6 +48,8 @@ class MissionConfiguration:
     overridden: tuple[str, ...] = ()
     models: tuple[Model, ...] = ()
     folder: Path | None = None
+    contents: tuple[tuple[str, bytes], ...] = field(default=(), repr=False, compare=False)
+    ground_cameras: tuple[str, ...] = field(init=False, repr=False, compare=False)
     _index: dict[str, Parameter] = field(init=False, repr=False, compare=False)
     _files: dict[str, Model] = field(init=False, repr=False, compare=False)
     _placed: dict[str, tuple[Place, ...]] = field(init=False, repr=False, compare=False)
@@ -53,6 +58,8 @@ class MissionConfiguration:
     def __post_init__(self) -> None:
         object.__setattr__(self, "_index", {p.key: p for p in self.parameters})
         object.__setattr__(self, "_files", {m.key: m for m in self.models})
+        layouts = [m.key.split(".") for m in self.models if m.key.startswith("ext.") and m.key.endswith(".layout")]
+        object.__setattr__(self, "ground_cameras", tuple(sorted(parts[1] for parts in layouts)))
         placed: dict[str, tuple[Place, ...]] = {}
         for name in self.overridden:
             key, place = detector_overrides.split(name, self._index)
@@ -104,11 +111,16 @@ class MissionConfiguration:
 
     def numbers(self, key: str) -> tuple[tuple[float, ...], ...]:
         """A model that is a table of numbers: its rows."""
-        return model.numbers(model.content(self.model(key), self.folder))
+        return model.numbers(self.content(self.model(key)))
 
     def rows(self, key: str) -> tuple[Mapping[str, str], ...]:
         """A model that is a table of texts: its rows by column name."""
-        return model.rows(model.content(self.model(key), self.folder))
+        return model.rows(self.content(self.model(key)))
+
+    def content(self, record: Model) -> bytes:
+        """Bytes of a model's file; Damaged if they are not those that the record names."""
+        given = dict(self.contents)
+        return given[record.sha256] if record.sha256 in given else model.content(record, self.folder)
 
     def overridden_with(self, overrides: Mapping[str, tuple[float, str]]) -> MissionConfiguration:
         """The same with other values of some names; BadInput / OutOfRange name the parameter."""
@@ -135,6 +147,7 @@ def resolve(
     overrides: Mapping[str, tuple[float, str]] | None = None,
     mjd: float | None = None,
     models: Iterable[Model] | None = None,
+    cameras: Iterable[Camera] = (),
 ) -> MissionConfiguration:
     """Choose one value a name.
 
@@ -143,6 +156,7 @@ def resolve(
     overrides : name -> (value, unit), replaces what the ladder would choose
     mjd       : date at which the records must hold; None = the latest
     models    : in any order; None = the package's where the records are, else none
+    cameras   : a user's own, beside those of the records
     returns   : configuration.  Errors: BadInput / OutOfRange name the parameter
     """
     unknown = [status for status in ladder if status not in STATUSES]
@@ -150,13 +164,18 @@ def resolve(
         raise BadInput(f"mission ladder {list(ladder)} must name some of {', '.join(STATUSES)}, each once")
     if models is None:
         models = read_models() if records is None else ()
-    parameters = _grouped(read_all() if records is None else records)
+    cameras = tuple(cameras)
+    own = [parameter for camera in cameras for parameter in camera.parameters]
+    parameters = _grouped([*(read_all() if records is None else records), *own])
     for key, group in parameters.items():
         for record in group[1:]:
             # Records of one quantity may differ in unit, never in kind.
             convert(1.0, record.unit, group[0].unit, f"mission parameter {key} ({record.status})")
     chosen = {key: _choose(key, group, ladder, mjd) for key, group in parameters.items()}
-    files_ = {key: _choose(key, group, ladder, mjd) for key, group in _grouped(models).items()}
+    files_ = {
+        key: _choose(key, group, ladder, mjd)
+        for key, group in _grouped([*models, *(m for c in cameras for m in c.models)]).items()
+    }
     if twice := sorted(set(chosen) & set(files_)):
         raise BadInput(f"mission parameter {twice[0]} is a value and a model")
     for parameter in chosen.values():
@@ -165,6 +184,7 @@ def resolve(
         tuple(chosen[key] for key in sorted(chosen)),
         tuple(ladder),
         models=tuple(files_[key] for key in sorted(files_)),
+        contents=tuple(item for camera in cameras for item in camera.contents),
     )
     return found.overridden_with(overrides) if overrides else found
 

@@ -28,7 +28,10 @@ STATUSES = tuple(code for code, _ in table.STATUSES)
 # What a value rests on: read in its source, quoted without the source at hand, computed from published
 # values, chosen here.
 CONFIDENCES = tuple(code for code, _ in table.CONFIDENCES)
+# Ground cameras that truesky knows; a user's folder may add others.
 CAMERAS = ("decam", "lsstcam", "megacam", "jpcam", "gpc1", "hsc")
+# All other cameras are on the ground.
+SPACE_CAMERAS = ("vis", "nisp")
 SECTIONS = ("environment", "spacecraft", "vis", "nisp", *(f"ext_{camera}" for camera in CAMERAS), "survey")
 _COLUMNS = ("key", "status", "value", "unit", "version", "valid_from", "confidence", "source")
 

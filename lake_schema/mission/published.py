@@ -14,7 +14,6 @@ import numpy as np
 import pyarrow as pa
 
 from lake_schema.errors import Damaged
-from lake_schema.mission import model
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.model import Model, read_models
 from lake_schema.mission.parameter import Parameter, read_all
@@ -29,7 +28,7 @@ _FOLDER = "models"
 
 def output(configuration: MissionConfiguration) -> Output:
     """Every record of the database, which of them are chosen, the overridden ones in rows of their own; the files."""
-    contents = {m.sha256: model.content(m, configuration.folder) for m in configuration.models}
+    contents = {m.sha256: configuration.content(m) for m in configuration.models}
     return Output(
         table(configuration),
         {f"{_FOLDER}/{sha256}": partial(_write, data) for sha256, data in contents.items()},

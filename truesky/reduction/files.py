@@ -23,7 +23,7 @@ from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 from lake_schema.fits import external
 from lake_schema.fits.images import Card, Image, read_images, write_images
-from lake_schema.mission.parameter import CAMERAS
+from lake_schema.mission.parameter import SPACE_CAMERAS
 from truesky.reduction import calibration
 from truesky.reduction.calibration import FLAGS, Reduced
 from truesky.reduction.combining import Combined
@@ -90,7 +90,7 @@ def master_name(folder: Path, frame: Frame, kind: str) -> Path:
         more = {"dark": "-".join(map(str, frame.ramp)) if kind == "dark" else "", "flat": exposure.band}.get(kind)
         channel = "NISP" if kind == "linearity" else exposure.channel
         return folder / "_".join(filter(None, (channel, more, frame.detector, f"{kind}.fits")))
-    if exposure.camera not in CAMERAS:
+    if exposure.camera in SPACE_CAMERAS:
         return folder / f"{exposure.channel}_{frame.detector}_{kind}.fits"
     band = f"_{exposure.band}" if kind == "flat" else ""
     return folder / f"{exposure.camera}{band}_{frame.detector}_{kind}.fits"

@@ -30,9 +30,12 @@ def check_sources(request: Request) -> None:
 
 
 def check_bands(request: Request) -> None:
-    """Of its own bands a request can point VIS in: of no other camera are zero point, sky and seeing known there."""
+    """Refuse a user's passband for a camera that has no zero point, sky and seeing in it: any but VIS and its own."""
     own = {name for name, _ in request.curves.passbands}
+    of_cameras = {(camera.name, curve.band) for camera in request.mission.cameras for curve in camera.curves}
     for i, pointing in enumerate(request.pointings):
+        if (pointing.camera, pointing.band) in of_cameras:
+            continue
         if pointing.band in own and pointing.channel != "VIS":
             what = f"{pointing.band} is your own passband, in which camera {pointing.camera} has no zero point and sky"
             raise BadInput(f"pointing[{i}].band: {what}: only VIS can be pointed in it")
@@ -43,14 +46,17 @@ def check_bands(request: Request) -> None:
 
 def check_mission(request: Request) -> MissionConfiguration:
     """The mission that a request chooses: overrides and explored values must be of its names, units and ranges."""
-    from lake_schema.mission.checks import ramps
+    from lake_schema.mission.checks import camera_faults, ramps
     from lake_schema.mission.configuration import resolve
 
     own = {key: (override.value, override.unit) for key, override in request.mission.overrides}
     try:
-        mission = resolve(ladder=request.mission.ladder, overrides=own)
+        mission = resolve(ladder=request.mission.ladder, overrides=own, cameras=request.mission.cameras)
     except BadInput as error:
         raise BadInput(f"mission: {error}") from None
+    for i, camera in enumerate(request.mission.cameras):
+        for fault in camera_faults(camera.name, mission):
+            raise BadInput(f"mission.cameras[{i}]: {fault}")
     for fault in ramps(mission):
         raise BadInput(f"mission: {fault}")
     for key, values in request.explore:

@@ -4,18 +4,22 @@ UserCurves, curves  spectra, filters and extinction laws: the section `fluxes`
 Ingest, ingest      catalogues, halos, a map of dust: the section `ingest`
 psfs                point-spread functions: the section `psf`
 GivenSources, sources   tables of all sources that there are: the section `sources`
+cameras             a user's own cameras: the key `mission.cameras`
 file_of             a file beside the request
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from lake_schema import user_files
 from lake_schema.errors import BadInput
+from lake_schema.mission import camera_folder
+from lake_schema.mission.camera_folder import Camera
 from lake_schema.store import layout
 from lake_schema.store.provenance import file_sha256
 from truesky.request.toml_values import Toml, boolean, number, shown, string, strings, table_of
@@ -109,6 +113,72 @@ def _csv(file: Path, key: str) -> Path:
 def file_of(folder: Path, name: str) -> Path:
     """A file by its name, found from the request's folder."""
     return user_files.expanded(name, folder)
+
+
+def cameras(names: Sequence[str], folder: Path) -> tuple[Camera, ...]:
+    """Read the folders of a user's own cameras.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Folders, as the request names them.
+    folder : Path
+        Folder from which they are found.
+
+    Returns
+    -------
+    tuple of Camera
+        The cameras, in the order of `names`.
+
+    Raises
+    ------
+    BadInput
+        If a folder is not a valid camera, or two have one name. The message names the file and the line.
+    """
+    found = []
+    for i, name in enumerate(names):
+        try:
+            found.append(camera_folder.read(file_of(folder, name)))
+        except BadInput as error:
+            raise BadInput(f"mission.cameras[{i}]: {error}") from None
+        if found[-1].name in [camera.name for camera in found[:-1]]:
+            raise BadInput(f"mission.cameras[{i}]: there are two cameras of the name {found[-1].name}")
+    return tuple(found)
+
+
+# By the ending of a file: a key of truesky/fluxes/libraries/spectrum_formats.toml.
+_CURVE_FORMATS = {".ecsv": "passband_ecsv", ".xml": "passband_svo", ".vot": "passband_svo"}
+
+
+def with_cameras(given: UserCurves, own: Sequence[Camera], bands: Collection[str]) -> UserCurves:
+    """Add the passbands of a user's cameras that a request observes in.
+
+    Parameters
+    ----------
+    given : UserCurves
+        The section `fluxes` of the request.
+    own : sequence of Camera
+        The user's cameras.
+    bands : collection of str
+        Bands that the request names.
+
+    Returns
+    -------
+    UserCurves
+        The same with these passbands.
+
+    Raises
+    ------
+    BadInput
+        If two passbands have one name.
+    """
+    found = dict(given.passbands)
+    for curve in (curve for camera in own for curve in camera.curves if curve.band in bands):
+        form = _CURVE_FORMATS.get(curve.file.suffix.lower(), "passband_ascii")
+        if curve.band in found:
+            raise BadInput(f"mission.cameras: passband {curve.band} is given twice: choose another name")
+        found[curve.band] = Curves((curve.file,), form, curve.medium)
+    return replace(given, passbands=tuple(found.items()))
 
 
 def curves(table: Toml, folder: Path) -> UserCurves:

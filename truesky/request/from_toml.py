@@ -24,6 +24,7 @@
                    stamps = {file, nearest, least_radius}   your own galaxies (truesky/render/sources/galaxy_stamps.py)
     [strong_lenses]  boost   how many times denser than in nature they are drawn
     [mission]      ladder = ["CBE", ..]   overrides = {"vis.read_noise" = {value = 5.0, unit = "electron"}}
+                   cameras = ["my_camera/"]   your own ground cameras (lake_schema/mission/camera_folder.py)
                    of one detector "vis.dark_current@3-4", amplifier "vis.gain.E", or both "vis.gain@3-4.E"
     [fluxes]       bands = [..]           default: the bands of the pointings and observations
                    intergalactic = true   galaxies are seen through the hydrogen between them
@@ -127,6 +128,10 @@ __all__ = ["Area", "Override", "Request", "parse"]
 _MOST_VARIANTS = 10_000
 _LARGEST_SEED = 2**63 - 1
 _ALL = "all"
+_SECTIONS = (
+    "area", "universe", "stars", "ingest", "sources", "strong_lenses", "structure", "mission", "fluxes",
+    "psf", "solar_system", "effects", "explore", "products",
+)  # fmt: skip
 # A request's tables are a schema of its name in SQL (truesky/explore), where these have a meaning of their own.
 _TAKEN = ("information_schema", "main", "memory", "pg_catalog", "system", "temp")
 
@@ -155,28 +160,13 @@ def _name(table: Toml) -> str:
 
 def from_table(table: Toml, folder: Path = Path()) -> Request:
     """A parsed TOML table -> Request; files are found from `folder`.  BadInput names the key."""
-    sections = {
-        "area",
-        "universe",
-        "stars",
-        "ingest",
-        "sources",
-        "strong_lenses",
-        "structure",
-        "mission",
-        "fluxes",
-        "psf",
-        "solar_system",
-        "effects",
-        "explore",
-        "products",
-    }
-    _known(table, "", {"name", "seed", "noise_seed", "accuracy", "pointing", "observation", *sections})
+    _known(table, "", {"name", "seed", "noise_seed", "accuracy", "pointing", "observation", *_SECTIONS})
     asked, blocks = observations.pointings(table), observations.observations(table, folder)
     fluxes = _section(table, "fluxes", {"bands", "intergalactic", "passbands", "templates", "stars", "extinction"})
-    curves = files.curves(fluxes, folder)
     bands = _strings(fluxes, "fluxes.bands")
-    mission = _mission(_section(table, "mission", {"ladder", "overrides"}))
+    mission = _mission(_section(table, "mission", {"ladder", "overrides", "cameras"}), folder)
+    named = {*bands, *(pointing.band for pointing in asked), *(b for o in blocks if o.table for b in o.table.bands)}
+    curves = files.with_cameras(files.curves(fluxes, folder), mission.cameras, named)
     products_ = _section(table, "products", {"truth", "compression", "wcs", "files", "readout"})
     solar_system = _section(table, "solar_system", {"bodies"})
     bodies = files.file_of(folder, _string(solar_system, "solar_system.bodies")) if solar_system else None
@@ -280,10 +270,11 @@ def _stars(table: Toml, folder: Path, star_limit: float) -> Stars:
     )
 
 
-def _mission(table: Toml) -> MissionChoice:
+def _mission(table: Toml, folder: Path) -> MissionChoice:
     ladder = _strings(table, "mission.ladder", STATUSES) or LADDER
     overrides = _table(table.get("overrides", {}), "mission.overrides", None)
-    return MissionChoice(ladder, tuple(sorted((key, _override(value, key)) for key, value in overrides.items())))
+    chosen = tuple(sorted((key, _override(value, key)) for key, value in overrides.items()))
+    return MissionChoice(ladder, chosen, files.cameras(_strings(table, "mission.cameras"), folder))
 
 
 def _override(value: object, key: str) -> Override:

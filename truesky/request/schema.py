@@ -9,6 +9,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+from lake_schema.mission.camera_folder import Camera
 from lake_schema.tables import mission as database
 from lake_schema.tables import products
 from truesky.request.accuracy import Accuracy
@@ -117,10 +118,11 @@ class Override:
 
 @dataclass(frozen=True, slots=True)
 class MissionChoice:
-    """Which statuses of the mission's parameters are preferred, and what is overridden."""
+    """Which statuses of the mission's parameters are preferred, what is overridden, and the user's own cameras."""
 
     ladder: tuple[str, ...] = LADDER
     overrides: tuple[tuple[str, Override], ...] = ()
+    cameras: tuple[Camera, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,6 +181,8 @@ class Request:
     def facts(self, *parts: str) -> dict[str, Any]:
         """The named parts of the request as JSON values, for the key of what depends on them."""
         everything = asdict(self)
+        # Not where a camera's folder lies, but what it holds.
+        everything["mission"]["cameras"] = {camera.name: camera.sha256 for camera in self.mission.cameras}
         return {part: everything[part] for part in parts}
 
     def variants(self) -> Iterator[dict[str, Any]]:

@@ -9,14 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from lake_schema.mission.configuration import MissionConfiguration
-from lake_schema.mission.parameter import CAMERAS
+from lake_schema.mission.parameter import SPACE_CAMERAS
 
 
 def of_ground(camera: str, mission: MissionConfiguration) -> tuple[str, ...]:
     """Names of a ground camera's passbands; () of any other camera."""
     prefix = f"ext.{camera}."
     keys = (p.key for p in mission.parameters if p.key.startswith(prefix) and p.key.endswith(".zero_point"))
-    return tuple(key.removeprefix(prefix).partition(".")[0] for key in keys) if camera in CAMERAS else ()
+    return () if camera in SPACE_CAMERAS else tuple(key.removeprefix(prefix).partition(".")[0] for key in keys)
 
 
 def of_one(only: str, *bands: str) -> Callable[[str, MissionConfiguration], tuple[str, ...]]:

@@ -13,7 +13,6 @@ import numpy as np
 from lake_schema.errors import BadInput
 from lake_schema.mission import detector_overrides
 from lake_schema.mission.configuration import MissionConfiguration
-from lake_schema.mission.parameter import CAMERAS
 from truesky.render.camera import distortion
 
 # VIS CCDs of the right half of the focal plane are mounted upside down (Euclid Data Product Description
@@ -93,9 +92,9 @@ def _of_camera(camera: str, mission: MissionConfiguration) -> tuple[Detector, ..
         return _of_grid("vis", lambda row, column: column >= _VIS_FIRST_ROTATED_COLUMN, mission)
     if camera == "nisp":
         return _of_grid("nisp", lambda row, column: row >= _NISP_FIRST_ROTATED_ROW, mission)
-    if camera in CAMERAS:
+    if camera in mission.ground_cameras:
         return _listed(f"ext.{camera}", mission)
-    raise BadInput(f"camera {camera!r} is not one of vis, nisp, {', '.join(CAMERAS)}")
+    raise BadInput(f"camera {camera!r} is not one of vis, nisp, {', '.join(mission.ground_cameras)}")
 
 
 def detector(camera: str, name: str, mission: MissionConfiguration) -> Detector:

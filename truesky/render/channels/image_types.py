@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from functools import lru_cache
 
-from lake_schema.mission.parameter import CAMERAS
+from lake_schema.mission.parameter import SPACE_CAMERAS
 from lake_schema.tables.exposures import ExposureRow
 
 SKY_TYPES = ("science", "deep", "self_calibration")
@@ -20,7 +20,7 @@ OWN = "own:"
 
 def section(camera: str) -> str:
     """Prefix of a camera's parameters in the mission database."""
-    return f"ext.{camera}" if camera in CAMERAS else camera
+    return camera if camera in SPACE_CAMERAS else f"ext.{camera}"
 
 
 def identity(exposure: ExposureRow) -> str:

@@ -4,7 +4,7 @@ from lake_schema.errors import BadInput
 from lake_schema.mission import configuration
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.store.plan import Json
-from truesky.fluxes import inputs
+from truesky.fluxes import inputs, passbands
 from truesky.fluxes.passbands import Passband
 from truesky.request.files import UserCurves
 from truesky.request.schema import MissionChoice, Request
@@ -16,14 +16,17 @@ PARTS = ("seed", "area", "universe", "pointings", "observations", "explore", "tr
 def mission_of(choice: MissionChoice) -> MissionConfiguration:
     """The mission configuration that a request chooses."""
     overrides = {key: (override.value, override.unit) for key, override in choice.overrides}
-    return configuration.resolve(ladder=choice.ladder, overrides=overrides)
+    return configuration.resolve(ladder=choice.ladder, overrides=overrides, cameras=choice.cameras)
 
 
 def user_filters(request: Request) -> tuple[dict[str, Passband], Json]:
     """The request's own passbands that it points in, by name, and their sha256 as facts of a plan."""
     wanted = {pointing.band for pointing in request.pointings}
+    wanted |= {band for block in request.observations if block.table for band in block.table.bands}
     given = UserCurves(tuple(own for own in request.curves.passbands if own[0] in wanted))
     found, origins = inputs.filters(given)
+    if unknown := sorted(wanted - {*found, *passbands.names()}):
+        raise BadInput(f"band {unknown[0]}: truesky has no passband of this name, and no curve is given for it")
     for name, band in found.items():
         if band.response.max() > 1.0:
             what = f"responds with {band.response.max():.4g}: a pointing wants the fraction of photons detected"

@@ -19,7 +19,7 @@ import pyarrow as pa
 from lake_schema import units
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
-from lake_schema.mission.parameter import CAMERAS
+from lake_schema.mission.parameter import SPACE_CAMERAS
 from lake_schema.tables.exposures import EXPOSURES, ExposureRow
 from truesky.fluxes import passbands
 from truesky.fluxes.passbands import Passband
@@ -225,7 +225,7 @@ class _Band:
         first = detectors.detectors(camera, mission)[0]
         sky = registry.CHANNELS[exposure.channel].sky(first, band, mission, curve)
         zero_point = zero_point_of(prefix, band, mission, curve)
-        if camera not in CAMERAS:
+        if camera in SPACE_CAMERAS:
             return cls(zero_point, sky)
         seeing = mission.value(f"{prefix}.{band}.seeing", "arcsec")
         curve = curve or passbands.load(band)

@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from lake_schema.errors import BadInput
-from lake_schema.mission.parameter import CAMERAS
+from lake_schema.mission.parameter import SPACE_CAMERAS
 from lake_schema.store import layout, read
 from truesky.validation.lake.measure import references
 from truesky.validation.lake.measure.frames import Curve, Instrument
@@ -156,7 +156,7 @@ def _told(held: Held, names: Sequence[str], effect: str) -> dict[str, list[float
     value = {row["name"]: row["value"] for row in rows.to_pylist() if row["chosen"]}
     found = {}
     for camera in {str(shot.exposure["camera"]) for shot in held.shots}:
-        section = f"ext.{camera}" if camera in CAMERAS else camera
+        section = camera if camera in SPACE_CAMERAS else f"ext.{camera}"
         own = [f"{section}.{name}" for name in names]
         if all(name in value for name in own):
             found[camera] = [float(value[name]) for name in own]
