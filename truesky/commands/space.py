@@ -80,19 +80,19 @@ def _catalogues(root: Path, request: Request) -> Iterator[Path]:
 
 def _images(root: Path, request: Request, exposures: pa.Table, tasks: pa.Table) -> float:
     """Bytes of the images that are asked for and need not be rendered."""
-    # All that renders: seconds that a lake without images need not wait for.
-    from truesky.render import render_exposures
+    # Importing the renderer takes seconds, which a lake without images need not wait for.
+    from truesky.render.planning import rendering
+    from truesky.render.planning.parts import Chosen
     from truesky.render.products import exposure_files
 
-    inputs = render_exposures.inputs_of(root, request)
     every = preconditions.rendered(exposures, tasks)
-    asked = planned.part(every, request)
-    made = render_exposures.products(root, request, inputs, exposures, every.to_pylist(), asked)
+    asked, planned_of = planned.part(every, request), Counter(every["exposure_id"].to_pylist())
+    chosen = Chosen(exposures, every.to_pylist(), asked, planned_of)
+    made = rendering.products(rendering.RenderInputs.of_plan(root, request, chosen))
     wanted = {(task["exposure_id"], task["detector"]) for task in asked}
     own = [part for part in made.parts if (part.facts["exposure_id"], part.facts["detector"]) in wanted]
     size = _kept(root, request, made, own)
     if request.files == "exposure":
-        planned_of = Counter(every["exposure_id"].to_pylist())
         whole, numbers = exposure_files.plan(made, planned_of), {number for number, _ in wanted}
         size += _kept(root, request, whole, [part for part in whole.parts if part.facts["exposure_id"] in numbers])
     return size

@@ -24,7 +24,7 @@ from lake_schema.mission.configuration import MissionConfiguration, resolve
 from lake_schema.store import layout, read
 from lake_schema.units import LIGHT_ANGSTROM_S, UJY_CGS
 from truesky.fluxes import passbands
-from truesky.render import render_exposures
+from truesky.render import detector_inputs
 from truesky.render.camera import detectors
 from truesky.render.channels.aim import Aim, electron_rate
 from truesky.render.dispersing import grism_files
@@ -67,7 +67,7 @@ def of_exposure(
         raise BadInput(f"table products has no exposure {exposure}")
     for part in parts:
         facts = {**version.manifest["facts"], **part}
-        aim, own, _ = render_exposures.aimed(root, facts)
+        aim, own, _ = detector_inputs.aimed(root, facts)
         if aim.channel.disperses is None or not aim.sees_sky:
             what = f"{aim.exposure.channel} {aim.exposure.image_type}"
             raise BadInput(f"exposure {exposure}: {what} is no image of spectra")

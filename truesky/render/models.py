@@ -25,7 +25,7 @@ from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 from lake_schema.fits.images import Image, write_images
 from lake_schema.store import layout, read
-from truesky.render import render_exposures
+from truesky.render import detector_inputs
 from truesky.render.exposure import alone
 from truesky.render.exposure.alone import Alone
 
@@ -45,7 +45,7 @@ def models(
     if not parts:
         raise BadInput(f"table products has no detector {detector} of exposure {exposure}")
     facts = {**version.manifest["facts"], **parts[0]}
-    aim, rows, own = render_exposures.prepared(root, facts)
+    aim, rows, own = detector_inputs.prepared(root, facts)
     return alone.spectra(aim, rows, own, facts["request"]["seed"], ids)
 
 

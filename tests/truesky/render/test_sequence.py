@@ -16,11 +16,11 @@ from tests.faults.victims import CONTEXT
 from truesky.catalogue import build_galaxies, build_stars
 from truesky.fluxes import compute_fluxes
 from truesky.randomness.rng import stream
-from truesky.render import plan_exposures, render_exposures
+from truesky.render import detector_inputs, plan_exposures, render_exposures
 from truesky.render.effects.charge.persistence import Traps, pixels_of
 from truesky.render.exposure import persistence, scene_of
 from truesky.render.exposure.records import EarlierSky, Variant
-from truesky.render.planning.mission import mission_of
+from truesky.render.planning.rendering import RenderInputs
 from truesky.request.from_toml import parse
 from truesky.running import shell
 
@@ -209,13 +209,14 @@ def test_products_change_with_the_catalogue_about_exposures_before_them(lake, fo
 
 def test_what_is_left_is_what_whole_images_leave(whole, folder):
     """Of everything that each earlier image expects, spectra among them: to 1.5 e- in any pixel."""
-    inputs, mission = render_exposures.inputs_of(whole, wanted(folder)), mission_of(wanted(folder).mission)
+    resolved = RenderInputs.of(whole, wanted(folder))
+    inputs, mission = resolved.versions, resolved.mission
     exposures = {row.exposure_id: row for row in map(ExposureRow.of, inputs["exposures"].rows().to_pylist())}
     tasks = {task["exposure_id"]: task for task in inputs["tasks"].rows().to_pylist()}
     version = read.version(whole, "products")
     files = {(row["exposure_id"], row["content"]): version.file(row["path"]) for row in version.rows().to_pylist()}
     now = exposures[5]
-    earlier = render_exposures._earlier(whole, inputs, now, tasks[5], mission, 5)
+    earlier = detector_inputs.earlier_exposures(whole, inputs, now, tasks[5], mission, 5)
     assert [before.exposure.exposure_id for before in earlier] == BEFORE[5]
     assert not any(isinstance(before, EarlierSky) for before in earlier)
     aim = replace(earlier[-1].aim, exposure=now)

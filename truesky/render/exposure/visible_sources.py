@@ -1,7 +1,6 @@
 """The catalogue rows that shine onto a detector, as sources to be drawn.
 
-least_flux      what a source beyond the margin must have to be read
-spike_flux, outer_flux   and a star, a galaxy still farther out
+flux_limits     fluxes above which sources outside the detector are read
 sources_of      the rows that shine onto the detector, as what is drawn
 Listed, listed  all rows, as what may be drawn
 """
@@ -31,7 +30,7 @@ from truesky.render.drawing.settings import Settings, settings_for
 from truesky.render.effects.effect import Decision, decide
 from truesky.render.effects.scene import NOTICEABLE, Lights, Scene
 from truesky.render.exposure import bright_lights, scene_of, standard_stars
-from truesky.render.exposure.records import Rows
+from truesky.render.exposure.records import Rows, Variant
 from truesky.render.psf import from_file, spikes, sub_bands
 from truesky.render.psf.model import Psf, of_colours
 from truesky.render.sources import (
@@ -45,7 +44,6 @@ from truesky.render.sources import (
     solar_system,
 )
 from truesky.render.sources.source_list import Sources
-from truesky.request.accuracy import Accuracy
 
 # What is read of the catalogues; fluxes are read besides.
 SHAPE_COLUMNS = ("id", "kind", "ra", "dec", *galaxy_shapes.COLUMNS)
@@ -196,57 +194,73 @@ def _no_sources(galaxies: pa.Table) -> Sources:
     return Sources(whole, none, none, np.zeros((0, 2, 2)), none, whole, galaxy_shapes.shapes(galaxies.slice(0, 0)))
 
 
-def least_flux(exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy) -> float:
-    """f_nu of the faintest source that reaches the detector from beyond its selection margin, microjansky.
+@dataclass(frozen=True, slots=True)
+class FluxLimits:
+    """Fluxes above which a source outside the detector is read from the catalogue, microjansky; infinite: none is.
 
-    Infinite where no source shows: in the dark, or in no time.
-    exposure : its row;  detector : of its camera
-    mission  : the mission database;  accuracy : of the request
-    Error : of the fainter out there each leaves out less than the settings' `edge` of a pixel's noise
+    Attributes
+    ----------
+    least : float
+        Faintest source that reaches the detector from beyond its selection margin. Each fainter source leaves out less
+        than the settings' `edge` of a pixel's noise.
+    spikes : float
+        Faintest star whose spikes are noticed from farther out.
+    far_galaxy : float
+        Faintest galaxy that is noticed from farther out.
+    """
+
+    least: float = np.inf
+    spikes: float = np.inf
+    far_galaxy: float = np.inf
+
+
+def flux_limits(exposure: ExposureRow, detector: Detector, band: Passband, variant: Variant) -> FluxLimits:
+    """Fluxes above which sources outside a detector are read.
+
+    Parameters
+    ----------
+    exposure : ExposureRow
+        Exposure.
+    detector : Detector
+        Detector of its camera.
+    band : Passband
+        Passband of the exposure.
+    variant : Variant
+        Mission and accuracy.
+
+    Returns
+    -------
+    FluxLimits
+        The limits. All are infinite if no source is seen: in the dark, or in an exposure of 0 s.
     """
     time, channel = exposure.exposure_time_s, registry.CHANNELS[exposure.channel]
     if time == 0.0 or not channel.sees_sky(exposure.image_type):
-        return float("inf")
+        return FluxLimits()
+    noise = scene_of.scene_of(exposure, detector, variant.mission, variant.accuracy).pixel_noise
+    electrons = electron_rate(exposure) * time
+    spikes_ = _spike_electrons(exposure, detector, band, variant.mission, noise) / electrons
     if channel.disperses is not None:
-        noise = scene_of.scene_of(exposure, detector, mission, accuracy).pixel_noise
-        return LEAST_SPECTRUM * noise / (electron_rate(exposure) * time)
-    margin = mission.value("survey.selection_margin", "arcsec")
-    noise = scene_of.scene_of(exposure, detector, mission, accuracy).pixel_noise
-    return stamp_sizes.least_electrons(margin, detector.pixel_scale, noise, settings_for(accuracy)) / (
-        electron_rate(exposure) * time
+        return FluxLimits(LEAST_SPECTRUM * noise / electrons, spikes_)
+    margin, scale = variant.mission.value("survey.selection_margin", "arcsec"), detector.pixel_scale
+    return FluxLimits(
+        stamp_sizes.least_electrons(margin, scale, noise, settings_for(variant.accuracy)) / electrons,
+        spikes_,
+        outskirts.least_electrons(stamp_sizes.reach(scale), scale, noise) / electrons,
     )
 
 
-def spike_flux(
-    exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy, band: Passband
+def _spike_electrons(
+    exposure: ExposureRow, detector: Detector, band: Passband, mission: MissionConfiguration, noise: float
 ) -> float:
-    """f_nu of the faintest star whose spikes are noticed from beyond what else is read, microjansky; or infinite.
-
-    exposure, detector, mission, accuracy : as of `least_flux`;  band : passband
-    """
-    time = exposure.exposure_time_s
-    channel = registry.CHANNELS[exposure.channel]
-    pupil_of = channel.pupil
-    if time == 0.0 or not channel.sees_sky(exposure.image_type) or pupil_of is None or exposure.psf:
-        return float("inf")
-    noise = scene_of.scene_of(exposure, detector, mission, accuracy).pixel_noise
+    """Electrons of the faintest star whose spikes are noticed from beyond the reach of stamps; or infinite."""
+    pupil_of = registry.CHANNELS[exposure.channel].pupil
+    if pupil_of is None or exposure.psf:
+        return np.inf
     pupil = pupil_of(detector, band, mission)
     if pupil is None:
-        return float("inf")
+        return np.inf
     (one,) = spikes.reach(pupil, np.ones(1), NOTICEABLE * noise)
-    return float((stamp_sizes.reach(1.0) / one) ** 2 / (electron_rate(exposure) * time))
-
-
-def outer_flux(exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy) -> float:
-    """f_nu of the faintest galaxy that may be noticed from beyond what else is read, microjansky; or infinite.
-
-    exposure, detector, mission, accuracy : as of `least_flux`
-    """
-    time, channel = exposure.exposure_time_s, registry.CHANNELS[exposure.channel]
-    if time == 0.0 or not channel.sees_sky(exposure.image_type) or channel.disperses is not None:
-        return float("inf")
-    noise, scale = scene_of.scene_of(exposure, detector, mission, accuracy).pixel_noise, detector.pixel_scale
-    return outskirts.least_electrons(stamp_sizes.reach(scale), scale, noise) / (electron_rate(exposure) * time)
+    return float((stamp_sizes.reach(1.0) / one) ** 2)
 
 
 def sources_of(

@@ -10,11 +10,12 @@ from lake_schema import position_columns, sky
 from lake_schema.arrays import Bool, Float, Int
 from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER
+from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.store import read
 from lake_schema.store.provenance import canonical
 from truesky.render.camera import pointing
 from truesky.render.channels import registry
-from truesky.render.planning.mission import PARTS, mission_of, user_filters
+from truesky.render.planning.mission import PARTS, user_filters
 from truesky.render.sources import catalogue_rows, selection
 from truesky.render.sources.catalogue_rows import CATALOGUES, FARTHEST_MOVED, LENSES
 from truesky.request import universe
@@ -27,13 +28,13 @@ _LINK, _MOST_PATCHES = 5.0, 12
 INPUTS = ("mission", "exposures", "tasks", "galaxies", "galaxy_fluxes", "stars", "star_fluxes")
 
 
-def refuse_other_plan(inputs: Mapping[str, read.Version], request: Request) -> None:
-    """What lies in the lake must have been made for this request, and the tables from one another."""
+def refuse_other_plan(inputs: Mapping[str, read.Version], request: Request, mission: MissionConfiguration) -> None:
+    """What lies in the lake must have been made for this request and its mission, and the tables from one another."""
     universe.refuse_other([inputs[name] for name in universe.CATALOGUES], request)
     position_columns.refuse_mixed(inputs.values())
     facts = {name: version.manifest["facts"] for name, version in inputs.items()}
     filters = user_filters(request)[1]
-    wanted = {"request": request.facts(*PARTS), "mission": mission_of(request.mission).fingerprint, **filters}
+    wanted = {"request": request.facts(*PARTS), "mission": mission.fingerprint, **filters}
     for name in ("exposures", "tasks"):
         if canonical({key: facts[name].get(key) for key in wanted}) != canonical(wanted):
             raise BadInput(f"table {name} was planned for another request: run plan_exposures first")

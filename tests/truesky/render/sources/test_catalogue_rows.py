@@ -19,7 +19,7 @@ from truesky.render.camera import astrometry, pointing
 from truesky.render.drawing import stamp_sizes, stamps
 from truesky.render.drawing.settings import settings_for
 from truesky.render.exposure import visible_sources
-from truesky.render.exposure.records import Rows
+from truesky.render.exposure.records import Rows, Variant
 from truesky.render.products import keys
 from truesky.render.sources import catalogue_rows, galaxy_shapes, selection
 from truesky.request.accuracy import SURVEY
@@ -66,6 +66,11 @@ def place():
     raise AssertionError("no such place")
 
 
+def limits_of(exposed, detector, band="euclid_vis", mission=MISSION):
+    variant = Variant(mission, SURVEY, {})
+    return visible_sources.flux_limits(exposure(**exposed), detector, passbands.load(band), variant)
+
+
 def rendered(distance, flux=1e6, drawn=None, found=True, **shape):
     """A detector with one galaxy so many arcsec north of its centre, as a task reads it, or as it stands."""
     task = {"detector": "R22_S11", **place()}
@@ -78,7 +83,7 @@ def rendered(distance, flux=1e6, drawn=None, found=True, **shape):
     if found:
         cells = sky.cell_of([task["ra"]], [task["dec"] + distance / 3600], 8)
         wanted = set(sky.cells_in_cone(task["ra"], task["dec"], 1.0, 8).tolist()) if drawn is None else drawn(task)
-        least = visible_sources.least_flux(exposure(**exposed), DETECTOR, MISSION, SURVEY)
+        least = limits_of(exposed, DETECTOR, "lsst_r").least
         body, light, complete = catalogue_rows.sources(
             Catalogue(body, cells, wanted), Catalogue(light, cells, wanted), task, [], [BAND], FARTHER, least
         )
@@ -162,10 +167,10 @@ def test_the_bound_on_what_shows_holds():
 def test_a_frame_that_no_source_shows_in_reads_none(dark):
     exposed = {**field_of("VIS")[1], **dark}
     detector, task = small("vis", "3-4"), place()
-    least = visible_sources.least_flux(exposure(**exposed), detector, MISSION, SURVEY)
+    least = limits_of(exposed, detector).least
     assert least == np.inf
     cells = sky.cell_of([task["ra"]], [task["dec"]], 8)
-    assert np.isfinite(visible_sources.least_flux(exposure(**field_of("VIS")[1]), detector, MISSION, SURVEY))
+    assert np.isfinite(limits_of(field_of("VIS")[1], detector).least)
     body = Catalogue(galaxies(task["ra"], task["dec"], **GIANT), cells, set(cells.tolist()))
     rows, light, complete = catalogue_rows.sources(body, body, task, [], [BAND], FARTHER, least)
     assert len(rows) == len(light) == 0
@@ -176,8 +181,7 @@ def test_bright_stars_are_read_from_as_far_away_as_their_spikes_show():
     """Eighteen minutes of arc: one of them, and none where there are no spikes or no light."""
     detector, task = small("vis", "3-4"), place()
     exposed = {**field_of("VIS")[1], "exposure_time_s": 560.53, "sky": 0.25, "zero_point": 25.93}
-    band = passbands.load("euclid_vis")
-    spikes = visible_sources.spike_flux(exposure(**exposed), detector, MISSION, SURVEY, band)
+    spikes = limits_of(exposed, detector).spikes
     # A star of 11.2 mag where those of all magnitudes end (3.4 minutes of arc), in a nominal exposure.
     assert 23.9 - 2.5 * np.log10(spikes) == pytest.approx(11.2, abs=0.3)
     rows = stars([task["ra"]] * 2, [task["dec"] - 0.3] * 2)
@@ -185,20 +189,20 @@ def test_bright_stars_are_read_from_as_far_away_as_their_spikes_show():
     cells = sky.cell_of(rows["ra"].to_numpy(), rows["dec"].to_numpy(), 8)
     drawn = set(sky.cells_in_cone(task["ra"], task["dec"], 1.0, 8).tolist())
     catalogues = Catalogue(rows, cells, drawn), Catalogue(light, cells, drawn)
-    least = visible_sources.least_flux(exposure(**exposed), detector, MISSION, SURVEY)
+    least = limits_of(exposed, detector).least
     for limit, wanted in ((spikes, [0]), (np.inf, [])):
         found, light, complete = catalogue_rows.sources(*catalogues, task, [], ["euclid_vis"], 85.0, least, limit)
         assert found.equals(rows.take(pa.array(wanted, pa.int64())))
         assert light["id"].equals(found["id"])
         assert complete == 85.0
     for other in ({"image_type": "dark"}, {"exposure_time_s": 0.0}, {"psf": "own.fits"}):
-        assert visible_sources.spike_flux(exposure(**{**exposed, **other}), detector, MISSION, SURVEY, band) == np.inf
-    ground, red = exposure(**field_of("EXT")[1]), passbands.load("lsst_r")
+        assert limits_of({**exposed, **other}, detector).spikes == np.inf
+    ground = field_of("EXT")[1]
     # LSST's aureole shows farther out than its spikes do; a Moffat profile has neither.
-    aureole = visible_sources.spike_flux(ground, DETECTOR, MISSION, SURVEY, red)
+    aureole = limits_of(ground, DETECTOR, "lsst_r").spikes
     assert 23.9 - 2.5 * np.log10(aureole) == pytest.approx(8.0, abs=0.3)
     moffat = resolve(overrides={"ext.lsstcam.psf.profile": (1.0, "")})
-    assert visible_sources.spike_flux(ground, DETECTOR, moffat, SURVEY, red) == np.inf
+    assert limits_of(ground, DETECTOR, "lsst_r", moffat).spikes == np.inf
 
 
 @dataclass
@@ -309,7 +313,8 @@ def test_large_galaxies_are_read_and_drawn_from_as_far_away_as_they_show(channel
     """One of m 7 and two minutes of arc, a third of a degree away; a small one, and a faint one, are not drawn."""
     detector, task = small(camera, name), place()
     exposed = {**field_of(channel)[1], "exposure_time_s": 560.53, "sky": 0.25, "zero_point": 25.93}
-    limit = visible_sources.outer_flux(exposure(**exposed), detector, MISSION, SURVEY)
+    band = "euclid_vis" if channel == "VIS" else "lsst_r"
+    limit = limits_of(exposed, detector, band).far_galaxy
     form = {"bulge_sersic_index": [4.0, 1.0, 4.0], "bulge_half_light_radius": [120.0, 2.0, 120.0]}
     rows = galaxies([task["ra"]] * 3, [task["dec"] - 0.3] * 3, bulge_fraction=1.0, **form)
     mags = np.array([7.0, 7.0, 27.0])
@@ -323,15 +328,13 @@ def test_large_galaxies_are_read_and_drawn_from_as_far_away_as_they_show(channel
     system = astrometry.wcs(detector, *pointing.boresight_for(detector, task["ra"], task["dec"], 0.0))
     electrons = light["f_nu_euclid_vis"].to_numpy() * 560.53 * 10 ** (0.4 * (25.93 - 23.9))
     noise, settings = 12.0, settings_for(SURVEY)
-    aim = fields.aimed(detector, system, passbands.load("euclid_vis" if channel == "VIS" else "lsst_r"))
+    aim = fields.aimed(detector, system, passbands.load(band))
     given = Rows(found, light, stars([], []), light.slice(0, 0))
     seen, sizes = visible_sources.sources_of(given, (electrons, np.zeros(0)), aim, psf_of(camera), noise, settings)
     assert seen.ids.tolist() == rows["id"].to_pylist()[:1]
     image = stamps.draw(seen, sizes, psf_of(camera), detector.nx, detector.ny)
     assert image.min() > 0.1 * noise
-    assert (
-        visible_sources.outer_flux(exposure(**{**exposed, "image_type": "bias"}), detector, MISSION, SURVEY) == np.inf
-    )
+    assert limits_of({**exposed, "image_type": "bias"}, detector, band).far_galaxy == np.inf
 
 
 def test_a_product_is_of_what_it_may_show_from_far_away():
