@@ -16,6 +16,7 @@ from lake_schema.mission.configuration import resolve
 from lake_schema.store import layout, read
 from lake_schema.tables.exposures import RENDERED
 from truesky.catalogue import build_galaxies, build_stars
+from truesky.commands import plan
 from truesky.fluxes import compute_fluxes
 from truesky.render import plan_exposures, render_exposures
 from truesky.render.camera import detectors
@@ -52,7 +53,7 @@ def small(name):
         if "ra" not in block:
             block.setdefault("area", table["area"])
     with pytest.raises(BadInput, match="this would do") as refused:
-        plan_exposures.check(from_table({**table, "area": {"cone": {"ra": 0.0, "dec": -60.0, "radius": 0.0}}}))
+        plan.check(from_table({**table, "area": {"cone": {"ra": 0.0, "dec": -60.0, "radius": 0.0}}}))
     table["area"] = tomllib.loads(re.search(r"this would do: \[area\] (.*)", str(refused.value))[1])
     return table
 
@@ -63,7 +64,7 @@ def test_a_shipped_request_goes_through_all_jobs(name, tmp_path, monkeypatch):
     # The parts here, not in Spark's workers.
     monkeypatch.setattr(shell, "_spark_map", lambda function, parts, *rest: map(function, parts))
     request = from_table(small(name))
-    plan_exposures.check(request)
+    plan.check(request)
     root = layout.lake(tmp_path / "lake")
     for module in MODULES:
         shell.run(module.JOB, root, request)

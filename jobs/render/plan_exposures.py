@@ -4,7 +4,7 @@ spark-submit jobs/render/plan_exposures.py --lake LAKE --request REQUEST
 """
 
 from lake_schema import command
-from truesky.render.plan_exposures import JOB
+from truesky.commands.plan import JOB
 from truesky.running.shell import main
 
 if __name__ == "__main__":

@@ -34,7 +34,7 @@ JOBS = {
     "fluxes": ("truesky.fluxes.compute_fluxes",),
     "lenses": ("truesky.catalogue.build_strong_lenses",),
     "gaia": ("truesky.catalogue.build_gaia",),
-    "plan": ("truesky.render.plan_exposures",),
+    "plan": ("truesky.commands.plan",),
     "render": ("truesky.render.render_exposures",),
 }
 # Command -> the module whose `main` it is, and whether that module wants the command's word, too.

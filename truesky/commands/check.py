@@ -48,15 +48,16 @@ def refuse(request: Request, alone: bool = False) -> None:
         Check the plan only, not the catalogues.
     """
     # What reads files and plans takes seconds to import: only a request whose keys are good is worth them.
-    from truesky.render import plan_exposures
+    from truesky.commands import plan
+    from truesky.render.plan_exposures import Planner
 
     if not request.pointings and not request.observations:
-        plan_exposures.check_catalogues(request)
+        plan.check_catalogues(request)
     elif alone:
-        for _ in plan_exposures.Planner.of(None, request).tables():
+        for _ in Planner.of(None, request).tables():
             pass
     else:
-        for _ in plan_exposures.checked(request):
+        for _ in plan.checked_parts(request):
             pass
 
 

@@ -20,9 +20,9 @@ import pyarrow as pa
 from lake_schema import __version__, command, user_files
 from lake_schema.store import layout, read
 from truesky.catalogue.stars import gaia
+from truesky.commands import plan as planning
 from truesky.commands import space
 from truesky.numerics import cache
-from truesky.render import plan_exposures
 from truesky.render.forecasting import catalogue_forecast, speed
 from truesky.render.planning import preconditions, tasks
 from truesky.request import universe
@@ -165,8 +165,8 @@ def checked_plan(root: Path, request: Request, stages: Sequence[Stage]) -> tuple
         The rows of `exposures` and `tasks` if images are rendered.
     """
     if stages[-1].name == IMAGES[-1].name:
-        return plan_exposures.check(request, root)
-    plan_exposures.check_catalogues(request)
+        return planning.check(request, root)
+    planning.check_catalogues(request)
     return None
 
 

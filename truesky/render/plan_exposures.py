@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain
 from pathlib import Path
 
 import pyarrow as pa
@@ -22,21 +21,17 @@ from lake_schema.store.provenance import digest
 from lake_schema.tables.exposures import EXPOSURES
 from lake_schema.tables.mission import MISSION
 from lake_schema.tables.tasks import TASKS
-from truesky.catalogue import request_checks
-from truesky.fluxes import inputs
-from truesky.render.forecasting import catalogue_forecast, forecast, speed
-from truesky.render.planning import ground_surveys, preconditions, psf_files, source_counts, tasks, variants
+from truesky.render.forecasting import forecast, speed
+from truesky.render.planning import ground_surveys, psf_files, source_counts, tasks, variants
 from truesky.render.planning.mission import PARTS, mission_of, user_filters
 from truesky.render.planning.parts import Layout, Piece
 from truesky.render.planning.prices import Files
-from truesky.render.products.keys import ephemeris_files, stamp_files
 from truesky.request import universe
-from truesky.request.checks import check_rendered
 from truesky.request.schema import Request
 from truesky.running.shell import Job, Step, common_facts
 
 # Rows of `exposures` and of `tasks`.
-Plan_ = tuple[pa.Table, pa.Table]
+PlanRows = tuple[pa.Table, pa.Table]
 # Fact of the plan of `tasks`: keys of what they were made of.
 _MADE_OF = "made_of"
 
@@ -91,7 +86,7 @@ class Planner:
         about = self.layout.about(piece, days) if days else ()
         return tasks.remembering(rows, exposures, about, self.mission)
 
-    def tables(self) -> Iterator[Plan_]:
+    def tables(self) -> Iterator[PlanRows]:
         """Rows of `exposures` and `tasks`, a part after the other."""
         for piece in self.layout.pieces:
             exposures = self.rows_of_exposures(piece)
@@ -101,11 +96,11 @@ class Planner:
 def plan(lake: Path | None, request: Request) -> tuple[MissionConfiguration, pa.Table, pa.Table]:
     """The mission configuration, and rows of the tables `exposures` and `tasks`; lake : with catalogues, if any."""
     planner = Planner.of(lake, request)
-    return planner.mission, *_together(planner.tables())
+    return planner.mission, *joined(planner.tables())
 
 
-def _together(parts: Iterable[Plan_]) -> Plan_:
-    """Rows of a whole plan, those of tasks longest first."""
+def joined(parts: Iterable[PlanRows]) -> PlanRows:
+    """Rows of a whole plan from those of its parts; tasks are sorted, the longest first."""
     exposures, rows = zip(*parts, strict=True)
     return pa.concat_tables(exposures).combine_chunks(), tasks.in_order(pa.concat_tables(rows))
 
@@ -155,55 +150,14 @@ def _print_published(lake: Path, version: read.Version) -> None:
     )
 
 
-def dry_run(lake: Path, request: Request) -> Sequence[Step]:
-    """The forecast alone, of the catalogues, too, of a request that no later job would refuse."""
+def print_forecast(lake: Path, request: Request, parts: Iterable[PlanRows]) -> None:
+    """Print the forecast of a plan that is not published; parts : rows of `exposures` and `tasks`."""
     universe.refuse_other(_catalogues(lake, request), request)
-    _print_forecast(lake, checked(request, lake))
+    _print_forecast(lake, parts)
     _say_by_day(Planner.of(lake, request))
-    print()
-    for line in catalogue_forecast.text(catalogue_forecast.of_request(request, speed.of_machine(lake).factor)):
-        print(line)
-    return ()
 
 
-def check(request: Request, lake: Path | None = None) -> Plan_:
-    """Refuse whatever the jobs of this request would refuse, the catalogues' as well, before any of them runs.
-
-    returns : rows of the tables `exposures` and `tasks`, as planned;  lake : whose catalogues say how dense the sky is
-    """
-    return _together(checked(request, lake))
-
-
-def checked(request: Request, lake: Path | None = None) -> Iterator[Plan_]:
-    """As `check`, a part of the plan after the other; all is refused that is to be when the last has come."""
-    check_rendered(request)
-    # First what names the pointing or the observation that is wrong.
-    planner = Planner.of(lake, request)
-    parts = planner.tables()
-    first = next(parts)
-    check_catalogues(request)
-    if request.structure.stamps is not None:
-        stamp_files(request.structure.stamps.file)
-    narrowed, some = tasks.Narrowed(request), False
-    for exposures, rows in chain([first], parts):
-        if request.bodies is not None:
-            ephemeris_files(request.bodies, exposures)
-        seen = preconditions.drawable(exposures, rows)
-        some = some or seen.num_rows > 0
-        preconditions.refuse_small_area(request.area, narrowed.of(seen))
-        yield exposures, rows
-    if not some:
-        preconditions.rendered(exposures, rows)
-    narrowed.refuse_unknown()
-
-
-def check_catalogues(request: Request) -> None:
-    """Refuse whatever the jobs of catalogues and fluxes would refuse."""
-    inputs.curves(request.bands, inputs.read(request.curves).passbands)
-    request_checks.refuse(request)
-
-
-def _print_forecast(lake: Path, parts: Iterable[Plan_]) -> None:
+def _print_forecast(lake: Path, parts: Iterable[PlanRows]) -> None:
     machine = speed.of_machine(lake)
     for line in forecast.text(forecast.of_parts(parts, machine.factor), machine):
         print(line)
@@ -218,5 +172,4 @@ JOB = Job(
     "plan_exposures",
     "Plan which detectors are rendered, with which sky and which sources.",
     steps,
-    dry_run=dry_run,
 )

@@ -10,7 +10,7 @@ import pytest
 from lake_schema.errors import BadInput
 from lake_schema.store import layout
 from tests import requests
-from truesky.commands import run, space
+from truesky.commands import plan, run, space
 from truesky.numerics import cache
 from truesky.render import plan_exposures
 from truesky.request.from_toml import parse
@@ -76,12 +76,12 @@ def test_what_an_earlier_run_of_the_name_left_is_no_room(lake, monkeypatch):
     (runs := layout.runs(lake)).mkdir(exist_ok=True)
     (runs / "1.jsonl").write_text(f'{{"request": "demo", "table": "products", "key": "{"c" * 16}"}}\n')
     with pytest.raises(BadInput, match=r"0\.20 GB are free"):
-        space.check(lake, request, run.plan_exposures.plan(lake, request)[1:])
+        space.check(lake, request, plan_exposures.plan(lake, request)[1:])
 
 
 @pytest.mark.parametrize("compiled", [False, True])
 def test_a_run_ends_with_the_first_job_that_fails(tmp_path, capsys, monkeypatch, compiled):
-    started, planned = [], plan_exposures.check
+    started, planned = [], plan.check
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "code"))
 
     def compiling(*known):
@@ -92,7 +92,7 @@ def test_a_run_ends_with_the_first_job_that_fails(tmp_path, capsys, monkeypatch,
 
     if compiled:
         compiling(parse(DEMO), layout.lake(tmp_path / "lake"))
-    monkeypatch.setattr(plan_exposures, "check", compiling)
+    monkeypatch.setattr(plan, "check", compiling)
 
     def start(module, arguments):
         started.append((module.rpartition(".")[2], *arguments))

@@ -11,8 +11,7 @@ from lake_schema.mission.configuration import resolve
 from lake_schema.tables.exposures import EUCLID_BANDS, RENDERED
 from tests import requests
 from truesky.catalogue import build_galaxies, build_stars
-from truesky.commands import check
-from truesky.render import plan_exposures
+from truesky.commands import check, plan
 from truesky.render.channels import registry
 from truesky.render.planning.planned_exposures import bands_of
 from truesky.request import checks, observations
@@ -73,8 +72,8 @@ def test_a_request_of_which_nothing_is_rendered_is_refused_by_the_check_and_the_
     wanted = f"^observation\\[0\\].channels: no simulator renders {first} {kind} yet: it can be planned alone$"
     for refuse in (
         checks.check_rendered,
-        plan_exposures.check,
-        lambda request: plan_exposures.dry_run(tmp_path, request),
+        plan.check,
+        lambda request: plan.dry_run(tmp_path, request),
         lambda request: build_galaxies.JOB.steps(tmp_path, request),
         lambda request: build_stars.JOB.steps(tmp_path, request),
     ):

@@ -2,8 +2,7 @@
 
 import pytest
 
-from truesky.commands import check
-from truesky.render import plan_exposures
+from truesky.commands import check, plan
 from truesky.running import shell
 
 HEAD = 'name = "x"\nseed = 1\n'
@@ -163,7 +162,7 @@ def test_a_mistake_is_refused_in_one_line_and_nothing_is_written(tmp_path, capsy
     before = sorted(tmp_path.iterdir())
     for call in (
         lambda: check.main([str(path)]),
-        lambda: shell.main(plan_exposures.JOB, ["--lake", str(lake), "--request", str(path), "--dry-run"]),
+        lambda: shell.main(plan.JOB, ["--lake", str(lake), "--request", str(path), "--dry-run"]),
     ):
         assert call() == 2
         said = capsys.readouterr()

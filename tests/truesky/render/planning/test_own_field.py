@@ -9,6 +9,7 @@ import pytest
 from lake_schema import sky
 from lake_schema.errors import BadInput
 from tests.house.test_names import ROOT
+from truesky.commands import plan
 from truesky.render import plan_exposures
 from truesky.request import pointing_tables
 from truesky.request.area import parse
@@ -58,9 +59,9 @@ def offsets(ra, dec, ra0, dec0):
 def test_the_area_that_is_named_would_do(ra, dec):
     block = {"channels": ["VIS"], "ra": ra, "dec": dec}
     with pytest.raises(BadInput, match="this would do") as refused:
-        plan_exposures.check(made(block, ((ra + 180.0) % 360.0, -dec / 2, 0.1)))
+        plan.check(made(block, ((ra + 180.0) % 360.0, -dec / 2, 0.1)))
     area = tomllib.loads(re.search(r"\[area\] (.*)", str(refused.value))[1])
-    plan_exposures.check(from_table({**BASE, "area": area, "observation": [block]}))
+    plan.check(from_table({**BASE, "area": area, "observation": [block]}))
     # Not much more than the field of view.
     assert area["cone"]["radius"] < 0.8
 
@@ -69,7 +70,7 @@ def test_fields_far_from_one_another_are_named_one_by_one():
     blocks = [{"channels": ["VIS"], "ra": ra, "dec": -45.0} for ra in (10.0, 60.0)]
     elsewhere = {"cone": {"ra": 0.0, "dec": 0.0, "radius": 1.0}}
     with pytest.raises(BadInput, match="this would do") as refused:
-        plan_exposures.check(from_table({**BASE, "area": elsewhere, "observation": blocks}))
+        plan.check(from_table({**BASE, "area": elsewhere, "observation": blocks}))
     area = tomllib.loads(re.search(r"\[area\] (.*)", str(refused.value))[1])
     assert np.array(area["patches"]) == pytest.approx(np.array([[10, -45, 0.65], [60, -45, 0.65]]), abs=0.15)
 

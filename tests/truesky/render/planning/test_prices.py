@@ -6,7 +6,7 @@ import pytest
 
 from lake_schema.tables.exposures import CHANNELS
 from tests.truesky.render.planning.test_survey import VIS, planned
-from truesky.render import plan_exposures
+from truesky.commands import plan
 from truesky.render.channels import image_types, registry
 from truesky.render.exposure import truth_maps
 from truesky.render.forecasting import forecast, speed
@@ -126,7 +126,7 @@ def test_the_forecast_adds_up(tmp_path):
 
 def test_a_dry_run_prints_the_forecast_and_writes_nothing(tmp_path, capsys):
     lake = tmp_path / "lake"
-    assert shell.main(plan_exposures.JOB, ["--lake", str(lake), "--request", str(DEMO), "--dry-run"]) == 0
+    assert shell.main(plan.JOB, ["--lake", str(lake), "--request", str(DEMO), "--dry-run"]) == 0
     lines, catalogues = (table.splitlines() for table in capsys.readouterr().out.split("\n\n"))
     assert [line.split()[0] for line in catalogues] == ["job", "build_galaxies", "build_stars", "compute_fluxes"]
     assert lines[0].startswith("channel")

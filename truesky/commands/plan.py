@@ -1,0 +1,100 @@
+"""Check a whole request, catalogues and plan, and forecast its cost: the job `plan_exposures` with its --dry-run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import chain
+from pathlib import Path
+
+from truesky.catalogue import request_checks
+from truesky.fluxes import inputs
+from truesky.render import plan_exposures
+from truesky.render.forecasting import catalogue_forecast, speed
+from truesky.render.plan_exposures import Planner, PlanRows
+from truesky.render.planning import preconditions, tasks
+from truesky.render.products.keys import ephemeris_files, stamp_files
+from truesky.request.checks import check_rendered
+from truesky.request.schema import Request
+from truesky.running.shell import Step
+
+
+def check(request: Request, lake: Path | None = None) -> PlanRows:
+    """Refuse whatever the jobs of a request would refuse, before any of them runs.
+
+    Parameters
+    ----------
+    request : Request
+        The request.
+    lake : Path, optional
+        Lake whose catalogues say how dense the sky is.
+
+    Returns
+    -------
+    tuple of pyarrow.Table
+        Rows of the tables `exposures` and `tasks`.
+
+    Raises
+    ------
+    BadInput
+        If a job would refuse the request. The message names the key, or the file and its line.
+    """
+    return plan_exposures.joined(checked_parts(request, lake))
+
+
+def checked_parts(request: Request, lake: Path | None = None) -> Iterator[PlanRows]:
+    """Check a request as `check` does, and return one part of the plan after the other.
+
+    Parameters
+    ----------
+    request : Request
+        The request.
+    lake : Path, optional
+        Lake whose catalogues say how dense the sky is.
+
+    Yields
+    ------
+    tuple of pyarrow.Table
+        Rows of the tables `exposures` and `tasks` of a part. All checks are done when the last part has come.
+
+    Raises
+    ------
+    BadInput
+        If a job would refuse the request.
+    """
+    check_rendered(request)
+    # A mistake in a pointing or an observation is named first.
+    parts = Planner.of(lake, request).tables()
+    first = next(parts)
+    check_catalogues(request)
+    if request.structure.stamps is not None:
+        stamp_files(request.structure.stamps.file)
+    narrowed, some = tasks.Narrowed(request), False
+    for exposures, rows in chain([first], parts):
+        if request.bodies is not None:
+            ephemeris_files(request.bodies, exposures)
+        seen = preconditions.drawable(exposures, rows)
+        some = some or seen.num_rows > 0
+        preconditions.refuse_small_area(request.area, narrowed.of(seen))
+        yield exposures, rows
+    if not some:
+        preconditions.rendered(exposures, rows)
+    narrowed.refuse_unknown()
+
+
+def check_catalogues(request: Request) -> None:
+    """Raise BadInput if the jobs of catalogues and fluxes would refuse the request."""
+    inputs.curves(request.bands, inputs.read(request.curves).passbands)
+    request_checks.refuse(request)
+
+
+def dry_run(lake: Path, request: Request) -> Sequence[Step]:
+    """Print the forecast of the plan and of the catalogues, for a request that no job would refuse."""
+    plan_exposures.print_forecast(lake, request, checked_parts(request, lake))
+    print()
+    for line in catalogue_forecast.text(catalogue_forecast.of_request(request, speed.of_machine(lake).factor)):
+        print(line)
+    return ()
+
+
+JOB = replace(plan_exposures.JOB, dry_run=dry_run)
