@@ -81,14 +81,14 @@ def _catalogues(root: Path, request: Request) -> Iterator[Path]:
 def _images(root: Path, request: Request, exposures: pa.Table, tasks: pa.Table) -> float:
     """Bytes of the images that are asked for and need not be rendered."""
     # Importing the renderer takes seconds, which a lake without images need not wait for.
-    from truesky.render.planning import rendering
+    from truesky.render import product_plan
     from truesky.render.planning.parts import Chosen
     from truesky.render.products import exposure_files
 
     every = preconditions.rendered(exposures, tasks)
     asked, planned_of = planned.part(every, request), Counter(every["exposure_id"].to_pylist())
     chosen = Chosen(exposures, every.to_pylist(), asked, planned_of)
-    made = rendering.products(rendering.RenderInputs.of_plan(root, request, chosen))
+    made = product_plan.products(product_plan.RenderInputs.of_plan(root, request, chosen))
     wanted = {(task["exposure_id"], task["detector"]) for task in asked}
     own = [part for part in made.parts if (part.facts["exposure_id"], part.facts["detector"]) in wanted]
     size = _kept(root, request, made, own)

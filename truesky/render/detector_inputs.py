@@ -139,7 +139,28 @@ def earlier_exposures(
     mission: MissionConfiguration,
     seed: int,
 ) -> tuple[Earlier | EarlierSky, ...]:
-    """Exposures of the task's detector that left something in it, with their bright sources."""
+    """Find earlier exposures of a detector that left charge in it.
+
+    Parameters
+    ----------
+    lake : Path
+        Folder of the lake.
+    inputs : mapping of str to Version
+        Versions of the tables that the images are made of.
+    exposed : ExposureRow
+        Exposure whose detector it is.
+    task : dict
+        Row of the table `tasks`.
+    mission : MissionConfiguration
+        Mission configuration of the request.
+    seed : int
+        Seed of the request.
+
+    Returns
+    -------
+    tuple of Earlier or EarlierSky
+        The exposures with their bright sources, or with the level of their sky alone if nothing renders them.
+    """
     if registry.CHANNELS[exposed.channel].remembers is None:
         return ()
     own = variants.missions(mission)

@@ -9,11 +9,11 @@ from lake_schema.store import parquet, read, reuse
 from lake_schema.store.plan import Json, Output, Part, Plan
 from lake_schema.tables.exposures import ExposureRow
 from lake_schema.tables.rendered_truth import RENDERED_SPECTRA, RENDERED_TRUTH
-from truesky.render import detector_inputs
+from truesky.render import detector_inputs, product_plan
 from truesky.render.channels import registry
 from truesky.render.exposure import render
-from truesky.render.planning import preconditions, rendering
-from truesky.render.planning.rendering import RenderInputs
+from truesky.render.planning import preconditions
+from truesky.render.product_plan import RenderInputs
 from truesky.render.products import exposure_files, fits_files, truth_table
 from truesky.render.products.beside import psf_file, spectra_file, truth_file
 from truesky.render.psf import to_psfex
@@ -31,7 +31,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
     """
     inputs = RenderInputs.of(lake, request)
     _refuse_uncovered(inputs)
-    plan = rendering.products(inputs)
+    plan = product_plan.products(inputs)
     drawn = tuple(Part(part.name, {"part": part.name, reuse.PRODUCT: part.facts[reuse.PRODUCT]}) for part in plan.parts)
     steps = [Step(plan, work, unit="detector"), Step(Plan(RENDERED_TRUTH, {"products": plan.key}, drawn), truth_work)]
     spread = _dispersed(inputs.chosen.exposures)

@@ -20,7 +20,7 @@ from truesky.render import detector_inputs, plan_exposures, render_exposures
 from truesky.render.effects.charge.persistence import Traps, pixels_of
 from truesky.render.exposure import persistence, scene_of
 from truesky.render.exposure.records import EarlierSky, Variant
-from truesky.render.planning.rendering import RenderInputs
+from truesky.render.product_plan import RenderInputs
 from truesky.request.from_toml import parse
 from truesky.running import shell
 
