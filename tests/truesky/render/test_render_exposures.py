@@ -30,7 +30,7 @@ from truesky.catalogue import build_galaxies, build_stars, build_strong_lenses
 from truesky.catalogue.galaxies import strong_lenses
 from truesky.commands import space
 from truesky.fluxes import compute_fluxes
-from truesky.render import archive, plan_exposures, render_exposures
+from truesky.render import archive, plan_exposures, product_plan, render_exposures
 from truesky.render.camera import detectors
 from truesky.render.exposure import truth_maps
 from truesky.render.planning import preconditions
@@ -441,7 +441,7 @@ def test_a_key_changes_with_everything_that_shapes_a_product(rendered, monkeypat
             patch.setattr(read.Version, "part_sha256", lambda self, part, name=table: f"{self.table == name}")
             found.append(keys(rendered, wanted()))
     with monkeypatch.context() as patch:
-        patch.setattr(shell, "code_version", lambda: "another")
+        patch.setattr(product_plan, "code_version", lambda: "another")
         found.append(keys(rendered, wanted()))
     noise = {"ext.lsstcam.read_noise": {"value": 7.0, "unit": "electron"}}
     found.append(keys(rendered, wanted(mission={"overrides": noise}), plan=True))
@@ -507,7 +507,7 @@ def test_strong_lenses_of_the_lake_are_drawn(rendered, monkeypatch):
     monkeypatch.setattr(
         preconditions,
         "refuse_other_plan",
-        lambda inputs, request: ahead({**inputs, "strong_lenses": other}, request),
+        lambda inputs, *others: ahead({**inputs, "strong_lenses": other}, *others),
     )
     with pytest.raises(BadInput, match="strong_lenses was drawn in another version of galaxies: run build_strong_lens"):
         render_exposures.steps(lake, crowded)
