@@ -1,7 +1,7 @@
 """Ecliptic coordinates, and the tiles that the sky is cut into along them.
 
 ecliptic, equatorial     ICRS <-> ecliptic longitude and latitude
-tile_of, tile_corners    which tile a place lies in, and where a tile lies
+tile_count, tile_corners number of tiles, and where a tile lies
 """
 
 from __future__ import annotations
@@ -45,16 +45,6 @@ def _turned(lon: npt.ArrayLike, lat: npt.ArrayLike, angle: float) -> tuple[Float
 def tile_count() -> int:
     """Number of tiles; they are numbered from 0, rows from the south, eastward in a row."""
     return int(_first_of_row()[-1])
-
-
-def tile_of(ra: npt.ArrayLike, dec: npt.ArrayLike) -> Int:
-    """Tile[n] that each place lies in: every place lies in exactly one."""
-    lon, lat = ecliptic(ra, dec)
-    row = np.clip(np.floor((lat + 90.0) / 180.0 * _ROWS), 0, _ROWS - 1).astype(np.int64)
-    first = _first_of_row()
-    count = first[row + 1] - first[row]
-    column = np.clip(np.floor(lon / 360.0 * count), 0, count - 1).astype(np.int64)
-    return np.asarray(first[row] + column, np.int64)
 
 
 def tile_corners(tile: int) -> Float:

@@ -176,7 +176,7 @@ class Explorer:
         check("bins", bins, 1, _MOST_BINS)
         lo, hi = _ordered(span or self._span(table, x, where))
         text = f"""
-            SELECT {_bin("x", "x")} AS i, {_counted(weight)} AS n FROM (SELECT ({x}\n)::DOUBLE AS x, {_weight(weight)}
+            SELECT {_bin("x")} AS i, {_counted(weight)} AS n FROM (SELECT ({x}\n)::DOUBLE AS x, {_weight(weight)}
             FROM {table}\nWHERE ({where}\n)) WHERE x BETWEEN $x_lo AND $x_hi GROUP BY i"""
         found = self.sql(text, into="arrow", x_lo=lo, x_hi=hi, x_bins=bins)
         counts = np.zeros(bins)
@@ -198,7 +198,7 @@ class Explorer:
         spans = span or (self._span(table, x, where), self._span(table, y, where))
         (x_lo, x_hi), (y_lo, y_hi) = (_ordered(axis) for axis in spans)
         text = f"""
-            SELECT {_bin("x", "x")} AS i, {_bin("y", "y")} AS j, {_counted(weight)} AS n
+            SELECT {_bin("x")} AS i, {_bin("y")} AS j, {_counted(weight)} AS n
             FROM (SELECT ({x}\n)::DOUBLE AS x, ({y}\n)::DOUBLE AS y, {_weight(weight)} FROM {table}\nWHERE ({where}\n))
             WHERE x BETWEEN $x_lo AND $x_hi AND y BETWEEN $y_lo AND $y_hi GROUP BY i, j"""
         limits = {"x_lo": x_lo, "x_hi": x_hi, "x_bins": bins[0], "y_lo": y_lo, "y_hi": y_hi, "y_bins": bins[1]}
@@ -238,8 +238,9 @@ def _ordered(span: Range) -> Range:
     return lo, hi
 
 
-def _bin(x: str, axis: str) -> str:
-    return f"least(floor(({x} - ${axis}_lo) / (${axis}_hi - ${axis}_lo) * ${axis}_bins), ${axis}_bins - 1)::INT"
+def _bin(axis: str) -> str:
+    """Number of the bin of a column `x` or `y`; the last bin includes its upper edge."""
+    return f"least(floor(({axis} - ${axis}_lo) / (${axis}_hi - ${axis}_lo) * ${axis}_bins), ${axis}_bins - 1)::INT"
 
 
 def _weight(weight: str | None) -> str:

@@ -4,7 +4,7 @@ Population     ages and metallicities of a component
 Pieces         short stretches of isochrones and of the cooling sequence of white dwarfs, each inside a bin of M_H
 Tracks         the isochrones' main sequences, for companions
 tracks, pieces_of, white_dwarfs   made of populations
-mass_below, white_dwarfs_below    the distributions that they are made of
+white_dwarfs_below                cumulative luminosity function of white dwarfs
 
 Above 0.7 Msun stars lie on isochrones, below 0.5 Msun on the mean sequence of nearby dwarfs, where metal-poor ones are
 hotter by as much as isochrones have them at 0.5 Msun; in between the two go over into one another. Types later than M9
@@ -17,7 +17,6 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from lake_schema.arrays import Bool, Float, Int
 from truesky.catalogue import parameters
@@ -242,16 +241,8 @@ def _white_dwarf_teff(numbers: WhiteDwarfs, m_bol: Float) -> Float:
     return np.asarray(_SUN_TEFF * 10.0 ** (-0.1 * (m_bol - _SUN_M_BOL)) / np.sqrt(numbers.radius))
 
 
-def mass_below(masses: MassFunction, m: npt.ArrayLike) -> Float:
-    """Systems pc^-3 at the Sun born lighter than m, all components together.
-
-    m : float[n] Msun
-    Ref: Kroupa 2001
-    """
-    return masses.local * _power_law(masses, np.asarray(m, float)) / _power_law(masses, np.asarray(masses.reference))
-
-
 def _power_law(masses: MassFunction, m: Float) -> Float:
+    """Integral of the mass function below m[n] Msun, not normalised.  Ref: Kroupa 2001"""
     edges = (masses.lightest, *masses.breaks, np.inf)
     total, height = np.zeros(m.shape), 1.0
     for i, slope in enumerate(masses.slopes):

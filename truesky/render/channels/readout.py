@@ -3,7 +3,7 @@
 FRAME       one array of pixels
 RAMP        the signal of a ramp, and whether it fits, in the frame of pixels that see no light
 RAMP_AND_CHI2  the same, with chi^2 itself
-QUADRANTS   four of them, each in the detector's own axes with its pre- and overscan; quadrant_map: where each lies
+QUADRANTS   four of them, each in the detector's own axes with its pre- and overscan
 BY_AMPLIFIER  an array of each amplifier, in the detector's own axes with its pre- and overscan
 ELECTRONS   what lies in the pixels before they are read
 AMPLIFIERS  one array: the pixels of all amplifiers as they lie on the detector, their pre- and overscans around them
@@ -208,12 +208,6 @@ def _quadrants(found: Frame, scene: Scene, detector: str, system: WCS) -> Readou
 
 def _assembled(array: Array, scene: Scene) -> Array:
     return array if array.ndim == 2 else layout.assembled(array, *layout.sizes(scene))
-
-
-def quadrant_map(numbers: Float, shape: tuple[int, ...], middle: int) -> Float:
-    """Numbers [4] of the quadrants, in the order in which they are read -> [ny, nx] of their pixels, 0 between them."""
-    parts = np.broadcast_to(np.reshape(numbers, (4, 1, 1)), (4, (shape[0] - middle) // 2, shape[1] // 2))
-    return layout.assembled(np.array(parts, float), 0, 0, 0, middle)
 
 
 def _quadrant_pixels(read: Sequence[Image]) -> Array:

@@ -3,7 +3,7 @@
 starlit_sky, thermal_sky, ground_sky   of a band, as different cameras see it
 sky_rate              of a band, at a position and date;  photons : by wavelength;  warm : the thermal ones of them
 zodiacal_intensity    W m-2 sr-1 um-1 at 500 nm
-zodiacal_rate         through a passband;  zodiacal_sky : what of it depends neither on place nor on date
+zodiacal_sky          zodiacal light through a passband, for `sky_rate`
 starlight             of a field's stars, of which the telescope scatters some
 solar                 the Sun's spectrum
 sun_longitude
@@ -196,29 +196,12 @@ def _filled(rows: tuple[tuple[float, ...], ...]) -> tuple[Float, Float]:
     return table[:, 0], values
 
 
-def zodiacal_rate(
-    ra: float,
-    dec: float,
-    mjd: float,
-    band: Passband,
-    area: float,
-    pixel_scale: float,
-    mission: MissionConfiguration,
-) -> float:
-    """Electrons per second in a pixel from the zodiacal light.
-
-    area : m2, collecting;  pixel_scale : arcsec
-    ra, dec, mjd : deg, and date;  band : passband;  mission : the mission database
-    Spectrum : the Sun's, reddened with the wavelength and the elongation
-    Ref      : Leinert et al. 1998, section 8
-    """
-    return _zodiacal(zodiacal_sky(band, area, pixel_scale, mission), ra, dec, mjd, mission)
-
-
 def zodiacal_sky(band: Passband, area: float, pixel_scale: float, mission: MissionConfiguration) -> SkyBand:
     """Zodiacal light alone.
 
     band : passband;  area : m2, collecting;  pixel_scale : arcsec;  mission : the mission database
+    Spectrum : the Sun's, reddened with the wavelength and the elongation
+    Ref      : Leinert et al. 1998, section 8
     """
     return SkyBand(0.0, *_zodiacal_integrals(band, area, pixel_scale, mission))
 

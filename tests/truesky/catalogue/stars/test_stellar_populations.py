@@ -7,32 +7,45 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from truesky.catalogue import parameters
+from truesky.catalogue.stars import milky_way
 from truesky.catalogue.stars import stellar_populations as populations
 
 MASSES = populations.MassFunction(**parameters.section("milky_way.toml", "mass_function"))
 EDGES = np.arange(-9.0, 14.05, 0.1)
 
 
+def systems_between(low, high):
+    """Number of systems of one main-sequence track from `low` to `high` Msun; it is 1 below 1 Msun."""
+    log_mass = np.linspace(np.log10(low), np.log10(high), 30)[None, :]
+    flat = np.zeros_like(log_mass)
+    track = populations.Tracks(np.ones(1), np.zeros(1), log_mass.size, log_mass, flat, flat, flat)
+    return populations.pieces_of(track, np.ones(1), MASSES, EDGES).number.sum()
+
+
 def test_stars_between_the_hydrogen_limit_and_the_sun():
     """Local density of stellar systems, Chabrier 2003: 0.07 - 0.08 pc^-3."""
-    assert populations.mass_below(MASSES, 1.0) == pytest.approx(0.075)
-    assert populations.mass_below(MASSES, 0.075) == 0.0
+    assert systems_between(0.075, 1.0) == pytest.approx(1.0)
+    assert systems_between(0.01, 0.0749) == 0.0
+    # Discs and halo together, white dwarfs left out; the bulge comes last.
+    galaxy = milky_way.milky_way()
+    pieces = galaxy.pieces.take(np.arange(galaxy.first[-1, 0]))
+    light = (pieces.track >= 0) & (pieces.log_mass.mean(0) < 0.0)
+    assert pieces.number[light].sum() == pytest.approx(0.075, rel=0.01)
 
 
 def test_masses_follow_the_broken_power_law():
     def law(m):
         return m**-1.3 if m < 0.5 else 0.5 * m**-2.3 if m < 1.0 else 0.5 * m**-2.5
 
-    norm = 0.075 / quad(law, 0.075, 1.0, points=[0.5])[0]
+    norm = 1.0 / quad(law, 0.075, 1.0, points=[0.5])[0]
     for low, high in ((0.1, 0.3), (0.3, 0.8), (0.8, 2.0), (2.0, 9.0)):
-        below = populations.mass_below(MASSES, [low, high])
-        assert below[1] - below[0] == pytest.approx(norm * quad(law, low, high, points=[0.5, 1.0])[0], rel=1e-6)
+        assert systems_between(low, high) == pytest.approx(norm * quad(law, low, high, points=[0.5, 1.0])[0], rel=1e-6)
 
 
 @given(st.floats(0.01, 100.0), st.floats(0.01, 100.0))
 def test_more_stars_are_below_a_larger_mass(m1, m2):
-    low, high = populations.mass_below(MASSES, sorted((m1, m2)))
-    assert 0.0 <= low <= high * (1 + 1e-12) < 0.1
+    low, high = (systems_between(0.005, mass) for mass in sorted((m1, m2)))
+    assert 0.0 <= low <= high * (1 + 1e-12) < 4.0 / 3.0
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +86,7 @@ def test_pieces_are_the_mass_function_cut_at_the_bins(tracks):
         own = found.number[found.track == k].sum()
         heaviest = 10 ** tracks.log_mass[k, -1]
         lightest = 10 ** tracks.log_mass[k, 0]
-        wanted = np.diff(populations.mass_below(MASSES, [lightest, heaviest]))[0] / MASSES.local * share[k]
+        wanted = systems_between(lightest, heaviest) * share[k]
         # But for the helium flash, and what is brighter or fainter than all bins.
         assert own == pytest.approx(wanted, rel=0.003)
     low, high = EDGES[found.bin], EDGES[found.bin + 1]
