@@ -21,7 +21,6 @@ _NO_CODE = {"requests", "notebooks"}
 _DATA = {".py", ".csv", ".toml"}
 # Libraries whose version can change a byte of a product.
 _LIBRARIES = (
-    "MeanStars",
     "astropy",
     "colossus",
     "dust_extinction",

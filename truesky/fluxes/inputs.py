@@ -115,7 +115,7 @@ def _stars(given: UserCurves) -> tuple[Library, dict[str, Origin], list[Origin]]
     """Stars, the request's files by key, and what each of its own dwarfs was made of."""
     if given.basel is None and not given.irtf:
         return templates.stellar_library(), {}, []
-    low, how, origins = stellar.table_file(), "Pecaut & Mamajek 2013, as MeanStars has them", {}
+    low, how, origins = stellar.TABLE, "Pecaut & Mamajek 2013", {}
     with _named("fluxes.stars"):
         library, infrared = stars_from_files.library(given.basel, given.irtf)
         if given.basel is not None:
@@ -272,7 +272,7 @@ def _galaxy_origin(template: int) -> Origin:
 
 def _star_origins(own: Sequence[Origin]) -> list[Origin]:
     """Of the stellar library; own : of its dwarfs, () = embedded."""
-    dwarfs = _origin("Pecaut & Mamajek 2013, as MeanStars has them", stellar.table_file())
+    dwarfs = _origin("Pecaut & Mamajek 2013", stellar.TABLE)
     first = [*own] or [dwarfs] * len(stellar.types().names)
     colours = _origin("Castelli & Kurucz 2003, as astroARIADNE has them", model_stars.TABLE)
     # Models go over into dwarfs; a request's own dwarfs stand for them, or lend them their infrared.

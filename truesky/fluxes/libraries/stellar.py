@@ -4,7 +4,8 @@ types       the mean dwarf sequence O9V .. M9V of Pecaut & Mamajek 2013: tempera
 spectra     a Planck spectrum a type, with absorption features, times a smooth curve that brings the colours
 planck      f_lambda of a black body
 normalised  mean f_lambda = 1 between 5450 and 5550 A
-table       the published table;  matching, corrected, shape: the steps, for other kinds of stars
+TABLE       file of the published table; table: its columns
+matching, corrected, shape: the steps, for other kinds of stars
 
 Metal-poor stars and giants take the spectrum of the dwarf of their temperature.
 """
@@ -12,7 +13,6 @@ Metal-poor stars and giants take the spectrum of the dwarf of their temperature.
 from __future__ import annotations
 
 import csv
-import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -52,6 +52,7 @@ _SERIES_LINES = 12
 _HYDROGEN_PEAK, _HYDROGEN_WIDTH = 9500.0, 0.3
 
 _FEATURES = Path(__file__).with_name("stellar_features.csv")
+TABLE = Path(__file__).with_name("dwarf_sequence.csv")
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +85,7 @@ class StellarTypes:
 
 
 def types() -> StellarTypes:
-    """The table of Pecaut & Mamajek 2013 (version 2022.04.16), O9V to M9V, as shipped by MeanStars."""
+    """The table of Pecaut & Mamajek 2013 (version 2022.04.16), O9V to M9V."""
     names, column = table(_FIRST, _LAST)
     bv, vk, hk = column["B-V"], column["V-Ks"], column["H-Ks"]
     h = hk - vk
@@ -105,27 +106,20 @@ def types() -> StellarTypes:
 
 def table(first: str, last: str) -> tuple[tuple[str, ...], dict[str, Float]]:
     """Spectral types from `first` to `last`, and the columns of the table of dwarfs by title, NaN where unknown."""
-    lines = table_file().read_text().splitlines()
-    titles = next(line for line in lines if line.startswith("SpT")).replace("#", " ").split()
-    rows = [
-        line.split()
-        for line in lines
-        if line and not line.startswith(("#", "SpT")) and len(line.split()) == len(titles)
-    ]
-    names = [row[0] for row in rows]
-    rows = rows[names.index(first) : names.index(last) + 1]
+    with TABLE.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    names = [row["SpT"] for row in rows]
+    kept = slice(names.index(first), names.index(last) + 1)
     columns = {
-        title: np.array([_number(row[k]) for row in rows])
-        for k, title in enumerate(titles)
-        if k not in (0, len(titles) - 1)
+        title: np.array([float(row[title] or "nan") for row in rows[kept]]) for title in rows[0] if title != "SpT"
     }
-    return tuple(row[0] for row in rows), columns
+    return tuple(names[kept]), columns
 
 
 def fingerprint() -> str:
     """Key of everything the spectra depend on."""
     responses = [array for name in _BANDS for array in (passbands.load(name).wavelength, passbands.load(name).response)]
-    return cache.content_key(code_key(__name__), table_file().read_bytes(), *responses)
+    return cache.content_key(code_key(__name__), TABLE.read_bytes(), *responses)
 
 
 def spectra(stars: StellarTypes, vega_wavelength: Float, vega_flux: Float) -> Float:
@@ -242,19 +236,3 @@ def shape(kind: str, wavelength: Float, centre: float, width: float) -> Float:
         lines = _RYDBERG / (centre**-2 - upper**-2)
         return np.asarray(np.exp(-0.5 * ((wavelength[:, None] - lines) / width) ** 2).max(1))
     raise BadInput(f"{_FEATURES.name}: kind {kind!r} is not line, band, edge or series")
-
-
-def _number(text: str) -> float:
-    """A number of the table; dots stand for unknown, a colon for uncertain."""
-    try:
-        return float(text.rstrip(":*"))
-    except ValueError:
-        return np.nan
-
-
-def table_file() -> Path:
-    """The published table; MeanStars itself, slow to import, is not loaded."""
-    spec = importlib.util.find_spec("MeanStars")
-    if spec is None or not spec.submodule_search_locations:
-        raise BadInput("MeanStars is not installed: its table of dwarf stars is needed")
-    return Path(spec.submodule_search_locations[0]) / "EEM_dwarf_UBVIJHK_colors_Teff.txt"
