@@ -1,4 +1,7 @@
-"""Nothing of ours adds up as a library of linear algebra does: that changes with threads and processor."""
+"""Published bytes are not sums of a library of linear algebra, which change with threads and processor.
+
+The validation and the reduction measure what is published; their results are the same up to rounding.
+"""
 
 import ast
 from pathlib import Path
@@ -6,7 +9,13 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-SOURCES = sorted(path for folder in ("lake_schema", "truesky") for path in (ROOT / folder).rglob("*.py"))
+MEASURE = [ROOT / "truesky" / folder for folder in ("reduction", "validation")]
+SOURCES = sorted(
+    path
+    for folder in ("lake_schema", "truesky")
+    for path in (ROOT / folder).rglob("*.py")
+    if not any(path.is_relative_to(folder) for folder in MEASURE)
+)
 # What numpy and scipy hand to BLAS or LAPACK.
 NAMES = {
     "dot", "vdot", "matmul", "matvec", "vecmat", "tensordot", "linalg", "convolve", "correlate", "cov", "corrcoef",
