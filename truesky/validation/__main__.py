@@ -3,7 +3,7 @@
 --lake LAKE   measures what the lake holds, by its published files alone, publishes the table `validation` of it and
               a report.html beside it. The exit status is 1 where a figure fails that is not known to.
 Without it the universe is drawn, and each figure that expectations.csv has an expectation of, or observed.csv an
-observation, is printed with it and with PASS or FAIL; near or far, where the number is remembered and gates nothing.
+observation, is printed with it and its verdict: pass, fail, or undecided if the expected number is only remembered.
 The exit status is 1 where one fails that its column known_to_fail gives no reason for. results.json holds the figures
 of the last full run.
 """
@@ -25,9 +25,9 @@ from lake_schema import command, user_files
 from lake_schema.errors import BadInput
 from lake_schema.store import layout, manifest, provenance
 from truesky.validation import checks
-from truesky.validation.lake.measure.rows import FAIL, UNDECIDED
 from truesky.validation.lake.suite import publishing
 from truesky.validation.model import universe
+from truesky.validation.verdicts import FAIL, UNDECIDED
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -7,11 +7,12 @@ report   as a table
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
+from truesky.validation.verdicts import AROUND, FAIL, LEAST, MOST, PASS, UNDECIDED, verdict
 
 # What follows from the models' own sources, and what surveys observed.
 _LISTS = (Path(__file__).with_name("expectations.csv"), Path(__file__).with_name("observed.csv"))
@@ -19,28 +20,48 @@ _LISTS = (Path(__file__).with_name("expectations.csv"), Path(__file__).with_name
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One expectation: what was found lies between two values.
+    """One figure and its expectation.
 
+    expected, tolerance : of the value that was `found`; kind : "around", "least" or "most", the latter with tolerance 0
+    group : of the expectation, "" = none
     known : why it is known to fail; empty where it has to pass
     gates : whether a failure is one of the whole; not where the expectation is itself remembered
     """
 
     name: str
     found: float
-    least: float
-    most: float
+    expected: float
+    tolerance: float
+    kind: str
     source: str
+    group: str = ""
     known: str = ""
     gates: bool = True
 
     @property
+    def least(self) -> float:
+        """Smallest value that is as expected."""
+        return -math.inf if self.kind == MOST else self.expected - self.tolerance
+
+    @property
+    def most(self) -> float:
+        """Largest value that is as expected."""
+        return math.inf if self.kind == LEAST else self.expected + self.tolerance
+
+    @property
     def passed(self) -> bool:
-        return self.least <= self.found <= self.most
+        """True if the value is as expected; the tolerance has room for its error."""
+        return verdict(self.found, 0.0, self.expected, self.tolerance, self.kind) == PASS
+
+    @property
+    def verdict(self) -> str:
+        """PASS or FAIL; UNDECIDED if the expectation is remembered."""
+        return (PASS if self.passed else FAIL) if self.gates else UNDECIDED
 
     @property
     def unexpected(self) -> bool:
         """Does it fail, and is not known to?"""
-        return self.gates and not self.passed and not self.known
+        return self.verdict == FAIL and not self.known
 
 
 def checks(figures: Mapping[str, float], errors: float = 0.0) -> list[Check]:
@@ -56,26 +77,24 @@ def read(path: Path, figures: Mapping[str, float], errors: float = 0.0) -> list[
     figures, errors : as of `checks`
     """
     found = []
-    with path.open(newline="") as file:
+    with path.open(newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
-            name, expected, tolerance = row["name"], float(row["expected"]), float(row["tolerance"])
+            name, expected, tolerance, kind = row["name"], float(row["expected"]), float(row["tolerance"]), row["kind"]
             if name not in figures:
                 continue
-            around = tolerance * (expected if row["kind"] == "relative" else 1.0)
-            least, most = expected - around, expected + around
-            if row["kind"] == "factor":
+            if kind == "relative":
+                tolerance *= abs(expected)
+            elif kind == "factor":
                 least, most = expected / tolerance, expected * tolerance
-            chance = max(float(row.get("errors") or 0.0), errors) * figures.get(f"{name}_error", 0.0)
-            least = -np.inf if row["kind"] == "most" else least - chance
-            most = np.inf if row["kind"] == "least" else most + chance
-            about = row["source"], row["known_to_fail"], row.get("confidence") != "M"
-            found.append(Check(name, figures[name], least, most, *about))
+                expected, tolerance = 0.5 * (least + most), 0.5 * (most - least)
+            tolerance += max(float(row.get("errors") or 0.0), errors) * figures.get(f"{name}_error", 0.0)
+            if kind in (LEAST, MOST):
+                expected, tolerance = expected + (tolerance if kind == MOST else -tolerance), 0.0
+            else:
+                kind = AROUND
+            about = row["source"], row.get("group") or "", row["known_to_fail"], row.get("confidence") != "M"
+            found.append(Check(name, figures[name], expected, tolerance, kind, *about))
     return found
-
-
-def _verdict(check: Check) -> str:
-    """A remembered number is neither passed nor failed."""
-    return ("PASS" if check.passed else "FAIL") if check.gates else ("near" if check.passed else "far ")
 
 
 def report(figures: Mapping[str, float], results: Sequence[Check]) -> list[str]:
@@ -83,11 +102,11 @@ def report(figures: Mapping[str, float], results: Sequence[Check]) -> list[str]:
     expected = {check.name for check in results}
     for name, value in figures.items():
         if name not in expected and not name.endswith("_error"):
-            print(f"     {name:34} {value:12,.4g}")
+            print(f"{'':9} {name:34} {value:12,.4g}")
     for check in results:
         error = f" +- {figures[check.name + '_error']:.2g}" if f"{check.name}_error" in figures else ""
-        verdict, span = _verdict(check), f"{check.least:.4g} .. {check.most:.4g}"
-        print(f"{verdict} {check.name:34} {check.found:12,.4g}{error:10} {span:20} {check.source}")
+        span = f"{check.least:.4g} .. {check.most:.4g}"
+        print(f"{check.verdict:9} {check.name:34} {check.found:12,.4g}{error:10} {span:20} {check.source}")
     failed = [check for check in results if not check.passed]
     print(f"{len(results) - len(failed)} of {len(results)} as expected")
     for check in (check for check in failed if check.gates):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from lake_schema.arrays import Float, Int
 from truesky.numerics.compiling import exact_jit
 
@@ -26,6 +28,31 @@ def counted(first: Int, pair: Int, place: Float, kind: Int, patch: Int, edge: Fl
                 while square < edge[k]:
                     k -= 1
                 sums[patch[i], patch[j], k, kind[i] + kind[j]] += 1.0
+
+
+@exact_jit
+def sum_products(first: Int, pair: Int, place: Float, value: Float, edge: Float, sums: Float) -> None:
+    """Number of pairs, sum of separations (rad) and sums of products of k kinds of values: sums[bin, 2 + k].
+
+    value : [n, k] at each place;  first, pair, place, edge : as of `counted`
+    """
+    last = edge.size - 1
+    for p in range(pair.shape[1]):
+        a, b = pair[0, p], pair[1, p]
+        for i in range(first[a], first[a + 1]):
+            for j in range(i + 1 if a == b else first[b], first[b + 1]):
+                dx, dy, dz = place[i, 0] - place[j, 0], place[i, 1] - place[j, 1], place[i, 2] - place[j, 2]
+                square = dx * dx + dy * dy + dz * dz
+                if square >= edge[last] or square < edge[0]:
+                    continue
+                k = last - 1
+                while square < edge[k]:
+                    k -= 1
+                own = sums[k]
+                own[0] += 1.0
+                own[1] += 2.0 * math.asin(0.5 * math.sqrt(square))
+                for kind in range(value.shape[1]):
+                    own[2 + kind] += value[i, kind] * value[j, kind]
 
 
 @exact_jit

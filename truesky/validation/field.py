@@ -93,10 +93,13 @@ def random(field: Field, n: int, *identity: int | str) -> tuple[Float, Int]:
     return sky.unit_vectors(ra, dec), np.repeat(field.patch, each)
 
 
-def spread(without: Float | Sequence[float]) -> Float:
-    """Standard error[...] of a figure; without : float[patch, ...] of it without each patch."""
+def spread(without: Float | Sequence[float], fewest: int = FEWEST) -> Float:
+    """Standard error[...] of a figure, NaN of fewer than `fewest` patches.
+
+    without : float[patch, ...] the figure without each patch;  fewest : patches that tell an error
+    """
     values = np.asarray(without, float)
-    if len(values) < FEWEST:
+    if len(values) < fewest:
         return np.full(values.shape[1:], np.nan)
     n = len(values)
     return np.asarray(np.sqrt((n - 1) / n * np.sum((values - values.mean(0)) ** 2, axis=0)))

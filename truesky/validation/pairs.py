@@ -1,6 +1,6 @@
 """Pairs of places on the sky within a separation: how many, and what their shears have in common.
 
-counted   of galaxies and of random places;  sheared : of galaxies with shear
+counted   of galaxies and of random places;  sheared : of galaxies with shear;  sum_products : of any values
 Sums      of either, with and without each patch of the sky
 thinned   rows that leave few enough pairs
 
@@ -16,7 +16,7 @@ import numpy as np
 from lake_schema import sky
 from lake_schema.arrays import Bool, Float, Int
 from truesky.randomness import rng
-from truesky.validation.lake.measure import compiled_pairs
+from truesky.validation import compiled_pairs
 
 # Pairs of places in neighbouring cubes that are looked at, at most: 3 s.
 MOST = 1e8
@@ -57,6 +57,32 @@ def sheared(ra: Float, dec: Float, shear: Float, patch: Int, edges: Float) -> Su
     sums, own = _empty(CHANNELS, edges, patch), (np.ascontiguousarray(frame[order]), shear[order].astype(float))
     compiled_pairs.sheared(first, pair, *own, patch[order].astype(np.int64), _chords(edges), sums)
     return _without(sums)
+
+
+def sum_products(place: Float, values: Float, edges: Float) -> tuple[Float, Float, Float]:
+    """Sums over pairs of places by separation.
+
+    Parameters
+    ----------
+    place : ndarray of float64, shape (n, 3)
+        Unit vectors.
+    values : ndarray of float64, shape (n, k)
+        Values of k kinds at each place.
+    edges : ndarray of float64, shape (b + 1,)
+        Edges of the bins of separation, rad, ascending.
+
+    Returns
+    -------
+    number, separation : ndarray of float64, shape (b,)
+        Number of pairs, and the sum of their separations in rad.
+    product : ndarray of float64, shape (k, b)
+        Sum of the products of the values at both ends.
+    """
+    order, first, pair = _cubes(place, edges[-1])
+    sums = np.zeros((len(edges) - 1, 2 + values.shape[1]))
+    ordered = np.ascontiguousarray(place[order]), np.ascontiguousarray(values[order], np.float64)
+    compiled_pairs.sum_products(first, pair, *ordered, _chords(edges), sums)
+    return sums[:, 0], sums[:, 1], sums[:, 2:].T
 
 
 def _without(sums: Float) -> Sums:

@@ -1,8 +1,9 @@
 """What non-linear theory expects of two points on the sky: shear, and galaxies of known bias.
 
 power                non-linear P(k) of matter;  linear : that of linear theory
+lensing_weight       share of the overdensity at a distance in the convergence of sources
 convergence          C_l of the convergence of sources at many distances
-galaxies             C_l of the numbers of galaxies
+Shells               numbers and bias of galaxies by distance;  galaxies : C_l of their numbers
 shear_correlations   xi+ and xi- of C_l;  correlation : w of C_l
 aperture             mean squares of the aperture mass and of its cross component, of xi+ and xi-
 
@@ -15,6 +16,7 @@ Ref: Smith et al. 2003, MNRAS 341, 1311, with the numbers of Takahashi et al. 20
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -73,31 +75,53 @@ def _today() -> Float:
     return found
 
 
-def convergence(ell: Float, chi: Float, weight: Float, of: Callable[[Float, float], Float] = power) -> Float:
+def lensing_weight(x: Float, chi: Float, weight: Float) -> Float:
+    """Convergence of sources for each Mpc/h of unit overdensity at x[n] Mpc/h.
+
+    chi, weight : float[s] of the sources, Mpc/h, and how many lie there
+    """
+    efficiency = np.maximum(1.0 - x[:, None] / chi, 0.0)
+    lens = 1.5 * cosmology.OMEGA_M / cosmology.HUBBLE_DISTANCE**2 * x * (1 + np.asarray(cosmology.redshift(x)))
+    return np.asarray(lens * np.sum(efficiency * weight, axis=1) / weight.sum())
+
+
+def convergence(
+    ell: Float, chi: Float, weight: Float, of: Callable[[Float, float], Float] = power, x: Float | None = None
+) -> Float:
     """C_l[n] of the convergence.
 
     ell : float[n];  chi, weight : float[s] of the sources, Mpc/h, and how many lie there;  of : P(k, z)
+    x   : float[m] distances that are summed over, Mpc/h, None = 100 up to the sources
     """
-    x = np.linspace(5.0, float(chi.max()) - 1.0, _STEPS)
-    z = np.asarray(cosmology.redshift(x))
-    efficiency = np.maximum(1.0 - x[:, None] / chi, 0.0)
-    lens = 1.5 * cosmology.OMEGA_M / cosmology.HUBBLE_DISTANCE**2 * x * (1 + z)
-    lens = lens * np.sum(efficiency * weight, axis=1) / weight.sum()
+    x = np.linspace(5.0, float(chi.max()) - 1.0, _STEPS) if x is None else x
+    z, lens = np.asarray(cosmology.redshift(x)), lensing_weight(x, chi, weight)
     rows = [(w / d) ** 2 * of((ell + 0.5) / d, float(at)) for w, d, at in zip(lens, x, z, strict=True)]
     return np.asarray(np.trapezoid(np.array(rows), x, axis=0))
 
 
-def galaxies(ell: Float, edges: Float, number: Float, bias: Float) -> Float:
-    """C_l[n] of galaxies.
+@dataclass(frozen=True, slots=True, eq=False)
+class Shells:
+    """Galaxies by comoving distance: float[s] middle and width of each shell, Mpc/h, and share / (Mpc/h) times bias."""
 
-    ell : float[n];  edges : float[s + 1] of shells, Mpc/h;  number, bias : float[s] of the galaxies in each
-    """
-    x, wide = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
-    share = number / number.sum() / wide * bias
+    chi: Float
+    wide: Float
+    weight: Float
+
+
+def shells(chi: Float, bias: Float, edges: Float) -> Shells:
+    """Galaxies at chi[n] Mpc/h with these biases[n], in shells with edges[s + 1] Mpc/h."""
+    number = np.histogram(chi, edges)[0].astype(float)
+    mean = np.histogram(chi, edges, weights=bias)[0] / np.maximum(number, 1.0)
+    wide = np.diff(edges)
+    return Shells(0.5 * (edges[1:] + edges[:-1]), wide, number / number.sum() / wide * mean)
+
+
+def galaxies(ell: Float, tracers: Shells, of: Callable[[Float, float], Float] = power) -> Float:
+    """C_l[n] of galaxies; ell : float[n];  tracers : the galaxies by distance;  of : P(k, z)"""
     total = np.zeros(len(ell))
-    for at, step, one in zip(x, wide, share, strict=True):
+    for at, step, one in zip(tracers.chi, tracers.wide, tracers.weight, strict=True):
         if one > 0.0:
-            total += step * (one / at) ** 2 * power((ell + 0.5) / at, float(cosmology.redshift(at)))
+            total += step * (one / at) ** 2 * of((ell + 0.5) / at, float(cosmology.redshift(at)))
     return total
 
 

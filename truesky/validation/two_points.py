@@ -16,9 +16,9 @@ import numpy as np
 
 from lake_schema import sky
 from lake_schema.arrays import Float, Int
-from truesky.validation.lake.measure import field as fields
-from truesky.validation.lake.measure import pairs
-from truesky.validation.lake.measure.field import Field
+from truesky.validation import field as fields
+from truesky.validation import pairs
+from truesky.validation.field import Field
 
 ARCMIN = np.radians(1.0 / 60.0)
 # Separations, rad, that all galaxies are taken for; of larger ones there are pairs enough of some of them.

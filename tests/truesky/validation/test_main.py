@@ -54,7 +54,7 @@ def test_what_is_known_to_fail_is_reported_with_its_reason(found, tmp_path, monk
     monkeypatch.setattr(checks, "_LISTS", (tmp_path / "list.csv",))
     assert __main__.main([]) == 0
     said = capsys.readouterr().out
-    assert "FAIL galaxies" in said
+    assert "fail      galaxies" in said
     assert "not: galaxies, known to fail: it was cloudy" in said
     found["galaxies"] = 20.5
     assert __main__.main([]) == 0
@@ -68,7 +68,9 @@ def test_remembered_numbers_gate_nothing(found, tmp_path, monkeypatch, capsys):
         monkeypatch.setattr(checks, "_LISTS", (tmp_path / "list.csv",))
         assert __main__.main([]) == status
     found["galaxies"] = 21.0
+    capsys.readouterr()
     assert __main__.main([]) == 0
+    assert "pass      galaxies" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

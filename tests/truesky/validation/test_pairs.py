@@ -7,9 +7,9 @@ import pytest
 
 from lake_schema import sky
 from lake_schema.ids import GENERATION_ORDER
-from truesky.validation.lake.measure import field as fields
-from truesky.validation.lake.measure import pairs, two_points
-from truesky.validation.lake.measure.two_points import ARCMIN, Measured
+from truesky.validation import field as fields
+from truesky.validation import pairs, two_points
+from truesky.validation.two_points import ARCMIN, Measured
 
 EDGES = np.radians([0.01, 0.1, 0.3, 0.8])
 
@@ -99,3 +99,16 @@ def test_wide_bins_are_of_their_narrow_ones():
     wide = two_points.grouped(fine, edges[[1, 3, 4]])
     assert wide.value.tolist() == [[2.5, 7.0]]
     assert wide.number.tolist() == [8.0, 5.0]
+
+
+def test_products_of_values_are_summed_by_separation():
+    ra, dec = around(np.random.default_rng(8), 0.0, 89.8)
+    values = np.random.default_rng(9).normal(size=(150, 2))
+    number, separation, product = pairs.sum_products(sky.unit_vectors(ra, dec), values, EDGES)
+    one, other = np.triu_indices(150, 1)
+    apart = np.radians(sky.separation(ra[one], dec[one], ra[other], dec[other]))
+    assert number.tolist() == np.histogram(apart, EDGES)[0].tolist()
+    assert separation == pytest.approx(np.histogram(apart, EDGES, weights=apart)[0], rel=1e-9)
+    for kind in range(2):
+        both = values[one, kind] * values[other, kind]
+        assert product[kind] == pytest.approx(np.histogram(apart, EDGES, weights=both)[0], abs=1e-9)

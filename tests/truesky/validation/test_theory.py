@@ -5,7 +5,7 @@ import pytest
 from scipy.special import j0, jv
 
 from truesky.fluxes import cosmology
-from truesky.validation.model import theory
+from truesky.validation import theory
 
 ARCMIN = np.radians(1 / 60)
 
@@ -57,6 +57,6 @@ def test_sources_at_two_distances_are_between_those_at_each():
 
 
 def test_galaxies_of_twice_the_bias_cluster_four_times_as_much():
-    edges, ell = np.array([1500.0, 1600.0, 1700.0]), np.array([300.0])
-    one, two = (theory.galaxies(ell, edges, np.array([1.0, 2.0]), np.full(2, bias)) for bias in (1.0, 2.0))
+    chi, edges, ell = np.array([1510.0, 1620.0, 1690.0]), np.array([1500.0, 1600.0, 1700.0]), np.array([300.0])
+    one, two = (theory.galaxies(ell, theory.shells(chi, np.full(3, bias), edges)) for bias in (1.0, 2.0))
     assert two == pytest.approx(4 * one, rel=1e-12, abs=0.0)

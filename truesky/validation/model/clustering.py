@@ -28,12 +28,13 @@ from truesky.catalogue.halos.population import Population
 from truesky.catalogue.matter import convergence, density_box, lightcone
 from truesky.catalogue.matter.density_box import Box
 from truesky.fluxes import cosmology
-from truesky.numerics import sums
+from truesky.validation import pairs, theory
+from truesky.validation.theory import Shells
 
 # Blocks are cells of this order (53.7 deg2), in pixels of 6.9 arcmin; small separations are counted in one piece of
 # each, in pixels of 0.9 arcmin: DEPTH orders finer.
 BLOCK_ORDER, PIECE_ORDER, DEPTH = 3, 6, 6
-_ROWS, _SPARSE = 512, 16
+_SPARSE = 16
 # Nodes of separations: of the pairs of a bin, and of w where it is summed.
 _NODES, _THETAS = 2000, 300
 # Shells in which the redshift distribution and the bias are taken, Mpc/h, and multipoles.
@@ -171,7 +172,7 @@ class Pairs:
 
     def left(self, w: Float) -> tuple[Float, Float]:
         """w[m] at the nodes -> (w[bin], what is left of it[bin] where each pixel is held against the block's mean)."""
-        mean, pixel, every = (sums.product(pairs, w) for pairs in (self.of_bin, self.of_pixel, self.of_all))
+        mean, pixel, every = (shares @ w for shares in (self.of_bin, self.of_pixel, self.of_all))
         return mean, mean - 2.0 * pixel + every
 
 
@@ -182,26 +183,19 @@ def correlation(blocks: Sequence[tuple[int, Sequence[Tracers | Float]]], order: 
     bins, kinds = edges.size - 1, delta.shape[1]
     product, number, angle = np.zeros((len(blocks), kinds, bins)), np.zeros((len(blocks), bins)), np.zeros(bins)
     for row, (cell, _) in enumerate(blocks):
-        place = _vectors(order, cell)
-        for first in range(0, len(place), _ROWS):
-            part = slice(first, first + _ROWS)
-            which, theta = _separations(place[part], place, edges)
-            kept = np.flatnonzero((which >= 0) & (which < bins))
-            number[row] += np.bincount(which[kept], minlength=bins)
-            angle += np.bincount(which[kept], theta[kept], bins)
-            for kind in range(kinds):
-                both = (delta[row, kind, part, None] * delta[row, kind][None, :]).ravel()[kept]
-                product[row, kind] += np.bincount(which[kept], both, bins)
-    pairs = _pairs(order, blocks[0][0], edges)
+        number[row], apart, product[row] = pairs.sum_products(_vectors(order, cell), delta[row].T, np.radians(edges))
+        angle += np.degrees(apart)
     product += chance[:, :, None] * number[:, None]
     scatter = np.std(product / number[:, None], axis=0, ddof=1) / np.sqrt(len(blocks))
     total = product.sum(0) / number.sum(0)
-    return [Correlation(angle / number.sum(0), w, error, pairs) for w, error in zip(total, scatter, strict=True)]
+    separations = _pairs(order, blocks[0][0], edges)
+    theta = angle / number.sum(0)
+    return [Correlation(theta, w, error, separations) for w, error in zip(total, scatter, strict=True)]
 
 
 def _separations(some: Float, every: Float, edges: Float) -> tuple[Int, Float]:
     """Bin of the separation of each pair, -1 or the number of bins outside; and the separation, deg."""
-    theta = np.degrees(np.arccos(np.clip(sums.product(some, every.T), -1.0, 1.0))).ravel()
+    theta = np.degrees(np.arccos(np.clip(some @ every.T, -1.0, 1.0))).ravel()
     return np.searchsorted(edges, theta) - 1, theta
 
 
@@ -240,30 +234,17 @@ def _vectors(order: int, cell: int) -> Float:
     return sky.unit_vectors(*sky.cell_centres(order + DEPTH, (cell << 2 * DEPTH) + np.arange(1 << 2 * DEPTH)))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Shells:
-    """Comoving distances[s] and widths, Mpc/h, share of the tracers a Mpc/h times their bias and growth."""
-
-    chi: Float
-    wide: Float
-    weight: Float
-
-
 def shells(everything: Tracers, near: float, far: float) -> Shells:
-    """The tracers' own redshifts and biases."""
+    """The tracers between two redshifts, with their bias times growth, in shells of equal width."""
     first, last = (float(cosmology.comoving_distance(z)) for z in (near, far))
     edges = np.linspace(first, last, int(np.ceil((last - first) / _SHELL)) + 1)
-    number = np.histogram(everything.chi, edges)[0]
-    x = np.histogram(everything.chi, edges, weights=everything.x)[0] / number
-    wide = np.diff(edges)
-    return Shells(0.5 * (edges[1:] + edges[:-1]), wide, number / number.sum() / wide * x)
+    return theory.shells(everything.chi, everything.x, edges)
 
 
 def limber(seen: Shells, found: Correlation, power: Callable[[Float], Float]) -> tuple[Float, Float]:
     """w of a power P(k) over the pairs of each bin, and what is left of it in blocks whose means are their own."""
     ell = np.geomspace(1.0, _ELL_MOST, 400)
-    k = (ell[:, None] + 0.5) / seen.chi
-    c_l = np.sum(seen.wide * (seen.weight / seen.chi) ** 2 * power(k.ravel()).reshape(k.shape), 1)
+    c_l = theory.galaxies(ell, seen, lambda k, _: power(k))
     every = np.arange(1, _ELL_MOST + 1)
     # Beyond the multipoles of the smallest separation the sum ends softly.
     weight = (2 * every + 1) / (4 * np.pi) * np.interp(np.log(every), np.log(ell), c_l)

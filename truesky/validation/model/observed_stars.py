@@ -6,7 +6,6 @@ checks    of these; rows of confidence M are remembered numbers, which gate noth
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -19,13 +18,11 @@ from truesky.catalogue.stars.stellar_populations import DWARF, GIANT, WHITE_DWAR
 from truesky.fluxes import passbands
 from truesky.fluxes.libraries import model_stars, templates
 from truesky.fluxes.libraries.vega import vega_magnitude
-from truesky.numerics import sums
 from truesky.randomness.rng import stream
-from truesky.validation.checks import Check
+from truesky.validation.checks import Check, read
 from truesky.validation.model import star_counts
 
 LIST = Path(__file__).with_name("observed_stars.csv")
-_REMEMBERED = "a remembered number gates nothing"
 _BULGE = ((1, -4), (10, -10))
 # Msun.
 _WHITE_DWARF_MASS = 0.6
@@ -55,13 +52,8 @@ def figures(universe: stars.StarModel, dust: Float32, step: int = 61) -> dict[st
 def checks(found: Mapping[str, float]) -> dict[str, list[Check]]:
     """Every row of the list by its group."""
     groups: dict[str, list[Check]] = {}
-    with LIST.open(newline="", encoding="utf-8") as file:
-        for row in csv.DictReader(file):
-            expected, around = float(row["expected"]), float(row["tolerance"])
-            around *= abs(expected) if row["kind"] == "relative" else 1.0
-            known = row["known_to_fail"] or (_REMEMBERED if row["confidence"] == "M" else "")
-            check = Check(row["name"], found[row["name"]], expected - around, expected + around, row["source"], known)
-            groups.setdefault(row["group"], []).append(check)
+    for check in read(LIST, found):
+        groups.setdefault(check.group, []).append(check)
     return groups
 
 
@@ -118,7 +110,7 @@ def colours(universe: stars.StarModel, area: float = 40.0) -> dict[str, float]:
     for name in ("sdss_g", "sdss_r", "twomass_h"):
         band = passbands.load(name)
         seen = library.flux[:, band.first : band.first + len(band.wavelength)].astype(float)
-        each = sums.product(seen, passbands.weights(band))
+        each = seen @ passbands.weights(band)
         light[name] = (found.frac * each[found.sed]).sum(0)
     mag_h = drawn.m_h + 5.0 * np.log10(drawn.distance) - 5.0 + vega_magnitude(passbands.load("twomass_h"))
     mag_r = mag_h - 2.5 * np.log10(light["sdss_r"] / light["twomass_h"])

@@ -18,30 +18,25 @@ from truesky.catalogue.galaxies.lensing import Planes
 from truesky.catalogue.matter import convergence, density_box, lightcone
 from truesky.catalogue.matter.density_box import Box
 from truesky.fluxes import cosmology
+from truesky.validation import theory as theories
 from truesky.validation.model.clustering import Tracers
 
 # Patches of the sky whose scatter gives the error of a mean: cells of this nside.
 _PATCHES = 2
 _STEPS = 1500
 _SIGHT_NSIDE = 128
-_LENS = 1.5 * cosmology.OMEGA_M / cosmology.HUBBLE_DISTANCE**2
 # Rings about halos, deg, and directions.
 RINGS, _DIRECTIONS = (0.1, 0.2, 0.4, 0.8), 8
 
 
 def theory(ell: Float, chi: float) -> Float:
     """C_l of the convergence of sources at chi Mpc/h, linear theory, by Limber's approximation."""
-    x, weight = _weight(chi)
-    k = (ell[:, None] + 0.5) / x
-    power = density_box.linear_power(k.ravel()).reshape(k.shape)
-    return np.asarray(np.trapezoid((weight / x) ** 2 * power, x, axis=1))
+    return theories.convergence(ell, np.array([chi]), np.ones(1), theories.linear, _distances(chi))
 
 
-def _weight(chi: float) -> tuple[Float, Float]:
-    """Distances[n] and what the overdensity of z = 0 counts for there, of sources at chi."""
-    x = np.linspace(2.0, chi - 0.5, _STEPS)
-    z = cosmology.redshift(x)
-    return x, _LENS * x * (1.0 - x / chi) * (1.0 + z) * density_box.growth(z)
+def _distances(chi: float) -> Float:
+    """Distances[n] that linear theory is summed over, Mpc/h, up to sources at chi."""
+    return np.linspace(2.0, chi - 0.5, _STEPS)
 
 
 def bands(power: Float, chi: float, edges: Sequence[int]) -> Float:
@@ -110,7 +105,8 @@ def sight_rms(box: Box, redshifts: Sequence[float]) -> list[tuple[float, float]]
     power = density_box.linear_power(k) * convergence.window(box.model.cell, 1, k)
     inside, found = np.trapezoid(k * power / (2 * np.pi), k), []
     for plane, far in zip(kappa, chi, strict=True):
-        x, weight = _weight(float(far))
+        x = _distances(float(far))
+        weight = theories.lensing_weight(x, np.array([far]), np.ones(1)) * density_box.growth(cosmology.redshift(x))
         found.append((float(plane.std(dtype=float)), float(np.sqrt(np.trapezoid(weight**2, x) * inside))))
     return found
 
@@ -124,7 +120,8 @@ def skipping_rms(box: Box, redshift: float, step: float) -> float:
         z = cosmology.redshift(chi)
         growths = np.full(len(direction), density_box.growth(z))
         place, _ = lightcone.box_cells(box, turned, direction, np.full(len(direction), chi))
-        kappa += step * _LENS * chi * (1.0 - chi / far) * (1.0 + z) * density_box.overdensity(box, place, growths)
+        lens = float(theories.lensing_weight(np.array([chi]), np.array([far]), np.ones(1))[0])
+        kappa += step * lens * density_box.overdensity(box, place, growths)
     return float(kappa.std())
 
 

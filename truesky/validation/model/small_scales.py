@@ -11,7 +11,6 @@ Ref  : Limber 1953, ApJ 117, 134; Peebles 1980, The Large-Scale Structure of the
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 from scipy.special import gamma
 
 from lake_schema import sky
@@ -21,6 +20,7 @@ from truesky.catalogue.halos.luminosity_function import Volume
 from truesky.catalogue.halos.population import Population
 from truesky.fluxes import cosmology
 from truesky.randomness.rng import stream
+from truesky.validation import pairs
 from truesky.validation.model import clustering
 
 # Projected separations, Mpc/h; the galaxies' redshifts and luminosities; the power law's length, Mpc/h, and slope.
@@ -47,7 +47,7 @@ def figures(universe: Population, count: int) -> dict[str, float]:
     low, high = (float(cosmology.comoving_distance(z)) for z in (NEAR, FAR))
     theta = EDGES / (0.75 * (high**4 - low**4) / (high**3 - low**3))
     cells = ((np.arange(count) + 0.31) * (12 << 2 * ORDER) / count).astype(int).tolist()
-    pairs, chance, number, chi = np.zeros((count, 4)), np.zeros((count, 4)), np.zeros(count), []
+    found_pairs, chance, number, chi = np.zeros((count, 4)), np.zeros((count, 4)), np.zeros(count), []
     for row, cell in enumerate(cells):
         found = clustering.tracers(universe, ORDER, cell)
         z = universe.halos.distances.redshift(found.chi)
@@ -55,11 +55,11 @@ def figures(universe: Population, count: int) -> dict[str, float]:
         found = found.part(bright & (found.chi > low) & (found.chi < high))
         number[row] = found.chi.size
         chi.append(found.chi)
-        pairs[row] = _pairs(found.ra, found.dec, theta)
+        found_pairs[row] = _pairs(found.ra, found.dec, theta)
         _, ra, dec = sky.random_in_cell(ORDER, cell, _RANDOM, stream(universe.seed, "small_scales", cell))
         chance[row] = _pairs(ra, dec, theta) / _RANDOM**2
     expected = chance.mean(0) * number.mean() ** 2
-    ratio = (pairs / expected - 1.0) / power_law(np.concatenate(chi), theta)
+    ratio = (found_pairs / expected - 1.0) / power_law(np.concatenate(chi), theta)
     names = [f"w_m20_{edge:g}" for edge in EDGES[:-1]]
     error = ratio.std(0, ddof=1) / np.sqrt(count)
     return {
@@ -70,8 +70,8 @@ def figures(universe: Population, count: int) -> dict[str, float]:
 
 def _pairs(ra: Float, dec: Float, theta: Float) -> Float:
     """Ordered pairs in each bin of separation, edges theta in rad."""
-    tree = cKDTree(sky.unit_vectors(ra, dec))
-    return np.asarray(np.diff(tree.count_neighbors(tree, 2.0 * np.sin(0.5 * theta))), float)
+    same = np.zeros(ra.size, np.int64)
+    return 2.0 * pairs.counted(sky.unit_vectors(ra, dec), same, same, theta).total[0]
 
 
 def power_law(chi: Float, theta: Float) -> Float:

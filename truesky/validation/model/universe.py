@@ -29,6 +29,7 @@ from truesky.fluxes.libraries import rest_grid, templates
 from truesky.numerics import cache
 from truesky.request.schema import Universe
 from truesky.validation.model import census, clustering, observed, pictures, shear, small_scales, star_counts
+from truesky.validation.theory import Shells
 
 SEED = 7
 POWER_EDGES = np.array([0.02, 0.05, 0.10, 0.15, 0.20])
@@ -149,7 +150,7 @@ def counted(size: Size) -> tuple[dict[str, float], census.Census]:
 
 
 def compared(
-    found: clustering.Correlation, of: clustering.Shells, power: Callable[[Float], Float]
+    found: clustering.Correlation, of: Shells, power: Callable[[Float], Float]
 ) -> tuple[Float, Float, Float, Float]:
     """theta, w, its error, and Limber's: the mean of a block takes as much from what is found as from that."""
     expected, left = clustering.limber(of, found, power)

@@ -19,7 +19,7 @@ from truesky.catalogue.halos.population import Cells
 from truesky.catalogue.matter import density_box
 from truesky.fluxes import cosmology, sources
 from truesky.request.schema import Universe
-from truesky.validation.model import theory
+from truesky.validation import theory
 
 pytestmark = pytest.mark.nightly
 

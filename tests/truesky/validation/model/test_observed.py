@@ -18,8 +18,8 @@ from truesky.catalogue.galaxies import high_redshift
 from truesky.catalogue.halos import quenching
 from truesky.validation import __main__, checks
 from truesky.validation.lake.catalogues import observed_sky
-from truesky.validation.lake.measure.rows import FAIL, PASS
 from truesky.validation.model import mean_sky, observed
+from truesky.validation.verdicts import FAIL, PASS
 
 LIST = Path(checks.__file__).with_name("observed.csv")
 # Cells that tell a wrong recipe.

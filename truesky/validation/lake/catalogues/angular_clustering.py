@@ -16,14 +16,13 @@ from lake_schema.arrays import Array, Bool, Float
 from lake_schema.store import read
 from truesky.catalogue.halos import matching
 from truesky.fluxes import cosmology
-from truesky.validation import checks
-from truesky.validation.lake.measure import field as fields
-from truesky.validation.lake.measure import two_points
-from truesky.validation.lake.measure.field import Field
-from truesky.validation.lake.measure.rows import Place, Row, not_applicable
+from truesky.validation import checks, theory, two_points
+from truesky.validation import field as fields
+from truesky.validation.field import Field
+from truesky.validation.lake.measure.rows import Place, Row, not_applicable, row_of_check
 from truesky.validation.lake.measure.seen import Result
-from truesky.validation.lake.measure.two_points import ARCMIN, Measured
-from truesky.validation.model import observed, small_scales, theory
+from truesky.validation.model import observed, small_scales
+from truesky.validation.two_points import ARCMIN, Measured
 
 NAME = "clustering"
 SOURCE = "Limber's approximation with the bias of the galaxies' halos (Tinker et al. 2010, ApJ 724, 878)"
@@ -112,9 +111,7 @@ def expected(
     chi, halos = np.asarray(cosmology.comoving_distance(z)), matching.masses()
     bias = halos.at(halos.bias, z, mass)
     edges = np.arange(chi.min() * 0.999, chi.max() + _SHELL, _SHELL)
-    number = np.histogram(chi, edges)[0].astype(float)
-    mean = np.histogram(chi, edges, weights=bias)[0] / np.maximum(number, 1.0)
-    c_l = theory.galaxies(theory.ELL, edges, number, mean)
+    c_l = theory.galaxies(theory.ELL, theory.shells(chi, bias, edges))
     curve = np.geomspace(EDGES[0] * ARCMIN, np.radians(20.0), 80)
     w = theory.correlation(curve, theory.ELL, c_l)
     # A field's own mean hides what all of its pairs have in common.
@@ -142,10 +139,8 @@ def _luminous(columns: Mapping[str, Array], field: Field, deepest: float) -> lis
     error = dict(zip(names, (found.error[0] / law).tolist(), strict=True))
     rows = []
     for check in checks.checks(value):
-        middle, half = 0.5 * (check.least + check.most), 0.5 * (check.most - check.least)
         note = f"{many} galaxies of M_r - 5 log h < -20 at 0.4 < z < 0.6, from {check.name[6:]} Mpc/h on"
-        rows.append(Row(NAME, check.name, Place(), check.found, error[check.name], middle, half, "", check.source,
-                        note=note, known=check.known))  # fmt: skip
+        rows.append(row_of_check(NAME, check, error[check.name], note))
     return rows
 
 

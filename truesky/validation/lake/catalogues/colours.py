@@ -17,8 +17,8 @@ from lake_schema.arrays import Array, Float, Int
 from lake_schema.store import read
 from truesky.fluxes import band_fluxes, passbands, sources
 from truesky.randomness import rng
-from truesky.validation.lake.measure import field as fields
-from truesky.validation.lake.measure.field import Field
+from truesky.validation import field as fields
+from truesky.validation.field import Field
 from truesky.validation.lake.measure.rows import Place, Row, not_applicable
 from truesky.validation.lake.measure.seen import Result
 from truesky.validation.model import observed

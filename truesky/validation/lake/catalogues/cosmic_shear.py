@@ -14,13 +14,12 @@ import numpy as np
 from lake_schema.arrays import Array, Float
 from lake_schema.store import read
 from truesky.fluxes import cosmology
-from truesky.validation.lake.measure import field as fields
-from truesky.validation.lake.measure import two_points
-from truesky.validation.lake.measure.field import Field
+from truesky.validation import field as fields
+from truesky.validation import theory, two_points
+from truesky.validation.field import Field
 from truesky.validation.lake.measure.rows import Place, Row, not_applicable
 from truesky.validation.lake.measure.seen import Result
-from truesky.validation.lake.measure.two_points import ARCMIN, Measured
-from truesky.validation.model import theory
+from truesky.validation.two_points import ARCMIN, Measured
 
 NAME = "shear"
 SOURCE = "non-linear theory (Takahashi et al. 2012, ApJ 761, 152) by Limber's approximation"

@@ -14,15 +14,15 @@ import numpy as np
 from lake_schema.arrays import Float, Int
 from lake_schema.store import read
 from truesky.validation import checks
-from truesky.validation.lake.measure import field as fields
-from truesky.validation.lake.measure.rows import AROUND, LEAST, MOST, Place, Row, not_applicable
+from truesky.validation import field as fields
+from truesky.validation.lake.measure.rows import Place, Row, not_applicable, row_of_check
 from truesky.validation.lake.measure.seen import Result
 from truesky.validation.model import observed
 from truesky.validation.model.observed import Sky
 
 NAME = "observed"
-# Patches that are left out in turn.
-_PATCHES = 8
+# Patches that are left out in turn, and the fewest that tell an error.
+_PATCHES, _FEWEST = 8, 4
 # Counts to a magnitude, i, r or I_E; how much fainter in I_E a galaxy of it may be; depth that all others want, and
 # by how much a catalogue's faintest galaxy may fall short of its limit.
 _LIMIT = re.compile(r"(?:log_)?(?:z_)?(?:i|r|vis)_([0-9.]+)")
@@ -78,14 +78,7 @@ def compared(seen: Sky, cell: Int) -> list[Row]:
             why = f"{check.name} wants galaxies to I_E = {needed:g}; 99 % are brighter than {deepest:.2f}"
             out.append(replace(not_applicable(NAME, Place(), why, check.source), quantity=check.name))
             continue
-        middle, half, kind = 0.5 * (check.least + check.most), 0.5 * (check.most - check.least), AROUND
-        if math.isinf(half):
-            kind = LEAST if math.isfinite(check.least) else MOST
-            middle, half = (check.least if kind == LEAST else check.most), 0.0
-        note = "" if check.gates else "a remembered number: it decides nothing"
-        error = errors.get(check.name, math.nan) if check.gates else math.nan
-        out.append(Row(NAME, check.name, Place(), check.found, error, middle, half, "", check.source, kind, note,
-                       known=check.known))  # fmt: skip
+        out.append(row_of_check(NAME, check, errors.get(check.name, math.nan), ""))
     return out
 
 
@@ -103,7 +96,7 @@ def _groups(cell: Int) -> list[Int]:
 def _errors(seen: Sky, cell: Int) -> dict[str, float]:
     """Standard error by figure; none where there are too few cells to tell."""
     cells, groups = np.unique(cell), _groups(cell)
-    if len(groups) < 4:
+    if len(groups) < _FEWEST:
         return {}
     found = []
     for group in groups:
@@ -114,11 +107,5 @@ def _errors(seen: Sky, cell: Int) -> dict[str, float]:
             seen.ultraviolet[kept], seen.area * (1.0 - len(group) / len(cells)), seen.quasars,
         )  # fmt: skip
         found.append(observed.figures(part))
-    n = len(groups)
-    errors = {}
-    for name in found[0]:
-        values = np.array([each.get(name, math.nan) for each in found])
-        error = float(np.sqrt((n - 1) * np.mean((values - values.mean()) ** 2)))
-        if math.isfinite(error) and error > 0.0:
-            errors[name] = error
-    return errors
+    errors = {name: float(fields.spread([each.get(name, math.nan) for each in found], _FEWEST)) for name in found[0]}
+    return {name: error for name, error in errors.items() if math.isfinite(error) and error > 0.0}

@@ -11,7 +11,8 @@ from lake_schema import sky
 from lake_schema.arrays import Float
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store import read
-from truesky.validation.lake.measure.rows import LEAST, Place, Row, not_applicable
+from truesky.validation.lake.measure.rows import Place, Row, not_applicable
+from truesky.validation.verdicts import LEAST
 
 NAME = "requirement"
 SOURCE = "requirements named by Serrano et al. 2024"

@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 
 from lake_schema.arrays import Float
-from truesky.numerics import sums
-from truesky.validation.lake.measure.rows import MOST, Row
+from truesky.validation.lake.measure.rows import Row
 from truesky.validation.lake.measure.seen import Check, Seen, wants_stars
+from truesky.validation.verdicts import MOST
 
 SOURCE = "Serrano et al. 2024, app. C: below 1 mas rms; ground cameras 5 mas"
 # mas: of the mean, and of what a linear term brings to the edge of the detector.
@@ -57,14 +57,14 @@ def fitted(off: Float, noise: Float, u: Float, v: Float, place: Float) -> tuple[
     kept = np.abs(off - np.median(off)) < _CLIP * _spread(off)
     for _ in range(4):
         root = 1.0 / np.hypot(noise, 0.5 * _spread((off - np.median(off))[kept]))
-        inverse = sums.least_squares(matrix[kept] * root[kept, None], np.eye(int(kept.sum())))
-        solution = (inverse * (off[kept] * root[kept])).sum(axis=1)
-        left = off - (matrix * solution).sum(axis=1)
+        inverse = np.linalg.pinv(matrix[kept] * root[kept, None])
+        solution = inverse @ (off[kept] * root[kept])
+        left = off - matrix @ solution
         kept = np.abs(left) < _CLIP * max(_spread(left[kept]), 1e-9)
     freedom = max(int(kept.sum()) - matrix.shape[1], 1)
     scale = float(((left[kept] * root[kept]) ** 2).sum()) / freedom
     error = np.sqrt((inverse[:3] ** 2).sum(axis=1) * scale)
-    return np.asarray(solution[:3], float), error, (matrix[:, 3:] * solution[3:]).sum(axis=1)
+    return np.asarray(solution[:3], float), error, matrix[:, 3:] @ solution[3:]
 
 
 def _spread(values: Float) -> float:

@@ -12,8 +12,9 @@ import sep
 
 from lake_schema.arrays import Bool, Float
 from truesky.validation.lake.measure import masks
-from truesky.validation.lake.measure.rows import LEAST, Row, not_applicable
+from truesky.validation.lake.measure.rows import Row, not_applicable
 from truesky.validation.lake.measure.seen import Check, Seen, wants_blank
+from truesky.validation.verdicts import LEAST
 
 SOURCE = (
     "sep (Barbary 2016) as SourceExtractor: 5 pixels above 1.5 sigma after a filter of the PSF's width, not deblended"

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from truesky.validation.lake.measure.rows import LEAST, Row
+from truesky.validation.lake.measure.rows import Row
 from truesky.validation.lake.measure.seen import Check, Seen, wants_blank
+from truesky.validation.verdicts import LEAST
 
 SOURCE = "requirements named by Serrano et al. 2024: NISP 24 AB (point, 5 sigma), VIS S/N 10 at 24.5 (extended)"
 # Exposures of a place, in the reference sequence.

@@ -11,7 +11,6 @@ from dataclasses import replace
 import numpy as np
 
 from lake_schema.arrays import Bool, Float
-from truesky.numerics import sums
 from truesky.validation.lake.measure import effective
 from truesky.validation.lake.measure.rows import Row, not_applicable
 from truesky.validation.lake.measure.seen import Check, Seen, wants_stars
@@ -70,8 +69,8 @@ def _line(off: Float, error: Float, mag: Float, known: Bool) -> tuple[Float, Flo
         kept = known & (np.abs(left - np.median(left[known])) < 5.0 * spread)
         weight = 1.0 / (error[kept] ** 2 + spread**2)
         matrix = np.stack([np.ones(kept.sum()), faint[kept]], axis=1)
-        inverse = sums.least_squares(matrix * np.sqrt(weight)[:, None], np.eye(len(matrix)))
-        line = (inverse * (np.sqrt(weight) * off[kept])).sum(axis=1)
+        inverse = np.linalg.pinv(matrix * np.sqrt(weight)[:, None])
+        line = inverse @ (np.sqrt(weight) * off[kept])
         spread = _spread((off - line[0] - line[1] * faint)[kept])
     return line, np.sqrt((inverse**2).sum(axis=1)), kept
 

@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 
-from truesky.validation.lake.measure.rows import MOST, Row
+from truesky.validation.lake.measure.rows import Row
 from truesky.validation.lake.measure.seen import Check, Seen, wants_stars
+from truesky.validation.verdicts import MOST
 
 SOURCE = 'PSFFWHM of the header; VIS: McCracken et al. 2025 (0.16"), requirement e < 0.15 (Cropper et al. 2016)'
 # Of the FWHM over the header's; and of the ellipticity (a^2 - b^2) / (a^2 + b^2) in space.

@@ -9,8 +9,9 @@ import numpy as np
 import scipy.stats
 
 from lake_schema.arrays import Array, Float
-from truesky.validation.lake.measure.rows import MOST, Row
+from truesky.validation.lake.measure.rows import Row
 from truesky.validation.lake.measure.seen import Check, Seen
+from truesky.validation.verdicts import MOST
 
 SOURCE = "chi^2 with NG - 2 degrees of freedom (Kubik et al. 2016, PASP 128, 104504)"
 # Of the middle half of the distribution, over what is expected; a rounded chi^2 tells it to a part of one.

@@ -6,8 +6,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from lake_schema.arrays import Bool, Float
-from truesky.validation.lake.measure.rows import LEAST, MOST, Row, not_applicable
+from truesky.validation.lake.measure.rows import Row, not_applicable
 from truesky.validation.lake.measure.seen import Check, Seen
+from truesky.validation.verdicts import LEAST, MOST
 
 SOURCE = "part of a point's light in its brightest pixel, from the frame's own fainter stars; SATURATE of the header"
 # Times the full well from which a star must be full, and up to which it must not.

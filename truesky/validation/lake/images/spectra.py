@@ -15,8 +15,9 @@ import numpy as np
 import pyarrow.compute as pc
 
 from lake_schema.arrays import Float, Int
-from truesky.validation.lake.measure.rows import LEAST, Row, not_applicable
+from truesky.validation.lake.measure.rows import Row, not_applicable
 from truesky.validation.lake.measure.seen import DISPERSED, Check, Seen
+from truesky.validation.verdicts import LEAST
 
 SOURCE = "rendered_spectra of the lake; the extracted flux of stars: Serrano et al. 2024, app. C"
 # Of the light over what is expected, pixels of the trace, part of a pixel of a line's wavelength.

@@ -1,7 +1,8 @@
-"""One measurement beside what it should be, and its verdict.
+"""One measurement of a lake, and what it should be.
 
-Row       a row of the table `validation`
-verdict   pass, fail or undecided, of a value, its error, what is expected and the tolerance
+Row              a row of the table `validation`
+row_of_check     the row of a check of the lists of expectations
+not_applicable   the row of a check that found nothing to measure
 """
 
 from __future__ import annotations
@@ -9,10 +10,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-PASS, FAIL, UNDECIDED, NOT_APPLICABLE = "pass", "fail", "undecided", "not_applicable"
-AROUND, LEAST, MOST = "around", "least", "most"
-# Standard errors beyond the tolerance from which a value is wrong, whatever chance does.
-SURE = 3.0
+from truesky.validation.checks import Check
+from truesky.validation.verdicts import AROUND, NOT_APPLICABLE, verdict
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,20 +74,28 @@ def not_applicable(check: str, place: Place, why: str, source: str, quantity: st
     return Row(check, quantity, place, nan, nan, nan, nan, "", source, note=why, applies=False)
 
 
-def verdict(value: float, error: float, expected: float, tolerance: float, kind: str = AROUND) -> str:
-    """pass, fail or undecided.
+def row_of_check(name: str, check: Check, error: float, note: str) -> Row:
+    """Return the row of a check of the whole lake.
 
-    value, error : measured, and its standard error;  expected, tolerance : of it
-    kind         : "around", "least" (at least expected - tolerance) or "most" (at most expected + tolerance)
+    Parameters
+    ----------
+    name : str
+        Name of the check of lakes, such as "observed".
+    check : Check
+        The figure and its expectation.
+    error : float
+        Standard error of the figure; NaN if it is not known.
+    note : str
+        What was sampled.
 
-    It fails where it lies more than three standard errors beyond the tolerance, passes where it lies within and its
-    error is no larger than the tolerance (or it lies three errors within); else there is too little to tell.
+    Returns
+    -------
+    Row
+        Its verdict is undecided if the expectation is remembered.
     """
-    if not (math.isfinite(value) and math.isfinite(error)):
-        return UNDECIDED
-    off = {AROUND: abs(value - expected), LEAST: expected - value, MOST: value - expected}[kind]
-    beyond = off - tolerance
-    if beyond > SURE * error:
-        return FAIL
-    sure = error <= tolerance or beyond < -SURE * error
-    return PASS if beyond <= 0.0 and sure else UNDECIDED
+    sure = error if check.gates else math.nan
+    about = "" if check.gates else "a remembered number: it decides nothing"
+    return Row(
+        name, check.name, Place(), check.found, sure, check.expected, check.tolerance, "", check.source, check.kind,
+        note or about, known=check.known,
+    )  # fmt: skip

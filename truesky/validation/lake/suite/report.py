@@ -10,9 +10,10 @@ from collections.abc import Iterable, Sequence
 from html import escape
 
 from lake_schema import __version__
-from truesky.validation.lake.measure.rows import FAIL, NOT_APPLICABLE, PASS, UNDECIDED, Row
+from truesky.validation.lake.measure.rows import Row
 from truesky.validation.lake.suite import figures
 from truesky.validation.lake.suite.running import Found
+from truesky.validation.verdicts import FAIL, NOT_APPLICABLE, PASS, UNDECIDED
 
 _ORDER = (FAIL, UNDECIDED, PASS, NOT_APPLICABLE)
 _STYLE = """

@@ -5,8 +5,8 @@ import numpy as np
 from lake_schema import sky
 from lake_schema.ids import GENERATION_ORDER
 from truesky.fluxes import cosmology
-from truesky.validation.lake.measure import field as fields
-from truesky.validation.model import theory
+from truesky.validation import field as fields
+from truesky.validation import theory
 
 CELLS = sky.cells_in_cone(0.0, 0.0, 0.9, GENERATION_ORDER)
 FIELD = fields.of_cells(GENERATION_ORDER, CELLS)
@@ -61,7 +61,9 @@ def clustered(seed=1, n=6000, log_mass=12.5):
         "id": np.arange(len(ra)), "ra": ra, "dec": dec, "_healpix_29": index,
     }  # fmt: skip
     edges = np.asarray(cosmology.comoving_distance(np.array([0.6, 0.65, 0.7, 0.75, 0.8])))
-    c_l = theory.galaxies(theory.ELL, edges, np.ones(4), np.full(4, bias(log_mass)))
+    wide = np.diff(edges)
+    shells = theory.Shells(0.5 * (edges[1:] + edges[:-1]), wide, 0.25 / wide * bias(log_mass))
+    c_l = theory.galaxies(theory.ELL, shells)
     ell, variance, (kx, ky), phase = waves(rng, c_l)
     east, north = plane(ra, dec)
     g = np.cos(np.outer(east, kx) + np.outer(north, ky) + phase) * np.sqrt(2 * variance)

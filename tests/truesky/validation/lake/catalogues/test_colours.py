@@ -10,8 +10,8 @@ from tests.universe import rows_of
 from truesky.fluxes import band_fluxes
 from truesky.fluxes.libraries import templates
 from truesky.validation.lake.catalogues import colours
-from truesky.validation.lake.measure.rows import FAIL, NOT_APPLICABLE, PASS
 from truesky.validation.model import observed
+from truesky.validation.verdicts import FAIL, NOT_APPLICABLE, PASS
 
 BANDS = ("euclid_vis", "lsst_g", "lsst_r", "lsst_i")
 N = 600

@@ -9,7 +9,7 @@ import pytest
 from lake_schema import sky
 from lake_schema.ids import GENERATION_ORDER
 from truesky.validation.lake.catalogues import duplicates, requirements
-from truesky.validation.lake.measure.rows import FAIL, NOT_APPLICABLE, PASS, UNDECIDED
+from truesky.validation.verdicts import FAIL, NOT_APPLICABLE, PASS, UNDECIDED
 
 CELLS = np.arange(400_000, 400_009)
 

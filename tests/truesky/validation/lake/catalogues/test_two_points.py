@@ -6,10 +6,10 @@ from scipy.special import j0
 
 from tests.truesky.validation.lake.catalogues import mocks
 from tests.truesky.validation.lake.catalogues.test_faults import Version
+from truesky.validation import two_points
 from truesky.validation.lake.catalogues import angular_clustering, cosmic_shear
-from truesky.validation.lake.measure import two_points
-from truesky.validation.lake.measure.rows import FAIL, NOT_APPLICABLE, PASS
-from truesky.validation.lake.measure.two_points import ARCMIN
+from truesky.validation.two_points import ARCMIN
+from truesky.validation.verdicts import FAIL, NOT_APPLICABLE, PASS
 
 
 def verdicts(result):

@@ -3,8 +3,9 @@
 import numpy as np
 
 from truesky.validation.lake.images import between
-from truesky.validation.lake.measure.rows import FAIL, NOT_APPLICABLE, PASS, Place
+from truesky.validation.lake.measure.rows import Place
 from truesky.validation.lake.measure.seen import Result
+from truesky.validation.verdicts import FAIL, NOT_APPLICABLE, PASS
 
 
 def frame(number, rng, east=0.0, mag=0.0, first=0, n=60):

@@ -7,7 +7,7 @@ import pytest
 
 from tests.truesky.validation.lake import made
 from truesky.validation.lake.images.completeness import COMPLETENESS
-from truesky.validation.lake.measure.rows import FAIL, NOT_APPLICABLE, PASS
+from truesky.validation.verdicts import FAIL, NOT_APPLICABLE, PASS
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,8 @@ from truesky.validation.lake.images.quality import QUALITY
 from truesky.validation.lake.images.saturation import SATURATION
 from truesky.validation.lake.measure import seen
 from truesky.validation.lake.measure.frames import Instrument
-from truesky.validation.lake.measure.rows import FAIL, NOT_APPLICABLE, PASS, UNDECIDED, Place
+from truesky.validation.lake.measure.rows import Place
+from truesky.validation.verdicts import FAIL, NOT_APPLICABLE, PASS, UNDECIDED
 
 CHECKS = (ASTROMETRY, PHOTOMETRY, BACKGROUND, NOISE, PSF, COSMIC_RAYS, SATURATION)
 

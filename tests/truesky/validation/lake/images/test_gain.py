@@ -11,8 +11,9 @@ from tests.truesky.validation.lake import made
 from truesky.validation.lake.images.gain import GAIN
 from truesky.validation.lake.images.noise import NOISE
 from truesky.validation.lake.measure import references, seen
-from truesky.validation.lake.measure.rows import FAIL, NOT_APPLICABLE, PASS, Place
+from truesky.validation.lake.measure.rows import Place
 from truesky.validation.lake.suite import inventory
+from truesky.validation.verdicts import FAIL, NOT_APPLICABLE, PASS
 
 SIDE = 2 * made.SIDE
 

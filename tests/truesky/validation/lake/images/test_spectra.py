@@ -9,9 +9,10 @@ from lake_schema.tables.validation import VALIDATION
 from tests.truesky.validation.lake import made
 from truesky.validation.lake.images.spectra import SPECTRA
 from truesky.validation.lake.measure.frames import Frame
-from truesky.validation.lake.measure.rows import FAIL, NOT_APPLICABLE, PASS, Place
+from truesky.validation.lake.measure.rows import Place
 from truesky.validation.lake.measure.seen import Seen
 from truesky.validation.lake.suite import publishing
+from truesky.validation.verdicts import FAIL, NOT_APPLICABLE, PASS
 
 SIDE, LONG, FIRST, LAST, LINE = 700, 500, 12_500.0, 18_500.0, 15_300.0
 

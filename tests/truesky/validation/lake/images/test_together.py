@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from truesky.validation.lake.images import together
-from truesky.validation.lake.measure.rows import FAIL, NOT_APPLICABLE, PASS, UNDECIDED, Place, verdict
+from truesky.validation.lake.measure.rows import Place
 from truesky.validation.lake.measure.seen import Result
+from truesky.validation.verdicts import FAIL, NOT_APPLICABLE, PASS, UNDECIDED, verdict
 
 
 def detectors(rng, east=0.0, mag=0.0, exposures=(1,), n=36):

@@ -9,8 +9,8 @@ from tests.truesky.validation.lake.catalogues import test_faults as catalogues
 from tests.truesky.validation.lake.images import test_between, test_completeness, test_gain, test_spectra, test_together
 from tests.truesky.validation.lake.images import test_faults as images
 from tests.truesky.validation.model import test_observed
-from truesky.validation.lake.measure.rows import FAIL
 from truesky.validation.lake.suite import checks
+from truesky.validation.verdicts import FAIL
 
 # Check -> (test, fault).
 FAULTS = {

@@ -1,0 +1,44 @@
+"""Verdicts of a figure that is compared with an expectation, for the universe and for lakes.
+
+verdict   pass, fail or undecided, of a value, its error, what is expected and the tolerance
+"""
+
+from __future__ import annotations
+
+import math
+
+PASS, FAIL, UNDECIDED, NOT_APPLICABLE = "pass", "fail", "undecided", "not_applicable"
+AROUND, LEAST, MOST = "around", "least", "most"
+# Standard errors beyond the tolerance from which a value is wrong, whatever chance does.
+SURE = 3.0
+
+
+def verdict(value: float, error: float, expected: float, tolerance: float, kind: str = AROUND) -> str:
+    """Return "pass", "fail" or "undecided".
+
+    A value fails if it lies more than three standard errors beyond the tolerance. It passes if it lies within the
+    tolerance, and its error is no larger than the tolerance or it lies three errors within. Otherwise there is too
+    little to tell.
+
+    Parameters
+    ----------
+    value, error : float
+        The measured value and its standard error.
+    expected, tolerance : float
+        What is expected of the value.
+    kind : str
+        "around", "least" (at least expected - tolerance) or "most" (at most expected + tolerance).
+
+    Returns
+    -------
+    str
+        PASS, FAIL or UNDECIDED.
+    """
+    if not (math.isfinite(value) and math.isfinite(error)):
+        return UNDECIDED
+    off = {AROUND: abs(value - expected), LEAST: expected - value, MOST: value - expected}[kind]
+    beyond = off - tolerance
+    if beyond > SURE * error:
+        return FAIL
+    sure = error <= tolerance or beyond < -SURE * error
+    return PASS if beyond <= 0.0 and sure else UNDECIDED
