@@ -1,4 +1,4 @@
-"""The loops of sums.product: two orders of going through matrices, one order of adding; those of sums.of_band."""
+"""The loops of sums.product: two orders of going through matrices, one order of adding."""
 
 from __future__ import annotations
 
@@ -66,30 +66,3 @@ def along_rows(left: Any, right: Any, out: Any) -> None:
             for k in range(left.shape[1]):
                 total += left[i, k] * np.float64(right[j, k])
             out[i, j] = total
-
-
-@exact_jit
-def solve_band(band: Any, values: Any) -> None:
-    """Solve for a positive definite matrix whose element (j + d, j) is band[d, j], float64[w + 1, n], in its place.
-
-    values : [n], become the solution
-    """
-    width, n = band.shape[0] - 1, band.shape[1]
-    for j in range(n):
-        most = min(width, n - 1 - j)
-        root = np.sqrt(band[0, j])
-        for d in range(most + 1):
-            band[d, j] /= root
-        for i in range(1, most + 1):
-            factor = band[i, j]
-            if factor != 0.0:
-                for d in range(i, most + 1):
-                    band[d - i, j + i] -= factor * band[d, j]
-        values[j] /= band[0, j]
-        for d in range(1, most + 1):
-            values[j + d] -= band[d, j] * values[j]
-    for j in range(n - 1, -1, -1):
-        total = values[j]
-        for d in range(1, min(width, n - 1 - j) + 1):
-            total -= band[d, j] * values[j + d]
-        values[j] = total / band[0, j]

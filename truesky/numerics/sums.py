@@ -3,7 +3,6 @@
 product         of matrices: every sum runs upwards, each product and each sum rounded to float64 as it is made
 inverse         of 2 x 2 matrices;  determinant : theirs
 least_squares   by Householder's reflections
-of_band         solution of equations whose matrix is a band
 gauss_legendre  nodes and weights of quadrature
 
 What numpy does element by element, sums along an axis, or by einsum without `optimize` needs none of them.
@@ -102,19 +101,6 @@ def least_squares(basis: Float, values: Float) -> Float:
     for i in reversed(range(n)):
         rest = product(upper[i, i + 1 : n], found[i + 1 :]) if i + 1 < n else 0.0
         found[i] = (wanted[i] - rest) / upper[i, i]
-    return found
-
-
-def of_band(band: Float, values: Float) -> Float:
-    """The x [n] that a symmetric, positive definite matrix makes the values [n].
-
-    band : [w + 1, n] element (j + d, j) of the matrix at [d, j]; what would lie outside of it is not looked at
-    Ref  : Golub & Van Loan 2013, Matrix Computations, section 4.3.5 (Cholesky's decomposition of a band)
-    """
-    from truesky.numerics import compiled_sums
-
-    left, found = np.array(band, float), np.array(values, float)
-    compiled_sums.solve_band(left, found)
     return found
 
 

@@ -76,18 +76,3 @@ def test_quadrature(count):
     assert weights == pytest.approx(np.polynomial.legendre.leggauss(count)[1], rel=1e-11, abs=0.0)
     for power in range(min(2 * count, 40)):
         assert np.sum(weights * nodes**power) == pytest.approx((1 + (-1) ** power) / (power + 1), rel=1e-13, abs=1e-15)
-
-
-@given(n=st.integers(1, 30), width=st.integers(0, 8), seed=st.integers(0, 99))
-def test_a_band_is_solved_as_the_whole_matrix(n, width, seed):
-    """B B^T of a lower band B is positive definite, and a band as wide; what lies outside of it is not looked at."""
-    rng = np.random.default_rng(seed)
-    lower = np.tril(np.triu(rng.normal(size=(n, n)), -width)) + 2.0 * np.sqrt(n) * np.eye(n)
-    matrix, values = lower @ lower.T, rng.normal(size=n)
-    band = np.full((width + 1, n), np.nan)
-    for apart in range(min(width, n - 1) + 1):
-        band[apart, : n - apart] = np.diagonal(matrix, -apart)
-    before = band.copy(), values.copy()
-    assert sums.of_band(band, values) == pytest.approx(np.linalg.solve(matrix, values), rel=1e-9, abs=1e-12)
-    assert (band == before[0])[np.isfinite(band)].all()
-    assert (values == before[1]).all()

@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solveh_banded
 
 from lake_schema.arrays import Bool, Float
-from truesky.numerics import sums
 from truesky.validation.lake.measure.frames import Frame
 from truesky.validation.lake.measure.stars import Measured
 
@@ -85,7 +85,7 @@ def built(x: Float, y: Float, value: Float, weight: Float, fwhm: float) -> Effec
 
 
 def _solved(index: np.ndarray, basis: Float, value: Float, weight: Float, k: int) -> Float:
-    """Coefficients [k k]: least squares with small second differences, by a banded normal matrix."""
+    """Coefficients [k k]: least squares with small second differences, by a banded normal matrix; else NaN."""
     heavy, width = basis * weight[:, None], 3 * k + 3
     band = np.zeros((width + 1, k * k))
     for i in range(16):
@@ -101,7 +101,11 @@ def _solved(index: np.ndarray, basis: Float, value: Float, weight: Float, k: int
         for i, a in enumerate((1.0, -2.0, 1.0)):
             for j, c in enumerate((1.0, -2.0, 1.0)[: i + 1]):
                 band[(i - j) * step] += smooth * a * c * np.bincount(first + j * step, minlength=k * k)
-    return sums.of_band(band, np.asarray(np.bincount(index.ravel(), (heavy * value[:, None]).ravel(), k * k), float))
+    light = np.bincount(index.ravel(), (heavy * value[:, None]).ravel(), k * k)
+    try:
+        return np.asarray(solveh_banded(band, light, lower=True, check_finite=False))
+    except np.linalg.LinAlgError:
+        return np.full(k * k, np.nan)
 
 
 def reach_of(fwhm: float) -> float:
@@ -177,15 +181,12 @@ def _fitted(
 
 
 def _step(columns: Sequence[Float], weight: Float, left: Float) -> list[Float]:
-    """Of each star [n] the three numbers by which its columns [n, m] explain what is left, by Cramer's rule.
+    """Of each star [n] the three numbers by which its columns [n, m] explain what is left; 0 if no pixel is good.
 
     Their matrix is far from singular: a PSF and its slopes along two axes are nearly orthogonal.
     """
-    (a, b, c), (d, e), (f,) = ([(weight * columns[i] * columns[j]).sum(axis=1) for j in range(i, 3)] for i in range(3))
-    p, q, r = ((weight * column * left).sum(axis=1) for column in columns)
-    aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
-    dd, ee, ff = a * f - c * c, b * c - a * e, a * d - b * b
-    whole = a * aa + b * bb + c * cc
-    # Where no pixel is good there is no step.
-    whole = np.where(whole > 0.0, whole, np.inf)
-    return [(aa * p + bb * q + cc * r) / whole, (bb * p + dd * q + ee * r) / whole, (cc * p + ee * q + ff * r) / whole]
+    basis = np.stack(columns, axis=2)
+    weighted = np.swapaxes(basis * weight[:, :, None], 1, 2)
+    normal = weighted @ basis
+    normal[~weight.any(axis=1)] = np.eye(3)
+    return list(np.linalg.solve(normal, weighted @ left[:, :, None])[:, :, 0].T)

@@ -16,7 +16,6 @@ import sep
 from scipy.spatial import cKDTree
 
 from lake_schema.arrays import Bool, Float, Int
-from truesky.numerics import sums
 from truesky.validation.lake.measure import wings
 from truesky.validation.lake.measure.frames import Frame, pixels_of
 from truesky.validation.lake.measure.references import Reference
@@ -259,7 +258,7 @@ def _fwhm(cuts: Float, x: Float, y: Float, flux: Float, window: float) -> float:
     square, bend = radius[near] ** 2, np.log(np.maximum(light[near], 1e-9))
     for _ in range(4):
         basis = np.stack([np.ones(len(square)), square, square**2], axis=1)
-        first, second, fourth = sums.least_squares(basis, bend)
+        first, second, fourth = np.linalg.lstsq(basis, bend)[0]
         left = bend - first - second * square - fourth * square**2
         kept = np.abs(left) < 4.0 * 1.4826 * np.median(np.abs(left)) + 1e-9
         square, bend = square[kept], bend[kept]
