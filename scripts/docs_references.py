@@ -32,7 +32,9 @@ from truesky.request import accuracy, from_toml, observations, schema, toml_valu
 # What readers of a lake import.
 API = (
     "truesky.api.lake",
+    "truesky.api.tables",
     "truesky.api.simulate",
+    "truesky.explore.plots",
     "lake_schema.store.read",
     "lake_schema.store.layout",
     "truesky.explore.explorer",

@@ -113,7 +113,15 @@ def test_python_reads_images_and_truth(field):
         stored, electrons = lake.image(first["path"]), lake.image(first["path"], electrons=True)
         assert stored.data.shape == electrons.data.shape
         assert 0 < np.median(electrons.data) < np.median(stored.data)
+        assert len(lake.extensions(first["path"])) > 1
         truth = lake.truth(first["exposure_id"], first["detector"])
+        # The WCS counts from the pixels that `image` returns; proper motions are some mas.
+        stars = truth.merge(lake.table("stars", ["id", "ra", "dec"], into="pandas"), on="id")
+        x, y = lake.wcs(first["path"]).all_world2pix(stars["ra"], stars["dec"], 0)
+        assert np.median(np.abs(x - stars["x"])) < 0.1
+        assert np.median(np.abs(y - stars["y"])) < 0.1
+        with pytest.raises(truesky.BadInput, match="is no image of spectra"):
+            list(lake.models(first["exposure_id"], first["detector"]))
         assert len(truth) > 1000
         assert set(truth["detector"]) == {first["detector"]}
         with pytest.raises(truesky.BadInput, match="nothing was rendered for detector 9-9"):

@@ -1,8 +1,10 @@
 """A mock sky, from dark-matter haloes to raw detector images.
 
-open   read the tables and images of a lake
-run    compute everything that a request asks for
-check  report what is wrong with a request
+open        read the tables and images of a lake
+run         compute everything that a request asks for
+check       report what is wrong with a request
+accuracies  what each named accuracy allows, reaches and costs
+plots       draw what `Lake.hist`, `Lake.heatmap` and `Lake.skymap` count
 """
 
 from __future__ import annotations
@@ -16,17 +18,27 @@ from lake_schema.errors import BadInput, LakeError
 if TYPE_CHECKING:
     from truesky.api.lake import Lake
     from truesky.api.lake import Lake as open
-    from truesky.api.simulate import check, run
+    from truesky.api.simulate import accuracies, check, run
+    from truesky.explore import plots
 
-__all__ = ["BadInput", "Lake", "LakeError", "__version__", "check", "open", "run"]
+__all__ = ["BadInput", "Lake", "LakeError", "__version__", "accuracies", "check", "open", "plots", "run"]
 
 # Loaded when they are first used: together they take seconds to import.
-_LAZY = {"Lake": "lake", "open": "lake", "check": "simulate", "run": "simulate"}
+_LAZY: dict[str, tuple[str, str | None]] = {
+    "Lake": ("truesky.api.lake", "Lake"),
+    "accuracies": ("truesky.api.simulate", "accuracies"),
+    "check": ("truesky.api.simulate", "check"),
+    "open": ("truesky.api.lake", "Lake"),
+    "plots": ("truesky.explore.plots", None),
+    "run": ("truesky.api.simulate", "run"),
+}
 
 
 def __getattr__(name: str) -> Any:
     if name in _LAZY:
-        return getattr(import_module(f"truesky.api.{_LAZY[name]}"), "Lake" if name == "open" else name)
+        module, attribute = _LAZY[name]
+        loaded = import_module(module)
+        return loaded if attribute is None else getattr(loaded, attribute)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

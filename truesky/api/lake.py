@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
+from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
+from lake_schema.fits import images
 from lake_schema.fits.images import Image
-from truesky.explore.explorer import Explorer
-from truesky.explore.process import MEMORY, TIMEOUT
+from truesky.api.tables import LakeTables
+
+if TYPE_CHECKING:
+    from astropy.wcs import WCS
 
 
-class Lake:
+class Lake(LakeTables):
     """A lake, opened for reading.
 
     All methods see the tables as they were when the lake was opened, whatever is published later. Use a `with` block,
@@ -45,134 +49,6 @@ class Lake:
     >>> lake = truesky.open("out/demo/lake")  # doctest: +SKIP
     >>> lake.sql("SELECT count(*) FROM galaxies WHERE z_obs > 1")  # doctest: +SKIP
     """
-
-    def __init__(
-        self, path: str | Path, request: str | None = None, memory: float = MEMORY, timeout: float = TIMEOUT
-    ) -> None:
-        self._explorer = Explorer(str(path) if isinstance(path, Path) else path, memory, timeout, request)
-
-    def __repr__(self) -> str:
-        return f"<Lake {self._explorer.root}: {', '.join(self.tables().index)}>"
-
-    def __enter__(self) -> Lake:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """End the process that answers queries. A later query starts another."""
-        self._explorer.close()
-
-    # ------------------------------------------------------------------------------------------------ tables
-
-    def tables(self) -> pd.DataFrame:
-        """List the tables.
-
-        Returns
-        -------
-        pandas.DataFrame
-            One row per table, indexed by name: rows, MB, files, version and meaning.
-        """
-        return self._explorer.tables()
-
-    def columns(self, table: str) -> pd.DataFrame:
-        """List the columns of a table.
-
-        Parameters
-        ----------
-        table : str
-            Name of the table.
-
-        Returns
-        -------
-        pandas.DataFrame
-            One row per column, indexed by name: type, unit, range, whether it can be null, UCD and meaning.
-        """
-        return self._explorer.describe(table)
-
-    def table(self, name: str, columns: str | Sequence[str] | None = None, into: str = "arrow") -> Any:
-        """Read a table.
-
-        Parameters
-        ----------
-        name : str
-            Name of the table.
-        columns : str or sequence of str, optional
-            Names of the columns to read. The default is all columns.
-        into : {"arrow", "pandas", "astropy"}, optional
-            Kind of the result. An astropy table has units.
-
-        Returns
-        -------
-        pyarrow.Table, pandas.DataFrame or astropy.table.Table
-        """
-        from truesky.explore import results
-
-        return results.converted(self._explorer._version(name).rows(_names(columns)), into)
-
-    def sql(self, query: str, /, into: str = "pandas", **parameters: object) -> Any:
-        """Run one SELECT over the tables of the lake.
-
-        Parameters
-        ----------
-        query : str
-            SQL in the dialect of DuckDB. Two functions are added: ``separation(ra1, dec1, ra2, dec2)`` in degrees and
-            ``mag_ab(f_nu)`` for flux densities in microjansky. ``$name`` stands for a parameter.
-        into : {"pandas", "arrow", "astropy"}, optional
-            Kind of the result.
-        **parameters
-            Values of the parameters: numbers, strings, booleans or lists of them.
-
-        Returns
-        -------
-        pandas.DataFrame, pyarrow.Table or astropy.table.Table
-
-        Raises
-        ------
-        BadInput
-            If the query is not a single SELECT over tables of the lake, or exceeds the limits of time or memory.
-        Damaged
-            If a file that the query reads is not as it was written.
-        """
-        return self._explorer.sql(query, into, **parameters)
-
-    def cone(
-        self,
-        table: str,
-        ra: float,
-        dec: float,
-        radius: float,
-        columns: str | Sequence[str] | None = None,
-        on: str = "observed",
-        into: str = "arrow",
-    ) -> Any:
-        """Read the rows of a catalogue within a circle on the sky.
-
-        Parameters
-        ----------
-        table : str
-            Name of a catalogue, such as ``galaxies``.
-        ra, dec : float
-            Centre of the circle, ICRS, in degrees.
-        radius : float
-            Radius of the circle in degrees.
-        columns : str or sequence of str, optional
-            Names of the columns to read. The default is all columns.
-        on : {"observed", "true"}, optional
-            Select by observed positions, or by the true ones without gravitational lensing.
-        into : {"arrow", "pandas", "astropy"}, optional
-            Kind of the result.
-
-        Returns
-        -------
-        pyarrow.Table, pandas.DataFrame or astropy.table.Table
-        """
-        return self._explorer.cone(table, ra, dec, radius, _names(columns), on, into)
-
-    # ------------------------------------------------------------------------------------------------ images
 
     def images(self, content: str | None = "science") -> pd.DataFrame:
         """List the image files.
@@ -221,6 +97,82 @@ class Lake:
         file = self._explorer._version("products").file(path)
         return read_back.electrons(file) if electrons else read_back.frame(file)
 
+    def extensions(self, path: str) -> list[Image]:
+        """Read all arrays of an image file as they are stored, with overscans and quality.
+
+        Parameters
+        ----------
+        path : str
+            The column ``path`` of `images`.
+
+        Returns
+        -------
+        list of Image
+            One per extension of the FITS file, the first with the header that holds for all. `data` is None if an
+            extension has no array.
+        """
+        return images.read_images(self._explorer._version("products").file(path))
+
+    def wcs(self, path: str) -> WCS:
+        """Return the world coordinate system of an image's pixels.
+
+        Parameters
+        ----------
+        path : str
+            The column ``path`` of `images`.
+
+        Returns
+        -------
+        astropy.wcs.WCS
+            Converts between ICRS positions and pixels of the array that `image` returns, counted from 0.
+        """
+        from astropy.io import fits
+        from astropy.wcs import WCS, FITSFixedWarning
+
+        from truesky.render.products import read_back
+
+        header = fits.Header(read_back.header(self._explorer._version("products").file(path)))
+        with warnings.catch_warnings():
+            # astropy reports that it understands the date.
+            warnings.simplefilter("ignore", FITSFixedWarning)
+            return WCS(header)
+
+    def models(
+        self, exposure_id: int, detector: str, sources: Sequence[int] | None = None
+    ) -> Iterator[tuple[int, Float]]:
+        """Draw single sources of a published slitless image, each by itself and without noise.
+
+        The expected electrons of all sources add up to the truth image ``noise_free``.
+
+        Parameters
+        ----------
+        exposure_id : int
+            Number of the exposure, one that a grism disperses.
+        detector : str
+            Name of the detector.
+        sources : sequence of int, optional
+            Identifiers of the sources. The default is all sources that have light on the detector.
+
+        Yields
+        ------
+        source : int
+            Identifier.
+        electrons : ndarray of float64, shape (ny, nx)
+            Expected electrons of this source, in all orders of the grism.
+
+        Raises
+        ------
+        BadInput
+            If there is no such image, it is not dispersed, or a source has no light on the detector.
+        """
+        from truesky.render import models
+
+        self._explorer._version("products")
+        ids = None if sources is None else [int(source) for source in sources]
+        root = Path(str(self._explorer.root))
+        found = models.models(root, int(exposure_id), str(detector), ids, self._request)
+        return ((one.id, one.frame) for one in found)
+
     def truth(self, exposure_id: int, detector: str) -> pd.DataFrame:
         """List the sources that were drawn on one detector of an exposure.
 
@@ -248,7 +200,3 @@ class Lake:
             )
         query = "SELECT * FROM rendered_truth WHERE exposure_id = $exposure AND detector = $detector"
         return self.sql(query, exposure=int(exposure_id), detector=str(detector))
-
-
-def _names(columns: str | Sequence[str] | None) -> Sequence[str] | None:
-    return [columns] if isinstance(columns, str) else columns

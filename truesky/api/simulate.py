@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
+
+import pandas as pd
 
 from lake_schema import instruction_set, user_files
 from lake_schema.errors import BadInput
@@ -16,7 +18,7 @@ from truesky.api.lake import Lake
 from truesky.commands import check as check_command
 from truesky.commands import run as run_command
 from truesky.commands import space, submit
-from truesky.request import universe
+from truesky.request import accuracy, universe
 from truesky.request.from_toml import from_table, parse
 from truesky.request.schema import Request
 from truesky.running import shell
@@ -112,6 +114,26 @@ def run(
     for stage in stages:
         shell.run(import_module(stage.module).JOB, root, stage.request(wanted))
     return Lake(root, request=wanted.name)
+
+
+def accuracies() -> pd.DataFrame:
+    """List what each named accuracy allows, reaches and costs in the drawing of sources.
+
+    Returns
+    -------
+    pandas.DataFrame
+        One row per name, such as ``survey``: the largest errors that it allows of a source's ``flux`` (relative),
+        ``shape`` (reduced shear) and ``position`` (pixels), and of the ``background`` (noise of a pixel of the sky);
+        the errors that were measured, with the ending ``_reached``; ``seconds`` of CPU time for all sources of a VIS
+        detector; and the settings of drawing that are used.
+    """
+    found = {}
+    for name, allowed in accuracy.PRESETS.items():
+        row, errors = accuracy.row_for(allowed), asdict(allowed)
+        reached = {f"{key}_reached": value for key, value in asdict(accuracy.reached(allowed)).items()}
+        settings = {key: value for key, value in row.items() if key.removesuffix("_held") not in errors}
+        found[name] = {**errors, **reached, **settings}
+    return pd.DataFrame.from_dict(found, orient="index")
 
 
 def _parsed(request: str | Path | Mapping[str, Any]) -> Request:

@@ -3,12 +3,13 @@
 import subprocess
 import sys
 
+import numpy as np
 import pyarrow as pa
 import pytest
 
 import truesky
 from lake_schema.store import publish
-from tests.universe import plain_plan, plain_work
+from tests.universe import CELLS, plain_plan, plain_work, toy_plan, toy_work
 
 
 @pytest.fixture
@@ -41,6 +42,28 @@ def test_a_query_takes_parameters(opened):
     assert opened.sql("SELECT 1 AS one", into="arrow")["one"].to_pylist() == [1]
 
 
+def test_rows_are_counted_in_bins(opened):
+    ids = opened.table("plain")["id"].to_numpy()
+    counts, edges = opened.hist("plain", "id", 6, (0.0, 60.0))
+    assert counts.tolist() == np.histogram(ids, edges)[0].tolist()
+    counts, _ = opened.hist("plain", "id", 6, (0.0, 60.0), where="id < 20", weight="0.5")
+    assert counts.sum() == 10.0
+    counts, x, y = opened.heatmap("plain", "id", "id / 2", (3, 2), ((0.0, 60.0), (0.0, 30.0)))
+    assert counts.tolist() == np.histogram2d(ids, ids / 2, (x, y))[0].T.tolist()
+
+
+def test_a_catalogue_is_counted_on_the_sky(lake):
+    publish.make(lake, toy_plan(), toy_work)
+    with truesky.open(lake) as found:
+        cells, counts = found.skymap("toy", order=5)
+    assert dict(zip(cells.tolist(), counts.tolist(), strict=True)) == {cell: n for cell, n in CELLS if n}
+
+
+def test_the_result_of_a_query_is_written(opened, tmp_path):
+    path = opened.export("SELECT id FROM plain WHERE id < $most ORDER BY id", tmp_path / "few.csv", most=3)
+    assert path.read_text().split() == ["id", "0", "1", "2"]
+
+
 @pytest.mark.parametrize(
     ("ask", "said"),
     [
@@ -48,6 +71,9 @@ def test_a_query_takes_parameters(opened):
         (lambda lake: lake.sql("DELETE FROM plain"), "DELETE"),
         (lambda lake: lake.images(), "has no table products"),
         (lambda lake: lake.truth(1, "3-4"), "has no table products"),
+        (lambda lake: lake.wcs("a.fits"), "has no table products"),
+        (lambda lake: lake.extensions("a.fits"), "has no table products"),
+        (lambda lake: lake.models(1, "3-4"), "has no table products"),
         (lambda lake: lake.table("plain", into="polars"), "polars"),
     ],
 )

@@ -9,6 +9,7 @@ import pytest
 import truesky
 from tests import requests
 from truesky.api import simulate
+from truesky.request.accuracy import PRESETS
 
 DEMO = Path(__file__).resolve().parents[3] / "requests" / "demo.toml"
 
@@ -26,6 +27,16 @@ def test_a_wrong_request_is_refused_and_nothing_written(tmp_path, monkeypatch, a
     with pytest.raises(truesky.BadInput, match=r"r\.toml.*colour"):
         ask(path)
     assert [file.name for file in tmp_path.iterdir()] == ["r.toml"]
+
+
+def test_each_named_accuracy_reaches_what_it_allows():
+    found = truesky.accuracies()
+    assert list(found.index) == list(PRESETS)
+    for name, row in found.iterrows():
+        for error in ("flux", "shape", "position", "background"):
+            assert row[error] == getattr(PRESETS[name], error)
+            assert 0.0 < row[f"{error}_reached"] <= row[error]
+    assert found["seconds"].is_monotonic_increasing
 
 
 def test_examples_of_the_documentation():

@@ -7,8 +7,10 @@ import grismconf
 import numpy as np
 import pyarrow.compute as pc
 import pytest
+from astropy.coordinates import SkyCoord
 from astropy.io import fits
 
+import truesky
 from lake_schema.errors import BadInput
 from lake_schema.fits import images
 from lake_schema.store import layout, publish, read
@@ -191,6 +193,30 @@ def test_models_of_single_sources_add_up_to_the_published_image(rendered, folder
         assert (head.data, len(units)) == (None, count)
         # As 32-bit numbers.
         np.testing.assert_allclose(sum(models.frame(unit, (NY, NX)) for unit in units), bright.frame, rtol=1e-6)
+
+
+def test_python_draws_the_same_models(rendered):
+    """Each source's brightest pixels lie where the WCS and its trace say."""
+    (bright,) = models.models(rendered, 3, "DET22", [drawn_first(rendered)])
+    with truesky.open(rendered) as lake:
+        ((source, electrons),) = lake.models(3, "DET22", [bright.id])
+        assert source == bright.id
+        np.testing.assert_array_equal(electrons, bright.frame)
+        path = lake.images().set_index("exposure_id")["path"][3]
+        header, signal, quality = lake.extensions(path)
+        assert header.data is None
+        assert signal.data.shape == quality.data.shape == (NY + 8, NX + 8)
+        x, y = lake.wcs(path).world_to_pixel(SkyCoord(53.117, -27.808, unit="deg"))
+        assert abs(x - NX / 2) < 2.0
+        assert abs(y - NY / 2) < 2.0
+        with pytest.raises(truesky.BadInput, match="no detector DET22 of exposure 99"):
+            lake.models(99, "DET22")
+
+
+def drawn_first(root):
+    """The identifier of a source that has a first order on exposure 3."""
+    spectra = read.version(root, "rendered_spectra").rows(where=pc.field("exposure_id") == 3)
+    return spectra.filter(pc.field("order") == 1)["id"][0].as_py()
 
 
 @pytest.mark.parametrize(
