@@ -23,7 +23,7 @@ def test_what_wants_a_clone_is_left_out():
     """Those notebooks that read what is not in the packages, and no other."""
     notebooks = (ROOT / "notebooks").glob("*.ipynb")
     cells = {path.name: "".join(map(str, json.loads(path.read_text())["cells"])) for path in notebooks}
-    wanting = {name for name, text in cells.items() if "from benchmarks" in text or "../tests/" in text}
+    wanting = {name for name, text in cells.items() if "../benchmarks/" in text or "../truesky/render/" in text}
     assert {path.name for path in examples.files() if path.suffix == ".ipynb"} == set(cells) - wanting
 
 

@@ -1,6 +1,6 @@
 """Notebooks that render: a field of small detectors, the shear of known galaxies, spectra; they show what they say.
 
-What they ask of the packages is looked at every day, in tests/house/test_calls.py.
+That they use the public interface alone is tested every day, in tests/house/test_public_interface.py.
 """
 
 import re
