@@ -2,6 +2,7 @@
 
 import os
 import tempfile
+from collections import Counter
 from pathlib import Path
 
 # Before numpy, numba, astropy or colossus are imported by anything.
@@ -12,7 +13,7 @@ os.environ.setdefault("TRUESKY_CACHE", str(Path(tempfile.gettempdir()) / f"trues
 import pytest
 from hypothesis import settings
 
-from tests import tolerances
+from tests import slow_tests, tolerances
 
 pytest.approx = tolerances.approx
 
@@ -22,29 +23,51 @@ settings.register_profile("nightly", max_examples=5000, deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci" if os.environ.get("CI") else "default"))
 
 
-# Where tests run in several processes (pytest-xdist, --dist loadfile), a file stays in one, and so do these together:
-# what shares the Spark session, and what shares the drawn sky. They begin first, for they take longest.
-_SPARK = (
-    "tests/faults/test_spark.py", "tests/truesky/running/test_session.py", "tests/test_field.py",
-    "tests/truesky/render/test_render_exposures_calibration.py",
-    "tests/truesky/render/test_render_exposures_infrared.py", "tests/truesky/render/test_render_exposures_spectra.py",
-    "tests/truesky/render/test_sequence.py",
-)  # fmt: skip
-_SKY = ("tests/truesky/catalogue/", "tests/truesky/validation/")
+# If tests run in several processes (pytest-xdist, --dist loadfile), all tests of a file run in the same one, and so do
+# the files of a group: those whose tests share the Spark session, and those whose tests share the drawn skies.
+_SHARED = {"spark": "Spark", "drawn": "sky", "flat_sky": "sky"}
+_GROUPS = {
+    "Spark": (
+        "tests/faults/test_spark.py", "tests/truesky/running/test_session.py", "tests/test_field.py",
+        "tests/truesky/render/test_render_exposures_calibration.py",
+        "tests/truesky/render/test_render_exposures_infrared.py",
+        "tests/truesky/render/test_render_exposures_spectra.py", "tests/truesky/render/test_sequence.py",
+    ),
+    "sky": (
+        "tests/truesky/catalogue/galaxies/test_emission_lines.py", "tests/truesky/catalogue/galaxies/test_galaxies.py",
+        "tests/truesky/catalogue/galaxies/test_high_redshift.py", "tests/truesky/catalogue/galaxies/test_lensing.py",
+        "tests/truesky/catalogue/galaxies/test_strong_lenses.py", "tests/truesky/catalogue/halos/test_halos.py",
+        "tests/truesky/validation/model/test_observed.py", "tests/truesky/validation/model/test_universe.py",
+    ),
+}  # fmt: skip
+_SCOPES = {file: group for group, files in _GROUPS.items() for file in files}
+_SLOW = slow_tests.read()
 
 
 def _scope(file):
-    return "Spark" if file in _SPARK else "sky" if file.startswith(_SKY) else file
+    return _SCOPES.get(file, file)
 
 
-def pytest_collection_modifyitems(items):
-    """The long ones first: of the Spark session, of other Javas, of the sky."""
+def pytest_configure(config):
+    cache = Path(os.environ["TRUESKY_CACHE"]).expanduser()
+    config.pluginmanager.register(slow_tests.Watch(_SLOW, cache), "slow tests")
+
+
+def pytest_collection_modifyitems(config, items):
+    """Groups and files with the slowest tests come first, so that both processes end at about the same time."""
     files = {item: item.nodeid.partition("::")[0] for item in items}
     for item, file in files.items():
-        if "spark" in item.fixturenames and file not in _SPARK:
-            raise pytest.UsageError(f"{file} wants the Spark session: it is to be named in tests/conftest.py")
+        for fixture in _SHARED.keys() & item.fixturenames:
+            if _scope(file) != _SHARED[fixture]:
+                raise pytest.UsageError(f"{file} uses the fixture {fixture}: add it to its group in tests/conftest.py")
+    # A test that is asked for by its name comes without the others of its file.
+    if not any("::" in name for name in config.args) and (lost := slow_tests.missing(_SLOW, items)):
+        raise pytest.UsageError(f"tests/slow_tests.csv lists what does not exist: {', '.join(lost)}")
+    seconds = Counter()
+    for name, row in _SLOW.items():
+        seconds[_scope(name.partition("::")[0])] += float(row["seconds"])
     java = {file for item, file in files.items() if item.get_closest_marker("spark")}
-    items.sort(key=lambda item: (files[item] not in _SPARK, files[item] not in java, _scope(files[item]) != "sky"))
+    items.sort(key=lambda item: (-seconds[_scope(files[item])], files[item] not in java, _scope(files[item])))
 
 
 @pytest.hookimpl(optionalhook=True)

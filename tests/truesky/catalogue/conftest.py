@@ -61,19 +61,25 @@ def cells(universe):
 FLAT_CELLS = 32
 
 
-@cache
+@pytest.fixture(scope="session")
 def flat_sky():
-    """The galaxies of so many cells."""
+    return draw_flat_sky()
+
+
+# Cached as well, for the fixtures of another folder are others.
+@cache
+def draw_flat_sky():
+    """The galaxies of these cells."""
     return mean_sky.rows(mean_sky.flat(made()), 0, FLAT_CELLS)
 
 
 @pytest.fixture(scope="session")
 def drawn():
-    return sky_drawn()
+    return draw_sky()
 
 
 @cache
-def sky_drawn():
+def draw_sky():
     """Five blocks of four cells spread over the sky (1.05 deg2): rows, columns by name, magnitudes by band."""
     universe, library = made(), templates.galaxy_library()
     cells, dust = population.Cells(universe.population), dust_map.load(SEED)

@@ -15,7 +15,7 @@ from lake_schema.store import plan, publish, read, validate
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.strong_lenses import STRONG_LENSES
 from tests import requests
-from tests.truesky.catalogue.conftest import FLAT_CELLS, SEED, flat_sky
+from tests.truesky.catalogue.conftest import FLAT_CELLS, SEED
 from truesky.catalogue import build_strong_lenses
 from truesky.catalogue.galaxies import strong_lenses
 from truesky.catalogue.galaxies.strong_lenses import Disc, Lens
@@ -117,12 +117,12 @@ def systems(drawn):
     return pa.concat_tables(found), 12 * sky.cell_area(8)
 
 
-def test_dispersions_are_those_of_nearby_galaxies():
+def test_dispersions_are_those_of_nearby_galaxies(flat_sky):
     """sum of (sigma / 161 km/s)^4, (Mpc/h)^-3: Choi, Park & Vogeley 2007 have phi* Gamma((alpha + 4) / beta) / ...
 
     In a sky without structure: one cluster of a degree2 moves the sum by a tenth.
     """
-    law, rows = strong_lenses.laws(), flat_sky()
+    law, rows = strong_lenses.laws(), flat_sky
     z, m_r, colour = (rows[name].to_numpy().astype(float) for name in ("z_true", "abs_mag_r01", "color_gr_01"))
     phi, alpha, beta = 8.0e-3, 2.32, 2.67
     expected = phi * gamma((alpha + 4.0) / beta) / gamma(alpha / beta)

@@ -45,7 +45,7 @@ def image(band, **known):
 
 
 @pytest.fixture(scope="module")
-def drawn():
+def frames():
     return {(band, colour): image(band, bulge_color=colour) for band in BANDS for colour in (0.25, np.nan)}
 
 
@@ -56,30 +56,30 @@ def light(frame, near, far):
     return frame[(radius >= near) & (radius < far)].sum()
 
 
-def redder_inside(drawn, band):
+def redder_inside(frames, band):
     """I_E less another band inside 0.5" less that of 1" to 3", mag."""
     inner, outer = (
-        -2.5 * np.log10(light(drawn["euclid_vis", 0.25], *ring) / light(drawn[band, 0.25], *ring))
+        -2.5 * np.log10(light(frames["euclid_vis", 0.25], *ring) / light(frames[band, 0.25], *ring))
         for ring in ((0.0, 0.5), (1.0, 3.0))
     )
     return inner - outer
 
 
 @pytest.mark.parametrize("band", BANDS[1:])
-def test_the_middle_is_redder_than_the_outskirts(drawn, band):
-    assert 0.02 < redder_inside(drawn, band) < 0.35
+def test_the_middle_is_redder_than_the_outskirts(frames, band):
+    assert 0.02 < redder_inside(frames, band) < 0.35
 
 
-def test_the_farther_the_band_the_redder(drawn):
-    assert redder_inside(drawn, "euclid_h") > 1.2 * redder_inside(drawn, "euclid_y")
+def test_the_farther_the_band_the_redder(frames):
+    assert redder_inside(frames, "euclid_h") > 1.2 * redder_inside(frames, "euclid_y")
 
 
 @pytest.mark.parametrize("band", BANDS)
-def test_the_flux_is_the_catalogue_s(drawn, band):
-    whole, plain = drawn[band, 0.25].sum(), drawn[band, np.nan].sum()
+def test_the_flux_is_the_catalogue_s(frames, band):
+    whole, plain = frames[band, 0.25].sum(), frames[band, np.nan].sum()
     assert whole == pytest.approx(plain, rel=1e-4)
     assert whole == pytest.approx(ELECTRONS, rel=0.01)
 
 
-def test_without_a_colour_bands_are_alike(drawn):
-    assert np.array_equal(drawn["euclid_vis", np.nan], drawn["euclid_h", np.nan])
+def test_without_a_colour_bands_are_alike(frames):
+    assert np.array_equal(frames["euclid_vis", np.nan], frames["euclid_h", np.nan])

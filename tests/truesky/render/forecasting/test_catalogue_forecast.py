@@ -90,7 +90,7 @@ def test_the_numbers_are_a_forecast_of_another_area():
 
 
 @pytest.fixture(scope="module")
-def drawn(tmp_path_factory):
+def few_sources(tmp_path_factory):
     """A lake of few sources."""
     lake = tmp_path_factory.mktemp("lake")
     wanted = from_table(tomllib.loads(requests.text(
@@ -103,8 +103,8 @@ def drawn(tmp_path_factory):
 
 
 @pytest.mark.nightly
-def test_what_is_drawn_is_what_was_forecast(drawn):
-    lake, wanted = drawn
+def test_what_is_drawn_is_what_was_forecast(few_sources):
+    lake, wanted = few_sources
     held = {line.job: line for line in catalogue_forecast.of_lake(lake)}
     for job, line in forecast(wanted).items():
         assert (held[job].rows, held[job].gb) == pytest.approx((line.rows, line.gb), rel=1e-6)

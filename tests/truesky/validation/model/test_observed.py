@@ -13,7 +13,7 @@ from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store import layout, publish, read
 from lake_schema.store.plan import Output, Part, Plan
 from lake_schema.tables.galaxies import GALAXIES
-from tests.truesky.catalogue.conftest import FLAT_CELLS, flat_sky, made
+from tests.truesky.catalogue.conftest import FLAT_CELLS, made
 from truesky.catalogue.galaxies import high_redshift
 from truesky.catalogue.halos import quenching
 from truesky.validation import __main__, checks
@@ -36,8 +36,8 @@ def flat():
 
 
 @pytest.fixture(scope="module")
-def whole():
-    return observed.figures(seen(flat_sky(), FLAT_CELLS))
+def whole(flat_sky):
+    return observed.figures(seen(flat_sky, FLAT_CELLS))
 
 
 def off(figures):
@@ -88,9 +88,9 @@ def test_a_lake_is_compared(flat, tmp_path, capsys):
 
 
 @pytest.fixture(scope="module")
-def patch():
+def patch(flat_sky):
     """(a lake's sky of eight cells, the cell of each galaxy)."""
-    rows = flat_sky()
+    rows = flat_sky
     cell = rows["_healpix_29"].to_numpy() >> 2 * (sky.DEEPEST - GENERATION_ORDER)
     part = rows.filter(pa.array(cell < 2 * FEW))
     return seen(part, 2 * FEW), cell[(cell < 2 * FEW) & (rows["kind"].to_numpy() < 2)]

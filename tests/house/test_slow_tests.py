@@ -1,0 +1,108 @@
+"""The list of slow tests, and the plugin that compares tests with it."""
+
+import os
+from types import SimpleNamespace
+
+import pytest
+
+from tests import slow_tests
+from tests.slow_tests import LIMIT, SLOW, Watch
+
+NAME = "tests/test_x.py::test_y"
+
+
+def test_the_list_is_short_and_gives_reasons():
+    rows = slow_tests.read()
+    assert len(rows) <= slow_tests.LONGEST
+    with slow_tests.LIST.open(encoding="utf-8") as stream:
+        # No test is listed twice.
+        assert len(list(stream)) == len(rows) + 1
+    for name, row in rows.items():
+        assert float(row["seconds"]) >= SLOW, name
+        assert len(row["reason"].split()) >= 3, name
+
+
+@pytest.fixture
+def warnings():
+    """Texts of warnings."""
+    return []
+
+
+@pytest.fixture
+def watch(tmp_path, warnings):
+    """A plugin whose run has an old cache, and that is at a test."""
+    cache = tmp_path / "cache"
+    (cache / "array").mkdir(parents=True)
+    for folder in (cache / "array", cache):
+        os.utime(folder, (1000.0, 1000.0))
+    found = Watch({"tests/test_x.py::test_listed", "tests/test_x.py::field"}, cache)
+    found.item = SimpleNamespace(
+        get_closest_marker=lambda name: None, warn=lambda warning: warnings.append(str(warning))
+    )
+    return found
+
+
+def test_a_slow_test_fails(watch, warnings):
+    with pytest.raises(pytest.fail.Exception, match=f"{NAME} took 10.1 s of CPU time"):
+        watch.judge(NAME, LIMIT + 0.1, 2000.0)
+    assert warnings == []
+
+
+def test_between_the_limits_there_is_a_warning(watch, warnings):
+    watch.judge(NAME, SLOW, 2000.0)
+    assert warnings == []
+    watch.judge(NAME, LIMIT, 2000.0)
+    (line,) = warnings
+    assert line.startswith(f"{NAME} took 10.0 s")
+
+
+def test_listed_and_nightly_ones_may_take_long(watch, warnings):
+    for name in ("test_listed", "field"):
+        watch.judge(f"tests/test_x.py::{name}", 100.0, 2000.0)
+    watch.item.get_closest_marker = lambda name: name == "nightly"
+    watch.judge(NAME, 100.0, 2000.0)
+    assert warnings == []
+
+
+def test_whoever_fills_the_cache_may_take_long(watch, warnings):
+    watch.judge(NAME, 100.0, 999.0)
+    os.utime(watch.cache / "array", (3000.0, 3000.0))
+    watch.judge(NAME, 100.0, 2000.0)
+    assert warnings == []
+
+
+def clock_of(*seconds):
+    """A clock that shows these times, one after another."""
+    left = iter(seconds)
+    return lambda: next(left)
+
+
+def test_calls_and_fixtures_are_measured(watch):
+    def result_of(wrapper):
+        next(wrapper)
+        with pytest.raises(StopIteration) as done:
+            wrapper.send("result")
+        return done.value.value
+
+    item = SimpleNamespace(nodeid=NAME)
+    fixture = SimpleNamespace(baseid="tests/test_x.py", argname="field")
+    watch.clock = clock_of(1.0, 1.0 + LIMIT, 1.0, 2.0 + LIMIT, 5.0, 500.0)
+    os.utime(watch.cache / "array", (1000.0, 1000.0))
+    assert result_of(watch.pytest_runtest_call(item)) == "result"
+    wrapper = watch.pytest_runtest_call(item)
+    next(wrapper)
+    with pytest.raises(pytest.fail.Exception, match=r"took 11\.0 s"):
+        wrapper.send(None)
+    assert result_of(watch.pytest_fixture_setup(fixture)) == "result"
+
+
+def test_entries_that_do_not_exist_are_found():
+    items = [SimpleNamespace(nodeid="tests/test_field.py::test_a[x]", fixturenames=["field"])]
+    there = [
+        "tests/test_field.py::test_a[x]",
+        "tests/test_field.py::field",
+        "tests::field",
+        "tests/test_jobs.py::test_b",
+    ]
+    lost = ["tests/test_field.py::test_a", "tests/test_field.py::other", "tests/test_none.py::test_a", "nowhere::field"]
+    assert slow_tests.missing(there + lost, items) == lost

@@ -1,0 +1,123 @@
+"""A test that takes long must be on a list with a reason (`slow_tests.csv`), or it fails.
+
+CPU time is measured, of the process and of its children that ended, so that other programs do not matter. A fixture is
+listed, too, as `<file or folder of its conftest>::<name>`.
+
+read     the list
+missing  entries of the list that name nothing
+Watch    the plugin that measures
+"""
+
+import csv
+import os
+import time
+from pathlib import Path
+
+import pytest
+
+LIST = Path(__file__).with_name("slow_tests.csv")
+# CPU seconds: above SLOW a test should be on the list. It fails only above LIMIT, since machines differ by a factor of 2.
+SLOW, LIMIT = 5.0, 10.0
+# Most entries of the list.
+LONGEST = 40
+
+
+def read(path=LIST):
+    """Name of a slow test or fixture -> its row of the list: `test`, `seconds`, `reason`."""
+    with path.open(newline="", encoding="utf-8") as stream:
+        return {row["test"]: row for row in csv.DictReader(stream)}
+
+
+def missing(names, items):
+    """Names of the list that no longer exist, as far as their files are among the collected ones.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Names of tests and fixtures.
+    items : list of pytest.Item
+        All tests of the files that are collected.
+    """
+    tests = {item.nodeid for item in items}
+    files = {test.partition("::")[0] for test in tests}
+    absent = []
+    for name in names:
+        place, _, last = name.partition("::")
+        if last.startswith("test_"):
+            there = name in tests if place in files else (LIST.parents[1] / place).is_file()
+        else:
+            below = [item for item in items if item.nodeid.startswith((f"{place}::", f"{place}/"))]
+            there = any(last in item.fixturenames for item in below) if below else (LIST.parents[1] / place).exists()
+        if not there:
+            absent.append(name)
+    return absent
+
+
+def cpu_seconds():
+    """CPU time (s) of this process and of its children that ended."""
+    used = os.times()
+    return used.user + used.system + used.children_user + used.children_system
+
+
+class Watch:
+    """Measure tests and fixtures. A slow one that is not on the list is reported, and fails above LIMIT.
+
+    Parameters
+    ----------
+    listed : container of str
+        Names that may take long.
+    cache : pathlib.Path
+        The cache of the run.
+    clock : callable
+        CPU time, s.
+    """
+
+    def __init__(self, listed, cache, clock=cpu_seconds):
+        self.listed, self.cache, self.clock = listed, cache, clock
+        self.item = None
+
+    def judge(self, name, seconds, since):
+        """Warn above SLOW, fail above LIMIT.
+
+        Parameters
+        ----------
+        name : str
+            Test or fixture, as it would be listed.
+        seconds : float
+            CPU time that it took, s.
+        since : float
+            When it began, s since the epoch.
+        """
+        nightly = self.item.get_closest_marker("nightly") is not None
+        if seconds <= SLOW or nightly or name in self.listed or self.is_filled(since):
+            return
+        message = f"{name} took {seconds:.1f} s of CPU time: make it faster, or add it to tests/slow_tests.csv"
+        if seconds > LIMIT:
+            pytest.fail(f"{message} (more than {LIMIT:g} s)", pytrace=False)
+        self.item.warn(pytest.PytestWarning(message))
+
+    def is_filled(self, since):
+        """Whether arrays or compiled code were added to the cache after a time, s since the epoch.
+
+        If the cache is empty, any test may be the first that needs one of them, and it makes it for all others.
+        """
+        return any(os.stat(folder).st_mtime >= since for folder, _, _ in os.walk(self.cache))
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_runtest_setup(self, item):
+        self.item = item
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_call(self, item):
+        since, before = time.time(), self.clock()
+        result = yield
+        self.judge(item.nodeid, self.clock() - before, since)
+        return result
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_fixture_setup(self, fixturedef):
+        # The fixtures that it depends on were set up before.
+        since, before = time.time(), self.clock()
+        result = yield
+        self.judge(f"{fixturedef.baseid}::{fixturedef.argname}", self.clock() - before, since)
+        return result
