@@ -98,6 +98,7 @@ def test_exposure_times_from_nothing_to_a_day(seconds):
 
 @pytest.mark.parametrize("mean", [1e-300, 1e9, 1e18])
 def test_counting_the_countless(mean):
+    """Sample of 40,000 pixels; significance 6e-5 of the mean (4 standard errors), 2e-5 of the variance (3 %)."""
     counted = poisson.apply(np.full((200, 200), mean), rng=np.random.default_rng(1))
     assert counted.mean() == pytest.approx(mean, abs=4 * np.sqrt(mean) / 200)
     assert counted.var() == pytest.approx(mean, rel=0.03, abs=1e-290)

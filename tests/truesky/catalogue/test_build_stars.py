@@ -50,6 +50,7 @@ def test_the_rows_do_not_depend_on_the_files(versions):
 
 
 def test_files_hold_about_what_was_planned(versions):
+    """Sample of all files; significance 3e-7 for each (5 standard errors)."""
     _, mixed, _ = versions
     coarse = [part for part in mixed.parts if layout.cell_of_file(part)[0] < ids.GENERATION_ORDER]
     rows = [mixed.rows(["id"], [part]).num_rows for part in coarse]

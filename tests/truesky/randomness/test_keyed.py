@@ -60,7 +60,7 @@ def test_compiled_uniforms_are_those_of_splitmix():
      ("beta", stats.beta(2.0, 0.6))],
 )  # fmt: skip
 def test_distributions(kind, law):
-    """Of neighbouring identifiers; p above 1e-4."""
+    """Sample of neighbouring identifiers; significance 1e-4 of the law, 6e-7 of correlations (5 standard errors)."""
     rng = Keyed(np.arange(N) << 11, 0, "x")
     one, other = drawn(rng, kind), drawn(rng, kind)
     assert stats.kstest(one, law.cdf).pvalue > 1e-4
@@ -78,6 +78,7 @@ def test_normals_are_the_inverse_of_the_uniforms():
 
 @pytest.mark.parametrize("mean", [0.0, 0.02, 3.0, 599.0, 4321.0])
 def test_poisson(mean):
+    """Sample of 20,000 identifiers; significance 6e-7 of the mean and of the variance (5 standard errors)."""
     found = np.array([compiled_draws.poisson(key, mean) for key in keys(np.arange(20_000), 1, "x")])
     error = np.sqrt(mean / found.size)
     assert found.mean() == pytest.approx(mean, abs=5 * error)

@@ -48,6 +48,7 @@ def test_other_types_are_refused(part):
 
 
 def test_uniform_and_uncorrelated():
+    """Sample of 100,000 numbers of each stream; significance 6e-5 (4 standard errors)."""
     a, b = stream(1, "a").random(100_000), stream(1, "b").random(100_000)
     assert abs(a.mean() - 0.5) < 4 / np.sqrt(12 * 100_000)
     assert abs(np.corrcoef(a, b)[0, 1]) < 4 / np.sqrt(100_000)
@@ -71,7 +72,10 @@ def test_a_source_has_its_own_uniforms_among_any_others(found, count):
 
 
 def test_uniforms_are_uniform_and_independent():
-    """Of neighbouring identifiers, of the numbers of one source, and of two seeds."""
+    """Of neighbouring identifiers, of the numbers of one source, and of two seeds.
+
+    Sample of 100,000 identifiers; significance 6e-7 of means, counts and correlations (5 standard errors).
+    """
     n = 100_000
     found = np.concatenate([uniforms(np.arange(n) << 18, 3, seed, "x") for seed in (1, 2)])
     assert abs(found.mean(1) - 0.5).max() < 5 / np.sqrt(12 * n)

@@ -107,7 +107,10 @@ def noisy(seed, hits=0.0):
 
 
 def test_the_noise_is_as_the_weight_and_the_correlation_say():
-    """Sums of many pixels scatter as the weight says, pixels alone less: by what the header says, and the variance."""
+    """Sums of many pixels scatter as the weight says, pixels alone less: by what the header says, and the variance.
+
+    Sample of 300 sums or more; significance 3e-3 of their variance (3 standard errors).
+    """
     made, *_ = stack.stacked(noisy(1), SCALE)
     truth, *_ = stack.stacked([(as_reduced(light + SKY), system) for light, system in dithers()[0]], SCALE)
     deep = (made.reduced.weight > 3.0 * np.median(nominal.TIME**2 / (SKY + NOISE**2))) & (truth.reduced.flags == 0)

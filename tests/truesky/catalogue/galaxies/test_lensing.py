@@ -108,7 +108,10 @@ def limber(ell, chi):
 
 
 def test_power_and_modes_of_the_universe(universe):
-    """C_l of kappa within 10 % of linear theory for 30 < l < nside; no B modes; gamma = what kappa says."""
+    """C_l of kappa within 10 % of linear theory for 30 < l < nside; no B modes; gamma = what kappa says.
+
+    Sample of two planes with about 500 independent places; significance 3e-3 of the mean (3 standard errors).
+    """
     planes = universe.lens
     for number in (7, 12):
         kappa, gamma1, gamma2 = (hp.reorder(planes.maps[number][:, i].astype(float), n2r=True) for i in range(3))

@@ -102,12 +102,14 @@ def test_disc_ellipticities_are_miller_s(rng):
 
 
 def test_bulge_axis_ratios_are_a_truncated_normal(rng):
+    """Sample of 20,000 ratios; significance 1e-3 (Kolmogorov-Smirnov)."""
     q = morphology.bulge_axis_ratio(SHAPES.bulge, 20_000, rng)
     truncated = stats.truncnorm((0.3 - 0.75) / 0.15, (1.0 - 0.75) / 0.15, 0.75, 0.15)
     assert stats.kstest(q, truncated.cdf).pvalue > 1e-3
 
 
 def test_position_angles_are_uniform(rng):
+    """Sample of 20,000 angles; significance 1e-3 (Kolmogorov-Smirnov)."""
     angle = morphology.position_angle(20_000, rng)
     assert stats.kstest(angle, stats.uniform(0, 180).cdf).pvalue > 1e-3
 

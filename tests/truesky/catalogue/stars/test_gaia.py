@@ -67,6 +67,7 @@ def test_errors_of_parallax(g, published):
     ("g", "parallax_mas", "g_mag"), [(15.0, 0.037, 8.5e-4), (17.0, 0.098, 2e-3), (20.0, 0.765, 0.01)]
 )
 def test_what_is_measured_has_the_errors_that_are_said(g, parallax_mas, g_mag):
+    """Sample of 20,000 stars; significance 6e-7 of means (5 standard errors); errors within 5 %."""
     n = 20_000
     stars, flux = stars_of(np.full(n, g))
     found = gaia.observe(stars, flux, 7)
@@ -279,7 +280,10 @@ def test_proper_motions_change_no_other_column():
 
 @pytest.mark.parametrize(("g", "published"), [(15.0, 0.06), (17.0, 0.2), (20.0, 1.2)])
 def test_errors_of_proper_motions(g, published):
-    """mas/yr, Lindegren et al. 2018, and errors that are those said and correlated with nothing."""
+    """mas/yr, Lindegren et al. 2018, and errors that are those said and correlated with nothing.
+
+    Sample of 20,000 stars; significance 6e-7 of correlations (5 standard errors).
+    """
     n = 20_000
     east, north = gaia.proper_motion_errors(np.array([g]))
     assert (east + north) / 2 == pytest.approx(published, rel=0.3)

@@ -72,6 +72,7 @@ def test_there_are_fewer_stars_away_from_the_plane(galaxy, lon, lat, step, limit
 
 
 def test_all_that_may_be_bright_enough_is_expected(rng):
+    """Sample of 0.05 deg2, drawn twice; significance 2e-5 of the difference (6 Poisson errors of one)."""
     everything = mw.expected(GALAXY, 40.0, 30.0, 0.05, 60.0)
     bright = mw.expected(GALAXY, 40.0, 30.0, 0.05, 22.0)
     assert np.all((bright == everything) | (bright == 0.0))
@@ -84,6 +85,7 @@ def test_all_that_may_be_bright_enough_is_expected(rng):
 
 
 def test_a_sample_has_the_expected_distribution(rng):
+    """Sample of 4 deg2; significance 6e-7 of each number (5 standard errors)."""
     mean = mw.expected(GALAXY, 120.0, -50.0, 4.0, 26.0)
     sample = mw.draw(GALAXY, mean, rng, rng)
     n = sample.m_h.size

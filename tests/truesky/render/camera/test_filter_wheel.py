@@ -77,6 +77,7 @@ def test_another_seed_is_another_tilt():
 
 
 def test_the_error_is_the_mission_s():
+    """Sample of 400 positions; significance 6e-5 of the mean (4 standard errors), 1e-3 of the rms (8 %)."""
     tilts = []
     for number in range(400):
         seen = filter_wheel.tilted(NISP[5], str(number), 1)

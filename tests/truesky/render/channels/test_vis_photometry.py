@@ -95,7 +95,10 @@ def test_what_the_effects_take_is_what_the_benchmark_says():
 
 
 def test_galaxies_of_the_weak_lensing_sample_are_as_clear_as_stated():
-    """Of I_E = 24.5 and r_e = 0.3", in a stack of four: the noise that their fluxes scatter by is the expected one."""
+    """Of I_E = 24.5 and r_e = 0.3", in a stack of four: the noise that their fluxes scatter by is the expected one.
+
+    Sample of 240 galaxies or more; significance 6e-5 of the mean (4 standard errors), 0.03 of the scatter (10 %).
+    """
     detector, forced = small("vis", "3-4", 512), nominal.off(*nominal.COSMIC_RAYS, *CTI)
     x, y = nominal.lattice(512, 32)
     stack = []

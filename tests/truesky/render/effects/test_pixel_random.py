@@ -65,6 +65,7 @@ def test_machine_code_is_made_anew_when_the_mixer_changes(tmp_path):
 
 
 def test_uniform(many):
+    """Sample of COUNT pixels; significance LEAST of the law and of each 4096th part."""
     uniform = many[1]
     assert stats.kstest(uniform, "uniform").pvalue > LEAST
     assert stats.chisquare(np.bincount((uniform * 4096).astype(int), minlength=4097)[:4096]).pvalue > LEAST
@@ -74,7 +75,7 @@ def test_uniform(many):
 
 
 def test_normal(many):
-    """As a whole, and bin by bin, where the ziggurat's layers meet."""
+    """As a whole, and bin by bin, where the ziggurat's layers meet. Sample of COUNT pixels, significance LEAST."""
     normal = many[2]
     assert stats.kstest(normal, "norm").pvalue > LEAST
     edges = np.concatenate([[-np.inf], np.arange(-4.0, 4.01, 0.02), [np.inf]])
@@ -83,7 +84,10 @@ def test_normal(many):
 
 
 def test_the_normal_s_tails():
-    """No layer holds them: of more deviates, as many beyond each place as there should be, and as they should lie."""
+    """No layer holds them: of more deviates, as many beyond each place as there should be, and as they should lie.
+
+    Sample of 2^26 deviates; significance LEAST of each number and of the law.
+    """
     count, least = 1 << 26, 3.5
     found = far_out(KEY, count, least)
     for sigma in (least, 3.654, 3.66, 4.0, 4.5, 5.0, 5.5):
@@ -96,6 +100,7 @@ def test_the_normal_s_tails():
 
 
 def test_each_bit_is_as_often_set(many):
+    """Sample of COUNT words; significance 7e-6 of each bit (4.5 standard errors)."""
     words = many[0]
     often = np.array([np.mean((words >> np.uint64(bit)) & np.uint64(1)) for bit in range(64)])
     assert np.abs(often - 0.5).max() < 4.5 * 0.5 / np.sqrt(COUNT)
@@ -117,6 +122,7 @@ def test_words_of_a_pixel_have_nothing_in_common(many):
 
 
 def unlike(one, other):
+    """Sample of COUNT pixels; significance 7e-6 of each correlation (4.5 standard errors)."""
     assert not np.any(one[0] == other[0])
     for a, b in ((one[1], other[1]), (one[2], other[2]), (one[2] ** 2, other[2] ** 2)):
         assert abs(np.corrcoef(a, b)[0, 1]) < 4.5 / np.sqrt(len(a))

@@ -128,6 +128,7 @@ def test_no_effect_is_left_out_here():
 
 @pytest.mark.parametrize("name", CASES)
 def test_what_is_left_out_is_not_noticed(name):
+    """Sample of eight columns; for random effects, a significance of 6e-7 of their mean (5 standard errors)."""
     effect = EFFECTS[name]
     needed = []
     for size in np.geomspace(1e-5, 1e4, 19):
@@ -186,7 +187,10 @@ def test_a_pixel_s_own_response_is_left_out_of_faint_stars():
 
 @pytest.mark.parametrize("mag", [pytest.param(14.0, marks=pytest.mark.nightly), 20.0, 24.0, 27.0])
 def test_all_that_a_scene_does_without_is_not_noticed_together(mag):
-    """Stars so faint that little is needed, or so bright that next to everything is."""
+    """Stars so faint that little is needed, or so bright that next to everything is.
+
+    Sample of 256 x 256 pixels; significance 6e-7 of the mean (5 standard errors).
+    """
     x, y = nominal.lattice(256, 64)
     one = nominal.rendered(small("vis", "3-4", 256), np.full(len(x), mag), x, y)
     # Before it is rounded.

@@ -89,7 +89,10 @@ def through(light, between):
 
 
 def test_rows_of_charge_injection_hold_nothing_that_repels():
-    """Neither half knows what shone between them, or on the other; each loses to them as its charge says."""
+    """Neither half knows what shone between them, or on the other; each loses to them as its charge says.
+
+    Sample of 2000 columns; significance 6e-7 of each row's mean (5 standard errors).
+    """
     level, rng = 1e5, np.random.default_rng(1)
     flat = rng.poisson(level, (40, 2000)).astype(float)
     lit = flat.copy()

@@ -46,7 +46,10 @@ def test_modes():
 
 @pytest.mark.parametrize("mode", [PHOTOMETRIC, SPECTROSCOPIC, ramp.Mode(2, 1, 0), ramp.Mode(30, 1, 0)], ids=str)
 def test_moments_of_the_groups(mode):
-    """Means and covariances of all groups, as sums of independent counts have them."""
+    """Means and covariances of all groups, as sums of independent counts have them.
+
+    Sample of 40,000 pixels; significance 7e-6 of each moment (4.5 standard errors).
+    """
     weights, count, per_frame = mode.weights(), 40_000, 2.0
     groups = fast(mode, per_frame, count, np.random.default_rng(1)).astype(float)
     first = np.clip(mode.reads - np.arange(mode.frames), 0, mode.reads) / mode.reads
@@ -76,7 +79,7 @@ def test_law_of_signal_and_quality_of_many(mode, rate):
 
 
 def hold_together(mode, rate, slow_count, count, width):
-    """rate : e-/s.  Kolmogorov-Smirnov at 1 %, the width of the signal, chi^2 within 2 %."""
+    """rate : e-/s.  Two samples: Kolmogorov-Smirnov, significance 1 %; the width of the signal; chi^2 within 2 %."""
     rng = np.random.default_rng(int(100 * rate) + mode.groups)
     slow = read(every_frame(mode, rate * FRAME_TIME, slow_count, rng), mode, rng)
     quick = read(fast(mode, rate * FRAME_TIME, count, rng), mode, rng)
@@ -107,7 +110,10 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("mode", [PHOTOMETRIC, SPECTROSCOPIC], ids=str)
 def test_law_of_pixels_that_are_not_linear(mode, case):
-    """With the noise of their light: signal and quality against a count a frame."""
+    """With the noise of their light: signal and quality against a count a frame.
+
+    Two samples of 4000 pixels; significance 1 % of the law, 7e-6 of the mean (4.5 standard errors).
+    """
     electrons, charge, bend = CASES[case]
     slow, quick = pixels(mode, 4000, np.random.default_rng(5), electrons, charge, bend)
     for i in range(2):
@@ -129,6 +135,7 @@ def test_a_hit_is_not_its_charge_in_the_signal(mode, more, seen):
 
 @pytest.mark.parametrize("mode", [PHOTOMETRIC, SPECTROSCOPIC], ids=str)
 def test_drawing_every_frame_is_the_same_law(mode):
+    """Two samples of 40,000 pixels; significance 1 % (Kolmogorov-Smirnov)."""
     rng, count = np.random.default_rng(3), 40_000
     quick = read(fast(mode, 1.0, count, rng), mode, rng)
     slow = read(fast(mode, 1.0, count, rng, linear_below=0.0), mode, rng)
@@ -153,7 +160,10 @@ def test_pixels_that_are_not_linear_against_every_frame(mode):
 
 
 def test_non_linearity_is_the_same_where_the_law_changes():
-    """Mean signal just below and just above the limit of the linear law."""
+    """Mean signal just below and just above the limit of the linear law.
+
+    Sample of 40,000 pixels; significance 7e-6 (4.5 standard errors).
+    """
     bend, count = 6e-7, 40_000
     light = np.full((1, count), 2990.0 * PHOTOMETRIC.integrated / PHOTOMETRIC.frames)
     bent = ramp.planes(light, 4)

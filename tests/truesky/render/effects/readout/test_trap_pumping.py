@@ -33,7 +33,10 @@ def pumped(lattice, phase, frame=None, seed=1, shuffles=2000, efficiency=0.5):
 @pytest.mark.parametrize("phase", [0.01, 0.05, 0.3])
 @pytest.mark.parametrize("tau", RELEASE)
 def test_a_trap_moves_what_cycles_one_by_one_do(tau, phase):
-    """An electron is caught as a cycle begins, held for an exponential time, and moves if it is let go in phase two."""
+    """An electron is caught as a cycle begins, held for an exponential time, and moves if it is let go in phase two.
+
+    Sample of 200,000 cycles; significance 6e-5 (4 standard errors).
+    """
     cycles = 200_000
     held = np.random.default_rng(1).exponential(tau * DWELL, cycles)
     carried = ((held > phase) & (held < 2 * phase)).sum()
@@ -69,7 +72,10 @@ def dipoles(frames):
 
 @pytest.mark.parametrize(("species", "phases"), [(0, (0.005, 0.01, 0.02, 0.04)), (2, (0.05, 0.15, 0.5, 1.2))])
 def test_release_times_and_densities_are_recovered(species, phases):
-    """From the dipoles alone, by the curve's fit and by counting those of the volume that the charge fills."""
+    """From the dipoles alone, by the curve's fit and by counting those of the volume that the charge fills.
+
+    Sample of the traps of one frame; significance 6e-5 of their number (4 standard errors).
+    """
     rho = 4e-3
     density = [0.0, 0.0, 0.0]
     density[species] = rho
@@ -101,7 +107,10 @@ def test_more_charge_reaches_more_traps():
 
 
 def test_traps_stay_and_more_come():
-    """In all exposures of a detector the same, and those of a young one in an old one, too."""
+    """In all exposures of a detector the same, and those of a young one in an old one, too.
+
+    Sample of one detector; significance 6e-5 of each species' number (4 standard errors).
+    """
     mission = resolve()
     found = []
     for age in (0.03, 0.03, 0.06):
