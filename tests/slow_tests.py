@@ -10,13 +10,14 @@ Watch    the plugin that measures
 
 import csv
 import os
+import re
 import time
 from pathlib import Path
 
 import pytest
 
 LIST = Path(__file__).with_name("slow_tests.csv")
-# CPU seconds: above SLOW a test should be on the list. It fails only above LIMIT, since machines differ by a factor of 2.
+# CPU seconds: above SLOW a test should be on the list. It fails only above LIMIT, since machines differ.
 SLOW, LIMIT = 5.0, 10.0
 # Most entries of the list.
 LONGEST = 40
@@ -38,16 +39,20 @@ def missing(names, items):
     items : list of pytest.Item
         All tests of the files that are collected.
     """
-    tests = {item.nodeid for item in items}
-    files = {test.partition("::")[0] for test in tests}
+    collected = {item.nodeid: item for item in items}
+    files = {test.partition("::")[0] for test in collected}
     absent = []
     for name in names:
         place, _, last = name.partition("::")
-        if last.startswith("test_"):
-            there = name in tests if place in files else (LIST.parents[1] / place).is_file()
+        path = LIST.parents[1] / place
+        if path.is_dir():
+            there = re.search(rf"\b{last}\b", (path / "conftest.py").read_text(encoding="utf-8"))
+        elif place not in files or not path.is_file():
+            there = path.is_file()
+        elif last.startswith("test_"):
+            there = name in collected
         else:
-            below = [item for item in items if item.nodeid.startswith((f"{place}::", f"{place}/"))]
-            there = any(last in item.fixturenames for item in below) if below else (LIST.parents[1] / place).exists()
+            there = any(last in item.fixturenames for test, item in collected.items() if test.startswith(f"{place}::"))
         if not there:
             absent.append(name)
     return absent

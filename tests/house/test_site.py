@@ -8,7 +8,6 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import pytest
 
-from scripts import docs_references, make_docs
 from truesky.render.channels import registry
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -17,6 +16,9 @@ EFFECTS = {e.name for channel in registry.CHANNELS.values() for kind in channel.
 
 def test_its_pages(tmp_path, monkeypatch):
     """Each is in the contents; every effect is described, with its figure, of which one is drawn by day."""
+    # Sphinx and nbconvert take seconds to load, in each process of tests.
+    from scripts import docs_references, make_docs
+
     draw = docs_references._figure
     monkeypatch.setattr(
         docs_references, "_figure", lambda path, *of: path.touch() if list(path.parent.iterdir()) else draw(path, *of)

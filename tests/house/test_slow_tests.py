@@ -8,7 +8,7 @@ import pytest
 from tests import slow_tests
 from tests.slow_tests import LIMIT, SLOW, Watch
 
-NAME = "tests/test_x.py::test_y"
+NAME = "test_x.py::test_y"
 
 
 def test_the_list_is_short_and_gives_reasons():
@@ -35,7 +35,7 @@ def watch(tmp_path, warnings):
     (cache / "array").mkdir(parents=True)
     for folder in (cache / "array", cache):
         os.utime(folder, (1000.0, 1000.0))
-    found = Watch({"tests/test_x.py::test_listed", "tests/test_x.py::field"}, cache)
+    found = Watch({"test_x.py::test_listed", "test_x.py::field"}, cache)
     found.item = SimpleNamespace(
         get_closest_marker=lambda name: None, warn=lambda warning: warnings.append(str(warning))
     )
@@ -58,7 +58,7 @@ def test_between_the_limits_there_is_a_warning(watch, warnings):
 
 def test_listed_and_nightly_ones_may_take_long(watch, warnings):
     for name in ("test_listed", "field"):
-        watch.judge(f"tests/test_x.py::{name}", 100.0, 2000.0)
+        watch.judge(f"test_x.py::{name}", 100.0, 2000.0)
     watch.item.get_closest_marker = lambda name: name == "nightly"
     watch.judge(NAME, 100.0, 2000.0)
     assert warnings == []
@@ -85,7 +85,7 @@ def test_calls_and_fixtures_are_measured(watch):
         return done.value.value
 
     item = SimpleNamespace(nodeid=NAME)
-    fixture = SimpleNamespace(baseid="tests/test_x.py", argname="field")
+    fixture = SimpleNamespace(baseid="test_x.py", argname="field")
     watch.clock = clock_of(1.0, 1.0 + LIMIT, 1.0, 2.0 + LIMIT, 5.0, 500.0)
     os.utime(watch.cache / "array", (1000.0, 1000.0))
     assert result_of(watch.pytest_runtest_call(item)) == "result"
@@ -98,11 +98,7 @@ def test_calls_and_fixtures_are_measured(watch):
 
 def test_entries_that_do_not_exist_are_found():
     items = [SimpleNamespace(nodeid="tests/test_field.py::test_a[x]", fixturenames=["field"])]
-    there = [
-        "tests/test_field.py::test_a[x]",
-        "tests/test_field.py::field",
-        "tests::field",
-        "tests/test_jobs.py::test_b",
-    ]
-    lost = ["tests/test_field.py::test_a", "tests/test_field.py::other", "tests/test_none.py::test_a", "nowhere::field"]
-    assert slow_tests.missing(there + lost, items) == lost
+    field, jobs, folder = "tests/test_field.py", "tests/test_jobs.py", "tests"
+    there = [f"{field}::test_a[x]", f"{field}::field", f"{jobs}::test_b", f"{folder}::spark"]
+    lost = [f"{field}::test_a", f"{field}::other", f"{folder}/x.py::test_a", f"{folder}/x::spark", f"{folder}::sparks"]
+    assert slow_tests.missing([*there, *lost], items) == lost

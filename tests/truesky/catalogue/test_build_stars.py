@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from hats.io.validation import is_valid_catalog
 
 from lake_schema import ids, sky
 from lake_schema.errors import BadInput
 from lake_schema.store import layout, publish, read
-from tests import requests
+from tests import hats_readers, requests
 from truesky.catalogue import build_stars
 from truesky.fluxes import compute_fluxes
 from truesky.render.planning import preconditions
@@ -59,7 +58,7 @@ def test_files_hold_about_what_was_planned(versions):
 
 def test_every_order_is_valid_for_others(versions):
     for one in versions[:2]:
-        assert is_valid_catalog(str(one.folder), strict=True)
+        assert hats_readers.is_valid(one.folder)
         assert read.verify(one, deep=True) == []
 
 
@@ -82,7 +81,7 @@ def test_fluxes_lie_beside_their_stars(versions):
     publish.make(lake, step.plan, step.work)
     fluxes = read.version(lake, "star_fluxes")
     assert fluxes.parts == mixed.parts
-    assert is_valid_catalog(str(fluxes.folder), strict=True)
+    assert hats_readers.is_valid(fluxes.folder)
     cells = sky.cells_in_cone(AREA["cone"]["ra"], AREA["cone"]["dec"], 0.3, 8).tolist()
     stars, beside = (one.in_cells(cells, 8, ["id"]) for one in (mixed, fluxes))
     assert stars.num_rows > 1000

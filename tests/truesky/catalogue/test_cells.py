@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from hats.pixel_math.partition_stats import generate_alignment
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -35,6 +34,9 @@ def test_every_cell_lies_in_one_file_of_the_lowest_order_that_can_hold_it(genera
 
 def test_files_are_those_that_hats_would_plan(rng):
     """A sky whose plane is crowded; hats puts each cell of the highest order into a file of its own making."""
+    # It takes seconds to load, in each process of tests.
+    from hats.pixel_math.partition_stats import generate_alignment
+
     _, lat = sky.galactic(*sky.cell_centres(GENERATION_ORDER, np.arange(12 << 16)))
     numbers = rng.poisson(2000.0 * np.exp(-np.abs(lat) / 10.0)) + 1
     parts = cells.by_number(range(numbers.size), numbers, 60_000, 3)

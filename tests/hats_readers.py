@@ -1,0 +1,15 @@
+"""Libraries that read HATS. They take seconds to load, in each process of tests, so a test loads them when it runs."""
+
+
+def is_valid(folder):
+    """Return whether a catalogue is valid by the strict rules of `hats`."""
+    from hats.io.validation import is_valid_catalog
+
+    return is_valid_catalog(str(folder), strict=True)
+
+
+def open_catalog(folder):
+    """Open a catalogue by `lsdb`."""
+    import lsdb
+
+    return lsdb.open_catalog(str(folder))
