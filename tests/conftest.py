@@ -1,5 +1,6 @@
 """What all tests share: a cache and an environment of their own, one Spark session, hypothesis profiles."""
 
+import gc
 import os
 import tempfile
 from collections import Counter
@@ -68,6 +69,12 @@ def pytest_collection_modifyitems(config, items):
         seconds[_scope(name.partition("::")[0])] += float(row["seconds"])
     java = {file for item, file in files.items() if item.get_closest_marker("spark")}
     items.sort(key=lambda item: (-seconds[_scope(files[item])], files[item] not in java, _scope(files[item])))
+
+
+def pytest_collection_finish():
+    """Modules and tests stay until the end, so the garbage collector need not look at them any more."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.hookimpl(optionalhook=True)

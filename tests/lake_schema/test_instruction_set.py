@@ -4,6 +4,7 @@ import os
 import platform
 import subprocess
 import sys
+from functools import cache
 
 import numpy as np
 import pytest
@@ -25,6 +26,8 @@ def clean_environment(**variables):
     return {**kept, **variables}
 
 
+# Several tests ask for the same: a process takes a second.
+@cache
 def told(code, **variables):
     """Lines that a new process prints, with the limit's own variables as given."""
     done = subprocess.run(
