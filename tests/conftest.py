@@ -1,6 +1,5 @@
 """What all tests share: a cache and an environment of their own, one Spark session, hypothesis profiles."""
 
-import gc
 import os
 import tempfile
 from collections import Counter
@@ -75,12 +74,6 @@ def pytest_collection_modifyitems(config, items):
         return -seconds[scope], scope not in java, scope.startswith("tests/lake_schema/"), scope
 
     items.sort(key=place)
-
-
-def pytest_collection_finish():
-    """Modules and tests stay until the end, so the garbage collector need not look at them any more."""
-    gc.collect()
-    gc.freeze()
 
 
 @pytest.hookimpl(optionalhook=True)
