@@ -71,7 +71,7 @@ def figures(universe: Population, count: int) -> dict[str, float]:
 def _pairs(ra: Float, dec: Float, theta: Float) -> Float:
     """Ordered pairs in each bin of separation, edges theta in rad."""
     same = np.zeros(ra.size, np.int64)
-    return 2.0 * pairs.counted(sky.unit_vectors(ra, dec), same, same, theta).total[0]
+    return np.asarray(2.0 * pairs.counted(sky.unit_vectors(ra, dec), same, same, theta).total[0])
 
 
 def power_law(chi: Float, theta: Float) -> Float:
