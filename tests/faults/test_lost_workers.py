@@ -62,7 +62,8 @@ def local(tmp_path_factory, request_file):
     """The lake that the jobs make in local mode."""
     root = layout.lake(tmp_path_factory.mktemp("local") / "lake")
     for stage in (*run.CATALOGUES, *run.IMAGES):
-        submit(stage.file, root, request_file)
+        package, name = stage.module.split(".")[1:]
+        submit(f"jobs/{package}/{name}.py", root, request_file)
     return root
 
 
