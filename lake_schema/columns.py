@@ -43,7 +43,6 @@ class Column:
     lo, hi        : inclusive bounds of a legal value
     codes         : meaning of each code of an enumeration, () for anything else
     mantissa_bits : bits kept of a float32 mantissa where the column may be rounded, None = all
-    since         : version of the table that introduced the column
     """
 
     name: str
@@ -56,7 +55,6 @@ class Column:
     nullable: bool = False
     codes: tuple[tuple[int | str, str], ...] = ()
     mantissa_bits: int | None = None
-    since: int = 1
 
     def __post_init__(self) -> None:
         if self.type not in _TYPES:
@@ -96,9 +94,6 @@ class Table:
     key   : columns that together identify a row
     order : HEALPix order of its files (nested), None for a table that is not on the sky
     finest : the highest order of its files, where they differ in order so as to hold about as many rows
-    former : columns of earlier versions, which are passed over where a lake has them
-    aliases : earlier names of columns, and what they are called now: both are understood for a version
-    earlier : the declaration that lakes up to its version are read with, where a name has changed its meaning since
     """
 
     name: str
@@ -108,9 +103,6 @@ class Table:
     key: tuple[str, ...] = ("id",)
     order: int | None = None
     finest: int | None = None
-    former: tuple[str, ...] = ()
-    aliases: tuple[tuple[str, str], ...] = ()
-    earlier: Table | None = None
 
     def __post_init__(self) -> None:
         names = [column.name for column in self.columns]

@@ -26,7 +26,6 @@ import numpy as np
 from lake_schema.errors import Damaged
 from lake_schema.store.object_storage.s3 import Folder, Place
 from lake_schema.store.plan import Json
-from lake_schema.store.provenance import file_sha256
 
 # Smaller pieces share a block, larger ones are cut.
 _LEAST_BYTES, _MOST_BYTES = 16 << 10, 8 << 20
@@ -69,21 +68,19 @@ def _ends(cuts: Sequence[int], size: int) -> list[int]:
 
 
 def listed(entry: Json) -> list[tuple[int, int]]:
-    """(end, CRC-32) of each block of an entry; none where an older truesky wrote it.
+    """(end, CRC-32) of each block of an entry.
 
-    Errors : ValueError where they are not the blocks of a file of that size
+    Errors : KeyError, TypeError or ValueError if they are not the blocks of a file of that size
     """
-    found = np.frombuffer(base64.b64decode(entry.get("blocks", ""), validate=True), _RECORD)
+    found = np.frombuffer(base64.b64decode(entry["blocks"], validate=True), _RECORD)
     ends = np.cumsum(found["bytes"], dtype=np.int64)
-    if "blocks" in entry and (not ends.size or ends[-1] != entry["bytes"]):
+    if not ends.size or ends[-1] != entry["bytes"]:
         raise ValueError("the blocks are not those of a file of this size")
     return list(zip(ends.tolist(), found["crc"].tolist(), strict=True))
 
 
 class Checked(io.RawIOBase):
     """A file of a lake, open for reading; a block is compared once, when something of it is read for the first time.
-
-    A file that an older truesky wrote has no blocks: then the sha256 of all of it is compared before the first byte.
 
     fault  : why it was refused, "" where it was not; for whoever meets the refusal through somebody else's code
     Errors : Damaged names the file
@@ -120,9 +117,7 @@ class Checked(io.RawIOBase):
         last = length if size is None or size < 0 else min(first + size, length)
         if last <= first:
             return b""
-        if not self._ends:
-            self._compare_whole()
-        numbers = range(bisect_right(self._ends, first), bisect_left(self._ends, last) + 1) if self._ends else range(0)
+        numbers = range(bisect_right(self._ends, first), bisect_left(self._ends, last) + 1)
         new = [number for number in numbers if number not in self._sound]
         # Whole blocks, once: what is handed out is what was compared.
         start, end = (min(first, self._start(new[0])), max(last, self._ends[new[-1]])) if new else (first, last)
@@ -145,11 +140,6 @@ class Checked(io.RawIOBase):
             place = f"from {self._start(number)} to {self._ends[number]}"
             raise self._refusal(f"has other bytes {place} than the manifest says")
         self._sound.add(number)
-
-    def _compare_whole(self) -> None:
-        if not self._sound and file_sha256(self.path) != self._entry["sha256"]:
-            raise self._refusal("has other contents than the manifest says")
-        self._sound.add(0)
 
     def _refusal(self, why: str) -> Damaged:
         self.fault = f"{self.path} {why}"

@@ -106,10 +106,11 @@ def _is_entry(entry: Any) -> bool:
     if not _has(entry, _FILE) or type(entry.get("rows", 0)) is not int:
         return False
     path = PurePosixPath(entry["path"])
-    try:
-        blocks.listed(entry)
-    except (TypeError, ValueError):
-        return False
+    if path.suffix == ".parquet":
+        try:
+            blocks.listed(entry)
+        except (LookupError, TypeError, ValueError):
+            return False
     return not path.is_absolute() and ".." not in path.parts
 
 
@@ -221,8 +222,8 @@ def _file_faults(folder: Folder, entry: Json, size: int, deep: bool) -> list[str
             _compare(checked(folder, entry), entry)
             return _row_faults(folder, entry) if "rows" in entry else []
         checked(folder, entry)
-        if "blocks" in entry:
-            # The footer; a file without blocks would be read as a whole.
+        if path.suffix == ".parquet":
+            # The footer.
             parquet.schema(folder, entry)
     except Damaged as error:
         return [str(error)]

@@ -171,7 +171,7 @@ def _finish(stage: Path, plan: Plan, made: Sequence[Json]) -> None:
             ],
             "rows": sum(rows.values()),
             # Whoever reads it can tell which last bits may differ where it is made again.
-            "machines": sorted({str(r["machine"]) for r in made if r.get("machine")}),
+            "machines": sorted({str(r["machine"]) for r in made}),
             "files": files,
             **deflections,
         },

@@ -22,7 +22,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as ds
 
-from lake_schema import position_columns, sky
+from lake_schema import sky
 from lake_schema import tables as declarations
 from lake_schema.arrays import Int
 from lake_schema.columns import Table
@@ -31,6 +31,8 @@ from lake_schema.store import layout, manifest, names, parquet
 from lake_schema.store.object_storage.s3 import Folder, Place
 from lake_schema.store.provenance import digest
 
+# Which positions of a catalogue's sources a selection goes by.
+ON = ("observed", "true")
 # So many stretches of _healpix_29 go into the filter of one file; the rest of its rows are left out after reading.
 _MOST_RANGES = 16
 # Added to a padded radius: more than the rounding of the largest deflection.
@@ -41,7 +43,7 @@ _ROUNDING_DEG = 1e-9
 class Version:
     """One published version of a table.
 
-    schema : of its rows, with units and descriptions in the fields' metadata; a column that the files lack is null
+    schema : of its rows, with units and descriptions in the fields' metadata
     """
 
     folder: Folder
@@ -154,20 +156,16 @@ class Version:
 
         columns : names, None = all;  parts : names of parts, None = all;  where : an Arrow filter
         """
-        own = None if columns is None else self._own(columns)
+        self._refuse_unknown(columns or ())
         with self._refusing():
-            found = self.dataset(parts).to_table(
-                columns=None if own is None else list(dict.fromkeys(own)), filter=where
-            )
-        return found if own is None or columns is None else _as_asked(found, own, columns)
+            return self.dataset(parts).to_table(columns=None if columns is None else list(columns), filter=where)
 
     def margin(self, part: str, columns: Sequence[str] | None = None) -> pa.Table:
         """Rows of a catalogue beside a part's cell, within 10" of it and a little farther."""
-        own = self._own(self.schema.names if columns is None else columns)
+        self._refuse_unknown(columns or ())
         entry = self._file(f"{self.table}_margin/dataset/{part}")
         with self._refusing():
-            found = self._opened([entry], self.schema).to_table(columns=list(dict.fromkeys(own)))
-        return found if columns is None else _as_asked(found, own, columns)
+            return self._opened([entry], self.schema).to_table(columns=None if columns is None else list(columns))
 
     def beside(self, relative: str) -> pa.Table:
         """Rows of a Parquet file of the version that is no part of its table."""
@@ -176,13 +174,11 @@ class Version:
         with self._refusing():
             return parquet.read(self.folder, entry)
 
-    def _own(self, asked: Sequence[str]) -> list[str]:
-        """What columns are called that may be asked for by an earlier name.  Errors: BadInput names an unknown one"""
-        own = position_columns.named(self.table, asked, self.schema.names)
-        for name in own:
+    def _refuse_unknown(self, columns: Sequence[str]) -> None:
+        """Raise BadInput if the table lacks one of the columns."""
+        for name in columns:
             if name not in self.schema.names:
                 raise BadInput(f"table {self.table} has no column {name}")
-        return own
 
     def in_cells(self, cells: Sequence[int], order: int, columns: Sequence[str] | None = None) -> pa.Table:
         """Rows of a catalogue inside cells of an order (nested), reading only files and row groups that can hold some.
@@ -192,8 +188,8 @@ class Version:
         wanted = np.unique(np.asarray(cells, np.int64))
         names = None if columns is None else list(dict.fromkeys([*columns, "_healpix_29"]))
         empty = self.schema.empty_table()
-        own = self._own(names or [])
-        pieces = [empty if names is None else _as_asked(empty.select(list(dict.fromkeys(own))), own, names)]
+        self._refuse_unknown(names or ())
+        pieces = [empty if names is None else empty.select(names)]
         for part in self.parts:
             here = _inside(part, wanted, order)
             if here.size:
@@ -213,8 +209,9 @@ class Version:
         columns         : that are wanted; None: all of them
         """
         place = self.place(on)
-        self._own([*place, "_healpix_29"])
-        padded = radius + self.padding(on)
+        self._refuse_unknown([*place, "_healpix_29"])
+        # Files go by observed positions: a source may lie so far beyond the cells of its true one.
+        padded = radius if place == ("ra", "dec") else radius + self.deflection() + _ROUNDING_DEG
         order = sky.cover_order(padded)
         names = None if columns is None else list(dict.fromkeys([*columns, *place]))
         rows = self.in_cells(sky.cells_in_cone(ra, dec, min(padded, 180.0), order).tolist(), order, names)
@@ -223,26 +220,19 @@ class Version:
         return rows if columns is None else rows.select(list(columns))
 
     def place(self, on: str = "observed") -> tuple[str, str]:
-        """Columns of ra and dec of a catalogue's observed or true positions.  Errors: as of position_columns.columns"""
-        return position_columns.columns(self, self.schema.names, on)
+        """Columns of ra and dec of a catalogue's observed or true positions: the same ones if nothing lenses it.
 
-    def padding(self, on: str = "observed") -> float:
-        """How far beyond the cells of a place its sources may lie, deg: files go by ra and dec."""
-        return 0.0 if self.place(on) == ("ra", "dec") else self.deflection() + _ROUNDING_DEG
+        on : one of ON;  Errors : BadInput for another
+        """
+        if on not in ON:
+            raise BadInput(f"on = {on!r} is not one of {', '.join(ON)}")
+        return ("ra_true", "dec_true") if on == "true" and "ra_true" in self.schema.names else ("ra", "dec")
 
     def deflection(self) -> float:
         """Largest distance of a lensed from its true position, deg, as it was when the version was published."""
         if "deflection_deg" not in self.manifest:
             raise BadInput(f"table {self.table}: version {self.key} does not say how far positions are lensed")
         return float(self.manifest["deflection_deg"])
-
-
-def _as_asked(rows: pa.Table, own: Sequence[str], asked: Sequence[str]) -> pa.Table:
-    """Columns by the names that they were asked by."""
-    if list(own) == list(asked):
-        return rows.select(list(own))
-    fields = [rows.schema.field(name).with_name(other) for name, other in zip(own, asked, strict=True)]
-    return pa.Table.from_arrays([rows[name] for name in own], schema=pa.schema(fields, rows.schema.metadata))
 
 
 def _inside(part: str, cells: Int, order: int) -> Int:
@@ -294,7 +284,7 @@ def version(root: Folder, name: str, key: str | None = None, request: str | None
 def for_request(root: Folder, name: str, request: str) -> Version:
     """What the next table of a request is made of: its own version of a table, else the one that was published last.
 
-    The second is for lakes that an older truesky wrote, and for requests that share a catalogue.  Errors: as `version`
+    The second is for requests that share a catalogue.  Errors: as `version`
     """
     own = names.key_of(root, request, name)
     return published_last(root, name) if own is None else version(root, name, request=request)
@@ -341,11 +331,9 @@ def _open(root: Folder, name: str, wanted: str, asked: bool, link: Folder) -> Ve
 
 
 def as_declared(opened: Version, table: Table) -> Version:
-    """The version as `table` declares it: nullable columns that came later are filled with nulls.
+    """The version with the schema that `table` declares.
 
-    One of an earlier meaning of its columns stays as it was declared then.
-
-    Errors : VersionMismatch, naming both versions and the first column that differs
+    Errors : VersionMismatch, naming both versions or the first column that differs
     """
     # To Arrow schemas are equal whatever their units.
     units = tuple((own.metadata or {}).get(b"unit", b"") for own in opened.schema)
@@ -354,28 +342,23 @@ def as_declared(opened: Version, table: Table) -> Version:
 
 @lru_cache(maxsize=64)
 def _declared(stored: pa.Schema, units: tuple[bytes, ...], was: int, table: Table) -> pa.Schema:
-    now = table.version
-    if table.earlier is not None and was <= table.earlier.version:
-        table = table.earlier
-    if fault := _difference(stored, table, was):
+    if was != table.version:
+        who = "a later" if was > table.version else "an earlier"
         raise VersionMismatch(
-            f"table {table.name}: version {was} of its declaration is in the lake, this is version {now}: {fault}"
+            f"table {table.name}: {who} truesky wrote it: "
+            f"its declaration is of version {was}, this truesky reads version {table.version}"
         )
+    if stored.names and (fault := _difference(stored, table)):
+        raise VersionMismatch(f"table {table.name}: {fault}: another truesky wrote it")
     return table.arrow()
 
 
-def _difference(stored: pa.Schema, table: Table, was: int) -> str:
-    if was > table.version:
-        return "it was written by a later truesky"
-    if not stored.names:
-        return ""
+def _difference(stored: pa.Schema, table: Table) -> str:
     for name in stored.names:
-        if name not in table.names and not (name in table.former and was < table.version):
+        if name not in table.names:
             return f"column {name} is not declared"
     for column in table.columns:
         if column.name not in stored.names:
-            if column.nullable and column.since > was:
-                continue
             return f"column {column.name} is missing"
         have, want = stored.field(column.name), column.field()
         if have.type != want.type or (have.nullable and not want.nullable):

@@ -26,20 +26,17 @@ def files_of(part: Part, receipt: Json) -> Json:
         return {}
     known = {"span": receipt["span"]} if "span" in receipt else {}
     files = [file["path"] for file in receipt["files"]]
-    return {"rows": receipt["rows"], "files": files, "machine": receipt.get("machine"), **known}
+    return {"rows": receipt["rows"], "files": files, "machine": receipt["machine"], **known}
 
 
 def held(root: Path, table: str, request: str) -> Mapping[str, str]:
-    """The parts of a request's present version that can be used again: name -> PRODUCT; none where it has no version.
+    """The parts of a request's present version that can be used again: name -> PRODUCT.
 
-    Where no request has one, an older truesky wrote the lake, and the version is the current one.  What cannot be read
-    holds nothing.
+    There are none if the request has no version, or one that cannot be read.
 
     root : folder of the lake;  table : its name;  request : its name
     """
     key = names.key_of(root, request, table)
-    if key is None and not names.holders(root, table):
-        key = layout.current_key(root, table)
     if key is None:
         return {}
     try:
@@ -71,7 +68,7 @@ def take(stage: Path, version: Path, table: str, parts: Sequence[Part]) -> None:
         if len(files) == len(found["files"]):
             for entry in files:
                 _link(version / entry["path"], stage / entry["path"])
-            receipt = {"part": part.name, "rows": found["rows"], "files": files, "machine": found.get("machine")}
+            receipt = {"part": part.name, "rows": found["rows"], "files": files, "machine": found["machine"]}
             write_receipt(stage, {**receipt, "span": found["span"]} if "span" in found else receipt)
 
 
@@ -81,9 +78,6 @@ def _whole(folder: Path, entry: Json) -> Json | None:
     try:
         if file_sha256(folder / path) != str(entry["sha256"]):
             return None
-        if path.endswith(".parquet") and "blocks" not in entry:
-            # An older truesky published it.
-            return manifest.file_facts(folder / path, path)
     except OSError:
         return None
     return {key: value for key, value in entry.items() if key != "rows"}

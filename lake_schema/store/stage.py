@@ -31,8 +31,6 @@ from lake_schema.store.validate import check
 _MOST_BLOCKS = 4096
 # Receipts that are looked at at once: what a file system on the network takes is waited for.
 _AT_ONCE = 16
-# Positions of a source besides those that files go by.
-_OTHER_PLACES = (("ra_true", "dec_true"), ("ra_lensed", "dec_lensed"))
 
 
 def attempt(root: Path, key: str, table: Table, facts: Json, work: Work, part: Part) -> Json:
@@ -123,9 +121,8 @@ def _row_facts(rows: pa.Table, table: Table) -> dict[str, Any]:
         facts["blocks"] = blocks.tolist() if blocks.size <= _MOST_BLOCKS else None
     else:
         facts["span"] = _span(rows, table)
-    other = next((names for names in _OTHER_PLACES if names[0] in table.names), None)
-    if other is not None:
-        places = (rows[name].to_numpy() for name in ("ra", "dec", *other))
+    if "ra_true" in table.names:
+        places = (rows[name].to_numpy() for name in ("ra", "dec", "ra_true", "dec_true"))
         facts["deflection_deg"] = float(sky.separation(*places).max(initial=0.0))
     return facts
 

@@ -67,10 +67,6 @@ def _refuse_within(what: str, block: int | None, files: Sequence[str], ids: Call
 
 def _overlapping(made: Sequence[Json]) -> Iterator[list[Json]]:
     """Receipts whose keys may be one another's, by their spans; of none that nobody shares a key with."""
-    if any("span" not in receipt for receipt in made):
-        # An older truesky wrote some.
-        yield list(made)
-        return
     group: list[Json] = []
     highest: list[Any] = []
     for receipt in sorted((one for one in made if one["span"]), key=lambda receipt: receipt["span"][0]):

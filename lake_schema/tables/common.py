@@ -28,8 +28,6 @@ SEEN_RA = replace(RA, doc="right ascension, ICRS, where a telescope sees it (len
 SEEN_DEC = replace(DEC, doc="declination, ICRS, where a telescope sees it (lensed)")
 TRUE_RA = Column("ra_true", "float64", "deg", "pos.eq.ra", "right ascension, ICRS, true (unlensed)", 0.0, 360.0)
 TRUE_DEC = Column("dec_true", "float64", "deg", "pos.eq.dec", "declination, ICRS, true (unlensed)", -90.0, 90.0)
-# What observed positions were called while true ones were the main ones.
-LENSED = (("ra_lensed", "ra"), ("dec_lensed", "dec"))
 HEALPIX_29 = Column(
     "_healpix_29", "int64", ucd="pos.healpix", doc="HEALPix index of (ra, dec), order 29, nested: the sort key", lo=0
 )

@@ -63,7 +63,7 @@ RENDERED: Mapping[str, tuple[str, ...]] = {
 
 EXPOSURES = Table(
     "exposures",
-    4,
+    1,
     (
         Column("exposure_id", "int64", ucd="meta.id;obs.exposure", doc="identifier of the exposure", lo=0),
         Column("channel", "string", ucd="instr", doc="channel", codes=CHANNELS),
@@ -92,12 +92,12 @@ EXPOSURES = Table(
             0.0,
         ),
         Column("seeing", "float64", "arcsec", "instr.obsty.seeing", "FWHM of the atmosphere, 0 in space", 0.0, 10.0),
-        Column("zero_point", "float64", "mag", "phot.mag;arith.zp", "AB magnitude of 1 electron/s", 0.0, 50.0, since=2),
-        Column("survey", "string", ucd="meta.id", doc="survey or request that it belongs to", since=2),
-        Column("field", "int64", "", "meta.id;obs", "field of the survey, from 1", 1, nullable=True, since=2),
-        Column("visit", "int32", "", "meta.number;obs", "visit of the field, from 1", 1, nullable=True, since=2),
-        Column("dither", "int32", "", "meta.number;obs", "dither of the visit, from 1", 1, nullable=True, since=2),
-        Column("grism", "string", "", "instr.dispersion", "grism", nullable=True, since=2),
+        Column("zero_point", "float64", "mag", "phot.mag;arith.zp", "AB magnitude of 1 electron/s", 0.0, 50.0),
+        Column("survey", "string", ucd="meta.id", doc="survey or request that it belongs to"),
+        Column("field", "int64", "", "meta.id;obs", "field of the survey, from 1", 1, nullable=True),
+        Column("visit", "int32", "", "meta.number;obs", "visit of the field, from 1", 1, nullable=True),
+        Column("dither", "int32", "", "meta.number;obs", "dither of the visit, from 1", 1, nullable=True),
+        Column("grism", "string", "", "instr.dispersion", "grism", nullable=True),
         Column(
             "grism_angle",
             "float64",
@@ -107,13 +107,10 @@ EXPOSURES = Table(
             -360.0,
             360.0,
             True,
-            since=2,
         ),
-        Column("lamp", "int32", "", "meta.number;instr", "calibration lamp, from 1", 1, nullable=True, since=2),
-        Column("target", "string", "", "meta.id;src", "calibration source", nullable=True, since=2),
-        Column(
-            "psf", "string", "", "meta.ref;instr.det.psf", "file of the PSF model, where given", nullable=True, since=2
-        ),
+        Column("lamp", "int32", "", "meta.number;instr", "calibration lamp, from 1", 1, nullable=True),
+        Column("target", "string", "", "meta.id;src", "calibration source", nullable=True),
+        Column("psf", "string", "", "meta.ref;instr.det.psf", "file of the PSF model, where given", nullable=True),
         Column(
             "settings",
             "string",
@@ -121,7 +118,6 @@ EXPOSURES = Table(
             "meta.note",
             "JSON of what this exposure changes of the request: a variant's, a calibration's parameters",
             nullable=True,
-            since=2,
         ),
         Column(
             "realisation",
@@ -131,9 +127,8 @@ EXPOSURES = Table(
             "of the noise, from 1: counts exposures of the same camera, band, place, position angle and start",
             1,
             nullable=True,
-            since=3,
         ),
-        Column("airmass", "float64", "", "obs.airMass", "of the field, of ground cameras", 1.0, 10.0, True, since=4),
+        Column("airmass", "float64", "", "obs.airMass", "of the field, of ground cameras", 1.0, 10.0, True),
         Column(
             "zenith",
             "float64",
@@ -143,7 +138,6 @@ EXPOSURES = Table(
             -180.0,
             180.0,
             True,
-            since=4,
         ),
     ),
     "Exposures, in the order they are taken.",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 from lake_schema.columns import Column, Table
 from lake_schema.tables.common import DEC, HEALPIX_29, ID, RA, SEEN_DEC, SEEN_RA
@@ -40,15 +39,12 @@ def fluxes(kind: str, bands: Sequence[str]) -> Table:
         for band in bands
     ]
     catalogue = GALAXIES if kind == "galaxy" else STARS
-    by_true = Table(
+    place = (SEEN_RA, SEEN_DEC) if kind == "galaxy" else (RA, DEC)
+    return Table(
         f"{kind}_fluxes",
         1,
-        (ID, RA, DEC, HEALPIX_29, *columns, INTEGRATED),
+        (ID, *place, HEALPIX_29, *columns, INTEGRATED),
         f"Band fluxes of the table {catalogue.name}, in the same cells and row order.",
         order=catalogue.order,
         finest=catalogue.finest,
     )
-    if kind == "star":
-        return by_true
-    seen = (ID, SEEN_RA, SEEN_DEC, HEALPIX_29, *columns, INTEGRATED)
-    return replace(by_true, version=2, columns=seen, earlier=by_true)

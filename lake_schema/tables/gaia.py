@@ -40,7 +40,7 @@ def _photometry(short: str, name: str) -> tuple[Column, ...]:
     )
 
 
-def _error(of: str, unit: str, ucd: str, doc: str, since: int = 1) -> Column:
+def _error(of: str, unit: str, ucd: str, doc: str, nullable: bool = False) -> Column:
     return Column(
         f"{of}_error",
         "float32",
@@ -49,15 +49,14 @@ def _error(of: str, unit: str, ucd: str, doc: str, since: int = 1) -> Column:
         f"standard error of {doc}",
         0.0,
         1e3,
-        since > 1,
-        since=since,
+        nullable,
     )
 
 
 def _motion(short: str, axis: str, doc: str) -> tuple[Column, ...]:
     ucd = f"pos.pm;pos.eq.{axis}"
-    value = Column(short, "float64", "mas yr-1", ucd, f"proper motion in {doc}, as measured", -1e5, 1e5, True, since=2)
-    return value, _error(short, "mas yr-1", ucd, f"the proper motion in {doc}", since=2)
+    value = Column(short, "float64", "mas yr-1", ucd, f"proper motion in {doc}, as measured", -1e5, 1e5, True)
+    return value, _error(short, "mas yr-1", ucd, f"the proper motion in {doc}", nullable=True)
 
 
 _ID = id_of_kinds(5, 5)
@@ -72,7 +71,7 @@ _MEASURED = (
 )
 
 _RUWE = Column(
-    "ruwe", "float32", "", "stat.error", "renormalised unit weight error of the astrometry", 0.0, 100.0, True, since=2
+    "ruwe", "float32", "", "stat.error", "renormalised unit weight error of the astrometry", 0.0, 100.0, True
 )
 _MOTIONS = (
     *_motion("pmra", "ra", "right ascension times cos(dec)"),
@@ -82,7 +81,7 @@ _MOTIONS = (
 
 GAIA = Table(
     "gaia",
-    2,
+    1,
     (
         _ID,
         _RA,
@@ -140,7 +139,7 @@ _FLUXES = tuple(column for short, name in _BANDS for column in _flux(short, name
 
 EXPORT = Table(
     "gaia_source",
-    2,
+    1,
     (
         replace(_ID, name="source_id"),
         Column("ref_epoch", "float64", "yr", "meta.ref;time.epoch", "epoch of the position", 2000.0, 2100.0),
@@ -188,7 +187,7 @@ def _dr3() -> Table:
     doc = (
         "Rows of the table `gaia` under the names, and in the order, of DR3's gaia_source; the values are those of DR2."
     )
-    return Table("gaia_source", 3, columns, doc, key=("source_id",))
+    return Table("gaia_source", 1, columns, doc, key=("source_id",))
 
 
 EXPORT_DR3 = _dr3()

@@ -16,11 +16,8 @@ import pyarrow as pa
 
 from lake_schema.columns import Column, Table
 from lake_schema.tables.common import (
-    DEC,
     HEALPIX_29,
     KINDS,
-    LENSED,
-    RA,
     SEEN_DEC,
     SEEN_RA,
     TRUE_DEC,
@@ -42,9 +39,9 @@ _LINE = (
 )
 
 
-def _line(name: str, which: str, since: int = 1) -> Column:
+def _line(name: str, which: str) -> Column:
     about = "phot.flux;spect.line", f"{which}: {_LINE}"
-    return Column(f"flux_{name}", "float32", "erg s-1 cm-2", *about, 0.0, 1e-5, True, since=since)
+    return Column(f"flux_{name}", "float32", "erg s-1 cm-2", *about, 0.0, 1e-5, True)
 
 
 def _component(k: int) -> tuple[Column, ...]:
@@ -130,7 +127,7 @@ _REST = (
         "float32",
         "",
         "phys.SFR",
-        "log10 of the star formation rate / (Msun/yr), Chabrier or Kroupa; before version 3 Salpeter (0.20 more)",
+        "log10 of the star formation rate / (Msun/yr), Chabrier or Kroupa",
         -10.0,
         5.0,
         True,
@@ -145,15 +142,15 @@ _REST = (
     _line("oiii", "[O III] 5008.2 (4960.3 has 1 / 2.98 of it)"),
     _line("nii", "[N II] 6585.3 (6549.9 has 1 / 3.05 of it)"),
     _line("sii", "[S II] 6718.3 (the doublet's other line has the same flux)"),
-    _line("hgamma", "H gamma 4341.7", 3),
-    _line("hdelta", "H delta 4102.9", 3),
-    _line("paalpha", "Paschen alpha 18756", 3),
-    _line("pabeta", "Paschen beta 12822", 3),
-    _line("pagamma", "Paschen gamma 10941", 3),
-    _line("padelta", "Paschen delta 10052", 3),
-    _line("siii", "[S III] 9533.2 (9071.1 has 1 / 2.47 of it)", 3),
-    _line("hei", "He I 10833", 3),
-    _line("hei_5877", "He I 5877.2", 3),
+    _line("hgamma", "H gamma 4341.7"),
+    _line("hdelta", "H delta 4102.9"),
+    _line("paalpha", "Paschen alpha 18756"),
+    _line("pabeta", "Paschen beta 12822"),
+    _line("pagamma", "Paschen gamma 10941"),
+    _line("padelta", "Paschen delta 10052"),
+    _line("siii", "[S III] 9533.2 (9071.1 has 1 / 2.47 of it)"),
+    _line("hei", "He I 10833"),
+    _line("hei_5877", "He I 5877.2"),
     # 8 morphology
     Column(
         "bulge_half_light_radius",
@@ -191,7 +188,6 @@ _REST = (
         -2.0,
         2.0,
         True,
-        since=3,
     ),
     Column("bulge_sersic_index", "float32", ucd="src.morph.scLength", doc="Sersic index of the bulge", lo=0.3, hi=6.2),
     Column("bulge_axis_ratio", "float32", ucd="phys.size.axisRatio", doc="bulge: minor / major axis", lo=0.02, hi=1.0),
@@ -248,7 +244,6 @@ _REST = (
         ucd="meta.id",
         doc="identifier in the catalogue that the galaxy was taken from; missing where it was drawn here",
         nullable=True,
-        since=2,
     ),
     Column(
         "stamp",
@@ -258,46 +253,16 @@ _REST = (
         lo=0,
         hi=1e6,
         nullable=True,
-        since=4,
     ),
 )
 _ABOUT = "Galaxies of the True Universe: central, satellite, QSO, high-redshift and strongly lensed."
 
-# As lakes have it whose files go by true positions.
-_BY_TRUE = Table(
-    "galaxies",
-    4,
-    (
-        *_IDENTITY,
-        RA,
-        DEC,
-        HEALPIX_29,
-        Column(
-            "ra_lensed",
-            "float64",
-            "deg",
-            "pos.eq.ra",
-            "observed (lensed) right ascension, what is rendered",
-            0.0,
-            360.0,
-        ),
-        Column(
-            "dec_lensed", "float64", "deg", "pos.eq.dec", "observed (lensed) declination, what is rendered", -90.0, 90.0
-        ),
-        *_REST,
-    ),
-    _ABOUT,
-    order=5,
-)
-
 GALAXIES = Table(
     "galaxies",
-    5,
+    1,
     (*_IDENTITY, SEEN_RA, SEEN_DEC, HEALPIX_29, TRUE_RA, TRUE_DEC, *_REST),
     _ABOUT,
     order=5,
-    aliases=LENSED,
-    earlier=_BY_TRUE,
 )
 
 _WIDTH = "of log10 sigma/(km/s) = (width_slope + width_slope_z z_obs) (abs_mag_r01 - width_magnitude) + width_z z_obs"

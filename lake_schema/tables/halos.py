@@ -7,7 +7,7 @@ from lake_schema.tables.common import DEC, HEALPIX_29, RA, id_of_kinds
 
 HALOS = Table(
     "halos",
-    2,
+    1,
     (
         id_of_kinds(0, 0),
         RA,
@@ -23,7 +23,6 @@ HALOS = Table(
     "Halos of the True Universe; a galaxy's halo_id is the id of a row here, also the id of its central galaxy. "
     "From which mass on all are listed: table halo_limits.",
     order=5,
-    former=("complete",),
 )
 
 HALO_LIMITS = Table(

@@ -22,7 +22,7 @@ CONFIDENCES = (
 
 MISSION = Table(
     "mission",
-    2,
+    1,
     (
         Column("name", "string", ucd="meta.id", doc="name of the parameter"),
         Column(
@@ -41,16 +41,13 @@ MISSION = Table(
         Column("source", "string", ucd="meta.ref", doc="where the value is from"),
         Column("chosen", "bool", ucd="meta.code", doc="is this the value that the run used?"),
         Column("overridden", "bool", ucd="meta.code", doc="did the request put it in place of the database's?"),
-        Column(
-            "file", "string", ucd="meta.ref", doc="file of a model, as the package names it", nullable=True, since=2
-        ),
+        Column("file", "string", ucd="meta.ref", doc="file of a model, as the package names it", nullable=True),
         Column(
             "sha256",
             "string",
             ucd="meta.checksum",
             doc="sha256 of that file, and its name in models/ beside this table",
             nullable=True,
-            since=2,
         ),
     ),
     "Parameters of the telescopes, the cameras and the survey: SELECT name, value, unit, status FROM mission.",

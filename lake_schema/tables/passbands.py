@@ -17,7 +17,7 @@ MEDIA = (("air", "from the ground"), ("vacuum", "from space"))
 
 PASSBANDS = Table(
     "passbands",
-    2,
+    1,
     (
         Column("name", "string", ucd="meta.id;instr.bandpass", doc="name, the <band> of f_nu_<band>"),
         Column("medium", "string", ucd="meta.code", doc="in which the wavelengths are measured", codes=MEDIA),
@@ -40,7 +40,6 @@ PASSBANDS = Table(
             -10.0,
             20.0,
             True,
-            since=2,
         ),
     ),
     "Passbands.",

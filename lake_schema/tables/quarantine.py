@@ -13,28 +13,22 @@ _BOUNDS = {"kappa": (-1.0, 100.0), "gamma1": (-10.0, 10.0), "gamma2": (-10.0, 10
 
 def _of_galaxies(column: Column) -> Column:
     lo, hi = _BOUNDS.get(column.name, (column.lo, column.hi))
-    return replace(column, since=1, lo=lo, hi=hi)
+    return replace(column, lo=lo, hi=hi)
 
 
-def _table(version: int, galaxies: Table, earlier: Table | None) -> Table:
-    return Table(
-        "quarantine",
-        version,
-        (
-            *(_of_galaxies(column) for column in galaxies.columns),
-            Column(
-                "determinant",
-                "float32",
-                ucd="arith.factor",
-                doc="(1 - kappa)^2 - gamma^2: one over the magnification that it would have",
-                lo=-200.0,
-                hi=10_000.0,
-            ),
+QUARANTINE = Table(
+    "quarantine",
+    1,
+    (
+        *(_of_galaxies(column) for column in GALAXIES.columns),
+        Column(
+            "determinant",
+            "float32",
+            ucd="arith.factor",
+            doc="(1 - kappa)^2 - gamma^2: one over the magnification that it would have",
+            lo=-200.0,
+            hi=10_000.0,
         ),
-        "Galaxies at or beyond a caustic, which are in no other table: no fluxes, no images.",
-        aliases=galaxies.aliases,
-        earlier=earlier,
-    )
-
-
-QUARANTINE = _table(2, GALAXIES, _table(1, GALAXIES.earlier, None) if GALAXIES.earlier else None)
+    ),
+    "Galaxies at or beyond a caustic, which are in no other table: no fluxes, no images.",
+)

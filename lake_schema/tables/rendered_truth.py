@@ -17,16 +17,16 @@ METHODS = (
 
 
 def _trail(axis: str, doc: str) -> Column:
-    return Column(f"trail_{axis}", "float64", "pix", f"pos.cartesian.{axis};instr.det", doc, nullable=True, since=2)
+    return Column(f"trail_{axis}", "float64", "pix", f"pos.cartesian.{axis};instr.det", doc, nullable=True)
 
 
 def _centroid(axis: str, doc: str) -> Column:
-    return Column(f"psf_{axis}", "float64", "pix", f"pos.cartesian.{axis};instr.det.psf", doc, nullable=True, since=3)
+    return Column(f"psf_{axis}", "float64", "pix", f"pos.cartesian.{axis};instr.det.psf", doc, nullable=True)
 
 
 RENDERED_TRUTH = Table(
     "rendered_truth",
-    3,
+    1,
     (
         Column("exposure_id", "int64", ucd="meta.id;obs.exposure", doc="exposure", lo=0),
         Column("detector", "string", ucd="meta.id;instr.det", doc="detector name"),
@@ -56,7 +56,6 @@ RENDERED_TRUTH = Table(
             "phot.mag",
             "AB, of `expected` by ZEROPNT and EXPTIME of the header",
             nullable=True,
-            since=3,
         ),
     ),
     "Sources of the rendered images: true places and electrons.",

@@ -21,17 +21,16 @@ EPOCH = 2015.5
 
 def _mixed(k: int) -> tuple[Column, ...]:
     return (
-        Column(f"sed_{k}", "int16", "", "meta.code", f"template {k} that the spectrum is mixed of", 0, nullable=True,
-               since=3),
+        Column(f"sed_{k}", "int16", "", "meta.code", f"template {k} that the spectrum is mixed of", 0, nullable=True),
         Column(f"frac_{k}", "float32", "", "phot.flux.density;arith.ratio",
                f"share of template {k} in f_lambda at 5500 A; sed has what is left by all", 0.0, 1.0, True,
-               mantissa_bits=12, since=3),
+               mantissa_bits=12),
     )  # fmt: skip
 
 
 STARS = Table(
     "stars",
-    3,
+    1,
     (
         id_of_kinds(5, 5),
         RA,
@@ -67,10 +66,10 @@ STARS = Table(
             40.0,
         ),
         density_boost_of("this population was"),
-        Column("stage", "int8", "", "src.class", "stage of evolution", 0, 4, nullable=True, codes=STAGES, since=2),
+        Column("stage", "int8", "", "src.class", "stage of evolution", 0, 4, nullable=True, codes=STAGES),
         *(column for k in (2, 3, 4) for column in _mixed(k)),
-        Column("mass", "float32", "solMass", "phys.mass", "mass at birth", 0.0, 200.0, True, since=3),
-        Column("age", "float32", "Gyr", "time.age", "age of its population", 0.0, 14.5, True, since=3),
+        Column("mass", "float32", "solMass", "phys.mass", "mass at birth", 0.0, 200.0, True),
+        Column("age", "float32", "Gyr", "time.age", "age of its population", 0.0, 14.5, True),
         Column(
             "pm_ra",
             "float32",
@@ -80,7 +79,6 @@ STARS = Table(
             -1e5,
             1e5,
             True,
-            since=3,
         ),
         Column(
             "pm_dec",
@@ -91,7 +89,6 @@ STARS = Table(
             -1e5,
             1e5,
             True,
-            since=3,
         ),
         Column(
             "radial_velocity",
@@ -102,7 +99,6 @@ STARS = Table(
             -2e3,
             2e3,
             True,
-            since=3,
         ),
         Column(
             "companion_of",
@@ -113,7 +109,6 @@ STARS = Table(
             5 << 60,
             (6 << 60) - 1,
             True,
-            since=3,
         ),
     ),
     "Stars of the True Universe, where they are at J2015.5; proper motions carry them to other times.",

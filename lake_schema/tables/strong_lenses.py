@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from lake_schema.columns import Column, Table
 from lake_schema.tables.common import (
-    DEC,
     HEALPIX_29,
-    LENSED,
-    RA,
     SEEN_DEC,
     SEEN_RA,
     TRUE_DEC,
@@ -51,29 +48,10 @@ _REST = (
 )
 _ABOUT = "Strong lenses: singular isothermal ellipsoids, and pictures of the galaxies behind them."
 
-# As lakes have it whose files go by true positions.
-_BY_TRUE = Table(
-    "strong_lenses",
-    1,
-    (
-        id_of_kinds(4, 4),
-        RA,
-        DEC,
-        HEALPIX_29,
-        Column("ra_lensed", "float64", "deg", "pos.eq.ra", "observed right ascension of the lens", 0.0, 360.0),
-        Column("dec_lensed", "float64", "deg", "pos.eq.dec", "observed declination of the lens", -90.0, 90.0),
-        *_REST,
-    ),
-    _ABOUT,
-    order=5,
-)
-
 STRONG_LENSES = Table(
     "strong_lenses",
-    2,
+    1,
     (id_of_kinds(4, 4), SEEN_RA, SEEN_DEC, HEALPIX_29, TRUE_RA, TRUE_DEC, *_REST),
     _ABOUT,
     order=5,
-    aliases=LENSED,
-    earlier=_BY_TRUE,
 )

@@ -5,7 +5,6 @@ that hold what is asked for.
 """
 
 import os
-import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +18,6 @@ from lake_schema.fits import images
 from lake_schema.store import blocks, layout, manifest, parquet, publish, read
 from lake_schema.store.plan import Output, Part, Plan
 from lake_schema.tables import declared
-from tests.make_old_lake import OLD_LAKE
 from tests.universe import PLAIN, TOY, plain_plan, plain_work, rows_of, toy_rows
 from truesky.catalogue.build_galaxies import quarantine_file, quarantine_work
 from truesky.explore.guard import checked
@@ -288,16 +286,16 @@ def test_another_number_of_rows_than_the_manifest_s_is_refused(lake):
             reader()
 
 
-# ------------------------------------------------------------------------------------------------ older lakes, images
+def test_a_manifest_without_the_blocks_of_a_table_is_refused(lake):
+    folder = publish.make(lake, plain_plan(), plain_work)
+    about = dict(manifest.load(folder, "plain"))
+    files = [{key: value for key, value in entry.items() if key != "blocks"} for entry in about["files"]]
+    manifest.write(folder, {**about, "files": files})
+    with pytest.raises(Damaged, match=r"manifest\.json is not a manifest of this form"):
+        read.version(lake, "plain")
 
 
-def test_a_file_without_blocks_is_compared_as_a_whole(lake):
-    """As an older truesky published it."""
-    old = read.version(OLD_LAKE, "plain")
-    assert all("blocks" not in entry for entry in old.manifest["files"])
-    shutil.copytree(OLD_LAKE / "plain", lake / "plain", symlinks=True)
-    version = read.version(lake, "plain")
-    assert harmed(version.path("1.parquet"), 200, lambda: version.rows(["id"])) == (200, 200)
+# ------------------------------------------------------------------------------------------------ images
 
 
 def picture(path):

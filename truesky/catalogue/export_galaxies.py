@@ -13,7 +13,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from lake_schema import __version__, command, position_columns, user_files
+from lake_schema import __version__, command, user_files
 from lake_schema.fits.tables import table_to_fits
 from lake_schema.store import layout, read
 from lake_schema.tables.galaxies import GALAXIES
@@ -54,12 +54,11 @@ def export(lake: Path, folder: Path, form: str, request: str | None = None) -> l
     if form == "skycatalogs":
         return skycatalogs.write(lake, folder, request)
     version = read.version(lake, GALAXIES.name, request=request)
-    declared = GALAXIES.earlier if GALAXIES.earlier and position_columns.is_indexed_by_true(version) else GALAXIES
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for part in version.parts:
         path = folder / f"galaxies_nside32_nest_{layout.cell_of_file(part)[1]}.fits"
-        table_to_fits(path, version.rows(parts=[part]), declared)
+        table_to_fits(path, version.rows(parts=[part]), GALAXIES)
         written.append(path)
     return written
 

@@ -10,7 +10,6 @@ import duckdb
 import pyarrow as pa
 import pyarrow.dataset as ds
 
-from lake_schema import position_columns
 from lake_schema.errors import BadInput, Damaged
 from lake_schema.store import read
 from lake_schema.store.object_storage.s3 import Folder
@@ -53,8 +52,6 @@ class Session:
         self.most = int(memory * _SHARE)
         self.opened: dict[str, Opened] = {}
         self._rows: dict[str, ds.Dataset] = {}
-        # Tables that queries can name, with the earlier names of columns that they have there.
-        self._shown: dict[str, tuple[tuple[str, str], ...]] = {}
         self._database: duckdb.DuckDBPyConnection | None = None
         self._parser = parser()
 
@@ -70,7 +67,6 @@ class Session:
         """Forget every table; the next query opens those that it names."""
         self.opened.clear()
         self._rows.clear()
-        self._shown.clear()
         if self._database is not None:
             self._database.close()
             self._database = None
@@ -84,12 +80,9 @@ class Session:
         whole = False
         try:
             for name in query.tables:
-                self._open(name, query.text)
+                self._open(name)
                 for file in getattr(self._rows[name], "read_from", ()):
                     file.forget()
-            position_columns.refuse_mixed(
-                one for name in query.tables if isinstance(one := self.opened[name], read.Version)
-            )
             relation = self._connected().sql(query.text, params=dict(parameters) or None)
             if relation is None:
                 raise BadInput("SQL: gives no rows")
@@ -122,39 +115,19 @@ class Session:
                 self._database.execute(command)
         return self._database
 
-    def _open(self, name: str, text: str) -> None:
-        """A table by its name, one of a request in a schema of the request's name.
-
-        Columns are there by earlier names as well for a query that has one: none sees them that does not ask.
-        """
-        if name not in self._rows:
-            opened = _table(self.root, name, self.known[name])
-            self.opened[name], self._rows[name] = (
-                opened,
-                opened.dataset() if isinstance(opened, read.Version) else opened,
-            )
-        opened = self.opened[name]
-        aliases = (
-            position_columns.aliases_in(opened.table, opened.schema.names, text)
-            if isinstance(opened, read.Version)
-            else ()
-        )
-        if self._shown.get(name) == aliases:
+    def _open(self, name: str) -> None:
+        """Open a table by its name, one of a request in a schema of the request's name."""
+        if name in self._rows:
             return
+        opened = _table(self.root, name, self.known[name])
+        self.opened[name] = opened
+        self._rows[name] = opened.dataset() if isinstance(opened, read.Version) else opened
         database = self._connected()
-        stored = f"{name} as stored" if aliases else name
-        if name in self._shown:
-            database.unregister(name)
-            database.execute(f'DROP VIEW IF EXISTS "{name}"')
-        database.register(stored, self._rows[name])
-        chosen = ", ".join(["*", *(f'"{own}" AS "{earlier}"' for earlier, own in aliases)])
-        if aliases:
-            database.execute(f'CREATE OR REPLACE TEMP VIEW "{name}" AS SELECT {chosen} FROM "{stored}"')
+        database.register(name, self._rows[name])
         if "." in name:
             request, _, table = name.partition(".")
             database.execute(f'CREATE SCHEMA IF NOT EXISTS "{request}"')
             database.execute(f'CREATE OR REPLACE VIEW "{request}"."{table}" AS SELECT * FROM "{name}"')
-        self._shown[name] = aliases
 
     def _with_units(self, schema: pa.Schema, query: Query) -> pa.Schema:
         """Give the columns that came unchanged from a table its unit and description."""

@@ -14,7 +14,6 @@ from typing import Any
 
 import pyarrow as pa
 
-from lake_schema import position_columns
 from lake_schema.columns import Table
 from lake_schema.store import layout, read
 from lake_schema.store.plan import Json, Output, Part, Plan
@@ -40,8 +39,6 @@ def steps(lake: Path, request: Request) -> list[Step]:
     """What fluxes are made with; then one part a cell of each catalogue, row by row beside it."""
     catalogues = [(kind, read.for_request(lake, name, request.name)) for kind, name in CATALOGUES]
     universe.refuse_other([version for _, version in catalogues], request)
-    for _, version in catalogues:
-        position_columns.refuse_earlier(version)
     own = inputs.read(request.curves)
     curves = inputs.curves(request.bands, own.passbands)
     sources = source_steps(own)

@@ -14,10 +14,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from lake_schema import position_columns, sky
+from lake_schema import sky
 from lake_schema.arrays import Float, Int
 from lake_schema.errors import BadInput
-from lake_schema.store import layout, read
+from lake_schema.store import layout
 from truesky.explore import adql
 from truesky.page.answers import is_catalogue, packed, plain
 from truesky.page.opened import Lake, Requested
@@ -151,27 +151,16 @@ async def sources(lake: Lake, table: str, view: Float, where: str) -> Json:
     lon, lat, radius = (float(number) for number in view)
     mag, sense = next((size for size in _SIZES if size[0] in names), (None, 1))
     key = "id" if "id" in names else names[0]
-    ra, dec = version.place(_shown(version))
-    chosen = [f'"{key}" AS id', f"{ra} AS ra", f"{dec} AS dec", f"{mag or 'NULL'} AS mag"]
-    wider = np.array([lon, lat, radius + version.padding(_shown(version))])
+    chosen = [f'"{key}" AS id', "ra", "dec", f"{mag or 'NULL'} AS mag"]
     chosen += ["kind" if "kind" in names else "NULL AS kind", "count(*) OVER () AS total"]
-    text = f"""SELECT {", ".join(chosen)} FROM {_table(lake, table)} WHERE ({where}\n) AND {_within(wider)}
-               AND separation({ra}, {dec}, {lon!r}, {lat!r}) <= {radius!r}
+    text = f"""SELECT {", ".join(chosen)} FROM {_table(lake, table)} WHERE ({where}\n) AND {_within(view)}
+               AND separation(ra, dec, {lon!r}, {lat!r}) <= {radius!r}
                ORDER BY {("mag DESC" if sense < 0 else "mag") if mag else "1"} NULLS LAST LIMIT {MOST_SOURCES}"""
     found = await _asked(lake, text, where)
     columns = {name: found[name].to_pylist() for name in ("ra", "dec", "mag", "kind")}
     return {**columns, "id": [str(value) for value in found["id"].to_pylist()], "by": mag, "sense": sense} | {
         "total": found["total"][0].as_py() if found.num_rows else 0, "most": MOST_SOURCES,
     }  # fmt: skip
-
-
-def _shown(version: read.Version) -> str:
-    """Which positions are shown: the observed ones, of a table that has them."""
-    return (
-        "true"
-        if position_columns.is_indexed_by_true(version) and "ra_lensed" not in version.schema.names
-        else "observed"
-    )
 
 
 async def _asked(lake: Lake, text: str, *expressions: str) -> pa.Table:

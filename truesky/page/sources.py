@@ -42,7 +42,7 @@ def source(lake: Lake, text: str) -> Json:
         "tables": {table: _facts(row) for table, row in rows.items()}, "drawn": [], "spectra": [],
     }  # fmt: skip
     if own is not None and (row := rows.get(_TABLES[kind][0])) is not None:
-        ra, dec = (float(row[name][0].as_py()) for name in own.versions[_TABLES[kind][0]].place())
+        ra, dec = (float(row[name][0].as_py()) for name in ("ra", "dec"))
         found["place"] = [ra, dec]
         found["images"] = [
             {"number": number, "x": x, "y": y, "is_north_up": pictures.is_north_up(lake, number)}
@@ -260,12 +260,10 @@ def nearest(lake: Lake, ra: float, dec: float, radius: float) -> Json:
     best: Json = {}
     for table in ("galaxies", "stars"):
         for own in lake.requested(table):
-            version = own.versions[table]
-            names = version.place()
-            rows = version.cone(ra, dec, radius, ["id", *names])
+            rows = own.versions[table].cone(ra, dec, radius, ["id", "ra", "dec"])
             if not rows.num_rows:
                 continue
-            lon, lat = (rows[name].to_numpy() for name in names)
+            lon, lat = (rows[name].to_numpy() for name in ("ra", "dec"))
             away = sky.separation(lon, lat, ra, dec)
             first = int(np.argmin(away))
             if not best or away[first] < best["separation"]:

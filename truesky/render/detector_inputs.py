@@ -47,7 +47,7 @@ def aimed(lake: Path, facts: Json) -> tuple[Aim, Variant, MissionConfiguration]:
     own = variants.variant(exposed.settings, mission, Accuracy(**request["accuracy"]), forced)
     detector = detectors.detector(exposed.camera, facts["detector"], own.mission)
     band = passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], exposed.band)
-    return Aim.of(exposed, detector, band, request["seed"], request.get("readout", "raw")), own, mission
+    return Aim.of(exposed, detector, band, request["seed"], request["readout"]), own, mission
 
 
 def prepared(lake: Path, facts: Json) -> tuple[Aim, Rows, Variant]:

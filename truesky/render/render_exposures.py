@@ -68,9 +68,9 @@ def work(lake: Path, facts: Json) -> Output:
     request = facts["request"]
     with heap.kept():
         aim, rows_, own = detector_inputs.prepared(lake, facts)
-        noise = request.get("noise_seed")
+        noise = request["noise_seed"]
         rendered = render.render(aim, rows_, own, request["seed"], request["truth"], noise_seed=noise)
-    rice, form = request["compression"] == "rice", request.get("wcs", "sip")
+    rice, form = request["compression"] == "rice", request["wcs"]
     rows, files = fits_files.products(rendered, request["truth"], rice, form)
     drawn = truth_table.truth(rendered)
     place = facts["exposure_id"], facts["detector"]

@@ -23,13 +23,6 @@ from truesky.request.files import Catalogue
 from truesky.request.schema import Request
 
 CATALOGUES = ("galaxies", "stars")
-# What an older truesky had no key for, and how its catalogues are.
-_LATER: Mapping[str, Mapping[str, Any]] = {
-    "galaxies": {"lensing": None, "rotation": 0.0},
-    "stars": {"bright_limit": None},
-}
-# And of those that were drawn by us.
-_LATER_DRAWN: Mapping[str, Any] = {"alignment": 0.0}
 # What the formats of external catalogues are; some are of two files each.
 _FORMATS = Path(__file__).parents[1] / "catalogue" / "external" / "ingest_formats.toml"
 # What names files, or says how rows are filed.
@@ -64,9 +57,7 @@ def refuse_others(root: Path, request: Request) -> None:
 
 def _difference(version: read.Version, request: Request) -> str:
     """What tells a catalogue's universe from the request's; empty where nothing does."""
-    facts = {**_LATER[version.table], **version.manifest["facts"]}
-    if version.table == "galaxies" and "galaxy_limit" in facts:
-        facts = {**_LATER_DRAWN, **facts}
+    facts = version.manifest["facts"]
     values, own = wanted(request), request.sources
     theirs = None if own is None else own.facts(request.area.bounds())
     if canonical(facts.get("sources")) != canonical(theirs):
@@ -80,8 +71,7 @@ def _difference(version: read.Version, request: Request) -> str:
             return f"{'no ' if given else ''}files of {key}, the request {'some' if given else 'none'}"
         if given is not None:
             for name, value in given.about.items():
-                # An older truesky may have written down less.
-                if name in facts[key] and canonical(facts[key][name]) != canonical(value):
+                if canonical(facts[key][name]) != canonical(value):
                     return f"{name} of {key} {facts[key][name] or 'none'}, the request {value or 'none'}"
             if not _same(facts[key], given):
                 return f"other files of {key} than the request"

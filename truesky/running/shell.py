@@ -219,7 +219,7 @@ def _run(job: Job, step: Step, root: Path, request: Request, verbose: bool, took
     log.close(time.time() - started)
     version = read.version(root, plan.table.name, plan.key)
     _summary(version, len(results), time.time() - started, before)
-    machines = version.manifest.get("machines", [])
+    machines = version.manifest["machines"]
     if machines and set(machines) != {machine()}:
         about = f"table {plan.table.name}: made on machines of other kinds than this one, so last bits may differ"
         command.say(job.name, f"{about}: here {machine()}, made on {'; '.join(machines)}", 0)

@@ -37,6 +37,8 @@ def test_filters_and_columns(toy):
     rows = toy.rows(["id"], where=pc.field("flux") > 0.5)
     assert rows.column_names == ["id"]
     assert rows.num_rows == sum(f > 0.5 for f in toy.rows()["flux"].to_pylist())
+    with pytest.raises(BadInput, match="table toy has no column speed"):
+        toy.rows(["id", "speed"])
 
 
 def test_units_come_back_with_the_rows(toy):

@@ -63,13 +63,3 @@ def test_one_is_named(two, capsys):
     assert "2.0" in capsys.readouterr().out
     assert main(["FROM plain", "--lake", str(two)]) == 2
     assert main(["--lake", str(two)]) == 0
-
-
-def test_a_request_of_a_lake_that_has_a_name_which_sql_knows(tmp_path):
-    """No request is called so any more; of an older lake it is said why its tables cannot be had by its name."""
-    for name, seed in (("temp", 1), ("b", 2)):
-        publish.make(tmp_path, plain_plan(seed), plain_work, name=name)
-    with Explorer(tmp_path, timeout=30.0) as explorer, pytest.raises(BadInput, match=r'SQL: .*schema "temp"'):
-        explorer.sql("SELECT value FROM temp.plain")
-    with Explorer(tmp_path, request="temp", timeout=30.0) as explorer:
-        assert explorer.sql("SELECT DISTINCT value FROM plain").to_dict("list") == {"value": [1.0]}

@@ -19,7 +19,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import yaml
 
-from lake_schema import __version__, position_columns, sky, user_files
+from lake_schema import __version__, sky, user_files
 from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 from lake_schema.store import layout, names, read
@@ -39,11 +39,10 @@ _Maker = Callable[[pa.Table], pa.Table]
 
 @dataclass(frozen=True, slots=True)
 class _Catalogue:
-    """A table of the lake beside its fluxes, row by row; place : columns of the observed position."""
+    """A table of the lake beside its fluxes, row by row."""
 
     rows: read.Version
     fluxes: read.Version
-    place: tuple[str, str]
     bands: list[str] = field(default_factory=list)
 
     def part(self, name: str) -> pa.Table:
@@ -55,11 +54,6 @@ class _Catalogue:
         for band in self.bands:
             rows = rows.append_column(f"f_nu_{band}", found[f"f_nu_{band}"])
         return rows
-
-    def pixels(self, rows: pa.Table) -> np.ndarray:
-        """Nested pixel[n] of rows."""
-        ra, dec = (rows[name].to_numpy() for name in self.place)
-        return sky.cell_of(ra, dec, ORDER)
 
 
 def write(lake: Path, folder: Path, request: str | None = None) -> list[Path]:
@@ -112,53 +106,26 @@ def _catalogue(lake: Path, kind: str, request: str | None) -> _Catalogue:
     bands = [name.removeprefix("f_nu_") for name in fluxes.schema.names if name.startswith("f_nu_lsst_")]
     if not bands:
         raise BadInput(f"table {fluxes.table} has no LSST band: put lsst_r into fluxes.bands and run compute_fluxes")
-    position_columns.refuse_mixed([rows, fluxes])
-    return _Catalogue(rows, fluxes, rows.place(), bands)
+    return _Catalogue(rows, fluxes, bands)
 
 
 def _by_pixel(catalogue: _Catalogue) -> Iterator[tuple[int, pa.Table]]:
     """(nested pixel, its rows) of every pixel that has some."""
-    strays = _strays(catalogue)
-    for parts in _together(catalogue.rows.parts).values():
+    for parts in _together(catalogue.rows.parts):
         rows = pa.concat_tables([catalogue.part(part) for part in parts])
-        at, own = catalogue.pixels(rows), _pixels_of(parts[0])
-        for pixel in np.unique(at[(at >= own[0]) & (at < own[1])]).tolist():
-            yield pixel, pa.concat_tables([rows.filter(pa.array(at == pixel)), *strays.pop(pixel, [])])
-    for pixel, tables in sorted(strays.items()):
-        yield pixel, pa.concat_tables(tables)
+        at = sky.parent(rows["_healpix_29"].to_numpy(), sky.DEEPEST, ORDER)
+        for pixel in np.unique(at).tolist():
+            yield pixel, rows.filter(pa.array(at == pixel))
 
 
-def _strays(catalogue: _Catalogue) -> dict[int, list[pa.Table]]:
-    """Rows by the pixel in which they are seen, of those that an earlier lake keeps where they would be unlensed."""
-    found: dict[int, list[pa.Table]] = {}
-    if catalogue.place == ("ra", "dec"):
-        return found
-    for part in catalogue.rows.parts:
-        at, own = catalogue.pixels(catalogue.rows.rows(list(catalogue.place), [part])), _pixels_of(part)
-        away = (at < own[0]) | (at >= own[1])
-        if away.any():
-            rows = catalogue.part(part).filter(pa.array(away))
-            for pixel in np.unique(at[away]).tolist():
-                found.setdefault(pixel, []).append(rows.filter(pa.array(at[away] == pixel)))
-    return found
-
-
-def _together(parts: Iterable[str]) -> dict[tuple[int, int], list[str]]:
+def _together(parts: Iterable[str]) -> list[list[str]]:
     """Parts that lie in one pixel, or alone where they are larger."""
     found: dict[tuple[int, int], list[str]] = {}
     for part in parts:
         order, cell = layout.cell_of_file(part)
         coarse = min(order, ORDER)
         found.setdefault((coarse, cell >> 2 * (order - coarse)), []).append(part)
-    return found
-
-
-def _pixels_of(part: str) -> tuple[int, int]:
-    """First pixel of those inside a part's cell, and the one after the last; the pixel around a smaller cell."""
-    order, cell = layout.cell_of_file(part)
-    if order > ORDER:
-        order, cell = ORDER, cell >> 2 * (order - ORDER)
-    return cell << 2 * (ORDER - order), (cell + 1) << 2 * (ORDER - order)
+    return list(found.values())
 
 
 # ------------------------------------------------------------------------------------------------ columns
@@ -171,13 +138,13 @@ def _galaxy_rows(lake: Path, catalogue: _Catalogue) -> tuple[_Maker, _Maker]:
         light = tophat.luminosities(given, library)
         share = bulges.in_bins(given, tophat.templates_in_bins(library), library)
         spectra = {"sed_val_bulge": _lists(light * share), "sed_val_disk": _lists(light * (1.0 - share))}
-        return pa.table({**_shapes(given, catalogue.place), **spectra})
+        return pa.table({**_shapes(given), **spectra})
 
     return rows, _fluxes("galaxy_id", catalogue.bands)
 
 
-def _shapes(given: pa.Table, place: tuple[str, str]) -> dict[str, Any]:
-    """Columns of galaxies but for their spectra; place : columns of the observed position.
+def _shapes(given: pa.Table) -> dict[str, Any]:
+    """Columns of galaxies but for their spectra.
 
     Sizes are half-light radii; shears are in GalSim's frame, whose x axis points west. Ellipticities are
     (a - b) / (a + b) along north and north-east: the reader turns them by 90 degrees.
@@ -186,8 +153,8 @@ def _shapes(given: pa.Table, place: tuple[str, str]) -> dict[str, Any]:
     angle = c["position_angle"].astype(float)
     columns = {
         "galaxy_id": c["id"],
-        "ra": c[place[0]],
-        "dec": c[place[1]],
+        "ra": c["ra"],
+        "dec": c["dec"],
         "redshift": c["z_obs"].astype(np.float64),
         "redshift_hubble": np.maximum(c["z_true"].astype(np.float64), tophat.NEAREST),
         "peculiar_velocity": LIGHT_KM_S * ((1.0 + c["z_obs"].astype(float)) / (1.0 + c["z_true"]) - 1.0),

@@ -5,7 +5,7 @@ import { ink, stretched } from "/static/colour.js";
 import { dispersed, use } from "/static/trace.js";
 
 const $ = (id) => document.getElementById(id);
-const SIDE = 64, SHOWN = ["ra", "dec", "ra_true", "dec_true", "ra_lensed", "dec_lensed", "z_obs", "z_true", "mag_r01", "abs_mag_r01", "color_gr_01", "log_stellar_mass", "log_sfr",
+const SIDE = 64, SHOWN = ["ra", "dec", "ra_true", "dec_true", "z_obs", "z_true", "mag_r01", "abs_mag_r01", "color_gr_01", "log_stellar_mass", "log_sfr",
   "bulge_fraction", "bulge_half_light_radius", "disk_half_light_radius", "inclination", "position_angle", "kappa", "gamma1", "gamma2", "a_v", "mag_h", "distance"];
 let source = null, drawings = [], pins = 0;
 const listeners = [];

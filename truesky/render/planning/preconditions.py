@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from lake_schema import position_columns, sky
+from lake_schema import sky
 from lake_schema.arrays import Bool, Float, Int
 from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER
@@ -31,7 +31,6 @@ INPUTS = ("mission", "exposures", "tasks", "galaxies", "galaxy_fluxes", "stars",
 def refuse_other_plan(inputs: Mapping[str, read.Version], request: Request, mission: MissionConfiguration) -> None:
     """What lies in the lake must have been made for this request and its mission, and the tables from one another."""
     universe.refuse_other([inputs[name] for name in universe.CATALOGUES], request)
-    position_columns.refuse_mixed(inputs.values())
     facts = {name: version.manifest["facts"] for name, version in inputs.items()}
     filters = user_filters(request)[1]
     wanted = {"request": request.facts(*PARTS), "mission": mission.fingerprint, **filters}

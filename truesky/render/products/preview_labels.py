@@ -54,22 +54,19 @@ def labels(root: Path, product: dict[str, Any], image: images.Image, made_of: Ma
     found: list[Label] = []
     for kind, table in (("galaxy", "galaxies"), ("star", "stars")):
         version = read.version(root, table, made_of[table])
-        position = version.place()
-        columns = ["id", *position] + (["z_obs"] if kind == "galaxy" else [])
+        columns = ["id", "ra", "dec"] + (["z_obs"] if kind == "galaxy" else [])
         rows = version.in_cells(cells, GENERATION_ORDER, columns)
         fluxes = read.version(root, f"{kind}_fluxes", made_of[f"{kind}_fluxes"])
         flux = fluxes.in_cells(cells, GENERATION_ORDER, ["id", column])
-        near = sky.separation(*centre, *(rows[name].to_numpy() for name in position)) < radius
+        near = sky.separation(*centre, *(rows[name].to_numpy() for name in ("ra", "dec"))) < radius
         near &= flux[column].to_numpy() > 0
         if near.any():
-            found += _labels_of(kind, rows.filter(near), flux[column].to_numpy()[near], position, system, (ny, nx))
+            found += _labels_of(kind, rows.filter(near), flux[column].to_numpy()[near], system, (ny, nx))
     return sorted(found, key=lambda label: label.mag)
 
 
-def _labels_of(
-    kind: str, rows: pa.Table, flux: Float, position: tuple[str, str], system: WCS, shape: tuple[int, int]
-) -> list[Label]:
-    column, row = astrometry.pixel_of_sky(system, *(rows[name].to_numpy() for name in position))
+def _labels_of(kind: str, rows: pa.Table, flux: Float, system: WCS, shape: tuple[int, int]) -> list[Label]:
+    column, row = astrometry.pixel_of_sky(system, *(rows[name].to_numpy() for name in ("ra", "dec")))
     inside = np.flatnonzero((column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0]))
     brightest = inside[np.argsort(-flux[inside])[: 4 * LABELS]]
     column, row = column[brightest], row[brightest]

@@ -34,23 +34,11 @@ def drawn_cells(catalogue: read.Version) -> set[int]:
 
 
 def deflection_of(catalogue: read.Version) -> float:
-    """How far a source may be seen from where its cell says, deg: stars as they move, galaxies of an earlier lake.
+    """How far a source may be seen from where its cell says, deg: stars move, galaxies do not.
 
     Error: a star that has moved farther is missed where its cell is not read
     """
-    if farther := catalogue.padding():
-        return farther
     return FARTHEST_MOVED if "pm_ra" in catalogue.schema.names else 0.0
-
-
-def as_seen(catalogue: read.Version, columns: Sequence[str]) -> list[str]:
-    """The columns, where `ra` and `dec` are those of observed positions, of a lake of this or of an earlier time."""
-    seen = dict(zip(("ra", "dec"), catalogue.place(), strict=True))
-    return [seen.get(name, name) for name in columns]
-
-
-def _as_asked(rows: pa.Table, own: Sequence[str], columns: Sequence[str]) -> pa.Table:
-    return rows if list(own) == list(columns) else rows.rename_columns(list(columns))
 
 
 def at_time(stars: pa.Table, mjd: float) -> pa.Table:
@@ -96,15 +84,14 @@ def sources(
     if np.isfinite(bright):
         around, _ = selection.beyond(task, deflection, max(FARTHEST, farther), drawn_cells(catalogue))
         farthest = sorted(set(around) - set(far))
-    own = as_seen(catalogue, columns)
-    rows, light = (v.in_cells(near, GENERATION_ORDER, c) for v, c in ((catalogue, own), (fluxes, flux)))
+    rows, light = (v.in_cells(near, GENERATION_ORDER, c) for v, c in ((catalogue, columns), (fluxes, flux)))
     for cells, limit in ((far, least), (farthest, bright)):
         if not cells:
             continue
-        more, fluxes_there = (v.in_cells(cells, GENERATION_ORDER, c) for v, c in ((catalogue, own), (fluxes, flux)))
+        more, fluxes_there = (v.in_cells(cells, GENERATION_ORDER, c) for v, c in ((catalogue, columns), (fluxes, flux)))
         shows = pc.greater_equal(fluxes_there[flux[1]], limit)
         rows, light = (pa.concat_tables([a, b.filter(shows)]) for a, b in ((rows, more), (light, fluxes_there)))
-    return _as_asked(rows, own, columns), light, complete
+    return rows, light, complete
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,8 +130,7 @@ def bright(catalogue: read.Version, fluxes: read.Version, wanted: Sequence[Brigh
     # Fluxes are small: only the parts of the catalogue that have some of these are read.
     parts = [part["name"] for part in catalogue.manifest["parts"] if not set(every).isdisjoint(part["facts"][CELLS])]
     columns = list(dict.fromkeys(["id", *(name for one in wanted for name in one.columns)]))
-    own = as_seen(catalogue, columns)
-    rows = _as_asked(catalogue.rows(own, parts if len(some) else [], pc.field("id").isin(some)), own, columns)
+    rows = catalogue.rows(columns, parts if len(some) else [], pc.field("id").isin(some))
     found = []
     for one, seen in zip(wanted, shows, strict=True):
         its = light.filter(pa.array(seen)).select(["id", f"f_nu_{one.band}"])
@@ -161,15 +147,13 @@ def lenses(table: read.Version, task: Mapping[str, Any], deflection: float, fart
     table      : version of `strong_lenses`;  task : its row
     """
     cells = selection.within(task, deflection, farther) if np.isfinite(least) else []
-    about = table.in_cells(cells, GENERATION_ORDER, ["id", *table.place()])
-    ra, dec = (about[name].to_numpy() for name in table.place())
+    about = table.in_cells(cells, GENERATION_ORDER, ["id", "ra", "dec"])
+    ra, dec = (about[name].to_numpy() for name in ("ra", "dec"))
     reach = task["radius"] + farther / 3600.0
     seen = about["id"].filter(pa.array(selection.near(ra, dec, (task["ra"], task["dec"]), reach)))
     # Pictures are large: only those of lenses that are seen are read.
     parts = [part["name"] for part in table.manifest["parts"] if not set(cells).isdisjoint(part["facts"][CELLS])]
-    own = as_seen(table, lensed_arcs.ARC_COLUMNS)
-    found = table.rows(own, parts if len(seen) else [], pc.field("id").isin(seen))
-    return _as_asked(found, own, lensed_arcs.ARC_COLUMNS)
+    return table.rows(lensed_arcs.ARC_COLUMNS, parts if len(seen) else [], pc.field("id").isin(seen))
 
 
 def with_lensed(
@@ -194,7 +178,6 @@ def with_lensed(
     cells = set(selection.within(task, deflection_of(catalogue), farther))
     parts = [part["name"] for part in catalogue.manifest["parts"] if not cells.isdisjoint(part["facts"][CELLS])]
     wanted = pc.field("id").isin(pa.array(missing))
-    own = as_seen(catalogue, rows.column_names)
-    more = _as_asked(catalogue.rows(own, parts, wanted), own, rows.column_names)
+    more = catalogue.rows(rows.column_names, parts, wanted)
     its = fluxes.rows(light.column_names, parts, wanted)
     return pa.concat_tables([rows, more]), pa.concat_tables([light, its])

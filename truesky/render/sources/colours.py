@@ -35,7 +35,7 @@ GALAXY_COLUMNS = (
     *(f"{name}_{k}" for name in ("sed", "frac", "ext_law", "ebv") for k in COMPONENTS),
     *sorted({line.column for line in line_list()}),
 )
-# What a star must have for a spectrum; older catalogues and a user's own have no second template.
+# What a star must have for a spectrum; a user's own catalogue has no second template.
 OF_ONE_TEMPLATE = ("sed", "mag_h", "a_v")
 STAR_COLUMNS = (*OF_ONE_TEMPLATE, *(f"{name}_{k}" for k in STAR_PARTS for name in ("sed", "frac")))
 

@@ -6,8 +6,8 @@ beyond     cells that lie farther out, of which the bright sources count
 near       rows within a circle, before any projection
 touching   sources whose stamp overlaps the frame
 
-Cells hold galaxies by where they are seen. Stars move, and a lake of an earlier time holds galaxies by their true
-position: circles are widened by how far a source may be seen from where its cell says.
+Cells hold galaxies by where they are seen. Stars move: circles are widened by how far a star may be seen from where its
+cell says.
 """
 
 from __future__ import annotations

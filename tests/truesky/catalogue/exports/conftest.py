@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pyarrow as pa
 import pytest
 
 from lake_schema import ids, sky, units
@@ -18,7 +17,7 @@ from truesky.fluxes.libraries import templates
 
 CELL = 8989
 BANDS = [f"lsst_{band}" for band in "ugrizy"]
-# So many galaxies are seen across the border of the cell in which they are kept.
+# So many galaxies, the last ones, are seen across the border of the cell in which they are.
 STRAYS = 3
 # Rows of three galaxies of given shapes, from and to.
 DRAWN = 12, 15
@@ -36,23 +35,22 @@ def bands():
 
 
 def galaxies(n=40, seed=4):
-    """Rows of one cell: of four kinds, with lines of up to 100 A of continuum, sheared, behind dust."""
+    """Rows by file: of four kinds, with lines of up to 100 A of continuum, sheared, behind dust."""
     rng = np.random.default_rng(seed)
-    index, ra, dec = sky.random_in_cell(5, CELL, n, rng)
+    _, ra, dec = sky.random_in_cell(5, CELL, n, rng)
     kind = rng.choice([0, 1, 2, 3], n, p=[0.5, 0.4, 0.05, 0.05])
     kind[:4], kind[slice(*DRAWN)] = range(4), 0
     far, mag = kind >= 2, rng.uniform(17.0, 26.0, n)
     continuum = units.cgs_of_ujy(units.f_nu_of_mag(mag)) * LIGHT_ANGSTROM_S / 7000.0**2
     z = np.where(far, rng.uniform(6.0, 6.5, n), rng.uniform(0.02, 2.3, n))
-    values = {c.name: np.full(n, max(c.lo or 0.0, 0.0)) for c in GALAXIES.earlier.columns if c.type.startswith("float")}
+    values = {c.name: np.full(n, max(c.lo or 0.0, 0.0)) for c in GALAXIES.columns if c.type.startswith("float")}
     values |= {
         "id": np.array([ids.source_id(int(k), CELL << 6, i) for i, k in enumerate(kind)]).ravel(),
         "halo_id": np.arange(n),
         "ra": ra,
         "dec": dec,
-        "_healpix_29": index,
-        "ra_lensed": ra.copy(),
-        "dec_lensed": dec.copy(),
+        "ra_true": ra.copy(),
+        "dec_true": dec.copy(),
         "kind": kind,
         "density_boost": np.ones(n),
         "z_true": z,
@@ -82,10 +80,14 @@ def galaxies(n=40, seed=4):
         values[f"flux_{name}"] = continuum * rng.choice([0.0, 5.0, 30.0, 100.0], n)
     # Some without a bulge at all, and with the sizes of nothing.
     values["bulge_fraction"][5:8] = values["bulge_half_light_radius"][5:8] = 0.0
-    neighbour = sky.cell_centre(5, CELL + 1)
-    values["ra_lensed"][8 : 8 + STRAYS], values["dec_lensed"][8 : 8 + STRAYS] = neighbour
+    values["ra"][-STRAYS:], values["dec"][-STRAYS:] = sky.cell_centre(5, CELL + 1)
+    values["_healpix_29"] = sky.healpix_29(values["ra"], values["dec"])
     _to_be_drawn(values, slice(*DRAWN))
-    return GALAXIES.earlier.build(values)
+    rows = GALAXIES.build(values)
+    return {
+        layout.cell_file(5, CELL): rows.slice(0, n - STRAYS),
+        layout.cell_file(5, CELL + 1): rows.slice(n - STRAYS),
+    }
 
 
 def _to_be_drawn(values, rows):
@@ -118,48 +120,20 @@ def stars(n=30, seed=5):
     )
 
 
-def published(lake, table, rows, order, facts):
-    plan = Plan(table, facts, (Part(layout.cell_file(order, CELL >> 2 * (5 - order)), {}),))
-    publish.make(lake, plan, lambda root, facts: Output(rows))
-    return plan.key
-
-
-def by_observed(rows, table):
-    """Rows of an earlier lake, in parts of CELL and the next as a lake of now has them: where they are seen."""
-    seen = {"ra": rows["ra_lensed"], "dec": rows["dec_lensed"], "ra_true": rows["ra"], "dec_true": rows["dec"]}
-    index = sky.healpix_29(rows["ra_lensed"].to_numpy(), rows["dec_lensed"].to_numpy())
-    values = seen | {"_healpix_29": index}
-    whole = table.build({name: values[name] if name in values else rows[name] for name in table.names}).sort_by(
-        "_healpix_29"
-    )
-    cells = sky.parent(whole["_healpix_29"].to_numpy(), sky.DEEPEST, 5)
-    return {layout.cell_file(5, cell): whole.filter(pa.array(cells == cell)) for cell in (CELL, CELL + 1)}
-
-
-def _published_parts(lake, table, parts, facts):
+def published(lake, table, parts, facts):
+    """Publish rows by file; returns the version's key."""
     plan = Plan(table, facts, tuple(Part(name, {"name": name}) for name in parts))
     publish.make(lake, plan, lambda root, facts: Output(parts[facts["name"]]))
     return plan.key
-
-
-def lake_of_now(root):
-    """The same galaxies by observed positions, with their fluxes."""
-    rows = by_observed(galaxies(), GALAXIES)
-    light = {name: band_fluxes.galaxy_fluxes(some, bands(), templates.galaxy_library()) for name, some in rows.items()}
-    key = _published_parts(root, GALAXIES, rows, {})
-    _published_parts(root, fluxes("galaxy", BANDS), light, {"input": key})
-    return root
 
 
 @pytest.fixture(scope="module")
 def lake(tmp_path_factory):
     root = tmp_path_factory.mktemp("lake")
     rows, points = galaxies(), stars()
-    light = band_fluxes.galaxy_fluxes(rows, bands(), templates.galaxy_library())
-    published(
-        root, fluxes("galaxy", BANDS).earlier, light, 5, {"input": published(root, GALAXIES.earlier, rows, 5, {})}
-    )
-    light = band_fluxes.star_fluxes(points, bands(), templates.stellar_library())
-    published(root, fluxes("star", BANDS), light, 3, {"input": published(root, STARS, points, 3, {})})
+    light = {name: band_fluxes.galaxy_fluxes(some, bands(), templates.galaxy_library()) for name, some in rows.items()}
+    published(root, fluxes("galaxy", BANDS), light, {"input": published(root, GALAXIES, rows, {})})
+    light, name = band_fluxes.star_fluxes(points, bands(), templates.stellar_library()), layout.cell_file(3, CELL >> 4)
+    published(root, fluxes("star", BANDS), {name: light}, {"input": published(root, STARS, {name: points}, {})})
     assert read.version(root, "star_fluxes").num_rows == points.num_rows
     return root
