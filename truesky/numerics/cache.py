@@ -151,10 +151,6 @@ def sealed(folder: Path) -> dict[str, int] | None:
     if not folder.exists():
         # Looked for before its seal: another process may publish the whole of it at any time.
         return None
-    if not (folder / _SEAL).exists():
-        # By an older truesky.
-        _remove(folder)
-        return None
     try:
         found = json.loads((folder / _SEAL).read_bytes())
         sums: dict[str, int] = found["sums"]

@@ -138,8 +138,7 @@ def read_master(path: Path, kind: str, frame: Frame) -> tuple[Combined, float]:
     if header.get("IMAGETYP") != f"master {kind}" or len(units) != 4:
         raise BadInput(f"{user_files.shown(path)}: is no master {kind}")
     for keyword in SAME:
-        # Older versions wrote the instrument in small letters.
-        if str(header.get(keyword)).lower() != str(frame.card(keyword)).lower():
+        if str(header.get(keyword)) != str(frame.card(keyword)):
             what = f"{keyword} = {header.get(keyword)}, the frame's is {frame.card(keyword)}"
             raise BadInput(f"{user_files.shown(path)}: {what}: it cannot calibrate {frame.stem}")
     mean, uncertainty, count = (np.asarray(unit.data) for unit in units[1:])

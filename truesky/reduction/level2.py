@@ -24,7 +24,6 @@ from truesky.reduction.calibration import Reduced
 from truesky.reduction.catalogue import Limits
 from truesky.reduction.frames import Frame
 from truesky.render.camera import astrometry
-from truesky.render.channels import registry
 from truesky.render.products import head_files
 
 # Of a point source's FWHM, the diameter of the aperture where none is asked for.
@@ -53,9 +52,8 @@ def refuse(frames: Sequence[Frame]) -> None:
 
 def _psf_of(frame: Frame) -> Path:
     if frame.psf is None:
-        ground = registry.CHANNELS[frame.exposure.channel].on_ground
-        why = "an older version rendered it" if ground else "choose those of ground cameras by --exposures"
-        raise BadInput(f"--level2: the lake has no PSF beside the image {frame.stem}: {why}")
+        what = f"the lake has no PSF beside the image {frame.stem}"
+        raise BadInput(f"--level2: {what}: choose images of ground cameras by --exposures")
     return frame.psf
 
 

@@ -231,9 +231,8 @@ def _raw(read: Sequence[Image]) -> tuple[Array, tuple[int, int, int, int]]:
     """Quadrants in readout order; prescan, overscan, overscan rows, rows between the halves."""
     header = _header(read[0])
     raw = np.stack([layout.placed(np.asarray(unit.data), number) for number, unit in enumerate(read[1:])])
-    prescan, overscan, rows = (int(header[key]) for key in ("PRESCAN", "OVERSCAN", "OVERROWS"))
-    # Files of older versions know nothing of rows between the halves.
-    return raw, (prescan, overscan, rows, int(header.get("INJROWS", 0)))
+    prescan, overscan, rows, between = (int(header[key]) for key in ("PRESCAN", "OVERSCAN", "OVERROWS", "INJROWS"))
+    return raw, (prescan, overscan, rows, between)
 
 
 def _header(image: Image) -> dict[str, Any]:

@@ -234,17 +234,6 @@ def test_the_halves_of_a_detector_lie_apart_on_the_sky(tmp_path):
     assert not read_back.electrons(path).data[128:132].any()
 
 
-def test_files_of_older_versions_are_read(rendered, written, tmp_path):
-    """They say nothing of rows between the halves, and had none."""
-    folder, rows = written
-    now, before = folder / rows["path"][0].as_py(), tmp_path / "older.fits"
-    older = [replace(i, cards=tuple(c for c in i.cards if c[0] != "INJROWS")) for i in images.read_images(now)]
-    images.write_images(before, older)
-    assert "INJROWS" not in astropy_fits.getheader(before)
-    np.testing.assert_array_equal(read_back.frame(before).data, rendered.science)
-    np.testing.assert_array_equal(read_back.electrons(before).data, read_back.electrons(now).data)
-
-
 def test_astropy_finds_the_sources_where_they_were_drawn(rendered, written):
     folder, rows = written
     for path in rows["path"].to_pylist():
