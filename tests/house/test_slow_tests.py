@@ -56,6 +56,13 @@ def test_between_the_limits_there_is_a_warning(watch, warnings):
     assert line.startswith(f"{NAME} took 10.0 s")
 
 
+def test_an_empty_list_warns_of_all(watch, warnings):
+    watch.listed = {}
+    watch.judge(NAME, 100.0, 2000.0)
+    (line,) = warnings
+    assert line.startswith(f"{NAME} took 100.0 s")
+
+
 def test_listed_and_nightly_ones_may_take_long(watch, warnings):
     for name in ("test_listed", "field"):
         watch.judge(f"test_x.py::{name}", 100.0, 2000.0)
