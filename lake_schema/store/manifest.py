@@ -106,7 +106,7 @@ def _is_entry(entry: Any) -> bool:
     if not _has(entry, _FILE) or type(entry.get("rows", 0)) is not int:
         return False
     path = PurePosixPath(entry["path"])
-    if path.suffix == ".parquet":
+    if path.suffix == ".parquet" or "blocks" in entry:
         try:
             blocks.listed(entry)
         except (LookupError, TypeError, ValueError):
@@ -222,7 +222,7 @@ def _file_faults(folder: Folder, entry: Json, size: int, deep: bool) -> list[str
             _compare(checked(folder, entry), entry)
             return _row_faults(folder, entry) if "rows" in entry else []
         checked(folder, entry)
-        if path.suffix == ".parquet":
+        if PurePosixPath(entry["path"]).suffix == ".parquet":
             # The footer.
             parquet.schema(folder, entry)
     except Damaged as error:

@@ -126,12 +126,12 @@ class Lake(LakeTables):
         astropy.wcs.WCS
             Converts between ICRS positions and pixels of the array that `image` returns, counted from 0.
         """
-        from astropy.io import fits
         from astropy.wcs import WCS, FITSFixedWarning
 
         from truesky.render.products import read_back
 
-        header = fits.Header(read_back.header(self._explorer._version("products").file(path)))
+        cards = read_back.header(self._explorer._version("products").file(path))
+        header = {keyword: value for keyword, value, _ in cards}
         with warnings.catch_warnings():
             # astropy reports that it understands the date.
             warnings.simplefilter("ignore", FITSFixedWarning)

@@ -14,15 +14,16 @@ import json
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lake_schema import user_files
 from lake_schema.errors import BadInput
-from lake_schema.mission import camera_folder
-from lake_schema.mission.camera_folder import Camera
 from lake_schema.store import layout
 from lake_schema.store.provenance import file_sha256
 from truesky.request.toml_values import Toml, boolean, number, shown, string, strings, table_of
+
+if TYPE_CHECKING:
+    from lake_schema.mission.camera_folder import Camera
 
 # A kind of lake_schema.user_files.
 SOURCES = "table of sources"
@@ -135,7 +136,12 @@ def cameras(names: Sequence[str], folder: Path) -> tuple[Camera, ...]:
     BadInput
         If a folder is not a valid camera, or two have one name. The message names the file and the line.
     """
-    found = []
+    if not names:
+        return ()
+    # Reading units takes a second, which a request without cameras need not wait for.
+    from lake_schema.mission import camera_folder
+
+    found: list[Camera] = []
     for i, name in enumerate(names):
         try:
             found.append(camera_folder.read(file_of(folder, name)))

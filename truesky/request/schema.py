@@ -7,9 +7,8 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from lake_schema.mission.camera_folder import Camera
 from lake_schema.tables import mission as database
 from lake_schema.tables import products
 from truesky.request.accuracy import Accuracy
@@ -17,6 +16,9 @@ from truesky.request.area import Area
 from truesky.request.files import GivenSources, Ingest, UserCurves
 from truesky.request.observations import Observation, Pointing
 from truesky.request.structure import Structure
+
+if TYPE_CHECKING:
+    from lake_schema.mission.camera_folder import Camera
 
 STATUSES = tuple(code for code, _ in database.STATUSES)
 LADDER = database.LADDER

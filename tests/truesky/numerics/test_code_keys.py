@@ -148,7 +148,7 @@ KEEPING = {
 }  # fmt: skip
 RECORDS = {
     "truesky.request.files.Curves", "truesky.request.files.DustMap", "truesky.request.files.UserCurves",
-    "lake_schema.mission.configuration.MissionConfiguration", "lake_schema.mission.parameter.CAMERAS",
+    "lake_schema.mission.configuration.MissionConfiguration", "lake_schema.mission.parameter.SPACE_CAMERAS",
     "lake_schema.mission.detector_overrides", "lake_schema.mission.detector_overrides.Place",
 }  # fmt: skip
 
