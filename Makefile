@@ -9,7 +9,8 @@ SHELL := bash
 
 export OMP_NUM_THREADS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
-unexport PYTHONHOME PYTHONPATH PIP_CONSTRAINT PIP_BUILD_CONSTRAINT
+# The last one: without bytecode each of the tests' processes would parse all sources again.
+unexport PYTHONHOME PYTHONPATH PIP_CONSTRAINT PIP_BUILD_CONSTRAINT PYTHONDONTWRITEBYTECODE
 
 ifneq ($(words $(CURDIR)),1)
 $(error truesky: Spark cannot be started from a folder with a space in its name ($(CURDIR)): move the clone)

@@ -1,5 +1,6 @@
 """What all tests share: a cache and an environment of their own, one Spark session, hypothesis profiles."""
 
+import gc
 import os
 import tempfile
 from collections import Counter
@@ -14,6 +15,7 @@ import pytest
 from hypothesis import settings
 
 from tests import slow_tests, tolerances
+from truesky.running import heap
 
 pytest.approx = tolerances.approx
 
@@ -76,6 +78,16 @@ def pytest_collection_modifyitems(config, items):
     items.sort(key=place)
 
 
+def pytest_collection_finish():
+    """Thousands of collected tests live until the end, so the garbage collector need not visit them each time."""
+    gc.collect()
+    gc.freeze()
+
+
+def pytest_unconfigure():
+    gc.unfreeze()
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
     """By file, or by what files share."""
@@ -95,6 +107,13 @@ def _no_waiting_for_the_disc():
     """Accidents here are of calls and processes, not of power: what is written need not have reached the disc."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda descriptor: None)
+        yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _memory_is_reused():
+    """Each file of tests keeps the memory of its large arrays until it ends, which saves a tenth of the CPU time."""
+    with heap.kept():
         yield
 
 

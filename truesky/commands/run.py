@@ -138,7 +138,7 @@ def run(root: Path, file: Path, wanted: Sequence[Stage], request: Request, start
     # Whatever is wrong with the request, or with the room on the disc, is said before the first job runs.
     universe.refuse_others(root, request)
     # Asked before anything is planned, which compiles a little.
-    compiled = any(cache.machine_code_dir().glob("kernels_*/*.nbi"))
+    compiled = any(cache.machine_code_dir().glob("render.drawing.kernels/*.nbi"))
     plan = checked_plan(root, request, wanted)
     wanted_gb, free_gb = space.check(root, request, plan)
     count = _foretell(root, request, plan, wanted_gb, free_gb)

@@ -1,9 +1,13 @@
-"""numba, with its machine code in the project's cache: compiled once a machine and version, not once a process."""
+"""Compile functions with numba, and keep their machine code in the project's cache.
+
+A function is compiled once per machine and version of the sources, not once per process or per copy of the package.
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar
 
 from lake_schema import instruction_set
@@ -11,11 +15,57 @@ from truesky.numerics import cache
 
 # numba reads these when it is imported, and processes begun from here have them.
 instruction_set.limit_numba()
-os.environ["NUMBA_CACHE_DIR"] = str(cache.machine_code_dir())
+_MACHINE_CODE = cache.machine_code_dir()
+os.environ["NUMBA_CACHE_DIR"] = str(_MACHINE_CODE)
 
 import numba  # noqa: E402
+from numba.core.caching import UserProvidedCacheLocator  # noqa: E402
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+_PACKAGE = Path(__file__).parents[1]
+_CONFIG: Any = numba.config
+# The others are for functions of users, and for machines on which the cache cannot be written.
+_LOCATORS = f"{__name__}.PackageCacheLocator,UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator"
+
+
+class PackageCacheLocator(UserProvidedCacheLocator):
+    """Name the machine code of a module by the module's place in the package.
+
+    numba names it by the absolute path of the file, so that each clone and each environment would compile anew. The
+    cache folder is named by the contents of all compiled modules, so the files of one folder belong to equal sources.
+    """
+
+    def __init__(self, py_func: Callable[..., Any], py_file: str) -> None:
+        base: Any = super()
+        base.__init__(py_func, py_file)
+        self._cache_path = str(_MACHINE_CODE / ".".join(Path(py_file).relative_to(_PACKAGE).parent.parts))
+
+    @classmethod
+    def from_function(cls, py_func: Callable[..., Any], py_file: str) -> Any:
+        """Return a locator; None for a function outside the package, or if the cache cannot be written."""
+        if not Path(py_file).is_relative_to(_PACKAGE):
+            return None
+        locator: Any = cls(py_func, py_file)
+        try:
+            locator.ensure_cache_path()
+        except OSError:
+            return None
+        return locator
+
+    def get_source_stamp(self) -> str:
+        """Return a constant: the name of the cache folder already depends on the sources."""
+        return ""
+
+
+def _compile(function: Function, **options: Any) -> Function:
+    before = _CONFIG.CACHE_LOCATOR_CLASSES
+    _CONFIG.CACHE_LOCATOR_CLASSES = _LOCATORS
+    try:
+        decorate: Any = numba.njit(cache=True, error_model="numpy", **options)
+        compiled: Function = decorate(function)
+    finally:
+        _CONFIG.CACHE_LOCATOR_CLASSES = before
+    return compiled
 
 
 def jit(function: Function) -> Function:
@@ -24,9 +74,7 @@ def jit(function: Function) -> Function:
     # order depends on what a function is compiled into: always into its caller, or a process that compiles would round
     # otherwise than one that finds the caller in the cache.
     fast = {"reassoc", "contract", "nsz"}
-    decorate: Any = numba.njit(cache=True, error_model="numpy", fastmath=fast, forceinline=True)
-    compiled: Function = decorate(function)
-    return compiled
+    return _compile(function, fastmath=fast, forceinline=True)
 
 
 def exact_jit(function: Function) -> Function:
@@ -34,6 +82,4 @@ def exact_jit(function: Function) -> Function:
 
     It lets other threads run beside it.
     """
-    decorate: Any = numba.njit(cache=True, error_model="numpy", nogil=True)
-    compiled: Function = decorate(function)
-    return compiled
+    return _compile(function, nogil=True)

@@ -86,7 +86,7 @@ def test_a_run_ends_with_the_first_job_that_fails(tmp_path, capsys, monkeypatch,
 
     def compiling(*known):
         """Planning compiles a little, and so it may once have done something of the renderer."""
-        (folder := cache.machine_code_dir() / "kernels_0").mkdir(parents=True, exist_ok=True)
+        (folder := cache.machine_code_dir() / "render.drawing.kernels").mkdir(parents=True, exist_ok=True)
         (folder / "some.nbi").touch()
         return planned(*known)
 

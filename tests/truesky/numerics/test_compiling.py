@@ -1,13 +1,15 @@
 """What is compiled gives the same bytes, whether a process compiles it or finds it in the cache."""
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from truesky.numerics import cache
+import truesky
+from truesky.numerics import cache, compiling
 
 # A kernel whose inner function sums in any order.
 SCRIPT = """
@@ -43,6 +45,39 @@ def test_compiled_here_or_found_in_the_cache(tmp_path):
     assert list(tmp_path.glob("numba/**/*.nbc"))
     assert first == second
     assert len(first.split()) == 2
+
+
+def test_code_of_the_package_is_named_by_its_module():
+    """Another clone has the same names; a user's own functions go where numba puts them."""
+    sources = Path(truesky.__file__).parent
+    locate = compiling.PackageCacheLocator.from_function
+    locator = locate(_plus_one, str(sources / "render" / "drawing" / "stamps.py"))
+    assert locator.get_cache_path() == str(cache.machine_code_dir() / "render.drawing")
+    assert locate(_plus_one, __file__) is None
+    compiled = compiling.exact_jit(_plus_one)
+    assert compiled(1) == 2
+    assert "truesky" not in compiling.numba.config.CACHE_LOCATOR_CLASSES
+
+
+def _plus_one(number):
+    return number + 1
+
+
+@pytest.mark.nightly
+def test_two_copies_of_the_package_share_their_machine_code(tmp_path):
+    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    environment["TRUESKY_CACHE"] = str(tmp_path / "cache")
+    sources, stored, told = Path(truesky.__file__).parents[1], [], []
+    for name in ("one", "two"):
+        for package in ("truesky", "lake_schema"):
+            shutil.copytree(sources / package, tmp_path / name / package)
+        command = [sys.executable, "-c", SCRIPT]
+        environment["PYTHONPATH"] = str(tmp_path / name)
+        done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=True)
+        told.append(done.stdout)
+        stored.append({path: path.stat().st_mtime_ns for path in tmp_path.glob("cache/numba/**/*.nb?")})
+    assert stored[0] == stored[1] != {}
+    assert told[0] == told[1]
 
 
 def test_machine_code_is_of_the_sources_as_they_are(tmp_path):

@@ -16,6 +16,11 @@ from truesky.running import heap
 SIZE = 64 << 20
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _memory_is_reused():
+    """These tests measure memory, so none is kept for them."""
+
+
 class Counted(ctypes.Structure):
     """mallinfo2 of malloc.h.
 

@@ -1,9 +1,15 @@
 """The memory of a part is its own, not that of what ran before it in the process."""
 
 import numpy as np
+import pytest
 
 from lake_schema.store.plan import Part
 from truesky.running.measured import Measured, forget_peak, peak_gb
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _memory_is_reused():
+    """These tests measure memory, so none is kept for them."""
 
 
 def test_the_peak_is_that_of_the_part():
