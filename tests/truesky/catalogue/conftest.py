@@ -91,11 +91,12 @@ def draw_sky():
     columns = {name: rows[name].to_numpy() for name in rows.column_names if not rows[name].null_count}
     z = columns["z_true"].astype(float)
     m_r = columns["abs_mag_r01"].astype(float)
+    distance_modulus = cosmology.distance_modulus(z)
     sed = band_ratios.Sed(*(columns[name] for name in ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")))
 
     def mag(band):
         table = band_ratios.load(library, band, matching.Z_LAST, 0.5)
-        continuum = m_r + cosmology.distance_modulus(z) + band_ratios.offset(table, z, sed)
+        continuum = m_r + distance_modulus + band_ratios.offset(table, z, sed)
         return emission_lines.brightened(
             continuum, emission_lines.added(passbands.load(band), columns["z_obs"], columns)
         )

@@ -12,6 +12,7 @@ Ref: Serrano et al. 2024, "Bulge and disc model"; the numbers and their sources 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import numpy.typing as npt
@@ -87,8 +88,9 @@ class Shapes:
     ln_disc: Float
 
 
+@cache
 def shapes() -> Shapes:
-    """The morphology of the embedded universe: numbers read, tables made (0.2 s)."""
+    """The morphology of the embedded universe: numbers read, tables made (0.2 s), once."""
     bulge = Bulge(**parameters.section("morphology.toml", "bulge"))
     e, cdf = _disc_distribution(**parameters.section("morphology.toml", "disc"))
     fraction = np.linspace(0.0, 1.0, _FRACTION_NODES)

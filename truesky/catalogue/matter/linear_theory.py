@@ -11,6 +11,7 @@ Ref: Eisenstein & Hu 1998; Tinker et al. 2008, ApJ 688, 709; Tinker et al. 2010,
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ def power(k: Float) -> Float:
 
     k : float[n] h/Mpc
     """
-    return np.asarray(_universe().matterPowerSpectrum(k, 0.0, model=_POWER), float)
+    return np.asarray(_of_power().matterPowerSpectrum(k, 0.0, model=_POWER), float)
 
 
 def halo_tables(log_mass: Float, z: Float) -> dict[str, Float]:
@@ -59,6 +60,12 @@ def _halo_tables(log_mass: Float, z: Float) -> dict[str, Float]:
     c = [concentration.concentration(10.0**few, MASS_DEFINITION, at, model=_CONCENTRATION) for at in coarse]
     fine = np.array([np.exp(np.interp(log_mass, few, np.log(row))) for row in c])
     return {"density": np.log(10.0) * np.array(rows), "bias": np.array(biases), "concentration": fine}
+
+
+@cache
+def _of_power() -> Any:
+    """The cosmology of `power`: each new one integrates its normalisation and makes its table of k again."""
+    return _universe()
 
 
 def _universe() -> Any:

@@ -8,6 +8,7 @@ import pyarrow.compute as pc
 import pytest
 
 from tests.truesky.catalogue.conftest import SEED, SMALL
+from truesky.catalogue import dust_map
 from truesky.catalogue.galaxies import band_ratios, emission_lines, galaxies, strong_lenses
 from truesky.catalogue.halos import halos, matching, population
 from truesky.request.schema import Universe
@@ -24,9 +25,11 @@ def model(limit, z_max, seed=SEED):
     return universe, population.Cells(universe.population)
 
 
-def tables(limit, z_max, cell, dust, seed=SEED):
-    """Galaxies of all kinds, and halos."""
+@cache
+def tables(limit, z_max, cell, seed=SEED):
+    """Galaxies of all kinds, and halos: drawn once for all tests, of which none changes them."""
     universe, cells = model(limit, z_max, seed)
+    dust = dust_map.load(SEED)
     return galaxies.draw(cell, universe, cells, dust), galaxies.halo_table(cell, universe.population, cells)
 
 
@@ -56,8 +59,8 @@ def same(one, other):
             assert a.to_numpy(zero_copy_only=False).tobytes() == b.to_numpy(zero_copy_only=False).tobytes(), name
 
 
-def check(shallow, deep, cell, dust):
-    (few, some), (many, every) = tables(*shallow, cell, dust), tables(*deep, cell, dust)
+def check(shallow, deep, cell):
+    (few, some), (many, every) = tables(*shallow, cell), tables(*deep, cell)
     same(few, of(many, few))
     same(some, of(every, some))
     # And it is all that there is: what a deeper table has to the shallower limits.
@@ -75,17 +78,17 @@ def check(shallow, deep, cell, dust):
     return few.num_rows, some.num_rows
 
 
-def test_a_shallower_and_a_nearer_request_are_parts_of_a_deeper_one(dust):
+def test_a_shallower_and_a_nearer_request_are_parts_of_a_deeper_one():
     deep = (23.0, 2.3)
     for shallow in ((20.0, 2.3), (23.0, 1.0)):
-        few, some = check(shallow, deep, CELLS[0], dust)
+        few, some = check(shallow, deep, CELLS[0])
         assert few > 50
         assert some > few
 
 
-def test_nothing_is_missing_at_the_limit(dust):
+def test_nothing_is_missing_at_the_limit():
     """Galaxies that lines alone lift above it are there: all that a limit 1 mag deeper has, but for one in 10^4."""
-    found = (tables(limit, 2.3, CELLS[0], dust)[0] for limit in (23.0, 24.0))
+    found = (tables(limit, 2.3, CELLS[0])[0] for limit in (23.0, 24.0))
     few, many = (rows.filter(pc.less(rows["kind"], 2)) for rows in found)
     universe, _ = model(23.0, 2.3)
     seen = magnitude(universe, many) < 23.0 - 1e-3
@@ -100,19 +103,19 @@ def test_nothing_is_missing_at_the_limit(dust):
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("cell", CELLS)
-def test_every_pair_of_limits(dust, cell):
+def test_every_pair_of_limits(cell):
     requests = [(limit, z_max) for limit in LIMITS for z_max in REDSHIFTS]
     pairs = [(a, b) for a in requests for b in requests if a != b and a[0] <= b[0] and a[1] <= b[1]]
     assert len(pairs) == 12
     for shallow, deep in pairs:
-        check(shallow, deep, cell, dust)
+        check(shallow, deep, cell)
 
 
 @pytest.mark.nightly
-def test_the_deepest_and_farthest_request_holds_a_usual_one(dust):
+def test_the_deepest_and_farthest_request_holds_a_usual_one():
     deepest = (29.0, min(6.0, matching.Z_LAST))
-    few, some = check((26.0, 2.3), deepest, CELLS[0], dust)
-    many, every = tables(*deepest, CELLS[0], dust)
+    few, some = check((26.0, 2.3), deepest, CELLS[0])
+    many, every = tables(*deepest, CELLS[0])
     for rows, least in ((many, few), (every, some)):
         assert rows.num_rows > 3 * least
         assert np.unique(rows["id"].to_numpy()).size == rows.num_rows
@@ -129,8 +132,8 @@ def test_hosts_behind_the_end_of_a_request_have_their_satellites_before_it():
     assert np.all(hosts.chi < near.halos.far + 2 * near.halos.box.model.cell)
 
 
-def test_strong_lenses_of_a_shallower_catalogue_are_among_those_of_a_deeper_one(dust):
-    few, many = (tables(limit, 2.3, CELLS[0], dust)[0] for limit in (23.0, 24.0))
+def test_strong_lenses_of_a_shallower_catalogue_are_among_those_of_a_deeper_one():
+    few, many = (tables(limit, 2.3, CELLS[0])[0] for limit in (23.0, 24.0))
     some, every = (strong_lenses.draw(CELLS[0], rows, SEED, 1000.0) for rows in (few, many))
     assert 5 < some.num_rows < every.num_rows
     same(some, of(every, some))
@@ -141,8 +144,8 @@ def test_strong_lenses_of_a_shallower_catalogue_are_among_those_of_a_deeper_one(
 
 @pytest.mark.parametrize("seed", [0, 2**63 - 1])
 @pytest.mark.parametrize(("limit", "z_max"), [(16.0, 0.01), (16.0, 0.3), (20.0, 0.05)])
-def test_extreme_requests(dust, seed, limit, z_max):
-    few, some = tables(limit, z_max, CELLS[0], dust, seed)
-    many, every = tables(20.0, 0.3, CELLS[0], dust, seed)
+def test_extreme_requests(seed, limit, z_max):
+    few, some = tables(limit, z_max, CELLS[0], seed)
+    many, every = tables(20.0, 0.3, CELLS[0], seed)
     same(few, of(many, few))
     same(some, of(every, some))
