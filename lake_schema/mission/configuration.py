@@ -33,7 +33,7 @@ __all__ = ["LADDER", "MissionConfiguration", "difference", "resolve"]
 Chosen = TypeVar("Chosen", Parameter, Model)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class MissionConfiguration:
     """One record a name, sorted by name; a value of a detector or an amplifier is under a name of its own (places).
 
@@ -54,6 +54,7 @@ class MissionConfiguration:
     _files: dict[str, Model] = field(init=False, repr=False, compare=False)
     _placed: dict[str, tuple[Place, ...]] = field(init=False, repr=False, compare=False)
     _fingerprint: str = field(init=False, repr=False, compare=False)
+    _whole: str = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "_index", {p.key: p for p in self.parameters})
@@ -69,9 +70,15 @@ class MissionConfiguration:
         lines = [f"{p.key}={p.value.hex()} {p.unit}\n" for p in self.parameters]
         lines += [f"{m.key}={m.sha256}\n" for m in self.models]
         object.__setattr__(self, "_fingerprint", hashlib.sha256("".join(lines).encode()).hexdigest())
+        everything = repr((self.parameters, self.ladder, self.overridden, self.models, self.folder))
+        object.__setattr__(self, "_whole", hashlib.sha256(everything.encode()).hexdigest())
 
     def __hash__(self) -> int:
         return hash(self._fingerprint)
+
+    def __eq__(self, other: object) -> bool:
+        # By a digest: caches compare a configuration with an equal one thousands of times in each exposure.
+        return self._whole == other._whole if isinstance(other, MissionConfiguration) else NotImplemented
 
     def parameter(self, key: str) -> Parameter:
         """The record chosen for a name; BadInput for an unknown one."""

@@ -20,7 +20,9 @@ def request(
         blocks += [{**BLOCK, "image_type": kind, "exposures": count}] if count else []
         if kind == "dark" and count:
             blocks[-1]["exposure_time_s"] = 1000.0
-    keys = f'accuracy = "draft"\n{requests.shallow(*depth)}[fluxes]\nbands = ["euclid_vis"]\n'
+    # Halos about the field need not be drawn for a few sources that are not lensed.
+    universe = requests.shallow(*depth, "lensing = { g1 = 0.0, g2 = 0.0 }\n")
+    keys = f'accuracy = "draft"\n{universe}[fluxes]\nbands = ["euclid_vis"]\n'
     table = tomllib.loads(requests.text(keys, requests.FIELD.format(0.2), seed=7))
     mission = {"mission": {"overrides": overrides}} if overrides else {}
     products = {"products": {"truth": list(truth)}, "effects": {"off": list(off)}}
