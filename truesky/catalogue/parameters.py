@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,16 @@ def section(file: str, name: str) -> dict[str, Any]:
 
     Errors: BadInput where the table is absent or has no source
     """
-    tables = user_files.toml_tables((_HERE / file).read_text(encoding="utf-8"))
+    tables = _tables((_HERE / file).read_text(encoding="utf-8"))
     if name not in tables:
         raise BadInput(f"{file} has no table [{name}]")
     numbers = dict(tables[name])
     if not str(numbers.pop("source", "")).strip():
         raise BadInput(f"{file}: table [{name}] states no source")
     return {key: tuple(value) if isinstance(value, list) else value for key, value in numbers.items()}
+
+
+@cache
+def _tables(text: str) -> dict[str, Any]:
+    """Of one text: a model reads dozens of tables, many of them of the same file."""
+    return user_files.toml_tables(text)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -124,7 +125,13 @@ class Rows:
 
 def formats() -> dict[str, dict[str, Any]]:
     """Name -> what ingest_formats.toml says of it."""
-    return user_files.toml_tables(_FILE.read_text(encoding="utf-8"))
+    return _formats(_FILE.read_text(encoding="utf-8"))
+
+
+@cache
+def _formats(text: str) -> dict[str, dict[str, Any]]:
+    """Of one text; nobody changes them."""
+    return user_files.toml_tables(text)
 
 
 def galaxies(name: str, own: Mapping[str, str]) -> Columns:

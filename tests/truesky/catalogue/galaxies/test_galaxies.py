@@ -189,7 +189,7 @@ def test_a_cell_is_the_same_alone_or_among_others(dust, monkeypatch):
     other = pickle.loads(pickle.dumps(universe))
     monkeypatch.setattr(build_galaxies, "_universe", lambda facts, own: other)
     monkeypatch.setattr(dust_map, "chosen", lambda seed, own: dust)
-    facts = {"seed": SEED, "generation_cells": [CELL + 1, CELL, CELL - 8]}
+    facts = {"seed": SEED, "generation_cells": [CELL + 1, CELL, CELL - 1]}
     rows = build_galaxies.work(Path(), facts).rows
     first, last = np.searchsorted(rows["_healpix_29"].to_numpy(), sky.cell_range(ids.GENERATION_ORDER, CELL))
     assert 0 < first < last < rows.num_rows
@@ -268,7 +268,7 @@ def test_a_shallow_limit_needs_little_of_the_volume():
     assert np.sum(number[1][deep.line.z > 1.2]) > 0.3 * number[1].sum()
 
 
-@pytest.mark.parametrize("place", [(0.0, 90.0), (0.0, -90.0), (0.0, 0.0)])
+@pytest.mark.parametrize("place", [(0.0, 90.0), pytest.param((0.0, -90.0), marks=pytest.mark.nightly), (0.0, 0.0)])
 def test_poles_and_the_first_meridian(universe, dust, place):
     at = int(sky.cell_of([place[0]], [place[1]], ids.GENERATION_ORDER)[0])
     rows = galaxies.draw(at, universe, population.Cells(universe.population), dust)

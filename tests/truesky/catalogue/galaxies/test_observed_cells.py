@@ -108,10 +108,10 @@ def test_without_lensing_nothing_crosses_a_border(shallow, population, dust):
     assert crossing(found) == 0
 
 
-def test_light_that_is_bent_too_far_is_refused(shallow, dust, monkeypatch):
+def test_light_that_is_bent_too_far_is_refused(shallow, population, dust, monkeypatch):
     monkeypatch.setattr(observed_cells, "_MOST", np.radians(10.0 / 3600.0))
     with pytest.raises(BadInput, match="halos may deflect light by"):
-        observed_cells.draw([cell_at(PLACES[0])], shallow, Cells(shallow.population), dust)
+        observed_cells.draw([cell_at(PLACES[0])], shallow, population, dust)
 
 
 @given(st.floats(0, 360, exclude_max=True), st.floats(-90, 90), st.integers(0, 999), st.sampled_from([8, 5]))
