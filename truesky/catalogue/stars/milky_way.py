@@ -12,6 +12,7 @@ sources are in milky_way.toml.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -104,8 +105,9 @@ class Sample:
     age: Float
 
 
+@cache
 def milky_way(model: str = "juric") -> MilkyWay:
-    """The Milky Way of the embedded universe: numbers read, tables made (0.2 s)."""
+    """The Milky Way of the embedded universe: numbers read, tables made (0.2 s), once."""
     sampling = parameters.section(_FILE, "sampling")
     sun, components = _juric() if model == "juric" else _besancon()
     masses = MassFunction(**parameters.section(_FILE, "mass_function"))
