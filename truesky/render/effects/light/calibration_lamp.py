@@ -6,6 +6,8 @@ lamp, as bright in all bands.
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from lake_schema.arrays import Float
@@ -61,10 +63,15 @@ def seen_in(band: Passband, led: int, section: str, mission: MissionConfiguratio
     Error   : the LED's spectrum is taken as a Gaussian of its central wavelength and width
     Errors  : OutOfRange for a number that no LED has
     """
-    _, bands = LAMPS[section]
     width = _width(section, mission)
     detected = float(np.sum(photons(band, led, section, mission)) / (width * np.sqrt(2.0 * np.pi)))
-    return detected / max(float(passbands.load(name).response.max()) for name in bands)
+    return detected / _best(section)
+
+
+@cache
+def _best(section: str) -> float:
+    """The largest response of the embedded bands of a camera."""
+    return max(float(passbands.load(name).response.max()) for name in LAMPS[section][1])
 
 
 def photons(band: Passband, led: int, section: str, mission: MissionConfiguration) -> Float:
@@ -84,11 +91,13 @@ def _width(section: str, mission: MissionConfiguration) -> float:
     return float(10.0 * mission.value(f"{section}.flat.led_width", "nm") / _FWHM)
 
 
-def _parameters(scene: Scene) -> tuple[float, Frame, Frame]:
+def _level(scene: Scene) -> float:
     level = scene.value("flat.signal", "electron")
-    if scene.section in LAMPS:
-        level *= seen(scene, scene.lamp)
-    return level, *pattern(scene, scene.lamp, scene.nx, scene.ny)
+    return level * seen(scene, scene.lamp) if scene.section in LAMPS else level
 
 
-EFFECT = Effect("calibration_lamp", apply, _parameters, lambda scene: _parameters(scene)[0], cost=1e-2)
+def _parameters(scene: Scene) -> tuple[float, Frame, Frame]:
+    return _level(scene), *pattern(scene, scene.lamp, scene.nx, scene.ny)
+
+
+EFFECT = Effect("calibration_lamp", apply, _parameters, _level, cost=1e-2)
