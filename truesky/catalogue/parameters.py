@@ -28,5 +28,5 @@ def section(file: str, name: str) -> dict[str, Any]:
 
 @cache
 def _tables(text: str) -> dict[str, Any]:
-    """Of one text: a model reads dozens of tables, many of them of the same file."""
+    """The tables of a file's text: a model reads dozens of tables from a few files."""
     return user_files.toml_tables(text)

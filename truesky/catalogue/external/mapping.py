@@ -130,7 +130,7 @@ def formats() -> dict[str, dict[str, Any]]:
 
 @cache
 def _formats(text: str) -> dict[str, dict[str, Any]]:
-    """Of one text; nobody changes them."""
+    """The formats in the text of the file."""
     return user_files.toml_tables(text)
 
 
