@@ -92,7 +92,10 @@ def whole(folder):
     yield from quick()
     stellar = templates.stellar_library()
     yield "stellar_templates", stellar.flux
-    yield "star_table", build_tables.star_table(passbands.load("euclid_vis"), stellar, build_tables.library_key(stellar))
+    yield (
+        "star_table",
+        build_tables.star_table(passbands.load("euclid_vis"), stellar, build_tables.library_key(stellar)),
+    )
     root = layout.lake(folder / "lake")
     root.mkdir(parents=True)
     wanted = from_table(REQUEST)
