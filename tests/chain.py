@@ -1,10 +1,11 @@
-"""What the chain makes, in this process, as digests: python -m tests.chain quick|whole FOLDER prints them as JSON.
+"""What the chain makes, in this process, as digests: python -m tests.chain table|quick|whole FOLDER prints them as JSON.
 
+table  the table of galaxies' fluxes in one band
 quick  tables of galaxies' fluxes, of the PSF, of shapes; products and solutions as they occur
 whole  besides, those of stars; a small lake by the jobs' own plans: galaxies, stars, fluxes, two CCDs; every array in
        the cache
 
-With --keep the arrays themselves are written beside the digests, to be compared number by number.
+Only what is made is imported, since a process for a single table is mostly imports. With --keep the arrays themselves are written beside the digests, to be compared number by number.
 """
 
 import argparse
@@ -18,18 +19,12 @@ import pyarrow as pa
 from lake_schema import sky
 from lake_schema.fits.images import read_images
 from lake_schema.store import layout, publish, read
-from tests.truesky.render import fields
-from truesky.catalogue import build_galaxies, build_stars
-from truesky.fluxes import compute_fluxes, cosmology, integration, passbands
+from truesky.fluxes import cosmology, integration, passbands
 from truesky.fluxes.libraries import templates
 from truesky.fluxes.sources import galaxies_of
 from truesky.fluxes.tables import build_tables, settings
 from truesky.numerics import cache, sums
-from truesky.render import plan_exposures, render_exposures
-from truesky.render.psf import euclid
-from truesky.render.sources import galaxy_shapes, sersic
 from truesky.request.accuracy import DRAFT
-from truesky.request.from_toml import from_table
 
 BANDS = ("euclid_vis", "lsst_r")
 REQUEST = {
@@ -54,13 +49,23 @@ def random_galaxies(n):
     return galaxies_of(sample(n, 1), templates.galaxy_library())
 
 
-def quick():
-    """Arrays by name, of a few seconds."""
-    rng = np.random.default_rng(1)
+def table():
+    """The table of galaxies' fluxes, with the templates that it is made from."""
     library, vis = templates.galaxy_library(), passbands.load("euclid_vis")
     setting = min((choice.setting for choice in settings.choose(["euclid_vis"], DRAFT)), key=lambda s: s.size)
     yield "templates", library.flux
     yield "galaxy_table", build_tables.galaxy_table(vis, library, setting, build_tables.library_key(library))
+
+
+def quick():
+    """Arrays by name, of a few seconds."""
+    from tests.truesky.render import fields
+    from truesky.render.psf import euclid
+    from truesky.render.sources import galaxy_shapes, sersic
+
+    yield from table()
+    rng = np.random.default_rng(1)
+    library, vis = templates.galaxy_library(), passbands.load("euclid_vis")
     yield "line_table", build_tables.line_table(vis)[1]
     yield "integrated", integration.galaxies(random_galaxies(20), [vis], library)
     yield "distances", cosmology.comoving_separation(0.0, np.linspace(0.0, 6.0, 50))
@@ -79,11 +84,18 @@ def quick():
 
 def whole(folder):
     """Of the lake, column by column and image by image; then all that lies in the cache."""
+    from truesky.catalogue import build_galaxies, build_stars
+    from truesky.fluxes import compute_fluxes
+    from truesky.render import plan_exposures, render_exposures
+    from truesky.request.from_toml import from_table
+
     yield from quick()
     stellar = templates.stellar_library()
     yield "stellar_templates", stellar.flux
-    table = build_tables.star_table(passbands.load("euclid_vis"), stellar, build_tables.library_key(stellar))
-    yield "star_table", table
+    yield (
+        "star_table",
+        build_tables.star_table(passbands.load("euclid_vis"), stellar, build_tables.library_key(stellar)),
+    )
     root = layout.lake(folder / "lake")
     root.mkdir(parents=True)
     wanted = from_table(REQUEST)
@@ -115,12 +127,13 @@ def values_of(column):
 
 def main():
     parser = argparse.ArgumentParser()
-    parser.add_argument("what", choices=("quick", "whole"))
+    parser.add_argument("what", choices=("table", "quick", "whole"))
     parser.add_argument("folder", type=Path)
     parser.add_argument("--keep", action="store_true")
     options = parser.parse_args()
+    made = {"table": table, "quick": quick, "whole": lambda: whole(options.folder)}[options.what]()
     found = {}
-    for number, (name, values) in enumerate(quick() if options.what == "quick" else whole(options.folder)):
+    for number, (name, values) in enumerate(made):
         values = np.ascontiguousarray(values)
         found[name] = hashlib.sha256(values.tobytes()).hexdigest()
         if options.keep:

@@ -1,5 +1,7 @@
 """A disc that fails or stops at any of its calls: the last version stays whole, and the next run repairs everything."""
 
+import shutil
+
 import pytest
 
 from lake_schema.errors import LakeError, PartsFailed
@@ -24,22 +26,33 @@ def wanted(tmp_path_factory):
     return sums
 
 
-def calls(tmp_path_factory, kind):
+@pytest.fixture(scope="module")
+def older(tmp_path_factory):
+    """Kind -> a function that gives a new lake with an older version, which is made once."""
+    roots = {kind: tmp_path_factory.mktemp("older") for kind in promise.KINDS}
+    for kind, root in roots.items():
+        promise.make(root, kind, 1)
+
+    def copied(kind):
+        return shutil.copytree(roots[kind], tmp_path_factory.mktemp("lake"), symlinks=True, dirs_exist_ok=True)
+
+    return copied
+
+
+def calls(older, kind):
     """How often a run touches the disc where an older version is there."""
-    root = tmp_path_factory.mktemp("counted")
-    promise.make(root, kind, 1)
+    root = older(kind)
     with Disc(root) as disc:
         promise.make(root, kind, 2)
     return len(disc.calls)
 
 
 @pytest.mark.parametrize(("kind", "stride"), SHORT + LONG)
-def test_any_call_may_fail(kind, stride, wanted, tmp_path_factory):
+def test_any_call_may_fail(kind, stride, wanted, older):
     failed = published = 0
-    total = calls(tmp_path_factory, kind)
+    total = calls(older, kind)
     for n in range(total, 0, -stride):
-        root = tmp_path_factory.mktemp("lake")
-        promise.make(root, kind, 1)
+        root = older(kind)
         old, new = (promise.key(kind, seed) for seed in (1, 2))
         try:
             with Disc(root, fail_at=n):
@@ -57,12 +70,11 @@ def test_any_call_may_fail(kind, stride, wanted, tmp_path_factory):
 
 
 @pytest.mark.parametrize(("kind", "stride"), SHORT + LONG)
-def test_death_at_any_call(kind, stride, wanted, tmp_path_factory):
+def test_death_at_any_call(kind, stride, wanted, older):
     """From one call on nothing reaches the disc, not even what `finally` would do: kill -9 without a process."""
     seen = set()
-    for n in range(calls(tmp_path_factory, kind), 0, -stride):
-        root = tmp_path_factory.mktemp("lake")
-        promise.make(root, kind, 1)
+    for n in range(calls(older, kind), 0, -stride):
+        root = older(kind)
         old, new = (promise.key(kind, seed) for seed in (1, 2))
         with Disc(root, die_at=n), pytest.raises(Killed):
             promise.make(root, kind, 2)
@@ -75,16 +87,14 @@ def test_death_at_any_call(kind, stride, wanted, tmp_path_factory):
     assert seen == {old, new}
 
 
-def test_death_in_gc_leaves_no_half_version(tmp_path_factory):
-    root = tmp_path_factory.mktemp("counted")
-    for seed in (1, 2):
-        promise.make(root, "plain", seed)
+def test_death_in_gc_leaves_no_half_version(older):
+    root = older("plain")
+    promise.make(root, "plain", 2)
     with Disc(root) as disc:
         garbage.collect(root, "plain", delete=True)
     for n in range(1, len(disc.calls) + 1):
-        root = tmp_path_factory.mktemp("lake")
-        for seed in (1, 2):
-            promise.make(root, "plain", seed)
+        root = older("plain")
+        promise.make(root, "plain", 2)
         with Disc(root, die_at=n), pytest.raises(Killed):
             garbage.collect(root, "plain", delete=True)
         assert promise.current(root, "plain") == promise.key("plain", 2)
@@ -96,27 +106,28 @@ def test_death_in_gc_leaves_no_half_version(tmp_path_factory):
         assert [path.name for path in layout.table(root, "plain").glob("*v-*")] == [f"v-{promise.key('plain', 2)}"]
 
 
+@pytest.fixture(scope="module")
 def two_requests(tmp_path_factory):
-    """A lake in which a and b have a version each, and an older one is nobody's."""
-    root = tmp_path_factory.mktemp("lake")
+    """A function that gives a new lake in which a and b have a version each, and an older one is nobody's."""
+    root = tmp_path_factory.mktemp("two")
     for name, seed in (("a", 4), ("a", 1), ("b", 3)):
         promise.make(root, "plain", seed, name=name)
-    return root
+    return lambda: shutil.copytree(root, tmp_path_factory.mktemp("lake"), symlinks=True, dirs_exist_ok=True)
 
 
 def versions(root):
     return [promise.current(root, "plain", name) for name in "ab"]
 
 
-def test_death_between_any_two_steps_leaves_every_request_its_version(tmp_path_factory):
+def test_death_between_any_two_steps_leaves_every_request_its_version(two_requests):
     """The one that publishes has its old or its new version, whole, the other its own; then gc takes from neither."""
     first, other, new = (promise.key("plain", seed) for seed in (1, 3, 2))
-    root = two_requests(tmp_path_factory)
+    root = two_requests()
     with Disc(root) as disc:
         promise.make(root, "plain", 2, name="a")
     found = set()
     for n in range(len(disc.calls), 0, -2):
-        root = two_requests(tmp_path_factory)
+        root = two_requests()
         with Disc(root, die_at=n), pytest.raises(Killed):
             promise.make(root, "plain", 2, name="a")
         now = versions(root)
@@ -129,12 +140,12 @@ def test_death_between_any_two_steps_leaves_every_request_its_version(tmp_path_f
     assert found == {first, new}
 
 
-def test_death_in_gc_leaves_what_names_link_to(tmp_path_factory):
-    root = two_requests(tmp_path_factory)
+def test_death_in_gc_leaves_what_names_link_to(two_requests):
+    root = two_requests()
     with Disc(root) as disc:
         assert garbage.collect(root, delete=True) == [layout.version(root, "plain", promise.key("plain", 4))]
     for n in range(1, len(disc.calls) + 1):
-        root = two_requests(tmp_path_factory)
+        root = two_requests()
         with Disc(root, die_at=n), pytest.raises(Killed):
             garbage.collect(root, delete=True)
         assert versions(root) == [promise.key("plain", seed) for seed in (1, 3)]

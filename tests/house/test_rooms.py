@@ -28,6 +28,7 @@ from truesky.request.schema import Universe
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = sorted(path for package in ("lake_schema", "truesky") for path in (ROOT / package).rglob("*.py"))
+MODULES_BY_NAME = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in SOURCES}
 MODULES, LINES, FUNCTION, PARAMETERS = 16, 400, 60, 8
 
 
@@ -244,9 +245,8 @@ def imported(path):
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in ("lake_schema", "truesky"):
             for name in node.names:
-                inner = ROOT / (f"{node.module}.{name.name}".replace(".", "/") + ".py")
-                outer = ROOT / (node.module.replace(".", "/") + ".py")
-                yield from (file for file in (inner, outer) if file.exists())
+                both = f"{node.module}.{name.name}", node.module
+                yield from (MODULES_BY_NAME[module] for module in both if module in MODULES_BY_NAME)
 
 
 def test_no_modules_import_each_other_in_a_circle():

@@ -54,7 +54,8 @@ def test_numpy_s_absolute_tolerance_is_stated_where_it_is_not_zero():
     silent = [
         f"{path.relative_to(TESTS)}:{call.lineno}"
         for path in sorted(TESTS.rglob("*.py"))
-        for call in ast.walk(ast.parse(path.read_text()))
+        if "close" in (text := path.read_text())
+        for call in ast.walk(ast.parse(text))
         if isinstance(call, ast.Call)
         and isinstance(call.func, ast.Attribute)
         and call.func.attr in ("isclose", "allclose")

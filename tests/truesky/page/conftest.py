@@ -26,7 +26,7 @@ from lake_schema.tables.products import PRODUCTS
 from lake_schema.tables.rendered_truth import RENDERED_TRUTH
 from lake_schema.tables.stars import STARS
 from lake_schema.tables.tasks import TASKS
-from tests.truesky.page.browsing import tab_of
+from tests.truesky.page.browsing import at, tab_of
 from tests.universe import plain_plan, plain_work, rows_of
 from truesky.page.gate import Gate
 from truesky.page.opened import Lake
@@ -286,12 +286,17 @@ def browser():
     if chromium is None:
         pytest.skip("no chromium (Debian: apt install chromium)")
     with playwright.sync_playwright() as started:
-        running = started.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        # Without a GPU, a compositor that needs none takes half of the CPU time.
+        args = ["--no-sandbox", "--disable-gpu-compositing"]
+        running = started.chromium.launch(executable_path=chromium, args=args)
         yield running
         running.close()
 
 
 @pytest.fixture
-def tab(browser, page):
-    with tab_of(browser, page, permissions=["clipboard-read", "clipboard-write"]) as opened:
+def tab(browser, page, request):
+    """The page, at the VIEW of the module if it names one."""
+    view = getattr(request.module, "VIEW", None)
+    address = at(view) if view else "/"
+    with tab_of(browser, page, address, permissions=["clipboard-read", "clipboard-write"]) as opened:
         yield opened

@@ -1,6 +1,7 @@
 """The page in a browser: every view, the address, themes, keys; no error, and no request to another host."""
 
 import re
+import shutil
 import time
 from pathlib import Path
 
@@ -8,9 +9,17 @@ import pytest
 
 import truesky.page as page_package
 from lake_schema.store import publish
-from tests.truesky.page.browsing import VIEWS, canvas_colours, tab_of, until
-from tests.truesky.page.conftest import published, serving
+from tests.truesky.page.browsing import VIEWS, at, canvas_colours, tab_of, until
+from tests.truesky.page.conftest import serving
 from tests.universe import plain_plan, plain_work
+
+
+def until_colours(tab, selector, fewest, seconds=30.0):
+    """Wait until a picture of an element has more colours."""
+    end = time.monotonic() + seconds
+    while canvas_colours(tab, selector) <= fewest:
+        assert time.monotonic() < end, selector
+        time.sleep(0.1)
 
 
 def test_every_view_is_drawn(tab):
@@ -28,8 +37,7 @@ def test_every_view_is_drawn(tab):
             until(tab, "document.querySelectorAll('#sql-result td').length > 0")
         if view == "images":
             until(tab, "document.getElementById('image-one').childElementCount === 3")
-            time.sleep(1.0)
-            assert canvas_colours(tab, "#image-canvas") > 30
+            until_colours(tab, "#image-canvas", 30)
         if view == "runs":
             until(tab, "document.querySelectorAll('#runs-content h2').length > 2")
 
@@ -49,11 +57,9 @@ def test_the_first_sky_waits_for_no_other_question(tab):
     assert times["parts"] == min(times.values())
 
 
-def test_a_lake_that_is_published_anew_is_announced(browser, tmp_path):
-    root = tmp_path / "lake"
-    root.mkdir()
-    published(root)
-    with serving(root) as page, tab_of(browser, page) as tab:
+def test_a_lake_that_is_published_anew_is_announced(browser, shown, tmp_path):
+    root = shutil.copytree(shown, tmp_path / "lake", symlinks=True)
+    with serving(root) as page, tab_of(browser, page, at("sql")) as tab:
         assert tab.locator("#changed").is_hidden()
         old = page.server.lake.key
         publish.make(root, plain_plan(2), plain_work)
@@ -67,11 +73,9 @@ def test_a_lake_that_is_published_anew_is_announced(browser, tmp_path):
         assert page.server.lake.key in tab.inner_text("#version")
 
 
-def test_a_tab_is_told_of_what_another_has_opened(browser, tmp_path):
-    root = tmp_path / "lake"
-    root.mkdir()
-    published(root)
-    with serving(root) as page, tab_of(browser, page) as tab, tab_of(browser, page) as other:
+def test_a_tab_is_told_of_what_another_has_opened(browser, shown, tmp_path):
+    root = shutil.copytree(shown, tmp_path / "lake", symlinks=True)
+    with serving(root) as page, tab_of(browser, page, at("sql")) as tab, tab_of(browser, page, at("sql")) as other:
         old = page.server.lake.key
         publish.make(root, plain_plan(2), plain_work)
         tab.reload()
@@ -86,8 +90,7 @@ def test_a_tab_is_told_of_what_another_has_opened(browser, tmp_path):
 
 
 def test_the_address_holds_the_view(browser, page):
-    with tab_of(browser, page) as tab:
-        tab.keyboard.press("4")
+    with tab_of(browser, page, at("images")) as tab:
         until(tab, "document.getElementById('image-one').childElementCount === 3")
         tab.select_option("#image-one", "1")
         tab.select_option("#image-map", "magma")
@@ -120,24 +123,28 @@ CONTRAST = """() => {
 }"""
 
 
-@pytest.mark.parametrize("theme", ["dark", "light"])
-def test_contrast(tab, theme):
+@pytest.fixture(scope="module")
+def any_view(browser, page):
+    """A tab for tests that leave nothing but another view and another theme."""
+    with tab_of(browser, page, at("sql")) as opened:
+        yield opened
+
+
+def in_theme(tab, theme):
     if tab.evaluate("document.documentElement.dataset.theme") != theme:
         tab.click("#theme")
+    return tab
+
+
+@pytest.mark.parametrize("theme", ["dark", "light"])
+def test_contrast(any_view, theme):
+    tab = in_theme(any_view, theme)
     assert [found for found in tab.evaluate(CONTRAST) if found[2] < 4.5] == []
 
 
 NAMELESS = """() => [...document.querySelectorAll('button, input, select, textarea, canvas:not([aria-hidden])')]
   .filter((one) => one.checkVisibility() && !(one.labels?.length || one.textContent.trim() || one.title
     || one.getAttribute('aria-label') || one.closest('label'))).map((one) => one.outerHTML)"""
-
-
-def test_every_control_has_a_name(tab):
-    for number, view in enumerate(VIEWS, start=1):
-        tab.keyboard.press(str(number))
-        until(tab, f"!document.getElementById('{view}').hidden")
-        time.sleep(0.5)
-        assert tab.evaluate(NAMELESS) == []
 
 
 # Text of each visible element against what lies behind it; a picture behind text has its own ground.
@@ -163,13 +170,13 @@ SEEN = """() => {
 
 
 @pytest.mark.parametrize("theme", ["dark", "light"])
-def test_text_can_be_read_where_it_stands(tab, theme):
-    if tab.evaluate("document.documentElement.dataset.theme") != theme:
-        tab.click("#theme")
+def test_every_control_has_a_name_and_text_can_be_read_where_it_stands(any_view, theme):
+    tab = in_theme(any_view, theme)
     for number, view in enumerate(VIEWS, start=1):
         tab.keyboard.press(str(number))
         until(tab, f"!document.getElementById('{view}').hidden")
-        time.sleep(0.4)
+        time.sleep(0.5)
+        assert tab.evaluate(NAMELESS) == []
         assert tab.evaluate(SEEN) == []
 
 

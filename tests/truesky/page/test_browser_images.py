@@ -6,17 +6,18 @@ import numpy as np
 import pytest
 
 from tests.truesky.page import test_traces
-from tests.truesky.page.browsing import HELD, canvas_colours, tab_of, until
+from tests.truesky.page.browsing import HELD, at, canvas_colours, tab_of, until
 from tests.truesky.page.conftest import serving
 from truesky.page import pictures
+
+VIEW = "images"
 
 
 def test_a_source_through_the_grism(browser, tmp_path):
     root = tmp_path / "lake"
     root.mkdir()
     own, wavelength = test_traces.published(root)
-    with serving(root) as page, tab_of(browser, page) as tab:
-        tab.keyboard.press("4")
+    with serving(root) as page, tab_of(browser, page, at(VIEW)) as tab:
         until(tab, "document.getElementById('image-one').childElementCount === 1")
         time.sleep(1.0)
         without = canvas_colours(tab, "#image-marks")
@@ -45,7 +46,6 @@ def test_a_source_through_the_grism(browser, tmp_path):
 
 def peaks(tab, page, number, most):
     """How many of the brightest stars that stand alone have the largest value of 3 x 3 pixels under the cursor."""
-    tab.keyboard.press("4")
     until(tab, "document.getElementById('image-one').childElementCount === 3")
     tab.select_option("#image-one", str(number))
     time.sleep(1.5)
@@ -79,7 +79,6 @@ def test_the_truth_of_all_is_where_pixels_peak_on_the_screen(tab, page):
 
 
 def test_an_image_its_places_and_a_pinned_source(tab, page):
-    tab.keyboard.press("4")
     until(tab, "document.getElementById('image-one').childElementCount === 3")
     tab.check("#image-truth")
     time.sleep(1.0)
@@ -106,7 +105,6 @@ def test_an_image_its_places_and_a_pinned_source(tab, page):
 
 def opened(tab):
     """Images are shown; the zoom at which all of the first is seen."""
-    tab.keyboard.press("4")
     until(tab, f"document.getElementById('image-one').childElementCount === 3 && {HELD}.images?.zoom > 0")
     box = tab.locator("#image-canvas").bounding_box()
     return box, 0.98 * min(box["width"] / 700, box["height"] / 600)

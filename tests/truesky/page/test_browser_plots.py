@@ -5,15 +5,15 @@ import time
 import numpy as np
 
 from lake_schema.store import read
-from tests.truesky.page.browsing import drag, plain, tab_of, until
+from tests.truesky.page.browsing import at, drag, plain, tab_of, until
 from tests.truesky.page.conftest import GALAXIES_N
 from truesky.page import charts
 
+VIEW = "plots"
 RANGES = "[...document.querySelectorAll('#plot-grid .range')].map((one) => one.textContent)"
 
 
 def test_brushes_filter_the_other_charts(tab, shown):
-    tab.keyboard.press("2")
     ranges = RANGES
     until(tab, f"{ranges}.every((text) => text.includes('rows'))")
     whole = tab.evaluate(ranges)
@@ -37,7 +37,6 @@ def test_brushes_filter_the_other_charts(tab, shown):
 
 
 def test_a_held_brush_asks_nothing(tab):
-    tab.keyboard.press("2")
     until(tab, "document.getElementById('plot-state').textContent.includes('rows')")
     asked, answered = [], []
     tab.on("request", lambda request: asked.append(request.url))
@@ -61,8 +60,7 @@ def test_a_held_brush_asks_nothing(tab):
 
 def test_of_many_rows_every_brush_counts_a_sample_first(browser, page, monkeypatch):
     monkeypatch.setattr(charts, "ROWS_A_CORE", 10)
-    with tab_of(browser, page) as tab:
-        tab.keyboard.press("2")
+    with tab_of(browser, page, at(VIEW)) as tab:
         asked = []
         tab.on("request", lambda one: asked.append(one.post_data_json["part"]) if "charts" in one.url else None)
         state = "document.getElementById('plot-state').textContent"
@@ -77,7 +75,6 @@ def test_of_many_rows_every_brush_counts_a_sample_first(browser, page, monkeypat
 
 
 def test_a_map_as_points(tab, shown):
-    tab.keyboard.press("2")
     ranges = "[...document.querySelectorAll('#plot-grid figure.map .range')].map((one) => one.textContent)"
     until(tab, f"{ranges}[0].includes('a bin')")
     before = tab.locator("#plot-grid figure.map canvas").first.screenshot()
@@ -109,7 +106,6 @@ def test_charts_are_tables_too(tab):
 
 
 def test_a_table_that_is_open_follows_its_chart(tab):
-    tab.keyboard.press("2")
     until(tab, f"{RANGES}.every((text) => text.includes('rows'))")
     figure = tab.locator("#plot-grid figure").nth(1)
     figure.locator("button", has_text="Table").click()
@@ -122,7 +118,6 @@ def test_a_table_that_is_open_follows_its_chart(tab):
 
 
 def test_what_no_bin_holds_is_said_of_every_axis(tab, shown):
-    tab.keyboard.press("2")
     galaxies = read.version(shown, "galaxies").rows(["z_obs", "mag_r01"])
     z = galaxies["z_obs"].to_numpy()
     bound = float(np.median(z))
@@ -140,7 +135,6 @@ def test_what_no_bin_holds_is_said_of_every_axis(tab, shown):
 
 
 def test_readers_are_told_once_when_keys_have_moved_a_brush(tab):
-    tab.keyboard.press("2")
     until(tab, f"{RANGES}.every((text) => text.includes('rows'))")
     assert tab.locator("#plots [aria-live], #plots [role=status]").count() == 0
     tab.locator("#plot-grid canvas").first.focus()

@@ -6,7 +6,7 @@ import tomllib
 import numpy as np
 import pytest
 
-from tests.truesky.page.browsing import HELD, copied, plain, tab_of, until
+from tests.truesky.page.browsing import HELD, at, copied, plain, tab_of, until
 from tests.truesky.page.conftest import CENTRE, PIXEL, system
 from truesky.page import sky_maps
 from truesky.render.camera import astrometry
@@ -136,11 +136,13 @@ def test_a_request_for_what_is_shown(browser, sky):
 PLACES = """([ra, dec]) => import('/static/api.js').then((api) => ra.map((one, k) => api.place(one, dec[k])))"""
 
 
-def test_places_have_the_digits_of_a_hundredth_of_an_arcsecond(tab):
+def test_places_have_the_digits_of_a_hundredth_of_an_arcsecond(browser, page):
     rng = np.random.default_rng(2)
     ra, dec = rng.uniform(0.0, 360.0, 500), rng.uniform(-90.0, 90.0, 500)
     ra[:4], dec[:4] = [359.99999999, 0.0, 359.9999, 15.0 - 1e-9], [-1e-9, 89.9999999, -0.5, 30.0 - 1e-9]
-    for lon, lat, text in zip(ra, dec, tab.evaluate(PLACES, [ra.tolist(), dec.tolist()]), strict=True):
+    with tab_of(browser, page, at("sql")) as tab:
+        texts = tab.evaluate(PLACES, [ra.tolist(), dec.tolist()])
+    for lon, lat, text in zip(ra, dec, texts, strict=True):
         hours, angles, degrees, declination, _ = text.replace("\N{MINUS SIGN}", "-").split()
         h, m, s = (float(part) for part in hours.split(":"))
         d, n, t = (float(part) for part in angles.lstrip("+-").split(":"))

@@ -1,10 +1,11 @@
 """Queries in a browser: what they answer, to the last digit, and what is refused."""
 
-from tests.truesky.page.browsing import tab_of, until
+from tests.truesky.page.browsing import at, tab_of, until
+
+VIEW = "sql"
 
 
 def test_numbers_keep_their_digits(tab):
-    tab.keyboard.press("3")
     whole = [999999999999, 1000000000001, 4503599627370497, 9007199254740991, 9007199254740993, -1234567890123]
     query = f"SELECT unnest({whole}) AS id, 150.1234567891::DOUBLE AS ra, 0.1::FLOAT AS x"
     tab.fill("#sql-text", query)
@@ -20,8 +21,7 @@ def test_numbers_keep_their_digits(tab):
 
 
 def test_a_query_and_its_refusal(browser, page):
-    with tab_of(browser, page) as tab:
-        tab.keyboard.press("3")
+    with tab_of(browser, page, at(VIEW)) as tab:
         tab.fill("#sql-text", "SELECT id, ra, '<b>x</b>' AS text FROM galaxies ORDER BY id LIMIT 3")
         tab.press("#sql-text", "Control+Enter")
         until(tab, "document.getElementById('sql-state').textContent.startsWith('3 rows')")
@@ -37,7 +37,6 @@ def test_a_query_and_its_refusal(browser, page):
 
 
 def test_names_have_their_ucds_beside_them(tab):
-    tab.keyboard.press("3")
     until(tab, "document.querySelectorAll('#sql-result td').length > 0")
     assert "pos.eq.ra" in tab.inner_text("#sql-result thead")
     tab.locator("#sql-schema summary", has_text="galaxies").click()
@@ -45,8 +44,7 @@ def test_names_have_their_ucds_beside_them(tab):
 
 
 def test_a_download_that_is_refused_says_why(browser, page):
-    with tab_of(browser, page, refused="/export?", accept_downloads=True) as tab:
-        tab.keyboard.press("3")
+    with tab_of(browser, page, at(VIEW), refused="/export?", accept_downloads=True) as tab:
         until(tab, "document.querySelectorAll('#sql-result td').length > 0")
         came = []
         tab.on("download", lambda download: came.append(download))
@@ -65,8 +63,7 @@ def test_a_download_that_is_refused_says_why(browser, page):
 
 
 def test_a_large_download_goes_past_the_page(browser, page):
-    with tab_of(browser, page, accept_downloads=True) as tab:
-        tab.keyboard.press("3")
+    with tab_of(browser, page, at(VIEW), accept_downloads=True) as tab:
         until(tab, "document.querySelectorAll('#sql-result td').length > 0")
         tab.fill("#sql-text", "SELECT repeat('0123456789', 100) AS x FROM range(40000)")
         with tab.expect_download() as begun:
@@ -76,7 +73,6 @@ def test_a_large_download_goes_past_the_page(browser, page):
 
 
 def test_of_overlapping_queries_the_last_is_shown(tab):
-    tab.keyboard.press("3")
     until(tab, "document.querySelectorAll('#sql-result td').length > 0")
     tab.fill("#sql-text", "SELECT sum(a.range * b.range) AS slow FROM range(40000) a, range(10000) b")
     tab.click("#sql-run")

@@ -5,6 +5,7 @@ import http.client
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import threading
@@ -18,7 +19,7 @@ import pytest
 from lake_schema.store import layout, publish
 from lake_schema.store.plan import Output, Part, Plan
 from lake_schema.tables.stars import STARS
-from tests.truesky.page.conftest import GALAXIES_N, asked, published, serving, star_rows
+from tests.truesky.page.conftest import GALAXIES_N, asked, serving, star_rows
 from tests.universe import plain_plan, plain_work
 from truesky.explore.process import Process
 from truesky.page.opened import Closed, Lane
@@ -105,10 +106,8 @@ def test_who_goes_away_stops_the_query(page):
     assert page.json("sql", method="POST", body=b'{"sql": "SELECT 1 AS a"}')["rows"] == [[1]]
 
 
-def test_a_lake_that_is_published_anew_is_announced(tmp_path):
-    root = tmp_path / "lake"
-    root.mkdir()
-    published(root)
+def test_a_lake_that_is_published_anew_is_announced(shown, tmp_path):
+    root = shutil.copytree(shown, tmp_path / "lake", symlinks=True)
     with serving(root) as page:
         old = page.server.lake.key
         assert json.loads(page.ask("/api/lake")[2])["is_changed"] is False
