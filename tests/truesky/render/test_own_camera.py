@@ -148,11 +148,11 @@ def test_another_content_of_the_folder_is_another_plan(lake, tmp_path):
 @pytest.mark.parametrize(
     ("tables", "words"),
     [
-        ({"layout": LAYOUT.replace("-2.5", "1.0")}, r"mission\.cameras\[0\]: .*detectors left and right overlap"),
+        ({"layout": LAYOUT.replace("-2.5", "1.0")}, r"mission\.cameras\[0\]: .*layout\.csv line 3: detectors left and"),
         ({"amplifiers": AMPLIFIERS.replace("1.7", "0")}, r"mission\.cameras\[0\]: .*amplifiers\.csv line 2: gain = 0"),
         ({"bands": BANDS.replace("fringes", "fringe")}, r"mission\.cameras\[0\]: .*unknown column 'fringe'"),
         ({"bands": BANDS.replace("narrow.dat", "x.dat")}, r"mission\.cameras\[0\]: .*bands\.csv line 2: .*no such"),
-        ({"bands": BANDS.replace("25.3", "99")}, r"mission: mission parameter ext\.mini\.narrow\.zero_point"),
+        ({"bands": BANDS.replace("25.3", "99")}, r"mission\.cameras\[0\]: .*bands\.csv line 2: .*narrow\.zero_point"),
     ],
 )  # fmt: skip
 def test_a_folder_with_a_mistake_is_refused_before_anything_is_written(tmp_path, tables, words):
@@ -167,9 +167,12 @@ def test_a_folder_with_a_mistake_is_refused_before_anything_is_written(tmp_path,
         ('cameras = ["mini"]', 'cameras = ["mini", "mini/"]', r"mission\.cameras\[1\]: there are two cameras of the n"),
         ('cameras = ["mini"]', 'cameras = ["none"]', r"mission\.cameras\[0\]: .*none: no such folder"),
         ('cameras = ["mini"]', "cameras = 3", r"mission\.cameras"),
+        ('cameras = ["mini"]', f'cameras = ["{"x" * 300}"]', r"mission\.cameras\[0\]: .*: File name too long$"),
+        ('cameras = ["mini"]', 'cameras = ["loop"]', r"mission\.cameras\[0\]: .*loop: no such folder"),
     ],
 )
 def test_a_request_that_names_no_folder_is_refused(tmp_path, old, new, words):
+    (tmp_path / "loop").symlink_to("loop")
     with pytest.raises(BadInput, match=words):
         parse(written(tmp_path, REQUEST.replace(old, new)))
 
