@@ -1,5 +1,7 @@
 """A ground camera from a user's folder is planned and rendered like those of the mission database."""
 
+import shutil
+
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -203,6 +205,37 @@ def test_a_band_without_a_curve_is_one_of_ours(lake, tmp_path):
     )
     with pytest.raises(BadInput, match="band odd: truesky has no passband of this name, and no curve is given for it"):
         plan_exposures.steps(lake, parse(unknown))
+
+
+@pytest.mark.parametrize(
+    ("band", "curve", "words"),
+    [
+        ("des_r", None, "truesky has a passband des_r: choose another name for this curve"),
+        ("narrow", "# nothing\n\n", r".*narrow\.dat: has no rows"),
+        ("narrow", "6000 0\n6100 -1\n", r".*narrow\.dat: row 2 is negative"),
+        ("narrow", "6000 0\n6100 50\n6200 50\n", r"responds with 50: a pointing wants the fraction"),
+    ],
+)
+def test_a_curve_with_a_mistake_is_named_with_its_table(lake, tmp_path, band, curve, words):
+    path = written(tmp_path, REQUEST.replace("narrow", band), bands=BANDS.replace("narrow,", f"{band},"))
+    if curve is not None:
+        (tmp_path / "mini" / "narrow.dat").write_text(curve)
+    with pytest.raises(BadInput, match=rf"^mission\.cameras\[0\]: .*mini/bands\.csv line 2: {words}"):
+        plan_exposures.steps(lake, parse(path))
+
+
+def test_two_curves_of_one_name_are_refused_with_both_places(tmp_path):
+    request = written(tmp_path, REQUEST.replace('["mini"]', '["mini", "maxi"]'))
+    shutil.copytree(tmp_path / "mini", tmp_path / "maxi")
+    words = (
+        r"mission\.cameras\[1\]: .*maxi/bands\.csv line 2: band narrow has another curve in "
+        r"mission\.cameras\[0\]: .*mini/bands\.csv line 2: all curves of a request have different names$"
+    )
+    with pytest.raises(BadInput, match=words):
+        parse(request)
+    passband = '[fluxes.passbands.narrow]\nfile = "mini/narrow.dat"\nformat = "passband_ascii"\nmedium = "air"\n'
+    with pytest.raises(BadInput, match=r"mission\.cameras\[0\]: .* has another curve in fluxes\.passbands\.narrow"):
+        parse(written(tmp_path, REQUEST + passband))
 
 
 def test_a_table_of_pointings_may_use_the_camera(lake, tmp_path):
