@@ -7,6 +7,7 @@ toml        its tables
 target      where a result may be written;  folder : where several may
 staged      a file that takes its place in one rename
 expanded    a path as it was typed
+reachable   refuses a path that the system does not take
 shown       a path as messages name it
 
 Only a regular file is opened: a pipe would never answer, a device never end. Every kind has a largest size.
@@ -139,27 +140,28 @@ _KINDS = (
 
 
 def text(path: Path, kind: str) -> str:
-    """The text of a file, UTF-8."""
+    """The text of a file, UTF-8, without the byte order mark that Excel and Notepad write."""
     with opened(path, kind) as stream:
         # No more than was there when it was looked at: a file can grow.
         data = stream.read(LARGEST[kind] + 1)
     if len(data) > LARGEST[kind]:
         raise BadInput(f"{shown(path)}: is larger than {LARGEST[kind]} bytes, the most of a {kind}")
     try:
-        return data.decode("utf-8")
+        return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise BadInput(f"{shown(path)}: {error}") from None
 
 
 @contextmanager
-def _reachable(path: Path) -> Iterator[None]:
-    """Refuses a path that the system does not take; one that is not there yet is well."""
+def reachable(path: Path) -> Iterator[None]:
+    """Refuse a path that the system does not take; a path that is not there yet is accepted."""
     try:
         yield
         os.lstat(path)
     except FileNotFoundError:
         pass
-    except (OSError, ValueError) as error:
+    except (OSError, RuntimeError, ValueError) as error:
+        # Python below 3.13 reports a loop of links as a RuntimeError.
         raise BadInput(f"{shown(path)}: {getattr(error, 'strerror', None) or error}") from None
 
 
@@ -167,7 +169,7 @@ def target(path: Path, endings: Sequence[str] = ()) -> Path:
     """A path at which a file can be written: of one of the endings, in a folder that is there."""
     if endings and path.suffix.lower() not in endings:
         raise BadInput(f"{shown(path)}: the ending is not one of {', '.join(endings)}")
-    with _reachable(path):
+    with reachable(path):
         if not path.parent.is_dir():
             raise BadInput(f"{shown(path)}: its folder is not there")
         if os.path.lexists(path) and not path.is_file():
@@ -178,7 +180,7 @@ def target(path: Path, endings: Sequence[str] = ()) -> Path:
 
 def folder(path: Path) -> Path:
     """A path at which a folder is, or can be made."""
-    with _reachable(path):
+    with reachable(path):
         if os.path.lexists(path) and not path.is_dir():
             raise BadInput(f"{shown(path)}: is there, and is no folder")
         there = next(one for one in (path, *path.absolute().parents) if os.path.lexists(one))

@@ -7,14 +7,15 @@
     my_camera/wavefront.csv     noll, x_power, y_power, coefficient_nm     optional, aberrations of the telescope
 
 The folder's name is the camera's name. Gain, read noise and full well stand in amplifiers.csv alone. Blank values of
-bands.csv: without a curve the band is the passband of truesky of this name, and without fringes it has none. Lines that
-begin with ``#`` are comments. ``python -m lake_schema mission camera
-FOLDER --like decam`` writes such a folder with the values of a known camera, to be edited.
+bands.csv: without a curve the band is the passband of truesky of this name, and without fringes it has none. Columns
+may have any order, and lines that begin with ``#`` are comments. ``python -m lake_schema mission camera FOLDER --like
+decam`` writes such a folder with the values of a known camera, to be edited.
 """
 
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -22,11 +23,10 @@ from pathlib import Path
 
 from lake_schema import user_files
 from lake_schema.errors import BadInput
-from lake_schema.mission import camera_tables
+from lake_schema.mission import bounds, camera_tables
 from lake_schema.mission.camera_tables import (
     AMPLIFIERS,
     BANDS,
-    KIND,
     LAYOUT,
     NAME,
     OF_AMPLIFIERS,
@@ -34,11 +34,13 @@ from lake_schema.mission.camera_tables import (
     OPTIONAL_OF_BAND,
     PARAMETERS,
     WAVEFRONT,
+    Row,
 )
 from lake_schema.mission.model import Model, read_models
 from lake_schema.mission.parameter import CAMERAS, SPACE_CAMERAS, Parameter, convert, read_all
 
 _STATUS = "SIM"
+_MODELS = {"layout": LAYOUT, "amplifiers": AMPLIFIERS, "psf.wavefront": WAVEFRONT}
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,11 +55,14 @@ class Curve:
         File of the response, the fraction of photons that are detected.
     medium : str
         Medium in which its wavelengths are measured, "air" or "vacuum".
+    place : str
+        File and line that name it, for messages.
     """
 
     band: str
     file: Path
     medium: str
+    place: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +78,7 @@ class Camera:
     models : tuple of Model
         Layout, amplifiers and wavefront.
     contents : tuple of (str, bytes)
-        Contents of the models' files, by their sha256.
+        Contents of the models' files, by their sha256: the checked tables without comments, columns in their order.
     curves : tuple of Curve
         Responses of bands that truesky does not have.
     """
@@ -104,96 +109,118 @@ def read(folder: Path) -> Camera:
     Returns
     -------
     Camera
-        The camera. Whether its detectors and amplifiers fit together is checked with the whole mission configuration
+        The camera. A request's overrides can still make its detectors overlap
         (`lake_schema.mission.checks.camera_faults`).
 
     Raises
     ------
     BadInput
-        If a file or a parameter is missing, or a column, name, unit or number is wrong. The message names the file
-        and the line.
+        If a file or a parameter is missing, a column, name, unit or number is wrong, or detectors or amplifiers
+        overlap. The message names the file and the line.
     """
     name = _name(folder)
     prefix = f"ext.{name}."
-    parameters = [
-        Parameter(prefix + key, _STATUS, value, unit, confidence="assumed", source=source)
-        for key, value, unit, source in _numbers(folder)
-    ]
-    of_bands, curves = _bands(folder, prefix)
-    camera_tables.check_layout(folder)
-    files = {"layout": LAYOUT, "amplifiers": AMPLIFIERS}
+    parameters = _parameters(folder, prefix)
+    of_bands, curves = _bands(folder, name)
+    pixel = next(p for p in parameters if p.key == f"{prefix}fpa.pixel_size")
+    layout = camera_tables.checked_layout(folder, convert(pixel.value, pixel.unit, "mm / pix", pixel.key))
+    tables = {LAYOUT: layout, AMPLIFIERS: camera_tables.checked_amplifiers(folder, layout)}
     # The other amplifiers differ from the first one by the ratios of their values in the table.
-    first, source = camera_tables.checked_amplifiers(folder)[0], f"{name}/{AMPLIFIERS}"
+    first = tables[AMPLIFIERS][0]
     parameters += [
-        Parameter(prefix + key, _STATUS, first.number(key), unit, source=source) for key, unit in OF_AMPLIFIERS.items()
+        _parameter(first.place, prefix + key, first.number(key), unit, f"{name}/{AMPLIFIERS}")
+        for key, unit in OF_AMPLIFIERS.items()
     ]
-    if (folder / WAVEFRONT).exists():
-        camera_tables.check_wavefront(folder)
-        files["psf.wavefront"] = WAVEFRONT
+    # A link that leads nowhere is a mistake: it is no choice of the default wavefront.
+    if os.path.lexists(folder / WAVEFRONT):
+        tables[WAVEFRONT] = camera_tables.checked_wavefront(folder)
     models, contents = [], []
-    for key, file in files.items():
-        data = user_files.text(folder / file, KIND).encode()
-        sha256 = hashlib.sha256(data).hexdigest()
-        models.append(Model(prefix + key, _STATUS, f"{name}_{file}", sha256, source=f"{name}/{file}"))
-        contents.append((sha256, data))
-    if "psf.wavefront" not in files:
+    for key, file in _MODELS.items():
+        if file in tables:
+            data = camera_tables.csv_text(tables[file]).encode()
+            sha256 = hashlib.sha256(data).hexdigest()
+            models.append(Model(prefix + key, _STATUS, f"{name}_{file}", sha256, source=f"{name}/{file}"))
+            contents.append((sha256, data))
+    if WAVEFRONT not in tables:
         ours = next(m for m in read_models() if m.file == "ground_wavefront.csv")
         models.append(Model(f"{prefix}psf.wavefront", _STATUS, ours.file, ours.sha256, source=ours.source))
     return Camera(name, (*parameters, *of_bands), tuple(models), tuple(contents), tuple(curves))
 
 
 def _name(folder: Path) -> str:
-    if not folder.is_dir():
-        raise BadInput(f"{user_files.shown(folder)}: no such folder")
+    with user_files.reachable(folder):
+        if not folder.is_dir():
+            raise BadInput(f"{user_files.shown(folder)}: no such folder")
     return checked_name(folder)
 
 
 def checked_name(folder: Path) -> str:
     """Name of the camera of a folder; BadInput if no camera may have it."""
-    name = folder.resolve().name
+    with user_files.reachable(folder):
+        name = folder.resolve().name
     if NAME.fullmatch(name) is None:
-        raise BadInput(f"{user_files.shown(folder)}: a camera has the name of its folder: letters a-z, digits and _")
+        what = "a camera has the name of its folder: at most 40 letters a-z, digits and _"
+        raise BadInput(f"{user_files.shown(folder)}: {what}")
     if name in (*CAMERAS, *SPACE_CAMERAS):
         raise BadInput(f"{user_files.shown(folder)}: truesky has a camera {name}: choose another name")
     return name
 
 
-def _numbers(folder: Path) -> list[tuple[str, float, str, str]]:
-    """Name, value, unit and source of each parameter."""
+def _parameter(place: str, key: str, value: float, unit: str, source: str) -> Parameter:
+    """Make a parameter; BadInput names its place, file and line, if it is outside its bounds."""
+    try:
+        parameter = Parameter(key, _STATUS, value, unit, source=source)
+        bounds.check(parameter, key)
+    except BadInput as error:
+        raise BadInput(f"{place}: {error}") from None
+    return parameter
+
+
+def _parameters(folder: Path, prefix: str) -> list[Parameter]:
+    """Read parameters.csv."""
     rows, known = camera_tables.read_rows(folder, PARAMETERS), parameter_units()
     camera_tables.refuse_repeated(rows, lambda row: row.text("name"))
     found = []
     for row in rows:
-        name, unit = row.text("name"), row.values["unit"].strip()
+        name, unit = row.text("name"), row.values["unit"]
         if name not in known:
             raise BadInput(f"{row.place}: a ground camera has no parameter {name!r}")
         convert(1.0, unit, known[name], f"{row.place}: {name}")
-        found.append((name, row.number("value"), unit, row.text("source")))
-    there = {name for name, *_ in found}
+        found.append(_parameter(row.place, prefix + name, row.number("value"), unit, row.text("source")))
+    there = {row.text("name") for row in rows}
     if missing := [name for name in required_parameters() if name not in there]:
         raise BadInput(f"{user_files.shown(folder / PARAMETERS)}: parameter {missing[0]} is missing")
     return found
 
 
-def _bands(folder: Path, prefix: str) -> tuple[list[Parameter], list[Curve]]:
+def _bands(folder: Path, name: str) -> tuple[list[Parameter], list[Curve]]:
     rows = camera_tables.read_rows(folder, BANDS)
     camera_tables.refuse_repeated(rows, lambda row: row.text("band"))
+    reserved = {key.partition(".")[0] for key in (*parameter_units(), *OF_AMPLIFIERS, *_MODELS)}
     parameters, curves = [], []
     for row in rows:
         band = row.text("band")
         if NAME.fullmatch(band) is None:
             raise BadInput(f"{row.place}: band = {band!r}: a name has letters a-z, digits and _")
-        units = OF_BAND | {key: unit for key, unit in OPTIONAL_OF_BAND.items() if row.values[key].strip()}
+        if band in reserved:
+            raise BadInput(f"{row.place}: band = {band!r} is the name of a parameter or table: choose another name")
+        units = OF_BAND | {key: unit for key, unit in OPTIONAL_OF_BAND.items() if row.values[key]}
         parameters += [
-            Parameter(f"{prefix}{band}.{key}", _STATUS, row.number(key), unit, source=f"{folder.name}/{BANDS}")
+            _parameter(row.place, f"ext.{name}.{band}.{key}", row.number(key), unit, f"{name}/{BANDS}")
             for key, unit in units.items()
         ]
-        if row.values["curve"].strip():
-            if row.text("medium") not in ("air", "vacuum"):
-                raise BadInput(f"{row.place}: medium = {row.text('medium')!r} is not air or vacuum")
-            file = user_files.checked(folder / row.text("curve"), "curve", row.place)
-            curves.append(Curve(band, file, row.text("medium")))
+        if row.values["curve"]:
+            curves.append(_curve(folder, row))
     return parameters, curves
+
+
+def _curve(folder: Path, row: Row) -> Curve:
+    file, medium = row.text("curve"), row.text("medium")
+    if medium not in ("air", "vacuum"):
+        raise BadInput(f"{row.place}: medium = {medium!r} is not air or vacuum")
+    if Path(file).is_absolute() or ".." in Path(file).parts:
+        raise BadInput(f"{row.place}: curve = {file!r} is outside the camera's folder: give a file in it")
+    return Curve(row.text("band"), user_files.checked(folder / file, "curve", row.place), medium, row.place)
 
 
 # -------------------------------------------------------------------------------------------------- known parameters

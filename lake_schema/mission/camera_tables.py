@@ -6,9 +6,11 @@ import csv
 import io
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
 
 from lake_schema import user_files
 from lake_schema.errors import BadInput
@@ -20,6 +22,8 @@ KIND = "table of a camera"
 NAME = re.compile(r"[a-z][a-z0-9_]{0,39}", re.ASCII)
 _DETECTOR = re.compile(r"\w[\w-]{0,39}", re.ASCII)
 _MOST_PIXELS = 65_536
+# Prescan and overscan of real amplifiers have up to about 100 columns or rows.
+_MOST_SCAN = 512
 # Parameters of a band, with the columns of bands.csv and their units; those of the second list may be blank.
 OF_BAND = {
     "zero_point": "mag",
@@ -40,7 +44,22 @@ COLUMNS = {
     BANDS: ("band", "curve", "medium", *OF_BAND, *OPTIONAL_OF_BAND),
     WAVEFRONT: ("noll", "x_power", "y_power", "coefficient_nm"),
 }  # fmt: skip
-_LONGEST_TEXT = 1000
+# Lowest and highest value of each column of whole numbers.
+_WHOLE = {
+    "nx": (1, _MOST_PIXELS),
+    "ny": (1, _MOST_PIXELS),
+    "x": (0, _MOST_PIXELS),
+    "y": (0, _MOST_PIXELS),
+    "read_right": (0, 1),
+    "read_top": (0, 1),
+    "prescan": (0, _MOST_SCAN),
+    "overscan": (0, _MOST_SCAN),
+    "overscan_rows": (0, _MOST_SCAN),
+    "noll": (4, 66),
+    "x_power": (0, 10),
+    "y_power": (0, 10),
+}
+_LONGEST_TEXT, _MOST_ROWS = 1000, 10_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +71,7 @@ class Row:
     place : str
         File and line, for messages.
     values : mapping of str to str
-        Texts by column.
+        Texts by column, in the order of `COLUMNS`, without blanks around them. Whole numbers have digits alone.
     """
 
     place: str
@@ -60,7 +79,7 @@ class Row:
 
     def text(self, column: str) -> str:
         """Text of a column; BadInput if it is blank."""
-        value = self.values[column].strip()
+        value = self.values[column]
         if not value:
             raise BadInput(f"{self.place}: {column} is missing")
         return value
@@ -72,13 +91,15 @@ class Row:
             value = float(text)
         except ValueError:
             raise BadInput(f"{self.place}: {column} = {text!r} is not a number") from None
-        if not (math.isfinite(value) and low <= value <= high):
+        if not math.isfinite(value):
+            raise BadInput(f"{self.place}: {column} = {text} is not finite")
+        if not low <= value <= high:
             raise BadInput(f"{self.place}: {column} = {text} is not between {low:g} and {high:g}")
         return value
 
-    def integer(self, column: str, low: int, high: int) -> int:
-        """Whole number of a column; BadInput for any other text, or outside the bounds."""
-        value = self.number(column, low, high)
+    def integer(self, column: str) -> int:
+        """Whole number of a column of `_WHOLE`; BadInput for any other text, or outside its bounds."""
+        value = self.number(column, *_WHOLE[column])
         if value % 1.0:
             raise BadInput(f"{self.place}: {column} = {value:g} is not a whole number")
         return int(value)
@@ -102,12 +123,16 @@ def read_rows(folder: Path, file: str) -> list[Row]:
     Raises
     ------
     BadInput
-        If the table cannot be read, or a column is missing, unknown or given twice.
+        If the table cannot be read, a column is missing, unknown or given twice, or a whole number is wrong.
     """
     path = folder / file
     shown = user_files.shown(path)
     lines = user_files.text(path, KIND).splitlines()
-    numbered = [(number, line) for number, line in enumerate(lines, start=1) if line and not line.startswith("#")]
+    numbered = [
+        (number, line) for number, line in enumerate(lines, start=1) if line.strip() and not line.startswith("#")
+    ]
+    if len(numbered) > _MOST_ROWS + 1:
+        raise BadInput(f"{shown}: has more than {_MOST_ROWS} rows")
     expected = COLUMNS[file]
     try:
         table = list(csv.reader(io.StringIO("\n".join(line for _, line in numbered)), strict=True))
@@ -123,16 +148,32 @@ def read_rows(folder: Path, file: str) -> list[Row]:
     if len(header) != len(expected):
         raise BadInput(f"{shown}: a column is given twice")
     found = []
-    for (number, _), row in zip(numbered[1:], table[1:], strict=True):
-        place = f"{shown} line {number}"
+    for (number, _), entries in zip(numbered[1:], table[1:], strict=True):
+        place, row = f"{shown} line {number}", [entry.strip() for entry in entries]
         if len(row) != len(header):
             raise BadInput(f"{place}: has {len(row)} values for {len(header)} columns")
         if any(len(value) > _LONGEST_TEXT or not value.isprintable() for value in row):
             raise BadInput(f"{place}: a text is too long or has characters that cannot be printed")
-        found.append(Row(place, dict(zip(header, row, strict=True))))
+        texts = dict(zip(header, row, strict=True))
+        found.append(_with_whole_numbers(Row(place, {column: texts[column] for column in expected})))
     if not found:
         raise BadInput(f"{shown}: has no rows")
     return found
+
+
+def _with_whole_numbers(row: Row) -> Row:
+    """Write 300.0 and 3e2 as 300: readers of the mission database take the texts of whole numbers as they are."""
+    whole = {column: str(row.integer(column)) for column in row.values if column in _WHOLE}
+    return Row(row.place, {**row.values, **whole})
+
+
+def csv_text(rows: Sequence[Row]) -> str:
+    """Write rows as a table for the mission database: columns in their order, no comments, every text in quotes."""
+    stream = io.StringIO()
+    # A text that begins with # would be a comment without its quotes.
+    writer = csv.writer(stream, lineterminator="\n", quoting=csv.QUOTE_ALL)
+    writer.writerows([list(rows[0].values), *(list(row.values.values()) for row in rows)])
+    return stream.getvalue()
 
 
 def refuse_repeated(rows: Sequence[Row], name_of: Callable[[Row], str]) -> None:
@@ -145,28 +186,72 @@ def refuse_repeated(rows: Sequence[Row], name_of: Callable[[Row], str]) -> None:
         seen.add(name)
 
 
-def check_layout(folder: Path) -> None:
-    """Raise BadInput if layout.csv has a wrong name or number, or a detector twice."""
+def checked_layout(folder: Path, pixel_mm: float) -> list[Row]:
+    """Read layout.csv.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the camera.
+    pixel_mm : float
+        Size of a pixel, mm.
+
+    Returns
+    -------
+    list of Row
+        Rows, one for each detector.
+
+    Raises
+    ------
+    BadInput
+        If a name or number is wrong, or a detector is given twice or overlaps another. The message names the line.
+    """
     rows = read_rows(folder, LAYOUT)
     refuse_repeated(rows, lambda row: row.text("detector"))
     for row in rows:
         if _DETECTOR.fullmatch(row.text("detector")) is None:
             raise BadInput(f"{row.place}: detector = {row.text('detector')!r}: a name has letters, digits, _ and -")
         row.text("type")
-        for axis in ("nx", "ny"):
-            row.integer(axis, 1, _MOST_PIXELS)
         for axis in ("x_mm", "y_mm"):
             row.number(axis, -1e4, 1e4)
         row.number("rotation_deg", -360.0, 360.0)
+    for first, second in overlaps([row.values for row in rows], pixel_mm):
+        names = f"{rows[first].text('detector')} and {rows[second].text('detector')}"
+        raise BadInput(f"{rows[second].place}: detectors {names} overlap")
+    return rows
 
 
-def checked_amplifiers(folder: Path) -> list[Row]:
-    """Rows of amplifiers.csv; BadInput if they do not fit the detectors of layout.csv or one another."""
-    rows, detectors = read_rows(folder, AMPLIFIERS), read_rows(folder, LAYOUT)
+def overlaps(rows: Sequence[Mapping[str, str]], pixel_mm: float) -> Iterator[tuple[int, int]]:
+    """Find detectors that overlap, as rectangles along the axes of the focal plane.
+
+    Parameters
+    ----------
+    rows : sequence of mapping of str to str
+        Rows of a layout.
+    pixel_mm : float
+        Size of a pixel, mm.
+
+    Yields
+    ------
+    tuple of (int, int)
+        Indices of two rows, the lower one first.
+    """
+    centre = np.array([[float(row["x_mm"]), float(row["y_mm"])] for row in rows])
+    size = np.array([[int(row["nx"]), int(row["ny"])] for row in rows]) * pixel_mm
+    turned = np.array([round(float(row["rotation_deg"]) / 90.0) % 2 == 1 for row in rows])
+    size[turned] = size[turned, ::-1]
+    for first in range(len(rows)):
+        near = np.abs(centre[first + 1 :] - centre[first]) < 0.5 * (size[first + 1 :] + size[first])
+        yield from ((first, first + 1 + int(later)) for later in np.flatnonzero(near.all(axis=1)))
+
+
+def checked_amplifiers(folder: Path, detectors: Sequence[Row]) -> list[Row]:
+    """Rows of amplifiers.csv; BadInput if they do not fit the detectors, the rows of layout.csv, or one another."""
+    rows = read_rows(folder, AMPLIFIERS)
     refuse_repeated(rows, lambda row: f"amplifier {row.text('amplifier')} of {row.text('type')}")
-    sizes = {row.text("type"): (int(row.text("nx")), int(row.text("ny"))) for row in detectors}
+    sizes = {row.text("type"): (row.integer("nx"), row.integer("ny")) for row in detectors}
     for row in detectors:
-        if (int(row.text("nx")), int(row.text("ny"))) != sizes[row.text("type")]:
+        if (row.integer("nx"), row.integer("ny")) != sizes[row.text("type")]:
             raise BadInput(f"{row.place}: detectors of type {row.text('type')} differ in size")
     described = {row.text("type") for row in rows}
     if missing := sorted(set(sizes) - described):
@@ -187,17 +272,11 @@ def _check_parts(rows: Sequence[Row], size: tuple[int, int]) -> None:
     for row in rows:
         if _DETECTOR.fullmatch(row.text("amplifier")) is None:
             raise BadInput(f"{row.place}: amplifier = {row.text('amplifier')!r}: a name has letters, digits, _ and -")
-        for column in ("read_right", "read_top"):
-            row.integer(column, 0, 1)
-        for column in ("prescan", "overscan", "overscan_rows"):
-            row.integer(column, 0, _MOST_PIXELS)
-        if row.number("gain", 0.0, 1e3) < 1e-3:
-            raise BadInput(f"{row.place}: gain = {row.text('gain')} is not between 0.001 and 1000")
+        row.number("gain", 1e-3, 1e3)
         if not row.number("read_noise", 0.0, 1e4):
             raise BadInput(f"{row.place}: read_noise = {row.text('read_noise')} is not positive")
         row.number("full_well", 1.0, 1e8)
-        x, y = (row.integer(axis, 0, _MOST_PIXELS) for axis in "xy")
-        nx, ny = (row.integer(axis, 1, _MOST_PIXELS) for axis in ("nx", "ny"))
+        x, y, nx, ny = (row.integer(column) for column in ("x", "y", "nx", "ny"))
         if x + nx > size[0] or y + ny > size[1]:
             raise BadInput(f"{row.place}: reaches beyond the detector of {size[0]} x {size[1]} pixels")
         for other, (left, low) in zip(rows, places, strict=False):
@@ -209,10 +288,9 @@ def _check_parts(rows: Sequence[Row], size: tuple[int, int]) -> None:
         places.append((x, y))
 
 
-def check_wavefront(folder: Path) -> None:
-    """Raise BadInput if wavefront.csv has a wrong number."""
-    for row in read_rows(folder, WAVEFRONT):
-        row.integer("noll", 4, 66)
-        for column in ("x_power", "y_power"):
-            row.integer(column, 0, 10)
+def checked_wavefront(folder: Path) -> list[Row]:
+    """Rows of wavefront.csv; BadInput if a number is wrong."""
+    rows = read_rows(folder, WAVEFRONT)
+    for row in rows:
         row.number("coefficient_nm", -1e4, 1e4)
+    return rows

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -48,7 +49,7 @@ def write_like(camera: str, folder: Path) -> list[Path]:
     """
     if camera not in CAMERAS:
         raise BadInput(f"--like {camera}: is not one of {', '.join(CAMERAS)}")
-    if folder.exists():
+    if os.path.lexists(folder):
         raise BadInput(f"{user_files.shown(folder)}: is there already")
     checked_name(folder)
     mission, prefix = resolve(), f"ext.{camera}."

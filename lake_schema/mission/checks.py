@@ -14,6 +14,7 @@ from fnmatch import fnmatchcase
 import numpy as np
 
 from lake_schema.errors import BadInput
+from lake_schema.mission.camera_tables import overlaps
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.detector_overrides import split
 from lake_schema.mission.parameter import convert, read_all
@@ -75,14 +76,7 @@ def _layout(section: str, configuration: MissionConfiguration) -> Iterator[str]:
     """No two detectors nearer than their size, as rectangles along the focal plane's axes."""
     key = f"{section}.layout"
     rows = configuration.rows(key)
-    pixel = configuration.value(f"{section}.fpa.pixel_size", "mm / pix")
-    place = np.array([[float(row["x_mm"]), float(row["y_mm"])] for row in rows])
-    size = np.array([[int(row["nx"]), int(row["ny"])] for row in rows]) * pixel
-    turned = np.array([round(float(row["rotation_deg"]) / 90.0) % 2 == 1 for row in rows])
-    size[turned] = size[turned, ::-1]
-    apart = np.abs(place[:, None] - place[None, :]) >= 0.5 * (size[:, None] + size[None, :])
-    overlap = np.triu(~apart.any(axis=2), 1)
-    for first, second in np.argwhere(overlap):
+    for first, second in overlaps(rows, configuration.value(f"{section}.fpa.pixel_size", "mm / pix")):
         yield f"mission model {key}: detectors {rows[first]['detector']} and {rows[second]['detector']} overlap"
     if len({row["detector"] for row in rows}) != len(rows):
         yield f"mission model {key}: a detector is given twice"

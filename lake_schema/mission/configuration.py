@@ -8,20 +8,15 @@ difference              what two configurations do not have in common
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import math
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from fnmatch import fnmatchcase, translate
-from functools import cache
-from importlib.resources import files
 from pathlib import Path
 from typing import TypeVar
 
-from lake_schema.errors import BadInput, OutOfRange
-from lake_schema.mission import detector_overrides, model
+from lake_schema.errors import BadInput
+from lake_schema.mission import bounds, detector_overrides, model
 from lake_schema.mission.camera_folder import Camera
 from lake_schema.mission.detector_overrides import Place
 from lake_schema.mission.model import Model, read_models
@@ -134,7 +129,7 @@ class MissionConfiguration:
         chosen = dict(self._index)
         for name, (value, unit) in overrides.items():
             chosen[name] = _overridden(self._index, name, value, unit)
-            _check_bounds(chosen[name], detector_overrides.split(name, self._index)[0])
+            bounds.check(chosen[name], detector_overrides.split(name, self._index)[0])
         names = tuple(sorted({*self.overridden, *overrides}))
         found = replace(self, parameters=tuple(chosen[key] for key in sorted(chosen)), overridden=names)
         for name in names:
@@ -186,7 +181,7 @@ def resolve(
     if twice := sorted(set(chosen) & set(files_)):
         raise BadInput(f"mission parameter {twice[0]} is a value and a model")
     for parameter in chosen.values():
-        _check_bounds(parameter, parameter.key)
+        bounds.check(parameter, parameter.key)
     found = MissionConfiguration(
         tuple(chosen[key] for key in sorted(chosen)),
         tuple(ladder),
@@ -233,38 +228,6 @@ def _overridden(known: Mapping[str, Parameter], name: str, value: float, unit: s
         confidence="assumed",
         source="request",
     )
-
-
-@cache
-def _bounds() -> tuple[tuple[re.Pattern[str], float, float, str], ...]:
-    with (files("lake_schema.mission") / "bounds.csv").open(encoding="utf-8") as stream:
-        return tuple(
-            (re.compile(translate(r["pattern"])), float(r["lo"]), float(r["hi"]), r["unit"])
-            for r in csv.DictReader(stream)
-        )
-
-
-@cache
-def bounds_of(key: str) -> tuple[tuple[float, float, str], ...]:
-    """(lowest, highest, unit) of every bound that a parameter must keep."""
-    return tuple((lo, hi, unit) for pattern, lo, hi, unit in _bounds() if pattern.fullmatch(key))
-
-
-@cache
-def is_whole(key: str) -> bool:
-    """Whether a parameter is a count, of which no fraction has a meaning."""
-    with (files("lake_schema.mission") / "counts.csv").open(encoding="utf-8") as stream:
-        return any(fnmatchcase(key, row["pattern"]) for row in csv.DictReader(stream))
-
-
-def _check_bounds(parameter: Parameter, key: str) -> None:
-    """key : the parameter's name, without a place."""
-    if is_whole(key) and parameter.value % 1.0:
-        raise BadInput(f"mission parameter {parameter.key} = {parameter.value:g} is not a whole number")
-    for lo, hi, unit in bounds_of(key):
-        value = convert(parameter.value, parameter.unit, unit, f"mission parameter {parameter.key}")
-        if not lo <= value <= hi:
-            raise OutOfRange(f"mission parameter {parameter.key} [{unit}]", value, lo, hi)
 
 
 def difference(first: MissionConfiguration, second: MissionConfiguration) -> Iterator[str]:

@@ -12,7 +12,8 @@ from fnmatch import fnmatchcase
 
 from lake_schema.errors import BadInput
 from lake_schema.mission import detector_overrides
-from lake_schema.mission.configuration import MissionConfiguration, bounds_of
+from lake_schema.mission.bounds import bounds_of
+from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.model import Model
 from lake_schema.mission.parameter import Parameter, convert
 

@@ -110,18 +110,23 @@ def identity_of(record: Dated) -> Identity:
 def parse_unit(text: str, where: str = "mission") -> u.UnitBase:
     """A unit string -> astropy unit; BadInput names where it stands."""
     try:
-        return u.Unit(text)
+        unit = u.Unit(text)
     except (ValueError, TypeError):
         raise BadInput(f"{where}: {text!r} is not a unit") from None
+    if not isinstance(unit, u.UnitBase):
+        # astropy converts mag(um) to um without taking the power.
+        raise BadInput(f"{where}: {text!r} is a logarithmic or structured unit: use a linear unit, or mag")
+    return unit
 
 
 @cache
 def _factor(unit: str, to: str) -> float | None:
     """What a value in `unit` is multiplied with to be in `to`, None where they do not fit."""
     try:
-        return float(parse_unit(unit).to(parse_unit(to)))
-    except u.UnitConversionError:
+        factor = float(parse_unit(unit).to(parse_unit(to)))
+    except u.UnitsError:
         return None
+    return factor if math.isfinite(factor) else None
 
 
 def convert(value: float, unit: str, to: str, where: str) -> float:

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from lake_schema.errors import OutOfRange
-from lake_schema.mission.configuration import bounds_of, is_whole, resolve
+from lake_schema.mission.bounds import bounds_of, is_whole
+from lake_schema.mission.configuration import resolve
 from tests.extremes.test_effects import scenes
 from tests.truesky.render import nominal
 from tests.truesky.render.fields import small

@@ -103,9 +103,10 @@ def filters(given: UserCurves) -> tuple[dict[str, Passband], dict[str, Origin]]:
     found, origins = {}, {}
     for name, curves in given.passbands:
         key = f"{FILTER}{name}"
+        place = curves.place or key
         if name in passbands.names():
-            raise BadInput(f"{key}: there is a passband of this name: choose another")
-        with _named(key):
+            raise BadInput(f"{place}: truesky has a passband {name}: choose another name for this curve")
+        with _named(place):
             found[name] = from_files.passband(curves.files[0], name, curves.medium, curves.format)
             origins[key] = _origin_of(curves)
     return found, origins

@@ -23,7 +23,7 @@ from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 from lake_schema.fits import external
 from lake_schema.fits.images import Card, Image, read_images, write_images
-from lake_schema.mission.parameter import SPACE_CAMERAS
+from lake_schema.mission.parameter import CAMERAS, SPACE_CAMERAS
 from truesky.reduction import calibration
 from truesky.reduction.calibration import FLAGS, Reduced
 from truesky.reduction.combining import Combined
@@ -82,8 +82,9 @@ def kinds(frame: Frame) -> tuple[str, ...]:
 def master_name(folder: Path, frame: Frame, kind: str) -> Path:
     """The file in a folder of the master for a frame; kind : of KINDS.
 
-    Of ground cameras, whose channel is one, it has the camera's name; and, a flat, that of the band. Of NISP a dark has
-    its ramp's numbers, and both channels have one linearity.
+    Of ground cameras, whose channel is one, it has the camera's name; and, a flat, that of the band. Names of a user's
+    camera are joined by dots: with underscores, camera a_b in band c would have the file of camera a in band b_c. Of
+    NISP a dark has its ramp's numbers, and both channels have one linearity.
     """
     exposure = frame.exposure
     if frame.scene.ramp:
@@ -92,8 +93,8 @@ def master_name(folder: Path, frame: Frame, kind: str) -> Path:
         return folder / "_".join(filter(None, (channel, more, frame.detector, f"{kind}.fits")))
     if exposure.camera in SPACE_CAMERAS:
         return folder / f"{exposure.channel}_{frame.detector}_{kind}.fits"
-    band = f"_{exposure.band}" if kind == "flat" else ""
-    return folder / f"{exposure.camera}{band}_{frame.detector}_{kind}.fits"
+    names = (exposure.camera, *((exposure.band,) if kind == "flat" else ()), frame.detector)
+    return folder / f"{('_' if exposure.camera in CAMERAS else '.').join(names)}_{kind}.fits"
 
 
 def write_master(path: Path, combined: Combined, kind: str, frames: Sequence[Frame], more: Sequence[Card] = ()) -> None:

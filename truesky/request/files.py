@@ -31,11 +31,24 @@ SOURCES = "table of sources"
 
 @dataclass(frozen=True, slots=True)
 class Curves:
-    """Files of spectra, of a filter or of an extinction law; medium : of a filter's wavelengths, "air" or "vacuum"."""
+    """Files of spectra, of a filter or of an extinction law.
+
+    Attributes
+    ----------
+    files : tuple of Path
+        The files.
+    format : str
+        Format of the files, a key of truesky/fluxes/libraries/spectrum_formats.toml.
+    medium : str
+        Medium in which a filter's wavelengths are measured, "air" or "vacuum".
+    place : str
+        Table and line that name the file, for messages; "" if a key of the request names it.
+    """
 
     files: tuple[Path, ...]
     format: str
     medium: str = ""
+    place: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,11 +192,15 @@ def with_cameras(given: UserCurves, own: Sequence[Camera], bands: Collection[str
         If two passbands have one name.
     """
     found = dict(given.passbands)
-    for curve in (curve for camera in own for curve in camera.curves if curve.band in bands):
+    every = [(i, curve) for i, camera in enumerate(own) for curve in camera.curves if curve.band in bands]
+    for i, curve in every:
+        place = f"mission.cameras[{i}]: {curve.place}"
         form = _CURVE_FORMATS.get(curve.file.suffix.lower(), "passband_ascii")
         if curve.band in found:
-            raise BadInput(f"mission.cameras: passband {curve.band} is given twice: choose another name")
-        found[curve.band] = Curves((curve.file,), form, curve.medium)
+            other = found[curve.band].place or f"fluxes.passbands.{curve.band}"
+            what = f"band {curve.band} has another curve in {other}: all curves of a request have different names"
+            raise BadInput(f"{place}: {what}")
+        found[curve.band] = Curves((curve.file,), form, curve.medium, place)
     return replace(given, passbands=tuple(found.items()))
 
 

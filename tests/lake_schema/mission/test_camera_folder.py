@@ -1,5 +1,7 @@
 """Folders of cameras: they are read, and mistakes are refused with the file and the line."""
 
+import csv
+
 import pytest
 
 from lake_schema.errors import BadInput
@@ -31,6 +33,7 @@ def test_a_folder_that_is_written_has_all_numbers_of_the_known_camera(tmp_path, 
     assert not list(checks.camera_faults("copied", mission))
     for key in ("layout", "psf.wavefront"):
         assert mission.rows(f"ext.copied.{key}") == KNOWN.rows(f"ext.{known}.{key}")
+    assert mission.numbers("ext.copied.psf.wavefront") == KNOWN.numbers(f"ext.{known}.psf.wavefront")
     copied, rows = (mission.rows(f"ext.{name}.amplifiers") for name in ("copied", known))
     for own, row in zip(copied, rows, strict=True):
         assert {key: own[key] for key in own if key not in ("gain", "read_noise", "full_well")}.items() <= row.items()
@@ -58,12 +61,16 @@ def test_the_checksum_is_of_what_the_folder_holds_wherever_it_lies(folder, tmp_p
     other.parent.mkdir()
     folder.rename(other)
     assert camera_folder.read(other).sha256 == first.sha256
-    for file in camera_tables.LAYOUT, camera_tables.AMPLIFIERS, camera_tables.WAVEFRONT:
-        (other / file).write_text((other / file).read_text() + "# another comment\n")
+    for file, old, new in (
+        (camera_tables.LAYOUT, "-114.399", "-114.4"),
+        (camera_tables.AMPLIFIERS, "4,106000", "5,106000"),
+        (camera_tables.WAVEFRONT, "4,2,0,90", "4,2,0,91"),
+        (camera_tables.BANDS, "cfis_r,,,26.", "cfis_r,,,25."),
+    ):
+        replace_in(other / file, old, new)
         assert camera_folder.read(other).sha256 != first.sha256
-        (other / file).write_text((other / file).read_text().removesuffix("# another comment\n"))
-    replace_in(other / camera_tables.BANDS, "cfis_r,,,26.", "cfis_r,,,25.")
-    assert camera_folder.read(other).sha256 != first.sha256
+        replace_in(other / file, new, old)
+    assert camera_folder.read(other).sha256 == first.sha256
 
 
 def test_without_a_wavefront_the_telescope_has_that_of_the_others(folder):
@@ -72,14 +79,79 @@ def test_without_a_wavefront_the_telescope_has_that_of_the_others(folder):
     assert mission.rows("ext.my_camera.psf.wavefront") == KNOWN.rows("ext.megacam.psf.wavefront")
 
 
-def test_a_table_may_have_its_columns_in_any_order_with_comments_and_empty_lines(folder):
+def write_again(file, change):
+    """Write a table with other rows: `change` gets all rows, the header first, and returns those to be written."""
+    lines = [line for line in file.read_text().splitlines() if not line.startswith("#")]
+    with file.open("w", newline="") as stream:
+        csv.writer(stream).writerows(change(list(csv.reader(lines))))
+
+
+def with_columns_reversed(rows):
+    return [row[::-1] for row in rows]
+
+
+def with_blanks(rows):
+    return [[f" {text}\t" for text in row] for row in rows]
+
+
+def with_points(rows):
+    whole = [column in ("nx", "ny", "x", "y", "noll", "overscan", "read_top", "x_power") for column in rows[0]]
+    exponent = [column in ("y_power", "read_right", "prescan") for column in rows[0]]
+    return [rows[0]] + [
+        [f"0{text}.0" if a else f"{text}e0" if b else text for text, a, b in zip(row, whole, exponent, strict=True)]
+        for row in rows[1:]
+    ]
+
+
+def with_empty_lines_and_comments(rows):
+    return [["# A comment"], [], *(line for row in rows for line in (row, [" "])), ["# The end"]]
+
+
+@pytest.mark.parametrize("file", camera_tables.COLUMNS)
+@pytest.mark.parametrize(
+    "change", [with_columns_reversed, with_blanks, with_points, with_empty_lines_and_comments], ids=lambda f: f.__name__
+)
+def test_a_table_may_be_written_in_another_way(folder, file, change):
+    (folder / "curve.dat").write_text("6000 0.5\n")
+    replace_in(folder / camera_tables.BANDS, "cfis_r,,", "mine,curve.dat,air")
     before = camera_folder.read(folder)
-    file = folder / camera_tables.PARAMETERS
-    rows = [line.rsplit(",", 3) if '"' not in line else None for line in file.read_text().splitlines()]
-    if all(rows):
-        file.write_text("\n".join(",".join(reversed(row)) for row in rows))
-    file.write_text("# A comment\n\n" + file.read_text() + "\n# The end\n")
-    assert camera_folder.read(folder).sha256 == before.sha256
+    write_again(folder / file, change)
+    after = camera_folder.read(folder)
+    assert after.parameters == before.parameters
+    # Readers of the mission database get the same layout, amplifiers and wavefront.
+    assert after.contents == before.contents
+    assert after.models == before.models
+    assert [(c.band, c.file, c.medium) for c in after.curves] == [(c.band, c.file, c.medium) for c in before.curves]
+    assert after.sha256 == before.sha256
+
+
+@pytest.mark.parametrize("file", camera_tables.COLUMNS)
+def test_a_table_may_begin_with_a_byte_order_mark(folder, file):
+    before = camera_folder.read(folder)
+    (folder / file).write_text((folder / file).read_text(), encoding="utf-8-sig")
+    assert camera_folder.read(folder) == before
+
+
+def test_columns_that_change_places_with_their_headers_are_no_other_wavefront(folder):
+    write_again(folder / camera_tables.WAVEFRONT, lambda rows: [[row[i] for i in (0, 2, 1, 3)] for row in rows])
+    mission = resolve(cameras=[camera_folder.read(folder)])
+    assert mission.numbers("ext.my_camera.psf.wavefront") == KNOWN.numbers("ext.megacam.psf.wavefront")
+
+
+def test_a_type_that_looks_like_a_comment_is_kept(folder):
+    for file in camera_tables.LAYOUT, camera_tables.AMPLIFIERS:
+        text = (folder / file).read_text().replace("megacam,", '"#1, thin",')
+        (folder / file).write_text("\n".join(line for line in text.splitlines() if not line.startswith("# ")))
+    mission = resolve(cameras=[camera_folder.read(folder)])
+    assert [row["type"] for row in mission.rows("ext.my_camera.amplifiers")] == ["#1, thin"] * 2
+
+
+@pytest.mark.parametrize(("target", "words"), [("nowhere.csv", "no such file"), ("wavefront.csv", "Too many levels")])
+def test_a_link_to_no_wavefront_is_refused(folder, target, words):
+    (folder / camera_tables.WAVEFRONT).unlink()
+    (folder / camera_tables.WAVEFRONT).symlink_to(target)
+    with pytest.raises(BadInput, match=rf"my_camera/wavefront\.csv: {words}"):
+        camera_folder.read(folder)
 
 
 @pytest.mark.parametrize("file", ["parameters.csv", "layout.csv", "amplifiers.csv", "bands.csv"])
@@ -114,6 +186,9 @@ def test_a_missing_file_or_column_is_named(folder, file):
         ("parameters.csv", "fpa.pixel_size,", "fpa.pixel_size,x", r"line \d+: value = 'x\d+.*' is not a number"),
         ("parameters.csv", "fpa.pixel_size,", "# fpa.pixel_size,", r"parameters\.csv: parameter fpa.pixel_size is m"),
         ("parameters.csv", "um / pix", "s", r"line \d+: fpa.pixel_size: s does not convert to um / pix"),
+        ("parameters.csv", "um / pix", "mag(um/pix)", r"line \d+: fpa.pixel_size: 'mag\(um/pix\)' is a logarithmic"),
+        ("parameters.csv", "um / pix", "1e-320 um/pix", r"line \d+: fpa.pixel_size: 1e-320 um/pix does not convert"),
+        ("parameters.csv", "bias,1000", "bias,99000", r"parameters\.csv line \d+: .*bias \[adu\] = 99000.0 is outside"),
         ("parameters.csv", "um / pix", "parrots", r"line \d+: fpa.pixel_size: 'parrots' is not a unit"),
         ("layout.csv", "ccd00,megacam,2048", "ccd00,megacam,0", r"layout\.csv line \d+: nx = 0 is not between 1 and"),
         ("layout.csv", "ccd00,megacam,2048", "ccd00,megacam,99.5", r"layout\.csv line \d+: nx = 99.5 is not a whole"),
@@ -129,6 +204,28 @@ def test_a_missing_file_or_column_is_named(folder, file):
             r"line \d+: reaches beyond the detector",
         ),
         (
+            "amplifiers.csv",
+            ",0,0,0,32,32",
+            ",0,2,0,32,32",
+            r"amplifiers\.csv line \d+: read_top = 2 is not betw",
+        ),
+        (
+            "amplifiers.csv",
+            ",0,0,0,32,32",
+            ",0.5,0,0,32,32",
+            r"amplifiers\.csv line \d+: read_right = 0.5 is no",
+        ),
+        (
+            "amplifiers.csv",
+            ",0,32,32",
+            ",0,65536,32",
+            r"amplifiers\.csv line \d+: overscan = 65536 is not b",
+        ),
+        ("wavefront.csv", "4,2,0,90", "4,2.5,0,90", r"wavefront\.csv line \d+: x_power = 2.5 is not a whole number"),
+        ("bands.csv", "26.78", "99", r"bands\.csv line 2: .*cfis_r\.zero_point \[mag\] = 99.0 is outside \[0"),
+        ("bands.csv", "cfis_r,,", "cfis_r,/etc/passwd,air", r"bands\.csv line 2: curve = '/etc/passwd' is outside the"),
+        ("bands.csv", "cfis_r,,", "cfis_r,a/../../b,air", r"bands\.csv line 2: curve = 'a/../../b' is outside the cam"),
+        (
             "bands.csv",
             "cfis_r,,",
             "cfis_r,missing.dat,air",
@@ -138,7 +235,7 @@ def test_a_missing_file_or_column_is_named(folder, file):
         ("bands.csv", "cfis_r,,", "cfis_r,layout.csv,water", r"bands\.csv line \d+: medium = 'water' is not air or"),
         ("bands.csv", "cfis_r,,", "cfis r,,", r"bands\.csv line \d+: band = 'cfis r': a name has letters"),
         ("bands.csv", "cfis_r,,,", "cfis_r,,,nan", r"bands\.csv line \d+: zero_point = 'nan\S*' is not a number"),
-        ("wavefront.csv", "4,0,0,60", "4,0,0,inf", r"wavefront\.csv line \d+: coefficient_nm = inf is not between"),
+        ("wavefront.csv", "4,0,0,60", "4,0,0,inf", r"wavefront\.csv line \d+: coefficient_nm = inf is not finite"),
     ],
 )
 def test_a_mistake_is_named_with_its_file_and_line(folder, file, old, new, words):
@@ -158,14 +255,28 @@ def test_an_amplifier_without_gain_or_noise_is_refused(folder, gain, noise):
         camera_folder.read(folder)
 
 
-def test_detectors_that_overlap_are_a_fault_of_the_configuration(folder):
+@pytest.mark.parametrize("name", ["gain", "bias", "fpa", "psf", "layout", "amplifiers", "read_noise"])
+def test_a_band_may_not_have_the_name_of_a_parameter(folder, name):
+    replace_in(folder / camera_tables.BANDS, "cfis_r,", f"{name},")
+    with pytest.raises(BadInput, match=rf"bands\.csv line 2: band = '{name}' is the name of a parameter or table"):
+        camera_folder.read(folder)
+
+
+def test_detectors_that_overlap_are_refused(folder):
     file = folder / camera_tables.LAYOUT
     lines = file.read_text().splitlines()
     first, second = (line.split(",") for line in lines[-2:])
     file.write_text("\n".join([*lines[:-1], ",".join([second[0], *first[1:]])]))
-    mission = resolve(cameras=[camera_folder.read(folder)])
-    (fault,) = checks.camera_faults("my_camera", mission)
-    assert fault == f"mission model ext.my_camera.layout: detectors {first[0]} and {second[0]} overlap"
+    words = rf"layout\.csv line {len(lines)}: detectors {first[0]} and {second[0]} overlap$"
+    with pytest.raises(BadInput, match=words):
+        camera_folder.read(folder)
+
+
+def test_detectors_that_overlap_with_a_larger_pixel_are_a_fault_of_the_configuration(folder):
+    larger = {"ext.my_camera.fpa.pixel_size": (14.5, "um / pix")}
+    mission = resolve(cameras=[camera_folder.read(folder)], overrides=larger)
+    fault = next(checks.camera_faults("my_camera", mission))
+    assert fault.startswith("mission model ext.my_camera.layout: detectors ccd00 and ccd01 overlap")
 
 
 @pytest.mark.parametrize("name", ["decam", "vis", "My Camera", "9", "x" * 41])
@@ -182,3 +293,18 @@ def test_the_command_writes_a_folder_and_never_over_another(tmp_path, capsys):
     assert capsys.readouterr().err.endswith("mine: is there already\n")
     assert commands.main(["camera", str(tmp_path / "No Name"), "--like", "decam"]) == 2
     assert not (tmp_path / "No Name").exists()
+
+
+def test_a_path_that_the_system_does_not_take_is_refused(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "loop").symlink_to("loop")
+    long = "x" * 300
+    for name in ("loop", long):
+        with pytest.raises(BadInput, match=r"loop: no such folder|x: File name too long"):
+            camera_folder.read(tmp_path / name)
+        assert commands.main(["camera", name, "--like", "decam"]) == 2
+        said = capsys.readouterr().err
+        assert len(said.splitlines()) == 1
+        assert said.endswith(("is there already\n", "File name too long\n"))
+    assert commands.main(["camera", "loop/mine", "--like", "decam"]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1

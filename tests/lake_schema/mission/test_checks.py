@@ -7,7 +7,8 @@ import pytest
 
 from lake_schema.errors import BadInput
 from lake_schema.mission import checks
-from lake_schema.mission.configuration import MissionConfiguration, bounds_of, resolve
+from lake_schema.mission.bounds import bounds_of
+from lake_schema.mission.configuration import MissionConfiguration, resolve
 from lake_schema.mission.parameter import CAMERAS, STATUSES, read_all
 from lake_schema.tables.mission import LADDER
 

@@ -85,6 +85,22 @@ def test_conversion():
         convert(1.0, "s", "m", "here")
 
 
+@pytest.mark.parametrize(
+    ("unit", "words"),
+    [
+        ("mag(um/pix)", r"'mag\(um/pix\)' is a logarithmic or structured unit: use a linear unit, or mag$"),
+        ("dB(um/pix)", "is a logarithmic or structured unit"),
+        ("mag(AB)", "is a logarithmic or structured unit"),
+        ("(um, pix)", "is a logarithmic or structured unit"),
+        ("1e-320 um/pix", "does not convert to mm / pix$"),
+        ("1e400 um/pix", "does not convert to mm / pix$"),
+    ],
+)
+def test_a_unit_without_a_finite_factor_is_refused(unit, words):
+    with pytest.raises(BadInput, match=f"^here: .*{words}"):
+        convert(15.0, unit, "mm / pix", "here")
+
+
 def test_the_zodiacal_table_is_the_published_one():
     table = {row[0]: row[1:] for row in resolve().numbers("env.zodi.map")}
     assert len(table) == 19

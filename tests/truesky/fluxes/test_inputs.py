@@ -116,7 +116,7 @@ def test_a_law_alone_stands_before_the_embedded_galaxies(tmp_path, embedded):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"passbands": (("euclid_vis", 0),)}, r"fluxes\.passbands\.euclid_vis: there is a passband of this name"),
+        ({"passbands": (("euclid_vis", 0),)}, r"fluxes\.passbands\.euclid_vis: truesky has a passband euclid_vis"),
         ({"passbands": (("x", ("absent.dat", "passband_ascii", "air")),)}, r"fluxes\.passbands\.x: .*absent\.dat"),
         ({"passbands": (("x", ("mine.dat", "nonsense", "air")),)}, r"fluxes\.passbands\.x: format 'nonsense' is not"),
         ({"passbands": (("x", ("mine.dat", "passband_svo", "air")),)}, r"fluxes\.passbands\.x: .*cannot be read as"),

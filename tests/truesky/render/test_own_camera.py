@@ -1,5 +1,7 @@
 """A ground camera from a user's folder is planned and rendered like those of the mission database."""
 
+import shutil
+
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -148,11 +150,11 @@ def test_another_content_of_the_folder_is_another_plan(lake, tmp_path):
 @pytest.mark.parametrize(
     ("tables", "words"),
     [
-        ({"layout": LAYOUT.replace("-2.5", "1.0")}, r"mission\.cameras\[0\]: .*detectors left and right overlap"),
+        ({"layout": LAYOUT.replace("-2.5", "1.0")}, r"mission\.cameras\[0\]: .*layout\.csv line 3: detectors left and"),
         ({"amplifiers": AMPLIFIERS.replace("1.7", "0")}, r"mission\.cameras\[0\]: .*amplifiers\.csv line 2: gain = 0"),
         ({"bands": BANDS.replace("fringes", "fringe")}, r"mission\.cameras\[0\]: .*unknown column 'fringe'"),
         ({"bands": BANDS.replace("narrow.dat", "x.dat")}, r"mission\.cameras\[0\]: .*bands\.csv line 2: .*no such"),
-        ({"bands": BANDS.replace("25.3", "99")}, r"mission: mission parameter ext\.mini\.narrow\.zero_point"),
+        ({"bands": BANDS.replace("25.3", "99")}, r"mission\.cameras\[0\]: .*bands\.csv line 2: .*narrow\.zero_point"),
     ],
 )  # fmt: skip
 def test_a_folder_with_a_mistake_is_refused_before_anything_is_written(tmp_path, tables, words):
@@ -167,9 +169,12 @@ def test_a_folder_with_a_mistake_is_refused_before_anything_is_written(tmp_path,
         ('cameras = ["mini"]', 'cameras = ["mini", "mini/"]', r"mission\.cameras\[1\]: there are two cameras of the n"),
         ('cameras = ["mini"]', 'cameras = ["none"]', r"mission\.cameras\[0\]: .*none: no such folder"),
         ('cameras = ["mini"]', "cameras = 3", r"mission\.cameras"),
+        ('cameras = ["mini"]', f'cameras = ["{"x" * 300}"]', r"mission\.cameras\[0\]: .*: File name too long$"),
+        ('cameras = ["mini"]', 'cameras = ["loop"]', r"mission\.cameras\[0\]: .*loop: no such folder"),
     ],
 )
 def test_a_request_that_names_no_folder_is_refused(tmp_path, old, new, words):
+    (tmp_path / "loop").symlink_to("loop")
     with pytest.raises(BadInput, match=words):
         parse(written(tmp_path, REQUEST.replace(old, new)))
 
@@ -200,6 +205,37 @@ def test_a_band_without_a_curve_is_one_of_ours(lake, tmp_path):
     )
     with pytest.raises(BadInput, match="band odd: truesky has no passband of this name, and no curve is given for it"):
         plan_exposures.steps(lake, parse(unknown))
+
+
+@pytest.mark.parametrize(
+    ("band", "curve", "words"),
+    [
+        ("des_r", None, "truesky has a passband des_r: choose another name for this curve"),
+        ("narrow", "# nothing\n\n", r".*narrow\.dat: has no rows"),
+        ("narrow", "6000 0\n6100 -1\n", r".*narrow\.dat: row 2 is negative"),
+        ("narrow", "6000 0\n6100 50\n6200 50\n", r"responds with 50: a pointing wants the fraction"),
+    ],
+)
+def test_a_curve_with_a_mistake_is_named_with_its_table(lake, tmp_path, band, curve, words):
+    path = written(tmp_path, REQUEST.replace("narrow", band), bands=BANDS.replace("narrow,", f"{band},"))
+    if curve is not None:
+        (tmp_path / "mini" / "narrow.dat").write_text(curve)
+    with pytest.raises(BadInput, match=rf"^mission\.cameras\[0\]: .*mini/bands\.csv line 2: {words}"):
+        plan_exposures.steps(lake, parse(path))
+
+
+def test_two_curves_of_one_name_are_refused_with_both_places(tmp_path):
+    request = written(tmp_path, REQUEST.replace('["mini"]', '["mini", "maxi"]'))
+    shutil.copytree(tmp_path / "mini", tmp_path / "maxi")
+    words = (
+        r"mission\.cameras\[1\]: .*maxi/bands\.csv line 2: band narrow has another curve in "
+        r"mission\.cameras\[0\]: .*mini/bands\.csv line 2: all curves of a request have different names$"
+    )
+    with pytest.raises(BadInput, match=words):
+        parse(request)
+    passband = '[fluxes.passbands.narrow]\nfile = "mini/narrow.dat"\nformat = "passband_ascii"\nmedium = "air"\n'
+    with pytest.raises(BadInput, match=r"mission\.cameras\[0\]: .* has another curve in fluxes\.passbands\.narrow"):
+        parse(written(tmp_path, REQUEST + passband))
 
 
 def test_a_table_of_pointings_may_use_the_camera(lake, tmp_path):

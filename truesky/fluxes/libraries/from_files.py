@@ -118,6 +118,8 @@ def _columns(path: Path, form: Mapping[str, Any]) -> tuple[Float, Float]:
     scale = ANGSTROM[form["unit"]]
     if reader == "ascii":
         lines = user_files.text(path, "curve").splitlines()
+        if not any(line.partition("#")[0].strip() for line in lines):
+            raise BadInput(f"{path}: has no rows")
         rows = np.loadtxt(lines, comments="#", usecols=[names[0] - 1, names[1] - 1], ndmin=2)
         return rows[:, 0] * scale, rows[:, 1]
     # Slow to import, and not needed for the form that most files have.

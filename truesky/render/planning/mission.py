@@ -30,5 +30,5 @@ def user_filters(request: Request) -> tuple[dict[str, Passband], Json]:
     for name, band in found.items():
         if band.response.max() > 1.0:
             what = f"responds with {band.response.max():.4g}: a pointing wants the fraction of photons detected"
-            raise BadInput(f"{inputs.FILTER}{name}: {what}")
+            raise BadInput(f"{dict(given.passbands)[name].place or inputs.FILTER + name}: {what}")
     return found, {"files": {key: origin.sha256 for key, origin in origins.items()}} if found else {}

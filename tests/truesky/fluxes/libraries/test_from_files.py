@@ -148,6 +148,14 @@ def test_what_is_not_a_table_is_refused(tmp_path):
         from_files.read(path, "guess")
 
 
+@pytest.mark.parametrize("text", ["", "\n \n", "# wavelength response\n"])
+def test_an_empty_file_is_refused_without_a_warning(tmp_path, recwarn, text):
+    (tmp_path / "empty.dat").write_text(text)
+    with pytest.raises(BadInput, match=r"empty\.dat: has no rows$"):
+        from_files.read(tmp_path / "empty.dat", "passband_ascii")
+    assert not recwarn
+
+
 def test_a_votable_declares_no_entities(tmp_path):
     path = votable(tmp_path / "bomb.xml")
     path.write_text(path.read_text().replace("<VOTABLE", '<!DOCTYPE x [<!ENTITY a "b">]>\n<VOTABLE', 1))

@@ -1,0 +1,59 @@
+"""Bounds of the mission's parameters, from bounds.csv and counts.csv."""
+
+from __future__ import annotations
+
+import csv
+import re
+from fnmatch import fnmatchcase, translate
+from functools import cache
+from importlib.resources import files
+
+from lake_schema.errors import BadInput, OutOfRange
+from lake_schema.mission.parameter import Parameter, convert
+
+
+@cache
+def _bounds() -> tuple[tuple[re.Pattern[str], float, float, str], ...]:
+    with (files("lake_schema.mission") / "bounds.csv").open(encoding="utf-8") as stream:
+        return tuple(
+            (re.compile(translate(r["pattern"])), float(r["lo"]), float(r["hi"]), r["unit"])
+            for r in csv.DictReader(stream)
+        )
+
+
+@cache
+def bounds_of(key: str) -> tuple[tuple[float, float, str], ...]:
+    """(lowest, highest, unit) of every bound that a parameter must keep."""
+    return tuple((lo, hi, unit) for pattern, lo, hi, unit in _bounds() if pattern.fullmatch(key))
+
+
+@cache
+def is_whole(key: str) -> bool:
+    """Whether a parameter is a count, of which no fraction has a meaning."""
+    with (files("lake_schema.mission") / "counts.csv").open(encoding="utf-8") as stream:
+        return any(fnmatchcase(key, row["pattern"]) for row in csv.DictReader(stream))
+
+
+def check(parameter: Parameter, key: str) -> None:
+    """Refuse a parameter outside its bounds.
+
+    Parameters
+    ----------
+    parameter : Parameter
+        The parameter.
+    key : str
+        Its name, without a detector or an amplifier.
+
+    Raises
+    ------
+    BadInput
+        If it must be a whole number and is not, or its unit does not fit the bound's.
+    OutOfRange
+        If it is outside its bounds.
+    """
+    if is_whole(key) and parameter.value % 1.0:
+        raise BadInput(f"mission parameter {parameter.key} = {parameter.value:g} is not a whole number")
+    for lo, hi, unit in bounds_of(key):
+        value = convert(parameter.value, parameter.unit, unit, f"mission parameter {parameter.key}")
+        if not lo <= value <= hi:
+            raise OutOfRange(f"mission parameter {parameter.key} [{unit}]", value, lo, hi)
