@@ -71,7 +71,8 @@ class MissionConfiguration:
         object.__setattr__(self, "_fingerprint", hashlib.sha256("".join(lines).encode()).hexdigest())
 
     def __hash__(self) -> int:
-        return hash(self._fingerprint)
+        # With the folder: those of different lakes are unequal, which a comparison finds only after all their records.
+        return hash((self._fingerprint, self.folder))
 
     def parameter(self, key: str) -> Parameter:
         """The record chosen for a name; BadInput for an unknown one."""
