@@ -69,7 +69,8 @@ class MissionConfiguration:
         object.__setattr__(self, "_whole", hashlib.sha256(everything.encode()).hexdigest())
 
     def __hash__(self) -> int:
-        return hash(self._fingerprint)
+        # With the folder: those of different lakes are unequal, which a comparison finds only after all their records.
+        return hash((self._fingerprint, self.folder))
 
     def __eq__(self, other: object) -> bool:
         # By a digest: caches compare a configuration with an equal one thousands of times in each exposure.

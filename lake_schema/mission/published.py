@@ -45,7 +45,8 @@ def table(configuration: MissionConfiguration) -> pa.Table:
     own = [record for record in chosen if record.key in configuration.overridden]
     known: list[Parameter | Model] = [*read_all(), *read_models()]
     # A configuration that was read back may hold records that the package no longer has.
-    gone = [record for record in chosen if record not in known and record not in own]
+    there = {*known, *own}
+    gone = [record for record in chosen if record not in there]
     every = [*known, *gone, *own]
     wanted = set(chosen)
     dates = [math.nan if record.valid_from is None else record.valid_from for record in every]

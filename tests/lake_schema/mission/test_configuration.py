@@ -2,6 +2,7 @@
 
 import pickle
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -73,6 +74,15 @@ def test_the_fingerprint_follows_the_values():
     assert resolve(overrides={"vis.gain": (3.5, "electron / adu")}).fingerprint != base.fingerprint
     assert resolve(ladder=("SIM", "CBE", "BLT", "DES", "REQ")).fingerprint != base.fingerprint
     assert pickle.loads(pickle.dumps(base)) == base
+
+
+def test_configurations_of_different_lakes_are_told_apart_by_their_hashes():
+    """Else each look into a cache compares all of their records."""
+    base = resolve()
+    here, there = (replace(base, folder=Path(name)) for name in ("here", "there"))
+    assert len({hash(base), hash(here), hash(there)}) == 3
+    assert replace(here) == here
+    assert hash(replace(here)) == hash(here)
 
 
 def test_an_override_is_converted_and_marked():

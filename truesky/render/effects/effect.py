@@ -41,8 +41,9 @@ class Effect:
 
     def margin(self, scene: Scene) -> float:
         """Contribution over what would be noticed, in a pixel or in a mean: above 1 the effect is needed."""
-        repeated = float((self.repeated or self.contribution)(scene))
-        change = max(float(self.contribution(scene)), math.sqrt(STACK) * repeated)
+        change = float(self.contribution(scene))
+        repeated = change if self.repeated is None else float(self.repeated(scene))
+        change = max(change, math.sqrt(STACK) * repeated)
         noise = NOTICEABLE * scene.pixel_noise
         # Without any noise everything is noticed.
         return change / noise if noise > 0.0 else math.inf if change > 0.0 else 0.0
@@ -94,10 +95,13 @@ def decide(effects: Sequence[Effect], scene: Scene) -> tuple[Decision, ...]:
     for effect in effects:
         if not effect.optional and not effect.applied(scene):
             raise BadInput(f"effect {effect.name} cannot be switched off")
-    return tuple(
-        Decision(effect.name, effect.applied(scene), effect.name in scene.forced, effect.margin(scene))
-        for effect in effects
-    )
+    found = []
+    for effect in effects:
+        # Once: some contributions take as long as the effect itself.
+        margin = effect.margin(scene)
+        applied = scene.forced.get(effect.name, not effect.optional or margin > 1.0)
+        found.append(Decision(effect.name, applied, effect.name in scene.forced, margin))
+    return tuple(found)
 
 
 def apply_all(

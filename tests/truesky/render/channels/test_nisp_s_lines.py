@@ -43,7 +43,7 @@ def unbiased(found):
 
 
 def test_fluxes_of_lines_are_measured_without_a_bias():
-    unbiased(pulls(strip(nx=840, ny=600), SEED, 12))
+    unbiased(pulls(strip(nx=840, ny=330), SEED, 12))
 
 
 @pytest.mark.nightly
@@ -147,7 +147,7 @@ def test_a_line_is_seen_as_well_as_is_required():
 
     A strip as wide as a detector: its outputs drift as theirs.
     """
-    enough(*sequence(strip(nx=2040, ny=90), SEED, 8))
+    enough(*sequence(strip(nx=2040, ny=90), SEED, 4))
 
 
 @pytest.mark.nightly

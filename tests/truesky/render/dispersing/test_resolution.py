@@ -51,7 +51,9 @@ def width(path, wavelength, gaussian, psf):
 SETTINGS = draw.settings_for(SURVEY)
 
 
-@pytest.mark.parametrize(("grism", "tilt"), [("RGS000", 0.0), ("RGS180", 4.0), ("BGS000", 0.0)])
+@pytest.mark.parametrize(
+    ("grism", "tilt"), [("RGS000", 0.0), pytest.param("RGS180", 4.0, marks=pytest.mark.nightly), ("BGS000", 0.0)]
+)
 def test_lines_are_resolved_as_required(grism, tilt):
     required = {record.key: record.value for record in read_all() if record.status == "REQ"}
     least = required[f"nisp.{grism.lower()}.resolving_power"]

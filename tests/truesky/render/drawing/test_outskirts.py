@@ -161,10 +161,6 @@ def test_light_far_from_the_centre_is_where_it_belongs(shape, mag, place):
 @given(LARGE, st.sampled_from([8.0, 10.0, 12.0]), PLACES, st.sampled_from(["vis", "lsstcam"]))
 @example(EDGE_ON, 10.0, (HALF, 400.0), "lsstcam")
 @example(shape_of(0.0, 120.0, 0.3, 0.02, 90.0, 5.9), 6.0, (HALF, 0.0), "vis")
-@example(shape_of(0.0, 120.0, 0.3, 0.02, 90.0, 57.0), 6.0, (HALF, -HALF), "vis")
-@example(shape_of(0.0, 120.0, 0.3, 0.02, 90.0, 13.0), 6.0, (HALF, -HALF), "vis").xfail(
-    raises=AssertionError, reason="rings by 5.93e-10 of its light beyond the corner into which its ridge runs"
-)
 def test_any_large_galaxy_is_drawn_to_its_outskirts(shape, mag, place, camera):
     found, expected, size = drawn_and_expected(camera, psf_of(camera), shape, mag, place, 1)
     # What a smaller stamp does not hold is below what the settings leave out.
@@ -178,6 +174,10 @@ def test_any_large_galaxy_is_drawn_to_its_outskirts(shape, mag, place, camera):
 @pytest.mark.nightly
 @settings(max_examples=60)
 @given(LARGE, st.floats(6.0, 14.0), PLACES, st.sampled_from(["vis", "lsstcam"]))
+@example(shape_of(0.0, 120.0, 0.3, 0.02, 90.0, 57.0), 6.0, (HALF, -HALF), "vis")
+@example(shape_of(0.0, 120.0, 0.3, 0.02, 90.0, 13.0), 6.0, (HALF, -HALF), "vis").xfail(
+    raises=AssertionError, reason="rings by 5.93e-10 of its light beyond the corner into which its ridge runs"
+)
 def test_many_large_galaxies_are_drawn_to_their_outskirts(shape, mag, place, camera):
     test_any_large_galaxy_is_drawn_to_its_outskirts.hypothesis.inner_test(shape, mag, place, camera)
 
@@ -256,11 +256,10 @@ def test_all_light_is_somewhere():
     with mock.patch.object(outskirts, "of_galaxy", wraps=outskirts.of_galaxy) as made:
         image = stamps.draw(source, stamp_sizes.SIZES[-1:], psf_of("lsstcam"), 3000, 3000, tally=stamps.Tally(drawn))
     made.assert_called_once()
-    y, x = np.mgrid[-4499:4500:3, -4499:4500:3]
-    light = profile(shape, source.jacobian[0], x, y) * 9.0
-    inside = light[(abs(x) < 1500) & (abs(y) < 1500)].sum() / light.sum()
-    beyond = 1.0 - light.sum()
-    assert image.sum() == pytest.approx(1e9 * inside * (1.0 - beyond), rel=1e-4)
+    # Of the frame every third pixel of every third row.
+    middles = np.meshgrid(np.arange(-1499, 1500, 3), np.arange(-1499, 1500, 3))
+    inside = 9.0 * profile(shape, source.jacobian[0], *middles).sum()
+    assert image.sum() == pytest.approx(1e9 * inside, rel=1e-4)
     assert drawn[0] == pytest.approx(image.sum(), rel=1e-9)
     assert image.min() >= 0.0
 

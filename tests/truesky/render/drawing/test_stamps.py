@@ -116,7 +116,9 @@ def test_no_light_is_lost(kind, x, y, electrons, accuracy):
 
 
 @pytest.mark.parametrize(("camera", "sizes"), [("vis", (64, 96, 160)), ("lsstcam", (48, 64, 96))])
-@pytest.mark.parametrize(("index", "radius"), [(2.5, 0.5), (4.0, 0.4), (6.2, 0.2)])
+@pytest.mark.parametrize(
+    ("index", "radius"), [(2.5, 0.5), pytest.param(4.0, 0.4, marks=pytest.mark.nightly), (6.2, 0.2)]
+)
 def test_light_beyond_the_stamp_is_where_it_belongs(camera, sizes, index, radius):
     """The light inside circles is that of a stamp that holds the frame, and of the closed form where no PSF matters."""
     detector, system, psf = scene(camera, {"vis": "3-4", "lsstcam": "R22_S11"}[camera], n=512)

@@ -143,6 +143,18 @@ def test_what_a_request_forces_is_recorded():
     assert not decisions["read_noise"].forced
 
 
+def test_a_contribution_is_computed_once_for_a_decision():
+    """Some take as long as the effect itself."""
+    (dark,) = (e for e in ground.SKY if e.name == "dark_current")
+    for kept in (None, lambda scene: 3.0):
+        asked = []
+        counted = replace(dark, contribution=lambda scene, asked=asked: asked.append(scene) or 2.0, repeated=kept)
+        (decision,) = decide([counted], SCENE)
+        assert len(asked) == 1
+        assert decision.margin == pytest.approx(32.0 * (2.0 if kept is None else 3.0) / (0.1 * SCENE.pixel_noise))
+        assert decision.applied
+
+
 def test_strange_or_impossible_wishes_are_refused():
     # Of another channel.
     assert len(decide(SOME, replace(SCENE, forced={"ghosts": True}))) == len(SOME)

@@ -2,6 +2,7 @@
 
 import re
 import tomllib
+from functools import cache
 
 import numpy as np
 import pytest
@@ -26,21 +27,32 @@ def made(block, area=(0.0, 0.0, 1.0)):
 PLACES = [(0.0, 35.0), (359.9999, -35.0), (10.0, 90.0), (200.0, -90.0), (123.0, 89.99), (150.1, 2.2)]
 
 
+def one_visit(ra, dec, angle):
+    """Rows of `exposures` and `tasks` of a field of one exposure."""
+    block = {"channels": ["VIS"], "ra": ra, "dec": dec, "position_angle": angle, "dither": "none"}
+    return plan_exposures.plan(None, made({**block, "flat": False, "short": False}))[1:]
+
+
+@cache
+def upright(ra, dec):
+    """Rows of `tasks` of a field that is not turned, for all of its angles."""
+    return one_visit(ra, dec, 0.0)[1]
+
+
 @pytest.mark.parametrize(("ra", "dec"), PLACES)
 @pytest.mark.parametrize("angle", [0.0, 359.999, -180.0])
 def test_a_field_is_centred_where_it_was_asked_for(ra, dec, angle):
-    block = {"channels": ["VIS"], "ra": ra, "dec": dec, "position_angle": angle, "dither": "none", "flat": False}
-    _, exposures, rows = plan_exposures.plan(None, made({**block, "short": False}))
+    exposures, rows = one_visit(ra, dec, angle)
     (row,) = exposures.to_pylist()
     assert float(sky.separation(row["ra"], row["dec"], ra, dec)) < 1e-9
     assert (row["position_angle"] - angle + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=1e-9)
     # The detectors lie around the centre, and the y axis has its angle there: the field turns with it.
     east, north = offsets(rows["ra"].to_numpy(), rows["dec"].to_numpy(), row["ra"], dec)
     assert np.abs([east.mean(), north.mean()]).max() < 0.02
-    upright = plan_exposures.plan(None, made({**block, "short": False, "position_angle": 0.0}))[2]
-    east0, north0 = offsets(upright["ra"].to_numpy(), upright["dec"].to_numpy(), row["ra"], dec)
+    other = upright(ra, dec)
+    east0, north0 = offsets(other["ra"].to_numpy(), other["dec"].to_numpy(), row["ra"], dec)
     turn = np.radians(angle)
-    order, order0 = np.argsort(rows["detector"].to_numpy()), np.argsort(upright["detector"].to_numpy())
+    order, order0 = np.argsort(rows["detector"].to_numpy()), np.argsort(other["detector"].to_numpy())
     np.testing.assert_allclose(east[order], (np.cos(turn) * east0 + np.sin(turn) * north0)[order0], atol=2e-6)
     np.testing.assert_allclose(north[order], (np.cos(turn) * north0 - np.sin(turn) * east0)[order0], atol=2e-6)
 

@@ -1,5 +1,7 @@
 """The same sky by several cameras: what lies where, whatever a detector's scale and turn."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from matplotlib.image import imread
@@ -23,13 +25,19 @@ PLACE = 150.0, 2.0
 STARS = ((0.0, 0.0, 4e4), (30.0, 0.0, 3e4), (0.0, 40.0, 2e4))
 
 
+def _middle(detector):
+    """Of a detector as much as holds the patch, wherever the place lies in it."""
+    side = round((same_sky.SIDE + 60.0) / detector.pixel_scale)
+    return replace(detector, nx=side, ny=side, middle=0)
+
+
 @pytest.fixture(scope="module")
 def rows(tmp_path_factory):
     """An image of each camera with the stars on it, whose place lies a few arcsec from its middle."""
     folder, found = tmp_path_factory.mktemp("images"), []
     rng = np.random.default_rng(5)
     for number, (camera, name, channel, band, angle) in enumerate(CAMERAS):
-        detector = detectors.detector(camera, name, MISSION)
+        detector = _middle(detectors.detector(camera, name, MISSION))
         about = astrometry.wcs(detector, *PLACE, angle)
         # The boresight that brings the detector's middle near the place.
         ra, dec = astrometry.centre(detector, about)

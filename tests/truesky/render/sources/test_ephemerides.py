@@ -341,7 +341,9 @@ def test_a_request_names_it(tmp_path, monkeypatch):
         parse(path)
 
 
-@pytest.mark.parametrize(("rate", "turn"), [(300.0, 0.0), (3000.0, 1.1), (1e5, 0.4)])
+@pytest.mark.parametrize(
+    ("rate", "turn"), [(300.0, 0.0), pytest.param(3000.0, 1.1, marks=pytest.mark.nightly), (1e5, 0.4)]
+)
 def test_a_fast_body_is_seen_however_far_its_trail_goes(tmp_path, rate, turn):
     """What it leaves as it passes the detector goes with the time that it takes across."""
     detector = small("vis", "3-4", 256)
