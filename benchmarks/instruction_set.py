@@ -23,12 +23,8 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import lake_schema  # noqa: F401
-from benchmarks import _detectors, catalogue, fluxes, nisp_s, report, vis
+from benchmarks import report
 from lake_schema import instruction_set
-from truesky.fluxes.libraries import templates
-from truesky.fluxes.sources import galaxies_of
-from truesky.request.accuracy import SURVEY
-from truesky.request.from_toml import parse
 
 SETTINGS = (instruction_set.PORTABLE, instruction_set.NATIVE)
 _GALAXIES, _GENERATION_CELLS = 200_000, 4
@@ -40,7 +36,10 @@ _NOTES = {
 }
 
 
+# A subject imports what it needs, since a process for another subject would load it for seconds.
 def _vis(folder: Path, quick: bool) -> Callable[[], Any]:
+    from benchmarks import _detectors, vis
+
     plain = vis.request(quick)
     root = _detectors.lake(folder, plain)
     facts = _detectors.prepared(root, vis.full(plain))
@@ -48,6 +47,9 @@ def _vis(folder: Path, quick: bool) -> Callable[[], Any]:
 
 
 def _nisp_s(folder: Path, quick: bool) -> Callable[[], Any]:
+    from benchmarks import _detectors, nisp_s
+    from truesky.request.from_toml import parse
+
     file = folder / "request.toml"
     file.write_text(nisp_s.request(quick), encoding="utf-8")
     plain = parse(file)
@@ -57,12 +59,19 @@ def _nisp_s(folder: Path, quick: bool) -> Callable[[], Any]:
 
 
 def _fluxes(folder: Path, quick: bool) -> Callable[[], Any]:
+    from benchmarks import fluxes
+    from truesky.fluxes.libraries import templates
+    from truesky.fluxes.sources import galaxies_of
+    from truesky.request.accuracy import SURVEY
+
     library = templates.galaxy_library()
     rows = galaxies_of(fluxes.sample(1000 if quick else _GALAXIES, 3), library)
     return lambda: fluxes._interpolated(rows, library, SURVEY)
 
 
 def _catalogue(folder: Path, quick: bool) -> Callable[[], Any]:
+    from benchmarks import catalogue
+
     about = catalogue.facts(quick=True)
     return lambda: catalogue.make(catalogue.CELL, 1 if quick else _GENERATION_CELLS, about)
 

@@ -1,11 +1,12 @@
-"""What the chain makes, in this process, as digests: python -m tests.chain table|quick|whole FOLDER prints them as JSON.
+"""What the chain makes, in this process, as digests in JSON: python -m tests.chain table|quick|whole FOLDER.
 
 table  the table of galaxies' fluxes in one band
 quick  tables of galaxies' fluxes, of the PSF, of shapes; products and solutions as they occur
 whole  besides, those of stars; a small lake by the jobs' own plans: galaxies, stars, fluxes, two CCDs; every array in
        the cache
 
-Only what is made is imported, since a process for a single table is mostly imports. With --keep the arrays themselves are written beside the digests, to be compared number by number.
+Only what is made is imported, since a process for a single table is mostly imports. With --keep the arrays themselves
+are written beside the digests, to be compared number by number.
 """
 
 import argparse
@@ -90,12 +91,9 @@ def whole(folder):
     from truesky.request.from_toml import from_table
 
     yield from quick()
-    stellar = templates.stellar_library()
+    stellar, vis = templates.stellar_library(), passbands.load("euclid_vis")
     yield "stellar_templates", stellar.flux
-    yield (
-        "star_table",
-        build_tables.star_table(passbands.load("euclid_vis"), stellar, build_tables.library_key(stellar)),
-    )
+    yield "star_table", build_tables.star_table(vis, stellar, build_tables.library_key(stellar))
     root = layout.lake(folder / "lake")
     root.mkdir(parents=True)
     wanted = from_table(REQUEST)

@@ -1,5 +1,10 @@
 """Libraries that read HATS. They take seconds to load, in each process of tests, so a test loads them when it runs."""
 
+from functools import cache
+
+# Names the folder of compiled code.
+import truesky.numerics.compiling  # noqa: F401
+
 
 def is_valid(folder):
     """Return whether a catalogue is valid by the strict rules of `hats`."""
@@ -8,8 +13,21 @@ def is_valid(folder):
     return is_valid_catalog(str(folder), strict=True)
 
 
-def open_catalog(folder):
+def open_catalog(folder, **options):
     """Open a catalogue by `lsdb`."""
     import lsdb
 
-    return lsdb.open_catalog(str(folder))
+    _keep_compiled_code()
+    return lsdb.open_catalog(folder, **options)
+
+
+@cache
+def _keep_compiled_code():
+    """Keep the compiled code of `hats` in the cache: it compiles for 5 s in each process that matches catalogues."""
+    from hats.pixel_tree import moc_filter, pixel_alignment
+    from numba.core.dispatcher import Dispatcher
+
+    for module in (moc_filter, pixel_alignment):
+        for compiled in vars(module).values():
+            if isinstance(compiled, Dispatcher):
+                compiled.enable_caching()

@@ -119,14 +119,15 @@ def versions(root):
     return [promise.current(root, "plain", name) for name in "ab"]
 
 
-def test_death_between_any_two_steps_leaves_every_request_its_version(two_requests):
+@pytest.mark.parametrize("stride", [5, pytest.param(1, marks=pytest.mark.nightly)])
+def test_death_between_any_two_steps_leaves_every_request_its_version(stride, two_requests):
     """The one that publishes has its old or its new version, whole, the other its own; then gc takes from neither."""
     first, other, new = (promise.key("plain", seed) for seed in (1, 3, 2))
     root = two_requests()
     with Disc(root) as disc:
         promise.make(root, "plain", 2, name="a")
     found = set()
-    for n in range(len(disc.calls), 0, -2):
+    for n in range(len(disc.calls), 0, -stride):
         root = two_requests()
         with Disc(root, die_at=n), pytest.raises(Killed):
             promise.make(root, "plain", 2, name="a")

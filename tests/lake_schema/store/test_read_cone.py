@@ -12,6 +12,7 @@ from lake_schema.columns import Column, Table
 from lake_schema.errors import BadInput
 from lake_schema.store import layout, publish, read
 from lake_schema.store.plan import Output, Part, Plan
+from tests import hats_readers
 from tests.universe import TOY, toy_plan, toy_work
 
 LENSED = Table(
@@ -141,12 +142,11 @@ def test_a_version_that_does_not_know_its_deflection(catalogues):
 
 
 def test_other_readers_open_mixed_orders(catalogues):
-    import lsdb
-    from hats.io.validation import is_valid_catalog
-
     corner, _, version = catalogues[0]
-    assert is_valid_catalog(str(version.folder), strict=True)
-    found = lsdb.open_catalog(str(version.folder)).cone_search(float(corner[0][0]), float(corner[1][0]), 60.0).compute()
+    assert hats_readers.is_valid(version.folder)
+    found = (
+        hats_readers.open_catalog(version.folder).cone_search(float(corner[0][0]), float(corner[1][0]), 60.0).compute()
+    )
     assert sorted(found["id"]) == sorted(
         version.cone(float(corner[0][0]), float(corner[1][0]), 1 / 60, ["id"])["id"].to_pylist()
     )
@@ -168,8 +168,6 @@ def test_the_margin_of_each_cell_is_what_lies_about_it(catalogues):
 
 def test_a_cross_match_loses_no_pair_across_cells_of_other_orders(catalogues, tmp_path):
     """Every source has a twin 0.5" to the north, in files cut in another way."""
-    import lsdb
-
     _, rows, version = catalogues[0]
     columns = {name: rows[name].to_numpy() for name in rows.column_names}
     columns["dec"] = columns["dec"] + 0.5 / 3600
@@ -185,6 +183,6 @@ def test_a_cross_match_loses_no_pair_across_cells_of_other_orders(catalogues, tm
     moved = dict(zip(columns["id"].tolist(), columns["_healpix_29"].tolist(), strict=True))
     stayed = dict(zip(rows["id"].to_pylist(), rows["_healpix_29"].to_pylist(), strict=True))
     assert sum(file_of[moved[i]] != file_of[stayed[i]] for i in stayed) > 100
-    left, right = (lsdb.open_catalog(str(one.folder), columns=["id", "ra", "dec"]) for one in (version, twins))
+    left, right = (hats_readers.open_catalog(one.folder, columns=["id", "ra", "dec"]) for one in (version, twins))
     pairs = left.crossmatch(right, radius_arcsec=0.6, n_neighbors=4, suffixes=("_a", "_b")).compute()
     assert set(pairs["id_a"][pairs["id_a"] == pairs["id_b"]]) == set(range(N))

@@ -190,19 +190,26 @@ BOUNDLESS = [
 ]
 
 
+@pytest.fixture(scope="module")
+def small(explored):
+    """An explorer of little memory."""
+    with Explorer(explored, memory=256 << 20) as opened:
+        yield opened
+
+
 @pytest.mark.parametrize("text", ENDLESS + BOUNDLESS)
-def test_time_and_memory_have_a_limit(explored, text):
-    with Explorer(explored, memory=256 << 20, timeout=30.0) as explorer:
-        # The process is there: it is the query that is stopped.
-        assert explorer.sql("SELECT 1 AS n")["n"][0] == 1
-        explorer.timeout = 0.3 if text in ENDLESS else 1.0
-        started = time.monotonic()
-        with pytest.raises(BadInput, match=rf"stopped after {explorer.timeout:g} s|more memory"):
-            explorer.sql(text)
-        assert time.monotonic() - started < explorer.timeout + 60.0
-        # The next question is answered by a new process, or by the same.
-        explorer.timeout = 30.0
-        assert explorer.sql("SELECT count(*) AS n FROM plain")["n"][0] == 60
+def test_time_and_memory_have_a_limit(small, text):
+    # The process is there: it is the query that is stopped.
+    small.timeout = 30.0
+    assert small.sql("SELECT 1 AS n")["n"][0] == 1
+    small.timeout = 0.3 if text in ENDLESS else 1.0
+    started = time.monotonic()
+    with pytest.raises(BadInput, match=rf"stopped after {small.timeout:g} s|more memory"):
+        small.sql(text)
+    assert time.monotonic() - started < small.timeout + 60.0
+    # The next question is answered by a new process, or by the same.
+    small.timeout = 30.0
+    assert small.sql("SELECT count(*) AS n FROM plain")["n"][0] == 60
 
 
 GOOD = [

@@ -5,17 +5,31 @@ import pytest
 from lake_schema.errors import BadInput, Damaged
 from lake_schema.store import layout, read
 from lake_schema.store.object_storage import push, s3
+from tests import hats_readers
+from tests import object_storage as storage
 from truesky.explore import __main__
 from truesky.explore.explorer import Explorer
 from truesky.explore.object_storage import catalogue
 
+BUCKET = "explored-by-all"
+
+
+@pytest.fixture(scope="module")
+def pushed(explored, object_storage):
+    """Address of the lake of this folder, pushed once; a test that changes an object puts it back."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in storage.CREDENTIALS.items():
+            patch.setenv(name, value)
+        object_storage.client.create_bucket(Bucket=BUCKET)
+        place = s3.address(f"s3://{BUCKET}/lake", object_storage.url)
+        list(push.push(explored, place))
+    return str(place)
+
 
 @pytest.fixture
-def there(explored, bucket):
-    """Address of the lake of this folder, pushed."""
-    place = s3.address(f"s3://{bucket[1]}/lake", bucket[0].url)
-    list(push.push(explored, place))
-    return str(place)
+def there(pushed, bucket):
+    """The same with an environment that leads there."""
+    return pushed
 
 
 def test_questions_have_the_same_answers(explored, there, monkeypatch):
@@ -44,21 +58,22 @@ def test_the_command_takes_an_address(there, capsys, bucket):
 
 
 def test_a_changed_object_is_refused_by_name_in_sql(there, bucket):
-    service, name = bucket
+    service, name = bucket[0], BUCKET
     with Explorer(there) as lake:
         assert lake.sql("SELECT count(*) AS n FROM plain")["n"][0] == 60
         key = next(key for key in service.names(name) if key.endswith("/1.parquet"))
         data = service.data(name, key)
         service.client.put_object(Bucket=name, Key=key, Body=data[:50] + bytes([data[50] ^ 1]) + data[51:])
-        with pytest.raises(Damaged, match=f"s3://{name}/{key} "):
-            lake.sql("SELECT sum(value) FROM plain")
+        try:
+            with pytest.raises(Damaged, match=f"s3://{name}/{key} "):
+                lake.sql("SELECT sum(value) FROM plain")
+        finally:
+            service.client.put_object(Bucket=name, Key=key, Body=data)
 
 
 def test_lsdb_reads_it_through_pyarrow(explored, there, monkeypatch):
-    import lsdb
-
     monkeypatch.delenv("AWS_ENDPOINT_URL")
-    galaxies = lsdb.open_catalog(catalogue(there, "galaxies"), columns="all")
+    galaxies = hats_readers.open_catalog(catalogue(there, "galaxies"), columns="all")
     assert len(galaxies.compute()) == 500
     here = read.version(explored, "galaxies")
     ra, dec = (here.rows()[name][0].as_py() for name in ("ra", "dec"))
