@@ -64,6 +64,8 @@ _TOKEN = re.compile(
 
 def expanded(text: str | Path, folder: Path | None = None) -> Path:
     """A path as it was typed, ~ replaced, found from a folder."""
+    if not isinstance(text, str | Path):
+        raise BadInput(f"{shown(repr(text))} is not a path")
     if len(str(text)) > _LONGEST_PATH:
         # Following its links, were there any, takes a square of the time.
         raise BadInput(f"{shown(text)}: File name too long")

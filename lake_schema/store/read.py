@@ -22,7 +22,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as ds
 
-from lake_schema import sky
+from lake_schema import bounds, sky
 from lake_schema import tables as declarations
 from lake_schema.arrays import Int
 from lake_schema.columns import Table
@@ -207,7 +207,10 @@ class Version:
         ra, dec, radius : deg
         on              : "observed" or "true", which of a source's positions counts
         columns         : that are wanted; None: all of them
+        Errors          : BadInput for a place or radius outside its bounds, or a column that is not there
         """
+        radius = bounds.number("radius", radius, 0.0, 180.0)
+        sky.checked(bounds.number("ra", ra), bounds.number("dec", dec))
         place = self.place(on)
         self._refuse_unknown([*place, "_healpix_29"])
         # Files go by observed positions: a source may lie so far beyond the cells of its true one.
@@ -343,9 +346,9 @@ def as_declared(opened: Version, table: Table) -> Version:
 @lru_cache(maxsize=64)
 def _declared(stored: pa.Schema, units: tuple[bytes, ...], was: int, table: Table) -> pa.Schema:
     if was != table.version:
-        who = "a later" if was > table.version else "an earlier"
+        # Numbers of development versions do not tell which is the later one.
         raise VersionMismatch(
-            f"table {table.name}: {who} truesky wrote it: "
+            f"table {table.name}: another version of truesky wrote it: "
             f"its declaration is of version {was}, this truesky reads version {table.version}"
         )
     if stored.names and (fault := _difference(stored, table)):

@@ -118,6 +118,11 @@ def test_what_a_cone_refuses(lake, catalogues):
         ((0.0, 91.0, 1.0), "dec"),
         ((0.0, 0.0, -1.0), "radius"),
         ((float("nan"), 0.0, 1.0), "ra"),
+        ((float("inf"), 0.0, 1.0), "ra"),
+        (("a", 0.0, 1.0), "ra = 'a' is not a number"),
+        ((0.0, None, 1.0), "dec = None is not a number"),
+        *(((0.0, 0.0, radius), "radius") for radius in (float("nan"), float("inf"), 1e9, "x", 180.1)),
+        ((0.0, 0.0, -1e-5, ["id"], "true"), "radius"),
         ((0.0, 0.0, 1.0, ["id"], "seen"), "on = 'seen'"),
         ((0.0, 0.0, 1.0, ["speed"]), "no column speed"),
     ):
