@@ -54,7 +54,7 @@ def differing(one, other):
 
 @pytest.fixture(scope="module")
 def standard(tmp_path_factory):
-    """What others are compared with: from a cold cache, by one thread, with the standard instruction set."""
+    """Digests from a cold cache, by one thread, with the standard instruction set: the reference of all comparisons."""
     folder = tmp_path_factory.mktemp("standard")
     return digests("quick", folder, folder / "cache", 1, KERNELS[0])
 

@@ -286,9 +286,7 @@ def browser():
     if chromium is None:
         pytest.skip("no chromium (Debian: apt install chromium)")
     with playwright.sync_playwright() as started:
-        # Without a GPU, a compositor that needs none takes half of the CPU time.
-        args = ["--no-sandbox", "--disable-gpu-compositing"]
-        running = started.chromium.launch(executable_path=chromium, args=args)
+        running = started.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
         yield running
         running.close()
 
