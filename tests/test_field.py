@@ -116,19 +116,19 @@ def test_python_reads_images_and_truth(field):
         assert len(lake.extensions(first["path"])) > 1
         truth = lake.truth(first["exposure_id"], first["detector"])
         # The WCS counts from the pixels that `image` returns. Galaxies do not move, as stars do.
-        found = truth.merge(lake.table("galaxies", ["id", "ra", "dec"], into="pandas"), on="id")
+        found = truth.merge(lake.table("galaxies", ["id", "ra", "dec"]), on="id")
         x, y = lake.wcs(first["path"]).all_world2pix(found["ra"], found["dec"], 0)
         assert len(found) > 100
         assert np.abs(x - found["x"]).max() < 1e-3
         assert np.abs(y - found["y"]).max() < 1e-3
         with pytest.raises(truesky.BadInput, match="is no image of spectra"):
-            list(lake.models(first["exposure_id"], first["detector"]))
+            lake.models(first["exposure_id"], first["detector"])
         assert len(truth) > 1000
         assert set(truth["detector"]) == {first["detector"]}
         with pytest.raises(truesky.BadInput, match="nothing was rendered for detector 9-9"):
             lake.truth(1, "9-9")
         ra, dec = 53.117, -27.808
-        near = lake.cone("galaxies", ra, dec, 0.02, ["id", "ra", "dec"], into="pandas")
+        near = lake.cone("galaxies", ra, dec, 0.02, ["id", "ra", "dec"])
         assert len(near) > 100
         assert sky.separation(near["ra"].to_numpy(), near["dec"].to_numpy(), ra, dec).max() <= 0.02
 

@@ -5,6 +5,8 @@ run         compute everything that a request asks for
 check       report what is wrong with a request
 accuracies  what each named accuracy allows, reaches and costs
 plots       draw what `Lake.hist`, `Lake.heatmap` and `Lake.skymap` count
+Lake, Image, Request             results of `open`, of `Lake.image` and of `check`
+LakeError, BadInput, Damaged     errors; the first is the base class of the others
 """
 
 from __future__ import annotations
@@ -13,19 +15,26 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from lake_schema import __version__
-from lake_schema.errors import BadInput, LakeError
+from lake_schema.errors import BadInput, Damaged, LakeError
 
 if TYPE_CHECKING:
+    from lake_schema.fits.images import Image
     from truesky.api.lake import Lake
     from truesky.api.lake import Lake as open
     from truesky.api.simulate import accuracies, check, run
     from truesky.explore import plots
+    from truesky.request.schema import Request
 
-__all__ = ["BadInput", "Lake", "LakeError", "__version__", "accuracies", "check", "open", "plots", "run"]
+__all__ = [
+    "BadInput", "Damaged", "Image", "Lake", "LakeError", "Request", "__version__", "accuracies", "check", "open",
+    "plots", "run",
+]  # fmt: skip
 
 # Loaded when they are first used: together they take seconds to import.
 _LAZY: dict[str, tuple[str, str | None]] = {
+    "Image": ("lake_schema.fits.images", "Image"),
     "Lake": ("truesky.api.lake", "Lake"),
+    "Request": ("truesky.request.schema", "Request"),
     "accuracies": ("truesky.api.simulate", "accuracies"),
     "check": ("truesky.api.simulate", "check"),
     "open": ("truesky.api.lake", "Lake"),

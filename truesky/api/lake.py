@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
+from lake_schema import bounds
 from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 from lake_schema.fits import images
@@ -19,12 +19,19 @@ from truesky.api.tables import LakeTables
 if TYPE_CHECKING:
     from astropy.wcs import WCS
 
+# Numbers of exposures and sources are 64-bit integers.
+_LARGEST = 2**63 - 1
+
 
 class Lake(LakeTables):
     """A lake, opened for reading.
 
     All methods see the tables as they were when the lake was opened, whatever is published later. Use a `with` block,
     or call `close`, to end the process that answers queries.
+
+    Several threads may use the same lake. One process answers its queries one after the other, so open the lake once
+    per thread to run queries at the same time. `close` also ends queries that other threads are waiting for; these
+    raise `BadInput`.
 
     Parameters
     ----------
@@ -151,26 +158,28 @@ class Lake(LakeTables):
         detector : str
             Name of the detector.
         sources : sequence of int, optional
-            Identifiers of the sources. The default is all sources that have light on the detector.
+            Identifiers of the sources. The default is all sources whose spectra may reach the detector.
 
         Yields
         ------
         source : int
             Identifier.
         electrons : ndarray of float64, shape (ny, nx)
-            Expected electrons of this source, in all orders of the grism.
+            Expected electrons of this source, in all orders of the grism. They are 0 if its spectrum misses the
+            detector by little.
 
         Raises
         ------
         BadInput
-            If there is no such image, it is not dispersed, or a source has no light on the detector.
+            At the call, if there is no such image, it is not dispersed, or the spectrum of a source cannot reach the
+            detector.
         """
         from truesky.render import models
 
-        self._explorer._version("products")
-        ids = None if sources is None else [int(source) for source in sources]
-        root = Path(str(self._explorer.root))
-        found = models.models(root, int(exposure_id), str(detector), ids, self._request)
+        version = self._explorer._version("products")
+        number = bounds.whole("exposure_id", exposure_id, 0, _LARGEST)
+        ids = None if sources is None else bounds.wholes("sources", sources, 0, _LARGEST)
+        found = models.models(self._explorer.root, version, number, str(detector), ids)
         return ((one.id, one.frame) for one in found)
 
     def truth(self, exposure_id: int, detector: str) -> pd.DataFrame:

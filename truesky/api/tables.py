@@ -9,8 +9,9 @@ from typing import Any, Self
 
 import pandas as pd
 
+from lake_schema import bounds
 from lake_schema.arrays import Float, Int
-from truesky.explore.explorer import Explorer
+from truesky.explore.explorer import ORDER, Explorer
 from truesky.explore.process import MEMORY, TIMEOUT
 
 
@@ -20,7 +21,6 @@ class LakeTables:
     def __init__(
         self, path: str | Path, request: str | None = None, memory: float = MEMORY, timeout: float = TIMEOUT
     ) -> None:
-        self._request = request
         self._explorer = Explorer(str(path) if isinstance(path, Path) else path, memory, timeout, request)
 
     def __repr__(self) -> str:
@@ -65,7 +65,7 @@ class LakeTables:
         """
         return self._explorer.describe(table)
 
-    def table(self, name: str, columns: str | Sequence[str] | None = None, into: str = "arrow") -> Any:
+    def table(self, name: str, columns: str | Sequence[str] | None = None, into: str = "pandas") -> Any:
         """Read a table.
 
         Parameters
@@ -74,12 +74,12 @@ class LakeTables:
             Name of the table.
         columns : str or sequence of str, optional
             Names of the columns to read. The default is all columns.
-        into : {"arrow", "pandas", "astropy"}, optional
+        into : {"pandas", "arrow", "astropy"}, optional
             Kind of the result. An astropy table has units.
 
         Returns
         -------
-        pyarrow.Table, pandas.DataFrame or astropy.table.Table
+        pandas.DataFrame, pyarrow.Table or astropy.table.Table
         """
         from truesky.explore import results
 
@@ -96,7 +96,7 @@ class LakeTables:
         into : {"pandas", "arrow", "astropy"}, optional
             Kind of the result.
         **parameters
-            Values of the parameters: numbers, strings, booleans or lists of them.
+            Values of the parameters: numbers, strings, booleans, or lists, tuples and arrays of them.
 
         Returns
         -------
@@ -119,7 +119,7 @@ class LakeTables:
         radius: float,
         columns: str | Sequence[str] | None = None,
         on: str = "observed",
-        into: str = "arrow",
+        into: str = "pandas",
     ) -> Any:
         """Read the rows of a catalogue within a circle on the sky.
 
@@ -130,17 +130,17 @@ class LakeTables:
         ra, dec : float
             Centre of the circle, ICRS, in degrees.
         radius : float
-            Radius of the circle in degrees.
+            Radius of the circle in degrees, from 0 to 180.
         columns : str or sequence of str, optional
             Names of the columns to read. The default is all columns.
         on : {"observed", "true"}, optional
             Select by observed positions, or by the true ones without gravitational lensing.
-        into : {"arrow", "pandas", "astropy"}, optional
+        into : {"pandas", "arrow", "astropy"}, optional
             Kind of the result.
 
         Returns
         -------
-        pyarrow.Table, pandas.DataFrame or astropy.table.Table
+        pandas.DataFrame, pyarrow.Table or astropy.table.Table
         """
         return self._explorer.cone(table, ra, dec, radius, _names(columns), on, into)
 
@@ -152,8 +152,8 @@ class LakeTables:
         query : str
             One SELECT, as for `sql`.
         path : str or Path
-            File to write. Its ending selects the format: ``.csv``, ``.parquet``, ``.fits`` or ``.vot``. Units and UCDs
-            are written where the format has them.
+            File to write; ``~`` is the home folder. Its ending selects the format: ``.csv``, ``.parquet``, ``.fits``
+            or ``.vot``. Units and UCDs are written where the format has them.
         **parameters
             Values of the parameters of the query.
 
@@ -190,7 +190,7 @@ class LakeTables:
         where : str, optional
             SQL condition of the rows that count.
         weight : str, optional
-            SQL expression that is summed instead of 1.
+            SQL expression that is summed instead of 1. Rows without a value count as 0.
 
         Returns
         -------
@@ -225,7 +225,7 @@ class LakeTables:
         where : str, optional
             SQL condition of the rows that count.
         weight : str, optional
-            SQL expression that is summed instead of 1.
+            SQL expression that is summed instead of 1. Rows without a value count as 0.
 
         Returns
         -------
@@ -236,7 +236,9 @@ class LakeTables:
         """
         return self._explorer.heatmap(table, x, y, bins, span, where, weight)
 
-    def skymap(self, table: str, order: int = 8, where: str = "true", weight: str | None = None) -> tuple[Int, Float]:
+    def skymap(
+        self, table: str, order: int = ORDER, where: str = "true", weight: str | None = None
+    ) -> tuple[Int, Float]:
         """Count the rows of a catalogue in nested HEALPix cells.
 
         Parameters
@@ -248,17 +250,17 @@ class LakeTables:
         where : str, optional
             SQL condition of the rows that count.
         weight : str, optional
-            SQL expression that is summed instead of 1.
+            SQL expression that is summed instead of 1. Rows without a value count as 0.
 
         Returns
         -------
         cells : ndarray of int64, shape (n,)
             Cells that hold any row, ascending.
         counts : ndarray of float64, shape (n,)
-            As ``truesky.plots.skymap`` takes them.
+            As ``truesky.plots.skymap`` takes them, together with the order if it is not 8.
         """
         return self._explorer.skymap(table, order, where, weight)
 
 
 def _names(columns: str | Sequence[str] | None) -> Sequence[str] | None:
-    return [columns] if isinstance(columns, str) else columns
+    return None if columns is None else bounds.names("columns", columns)

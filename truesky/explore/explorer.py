@@ -9,17 +9,21 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lake_schema import sky
+from lake_schema import bounds, sky, user_files
 from lake_schema.arrays import Float, Int
-from lake_schema.errors import BadInput, LakeError
+from lake_schema.errors import BadInput, LakeError, VersionMismatch
 from lake_schema.store import layout, names, read
 from lake_schema.store.object_storage.s3 import Folder
 from truesky.explore import results
-from truesky.explore.process import MEMORY, TIMEOUT, TIMEOUT_HI, Process, check
+from truesky.explore.process import MEMORY, TIMEOUT, TIMEOUT_HI, Process
 
 Range = tuple[float, float]
 
+# Order of the cells of a map of the sky if none is given.
+ORDER = 8
 _MOST_BINS = 10_000
+# How a table that cannot be read is listed, by its error; all others are damaged.
+_UNREADABLE: dict[type[LakeError], str] = {VersionMismatch: "unreadable version"}
 
 
 class Explorer:
@@ -51,8 +55,7 @@ class Explorer:
         versions += [f"{name}=?{request or name.rpartition('.')[0]}" for name in (*self.damaged, *self._unclear)]
         self._named, self._memory = versions, memory
         self._process = self.process()
-        check("timeout", timeout, 0.0, TIMEOUT_HI)
-        self.timeout = timeout
+        self.timeout = bounds.number("timeout", timeout, 0.0, TIMEOUT_HI)
 
     def _open(self, name: str, request: str | None, table: str) -> None:
         try:
@@ -96,7 +99,7 @@ class Explorer:
             if self.is_listed(name)
         ]
         rows += [
-            {"table": name, "version": "damaged", "meaning": str(error)}
+            {"table": name, "version": _UNREADABLE.get(type(error), "damaged"), "meaning": str(error)}
             for name, error in self.damaged.items()
             if self.is_listed(name)
         ]
@@ -153,8 +156,9 @@ class Explorer:
 
     def export(self, text: str, path: str | Path, /, **parameters: object) -> Path:
         """Write the result of a SELECT to a .csv, .parquet, .fits or .vot file; returns its path."""
-        results.write(self.sql(text, into="arrow", **parameters), Path(path))
-        return Path(path)
+        target = user_files.expanded(path)
+        results.write(self._process.ask(text, parameters, self.timeout), target)
+        return target
 
     # ------------------------------------------------------------------------------------------------ distributions
 
@@ -173,8 +177,8 @@ class Explorer:
         x, where, weight : SQL of the table's columns;  span : lowest and highest value, None = all
         returns          : counts[bins], edges[bins + 1]
         """
-        check("bins", bins, 1, _MOST_BINS)
-        lo, hi = _ordered(span or self._span(table, x, where))
+        bins = bounds.whole("bins", bins, 1, _MOST_BINS)
+        lo, hi = self._span(table, x, where) if span is None else _ordered(span)
         text = f"""
             SELECT {_bin("x")} AS i, {_counted(weight)} AS n FROM (SELECT ({x}\n)::DOUBLE AS x, {_weight(weight)}
             FROM {table}\nWHERE ({where}\n)) WHERE x BETWEEN $x_lo AND $x_hi GROUP BY i"""
@@ -193,28 +197,31 @@ class Explorer:
         x, y    : SQL expressions;  bins, span : of each of the two; span None: from least to largest
         returns : counts[y bins, x bins], edges of x, edges of y
         """
-        for axis in bins:
-            check("bins", axis, 1, _MOST_BINS)
-        spans = span or (self._span(table, x, where), self._span(table, y, where))
-        (x_lo, x_hi), (y_lo, y_hi) = (_ordered(axis) for axis in spans)
+        x_bins, y_bins = (bounds.whole("bins", axis, 1, _MOST_BINS) for axis in _pair("bins", bins))
+        if span is None:
+            spans = [self._span(table, axis, where) for axis in (x, y)]
+        else:
+            spans = [_ordered(axis) for axis in _pair("span", span)]
+        (x_lo, x_hi), (y_lo, y_hi) = spans
         text = f"""
             SELECT {_bin("x")} AS i, {_bin("y")} AS j, {_counted(weight)} AS n
             FROM (SELECT ({x}\n)::DOUBLE AS x, ({y}\n)::DOUBLE AS y, {_weight(weight)} FROM {table}\nWHERE ({where}\n))
             WHERE x BETWEEN $x_lo AND $x_hi AND y BETWEEN $y_lo AND $y_hi GROUP BY i, j"""
-        limits = {"x_lo": x_lo, "x_hi": x_hi, "x_bins": bins[0], "y_lo": y_lo, "y_hi": y_hi, "y_bins": bins[1]}
+        limits = {"x_lo": x_lo, "x_hi": x_hi, "x_bins": x_bins, "y_lo": y_lo, "y_hi": y_hi, "y_bins": y_bins}
         found = self.sql(text, into="arrow", **limits)
-        counts = np.zeros((bins[1], bins[0]))
+        counts = np.zeros((y_bins, x_bins))
         counts[found["j"].to_numpy(), found["i"].to_numpy()] = found["n"].to_numpy()
-        return counts, np.linspace(x_lo, x_hi, bins[0] + 1), np.linspace(y_lo, y_hi, bins[1] + 1)
+        return counts, np.linspace(x_lo, x_hi, x_bins + 1), np.linspace(y_lo, y_hi, y_bins + 1)
 
-    def skymap(self, table: str, order: int = 8, where: str = "true", weight: str | None = None) -> tuple[Int, Float]:
+    def skymap(
+        self, table: str, order: int = ORDER, where: str = "true", weight: str | None = None
+    ) -> tuple[Int, Float]:
         """Counts in nested HEALPix cells of an order: int64[n] cells that hold any, ascending, and their counts [n].
 
         table  : as of `hist`;  order : of the cells
         where  : SQL condition of the rows that count;  weight : SQL that is summed, None = 1
         """
-        if not 0 <= order <= sky.DEEPEST:
-            raise BadInput(f"order = {order} is outside [0, {sky.DEEPEST}]")
+        order = bounds.whole("order", order, 0, sky.DEEPEST)
         text = f"""
             SELECT cell, {_counted(weight)} AS n FROM (SELECT _healpix_29 >> $shift::INT AS cell, {_weight(weight)}
             FROM {table}\nWHERE ({where}\n)) GROUP BY cell ORDER BY cell"""
@@ -231,8 +238,16 @@ class Explorer:
         return (lo, hi) if hi > lo else (lo - 0.5, hi + 0.5)
 
 
+def _pair(name: str, given: Any) -> tuple[Any, Any]:
+    try:
+        first, second = given
+    except (TypeError, ValueError):
+        raise BadInput(f"{name} = {given!r} is not a pair") from None
+    return first, second
+
+
 def _ordered(span: Range) -> Range:
-    lo, hi = span
+    lo, hi = (bounds.number("span", edge) for edge in _pair("span", span))
     if not (np.isfinite([lo, hi]).all() and lo < hi):
         raise BadInput(f"span = {span} is not from a finite number to a larger one")
     return lo, hi
@@ -248,4 +263,5 @@ def _weight(weight: str | None) -> str:
 
 
 def _counted(weight: str | None) -> str:
-    return "count(*)" if weight is None else "sum(w)"
+    # The sum is NULL if all rows lack a weight; a row without one counts nothing.
+    return "count(*)" if weight is None else "coalesce(sum(w), 0)"

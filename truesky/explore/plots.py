@@ -1,4 +1,4 @@
-"""Pictures of what the explorer counts: each takes the result of the function of its name, and draws into axes."""
+"""Pictures of counts: each function draws the result of the method of `truesky.Lake` that has its name."""
 
 from __future__ import annotations
 
@@ -8,12 +8,26 @@ import numpy as np
 
 from lake_schema import sky
 from lake_schema.arrays import Float, Int
+from truesky.explore.explorer import ORDER
 
 
 def hist(counts: Float, edges: Float, ax: Any = None, **style: Any) -> Any:
-    """Steps; returns the axes.
+    """Draw counts as steps.
 
-    counts : [bins];  edges : [bins + 1], as `Explorer.hist` gives them
+    Parameters
+    ----------
+    counts : ndarray of float64, shape (bins,)
+        Counts of `Lake.hist`.
+    edges : ndarray of float64, shape (bins + 1,)
+        Edges of the bins.
+    ax : matplotlib Axes, optional
+        Axes to draw in. The default is a new figure.
+    **style
+        Options of `matplotlib.axes.Axes.stairs`.
+
+    Returns
+    -------
+    matplotlib Axes
     """
     axes = _axes(ax)
     axes.stairs(counts, edges, **style)
@@ -21,10 +35,24 @@ def hist(counts: Float, edges: Float, ax: Any = None, **style: Any) -> Any:
 
 
 def heatmap(counts: Float, x_edges: Float, y_edges: Float, ax: Any = None, **style: Any) -> Any:
-    """Colours, logarithmic, blank where there is nothing; returns the axes.
+    """Draw counts as colours on a logarithmic scale, with empty bins blank.
 
-    counts : [y bins, x bins];  x_edges, y_edges : one more than bins, as `Explorer.heatmap` gives them
-    ax     : of matplotlib; None: a new one
+    Parameters
+    ----------
+    counts : ndarray of float64, shape (y bins, x bins)
+        Counts of `Lake.heatmap`.
+    x_edges : ndarray of float64, shape (x bins + 1,)
+        Edges of the bins in x.
+    y_edges : ndarray of float64, shape (y bins + 1,)
+        Edges of the bins in y.
+    ax : matplotlib Axes, optional
+        Axes to draw in. The default is a new figure.
+    **style
+        Options of `matplotlib.axes.Axes.pcolormesh`.
+
+    Returns
+    -------
+    matplotlib Axes
     """
     from matplotlib.colors import LogNorm
 
@@ -36,11 +64,25 @@ def heatmap(counts: Float, x_edges: Float, y_edges: Float, ax: Any = None, **sty
     return axes
 
 
-def skymap(cells: Int, counts: Float, order: int, ax: Any = None, **style: Any) -> Any:
-    """Number a square degree in HEALPix cells, east to the left; returns the axes.
+def skymap(cells: Int, counts: Float, order: int = ORDER, ax: Any = None, **style: Any) -> Any:
+    """Draw the number per square degree in HEALPix cells, with east to the left.
 
-    cells : int64[n] nested cells of the order;  counts : [n], as `Explorer.skymap` gives them
-    ax    : of matplotlib; None: a new one
+    Parameters
+    ----------
+    cells : ndarray of int64, shape (n,)
+        Nested cells of `Lake.skymap`.
+    counts : ndarray of float64, shape (n,)
+        Their counts.
+    order : int, optional
+        Order of the cells, as it was given to `Lake.skymap`.
+    ax : matplotlib Axes, optional
+        Axes to draw in. The default is a new figure.
+    **style
+        Options of `matplotlib.collections.PolyCollection`.
+
+    Returns
+    -------
+    matplotlib Axes
     """
     from matplotlib.collections import PolyCollection
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import os
 import selectors
@@ -11,12 +12,15 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
 import pyarrow as pa
 
-from lake_schema.errors import BadInput, Damaged, LakeError, OutOfRange
+from lake_schema import bounds
+from lake_schema.arrays import as_python
+from lake_schema.errors import BadInput, Damaged, LakeError
 from lake_schema.store.object_storage.s3 import Folder
 
 _ROOT = Path(__file__).resolve().parents[2]
@@ -28,46 +32,70 @@ TIMEOUT_HI = 1e6
 _RESULT = 0.5
 _BUFFER = 1 << 20
 _ERRORS = {"BadInput": BadInput, "Damaged": Damaged}
+_CLOSED = "SQL: stopped, because the lake was closed before the query was answered"
+_INTERRUPTED = "SQL: another query began before all rows of this one were read"
+
+
+@dataclass(slots=True)
+class _Worker:
+    """The other process; `is_stopped` if a thread ended it while another may have waited for an answer."""
+
+    process: subprocess.Popen[bytes]
+    is_stopped: bool = False
+
+    @property
+    def is_alive(self) -> bool:
+        return not self.is_stopped and self.process.poll() is None
 
 
 class Process:
-    """Answers queries of some tables; starts with the first, ends with `close`, and then starts again.
+    """Answers queries of some tables. The first query starts it, and `close` ends it until the next query.
+
+    Several threads may use it. `ask` waits until the queries of other threads are answered. A query whose rows are
+    read piece by piece, with `batches`, ends if any other query begins before its last piece was read.
 
     tables  : NAME=KEY or REQUEST.NAME=KEY of tables of the lake `root`, NAME=@FILE of an Arrow file
     memory  : bytes that a query and its result may take together
     """
 
     def __init__(self, root: Folder, tables: Sequence[str], memory: float = MEMORY) -> None:
-        check("memory", memory, _MEMORY_LO, _MEMORY_HI)
+        bounds.number("memory", memory, _MEMORY_LO, _MEMORY_HI)
         self.most_bytes = int(memory * _RESULT)
         self.command = [sys.executable, "-m", "truesky.explore.worker", str(root), str(int(memory)), *tables]
-        self._worker: subprocess.Popen[bytes] | None = None
-        # Of the question that is being answered, None between two.
-        self._answering: object | None = None
-        # A question that was given up may be ended by whichever thread collects its generator.
-        self._changing = threading.RLock()
+        self._worker: _Worker | None = None
+        # The answer that is being read, None between two answers.
+        self._answer: _Answer | None = None
+        self._numbers = itertools.count(1)
+        # Held by the thread that uses the pipes: `ask` keeps it for the whole answer, `batches` for each piece.
+        self._lock = threading.RLock()
 
     def close(self) -> None:
-        """End the process; a later query starts another."""
-        with self._changing:
+        """End the process and the query that it answers; a later query starts another."""
+        self.stop()
+        with self._lock:
             self._end()
 
     def _end(self) -> None:
-        if self._worker is not None:
-            self._worker.kill()
-            self._worker.communicate()
-            self._worker = None
+        # The collection of another generator may call this once more before it returns.
+        worker, self._worker, self._answer = self._worker, None, None
+        if worker is not None:
+            worker.process.kill()
+            worker.process.communicate()
 
     def stop(self) -> None:
-        """End what it is doing, from another thread than the one that waits for it; a later query starts another."""
-        # Looked up once: another thread may end it meanwhile.
+        """End the query that another thread waits for, without waiting for that thread; a later query is answered."""
+        # Read once, since another thread may end it meanwhile.
         if (worker := self._worker) is not None:
-            worker.kill()
+            worker.is_stopped = True
+            worker.process.kill()
 
-    def ask(self, text: str, parameters: dict[str, object], timeout: float = TIMEOUT) -> pa.Table:
-        """The result of a SELECT, which is stopped after `timeout` s.  Errors: BadInput, Damaged, as of Explorer.sql"""
-        batches = list(self.batches(text, parameters, timeout, most_bytes=self.most_bytes))
-        return pa.Table.from_batches(batches)
+    def ask(self, text: str, parameters: Mapping[str, object], timeout: float = TIMEOUT) -> pa.Table:
+        """Return the result of a SELECT, which is stopped after `timeout` s.
+
+        Errors : BadInput, Damaged, as `Explorer.sql`
+        """
+        with self._lock:
+            return pa.Table.from_batches(list(self.batches(text, parameters, timeout, most_bytes=self.most_bytes)))
 
     def batches(
         self,
@@ -78,81 +106,132 @@ class Process:
         most_bytes: int | None = None,
         expressions: Sequence[str] = (),
     ) -> Iterator[pa.RecordBatch]:
-        """The same piece by piece, at least one; whoever reads no further stops the query.
+        """Yield the result piece by piece, at least one piece; closing the generator stops the query.
 
-        text, parameters : as of `ask`;  timeout : s until the last piece
-        rows             : at most so many, None = all;  most_bytes : refuse a larger result, None = any size
-        expressions      : parts of the text that must each be one expression, whoever wrote them
-        Errors           : as of `ask`, also after some pieces have come
+        text, parameters : as for `ask`;  timeout : s until the last piece
+        rows             : largest number of rows, None = all;  most_bytes : refuse a larger result, None = any size
+        expressions      : parts of the text that a user wrote, each of which must be one expression
+        Errors           : as `ask`, also after some pieces; BadInput if another query began before the last piece
         """
-        check("timeout", timeout, 0.0, TIMEOUT_HI)
-        question: dict[str, Any] = {
-            "sql": text,
-            "parameters": dict(parameters or {}),
-            "rows": rows,
-            "bytes": most_bytes,
-        }
-        question["expressions"] = [*expressions]
+        bounds.number("timeout", timeout, 0.0, TIMEOUT_HI)
+        question = {"sql": text, "parameters": dict(parameters or {}), "rows": rows, "bytes": most_bytes}
+        answer = self._begun(question | {"expressions": [*expressions]}, timeout)
         try:
-            line = json.dumps(question, allow_nan=False)
-        except (TypeError, ValueError) as error:
-            raise BadInput(f"SQL: a parameter is not a number, text, boolean or list of them: {error}") from None
-        stopped = BadInput(f"SQL: stopped after {timeout:g} s")
-        own, worker = self._begun()
-        assert worker.stdin is not None
-        assert worker.stdout is not None
-        whole = False
-        try:
-            worker.stdin.write(line.encode() + b"\n")
-            worker.stdin.flush()
-            out = io.BufferedReader(_Timed(worker.stdout.fileno(), time.monotonic() + timeout), _BUFFER)
-            answer = _line(out)
-            if not answer:
-                with pa.ipc.open_stream(out) as stream:
-                    yield from stream
-                answer = _line(out)
-            whole = True
-        except TimeoutError:
-            raise stopped from None
-        except BrokenPipeError:
-            raise BadInput("SQL: the process that answers queries has ended; ask again") from None
-        except (pa.ArrowException, OSError, EOFError):
-            raise BadInput("SQL: the query needs more memory than it may have, or brought its process down") from None
+            while (batch := self._next(answer)) is not None:
+                yield batch
         finally:
-            self._ended(own, whole)
-        if answer:
-            raise _ERRORS.get(answer["kind"], LakeError)(answer["error"])
+            self._give_up(answer)
 
-    def _begun(self) -> tuple[object, subprocess.Popen[bytes]]:
-        """A question that is now being answered, and who answers it."""
-        with self._changing:
-            if self._answering is not None:
-                # Whoever asked before reads no further, though that is found out only when the generator is collected.
+    def _begun(self, question: dict[str, Any], timeout: float) -> _Answer:
+        """Send a question; an answer that is not yet read to its end is given up."""
+        number = next(self._numbers)
+        line = _line_of(question | {"id": number})
+        with self._lock:
+            if self._answer is not None:
                 self._end()
-            self._answering = object()
-            return self._answering, self._running()
+            worker = self._running()
+            pipe = worker.process.stdin
+            assert pipe is not None
+            try:
+                pipe.write(line)
+                pipe.flush()
+            except BrokenPipeError:
+                self._end()
+                said = _CLOSED if worker.is_stopped else "SQL: the process that answers queries has ended; ask again"
+                raise BadInput(said) from None
+            self._answer = _Answer(worker, number, timeout)
+            return self._answer
 
-    def _ended(self, question: object, whole: bool) -> None:
-        """A question that has been answered, or is given up; that may be found out when another is being answered."""
-        with self._changing:
-            if self._answering is question:
-                self._answering = None
-                if not whole:
+    def _next(self, answer: _Answer) -> pa.RecordBatch | None:
+        """The next piece, None after the last one."""
+        with self._lock:
+            if self._answer is not answer:
+                raise BadInput(_CLOSED if answer.worker.is_stopped else _INTERRUPTED)
+            try:
+                batch = answer.read()
+            except TimeoutError:
+                said = f"SQL: stopped after {answer.timeout:g} s"
+            except (pa.ArrowException, OSError, EOFError):
+                crashed = "SQL: the query needs more memory than it may have, or brought its process down"
+                said = _CLOSED if answer.worker.is_stopped else crashed
+            else:
+                if batch is not None:
+                    return batch
+                self._answer = None
+                if answer.error is not None:
+                    raise answer.error
+                return None
+            self._end()
+            raise BadInput(said)
+
+    def _give_up(self, answer: _Answer) -> None:
+        """End the process if it still answers this question."""
+        # A thread that collects a generator must not wait for the answer to another thread's question. Whoever holds
+        # the lock has ended this answer, or does so with the next question.
+        if self._answer is answer and self._lock.acquire(blocking=False):
+            try:
+                if self._answer is answer:
                     self._end()
+            finally:
+                self._lock.release()
 
-    def _running(self) -> subprocess.Popen[bytes]:
-        if self._worker is None or self._worker.poll() is not None:
+    def _running(self) -> _Worker:
+        if self._worker is None or not self._worker.is_alive:
+            self._end()
             pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
             # Arrow's other allocators reserve a gigabyte at the start, which would count against the limit.
             environment = {**os.environ, "ARROW_DEFAULT_MEMORY_POOL": "system"}
-            self._worker = subprocess.Popen(self.command, cwd=_ROOT, env=environment, **pipes)
+            self._worker = _Worker(subprocess.Popen(self.command, cwd=_ROOT, env=environment, **pipes))
         return self._worker
 
 
-class _Timed(io.RawIOBase):
-    """What a pipe says until a moment of the monotonic clock; later TimeoutError."""
+class _Answer:
+    """The answer to one question, as a worker sends it.
 
-    def __init__(self, pipe: int, deadline: float) -> None:
+    number  : number of the question, which the answer repeats;  timeout : s from now until its last piece
+    error   : the worker's refusal, known after the last piece
+    """
+
+    def __init__(self, worker: _Worker, number: int, timeout: float) -> None:
+        assert worker.process.stdout is not None
+        self.worker, self.number, self.timeout = worker, number, timeout
+        self.error: LakeError | None = None
+        self._pipe = io.BufferedReader(_Timed(worker.process.stdout, time.monotonic() + timeout), _BUFFER)
+        self._stream: pa.RecordBatchStreamReader | None = None
+
+    def read(self) -> pa.RecordBatch | None:
+        """The next piece, None after the last one.
+
+        Errors : TimeoutError; OSError, EOFError or an error of Arrow if the worker has ended
+        """
+        if self._stream is None:
+            if not self._is_good():
+                return None
+            self._stream = pa.ipc.open_stream(self._pipe)
+        try:
+            return self._stream.read_next_batch()
+        except StopIteration:
+            self._is_good()
+            return None
+
+    def _is_good(self) -> bool:
+        """Read the line before or after the pieces."""
+        line = self._pipe.readline()
+        if not line.endswith(b"\n"):
+            raise EOFError
+        said = json.loads(line)
+        if said["id"] != self.number:
+            raise LakeError(f"SQL: question {self.number} got the answer to question {said['id']}")
+        if "error" in said:
+            self.error = _ERRORS.get(said["kind"], LakeError)(said["error"])
+        return self.error is None
+
+
+class _Timed(io.RawIOBase):
+    """A pipe that is read until a moment of the monotonic clock; TimeoutError after it."""
+
+    def __init__(self, pipe: IO[bytes], deadline: float) -> None:
+        # The file and not its number, which the next file that is opened may get.
         self.pipe, self.deadline = pipe, deadline
 
     def readable(self) -> bool:
@@ -163,20 +242,14 @@ class _Timed(io.RawIOBase):
             selector.register(self.pipe, selectors.EVENT_READ)
             if not selector.select(max(self.deadline - time.monotonic(), 0.0)):
                 raise TimeoutError
-        return os.readv(self.pipe, [buffer])
+        return os.readv(self.pipe.fileno(), [buffer])
 
 
-def _line(out: IO[bytes]) -> dict[str, str]:
-    if not (line := out.readline()):
-        raise EOFError
-    said: dict[str, str] = json.loads(line)
-    return said
-
-
-def check(name: str, value: float, lo: float, hi: float) -> None:
-    """Refuse a number outside its bounds.
-
-    name : in the refusal;  value : what was given;  lo, hi : both still allowed
-    """
-    if not lo <= value <= hi:
-        raise OutOfRange(name, value, lo, hi)
+def _line_of(question: dict[str, Any]) -> bytes:
+    """A question as the worker reads it."""
+    if not isinstance(question["sql"], str):
+        raise BadInput(f"SQL: the query must be text, not {type(question['sql']).__name__}")
+    try:
+        return json.dumps(question, allow_nan=False, default=as_python).encode() + b"\n"
+    except (TypeError, ValueError) as error:
+        raise BadInput(f"SQL: a parameter is not a number, text, boolean or list of them: {error}") from None

@@ -2,7 +2,8 @@
 
 DuckDB counts neither the memory of every function nor its result, and some functions do not stop when told to; a
 process has a limit of memory that holds, and can be killed.  A query is a line of JSON on stdin; an answer is a line of
-JSON, then, if it is a result, an Arrow stream, and a line of JSON that says whether the stream is whole.
+JSON, then, if it is a result, an Arrow stream, and a line of JSON that says whether the stream is whole.  Both lines
+repeat the number of the query, `id`.
 """
 
 from __future__ import annotations
@@ -46,12 +47,12 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _answer(out: IO[bytes], session: Session, question: dict[str, Any]) -> None:
-    fault: dict[str, str] = {}
+    about, fault = {"id": question["id"]}, dict[str, str]()
     batches = _batches(session, question)
     try:
         # Whatever is wrong with the text is found before the first of these two.
         first = list(itertools.islice(batches, 2))
-        out.write(b"{}\n")
+        out.write(json.dumps(about).encode() + b"\n")
         with pa.ipc.new_stream(out, first[0].schema) as stream:
             try:
                 for batch in itertools.chain(first, batches):
@@ -60,7 +61,7 @@ def _answer(out: IO[bytes], session: Session, question: dict[str, Any]) -> None:
                 fault = _said(error)
     except (LakeError, MemoryError) as error:
         fault = _said(error)
-    out.write(json.dumps(fault).encode() + b"\n")
+    out.write(json.dumps(about | fault).encode() + b"\n")
     out.flush()
 
 

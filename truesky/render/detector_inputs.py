@@ -14,6 +14,7 @@ from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.published import read_back
 from lake_schema.store import read
+from lake_schema.store.object_storage.s3 import Folder
 from lake_schema.store.plan import Json
 from lake_schema.store.provenance import file_sha256
 from lake_schema.tables.exposures import ExposureRow
@@ -34,7 +35,7 @@ from truesky.request.accuracy import Accuracy
 from truesky.request.structure import Arms, Stamps
 
 
-def aimed(lake: Path, facts: Json) -> tuple[Aim, Variant, MissionConfiguration]:
+def aimed(lake: Folder, facts: Json) -> tuple[Aim, Variant, MissionConfiguration]:
     """A detector as it looks at the sky, its exposure's variant, and the request's mission; facts : of `prepared`."""
     request = facts["request"]
     forced = dict.fromkeys(request["effects"]["on"], True) | dict.fromkeys(request["effects"]["off"], False)
@@ -50,7 +51,7 @@ def aimed(lake: Path, facts: Json) -> tuple[Aim, Variant, MissionConfiguration]:
     return Aim.of(exposed, detector, band, request["seed"], request["readout"]), own, mission
 
 
-def prepared(lake: Path, facts: Json) -> tuple[Aim, Rows, Variant]:
+def prepared(lake: Folder, facts: Json) -> tuple[Aim, Rows, Variant]:
     """What a detector is rendered from.
 
     facts  : of the plan and of its part: exposure_id, detector
@@ -88,7 +89,7 @@ def _with_structure(rows: Rows, request: Json, files: Mapping[str, str]) -> Rows
 
 
 def _rows(
-    lake: Path,
+    lake: Folder,
     inputs: Mapping[str, read.Version],
     aim: Aim,
     task: Json,
@@ -132,7 +133,7 @@ def _rows(
 
 
 def earlier_exposures(
-    lake: Path,
+    lake: Folder,
     inputs: Mapping[str, read.Version],
     exposed: ExposureRow,
     task: Json,
@@ -143,8 +144,8 @@ def earlier_exposures(
 
     Parameters
     ----------
-    lake : Path
-        Folder of the lake.
+    lake : Path or Place
+        The lake.
     inputs : mapping of str to Version
         Versions of the tables that the images are made of.
     exposed : ExposureRow
@@ -179,7 +180,7 @@ def earlier_exposures(
 
 
 def _drawn_again(
-    lake: Path,
+    lake: Folder,
     inputs: Mapping[str, read.Version],
     exposed: ExposureRow,
     drawn: Sequence[tuple[ExposureRow, Json]],

@@ -25,21 +25,33 @@ from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 from lake_schema.fits.images import Image, write_images
 from lake_schema.store import layout, read
+from lake_schema.store.object_storage.s3 import Folder
 from truesky.render import detector_inputs
 from truesky.render.exposure import alone
 from truesky.render.exposure.alone import Alone
 
 
 def models(
-    root: Path, exposure: int, detector: str, ids: Sequence[int] | None = None, request: str | None = None
+    root: Folder, version: read.Version, exposure: int, detector: str, ids: Sequence[int] | None = None
 ) -> Iterator[Alone]:
-    """Of sources of a published image, None = of all.
+    """Draw single sources of a published image.
 
-    root : folder of the lake;  exposure, detector : of the image;  ids : of the sources
-    request : whose image, where a lake has those of several
-    Errors  : BadInput where there is no such image, or no light of a source in it
+    Parameters
+    ----------
+    root : Path or Place
+        The lake.
+    version : Version
+        Version of the table `products` that has the image.
+    exposure, detector : int, str
+        Exposure and detector of the image.
+    ids : sequence of int, optional
+        Identifiers of the sources. The default is all sources that may have light in the image.
+
+    Raises
+    ------
+    BadInput
+        At the call, if there is no such image, it is not dispersed, or a source cannot have light in it.
     """
-    version = read.version(root, "products", request=request)
     wanted = {"exposure_id": exposure, "detector": detector}
     parts = [part["facts"] for part in version.manifest["parts"] if wanted.items() <= part["facts"].items()]
     if not parts:
@@ -79,7 +91,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m truesky.render.models", description=(__doc__ or "").splitlines()[0]
     )
-    parser.add_argument("--lake", required=True, help="folder of the lake, with rendered images of spectra")
+    parser.add_argument("--lake", required=True, help="folder or address of the lake, with rendered images of spectra")
     parser.add_argument("--name", help="of the request whose images are meant, where the lake has several")
     parser.add_argument("--exposure", type=int, required=True, help="number of the exposure")
     parser.add_argument("--detector", required=True, help="name of the detector")
@@ -94,7 +106,9 @@ def _written(options: argparse.Namespace) -> int:
     out = user_files.target(options.out, (".fits",))
     ids = list(dict.fromkeys(options.sources))
     images = [Image(None, (("EXPOSURE", options.exposure, "exposure"), ("DETECTOR", options.detector, "detector")))]
-    for one in models(layout.lake(options.lake), options.exposure, options.detector, ids, options.name):
+    root = layout.opened(options.lake)
+    version = read.version(root, "products", request=options.name)
+    for one in models(root, version, options.exposure, options.detector, ids):
         layers = one.orders.items() if options.orders else [(None, one.frame)]
         images += [_extension(one.id, order, light) for order, light in layers]
         print(f"{one.id}: {one.frame.sum():.6g} electrons")

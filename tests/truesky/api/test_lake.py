@@ -1,15 +1,26 @@
 """A lake opened from Python: tables, queries and what is refused; images and truth in tests/test_field.py."""
 
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pytest
 
 import truesky
-from lake_schema.store import publish
-from tests.universe import CELLS, plain_plan, plain_work, toy_plan, toy_work
+from lake_schema import errors
+from lake_schema.fits import images
+from lake_schema.store import publish, read
+from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.tables.products import PRODUCTS
+from tests import requests
+from tests.universe import CELLS, plain_plan, plain_work, rows_of, toy_plan, toy_work
+from truesky.render import models
+
+ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.fixture
@@ -22,18 +33,29 @@ def opened(lake):
 def test_tables_and_columns_are_listed(opened):
     assert list(opened.tables().index) == ["plain"]
     assert opened.tables().loc["plain", "rows"] == 60
-    assert set(opened.table("plain").column_names) == set(opened.columns("plain").index)
+    assert set(opened.table("plain")) == set(opened.columns("plain").index)
     assert "plain" in repr(opened)
 
 
 def test_a_table_is_read_in_each_form(opened):
-    rows = opened.table("plain")
+    rows = opened.table("plain", into="arrow")
     assert isinstance(rows, pa.Table)
     assert rows.num_rows == 60
     name = rows.column_names[0]
-    assert opened.table("plain", [name]).column_names == [name]
-    assert opened.table("plain", into="pandas")[name].tolist() == rows[name].to_pylist()
+    assert opened.table("plain", [name], into="arrow").column_names == [name]
     assert list(opened.table("plain", into="astropy")[name]) == rows[name].to_pylist()
+
+
+def test_tables_are_pandas_unless_another_kind_is_named(lake):
+    publish.make(lake, toy_plan(), toy_work)
+    with truesky.open(lake) as found:
+        for ask in (
+            lambda **into: found.table("toy", ["id"], **into),
+            lambda **into: found.sql("SELECT id FROM toy", **into),
+            lambda **into: found.cone("toy", 0.0, 0.0, 180.0, ["id"], **into),
+        ):
+            assert isinstance(ask(), pd.DataFrame)
+            assert sorted(ask()["id"]) == sorted(ask(into="arrow")["id"].to_pylist())
 
 
 def test_a_query_takes_parameters(opened):
@@ -75,11 +97,32 @@ def test_the_result_of_a_query_is_written(opened, tmp_path):
         (lambda lake: lake.extensions("a.fits"), "has no table products"),
         (lambda lake: lake.models(1, "3-4"), "has no table products"),
         (lambda lake: lake.table("plain", into="polars"), "polars"),
+        (lambda lake: lake.table("plain", [3]), r"columns = \[3\] is not a name or a list of names"),
     ],
 )
 def test_what_a_lake_has_not_is_named(opened, ask, said):
     with pytest.raises(truesky.BadInput, match=said):
         ask(opened)
+
+
+def test_models_are_of_the_lake_as_it_was_opened(lake, monkeypatch):
+    """Its address and the version of its images are handed on, and what is wrong is refused at the call."""
+    rows, calls = Output(rows_of(PRODUCTS, 12)), []
+
+    def published(seed):
+        publish.make(lake, Plan(PRODUCTS, {"seed": seed}, (Part("0.parquet", {}),)), lambda root, facts: rows)
+
+    published(1)
+    monkeypatch.setattr(models, "models", lambda *arguments: iter(calls.append(arguments) or ()))
+    with truesky.open(lake) as found:
+        published(2)
+        assert list(found.models(np.int32(3), "DET22", [np.int64(7)])) == []
+        ((root, version, *others),) = calls
+        assert (root, version.key, others) == (lake, found.tables().loc["products", "version"], [3, "DET22", [7]])
+        assert version.key != read.version(lake, "products").key
+        for bad in ({"exposure_id": "x"}, {"exposure_id": 1.5}, {"sources": ["x"]}, {"sources": 3}):
+            with pytest.raises(truesky.BadInput, match="number"):
+                found.models(**{"exposure_id": 3, "detector": "DET22", **bad})
 
 
 def test_a_folder_that_is_no_lake_is_refused(tmp_path):
@@ -92,6 +135,10 @@ def test_all_names_of_the_interface_are_there():
         assert getattr(truesky, name) is not None
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = truesky.nothing
+    assert truesky.Damaged is errors.Damaged
+    assert truesky.Image is images.Image
+    page = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
+    assert [name for name in truesky.__all__ if f"truesky.{name}" not in page and name[0] != "_"] == []
 
 
 def test_importing_truesky_is_quick():
@@ -102,13 +149,19 @@ def test_importing_truesky_is_quick():
 
 
 def test_another_package_called_jobs_does_not_matter(tmp_path):
-    """The names of our own scripts' folder is free for users."""
+    """Users may call a package as the folder of our scripts, in the current folder and in $PYTHONPATH."""
     (tmp_path / "jobs").mkdir()
-    (tmp_path / "jobs" / "__init__.py").write_text("raise SystemExit('the user\\'s own')")
-    code = "import truesky; print(truesky.open.__name__, truesky.check.__name__)"
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert done.stdout == "Lake check\n"
-    help_text = subprocess.run(
-        [sys.executable, "-m", "truesky.commands", "build", "--help"], cwd=tmp_path, capture_output=True, text=True
+    (tmp_path / "jobs" / "__init__.py").write_text("raise SystemExit('the other package')")
+    path = requests.written(tmp_path)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
+    code = (
+        "import sys, truesky; from truesky.commands.__main__ import main; truesky.open, truesky.run\n"
+        "assert main(['check', sys.argv[1]]) == 0; main(['build', '--help'])"
     )
-    assert (help_text.returncode, help_text.stderr) == (0, "")
+    script = str(ROOT / "jobs" / "catalogue" / "build_stars.py")
+    for arguments, said in ((["-c", code, str(path)], ": good: "), ([script, "--help"], "--request")):
+        done = subprocess.run(
+            [sys.executable, *arguments], cwd=tmp_path, env=environment, capture_output=True, text=True
+        )
+        assert (done.returncode, done.stderr) == (0, "")
+        assert said in done.stdout

@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -13,9 +14,10 @@ from astropy.coordinates import SkyCoord
 
 from lake_schema import sky
 from lake_schema.errors import BadInput, Damaged
-from lake_schema.store import publish, read
+from lake_schema.store import layout, publish, read
+from lake_schema.store.plan import Output, Part, Plan
 from lake_schema.tables.galaxies import GALAXIES
-from tests.universe import plain_plan, plain_work
+from tests.universe import plain_plan, plain_work, rows_of
 from truesky.explore.explorer import Explorer
 
 
@@ -51,7 +53,20 @@ def test_parameters_are_values_and_nothing_else(explorer, value, kind):
     assert isinstance(value, kind)
 
 
-@pytest.mark.parametrize("value", [object(), float("nan"), b"x", {1, 2}])
+@pytest.mark.parametrize(
+    ("value", "wanted"),
+    [
+        (np.int64(2**53 + 1), 2**53 + 1), (np.float32(0.5), 0.5), (np.True_, True), ((1, 2), [1, 2]),
+        (np.arange(3), [0, 1, 2]), ([np.int16(1), 2], [1, 2]),
+    ],
+)  # fmt: skip
+def test_parameters_of_numpy_and_tuples_are_values(explorer, value, wanted):
+    assert explorer.sql("SELECT $x AS x", into="arrow", x=value)["x"].to_pylist() == [wanted]
+
+
+@pytest.mark.parametrize(
+    "value", [object(), float("nan"), b"x", {1, 2}, np.float32("nan"), np.datetime64("2030-01-01", "ns")]
+)
 def test_other_parameters_are_refused(explorer, value):
     with pytest.raises(BadInput, match="parameter"):
         explorer.sql("SELECT $x", x=value)
@@ -201,6 +216,57 @@ def test_hist_of_two_tables(explorer, galaxies):
     assert counts[0] == sum(kind == 0 for kind in galaxies["kind"].to_pylist())
 
 
+BAD = [
+    (lambda lake: lake.hist("plain", "id", bins=2.5), r"bins = 2\.5 is not a whole number"),
+    (lambda lake: lake.hist("plain", "id", bins="5"), "bins = '5' is not a whole number"),
+    (lambda lake: lake.hist("plain", "id", bins=0), r"bins = 0 is outside \[1, 10000\]"),
+    (lambda lake: lake.hist("plain", "id", span="x"), "span = 'x' is not a pair"),
+    (lambda lake: lake.hist("plain", "id", span=(0, "x")), "span = 'x' is not a number"),
+    (lambda lake: lake.hist("plain", "id", span=(1, 0)), "from a finite number to a larger one"),
+    (lambda lake: lake.heatmap("plain", "id", "id", bins=5), "bins = 5 is not a pair"),
+    (lambda lake: lake.heatmap("plain", "id", "id", span=((0, 1), 2)), "span = 2 is not a pair"),
+    (lambda lake: lake.skymap("galaxies", order=2.5), r"order = 2\.5 is not a whole number"),
+    (lambda lake: lake.sql(None), "the query must be text, not NoneType"),
+]
+
+
+@pytest.mark.parametrize("number", range(len(BAD)))
+def test_wrong_arguments_are_named(explorer, number):
+    ask, said = BAD[number]
+    with pytest.raises(BadInput, match=said):
+        ask(explorer)
+
+
+@pytest.mark.parametrize("number", ["x", None, float("nan"), -1.0])
+def test_limits_of_a_lake_are_numbers(explored, number):
+    for name in ("memory", "timeout"):
+        with pytest.raises(BadInput, match=name):
+            Explorer(explored, **{name: number})
+
+
+def test_rows_without_a_weight_count_nothing(explorer):
+    counts, _ = explorer.hist("plain", "id", 3, weight="NULL")
+    assert counts.tolist() == [0.0, 0.0, 0.0]
+    counts, *_ = explorer.heatmap("plain", "id", "id", (1, 1), weight="CASE WHEN id < 3 THEN 1 END")
+    assert counts.tolist() == [[3.0]]
+
+
+def test_any_parameter_may_be_exported_to_a_file_of_the_home_folder(explorer, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert explorer.export("SELECT $into AS q", "~/few.csv", into="x") == tmp_path / "few.csv"
+    assert (tmp_path / "few.csv").read_text().split() == ['"q"', '"x"']
+
+
+def test_a_table_of_another_version_is_not_listed_as_damaged(lake):
+    table = replace(GALAXIES, version=GALAXIES.version + 1)
+    plan = Plan(table, {}, (Part(layout.cell_file(5, 1607), {}),))
+    publish.make(lake, plan, lambda root, facts: Output(rows_of(table, 12)))
+    with Explorer(lake) as other:
+        row = other.tables().loc["galaxies"]
+    assert row["version"] == "unreadable version"
+    assert "another version of truesky wrote it" in row["meaning"]
+
+
 def test_heatmap_is_numpys(explorer, galaxies):
     x, y = (galaxies[name].to_numpy().astype(float) for name in ("z_obs", "abs_mag_r01"))
     counts, x_edges, y_edges = explorer.heatmap("galaxies", "z_obs", "abs_mag_r01", (8, 5))
@@ -283,8 +349,8 @@ def test_a_changed_byte_is_damage_not_a_number(lake):
 
 def test_a_killed_process_is_replaced(explorer):
     explorer.sql("SELECT 1")
-    os.kill(explorer._process._worker.pid, signal.SIGKILL)
-    explorer._process._worker.wait()
+    os.kill(explorer._process._worker.process.pid, signal.SIGKILL)
+    explorer._process._worker.process.wait()
     assert explorer.sql("SELECT 1 AS a")["a"][0] == 1
 
 

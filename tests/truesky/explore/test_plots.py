@@ -25,6 +25,11 @@ def test_hist(explorer):
     assert np.array_equal(drawn.get_data().edges, edges)
 
 
+def test_results_are_drawn_as_they_come(explorer):
+    for name, axes in (("hist", ["z_obs"]), ("heatmap", ["z_obs", "abs_mag_r01"]), ("skymap", [])):
+        getattr(plots, name)(*getattr(explorer, name)("galaxies", *axes))
+
+
 def test_heatmap_leaves_empty_bins_blank(explorer):
     counts, x, y = explorer.heatmap("galaxies", "z_obs", "abs_mag_r01", (40, 30))
     _, ax = plt.subplots()

@@ -1,12 +1,18 @@
 """The process of queries: results piece by piece, its session kept open, and nothing of one answer in the next."""
 
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 
-from lake_schema.errors import BadInput, Damaged
+from lake_schema.errors import BadInput, Damaged, LakeError
 from lake_schema.store import publish, read
 from tests.universe import plain_plan, plain_work
 from truesky.explore.process import Process
 from truesky.explore.session import Session
+
+SLOW = "SELECT count(*) FROM range(100000) a, range(100000) b WHERE a.range * b.range % 7 = 3"
 
 
 @pytest.fixture(scope="module")
@@ -68,10 +74,67 @@ def test_what_is_read_no_further_ends_no_later_answer(process):
     assert numbers([first, *later]) == list(range(3_000_000))
 
 
+def test_threads_get_their_answers(process):
+    """Each thread gets the rows that it asked for, whatever the others ask meanwhile."""
+
+    def rounds(number):
+        return {process.ask(f"SELECT {number} AS a", {})["a"][0].as_py() for _ in range(10)}
+
+    with ThreadPoolExecutor(4) as threads:
+        assert list(threads.map(rounds, range(4))) == [{number} for number in range(4)]
+
+
+def test_rows_that_are_not_read_let_another_thread_ask(process):
+    """The query whose rows were left ends, and says so to whoever reads on."""
+    left = process.batches("SELECT range + 100 FROM range(100000000)")
+    assert next(left).num_rows >= 0
+    with ThreadPoolExecutor(1) as thread:
+        assert thread.submit(process.ask, "SELECT 7 AS a", {}, 20.0).result(20)["a"].to_pylist() == [7]
+    with pytest.raises(BadInput, match="another query began before all rows of this one were read"):
+        next(left)
+
+
+def test_rows_that_are_given_up_do_not_wait_for_the_query_of_another_thread(process):
+    left, is_locked, is_done = process.batches("SELECT * FROM range(9)"), threading.Event(), threading.Event()
+    next(left)
+
+    def hold():
+        with process._lock:
+            is_locked.set()
+            return is_done.wait(20)
+
+    with ThreadPoolExecutor(1) as thread:
+        waiting = thread.submit(hold)
+        assert is_locked.wait(20)
+        left.close()
+        is_done.set()
+        assert waiting.result(20)
+    assert process.ask("SELECT 7 AS a", {})["a"].to_pylist() == [7]
+
+
+def test_a_query_that_another_thread_ends_by_closing_says_so(process):
+    process.ask("SELECT 1", {})
+    with ThreadPoolExecutor(1) as thread:
+        waiting = thread.submit(process.ask, SLOW, {}, 60.0)
+        while process._answer is None:
+            time.sleep(0.01)
+        process.close()
+        with pytest.raises(BadInput, match="the lake was closed before the query was answered"):
+            waiting.result(20)
+    assert process.ask("SELECT 7 AS a", {})["a"].to_pylist() == [7]
+
+
+def test_an_answer_names_its_question(process):
+    answer = process._begun({"sql": "SELECT 1", "parameters": {}}, 20.0)
+    answer.number += 1
+    with pytest.raises(LakeError, match="got the answer to question"):
+        process._next(answer)
+    assert process.ask("SELECT 7 AS a", {})["a"].to_pylist() == [7]
+
+
 def test_it_is_stopped_while_it_sends(process):
-    slow = "SELECT count(*) FROM range(100000) a, range(100000) b WHERE a.range * b.range % 7 = 3"
     with pytest.raises(BadInput, match=r"stopped after 0\.3 s"):
-        list(process.batches(slow, timeout=0.3))
+        list(process.batches(SLOW, timeout=0.3))
     assert numbers(process.batches("SELECT 7 AS a")) == [7]
 
 

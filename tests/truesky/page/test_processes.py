@@ -27,7 +27,7 @@ from truesky.page.tap.queries import Jobs
 
 def killed(lane):
     """Kill the processes of a lane, as the system does where memory is short."""
-    found = [process._worker for process in lane._all if process._worker is not None]
+    found = [process._worker.process for process in lane._all if process._worker is not None]
     for worker in found:
         os.kill(worker.pid, signal.SIGKILL)
         worker.wait(30.0)
@@ -57,6 +57,10 @@ def test_a_process_is_stopped_while_it_ends():
     killed = []
 
     class Worker:
+        @property
+        def process(self):
+            return self
+
         def kill(self):
             killed.append(self)
 
@@ -161,7 +165,7 @@ def test_a_lake_is_opened_anew_beside_what_is_being_answered(tmp_path):
         assert (first + answer.read()).count(b"\n") == 3_000_001
         connection.close()
         ended = time.monotonic() + 30.0
-        while any(one._worker is not None and one._worker.poll() is None for one in before.questions._all):
+        while any(one._worker is not None and one._worker.is_alive for one in before.questions._all):
             assert time.monotonic() < ended
             time.sleep(0.05)
 

@@ -14,6 +14,7 @@ import truesky
 from lake_schema.errors import BadInput
 from lake_schema.fits import images
 from lake_schema.store import layout, publish, read
+from lake_schema.store.object_storage import push, s3
 from tests import requests
 from truesky.catalogue import build_galaxies, build_stars
 from truesky.fluxes import compute_fluxes
@@ -181,7 +182,7 @@ def test_sources_farther_away_than_images_are_read_have_a_first_order_on_the_det
 
 def test_models_of_single_sources_add_up_to_the_published_image(rendered, folder, capsys):
     light = opened(rendered, "noise_free")
-    found = list(models.models(rendered, 3, "DET22"))
+    found = list(models.models(rendered, read.version(rendered, "products"), 3, "DET22"))
     np.testing.assert_array_equal(sum(one.frame for one in found).astype(np.float32), fits.getdata(light[3]))
     bright = max(found, key=lambda one: one.frame.sum())
     file = folder / "models.fits"
@@ -195,9 +196,20 @@ def test_models_of_single_sources_add_up_to_the_published_image(rendered, folder
         np.testing.assert_allclose(sum(models.frame(unit, (NY, NX)) for unit in units), bright.frame, rtol=1e-6)
 
 
+def test_a_lake_on_object_storage_has_the_same_models(rendered, bucket):
+    source, place = drawn_first(rendered), s3.address(f"s3://{bucket[1]}/lake", bucket[0].url)
+    list(push.push(rendered, place))
+    found = []
+    for address in (rendered, str(place)):
+        with truesky.open(address) as lake:
+            found.append([frame for _, frame in lake.models(3, "DET22", [source])])
+    np.testing.assert_array_equal(*found)
+
+
 def test_python_draws_the_same_models(rendered):
     """Each source's brightest pixels lie where the WCS and its trace say."""
-    (bright,) = models.models(rendered, 3, "DET22", [drawn_first(rendered)])
+    version = read.version(rendered, "products")
+    (bright,) = models.models(rendered, version, 3, "DET22", [drawn_first(rendered)])
     with truesky.open(rendered) as lake:
         ((source, electrons),) = lake.models(3, "DET22", [bright.id])
         assert source == bright.id
@@ -211,6 +223,8 @@ def test_python_draws_the_same_models(rendered):
         assert abs(y - NY / 2) < 2.0
         with pytest.raises(truesky.BadInput, match="no detector DET22 of exposure 99"):
             lake.models(99, "DET22")
+        with pytest.raises(truesky.BadInput, match="no light of source 12 is drawn there"):
+            lake.models(3, "DET22", [12])
 
 
 def drawn_first(root):

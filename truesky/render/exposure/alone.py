@@ -34,10 +34,19 @@ class Alone:
 
 
 def spectra(aim: Aim, rows: Rows, variant: Variant, seed: int, ids: Sequence[int] | None = None) -> Iterator[Alone]:
-    """One source after the other.  The float64 frames of all of them add up exactly to the noise-free one.
+    """Draw one source after the other. The float64 frames of all sources add up exactly to the noise-free frame.
 
-    aim, rows, variant, seed : as of `render`;  ids : of the sources, None = all that may have light on the detector
-    Errors : BadInput where nothing is spread out, or for a source that is not among them
+    Parameters
+    ----------
+    aim, rows, variant, seed : Aim, Rows, Variant, int
+        As for `render`.
+    ids : sequence of int, optional
+        Identifiers of the sources. The default is all sources that may have light on the detector.
+
+    Raises
+    ------
+    BadInput
+        At the call, if the image is not dispersed or a source is not among them.
     """
     exposure = aim.exposure
     if aim.channel.disperses is None or not aim.sees_sky:
@@ -55,12 +64,15 @@ def spectra(aim: Aim, rows: Rows, variant: Variant, seed: int, ids: Sequence[int
     shape, of = (aim.detector.ny, aim.detector.nx), dispersed.spectra
     known: draw.Known = {}
     noise = light.scene.pixel_noise
-    for number in chosen:
+
+    def drawn(number: int) -> Alone:
         at = np.array([place[number]])
         one = replace(dispersed, spectra=partial(_of_some, of, at))
         layers: dict[int, Float] = {}
         frame = draw.draw(sources.take(at), one, psf, shape, noise, None, layers, known)
-        yield Alone(number, frame, layers)
+        return Alone(number, frame, layers)
+
+    return map(drawn, chosen)
 
 
 def _of_some(spectra: Spectra, which: Int, some: Int) -> Float32:
