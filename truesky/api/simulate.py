@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from importlib import import_module
@@ -11,7 +10,8 @@ from typing import Any
 
 import pandas as pd
 
-from lake_schema import instruction_set, user_files
+from lake_schema import bounds, instruction_set, user_files
+from lake_schema.arrays import as_python
 from lake_schema.errors import BadInput
 from lake_schema.store import layout
 from truesky.api.lake import Lake
@@ -23,6 +23,8 @@ from truesky.request.from_toml import from_table, parse
 from truesky.request.schema import Request
 from truesky.running import shell
 
+_MOST_DETECTORS = 2**63 - 1
+
 
 def check(request: str | Path | Mapping[str, Any]) -> Request:
     """Check a request as completely as the jobs do, without writing anything.
@@ -30,7 +32,8 @@ def check(request: str | Path | Mapping[str, Any]) -> Request:
     Parameters
     ----------
     request : str, Path or mapping
-        A TOML file, or the same keys as a dictionary. Relative file names in a dictionary start at the current folder.
+        A TOML file, or the same keys as a dictionary, whose numbers may be numpy's and whose lists may be tuples or
+        arrays. Relative file names in a dictionary start at the current folder.
 
     Returns
     -------
@@ -98,10 +101,11 @@ def run(
     LakeError
         If a job fails.
     """
-    names = (detectors,) if isinstance(detectors, str) else tuple(detectors)
-    wanted = replace(_parsed(request), detectors=names, limit=limit)
+    names = bounds.names("detectors", detectors)
+    most = None if limit is None else bounds.whole("limit", limit, 1, _MOST_DETECTORS)
+    wanted = replace(_parsed(request), detectors=names, limit=most)
     instruction_set.check()
-    root = layout.lake(os.fspath(lake))
+    root = layout.lake(lake)
     universe.refuse_others(root, wanted)
     stages = run_command.stages(wanted, lenses, gaia)
     try:
@@ -138,9 +142,21 @@ def accuracies() -> pd.DataFrame:
 
 def _parsed(request: str | Path | Mapping[str, Any]) -> Request:
     if isinstance(request, Mapping):
-        return from_table(dict(request))
-    return parse(Path(request))
+        return from_table(_as_toml(request))
+    return parse(user_files.expanded(request))
+
+
+def _as_toml(value: Any) -> Any:
+    """A value of a dictionary as a TOML file would give it."""
+    if isinstance(value, Mapping):
+        return {key: _as_toml(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_as_toml(entry) for entry in value]
+    try:
+        return as_python(value)
+    except TypeError:
+        return value
 
 
 def _name(request: str | Path | Mapping[str, Any]) -> str:
-    return "request" if isinstance(request, Mapping) else f"request {user_files.shown(Path(request))}"
+    return "request" if isinstance(request, Mapping) else f"request {user_files.shown(user_files.expanded(request))}"
