@@ -67,12 +67,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     here = arguments[:1] == ["--local"]
     word, *rest = arguments[here:] or ["--help"]
-    if word in ("-h", "--help"):
-        print(f"{__doc__}\ntruesky {__version__}", end="\n")
-        return 0
-    if word == "--version":
-        print(f"truesky {__version__}")
-        return 0
+    if word in ("-h", "--help", "--version"):
+        said = f"truesky {__version__}" if word == "--version" else f"{__doc__}\ntruesky {__version__}"
+        # Whoever reads it may close the pipe after the first lines.
+        return command.status("truesky", lambda: print(said) or 0)
     if word in MODULES:
         return _module_command(word, rest)
     if word not in JOBS and word != "run":

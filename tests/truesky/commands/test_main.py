@@ -1,6 +1,9 @@
 """The command: which job or module a word is, what is handed on, and what is refused."""
 
+import os
 import re
+import subprocess
+import sys
 from importlib import import_module
 from pathlib import Path
 
@@ -35,6 +38,16 @@ def test_every_job_has_a_word():
     assert {module for modules in truesky.JOBS.values() for module in modules} == modules
     assert all(callable(import_module(module).main) for module, _ in truesky.MODULES.values())
     assert all(f" {word} " in f"{truesky.__doc__} " for word in (*truesky.JOBS, *truesky.MODULES))
+
+
+@pytest.mark.parametrize("word", ["--help", "--version"])
+def test_a_reader_of_the_help_may_close_the_pipe(word):
+    reader, writer = os.pipe()
+    os.close(reader)
+    # Unbuffered, so that the line that prints meets the closed pipe.
+    done = subprocess.run([sys.executable, "-u", "-m", "truesky.commands", word], stdout=writer, stderr=-1, cwd=ROOT)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (1, b"")
 
 
 def test_a_job_is_given_what_the_command_is(called):
