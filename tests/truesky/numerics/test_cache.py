@@ -1,6 +1,8 @@
 """The cache: one make a key, published whole, mapped read-only."""
 
 import os
+import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,6 +25,22 @@ def test_folder_is_named_by_the_environment(monkeypatch, tmp_path):
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setenv("HOME", str(tmp_path))
     assert cache.cache_dir() == tmp_path / ".cache" / "truesky"
+
+
+def test_old_entries_alone_are_removed_between_runs(tmp_path):
+    """The script of continuous integration leaves what is no entry of the cache, however old it is."""
+    root, folder = Path(__file__).resolve().parents[3], cache.cache_dir()
+    cache.cached_arrays("new", "ab", lambda: {"a": np.zeros(1)})
+    cache.cached_arrays("old", "ab", lambda: {"a": np.zeros(1)})
+    code = ("numba/0123456789abcdef", "numba/fedcba9876543210", "numba/other", "documents")
+    for name in code:
+        (folder / name).mkdir(parents=True)
+    new, old = (next(folder.glob(f"{name}-*")) for name in ("new", "old"))
+    for path in (old, *(folder / name for name in code if not name.endswith("f"))):
+        os.utime(path, (0, 0))
+    subprocess.run([root / ".ci" / "trim_cache", folder], check=True)
+    left = {path.relative_to(folder).as_posix() for path in (*folder.iterdir(), *(folder / "numba").iterdir())}
+    assert left == {new.name, "numba", "documents", "numba/other", "numba/0123456789abcdef"}
 
 
 def test_keys_tell_parts_types_and_shapes_apart():
