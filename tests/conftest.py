@@ -88,6 +88,15 @@ def pytest_unconfigure():
     gc.unfreeze()
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport():
+    """With $TRUESKY_NO_SKIPS a test that is skipped fails: a run of one test must not end well without it."""
+    report = yield
+    if report.skipped and os.environ.get("TRUESKY_NO_SKIPS"):
+        report.outcome = "failed"
+    return report
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
     """By file, or by what files share."""
