@@ -58,6 +58,10 @@ def test_a_process_is_stopped_while_it_ends():
     killed = []
 
     class Worker:
+        @property
+        def process(self):
+            return self
+
         def kill(self):
             killed.append(self)
 
