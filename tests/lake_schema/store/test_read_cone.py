@@ -141,11 +141,11 @@ def test_a_version_that_does_not_know_its_deflection(catalogues):
 
 
 def test_other_readers_open_mixed_orders(catalogues):
-    import lsdb
     from hats.io.validation import is_valid_catalog
 
     corner, _, version = catalogues[0]
     assert is_valid_catalog(str(version.folder), strict=True)
+    lsdb = pytest.importorskip("lsdb", reason="lsdb is not installed (extra test)")
     found = lsdb.open_catalog(str(version.folder)).cone_search(float(corner[0][0]), float(corner[1][0]), 60.0).compute()
     assert sorted(found["id"]) == sorted(
         version.cone(float(corner[0][0]), float(corner[1][0]), 1 / 60, ["id"])["id"].to_pylist()
@@ -168,8 +168,7 @@ def test_the_margin_of_each_cell_is_what_lies_about_it(catalogues):
 
 def test_a_cross_match_loses_no_pair_across_cells_of_other_orders(catalogues, tmp_path):
     """Every source has a twin 0.5" to the north, in files cut in another way."""
-    import lsdb
-
+    lsdb = pytest.importorskip("lsdb", reason="lsdb is not installed (extra test)")
     _, rows, version = catalogues[0]
     columns = {name: rows[name].to_numpy() for name in rows.column_names}
     columns["dec"] = columns["dec"] + 0.5 / 3600

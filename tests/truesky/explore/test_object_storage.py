@@ -55,8 +55,7 @@ def test_a_changed_object_is_refused_by_name_in_sql(there, bucket):
 
 
 def test_lsdb_reads_it_through_pyarrow(explored, there, monkeypatch):
-    import lsdb
-
+    lsdb = pytest.importorskip("lsdb", reason="lsdb is not installed (extra test)")
     monkeypatch.delenv("AWS_ENDPOINT_URL")
     galaxies = lsdb.open_catalog(catalogue(there, "galaxies"), columns="all")
     assert len(galaxies.compute()) == 500
