@@ -1,11 +1,12 @@
-# make demo | pilot | test | check | bench | docs | clean -- each installs what it is missing into .venv, and nothing a second time.
+# make demo | pilot | test | test-oldest | check | bench | docs | clean -- each installs what it is missing into .venv, and nothing a
+# second time. test-oldest has an environment of its own, .venv-oldest.
 
 SHELL := bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help demo pilot test check bench docs clean spark FORCE
+.PHONY: help demo pilot test test-oldest check bench docs clean spark FORCE
 
 export OMP_NUM_THREADS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
@@ -19,18 +20,20 @@ endif
 RUN := . .venv/bin/activate &&
 # Nothing is installed whose sha256 is not known; what comes as source (pyspark among others) is built by what is
 # known, too.
-INSTALL := .venv/bin/python -m pip install --no-deps --no-build-isolation
-KNOWN := $(INSTALL) --require-hashes --requirement
+# The target's folder is the environment.
+INSTALL = $(@D)/bin/python -m pip install --no-deps --no-build-isolation
+KNOWN = $(INSTALL) --require-hashes --requirement
 
 help:
-	@echo 'make demo    simulate a field: five Spark jobs, a lake of tables and two images in out/demo'
-	@echo 'make pilot   one observation of Euclid in full, ground cameras, calibrations: says hours and disc first; goes on'
-	@echo '             where it was stopped'
-	@echo 'make test    all tests'
-	@echo 'make check   style, types, who may import whom'
-	@echo 'make bench   all benchmarks'
-	@echo 'make docs    the documentation as a site in out/site, its notebooks run on the lake of make demo'
-	@echo 'make clean   remove what was computed (.venv and the cache stay)'
+	@echo 'make demo         simulate a field: five Spark jobs, a lake of tables and two images in out/demo'
+	@echo 'make pilot        one observation of Euclid in full, ground cameras, calibrations: says hours and disc first;'
+	@echo '                  goes on where it was stopped'
+	@echo 'make test         all tests'
+	@echo 'make test-oldest  fast tests with the lowest versions that pyproject.toml allows'
+	@echo 'make check        style, types, who may import whom'
+	@echo 'make bench        all benchmarks'
+	@echo 'make docs         the documentation as a site in out/site, its notebooks run on the lake of make demo'
+	@echo 'make clean        remove what was computed (.venv, .venv-oldest and the cache stay)'
 
 demo: spark
 	@$(RUN) python -m truesky.commands.demo
@@ -40,6 +43,11 @@ pilot: spark
 
 test: .venv/installed-test spark
 	@$(RUN) python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
+
+# Tests of the packages that call numpy, scipy, numba, astropy, pyarrow, hats, duckdb and boto3 most directly.
+test-oldest: .venv-oldest/installed
+	@. .venv-oldest/bin/activate && python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder \
+	    -m 'not nightly and not spark' tests/lake_schema $(addprefix tests/truesky/,explore fluxes numerics randomness request)
 
 check: .venv/installed-test
 	@$(RUN) ruff check . && ruff format --check . && mypy && lint-imports --no-cache
@@ -53,7 +61,7 @@ docs: .venv/installed-test demo
 clean:
 	rm -rf out build dist *.egg-info spark-warehouse
 	rm -rf .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
-	find . -path ./.venv -prune -o -name __pycache__ -prune -exec rm -rf {} +
+	find . -path './.venv*' -prune -o -name __pycache__ -prune -exec rm -rf {} +
 
 # ---------------------------------------------------------------------------- the environment
 
@@ -67,6 +75,13 @@ spark: .venv/installed
 	$(INSTALL) --editable .
 	@touch $@
 
+# truesky is built first, since the lowest galsim needs a setuptools that is too old to build it.
+.venv-oldest/installed: .venv-oldest/bin/python pyproject.toml requirements/build.txt requirements/oldest.txt
+	$(KNOWN) requirements/build.txt
+	$(INSTALL) --editable .
+	$(KNOWN) requirements/oldest.txt
+	@touch $@
+
 .venv/installed-test: requirements/java.txt
 .venv/installed-%: .venv/installed requirements/%.txt
 	$(KNOWN) requirements/$*.txt
@@ -76,14 +91,17 @@ spark: .venv/installed
 PYTHONS := $(or $(PYTHON),python3.13 python3.12 python3.11 python3)
 SERVES := import sys, ensurepip, venv; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
 # An environment that does not run, or was made for another folder, is made anew.
-STALE := $(shell test "$$(cat .venv/.place 2>/dev/null || pwd)" = "$$(pwd)" && .venv/bin/python -c 'import pip' 2>/dev/null || echo FORCE)
+stale = $(shell test "$$(cat $1/.place 2>/dev/null || pwd)" = "$$(pwd)" && $1/bin/python -c 'import pip' 2>/dev/null || echo FORCE)
 
-.venv/bin/python: $(STALE)
+.venv/bin/python: $(call stale,.venv)
+.venv-oldest/bin/python: $(call stale,.venv-oldest)
+.venv/bin/python .venv-oldest/bin/python: environment = $(@D:/bin=)
+.venv/bin/python .venv-oldest/bin/python:
 	@for python in $(PYTHONS); do \
 	    if $$python -c '$(SERVES)' >/dev/null 2>&1; then \
-	        echo "$$($$python --version) makes .venv"; \
-	        $$python -m venv --clear .venv; \
-	        pwd > .venv/.place; \
+	        echo "$$($$python --version) makes $(environment)"; \
+	        $$python -m venv --clear $(environment); \
+	        pwd > $(environment)/.place; \
 	        exit; \
 	    fi; \
 	done; \

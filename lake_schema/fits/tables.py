@@ -56,6 +56,8 @@ def table_to_fits(path: Path, table: pa.Table, declared: Table) -> None:
     for column in columns:
         if column.type == "bool":
             stored[column.name][table.column(column.name).is_null().to_numpy()] = 0
+            # astropy 7.2 would write its converted copy of the column, in which a missing value is False.
+            unit.data._converted.pop(column.name, None)
     for number, column in enumerate(columns, start=1):
         if column.ucd:
             unit.header[f"TUCD{number}"] = (column.ucd, "IVOA UCD")

@@ -19,6 +19,7 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+from packaging.version import Version
 
 import lake_schema
 from lake_schema.store import provenance
@@ -144,7 +145,7 @@ def pins() -> dict[str, str]:
     return found
 
 
-@pytest.mark.parametrize("name", LISTS)
+@pytest.mark.parametrize("name", [*LISTS, "oldest"])
 def test_every_package_has_one_version_and_hashes(name):
     some = pinned(name)
     assert some
@@ -189,6 +190,22 @@ def test_what_is_wanted_is_pinned_within_its_range():
 
 # What users install for some commands alone.
 EXTRAS = ("page", "reduction", "s3")
+
+
+def test_the_oldest_versions_are_the_lower_bounds():
+    """A lower bound that cannot be installed with the other ones would not be tested."""
+    project = PROJECT["project"]
+    lines = [
+        *project["dependencies"],
+        *(line for extra in EXTRAS for line in project["optional-dependencies"][extra]),
+    ]
+    oldest = {canonicalize_name(requirement.name): requirement for requirement, _ in pinned("oldest")}
+    for requirement in map(Requirement, lines):
+        (bound,) = (Version(one.version).release for one in requirement.specifier if one.operator == ">=")
+        (pin,) = (Version(one.version).release for one in oldest[canonicalize_name(requirement.name)].specifier)
+        assert pin[: len(bound)] == bound, requirement
+
+
 # Of numba, pyspark and boto3, which want one version of them each and are nothing without.
 PARTS = {"llvmlite", "py4j", "botocore"}
 

@@ -362,7 +362,8 @@ def test_results_in_files(explorer, galaxies, tmp_path):
     fits = Table.read(explorer.export(text, tmp_path / "a.fits"))
     header = getheader(tmp_path / "a.fits", 1)
     assert (header["TUNIT2"], header["TUCD2"]) == ("deg", GALAXIES.column("ra").ucd)
-    csv = pd.read_csv(explorer.export(text, tmp_path / "a.csv"))
+    # By default, pandas 3.0 rounds the last bits of some numbers.
+    csv = pd.read_csv(explorer.export(text, tmp_path / "a.csv"), float_precision="round_trip")
     parquet = pa.parquet.read_table(explorer.export(text, tmp_path / "a.parquet"))
     assert fits["ra"].unit == "deg"
     assert fits["flux_halpha"].unit == u.Unit("erg s-1 cm-2")

@@ -3,10 +3,8 @@
 from pathlib import Path
 
 import matplotlib.pyplot as plt
-import nbformat
 import pytest
 from astropy.table import Table
-from nbclient import NotebookClient
 
 from lake_schema.store import layout, publish
 from tests import requests
@@ -14,6 +12,8 @@ from truesky.catalogue import build_galaxies, build_stars
 from truesky.fluxes import compute_fluxes
 from truesky.request.from_toml import parse
 
+nbclient = pytest.importorskip("nbclient", reason="nbclient is not installed (extra notebooks)")
+nbformat = pytest.importorskip("nbformat", reason="nbformat is not installed (extra notebooks)")
 NOTEBOOK = Path(__file__).resolve().parents[3] / "notebooks" / "01_explore_catalogue.ipynb"
 SMALL = requests.shallow(23.5, 20.0) + '[fluxes]\nbands = ["euclid_vis", "lsst_r"]\n'
 
@@ -66,7 +66,7 @@ def test_every_cell_runs_in_a_kernel(cells, tmp_path, monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
     monkeypatch.setenv("PYTHONPATH", str(NOTEBOOK.parents[1]))
     notebook = nbformat.read(NOTEBOOK, as_version=4)
-    NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(NOTEBOOK.parent)}}).execute()
+    nbclient.NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(NOTEBOOK.parent)}}).execute()
     outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
     assert [output for output in outputs if output.output_type in ("error", "stream")] == []
     assert sum("image/png" in output.get("data", {}) for output in outputs) == 8
