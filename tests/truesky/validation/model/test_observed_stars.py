@@ -68,7 +68,7 @@ def test_a_fifth_more_stars_fail_the_counts(universe, figures):
 def test_without_companions_the_neighbourhood_fails(monkeypatch, figures, universe):
     law = companions._law()
     monkeypatch.setattr(companions, "_law", lambda: law | {"fraction": tuple(0.5 * f for f in law["fraction"])})
-    single = dataclasses.replace(universe, galaxy=milky_way.milky_way())
+    single = dataclasses.replace(universe, galaxy=milky_way.milky_way.__wrapped__())
     assert failed(figures | observed_stars.nearby(single)) == {"stars_near_the_sun": ["companions_per_star"]}
 
 
