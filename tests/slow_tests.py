@@ -101,6 +101,13 @@ class Watch:
             pytest.fail(f"{message} (more than {LIMIT:g} s)", pytrace=False)
         self.item.warn(pytest.PytestWarning(message))
 
+    def seconds_since(self, since, before):
+        """CPU seconds since a time, s since the epoch, when the clock showed `before`; at most those of one core.
+
+        A child's CPU time is counted when the child is waited for, which can be long after the test that started it.
+        """
+        return min(self.clock() - before, time.time() - since)
+
     def is_filled(self, since):
         """Whether arrays or compiled code were added to the cache after a time, s since the epoch.
 
@@ -116,7 +123,7 @@ class Watch:
     def pytest_runtest_call(self, item):
         since, before = time.time(), self.clock()
         result = yield
-        self.judge(item.nodeid, self.clock() - before, since)
+        self.judge(item.nodeid, self.seconds_since(since, before), since)
         return result
 
     @pytest.hookimpl(wrapper=True)
@@ -124,5 +131,5 @@ class Watch:
         # The fixtures that it depends on were set up before.
         since, before = time.time(), self.clock()
         result = yield
-        self.judge(f"{fixturedef.baseid}::{fixturedef.argname}", self.clock() - before, since)
+        self.judge(f"{fixturedef.baseid}::{fixturedef.argname}", self.seconds_since(since, before), since)
         return result

@@ -56,6 +56,14 @@ def test_between_the_limits_there_is_a_warning(watch, warnings):
     assert line.startswith(f"{NAME} took 10.0 s")
 
 
+def test_a_child_of_an_earlier_test_is_not_counted(watch, monkeypatch):
+    """Its CPU time is added when it is waited for, during a test that takes 2 s."""
+    monkeypatch.setattr(slow_tests.time, "time", lambda: 1002.0)
+    watch.clock = lambda: 120.0
+    assert watch.seconds_since(1000.0, 100.0) == 2.0
+    assert watch.seconds_since(900.0, 100.0) == 20.0
+
+
 def test_an_empty_list_warns_of_all(watch, warnings):
     watch.listed = {}
     watch.judge(NAME, 100.0, 2000.0)
@@ -84,7 +92,9 @@ def clock_of(*seconds):
     return lambda: next(left)
 
 
-def test_calls_and_fixtures_are_measured(watch):
+def test_calls_and_fixtures_are_measured(watch, monkeypatch):
+    monkeypatch.setattr(slow_tests.time, "time", clock_of(*range(2000, 10000, 1000)))
+
     def result_of(wrapper):
         next(wrapper)
         with pytest.raises(StopIteration) as done:
