@@ -69,9 +69,10 @@ def machine_code_dir() -> Path:
 
 
 def sources_key(root: Path = Path(__file__).parents[1]) -> str:
-    """sha256 (hex) of every file below a folder that has compiled functions.
+    """Return the sha256 (hex) of every file below a folder that names truesky.numerics.compiling.
 
-    numba compiles a function anew when its own file changes, not when one does whose functions are in it.
+    numba compiles a function again if its own file changes, but not if another file changes whose functions or
+    constants it contains. A file with such constants therefore names the module in a comment.
     """
     compiled = [path for path in sorted(root.rglob("*.py")) if b"truesky.numerics.compiling" in path.read_bytes()]
     return content_key(*(part for path in compiled for part in (path.relative_to(root).as_posix(), path.read_bytes())))

@@ -24,7 +24,8 @@ from numba.core.caching import UserProvidedCacheLocator  # noqa: E402
 Function = TypeVar("Function", bound=Callable[..., Any])
 _PACKAGE = Path(__file__).parents[1]
 _CONFIG: Any = numba.config
-# The others are for functions of users, and for machines on which the cache cannot be written.
+# The others are for functions of users, and for machines on which the cache cannot be written. The options below decide
+# about the machine code, so this file is part of its key, too: it names truesky.numerics.compiling.
 _LOCATORS = f"{__name__}.PackageCacheLocator,UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator"
 
 

@@ -1,5 +1,6 @@
 """What is compiled gives the same bytes, whether a process compiles it or finds it in the cache."""
 
+import ast
 import os
 import shutil
 import subprocess
@@ -92,3 +93,55 @@ def test_machine_code_is_of_the_sources_as_they_are(tmp_path):
     assert cache.sources_key(tmp_path) == first
     inner.write_text("from truesky.numerics.compiling import jit\n\n")
     assert cache.sources_key(tmp_path) != first
+
+
+def test_constants_of_kernels_are_in_the_key_of_the_machine_code():
+    """A constant of another module is compiled into a kernel, so its file must be part of the key."""
+    root, checked = Path(truesky.__file__).parents[1], 0
+    for path in sorted((root / "truesky").rglob("*.py")):
+        source = path.read_text()
+        if "from truesky.numerics.compiling import" not in source:
+            continue
+        tree = ast.parse(source)
+        imported = dict(_imports(tree))
+        for name in sorted(_names_in_kernels(tree) & imported.keys()):
+            folder = root.joinpath(*imported[name].split("."))
+            file = folder / f"{name}.py" if folder.is_dir() else folder.with_suffix(".py")
+            assert "truesky.numerics.compiling" in file.read_text(), f"{path}: {name} of {file}"
+            checked += 1
+    assert checked > 5
+
+
+def _imports(tree):
+    """Yield the name of each import from our packages, and the package or module it comes from."""
+    for node in tree.body:
+        if isinstance(node, ast.ImportFrom) and node.module.split(".")[0] in ("truesky", "lake_schema"):
+            yield from ((alias.name, node.module) for alias in node.names)
+
+
+def _names_in_kernels(tree):
+    """Return the names that compiled functions use, and those in the module-level assignments of such names."""
+    kernels = [
+        node
+        for node in tree.body
+        if isinstance(node, ast.FunctionDef)
+        and any(isinstance(d, ast.Name) and d.id in ("jit", "exact_jit") for d in node.decorator_list)
+    ]
+    used = set().union(*(_global_names(kernel) for kernel in kernels))
+    assigned = {
+        target.id: {n.id for n in ast.walk(node.value) if isinstance(n, ast.Name)}
+        for node in tree.body
+        if isinstance(node, ast.Assign)
+        for whole in node.targets
+        for target in ast.walk(whole)
+        if isinstance(target, ast.Name)
+    }
+    while more := {n for name in used for n in assigned.get(name, ())} - used:
+        used |= more
+    return used
+
+
+def _global_names(kernel):
+    names = [node for part in kernel.body for node in ast.walk(part) if isinstance(node, ast.Name)]
+    local = {node.id for node in names if isinstance(node.ctx, ast.Store)} | {a.arg for a in kernel.args.args}
+    return {node.id for node in names} - local

@@ -40,7 +40,8 @@ from truesky.numerics import sums
 
 # Wavelengths in each sub-band: a bar's fringes run through each other.
 _WAVES = 8
-# Half the width of a spike, pixels, and the steps of its table across and along.
+# Half the width of a spike, pixels, and the steps of its table across and along. Kernels contain these constants, and
+# naming truesky.numerics.compiling here makes this file part of the key of the machine code.
 WIDE, STEP, LONG = 40, 0.25, 8.0
 # Points along a bar that tell how much of it is seen.
 _POINTS = 7001

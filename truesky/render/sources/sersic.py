@@ -24,7 +24,8 @@ INDEX_LO, INDEX_HI = 0.3, 6.2
 ROWS = 96
 # k^2 from 2^-30, where 1 - S is below 1e-7 for every n, to 2^26.
 OCTAVE_LO, OCTAVE_HI = -30, 26
-# The top bits of float32(2^OCTAVE_LO).
+# The top bits of float32(2^OCTAVE_LO). Kernels contain this constant, and naming truesky.numerics.compiling here makes
+# this file part of the key of the machine code.
 FIRST_BITS = (127 + OCTAVE_LO) << 7
 _SEGMENTS = 128 * (OCTAVE_HI - OCTAVE_LO)
 # Grid of the Hankel transform: points, and reach in radius either side of 1.
