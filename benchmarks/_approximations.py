@@ -28,15 +28,15 @@ from truesky.render.sources.source_list import Sources
 FOLDING, TINY, HUGE, FAINT = 5e-3, 0.01, 10.0, 24.5
 
 
-Anything = TypeVar("Anything")
+Value = TypeVar("Anything")
 
 
-def _as_it_is(what: Anything) -> Anything:
-    return what
+def _identity(value: Value) -> Value:
+    return value
 
 
-def _sizes(some: Sources, psf: model.Psf, scene: Scene, settings: Settings) -> Int:
-    return stamp_sizes.stamp_sizes(some.electrons, some.shape, some.shapes, psf, scene.noise, settings)
+def _stamp_sizes(sources: Sources, psf: model.Psf, scene: Scene, settings: Settings) -> Int:
+    return stamp_sizes.stamp_sizes(sources.electrons, sources.shape, sources.shapes, psf, scene.noise, settings)
 
 
 @dataclass(frozen=True)
@@ -49,140 +49,149 @@ class Approximation:
     """
 
     name: str
-    concerned: Callable[[Scene, int, int], Sources] = scenes.sample
-    simplified: Callable[[Sources], Sources] = _as_it_is
-    psf: Callable[[model.Psf], model.Psf] = _as_it_is
-    sizes: Callable[[Sources, model.Psf, Scene, Settings], Int] = _sizes
-    after: Callable[[Float], Float] = _as_it_is
-    numbers: tuple[int, int, int] = (24, 6, 0)
-    timed: Approximation | None = None
+    select_galaxies: Callable[[Scene, int, int], Sources] = scenes.sample
+    simplify: Callable[[Sources], Sources] = _identity
+    simplify_psf: Callable[[model.Psf], model.Psf] = _identity
+    sizes: Callable[[Sources, model.Psf, Scene, Settings], Int] = _stamp_sizes
+    process_image: Callable[[Float], Float] = _identity
+    sample_sizes: tuple[int, int, int] = (24, 6, 0)
+    timed_as: Approximation | None = None
 
-    def draw(self, some: Sources, psf: model.Psf, scene: Scene, settings: Settings, side: int | None = None) -> Float:
+    def draw(
+        self, sources: Sources, psf: model.Psf, scene: Scene, settings: Settings, side: int | None = None
+    ) -> Float:
         """Sources that are simplified, through a PSF that is."""
-        neglected = stamp_sizes.neglected_flux(some.electrons, scene.noise, settings)
+        neglected = stamp_sizes.neglected_flux(sources.electrons, scene.noise, settings)
         nx, ny = (scene.nx, scene.ny) if side is None else (side, side)
-        sizes = self.sizes(some, psf, scene, settings)
-        return self.after(stamps.draw(some, sizes, psf, nx, ny, None, neglected))
+        sizes = self.sizes(sources, psf, scene, settings)
+        return self.process_image(stamps.draw(sources, sizes, psf, nx, ny, None, neglected))
 
 
-def _folded(some: Sources, psf: model.Psf, scene: Scene, settings: Settings) -> Int:
+def _folding_sizes(sources: Sources, psf: model.Psf, scene: Scene, settings: Settings) -> Int:
     """Stamps as wide as galsim's folding_threshold asks for: all but that of the light."""
-    shapes = some.shapes.take(some.shape)
+    shapes = sources.shapes.take(sources.shape)
     stretch = np.sqrt(shapes.magnification)
     radius = np.zeros(len(shapes))
     for share, half_light, index in (
         (shapes.bulge_fraction, shapes.bulge_radius, shapes.sersic_index),
         (1 - shapes.bulge_fraction, shapes.disk_radius, np.ones(len(shapes))),
     ):
-        whole = (gammaincinv(2 * index, 1 - FOLDING) / gammaincinv(2 * index, 0.5)) ** index
-        radius = np.maximum(radius, np.where(share > 0, half_light * stretch * whole, 0.0))
+        radius_ratio = (gammaincinv(2 * index, 1 - FOLDING) / gammaincinv(2 * index, 0.5)) ** index
+        radius = np.maximum(radius, np.where(share > 0, half_light * stretch * radius_ratio, 0.0))
     light = psf.outside / (psf.outside[0] + psf.surface[0])
-    of_psf = np.argmax(light < FOLDING) if (light < FOLDING).any() else len(light)
-    wanted = 2 * np.hypot(radius / psf.pixel_scale, of_psf)
+    psf_radius = np.argmax(light < FOLDING) if (light < FOLDING).any() else len(light)
+    width = 2 * np.hypot(radius / psf.pixel_scale, psf_radius)
     return np.asarray(
-        stamp_sizes.SIZES[np.minimum(np.searchsorted(stamp_sizes.SIZES, wanted), len(stamp_sizes.SIZES) - 1)]
+        stamp_sizes.SIZES[np.minimum(np.searchsorted(stamp_sizes.SIZES, width), len(stamp_sizes.SIZES) - 1)]
     )
 
 
-def _rounded(some: Sources) -> Sources:
-    return replace(some, shapes=replace(some.shapes, sersic_index=np.round(some.shapes.sersic_index, 1)))
+def _round_index(sources: Sources) -> Sources:
+    return replace(sources, shapes=replace(sources.shapes, sersic_index=np.round(sources.shapes.sersic_index, 1)))
 
 
-def _exponential(some: Sources) -> Sources:
+def _to_exponential(sources: Sources) -> Sources:
     """Discs of the same half-light radius; those that had a bulge alone are seen as round as it was."""
-    shapes = some.shapes
+    shapes = sources.shapes
     fraction = shapes.bulge_fraction
     radius = fraction * shapes.bulge_radius + (1 - fraction) * shapes.disk_radius
     axis_ratio = np.degrees(np.arccos(np.clip(shapes.bulge_axis_ratio, 0.0, 1.0)))
     inclination = np.where(fraction < 1, shapes.inclination, axis_ratio)
     return replace(
-        some,
+        sources,
         shapes=replace(shapes, disk_radius=radius, bulge_fraction=np.zeros(len(shapes)), inclination=inclination),
     )
 
 
-def _faint(scene: Scene, seed: int, n: int) -> Sources:
+def _faint_galaxies(scene: Scene, seed: int, n: int) -> Sources:
     """Bulge and disc, beyond the limit."""
-    some = scenes.sources(scene, seed, galaxies=40 * n, stars=0)
-    fraction = some.shapes.bulge_fraction
-    both = (fraction > 0) & (fraction < 1) & (scenes.magnitudes(some, scene) > FAINT)
-    return some.take(np.flatnonzero(both)[:n])
+    sources = scenes.sources(scene, seed, galaxies=40 * n, stars=0)
+    fraction = sources.shapes.bulge_fraction
+    is_faint_composite = (fraction > 0) & (fraction < 1) & (scenes.magnitudes(sources, scene) > FAINT)
+    return sources.take(np.flatnonzero(is_faint_composite)[:n])
 
 
-def _sized(scene: Scene, seed: int, n: int, radius: float, magnitude: float) -> Sources:
-    some = scenes.sources(scene, seed, galaxies=n, stars=0)
-    shapes = some.shapes
+def _galaxies_of_size(scene: Scene, seed: int, n: int, radius: float, magnitude: float) -> Sources:
+    sources = scenes.sources(scene, seed, galaxies=n, stars=0)
+    shapes = sources.shapes
     scale = radius / galaxy_shapes.half_light(shapes)
     shapes = replace(shapes, bulge_radius=shapes.bulge_radius * scale, disk_radius=shapes.disk_radius * scale)
     electrons = np.full(n, scene.exposure * 10 ** (0.4 * (scene.zero_point - magnitude)))
-    return replace(some, shapes=shapes, electrons=electrons)
+    return replace(sources, shapes=shapes, electrons=electrons)
 
 
-def _tiny(scene: Scene, seed: int, n: int) -> Sources:
-    return _sized(scene, seed, n, TINY, 23.0)
+def _tiny_galaxies(scene: Scene, seed: int, n: int) -> Sources:
+    return _galaxies_of_size(scene, seed, n, TINY, 23.0)
 
 
-def _huge(scene: Scene, seed: int, n: int) -> Sources:
+def _huge_galaxies(scene: Scene, seed: int, n: int) -> Sources:
     """The steep ones, which the paper had no memory for."""
-    some = _sized(scene, seed, n, 1.2 * HUGE, 17.0)
+    sources = _galaxies_of_size(scene, seed, n, 1.2 * HUGE, 17.0)
     index, radius = np.linspace(2.5, 6.0, n), np.full(n, 1.2 * HUGE)
-    shapes = replace(some.shapes, bulge_radius=radius, sersic_index=index, bulge_fraction=np.ones(n))
-    return replace(some, shapes=shapes)
+    shapes = replace(sources.shapes, bulge_radius=radius, sersic_index=index, bulge_fraction=np.ones(n))
+    return replace(sources, shapes=shapes)
 
 
-def _down_and_up(image: Float) -> Float:
+def _resample(image: Float) -> Float:
     """Pixels twice as wide, and a biquadratic interpolation between them."""
     ny, nx = image.shape
     coarse = image.reshape(ny // 2, 2, nx // 2, 2).sum(axis=(1, 3))
     return np.asarray(zoom(coarse, 2, order=2, mode="nearest", grid_mode=True)) / 4
 
 
-def _half(some: Sources, psf: model.Psf, scene: Scene, settings: Settings) -> Int:
-    sizes = _sizes(some, psf, scene, settings)
+def _half_sizes(sources: Sources, psf: model.Psf, scene: Scene, settings: Settings) -> Int:
+    sizes = _stamp_sizes(sources, psf, scene, settings)
     return np.asarray(stamp_sizes.SIZES[np.searchsorted(stamp_sizes.SIZES, sizes // 2)])
 
 
-def _up(image: Float) -> Float:
+def _upsample_copy(image: Float) -> Float:
     """What `_down_and_up` takes besides the drawing, of an image of half the side."""
     zoom(image[: len(image) // 2, : len(image) // 2], 2, order=2, mode="nearest", grid_mode=True)
     return image
 
 
-def _grey(some: Sources) -> Sources:
-    return replace(some, photons=None)
+def _remove_colours(sources: Sources) -> Sources:
+    return replace(sources, photons=None)
 
 
-def _grey_planes(psf: model.Psf) -> model.Psf:
+def _mean_colour_psf(psf: model.Psf) -> model.Psf:
     """One plane for all colours; its drift across the detector stays."""
     planes = psf.planes
     assert planes is not None
-    kept = [i for i, power in enumerate(planes.powers) if power[2] == 0]
+    achromatic = [i for i, power in enumerate(planes.powers) if power[2] == 0]
     mean = planes.images.mean(axis=0, keepdims=True)
-    powers = tuple(planes.powers[i] for i in kept)
+    powers = tuple(planes.powers[i] for i in achromatic)
     waves = planes.wavelength.mean(keepdims=True)
-    return replace(psf, planes=model.Planes(waves, mean, planes.drift[kept], planes.half, powers))
+    return replace(psf, planes=model.Planes(waves, mean, planes.drift[achromatic], planes.half, powers))
 
 
-def _still(psf: model.Psf) -> model.Psf:
+def _central_psf(psf: model.Psf) -> model.Psf:
     """The detector's centre everywhere."""
     planes = psf.planes
     assert planes is not None
     return replace(psf, planes=replace(planes, drift=planes.drift[:0], powers=()))
 
 
-NONE = Approximation("none")
+NO_APPROXIMATION = Approximation("none")
 ALL = (
-    Approximation("index rounded to 0.1", simplified=_rounded),
-    Approximation("single component, faint", concerned=_faint, simplified=_exponential, numbers=(24, 6, 1000)),
-    Approximation("folding threshold 0.5 %", sizes=_folded),
-    Approximation("exponential below 0.01 arcsec", concerned=_tiny, simplified=_exponential, numbers=(12, 3, 1000)),
+    Approximation("index rounded to 0.1", simplify=_round_index),
+    Approximation(
+        "single component, faint", select_galaxies=_faint_galaxies, simplify=_to_exponential, sample_sizes=(24, 6, 1000)
+    ),
+    Approximation("folding threshold 0.5 %", sizes=_folding_sizes),
+    Approximation(
+        "exponential below 0.01 arcsec",
+        select_galaxies=_tiny_galaxies,
+        simplify=_to_exponential,
+        sample_sizes=(12, 3, 1000),
+    ),
     Approximation(
         "sampled down and up",
-        concerned=_huge,
-        after=_down_and_up,
-        numbers=(4, 2, 4),
-        timed=Approximation("half the side", sizes=_half, after=_up),
+        select_galaxies=_huge_galaxies,
+        process_image=_resample,
+        sample_sizes=(4, 2, 4),
+        timed_as=Approximation("half the side", sizes=_half_sizes, process_image=_upsample_copy),
     ),
-    Approximation("one PSF for all colours", simplified=_grey, psf=_grey_planes),
-    Approximation("one PSF for all places", psf=_still),
+    Approximation("one PSF for all colours", simplify=_remove_colours, simplify_psf=_mean_colour_psf),
+    Approximation("one PSF for all places", simplify_psf=_central_psf),
 )

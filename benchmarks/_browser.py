@@ -13,7 +13,7 @@ from statistics import median, quantiles
 from typing import Any
 
 CHROMIUM = os.environ.get("TRUESKY_CHROMIUM") or shutil.which("chromium")
-_LONGEST, _HELD = 120.0, 3.0
+_TIMEOUT, _PAUSE = 120.0, 3.0
 # A move of the brush of the first chart: ms until the other charts show other numbers, and until a frame with them.
 _MOVE = """async ([kind, facts]) => {
   const [canvas] = document.querySelectorAll('#plot-grid canvas'), box = canvas.getBoundingClientRect();
@@ -29,7 +29,7 @@ _MOVE = """async ([kind, facts]) => {
 }"""
 
 
-def missing() -> str:
+def missing_requirement() -> str:
     """What there is not, "" where there is a browser."""
     if importlib.util.find_spec("playwright") is None:
         return "playwright is not installed (make .venv/installed-test)"
@@ -37,7 +37,7 @@ def missing() -> str:
 
 
 @contextmanager
-def _tab() -> Iterator[Any]:
+def _open_tab() -> Iterator[Any]:
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as started:
@@ -46,54 +46,54 @@ def _tab() -> Iterator[Any]:
         browser.close()
 
 
-def _until(tab: Any, expression: str) -> None:
-    end = time.monotonic() + _LONGEST
+def _wait_until(tab: Any, expression: str) -> None:
+    end = time.monotonic() + _TIMEOUT
     while not tab.evaluate(expression):
         if time.monotonic() > end:
             raise TimeoutError(expression)
         time.sleep(0.01)
 
 
-def first_sky(command: Sequence[str]) -> float:
+def time_first_sky(command: Sequence[str]) -> float:
     """s from a command that serves a lake to the legend of its sky."""
-    with _tab() as tab:
+    with _open_tab() as tab:
         started = time.perf_counter()
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
             try:
                 assert server.stdout is not None
                 tab.goto(server.stdout.readline().split()[-1])
-                _until(tab, "document.getElementById('sky-legend').textContent !== ''")
+                _wait_until(tab, "document.getElementById('sky-legend').textContent !== ''")
                 return time.perf_counter() - started
             finally:
                 server.terminate()
 
 
-def brushes(address: str, times: int) -> dict[str, float]:
+def time_brushes(address: str, times: int) -> dict[str, float]:
     """Moves of a brush over four histograms and a map: held, and counted anew.
 
     address : of a page over a lake whose table `trial` has columns x_0 to x_3;  times : how many moves
     """
-    with _tab() as tab:
+    with _open_tab() as tab:
         tab.goto(address)
-        _until(tab, "document.body.dataset.ready === '1'")
+        _wait_until(tab, "document.body.dataset.ready === '1'")
         tab.keyboard.press("2")
         tab.fill("#plot-source", "trial")
         tab.press("#plot-source", "Enter")
         tab.evaluate("() => document.getElementById('plot-source').dispatchEvent(new Event('change'))")
-        _until(tab, "document.getElementById('plot-state').textContent.includes('rows')")
+        _wait_until(tab, "document.getElementById('plot-state').textContent.includes('rows')")
         # To and fro: beyond the end of an axis nothing changes.
         keys = ["ArrowRight" if k % 16 < 8 else "ArrowLeft" for k in range(times)]
-        anew = [tab.evaluate(_MOVE, ["key", {"key": key}]) for key in keys][1:]
+        key_times = [tab.evaluate(_MOVE, ["key", {"key": key}]) for key in keys][1:]
         box = tab.locator("#plot-grid canvas").first.bounding_box()
         tab.mouse.move(box["x"] + 0.3 * box["width"], box["y"] + 0.5 * box["height"])
         tab.mouse.down()
         tab.mouse.move(box["x"] + 0.35 * box["width"], box["y"] + 0.5 * box["height"])
         # The counts for every place of the brush.
-        time.sleep(_HELD)
-        held = [tab.evaluate(_MOVE, ["drag", {"place": 0.4 + 0.5 * k / times}]) for k in range(times)]
+        time.sleep(_PAUSE)
+        drag_times = [tab.evaluate(_MOVE, ["drag", {"place": 0.4 + 0.5 * k / times}]) for k in range(times)]
         tab.mouse.up()
     return {
-        "cube_ms": median(one[0] for one in held),
-        "brush_1m_ms": median(one[1] for one in anew),
-        "brush_1m_95_ms": quantiles((one[1] for one in anew), n=20)[-1],
+        "cube_ms": median(durations[0] for durations in drag_times),
+        "brush_1m_ms": median(durations[1] for durations in key_times),
+        "brush_1m_95_ms": quantiles((durations[1] for durations in key_times), n=20)[-1],
     }

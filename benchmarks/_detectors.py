@@ -20,23 +20,23 @@ from truesky.render import plan_exposures, render_exposures
 from truesky.render.effects.effect import Effect
 from truesky.request.from_toml import parse
 from truesky.request.schema import Request
-from truesky.running.measured import forget_peak, peak_gb
+from truesky.running.task_metrics import peak_memory_gb, reset_peak_memory
 
 ROOT = Path(__file__).resolve().parents[1]
 # As far from an exposure's centre as sources of one of its detectors may lie, deg.
-FIELD = 0.62
+FIELD_RADIUS = 0.62
 
 
-def lake(folder: Path, wanted: Request) -> Path:
+def make_lake(folder: Path, request: Request) -> Path:
     """Catalogues and fluxes of a request."""
-    root = layout.lake(folder / "lake")
+    root = layout.resolve_lake(folder / "lake")
     for module in (build_galaxies, build_stars, compute_fluxes):
-        for step in module.steps(root, wanted):
-            publish.make(root, step.plan, step.work)
+        for step in module.steps(root, request):
+            publish.make_version(root, step.plan, step.work)
     return root
 
 
-def head(quick: bool) -> str:
+def request_head(quick: bool) -> str:
     """The demo's request as far as its first pointing, as text; of a brighter universe where it must be quick."""
     text = (ROOT / "requests" / "demo.toml").read_text(encoding="utf-8").split("[[pointing]]")[0]
     if quick:
@@ -46,27 +46,27 @@ def head(quick: bool) -> str:
     return text
 
 
-def prepared(root: Path, wanted: Request, number: int = 0) -> Json:
+def plan_detector(root: Path, request: Request, number: int = 0) -> Json:
     """Plans the request; facts of a detector's task, by its number among those of the plan."""
-    for step in plan_exposures.steps(root, wanted):
-        publish.make(root, step.plan, step.work)
-    step = render_exposures.steps(root, wanted)[0]
-    return {**step.plan.facts, **step.plan.parts[number].facts}
+    for step in plan_exposures.steps(root, request):
+        publish.make_version(root, step.plan, step.run_task)
+    step = render_exposures.steps(root, request)[0]
+    return {**step.plan.facts, **step.plan.tasks[number].facts}
 
 
-def rendered(root: Path, facts: Json, folder: Path) -> tuple[float, float]:
+def measure_render(root: Path, facts: Json, folder: Path) -> tuple[float, float]:
     """CPU s and largest memory, GB, from reading the sources to the last byte written."""
-    forget_peak()
+    reset_peak_memory()
     started = time.process_time()
-    output = render_exposures.work(root, facts)
+    output = render_exposures.render_task(root, facts)
     for path, write in output.files.items():
         file = folder / path
         file.parent.mkdir(parents=True, exist_ok=True)
         write(file)
-    return time.process_time() - started, peak_gb()
+    return time.process_time() - started, peak_memory_gb()
 
 
-def cold_and_warm(root: Path, facts: Json, folder: Path, planes: str, repeats: int) -> dict[str, float]:
+def time_cold_and_warm(root: Path, facts: Json, folder: Path, planes: str, repeats: int) -> dict[str, float]:
     """`cold_s`, `warm_s` and `peak_gb` of a detector: without the PSF's planes in the cache, and with them.
 
     planes : pattern of their folders in the cache
@@ -76,15 +76,15 @@ def cold_and_warm(root: Path, facts: Json, folder: Path, planes: str, repeats: i
         seconds = []
         for _ in range(repeats):
             if state == "cold":
-                without_planes(planes)
-            used, peak = rendered(root, facts, folder)
+                remove_planes(planes)
+            used, peak = measure_render(root, facts, folder)
             seconds.append(used)
             out["peak_gb"] = max(out["peak_gb"], peak)
         out[f"{state}_s"] = min(seconds)
     return out
 
 
-def without_planes(pattern: str) -> None:
+def remove_planes(pattern: str) -> None:
     """Empties the cache of PSF planes, whose folders match a pattern."""
     for folder in cache.cache_dir().glob(pattern):
         for file in folder.iterdir():
@@ -92,44 +92,47 @@ def without_planes(pattern: str) -> None:
         folder.rmdir()
 
 
-def timed(function: Callable[..., Any], name: str, seconds: dict[str, float]) -> Callable[..., Any]:
+def add_cpu_time(function: Callable[..., Any], name: str, seconds: dict[str, float]) -> Callable[..., Any]:
     """The function, which adds its CPU seconds to those of a name."""
 
-    def measured(*arguments: Any, **options: Any) -> Any:
+    def call_timed(*arguments: Any, **options: Any) -> Any:
         started = time.process_time()
         try:
             return function(*arguments, **options)
         finally:
             seconds[name] += time.process_time() - started
 
-    return measured
+    return call_timed
 
 
 def effect_seconds(
-    effects: Mapping[str, tuple[Effect, ...]], own: tuple[object, ...], render: Callable[[], object]
+    effects: Mapping[str, tuple[Effect, ...]], untimed_effects: tuple[object, ...], render: Callable[[], object]
 ) -> dict[str, float]:
     """CPU s of each effect of a science image in one rendering.
 
     effects : of a channel, by image type;  own : those that a channel is known by: they stay as they are
     """
     seconds: dict[str, float] = defaultdict(float)
-    kept = effects["science"]
-    measured = tuple(e if e in own else replace(e, apply=timed(e.apply, f"effect_{e.name}_s", seconds)) for e in kept)
-    effects["science"] = measured  # type: ignore[index]
+    science_effects = effects["science"]
+    timed_effects = tuple(
+        e if e in untimed_effects else replace(e, apply=add_cpu_time(e.apply, f"effect_{e.name}_s", seconds))
+        for e in science_effects
+    )
+    effects["science"] = timed_effects  # type: ignore[index]
     try:
         render()
     finally:
-        effects["science"] = kept  # type: ignore[index]
+        effects["science"] = science_effects  # type: ignore[index]
     return seconds
 
 
-def by_job(folder: Path, text: str) -> float:
+def time_job(folder: Path, text: str) -> float:
     """Wall s of the Spark job that renders a request on 2 cores."""
     file = folder / "exposure.toml"
     file.write_text(text, encoding="utf-8")
-    wanted = parse(file)
-    root = lake(folder / "exposure", wanted)
-    prepared(root, wanted)
+    request = parse(file)
+    root = make_lake(folder / "exposure", request)
+    plan_detector(root, request)
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     command = ["spark-submit", "--master", "local[2]", str(ROOT / "jobs" / "render" / "render_exposures.py")]
     started = time.perf_counter()

@@ -20,7 +20,7 @@ from lake_schema.mission.configuration import resolve
 from truesky.fluxes import passbands
 from truesky.render.camera import detectors, traces
 from truesky.render.dispersing import draw, images
-from truesky.render.dispersing.draw import Dispersed, Order, Settings
+from truesky.render.dispersing.draw import DispersedSources, Order, Settings
 from truesky.render.psf import euclid
 from truesky.render.psf.model import Psf
 from truesky.render.sources.source_list import Sources
@@ -28,20 +28,20 @@ from truesky.render.sources.source_list import Sources
 # Electrons a pixel, of the sky of an exposure through the red grism.
 NOISE = 28.0
 # The largest of each, and by which the table is ordered.
-NUMBERS = ("background", "flux", "position")
+ERROR_NAMES = ("background", "flux", "position")
 # Sources of a sample, their seeds; those that are timed.
-CHOSEN, HELD, _SEEDS, _TIMED, _TIMED_SEED = 18, 36, (41, 42), 400, 43
+NUM_CHOSEN, NUM_TEST, _SEEDS, _NUM_TIMED, _TIMED_SEED = 18, 36, (41, 42), 400, 43
 # All of their light is in one order and one row of tilts, deg.
 _TILTS = (0.0, 4.0, -4.0)
 # H_E of the brightest and of the faintest, electrons of magnitude 0: zero point 25.3 and 549 s.
 _BRIGHT, _FAINT, _ZERO = 17.0, 23.0, 549.6 * 10 ** (0.4 * 25.3)
-_TRUTH = Settings(edge=1e-5, faint=0.0, least=80, along=4, across=4, block=0.0, nodes=5, positions=9)
+_TRUTH = Settings(edge=1e-5, faint=0.0, min_size=80, along=4, across=4, block=0.0, nodes=5, positions=9)
 # Pixels of the frame, and where the undispersed image lies; half the box about a line; sigma of its weight.
 _SHAPE, _PLACE, _BOX, _SIGMA = (128, 720), (270.0, 60.0), (8, 4), 2.0
-_HEAD = """\
+_TABLE_HEADER = """\
 # Settings of drawing spectra. allowed: the error of a pixel, of its noise, that they are for.
 #
-# edge, faint: of a sky pixel's noise; least: pixels; along, across: samples a pixel; block: A that share a PSF;
+# edge, faint: of a sky pixel's noise; min_size: pixels; along, across: samples a pixel; block: A that share a PSF;
 # nodes: wavelengths of the PSF; positions: of the PSF on a detector, one of euclid.DEGREES.
 # Then by python -m benchmarks.nisp_s --settings, the largest errors of {chosen} galaxies and stars of
 # H_E = {bright:g} to {faint:g} that the settings were chosen on, and (_held) of {held} others, each in a first order
@@ -52,7 +52,7 @@ _HEAD = """\
 
 
 @dataclass(frozen=True)
-class One:
+class SampleSource:
     """A source alone, its tilt, its continuum and line, and where the line lies, pixels."""
 
     source: Sources
@@ -62,7 +62,7 @@ class One:
     place: tuple[float, float]
 
 
-def orders(tilt: float) -> tuple[Order, ...]:
+def first_orders(tilt: float) -> tuple[Order, ...]:
     """The first order of the red grism."""
     mission, band = resolve(), passbands.load("nisp_red")
     first = next(t for t in traces.traces("RGS000", tilt, _detector(), mission) if t.order == 1)
@@ -73,23 +73,23 @@ def _detector() -> detectors.Detector:
     return detectors.detector("nisp", "DET22", resolve())
 
 
-def psf_of(settings: Settings) -> Psf:
+def settings_psf(settings: Settings) -> Psf:
     """At the settings' wavelengths and places."""
-    trace = orders(0.0)[0].trace
+    trace = first_orders(0.0)[0].trace
     nodes = images.nodes(trace.first, trace.last, settings.nodes)
     return euclid.nisp_psf_at(_detector(), nodes, resolve(), settings.positions)
 
 
-def sample(seed: int, count: int) -> list[One]:
+def sample_sources(seed: int, count: int) -> list[SampleSource]:
     """Two galaxies to a star, evenly in magnitude."""
     rng = np.random.default_rng(seed)
     stars = count // 3
-    some = scenes.sources(NISP, seed, galaxies=count - stars, stars=stars)
+    sources = scenes.sources(NISP, seed, galaxies=count - stars, stars=stars)
     mag = _BRIGHT + (_FAINT - _BRIGHT) * (rng.permutation(count) + rng.random(count)) / count
-    some = replace(some, electrons=_ZERO * 10 ** (-0.4 * mag), photons=None)
-    some.column[:], some.row[:] = (place + rng.random(count) for place in _PLACE)
-    wave, weight = orders(0.0)[0].wavelength, orders(0.0)[0].response
-    found = []
+    sources = replace(sources, electrons=_ZERO * 10 ** (-0.4 * mag), photons=None)
+    sources.column[:], sources.row[:] = (place + rng.random(count) for place in _PLACE)
+    wave, weight = first_orders(0.0)[0].wavelength, first_orders(0.0)[0].response
+    sample_list = []
     for i in range(count):
         tilt, centre = _TILTS[i % len(_TILTS)], rng.uniform(12600.0, 18400.0)
         parts = [wave ** rng.uniform(-3.0, 0.0), np.exp(-0.5 * ((wave - centre) / rng.uniform(5.0, 15.0)) ** 2)]
@@ -98,34 +98,43 @@ def sample(seed: int, count: int) -> list[One]:
             (s * part / (part * weight).sum()).astype(np.float32)[None]
             for s, part in zip((1 - share, share), parts, strict=True)
         )
-        one = some.take(np.array([i]))
-        x, y = orders(tilt)[0].trace.offsets(float(one.column[0]), float(one.row[0]), np.array([centre]))
-        place = float(one.column[0] + x[0]), float(one.row[0] + y[0])
-        found.append(One(one, tilt, continuum, line, place))
-    return found
+        source = sources.take(np.array([i]))
+        x, y = first_orders(tilt)[0].trace.offsets(float(source.column[0]), float(source.row[0]), np.array([centre]))
+        place = float(source.column[0] + x[0]), float(source.row[0] + y[0])
+        sample_list.append(SampleSource(source, tilt, continuum, line, place))
+    return sample_list
 
 
-def images_of(one: One, settings: Settings, psf: Psf) -> tuple[Float, Float]:
+def draw_images(sample_source: SampleSource, settings: Settings, psf: Psf) -> tuple[Float, Float]:
     """(all of its light, its line alone) on a frame."""
-    spectra = one.continuum + one.line, one.line
-    both = (Dispersed(lambda _, own=own: own, orders(one.tilt), settings) for own in spectra)  # type: ignore[misc]
-    whole, line = (draw.draw(one.source, each, psf, _SHAPE, NOISE) for each in both)
-    return whole, line
+    spectra = sample_source.continuum + sample_source.line, sample_source.line
+    dispersions = (
+        DispersedSources(lambda _, spectrum=spectrum: spectrum, first_orders(sample_source.tilt), settings)
+        for spectrum in spectra
+    )  # type: ignore[misc]
+    total, line = (draw.draw(sample_source.source, each, psf, _SHAPE, NOISE) for each in dispersions)
+    return total, line
 
 
-def errors(found: tuple[Float, Float], truth: tuple[Float, Float], one: One) -> tuple[float, float, float]:
+def errors(
+    drawn: tuple[Float, Float], truth: tuple[Float, Float], sample_source: SampleSource
+) -> tuple[float, float, float]:
     """(largest of a pixel, of its own noise; of the line's flux in a box, relative; of its place, pixels)."""
-    background = np.abs(found[0] - truth[0]) / np.sqrt(NOISE**2 + np.maximum(truth[0], 0.0))
-    mine, true = (_measured(image, *one.place) for image in (found[1], truth[1]))
-    return float(background.max()), abs(mine[0] / true[0] - 1.0), float(np.hypot(mine[1] - true[1], mine[2] - true[2]))
+    background = np.abs(drawn[0] - truth[0]) / np.sqrt(NOISE**2 + np.maximum(truth[0], 0.0))
+    measured, expected = (_flux_and_centroid(image, *sample_source.place) for image in (drawn[1], truth[1]))
+    return (
+        float(background.max()),
+        abs(measured[0] / expected[0] - 1.0),
+        float(np.hypot(measured[1] - expected[1], measured[2] - expected[2])),
+    )
 
 
-def _measured(image: Float, column: float, row: float) -> tuple[float, float, float]:
+def _flux_and_centroid(image: Float, column: float, row: float) -> tuple[float, float, float]:
     """Flux in a box, and the centroid under a Gaussian weight about the line."""
-    left, low = round(column) - _BOX[0], round(row) - _BOX[1]
-    box = image[low : low + 2 * _BOX[1] + 1, left : left + 2 * _BOX[0] + 1]
+    first_column, first_row = round(column) - _BOX[0], round(row) - _BOX[1]
+    box = image[first_row : first_row + 2 * _BOX[1] + 1, first_column : first_column + 2 * _BOX[0] + 1]
     y, x = np.indices(box.shape)
-    x, y = x + left - column, y + low - row
+    x, y = x + first_column - column, y + first_row - row
     weighted = box * np.exp(-0.5 * (x**2 + y**2) / _SIGMA**2)
     total = weighted.sum()
     return float(box.sum()), float((weighted * x).sum() / total), float((weighted * y).sum() / total)
@@ -133,54 +142,66 @@ def _measured(image: Float, column: float, row: float) -> tuple[float, float, fl
 
 def seconds(settings: Settings, repeats: int) -> float:
     """CPU s of the first orders of 7,400 sources on a detector, one in ten of them a star."""
-    rng, psf = np.random.default_rng(_TIMED_SEED), psf_of(settings)
-    some = scenes.sources(NISP, _TIMED_SEED, galaxies=_TIMED - _TIMED // 10, stars=_TIMED // 10)
+    rng, psf = np.random.default_rng(_TIMED_SEED), settings_psf(settings)
+    sources = scenes.sources(NISP, _TIMED_SEED, galaxies=_NUM_TIMED - _NUM_TIMED // 10, stars=_NUM_TIMED // 10)
     low, high = 10 ** (0.3 * _BRIGHT), 10 ** (0.3 * _FAINT)
-    mag = np.log10(low + (high - low) * rng.random(len(some))) / 0.3
-    some = replace(some, electrons=_ZERO * 10 ** (-0.4 * mag), photons=None)
-    spectrum = sample(_TIMED_SEED, 3)[0]
+    mag = np.log10(low + (high - low) * rng.random(len(sources))) / 0.3
+    sources = replace(sources, electrons=_ZERO * 10 ** (-0.4 * mag), photons=None)
+    spectrum = sample_sources(_TIMED_SEED, 3)[0]
     flat = spectrum.continuum + spectrum.line
-    dispersed = Dispersed(lambda chosen: np.repeat(flat, len(chosen), axis=0), orders(0.0), settings)
-    draw.draw(some.take(np.arange(0, len(some), 50)), dispersed, psf, (NISP.ny, NISP.nx), NOISE)
-    few, all_of_them = np.inf, np.inf
+    dispersed = DispersedSources(lambda chosen: np.repeat(flat, len(chosen), axis=0), first_orders(0.0), settings)
+    draw.draw(sources.take(np.arange(0, len(sources), 50)), dispersed, psf, (NISP.ny, NISP.nx), NOISE)
+    half_seconds, all_seconds = np.inf, np.inf
     for _ in range(repeats):
         started = time.process_time()
-        draw.draw(some.take(np.arange(len(some) // 2)), dispersed, psf, (NISP.ny, NISP.nx), NOISE)
+        draw.draw(sources.take(np.arange(len(sources) // 2)), dispersed, psf, (NISP.ny, NISP.nx), NOISE)
         half = time.process_time()
-        draw.draw(some, dispersed, psf, (NISP.ny, NISP.nx), NOISE)
-        few, all_of_them = min(few, half - started), min(all_of_them, time.process_time() - half)
+        draw.draw(sources, dispersed, psf, (NISP.ny, NISP.nx), NOISE)
+        half_seconds, all_seconds = min(half_seconds, half - started), min(all_seconds, time.process_time() - half)
     # What is the same for any number of sources is the detector's once.
-    each = (all_of_them - few) / (len(some) - len(some) // 2)
-    return all_of_them + each * (7400 - len(some))
+    each = (all_seconds - half_seconds) / (len(sources) - len(sources) // 2)
+    return all_seconds + each * (7400 - len(sources))
 
 
-def rows(tiers: Iterable[Settings], repeats: int, chosen: int = CHOSEN, held: int = HELD) -> list[dict[str, float]]:
+def measure_settings(
+    tiers: Iterable[Settings], repeats: int, num_chosen: int = NUM_CHOSEN, num_test: int = NUM_TEST
+) -> list[dict[str, float]]:
     """Of each: the largest errors of the sources it was chosen on and (_held) of the others; seconds."""
-    samples = {end: sample(seed, n) for end, seed, n in zip(("", "_held"), _SEEDS, (chosen, held), strict=True)}
-    psf = psf_of(_TRUTH)
-    truths = {end: [images_of(one, _TRUTH, psf) for one in some] for end, some in samples.items()}
-    found = []
+    samples = {
+        end: sample_sources(seed, n) for end, seed, n in zip(("", "_held"), _SEEDS, (num_chosen, num_test), strict=True)
+    }
+    psf = settings_psf(_TRUTH)
+    truths = {
+        end: [draw_images(sample_source, _TRUTH, psf) for sample_source in sample_list]
+        for end, sample_list in samples.items()
+    }
+    table_rows = []
     for settings in tiers:
-        row, own = {}, psf_of(settings)
-        for end, some in samples.items():
-            each = [errors(images_of(one, settings, own), t, one) for one, t in zip(some, truths[end], strict=True)]
-            row |= {f"{name}{end}": float(worst) for name, worst in zip(NUMBERS, np.max(each, axis=0), strict=True)}
-        found.append({**row, "seconds": seconds(settings, repeats)})
-    return found
+        row, psf_for_settings = {}, settings_psf(settings)
+        for end, sample_list in samples.items():
+            each = [
+                errors(draw_images(sample_source, settings, psf_for_settings), t, sample_source)
+                for sample_source, t in zip(sample_list, truths[end], strict=True)
+            ]
+            row |= {f"{name}{end}": float(worst) for name, worst in zip(ERROR_NAMES, np.max(each, axis=0), strict=True)}
+        table_rows.append({**row, "seconds": seconds(settings, repeats)})
+    return table_rows
 
 
-def table(repeats: int = 2) -> str:
+def settings_table(repeats: int = 2) -> str:
     """The table of settings that is in use, with what it is now measured to be."""
-    known = draw.rows()
-    own = [name for name in known[0] if name == "allowed" or name in Settings.__slots__]
-    names = [*own, *(f"{name}{end}" for end in ("", "_held") for name in NUMBERS), "seconds"]
-    found = rows([draw.of_row(row) for row in known], repeats)
+    current_rows = draw.read_settings()
+    setting_names = [name for name in current_rows[0] if name == "allowed" or name in Settings.__slots__]
+    names = [*setting_names, *(f"{name}{end}" for end in ("", "_held") for name in ERROR_NAMES), "seconds"]
+    measured_rows = measure_settings([draw.settings_from_row(row) for row in current_rows], repeats)
     lines = [
-        ",".join(f"{({**row, **measured})[name]:.2g}" if name not in own else f"{row[name]:g}" for name in names)
-        for row, measured in zip(known, found, strict=True)
+        ",".join(
+            f"{({**row, **measured})[name]:.2g}" if name not in setting_names else f"{row[name]:g}" for name in names
+        )
+        for row, measured in zip(current_rows, measured_rows, strict=True)
     ]
-    head = _HEAD.format(
-        chosen=CHOSEN, held=HELD, bright=_BRIGHT, faint=_FAINT, wide=2 * _BOX[0] + 1, high=2 * _BOX[1] + 1,
+    head = _TABLE_HEADER.format(
+        chosen=NUM_CHOSEN, held=NUM_TEST, bright=_BRIGHT, faint=_FAINT, wide=2 * _BOX[0] + 1, high=2 * _BOX[1] + 1,
         machine=report.machine(),
     )  # fmt: skip
     return "\n".join([*head.splitlines(), ",".join(names), *lines]) + "\n"

@@ -28,22 +28,22 @@ def galsim_seconds(scene: Scene, each: int, seed: int = 3) -> tuple[float, float
     returns : with a PSF of its own for each galaxy (its image summed to its colour and place); with one PSF for all,
               the index rounded to 0.1, and every index drawn once before
     """
-    some, full = scenes.sample(scene, seed, each * (len(BINS) - 1)), scenes.psf_of(scene)
-    bins = scenes.bins_of(some, scene)
-    everything = scenes.sources(scene, 1, stars=0)
-    counts = np.bincount(scenes.bins_of(everything, scene), minlength=len(BINS) - 1)
-    weights = transfer.basis_weights(full, some.photons, some.column, some.row)
-    shared = _image(full, weights.mean(axis=0))
-    shared.drawKImage()
-    default, cached = np.zeros(len(some)), np.zeros(len(some))
-    for i in range(len(some)):
+    sources, full_psf = scenes.sample(scene, seed, each * (len(BINS) - 1)), scenes.scene_psf(scene)
+    bins = scenes.magnitude_bins(sources, scene)
+    all_galaxies = scenes.sources(scene, 1, stars=0)
+    counts = np.bincount(scenes.magnitude_bins(all_galaxies, scene), minlength=len(BINS) - 1)
+    weights = transfer.basis_weights(full_psf, sources.photons, sources.column, sources.row)
+    mean_psf = _psf_image(full_psf, weights.mean(axis=0))
+    mean_psf.drawKImage()
+    default, cached = np.zeros(len(sources)), np.zeros(len(sources))
+    for i in range(len(sources)):
         start = time.process_time()
-        _draw(some, i, _image(full, weights[i]), some.shapes.sersic_index[some.shape[i]])
+        _draw(sources, i, _psf_image(full_psf, weights[i]), sources.shapes.sersic_index[sources.shape[i]])
         default[i] = time.process_time() - start
-        index = np.round(some.shapes.sersic_index[some.shape[i]], 1)
-        _draw(some, i, shared, index)
+        index = np.round(sources.shapes.sersic_index[sources.shape[i]], 1)
+        _draw(sources, i, mean_psf, index)
         start = time.process_time()
-        _draw(some, i, shared, index)
+        _draw(sources, i, mean_psf, index)
         cached[i] = time.process_time() - start
     return tuple(  # type: ignore[return-value]
         float(sum(counts[b] * spent[bins == b].mean() for b in range(len(counts)) if (bins == b).any()))
@@ -51,30 +51,30 @@ def galsim_seconds(scene: Scene, each: int, seed: int = 3) -> tuple[float, float
     )
 
 
-def _image(full: model.Psf, weights: Float) -> galsim.GSObject:
+def _psf_image(psf: model.Psf, weights: Float) -> galsim.GSObject:
     """The PSF in pixels."""
-    assert full.planes is not None
-    whole = transfer.image_of(full.planes, weights)
-    middle = slice((len(whole) - _SIDE) // 2, (len(whole) + _SIDE) // 2)
-    return galsim.InterpolatedImage(galsim.Image(whole[middle, middle], scale=1.0 / full.planes.samples))
+    assert psf.planes is not None
+    image = transfer.image_of(psf.planes, weights)
+    middle = slice((len(image) - _SIDE) // 2, (len(image) + _SIDE) // 2)
+    return galsim.InterpolatedImage(galsim.Image(image[middle, middle], scale=1.0 / psf.planes.samples))
 
 
-def _draw(some: Sources, i: int, psf: galsim.GSObject, index: float) -> None:
-    shape = some.shapes.take(some.shape[i : i + 1])
+def _draw(sources: Sources, i: int, psf: galsim.GSObject, index: float) -> None:
+    shape = sources.shapes.take(sources.shape[i : i + 1])
     shape.sersic_index[0] = index
-    body = galsim.JacobianWCS(*some.jacobian[i].ravel()).toImage(galaxy_shapes.profile(shape, 0, 1e-6))
-    whole = galsim.Convolve([body.withFlux(some.electrons[i]), psf])
-    whole.drawImage(scale=1.0, offset=(some.column[i] % 1, some.row[i] % 1))
+    body = galsim.JacobianWCS(*sources.jacobian[i].ravel()).toImage(galaxy_shapes.profile(shape, 0, 1e-6))
+    convolved = galsim.Convolve([body.withFlux(sources.electrons[i]), psf])
+    convolved.drawImage(scale=1.0, offset=(sources.column[i] % 1, sources.row[i] % 1))
 
 
-def galsim_image(one: Sources, own: model.Psf, side: int) -> Float:
+def galsim_image(source: Sources, psf: model.Psf, side: int) -> Float:
     """The only source by galsim's defaults, on a stamp that galsim chooses, on a frame [side, side]."""
-    assert own.planes is not None
-    body = galsim.JacobianWCS(*one.jacobian[0].ravel()).toImage(
-        galaxy_shapes.profile(one.shapes, int(one.shape[0]), 1e-6)
+    assert psf.planes is not None
+    body = galsim.JacobianWCS(*source.jacobian[0].ravel()).toImage(
+        galaxy_shapes.profile(source.shapes, int(source.shape[0]), 1e-6)
     )
-    whole = galsim.Convolve([body.withFlux(one.electrons[0]), _image(own, np.ones(1))])
-    drawn = whole.drawImage(scale=1.0, center=galsim.PositionD(one.column[0], one.row[0]), dtype=float)
+    convolved = galsim.Convolve([body.withFlux(source.electrons[0]), _psf_image(psf, np.ones(1))])
+    drawn = convolved.drawImage(scale=1.0, center=galsim.PositionD(source.column[0], source.row[0]), dtype=float)
     frame = galsim.ImageD(galsim.BoundsI(0, side - 1, 0, side - 1), init_value=0.0)
     shared = frame.bounds & drawn.bounds
     frame[shared] = drawn[shared]
@@ -90,42 +90,55 @@ def ufig_seconds(scene: Scene) -> float:
     except ImportError:
         print("UFig is not installed (pip install ufig): not compared")
         return float("nan")
-    some = scenes.sources(scene, 1, stars=0)
-    shape, n = some.shapes, len(some)
+    sources = scenes.sources(scene, 1, stars=0)
+    shape, n = sources.shapes, len(sources)
     fraction = np.concatenate([shape.bulge_fraction, 1 - shape.bulge_fraction])
-    photons = np.rint(np.tile(some.electrons, 2) * fraction).astype(np.int64)
+    photons = np.rint(np.tile(sources.electrons, 2) * fraction).astype(np.int64)
     radius = np.concatenate([shape.bulge_radius, shape.disk_radius]) / scene.scale
     index = np.concatenate([shape.sersic_index, np.ones(n)])
     cosine = np.concatenate([shape.bulge_axis_ratio, np.cos(np.radians(shape.inclination))])
     slim = (1 - cosine**2) / (1 + cosine**2)
     ellipticity = [slim * turn(2 * np.tile(shape.beta, 2)) for turn in (np.cos, np.sin)]
-    kept = photons > 0
-    m = int(kept.sum())
+    has_photons = photons > 0
+    m = int(has_photons.sum())
     fwhm, beta = (0.16 / scene.scale, 3.5) if scene.name == "vis" else (scenes.SEEING / scene.scale, scenes.BETA)
-    nothing, one = np.zeros((m, 1)), np.ones((m, 1))
+    zeros, ones = np.zeros((m, 1)), np.ones((m, 1))
     np.random.seed(1)  # noqa: NPY002  (UFig draws from it)
     arguments = [
-        13, 4, 9, load_intrinsicTable(9, 13, 4), np.zeros((scene.ny, scene.nx)),
-        np.tile(some.column, 2)[kept], np.tile(some.row, 2)[kept], photons[kept, None], index[kept],
-        rendering_util.compute_ellip_matrices(radius[kept], *(e[kept] for e in ellipticity)),
-        beta * one, rendering_util.compute_ellip_matrices(np.full(m, fwhm), np.full(m, 0.01), np.zeros(m)),
-        np.zeros((m, 2, 2, 2)), nothing, nothing, nothing, -9.0, False,
-    ]  # fmt: skip
+        13,
+        4,
+        9,
+        load_intrinsicTable(9, 13, 4),
+        np.zeros((scene.ny, scene.nx)),
+        np.tile(sources.column, 2)[has_photons],
+        np.tile(sources.row, 2)[has_photons],
+        photons[has_photons, None],
+        index[has_photons],
+        rendering_util.compute_ellip_matrices(radius[has_photons], *(e[has_photons] for e in ellipticity)),
+        beta * ones,
+        rendering_util.compute_ellip_matrices(np.full(m, fwhm), np.full(m, 0.01), np.zeros(m)),
+        np.zeros((m, 2, 2, 2)),
+        zeros,
+        zeros,
+        zeros,
+        -9.0,
+        False,
+    ]
     best = np.inf
-    for few in (True, False, False):
-        arguments[7] = np.minimum(photons[kept, None], 10) if few else photons[kept, None]
+    for is_warm_up in (True, False, False):
+        arguments[7] = np.minimum(photons[has_photons, None], 10) if is_warm_up else photons[has_photons, None]
         start = time.process_time()
         integrate_image(rendering_util.rng_buffer(), *arguments)
-        best = best if few else min(best, time.process_time() - start)
+        best = best if is_warm_up else min(best, time.process_time() - start)
     return best
 
 
 # Of blue galaxies (Herbel et al. 2017): what k-correct's five templates are mixed by at z = 0 and 1, and their weights.
-_MIX = (
+_TEMPLATE_MIX = (
     [2.079, 3.524, 1.917, 1.992, 2.536], [2.265, 3.862, 1.921, 1.685, 2.480], [3.47e9, 3.31e6, 2.13e9, 1.64e10, 1.01e9],
 )  # fmt: skip
 # Beyond, the templates end before I_E does.
-_FARTHEST = 3.9
+_MAX_REDSHIFT = 3.9
 
 
 def skypy_photometry(area: float, seed: int) -> float:
@@ -142,14 +155,14 @@ def skypy_photometry(area: float, seed: int) -> float:
     except ImportError as error:
         raise BadInput(f"the peer is missing: {error} (pip install skypy)") from None
     np.random.seed(seed)  # noqa: NPY002
-    ours, z = FlatLambdaCDM(67.0, 0.319), np.linspace(0.002, _FARTHEST, 400)
-    m_star, phi_star, alpha = luminosity_function.schechter().at(z)
+    ours, z = FlatLambdaCDM(67.0, 0.319), np.linspace(0.002, _MAX_REDSHIFT, 400)
+    m_star, phi_star, alpha = luminosity_function.schechter().parameters_at(z)
     scale = 5.0 * np.log10(cosmology.HUBBLE)
     start = time.process_time()
     redshift, m_r = schechter_lf(
         z, m_star + scale, phi_star * cosmology.HUBBLE**3, float(alpha.mean()), 26.0, Quantity(area, "deg2"), ours
     )
-    mix = dirichlet_coefficients(redshift, *_MIX[:2], weight=_MIX[2])
+    mix = dirichlet_coefficients(redshift, *_TEMPLATE_MIX[:2], weight=_TEMPLATE_MIX[2])
     mass = kcorrect.stellar_mass(mix, m_r, "sdss2010-r")
     bands = ["Euclid-VIS", "Euclid-Y", "Euclid-H"]
     magnitudes = kcorrect.apparent_magnitudes(mix, redshift, bands, ours, stellar_mass=mass)

@@ -18,21 +18,21 @@ from truesky.fluxes import passbands
 from truesky.render.camera import traces
 from truesky.render.camera.detectors import detector
 from truesky.render.dispersing import draw, grism_files, images
-from truesky.render.dispersing.draw import Dispersed, Order
+from truesky.render.dispersing.draw import DispersedSources, Order
 from truesky.render.psf import euclid
 from truesky.render.psf.model import Psf
 from truesky.render.sources.source_list import Sources
 from truesky.request.accuracy import SURVEY
 
 # Names the Python of an environment with slitlessutils, which wants an older numpy than this one's.
-VARIABLE = "TRUESKY_SLITLESSUTILS"
-_HOW = "python3.11 -m venv PEERS; PEERS/bin/pip install slitlessutils==1.0.0 'numpy<2.4'"
-_CHILD = Path(__file__).with_name("_slitlessutils.py")
+PYTHON_VARIABLE = "TRUESKY_SLITLESSUTILS"
+_INSTALL_HINT = "python3.11 -m venv PEERS; PEERS/bin/pip install slitlessutils==1.0.0 'numpy<2.4'"
+_PEER_SCRIPT = Path(__file__).with_name("_slitlessutils.py")
 # Wavelengths a pixel, as its modules take by default; pixels of a stretch that fluxes are compared in; noise, e-.
-_SUBSAMPLES, _STRETCH, _NOISE = 5, 64, 28.0
+_SUBSAMPLES, _INTERVAL, _NOISE = 5, 64, 28.0
 _SHAPE, _SIDE = (2040, 2040), 40
 # Times that the same sources are drawn for the time of one.
-_MANY = 25
+_NUM_COPIES = 25
 
 
 def slitlessutils_figures(count: int = 2, seed: int = 7) -> dict[str, float]:
@@ -42,50 +42,52 @@ def slitlessutils_figures(count: int = 2, seed: int = 7) -> dict[str, float]:
     Errors      : SystemExit where there is no slitlessutils
     """
     python = _python()
-    order, through = _grism()
-    some = _sources(count, seed)
+    order, psf = _grism()
+    sources = _sources(count, seed)
     spectrum = _spectrum(order)
-    ours, seconds = _timed(some, order, through, spectrum)
+    ours, seconds = _time_drawing(sources, order, psf, spectrum)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         configuration = grism_files.write(folder, "RGS000", [order], _SHAPE)
-        theirs, their_seconds = _child(python, folder, configuration, *_given(some, order, through, spectrum))
-    differ = _differences(some, order, ours, theirs)
+        theirs, their_seconds = _run_peer(python, folder, configuration, *_peer_inputs(sources, order, psf, spectrum))
+    differences = _differences(sources, order, ours, theirs)
     return {
         "spectrum_s": seconds / count,
         "slitlessutils_spectrum_s": their_seconds / count,
         "against_slitlessutils": their_seconds / seconds,
-        "slitlessutils_flux": float(np.abs(differ).max()),
+        "slitlessutils_flux": float(np.abs(differences).max()),
     }
 
 
 def _python() -> str:
-    python = os.environ.get(VARIABLE, "")
+    python = os.environ.get(PYTHON_VARIABLE, "")
     if not python or subprocess.run([python, "-c", "import pypolyclip"], check=False, capture_output=True).returncode:
-        raise SystemExit(f"no slitlessutils: {VARIABLE} must name a Python that has it ({_HOW})")
+        raise SystemExit(f"no slitlessutils: {PYTHON_VARIABLE} must name a Python that has it ({_INSTALL_HINT})")
     return python
 
 
 def _grism() -> tuple[Order, Psf]:
     """The red grism's first order, and the PSF through it."""
     mission, band = resolve(), passbands.load("nisp_red")
-    seen = detector("nisp", "DET23", mission)
-    trace = next(one for one in traces.traces("RGS000", 0.0, seen, mission) if one.order == 1)
+    nisp_detector = detector("nisp", "DET23", mission)
+    trace = next(
+        candidate for candidate in traces.traces("RGS000", 0.0, nisp_detector, mission) if candidate.order == 1
+    )
     part = (band.wavelength >= trace.first) & (band.wavelength <= trace.last)
     # Electrons for each erg s-1 cm-2 A-1: of a scale that its limit of sensitivity, 1e10, is small beside.
     response = (band.response * band.wavelength)[part] * 1e12
     nodes = images.nodes(trace.first, trace.last, 3)
-    return Order(trace, int(band.wavelength[part][0]), response), euclid.nisp_psf_at(seen, nodes, mission, 4)
+    return Order(trace, int(band.wavelength[part][0]), response), euclid.nisp_psf_at(nisp_detector, nodes, mission, 4)
 
 
 def _sources(count: int, seed: int) -> Sources:
     """Apart from each other, with their first orders on the detector."""
-    some = scenes.sources(scenes.NISP, seed, galaxies=40, stars=count - count // 2)
-    small = np.flatnonzero(scenes.magnitudes(some, scenes.NISP)[:40] > 21.0)[: count // 2]
-    some = some.take(np.concatenate([small, 40 + np.arange(count - count // 2)]))
+    sources = scenes.sources(scenes.NISP, seed, galaxies=40, stars=count - count // 2)
+    small = np.flatnonzero(scenes.magnitudes(sources, scenes.NISP)[:40] > 21.0)[: count // 2]
+    sources = sources.take(np.concatenate([small, 40 + np.arange(count - count // 2)]))
     rng = np.random.default_rng(seed)
     column, row = 900.0 + rng.uniform(0.0, 1.0, count), 200.0 + 100.0 * np.arange(count) + rng.uniform(0.0, 1.0, count)
-    return replace(some, column=column, row=row, electrons=np.ones(count))
+    return replace(sources, column=column, row=row, electrons=np.ones(count))
 
 
 def _spectrum(order: Order) -> Float:
@@ -97,34 +99,36 @@ def _spectrum(order: Order) -> Float:
     return np.asarray(flux * 2e4 / float((flux * order.response).sum()))
 
 
-def _timed(some: Sources, order: Order, through: Psf, spectrum: Float) -> tuple[Float, float]:
+def _time_drawing(sources: Sources, order: Order, psf: Psf, spectrum: Float) -> tuple[Float, float]:
     """(frame, CPU s of it): of a detector's many, whose PSF's transform and frame are shared; the best of two."""
-    of, best = spectrum.astype(np.float32), np.inf
+    source_spectrum, best = spectrum.astype(np.float32), np.inf
     # Stamps as wide as the images that the others are given.
-    settings = replace(draw.settings_for(SURVEY), least=_SIDE)
-    dispersed = Dispersed(lambda which: np.tile(of, (len(which), 1)), (order,), settings)
-    frame = draw.draw(some, dispersed, through, _SHAPE, _NOISE)
-    many = some.take(np.tile(np.arange(len(some)), _MANY))
+    settings = replace(draw.settings_for(SURVEY), min_size=_SIDE)
+    dispersed = DispersedSources(lambda which: np.tile(source_spectrum, (len(which), 1)), (order,), settings)
+    frame = draw.draw(sources, dispersed, psf, _SHAPE, _NOISE)
+    copies = sources.take(np.tile(np.arange(len(sources)), _NUM_COPIES))
     for _ in range(2):
         start = time.process_time()
-        draw.draw(many, dispersed, through, _SHAPE, _NOISE)
-        best = min(best, (time.process_time() - start) / _MANY)
+        draw.draw(copies, dispersed, psf, _SHAPE, _NOISE)
+        best = min(best, (time.process_time() - start) / _NUM_COPIES)
     return frame, best
 
 
-def _given(some: Sources, order: Order, through: Psf, spectrum: Float) -> tuple[Float, Float, Float, Float]:
+def _peer_inputs(sources: Sources, order: Order, psf: Psf, spectrum: Float) -> tuple[Float, Float, Float, Float]:
     """(images through the PSF [n, side, side], their corners, wavelengths, f_lambda [n, v]) for the others."""
-    still = replace(order.trace, x=np.zeros((2, 3)), y=np.zeros((2, 3)))
-    whole = Order(still, order.first, order.response / float((spectrum * order.response).sum()))
-    of, found, corners = spectrum.astype(np.float32), [], []
-    for i in range(len(some)):
-        one = some.take(np.array([i]))
+    constant_trace = replace(order.trace, x=np.zeros((2, 3)), y=np.zeros((2, 3)))
+    undispersed_order = Order(constant_trace, order.first, order.response / float((spectrum * order.response).sum()))
+    source_spectrum, stamps, corners = spectrum.astype(np.float32), [], []
+    for i in range(len(sources)):
+        source = sources.take(np.array([i]))
         # The frame is no larger: its PSF is that of where the source lies, to a part in a thousand.
-        corner = np.floor([one.column[0], one.row[0]]).astype(int) - _SIDE // 2
-        moved = replace(one, column=one.column - corner[0], row=one.row - corner[1])
-        settings = replace(draw.settings_for(SURVEY), least=_SIDE, edge=1e-9, faint=0.0)
-        seen = Dispersed(lambda which: np.tile(of, (len(which), 1)), (whole,), settings)
-        found.append(draw.draw(moved, seen, through, (_SIDE, _SIDE), 1.0))
+        corner = np.floor([source.column[0], source.row[0]]).astype(int) - _SIDE // 2
+        shifted = replace(source, column=source.column - corner[0], row=source.row - corner[1])
+        settings = replace(draw.settings_for(SURVEY), min_size=_SIDE, edge=1e-9, faint=0.0)
+        dispersed = DispersedSources(
+            lambda which: np.tile(source_spectrum, (len(which), 1)), (undispersed_order,), settings
+        )
+        stamps.append(draw.draw(shifted, dispersed, psf, (_SIDE, _SIDE), 1.0))
         corners.append(corner)
     step = (order.trace.last - order.trace.first) / 512.0 / _SUBSAMPLES
     waves = np.arange(order.trace.first + 0.5 * step, order.trace.last, step)
@@ -132,40 +136,40 @@ def _given(some: Sources, order: Order, through: Psf, spectrum: Float) -> tuple[
     edges = np.concatenate([[0.0], np.cumsum(spectrum)])
     at = [np.interp(waves + side * step - order.first + 0.5, np.arange(len(edges)), edges) for side in (-0.5, 0.5)]
     flux = (at[1] - at[0]) / step
-    return np.array(found), np.array(corners), waves, np.tile(flux, (len(some), 1))
+    return np.array(stamps), np.array(corners), waves, np.tile(flux, (len(sources), 1))
 
 
-def _child(
+def _run_peer(
     python: str, folder: Path, configuration: Path, stamps: Float, corners: Float, waves: Float, spectra: Float
 ) -> tuple[Float, float]:
-    given, out = folder / "given.npz", folder / "out.npz"
-    np.savez(given, images=stamps, corners=corners, waves=waves, spectra=spectra, shape=np.array(_SHAPE))
+    input_file, output_file = folder / "given.npz", folder / "out.npz"
+    np.savez(input_file, images=stamps, corners=corners, waves=waves, spectra=spectra, shape=np.array(_SHAPE))
     environment = {**os.environ, "HOME": str(folder), "OMP_NUM_THREADS": "1"}
     subprocess.run(
-        [python, str(_CHILD), str(configuration), str(given), str(out)],
+        [python, str(_PEER_SCRIPT), str(configuration), str(input_file), str(output_file)],
         check=True,
         env=environment,
         # It writes a log where it is started.
         cwd=folder,
         capture_output=True,
     )
-    with np.load(out) as read:
+    with np.load(output_file) as read:
         return np.asarray(read["frame"]), float(read["seconds"])
 
 
-def _differences(some: Sources, order: Order, ours: Float, theirs: Float) -> Float:
+def _differences(sources: Sources, order: Order, ours: Float, theirs: Float) -> Float:
     """[n, stretches] of light within half a stamp of each trace, of ours."""
-    found = []
-    for column, row in zip(some.column.tolist(), some.row.tolist(), strict=True):
+    differences = []
+    for column, row in zip(sources.column.tolist(), sources.row.tolist(), strict=True):
         x, y = order.trace.offsets(column, row, np.array([order.trace.first, order.trace.last]))
-        low = round(row + float(y.mean())) - _SIDE // 2
-        left = int(column + x[0])
-        edges = np.arange(left, int(column + x[1]), _STRETCH)
+        first_row = round(row + float(y.mean())) - _SIDE // 2
+        first_column = int(column + x[0])
+        edges = np.arange(first_column, int(column + x[1]), _INTERVAL)
         sums = [
-            np.add.reduceat(frame[low : low + _SIDE].sum(axis=0), edges)[:-1] for frame in (ours, theirs)
+            np.add.reduceat(frame[first_row : first_row + _SIDE].sum(axis=0), edges)[:-1] for frame in (ours, theirs)
         ]  # fmt: skip
-        found.append(sums[1] / sums[0] - 1.0)
-    return np.array(found)
+        differences.append(sums[1] / sums[0] - 1.0)
+    return np.array(differences)
 
 
 if __name__ == "__main__":

@@ -22,23 +22,23 @@ from truesky.render.camera import detectors
 from truesky.render.psf import euclid, model, sub_bands
 
 # Stars that the errors are of, by a seed of their own.
-STARS, _SEED = 24, 5
+NUM_STARS, _SEED = 24, 5
 # Stars that others' errors are quoted of.
-HELD = 48
+NUM_TEST_STARS = 48
 # R2 of a point over that of the smallest galaxies whose shear is measured, 1.25 times as large: a PSF that is wider by
 # a fraction makes the response to shear smaller by so much of it (Paulin-Henriksson et al. 2008; Laureijs et al. 2011).
-LENSED = 1.25**-2
+R2_RATIO = 1.25**-2
 # Grids that the nearest position is taken of: positions along a side.
 _NEAREST = (1, 2, 3, 4, 6, 10, 15, 20, 30, 40)
 # Of NISP fewer, and where its table is.
-_FEW = (1, 2, 3, 4, 6, 10)
+_NISP_NEAREST = (1, 2, 3, 4, 6, 10)
 _FILE = Path(model.__file__).parents[1] / "drawing" / "psf_positions_nisp.csv"
 _COLUMNS = (
     "positions,nearest,flux_rms,flux_error,position_rms,position_error,"
     "r2_rms,r2_error,ellipticity_rms,ellipticity_error,seconds,megabytes"
 )
-_ABOUT = f"""\
-# Error of the {{camera}} PSF by the number of its positions on a detector: of {STARS} stars of other places and \
+_TABLE_HEADER = f"""\
+# Error of the {{camera}} PSF by the number of its positions on a detector: of {NUM_STARS} stars of other places and \
 colours the
 # flux in 1" (relative), the position (pixels), R2 (relative) and the ellipticity under a Gaussian weight of 0.75" (rms
 # and largest); CPU seconds to compute its planes, and what they hold. nearest: 0 = polynomials through the positions
@@ -55,98 +55,117 @@ class Star:
     truth: Float
 
 
-def optics(scene: Scene = VIS) -> Callable[[tuple[float, float]], Float]:
+def make_optics(scene: Scene = VIS) -> Callable[[tuple[float, float]], Float]:
     """The PSF at a place, computed: (x, y) in half sides -> [wavelengths, t, t], in the detector's axes."""
     mission, sampled = resolve(), _SAMPLINGS[scene.name]
     detector = detectors.detector(scene.name, scenes.SPACE[scene.name][0], mission)
-    waves = scenes.psf_of(scene, 1).planes.wavelength  # type: ignore[union-attr]
+    waves = scenes.scene_psf(scene, 1).planes.wavelength  # type: ignore[union-attr]
     blurs = [euclid._blur_variances(detector, float(waves[w]), mission) for w in range(len(waves))]
     sign = -1 if detector.upside_down else 1
 
-    def at(place: tuple[float, float]) -> Float:
+    def compute_psf(place: tuple[float, float]) -> Float:
         nm = euclid.wavefront(
-            *euclid._field(detector, sign * place[0], sign * place[1], mission), detector.section, mission
+            *euclid._field_position(detector, sign * place[0], sign * place[1], mission), detector.section, mission
         )
         scale = detector.pixel_scale / sampled.samples
-        nm = euclid.centred(nm, waves, sampled, scale, mission)
+        nm = euclid.centre_wavefront(nm, waves, sampled, scale, mission)
         core = replace(sampled, transform=sampled.core_transform, side=sampled.core_side)
         planes = [euclid._plane(nm, float(w), core, scale, blur, mission) for w, blur in zip(waves, blurs, strict=True)]
         return np.stack(planes).astype(float)[:, ::sign, ::sign]
 
-    return at
+    return compute_psf
 
 
-def rows(stars: int, nearest: tuple[int, ...] = _NEAREST, scene: Scene = VIS) -> list[dict[str, float]]:
+def measure_positions(
+    num_stars: int, nearest: tuple[int, ...] = _NEAREST, scene: Scene = VIS
+) -> list[dict[str, float]]:
     """A row a way and number of positions: keys as _COLUMNS."""
-    at, rng = optics(scene), np.random.default_rng(_SEED)
-    at((0.0, 0.0))
+    psf_at, rng = make_optics(scene), np.random.default_rng(_SEED)
+    psf_at((0.0, 0.0))
     start = time.process_time()
-    centre = at((0.0, 0.0))
-    plane_s = (time.process_time() - start) / sub_bands.PARTS
-    some = [star(at, rng) for _ in range(stars)]
+    centre = psf_at((0.0, 0.0))
+    plane_s = (time.process_time() - start) / sub_bands.N_SUB_BANDS
+    star_sample = [draw_star(psf_at, rng) for _ in range(num_stars)]
     out = []
     for positions in euclid.DEGREES:
-        cold, psf = _cold(positions, scene)
-        found = np.array([errors_of(centre + drift(psf, one), one, scene) for one in some])
-        out.append(_row(positions, False, found, cold, (psf.images.nbytes + psf.drift.nbytes) / 1e6))
+        compute_s, psf = _compute_planes(positions, scene)
+        error_values = np.array(
+            [star_errors(centre + drift(psf, sample_star), sample_star, scene) for sample_star in star_sample]
+        )
+        out.append(_table_row(positions, False, error_values, compute_s, (psf.images.nbytes + psf.drift.nbytes) / 1e6))
     for side in nearest:
-        middles = (2 * np.arange(side) + 1) / side - 1
-        found = np.array([errors_of(at(_nearest(middles, one.place)), one, scene) for one in some])
+        grid_centres = (2 * np.arange(side) + 1) / side - 1
+        error_values = np.array(
+            [
+                star_errors(psf_at(_nearest_position(grid_centres, sample_star.place)), sample_star, scene)
+                for sample_star in star_sample
+            ]
+        )
         # The wings are the centre's everywhere: a position has the core alone.
         planes = side**2 * len(psf.wavelength)
         megabytes = (planes * centre[0].size * psf.images.itemsize + psf.images.nbytes) / 1e6
-        out.append(_row(side**2, True, found, out[0]["seconds"] + planes * plane_s, megabytes))
+        out.append(_table_row(side**2, True, error_values, out[0]["seconds"] + planes * plane_s, megabytes))
     return out
 
 
-def text(found: list[dict[str, float]], scene: Scene = VIS) -> str:
+def table_text(table_rows: list[dict[str, float]], scene: Scene = VIS) -> str:
     """The table of positions."""
-    about = _ABOUT.format(camera=scene.name.upper(), writer=_WRITERS[scene.name])
+    header = _TABLE_HEADER.format(camera=scene.name.upper(), writer=_WRITERS[scene.name])
     lines = [
-        ",".join(f"{row[name]:.2g}" if name not in _EXACT else f"{row[name]:.0f}" for name in row) for row in found
+        ",".join(f"{row[name]:.2g}" if name not in _INTEGER_COLUMNS else f"{row[name]:.0f}" for name in row)
+        for row in table_rows
     ]
-    return "\n".join([about + _COLUMNS, *lines]) + "\n"
+    return "\n".join([header + _COLUMNS, *lines]) + "\n"
 
 
 # How each is sampled, and which command writes its table.
 _SAMPLINGS = {"vis": euclid.VIS, "nisp": euclid.NISP}
 _WRITERS = {"vis": "python -m benchmarks.trade\n# --positions", "nisp": "python -m benchmarks._positions"}
-_EXACT = ("positions", "nearest", "megabytes")
+_INTEGER_COLUMNS = ("positions", "nearest", "megabytes")
 
 
-def star(at: Callable[[tuple[float, float]], Float], rng: np.random.Generator) -> Star:
+def draw_star(psf_at: Callable[[tuple[float, float]], Float], rng: np.random.Generator) -> Star:
     place = rng.uniform(-1, 1, 2).tolist()
     photons = scenes.colours(1, rng)[0]
-    return Star((place[0], place[1]), photons / photons.sum(), at((place[0], place[1])))
+    return Star((place[0], place[1]), photons / photons.sum(), psf_at((place[0], place[1])))
 
 
-def errors_of(planes: Float, star: Star, scene: Scene = VIS) -> tuple[float, float, float, float]:
+def star_errors(planes: Float, star: Star, scene: Scene = VIS) -> tuple[float, float, float, float]:
     """Of a star: |dF / F| in 1", the position's error in pixels, |dR2 / R2| and the ellipticity's error."""
     # Neighbouring sub-bands may have one plane.
     shares = star.shares.reshape(len(planes), -1).sum(axis=1)
-    found = _moments(np.tensordot(shares, planes, 1), scene)
+    measured = _moments(np.tensordot(shares, planes, 1), scene)
     truth = _moments(np.tensordot(star.shares, star.truth, 1), scene)
-    moved = float(np.hypot(*(found - truth)[1:3])) / scene.scale
-    return abs(found[0] / truth[0] - 1), moved, abs(found[3] / truth[3] - 1), float(np.hypot(*(found - truth)[4:6]))
+    shift = float(np.hypot(*(measured - truth)[1:3])) / scene.scale
+    return (
+        abs(measured[0] / truth[0] - 1),
+        shift,
+        abs(measured[3] / truth[3] - 1),
+        float(np.hypot(*(measured - truth)[4:6])),
+    )
 
 
-def largest(seed: int, n: int, kinds: Sequence[tuple[int, int]]) -> dict[tuple[int, int], dict[str, float]]:
+def largest_errors(
+    seed: int, n: int, psf_variants: Sequence[tuple[int, int]]
+) -> dict[tuple[int, int], dict[str, float]]:
     """By (positions, colours) of a PSF, the largest errors of n stars: flux, shape, position of an accuracy."""
-    at, rng = optics(), np.random.default_rng(seed)
-    centre, some = at((0.0, 0.0)), [star(at, rng) for _ in range(n)]
+    psf_at, rng = make_optics(), np.random.default_rng(seed)
+    centre, star_sample = psf_at((0.0, 0.0)), [draw_star(psf_at, rng) for _ in range(n)]
     out = {}
-    for positions, colours in kinds:
-        psf = scenes.psf_of(VIS, positions, colours).planes
+    for positions, colours in psf_variants:
+        psf = scenes.scene_psf(VIS, positions, colours).planes
         assert psf is not None
-        middle = centre.reshape(colours, -1, *centre.shape[1:]).mean(axis=1)
-        flux, moved, r2, e = np.array([errors_of(middle + drift(psf, one), one) for one in some]).max(axis=0)
-        out[positions, colours] = {"flux": flux, "shape": max(LENSED * r2, e / 2), "position": moved}
+        centre_planes = centre.reshape(colours, -1, *centre.shape[1:]).mean(axis=1)
+        flux, moved, r2, e = np.array(
+            [star_errors(centre_planes + drift(psf, sample_star), sample_star) for sample_star in star_sample]
+        ).max(axis=0)
+        out[positions, colours] = {"flux": flux, "shape": max(R2_RATIO * r2, e / 2), "position": moved}
     return out
 
 
 def _moments(image: Float, scene: Scene) -> Float:
     middle = image.shape[0] // 2
-    return errors.measured(image, scene.scale / _SAMPLINGS[scene.name].samples, middle, middle)
+    return errors.measure_image(image, scene.scale / _SAMPLINGS[scene.name].samples, middle, middle)
 
 
 def drift(psf: model.Planes, star: Star) -> Float:
@@ -159,27 +178,29 @@ def drift(psf: model.Planes, star: Star) -> Float:
     return np.stack([np.broadcast_to(each, star.truth.shape[1:]) for each in out])
 
 
-def _nearest(middles: Float, place: tuple[float, float]) -> tuple[float, float]:
-    x, y = (float(middles[np.argmin(np.abs(middles - at))]) for at in place)
+def _nearest_position(grid_centres: Float, place: tuple[float, float]) -> tuple[float, float]:
+    x, y = (float(grid_centres[np.argmin(np.abs(grid_centres - at))]) for at in place)
     return x, y
 
 
-def _cold(positions: int, scene: Scene) -> tuple[float, model.Planes]:
+def _compute_planes(positions: int, scene: Scene) -> tuple[float, model.Planes]:
     """CPU s to compute the planes, and they."""
-    with cache.temporary():
+    with cache.use_temporary_dir():
         start = time.process_time()
-        planes = scenes.psf_of(scene, positions).planes
+        planes = scenes.scene_psf(scene, positions).planes
         seconds = time.process_time() - start
     assert planes is not None
     return seconds, planes
 
 
-def _row(positions: int, nearest: bool, found: Float, seconds: float, megabytes: float) -> dict[str, float]:
-    rms, worst = np.sqrt((found**2).mean(axis=0)), found.max(axis=0)
-    both = np.column_stack([rms, worst]).ravel()
-    values = positions, nearest, *both, seconds, megabytes
+def _table_row(
+    positions: int, nearest: bool, error_values: Float, seconds: float, megabytes: float
+) -> dict[str, float]:
+    rms, worst = np.sqrt((error_values**2).mean(axis=0)), error_values.max(axis=0)
+    rms_and_worst = np.column_stack([rms, worst]).ravel()
+    values = positions, nearest, *rms_and_worst, seconds, megabytes
     return {name: float(value) for name, value in zip(_COLUMNS.split(","), values, strict=True)}
 
 
 if __name__ == "__main__":
-    _FILE.write_text(text(rows(STARS, _FEW, NISP), NISP), encoding="utf-8")
+    _FILE.write_text(table_text(measure_positions(NUM_STARS, _NISP_NEAREST, NISP), NISP), encoding="utf-8")

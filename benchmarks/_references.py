@@ -18,38 +18,45 @@ from truesky.render.sources.source_list import Sources
 ACCURACY = 1e-4
 
 
-def image(
-    one: Sources, psf: model.Psf, side: int, highest: float = ACCURACY, folding: float = ACCURACY
+def reference_image(
+    source: Sources, psf: model.Psf, side: int, maxk_threshold: float = ACCURACY, folding_threshold: float = ACCURACY
 ) -> Float | None:
     """The only source, through a PSF that is its own, on a frame [side, side]; None where memory does not suffice.
 
     highest, folding : thresholds of the largest frequency, and of what folds
     """
     # A point has no form.
-    shapes = one.shapes.take(one.shape[one.shape >= 0])
-    seen = [
-        one.column,
-        one.row,
-        one.jacobian,
-        one.electrons,
+    shapes = source.shapes.take(source.shape[source.shape >= 0])
+    source_values = [
+        source.column,
+        source.row,
+        source.jacobian,
+        source.electrons,
         *(getattr(shapes, field.name) for field in fields(shapes)),
     ]
-    through = [repr(psf.profile)] if psf.planes is None else ["Lanczos 31", psf.planes.images]
+    psf_values = [repr(psf.profile)] if psf.planes is None else ["Lanczos 31", psf.planes.images]
     key = cache.content_key(
-        galsim.__version__, highest, folding, side, psf.pixel_scale, psf.intra_pixel, *seen, *through
-    )  # fmt: skip
+        galsim.__version__,
+        maxk_threshold,
+        folding_threshold,
+        side,
+        psf.pixel_scale,
+        psf.intra_pixel,
+        *source_values,
+        *psf_values,
+    )
 
     def make() -> dict[str, Float]:
         try:
-            return {"image": reference.reference(one, 0, psf, side, folding, highest)}
+            return {"image": reference.draw_reference(source, 0, psf, side, folding_threshold, maxk_threshold)}
         except (MemoryError, RuntimeError):
             return {"image": np.zeros((0, 0))}
 
-    found = cache.cached_arrays("reference", key, make)["image"]
-    return found if found.size else None
+    cached_image = cache.cached_arrays("reference", key, make)["image"]
+    return cached_image if cached_image.size else None
 
 
-def by_series(one: Sources, psf: model.Psf, side: int) -> Float:
+def image_by_series(source: Sources, psf: model.Psf, side: int) -> Float:
     """The same through planes, all but their Fourier series between samples: moved, averaged over pixels, sampled.
 
     A galaxy's own transform is galsim's, at its tightest. galsim knows a PSF between its samples by Lanczos' kernel of
@@ -63,15 +70,15 @@ def by_series(one: Sources, psf: model.Psf, side: int) -> Float:
     padded[: len(plane), : len(plane)] = plane
     middle, frequency = len(plane) // 2, np.fft.fftfreq(wide)
     out = np.fft.fft2(padded)
-    for axis, position in ((1, one.column[0]), (0, one.row[0])):
+    for axis, position in ((1, source.column[0]), (0, source.row[0])):
         moved = np.exp(-2j * np.pi * frequency * (samples * position - middle)) * np.sinc(samples * frequency)
         out *= np.expand_dims(moved, 1 - axis)
-    if one.shape[0] >= 0:
-        body = galsim.JacobianWCS(*one.jacobian[0].ravel()).toImage(
-            galaxy_shapes.profile(one.shapes, int(one.shape[0]), 1e-6)
+    if source.shape[0] >= 0:
+        body = galsim.JacobianWCS(*source.jacobian[0].ravel()).toImage(
+            galaxy_shapes.profile(source.shapes, int(source.shape[0]), 1e-6)
         )
         tight = body.withGSParams(folding_threshold=ACCURACY, maxk_threshold=1e-6, kvalue_accuracy=1e-8)
         drawn = tight.drawKImage(nx=wide, ny=wide, scale=2 * np.pi * samples / wide).array
         out *= np.fft.ifftshift(drawn) / tight.flux
     image = np.fft.ifft2(out).real[::samples, ::samples][:side, :side]
-    return np.asarray(one.electrons[0] * samples**2 * image)
+    return np.asarray(source.electrons[0] * samples**2 * image)

@@ -27,7 +27,7 @@ LAYERS = (14.5, 16.0, 18.0, 20.0, 22.0, 24.0, 26.0)
 # Of the LSST scene: FWHM in arcsec; of peers that have nothing but a Moffat profile, its exponent.
 SEEING, BETA = 0.7, 3.0
 # Its air, at an airmass of 1.2.
-_AIR = ground.Air(SEEING, (0.01, 0.005), slope=-0.3, lift=0.66, zenith=0.5, height=2663.0)
+_AIR = ground.Air(SEEING, (0.01, 0.005), slope=-0.3, tan_zenith_distance=0.66, zenith=0.5, height=2663.0)
 
 
 @dataclass(frozen=True)
@@ -53,17 +53,17 @@ SPACE = {"vis": ("3-4", "euclid_vis", euclid.vis_psf), "nisp": ("DET23", "euclid
 LSST = Scene("lsst", 4096, 4004, 0.2, 30.0, 28.17, 38.3, 18223, 1160)
 
 
-def psf_of(scene: Scene, positions: int = 9, colours: int = sub_bands.PARTS) -> model.Psf:
+def scene_psf(scene: Scene, positions: int = 9, colours: int = sub_bands.N_SUB_BANDS) -> model.Psf:
     """The scene's PSF."""
     mission = resolve()
     if scene.name == "lsst":
         detector = detectors.detector("lsstcam", "R22_S11", mission)
-        return model.of_colours(
-            ground.through_air(_AIR, detector, passbands.load("lsst_i"), mission, positions), colours
+        return model.reduce_colours(
+            ground.atmospheric_psf(_AIR, detector, passbands.load("lsst_i"), mission, positions), colours
         )
     name, band, psf = SPACE[scene.name]
     detector = detectors.detector(scene.name, name, mission)
-    return model.of_colours(psf(detector, passbands.load(band), mission, positions), colours)
+    return model.reduce_colours(psf(detector, passbands.load(band), mission, positions), colours)
 
 
 def sources(scene: Scene, seed: int, galaxies: int | None = None, stars: int | None = None) -> Sources:
@@ -103,7 +103,7 @@ def sources(scene: Scene, seed: int, galaxies: int | None = None, stars: int | N
 
 def colours(n: int, rng: np.random.Generator) -> Float:
     """Photons in each of the PSF's wavelengths, [n, PARTS]: power laws."""
-    waves = np.linspace(-0.25, 0.25, sub_bands.PARTS)
+    waves = np.linspace(-0.25, 0.25, sub_bands.N_SUB_BANDS)
     return np.asarray(np.exp(np.outer(rng.normal(0.5, 1.5, n), waves)))
 
 
@@ -112,60 +112,66 @@ def _magnitudes(rng: np.random.Generator, bright: float, faint: float, slope: fl
     return np.asarray(np.log10(low + (high - low) * rng.random(n)) / slope)
 
 
-def magnitudes(some: Sources, scene: Scene) -> Float:
+def magnitudes(source_list: Sources, scene: Scene) -> Float:
     """AB magnitudes of the sources."""
-    return np.asarray(scene.zero_point - 2.5 * np.log10(some.electrons / scene.exposure))
+    return np.asarray(scene.zero_point - 2.5 * np.log10(source_list.electrons / scene.exposure))
 
 
-def bins_of(some: Sources, scene: Scene) -> Int:
+def magnitude_bins(source_list: Sources, scene: Scene) -> Int:
     """Magnitude bin of each source."""
-    return np.clip(np.searchsorted(BINS, magnitudes(some, scene)) - 1, 0, len(BINS) - 2)
+    return np.clip(np.searchsorted(BINS, magnitudes(source_list, scene)) - 1, 0, len(BINS) - 2)
 
 
 def sample(scene: Scene, seed: int, n: int) -> Sources:
     """n galaxies, as many in every magnitude bin."""
-    some = sources(scene, seed, galaxies=max(60 * n, 3000), stars=0)
-    bins, rng = bins_of(some, scene), np.random.default_rng(seed)
+    candidates = sources(scene, seed, galaxies=max(60 * n, 3000), stars=0)
+    bins, rng = magnitude_bins(candidates, scene), np.random.default_rng(seed)
     each = -(-n // (len(BINS) - 1))
     chosen = [rng.permutation(np.flatnonzero(bins == b))[:each] for b in range(len(BINS) - 1)]
-    return some.take(np.sort(np.concatenate(chosen)))
+    return candidates.take(np.sort(np.concatenate(chosen)))
 
 
-def stratified(scene: Scene, seed: int, each: int) -> Sources:
+def stratified_sample(scene: Scene, seed: int, each: int) -> Sources:
     """Galaxies and stars, `each` of either in every one of LAYERS: what is bright, or faint, is among them."""
     layers, n = len(LAYERS) - 1, each * (len(LAYERS) - 1)
-    some, rng = sources(scene, seed, galaxies=n, stars=n), np.random.default_rng([seed, 1])
+    candidates, rng = sources(scene, seed, galaxies=n, stars=n), np.random.default_rng([seed, 1])
     low, high = np.array(LAYERS[:-1]), np.array(LAYERS[1:])
     layer = np.tile(np.arange(layers), 2 * each)
     mag = low[layer] + (high - low)[layer] * rng.random(2 * n)
     # The size goes with the magnitude.
-    size = 10 ** (-0.14 * (mag - magnitudes(some, scene)))[:n]
-    shapes = some.shapes
+    size = 10 ** (-0.14 * (mag - magnitudes(candidates, scene)))[:n]
+    shapes = candidates.shapes
     shapes = replace(shapes, bulge_radius=shapes.bulge_radius * size, disk_radius=shapes.disk_radius * size)
-    return replace(some, shapes=shapes, electrons=scene.exposure * 10 ** (0.4 * (scene.zero_point - mag)))
+    return replace(candidates, shapes=shapes, electrons=scene.exposure * 10 ** (0.4 * (scene.zero_point - mag)))
 
 
-def draw(some: Sources, psf: model.Psf, scene: Scene, settings: Settings, side: int | None = None) -> Float:
+def draw_sources(
+    source_list: Sources, psf: model.Psf, scene: Scene, settings: Settings, side: int | None = None
+) -> Float:
     """The whole of drawing, as for an exposure; `side`: on a small frame instead of the scene's."""
-    sizes = stamp_sizes.stamp_sizes(some.electrons, some.shape, some.shapes, psf, scene.noise, settings)
-    neglected = stamp_sizes.neglected_flux(some.electrons, scene.noise, settings)
+    sizes = stamp_sizes.stamp_sizes(
+        source_list.electrons, source_list.shape, source_list.shapes, psf, scene.noise, settings
+    )
+    neglected = stamp_sizes.neglected_flux(source_list.electrons, scene.noise, settings)
     nx, ny = (scene.nx, scene.ny) if side is None else (side, side)
-    return stamps.draw(some, sizes, psf, nx, ny, None, neglected)
+    return stamps.draw(source_list, sizes, psf, nx, ny, None, neglected)
 
 
-def own(psf: model.Psf, some: Sources, i: int) -> model.Psf:
+def psf_of_source(psf: model.Psf, source_list: Sources, i: int) -> model.Psf:
     """The PSF of source i everywhere on a frame, and nothing beyond its planes."""
     planes = psf.planes
     if planes is None:
         return psf
-    weights = transfer.basis_weights(psf, some.photons, some.column, some.row)[i]
+    weights = transfer.basis_weights(psf, source_list.photons, source_list.column, source_list.row)[i]
     image = transfer.image_of(planes, weights)
-    alone = replace(planes, wavelength=planes.wavelength[:1], images=image[None], drift=planes.drift[:0], powers=())
-    return replace(psf, planes=alone, edges=None)
+    constant_planes = replace(
+        planes, wavelength=planes.wavelength[:1], images=image[None], drift=planes.drift[:0], powers=()
+    )
+    return replace(psf, planes=constant_planes, edges=None)
 
 
-def moved(some: Sources, i: int, side: int) -> Sources:
+def centred_source(source_list: Sources, i: int, side: int) -> Sources:
     """Source i alone, its middle pixel on the middle of a frame; of `own`'s PSF."""
-    one = some.take(np.array([i]))
-    shift = [side // 2 - np.rint(position) for position in (one.column, one.row)]
-    return replace(one, column=one.column + shift[0], row=one.row + shift[1], photons=None)
+    source = source_list.take(np.array([i]))
+    shift = [side // 2 - np.rint(position) for position in (source.column, source.row)]
+    return replace(source, column=source.column + shift[0], row=source.row + shift[1], photons=None)

@@ -26,18 +26,18 @@ def _detector(configuration: Path, shape: tuple[int, int]) -> object:
     from slitlessutils.core.wfss.config.instrumentconfig import DetectorConfig
 
     ny, nx = shape
-    made = {
+    settings = {
         "naxis": [nx, ny], "crpix": [nx / 2, ny / 2], "scale": [0.3, 0.3], "noise": {"dark": 0.0, "read": 0.0},
         "extensions": {}, "siaf": {"v2": 0.0, "v3": 0.0, "v3y": 0.0},
         "blockers": {"": {"sip": None, "config": {"grism": str(configuration)}}},
     }  # fmt: skip
-    return DetectorConfig("made", made, types.SimpleNamespace(blocking="", name="grism"), "")
+    return DetectorConfig("made", settings, types.SimpleNamespace(blocking="", name="grism"), "")
 
 
-def main(configuration: Path, given: Path, out: Path) -> None:
+def main(configuration: Path, input_file: Path, output_file: Path) -> None:
     """Reads image, corner, wavelength and f_lambda; writes the frame, and CPU s."""
     urllib.request.urlopen = _no_network  # type: ignore[assignment]
-    with np.load(given) as read:
+    with np.load(input_file) as read:
         images, corners, waves, spectra, shape = (read[n] for n in ("images", "corners", "waves", "spectra", "shape"))
     # A made fixture of reference files, empty: none of an instrument is wanted.
     fixture = Path.home() / ".slitlessutils" / "1.0.0"
@@ -46,15 +46,15 @@ def main(configuration: Path, given: Path, out: Path) -> None:
     detector = _detector(configuration, tuple(shape.tolist()))
     order, step = detector["+1"], float(waves[1] - waves[0])  # type: ignore[index]
     frame, start = np.zeros(shape), time.process_time()
-    for image, (left, low), spectrum in zip(images, corners, spectra, strict=True):
+    for image, (first_column, first_row), spectrum in zip(images, corners, spectra, strict=True):
         detected = order.sensitivity(waves) * spectrum * step
         for row, column in np.argwhere(image > 1e-6 * image.sum()).tolist():
             # Corners of a pixel, whose places count from 1.
-            x = left + column + 1 + np.array([-0.5, -0.5, 0.5, 0.5])
-            y = low + row + 1 + np.array([-0.5, 0.5, 0.5, -0.5])
+            x = first_column + column + 1 + np.array([-0.5, -0.5, 0.5, 0.5])
+            y = first_row + row + 1 + np.array([-0.5, 0.5, 0.5, -0.5])
             to_x, to_y, wave, area = detector.drizzle(x, y, "+1", waves)  # type: ignore[attr-defined]
             np.add.at(frame, (to_y, to_x), area * image[row, column] * detected[wave])
-    np.savez(out, frame=frame, seconds=time.process_time() - start)
+    np.savez(output_file, frame=frame, seconds=time.process_time() - start)
 
 
 if __name__ == "__main__":

@@ -36,7 +36,7 @@ from truesky.catalogue.galaxies import band_ratios, galaxies
 from truesky.catalogue.halos import matching, population
 from truesky.fluxes import cosmology
 from truesky.fluxes.libraries import templates
-from truesky.running.measured import forget_peak, peak_gb
+from truesky.running.task_metrics import peak_memory_gb, reset_peak_memory
 
 ROOT = Path(__file__).resolve().parents[1]
 SEED = 7
@@ -44,7 +44,7 @@ CELL = 9000
 # Serrano et al. 2024: galaxies of the simulated survey.
 SURVEY_GALAXIES = 922e6
 # Four order-5 cells meet here, and share such a circle evenly.
-MEETING, RADIUS, QUICK_RADIUS = (53.4375, -27.279613), 0.75, 0.05
+CENTRE, RADIUS, QUICK_RADIUS = (53.4375, -27.279613), 0.75, 0.05
 NOTES = {
     "cell_rows": "galaxies of an order-5 cell to I_E < 26",
     "cell_s": "CPU, both tables, drawn and written (target 45)",
@@ -60,46 +60,46 @@ NOTES = {
 }
 
 
-def facts(quick: bool) -> dict[str, object]:
+def universe_settings(quick: bool) -> dict[str, object]:
     """What a request says of its universe where it says nothing."""
     small = {"box_cells": 192, "lensing_nside": 64} if quick else {}
     return {"seed": SEED, **asdict(Universe()), **small}
 
 
-def make(cell: int, count: int, about: dict[str, object]) -> dict[str, float]:
+def make_cell(cell: int, count: int, settings: dict[str, object]) -> dict[str, float]:
     """Both tables of the first `count` generation cells of an order-5 cell, as a task makes them."""
-    wanted = {**about, "generation_cells": list(range(cell << 6, (cell << 6) + count))}
-    build_galaxies._universe(wanted, None)
-    forget_peak()
-    started, began = time.process_time(), time.perf_counter()
+    task_facts = {**settings, "generation_cells": list(range(cell << 6, (cell << 6) + count))}
+    build_galaxies._universe(task_facts, None)
+    reset_peak_memory()
+    started, wall_start = time.process_time(), time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        halos = build_galaxies.halo_work(Path(folder), wanted).rows
+        halos = build_galaxies.draw_halos(Path(folder), task_facts).rows
         parquet.write(Path(folder) / "halos.parquet", halos, HALOS)
         halo_s = time.process_time() - started
-        rows = build_galaxies.work(Path(folder), wanted).rows
+        rows = build_galaxies.draw_galaxies(Path(folder), task_facts).rows
         parquet.write(Path(folder) / "galaxies.parquet", rows, GALAXIES)
         size = (Path(folder) / "galaxies.parquet").stat().st_size
     return {
         "cell_rows": rows.num_rows,
         "cell_halos": halos.num_rows,
         "cell_s": time.process_time() - started,
-        "cell_wall_s": time.perf_counter() - began,
+        "cell_wall_s": time.perf_counter() - wall_start,
         "cell_halo_s": halo_s,
-        "cell_peak_gb": peak_gb(),
+        "cell_peak_gb": peak_memory_gb(),
         "bytes_per_row": size / rows.num_rows,
     }
 
 
-def submitted(cores: int, quick: bool) -> tuple[float, float]:
+def time_job(cores: int, quick: bool) -> tuple[float, float]:
     """Wall seconds of table `galaxies` under local[cores], Java and its workers running already, and of its tasks."""
-    ra, dec = MEETING
-    about = facts(quick)
+    ra, dec = CENTRE
+    settings = universe_settings(quick)
     with tempfile.TemporaryDirectory() as folder:
         request = Path(folder) / "request.toml"
         request.write_text(
             f'name = "meeting"\nseed = {SEED}\n[area]\n'
             f"cone = {{ ra = {ra}, dec = {dec}, radius = {QUICK_RADIUS if quick else RADIUS} }}\n[universe]\n"
-            f"box_cells = {about['box_cells']}\nlensing_nside = {about['lensing_nside']}\n"
+            f"box_cells = {settings['box_cells']}\nlensing_nside = {settings['lensing_nside']}\n"
         )
         spark = shutil.which("spark-submit", path=str(Path(sys.executable).parent)) or "spark-submit"
         job = ROOT / "jobs" / "catalogue" / "build_galaxies.py"
@@ -107,57 +107,63 @@ def submitted(cores: int, quick: bool) -> tuple[float, float]:
         command = [spark, "--master", f"local[{cores}]", job, "--lake", lake, "--request", request]
         subprocess.run([str(word) for word in command], check=True, capture_output=True, text=True)
         # Halos were made first, by the same workers.
-        (log,) = layout.runs(layout.lake(lake)).glob("*-galaxies-*.jsonl")
+        (log,) = layout.runs_folder(layout.resolve_lake(lake)).glob("*-galaxies-*.jsonl")
         lines = [json.loads(line) for line in log.read_text().splitlines()]
     tasks = sum(line["seconds"] for line in lines if "part" in line)
     return next(line["seconds"] for line in lines if "ended" in line), tasks
 
 
-def two_cores(quick: bool, repeats: int) -> dict[str, float]:
+def two_core_speedup(quick: bool, repeats: int) -> dict[str, float]:
     """The job with one core and with two, each the fastest of several turns taken alternately."""
-    turns = [(submitted(1, quick), submitted(2, quick)) for _ in range(repeats)]
-    alone, tasks = min(one for one, _ in turns)
-    both = min(two for _, two in turns)[0]
-    serial = 1.0 - tasks / alone
+    turns = [(time_job(1, quick), time_job(2, quick)) for _ in range(repeats)]
+    single_core_s, tasks = min(single_core for single_core, _ in turns)
+    double_core_s = min(double_core for _, double_core in turns)[0]
+    serial = 1.0 - tasks / single_core_s
     return {
-        "speedup_2_cores": alone / both,
+        "speedup_2_cores": single_core_s / double_core_s,
         "serial_share": serial,
         "speedup_from_shares": 1.0 / (serial + 0.5 * (1.0 - serial)),
     }
 
 
-def photometry(count: int, about: dict[str, object]) -> float:
+def photometry(count: int, settings: dict[str, object]) -> float:
     """Ours: galaxies a second with halo, position, velocity, redshift, spectrum and magnitudes in three bands."""
-    universe = build_galaxies._universe(about, None)
-    drawn = population.Cells(universe.population)
+    universe = build_galaxies._universe(settings, None)
+    drawn = population.CellCache(universe.population)
     library, dustiest = templates.galaxy_library(), float(universe.selection.ebv[-1])
     bands = [band_ratios.load(library, band, matching.Z_LAST, dustiest) for band in ("euclid_y", "euclid_h")]
     started, number = time.process_time(), 0
     for cell in range(CELL << 6, (CELL << 6) + count):
-        found = population.members(drawn, cell)
-        seen = galaxies.select(universe, *galaxies._light(SEED, universe, found))
-        plain = seen.m_r + cosmology.distance_modulus(seen.z)
-        others = [plain + band_ratios.offset(band, seen.z, seen.sed) for band in bands]
-        number += np.stack([found.ra[seen.row], found.dec[seen.row], seen.magnitude, *others]).shape[1]
+        members = population.members(drawn, cell)
+        selected = galaxies.select(universe, *galaxies._draw_candidates(SEED, universe, members))
+        reference_magnitude = selected.m_r + cosmology.distance_modulus(selected.z)
+        band_magnitudes = [reference_magnitude + band_ratios.offset(band, selected.z, selected.sed) for band in bands]
+        number += np.stack(
+            [members.ra[selected.row], members.dec[selected.row], selected.magnitude, *band_magnitudes]
+        ).shape[1]
     return number / (time.process_time() - started)
 
 
 def run(quick: bool, repeats: int) -> dict[str, float]:
     """All figures."""
-    about, count = facts(quick), 4 if quick else 64
-    turns = [make(CELL, count, about) for _ in range(repeats)]
+    settings, count = universe_settings(quick), 4 if quick else 64
+    turns = [make_cell(CELL, count, settings) for _ in range(repeats)]
     figures = {"generation_cells": count, **min(turns, key=lambda turn: turn["cell_s"])}
     figures["galaxies_per_s_core"] = figures["cell_rows"] / figures["cell_s"]
     figures["projected_core_hours_922m"] = SURVEY_GALAXIES / figures["galaxies_per_s_core"] / 3600.0
     area = sky.cell_area(8) * count
-    own, other = photometry(count, about), _peers.skypy_photometry(area, SEED)
-    figures |= {"photometry_per_s_core": own, "skypy_photometry_per_s_core": other, "photometry_vs_skypy": own / other}
-    return figures | two_cores(quick, repeats)
+    our_rate, skypy_rate = photometry(count, settings), _peers.skypy_photometry(area, SEED)
+    figures |= {
+        "photometry_per_s_core": our_rate,
+        "skypy_photometry_per_s_core": skypy_rate,
+        "photometry_vs_skypy": our_rate / skypy_rate,
+    }
+    return figures | two_core_speedup(quick, repeats)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     options = report.options("catalogue", __doc__ or "", argv)
-    report.finish("catalogue", 1, run(options.quick, 1), NOTES, options.json)
+    report.print_and_write("catalogue", 1, run(options.quick, 1), NOTES, options.json)
     return 0
 
 

@@ -36,12 +36,12 @@ _SOURCES, _STARS, _LIGHT = 30_000, 200, 1e9
 _EXPOSURE, _SKY, _ZERO_POINT = 560.53, 0.25, 25.93
 # The standard set: magnitudes, half-light radius (of an exponential disc), arcsec; pixels apart, and of a stamp.
 _STAR, _GALAXY, _RADIUS = 19.0, 22.5, 0.3
-_PITCH, _STAMP = 64, 64
+_SPACING, _STAMP = 64, 64
 # Radius that fluxes are measured in, arcsec.
 APERTURE = 1.3
 
 
-def light(ny: int, nx: int) -> Frame:
+def draw_light(ny: int, nx: int) -> Frame:
     """Expected electrons of points and of squares of seven pixels."""
     rng = np.random.default_rng(1)
     frame = np.zeros((ny, nx))
@@ -54,13 +54,13 @@ def light(ny: int, nx: int) -> Frame:
     return frame
 
 
-def measured(side: int | None, repeats: int) -> dict[str, float]:
+def measure_effects(side: int | None, repeats: int) -> dict[str, float]:
     """Of each effect: CPU s of a detector, margin, rms and largest change of a pixel over its noise."""
     mission = resolve()
     detector = detectors.detector("vis", "3-4", mission)
     if side is not None:
         detector = type(detector)("3-4", "vis", side, side, detector.x, detector.y, 0.0, detector.pixel_scale)
-    frame = light(detector.ny, detector.nx)
+    frame = draw_light(detector.ny, detector.nx)
     scene = Scene(mission, "vis", _EXPOSURE, _SKY, float(frame.max()), detector)
     # The light is where its ghost falls into the middle.
     _, _, across, *_ = ghosts.parameters(scene)
@@ -69,75 +69,75 @@ def measured(side: int | None, repeats: int) -> dict[str, float]:
     scene = replace(scene, lights=lights)
     out: dict[str, float] = {}
     for effect in vis.SKY:
-        frame = _one(effect, frame, scene, repeats, out)
-    assembled = quadrants.assembled(frame, *quadrants.sizes(scene))
+        frame = _measure_effect(effect, frame, scene, repeats, out)
+    assembled = quadrants.assemble(frame, *quadrants.overscan_sizes(scene))
     out["all_s"] = sum(value for key, value in out.items() if key.endswith("_s"))
     out["mean_adu"] = float(assembled.mean())
     # What other images have besides, each on the light, or on nothing where none falls.
-    light_alone = light(detector.ny, detector.nx)
+    light_alone = draw_light(detector.ny, detector.nx)
     for effect in vis.FLAT:
         if effect not in vis.SKY:
-            _one(effect, light_alone, scene, repeats, out)
+            _measure_effect(effect, light_alone, scene, repeats, out)
     filled = np.zeros_like(light_alone)
     for effect in vis.PUMPING:
         if effect not in vis.SKY:
-            filled = _one(effect, filled, scene, repeats, out)
+            filled = _measure_effect(effect, filled, scene, repeats, out)
     return out
 
 
-def _one(effect: Effect, frame: Frame, scene: Scene, repeats: int, out: dict[str, float]) -> Frame:
+def _measure_effect(effect: Effect, frame: Frame, scene: Scene, repeats: int, out: dict[str, float]) -> Frame:
     """Adds an effect's figures to `out`; what it leaves."""
     parameters = effect.parameters(scene)
-    after = effect.apply(frame, *parameters, rng=stream(1, effect.name))
-    work = partial(effect.apply, frame, *parameters, rng=stream(1, effect.name))
-    out[f"{effect.name}_s"] = report.best(work, repeats, time.process_time)
+    result = effect.apply(frame, *parameters, rng=stream(1, effect.name))
+    apply_effect = partial(effect.apply, frame, *parameters, rng=stream(1, effect.name))
+    out[f"{effect.name}_s"] = report.best_time(apply_effect, repeats, time.process_time)
     out[f"{effect.name}_margin"] = effect.margin(scene)
-    if after.shape == frame.shape and effect.name != "adc":
-        _changed(effect.name, after - frame, scene, out)
-    return after
+    if result.shape == frame.shape and effect.name != "adc":
+        _add_change(effect.name, result - frame, scene, out)
+    return result
 
 
-def _changed(name: str, change: Frame, scene: Scene, out: dict[str, float]) -> None:
+def _add_change(name: str, change: Frame, scene: Scene, out: dict[str, float]) -> None:
     """rms and largest change of a pixel, of its noise."""
     out[f"{name}_rms_sigma"] = float(np.sqrt(np.mean(change**2))) / scene.pixel_noise
     out[f"{name}_largest_sigma"] = float(np.abs(change).max()) / scene.pixel_noise
 
 
-def standard(detector: Detector, pitch: int) -> Sources:
+def standard_sources(detector: Detector, spacing: int) -> Sources:
     """The standard set, in turns on a lattice: stars of _STAR, round exponential galaxies of _GALAXY and _RADIUS."""
     rng = np.random.default_rng(2)
-    middle = [np.arange(pitch / 2, n - pitch / 2 + 1, pitch) for n in (detector.nx, detector.ny)]
+    middle = [np.arange(spacing / 2, n - spacing / 2 + 1, spacing) for n in (detector.nx, detector.ny)]
     column, row = (axis.ravel() for axis in np.meshgrid(*middle))
     n = len(column)
-    star, one, nothing = np.arange(n) % 2 == 0, np.ones(1), np.zeros(1)
-    light = _EXPOSURE * 10.0 ** (0.4 * (_ZERO_POINT - np.where(star, _STAR, _GALAXY)))
-    disc = Shapes(one, one * _RADIUS, nothing, one, one, nothing, nothing, nothing, nothing, one)
+    is_star, ones, zeros = np.arange(n) % 2 == 0, np.ones(1), np.zeros(1)
+    light = _EXPOSURE * 10.0 ** (0.4 * (_ZERO_POINT - np.where(is_star, _STAR, _GALAXY)))
+    disc = Shapes(ones, ones * _RADIUS, zeros, ones, ones, zeros, zeros, zeros, zeros, ones)
     jacobian = np.tile(detector.pixel_scale * np.eye(2), (n, 1, 1))
     shift = rng.uniform(-0.5, 0.5, (2, n))
     return Sources(
-        np.arange(n), column + shift[0], row + shift[1], jacobian, light, np.where(star, -1, 0), disc,
-        np.full((n, sub_bands.PARTS), 1.0 / sub_bands.PARTS),
+        np.arange(n), column + shift[0], row + shift[1], jacobian, light, np.where(is_star, -1, 0), disc,
+        np.full((n, sub_bands.N_SUB_BANDS), 1.0 / sub_bands.N_SUB_BANDS),
     )  # fmt: skip
 
 
-def forms(frame: Frame, some: Sources, radius: float = APERTURE, scale: float = 0.1) -> Frame:
+def measure_shapes(frame: Frame, sources: Sources, radius: float = APERTURE, scale: float = 0.1) -> Frame:
     """Of each source: flux within `radius` arcsec above its surroundings, R^2, e1, e2 under a Gaussian of 0.75"."""
     half, out = round(2.0 * radius / scale), []
-    for x, y in zip(some.column, some.row, strict=True):
+    for x, y in zip(sources.column, sources.row, strict=True):
         x0, y0 = max(round(x) - half, 0), max(round(y) - half, 0)
-        part = frame[y0 : y0 + 2 * half + 1, x0 : x0 + 2 * half + 1]
-        rows, columns = np.mgrid[: part.shape[0], : part.shape[1]]
+        cutout = frame[y0 : y0 + 2 * half + 1, x0 : x0 + 2 * half + 1]
+        rows, columns = np.mgrid[: cutout.shape[0], : cutout.shape[1]]
         dx, dy = (columns - (x - x0)) * scale, (rows - (y - y0)) * scale
         distance = np.hypot(dx, dy)
         # The mean: a median of counts is a whole number.
-        part = part - part[distance > 1.5 * radius].mean()
-        weighted = part * np.exp(-0.5 * (distance / 0.75) ** 2)
+        cutout = cutout - cutout[distance > 1.5 * radius].mean()
+        weighted = cutout * np.exp(-0.5 * (distance / 0.75) ** 2)
         xx, yy, xy = ((weighted * a).sum() / weighted.sum() for a in (dx * dx, dy * dy, dx * dy))
-        out.append([part[distance < radius].sum(), xx + yy, (xx - yy) / (xx + yy), 2 * xy / (xx + yy)])
+        out.append([cutout[distance < radius].sum(), xx + yy, (xx - yy) / (xx + yy), 2 * xy / (xx + yy)])
     return np.array(out)
 
 
-def changes(scene: Scene, some: Sources, frame: Frame, radius: float = APERTURE) -> dict[str, Frame]:
+def effect_changes(scene: Scene, sources: Sources, frame: Frame, radius: float = APERTURE) -> dict[str, Frame]:
     """What each effect that leaves electrons does to each source: magnitude, dR^2 / R^2, de1, de2, [n, 4].
 
     Cosmic rays hit some sources and not others: they are left out.
@@ -145,60 +145,63 @@ def changes(scene: Scene, some: Sources, frame: Frame, radius: float = APERTURE)
     frame : [ny, nx] expected e- of the sources
     """
     out: dict[str, Frame] = {}
-    sizes = quadrants.sizes(scene)
-    before = forms(frame, some, radius)
+    sizes = quadrants.overscan_sizes(scene)
+    previous_shapes = measure_shapes(frame, sources, radius)
     for effect in vis.SKY[:-1]:
         if effect in (cosmic_rays.EFFECT, readout_cosmic_rays.READOUT):
             continue
         frame = effect.apply(frame, *effect.parameters(scene), rng=stream(1, effect.name))
-        after = forms(frame if frame.ndim == 2 else quadrants.assembled(frame, *sizes), some, radius)
-        out[effect.name] = _differences(before, after)
-        before = after
+        new_shapes = measure_shapes(frame if frame.ndim == 2 else quadrants.assemble(frame, *sizes), sources, radius)
+        out[effect.name] = _shape_differences(previous_shapes, new_shapes)
+        previous_shapes = new_shapes
     return out
 
 
-def sources_changed(side: int | None, repeats: int) -> dict[str, float]:
+def median_changes(side: int | None, repeats: int) -> dict[str, float]:
     """Medians over the standard set of what each effect changes; shear is half an ellipticity."""
     mission = resolve()
     detector = detectors.detector("vis", "3-4", mission)
     detector = detector if side is None else replace(detector, nx=side, ny=side)
-    some = standard(detector, _PITCH)
+    sources = standard_sources(detector, _SPACING)
     psf = euclid.vis_psf(detector, passbands.load("euclid_vis"), mission)
-    light = stamps.draw(some, np.full(len(some), _STAMP), psf, detector.nx, detector.ny)
+    light = stamps.draw(sources, np.full(len(sources), _STAMP), psf, detector.nx, detector.ny)
     lights = Lights(np.array([100.0]), np.array([100.0]), np.array([_LIGHT]))
     scene = Scene(mission, "vis", _EXPOSURE, _SKY, float(light.max()), detector, lights)
     out: dict[str, float] = {}
-    own = _drawn(some, psf, light, scene, repeats, out)
-    for name, change in {vis.DRAWN.name: own, **changes(scene, some, light)}.items():
-        for kind, chosen in (("star", some.shape < 0), ("galaxy", some.shape >= 0)):
-            mag, size, e1, e2 = np.nanmedian(change[chosen], axis=0)
+    drawing_change = _measure_drawing(sources, psf, light, scene, repeats, out)
+    for name, change in {vis.TRANSFER_EFFECT.name: drawing_change, **effect_changes(scene, sources, light)}.items():
+        for kind, in_class in (("star", sources.shape < 0), ("galaxy", sources.shape >= 0)):
+            mag, size, e1, e2 = np.nanmedian(change[in_class], axis=0)
             out[f"{name}_{kind}_mag"], out[f"{name}_{kind}_size"] = float(mag), float(size)
             out[f"{name}_{kind}_shear"] = float(np.hypot(e1, e2)) / 2
     return out
 
 
-def _drawn(
-    some: Sources, psf: model.Psf, light: Frame, scene: Scene, repeats: int, out: dict[str, float]
+def _measure_drawing(
+    sources: Sources, psf: model.Psf, light: Frame, scene: Scene, repeats: int, out: dict[str, float]
 ) -> Frame:  # fmt: skip
     """Adds the figures of what is part of drawing: what that takes more with it; what it does to sources, [n, 4]."""
-    (strength,) = vis.DRAWN.parameters(scene)
-    sizes, (ny, nx) = np.full(len(some), _STAMP), light.shape
-    with_it, without = (
-        partial(stamps.draw, some, sizes, one, nx, ny) for one in (replace(psf, intra_pixel=strength), psf)
+    (strength,) = vis.TRANSFER_EFFECT.parameters(scene)
+    sizes, (ny, nx) = np.full(len(sources), _STAMP), light.shape
+    draw_with, draw_without = (
+        partial(stamps.draw, sources, sizes, psf_variant, nx, ny)
+        for psf_variant in (replace(psf, intra_pixel=strength), psf)
     )
-    more = report.best(with_it, repeats, time.process_time) - report.best(without, repeats, time.process_time)
+    extra_s = report.best_time(draw_with, repeats, time.process_time) - report.best_time(
+        draw_without, repeats, time.process_time
+    )
     # Less than two drawings differ by chance.
-    out[f"{vis.DRAWN.name}_s"] = max(more, 0.0)
-    out[f"{vis.DRAWN.name}_margin"] = vis.DRAWN.margin(scene)
-    drawn = with_it()
-    _changed(vis.DRAWN.name, drawn - light, scene, out)
-    return _differences(forms(light, some), forms(drawn, some))
+    out[f"{vis.TRANSFER_EFFECT.name}_s"] = max(extra_s, 0.0)
+    out[f"{vis.TRANSFER_EFFECT.name}_margin"] = vis.TRANSFER_EFFECT.margin(scene)
+    drawn = draw_with()
+    _add_change(vis.TRANSFER_EFFECT.name, drawn - light, scene, out)
+    return _shape_differences(measure_shapes(light, sources), measure_shapes(drawn, sources))
 
 
-def _differences(before: Frame, after: Frame) -> Frame:
+def _shape_differences(previous_shapes: Frame, new_shapes: Frame) -> Frame:
     """Of `forms`: magnitude, dR^2 / R^2, de1, de2."""
-    ratio = after[:, :2] / before[:, :2]
-    return np.column_stack([-2.5 * np.log10(ratio[:, 0]), ratio[:, 1] - 1, after[:, 2:] - before[:, 2:]])
+    ratio = new_shapes[:, :2] / previous_shapes[:, :2]
+    return np.column_stack([-2.5 * np.log10(ratio[:, 0]), ratio[:, 1] - 1, new_shapes[:, 2:] - previous_shapes[:, 2:]])
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -206,8 +209,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = report.options("effects", __doc__ or "", argv)
     side = 512 if options.quick else None
     repeats = 1 if options.quick else 3
-    figures = measured(side, repeats) | sources_changed(side, repeats)
-    report.finish("effects", repeats, figures, {"all_s": "CPU, every effect of a science image"}, options.json)
+    figures = measure_effects(side, repeats) | median_changes(side, repeats)
+    report.print_and_write("effects", repeats, figures, {"all_s": "CPU, every effect of a science image"}, options.json)
     return 0
 
 

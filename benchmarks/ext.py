@@ -17,7 +17,7 @@ from pathlib import Path
 
 from benchmarks import _detectors as one_detector
 from benchmarks import report
-from benchmarks._detectors import ROOT, prepared, rendered
+from benchmarks._detectors import ROOT, measure_render, plan_detector
 from lake_schema.store import read
 from truesky.render import render_exposures
 from truesky.render.channels import ground
@@ -28,7 +28,7 @@ from truesky.request.schema import Effects, Request
 
 RESULTS = ROOT / "benchmarks" / "results" / "ext.json"
 # As far from the field's centre as sources of JPCam's detectors may lie, and of LSSTCam's all; of one in haste; deg.
-_FIELD, _WHOLE, _SMALL = 0.47, 2.1, 0.2
+_FIELD_RADIUS, _LSST_RADIUS, _QUICK_RADIUS = 0.47, 2.1, 0.2
 # Faintest galaxies and stars, and those of one in haste.
 _DEEP, _BRIGHT = (26.0, 26.0), (20.0, 16.0)
 
@@ -67,14 +67,16 @@ _NOTES = {
 }
 
 
-def request(cameras: Sequence[Camera], radius: float, limits: tuple[float, float] = _DEEP, whole: bool = False) -> str:
+def request_text(
+    cameras: Sequence[Camera], radius: float, limits: tuple[float, float] = _DEEP, whole_cameras: bool = False
+) -> str:
     """A field that all sites see, with a detector of each camera; or whole cameras, at draft accuracy.
 
     radius : deg, of the area;  limits : magnitudes of the faintest galaxies and stars
     """
     text = f"""name = "ext"
 seed = 20240401
-accuracy = "{"draft" if whole else "survey"}"
+accuracy = "{"draft" if whole_cameras else "survey"}"
 
 [area]
 cone = {{ ra = 150.117, dec = 2.208, radius = {radius} }}
@@ -86,7 +88,7 @@ box_cells = 192
 lensing_nside = {256 if limits == _DEEP else 64}
 """
     for camera in cameras:
-        one = f'centre_on = "{camera.detector}"\ndetectors = ["{camera.detector}"]'
+        detector_lines = f'centre_on = "{camera.detector}"\ndetectors = ["{camera.detector}"]'
         text += f"""
 [[pointing]]
 channel = "EXT"
@@ -96,73 +98,75 @@ ra = 150.117
 dec = 2.208
 position_angle = 0.0
 mjd = {camera.mjd!r}
-{"" if whole else one}
+{"" if whole_cameras else detector_lines}
 """
     return f"{text}\n[products]\ntruth = []\n"
 
 
-def full(wanted: Request) -> Request:
+def with_all_effects(request: Request) -> Request:
     """With every effect of a science image forced on."""
-    return replace(wanted, effects=Effects(on=tuple(effect.name for effect in ground.SKY if effect.optional)))
+    return replace(request, effects=Effects(on=tuple(effect.name for effect in ground.SKY if effect.optional)))
 
 
-def detectors(folder: Path, quick: bool, repeats: int) -> dict[str, float]:
+def measure_detectors(folder: Path, quick: bool, repeats: int) -> dict[str, float]:
     """All figures of single detectors, each camera's of a process of its own, which holds nothing of the others."""
     file, out = folder / "detectors.toml", dict[str, float]()
     cameras = {name: camera for name, camera in CAMERAS.items() if not (quick and name == _LARGEST)}
-    field, limits = (_SMALL, _BRIGHT) if quick else (_FIELD, _DEEP)
-    file.write_text(request(tuple(cameras.values()), field, limits), encoding="utf-8")
-    wanted = parse(file)
-    root = one_detector.lake(folder, wanted)
-    alone = multiprocessing.get_context("spawn")
+    field, limits = (_QUICK_RADIUS, _BRIGHT) if quick else (_FIELD_RADIUS, _DEEP)
+    file.write_text(request_text(tuple(cameras.values()), field, limits), encoding="utf-8")
+    request = parse(file)
+    root = one_detector.make_lake(folder, request)
+    context = multiprocessing.get_context("spawn")
     for number, name in enumerate(cameras):
-        one = replace(wanted, pointings=wanted.pointings[number : number + 1])
-        with ProcessPoolExecutor(1, mp_context=alone) as process:
-            out |= process.submit(_figures, name, root, one, repeats).result()
+        camera_request = replace(request, pointings=request.pointings[number : number + 1])
+        with ProcessPoolExecutor(1, mp_context=context) as process:
+            out |= process.submit(_camera_figures, name, root, camera_request, repeats).result()
     worst = {unit: max(abs(out[f"{name}_{unit}_error"]) for name in cameras) for unit in ("s", "gb")}
     return {**out, "seconds_error": worst["s"], "memory_error": worst["gb"]}
 
 
-def _figures(name: str, root: Path, one: Request, repeats: int) -> dict[str, float]:
+def _camera_figures(name: str, root: Path, camera_request: Request, repeats: int) -> dict[str, float]:
     """Of a camera's detector; one : the request of it alone."""
-    folder, everything = root.parent, prepared(root, full(one))
+    folder, full_task = root.parent, plan_detector(root, with_all_effects(camera_request))
     # Compiles, and fills the caches.
-    sources = render_exposures.work(root, everything).rows["sources"][0].as_py()
-    took = [rendered(root, everything, folder) for _ in range(repeats)]
-    (said,) = read.version(root, "tasks").rows().to_pylist()
+    sources = render_exposures.render_task(root, full_task).rows["sources"][0].as_py()
+    measurements = [measure_render(root, full_task, folder) for _ in range(repeats)]
+    (forecast,) = read.version(root, "tasks").rows().to_pylist()
     out = {
         f"{name}_sources": float(sources),
-        f"{name}_survey_s": min(seconds for seconds, _ in took),
-        f"{name}_peak_gb": max(gb for _, gb in took),
+        f"{name}_survey_s": min(seconds for seconds, _ in measurements),
+        f"{name}_peak_gb": max(gb for _, gb in measurements),
     }
-    factor = speed.of_machine(root).factor
-    out[f"{name}_s_error"] = factor * said["seconds"] / out[f"{name}_survey_s"] - 1.0
-    out[f"{name}_gb_error"] = said["memory"] / out[f"{name}_peak_gb"] - 1.0
+    factor = speed.estimate_speed(root).factor
+    out[f"{name}_s_error"] = factor * forecast["seconds"] / out[f"{name}_survey_s"] - 1.0
+    out[f"{name}_gb_error"] = forecast["memory"] / out[f"{name}_peak_gb"] - 1.0
     if name == "lsst":
-        out |= one_detector.effect_seconds(ground.EFFECTS, (), lambda: rendered(root, everything, folder))
-        draft = prepared(root, replace(one, accuracy=preset("draft")))
-        out |= {"lsst_draft_s": min(rendered(root, draft, folder)[0] for _ in range(repeats))}
+        out |= one_detector.effect_seconds(ground.EFFECTS, (), lambda: measure_render(root, full_task, folder))
+        draft = plan_detector(root, replace(camera_request, accuracy=preset("draft")))
+        out |= {"lsst_draft_s": min(measure_render(root, draft, folder)[0] for _ in range(repeats))}
     return out
 
 
-def whole_exposure(folder: Path, limits: tuple[float, float]) -> Mapping[str, float]:
+def time_exposure(folder: Path, limits: tuple[float, float]) -> Mapping[str, float]:
     """Wall s of the Spark job that renders all 189 detectors of LSSTCam; limits : as of `request`."""
-    return {"lsst_exposure_s": one_detector.by_job(folder, request([LSST], _WHOLE, limits, whole=True))}
+    return {
+        "lsst_exposure_s": one_detector.time_job(folder, request_text([LSST], _LSST_RADIUS, limits, whole_cameras=True))
+    }
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Measures and prints everything."""
-    own = argparse.ArgumentParser(add_help=False)
-    own.add_argument("--exposure", action="store_true", help="also a whole exposure by the Spark job")
-    own.add_argument("--repeats", type=int, default=2, help="of every time, the best of which counts")
-    known, others = own.parse_known_args(argv)
-    options = report.options("ext", __doc__ or "", others)
-    repeats = 1 if options.quick else known.repeats
+    extra_parser = argparse.ArgumentParser(add_help=False)
+    extra_parser.add_argument("--exposure", action="store_true", help="also a whole exposure by the Spark job")
+    extra_parser.add_argument("--repeats", type=int, default=2, help="of every time, the best of which counts")
+    extra_options, other_arguments = extra_parser.parse_known_args(argv)
+    options = report.options("ext", __doc__ or "", other_arguments)
+    repeats = 1 if options.quick else extra_options.repeats
     with tempfile.TemporaryDirectory() as name:
-        figures = detectors(Path(name), options.quick, repeats)
-        if known.exposure:
-            figures |= whole_exposure(Path(name), _BRIGHT if options.quick else _DEEP)
-    report.finish("ext", repeats, figures, _NOTES, options.json or (None if options.quick else RESULTS))
+        figures = measure_detectors(Path(name), options.quick, repeats)
+        if extra_options.exposure:
+            figures |= time_exposure(Path(name), _BRIGHT if options.quick else _DEEP)
+    report.print_and_write("ext", repeats, figures, _NOTES, options.json or (None if options.quick else RESULTS))
     return 0
 
 

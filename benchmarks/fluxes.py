@@ -25,13 +25,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 import pyarrow as pa
 
-from benchmarks.report import best, machine
+from benchmarks.report import best_time, machine
 from lake_schema.arrays import Float
 from lake_schema.store.provenance import git_commit
 from truesky.fluxes import band_fluxes, integration, passbands
 from truesky.fluxes.libraries import templates
 from truesky.fluxes.libraries.templates import Library
-from truesky.fluxes.sources import Galaxies, galaxies_of
+from truesky.fluxes.sources import Galaxies, galaxies_from_table
 from truesky.fluxes.spectra import lines
 from truesky.fluxes.tables import build_tables, flux_tables
 from truesky.fluxes.tables.settings import CANDIDATES, choose
@@ -86,16 +86,16 @@ def sample(n: int, seed: int) -> pa.Table:
 def measure(file: Path, n: int = _SAMPLE, bands: Sequence[str] = ()) -> None:
     """Write the error of every candidate setting in every passband."""
     library = templates.galaxy_library()
-    rows = galaxies_of(sample(n, _SEED_CHOICE), library)
+    rows = galaxies_from_table(sample(n, _SEED_CHOICE), library)
     with file.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(("band", "step", "n_ebv", "n_av", "rms", "largest"))
         for name in bands or passbands.names():
             band = passbands.load(name)
-            truth = integration.galaxies(rows, [band], library)
+            truth = integration.galaxy_fluxes(rows, [band], library)
             for setting in CANDIDATES:
                 grid = flux_tables.open_grid([band], [setting], library)
-                error = np.abs(flux_tables.galaxies(rows, grid) / truth - 1.0)
+                error = np.abs(flux_tables.galaxy_fluxes(rows, grid) / truth - 1.0)
                 rms, largest = float(np.sqrt(np.mean(error**2))), float(error.max())
                 writer.writerow((name, setting.step, setting.n_ebv, setting.n_av, f"{rms:.2e}", f"{largest:.2e}"))
             stream.flush()
@@ -104,20 +104,20 @@ def measure(file: Path, n: int = _SAMPLE, bands: Sequence[str] = ()) -> None:
 
 def accuracy_of(rows: Galaxies, truth: Float, library: Library, accuracy: Accuracy) -> Float:
     """Errors, mag, float64[n, 22], of what the job chooses for an accuracy."""
-    f_nu, _ = _interpolated(rows, library, accuracy)
+    f_nu, _ = _interpolate(rows, library, accuracy)
     return np.asarray(-_MAG * np.log(f_nu / truth))
 
 
-def _interpolated(rows: Galaxies, library: Library, accuracy: Accuracy) -> tuple[Float, flux_tables.Grid]:
+def _interpolate(rows: Galaxies, library: Library, accuracy: Accuracy) -> tuple[Float, flux_tables.Grid]:
     curves = [passbands.load(name) for name in BANDS]
     settings = [choice.setting for choice in choose(BANDS, accuracy)]
     if missing := [name for name, setting in zip(BANDS, settings, strict=True) if setting is None]:
         raise SystemExit(f"no table is fine enough for {', '.join(missing)}")
     grid = flux_tables.open_grid(curves, [setting for setting in settings if setting], library)
-    return flux_tables.galaxies(rows, grid), grid
+    return flux_tables.galaxy_fluxes(rows, grid), grid
 
 
-def oracle(n: int, library: Library) -> float:
+def speclite_difference(n: int, library: Library) -> float:
     """Largest difference, mag, between our photometry and speclite's of the same spectra."""
     import astropy.units as u
     from speclite.filters import load_filter
@@ -127,21 +127,21 @@ def oracle(n: int, library: Library) -> float:
     worst, grid = 0.0, passbands.grid()
     with (Path(passbands.__file__).with_suffix(".csv")).open(newline="", encoding="utf-8") as stream:
         published = {row["name"]: row["source"] for row in csv.DictReader(stream)}
-    made = {medium: band_fluxes.galaxy_spectra(table, library, medium) for medium in ("air", "vacuum")}
+    spectra_by_medium = {medium: band_fluxes.galaxy_spectra(table, library, medium) for medium in ("air", "vacuum")}
     for name in BANDS:
         kind, _, source = published[name].partition(":")
         if kind != "speclite":
             continue
         band = passbands.load(name)
-        seen = made[band.medium]
+        spectra = spectra_by_medium[band.medium]
         unit = u.erg / u.s / u.cm**2 / u.AA
-        wanted = np.array(load_filter(source).get_ab_maggies(seen * unit, grid * u.AA), float) * _AB_UJY
-        ours = band_fluxes.band_fluxes(seen, [band])[:, 0]
-        worst = max(worst, float(np.abs(_MAG * np.log(ours / wanted)).max()))
+        reference_flux = np.array(load_filter(source).get_ab_maggies(spectra * unit, grid * u.AA), float) * _AB_UJY
+        ours = band_fluxes.band_fluxes(spectra, [band])[:, 0]
+        worst = max(worst, float(np.abs(_MAG * np.log(ours / reference_flux)).max()))
     return worst
 
 
-def job(n: int) -> float:
+def job_speed(n: int) -> float:
     """Galaxies a second of a core, from Parquet to published Parquet, 22 bands, without Spark."""
     from lake_schema import ids, sky
     from lake_schema.store import layout, plan, publish
@@ -155,14 +155,16 @@ def job(n: int) -> float:
     columns |= {name: drawn[name].to_numpy() for name in drawn.column_names}
     columns |= {"ra": ra, "dec": dec, "ra_true": ra, "dec_true": dec, "_healpix_29": index}
     columns |= {"id": ids.source_id(0, 1607 << 6, np.arange(n)), "density_boost": np.ones(n)}
-    fitting = {c.name: np.asarray(columns[c.name]).astype(c.type) for c in GALAXIES.columns if c.name in columns}
-    rows = GALAXIES.build(fitting)
-    part = plan.Part(layout.cell_file(5, 1607), {})
+    declared_columns = {
+        c.name: np.asarray(columns[c.name]).astype(c.type) for c in GALAXIES.columns if c.name in columns
+    }
+    rows = GALAXIES.build(declared_columns)
+    part = plan.Task(layout.cell_file(5, 1607), {})
     with tempfile.TemporaryDirectory() as folder:
-        lake = layout.lake(Path(folder) / "lake")
+        lake = layout.resolve_lake(Path(folder) / "lake")
         lake.mkdir()
-        publish.make(lake, plan.Plan(GALAXIES, {}, (part,)), lambda root, facts: plan.Output(rows))
-        wanted = from_toml.from_table(
+        publish.make_version(lake, plan.Plan(GALAXIES, {}, (part,)), lambda root, facts: plan.Output(rows))
+        request = from_toml.from_table(
             {
                 "name": "bench",
                 "seed": 1,
@@ -170,8 +172,8 @@ def job(n: int) -> float:
                 "fluxes": {"bands": list(BANDS)},
             }
         )
-        step = compute_fluxes.step_of("galaxy", lake, wanted)
-        seconds = _cpu(lambda: publish.make(lake, step.plan, step.work), 1)
+        step = compute_fluxes.flux_step("galaxy", lake, request)
+        seconds = _best_cpu_time(lambda: publish.make_version(lake, step.plan, step.run_task), 1)
     return n / seconds
 
 
@@ -187,20 +189,22 @@ def stars(n: int) -> dict[str, float]:
         rng.uniform(0.0, build_tables.STAR_A_V_LAST, n),
     )  # fmt: skip
     curves = [passbands.load(name) for name in BANDS]
-    found, truth = flux_tables.stars(rows, curves, library), integration.stars(rows, curves, library)
-    seconds = _cpu(lambda: flux_tables.stars(rows, curves, library), 3)
-    return {"stars_max_mag": float(np.abs(_MAG * np.log(found / truth)).max()), "stars_per_s_core": n / seconds}
+    fluxes, truth = flux_tables.star_fluxes(rows, curves, library), integration.star_fluxes(rows, curves, library)
+    seconds = _best_cpu_time(lambda: flux_tables.star_fluxes(rows, curves, library), 3)
+    return {"stars_max_mag": float(np.abs(_MAG * np.log(fluxes / truth)).max()), "stars_per_s_core": n / seconds}
 
 
-def curve(rows: Galaxies, truth: Float, library: Library) -> dict[str, list[float]]:
+def error_curve(rows: Galaxies, truth: Float, library: Library) -> dict[str, list[float]]:
     """Error against time of each setting, all bands alike: what the notebook draws."""
     curves = [passbands.load(name) for name in BANDS]
     names = ("curve_us", "curve_rms_mag", "curve_max_mag", "curve_mb")
     out: dict[str, list[float]] = {name: [] for name in names}
     for setting in CANDIDATES:
         grid = flux_tables.open_grid(curves, [setting] * len(curves), library)
-        error = -_MAG * np.log(flux_tables.galaxies(rows, grid) / truth)
-        out["curve_us"].append(1e6 * _cpu(lambda grid=grid: flux_tables.galaxies(rows, grid), 3) / len(rows))  # type: ignore[misc]
+        error = -_MAG * np.log(flux_tables.galaxy_fluxes(rows, grid) / truth)
+        out["curve_us"].append(
+            1e6 * _best_cpu_time(lambda grid=grid: flux_tables.galaxy_fluxes(rows, grid), 3) / len(rows)
+        )  # type: ignore[misc]
         out["curve_rms_mag"].append(_rms(error))
         out["curve_max_mag"].append(float(np.abs(error).max()))
         out["curve_mb"].append(grid.tables[0].nbytes / 1e6)
@@ -212,16 +216,16 @@ def run(quick: bool) -> dict[str, Any]:
     library = templates.galaxy_library()
     n = _QUICK if quick else _SAMPLE
     curves = [passbands.load(name) for name in BANDS]
-    rows = galaxies_of(sample(n, _SEED_TEST), library)
+    rows = galaxies_from_table(sample(n, _SEED_TEST), library)
     integrated: list[Float] = []
     # What is compiled is read in before the clock starts.
-    integration.galaxies(rows.rows(np.arange(2)), curves, library)
-    integration_s = _cpu(lambda: integrated.append(integration.galaxies(rows, curves, library)), 1)
+    integration.galaxy_fluxes(rows.select(np.arange(2)), curves, library)
+    integration_s = _best_cpu_time(lambda: integrated.append(integration.galaxy_fluxes(rows, curves, library)), 1)
     truth = integrated[0]
     survey, draft = (accuracy_of(rows, truth, library, accuracy) for accuracy in (SURVEY, DRAFT))
-    many = rows if quick else galaxies_of(sample(_SPEED_SAMPLE, _SEED_SPEED), library)
-    _, grid = _interpolated(many, library, SURVEY)
-    speed = len(many) / _cpu(lambda: flux_tables.galaxies(many, grid), 1 if quick else 5)
+    speed_rows = rows if quick else galaxies_from_table(sample(_SPEED_SAMPLE, _SEED_SPEED), library)
+    _, grid = _interpolate(speed_rows, library, SURVEY)
+    speed = len(speed_rows) / _best_cpu_time(lambda: flux_tables.galaxy_fluxes(speed_rows, grid), 1 if quick else 5)
     figures: dict[str, Any] = {
         "objects": n,
         "rms_mag_all": _rms(survey),
@@ -232,20 +236,20 @@ def run(quick: bool) -> dict[str, Any]:
         "galaxies_per_s_core": speed,
         "integration_galaxies_per_s_core": n / integration_s,
         "speedup_vs_integration": speed * integration_s / n,
-        "speedup_vs_whole_spectra": speed * _whole_seconds(100 if quick else 1000, library),
-        "job_galaxies_per_s_core": job(n if quick else _SPEED_SAMPLE),
+        "speedup_vs_whole_spectra": speed * _full_spectrum_seconds(100 if quick else 1000, library),
+        "job_galaxies_per_s_core": job_speed(n if quick else _SPEED_SAMPLE),
         "table_mb": max(table.nbytes for table in grid.tables) / 1e6,
         "table_mb_mean": float(np.mean([table.nbytes for table in grid.tables])) / 1e6,
         "build_s": _build_seconds(library, quick),
-        "oracle_mag_max": oracle(20 if quick else 200, library),
+        "oracle_mag_max": speclite_difference(20 if quick else 200, library),
         **stars(n),
     }
     figures |= {f"rms_mag_{name}": _rms(error) for name, error in zip(BANDS, survey.T, strict=True)}
     for name, accuracy in (("draft", DRAFT), ("survey", SURVEY)):
-        _, chosen = _interpolated(rows, library, accuracy)
-        seconds = _cpu(lambda chosen=chosen: flux_tables.galaxies(rows, chosen), 1 if quick else 5)  # type: ignore[misc]
+        _, chosen = _interpolate(rows, library, accuracy)
+        seconds = _best_cpu_time(lambda chosen=chosen: flux_tables.galaxy_fluxes(rows, chosen), 1 if quick else 5)  # type: ignore[misc]
         figures[f"{name}_us"] = 1e6 * seconds / n
-    return figures if quick else figures | curve(rows, truth, library)
+    return figures if quick else figures | error_curve(rows, truth, library)
 
 
 def _build_seconds(library: Library, quick: bool) -> float:
@@ -253,18 +257,18 @@ def _build_seconds(library: Library, quick: bool) -> float:
     bands = BANDS[:2] if quick else BANDS
     curves = [passbands.load(name) for name in bands]
     settings = [setting for choice in choose(bands, SURVEY) if (setting := choice.setting) is not None]
-    before = os.environ.get("TRUESKY_CACHE")
+    previous_cache = os.environ.get("TRUESKY_CACHE")
     with tempfile.TemporaryDirectory() as folder:
         os.environ["TRUESKY_CACHE"] = folder
         try:
-            return _cpu(lambda: flux_tables.open_grid(curves, settings, library), 1)
+            return _best_cpu_time(lambda: flux_tables.open_grid(curves, settings, library), 1)
         finally:
             os.environ.pop("TRUESKY_CACHE")
-            if before is not None:
-                os.environ["TRUESKY_CACHE"] = before
+            if previous_cache is not None:
+                os.environ["TRUESKY_CACHE"] = previous_cache
 
 
-def _whole_seconds(n: int, library: Library) -> float:
+def _full_spectrum_seconds(n: int, library: Library) -> float:
     """Seconds a galaxy by the whole spectrum, 600 .. 24000 A, as it reaches space and ground."""
     table, curves = sample(n, _SEED_TEST), [passbands.load(name) for name in BANDS]
 
@@ -274,16 +278,16 @@ def _whole_seconds(n: int, library: Library) -> float:
                 f_lambda = band_fluxes.galaxy_spectra(table.slice(start, 50), library, medium)
                 band_fluxes.band_fluxes(f_lambda, [band for band in curves if band.medium == medium])
 
-    return _cpu(work, 1) / n
+    return _best_cpu_time(work, 1) / n
 
 
 def _rms(error: Float) -> float:
     return float(np.sqrt(np.mean(error**2)))
 
 
-def _cpu(work: Callable[[], object], repeats: int) -> float:
+def _best_cpu_time(work: Callable[[], object], repeats: int) -> float:
     """Least CPU seconds of a few repeats."""
-    return best(work, repeats, time.process_time)
+    return best_time(work, repeats, time.process_time)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -299,8 +303,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name, value in figures.items():
         print(f"{name:34} {', '.join(f'{v:.3g}' for v in value) if isinstance(value, list) else f'{value:,.4g}'}")
     if options.json:
-        about = {"name": "fluxes", "commit": git_commit(), "machine": machine()}
-        options.json.write_text(json.dumps({**about, "repeats": 1 if options.quick else 5, **figures}, indent=1) + "\n")
+        header = {"name": "fluxes", "commit": git_commit(), "machine": machine()}
+        options.json.write_text(
+            json.dumps({**header, "repeats": 1 if options.quick else 5, **figures}, indent=1) + "\n"
+        )
     return 0
 
 

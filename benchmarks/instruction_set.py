@@ -40,10 +40,10 @@ _NOTES = {
 def _vis(folder: Path, quick: bool) -> Callable[[], Any]:
     from benchmarks import _detectors, vis
 
-    plain = vis.request(quick)
-    root = _detectors.lake(folder, plain)
-    facts = _detectors.prepared(root, vis.full(plain))
-    return lambda: _detectors.rendered(root, facts, folder)
+    plain = vis.demo_request(quick)
+    root = _detectors.make_lake(folder, plain)
+    facts = _detectors.plan_detector(root, vis.with_all_effects(plain))
+    return lambda: _detectors.measure_render(root, facts, folder)
 
 
 def _nisp_s(folder: Path, quick: bool) -> Callable[[], Any]:
@@ -51,29 +51,29 @@ def _nisp_s(folder: Path, quick: bool) -> Callable[[], Any]:
     from truesky.request.from_toml import parse
 
     file = folder / "request.toml"
-    file.write_text(nisp_s.request(quick), encoding="utf-8")
+    file.write_text(nisp_s.request_text(quick), encoding="utf-8")
     plain = parse(file)
-    root = _detectors.lake(folder, plain)
-    facts = _detectors.prepared(root, nisp_s.full(plain))
-    return lambda: _detectors.rendered(root, facts, folder)
+    root = _detectors.make_lake(folder, plain)
+    facts = _detectors.plan_detector(root, nisp_s.with_all_effects(plain))
+    return lambda: _detectors.measure_render(root, facts, folder)
 
 
 def _fluxes(folder: Path, quick: bool) -> Callable[[], Any]:
     from benchmarks import fluxes
     from truesky.fluxes.libraries import templates
-    from truesky.fluxes.sources import galaxies_of
+    from truesky.fluxes.sources import galaxies_from_table
     from truesky.request.accuracy import SURVEY
 
     library = templates.galaxy_library()
-    rows = galaxies_of(fluxes.sample(1000 if quick else _GALAXIES, 3), library)
-    return lambda: fluxes._interpolated(rows, library, SURVEY)
+    rows = galaxies_from_table(fluxes.sample(1000 if quick else _GALAXIES, 3), library)
+    return lambda: fluxes._interpolate(rows, library, SURVEY)
 
 
 def _catalogue(folder: Path, quick: bool) -> Callable[[], Any]:
     from benchmarks import catalogue
 
-    about = catalogue.facts(quick=True)
-    return lambda: catalogue.make(catalogue.CELL, 1 if quick else _GENERATION_CELLS, about)
+    settings = catalogue.universe_settings(quick=True)
+    return lambda: catalogue.make_cell(catalogue.CELL, 1 if quick else _GENERATION_CELLS, settings)
 
 
 SUBJECTS = {"vis": _vis, "nisp_s": _nisp_s, "fluxes": _fluxes, "catalogue": _catalogue}
@@ -82,11 +82,11 @@ SUBJECTS = {"vis": _vis, "nisp_s": _nisp_s, "fluxes": _fluxes, "catalogue": _cat
 def serve(subject: str, quick: bool) -> None:
     """Do a subject's work once for each line on stdin and answer with its CPU seconds."""
     with tempfile.TemporaryDirectory() as folder:
-        work = SUBJECTS[subject](Path(folder), quick)
-        work()
+        run_subject = SUBJECTS[subject](Path(folder), quick)
+        run_subject()
         for _ in sys.stdin:
             started = time.process_time()
-            work()
+            run_subject()
             print(f"seconds {time.process_time() - started}", flush=True)
 
 
@@ -109,7 +109,7 @@ def compare(subject: str, repeats: int, quick: bool) -> dict[str, float]:
         `<subject>_portable_s`, `<subject>_native_s`.
     """
     command = [sys.executable, "-m", "benchmarks.instruction_set", "--serve", subject, *["--quick"] * quick]
-    unset = {
+    environment = {
         name: os.environ[name]
         for name in os.environ
         if not name.startswith(("NPY_", "NUMBA_CPU", "NUMBA_DISABLE", "ARROW_USER"))
@@ -118,7 +118,7 @@ def compare(subject: str, repeats: int, quick: bool) -> dict[str, float]:
         children = {
             setting: stack.enter_context(
                 subprocess.Popen(
-                    command, env={**unset, instruction_set.SETTING: setting}, text=True,
+                    command, env={**environment, instruction_set.SETTING: setting}, text=True,
                     stdin=subprocess.PIPE, stdout=subprocess.PIPE,
                 )
             )
@@ -130,7 +130,7 @@ def compare(subject: str, repeats: int, quick: bool) -> dict[str, float]:
                 seconds[setting].append(_ask(children[setting]))
         for child in children.values():
             child.communicate()
-    ratios = [ours / all_of_them for ours, all_of_them in zip(*seconds.values(), strict=True)]
+    ratios = [portable / native for portable, native in zip(*seconds.values(), strict=True)]
     return {
         f"{subject}_ratio": statistics.median(ratios),
         f"{subject}_ratio_min": min(ratios),
@@ -152,20 +152,20 @@ def _ask(child: subprocess.Popen[str]) -> float:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure the subjects and print the ratios."""
-    own = argparse.ArgumentParser(add_help=False)
-    own.add_argument("--subjects", nargs="+", choices=SUBJECTS, default=list(SUBJECTS))
-    own.add_argument("--repeats", type=int, default=7, help="of each measurement")
-    own.add_argument("--serve", choices=SUBJECTS, help=argparse.SUPPRESS)
-    known, others = own.parse_known_args(argv)
-    options = report.options("instruction_set", __doc__ or "", others)
-    if known.serve:
-        serve(known.serve, options.quick)
+    extra_parser = argparse.ArgumentParser(add_help=False)
+    extra_parser.add_argument("--subjects", nargs="+", choices=SUBJECTS, default=list(SUBJECTS))
+    extra_parser.add_argument("--repeats", type=int, default=7, help="of each measurement")
+    extra_parser.add_argument("--serve", choices=SUBJECTS, help=argparse.SUPPRESS)
+    extra_options, other_arguments = extra_parser.parse_known_args(argv)
+    options = report.options("instruction_set", __doc__ or "", other_arguments)
+    if extra_options.serve:
+        serve(extra_options.serve, options.quick)
         return 0
-    repeats = 1 if options.quick else known.repeats
+    repeats = 1 if options.quick else extra_options.repeats
     figures: dict[str, float] = {}
-    for subject in known.subjects:
+    for subject in extra_options.subjects:
         figures |= compare(subject, repeats, options.quick)
-    report.finish("instruction_set", repeats, figures, _NOTES, options.json)
+    report.print_and_write("instruction_set", repeats, figures, _NOTES, options.json)
     return 0
 
 

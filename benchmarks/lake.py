@@ -27,8 +27,8 @@ from benchmarks import report
 from lake_schema import sky
 from lake_schema.columns import Column, Table
 from lake_schema.store import layout, parquet, publish, read
-from lake_schema.store.plan import Json, Output, Part, Plan
-from lake_schema.store.stage import write_part
+from lake_schema.store.plan import Json, Output, Plan, Task
+from lake_schema.store.stage import write_partition
 from lake_schema.tables.common import DEC, HEALPIX_29, ID, RA
 from truesky.explore.explorer import Explorer
 
@@ -37,7 +37,7 @@ FIRST_CELL, CELLS, ROWS = 8976, 20, 250_000
 QUICK_CELLS, QUICK_ROWS = 3, 20_000
 CONE_ARCSEC, CONE_COLUMNS = 60.0, ("id", "ra", "dec", "x_0", "x_1")
 
-KINDS = tuple((code, f"kind {code}") for code in range(5))
+KIND_CODES = tuple((code, f"kind {code}") for code in range(5))
 TRIAL = Table(
     "trial",
     1,
@@ -48,7 +48,7 @@ TRIAL = Table(
         HEALPIX_29,
         Column("halo_id", "int64", doc="identifier", lo=0),
         *(Column(f"{name}_true", "float64", "deg", doc="a place nearby", lo=-90.0, hi=360.0) for name in ("ra", "dec")),
-        *(Column(f"kind_{i}", "int32", codes=KINDS, doc="random code", lo=0, hi=4) for i in range(3)),
+        *(Column(f"kind_{i}", "int32", codes=KIND_CODES, doc="random code", lo=0, hi=4) for i in range(3)),
         *(Column(f"x_{i}", "float32", doc="random number", lo=0.0, hi=1.0) for i in range(40)),
     ),
     "50 columns of random values, 228 bytes a row as they are, which compress worse than anything real.",
@@ -76,7 +76,7 @@ NOTES = {
 }
 
 
-def rows_of(cell: int, n: int) -> pa.Table:
+def random_rows(cell: int, n: int) -> pa.Table:
     """Random rows of a cell."""
     rng = np.random.default_rng([1, cell])
     index, ra, dec = sky.random_in_cell(5, cell, n, rng)
@@ -88,66 +88,68 @@ def rows_of(cell: int, n: int) -> pa.Table:
     return TRIAL.build(columns)
 
 
-def work(root: Path, facts: Json) -> Output:
+def make_cell(root: Path, facts: Json) -> Output:
     """One cell."""
-    return Output(rows_of(facts["cell"], facts["rows"]))
+    return Output(random_rows(facts["cell"], facts["rows"]))
 
 
-def plan(cells: int, rows: int) -> Plan:
+def catalogue_plan(cells: int, rows: int) -> Plan:
     """The catalogue."""
     numbers = range(FIRST_CELL, FIRST_CELL + cells)
     return Plan(
-        TRIAL, {}, tuple(Part(layout.cell_file(5, cell), {"cell": cell, "rows": rows}, rows) for cell in numbers)
+        TRIAL, {}, tuple(Task(layout.cell_file(5, cell), {"cell": cell, "rows": rows}, rows) for cell in numbers)
     )
 
 
-def writing(folder: Path, rows: pa.Table, repeats: int) -> dict[str, float]:
+def time_writing(folder: Path, rows: pa.Table, repeats: int) -> dict[str, float]:
     """One cell written by us and by others, one core each."""
-    part = Part(layout.cell_file(5, FIRST_CELL), {})
+    part = Task(layout.cell_file(5, FIRST_CELL), {})
     ours, plain = folder / "ours.parquet", folder / "plain.parquet"
     pa.set_cpu_count(1)
-    whole = report.best(lambda: write_part(folder / ".stage-x", TRIAL, part, Output(rows)), repeats)
-    file = report.best(lambda: parquet.write(ours, rows, TRIAL), repeats)
-    default = report.best(lambda: pq.write_table(rows, plain), repeats)
-    spark = _spark_writer(folder, ours, repeats)
+    partition_s = report.best_time(lambda: write_partition(folder / ".stage-x", TRIAL, part, Output(rows)), repeats)
+    parquet_s = report.best_time(lambda: parquet.write(ours, rows, TRIAL), repeats)
+    default_s = report.best_time(lambda: pq.write_table(rows, plain), repeats)
+    spark_s = _time_spark_writer(folder, ours, repeats)
     n = rows.num_rows
     return {
-        "write_rows_per_s_core": n / whole,
-        "write_parquet_rows_per_s": n / file,
-        "write_vs_spark_writer": spark / file,
-        "write_vs_pyarrow_defaults": default / file,
+        "write_rows_per_s_core": n / partition_s,
+        "write_parquet_rows_per_s": n / parquet_s,
+        "write_vs_spark_writer": spark_s / parquet_s,
+        "write_vs_pyarrow_defaults": default_s / parquet_s,
         "bytes_per_row": ours.stat().st_size / n,
         "bytes_per_row_defaults": plain.stat().st_size / n,
     }
 
 
-def _spark_writer(folder: Path, file: Path, repeats: int) -> float:
+def _time_spark_writer(folder: Path, file: Path, repeats: int) -> float:
     """s of Spark's own writer on the same rows, held in its memory, in one task."""
-    from truesky.running.session import session
+    from truesky.running.session import get_session
 
-    frame = session("benchmarks.lake").read.parquet(str(file)).coalesce(1).cache()
+    frame = get_session("benchmarks.lake").read.parquet(str(file)).coalesce(1).cache()
     frame.count()
-    return report.best(lambda: frame.write.mode("overwrite").parquet(str(folder / "spark")), repeats + 1)
+    return report.best_time(lambda: frame.write.mode("overwrite").parquet(str(folder / "spark")), repeats + 1)
 
 
-def cones(version: read.Version, repeats: int) -> dict[str, float]:
+def time_cones(version: read.Version, repeats: int) -> dict[str, float]:
     """Small circles at random places of the catalogue."""
     import lsdb
 
-    centres = np.random.default_rng(2).permutation(version.rows(["ra", "dec"], version.parts[:2]).to_pandas())[:repeats]
+    centres = np.random.default_rng(2).permutation(version.rows(["ra", "dec"], version.partitions[:2]).to_pandas())[
+        :repeats
+    ]
     radius, columns = CONE_ARCSEC / 3600, list(CONE_COLUMNS)
     started = time.perf_counter()
     opened = read.version(version.folder.parents[1], TRIAL.name)
     opened.cone(*centres[0], radius, columns)
     cold = time.perf_counter() - started
-    theirs = lsdb.open_catalog(str(version.folder), columns=columns)
+    catalogue = lsdb.open_catalog(str(version.folder), columns=columns)
     ours_s, theirs_s, scan_s = [], [], []
     for ra, dec in centres:
-        found = _timed(ours_s, lambda ra=ra, dec=dec: opened.cone(ra, dec, radius, columns))
-        same = _timed(theirs_s, lambda ra=ra, dec=dec: theirs.cone_search(ra, dec, CONE_ARCSEC).compute())
-        scan = _timed(scan_s, lambda ra=ra, dec=dec: _scan(version, ra, dec, radius, columns))
-        if not found.num_rows == len(same) == scan.num_rows:
-            raise SystemExit(f"cones differ: {found.num_rows}, {len(same)}, {scan.num_rows} rows")
+        our_rows = _time_call(ours_s, lambda ra=ra, dec=dec: opened.cone(ra, dec, radius, columns))
+        lsdb_rows = _time_call(theirs_s, lambda ra=ra, dec=dec: catalogue.cone_search(ra, dec, CONE_ARCSEC).compute())
+        scan_rows = _time_call(scan_s, lambda ra=ra, dec=dec: _scan_cone(version, ra, dec, radius, columns))
+        if not our_rows.num_rows == len(lsdb_rows) == scan_rows.num_rows:
+            raise SystemExit(f"cones differ: {our_rows.num_rows}, {len(lsdb_rows)}, {scan_rows.num_rows} rows")
     best = min(ours_s)
     return {
         "cone_ms": 1e3 * best,
@@ -157,56 +159,57 @@ def cones(version: read.Version, repeats: int) -> dict[str, float]:
     }
 
 
-def _timed(seconds: list[float], work):  # type: ignore[no-untyped-def]
+def _time_call(seconds: list[float], work):  # type: ignore[no-untyped-def]
     started = time.perf_counter()
-    found = work()
+    result = work()
     seconds.append(time.perf_counter() - started)
-    return found
+    return result
 
 
-def _scan(version: read.Version, ra: float, dec: float, radius: float, columns: list[str]) -> pa.Table:
+def _scan_cone(version: read.Version, ra: float, dec: float, radius: float, columns: list[str]) -> pa.Table:
     rows = version.rows(columns)
     return rows.filter(pa.array(sky.separation(rows["ra"].to_numpy(), rows["dec"].to_numpy(), ra, dec) <= radius))
 
 
-def exploring(version: read.Version, repeats: int) -> dict[str, float]:
+def time_heatmap(version: read.Version, repeats: int) -> dict[str, float]:
     """A heat map of all rows."""
     import duckdb
 
-    files = [str(version.path(part)) for part in version.parts]
+    files = [str(version.partition_path(part)) for part in version.partitions]
     text = """SELECT floor(x_0 * 100)::INT AS i, floor(x_1 * 100)::INT AS j, count(*) AS n
         FROM read_parquet($files) WHERE x_0 BETWEEN 0 AND 1 AND x_1 BETWEEN 0 AND 1 GROUP BY i, j"""
     with Explorer(version.folder.parents[1]) as lake, duckdb.connect(":memory:") as plain:
 
-        def ours() -> None:
+        def count_bins() -> None:
             lake.heatmap("trial", "x_0", "x_1", span=((0.0, 1.0), (0.0, 1.0)))
 
-        ours()
-        seconds = report.best(ours, repeats)
-        unverified = report.best(lambda: plain.execute(text, {"files": files}).fetchall(), repeats + 1)
+        count_bins()
+        seconds = report.best_time(count_bins, repeats)
+        unverified = report.best_time(lambda: plain.execute(text, {"files": files}).fetchall(), repeats + 1)
     return {"heatmap_s": seconds, "heatmap_vs_unverified": seconds / unverified}
 
 
-def verifying(version: read.Version, repeats: int) -> dict[str, float]:
+def time_verification(version: read.Version, repeats: int) -> dict[str, float]:
     """Bytes a second through the checks."""
     size = sum(entry["bytes"] for entry in version.manifest["files"]) / 1e6
-    deep = report.best(lambda: read.verify(version, deep=True), repeats)
-    part = version.parts[0]
-    checked = report.best(lambda: version.rows(parts=[part]), repeats)
-    plain = report.best(lambda: ds.dataset(str(version.path(part))).to_table(), repeats)
+    deep = report.best_time(lambda: read.find_faults(version, deep=True), repeats)
+    part = version.partitions[0]
+    checked = report.best_time(lambda: version.rows(partitions=[part]), repeats)
+    plain = report.best_time(lambda: ds.dataset(str(version.partition_path(part))).to_table(), repeats)
     return {
         "verify_mb_per_s": size / deep,
-        "read_mb_per_s": version.path(part).stat().st_size / 1e6 / checked,
+        "read_mb_per_s": version.partition_path(part).stat().st_size / 1e6 / checked,
         "read_vs_unverified": checked / plain,
     }
 
 
 _SESSION = (
-    "import time; t = time.time(); from truesky.running.session import session; session('x'); print(time.time() - t)"
+    "import time; t = time.time(); from truesky.running.session import get_session; get_session('x'); "
+    "print(time.time() - t)"
 )
 
 
-def starting(repeats: int) -> dict[str, float]:
+def time_session_start(repeats: int) -> dict[str, float]:
     """The first seconds of a job."""
     command = [sys.executable, "-c", _SESSION]
     done = [subprocess.run(command, capture_output=True, text=True, check=True).stdout for _ in range(min(repeats, 3))]
@@ -216,7 +219,7 @@ def starting(repeats: int) -> dict[str, float]:
 def run(quick: bool, folder: Path) -> tuple[int, dict[str, float]]:
     """All figures."""
     cells, rows, repeats = (QUICK_CELLS, QUICK_ROWS, 1) if quick else (CELLS, ROWS, 5)
-    figures = writing(folder, rows_of(FIRST_CELL, rows), repeats)
+    figures = time_writing(folder, random_rows(FIRST_CELL, rows), repeats)
     pa.set_cpu_count(os.cpu_count() or 1)
     root = folder / "lake"
     root.mkdir()
@@ -226,11 +229,13 @@ def run(quick: bool, folder: Path) -> tuple[int, dict[str, float]]:
         yield from map(function, parts)
         ends.append(time.perf_counter())
 
-    publish.make(root, plan(cells, rows), work, mapper)
+    publish.make_version(root, catalogue_plan(cells, rows), make_cell, mapper)
     figures["finish_s"] = time.perf_counter() - ends[0]
     version = read.version(root, TRIAL.name)
-    figures |= cones(version, 3 if quick else 20) | exploring(version, repeats) | verifying(version, repeats)
-    return repeats, figures | starting(repeats)
+    figures |= (
+        time_cones(version, 3 if quick else 20) | time_heatmap(version, repeats) | time_verification(version, repeats)
+    )
+    return repeats, figures | time_session_start(repeats)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -241,7 +246,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         repeats, figures = run(chosen.quick, folder)
     finally:
         shutil.rmtree(folder)
-    report.finish("lake", repeats, figures, NOTES, chosen.json)
+    report.print_and_write("lake", repeats, figures, NOTES, chosen.json)
     return 0
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from benchmarks import _detectors as one_detector
 from benchmarks import report
-from benchmarks._detectors import FIELD, ROOT, prepared, rendered
+from benchmarks._detectors import FIELD_RADIUS, ROOT, measure_render, plan_detector
 from truesky.render.channels import nisp_p
 from truesky.request.accuracy import preset
 from truesky.request.from_toml import parse
@@ -36,9 +36,9 @@ _NOTES = {
 }
 
 
-def request(quick: bool, detectors: str = 'detectors = ["DET22"]', exposures: int = 1) -> str:
+def request_text(quick: bool, detectors: str = 'detectors = ["DET22"]', exposures: int = 1) -> str:
     """The demo's field with one of NISP's detectors, in H; or the third of three exposures 134 s apart."""
-    text = one_detector.head(quick).split("[products]")[0]
+    text = one_detector.request_head(quick).split("[products]")[0]
     for number, band in enumerate(("h", "j", "y")[:exposures][::-1]):
         text += f"""
 [[pointing]]
@@ -54,53 +54,55 @@ mjd = {60905.0 + number * 134.0 / 86400.0!r}
     return text
 
 
-def full(wanted: Request) -> Request:
+def with_all_effects(request: Request) -> Request:
     """With every effect of a science image forced on, but the non-linearity of the signal: that of the ramp is."""
     names = [effect.name for effect in nisp_p.SKY if effect.optional and effect.name != "signal_nonlinearity"]
-    return replace(wanted, effects=Effects(on=tuple(names)))
+    return replace(request, effects=Effects(on=tuple(names)))
 
 
-def detector(folder: Path, quick: bool, repeats: int) -> dict[str, float]:
+def measure_detector(folder: Path, quick: bool, repeats: int) -> dict[str, float]:
     """All of a detector's figures."""
     file = folder / "three.toml"
-    file.write_text(request(quick, exposures=3), encoding="utf-8")
-    three = parse(file)
-    one = replace(three, pointings=three.pointings[-1:])
-    root = one_detector.lake(folder, three)
-    everything = prepared(root, full(one))
-    rendered(root, everything, folder)  # Compiles, and fills the other caches.
-    out = one_detector.cold_and_warm(root, everything, folder, _PLANES, repeats)
+    file.write_text(request_text(quick, exposures=3), encoding="utf-8")
+    three_exposures = parse(file)
+    last_exposure = replace(three_exposures, pointings=three_exposures.pointings[-1:])
+    root = one_detector.make_lake(folder, three_exposures)
+    full_task = plan_detector(root, with_all_effects(last_exposure))
+    measure_render(root, full_task, folder)  # Compiles, and fills the other caches.
+    out = one_detector.time_cold_and_warm(root, full_task, folder, _PLANES, repeats)
     out |= {f"survey_{state}_s": out.pop(f"{state}_s") for state in ("cold", "warm")}
     # By which the channel is known for what it is.
-    own = nisp_p.CHANNEL.remembers, nisp_p.CHANNEL.coloured
-    effects = one_detector.effect_seconds(nisp_p.EFFECTS, own, lambda: rendered(root, everything, folder))
+    channel_effects = nisp_p.CHANNEL.persistence_effect, nisp_p.CHANNEL.chromatic_effect
+    effects = one_detector.effect_seconds(
+        nisp_p.EFFECTS, channel_effects, lambda: measure_render(root, full_task, folder)
+    )
     out |= {"ramp_s": sum(effects[f"effect_{effect.name}_s"] for effect in _RAMP), **effects}
-    draft = prepared(root, replace(one, accuracy=preset("draft")))
-    out["draft_s"] = min(rendered(root, draft, folder)[0] for _ in range(repeats + 1))
-    last = prepared(root, full(three), -1)
-    out["third_s"] = min(rendered(root, last, folder)[0] for _ in range(repeats + 1))
+    draft = plan_detector(root, replace(last_exposure, accuracy=preset("draft")))
+    out["draft_s"] = min(measure_render(root, draft, folder)[0] for _ in range(repeats + 1))
+    last_task = plan_detector(root, with_all_effects(three_exposures), -1)
+    out["third_s"] = min(measure_render(root, last_task, folder)[0] for _ in range(repeats + 1))
     return out
 
 
-def whole_exposure(folder: Path, quick: bool) -> Mapping[str, float]:
+def time_exposure(folder: Path, quick: bool) -> Mapping[str, float]:
     """Wall s of the Spark job that renders all 16 detectors of an exposure; quick: two of a bright universe."""
-    text = request(quick, 'detectors = ["DET22", "DET23"]' if quick else "")
-    return {"exposure_s": one_detector.by_job(folder, text.replace("radius = 0.2", f"radius = {FIELD}"))}
+    text = request_text(quick, 'detectors = ["DET22", "DET23"]' if quick else "")
+    return {"exposure_s": one_detector.time_job(folder, text.replace("radius = 0.2", f"radius = {FIELD_RADIUS}"))}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Measures and prints everything."""
-    own = argparse.ArgumentParser(add_help=False)
-    own.add_argument("--exposure", action="store_true", help="also a whole exposure by the Spark job")
-    own.add_argument("--repeats", type=int, default=2, help="of every time, the best of which counts")
-    known, others = own.parse_known_args(argv)
-    options = report.options("nisp_p", __doc__ or "", others)
-    repeats = 1 if options.quick else known.repeats
+    extra_parser = argparse.ArgumentParser(add_help=False)
+    extra_parser.add_argument("--exposure", action="store_true", help="also a whole exposure by the Spark job")
+    extra_parser.add_argument("--repeats", type=int, default=2, help="of every time, the best of which counts")
+    extra_options, other_arguments = extra_parser.parse_known_args(argv)
+    options = report.options("nisp_p", __doc__ or "", other_arguments)
+    repeats = 1 if options.quick else extra_options.repeats
     with tempfile.TemporaryDirectory() as name:
-        figures = dict(detector(Path(name), options.quick, repeats))
-        if known.exposure:
-            figures |= whole_exposure(Path(name), options.quick)
-    report.finish("nisp_p", repeats, figures, _NOTES, options.json or (None if options.quick else RESULTS))
+        figures = dict(measure_detector(Path(name), options.quick, repeats))
+        if extra_options.exposure:
+            figures |= time_exposure(Path(name), options.quick)
+    report.print_and_write("nisp_p", repeats, figures, _NOTES, options.json or (None if options.quick else RESULTS))
     return 0
 
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from benchmarks import _detectors as one_detector
 from benchmarks import _dispersion, _peers_slitless, report
-from benchmarks._detectors import FIELD, ROOT, prepared, rendered
+from benchmarks._detectors import FIELD_RADIUS, ROOT, measure_render, plan_detector
 from lake_schema.store.plan import Json
 from truesky.render.channels import nisp_s
 from truesky.render.dispersing import draw
@@ -40,7 +40,7 @@ _PLANES = "nisp*_psf-*"
 _RA, _DEC = 53.0135, -27.907
 _RAMP = nisp_s.SKY[nisp_s.SKY.index(nisp_s.persistence.EFFECT) + 1 :]
 # Sources that galsim draws, and pixels of its stamps.
-_FEW, _STAMP = 8, 32
+_NUM_GALSIM, _STAMP = 8, 32
 _NOTES = {
     "survey_cold_s": "CPU, catalogue to FITS, everything on, PSF planes computed",
     "survey_warm_s": "the same, PSF planes from the cache (target 12 on a Xeon of 2.5 GHz)",
@@ -61,9 +61,11 @@ _NOTES = {
 }
 
 
-def request(quick: bool, detectors: str = 'detectors = ["DET22"]', place: tuple[float, float] = (_RA, _DEC)) -> str:
+def request_text(
+    quick: bool, detectors: str = 'detectors = ["DET22"]', place: tuple[float, float] = (_RA, _DEC)
+) -> str:
     """The demo's field through the red grism, chosen as in Serrano et al. 2024."""
-    return f"""{one_detector.head(quick)}
+    return f"""{one_detector.request_head(quick)}
 [mission.overrides]
 "nisp.spectra.selection" = {{ value = 1.0, unit = "" }}
 
@@ -81,72 +83,72 @@ mjd = 60905.0
 """
 
 
-def full(wanted: Request) -> Request:
+def with_all_effects(request: Request) -> Request:
     """With every effect of a science image forced on, but the non-linearity of the signal: that of the ramp is."""
     names = [effect.name for effect in nisp_s.SKY if effect.optional and effect.name != "signal_nonlinearity"]
-    return replace(wanted, effects=Effects(on=tuple(names)))
+    return replace(request, effects=Effects(on=tuple(names)))
 
 
 @contextmanager
-def watched(seconds: dict[str, float], drawn: list[tuple[Any, ...]]) -> Iterator[None]:
+def record_drawing(seconds: dict[str, float], drawn: list[tuple[Any, ...]]) -> Iterator[None]:
     """Adds up the CPU seconds of drawing and of spectra, and keeps what is drawn, while it is open.
 
     Of one rendering: all sources are drawn first, and then some of them by their colours.
     """
-    kept_draw, kept_rows = draw.draw, spectra.of_rows
+    original_draw, original_of_rows = draw.draw, spectra.spectrum_function
 
-    def kept(*arguments: Any, **options: Any) -> Any:
+    def draw_and_record(*arguments: Any, **options: Any) -> Any:
         name = "colours_s" if drawn else "draw_s"
         drawn.append(arguments)
-        return one_detector.timed(kept_draw, name, seconds)(*arguments, **options)
+        return one_detector.add_cpu_time(original_draw, name, seconds)(*arguments, **options)
 
-    def of_rows(*arguments: Any, **options: Any) -> Any:
-        prepared_of = one_detector.timed(kept_rows, "spectra_s", seconds)
-        return one_detector.timed(prepared_of(*arguments, **options), "spectra_s", seconds)
+    def read_timed_spectra(*arguments: Any, **options: Any) -> Any:
+        prepared_of = one_detector.add_cpu_time(original_of_rows, "spectra_s", seconds)
+        return one_detector.add_cpu_time(prepared_of(*arguments, **options), "spectra_s", seconds)
 
-    draw.draw, spectra.of_rows = kept, of_rows
+    draw.draw, spectra.spectrum_function = draw_and_record, read_timed_spectra
     try:
         yield
     finally:
-        draw.draw, spectra.of_rows = kept_draw, kept_rows
+        draw.draw, spectra.spectrum_function = original_draw, original_of_rows
 
 
 def galsim_seconds(drawn: tuple[Any, ...]) -> float:
     """CPU s of a first order of one source by galsim: a stamp a pixel of the trace, one PSF for all of it; a mean."""
     sources, dispersed, psf = drawn[:3]
     (first,) = (order.trace for order in dispersed.orders if order.trace.order == 1)
-    some = np.linspace(0, len(sources) - 1, _FEW).astype(int)
+    indices = np.linspace(0, len(sources) - 1, _NUM_GALSIM).astype(int)
     weights = transfer.basis_weights(psf, None, sources.column, sources.row)
     seconds = 0.0
-    for i in some.tolist():
-        through = galsim.InterpolatedImage(
+    for i in indices.tolist():
+        psf_image = galsim.InterpolatedImage(
             galsim.Image(transfer.image_of(psf.planes, weights[i]), scale=1.0 / psf.planes.samples)
         )
         along, across = first.polynomials(float(sources.column[i]), float(sources.row[i]))
         frame = galsim.ImageF(galsim.BoundsI(-1024, 1024, -256, 256), init_value=0.0)
         started = time.process_time()
-        whole = through
+        profile = psf_image
         if sources.shape[i] >= 0:
             body = galaxy_shapes.profile(sources.shapes, int(sources.shape[i]), 1e-6)
-            whole = galsim.Convolve([galsim.JacobianWCS(*sources.jacobian[i].ravel()).toImage(body), through])
+            profile = galsim.Convolve([galsim.JacobianWCS(*sources.jacobian[i].ravel()).toImage(body), psf_image])
         for t in np.linspace(0.0, 1.0, max(int(abs(along[1:].sum())), 1)):
             x, y = (float(np.polynomial.polynomial.polyval(t, part)) for part in (along, across))
-            stamp = whole.drawImage(nx=_STAMP, ny=_STAMP, scale=1.0, center=galsim.PositionD(x, y))
+            stamp = profile.drawImage(nx=_STAMP, ny=_STAMP, scale=1.0, center=galsim.PositionD(x, y))
             shared = frame.bounds & stamp.bounds
             frame[shared] += stamp[shared]
         seconds += time.process_time() - started
-    return seconds / len(some)
+    return seconds / len(indices)
 
 
-def measured(root: Path, everything: Json, folder: Path) -> dict[str, float]:
+def measure_stages(root: Path, full_task: Json, folder: Path) -> dict[str, float]:
     """Of one rendering: what drawing, spectra and effects take, and galsim for as many sources."""
     seconds: dict[str, float] = defaultdict(float)
     drawn: list[tuple[Any, ...]] = []
-    with watched(seconds, drawn):
+    with record_drawing(seconds, drawn):
         effects = one_detector.effect_seconds(
             nisp_s.EFFECTS,
-            (nisp_s.CHANNEL.remembers, nisp_s.CHANNEL.coloured),
-            lambda: rendered(root, everything, folder),
+            (nisp_s.CHANNEL.persistence_effect, nisp_s.CHANNEL.chromatic_effect),
+            lambda: measure_render(root, full_task, folder),
         )
     sources = len(drawn[0][0])
     return {
@@ -158,49 +160,53 @@ def measured(root: Path, everything: Json, folder: Path) -> dict[str, float]:
     }
 
 
-def detector(folder: Path, quick: bool, repeats: int) -> dict[str, float]:
+def measure_detector(folder: Path, quick: bool, repeats: int) -> dict[str, float]:
     """All of a detector's figures."""
     file = folder / "one.toml"
-    file.write_text(request(quick), encoding="utf-8")
-    wanted = parse(file)
-    root = one_detector.lake(folder, wanted)
-    everything = prepared(root, full(wanted))
-    rendered(root, everything, folder)  # Compiles, and fills the other caches.
-    out = one_detector.cold_and_warm(root, everything, folder, _PLANES, repeats)
+    file.write_text(request_text(quick), encoding="utf-8")
+    request = parse(file)
+    root = one_detector.make_lake(folder, request)
+    full_task = plan_detector(root, with_all_effects(request))
+    measure_render(root, full_task, folder)  # Compiles, and fills the other caches.
+    out = one_detector.time_cold_and_warm(root, full_task, folder, _PLANES, repeats)
     out |= {f"survey_{state}_s": out.pop(f"{state}_s") for state in ("cold", "warm")}
-    out |= measured(root, everything, folder)
-    for name, request_of in (("draft", wanted), ("reference", full(wanted))):
-        facts = prepared(root, replace(request_of, accuracy=preset(name)))
-        out[f"{name}_s"] = min(rendered(root, facts, folder)[0] for _ in range(repeats + 1))
+    out |= measure_stages(root, full_task, folder)
+    for name, variant in (("draft", request), ("reference", with_all_effects(request))):
+        facts = plan_detector(root, replace(variant, accuracy=preset(name)))
+        out[f"{name}_s"] = min(measure_render(root, facts, folder)[0] for _ in range(repeats + 1))
     return out
 
 
-def whole_exposure(folder: Path, quick: bool) -> dict[str, float]:
+def time_exposure(folder: Path, quick: bool) -> dict[str, float]:
     """Wall s of the Spark job that renders all 16 detectors of an exposure; quick: two of a bright universe."""
-    text = request(quick, 'detectors = ["DET22", "DET23"]' if quick else "", (53.117, -27.808))
-    return {"exposure_s": one_detector.by_job(folder, text.replace("radius = 0.2", f"radius = {FIELD}"))}
+    text = request_text(quick, 'detectors = ["DET22", "DET23"]' if quick else "", (53.117, -27.808))
+    return {"exposure_s": one_detector.time_job(folder, text.replace("radius = 0.2", f"radius = {FIELD_RADIUS}"))}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Measures and prints everything."""
-    own = argparse.ArgumentParser(add_help=False)
-    own.add_argument("--exposure", action="store_true", help="also a whole exposure by the Spark job")
-    own.add_argument("--peer", action="store_true", help="also slitlessutils, of the Python that its variable names")
-    own.add_argument("--settings", action="store_true", help="the table of settings of drawing alone, measured anew")
-    own.add_argument("--repeats", type=int, default=2, help="of every time, the best of which counts")
-    known, others = own.parse_known_args(argv)
-    options = report.options("nisp_s", __doc__ or "", others)
-    repeats = 1 if options.quick else known.repeats
-    if known.settings:
-        draw.TABLE.write_text(_dispersion.table(repeats), encoding="utf-8")
+    extra_parser = argparse.ArgumentParser(add_help=False)
+    extra_parser.add_argument("--exposure", action="store_true", help="also a whole exposure by the Spark job")
+    extra_parser.add_argument(
+        "--peer", action="store_true", help="also slitlessutils, of the Python that its variable names"
+    )
+    extra_parser.add_argument(
+        "--settings", action="store_true", help="the table of settings of drawing alone, measured anew"
+    )
+    extra_parser.add_argument("--repeats", type=int, default=2, help="of every time, the best of which counts")
+    extra_options, other_arguments = extra_parser.parse_known_args(argv)
+    options = report.options("nisp_s", __doc__ or "", other_arguments)
+    repeats = 1 if options.quick else extra_options.repeats
+    if extra_options.settings:
+        draw.TABLE.write_text(_dispersion.settings_table(repeats), encoding="utf-8")
         return 0
     with tempfile.TemporaryDirectory() as name:
-        figures = detector(Path(name), options.quick, repeats)
-        if known.exposure:
-            figures |= whole_exposure(Path(name), options.quick)
-        if known.peer:
+        figures = measure_detector(Path(name), options.quick, repeats)
+        if extra_options.exposure:
+            figures |= time_exposure(Path(name), options.quick)
+        if extra_options.peer:
             figures |= _peers_slitless.slitlessutils_figures()
-    report.finish("nisp_s", repeats, figures, _NOTES, options.json or (None if options.quick else RESULTS))
+    report.print_and_write("nisp_s", repeats, figures, _NOTES, options.json or (None if options.quick else RESULTS))
     return 0
 
 

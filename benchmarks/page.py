@@ -29,18 +29,24 @@ import psutil
 import pyarrow as pa
 
 from benchmarks import _browser, report
-from benchmarks.lake import plan, work
+from benchmarks.lake import catalogue_plan, make_cell
 from lake_schema.fits import images
 from lake_schema.store import publish
-from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.tables.products import PRODUCTS
-from truesky.explore.counting import Chart, Held, counted, held
-from truesky.page.charts import PART, answered
+from truesky.explore.counting import Chart, ChartColumns, count_rows, inspect_columns
+from truesky.page.charts import SUBSAMPLING, pack_counts
 
-ROWS, MANY_ROWS, MOST_ROWS, DOWNLOADED, LARGE = 1_000_000, 50_000_000, 100_000_000, 10_000_000, 10_000_000
-QUICK_ROWS, QUICK_MANY, QUICK_MOST, QUICK_DOWNLOADED, QUICK_LARGE = 100_000, 500_000, 1_000_000, 200_000, 200_000
+ROWS, MANY_ROWS, MAX_ROWS, DOWNLOADED_ROWS, LARGE_LAKE_ROWS = 1_000_000, 50_000_000, 100_000_000, 10_000_000, 10_000_000
+QUICK_ROWS, QUICK_MANY_ROWS, QUICK_MAX_ROWS, QUICK_DOWNLOADED_ROWS, QUICK_LARGE_LAKE_ROWS = (
+    100_000,
+    500_000,
+    1_000_000,
+    200_000,
+    200_000,
+)
 CELLS, SIDE, QUICK_SIDE = 2, 4096, 1024
-FORMS = ("csv", "parquet", "vot", "fits")
+FORMATS = ("csv", "parquet", "vot", "fits")
 TOKEN = "a-token-of-the-benchmark"
 
 SPAN = (-3.0, 3.0)
@@ -79,17 +85,17 @@ NOTES = {
     "first_tile_ms": "the first tile of a 4096 x 4096 image, whose tiles are then kept",
     "server_gb": "memory of the server, without its processes of queries",
     "download_mb": "what server and processes took more at most while 10 M rows went out, of any kind of file",
-    **{f"download_{form}_mb_per_s": f"10 M rows as {form}" for form in FORMS},
+    **{f"download_{form}_mb_per_s": f"10 M rows as {form}" for form in FORMATS},
 }
 
 
-def columns_of(rows: int) -> list[np.ndarray]:
+def random_columns(rows: int) -> list[np.ndarray]:
     """Made columns, normal."""
     rng = np.random.default_rng(1)
     return [rng.standard_normal(rows, np.float32) for _ in range(4)]
 
 
-def by_duckdb(columns: Sequence[np.ndarray]) -> None:
+def count_with_duckdb(columns: Sequence[np.ndarray]) -> None:
     """The same counts, a query a chart."""
     with duckdb.connect() as session:
         session.register("t", pa.table({f"c{k}": column for k, column in enumerate(columns)}))
@@ -106,36 +112,40 @@ def by_duckdb(columns: Sequence[np.ndarray]) -> None:
             ).fetchall()
 
 
-def counting(rows: int, many: int, most: int, repeats: int) -> dict[str, float]:
+def time_counting(rows: int, many_rows: int, max_rows: int, repeats: int) -> dict[str, float]:
     """Charts over kept columns."""
-    few = columns_of(rows)
-    counted(few, CHARTS, LIMITS)
-    ours = report.best(lambda: counted(few, CHARTS, LIMITS), repeats, time.process_time)
-    theirs = report.best(lambda: by_duckdb(few), repeats, time.process_time)
+    few_columns = random_columns(rows)
+    count_rows(few_columns, CHARTS, LIMITS)
+    ours = report.best_time(lambda: count_rows(few_columns, CHARTS, LIMITS), repeats, time.process_time)
+    theirs = report.best_time(lambda: count_with_duckdb(few_columns), repeats, time.process_time)
     figures = {
-        "count_1m_ms": 1e3 * typical(lambda: counted(few, CHARTS, LIMITS), 5 * repeats),
+        "count_1m_ms": 1e3 * median_seconds(lambda: count_rows(few_columns, CHARTS, LIMITS), 5 * repeats),
         "count_vs_duckdb": theirs / ours,
-        "cube_server_ms": 1e3 * report.best(lambda: counted(few, CUBE, {1: LIMITS[1]}), repeats),
+        "cube_server_ms": 1e3 * report.best_time(lambda: count_rows(few_columns, CUBE, {1: LIMITS[1]}), repeats),
     }
     threads = os.cpu_count() or 1
-    lots = columns_of(most)
-    half = [column[:many] for column in lots]
-    figures["held_50m_cpu_s"] = report.best(lambda: held(half), 1, time.process_time)
+    all_columns = random_columns(max_rows)
+    many_columns = [column[:many_rows] for column in all_columns]
+    figures["held_50m_cpu_s"] = report.best_time(lambda: inspect_columns(many_columns), 1, time.process_time)
 
-    def answer(kept: Held, part: int = 1) -> Callable[[], bytes]:
-        return lambda: answered(kept, QUESTION, part, threads)
+    def make_answer(cached_columns: ChartColumns, part: int = 1) -> Callable[[], bytes]:
+        return lambda: pack_counts(cached_columns, QUESTION, part, threads)
 
-    figures["brush_50m_cpu_ms"] = 1e3 * report.best(answer(held(half)), repeats, time.process_time)
+    figures["brush_50m_cpu_ms"] = 1e3 * report.best_time(
+        make_answer(inspect_columns(many_columns)), repeats, time.process_time
+    )
     # Rows that are shown first are kept as columns of their own.
-    some = held([column[::PART].copy() for column in lots])
-    figures["first_100m_ms"] = 1e3 * typical(answer(some, PART), 5 * repeats)
-    figures["whole_100m_cpu_s"] = report.best(answer(held(lots)), repeats, time.process_time)
-    figures["first_1e9_ms_extrapolated"] = 1e9 / most * figures["first_100m_ms"]
-    figures["whole_1e9_cpu_s_extrapolated"] = 1e9 / most * figures["whole_100m_cpu_s"]
+    sample = inspect_columns([column[::SUBSAMPLING].copy() for column in all_columns])
+    figures["first_100m_ms"] = 1e3 * median_seconds(make_answer(sample, SUBSAMPLING), 5 * repeats)
+    figures["whole_100m_cpu_s"] = report.best_time(
+        make_answer(inspect_columns(all_columns)), repeats, time.process_time
+    )
+    figures["first_1e9_ms_extrapolated"] = 1e9 / max_rows * figures["first_100m_ms"]
+    figures["whole_1e9_cpu_s_extrapolated"] = 1e9 / max_rows * figures["whole_100m_cpu_s"]
     return figures
 
 
-def typical(ask: Callable[[], Any], times: int) -> float:
+def median_seconds(ask: Callable[[], Any], times: int) -> float:
     """Median time, s."""
     seconds = []
     for _ in range(times):
@@ -145,25 +155,25 @@ def typical(ask: Callable[[], Any], times: int) -> float:
     return median(seconds)
 
 
-class Asker:
+class PageClient:
     """A connection to the page."""
 
     def __init__(self, port: int) -> None:
         self.connection, self.cookie = http.client.HTTPConnection("127.0.0.1", port), f"truesky-{port}={TOKEN}"
 
-    def ask(self, method: str, path: str, body: str | None = None) -> http.client.HTTPResponse:
+    def send(self, method: str, path: str, body: str | None = None) -> http.client.HTTPResponse:
         self.connection.request(method, path, body, {"Cookie": self.cookie})
         return self.connection.getresponse()
 
     def milliseconds(self, times: int, method: str, path: str, body: str | None = None) -> float:
-        return 1e3 * typical(lambda: self.ask(method, path, body).read(), times)
+        return 1e3 * median_seconds(lambda: self.send(method, path, body).read(), times)
 
 
-def made_lake(lake: Path, rows: int, side: int) -> None:
+def make_lake(lake: Path, rows: int, side: int) -> None:
     """A catalogue of cells of at most 1 M rows, and an image."""
     lake.mkdir()
     cells = max(CELLS, rows // ROWS)
-    publish.make(lake, plan(cells, rows // cells), work)
+    publish.make_version(lake, catalogue_plan(cells, rows // cells), make_cell)
     pixels = np.random.default_rng(2).normal(100.0, 5.0, (side, side)).astype(np.float32)
     header = [
         ("CTYPE1", "RA---TAN", ""), ("CTYPE2", "DEC--TAN", ""), ("CRVAL1", 53.1, ""), ("CRVAL2", -27.8, ""),
@@ -177,12 +187,12 @@ def made_lake(lake: Path, rows: int, side: int) -> None:
         "s_region": ["POLYGON ICRS 53.2 -27.9 53.0 -27.9 53.0 -27.7 53.2 -27.7"],
     })  # fmt: skip
     files = {"images/one.fits": lambda to: images.write_images(to, [images.Image(pixels, tuple(header))])}
-    publish.make(lake, Plan(PRODUCTS, {}, (Part("1.parquet", {}),)), lambda root, facts: Output(row, files))
+    publish.make_version(lake, Plan(PRODUCTS, {}, (Task("1.parquet", {}),)), lambda root, facts: Output(row, files))
 
 
-def serving(lake: Path, rows: int, downloaded: int, side: int, repeats: int) -> dict[str, float]:
+def measure_server(lake: Path, rows: int, downloaded: int, side: int, repeats: int) -> dict[str, float]:
     """A server over a made lake: asked over HTTP, and in a browser."""
-    made_lake(lake, rows, side)
+    make_lake(lake, rows, side)
     started = time.perf_counter()
     command = [sys.executable, "-m", "truesky.page", str(lake), "--no-open", "--token", TOKEN]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
@@ -190,60 +200,60 @@ def serving(lake: Path, rows: int, downloaded: int, side: int, repeats: int) -> 
             assert server.stdout is not None
             address = server.stdout.readline().split()[-1]
             port = int(address.rpartition("/?")[0].rpartition(":")[2])
-            asker = Asker(port)
-            key = json.loads(asker.ask("GET", "/api/lake").read())["key"]
-            asker.ask("GET", f"/api/{key}/sky/trial/parts").read()
+            client = PageClient(port)
+            key = json.loads(client.send("GET", "/api/lake").read())["key"]
+            client.send("GET", f"/api/{key}/sky/trial/parts").read()
             figures = {"first_sky_s": time.perf_counter() - started}
-            figures |= asked(asker, f"/api/{key}", side, 20 * repeats)
-            figures["fill_1m_s"] = filled(asker, f"/api/{key}", 1)
+            figures |= time_requests(client, f"/api/{key}", side, 20 * repeats)
+            figures["fill_1m_s"] = first_answer_seconds(client, f"/api/{key}", 1)
             figures["server_gb"] = psutil.Process(server.pid).memory_info().rss / 1e9
-            if why := _browser.missing():
-                print(f"page: no figures of the browser: {why}")
+            if missing := _browser.missing_requirement():
+                print(f"page: no figures of the browser: {missing}")
             else:
-                figures |= _browser.brushes(address, 20 * repeats)
+                figures |= _browser.time_brushes(address, 20 * repeats)
             # A connection that was idle meanwhile has been closed.
-            figures |= downloads(Asker(port), f"/api/{key}", server.pid, downloaded)
+            figures |= measure_downloads(PageClient(port), f"/api/{key}", server.pid, downloaded)
         finally:
             server.terminate()
-    if not _browser.missing():
-        figures["first_sky_browser_s"] = _browser.first_sky(command)
+    if not _browser.missing_requirement():
+        figures["first_sky_browser_s"] = _browser.time_first_sky(command)
     return figures
 
 
-def filled(asker: Asker, lake: str, part: int) -> float:
+def first_answer_seconds(client: PageClient, lake: str, part: int) -> float:
     """s of the first answer of four columns of a lake of which nothing is kept."""
     question = {**QUESTION, "source": "trial", "axes": ["ra", "dec", "x_0", "x_1"], "limits": [], "part": part}
     question["charts"] = [{**chart, "spans": None} for chart in QUESTION["charts"]]
     started = time.perf_counter()
-    answer = asker.ask("POST", f"{lake}/charts", json.dumps(question))
+    answer = client.send("POST", f"{lake}/charts", json.dumps(question))
     answer.read()
     assert answer.status == 200
     return time.perf_counter() - started
 
 
-def large(lake: Path, rows: int, repeats: int) -> dict[str, float]:
+def measure_large_lake(lake: Path, rows: int, repeats: int) -> dict[str, float]:
     """A lake of many rows: the first answer of a sample, and a cone among them."""
-    made_lake(lake, rows, QUICK_SIDE)
+    make_lake(lake, rows, QUICK_SIDE)
     command = [sys.executable, "-m", "truesky.page", str(lake), "--no-open", "--token", TOKEN]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         try:
             assert server.stdout is not None
             server.stdout.readline()
             service = server.stdout.readline().split()[-1]
-            asker = Asker(int(service.partition("/tap/")[0].rpartition(":")[2]))
-            about = json.loads(asker.ask("GET", "/api/lake").read())
-            asker.ask("POST", f"/api/{about['key']}/sql", '{"sql": "SELECT count(*) FROM trial"}').read()
-            sample = filled(asker, f"/api/{about['key']}", PART)
+            client = PageClient(int(service.partition("/tap/")[0].rpartition(":")[2]))
+            lake_info = json.loads(client.send("GET", "/api/lake").read())
+            client.send("POST", f"/api/{lake_info['key']}/sql", '{"sql": "SELECT count(*) FROM trial"}').read()
+            sample = first_answer_seconds(client, f"/api/{lake_info['key']}", SUBSAMPLING)
             question = '{"sql": "SELECT ra, dec FROM trial LIMIT 1 OFFSET 1000"}'
-            ((ra, dec),) = json.loads(asker.ask("POST", f"/api/{about['key']}/sql", question).read())["rows"]
+            ((ra, dec),) = json.loads(client.send("POST", f"/api/{lake_info['key']}/sql", question).read())["rows"]
             times = []
             for condition in (
                 f"CONTAINS(POINT(ra, dec), CIRCLE({ra}, {dec}, 0.01)) = 1", f"separation(ra, dec, {ra}, {dec}) <= 0.01"
             ):  # fmt: skip
                 query = quote(f"SELECT id FROM trial WHERE {condition}")
                 path = f"/tap/{service.partition('/tap/')[2]}/sync?LANG=ADQL&QUERY={query}"
-                asker.ask("GET", path).read()
-                times.append(asker.milliseconds(3 * repeats, "GET", path))
+                client.send("GET", path).read()
+                times.append(client.milliseconds(3 * repeats, "GET", path))
         finally:
             server.terminate()
     return {
@@ -252,54 +262,58 @@ def large(lake: Path, rows: int, repeats: int) -> dict[str, float]:
     }  # fmt: skip
 
 
-def asked(asker: Asker, lake: str, side: int, times: int) -> dict[str, float]:
+def time_requests(client: PageClient, lake: str, side: int, times: int) -> dict[str, float]:
     """What the page asks all the time."""
-    asker.ask("POST", f"{lake}/sql", '{"sql": "SELECT 1"}').read()
+    client.send("POST", f"{lake}/sql", '{"sql": "SELECT 1"}').read()
     clock = time.perf_counter()
-    asker.ask("GET", f"{lake}/tile/0/0/0/0").read()
+    client.send("GET", f"{lake}/tile/0/0/0/0").read()
     first = time.perf_counter() - clock
     tiles = [f"{lake}/tile/0/0/{row}/{column}" for row in range(side // 512) for column in range(side // 512)]
     return {
-        "select_1_ms": asker.milliseconds(times, "POST", f"{lake}/sql", '{"sql": "SELECT 1"}'),
-        "sky_ms": asker.milliseconds(times, "GET", f"{lake}/sky/trial/parts"),
-        "tile_ms": median(asker.milliseconds(1, "GET", tile) for tile in tiles),
+        "select_1_ms": client.milliseconds(times, "POST", f"{lake}/sql", '{"sql": "SELECT 1"}'),
+        "sky_ms": client.milliseconds(times, "GET", f"{lake}/sky/trial/parts"),
+        "tile_ms": median(client.milliseconds(1, "GET", tile) for tile in tiles),
         "first_tile_ms": 1e3 * first,
     }
 
 
-def downloads(asker: Asker, lake: str, server: int, rows: int) -> dict[str, float]:
+def measure_downloads(client: PageClient, lake: str, server: int, rows: int) -> dict[str, float]:
     """Large results, read as they come; memory of the server and of its processes."""
     sql = quote(f"SELECT range AS id, range * 1.5 AS x, (range % 1000)::FLOAT AS y FROM range({rows})")
-    figures, more = {}, 0.0
-    for form in FORMS:
-        went, most, before, clock = 0, 0, memory(server), time.perf_counter()
-        answer = asker.ask("GET", f"{lake}/export?format={form}&sql={sql}")
+    figures, added_mb = {}, 0.0
+    for form in FORMATS:
+        num_bytes, peak, initial, clock = 0, 0, process_memory(server), time.perf_counter()
+        answer = client.send("GET", f"{lake}/export?format={form}&sql={sql}")
         while piece := answer.read(1 << 22):
-            went, most = went + len(piece), max(most, memory(server))
-        figures[f"download_{form}_mb_per_s"] = went / 1e6 / (time.perf_counter() - clock)
-        more = max(more, (most - before) / 1e6)
-    return {"download_mb": more, **figures}
+            num_bytes, peak = num_bytes + len(piece), max(peak, process_memory(server))
+        figures[f"download_{form}_mb_per_s"] = num_bytes / 1e6 / (time.perf_counter() - clock)
+        added_mb = max(added_mb, (peak - initial) / 1e6)
+    return {"download_mb": added_mb, **figures}
 
 
-def memory(pid: int) -> int:
+def process_memory(pid: int) -> int:
     """Bytes of a process and those that it started."""
     process = psutil.Process(pid)
-    return sum(one.memory_info().rss for one in (process, *process.children(recursive=True)))
+    return sum(family_member.memory_info().rss for family_member in (process, *process.children(recursive=True)))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Exit status 0."""
     options = report.options("page", __doc__ or "", argv)
-    rows, many, most = (QUICK_ROWS, QUICK_MANY, QUICK_MOST) if options.quick else (ROWS, MANY_ROWS, MOST_ROWS)
-    downloaded, side = (QUICK_DOWNLOADED, QUICK_SIDE) if options.quick else (DOWNLOADED, SIDE)
+    rows, many_rows, max_rows = (
+        (QUICK_ROWS, QUICK_MANY_ROWS, QUICK_MAX_ROWS) if options.quick else (ROWS, MANY_ROWS, MAX_ROWS)
+    )
+    downloaded, side = (QUICK_DOWNLOADED_ROWS, QUICK_SIDE) if options.quick else (DOWNLOADED_ROWS, SIDE)
     repeats = 1 if options.quick else 3
-    figures = counting(rows, many, most, repeats)
+    figures = time_counting(rows, many_rows, max_rows, repeats)
     with tempfile.TemporaryDirectory() as folder:
         # Nothing that is kept is found.
         os.environ["TRUESKY_CACHE"] = f"{folder}/cache"
-        figures |= serving(Path(folder) / "lake", rows, downloaded, side, repeats)
-        figures |= large(Path(folder) / "large", QUICK_LARGE if options.quick else LARGE, repeats)
-    report.finish("page", repeats, figures, NOTES, options.json)
+        figures |= measure_server(Path(folder) / "lake", rows, downloaded, side, repeats)
+        figures |= measure_large_lake(
+            Path(folder) / "large", QUICK_LARGE_LAKE_ROWS if options.quick else LARGE_LAKE_ROWS, repeats
+        )
+    report.print_and_write("page", repeats, figures, NOTES, options.json)
     return 0
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks import _around, planner, report, scheduler
+from benchmarks import _overhead, planner, report, scheduler
 from truesky.render.planning import planned_exposures, source_counts, survey, tasks, variants
 from truesky.render.planning.mission import mission_of, user_filters
 from truesky.request.from_toml import parse
@@ -49,38 +49,46 @@ _NOTES = {
 
 def core_hours(name: str, sample: int = _SAMPLE) -> tuple[dict[str, float], dict[str, int]]:
     """Of a shipped request by channel, of the ground by camera; and the exposures."""
-    wanted = parse(ROOT / "requests" / f"{name}.toml")
-    mission = mission_of(wanted.mission)
-    kinds, plan = defaultdict(list), survey.exposures(wanted, mission)
-    for exposure, own in plan:
-        kinds[exposure.channel, exposure.camera, exposure.image_type, exposure.band].append((exposure, own))
-    densities = source_counts.Densities(mission, wanted.universe)
+    request = parse(ROOT / "requests" / f"{name}.toml")
+    mission = mission_of(request.mission)
+    exposures_by_kind, plan = defaultdict(list), survey.exposures(request, mission)
+    for exposure, settings in plan:
+        exposures_by_kind[exposure.channel, exposure.camera, exposure.image_type, exposure.band].append(
+            (exposure, settings)
+        )
+    densities = source_counts.Densities(mission, request.universe)
     hours: dict[str, float] = defaultdict(float)
     counts: dict[str, int] = defaultdict(int)
-    for (channel, camera, *_), found in kinds.items():
-        some = [
-            found[i] for i in np.unique(np.linspace(0, len(found) - 1, min(sample, len(found))).round().astype(int))
+    for (channel, camera, *_), kind_exposures in exposures_by_kind.items():
+        sampled = [
+            kind_exposures[i]
+            for i in np.unique(
+                np.linspace(0, len(kind_exposures) - 1, min(sample, len(kind_exposures))).round().astype(int)
+            )
         ]
         rows = planned_exposures.table(
-            [exposure for exposure, _ in some], [own for _, own in some], user_filters(wanted)[0], wanted.seed
+            [exposure for exposure, _ in sampled],
+            [settings for _, settings in sampled],
+            user_filters(request)[0],
+            request.seed,
         )
-        priced = tasks.table(
+        task_costs = tasks.table(
             rows,
-            [exposure.detectors for exposure, _ in some],
+            [exposure.detectors for exposure, _ in sampled],
             mission,
             densities,
-            wanted.truth,
-            wanted.accuracy,
-            variants.forced(wanted),
+            request.truth,
+            request.accuracy,
+            variants.forced_effects(request),
         )
-        priced = tasks.remembering(priced, rows, (exposure for exposure, _ in plan), mission)
+        task_costs = tasks.add_persistence_cost(task_costs, rows, (exposure for exposure, _ in plan), mission)
         place = camera if channel == "EXT" else channel
-        hours[place] += sum(priced["seconds"].to_pylist()) / 3600.0 * len(found) / len(some)
-        counts[place] += len(found)
+        hours[place] += sum(task_costs["seconds"].to_pylist()) / 3600.0 * len(kind_exposures) / len(sampled)
+        counts[place] += len(kind_exposures)
     return dict(hours), dict(counts)
 
 
-def forecast(quick: bool) -> dict[str, float]:
+def forecast_core_hours(quick: bool) -> dict[str, float]:
     """Of the three productions; quick: of the deep field alone."""
     out: dict[str, float] = {}
     for run in ("deep",) if quick else ("pilot", "deep", "main"):
@@ -96,46 +104,52 @@ def forecast(quick: bool) -> dict[str, float]:
     return out
 
 
-def around(quick: bool) -> dict[str, float]:
+def overhead(quick: bool) -> dict[str, float]:
     """What a task and a run take besides their physics."""
     with tempfile.TemporaryDirectory() as name:
         # Detectors that have next to nothing on them, and those of the demo, eight times.
-        empty = replace(
-            planner.request("field", quick), universe=planner.request("field", True).universe, observations=()
+        empty_request = replace(
+            planner.sky_request("field", quick), universe=planner.sky_request("field", True).universe, observations=()
         )
-        root, _ = planner.lake(Path(name), "field", True, empty)
-        own = {
-            "task_ms": _around.task_ms(root, empty),
-            "publish_ms": scheduler.publishing(Path(name), 100 if quick else 2000)["publish_cpu_ms_a_part"],
+        root, _ = planner.make_lake(Path(name), "field", True, empty_request)
+        figures = {
+            "task_ms": _overhead.task_ms(root, empty_request),
+            "publish_ms": scheduler.time_publishing(Path(name), 100 if quick else 2000)["publish_cpu_ms_a_part"],
         }
         if not quick:
-            often = tuple(replace(one, realisations=8) for one in planner.request("field", False).pointings)
-            wanted = replace(planner.request("field", False), pointings=often, observations=())
-            root = planner.lake(Path(name) / "demo", "field", False, wanted)[0]
-            own |= _around.shares(root, wanted)
-            own["hand_out_ms"] = 1e3 / scheduler.dispatch(2000)["spark_tasks_per_s"]
-    return {**own, "overhead_ms": sum(own.get(key, 0.0) for key in ("task_ms", "hand_out_ms", "publish_ms"))}
+            repeated_pointings = tuple(
+                replace(pointing, realisations=8) for pointing in planner.sky_request("field", False).pointings
+            )
+            repeated_request = replace(
+                planner.sky_request("field", False), pointings=repeated_pointings, observations=()
+            )
+            root = planner.make_lake(Path(name) / "demo", "field", False, repeated_request)[0]
+            figures |= _overhead.cpu_shares(root, repeated_request)
+            figures["hand_out_ms"] = 1e3 / scheduler.time_dispatch(2000)["spark_tasks_per_s"]
+    return {**figures, "overhead_ms": sum(figures.get(key, 0.0) for key in ("task_ms", "hand_out_ms", "publish_ms"))}
 
 
-def validation(lake: Path) -> dict[str, float]:
+def time_validation(lake: Path) -> dict[str, float]:
     """Seconds that the checks of a rendered field of Euclid take."""
-    held = inventory.look(lake)
+    contents = inventory.read_contents(lake)
     shots = tuple(
-        shot for shot in held.shots if shot.place.channel in _EUCLID and shot.exposure["image_type"] == "science"
+        shot
+        for shot in contents.science_files
+        if shot.place.channel in _EUCLID and shot.exposure["image_type"] == "science"
     )
     started = time.perf_counter()
-    running.validated(replace(held, shots=shots), 2)
+    running.run_checks(replace(contents, science_files=shots), 2)
     return {"validation_s": time.perf_counter() - started, "validation_detectors": float(len(shots))}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Forecasts and prints."""
-    told = "of a field of Euclid that is rendered, such as `make pilot` makes: its validation is timed"
-    options = report.options("production", __doc__ or "", argv, lake=told)
-    figures = around(options.quick) | forecast(options.quick)
+    lake_help = "of a field of Euclid that is rendered, such as `make pilot` makes: its validation is timed"
+    options = report.options("production", __doc__ or "", argv, lake=lake_help)
+    figures = overhead(options.quick) | forecast_core_hours(options.quick)
     if options.lake is not None:
-        figures |= validation(options.lake)
-    report.finish("production", 1, figures, _NOTES, options.json or (None if options.quick else RESULTS))
+        figures |= time_validation(options.lake)
+    report.print_and_write("production", 1, figures, _NOTES, options.json or (None if options.quick else RESULTS))
     return 0
 
 

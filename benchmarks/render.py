@@ -24,7 +24,7 @@ from truesky.render.psf import model
 from truesky.request import accuracy
 
 # Galaxies whose errors are quoted, by a seed of their own, of them sheared in pairs; galsim's, a magnitude bin.
-HOLD_OUT, PAIRED, PEERS = 204, 0.25, 8
+NUM_TEST, PAIR_FRACTION, NUM_PEER = 204, 0.25, 8
 REPEATS = 2
 _SEED = 16
 _NOTES = {
@@ -54,34 +54,34 @@ _NOTES = {
 
 def seconds(scene: Scene, settings: Settings, repeats: int, stars: bool = True, shared: bool = False) -> float:
     """CPU s of all sources, or of the galaxies alone; `shared`: one PSF for all."""
-    some, psf = scenes.sources(scene, 1, stars=None if stars else 0), _psf(scene, settings)
+    sources, psf = scenes.sources(scene, 1, stars=None if stars else 0), _psf(scene, settings)
     if shared and psf.planes is not None:
-        psf = scenes.own(psf, some, 0)
-        some = replace(some, photons=None)
+        psf = scenes.psf_of_source(psf, sources, 0)
+        sources = replace(sources, photons=None)
     # The brightest are drawn in double precision, which is compiled on its own.
-    bright = some.electrons >= np.sort(some.electrons)[-3]
-    scenes.draw(some.take(bright | (np.arange(len(some)) % 500 == 0)), psf, scene, settings)
-    return report.best(lambda: scenes.draw(some, psf, scene, settings), repeats, time.process_time)
+    is_bright = sources.electrons >= np.sort(sources.electrons)[-3]
+    scenes.draw_sources(sources.take(is_bright | (np.arange(len(sources)) % 500 == 0)), psf, scene, settings)
+    return report.best_time(lambda: scenes.draw_sources(sources, psf, scene, settings), repeats, time.process_time)
 
 
 def _psf(scene: Scene, settings: Settings) -> model.Psf:
-    return scenes.psf_of(scene, settings.positions, settings.colours)
+    return scenes.scene_psf(scene, settings.positions, settings.colours)
 
 
-def planes_seconds() -> tuple[float, float]:
+def psf_plane_seconds() -> tuple[float, float]:
     """CPU s of a detector's PSF: its optics computed, and from the cache."""
     out = []
-    with cache.temporary():
+    with cache.use_temporary_dir():
         for _ in range(2):
             start = time.process_time()
-            scenes.psf_of(VIS)
+            scenes.scene_psf(VIS)
             out.append(time.process_time() - start)
     return out[0], out[1]
 
 
 def times(quick: bool, repeats: int) -> dict[str, float]:
     """All seconds, and the ratios of those that one run measured."""
-    tiers = {name: settings_for(wanted) for name, wanted in accuracy.PRESETS.items()}
+    tiers = {name: settings_for(target) for name, target in accuracy.PRESETS.items()}
     out = {}
     for scene in (VIS, LSST):
         for name, settings in tiers.items():
@@ -89,7 +89,7 @@ def times(quick: bool, repeats: int) -> dict[str, float]:
                 out[f"{scene.name}_{name}_s"] = seconds(scene, settings, repeats)
         galaxies = seconds(scene, tiers["survey"], repeats, stars=False)
         out[f"{scene.name}_galaxies_s"] = galaxies
-        default, cached = peers.galsim_seconds(scene, 1 if quick else PEERS)
+        default, cached = peers.galsim_seconds(scene, 1 if quick else NUM_PEER)
         out |= {f"{scene.name}_galsim_default_s": default, f"{scene.name}_galsim_cached_s": cached}
         out |= {
             f"{scene.name}_vs_galsim_default": default / galaxies,
@@ -101,33 +101,37 @@ def times(quick: bool, repeats: int) -> dict[str, float]:
         ufig = peers.ufig_seconds(scene)
         out |= {f"{scene.name}_ufig_s": ufig, f"{scene.name}_vs_ufig": ufig / galaxies}
     if not quick:
-        out["psf_planes_cold_s"], out["psf_planes_warm_s"] = planes_seconds()
+        out["psf_planes_cold_s"], out["psf_planes_warm_s"] = psf_plane_seconds()
     return out
 
 
 def accuracies(quick: bool, galaxies: int) -> dict[str, float]:
     """All errors: of survey by their plain names, of others by scene and accuracy."""
-    compared, pairs = (6, 2) if quick else (galaxies, max(round(PAIRED * galaxies), 1))
+    num_galaxies, pairs = (6, 2) if quick else (galaxies, max(round(PAIR_FRACTION * galaxies), 1))
     names = ("survey",) if quick else ("quicklook", "draft", "survey", "reference")
     tiers = {name: settings_for(accuracy.preset(name)) for name in names}
     out: dict[str, float] = {}
     for scene in (VIS,) if quick else (VIS, LSST):
-        found, bins, refused = errors.capped(errors.against_galsim, scene, tiers, _SEED, compared)
+        galsim_errors, bins, refused = errors.run_with_memory_limit(
+            errors.against_galsim, scene, tiers, _SEED, num_galaxies
+        )
         print(f"{scene.name}: {len(bins)} galaxies against galsim, which refused {refused}; rms/worst")
-        response, paired = errors.shear_response(scene, tiers, _SEED + 1, pairs)
+        response, sheared_galaxies = errors.shear_response(scene, tiers, _SEED + 1, pairs)
         for name in names:
-            errors.table(f"{scene.name} {name}", found[name], bins)
+            errors.print_table(f"{scene.name} {name}", galsim_errors[name], bins)
             m, c = np.abs(response[name]).max(axis=0)
             print(f"  shear response: |m| <= {m:.1e}, |c| <= {c:.1e} of {len(response[name])} pairs")
-            some = errors.figures(found[name]) | {"shear_m_worst": float(m), "shear_c_worst": float(c)}
-            for kind, (n, worst_m, worst_c) in errors.worst_by_kind(response[name], paired, scene).items():
+            row = errors.figures(galsim_errors[name]) | {"shear_m_worst": float(m), "shear_c_worst": float(c)}
+            for kind, (n, worst_m, worst_c) in errors.worst_by_group(response[name], sheared_galaxies, scene).items():
                 print(f"    {kind:12}{n:>6} pairs    |m| <= {worst_m:.1e}, |c| <= {worst_c:.1e}")
-                some |= {f"shear_m_worst_{kind.replace(' ', '')}": worst_m}
+                row |= {f"shear_m_worst_{kind.replace(' ', '')}": worst_m}
             prefix = "" if (scene, name) == (VIS, "survey") else f"{scene.name}_{name}_"
-            out |= {prefix + key: value for key, value in (some | errors.by_bin(found[name], bins)).items()}
+            out |= {
+                prefix + key: value for key, value in (row | errors.figures_by_bin(galsim_errors[name], bins)).items()
+            }
         out |= {
             f"{scene.name}_galaxies_compared": float(len(bins)),
-            f"{scene.name}_pairs": float(len(paired)),
+            f"{scene.name}_pairs": float(len(sheared_galaxies)),
             f"{scene.name}_galsim_refused": float(refused),
         }
     return out
@@ -135,14 +139,14 @@ def accuracies(quick: bool, galaxies: int) -> dict[str, float]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Measures and prints everything."""
-    own = argparse.ArgumentParser(add_help=False)
-    own.add_argument("--galaxies", type=int, default=HOLD_OUT, help="galaxies that are held against galsim")
-    own.add_argument("--repeats", type=int, default=REPEATS, help="of every time, the best of which counts")
-    known, others = own.parse_known_args(argv)
-    options = report.options("render", __doc__ or "", others)
-    repeats = 1 if options.quick else known.repeats
-    figures = times(options.quick, repeats) | accuracies(options.quick, known.galaxies)
-    report.finish("render", repeats, figures, _NOTES, options.json)
+    extra_parser = argparse.ArgumentParser(add_help=False)
+    extra_parser.add_argument("--galaxies", type=int, default=NUM_TEST, help="galaxies that are held against galsim")
+    extra_parser.add_argument("--repeats", type=int, default=REPEATS, help="of every time, the best of which counts")
+    extra_options, other_arguments = extra_parser.parse_known_args(argv)
+    options = report.options("render", __doc__ or "", other_arguments)
+    repeats = 1 if options.quick else extra_options.repeats
+    figures = times(options.quick, repeats) | accuracies(options.quick, extra_options.galaxies)
+    report.print_and_write("render", repeats, figures, _NOTES, options.json)
     return 0
 
 

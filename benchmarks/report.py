@@ -28,7 +28,7 @@ def options(
     return parser.parse_args(argv)
 
 
-def best(work: Callable[[], Any], repeats: int, clock: Callable[[], float] = time.perf_counter) -> float:
+def best_time(work: Callable[[], Any], repeats: int, clock: Callable[[], float] = time.perf_counter) -> float:
     """Shortest time of several, s."""
     seconds = []
     for _ in range(repeats):
@@ -49,12 +49,14 @@ def machine() -> str:
     return f"{model}, {os.cpu_count()} cores"
 
 
-def finish(name: str, repeats: int, figures: Mapping[str, float], notes: Mapping[str, str], file: Path | None) -> None:
+def print_and_write(
+    name: str, repeats: int, figures: Mapping[str, float], notes: Mapping[str, str], file: Path | None
+) -> None:
     """Print the figures, each with its note; write them as one flat JSON object where a file is given."""
-    about = {"name": name, "commit": git_commit(), "machine": machine(), "repeats": repeats}
+    header = {"name": name, "commit": git_commit(), "machine": machine(), "repeats": repeats}
     load = round(os.getloadavg()[0], 2)
-    print(f"{name}: {about['machine']}, commit {about['commit'][:10]}, best of {repeats}, load average {load}")
+    print(f"{name}: {header['machine']}, commit {header['commit'][:10]}, best of {repeats}, load average {load}")
     for key, value in figures.items():
         print(f"  {key:28} {value:14,.4g}   {notes.get(key, '')}")
     if file is not None:
-        file.write_text(json.dumps({**about, "load_average": load, **figures}, indent=1) + "\n")
+        file.write_text(json.dumps({**header, "load_average": load, **figures}, indent=1) + "\n")

@@ -25,24 +25,24 @@ import numpy as np
 from benchmarks import report
 from lake_schema.arrays import Float, Int
 from lake_schema.store import layout, manifest, publish, reuse, stage
-from lake_schema.store.plan import Json, Part, Plan
+from lake_schema.store.plan import Json, Plan, Task
 from lake_schema.tables.products import PRODUCTS
 from truesky.render import plan_exposures
 from truesky.render.planning import tasks as planned
 from truesky.render.products.keys import part_name
 from truesky.request.from_toml import parse
-from truesky.running.session import session
-from truesky.running.shell import _collect
+from truesky.running.session import get_session
+from truesky.running.submitted_job import _collect
 
 ROOT = Path(__file__).resolve().parents[1]
 CORES = (100, 300, 1000, 3000, 10_000)
 # Cores of a machine; of which share of machines each is how much slower, of few machines one; hours from death to death
 # of one, and until it is back.  One in fifty at half speed and a death in a thousand hours are worse than sites tell.
-MACHINE, SLOW, SLOWER, LIVES_H, BACK_H = 32, 0.02, 2.0, 1000.0, 0.2
+CORES_PER_MACHINE, SLOW_FRACTION, SLOWDOWN, MEAN_LIFE_H, REPAIR_H = 32, 0.02, 2.0, 1000.0, 0.2
 # Scatter of a detector's seconds about their forecast (natural logarithm), and s of a task beside its render.
 SCATTER, OVERHEAD_S = 0.25, 0.03
 # Files of a part as it is written: rows, image, head, truth, and its receipt; each is made, renamed and synced.
-FILES_A_PART = 5
+FILES_PER_TASK = 5
 _NOTES = {
     "tasks": "detectors of the main run, as planned",
     "core_hours": "forecast, on the machine that costs were measured on",
@@ -69,8 +69,8 @@ class Site:
 
     cores: int
     handed_out_per_s: float
-    slow: float = SLOW
-    lives_h: float = LIVES_H
+    slow_fraction: float = SLOW_FRACTION
+    mean_life_h: float = MEAN_LIFE_H
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,57 +80,57 @@ class Outcome:
     makespan: float
     busy: float
     lost: float
-    again: int
+    repeated: int
 
     def efficiency(self, cores: int, seconds: float) -> float:
         """Core-s of the tasks on machines that are not slow, over those that passed."""
         return seconds / (cores * self.makespan)
 
 
-def simulated(seconds: Float, site: Site, rng: np.random.Generator) -> Outcome:
+def simulate(seconds: Float, site: Site, rng: np.random.Generator) -> Outcome:
     """Tasks in their order, each on the core that is free first; what a machine's death interrupts is begun again.
 
     seconds : [n] of one core, in the order that they are handed out
     """
-    machines = -(-site.cores // MACHINE)
-    slow = np.isin(np.arange(machines), rng.permutation(machines)[: math.ceil(site.slow * machines)])
-    dies = rng.exponential(site.lives_h * 3600.0, machines)
-    if np.isfinite(site.lives_h):
+    machines = -(-site.cores // CORES_PER_MACHINE)
+    slow = np.isin(np.arange(machines), rng.permutation(machines)[: math.ceil(site.slow_fraction * machines)])
+    death_time = rng.exponential(site.mean_life_h * 3600.0, machines)
+    if np.isfinite(site.mean_life_h):
         # However short a run is, one machine dies in its midst.
-        dies[rng.integers(machines)] = 0.5 * seconds.sum() / site.cores
+        death_time[rng.integers(machines)] = 0.5 * seconds.sum() / site.cores
     free = [(0.0, core) for core in range(site.cores)]
     waiting = iter(range(len(seconds)))
-    back: list[tuple[float, int]] = []
+    lost_tasks: list[tuple[float, int]] = []
     driver = makespan = busy = lost = 0.0
-    again, step = 0, 1.0 / site.handed_out_per_s
+    repeated, step = 0, 1.0 / site.handed_out_per_s
     while True:
         now, core = free[0]
-        if back and back[0][0] <= max(now, driver):
-            task = heapq.heappop(back)[1]
+        if lost_tasks and lost_tasks[0][0] <= max(now, driver):
+            task = heapq.heappop(lost_tasks)[1]
         elif (task := next(waiting, -1)) < 0:
-            if not back:
+            if not lost_tasks:
                 break
-            when, task = heapq.heappop(back)
-            now = max(now, when)
+            lost_at, task = heapq.heappop(lost_tasks)
+            now = max(now, lost_at)
         driver = max(driver, now) + step
-        machine = core // MACHINE
-        takes = seconds[task] * (SLOWER if slow[machine] else 1.0)
-        while dies[machine] < driver:
+        machine = core // CORES_PER_MACHINE
+        duration = seconds[task] * (SLOWDOWN if slow[machine] else 1.0)
+        while death_time[machine] < driver:
             # It died while nothing ran on it.
-            dies[machine] += rng.exponential(site.lives_h * 3600.0)
-        if dies[machine] < driver + takes:
-            again += 1
-            lost += dies[machine] - driver
-            heapq.heappush(back, (dies[machine], task))
-            heapq.heapreplace(free, (dies[machine] + BACK_H * 3600.0, core))
+            death_time[machine] += rng.exponential(site.mean_life_h * 3600.0)
+        if death_time[machine] < driver + duration:
+            repeated += 1
+            lost += death_time[machine] - driver
+            heapq.heappush(lost_tasks, (death_time[machine], task))
+            heapq.heapreplace(free, (death_time[machine] + REPAIR_H * 3600.0, core))
             continue
-        busy += takes
-        makespan = max(makespan, driver + takes)
-        heapq.heapreplace(free, (driver + takes, core))
-    return Outcome(makespan, busy, lost, again)
+        busy += duration
+        makespan = max(makespan, driver + duration)
+        heapq.heapreplace(free, (driver + duration, core))
+    return Outcome(makespan, busy, lost, repeated)
 
 
-def orders(seconds: Float, exposures: Int) -> dict[str, Int]:
+def task_orders(seconds: Float, exposures: Int) -> dict[str, Int]:
     """Orders in which tasks may be handed out, by name: ours, as they are observed, the shortest first."""
     return {
         "longest": np.argsort(-seconds, kind="stable"),
@@ -141,134 +141,141 @@ def orders(seconds: Float, exposures: Int) -> dict[str, Int]:
 
 def makespans(seconds: Float, exposures: Int, rate: float, cores: Sequence[int]) -> dict[str, float]:
     """Of each number of cores and order: hours, efficiency; of ours also on machines that neither die nor are slow."""
-    took = seconds * np.random.default_rng(1).lognormal(-0.5 * SCATTER**2, SCATTER, len(seconds)) + OVERHEAD_S
+    actual_seconds = seconds * np.random.default_rng(1).lognormal(-0.5 * SCATTER**2, SCATTER, len(seconds)) + OVERHEAD_S
     figures = {}
-    for many in cores:
-        for name, order in orders(seconds, exposures).items():
-            found = simulated(took[order], Site(many, rate), np.random.default_rng(2))
-            figures[f"hours_{many}_{name}"] = found.makespan / 3600.0
-            figures[f"efficiency_{many}_{name}"] = found.efficiency(many, float(seconds.sum()))
+    for num_cores in cores:
+        for name, order in task_orders(seconds, exposures).items():
+            outcome = simulate(actual_seconds[order], Site(num_cores, rate), np.random.default_rng(2))
+            figures[f"hours_{num_cores}_{name}"] = outcome.makespan / 3600.0
+            figures[f"efficiency_{num_cores}_{name}"] = outcome.efficiency(num_cores, float(seconds.sum()))
             if name == "longest":
-                figures[f"again_{many}"] = found.again
-        sound = simulated(
-            took[orders(seconds, exposures)["longest"]], Site(many, rate, 0.0, math.inf), np.random.default_rng(2)
+                figures[f"again_{num_cores}"] = outcome.repeated
+        faultless = simulate(
+            actual_seconds[task_orders(seconds, exposures)["longest"]],
+            Site(num_cores, rate, 0.0, math.inf),
+            np.random.default_rng(2),
         )
-        figures[f"hours_{many}_sound"] = sound.makespan / 3600.0
-        figures[f"tasks_per_s_{many}"] = len(seconds) / sound.makespan
-        figures[f"creates_per_s_{many}"] = FILES_A_PART * len(seconds) / sound.makespan
+        figures[f"hours_{num_cores}_sound"] = faultless.makespan / 3600.0
+        figures[f"tasks_per_s_{num_cores}"] = len(seconds) / faultless.makespan
+        figures[f"creates_per_s_{num_cores}"] = FILES_PER_TASK * len(seconds) / faultless.makespan
     return figures
 
 
 # ------------------------------------------------------------------------------------------------ measured
 
 
-def tasks(quick: bool) -> tuple[Float, Int, dict[str, float]]:
+def planned_tasks(quick: bool) -> tuple[Float, Int, dict[str, float]]:
     """Seconds and exposures of the main run's tasks; figures of the plan, and of what it takes in the driver."""
-    wanted = parse(ROOT / "requests" / "sc8_main.toml")
+    request = parse(ROOT / "requests" / "sc8_main.toml")
     if quick:
-        few = tuple(
-            replace(one, fields=4 * bool(one.fields), exposures=4 * bool(one.exposures)) for one in wanted.observations
+        short_observations = tuple(
+            replace(observation, fields=4 * bool(observation.fields), exposures=4 * bool(observation.exposures))
+            for observation in request.observations
         )
-        wanted = replace(wanted, observations=few)
-    planner = plan_exposures.Planner.of(None, wanted)
-    some = [rows.select(["exposure_id", "detector", "seconds"]) for _, rows in planner.tables()]
+        request = replace(request, observations=short_observations)
+    planner = plan_exposures.Planner.from_request(None, request)
+    plan_tables = [rows.select(["exposure_id", "detector", "seconds"]) for _, rows in planner.tables()]
     seconds, exposures = (
-        np.concatenate([rows[name].to_numpy() for rows in some]) for name in ("seconds", "exposure_id")
+        np.concatenate([rows[name].to_numpy() for rows in plan_tables]) for name in ("seconds", "exposure_id")
     )
     figures = {
         "tasks": len(seconds),
         "core_hours": float(seconds.sum()) / 3600.0,
         "longest_s": float(seconds.max()),
-        "plan_parts": len(planner.layout.pieces),
+        "plan_parts": len(planner.layout.chunks),
     }
     _, rows = next(planner.tables())
-    rows = planned.in_order(rows.slice(0, 20_000))
+    rows = planned.sort_by_cost(rows.slice(0, 20_000))
     gc.collect()
     tracemalloc.start()
-    kept = rows.to_pylist()
-    parts = tuple(_part(task) for task in kept)
+    task_rows = rows.to_pylist()
+    parts = tuple(_make_part(task) for task in task_rows)
     figures["python_kb_a_part"] = tracemalloc.get_traced_memory()[0] / len(parts) / 1e3
     tracemalloc.stop()
     return seconds, exposures, figures
 
 
-def _part(task: Json) -> Part:
-    return Part(
+def _make_part(task: Json) -> Task:
+    return Task(
         part_name(task), {"exposure_id": task["exposure_id"], "detector": task["detector"], reuse.PRODUCT: "0" * 64}
     )
 
 
-def dispatch(parts: int) -> dict[str, float]:
+def time_dispatch(num_tasks: int) -> dict[str, float]:
     """How many empty tasks a second pass, and what they leave in the driver's Java; in local mode."""
-    spark = session("benchmark of the scheduler")
+    spark = get_session("benchmark of the scheduler")
     java = spark.sparkContext._jvm
-    some = [
-        Part(f"{i:06d}-1.parquet", {"exposure_id": i, "detector": "1", reuse.PRODUCT: "0" * 64}) for i in range(parts)
+    task_list = [
+        Task(f"{i:06d}-1.parquet", {"exposure_id": i, "detector": "1", reuse.PRODUCT: "0" * 64})
+        for i in range(num_tasks)
     ]
 
-    def nothing(part: Part) -> Json:
+    def run_empty_task(part: Task) -> Json:
         return {"part": part.name, "rows": 1, "bytes": 1, "seconds": 0.0, "cpu_s": 0.0, "peak_gb": 0.0, "machine": "x"}
 
-    def held() -> float:
+    def java_memory() -> float:
         java.System.gc()
         runtime = java.Runtime.getRuntime()
         return float(runtime.totalMemory() - runtime.freeMemory())
 
-    _collect(spark, nothing, some[:64])
+    _collect(spark, run_empty_task, task_list[:64])
     spark.range(0, 64, 1, numPartitions=64).count()
-    before, started = held(), time.perf_counter()
-    assert len(_collect(spark, nothing, some)) == parts
+    initial_memory, started = java_memory(), time.perf_counter()
+    assert len(_collect(spark, run_empty_task, task_list)) == num_tasks
     ours = time.perf_counter() - started
-    after, started = held(), time.perf_counter()
-    spark.sparkContext._jsc.sc().range(0, parts, 1, parts).count()
+    final_memory, started = java_memory(), time.perf_counter()
+    spark.sparkContext._jsc.sc().range(0, num_tasks, 1, num_tasks).count()
     return {
-        "spark_tasks_per_s": parts / ours,
-        "java_tasks_per_s": parts / (time.perf_counter() - started),
-        "java_kb_a_part": max(after - before, 0.0) / parts / 1e3,
+        "spark_tasks_per_s": num_tasks / ours,
+        "java_tasks_per_s": num_tasks / (time.perf_counter() - started),
+        "java_kb_a_part": max(final_memory - initial_memory, 0.0) / num_tasks / 1e3,
     }
 
 
-def publishing(folder: Path, parts: int) -> dict[str, float]:
+def time_publishing(folder: Path, num_partitions: int) -> dict[str, float]:
     """What it takes to publish so many parts whose files and receipts are there: tiny files, everything else real."""
-    root = layout.lake(folder / f"lake-{parts}")
-    own = tuple(_part({"exposure_id": i // 36, "detector": f"{i % 36}"}) for i in range(parts))
-    plan = Plan(PRODUCTS, {"request": {"name": "tiny"}}, own)
-    made = layout.stage(root, PRODUCTS.name, plan.key)
-    for part in own:
-        _fake(made, part)
+    root = layout.resolve_lake(folder / f"lake-{num_partitions}")
+    partitions = tuple(_make_part({"exposure_id": i // 36, "detector": f"{i % 36}"}) for i in range(num_partitions))
+    plan = Plan(PRODUCTS, {"request": {"name": "tiny"}}, partitions)
+    stage_folder = layout.stage_folder(root, PRODUCTS.name, plan.key)
+    for part in partitions:
+        _write_fake_output(stage_folder, part)
     started, cpu = time.perf_counter(), time.process_time()
-    target = publish.make(root, plan, lambda lake, facts: publish.Output(PRODUCTS.empty()), name="tiny")
+    target = publish.make_version(root, plan, lambda lake, facts: publish.Output(PRODUCTS.empty()), name="tiny")
     figures = {
-        "publish_ms_a_part": 1e3 * (time.perf_counter() - started) / parts,
-        "publish_cpu_ms_a_part": 1e3 * (time.process_time() - cpu) / parts,
-        "manifest_kb_a_part": (target / manifest.MANIFEST).stat().st_size / parts / 1e3,
-        "published_parts": parts,
+        "publish_ms_a_part": 1e3 * (time.perf_counter() - started) / num_partitions,
+        "publish_cpu_ms_a_part": 1e3 * (time.process_time() - cpu) / num_partitions,
+        "manifest_kb_a_part": (target / manifest.MANIFEST).stat().st_size / num_partitions / 1e3,
+        "published_parts": num_partitions,
     }
     started = time.process_time()
-    assert len(manifest.load(target, PRODUCTS.name)["parts"]) == parts
-    figures["manifest_load_ms_a_part"] = 1e3 * (time.process_time() - started) / parts
+    assert len(manifest.load(target, PRODUCTS.name)["parts"]) == num_partitions
+    figures["manifest_load_ms_a_part"] = 1e3 * (time.process_time() - started) / num_partitions
     figures["publish_peak_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
     gc.collect()
     tracemalloc.start()
-    again = manifest._read(target / manifest.MANIFEST)
-    held, peak = tracemalloc.get_traced_memory()
+    loaded = manifest._read_manifest(target / manifest.MANIFEST)
+    manifest_memory, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    figures["manifest_held_kb_a_part"], figures["manifest_peak_kb_a_part"] = held / parts / 1e3, peak / parts / 1e3
-    assert len(again["parts"]) == parts
+    figures["manifest_held_kb_a_part"], figures["manifest_peak_kb_a_part"] = (
+        manifest_memory / num_partitions / 1e3,
+        peak / num_partitions / 1e3,
+    )
+    assert len(loaded["parts"]) == num_partitions
     return figures
 
 
-def _fake(made: Path, part: Part) -> None:
+def _write_fake_output(stage_folder: Path, part: Task) -> None:
     files = []
     number, detector = part.facts["exposure_id"], part.facts["detector"]
     image = f"images/{number:06d}/{detector}_science"
     for relative in (f"dataset/{part.name}", f"{image}.fits", f"{image}.head", f"truth/{part.name}"):
-        path = made / relative
+        path = stage_folder / relative
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(b"x")
         files.append({"path": relative, "bytes": 1, "sha256": _SHA256_OF_X})
     receipt = {"part": part.name, "rows": 1, "files": files, "machine": "x", "span": [[image], [image]]}
-    path = stage.receipts(made) / f"{part.name}.json"
+    path = stage.receipts_folder(stage_folder) / f"{part.name}.json"
     path.parent.mkdir(exist_ok=True)
     path.write_text(json.dumps(receipt))
 
@@ -276,7 +283,7 @@ def _fake(made: Path, part: Part) -> None:
 _SHA256_OF_X = "2d711642b726b04401627ca9fbac32f5c8530fb1903cc4db02258717921a4881"
 
 
-def picture(figures: Json, file: Path) -> None:
+def draw_picture(figures: Json, file: Path) -> None:
     """Hours and efficiency against cores, of the orders; file : PNG or JPEG."""
     import matplotlib
 
@@ -284,18 +291,20 @@ def picture(figures: Json, file: Path) -> None:
     from matplotlib import pyplot
 
     figure, (hours, share) = pyplot.subplots(1, 2, figsize=(10.0, 4.0), layout="constrained")
-    ideal = [figures["core_hours"] / many for many in CORES]
+    ideal = [figures["core_hours"] / num_cores for num_cores in CORES]
     hours.loglog(CORES, ideal, color="0.6", linestyle=":", label="core-hours / cores")
-    for name, said in (
+    for name, label in (
         ("longest", "longest first (ours)"),
         ("observed", "as observed"),
         ("shortest", "shortest first"),
     ):
-        hours.loglog(CORES, [figures[f"hours_{many}_{name}"] for many in CORES], marker="o", label=said)
-        share.semilogx(CORES, [100.0 * figures[f"efficiency_{many}_{name}"] for many in CORES], marker="o", label=said)
+        hours.loglog(CORES, [figures[f"hours_{num_cores}_{name}"] for num_cores in CORES], marker="o", label=label)
+        share.semilogx(
+            CORES, [100.0 * figures[f"efficiency_{num_cores}_{name}"] for num_cores in CORES], marker="o", label=label
+        )
     hours.loglog(
         CORES,
-        [figures[f"hours_{many}_sound"] for many in CORES],
+        [figures[f"hours_{num_cores}_sound"] for num_cores in CORES],
         color="k",
         linestyle="--",
         label="no machine slow or dead",
@@ -312,15 +321,15 @@ def picture(figures: Json, file: Path) -> None:
 def main(argv: Sequence[str] | None = None) -> int:
     """Measures, simulates and prints everything."""
     options = report.options("scheduler", __doc__ or "", argv, picture=True)
-    seconds, exposures, figures = tasks(options.quick)
-    figures |= dispatch(200 if options.quick else 4000)
+    seconds, exposures, figures = planned_tasks(options.quick)
+    figures |= time_dispatch(200 if options.quick else 4000)
     with tempfile.TemporaryDirectory() as name:
-        figures |= publishing(Path(name), 200 if options.quick else 10_000)
+        figures |= time_publishing(Path(name), 200 if options.quick else 10_000)
     cores = CORES[:2] if options.quick else CORES
     figures |= makespans(seconds, exposures, figures["java_tasks_per_s"], cores)
-    report.finish("scheduler", 1, figures, _NOTES, options.json)
+    report.print_and_write("scheduler", 1, figures, _NOTES, options.json)
     if options.picture is not None and not options.quick:
-        picture(figures, options.picture)
+        draw_picture(figures, options.picture)
     return 0
 
 

@@ -50,39 +50,39 @@ def pole_counts(v: float) -> float:
     return float(disc + spheroid)
 
 
-def far_from_the_plane(step: int) -> float:
+def count_far_from_plane(step: int) -> float:
     """Stars to expect to H < 26 at |b| > 20 deg, from every step-th cell."""
     cells = np.arange(0, 12 << 2 * GENERATION_ORDER, step)
     _, b = sky.galactic(*sky.cell_centres(GENERATION_ORDER, cells))
     universe = stars.model()
     # The published number is of systems.
-    alone = replace(universe.galaxy, companions=0.0 * universe.galaxy.companions)
-    return float(stars.numbers(cells[np.abs(b) > 20.0], replace(universe, galaxy=alone)).sum() * step)
+    single_stars = replace(universe.galaxy, companions=0.0 * universe.galaxy.companions)
+    return float(stars.expected_counts(cells[np.abs(b) > 20.0], replace(universe, galaxy=single_stars)).sum() * step)
 
 
 def brighter_than_11(step: int, dust: Float32) -> float:
     """Stars of the whole sky to expect with V < 11, behind the dust, from every step-th cell of order 4."""
-    return star_counts.whole_sky(stars.model(), 11.0, dust, step)
+    return star_counts.count_whole_sky(stars.model(), 11.0, dust, step)
 
 
-def pole(cells: int, dust: Float32) -> dict[str, float]:
+def pole_figures(cells: int, dust: Float32) -> dict[str, float]:
     """Stars deg-2 at both poles to V = 20 and G = 20 from the flux table, against published counts in the same band."""
     universe, library = stars.model(24.0), templates.stellar_library()
-    zero = {"bessell_v": vega_magnitude(passbands.load("bessell_v")), "gaia_g": gaia.ab_minus_vega()[0]}
-    drawn = star_counts.around(90.0, cells, south=True)
-    found = {band: [] for band in zero}
+    zero_points = {"bessell_v": vega_magnitude(passbands.load("bessell_v")), "gaia_g": gaia.ab_minus_vega()[0]}
+    drawn = star_counts.cells_at_latitude(90.0, cells, south=True)
+    magnitudes = {band: [] for band in zero_points}
     for cell in drawn:
         rows = stars.draw(cell, star_counts.SEED, universe, dust)
-        fluxes = band_fluxes.star_fluxes(rows, list(zero), library)
-        for band, offset in zero.items():
-            found[band].append(units.mag_of_f_nu(fluxes[f"f_nu_{band}"].to_numpy().astype(float)) - offset)
-    v, g = (np.concatenate(found[band]) for band in zero)
+        fluxes = band_fluxes.star_fluxes(rows, list(zero_points), library)
+        for band, offset in zero_points.items():
+            magnitudes[band].append(units.mag_of_f_nu(fluxes[f"f_nu_{band}"].to_numpy().astype(float)) - offset)
+    v, g = (np.concatenate(magnitudes[band]) for band in zero_points)
     area = len(drawn) * star_counts.AREA
     # The published counts in G: in bins of V, the part of our stars that is brighter than G = 20.
     edges = np.arange(8.0, 24.1, 0.5)
-    inside, _ = np.histogram(v[g < 20.0], edges)
-    every, _ = np.histogram(v, edges)
-    published = np.diff([pole_counts(edge) for edge in edges]) @ (inside / np.maximum(every, 1))
+    bright_counts, _ = np.histogram(v[g < 20.0], edges)
+    all_counts, _ = np.histogram(v, edges)
+    published = np.diff([pole_counts(edge) for edge in edges]) @ (bright_counts / np.maximum(all_counts, 1))
     return {
         "pole_v20_per_deg2": np.sum(v < 20.0) / area,
         "against_pole_v20": np.sum(v < 20.0) / area / pole_counts(20.0),
@@ -95,20 +95,20 @@ def speed(radius: float) -> dict[str, float]:
     """CPU seconds of the two jobs at b = 30 deg, without Spark."""
     ra, dec = (float(x) for x in sky.equatorial(90.0, 30.0))
     table = {"name": "benchmark", "seed": star_counts.SEED, "area": {"cone": {"ra": ra, "dec": dec, "radius": radius}}}
-    wanted = from_table({**table, "fluxes": {"bands": BANDS}})
+    request = from_table({**table, "fluxes": {"bands": BANDS}})
     # Libraries and machine code are made once, whatever is asked for.
     curves = [passbands.load(band) for band in BANDS]
     libraries = templates.galaxy_library(), templates.stellar_library()
-    band_fluxes.prepare(curves, [None] * len(curves), *libraries, wanted.accuracy)
+    band_fluxes.prepare(curves, [None] * len(curves), *libraries, request.accuracy)
     dust_map.load(star_counts.SEED)
     with tempfile.TemporaryDirectory() as folder:
-        lake = layout.lake(folder)
+        lake = layout.resolve_lake(folder)
         started = time.process_time()
-        (step,) = build_stars.steps(lake, wanted)
-        publish.make(lake, step.plan, step.work)
+        (step,) = build_stars.steps(lake, request)
+        publish.make_version(lake, step.plan, step.run_task)
         drawn = time.process_time()
-        step = compute_fluxes.step_of("star", lake, wanted)
-        publish.make(lake, step.plan, step.work)
+        step = compute_fluxes.flux_step("star", lake, request)
+        publish.make_version(lake, step.plan, step.run_task)
         ended = time.process_time()
         version = read.version(lake, "stars")
         size = sum(path.stat().st_size for path in version.folder.rglob("Npix=*"))
@@ -124,30 +124,32 @@ def speed(radius: float) -> dict[str, float]:
 _CROWDED = """
 import resource, sys
 from pathlib import Path
-from benchmarks.stars import crowded
-rows = crowded(float(sys.argv[1]))
+from benchmarks.stars import draw_crowded_cell
+rows = draw_crowded_cell(float(sys.argv[1]))
 print(rows, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6)
 """
 
 
-def crowded(limit: float) -> int:
+def draw_crowded_cell(limit: float) -> int:
     """Draw and publish the most crowded cell that is drawn without a limit of its own; returns its rows."""
     cells = np.arange(12 << 2 * GENERATION_ORDER)
     lon, lat = sky.galactic(*sky.cell_centres(GENERATION_ORDER, cells))
     before_bulge = np.abs((lon + 180.0) % 360.0 - 180.0) < stars.BULGE[0]
-    least = np.where(before_bulge, stars.BULGE[1], stars.PLANE)
-    near = cells[(np.abs(lat) >= least) & (np.abs(lat) < least + 0.3)]
-    (ra,), (dec,) = sky.cell_centres(GENERATION_ORDER, near[[stars.numbers(near, stars.model()).argmax()]])
+    min_latitude = np.where(before_bulge, stars.BULGE[1], stars.PLANE)
+    edge_cells = cells[(np.abs(lat) >= min_latitude) & (np.abs(lat) < min_latitude + 0.3)]
+    (ra,), (dec,) = sky.cell_centres(
+        GENERATION_ORDER, edge_cells[[stars.expected_counts(edge_cells, stars.model()).argmax()]]
+    )
     area = {"cone": {"ra": float(ra), "dec": float(dec), "radius": 0.0}}
-    wanted = from_table({"name": "x", "seed": star_counts.SEED, "area": area, "universe": {"star_limit": limit}})
+    request = from_table({"name": "x", "seed": star_counts.SEED, "area": area, "universe": {"star_limit": limit}})
     with tempfile.TemporaryDirectory() as folder:
-        lake = layout.lake(folder)
-        (step,) = build_stars.steps(lake, wanted)
-        publish.make(lake, step.plan, step.work)
+        lake = layout.resolve_lake(folder)
+        (step,) = build_stars.steps(lake, request)
+        publish.make_version(lake, step.plan, step.run_task)
         return read.version(lake, "stars").num_rows
 
 
-def peak(limit: float) -> tuple[float, float]:
+def crowded_cell_memory(limit: float) -> tuple[float, float]:
     """Rows and peak memory, GB, of `crowded` in a process of its own."""
     root = Path(__file__).resolve().parents[1]
     done = subprocess.run(
@@ -161,18 +163,18 @@ def run(quick: bool) -> dict[str, float]:
     """All figures."""
     dust = dust_map.load(star_counts.SEED)
     figures = speed(0.1 if quick else 1.0)
-    figures["cell_rows"], figures["cell_peak_gb"] = peak(16.0 if quick else 26.0)
+    figures["cell_rows"], figures["cell_peak_gb"] = crowded_cell_memory(16.0 if quick else 26.0)
     cells, universe = (4, stars.model(22.0)) if quick else (24, stars.model())
     for b in (60,) if quick else star_counts.COUNTS:
-        found = star_counts.counts(b, cells, universe, dust) / np.array(star_counts.COUNTS[b])
-        kept = found[:-1] if quick else found
-        figures[f"counts_b{b}_off"] = float(kept[np.abs(kept - 1.0).argmax()] - 1.0)
+        ratios = star_counts.counts(b, cells, universe, dust) / np.array(star_counts.COUNTS[b])
+        compared = ratios[:-1] if quick else ratios
+        figures[f"counts_b{b}_off"] = float(compared[np.abs(compared - 1.0).argmax()] - 1.0)
     for b in (60,) if quick else star_counts.DWARFS:
-        found = star_counts.dwarf_counts(b, 100.0 if quick else 1000.0) / np.array(star_counts.DWARFS[b])
-        figures[f"lt_b{b}_off"] = float(found[np.abs(found - 1.0).argmax()] - 1.0)
-    figures["sky_b20_off"] = far_from_the_plane(4096 if quick else 64) / SKY_20 - 1.0
+        ratios = star_counts.dwarf_counts(b, 100.0 if quick else 1000.0) / np.array(star_counts.DWARFS[b])
+        figures[f"lt_b{b}_off"] = float(ratios[np.abs(ratios - 1.0).argmax()] - 1.0)
+    figures["sky_b20_off"] = count_far_from_plane(4096 if quick else 64) / SKY_20 - 1.0
     figures["sky_v11"] = brighter_than_11(64 if quick else 4, dust)
-    figures |= pole(4 if quick else 24, dust)
+    figures |= pole_figures(4 if quick else 24, dust)
     for g, published in star_counts.PARALLAX.items():
         figures[f"gaia_parallax_g{g:g}_off"] = float(gaia.astrometric_errors(g)[2] / published - 1.0)
     return figures
@@ -191,7 +193,7 @@ NOTES = {
 
 def main(argv: Sequence[str] | None = None) -> int:
     options = report.options("stars", __doc__ or "", argv)
-    report.finish("stars", 1, run(options.quick), NOTES, options.json)
+    report.print_and_write("stars", 1, run(options.quick), NOTES, options.json)
     return 0
 
 

@@ -28,7 +28,7 @@ from benchmarks import _positions as positions
 from benchmarks import _references as references
 from benchmarks import _scenes as scenes
 from benchmarks import report
-from benchmarks._approximations import NONE, Approximation
+from benchmarks._approximations import NO_APPROXIMATION, Approximation
 from benchmarks._scenes import VIS
 from lake_schema.arrays import Bool, Float
 from truesky.render.drawing.settings import Settings
@@ -46,21 +46,28 @@ _CHAIN = (
     Settings(0.005, 5e-5, 1e-4, 8.0, 25),
 )
 _SURVEY = 4
-_CHANGED = (("edge", 0.1), ("aliased", 1e-2), ("floor", 1e-2), ("least", 5.6), ("least", 3.2), ("colours", 4))
+_CHANGED = (
+    ("edge", 0.1),
+    ("aliased", 1e-2),
+    ("floor", 1e-2),
+    ("min_size_arcsec", 5.6),
+    ("min_size_arcsec", 3.2),
+    ("colours", 4),
+)
 # Of each layer of magnitude as many galaxies and stars: that the settings are chosen on, that the errors are quoted of;
 # of each, galaxies that are sheared in pairs. Galaxies that approximations are measured on, and their pairs.
-_EACH, _HELD, _SHEARED, _QUOTED, _PAIRS = 3, 4, 12, 24, 18
-_CHOSEN_SEED, _HELD_SEED, _QUOTED_SEED, _SCENE_SEED = 12, 34, 21, 1
+_NUM_CHOSEN, _NUM_TEST, _NUM_SHEARED, _NUM_QUOTED, _NUM_PAIRS = 3, 4, 12, 24, 18
+_CHOSEN_SEED, _TEST_SEED, _QUOTED_SEED, _SCENE_SEED = 12, 34, 21, 1
 # Seeds of the stars that the error of the PSF is of.
 _PSF_SEEDS = (5, 6)
 # Threshold of galsim's largest frequency: at 1e-4 its middles of bright discs are 3e-3 of the noise wrong.
-_HIGHEST = 1e-5
+_MAXK_THRESHOLD = 1e-5
 # Galaxies fainter than this are small beside the frame.
 _SMALL = 20.0
 # galsim at its tightest but for one parameter each.
-_LOOSER = (("folding 1e-3", 1e-3, _HIGHEST), ("largest frequency 1e-4", references.ACCURACY, 1e-4))
+_LOOSER_THRESHOLDS = (("folding 1e-3", 1e-3, _MAXK_THRESHOLD), ("largest frequency 1e-4", references.ACCURACY, 1e-4))
 # No approximation but the stamp, and that large; in double precision, as nothing may be left out.
-_TRUTH = Settings(edge=1e-6, aliased=1e-8, floor=0.0, least=25.6, positions=9)
+_TRUTH = Settings(edge=1e-6, aliased=1e-8, floor=0.0, min_size_arcsec=25.6, positions=9)
 # Magnitudes of a relative error.
 _MAG = 1.0857362
 _NUMBERS = ("flux", "shape", "position", "background")
@@ -68,19 +75,19 @@ _SETTINGS = f"""\
 # Settings of drawing by python -m benchmarks.trade --settings, and the largest errors they make.
 #
 # flux: of a source, in a 1" aperture, relative; position: pixels; background: of a sky pixel's noise; shape: the
-# largest of |m| and |c| of {_SHEARED} 90-degree pairs, of half the ellipticity's error, and of {positions.LENSED:.2f}
-# times what a star's R2 is wrong by (what that does to m, benchmarks/_positions.py).
-# First of {12 * _EACH} VIS galaxies and stars of 14.5 to 26 mag that the settings were chosen on, against the largest
-# stamps; then (_held) of {12 * _HELD} others: galaxies against galsim at its tightest, stars against the Fourier series
-# of their PSF, pairs against the largest stamps. To each, as the root of the sum of squares, the PSF's own error of
-# {positions.STARS} and of {positions.HELD} stars of other places, their colours of eight sub-bands. CPU seconds of a
-# VIS detector's sources, on {{machine}}.
+# largest of |m| and |c| of {_NUM_SHEARED} 90-degree pairs, of half the ellipticity's error, and of
+# {positions.R2_RATIO:.2f} times what a star's R2 is wrong by (what that does to m, benchmarks/_positions.py).
+# First of {12 * _NUM_CHOSEN} VIS galaxies and stars of 14.5 to 26 mag that the settings were chosen on, against the
+# largest stamps; then (_held) of {12 * _NUM_TEST} others: galaxies against galsim at its tightest, stars against the
+# Fourier series of their PSF, pairs against the largest stamps. To each, as the root of the sum of squares, the PSF's
+# own error of {positions.NUM_STARS} and of {positions.NUM_TEST_STARS} stars of other places, their colours of eight
+# sub-bands. CPU seconds of a VIS detector's sources, on {{machine}}.
 edge,aliased,floor,least,positions,colours,{",".join(_NUMBERS)},{",".join(f"{name}_held" for name in _NUMBERS)},seconds
 """
 
 
 @dataclass(frozen=True)
-class Known:
+class Reference:
     """One of a sample: itself, on frames that it is in the middle of, and its PSF; its image and response to shear."""
 
     sources: Sources
@@ -89,208 +96,263 @@ class Known:
     response: Float | None
 
     @property
-    def star(self) -> bool:
+    def is_star(self) -> bool:
         return bool(self.sources.shape[0] < 0)
 
 
-def sample(some: Sources, pairs: int, highest: float = 0.0) -> list[Known]:
+def make_references(sources: Sources, num_pairs: int, maxk_threshold: float = 0.0) -> list[Reference]:
     """Sources with the truth about them, the first galaxies' response too; highest : galsim's, if that is the truth."""
-    full, out = scenes.psf_of(VIS), []
-    order = np.random.default_rng(_CHOSEN_SEED).permutation(len(some))
+    full_psf, out = scenes.scene_psf(VIS), []
+    order = np.random.default_rng(_CHOSEN_SEED).permutation(len(sources))
     for i in order:
-        own, one = scenes.own(full, some, i), scenes.moved(some, i, errors.COMPARED)
+        source_psf, source = (
+            scenes.psf_of_source(full_psf, sources, i),
+            scenes.centred_source(sources, i, errors.COMPARED_SIDE),
+        )
         image = None
-        if highest:
-            point = one.shape[0] < 0
+        if maxk_threshold:
+            point = source.shape[0] < 0
             image = (
-                references.by_series(one, own, errors.COMPARED)
+                references.image_by_series(source, source_psf, errors.COMPARED_SIDE)
                 if point
-                else references.image(one, own, errors.COMPARED, highest)
+                else references.reference_image(source, source_psf, errors.COMPARED_SIDE, maxk_threshold)
             )
         if image is None:
-            image = scenes.draw(one, own, VIS, _TRUTH, errors.COMPARED)
-        sheared = one.shape[0] >= 0 and pairs > 0
-        pairs -= sheared
-        out.append(Known(one, own, image, _response(one, own, NONE, _TRUTH) if sheared else None))
+            image = scenes.draw_sources(source, source_psf, VIS, _TRUTH, errors.COMPARED_SIDE)
+        sheared = source.shape[0] >= 0 and num_pairs > 0
+        num_pairs -= sheared
+        out.append(
+            Reference(
+                source, source_psf, image, _response(source, source_psf, NO_APPROXIMATION, _TRUTH) if sheared else None
+            )
+        )
     return out
 
 
-def _truth(one: Sources, own: model.Psf, highest: float) -> Float | None:
+def _truth(source: Sources, psf: model.Psf, maxk_threshold: float) -> Float | None:
     """Of a galaxy galsim's; a point has no profile that it would be needed for."""
-    if one.shape[0] < 0:
-        return references.by_series(one, own, errors.COMPARED)
-    return references.image(one, own, errors.COMPARED, highest)
+    if source.shape[0] < 0:
+        return references.image_by_series(source, psf, errors.COMPARED_SIDE)
+    return references.reference_image(source, psf, errors.COMPARED_SIDE, maxk_threshold)
 
 
-def _response(one: Sources, psf: model.Psf, approximation: Approximation, settings: Settings) -> Float:
-    return errors.response(lambda each: approximation.draw(each, psf, VIS, settings, errors.COMPARED), one, VIS.scale)
+def _response(source: Sources, psf: model.Psf, approximation: Approximation, settings: Settings) -> Float:
+    return errors.response(
+        lambda each: approximation.draw(each, psf, VIS, settings, errors.COMPARED_SIDE), source, VIS.scale
+    )
 
 
-def compared(
-    settings: Settings, galaxies: list[Known], others: list[Known], approximation: Approximation = NONE
+def compare(
+    settings: Settings,
+    galaxies: list[Reference],
+    simplified: list[Reference],
+    approximation: Approximation = NO_APPROXIMATION,
 ) -> tuple[Float, Float]:
     """(errors [n, 5], m and c [pairs, 2]) of galaxies; others : the same as they are approximated, or themselves."""
-    found, bias = [], []
-    for galaxy, other in zip(galaxies, others, strict=True):
-        image = approximation.draw(other.sources, other.psf, VIS, settings, errors.COMPARED)
-        found.append(errors.errors(image, galaxy.image, VIS, galaxy.sources))
+    error_values, bias = [], []
+    for galaxy, simplified_galaxy in zip(galaxies, simplified, strict=True):
+        image = approximation.draw(
+            simplified_galaxy.sources, simplified_galaxy.psf, VIS, settings, errors.COMPARED_SIDE
+        )
+        error_values.append(errors.errors(image, galaxy.image, VIS, galaxy.sources))
         if galaxy.response is not None:
-            response = _response(other.sources, other.psf, approximation, settings)
+            response = _response(simplified_galaxy.sources, simplified_galaxy.psf, approximation, settings)
             bias.append(errors.bias(response, galaxy.response))
-    return np.array(found), np.array(bias)
+    return np.array(error_values), np.array(bias)
 
 
-def _summary(found: Float, bias: Float) -> Row:
+def _summary(error_values: Float, bias: Float) -> Row:
     m, c = np.abs(bias).max(axis=0)
-    return {**errors.figures(found), "shear_m_worst": float(m), "shear_c_worst": float(c), "galaxies": len(found)}
+    return {
+        **errors.figures(error_values),
+        "shear_m_worst": float(m),
+        "shear_c_worst": float(c),
+        "galaxies": len(error_values),
+    }
 
 
-def point(
-    settings: Settings, chosen: list[Known], held: list[Known], psf_errors: Mapping[str, dict[str, float]]
+def measure_settings(
+    settings: Settings,
+    chosen_sample: list[Reference],
+    test_sample: list[Reference],
+    psf_errors: Mapping[str, dict[str, float]],
 ) -> Row:
     """Errors of settings: of the sources that they are chosen on, and of others.
 
     psf_errors : "" and "_held": the largest errors of the PSF's own positions and colours
     """
     row: Row = {}
-    for kind, some in (("", chosen), ("_held", held)):
-        found, bias = compared(settings, some, some)
-        drawn = _largest(found, bias, np.array([each.star for each in some]))
+    for kind, sample_part in (("", chosen_sample), ("_held", test_sample)):
+        error_values, bias = compare(settings, sample_part, sample_part)
+        drawn = _largest_errors(error_values, bias, np.array([each.is_star for each in sample_part]))
         row |= {f"{name}{kind}": math.hypot(drawn[name], psf_errors[kind].get(name, 0.0)) for name in _NUMBERS}
         row |= {f"{name}{kind}_drawn": value for name, value in drawn.items()}
-    mag = np.array([float(scenes.magnitudes(each.sources, VIS)[0]) for each in held])
+    mag = np.array([float(scenes.magnitudes(each.sources, VIS)[0]) for each in test_sample])
     for low, high in pairwise(scenes.LAYERS):
-        row[f"background_held_m{low:g}"] = float(found[(mag >= low) & (mag < high), 4].max(initial=0.0))
-    galaxy = np.array([not each.star for each in held])
-    return {**row, **_summary(found[galaxy], bias)}
+        row[f"background_held_m{low:g}"] = float(error_values[(mag >= low) & (mag < high), 4].max(initial=0.0))
+    galaxy = np.array([not each.is_star for each in test_sample])
+    return {**row, **_summary(error_values[galaxy], bias)}
 
 
-def _largest(found: Float, bias: Float, star: Bool) -> dict[str, float]:
+def _largest_errors(error_values: Float, bias: Float, is_star: Bool) -> dict[str, float]:
     """Errors in the terms of an accuracy; found [n, 5] and bias [pairs, 2] of `compared`."""
-    worst = found.max(axis=0)
+    worst = error_values.max(axis=0)
     return {
         "flux": float(np.expm1(worst[0] / _MAG)),
-        "shape": float(max(worst[3] / 2, np.abs(bias).max(), positions.LENSED * found[star, 2].max(initial=0.0))),
+        "shape": float(
+            max(worst[3] / 2, np.abs(bias).max(), positions.R2_RATIO * error_values[is_star, 2].max(initial=0.0))
+        ),
         "position": float(worst[1] / 1e3 / VIS.scale),
         "background": float(worst[4]),
     }
 
 
-def approximated(approximation: Approximation, settings: Settings, repeats: int, quoted: list[Known]) -> Row:
+def measure_approximation(
+    approximation: Approximation, settings: Settings, repeats: int, quoted: list[Reference]
+) -> Row:
     """What an approximation buys and costs: seconds of its galaxies with and without, and errors."""
-    n, pairs, timed = approximation.numbers
-    some, full = scenes.sources(VIS, _SCENE_SEED, stars=0), scenes.psf_of(VIS)
-    if timed:
-        some = approximation.concerned(VIS, _SCENE_SEED, timed)
-    row: Row = {"galaxies_timed": len(some), "seconds_before": _seconds(some, full, settings, repeats)}
-    simple, less = approximation.simplified(some), approximation.psf(full)
-    row["seconds"] = _seconds(simple, less, settings, repeats, approximation.timed or approximation)
-    some = approximation.concerned(VIS, _QUOTED_SEED, n)
-    galaxies = quoted if approximation.concerned is NONE.concerned else sample(some, pairs)
-    others = [_changed(galaxy, some, less, approximation) for galaxy in galaxies]
+    n, pairs, num_timed = approximation.sample_sizes
+    sources, full_psf = scenes.sources(VIS, _SCENE_SEED, stars=0), scenes.scene_psf(VIS)
+    if num_timed:
+        sources = approximation.select_galaxies(VIS, _SCENE_SEED, num_timed)
+    row: Row = {"galaxies_timed": len(sources), "seconds_before": _seconds(sources, full_psf, settings, repeats)}
+    simple_sources, simple_psf = approximation.simplify(sources), approximation.simplify_psf(full_psf)
+    row["seconds"] = _seconds(simple_sources, simple_psf, settings, repeats, approximation.timed_as or approximation)
+    sources = approximation.select_galaxies(VIS, _QUOTED_SEED, n)
+    galaxies = (
+        quoted if approximation.select_galaxies is NO_APPROXIMATION.select_galaxies else make_references(sources, pairs)
+    )
+    simplified = [_simplify_galaxy(galaxy, sources, simple_psf, approximation) for galaxy in galaxies]
     # Nothing but the approximation is wrong: the stamps are large, unless they are what is approximated.
-    wide = _TRUTH if approximation.sizes is NONE.sizes else settings
-    return {**row, **_summary(*compared(wide, galaxies, others, approximation))}
+    settings_used = _TRUTH if approximation.sizes is NO_APPROXIMATION.sizes else settings
+    return {**row, **_summary(*compare(settings_used, galaxies, simplified, approximation))}
 
 
-def _changed(galaxy: Known, some: Sources, less: model.Psf, approximation: Approximation) -> Known:
+def _simplify_galaxy(
+    galaxy: Reference, sources: Sources, simple_psf: model.Psf, approximation: Approximation
+) -> Reference:
     """A galaxy of `some` as it is approximated; `less`: the detector's PSF as it is."""
-    one = replace(approximation.simplified(galaxy.sources), photons=None)
-    if approximation.psf is NONE.psf:
-        return replace(galaxy, sources=one)
-    place = np.flatnonzero(some.ids == galaxy.sources.ids[0])
-    return replace(galaxy, sources=one, psf=scenes.own(less, approximation.simplified(some), int(place[0])))
+    source = replace(approximation.simplify(galaxy.sources), photons=None)
+    if approximation.simplify_psf is NO_APPROXIMATION.simplify_psf:
+        return replace(galaxy, sources=source)
+    place = np.flatnonzero(sources.ids == galaxy.sources.ids[0])
+    return replace(
+        galaxy, sources=source, psf=scenes.psf_of_source(simple_psf, approximation.simplify(sources), int(place[0]))
+    )
 
 
 def _seconds(
-    some: Sources, psf: model.Psf, settings: Settings, repeats: int, approximation: Approximation = NONE
+    sources: Sources, psf: model.Psf, settings: Settings, repeats: int, approximation: Approximation = NO_APPROXIMATION
 ) -> float:
     """CPU s of sources on the scene's frame."""
     # The brightest are drawn in double precision, which is compiled on its own.
-    bright = some.electrons >= np.sort(some.electrons)[-3:].min()
-    approximation.draw(some.take(bright | (np.arange(len(some)) % 500 == 0)), psf, VIS, settings)
-    return report.best(lambda: approximation.draw(some, psf, VIS, settings), repeats, time.process_time)
+    is_bright = sources.electrons >= np.sort(sources.electrons)[-3:].min()
+    approximation.draw(sources.take(is_bright | (np.arange(len(sources)) % 500 == 0)), psf, VIS, settings)
+    return report.best_time(lambda: approximation.draw(sources, psf, VIS, settings), repeats, time.process_time)
 
 
-def together(some: Sequence[Settings], repeats: int) -> dict[Settings, float]:
+def time_settings(settings_list: Sequence[Settings], repeats: int) -> dict[Settings, float]:
     """CPU s of the scene's sources by settings, each drawn in turn: what else the machine does is shared by all."""
-    scene, out = scenes.sources(VIS, _SCENE_SEED), dict.fromkeys(some, np.inf)
+    scene, out = scenes.sources(VIS, _SCENE_SEED), dict.fromkeys(settings_list, np.inf)
     for _ in range(repeats):
-        for each in some:
-            psf = scenes.psf_of(VIS, each.positions, each.colours)
+        for each in settings_list:
+            psf = scenes.scene_psf(VIS, each.positions, each.colours)
             out[each] = min(out[each], _seconds(scene, psf, each, 1))
     return out
 
 
-def by_galsim(held: list[Known], each: int) -> Row:
+def measure_galsim(test_sample: list[Reference], num_per_bin: int) -> Row:
     """galsim's default: seconds of the scene's galaxies, errors of the same galaxies as ours against the same truth."""
-    default, _ = peers.galsim_seconds(VIS, each)
-    some = [known for known in held if not known.star]
-    found = [
-        errors.errors(peers.galsim_image(g.sources, g.psf, errors.COMPARED), g.image, VIS, g.sources) for g in some
+    default, _ = peers.galsim_seconds(VIS, num_per_bin)
+    galaxies = [reference for reference in test_sample if not reference.is_star]
+    error_values = [
+        errors.errors(peers.galsim_image(g.sources, g.psf, errors.COMPARED_SIDE), g.image, VIS, g.sources)
+        for g in galaxies
     ]
-    return {"seconds": default, **errors.figures(np.array(found)), "galaxies": len(found)}
+    return {"seconds": default, **errors.figures(np.array(error_values)), "galaxies": len(error_values)}
 
 
-def oracles(held: list[Known]) -> Iterator[Row]:
+def compare_oracles(test_sample: list[Reference]) -> Iterator[Row]:
     """How far galsim's tightest is to be trusted: others that should be as good, against it, of the same galaxies."""
-    some = [known for known in held if not known.star]
-    ways: dict[str, Callable[[Known], Float | None]] = {
-        "ours, the largest stamps": lambda g: scenes.draw(g.sources, g.psf, VIS, _TRUTH, errors.COMPARED)
+    galaxies = [reference for reference in test_sample if not reference.is_star]
+    draw_functions: dict[str, Callable[[Reference], Float | None]] = {
+        "ours, the largest stamps": lambda g: scenes.draw_sources(g.sources, g.psf, VIS, _TRUTH, errors.COMPARED_SIDE)
     }
-    for name, folding, highest in _LOOSER:
-        ways[name] = partial(_looser, folding=folding, highest=highest)
-    ways["the PSF by its Fourier series"] = _by_series
-    for name, way in ways.items():
-        images = [(way(known), known) for known in some]
-        found = [errors.errors(image, g.image, VIS, g.sources) for image, g in images if image is not None]
-        yield {"kind": "oracle", "name": name, **errors.figures(np.array(found)), "galaxies": len(found)}
+    for name, folding_threshold, maxk_threshold in _LOOSER_THRESHOLDS:
+        draw_functions[name] = partial(
+            _draw_with_thresholds, folding_threshold=folding_threshold, maxk_threshold=maxk_threshold
+        )
+    draw_functions["the PSF by its Fourier series"] = _draw_by_series
+    for name, draw_galaxy in draw_functions.items():
+        images = [(draw_galaxy(reference), reference) for reference in galaxies]
+        error_values = [errors.errors(image, g.image, VIS, g.sources) for image, g in images if image is not None]
+        yield {"kind": "oracle", "name": name, **errors.figures(np.array(error_values)), "galaxies": len(error_values)}
     # Of those that are small beside the frame, ours against the better of both.
-    faint = [known for known in some if float(scenes.magnitudes(known.sources, VIS)[0]) > _SMALL]
-    found = [errors.errors(ways["ours, the largest stamps"](g), _by_series(g), VIS, g.sources) for g in faint]  # type: ignore[arg-type]
-    yield {"kind": "series", "name": "ours", **errors.figures(np.array(found)), "galaxies": len(found)}
+    faint = [reference for reference in galaxies if float(scenes.magnitudes(reference.sources, VIS)[0]) > _SMALL]
+    error_values = [
+        errors.errors(draw_functions["ours, the largest stamps"](g), _draw_by_series(g), VIS, g.sources) for g in faint
+    ]  # type: ignore[arg-type]
+    yield {"kind": "series", "name": "ours", **errors.figures(np.array(error_values)), "galaxies": len(error_values)}
 
 
-def _by_series(known: Known) -> Float:
-    return references.by_series(known.sources, known.psf, errors.COMPARED)
+def _draw_by_series(reference: Reference) -> Float:
+    return references.image_by_series(reference.sources, reference.psf, errors.COMPARED_SIDE)
 
 
-def _looser(known: Known, folding: float, highest: float) -> Float | None:
-    return references.image(known.sources, known.psf, errors.COMPARED, highest, folding)
+def _draw_with_thresholds(reference: Reference, folding_threshold: float, maxk_threshold: float) -> Float | None:
+    return references.reference_image(
+        reference.sources, reference.psf, errors.COMPARED_SIDE, maxk_threshold, folding_threshold
+    )
 
 
-def walk(quick: bool, repeats: int) -> Iterator[Row]:
+def measure_all(quick: bool, repeats: int) -> Iterator[Row]:
     """A row a point, each in a process of its own."""
     chain = [_CHAIN[0], _CHAIN[_SURVEY]] if quick else _CHAIN
     changed = [] if quick else [Settings(**{**asdict(_CHAIN[_SURVEY]), name: value}) for name, value in _CHANGED]
-    each, others, pairs = (1, 1, 2) if quick else (_EACH, _HELD, _SHEARED)
-    chosen = sample(scenes.stratified(VIS, _CHOSEN_SEED, each), pairs)
-    held = errors.capped(sample, scenes.stratified(VIS, _HELD_SEED, others), pairs, 0.0 if quick else _HIGHEST)
-    kinds = list(dict.fromkeys((some.positions, some.colours) for some in (*chain, *changed)))
-    stars = (positions.STARS, positions.HELD)
-    psf_errors = [positions.largest(seed, 4 if quick else n, kinds) for seed, n in zip(_PSF_SEEDS, stars, strict=True)]
-    seconds = errors.capped(together, [*chain, *changed], repeats)
-    for kind, some in (("settings", chain), ("changed", changed)):
-        for i, settings in enumerate(some):
+    num_chosen, num_test, pairs = (1, 1, 2) if quick else (_NUM_CHOSEN, _NUM_TEST, _NUM_SHEARED)
+    chosen_sample = make_references(scenes.stratified_sample(VIS, _CHOSEN_SEED, num_chosen), pairs)
+    test_sample = errors.run_with_memory_limit(
+        make_references, scenes.stratified_sample(VIS, _TEST_SEED, num_test), pairs, 0.0 if quick else _MAXK_THRESHOLD
+    )
+    psf_variants = list(dict.fromkeys((candidate.positions, candidate.colours) for candidate in (*chain, *changed)))
+    stars = (positions.NUM_STARS, positions.NUM_TEST_STARS)
+    psf_errors = [
+        positions.largest_errors(seed, 4 if quick else n, psf_variants)
+        for seed, n in zip(_PSF_SEEDS, stars, strict=True)
+    ]
+    seconds = errors.run_with_memory_limit(time_settings, [*chain, *changed], repeats)
+    for kind, settings_group in (("settings", chain), ("changed", changed)):
+        for i, settings in enumerate(settings_group):
             name = f"{i + 1}" if kind == "settings" else "{} {:g}".format(*_CHANGED[i])
-            own = {
-                end: of[settings.positions, settings.colours] for end, of in zip(("", "_held"), psf_errors, strict=True)
+            psf_error_pair = {
+                end: errors_by_variant[settings.positions, settings.colours]
+                for end, errors_by_variant in zip(("", "_held"), psf_errors, strict=True)
             }
-            found = errors.capped(point, settings, chosen, held, own)
-            about = {"kind": kind, "name": name, **asdict(settings), "seconds": seconds[settings]}
-            yield {**about, **found, "machine": report.machine()}
+            figures = errors.run_with_memory_limit(
+                measure_settings, settings, chosen_sample, test_sample, psf_error_pair
+            )
+            header = {"kind": kind, "name": name, **asdict(settings), "seconds": seconds[settings]}
+            yield {**header, **figures, "machine": report.machine()}
     if not quick:
-        yield {"kind": "peer", "name": "galsim", **errors.capped(by_galsim, held, 4)}
-        yield from errors.capped(lambda: list(oracles(held)))
-    quoted = sample(scenes.sample(VIS, _QUOTED_SEED, 6 if quick else _QUOTED), 2 if quick else _PAIRS)
+        yield {"kind": "peer", "name": "galsim", **errors.run_with_memory_limit(measure_galsim, test_sample, 4)}
+        yield from errors.run_with_memory_limit(lambda: list(compare_oracles(test_sample)))
+    quoted = make_references(scenes.sample(VIS, _QUOTED_SEED, 6 if quick else _NUM_QUOTED), 2 if quick else _NUM_PAIRS)
     for approximation in approximations.ALL[:1] if quick else approximations.ALL:
-        found = errors.capped(approximated, approximation, _CHAIN[_SURVEY], repeats, quoted)
-        yield {"kind": "approximation", "name": approximation.name, **found}
+        figures = errors.run_with_memory_limit(measure_approximation, approximation, _CHAIN[_SURVEY], repeats, quoted)
+        yield {"kind": "approximation", "name": approximation.name, **figures}
 
 
-def _line(row: Row) -> str:
-    shown = ("seconds", "aperture_mag_rms", "r2_rms", "r2_worst", "ellipticity_worst", "shear_m_worst", "shear_c_worst")
-    return f"{row['kind']:14}{row['name']:32}" + "".join(f"{row[key]:>12.2g}" for key in shown if key in row)
+def _format_row(row: Row) -> str:
+    columns = (
+        "seconds",
+        "aperture_mag_rms",
+        "r2_rms",
+        "r2_worst",
+        "ellipticity_worst",
+        "shear_m_worst",
+        "shear_c_worst",
+    )
+    return f"{row['kind']:14}{row['name']:32}" + "".join(f"{row[key]:>12.2g}" for key in columns if key in row)
 
 
 def write(rows: list[Row], file: Path) -> None:
@@ -305,22 +367,22 @@ def write(rows: list[Row], file: Path) -> None:
 def settings_table(rows: list[Row]) -> str:
     """The table that truesky.request.accuracy reads, of the rows of trade.csv."""
     names = _SETTINGS.splitlines()[-1].split(",")
-    some = [row for row in rows if row["kind"] == "settings"]
-    lines = [",".join(f"{float(row[name]):.4g}" for name in names) for row in some]
-    return _SETTINGS.format(machine=some[0]["machine"]) + "\n".join(lines) + "\n"
+    setting_rows = [row for row in rows if row["kind"] == "settings"]
+    lines = [",".join(f"{float(row[name]):.4g}" for name in names) for row in setting_rows]
+    return _SETTINGS.format(machine=setting_rows[0]["machine"]) + "\n".join(lines) + "\n"
 
 
-def pareto(rows: list[Row], file: Path) -> None:
+def draw_figure(rows: list[Row], file: Path) -> None:
     """Seconds against the errors of flux, shape and position."""
     from matplotlib.figure import Figure
 
-    shown = {"aperture_mag_rms": 'flux in 1", mag', "r2_rms": "R², relative", "ellipticity_rms": "ellipticity"}
+    labels = {"aperture_mag_rms": 'flux in 1", mag', "r2_rms": "R², relative", "ellipticity_rms": "ellipticity"}
     figure = Figure(figsize=(13, 4.2), layout="constrained")
     axes = figure.subplots(1, 4, sharey=True)
-    for axis, (key, label) in zip(axes, (shown | {"centroid_mas_rms": "position, mas"}).items(), strict=True):
+    for axis, (key, label) in zip(axes, (labels | {"centroid_mas_rms": "position, mas"}).items(), strict=True):
         for kind, style in (("settings", "o-"), ("changed", "x"), ("peer", "s")):
-            some = [row for row in rows if row["kind"] == kind]
-            axis.loglog([row[key] for row in some], [row["seconds"] for row in some], style, label=kind)
+            points = [row for row in rows if row["kind"] == kind]
+            axis.loglog([row[key] for row in points], [row["seconds"] for row in points], style, label=kind)
         axis.set_xlabel(f"rms error: {label}")
     axes[0].set_ylabel("CPU s of a VIS detector")
     axes[0].legend()
@@ -329,35 +391,41 @@ def pareto(rows: list[Row], file: Path) -> None:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Walks, prints and writes what is asked for."""
-    own = argparse.ArgumentParser(add_help=False)
-    own.add_argument("--csv", type=Path, metavar="FILE", help="write the points to this file")
-    own.add_argument("--figure", type=Path, metavar="FILE", help="draw seconds against errors")
-    own.add_argument("--settings", type=Path, metavar="FILE", help="write the table that settings are chosen from")
-    own.add_argument("--positions", type=Path, metavar="FILE", help="write the table of positions of the PSF alone")
-    own.add_argument("--repeats", type=int, default=3, help="of every time, the best of which counts")
-    known, others = own.parse_known_args(argv)
-    options = report.options("trade", __doc__ or "", others)
-    if known.positions:
-        known.positions.write_text(positions.text(positions.rows(positions.STARS)), encoding="utf-8")
+    extra_parser = argparse.ArgumentParser(add_help=False)
+    extra_parser.add_argument("--csv", type=Path, metavar="FILE", help="write the points to this file")
+    extra_parser.add_argument("--figure", type=Path, metavar="FILE", help="draw seconds against errors")
+    extra_parser.add_argument(
+        "--settings", type=Path, metavar="FILE", help="write the table that settings are chosen from"
+    )
+    extra_parser.add_argument(
+        "--positions", type=Path, metavar="FILE", help="write the table of positions of the PSF alone"
+    )
+    extra_parser.add_argument("--repeats", type=int, default=3, help="of every time, the best of which counts")
+    extra_options, other_arguments = extra_parser.parse_known_args(argv)
+    options = report.options("trade", __doc__ or "", other_arguments)
+    if extra_options.positions:
+        extra_options.positions.write_text(
+            positions.table_text(positions.measure_positions(positions.NUM_STARS)), encoding="utf-8"
+        )
         return 0
-    repeats = 1 if options.quick else known.repeats
+    repeats = 1 if options.quick else extra_options.repeats
     rows: list[Row] = []
-    for row in walk(options.quick, repeats):
+    for row in measure_all(options.quick, repeats):
         rows.append(row)
-        print(_line(row), flush=True)
+        print(_format_row(row), flush=True)
         # After every point: the walk is long.
-        if known.csv:
-            write(rows, known.csv)
-    if known.figure:
-        pareto(rows, known.figure)
-    if known.settings:
-        known.settings.write_text(settings_table(rows), encoding="utf-8")
+        if extra_options.csv:
+            write(rows, extra_options.csv)
+    if extra_options.figure:
+        draw_figure(rows, extra_options.figure)
+    if extra_options.settings:
+        extra_options.settings.write_text(settings_table(rows), encoding="utf-8")
     figures = {
         f"{row['name']}_s".replace(" ", "_"): float(row["seconds"])
         for row in rows
         if "seconds" in row and row["kind"] != "settings"
     }
-    report.finish("trade", repeats, figures, {}, options.json)
+    report.print_and_write("trade", repeats, figures, {}, options.json)
     return 0
 
 

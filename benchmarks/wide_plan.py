@@ -23,9 +23,9 @@ from benchmarks import report
 from lake_schema.store import layout, read
 from truesky.render import plan_exposures
 from truesky.render.forecasting import speed
-from truesky.render.planning import parts
+from truesky.render.planning import exposure_chunks
 from truesky.request.from_toml import parse
-from truesky.running.measured import forget_peak, peak_gb
+from truesky.running.task_metrics import peak_memory_gb, reset_peak_memory
 
 ROOT = Path(__file__).resolve().parents[1]
 FIELDS, QUICK_FIELDS = 34_000, 600
@@ -48,45 +48,52 @@ _NOTES = {
 _POLL_S = 0.5
 
 
-def planned(folder: Path, fields: int, cores: int) -> dict[str, float]:
+def measure_planner(folder: Path, fields: int, cores: int) -> dict[str, float]:
     """The job, its clock, and the memory of its processes, looked at twice a second."""
     request, lake = folder / "wide.toml", folder / "lake"
     request.write_text(REQUEST.format(fields=fields))
     submit = shutil.which("spark-submit", path=str(Path(sys.executable).parent)) or "spark-submit"
     job = ROOT / "jobs" / "render" / "plan_exposures.py"
-    words = [submit, "--master", f"local[{cores}]", job, "--lake", lake, "--request", request]
-    most: dict[str, float] = defaultdict(float)
+    command = [submit, "--master", f"local[{cores}]", job, "--lake", lake, "--request", request]
+    peaks: dict[str, float] = defaultdict(float)
     started = time.perf_counter()
-    with subprocess.Popen([str(word) for word in words], cwd="/", stdout=sys.stderr) as running:
+    with subprocess.Popen([str(word) for word in command], cwd="/", stdout=sys.stderr) as running:
         while running.poll() is None:
-            for name, size in _held(running.pid).items():
-                most[name] = max(most[name], size)
+            for name, size in _process_memory(running.pid).items():
+                peaks[name] = max(peaks[name], size)
             time.sleep(_POLL_S)
     if running.returncode:
         raise SystemExit(f"plan_exposures ended with status {running.returncode}")
-    version = read.version(layout.lake(lake), "tasks")
-    return {"plan_s": time.perf_counter() - started, "tasks": version.num_rows, "parts": len(version.parts), **most}
+    version = read.version(layout.resolve_lake(lake), "tasks")
+    return {
+        "plan_s": time.perf_counter() - started,
+        "tasks": version.num_rows,
+        "parts": len(version.partitions),
+        **peaks,
+    }
 
 
-def _held(pid: int) -> dict[str, float]:
+def _process_memory(pid: int) -> dict[str, float]:
     """GB of the driver's Python and Java together, of its Python, of the largest worker."""
     java = python = worker = 0.0
-    for own in _below(pid):
+    for process_id in _process_tree(pid):
         try:
-            name = Path(f"/proc/{own}/cmdline").read_text().replace("\0", " ")
-            held = int(Path(f"/proc/{own}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e9
+            name = Path(f"/proc/{process_id}/cmdline").read_text().replace("\0", " ")
+            resident_gb = (
+                int(Path(f"/proc/{process_id}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e9
+            )
         except (OSError, IndexError):
             continue
         if "truesky.running.spark_workers" in name:
-            worker = max(worker, held)
+            worker = max(worker, resident_gb)
         elif "plan_exposures.py" in name and "java" in name.split(" ")[0]:
-            java += held
+            java += resident_gb
         elif "plan_exposures.py" in name and "python" in name.split(" ")[0]:
-            python += held
+            python += resident_gb
     return {"driver_gb": java + python, "driver_python_gb": python, "worker_gb": worker}
 
 
-def _below(pid: int) -> list[int]:
+def _process_tree(pid: int) -> list[int]:
     """The process and those that it started."""
     parents = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
@@ -94,33 +101,33 @@ def _below(pid: int) -> list[int]:
             parents[int(path.parent.name)] = int(path.read_text().rpartition(")")[2].split()[1])
         except OSError:
             continue
-    found = [pid]
-    for one in found:
-        found += [child for child, parent in parents.items() if parent == one]
-    return found
+    process_ids = [pid]
+    for process_id in process_ids:
+        process_ids += [child for child, parent in parents.items() if parent == process_id]
+    return process_ids
 
 
-def grown(reader: Callable[[Path], None], lake: Path) -> float:
+def added_memory(reader: Callable[[Path], None], lake: Path) -> float:
     """GB that a reader adds to a process of its own."""
-    forget_peak()
-    before = peak_gb()
+    reset_peak_memory()
+    initial = peak_memory_gb()
     reader(lake)
-    return peak_gb() - before
+    return peak_memory_gb() - initial
 
 
-def forecast(lake: Path) -> None:
+def sum_plan(lake: Path) -> None:
     """Add up the whole plan."""
-    speed.of_machine(lake)
+    speed.estimate_speed(lake)
     plan_exposures._print_published(lake, read.version(lake, "tasks"))
 
 
-def chosen(lake: Path) -> None:
+def choose_detectors(lake: Path) -> None:
     """Choose one detector of each of the last thousand exposures that have it."""
     versions = {name: read.version(lake, name) for name in ("exposures", "tasks")}
     request = parse(lake.parent / "wide.toml")
     last = versions["exposures"].num_rows
     narrow = replace(request, detectors=("3-4",), limit=1000)
-    parts.chosen(versions["exposures"], versions["tasks"], narrow, range(last - 10, last))
+    exposure_chunks.select_for_rendering(versions["exposures"], versions["tasks"], narrow, range(last - 10, last))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -128,11 +135,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = report.options("wide_plan", __doc__ or "", argv)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        figures = planned(folder, QUICK_FIELDS if options.quick else FIELDS, 2)
+        figures = measure_planner(folder, QUICK_FIELDS if options.quick else FIELDS, 2)
         with ProcessPoolExecutor(1, get_context("spawn"), max_tasks_per_child=1) as pool:
-            for key, reader in (("forecast_gb", forecast), ("chosen_gb", chosen)):
-                figures[key] = pool.submit(grown, reader, layout.lake(folder / "lake")).result()
-    report.finish("wide_plan", 1, figures, _NOTES, options.json)
+            for key, reader in (("forecast_gb", sum_plan), ("chosen_gb", choose_detectors)):
+                figures[key] = pool.submit(added_memory, reader, layout.resolve_lake(folder / "lake")).result()
+    report.print_and_write("wide_plan", 1, figures, _NOTES, options.json)
     return 0
 
 

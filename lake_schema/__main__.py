@@ -12,7 +12,7 @@ from pathlib import Path
 
 from lake_schema import __version__, command, listing, tables
 from lake_schema.errors import BadInput
-from lake_schema.store import garbage, layout, names, read
+from lake_schema.store import garbage, layout, read, request_links
 from lake_schema.store.object_storage.s3 import Folder
 
 
@@ -25,92 +25,92 @@ def main(argv: Sequence[str] | None = None) -> int:
         return mission.main(arguments[1:])
     parser = argparse.ArgumentParser(prog="python -m lake_schema", description=__doc__, epilog=f"truesky {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="list|verify|gc|describe|tables")
-    one = {name: commands.add_parser(name) for name in ("list", "verify", "gc", "describe")}
-    for name, its in one.items():
-        its.add_argument("lake", help="folder of the lake" + ("" if name == "gc" else ", or s3://BUCKET/PREFIX"))
+    subparsers = {name: commands.add_parser(name) for name in ("list", "verify", "gc", "describe")}
+    for name, subparser in subparsers.items():
+        subparser.add_argument("lake", help="folder of the lake" + ("" if name == "gc" else ", or s3://BUCKET/PREFIX"))
         if name != "gc":
-            its.add_argument(
+            subparser.add_argument(
                 "--endpoint-url", help="of the object storage (default: $AWS_ENDPOINT_URL, else Amazon S3)"
             )
-        its.add_argument("table", nargs="?", help="one table (default: all of them)")
+        subparser.add_argument("table", nargs="?", help="one table (default: all of them)")
         if name in ("verify", "describe"):
-            its.add_argument("--name", help="only what belongs to this request (default: all of them)")
-    one["list"].add_argument("--json", action="store_true", help="one JSON list instead of columns")
-    one["verify"].add_argument("--deep", action="store_true", help="read every byte and compare its sha256")
-    one["gc"].add_argument("--delete", action="store_true", help="remove what is said; without it nothing is")
+            subparser.add_argument("--name", help="only what belongs to this request (default: all of them)")
+    subparsers["list"].add_argument("--json", action="store_true", help="one JSON list instead of columns")
+    subparsers["verify"].add_argument("--deep", action="store_true", help="read every byte and compare its sha256")
+    subparsers["gc"].add_argument("--delete", action="store_true", help="remove what is said; without it nothing is")
     commands.add_parser("tables")
     options = parser.parse_args(arguments)
     if options.command == "tables":
-        print(tables.markdown(), end="")
+        print(tables.to_markdown(), end="")
         return 0
-    return command.status("lake_schema", lambda: _looked_after(options))
+    return command.run("lake_schema", lambda: _run_command(options))
 
 
-def _looked_after(options: argparse.Namespace) -> int:
+def _run_command(options: argparse.Namespace) -> int:
     if options.command == "gc":
-        return _gc(layout.lake(options.lake), options.table, options.delete)
-    root = layout.opened(options.lake, options.endpoint_url)
+        return _collect_garbage(layout.resolve_lake(options.lake), options.table, options.delete)
+    root = layout.open_lake(options.lake, options.endpoint_url)
     if options.command == "list":
-        return _list(root, options.table, options.json)
-    own = names.checked(root, options.name) if options.name else None
-    there = names.tables(root, own) if own else read.tables(root)
-    if not (chosen := [options.table] if options.table else there):
+        return _list_versions(root, options.table, options.json)
+    request = request_links.check_request(root, options.name) if options.name else None
+    table_names = request_links.tables_of_request(root, request) if request else read.table_names(root)
+    if not (selected := [options.table] if options.table else table_names):
         raise BadInput(f"lake {root} holds no table")
 
-    def looked_at(name: str) -> int:
-        versions = _versions(root, name, own)
+    def inspect_table(name: str) -> int:
+        versions = _versions_of_table(root, name, request)
         return max(int(_verify(v, options.deep) if options.command == "verify" else _describe(v)) for v in versions)
 
     # What is wrong with one table is said, and the others are looked at all the same.
-    return max(command.status("lake_schema", lambda name=name: looked_at(name)) for name in chosen)  # type: ignore[misc]
+    return max(command.run("lake_schema", lambda name=name: inspect_table(name)) for name in selected)  # type: ignore[misc]
 
 
-def _versions(root: Folder, name: str, own: str | None) -> list[read.Version]:
+def _versions_of_table(root: Folder, name: str, request: str | None) -> list[read.Version]:
     """The current version of a table and those of its requests, or the one of a request."""
-    if own:
-        return [read.version(root, name, request=own)]
-    current, held = layout.current_key(root, name), names.holders(root, name)
-    if current is None and not held:
+    if request:
+        return [read.version(root, name, request=request)]
+    current, keys_by_request = layout.current_key(root, name), request_links.keys_by_request(root, name)
+    if current is None and not keys_by_request:
         raise BadInput(f"lake {root} has no table {name}")
-    found = {held[request]: read.version(root, name, request=request) for request in held}
-    if current is not None and current not in found:
-        found[current] = read.published_last(root, name)
-    return list(found.values())
+    versions_by_key = {keys_by_request[holder]: read.version(root, name, request=holder) for holder in keys_by_request}
+    if current is not None and current not in versions_by_key:
+        versions_by_key[current] = read.latest_version(root, name)
+    return list(versions_by_key.values())
 
 
-def _list(root: Folder, name: str | None, as_json: bool) -> int:
-    found = [row for row in listing.rows(root) if name in (None, row["table"])]
-    if not found:
+def _list_versions(root: Folder, name: str | None, as_json: bool) -> int:
+    rows = [version_row for version_row in listing.rows(root) if name in (None, version_row["table"])]
+    if not rows:
         raise BadInput(f"lake {root} has no table {name}")
-    print(json.dumps(found, indent=1) if as_json else listing.text(found))
-    return int(any("error" in row for row in found))
+    print(json.dumps(rows, indent=1) if as_json else listing.format_table(rows))
+    return int(any("error" in version_row for version_row in rows))
 
 
-def _gc(root: Path, name: str | None, delete: bool) -> int:
-    if not garbage.tables(root):
+def _collect_garbage(root: Path, name: str | None, delete: bool) -> int:
+    if not garbage.table_names(root):
         raise BadInput(f"lake {root} holds no table")
-    found = garbage.collect(root, name, delete)
-    for path in found:
+    paths = garbage.collect(root, name, delete)
+    for path in paths:
         print(f"{'removed' if delete else 'would remove'} {path}")
-    if found and not delete:
+    if paths and not delete:
         print("nothing was removed: gc --delete removes these")
     return 0
 
 
 def _verify(version: read.Version, deep: bool) -> bool:
-    found = read.verify(version, deep)
-    for line in found:
+    faults = read.find_faults(version, deep)
+    for line in faults:
         print(line)
     size = sum(entry["bytes"] for entry in version.manifest["files"])
-    verdict = f"{len(found)} faults" if found else "sound"
+    verdict = f"{len(faults)} faults" if faults else "sound"
     print(f"{version.table:16} v-{version.key} {version.num_rows:12,} rows {size / 1e6:10.1f} MB   {verdict}")
-    return bool(found)
+    return bool(faults)
 
 
 def _describe(version: read.Version) -> bool:
     schema = version.schema
     print(f"{version.table}: {(schema.metadata or {}).get(b'description', b'').decode()}")
-    print(f"  version {version.key}, {version.num_rows:,} rows in {len(version.parts)} files")
+    print(f"  version {version.key}, {version.num_rows:,} rows in {len(version.partitions)} files")
     width = max(len(field.name) for field in schema)
     for field in schema:
         facts = {k.decode(): v.decode() for k, v in (field.metadata or {}).items()}
@@ -119,4 +119,4 @@ def _describe(version: read.Version) -> bool:
 
 
 if __name__ == "__main__":
-    command.leave(main)
+    command.exit_with_status(main)

@@ -102,7 +102,7 @@ class Table:
     doc: str
     key: tuple[str, ...] = ("id",)
     order: int | None = None
-    finest: int | None = None
+    max_order: int | None = None
 
     def __post_init__(self) -> None:
         names = [column.name for column in self.columns]
@@ -124,7 +124,7 @@ class Table:
                 return column
         raise BadInput(f"table {self.name} has no column {name}")
 
-    def arrow(self) -> pa.Schema:
+    def arrow_schema(self) -> pa.Schema:
         """The Arrow schema: types, nullability, field metadata, and the table's name and version."""
         facts = {"table": self.name, "version": str(self.version), "description": self.doc, "key": ",".join(self.key)}
         return pa.schema([column.field() for column in self.columns], metadata=facts)
@@ -142,14 +142,14 @@ class Table:
         if missing:
             raise BadInput(f"table {self.name}: column {', '.join(missing)} is missing")
         rows = len(next(iter(columns.values()))) if columns else 0
-        arrays = [_array(self.name, column, columns.get(column.name), rows) for column in self.columns]
-        return pa.Table.from_arrays(arrays, schema=self.arrow())
+        arrays = [_arrow_array(self.name, column, columns.get(column.name), rows) for column in self.columns]
+        return pa.Table.from_arrays(arrays, schema=self.arrow_schema())
 
     def empty(self) -> pa.Table:
         """A valid table of no rows."""
-        return self.arrow().empty_table()
+        return self.arrow_schema().empty_table()
 
-    def parquet(self) -> dict[str, Any]:
+    def parquet_options(self) -> dict[str, Any]:
         """Keyword arguments of pyarrow.parquet.ParquetWriter that suit the columns.
 
         Measured on random columns: byte-stream-split floats, delta ids, dictionaries only for enumerations and zstd 3
@@ -173,17 +173,17 @@ class Table:
             "version": "2.6",
         }
 
-    def markdown(self) -> str:
+    def to_markdown(self) -> str:
         """The reference page of the table, in Markdown."""
         lines = [f"## {self.name} (version {self.version})", "", self.doc, ""]
         if self.is_catalogue:
-            orders = f"{self.order} to {self.finest}" if self.finest else str(self.order)
+            orders = f"{self.order} to {self.max_order}" if self.max_order else str(self.order)
             lines += [f"HATS catalogue, HEALPix order {orders} files, key `{', '.join(self.key)}`.", ""]
         else:
             lines += [f"Key `{', '.join(self.key)}`.", ""]
         lines += ["| column | type | unit | range | null | UCD | meaning |", "|---|---|---|---|---|---|---|"]
         for c in self.columns:
-            lo, hi = (_shown(bound) for bound in (c.lo, c.hi))
+            lo, hi = (_format_bound(bound) for bound in (c.lo, c.hi))
             bounds = f"{lo} .. {hi}" if lo or hi else ""
             codes = "; ".join(f"{code} {meaning}" for code, meaning in c.codes)
             meaning = c.doc + (f" ({codes})" if codes else "")
@@ -192,13 +192,13 @@ class Table:
         return "\n".join(lines) + "\n"
 
 
-def _shown(bound: float | None) -> str:
+def _format_bound(bound: float | None) -> str:
     if bound is None:
         return ""
     return str(bound) if isinstance(bound, int) else f"{bound:g}"
 
 
-def _array(table: str, column: Column, values: Any, rows: int) -> pa.Array:
+def _arrow_array(table: str, column: Column, values: Any, rows: int) -> pa.Array:
     if values is None:
         return pa.nulls(rows, column.arrow_type)
     if column.mantissa_bits is not None and column.type == "float32":
@@ -211,10 +211,10 @@ def _array(table: str, column: Column, values: Any, rows: int) -> pa.Array:
         values = values.combine_chunks()
     try:
         if isinstance(values, np.ndarray) and values.dtype.kind in "fiub" and column.type != "string":
-            wanted = column.arrow_type.to_pandas_dtype()
-            if np.dtype(wanted).kind in "iu" and values.dtype.kind == "f":
+            target_type = column.arrow_type.to_pandas_dtype()
+            if np.dtype(target_type).kind in "iu" and values.dtype.kind == "f":
                 raise BadInput(f"table {table}: column {column.name} wants {column.type}, got {values.dtype}")
-            values = _fitting(table, column, values, np.dtype(wanted))
+            values = _cast_in_range(table, column, values, np.dtype(target_type))
         array = pa.array(values, column.arrow_type, mask=mask)
     except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError) as error:
         raise BadInput(f"table {table}: column {column.name} wants {column.type}: {error}") from None
@@ -223,12 +223,12 @@ def _array(table: str, column: Column, values: Any, rows: int) -> pa.Array:
     return array
 
 
-def _fitting(table: str, column: Column, values: np.ndarray, wanted: np.dtype) -> np.ndarray:
-    if wanted.kind in "iu" and values.size:
-        limits = np.iinfo(wanted)
+def _cast_in_range(table: str, column: Column, values: np.ndarray, target_type: np.dtype) -> np.ndarray:
+    if target_type.kind in "iu" and values.size:
+        limits = np.iinfo(target_type)
         if values.min() < limits.min or values.max() > limits.max:
             raise BadInput(f"table {table}: column {column.name} does not fit {column.type}")
-    return np.ascontiguousarray(values, dtype=wanted)
+    return np.ascontiguousarray(values, dtype=target_type)
 
 
 def round_mantissa(values: np.ndarray, bits: int) -> np.ndarray:

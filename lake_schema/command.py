@@ -20,7 +20,7 @@ from typing import NoReturn
 from lake_schema.errors import BadInput, LakeError, one_line
 
 
-def status(name: str, body: Callable[[], int]) -> int:
+def run(name: str, body: Callable[[], int]) -> int:
     """What `body` returns; 2 where it refuses what it was given, 1 where the lake or the machine is at fault.
 
     name : of the command, as it is to be named in the line
@@ -37,12 +37,12 @@ def status(name: str, body: Callable[[], int]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except BadInput as error:
-        return say(name, error, 2)
+        return print_error(name, error, 2)
     except (LakeError, OSError, MemoryError) as error:
-        return say(name, error, 1)
+        return print_error(name, error, 1)
 
 
-def leave(main: Callable[..., int], *arguments: object) -> NoReturn:
+def exit_with_status(main: Callable[..., int], *arguments: object) -> NoReturn:
     """Run `main(*arguments)` and end the process with what it returns.
 
     Nobody waits for Arrow's threads: one that still closes a file of ours once Python is being taken down finds no
@@ -63,7 +63,7 @@ def leave(main: Callable[..., int], *arguments: object) -> NoReturn:
     os._exit(code)
 
 
-def limit_resource(name: str, most: int) -> None:
+def limit_resource(name: str, limit: int) -> None:
     """Limit a resource of this process, where the operating system can.
 
     macOS has no limit of a process's memory: there a hostile file or query is bounded by the system alone.
@@ -76,10 +76,10 @@ def limit_resource(name: str, most: int) -> None:
         Bytes, or seconds of CPU time.
     """
     with contextlib.suppress(OSError, ValueError, AttributeError):
-        resource.setrlimit(getattr(resource, name), (most, most))
+        resource.setrlimit(getattr(resource, name), (limit, limit))
 
 
-def say(name: str, error: object, code: int) -> int:
+def print_error(name: str, error: object, code: int) -> int:
     """Print one line, never longer than anybody reads, and return the exit status."""
     with contextlib.suppress(BrokenPipeError):
         print(f"{name}: {one_line(error).strip() or type(error).__name__}", file=sys.stderr, flush=True)

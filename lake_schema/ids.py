@@ -26,12 +26,12 @@ MEMBER_BITS = 18
 # Identifiers that differ above these bits stand for another kind or another generation cell.
 BLOCK_BITS = MEMBER_BITS + _NUMBER_BITS
 # Number and member of drawn halos share so many bits.  Blocks end where the running numbers of other kinds begin.
-_IN_BLOCK_BITS = 23
-BLOCKS = 7 << 14
-FIRST_NUMBER = BLOCKS << _IN_BLOCK_BITS >> MEMBER_BITS
+_NUMBER_AND_MEMBER_BITS = 23
+BLOCK_COUNT = 7 << 14
+FIRST_NUMBER = BLOCK_COUNT << _NUMBER_AND_MEMBER_BITS >> MEMBER_BITS
 # Bits of a member of halos of at least this log10 mass, Msun/h: four times what they have above 10^9.1 are identified,
 # and the densest block of the sky has room for its halos (tests/truesky/catalogue/halos/test_halos.py).
-_BITS_FROM = ((0.0, 7), (11.5, 10), (12.5, 13), (13.5, 17), (14.5, 18), (15.0, 20))
+_MEMBER_BITS_BY_MASS = ((0.0, 7), (11.5, 10), (12.5, 13), (13.5, 17), (14.5, 18), (15.0, 20))
 
 
 def source_id(kind: npt.ArrayLike, cell: npt.ArrayLike, number: npt.ArrayLike, member: npt.ArrayLike = 0) -> Int:
@@ -42,10 +42,10 @@ def source_id(kind: npt.ArrayLike, cell: npt.ArrayLike, number: npt.ArrayLike, m
     returns int64[n].  Errors: BadInput where a number needs more bits than it has
     """
     kinds, numbers, members = (np.asarray(x, np.int64) for x in (kind, number, member))
-    _refuse_beyond("kind", kinds, 8)
-    _refuse_beyond("number", numbers, 1 << _NUMBER_BITS)
-    _refuse_beyond("member", members, 1 << MEMBER_BITS)
-    return np.asarray(kinds << 60 | _cell(cell) | numbers << MEMBER_BITS | members)
+    _check_range("kind", kinds, 8)
+    _check_range("number", numbers, 1 << _NUMBER_BITS)
+    _check_range("member", members, 1 << MEMBER_BITS)
+    return np.asarray(kinds << 60 | _shifted_cell(cell) | numbers << MEMBER_BITS | members)
 
 
 def member_bits(log_mass: npt.ArrayLike) -> Int:
@@ -53,7 +53,7 @@ def member_bits(log_mass: npt.ArrayLike) -> Int:
 
     log_mass : float[n] log10 Msun/h, the lower edge of the halo's bin
     """
-    edges, bits = (np.array(column) for column in zip(*_BITS_FROM, strict=True))
+    edges, bits = (np.array(column) for column in zip(*_MEMBER_BITS_BY_MASS, strict=True))
     # Edges of bins are multiples that are rounded.
     place = np.searchsorted(edges, np.asarray(log_mass, float) + 1e-6, side="right") - 1
     return np.asarray(bits[place], np.int64)
@@ -66,9 +66,9 @@ def drawn_halo_id(cell: npt.ArrayLike, block: Int, number: Int, bits: Int) -> In
     number : int64[n] of the halo among those of its block in this cell;  bits : int64[n] as of `member_bits`
     Errors: BadInput where a number needs more bits than it has
     """
-    _refuse_beyond("block", block, BLOCKS)
-    _refuse_beyond("number in its block", number, 1 << _IN_BLOCK_BITS - bits)
-    return np.asarray(_cell(cell) | block << _IN_BLOCK_BITS | number << bits)
+    _check_range("block", block, BLOCK_COUNT)
+    _check_range("number in its block", number, 1 << _NUMBER_AND_MEMBER_BITS - bits)
+    return np.asarray(_shifted_cell(cell) | block << _NUMBER_AND_MEMBER_BITS | number << bits)
 
 
 def satellite_id(halo: Int, member: Int, bits: npt.ArrayLike = MEMBER_BITS) -> Int:
@@ -77,7 +77,7 @@ def satellite_id(halo: Int, member: Int, bits: npt.ArrayLike = MEMBER_BITS) -> I
     halo : int64[n] identifiers of their halos;  member : int64[n] from 1;  bits : of a member
     Errors: BadInput where a member needs more bits than it has
     """
-    _refuse_beyond("member", member, 1 << np.asarray(bits, np.int64))
+    _check_range("member", member, 1 << np.asarray(bits, np.int64))
     return np.asarray(np.int64(1) << 60 | halo | member)
 
 
@@ -86,31 +86,31 @@ def hashed_id(kind: int, cell: int, words: npt.NDArray[np.uint64]) -> Int:
 
     kind, cell : of all;  words : uint64[n], random: of a thousand in a cell two are the same once in two million cells
     """
-    own = np.asarray(words, np.uint64) & np.uint64((1 << BLOCK_BITS) - 1)
-    return np.asarray(np.int64(kind) << 60 | _cell(cell) | own.astype(np.int64))
+    hashed_bits = np.asarray(words, np.uint64) & np.uint64((1 << BLOCK_BITS) - 1)
+    return np.asarray(np.int64(kind) << 60 | _shifted_cell(cell) | hashed_bits.astype(np.int64))
 
 
-def halo_of(ids: Int) -> Int:
+def halo_from_id(ids: Int) -> Int:
     """int64[n] -> identifier of the halo of each source that is numbered in its cell: kind and member bits cleared."""
     return ids & np.int64((1 << 60) - 1) & ~np.int64((1 << MEMBER_BITS) - 1)
 
 
-def kind_of(ids: Int) -> Int:
+def kind_from_id(ids: Int) -> Int:
     """int64[n] -> kind code of each source."""
     return ids >> 60
 
 
-def _cell(cell: npt.ArrayLike) -> Int:
+def _shifted_cell(cell: npt.ArrayLike) -> Int:
     cells = np.asarray(cell, np.int64)
-    beyond = (cells < 0) | (cells >= 12 << (2 * GENERATION_ORDER))
-    if beyond.any():
-        raise BadInput(f"source id: {cells[beyond].ravel()[0]} is not a cell of order {GENERATION_ORDER}")
+    invalid = (cells < 0) | (cells >= 12 << (2 * GENERATION_ORDER))
+    if invalid.any():
+        raise BadInput(f"source id: {cells[invalid].ravel()[0]} is not a cell of order {GENERATION_ORDER}")
     return np.asarray(cells << BLOCK_BITS)
 
 
-def _refuse_beyond(name: str, values: Int, most: int | Int) -> None:
-    beyond = (values < 0) | (values >= most)
-    if np.any(beyond):
-        first = np.asarray(values)[beyond].ravel()[0] if np.ndim(values) else values
-        room = np.broadcast_to(most, np.shape(values))[beyond].ravel()[0] if np.ndim(values) else most
-        raise BadInput(f"source id: {name} {first} is not in 0 .. {room - 1}")
+def _check_range(name: str, values: Int, limit: int | Int) -> None:
+    invalid = (values < 0) | (values >= limit)
+    if np.any(invalid):
+        first = np.asarray(values)[invalid].ravel()[0] if np.ndim(values) else values
+        first_limit = np.broadcast_to(limit, np.shape(values))[invalid].ravel()[0] if np.ndim(values) else limit
+        raise BadInput(f"source id: {name} {first} is not in 0 .. {first_limit - 1}")

@@ -22,13 +22,13 @@ SETTING = "TRUESKY_CPU"
 PORTABLE, NATIVE = "portable", "native"
 LEVEL = "x86-64-v3"
 # numpy's dispatch groups above x86-64-v3, by their names since numpy 2.4.
-_NUMPY_ABOVE = ("X86_V4", "AVX512_ICL", "AVX512_SPR")
+_NUMPY_GROUPS_ABOVE = ("X86_V4", "AVX512_ICL", "AVX512_SPR")
 _NUMPY_DISABLE, _NUMPY_ENABLE = "NPY_DISABLE_CPU_FEATURES", "NPY_ENABLE_CPU_FEATURES"
 _ARROW, _ARROW_LEVEL = "ARROW_USER_SIMD_LEVEL", "AVX2"
 _NUMBA_CPU, _NUMBA_FEATURES, _NUMBA_SVML = "NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES", "NUMBA_DISABLE_INTEL_SVML"
 _BLAS, _BLAS_CORE = "OPENBLAS_CORETYPE", "Haswell"
 _DEFAULTS = {
-    _NUMPY_DISABLE: " ".join(_NUMPY_ABOVE),
+    _NUMPY_DISABLE: " ".join(_NUMPY_GROUPS_ABOVE),
     _ARROW: _ARROW_LEVEL,
     _NUMBA_CPU: LEVEL,
     _NUMBA_FEATURES: "",
@@ -38,28 +38,28 @@ _DEFAULTS = {
 # Variables that must fit the CPU: code for x86-64-v3 does not run on an older one.
 _FOR_THIS_CPU = (_NUMBA_CPU, _NUMBA_FEATURES, _NUMBA_SVML, _BLAS)
 # Other settings of numba that change the order of sums or the functions that are used.
-_NUMBA_OTHERS = (
+_OTHER_NUMBA_VARIABLES = (
     "NUMBA_DISABLE_JIT", "NUMBA_ENABLE_AVX", "NUMBA_LOOP_VECTORIZE", "NUMBA_OPT", "NUMBA_SLP_VECTORIZE",
 )  # fmt: skip
 # LLVM's names of the features that x86-64-v3 adds to v2. https://gitlab.com/x86-psABIs/x86-64-ABI, table 3.1
 _LEVEL_FEATURES = ("avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe")
 # Linux's names of the same features.
-_CPUINFO, _FLAGS = Path("/proc/cpuinfo"), {"avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe"}
+_CPUINFO, _LEVEL_FLAGS = Path("/proc/cpuinfo"), {"avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe"}
 
 
 def is_portable() -> bool:
     """Return True unless the user asked for all instructions of this CPU."""
-    return _setting() != NATIVE
+    return _read_setting() != NATIVE
 
 
 def limit() -> None:
     """Set the environment variables of the libraries; call this before they are imported."""
     os.environ.update(variables())
-    if is_portable() and _linux_says_level():
+    if is_portable() and _linux_lists_level():
         _limit_for_this_cpu()
 
 
-def _setting() -> str:
+def _read_setting() -> str:
     return os.environ.get(SETTING) or PORTABLE
 
 
@@ -80,7 +80,7 @@ def variables() -> dict[str, str]:
     # numpy refuses to start with both of its variables; `check` reports the conflict.
     if _NUMPY_ENABLE not in os.environ:
         chosen = os.environ.get(_NUMPY_DISABLE, "").replace(",", " ").split()
-        setting[_NUMPY_DISABLE] = " ".join(dict.fromkeys((*chosen, *_NUMPY_ABOVE)))
+        setting[_NUMPY_DISABLE] = " ".join(dict.fromkeys((*chosen, *_NUMPY_GROUPS_ABOVE)))
     return setting
 
 
@@ -111,10 +111,18 @@ def kind() -> str:
     """
     system = [word for word in platform.libc_ver() if word] or [platform.system(), platform.release()]
     target, features = numba_target()
-    numpy, arrow, others = _numpy_in_use(), _arrow_in_use(), _other_numba_settings()
-    if (target, features, numpy, arrow, others) == (LEVEL, "", ("X86_V3",), _ARROW_LEVEL.lower(), ()):
+    numpy, arrow, numba_settings = _numpy_in_use(), _arrow_in_use(), _other_numba_settings()
+    if (target, features, numpy, arrow, numba_settings) == (LEVEL, "", ("X86_V3",), _ARROW_LEVEL.lower(), ()):
         return " ".join((LEVEL, *system))
-    words = [platform.machine(), target, features, *others, f"numpy({' '.join(numpy)})", f"arrow({arrow})", *system]
+    words = [
+        platform.machine(),
+        target,
+        features,
+        *numba_settings,
+        f"numpy({' '.join(numpy)})",
+        f"arrow({arrow})",
+        *system,
+    ]
     return " ".join(word for word in words if word)
 
 
@@ -133,11 +141,11 @@ def numba_target() -> tuple[str, str]:
     if "numba" in sys.modules:
         from numba.core.registry import cpu_target
 
-        _, name, found = (str(word) for word in cpu_target.target_context.codegen().magic_tuple())
+        _, name, host_features = (str(word) for word in cpu_target.target_context.codegen().magic_tuple())
         chosen = os.environ.get(_NUMBA_FEATURES)
-        if found == chosen or (chosen is None and name != LEVEL):
+        if host_features == chosen or (chosen is None and name != LEVEL):
             return name, chosen or ""
-        return name, f"features:{hashlib.sha256(found.encode()).hexdigest()[:8]}"
+        return name, f"features:{hashlib.sha256(host_features.encode()).hexdigest()[:8]}"
     import llvmlite.binding
 
     return os.environ.get(_NUMBA_CPU) or llvmlite.binding.get_host_cpu_name(), os.environ.get(_NUMBA_FEATURES, "")
@@ -145,10 +153,10 @@ def numba_target() -> tuple[str, str]:
 
 def _other_numba_settings() -> tuple[str, ...]:
     """Further settings of numba in the environment that are not the defaults."""
-    found = [f"{name}={os.environ[name]}" for name in _NUMBA_OTHERS if name in os.environ]
+    settings = [f"{name}={os.environ[name]}" for name in _OTHER_NUMBA_VARIABLES if name in os.environ]
     if os.environ.get(_NUMBA_SVML, _DEFAULTS[_NUMBA_SVML]) != _DEFAULTS[_NUMBA_SVML]:
-        found.append(f"{_NUMBA_SVML}={os.environ[_NUMBA_SVML]}")
-    return tuple(found)
+        settings.append(f"{_NUMBA_SVML}={os.environ[_NUMBA_SVML]}")
+    return tuple(settings)
 
 
 def check() -> str | None:
@@ -165,12 +173,12 @@ def check() -> str | None:
         If TRUESKY_CPU has an unknown value, or if numpy, numba or Arrow uses instructions above x86-64-v3
         nevertheless.
     """
-    if _setting() not in (PORTABLE, NATIVE):
-        raise BadInput(f"{SETTING} must be {PORTABLE} or {NATIVE}, got {_setting()!r}")
+    if _read_setting() not in (PORTABLE, NATIVE):
+        raise BadInput(f"{SETTING} must be {PORTABLE} or {NATIVE}, got {_read_setting()!r}")
     if not is_portable() or not _has_level():
         return None
     remedy = f"import truesky first, or set {SETTING}={NATIVE}"
-    above = [name for name in _numpy_in_use() if name in _NUMPY_ABOVE or name.startswith("AVX512")]
+    above = [name for name in _numpy_in_use() if name in _NUMPY_GROUPS_ABOVE or name.startswith("AVX512")]
     if above:
         why = "numpy was imported before truesky, or this version of numpy ignores the limit"
         if _NUMPY_ENABLE in os.environ:
@@ -186,11 +194,11 @@ def check() -> str | None:
         raise BadInput(f"{why}, so results would differ between machines; {remedy}")
     if kind().startswith(LEVEL):
         return None
-    names = (_NUMPY_DISABLE, _NUMPY_ENABLE, _ARROW, _NUMBA_CPU, _NUMBA_FEATURES, _NUMBA_SVML, *_NUMBA_OTHERS)
+    names = (_NUMPY_DISABLE, _NUMPY_ENABLE, _ARROW, _NUMBA_CPU, _NUMBA_FEATURES, _NUMBA_SVML, *_OTHER_NUMBA_VARIABLES)
     changed = {name: os.environ[name] for name in names if os.environ.get(name) not in (None, _DEFAULTS.get(name))}
-    given = ", ".join(f"{name}={value!r}" for name, value in changed.items())
+    changes = ", ".join(f"{name}={value!r}" for name, value in changed.items())
     line = f"last bits may differ between machines: this process computes as {kind()}"
-    return f"{line} ({given})" if given else line
+    return f"{line} ({changes})" if changes else line
 
 
 @cache
@@ -203,7 +211,7 @@ def _is_x86() -> bool:
     return platform.machine().lower() in ("x86_64", "amd64")
 
 
-def _linux_says_level() -> bool:
+def _linux_lists_level() -> bool:
     """Return True if Linux lists all features of x86-64-v3 for this CPU; quick, needs no other package."""
     if not _is_x86():
         return False
@@ -212,7 +220,7 @@ def _linux_says_level() -> bool:
             flags = next((line for line in lines if line.startswith("flags")), "")
     except OSError:
         return False
-    return set(flags.split()) >= _FLAGS
+    return set(flags.split()) >= _LEVEL_FLAGS
 
 
 @cache

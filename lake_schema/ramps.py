@@ -6,9 +6,9 @@ Ref : Euclid Collaboration: Serrano et al. 2024 (MACC: multiple accumulated grou
 from __future__ import annotations
 
 # Of a ramp: more are not drawn.
-MOST_FRAMES = 4000
+MAX_FRAMES = 4000
 
 
-def frames(groups: int, reads: int, drops: int) -> int:
+def frame_count(groups: int, reads: int, drops: int) -> int:
     """Of groups of reads, with drops between two groups: from the reset to the last read."""
     return groups * reads + (groups - 1) * drops

@@ -25,26 +25,26 @@ _TYPES = {
 }  # fmt: skip
 
 
-def footer(rows: pa.Table, table: Table) -> dict[str, str]:
+def footer_metadata(rows: pa.Table, table: Table) -> dict[str, str]:
     """What is added to the footer of a file that holds these rows of a table."""
     texts = [column.name for column in table.columns if column.type == "string"]
     # A text of unknown length is an object to astropy's VOTables, and none to its Parquet files.
-    longest = tuple((name, pc.max(pc.utf8_length(rows[name])).as_py() or 1) for name in texts)
-    return {VERSION: "1.0", CONTENT: header(table, longest)}
+    text_lengths = tuple((name, pc.max(pc.utf8_length(rows[name])).as_py() or 1) for name in texts)
+    return {VERSION: "1.0", CONTENT: table_header(table, text_lengths)}
 
 
 @lru_cache(maxsize=64)
-def header(table: Table, longest: tuple[tuple[str, int], ...] = ()) -> str:
+def table_header(table: Table, text_lengths: tuple[tuple[str, int], ...] = ()) -> str:
     """The table's columns as a VOTable without data, XML.
 
     longest : (column, most characters) of the texts
     """
     root = ElementTree.Element("VOTABLE", {"version": "1.4", "xmlns": _NAMESPACE})
-    about = ElementTree.SubElement(ElementTree.SubElement(root, "RESOURCE"), "TABLE", {"name": table.name})
-    ElementTree.SubElement(about, "DESCRIPTION").text = table.doc
-    lengths = dict(longest)
+    table_element = ElementTree.SubElement(ElementTree.SubElement(root, "RESOURCE"), "TABLE", {"name": table.name})
+    ElementTree.SubElement(table_element, "DESCRIPTION").text = table.doc
+    lengths = dict(text_lengths)
     for column in table.columns:
-        field = ElementTree.SubElement(about, "FIELD", _field(column, lengths))
+        field = ElementTree.SubElement(table_element, "FIELD", _field(column, lengths))
         ElementTree.SubElement(field, "DESCRIPTION").text = column.doc
     return ElementTree.tostring(root, encoding="unicode")
 

@@ -31,7 +31,7 @@ SOURCE = """# Fit to MIST isochrones, v/v_crit = 0.4: Choi et al. 2016, ApJ 823,
 # log10 L / Lsun, log10 Teff / K; mass: log10 of the mass that leaves the main sequence, Msun, then log10 of the
 # differences of initial mass between points, in units of it."""
 # Least difference of two masses, of the one that leaves the main sequence: less is the tables' rounding.
-_LEAST = 1e-5
+_MIN_MASS_DIFFERENCE = 1e-5
 
 
 def read(path: Path) -> dict[str, Float]:
@@ -40,33 +40,38 @@ def read(path: Path) -> dict[str, Float]:
     return {name: table[name].to_numpy().astype(float) for name in NAMES if name in table.column_names}
 
 
-def sampled(table: dict[str, Float]) -> tuple[Float, Float, dict[str, Float]]:
+def sample_isochrones(table: dict[str, Float]) -> tuple[Float, Float, dict[str, Float]]:
     """Ages, metallicities [k], and at the points of the fit log_l, log_teff, and mass as `model.masses` reads it."""
     age = table["log_age"]
     inside = (age > model.AGES[0] - 1e-6) & (age < model.AGES[-1] + 1e-6)
-    inside &= (table["metallicity"] >= model.lowest(age)) & (table["metallicity"] <= model.METALLICITIES[-1])
+    inside &= (table["metallicity"] >= model.min_metallicity(age)) & (table["metallicity"] <= model.METALLICITIES[-1])
     rows = {name: values[inside] for name, values in table.items()}
     key = np.stack([rows["metallicity"], rows["log_age"]], 1)
-    kinds, which = np.unique(key, axis=0, return_inverse=True)
-    found: dict[str, list[Float]] = {"log_l": [], "log_teff": [], "mass": []}
-    for k in range(len(kinds)):
-        one = {name: values[which.ravel() == k] for name, values in rows.items()}
-        evolved = one["eep"] >= model.PHASES[0]
-        mass = np.interp(model.PHASES, one["eep"], one["initial_mass"])
-        own = np.concatenate([model.FIXED, model.FIXED[-1] * (mass[0] / model.FIXED[-1]) ** np.array(model.UPPER)])
-        main = ~evolved | (one["eep"] == model.PHASES[0])
+    isochrone_keys, isochrone_index = np.unique(key, axis=0, return_inverse=True)
+    samples: dict[str, list[Float]] = {"log_l": [], "log_teff": [], "mass": []}
+    for k in range(len(isochrone_keys)):
+        isochrone = {name: values[isochrone_index.ravel() == k] for name, values in rows.items()}
+        evolved = isochrone["eep"] >= model.PHASES[0]
+        mass = np.interp(model.PHASES, isochrone["eep"], isochrone["initial_mass"])
+        main_masses = np.concatenate(
+            [
+                model.FIXED_MASSES,
+                model.FIXED_MASSES[-1] * (mass[0] / model.FIXED_MASSES[-1]) ** np.array(model.UPPER_FRACTIONS),
+            ]
+        )
+        main = ~evolved | (isochrone["eep"] == model.PHASES[0])
         for name in ("log_l", "log_teff"):
-            values = [np.interp(own, one["initial_mass"][main], one[name][main])]
-            values += [np.interp(model.PHASES[1:], one["eep"], one[name])]
-            found[name].append(np.concatenate(values))
-        grown = np.log10(np.maximum(np.diff(mass) / mass[0], _LEAST))
-        found["mass"].append(np.concatenate([np.full(own.size - 1, np.nan), [np.log10(mass[0])], grown]))
-    return kinds[:, 1], kinds[:, 0], {name: np.array(values) for name, values in found.items()}
+            values = [np.interp(main_masses, isochrone["initial_mass"][main], isochrone[name][main])]
+            values += [np.interp(model.PHASES[1:], isochrone["eep"], isochrone[name])]
+            samples[name].append(np.concatenate(values))
+        mass_steps = np.log10(np.maximum(np.diff(mass) / mass[0], _MIN_MASS_DIFFERENCE))
+        samples["mass"].append(np.concatenate([np.full(main_masses.size - 1, np.nan), [np.log10(mass[0])], mass_steps]))
+    return isochrone_keys[:, 1], isochrone_keys[:, 0], {name: np.array(values) for name, values in samples.items()}
 
 
-def fitted(age: Float, metallicity: Float, values: Float) -> Float:
+def fit_coefficients(age: Float, metallicity: Float, values: Float) -> Float:
     """[point, knot, power] by least squares."""
-    knot, weight = model.place(age)
+    knot, weight = model.bracket_age(age)
     shares = np.zeros((age.size, len(model.AGES)))
     shares[np.arange(age.size), knot] = 1.0 - weight
     shares[np.arange(age.size), knot + 1] += weight
@@ -76,53 +81,57 @@ def fitted(age: Float, metallicity: Float, values: Float) -> Float:
     return solution.T.reshape(values.shape[1], len(model.AGES), model.DEGREE + 1)
 
 
-def write(path: Path, found: dict[str, Float], said: list[str]) -> None:
+def write(path: Path, coefficients: dict[str, Float], comments: list[str]) -> None:
     """The table, with its sources and what was said of its errors before it."""
     powers = range(model.DEGREE + 1)
-    lines = [SOURCE, *(f"# {line}" for line in said)]
-    lines.append(",".join(["point", "log_age", *(f"{name}_{k}" for name in found for k in powers)]))
-    names = [f"m{m:g}" for m in model.FIXED] + [f"u{u:g}" for u in model.UPPER] + [f"e{e}" for e in model.PHASES[1:]]
+    lines = [SOURCE, *(f"# {line}" for line in comments)]
+    lines.append(",".join(["point", "log_age", *(f"{name}_{k}" for name in coefficients for k in powers)]))
+    names = (
+        [f"m{m:g}" for m in model.FIXED_MASSES]
+        + [f"u{u:g}" for u in model.UPPER_FRACTIONS]
+        + [f"e{e}" for e in model.PHASES[1:]]
+    )
     for p, name in enumerate(names):
         for a, age in enumerate(model.AGES):
-            cells = [f"{v:.4f}" if np.isfinite(v) else "" for values in found.values() for v in values[p, a]]
+            cells = [f"{v:.4f}" if np.isfinite(v) else "" for values in coefficients.values() for v in values[p, a]]
             lines.append(",".join([name, f"{age:g}", *cells]))
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def residuals(age: Float, metallicity: Float, wanted: dict[str, Float]) -> list[str]:
+def residuals(age: Float, metallicity: Float, samples: dict[str, Float]) -> list[str]:
     """Sentences: rms and largest differences of what the table gives from what it is a fit to, by phase and age."""
-    found = model.isochrones(10.0 ** (age - 9.0), metallicity)
-    main, said = found.main_sequence, []
+    fit = model.isochrones(10.0 ** (age - 9.0), metallicity)
+    main, comments = fit.main_sequence, []
     phases = {"main sequence": slice(0, main), "to the tip of the giant branch": slice(main, main + model.FLASH),
               "core helium burning and later": slice(main + model.FLASH, None)}  # fmt: skip
     for low, high in ((7.8, 9.0), (9.0, 9.6), (9.6, 10.2)):
-        here = (age >= low - 1e-6) & (age <= high + 1e-6)
+        in_age_range = (age >= low - 1e-6) & (age <= high + 1e-6)
         for name, part in phases.items():
-            off_t = 100.0 * np.log(10.0) * (found.log_teff - wanted["log_teff"])[here, part]
-            off_l = 2.5 * (found.log_l - wanted["log_l"])[here, part]
-            said.append(
+            off_t = 100.0 * np.log(10.0) * (fit.log_teff - samples["log_teff"])[in_age_range, part]
+            off_l = 2.5 * (fit.log_l - samples["log_l"])[in_age_range, part]
+            comments.append(
                 f"log age {low} .. {high}, {name}: Teff {off_t.std():.1f} % rms, {np.abs(off_t).max():.1f} % at most; "
                 f"M_bol {off_l.std():.2f} mag rms, {np.abs(off_l).max():.2f} at most"
             )
-    return said
+    return comments
 
 
-def compared(path: Path) -> list[str]:
+def compare_hottest(path: Path) -> list[str]:
     """The hottest point of old isochrones beside the one of another table."""
-    table, said = read(path), []
+    table, comments = read(path), []
     for age, metals in ((12.5, -2.0), (12.5, -1.5), (10.0, -1.0), (10.0, -0.5), (5.0, 0.0)):
         ages = np.unique(table["log_age"])
         nearest = ages[np.argmin(np.abs(ages - 9.0 - np.log10(age)))]
-        here = (np.abs(table["log_age"] - nearest) < 1e-6) & (np.abs(table["metallicity"] - metals) < 1e-6)
-        here &= (table["log_l"] < 1.2) & (table["log_teff"] < 4.2) & (table["initial_mass"] > 0.6)
-        if here.any():
-            k = np.flatnonzero(here)[table["log_teff"][here].argmax()]
+        selected = (np.abs(table["log_age"] - nearest) < 1e-6) & (np.abs(table["metallicity"] - metals) < 1e-6)
+        selected &= (table["log_l"] < 1.2) & (table["log_teff"] < 4.2) & (table["initial_mass"] > 0.6)
+        if selected.any():
+            k = np.flatnonzero(selected)[table["log_teff"][selected].argmax()]
             ours = model.isochrones([10.0 ** (nearest - 9.0)], [metals])
             at = ours.log_teff[0, : ours.main_sequence].argmax()
             theirs = f"{10.0 ** table['log_teff'][k]:.0f} K of {table['initial_mass'][k]:.3f} Msun"
-            own = f"{10.0 ** ours.log_teff[0, at]:.0f} K of {ours.mass[0, at]:.3f}"
-            said.append(f"{path.stem} {metals:g} {age:g} Gyr: hottest {theirs}, ours {own}")
-    return said
+            fit_text = f"{10.0 ** ours.log_teff[0, at]:.0f} K of {ours.mass[0, at]:.3f}"
+            comments.append(f"{path.stem} {metals:g} {age:g} Gyr: hottest {theirs}, ours {fit_text}")
+    return comments
 
 
 def main() -> int:
@@ -131,13 +140,13 @@ def main() -> int:
     parser.add_argument("--test", type=Path, nargs="*", default=[])
     parser.add_argument("--out", type=Path, default=model.TABLE)
     options = parser.parse_args()
-    age, metallicity, wanted = sampled(read(options.isochrones))
-    found = {name: fitted(age, metallicity, values) for name, values in wanted.items()}
-    write(options.out, found, [])
+    age, metallicity, samples = sample_isochrones(read(options.isochrones))
+    coefficients = {name: fit_coefficients(age, metallicity, values) for name, values in samples.items()}
+    write(options.out, coefficients, [])
     model.TABLE = options.out
-    said = residuals(age, metallicity, wanted)
-    write(options.out, found, said)
-    print("\n".join([*said, *(line for path in options.test for line in compared(path))]))
+    comments = residuals(age, metallicity, samples)
+    write(options.out, coefficients, comments)
+    print("\n".join([*comments, *(line for path in options.test for line in compare_hottest(path))]))
     return 0
 
 

@@ -58,8 +58,8 @@ def notebooks(into: Path, run: bool) -> list[str]:
         notebook = nbformat.read(path, as_version=4)
         if run:
             # Those that look at a field look at that of `make demo`, which it has rendered; others make their own.
-            own = path.stem.endswith(("shear", "slitless"))
-            demo = {} if own else {"TRUESKY_REQUEST": str(_DEMO), "TRUESKY_LAKE": str(_DEMO_LAKE)}
+            makes_own_lake = path.stem.endswith(("shear", "slitless"))
+            demo = {} if makes_own_lake else {"TRUESKY_REQUEST": str(_DEMO), "TRUESKY_LAKE": str(_DEMO_LAKE)}
             client = NotebookClient(notebook, timeout=1800, resources={"metadata": {"path": str(path.parent)}})
             client.execute(env={**os.environ, **demo})
         text, resources = MarkdownExporter().from_notebook_node(notebook)
@@ -80,7 +80,7 @@ def pages(into: Path, run: bool) -> None:
     """Write all pages."""
     shutil.copytree(ROOT / "docs", into, dirs_exist_ok=True)
     mission = resolve()
-    made = {
+    generated = {
         "request.md": docs_references.request_page(),
         "mission.md": docs_references.mission_page(mission),
         "effects.md": docs_references.effects_page(into, mission),
@@ -88,7 +88,7 @@ def pages(into: Path, run: bool) -> None:
         "api.md": docs_references.api_page(),
         "contributing.md": (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8"),
     }
-    for name, text in made.items():
+    for name, text in generated.items():
         (into / name).write_text(text, encoding="utf-8")
     tutorials = notebooks(into, run)
     if run:
@@ -108,7 +108,7 @@ def pages(into: Path, run: bool) -> None:
 def _with_pictures(into: Path) -> None:
     """Spiral galaxies; the page over a lake as a browser shows it, where there is one."""
     structure_picture.write(into / "structure.jpg")
-    if why := page_pictures.missing():
+    if why := page_pictures.missing_requirement():
         print(f"docs: no pictures of the page: {why}")
         return
     with (into / "page.md").open("a", encoding="utf-8") as page:
@@ -129,12 +129,12 @@ def build(source: Path, out: Path) -> int:
         "autodoc_typehints": "none",
     }
     site = Sphinx(source, None, out, source / "_built", "html", configuration, status=None, warningiserror=True)
-    site.connect("autodoc-process-docstring", _as_written)
+    site.connect("autodoc-process-docstring", _show_verbatim)
     site.build()
     return site.statuscode
 
 
-def _as_written(*event: Any) -> None:
+def _show_verbatim(*event: Any) -> None:
     """A docstring is shown as it is written."""
     lines = event[-1]
     lines[1:] = ["", "::", "", *("    " + line for line in lines[1:]), ""] if any(lines[1:]) else []

@@ -28,7 +28,7 @@ from truesky.fluxes import cosmology
 from truesky.request.schema import Universe
 from truesky.validation.model import mean_sky
 
-SEED, WANTED = 2016, Universe(galaxy_limit=26.0, z_max=6.0, lensing=(0.0, 0.0), box_cells=192)
+SEED, UNIVERSE = 2016, Universe(galaxy_limit=26.0, z_max=6.0, lensing=(0.0, 0.0), box_cells=192)
 EDGES = np.concatenate([[0.03, 0.2], np.arange(0.3, 3.01, 0.1), [3.3, 3.7, 4.2, 5.0, 6.0]])
 LOG_L = np.linspace(39.0, 43.6, 47)
 # A luminosity that fewer have takes the shift of the last that enough have.
@@ -38,8 +38,8 @@ CM_PER_MPC = 3.0856775814913673e24
 
 def sample(cells: int) -> tuple[np.ndarray, np.ndarray]:
     """(z, raw log L) of galaxies with I_E < WANTED.galaxy_limit in so many cells' area."""
-    lines = emission_lines.unmatched(np.array([0.0, 9.0]), np.array([0.0, 99.0]), np.zeros((2, 2)))
-    universe = replace(mean_sky.flat(galaxies.model(SEED, WANTED)), lines=lines)
+    lines = emission_lines.model_from_table(np.array([0.0, 9.0]), np.array([0.0, 99.0]), np.zeros((2, 2)))
+    universe = replace(mean_sky.without_clustering(galaxies.model(SEED, UNIVERSE)), lines=lines)
     rows = mean_sky.rows(universe, 0, cells)
     z, flux = (rows[name].to_numpy().astype(float) for name in ("z_true", "flux_halpha"))
     shines = flux > 0.0
@@ -50,18 +50,18 @@ def sample(cells: int) -> tuple[np.ndarray, np.ndarray]:
 def shifts(z: np.ndarray, raw: np.ndarray, area: float) -> np.ndarray:
     """What is to be added to log L, [z bin, node]."""
     rows = []
-    for near, far in pairwise(EDGES):
-        middle = 0.5 * (near + far)
-        here = np.sort(raw[(z > near) & (z < far)])
+    for z_low, z_high in pairwise(EDGES):
+        middle = 0.5 * (z_low + z_high)
+        luminosities = np.sort(raw[(z > z_low) & (z < z_high)])
         distance = float(cosmology.luminosity_distance(middle)) / cosmology.HUBBLE * CM_PER_MPC
-        wanted = np.linspace(38.0, 45.0, 281)
-        counts = emission_lines.expected_counts(10.0**wanted / (4 * np.pi * distance**2), near, far) * area
-        above = here.size - np.searchsorted(here, LOG_L)
+        log_luminosity = np.linspace(38.0, 45.0, 281)
+        counts = emission_lines.expected_counts(10.0**log_luminosity / (4 * np.pi * distance**2), z_low, z_high) * area
+        above = luminosities.size - np.searchsorted(luminosities, LOG_L)
         # Counts fall with luminosity: interpolate their logarithms backwards.
-        to = np.interp(-np.log(np.maximum(above, 1)), -np.log(np.maximum(counts, 1e-9)), wanted)
-        shift = to - LOG_L
+        matched = np.interp(-np.log(np.maximum(above, 1)), -np.log(np.maximum(counts, 1e-9)), log_luminosity)
+        shift = matched - LOG_L
         last = int(np.flatnonzero(above >= ENOUGH)[-1])
-        first = int(np.flatnonzero(above < 0.98 * here.size)[0])
+        first = int(np.flatnonzero(above < 0.98 * luminosities.size)[0])
         shift[last:] = shift[last]
         shift[:first] = shift[first]
         rows.append(np.maximum.accumulate(LOG_L + shift) - LOG_L)
@@ -75,9 +75,9 @@ def main() -> None:
     z, raw = sample(cells)
     table = shifts(z, raw, cells * sky.cell_area(GENERATION_ORDER))
     middle = 0.5 * (EDGES[1:] + EDGES[:-1])
-    whole = np.vstack([np.concatenate([[0.0], LOG_L]), np.column_stack([middle, table])])
+    matching_table = np.vstack([np.concatenate([[0.0], LOG_L]), np.column_stack([middle, table])])
     note = "rows: redshift, then the shift of log10 L(H alpha) in dex; first row: raw log10 L; scripts/match_halpha.py"
-    np.savetxt(emission_lines.MATCHING, whole, "%.4f", ",", header=note)
+    np.savetxt(emission_lines.MATCHING, matching_table, "%.4f", ",", header=note)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ CHROMIUM = os.environ.get("TRUESKY_CHROMIUM") or shutil.which("chromium")
 _TOKEN, _SIZE, _LONGEST = "a-token-of-the-pictures", {"width": 1400, "height": 860}, 60.0
 
 
-def missing() -> str:
+def missing_requirement() -> str:
     """What there is not, "" where pictures can be taken."""
     if importlib.util.find_spec("playwright") is None:
         return "playwright is not installed (make .venv/installed-test)"
@@ -32,7 +32,7 @@ def missing() -> str:
 
 
 @contextmanager
-def served(lake: Path) -> Iterator[str]:
+def serve_page(lake: Path) -> Iterator[str]:
     """Address of a page over a lake, while the block lasts."""
     command = [sys.executable, "-m", "truesky.page", str(lake), "--no-open", "--token", _TOKEN]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as server:
@@ -43,7 +43,7 @@ def served(lake: Path) -> Iterator[str]:
             server.terminate()
 
 
-def until(tab: Any, expression: str) -> Any:
+def wait_until(tab: Any, expression: str) -> Any:
     """Wait until JavaScript says something that is true; a page that refuses eval can be waited for only so."""
     end = time.monotonic() + _LONGEST
     while not (value := tab.evaluate(expression)):
@@ -54,12 +54,12 @@ def until(tab: Any, expression: str) -> Any:
 
 
 def _sky(tab: Any) -> None:
-    until(tab, "document.getElementById('sky-legend').textContent !== ''")
+    wait_until(tab, "document.getElementById('sky-legend').textContent !== ''")
     time.sleep(2.0)
 
 
 def _plots(tab: Any) -> None:
-    until(tab, "document.getElementById('plot-state').textContent.includes('rows')")
+    wait_until(tab, "document.getElementById('plot-state').textContent.includes('rows')")
     box = tab.locator("#plot-grid canvas").first.bounding_box()
     tab.mouse.move(box["x"] + 0.35 * box["width"], box["y"] + 80)
     tab.mouse.down()
@@ -69,12 +69,12 @@ def _plots(tab: Any) -> None:
 
 
 def _sql(tab: Any) -> None:
-    until(tab, "document.querySelectorAll('#sql-result td').length > 0")
+    wait_until(tab, "document.querySelectorAll('#sql-result td').length > 0")
     tab.locator("#sql-schema details summary").nth(2).click()
 
 
 def _images(tab: Any) -> None:
-    until(tab, "document.getElementById('image-one').childElementCount > 0")
+    wait_until(tab, "document.getElementById('image-one').childElementCount > 0")
     tab.check("#image-truth")
     time.sleep(4.0)
     box = tab.locator("#image-canvas").bounding_box()
@@ -86,13 +86,13 @@ def _images(tab: Any) -> None:
         time.sleep(0.15)
     time.sleep(1.5)
     tab.mouse.click(x, y)
-    until(tab, "document.querySelectorAll('#pin .cutouts canvas').length > 0")
-    until(tab, "document.querySelector('#pin canvas.spectrum') !== null")
+    wait_until(tab, "document.querySelectorAll('#pin .cutouts canvas').length > 0")
+    wait_until(tab, "document.querySelector('#pin canvas.spectrum') !== null")
     time.sleep(2.0)
 
 
 def _runs(tab: Any) -> None:
-    until(tab, "document.querySelectorAll('#runs-content h2').length > 2")
+    wait_until(tab, "document.querySelectorAll('#runs-content h2').length > 2")
     tab.locator("#runs-content details summary").first.click()
     time.sleep(1.0)
 
@@ -110,33 +110,33 @@ def pictures(into: Path) -> list[tuple[str, str]]:
     """Take them; returns file names and captions.  Errors: RuntimeError where the page has an error"""
     from playwright.sync_api import sync_playwright
 
-    taken = []
+    files = []
     faults: list[str] = []
-    with served(LAKE) as address, sync_playwright() as started:
+    with serve_page(LAKE) as address, sync_playwright() as started:
         browser = started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         tab = browser.new_page(viewport=_SIZE)
         tab.on("console", lambda message: faults.append(message.text) if message.type == "error" else None)
         tab.on("pageerror", lambda error: faults.append(str(error)))
         tab.goto(address)
-        until(tab, "document.body.dataset.ready === '1'")
+        wait_until(tab, "document.body.dataset.ready === '1'")
         for name, caption, show in VIEWS:
             tab.click(f"#tab-{name}")
             show(tab)
             tab.screenshot(path=into / f"page_{name}.png")
-            taken.append((f"page_{name}.png", caption))
+            files.append((f"page_{name}.png", caption))
         tab.click("#theme")
         tab.click("#tab-plots")
         time.sleep(1.5)
         tab.screenshot(path=into / "page_light.png")
-        taken.append(("page_light.png", "The same histograms in the light theme"))
+        files.append(("page_light.png", "The same histograms in the light theme"))
         browser.close()
     if faults:
         raise RuntimeError(f"the page has errors: {faults}")
-    return taken
+    return files
 
 
 def main() -> None:
-    if why := missing():
+    if why := missing_requirement():
         raise SystemExit(f"truesky: {why}")
     folder = Path(sys.argv[1])
     folder.mkdir(parents=True, exist_ok=True)

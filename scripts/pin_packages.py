@@ -18,7 +18,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "requirements"
-ABOUT = {
+DESCRIPTIONS = {
     "run": "What every job wants. `make` installs from here and nothing else, so that equal requests give equal bytes.",
     "build": "What builds the packages that come as source.",
     "java": "A Java for machines that have none.",
@@ -38,16 +38,16 @@ Pins = dict[str, list[str]]
 
 def read(text: str) -> Pins:
     """The lines of each package, by name."""
-    found: Pins = {}
+    pins: Pins = {}
     for line in text.splitlines():
         if match := re.match(r"([\w.-]+)==", line):
             name = match[1]
-            if name in found:
+            if name in pins:
                 raise SystemExit(f"{name} has two versions, on machines or Pythons of different kinds: bound it")
-            found[name] = []
+            pins[name] = []
         if line and line[0] not in "#-":
-            found[name].append(line)
-    return found
+            pins[name].append(line)
+    return pins
 
 
 def versions(pins: Pins) -> list[str]:
@@ -55,19 +55,19 @@ def versions(pins: Pins) -> list[str]:
     return [lines[0].split()[0] for lines in pins.values()]
 
 
-def resolved(wanted: Sequence[Path], *options: str) -> str:
+def resolve_versions(requirement_files: Sequence[Path], *options: str) -> str:
     """Text that uv prints for lists and for pyproject.toml."""
-    command = ["uv", "pip", "compile", *map(str, wanted), "--generate-hashes", "--universal"]
+    command = ["uv", "pip", "compile", *map(str, requirement_files), "--generate-hashes", "--universal"]
     command += ["--python-version", "3.11.7", "--quiet", "--no-annotate", "--no-header", *options]
     return subprocess.run(command, check=True, capture_output=True, text=True).stdout
 
 
-def compiled(wanted: Sequence[Path], known: Path, *options: str) -> Pins:
+def compile_pins(requirement_files: Sequence[Path], constraints: Path, *options: str) -> Pins:
     """What uv makes of lists and of pyproject.toml, at the versions of `known` where it has them."""
-    return read(resolved(wanted, "--constraint", str(known), *options))
+    return read(resolve_versions(requirement_files, "--constraint", str(constraints), *options))
 
 
-def oldest(project: Path, folder: Path, every: Pins, before: Pins) -> Pins:
+def oldest(project: Path, folder: Path, all_pins: Pins, previous: Pins) -> Pins:
     """The lowest versions of the packages that pyproject.toml names, with the tests' packages and all dependencies.
 
     Dependencies have the versions of `before`, or else of `every`, if they fit. The lowest numba, for example, needs an
@@ -77,13 +77,13 @@ def oldest(project: Path, folder: Path, every: Pins, before: Pins) -> Pins:
     lines = [*table["dependencies"], *(line for extra in IMPORTED for line in table["optional-dependencies"][extra])]
     named = {re.split(r"[^\w.-]", line)[0].lower().replace("_", "-") for line in lines}
     tools, written = folder / "tools.in", folder / "oldest.txt"
-    pinned = {name: pin.partition("==")[2] for name, pin in zip(every, versions(every), strict=True)}
+    pinned = {name: pin.partition("==")[2] for name, pin in zip(all_pins, versions(all_pins), strict=True)}
     tools.write_text("\n".join(f"{name}=={pinned[name.partition('[')[0]]}" for name in TESTED_WITH))
     # uv prefers the versions in the file that it is going to write.
-    rest = {name: lines for name, lines in (every | before).items() if name not in named}
+    rest = {name: lines for name, lines in (all_pins | previous).items() if name not in named}
     written.write_text("\n".join(versions(rest)))
     extras = [word for extra in IMPORTED for word in ("--extra", extra)]
-    resolved([project, tools], *extras, "--resolution", "lowest-direct", "--output-file", str(written))
+    resolve_versions([project, tools], *extras, "--resolution", "lowest-direct", "--output-file", str(written))
     return read(written.read_text())
 
 
@@ -91,29 +91,29 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--upgrade", action="store_true", help="the newest versions that pyproject.toml admits")
     upgrade = parser.parse_args().upgrade
-    files = {name: FOLDER / f"{name}.txt" for name in ABOUT}
-    here = {name: read(file.read_text()) for name, file in files.items() if file.exists()}
+    files = {name: FOLDER / f"{name}.txt" for name in DESCRIPTIONS}
+    current = {name: read(file.read_text()) for name, file in files.items() if file.exists()}
     with tempfile.TemporaryDirectory() as name:
-        known, builders = Path(name) / "known.txt", Path(name) / "builders.in"
+        constraints, builders = Path(name) / "known.txt", Path(name) / "builders.in"
         project = ROOT / "pyproject.toml"
         builders.write_text("\n".join(BUILDERS))
-        before = here.pop("oldest", {})
-        known.write_text("" if upgrade else "\n".join(pin for some in here.values() for pin in versions(some)))
+        previous = current.pop("oldest", {})
+        constraints.write_text("" if upgrade else "\n".join(pin for pins in current.values() for pin in versions(pins)))
         # All together decide the versions, once; each list then takes its own of them.
-        every = compiled([project, builders], known, "--all-extras")
-        known.write_text("\n".join(versions(every)))
-        run = compiled([project], known, "--extra", "page", "--extra", "reduction")
-        made = {"run": run, "build": compiled([builders], known)}
+        all_pins = compile_pins([project, builders], constraints, "--all-extras")
+        constraints.write_text("\n".join(versions(all_pins)))
+        run = compile_pins([project], constraints, "--extra", "page", "--extra", "reduction")
+        lists = {"run": run, "build": compile_pins([builders], constraints)}
         for extra in ("test", "bench", "s3"):
-            wanted = compiled([project], known, "--extra", extra)
+            extra_pins = compile_pins([project], constraints, "--extra", extra)
             # What run.txt has for some machines alone may here be wanted on all.
-            made[extra] = {name: lines for name, lines in wanted.items() if lines != made["run"].get(name)}
-        made["java"] = {JAVA: made["test"].pop(JAVA)}
-        made["oldest"] = oldest(project, Path(name), every, {} if upgrade else before)
-    for name, some in made.items():
-        head = [f"# {ABOUT[name]}", "# Made by scripts/pin_packages.py.", ""]
+            lists[extra] = {name: lines for name, lines in extra_pins.items() if lines != lists["run"].get(name)}
+        lists["java"] = {JAVA: lists["test"].pop(JAVA)}
+        lists["oldest"] = oldest(project, Path(name), all_pins, {} if upgrade else previous)
+    for name, pins in lists.items():
+        head = [f"# {DESCRIPTIONS[name]}", "# Made by scripts/pin_packages.py.", ""]
         head += ["--requirement java.txt"] * (name == "test")
-        body = [line for _, lines in sorted(some.items()) for line in lines]
+        body = [line for _, lines in sorted(pins.items()) for line in lines]
         (FOLDER / f"{name}.txt").write_text("\n".join([*head, *body]) + "\n")
 
 

@@ -17,29 +17,32 @@ from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[1]
 # How their captions begin, in rows of two; pixels that each is wide, and between rows.
-SHOWN = (
+CAPTIONS = (
     "VIS: positions", "VIS: magnitudes", "VIS: noise", "VIS: sources that are found",
     "NISP-P: positions", "NISP-P: magnitudes", "galaxies: counts", "galaxies: how they cluster",
 )  # fmt: skip
-_WIDE, _BETWEEN = 760, 14
+_WIDE, _GAP = 760, 14
 _FIGURE = re.compile(r"<img alt='[^']*' src='data:image/png;base64,([^']+)'><figcaption>(.*?)</figcaption>", re.DOTALL)
 
 
 def figures(report: str) -> dict[str, Image.Image]:
     """Caption -> picture of a report's HTML."""
-    found = _FIGURE.findall(report)
-    return {unescape(text): Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB") for data, text in found}
+    matches = _FIGURE.findall(report)
+    return {unescape(text): Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB") for data, text in matches}
 
 
 def side_by_side(pictures: Sequence[Image.Image]) -> Image.Image:
     """In rows of two, as wide as each other."""
-    scaled = [one.resize((_WIDE, round(one.height * _WIDE / one.width)), Image.Resampling.LANCZOS) for one in pictures]
+    scaled = [
+        picture.resize((_WIDE, round(picture.height * _WIDE / picture.width)), Image.Resampling.LANCZOS)
+        for picture in pictures
+    ]
     rows = [scaled[i : i + 2] for i in range(0, len(scaled), 2)]
-    heights = [max(one.height for one in row) + _BETWEEN for row in rows]
+    heights = [max(picture.height for picture in row) + _GAP for row in rows]
     out, top = Image.new("RGB", (2 * _WIDE, sum(heights)), "white"), 0
     for row, height in zip(rows, heights, strict=True):
-        for i, one in enumerate(row):
-            out.paste(one, (i * _WIDE, top + (height - one.height) // 2))
+        for i, picture in enumerate(row):
+            out.paste(picture, (i * _WIDE, top + (height - picture.height) // 2))
         top += height
     return out
 
@@ -49,11 +52,13 @@ def main(argv: Sequence[str]) -> int:
     if not argv or not Path(argv[0]).is_file():
         print(f"{' '.join(argv) or 'report_pictures'}: no report of truesky validate", file=sys.stderr)
         return 2
-    held = figures(Path(argv[0]).read_text(encoding="utf-8"))
-    chosen = [next((held[text] for text in held if text.startswith(name)), None) for name in SHOWN]
-    pictures = [one for one in chosen if one is not None]
-    if len(pictures) < len(SHOWN):
-        lacking = ", ".join(name for name, one in zip(SHOWN, chosen, strict=True) if one is None)
+    report_figures = figures(Path(argv[0]).read_text(encoding="utf-8"))
+    chosen = [
+        next((report_figures[text] for text in report_figures if text.startswith(name)), None) for name in CAPTIONS
+    ]
+    pictures = [picture for picture in chosen if picture is not None]
+    if len(pictures) < len(CAPTIONS):
+        lacking = ", ".join(name for name, picture in zip(CAPTIONS, chosen, strict=True) if picture is None)
         print(f"{argv[0]}: no figure of {lacking}", file=sys.stderr)
         return 2
     target = Path(argv[1]) if len(argv) > 1 else ROOT / "docs" / "pilot_validation.jpg"

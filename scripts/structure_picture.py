@@ -50,16 +50,16 @@ def draw(discs: DiscStructure | None) -> Float:
     sources = Sources(np.arange(4), column, row, jacobian, np.full(4, _LIGHT), np.arange(4), shape)
     psf, settings = euclid.vis_psf(detector, passbands.load("euclid_vis"), mission), settings_for(SURVEY)
     sizes = stamp_sizes.stamp_sizes(sources.electrons, sources.shape, shape, psf, _NOISE, settings)
-    sizes = stamp_sizes.holding(sizes, disc_structure.sides(shape, discs) / psf.pixel_scale)
-    return stamps.draw(disc_structure.added(sources, shape, discs), sizes, psf, detector.nx, detector.ny)
+    sizes = stamp_sizes.smallest_allowed_sizes(sizes, disc_structure.sides(shape, discs) / psf.pixel_scale)
+    return stamps.draw(disc_structure.add_structure(sources, shape, discs), sizes, psf, detector.nx, detector.ny)
 
 
 def write(path: Path) -> None:
     """The picture, a JPEG."""
-    both = np.concatenate([draw(None)[::-1], draw(DiscStructure(Arms(), 1))[::-1]])
-    grey = np.arcsinh(np.maximum(both, 0.0) / _SOFT) / np.arcsinh(_WHITE / _SOFT)
-    twice = np.minimum(grey, 1.0).repeat(2, axis=0).repeat(2, axis=1)
-    image.imsave(path, twice, cmap="gray", vmin=0.0, vmax=1.0, pil_kwargs={"quality": 85})
+    panels = np.concatenate([draw(None)[::-1], draw(DiscStructure(Arms(), 1))[::-1]])
+    grey = np.arcsinh(np.maximum(panels, 0.0) / _SOFT) / np.arcsinh(_WHITE / _SOFT)
+    enlarged = np.minimum(grey, 1.0).repeat(2, axis=0).repeat(2, axis=1)
+    image.imsave(path, enlarged, cmap="gray", vmin=0.0, vmax=1.0, pil_kwargs={"quality": 85})
 
 
 if __name__ == "__main__":

@@ -22,9 +22,9 @@ from lake_schema.fits.images import read_images
 from lake_schema.store import layout, publish, read
 from truesky.fluxes import cosmology, integration, passbands
 from truesky.fluxes.libraries import templates
-from truesky.fluxes.sources import galaxies_of
+from truesky.fluxes.sources import galaxies_from_table
 from truesky.fluxes.tables import build_tables, settings
-from truesky.numerics import cache, sums
+from truesky.numerics import cache, matrices
 from truesky.request.accuracy import DRAFT
 
 BANDS = ("euclid_vis", "lsst_r")
@@ -47,7 +47,7 @@ def random_galaxies(n):
     """Rows that integration and the tables read."""
     from benchmarks.fluxes import sample
 
-    return galaxies_of(sample(n, 1), templates.galaxy_library())
+    return galaxies_from_table(sample(n, 1), templates.galaxy_library())
 
 
 def table():
@@ -68,7 +68,7 @@ def quick():
     rng = np.random.default_rng(1)
     library, vis = templates.galaxy_library(), passbands.load("euclid_vis")
     yield "line_table", build_tables.line_table(vis)[1]
-    yield "integrated", integration.galaxies(random_galaxies(20), [vis], library)
+    yield "integrated", integration.galaxy_fluxes(random_galaxies(20), [vis], library)
     yield "distances", cosmology.comoving_separation(0.0, np.linspace(0.0, 6.0, 50))
     yield "galactic", np.stack(sky.galactic(*rng.uniform(-80.0, 80.0, (2, 1000))))
     planes = euclid.vis_psf(fields.small("vis", "3-4"), vis, fields.MISSION, 4).planes
@@ -80,7 +80,7 @@ def quick():
     )
     form = galaxy_shapes.forms(shapes, rng.normal(size=(50, 2, 2)))
     yield "forms", np.concatenate([part.ravel() for part in (form.bulge, form.disk, form.thick)])
-    yield "least_squares", sums.least_squares(rng.normal(size=(30, 6)), rng.normal(size=(30, 3)))
+    yield "least_squares", matrices.least_squares(rng.normal(size=(30, 6)), rng.normal(size=(30, 3)))
 
 
 def whole(folder):
@@ -94,13 +94,13 @@ def whole(folder):
     stellar, vis = templates.stellar_library(), passbands.load("euclid_vis")
     yield "stellar_templates", stellar.flux
     yield "star_table", build_tables.star_table(vis, stellar, build_tables.library_key(stellar))
-    root = layout.lake(folder / "lake")
+    root = layout.resolve_lake(folder / "lake")
     root.mkdir(parents=True)
     wanted = from_table(REQUEST)
     for job in (build_galaxies.JOB, build_stars.JOB, compute_fluxes.JOB, plan_exposures.JOB, render_exposures.JOB):
         for step in job.steps(root, wanted):
-            publish.make(root, step.plan, step.work)
-    for name in read.tables(root):
+            publish.make_version(root, step.plan, step.run_task)
+    for name in read.table_names(root):
         version = read.version(root, name)
         if name != "products":
             rows = version.rows()

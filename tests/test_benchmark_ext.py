@@ -12,11 +12,13 @@ from truesky.request.from_toml import parse
 def test_a_field_that_all_sites_see(tmp_path):
     """Requests that are right; what is asked for of a detector is everything."""
     file = tmp_path / "ext.toml"
-    file.write_text(benchmark.request(tuple(benchmark.CAMERAS.values()), 0.2))
+    file.write_text(benchmark.request_text(tuple(benchmark.CAMERAS.values()), 0.2))
     wanted = parse(file)
     assert [pointing.camera for pointing in wanted.pointings] == ["lsstcam", "decam", "jpcam", "megacam", "hsc", "gpc1"]
-    assert {"bleeding", "crosstalk", "tree_rings", "brighter_fatter"} < set(benchmark.full(wanted).effects.on)
-    file.write_text(benchmark.request([benchmark.LSST], 2.1, whole=True))
+    assert {"bleeding", "crosstalk", "tree_rings", "brighter_fatter"} < set(
+        benchmark.with_all_effects(wanted).effects.on
+    )
+    file.write_text(benchmark.request_text([benchmark.LSST], 2.1, whole_cameras=True))
     (pointing,) = parse(file).pointings
     assert pointing.detectors == ()
 
@@ -40,10 +42,10 @@ def test_a_whole_exposure_of_lsstcam(tmp_path):
 
     Of the processor, whatever else it does.
     """
-    assert benchmark.whole_exposure(tmp_path, (24.0, 22.0))["lsst_exposure_s"] > 0.0
+    assert benchmark.time_exposure(tmp_path, (24.0, 22.0))["lsst_exposure_s"] > 0.0
     images = [*tmp_path.rglob("EXT_lsst_r_*_science.fits")]
     assert len({image.name for image in images}) == 189
-    lines = [line for log in run_log.of_products(tmp_path / "exposure" / "lake") for line in run_log.lines(log)]
+    lines = [line for log in run_log.logs_of_products(tmp_path / "exposure" / "lake") for line in run_log.lines(log)]
     seconds = [line["cpu_s"] for line in lines if "cpu_s" in line]
     assert len(seconds) == 189
     assert sum(seconds) / 2.0 < 720.0

@@ -29,7 +29,7 @@ def test_a_row_is_smaller_than_with_defaults(tmp_path):
 
     from lake_schema.store import parquet
 
-    rows = benchmark.rows_of(benchmark.FIRST_CELL, 100_000)
+    rows = benchmark.random_rows(benchmark.FIRST_CELL, 100_000)
     assert rows.nbytes == 228 * rows.num_rows
     parquet.write(tmp_path / "ours.parquet", rows, benchmark.TRIAL)
     pq.write_table(rows, tmp_path / "default.parquet")

@@ -16,6 +16,6 @@ def test_a_few_exposures_stand_for_all():
 
 
 def test_the_validation_of_a_lake_is_timed(tmp_path):
-    found = benchmark.validation(lakes.lake(tmp_path / "lake"))
+    found = benchmark.time_validation(lakes.lake(tmp_path / "lake"))
     assert found["validation_detectors"] == 2.0
     assert found["validation_s"] > 0.0

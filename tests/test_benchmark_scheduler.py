@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 
 from benchmarks import scheduler
-from benchmarks.scheduler import BACK_H, MACHINE, SLOWER, Site, simulated
+from benchmarks.scheduler import CORES_PER_MACHINE, REPAIR_H, SLOWDOWN, Site, simulate
 
 AT_ONCE = 1e12
 SOUND = {"slow": 0.0, "lives_h": math.inf}
 
 
 def ran(seconds, cores, rate=AT_ONCE, **site):
-    return simulated(np.asarray(seconds, float), Site(cores, rate, **{**SOUND, **site}), np.random.default_rng(1))
+    return simulate(np.asarray(seconds, float), Site(cores, rate, **{**SOUND, **site}), np.random.default_rng(1))
 
 
 def test_equal_tasks_fill_equal_cores():
     found = ran(np.full(600, 10.0), 100)
     assert found.makespan == pytest.approx(60.0)
-    assert (found.busy, found.lost, found.again) == (pytest.approx(6000.0), 0.0, 0)
+    assert (found.busy, found.lost, found.repeated) == (pytest.approx(6000.0), 0.0, 0)
     assert found.efficiency(100, 6000.0) == pytest.approx(1.0)
 
 
@@ -35,20 +35,20 @@ def test_the_driver_hands_out_one_task_after_the_other():
 
 
 def test_one_machine_of_four_is_slow_where_few_are():
-    found = ran(np.full(40_000, 1.0), 4 * MACHINE, slow=0.02)
-    per_core = 40_000 / (MACHINE * (3.0 + 1.0 / SLOWER))
+    found = ran(np.full(40_000, 1.0), 4 * CORES_PER_MACHINE, slow=0.02)
+    per_core = 40_000 / (CORES_PER_MACHINE * (3.0 + 1.0 / SLOWDOWN))
     assert found.makespan == pytest.approx(per_core, rel=0.01)
 
 
 def test_what_a_death_interrupts_is_done_again():
-    found = ran(np.full(4 * MACHINE, 100.0), 4 * MACHINE, lives_h=1e9)
+    found = ran(np.full(4 * CORES_PER_MACHINE, 100.0), 4 * CORES_PER_MACHINE, lives_h=1e9)
     # In the midst of the only tasks: others take them up when they are through with their own.
-    assert (found.again, found.lost) == (MACHINE, pytest.approx(50.0 * MACHINE))
+    assert (found.repeated, found.lost) == (CORES_PER_MACHINE, pytest.approx(50.0 * CORES_PER_MACHINE))
     assert found.makespan == pytest.approx(200.0)
-    assert BACK_H * 3600.0 > 100.0
+    assert REPAIR_H * 3600.0 > 100.0
 
 
 def test_tasks_have_an_order():
     seconds, exposures = np.array([3.0, 9.0, 5.0]), np.array([2, 3, 1])
-    found = {name: order.tolist() for name, order in scheduler.orders(seconds, exposures).items()}
+    found = {name: order.tolist() for name, order in scheduler.task_orders(seconds, exposures).items()}
     assert found == {"longest": [1, 2, 0], "observed": [2, 0, 1], "shortest": [0, 2, 1]}

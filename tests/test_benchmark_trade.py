@@ -47,13 +47,13 @@ def test_what_the_sources_were_held_against_is_told():
 
 
 def test_a_stratified_sample_has_bright_and_faint_galaxies_and_stars():
-    some = scenes.stratified(VIS, 3, 2)
+    some = scenes.stratified_sample(VIS, 3, 2)
     magnitudes, star = scenes.magnitudes(some, VIS), some.shape < 0
     for of in (star, ~star):
         counts, _ = np.histogram(magnitudes[of], scenes.LAYERS)
         assert (counts == 2).all()
     # Not the same as another seed's.
-    assert not np.isin(magnitudes, scenes.magnitudes(scenes.stratified(VIS, 4, 2), VIS)).any()
+    assert not np.isin(magnitudes, scenes.magnitudes(scenes.stratified_sample(VIS, 4, 2), VIS)).any()
 
 
 def test_every_approximation_was_measured():
@@ -64,8 +64,8 @@ def test_every_approximation_was_measured():
 def test_an_approximation_keeps_what_it_should(name):
     """Sources, places and light stay; the galaxies are those it is meant for."""
     approximation = BY_NAME[name]
-    some = approximation.concerned(VIS, 3, 6)
-    simple = approximation.simplified(some)
+    some = approximation.select_galaxies(VIS, 3, 6)
+    simple = approximation.simplify(some)
     assert len(simple) == len(some) == 6
     np.testing.assert_array_equal(simple.electrons, some.electrons)
     np.testing.assert_array_equal(simple.column, some.column)
@@ -83,7 +83,7 @@ def test_an_approximation_keeps_what_it_should(name):
 
 def test_stamps_of_a_folding_threshold_hold_all_but_that():
     """Of a point, against the PSF itself: the rest lies beyond half the stamp."""
-    some, psf = scenes.sample(VIS, 3, 6), scenes.psf_of(VIS, 1)
+    some, psf = scenes.sample(VIS, 3, 6), scenes.scene_psf(VIS, 1)
     settings = settings_for(SURVEY)
     sizes = BY_NAME["folding threshold 0.5 %"].sizes(some, psf, VIS, settings)
     outside = psf.outside[np.minimum(sizes // 2, len(psf.outside) - 1)]
@@ -94,7 +94,7 @@ def test_sampling_down_and_up_keeps_a_plane():
     """A biquadratic interpolation is exact where light changes evenly."""
     y, x = np.mgrid[:32, :32]
     plane = 5.0 + 0.3 * x - 0.1 * y
-    found = BY_NAME["sampled down and up"].after(plane)
+    found = BY_NAME["sampled down and up"].process_image(plane)
     np.testing.assert_allclose(found[8:-8, 8:-8], plane[8:-8, 8:-8], rtol=1e-3)
 
 

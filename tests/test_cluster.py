@@ -37,7 +37,7 @@ def request_file(tmp_path_factory):
 @pytest.fixture(scope="module")
 def local(tmp_path_factory, request_file):
     """The lake that the five jobs make in local mode."""
-    root = layout.lake(tmp_path_factory.mktemp("local") / "lake")
+    root = layout.resolve_lake(tmp_path_factory.mktemp("local") / "lake")
     for script in JOBS:
         submit(script, root, request_file)
     return root
@@ -54,7 +54,7 @@ def cluster(tmp_path_factory):
 
 def test_the_demo_on_a_cluster_gives_the_bytes_of_one_machine(local, cluster, request_file, tmp_path):
     master, folder = cluster
-    lake = layout.lake(tmp_path / "lake")
+    lake = layout.resolve_lake(tmp_path / "lake")
     for script in JOBS:
         submit(script, lake, request_file, "--master", master, *told(folder / "events"))
     logs = [events(path) for path in sorted((folder / "events").iterdir())]
@@ -77,7 +77,7 @@ def test_the_demo_on_a_cluster_gives_the_bytes_of_one_machine(local, cluster, re
 
 
 def test_a_render_that_is_killed_half_way_ends_with_the_same_bytes(local, request_file, tmp_path):
-    lake = layout.lake(shutil.copytree(local, tmp_path / "lake", symlinks=True))
+    lake = layout.resolve_lake(shutil.copytree(local, tmp_path / "lake", symlinks=True))
     for name in ("products", "rendered_truth"):
         shutil.rmtree(lake / name)
     script = "jobs/render/render_exposures.py"

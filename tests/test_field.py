@@ -35,7 +35,7 @@ from truesky.render.effects.scene import Scene
 from truesky.render.products import preview_labels, read_back
 from truesky.render.sources import catalogue_rows
 from truesky.request.from_toml import parse
-from truesky.running import shell
+from truesky.running import submitted_job
 
 pytestmark = pytest.mark.spark
 
@@ -69,13 +69,13 @@ class Image:
 @pytest.fixture(scope="session")
 def field(spark, tmp_path_factory):
     """The lake of the demo."""
-    root = layout.lake(tmp_path_factory.mktemp("field") / "lake")
+    root = layout.resolve_lake(tmp_path_factory.mktemp("field") / "lake")
     wanted = parse(DEMO)
     # Compiled here, so that no worker's memory is the compiler's.
     for channel in ("VIS", "EXT"):
         small(channel, forced={effect.name: True for effect in registry.CHANNELS[channel].effects["science"]})
     for job in JOBS:
-        shell.run(job, root, wanted)
+        submitted_job.run(job, root, wanted)
     return root
 
 
@@ -144,7 +144,7 @@ def product(field, channel, content):
     products = read.version(field, "products")
     for row in products.rows().to_pylist():
         if row["channel"] == channel and row["content"] == content:
-            return products.file(row["path"])
+            return products.sidecar_path(row["path"])
     raise AssertionError(f"no {content} product of {channel}")
 
 
@@ -188,11 +188,11 @@ def scene_of(header):
 def trailed(expected, header):
     """What traps make of expected charge: it is not lost, it comes later."""
     scene = scene_of(header)
-    sizes = quadrants.sizes(scene)
+    sizes = quadrants.overscan_sizes(scene)
     charge = quadrants.apply(expected, *sizes)
     for effect in (charge_transfer.PARALLEL, charge_transfer.SERIAL):
         charge = effect.apply(charge, *effect.parameters(scene))
-    return quadrants.assembled(charge, *sizes)
+    return quadrants.assemble(charge, *sizes)
 
 
 def calibrated_electrons(path, header):
@@ -200,9 +200,11 @@ def calibrated_electrons(path, header):
     scene = scene_of(header)
     with fits.open(path) as units:
         if scene.layout is not None:
-            raw = scene.layout.apart(np.asarray(read_back.frame(path).data))
+            raw = scene.layout.split(np.asarray(read_back.frame(path).data))
         else:
-            raw = np.stack([quadrants.placed(unit.data.astype(np.uint16), i) for i, unit in enumerate(units[1:])])
+            raw = np.stack(
+                [quadrants.to_detector_axes(unit.data.astype(np.uint16), i) for i, unit in enumerate(units[1:])]
+            )
     return calibrated.electrons(raw, scene, int(header["SEED"]), applied(header))
 
 
@@ -230,7 +232,7 @@ def sources(field, header):
     for catalogue, fluxes in (("galaxies", "galaxy_fluxes"), ("stars", "star_fluxes")):
         motion = ["pm_ra", "pm_dec"] if catalogue == "stars" else []
         middle = header["MJD-OBS"] + 0.5 * header["EXPTIME"] / 86400.0
-        where = catalogue_rows.at_time(read.version(field, catalogue).rows(["ra", "dec", *motion]), middle)
+        where = catalogue_rows.apply_proper_motion(read.version(field, catalogue).rows(["ra", "dec", *motion]), middle)
         flux = read.version(field, fluxes).rows([f"f_nu_{header['FILTER']}"])
         x, y = system.all_world2pix(where["ra"].to_numpy(), where["dec"].to_numpy(), 0)
         microjansky = flux.column(0).to_numpy().astype(float)
@@ -360,7 +362,7 @@ def test_other_tools_can_open_the_lake(field):
     import lsdb
 
     galaxies = read.version(field, "galaxies")
-    found = lsdb.open_catalog(str(layout.current(field, "galaxies"))).cone_search(53.117, -27.808, 60.0).compute()
+    found = lsdb.open_catalog(str(layout.current_link(field, "galaxies"))).cone_search(53.117, -27.808, 60.0).compute()
     everything = galaxies.rows(["ra", "dec"])
     near = sky.separation(53.117, -27.808, everything["ra"].to_numpy(), everything["dec"].to_numpy()) < 60 / 3600
     assert len(found) == near.sum() > 100
@@ -369,14 +371,14 @@ def test_other_tools_can_open_the_lake(field):
 def test_fluxes_lie_beside_their_catalogues(field):
     for catalogue, fluxes in (("galaxies", "galaxy_fluxes"), ("stars", "star_fluxes")):
         left, right = read.version(field, catalogue), read.version(field, fluxes)
-        assert left.parts == right.parts
+        assert left.partitions == right.partitions
         assert left.rows(["id"]).equals(right.rows(["id"]))
 
 
 def test_every_table_is_sound(field):
-    assert {"galaxies", "galaxy_fluxes", "stars", "products", "rendered_truth"} <= set(read.tables(field))
-    for name in read.tables(field):
-        assert read.verify(read.version(field, name), deep=True) == []
+    assert {"galaxies", "galaxy_fluxes", "stars", "products", "rendered_truth"} <= set(read.table_names(field))
+    for name in read.table_names(field):
+        assert read.find_faults(read.version(field, name), deep=True) == []
 
 
 def test_the_demo_covers_only_what_its_detectors_touch(field):

@@ -15,7 +15,7 @@ from truesky.commands import demo
 from truesky.fluxes import compute_fluxes
 from truesky.render import plan_exposures, render_exposures
 from truesky.request.from_toml import from_table
-from truesky.running import shell
+from truesky.running import submitted_job
 
 ROOT = Path(__file__).parents[1]
 FIRST = (build_galaxies.JOB, build_stars.JOB)
@@ -75,7 +75,7 @@ def test_a_bad_request_ends_with_one_line_and_nothing_written(job, text, key, tm
     path = tmp_path / "bad.toml"
     path.write_text(text)
     lake = tmp_path / "lake"
-    assert shell.main(job, ["--lake", str(lake), "--request", str(path)]) == 2
+    assert submitted_job.main(job, ["--lake", str(lake), "--request", str(path)]) == 2
     out, err = capsys.readouterr()
     assert out == ""
     assert len(err.strip().splitlines()) == 1
@@ -99,7 +99,7 @@ def test_a_bad_pointing_is_refused_before_the_first_job_runs(words, key, tmp_pat
 def test_what_must_be_built_first_is_named(job, tmp_path, capsys):
     path = tmp_path / "r.toml"
     path.write_text(SMALL)
-    assert shell.main(job, ["--lake", str(tmp_path / "lake"), "--request", str(path)]) == 2
+    assert submitted_job.main(job, ["--lake", str(tmp_path / "lake"), "--request", str(path)]) == 2
     missing = {
         "compute_fluxes": "no table galaxies",
         "build_strong_lenses": "no table galaxies",
@@ -130,11 +130,11 @@ sys.exit(max(shell.main(m.JOB, sys.argv[1:]) for m in (build_galaxies, build_sta
         lake = tmp_path / master
         done = submit("--master", master, script, "--lake", lake, "--request", path)
         assert done.returncode == 0, done.stderr
-        root = layout.lake(lake)
+        root = layout.resolve_lake(lake)
         versions = {name: read.version(root, name) for name in ("galaxies", "stars", "galaxy_fluxes", "star_fluxes")}
-        assert len(versions["galaxies"].parts) == 4
+        assert len(versions["galaxies"].partitions) == 4
         assert versions["galaxies"].num_rows > 100
-        assert all(read.verify(version, deep=True) == [] for version in versions.values())
+        assert all(read.find_faults(version, deep=True) == [] for version in versions.values())
         manifests.append({name: (v.folder / "manifest.json").read_bytes() for name, v in versions.items()})
     assert manifests[0] == manifests[1]
 

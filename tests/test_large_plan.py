@@ -12,22 +12,22 @@ import pyarrow.compute as pc
 import pytest
 
 from lake_schema.store import layout, publish, read, reuse
-from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.tables.exposures import EXPOSURES, ExposureRow
 from lake_schema.tables.products import PRODUCTS
 from lake_schema.tables.tasks import TASKS
 from tests.universe import rows_of
 from truesky.commands import report
 from truesky.page import runs, sky_maps
-from truesky.page.opened import Lake
+from truesky.page.lake_session import LakeSession
 from truesky.render import coverage, plan_exposures
 from truesky.render.exposure import persistence
-from truesky.render.forecasting import speed, taken
-from truesky.render.planning import parts, variants
+from truesky.render.forecasting import actual_costs, speed
+from truesky.render.planning import exposure_chunks, variants
 from truesky.render.planning import tasks as planning
 from truesky.render.planning.mission import mission_of
 from truesky.request.from_toml import from_table
-from truesky.running.measured import forget_peak, peak_gb
+from truesky.running.task_metrics import peak_memory_gb, reset_peak_memory
 
 BLOCK = {"channels": ["VIS", "NISP-P"], "fields": 1, "dither": "none", "mjd": 60400.0}
 AREA = {"cone": {"ra": 60.0, "dec": -50.0, "radius": 1.0}}
@@ -60,11 +60,11 @@ def published(root, number, times):
         first = i * times * many + 1
         dates = [began.min() + i * times, began.max() + (i + 1) * times]
         facts = {"exposures": [first, first + times * many - 1], "mjd": dates, "block": i}
-        cut.append(Part(f"{first:09d}.parquet", facts))
+        cut.append(Task(f"{first:09d}.parquet", facts))
 
     def make(table, facts, some, work):
         plan = Plan(table, facts, tuple(some))
-        publish.make(root, plan, work)
+        publish.make_version(root, plan, work)
         return plan.key
 
     def block(rows, lake, facts):
@@ -87,7 +87,7 @@ def published(root, number, times):
 
 def image_part(task):
     name = f"{task['exposure_id']:06d}-{task['detector'].lower()}.parquet"
-    return Part(name, {"exposure_id": task["exposure_id"], "detector": task["detector"], reuse.PRODUCT: "0"})
+    return Task(name, {"exposure_id": task["exposure_id"], "detector": task["detector"], reuse.PRODUCT: "0"})
 
 
 def versions(root):
@@ -97,19 +97,22 @@ def versions(root):
 def chosen(root, **narrow):
     own = versions(root)
     request = replace(REQUEST, **(narrow or {"limit": 5}))
-    found = parts.chosen(own["exposures"], own["tasks"], request, MADE)
-    missions = variants.missions(mission_of(REQUEST.mission))
-    return found, parts.before(own, found.exposures, found.tasks, missions)
+    found = exposure_chunks.select_for_rendering(own["exposures"], own["tasks"], request, MADE)
+    missions = variants.mission_lookup(mission_of(REQUEST.mission))
+    return found, exposure_chunks.with_previous_exposures(own, found.exposures, found.tasks, missions)
 
 
 def drawn(root):
     own = versions(root)
-    tasks, exposures = partial(parts.each, own["tasks"], coverage._TASK), own["exposures"].rows(coverage._EXPOSURE)
+    tasks, exposures = (
+        partial(exposure_chunks.rows_by_partition, own["tasks"], coverage._TASK_COLUMNS),
+        own["exposures"].rows(coverage._EXPOSURE_COLUMNS),
+    )
     return coverage.depths(exposures, tasks, coverage.area_of(own["exposures"]), 20)
 
 
 def paged(root, ask):
-    lake = Lake(root)
+    lake = LakeSession(root)
     try:
         return ask(lake)
     finally:
@@ -118,17 +121,17 @@ def paged(root, ask):
 
 def in_view(lake):
     """Elsewhere than the plan: what is there would be more than a page shows."""
-    return sky_maps.exposures(lake, np.array([200.0, 10.0, 1.0]))
+    return sky_maps.exposure_footprints(lake, np.array([200.0, 10.0, 1.0]))
 
 
 READERS = {
     "render": chosen,
     "forecast": lambda root: plan_exposures._print_published(root, read.version(root, "tasks")),
-    "speed": speed.of_machine,
-    "taken": taken.rows,
+    "speed": speed.estimate_speed,
+    "taken": actual_costs.summarise,
     "report": lambda root: report._forecast(root, 1.0),
     "coverage": drawn,
-    "page, runs": partial(paged, ask=lambda lake: runs._left(lake.observed[0], {(1, "none")})),
+    "page, runs": partial(paged, ask=lambda lake: runs._remaining_work(lake.observed[0], {(1, "none")})),
     "page, footprints": partial(paged, ask=sky_maps.regions),
     "page, exposures": partial(paged, ask=in_view),
     "page, bands": partial(paged, ask=sky_maps.bands),
@@ -143,14 +146,14 @@ ALSO = {"render, one detector": partial(chosen, detectors=("3-4",))}
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
     """A lake with a plan of six parts; rows of a field."""
-    root = layout.lake(tmp_path_factory.mktemp("small") / "lake")
+    root = layout.resolve_lake(tmp_path_factory.mktemp("small") / "lake")
     return root, published(root, 6, 1)
 
 
 @pytest.mark.parametrize("name", READERS)
 def test_no_more_is_read_at_once_than_a_part(small, name, monkeypatch):
     root, (exposures, tasks) = small
-    monkeypatch.setattr(sky_maps, "MOST_PLANNED", tasks.num_rows)
+    monkeypatch.setattr(sky_maps, "LARGE_PLAN", tasks.num_rows)
     read_rows, seen = read.Version.rows, []
 
     def spied(version, columns=None, *rest, **more):
@@ -174,11 +177,11 @@ NARROW = ({"limit": None}, {"limit": 5}, {"limit": 500}, {"detectors": ("3-4",)}
 def test_what_is_chosen_of_parts_is_what_is_chosen_of_the_whole(small, narrow):
     root, (_, tasks) = small
     own, request = versions(root), replace(REQUEST, **narrow)
-    every, exposures = planning.in_order(own["tasks"].rows()), own["exposures"].rows()
+    every, exposures = planning.sort_by_cost(own["tasks"].rows()), own["exposures"].rows()
     assert every.num_rows == 6 * tasks.num_rows
     found, (with_before, earlier) = chosen(root, **narrow)
-    asked = planning.part(every, request)
-    assert list(map(place, found.asked)) == list(map(place, asked))
+    asked = planning.select_requested(every, request)
+    assert list(map(place, found.requested)) == list(map(place, asked))
     wanted = {place(task) for task in asked}
     kept = [task for task in every.to_pylist() if place(task) in wanted or task["exposure_id"] in MADE]
     assert list(map(place, found.tasks)) == list(map(place, kept))
@@ -186,10 +189,10 @@ def test_what_is_chosen_of_parts_is_what_is_chosen_of_the_whole(small, narrow):
     numbers = {task["exposure_id"] for task in kept}
     assert found.exposures.equals(exposures.filter(pc.is_in(exposures["exposure_id"], pa.array([*numbers]))))
     counts = Counter(every["exposure_id"].to_pylist())
-    assert found.planned == {number: counts[number] for number in numbers}
+    assert found.detector_counts == {number: counts[number] for number in numbers}
     # What is left in their detectors by whatever was exposed before.
-    rows = {row.exposure_id: row for row in map(ExposureRow.of, exposures.to_pylist())}
-    before = persistence.earlier_of(every.to_pylist(), rows, variants.missions(mission_of(request.mission)))
+    rows = {row.exposure_id: row for row in map(ExposureRow.from_row, exposures.to_pylist())}
+    before = persistence.previous_tasks(every.to_pylist(), rows, variants.mission_lookup(mission_of(request.mission)))
     mine = {key: list(map(place, some)) for key, some in earlier.items() if key in set(map(place, kept))}
     assert mine == {key: list(map(place, some)) for key, some in before.items() if key in set(map(place, kept))}
     assert any(mine.values()) or narrow != NARROW[0]
@@ -204,15 +207,15 @@ def growth(name, small, large):
     """GB that a reader takes of a large plan beyond what the process holds after it has read a small one."""
     reader = {**READERS, **ALSO}[name]
     reader(small)
-    forget_peak()
-    before = peak_gb()
+    reset_peak_memory()
+    before = peak_memory_gb()
     reader(large)
-    return peak_gb() - before
+    return peak_memory_gb() - before
 
 
 @pytest.mark.nightly
 def test_a_plan_of_a_million_detectors_takes_little_memory(small, tmp_path_factory):
-    root = layout.lake(tmp_path_factory.mktemp("large") / "lake")
+    root = layout.resolve_lake(tmp_path_factory.mktemp("large") / "lake")
     rows = small[1][1].num_rows
     published(root, 20, 50_000 // rows)
     assert read.version(root, "tasks").num_rows > 20 * (50_000 - rows)

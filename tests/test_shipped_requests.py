@@ -14,7 +14,7 @@ import pytest
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import resolve
 from lake_schema.store import layout, read
-from lake_schema.tables.exposures import RENDERED
+from lake_schema.tables.exposures import RENDERED_TYPES
 from truesky.catalogue import build_galaxies, build_stars
 from truesky.commands import plan
 from truesky.fluxes import compute_fluxes
@@ -22,7 +22,7 @@ from truesky.render import plan_exposures, render_exposures
 from truesky.render.camera import detectors
 from truesky.render.planning import ground_surveys, survey
 from truesky.request.from_toml import from_table, parse
-from truesky.running import shell
+from truesky.running import submitted_job
 
 REQUESTS = Path(__file__).parents[1] / "requests"
 MODULES = (build_galaxies, build_stars, compute_fluxes, plan_exposures)
@@ -62,18 +62,18 @@ def small(name):
 @pytest.mark.parametrize("name", [path.stem for path in sorted(REQUESTS.glob("*.toml"))])
 def test_a_shipped_request_goes_through_all_jobs(name, tmp_path, monkeypatch):
     # The parts here, not in Spark's workers.
-    monkeypatch.setattr(shell, "_spark_map", lambda function, parts, *rest: map(function, parts))
+    monkeypatch.setattr(submitted_job, "_spark_map", lambda function, parts, *rest: map(function, parts))
     request = from_table(small(name))
     plan.check(request)
-    root = layout.lake(tmp_path / "lake")
+    root = layout.resolve_lake(tmp_path / "lake")
     for module in MODULES:
-        shell.run(module.JOB, root, request)
+        submitted_job.run(module.JOB, root, request)
     exposures = {row["exposure_id"]: row for row in read.version(root, "exposures").rows().to_pylist()}
     tasks = read.version(root, "tasks").rows(["exposure_id", "detector"]).to_pylist()
     # An exposure of NISP has all of its detectors: the middle one is enough.
     some = {task["detector"] for task in tasks} & {middle(row["camera"]) for row in exposures.values()}
-    shell.run(render_exposures.JOB, root, replace(request, detectors=tuple(sorted(some))))
-    is_rendered = {k for k, row in exposures.items() if row["image_type"] in RENDERED.get(row["channel"], ())}
+    submitted_job.run(render_exposures.JOB, root, replace(request, detectors=tuple(sorted(some))))
+    is_rendered = {k for k, row in exposures.items() if row["image_type"] in RENDERED_TYPES.get(row["channel"], ())}
     rendered = {
         (task["exposure_id"], task["detector"])
         for task in tasks
@@ -89,7 +89,7 @@ def test_the_pilot_observation_has_every_kind_of_image():
     """All that is rendered, deep fields apart, which are the wide survey's again; every band of every ground survey."""
     request = parse(REQUESTS / "pilot_one_observation.toml")
     found = [exposure for exposure, _ in survey.exposures(request, MISSION)]
-    rendered = {(channel, kind) for channel, kinds in RENDERED.items() for kind in kinds if kind != "deep"}
+    rendered = {(channel, kind) for channel, kinds in RENDERED_TYPES.items() for kind in kinds if kind != "deep"}
     assert {(one.channel, one.image_type) for one in found} == rendered
     euclid = [one for one in found if one.image_type == "science" and one.channel != "EXT"]
     assert Counter(one.channel for one in euclid) == {"VIS": 4, "NISP-P": 12, "NISP-S": 4}

@@ -5,7 +5,7 @@ import numpy as np
 from lake_schema import ids, sky
 from lake_schema.columns import Column, Table
 from lake_schema.store import layout
-from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.plan import Output, Plan, Task
 
 TOY = Table(
     "toy",
@@ -35,7 +35,7 @@ def toy_work(root, facts):
 
 
 def toy_plan(seed=1, cells=CELLS):
-    parts = tuple(Part(layout.cell_file(5, cell), {"cell": cell, "rows": n}) for cell, n in cells)
+    parts = tuple(Task(layout.cell_file(5, cell), {"cell": cell, "rows": n}) for cell, n in cells)
     return Plan(TOY, {"seed": seed}, parts)
 
 
@@ -51,7 +51,7 @@ def plain_work(root, facts):
 
 
 def plain_plan(seed=1, parts=3):
-    return Plan(PLAIN, {"seed": seed}, tuple(Part(f"{i}.parquet", {"part": i}, 20) for i in range(parts)))
+    return Plan(PLAIN, {"seed": seed}, tuple(Task(f"{i}.parquet", {"part": i}, 20) for i in range(parts)))
 
 
 def rows_of(table, n, seed=0):

@@ -31,7 +31,7 @@ __all__ = [
 ]  # fmt: skip
 
 # Loaded when they are first used: together they take seconds to import.
-_LAZY: dict[str, tuple[str, str | None]] = {
+_LAZY_IMPORTS: dict[str, tuple[str, str | None]] = {
     "Image": ("lake_schema.fits.images", "Image"),
     "Lake": ("truesky.api.lake", "Lake"),
     "Request": ("truesky.request.schema", "Request"),
@@ -44,8 +44,8 @@ _LAZY: dict[str, tuple[str, str | None]] = {
 
 
 def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        module, attribute = _LAZY[name]
+    if name in _LAZY_IMPORTS:
+        module, attribute = _LAZY_IMPORTS[name]
         loaded = import_module(module)
         return loaded if attribute is None else getattr(loaded, attribute)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -5,7 +5,7 @@ spark-submit jobs/catalogue/build_strong_lenses.py --lake LAKE --request REQUEST
 
 from lake_schema import command
 from truesky.catalogue.build_strong_lenses import JOB
-from truesky.running.shell import main
+from truesky.running.submitted_job import main
 
 if __name__ == "__main__":
-    command.leave(main, JOB)
+    command.exit_with_status(main, JOB)

@@ -5,7 +5,7 @@ spark-submit jobs/render/plan_exposures.py --lake LAKE --request REQUEST
 
 from lake_schema import command
 from truesky.commands.plan import JOB
-from truesky.running.shell import main
+from truesky.running.submitted_job import main
 
 if __name__ == "__main__":
-    command.leave(main, JOB)
+    command.exit_with_status(main, JOB)

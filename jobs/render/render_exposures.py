@@ -5,7 +5,7 @@ spark-submit jobs/render/render_exposures.py --lake LAKE --request REQUEST
 
 from lake_schema import command
 from truesky.render.render_exposures import JOB
-from truesky.running.shell import main
+from truesky.running.submitted_job import main
 
 if __name__ == "__main__":
-    command.leave(main, JOB)
+    command.exit_with_status(main, JOB)

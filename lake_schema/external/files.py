@@ -27,21 +27,21 @@ from lake_schema.errors import BadInput
 _MAGIC = b"PAR1"
 # A footer larger than this describes no table of ours; columns and row groups are bounded by the length of any list in
 # it, and with them how deep columns can nest.
-_MOST_FOOTER_BYTES = 32 << 20
-_MOST_ENTRIES = 5000
+_MAX_FOOTER_BYTES = 32 << 20
+_MAX_ENTRIES = 5000
 # What one row group may hold, uncompressed; the largest that is written here is a tenth of it.
-_MOST_GROUP_BYTES = 256 << 20
+_MAX_GROUP_BYTES = 256 << 20
 # Of a column in a batch: as a dictionary, and where each row has a text of its own, 64 bytes each.
-_MOST_TEXT_BYTES, _MOST_OWN_BYTES = 1 << 20, 4 << 20
-_ROWS_A_BATCH = 65_536
+_MAX_DICTIONARY_BYTES, _MAX_TEXT_BYTES = 1 << 20, 4 << 20
+_ROWS_PER_BATCH = 65_536
 # Of the reading process: address space; CPU time at the least, and bytes of the file for each second more.
-_MOST_MEMORY = 3 << 29
-_LEAST_SECONDS, _BYTES_A_SECOND = 10, 10_000_000
-_REFUSED = 2
+_MAX_MEMORY = 3 << 29
+_MIN_SECONDS, _BYTES_PER_SECOND = 10, 10_000_000
+_REFUSED_STATUS = 2
 _ROOT = Path(__file__).resolve().parents[2]
 
 
-def batches(path: Path, columns: Sequence[str], texts: Sequence[str] = ()) -> Iterator[pa.RecordBatch]:
+def read_batches(path: Path, columns: Sequence[str], text_columns: Sequence[str] = ()) -> Iterator[pa.RecordBatch]:
     """Rows of some columns of a file, in its order; texts come as dictionaries, so that a repeated one is held once.
 
     columns : names of flat columns of numbers, booleans or texts
@@ -49,50 +49,52 @@ def batches(path: Path, columns: Sequence[str], texts: Sequence[str] = ()) -> It
     Errors  : BadInput, one line, where the file is not Parquet, is damaged, or asks for more than is reasonable
     """
     _refuse_large_footer(path)
-    yield from read_apart(__name__, path, columns, texts)
+    yield from read_in_subprocess(__name__, path, columns, text_columns)
 
 
-def read_apart(module: str, path: Path, columns: Sequence[str], texts: Sequence[str] = ()) -> Iterator[pa.RecordBatch]:
+def read_in_subprocess(
+    module: str, path: Path, columns: Sequence[str], text_columns: Sequence[str] = ()
+) -> Iterator[pa.RecordBatch]:
     """The batches that a module sends, run by a process of its own.
 
     module  : name of one that calls `main` with its reader
     path    : of the file
     columns : names of those that are needed;  texts : of those that are sent where they are there
     """
-    command = [sys.executable, "-m", module, str(path.resolve()), str(len(columns)), *columns, *texts]
+    command = [sys.executable, "-m", module, str(path.resolve()), str(len(columns)), *columns, *text_columns]
     environment = {**os.environ, "ARROW_DEFAULT_MEMORY_POOL": "system"}
     pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(command, cwd=_ROOT, env=environment, **pipes) as reader:
         try:
-            yield from _received(path, reader)
+            yield from _receive_batches(path, reader)
         finally:
             reader.kill()
 
 
-def _received(path: Path, reader: subprocess.Popen[bytes]) -> Iterator[pa.RecordBatch]:
+def _receive_batches(path: Path, reader: subprocess.Popen[bytes]) -> Iterator[pa.RecordBatch]:
     try:
         with pa.ipc.open_stream(reader.stdout) as stream:
             yield from stream
     except (OSError, pa.ArrowException):
         # It ended early, and says why.
         pass
-    _, said = reader.communicate()
-    if reader.returncode == _REFUSED:
-        raise BadInput(said.decode(errors="replace").strip())
+    _, stderr = reader.communicate()
+    if reader.returncode == _REFUSED_STATUS:
+        raise BadInput(stderr.decode(errors="replace").strip())
     if reader.returncode:
         raise BadInput(f"{path}: its reader died of it, status {reader.returncode}")
 
 
 def _refuse_large_footer(path: Path) -> None:
-    with user_files.opened(path, "catalogue") as stream:
+    with user_files.open_file(path, "catalogue") as stream:
         first = stream.read(4)
         size = stream.seek(0, os.SEEK_END)
         stream.seek(max(size - 8, 0))
         length, last = int.from_bytes(stream.read(4), "little"), stream.read(4)
     if size < 12 or first != _MAGIC or last != _MAGIC:
         raise BadInput(f"{path}: is not a Parquet file")
-    if not 0 < length <= min(size - 12, _MOST_FOOTER_BYTES):
-        raise BadInput(f"{path}: its footer says {length} bytes, of {size} and at most {_MOST_FOOTER_BYTES}")
+    if not 0 < length <= min(size - 12, _MAX_FOOTER_BYTES):
+        raise BadInput(f"{path}: its footer says {length} bytes, of {size} and at most {_MAX_FOOTER_BYTES}")
 
 
 # ----------------------------------------------------------------------------------------- in a process of its own
@@ -103,22 +105,22 @@ def main(argv: Sequence[str], sender: Callable[[Path, Sequence[str], Sequence[st
 
     argv : FILE NEEDED COLUMN ...;  sender : what writes them
     """
-    path, needed, columns = Path(argv[0]), int(argv[1]), list(argv[2:])
-    seconds = _LEAST_SECONDS + path.stat().st_size // _BYTES_A_SECOND
-    command.limit_resource("RLIMIT_AS", _MOST_MEMORY)
+    path, required_count, columns = Path(argv[0]), int(argv[1]), list(argv[2:])
+    seconds = _MIN_SECONDS + path.stat().st_size // _BYTES_PER_SECOND
+    command.limit_resource("RLIMIT_AS", _MAX_MEMORY)
     command.limit_resource("RLIMIT_CPU", seconds)
     command.limit_resource("RLIMIT_CORE", 0)
     pa.set_cpu_count(1)
     try:
         with os.fdopen(1, "wb", closefd=False) as out:
-            sender(path, columns[:needed], columns[needed:], out)
+            sender(path, columns[:required_count], columns[required_count:], out)
     except BadInput as error:
         print(error, file=sys.stderr)
-        return _REFUSED
+        return _REFUSED_STATUS
     return 0
 
 
-def send(path: Path, needed: Sequence[str], texts: Sequence[str], out: IO[bytes]) -> None:
+def send_batches(path: Path, required: Sequence[str], text_columns: Sequence[str], out: IO[bytes]) -> None:
     """Write the batches of a file as an Arrow stream; BadInput, whatever Arrow's reader trips over.
 
     path   : a Parquet file of another program
@@ -126,8 +128,8 @@ def send(path: Path, needed: Sequence[str], texts: Sequence[str], out: IO[bytes]
     out    : where the stream goes
     """
     try:
-        with _opened(path, needed, texts) as (file, found):
-            _send(path, file, found, out)
+        with _open_file(path, required, text_columns) as (file, columns):
+            _send(path, file, columns, out)
     except BadInput:
         raise
     except Exception as error:
@@ -136,10 +138,10 @@ def send(path: Path, needed: Sequence[str], texts: Sequence[str], out: IO[bytes]
 
 def _send(path: Path, file: pq.ParquetFile, columns: list[str], out: IO[bytes]) -> None:
     rows, stream = 0, None
-    for batch in file.iter_batches(_ROWS_A_BATCH, columns=columns, use_threads=False):
+    for batch in file.iter_batches(_ROWS_PER_BATCH, columns=columns, use_threads=False):
         rows += batch.num_rows
         stream = stream or pa.ipc.new_stream(out, batch.schema)
-        stream.write_batch(_bounded(path, batch))
+        stream.write_batch(_check_text_size(path, batch))
     if rows != file.metadata.num_rows:
         raise BadInput(f"{path}: holds {rows} rows and says {file.metadata.num_rows}")
     if stream is not None:
@@ -147,47 +149,49 @@ def _send(path: Path, file: pq.ParquetFile, columns: list[str], out: IO[bytes]) 
 
 
 @contextmanager
-def _opened(path: Path, needed: Sequence[str], texts: Sequence[str]) -> Iterator[tuple[pq.ParquetFile, list[str]]]:
+def _open_file(
+    path: Path, required: Sequence[str], text_columns: Sequence[str]
+) -> Iterator[tuple[pq.ParquetFile, list[str]]]:
     """The file, and the columns that are to be read."""
     limits: dict[str, Any] = {
-        "thrift_container_size_limit": _MOST_ENTRIES,
-        "thrift_string_size_limit": _MOST_FOOTER_BYTES,
+        "thrift_container_size_limit": _MAX_ENTRIES,
+        "thrift_string_size_limit": _MAX_FOOTER_BYTES,
         "page_checksum_verification": True,
         "arrow_extensions_enabled": False,
     }
     with pq.ParquetFile(path, **limits) as file:
-        titles = [file.schema.column(i).path for i in range(len(file.schema))]
-        columns = [*needed, *(name for name in texts if name in titles)]
-        _check_columns(path, file, titles, columns)
-    with pq.ParquetFile(path, read_dictionary=list(needed), **limits) as file:
+        names = [file.schema.column(i).path for i in range(len(file.schema))]
+        columns = [*required, *(column for column in text_columns if column in names)]
+        _check_columns(path, file, names, columns)
+    with pq.ParquetFile(path, read_dictionary=list(required), **limits) as file:
         yield file, columns
 
 
-def check_titles(path: Path, titles: Sequence[str], columns: Sequence[str]) -> None:
+def check_column_names(path: Path, names: Sequence[str], columns: Sequence[str]) -> None:
     """Refuse a file in which columns are not there, or one twice; BadInput names all that are missing."""
-    count = Counter(titles)
-    if missing := [name for name in dict.fromkeys(columns) if not count[name]]:
-        has = " ".join(", ".join(titles).split())[:300]
+    count = Counter(names)
+    if missing := [column for column in dict.fromkeys(columns) if not count[column]]:
+        has = " ".join(", ".join(names).split())[:300]
         raise BadInput(f"{path}: has no column {', '.join(missing)}; it has {has}")
-    for name in columns:
-        if count[name] > 1:
-            raise BadInput(f"{path}: has column {name} more than once")
+    for column in columns:
+        if count[column] > 1:
+            raise BadInput(f"{path}: has column {column} more than once")
 
 
-def _check_columns(path: Path, file: pq.ParquetFile, titles: Sequence[str], columns: Sequence[str]) -> None:
-    check_titles(path, titles, columns)
-    about, schema = file.metadata, file.schema
-    places = {title: i for i, title in enumerate(titles)}
-    for name in columns:
-        kind = file.schema_arrow.field(name).type
+def _check_columns(path: Path, file: pq.ParquetFile, names: Sequence[str], columns: Sequence[str]) -> None:
+    check_column_names(path, names, columns)
+    metadata, schema = file.metadata, file.schema
+    indices = {name: i for i, name in enumerate(names)}
+    for column in columns:
+        kind = file.schema_arrow.field(column).type
         if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind) or _is_text(kind)):
-            raise BadInput(f"{path}: column {name} is {kind}, wanted numbers, booleans or texts")
-        if schema.column(places[name]).max_repetition_level:
-            raise BadInput(f"{path}: column {name} is a list")
-    for number in range(about.num_row_groups):
-        group = about.row_group(number)
-        size = sum(group.column(places[name]).total_uncompressed_size for name in columns)
-        if not 0 <= size <= _MOST_GROUP_BYTES or not 0 <= group.num_rows <= _MOST_GROUP_BYTES:
+            raise BadInput(f"{path}: column {column} is {kind}, wanted numbers, booleans or texts")
+        if schema.column(indices[column]).max_repetition_level:
+            raise BadInput(f"{path}: column {column} is a list")
+    for number in range(metadata.num_row_groups):
+        group = metadata.row_group(number)
+        size = sum(group.column(indices[column]).total_uncompressed_size for column in columns)
+        if not 0 <= size <= _MAX_GROUP_BYTES or not 0 <= group.num_rows <= _MAX_GROUP_BYTES:
             raise BadInput(f"{path}: row group {number} says {group.num_rows} rows of {size} bytes: too large")
 
 
@@ -195,17 +199,17 @@ def _is_text(kind: pa.DataType) -> bool:
     return bool(pa.types.is_string(kind) or pa.types.is_large_string(kind))
 
 
-def _bounded(path: Path, batch: pa.RecordBatch) -> pa.RecordBatch:
+def _check_text_size(path: Path, batch: pa.RecordBatch) -> pa.RecordBatch:
     for name, column in zip(batch.schema.names, batch.columns, strict=True):
-        size, most = 0, _MOST_OWN_BYTES
+        size, limit = 0, _MAX_TEXT_BYTES
         if pa.types.is_dictionary(column.type):
-            size, most = column.dictionary.nbytes, _MOST_TEXT_BYTES
+            size, limit = column.dictionary.nbytes, _MAX_DICTIONARY_BYTES
         elif _is_text(column.type):
             size = column.nbytes
-        if size > most:
+        if size > limit:
             raise BadInput(f"{path}: column {name} holds texts of {size} bytes: too large")
     return batch
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:], send))
+    sys.exit(main(sys.argv[1:], send_batches))

@@ -23,24 +23,24 @@ from lake_schema.external import files
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 _TYPES = ("diffsky_fits", "synthetic_galaxies")
-_ROWS_A_BATCH = 65_536
+_ROWS_PER_BATCH = 65_536
 # Groups of a file, slices among them; characters of a unit; bytes of a chunk, unpacked.
-_MOST_GROUPS, _LONGEST_UNIT, _MOST_CHUNK = 4096, 64, 64 << 20
+_MAX_GROUPS, _MAX_UNIT_LENGTH, _MAX_CHUNK_BYTES = 4096, 64, 64 << 20
 
 
-def batches(path: Path, columns: Sequence[str]) -> Iterator[pa.RecordBatch]:
+def read_batches(path: Path, columns: Sequence[str]) -> Iterator[pa.RecordBatch]:
     """Rows of some columns of numbers, in the order of the file; the unit of each in its field's metadata.
 
     Errors : BadInput, one line, where the file is damaged, has no rows, or asks for more than is reasonable; it names
              the dataset where one is wrong
     """
-    yield from files.read_apart(__name__, path, columns)
+    yield from files.read_in_subprocess(__name__, path, columns)
 
 
 # ----------------------------------------------------------------------------------------- in a process of its own
 
 
-def send(path: Path, columns: Sequence[str], texts: Sequence[str], out: IO[bytes]) -> None:
+def send_batches(path: Path, columns: Sequence[str], text_columns: Sequence[str], out: IO[bytes]) -> None:
     """Write the batches of a file as an Arrow stream; BadInput, whatever the library trips over.
 
     path : of the file;  columns : wanted, of numbers;  texts : none, as other forms have them;  out : open to write
@@ -49,44 +49,44 @@ def send(path: Path, columns: Sequence[str], texts: Sequence[str], out: IO[bytes
 
     try:
         with h5py.File(path, "r", locking=False) as file:
-            slices = [_columns(path, group, columns) for group in _slices(path, file)]
-            if not sum(_rows(one) for one in slices):
-                raise BadInput(f"{path}: dataset {slices[0][0].name} has no rows")
-            _send(path, slices, columns, out)
+            slice_columns = [_column_datasets(path, group, columns) for group in _data_groups(path, file)]
+            if not sum(_row_count(columns_of_slice) for columns_of_slice in slice_columns):
+                raise BadInput(f"{path}: dataset {slice_columns[0][0].name} has no rows")
+            _send(path, slice_columns, columns, out)
     except BadInput:
         raise
     except Exception as error:
         raise BadInput(f"{path}: {' '.join(str(error).split())[:300] or type(error).__name__}") from None
 
 
-def _slices(path: Path, file: Any) -> list[Any]:
+def _data_groups(path: Path, file: Any) -> list[Any]:
     """The groups `data` of a file, and what its headers say."""
     import h5py
 
-    if len(file) > _MOST_GROUPS:
+    if len(file) > _MAX_GROUPS:
         raise BadInput(f"{path}: has {len(file)} groups: too many")
-    names = [name for name in sorted(file, key=_by_number) if name not in ("data", "index")]
-    inside = [file, *(_held(path, file, name) for name in names)]
-    found = []
-    for group in inside:
+    names = [name for name in sorted(file, key=_numeric_sort_key) if name not in ("data", "index")]
+    slice_groups = [file, *(_hard_linked_item(path, file, name) for name in names)]
+    data_groups = []
+    for group in slice_groups:
         if not isinstance(group, h5py.Group):
             continue
         if "header" in group and "file" in group["header"]:
-            kind = _text(group["header"]["file"].attrs.get("data_type", _TYPES[0]))
+            kind = _decode_text(group["header"]["file"].attrs.get("data_type", _TYPES[0]))
             if kind not in _TYPES:
                 raise BadInput(f"{path}: {group.name} holds {kind[:40]}, wanted {' or '.join(_TYPES)}")
-        if "data" in group and isinstance(held := _held(path, group, "data"), h5py.Group):
-            found.append(held)
-    if not found:
+        if "data" in group and isinstance(data_group := _hard_linked_item(path, group, "data"), h5py.Group):
+            data_groups.append(data_group)
+    if not data_groups:
         raise BadInput(f"{path}: has no group data with columns")
-    return found
+    return data_groups
 
 
-def _by_number(name: str) -> tuple[int, str]:
+def _numeric_sort_key(name: str) -> tuple[int, str]:
     return (int(name), "") if name.isascii() and name.isdigit() and len(name) < 10 else (1 << 31, name)
 
 
-def _held(path: Path, group: Any, name: str) -> Any:
+def _hard_linked_item(path: Path, group: Any, name: str) -> Any:
     """What a file itself holds, not what it leads to."""
     import h5py
 
@@ -95,56 +95,58 @@ def _held(path: Path, group: Any, name: str) -> Any:
     return group[name]
 
 
-def _columns(path: Path, group: Any, columns: Sequence[str]) -> list[Any]:
+def _column_datasets(path: Path, group: Any, columns: Sequence[str]) -> list[Any]:
     import h5py
 
-    titles = list(group)
-    if len(titles) > _MOST_GROUPS:
-        raise BadInput(f"{path}: {group.name} has {len(titles)} columns: too many")
-    files.check_titles(path, titles, columns)
-    found = [_held(path, group, name) for name in columns]
-    for column in found:
+    column_names = list(group)
+    if len(column_names) > _MAX_GROUPS:
+        raise BadInput(f"{path}: {group.name} has {len(column_names)} columns: too many")
+    files.check_column_names(path, column_names, columns)
+    datasets = [_hard_linked_item(path, group, name) for name in columns]
+    for column in datasets:
         if not isinstance(column, h5py.Dataset) or len(column.shape or ()) != 1 or column.dtype.kind not in "fiub":
             raise BadInput(f"{path}: dataset {column.name} is no column of numbers")
         if column.is_virtual or column.external:
             raise BadInput(f"{path}: dataset {column.name} leads elsewhere")
-        if column.chunks and column.chunks[0] * column.dtype.itemsize > _MOST_CHUNK:
+        if column.chunks and column.chunks[0] * column.dtype.itemsize > _MAX_CHUNK_BYTES:
             raise BadInput(f"{path}: dataset {column.name} has chunks of {column.chunks[0]} rows: too large")
-        if len(column) != len(found[0]):
-            said = f"has {len(column)} rows, {found[0].name} {len(found[0])}"
-            raise BadInput(f"{path}: dataset {column.name} {said}")
-    return found
+        if len(column) != len(datasets[0]):
+            lengths = f"has {len(column)} rows, {datasets[0].name} {len(datasets[0])}"
+            raise BadInput(f"{path}: dataset {column.name} {lengths}")
+    return datasets
 
 
-def _rows(columns: Sequence[Any]) -> int:
+def _row_count(columns: Sequence[Any]) -> int:
     return len(columns[0])
 
 
-def _send(path: Path, slices: Sequence[Sequence[Any]], columns: Sequence[str], out: IO[bytes]) -> None:
-    fields = zip(columns, slices[0], strict=True)
-    schema = pa.schema([pa.field(name, pa.from_numpy_dtype(one.dtype), metadata=_about(one)) for name, one in fields])
+def _send(path: Path, slice_columns: Sequence[Sequence[Any]], columns: Sequence[str], out: IO[bytes]) -> None:
+    fields = zip(columns, slice_columns[0], strict=True)
+    schema = pa.schema(
+        [pa.field(name, pa.from_numpy_dtype(column.dtype), metadata=_unit_metadata(column)) for name, column in fields]
+    )
     with pa.ipc.new_stream(out, schema) as stream:
-        for here in slices:
-            for name, one in zip(columns, here, strict=True):
-                _check_alike(path, schema.field(name), one)
-            for first in range(0, _rows(here), _ROWS_A_BATCH):
-                arrays = [pa.array(one[first : first + _ROWS_A_BATCH]) for one in here]
+        for columns_of_slice in slice_columns:
+            for name, column in zip(columns, columns_of_slice, strict=True):
+                _check_same_type(path, schema.field(name), column)
+            for first in range(0, _row_count(columns_of_slice), _ROWS_PER_BATCH):
+                arrays = [pa.array(column[first : first + _ROWS_PER_BATCH]) for column in columns_of_slice]
                 stream.write_batch(pa.record_batch(arrays, schema=schema))
 
 
-def _check_alike(path: Path, field: pa.Field, column: Any) -> None:
-    if pa.from_numpy_dtype(column.dtype) != field.type or _about(column) != (field.metadata or {}):
+def _check_same_type(path: Path, field: pa.Field, column: Any) -> None:
+    if pa.from_numpy_dtype(column.dtype) != field.type or _unit_metadata(column) != (field.metadata or {}):
         raise BadInput(f"{path}: dataset {column.name} has another type or unit than in the first slice")
 
 
-def _about(column: Any) -> dict[bytes, bytes]:
-    said = _text(column.attrs.get("unit", ""))
-    return {} if said in ("", "None") else {b"unit": said[:_LONGEST_UNIT].encode()}
+def _unit_metadata(column: Any) -> dict[bytes, bytes]:
+    unit = _decode_text(column.attrs.get("unit", ""))
+    return {} if unit in ("", "None") else {b"unit": unit[:_MAX_UNIT_LENGTH].encode()}
 
 
-def _text(said: Any) -> str:
-    return said.decode(errors="replace") if isinstance(said, bytes) else str(said)
+def _decode_text(value: Any) -> str:
+    return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
 
 
 if __name__ == "__main__":
-    sys.exit(files.main(sys.argv[1:], send))
+    sys.exit(files.main(sys.argv[1:], send_batches))

@@ -16,7 +16,7 @@ from lake_schema.fits import images, write
 from lake_schema.fits.images import STRUCTURE, Card, Image
 
 # What astropy calls a packed image that has no name.
-_NAMELESS = ("", "COMPRESSED_IMAGE")
+_DEFAULT_NAMES = ("", "COMPRESSED_IMAGE")
 
 _INHERIT: tuple[Card, ...] = (("INHERIT", True, "the first header of the file holds, too"),)
 
@@ -24,9 +24,9 @@ _INHERIT: tuple[Card, ...] = (("INHERIT", True, "the first header of the file ho
 def join(
     path: Path,
     files: Sequence[tuple[str, Path]],
-    shared: Sequence[str],
-    more: Sequence[Card],
-    in_each: Sequence[str] = (),
+    shared_keywords: Sequence[str],
+    extra_cards: Sequence[Card],
+    kept_keywords: Sequence[str] = (),
 ) -> None:
     """Write a file of all the files' arrays, one file after the other; replaces `path` in one rename.
 
@@ -39,55 +39,75 @@ def join(
     """
     if not files:
         raise BadInput(f"{path}: there is nothing to join")
-    every = [_first_cards(file) for _, file in files]
-    common = [card for key, card in every[0].items() if key in shared and all(one.get(key) == card for one in every)]
-    write.write_one_by_one(path, _units(files, [*common, *more], {card[0] for card in common}, set(in_each)))
+    first_cards = [_first_cards(file) for _, file in files]
+    common = [
+        card
+        for key, card in first_cards[0].items()
+        if key in shared_keywords and all(cards.get(key) == card for cards in first_cards)
+    ]
+    write.write_one_by_one(
+        path, _joined_hdus(files, [*common, *extra_cards], {card[0] for card in common}, set(kept_keywords))
+    )
 
 
-def _units(files: Sequence[tuple[str, Path]], cards: Sequence[Card], common: set[str], kept: set[str]) -> Iterator[Any]:
-    yield images.primary(Image(None, tuple(cards)))
+def _joined_hdus(
+    files: Sequence[tuple[str, Path]], cards: Sequence[Card], common_keywords: set[str], kept_keywords: set[str]
+) -> Iterator[Any]:
+    yield images.primary_hdu(Image(None, tuple(cards)))
     for name, file in files:
-        with write.refusing(file), fits.open(file, memmap=False, disable_image_compression=True) as units:
-            first = units[0]
-            for unit in units:
-                if write.is_packed(unit):
-                    yield _packed(unit, name, common, kept, first)
-                elif unit.header["NAXIS"]:
-                    yield _plain(unit, name, common, kept, first)
+        with write.errors_as_damaged(file), fits.open(file, memmap=False, disable_image_compression=True) as hdus:
+            first_hdu = hdus[0]
+            for hdu in hdus:
+                if write.is_compressed(hdu):
+                    yield _compressed_extension(hdu, name, common_keywords, kept_keywords, first_hdu)
+                elif hdu.header["NAXIS"]:
+                    yield _image_extension(hdu, name, common_keywords, kept_keywords, first_hdu)
 
 
-def _plain(unit: Any, name: str, common: set[str], kept: set[str], first: Any) -> Any:
-    image = images.image_of(unit)
-    own = tuple(card for card in image.cards if card[0] not in common - kept)
-    cards = (*_INHERIT * ("INHERIT" not in unit.header), *_cards_of(first, {*common, *unit.header}), *own)
-    return images.extension(Image(image.data, cards, _name(image.name, name)))
+def _image_extension(hdu: Any, name: str, common_keywords: set[str], kept_keywords: set[str], first_hdu: Any) -> Any:
+    image = images.image_from_hdu(hdu)
+    array_cards = tuple(card for card in image.cards if card[0] not in common_keywords - kept_keywords)
+    cards = (
+        *_INHERIT * ("INHERIT" not in hdu.header),
+        *_cards_except(first_hdu, {*common_keywords, *hdu.header}),
+        *array_cards,
+    )
+    return images.image_hdu(Image(image.data, cards, _extension_name(image.name, name)))
 
 
-def _packed(unit: Any, name: str, common: set[str], kept: set[str], first: Any) -> Any:
+def _compressed_extension(
+    hdu: Any, name: str, common_keywords: set[str], kept_keywords: set[str], first_hdu: Any
+) -> Any:
     """The table that it is stored as: its rows are not touched."""
-    for key in (common - kept) & set(unit.header):
-        del unit.header[key]
-    for card in (*_INHERIT * ("INHERIT" not in unit.header), *_cards_of(first, {*common, *unit.header})):
-        unit.header.append(card, end=True)
-    unit.header["EXTNAME"] = _name(unit.header.get("EXTNAME", ""), name)
-    return unit
+    for key in (common_keywords - kept_keywords) & set(hdu.header):
+        del hdu.header[key]
+    for card in (*_INHERIT * ("INHERIT" not in hdu.header), *_cards_except(first_hdu, {*common_keywords, *hdu.header})):
+        hdu.header.append(card, end=True)
+    hdu.header["EXTNAME"] = _extension_name(hdu.header.get("EXTNAME", ""), name)
+    return hdu
 
 
-def _name(own: str, file: str) -> str:
+def _extension_name(array_name: str, file_name: str) -> str:
     """Of an array: its file's, and its own where it has one."""
-    return file if own in _NAMELESS else own if own.startswith(file) else f"{file}.{own}"
+    return (
+        file_name
+        if array_name in _DEFAULT_NAMES
+        else array_name
+        if array_name.startswith(file_name)
+        else f"{file_name}.{array_name}"
+    )
 
 
 def _first_cards(file: Path) -> dict[str, Card]:
     """Of the header that holds for all of a file: the first that says anything."""
-    with write.refusing(file), fits.open(file, memmap=False, disable_image_compression=True) as units:
-        hollow = len(units) > 1 and write.is_packed(units[1]) and not _cards_of(units[0], set())
-        return {card[0]: card for card in _cards_of(units[int(hollow)], set())}
+    with write.errors_as_damaged(file), fits.open(file, memmap=False, disable_image_compression=True) as hdus:
+        skip_primary = len(hdus) > 1 and write.is_compressed(hdus[1]) and not _cards_except(hdus[0], set())
+        return {card[0]: card for card in _cards_except(hdus[int(skip_primary)], set())}
 
 
-def _cards_of(unit: Any, without: set[str]) -> list[Card]:
+def _cards_except(hdu: Any, excluded_keywords: set[str]) -> list[Card]:
     return [
         (card.keyword, card.value, card.comment)
-        for card in unit.header.cards
-        if card.keyword not in STRUCTURE and card.keyword not in without
+        for card in hdu.header.cards
+        if card.keyword not in STRUCTURE and card.keyword not in excluded_keywords
     ]

@@ -13,16 +13,16 @@ from astropy.io import fits
 
 from lake_schema.arrays import Array
 from lake_schema.fits import images
-from lake_schema.fits import write as whole
+from lake_schema.fits import write as fits_file
 from lake_schema.fits.images import Card
 
 # Name, code of the FITS type, unit ("" = none), values of a column.
-Values = tuple[str, str, str, Array]
+ColumnData = tuple[str, str, str, Array]
 _CARD, _BLOCK = 80, 2880
 
 
 def write(
-    path: Path, columns: Sequence[Values], cards: Sequence[Card] = (), shape: tuple[int, ...] | None = None
+    path: Path, columns: Sequence[ColumnData], cards: Sequence[Card] = (), shape: tuple[int, ...] | None = None
 ) -> None:
     """Replaced in one rename.
 
@@ -30,25 +30,25 @@ def write(
     cards : of the image that the rows were found in;  shape : ny, nx of it, None where there is none
     """
     objects = fits.BinTableHDU.from_columns([_column(*column) for column in columns], name="LDAC_OBJECTS")
-    whole.write_staged(path, fits.HDUList([fits.PrimaryHDU(), _header(cards, shape or ()), objects]))
+    fits_file.write_atomically(path, fits.HDUList([fits.PrimaryHDU(), _header(cards, shape or ()), objects]))
 
 
 def _column(name: str, code: str, unit: str, values: Array) -> fits.Column:
     return fits.Column(name, code, array=values, **({"unit": unit} if unit else {}))
 
 
-def _header(of_image: Sequence[Card], shape: tuple[int, ...]) -> fits.BinTableHDU:
+def _header(image_cards: Sequence[Card], shape: tuple[int, ...]) -> fits.BinTableHDU:
     """The cards of a field's header as one text, as the form wants them."""
     structure: tuple[Card, ...] = (
         ("SIMPLE", True, ""), ("BITPIX", -32 if shape else 8, ""), ("NAXIS", len(shape), ""),
         *((f"NAXIS{i}", n, "") for i, n in enumerate(reversed(shape), start=1)),
     )  # fmt: skip
-    lines = [*images.text_of([*structure, *of_image]).splitlines(), "END"]
+    lines = [*images.cards_to_text([*structure, *image_cards]).splitlines(), "END"]
     # A long text goes on in the next cards.
     cards = b"".join(line.ljust(-(-len(line) // _CARD) * _CARD).encode("ascii") for line in lines)
     column = fits.Column("Field Header Card", f"{len(cards)}A", array=np.array([cards]))
-    unit = fits.BinTableHDU.from_columns([column], name="LDAC_IMHEAD")
-    unit.header["TDIM1"] = f"({_CARD}, {len(cards) // _CARD})"
+    hdu = fits.BinTableHDU.from_columns([column], name="LDAC_IMHEAD")
+    hdu.header["TDIM1"] = f"({_CARD}, {len(cards) // _CARD})"
     # Taken as it is stored: astropy would make zeros of the spaces at the end of a text, after it has summed them up.
-    stored = unit.header.tostring().encode("ascii") + cards + bytes(-len(cards) % _BLOCK)
+    stored = hdu.header.tostring().encode("ascii") + cards + bytes(-len(cards) % _BLOCK)
     return fits.BinTableHDU.fromstring(stored)

@@ -12,11 +12,11 @@ from astropy.io import fits
 
 from lake_schema.arrays import Float32
 from lake_schema.errors import BadInput
-from lake_schema.fits import write as whole
+from lake_schema.fits import write as fits_file
 
 
 def write(
-    path: Path, planes: Float32, step: float, fwhm: float, middle: tuple[float, float], unit: tuple[float, float]
+    path: Path, planes: Float32, step: float, fwhm: float, centre: tuple[float, float], scale: tuple[float, float]
 ) -> None:
     """Write a model; replaces `path` in one rename.
 
@@ -35,8 +35,8 @@ def write(
     for number, axis in enumerate("XY", start=1):
         table.header[f"POLGRP{number}"] = (1, "polynomial group of this coordinate")
         table.header[f"POLNAME{number}"] = (f"{axis}_IMAGE", "coordinate")
-        table.header[f"POLZERO{number}"] = (middle[number - 1], "[pix] its zero")
-        table.header[f"POLSCAL{number}"] = (unit[number - 1], "[pix] its unit")
+        table.header[f"POLZERO{number}"] = (centre[number - 1], "[pix] its zero")
+        table.header[f"POLSCAL{number}"] = (scale[number - 1], "[pix] its unit")
     table.header["POLNGRP"] = (1, "groups of coordinates")
     table.header["POLDEG1"] = (degree, "degree of the polynomials")
     table.header["PSF_FWHM"] = (fwhm, "[pix] of a star")
@@ -44,4 +44,4 @@ def write(
     table.header["PSFNAXIS"] = (3, "axes of PSF_MASK")
     for number, length in enumerate((side, side, len(planes)), start=1):
         table.header[f"PSFAXIS{number}"] = length
-    whole.write_staged(path, fits.HDUList([fits.PrimaryHDU(), table]))
+    fits_file.write_atomically(path, fits.HDUList([fits.PrimaryHDU(), table]))

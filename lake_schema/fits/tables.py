@@ -27,7 +27,7 @@ from lake_schema.errors import BadInput
 from lake_schema.fits import write
 
 # What fits into the card of a column's name.
-_LONGEST_NAME = 68
+_MAX_NAME_LENGTH = 68
 _TABLE_FORMATS = {
     "int64": "K",
     "int32": "J",
@@ -48,62 +48,64 @@ def table_to_fits(path: Path, table: pa.Table, declared: Table) -> None:
     """
     columns = [declared.column(name) for name in table.column_names]
     for column in columns:
-        _check_name(column.name, f"{path}: ")
-    unit = fits.BinTableHDU.from_columns(
+        _check_column_name(column.name, f"{path}: ")
+    hdu = fits.BinTableHDU.from_columns(
         [_fits_column(c, table.column(c.name)) for c in columns], name=declared.name.upper()
     )
-    stored = unit.data.view(np.ndarray)
+    stored = hdu.data.view(np.ndarray)
     for column in columns:
         if column.type == "bool":
             stored[column.name][table.column(column.name).is_null().to_numpy()] = 0
             # astropy 7.2 would write its converted copy of the column, in which a missing value is False.
-            unit.data._converted.pop(column.name, None)
+            hdu.data._converted.pop(column.name, None)
     for number, column in enumerate(columns, start=1):
         if column.ucd:
-            unit.header[f"TUCD{number}"] = (column.ucd, "IVOA UCD")
-    unit.header["TABLEVER"] = (declared.version, "version of the table's declaration")
-    write.write_staged(path, fits.HDUList([fits.PrimaryHDU(), unit]))
+            hdu.header[f"TUCD{number}"] = (column.ucd, "IVOA UCD")
+    hdu.header["TABLEVER"] = (declared.version, "version of the table's declaration")
+    write.write_atomically(path, fits.HDUList([fits.PrimaryHDU(), hdu]))
 
 
-def _check_name(name: str, where: str = "") -> None:
-    if not (name.isascii() and name.isprintable() and 0 < len(name) <= _LONGEST_NAME):
+def _check_column_name(name: str, where: str = "") -> None:
+    if not (name.isascii() and name.isprintable() and 0 < len(name) <= _MAX_NAME_LENGTH):
         raise BadInput(f"{where}column {name!r} has a name that FITS cannot hold; give it another with AS")
 
 
 def _fits_column(column: Column, values: pa.ChunkedArray) -> fits.Column:
-    unit = {"unit": fits_unit(column.unit)} if column.unit else {}
+    unit_option = {"unit": fits_unit(column.unit)} if column.unit else {}
     if column.type.startswith("list"):
-        return _fits_lists(column, values, unit)
+        return _fits_lists(column, values, unit_option)
     if column.type == "string":
         texts = [value or "" for value in values.to_pylist()]
         width = max([1, *(len(text.encode()) for text in texts)])
-        return fits.Column(column.name, f"{width}A", array=np.array(texts, dtype=f"U{width}"), **unit)
+        return fits.Column(column.name, f"{width}A", array=np.array(texts, dtype=f"U{width}"), **unit_option)
     code = _TABLE_FORMATS[column.type]
     if values.null_count == 0 or code in "DEL":
         filled = values.fill_null(False if code == "L" else float("nan")) if values.null_count else values
-        return fits.Column(column.name, code, array=filled.to_numpy(), **unit)
+        return fits.Column(column.name, code, array=filled.to_numpy(), **unit_option)
     # FITS has no signed bytes: they are written as 16 bits.
-    wide = values.cast(pa.int16()) if column.type == "int8" else values
-    missing = _unused(wide.drop_null().to_numpy())
-    return fits.Column(column.name, code, array=wide.fill_null(missing).to_numpy(), null=missing, **unit)
+    widened = values.cast(pa.int16()) if column.type == "int8" else values
+    null_value = _lowest_unused_value(widened.drop_null().to_numpy())
+    return fits.Column(
+        column.name, code, array=widened.fill_null(null_value).to_numpy(), null=null_value, **unit_option
+    )
 
 
-def _unused(values: Array) -> int:
+def _lowest_unused_value(values: Array) -> int:
     """The lowest number of an integer type that does not occur."""
-    limits, seen = np.iinfo(values.dtype), np.unique(values)
-    taken = np.flatnonzero(seen != limits.min + np.arange(seen.size))
-    lowest = int(limits.min) + int(taken[0] if taken.size else seen.size)
+    limits, unique_values = np.iinfo(values.dtype), np.unique(values)
+    gaps = np.flatnonzero(unique_values != limits.min + np.arange(unique_values.size))
+    lowest = int(limits.min) + int(gaps[0] if gaps.size else unique_values.size)
     if lowest > limits.max:
         raise ValueError(f"every number of {values.dtype} occurs: none is left for what is missing")
     return lowest
 
 
-def _fits_lists(column: Column, values: pa.ChunkedArray, unit: dict[str, str]) -> fits.Column:
+def _fits_lists(column: Column, values: pa.ChunkedArray, unit_option: dict[str, str]) -> fits.Column:
     code = _TABLE_FORMATS[column.type.removeprefix("list<").removesuffix(">")]
     arrays = np.empty(len(values), object)
     for i, value in enumerate(values.to_pylist()):
         arrays[i] = np.array(value or [], fits.column.FITS2NUMPY[code])
-    return fits.Column(column.name, f"P{code}()", array=arrays, **unit)
+    return fits.Column(column.name, f"P{code}()", array=arrays, **unit_option)
 
 
 def fits_unit(text: str) -> str:
@@ -119,13 +121,13 @@ def fits_unit(text: str) -> str:
 # ------------------------------------------------------------------------------------------------ any number of rows
 
 # Bytes of rows that are put together at a time, and of a block of a FITS file.
-_PIECE_BYTES, _BLOCK = 8 << 20, 2880
+_CHUNK_BYTES, _BLOCK = 8 << 20, 2880
 # Of the lowest numbers of an integer type those among which one that does not occur is looked for.
-_LOOKED_THROUGH = 1 << 16
+_SEARCHED_VALUES = 1 << 16
 
 
 @dataclass(slots=True)
-class _Looked:
+class _ColumnScan:
     """What must be known of all values of a column before the first is written.
 
     widest : bytes of a text, or length of a list;  is_missing : whether one is null
@@ -133,53 +135,53 @@ class _Looked:
     """
 
     column: Column
-    widest: int = 0
-    is_missing: bool = False
-    lowest: Array = field(default_factory=lambda: np.zeros(_LOOKED_THROUGH, bool))
+    max_width: int = 0
+    has_missing: bool = False
+    is_used: Array = field(default_factory=lambda: np.zeros(_SEARCHED_VALUES, bool))
 
     @property
     def is_list(self) -> bool:
         return self.column.type.startswith("list")
 
     @property
-    def kind(self) -> np.dtype[Any]:
+    def dtype(self) -> np.dtype[Any]:
         """Of a value in its row; of a list the length and the place of its values."""
         if self.is_list:
             return np.dtype((">i8", (2,)))
         if self.column.type == "string":
-            return np.dtype(f"S{max(self.widest, 1)}")
-        return np.dtype("u1") if self.column.type == "bool" else np.dtype(_item(self.column.type))
+            return np.dtype(f"S{max(self.max_width, 1)}")
+        return np.dtype("u1") if self.column.type == "bool" else np.dtype(_fits_byte_type(self.column.type))
 
     @property
-    def form(self) -> str:
+    def fits_format(self) -> str:
         if self.is_list:
-            return f"Q{_TABLE_FORMATS[_inner(self.column.type)]}({self.widest})"
-        return f"{max(self.widest, 1)}A" if self.column.type == "string" else _TABLE_FORMATS[self.column.type]
+            return f"Q{_TABLE_FORMATS[_element_type(self.column.type)]}({self.max_width})"
+        return f"{max(self.max_width, 1)}A" if self.column.type == "string" else _TABLE_FORMATS[self.column.type]
 
     @property
-    def null(self) -> int | None:
+    def null_value(self) -> int | None:
         """What stands for a missing whole number, None where none is missing."""
-        if not (self.is_missing and self.kind.kind == "i" and not self.is_list):
+        if not (self.has_missing and self.dtype.kind == "i" and not self.is_list):
             return None
-        if self.lowest.all():
+        if self.is_used.all():
             raise BadInput(f"column {self.column.name}: no integer is left to stand for null; cast it to DOUBLE")
-        return int(np.iinfo(self.kind).min) + int(np.argmin(self.lowest))
+        return int(np.iinfo(self.dtype).min) + int(np.argmin(self.is_used))
 
-    def look(self, values: pa.Array) -> None:
+    def scan(self, values: pa.Array) -> None:
         """At some more values."""
-        self.is_missing |= values.null_count > 0
+        self.has_missing |= values.null_count > 0
         if self.is_list or self.column.type == "string":
             lengths = pc.list_value_length(values) if self.is_list else pc.binary_length(values)
-            self.widest = max(self.widest, pc.max(lengths).as_py() or 0)
-        elif self.kind.kind == "i":
-            found = values.drop_null().to_numpy()
+            self.max_width = max(self.max_width, pc.max(lengths).as_py() or 0)
+        elif self.dtype.kind == "i":
+            present_values = values.drop_null().to_numpy()
             # Far from the lowest a difference would leave the type.
-            near = found[found < np.iinfo(self.kind).min + _LOOKED_THROUGH].astype(np.int64)
-            self.lowest[near - np.iinfo(self.kind).min] = True
+            low_values = present_values[present_values < np.iinfo(self.dtype).min + _SEARCHED_VALUES].astype(np.int64)
+            self.is_used[low_values - np.iinfo(self.dtype).min] = True
 
 
 def stream_to_fits(
-    file: IO[bytes], batches: Callable[[], Iterable[pa.RecordBatch]], declared: Table, most: int | None = None
+    file: IO[bytes], batches: Callable[[], Iterable[pa.RecordBatch]], declared: Table, max_bytes: int | None = None
 ) -> None:
     """Write rows as `table_to_fits` does, without checksums; lists have addresses of 64 bits.
 
@@ -187,93 +189,95 @@ def stream_to_fits(
     most : bytes that the rows may take, None = any number
     Errors : BadInput names a column that FITS cannot hold, or where they take more
     """
-    looked, rows = [_Looked(column) for column in declared.columns], 0
+    scans, rows = [_ColumnScan(column) for column in declared.columns], 0
     for column in declared.columns:
-        _check_name(column.name)
+        _check_column_name(column.name)
     for batch in batches():
         rows += batch.num_rows
-        for one, values in zip(looked, batch.columns, strict=True):
-            one.look(values)
-    record = np.dtype([(f"f{number}", one.kind) for number, one in enumerate(looked)])
-    if most is not None and rows * record.itemsize > most:
-        raise BadInput(f"a FITS file of the result has more than {most / 1e9:.3g} GB: ask for less, or another kind")
+        for scan, values in zip(scans, batch.columns, strict=True):
+            scan.scan(values)
+    record_type = np.dtype([(f"f{number}", scan.dtype) for number, scan in enumerate(scans)])
+    if max_bytes is not None and rows * record_type.itemsize > max_bytes:
+        raise BadInput(
+            f"a FITS file of the result has more than {max_bytes / 1e9:.3g} GB: ask for less, or another kind"
+        )
     with tempfile.TemporaryFile() as lists:
         # The header says how long the values of lists are, which lie behind the rows.
         start = file.tell()
-        file.write(_header(declared, looked, record.itemsize, rows, 0))
+        file.write(_header(declared, scans, record_type.itemsize, rows, 0))
         for batch in batches():
-            step = max(_PIECE_BYTES // max(record.itemsize, 1), 1)
-            for first in range(0, batch.num_rows, step):
-                file.write(_records(batch.slice(first, step), looked, record, lists))
-        behind = lists.tell()
+            rows_per_chunk = max(_CHUNK_BYTES // max(record_type.itemsize, 1), 1)
+            for first in range(0, batch.num_rows, rows_per_chunk):
+                file.write(_records(batch.slice(first, rows_per_chunk), scans, record_type, lists))
+        list_bytes = lists.tell()
         lists.seek(0)
-        shutil.copyfileobj(lists, file, _PIECE_BYTES)
-        file.write(bytes(-(rows * record.itemsize + behind) % _BLOCK))
+        shutil.copyfileobj(lists, file, _CHUNK_BYTES)
+        file.write(bytes(-(rows * record_type.itemsize + list_bytes) % _BLOCK))
         file.seek(start)
-        file.write(_header(declared, looked, record.itemsize, rows, behind))
+        file.write(_header(declared, scans, record_type.itemsize, rows, list_bytes))
 
 
-def _header(declared: Table, looked: list[_Looked], width: int, rows: int, behind: int) -> bytes:
+def _header(declared: Table, scans: list[_ColumnScan], width: int, rows: int, list_bytes: int) -> bytes:
     """A primary unit without pixels, and the header of the table, of a length that its numbers do not change."""
     columns = []
-    for one in looked:
-        unit = {"unit": fits_unit(one.column.unit)} if one.column.unit else {}
-        columns.append(fits.Column(one.column.name, one.form, null=one.null, **unit))
+    for scan in scans:
+        unit_option = {"unit": fits_unit(scan.column.unit)} if scan.column.unit else {}
+        columns.append(fits.Column(scan.column.name, scan.fits_format, null=scan.null_value, **unit_option))
     header = fits.BinTableHDU.from_columns(columns, name=declared.name.upper()).header
-    header["NAXIS1"], header["NAXIS2"], header["PCOUNT"] = width, rows, behind
-    for number, one in enumerate(looked, start=1):
-        header[f"TFORM{number}"] = one.form
-        if one.column.ucd:
-            header[f"TUCD{number}"] = (one.column.ucd, "IVOA UCD")
+    header["NAXIS1"], header["NAXIS2"], header["PCOUNT"] = width, rows, list_bytes
+    for number, scan in enumerate(scans, start=1):
+        header[f"TFORM{number}"] = scan.fits_format
+        if scan.column.ucd:
+            header[f"TUCD{number}"] = (scan.column.ucd, "IVOA UCD")
     header["TABLEVER"] = (declared.version, "version of the table's declaration")
     text: str = fits.PrimaryHDU().header.tostring() + header.tostring()
     return text.encode("ascii")
 
 
-def _records(batch: pa.RecordBatch, looked: list[_Looked], record: np.dtype[Any], lists: IO[bytes]) -> bytes:
+def _records(batch: pa.RecordBatch, scans: list[_ColumnScan], record_type: np.dtype[Any], lists: IO[bytes]) -> bytes:
     """Some rows as they stand in the file; values of lists go to the end of `lists`."""
-    out = np.zeros(batch.num_rows, record)
-    _place_lists(out, [(f"f{k}", one, batch.column(k)) for k, one in enumerate(looked) if one.is_list], lists)
-    for name, one, values in zip(record.names or (), looked, batch.columns, strict=True):
-        if one.is_list:
+    out = np.zeros(batch.num_rows, record_type)
+    _write_lists(out, [(f"f{k}", scan, batch.column(k)) for k, scan in enumerate(scans) if scan.is_list], lists)
+    for name, scan, values in zip(record_type.names or (), scans, batch.columns, strict=True):
+        if scan.is_list:
             continue
-        if one.column.type == "string":
+        if scan.column.type == "string":
             try:
                 out[name] = [(value or "").encode("ascii") for value in values.to_pylist()]
             except UnicodeEncodeError as error:
                 letter = error.object[error.start]
-                raise BadInput(f"column {one.column.name}: FITS cannot hold the character {letter!r}") from None
-        elif one.column.type == "bool":
-            texts = pc.if_else(values, ord("T"), ord("F")).cast(pa.uint8())
-            out[name] = texts.fill_null(0).to_numpy(zero_copy_only=False)
+                raise BadInput(f"column {scan.column.name}: FITS cannot hold the character {letter!r}") from None
+        elif scan.column.type == "bool":
+            flags = pc.if_else(values, ord("T"), ord("F")).cast(pa.uint8())
+            out[name] = flags.fill_null(0).to_numpy(zero_copy_only=False)
         else:
-            missing = one.null if one.kind.kind == "i" else float("nan")
-            whole = values if missing is None else values.cast(_wide(values.type)).fill_null(missing)
-            out[name] = whole.to_numpy(zero_copy_only=False)
+            null_value = scan.null_value if scan.dtype.kind == "i" else float("nan")
+            filled = values if null_value is None else values.cast(_fits_arrow_type(values.type)).fill_null(null_value)
+            out[name] = filled.to_numpy(zero_copy_only=False)
     return out.tobytes()
 
 
-def _place_lists(out: Array, columns: list[tuple[str, _Looked, pa.Array]], lists: IO[bytes]) -> None:
+def _write_lists(out: Array, columns: list[tuple[str, _ColumnScan, pa.Array]], lists: IO[bytes]) -> None:
     """Write the values of lists row by row, however many rows come at a time; their lengths and places into `out`."""
-    kinds = [np.dtype(_item(_inner(one.column.type))) for _, one, _ in columns]
+    element_types = [np.dtype(_fits_byte_type(_element_type(scan.column.type))) for _, scan, _ in columns]
     for k, row in enumerate(zip(*(values.to_pylist() for *_, values in columns), strict=True)):
-        for (name, one, _), kind, value in zip(columns, kinds, row, strict=True):
+        for (name, scan, _), element_type, value in zip(columns, element_types, row, strict=True):
             if value:
                 out[name][k] = len(value), lists.tell()
                 try:
-                    lists.write(np.array(value, kind).tobytes())
+                    lists.write(np.array(value, element_type).tobytes())
                 except (TypeError, ValueError):
-                    raise BadInput(f"column {one.column.name}: FITS has no missing value in a list") from None
+                    raise BadInput(f"column {scan.column.name}: FITS has no missing value in a list") from None
 
 
-def _inner(kind: str) -> str:
-    return kind.removeprefix("list<").removesuffix(">")
+def _element_type(list_type: str) -> str:
+    return list_type.removeprefix("list<").removesuffix(">")
 
 
-def _item(kind: str) -> str:
+def _fits_byte_type(kind: str) -> str:
     """FITS has no signed bytes: they are written as 16 bits."""
     return ">i2" if kind == "int8" else np.dtype(kind).newbyteorder(">").str
 
 
-def _wide(kind: pa.DataType) -> pa.DataType:
+def _fits_arrow_type(kind: pa.DataType) -> pa.DataType:
     return pa.int16() if kind == pa.int8() else kind

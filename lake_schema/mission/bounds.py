@@ -13,7 +13,7 @@ from lake_schema.mission.parameter import Parameter, convert
 
 
 @cache
-def _bounds() -> tuple[tuple[re.Pattern[str], float, float, str], ...]:
+def _read_bounds() -> tuple[tuple[re.Pattern[str], float, float, str], ...]:
     with (files("lake_schema.mission") / "bounds.csv").open(encoding="utf-8") as stream:
         return tuple(
             (re.compile(translate(r["pattern"])), float(r["lo"]), float(r["hi"]), r["unit"])
@@ -22,19 +22,19 @@ def _bounds() -> tuple[tuple[re.Pattern[str], float, float, str], ...]:
 
 
 @cache
-def bounds_of(key: str) -> tuple[tuple[float, float, str], ...]:
+def bounds_of_parameter(key: str) -> tuple[tuple[float, float, str], ...]:
     """(lowest, highest, unit) of every bound that a parameter must keep."""
-    return tuple((lo, hi, unit) for pattern, lo, hi, unit in _bounds() if pattern.fullmatch(key))
+    return tuple((lo, hi, unit) for pattern, lo, hi, unit in _read_bounds() if pattern.fullmatch(key))
 
 
 @cache
-def is_whole(key: str) -> bool:
+def is_count(key: str) -> bool:
     """Whether a parameter is a count, of which no fraction has a meaning."""
     with (files("lake_schema.mission") / "counts.csv").open(encoding="utf-8") as stream:
         return any(fnmatchcase(key, row["pattern"]) for row in csv.DictReader(stream))
 
 
-def check(parameter: Parameter, key: str) -> None:
+def check_bounds(parameter: Parameter, key: str) -> None:
     """Refuse a parameter outside its bounds.
 
     Parameters
@@ -51,9 +51,9 @@ def check(parameter: Parameter, key: str) -> None:
     OutOfRange
         If it is outside its bounds.
     """
-    if is_whole(key) and parameter.value % 1.0:
+    if is_count(key) and parameter.value % 1.0:
         raise BadInput(f"mission parameter {parameter.key} = {parameter.value:g} is not a whole number")
-    for lo, hi, unit in bounds_of(key):
+    for lo, hi, unit in bounds_of_parameter(key):
         value = convert(parameter.value, parameter.unit, unit, f"mission parameter {parameter.key}")
         if not lo <= value <= hi:
             raise OutOfRange(f"mission parameter {parameter.key} [{unit}]", value, lo, hi)

@@ -25,22 +25,22 @@ from lake_schema import user_files
 from lake_schema.errors import BadInput
 from lake_schema.mission import bounds, camera_tables
 from lake_schema.mission.camera_tables import (
+    AMPLIFIER_UNITS,
     AMPLIFIERS,
+    BAND_UNITS,
     BANDS,
     LAYOUT,
-    NAME,
-    OF_AMPLIFIERS,
-    OF_BAND,
-    OPTIONAL_OF_BAND,
+    NAME_PATTERN,
+    OPTIONAL_BAND_UNITS,
     PARAMETERS,
     WAVEFRONT,
     Row,
 )
 from lake_schema.mission.model import Model, read_models
-from lake_schema.mission.parameter import CAMERAS, SPACE_CAMERAS, Parameter, convert, read_all
+from lake_schema.mission.parameter import CAMERAS, SPACE_CAMERAS, Parameter, convert, read_all_parameters
 
 _STATUS = "SIM"
-_MODELS = {"layout": LAYOUT, "amplifiers": AMPLIFIERS, "psf.wavefront": WAVEFRONT}
+_MODEL_FILES = {"layout": LAYOUT, "amplifiers": AMPLIFIERS, "psf.wavefront": WAVEFRONT}
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class Curve:
     band: str
     file: Path
     medium: str
-    place: str
+    location: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,131 +118,143 @@ def read(folder: Path) -> Camera:
         If a file or a parameter is missing, a column, name, unit or number is wrong, or detectors or amplifiers
         overlap. The message names the file and the line.
     """
-    name = _name(folder)
+    name = _camera_name(folder)
     prefix = f"ext.{name}."
-    parameters = _parameters(folder, prefix)
-    of_bands, curves = _bands(folder, name)
+    parameters = _read_parameters(folder, prefix)
+    band_parameters, curves = _read_bands(folder, name)
     pixel = next(p for p in parameters if p.key == f"{prefix}fpa.pixel_size")
-    layout = camera_tables.checked_layout(folder, convert(pixel.value, pixel.unit, "mm / pix", pixel.key))
-    tables = {LAYOUT: layout, AMPLIFIERS: camera_tables.checked_amplifiers(folder, layout)}
+    layout = camera_tables.read_layout(folder, convert(pixel.value, pixel.unit, "mm / pix", pixel.key))
+    tables = {LAYOUT: layout, AMPLIFIERS: camera_tables.read_amplifiers(folder, layout)}
     # The other amplifiers differ from the first one by the ratios of their values in the table.
-    first = tables[AMPLIFIERS][0]
+    first_amplifier = tables[AMPLIFIERS][0]
     parameters += [
-        _parameter(first.place, prefix + key, first.number(key), unit, f"{name}/{AMPLIFIERS}")
-        for key, unit in OF_AMPLIFIERS.items()
+        _make_parameter(
+            first_amplifier.location, prefix + key, first_amplifier.number(key), unit, f"{name}/{AMPLIFIERS}"
+        )
+        for key, unit in AMPLIFIER_UNITS.items()
     ]
     # A link that leads nowhere is a mistake: it is no choice of the default wavefront.
     if os.path.lexists(folder / WAVEFRONT):
-        tables[WAVEFRONT] = camera_tables.checked_wavefront(folder)
+        tables[WAVEFRONT] = camera_tables.read_wavefront(folder)
     models, contents = [], []
-    for key, file in _MODELS.items():
+    for key, file in _MODEL_FILES.items():
         if file in tables:
             data = camera_tables.csv_text(tables[file]).encode()
             sha256 = hashlib.sha256(data).hexdigest()
             models.append(Model(prefix + key, _STATUS, f"{name}_{file}", sha256, source=f"{name}/{file}"))
             contents.append((sha256, data))
     if WAVEFRONT not in tables:
-        ours = next(m for m in read_models() if m.file == "ground_wavefront.csv")
-        models.append(Model(f"{prefix}psf.wavefront", _STATUS, ours.file, ours.sha256, source=ours.source))
-    return Camera(name, (*parameters, *of_bands), tuple(models), tuple(contents), tuple(curves))
+        default_wavefront = next(m for m in read_models() if m.file == "ground_wavefront.csv")
+        models.append(
+            Model(
+                f"{prefix}psf.wavefront",
+                _STATUS,
+                default_wavefront.file,
+                default_wavefront.sha256,
+                source=default_wavefront.source,
+            )
+        )
+    return Camera(name, (*parameters, *band_parameters), tuple(models), tuple(contents), tuple(curves))
 
 
-def _name(folder: Path) -> str:
-    with user_files.reachable(folder):
+def _camera_name(folder: Path) -> str:
+    with user_files.check_reachable(folder):
         if not folder.is_dir():
-            raise BadInput(f"{user_files.shown(folder)}: no such folder")
-    return checked_name(folder)
+            raise BadInput(f"{user_files.format_path(folder)}: no such folder")
+    return check_name(folder)
 
 
-def checked_name(folder: Path) -> str:
+def check_name(folder: Path) -> str:
     """Name of the camera of a folder; BadInput if no camera may have it."""
-    with user_files.reachable(folder):
+    with user_files.check_reachable(folder):
         name = folder.resolve().name
-    if NAME.fullmatch(name) is None:
-        what = "a camera has the name of its folder: at most 40 letters a-z, digits and _"
-        raise BadInput(f"{user_files.shown(folder)}: {what}")
+    if NAME_PATTERN.fullmatch(name) is None:
+        reason = "a camera has the name of its folder: at most 40 letters a-z, digits and _"
+        raise BadInput(f"{user_files.format_path(folder)}: {reason}")
     if name in (*CAMERAS, *SPACE_CAMERAS):
-        raise BadInput(f"{user_files.shown(folder)}: truesky has a camera {name}: choose another name")
+        raise BadInput(f"{user_files.format_path(folder)}: truesky has a camera {name}: choose another name")
     return name
 
 
-def _parameter(place: str, key: str, value: float, unit: str, source: str) -> Parameter:
+def _make_parameter(location: str, key: str, value: float, unit: str, source: str) -> Parameter:
     """Make a parameter; BadInput names its place, file and line, if it is outside its bounds."""
     try:
         parameter = Parameter(key, _STATUS, value, unit, source=source)
-        bounds.check(parameter, key)
+        bounds.check_bounds(parameter, key)
     except BadInput as error:
-        raise BadInput(f"{place}: {error}") from None
+        raise BadInput(f"{location}: {error}") from None
     return parameter
 
 
-def _parameters(folder: Path, prefix: str) -> list[Parameter]:
+def _read_parameters(folder: Path, prefix: str) -> list[Parameter]:
     """Read parameters.csv."""
-    rows, known = camera_tables.read_rows(folder, PARAMETERS), parameter_units()
+    rows, known_parameters = camera_tables.read_rows(folder, PARAMETERS), parameter_units()
     camera_tables.refuse_repeated(rows, lambda row: row.text("name"))
-    found = []
+    parameters = []
     for row in rows:
         name, unit = row.text("name"), row.values["unit"]
-        if name not in known:
-            raise BadInput(f"{row.place}: a ground camera has no parameter {name!r}")
-        convert(1.0, unit, known[name], f"{row.place}: {name}")
-        found.append(_parameter(row.place, prefix + name, row.number("value"), unit, row.text("source")))
-    there = {row.text("name") for row in rows}
-    if missing := [name for name in required_parameters() if name not in there]:
-        raise BadInput(f"{user_files.shown(folder / PARAMETERS)}: parameter {missing[0]} is missing")
-    return found
+        if name not in known_parameters:
+            raise BadInput(f"{row.location}: a ground camera has no parameter {name!r}")
+        convert(1.0, unit, known_parameters[name], f"{row.location}: {name}")
+        parameters.append(_make_parameter(row.location, prefix + name, row.number("value"), unit, row.text("source")))
+    given_names = {row.text("name") for row in rows}
+    if missing := [name for name in required_parameters() if name not in given_names]:
+        raise BadInput(f"{user_files.format_path(folder / PARAMETERS)}: parameter {missing[0]} is missing")
+    return parameters
 
 
-def _bands(folder: Path, name: str) -> tuple[list[Parameter], list[Curve]]:
+def _read_bands(folder: Path, name: str) -> tuple[list[Parameter], list[Curve]]:
     rows = camera_tables.read_rows(folder, BANDS)
     camera_tables.refuse_repeated(rows, lambda row: row.text("band"))
-    reserved = {key.partition(".")[0] for key in (*parameter_units(), *OF_AMPLIFIERS, *_MODELS)}
+    reserved = {key.partition(".")[0] for key in (*parameter_units(), *AMPLIFIER_UNITS, *_MODEL_FILES)}
     parameters, curves = [], []
     for row in rows:
         band = row.text("band")
-        if NAME.fullmatch(band) is None:
-            raise BadInput(f"{row.place}: band = {band!r}: a name has letters a-z, digits and _")
+        if NAME_PATTERN.fullmatch(band) is None:
+            raise BadInput(f"{row.location}: band = {band!r}: a name has letters a-z, digits and _")
         if band in reserved:
-            raise BadInput(f"{row.place}: band = {band!r} is the name of a parameter or table: choose another name")
-        units = OF_BAND | {key: unit for key, unit in OPTIONAL_OF_BAND.items() if row.values[key]}
+            raise BadInput(f"{row.location}: band = {band!r} is the name of a parameter or table: choose another name")
+        units = BAND_UNITS | {key: unit for key, unit in OPTIONAL_BAND_UNITS.items() if row.values[key]}
         parameters += [
-            _parameter(row.place, f"ext.{name}.{band}.{key}", row.number(key), unit, f"{name}/{BANDS}")
+            _make_parameter(row.location, f"ext.{name}.{band}.{key}", row.number(key), unit, f"{name}/{BANDS}")
             for key, unit in units.items()
         ]
         if row.values["curve"]:
-            curves.append(_curve(folder, row))
+            curves.append(_read_curve(folder, row))
     return parameters, curves
 
 
-def _curve(folder: Path, row: Row) -> Curve:
+def _read_curve(folder: Path, row: Row) -> Curve:
     file, medium = row.text("curve"), row.text("medium")
     if medium not in ("air", "vacuum"):
-        raise BadInput(f"{row.place}: medium = {medium!r} is not air or vacuum")
+        raise BadInput(f"{row.location}: medium = {medium!r} is not air or vacuum")
     if Path(file).is_absolute() or ".." in Path(file).parts:
-        raise BadInput(f"{row.place}: curve = {file!r} is outside the camera's folder: give a file in it")
-    return Curve(row.text("band"), user_files.checked(folder / file, "curve", row.place), medium, row.place)
+        raise BadInput(f"{row.location}: curve = {file!r} is outside the camera's folder: give a file in it")
+    return Curve(row.text("band"), user_files.check_file(folder / file, "curve", row.location), medium, row.location)
 
 
 # -------------------------------------------------------------------------------------------------- known parameters
 
 
 @cache
-def known_units() -> Mapping[str, Mapping[str, str]]:
+def units_by_camera() -> Mapping[str, Mapping[str, str]]:
     """Units by parameter, without the camera's prefix and without those of bands, of each known ground camera."""
-    found: dict[str, dict[str, str]] = {camera: {} for camera in CAMERAS}
-    bands = {p.key.split(".")[2] for p in read_all() if p.key.startswith("ext.") and p.key.endswith(".zero_point")}
-    for parameter in read_all():
+    units: dict[str, dict[str, str]] = {camera: {} for camera in CAMERAS}
+    bands = {
+        p.key.split(".")[2] for p in read_all_parameters() if p.key.startswith("ext.") and p.key.endswith(".zero_point")
+    }
+    for parameter in read_all_parameters():
         first, *rest = parameter.key.split(".")
-        if first == "ext" and rest[1] not in (*bands, *OF_AMPLIFIERS):
-            found[rest[0]][".".join(rest[1:])] = parameter.unit
-    return found
+        if first == "ext" and rest[1] not in (*bands, *AMPLIFIER_UNITS):
+            units[rest[0]][".".join(rest[1:])] = parameter.unit
+    return units
 
 
 def parameter_units() -> dict[str, str]:
     """Units of all parameters that a ground camera may have, by name."""
-    return {key: unit for units in known_units().values() for key, unit in units.items()}
+    return {key: unit for units in units_by_camera().values() for key, unit in units.items()}
 
 
 def required_parameters() -> tuple[str, ...]:
     """Names of the parameters that every ground camera has, sorted."""
-    return tuple(sorted(set.intersection(*(set(units) for units in known_units().values()))))
+    return tuple(sorted(set.intersection(*(set(units) for units in units_by_camera().values()))))

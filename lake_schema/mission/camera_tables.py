@@ -18,48 +18,48 @@ from lake_schema.errors import BadInput
 PARAMETERS, LAYOUT, AMPLIFIERS, BANDS, WAVEFRONT = (
     f"{name}.csv" for name in ("parameters", "layout", "amplifiers", "bands", "wavefront")
 )
-KIND = "table of a camera"
-NAME = re.compile(r"[a-z][a-z0-9_]{0,39}", re.ASCII)
-_DETECTOR = re.compile(r"\w[\w-]{0,39}", re.ASCII)
-_MOST_PIXELS = 65_536
+FILE_KIND = "table of a camera"
+NAME_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,39}", re.ASCII)
+_DETECTOR_PATTERN = re.compile(r"\w[\w-]{0,39}", re.ASCII)
+_MAX_PIXELS = 65_536
 # Prescan and overscan of real amplifiers have up to about 100 columns or rows.
-_MOST_SCAN = 512
+_MAX_SCAN = 512
 # Parameters of a band, with the columns of bands.csv and their units; those of the second list may be blank.
-OF_BAND = {
+BAND_UNITS = {
     "zero_point": "mag",
     "sky_brightness": "mag / arcsec2",
     "seeing": "arcsec",
     "extinction": "mag",
 }
-OPTIONAL_OF_BAND = {"fringes": ""}
+OPTIONAL_BAND_UNITS = {"fringes": ""}
 # Parameters of the amplifiers, with the columns of amplifiers.csv and their units.
-OF_AMPLIFIERS = {"gain": "electron / adu", "read_noise": "electron", "full_well": "electron"}
+AMPLIFIER_UNITS = {"gain": "electron / adu", "read_noise": "electron", "full_well": "electron"}
 COLUMNS = {
     PARAMETERS: ("name", "value", "unit", "source"),
     LAYOUT: ("detector", "type", "nx", "ny", "x_mm", "y_mm", "rotation_deg"),
     AMPLIFIERS: (
         "type", "amplifier", "x", "y", "nx", "ny", "read_right", "read_top", "prescan", "overscan", "overscan_rows",
-        *OF_AMPLIFIERS,
+        *AMPLIFIER_UNITS,
     ),
-    BANDS: ("band", "curve", "medium", *OF_BAND, *OPTIONAL_OF_BAND),
+    BANDS: ("band", "curve", "medium", *BAND_UNITS, *OPTIONAL_BAND_UNITS),
     WAVEFRONT: ("noll", "x_power", "y_power", "coefficient_nm"),
 }  # fmt: skip
 # Lowest and highest value of each column of whole numbers.
-_WHOLE = {
-    "nx": (1, _MOST_PIXELS),
-    "ny": (1, _MOST_PIXELS),
-    "x": (0, _MOST_PIXELS),
-    "y": (0, _MOST_PIXELS),
+_INTEGER_BOUNDS = {
+    "nx": (1, _MAX_PIXELS),
+    "ny": (1, _MAX_PIXELS),
+    "x": (0, _MAX_PIXELS),
+    "y": (0, _MAX_PIXELS),
     "read_right": (0, 1),
     "read_top": (0, 1),
-    "prescan": (0, _MOST_SCAN),
-    "overscan": (0, _MOST_SCAN),
-    "overscan_rows": (0, _MOST_SCAN),
+    "prescan": (0, _MAX_SCAN),
+    "overscan": (0, _MAX_SCAN),
+    "overscan_rows": (0, _MAX_SCAN),
     "noll": (4, 66),
     "x_power": (0, 10),
     "y_power": (0, 10),
 }
-_LONGEST_TEXT, _MOST_ROWS = 1000, 10_000
+_MAX_TEXT_LENGTH, _MAX_ROWS = 1000, 10_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,14 +74,14 @@ class Row:
         Texts by column, in the order of `COLUMNS`, without blanks around them. Whole numbers have digits alone.
     """
 
-    place: str
+    location: str
     values: Mapping[str, str]
 
     def text(self, column: str) -> str:
         """Text of a column; BadInput if it is blank."""
         value = self.values[column]
         if not value:
-            raise BadInput(f"{self.place}: {column} is missing")
+            raise BadInput(f"{self.location}: {column} is missing")
         return value
 
     def number(self, column: str, low: float = -math.inf, high: float = math.inf) -> float:
@@ -90,18 +90,18 @@ class Row:
         try:
             value = float(text)
         except ValueError:
-            raise BadInput(f"{self.place}: {column} = {text!r} is not a number") from None
+            raise BadInput(f"{self.location}: {column} = {text!r} is not a number") from None
         if not math.isfinite(value):
-            raise BadInput(f"{self.place}: {column} = {text} is not finite")
+            raise BadInput(f"{self.location}: {column} = {text} is not finite")
         if not low <= value <= high:
-            raise BadInput(f"{self.place}: {column} = {text} is not between {low:g} and {high:g}")
+            raise BadInput(f"{self.location}: {column} = {text} is not between {low:g} and {high:g}")
         return value
 
     def integer(self, column: str) -> int:
         """Whole number of a column of `_WHOLE`; BadInput for any other text, or outside its bounds."""
-        value = self.number(column, *_WHOLE[column])
+        value = self.number(column, *_INTEGER_BOUNDS[column])
         if value % 1.0:
-            raise BadInput(f"{self.place}: {column} = {value:g} is not a whole number")
+            raise BadInput(f"{self.location}: {column} = {value:g} is not a whole number")
         return int(value)
 
 
@@ -126,45 +126,45 @@ def read_rows(folder: Path, file: str) -> list[Row]:
         If the table cannot be read, a column is missing, unknown or given twice, or a whole number is wrong.
     """
     path = folder / file
-    shown = user_files.shown(path)
-    lines = user_files.text(path, KIND).splitlines()
+    path_text = user_files.format_path(path)
+    lines = user_files.read_text(path, FILE_KIND).splitlines()
     numbered = [
         (number, line) for number, line in enumerate(lines, start=1) if line.strip() and not line.startswith("#")
     ]
-    if len(numbered) > _MOST_ROWS + 1:
-        raise BadInput(f"{shown}: has more than {_MOST_ROWS} rows")
+    if len(numbered) > _MAX_ROWS + 1:
+        raise BadInput(f"{path_text}: has more than {_MAX_ROWS} rows")
     expected = COLUMNS[file]
     try:
         table = list(csv.reader(io.StringIO("\n".join(line for _, line in numbered)), strict=True))
     except csv.Error as error:
-        raise BadInput(f"{shown}: {error}") from None
+        raise BadInput(f"{path_text}: {error}") from None
     if len(table) != len(numbered):
-        raise BadInput(f"{shown}: a text goes over several lines")
+        raise BadInput(f"{path_text}: a text goes over several lines")
     header = [column.strip() for column in table[0]] if table else []
     if unknown := [column for column in header if column not in expected]:
-        raise BadInput(f"{shown}: unknown column {unknown[0]!r}, the columns are {', '.join(expected)}")
+        raise BadInput(f"{path_text}: unknown column {unknown[0]!r}, the columns are {', '.join(expected)}")
     if missing := [column for column in expected if column not in header]:
-        raise BadInput(f"{shown}: column {missing[0]} is missing")
+        raise BadInput(f"{path_text}: column {missing[0]} is missing")
     if len(header) != len(expected):
-        raise BadInput(f"{shown}: a column is given twice")
-    found = []
+        raise BadInput(f"{path_text}: a column is given twice")
+    rows = []
     for (number, _), entries in zip(numbered[1:], table[1:], strict=True):
-        place, row = f"{shown} line {number}", [entry.strip() for entry in entries]
-        if len(row) != len(header):
-            raise BadInput(f"{place}: has {len(row)} values for {len(header)} columns")
-        if any(len(value) > _LONGEST_TEXT or not value.isprintable() for value in row):
-            raise BadInput(f"{place}: a text is too long or has characters that cannot be printed")
-        texts = dict(zip(header, row, strict=True))
-        found.append(_with_whole_numbers(Row(place, {column: texts[column] for column in expected})))
-    if not found:
-        raise BadInput(f"{shown}: has no rows")
-    return found
+        location, cells = f"{path_text} line {number}", [entry.strip() for entry in entries]
+        if len(cells) != len(header):
+            raise BadInput(f"{location}: has {len(cells)} values for {len(header)} columns")
+        if any(len(value) > _MAX_TEXT_LENGTH or not value.isprintable() for value in cells):
+            raise BadInput(f"{location}: a text is too long or has characters that cannot be printed")
+        texts = dict(zip(header, cells, strict=True))
+        rows.append(_with_integers(Row(location, {column: texts[column] for column in expected})))
+    if not rows:
+        raise BadInput(f"{path_text}: has no rows")
+    return rows
 
 
-def _with_whole_numbers(row: Row) -> Row:
+def _with_integers(row: Row) -> Row:
     """Write 300.0 and 3e2 as 300: readers of the mission database take the texts of whole numbers as they are."""
-    whole = {column: str(row.integer(column)) for column in row.values if column in _WHOLE}
-    return Row(row.place, {**row.values, **whole})
+    integers = {column: str(row.integer(column)) for column in row.values if column in _INTEGER_BOUNDS}
+    return Row(row.location, {**row.values, **integers})
 
 
 def csv_text(rows: Sequence[Row]) -> str:
@@ -178,15 +178,15 @@ def csv_text(rows: Sequence[Row]) -> str:
 
 def refuse_repeated(rows: Sequence[Row], name_of: Callable[[Row], str]) -> None:
     """Raise BadInput if two rows have one name, which `name_of` returns for a row."""
-    seen: set[str] = set()
+    used_names: set[str] = set()
     for row in rows:
         name = name_of(row)
-        if name in seen:
-            raise BadInput(f"{row.place}: {name} is given twice")
-        seen.add(name)
+        if name in used_names:
+            raise BadInput(f"{row.location}: {name} is given twice")
+        used_names.add(name)
 
 
-def checked_layout(folder: Path, pixel_mm: float) -> list[Row]:
+def read_layout(folder: Path, pixel_mm: float) -> list[Row]:
     """Read layout.csv.
 
     Parameters
@@ -209,19 +209,19 @@ def checked_layout(folder: Path, pixel_mm: float) -> list[Row]:
     rows = read_rows(folder, LAYOUT)
     refuse_repeated(rows, lambda row: row.text("detector"))
     for row in rows:
-        if _DETECTOR.fullmatch(row.text("detector")) is None:
-            raise BadInput(f"{row.place}: detector = {row.text('detector')!r}: a name has letters, digits, _ and -")
+        if _DETECTOR_PATTERN.fullmatch(row.text("detector")) is None:
+            raise BadInput(f"{row.location}: detector = {row.text('detector')!r}: a name has letters, digits, _ and -")
         row.text("type")
         for axis in ("x_mm", "y_mm"):
             row.number(axis, -1e4, 1e4)
         row.number("rotation_deg", -360.0, 360.0)
-    for first, second in overlaps([row.values for row in rows], pixel_mm):
+    for first, second in find_overlaps([row.values for row in rows], pixel_mm):
         names = f"{rows[first].text('detector')} and {rows[second].text('detector')}"
-        raise BadInput(f"{rows[second].place}: detectors {names} overlap")
+        raise BadInput(f"{rows[second].location}: detectors {names} overlap")
     return rows
 
 
-def overlaps(rows: Sequence[Mapping[str, str]], pixel_mm: float) -> Iterator[tuple[int, int]]:
+def find_overlaps(rows: Sequence[Mapping[str, str]], pixel_mm: float) -> Iterator[tuple[int, int]]:
     """Find detectors that overlap, as rectangles along the axes of the focal plane.
 
     Parameters
@@ -238,57 +238,61 @@ def overlaps(rows: Sequence[Mapping[str, str]], pixel_mm: float) -> Iterator[tup
     """
     centre = np.array([[float(row["x_mm"]), float(row["y_mm"])] for row in rows])
     size = np.array([[int(row["nx"]), int(row["ny"])] for row in rows]) * pixel_mm
-    turned = np.array([round(float(row["rotation_deg"]) / 90.0) % 2 == 1 for row in rows])
-    size[turned] = size[turned, ::-1]
-    for first in range(len(rows)):
-        near = np.abs(centre[first + 1 :] - centre[first]) < 0.5 * (size[first + 1 :] + size[first])
-        yield from ((first, first + 1 + int(later)) for later in np.flatnonzero(near.all(axis=1)))
+    is_rotated = np.array([round(float(row["rotation_deg"]) / 90.0) % 2 == 1 for row in rows])
+    size[is_rotated] = size[is_rotated, ::-1]
+    for index in range(len(rows)):
+        is_close = np.abs(centre[index + 1 :] - centre[index]) < 0.5 * (size[index + 1 :] + size[index])
+        yield from ((index, index + 1 + int(offset)) for offset in np.flatnonzero(is_close.all(axis=1)))
 
 
-def checked_amplifiers(folder: Path, detectors: Sequence[Row]) -> list[Row]:
+def read_amplifiers(folder: Path, detectors: Sequence[Row]) -> list[Row]:
     """Rows of amplifiers.csv; BadInput if they do not fit the detectors, the rows of layout.csv, or one another."""
     rows = read_rows(folder, AMPLIFIERS)
     refuse_repeated(rows, lambda row: f"amplifier {row.text('amplifier')} of {row.text('type')}")
     sizes = {row.text("type"): (row.integer("nx"), row.integer("ny")) for row in detectors}
     for row in detectors:
         if (row.integer("nx"), row.integer("ny")) != sizes[row.text("type")]:
-            raise BadInput(f"{row.place}: detectors of type {row.text('type')} differ in size")
+            raise BadInput(f"{row.location}: detectors of type {row.text('type')} differ in size")
     described = {row.text("type") for row in rows}
     if missing := sorted(set(sizes) - described):
-        raise BadInput(f"{user_files.shown(folder / AMPLIFIERS)}: detectors of type {missing[0]} have no amplifier")
+        raise BadInput(
+            f"{user_files.format_path(folder / AMPLIFIERS)}: detectors of type {missing[0]} have no amplifier"
+        )
     if unused := sorted(described - set(sizes)):
-        raise BadInput(f"{user_files.shown(folder / AMPLIFIERS)}: no detector has type {unused[0]}")
-    for kind, size in sizes.items():
-        _check_parts([row for row in rows if row.text("type") == kind], size)
+        raise BadInput(f"{user_files.format_path(folder / AMPLIFIERS)}: no detector has type {unused[0]}")
+    for detector_type, size in sizes.items():
+        _check_amplifiers([row for row in rows if row.text("type") == detector_type], size)
     for row in rows:
         if row.number("full_well") != rows[0].number("full_well"):
-            raise BadInput(f"{row.place}: full_well differs from the first amplifier: a camera has one")
+            raise BadInput(f"{row.location}: full_well differs from the first amplifier: a camera has one")
     return rows
 
 
-def _check_parts(rows: Sequence[Row], size: tuple[int, int]) -> None:
+def _check_amplifiers(rows: Sequence[Row], size: tuple[int, int]) -> None:
     """Refuse amplifiers of a type that lie outside the detector, overlap, or differ in size or overscan."""
-    places: list[tuple[int, int]] = []
+    corners: list[tuple[int, int]] = []
     for row in rows:
-        if _DETECTOR.fullmatch(row.text("amplifier")) is None:
-            raise BadInput(f"{row.place}: amplifier = {row.text('amplifier')!r}: a name has letters, digits, _ and -")
+        if _DETECTOR_PATTERN.fullmatch(row.text("amplifier")) is None:
+            raise BadInput(
+                f"{row.location}: amplifier = {row.text('amplifier')!r}: a name has letters, digits, _ and -"
+            )
         row.number("gain", 1e-3, 1e3)
         if not row.number("read_noise", 0.0, 1e4):
-            raise BadInput(f"{row.place}: read_noise = {row.text('read_noise')} is not positive")
+            raise BadInput(f"{row.location}: read_noise = {row.text('read_noise')} is not positive")
         row.number("full_well", 1.0, 1e8)
         x, y, nx, ny = (row.integer(column) for column in ("x", "y", "nx", "ny"))
         if x + nx > size[0] or y + ny > size[1]:
-            raise BadInput(f"{row.place}: reaches beyond the detector of {size[0]} x {size[1]} pixels")
-        for other, (left, low) in zip(rows, places, strict=False):
-            if abs(left - x) < nx and abs(low - y) < ny:
-                raise BadInput(f"{row.place}: overlaps amplifier {other.text('amplifier')}")
+            raise BadInput(f"{row.location}: reaches beyond the detector of {size[0]} x {size[1]} pixels")
+        for other, (other_x, other_y) in zip(rows, corners, strict=False):
+            if abs(other_x - x) < nx and abs(other_y - y) < ny:
+                raise BadInput(f"{row.location}: overlaps amplifier {other.text('amplifier')}")
         for column in ("nx", "ny", "prescan", "overscan", "overscan_rows"):
             if row.number(column) != rows[0].number(column):
-                raise BadInput(f"{row.place}: {column} differs from the first amplifier of the type")
-        places.append((x, y))
+                raise BadInput(f"{row.location}: {column} differs from the first amplifier of the type")
+        corners.append((x, y))
 
 
-def checked_wavefront(folder: Path) -> list[Row]:
+def read_wavefront(folder: Path) -> list[Row]:
     """Rows of wavefront.csv; BadInput if a number is wrong."""
     rows = read_rows(folder, WAVEFRONT)
     for row in rows:

@@ -11,15 +11,15 @@ from pathlib import Path
 
 from lake_schema import user_files
 from lake_schema.errors import BadInput
-from lake_schema.mission.camera_folder import checked_name, known_units
+from lake_schema.mission.camera_folder import check_name, units_by_camera
 from lake_schema.mission.camera_tables import (
+    AMPLIFIER_UNITS,
     AMPLIFIERS,
+    BAND_UNITS,
     BANDS,
     COLUMNS,
     LAYOUT,
-    OF_AMPLIFIERS,
-    OF_BAND,
-    OPTIONAL_OF_BAND,
+    OPTIONAL_BAND_UNITS,
     PARAMETERS,
     WAVEFRONT,
 )
@@ -50,47 +50,50 @@ def write_like(camera: str, folder: Path) -> list[Path]:
     if camera not in CAMERAS:
         raise BadInput(f"--like {camera}: is not one of {', '.join(CAMERAS)}")
     if os.path.lexists(folder):
-        raise BadInput(f"{user_files.shown(folder)}: is there already")
-    checked_name(folder)
+        raise BadInput(f"{user_files.format_path(folder)}: is there already")
+    check_name(folder)
     mission, prefix = resolve(), f"ext.{camera}."
-    units = known_units()[camera]
+    units = units_by_camera()[camera]
     numbers = [mission.parameter(prefix + name) for name in sorted(units)]
     tables: dict[str, Sequence[Sequence[str]]] = {
         PARAMETERS: [(p.key.removeprefix(prefix), repr(p.value), p.unit, f"{camera}: {p.source}") for p in numbers],
-        BANDS: [_band_row(prefix, band, mission) for band in _bands_of(prefix, mission)],
+        BANDS: [_band_row(prefix, band, mission) for band in _band_names(prefix, mission)],
         AMPLIFIERS: _amplifier_rows(prefix, mission),
     }
     texts = {name: _csv_text(COLUMNS[name], rows) for name, rows in tables.items()}
     for key, file in (("layout", LAYOUT), ("psf.wavefront", WAVEFRONT)):
         texts[file] = mission.content(mission.model(prefix + key)).decode()
-    made = user_files.folder(folder)
-    made.mkdir(parents=True)
+    new_folder = user_files.check_folder(folder)
+    new_folder.mkdir(parents=True)
     for name, text in texts.items():
-        (made / name).write_text(text, encoding="utf-8")
-    return [made / name for name in texts]
+        (new_folder / name).write_text(text, encoding="utf-8")
+    return [new_folder / name for name in texts]
 
 
 def _amplifier_rows(prefix: str, mission: MissionConfiguration) -> list[tuple[str, ...]]:
     """Rows of amplifiers.csv: the database has the mean of the camera and each amplifier's ratio to the first one."""
     rows = mission.rows(f"{prefix}amplifiers")
-    mean = {key: mission.value(prefix + key, unit) for key, unit in OF_AMPLIFIERS.items()}
+    mean = {key: mission.value(prefix + key, unit) for key, unit in AMPLIFIER_UNITS.items()}
     ratios = {key: [float(row[key]) / float(rows[0][key]) for row in rows] for key in ("gain", "read_noise")}
     ratios["full_well"] = [1.0] * len(rows)
-    places = [column for column in COLUMNS[AMPLIFIERS] if column not in OF_AMPLIFIERS]
+    geometry_columns = [column for column in COLUMNS[AMPLIFIERS] if column not in AMPLIFIER_UNITS]
     return [
-        (*(row[column] for column in places), *(f"{mean[key] * ratios[key][i]:.7g}" for key in OF_AMPLIFIERS))
+        (
+            *(row[column] for column in geometry_columns),
+            *(f"{mean[key] * ratios[key][i]:.7g}" for key in AMPLIFIER_UNITS),
+        )
         for i, row in enumerate(rows)
     ]
 
 
-def _bands_of(prefix: str, mission: MissionConfiguration) -> list[str]:
+def _band_names(prefix: str, mission: MissionConfiguration) -> list[str]:
     keys = (p.key for p in mission.parameters if p.key.startswith(prefix) and p.key.endswith(".zero_point"))
     return [key.removeprefix(prefix).partition(".")[0] for key in keys]
 
 
 def _band_row(prefix: str, band: str, mission: MissionConfiguration) -> tuple[str, ...]:
     values = {}
-    for key, unit in (OF_BAND | OPTIONAL_OF_BAND).items():
+    for key, unit in (BAND_UNITS | OPTIONAL_BAND_UNITS).items():
         name = f"{prefix}{band}.{key}"
         values[key] = repr(mission.value(name, unit)) if name in mission else ""
     if not values["sky_brightness"]:

@@ -14,11 +14,11 @@ from fnmatch import fnmatchcase
 import numpy as np
 
 from lake_schema.errors import BadInput
-from lake_schema.mission.camera_tables import overlaps
+from lake_schema.mission.camera_tables import find_overlaps
 from lake_schema.mission.configuration import MissionConfiguration
-from lake_schema.mission.detector_overrides import split
-from lake_schema.mission.parameter import convert, read_all
-from lake_schema.ramps import MOST_FRAMES, frames
+from lake_schema.mission.detector_overrides import split_name
+from lake_schema.mission.parameter import convert, read_all_parameters
+from lake_schema.ramps import MAX_FRAMES, frame_count
 
 # Quantities of which no chosen value may be worse than what is required, and which way worse is.
 _LOWER = ("*.read_noise", "*.dark_current", "*.prnu", "*.crosstalk", "*.jitter_?", "*.psf.fwhm", "*.ellipticity",
@@ -39,69 +39,69 @@ def faults(configuration: MissionConfiguration) -> Iterator[str]:
     yield from _worse_than_required(configuration)
     for camera in configuration.ground_cameras:
         yield from camera_faults(camera, configuration)
-    yield from _amplifiers("vis.amplifiers", configuration)
-    yield from _pitch("vis", configuration)
-    yield from _pitch("nisp", configuration)
-    yield from ramps(configuration)
+    yield from _amplifier_faults("vis.amplifiers", configuration)
+    yield from _gap_faults("vis", configuration)
+    yield from _gap_faults("nisp", configuration)
+    yield from ramp_faults(configuration)
     for m in configuration.models:
         if m.key.endswith(".throughput"):
-            yield from _throughput(m.key, configuration)
-    yield from _quantiles("env.cosmic_rays.vis_tracks", configuration)
+            yield from _throughput_faults(m.key, configuration)
+    yield from _quantile_faults("env.cosmic_rays.vis_tracks", configuration)
 
 
 def camera_faults(camera: str, configuration: MissionConfiguration) -> Iterator[str]:
     """Detectors of a ground camera that overlap, and amplifiers that cannot be read."""
-    yield from _layout(f"ext.{camera}", configuration)
-    yield from _amplifiers(f"ext.{camera}.amplifiers", configuration)
+    yield from _layout_faults(f"ext.{camera}", configuration)
+    yield from _amplifier_faults(f"ext.{camera}.amplifiers", configuration)
 
 
 def _worse_than_required(configuration: MissionConfiguration) -> Iterator[str]:
-    required = {record.key: record for record in read_all() if record.status == "REQ"}
+    required = {record.key: record for record in read_all_parameters() if record.status == "REQ"}
     for chosen in configuration.parameters:
-        limit = required.get(split(chosen.key, configuration)[0])
+        limit = required.get(split_name(chosen.key, configuration)[0])
         if limit is None or chosen.status in ("REQ", "SIM"):
             continue
         bound = convert(limit.value, limit.unit, chosen.unit, chosen.key)
-        sign = 1 if _like(chosen.key, _LOWER) else -1 if _like(chosen.key, _HIGHER) else 0
+        sign = 1 if _matches_any(chosen.key, _LOWER) else -1 if _matches_any(chosen.key, _HIGHER) else 0
         if sign * (chosen.value - bound) > 0:
             value = f"{chosen.key} ({chosen.status}) = {chosen.value:g}"
             yield f"mission parameter {value} is worse than required: {bound:g}"
 
 
-def _like(key: str, patterns: tuple[str, ...]) -> bool:
+def _matches_any(key: str, patterns: tuple[str, ...]) -> bool:
     return any(fnmatchcase(key, pattern) for pattern in patterns)
 
 
-def _layout(section: str, configuration: MissionConfiguration) -> Iterator[str]:
+def _layout_faults(section: str, configuration: MissionConfiguration) -> Iterator[str]:
     """No two detectors nearer than their size, as rectangles along the focal plane's axes."""
     key = f"{section}.layout"
     rows = configuration.rows(key)
-    for first, second in overlaps(rows, configuration.value(f"{section}.fpa.pixel_size", "mm / pix")):
+    for first, second in find_overlaps(rows, configuration.value(f"{section}.fpa.pixel_size", "mm / pix")):
         yield f"mission model {key}: detectors {rows[first]['detector']} and {rows[second]['detector']} overlap"
     if len({row["detector"] for row in rows}) != len(rows):
         yield f"mission model {key}: a detector is given twice"
 
 
-def _pitch(section: str, configuration: MissionConfiguration) -> Iterator[str]:
+def _gap_faults(section: str, configuration: MissionConfiguration) -> Iterator[str]:
     for axis in ("x", "y"):
         if configuration.value(f"{section}.fpa.gap_{axis}", "arcsec") < 0:
             yield f"mission parameter {section}.fpa.gap_{axis}: detectors overlap"
 
 
-def ramps(configuration: MissionConfiguration) -> Iterator[str]:
+def ramp_faults(configuration: MissionConfiguration) -> Iterator[str]:
     """Ramps that cannot be drawn: of too many frames, or of pixels of which others see more than half."""
     for kind in ("photometric", "spectroscopic"):
         key = f"nisp.macc.{kind}"
         groups, reads, drops = (int(configuration.value(f"{key}.{part}")) for part in ("groups", "reads", "drops"))
-        count = frames(groups, reads, drops)
-        if count > MOST_FRAMES:
-            yield f"mission parameter {key}: MACC({groups},{reads},{drops}) has {count} frames, more than {MOST_FRAMES}"
-    seen = 4.0 * sum(configuration.value(f"nisp.ipc.{part}") for part in ("side", "diagonal"))
-    if seen > 0.5:
-        yield f"mission parameter nisp.ipc: {seen:g} of a pixel's charge is seen by others, more than 0.5"
+        count = frame_count(groups, reads, drops)
+        if count > MAX_FRAMES:
+            yield f"mission parameter {key}: MACC({groups},{reads},{drops}) has {count} frames, more than {MAX_FRAMES}"
+    coupled_fraction = 4.0 * sum(configuration.value(f"nisp.ipc.{part}") for part in ("side", "diagonal"))
+    if coupled_fraction > 0.5:
+        yield f"mission parameter nisp.ipc: {coupled_fraction:g} of a pixel's charge is seen by others, more than 0.5"
 
 
-def _amplifiers(key: str, configuration: MissionConfiguration) -> Iterator[str]:
+def _amplifier_faults(key: str, configuration: MissionConfiguration) -> Iterator[str]:
     for row in configuration.rows(key):
         name = f"mission model {key}: amplifier {row['amplifier']} of {row['type']}"
         if not float(row["gain"]) > 0:
@@ -110,16 +110,16 @@ def _amplifiers(key: str, configuration: MissionConfiguration) -> Iterator[str]:
             yield f"{name}: read noise and full well must be positive"
 
 
-def _throughput(key: str, configuration: MissionConfiguration) -> Iterator[str]:
-    curve = _curve(key, configuration)
+def _throughput_faults(key: str, configuration: MissionConfiguration) -> Iterator[str]:
+    curve = _read_curve(key, configuration)
     if not (np.diff(curve[:, 0]) > 0).all():
         yield f"mission model {key}: wavelengths do not ascend"
-    highest = np.inf if _like(key, _CROSS_SECTIONS) else 1.0
+    highest = np.inf if _matches_any(key, _CROSS_SECTIONS) else 1.0
     if not ((curve[:, 1] >= 0) & (curve[:, 1] <= highest)).all():
         yield f"mission model {key}: throughput outside 0 to {highest:g}"
 
 
-def _curve(key: str, configuration: MissionConfiguration) -> np.ndarray:
+def _read_curve(key: str, configuration: MissionConfiguration) -> np.ndarray:
     """[n, 2] wavelength and throughput of a file of ours or of speclite's (blank-separated, header line)."""
     rows = configuration.rows(key)
     if next(iter(rows[0])) == "wavelength_nm":
@@ -128,7 +128,7 @@ def _curve(key: str, configuration: MissionConfiguration) -> np.ndarray:
     return np.loadtxt([next(iter(row.values())) for row in rows], usecols=(0, 1), ndmin=2)
 
 
-def _quantiles(key: str, configuration: MissionConfiguration) -> Iterator[str]:
+def _quantile_faults(key: str, configuration: MissionConfiguration) -> Iterator[str]:
     table = np.array(configuration.numbers(key))
     if table[0, 0] != 0.0 or table[-1, 0] != 1.0:
         yield f"mission model {key}: quantiles do not go from 0 to 1"

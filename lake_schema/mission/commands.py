@@ -16,47 +16,53 @@ from lake_schema.mission import camera_template, compare, listing
 from lake_schema.mission.parameter import CAMERAS
 from lake_schema.tables.mission import LADDER
 
-_DEFAULT = ",".join(LADDER)
-_WHAT = "a ladder (CBE,BLT,DES,REQ,SIM), a request file, or LAKE or LAKE@KEY of its table mission"
+_DEFAULT_LADDER = ",".join(LADDER)
+_CONFIGURATION_HELP = "a ladder (CBE,BLT,DES,REQ,SIM), a request file, or LAKE or LAKE@KEY of its table mission"
 
 
 def main(argv: Sequence[str]) -> int:
     """Exit status: 2 the call is wrong; of diff as of diff: 0 the same, 1 different."""
     parser = argparse.ArgumentParser(prog="python -m lake_schema mission", description="Look into the mission database")
     commands = parser.add_subparsers(dest="command", required=True, metavar="list|diff|camera")
-    one = commands.add_parser("list", help="names, values, units, bounds, status and source")
-    one.add_argument("pattern", nargs="?", default="*", help="of names, as vis.* or *gain*; without * a part of them")
-    one.add_argument("--of", default=_DEFAULT, metavar="WHAT", help=f"{_WHAT} (default: {_DEFAULT})")
-    one.add_argument("--json", action="store_true", help="a list of objects")
-    two = commands.add_parser("diff", help="what differs between two configurations")
-    two.add_argument("first", help=_WHAT)
-    two.add_argument("second", nargs="?", default=_DEFAULT, help=f"the same (default: {_DEFAULT})")
-    three = commands.add_parser("camera", help="write the folder of a ground camera, to be edited")
-    three.add_argument("folder", type=Path, help="folder that is made; its name is the camera's name")
-    three.add_argument("--like", required=True, choices=CAMERAS, help="camera whose numbers it has at first")
+    list_parser = commands.add_parser("list", help="names, values, units, bounds, status and source")
+    list_parser.add_argument(
+        "pattern", nargs="?", default="*", help="of names, as vis.* or *gain*; without * a part of them"
+    )
+    list_parser.add_argument(
+        "--of", default=_DEFAULT_LADDER, metavar="WHAT", help=f"{_CONFIGURATION_HELP} (default: {_DEFAULT_LADDER})"
+    )
+    list_parser.add_argument("--json", action="store_true", help="a list of objects")
+    diff_parser = commands.add_parser("diff", help="what differs between two configurations")
+    diff_parser.add_argument("first", help=_CONFIGURATION_HELP)
+    diff_parser.add_argument(
+        "second", nargs="?", default=_DEFAULT_LADDER, help=f"the same (default: {_DEFAULT_LADDER})"
+    )
+    camera_parser = commands.add_parser("camera", help="write the folder of a ground camera, to be edited")
+    camera_parser.add_argument("folder", type=Path, help="folder that is made; its name is the camera's name")
+    camera_parser.add_argument("--like", required=True, choices=CAMERAS, help="camera whose numbers it has at first")
     options = parser.parse_args(argv)
-    body = {"list": _listed, "diff": _compared, "camera": _camera_written}[options.command]
-    return command.status("lake_schema", lambda: body(options))
+    run_command = {"list": _list_entries, "diff": _print_differences, "camera": _write_camera}[options.command]
+    return command.run("lake_schema", lambda: run_command(options))
 
 
-def _listed(options: argparse.Namespace) -> int:
-    entries = listing.listed(compare.configuration(options.of), options.pattern)
+def _list_entries(options: argparse.Namespace) -> int:
+    entries = listing.list_entries(compare.load_configuration(options.of), options.pattern)
     if options.json:
         print(json.dumps([asdict(entry) for entry in entries], indent=1))
         return 0
-    for line in listing.aligned(entries):
+    for line in listing.align_columns(entries):
         print(line)
     return 0
 
 
-def _camera_written(options: argparse.Namespace) -> int:
+def _write_camera(options: argparse.Namespace) -> int:
     for path in camera_template.write_like(options.like, options.folder):
         print(path)
     return 0
 
 
-def _compared(options: argparse.Namespace) -> int:
-    lines = compare.compare(options.first, options.second)
+def _print_differences(options: argparse.Namespace) -> int:
+    lines = compare.compare_configurations(options.first, options.second)
     for line in lines:
         print(line)
     return int(bool(lines))

@@ -8,47 +8,47 @@ from typing import Any
 from lake_schema import user_files
 from lake_schema.errors import BadInput
 from lake_schema.mission import camera_folder
-from lake_schema.mission.configuration import MissionConfiguration, difference, resolve
+from lake_schema.mission.configuration import MissionConfiguration, differences, resolve
 from lake_schema.mission.parameter import STATUSES
 from lake_schema.mission.published import read_back
 from lake_schema.store import layout, read
 from lake_schema.tables.mission import LADDER
 
 
-def compare(first: str, second: str) -> list[str]:
+def compare_configurations(first: str, second: str) -> list[str]:
     """A line a name that differs.
 
     first, second : a ladder ("CBE,BLT,DES,REQ,SIM"), a request file, or a lake, LAKE or LAKE@KEY of its table mission
     """
-    return list(difference(configuration(first), configuration(second)))
+    return list(differences(load_configuration(first), load_configuration(second)))
 
 
-def configuration(what: str) -> MissionConfiguration:
+def load_configuration(name: str) -> MissionConfiguration:
     """The configuration that a ladder, a request file or a lake stands for."""
-    statuses = tuple(what.split(","))
+    statuses = tuple(name.split(","))
     if all(status in STATUSES for status in statuses):
         return resolve(ladder=statuses)
-    root, _, key = what.partition("@")
-    for lake, version in ((what, None), (root, key or None)):
+    root, _, key = name.partition("@")
+    for lake, version in ((name, None), (root, key or None)):
         if _is_folder(lake):
-            return read_back(read.version(layout.lake(lake), "mission", version))
+            return read_back(read.version(layout.resolve_lake(lake), "mission", version))
     try:
-        user_files.checked(Path(what), "request")
+        user_files.check_file(Path(name), "request")
     except BadInput as error:
         raise BadInput(f"{error}: neither a request, nor a ladder of {', '.join(STATUSES)}, nor a lake") from None
-    return _of_request(Path(what))
+    return _configuration_of_request(Path(name))
 
 
-def _is_folder(what: str) -> bool:
+def _is_folder(name: str) -> bool:
     try:
-        return Path(what).is_dir()
+        return Path(name).is_dir()
     except OSError:
         return False
 
 
-def _of_request(path: Path) -> MissionConfiguration:
+def _configuration_of_request(path: Path) -> MissionConfiguration:
     try:
-        table = user_files.toml(path, "request")
+        table = user_files.read_toml(path, "request")
     except BadInput as error:
         raise BadInput(f"request {error}") from None
     try:
@@ -56,8 +56,8 @@ def _of_request(path: Path) -> MissionConfiguration:
         overrides = {
             key: (float(value["value"]), str(value["unit"])) for key, value in section.get("overrides", {}).items()
         }
-        folders = [user_files.expanded(str(name), path.parent) for name in section.get("cameras", ())]
+        folders = [user_files.expand_path(str(name), path.parent) for name in section.get("cameras", ())]
         cameras = [camera_folder.read(folder) for folder in folders]
         return resolve(ladder=tuple(section.get("ladder", LADDER)), overrides=overrides, cameras=cameras)
     except (AttributeError, TypeError, KeyError, ValueError, OverflowError) as error:
-        raise BadInput(f"request {user_files.shown(path)}: {' '.join(str(error).split())[:300]}") from None
+        raise BadInput(f"request {user_files.format_path(path)}: {' '.join(str(error).split())[:300]}") from None

@@ -18,12 +18,12 @@ from typing import TypeVar
 from lake_schema.errors import BadInput
 from lake_schema.mission import bounds, detector_overrides, model
 from lake_schema.mission.camera_folder import Camera
-from lake_schema.mission.detector_overrides import Place
+from lake_schema.mission.detector_overrides import DetectorPlace
 from lake_schema.mission.model import Model, read_models
-from lake_schema.mission.parameter import STATUSES, Parameter, convert, read_all
+from lake_schema.mission.parameter import STATUSES, Parameter, convert, read_all_parameters
 from lake_schema.tables.mission import LADDER
 
-__all__ = ["LADDER", "MissionConfiguration", "difference", "resolve"]
+__all__ = ["LADDER", "MissionConfiguration", "differences", "resolve"]
 
 Chosen = TypeVar("Chosen", Parameter, Model)
 
@@ -45,28 +45,28 @@ class MissionConfiguration:
     folder: Path | None = None
     contents: tuple[tuple[str, bytes], ...] = field(default=(), repr=False, compare=False)
     ground_cameras: tuple[str, ...] = field(init=False, repr=False, compare=False)
-    _index: dict[str, Parameter] = field(init=False, repr=False, compare=False)
-    _files: dict[str, Model] = field(init=False, repr=False, compare=False)
-    _placed: dict[str, tuple[Place, ...]] = field(init=False, repr=False, compare=False)
+    _parameters_by_key: dict[str, Parameter] = field(init=False, repr=False, compare=False)
+    _models_by_key: dict[str, Model] = field(init=False, repr=False, compare=False)
+    _places_by_key: dict[str, tuple[DetectorPlace, ...]] = field(init=False, repr=False, compare=False)
     _fingerprint: str = field(init=False, repr=False, compare=False)
-    _whole: str = field(init=False, repr=False, compare=False)
+    _digest: str = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "_index", {p.key: p for p in self.parameters})
-        object.__setattr__(self, "_files", {m.key: m for m in self.models})
+        object.__setattr__(self, "_parameters_by_key", {p.key: p for p in self.parameters})
+        object.__setattr__(self, "_models_by_key", {m.key: m for m in self.models})
         layouts = [m.key.split(".") for m in self.models if m.key.startswith("ext.") and m.key.endswith(".layout")]
         object.__setattr__(self, "ground_cameras", tuple(sorted(parts[1] for parts in layouts)))
-        placed: dict[str, tuple[Place, ...]] = {}
+        places_by_key: dict[str, tuple[DetectorPlace, ...]] = {}
         for name in self.overridden:
-            key, place = detector_overrides.split(name, self._index)
+            key, place = detector_overrides.split_name(name, self._parameters_by_key)
             if key != name:
-                placed[key] = (*placed.get(key, ()), place)
-        object.__setattr__(self, "_placed", placed)
+                places_by_key[key] = (*places_by_key.get(key, ()), place)
+        object.__setattr__(self, "_places_by_key", places_by_key)
         lines = [f"{p.key}={p.value.hex()} {p.unit}\n" for p in self.parameters]
         lines += [f"{m.key}={m.sha256}\n" for m in self.models]
         object.__setattr__(self, "_fingerprint", hashlib.sha256("".join(lines).encode()).hexdigest())
         everything = repr((self.parameters, self.ladder, self.overridden, self.models, self.folder))
-        object.__setattr__(self, "_whole", hashlib.sha256(everything.encode()).hexdigest())
+        object.__setattr__(self, "_digest", hashlib.sha256(everything.encode()).hexdigest())
 
     def __hash__(self) -> int:
         # With the folder: those of different lakes are unequal, which a comparison finds only after all their records.
@@ -74,69 +74,75 @@ class MissionConfiguration:
 
     def __eq__(self, other: object) -> bool:
         # By a digest: caches compare a configuration with an equal one thousands of times in each exposure.
-        return self._whole == other._whole if isinstance(other, MissionConfiguration) else NotImplemented
+        return self._digest == other._digest if isinstance(other, MissionConfiguration) else NotImplemented
 
     def parameter(self, key: str) -> Parameter:
         """The record chosen for a name; BadInput for an unknown one."""
-        if key not in self._index:
+        if key not in self._parameters_by_key:
             raise BadInput(f"the mission database has no parameter {key}")
-        return self._index[key]
+        return self._parameters_by_key[key]
 
     def model(self, key: str) -> Model:
         """The model chosen for a name; BadInput for an unknown one."""
-        if key not in self._files:
+        if key not in self._models_by_key:
             raise BadInput(f"the mission database has no model {key}")
-        return self._files[key]
+        return self._models_by_key[key]
 
     def __contains__(self, key: object) -> bool:
-        return key in self._index or key in self._files
+        return key in self._parameters_by_key or key in self._models_by_key
 
-    def is_own(self, key: str, place: Place) -> bool:
+    def is_overridden_at(self, key: str, place: DetectorPlace) -> bool:
         """Whether a detector or an amplifier has a value of its own, beside the camera's."""
-        return any(narrow in self for narrow in detector_overrides.names(key, place)[:-1])
+        return any(narrow in self for narrow in detector_overrides.names_at_place(key, place)[:-1])
 
-    def value(self, key: str, unit: str | None = None, place: Place | None = None) -> float:
+    def value(self, key: str, unit: str | None = None, place: DetectorPlace | None = None) -> float:
         """The value of a name, in `unit` where one is given, else in its record's own; place : where."""
         record = self.parameter(key)
-        if place and key in self._placed:
-            record = next(self._index[name] for name in detector_overrides.names(key, place) if name in self._index)
+        if place and key in self._places_by_key:
+            record = next(
+                self._parameters_by_key[name]
+                for name in detector_overrides.names_at_place(key, place)
+                if name in self._parameters_by_key
+            )
         if unit is None or unit == record.unit:
             return record.value
         return convert(record.value, record.unit, unit, f"mission parameter {key}")
 
-    def of_amplifiers(self, key: str, unit: str, detector: str) -> tuple[float, ...]:
+    def amplifier_values(self, key: str, unit: str, detector: str) -> tuple[float, ...]:
         """The value for each amplifier of a detector, in the order in which they are read; one where all have it."""
-        if not any(place.amplifier and place.detector in ("", detector) for place in self._placed.get(key, ())):
-            return (self.value(key, unit, Place(detector)),)
-        names = detector_overrides.amplifiers(detector_overrides.section_of(key), self)
-        values = tuple(self.value(key, unit, Place(detector, name)) for name in names)
+        if not any(place.amplifier and place.detector in ("", detector) for place in self._places_by_key.get(key, ())):
+            return (self.value(key, unit, DetectorPlace(detector)),)
+        names = detector_overrides.amplifiers(detector_overrides.camera_prefix(key), self)
+        values = tuple(self.value(key, unit, DetectorPlace(detector, name)) for name in names)
         return values if len(set(values)) > 1 else values[:1]
 
     def numbers(self, key: str) -> tuple[tuple[float, ...], ...]:
         """A model that is a table of numbers: its rows."""
-        return model.numbers(self.content(self.model(key)))
+        return model.parse_numbers(self.content(self.model(key)))
 
     def rows(self, key: str) -> tuple[Mapping[str, str], ...]:
         """A model that is a table of texts: its rows by column name."""
-        return model.rows(self.content(self.model(key)))
+        return model.parse_rows(self.content(self.model(key)))
 
     def content(self, record: Model) -> bytes:
         """Bytes of a model's file; Damaged if they are not those that the record names."""
-        given = dict(self.contents)
-        return given[record.sha256] if record.sha256 in given else model.content(record, self.folder)
+        user_contents = dict(self.contents)
+        return (
+            user_contents[record.sha256] if record.sha256 in user_contents else model.read_content(record, self.folder)
+        )
 
-    def overridden_with(self, overrides: Mapping[str, tuple[float, str]]) -> MissionConfiguration:
+    def with_overrides(self, overrides: Mapping[str, tuple[float, str]]) -> MissionConfiguration:
         """The same with other values of some names; BadInput / OutOfRange name the parameter."""
-        chosen = dict(self._index)
+        chosen = dict(self._parameters_by_key)
         for name, (value, unit) in overrides.items():
-            chosen[name] = _overridden(self._index, name, value, unit)
-            bounds.check(chosen[name], detector_overrides.split(name, self._index)[0])
+            chosen[name] = _override_record(self._parameters_by_key, name, value, unit)
+            bounds.check_bounds(chosen[name], detector_overrides.split_name(name, self._parameters_by_key)[0])
         names = tuple(sorted({*self.overridden, *overrides}))
-        found = replace(self, parameters=tuple(chosen[key] for key in sorted(chosen)), overridden=names)
+        configuration = replace(self, parameters=tuple(chosen[key] for key in sorted(chosen)), overridden=names)
         for name in names:
-            if detector_overrides.split(name, chosen)[0] != name:
-                detector_overrides.check(name, found)
-        return found
+            if detector_overrides.split_name(name, chosen)[0] != name:
+                detector_overrides.check_override(name, configuration)
+        return configuration
 
     @property
     def fingerprint(self) -> str:
@@ -168,42 +174,42 @@ def resolve(
     if models is None:
         models = read_models() if records is None else ()
     cameras = tuple(cameras)
-    own = [parameter for camera in cameras for parameter in camera.parameters]
-    parameters = _grouped([*(read_all() if records is None else records), *own])
+    camera_parameters = [parameter for camera in cameras for parameter in camera.parameters]
+    parameters = _group_by_key([*(read_all_parameters() if records is None else records), *camera_parameters])
     for key, group in parameters.items():
         for record in group[1:]:
             # Records of one quantity may differ in unit, never in kind.
             convert(1.0, record.unit, group[0].unit, f"mission parameter {key} ({record.status})")
-    chosen = {key: _choose(key, group, ladder, mjd) for key, group in parameters.items()}
-    files_ = {
-        key: _choose(key, group, ladder, mjd)
-        for key, group in _grouped([*models, *(m for c in cameras for m in c.models)]).items()
+    chosen = {key: _choose_record(key, group, ladder, mjd) for key, group in parameters.items()}
+    chosen_models = {
+        key: _choose_record(key, group, ladder, mjd)
+        for key, group in _group_by_key([*models, *(m for c in cameras for m in c.models)]).items()
     }
-    if twice := sorted(set(chosen) & set(files_)):
-        raise BadInput(f"mission parameter {twice[0]} is a value and a model")
+    if duplicates := sorted(set(chosen) & set(chosen_models)):
+        raise BadInput(f"mission parameter {duplicates[0]} is a value and a model")
     for parameter in chosen.values():
-        bounds.check(parameter, parameter.key)
-    found = MissionConfiguration(
+        bounds.check_bounds(parameter, parameter.key)
+    configuration = MissionConfiguration(
         tuple(chosen[key] for key in sorted(chosen)),
         tuple(ladder),
-        models=tuple(files_[key] for key in sorted(files_)),
+        models=tuple(chosen_models[key] for key in sorted(chosen_models)),
         contents=tuple(item for camera in cameras for item in camera.contents),
     )
-    return found.overridden_with(overrides) if overrides else found
+    return configuration.with_overrides(overrides) if overrides else configuration
 
 
-def _grouped(records: Iterable[Chosen]) -> dict[str, list[Chosen]]:
+def _group_by_key(records: Iterable[Chosen]) -> dict[str, list[Chosen]]:
     groups: dict[str, list[Chosen]] = {}
-    seen = set()
+    identities = set()
     for record in records:
-        if record.identity in seen:
+        if record.identity in identities:
             raise BadInput(f"mission parameter {record.key} ({record.status}, version {record.version}) is given twice")
-        seen.add(record.identity)
+        identities.add(record.identity)
         groups.setdefault(record.key, []).append(record)
     return groups
 
 
-def _choose(key: str, group: Sequence[Chosen], ladder: Sequence[str], mjd: float | None) -> Chosen:
+def _choose_record(key: str, group: Sequence[Chosen], ladder: Sequence[str], mjd: float | None) -> Chosen:
     for status in ladder:
         valid = [
             p for p in group if p.status == status and (mjd is None or p.valid_from is None or p.valid_from <= mjd)
@@ -213,49 +219,49 @@ def _choose(key: str, group: Sequence[Chosen], ladder: Sequence[str], mjd: float
     raise BadInput(f"mission parameter {key} has no record of status {', '.join(ladder)} at this date")
 
 
-def _overridden(known: Mapping[str, Parameter], name: str, value: float, unit: str) -> Parameter:
+def _override_record(parameters: Mapping[str, Parameter], name: str, value: float, unit: str) -> Parameter:
     where = f"mission override {name}"
-    key, _ = detector_overrides.split(name, known)
-    if key not in known:
+    key, _ = detector_overrides.split_name(name, parameters)
+    if key not in parameters:
         raise BadInput(f"{where}: the mission database has no such parameter")
     if not math.isfinite(value):
         raise BadInput(f"{where} = {value} is not finite")
-    own = known[key].unit
+    parameter_unit = parameters[key].unit
     return replace(
-        known[key],
+        parameters[key],
         key=name,
         status="SIM",
-        value=convert(value, unit, own, where),
+        value=convert(value, unit, parameter_unit, where),
         confidence="assumed",
         source="request",
     )
 
 
-def difference(first: MissionConfiguration, second: MissionConfiguration) -> Iterator[str]:
+def differences(first: MissionConfiguration, second: MissionConfiguration) -> Iterator[str]:
     """A line for each name whose value, unit or file differs, or that only one of them has."""
-    left, right = _by_key(first), _by_key(second)
-    for key in sorted(set(left) | set(right)):
-        a, b = left.get(key), right.get(key)
-        if _shown(a).acts != _shown(b).acts:
-            yield f"{key}: {_shown(a).text} -> {_shown(b).text}"
+    first_records, second_records = _records_by_key(first), _records_by_key(second)
+    for key in sorted(set(first_records) | set(second_records)):
+        first_record, second_record = first_records.get(key), second_records.get(key)
+        if _describe_record(first_record).content != _describe_record(second_record).content:
+            yield f"{key}: {_describe_record(first_record).text} -> {_describe_record(second_record).text}"
 
 
-def _by_key(configuration: MissionConfiguration) -> dict[str, Parameter | Model]:
+def _records_by_key(configuration: MissionConfiguration) -> dict[str, Parameter | Model]:
     return {p.key: p for p in configuration.parameters} | {m.key: m for m in configuration.models}
 
 
 @dataclass(frozen=True, slots=True)
-class _Shown:
+class _RecordText:
     """What a record does, and how it is written."""
 
-    acts: str
+    content: str
     text: str
 
 
-def _shown(record: Parameter | Model | None) -> _Shown:
+def _describe_record(record: Parameter | Model | None) -> _RecordText:
     if record is None:
-        return _Shown("", "absent")
+        return _RecordText("", "absent")
     if isinstance(record, Model):
-        return _Shown(record.sha256, f"{record.file} ({record.sha256[:12]}, {record.status})")
+        return _RecordText(record.sha256, f"{record.file} ({record.sha256[:12]}, {record.status})")
     value = f"{record.value!r} {record.unit}".strip()
-    return _Shown(f"{record.value.hex()} {record.unit}", f"{value} ({record.status})")
+    return _RecordText(f"{record.value.hex()} {record.unit}", f"{value} ({record.status})")

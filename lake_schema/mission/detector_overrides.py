@@ -32,7 +32,7 @@ GRID_NAMES = {"vis": "{row}-{column}", "nisp": "DET{row}{column}"}
 CAMERA, DETECTOR, AMPLIFIER = "", "detector", "amplifier"
 
 
-class Known(Protocol):
+class MissionValues(Protocol):
     """What is asked of a mission configuration."""
 
     def value(self, key: str) -> float: ...
@@ -41,7 +41,7 @@ class Known(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class DetectorPlace:
     """A detector, an amplifier, or both; "" = every one."""
 
     detector: str = ""
@@ -51,67 +51,67 @@ class Place:
         return bool(self.detector or self.amplifier)
 
 
-def split(name: str, known: Container[str]) -> tuple[str, Place]:
+def split_name(name: str, parameter_names: Container[str]) -> tuple[str, DetectorPlace]:
     """The parameter and the place of a name; known : names of the parameters."""
     key, at, place = name.partition("@")
     if at:
         detector, _, amplifier = place.partition(".")
-        return key, Place(detector, amplifier)
+        return key, DetectorPlace(detector, amplifier)
     # No parameter's name goes on where another's ends.
     parent, _, last = name.rpartition(".")
-    if parent in known:
-        return parent, Place(amplifier=last)
-    return name, Place()
+    if parent in parameter_names:
+        return parent, DetectorPlace(amplifier=last)
+    return name, DetectorPlace()
 
 
-def names(key: str, place: Place) -> tuple[str, str, str, str]:
+def names_at_place(key: str, place: DetectorPlace) -> tuple[str, str, str, str]:
     """Names of a parameter's values at a place, the narrowest first."""
     detector, amplifier = f"@{place.detector}", f".{place.amplifier}"
     return f"{key}{detector}{amplifier}", f"{key}{detector}", f"{key}{amplifier}", key
 
 
 @cache
-def _scopes() -> tuple[tuple[re.Pattern[str], str], ...]:
+def _read_scopes() -> tuple[tuple[re.Pattern[str], str], ...]:
     with (files("lake_schema.mission") / "places.csv").open(encoding="utf-8") as stream:
         return tuple((re.compile(translate(row["pattern"])), row["by"]) for row in csv.DictReader(stream))
 
 
 @cache
-def scope(key: str) -> str:
+def variation_scope(key: str) -> str:
     """CAMERA, DETECTOR or AMPLIFIER: how far a parameter's values may differ."""
-    return next((by for pattern, by in _scopes() if pattern.fullmatch(key)), CAMERA)
+    return next((by for pattern, by in _read_scopes() if pattern.fullmatch(key)), CAMERA)
 
 
-def check(name: str, configuration: Known) -> None:
+def check_override(name: str, configuration: MissionValues) -> None:
     """BadInput names what is wrong with a name at a place."""
-    key, place = split(name, configuration)
-    where, by = f"mission override {name}", scope(key)
+    key, place = split_name(name, configuration)
+    where, scope = f"mission override {name}", variation_scope(key)
     if ("@" in name and not place.detector) or name.endswith("."):
         raise BadInput(f"{where}: names no {AMPLIFIER if name.endswith('.') else DETECTOR}")
-    if by == CAMERA:
+    if scope == CAMERA:
         raise BadInput(f"{where}: {key} is one value for the whole camera")
-    if place.amplifier and by == DETECTOR:
+    if place.amplifier and scope == DETECTOR:
         raise BadInput(f"{where}: {key} may differ between detectors ({key}@NAME), not between their amplifiers")
-    section = section_of(key)
-    for kind, wanted, there in (
+    section = camera_prefix(key)
+    for element, name_at_place, existing in (
         ("detector", place.detector, detectors(section, configuration)),
         ("amplifier", place.amplifier, amplifiers(section, configuration)),
     ):
-        if wanted and wanted not in there:
-            raise BadInput(f"{where}: {section} has no {kind} {wanted!r}, only {_listed(there)}")
+        if name_at_place and name_at_place not in existing:
+            raise BadInput(f"{where}: {section} has no {element} {name_at_place!r}, only {_format_names(existing)}")
 
 
-def _listed(there: tuple[str, ...]) -> str:
-    return ", ".join(there) if len(there) <= 16 else f"{len(there)} from {there[0]} to {there[-1]}"
+def _format_names(existing: tuple[str, ...]) -> str:
+    return ", ".join(existing) if len(existing) <= 16 else f"{len(existing)} from {existing[0]} to {existing[-1]}"
 
 
-def section_of(key: str) -> str:
+def camera_prefix(key: str) -> str:
     """The camera's prefix of a parameter's name: vis, nisp, ext.lsstcam."""
     parts = key.split(".")
     return ".".join(parts[:2] if parts[0] == "ext" else parts[:1])
 
 
-def detectors(section: str, configuration: Known) -> tuple[str, ...]:
+def detectors(section: str, configuration: MissionValues) -> tuple[str, ...]:
     """Names of a camera's detectors, in their order; none of a section that is no camera."""
     if section in GRID_NAMES:
         rows, columns = (int(configuration.value(f"{section}.fpa.{key}")) for key in ("rows", "columns"))
@@ -123,7 +123,7 @@ def detectors(section: str, configuration: Known) -> tuple[str, ...]:
     return tuple(row["detector"] for row in configuration.rows(key)) if key in configuration else ()
 
 
-def amplifiers(section: str, configuration: Known) -> tuple[str, ...]:
+def amplifiers(section: str, configuration: MissionValues) -> tuple[str, ...]:
     """Names of a detector's amplifiers, in the order in which they are read; none where it is read as one frame."""
     key = f"{section}.amplifiers"
     if key not in configuration:

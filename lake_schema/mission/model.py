@@ -21,7 +21,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from lake_schema.errors import BadInput, Damaged
-from lake_schema.mission.parameter import Identity, check_record, identity_of, read_rows
+from lake_schema.mission.parameter import Identity, check_record, read_records, record_identity
 
 _COLUMNS = ("key", "status", "file", "sha256", "version", "valid_from", "confidence", "source")
 _FOLDER = "models"
@@ -58,17 +58,17 @@ class Model:
     @property
     def identity(self) -> Identity:
         """What no two records may share."""
-        return identity_of(self)
+        return record_identity(self)
 
 
 def read(file: Traversable) -> tuple[Model, ...]:
     """The records of a CSV file of exactly the columns _COLUMNS."""
 
-    def record(row: Mapping[str, str], version: int, valid_from: float | None) -> Model:
+    def make_model(row: Mapping[str, str], version: int, valid_from: float | None) -> Model:
         file, sha256, confidence = row["file"], row["sha256"], row["confidence"]
         return Model(row["key"], row["status"], file, sha256, version, valid_from, confidence, row["source"] or "")
 
-    return tuple(read_rows(file, _COLUMNS, record))
+    return tuple(read_records(file, _COLUMNS, make_model))
 
 
 @cache
@@ -77,44 +77,44 @@ def read_models() -> tuple[Model, ...]:
     return read(files("lake_schema.mission") / "models.csv")
 
 
-def content(model: Model, folder: Path | None = None) -> bytes:
+def read_content(model: Model, folder: Path | None = None) -> bytes:
     """The bytes of a model's file.
 
     folder : where the files of a published configuration lie, each named by its sha256; looked at where the
              installed file is another one
     Errors : Damaged names the model and the sha256 that its file has
     """
-    data = _installed(model.file)
+    data = _read_installed(model.file)
     if data is not None and hashlib.sha256(data).hexdigest() == model.sha256:
         return data
-    kept = folder / model.sha256 if folder is not None else None
-    if kept is not None and kept.is_file():
-        old = kept.read_bytes()
-        if hashlib.sha256(old).hexdigest() == model.sha256:
-            return old
-    found = "is missing" if data is None else f"has sha256 {hashlib.sha256(data).hexdigest()}, not {model.sha256}"
-    raise Damaged(f"mission model {model.key} ({model.status}): file {model.file} {found}")
+    published_file = folder / model.sha256 if folder is not None else None
+    if published_file is not None and published_file.is_file():
+        published_data = published_file.read_bytes()
+        if hashlib.sha256(published_data).hexdigest() == model.sha256:
+            return published_data
+    problem = "is missing" if data is None else f"has sha256 {hashlib.sha256(data).hexdigest()}, not {model.sha256}"
+    raise Damaged(f"mission model {model.key} ({model.status}): file {model.file} {problem}")
 
 
 @cache
-def _installed(file: str) -> bytes | None:
+def _read_installed(file: str) -> bytes | None:
     package, _, path = file.rpartition(":")
     try:
-        where = files(package).joinpath(path) if package else files("lake_schema.mission") / _FOLDER / path
-        return where.read_bytes()
+        file_path = files(package).joinpath(path) if package else files("lake_schema.mission") / _FOLDER / path
+        return file_path.read_bytes()
     except (OSError, ModuleNotFoundError):
         return None
 
 
 @lru_cache(maxsize=256)
-def numbers(data: bytes) -> tuple[tuple[float, ...], ...]:
+def parse_numbers(data: bytes) -> tuple[tuple[float, ...], ...]:
     """A table of numbers: header dropped, lines that begin with '#' are comments, a blank entry is NaN."""
     table = list(csv.reader(_lines(data)))
     return tuple(tuple(float(entry) if entry else math.nan for entry in row) for row in table[1:])
 
 
 @lru_cache(maxsize=256)
-def rows(data: bytes) -> tuple[Mapping[str, str], ...]:
+def parse_rows(data: bytes) -> tuple[Mapping[str, str], ...]:
     """A table of texts by column name; lines that begin with '#' are comments."""
     return tuple(MappingProxyType(row) for row in csv.DictReader(_lines(data)))
 

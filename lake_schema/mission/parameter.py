@@ -36,13 +36,13 @@ SECTIONS = ("environment", "spacecraft", "vis", "nisp", *(f"ext_{camera}" for ca
 _COLUMNS = ("key", "status", "value", "unit", "version", "valid_from", "confidence", "source")
 
 # Of a text in a record, characters.
-_LONGEST = 1000
+_MAX_LENGTH = 1000
 
 Identity = tuple[str, str, int, float]
 Record = TypeVar("Record")
 
 
-class Dated(Protocol):
+class MissionRecord(Protocol):
     """What records of values and of files have in common."""
 
     @property
@@ -86,10 +86,10 @@ class Parameter:
     @property
     def identity(self) -> Identity:
         """What no two records may share."""
-        return identity_of(self)
+        return record_identity(self)
 
 
-def check_record(record: Dated, where: str) -> None:
+def check_record(record: MissionRecord, where: str) -> None:
     """Refuse a status, confidence, date or source that a record may not have."""
     if record.status not in STATUSES:
         raise BadInput(f"{where}: status is not one of {', '.join(STATUSES)}")
@@ -101,7 +101,7 @@ def check_record(record: Dated, where: str) -> None:
         raise BadInput(f"{where}: has no source")
 
 
-def identity_of(record: Dated) -> Identity:
+def record_identity(record: MissionRecord) -> Identity:
     """Key, status, version and date of a record."""
     return record.key, record.status, record.version, -math.inf if record.valid_from is None else record.valid_from
 
@@ -120,7 +120,7 @@ def parse_unit(text: str, where: str = "mission") -> u.UnitBase:
 
 
 @cache
-def _factor(unit: str, to: str) -> float | None:
+def _conversion_factor(unit: str, to: str) -> float | None:
     """What a value in `unit` is multiplied with to be in `to`, None where they do not fit."""
     try:
         factor = float(parse_unit(unit).to(parse_unit(to)))
@@ -136,7 +136,7 @@ def convert(value: float, unit: str, to: str, where: str) -> float:
     """
     parse_unit(unit, where)
     parse_unit(to, where)
-    factor = _factor(unit, to)
+    factor = _conversion_factor(unit, to)
     if factor is None:
         raise BadInput(f"{where}: {unit or 'a pure number'} does not convert to {to or 'a pure number'}")
     return value * factor
@@ -145,19 +145,19 @@ def convert(value: float, unit: str, to: str, where: str) -> float:
 def read(file: Traversable) -> tuple[Parameter, ...]:
     """The records of a CSV file of exactly the columns _COLUMNS."""
 
-    def record(row: Mapping[str, str], version: int, valid_from: float | None) -> Parameter:
+    def make_parameter(row: Mapping[str, str], version: int, valid_from: float | None) -> Parameter:
         value = float(row["value"])
         return Parameter(
             row["key"], row["status"], value, row["unit"], version, valid_from, row["confidence"], row["source"] or ""
         )
 
-    return tuple(read_rows(file, _COLUMNS, record))
+    return tuple(read_records(file, _COLUMNS, make_parameter))
 
 
-def read_rows(
+def read_records(
     file: Traversable,
     columns: Sequence[str],
-    record: Callable[[Mapping[str, str], int, float | None], Record],
+    make_record: Callable[[Mapping[str, str], int, float | None], Record],
 ) -> Iterator[Record]:
     """Records of a CSV file of exactly these columns: record(row, version, valid_from) of each line."""
     try:
@@ -165,22 +165,22 @@ def read_rows(
         if tuple(lines.fieldnames or ()) != tuple(columns):
             raise BadInput(f"{file.name}: columns are not {', '.join(columns)}")
         for row in lines:
-            if not all(_is_plain(value) for value in row.values()):
+            if not all(_is_short_line(value) for value in row.values()):
                 raise BadInput(f"{file.name} line {lines.line_num}: a text is too long, or of several lines")
             valid_from = float(row["valid_from"]) if row["valid_from"] else None
-            yield record(row, int(row["version"]), valid_from)
+            yield make_record(row, int(row["version"]), valid_from)
     except UnicodeDecodeError as error:
         raise BadInput(f"{file.name}: {error}") from None
     except (ValueError, TypeError, csv.Error) as error:
         raise BadInput(f"{file.name} line {lines.line_num}: {error}") from None
 
 
-def _is_plain(value: object) -> bool:
-    return value is None or (isinstance(value, str) and value.isprintable() and len(value) <= _LONGEST)
+def _is_short_line(value: object) -> bool:
+    return value is None or (isinstance(value, str) and value.isprintable() and len(value) <= _MAX_LENGTH)
 
 
 @cache
-def read_all() -> tuple[Parameter, ...]:
+def read_all_parameters() -> tuple[Parameter, ...]:
     """Every record of the package."""
     folder = files("lake_schema.mission")
     return tuple(record for section in SECTIONS for record in read(folder / f"{section}.csv"))

@@ -16,7 +16,7 @@ import pyarrow as pa
 from lake_schema.errors import Damaged
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.model import Model, read_models
-from lake_schema.mission.parameter import Parameter, read_all
+from lake_schema.mission.parameter import Parameter, read_all_parameters
 from lake_schema.store import manifest
 from lake_schema.store.plan import Output
 from lake_schema.store.read import Version
@@ -26,11 +26,11 @@ from lake_schema.tables.mission import MISSION
 _FOLDER = "models"
 
 
-def output(configuration: MissionConfiguration) -> Output:
+def to_output(configuration: MissionConfiguration) -> Output:
     """Every record of the database, which of them are chosen, the overridden ones in rows of their own; the files."""
     contents = {m.sha256: configuration.content(m) for m in configuration.models}
     return Output(
-        table(configuration),
+        to_table(configuration),
         {f"{_FOLDER}/{sha256}": partial(_write, data) for sha256, data in contents.items()},
     )
 
@@ -39,32 +39,32 @@ def _write(data: bytes, path: Path) -> None:
     path.write_bytes(data)
 
 
-def table(configuration: MissionConfiguration) -> pa.Table:
+def to_table(configuration: MissionConfiguration) -> pa.Table:
     """Rows of the table `mission`."""
-    chosen: list[Parameter | Model] = [*configuration.parameters, *configuration.models]
-    own = [record for record in chosen if record.key in configuration.overridden]
-    known: list[Parameter | Model] = [*read_all(), *read_models()]
+    records: list[Parameter | Model] = [*configuration.parameters, *configuration.models]
+    overridden = [record for record in records if record.key in configuration.overridden]
+    package_records: list[Parameter | Model] = [*read_all_parameters(), *read_models()]
     # A configuration that was read back may hold records that the package no longer has.
-    there = {*known, *own}
-    gone = [record for record in chosen if record not in there]
-    every = [*known, *gone, *own]
-    wanted = set(chosen)
-    dates = [math.nan if record.valid_from is None else record.valid_from for record in every]
-    values = [record.value if isinstance(record, Parameter) else math.nan for record in every]
+    listed = {*package_records, *overridden}
+    removed_records = [record for record in records if record not in listed]
+    all_records = [*package_records, *removed_records, *overridden]
+    chosen_records = set(records)
+    dates = [math.nan if record.valid_from is None else record.valid_from for record in all_records]
+    values = [record.value if isinstance(record, Parameter) else math.nan for record in all_records]
     return MISSION.build(
         {
-            "name": [record.key for record in every],
+            "name": [record.key for record in all_records],
             "value": np.ma.masked_invalid(values),
-            "unit": [record.unit if isinstance(record, Parameter) else "" for record in every],
-            "status": [record.status for record in every],
-            "version": np.array([record.version for record in every], np.int64),
+            "unit": [record.unit if isinstance(record, Parameter) else "" for record in all_records],
+            "status": [record.status for record in all_records],
+            "version": np.array([record.version for record in all_records], np.int64),
             "valid_from": np.ma.masked_invalid(dates),
-            "confidence": [record.confidence for record in every],
-            "source": [record.source for record in every],
-            "chosen": np.array([record in wanted for record in every], bool),
-            "overridden": np.arange(len(every)) >= len(every) - len(own),
-            "file": [record.file if isinstance(record, Model) else None for record in every],
-            "sha256": [record.sha256 if isinstance(record, Model) else None for record in every],
+            "confidence": [record.confidence for record in all_records],
+            "source": [record.source for record in all_records],
+            "chosen": np.array([record in chosen_records for record in all_records], bool),
+            "overridden": np.arange(len(all_records)) >= len(all_records) - len(overridden),
+            "file": [record.file if isinstance(record, Model) else None for record in all_records],
+            "sha256": [record.sha256 if isinstance(record, Model) else None for record in all_records],
         }
     )
 
@@ -75,33 +75,33 @@ def read_back(version: Version) -> MissionConfiguration:
     Errors : Damaged where it is not the one that the manifest names
     """
     try:
-        files = [version.folder / f"dataset/{part}" for part in version.parts]
-        states = [manifest.state(path) for path in files if isinstance(path, Path)]
+        files = [version.folder / f"dataset/{part}" for part in version.partitions]
+        states = [manifest.file_state(path) for path in files if isinstance(path, Path)]
     except OSError:
         # What is wrong with it is said by whoever reads it.
-        return _configuration(version)
+        return _read_configuration(version)
     # Copies of files on object storage go with their store.
-    return _once(version, *states) if len(states) == len(files) else _configuration(version)
+    return _read_cached(version, *states) if len(states) == len(files) else _read_configuration(version)
 
 
 @lru_cache(maxsize=8)
-def _once(version: Version, *states: tuple[int, ...]) -> MissionConfiguration:
+def _read_cached(version: Version, *states: tuple[int, ...]) -> MissionConfiguration:
     """As long as its files stay as they are: tasks of a process read the same one."""
-    return _configuration(version)
+    return _read_configuration(version)
 
 
-def _configuration(version: Version) -> MissionConfiguration:
+def _read_configuration(version: Version) -> MissionConfiguration:
     parameters: list[Parameter] = []
     models: list[Model] = []
     overridden = []
     for row in version.rows().to_pylist():
         if not row["chosen"]:
             continue
-        rest = (row["version"], row["valid_from"], row["confidence"], row["source"])
+        provenance = (row["version"], row["valid_from"], row["confidence"], row["source"])
         if row["file"] is None:
-            parameters.append(Parameter(row["name"], row["status"], row["value"], row["unit"], *rest))
+            parameters.append(Parameter(row["name"], row["status"], row["value"], row["unit"], *provenance))
         else:
-            models.append(Model(row["name"], row["status"], row["file"], row["sha256"], *rest))
+            models.append(Model(row["name"], row["status"], row["file"], row["sha256"], *provenance))
         if row["overridden"]:
             overridden.append(row["name"])
     facts = version.manifest["facts"]
@@ -110,7 +110,7 @@ def _configuration(version: Version) -> MissionConfiguration:
         tuple(facts["ladder"]),
         tuple(sorted(overridden)),
         tuple(sorted(models, key=lambda m: m.key)),
-        version.below(_FOLDER),
+        version.sidecar_folder(_FOLDER),
     )
     if configuration.fingerprint != facts["mission"]:
         raise Damaged(f"table mission: version {version.key} is not the configuration {facts['mission']}")

@@ -23,24 +23,24 @@ import numpy.typing as npt
 from lake_schema.arrays import Float, Float32, Int
 from lake_schema.errors import BadInput, OutOfRange
 
-DEEPEST = 29
+MAX_ORDER = 29
 # Of three neighbouring vertices (unit vectors) the triple product at which healpy sees no corner any more.
-_FLATTEST = 1e-10
+_MIN_TRIPLE_PRODUCT = 1e-10
 # Cells of a circle's cover are about this part of its radius wide: finer ones skip few rows more.
-_CELLS_A_RADIUS = 4
+_CELLS_PER_RADIUS = 4
 # Added to a distance that decides: more than the rounding of any.
 _ROUNDING_DEG = 1e-9
 
 
 @cache
-def _hp() -> Any:
+def _healpy() -> Any:
     # Its import takes longer than most of what a process does with a lake.
     import healpy
 
     return healpy
 
 
-def checked(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:
+def check_positions(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:
     """ra, dec [any shape] deg -> the same with ra in [0, 360); refuses NaN, infinities and |dec| > 90 by name."""
     ra_deg, dec_deg = np.asarray(ra, float), np.asarray(dec, float)
     if not np.isfinite(ra_deg).all():
@@ -48,22 +48,22 @@ def checked(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:
     bad = ~(np.abs(dec_deg) <= 90.0)
     if bad.any():
         raise OutOfRange("dec", _first(dec_deg[bad]), -90.0, 90.0)
-    return wrapped(ra_deg), dec_deg
+    return wrap_angle(ra_deg), dec_deg
 
 
-def wrapped(angle: npt.ArrayLike) -> Float:
+def wrap_angle(angle: npt.ArrayLike) -> Float:
     """Angles [any shape] deg -> the same in [0, 360)."""
-    turned = np.mod(np.asarray(angle, float), 360.0)
+    remainder = np.mod(np.asarray(angle, float), 360.0)
     # A tiny negative angle rounds up to exactly 360.
-    within: Float = np.where(turned >= 360.0, 0.0, turned)[()]
-    return within
+    angle_deg: Float = np.where(remainder >= 360.0, 0.0, remainder)[()]
+    return angle_deg
 
 
-def position_angle(angle: npt.ArrayLike) -> Float32:
+def wrap_position_angle(angle: npt.ArrayLike) -> Float32:
     """Position angles [any shape] deg of axes -> float32, the same in [0, 180)."""
-    turned = np.mod(np.asarray(angle), 180.0).astype(np.float32)
+    remainder = np.mod(np.asarray(angle), 180.0).astype(np.float32)
     # What lies below 180 by less than float32 tells, as tiny negative angles do, rounds up to it.
-    return np.where(turned >= 180.0, np.float32(0.0), turned)
+    return np.where(remainder >= 180.0, np.float32(0.0), remainder)
 
 
 def _first(values: Float) -> float:
@@ -72,13 +72,13 @@ def _first(values: Float) -> float:
 
 def healpix_29(ra: npt.ArrayLike, dec: npt.ArrayLike) -> Int:
     """ra, dec [n] deg -> int64[n], the nested HEALPix index of order 29 (0.4 mas)."""
-    return cell_of(ra, dec, DEEPEST)
+    return cell_at(ra, dec, MAX_ORDER)
 
 
-def cell_of(ra: npt.ArrayLike, dec: npt.ArrayLike, order: int) -> Int:
+def cell_at(ra: npt.ArrayLike, dec: npt.ArrayLike, order: int) -> Int:
     """ra, dec [n] deg -> int64[n], the nested cell of `order` that holds each position."""
-    ra_deg, dec_deg = checked(ra, dec)
-    return np.asarray(_hp().ang2pix(1 << order, ra_deg, dec_deg, nest=True, lonlat=True), np.int64)
+    ra_deg, dec_deg = check_positions(ra, dec)
+    return np.asarray(_healpy().ang2pix(1 << order, ra_deg, dec_deg, nest=True, lonlat=True), np.int64)
 
 
 def cell_area(order: int) -> float:
@@ -88,13 +88,13 @@ def cell_area(order: int) -> float:
 
 def cell_centre(order: int, cell: int) -> tuple[float, float]:
     """ra, dec of a cell's centre, deg."""
-    ra, dec = _hp().pix2ang(1 << order, cell, nest=True, lonlat=True)
+    ra, dec = _healpy().pix2ang(1 << order, cell, nest=True, lonlat=True)
     return float(ra), float(dec)
 
 
 def cell_centres(order: int, cells: npt.ArrayLike) -> tuple[Float, Float]:
     """ra[n], dec[n] of the centres of cells, deg."""
-    ra, dec = _hp().pix2ang(1 << order, np.asarray(cells, np.int64), nest=True, lonlat=True)
+    ra, dec = _healpy().pix2ang(1 << order, np.asarray(cells, np.int64), nest=True, lonlat=True)
     return np.asarray(ra, float), np.asarray(dec, float)
 
 
@@ -108,7 +108,7 @@ def cell_corners(order: int, cells: npt.ArrayLike) -> Float:
     nested = np.atleast_1d(np.asarray(cells, np.int64))
     face, within = nested >> (2 * order), nested & ((1 << 2 * order) - 1)
     # Of the two coordinates in a base cell, of 1 across, those of the corner: they grow to the north-east and -west.
-    x, y = ((_every_second(within >> bit)[:, None] + np.array(step)) / (1 << order)
+    x, y = ((_even_bits(within >> bit)[:, None] + np.array(step)) / (1 << order)
             for bit, step in ((0, (1, 0, 0, 1)), (1, (1, 1, 0, 0))))  # fmt: skip
     # Rows of base cells from the north, from 2, and their middles in steps of 45 deg.
     row, column = face // 4 + 2, 2 * (face % 4) + (face // 4 != 1)
@@ -127,20 +127,20 @@ def cell_corners(order: int, cells: npt.ArrayLike) -> Float:
     return np.stack([ra % 360.0, dec], -1)
 
 
-def _every_second(bits: Int) -> Int:
+def _even_bits(bits: Int) -> Int:
     """The number that bits 0, 2, 4 ... of a number make."""
-    found = bits & 0x5555555555555555
+    packed = bits & 0x5555555555555555
     for shift, mask in (
         (1, 0x3333333333333333), (2, 0x0F0F0F0F0F0F0F0F), (4, 0x00FF00FF00FF00FF), (8, 0x0000FFFF0000FFFF),
         (16, 0x00000000FFFFFFFF),
     ):  # fmt: skip
-        found = (found | found >> shift) & mask
-    return np.asarray(found, np.int64)
+        packed = (packed | packed >> shift) & mask
+    return np.asarray(packed, np.int64)
 
 
 def cell_range(order: int, cell: int) -> tuple[int, int]:
     """The half-open range of order-29 indices inside a cell."""
-    shift = 2 * (DEEPEST - order)
+    shift = 2 * (MAX_ORDER - order)
     return int(cell) << shift, (int(cell) + 1) << shift
 
 
@@ -151,7 +151,7 @@ def parent(cells: npt.ArrayLike, order: int, coarser: int) -> Int:
 
 def cell_radius(order: int) -> float:
     """Largest distance of a point of any cell of `order` from the cell's centre, deg."""
-    return float(np.degrees(_hp().max_pixrad(1 << order)))
+    return float(np.degrees(_healpy().max_pixrad(1 << order)))
 
 
 def cells_in_cone(ra: float, dec: float, radius: float, order: int) -> Int:
@@ -160,21 +160,21 @@ def cells_in_cone(ra: float, dec: float, radius: float, order: int) -> Int:
     ra, dec, radius : deg, radius in [0, 180]
     returns         : int64[n]; holds every touched cell, and may hold a neighbour whose edge is just outside
     """
-    (ra_deg,), (dec_deg,) = checked([ra], [dec])
+    (ra_deg,), (dec_deg,) = check_positions([ra], [dec])
     if not 0.0 <= radius <= 180.0:
         raise OutOfRange("radius", radius, 0.0, 180.0)
-    centre = _hp().ang2vec(ra_deg, dec_deg, lonlat=True)
-    fine = min(order + 3, DEEPEST)
-    found = _hp().query_disc(1 << fine, centre, np.radians(min(radius + cell_radius(fine), 180.0)), nest=True)
-    own = cell_of([ra], [dec], order)
-    return np.unique(np.concatenate([parent(found, fine, order), own]))
+    centre = _healpy().ang2vec(ra_deg, dec_deg, lonlat=True)
+    fine = min(order + 3, MAX_ORDER)
+    fine_cells = _healpy().query_disc(1 << fine, centre, np.radians(min(radius + cell_radius(fine), 180.0)), nest=True)
+    centre_cell = cell_at([ra], [dec], order)
+    return np.unique(np.concatenate([parent(fine_cells, fine, order), centre_cell]))
 
 
 def cover_order(radius: float) -> int:
     """Order of cells that suit the cover of a circle of `radius` deg."""
-    wanted = max(radius / _CELLS_A_RADIUS, 1e-7)
-    order = int(np.ceil(np.log2(np.sqrt(cell_area(0)) / wanted)))
-    return min(max(order, 0), DEEPEST - 3)
+    cell_width = max(radius / _CELLS_PER_RADIUS, 1e-7)
+    order = int(np.ceil(np.log2(np.sqrt(cell_area(0)) / cell_width)))
+    return min(max(order, 0), MAX_ORDER - 3)
 
 
 def cells_in_cones(ra: npt.ArrayLike, dec: npt.ArrayLike, radius: npt.ArrayLike, order: int) -> list[Int]:
@@ -182,35 +182,37 @@ def cells_in_cones(ra: npt.ArrayLike, dec: npt.ArrayLike, radius: npt.ArrayLike,
 
     ra, dec, radius : [n] deg; quick where the circles lie close together, such as those of the detectors of a camera
     """
-    lon, lat = checked(ra, dec)
-    far, fine = np.asarray(radius, float), min(order + 3, DEEPEST)
+    lon, lat = check_positions(ra, dec)
+    radii, fine = np.asarray(radius, float), min(order + 3, MAX_ORDER)
     if not lon.size:
         return []
-    if not ((far >= 0.0) & (far <= 180.0)).all():
-        raise OutOfRange("radius", _first(far[~((far >= 0.0) & (far <= 180.0))]), 0.0, 180.0)
-    centres, own = unit_vectors(lon, lat), cell_of(lon, lat, order)
-    reach = np.minimum(far + cell_radius(fine), 180.0)
+    if not ((radii >= 0.0) & (radii <= 180.0)).all():
+        raise OutOfRange("radius", _first(radii[~((radii >= 0.0) & (radii <= 180.0))]), 0.0, 180.0)
+    centres, centre_cells = unit_vectors(lon, lat), cell_at(lon, lat, order)
+    reach = np.minimum(radii + cell_radius(fine), 180.0)
     size = cell_radius(order) + _ROUNDING_DEG
-    widest = float((separation(lon, lat, lon[0], lat[0]) + far).max()) + size
-    about = cells_in_cone(float(lon[0]), float(lat[0]), min(widest, 180.0), order)
+    widest = float((separation(lon, lat, lon[0], lat[0]) + radii).max()) + size
+    candidates = cells_in_cone(float(lon[0]), float(lat[0]), min(widest, 180.0), order)
     # Of most cells their middle tells; of the others, whether the middle of a finer cell within them is near enough.
-    middles = _hp().pix2vec(1 << order, about, nest=True)
-    nearness = sum(centres[:, i, None] * middles[i] for i in range(3))
-    sure = np.where(reach > size, np.cos(np.radians(np.maximum(reach - size, 0.0))), np.inf)
-    touched = nearness >= sure[:, None]
-    circle, unsure = np.nonzero(~touched & (nearness >= np.cos(np.radians(np.minimum(reach + size, 180.0)))[:, None]))
-    within = _middles(about, order, fine)[:, unsure]
-    nearness = sum(within[i] * centres[circle, i, None] for i in range(3))
-    touched[circle, unsure] = (nearness >= np.cos(np.radians(reach))[circle, None]).any(axis=1)
-    touched |= about == own[:, None]
-    return [about[row] for row in touched]
+    cell_centres_xyz = _healpy().pix2vec(1 << order, candidates, nest=True)
+    cos_distance = sum(centres[:, i, None] * cell_centres_xyz[i] for i in range(3))
+    inside_limit = np.where(reach > size, np.cos(np.radians(np.maximum(reach - size, 0.0))), np.inf)
+    touched = cos_distance >= inside_limit[:, None]
+    circle, unsure = np.nonzero(
+        ~touched & (cos_distance >= np.cos(np.radians(np.minimum(reach + size, 180.0)))[:, None])
+    )
+    finer_centres = _finer_centres(candidates, order, fine)[:, unsure]
+    cos_distance = sum(finer_centres[i] * centres[circle, i, None] for i in range(3))
+    touched[circle, unsure] = (cos_distance >= np.cos(np.radians(reach))[circle, None]).any(axis=1)
+    touched |= candidates == centre_cells[:, None]
+    return [candidates[row] for row in touched]
 
 
-def _middles(cells: Int, order: int, finer: int) -> Float:
+def _finer_centres(cells: Int, order: int, finer: int) -> Float:
     """[3, n, m] directions of the middles of the finer cells within each cell."""
-    many = 1 << 2 * (finer - order)
-    inside = (np.asarray(cells)[:, None] << 2 * (finer - order)) + np.arange(many)
-    return np.array(_hp().pix2vec(1 << finer, inside, nest=True))
+    finer_count = 1 << 2 * (finer - order)
+    inside = (np.asarray(cells)[:, None] << 2 * (finer - order)) + np.arange(finer_count)
+    return np.array(_healpy().pix2vec(1 << finer, inside, nest=True))
 
 
 def cells_in_polygon(vertices: npt.ArrayLike, order: int) -> Int:
@@ -222,27 +224,27 @@ def cells_in_polygon(vertices: npt.ArrayLike, order: int) -> Int:
     corners = np.asarray(vertices, float)
     if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
         raise BadInput(f"a polygon wants at least 3 vertices (ra, dec), got shape {corners.shape}")
-    ra, dec = checked(corners[:, 0], corners[:, 1])
-    vectors = _hp().ang2vec(ra, dec, lonlat=True)
+    ra, dec = check_positions(corners[:, 0], corners[:, 1])
+    vectors = _healpy().ang2vec(ra, dec, lonlat=True)
     _refuse_not_convex(vectors)
-    fine = min(order + 3, DEEPEST)
-    inside = _hp().query_polygon(1 << fine, vectors, inclusive=True, fact=4, nest=True)
+    fine = min(order + 3, MAX_ORDER)
+    inside = _healpy().query_polygon(1 << fine, vectors, inclusive=True, fact=4, nest=True)
     return np.unique(parent(inside, fine, order))
 
 
 def _refuse_not_convex(vectors: Float) -> None:
     sides = np.cross(vectors, np.roll(vectors, -1, 0))
-    flat = np.abs(np.einsum("ij,ij->i", sides, np.roll(vectors, -2, 0))) <= _FLATTEST
+    flat = np.abs(np.einsum("ij,ij->i", sides, np.roll(vectors, -2, 0))) <= _MIN_TRIPLE_PRODUCT
     if flat.any():
         corner = (int(flat.argmax()) + 1) % len(vectors) + 1
         raise BadInput(
             f"a polygon must be convex: vertex {corner} lies on the great circle of its neighbours, or on one of them"
         )
     # Every vertex lies on the same side of every side: the turns alone would let a star with crossing sides through.
-    every = np.einsum("ij,kj->ik", sides, vectors)
+    heights = np.einsum("ij,kj->ik", sides, vectors)
     ends = np.arange(len(vectors))
-    every[ends, ends] = every[ends, (ends + 1) % len(vectors)] = np.sign(every[0, 2])
-    if not ((every > 0).all() or (every < 0).all()):
+    heights[ends, ends] = heights[ends, (ends + 1) % len(vectors)] = np.sign(heights[0, 2])
+    if not ((heights > 0).all() or (heights < 0).all()):
         raise BadInput("a polygon must be convex, with no repeated vertex and no angle of 180 deg")
 
 
@@ -252,21 +254,21 @@ def cells_in_box(west: float, east: float, south: float, north: float, order: in
     west, east, south, north : deg; the box runs eastward from west to east (across RA 0 where east < west)
     returns                  : int64[m]; holds every touched cell, and may hold a neighbour whose edge is just outside
     """
-    ra, dec = checked([west, east], [south, north])
-    fine = min(order + 3, DEEPEST)
+    ra, dec = check_positions([west, east], [south, north])
+    fine = min(order + 3, MAX_ORDER)
     reach = cell_radius(fine)
     low, high = max(dec[0] - reach, -90.0), min(dec[1] + reach, 90.0)
     # The southernmost cells of the strip have the largest colatitude.
-    strip = _hp().query_strip(1 << fine, np.radians(90.0 - high), np.radians(90.0 - low), inclusive=True)
-    found = _hp().ring2nest(1 << fine, strip)
-    lon, lat = _hp().pix2ang(1 << fine, found, nest=True, lonlat=True)
+    strip = _healpy().query_strip(1 << fine, np.radians(90.0 - high), np.radians(90.0 - low), inclusive=True)
+    fine_cells = _healpy().ring2nest(1 << fine, strip)
+    lon, lat = _healpy().pix2ang(1 << fine, fine_cells, nest=True, lonlat=True)
     # A cell's half-width in right ascension; near a pole it may reach any meridian.
     widest = np.cos(np.radians(np.minimum(np.abs(lat) + reach, 90.0)))
     margin = np.where(widest > np.radians(reach), reach / np.maximum(widest, 1e-9), 360.0)
     eastward = (lon - ra[0] + margin) % 360.0
     span = (ra[1] - ra[0]) % 360.0
-    kept = (eastward <= span + 2 * margin) | (2 * margin + span >= 360.0)
-    return np.unique(parent(found[kept], fine, order))
+    inside = (eastward <= span + 2 * margin) | (2 * margin + span >= 360.0)
+    return np.unique(parent(fine_cells[inside], fine, order))
 
 
 def separation(ra1: npt.ArrayLike, dec1: npt.ArrayLike, ra2: npt.ArrayLike, dec2: npt.ArrayLike) -> Float:
@@ -276,13 +278,13 @@ def separation(ra1: npt.ArrayLike, dec1: npt.ArrayLike, ra2: npt.ArrayLike, dec2
     """
     lon1, lat1, lon2, lat2 = (np.radians(np.asarray(x, float)) for x in (ra1, dec1, ra2, dec2))
     dlon, dlat = np.sin((lon2 - lon1) / 2), np.sin((lat2 - lat1) / 2)
-    near = dlat**2 + np.cos(lat1) * np.cos(lat2) * dlon**2
+    haversine = dlat**2 + np.cos(lat1) * np.cos(lat2) * dlon**2
     # The complement keeps its digits near the antipode, where 1 - near has lost them.
-    far = np.sin((lat1 + lat2) / 2) ** 2 + np.cos(lat1) * np.cos(lat2) * np.cos((lon2 - lon1) / 2) ** 2
-    return np.asarray(np.degrees(2 * np.arctan2(np.sqrt(near), np.sqrt(far))))
+    complement = np.sin((lat1 + lat2) / 2) ** 2 + np.cos(lat1) * np.cos(lat2) * np.cos((lon2 - lon1) / 2) ** 2
+    return np.asarray(np.degrees(2 * np.arctan2(np.sqrt(haversine), np.sqrt(complement))))
 
 
-def displaced(ra: Float, dec: Float, east: Float, north: Float) -> tuple[Float, Float]:
+def offset_positions(ra: Float, dec: Float, east: Float, north: Float) -> tuple[Float, Float]:
     """Positions moved along great circles by (east, north) rad; all [n], ra, dec deg.
 
     ra, dec : float[n] deg;  east, north : float[n] rad
@@ -295,7 +297,7 @@ def displaced(ra: Float, dec: Float, east: Float, north: Float) -> tuple[Float, 
     up = np.cos(angle) * np.sin(lat) + ratio * north * np.cos(lat)
     sideways = ratio * east
     moved = lon + np.arctan2(sideways, forward)
-    return wrapped(np.degrees(moved)), np.degrees(np.arctan2(up, np.hypot(forward, sideways)))
+    return wrap_angle(np.degrees(moved)), np.degrees(np.arctan2(up, np.hypot(forward, sideways)))
 
 
 def random_in_cell(order: int, cell: int, n: int, rng: np.random.Generator) -> tuple[Int, Float, Float]:
@@ -304,23 +306,25 @@ def random_in_cell(order: int, cell: int, n: int, rng: np.random.Generator) -> t
     order, cell : of the nested cell;  n : positions;  rng : random numbers
     """
     first, _ = cell_range(order, cell)
-    index = np.sort(rng.integers(0, 1 << (2 * (DEEPEST - order)), n, dtype=np.int64)) | np.int64(first)
-    ra, dec = _hp().pix2ang(1 << DEEPEST, index, nest=True, lonlat=True)
+    index = np.sort(rng.integers(0, 1 << (2 * (MAX_ORDER - order)), n, dtype=np.int64)) | np.int64(first)
+    ra, dec = _healpy().pix2ang(1 << MAX_ORDER, index, nest=True, lonlat=True)
     return index, ra, dec
 
 
-def positions(index: npt.ArrayLike) -> tuple[Float, Float]:
+def positions_of_indices(index: npt.ArrayLike) -> tuple[Float, Float]:
     """Order-29 indices [n] -> ra, dec [n] deg of their centres."""
-    ra, dec = _hp().pix2ang(1 << DEEPEST, np.asarray(index, np.int64), nest=True, lonlat=True)
+    ra, dec = _healpy().pix2ang(1 << MAX_ORDER, np.asarray(index, np.int64), nest=True, lonlat=True)
     return np.asarray(ra, float), np.asarray(dec, float)
 
 
 def unit_vectors(ra: npt.ArrayLike, dec: npt.ArrayLike) -> Float:
     """[..., 3] unit vectors towards places; ra, dec [...] deg, of one shape."""
-    return np.moveaxis(_towards(np.radians(np.asarray(ra, float)), np.radians(np.asarray(dec, float))), 0, -1)
+    return np.moveaxis(
+        _unit_vector_components(np.radians(np.asarray(ra, float)), np.radians(np.asarray(dec, float))), 0, -1
+    )
 
 
-def _towards(lon: Float, lat: Float) -> Float:
+def _unit_vector_components(lon: Float, lat: Float) -> Float:
     """[3, ...] of [...] rad."""
     return np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
 
@@ -328,18 +332,18 @@ def _towards(lon: Float, lat: Float) -> Float:
 def galactic(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:
     """ICRS ra, dec [n] deg -> Galactic l, b [n] deg (matrix of the Hipparcos catalogue, ESA 1997, eq. 1.5.11)."""
     ra_rad, dec_rad = np.radians(np.asarray(ra, float)), np.radians(np.asarray(dec, float))
-    x, y, z = _turned(TO_GALACTIC, _towards(ra_rad, dec_rad))
-    return wrapped(np.degrees(np.arctan2(y, x))), np.degrees(np.arctan2(z, np.hypot(x, y)))
+    x, y, z = _rotate(TO_GALACTIC, _unit_vector_components(ra_rad, dec_rad))
+    return wrap_angle(np.degrees(np.arctan2(y, x))), np.degrees(np.arctan2(z, np.hypot(x, y)))
 
 
 def equatorial(lon: npt.ArrayLike, lat: npt.ArrayLike) -> tuple[Float, Float]:
     """Galactic l, b [n] deg -> ICRS ra, dec [n] deg; the inverse of `galactic`."""
     l_rad, b_rad = np.radians(np.asarray(lon, float)), np.radians(np.asarray(lat, float))
-    x, y, z = _turned(TO_GALACTIC.T, _towards(l_rad, b_rad))
-    return wrapped(np.degrees(np.arctan2(y, x))), np.degrees(np.arctan2(z, np.hypot(x, y)))
+    x, y, z = _rotate(TO_GALACTIC.T, _unit_vector_components(l_rad, b_rad))
+    return wrap_angle(np.degrees(np.arctan2(y, x))), np.degrees(np.arctan2(z, np.hypot(x, y)))
 
 
-def _turned(matrix: Float, vector: Float) -> Float:
+def _rotate(matrix: Float, vector: Float) -> Float:
     """[3, 3] by [3, ...], added in the order written: a library's product has other last bits on another processor."""
     return np.stack([row[0] * vector[0] + row[1] * vector[1] + row[2] * vector[2] for row in matrix])
 
@@ -353,9 +357,9 @@ TO_GALACTIC = np.array(
 )
 
 
-def ring_of(order: int, cell: int) -> int:
+def ring_index(order: int, cell: int) -> int:
     """Number in the RING ordering of a nested cell."""
-    return int(_hp().nest2ring(1 << order, cell))
+    return int(_healpy().nest2ring(1 << order, cell))
 
 
 def border_cells(order: int, cell: int, fine: int) -> Int:
@@ -363,13 +367,13 @@ def border_cells(order: int, cell: int, fine: int) -> Int:
     side = 1 << (fine - order)
     x, y = np.meshgrid(np.arange(side), np.arange(side))
     rim = (x == 0) | (y == 0) | (x == side - 1) | (y == side - 1)
-    within = _hp().xyf2pix(side, x[rim], y[rim], 0, nest=True)
+    within = _healpy().xyf2pix(side, x[rim], y[rim], 0, nest=True)
     return np.sort((np.int64(cell) << (2 * (fine - order))) + within)
 
 
 def margin_cells(order: int, cell: int, fine: int) -> Int:
     """int64[n] cells of the finer order outside `cell` that touch its border (8 neighbours), sorted: its rim."""
-    around = _hp().get_all_neighbours(1 << fine, border_cells(order, cell, fine), nest=True).ravel()
-    around = np.unique(around[around >= 0]).astype(np.int64)
-    outside: Int = around[parent(around, fine, order) != cell]
+    neighbours = _healpy().get_all_neighbours(1 << fine, border_cells(order, cell, fine), nest=True).ravel()
+    neighbours = np.unique(neighbours[neighbours >= 0]).astype(np.int64)
+    outside: Int = neighbours[parent(neighbours, fine, order) != cell]
     return outside

@@ -24,62 +24,62 @@ from typing import Any
 import numpy as np
 
 from lake_schema.errors import Damaged
-from lake_schema.store.object_storage.s3 import Folder, Place
+from lake_schema.store.object_storage.s3 import Folder, ObjectPath
 from lake_schema.store.plan import Json
 
 # Smaller pieces share a block, larger ones are cut.
-_LEAST_BYTES, _MOST_BYTES = 16 << 10, 8 << 20
+_MIN_BYTES, _MAX_BYTES = 16 << 10, 8 << 20
 _RECORD = np.dtype([("bytes", "<u4"), ("crc", "<u4")])
 
 
-def facts(path: Path, cuts: Sequence[int]) -> dict[str, Any]:
+def file_checksums(path: Path, cuts: Sequence[int]) -> dict[str, Any]:
     """What the manifest says of a file of which parts are read.
 
     cuts    : ascending, where one may be read without what comes before; the last begins what every reader wants
     returns : bytes, sha256 (hexadecimal), blocks: base64 of (bytes, CRC-32) of each, as 4-byte integers, low byte first
     """
-    whole, found, size = hashlib.sha256(), [], path.stat().st_size
-    ends = _ends(cuts, size)
+    file_hash, block_checksums, size = hashlib.sha256(), [], path.stat().st_size
+    ends = _block_ends(cuts, size)
     with path.open("rb") as stream:
         for start, end in zip([0, *ends[:-1]], ends, strict=True):
             data = stream.read(end - start)
-            whole.update(data)
-            found.append((len(data), zlib.crc32(data)))
-    blocks = base64.b64encode(np.array(found, _RECORD).tobytes()).decode()
-    return {"bytes": size, "sha256": whole.hexdigest(), "blocks": blocks}
+            file_hash.update(data)
+            block_checksums.append((len(data), zlib.crc32(data)))
+    blocks = base64.b64encode(np.array(block_checksums, _RECORD).tobytes()).decode()
+    return {"bytes": size, "sha256": file_hash.hexdigest(), "blocks": blocks}
 
 
 def crc32(path: Path) -> int:
     """CRC-32 of a file's bytes, read a piece at a time."""
-    found = 0
+    checksum = 0
     with path.open("rb") as stream:
-        while data := stream.read(_MOST_BYTES):
-            found = zlib.crc32(data, found)
-    return found
+        while data := stream.read(_MAX_BYTES):
+            checksum = zlib.crc32(data, checksum)
+    return checksum
 
 
-def _ends(cuts: Sequence[int], size: int) -> list[int]:
+def _block_ends(cuts: Sequence[int], size: int) -> list[int]:
     ends, last = [], 0
     for cut in [*cuts, size]:
-        if cut - last >= _LEAST_BYTES or cut in (cuts[-1], size):
-            ends += [*range(last + _MOST_BYTES, cut, _MOST_BYTES), cut]
+        if cut - last >= _MIN_BYTES or cut in (cuts[-1], size):
+            ends += [*range(last + _MAX_BYTES, cut, _MAX_BYTES), cut]
             last = cut
     return ends
 
 
-def listed(entry: Json) -> list[tuple[int, int]]:
+def decode_blocks(entry: Json) -> list[tuple[int, int]]:
     """(end, CRC-32) of each block of an entry.
 
     Errors : KeyError, TypeError or ValueError if they are not the blocks of a file of that size
     """
-    found = np.frombuffer(base64.b64decode(entry["blocks"], validate=True), _RECORD)
-    ends = np.cumsum(found["bytes"], dtype=np.int64)
+    blocks = np.frombuffer(base64.b64decode(entry["blocks"], validate=True), _RECORD)
+    ends = np.cumsum(blocks["bytes"], dtype=np.int64)
     if not ends.size or ends[-1] != entry["bytes"]:
         raise ValueError("the blocks are not those of a file of this size")
-    return list(zip(ends.tolist(), found["crc"].tolist(), strict=True))
+    return list(zip(ends.tolist(), blocks["crc"].tolist(), strict=True))
 
 
-class Checked(io.RawIOBase):
+class VerifiedFile(io.RawIOBase):
     """A file of a lake, open for reading; a block is compared once, when something of it is read for the first time.
 
     fault  : why it was refused, "" where it was not; for whoever meets the refusal through somebody else's code
@@ -91,10 +91,10 @@ class Checked(io.RawIOBase):
     def __init__(self, path: Folder, entry: Json) -> None:
         super().__init__()
         self.path, self._entry = path, entry
-        blocks = listed(entry)
-        self._ends, self._sums = [end for end, _ in blocks], [crc for _, crc in blocks]
-        self._sound: set[int] = set()
-        self._at = 0
+        blocks = decode_blocks(entry)
+        self._ends, self._checksums = [end for end, _ in blocks], [crc for _, crc in blocks]
+        self._verified: set[int] = set()
+        self._position = 0
         # Of an object, which is no open file of this process.
         self._object: Any = None
 
@@ -105,80 +105,84 @@ class Checked(io.RawIOBase):
         return True
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        start = {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: int(self._entry["bytes"])}[whence]
-        self._at = max(start + offset, 0)
-        return self._at
+        start = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: int(self._entry["bytes"])}[whence]
+        self._position = max(start + offset, 0)
+        return self._position
 
     def tell(self) -> int:
-        return self._at
+        return self._position
 
     def read(self, size: int | None = -1) -> bytes:
-        first, length = self._at, int(self._entry["bytes"])
+        first, length = self._position, int(self._entry["bytes"])
         last = length if size is None or size < 0 else min(first + size, length)
         if last <= first:
             return b""
         numbers = range(bisect_right(self._ends, first), bisect_left(self._ends, last) + 1)
-        new = [number for number in numbers if number not in self._sound]
+        unverified = [number for number in numbers if number not in self._verified]
         # Whole blocks, once: what is handed out is what was compared.
-        start, end = (min(first, self._start(new[0])), max(last, self._ends[new[-1]])) if new else (first, last)
-        data = self._bytes(start, end)
-        for number in new:
-            self._compare(number, memoryview(data)[self._start(number) - start : self._ends[number] - start])
-        self._at = last
+        start, end = (
+            (min(first, self._block_start(unverified[0])), max(last, self._ends[unverified[-1]]))
+            if unverified
+            else (first, last)
+        )
+        data = self._read_range(start, end)
+        for number in unverified:
+            self._verify_block(number, memoryview(data)[self._block_start(number) - start : self._ends[number] - start])
+        self._position = last
         return data[first - start : last - start]
 
     def forget(self) -> None:
         """Compare every block again when it is next read: for who keeps a file from question to question."""
-        self._sound.clear()
+        self._verified.clear()
         self._object = None
 
-    def _start(self, number: int) -> int:
+    def _block_start(self, number: int) -> int:
         return self._ends[number - 1] if number else 0
 
-    def _compare(self, number: int, block: memoryview) -> None:
-        if zlib.crc32(block) != self._sums[number]:
-            place = f"from {self._start(number)} to {self._ends[number]}"
-            raise self._refusal(f"has other bytes {place} than the manifest says")
-        self._sound.add(number)
+    def _verify_block(self, number: int, block: memoryview) -> None:
+        if zlib.crc32(block) != self._checksums[number]:
+            place = f"from {self._block_start(number)} to {self._ends[number]}"
+            raise self._damage_error(f"has other bytes {place} than the manifest says")
+        self._verified.add(number)
 
-    def _refusal(self, why: str) -> Damaged:
+    def _damage_error(self, why: str) -> Damaged:
         self.fault = f"{self.path} {why}"
         return Damaged(self.fault)
 
-    def _bytes(self, first: int, last: int) -> bytes:
+    def _read_range(self, first: int, last: int) -> bytes:
         """Opened each time: a lake has more files than a process may hold open."""
-        if isinstance(self.path, Place):
-            return self._object_bytes(self.path, first, last)
+        if isinstance(self.path, ObjectPath):
+            return self._read_object_range(self.path, first, last)
         try:
             descriptor = os.open(self.path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
             try:
-                pieces, at = [], first
-                while at < last and (piece := os.pread(descriptor, last - at, at)):
+                pieces, position = [], first
+                while position < last and (piece := os.pread(descriptor, last - position, position)):
                     pieces.append(piece)
-                    at += len(piece)
+                    position += len(piece)
             finally:
                 os.close(descriptor)
         except FileNotFoundError:
             # Removed since, with its whole version.
-            raise self._refusal("is missing") from None
+            raise self._damage_error("is missing") from None
         except OSError as error:
-            raise self._refusal(f"cannot be read: {error.strerror}") from None
-        if at < last:
-            raise self._refusal(f"has {at} bytes, the manifest says {self._entry['bytes']}")
+            raise self._damage_error(f"cannot be read: {error.strerror}") from None
+        if position < last:
+            raise self._damage_error(f"has {position} bytes, the manifest says {self._entry['bytes']}")
         return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
-    def _object_bytes(self, place: Place, first: int, last: int) -> bytes:
+    def _read_object_range(self, place: ObjectPath, first: int, last: int) -> bytes:
         """Asked for each time; of which size the object is, once, and again after `forget`."""
         try:
             if self._object is None:
                 self._object = place.open()
             if (size := self._object.size()) != self._entry["bytes"]:
-                raise self._refusal(f"has {size} bytes, the manifest says {self._entry['bytes']}")
+                raise self._damage_error(f"has {size} bytes, the manifest says {self._entry['bytes']}")
             data: bytes = self._object.read_at(last - first, first)
         except FileNotFoundError:
-            raise self._refusal("is missing") from None
+            raise self._damage_error("is missing") from None
         except OSError as error:
-            raise self._refusal(f"cannot be read: {error}") from None
+            raise self._damage_error(f"cannot be read: {error}") from None
         if len(data) < last - first:
-            raise self._refusal(f"has {first + len(data)} bytes, the manifest says {self._entry['bytes']}")
+            raise self._damage_error(f"has {first + len(data)} bytes, the manifest says {self._entry['bytes']}")
         return data

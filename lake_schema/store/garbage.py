@@ -18,45 +18,53 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from lake_schema.errors import BadInput, Damaged, Superseded
-from lake_schema.store import layout, locks, manifest, names
+from lake_schema.store import layout, locks, manifest, request_links
 from lake_schema.store.object_storage.s3 import Folder
-from lake_schema.store.stage import receipts
+from lake_schema.store.stage import receipts_folder
 
 # What stands in a table's folder by a version's key; and what was on its way out.
-_KEYED = re.compile(r"(?:v|\.stage|\.receipts|\.lock)-([0-9a-f]{16})", re.ASCII)
-_GONE = ".gone*"
+_KEY_PATTERN = re.compile(r"(?:v|\.stage|\.receipts|\.lock)-([0-9a-f]{16})", re.ASCII)
+_MARKED_PATTERN = ".gone*"
 
 
-def tables(root: Folder) -> list[str]:
+def table_names(root: Folder) -> list[str]:
     """Folders of the lake in which something was published or begun, sorted."""
-    return sorted({path.parent.name for path in root.glob("*/.lock*")} | set(layout.tables(root)))
+    return sorted({path.parent.name for path in root.glob("*/.lock*")} | set(layout.table_names(root)))
 
 
-def kept(root: Path, known: Mapping[str, set[str]] | None = None) -> dict[str, set[str]]:
+def kept_versions(root: Path, previous: Mapping[str, set[str]] | None = None) -> dict[str, set[str]]:
     """Table -> keys of the versions that stay.
 
     root   : of the lake
     known  : what this said before; only the manifests of other versions are read, and what stayed stays
     Errors : Damaged where a version that stays is missing or its manifest broken: what it was made of is not known
     """
-    links = [(name, layout.current_key(root, name), layout.current(root, name)) for name in layout.tables(root)]
-    for request in names.names(root):
-        for name in names.tables(root, request):
-            links.append((name, names.key_of(root, request, name), layout.pin(root, request, name)))
+    links = [
+        (name, layout.current_key(root, name), layout.current_link(root, name)) for name in layout.table_names(root)
+    ]
+    for request in request_links.request_names(root):
+        for name in request_links.tables_of_request(root, request):
+            links.append(
+                (name, request_links.linked_key(root, request, name), layout.request_link(root, request, name))
+            )
     for name, key, link in links:
-        if key is not None and not layout.version(root, name, key).exists():
+        if key is not None and not layout.version_folder(root, name, key).exists():
             raise Damaged(f"{link} leads to v-{key}, which is missing: nothing is removed")
-    found: dict[str, set[str]] = defaultdict(set, {name: set(keys) for name, keys in (known or {}).items()})
-    waiting = [(name, key) for name, key, _ in links if key is not None]
-    there = tables(root)
-    while waiting:
-        name, key = waiting.pop()
-        if key in found[name]:
+    kept_keys: dict[str, set[str]] = defaultdict(set, {name: set(keys) for name, keys in (previous or {}).items()})
+    pending = [(name, key) for name, key, _ in links if key is not None]
+    existing_tables = table_names(root)
+    while pending:
+        name, key = pending.pop()
+        if key in kept_keys[name]:
             continue
-        found[name].add(key)
-        made_of = set(names.keys_in(manifest.load(layout.version(root, name, key), name)["facts"]))
-        waiting += [(other, k) for other in there for k in made_of if layout.version(root, other, k).exists()]
-    return found
+        kept_keys[name].add(key)
+        made_of = set(
+            request_links.version_keys_in(manifest.load(layout.version_folder(root, name, key), name)["facts"])
+        )
+        pending += [
+            (other, k) for other in existing_tables for k in made_of if layout.version_folder(root, other, k).exists()
+        ]
+    return kept_keys
 
 
 def collect(root: Path, name: str | None = None, delete: bool = False) -> list[Path]:
@@ -64,58 +72,58 @@ def collect(root: Path, name: str | None = None, delete: bool = False) -> list[P
 
     Errors : BadInput where there is no such table; Damaged, and nothing is removed, where it is not known what is kept
     """
-    there = tables(root)
-    chosen = there if name is None else [layout.table(root, name).name]
-    if not set(chosen) <= set(there):
+    existing_tables = table_names(root)
+    selected = existing_tables if name is None else [layout.table_folder(root, name).name]
+    if not set(selected) <= set(existing_tables):
         raise BadInput(f"lake {root} has no table {name}")
-    stays = kept(root)
+    kept_keys = kept_versions(root)
     if not delete:
-        return [path for one in chosen for path in _left_over(root, one, stays[one])]
+        return [path for table in selected for path in _removable_paths(root, table, kept_keys[table])]
     # What a death has left must not be in the way of a version that was made again since.
-    removed = _emptied(root, chosen)
+    removed = _delete_marked(root, selected)
     with contextlib.ExitStack() as stack:
         # Nobody publishes while it is decided: what has been linked since is looked at, and little else.
-        for one in there:
-            stack.enter_context(locks.table(layout.table(root, one)))
-        stays = kept(root, stays)
-        removed += [path for one in chosen for path in _taken(root, one, stays[one])]
-    _emptied(root, chosen)
+        for table in existing_tables:
+            stack.enter_context(locks.hold_table(layout.table_folder(root, table)))
+        kept_keys = kept_versions(root, kept_keys)
+        removed += [path for table in selected for path in _mark_for_removal(root, table, kept_keys[table])]
+    _delete_marked(root, selected)
     return removed
 
 
-def _emptied(root: Path, chosen: Iterable[str]) -> list[Path]:
+def _delete_marked(root: Path, selected: Iterable[str]) -> list[Path]:
     """Remove what is on its way out of some tables."""
-    gone = [path for one in chosen for path in sorted(layout.table(root, one).glob(_GONE))]
-    for path in gone:
+    marked = [path for table in selected for path in sorted(layout.table_folder(root, table).glob(_MARKED_PATTERN))]
+    for path in marked:
         shutil.rmtree(path, ignore_errors=True)
-    return gone
+    return marked
 
 
-def _left_over(root: Path, name: str, stays: set[str]) -> list[Path]:
-    folder, found = layout.table(root, name), []
-    for key in _keys(folder):
+def _removable_paths(root: Path, name: str, kept_keys: set[str]) -> list[Path]:
+    folder, removable = layout.table_folder(root, name), []
+    for key in _version_keys(folder):
         if not locks.is_held(folder / f".lock-{key}"):
-            found += _folders(root, name, key, stays)
-    return [*found, *sorted(folder.glob(_GONE))]
+            removable += _removable_folders(root, name, key, kept_keys)
+    return [*removable, *sorted(folder.glob(_MARKED_PATTERN))]
 
 
-def _taken(root: Path, name: str, stays: set[str]) -> Iterator[Path]:
+def _mark_for_removal(root: Path, name: str, kept_keys: set[str]) -> Iterator[Path]:
     """Give what can go another name; stages that a run is working on stay."""
-    folder = layout.table(root, name)
-    for key in _keys(folder):
+    folder = layout.table_folder(root, name)
+    for key in _version_keys(folder):
         lock = folder / f".lock-{key}"
-        with contextlib.suppress(Superseded), locks.held(lock, "in use"):
-            for path in _folders(root, name, key, stays):
+        with contextlib.suppress(Superseded), locks.hold(lock, "in use"):
+            for path in _removable_folders(root, name, key, kept_keys):
                 os.rename(path, folder / f".gone{path.name}")
                 yield path
             lock.unlink()
 
 
-def _keys(folder: Path) -> list[str]:
-    return sorted({found[1] for path in folder.iterdir() if (found := _KEYED.fullmatch(path.name))})
+def _version_keys(folder: Path) -> list[str]:
+    return sorted({match[1] for path in folder.iterdir() if (match := _KEY_PATTERN.fullmatch(path.name))})
 
 
-def _folders(root: Path, name: str, key: str, stays: set[str]) -> list[Path]:
-    stage = layout.stage(root, name, key)
-    wanted = [stage, receipts(stage)] + ([] if key in stays else [layout.version(root, name, key)])
-    return [path for path in wanted if path.exists()]
+def _removable_folders(root: Path, name: str, key: str, kept_keys: set[str]) -> list[Path]:
+    stage = layout.stage_folder(root, name, key)
+    folders = [stage, receipts_folder(stage)] + ([] if key in kept_keys else [layout.version_folder(root, name, key)])
+    return [path for path in folders if path.exists()]

@@ -25,42 +25,44 @@ MARGIN_ARCSEC = 10.0
 _MARGIN_ORDER = 13
 _SKYMAP_ORDER = 8
 # Above this many files the merged footers of `_metadata` outgrow their use.
-_MOST_FILES_IN_METADATA = 1000
+_MAX_FILES_IN_METADATA = 1000
 # The properties want a date; a clock's would make equal lakes differ.
 _DATE = "2000-01-01T00:00UTC"
 
 Cell = tuple[int, int]  # order, nested cell
 
 
-def border(rows: pa.Table, part: str) -> pa.Table:
+def border_rows(rows: pa.Table, partition: str) -> pa.Table:
     """Those rows of a cell that another cell's margin may want: kept beside the receipts until the margins are made."""
-    order, cell = layout.cell_of_file(part)
-    fine = sky.parent(rows["_healpix_29"].to_numpy(), sky.DEEPEST, _MARGIN_ORDER)
+    order, cell = layout.cell_of_file(partition)
+    fine = sky.parent(rows["_healpix_29"].to_numpy(), sky.MAX_ORDER, _MARGIN_ORDER)
     return rows.filter(pa.array(np.isin(fine, sky.border_cells(order, cell, _MARGIN_ORDER))))
 
 
-def write(version: Path, table: Table, made: Sequence[Json], borders: Path) -> None:
+def write_metadata(version: Path, table: Table, receipts: Sequence[Json], borders: Path) -> None:
     """Write the metadata of a catalogue whose cells lie in `version`/<table>/dataset.
 
     made : receipts of the cells;  borders : folder of their border rows
     """
-    cells = [layout.cell_of_file(receipt["part"]) for receipt in made]
+    cells = [layout.cell_of_file(receipt["part"]) for receipt in receipts]
     root, margin = version / table.name, version / f"{table.name}_margin"
-    along = {cell: receipt["border"] for cell, receipt in zip(cells, made, strict=True)}
-    margin_rows = _write_margin(margin, table, borders, along)
-    counts = _skymap(version, [receipt["files"][0] for receipt in made])
-    _write_catalogue(root, table, cells, sum(receipt["rows"] for receipt in made), counts)
+    borders_by_cell = {cell: receipt["border"] for cell, receipt in zip(cells, receipts, strict=True)}
+    margin_rows = _write_margin(margin, table, borders, borders_by_cell)
+    counts = _count_rows_per_cell(version, [receipt["files"][0] for receipt in receipts])
+    _write_catalogue(root, table, cells, sum(receipt["rows"] for receipt in receipts), counts)
     _write_catalogue(margin, table, cells, margin_rows, None)
     _write_collection(version, table)
 
 
-def _write_margin(folder: Path, table: Table, borders: Path, along: Mapping[Cell, Json]) -> int:
-    orders = sorted({order for order, _ in along})
+def _write_margin(folder: Path, table: Table, borders: Path, borders_by_cell: Mapping[Cell, Json]) -> int:
+    orders = sorted({order for order, _ in borders_by_cell})
     total = 0
-    for order, cell in along:
+    for order, cell in borders_by_cell:
         rim = sky.margin_cells(order, cell, _MARGIN_ORDER)
-        around = [(o, int(c)) for o in orders for c in np.unique(sky.parent(rim, _MARGIN_ORDER, o))]
-        pieces = [_rows_in(borders, along[other], rim) for other in around if other in along]
+        neighbours = [(o, int(c)) for o in orders for c in np.unique(sky.parent(rim, _MARGIN_ORDER, o))]
+        pieces = [
+            _rows_in_cells(borders, borders_by_cell[other], rim) for other in neighbours if other in borders_by_cell
+        ]
         rows = pa.concat_tables([table.empty(), *pieces]).sort_by([("_healpix_29", "ascending"), ("id", "ascending")])
         target = folder / "dataset" / layout.cell_file(order, cell)
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -69,10 +71,10 @@ def _write_margin(folder: Path, table: Table, borders: Path, along: Mapping[Cell
     return total
 
 
-def _rows_in(folder: Path, entry: Json, rim: Int) -> pa.Table:
+def _rows_in_cells(folder: Path, entry: Json, cells: Int) -> pa.Table:
     rows = parquet.read(folder, entry)
-    fine = sky.parent(rows["_healpix_29"].to_numpy(), sky.DEEPEST, _MARGIN_ORDER)
-    return rows.filter(pa.array(np.isin(fine, rim)))
+    fine = sky.parent(rows["_healpix_29"].to_numpy(), sky.MAX_ORDER, _MARGIN_ORDER)
+    return rows.filter(pa.array(np.isin(fine, cells)))
 
 
 def _write_catalogue(root: Path, table: Table, cells: list[Cell], rows: int, counts: Int | None) -> None:
@@ -83,14 +85,14 @@ def _write_catalogue(root: Path, table: Table, cells: list[Cell], rows: int, cou
     from hats.io.paths import get_skymap_file_pointer
     from hats.pixel_math.healpix_pixel import HealpixPixel
 
-    write_parquet_metadata(root, create_metadata=len(cells) <= _MOST_FILES_IN_METADATA)
+    write_parquet_metadata(root, create_metadata=len(cells) <= _MAX_FILES_IN_METADATA)
     PartitionInfo([HealpixPixel(order, cell) for order, cell in cells]).write_to_file(catalog_path=root)
     facts: dict[str, Any] = {
         "total_rows": rows,
         "ra_column": "ra",
         "dec_column": "dec",
         "healpix_column": "_healpix_29",
-        "healpix_order": sky.DEEPEST,
+        "healpix_order": sky.MAX_ORDER,
         "npix_suffix": ".parquet",
     }
     if counts is None:
@@ -99,18 +101,18 @@ def _write_catalogue(root: Path, table: Table, cells: list[Cell], rows: int, cou
     else:
         write_fits_image(counts, get_skymap_file_pointer(root))
         facts |= {"catalog_name": table.name, "catalog_type": "object", "skymap_order": _SKYMAP_ORDER}
-    about = TableProperties.new_provenance_dict(root, builder="truesky")
-    about["hats_creation_date"] = _DATE
+    provenance = TableProperties.new_provenance_dict(root, builder="truesky")
+    provenance["hats_creation_date"] = _DATE
     # The size on disk would differ by a byte with the length of a path.
-    about.pop("hats_estsize", None)
-    TableProperties(**facts, **about).to_properties_file(root)
+    provenance.pop("hats_estsize", None)
+    TableProperties(**facts, **provenance).to_properties_file(root)
 
 
-def _skymap(folder: Path, entries: Sequence[Json]) -> Int:
+def _count_rows_per_cell(folder: Path, entries: Sequence[Json]) -> Int:
     counts = np.zeros(12 << (2 * _SKYMAP_ORDER), np.int64)
     for entry in entries:
         index = parquet.read(folder, entry, ["_healpix_29"])["_healpix_29"].to_numpy()
-        counts += np.bincount(sky.parent(index, sky.DEEPEST, _SKYMAP_ORDER), minlength=counts.size)
+        counts += np.bincount(sky.parent(index, sky.MAX_ORDER, _SKYMAP_ORDER), minlength=counts.size)
     return counts
 
 
@@ -118,11 +120,11 @@ def _write_collection(version: Path, table: Table) -> None:
     from hats.catalog.dataset.collection_properties import CollectionProperties
 
     margin = f"{table.name}_margin"
-    about: dict[str, Any] = {"hats_builder": "truesky", "hats_creation_date": _DATE}
+    provenance: dict[str, Any] = {"hats_builder": "truesky", "hats_creation_date": _DATE}
     CollectionProperties(
         obs_collection=table.name,
         hats_primary_table_url=table.name,
         all_margins=[margin],
         default_margin=margin,
-        **about,
+        **provenance,
     ).to_properties_file(version)

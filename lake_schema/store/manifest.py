@@ -23,13 +23,13 @@ import pyarrow as pa
 from lake_schema import sky
 from lake_schema.errors import Damaged
 from lake_schema.store import blocks, layout, parquet
-from lake_schema.store.object_storage.s3 import MANIFEST, Folder, Place
+from lake_schema.store.object_storage.s3 import MANIFEST, Folder, ObjectPath
 from lake_schema.store.plan import Json
 from lake_schema.store.provenance import canonical, digest, file_sha256
 
 # Types of what every manifest says, and of what it says of each file.
-_FACTS = {"table": str, "version": int, "key": str, "facts": dict, "parts": list, "rows": int, "files": list}
-_FILE = {"path": str, "bytes": int, "sha256": str}
+_FACT_TYPES = {"table": str, "version": int, "key": str, "facts": dict, "parts": list, "rows": int, "files": list}
+_ENTRY_TYPES = {"path": str, "bytes": int, "sha256": str}
 _TEMPORARY = re.compile(r"\.[0-9a-f]{12}\.tmp\.")
 
 
@@ -46,7 +46,7 @@ def load(folder: Folder, table: str) -> Manifest:
     """
     path = folder / MANIFEST
     try:
-        facts = _read(path) if isinstance(path, Place) else _read_once(path, *state(path))
+        facts = _read_manifest(path) if isinstance(path, ObjectPath) else _read_once(path, *file_state(path))
     except (OSError, ValueError, KeyError, AttributeError, RecursionError) as error:
         raise Damaged(f"{path}: {type(error).__name__}: {error}") from None
     if facts["table"] != table or folder.name != f"v-{facts['key']}":
@@ -68,22 +68,22 @@ class Manifest(dict[str, Any]):
         return {}
 
 
-def state(path: Path) -> tuple[int, int, int, int]:
+def file_state(path: Path) -> tuple[int, int, int, int]:
     """Inode, bytes, times of modification and of change, ns: while they are the same a file need not be read again.
 
     Errors : OSError
     """
-    about = path.stat()
-    return about.st_ino, about.st_size, about.st_mtime_ns, about.st_ctime_ns
+    status = path.stat()
+    return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
 @lru_cache(maxsize=16)
 def _read_once(path: Path, *state: int) -> Manifest:
     """As long as the file stays as it is: tasks of a process read the same ones, and they may be large."""
-    return _read(path)
+    return _read_manifest(path)
 
 
-def _read(path: Folder) -> Manifest:
+def _read_manifest(path: Folder) -> Manifest:
     facts = json.loads(path.read_bytes())
     seal = facts.pop("digest")
     if digest(facts) != seal:
@@ -95,62 +95,62 @@ def _read(path: Folder) -> Manifest:
 
 def _is_manifest(facts: Any) -> bool:
     return (
-        _has(facts, _FACTS)
+        _has_types(facts, _FACT_TYPES)
         and type(facts.get("deflection_deg", 0.0)) is float
-        and all(_has(part, {"name": str}) for part in facts["parts"])
+        and all(_has_types(part, {"name": str}) for part in facts["parts"])
         and all(_is_entry(entry) for entry in facts["files"])
     )
 
 
 def _is_entry(entry: Any) -> bool:
-    if not _has(entry, _FILE) or type(entry.get("rows", 0)) is not int:
+    if not _has_types(entry, _ENTRY_TYPES) or type(entry.get("rows", 0)) is not int:
         return False
     path = PurePosixPath(entry["path"])
     if path.suffix == ".parquet" or "blocks" in entry:
         try:
-            blocks.listed(entry)
+            blocks.decode_blocks(entry)
         except (LookupError, TypeError, ValueError):
             return False
     return not path.is_absolute() and ".." not in path.parts
 
 
-def _has(value: Any, kinds: dict[str, type]) -> bool:
-    return isinstance(value, dict) and all(type(value.get(key)) is kind for key, kind in kinds.items())
+def _has_types(value: Any, types: dict[str, type]) -> bool:
+    return isinstance(value, dict) and all(type(value.get(key)) is expected for key, expected in types.items())
 
 
-def file_facts(path: Path, relative: str) -> dict[str, Any]:
+def file_entry(path: Path, relative: str) -> dict[str, Any]:
     """A file's entry in the manifest: path, bytes, sha256, and of a Parquet file the checksums of its blocks.
 
     The blocks cover the file from its first byte to its last, so that whatever part of it is read can be compared.
     """
     if relative.endswith(".parquet"):
-        return {"path": relative, **parquet.facts(path)}
+        return {"path": relative, **parquet.file_checksums(path)}
     return {"path": relative, "bytes": path.stat().st_size, "sha256": file_sha256(path)}
 
 
-def checked(folder: Folder, entry: Json) -> Folder:
+def check_size(folder: Folder, entry: Json) -> Folder:
     """A listed file that has the size that the manifest says; what is in it is not looked at.  Errors: Damaged
 
     Of an object nothing is asked: whoever opens it compares its size.
     """
     path: Folder = folder / entry["path"]
-    if isinstance(path, Place):
+    if isinstance(path, ObjectPath):
         return path
-    if fault := _misfit(path, entry):
+    if fault := _size_fault(path, entry):
         raise Damaged(fault)
     return path
 
 
-def whole(folder: Folder, entry: Json) -> Path:
+def check_contents(folder: Folder, entry: Json) -> Path:
     """A listed file whose every byte is what was written, by its sha256; of an object a copy.  Errors: Damaged"""
-    path = checked(folder, entry)
-    if isinstance(path, Place):
-        return path.copy(entry["sha256"])
-    _compare(path, entry)
+    path = check_size(folder, entry)
+    if isinstance(path, ObjectPath):
+        return path.download(entry["sha256"])
+    _check_sha256(path, entry)
     return path
 
 
-def _compare(path: Folder, entry: Json) -> None:
+def _check_sha256(path: Folder, entry: Json) -> None:
     """Read all of a file.  Errors: Damaged"""
     try:
         if file_sha256(path) == entry["sha256"]:
@@ -160,9 +160,9 @@ def _compare(path: Folder, entry: Json) -> None:
     raise Damaged(f"{path} has other contents than the manifest says")
 
 
-def _misfit(path: Path, entry: Json) -> str:
+def _size_fault(path: Path, entry: Json) -> str:
     try:
-        return _difference(path, entry)
+        return _size_difference(path, entry)
     except FileNotFoundError:
         # Removed since, with its whole version.
         return f"{path} is missing"
@@ -170,7 +170,7 @@ def _misfit(path: Path, entry: Json) -> str:
         return f"{path} cannot be read: {error.strerror}"
 
 
-def _difference(path: Path, entry: Json) -> str:
+def _size_difference(path: Path, entry: Json) -> str:
     if not path.is_file() or path.is_symlink():
         return f"{path} is missing"
     size = path.stat().st_size
@@ -185,46 +185,48 @@ def faults(folder: Folder, facts: Json, deep: bool = False) -> list[str]:
     facts : its manifest
     deep  : also the sha256 of every file, and that each cell holds only its own rows, sorted
     """
-    listed = facts["files"]
-    names = {entry["path"] for entry in listed}
+    entries = facts["files"]
+    names = {entry["path"] for entry in entries}
     try:
-        here = _files(folder)
+        sizes = _file_sizes(folder)
     except OSError as error:
         return [f"{folder} cannot be read: {error}"]
-    found = [f"{folder / extra} is not in the manifest" for extra in sorted(here.keys() - names - {MANIFEST})]
+    messages = [f"{folder / extra} is not in the manifest" for extra in sorted(sizes.keys() - names - {MANIFEST})]
     # Hashing lets go of the interpreter: as many files at a time as there are cores.
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for wrong in pool.map(lambda entry: _file_faults(folder, entry, here.get(entry["path"], 0), deep), listed):
-            found += wrong
-    total = sum(entry.get("rows", 0) for entry in listed)
+        for file_messages in pool.map(
+            lambda entry: _file_faults(folder, entry, sizes.get(entry["path"], 0), deep), entries
+        ):
+            messages += file_messages
+    total = sum(entry.get("rows", 0) for entry in entries)
     if total != facts["rows"]:
-        found.append(f"{folder / MANIFEST}: {facts['rows']} rows in all, {total} in the files")
-    return found
+        messages.append(f"{folder / MANIFEST}: {facts['rows']} rows in all, {total} in the files")
+    return messages
 
 
-def _files(folder: Folder) -> Mapping[str, int]:
+def _file_sizes(folder: Folder) -> Mapping[str, int]:
     """Of every file below a folder its name and its bytes; of one that is none, 0."""
-    if isinstance(folder, Place):
+    if isinstance(folder, ObjectPath):
         return folder.sizes()
     # What another copy of a task was writing when the version was renamed is in nobody's way.
-    some = (path for path in folder.rglob("*") if not is_temporary(path))
-    there = [path for path in some if path.is_symlink() or not path.is_dir()]
-    return {path.relative_to(folder).as_posix(): 0 if path.is_symlink() else path.stat().st_size for path in there}
+    permanent = (path for path in folder.rglob("*") if not is_temporary(path))
+    files = [path for path in permanent if path.is_symlink() or not path.is_dir()]
+    return {path.relative_to(folder).as_posix(): 0 if path.is_symlink() else path.stat().st_size for path in files}
 
 
 def _file_faults(folder: Folder, entry: Json, size: int, deep: bool) -> list[str]:
     """What is wrong with a file, of which a listing says the size."""
     path = folder / entry["path"]
-    if isinstance(path, Place) and size != entry["bytes"]:
+    if isinstance(path, ObjectPath) and size != entry["bytes"]:
         return [f"{path} has {size} bytes, the manifest says {entry['bytes']}" if size else f"{path} is missing"]
     try:
         if deep:
-            _compare(checked(folder, entry), entry)
+            _check_sha256(check_size(folder, entry), entry)
             return _row_faults(folder, entry) if "rows" in entry else []
-        checked(folder, entry)
+        check_size(folder, entry)
         if PurePosixPath(entry["path"]).suffix == ".parquet":
             # The footer.
-            parquet.schema(folder, entry)
+            parquet.read_schema(folder, entry)
     except Damaged as error:
         return [str(error)]
     except (OSError, pa.ArrowInvalid) as error:
@@ -233,9 +235,9 @@ def _file_faults(folder: Folder, entry: Json, size: int, deep: bool) -> list[str
 
 
 def _row_faults(folder: Folder, entry: Json) -> list[str]:
-    path, schema = folder / entry["path"], parquet.schema(folder, entry)
+    path, schema = folder / entry["path"], parquet.read_schema(folder, entry)
     # Refuses another number of rows.
-    rows = parquet.dataset(folder, [entry], schema)
+    rows = parquet.open_dataset(folder, [entry], schema)
     if "_healpix_29" not in schema.names or "Npix=" not in path.name:
         return []
     index = rows.to_table(columns=["_healpix_29"])["_healpix_29"].to_numpy()
@@ -251,19 +253,19 @@ def _row_faults(folder: Folder, entry: Json) -> list[str]:
 def write_json(path: Path, value: Json) -> None:
     """Replace a JSON file in one rename, synced."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    own = temporary(path)
+    staged = temporary_path(path)
     try:
-        with own.open("w") as stream:
-            stream.write(_text(value))
+        with staged.open("w") as stream:
+            stream.write(_json_text(value))
             stream.flush()
             os.fsync(stream.fileno())
-        os.replace(own, path)
+        os.replace(staged, path)
         sync(path.parent)
     finally:
-        own.unlink(missing_ok=True)
+        staged.unlink(missing_ok=True)
 
 
-def temporary(path: Path) -> Path:
+def temporary_path(path: Path) -> Path:
     """A name beside a file that nobody else gives to their own: processes of two machines may have one number."""
     return path.with_name(f".{uuid4().hex[:12]}.tmp.{path.name}")
 
@@ -273,19 +275,19 @@ def is_temporary(path: Path) -> bool:
     return _TEMPORARY.match(path.name) is not None
 
 
-def _text(value: Json) -> str:
+def _json_text(value: Json) -> str:
     """JSON, a line for each value of the outermost object, and for each of its lists' entries.
 
     Spread out any further it would take Python's own encoder, which takes a minute where there are 100,000 parts.
     """
     lines = []
     for key in sorted(value):
-        own = value[key]
-        if isinstance(own, (list, tuple)) and own:
-            shown = "[\n  " + ",\n  ".join(_line(entry) for entry in own) + "\n ]"
+        item = value[key]
+        if isinstance(item, (list, tuple)) and item:
+            item_text = "[\n  " + ",\n  ".join(_line(entry) for entry in item) + "\n ]"
         else:
-            shown = _line(own)
-        lines.append(f" {json.dumps(key)}: {shown}")
+            item_text = _line(item)
+        lines.append(f" {json.dumps(key)}: {item_text}")
     return "{\n" + ",\n".join(lines) + "\n}"
 
 

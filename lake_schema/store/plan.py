@@ -17,7 +17,7 @@ Json = Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class Task:
     """One file of a table and what its maker needs to know.
 
     name  : file below dataset/ for a plain table, the HATS path for a catalogue's cell
@@ -39,22 +39,22 @@ class Plan:
 
     table: Table
     facts: Json
-    parts: tuple[Part, ...]
+    tasks: tuple[Task, ...]
 
     def __post_init__(self) -> None:
-        if len({part.name for part in self.parts}) != len(self.parts):
+        if len({task.name for task in self.tasks}) != len(self.tasks):
             raise BadInput(f"table {self.table.name}: the plan names a part twice")
-        if self.table.is_catalogue and not self.parts:
+        if self.table.is_catalogue and not self.tasks:
             raise BadInput(f"table {self.table.name}: the plan has no cells")
 
     @property
     def key(self) -> str:
         """16 hexadecimal digits that stand for all of it."""
         table = self.table
-        schema = [[f.name, str(f.type), f.nullable, _text(f.metadata)] for f in table.arrow()]
-        parts = [[part.name, dict(part.facts), part.rows] for part in self.parts]
-        about = {"table": table.name, "version": table.version, "schema": schema, "key": table.key}
-        return digest({**about, "facts": dict(self.facts), "parts": parts})[:16]
+        schema = [[f.name, str(f.type), f.nullable, _text(f.metadata)] for f in table.arrow_schema()]
+        tasks = [[task.name, dict(task.facts), task.rows] for task in self.tasks]
+        declaration = {"table": table.name, "version": table.version, "schema": schema, "key": table.key}
+        return digest({**declaration, "facts": dict(self.facts), "parts": tasks})[:16]
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,12 +65,12 @@ class Output:
     files: Mapping[str, Callable[[Path], None]] = field(default_factory=dict)
 
 
-Work = Callable[[Path, Json], Output]
+TaskFunction = Callable[[Path, Json], Output]
 
 
-def data_path(table: Table, part: str) -> str:
+def data_path(table: Table, partition: str) -> str:
     """Path of a part's Parquet file in a version."""
-    return f"{table.name}/dataset/{part}" if table.is_catalogue else f"dataset/{part}"
+    return f"{table.name}/dataset/{partition}" if table.is_catalogue else f"dataset/{partition}"
 
 
 def _text(metadata: Mapping[bytes, bytes] | None) -> dict[str, str]:

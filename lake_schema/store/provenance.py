@@ -17,8 +17,8 @@ from lake_schema.store.object_storage.s3 import Folder
 _ROOT = Path(__file__).resolve().parents[2]
 _PACKAGES = ("lake_schema", "truesky")
 # Examples, which a wheel has in the package and a clone has not.
-_NO_CODE = {"requests", "notebooks"}
-_DATA = {".py", ".csv", ".toml"}
+_EXCLUDED_FOLDERS = {"requests", "notebooks"}
+_SUFFIXES = {".py", ".csv", ".toml"}
 # Libraries whose version can change a byte of a product.
 _LIBRARIES = (
     "astropy",
@@ -57,12 +57,12 @@ def code_version(root: Path = _ROOT) -> str:
         path
         for package in _PACKAGES
         for path in (root / package).rglob("*")
-        if path.suffix in _DATA
+        if path.suffix in _SUFFIXES
         and "__pycache__" not in path.parts
-        and path.relative_to(root / package).parts[0] not in _NO_CODE
+        and path.relative_to(root / package).parts[0] not in _EXCLUDED_FOLDERS
     )
-    sums = {path.relative_to(root).as_posix(): file_sha256(path) for path in files}
-    return digest({"files": sums, "libraries": libraries()})
+    checksums = {path.relative_to(root).as_posix(): file_sha256(path) for path in files}
+    return digest({"files": checksums, "libraries": libraries()})
 
 
 def libraries() -> Mapping[str, str]:
@@ -78,9 +78,9 @@ def machine() -> str:
 def git_commit(root: Path = _ROOT) -> str:
     """The commit that is checked out, "unknown" outside a checkout; recorded, never part of a key."""
     try:
-        done = subprocess.run(
+        process = subprocess.run(
             ["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, timeout=10, check=True
         )
     except (OSError, subprocess.SubprocessError):
         return "unknown"
-    return done.stdout.strip()
+    return process.stdout.strip()

@@ -24,24 +24,49 @@ from functools import partial
 from pathlib import Path
 
 from lake_schema import __version__
-from lake_schema.errors import Damaged, PartsFailed, Superseded
-from lake_schema.store import hats_files, layout, locks, manifest, names, reuse
+from lake_schema.errors import Damaged, Superseded, TasksFailed
+from lake_schema.store import hats_files, layout, locks, manifest, request_links, reuse
 from lake_schema.store.layout import current_key
 from lake_schema.store.manifest import sync
-from lake_schema.store.plan import Json, Output, Part, Plan, Work, data_path
-from lake_schema.store.stage import attempt, done, forget_damaged, is_done, missing, receipts, write_part
+from lake_schema.store.plan import Json, Output, Plan, Task, TaskFunction, data_path
+from lake_schema.store.stage import (
+    completed_receipts,
+    discard_damaged,
+    is_done,
+    missing_tasks,
+    receipts_folder,
+    run_task,
+    write_partition,
+)
 from lake_schema.store.uniqueness import refuse_duplicates
 
 __all__ = [
-    "Json", "Mapper", "Output", "Part", "Plan", "Work", "attempt", "current_key", "data_path", "is_done", "make",
-    "missing", "receipts", "write_part",
+    "Json",
+    "Mapper",
+    "Output",
+    "Plan",
+    "Task",
+    "TaskFunction",
+    "current_key",
+    "data_path",
+    "is_done",
+    "make_version",
+    "missing_tasks",
+    "receipts_folder",
+    "run_task",
+    "write_partition",
 ]  # fmt: skip
 
-Mapper = Callable[[Callable[[Part], Json], Sequence[Part]], Iterable[Json]]
+Mapper = Callable[[Callable[[Task], Json], Sequence[Task]], Iterable[Json]]
 
 
-def make(
-    root: Path, plan: Plan, work: Work, mapper: Mapper = map, base: str | None = "", name: str | None = None
+def make_version(
+    root: Path,
+    plan: Plan,
+    task_function: TaskFunction,
+    mapper: Mapper = map,
+    base: str | None = "",
+    name: str | None = None,
 ) -> Path:
     """Make what is missing of a plan's version and publish it; returns the version's folder.
 
@@ -55,88 +80,94 @@ def make(
              holds the same plan, or has published another version since; Damaged where it is there and not whole
     """
     table, key = plan.table.name, plan.key
-    now = _replaced(root, table, name)
-    base = now if base == "" else base
-    target = layout.version(root, table, key)
-    folder = layout.table(root, table)
+    replaced_key = _replaced_key(root, table, name)
+    base = replaced_key if base == "" else base
+    target = layout.version_folder(root, table, key)
+    folder = layout.table_folder(root, table)
     lock = folder / f".lock-{key}"
-    if now == current_key(root, table) == key and target.exists() and not lock.exists():
+    if replaced_key == current_key(root, table) == key and target.exists() and not lock.exists():
         # Nothing is left to do: said without a lock, also where nothing can be written.
         _refuse_damaged(target, table)
         return target
     folder.mkdir(parents=True, exist_ok=True)
     if name is not None:
         _pin_inputs(root, plan, name)
-    with locks.held(lock, f"table {table}: another run is making version {key}", locks.MOMENT):
+    with locks.hold(lock, f"table {table}: another run is making version {key}", locks.SHORT_TIMEOUT):
         if target.exists():
             _refuse_damaged(target, table)
         else:
-            stage = layout.stage(root, table, key)
+            stage = layout.stage_folder(root, table, key)
             stage.mkdir(exist_ok=True)
-            _finish(stage, plan, _make_parts(root, plan, work, mapper, name))
+            _finish_stage(stage, plan, _run_tasks(root, plan, task_function, mapper, name))
         _publish(root, plan, base, name)
     return target
 
 
-def _replaced(root: Path, table: str, name: str | None) -> str | None:
+def _replaced_key(root: Path, table: str, name: str | None) -> str | None:
     """Key of the version that one made for a request, or for none, comes in the place of."""
-    return current_key(root, table) if name is None else names.key_of(root, name, table)
+    return current_key(root, table) if name is None else request_links.linked_key(root, name, table)
 
 
 def _pin_inputs(root: Path, plan: Plan, name: str) -> None:
     """What a request's table is made of belongs to the request before it is used, so that nobody removes it."""
-    keys = set(names.keys_in(plan.facts))
-    for table in set(layout.tables(root)) - {plan.table.name}:
+    keys = set(request_links.version_keys_in(plan.facts))
+    for table in set(layout.table_names(root)) - {plan.table.name}:
         for key in sorted(keys):
-            target = layout.version(root, table, key)
-            if target.exists() and names.key_of(root, name, table) is None:
-                with locks.table(layout.table(root, table)):
-                    if target.exists() and names.key_of(root, name, table) is None:
-                        names.pin(root, name, table, key)
+            target = layout.version_folder(root, table, key)
+            if target.exists() and request_links.linked_key(root, name, table) is None:
+                with locks.hold_table(layout.table_folder(root, table)):
+                    if target.exists() and request_links.linked_key(root, name, table) is None:
+                        request_links.link_version(root, name, table, key)
 
 
 def _refuse_damaged(target: Path, name: str) -> None:
-    if found := manifest.faults(target, manifest.load(target, name)):
-        raise Damaged(f"{found[0]}; remove {target} to have it made again")
+    if faults := manifest.faults(target, manifest.load(target, name)):
+        raise Damaged(f"{faults[0]}; remove {target} to have it made again")
 
 
-def _make_parts(root: Path, plan: Plan, work: Work, mapper: Mapper, name: str | None) -> list[Json]:
+def _run_tasks(root: Path, plan: Plan, task_function: TaskFunction, mapper: Mapper, name: str | None) -> list[Json]:
     """Receipts of all parts, in the plan's order."""
-    table, stage = plan.table, layout.stage(root, plan.table.name, plan.key)
-    forget_damaged(stage, plan)
-    for version in _others(root, table.name, name):
-        reuse.take(stage, version, table.name, missing(stage, plan))
-    todo = missing(stage, plan)
+    table, stage = plan.table, layout.stage_folder(root, plan.table.name, plan.key)
+    discard_damaged(stage, plan)
+    for version in _candidate_versions(root, table.name, name):
+        reuse.link_reusable(stage, version, table.name, missing_tasks(stage, plan))
+    remaining = missing_tasks(stage, plan)
     failures: dict[str, str] = {}
-    function = partial(attempt, root, plan.key, table, plan.facts, work)
-    for result in mapper(function, todo) if todo else ():
+    run = partial(run_task, root, plan.key, table, plan.facts, task_function)
+    for result in mapper(run, remaining) if remaining else ():
         if "error" in result:
             failures[result["part"]] = result["error"]
-    made = done(stage, plan)
-    if left := [part for part in plan.parts if part.name not in made]:
-        lines = [f"{part.name}: {failures.get(part.name, 'ended without a receipt')}" for part in left]
-        raise PartsFailed(f"table {table.name}: {len(left)} of {len(plan.parts)} parts failed: " + "; ".join(lines))
-    return [made[part.name] for part in plan.parts]
+    completed = completed_receipts(stage, plan)
+    if failed_tasks := [task for task in plan.tasks if task.name not in completed]:
+        lines = [f"{task.name}: {failures.get(task.name, 'ended without a receipt')}" for task in failed_tasks]
+        raise TasksFailed(
+            f"table {table.name}: {len(failed_tasks)} of {len(plan.tasks)} parts failed: " + "; ".join(lines)
+        )
+    return [completed[task.name] for task in plan.tasks]
 
 
-def _others(root: Path, table: str, name: str | None) -> list[Path]:
+def _candidate_versions(root: Path, table: str, name: str | None) -> list[Path]:
     """Versions that may hold some of the parts already: the request's own, the last one, those of other requests."""
-    keys = [_replaced(root, table, name), current_key(root, table), *names.holders(root, table).values()]
-    found = (layout.version(root, table, key) for key in dict.fromkeys(keys) if key is not None)
-    return [path for path in found if path.exists()]
+    keys = [
+        _replaced_key(root, table, name),
+        current_key(root, table),
+        *request_links.keys_by_request(root, table).values(),
+    ]
+    versions = (layout.version_folder(root, table, key) for key in dict.fromkeys(keys) if key is not None)
+    return [path for path in versions if path.exists()]
 
 
-def _finish(stage: Path, plan: Plan, made: Sequence[Json]) -> None:
+def _finish_stage(stage: Path, plan: Plan, task_receipts: Sequence[Json]) -> None:
     """Metadata and manifest: after this the stage is the version, all but its name.
 
     made : receipts of the plan's parts
     """
-    refuse_duplicates(stage, plan, made)
-    listed = {f["path"]: f for receipt in made for f in receipt["files"]}
-    _sweep(stage, set(listed))
+    refuse_duplicates(stage, plan, task_receipts)
+    entries = {f["path"]: f for receipt in task_receipts for f in receipt["files"]}
+    _remove_unlisted(stage, set(entries))
     if plan.table.is_catalogue:
-        hats_files.write(stage, plan.table, made, receipts(stage))
-    rows = {data_path(plan.table, r["part"]): r["rows"] for r in made}
+        hats_files.write_metadata(stage, plan.table, task_receipts, receipts_folder(stage))
+    rows = {data_path(plan.table, r["part"]): r["rows"] for r in task_receipts}
     files = []
     for path in sorted(stage.rglob("*")):
         relative = path.relative_to(stage).as_posix()
@@ -144,18 +175,20 @@ def _finish(stage: Path, plan: Plan, made: Sequence[Json]) -> None:
             # Of another copy of a task, which is still running.
             continue
         if path.is_file():
-            entry = listed.pop(relative, None)
+            entry = entries.pop(relative, None)
             if entry is None:
                 # What a receipt names was synced before.
-                entry = manifest.file_facts(path, relative)
+                entry = manifest.file_entry(path, relative)
                 sync(path)
             files.append({**entry, **({"rows": rows[relative]} if relative in rows else {})})
         else:
             sync(path)
-    if listed:
-        raise Damaged(f"{stage / min(listed)} is missing")
+    if entries:
+        raise Damaged(f"{stage / min(entries)} is missing")
     deflections = (
-        {"deflection_deg": max(r["deflection_deg"] for r in made)} if made and "deflection_deg" in made[0] else {}
+        {"deflection_deg": max(r["deflection_deg"] for r in task_receipts)}
+        if task_receipts and "deflection_deg" in task_receipts[0]
+        else {}
     )
     manifest.write(
         stage,
@@ -166,41 +199,42 @@ def _finish(stage: Path, plan: Plan, made: Sequence[Json]) -> None:
             "key": plan.key,
             "facts": dict(plan.facts),
             "parts": [
-                {"name": part.name, "facts": dict(part.facts), **reuse.files_of(part, receipt)}
-                for part, receipt in zip(plan.parts, made, strict=True)
+                {"name": task.name, "facts": dict(task.facts), **reuse.manifest_facts(task, receipt)}
+                for task, receipt in zip(plan.tasks, task_receipts, strict=True)
             ],
             "rows": sum(rows.values()),
             # Whoever reads it can tell which last bits may differ where it is made again.
-            "machines": sorted({str(r["machine"]) for r in made}),
+            "machines": sorted({str(r["machine"]) for r in task_receipts}),
             "files": files,
             **deflections,
         },
     )
 
 
-def _sweep(stage: Path, wanted: set[str]) -> None:
+def _remove_unlisted(stage: Path, listed: set[str]) -> None:
     """Remove what no receipt names: temporary files of dead tasks, metadata of an interrupted finish."""
     for path in sorted(stage.rglob("*"), reverse=True):
-        if path.is_file() and path.relative_to(stage).as_posix() not in wanted:
+        if path.is_file() and path.relative_to(stage).as_posix() not in listed:
             path.unlink(missing_ok=True)
 
 
 def _publish(root: Path, plan: Plan, base: str | None, name: str | None) -> None:
     table, key = plan.table.name, plan.key
-    folder = layout.table(root, table)
-    with locks.table(folder):
-        now = _replaced(root, table, name)
-        if now not in (base, key):
+    folder = layout.table_folder(root, table)
+    with locks.hold_table(folder):
+        replaced_key = _replaced_key(root, table, name)
+        if replaced_key not in (base, key):
             raise Superseded(
-                f"table {table}: version {now} was published since this run began from {base}; run again to replace it"
+                f"table {table}: version {replaced_key} was published since this run began from {base}; "
+                "run again to replace it"
             )
-        stage, target = layout.stage(root, table, key), layout.version(root, table, key)
+        stage, target = layout.stage_folder(root, table, key), layout.version_folder(root, table, key)
         if not target.exists():
             os.rename(stage, target)
             sync(folder)
-        if name is not None and now != key:
-            names.pin(root, name, table, key)
+        if name is not None and replaced_key != key:
+            request_links.link_version(root, name, table, key)
         if current_key(root, table) != key:
-            names.swap(layout.current(root, table), target.name)
-    shutil.rmtree(receipts(stage), ignore_errors=True)
+            request_links.replace_link(layout.current_link(root, table), target.name)
+    shutil.rmtree(receipts_folder(stage), ignore_errors=True)
     (folder / f".lock-{key}").unlink(missing_ok=True)

@@ -22,19 +22,19 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as ds
 
-from lake_schema import bounds, sky
+from lake_schema import arguments, sky
 from lake_schema import tables as declarations
 from lake_schema.arrays import Int
 from lake_schema.columns import Table
 from lake_schema.errors import BadInput, Damaged, VersionMismatch
-from lake_schema.store import layout, manifest, names, parquet
-from lake_schema.store.object_storage.s3 import Folder, Place
+from lake_schema.store import layout, manifest, parquet, request_links
+from lake_schema.store.object_storage.s3 import Folder, ObjectPath
 from lake_schema.store.provenance import digest
 
 # Which positions of a catalogue's sources a selection goes by.
-ON = ("observed", "true")
+POSITION_KINDS = ("observed", "true")
 # So many stretches of _healpix_29 go into the filter of one file; the rest of its rows are left out after reading.
-_MOST_RANGES = 16
+_MAX_RANGES = 16
 # Added to a padded radius: more than the rounding of the largest deflection.
 _ROUNDING_DEG = 1e-9
 
@@ -72,74 +72,76 @@ class Version:
         return int(self.manifest["rows"])
 
     @property
-    def parts(self) -> list[str]:
-        return [str(part["name"]) for part in self.manifest["parts"]]
+    def partitions(self) -> list[str]:
+        return [str(entry["name"]) for entry in self.manifest["parts"]]
 
-    def path(self, part: str) -> Path:
+    def partition_path(self, partition: str) -> Path:
         """A part's Parquet file for a reader of somebody else's: only its size is compared; or a copy, as of `file`."""
-        path = manifest.checked(self.folder, self._entry(part))
-        return path.copy(self.part_sha256(part)) if isinstance(path, Place) else path
+        path = manifest.check_size(self.folder, self._partition_entry(partition))
+        return path.download(self.partition_sha256(partition)) if isinstance(path, ObjectPath) else path
 
-    def part_sha256(self, part: str) -> str:
+    def partition_sha256(self, partition: str) -> str:
         """sha256 of a part's Parquet file, as it was published."""
-        return str(self._entry(part)["sha256"])
+        return str(self._partition_entry(partition)["sha256"])
 
-    def part_rows(self, part: str) -> int:
+    def partition_rows(self, partition: str) -> int:
         """Number of rows of a part."""
-        return int(self._entry(part)["rows"])
+        return int(self._partition_entry(partition)["rows"])
 
-    def _entry(self, part: str) -> dict[str, Any]:
-        files = self._files()
+    def _partition_entry(self, partition: str) -> dict[str, Any]:
+        entries = self._entries_by_path()
         for prefix in (f"{self.table}/dataset/", "dataset/"):
-            if (entry := files.get(prefix + part)) is not None:
+            if (entry := entries.get(prefix + partition)) is not None:
                 return entry
-        raise BadInput(f"table {self.table}: version {self.key} has no part {part}")
+        raise BadInput(f"table {self.table}: version {self.key} has no part {partition}")
 
-    def file(self, relative: str) -> Path:
+    def sidecar_path(self, relative: str) -> Path:
         """Any other file, such as an image; Damaged where its sha256 is not what the manifest says.
 
         Of a lake on object storage it is a copy, in a temporary folder that goes with the process.
         """
-        return manifest.whole(self.folder, self._file(relative))
+        return manifest.check_contents(self.folder, self._file_entry(relative))
 
-    def below(self, relative: str) -> Path:
+    def sidecar_folder(self, relative: str) -> Path:
         """A folder of files beside the table; of a lake on object storage one with copies of them.  Errors: Damaged"""
         folder = self.folder / relative
         if isinstance(folder, Path):
             return folder
-        copies = [self.file(path) for path in self._files() if path.startswith(f"{relative}/")]
-        return folder.gathered(copies)
+        copies = [self.sidecar_path(path) for path in self._entries_by_path() if path.startswith(f"{relative}/")]
+        return folder.gather_copies(copies)
 
-    def has(self, relative: str) -> bool:
+    def has_file(self, relative: str) -> bool:
         """Whether there is such a file."""
-        return relative in self._files()
+        return relative in self._entries_by_path()
 
-    def sha256(self, relative: str) -> str:
+    def file_sha256(self, relative: str) -> str:
         """sha256 of such a file, as it was published."""
-        return str(self._file(relative)["sha256"])
+        return str(self._file_entry(relative)["sha256"])
 
-    def _file(self, relative: str) -> dict[str, Any]:
-        entry = self._files().get(relative)
+    def _file_entry(self, relative: str) -> dict[str, Any]:
+        entry = self._entries_by_path().get(relative)
         if entry is None:
             raise BadInput(f"table {self.table}: version {self.key} has no file {relative}")
         return entry
 
-    def _files(self) -> dict[str, dict[str, Any]]:
+    def _entries_by_path(self) -> dict[str, dict[str, Any]]:
         return self.manifest.by_path
 
-    def dataset(self, parts: Iterable[str] | None = None) -> parquet.Dataset:
+    def dataset(self, partitions: Iterable[str] | None = None) -> parquet.Dataset:
         """The version's files (or those parts') as an Arrow dataset that refuses what is not as it was written."""
-        entries = [self._entry(name) for name in (self.parts if parts is None else parts)]
-        return self._opened(entries, self.schema)
+        entries = [
+            self._partition_entry(partition) for partition in (self.partitions if partitions is None else partitions)
+        ]
+        return self._open_dataset(entries, self.schema)
 
-    def _opened(self, entries: Sequence[dict[str, Any]], schema: pa.Schema) -> parquet.Dataset:
+    def _open_dataset(self, entries: Sequence[dict[str, Any]], schema: pa.Schema) -> parquet.Dataset:
         for entry in entries:
-            manifest.checked(self.folder, entry)
-        with self._refusing():
-            return parquet.dataset(self.folder, entries, schema)
+            manifest.check_size(self.folder, entry)
+        with self._errors_as_damaged():
+            return parquet.open_dataset(self.folder, entries, schema)
 
     @contextmanager
-    def _refusing(self) -> Iterator[None]:
+    def _errors_as_damaged(self) -> Iterator[None]:
         """What Arrow cannot read although it is as it was written."""
         try:
             yield
@@ -149,53 +151,53 @@ class Version:
     def rows(
         self,
         columns: Sequence[str] | None = None,
-        parts: Iterable[str] | None = None,
+        partitions: Iterable[str] | None = None,
         where: ds.Expression | None = None,
     ) -> pa.Table:
         """Rows in file order.
 
         columns : names, None = all;  parts : names of parts, None = all;  where : an Arrow filter
         """
-        self._refuse_unknown(columns or ())
-        with self._refusing():
-            return self.dataset(parts).to_table(columns=None if columns is None else list(columns), filter=where)
+        self._check_columns(columns or ())
+        with self._errors_as_damaged():
+            return self.dataset(partitions).to_table(columns=None if columns is None else list(columns), filter=where)
 
-    def margin(self, part: str, columns: Sequence[str] | None = None) -> pa.Table:
+    def read_margin(self, partition: str, columns: Sequence[str] | None = None) -> pa.Table:
         """Rows of a catalogue beside a part's cell, within 10" of it and a little farther."""
-        self._refuse_unknown(columns or ())
-        entry = self._file(f"{self.table}_margin/dataset/{part}")
-        with self._refusing():
-            return self._opened([entry], self.schema).to_table(columns=None if columns is None else list(columns))
+        self._check_columns(columns or ())
+        entry = self._file_entry(f"{self.table}_margin/dataset/{partition}")
+        with self._errors_as_damaged():
+            return self._open_dataset([entry], self.schema).to_table(columns=None if columns is None else list(columns))
 
-    def beside(self, relative: str) -> pa.Table:
+    def read_sidecar(self, relative: str) -> pa.Table:
         """Rows of a Parquet file of the version that is no part of its table."""
-        entry = self._file(relative)
-        manifest.checked(self.folder, entry)
-        with self._refusing():
+        entry = self._file_entry(relative)
+        manifest.check_size(self.folder, entry)
+        with self._errors_as_damaged():
             return parquet.read(self.folder, entry)
 
-    def _refuse_unknown(self, columns: Sequence[str]) -> None:
+    def _check_columns(self, columns: Sequence[str]) -> None:
         """Raise BadInput if the table lacks one of the columns."""
         for name in columns:
             if name not in self.schema.names:
                 raise BadInput(f"table {self.table} has no column {name}")
 
-    def in_cells(self, cells: Sequence[int], order: int, columns: Sequence[str] | None = None) -> pa.Table:
+    def rows_in_cells(self, cells: Sequence[int], order: int, columns: Sequence[str] | None = None) -> pa.Table:
         """Rows of a catalogue inside cells of an order (nested), reading only files and row groups that can hold some.
 
         cells : int[n]
         """
-        wanted = np.unique(np.asarray(cells, np.int64))
+        unique_cells = np.unique(np.asarray(cells, np.int64))
         names = None if columns is None else list(dict.fromkeys([*columns, "_healpix_29"]))
         empty = self.schema.empty_table()
-        self._refuse_unknown(names or ())
+        self._check_columns(names or ())
         pieces = [empty if names is None else empty.select(names)]
-        for part in self.parts:
-            here = _inside(part, wanted, order)
-            if here.size:
-                pieces.append(self.rows(names, [part], _in_ranges(_ranges(here, order))))
+        for partition in self.partitions:
+            cells_in_partition = _cells_in_partition(partition, unique_cells, order)
+            if cells_in_partition.size:
+                pieces.append(self.rows(names, [partition], _range_filter(_ranges(cells_in_partition, order))))
         rows = pa.concat_tables(pieces)
-        inside = np.isin(sky.parent(rows["_healpix_29"].to_numpy(), sky.DEEPEST, order), wanted)
+        inside = np.isin(sky.parent(rows["_healpix_29"].to_numpy(), sky.MAX_ORDER, order), unique_cells)
         rows = rows.filter(pa.array(inside))
         return rows if columns is None else rows.select(list(columns))
 
@@ -209,38 +211,38 @@ class Version:
         columns         : that are wanted; None: all of them
         Errors          : BadInput for a place or radius outside its bounds, or a column that is not there
         """
-        radius = bounds.number("radius", radius, 0.0, 180.0)
-        sky.checked(bounds.number("ra", ra), bounds.number("dec", dec))
-        place = self.place(on)
-        self._refuse_unknown([*place, "_healpix_29"])
+        radius = arguments.check_number("radius", radius, 0.0, 180.0)
+        sky.check_positions(arguments.check_number("ra", ra), arguments.check_number("dec", dec))
+        position_names = self.position_columns(on)
+        self._check_columns([*position_names, "_healpix_29"])
         # Files go by observed positions: a source may lie so far beyond the cells of its true one.
-        padded = radius if place == ("ra", "dec") else radius + self.deflection() + _ROUNDING_DEG
+        padded = radius if position_names == ("ra", "dec") else radius + self.max_deflection() + _ROUNDING_DEG
         order = sky.cover_order(padded)
-        names = None if columns is None else list(dict.fromkeys([*columns, *place]))
-        rows = self.in_cells(sky.cells_in_cone(ra, dec, min(padded, 180.0), order).tolist(), order, names)
-        lon, lat = (rows[name].to_numpy() for name in place)
+        names = None if columns is None else list(dict.fromkeys([*columns, *position_names]))
+        rows = self.rows_in_cells(sky.cells_in_cone(ra, dec, min(padded, 180.0), order).tolist(), order, names)
+        lon, lat = (rows[name].to_numpy() for name in position_names)
         rows = rows.filter(pa.array(sky.separation(lon, lat, ra, dec) <= radius))
         return rows if columns is None else rows.select(list(columns))
 
-    def place(self, on: str = "observed") -> tuple[str, str]:
+    def position_columns(self, on: str = "observed") -> tuple[str, str]:
         """Columns of ra and dec of a catalogue's observed or true positions: the same ones if nothing lenses it.
 
         on : one of ON;  Errors : BadInput for another
         """
-        if on not in ON:
-            raise BadInput(f"on = {on!r} is not one of {', '.join(ON)}")
+        if on not in POSITION_KINDS:
+            raise BadInput(f"on = {on!r} is not one of {', '.join(POSITION_KINDS)}")
         return ("ra_true", "dec_true") if on == "true" and "ra_true" in self.schema.names else ("ra", "dec")
 
-    def deflection(self) -> float:
+    def max_deflection(self) -> float:
         """Largest distance of a lensed from its true position, deg, as it was when the version was published."""
         if "deflection_deg" not in self.manifest:
             raise BadInput(f"table {self.table}: version {self.key} does not say how far positions are lensed")
         return float(self.manifest["deflection_deg"])
 
 
-def _inside(part: str, cells: Int, order: int) -> Int:
+def _cells_in_partition(partition: str, cells: Int, order: int) -> Int:
     """Those of the cells that a part's cell overlaps."""
-    file_order, cell = layout.cell_of_file(part)
+    file_order, cell = layout.cell_of_file(partition)
     if file_order <= order:
         inside: Int = cells[sky.parent(cells, order, file_order) == cell]
     else:
@@ -252,8 +254,8 @@ def _ranges(cells: Int, order: int) -> list[tuple[int, int]]:
     """Half-open stretches of order-29 indices that cover sorted cells: at most _MOST_RANGES, widest gaps left out."""
     gaps = np.diff(cells)
     cuts = np.flatnonzero(gaps > 1)
-    if cuts.size >= _MOST_RANGES:
-        cuts = np.sort(cuts[np.argsort(gaps[cuts])[-_MOST_RANGES + 1 :]])
+    if cuts.size >= _MAX_RANGES:
+        cuts = np.sort(cuts[np.argsort(gaps[cuts])[-_MAX_RANGES + 1 :]])
     firsts, lasts = cells[np.append(0, cuts + 1)], cells[np.append(cuts, -1)]
     return [
         (sky.cell_range(order, int(first))[0], sky.cell_range(order, int(last))[1])
@@ -261,7 +263,7 @@ def _ranges(cells: Int, order: int) -> list[tuple[int, int]]:
     ]
 
 
-def _in_ranges(ranges: Sequence[tuple[int, int]]) -> ds.Expression:
+def _range_filter(ranges: Sequence[tuple[int, int]]) -> ds.Expression:
     index = pc.field("_healpix_29")
     return reduce(lambda a, b: a | b, [(index >= first) & (index < last) for first, last in ranges])
 
@@ -278,82 +280,84 @@ def version(root: Folder, name: str, key: str | None = None, request: str | None
              their own and none is named; Damaged where its manifest is missing, broken or another's; VersionMismatch
              where it was written with a declaration that this code cannot read
     """
-    wanted = key or _chosen(root, name, request)
-    if wanted is None:
+    selected_key = key or _select_key(root, name, request)
+    if selected_key is None:
         raise BadInput(f"lake {root} has no table {name}" + (f" of request {request}" if request else ""))
-    return _open(root, name, wanted, asked=key is not None, link=_link(root, name, request))
+    return _open_version(root, name, selected_key, is_requested=key is not None, link=_link(root, name, request))
 
 
-def for_request(root: Folder, name: str, request: str) -> Version:
+def input_version(root: Folder, name: str, request: str) -> Version:
     """What the next table of a request is made of: its own version of a table, else the one that was published last.
 
     The second is for requests that share a catalogue.  Errors: as `version`
     """
-    own = names.key_of(root, request, name)
-    return published_last(root, name) if own is None else version(root, name, request=request)
+    request_key = request_links.linked_key(root, request, name)
+    return latest_version(root, name) if request_key is None else version(root, name, request=request)
 
 
-def published_last(root: Folder, name: str) -> Version:
+def latest_version(root: Folder, name: str) -> Version:
     """The version that `current` leads to, whichever request it belongs to.  Errors: as `version`"""
-    wanted = layout.current_key(root, name)
-    if wanted is None:
+    current_key = layout.current_key(root, name)
+    if current_key is None:
         raise BadInput(f"lake {root} has no table {name}")
-    return _open(root, name, wanted, asked=False, link=layout.current(root, name))
+    return _open_version(root, name, current_key, is_requested=False, link=layout.current_link(root, name))
 
 
-def _chosen(root: Folder, name: str, request: str | None) -> str | None:
+def _select_key(root: Folder, name: str, request: str | None) -> str | None:
     if request is not None:
-        return names.key_of(root, names.checked(root, request), name)
-    if len(set((held := names.holders(root, name)).values())) > 1:
-        which = f"requests {', '.join(held)} have versions of their own of table {name}"
-        raise BadInput(f"lake {root}: {which}: name one of them")
+        return request_links.linked_key(root, request_links.check_request(root, request), name)
+    if len(set((keys_by_request := request_links.keys_by_request(root, name)).values())) > 1:
+        requests = f"requests {', '.join(keys_by_request)} have versions of their own of table {name}"
+        raise BadInput(f"lake {root}: {requests}: name one of them")
     return layout.current_key(root, name)
 
 
 def _link(root: Folder, name: str, request: str | None) -> Folder:
-    return layout.current(root, name) if request is None else layout.pin(root, request, name)
+    return layout.current_link(root, name) if request is None else layout.request_link(root, request, name)
 
 
-def _open(root: Folder, name: str, wanted: str, asked: bool, link: Folder) -> Version:
-    folder = layout.version(root, name, wanted)
+def _open_version(root: Folder, name: str, key: str, is_requested: bool, link: Folder) -> Version:
+    folder = layout.version_folder(root, name, key)
     if not folder.exists():
-        if asked:
-            raise BadInput(f"lake {root} has no table {name} of version {wanted}")
+        if is_requested:
+            raise BadInput(f"lake {root} has no table {name} of version {key}")
         raise Damaged(f"{link} leads to {folder.name}, which is missing")
-    opened = Version(folder, manifest.load(folder, name), pa.schema([]))
-    if opened.parts:
-        entry = opened._entry(opened.parts[0])
-        first = manifest.checked(folder, entry)
-        with opened._refusing():
-            state = manifest.state(first) if isinstance(first, Path) else ()
-            if (own := opened.manifest.schemas.get(state)) is None:
-                own = opened.manifest.schemas[state] = parquet.schema(folder, entry)
-        opened = replace(opened, schema=own)
-    known = declarations.find(name, opened.schema.names)
-    return opened if known is None else as_declared(opened, known)
+    published = Version(folder, manifest.load(folder, name), pa.schema([]))
+    if published.partitions:
+        entry = published._partition_entry(published.partitions[0])
+        path = manifest.check_size(folder, entry)
+        with published._errors_as_damaged():
+            state = manifest.file_state(path) if isinstance(path, Path) else ()
+            if (schema := published.manifest.schemas.get(state)) is None:
+                schema = published.manifest.schemas[state] = parquet.read_schema(folder, entry)
+        published = replace(published, schema=schema)
+    declaration = declarations.find_table(name, published.schema.names)
+    return published if declaration is None else with_declared_schema(published, declaration)
 
 
-def as_declared(opened: Version, table: Table) -> Version:
+def with_declared_schema(published: Version, table: Table) -> Version:
     """The version with the schema that `table` declares.
 
     Errors : VersionMismatch, naming both versions or the first column that differs
     """
     # To Arrow schemas are equal whatever their units.
-    units = tuple((own.metadata or {}).get(b"unit", b"") for own in opened.schema)
-    return replace(opened, schema=_declared(opened.schema, units, int(opened.manifest["version"]), table))
+    units = tuple((column.metadata or {}).get(b"unit", b"") for column in published.schema)
+    return replace(
+        published, schema=_declared_schema(published.schema, units, int(published.manifest["version"]), table)
+    )
 
 
 @lru_cache(maxsize=64)
-def _declared(stored: pa.Schema, units: tuple[bytes, ...], was: int, table: Table) -> pa.Schema:
-    if was != table.version:
+def _declared_schema(stored: pa.Schema, units: tuple[bytes, ...], stored_version: int, table: Table) -> pa.Schema:
+    if stored_version != table.version:
         # Numbers of development versions do not tell which is the later one.
         raise VersionMismatch(
             f"table {table.name}: another version of truesky wrote it: "
-            f"its declaration is of version {was}, this truesky reads version {table.version}"
+            f"its declaration is of version {stored_version}, this truesky reads version {table.version}"
         )
     if stored.names and (fault := _difference(stored, table)):
         raise VersionMismatch(f"table {table.name}: {fault}: another truesky wrote it")
-    return table.arrow()
+    return table.arrow_schema()
 
 
 def _difference(stored: pa.Schema, table: Table) -> str:
@@ -372,12 +376,12 @@ def _difference(stored: pa.Schema, table: Table) -> str:
     return ""
 
 
-def tables(root: Folder) -> list[str]:
+def table_names(root: Folder) -> list[str]:
     """Names of the published tables, those that are damaged among them."""
-    return layout.tables(root)
+    return layout.table_names(root)
 
 
-def verify(published: Version, deep: bool = False) -> list[str]:
+def find_faults(published: Version, deep: bool = False) -> list[str]:
     """What is wrong with a version: a list of sentences, empty where all is well.
 
     deep : also the sha256 of every file, and that each cell holds only its own rows, sorted

@@ -12,67 +12,69 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from lake_schema.errors import Damaged
-from lake_schema.store import layout, manifest, names
-from lake_schema.store.plan import Json, Part
+from lake_schema.store import layout, manifest, request_links
+from lake_schema.store.plan import Json, Task
 from lake_schema.store.provenance import file_sha256
 from lake_schema.store.stage import write_receipt
 
 PRODUCT = "product"
 
 
-def files_of(part: Part, receipt: Json) -> Json:
+def manifest_facts(task: Task, receipt: Json) -> Json:
     """What the manifest says of a part that can be used again: its rows and files."""
-    if PRODUCT not in part.facts:
+    if PRODUCT not in task.facts:
         return {}
-    known = {"span": receipt["span"]} if "span" in receipt else {}
+    span = {"span": receipt["span"]} if "span" in receipt else {}
     files = [file["path"] for file in receipt["files"]]
-    return {"rows": receipt["rows"], "files": files, "machine": receipt["machine"], **known}
+    return {"rows": receipt["rows"], "files": files, "machine": receipt["machine"], **span}
 
 
-def held(root: Path, table: str, request: str) -> Mapping[str, str]:
+def reusable_tasks(root: Path, table: str, request: str) -> Mapping[str, str]:
     """The parts of a request's present version that can be used again: name -> PRODUCT.
 
     There are none if the request has no version, or one that cannot be read.
 
     root : folder of the lake;  table : its name;  request : its name
     """
-    key = names.key_of(root, request, table)
+    key = request_links.linked_key(root, request, table)
     if key is None:
         return {}
     try:
-        parts = manifest.load(layout.version(root, table, key), table)["parts"]
+        entries = manifest.load(layout.version_folder(root, table, key), table)["parts"]
     except Damaged:
         return {}
-    return {part["name"]: part["facts"][PRODUCT] for part in parts if "files" in part and PRODUCT in part["facts"]}
+    return {
+        entry["name"]: entry["facts"][PRODUCT] for entry in entries if "files" in entry and PRODUCT in entry["facts"]
+    }
 
 
-def take(stage: Path, version: Path, table: str, parts: Sequence[Part]) -> None:
+def link_reusable(stage: Path, version: Path, table: str, tasks: Sequence[Task]) -> None:
     """Give a stage those of the parts that a version has; what is missing or damaged there is made again.
 
     stage   : folder of the version that is being made;  version : folder of the version that may have parts of it
     table   : its name;  parts : of the plan that is being made
     """
-    if not any(PRODUCT in part.facts for part in parts):
+    if not any(PRODUCT in task.facts for task in tasks):
         return
     try:
         facts = manifest.load(version, table)
     except Damaged:
         return
     entries = {entry["path"]: entry for entry in facts["files"]}
-    there = {entry["name"]: entry for entry in facts["parts"] if "files" in entry}
-    for part in parts:
-        found = there.get(part.name)
-        if found is None or PRODUCT not in part.facts or found["facts"] != part.facts:
+    entries_by_task = {entry["name"]: entry for entry in facts["parts"] if "files" in entry}
+    for task in tasks:
+        previous = entries_by_task.get(task.name)
+        if previous is None or PRODUCT not in task.facts or previous["facts"] != task.facts:
             continue
-        files = [entry for path in found["files"] if (entry := _whole(version, entries[path])) is not None]
-        if len(files) == len(found["files"]):
+        files = [entry for path in previous["files"] if (entry := _intact_entry(version, entries[path])) is not None]
+        if len(files) == len(previous["files"]):
             for entry in files:
-                _link(version / entry["path"], stage / entry["path"])
-            receipt = {"part": part.name, "rows": found["rows"], "files": files, "machine": found["machine"]}
-            write_receipt(stage, {**receipt, "span": found["span"]} if "span" in found else receipt)
+                _link_file(version / entry["path"], stage / entry["path"])
+            receipt = {"part": task.name, "rows": previous["rows"], "files": files, "machine": previous["machine"]}
+            write_receipt(stage, {**receipt, "span": previous["span"]} if "span" in previous else receipt)
 
 
-def _whole(folder: Path, entry: Json) -> Json | None:
+def _intact_entry(folder: Path, entry: Json) -> Json | None:
     """The entry of a file that is as it was published, None of another."""
     path = str(entry["path"])
     try:
@@ -83,9 +85,9 @@ def _whole(folder: Path, entry: Json) -> Json | None:
     return {key: value for key, value in entry.items() if key != "rows"}
 
 
-def _link(source: Path, target: Path) -> None:
+def _link_file(source: Path, target: Path) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = manifest.temporary(target)
+    temporary = manifest.temporary_path(target)
     try:
         os.link(source, temporary)
     except OSError:

@@ -19,57 +19,61 @@ from lake_schema.store.plan import Json, Plan
 from lake_schema.store.stage import is_numbered
 
 
-def refuse_duplicates(stage: Path, plan: Plan, made: Sequence[Json]) -> None:
+def refuse_duplicates(stage: Path, plan: Plan, receipts: Sequence[Json]) -> None:
     """Raise BadInput where a key stands in two parts; the rows of one part have been compared before they were written.
 
     made : receipts.  Only parts are read that share a block of identifiers, or whose keys' spans overlap
     """
     table = plan.table
     # A part's table is the first of its files.
-    entries = {receipt["files"][0]["path"]: receipt["files"][0] for receipt in made}
+    entries = {receipt["files"][0]["path"]: receipt["files"][0] for receipt in receipts}
     if not is_numbered(table):
-        for some in _overlapping(made):
-            _refuse_any(stage, table, [receipt["files"][0] for receipt in some])
+        for group in _overlapping_groups(receipts):
+            _refuse_shared_keys(stage, table, [receipt["files"][0] for receipt in group])
         return
 
     @lru_cache(maxsize=16)
-    def ids(path: str) -> Int:
+    def sorted_ids(path: str) -> Int:
         return np.sort(parquet.read(stage, entries[path], table.key).column(0).to_numpy())
 
-    for block, sharers in _shared_blocks(made, list(entries)).items():
-        _refuse_within(f"table {table.name}: {table.key[0]}", block, sharers, ids)
+    for block, files in _shared_blocks(receipts, list(entries)).items():
+        _refuse_shared_ids(f"table {table.name}: {table.key[0]}", block, files, sorted_ids)
 
 
-def _shared_blocks(made: Sequence[Json], paths: Sequence[str]) -> dict[int | None, list[str]]:
+def _shared_blocks(receipts: Sequence[Json], paths: Sequence[str]) -> dict[int | None, list[str]]:
     """Block of identifiers -> the files that hold some of it, where there are two or more; None = all of them."""
-    if any(receipt["blocks"] is None for receipt in made):
+    if any(receipt["blocks"] is None for receipt in receipts):
         return {None: list(paths)}
     holders: dict[int | None, list[str]] = defaultdict(list)
-    for receipt, path in zip(made, paths, strict=True):
+    for receipt, path in zip(receipts, paths, strict=True):
         for block in receipt["blocks"]:
             holders[block].append(path)
     return {block: files for block, files in holders.items() if len(files) > 1}
 
 
-def _refuse_within(what: str, block: int | None, files: Sequence[str], ids: Callable[[str], Int]) -> None:
-    pieces = [ids(path) for path in files]
+def _refuse_shared_ids(
+    column_label: str, block: int | None, files: Sequence[str], sorted_ids: Callable[[str], Int]
+) -> None:
+    pieces = [sorted_ids(path) for path in files]
     if block is not None:
         edges = np.array([block, block + 1]) << BLOCK_BITS
         pieces = [piece[slice(*np.searchsorted(piece, edges))] for piece in pieces]
-    together = np.concatenate(pieces)
-    order = np.argsort(together, kind="stable")
-    same = np.flatnonzero(np.diff(together[order]) == 0)
+    all_ids = np.concatenate(pieces)
+    order = np.argsort(all_ids, kind="stable")
+    same = np.flatnonzero(np.diff(all_ids[order]) == 0)
     if same.size:
         source = np.repeat(np.arange(len(files)), [piece.size for piece in pieces])
         first, second = (PurePosixPath(files[source[order[same[0] + i]]]).name for i in (0, 1))
-        raise BadInput(f"{what} {together[order[same[0]]]} stands in {first} and in {second}")
+        raise BadInput(f"{column_label} {all_ids[order[same[0]]]} stands in {first} and in {second}")
 
 
-def _overlapping(made: Sequence[Json]) -> Iterator[list[Json]]:
+def _overlapping_groups(receipts: Sequence[Json]) -> Iterator[list[Json]]:
     """Receipts whose keys may be one another's, by their spans; of none that nobody shares a key with."""
     group: list[Json] = []
     highest: list[Any] = []
-    for receipt in sorted((one for one in made if one["span"]), key=lambda receipt: receipt["span"][0]):
+    for receipt in sorted(
+        (candidate for candidate in receipts if candidate["span"]), key=lambda receipt: receipt["span"][0]
+    ):
         lowest, high = receipt["span"]
         if group and _is_below(highest, lowest):
             if len(group) > 1:
@@ -83,16 +87,16 @@ def _overlapping(made: Sequence[Json]) -> Iterator[list[Json]]:
         yield group
 
 
-def _is_below(one: Sequence[Any], other: Sequence[Any]) -> bool:
-    many = min(len(one), len(other))
-    return list(one[:many]) < list(other[:many])
+def _is_below(first: Sequence[Any], second: Sequence[Any]) -> bool:
+    length = min(len(first), len(second))
+    return list(first[:length]) < list(second[:length])
 
 
-def _refuse_any(stage: Path, table: Table, entries: Sequence[Json]) -> None:
-    seen: dict[tuple[object, ...], str] = {}
+def _refuse_shared_keys(stage: Path, table: Table, entries: Sequence[Json]) -> None:
+    file_by_key: dict[tuple[object, ...], str] = {}
     for entry in entries:
-        columns, here = parquet.read(stage, entry, table.key), PurePosixPath(entry["path"]).name
+        columns, file_name = parquet.read(stage, entry, table.key), PurePosixPath(entry["path"]).name
         for value in zip(*(columns[k].to_pylist() for k in table.key), strict=True):
-            if value in seen:
-                raise BadInput(f"table {table.name}: key {value} stands in {seen[value]} and in {here}")
-            seen[value] = here
+            if value in file_by_key:
+                raise BadInput(f"table {table.name}: key {value} stands in {file_by_key[value]} and in {file_name}")
+            file_by_key[value] = file_name

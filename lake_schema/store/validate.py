@@ -16,42 +16,44 @@ from lake_schema.columns import Column, Table
 from lake_schema.errors import BadInput
 
 
-def violations(rows: pa.Table, table: Table) -> list[str]:
+def find_violations(rows: pa.Table, table: Table) -> list[str]:
     """What is wrong with `rows` as `table`: schema first; contents only where the schema is right."""
-    found = _schema_violations(rows.schema, table)
-    if found:
-        return found
+    messages = _schema_violations(rows.schema, table)
+    if messages:
+        return messages
     for column in table.columns:
-        found += _content_violations(rows[column.name], column, table.name)
-    return found + _duplicates(rows, table)
+        messages += _content_violations(rows[column.name], column, table.name)
+    return messages + _duplicates(rows, table)
 
 
-def check(rows: pa.Table, table: Table) -> None:
+def check_rows(rows: pa.Table, table: Table) -> None:
     """Raise BadInput, one line, where `rows` are not what `table` declares."""
-    found = violations(rows, table)
-    if found:
-        more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
-        raise BadInput(found[0] + more)
+    messages = find_violations(rows, table)
+    if messages:
+        suffix = f" (and {len(messages) - 1} more)" if len(messages) > 1 else ""
+        raise BadInput(messages[0] + suffix)
 
 
 def _schema_violations(schema: pa.Schema, table: Table) -> list[str]:
-    wanted = table.arrow()
-    found = [f"table {table.name}: column {n} is missing" for n in wanted.names if n not in schema.names]
-    found += [f"table {table.name}: column {n} is not declared" for n in schema.names if n not in wanted.names]
-    if found:
-        return found
-    if schema.names != wanted.names:
+    declared = table.arrow_schema()
+    messages = [f"table {table.name}: column {name} is missing" for name in declared.names if name not in schema.names]
+    messages += [
+        f"table {table.name}: column {name} is not declared" for name in schema.names if name not in declared.names
+    ]
+    if messages:
+        return messages
+    if schema.names != declared.names:
         return [f"table {table.name}: columns are in another order than declared"]
-    for want in wanted:
-        have = schema.field(want.name)
-        where = f"table {table.name}: column {want.name}"
-        if have.type != want.type:
-            found.append(f"{where} is {have.type}, wanted {want.type}")
-        elif have.nullable != want.nullable:
-            found.append(f"{where} is {'' if have.nullable else 'not '}nullable, wanted the opposite")
-        elif _unit(have) != _unit(want):
-            found.append(f"{where} has unit {_unit(have)!r}, wanted {_unit(want)!r}")
-    return found
+    for declared_field in declared:
+        field = schema.field(declared_field.name)
+        where = f"table {table.name}: column {declared_field.name}"
+        if field.type != declared_field.type:
+            messages.append(f"{where} is {field.type}, wanted {declared_field.type}")
+        elif field.nullable != declared_field.nullable:
+            messages.append(f"{where} is {'' if field.nullable else 'not '}nullable, wanted the opposite")
+        elif _unit(field) != _unit(declared_field):
+            messages.append(f"{where} has unit {_unit(field)!r}, wanted {_unit(declared_field)!r}")
+    return messages
 
 
 def _unit(field: pa.Field) -> str:
@@ -61,7 +63,7 @@ def _unit(field: pa.Field) -> str:
 def _content_violations(values: pa.ChunkedArray, column: Column, table: str) -> list[str]:
     where = f"table {table}: column {column.name}"
     if values.null_count and not column.nullable:
-        return [f"{where} has {values.null_count} missing values, the first in row {_first(pc.is_null(values))}"]
+        return [f"{where} has {values.null_count} missing values, the first in row {_first_true(pc.is_null(values))}"]
     if column.type == "string":
         return _code_violations(values, column, where)
     if column.type == "bool":
@@ -76,20 +78,20 @@ def _number_violations(values: pa.ChunkedArray, column: Column, where: str, row_
     if pa.types.is_floating(values.type):
         strange = pc.invert(pc.is_finite(values))
         if pc.any(strange).as_py():
-            place = _first(strange)
+            place = _first_true(strange)
             return [f"{where} is {values[place].as_py()} in row {row_of(place)}, wanted a finite number"]
-    found = []
-    for bound, outside in ((column.lo, pc.less), (column.hi, pc.greater)):
+    messages = []
+    for bound, compare in ((column.lo, pc.less), (column.hi, pc.greater)):
         if bound is None or len(values) == 0:
             continue
         # The bound as the column holds it: 0.02 in float32 is a little less than 0.02.
         scalar = pa.scalar(np.dtype(values.type.to_pandas_dtype()).type(bound), values.type)
-        beyond = outside(values, scalar)
-        if pc.any(beyond).as_py():
-            place = _first(beyond)
+        out_of_range = compare(values, scalar)
+        if pc.any(out_of_range).as_py():
+            place = _first_true(out_of_range)
             bounds = f"[{column.lo}, {column.hi}]"
-            found.append(f"{where} is {values[place].as_py()} in row {row_of(place)}, outside {bounds}")
-    return found + ([] if found else _code_violations(values, column, where))
+            messages.append(f"{where} is {values[place].as_py()} in row {row_of(place)}, outside {bounds}")
+    return messages + ([] if messages else _code_violations(values, column, where))
 
 
 def _code_violations(values: pa.ChunkedArray, column: Column, where: str) -> list[str]:
@@ -99,7 +101,7 @@ def _code_violations(values: pa.ChunkedArray, column: Column, where: str) -> lis
     strange = pc.and_(pc.invert(pc.is_in(values, value_set=legal)), pc.is_valid(values))
     if not pc.any(strange).as_py():
         return []
-    row = _first(strange)
+    row = _first_true(strange)
     return [f"{where} is {values[row].as_py()!r} in row {row}, not one of {legal.to_pylist()}"]
 
 
@@ -114,13 +116,13 @@ def _duplicates(rows: pa.Table, table: Table) -> list[str]:
         return [f"table {table.name}: {table.key[0]} {value} stands in rows {places[0]} and {places[1]}"]
     if rows.group_by(list(table.key), use_threads=False).aggregate([]).num_rows == rows.num_rows:
         return []
-    seen: dict[tuple[object, ...], int] = {}
+    row_by_key: dict[tuple[object, ...], int] = {}
     for row, key in enumerate(zip(*(rows[k].to_pylist() for k in table.key), strict=True)):
-        if key in seen:
-            return [f"table {table.name}: key {key} stands in rows {seen[key]} and {row}"]
-        seen[key] = row
+        if key in row_by_key:
+            return [f"table {table.name}: key {key} stands in rows {row_by_key[key]} and {row}"]
+        row_by_key[key] = row
     return []
 
 
-def _first(flags: pa.ChunkedArray) -> int:
+def _first_true(flags: pa.ChunkedArray) -> int:
     return int(pc.index(flags, pa.scalar(True)).as_py())

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from lake_schema.columns import Table
 
 
-def declared(bands: Sequence[str]) -> list[Table]:
+def all_tables(bands: Sequence[str]) -> list[Table]:
     """Every table of the lake, the flux tables with these bands."""
     from lake_schema.tables.exposures import EXPOSURES
     from lake_schema.tables.fluxes import fluxes
@@ -36,16 +36,16 @@ def declared(bands: Sequence[str]) -> list[Table]:
     return [*skies, HALO_LIMITS, TEMPLATES, EXTINCTION_LAWS, EMISSION_LINES, PASSBANDS, *plans, *images, VALIDATION]
 
 
-def markdown() -> str:
+def to_markdown() -> str:
     """The reference page of all tables."""
     head = "# Tables of the lake\n\nWritten by `python -m lake_schema tables`; do not edit.\n"
-    return "\n".join([head, *(table.markdown() for table in declared(["<band>"]))])
+    return "\n".join([head, *(table.to_markdown() for table in all_tables(["<band>"]))])
 
 
-def find(name: str, columns: Sequence[str] = ()) -> Table | None:
+def find_table(name: str, columns: Sequence[str] = ()) -> Table | None:
     """The declaration of the table `name`, None where there is none.
 
     columns : names that the table has; a flux table's bands are taken from them
     """
     bands = [column.removeprefix("f_nu_") for column in columns if column.startswith("f_nu_")]
-    return next((table for table in declared(bands) if table.name == name), None)
+    return next((table for table in all_tables(bands) if table.name == name), None)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from lake_schema.columns import Column
 
-KINDS = (
+SOURCE_KINDS = (
     (0, "central galaxy"),
     (1, "satellite galaxy"),
     (2, "QSO"),
@@ -24,8 +24,8 @@ ID = Column(
 )
 RA = Column("ra", "float64", "deg", "pos.eq.ra;meta.main", "right ascension, ICRS, true (unlensed)", 0.0, 360.0)
 DEC = Column("dec", "float64", "deg", "pos.eq.dec;meta.main", "declination, ICRS, true (unlensed)", -90.0, 90.0)
-SEEN_RA = replace(RA, doc="right ascension, ICRS, where a telescope sees it (lensed)")
-SEEN_DEC = replace(DEC, doc="declination, ICRS, where a telescope sees it (lensed)")
+OBSERVED_RA = replace(RA, doc="right ascension, ICRS, where a telescope sees it (lensed)")
+OBSERVED_DEC = replace(DEC, doc="declination, ICRS, where a telescope sees it (lensed)")
 TRUE_RA = Column("ra_true", "float64", "deg", "pos.eq.ra", "right ascension, ICRS, true (unlensed)", 0.0, 360.0)
 TRUE_DEC = Column("dec_true", "float64", "deg", "pos.eq.dec", "declination, ICRS, true (unlensed)", -90.0, 90.0)
 HEALPIX_29 = Column(
@@ -47,7 +47,7 @@ def id_of_kinds(first: int, last: int) -> Column:
     return replace(ID, lo=first << 60, hi=(last + 1 << 60) - 1)
 
 
-def density_boost_of(what: str) -> Column:
+def density_boost_column(sources: str) -> Column:
     """The column `density_boost` of a table; `what` was drawn."""
-    doc = f"how many times denser than in nature {what} drawn; weight by its inverse"
+    doc = f"how many times denser than in nature {sources} drawn; weight by its inverse"
     return Column("density_boost", "float32", ucd="stat.weight", doc=doc, lo=1e-3, hi=1e6)

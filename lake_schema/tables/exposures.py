@@ -38,10 +38,10 @@ EUCLID_BANDS: Mapping[str, tuple[str, ...]] = {
     "NISP-S": ("nisp_red", "nisp_blue"),
 }
 # Of a channel without a slit, the passband in which the sources are chosen that it draws: of these it wants the fluxes.
-CHOSEN_BY: Mapping[str, str] = {"NISP-S": "euclid_h"}
+SELECTION_BANDS: Mapping[str, str] = {"NISP-S": "euclid_h"}
 # What there is a simulator for: channel -> image types. All others can be planned and forecast. A copy, since
 # requests are refused below the renderer (test_checks.py holds it to the registry of channels).
-RENDERED: Mapping[str, tuple[str, ...]] = {
+RENDERED_TYPES: Mapping[str, tuple[str, ...]] = {
     "VIS": (
         "science",
         "deep",
@@ -177,6 +177,6 @@ class ExposureRow:
     zenith: float | None = None
 
     @classmethod
-    def of(cls, row: Mapping[str, Any]) -> ExposureRow:
+    def from_row(cls, row: Mapping[str, Any]) -> ExposureRow:
         """Of a row as Arrow gives it; KeyError where a column is missing."""
         return cls(**{name: row[name] for name in cls.__slots__})

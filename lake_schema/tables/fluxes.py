@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from lake_schema.columns import Column, Table
-from lake_schema.tables.common import DEC, HEALPIX_29, ID, RA, SEEN_DEC, SEEN_RA
+from lake_schema.tables.common import DEC, HEALPIX_29, ID, OBSERVED_DEC, OBSERVED_RA, RA
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.stars import STARS
 
@@ -39,12 +39,12 @@ def fluxes(kind: str, bands: Sequence[str]) -> Table:
         for band in bands
     ]
     catalogue = GALAXIES if kind == "galaxy" else STARS
-    place = (SEEN_RA, SEEN_DEC) if kind == "galaxy" else (RA, DEC)
+    place = (OBSERVED_RA, OBSERVED_DEC) if kind == "galaxy" else (RA, DEC)
     return Table(
         f"{kind}_fluxes",
         1,
         (ID, *place, HEALPIX_29, *columns, INTEGRATED),
         f"Band fluxes of the table {catalogue.name}, in the same cells and row order.",
         order=catalogue.order,
-        finest=catalogue.finest,
+        max_order=catalogue.max_order,
     )

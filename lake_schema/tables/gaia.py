@@ -40,9 +40,9 @@ def _photometry(short: str, name: str) -> tuple[Column, ...]:
     )
 
 
-def _error(of: str, unit: str, ucd: str, doc: str, nullable: bool = False) -> Column:
+def _error(column_name: str, unit: str, ucd: str, doc: str, nullable: bool = False) -> Column:
     return Column(
-        f"{of}_error",
+        f"{column_name}_error",
         "float32",
         unit,
         f"stat.error;{ucd}",
@@ -105,7 +105,7 @@ GAIA = Table(
     ),
     "The stars as Gaia DR2 would list them: brighter than G = 21, with its errors; the truth is in `stars`, by id.",
     order=3,
-    finest=8,
+    max_order=8,
 )
 
 PARAMETERS = ("ra", "dec", "parallax", "pmra", "pmdec")
@@ -130,10 +130,17 @@ def _flux(short: str, name: str) -> tuple[Column, ...]:
 
 _CORRELATIONS = tuple(
     Column(
-        f"{one}_{other}_corr", "float32", "", "stat.correlation", f"correlation of {one} and {other}", -1.0, 1.0, True
+        f"{first}_{second}_corr",
+        "float32",
+        "",
+        "stat.correlation",
+        f"correlation of {first} and {second}",
+        -1.0,
+        1.0,
+        True,
     )
-    for i, one in enumerate(PARAMETERS)
-    for other in PARAMETERS[i + 1 :]
+    for i, first in enumerate(PARAMETERS)
+    for second in PARAMETERS[i + 1 :]
 )
 _FLUXES = tuple(column for short, name in _BANDS for column in _flux(short, name))
 
@@ -156,18 +163,18 @@ EXPORT = Table(
 )
 
 
-def _dr3() -> Table:
+def _make_dr3_table() -> Table:
     """The columns of DR3's gaia_source that we have, in its order."""
-    known = {column.name: column for column in EXPORT.columns}
-    of_one = [name for parameter in PARAMETERS for name in (parameter, f"{parameter}_error")]
+    columns_by_name = {column.name: column for column in EXPORT.columns}
+    parameter_names = [name for parameter in PARAMETERS for name in (parameter, f"{parameter}_error")]
     # parallax_over_error and pm stand behind the parallax.
-    order: list[str | Column] = ["source_id", "ref_epoch", *of_one[:6]]
+    order: list[str | Column] = ["source_id", "ref_epoch", *parameter_names[:6]]
     order += [
         Column(
             "parallax_over_error", "float32", "", "stat.snr;pos.parallax", "parallax over its error", None, None, True
         ),
         Column("pm", "float32", "mas yr-1", "pos.pm", "total proper motion", 0.0, 2e5, True),
-        *of_one[6:],
+        *parameter_names[6:],
         *(column.name for column in _CORRELATIONS),
         Column(
             "astrometric_params_solved",
@@ -181,13 +188,13 @@ def _dr3() -> Table:
         "ruwe",
     ]
     for short, _ in _BANDS:
-        of_band = f"phot_{short}_mean"
-        order += [f"{of_band}_flux", f"{of_band}_flux_error", f"{of_band}_flux_over_error", f"{of_band}_mag"]
-    columns = tuple(known[one] if isinstance(one, str) else one for one in [*order, "bp_rp"])
+        prefix = f"phot_{short}_mean"
+        order += [f"{prefix}_flux", f"{prefix}_flux_error", f"{prefix}_flux_over_error", f"{prefix}_mag"]
+    columns = tuple(columns_by_name[item] if isinstance(item, str) else item for item in [*order, "bp_rp"])
     doc = (
         "Rows of the table `gaia` under the names, and in the order, of DR3's gaia_source; the values are those of DR2."
     )
     return Table("gaia_source", 1, columns, doc, key=("source_id",))
 
 
-EXPORT_DR3 = _dr3()
+EXPORT_DR3 = _make_dr3_table()

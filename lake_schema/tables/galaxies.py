@@ -17,13 +17,13 @@ import pyarrow as pa
 from lake_schema.columns import Column, Table
 from lake_schema.tables.common import (
     HEALPIX_29,
-    KINDS,
-    SEEN_DEC,
-    SEEN_RA,
+    OBSERVED_DEC,
+    OBSERVED_RA,
+    SOURCE_KINDS,
     TRUE_DEC,
     TRUE_RA,
     Origin,
-    density_boost_of,
+    density_boost_column,
     id_of_kinds,
 )
 
@@ -33,15 +33,15 @@ LAWS = ((0, "none"), (1, "Prevot"), (2, "Calzetti"), (3, "Calzetti + 2175 A bump
 # (Serrano et al. 2024, "Bulge and disc model").
 DISK_SCALE_HEIGHT = 0.1
 
-_LINE = (
+_LINE_DOC = (
     "observed flux of the primary component, dimmed by the galaxy's own dust, before magnification and the Milky Way; "
     "missing where it was not modelled"
 )
 
 
-def _line(name: str, which: str) -> Column:
-    about = "phot.flux;spect.line", f"{which}: {_LINE}"
-    return Column(f"flux_{name}", "float32", "erg s-1 cm-2", *about, 0.0, 1e-5, True)
+def _line_column(name: str, label: str) -> Column:
+    ucd_and_doc = "phot.flux;spect.line", f"{label}: {_LINE_DOC}"
+    return Column(f"flux_{name}", "float32", "erg s-1 cm-2", *ucd_and_doc, 0.0, 1e-5, True)
 
 
 def _component(k: int) -> tuple[Column, ...]:
@@ -73,10 +73,10 @@ _IDENTITY = (
     ),
 )
 # Behind 2, the positions.
-_REST = (
+_OTHER_COLUMNS = (
     # 3 kind
-    Column("kind", "int8", ucd="src.class", doc="kind of source", codes=KINDS[:5], lo=0, hi=4),
-    density_boost_of("this kind was"),
+    Column("kind", "int8", ucd="src.class", doc="kind of source", codes=SOURCE_KINDS[:5], lo=0, hi=4),
+    density_boost_column("this kind was"),
     # 4 redshift
     Column("z_true", "float32", "", "src.redshift", "cosmological redshift", 0.0, 15.0),
     Column("z_obs", "float32", "", "src.redshift", "observed redshift, with the peculiar velocity", -0.02, 15.0),
@@ -136,21 +136,21 @@ _REST = (
     *_component(1),
     *_component(2),
     # 7 emission lines
-    _line("halpha", "H alpha 6564.6"),
-    _line("hbeta", "H beta 4862.7"),
-    _line("oii", "[O II] 3727.1 (the doublet's other line has the same flux)"),
-    _line("oiii", "[O III] 5008.2 (4960.3 has 1 / 2.98 of it)"),
-    _line("nii", "[N II] 6585.3 (6549.9 has 1 / 3.05 of it)"),
-    _line("sii", "[S II] 6718.3 (the doublet's other line has the same flux)"),
-    _line("hgamma", "H gamma 4341.7"),
-    _line("hdelta", "H delta 4102.9"),
-    _line("paalpha", "Paschen alpha 18756"),
-    _line("pabeta", "Paschen beta 12822"),
-    _line("pagamma", "Paschen gamma 10941"),
-    _line("padelta", "Paschen delta 10052"),
-    _line("siii", "[S III] 9533.2 (9071.1 has 1 / 2.47 of it)"),
-    _line("hei", "He I 10833"),
-    _line("hei_5877", "He I 5877.2"),
+    _line_column("halpha", "H alpha 6564.6"),
+    _line_column("hbeta", "H beta 4862.7"),
+    _line_column("oii", "[O II] 3727.1 (the doublet's other line has the same flux)"),
+    _line_column("oiii", "[O III] 5008.2 (4960.3 has 1 / 2.98 of it)"),
+    _line_column("nii", "[N II] 6585.3 (6549.9 has 1 / 3.05 of it)"),
+    _line_column("sii", "[S II] 6718.3 (the doublet's other line has the same flux)"),
+    _line_column("hgamma", "H gamma 4341.7"),
+    _line_column("hdelta", "H delta 4102.9"),
+    _line_column("paalpha", "Paschen alpha 18756"),
+    _line_column("pabeta", "Paschen beta 12822"),
+    _line_column("pagamma", "Paschen gamma 10941"),
+    _line_column("padelta", "Paschen delta 10052"),
+    _line_column("siii", "[S III] 9533.2 (9071.1 has 1 / 2.47 of it)"),
+    _line_column("hei", "He I 10833"),
+    _line_column("hei_5877", "He I 5877.2"),
     # 8 morphology
     Column(
         "bulge_half_light_radius",
@@ -255,13 +255,13 @@ _REST = (
         nullable=True,
     ),
 )
-_ABOUT = "Galaxies of the True Universe: central, satellite, QSO, high-redshift and strongly lensed."
+_DESCRIPTION = "Galaxies of the True Universe: central, satellite, QSO, high-redshift and strongly lensed."
 
 GALAXIES = Table(
     "galaxies",
     1,
-    (*_IDENTITY, SEEN_RA, SEEN_DEC, HEALPIX_29, TRUE_RA, TRUE_DEC, *_REST),
-    _ABOUT,
+    (*_IDENTITY, OBSERVED_RA, OBSERVED_DEC, HEALPIX_29, TRUE_RA, TRUE_DEC, *_OTHER_COLUMNS),
+    _DESCRIPTION,
     order=5,
 )
 

@@ -11,7 +11,7 @@ from lake_schema.tables.galaxies import GALAXIES
 _BOUNDS = {"kappa": (-1.0, 100.0), "gamma1": (-10.0, 10.0), "gamma2": (-10.0, 10.0)}
 
 
-def _of_galaxies(column: Column) -> Column:
+def _with_wide_bounds(column: Column) -> Column:
     lo, hi = _BOUNDS.get(column.name, (column.lo, column.hi))
     return replace(column, lo=lo, hi=hi)
 
@@ -20,7 +20,7 @@ QUARANTINE = Table(
     "quarantine",
     1,
     (
-        *(_of_galaxies(column) for column in GALAXIES.columns),
+        *(_with_wide_bounds(column) for column in GALAXIES.columns),
         Column(
             "determinant",
             "float32",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from lake_schema.columns import Column, Table
-from lake_schema.tables.common import DEC, HEALPIX_29, RA, density_boost_of, id_of_kinds
+from lake_schema.tables.common import DEC, HEALPIX_29, RA, density_boost_column, id_of_kinds
 
 COMPONENTS = (
     (0, "thin disc"),
@@ -19,7 +19,7 @@ STAGES = ((0, "main sequence"), (1, "giant"), (2, "white dwarf"), (3, "brown dwa
 EPOCH = 2015.5
 
 
-def _mixed(k: int) -> tuple[Column, ...]:
+def _template_columns(k: int) -> tuple[Column, ...]:
     return (
         Column(f"sed_{k}", "int16", "", "meta.code", f"template {k} that the spectrum is mixed of", 0, nullable=True),
         Column(f"frac_{k}", "float32", "", "phot.flux.density;arith.ratio",
@@ -65,9 +65,9 @@ STARS = Table(
             0.0,
             40.0,
         ),
-        density_boost_of("this population was"),
+        density_boost_column("this population was"),
         Column("stage", "int8", "", "src.class", "stage of evolution", 0, 4, nullable=True, codes=STAGES),
-        *(column for k in (2, 3, 4) for column in _mixed(k)),
+        *(column for k in (2, 3, 4) for column in _template_columns(k)),
         Column("mass", "float32", "solMass", "phys.mass", "mass at birth", 0.0, 200.0, True),
         Column("age", "float32", "Gyr", "time.age", "age of its population", 0.0, 14.5, True),
         Column(
@@ -113,5 +113,5 @@ STARS = Table(
     ),
     "Stars of the True Universe, where they are at J2015.5; proper motions carry them to other times.",
     order=3,
-    finest=8,
+    max_order=8,
 )

@@ -5,15 +5,15 @@ from __future__ import annotations
 from lake_schema.columns import Column, Table
 from lake_schema.tables.common import (
     HEALPIX_29,
-    SEEN_DEC,
-    SEEN_RA,
+    OBSERVED_DEC,
+    OBSERVED_RA,
     TRUE_DEC,
     TRUE_RA,
-    density_boost_of,
+    density_boost_column,
     id_of_kinds,
 )
 
-_REST = (
+_OTHER_COLUMNS = (
     Column("kind", "int8", ucd="src.class", doc="kind of source", codes=((4, "strong lens"),), lo=4, hi=4),
     Column("lens_id", "int64", ucd="meta.id.assoc", doc="the lens: a central or satellite of table galaxies", lo=0),
     Column(
@@ -23,7 +23,7 @@ _REST = (
         doc="the galaxy of table galaxies whose spectrum, brightness and shape the lensed one has",
         lo=0,
     ),
-    density_boost_of("strong lenses were"),
+    density_boost_column("strong lenses were"),
     Column("z_lens", "float32", "", "src.redshift", "redshift of the lens", 0.0, 15.0),
     Column("z_source", "float32", "", "src.redshift", "redshift of the source", 0.0, 15.0),
     Column("velocity_dispersion", "float32", "km/s", "phys.veloc.dispersion", "of the lens", 10.0, 1000.0),
@@ -46,12 +46,12 @@ _REST = (
         1e6,
     ),
 )
-_ABOUT = "Strong lenses: singular isothermal ellipsoids, and pictures of the galaxies behind them."
+_DESCRIPTION = "Strong lenses: singular isothermal ellipsoids, and pictures of the galaxies behind them."
 
 STRONG_LENSES = Table(
     "strong_lenses",
     1,
-    (id_of_kinds(4, 4), SEEN_RA, SEEN_DEC, HEALPIX_29, TRUE_RA, TRUE_DEC, *_REST),
-    _ABOUT,
+    (id_of_kinds(4, 4), OBSERVED_RA, OBSERVED_DEC, HEALPIX_29, TRUE_RA, TRUE_DEC, *_OTHER_COLUMNS),
+    _DESCRIPTION,
     order=5,
 )

@@ -71,15 +71,15 @@ class Library(Protocol):
 
 def rows(libraries: Mapping[str, Library], origins: Mapping[str, Sequence[Origin]]) -> pa.Table:
     """Table `templates` of the libraries, by name ("galaxy", "star"), and where each of their spectra is from."""
-    made = (_rows(name, library, origins[name]) for name, library in libraries.items())
-    return pa.concat_tables([TEMPLATES.empty(), *made])
+    library_tables = (_rows(name, library, origins[name]) for name, library in libraries.items())
+    return pa.concat_tables([TEMPLATES.empty(), *library_tables])
 
 
 def _rows(name: str, library: Library, origins: Sequence[Origin]) -> pa.Table:
     n, wavelength = len(library.names), library.wavelength
-    known: dict[str, Any] = {}
+    star_types: dict[str, Any] = {}
     if library.types is not None:
-        known = {"teff": _first(library.types.teff, n), "log_g": _first(library.types.log_g, n)}
+        star_types = {"teff": _pad_missing(library.types.teff, n), "log_g": _pad_missing(library.types.log_g, n)}
     return TEMPLATES.build(
         {
             "library": [name] * n,
@@ -90,12 +90,12 @@ def _rows(name: str, library: Library, origins: Sequence[Origin]) -> pa.Table:
             "flux": [np.asarray(spectrum) for spectrum in library.flux],
             "source": [origin.source for origin in origins],
             "sha256": [origin.sha256 for origin in origins],
-            **known,
+            **star_types,
         }
     )
 
 
-def _first(values: Float, n: int) -> Any:
+def _pad_missing(values: Float, n: int) -> Any:
     """Values of the first rows of n, the others missing."""
     missing = np.arange(n) >= len(values)
     return np.ma.masked_array(np.concatenate([values[:n], np.zeros(max(n - len(values), 0))]), missing)

@@ -11,7 +11,7 @@ VERDICTS = (
     ("undecided", "too little to tell"),
     ("not_applicable", "the lake has nothing that it could be measured of"),
 )
-KINDS = (
+CRITERIA = (
     ("around", "within the tolerance of what is expected"),
     ("least", "no less than what is expected minus the tolerance"),
     ("most", "no more than what is expected and the tolerance"),
@@ -37,7 +37,7 @@ VALIDATION = Table(
         _number("error", "stat.error", "its standard error"),
         _number("expected", "meta.number", "what it should be"),
         _number("tolerance", "stat.error", "how far from that it may be"),
-        Column("kind", "string", ucd="meta.code", doc="how tolerance and expectation bound it", codes=KINDS),
+        Column("kind", "string", ucd="meta.code", doc="how tolerance and expectation bound it", codes=CRITERIA),
         Column("value_unit", "string", ucd="meta.unit", doc="unit of these numbers, empty for a ratio"),
         Column("source", "string", ucd="meta.bib", doc="where the expectation and the tolerance are from"),
         Column("note", "string", ucd="meta.note", doc="what was sampled; why a check does not apply"),

@@ -17,7 +17,7 @@ from tests.truesky.render.fields import psf_of, small
 from truesky.render.drawing import reference, stamp_sizes, stamps
 from truesky.render.drawing.kernels import fourier, frame
 from truesky.render.drawing.settings import settings_for
-from truesky.render.psf.seeing import ground_psf
+from truesky.render.psf.seeing import moffat_psf
 from truesky.request.accuracy import DRAFT, SURVEY
 
 NOISE = {"vis": 12.0, "lsstcam": 38.0}
@@ -28,7 +28,7 @@ LIGHT = st.floats(0.0, 16.9).map(lambda x: 10.0**x)
 def drawn(camera, electrons, seeing=None, side=256, accuracy=SURVEY, most=1024, **shape):
     """(frame, size, light of the stamp on it): of one source whose stamp is at most so large."""
     source = source_of(camera, electrons, column=side / 2 + 0.3, row=side / 2 - 0.4, **shape)
-    beam = psf_of(camera) if seeing is None else ground_psf(seeing, 3.0, 0.2)
+    beam = psf_of(camera) if seeing is None else moffat_psf(seeing, 3.0, 0.2)
     settings, noise = settings_for(accuracy), NOISE[camera]
     sizes = stamp_sizes.stamp_sizes(source.electrons, source.shape, source.shapes, beam, noise, settings)
     light = np.zeros(1)
@@ -88,7 +88,7 @@ def test_the_brightest_star_in_the_longest_exposure(mag, seconds):
     assert len(one.sources) == 2
     assert one.noise_free.min() >= 0.0
     bright = int(np.argmax(one.sources.electrons))
-    assert one.drawn[bright] == pytest.approx(one.sources.electrons[bright], rel=0.02)
+    assert one.drawn_electrons[bright] == pytest.approx(one.sources.electrons[bright], rel=0.02)
     assert one.noise_free[111, 100] == one.noise_free.max() > 0.05 * one.sources.electrons[bright]
     # Its column is full.
     full = one.science[:128, 100].astype(float)
@@ -108,7 +108,7 @@ def test_an_axis_ratio_is_drawn_as_it_is_given(ratio):
     )
     asked = replace(source, shapes=replace(source.shapes, bulge_axis_ratio=np.array([ratio])))
     image = stamps.draw(source, np.array([128]), psf_of("vis"), 128, 128)
-    expected = reference.reference(asked, 0, psf_of("vis"), 128)
+    expected = reference.draw_reference(asked, 0, psf_of("vis"), 128)
     np.testing.assert_allclose(image[34:94, 34:94], expected[34:94, 34:94], atol=1e-3 * expected.max())
 
 

@@ -68,8 +68,8 @@ def test_bleeding_and_transfer_account_for_every_electron(shape):
         part = np.ascontiguousarray(frame[: shape[0], : shape[1]])
         held, lost = bleeding.bleed(part, 2e5, [(0, len(part), False)])
         assert held.sum() + lost == part.sum()
-        out, below = traps.shifted(held, END_OF_LIFE, Sweeps(1, 2), -2)
-        read, along = traps.shifted(out, END_OF_LIFE, Sweeps(1, 2), -1)
+        out, below = traps.shift_charge(held, END_OF_LIFE, Sweeps(1, 2), -2)
+        read, along = traps.shift_charge(out, END_OF_LIFE, Sweeps(1, 2), -1)
         assert read.sum() + below + along + lost == pytest.approx(part.sum(), rel=1e-12)
         assert read.min() >= 0
 
@@ -77,9 +77,9 @@ def test_bleeding_and_transfer_account_for_every_electron(shape):
 @pytest.mark.parametrize("age", [0.0, 1.0, 10.0])
 def test_no_traps_and_far_beyond_the_end_of_life(age):
     scene = Scene(resolve(overrides={"vis.cti.age": (age, "")}), "vis", 560.0, 0.25, 1e4)
-    silicon = charge_transfer.lattice(scene, "parallel")
+    silicon = charge_transfer.silicon_traps(scene, "parallel")
     for frame in scenes((SIDE, 8)).values():
-        out, still = traps.shifted(frame, silicon, Sweeps(1, 2), -2)
+        out, still = traps.shift_charge(frame, silicon, Sweeps(1, 2), -2)
         assert out.sum() + still == pytest.approx(frame.sum(), rel=1e-12)
         if age == 0:
             np.testing.assert_array_equal(out, frame)
@@ -91,7 +91,7 @@ def test_exposure_times_from_nothing_to_a_day(seconds):
     assert np.isfinite([effect.margin(scene) for effect in (cosmic_rays.EFFECT, readout_cosmic_rays.READOUT)]).all()
     expected, quantiles = cosmic_rays.EFFECT.parameters(scene)
     started = time.process_time()
-    image = cosmic_rays.tracks((SIDE, SIDE), expected * (SIDE / 4096) ** 2, quantiles, np.random.default_rng(1))
+    image = cosmic_rays.draw_tracks((SIDE, SIDE), expected * (SIDE / 4096) ** 2, quantiles, np.random.default_rng(1))
     assert time.process_time() - started < HANGS
     assert (image.sum() > 0) == (seconds > 0)
 

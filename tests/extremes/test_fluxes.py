@@ -189,8 +189,8 @@ def test_an_opposite_lens_undoes_a_weak_one(kappa, gamma1, gamma2):
 @given(st.integers(0, 4), st.floats(0.0, 3.0), st.floats(0.0, 3.0))
 def test_extinction_is_monotone_and_one_without_dust(law, ebv, more):
     k = extinction.laws(np.linspace(100.0, 24000.0, 300))[law]
-    assert (extinction.transmitted(k, 0.0) == 1.0).all()
-    assert (extinction.transmitted(k, max(ebv, more)) <= extinction.transmitted(k, min(ebv, more))).all()
+    assert (extinction.transmission(k, 0.0) == 1.0).all()
+    assert (extinction.transmission(k, max(ebv, more)) <= extinction.transmission(k, min(ebv, more))).all()
 
 
 @given(st.floats(-30.0, 60.0))

@@ -229,7 +229,7 @@ def test_whatever_is_drawn_is_finite_and_of_its_flux(what, camera, accuracy):
     # A pixel is rounded to 2^-20 electrons; single precision sums to 1e-6.
     least, rounding = 1.0, image.size * 2.0**-21 + 2e-6 * electrons
     if len(source.shapes):
-        least -= galaxy_shapes.outside(source.shapes, np.array([0.5 * side * psf.pixel_scale]))[0]
+        least -= galaxy_shapes.flux_outside(source.shapes, np.array([0.5 * side * psf.pixel_scale]))[0]
     assert least * electrons - rounding <= image.sum() <= electrons + rounding
     assert image.min() >= -max(2e-3 * image.max(), accuracy.background * NOISE)
     # Where nothing is taken off the stamp all of its light is on it.
@@ -359,7 +359,7 @@ def test_what_is_taken_off_slim_galaxies_is_theirs(kind, accuracy):
     side = 2 * size
     source = source_of("vis", 1e5, column=side / 2 + 0.3, row=side / 2 - 0.4, **shape)
     image, _ = drawn(source, psf_of("vis"), side, accuracy)
-    least = 1.0 - galaxy_shapes.outside(source.shapes, np.array([0.5 * side * 0.1]))[0]
+    least = 1.0 - galaxy_shapes.flux_outside(source.shapes, np.array([0.5 * side * 0.1]))[0]
     assert 1e5 * (least - 1e-3) < image.sum() < 1e5 * (1 + 2e-6)
     assert image.min() > -accuracy.background * NOISE
 
@@ -384,7 +384,7 @@ def test_a_stamp_gives_no_more_than_what_is_outside(index):
     for column in (-26.0, 2078.0):
         source = source_of("vis", 1e6, column=column, row=1023.5, bulge_axis_ratio=0.02, position_angle=80.0, **shape)
         light += stamps.draw(source, np.array([48]), psf_of("vis"), 2048, 2048).sum()
-    outside = 1e6 * galaxy_shapes.outside(source.shapes, np.array([2.4]))[0]
+    outside = 1e6 * galaxy_shapes.flux_outside(source.shapes, np.array([2.4]))[0]
     assert 0.1 * outside < light < outside
 
 
@@ -422,7 +422,7 @@ def test_what_is_taken_off_ends_by_and_by_where_it_cancels():
     for q in np.arange(0.2, 0.3, 0.002):
         one = source_of("vis", 1e5, bulge_fraction=1.0, bulge_axis_ratio=q, bulge_half_light_radius=1.0)
         one = replace(centred(one, 64.0), jacobian=0.1 * np.eye(2)[None])
-        outside = stamps._outside(one, *stamps._forms(one), np.array([64]), 0.1)
+        outside = stamps._light_outside(one, *stamps._forms(one), np.array([64]), 0.1)
         taken.append(frame.aliased_light(np.array([64]), *np.full((2, 1), 32.0), outside[0], outside[2])[0])
     level, light = np.array(taken)[:, 0], np.array(taken)[:, -1]
     assert light[0] < 1.0 < 500.0 < light[-1]
@@ -504,7 +504,7 @@ def test_poles_and_the_seam_are_as_good_as_any_place(camera, ra, dec):
     lon, lat = sky_of_pixel(system, *places.T)
     settings, band = settings_for(SURVEY), passbands.load("euclid_vis" if camera == "vis" else "lsst_r")
     body = galaxies(lon[:1], lat[:1], inclination=75.0, disk_half_light_radius=0.3)
-    found, sizes = visible_sources.sources_of(
+    found, sizes = visible_sources.select_sources(
         Rows(body, None, stars(lon[1:], lat[1:]), None), (np.array([1e5]), np.array([1e5])),
         aimed(detector, system, band), psf_of(camera), NOISE, settings,
     )  # fmt: skip

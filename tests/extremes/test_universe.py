@@ -31,7 +31,7 @@ SHEARED = {**SMALL, "lensing": (0.02, -0.01)}
 
 def drawn(seed, limit, z_max, cell=CELL):
     universe = galaxies.model(seed, Universe(galaxy_limit=limit, z_max=z_max, **SHEARED))
-    cells = population.Cells(universe.population)
+    cells = population.CellCache(universe.population)
     return galaxies.draw(cell, universe, cells, dust_map.load(SEED)), galaxies.halo_table(
         cell, universe.population, cells
     )
@@ -51,8 +51,8 @@ def with_either(cases):
 )
 def test_the_ends_of_limit_and_redshift(seed, limit, z_max):
     rows, halos = drawn(seed, limit, z_max)
-    assert validate.violations(rows, GALAXIES) == []
-    assert validate.violations(halos, HALOS) == []
+    assert validate.find_violations(rows, GALAXIES) == []
+    assert validate.find_violations(halos, HALOS) == []
     near = rows.filter(pc.less(rows["kind"], 2))
     assert near["z_true"].to_numpy().max(initial=0.0) <= np.float32(z_max)
     assert np.unique(rows["id"].to_numpy()).size == rows.num_rows
@@ -66,15 +66,15 @@ def test_the_ends_of_limit_and_redshift(seed, limit, z_max):
 )
 def test_poles_the_first_meridian_and_the_centre_of_the_galaxy(seed, ra, dec):
     """Galaxies, and stars within the limit of the plane."""
-    cell = int(sky.cell_of([ra], [dec], ids.GENERATION_ORDER)[0])
+    cell = int(sky.cell_at([ra], [dec], ids.GENERATION_ORDER)[0])
     rows, _ = drawn(seed, 19.0, 0.3, cell)
-    assert validate.violations(rows, GALAXIES) == []
+    assert validate.find_violations(rows, GALAXIES) == []
     assert rows.num_rows > 3
     points = stars.draw(cell, seed, stars.model(20.0, plane_limit=13.0), dust_map.load(SEED))
-    assert validate.violations(points, STARS) == []
+    assert validate.find_violations(points, STARS) == []
     assert points.num_rows > 20
     for table in (rows, points):
-        assert (sky.cell_of(table["ra"].to_numpy(), table["dec"].to_numpy(), ids.GENERATION_ORDER) == cell).all()
+        assert (sky.cell_at(table["ra"].to_numpy(), table["dec"].to_numpy(), ids.GENERATION_ORDER) == cell).all()
 
 
 # ------------------------------------------------------------------------------------------------ a halo in front
@@ -93,9 +93,9 @@ def in_front(folder):
         "z_true": '"z"',
         "log_mass": '{"column": "mass", "log10": true, "unit": "Msun/h"}',
     }
-    cone = halo_catalogue.load([path], [file_sha256(path)], mapping.halos(columns))
+    cone = halo_catalogue.load([path], [file_sha256(path)], mapping.halo_columns(columns))
     universe = galaxies.model(SEED, Universe(galaxy_limit=23.0, z_max=1.0, **SMALL), cone)
-    return universe, population.Cells(universe.population), (ra, dec)
+    return universe, population.CellCache(universe.population), (ra, dec)
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +109,7 @@ def heavy(tmp_path_factory):
 
 def lensed(heavy, ra, dec, chi):
     universe, cells, _ = heavy
-    around = halo_lensing.around(universe.lens, cells, CELL)
+    around = halo_lensing.lens_of_cell(universe.lens, cells, CELL)
     found = halo_lensing.columns(around, np.atleast_1d(ra), np.atleast_1d(dec), np.atleast_1d(chi))
     return {name: values.astype(float) for name, values in found.items()}
 
@@ -133,12 +133,12 @@ def test_the_heaviest_halo_bends_and_shears_what_is_behind_it(heavy):
 def test_a_galaxy_exactly_behind_a_centre(heavy):
     """Where the box shows the halo: it stays there, and its numbers are finite; a step aside it does not."""
     universe, cells, place = heavy
-    around = halo_lensing.around(universe.lens, cells, CELL)
+    around = halo_lensing.lens_of_cell(universe.lens, cells, CELL)
     near, far = (np.full(2, float(cosmology.comoving_distance(z))) for z in (0.05, 1.0))
     centre = [np.full(2, angle) for angle in place]
-    seen = lensing.displaced(*centre, *lensing.at(around.box, *centre, near)[3:])
+    seen = lensing.displace(*centre, *lensing.interpolate(around.box, *centre, near)[3:])
     seen[1][1] += 5e-3
-    kappa, _, _, east, north = halo_lensing.images(around, *seen, far)
+    kappa, _, _, east, north = halo_lensing.lensing_at_images(around, *seen, far)
     assert np.isfinite([kappa, east, north]).all()
     moved = np.degrees(np.hypot(east, north)) * 3600.0
     assert moved[0] < 1.0 < 5.0 < moved[1]
@@ -154,8 +154,8 @@ def test_the_catalogue_behind_the_heaviest_halo(heavy):
     rows = galaxies.draw(CELL, universe, cells, dust_map.load(SEED))
     hosts = galaxies.halo_table(CELL, universe.population, cells)
     assert hosts["log_mass"].to_numpy().max() == pytest.approx(15.5, abs=1e-6)
-    made = build_galaxies._parted({"generation_cells": [CELL]}, rows)
-    assert validate.violations(made.rows, GALAXIES) == []
+    made = build_galaxies._split_quarantine({"generation_cells": [CELL]}, rows)
+    assert validate.find_violations(made.rows, GALAXIES) == []
     apart = rows.num_rows - made.rows.num_rows
     assert bool(apart) == bool(made.files)
     assert made.rows.num_rows > 300

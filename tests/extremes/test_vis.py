@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lake_schema.errors import OutOfRange
-from lake_schema.mission.bounds import bounds_of, is_whole
+from lake_schema.mission.bounds import bounds_of_parameter, is_count
 from lake_schema.mission.configuration import resolve
 from tests.extremes.test_effects import scenes
 from tests.truesky.render import nominal
@@ -77,13 +77,13 @@ def test_every_effect_on_every_frame(shape, age):
 )
 def test_what_a_configuration_may_hold_every_effect_takes(key, unit):
     """At both ends of what is allowed; beyond, the key is named before anything is drawn."""
-    least, most = (edge(value[i] for value in bounds_of(key)) for i, edge in enumerate((max, min)))
+    least, most = (edge(value[i] for value in bounds_of_parameter(key)) for i, edge in enumerate((max, min)))
     shape = (8, 8)
     for value in (least, most):
         one = scene_of(shape, light=1e8, peak=1e5, **{key: (value, unit)})
-        assert vis.DRAWN.apply(0.0, 0.0, *vis.DRAWN.parameters(one)) == pytest.approx(1.0)
+        assert vis.TRANSFER_EFFECT.apply(0.0, 0.0, *vis.TRANSFER_EFFECT.parameters(one)) == pytest.approx(1.0)
         assert np.isfinite(through(np.zeros(shape), one)).all()
-    beyond = 1.0 if is_whole(key) else 0.25
+    beyond = 1.0 if is_count(key) else 0.25
     for value in (least - beyond, most + beyond):
         with pytest.raises(OutOfRange, match=key):
             resolve(overrides={key: (value, unit)})
@@ -98,7 +98,7 @@ def test_rows_between_the_halves_are_not_read(kind):
     raw = through(frame, one, kind, watch=lambda name, before, after: found.setdefault(name, after))
     assert raw.min() >= 0
     assert raw.max() <= 65535
-    _, _, rows, middle = quadrants.sizes(one)
+    _, _, rows, middle = quadrants.overscan_sizes(one)
     assert middle == 4
     assert raw.shape[1] == SIDE // 2 - 2 + rows
     if "bleeding" in found:
@@ -161,7 +161,7 @@ def counted(frame, one):
     trapped = 0.0
     for name, axis in (("parallel_cti", -2), ("serial_cti", -1)):
         (effect,) = (e for e in vis.SKY if e.name == name)
-        out, still = traps.shifted(seen[name][0], *effect.parameters(one)[:2], axis, effect.parameters(one)[2])
+        out, still = traps.shift_charge(seen[name][0], *effect.parameters(one)[:2], axis, effect.parameters(one)[2])
         np.testing.assert_array_equal(out, seen[name][1])
         trapped += still
     return before.sum(), after, trapped, lost

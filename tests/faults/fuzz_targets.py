@@ -167,10 +167,10 @@ def lines(x, y, separator=" "):
 
 
 def of_area(path):
-    found = area.parse(user_files.toml(path, "request"))
+    found = area.parse(user_files.read_toml(path, "request"))
     found.cells(3)
     found.contains(*np.meshgrid(np.linspace(0, 360, 9), np.linspace(-90, 90, 5)))
-    found.bounds()
+    found.bounding_circle()
 
 
 def curve(form):
@@ -196,19 +196,24 @@ def of_pointings(path):
 
 def of_parquet(path):
     external_files._refuse_large_footer(path)
-    external_files.send(path, ["ra", "dec", "id"], ["name"], io.BytesIO())
+    external_files.send_batches(path, ["ra", "dec", "id"], ["name"], io.BytesIO())
 
 
 def of_query(path):
     text = path.read_bytes().decode("utf-8", "surrogateescape")
-    guard.checked(text, ("galaxies", "galaxy_fluxes", "plain", "products"))
+    guard.check_query(text, ("galaxies", "galaxy_fluxes", "plain", "products"))
 
 
 def of_path(path):
     text = path.read_bytes().decode("utf-8", "surrogateescape")
-    for ask in (layout.lake, layout.name, user_files.expanded, lambda name: files.file_of(Path("."), name)):
+    for ask in (
+        layout.resolve_lake,
+        layout.check_name,
+        user_files.expand_path,
+        lambda name: files.resolve_path(Path("."), name),
+    ):
         try:
-            user_files.checked(Path(ask(text)), "request")
+            user_files.check_file(Path(ask(text)), "request")
         except BadInput as error:
             if len(str(error).splitlines()) > 1:
                 raise
@@ -217,7 +222,7 @@ def of_path(path):
 @cache
 def lake():
     root = Path(tempfile.mkdtemp(prefix="fuzz-lake-"))
-    publish.make(root, plain_plan(), plain_work)
+    publish.make_version(root, plain_plan(), plain_work)
     return root
 
 
@@ -237,7 +242,7 @@ def of_manifest(path):
         file.write_bytes(data)
         version = read.version(root, "plain")
         version.rows()
-        read.verify(version, deep=True)
+        read.find_faults(version, deep=True)
 
 
 def of_log(path):
@@ -330,7 +335,7 @@ def curve_targets():
             lambda: [lines(np.linspace(900.0, 24_000.0, 100), np.linspace(10.0, 0.1, 100)).encode()],
             lambda path: from_files.law(path, "extinction", WAVELENGTH), ".dat",
         ),
-        "models of stars": (basel, stars_from_files.basel, ".cor"),
+        "models of stars": (basel, stars_from_files.read_basel, ".cor"),
     }  # fmt: skip
 
 
@@ -352,7 +357,7 @@ TARGETS = {
         lambda path: galaxy_stamps.read.__wrapped__(path, ""), ".fits",
     ),
     **table_targets("bodies", {**BODIES, "name": MANY["name"]}, lambda path: ephemerides.read.__wrapped__(path, "")),
-    **table_targets("catalogue", MANY, rows_of(mapping.halos(HALOS)), units={"ra": "deg"}),
+    **table_targets("catalogue", MANY, rows_of(mapping.halo_columns(HALOS)), units={"ra": "deg"}),
     "catalogue, Parquet": (
         lambda: [as_parquet(MANY, write_page_checksum=True), as_parquet(MANY, compression="zstd", row_group_size=20)],
         of_parquet, ".parquet", True,

@@ -12,7 +12,7 @@ KINDS = {"plain": (plain_plan, plain_work), "toy": (partial(toy_plan, cells=CELL
 
 def make(root, kind, seed, **options):
     plan, work = KINDS[kind]
-    return publish.make(root, plan(seed), work, **options)
+    return publish.make_version(root, plan(seed), work, **options)
 
 
 def key(kind, seed):
@@ -25,9 +25,9 @@ def current(root, kind, request=None):
         version = read.version(root, kind, request=request)
     except BadInput:
         return None
-    assert read.verify(version, deep=True) == []
+    assert read.find_faults(version, deep=True) == []
     assert version.rows().num_rows == version.num_rows
-    assert version.folder == layout.version(root, kind, version.key)
+    assert version.folder == layout.version_folder(root, kind, version.key)
     if kind == "plain":
         assert set(version.rows()["value"].to_pylist()) == {float(version.manifest["facts"]["seed"])}
     return version.key

@@ -11,7 +11,7 @@ if __name__ == "__main__":
 
 
 from tests.universe import plain_plan, plain_work
-from truesky.running.shell import Job, Step, main
+from truesky.running.submitted_job import Job, Step, main
 
 # Parts, and s a part: a driver that is to be stopped must still be at work.
 PARTS, SLOW = 12, 1.5

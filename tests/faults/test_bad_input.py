@@ -37,7 +37,7 @@ from truesky.render.products import keys
 from truesky.render.psf import from_file
 from truesky.request.files import UserCurves
 from truesky.request.from_toml import parse
-from truesky.running import shell
+from truesky.running import submitted_job
 
 JOB = Path(__file__).resolve().parents[2] / "jobs" / "render" / "plan_exposures.py"
 # What has no bound takes minutes; a slow machine's imports take seconds.
@@ -51,7 +51,7 @@ JOBS = {
 
 
 def run(name, lake, path):
-    return shell.main(JOBS[name], ["--lake", lake, "--request", path])
+    return submitted_job.main(JOBS[name], ["--lake", lake, "--request", path])
 
 
 # Commands by what they are given: a lake, a request, a file or folder to write to.
@@ -142,7 +142,7 @@ def _soon(monkeypatch):
     def fail(*arguments):
         raise AssertionError("a session was asked for")
 
-    monkeypatch.setattr(shell, "_spark_map", fail)
+    monkeypatch.setattr(submitted_job, "_spark_map", fail)
     monkeypatch.setattr(submit, "submit", fail)
     before = signal.signal(signal.SIGALRM, fail)
     signal.alarm(300)
@@ -208,7 +208,7 @@ def test_a_request_of_bad_contents(tmp_path, capsys, call):
 def test_a_file_that_cannot_be_written(tmp_path, capsys, call):
     lake = tmp_path / "lake"
     lake.mkdir()
-    publish.make(lake, plain_plan(), plain_work)
+    publish.make_version(lake, plain_plan(), plain_work)
     for name in ("NUL", "5,000 characters"):
         refused(tmp_path, capsys, call, f"{tmp_path}/{NAMES[name]}.csv", str(lake))
     for thing in ("a pipe", "a device", "a loop"):
@@ -226,33 +226,39 @@ HALOS = 'columns = { ra = "ra", dec = "dec", z_true = "z", log_mass = "m" }\n'
 SKY = pa.table({"mjd": [60905.0], "channel": ["VIS"], "image_type": ["science"]})
 # A key of the request that names a file, and what reads it.
 OWN = {
-    "fluxes.passbands": (HEAD + 'format = "passband_ascii"\nfile = {}\n', lambda r: inputs.filters(r.curves)),
-    "fluxes.passbands, ECSV": (HEAD + 'format = "passband_ecsv"\nfile = {}\n', lambda r: inputs.filters(r.curves)),
-    "fluxes.passbands, VOTable": (HEAD + 'format = "passband_svo"\nfile = {}\n', lambda r: inputs.filters(r.curves)),
+    "fluxes.passbands": (HEAD + 'format = "passband_ascii"\nfile = {}\n', lambda r: inputs.read_passbands(r.curves)),
+    "fluxes.passbands, ECSV": (
+        HEAD + 'format = "passband_ecsv"\nfile = {}\n',
+        lambda r: inputs.read_passbands(r.curves),
+    ),
+    "fluxes.passbands, VOTable": (
+        HEAD + 'format = "passband_svo"\nfile = {}\n',
+        lambda r: inputs.read_passbands(r.curves),
+    ),
     "fluxes.templates": ('[fluxes.templates]\nformat = "cosmos"\nfiles = [{}]\n', lambda r: inputs.read(r.curves)),
     "fluxes.templates, FITS": (
-        '[fluxes.templates]\nformat = "spectrum_fits"\nfiles = [{}]\n', lambda r: inputs.read(r.curves)
+        '[fluxes.templates]\nformat = "spectrum_fits"\nfiles = [{}]\n',
+        lambda r: inputs.read(r.curves),
     ),
     "fluxes.extinction": ('[fluxes.extinction.3]\nformat = "extinction"\nfile = {}\n', lambda r: inputs.read(r.curves)),
     "fluxes.stars, models": ("[fluxes.stars]\nbasel = {}\n", lambda r: inputs.read(r.curves)),
     "fluxes.stars, infrared": ("[fluxes.stars]\nirtf = [{}]\n", lambda r: inputs.read(r.curves)),
     "ingest.galaxies": ("[ingest.galaxies]\n" + CATALOGUE + "files = [{}]\n", lambda r: build_galaxies.steps(None, r)),
     "ingest.halos": ("[ingest.halos]\n" + HALOS + "files = [{}]\n", lambda r: build_galaxies.steps(None, r)),
-    "ingest.dust": ('[ingest.dust]\ncolumn = "EBV"\nfile = {}\n', lambda r: dust_map.chosen(1, r.ingest.dust)),
+    "ingest.dust": ('[ingest.dust]\ncolumn = "EBV"\nfile = {}\n', lambda r: dust_map.map_for_request(1, r.ingest.dust)),
     "stars.tycho2": ("[stars]\ntycho2 = [{}]\n", lambda r: request_checks.star_files(r.stars)),
     "stars.catalogue": (
         '[stars.catalogue]\ncolumns = {{ ra = "ra", dec = "dec", mag_h = "h", teff = "t" }}\nfile = {}\n',
         lambda r: request_checks.star_files(r.stars),
     ),
     "psf": (POINT + "[psf]\neuclid_vis = {}\n", lambda r: from_file.read(Path(dict(r.psfs)["euclid_vis"]), None, None)),
-    "solar_system.bodies": (
-        POINT + "[solar_system]\nbodies = {}\n", lambda r: keys.ephemeris_files(r.bodies, SKY)
-    ),
+    "solar_system.bodies": (POINT + "[solar_system]\nbodies = {}\n", lambda r: keys.ephemeris_files(r.bodies, SKY)),
     "structure.stamps": (
-        POINT + "[structure]\nstamps = {{ file = {} }}\n", lambda r: keys.stamp_files(r.structure.stamps.file)
+        POINT + "[structure]\nstamps = {{ file = {} }}\n",
+        lambda r: keys.stamp_files(r.structure.stamps.file),
     ),
     "observation.pointings": ('[[observation]]\nchannels = ["VIS"]\npointings = {}\n', lambda r: None),
-}  # fmt: skip
+}
 
 
 def quoted(text):
@@ -292,15 +298,15 @@ def test_a_file_of_a_request_that_is_none(tmp_path, key, read):
 
 
 def test_every_kind_of_file_has_a_size_that_is_named(tmp_path, monkeypatch):
-    for size, kind in enumerate(user_files.LARGEST):
-        monkeypatch.setitem(user_files.LARGEST, kind, size)
-    for size, kind in enumerate(user_files.LARGEST):
+    for size, kind in enumerate(user_files.MAX_BYTES):
+        monkeypatch.setitem(user_files.MAX_BYTES, kind, size)
+    for size, kind in enumerate(user_files.MAX_BYTES):
         path = tmp_path / "x"
         path.write_bytes(b"x" * size)
-        assert user_files.checked(path, kind) == path
+        assert user_files.check_file(path, kind) == path
         path.write_bytes(b"x" * (size + 1))
         with pytest.raises(BadInput, match=f"is larger than {size} bytes, the most of a {kind}"):
-            user_files.checked(path, kind)
+            user_files.check_file(path, kind)
 
 
 @pytest.mark.parametrize(("lost", "gateway"), [("??", "25333"), ("\udcc3\udca9", "")])

@@ -16,16 +16,16 @@ import pytest
 from lake_schema.errors import Damaged
 from lake_schema.fits import images
 from lake_schema.store import blocks, layout, manifest, parquet, publish, read
-from lake_schema.store.plan import Output, Part, Plan
-from lake_schema.tables import declared
+from lake_schema.store.plan import Output, Plan, Task
+from lake_schema.tables import all_tables
 from tests.universe import PLAIN, TOY, plain_plan, plain_work, rows_of, toy_rows
-from truesky.catalogue.build_galaxies import quarantine_file, quarantine_work
-from truesky.explore.guard import checked
+from truesky.catalogue.build_galaxies import collect_quarantine, quarantine_file
+from truesky.explore.guard import check_query
 from truesky.explore.session import Session
-from truesky.render.products.beside import truth_file
-from truesky.render.render_exposures import truth_work
+from truesky.render.products.sidecar_files import truth_file
+from truesky.render.render_exposures import read_truth
 
-TABLES = declared(["vis"])
+TABLES = all_tables(["vis"])
 CELL = layout.cell_file(5, 1607)
 ROWS = 2
 # Bits of each file: a sample, or all of them; of larger files, which are mostly footer, one of each byte. Of those one
@@ -38,15 +38,15 @@ MEMORY = 1_000_000_000
 
 def published(root, table, rows, name="a"):
     """A version of a table that holds these rows in one file, and the same rows beside it, as jobs keep some."""
-    part = Part(CELL if table.is_catalogue else "all.parquet", {})
+    part = Task(CELL if table.is_catalogue else "all.parquet", {})
     beside = {"beside/x.parquet": lambda path: parquet.write(path, rows, table)}
-    publish.make(root, Plan(table, {"name": name}, (part,)), lambda lake, facts: Output(rows, beside))
+    publish.make_version(root, Plan(table, {"name": name}, (part,)), lambda lake, facts: Output(rows, beside))
     return read.version(root, table.name)
 
 
 def asking(version, text):
     """What the explorer's process does with a query that it let through."""
-    query = checked(text, {version.table: version.key})
+    query = check_query(text, {version.table: version.key})
     root = version.folder.parents[1]
 
     def asked():
@@ -69,7 +69,7 @@ def readers(version, table):
     if table.is_catalogue:
         ra, dec = (version.rows()[name].to_numpy()[0] for name in ("ra", "dec"))
         found["cone"] = lambda: version.cone(ra, dec, 0.5, ["id"])
-        found["cells"] = lambda: version.in_cells([1607], 5, some)
+        found["cells"] = lambda: version.rows_in_cells([1607], 5, some)
         if "ra_true" in names:
             found["cone by true positions"] = lambda: version.cone(ra, dec, 180.0, ["id"], on="true")
     return found
@@ -112,7 +112,7 @@ def harmed(path, bits, reader, step=1):
 @pytest.mark.parametrize("table", TABLES, ids=lambda table: table.name)
 def test_a_flipped_bit_of_any_table_is_refused_by_name(lake, table, bits, record_property):
     version = published(lake, table, rows_of(table, ROWS))
-    path = version.path(version.parts[0])
+    path = version.partition_path(version.partitions[0])
     for name, reader in readers(version, table).items():
         some = bits if bits is None or name == "rows" else bits // SHARE
         refused, tried = harmed(path, some, reader, 1 if name == "rows" else SPREAD)
@@ -126,9 +126,9 @@ def test_a_flipped_bit_beside_a_table_is_refused_by_name(lake, name, bits, recor
     """What other tables are made from: rows beside a part, rows of a margin."""
     (table,) = (table for table in TABLES if table.name == name)
     version = published(lake, table, rows_of(table, ROWS))
-    files = {"beside/x.parquet": lambda: version.beside("beside/x.parquet")}
+    files = {"beside/x.parquet": lambda: version.read_sidecar("beside/x.parquet")}
     if table.is_catalogue:
-        files[f"{name}_margin/dataset/{CELL}"] = lambda: version.margin(CELL)
+        files[f"{name}_margin/dataset/{CELL}"] = lambda: version.read_margin(CELL)
     for relative, reader in files.items():
         refused, tried = harmed(version.folder / relative, bits, reader)
         assert refused == tried
@@ -139,9 +139,9 @@ def rows_beside(root, name, beside, relative, facts):
     """A version of a table of two rows, with rows of another table in a file beside it."""
     (table,) = (table for table in TABLES if table.name == name)
     given = rows_of(table, ROWS)
-    part = Part(CELL if table.is_catalogue else "all.parquet", facts)
+    part = Task(CELL if table.is_catalogue else "all.parquet", facts)
     files = {relative(given): lambda path: parquet.write(path, rows_of(beside, ROWS), beside)}
-    publish.make(root, Plan(table, {}, (part,)), lambda lake, known: Output(given, files))
+    publish.make_version(root, Plan(table, {}, (part,)), lambda lake, known: Output(given, files))
     return read.version(root, name)
 
 
@@ -153,7 +153,7 @@ def test_a_table_is_not_made_from_rows_with_a_flipped_bit(lake, made, bits):
     if made == "quarantine":
         cells = [1607 << 6]
         version = rows_beside(lake, "galaxies", table, lambda rows: quarantine_file(cells), {"generation_cells": cells})
-        work, facts = quarantine_work, {"galaxies": version.key}
+        work, facts = collect_quarantine, {"galaxies": version.key}
     else:
 
         def first(rows):
@@ -161,7 +161,7 @@ def test_a_table_is_not_made_from_rows_with_a_flipped_bit(lake, made, bits):
             return truth_file(row["exposure_id"], row["detector"])
 
         version = rows_beside(lake, "products", table, first, {})
-        work, facts = truth_work, {"products": version.key, "part": "all.parquet"}
+        work, facts = read_truth, {"products": version.key, "part": "all.parquet"}
     (relative,) = (entry["path"] for entry in version.manifest["files"] if entry["path"].startswith(("truth", "quara")))
     path = version.folder / relative
     assert work(lake, facts).rows.num_rows == ROWS
@@ -176,7 +176,7 @@ def test_a_table_is_not_made_from_rows_with_a_flipped_bit(lake, made, bits):
 def large(tmp_path_factory):
     """A file of several row groups, whose columns lie in blocks of their own."""
     root = tmp_path_factory.mktemp("large")
-    rows = toy_rows(1607, 3 * parquet.ROWS_A_GROUP)
+    rows = toy_rows(1607, 3 * parquet.ROWS_PER_GROUP)
     # Identifiers in no order, whose pages are not small.
     ids = np.random.default_rng(4).permutation(1 << 20)[: rows.num_rows]
     return published(root, TOY, rows.set_column(0, rows.schema.field(0), pa.array(ids)))
@@ -200,8 +200,8 @@ def test_of_a_large_file_what_is_read_is_compared(large, flips):
     """A flip in what is asked for is refused, also where a page's own checksum does not reach; others are not seen."""
     part = large.parts[0]
     index = large.rows(["_healpix_29"])["_healpix_29"].to_numpy()
-    ra, dec = (large.rows([name])[name].to_numpy()[parquet.ROWS_A_GROUP + 1000] for name in ("ra", "dec"))
-    where = pc.field("_healpix_29") == int(index[parquet.ROWS_A_GROUP + 1000])
+    ra, dec = (large.rows([name])[name].to_numpy()[parquet.ROWS_PER_GROUP + 1000] for name in ("ra", "dec"))
+    where = pc.field("_healpix_29") == int(index[parquet.ROWS_PER_GROUP + 1000])
     every, second = {0, 1, 2}, {1}
     wanted = {
         "flux": (lambda: large.rows(["flux"]), {"flux"}, every),
@@ -231,13 +231,13 @@ def test_of_a_large_file_what_is_read_is_compared(large, flips):
 def test_a_column_costs_the_bytes_of_a_column(large, monkeypatch):
     """A reading of one column in one row group asks for few bytes beside those."""
     read_bytes = []
-    one = blocks.Checked._bytes
+    one = blocks.VerifiedFile._read_range
 
     def counted(self, first, last):
         read_bytes.append(last - first)
         return one(self, first, last)
 
-    monkeypatch.setattr(blocks.Checked, "_bytes", counted)
+    monkeypatch.setattr(blocks.VerifiedFile, "_bytes", counted)
     index = large.rows(["_healpix_29"])["_healpix_29"].to_numpy()
     read_bytes.clear()
     large.rows(["flux"], where=pc.field("_healpix_29") == int(index[5]))
@@ -249,12 +249,12 @@ def test_a_column_costs_the_bytes_of_a_column(large, monkeypatch):
 @pytest.mark.parametrize("what", ["columns", "row groups"])
 def test_pieces_of_equal_length_that_changed_places_are_refused(lake, what):
     """Each piece carries a checksum that is right, wherever it stands."""
-    n = 2 * parquet.ROWS_A_GROUP
+    n = 2 * parquet.ROWS_PER_GROUP
     rows = replace(PLAIN, name="wide", columns=tuple(replace(PLAIN.columns[1], name=c) for c in "ab"), key=("a",))
     rng = np.random.default_rng(3)
     # Noise is stored as it is: pieces of one length.
     version = published(lake, rows, rows.build({c: rng.random(n) for c in "ab"}))
-    path, part = version.path(version.parts[0]), version.parts[0]
+    path, part = version.partition_path(version.partitions[0]), version.partitions[0]
     a0, b0, a1, *_ = ((start, end) for _, _, start, end in spans(version, part))
     first, second = (a0, b0) if what == "columns" else (a0, a1)
     length = min(first[1] - first[0], second[1] - second[0])
@@ -268,17 +268,17 @@ def test_pieces_of_equal_length_that_changed_places_are_refused(lake, what):
     for reader in (lambda: version.rows(["a"]), asking(version, "SELECT max(a) FROM wide")):
         with pytest.raises(Damaged, match=path.name):
             reader()
-    assert read.verify(version, deep=True) == [f"{path} has other contents than the manifest says"]
+    assert read.find_faults(version, deep=True) == [f"{path} has other contents than the manifest says"]
 
 
 def test_another_number_of_rows_than_the_manifest_s_is_refused(lake):
     """A hand that rewrites a file and its entry, but not how many rows there were."""
-    folder = publish.make(lake, plain_plan(), plain_work)
+    folder = publish.make_version(lake, plain_plan(), plain_work)
     version = read.version(lake, "plain")
-    path = version.path("1.parquet")
-    parquet.write(path, version.rows(parts=["1.parquet"]).slice(0, 19), PLAIN)
+    path = version.partition_path("1.parquet")
+    parquet.write(path, version.rows(partitions=["1.parquet"]).slice(0, 19), PLAIN)
     facts = {key: value for key, value in version.manifest.items() if key != "files"}
-    new = manifest.file_facts(path, "dataset/1.parquet")
+    new = manifest.file_entry(path, "dataset/1.parquet")
     files = [{**entry, **(new if entry["path"] == new["path"] else {})} for entry in version.manifest["files"]]
     manifest.write(folder, {**facts, "files": files})
     changed = read.version(lake, "plain")
@@ -288,7 +288,7 @@ def test_another_number_of_rows_than_the_manifest_s_is_refused(lake):
 
 
 def test_a_manifest_without_the_blocks_of_a_table_is_refused(lake):
-    folder = publish.make(lake, plain_plan(), plain_work)
+    folder = publish.make_version(lake, plain_plan(), plain_work)
     about = dict(manifest.load(folder, "plain"))
     files = [{key: value for key, value in entry.items() if key != "blocks"} for entry in about["files"]]
     manifest.write(folder, {**about, "files": files})
@@ -327,16 +327,16 @@ def swapped(whole, rng):
 @pytest.mark.parametrize("writer", [picture, packed])
 def test_pieces_of_an_image_that_changed_places_are_refused(lake, writer):
     """The sums that FITS keeps do not see it; the manifest's sha256 does."""
-    publish.make(
+    publish.make_version(
         lake, plain_plan(parts=1), lambda root, facts: Output(plain_work(root, facts).rows, {"images/a.fits": writer})
     )
     version = read.version(lake, "plain")
-    path = version.file("images/a.fits")
+    path = version.sidecar_path("images/a.fits")
     whole, rng = path.read_bytes(), np.random.default_rng(6)
     for _ in range(100):
         path.write_bytes(swapped(whole, rng))
         with pytest.raises(Damaged, match=r"a\.fits has other contents than the manifest says"):
-            images.read_images(version.file("images/a.fits"))
+            images.read_images(version.sidecar_path("images/a.fits"))
 
 
 @pytest.mark.parametrize("trials", [300, pytest.param(20_000, marks=pytest.mark.nightly)])

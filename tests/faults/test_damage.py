@@ -20,7 +20,7 @@ FLIPS = [pytest.param(60, id="short"), pytest.param(2000, id="long", marks=pytes
 
 @pytest.fixture
 def toy(lake):
-    publish.make(lake, toy_plan(), toy_work)
+    publish.make_version(lake, toy_plan(), toy_work)
     return read.version(lake, "toy")
 
 
@@ -37,7 +37,7 @@ def image_work(root, facts):
 
 @pytest.fixture
 def images(lake):
-    publish.make(lake, plain_plan(), image_work)
+    publish.make_version(lake, plain_plan(), image_work)
     return read.version(lake, "plain")
 
 
@@ -55,7 +55,7 @@ def test_a_flipped_bit_of_a_table_is_never_a_wrong_number(toy, flips):
     rng = np.random.default_rng(3)
     for bit in rng.choice(8 * len(whole), flips, replace=False):
         flipped(path, bit)
-        assert read.verify(toy, deep=True) == [f"{path} has other contents than the manifest says"]
+        assert read.find_faults(toy, deep=True) == [f"{path} has other contents than the manifest says"]
         with pytest.raises(Damaged, match=path.name):
             toy.rows(parts=[part])
         path.write_bytes(whole)
@@ -70,7 +70,7 @@ def test_a_flipped_bit_of_an_image_is_never_a_wrong_number(images, flips):
     refused = 0
     for bit in rng.choice(8 * len(whole), flips, replace=False):
         flipped(path, bit)
-        assert len(read.verify(images, deep=True)) == 1
+        assert len(read.find_faults(images, deep=True)) == 1
         with pytest.raises(Damaged, match=r"0\.fits has other contents"):
             images.file("images/0.fits")
         try:
@@ -93,7 +93,7 @@ def test_a_truncated_file_is_refused_before_use(toy, images, kind):
         os.truncate(path, size)
         with pytest.raises(Damaged, match="bytes"):
             version.rows() if kind == "rows" else version.file("images/0.fits")
-        assert path.name in read.verify(version)[0]
+        assert path.name in read.find_faults(version)[0]
         path.write_bytes(whole)
 
 
@@ -122,12 +122,12 @@ def test_a_folder_that_was_edited_is_named(lake, toy, images, kind, harm):
         other.rename(second)
     if harm == "swap versions":
         later = (
-            publish.make(lake, toy_plan(2), toy_work)
+            publish.make_version(lake, toy_plan(2), toy_work)
             if kind == "rows"
-            else publish.make(lake, plain_plan(2), image_work)
+            else publish.make_version(lake, plain_plan(2), image_work)
         )
         shutil.copy(later / first.relative_to(version.folder), first)
-    found = read.verify(version, deep=True)
+    found = read.find_faults(version, deep=True)
     assert found
     assert all(first.name in line or second.name in line for line in found)
     if kind == "rows" and harm != "add":
@@ -136,20 +136,20 @@ def test_a_folder_that_was_edited_is_named(lake, toy, images, kind, harm):
 
 
 def test_a_damaged_version_is_not_published_again(toy, lake):
-    publish.make(lake, toy_plan(2), toy_work)
+    publish.make_version(lake, toy_plan(2), toy_work)
     toy.path(toy.parts[0]).unlink()
     with pytest.raises(Damaged, match="made again"):
-        publish.make(lake, toy_plan(1), toy_work)
+        publish.make_version(lake, toy_plan(1), toy_work)
     shutil.rmtree(toy.folder)
-    publish.make(lake, toy_plan(1), toy_work)
-    assert read.verify(read.version(lake, "toy"), deep=True) == []
+    publish.make_version(lake, toy_plan(1), toy_work)
+    assert read.find_faults(read.version(lake, "toy"), deep=True) == []
 
 
 @given(st.data())
 def test_verify_finds_any_one_change(tmp_path_factory, data):
     root = tmp_path_factory.mktemp("lake")
     folder = promise.make(root, "plain", data.draw(st.integers(1, 5)))
-    assert read.verify(read.version(root, "plain"), deep=True) == []
+    assert read.find_faults(read.version(root, "plain"), deep=True) == []
     path = data.draw(st.sampled_from(sorted(p for p in folder.rglob("*") if p.is_file())))
     whole = path.read_bytes()
     change = data.draw(st.sampled_from(["flip", "cut", "append", "delete"]))
@@ -162,7 +162,7 @@ def test_verify_finds_any_one_change(tmp_path_factory, data):
     else:
         path.unlink()
     try:
-        found = read.verify(read.version(root, "plain"), deep=True)
+        found = read.find_faults(read.version(root, "plain"), deep=True)
     except Damaged as error:
         found = [str(error)]
     # White space in a manifest says nothing.
@@ -175,9 +175,9 @@ def test_rows_of_another_cell_are_found_by_verify(lake):
     """A hand that rewrites a file and its manifest is still found out by the rows themselves."""
     from lake_schema.store import manifest, parquet
 
-    folder = publish.make(lake, toy_plan(), toy_work)
+    folder = publish.make_version(lake, toy_plan(), toy_work)
     version = read.version(lake, "toy")
-    path = version.path(version.parts[0])
+    path = version.partition_path(version.partitions[0])
     for rows, words in (
         (toy_rows(1608, 300), "another cell"),
         (toy_rows(1607, 300).take(list(range(299, -1, -1))), "not sorted"),
@@ -187,10 +187,10 @@ def test_rows_of_another_cell_are_found_by_verify(lake):
         facts = {k: v for k, v in version.manifest.items() if k != "files"}
         relative = path.relative_to(folder).as_posix()
         files = [
-            {**entry, **(manifest.file_facts(path, relative) if entry["path"] == relative else {})}
+            {**entry, **(manifest.file_entry(path, relative) if entry["path"] == relative else {})}
             for entry in version.manifest["files"]
         ]
         manifest.write(folder, {**facts, "files": files})
-        (found,) = read.verify(read.version(lake, "toy"), deep=True)
+        (found,) = read.find_faults(read.version(lake, "toy"), deep=True)
         assert words in found
         assert path.name in found

@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-from lake_schema.errors import LakeError, PartsFailed
+from lake_schema.errors import LakeError, TasksFailed
 from lake_schema.store import garbage, layout, publish, read
 from lake_schema.store.plan import Plan
 from tests.faults import promise, victims
@@ -82,7 +82,7 @@ def test_death_at_any_call(kind, stride, wanted, older):
         promise.make(root, kind, 2)
         assert promise.current(root, kind) == new
         assert promise.sums(root, kind) == wanted[kind]
-        left = {path.name for path in layout.table(root, kind).iterdir()}
+        left = {path.name for path in layout.table_folder(root, kind).iterdir()}
         assert not [name for name in left if name.startswith((".stage", ".receipts"))]
     assert seen == {old, new}
 
@@ -103,7 +103,9 @@ def test_death_in_gc_leaves_no_half_version(older):
         # The one that was on its way out has been made again, and is no longer wanted again.
         promise.make(root, "plain", 2)
         garbage.collect(root, "plain", delete=True)
-        assert [path.name for path in layout.table(root, "plain").glob("*v-*")] == [f"v-{promise.key('plain', 2)}"]
+        assert [path.name for path in layout.table_folder(root, "plain").glob("*v-*")] == [
+            f"v-{promise.key('plain', 2)}"
+        ]
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +152,7 @@ def test_death_between_any_two_steps_leaves_every_request_its_version(stride, tw
 def test_death_in_gc_leaves_what_names_link_to(two_requests):
     root = two_requests()
     with Disc(root) as disc:
-        assert garbage.collect(root, delete=True) == [layout.version(root, "plain", promise.key("plain", 4))]
+        assert garbage.collect(root, delete=True) == [layout.version_folder(root, "plain", promise.key("plain", 4))]
     for n in range(1, len(disc.calls) + 1):
         root = two_requests()
         with Disc(root, die_at=n), pytest.raises(Killed):
@@ -169,22 +171,22 @@ def test_a_full_disc_is_a_clear_error(lake, work, most_bytes, file):
     answers = victims.CONTEXT.SimpleQueue()
     victims.run(victims.on_a_small_disc, lake, work, most_bytes, answers)
     text = answers.get()
-    assert text.startswith("PartsFailed: table plain: 3 of 3 parts failed")
+    assert text.startswith("TasksFailed: table plain: 3 of 3 parts failed")
     assert "OSError" in text
     assert "File too large" in text or " requested and " in text, text
     assert promise.current(lake, "plain") == promise.key("plain", 1)
     assert not [path for path in lake.rglob("*") if path.is_file() and file in path.name and "v-" not in str(path)]
-    publish.make(lake, plain_plan(2), work)
-    assert read.verify(read.version(lake, "plain"), deep=True) == []
+    publish.make_version(lake, plain_plan(2), work)
+    assert read.find_faults(read.version(lake, "plain"), deep=True) == []
 
 
 def test_parts_that_failed_leave_no_temporary_files(lake):
-    with Disc(lake, fail_at=5), pytest.raises(PartsFailed):
+    with Disc(lake, fail_at=5), pytest.raises(TasksFailed):
         promise.make(lake, "plain", 1)
     assert not list(lake.rglob("*.tmp*"))
 
 
 def test_a_plan_without_parts_is_an_empty_table(lake):
     plan = plain_plan()
-    publish.make(lake, Plan(plan.table, plan.facts, ()), plain_work)
+    publish.make_version(lake, Plan(plan.table, plan.facts, ()), plain_work)
     assert read.version(lake, "plain").rows().num_rows == 0

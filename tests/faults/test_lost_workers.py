@@ -60,7 +60,7 @@ def request_file(tmp_path_factory):
 @pytest.fixture(scope="module")
 def local(tmp_path_factory, request_file):
     """The lake that the jobs make in local mode."""
-    root = layout.lake(tmp_path_factory.mktemp("local") / "lake")
+    root = layout.resolve_lake(tmp_path_factory.mktemp("local") / "lake")
     for stage in (*run.CATALOGUES, *run.IMAGES):
         package, name = stage.module.split(".")[1:]
         submit(f"jobs/{package}/{name}.py", root, request_file)
@@ -111,7 +111,7 @@ def wait_for(driver, condition):
 
 
 def test_a_worker_is_killed_and_another_is_slow(local, request_file, tmp_path):
-    lake = layout.lake(shutil.copytree(local, tmp_path / "lake", symlinks=True))
+    lake = layout.resolve_lake(shutil.copytree(local, tmp_path / "lake", symlinks=True))
     for name in ("products", "rendered_truth"):
         shutil.rmtree(lake / name)
         (lake / "names" / "lost" / name).unlink()
@@ -159,11 +159,11 @@ def check_once(lake):
     rows = version.rows(["exposure_id", "detector", "content"]).to_pylist()
     places = [(row["exposure_id"], row["detector"]) for row in rows if row["content"] == "science"]
     assert sorted(places) == sorted({*places})
-    assert len(places) == TASKS == len(version.parts)
+    assert len(places) == TASKS == len(version.partitions)
     # Nor is anything left of copies that lost.
-    left = {path.name for path in layout.table(lake, "products").iterdir() if not path.name.startswith(".lock")}
+    left = {path.name for path in layout.table_folder(lake, "products").iterdir() if not path.name.startswith(".lock")}
     assert left == {"current", version.folder.name}
     assert not list(lake.rglob("*.tmp.*"))
-    log = max(layout.runs(lake).glob("*-products-*.jsonl"), key=lambda path: path.stat().st_mtime_ns)
+    log = max(layout.runs_folder(lake).glob("*-products-*.jsonl"), key=lambda path: path.stat().st_mtime_ns)
     made = [line["part"] for line in events(log) if "part" in line]
-    assert sorted(made) == sorted(version.parts)
+    assert sorted(made) == sorted(version.partitions)

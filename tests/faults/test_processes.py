@@ -124,7 +124,7 @@ def test_a_reader_never_sees_two_versions(kind, versions, reads, lake):
 
 
 def test_gc_leaves_a_running_publisher_alone(lake, plain_phases, monkeypatch):
-    monkeypatch.setattr(locks, "PATIENCE", victims.PATIENCE)
+    monkeypatch.setattr(locks, "TABLE_TIMEOUT", victims.PATIENCE)
     promise.make(lake, "plain", 1)
     answers = victims.CONTEXT.SimpleQueue()
     for name, n in plain_phases.items():

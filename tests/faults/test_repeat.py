@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from lake_schema.columns import Column, Table
-from lake_schema.errors import BadInput, PartsFailed
+from lake_schema.errors import BadInput, TasksFailed
 from lake_schema.store import publish, read
-from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.store.provenance import code_version
 from tests.faults import promise
 from tests.faults.disc import Disc, Killed
@@ -61,8 +61,8 @@ def test_the_same_bytes_however_they_were_made(tmp_path):
             root.mkdir()
             if past == "resumed":
                 with Disc(root, die_at=25), pytest.raises(Killed):
-                    publish.make(root, toy_plan(), toy_work)
-            publish.make(root, toy_plan(), toy_work, mapper)
+                    publish.make_version(root, toy_plan(), toy_work)
+            publish.make_version(root, toy_plan(), toy_work, mapper)
             found[how, past] = promise.sums(root, "toy")
     first = next(iter(found.values()))
     assert [how for how, sums in found.items() if sums != first] == []
@@ -120,15 +120,15 @@ def counted(made):
 )
 def test_nothing_stale_is_resumed(lake, change):
     facts = {"seed": 1, "input": "a", "mission": "a", "request": {"seed": 1}, "code": "a"}
-    before = Plan(PLAIN, facts, plain_plan().parts)
-    after = Plan(PLAIN, {**facts, **change}, plain_plan().parts)
+    before = Plan(PLAIN, facts, plain_plan().tasks)
+    after = Plan(PLAIN, {**facts, **change}, plain_plan().tasks)
     made = []
-    with pytest.raises(PartsFailed):
-        publish.make(lake, before, counted(made))
-    publish.make(lake, after, counted(made))
+    with pytest.raises(TasksFailed):
+        publish.make_version(lake, before, counted(made))
+    publish.make_version(lake, after, counted(made))
     assert made == [0, 1, 2, 0, 1, 2]
     # What was done for the first plan is still good for it.
-    publish.make(lake, before, counted(made))
+    publish.make_version(lake, before, counted(made))
     assert made[6:] == [1]
 
 
@@ -136,10 +136,10 @@ def test_a_table_made_from_another_knows_it(lake):
     """One changed row of an input changes its fingerprint, and so the key of what is made from it."""
     keys, prints = set(), set()
     for seed in (1, 2):
-        publish.make(lake, plain_plan(seed), plain_work)
+        publish.make_version(lake, plain_plan(seed), plain_work)
         source = read.version(lake, "plain")
         prints.add(source.fingerprint)
-        keys.add(Plan(TOY, {"input": source.key}, toy_plan().parts).key)
+        keys.add(Plan(TOY, {"input": source.key}, toy_plan().tasks).key)
     assert len(keys) == len(prints) == 2
 
 
@@ -177,8 +177,8 @@ def fewer(root, facts):
 
 @pytest.mark.parametrize(("work", "words"), [(silent, "returned NoneType"), (fewer, "19 rows, the plan says 20")])
 def test_a_maker_that_returns_too_little(lake, work, words):
-    with pytest.raises(PartsFailed, match=words):
-        publish.make(lake, plain_plan(), work)
+    with pytest.raises(TasksFailed, match=words):
+        publish.make_version(lake, plain_plan(), work)
 
 
 def test_a_part_that_raises_is_named_and_the_others_are_kept(lake):
@@ -189,8 +189,8 @@ def test_a_part_that_raises_is_named_and_the_others_are_kept(lake):
             raise ValueError("row 17: no such template")
         return plain_work(root, facts)
 
-    with pytest.raises(PartsFailed, match=r"1 of 3 parts failed: 1\.parquet: ValueError: row 17: no such template"):
-        publish.make(lake, plain_plan(2), work)
+    with pytest.raises(TasksFailed, match=r"1 of 3 parts failed: 1\.parquet: ValueError: row 17: no such template"):
+        publish.make_version(lake, plain_plan(2), work)
     assert promise.current(lake, "plain") == promise.key("plain", 1)
     assert len(list(lake.rglob(".receipts-*/[!.]*.json"))) == 2
 
@@ -204,9 +204,9 @@ def toy_with_ids(root, facts):
 
 @pytest.mark.parametrize("number", [7, 7 << 46 | 7])
 def test_an_id_in_two_cells_names_both(lake, number):
-    parts = tuple(Part(p.name, {**p.facts, "id": number}) for p in toy_plan().parts[:2])
+    parts = tuple(Task(p.name, {**p.facts, "id": number}) for p in toy_plan().tasks[:2])
     with pytest.raises(BadInput, match=rf"table toy: id {number} stands in Npix=1607.parquet and in Npix=1608.parquet"):
-        publish.make(lake, Plan(TOY, {}, parts), toy_with_ids)
+        publish.make_version(lake, Plan(TOY, {}, parts), toy_with_ids)
     assert promise.current(lake, "toy") is None
 
 
@@ -219,7 +219,7 @@ def test_scattered_ids_are_compared_too(lake):
         return Output(PLAIN.build({"id": ids, "value": np.zeros(ids.size)}))
 
     with pytest.raises(BadInput, match=rf"id {spread[1999]} stands in 0.parquet and in 1.parquet"):
-        publish.make(lake, Plan(PLAIN, {}, tuple(Part(f"{i}.parquet", {"part": i}) for i in (0, 1))), work)
+        publish.make_version(lake, Plan(PLAIN, {}, tuple(Task(f"{i}.parquet", {"part": i}) for i in (0, 1))), work)
 
 
 def test_a_key_of_two_columns_in_two_parts(lake):
@@ -229,7 +229,7 @@ def test_a_key_of_two_columns_in_two_parts(lake):
         return Output(table.build({"a": [facts["part"], 5], "b": ["x", "y"]}))
 
     with pytest.raises(BadInput, match=r"key \(5, 'y'\) stands in 0.parquet and in 1.parquet"):
-        publish.make(lake, Plan(table, {}, tuple(Part(f"{i}.parquet", {"part": i}) for i in (0, 1))), work)
+        publish.make_version(lake, Plan(table, {}, tuple(Task(f"{i}.parquet", {"part": i}) for i in (0, 1))), work)
 
 
 @pytest.mark.parametrize(
@@ -243,5 +243,5 @@ def test_positions_that_do_not_agree(lake, column, value, words):
         index[0 if value < 1608 << 48 else -1] = value
         return Output(rows.set_column(3, rows.schema.field(3), [index]))
 
-    with pytest.raises(PartsFailed, match=words):
-        publish.make(lake, Plan(TOY, {}, toy_plan().parts[:1]), work)
+    with pytest.raises(TasksFailed, match=words):
+        publish.make_version(lake, Plan(TOY, {}, toy_plan().tasks[:1]), work)

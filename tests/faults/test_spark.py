@@ -16,8 +16,8 @@ from tests import requests
 from tests.cluster import below
 from tests.faults import promise, slow_job
 from tests.universe import plain_plan, plain_work
-from truesky.running import shell
-from truesky.running.shell import Job, Step
+from truesky.running import submitted_job
+from truesky.running.submitted_job import Job, Step
 
 pytestmark = pytest.mark.spark
 
@@ -50,7 +50,7 @@ def run(spark, lake, request_file, capfd):
     promise.make(lake, "plain", 1)
 
     def run_job():
-        status = shell.main(JOB, ["--lake", str(lake), "--request", str(request_file)])
+        status = submitted_job.main(JOB, ["--lake", str(lake), "--request", str(request_file)])
         return status, capfd.readouterr().err.strip().splitlines()
 
     return run_job
@@ -67,7 +67,7 @@ def wanted(tmp_path_factory):
     ("harm", "words"),
     [
         ("raise-1", "1.parquet: ValueError: row 17: no such template"),
-        # Four workers die, one after the other; by day tests/truesky/running/test_shell.py has what is said of them.
+        # Four workers die, one after the other; tests/truesky/running/test_submitted_job.py has a short version.
         pytest.param("die-1", "1.parquet: its worker died", marks=pytest.mark.nightly),
     ],
 )
@@ -77,13 +77,13 @@ def test_a_part_that_fails_is_named_and_the_rest_is_kept(run, lake, wanted, harm
     assert (status, len(lines)) == (1, 1)
     assert lines[0] == f"poisoned: table plain: 1 of 3 parts failed: {words}"
     assert promise.current(lake, "plain") == promise.key("plain", 1)
-    log = [json.loads(line) for line in max(layout.runs(lake).glob("*.jsonl")).read_text().splitlines()]
+    log = [json.loads(line) for line in max(layout.runs_folder(lake).glob("*.jsonl")).read_text().splitlines()]
     (failed,) = [line for line in log if "error" in line and "part" in line]
     assert failed["part"] == "1.parquet"
     (lake / harm).unlink()
     assert run() == (0, [])
     assert promise.sums(lake, "plain") == wanted
-    log = [json.loads(line) for line in max(layout.runs(lake).glob("*.jsonl")).read_text().splitlines()]
+    log = [json.loads(line) for line in max(layout.runs_folder(lake).glob("*.jsonl")).read_text().splitlines()]
     assert [line["part"] for line in log if "part" in line] == ["1.parquet"]
 
 
@@ -151,8 +151,8 @@ def test_a_driver_that_is_stopped(driver, lake, spark, request_file, number, who
     assert promise.current(lake, "plain") == promise.key("plain", 1)
     (lake / "slow").unlink()
     before = len(receipts(lake))
-    assert shell.main(slow_job.JOB, ["--lake", str(lake), "--request", str(request_file)]) == 0
+    assert submitted_job.main(slow_job.JOB, ["--lake", str(lake), "--request", str(request_file)]) == 0
     assert promise.current(lake, "plain") == plain_plan(2, parts=slow_job.PARTS).key
-    last = max(layout.runs(lake).glob("*.jsonl"), key=lambda path: path.stat().st_mtime_ns)
+    last = max(layout.runs_folder(lake).glob("*.jsonl"), key=lambda path: path.stat().st_mtime_ns)
     log = [json.loads(line) for line in last.read_text().splitlines()]
     assert sum("part" in line for line in log) == slow_job.PARTS - before

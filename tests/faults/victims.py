@@ -53,7 +53,7 @@ def kill_at(root, kind, seed, n):
 
 def stop_at(root, kind, seed, n, base, reached, go, answers):
     """Publish, and wait at the n-th call to the disc until told to go on."""
-    os.fsync, locks.PATIENCE, locks.MOMENT = _no_fsync, PATIENCE, PATIENCE
+    os.fsync, locks.TABLE_TIMEOUT, locks.SHORT_TIMEOUT = _no_fsync, PATIENCE, PATIENCE
 
     def wait(call, what, path):
         if call == n:
@@ -91,7 +91,7 @@ def on_a_small_disc(root, work, most_bytes, answers):
     """Publish where no file may grow larger."""
     resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
     try:
-        publish.make(root, plain_plan(2), work)
+        publish.make_version(root, plain_plan(2), work)
         answers.put("published")
     except LakeError as error:
         answers.put(f"{type(error).__name__}: {error}")

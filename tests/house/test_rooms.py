@@ -180,7 +180,7 @@ def with_its_camera(monkeypatch):
     for module in [m for name, m in sys.modules.items() if name.startswith(("truesky.", "lake_schema."))]:
         if hasattr(module, "CAMERAS"):
             monkeypatch.setattr(module, "CAMERAS", (*parameter.CAMERAS, "dummycam"))
-    return resolve(copied(parameter.read_all()), models=copied(model.read_models()))
+    return resolve(copied(parameter.read_all_parameters()), models=copied(model.read_models()))
 
 
 def test_a_channel_touches_two_files_of_the_renderer(monkeypatch, tmp_path):
@@ -209,7 +209,7 @@ def test_a_channel_touches_two_files_of_the_renderer(monkeypatch, tmp_path):
     assert task["seconds"] > 16.0 + dummy.CHANNEL.cost.frame_s
     assert task["sources"] > 0
     tables = body, fields.fluxes(body, "lsst_r", 3.0), points, fields.fluxes(points, "lsst_r", 3.0)
-    detector = replace(detectors.detector("dummycam", "R22_S11", mission), nx=256, ny=256, middle=0)
+    detector = replace(detectors.detector("dummycam", "R22_S11", mission), nx=256, ny=256, injection_rows=0)
     one = fields.rendered(row, detector, tables, mission, SURVEY)
     assert one.noise_free.max() > 100.0
     assert [decision.name for decision in one.decisions] == ["brighter"]
@@ -223,7 +223,7 @@ def test_a_channel_touches_two_files_of_the_renderer(monkeypatch, tmp_path):
 def test_a_channel_that_nothing_renders_has_no_effects():
     others = [name for name in (*dict(CHANNELS), "RADIO") if name not in registry.CHANNELS]
     assert "RADIO" in others
-    assert [registry.effects_or_none(name, "science") for name in others] == [None] * len(others)
+    assert [registry.find_effects_or_none(name, "science") for name in others] == [None] * len(others)
 
 
 def test_an_effect_without_a_cost_is_refused():

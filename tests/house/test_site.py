@@ -19,9 +19,11 @@ def test_its_pages(tmp_path, monkeypatch):
     # Sphinx and nbconvert take seconds to load, in each process of tests.
     from scripts import docs_references, make_docs
 
-    draw = docs_references._figure
+    draw = docs_references._draw_figure
     monkeypatch.setattr(
-        docs_references, "_figure", lambda path, *of: path.touch() if list(path.parent.iterdir()) else draw(path, *of)
+        docs_references,
+        "_draw_figure",
+        lambda path, *of: path.touch() if list(path.parent.iterdir()) else draw(path, *of),
     )
     plt.switch_backend("Agg")
     make_docs.pages(tmp_path, run=False)

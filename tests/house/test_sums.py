@@ -47,4 +47,4 @@ def test_what_would_be_found(text):
 
 def test_products_are_those_of_sums():
     found = [f"{p.relative_to(ROOT)}:{line}" for p in SOURCES for line in faults(ast.parse(p.read_text()))]
-    assert found == [], "truesky/numerics/sums.py has products and solutions whose last bit is the same everywhere"
+    assert found == [], "truesky/numerics/matrices.py has products and solutions whose last bit is the same everywhere"

@@ -13,10 +13,10 @@ from lake_schema.columns import Column, Table, round_mantissa
 from lake_schema.errors import BadInput
 from lake_schema.fits.tables import fits_unit
 from lake_schema.store import manifest, parquet
-from lake_schema.tables import declared
+from lake_schema.tables import all_tables
 from tests.universe import TOY, rows_of
 
-TABLES = declared(["euclid_vis", "lsst_r"])
+TABLES = all_tables(["euclid_vis", "lsst_r"])
 
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda t: t.name)
@@ -32,20 +32,20 @@ def test_units_and_ucds_are_standard(table):
 @pytest.mark.parametrize("table", TABLES, ids=lambda t: t.name)
 def test_metadata_survives_into_the_file(table, tmp_path):
     parquet.write(tmp_path / "x.parquet", rows_of(table, 5), table)
-    assert pq.read_schema(tmp_path / "x.parquet").equals(table.arrow(), check_metadata=True)
+    assert pq.read_schema(tmp_path / "x.parquet").equals(table.arrow_schema(), check_metadata=True)
 
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda t: t.name)
 def test_values_survive_the_encodings(table, tmp_path):
     rows = rows_of(table, 1000)
     parquet.write(tmp_path / "x.parquet", rows, table)
-    entry = manifest.file_facts(tmp_path / "x.parquet", "x.parquet")
-    assert parquet.dataset(tmp_path, [entry], table.arrow()).to_table().equals(rows)
+    entry = manifest.file_entry(tmp_path / "x.parquet", "x.parquet")
+    assert parquet.open_dataset(tmp_path, [entry], table.arrow_schema()).to_table().equals(rows)
 
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda t: t.name)
 def test_markdown_names_every_column(table):
-    page = table.markdown()
+    page = table.to_markdown()
     assert all(f"| `{name}` |" in page for name in table.names)
 
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from lake_schema import errors
 
-KINDS = [errors.BadInput, errors.Damaged, errors.Superseded, errors.VersionMismatch, errors.PartsFailed]
+KINDS = [errors.BadInput, errors.Damaged, errors.Superseded, errors.VersionMismatch, errors.TasksFailed]
 
 
 @given(st.text() | st.text(st.characters(), min_size=1).map(lambda text: text * 2000), st.sampled_from(KINDS))

@@ -23,12 +23,16 @@ def test_an_id_is_positive_and_carries_kind_and_halo(parts):
     kind, cell, number, _ = parts
     one = ids.source_id(*parts)
     assert one >= 0
-    assert ids.kind_of(one) == kind
-    assert ids.halo_of(one) == ids.halo_of(ids.source_id(0, cell, number, 0)) == ids.source_id(0, cell, number, 0)
+    assert ids.kind_from_id(one) == kind
+    assert (
+        ids.halo_from_id(one)
+        == ids.halo_from_id(ids.source_id(0, cell, number, 0))
+        == ids.source_id(0, cell, number, 0)
+    )
 
 
 DRAWN = st.tuples(
-    st.integers(0, 12 * 4**8 - 1), st.integers(0, ids.BLOCKS - 1), st.integers(0, 7), st.floats(8.0, 16.0),
+    st.integers(0, 12 * 4**8 - 1), st.integers(0, ids.BLOCK_COUNT - 1), st.integers(0, 7), st.floats(8.0, 16.0),
     st.integers(0, 127),
 )  # fmt: skip
 
@@ -41,7 +45,7 @@ def test_members_of_drawn_halos_have_their_own_ids(a, b):
         halo = ids.drawn_halo_id(cell, np.array([block]), np.array([number]), bits)
         one = ids.satellite_id(halo, np.array([member]), bits)
         assert 0 <= halo[0] < 1 << 60 <= one[0]
-        assert ids.kind_of(one) == 1
+        assert ids.kind_from_id(one) == 1
         assert one[0] >> ids.BLOCK_BITS == 1 << 20 | cell
         # None of those that are numbered in their cells beyond the blocks.
         assert halo[0] & (1 << ids.BLOCK_BITS) - 1 < ids.FIRST_NUMBER << ids.MEMBER_BITS

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lake_schema import instruction_set
-from lake_schema.errors import BadInput, PartsFailed
+from lake_schema.errors import BadInput, TasksFailed
 from lake_schema.store import publish, read
 from lake_schema.store.provenance import machine
 from tests.universe import plain_plan, plain_work
@@ -156,11 +156,11 @@ def test_a_worker_without_the_limit_makes_nothing(lake, monkeypatch):
     monkeypatch.setattr(instruction_set, "_numpy_in_use", lambda: ("X86_V3", "X86_V4"))
     monkeypatch.delenv("TRUESKY_CPU", raising=False)
     try:
-        with pytest.raises(PartsFailed, match="numpy uses X86_V4"):
-            publish.make(lake, plain_plan(1), plain_work)
+        with pytest.raises(TasksFailed, match="numpy uses X86_V4"):
+            publish.make_version(lake, plain_plan(1), plain_work)
     finally:
         instruction_set.require_limit.cache_clear()
-    assert read.tables(lake) == []
+    assert read.table_names(lake) == []
 
 
 def test_an_unknown_setting_is_refused(monkeypatch):

@@ -10,18 +10,18 @@ import pytest
 from lake_schema import listing
 from lake_schema.__main__ import main
 from lake_schema.store import publish
-from tests.lake_schema.store.test_names import made_from
+from tests.lake_schema.store.test_request_links import made_from
 from tests.universe import plain_plan, plain_work, toy_plan, toy_work
 
 
 @pytest.fixture
 def listed(lake):
-    first = publish.make(lake, plain_plan(1), plain_work, name="a")
+    first = publish.make_version(lake, plain_plan(1), plain_work, name="a")
     os.utime(first / "manifest.json", (1.7e9, 1.7e9))
-    publish.make(lake, plain_plan(2), plain_work, name="b")
-    publish.make(lake, made_from(plain_plan(1).key), plain_work, name="a")
+    publish.make_version(lake, plain_plan(2), plain_work, name="b")
+    publish.make_version(lake, made_from(plain_plan(1).key), plain_work, name="a")
     for name in "ab":
-        publish.make(lake, toy_plan(), toy_work, name=name)
+        publish.make_version(lake, toy_plan(), toy_work, name=name)
     return lake
 
 

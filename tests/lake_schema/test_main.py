@@ -10,16 +10,16 @@ import pytest
 
 from lake_schema import __version__
 from lake_schema.__main__ import main
-from lake_schema.errors import Damaged, PartsFailed
+from lake_schema.errors import Damaged, TasksFailed
 from lake_schema.store import garbage, layout, manifest, provenance, publish, read
 from tests.universe import plain_plan, plain_work, toy_plan, toy_work
 
 
 @pytest.fixture
 def filled(lake):
-    publish.make(lake, plain_plan(1), plain_work)
-    publish.make(lake, plain_plan(2), plain_work)
-    publish.make(lake, toy_plan(), toy_work)
+    publish.make_version(lake, plain_plan(1), plain_work)
+    publish.make_version(lake, plain_plan(2), plain_work)
+    publish.make_version(lake, toy_plan(), toy_work)
     return lake
 
 
@@ -39,7 +39,7 @@ def test_verify_says_sound_and_ends_with_0(filled, capsys):
 
 def test_verify_finds_what_it_is_told_to_look_for(filled, capsys):
     version = read.version(filled, "toy")
-    flip(version.file("toy/partition_info.csv"), 5)
+    flip(version.sidecar_path("toy/partition_info.csv"), 5)
     assert main(["verify", str(filled), "toy"]) == 0
     capsys.readouterr()
     assert main(["verify", str(filled), "--deep"]) == 1
@@ -50,7 +50,7 @@ def test_verify_finds_what_it_is_told_to_look_for(filled, capsys):
 
 
 def test_verify_goes_on_after_a_broken_manifest(filled, capsys):
-    flip(layout.current(filled, "plain") / "manifest.json", 30)
+    flip(layout.current_link(filled, "plain") / "manifest.json", 30)
     assert main(["verify", str(filled)]) == 1
     out, err = capsys.readouterr()
     assert "manifest.json" in err
@@ -58,7 +58,7 @@ def test_verify_goes_on_after_a_broken_manifest(filled, capsys):
 
 
 def test_verify_names_a_version_that_is_gone(filled, capsys):
-    shutil.rmtree(layout.version(filled, "plain", plain_plan(2).key))
+    shutil.rmtree(layout.version_folder(filled, "plain", plain_plan(2).key))
     assert main(["verify", str(filled)]) == 1
     out, err = capsys.readouterr()
     assert f"v-{plain_plan(2).key}, which is missing" in err
@@ -74,14 +74,16 @@ def test_verify_goes_on_after_a_file_that_cannot_be_read(filled, capsys, monkeyp
         return real(path)
 
     version = read.version(filled, "toy")
-    flip(version.path(version.parts[2]), 100)
+    flip(version.partition_path(version.partitions[2]), 100)
     monkeypatch.setattr(manifest, "file_sha256", sha256)
     assert main(["verify", str(filled), "toy", "--deep"]) == 1
     out = capsys.readouterr().out
     assert "Npix=1610.parquet has other contents" in out
     assert "Npix=1608.parquet cannot be read: Input/output error" in out
-    monkeypatch.setattr(manifest, "_difference", lambda path, entry: sha256(path) and "")
-    assert [line for line in read.verify(version) if "Npix=1608.parquet cannot be read: Input/output error" in line]
+    monkeypatch.setattr(manifest, "_size_difference", lambda path, entry: sha256(path) and "")
+    assert [
+        line for line in read.find_faults(version) if "Npix=1608.parquet cannot be read: Input/output error" in line
+    ]
 
 
 def test_a_copy_that_followed_links_is_damaged_for_everyone(filled, tmp_path, capsys):
@@ -90,7 +92,7 @@ def test_a_copy_that_followed_links_is_damaged_for_everyone(filled, tmp_path, ca
         assert main([command, str(tmp_path / "copy"), "toy"]) == 1
     assert len([line for line in capsys.readouterr().err.splitlines() if "must keep its links" in line]) == 3
     with pytest.raises(Damaged, match="must keep its links"):
-        publish.make(tmp_path / "copy", toy_plan(), toy_work)
+        publish.make_version(tmp_path / "copy", toy_plan(), toy_work)
 
 
 def test_a_disc_that_refuses_is_one_line(filled, capsys, monkeypatch):
@@ -107,7 +109,7 @@ def test_gc_leaves_what_is_not_its_own(filled, capsys):
     (filled / "plain" / "v-2").mkdir()
     (filled / "runs").mkdir()
     assert main(["gc", str(filled), "--delete"]) == 0
-    assert capsys.readouterr().out == f"removed {layout.version(filled, 'plain', plain_plan(1).key)}\n"
+    assert capsys.readouterr().out == f"removed {layout.version_folder(filled, 'plain', plain_plan(1).key)}\n"
     assert main(["gc", str(filled), "runs", "--delete"]) == 2
     assert list((filled / "runs").iterdir()) == []
     assert {"my-Notes.txt", "v-2"} < {path.name for path in (filled / "plain").iterdir()}
@@ -117,7 +119,7 @@ def test_gc_leaves_what_is_not_its_own(filled, capsys):
 def test_gc_keeps_everything_while_it_does_not_know_what_is_current(filled, capsys, to):
     versions = sorted((filled / "plain").glob("v-*"))
     if to == "gone":
-        shutil.rmtree(versions.pop(versions.index(layout.version(filled, "plain", plain_plan(2).key))))
+        shutil.rmtree(versions.pop(versions.index(layout.version_folder(filled, "plain", plain_plan(2).key))))
     else:
         (filled / "plain" / "current").unlink()
         (filled / "plain" / "current").symlink_to(versions[0])
@@ -134,7 +136,7 @@ def test_an_argument_that_means_nothing_is_refused(arguments, capsys):
 
 
 def test_gc_removes_what_is_old_and_says_so(filled, capsys):
-    old = layout.version(filled, "plain", plain_plan(1).key)
+    old = layout.version_folder(filled, "plain", plain_plan(1).key)
     assert main(["gc", str(filled), "--delete"]) == 0
     assert capsys.readouterr().out == f"removed {old}\n"
     assert not old.exists()
@@ -145,8 +147,8 @@ def test_gc_removes_what_is_old_and_says_so(filled, capsys):
 
 
 def test_gc_removes_the_stage_of_a_run_that_was_given_up(lake, capsys):
-    with pytest.raises(PartsFailed):
-        publish.make(lake, plain_plan(1), lambda root, facts: None)
+    with pytest.raises(TasksFailed):
+        publish.make_version(lake, plain_plan(1), lambda root, facts: None)
     assert main(["gc", str(lake), "--delete"]) == 0
     assert "removed" in capsys.readouterr().out
     assert [path.name for path in (lake / "plain").iterdir()] == [".lock"]

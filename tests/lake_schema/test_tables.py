@@ -12,10 +12,10 @@ from lake_schema.errors import BadInput
 from lake_schema.mission import published
 from lake_schema.mission.configuration import resolve
 from lake_schema.mission.model import read_models
-from lake_schema.mission.parameter import read_all
+from lake_schema.mission.parameter import read_all_parameters
 from lake_schema.store import publish, read
-from lake_schema.store.plan import Output, Part, Plan
-from lake_schema.store.validate import check
+from lake_schema.store.plan import Output, Plan, Task
+from lake_schema.store.validate import check_rows
 from lake_schema.tables import mission, passbands, templates
 from lake_schema.tables.common import Origin
 from lake_schema.tables.exposures import EXPOSURES, ExposureRow
@@ -31,9 +31,9 @@ def test_the_reference_page_is_up_to_date(capsys):
 
 
 def test_tables_are_found_by_name():
-    for table in tables.declared(["euclid_vis", "lsst_r"]):
-        assert tables.find(table.name, table.names) == table
-    assert tables.find("nothing") is None
+    for table in tables.all_tables(["euclid_vis", "lsst_r"]):
+        assert tables.find_table(table.name, table.names) == table
+    assert tables.find_table("nothing") is None
 
 
 def test_a_row_of_exposures_has_a_field_a_column():
@@ -42,9 +42,9 @@ def test_a_row_of_exposures_has_a_field_a_column():
     declared = {c.name: types[c.type] | None if c.nullable else types[c.type] for c in EXPOSURES.columns}
     assert list(get_type_hints(ExposureRow).items()) == list(declared.items())
     row = {name: number for number, name in enumerate(declared)}
-    assert asdict(ExposureRow.of({**row, "another": 0})) == row
+    assert asdict(ExposureRow.from_row({**row, "another": 0})) == row
     with pytest.raises(KeyError, match="survey"):
-        ExposureRow.of({name: value for name, value in row.items() if name != "survey"})
+        ExposureRow.from_row({name: value for name, value in row.items() if name != "survey"})
 
 
 @dataclass
@@ -81,7 +81,7 @@ def origins():
 
 def test_templates_come_back_as_spectra():
     rows = templates.rows(libraries(), origins())
-    check(rows, templates.TEMPLATES)
+    check_rows(rows, templates.TEMPLATES)
     assert rows["sed"].to_pylist() == [0, 1, 0, 1, 2]
     assert rows["teff"].to_pylist() == [None, None, 40_000.0, 5_000.0, None]
     assert rows["log_g"].to_pylist() == [None, None, 4.0, 4.5, None]
@@ -98,7 +98,7 @@ def test_passbands_come_back_as_responses():
     bands = [responses.load(name) for name in ("euclid_vis", "lsst_r")]
     pivots, widths = [responses.pivot_wavelength(b) for b in bands], [responses.log_width(b) for b in bands]
     rows = passbands.rows(bands, pivots, widths, [Origin(b.name, "0" * 64) for b in bands], [-0.1, None])
-    check(rows, passbands.PASSBANDS)
+    check_rows(rows, passbands.PASSBANDS)
     assert rows["ab_minus_vega"].to_pylist() == [-0.1, None]
     assert rows["source"].to_pylist() == ["euclid_vis", "lsst_r"]
     for band, row in zip(bands, rows.to_pylist(), strict=True):
@@ -108,7 +108,7 @@ def test_passbands_come_back_as_responses():
         assert row["first_wavelength"] + row["wavelength_step"] * (len(row["response"]) - 1) == band.wavelength[-1]
         assert 4000 < row["pivot_wavelength"] < 10_000
     with pytest.raises(BadInput, match="medium"):
-        check(passbands.rows([Other()], [5000.0], [0.1], [Origin("x", "")], [None]), passbands.PASSBANDS)
+        check_rows(passbands.rows([Other()], [5000.0], [0.1], [Origin("x", "")], [None]), passbands.PASSBANDS)
 
 
 class Other:
@@ -116,12 +116,12 @@ class Other:
 
 
 def test_the_mission_with_what_a_run_chose():
-    name = next(p.key for p in read_all() if p.unit == "electron")
+    name = next(p.key for p in read_all_parameters() if p.unit == "electron")
     plain, changed = resolve(), resolve(overrides={name: (7.5, "electron")})
     for chosen, given in ((plain, 0), (changed, 1)):
-        rows = published.table(chosen)
-        check(rows, mission.MISSION)
-        assert rows.num_rows == len(read_all()) + len(read_models()) + given
+        rows = published.to_table(chosen)
+        check_rows(rows, mission.MISSION)
+        assert rows.num_rows == len(read_all_parameters()) + len(read_models()) + given
         used = [row for row in rows.to_pylist() if row["chosen"]]
         assert sorted(row["name"] for row in used) == sorted(r.key for r in (*chosen.parameters, *chosen.models))
         values = {row["name"]: (row["value"], row["unit"]) for row in used if row["file"] is None}
@@ -134,7 +134,9 @@ def test_the_mission_with_what_a_run_chose():
 def test_they_can_be_published_and_asked(lake):
     for table, rows in (
         (templates.TEMPLATES, templates.rows(libraries(), origins())),
-        (mission.MISSION, published.table(resolve())),
+        (mission.MISSION, published.to_table(resolve())),
     ):
-        publish.make(lake, Plan(table, {}, (Part("0.parquet", {}),)), lambda root, facts, rows=rows: Output(rows))
+        publish.make_version(
+            lake, Plan(table, {}, (Task("0.parquet", {}),)), lambda root, facts, rows=rows: Output(rows)
+        )
         assert read.version(lake, table.name).rows().equals(rows)

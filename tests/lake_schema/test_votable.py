@@ -13,7 +13,7 @@ from lake_schema import tables, votable
 from lake_schema.store import parquet
 from tests.universe import PLAIN, rows_of
 
-DECLARED = tables.declared(["euclid_vis", "lsst_r"])
+DECLARED = tables.all_tables(["euclid_vis", "lsst_r"])
 
 
 def opened(path):
@@ -43,7 +43,7 @@ def test_the_header_is_a_votable(table):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", units.UnitsWarning)
         (field, *_) = (
-            astropy_votable.parse(io.BytesIO(votable.header(table).encode()), verify="exception")
+            astropy_votable.parse(io.BytesIO(votable.table_header(table).encode()), verify="exception")
             .get_first_table()
             .fields
         )
@@ -63,4 +63,4 @@ def test_missing_texts_and_no_rows(tmp_path):
 def test_our_own_schema_is_as_declared(tmp_path):
     """The header stands in the footer alone: what Arrow makes of a file does not change by it."""
     parquet.write(tmp_path / "x.parquet", rows_of(PLAIN, 3), PLAIN)
-    assert pq.read_schema(tmp_path / "x.parquet").equals(PLAIN.arrow(), check_metadata=True)
+    assert pq.read_schema(tmp_path / "x.parquet").equals(PLAIN.arrow_schema(), check_metadata=True)

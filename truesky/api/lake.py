@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from lake_schema import bounds
+from lake_schema import arguments
 from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 from lake_schema.fits import images
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from astropy.wcs import WCS
 
 # Numbers of exposures and sources are 64-bit integers.
-_LARGEST = 2**63 - 1
+_MAX_INT64 = 2**63 - 1
 
 
 class Lake(LakeTables):
@@ -71,9 +71,9 @@ class Lake(LakeTables):
             One row per file: the columns of the table ``products``, and ``file``, its path relative to the lake.
         """
         version = self._explorer._version("products")
-        found = version.rows().to_pandas()
-        found["file"] = [f"products/v-{version.key}/{path}" for path in found["path"]]
-        return found if content is None else found[found["content"] == content].reset_index(drop=True)
+        files = version.rows().to_pandas()
+        files["file"] = [f"products/v-{version.key}/{path}" for path in files["path"]]
+        return files if content is None else files[files["content"] == content].reset_index(drop=True)
 
     def image(self, path: str, electrons: bool = False) -> Image:
         """Read one image as the pixels of its detector, without overscan and in one piece.
@@ -101,7 +101,7 @@ class Lake(LakeTables):
         """
         from truesky.render.products import read_back
 
-        file = self._explorer._version("products").file(path)
+        file = self._explorer._version("products").sidecar_path(path)
         return read_back.electrons(file) if electrons else read_back.frame(file)
 
     def extensions(self, path: str) -> list[Image]:
@@ -118,7 +118,7 @@ class Lake(LakeTables):
             One per extension of the FITS file, the first with the header that holds for all. `data` is None if an
             extension has no array.
         """
-        return images.read_images(self._explorer._version("products").file(path))
+        return images.read_images(self._explorer._version("products").sidecar_path(path))
 
     def wcs(self, path: str) -> WCS:
         """Return the world coordinate system of an image's pixels.
@@ -137,7 +137,7 @@ class Lake(LakeTables):
 
         from truesky.render.products import read_back
 
-        cards = read_back.header(self._explorer._version("products").file(path))
+        cards = read_back.header(self._explorer._version("products").sidecar_path(path))
         header = {keyword: value for keyword, value, _ in cards}
         with warnings.catch_warnings():
             # astropy reports that it understands the date.
@@ -177,10 +177,10 @@ class Lake(LakeTables):
         from truesky.render import models
 
         version = self._explorer._version("products")
-        number = bounds.whole("exposure_id", exposure_id, 0, _LARGEST)
-        ids = None if sources is None else bounds.wholes("sources", sources, 0, _LARGEST)
-        found = models.models(self._explorer.root, version, number, str(detector), ids)
-        return ((one.id, one.frame) for one in found)
+        number = arguments.check_integer("exposure_id", exposure_id, 0, _MAX_INT64)
+        ids = None if sources is None else arguments.check_integers("sources", sources, 0, _MAX_INT64)
+        source_models = models.models(self._explorer.root, version, number, str(detector), ids)
+        return ((source_model.id, source_model.frame) for source_model in source_models)
 
     def truth(self, exposure_id: int, detector: str) -> pd.DataFrame:
         """List the sources that were drawn on one detector of an exposure.
@@ -202,8 +202,8 @@ class Lake(LakeTables):
         BadInput
             If nothing was rendered for this detector.
         """
-        known = self.images(content=None)
-        if not np.any((known["exposure_id"] == exposure_id) & (known["detector"] == detector)):
+        files = self.images(content=None)
+        if not np.any((files["exposure_id"] == exposure_id) & (files["detector"] == detector)):
             raise BadInput(
                 f"lake {self._explorer.root}: nothing was rendered for detector {detector} of exposure {exposure_id}"
             )

@@ -10,7 +10,7 @@ from typing import Any
 
 import pandas as pd
 
-from lake_schema import bounds, instruction_set, user_files
+from lake_schema import arguments, instruction_set, user_files
 from lake_schema.arrays import as_python
 from lake_schema.errors import BadInput
 from lake_schema.store import layout
@@ -21,9 +21,9 @@ from truesky.commands import space, submit
 from truesky.request import accuracy, universe
 from truesky.request.from_toml import from_table, parse
 from truesky.request.schema import Request
-from truesky.running import shell
+from truesky.running import submitted_job
 
-_MOST_DETECTORS = 2**63 - 1
+_MAX_DETECTORS = 2**63 - 1
 
 
 def check(request: str | Path | Mapping[str, Any]) -> Request:
@@ -52,11 +52,11 @@ def check(request: str | Path | Mapping[str, Any]) -> Request:
     >>> truesky.check({"name": "field", "seed": 1, "area": area, "fluxes": {"bands": ["euclid_vis"]}}).seed
     1
     """
-    parsed = _parsed(request)
+    parsed = _parse_request(request)
     try:
-        check_command.refuse(parsed)
+        check_command.check_request(parsed)
     except BadInput as error:
-        raise BadInput(f"{_name(request)}: {error}") from None
+        raise BadInput(f"{_describe_request(request)}: {error}") from None
     return parsed
 
 
@@ -101,23 +101,23 @@ def run(
     LakeError
         If a job fails.
     """
-    names = bounds.names("detectors", detectors)
-    most = None if limit is None else bounds.whole("limit", limit, 1, _MOST_DETECTORS)
-    wanted = replace(_parsed(request), detectors=names, limit=most)
+    detector_names = arguments.check_names("detectors", detectors)
+    max_detectors = None if limit is None else arguments.check_integer("limit", limit, 1, _MAX_DETECTORS)
+    parsed_request = replace(_parse_request(request), detectors=detector_names, limit=max_detectors)
     instruction_set.check()
-    root = layout.lake(lake)
-    universe.refuse_others(root, wanted)
-    stages = run_command.stages(wanted, lenses, gaia)
+    root = layout.resolve_lake(lake)
+    universe.check_lake(root, parsed_request)
+    stages = run_command.stages(parsed_request, lenses, gaia)
     try:
-        plan = run_command.checked_plan(root, wanted, stages)
+        plan = run_command.checked_plan(root, parsed_request, stages)
     except BadInput as error:
-        raise BadInput(f"{_name(request)}: {error}") from None
-    space.check(root, wanted, plan)
-    if not shell.has_session():
+        raise BadInput(f"{_describe_request(request)}: {error}") from None
+    space.check(root, parsed_request, plan)
+    if not submitted_job.has_session():
         submit.use_environment()
     for stage in stages:
-        shell.run(import_module(stage.module).JOB, root, stage.request(wanted))
-    return Lake(root, request=wanted.name)
+        submitted_job.run(import_module(stage.module).JOB, root, stage.request(parsed_request))
+    return Lake(root, request=parsed_request.name)
 
 
 def accuracies() -> pd.DataFrame:
@@ -131,32 +131,36 @@ def accuracies() -> pd.DataFrame:
         the errors that were measured, with the ending ``_reached``; ``seconds`` of CPU time for all sources of a VIS
         detector; and the settings of drawing that are used.
     """
-    found = {}
+    rows = {}
     for name, allowed in accuracy.PRESETS.items():
-        row, errors = accuracy.row_for(allowed), asdict(allowed)
-        reached = {f"{key}_reached": value for key, value in asdict(accuracy.reached(allowed)).items()}
+        row, errors = accuracy.fastest_row(allowed), asdict(allowed)
+        reached = {f"{key}_reached": value for key, value in asdict(accuracy.expected_errors(allowed)).items()}
         settings = {key: value for key, value in row.items() if key.removesuffix("_held") not in errors}
-        found[name] = {**errors, **reached, **settings}
-    return pd.DataFrame.from_dict(found, orient="index")
+        rows[name] = {**errors, **reached, **settings}
+    return pd.DataFrame.from_dict(rows, orient="index")
 
 
-def _parsed(request: str | Path | Mapping[str, Any]) -> Request:
+def _parse_request(request: str | Path | Mapping[str, Any]) -> Request:
     if isinstance(request, Mapping):
-        return from_table(_as_toml(request))
-    return parse(user_files.expanded(request))
+        return from_table(_to_toml_value(request))
+    return parse(user_files.expand_path(request))
 
 
-def _as_toml(value: Any) -> Any:
+def _to_toml_value(value: Any) -> Any:
     """A value of a dictionary as a TOML file would give it."""
     if isinstance(value, Mapping):
-        return {key: _as_toml(entry) for key, entry in value.items()}
+        return {key: _to_toml_value(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_as_toml(entry) for entry in value]
+        return [_to_toml_value(entry) for entry in value]
     try:
         return as_python(value)
     except TypeError:
         return value
 
 
-def _name(request: str | Path | Mapping[str, Any]) -> str:
-    return "request" if isinstance(request, Mapping) else f"request {user_files.shown(user_files.expanded(request))}"
+def _describe_request(request: str | Path | Mapping[str, Any]) -> str:
+    return (
+        "request"
+        if isinstance(request, Mapping)
+        else f"request {user_files.format_path(user_files.expand_path(request))}"
+    )

@@ -9,7 +9,7 @@ from typing import Any, Self
 
 import pandas as pd
 
-from lake_schema import bounds
+from lake_schema import arguments
 from lake_schema.arrays import Float, Int
 from truesky.explore.explorer import ORDER, Explorer
 from truesky.explore.process import MEMORY, TIMEOUT
@@ -83,7 +83,7 @@ class LakeTables:
         """
         from truesky.explore import results
 
-        return results.converted(self._explorer._version(name).rows(_names(columns)), into)
+        return results.convert(self._explorer._version(name).rows(_names(columns)), into)
 
     def sql(self, query: str, /, into: str = "pandas", **parameters: object) -> Any:
         """Run one SELECT over the tables of the lake.
@@ -263,4 +263,4 @@ class LakeTables:
 
 
 def _names(columns: str | Sequence[str] | None) -> Sequence[str] | None:
-    return None if columns is None else bounds.names("columns", columns)
+    return None if columns is None else arguments.check_names("columns", columns)

@@ -11,19 +11,19 @@ import pyarrow.compute as pc
 from lake_schema import sky
 from lake_schema.errors import BadInput
 from lake_schema.store import layout, read
-from lake_schema.store.plan import Json, Output, Part, Plan
+from lake_schema.store.plan import Json, Output, Plan, Task
 from lake_schema.store.provenance import code_version
 from lake_schema.tables.gaia import GAIA
 from truesky.catalogue.stars import gaia
 from truesky.request import universe
 from truesky.request.schema import Request
-from truesky.running.shell import Job, Step
+from truesky.running.submitted_job import Job, Step
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
     """One part a file of the stars."""
-    stars, fluxes = (read.for_request(lake, name, request.name) for name in ("stars", "star_fluxes"))
-    universe.refuse_other([stars], request)
+    stars, fluxes = (read.input_version(lake, name, request.name) for name in ("stars", "star_fluxes"))
+    universe.check_catalogues([stars], request)
     if missing := [name for name in gaia.FLUX_COLUMNS if name not in fluxes.schema.names]:
         raise BadInput(
             f"table star_fluxes has no column {', '.join(missing)}: put {', '.join(gaia.BANDS)} into fluxes.bands and "
@@ -32,23 +32,23 @@ def steps(lake: Path, request: Request) -> list[Step]:
     if fluxes.manifest["facts"].get("input") != stars.key:
         raise BadInput("table star_fluxes was computed from another version of stars: run compute_fluxes first")
     facts = {"seed": request.seed, "stars": stars.key, "star_fluxes": fluxes.key, "code": code_version()}
-    parts = tuple(Part(name, {"part": name}) for name in stars.parts)
-    return [Step(Plan(GAIA, facts, parts), work)]
+    tasks = tuple(Task(name, {"part": name}) for name in stars.partitions)
+    return [Step(Plan(GAIA, facts, tasks), observe_stars)]
 
 
-def work(lake: Path, facts: Json) -> Output:
+def observe_stars(lake: Path, facts: Json) -> Output:
     """What Gaia finds in a file's cell: also stars from beside it, whose measured place may lie inside."""
-    part = facts["part"]
-    stars = _rows(read.version(lake, "stars", facts["stars"]), part, gaia.STAR_COLUMNS)
-    fluxes = _rows(read.version(lake, "star_fluxes", facts["star_fluxes"]), part, gaia.FLUX_COLUMNS)
+    partition = facts["part"]
+    stars = _rows(read.version(lake, "stars", facts["stars"]), partition, gaia.STAR_COLUMNS)
+    fluxes = _rows(read.version(lake, "star_fluxes", facts["star_fluxes"]), partition, gaia.FLUX_COLUMNS)
     rows = gaia.observe(stars, fluxes, facts["seed"])
-    first, last = sky.cell_range(*layout.cell_of_file(part))
+    first, last = sky.cell_range(*layout.cell_of_file(partition))
     index = rows["_healpix_29"]
     return Output(rows.filter(pc.and_(pc.greater_equal(index, first), pc.less(index, last))))
 
 
-def _rows(version: read.Version, part: str, columns: list[str]) -> pa.Table:
-    return pa.concat_tables([version.rows(columns, [part]), version.margin(part, columns)])
+def _rows(version: read.Version, partition: str, columns: list[str]) -> pa.Table:
+    return pa.concat_tables([version.rows(columns, [partition]), version.read_margin(partition, columns)])
 
 
 JOB = Job("build_gaia", "List the stars as Gaia would.", steps)

@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from lake_schema.ids import FILE_ORDER, GENERATION_ORDER
 from lake_schema.store import layout, parquet, read
-from lake_schema.store.plan import Json, Output, Part, Plan
+from lake_schema.store.plan import Json, Output, Plan, Task
 from lake_schema.store.provenance import code_version
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.halos import HALO_LIMITS, HALOS
@@ -28,9 +28,9 @@ from truesky.catalogue.request_checks import check_band
 from truesky.fluxes import sources
 from truesky.request.area import Area
 from truesky.request.checks import check_rendered
-from truesky.request.files import Catalogue, DustMap, GivenSources, Ingest
+from truesky.request.files import Catalogue, DustMap, Ingest, UserSources
 from truesky.request.schema import Request, Universe
-from truesky.running.shell import Job, Step
+from truesky.running.submitted_job import Job, Step
 
 _HALO_FACTS = ("galaxy_limit", "z_max", "box_cells")
 _LENS_FACTS = ("lensing", "rotation")
@@ -45,73 +45,87 @@ def steps(lake: Path, request: Request) -> list[Step]:
     """
     check_rendered(request)
     # Whatever is wrong with a file is said before anything is published.
-    dust_map.chosen(request.seed, request.ingest.dust)
+    dust_map.map_for_request(request.seed, request.ingest.dust)
     if request.sources is not None:
-        made = [_given(request, request.sources)]
+        table_steps = [_given_step(request, request.sources)]
     elif request.ingest.galaxies is not None:
-        made = [_ingested(lake, request, request.ingest.galaxies)]
+        table_steps = [_ingest_step(lake, request, request.ingest.galaxies)]
     else:
-        made = _drawn(lake, request)
-    facts = {"galaxies": made[-1].plan.key, "code": code_version()}
-    apart = Plan(QUARANTINE, facts, (Part("all.parquet", {}),))
-    return [*made, Step(apart, quarantine_work, on_driver=True)]
+        table_steps = _draw_steps(lake, request)
+    facts = {"galaxies": table_steps[-1].plan.key, "code": code_version()}
+    quarantine = Plan(QUARANTINE, facts, (Task("all.parquet", {}),))
+    return [*table_steps, Step(quarantine, collect_quarantine, on_driver=True)]
 
 
-def _drawn(lake: Path, request: Request) -> list[Step]:
+def _draw_steps(lake: Path, request: Request) -> list[Step]:
     universe = request.facts("universe")["universe"]
     del universe["star_limit"]
-    own = request.ingest
+    user_inputs = request.ingest
     check_band(request)
     # The spectra of a training table say how faint a halo's galaxy may be.
-    theirs = {"halos": _about(own.halos, mapping.halos(dict(own.halos.columns)))} if own.halos else {}
-    theirs |= {"training": _about(own.training, mapping.training(dict(own.training.columns)))} if own.training else {}
-    facts = {"seed": request.seed, **universe, **theirs, **dust_map.facts(own.dust), "code": code_version()}
-    parts = cells.parts(request.area)
-    of_halos = {key: facts[key] for key in ("seed", *_HALO_FACTS, "galaxy_band", *theirs, "code")}
-    halos, limits = Plan(HALOS, of_halos, parts), Plan(HALO_LIMITS, of_halos, (Part("all.parquet", {}),))
+    external_facts = (
+        {"halos": _input_facts(user_inputs.halos, mapping.halo_columns(dict(user_inputs.halos.columns)))}
+        if user_inputs.halos
+        else {}
+    )
+    external_facts |= (
+        {"training": _input_facts(user_inputs.training, mapping.training_columns(dict(user_inputs.training.columns)))}
+        if user_inputs.training
+        else {}
+    )
+    facts = {
+        "seed": request.seed,
+        **universe,
+        **external_facts,
+        **dust_map.facts(user_inputs.dust),
+        "code": code_version(),
+    }
+    tasks = cells.tasks_of_area(request.area)
+    halo_facts = {key: facts[key] for key in ("seed", *_HALO_FACTS, "galaxy_band", *external_facts, "code")}
+    halos, limits = Plan(HALOS, halo_facts, tasks), Plan(HALO_LIMITS, halo_facts, (Task("all.parquet", {}),))
     # Up to this multipole the lensing has the power of linear theory within 10 %.
-    reach = {"lensing_l_max": facts["lensing_nside"]} if request.universe.lensing is None else {}
-    plan = Plan(GALAXIES, {**facts, **reach}, parts)
-    if not layout.version(lake, GALAXIES.name, plan.key).exists():
+    multipole_limit = {"lensing_l_max": facts["lensing_nside"]} if request.universe.lensing is None else {}
+    plan = Plan(GALAXIES, {**facts, **multipole_limit}, tasks)
+    if not layout.version_folder(lake, GALAXIES.name, plan.key).exists():
         # The box and its lensing are made here, once, and only mapped by the workers.
-        _universe(facts, own)
+        _universe(facts, user_inputs)
     return [
-        Step(halos, partial(halo_work, own=own)),
-        Step(limits, partial(limit_work, own=own), on_driver=True),
-        Step(plan, partial(work, own=own)),
+        Step(halos, partial(draw_halos, user_inputs=user_inputs)),
+        Step(limits, partial(list_halo_limits, user_inputs=user_inputs), on_driver=True),
+        Step(plan, partial(draw_galaxies, user_inputs=user_inputs)),
     ]
 
 
-def halo_work(lake: Path, facts: Json, own: Ingest | None = None) -> Output:
+def draw_halos(lake: Path, facts: Json, user_inputs: Ingest | None = None) -> Output:
     """The halos of one order-5 cell."""
-    light_cone, training = _external(facts, own)
-    found = galaxies.halos_and_galaxies(facts["seed"], _wanted(facts, _HALO_FACTS), light_cone, training)
-    drawn = population.Cells(found)
-    return Output(cells.rows(facts, HALOS, lambda cell: galaxies.halo_table(cell, found, drawn)))
+    light_cone, training = _load_external(facts, user_inputs)
+    universe = galaxies.halos_and_galaxies(facts["seed"], _universe_section(facts, _HALO_FACTS), light_cone, training)
+    drawn_cells = population.CellCache(universe)
+    return Output(cells.draw_rows(facts, HALOS, lambda cell: galaxies.halo_table(cell, universe, drawn_cells)))
 
 
-def limit_work(lake: Path, facts: Json, own: Ingest | None = None) -> Output:
+def list_halo_limits(lake: Path, facts: Json, user_inputs: Ingest | None = None) -> Output:
     """From which mass on all halos are listed."""
-    light_cone, training = _external(facts, own)
-    found = galaxies.halos_and_galaxies(facts["seed"], _wanted(facts, _HALO_FACTS), light_cone, training)
-    return Output(galaxies.halo_limits(found))
+    light_cone, training = _load_external(facts, user_inputs)
+    universe = galaxies.halos_and_galaxies(facts["seed"], _universe_section(facts, _HALO_FACTS), light_cone, training)
+    return Output(galaxies.halo_limits(universe))
 
 
-def work(lake: Path, facts: Json, own: Ingest | None = None) -> Output:
+def draw_galaxies(lake: Path, facts: Json, user_inputs: Ingest | None = None) -> Output:
     """The galaxies that are seen in one order-5 cell."""
-    universe = _universe(facts, own)
-    dust = dust_map.chosen(facts["seed"], own.dust if own else None)
-    drawn = population.Cells(universe.population)
-    return _parted(facts, observed_cells.draw(facts["generation_cells"], universe, drawn, dust))
+    universe = _universe(facts, user_inputs)
+    dust = dust_map.map_for_request(facts["seed"], user_inputs.dust if user_inputs else None)
+    drawn_cells = population.CellCache(universe.population)
+    return _split_quarantine(facts, observed_cells.draw(facts["generation_cells"], universe, drawn_cells, dust))
 
 
-def quarantine_work(lake: Path, facts: Json) -> Output:
+def collect_quarantine(lake: Path, facts: Json) -> Output:
     """What lies beside the galaxies of all cells."""
     version = read.version(lake, GALAXIES.name, facts["galaxies"])
-    there = {entry["path"] for entry in version.manifest["files"]}
+    existing = {entry["path"] for entry in version.manifest["files"]}
     names = (quarantine_file(part["facts"]["generation_cells"]) for part in version.manifest["parts"])
-    found = [version.beside(name) for name in names if name in there]
-    return Output(pa.concat_tables([QUARANTINE.empty(), *found]))
+    tables = [version.read_sidecar(name) for name in names if name in existing]
+    return Output(pa.concat_tables([QUARANTINE.empty(), *tables]))
 
 
 def quarantine_file(generation_cells: Sequence[int]) -> str:
@@ -119,108 +133,120 @@ def quarantine_file(generation_cells: Sequence[int]) -> str:
     return f"quarantine/{layout.cell_file(FILE_ORDER, generation_cells[0] >> 2 * (GENERATION_ORDER - FILE_ORDER))}"
 
 
-def _parted(facts: Json, rows: pa.Table) -> Output:
+def _split_quarantine(facts: Json, rows: pa.Table) -> Output:
     kappa, gamma1, gamma2 = (rows[name].to_numpy().astype(float) for name in ("kappa", "gamma1", "gamma2"))
-    apart = lensing.near_caustic(kappa, gamma1, gamma2, lensing.settings().caustic)
-    if not apart.any():
+    quarantined = lensing.is_near_caustic(kappa, gamma1, gamma2, lensing.settings().caustic)
+    if not quarantined.any():
         return Output(rows)
-    given = {name: rows[name].filter(pa.array(apart)) for name in rows.column_names}
-    found = QUARANTINE.build({**given, "determinant": sources.determinant(kappa, gamma1, gamma2)[apart]})
+    columns = {name: rows[name].filter(pa.array(quarantined)) for name in rows.column_names}
+    quarantine_rows = QUARANTINE.build(
+        {**columns, "determinant": sources.determinant(kappa, gamma1, gamma2)[quarantined]}
+    )
     name = quarantine_file(facts["generation_cells"])
-    return Output(rows.filter(pa.array(~apart)), {name: lambda path: parquet.write(path, found, QUARANTINE)})
+    return Output(
+        rows.filter(pa.array(~quarantined)), {name: lambda path: parquet.write(path, quarantine_rows, QUARANTINE)}
+    )
 
 
-def _universe(facts: Json, own: Ingest | None = None) -> GalaxyModel:
-    light_cone, training = _external(facts, own)
-    return galaxies.model(facts["seed"], _wanted(facts, _GALAXY_FACTS), light_cone, training)
+def _universe(facts: Json, user_inputs: Ingest | None = None) -> GalaxyModel:
+    light_cone, training = _load_external(facts, user_inputs)
+    return galaxies.model(facts["seed"], _universe_section(facts, _GALAXY_FACTS), light_cone, training)
 
 
-def _wanted(facts: Json, names: Sequence[str]) -> Universe:
+def _universe_section(facts: Json, names: Sequence[str]) -> Universe:
     return Universe(**{name: facts[name] for name in ("galaxy_band", *names)})
 
 
-def _external(facts: Json, own: Ingest | None) -> tuple[LightCone | None, Training | None]:
+def _load_external(facts: Json, user_inputs: Ingest | None) -> tuple[LightCone | None, Training | None]:
     """The user's halos and observed galaxies, where the request names some."""
     light_cone = training = None
-    if own is not None and own.halos is not None:
-        columns = mapping.halos(dict(own.halos.columns))
-        found, _ = ingest.listed(own.halos.files, columns)
-        light_cone = halo_catalogue.load(found, facts["halos"]["sha256"], columns)
-    if own is not None and own.training is not None:
-        columns = mapping.training(dict(own.training.columns))
-        found, _ = ingest.listed(own.training.files, columns)
-        training = nearest_sed.load(found, facts["training"]["sha256"], columns)
+    if user_inputs is not None and user_inputs.halos is not None:
+        columns = mapping.halo_columns(dict(user_inputs.halos.columns))
+        files, _ = ingest.list_files(user_inputs.halos.files, columns)
+        light_cone = halo_catalogue.load(files, facts["halos"]["sha256"], columns)
+    if user_inputs is not None and user_inputs.training is not None:
+        columns = mapping.training_columns(dict(user_inputs.training.columns))
+        files, _ = ingest.list_files(user_inputs.training.files, columns)
+        training = nearest_sed.load(files, facts["training"]["sha256"], columns)
     return light_cone, training
 
 
-def _about(given: Catalogue, columns: mapping.Columns) -> Json:
-    return {"sha256": ingest.files(given.files, columns)[1], "columns": dict(given.columns)}
+def _input_facts(catalogue: Catalogue, columns: mapping.Columns) -> Json:
+    return {"sha256": ingest.files_with_checksums(catalogue.files, columns)[1], "columns": dict(catalogue.columns)}
 
 
-def _ingested(lake: Path, request: Request, given: Catalogue) -> Step:
-    columns = _columns(given, request.universe.lensing is not None)
-    found, sha256 = ingest.files(given.files, columns)
-    about = {"sha256": sha256, "format": given.format, "columns": dict(given.columns)}
+def _ingest_step(lake: Path, request: Request, catalogue: Catalogue) -> Step:
+    columns = _columns(catalogue, request.universe.lensing is not None)
+    files, sha256 = ingest.files_with_checksums(catalogue.files, columns)
+    catalogue_facts = {"sha256": sha256, "format": catalogue.format, "columns": dict(catalogue.columns)}
     dust = request.ingest.dust
     universe = request.facts("universe")["universe"]
-    controlled = {name: universe[name] for name in _LENS_FACTS}
-    facts = {"seed": request.seed, "ingest": about, **controlled, **dust_map.facts(dust), "code": code_version()}
-    plan = Plan(GALAXIES, facts, cells.parts(request.area))
-    if not layout.version(lake, GALAXIES.name, plan.key).exists():
-        ingest.split(found, sha256, columns)
-    return Step(plan, partial(ingested_work, given=given, dust=dust))
+    lens_facts = {name: universe[name] for name in _LENS_FACTS}
+    facts = {
+        "seed": request.seed,
+        "ingest": catalogue_facts,
+        **lens_facts,
+        **dust_map.facts(dust),
+        "code": code_version(),
+    }
+    plan = Plan(GALAXIES, facts, cells.tasks_of_area(request.area))
+    if not layout.version_folder(lake, GALAXIES.name, plan.key).exists():
+        ingest.split_by_cell(files, sha256, columns)
+    return Step(plan, partial(ingest_galaxies, catalogue=catalogue, dust=dust))
 
 
-def _columns(given: Catalogue, is_lensed_anew: bool) -> mapping.Columns:
+def _columns(catalogue: Catalogue, is_lensed_anew: bool) -> mapping.Columns:
     """The mapping of a catalogue, which is seen where it says; where it is, if a request lenses it in another way."""
-    columns = mapping.galaxies(given.format, dict(given.columns))
-    return mapping.unlensed(columns) if is_lensed_anew else columns
+    columns = mapping.galaxy_columns(catalogue.format, dict(catalogue.columns))
+    return mapping.drop_lensed_positions(columns) if is_lensed_anew else columns
 
 
-def _given(request: Request, own: GivenSources) -> Step:
+def _given_step(request: Request, source_tables: UserSources) -> Step:
     universe = request.facts("universe")["universe"]
-    controlled = {name: universe[name] for name in _LENS_FACTS}
-    about = own.facts(request.area.bounds())
-    given_sources.load(own, request.area)
+    lens_facts = {name: universe[name] for name in _LENS_FACTS}
+    source_facts = source_tables.facts(request.area.bounding_circle())
+    given_sources.load(source_tables, request.area)
     plan = Plan(
         GALAXIES,
-        {"seed": request.seed, "sources": about, **controlled, "code": code_version()},
-        cells.parts(request.area),
+        {"seed": request.seed, "sources": source_facts, **lens_facts, "code": code_version()},
+        cells.tasks_of_area(request.area),
     )
-    return Step(plan, partial(given_work, own=own, area=request.area))
+    return Step(plan, partial(draw_given_galaxies, source_tables=source_tables, area=request.area))
 
 
-def given_work(lake: Path, facts: Json, own: GivenSources, area: Area) -> Output:
+def draw_given_galaxies(lake: Path, facts: Json, source_tables: UserSources, area: Area) -> Output:
     """The galaxies of a request that names them all, of one order-5 cell.
 
     lake  : not used;  facts : of the part
     own   : the tables;  area : of the request
     """
-    given = given_sources.load(own, area, facts["sources"])
-    model = given_sources.model(facts["seed"], own, given, _shear(facts), facts["rotation"])
-    return _parted(facts, cells.rows(facts, GALAXIES, lambda cell: given_sources.galaxies(cell, given, model)))
+    source_columns = given_sources.load(source_tables, area, facts["sources"])
+    model = given_sources.model(facts["seed"], source_tables, source_columns, _shear(facts), facts["rotation"])
+    return _split_quarantine(
+        facts, cells.draw_rows(facts, GALAXIES, lambda cell: given_sources.galaxies(cell, source_columns, model))
+    )
 
 
 def _shear(facts: Json) -> Shear | None:
     return None if facts["lensing"] is None else Shear(*facts["lensing"])
 
 
-def ingested_work(lake: Path, facts: Json, given: Catalogue, dust: DustMap | None) -> Output:
+def ingest_galaxies(lake: Path, facts: Json, catalogue: Catalogue, dust: DustMap | None) -> Output:
     """A catalogue's galaxies of one order-5 cell.
 
     lake  : folder of the lake;  facts : of the plan and of the part, which has its cell
     given : the catalogue's files and columns;  dust : an external map of dust, None = the embedded one
     """
-    columns = _columns(given, facts["lensing"] is not None)
-    found, _ = ingest.listed(given.files, columns)
-    laid_out = ingest.split(found, facts["ingest"]["sha256"], columns)
-    model = from_catalogue.model(facts["seed"], columns, laid_out, _shear(facts), facts["rotation"])
-    sky_map = dust_map.chosen(facts["seed"], dust)
+    columns = _columns(catalogue, facts["lensing"] is not None)
+    files, _ = ingest.list_files(catalogue.files, columns)
+    split_catalogue = ingest.split_by_cell(files, facts["ingest"]["sha256"], columns)
+    model = from_catalogue.model(facts["seed"], columns, split_catalogue, _shear(facts), facts["rotation"])
+    sky_map = dust_map.map_for_request(facts["seed"], dust)
 
     def draw(cell: int) -> pa.Table:
-        return from_catalogue.draw(cell, ingest.rows(laid_out, cell), model, sky_map)
+        return from_catalogue.draw(cell, ingest.rows_of_cell(split_catalogue, cell), model, sky_map)
 
-    return _parted(facts, cells.rows(facts, GALAXIES, draw))
+    return _split_quarantine(facts, cells.draw_rows(facts, GALAXIES, draw))
 
 
 JOB = Job("build_galaxies", "Draw the halos and galaxies of a sky area.", steps)

@@ -13,12 +13,12 @@ from truesky.catalogue import cells, dust_map, given_sources, request_checks
 from truesky.catalogue.stars import stars
 from truesky.request.area import Area
 from truesky.request.checks import check_rendered
-from truesky.request.files import DustMap, GivenSources
+from truesky.request.files import DustMap, UserSources
 from truesky.request.schema import Request, Stars
-from truesky.running.shell import Job, Step
+from truesky.running.submitted_job import Job, Step
 
 # Lowest order of a file: 54 deg2, what a bright limit leaves in them is soon drawn.
-_LARGEST = 3
+_MIN_FILE_ORDER = 3
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
@@ -26,7 +26,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
     check_rendered(request)
     choice = request.stars
     if request.sources is not None:
-        return [_given(request, request.sources)]
+        return [_given_step(request, request.sources)]
     facts = {
         "seed": request.seed,
         "star_limit": request.universe.star_limit,
@@ -38,45 +38,51 @@ def steps(lake: Path, request: Request) -> list[Step]:
         **dust_map.facts(request.ingest.dust),
         "code": code_version(),
     }
-    drawn = request.area.cells()
-    numbers = stars.numbers(drawn, request_checks.star_model(facts["star_limit"], choice, facts))
-    parts = cells.by_number(drawn, numbers, choice.rows_a_file, _LARGEST)
-    return [Step(Plan(STARS, facts, parts), partial(work, choice=choice, own=request.ingest.dust))]
+    generation_cells = request.area.cells()
+    numbers = stars.expected_counts(generation_cells, request_checks.star_model(facts["star_limit"], choice, facts))
+    tasks = cells.tasks_by_row_count(generation_cells, numbers, choice.rows_a_file, _MIN_FILE_ORDER)
+    return [Step(Plan(STARS, facts, tasks), partial(draw_stars, choice=choice, user_dust_map=request.ingest.dust))]
 
 
-def _given(request: Request, own: GivenSources) -> Step:
-    facts = {"seed": request.seed, "sources": own.facts(request.area.bounds()), "code": code_version()}
-    model = _given_model(own, request.area)
-    drawn = request.area.cells()
-    parts = cells.by_number(drawn, stars.numbers(drawn, model), request.stars.rows_a_file, _LARGEST)
-    return Step(Plan(STARS, facts, parts), partial(given_work, own=own, area=request.area))
+def _given_step(request: Request, source_tables: UserSources) -> Step:
+    facts = {
+        "seed": request.seed,
+        "sources": source_tables.facts(request.area.bounding_circle()),
+        "code": code_version(),
+    }
+    model = _given_model(source_tables, request.area)
+    generation_cells = request.area.cells()
+    tasks = cells.tasks_by_row_count(
+        generation_cells, stars.expected_counts(generation_cells, model), request.stars.rows_a_file, _MIN_FILE_ORDER
+    )
+    return Step(Plan(STARS, facts, tasks), partial(draw_given_stars, source_tables=source_tables, area=request.area))
 
 
-def given_work(lake: Path, facts: Json, own: GivenSources, area: Area) -> Output:
+def draw_given_stars(lake: Path, facts: Json, source_tables: UserSources, area: Area) -> Output:
     """The stars of a request that names them all, of one file's cell.
 
     lake  : not used;  facts : of the part
     own   : the tables;  area : of the request
     """
-    model, dust = _given_model(own, area, facts["sources"]), np.zeros(12, np.float32)
-    return Output(cells.rows(facts, STARS, lambda cell: stars.draw(cell, facts["seed"], model, dust)))
+    model, dust = _given_model(source_tables, area, facts["sources"]), np.zeros(12, np.float32)
+    return Output(cells.draw_rows(facts, STARS, lambda cell: stars.draw(cell, facts["seed"], model, dust)))
 
 
-def _given_model(own: GivenSources, area: Area, planned: Json | None = None) -> stars.StarModel:
+def _given_model(source_tables: UserSources, area: Area, planned: Json | None = None) -> stars.StarModel:
     """Each star, however faint and wherever it is."""
-    catalogue = given_sources.stars(given_sources.load(own, area, planned), own.band)
+    catalogue = given_sources.stars(given_sources.load(source_tables, area, planned), source_tables.band)
     return stars.model(math.inf, math.inf, brown_dwarf_boost=0.0, catalogue=catalogue)
 
 
-def work(lake: Path, facts: Json, choice: Stars, own: DustMap | None = None) -> Output:
+def draw_stars(lake: Path, facts: Json, choice: Stars, user_dust_map: DustMap | None = None) -> Output:
     """The stars of one file's cell.
 
     lake   : folder of the lake;  facts : of the plan and of the part, which has its cell
     choice : section `stars` of the request;  own : an external map of dust, None = the embedded one
     """
     model = request_checks.star_model(facts["star_limit"], choice, facts)
-    dust = dust_map.chosen(facts["seed"], own)
-    return Output(cells.rows(facts, STARS, lambda cell: stars.draw(cell, facts["seed"], model, dust)))
+    dust = dust_map.map_for_request(facts["seed"], user_dust_map)
+    return Output(cells.draw_rows(facts, STARS, lambda cell: stars.draw(cell, facts["seed"], model, dust)))
 
 
 JOB = Job("build_stars", "Draw the Milky Way's stars of a sky area.", steps)

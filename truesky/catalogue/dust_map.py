@@ -28,14 +28,14 @@ from lake_schema.sky import equatorial, galactic
 from lake_schema.store.provenance import canonical, file_sha256
 from truesky.catalogue import parameters
 from truesky.numerics.cache import cached_arrays, content_key
-from truesky.numerics.code_keys import code_key
+from truesky.numerics.code_fingerprints import code_key
 from truesky.randomness.rng import stream
 from truesky.request.files import DustMap
 
 # Table `galaxies` holds no more.
-_MOST_A_V = 40.0
+_MAX_A_V = 40.0
 # Of the steps between neighbours, the other ordering's over that which the header says.
-_MUCH_SMOOTHER = 0.5
+_SMOOTHNESS_RATIO = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +70,7 @@ def layer() -> Layer:
     return Layer(**parameters.section("dust_map.toml", "layer"))
 
 
-def embedded(seed: int, model: Cosecant) -> Float32:
+def make_map(seed: int, model: Cosecant) -> Float32:
     """Map of A(V), float32[12 nside^2] mag."""
     _, b = hp.pix2ang(model.nside, np.arange(hp.nside2npix(model.nside)), lonlat=True)
     field = _gaussian_field(seed, model)
@@ -105,50 +105,56 @@ def load(seed: int) -> Float32:
     """
     model = cosecant()
     key = content_key(code_key(__name__), version("healpy"), seed, *astuple(model))
-    return cached_arrays("dust_map", key, lambda: {"a_v": embedded(seed, model)})["a_v"]
+    return cached_arrays("dust_map", key, lambda: {"a_v": make_map(seed, model)})["a_v"]
 
 
-def facts(own: DustMap | None) -> dict[str, Any]:
+def facts(user_map: DustMap | None) -> dict[str, Any]:
     """Empty without a file; BadInput where it is not there."""
-    if own is None:
+    if user_map is None:
         return {}
-    user_files.checked(own.file, "map of dust", "ingest.dust.file")
-    about = {name: value for name, value in asdict(own).items() if name != "file"}
-    return {"dust": {"sha256": file_sha256(own.file), **about}}
+    user_files.check_file(user_map.file, "map of dust", "ingest.dust.file")
+    settings = {name: value for name, value in asdict(user_map).items() if name != "file"}
+    return {"dust": {"sha256": file_sha256(user_map.file), **settings}}
 
 
-def chosen(seed: int, own: DustMap | None) -> Float32:
+def map_for_request(seed: int, user_map: DustMap | None) -> Float32:
     """Map of A(V), RING and Galactic, of a request's file (from the cache or read now), or the embedded one.
 
     returns : float32[pixel] mag
     """
-    if own is None:
+    if user_map is None:
         return load(seed)
-    key = content_key(code_key(__name__), version("healpy"), canonical(facts(own)))
-    return cached_arrays("dust_file", key, lambda: {"a_v": read(own)})["a_v"]
+    key = content_key(code_key(__name__), version("healpy"), canonical(facts(user_map)))
+    return cached_arrays("dust_file", key, lambda: {"a_v": read(user_map)})["a_v"]
 
 
-def read(own: DustMap) -> Float32:
+def read(user_map: DustMap) -> Float32:
     """An external map in the form of the embedded one: A(V), RING, Galactic, not finer than the embedded one.
 
     returns : float32[pixel] mag
     Errors: BadInput names the file, and what is missing or wrong: ordering, coordinates, or the row of a pixel
     """
-    values, cards = read_map(own.file, own.column)
-    where = f"{own.file}: column {own.column}"
-    ordering = _agreed(own, "ORDERING", "ordering", cards, {"RING": "RING", "NESTED": "NESTED", "NEST": "NESTED"})
-    frame = _agreed(own, "COORDSYS", "coordinates", cards, {"G": "G", "GALACTIC": "G", "C": "C", "Q": "C"})
+    values, cards = read_map(user_map.file, user_map.column)
+    where = f"{user_map.file}: column {user_map.column}"
+    ordering = _header_or_request(
+        user_map, "ORDERING", "ordering", cards, {"RING": "RING", "NESTED": "NESTED", "NEST": "NESTED"}
+    )
+    frame = _header_or_request(
+        user_map, "COORDSYS", "coordinates", cards, {"G": "G", "GALACTIC": "G", "C": "C", "Q": "C"}
+    )
     if not values.size or not hp.isnpixok(values.size):
         raise BadInput(f"{where}: {values.size} pixels are not those of a HEALPix map of the whole sky")
     nside = hp.npix2nside(values.size)
     if cards.get("NSIDE", nside) != nside:
         raise BadInput(f"{where}: NSIDE is {cards['NSIDE']}, {values.size} pixels are of {nside}")
     model = cosecant()
-    to_a_v = model.r_v if own.quantity == "ebv" else 1.0
-    bad = ~((values >= 0.0) & (values * to_a_v <= _MOST_A_V))
+    to_a_v = model.r_v if user_map.quantity == "ebv" else 1.0
+    bad = ~((values >= 0.0) & (values * to_a_v <= _MAX_A_V))
     if bad.any():
         row = int(bad.argmax())
-        raise BadInput(f"{where} of row {row + 1} is {values[row]:g} ({bad.sum()} rows like it), no {own.quantity}")
+        raise BadInput(
+            f"{where} of row {row + 1} is {values[row]:g} ({bad.sum()} rows like it), no {user_map.quantity}"
+        )
     _refuse_other_ordering(where, values, ordering)
     ring = hp.reorder(values, n2r=True) if ordering == "NESTED" else values
     if nside > model.nside:
@@ -159,16 +165,20 @@ def read(own: DustMap) -> Float32:
     return np.asarray(to_a_v * ring, np.float32)
 
 
-def _agreed(own: DustMap, card: str, key: str, cards: Mapping[str, Any], names: Mapping[str, str]) -> str:
+def _header_or_request(
+    user_map: DustMap, card: str, key: str, cards: Mapping[str, Any], names: Mapping[str, str]
+) -> str:
     """What header and request say; one of them is enough."""
-    said, wanted = str(cards.get(card, "")).strip().upper(), getattr(own, key)
-    if said and said not in names:
-        raise BadInput(f"{own.file}: {card} is {said!r}, not one of {', '.join(names)}")
-    if said and wanted and names[said] != wanted:
-        raise BadInput(f"{own.file}: {card} is {said!r}, ingest.dust.{key} says {wanted!r}")
-    if not said and not wanted:
-        raise BadInput(f"{own.file}: column {own.column}: no {card} in its header: name it by ingest.dust.{key}")
-    return names[said] if said else str(wanted)
+    header_value, requested = str(cards.get(card, "")).strip().upper(), getattr(user_map, key)
+    if header_value and header_value not in names:
+        raise BadInput(f"{user_map.file}: {card} is {header_value!r}, not one of {', '.join(names)}")
+    if header_value and requested and names[header_value] != requested:
+        raise BadInput(f"{user_map.file}: {card} is {header_value!r}, ingest.dust.{key} says {requested!r}")
+    if not header_value and not requested:
+        raise BadInput(
+            f"{user_map.file}: column {user_map.column}: no {card} in its header: name it by ingest.dust.{key}"
+        )
+    return names[header_value] if header_value else str(requested)
 
 
 def _refuse_other_ordering(where: str, values: Float, ordering: str) -> None:
@@ -177,10 +187,10 @@ def _refuse_other_ordering(where: str, values: Float, ordering: str) -> None:
     pixel = np.unique(np.linspace(0, values.size - 1, 20_000).astype(np.int64))
     step = {}
     for name, nested in (("RING", False), ("NESTED", True)):
-        around = hp.get_all_neighbours(nside, pixel, nest=nested)
-        step[name] = np.mean(np.abs(np.where(around >= 0, values[around] - values[pixel], 0.0)))
+        neighbours = hp.get_all_neighbours(nside, pixel, nest=nested)
+        step[name] = np.mean(np.abs(np.where(neighbours >= 0, values[neighbours] - values[pixel], 0.0)))
     other = "RING" if ordering == "NESTED" else "NESTED"
-    if step[other] < _MUCH_SMOOTHER * step[ordering]:
+    if step[other] < _SMOOTHNESS_RATIO * step[ordering]:
         raise BadInput(f"{where}: ORDERING is said to be {ordering}, but the map is smooth in {other} only")
 
 

@@ -48,13 +48,13 @@ def main(argv: Sequence[str] | None = None) -> int:
                         "for programs that take references where they are")  # fmt: skip
     options = parser.parse_args(argv)
 
-    def exported() -> int:
-        lake, declared = layout.lake(options.lake), RELEASES[options.release]
+    def run_export() -> int:
+        lake, declared = layout.resolve_lake(options.lake), RELEASES[options.release]
         rows = export(lake, options.out, declared, options.form, options.epoch, options.name)
         print(f"{options.out}: {rows:,} stars")
         return 0
 
-    return command.status("export_gaia", exported)
+    return command.run("export_gaia", run_export)
 
 
 def export(
@@ -72,39 +72,42 @@ def export(
     Errors   : BadInput for another ending than those of FORMS, an epoch that no proper motion reaches, and where the
                table is one without proper motions
     """
-    user_files.target(path, FORMS[form])
+    user_files.check_target(path, FORMS[form])
     if epoch is not None and not 1900.0 <= epoch <= 2100.0:
         raise BadInput(f"epoch {epoch:g} is not in [1900, 2100]")
     version = read.version(lake, "gaia", request=request)
-    parts = (_named(version, part, epoch) for part in version.parts)
+    tables = (_release_columns(version, partition, epoch) for partition in version.partitions)
     if form == "ldac":
-        ldac.write(path, pa.concat_tables(list(parts)))
+        ldac.write(path, pa.concat_tables(list(tables)))
     elif path.suffix.lower() == ".fits":
-        table_to_fits(path, pa.concat_tables([part.select(declared.names) for part in parts]), declared)
+        table_to_fits(path, pa.concat_tables([table.select(declared.names) for table in tables]), declared)
     else:
-        with user_files.staged(path) as temporary, csv.CSVWriter(temporary, declared.arrow()) as writer:
-            for part in parts:
-                writer.write_table(_as(part, declared))
+        with (
+            user_files.replace_atomically(path) as temporary,
+            csv.CSVWriter(temporary, declared.arrow_schema()) as writer,
+        ):
+            for table in tables:
+                writer.write_table(_select_columns(table, declared))
     return version.num_rows
 
 
-def _as(rows: pa.Table, declared: Table) -> pa.Table:
+def _select_columns(rows: pa.Table, declared: Table) -> pa.Table:
     return declared.build({name: rows[name] for name in declared.names})
 
 
-def _named(version: read.Version, part: str, epoch: float | None) -> pa.Table:
+def _release_columns(version: read.Version, partition: str, epoch: float | None) -> pa.Table:
     """Rows of a part with every column that any release has."""
-    rows = version.rows(parts=[part])
+    rows = version.rows(partitions=[partition])
     if rows.num_rows and rows["ruwe"].null_count:
         raise BadInput("table gaia has no proper motions: it was built before it had them; run build_gaia again")
     columns: dict[str, Any] = {name: rows[name] for name in rows.column_names}
     columns |= {"source_id": rows["id"], "bp_rp": pc.subtract(rows["phot_bp_mean_mag"], rows["phot_rp_mean_mag"])}
-    own_epoch = parameters.section("gaia.toml", "astrometry")["epoch"]
-    columns["ref_epoch"] = pa.array(np.full(rows.num_rows, own_epoch if epoch is None else epoch))
+    catalogue_epoch = parameters.section("gaia.toml", "astrometry")["epoch"]
+    columns["ref_epoch"] = pa.array(np.full(rows.num_rows, catalogue_epoch if epoch is None else epoch))
     if epoch is not None:
-        columns["ra"], columns["dec"] = map(pa.array, _after(rows, epoch - own_epoch))
-    known = pc.is_valid(rows["pmra"])
-    columns |= _correlations(known)
+        columns["ra"], columns["dec"] = map(pa.array, _advance_positions(rows, epoch - catalogue_epoch))
+    has_motion = pc.is_valid(rows["pmra"])
+    columns |= _correlations(has_motion)
     for band, short in enumerate(("g", "bp", "rp")):
         name = f"phot_{short}_mean"
         flux = gaia.mean_flux(pc.fill_null(rows[f"{name}_mag"], np.nan).to_numpy(), band)
@@ -115,23 +118,23 @@ def _named(version: read.Version, part: str, epoch: float | None) -> pa.Table:
         }
     columns["parallax_over_error"] = pc.divide(rows["parallax"], rows["parallax_error"]).cast(pa.float32())
     columns["pm"] = pc.sqrt(pc.add(pc.power(rows["pmra"], 2), pc.power(rows["pmdec"], 2))).cast(pa.float32())
-    columns["astrometric_params_solved"] = pc.if_else(known, 31, 3).cast(pa.int16())
+    columns["astrometric_params_solved"] = pc.if_else(has_motion, 31, 3).cast(pa.int16())
     return pa.table(columns)
 
 
-def _correlations(known: pa.ChunkedArray) -> dict[str, Any]:
+def _correlations(has_motion: pa.ChunkedArray) -> dict[str, Any]:
     """Errors are drawn one by one: where all five parameters are known their correlations are 0."""
-    zero = pc.if_else(known, pa.scalar(0.0, pa.float32()), pa.scalar(None, pa.float32()))
-    pairs = [(one, other) for i, one in enumerate(PARAMETERS) for other in PARAMETERS[i + 1 :]]
-    position = pa.array(np.zeros(len(known), np.float32))
-    return {f"{one}_{other}_corr": position if (one, other) == ("ra", "dec") else zero for one, other in pairs}
+    zero = pc.if_else(has_motion, pa.scalar(0.0, pa.float32()), pa.scalar(None, pa.float32()))
+    pairs = [(first, second) for i, first in enumerate(PARAMETERS) for second in PARAMETERS[i + 1 :]]
+    position = pa.array(np.zeros(len(has_motion), np.float32))
+    return {f"{first}_{second}_corr": position if (first, second) == ("ra", "dec") else zero for first, second in pairs}
 
 
-def _after(rows: pa.Table, years: float) -> tuple[Any, Any]:
+def _advance_positions(rows: pa.Table, years: float) -> tuple[Any, Any]:
     """Positions to which the proper motions lead in so many years."""
     east, north = (_MAS * years * pc.fill_null(rows[name], 0.0).to_numpy() for name in ("pmra", "pmdec"))
-    return sky.displaced(rows["ra"].to_numpy(), rows["dec"].to_numpy(), east, north)
+    return sky.offset_positions(rows["ra"].to_numpy(), rows["dec"].to_numpy(), east, north)
 
 
 if __name__ == "__main__":
-    command.leave(main)
+    command.exit_with_status(main)

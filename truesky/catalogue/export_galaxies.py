@@ -35,12 +35,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--form", required=True, choices=FORMS)
     parser.add_argument("--name", help="of the request whose tables are meant, where the lake has several")
     options = parser.parse_args(argv)
-    return command.status("export_galaxies", lambda: _exported(options))
+    return command.run("export_galaxies", lambda: _run_export(options))
 
 
-def _exported(options: argparse.Namespace) -> int:
+def _run_export(options: argparse.Namespace) -> int:
     out = options.out
-    written = export(layout.lake(options.lake), user_files.folder(out), options.form, options.name)
+    written = export(layout.resolve_lake(options.lake), user_files.check_folder(out), options.form, options.name)
     print(f"{out}: {len(written)} files")
     return 0
 
@@ -56,12 +56,12 @@ def export(lake: Path, folder: Path, form: str, request: str | None = None) -> l
     version = read.version(lake, GALAXIES.name, request=request)
     folder.mkdir(parents=True, exist_ok=True)
     written = []
-    for part in version.parts:
-        path = folder / f"galaxies_nside32_nest_{layout.cell_of_file(part)[1]}.fits"
-        table_to_fits(path, version.rows(parts=[part]), GALAXIES)
+    for partition in version.partitions:
+        path = folder / f"galaxies_nside32_nest_{layout.cell_of_file(partition)[1]}.fits"
+        table_to_fits(path, version.rows(partitions=[partition]), GALAXIES)
         written.append(path)
     return written
 
 
 if __name__ == "__main__":
-    command.leave(main)
+    command.exit_with_status(main)

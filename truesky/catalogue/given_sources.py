@@ -34,10 +34,10 @@ from truesky.fluxes import integration, passbands
 from truesky.fluxes.libraries import stellar, templates
 from truesky.fluxes.sources import Stars
 from truesky.request.area import Area
-from truesky.request.files import SOURCES, GivenSources
-from truesky.request.schema import MOST_SHEAR
+from truesky.request.files import SOURCES_KIND, UserSources
+from truesky.request.schema import MAX_SHEAR
 
-_PLACE = ("ra", "dec")
+_POSITION = ("ra", "dec")
 # What a column holds that is not there; None = it has to be there. Units and frames are those of table `galaxies`.
 GALAXIES: Mapping[str, float | None] = {
     "mag": None, "z_true": 0.2, "sed": 15.0, "ext_law": 0.0, "ebv": 0.0, "bulge_fraction": 0.0,
@@ -48,146 +48,154 @@ GALAXIES: Mapping[str, float | None] = {
 STARS: Mapping[str, float | None] = {"mag": None, "teff": 5800.0, "a_v": 0.0}
 _GALAXY_BOUNDS = {**GALAXY_BOUNDS, "sed": (0.0, 30.0), "stamp": (-1.0, GALAXY_BOUNDS["stamp"][1])}
 # Columns of whole numbers.
-_WHOLE = ("ext_law", "stamp")
+_INTEGER_COLUMNS = ("ext_law", "stamp")
 _STAR_BOUNDS = {**KEYS, "mag": GALAXY_BOUNDS["mag"]}
 # Of a grid, on the square about the area.
-_MOST_PLACES = 4_000_000
+_MAX_GRID_POSITIONS = 4_000_000
 # Each galaxy says how much there is before it.
 _NO_DUST: Float32 = np.zeros(12, np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Given:
+class SourceColumns:
     """Sources by column, [n] each, ascending in index (order-29 cell); origin_id : row of the table, from 1."""
 
     galaxies: Mapping[str, Array]
     stars: Mapping[str, Array]
 
 
-def load(own: GivenSources, area: Area, planned: Json | None = None) -> Given:
+def load(source_tables: UserSources, area: Area, planned: Json | None = None) -> SourceColumns:
     """The sources, from their files; BadInput names the file, and the column and the row that is wrong.
 
     planned : facts of the plan that they are read for
     """
-    if planned is not None and canonical(own.facts(area.bounds())) != canonical(planned):
+    if planned is not None and canonical(source_tables.facts(area.bounding_circle())) != canonical(planned):
         raise BadInput("sources: a table has changed since the job began")
-    if own.band not in passbands.names():
-        raise BadInput(f"sources.band = {own.band!r} is not one of {', '.join(passbands.names())}")
-    places = () if own.spacing else _PLACE
-    found = {
-        "galaxies": _read(own.galaxies, {**dict.fromkeys(places), **GALAXIES}, _GALAXY_BOUNDS),
-        "stars": _read(own.stars, {**dict.fromkeys(places), **STARS}, _STAR_BOUNDS),
+    if source_tables.band not in passbands.names():
+        raise BadInput(f"sources.band = {source_tables.band!r} is not one of {', '.join(passbands.names())}")
+    position_columns = () if source_tables.spacing else _POSITION
+    tables = {
+        "galaxies": _read(source_tables.galaxies, {**dict.fromkeys(position_columns), **GALAXIES}, _GALAXY_BOUNDS),
+        "stars": _read(source_tables.stars, {**dict.fromkeys(position_columns), **STARS}, _STAR_BOUNDS),
     }
-    if own.spacing:
-        found = _on_grid(found, area, own.spacing)
-    _refuse_caustics(own.galaxies, found["galaxies"])
-    for file, values in zip((own.galaxies, own.stars), found.values(), strict=True):
-        values["ra"] = sky.wrapped(values["ra"])
-        cell = sky.cell_of(values["ra"], values["dec"], GENERATION_ORDER)
+    if source_tables.spacing:
+        tables = _on_grid(tables, area, source_tables.spacing)
+    _refuse_caustics(source_tables.galaxies, tables["galaxies"])
+    for file, values in zip((source_tables.galaxies, source_tables.stars), tables.values(), strict=True):
+        values["ra"] = sky.wrap_angle(values["ra"])
+        cell = sky.cell_at(values["ra"], values["dec"], GENERATION_ORDER)
         outside = ~np.isin(cell, area.cells(GENERATION_ORDER))
         if outside.any():
             row = values["origin_id"][outside.argmax()]
             raise BadInput(f"{file}: ra, dec of row {row} are not in the request's area")
         values["index"] = sky.healpix_29(values["ra"], values["dec"])
-    return Given(*(_sorted(values) for values in found.values()))
+    return SourceColumns(*(_sort_by_cell(values) for values in tables.values()))
 
 
-def model(seed: int, own: GivenSources, given: Given, lens: lensing.Shear | None, rotation: float) -> IngestModel:
+def model(
+    seed: int, source_tables: UserSources, sources: SourceColumns, lens: lensing.Shear | None, rotation: float
+) -> IngestModel:
     """What `galaxies` takes.
 
     seed, own      : of the request
     given          : of `load`
     lens, rotation : in place of the rows' lensing, None = as they say; deg, added to position angles
     """
-    columns = Columns({"mag": Field(column="mag")}, GALAXY_BOUNDS, band=own.band)
-    most = [float(given.galaxies[name].max(initial=0.0)) for name in ("z_true", "ebv")]
-    return from_catalogue.model(seed, columns, Split(Path(), {}, 0, *most), lens, rotation)
+    columns = Columns({"mag": Field(column="mag")}, GALAXY_BOUNDS, band=source_tables.band)
+    maxima = [float(sources.galaxies[name].max(initial=0.0)) for name in ("z_true", "ebv")]
+    return from_catalogue.model(seed, columns, Split(Path(), {}, 0, *maxima), lens, rotation)
 
 
-def galaxies(cell: int, given: Given, universe: IngestModel) -> pa.Table:
+def galaxies(cell: int, sources: SourceColumns, universe: IngestModel) -> pa.Table:
     """Table `galaxies` of one generation cell."""
-    first, last = np.searchsorted(given.galaxies["index"], sky.cell_range(GENERATION_ORDER, cell))
-    rows = {name: values[first:last] for name, values in given.galaxies.items()}
+    first, last = np.searchsorted(sources.galaxies["index"], sky.cell_range(GENERATION_ORDER, cell))
+    rows = {name: values[first:last] for name, values in sources.galaxies.items()}
     return from_catalogue.draw(cell, {**rows, "flux_halpha": np.full(last - first, np.nan)}, universe, _NO_DUST)
 
 
-def stars(given: Given, band: str) -> StarCatalogue:
+def stars(sources: SourceColumns, band: str) -> StarCatalogue:
     """The stars with their H, of the spectrum of the nearest temperature."""
-    library, values = templates.stellar_library(), dict(given.stars)
+    library, values = templates.stellar_library(), dict(sources.stars)
     temperatures = stellar.types().teff
-    none = np.zeros(temperatures.size)
-    rows = Stars.of_templates(np.arange(none.size), none, none)
-    ab = units.mag_of_f_nu(integration.stars(rows, [passbands.load(band)], library)[:, 0])
+    zeros = np.zeros(temperatures.size)
+    rows = Stars.from_templates(np.arange(zeros.size), zeros, zeros)
+    ab = units.mag_of_f_nu(integration.star_fluxes(rows, [passbands.load(band)], library)[:, 0])
     values["mag_h"] = values.pop("mag") - ab[nearest_template(temperatures, values["teff"])]
     return StarCatalogue(values.pop("index"), values)
 
 
 def _read(
-    file: Path | None, known: Mapping[str, float | None], bounds: Mapping[str, tuple[float, float]]
+    file: Path | None, defaults: Mapping[str, float | None], bounds: Mapping[str, tuple[float, float]]
 ) -> dict[str, Array]:
     """The columns of a table that are known, with those that it lacks; of no table: none of each."""
     if file is None:
-        return {name: np.zeros(0) for name in known} | {"origin_id": np.zeros(0, np.int64)}
-    titles = external_rows.titles(file, SOURCES)
+        return {name: np.zeros(0) for name in defaults} | {"origin_id": np.zeros(0, np.int64)}
+    titles = external_rows.csv_column_names(file, SOURCES_KIND)
     for title in titles:
-        if title not in known:
-            raise BadInput(f"{user_files.shown(file)}: column {title} is none of {', '.join(known)}")
-    for name, value in known.items():
+        if title not in defaults:
+            raise BadInput(f"{user_files.format_path(file)}: column {title} is none of {', '.join(defaults)}")
+    for name, value in defaults.items():
         if value is None and name not in titles:
-            raise BadInput(f"{user_files.shown(file)}: column {name} is missing")
-    pieces = list(external_rows.pieces(file, titles, kind=SOURCES))
-    found = {title: np.concatenate([np.zeros(0), *(piece.columns[title] for piece in pieces)]) for title in titles}
-    n = len(found["mag"])
+            raise BadInput(f"{user_files.format_path(file)}: column {name} is missing")
+    pieces = list(external_rows.read_batches(file, titles, kind=SOURCES_KIND))
+    columns = {title: np.concatenate([np.zeros(0), *(piece.columns[title] for piece in pieces)]) for title in titles}
+    n = len(columns["mag"])
     if n == 0:
-        raise BadInput(f"{user_files.shown(file)}: holds no source")
-    for title, values in found.items():
-        external_rows.within(file, title, values, bounds[title])
-    for title in _WHOLE:
-        if (half := found.get(title, np.zeros(n)) % 1.0 != 0.0).any():
-            raise BadInput(f"{user_files.shown(file)}: {title} of row {half.argmax() + 1} is not a whole number")
-    found |= {name: np.full(n, value) for name, value in known.items() if name not in found}
-    found |= {name: found[name].astype(np.int64) for name in _WHOLE if name in found}
-    return found | {"origin_id": np.arange(1, n + 1)}
+        raise BadInput(f"{user_files.format_path(file)}: holds no source")
+    for title, values in columns.items():
+        external_rows.check_bounds(file, title, values, bounds[title])
+    for title in _INTEGER_COLUMNS:
+        if (not_whole := columns.get(title, np.zeros(n)) % 1.0 != 0.0).any():
+            raise BadInput(
+                f"{user_files.format_path(file)}: {title} of row {not_whole.argmax() + 1} is not a whole number"
+            )
+    columns |= {name: np.full(n, value) for name, value in defaults.items() if name not in columns}
+    columns |= {name: columns[name].astype(np.int64) for name in _INTEGER_COLUMNS if name in columns}
+    return columns | {"origin_id": np.arange(1, n + 1)}
 
 
 def _refuse_caustics(file: Path | None, values: Mapping[str, Array]) -> None:
     """What is no ellipse would be left out of the images, or be less sheared than it says."""
     kappa, gamma1, gamma2 = (values[name] for name in ("kappa", "gamma1", "gamma2"))
-    bad = lensing.near_caustic(kappa, gamma1, gamma2, lensing.settings().caustic)
-    bad |= np.hypot(gamma1, gamma2) > MOST_SHEAR * np.abs(1.0 - kappa)
+    bad = lensing.is_near_caustic(kappa, gamma1, gamma2, lensing.settings().caustic)
+    bad |= np.hypot(gamma1, gamma2) > MAX_SHEAR * np.abs(1.0 - kappa)
     if bad.any():
-        row, what = values["origin_id"][bad.argmax()], "kappa, gamma1, gamma2"
-        raise BadInput(f"{file}: {what} of row {row} are near a caustic: images are ellipses up to |g| = {MOST_SHEAR}")
+        row, column_names = values["origin_id"][bad.argmax()], "kappa, gamma1, gamma2"
+        raise BadInput(
+            f"{file}: {column_names} of row {row} are near a caustic: images are ellipses up to |g| = {MAX_SHEAR}"
+        )
 
 
-def _on_grid(found: Mapping[str, dict[str, Array]], area: Area, spacing: float) -> dict[str, dict[str, Array]]:
+def _on_grid(tables: Mapping[str, dict[str, Array]], area: Area, spacing: float) -> dict[str, dict[str, Array]]:
     """The rows of all tables in turn at the places of a grid."""
     ra, dec = _grid(area, spacing)
-    numbers = np.cumsum([0, *(len(values["mag"]) for values in found.values())])
-    which = np.arange(ra.size) % numbers[-1]
+    first_rows = np.cumsum([0, *(len(values["mag"]) for values in tables.values())])
+    row_number = np.arange(ra.size) % first_rows[-1]
     out = {}
-    for (name, values), first, last in zip(found.items(), numbers[:-1], numbers[1:], strict=True):
-        here = np.flatnonzero((which >= first) & (which < last))
-        rows = {key: column[which[here] - first] for key, column in values.items()}
-        out[name] = {**rows, "ra": ra[here], "dec": dec[here]}
+    for (name, values), first, last in zip(tables.items(), first_rows[:-1], first_rows[1:], strict=True):
+        selected = np.flatnonzero((row_number >= first) & (row_number < last))
+        rows = {key: column[row_number[selected] - first] for key, column in values.items()}
+        out[name] = {**rows, "ra": ra[selected], "dec": dec[selected]}
     return out
 
 
 def _grid(area: Area, spacing: float) -> tuple[Float, Float]:
     """Places in an area, `spacing` arcsec apart to the east and north of its middle, from the south, west to east."""
-    ra, dec, radius = area.bounds()
+    ra, dec, radius = area.bounding_circle()
     half = int(radius * 3600.0 / spacing)
-    if (2 * half + 1) ** 2 > _MOST_PLACES:
-        raise BadInput(f"sources.spacing = {spacing:g}: the square about the area has more than {_MOST_PLACES} places")
+    if (2 * half + 1) ** 2 > _MAX_GRID_POSITIONS:
+        raise BadInput(
+            f"sources.spacing = {spacing:g}: the square about the area has more than {_MAX_GRID_POSITIONS} places"
+        )
     steps = np.radians(np.arange(-half, half + 1) * spacing / 3600.0)
     north, east = (axis.ravel() for axis in np.meshgrid(steps, steps, indexing="ij"))
-    places = lensing.displaced(np.full(east.size, ra), np.full(east.size, dec), east, north)
+    places = lensing.displace(np.full(east.size, ra), np.full(east.size, dec), east, north)
     inside = area.contains(*places)
     if not inside.any():
         raise BadInput("sources: no place of the grid lies in the area")
     return places[0][inside], places[1][inside]
 
 
-def _sorted(values: Mapping[str, Array]) -> dict[str, Array]:
+def _sort_by_cell(values: Mapping[str, Array]) -> dict[str, Array]:
     order: Int = np.lexsort((values["origin_id"], values["index"]))
     return {name: column[order] for name, column in values.items()}

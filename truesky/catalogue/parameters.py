@@ -9,7 +9,7 @@ from typing import Any
 from lake_schema import user_files
 from lake_schema.errors import BadInput
 
-_HERE = Path(__file__).resolve().parent
+_FOLDER = Path(__file__).resolve().parent
 
 
 def section(file: str, name: str) -> dict[str, Any]:
@@ -17,7 +17,7 @@ def section(file: str, name: str) -> dict[str, Any]:
 
     Errors: BadInput where the table is absent or has no source
     """
-    tables = _tables((_HERE / file).read_text(encoding="utf-8"))
+    tables = _tables((_FOLDER / file).read_text(encoding="utf-8"))
     if name not in tables:
         raise BadInput(f"{file} has no table [{name}]")
     numbers = dict(tables[name])
@@ -29,4 +29,4 @@ def section(file: str, name: str) -> dict[str, Any]:
 @cache
 def _tables(text: str) -> dict[str, Any]:
     """The tables of a file's text: a model reads dozens of tables from a few files."""
-    return user_files.toml_tables(text)
+    return user_files.parse_toml(text)

@@ -23,53 +23,60 @@ from truesky.fluxes import passbands
 from truesky.request.schema import Request, Stars
 
 
-def refuse(request: Request) -> None:
+def check_request(request: Request) -> None:
     """BadInput names the key, or the file and its column or row.
 
     Of a large catalogue the first rows are read; the job that splits it into cells reads all of them.
     """
-    own = request.ingest
-    if own.dust is not None:
-        dust_map.chosen(request.seed, own.dust)
+    user_inputs = request.ingest
+    if user_inputs.dust is not None:
+        dust_map.map_for_request(request.seed, user_inputs.dust)
     if request.sources is not None:
         given_sources.load(request.sources, request.area)
         return
     check_band(request)
-    if own.galaxies is not None:
-        _looked_at(own.galaxies.files, mapping.galaxies(own.galaxies.format, dict(own.galaxies.columns)))
-    if own.halos is not None:
-        _looked_at(own.halos.files, mapping.halos(dict(own.halos.columns)))
-    if own.training is not None:
-        _looked_at(own.training.files, mapping.training(dict(own.training.columns)))
+    if user_inputs.galaxies is not None:
+        _check_first_rows(
+            user_inputs.galaxies.files,
+            mapping.galaxy_columns(user_inputs.galaxies.format, dict(user_inputs.galaxies.columns)),
+        )
+    if user_inputs.halos is not None:
+        _check_first_rows(user_inputs.halos.files, mapping.halo_columns(dict(user_inputs.halos.columns)))
+    if user_inputs.training is not None:
+        _check_first_rows(user_inputs.training.files, mapping.training_columns(dict(user_inputs.training.columns)))
     choice, limit = request.stars, request.universe.star_limit
-    stars.numbers(request.area.cells(), star_model(limit, choice, star_files(choice)))
+    stars.expected_counts(request.area.cells(), star_model(limit, choice, star_files(choice)))
 
 
 def check_band(request: Request) -> None:
     """The band of the faintest galaxies must be one of the embedded ones."""
     if request.ingest.galaxies is None and request.universe.galaxy_band not in passbands.names():
-        known = ", ".join(passbands.names())
-        raise BadInput(f"universe.galaxy_band = {request.universe.galaxy_band!r} is not one of {known}")
+        band_names = ", ".join(passbands.names())
+        raise BadInput(f"universe.galaxy_band = {request.universe.galaxy_band!r} is not one of {band_names}")
 
 
-def _looked_at(files: Sequence[Path], columns: mapping.Columns) -> None:
-    found, _ = ingest.listed(files, columns)
+def _check_first_rows(files: Sequence[Path], columns: mapping.Columns) -> None:
+    listed_files, _ = ingest.list_files(files, columns)
     # Columns, units and the values of the first rows.
-    next(mapping.read(found[:1], columns), None)
+    next(mapping.read(listed_files[:1], columns), None)
 
 
 def star_files(choice: Stars) -> dict[str, Any]:
     """What the user's files hold, wherever they lie."""
     facts: dict[str, Any] = {}
     if choice.tycho2:
-        sums = bright_stars.sha256(choice.tycho2)
-        read = bright_stars.load(choice.tycho2, sums)
-        counts = {"records": read.read, "without_color": read.without_color, "left_out": read.without_magnitude}
-        facts["tycho2"] = {"sha256": sums, "brighter": read.ra.size, **counts}
+        checksums = bright_stars.sha256(choice.tycho2)
+        bright = bright_stars.load(choice.tycho2, checksums)
+        counts = {
+            "records": bright.record_count,
+            "without_color": bright.without_color,
+            "left_out": bright.without_magnitude,
+        }
+        facts["tycho2"] = {"sha256": checksums, "brighter": bright.ra.size, **counts}
     if choice.catalogue:
         columns = dict(choice.columns)
-        from_catalogue.checked_columns(columns)
-        file = user_files.checked(choice.catalogue, from_catalogue.KIND, "stars.catalogue.file")
+        from_catalogue.check_columns(columns)
+        file = user_files.check_file(choice.catalogue, from_catalogue.KIND, "stars.catalogue.file")
         facts["catalogue"] = {"sha256": file_sha256(file), "columns": columns}
     return facts
 
@@ -81,8 +88,8 @@ def star_model(limit: float, choice: Stars, files: Json) -> stars.StarModel:
     """
     catalogue = bright = None
     if choice.catalogue:
-        given = files["catalogue"]
-        catalogue = from_catalogue.load(choice.catalogue, given["sha256"], given["columns"])
+        catalogue_facts = files["catalogue"]
+        catalogue = from_catalogue.load(choice.catalogue, catalogue_facts["sha256"], catalogue_facts["columns"])
     if choice.tycho2:
         bright = bright_stars.load(choice.tycho2, files["tycho2"]["sha256"])
     brightest = -math.inf if choice.bright_limit is None else choice.bright_limit

@@ -59,65 +59,77 @@ MODULES = {
 EXTRAS = {"masters": "reduction", "page": "page", "push": "s3", "reduce": "reduction", "stack": "reduction"}
 EXTRAS |= {"validate": "reduction"}
 # What a job answers without Spark.
-_WITHOUT = {"-h", "--help", "--dry-run"}
+_OPTIONS_WITHOUT_SPARK = {"-h", "--help", "--dry-run"}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Exit status: the job's or module's own; 2 where there is no such command."""
     arguments = list(sys.argv[1:] if argv is None else argv)
-    here = arguments[:1] == ["--local"]
-    word, *rest = arguments[here:] or ["--help"]
-    if word in ("-h", "--help", "--version"):
-        said = f"truesky {__version__}" if word == "--version" else f"{__doc__}\ntruesky {__version__}"
+    is_local = arguments[:1] == ["--local"]
+    command_name, *rest = arguments[is_local:] or ["--help"]
+    if command_name in ("-h", "--help", "--version"):
+        text = f"truesky {__version__}" if command_name == "--version" else f"{__doc__}\ntruesky {__version__}"
         # Whoever reads it may close the pipe after the first lines.
-        return command.status("truesky", lambda: print(said) or 0)
-    if word in MODULES:
-        return _module_command(word, rest)
-    if word not in JOBS and word != "run":
-        known = ", ".join(sorted({"run", *JOBS, *MODULES}))
-        return command.say("truesky", f"{word} is no command of truesky: {known}; truesky --help says more", 2)
-    cut = rest.index("--") if "--" in rest else len(rest)
-    own, options = rest[:cut], rest[cut + 1 :]
-    if here and options:
-        return command.say("truesky", f"--local: no spark-submit is called that could take {options[0]}", 2)
-    return _started(word, own, options, here or not _WITHOUT.isdisjoint(own))
+        return command.run("truesky", lambda: print(text) or 0)
+    if command_name in MODULES:
+        return _module_command(command_name, rest)
+    if command_name not in JOBS and command_name != "run":
+        command_names = ", ".join(sorted({"run", *JOBS, *MODULES}))
+        return command.print_error(
+            "truesky", f"{command_name} is no command of truesky: {command_names}; truesky --help says more", 2
+        )
+    separator = rest.index("--") if "--" in rest else len(rest)
+    job_arguments, spark_options = rest[:separator], rest[separator + 1 :]
+    if is_local and spark_options:
+        return command.print_error(
+            "truesky", f"--local: no spark-submit is called that could take {spark_options[0]}", 2
+        )
+    return _run_jobs(
+        command_name, job_arguments, spark_options, is_local or not _OPTIONS_WITHOUT_SPARK.isdisjoint(job_arguments)
+    )
 
 
-def _module_command(word: str, rest: Sequence[str]) -> int:
+def _module_command(command_name: str, arguments: Sequence[str]) -> int:
     """Run a command that is a module; returns its exit status, or 2 if an optional package is missing."""
-    module, with_word = MODULES[word]
+    module, takes_command_name = MODULES[command_name]
     try:
-        status: int = import_module(module).main([word, *rest] if with_word else rest)
+        status: int = import_module(module).main([command_name, *arguments] if takes_command_name else arguments)
     except ModuleNotFoundError as error:
-        if word not in EXTRAS or (error.name or "").startswith(("truesky", "lake_schema")):
+        if command_name not in EXTRAS or (error.name or "").startswith(("truesky", "lake_schema")):
             raise
-        remedy = f"pip install 'truesky[{EXTRAS[word]}]'"
-        return command.say("truesky", f"{word} requires the package {error.name}, which is not installed: {remedy}", 2)
+        remedy = f"pip install 'truesky[{EXTRAS[command_name]}]'"
+        return command.print_error(
+            "truesky", f"{command_name} requires the package {error.name}, which is not installed: {remedy}", 2
+        )
     return status
 
 
-def _started(word: str, own: Sequence[str], options: Sequence[str], here: bool) -> int:
+def _run_jobs(command_name: str, job_arguments: Sequence[str], spark_options: Sequence[str], is_local: bool) -> int:
     def start(module: str, arguments: Sequence[str]) -> int:
-        return submit.in_here(module, arguments) if here else submit.submit(module, arguments, options)
+        return submit.run_in_process(module, arguments) if is_local else submit.submit(module, arguments, spark_options)
 
-    with submit.stopping("truesky"):
-        if word == "run":
+    with submit.stop_on_signal("truesky"):
+        if command_name == "run":
             from truesky.commands import run
 
-            return run.main(own, start)
-        return command.status("truesky", lambda: _one_after_another(start, JOBS[word], own))
+            return run.main(job_arguments, start)
+        return command.run("truesky", lambda: _run_in_order(start, JOBS[command_name], job_arguments))
 
 
-def _one_after_another(start: Callable[[str, Sequence[str]], int], modules: Sequence[str], own: Sequence[str]) -> int:
+def _run_in_order(
+    start: Callable[[str, Sequence[str]], int], modules: Sequence[str], job_arguments: Sequence[str]
+) -> int:
     """Status of the first job that fails."""
     # The request may be given without its option, as `truesky run` and `truesky check` take it.
-    own = ["--request", *own] if own and not own[0].startswith("-") else own
-    return next((status for module in modules if (status := start(module, own))), 0)
+    job_arguments = (
+        ["--request", *job_arguments] if job_arguments and not job_arguments[0].startswith("-") else job_arguments
+    )
+    return next((status for module in modules if (status := start(module, job_arguments))), 0)
 
 
 def entry() -> NoReturn:
     """`truesky`, as it is installed."""
-    command.leave(main)
+    command.exit_with_status(main)
 
 
 if __name__ == "__main__":

@@ -16,28 +16,28 @@ from truesky.request.schema import Request
 def main(argv: Sequence[str] | None = None) -> int:
     """0 and a line where the request is good, 2 and the key that is not; --plan : it is to be planned alone."""
     arguments = list(sys.argv[1:] if argv is None else argv)
-    alone = arguments[1:] == ["--plan"]
-    if len(arguments) != 1 + alone or arguments[0].startswith("--"):
+    plan_only = arguments[1:] == ["--plan"]
+    if len(arguments) != 1 + plan_only or arguments[0].startswith("--"):
         print("usage: truesky check REQUEST [--plan]", file=sys.stderr)
         return 2
-    return command.status("request", lambda: _check(Path(arguments[0]), alone))
+    return command.run("request", lambda: _check(Path(arguments[0]), plan_only))
 
 
-def _check(path: Path, alone: bool) -> int:
+def _check(path: Path, plan_only: bool) -> int:
     request = parse(path)
     try:
-        refuse(request, alone)
+        check_request(request, plan_only)
     except BadInput as error:
-        raise BadInput(f"request {user_files.shown(path)}: {error}") from None
+        raise BadInput(f"request {user_files.format_path(path)}: {error}") from None
     variants = sum(1 for _ in request.variants())
     counts = f"{len(request.pointings)} pointings, {len(request.observations)} observations, {variants} variants"
     print(f"{request.name}: good: {counts}")
-    if skipped := checks.skipped(request):
+    if skipped := checks.describe_skipped(request):
         print(f"{request.name}: {skipped}")
     return 0
 
 
-def refuse(request: Request, alone: bool = False) -> None:
+def check_request(request: Request, plan_only: bool = False) -> None:
     """Raise BadInput if any job would refuse the request.
 
     Parameters
@@ -53,13 +53,13 @@ def refuse(request: Request, alone: bool = False) -> None:
 
     if not request.pointings and not request.observations:
         plan.check_catalogues(request)
-    elif alone:
-        for _ in Planner.of(None, request).tables():
+    elif plan_only:
+        for _ in Planner.from_request(None, request).tables():
             pass
     else:
-        for _ in plan.checked_parts(request):
+        for _ in plan.checked_chunks(request):
             pass
 
 
 if __name__ == "__main__":
-    command.leave(main)
+    command.exit_with_status(main)

@@ -21,17 +21,19 @@ def main(argv: list[str] | None = None) -> int:
         description="Simulate a field: five jobs, a table, pictures.",
         epilog=f"truesky {__version__}",
     )
-    parser.add_argument("--request", type=Path, default=examples.request("demo"), help="simulation request")
+    parser.add_argument("--request", type=Path, default=examples.request_file("demo"), help="simulation request")
     parser.add_argument("--out", default="out/demo", help="folder of the lake and the pictures")
     options = parser.parse_args(argv)
 
-    def demonstrated() -> int:
-        out, request = layout.lake(options.out), parse(options.request)
-        return run.run(layout.lake(out / "lake"), options.request, run.stages(request), request, submit.submit, out)
+    def run_demo() -> int:
+        out, request = layout.resolve_lake(options.out), parse(options.request)
+        return run.run(
+            layout.resolve_lake(out / "lake"), options.request, run.stages(request), request, submit.submit, out
+        )
 
-    with submit.stopping("demo"):
-        return command.status("demo", demonstrated)
+    with submit.stop_on_signal("demo"):
+        return command.run("demo", run_demo)
 
 
 if __name__ == "__main__":
-    command.leave(main)
+    command.exit_with_status(main)

@@ -11,18 +11,18 @@ from lake_schema import __version__, command, user_files
 from lake_schema.errors import BadInput
 
 # Folder -> the ending of what is copied of it.
-KINDS = {"requests": ".toml", "notebooks": ".ipynb"}
+SUFFIXES = {"requests": ".toml", "notebooks": ".ipynb"}
 # What measures truesky against other programs, and so wants a clone.
-_OF_A_CLONE = ("02_speed_for_accuracy.ipynb",)
+_CLONE_ONLY = ("02_speed_for_accuracy.ipynb",)
 
 
-def files() -> list[Path]:
+def example_files() -> list[Path]:
     """What there is to be copied."""
-    found = [path for name, ending in KINDS.items() for path in sorted(_folder(name).glob(f"*{ending}"))]
-    return [path for path in found if path.name not in _OF_A_CLONE]
+    paths = [path for name, suffix in SUFFIXES.items() for path in sorted(_folder(name).glob(f"*{suffix}"))]
+    return [path for path in paths if path.name not in _CLONE_ONLY]
 
 
-def request(name: str) -> Path:
+def request_file(name: str) -> Path:
     """A request that truesky comes with."""
     return _folder("requests") / f"{name}.toml"
 
@@ -33,18 +33,20 @@ def _folder(name: str) -> Path:
     return next(folder for folder in (package / name, package.parent / name) if folder.is_dir())
 
 
-def copy(folder: Path) -> list[Path]:
+def copy_examples(folder: Path) -> list[Path]:
     """Copies all of them; returns what was written.
 
     Errors : BadInput where one of them is there already, and nothing is copied
     """
-    wanted = {user_files.folder(folder) / path.parent.name / path.name: path for path in files()}
-    if there := [path for path in wanted if path.exists()]:
-        raise BadInput(f"{user_files.shown(there[0])} is there already: name another folder")
-    for target, path in wanted.items():
+    source_by_target = {
+        user_files.check_folder(folder) / path.parent.name / path.name: path for path in example_files()
+    }
+    if existing := [path for path in source_by_target if path.exists()]:
+        raise BadInput(f"{user_files.format_path(existing[0])} is there already: name another folder")
+    for target, path in source_by_target.items():
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(path, target)
-    return list(wanted)
+    return list(source_by_target)
 
 
 def main(argv: Sequence[str]) -> int:
@@ -53,9 +55,9 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("folder", type=Path, help="made where it is not there")
     options = parser.parse_args(argv)
 
-    def copied() -> int:
-        for path in copy(options.folder):
+    def copy_and_list() -> int:
+        for path in copy_examples(options.folder):
             print(path)
         return 0
 
-    return command.status("truesky", copied)
+    return command.run("truesky", copy_and_list)

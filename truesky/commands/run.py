@@ -30,8 +30,10 @@ from truesky.request.from_toml import parse
 from truesky.request.schema import Request
 
 # A picture takes some 3 s to draw.
-_PICTURES = 12
-_FIRST = "the renderer has not been compiled on this machine yet: the first detectors take about a minute longer, once"
+_MAX_PICTURES = 12
+_COMPILATION_NOTE = (
+    "the renderer has not been compiled on this machine yet: the first detectors take about a minute longer, once"
+)
 # Run a job: the name of its module, its arguments -> its exit status.
 Start = Callable[[str, Sequence[str]], int]
 
@@ -88,12 +90,12 @@ def stages(request: Request, lenses: bool = False, with_gaia: bool = False) -> l
 
     lenses : strong lenses, too;  with_gaia : Gaia's view of the stars, too, in whose bands fluxes are computed then
     """
-    *found, fluxes = CATALOGUES
+    *job_stages, fluxes = CATALOGUES
     if with_gaia:
         fluxes = replace(fluxes, changes=(("bands", tuple(dict.fromkeys((*request.bands, *gaia.BANDS)))),))
-    found += [_LENSES] * lenses + [fluxes] + [_GAIA] * with_gaia
+    job_stages += [_LENSES] * lenses + [fluxes] + [_GAIA] * with_gaia
     if not request.pointings and not request.observations:
-        return found
+        return job_stages
     plan, render = IMAGES
     changes: tuple[tuple[str, tuple[str, ...] | int], ...] = ()
     if request.detectors:
@@ -101,7 +103,7 @@ def stages(request: Request, lenses: bool = False, with_gaia: bool = False) -> l
     if request.limit is not None:
         changes += (("limit", request.limit),)
     tables = (*render.tables, "exposure_files") if request.files == "exposure" else render.tables
-    return [*found, plan, replace(render, tables=tables, changes=changes)]
+    return [*job_stages, plan, replace(render, tables=tables, changes=changes)]
 
 
 def main(argv: Sequence[str], start: Start) -> int:
@@ -120,39 +122,41 @@ def main(argv: Sequence[str], start: Start) -> int:
     parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="of the pictures (default: LAKE/pictures)")
     options = parser.parse_args(argv)
 
-    def ran() -> int:
-        root = layout.lake(options.lake)
-        out = user_files.folder(options.pictures or root / "pictures")
+    def run_request() -> int:
+        root = layout.resolve_lake(options.lake)
+        out = user_files.check_folder(options.pictures or root / "pictures")
         request = replace(parse(options.request), detectors=tuple(options.detectors), limit=options.limit)
         return run(root, options.request, stages(request, options.lenses, options.gaia), request, start, out)
 
-    return command.status("truesky", ran)
+    return command.run("truesky", run_request)
 
 
-def run(root: Path, file: Path, wanted: Sequence[Stage], request: Request, start: Start, out: Path) -> int:
+def run(
+    root: Path, file: Path, job_stages: Sequence[Stage], request: Request, start: Start, pictures_folder: Path
+) -> int:
     """Exit status of the first job that fails; 0 and a table and pictures where none does.
 
     root : of the lake;  file : of the request;  wanted : its stages;  request : what the file says, and the part
     that is to be rendered;  start : starts a job;  out : folder of the pictures
     """
     # Whatever is wrong with the request, or with the room on the disc, is said before the first job runs.
-    universe.refuse_others(root, request)
+    universe.check_lake(root, request)
     # Asked before anything is planned, which compiles a little.
-    compiled = any(cache.machine_code_dir().glob("render.drawing.kernels/*.nbi"))
-    plan = checked_plan(root, request, wanted)
-    wanted_gb, free_gb = space.check(root, request, plan)
-    count = _foretell(root, request, plan, wanted_gb, free_gb)
-    print(f"{_FIRST}\n" if count and not compiled else "", flush=True)
-    rows, began = [], time.perf_counter()
-    for stage in wanted:
-        started = time.perf_counter()
+    is_compiled = any(cache.machine_code_dir().glob("render.drawing.kernels/*.nbi"))
+    plan = checked_plan(root, request, job_stages)
+    required_gb, free_gb = space.check(root, request, plan)
+    count = _print_forecast(root, request, plan, required_gb, free_gb)
+    print(f"{_COMPILATION_NOTE}\n" if count and not is_compiled else "", flush=True)
+    timings, run_start = [], time.perf_counter()
+    for stage in job_stages:
+        stage_start = time.perf_counter()
         print(f"{stage.name} ...", flush=True)
         if status := start(stage.module, ["--lake", str(root), "--request", str(file), *stage.options]):
             return status
-        rows.append((stage, time.perf_counter() - started))
-    _table(root, request.name, rows, time.perf_counter() - began)
+        timings.append((stage, time.perf_counter() - stage_start))
+    _print_table(root, request.name, timings, time.perf_counter() - run_start)
     if plan is not None:
-        _show(root, out, request.name)
+        _print_results(root, pictures_folder, request.name)
     return 0
 
 
@@ -170,25 +174,28 @@ def checked_plan(root: Path, request: Request, stages: Sequence[Stage]) -> tuple
     return None
 
 
-def _foretell(
-    root: Path, request: Request, plan: tuple[pa.Table, pa.Table] | None, wanted_gb: float, free_gb: float
+def _print_forecast(
+    root: Path, request: Request, plan: tuple[pa.Table, pa.Table] | None, required_gb: float, free_gb: float
 ) -> int:
     """Detectors. Says what all of it will take; what the lake has already is taken off the room alone."""
-    machine = speed.of_machine(root)
-    seconds = sum(line.seconds for line in catalogue_forecast.of_request(request, machine.factor))
+    machine = speed.estimate_speed(root)
+    seconds = sum(line.seconds for line in catalogue_forecast.for_request(request, machine.factor))
     count = 0
     if plan is not None:
-        asked = tasks.part(preconditions.rendered(*plan), request)
-        count, seconds = len(asked), seconds + machine.factor * sum(task["seconds"] for task in asked)
+        requested_tasks = tasks.select_requested(preconditions.require_renderable_tasks(*plan), request)
+        count, seconds = (
+            len(requested_tasks),
+            seconds + machine.factor * sum(task["seconds"] for task in requested_tasks),
+        )
     hours, cores = seconds / 3600.0, catalogue_forecast.WORKERS
     print(
         f"forecast: {count:,} detectors, {hours:.2f} core-hours of this machine ({machine.source}), "
-        f"{hours / cores:.2f} h on {cores} cores; {wanted_gb:.2f} GB to write, {free_gb:.2f} GB are free"
+        f"{hours / cores:.2f} h on {cores} cores; {required_gb:.2f} GB to write, {free_gb:.2f} GB are free"
     )
     return count
 
 
-def _table(root: Path, request: str, stages: Sequence[tuple[Stage, float]], total: float) -> None:
+def _print_table(root: Path, request: str, stages: Sequence[tuple[Stage, float]], total: float) -> None:
     print(f"\n{'stage':20} {'table':14} {'rows':>10} {'rows/s':>10} {'MB':>8} {'seconds':>8}")
     for stage, seconds in stages:
         versions = [read.version(root, name, request=request) for name in stage.tables]
@@ -200,13 +207,16 @@ def _table(root: Path, request: str, stages: Sequence[tuple[Stage, float]], tota
     print(f"{'all':20} {'':14} {'':10} {'':10} {'':8} {total:8.1f}\n")
 
 
-def _show(root: Path, out: Path, request: str) -> None:
+def _print_results(root: Path, pictures_folder: Path, request: str) -> None:
     # All that renders: seconds that the first job need not wait for.
-    from truesky.render.forecasting import taken
+    from truesky.render.forecasting import actual_costs
     from truesky.render.products import preview, same_sky
 
-    for line in taken.text(taken.rows(root, request, speed.of_machine(root).factor)):
+    for line in actual_costs.format_table(actual_costs.summarise(root, request, speed.estimate_speed(root).factor)):
         print(line)
     print()
-    for picture in (*preview.previews(root, out, _PICTURES, request), *same_sky.draw(root, out, request)):
+    for picture in (
+        *preview.previews(root, pictures_folder, _MAX_PICTURES, request),
+        *same_sky.draw(root, pictures_folder, request),
+    ):
         print(picture)

@@ -24,8 +24,8 @@ from truesky.commands import prepare_spark
 from truesky.numerics import cache
 
 # The file that spark-submit runs, whichever the job.
-_SUBMITTED = Path(__file__).resolve().parents[1] / "running" / "submitted.py"
-_STOPPING = (signal.SIGINT, signal.SIGTERM)
+_JOB_SCRIPT = Path(__file__).resolve().parents[1] / "running" / "spark_entry.py"
+_STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def submit(module: str, arguments: Sequence[str], options: Sequence[str] = ()) -> int:
@@ -45,34 +45,36 @@ def submit(module: str, arguments: Sequence[str], options: Sequence[str] = ()) -
     int
         Exit status of the job.
     """
-    return _call([str(_environment() / "bin" / "spark-submit"), *options, str(_SUBMITTED), module, *arguments])
+    return _run_program(
+        [str(_spark_environment() / "bin" / "spark-submit"), *options, str(_JOB_SCRIPT), module, *arguments]
+    )
 
 
-def in_here(module: str, arguments: Sequence[str]) -> int:
+def run_in_process(module: str, arguments: Sequence[str]) -> int:
     """Run the same job without spark-submit: a session begins when a step has work for Spark workers."""
-    from truesky.running import shell
+    from truesky.running import submitted_job
 
     use_environment()
-    return shell.main(import_module(module).JOB, arguments)
+    return submitted_job.main(import_module(module).JOB, arguments)
 
 
 def use_environment() -> None:
     """Let a Spark session of this process use the settings that spark-submit would use."""
-    folder, spark = _environment(), find_spec("pyspark")
+    folder, spark = _spark_environment(), find_spec("pyspark")
     if spark is not None and spark.origin is not None:
         os.environ |= {"SPARK_CONF_DIR": str(folder / "spark-conf"), "SPARK_HOME": str(Path(spark.origin).parent)}
 
 
-def _environment() -> Path:
+def _spark_environment() -> Path:
     """The folder that holds Spark's settings: .venv as `make` prepared it, else one of the cache, prepared now."""
-    made = Path(sys.prefix)
-    if (made / "spark-conf" / "spark-env.sh").is_file() and (made / "java" / "bin" / "java").is_file():
-        return made
-    spark, java = find_spec("pyspark"), prepare_spark.choose(install=False)
+    environment = Path(sys.prefix)
+    if (environment / "spark-conf" / "spark-env.sh").is_file() and (environment / "java" / "bin" / "java").is_file():
+        return environment
+    spark, java = find_spec("pyspark"), prepare_spark.choose_java(install=False)
     if spark is None or spark.origin is None:
         raise BadInput(f"pyspark is not installed for {sys.executable}")
     if java is None:
-        raise BadInput(prepare_spark.WANTED.removeprefix("truesky: "))
+        raise BadInput(prepare_spark.MISSING_JAVA.removeprefix("truesky: "))
     home = Path(spark.origin).parent
     folder = cache.cache_dir().resolve() / f"spark-{cache.content_key(sys.executable, str(home))[:16]}"
     for path in (folder, home):
@@ -82,17 +84,17 @@ def _environment() -> Path:
     return folder
 
 
-def _call(command: Sequence[str]) -> int:
+def _run_program(command: Sequence[str]) -> int:
     """Exit status of a program; it is stopped where we are."""
     # A signal that arrives while the job is started is answered when there is a job to stop.
-    early: list[int] = []
-    handlers = {number: signal.signal(number, lambda n, _: early.append(n)) for number in _STOPPING}
+    early_signals: list[int] = []
+    handlers = {number: signal.signal(number, lambda n, _: early_signals.append(n)) for number in _STOP_SIGNALS}
     with subprocess.Popen(command) as job:
         try:
             for number, handler in handlers.items():
                 signal.signal(number, handler)
-            if early:
-                raise KeyboardInterrupt(early[0])
+            if early_signals:
+                raise KeyboardInterrupt(early_signals[0])
             return job.wait()
         except BaseException:
             job.terminate()
@@ -100,18 +102,20 @@ def _call(command: Sequence[str]) -> int:
 
 
 @contextmanager
-def stopping(name: str) -> Iterator[None]:
+def stop_on_signal(name: str) -> Iterator[None]:
     """Ctrl-C and SIGTERM stop the job that runs, and end the command `name` with 130 or 143 and one line."""
-    before = {number: signal.signal(number, _stop) for number in _STOPPING}
+    previous_handlers = {number: signal.signal(number, _raise_interrupt) for number in _STOP_SIGNALS}
     try:
         yield
     except KeyboardInterrupt as stopped:
         number = 128 + int(stopped.args[0])
-        raise SystemExit(command.say(name, "stopped; a second run continues where this one ended", number)) from None
+        raise SystemExit(
+            command.print_error(name, "stopped; a second run continues where this one ended", number)
+        ) from None
     finally:
-        for number, handler in before.items():
+        for number, handler in previous_handlers.items():
             signal.signal(number, handler)
 
 
-def _stop(number: int, frame: FrameType | None) -> None:
+def _raise_interrupt(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt(number)

@@ -16,27 +16,27 @@ from truesky.explore.explorer import Explorer
 from truesky.explore.process import MEMORY, TIMEOUT
 
 _GIGABYTE = 1e9
-_MOST_ROWS_SHOWN = 40
+_MAX_ROWS_SHOWN = 40
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Exit status: 0, 1 the lake is damaged, 2 the call or the query is wrong."""
     options = _options(argv)
-    return command.status("explore", lambda: _answer(options))
+    return command.run("explore", lambda: _answer(options))
 
 
 def _answer(options: argparse.Namespace) -> int:
     if options.out is not None:
-        user_files.target(options.out, results.ENDINGS)
+        user_files.check_target(options.out, results.ENDINGS)
     with Explorer(
-        layout.opened(options.lake, options.endpoint_url), options.memory * _GIGABYTE, options.timeout, options.name
+        layout.open_lake(options.lake, options.endpoint_url), options.memory * _GIGABYTE, options.timeout, options.name
     ) as lake:
         if options.sql is None:
             print(lake.tables().to_string())
             return int(bool(lake.damaged))
         rows = lake.sql(options.sql, into="arrow")
     if options.out is None:
-        print(results.converted(rows, "pandas").to_string(max_rows=_MOST_ROWS_SHOWN, index=False))
+        print(results.convert(rows, "pandas").to_string(max_rows=_MAX_ROWS_SHOWN, index=False))
         print(f"{rows.num_rows:,} rows")
     else:
         results.write(rows, options.out)
@@ -62,4 +62,4 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
 
 
 if __name__ == "__main__":
-    command.leave(main)
+    command.exit_with_status(main)

@@ -74,31 +74,34 @@ _REGIONS = {"CIRCLE", "POLYGON"}
 _GEOMETRY = {"CONTAINS", "INTERSECTS", "DISTANCE", "COORD1", "COORD2"}
 _REFUSED = {"AREA", "BOX", "CENTROID", "COORDSYS", "REGION"}
 _SET = {"UNION", "INTERSECT", "EXCEPT"}
-_LONGEST = 50_000
+_MAX_LENGTH = 50_000
 _CLAUSES = {"SELECT", "FROM", "WHERE", "GROUP", "HAVING", "ORDER", "ON"}
 # Between which a comparison is a condition of its own.
-_BEFORE, _BEHIND = {"WHERE", "ON", "AND", "OR", "NOT", "("}, {"AND", "OR", ")", "GROUP", "ORDER", "LIMIT", "OFFSET", ""}
+_CONDITION_STARTS, _CONDITION_ENDS = (
+    {"WHERE", "ON", "AND", "OR", "NOT", "("},
+    {"AND", "OR", ")", "GROUP", "ORDER", "LIMIT", "OFFSET", ""},
+)
 # What follows a table's name and is not another name of it.
 _NO_NAMES = {*_CLAUSES, *_SET, "JOIN", "INNER", "LEFT", "RIGHT", "FULL", "CROSS", "NATURAL", "USING", "LIMIT", "OFFSET"}
 # Cells of a cover are about this part of its radius wide, and stand in so many ranges at most.
-_CELLS_A_RADIUS, _MOST_RANGES, _WIDEST_DEG, _ROUNDING_DEG = 4, 24, 60.0, 1e-7
+_CELLS_A_RADIUS, _MAX_RANGES, _MAX_RADIUS_DEG, _ROUNDING_DEG = 4, 24, 60.0, 1e-7
 
 
-def in_sql(text: str, catalogues: Collection[str] = ()) -> str:
+def to_sql(text: str, catalogues: Collection[str] = ()) -> str:
     """The query in DuckDB's SQL.
 
     catalogues : tables, in lower case, whose `_healpix_29` is that of ra and dec
     Errors     : BadInput names what of ADQL is not understood
     """
-    if len(text) > _LONGEST:
-        raise BadInput(f"ADQL: a query has at most {_LONGEST} characters")
+    if len(text) > _MAX_LENGTH:
+        raise BadInput(f"ADQL: a query has at most {_MAX_LENGTH} characters")
     tokens = [token for token in _TOKEN.findall(text) if not token.startswith(("--", "/*"))]
     while tokens and (tokens[-1].isspace() or tokens[-1] == ";"):
         tokens.pop()
-    return "".join(_limited(_functions(tokens, _indices(tokens, catalogues))))
+    return "".join(_top_to_limit(_translate_functions(tokens, _indices(tokens, catalogues))))
 
 
-def in_cone(column: str, ra: float, dec: float, radius: float) -> str:
+def cone_condition(column: str, ra: float, dec: float, radius: float) -> str:
     """The condition that an index of order 29 lies in cells that a circle touches, as few ranges.
 
     column : of the index;  ra, dec, radius : deg
@@ -107,9 +110,9 @@ def in_cone(column: str, ra: float, dec: float, radius: float) -> str:
     cells = sky.cells_in_cone(ra, dec, min(radius + _ROUNDING_DEG, 180.0), order)
     gaps = np.diff(cells)
     cuts = np.flatnonzero(gaps > 1)
-    if len(cuts) >= _MOST_RANGES:
+    if len(cuts) >= _MAX_RANGES:
         # The widest gaps are left out.
-        cuts = np.sort(cuts[np.argsort(gaps[cuts])[-_MOST_RANGES + 1 :]])
+        cuts = np.sort(cuts[np.argsort(gaps[cuts])[-_MAX_RANGES + 1 :]])
     firsts, lasts = cells[np.append(0, cuts + 1)], cells[np.append(cuts, len(cells) - 1)]
     ranges = [(sky.cell_range(order, a)[0], sky.cell_range(order, b)[1]) for a, b in zip(firsts, lasts, strict=True)]
     return f"({' OR '.join(f'({column} >= {first} AND {column} < {last})' for first, last in ranges)})"
@@ -127,7 +130,7 @@ def _indices(tokens: Sequence[str], catalogues: Collection[str]) -> Mapping[str,
     upper = [word.upper() for word in words]
     if not catalogues or "WITH" in upper:
         return {}
-    found: list[tuple[str, bool]] = []
+    named_tables: list[tuple[str, bool]] = []
     for k, word in enumerate(upper):
         # A comma joins, too: what follows one is no table of ours unless it stands alone.
         if word in ("FROM", "JOIN"):
@@ -138,35 +141,39 @@ def _indices(tokens: Sequence[str], catalogues: Collection[str]) -> Mapping[str,
                 name += words[at].strip('"').lower()
                 at += 1
             at += at < len(words) and upper[at] == "AS"
-            other = words[at] if at < len(words) and words[at].isidentifier() and upper[at] not in _NO_NAMES else ""
-            behind = words[at + bool(other)] if at + bool(other) < len(words) else ""
-            found.append((other.lower() or name.rpartition(".")[2], name in catalogues and behind not in ("(", ",")))
+            alias = words[at] if at < len(words) and words[at].isidentifier() and upper[at] not in _NO_NAMES else ""
+            next_word = words[at + bool(alias)] if at + bool(alias) < len(words) else ""
+            named_tables.append(
+                (alias.lower() or name.rpartition(".")[2], name in catalogues and next_word not in ("(", ","))
+            )
     # Names of subqueries stand behind a bracket.
     behind_brackets = " ".join(upper).replace(") AS ", ") ").split(") ")[1:]
     hidden = {text.partition(" ")[0].lower() for text in behind_brackets}
-    names = [name for name, _ in found]
-    own = {name for name, is_known in found if is_known and names.count(name) == 1 and name not in hidden}
-    alone = {"": "_healpix_29"} if len(found) == 1 and own else {}
-    return alone | {f"{name}.": f"{name}._healpix_29" for name in own if name.isidentifier()}
+    names = [name for name, _ in named_tables]
+    catalogue_names = {
+        name for name, is_known in named_tables if is_known and names.count(name) == 1 and name not in hidden
+    }
+    unqualified = {"": "_healpix_29"} if len(named_tables) == 1 and catalogue_names else {}
+    return unqualified | {f"{name}.": f"{name}._healpix_29" for name in catalogue_names if name.isidentifier()}
 
 
 # ------------------------------------------------------------------------------------------------ TOP
 
 
-def _limited(tokens: Sequence[str]) -> list[str]:
+def _top_to_limit(tokens: Sequence[str]) -> list[str]:
     """TOP n of every SELECT as LIMIT n where that SELECT ends: at its bracket, at OFFSET, or at the end."""
     out: list[str] = []
     # A SELECT's depth of brackets and its limit, innermost last.
-    open_: list[tuple[int, str]] = []
+    open_selects: list[tuple[int, str]] = []
     depth, at = 0, 0
     while at < len(tokens):
         token = tokens[at]
         word = token.upper()
         if token == "(":
             depth += 1
-        ends = open_ and open_[-1][0] == depth
+        ends = open_selects and open_selects[-1][0] == depth
         if (token == ")" or word == "OFFSET") and ends:
-            out.append(f" LIMIT {open_.pop()[1]} ")
+            out.append(f" LIMIT {open_selects.pop()[1]} ")
         elif word in _SET and ends:
             raise BadInput(f"ADQL: TOP in a part of {word} is not possible: put that part in a subquery")
         if token == ")":
@@ -176,8 +183,8 @@ def _limited(tokens: Sequence[str]) -> list[str]:
         if word == "SELECT":
             at, limit = _top(tokens, at, out)
             if limit is not None:
-                open_.append((depth, limit))
-    out += [f" LIMIT {limit}" for _, limit in reversed(open_)]
+                open_selects.append((depth, limit))
+    out += [f" LIMIT {limit}" for _, limit in reversed(open_selects)]
     return out
 
 
@@ -195,7 +202,7 @@ def _top(tokens: Sequence[str], at: int, out: list[str]) -> tuple[int, str | Non
 # ------------------------------------------------------------------------------------------------ functions
 
 
-def _functions(tokens: Sequence[str], indices: Mapping[str, str]) -> list[str]:
+def _translate_functions(tokens: Sequence[str], indices: Mapping[str, str]) -> list[str]:
     """Calls of functions that have another name or form.
 
     indices : as of `_indices`
@@ -213,10 +220,10 @@ def _functions(tokens: Sequence[str], indices: Mapping[str, str]) -> list[str]:
             where = "alone" if word in _REGIONS | {"POINT"} else "here"
             raise BadInput(f"ADQL: {word} is not possible {where}")
         if is_call and word in _GEOMETRY:
-            arguments, behind = _arguments(tokens, bracket)
-            cells = _cells(word, arguments, indices) if clauses[-1] in ("WHERE", "ON") else ""
-            geometry, at = _geometry(word, arguments), behind
-            if cells and (end := _condition(tokens, behind, out)) is not None:
+            arguments, call_end = _arguments(tokens, bracket)
+            cells = _cone_cells(word, arguments, indices) if clauses[-1] in ("WHERE", "ON") else ""
+            geometry, at = _geometry(word, arguments), call_end
+            if cells and (end := _condition_end(tokens, call_end, out)) is not None:
                 geometry, at = f"({cells} AND {geometry} = 1)", end
             out.append(geometry)
         else:
@@ -225,7 +232,7 @@ def _functions(tokens: Sequence[str], indices: Mapping[str, str]) -> list[str]:
     return out
 
 
-def _cells(word: str, arguments: list[list[str]], indices: Mapping[str, str]) -> str:
+def _cone_cells(word: str, arguments: list[list[str]], indices: Mapping[str, str]) -> str:
     """The condition that the rows' cells are those of a circle, where a call asks whether they lie in one; else "".
 
     Only of places that are columns, and circles that are numbers.
@@ -242,23 +249,26 @@ def _cells(word: str, arguments: list[list[str]], indices: Mapping[str, str]) ->
     except ValueError:
         return ""
     column = indices.get(ra.removesuffix("ra"), "") if ra.endswith("ra") and ra[:-2] == dec[:-3] else ""
-    is_circle = -1e6 < lon < 1e6 and -90.0 <= lat <= 90.0 and 0.0 <= radius <= _WIDEST_DEG
-    return in_cone(column, lon, lat, radius) if column and dec.endswith("dec") and is_circle else ""
+    is_circle = -1e6 < lon < 1e6 and -90.0 <= lat <= 90.0 and 0.0 <= radius <= _MAX_RADIUS_DEG
+    return cone_condition(column, lon, lat, radius) if column and dec.endswith("dec") and is_circle else ""
 
 
-def _condition(tokens: Sequence[str], behind: int, out: list[str]) -> int | None:
+def _condition_end(tokens: Sequence[str], call_end: int, out: list[str]) -> int | None:
     """Where what compares a call with 1 ends, `behind` the call or further on; None where it is no condition alone.
 
     out : before the call; a "1 =" is taken away from it
     """
-    ahead = [k for k in range(behind, len(tokens)) if not tokens[k].isspace()][:3]
-    before = [k for k in range(len(out)) if not out[k].isspace()][-3:]
-    next_, last = [tokens[k].upper() for k in ahead] + [""] * 3, [""] * 3 + [out[k].upper() for k in before]
-    if next_[:2] == ["=", "1"] and next_[2] in _BEHIND and last[-1] in _BEFORE:
-        return ahead[1] + 1
-    if last[-2:] == ["1", "="] and next_[0] in _BEHIND and last[-3] in _BEFORE:
-        del out[before[-2] :]
-        return behind
+    following = [k for k in range(call_end, len(tokens)) if not tokens[k].isspace()][:3]
+    preceding = [k for k in range(len(out)) if not out[k].isspace()][-3:]
+    next_words, last_words = (
+        [tokens[k].upper() for k in following] + [""] * 3,
+        [""] * 3 + [out[k].upper() for k in preceding],
+    )
+    if next_words[:2] == ["=", "1"] and next_words[2] in _CONDITION_ENDS and last_words[-1] in _CONDITION_STARTS:
+        return following[1] + 1
+    if last_words[-2:] == ["1", "="] and next_words[0] in _CONDITION_ENDS and last_words[-3] in _CONDITION_STARTS:
+        del out[preceding[-2] :]
+        return call_end
     return None
 
 
@@ -282,20 +292,20 @@ def _geometry(word: str, arguments: list[list[str]]) -> str:
     if word == "DISTANCE":
         if len(arguments) == 4:
             return f"separation({', '.join(_sql(argument) for argument in arguments)})"
-        first, second = (_point(word, argument) for argument in _so_many(word, arguments, 2))
+        first, second = (_point(word, argument) for argument in _require_number(word, arguments, 2))
         return f"separation({first[0]}, {first[1]}, {second[0]}, {second[1]})"
     if word in ("COORD1", "COORD2"):
-        (argument,) = _so_many(word, arguments, 1)
+        (argument,) = _require_number(word, arguments, 1)
         return f"({_point(word, argument)[word == 'COORD2']})"
-    first_argument, second_argument = _so_many(word, arguments, 2)
-    kinds = _kind(first_argument), _kind(second_argument)
-    if word == "INTERSECTS" and kinds == ("CIRCLE", "CIRCLE"):
-        one, other = _circle(first_argument), _circle(second_argument)
-        return f"CAST(separation({one[0]}, {one[1]}, {other[0]}, {other[1]}) <= {one[2]} + {other[2]} AS INTEGER)"
-    if word == "INTERSECTS" and "CIRCLE" in kinds and "POINT" not in kinds:
-        region, circle = (first_argument, second_argument)[:: 1 if kinds[1] == "CIRCLE" else -1]
+    first_argument, second_argument = _require_number(word, arguments, 2)
+    shapes = _kind(first_argument), _kind(second_argument)
+    if word == "INTERSECTS" and shapes == ("CIRCLE", "CIRCLE"):
+        (ra_1, dec_1, radius_1), (ra_2, dec_2, radius_2) = _circle(first_argument), _circle(second_argument)
+        return f"CAST(separation({ra_1}, {dec_1}, {ra_2}, {dec_2}) <= {radius_1} + {radius_2} AS INTEGER)"
+    if word == "INTERSECTS" and "CIRCLE" in shapes and "POINT" not in shapes:
+        region, circle = (first_argument, second_argument)[:: 1 if shapes[1] == "CIRCLE" else -1]
         return f"CAST(adql_meets_circle({', '.join(_circle(circle))}, {_vertices(region)}) AS INTEGER)"
-    if word == "INTERSECTS" and kinds[1] == "POINT":
+    if word == "INTERSECTS" and shapes[1] == "POINT":
         first_argument, second_argument = second_argument, first_argument
     ra, dec = _point(word, first_argument)
     return f"CAST({_inside(ra, dec, second_argument)} AS INTEGER)"
@@ -334,38 +344,38 @@ def _kind(tokens: list[str]) -> str:
 def _numbers(tokens: list[str]) -> list[list[str]]:
     """The arguments of such a call, without the frame that ADQL 2.0 wants; points as two numbers."""
     arguments, _ = _arguments(tokens, tokens.index("("))
-    found = []
+    numbers = []
     for number, argument in enumerate(arguments):
         if number == 0 and "".join(argument).strip().startswith("'"):
             continue
-        found.append(_point("", argument) if _kind(argument) == "POINT" else [_sql(argument)])
-    return found
+        numbers.append(_point("", argument) if _kind(argument) == "POINT" else [_sql(argument)])
+    return numbers
 
 
 def _point(word: str, tokens: list[str]) -> list[str]:
     if _kind(tokens) != "POINT":
         raise BadInput(f"ADQL: {word} wants a POINT")
-    found = [part for argument in _numbers(tokens) for part in argument]
-    if len(found) != 2:
+    coordinates = [part for argument in _numbers(tokens) for part in argument]
+    if len(coordinates) != 2:
         raise BadInput("ADQL: a POINT has two coordinates")
-    return found
+    return coordinates
 
 
 def _circle(tokens: list[str]) -> list[str]:
-    found = [part for argument in _numbers(tokens) for part in argument]
-    if len(found) != 3:
+    numbers = [part for argument in _numbers(tokens) for part in argument]
+    if len(numbers) != 3:
         raise BadInput("ADQL: a CIRCLE has two coordinates and a radius")
-    return found
+    return numbers
 
 
-def _so_many(word: str, arguments: list[list[str]], number: int) -> list[list[str]]:
+def _require_number(word: str, arguments: list[list[str]], number: int) -> list[list[str]]:
     if len(arguments) != number:
         raise BadInput(f"ADQL: {word} wants {number} arguments, got {len(arguments)}")
     return arguments
 
 
 def _sql(tokens: list[str]) -> str:
-    text = "".join(_functions(tokens, {})).strip()
+    text = "".join(_translate_functions(tokens, {})).strip()
     if not text:
         raise BadInput("ADQL: an argument is missing")
     # A column, a number or a text needs no brackets.

@@ -24,13 +24,13 @@ import pyarrow as pa
 
 from lake_schema.arrays import Array, Float32
 from truesky.numerics import cache
-from truesky.numerics.code_keys import code_key
+from truesky.numerics.code_fingerprints import code_key
 
 # (query, texts that must each be an expression) -> its rows
 Ask = Callable[[str, Sequence[str]], Iterable[pa.RecordBatch]]
 _NAME = "columns"
 _ORDER = "order"
-MOST_BYTES = 4e9
+MAX_BYTES = 4e9
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,38 +54,44 @@ class Selection:
         return f"({self.where}\n){sampled}"
 
 
-def kept(selection: Selection, expressions: Sequence[str], ask: Ask) -> list[Float32]:
+def load(selection: Selection, expressions: Sequence[str], ask: Ask) -> list[Float32]:
     """float32[n] of each expression, NaN where it is missing, row by row of the same rows; mapped from disc.
 
     ask    : runs a query
     Errors : BadInput for what is no expression
     """
     if selection.keys:
-        found = [_column(selection, [text], ask) for text in expressions]
-        if len({int(one[_ORDER][0]) for one in found}) <= 1:
-            return [one["0"] for one in found]
-    together = _column(selection, expressions, ask)
-    return [together[str(number)] for number in range(len(expressions))]
+        loaded = [_cached_columns(selection, [text], ask) for text in expressions]
+        if len({int(column[_ORDER][0]) for column in loaded}) <= 1:
+            return [column["0"] for column in loaded]
+    joint = _cached_columns(selection, expressions, ask)
+    return [joint[str(number)] for number in range(len(expressions))]
 
 
-def _column(selection: Selection, expressions: Sequence[str], ask: Ask) -> dict[str, Array]:
-    about: tuple[str | int, ...] = (selection.lake, selection.source, selection.where, *selection.keys, selection.part)
-    key = cache.content_key(code_key(__name__), *about, "of", *expressions)
-    return cache.cached_arrays(_NAME, key, lambda: _filled(selection, expressions, ask))
+def _cached_columns(selection: Selection, expressions: Sequence[str], ask: Ask) -> dict[str, Array]:
+    key_parts: tuple[str | int, ...] = (
+        selection.lake,
+        selection.source,
+        selection.where,
+        *selection.keys,
+        selection.part,
+    )
+    key = cache.content_key(code_key(__name__), *key_parts, "of", *expressions)
+    return cache.cached_arrays(_NAME, key, lambda: _compute_columns(selection, expressions, ask))
 
 
-def _filled(selection: Selection, expressions: Sequence[str], ask: Ask) -> dict[str, Array]:
-    wanted = [f"TRY_CAST(({text}\n) AS FLOAT) AS v{number}" for number, text in enumerate(expressions)]
+def _compute_columns(selection: Selection, expressions: Sequence[str], ask: Ask) -> dict[str, Array]:
+    select_list = [f"TRY_CAST(({text}\n) AS FLOAT) AS v{number}" for number, text in enumerate(expressions)]
     order = f"hash({', '.join(selection.keys)})" if selection.keys else "0::UBIGINT"
-    query = f"SELECT {', '.join(wanted)}, {order} AS own FROM {selection.source} WHERE {selection.condition()}"
+    query = f"SELECT {', '.join(select_list)}, {order} AS row_key FROM {selection.source} WHERE {selection.condition()}"
     cache.cache_dir().mkdir(parents=True, exist_ok=True)
     # On disc, not in memory: of a large table a column is gigabytes.
-    with ExitStack() as opened:
-        files = [opened.enter_context(tempfile.TemporaryFile(dir=cache.cache_dir())) for _ in expressions]
-        return _collected(ask(query, [*expressions, selection.where]), files)
+    with ExitStack() as open_files:
+        files = [open_files.enter_context(tempfile.TemporaryFile(dir=cache.cache_dir())) for _ in expressions]
+        return _collect_batches(ask(query, [*expressions, selection.where]), files)
 
 
-def _collected(batches: Iterable[pa.RecordBatch], files: Sequence[IO[bytes]]) -> dict[str, Array]:
+def _collect_batches(batches: Iterable[pa.RecordBatch], files: Sequence[IO[bytes]]) -> dict[str, Array]:
     """Columns, each through its file, and the sum that tells their order; the last column is the rows' keys."""
     total, rows = np.zeros(1, np.uint64), 0
     for batch in batches:
@@ -101,7 +107,7 @@ def _collected(batches: Iterable[pa.RecordBatch], files: Sequence[IO[bytes]]) ->
     return arrays
 
 
-def trim(most: float = MOST_BYTES, folder: Path | None = None) -> int:
+def trim(max_bytes: float = MAX_BYTES, folder: Path | None = None) -> int:
     """Remove kept columns, the oldest first, until they take at most `most` bytes.
 
     folder  : of the cache, None = the project's
@@ -111,7 +117,7 @@ def trim(most: float = MOST_BYTES, folder: Path | None = None) -> int:
     sizes = {path: sum(file.stat().st_size for file in path.iterdir()) for path in folders}
     removed, total = 0, sum(sizes.values())
     for path in sorted(folders, key=_age):
-        if total <= most:
+        if total <= max_bytes:
             break
         shutil.rmtree(path, ignore_errors=True)
         removed, total = removed + 1, total - sizes[path]

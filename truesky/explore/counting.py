@@ -27,21 +27,21 @@ from truesky.numerics.compiling import exact_jit
 
 # Rows that are counted at a time: a few columns of them stay in a processor's own cache.
 _BLOCK = 32768
-_MOST_COLUMNS, MOST_CELLS = 30, 8_000_000
-_MOST_AXES = 3
+_MAX_COLUMNS, MAX_CELLS = 30, 8_000_000
+_MAX_AXES = 3
 # Counts of all threads together: 128 MB.
-_MOST_COUNTS = 2 * MOST_CELLS
+_MAX_COUNTS = 2 * MAX_CELLS
 # A grid of more cells than so many a row of a block is counted in directly.
 _SPARSE = 4
 # Rows that tell a span, and the part of them that may lie outside on each side.
-_LOOKED_AT, _OUTSIDE = 200_000, 2e-3
+_SPAN_SAMPLE, _OUTSIDE = 200_000, 2e-3
 # Rows that are looked at for a point, at first.
-_LOOKED_AT_A_POINT = 8
+_ROWS_PER_POINT = 8
 
 # Values of which missing ones are counted at a time.
 _PIECE = 1 << 22
 # The bit of a row that has a value on every axis, one of them outside of the spans; those below are of the columns.
-_BEYOND = 1 << _MOST_COLUMNS
+_OUTSIDE_BIT = 1 << _MAX_COLUMNS
 
 Limits = Mapping[int, tuple[float, float]]
 
@@ -57,15 +57,15 @@ class Chart:
     columns: tuple[int, ...]
     spans: tuple[tuple[float, float], ...]
     bins: tuple[int, ...]
-    own: frozenset[int] | None = None
+    ignored_limits: frozenset[int] | None = None
 
     def __post_init__(self) -> None:
-        if not 1 <= len(self.columns) == len(self.spans) == len(self.bins) <= _MOST_AXES:
+        if not 1 <= len(self.columns) == len(self.spans) == len(self.bins) <= _MAX_AXES:
             raise BadInput("a chart has one to three axes, each with a span and a number of bins")
         if not all(np.isfinite([lo, hi]).all() and lo < hi for lo, hi in self.spans):
             raise BadInput(f"spans = {self.spans} are not from a finite number to a larger one")
-        if not (min(self.bins) >= 1 and self.cells <= MOST_CELLS):
-            raise BadInput(f"bins = {self.bins} are not between 1 and {MOST_CELLS} in all")
+        if not (min(self.bins) >= 1 and self.cells <= MAX_CELLS):
+            raise BadInput(f"bins = {self.bins} are not between 1 and {MAX_CELLS} in all")
 
     @property
     def cells(self) -> int:
@@ -73,17 +73,17 @@ class Chart:
         return math.prod(int(bins) for bins in self.bins)
 
 
-def counted(columns: Sequence[Float32], charts: Sequence[Chart], limits: Limits, threads: int = 1) -> list[Int]:
+def count_rows(columns: Sequence[Float32], charts: Sequence[Chart], limits: Limits, threads: int = 1) -> list[Int]:
     """int64[bins of the first axis, of the second ...] of each chart.
 
     columns : float32[n] each;  charts : what to count
     limits  : number of a column -> lowest and highest value that count, both included
     threads : that count side by side, fewer where the counts of each would fill much memory
     """
-    return tallied(columns, charts, limits, threads)[0]
+    return count_with_outside(columns, charts, limits, threads)[0]
 
 
-def tallied(
+def count_with_outside(
     columns: Sequence[Float32], charts: Sequence[Chart], limits: Limits, threads: int = 1
 ) -> tuple[list[Int], list[int]]:
     """(Counts as of `counted`; of each chart the rows within the limits that have a value on each of its axes, one of
@@ -91,71 +91,71 @@ def tallied(
 
     columns, charts, limits, threads : as of `counted`
     """
-    if not 1 <= len(columns) <= _MOST_COLUMNS or len({len(column) for column in columns}) != 1:
-        raise BadInput(f"counting wants 1 to {_MOST_COLUMNS} columns of the same rows")
+    if not 1 <= len(columns) <= _MAX_COLUMNS or len({len(column) for column in columns}) != 1:
+        raise BadInput(f"counting wants 1 to {_MAX_COLUMNS} columns of the same rows")
     _check(len(columns), charts, limits)
     tables = _tables(len(columns), charts, limits)
     rows = len(columns[0])
-    threads = max(1, min(threads, _MOST_COUNTS // max(1, sum(chart.cells for chart in charts))))
+    threads = max(1, min(threads, _MAX_COUNTS // max(1, sum(chart.cells for chart in charts))))
     edges = np.linspace(0, rows, threads + 1).astype(np.int64)
 
     cells = sum(chart.cells for chart in charts)
 
-    def part(number: int) -> Int:
+    def count_part(number: int) -> Int:
         # Behind the counts, of each chart the rows outside of its spans.
         counts = np.zeros(cells + len(charts), np.int64)
         for first in range(int(edges[number]), int(edges[number + 1]), _BLOCK):
             last = min(first + _BLOCK, int(edges[number + 1]))
-            _count(np.stack([column[first:last] for column in columns]), *tables, counts[:cells], counts[cells:])
+            _count_block(np.stack([column[first:last] for column in columns]), *tables, counts[:cells], counts[cells:])
         return counts
 
     if threads == 1:
-        total = part(0)
+        total = count_part(0)
     else:
         with ThreadPoolExecutor(threads) as pool:
-            total = reduce(np.add, pool.map(part, range(threads)))
-    *pieces, beyond = np.split(total, np.cumsum([chart.cells for chart in charts]))
-    found = [piece.reshape(chart.bins) for piece, chart in zip(pieces, charts, strict=True)]
-    return found, [int(rows) for rows in beyond]
+            total = reduce(np.add, pool.map(count_part, range(threads)))
+    *pieces, outside = np.split(total, np.cumsum([chart.cells for chart in charts]))
+    counts_by_chart = [piece.reshape(chart.bins) for piece, chart in zip(pieces, charts, strict=True)]
+    return counts_by_chart, [int(rows) for rows in outside]
 
 
 def _check(number: int, charts: Sequence[Chart], limits: Limits) -> None:
     """Refuse what the compiled loops, which look at no bounds, would read or write outside of their arrays."""
     if any(not 0 <= column < number for column in [*limits, *(c for chart in charts for c in chart.columns)]):
         raise BadInput(f"a chart or a limit is of a column that is none of the {number}")
-    if sum(chart.cells for chart in charts) > MOST_CELLS:
-        raise BadInput(f"the charts have more than {MOST_CELLS} bins together")
+    if sum(chart.cells for chart in charts) > MAX_CELLS:
+        raise BadInput(f"the charts have more than {MAX_CELLS} bins together")
 
 
 def _tables(number: int, charts: Sequence[Chart], limits: Limits) -> tuple[Float32, Bool, Int, Float, Int, Int, Int]:
     """Limits [column, 2], which of them are set [column], and of each chart: axes, spans, bins, the limits it heeds."""
     bounds, is_set = np.zeros((number, 2), np.float32), np.zeros(number, np.bool_)
     for column, (lo, hi) in limits.items():
-        bounds[column], is_set[column] = (_single(lo, up=True), _single(hi, up=False)), True
-    axes = np.full((len(charts), _MOST_AXES), -1, np.int64)
-    spans, bins = np.zeros((len(charts), _MOST_AXES, 2)), np.ones((len(charts), _MOST_AXES), np.int64)
+        bounds[column], is_set[column] = (_next_float32(lo, up=True), _next_float32(hi, up=False)), True
+    axes = np.full((len(charts), _MAX_AXES), -1, np.int64)
+    spans, bins = np.zeros((len(charts), _MAX_AXES, 2)), np.ones((len(charts), _MAX_AXES), np.int64)
     heeded = np.zeros(len(charts), np.int64)
     for k, chart in enumerate(charts):
         size = len(chart.columns)
         axes[k, :size], spans[k, :size], bins[k, :size] = chart.columns, chart.spans, chart.bins
-        own = frozenset(chart.columns) if chart.own is None else chart.own
-        heeded[k] = sum(1 << column for column in range(number) if column not in own)
+        ignored = frozenset(chart.columns) if chart.ignored_limits is None else chart.ignored_limits
+        heeded[k] = sum(1 << column for column in range(number) if column not in ignored)
     starts = np.append(0, np.cumsum([chart.cells for chart in charts])[:-1]).astype(np.int64)
     return bounds, is_set, axes, spans, bins, heeded, starts
 
 
-def _single(limit: float, up: bool) -> np.float32:
+def _next_float32(limit: float, up: bool) -> np.float32:
     """The float32 next to a limit, not below or not above it: float32 values are on the same side of both."""
     with np.errstate(over="ignore"):
-        near = np.float32(limit)
-    beyond = float(near) < limit if up else float(near) > limit
-    return np.nextafter(near, np.float32(np.inf if up else -np.inf)) if beyond else near
+        rounded = np.float32(limit)
+    is_past = float(rounded) < limit if up else float(rounded) > limit
+    return np.nextafter(rounded, np.float32(np.inf if up else -np.inf)) if is_past else rounded
 
 
 @exact_jit
-def _count(
+def _count_block(
     values: Float32, bounds: Float32, is_set: Bool, axes: Int, spans: Float, bins: Int, heeded: Int, starts: Int,
-    counts: Int, beyond: Int,
+    counts: Int, outside: Int,
 ) -> None:  # fmt: skip
     """Add the rows of a block, float32[column, n], to the counts, and those outside of a chart's spans to `beyond`.
 
@@ -171,10 +171,10 @@ def _count(
                 fails[i] |= np.int32(0) if (values[c, i] >= lo) & (values[c, i] <= hi) else bit
     cell, out = np.empty(rows, np.int32), np.empty(rows, np.int32)
     for k in range(axes.shape[0]):
-        own, cells = np.int32(heeded[k]), np.int32(1)
+        heeded_bits, cells = np.int32(heeded[k]), np.int32(1)
         for i in range(rows):
             cell[i] = 0
-            out[i] = fails[i] & own
+            out[i] = fails[i] & heeded_bits
         for a in range(axes.shape[1]):
             c = axes[k, a]
             if c < 0:
@@ -188,52 +188,54 @@ def _count(
                 place = place if place < last else last
                 cell[i] = cell[i] * n + np.int32(place if inside else 0.0)
                 # A missing value, and an infinite one, is nowhere.
-                out[i] |= np.int32(0) if inside else (np.int32(_BEYOND) if abs(x) < np.inf else np.int32(1))
+                out[i] |= np.int32(0) if inside else (np.int32(_OUTSIDE_BIT) if abs(x) < np.inf else np.int32(1))
             cells *= n
         if cells > _SPARSE * rows:
             for i in range(rows):
                 if out[i] == 0:
                     counts[starts[k] + cell[i]] += 1
-                elif out[i] == _BEYOND:
-                    beyond[k] += 1
+                elif out[i] == _OUTSIDE_BIT:
+                    outside[k] += 1
         else:
             for i in range(rows):
-                cell[i] = cell[i] if out[i] == 0 else (cells + 1 if out[i] == _BEYOND else cells)
-            found = np.zeros(cells + 2, np.int32)
+                cell[i] = cell[i] if out[i] == 0 else (cells + 1 if out[i] == _OUTSIDE_BIT else cells)
+            block_counts = np.zeros(cells + 2, np.int32)
             for i in range(rows):
-                found[cell[i]] += 1
+                block_counts[cell[i]] += 1
             for m in range(cells):
-                counts[starts[k] + m] += found[m]
-            beyond[k] += found[cells + 1]
+                counts[starts[k] + m] += block_counts[m]
+            outside[k] += block_counts[cells + 1]
 
 
-def points(columns: Sequence[Float32], chart: Chart, limits: Limits, most: int) -> tuple[Float32, int]:
+def points(columns: Sequence[Float32], chart: Chart, limits: Limits, max_points: int) -> tuple[Float32, int]:
     """(float32[n, axes] places of rows that count in a chart, n <= most; one row in how many was looked at).
 
     columns, limits : as of `counted`;  chart : which;  most : how many points at most, > 0
     All rows that count where they are no more; else rows at equal steps, the step a power of two.
     """
-    own = frozenset(chart.columns) if chart.own is None else chart.own
-    bounds = [(column, limit) for column, limit in limits.items() if column not in own]
+    ignored = frozenset(chart.columns) if chart.ignored_limits is None else chart.ignored_limits
+    bounds = [(column, limit) for column, limit in limits.items() if column not in ignored]
     bounds += zip(chart.columns, chart.spans, strict=True)
     step = 1
     # Of many rows few are looked at, and more only where these are not enough.
-    while len(columns[0]) > step * most * _LOOKED_AT_A_POINT:
+    while len(columns[0]) > step * max_points * _ROWS_PER_POINT:
         step *= 2
     while True:
-        some = [column[::step] for column in columns]
-        inside = np.ones(len(some[0]), bool)
+        sample = [column[::step] for column in columns]
+        inside = np.ones(len(sample[0]), bool)
         for column, (low, high) in bounds:
-            inside &= (some[column] >= _single(low, up=True)) & (some[column] <= _single(high, up=False))
-        found = np.flatnonzero(inside)
-        if step == 1 or 2 * len(found) > most:
+            inside &= (sample[column] >= _next_float32(low, up=True)) & (
+                sample[column] <= _next_float32(high, up=False)
+            )
+        indices = np.flatnonzero(inside)
+        if step == 1 or 2 * len(indices) > max_points:
             break
         step //= 2
-    while len(found) > most:
+    while len(indices) > max_points:
         step *= 2
-        found = found[found % 2 == 0] // 2
-        some = [column[::2] for column in some]
-    return np.stack([some[column][found] for column in chart.columns], axis=1), step
+        indices = indices[indices % 2 == 0] // 2
+        sample = [column[::2] for column in sample]
+    return np.stack([sample[column][indices] for column in chart.columns], axis=1), step
 
 
 def span(column: Float32) -> tuple[float, float]:
@@ -241,18 +243,18 @@ def span(column: Float32) -> tuple[float, float]:
 
     column : float32[n]
     """
-    some = np.asarray(column[:: max(len(column) // _LOOKED_AT, 1)], float)
-    some = some[np.isfinite(some)]
-    if not len(some):
+    sample = np.asarray(column[:: max(len(column) // _SPAN_SAMPLE, 1)], float)
+    sample = sample[np.isfinite(sample)]
+    if not len(sample):
         return 0.0, 1.0
-    lo, hi = np.quantile(some, [_OUTSIDE, 1.0 - _OUTSIDE])
+    lo, hi = np.quantile(sample, [_OUTSIDE, 1.0 - _OUTSIDE])
     margin = 0.02 * (hi - lo)
-    lo, hi = max(lo - margin, some.min()), min(hi + margin, some.max())
+    lo, hi = max(lo - margin, sample.min()), min(hi + margin, sample.max())
     return (float(lo), float(hi)) if hi > lo else (float(lo) - 0.5, float(hi) + 0.5)
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
+class ChartColumns:
     """Kept columns of the same rows, float32[n] each; of each its span and how many rows have no value."""
 
     columns: list[Float32]
@@ -260,9 +262,9 @@ class Held:
     missing: list[int]
 
 
-def held(columns: Sequence[Float32]) -> Held:
+def inspect_columns(columns: Sequence[Float32]) -> ChartColumns:
     """Columns, looked at once: at every move of a brush this would take as long as counting."""
-    return Held([*columns], [span(column) for column in columns], [_missing(column) for column in columns])
+    return ChartColumns([*columns], [span(column) for column in columns], [_missing(column) for column in columns])
 
 
 def _missing(column: Float32) -> int:

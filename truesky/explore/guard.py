@@ -15,7 +15,7 @@ import duckdb
 
 from lake_schema.errors import BadInput
 
-_MOST_CHARACTERS, _LONGEST = 100_000, 500
+_MAX_CHARACTERS, _MAX_LENGTH = 100_000, 500
 _QUERIES = {"SELECT_NODE", "SET_OPERATION_NODE", "RECURSIVE_CTE_NODE", "CTE_NODE"}
 _SOURCES = {"BASE_TABLE", "JOIN", "SUBQUERY", "EMPTY", "EXPRESSION_LIST", "TABLE_FUNCTION"}
 _TABLE_FUNCTIONS = {"range", "generate_series", "unnest"}
@@ -43,7 +43,7 @@ class Origins:
         return name not in self.other and (self.names is None or name in self.names)
 
 
-_NOTHING = Origins(frozenset())
+_NO_ORIGINS = Origins(frozenset())
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,40 +59,42 @@ class Query:
     columns: Origins
 
 
-def checked(text: str, known: Collection[str], opened: duckdb.DuckDBPyConnection | None = None) -> Query:
+def check_query(text: str, table_names: Collection[str], connection: duckdb.DuckDBPyConnection | None = None) -> Query:
     """The query, if it is harmless.  Errors: BadInput says what it may not do.
 
     known : names of the lake's tables;  opened : a parser to use, None = a new one
     """
-    if len(text) > _MOST_CHARACTERS or "\0" in text:
-        raise BadInput(f"SQL: a query has at most {_MOST_CHARACTERS} characters and no NUL")
+    if len(text) > _MAX_CHARACTERS or "\0" in text:
+        raise BadInput(f"SQL: a query has at most {_MAX_CHARACTERS} characters and no NUL")
     try:
         text.encode()
     except UnicodeEncodeError as error:
         raise BadInput(f"SQL: {one_line(error)}") from None
-    tree = _parsed(text, opened)
+    tree = _parse(text, connection)
     used: set[str] = set()
     for node, visible in _nodes(tree):
         if "cte_map" in node and node.get("type") not in _QUERIES:
             raise BadInput(f"SQL: only SELECT is possible, not {_words(node)}")
         if {"type", "alias", "sample"} <= node.keys():
-            used |= _source(node, known, visible)
+            used |= _source(node, table_names, visible)
         if node.get("class") == "FUNCTION":
             _refuse_function(str(node["function_name"]).lower())
     return Query(text, tuple(sorted(used)), _origins(tree, used, {}))
 
 
-def check_expression(text: str, opened: duckdb.DuckDBPyConnection | None = None) -> None:
+def check_expression(text: str, connection: duckdb.DuckDBPyConnection | None = None) -> None:
     """Refuse what is not one expression, which could be more than its place in a query gives it room for.
 
     text : SQL;  opened : a parser to use, None = a new one;  Errors: BadInput
     """
-    if not 0 < len(text.strip()) <= _MOST_CHARACTERS or "\0" in text:
-        raise BadInput(f"SQL: an expression has 1 to {_MOST_CHARACTERS} characters and no NUL")
-    tree = _parsed(f"SELECT ({text}\n)", opened)
-    alone = tree.get("type") == "SELECT_NODE" and len(tree["select_list"]) == 1 and not tree["select_list"][0]["alias"]
-    more = ("where_clause", "group_expressions", "having", "qualify", "sample", "modifiers")
-    if not alone or tree["from_table"]["type"] != "EMPTY" or any(tree.get(key) for key in more):
+    if not 0 < len(text.strip()) <= _MAX_CHARACTERS or "\0" in text:
+        raise BadInput(f"SQL: an expression has 1 to {_MAX_CHARACTERS} characters and no NUL")
+    tree = _parse(f"SELECT ({text}\n)", connection)
+    is_single = (
+        tree.get("type") == "SELECT_NODE" and len(tree["select_list"]) == 1 and not tree["select_list"][0]["alias"]
+    )
+    other_clauses = ("where_clause", "group_expressions", "having", "qualify", "sample", "modifiers")
+    if not is_single or tree["from_table"]["type"] != "EMPTY" or any(tree.get(key) for key in other_clauses):
         raise BadInput(f"SQL: {one_line(text)[:100]!r} is not one expression")
 
 
@@ -101,12 +103,12 @@ def parser() -> duckdb.DuckDBPyConnection:
     return duckdb.connect(":memory:", config={"threads": 1})
 
 
-def _parsed(text: str, opened: duckdb.DuckDBPyConnection | None) -> Tree:
-    with contextlib.nullcontext(opened) if opened is not None else parser() as database:
+def _parse(text: str, connection: duckdb.DuckDBPyConnection | None) -> Tree:
+    with contextlib.nullcontext(connection) if connection is not None else parser() as database:
         try:
-            kinds = [statement.type for statement in database.extract_statements(text)]
-            if kinds != [duckdb.StatementType.SELECT]:
-                names = ", ".join(str(kind).rpartition(".")[2] for kind in kinds) or "nothing"
+            statement_types = [statement.type for statement in database.extract_statements(text)]
+            if statement_types != [duckdb.StatementType.SELECT]:
+                names = ", ".join(str(kind).rpartition(".")[2] for kind in statement_types) or "nothing"
                 raise BadInput(f"SQL: exactly one SELECT is possible, got {names[:100]}")
             row = database.execute("SELECT json_serialize_sql($text::VARCHAR)", {"text": text}).fetchone()
         except (duckdb.Error, UnicodeError) as error:
@@ -122,48 +124,48 @@ def _parsed(text: str, opened: duckdb.DuckDBPyConnection | None) -> Tree:
 
 def one_line(error: BaseException | str) -> str:
     """An error's text, or a name, without its line breaks and pointers."""
-    return " ".join(str(error).split())[:_LONGEST]
+    return " ".join(str(error).split())[:_MAX_LENGTH]
 
 
 def _nodes(tree: Any) -> Iterator[tuple[Tree, frozenset[str]]]:
     """Every node, and which names of WITH clauses are to be seen from it: elsewhere DuckDB finds its own tables."""
-    waiting: list[tuple[Any, frozenset[str]]] = [(tree, frozenset())]
-    while waiting:
-        node, visible = waiting.pop()
+    stack: list[tuple[Any, frozenset[str]]] = [(tree, frozenset())]
+    while stack:
+        node, visible = stack.pop()
         if isinstance(node, dict):
             yield node, visible
             rest = {key: value for key, value in node.items() if key != "cte_map"}
             for entry in node.get("cte_map", {}).get("map", ()):
                 # A query sees those before it, never itself.
-                waiting.append((entry["value"], visible))
+                stack.append((entry["value"], visible))
                 visible |= {str(entry["key"]).lower()}
             # But for the second half of a recursive one, and what follows one that is kept.
-            own = visible | {str(node["cte_name"]).lower()} if "cte_name" in node else visible
-            waiting += [(value, own if key in ("right", "child") else visible) for key, value in rest.items()]
+            inner_visible = visible | {str(node["cte_name"]).lower()} if "cte_name" in node else visible
+            stack += [(value, inner_visible if key in ("right", "child") else visible) for key, value in rest.items()]
         elif isinstance(node, list):
-            waiting += [(value, visible) for value in node]
+            stack += [(value, visible) for value in node]
 
 
 def _words(node: Tree) -> str:
     return str(node.get("type")).removesuffix("_NODE").removesuffix("_QUERY").replace("_", " ")
 
 
-def _source(node: Tree, known: Collection[str], named: Collection[str]) -> set[str]:
+def _source(node: Tree, table_names: Collection[str], with_names: Collection[str]) -> set[str]:
     """The lake's table that a FROM entry stands for, if any."""
     kind = node["type"]
     if kind not in _SOURCES:
         raise BadInput(f"SQL: {_words(node)} is not possible here")
     if kind == "TABLE_FUNCTION" and node["function"].get("function_name", "").lower() not in _TABLE_FUNCTIONS:
         name = node["function"].get("function_name", "this")
-        raise BadInput(f"SQL: {one_line(name)}() is not a table of the lake ({', '.join(sorted(known))})")
+        raise BadInput(f"SQL: {one_line(name)}() is not a table of the lake ({', '.join(sorted(table_names))})")
     if kind != "BASE_TABLE":
         return set()
     name = _table_name(node)
-    if not node.get("catalog_name") and name in known:
+    if not node.get("catalog_name") and name in table_names:
         return {name}
-    if not node.get("catalog_name") and name in named:
+    if not node.get("catalog_name") and name in with_names:
         return set()
-    raise BadInput(f"SQL: {one_line(repr(name))} is not a table of the lake ({', '.join(sorted(known))})")
+    raise BadInput(f"SQL: {one_line(repr(name))} is not a table of the lake ({', '.join(sorted(table_names))})")
 
 
 def _refuse_function(name: str) -> None:
@@ -171,20 +173,20 @@ def _refuse_function(name: str) -> None:
         raise BadInput(f"SQL: the function {one_line(name)} is not possible here")
 
 
-def _origins(node: Tree, tables: Collection[str], before: Mapping[str, Origins]) -> Origins:
+def _origins(node: Tree, tables: Collection[str], outer: Mapping[str, Origins]) -> Origins:
     """Which columns of a query's result are columns of the lake's tables, however deep in it they are chosen.
 
     before : of the WITH clauses that the query sees
     """
-    seen = dict(before)
+    visible = dict(outer)
     for entry in node.get("cte_map", {}).get("map", ()):
-        own = entry["value"]
-        query = {} if own.get("aliases") else own.get("query_node", {})
-        seen[str(entry["key"]).lower()] = _origins(query, tables, seen)
+        clause = entry["value"]
+        query = {} if clause.get("aliases") else clause.get("query_node", {})
+        visible[str(entry["key"]).lower()] = _origins(query, tables, visible)
     if node.get("type") != "SELECT_NODE":
-        return _NOTHING
-    given = _given(node["from_table"], tables, seen)
-    names, other, everything = set[str](), set(given.other), False
+        return _NO_ORIGINS
+    source_origins = _source_origins(node["from_table"], tables, visible)
+    names, other, everything = set[str](), set(source_origins.other), False
     for entry in node["select_list"]:
         if entry["class"] == "STAR" and not (
             entry.get("replace_list") or entry.get("rename_list") or entry.get("columns")
@@ -193,28 +195,36 @@ def _origins(node: Tree, tables: Collection[str], before: Mapping[str, Origins])
         elif entry["class"] == "COLUMN_REF" and not entry["alias"]:
             *within, name = (str(part).lower() for part in entry["column_names"])
             # A field of a structure that the query made.
-            (other if given.other & set(within) else names).add(name)
+            (other if source_origins.other & set(within) else names).add(name)
         else:
             other.add(str(entry["alias"]).lower())
     if everything:
-        return Origins(given.names, frozenset(other))
-    return Origins(frozenset(names if given.names is None else names & given.names), frozenset(other))
+        return Origins(source_origins.names, frozenset(other))
+    return Origins(frozenset(names if source_origins.names is None else names & source_origins.names), frozenset(other))
 
 
-def _given(source: Tree, tables: Collection[str], seen: Mapping[str, Origins]) -> Origins:
+def _source_origins(source: Tree, tables: Collection[str], visible: Mapping[str, Origins]) -> Origins:
     """The same of what follows FROM."""
     if source.get("column_name_alias"):
-        return _NOTHING
+        return _NO_ORIGINS
     if source["type"] == "JOIN":
-        left, right = (_given(source[side], tables, seen) for side in ("left", "right"))
-        names = None if left.names is None or right.names is None else left.names | right.names
-        return Origins(names, left.other | right.other) if _NOTHING not in (left, right) else _NOTHING
+        left_origins, right_origins = (_source_origins(source[side], tables, visible) for side in ("left", "right"))
+        names = (
+            None
+            if left_origins.names is None or right_origins.names is None
+            else left_origins.names | right_origins.names
+        )
+        return (
+            Origins(names, left_origins.other | right_origins.other)
+            if _NO_ORIGINS not in (left_origins, right_origins)
+            else _NO_ORIGINS
+        )
     if source["type"] == "SUBQUERY":
-        return _origins(source["subquery"]["node"], tables, seen)
+        return _origins(source["subquery"]["node"], tables, visible)
     if source["type"] == "BASE_TABLE":
         name = _table_name(source)
-        return seen.get(name, Origins(None) if name in tables else _NOTHING)
-    return _NOTHING
+        return visible.get(name, Origins(None) if name in tables else _NO_ORIGINS)
+    return _NO_ORIGINS
 
 
 def _table_name(source: Tree) -> str:

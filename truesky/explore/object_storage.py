@@ -32,12 +32,12 @@ class Objects(ArrowFSWrapper):  # type: ignore[misc]
     cachable = True
 
     def __init__(self, endpoint: str = "", region: str = "", **_: Any) -> None:
-        super().__init__(s3.Store(s3.Address("", "", endpoint, region)).files)
+        super().__init__(s3.ObjectStore(s3.Address("", "", endpoint, region)).files)
 
     @classmethod
     def _strip_protocol(cls, path: Any) -> Any:
         if isinstance(path, list):
-            return [cls._strip_protocol(one) for one in path]
+            return [cls._strip_protocol(item) for item in path]
         return str(path).removeprefix(f"{_PROTOCOL}://").rstrip("/")
 
     @classmethod
@@ -48,8 +48,8 @@ class Objects(ArrowFSWrapper):  # type: ignore[misc]
         """Bytes of an object; places below 0 count from its end, which pyarrow's own files do not know."""
         with self.fs.open_input_file(self._strip_protocol(path)) as stream:
             first, last, _step = slice(start, end).indices(stream.size())
-            found: bytes = stream.read_at(max(last - first, 0), first)
-            return found
+            content: bytes = stream.read_at(max(last - first, 0), first)
+            return content
 
 
 def catalogue(lake: str, table: str, request: str | None = None) -> UPath:
@@ -58,14 +58,14 @@ def catalogue(lake: str, table: str, request: str | None = None) -> UPath:
     lake    : s3://BUCKET/PREFIX, maybe with ?endpoint_override=URL;  request : whose, where the lake has several
     Errors  : BadInput for what is no such lake, or no catalogue of it
     """
-    root = layout.opened(lake)
-    if not isinstance(root, s3.Place):
+    root = layout.open_lake(lake)
+    if not isinstance(root, s3.ObjectPath):
         raise BadInput(f"lake {lake} is no address s3://..: lsdb opens a folder by its path")
     version, place = read.version(root, table, request=request), root.store.address
-    if not version.has("collection.properties"):
+    if not version.has_file("collection.properties"):
         raise BadInput(f"table {table} is no catalogue: version {version.key} has no HATS collection")
     fsspec.register_implementation(_PROTOCOL, Objects, clobber=True)
-    name = root.store.path(table, f"v-{version.key}")
+    name = root.store.object_path(table, f"v-{version.key}")
     with warnings.catch_warnings():
         # That UPath does not know this protocol by itself.
         warnings.simplefilter("ignore")

@@ -57,9 +57,9 @@ def heatmap(counts: Float, x_edges: Float, y_edges: Float, ax: Any = None, **sty
     from matplotlib.colors import LogNorm
 
     axes = _axes(ax)
-    seen = np.ma.masked_less_equal(counts, 0.0)
+    nonempty = np.ma.masked_less_equal(counts, 0.0)
     norm = LogNorm(1.0, max(2.0, float(counts.max(initial=0.0))))
-    mesh = axes.pcolormesh(x_edges, y_edges, seen, **{"norm": norm, "cmap": "viridis", **style})
+    mesh = axes.pcolormesh(x_edges, y_edges, nonempty, **{"norm": norm, "cmap": "viridis", **style})
     axes.figure.colorbar(mesh, ax=axes, label="number")
     return axes
 
@@ -90,14 +90,14 @@ def skymap(cells: Int, counts: Float, order: int = ORDER, ax: Any = None, **styl
     corners = sky.cell_corners(order, cells)
     # Each cell as it lies about its own first corner: none is torn at RA 0.
     corners[:, :, 0] = corners[:, :1, 0] + (corners[:, :, 0] - corners[:, :1, 0] + 180.0) % 360.0 - 180.0
-    drawn = PolyCollection(list(corners), array=counts / sky.cell_area(order), **{"cmap": "viridis", **style})
-    axes.add_collection(drawn)
+    collection = PolyCollection(list(corners), array=counts / sky.cell_area(order), **{"cmap": "viridis", **style})
+    axes.add_collection(collection)
     axes.autoscale_view()
     axes.invert_xaxis()
     axes.set_aspect(1.0 / max(np.cos(np.radians(corners[:, :, 1].mean())), 0.1))
     axes.set_xlabel("right ascension / deg")
     axes.set_ylabel("declination / deg")
-    axes.figure.colorbar(drawn, ax=axes, label="number / deg$^2$")
+    axes.figure.colorbar(collection, ax=axes, label="number / deg$^2$")
     return axes
 
 

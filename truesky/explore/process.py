@@ -18,7 +18,7 @@ from typing import IO, Any
 
 import pyarrow as pa
 
-from lake_schema import bounds
+from lake_schema import arguments
 from lake_schema.arrays import as_python
 from lake_schema.errors import BadInput, Damaged, LakeError
 from lake_schema.store.object_storage.s3 import Folder
@@ -29,7 +29,7 @@ MEMORY, TIMEOUT = 4e9, 300.0
 _MEMORY_LO, _MEMORY_HI = 1e7, 1e15
 TIMEOUT_HI = 1e6
 # Of the memory the part that a result may fill that is wanted in one piece.
-_RESULT = 0.5
+_RESULT_SHARE = 0.5
 _BUFFER = 1 << 20
 _ERRORS = {"BadInput": BadInput, "Damaged": Damaged}
 _CLOSED = "SQL: stopped, because the lake was closed before the query was answered"
@@ -59,8 +59,8 @@ class Process:
     """
 
     def __init__(self, root: Folder, tables: Sequence[str], memory: float = MEMORY) -> None:
-        bounds.number("memory", memory, _MEMORY_LO, _MEMORY_HI)
-        self.most_bytes = int(memory * _RESULT)
+        arguments.check_number("memory", memory, _MEMORY_LO, _MEMORY_HI)
+        self.max_bytes = int(memory * _RESULT_SHARE)
         self.command = [sys.executable, "-m", "truesky.explore.worker", str(root), str(int(memory)), *tables]
         self._worker: _Worker | None = None
         # The answer that is being read, None between two answers.
@@ -95,15 +95,15 @@ class Process:
         Errors : BadInput, Damaged, as `Explorer.sql`
         """
         with self._lock:
-            return pa.Table.from_batches(list(self.batches(text, parameters, timeout, most_bytes=self.most_bytes)))
+            return pa.Table.from_batches(list(self.batches(text, parameters, timeout, max_bytes=self.max_bytes)))
 
     def batches(
         self,
         text: str,
         parameters: Mapping[str, object] | None = None,
         timeout: float = TIMEOUT,
-        rows: int | None = None,
-        most_bytes: int | None = None,
+        max_rows: int | None = None,
+        max_bytes: int | None = None,
         expressions: Sequence[str] = (),
     ) -> Iterator[pa.RecordBatch]:
         """Yield the result piece by piece, at least one piece; closing the generator stops the query.
@@ -113,23 +113,23 @@ class Process:
         expressions      : parts of the text that a user wrote, each of which must be one expression
         Errors           : as `ask`, also after some pieces; BadInput if another query began before the last piece
         """
-        bounds.number("timeout", timeout, 0.0, TIMEOUT_HI)
-        question = {"sql": text, "parameters": dict(parameters or {}), "rows": rows, "bytes": most_bytes}
-        answer = self._begun(question | {"expressions": [*expressions]}, timeout)
+        arguments.check_number("timeout", timeout, 0.0, TIMEOUT_HI)
+        question = {"sql": text, "parameters": dict(parameters or {}), "rows": max_rows, "bytes": max_bytes}
+        answer = self._send(question | {"expressions": [*expressions]}, timeout)
         try:
             while (batch := self._next(answer)) is not None:
                 yield batch
         finally:
             self._give_up(answer)
 
-    def _begun(self, question: dict[str, Any], timeout: float) -> _Answer:
+    def _send(self, question: dict[str, Any], timeout: float) -> _Answer:
         """Send a question; an answer that is not yet read to its end is given up."""
         number = next(self._numbers)
         line = _line_of(question | {"id": number})
         with self._lock:
             if self._answer is not None:
                 self._end()
-            worker = self._running()
+            worker = self._ensure_worker()
             pipe = worker.process.stdin
             assert pipe is not None
             try:
@@ -137,8 +137,8 @@ class Process:
                 pipe.flush()
             except BrokenPipeError:
                 self._end()
-                said = _CLOSED if worker.is_stopped else "SQL: the process that answers queries has ended; ask again"
-                raise BadInput(said) from None
+                message = _CLOSED if worker.is_stopped else "SQL: the process that answers queries has ended; ask again"
+                raise BadInput(message) from None
             self._answer = _Answer(worker, number, timeout)
             return self._answer
 
@@ -150,10 +150,10 @@ class Process:
             try:
                 batch = answer.read()
             except TimeoutError:
-                said = f"SQL: stopped after {answer.timeout:g} s"
+                message = f"SQL: stopped after {answer.timeout:g} s"
             except (pa.ArrowException, OSError, EOFError):
                 crashed = "SQL: the query needs more memory than it may have, or brought its process down"
-                said = _CLOSED if answer.worker.is_stopped else crashed
+                message = _CLOSED if answer.worker.is_stopped else crashed
             else:
                 if batch is not None:
                     return batch
@@ -162,7 +162,7 @@ class Process:
                     raise answer.error
                 return None
             self._end()
-            raise BadInput(said)
+            raise BadInput(message)
 
     def _give_up(self, answer: _Answer) -> None:
         """End the process if it still answers this question."""
@@ -175,7 +175,7 @@ class Process:
             finally:
                 self._lock.release()
 
-    def _running(self) -> _Worker:
+    def _ensure_worker(self) -> _Worker:
         if self._worker is None or not self._worker.is_alive:
             self._end()
             pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
@@ -196,7 +196,7 @@ class _Answer:
         assert worker.process.stdout is not None
         self.worker, self.number, self.timeout = worker, number, timeout
         self.error: LakeError | None = None
-        self._pipe = io.BufferedReader(_Timed(worker.process.stdout, time.monotonic() + timeout), _BUFFER)
+        self._pipe = io.BufferedReader(_TimedPipe(worker.process.stdout, time.monotonic() + timeout), _BUFFER)
         self._stream: pa.RecordBatchStreamReader | None = None
 
     def read(self) -> pa.RecordBatch | None:
@@ -205,29 +205,29 @@ class _Answer:
         Errors : TimeoutError; OSError, EOFError or an error of Arrow if the worker has ended
         """
         if self._stream is None:
-            if not self._is_good():
+            if not self._read_status():
                 return None
             self._stream = pa.ipc.open_stream(self._pipe)
         try:
             return self._stream.read_next_batch()
         except StopIteration:
-            self._is_good()
+            self._read_status()
             return None
 
-    def _is_good(self) -> bool:
+    def _read_status(self) -> bool:
         """Read the line before or after the pieces."""
         line = self._pipe.readline()
         if not line.endswith(b"\n"):
             raise EOFError
-        said = json.loads(line)
-        if said["id"] != self.number:
-            raise LakeError(f"SQL: question {self.number} got the answer to question {said['id']}")
-        if "error" in said:
-            self.error = _ERRORS.get(said["kind"], LakeError)(said["error"])
+        status = json.loads(line)
+        if status["id"] != self.number:
+            raise LakeError(f"SQL: question {self.number} got the answer to question {status['id']}")
+        if "error" in status:
+            self.error = _ERRORS.get(status["kind"], LakeError)(status["error"])
         return self.error is None
 
 
-class _Timed(io.RawIOBase):
+class _TimedPipe(io.RawIOBase):
     """A pipe that is read until a moment of the monotonic clock; TimeoutError after it."""
 
     def __init__(self, pipe: IO[bytes], deadline: float) -> None:

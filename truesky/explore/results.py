@@ -20,7 +20,7 @@ from lake_schema.errors import BadInput
 from truesky.explore import votables
 
 # That a FITS file is made of, and that it may have: of other files no more than a piece is kept.
-MOST_FITS_BYTES, _PIECE = 8 << 30, 1 << 20
+MAX_FITS_BYTES, _PIECE = 8 << 30, 1 << 20
 INTO = ("pandas", "astropy", "arrow")
 # Where some are missing: pandas' own way is to make floats of integers, which rounds an identifier.
 _NULLABLE: dict[pa.DataType, Any] = {pa.bool_(): pd.BooleanDtype()}
@@ -30,7 +30,7 @@ _NULLABLE |= {
 }
 
 
-def converted(rows: pa.Table, into: str) -> Any:
+def convert(rows: pa.Table, into: str) -> Any:
     """The rows as a pandas DataFrame, an astropy Table with units, or as they are."""
     if into == "pandas":
         gaps = {column.type for column in rows.columns if column.null_count}
@@ -51,14 +51,14 @@ def _astropy(rows: pa.Table) -> Any:
     table = AstropyTable()
     for field, values in zip(rows.schema, rows.columns, strict=True):
         facts = _facts(field)
-        about: dict[str, Any] = {"unit": facts.get("unit") or None, "description": facts.get("description")}
+        attributes: dict[str, Any] = {"unit": facts.get("unit") or None, "description": facts.get("description")}
         # As astropy does with those of a VOTable.
-        about |= {"meta": {"ucd": facts["ucd"]}} if facts.get("ucd") else {}
+        attributes |= {"meta": {"ucd": facts["ucd"]}} if facts.get("ucd") else {}
         if values.null_count:
             filled = values.fill_null(pa.scalar(0).cast(field.type)) if field.type in _NULLABLE else values
-            table[field.name] = MaskedColumn(filled.to_numpy(), mask=values.is_null().to_numpy(), **about)
+            table[field.name] = MaskedColumn(filled.to_numpy(), mask=values.is_null().to_numpy(), **attributes)
         else:
-            table[field.name] = AstropyColumn(values.to_numpy(), **about)
+            table[field.name] = AstropyColumn(values.to_numpy(), **attributes)
     return table
 
 
@@ -72,9 +72,9 @@ def write(rows: pa.Table, path: Path) -> None:
     Errors : BadInput for another ending, or names the column that such a file cannot hold; OSError where the disc
              refuses
     """
-    writer = _WRITERS[user_files.target(path, ENDINGS).suffix.lower()]
+    writer = _WRITERS[user_files.check_target(path, ENDINGS).suffix.lower()]
     _refuse_same_names(rows)
-    with user_files.staged(path) as temporary:
+    with user_files.replace_atomically(path) as temporary:
         if error := _refusal(writer, rows, temporary):
             column = next((name for name in rows.column_names if _refusal(writer, rows.select([name]), temporary)), "")
             raise BadInput(f"{path}: column {column}: {' '.join(str(error).split())[:300]}") from None
@@ -106,11 +106,11 @@ def _fits(rows: pa.Table, path: Path) -> None:
     # astropy's import takes longer than a page of the sky.
     from lake_schema.fits.tables import table_to_fits
 
-    declared = _declared(rows.schema)
-    table_to_fits(path, rows.cast(declared.arrow()), declared)
+    declared = _declare_table(rows.schema)
+    table_to_fits(path, rows.cast(declared.arrow_schema()), declared)
 
 
-def _declared(schema: pa.Schema) -> Table:
+def _declare_table(schema: pa.Schema) -> Table:
     return Table("result", 1, tuple(_column(field) for field in schema), "Result of a query.", key=())
 
 
@@ -145,7 +145,7 @@ _WRITERS: dict[str, Callable[[pa.Table, Path], None]] = {
 ENDINGS = tuple(_WRITERS)
 
 
-def streamed(batches: Iterator[pa.RecordBatch], ending: str) -> Iterator[bytes]:
+def stream_file(batches: Iterator[pa.RecordBatch], ending: str) -> Iterator[bytes]:
     """The bytes of a .csv, .parquet, .vot or .fits file of any number of rows, piece by piece.
 
     batches : at least one; for FITS all of them are read before the first piece
@@ -153,15 +153,15 @@ def streamed(batches: Iterator[pa.RecordBatch], ending: str) -> Iterator[bytes]:
     """
     first = next(batches)
     _refuse_same_names(pa.Table.from_batches([first]))
-    both = itertools.chain([first], batches)
+    all_batches = itertools.chain([first], batches)
     if ending == ".vot":
-        yield from votables.pieces(both)
+        yield from votables.pieces(all_batches)
     elif ending == ".csv":
-        yield from _written(both, lambda sink: pa.csv.CSVWriter(sink, first.schema))
+        yield from _write_pieces(all_batches, lambda sink: pa.csv.CSVWriter(sink, first.schema))
     elif ending == ".parquet":
-        yield from _written(both, lambda sink: _groups(sink, first.schema))
+        yield from _write_pieces(all_batches, lambda sink: _parquet_writer(sink, first.schema))
     elif ending == ".fits":
-        yield from _fits_pieces(both, first.schema)
+        yield from _fits_pieces(all_batches, first.schema)
     else:
         raise BadInput(f"a file of {ending} is not written piece by piece")
 
@@ -170,15 +170,15 @@ def _fits_pieces(batches: Iterator[pa.RecordBatch], schema: pa.Schema) -> Iterat
     """A file whose header tells the number of rows and the longest text: through files on disc, not in memory."""
     from lake_schema.fits.tables import stream_to_fits
 
-    declared = _declared(schema)
+    declared = _declare_table(schema)
     with tempfile.TemporaryFile() as spool, tempfile.TemporaryFile() as file:
-        _spool(batches, spool, declared.arrow())
+        _spool(batches, spool, declared.arrow_schema())
 
-        def again() -> Iterator[pa.RecordBatch]:
+        def reread() -> Iterator[pa.RecordBatch]:
             spool.seek(0)
             yield from pa.ipc.open_stream(spool)
 
-        stream_to_fits(file, again, declared, MOST_FITS_BYTES)
+        stream_to_fits(file, reread, declared, MAX_FITS_BYTES)
         file.seek(0)
         while piece := file.read(_PIECE):
             yield piece
@@ -193,53 +193,51 @@ def _spool(batches: Iterator[pa.RecordBatch], spool: IO[bytes], schema: pa.Schem
                 try:
                     columns.append(values.cast(field.type))
                 except pa.ArrowException as error:
-                    said = " ".join(str(error).split())[:300]
-                    raise BadInput(f"column {field.name}: FITS cannot hold it: {said}") from None
+                    message = " ".join(str(error).split())[:300]
+                    raise BadInput(f"column {field.name}: FITS cannot hold it: {message}") from None
             writer.write_batch(pa.RecordBatch.from_arrays(columns, schema=schema))
-            if spool.tell() > MOST_FITS_BYTES:
-                raise BadInput(
-                    f"the result has more than {MOST_FITS_BYTES / 1e9:.3g} GB: ask for less, or another kind"
-                )
+            if spool.tell() > MAX_FITS_BYTES:
+                raise BadInput(f"the result has more than {MAX_FITS_BYTES / 1e9:.3g} GB: ask for less, or another kind")
 
 
-def _groups(sink: Any, schema: pa.Schema) -> pq.ParquetWriter:
+def _parquet_writer(sink: Any, schema: pa.Schema) -> pq.ParquetWriter:
     return pq.ParquetWriter(sink, schema, compression="zstd", write_page_checksum=True)
 
 
-def _written(batches: Iterator[pa.RecordBatch], opened: Callable[[Any], Any]) -> Iterator[bytes]:
+def _write_pieces(batches: Iterator[pa.RecordBatch], open_writer: Callable[[Any], Any]) -> Iterator[bytes]:
     """What a writer puts into its file, as it comes."""
     sink = _Sink()
     try:
-        writer = opened(sink)
+        writer = open_writer(sink)
         for batch in batches:
             writer.write_batch(batch)
-            if piece := sink.taken():
+            if piece := sink.take():
                 yield piece
     except (pa.ArrowException, TypeError) as error:
         raise BadInput(f"such a file cannot hold the result: {' '.join(str(error).split())[:300]}") from None
     writer.close()
-    yield sink.taken()
+    yield sink.take()
 
 
 class _Sink(io.RawIOBase):
     """Keeps what is written until it is taken."""
 
     def __init__(self) -> None:
-        self._kept, self._at = bytearray(), 0
+        self._buffer, self._position = bytearray(), 0
 
     def writable(self) -> bool:
         return True
 
     def write(self, data: Any) -> int:
-        self._kept += data
-        self._at += len(data)
+        self._buffer += data
+        self._position += len(data)
         return len(data)
 
     def tell(self) -> int:
-        return self._at
+        return self._position
 
-    def taken(self) -> bytes:
+    def take(self) -> bytes:
         """What was written since it was last asked."""
-        piece = bytes(self._kept)
-        self._kept.clear()
+        piece = bytes(self._buffer)
+        self._buffer.clear()
         return piece

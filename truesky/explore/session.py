@@ -14,7 +14,7 @@ from lake_schema.errors import BadInput, Damaged
 from lake_schema.store import read
 from lake_schema.store.object_storage.s3 import Folder
 from truesky.explore import adql
-from truesky.explore.guard import Query, check_expression, checked, one_line, parser
+from truesky.explore.guard import Query, check_expression, check_query, one_line, parser
 
 _MACROS = (
     # Great-circle distance by the haversine, deg.
@@ -36,7 +36,7 @@ _LOCKS = (
 # Of the memory of a query the part that DuckDB may fill, and that its result may.
 _SHARE = 0.5
 TOO_LARGE = "SQL: the query or its result needs more memory than it may have: ask for less"
-Opened: TypeAlias = read.Version | ds.Dataset
+OpenTable: TypeAlias = read.Version | ds.Dataset
 
 
 class Session:
@@ -48,16 +48,16 @@ class Session:
     """
 
     def __init__(self, root: Folder, tables: Mapping[str, str], memory: int) -> None:
-        self.root, self.known = root, tables
-        self.most = int(memory * _SHARE)
-        self.opened: dict[str, Opened] = {}
+        self.root, self.table_keys = root, tables
+        self.max_bytes = int(memory * _SHARE)
+        self.open_tables: dict[str, OpenTable] = {}
         self._rows: dict[str, ds.Dataset] = {}
         self._database: duckdb.DuckDBPyConnection | None = None
         self._parser = parser()
 
-    def checked(self, text: str) -> Query:
+    def check_query(self, text: str) -> Query:
         """The query, if it may run.  Errors: BadInput"""
-        return checked(text, self.known, self._parser)
+        return check_query(text, self.table_keys, self._parser)
 
     def check_expression(self, text: str) -> None:
         """Refuse what is not one expression.  Errors: BadInput"""
@@ -65,7 +65,7 @@ class Session:
 
     def close(self) -> None:
         """Forget every table; the next query opens those that it names."""
-        self.opened.clear()
+        self.open_tables.clear()
         self._rows.clear()
         if self._database is not None:
             self._database.close()
@@ -77,13 +77,13 @@ class Session:
         Errors : BadInput for what cannot be run; Damaged names a file that is not as it was written; of either some
                  batches may have come before
         """
-        whole = False
+        finished = False
         try:
             for name in query.tables:
                 self._open(name)
                 for file in getattr(self._rows[name], "read_from", ()):
                     file.forget()
-            relation = self._connected().sql(query.text, params=dict(parameters) or None)
+            relation = self._connect().sql(query.text, params=dict(parameters) or None)
             if relation is None:
                 raise BadInput("SQL: gives no rows")
             batches = pa.RecordBatchReader.from_stream(relation)
@@ -91,7 +91,7 @@ class Session:
             yield pa.RecordBatch.from_pylist([], schema)
             for batch in batches:
                 yield _cast(batch, schema)
-            whole = True
+            finished = True
         except duckdb.OutOfMemoryException:
             raise BadInput(TOO_LARGE) from None
         except (duckdb.Error, OSError, pa.ArrowException) as error:
@@ -100,13 +100,13 @@ class Session:
                 raise Damaged(fault) from None
             raise BadInput(f"SQL: {one_line(error)}") from None
         finally:
-            if not whole:
+            if not finished:
                 self.close()
 
-    def _connected(self) -> duckdb.DuckDBPyConnection:
+    def _connect(self) -> duckdb.DuckDBPyConnection:
         if self._database is None:
             config: dict[str, str | bool | int | float | list[str]] = {
-                "memory_limit": f"{self.most // 1_000_000}MB",
+                "memory_limit": f"{self.max_bytes // 1_000_000}MB",
                 "temp_directory": "",
                 "threads": os.cpu_count() or 1,
             }
@@ -119,10 +119,10 @@ class Session:
         """Open a table by its name, one of a request in a schema of the request's name."""
         if name in self._rows:
             return
-        opened = _table(self.root, name, self.known[name])
-        self.opened[name] = opened
-        self._rows[name] = opened.dataset() if isinstance(opened, read.Version) else opened
-        database = self._connected()
+        source = _open_table(self.root, name, self.table_keys[name])
+        self.open_tables[name] = source
+        self._rows[name] = source.dataset() if isinstance(source, read.Version) else source
+        database = self._connect()
         database.register(name, self._rows[name])
         if "." in name:
             request, _, table = name.partition(".")
@@ -134,23 +134,27 @@ class Session:
         fields = []
         for field in schema:
             name = field.name.lower()
-            tables = [self.opened[table].schema for table in query.tables]
+            tables = [self.open_tables[table].schema for table in query.tables]
             columns = [column for table in tables for column in table if column.name.lower() == name]
-            own = [dict(c.metadata or {}).items() for c in columns if _kind(c.type) == _kind(field.type)]
+            candidate_facts = [dict(c.metadata or {}).items() for c in columns if _kind(c.type) == _kind(field.type)]
             # Which of several tables it is from is not known: what they all say holds.
-            facts = dict(set.intersection(*map(set, own))) if own and name in query.columns else None
+            facts = (
+                dict(set.intersection(*map(set, candidate_facts)))
+                if candidate_facts and name in query.columns
+                else None
+            )
             fields.append(field.with_metadata(facts) if facts else field)
         return pa.schema(fields)
 
 
-def _table(root: Folder, name: str, what: str) -> Opened:
-    if what.startswith("@"):
-        return ds.dataset(what[1:], format="ipc")
+def _open_table(root: Folder, name: str, key: str) -> OpenTable:
+    if key.startswith("@"):
+        return ds.dataset(key[1:], format="ipc")
     table = name.rpartition(".")[2]
-    if what.startswith("?"):
+    if key.startswith("?"):
         # Whatever was wrong with it is said again.
-        return read.version(root, table, request=what[1:] or None)
-    return read.version(root, table, what)
+        return read.version(root, table, request=key[1:] or None)
+    return read.version(root, table, key)
 
 
 def _exportable(schema: pa.Schema) -> pa.Schema:

@@ -44,39 +44,41 @@ class Facts:
 
 
 @dataclass(slots=True)
-class Cut:
+class RowLimit:
     """How many rows may be sent, and whether there were more.
 
     most : None = all;  overflowed : set when the last piece has been made
     """
 
-    most: int | None = None
+    max_rows: int | None = None
     overflowed: bool = field(default=False)
 
 
-def pieces(batches: Iterable[pa.RecordBatch], cut: Cut | None = None, infos: Sequence[str] = ()) -> Iterator[bytes]:
+def pieces(
+    batches: Iterable[pa.RecordBatch], row_limit: RowLimit | None = None, infos: Sequence[str] = ()
+) -> Iterator[bytes]:
     """The bytes of a VOTable of the rows, serialised as TABLEDATA; at least the first batch is asked for at once.
 
     batches : at least one;  cut : how many rows;  infos : further INFO elements, XML
     """
-    cut = cut or Cut()
-    waiting = iter(batches)
-    batch = next(waiting, None)
+    row_limit = row_limit or RowLimit()
+    remaining_batches = iter(batches)
+    batch = next(remaining_batches, None)
     schema = batch.schema if batch is not None else pa.schema([])
     status = '<INFO name="QUERY_STATUS" value="OK"/>\n'
     fields = "".join(_field(column) for column in schema)
     yield f"{_OPEN}{status}{''.join(infos)}<TABLE>\n{fields}<DATA><TABLEDATA>\n".encode()
     sent = 0
     while batch is not None:
-        left = batch.num_rows if cut.most is None else max(cut.most - sent, 0)
-        cut.overflowed |= batch.num_rows > left
-        kept = batch.slice(0, left)
+        remaining = batch.num_rows if row_limit.max_rows is None else max(row_limit.max_rows - sent, 0)
+        row_limit.overflowed |= batch.num_rows > remaining
+        limited = batch.slice(0, remaining)
         # As texts of Python values take many times their size.
-        for first in range(0, kept.num_rows, _ROWS_A_PIECE):
-            yield _rows(kept.slice(first, _ROWS_A_PIECE))
-        sent += min(left, batch.num_rows)
-        batch = next(waiting, None)
-    tail = '<INFO name="QUERY_STATUS" value="OVERFLOW"/>\n' if cut.overflowed else ""
+        for first in range(0, limited.num_rows, _ROWS_A_PIECE):
+            yield _rows(limited.slice(first, _ROWS_A_PIECE))
+        sent += min(remaining, batch.num_rows)
+        batch = next(remaining_batches, None)
+    tail = '<INFO name="QUERY_STATUS" value="OVERFLOW"/>\n' if row_limit.overflowed else ""
     yield f"</TABLEDATA></DATA>\n</TABLE>\n{tail}{_CLOSE}".encode()
 
 
@@ -85,22 +87,22 @@ def refusal(message: str) -> bytes:
     return f'{_OPEN}<INFO name="QUERY_STATUS" value="ERROR">{_text(message)}</INFO>\n{_CLOSE}'.encode()
 
 
-def facts_of(column: pa.Field) -> Facts:
+def field_facts(column: pa.Field) -> Facts:
     """Of a field its unit, UCD and sentence."""
-    known = {key.decode(): value.decode() for key, value in (column.metadata or {}).items()}
-    return Facts(*(known.get(key, "") for key in ("unit", "ucd", "description", "xtype", "utype")))
+    metadata = {key.decode(): value.decode() for key, value in (column.metadata or {}).items()}
+    return Facts(*(metadata.get(key, "") for key in ("unit", "ucd", "description", "xtype", "utype")))
 
 
-def values(column: pa.Array, name: str = "") -> list[Any]:
+def python_values(column: pa.Array, name: str = "") -> list[Any]:
     """The values as Python has them.
 
     Errors : BadInput where it has none for them, such as moments before the year 1 or after 9999
     """
     try:
-        found: list[Any] = column.to_pylist()
+        values: list[Any] = column.to_pylist()
     except (ValueError, OverflowError, pa.ArrowException) as error:
         raise BadInput(f"column {name}: a value cannot be shown; CAST it AS VARCHAR: {error}") from None
-    return found
+    return values
 
 
 def datatype(kind: pa.DataType) -> tuple[str, str]:
@@ -115,13 +117,13 @@ def datatype(kind: pa.DataType) -> tuple[str, str]:
 
 
 def _field(column: pa.Field) -> str:
-    about = facts_of(column)
+    facts = field_facts(column)
     kind, size = datatype(column.type)
-    given = {"name": column.name, "datatype": kind, "arraysize": size, "unit": about.unit, "ucd": about.ucd}
-    given |= {"xtype": about.xtype, "utype": about.utype}
-    words = " ".join(f"{key}={_quoted(value)}" for key, value in given.items() if value)
+    attributes = {"name": column.name, "datatype": kind, "arraysize": size, "unit": facts.unit, "ucd": facts.ucd}
+    attributes |= {"xtype": facts.xtype, "utype": facts.utype}
+    words = " ".join(f"{key}={_quote_attribute(value)}" for key, value in attributes.items() if value)
     null = f'<VALUES null="{_NULLS[kind]}"/>' if kind in _NULLS else ""
-    description = f"<DESCRIPTION>{_text(about.description)}</DESCRIPTION>" if about.description else ""
+    description = f"<DESCRIPTION>{_text(facts.description)}</DESCRIPTION>" if facts.description else ""
     return f"<FIELD {words}>{description}{null}</FIELD>\n"
 
 
@@ -135,15 +137,15 @@ def _rows(batch: pa.RecordBatch) -> bytes:
 
 
 def _cells(column: pa.Array, name: str) -> list[str]:
-    shown = _shown(column.type)
+    format_value = _formatter(column.type)
     null = f"<TD>{_NULLS.get(datatype(column.type)[0], '')}</TD>" if not datatype(column.type)[1] else "<TD/>"
-    return [null if value is None else f"<TD>{shown(value)}</TD>" for value in values(column, name)]
+    return [null if value is None else f"<TD>{format_value(value)}</TD>" for value in python_values(column, name)]
 
 
-def _shown(kind: pa.DataType) -> Callable[[Any], str]:
+def _formatter(kind: pa.DataType) -> Callable[[Any], str]:
     if pa.types.is_list(kind) and not datatype(kind.value_type)[1]:
-        inner, nothing = _shown(kind.value_type), str(_NULLS.get(datatype(kind.value_type)[0], "NaN"))
-        return lambda values: " ".join(nothing if value is None else inner(value) for value in values)
+        inner, null_text = _formatter(kind.value_type), str(_NULLS.get(datatype(kind.value_type)[0], "NaN"))
+        return lambda values: " ".join(null_text if value is None else inner(value) for value in values)
     if pa.types.is_boolean(kind):
         return lambda value: "T" if value else "F"
     if pa.types.is_integer(kind):
@@ -170,5 +172,5 @@ def _text(text: str) -> str:
     return escape(_NO_XML.sub("\N{REPLACEMENT CHARACTER}", text))
 
 
-def _quoted(text: str) -> str:
+def _quote_attribute(text: str) -> str:
     return quoteattr(_text(text).replace("&lt;", "<").replace("&gt;", ">").replace("&amp;", "&"))

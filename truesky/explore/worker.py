@@ -25,7 +25,7 @@ from truesky.explore.session import TOO_LARGE, Session
 # What Python and the libraries take before any query.
 _BASE_BYTES = 1 << 30
 # Bytes that are sent at a time, and that a row may have.
-_PIECE_BYTES, _MOST_ROW_BYTES = 8 << 20, 64 << 20
+_PIECE_BYTES, _MAX_ROW_BYTES = 8 << 20, 64 << 20
 
 
 def main(argv: Sequence[str]) -> int:
@@ -34,7 +34,7 @@ def main(argv: Sequence[str]) -> int:
     argv : lake, most bytes of memory, TABLE=KEY or REQUEST.TABLE=KEY of each table, =?REQUEST of one that could not be
            opened, TABLE=@FILE of rows in an Arrow file
     """
-    root, memory = layout.opened(argv[0]), int(argv[1])
+    root, memory = layout.open_lake(argv[0]), int(argv[1])
     command.limit_resource("RLIMIT_DATA", memory + _BASE_BYTES)
     command.limit_resource("RLIMIT_CORE", 0)
     session = Session(root, dict(entry.split("=", 1) for entry in argv[2:]), memory)
@@ -47,41 +47,41 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _answer(out: IO[bytes], session: Session, question: dict[str, Any]) -> None:
-    about, fault = {"id": question["id"]}, dict[str, str]()
+    header, fault = {"id": question["id"]}, dict[str, str]()
     batches = _batches(session, question)
     try:
         # Whatever is wrong with the text is found before the first of these two.
         first = list(itertools.islice(batches, 2))
-        out.write(json.dumps(about).encode() + b"\n")
+        out.write(json.dumps(header).encode() + b"\n")
         with pa.ipc.new_stream(out, first[0].schema) as stream:
             try:
                 for batch in itertools.chain(first, batches):
                     stream.write_batch(batch)
             except (LakeError, MemoryError) as error:
-                fault = _said(error)
+                fault = _error_fields(error)
     except (LakeError, MemoryError) as error:
-        fault = _said(error)
-    out.write(json.dumps(about | fault).encode() + b"\n")
+        fault = _error_fields(error)
+    out.write(json.dumps(header | fault).encode() + b"\n")
     out.flush()
 
 
 def _batches(session: Session, question: dict[str, Any]) -> Iterator[pa.RecordBatch]:
     """The answer up to its row `rows`, if that is given; BadInput where it is larger than `bytes`, if that is."""
-    most_rows, most_bytes = question.get("rows"), question.get("bytes")
+    max_rows, max_bytes = question.get("rows"), question.get("bytes")
     rows = size = 0
     for text in question.get("expressions", ()):
         session.check_expression(text)
-    for batch in session.run(session.checked(question["sql"]), question["parameters"]):
-        whole = batch if most_rows is None else batch.slice(0, most_rows - rows)
-        rows, size = rows + whole.num_rows, size + whole.nbytes
-        if most_bytes is not None and size > most_bytes:
+    for batch in session.run(session.check_query(question["sql"]), question["parameters"]):
+        limited = batch if max_rows is None else batch.slice(0, max_rows - rows)
+        rows, size = rows + limited.num_rows, size + limited.nbytes
+        if max_bytes is not None and size > max_bytes:
             raise BadInput(TOO_LARGE)
-        yield from _pieces(whole, _MOST_ROW_BYTES if most_bytes is None else most_bytes)
-        if rows == most_rows:
+        yield from _pieces(limited, _MAX_ROW_BYTES if max_bytes is None else max_bytes)
+        if rows == max_rows:
             return
 
 
-def _pieces(batch: pa.RecordBatch, most: int) -> Iterator[pa.RecordBatch]:
+def _pieces(batch: pa.RecordBatch, max_bytes: int) -> Iterator[pa.RecordBatch]:
     """The batch in parts of few bytes each: whoever passes them on holds one at a time.
 
     Errors : BadInput where a row has more bytes than `most`
@@ -90,18 +90,18 @@ def _pieces(batch: pa.RecordBatch, most: int) -> Iterator[pa.RecordBatch]:
         yield batch
     elif batch.num_rows > 1:
         half = batch.num_rows // 2
-        yield from _pieces(batch.slice(0, half), most)
-        yield from _pieces(batch.slice(half), most)
-    elif batch.nbytes <= most:
+        yield from _pieces(batch.slice(0, half), max_bytes)
+        yield from _pieces(batch.slice(half), max_bytes)
+    elif batch.nbytes <= max_bytes:
         yield batch
     else:
-        raise BadInput(f"SQL: a row of the result has more than {most >> 20} MB")
+        raise BadInput(f"SQL: a row of the result has more than {max_bytes >> 20} MB")
 
 
-def _said(error: BaseException) -> dict[str, str]:
+def _error_fields(error: BaseException) -> dict[str, str]:
     kind = "Damaged" if isinstance(error, Damaged) else "BadInput"
     return {"error": TOO_LARGE if isinstance(error, MemoryError) else str(error), "kind": kind}
 
 
 if __name__ == "__main__":
-    command.leave(main, sys.argv[1:])
+    command.exit_with_status(main, sys.argv[1:])

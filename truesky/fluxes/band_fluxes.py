@@ -30,13 +30,13 @@ from truesky.fluxes import high_redshift, integration, passbands
 from truesky.fluxes.calibration import continuum_scale, star_scale
 from truesky.fluxes.libraries.templates import Library
 from truesky.fluxes.passbands import Passband
-from truesky.fluxes.sources import GALAXY_KINDS, Galaxies, Stars, galaxies_of, stars_of
+from truesky.fluxes.sources import GALAXY_KINDS, Galaxies, Stars, galaxies_from_table, stars_from_table
 from truesky.fluxes.spectra import extinction, lines
-from truesky.fluxes.spectra.continuum import REFERENCE_BAND, amplitudes, dust_of, observed_shape
+from truesky.fluxes.spectra.continuum import REFERENCE_BAND, amplitudes, dust_curves, observed_shape
 from truesky.fluxes.tables import errors_measured, flux_tables
 from truesky.fluxes.tables.build_tables import Setting
 from truesky.fluxes.tables.settings import stars_tabulated
-from truesky.numerics import sums
+from truesky.numerics import matrices
 from truesky.request.accuracy import REFERENCE, Accuracy
 
 # Rows turned into arrays at a time: some 80 MB of them. The more, the more often a part of a table is used.
@@ -50,20 +50,20 @@ def galaxy_spectra(galaxies: pa.Table, library: Library, medium: str = "vacuum")
     medium   : where lines are seen, "vacuum" (from space) or "air" (from the ground)
     Error    : 1e-6 relative (the templates are held in single precision)
     """
-    rows = galaxies_of(galaxies, library)
+    rows = galaxies_from_table(galaxies, library)
     grid = passbands.grid()
     if not len(rows):
         return np.zeros((0, len(grid)))
-    reference, dust = passbands.load(REFERENCE_BAND), dust_of(library)
+    reference, dust = passbands.load(REFERENCE_BAND), dust_curves(library)
     amplitude = amplitudes(rows.mix, reference, library, dust)
     shape = observed_shape(rows.mix, amplitude, library, dust, passbands.GRID_FIRST, len(grid))
     spectra = shape.astype(float)
-    inside = slice(reference.first, reference.first + len(reference.wavelength))
-    observed = sums.product(spectra[:, inside], passbands.weights(reference))
+    in_band = slice(reference.first, reference.first + len(reference.wavelength))
+    observed = matrices.matmul(spectra[:, in_band], passbands.weights(reference))
     spectra *= continuum_scale(rows.mag_r01, observed)[:, None]
     sigma = lines.velocity_dispersion(rows.abs_mag_r01, rows.mix.z_obs)
-    found = lines.profiles(rows.lines, rows.mix.z_obs, sigma, medium)
-    lines.add(spectra, passbands.GRID_FIRST, found)
+    profiles = lines.profiles(rows.lines, rows.mix.z_obs, sigma, medium)
+    lines.add(spectra, passbands.GRID_FIRST, profiles)
     spectra *= rows.magnification[:, None]
     spectra *= milky_way_transmission(grid, rows.a_v)
     return spectra
@@ -71,7 +71,7 @@ def galaxy_spectra(galaxies: pa.Table, library: Library, medium: str = "vacuum")
 
 def star_spectra(stars: pa.Table, library: Library) -> Float:
     """f_lambda of stars, float64[n, 23401] erg s-1 cm-2 A-1; `stars`: rows of the table `stars`."""
-    rows = stars_of(stars, library)
+    rows = stars_from_table(stars, library)
     spectra = np.zeros((len(rows), len(library.wavelength)))
     for sed, share in zip(rows.sed, rows.frac, strict=True):
         spectra += library.flux[sed] * share[:, None]
@@ -84,7 +84,7 @@ def band_fluxes(spectra: Float, bands: Sequence[Passband]) -> Float:
     out = np.empty((len(spectra), len(bands)))
     for k, band in enumerate(bands):
         inside = slice(band.first, band.first + len(band.wavelength))
-        out[:, k] = sums.product(spectra[:, inside], passbands.weights(band))
+        out[:, k] = matrices.matmul(spectra[:, inside], passbands.weights(band))
     return units.ujy_of_cgs(out)
 
 
@@ -99,12 +99,12 @@ def galaxy_fluxes(
     Error    : |df/f| <= accuracy.flux against band_fluxes of galaxy_spectra (benchmarks/fluxes.py); 1e-6 at best
     Errors   : BadInput names the column and source of a missing value, OutOfRange what is out of bounds
     """
-    curves = _curves(bands)
+    curves = _load_passbands(bands)
     settings = [choice.setting for choice in errors_measured.choose(curves, accuracy, library)]
-    return galaxy_fluxes_by(galaxies, curves, settings, library)
+    return fluxes_with_settings(galaxies, curves, settings, library)
 
 
-def galaxy_fluxes_by(
+def fluxes_with_settings(
     galaxies: pa.Table, curves: Sequence[Passband], settings: Sequence[Setting | None], library: Library
 ) -> pa.Table:
     """`galaxy_fluxes` from the tables of these settings; bands without one are integrated.
@@ -115,18 +115,18 @@ def galaxy_fluxes_by(
     tabulated = [k for k, setting in enumerate(settings) if setting is not None]
     grid = None
     f_nu, integrated = np.zeros((galaxies.num_rows, len(curves))), np.ones(galaxies.num_rows, bool)
-    for start, part in _slices(galaxies):
-        out, exact = (array[start : start + part.num_rows] for array in (f_nu, integrated))
-        usual = np.isin(_kinds(part), GALAXY_KINDS)
-        if not usual.all():
-            out[~usual] = high_redshift.fluxes(part.filter(pa.array(~usual)), curves)
-            part = part.filter(pa.array(usual))
-        rows = galaxies_of(part, library)
+    for start, chunk in _slices(galaxies):
+        out, exact = (array[start : start + chunk.num_rows] for array in (f_nu, integrated))
+        in_library = np.isin(_source_kinds(chunk), GALAXY_KINDS)
+        if not in_library.all():
+            out[~in_library] = high_redshift.fluxes(chunk.filter(pa.array(~in_library)), curves)
+            chunk = chunk.filter(pa.array(in_library))
+        rows = galaxies_from_table(chunk, library)
         if tabulated and grid is None and len(rows):
-            chosen = [setting for setting in settings if setting is not None]
-            grid = flux_tables.open_grid([curves[k] for k in tabulated], chosen, library)
-        out[usual], exact[usual] = _galaxies(rows, curves, tabulated, grid, library)
-    return _table("galaxy", galaxies, [curve.name for curve in curves], f_nu, integrated)
+            grid_settings = [setting for setting in settings if setting is not None]
+            grid = flux_tables.open_grid([curves[k] for k in tabulated], grid_settings, library)
+        out[in_library], exact[in_library] = _galaxy_f_nu(rows, curves, tabulated, grid, library)
+    return _flux_table("galaxy", galaxies, [curve.name for curve in curves], f_nu, integrated)
 
 
 def star_fluxes(
@@ -137,20 +137,22 @@ def star_fluxes(
     stars   : rows of table `stars`;  bands : embedded ones by name
     library : spectra of stars;  accuracy : largest errors that are allowed
     """
-    curves = _curves(bands)
+    curves = _load_passbands(bands)
     tabulated = stars_tabulated(accuracy)
     f_nu, integrated = np.zeros((stars.num_rows, len(curves))), np.ones(stars.num_rows, bool)
-    for start, part in _slices(stars):
-        here = slice(start, start + part.num_rows)
-        f_nu[here], integrated[here] = _stars(stars_of(part, library), curves, tabulated, library)
-    return _table("star", stars, [curve.name for curve in curves], f_nu, integrated)
+    for start, chunk in _slices(stars):
+        chunk_rows = slice(start, start + chunk.num_rows)
+        f_nu[chunk_rows], integrated[chunk_rows] = _star_f_nu(
+            stars_from_table(chunk, library), curves, tabulated, library
+        )
+    return _flux_table("star", stars, [curve.name for curve in curves], f_nu, integrated)
 
 
 def prepare(
     curves: Sequence[Passband],
     settings: Sequence[Setting | None],
-    library: Library,
-    stars: Library,
+    galaxy_library: Library,
+    star_library: Library,
     accuracy: Accuracy,
 ) -> None:
     """Make what the cache lacks for these bands, tables and machine code, so that workers find it there.
@@ -159,15 +161,19 @@ def prepare(
     curves, settings : passbands, and how fine the table of each is; None: it is integrated
     accuracy         : largest errors that are allowed
     """
-    chosen = [(curve, setting) for curve, setting in zip(curves, settings, strict=True) if setting is not None]
-    if chosen:
-        grid = flux_tables.open_grid([curve for curve, _ in chosen], [setting for _, setting in chosen], library)
+    tabulated = [(curve, setting) for curve, setting in zip(curves, settings, strict=True) if setting is not None]
+    if tabulated:
+        grid = flux_tables.open_grid(
+            [curve for curve, _ in tabulated], [setting for _, setting in tabulated], galaxy_library
+        )
         flux_tables.compile_kernels(grid)
     if stars_tabulated(accuracy):
-        flux_tables.stars(Stars.of_templates(np.zeros(1, np.int64), np.zeros(1), np.zeros(1)), curves, stars)
+        flux_tables.star_fluxes(
+            Stars.from_templates(np.zeros(1, np.int64), np.zeros(1), np.zeros(1)), curves, star_library
+        )
 
 
-def _galaxies(
+def _galaxy_f_nu(
     rows: Galaxies,
     curves: Sequence[Passband],
     tabulated: Sequence[int],
@@ -176,45 +182,47 @@ def _galaxies(
 ) -> tuple[Float, Bool]:
     """float64[n, n_band]: from tables where there are any, the rest integrated; bool[n] in no table."""
     if grid is None:
-        return integration.galaxies(rows, curves, library), np.ones(len(rows), bool)
-    inside = flux_tables.covered(rows)
+        return integration.galaxy_fluxes(rows, curves, library), np.ones(len(rows), bool)
+    inside = flux_tables.covered_galaxies(rows)
     if inside.all() and len(tabulated) == len(curves):
-        return flux_tables.galaxies(rows, grid), ~inside
+        return flux_tables.galaxy_fluxes(rows, grid), ~inside
     out = np.zeros((len(rows), len(curves)))
-    near, far = np.flatnonzero(inside), np.flatnonzero(~inside)
-    covered = rows.rows(near)
-    out[np.ix_(near, np.array(tabulated))] = flux_tables.galaxies(covered, grid)
-    others = [k for k in range(len(curves)) if k not in tabulated]
-    if others and len(near):
-        out[np.ix_(near, np.array(others))] = integration.galaxies(covered, [curves[k] for k in others], library)
-    if len(far):
-        out[far] = integration.galaxies(rows.rows(far), curves, library)
+    inside_rows, outside_rows = np.flatnonzero(inside), np.flatnonzero(~inside)
+    covered = rows.select(inside_rows)
+    out[np.ix_(inside_rows, np.array(tabulated))] = flux_tables.galaxy_fluxes(covered, grid)
+    integrated_bands = [k for k in range(len(curves)) if k not in tabulated]
+    if integrated_bands and len(inside_rows):
+        out[np.ix_(inside_rows, np.array(integrated_bands))] = integration.galaxy_fluxes(
+            covered, [curves[k] for k in integrated_bands], library
+        )
+    if len(outside_rows):
+        out[outside_rows] = integration.galaxy_fluxes(rows.select(outside_rows), curves, library)
     return out, ~inside
 
 
-def _stars(rows: Stars, curves: Sequence[Passband], tabulated: bool, library: Library) -> tuple[Float, Bool]:
+def _star_f_nu(rows: Stars, curves: Sequence[Passband], tabulated: bool, library: Library) -> tuple[Float, Bool]:
     inside = flux_tables.covered_stars(rows) & tabulated
     out = np.zeros((len(rows), len(curves)))
-    near, far = np.flatnonzero(inside), np.flatnonzero(~inside)
-    if len(near):
-        out[near] = flux_tables.stars(rows.rows(near), curves, library)
-    if len(far):
-        out[far] = integration.stars(rows.rows(far), curves, library)
+    inside_rows, outside_rows = np.flatnonzero(inside), np.flatnonzero(~inside)
+    if len(inside_rows):
+        out[inside_rows] = flux_tables.star_fluxes(rows.select(inside_rows), curves, library)
+    if len(outside_rows):
+        out[outside_rows] = integration.star_fluxes(rows.select(outside_rows), curves, library)
     return out, ~inside
 
 
 def milky_way_transmission(wavelength: npt.ArrayLike, a_v: Float) -> Float:
     """10^(-0.4 A(lambda)), float64[n, n_lambda]: A = R_V E(B-V) [A(lambda) / A(V)], a_v = R_V E(B-V)."""
-    return np.asarray(extinction.transmitted(extinction.milky_way(wavelength), a_v[:, None]))
+    return np.asarray(extinction.transmission(extinction.milky_way(wavelength), a_v[:, None]))
 
 
-def _curves(bands: Sequence[str | Passband]) -> list[Passband]:
+def _load_passbands(bands: Sequence[str | Passband]) -> list[Passband]:
     if not bands:
         raise BadInput("no passband is asked for")
     return [band if isinstance(band, Passband) else passbands.load(band) for band in bands]
 
 
-def _kinds(table: pa.Table) -> Int:
+def _source_kinds(table: pa.Table) -> Int:
     if "kind" not in table.column_names:
         return np.zeros(table.num_rows, np.int64)
     return np.asarray(table["kind"].to_numpy(), np.int64)
@@ -224,7 +232,7 @@ def _slices(table: pa.Table) -> list[tuple[int, pa.Table]]:
     return [(start, table.slice(start, _SLICE)) for start in range(0, table.num_rows, _SLICE)]
 
 
-def _table(kind: str, source: pa.Table, bands: Sequence[str], f_nu: Float, integrated: Bool) -> pa.Table:
+def _flux_table(kind: str, source: pa.Table, bands: Sequence[str], f_nu: Float, integrated: Bool) -> pa.Table:
     names = ("id", "ra", "dec", "_healpix_29")
     if absent := [name for name in names if name not in source.column_names]:
         raise BadInput(f"{kind} catalogue: column {', '.join(absent)} is missing")

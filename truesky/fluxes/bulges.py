@@ -31,7 +31,7 @@ from truesky.fluxes.passbands import Passband
 from truesky.fluxes.sources import GALAXY_KINDS
 from truesky.fluxes.spectra import intergalactic
 from truesky.fluxes.spectra.continuum import COMPONENTS, REFERENCE_BAND
-from truesky.numerics import sums
+from truesky.numerics import matrices
 
 FRACTION, COLOUR = "bulge_fraction", "bulge_color"
 # What is read of a row besides.
@@ -40,11 +40,11 @@ _BLUE_BAND = "sdss_g01"
 # Nodes of the table of a band in ln(1 + z), and wavelengths of the band at each: 1e-3 of a share.
 _FIRST, _LAST, _STEP, _SAMPLES = np.log(0.97), np.log(8.0), 0.01, 500
 # Templates of equal colour are apart by this.
-_APART = 1e-6
+_COLOUR_STEP = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Ladder:
+class ColourSequence:
     """Templates from blue to red.
 
     colour : float64[m] 0.1(g - r), rising;  of : int64[m] template;  rank : int64[template]
@@ -52,99 +52,104 @@ class Ladder:
     """
 
     colour: Float
-    of: Int
+    template: Int
     rank: Int
     light: Float
 
 
 @lru_cache(maxsize=4)
-def ladder(library: Library) -> Ladder:
+def colour_sequence(library: Library) -> ColourSequence:
     """Of a library's templates, without dust."""
-    blue, light = (_at_rest(library, passbands.load(name)) for name in (_BLUE_BAND, REFERENCE_BAND))
+    blue, light = (_rest_frame_light(library, passbands.load(name)) for name in (_BLUE_BAND, REFERENCE_BAND))
     colour = -2.5 * np.log10(blue / light)
-    of = np.argsort(colour, kind="stable")
-    rising = np.maximum.accumulate(colour[of]) + _APART * np.arange(of.size)
-    return Ladder(rising, of, np.argsort(of, kind="stable"), light[of])
+    order = np.argsort(colour, kind="stable")
+    rising = np.maximum.accumulate(colour[order]) + _COLOUR_STEP * np.arange(order.size)
+    return ColourSequence(rising, order, np.argsort(order, kind="stable"), light[order])
 
 
-def in_band(rows: pa.Table, band: Passband, library: Library) -> pa.Table:
+def with_fractions_in_band(rows: pa.Table, band: Passband, library: Library) -> pa.Table:
     """Rows of `galaxies`, those with a colour of the bulge with its share of the light in a band as bulge_fraction.
 
     rows    : with `COLUMNS`; without them, or without a colour, a row stays as it is
     library : what sed_1 and sed_2 count
     """
-    share, some, redness, parts = _read(rows, library)
-    if not some.size:
+    share, indices, redness, components = _read_rows(rows, library)
+    if not indices.size:
         return rows
-    z = rows["z_obs"].to_numpy().astype(float)[some]
-    place = np.clip((np.log1p(z) - _FIRST) / _STEP, 0.0, (_LAST - _FIRST) / _STEP - 1e-9)
-    node = place.astype(np.int64)
-    between, table, own = place - node, _table(band, library), ladder(library)
-    times = np.zeros(some.size)
-    for sed, frac in parts:
-        rank, below, part = _steps(own, sed, redness)
-        low, high = (_redder(part, *(table[z, at] for at in (below, below + 1, rank))) for z in (node, node + 1))
-        times += frac * np.exp(low + between * (high - low))
-    share[some] = _shared(share[some], times)
-    at = rows.schema.get_field_index(FRACTION)
-    return rows.set_column(at, FRACTION, pa.array(share, rows.schema.field(FRACTION).type))
+    z = rows["z_obs"].to_numpy().astype(float)[indices]
+    position = np.clip((np.log1p(z) - _FIRST) / _STEP, 0.0, (_LAST - _FIRST) / _STEP - 1e-9)
+    node = position.astype(np.int64)
+    weight, table, sequence = position - node, _band_table(band, library), colour_sequence(library)
+    ratio = np.zeros(indices.size)
+    for sed, frac in components:
+        rank, bluer, fraction = _neighbour_ranks(sequence, sed, redness)
+        low, high = (
+            _log_light_ratio(fraction, *(table[z, index] for index in (bluer, bluer + 1, rank)))
+            for z in (node, node + 1)
+        )
+        ratio += frac * np.exp(low + weight * (high - low))
+    share[indices] = _bulge_share(share[indices], ratio)
+    index = rows.schema.get_field_index(FRACTION)
+    return rows.set_column(index, FRACTION, pa.array(share, rows.schema.field(FRACTION).type))
 
 
-def in_bins(rows: pa.Table, light: Float, library: Library) -> Float:
+def fractions_in_bins(rows: pa.Table, light: Float, library: Library) -> Float:
     """The bulge's share of the light in each bin, float64[n, bins].
 
     rows  : of `galaxies`;  library : what sed_1 and sed_2 count
     light : float64[template, bins] of each template in bins of the rest frame
     """
-    share, some, redness, parts = _read(rows, library)
-    own, out = ladder(library), np.repeat(share[:, None], light.shape[1], axis=1)
-    table = _logarithm(light[own.of]) - np.log(own.light)[:, None]
-    times = np.zeros((some.size, light.shape[1]))
-    for sed, frac in parts:
-        rank, below, part = _steps(own, sed, redness)
-        times += frac[:, None] * np.exp(_redder(part[:, None], *(table[at] for at in (below, below + 1, rank))))
-    out[some] = _shared(share[some, None], times)
+    share, indices, redness, components = _read_rows(rows, library)
+    sequence, out = colour_sequence(library), np.repeat(share[:, None], light.shape[1], axis=1)
+    table = _logarithm(light[sequence.template]) - np.log(sequence.light)[:, None]
+    ratio = np.zeros((indices.size, light.shape[1]))
+    for sed, frac in components:
+        rank, bluer, fraction = _neighbour_ranks(sequence, sed, redness)
+        ratio += frac[:, None] * np.exp(
+            _log_light_ratio(fraction[:, None], *(table[index] for index in (bluer, bluer + 1, rank)))
+        )
+    out[indices] = _bulge_share(share[indices, None], ratio)
     return out
 
 
-def _steps(own: Ladder, sed: Int, redness: Float) -> tuple[Int, Int, Float]:
+def _neighbour_ranks(sequence: ColourSequence, sed: Int, redness: Float) -> tuple[Int, Int, Float]:
     """Rank[n] of templates; that of the next bluer one than what is redder by `redness`, mag, and how far beyond."""
-    rank = own.rank[sed]
-    wanted = np.clip(own.colour[rank] + redness, own.colour[0], own.colour[-1])
-    below = np.clip(np.searchsorted(own.colour, wanted, side="right") - 1, 0, own.colour.size - 2)
-    return rank, below, (wanted - own.colour[below]) / (own.colour[below + 1] - own.colour[below])
+    rank = sequence.rank[sed]
+    target_colour = np.clip(sequence.colour[rank] + redness, sequence.colour[0], sequence.colour[-1])
+    bluer = np.clip(np.searchsorted(sequence.colour, target_colour, side="right") - 1, 0, sequence.colour.size - 2)
+    return rank, bluer, (target_colour - sequence.colour[bluer]) / (sequence.colour[bluer + 1] - sequence.colour[bluer])
 
 
-def _redder(part: Float, low: Float, high: Float, own: Float) -> Float:
+def _log_light_ratio(fraction: Float, low: Float, high: Float, galaxy: Float) -> Float:
     """ln of the light of what lies a part of the way from one template to the next, over that of the galaxy's own."""
-    return np.asarray(low + part * (high - low) - own)
+    return np.asarray(low + fraction * (high - low) - galaxy)
 
 
-def _read(rows: pa.Table, library: Library) -> tuple[Float, Int, Float, list[tuple[Int, Float]]]:
+def _read_rows(rows: pa.Table, library: Library) -> tuple[Float, Int, Float, list[tuple[Int, Float]]]:
     """Shares[n] in the reference band; which rows have a colour; it; their templates and fractions."""
     share = np.asarray(rows[FRACTION].to_numpy(), float).copy()
     if not set(COLUMNS) <= set(rows.column_names) or len(library) < 2:
         return share, np.zeros(0, np.int64), np.zeros(0), []
     redness = pc.fill_null(pc.cast(rows[COLOUR], pa.float64()), 0.0).to_numpy()
-    wanted = np.nan_to_num(redness) != 0.0
+    is_selected = np.nan_to_num(redness) != 0.0
     if "kind" in rows.column_names:
-        wanted &= np.isin(rows["kind"].to_numpy(), GALAXY_KINDS)
-    some = np.flatnonzero(wanted & (share > 0.0) & (share < 1.0))
-    frac = np.stack([rows[f"frac_{k}"].to_numpy().astype(float)[some] for k in COMPONENTS])
+        is_selected &= np.isin(rows["kind"].to_numpy(), GALAXY_KINDS)
+    indices = np.flatnonzero(is_selected & (share > 0.0) & (share < 1.0))
+    frac = np.stack([rows[f"frac_{k}"].to_numpy().astype(float)[indices] for k in COMPONENTS])
     frac /= frac.sum(0)
-    sed = [rows[f"sed_{k}"].to_numpy().astype(np.int64)[some] for k in COMPONENTS]
-    return share, some, redness[some], list(zip(sed, frac, strict=True))
+    sed = [rows[f"sed_{k}"].to_numpy().astype(np.int64)[indices] for k in COMPONENTS]
+    return share, indices, redness[indices], list(zip(sed, frac, strict=True))
 
 
-def _shared(share: Float, times: Float) -> Float:
-    bulge = share * times
+def _bulge_share(share: Float, ratio: Float) -> Float:
+    bulge = share * ratio
     return np.asarray(bulge / (bulge + 1.0 - share))
 
 
-def _at_rest(library: Library, band: Passband) -> Float:
+def _rest_frame_light(library: Library, band: Passband) -> Float:
     first = int(band.wavelength[0] - library.wavelength[0])
-    seen = library.flux[:, first : first + len(band.wavelength)].astype(float)
-    return np.asarray(sums.product(seen, passbands.weights(band)))
+    spectra = library.flux[:, first : first + len(band.wavelength)].astype(float)
+    return np.asarray(matrices.matmul(spectra, passbands.weights(band)))
 
 
 def _logarithm(light: Float) -> Float:
@@ -152,22 +157,26 @@ def _logarithm(light: Float) -> Float:
     return np.asarray(np.log(np.maximum(light, np.finfo(np.float32).tiny)))
 
 
-def _table(band: Passband, library: Library) -> Float:
+def _band_table(band: Passband, library: Library) -> Float:
     # By its contents: a passband is read anew for each detector.
-    return _made(band.response.tobytes(), band.wavelength.tobytes(), library)
+    return _compute_table(band.response.tobytes(), band.wavelength.tobytes(), library)
 
 
 @lru_cache(maxsize=64)
-def _made(response: bytes, wavelength: bytes, library: Library) -> Float:
+def _compute_table(response: bytes, wavelength: bytes, library: Library) -> Float:
     """ln of the light in the band over that in the reference band at rest: float64[z, m] of the ladder."""
     band = Passband("", np.frombuffer(wavelength), np.frombuffer(response), "")
-    own, nodes = ladder(library), np.exp(np.arange(_FIRST, _LAST + 2 * _STEP, _STEP))
-    every = slice(None, None, max(len(band.wavelength) // _SAMPLES, 1))
-    at, weights = band.wavelength[every], passbands.weights(band)[every]
-    out = np.empty((nodes.size, own.of.size))
+    sequence, nodes = colour_sequence(library), np.exp(np.arange(_FIRST, _LAST + 2 * _STEP, _STEP))
+    samples = slice(None, None, max(len(band.wavelength) // _SAMPLES, 1))
+    sampled, weights = band.wavelength[samples], passbands.weights(band)[samples]
+    out = np.empty((nodes.size, sequence.template.size))
     for row, stretch in enumerate(nodes.tolist()):
-        place = np.rint(at / stretch - library.wavelength[0]).astype(np.int64)
-        seen = np.take(library.flux, np.clip(place, 0, library.flux.shape[1] - 1), axis=1)[own.of].astype(float)
-        passed = weights * intergalactic.transmission(at, stretch - 1.0)[0] if library.intergalactic else weights
-        out[row] = _logarithm(sums.product(seen, passed) / passed.sum())
-    return out - np.log(own.light)
+        index = np.rint(sampled / stretch - library.wavelength[0]).astype(np.int64)
+        spectra = np.take(library.flux, np.clip(index, 0, library.flux.shape[1] - 1), axis=1)[sequence.template].astype(
+            float
+        )
+        absorbed_weights = (
+            weights * intergalactic.transmission(sampled, stretch - 1.0)[0] if library.intergalactic else weights
+        )
+        out[row] = _logarithm(matrices.matmul(spectra, absorbed_weights) / absorbed_weights.sum())
+    return out - np.log(sequence.light)

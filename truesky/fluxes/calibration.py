@@ -15,11 +15,11 @@ from truesky.fluxes import passbands
 from truesky.fluxes.libraries import vega
 from truesky.fluxes.libraries.templates import Library
 from truesky.fluxes.sources import Stars
-from truesky.numerics import sums
+from truesky.numerics import matrices
 
 STAR_BAND = "twomass_h"
 # f_nu of a normalised template is 1e-11; 30 decades below, single precision has run out of digits.
-_DARKEST = 1e-41
+_MIN_F_NU = 1e-41
 
 
 def continuum_scale(mag_r01: Float, f_nu_observed: Float) -> Float:
@@ -28,7 +28,7 @@ def continuum_scale(mag_r01: Float, f_nu_observed: Float) -> Float:
     Errors: BadInput where dust has left nothing to scale
     Ref: Serrano et al. 2024, appendix B, eq. f_continuum
     """
-    if dark := int(np.sum(~(f_nu_observed > _DARKEST))):
+    if dark := int(np.sum(~(f_nu_observed > _MIN_F_NU))):
         raise BadInput(f"{dark} galaxies have no light in the reference band: mag_r01 cannot be met")
     return np.asarray(units.cgs_of_ujy(units.f_nu_of_mag(mag_r01)) / f_nu_observed)
 
@@ -39,7 +39,7 @@ def star_scale(stars: Stars, library: Library) -> Float:
     The catalogue's H is Vega, 1.375 mag below AB; Serrano et al. 2024, appendix B, read it by the AB formula.
     """
     band = passbands.load(STAR_BAND)
-    seen = library.flux[:, band.first : band.first + len(band.wavelength)].astype(float)
-    template = sums.product(seen, passbands.weights(band))
+    spectra = library.flux[:, band.first : band.first + len(band.wavelength)].astype(float)
+    template = matrices.matmul(spectra, passbands.weights(band))
     mag_ab = stars.mag_h + vega.vega_magnitude(band)
     return np.asarray(units.cgs_of_ujy(units.f_nu_of_mag(mag_ab)) / (stars.frac * template[stars.sed]).sum(0))

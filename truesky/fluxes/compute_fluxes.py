@@ -16,55 +16,64 @@ import pyarrow as pa
 
 from lake_schema.columns import Table
 from lake_schema.store import layout, read
-from lake_schema.store.plan import Json, Output, Part, Plan
+from lake_schema.store.plan import Json, Output, Plan, Task
 from lake_schema.store.provenance import code_version
 from lake_schema.tables.fluxes import fluxes
 from lake_schema.tables.galaxies import EMISSION_LINES
 from lake_schema.tables.passbands import PASSBANDS
 from lake_schema.tables.templates import EXTINCTION_LAWS, TEMPLATES
 from truesky.fluxes import band_fluxes, inputs
-from truesky.fluxes.inputs import Own
+from truesky.fluxes.inputs import FluxInputs
 from truesky.fluxes.tables import errors_measured
 from truesky.fluxes.tables.build_tables import Setting
-from truesky.fluxes.tables.settings import COVERED, Choice, of_stars
+from truesky.fluxes.tables.settings import COVERED_RANGES, Choice, star_error_facts
 from truesky.request import universe
 from truesky.request.accuracy import Accuracy
 from truesky.request.schema import Request
-from truesky.running.shell import Job, Step
+from truesky.running.submitted_job import Job, Step
 
 CATALOGUES = (("galaxy", "galaxies"), ("star", "stars"))
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
     """What fluxes are made with; then one part a cell of each catalogue, row by row beside it."""
-    catalogues = [(kind, read.for_request(lake, name, request.name)) for kind, name in CATALOGUES]
-    universe.refuse_other([version for _, version in catalogues], request)
-    own = inputs.read(request.curves)
-    curves = inputs.curves(request.bands, own.passbands)
-    sources = source_steps(own)
-    chosen = errors_measured.choose(curves, request.accuracy, own.library)
-    made = [_step(catalogue, kind, request, own, chosen, sources) for kind, catalogue in catalogues]
-    if not all(layout.version(lake, step.plan.table.name, step.plan.key).exists() for step in made):
+    catalogues = [(kind, read.input_version(lake, name, request.name)) for kind, name in CATALOGUES]
+    universe.check_catalogues([version for _, version in catalogues], request)
+    flux_inputs = inputs.read(request.curves)
+    curves = inputs.select_passbands(request.bands, flux_inputs.passbands)
+    sources = source_steps(flux_inputs)
+    choices = errors_measured.choose(curves, request.accuracy, flux_inputs.library)
+    flux_steps = [_step(catalogue, kind, request, flux_inputs, choices, sources) for kind, catalogue in catalogues]
+    if not all(layout.version_folder(lake, step.plan.table.name, step.plan.key).exists() for step in flux_steps):
         # Here once, and not in every worker at the same time.
-        band_fluxes.prepare(curves, [choice.setting for choice in chosen], own.library, own.stars, request.accuracy)
-    return [*sources, *made]
+        band_fluxes.prepare(
+            curves, [choice.setting for choice in choices], flux_inputs.library, flux_inputs.stars, request.accuracy
+        )
+    return [*sources, *flux_steps]
 
 
-def step_of(kind: str, lake: Path, request: Request) -> Step:
+def flux_step(kind: str, lake: Path, request: Request) -> Step:
     """The step of the galaxies or of the stars alone."""
-    own = inputs.read(request.curves)
-    chosen = errors_measured.choose(inputs.curves(request.bands, own.passbands), request.accuracy, own.library)
+    flux_inputs = inputs.read(request.curves)
+    choices = errors_measured.choose(
+        inputs.select_passbands(request.bands, flux_inputs.passbands), request.accuracy, flux_inputs.library
+    )
     return _step(
-        read.for_request(lake, dict(CATALOGUES)[kind], request.name), kind, request, own, chosen, source_steps(own)
+        read.input_version(lake, dict(CATALOGUES)[kind], request.name),
+        kind,
+        request,
+        flux_inputs,
+        choices,
+        source_steps(flux_inputs),
     )
 
 
-def source_steps(own: Own) -> list[Step]:
+def source_steps(flux_inputs: FluxInputs) -> list[Step]:
     """The tables `templates`, `extinction_laws`, `emission_lines` and `passbands`."""
 
-    def step(table: Table, rows: Callable[[Own], pa.Table]) -> Step:
-        plan = Plan(table, {"files": own.sha256(), "code": code_version()}, (Part("all.parquet", {}),))
-        return Step(plan, lambda lake, facts: Output(rows(own)), on_driver=True)
+    def step(table: Table, rows: Callable[[FluxInputs], pa.Table]) -> Step:
+        plan = Plan(table, {"files": flux_inputs.sha256(), "code": code_version()}, (Task("all.parquet", {}),))
+        return Step(plan, lambda lake, facts: Output(rows(flux_inputs)), on_driver=True)
 
     tables = (
         (TEMPLATES, inputs.template_rows),
@@ -76,44 +85,55 @@ def source_steps(own: Own) -> list[Step]:
 
 
 def _step(
-    catalogue: read.Version, kind: str, request: Request, own: Own, chosen: Sequence[Choice], sources: Sequence[Step]
+    catalogue: read.Version,
+    kind: str,
+    request: Request,
+    flux_inputs: FluxInputs,
+    choices: Sequence[Choice],
+    sources: Sequence[Step],
 ) -> Step:
     facts = {
         "catalogue": catalogue.table,
         "input": catalogue.key,
         "bands": list(request.bands),
         "accuracy": asdict(request.accuracy),
-        **_errors(kind, request, chosen),
-        "files": own.sha256(),
-        **({"intergalactic": True} if kind == "galaxy" and own.library.intergalactic else {}),
+        **_error_facts(kind, request, choices),
+        "files": flux_inputs.sha256(),
+        **({"intergalactic": True} if kind == "galaxy" and flux_inputs.library.intergalactic else {}),
         "sources": {step.plan.table.name: step.plan.key for step in sources},
         "code": code_version(),
     }
-    parts = tuple(Part(name, {"part": name}) for name in catalogue.parts)
-    return Step(Plan(fluxes(kind, request.bands), facts, parts), work)
+    partitions = tuple(Task(name, {"part": name}) for name in catalogue.partitions)
+    return Step(Plan(fluxes(kind, request.bands), facts, partitions), compute_partition)
 
 
-def _errors(kind: str, request: Request, chosen: Sequence[Choice]) -> dict[str, Any]:
+def _error_facts(kind: str, request: Request, choices: Sequence[Choice]) -> dict[str, Any]:
     if kind == "star":
-        return {"errors": {band: of_stars(request.accuracy) for band in request.bands}}
-    errors = {band: choice.facts() for band, choice in zip(request.bands, chosen, strict=True)}
-    return {"errors": errors, "covered": COVERED}
+        return {"errors": {band: star_error_facts(request.accuracy) for band in request.bands}}
+    errors = {band: choice.facts() for band, choice in zip(request.bands, choices, strict=True)}
+    return {"errors": errors, "covered": COVERED_RANGES}
 
 
-def work(lake: Path, facts: Json) -> Output:
+def compute_partition(lake: Path, facts: Json) -> Output:
     """The fluxes of one cell, in the order of its rows."""
-    rows = read.version(lake, facts["catalogue"], facts["input"]).rows(parts=[facts["part"]])
-    curves = [inputs.passband_of(lake, facts, band) for band in facts["bands"]]
+    rows = read.version(lake, facts["catalogue"], facts["input"]).rows(partitions=[facts["part"]])
+    curves = [inputs.passband_from_facts(lake, facts, band) for band in facts["bands"]]
     if facts["catalogue"] == "galaxies":
         chosen = [facts["errors"][band]["setting"] for band in facts["bands"]]
         settings = [Setting(*numbers) if numbers else None for numbers in chosen]
-        return Output(band_fluxes.galaxy_fluxes_by(rows, curves, settings, inputs.library_of(lake, facts)))
-    return Output(band_fluxes.star_fluxes(rows, curves, inputs.stars_of(lake, facts), Accuracy(**facts["accuracy"])))
+        return Output(
+            band_fluxes.fluxes_with_settings(rows, curves, settings, inputs.galaxy_library_from_facts(lake, facts))
+        )
+    return Output(
+        band_fluxes.star_fluxes(
+            rows, curves, inputs.stellar_library_from_facts(lake, facts), Accuracy(**facts["accuracy"])
+        )
+    )
 
 
 JOB = Job(
     "compute_fluxes",
     "Compute the band fluxes of galaxies and stars.",
     steps,
-    options=(("bands", "passbands, instead of those of the request"),),
+    list_options=(("bands", "passbands, instead of those of the request"),),
 )

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from lake_schema.arrays import Float
 from lake_schema.errors import OutOfRange
 from lake_schema.units import LIGHT_KM_S
-from truesky.numerics import sums
+from truesky.numerics import matrices
 
 # Flagship simulation: Potter, Stadel & Teyssier 2017; Serrano et al. 2024, section 4.1. No radiation,
 # no massive neutrinos.
@@ -36,7 +36,7 @@ HUBBLE_DISTANCE = LIGHT_KM_S / 100.0
 Z_MAX = 20.0
 
 # 24 nodes: 1e-12 relative up to z = 20.
-_NODES, _WEIGHTS = sums.gauss_legendre(24)
+_NODES, _WEIGHTS = matrices.gauss_legendre(24)
 # 1 / (100 km/s/Mpc).
 _HUBBLE_TIME_GYR = 9.777922
 _ARCSEC = np.pi / 180.0 / 3600.0
@@ -50,7 +50,7 @@ def expansion_rate(z: npt.ArrayLike) -> Float:
 
 def comoving_separation(z1: npt.ArrayLike, z2: npt.ArrayLike) -> Float:
     """Radial comoving distance from z1 to z2, Mpc/h; negative if z2 < z1.  Error: 1e-12 relative."""
-    lo, hi = np.log1p(_checked("z1", z1)), np.log1p(_checked("z2", z2))
+    lo, hi = np.log1p(_check_redshift("z1", z1)), np.log1p(_check_redshift("z2", z2))
     # ln((1 + z2) / (1 + z1)) from the difference of the redshifts, which is exact for close ones.
     half = 0.5 * np.log1p((np.asarray(z2, float) - np.asarray(z1, float)) / (1.0 + np.asarray(z1, float)))
     middle = 0.5 * (lo + hi)
@@ -79,9 +79,9 @@ def distance_modulus(z: npt.ArrayLike) -> Float:
 
 def comoving_volume(z1: npt.ArrayLike, z2: npt.ArrayLike) -> Float:
     """Comoving volume per steradian between z1 and z2, (Mpc/h)^3."""
-    near, depth = comoving_distance(z1), comoving_separation(z1, z2)
-    far = near + depth
-    return depth * (near**2 + near * far + far**2) / 3.0
+    inner, depth = comoving_distance(z1), comoving_separation(z1, z2)
+    outer = inner + depth
+    return depth * (inner**2 + inner * outer + outer**2) / 3.0
 
 
 def redshift(chi: npt.ArrayLike) -> Float:
@@ -116,7 +116,7 @@ def age(z: npt.ArrayLike, omega_m: float = OMEGA_M, hubble: float = HUBBLE) -> F
     return np.asarray(2.0 / (3.0 * np.sqrt(rest)) * np.arcsinh(ratio) * _HUBBLE_TIME_GYR / hubble)
 
 
-def _checked(name: str, z: npt.ArrayLike) -> Float:
+def _check_redshift(name: str, z: npt.ArrayLike) -> Float:
     values = np.asarray(z, float)
     bad = ~((values >= 0.0) & (values <= Z_MAX))
     if bad.any():

@@ -27,14 +27,14 @@ from lake_schema.units import LIGHT_ANGSTROM_S
 from truesky.fluxes import cosmology, passbands
 from truesky.fluxes.libraries.templates import Library
 from truesky.fluxes.passbands import Passband
-from truesky.fluxes.sources import column, ids_of, magnification_of
+from truesky.fluxes.sources import column, source_ids, table_magnification
 from truesky.fluxes.spectra import extinction, intergalactic
-from truesky.fluxes.spectra.continuum import within
-from truesky.numerics import sums
+from truesky.fluxes.spectra.continuum import check_range
+from truesky.numerics import matrices
 
 QUASAR, HIGH_REDSHIFT = 2, 3
 # Rest-frame wavelength of the magnitude, A.
-MAGNITUDE_AT = {QUASAR: 1450.0, HIGH_REDSHIFT: 1500.0}
+MAGNITUDE_WAVELENGTH = {QUASAR: 1450.0, HIGH_REDSHIFT: 1500.0}
 Z_MAX = 15.0
 
 # Rest frame: 600 A seen at z = 15, and 24000 A seen at z = 0.
@@ -45,7 +45,7 @@ _LYMAN_ALPHA = 1215.67
 # Vanden Berk et al. 2001: slopes of f_lambda below and above 5000 A; the 3 x 3 of Barnett et al. 2019.
 _QUASAR_SLOPE, _QUASAR_RED_SLOPE, _QUASAR_BREAK = -1.56, 0.45, 5000.0
 # Below Lyman alpha f_nu falls as nu^-1.7: Lusso et al. 2015, MNRAS 449, 4204.
-_QUASAR_FAR_SLOPE = -0.3
+_QUASAR_FAR_UV_SLOPE = -0.3
 QUASAR_OFFSETS, QUASAR_STRENGTHS = (-0.3, 0.0, 0.3), (0.5, 1.0, 2.0)
 QUASAR_LINES = Path(__file__).with_name("quasar_lines.csv")
 
@@ -58,22 +58,22 @@ _BLOCK = 64
 
 def quasar_library() -> Library:
     """The nine quasars."""
-    wavelength = _rest()
+    wavelength = _rest_wavelengths()
     flux, names = [], []
     for offset in QUASAR_OFFSETS:
         for strength in QUASAR_STRENGTHS:
-            flux.append(_quasar(wavelength, _QUASAR_SLOPE + offset, strength))
+            flux.append(_quasar_spectrum(wavelength, _QUASAR_SLOPE + offset, strength))
             names.append(f"QSO slope {offset:+.1f} lines x {strength:g}")
     return Library(wavelength, np.stack(flux).astype(np.float32), tuple(names))
 
 
 def high_redshift_library() -> Library:
     """The fifteen galaxies."""
-    wavelength = _rest()
+    wavelength = _rest_wavelengths()
     flux, names = [], []
     for slope in HIGH_REDSHIFT_SLOPES:
         for width in LYMAN_ALPHA_WIDTHS:
-            flux.append(_star_forming(wavelength, slope, width))
+            flux.append(_star_forming_spectrum(wavelength, slope, width))
             names.append(f"slope {slope:.1f} Lya {width:g} A")
     return Library(wavelength, np.stack(flux).astype(np.float32), tuple(names))
 
@@ -90,8 +90,8 @@ def fluxes(galaxies: pa.Table, bands: Sequence[Passband]) -> Float:
     for start in range(0, galaxies.num_rows, _BLOCK):
         f_lambda = spectra(galaxies.slice(start, _BLOCK))
         for k, band in enumerate(bands):
-            seen = f_lambda[:, band.first : band.first + len(band.wavelength)]
-            out[start : start + _BLOCK, k] = sums.product(seen, passbands.weights(band))
+            in_band = f_lambda[:, band.first : band.first + len(band.wavelength)]
+            out[start : start + _BLOCK, k] = matrices.matmul(in_band, passbands.weights(band))
     return units.ujy_of_cgs(out)
 
 
@@ -102,57 +102,59 @@ def spectra(galaxies: pa.Table) -> Float:
     """
     kind, z, mag, a_v = (column(galaxies, name) for name in ("kind", "z_obs", "mag_r01", "a_v"))
     sed = column(galaxies, "sed_1").astype(np.int64)
-    within("z_obs", z, 0.0, Z_MAX)
-    within("mag_r01", mag, -5.0, 60.0)
-    within("a_v", a_v, 0.0, 40.0)
+    check_range("z_obs", z, 0.0, Z_MAX)
+    check_range("mag_r01", mag, -5.0, 60.0)
+    check_range("a_v", a_v, 0.0, 40.0)
     _refuse_mixtures(galaxies)
     grid, out = passbands.grid(), np.zeros((galaxies.num_rows, passbands.GRID_LAST - passbands.GRID_FIRST + 1))
     for code, library in ((QUASAR, quasar_library), (HIGH_REDSHIFT, high_redshift_library)):
-        chosen = np.flatnonzero(kind == code)
-        if not len(chosen):
+        indices = np.flatnonzero(kind == code)
+        if not len(indices):
             continue
         templates = library()
-        within("sed_1", sed[chosen].astype(float), 0, len(templates) - 1)
-        factors = scale(code, templates, sed[chosen], mag[chosen], z[chosen])
-        for i, factor in zip(chosen, factors, strict=True):
+        check_range("sed_1", sed[indices].astype(float), 0, len(templates) - 1)
+        factors = template_scale(code, templates, sed[indices], mag[indices], z[indices])
+        for i, factor in zip(indices, factors, strict=True):
             spectrum = templates.flux[sed[i]].astype(float)
             out[i] = factor * np.interp(grid / (1.0 + z[i]), templates.wavelength, spectrum)
         if code == QUASAR:
-            out[chosen] *= intergalactic.transmission(grid, z[chosen])
-    out *= magnification_of(galaxies)[:, None]
-    out *= extinction.transmitted(extinction.milky_way(grid), a_v[:, None])
+            out[indices] *= intergalactic.transmission(grid, z[indices])
+    out *= table_magnification(galaxies)[:, None]
+    out *= extinction.transmission(extinction.milky_way(grid), a_v[:, None])
     return out
 
 
-def scale(code: int, templates: Library, sed: Int, mag: Float, z: Float) -> Float:
+def template_scale(code: int, templates: Library, sed: Int, mag: Float, z: Float) -> Float:
     """What a template's f_lambda at lambda / (1 + z) is multiplied by to be seen at lambda: float64[n].
 
     code : of the kind;  templates : its library;  sed : int64[n];  mag : float64[n] mag_r01;  z : float64[n]
     """
-    at = MAGNITUDE_AT[code]
-    level = np.array([np.interp(at, templates.wavelength, spectrum.astype(float)) for spectrum in templates.flux])
+    wavelength = MAGNITUDE_WAVELENGTH[code]
+    template_flux = np.array(
+        [np.interp(wavelength, templates.wavelength, spectrum.astype(float)) for spectrum in templates.flux]
+    )
     f_nu = units.cgs_of_ujy(units.f_nu_of_mag(mag))
-    return np.asarray(f_nu * LIGHT_ANGSTROM_S / (at * (1.0 + z)) ** 2 / level[sed])
+    return np.asarray(f_nu * LIGHT_ANGSTROM_S / (wavelength * (1.0 + z)) ** 2 / template_flux[sed])
 
 
 def _refuse_mixtures(galaxies: pa.Table) -> None:
     for name, why in (("frac_2", "has a second component"), ("ebv_1", "has internal dust")):
         values = column(galaxies, name)
         if (bad := values != 0.0).any():
-            source = int(ids_of(galaxies)[np.flatnonzero(bad)[0]])
+            source = int(source_ids(galaxies)[np.flatnonzero(bad)[0]])
             raise BadInput(f"galaxies: source {source} of kind 2 or 3 {why} ({name} is not 0)")
 
 
-def _rest() -> Float:
+def _rest_wavelengths() -> Float:
     return np.arange(_REST_FIRST, _REST_LAST + 1, dtype=float)
 
 
-def _quasar(wavelength: Float, slope: float, strength: float) -> Float:
+def _quasar_spectrum(wavelength: Float, slope: float, strength: float) -> Float:
     ratio = wavelength / _QUASAR_BREAK
     continuum = np.where(ratio < 1.0, ratio**slope, ratio**_QUASAR_RED_SLOPE)
     edge = (_LYMAN_ALPHA / _QUASAR_BREAK) ** slope
-    far = edge * (wavelength / _LYMAN_ALPHA) ** _QUASAR_FAR_SLOPE
-    continuum = np.where(wavelength < _LYMAN_ALPHA, far, continuum)
+    far_uv = edge * (wavelength / _LYMAN_ALPHA) ** _QUASAR_FAR_UV_SLOPE
+    continuum = np.where(wavelength < _LYMAN_ALPHA, far_uv, continuum)
     flux = continuum.copy()
     with QUASAR_LINES.open(newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
@@ -162,11 +164,11 @@ def _quasar(wavelength: Float, slope: float, strength: float) -> Float:
     return flux
 
 
-def _star_forming(wavelength: Float, slope: float, width: float) -> Float:
+def _star_forming_spectrum(wavelength: Float, slope: float, width: float) -> Float:
     """A power law, 1 at 1500 A, with the red half of Lyman alpha, in bins of 1 A."""
     from scipy.special import erf
 
-    flux = np.where(wavelength < _LYMAN_ALPHA, 0.0, (wavelength / MAGNITUDE_AT[HIGH_REDSHIFT]) ** slope)
+    flux = np.where(wavelength < _LYMAN_ALPHA, 0.0, (wavelength / MAGNITUDE_WAVELENGTH[HIGH_REDSHIFT]) ** slope)
     edges = np.append(wavelength, wavelength[-1] + 1.0) - 0.5
     profile = np.diff(erf(np.maximum(edges - _LYMAN_ALPHA, 0.0) / (np.sqrt(2.0) * _LYMAN_ALPHA_SIGMA)))
-    return np.asarray(flux + width * (_LYMAN_ALPHA / MAGNITUDE_AT[HIGH_REDSHIFT]) ** slope * profile)
+    return np.asarray(flux + width * (_LYMAN_ALPHA / MAGNITUDE_WAVELENGTH[HIGH_REDSHIFT]) ** slope * profile)

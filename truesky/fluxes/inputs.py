@@ -45,17 +45,19 @@ from truesky.fluxes.libraries.templates import Library
 from truesky.fluxes.libraries.vega import spectrum_file, vega_magnitudes
 from truesky.fluxes.passbands import Passband
 from truesky.fluxes.spectra import extinction, lines
-from truesky.fluxes.spectra.continuum import dust_of
+from truesky.fluxes.spectra.continuum import dust_curves
 from truesky.numerics import cache
-from truesky.numerics.code_keys import code_key
+from truesky.numerics.code_fingerprints import code_key
 from truesky.request.files import Curves, UserCurves
 
 # Beginnings of the keys of a request's own files.
-FILTER, _TEMPLATES, _LAWS, _STARS = (f"fluxes.{part}." for part in ("passbands", "templates", "extinction", "stars"))
+FILTER_PREFIX, _TEMPLATES_PREFIX, _LAWS_PREFIX, _STARS_PREFIX = (
+    f"fluxes.{part}." for part in ("passbands", "templates", "extinction", "stars")
+)
 
 
 @dataclass(frozen=True, slots=True)
-class Own:
+class FluxInputs:
     """passbands : by name;  library : galaxies with their laws;  stars;  origins : of files, by the key in the request.
 
     dwarfs : origins of the first of the stars, () = embedded
@@ -65,98 +67,103 @@ class Own:
     library: Library
     stars: Library
     origins: Mapping[str, Origin]
-    dwarfs: Sequence[Origin] = ()
+    dwarf_origins: Sequence[Origin] = ()
 
     def sha256(self) -> dict[str, str]:
         """What names the files' contents in a plan."""
         return {key: origin.sha256 for key, origin in self.origins.items()}
 
 
-def read(given: UserCurves) -> Own:
+def read(user_curves: UserCurves) -> FluxInputs:
     """The embedded library with whatever the request puts in its place, and its passbands.
 
     Errors: BadInput names the key of the request, the file, and the row where there is one
     """
-    found, origins = filters(given)
+    user_passbands, origins = read_passbands(user_curves)
     library = templates.galaxy_library()
-    if given.templates is not None:
-        with _named("fluxes.templates"):
-            library = from_files.library(given.templates.files, given.templates.format)
-            each = (replace(given.templates, files=(file,)) for file in given.templates.files)
-            origins |= {f"{_TEMPLATES}{k}": _origin_of(curves) for k, curves in enumerate(each)}
-    if given.extinction:
-        dust = dust_of(library).copy()
-        for code, curves in given.extinction:
-            key = f"{_LAWS}{code}"
-            with _named(key):
+    if user_curves.templates is not None:
+        with _prefix_errors("fluxes.templates"):
+            library = from_files.library(user_curves.templates.files, user_curves.templates.format)
+            each = (replace(user_curves.templates, files=(file,)) for file in user_curves.templates.files)
+            origins |= {f"{_TEMPLATES_PREFIX}{k}": _user_origin(curves) for k, curves in enumerate(each)}
+    if user_curves.extinction:
+        dust = dust_curves(library).copy()
+        for code, curves in user_curves.extinction:
+            key = f"{_LAWS_PREFIX}{code}"
+            with _prefix_errors(key):
                 dust[code] = from_files.law(curves.files[0], curves.format, library.wavelength)
-                origins[key] = _origin_of(curves)
-        library = replace(library, dust=dust, own=True)
-    if given.intergalactic:
+                origins[key] = _user_origin(curves)
+        library = replace(library, dust=dust, external=True)
+    if user_curves.intergalactic:
         library = replace(library, intergalactic=True)
-    stars, of_stars, dwarfs = _stars(given)
-    return Own(found, library, stars, origins | of_stars, dwarfs)
+    stars, star_origins, dwarf_origins = _read_stars(user_curves)
+    return FluxInputs(user_passbands, library, stars, origins | star_origins, dwarf_origins)
 
 
-def filters(given: UserCurves) -> tuple[dict[str, Passband], dict[str, Origin]]:
+def read_passbands(user_curves: UserCurves) -> tuple[dict[str, Passband], dict[str, Origin]]:
     """The request's own passbands by name, and their origins by key; errors as of `read`."""
-    found, origins = {}, {}
-    for name, curves in given.passbands:
-        key = f"{FILTER}{name}"
-        place = curves.place or key
+    user_passbands, origins = {}, {}
+    for name, curves in user_curves.passbands:
+        key = f"{FILTER_PREFIX}{name}"
+        location = curves.location or key
         if name in passbands.names():
-            raise BadInput(f"{place}: truesky has a passband {name}: choose another name for this curve")
-        with _named(place):
-            found[name] = from_files.passband(curves.files[0], name, curves.medium, curves.format)
-            origins[key] = _origin_of(curves)
-    return found, origins
+            raise BadInput(f"{location}: truesky has a passband {name}: choose another name for this curve")
+        with _prefix_errors(location):
+            user_passbands[name] = from_files.passband(curves.files[0], name, curves.medium, curves.format)
+            origins[key] = _user_origin(curves)
+    return user_passbands, origins
 
 
-def _stars(given: UserCurves) -> tuple[Library, dict[str, Origin], list[Origin]]:
+def _read_stars(user_curves: UserCurves) -> tuple[Library, dict[str, Origin], list[Origin]]:
     """Stars, the request's files by key, and what each of its own dwarfs was made of."""
-    if given.basel is None and not given.irtf:
+    if user_curves.basel is None and not user_curves.irtf:
         return templates.stellar_library(), {}, []
-    low, how, origins = stellar.TABLE, "Pecaut & Mamajek 2013", {}
-    with _named("fluxes.stars"):
-        library, infrared = stars_from_files.library(given.basel, given.irtf)
-        if given.basel is not None:
-            low, how = given.basel, "read as basel"
-            origins[f"{_STARS}basel"] = _origin(how, low)
-        origins |= {f"{_STARS}irtf.{k}": _origin("read as irtf", file) for k, file in enumerate(given.irtf)}
-        spliced = f"{how}; the last, read as irtf, in the infrared"
-        dwarfs = [_origin(how, low) if k < 0 else _origin(spliced, low, given.irtf[k]) for k in infrared]
-    return library, origins, dwarfs
+    low_resolution, reference, origins = stellar.TABLE, "Pecaut & Mamajek 2013", {}
+    with _prefix_errors("fluxes.stars"):
+        library, infrared = stars_from_files.library(user_curves.basel, user_curves.irtf)
+        if user_curves.basel is not None:
+            low_resolution, reference = user_curves.basel, "read as basel"
+            origins[f"{_STARS_PREFIX}basel"] = _origin(reference, low_resolution)
+        origins |= {
+            f"{_STARS_PREFIX}irtf.{k}": _origin("read as irtf", file) for k, file in enumerate(user_curves.irtf)
+        }
+        spliced = f"{reference}; the last, read as irtf, in the infrared"
+        dwarf_origins = [
+            _origin(reference, low_resolution) if k < 0 else _origin(spliced, low_resolution, user_curves.irtf[k])
+            for k in infrared
+        ]
+    return library, origins, dwarf_origins
 
 
-def curves(names: Sequence[str], own: Mapping[str, Passband]) -> list[Passband]:
+def select_passbands(names: Sequence[str], user_passbands: Mapping[str, Passband]) -> list[Passband]:
     """Passbands by name.  Errors: BadInput for one that is not there"""
-    known = (*passbands.names(), *own)
+    available = (*passbands.names(), *user_passbands)
     for name in names:
-        if name not in known:
-            raise BadInput(f"fluxes.bands: {name!r} is not one of {', '.join(known)}")
-    return [own[name] if name in own else passbands.load(name) for name in names]
+        if name not in available:
+            raise BadInput(f"fluxes.bands: {name!r} is not one of {', '.join(available)}")
+    return [user_passbands[name] if name in user_passbands else passbands.load(name) for name in names]
 
 
-def template_rows(own: Own) -> pa.Table:
+def template_rows(flux_inputs: FluxInputs) -> pa.Table:
     """Table `templates`: galaxies (the request's own where it has them), quasars, high-redshift galaxies, stars."""
     libraries = {
-        "galaxy": own.library,
+        "galaxy": flux_inputs.library,
         "qso": high_redshift.quasar_library(),
         "high_redshift": high_redshift.high_redshift_library(),
-        "star": own.stars,
+        "star": flux_inputs.stars,
     }
-    given = [origin for key, origin in own.origins.items() if key.startswith(_TEMPLATES)]
+    user_origins = [origin for key, origin in flux_inputs.origins.items() if key.startswith(_TEMPLATES_PREFIX)]
     quasars = _origin("Vanden Berk et al. 2001", high_redshift.QUASAR_LINES)
     origins = {
-        "galaxy": given or [_galaxy_origin(k) for k in range(len(own.library))],
+        "galaxy": user_origins or [_galaxy_origin(k) for k in range(len(flux_inputs.library))],
         "qso": [quasars] * len(libraries["qso"]),
         "high_redshift": [_origin("power laws", Path(high_redshift.__file__))] * len(libraries["high_redshift"]),
-        "star": _star_origins(own.dwarfs),
+        "star": _star_origins(flux_inputs.dwarf_origins),
     }
     return template_table.rows(libraries, origins)
 
 
-def law_rows(own: Own) -> pa.Table:
+def law_rows(flux_inputs: FluxInputs) -> pa.Table:
     """Table `extinction_laws`, on the wavelengths of the galaxies."""
     code = Path(extinction.__file__)
     embedded = (
@@ -165,43 +172,45 @@ def law_rows(own: Own) -> pa.Table:
         _origin("Calzetti et al. 2000", code),
         *(_origin("Calzetti et al. 2000 with the bump of Fitzpatrick & Massa 1986", code) for _ in range(2)),
     )
-    origins = [own.origins.get(f"{_LAWS}{law}", origin) for law, origin in enumerate(embedded)]
-    return template_table.law_rows(own.library.wavelength, dust_of(own.library), origins)
+    origins = [flux_inputs.origins.get(f"{_LAWS_PREFIX}{law}", origin) for law, origin in enumerate(embedded)]
+    return template_table.law_rows(flux_inputs.library.wavelength, dust_curves(flux_inputs.library), origins)
 
 
-def line_rows(own: Own) -> pa.Table:
+def line_rows(flux_inputs: FluxInputs) -> pa.Table:
     """Table `emission_lines`; own : the request's files, none of which are lines."""
-    found = lines.line_list()
-    return line_table.line_rows(found, lines.width_law(), [_origin(line.source, lines.TABLE) for line in found])
+    emission_lines = lines.line_list()
+    return line_table.line_rows(
+        emission_lines, lines.width_law(), [_origin(line.source, lines.TABLE) for line in emission_lines]
+    )
 
 
-def passband_rows(own: Own) -> pa.Table:
+def passband_rows(flux_inputs: FluxInputs) -> pa.Table:
     """Table `passbands`: the embedded ones, and the request's own."""
-    bands = [*(passbands.load(name) for name in passbands.names()), *own.passbands.values()]
+    bands = [*(passbands.load(name) for name in passbands.names()), *flux_inputs.passbands.values()]
     origins = [_passband_origin(name) for name in passbands.names()]
-    origins += [own.origins[f"{FILTER}{name}"] for name in own.passbands]
+    origins += [flux_inputs.origins[f"{FILTER_PREFIX}{name}"] for name in flux_inputs.passbands]
     pivots, widths = [passbands.pivot_wavelength(b) for b in bands], [passbands.log_width(b) for b in bands]
     return passband_table.rows(bands, pivots, widths, origins, vega_magnitudes(bands))
 
 
-def library_of(lake: Folder, facts: Mapping[str, Any]) -> Library:
+def galaxy_library_from_facts(lake: Folder, facts: Mapping[str, Any]) -> Library:
     """The galaxies that a table of fluxes was, or is to be, made with; facts : of its plan."""
     library = templates.galaxy_library()
-    if any(key.startswith((_TEMPLATES, _LAWS)) for key in facts.get("files", ())):
+    if any(key.startswith((_TEMPLATES_PREFIX, _LAWS_PREFIX)) for key in facts.get("files", ())):
         library = published_library(lake, facts["sources"]["templates"], facts["sources"]["extinction_laws"])
     return replace(library, intergalactic=True) if facts.get("intergalactic") else library
 
 
-def stars_of(lake: Folder, facts: Mapping[str, Any]) -> Library:
+def stellar_library_from_facts(lake: Folder, facts: Mapping[str, Any]) -> Library:
     """The same of stars."""
-    if not any(key.startswith(_STARS) for key in facts.get("files", ())):
+    if not any(key.startswith(_STARS_PREFIX) for key in facts.get("files", ())):
         return templates.stellar_library()
     return published_stars(lake, facts["sources"]["templates"])
 
 
-def passband_of(lake: Folder, facts: Mapping[str, Any], name: str) -> Passband:
+def passband_from_facts(lake: Folder, facts: Mapping[str, Any], name: str) -> Passband:
     """The same of a passband."""
-    if f"{FILTER}{name}" not in facts.get("files", ()):
+    if f"{FILTER_PREFIX}{name}" not in facts.get("files", ()):
         return passbands.load(name)
     return published_passband(lake, facts["sources"]["passbands"], name)
 
@@ -221,7 +230,7 @@ def published_library(lake: Folder, templates_key: str, laws_key: str) -> Librar
     key = cache.content_key(templates_key, laws_key, code_key(__name__))
     arrays = cache.cached_arrays("published_library", key, read_rows)
     names = tuple(str(k) for k in range(len(arrays["flux"])))
-    return Library(arrays["wavelength"], arrays["flux"], names, dust=arrays["dust"], own=True)
+    return Library(arrays["wavelength"], arrays["flux"], names, dust=arrays["dust"], external=True)
 
 
 @lru_cache(maxsize=2)
@@ -234,7 +243,7 @@ def published_stars(lake: Folder, templates_key: str) -> Library:
 
     key = cache.content_key(templates_key, code_key(__name__))
     return replace(
-        templates.stellar_library(), flux=cache.cached_arrays("published_stars", key, read_rows)["flux"], own=True
+        templates.stellar_library(), flux=cache.cached_arrays("published_stars", key, read_rows)["flux"], external=True
     )
 
 
@@ -247,7 +256,7 @@ def published_passband(lake: Folder, key: str, name: str) -> Passband:
 
 
 @contextmanager
-def _named(key: str) -> Iterator[None]:
+def _prefix_errors(key: str) -> Iterator[None]:
     """Whatever is refused is refused with the key of the request."""
     try:
         yield
@@ -255,7 +264,7 @@ def _named(key: str) -> Iterator[None]:
         raise BadInput(f"{key}: {' '.join(str(error).split())}") from None
 
 
-def _origin_of(curves: Curves) -> Origin:
+def _user_origin(curves: Curves) -> Origin:
     (file,) = curves.files
     return Origin(f"{file.name}, read as {curves.format}", file_sha256(file))
 
@@ -267,18 +276,22 @@ def _origin(reference: str, *files: Path) -> Origin:
 
 def _galaxy_origin(template: int) -> Origin:
     code, young = Path(templates.__file__), templates.YOUNG
-    files = [code if name == young else spectrum_file(f"CWW_{name}_ext.sed") for name in templates.anchors_of(template)]
+    files = [
+        code if name == young else spectrum_file(f"CWW_{name}_ext.sed") for name in templates.template_anchors(template)
+    ]
     return _origin("Coleman, Wu & Weedman 1980, as GalSim has them" + ", and a burst" * (code in files), *files)
 
 
-def _star_origins(own: Sequence[Origin]) -> list[Origin]:
+def _star_origins(user_origins: Sequence[Origin]) -> list[Origin]:
     """Of the stellar library; own : of its dwarfs, () = embedded."""
     dwarfs = _origin("Pecaut & Mamajek 2013", stellar.TABLE)
-    first = [*own] or [dwarfs] * len(stellar.types().names)
+    first = [*user_origins] or [dwarfs] * len(stellar.types().names)
     colours = _origin("Castelli & Kurucz 2003, as astroARIADNE has them", model_stars.TABLE)
     # Models go over into dwarfs; a request's own dwarfs stand for them, or lend them their infrared.
     models = (
-        [own[k] for k in model_stars.nearest_dwarfs(stellar.types())] if own else [colours] * len(model_stars.names())
+        [user_origins[k] for k in model_stars.nearest_dwarfs(stellar.types())]
+        if user_origins
+        else [colours] * len(model_stars.names())
     )
     vega = _origin("CALSPEC alpha_lyr_mod_001, as GalSim has it; lambda^-3.95 beyond it", spectrum_file("vega.txt"))
     white_dwarf = _origin("Bohlin, Hubeny & Rauch 2020", Path(standards.__file__))
@@ -287,7 +300,7 @@ def _star_origins(own: Sequence[Origin]) -> list[Origin]:
 
 
 def _passband_origin(name: str) -> Origin:
-    source, note = passbands.published(name)
+    source, note = passbands.provenance(name)
     kind, _, detail = source.partition(":")
     if kind != "speclite":
         return _origin(f"{source}, {note}", passbands.TABLE)

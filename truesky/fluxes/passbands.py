@@ -21,14 +21,14 @@ import numpy.typing as npt
 from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 from lake_schema.units import LIGHT_ANGSTROM_S
-from truesky.numerics import cache, sums
-from truesky.numerics.code_keys import code_key
+from truesky.numerics import cache, matrices
+from truesky.numerics.code_fingerprints import code_key
 
 # Serrano et al. 2024, appendix B: every spectrum and response is homogenised to this range and step.
 GRID_FIRST, GRID_LAST = 600, 24000
 # Each end of a curve is cut where this fraction of the photons of a source of constant f_lambda would be
 # detected outside. Never inside: behind dust, a red leak is most of what ultraviolet bands see.
-END_PHOTONS = 1e-7
+END_PHOTON_FRACTION = 1e-7
 # How far out a logistic edge is tabulated, in widths: exp(-20) is below any use.
 _LOGISTIC_REACH = 20.0
 
@@ -71,12 +71,12 @@ def load(name: str) -> Passband:
     if name not in rows:
         raise BadInput(f"passband {name!r} is not one of {', '.join(rows)}")
     row = rows[name]
-    key = cache.content_key(code_key(__name__), repr(row), _speclite())
+    key = cache.content_key(code_key(__name__), repr(row), _speclite_version())
     arrays = cache.cached_arrays(f"passband_{name}", key, lambda: _curve(row["source"], float(row["shift"])))
     return Passband(name, arrays["wavelength"], arrays["response"], row["medium"])
 
 
-def published(name: str) -> tuple[str, str]:
+def provenance(name: str) -> tuple[str, str]:
     """Where a passband is from: its source as passbands.csv has it, and a note."""
     row = _rows()[name]
     return row["source"], row["note"]
@@ -113,47 +113,47 @@ def ab_flux(band: Passband, wavelength: npt.ArrayLike, f_lambda: npt.ArrayLike) 
     if at[0] > band.wavelength[0] or at[-1] < band.wavelength[-1]:
         raise BadInput(f"spectrum {at[0]:g}-{at[-1]:g} A does not cover passband {band.name}")
     index = np.clip(np.searchsorted(at, band.wavelength, "right") - 1, 0, len(at) - 2)
-    part = (band.wavelength - at[index]) / (at[index + 1] - at[index])
-    between = spectra[..., index] * (1.0 - part) + spectra[..., index + 1] * part
-    return np.asarray(sums.product(between, weights(band)))
+    fraction = (band.wavelength - at[index]) / (at[index + 1] - at[index])
+    interpolated = spectra[..., index] * (1.0 - fraction) + spectra[..., index + 1] * fraction
+    return np.asarray(matrices.matmul(interpolated, weights(band)))
 
 
 @lru_cache
-def _speclite() -> str:
+def _speclite_version() -> str:
     return importlib.metadata.version("speclite")
 
 
 def _rows() -> dict[str, dict[str, str]]:
-    found: dict[str, dict[str, str]] = {}
+    by_name: dict[str, dict[str, str]] = {}
     with TABLE.open(newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
-            if row["name"] in found:
+            if row["name"] in by_name:
                 raise BadInput(f"{TABLE.name}: passband {row['name']} stands twice: choose another name")
-            found[row["name"]] = row
-    return found
+            by_name[row["name"]] = row
+    return by_name
 
 
 def _curve(source: str, shift: float) -> dict[str, Float]:
     """The response on whole angstroms; `shift` above 1 is to the blue: R_new(lambda) = R(shift lambda)."""
     kind, _, detail = source.partition(":")
-    wavelength, response = _published(detail) if kind == "speclite" else _logistic(detail)
-    whole, resampled_response = resampled(wavelength / shift, response)
-    return {"wavelength": whole, "response": resampled_response}
+    wavelength, response = _speclite_curve(detail) if kind == "speclite" else _logistic(detail)
+    angstroms, resampled_response = resample_to_grid(wavelength / shift, response)
+    return {"wavelength": angstroms, "response": resampled_response}
 
 
-def resampled(wavelength: Float, response: Float) -> tuple[Float, Float]:
+def resample_to_grid(wavelength: Float, response: Float) -> tuple[Float, Float]:
     """A curve on the whole angstroms of the grid, linearly, without its ends; empty where it lies outside."""
-    whole = np.arange(np.ceil(wavelength[0]), np.floor(wavelength[-1]) + 1.0)
-    whole = whole[(whole >= GRID_FIRST) & (whole <= GRID_LAST)]
-    if not len(whole):
-        return whole, whole
-    at_whole = np.interp(whole, wavelength, response)
-    photons = np.cumsum(at_whole * whole)
-    first, last = np.searchsorted(photons, np.array([END_PHOTONS, 1.0 - END_PHOTONS]) * photons[-1])
-    return whole[first : last + 1], at_whole[first : last + 1]
+    angstroms = np.arange(np.ceil(wavelength[0]), np.floor(wavelength[-1]) + 1.0)
+    angstroms = angstroms[(angstroms >= GRID_FIRST) & (angstroms <= GRID_LAST)]
+    if not len(angstroms):
+        return angstroms, angstroms
+    at_angstroms = np.interp(angstroms, wavelength, response)
+    photons = np.cumsum(at_angstroms * angstroms)
+    first, last = np.searchsorted(photons, np.array([END_PHOTON_FRACTION, 1.0 - END_PHOTON_FRACTION]) * photons[-1])
+    return angstroms[first : last + 1], at_angstroms[first : last + 1]
 
 
-def _published(name: str) -> tuple[Float, Float]:
+def _speclite_curve(name: str) -> tuple[Float, Float]:
     # Slow to import, and needed only when a band is not in the cache.
     from speclite.filters import load_filter
 

@@ -22,11 +22,11 @@ from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.stars import STARS
 from truesky.fluxes.libraries.templates import Library
 from truesky.fluxes.spectra import lines
-from truesky.fluxes.spectra.continuum import COMPONENTS, Mix, mix_of, picked, within
+from truesky.fluxes.spectra.continuum import COMPONENTS, TemplateMix, check_range, mix_from_columns, take_last_axis
 
 MAGNIFICATION_MAX = 100.0
 # Numbers of the templates that a star's spectrum is mixed of beside `sed`.
-STAR_PARTS = (2, 3, 4)
+STAR_COMPONENTS = (2, 3, 4)
 # Kinds whose templates are in the galaxy library: central, satellite, strong lens.
 GALAXY_KINDS = (0, 1, 4)
 
@@ -40,7 +40,7 @@ class Galaxies:
     magnification, a_v   : float64[n]
     """
 
-    mix: Mix
+    mix: TemplateMix
     abs_mag_r01: Float
     mag_r01: Float
     lines: Float
@@ -49,21 +49,21 @@ class Galaxies:
 
     def __post_init__(self) -> None:
         # Compiled code reads all of them, and looks at no bounds.
-        wanted = len(self.mix), len(lines.line_list())
-        if self.lines.shape != wanted:
-            raise ValueError(f"lines are of shape {self.lines.shape}, not {wanted}")
+        expected_shape = len(self.mix), len(lines.line_list())
+        if self.lines.shape != expected_shape:
+            raise ValueError(f"lines are of shape {self.lines.shape}, not {expected_shape}")
 
     def __len__(self) -> int:
         return len(self.mix)
 
-    def rows(self, chosen: Int | slice) -> Galaxies:
+    def select(self, indices: Int | slice) -> Galaxies:
         return Galaxies(
-            self.mix.rows(chosen),
-            picked(self.abs_mag_r01, chosen),
-            picked(self.mag_r01, chosen),
-            self.lines[chosen] if isinstance(chosen, slice) else np.take(self.lines, chosen, 0),
-            picked(self.magnification, chosen),
-            picked(self.a_v, chosen),
+            self.mix.select(indices),
+            take_last_axis(self.abs_mag_r01, indices),
+            take_last_axis(self.mag_r01, indices),
+            self.lines[indices] if isinstance(indices, slice) else np.take(self.lines, indices, 0),
+            take_last_axis(self.magnification, indices),
+            take_last_axis(self.a_v, indices),
         )
 
 
@@ -82,16 +82,16 @@ class Stars:
     def __len__(self) -> int:
         return len(self.mag_h)
 
-    def rows(self, chosen: Int | slice) -> Stars:
-        return Stars(self.sed[:, chosen], self.frac[:, chosen], self.mag_h[chosen], self.a_v[chosen])
+    def select(self, indices: Int | slice) -> Stars:
+        return Stars(self.sed[:, indices], self.frac[:, indices], self.mag_h[indices], self.a_v[indices])
 
     @classmethod
-    def of_templates(cls, sed: Int, mag_h: Float, a_v: Float) -> Stars:
+    def from_templates(cls, sed: Int, mag_h: Float, a_v: Float) -> Stars:
         """Of one template each."""
         return cls(sed[None, :], np.ones((1, sed.size)), mag_h, a_v)
 
 
-def galaxies_of(table: pa.Table, library: Library) -> Galaxies:
+def galaxies_from_table(table: pa.Table, library: Library) -> Galaxies:
     """Rows of the table `galaxies`, checked.
 
     Errors: BadInput names the column and the source of a missing value or NaN, OutOfRange the column
@@ -100,35 +100,35 @@ def galaxies_of(table: pa.Table, library: Library) -> Galaxies:
     names = ["z_obs", *(f"{name}_{k}" for name in ("sed", "frac", "ext_law", "ebv") for k in COMPONENTS)]
     columns = {name: column(table, name) for name in names}
     a_v = column(table, "a_v")
-    _declared("a_v", a_v)
+    _check_declared_range("a_v", a_v)
     return Galaxies(
-        mix_of(columns, library),
-        _declared("abs_mag_r01", column(table, "abs_mag_r01")),
-        _declared("mag_r01", column(table, "mag_r01")),
+        mix_from_columns(columns, library),
+        _check_declared_range("abs_mag_r01", column(table, "abs_mag_r01")),
+        _check_declared_range("mag_r01", column(table, "mag_r01")),
         _line_fluxes(table),
-        magnification_of(table),
+        table_magnification(table),
         a_v,
     )
 
 
-def stars_of(table: pa.Table, library: Library) -> Stars:
+def stars_from_table(table: pa.Table, library: Library) -> Stars:
     """Rows of the table `stars`, checked; errors as `galaxies_of`."""
     mag_h, a_v = (column(table, name) for name in ("mag_h", "a_v"))
     for name, values in (("mag_h", mag_h), ("a_v", a_v)):
         declared = STARS.column(name)
-        within(name, values, _bound(declared.lo), _bound(declared.hi))
+        check_range(name, values, _required_bound(declared.lo), _required_bound(declared.hi))
     sed, frac = [column(table, "sed")], []
-    within("sed", sed[0], 0, len(library) - 1)
-    for k in STAR_PARTS:
+    check_range("sed", sed[0], 0, len(library) - 1)
+    for k in STAR_COMPONENTS:
         if f"sed_{k}" not in table.column_names or table[f"sed_{k}"].null_count == table.num_rows:
             continue
         frac.append(np.nan_to_num(_floats(table, f"frac_{k}"), nan=0.0, posinf=np.inf))
-        within(f"frac_{k}", frac[-1], 0.0, 1.0)
+        check_range(f"frac_{k}", frac[-1], 0.0, 1.0)
         sed.append(np.where(frac[-1] > 0.0, _floats(table, f"sed_{k}"), sed[0]))
-        within(f"sed_{k}", sed[-1], 0, len(library) - 1)
+        check_range(f"sed_{k}", sed[-1], 0, len(library) - 1)
     shares = np.stack([np.ones(table.num_rows), *frac])
     shares[0] = 1.0 - shares[1:].sum(0)
-    within("what frac_2, frac_3, frac_4 leave to sed", shares[0], -1e-6, 1.0)
+    check_range("what frac_2, frac_3, frac_4 leave to sed", shares[0], -1e-6, 1.0)
     return Stars(np.stack(sed).astype(np.int64), np.maximum(shares, 0.0), mag_h, a_v)
 
 
@@ -158,10 +158,10 @@ def determinant(kappa: npt.ArrayLike, gamma1: npt.ArrayLike, gamma2: npt.ArrayLi
     return np.asarray((stretch - shear) * (stretch + shear))
 
 
-def magnification_of(table: pa.Table) -> Float:
+def table_magnification(table: pa.Table) -> Float:
     """`magnification` of the rows of the table `galaxies`."""
     kappa, gamma1, gamma2 = (column(table, name) for name in ("kappa", "gamma1", "gamma2"))
-    return magnification(kappa, gamma1, gamma2, ids_of(table))
+    return magnification(kappa, gamma1, gamma2, source_ids(table))
 
 
 def _line_fluxes(table: pa.Table) -> Float:
@@ -172,18 +172,18 @@ def _line_fluxes(table: pa.Table) -> Float:
             continue
         flux = np.nan_to_num(_floats(table, line.column), nan=0.0, posinf=np.inf)
         declared = GALAXIES.column(line.column)
-        within(line.column, flux, _bound(declared.lo), _bound(declared.hi))
+        check_range(line.column, flux, _required_bound(declared.lo), _required_bound(declared.hi))
         out[:, k] = flux * line.ratio
     return out
 
 
-def _declared(name: str, values: Float) -> Float:
+def _check_declared_range(name: str, values: Float) -> Float:
     declared = GALAXIES.column(name)
-    within(name, values, _bound(declared.lo), _bound(declared.hi))
+    check_range(name, values, _required_bound(declared.lo), _required_bound(declared.hi))
     return values
 
 
-def _bound(value: float | None) -> float:
+def _required_bound(value: float | None) -> float:
     if value is None:
         raise BadInput("a column that is read for its spectrum has no bounds")
     return value
@@ -196,11 +196,11 @@ def _refuse_other_kinds(table: pa.Table) -> None:
     other = ~np.isin(kinds, GALAXY_KINDS)
     if other.any():
         first = int(np.flatnonzero(other)[0])
-        source = int(ids_of(table)[first])
+        source = int(source_ids(table)[first])
         raise BadInput(f"galaxies: source {source} has kind {int(kinds[first])}: not in the galaxy library")
 
 
-def ids_of(table: pa.Table) -> Int:
+def source_ids(table: pa.Table) -> Int:
     if "id" not in table.column_names:
         return np.arange(table.num_rows, dtype=np.int64)
     return np.asarray(table["id"].to_numpy(), np.int64)
@@ -212,7 +212,7 @@ def column(table: pa.Table, name: str) -> Float:
     gap = np.isnan(values)
     if gap.any():
         first = int(np.flatnonzero(gap)[0])
-        raise BadInput(f"column {name} is missing in the row of source {int(ids_of(table)[first])}")
+        raise BadInput(f"column {name} is missing in the row of source {int(source_ids(table)[first])}")
     return values
 
 

@@ -32,7 +32,7 @@ from lake_schema.errors import BadInput
 from lake_schema.store import blocks, layout, manifest
 from lake_schema.store.provenance import digest, machine
 
-_SEAL, _ARRAY = "sums.json", ".npy"
+_CHECKSUM_FILE, _ARRAY = "sums.json", ".npy"
 # Another process may remove what it found damaged at the moment when this one has made it again.
 _TRIES = 3
 _KEY_LENGTH = 32
@@ -40,25 +40,25 @@ _KEY_LENGTH = 32
 
 def cache_dir() -> Path:
     """$TRUESKY_CACHE, else $XDG_CACHE_HOME/truesky, else ~/.cache/truesky; it need not exist yet."""
-    if own := os.environ.get("TRUESKY_CACHE"):
-        return user_files.expanded(own)
+    if custom := os.environ.get("TRUESKY_CACHE"):
+        return user_files.expand_path(custom)
     if home := os.environ.get("XDG_CACHE_HOME"):
-        return user_files.expanded(home) / "truesky"
+        return user_files.expand_path(home) / "truesky"
     return Path.home() / ".cache" / "truesky"
 
 
 @contextlib.contextmanager
-def temporary() -> Iterator[None]:
+def use_temporary_dir() -> Iterator[None]:
     """An empty cache meanwhile, which is removed afterwards."""
-    before = os.environ.get("TRUESKY_CACHE")
+    previous = os.environ.get("TRUESKY_CACHE")
     with tempfile.TemporaryDirectory(prefix="truesky-") as folder:
         os.environ["TRUESKY_CACHE"] = folder
         try:
             yield
         finally:
             del os.environ["TRUESKY_CACHE"]
-            if before is not None:
-                os.environ["TRUESKY_CACHE"] = before
+            if previous is not None:
+                os.environ["TRUESKY_CACHE"] = previous
 
 
 def machine_code_dir() -> Path:
@@ -109,78 +109,78 @@ def cached_arrays(name: str, key: str, make: Callable[[], Mapping[str, Array]]) 
     make : called only if nothing usable is stored; of processes that race, all use what the first published
     """
     # A folder that machines of several kinds share keeps each kind's: what is kept changes no result.
-    own = content_key(key, machine())[:_KEY_LENGTH]
-    folder = cache_dir() / f"{layout.name(name)}-{own}"
-    made: Mapping[str, Array] | None = None
+    machine_key = content_key(key, machine())[:_KEY_LENGTH]
+    folder = cache_dir() / f"{layout.check_name(name)}-{machine_key}"
+    arrays: Mapping[str, Array] | None = None
     for _ in range(_TRIES):
         stored = _load(folder)
         if stored is not None:
             return stored
-        made = make() if made is None else made
-        _publish(made, folder)
+        arrays = make() if arrays is None else arrays
+        _publish(arrays, folder)
     raise BadInput(f"cache {folder}: what was just written cannot be read")
 
 
 def _load(folder: Path) -> dict[str, Array] | None:
-    sums = sealed(folder)
-    if sums is None:
+    checksums = stored_checksums(folder)
+    if checksums is None:
         return None
-    if broken := [name for name, crc in sums.items() if not is_whole(folder / name, crc)]:
+    if broken := [name for name, crc in checksums.items() if not is_intact(folder / name, crc)]:
         discard(folder, f"{broken[0]} is not what was written")
         return None
     try:
-        return {name.removesuffix(_ARRAY): _map(folder / name) for name in sums}
+        return {name.removesuffix(_ARRAY): _map(folder / name) for name in checksums}
     except (ValueError, EOFError, FileNotFoundError) as error:
         # Removed meanwhile by another process.
         discard(folder, str(error))
         return None
 
 
-def seal(folder: Path, names: Iterable[str]) -> None:
+def store_checksums(folder: Path, names: Iterable[str]) -> None:
     """Write the checksums of a folder's files beside them, everything synced."""
-    sums = {}
+    checksums = {}
     for name in names:
         manifest.sync(folder / name)
-        sums[name] = blocks.crc32(folder / name)
-    manifest.write_json(folder / _SEAL, {"sums": sums, "digest": digest(sums)})
-    for path in {(folder / name).parent for name in sums}:
+        checksums[name] = blocks.crc32(folder / name)
+    manifest.write_json(folder / _CHECKSUM_FILE, {"sums": checksums, "digest": digest(checksums)})
+    for path in {(folder / name).parent for name in checksums}:
         manifest.sync(path)
 
 
-def sealed(folder: Path) -> dict[str, int] | None:
+def stored_checksums(folder: Path) -> dict[str, int] | None:
     """Name -> CRC-32 of the files that were sealed; None where nothing usable is stored, what there was is removed."""
     if not folder.exists():
         # Looked for before its seal: another process may publish the whole of it at any time.
         return None
     try:
-        found = json.loads((folder / _SEAL).read_bytes())
-        sums: dict[str, int] = found["sums"]
-        if digest(sums) == found["digest"]:
-            return sums
-        why = f"{_SEAL} is not what was written"
+        stored = json.loads((folder / _CHECKSUM_FILE).read_bytes())
+        checksums: dict[str, int] = stored["sums"]
+        if digest(checksums) == stored["digest"]:
+            return checksums
+        reason = f"{_CHECKSUM_FILE} is not what was written"
     except (ValueError, LookupError, TypeError, FileNotFoundError, RecursionError) as error:
-        why = str(error)
-    discard(folder, why)
+        reason = str(error)
+    discard(folder, reason)
     return None
 
 
-def is_whole(path: Path, crc: int) -> bool:
+def is_intact(path: Path, crc: int) -> bool:
     """Is the file what it was when it was sealed?  Compared once a process, and again where the file has changed."""
     try:
-        about = path.stat()
-        return _crc32(path, about.st_ino, about.st_size, about.st_mtime_ns) == crc
+        status = path.stat()
+        return _crc32(path, status.st_ino, status.st_size, status.st_mtime_ns) == crc
     except FileNotFoundError:
         return False
 
 
 @lru_cache(maxsize=65_536)
-def _crc32(path: Path, *which: int) -> int:
+def _crc32(path: Path, *file_state: int) -> int:
     return blocks.crc32(path)
 
 
-def discard(folder: Path, why: str) -> None:
+def discard(folder: Path, reason: str) -> None:
     """Remove a folder, and say so."""
-    logging.getLogger(__name__).warning("cache %s: %s: made again", folder, " ".join(why.split()))
+    logging.getLogger(__name__).warning("cache %s: %s: made again", folder, " ".join(reason.split()))
     _remove(folder)
 
 
@@ -188,10 +188,10 @@ def _remove(folder: Path) -> None:
     if not folder.exists():
         return
     # In one rename, so that nobody meets half of it.
-    gone = Path(tempfile.mkdtemp(prefix=".gone-", dir=folder.parent))
+    trash = Path(tempfile.mkdtemp(prefix=".gone-", dir=folder.parent))
     with contextlib.suppress(OSError):
-        folder.rename(gone / folder.name)
-    shutil.rmtree(gone, ignore_errors=True)
+        folder.rename(trash / folder.name)
+    shutil.rmtree(trash, ignore_errors=True)
 
 
 def _map(file: Path) -> Array:
@@ -208,8 +208,8 @@ def _publish(arrays: Mapping[str, Array], folder: Path) -> None:
     staged = Path(tempfile.mkdtemp(prefix=".making-", dir=folder.parent))
     try:
         for stem, array in arrays.items():
-            np.save(staged / f"{layout.name(stem)}{_ARRAY}", np.ascontiguousarray(array), allow_pickle=False)
-        seal(staged, [f"{stem}{_ARRAY}" for stem in arrays])
+            np.save(staged / f"{layout.check_name(stem)}{_ARRAY}", np.ascontiguousarray(array), allow_pickle=False)
+        store_checksums(staged, [f"{stem}{_ARRAY}" for stem in arrays])
         staged.chmod(0o755)
         try:
             staged.rename(folder)

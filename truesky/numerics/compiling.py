@@ -59,13 +59,13 @@ class PackageCacheLocator(UserProvidedCacheLocator):
 
 
 def _compile(function: Function, **options: Any) -> Function:
-    before = _CONFIG.CACHE_LOCATOR_CLASSES
+    previous = _CONFIG.CACHE_LOCATOR_CLASSES
     _CONFIG.CACHE_LOCATOR_CLASSES = _LOCATORS
     try:
         decorate: Any = numba.njit(cache=True, error_model="numpy", **options)
         compiled: Function = decorate(function)
     finally:
-        _CONFIG.CACHE_LOCATOR_CLASSES = before
+        _CONFIG.CACHE_LOCATOR_CLASSES = previous
     return compiled
 
 

@@ -14,12 +14,12 @@ from lake_schema import __version__, command
 from lake_schema.errors import BadInput
 from lake_schema.store import layout
 from truesky.explore.process import MEMORY, TIMEOUT
-from truesky.page.gate import Gate, new_token
-from truesky.page.opened import Lake
+from truesky.page.access_control import AccessRules, new_token
+from truesky.page.lake_session import LakeSession
 from truesky.page.server import Server
 
 _GIGABYTE = 1e9
-_HERE, _EVERYWHERE = ("127.0.0.1", "localhost"), ("", "0.0.0.0")
+_LOCAL_NAMES, _ALL_INTERFACES = ("127.0.0.1", "localhost"), ("", "0.0.0.0")
 # What an address and a cookie hold as it is.
 _TOKEN = re.compile(r"[A-Za-z0-9_.~-]{16,256}")
 _NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?")
@@ -28,52 +28,52 @@ _NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?")
 def main(argv: Sequence[str] | None = None) -> int:
     """Exit status: 0 stopped, 1 the lake is damaged or the port is taken, 2 the call is wrong."""
     options = _options(argv)
-    return command.status("page", lambda: _served(options))
+    return command.run("page", lambda: _serve(options))
 
 
-def _served(options: argparse.Namespace) -> int:
-    root, names = layout.opened(_lake(options), options.endpoint_url), _names(options)
-    if options.token is None and names != _HERE:
+def _serve(options: argparse.Namespace) -> int:
+    root, host_names = layout.open_lake(_lake_folder(options), options.endpoint_url), _host_names(options)
+    if options.token is None and host_names != _LOCAL_NAMES:
         raise BadInput(f"--host {options.host}: others can reach it, so a --token of your own is wanted")
     if options.token is not None and not _TOKEN.fullmatch(options.token):
         raise BadInput("--token: wanted 16 to 256 letters, digits or any of - _ . ~")
     if not 0 <= options.port < 65536:
         raise BadInput(f"--port {options.port}: wanted 0 to 65535")
 
-    def opened() -> Lake:
-        return Lake(root, options.name, options.memory * _GIGABYTE, options.timeout)
+    def open_lake() -> LakeSession:
+        return LakeSession(root, options.name, options.memory * _GIGABYTE, options.timeout)
 
     # Taken before anything is said of it: port 0 is any that is free.
-    listening = socket.create_server((options.host, options.port))
-    port = int(listening.getsockname()[1])
-    gate = Gate(names, port, options.token or new_token())
-    server = Server(opened, gate)
-    site = f"http://{names[0]}:{port}"
-    address = f"{site}/?token={gate.token}"
-    print(f"{root} is shown at {address}\nTAP: {site}/tap/{gate.tap_token}", flush=True)
+    server_socket = socket.create_server((options.host, options.port))
+    port = int(server_socket.getsockname()[1])
+    access = AccessRules(host_names, port, options.token or new_token())
+    server = Server(open_lake, access)
+    origin = f"http://{host_names[0]}:{port}"
+    address = f"{origin}/?token={access.token}"
+    print(f"{root} is shown at {address}\nTAP: {origin}/tap/{access.tap_token}", flush=True)
     if options.open:
         webbrowser.open(address)
-    web.run_app(server.application(), sock=listening, print=None, handler_cancellation=True, access_log=None)
+    web.run_app(server.application(), sock=server_socket, print=None, handler_cancellation=True, access_log=None)
     return 0
 
 
-def _lake(options: argparse.Namespace) -> str:
+def _lake_folder(options: argparse.Namespace) -> str:
     if (options.lake is None) == (options.folder is None):
         raise BadInput("wanted the folder of one lake: LAKE, or --lake LAKE")
     return str(options.folder if options.lake is None else options.lake)
 
 
-def _names(options: argparse.Namespace) -> tuple[str, ...]:
+def _host_names(options: argparse.Namespace) -> tuple[str, ...]:
     """By which it may be called, that which is printed first: a name of another's may lead to this machine, too."""
-    if wrong := next((name for name in options.called if not _NAME.fullmatch(name)), None):
-        raise BadInput(f"--called {wrong[:80]!r} is no name or address of a machine")
-    called = tuple(name.lower() for name in options.called)
-    if options.host in _EVERYWHERE:
-        if not called:
-            accepts = f"--host {options.host} accepts connections from other machines"
-            raise BadInput(f"{accepts}: give --called NAME, the name or address that they use")
-        return (*called, *_HERE)
-    return (*called, *_HERE) if options.host in _HERE else (options.host.lower(), *called)
+    if invalid_name := next((name for name in options.called if not _NAME.fullmatch(name)), None):
+        raise BadInput(f"--called {invalid_name[:80]!r} is no name or address of a machine")
+    other_names = tuple(name.lower() for name in options.called)
+    if options.host in _ALL_INTERFACES:
+        if not other_names:
+            problem = f"--host {options.host} accepts connections from other machines"
+            raise BadInput(f"{problem}: give --called NAME, the name or address that they use")
+        return (*other_names, *_LOCAL_NAMES)
+    return (*other_names, *_LOCAL_NAMES) if options.host in _LOCAL_NAMES else (options.host.lower(), *other_names)
 
 
 def _options(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -106,4 +106,4 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
 
 
 if __name__ == "__main__":
-    command.leave(main)
+    command.exit_with_status(main)

@@ -11,86 +11,94 @@ import pyarrow.compute as pc
 
 from lake_schema.errors import LakeError
 from lake_schema.mission.configuration import resolve
-from lake_schema.store import names as named
 from lake_schema.store import read
+from lake_schema.store import request_links as named
 from truesky.commands import report
 from truesky.page import pictures
-from truesky.page.answers import plain
-from truesky.page.opened import Lake, Requested
+from truesky.page.answers import to_json_value
+from truesky.page.lake_session import LakeSession, RequestTables
 
-_DEEPEST = 8
+_MAX_DEPTH = 8
 Json = dict[str, Any]
 
 
-def runs(lake: Lake) -> Json:
+def runs(lake: LakeSession) -> Json:
     """Jobs with their forecasts, tasks done of all, failures, and what of the mission is not as truesky has it."""
-    found: Json = {"jobs": [], "tasks": [], "failures": [], "mission": []}
+    result: Json = {"jobs": [], "tasks": [], "failures": [], "mission": []}
     try:
-        found["jobs"] = [
+        result["jobs"] = [
             {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in asdict(line).items()}
-            for line in report.rows(lake.root)
+            for line in report.job_totals(lake.root)
         ]
     except LakeError as error:
-        found["said"] = str(error)
-    done = {one.place for one in pictures.pictures(lake)}
-    for own in lake.observed:
-        about = {"request": own.request}
-        if number := own.versions["tasks"].num_rows if "tasks" in own.versions else 0:
-            left, seconds = _left(own, {place[1:] for place in done if place[0] == own.request})
-            found["tasks"].append(about | {"done": number - left, "all": number, "seconds_left": seconds})
-        found["failures"] += [about | {k: plain(v) for k, v in row.items()} for row in pictures.failures(lake, own)]
-    for own in lake.requested("mission"):
-        found["mission"] += [{"request": own.request, **row} for row in _changed(own.versions["mission"])]
-    return found
+        result["said"] = str(error)
+    done = {image.detector_key for image in pictures.pictures(lake)}
+    for request_tables in lake.observed_requests:
+        label = {"request": request_tables.request}
+        if number := request_tables.versions["tasks"].num_rows if "tasks" in request_tables.versions else 0:
+            remaining, seconds = _remaining_work(
+                request_tables, {place[1:] for place in done if place[0] == request_tables.request}
+            )
+            result["tasks"].append(label | {"done": number - remaining, "all": number, "seconds_left": seconds})
+        result["failures"] += [
+            label | {k: to_json_value(v) for k, v in row.items()}
+            for row in pictures.failed_detectors(lake, request_tables)
+        ]
+    for request_tables in lake.request_tables("mission"):
+        result["mission"] += [
+            {"request": request_tables.request, **row}
+            for row in _overridden_parameters(request_tables.versions["mission"])
+        ]
+    return result
 
 
-def _left(own: Requested, done: set[tuple[int, str]]) -> tuple[int, float]:
+def _remaining_work(request_tables: RequestTables, done: set[tuple[int, str]]) -> tuple[int, float]:
     """Detectors that are planned and not done: how many, and their seconds."""
     begun = pa.array([*{exposure for exposure, _ in done}], pa.int64())
     number, seconds = 0, 0.0
-    for rows in own.pieces("tasks", ["exposure_id", "detector", "seconds"]):
+    for rows in request_tables.iterate_rows("tasks", ["exposure_id", "detector", "seconds"]):
         is_begun = pc.is_in(rows["exposure_id"], begun)
-        some = rows.filter(is_begun).to_pylist()
-        left = [row["seconds"] for row in some if (row["exposure_id"], row["detector"]) not in done]
-        others = rows.filter(pc.invert(is_begun))
-        number += len(left) + others.num_rows
-        seconds += sum(left) + (pc.sum(others["seconds"]).as_py() or 0.0)
+        begun_rows = rows.filter(is_begun).to_pylist()
+        remaining_seconds = [row["seconds"] for row in begun_rows if (row["exposure_id"], row["detector"]) not in done]
+        other_rows = rows.filter(pc.invert(is_begun))
+        number += len(remaining_seconds) + other_rows.num_rows
+        seconds += sum(remaining_seconds) + (pc.sum(other_rows["seconds"]).as_py() or 0.0)
     return number, seconds
 
 
-def _changed(version: read.Version) -> list[Json]:
+def _overridden_parameters(version: read.Version) -> list[Json]:
     """Parameters that a request gave another value than they have in the mission database of this truesky."""
     rows = version.rows(["name", "value", "unit", "overridden"]).to_pylist()
-    usual = resolve()
+    defaults = resolve()
     return [
-        {"name": row["name"], "value": plain(row["value"]), "unit": row["unit"],
-         "usual": plain(usual.parameter(row["name"]).value) if row["name"] in usual else None}
+        {"name": row["name"], "value": to_json_value(row["value"]), "unit": row["unit"],
+         "usual": to_json_value(defaults.parameter(row["name"]).value) if row["name"] in defaults else None}
         for row in rows
         if row["overridden"]
     ]  # fmt: skip
 
 
-def provenance(lake: Lake, number: int) -> Json:
+def provenance(lake: LakeSession, number: int) -> Json:
     """A tree: the image, the version of the table that it is of, what that was made of, and so on.
 
     number : of the image
     """
-    one = pictures.picture(lake, number)
+    image = pictures.picture(lake, number)
     return {
-        "name": one.row["path"].rpartition("/")[2],
-        "about": f"sha256 {one.version.sha256(one.row['path'])}",
-        "from": [_tree(lake, one.version, 0)],
+        "name": image.row["path"].rpartition("/")[2],
+        "about": f"sha256 {image.version.file_sha256(image.row['path'])}",
+        "from": [_provenance_tree(lake, image.version, 0)],
     }
 
 
-def _tree(lake: Lake, version: read.Version, depth: int) -> Json:
-    keys = set(named.keys_in(version.manifest.get("facts", {})))
-    made_of = []
-    for table in read.tables(lake.root) if depth < _DEEPEST else []:
+def _provenance_tree(lake: LakeSession, version: read.Version, depth: int) -> Json:
+    keys = set(named.version_keys_in(version.manifest.get("facts", {})))
+    inputs = []
+    for table in read.table_names(lake.root) if depth < _MAX_DEPTH else []:
         for key in sorted(keys):
             try:
-                made_of.append(_tree(lake, read.version(lake.root, table, key), depth + 1))
+                inputs.append(_provenance_tree(lake, read.version(lake.root, table, key), depth + 1))
             except LakeError:
                 continue
-    about = f"version {version.key}, {version.num_rows:,} rows, truesky {version.manifest.get('truesky', '')}"
-    return {"name": version.table, "about": about, "from": made_of}
+    summary = f"version {version.key}, {version.num_rows:,} rows, truesky {version.manifest.get('truesky', '')}"
+    return {"name": version.table, "about": summary, "from": inputs}

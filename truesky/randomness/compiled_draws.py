@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from truesky.numerics.compiling import exact_jit
-from truesky.randomness.rng import GOLDEN, mixed
+from truesky.randomness.rng import GOLDEN, mix_bits
 
 # Rational approximations of AS 241, PPND16, lowest power first: in the middle, in the tails, and far out.
 _MIDDLE = (
@@ -38,7 +38,7 @@ _TAIL = (
         1.48103976427480074590e-1, 1.51986665636164571966e-2, 5.47593808499534494600e-4, 1.05075007164441684324e-9,
     ),
 )  # fmt: skip
-_FAR = (
+_FAR_TAIL = (
     (
         6.65790464350110377720e0, 5.46378491116411436990e0, 1.78482653991729133580e0, 2.96560571828504891230e-1,
         2.65321895265761230930e-2, 1.24266094738807843860e-3, 2.71155556874348757815e-5, 2.01033439929228813265e-7,
@@ -52,13 +52,13 @@ _FAR = (
 _LARGEST_MEAN = 600.0
 _S12 = np.uint64(12)
 
-_mixed = exact_jit(mixed)
+_mix_bits = exact_jit(mix_bits)
 
 
 @exact_jit
-def following(key: Any, number: Any) -> Any:
+def child_key(key: Any, number: Any) -> Any:
     """The key of one of the things that belong to a key; number : int, from 0."""
-    return _mixed(key + (np.uint64(number) + np.uint64(1)) * GOLDEN)
+    return _mix_bits(key + (np.uint64(number) + np.uint64(1)) * GOLDEN)
 
 
 @exact_jit
@@ -75,36 +75,36 @@ def normal(key: Any) -> Any:
     if abs(q) <= 0.425:
         return q * _ratio(_MIDDLE, 0.180625 - q * q)
     r = np.sqrt(-np.log(u if q < 0.0 else 1.0 - u))
-    x = _ratio(_TAIL, r - 1.6) if r <= 5.0 else _ratio(_FAR, r - 5.0)
+    x = _ratio(_TAIL, r - 1.6) if r <= 5.0 else _ratio(_FAR_TAIL, r - 5.0)
     return -x if q < 0.0 else x
 
 
 @exact_jit
-def _ratio(of: Any, x: Any) -> Any:
-    above, below = of[0][7], of[1][7]
+def _ratio(coefficients: Any, x: Any) -> Any:
+    numerator, denominator = coefficients[0][7], coefficients[1][7]
     for i in range(6, -1, -1):
-        above = above * x + of[0][i]
-        below = below * x + of[1][i]
-    return above / below
+        numerator = numerator * x + coefficients[0][i]
+        denominator = denominator * x + coefficients[1][i]
+    return numerator / denominator
 
 
 @exact_jit
 def poisson(key: Any, mean: Any) -> Any:
     """A Poisson number, by inversion."""
     pieces = int(mean / _LARGEST_MEAN) + 1
-    part = mean / pieces
-    found = 0
+    part_mean = mean / pieces
+    total = 0
     for piece in range(pieces):
-        u = uniform(following(key, piece))
-        share = np.exp(-part)
-        below, number = share, 0
+        u = uniform(child_key(key, piece))
+        probability = np.exp(-part_mean)
+        cumulative, count = probability, 0
         # The sum stops growing before it is 1 where u is so near to it that no number has this probability.
-        while u > below and share > 0.0:
-            number += 1
-            share *= part / number
-            below += share
-        found += number
-    return found
+        while u > cumulative and probability > 0.0:
+            count += 1
+            probability *= part_mean / count
+            cumulative += probability
+        total += count
+    return total
 
 
 @exact_jit
@@ -114,19 +114,19 @@ def gamma(key: Any, shape: Any) -> Any:
     c = 1.0 / np.sqrt(9.0 * d)
     trial = 1
     while True:
-        x = normal(following(key, trial))
+        x = normal(child_key(key, trial))
         v = (1.0 + c * x) ** 3
-        if v > 0.0 and np.log(uniform(following(key, trial + 1))) < 0.5 * x * x + d - d * v + d * np.log(v):
+        if v > 0.0 and np.log(uniform(child_key(key, trial + 1))) < 0.5 * x * x + d - d * v + d * np.log(v):
             break
         trial += 2
-    return d * v if shape >= 1.0 else d * v * uniform(following(key, 0)) ** (1.0 / shape)
+    return d * v if shape >= 1.0 else d * v * uniform(child_key(key, 0)) ** (1.0 / shape)
 
 
 @exact_jit
 def uniforms(keys: Any, number: Any, out: Any) -> None:
     """Fills out, float64[n], with the uniform of each key's `number`-th following; keys : uint64[n]."""
     for i in range(keys.size):
-        out[i] = uniform(following(keys[i], number))
+        out[i] = uniform(child_key(keys[i], number))
 
 
 @exact_jit
@@ -136,7 +136,7 @@ def normals(keys: Any, number: Any, out: Any) -> None:
     keys : uint64[n];  number : int;  out : float64[n]
     """
     for i in range(keys.size):
-        out[i] = normal(following(keys[i], number))
+        out[i] = normal(child_key(keys[i], number))
 
 
 @exact_jit
@@ -146,4 +146,4 @@ def gammas(keys: Any, number: Any, shapes: Any, out: Any) -> None:
     keys : uint64[n];  number : int;  out : float64[n]
     """
     for i in range(keys.size):
-        out[i] = gamma(following(keys[i], number), shapes[i])
+        out[i] = gamma(child_key(keys[i], number), shapes[i])

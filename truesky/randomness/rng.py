@@ -27,7 +27,7 @@ _FIRST, _SECOND = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 _S30, _S27, _S31 = np.uint64(30), np.uint64(27), np.uint64(31)
 
 
-def name_of(*identity: int | str) -> str:
+def key_hex(*identity: int | str) -> str:
     """The key of an identity's generator as text: 32 hexadecimal digits, the first word of Philox's key first."""
     first, second = _key(identity)
     return f"{int(first):016x}{int(second):016x}"
@@ -48,15 +48,15 @@ def uniforms(ids: Int, count: int, *identity: int | str) -> Float:
     Ref : Steele, Lea & Flood 2014 (SplitMix64: a counter through a mixer that changes half of the bits)
     """
     first, second = _key(identity)
-    own = mixed(ids.astype(np.uint64) ^ first)
+    hashed_ids = mix_bits(ids.astype(np.uint64) ^ first)
     # Arithmetic is modulo 2^64.
     counters = (np.arange(count, dtype=np.uint64) + np.uint64(1)) * GOLDEN
-    bits = mixed((own[None, :] ^ second) + counters[:, None])
+    bits = mix_bits((hashed_ids[None, :] ^ second) + counters[:, None])
     # 52 bits and a half: neither 0 nor, rounded, 1.
     return np.asarray(((bits >> np.uint64(12)) + 0.5) * 2.0**-52)
 
 
-def mixed(words: Any) -> Any:
+def mix_bits(words: Any) -> Any:
     """uint64 words, each through a mixer that changes half of the bits.
 
     Arrays, or single ones where truesky.numerics.compiling compiles it (by that name this file is in the key of

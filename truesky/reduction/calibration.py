@@ -23,7 +23,7 @@ from scipy import ndimage
 
 from lake_schema.arrays import Array, Bool, Float, Float32
 from truesky.reduction import amplifiers
-from truesky.reduction.combining import Combined
+from truesky.reduction.combining import CombinedFrame
 from truesky.render.effects.charge import pixel_borders
 from truesky.render.effects.light import illumination
 from truesky.render.effects.scene import Scene
@@ -43,16 +43,16 @@ FLAGS = (
 # What a pixel may have that is used all the same.
 GOOD = EDGE | PERSISTENCE
 # Response of a pixel that is used, and its largest difference from its neighbours', in units of their rms.
-_LEAST, _MOST, _SPREAD = 0.7, 1.3, 8.0
+_MIN_RESPONSE, _MAX_RESPONSE, _MAX_DEVIATION = 0.7, 1.3, 8.0
 # Standard deviations of a dark's pixel above the others.
-_HOT = 8.0
+_HOT_SIGMA = 8.0
 # Pixels beside an edge at which charge is displaced.
 _BORDER = 10
 # Pixels of the mesh on which the level of the sky is taken, and of a side of the neighbours of a pixel of the flat.
-_MESH, _NEAR = 64, 9
+_MESH, _NEIGHBOURHOOD = 64, 9
 # Standard deviations above the sky, smoothed over a pixel, from which light counts as a source's; pixels that the
 # smoothing reaches.
-_SOURCE, _REACH = 4.0, 4
+_SOURCE_SIGMA, _SMOOTHING_REACH = 4.0, 4
 # Rows that are calibrated at a time.
 _ROWS = 512
 
@@ -65,15 +65,15 @@ class Masters:
     flags : uint8[ny, nx];  dark_time : s that the dark's frames have lasted: the noise of the bias is in them, too
     """
 
-    bias: Combined
-    dark: Combined
-    flat: Combined
+    bias: CombinedFrame
+    dark: CombinedFrame
+    flat: CombinedFrame
     flags: Array
     dark_time: float = np.inf
 
 
 @dataclass(frozen=True, slots=True)
-class Reduced:
+class ReducedImage:
     """A calibrated image [ny, nx].
 
     image  : float32, electrons of the exposure (or another unit), the sky in it; 0 where there is no value
@@ -86,14 +86,14 @@ class Reduced:
     flags: Array
 
 
-def nothing(shape: tuple[int, ...], value: float) -> Combined:
+def neutral_master(shape: tuple[int, ...], value: float) -> CombinedFrame:
     """What stands for a master that there is none of."""
     # One number for all: it takes no memory.
     mean, uncertainty = (np.broadcast_to(np.float32(number), shape) for number in (value, 0.0))
-    return Combined(mean, uncertainty, np.broadcast_to(np.int16(1), shape))
+    return CombinedFrame(mean, uncertainty, np.broadcast_to(np.int16(1), shape))
 
 
-def illuminated(scene: Scene, applied: Container[str], rows: slice = slice(None)) -> Float:
+def illumination_map(scene: Scene, applied: Container[str], rows: slice = slice(None)) -> Float:
     """What of the light reaches each pixel [ny, nx], 1 in the middle of the focal plane: as the mission declares it.
 
     rows : of the detector, all of them or some
@@ -112,42 +112,42 @@ def reading_variance(scene: Scene, applied: Container[str], rows: slice = slice(
     rows : of the detector, all of them or some
     """
     shape = len(range(scene.ny)[rows]), scene.nx
-    return np.broadcast_to(amplifiers.of_pixels(_reading(scene, applied), scene, rows), shape)
+    return np.broadcast_to(amplifiers.to_pixels(_amplifier_read_variance(scene, applied), scene, rows), shape)
 
 
-def _reading(scene: Scene, applied: Container[str]) -> float | Float:
+def _amplifier_read_variance(scene: Scene, applied: Container[str]) -> float | Float:
     """The same of each amplifier, [q]."""
-    noise = scene.of_amplifiers("read_noise", "electron") if "read_noise" in applied else 0.0
-    return noise**2 + scene.of_amplifiers("gain", "electron / adu") ** 2 / 12.0
+    noise = scene.amplifier_values("read_noise", "electron") if "read_noise" in applied else 0.0
+    return noise**2 + scene.amplifier_values("gain", "electron / adu") ** 2 / 12.0
 
 
-def response_flags(flat: Combined) -> Array:
+def response_flags(flat: CombinedFrame) -> Array:
     """Pixels whose response is far from 1, or in which a star has shone that the clipping left."""
-    flags = np.where((flat.mean > _LEAST) & (flat.mean < _MOST), 0, RESPONSE).astype(np.uint8)
+    flags = np.where((flat.mean > _MIN_RESPONSE) & (flat.mean < _MAX_RESPONSE), 0, RESPONSE).astype(np.uint8)
     # A median of medians: as robust, and a tenth of the time.
-    smooth = ndimage.median_filter(flat.mean, size=(1, _NEAR), mode="nearest")
-    off = flat.mean - ndimage.median_filter(smooth, size=(_NEAR, 1), mode="nearest")
+    smooth = ndimage.median_filter(flat.mean, size=(1, _NEIGHBOURHOOD), mode="nearest")
+    off = flat.mean - ndimage.median_filter(smooth, size=(_NEIGHBOURHOOD, 1), mode="nearest")
     rms = 1.4826 * float(np.median(np.abs(off)))
     # Dust dims a few pixels by more than their neighbours, and is no star.
-    flags[off > _SPREAD * rms] |= UNSURE
+    flags[off > _MAX_DEVIATION * rms] |= UNSURE
     flags[flat.count == 0] |= UNSURE
     return flags
 
 
-def dark_flags(dark: Combined) -> Array:
+def dark_flags(dark: CombinedFrame) -> Array:
     """Pixels in which far more charge is set free than in the others."""
     above = dark.mean - float(np.median(dark.mean))
-    hot = above > _HOT * np.where(np.isfinite(dark.uncertainty), dark.uncertainty, np.inf)
+    hot = above > _HOT_SIGMA * np.where(np.isfinite(dark.uncertainty), dark.uncertainty, np.inf)
     return (np.where(hot, HOT, 0) | np.where(dark.count == 0, UNSURE, 0)).astype(np.uint8)
 
 
-def master_flags(shape: tuple[int, int], found: Mapping[str, Combined], without: Container[str]) -> Array:
+def master_flags(shape: tuple[int, int], masters: Mapping[str, CombinedFrame], without: Container[str]) -> Array:
     """Flags [ny, nx] of a detector's pixels by its flat and its dark; without : masters that are not wanted."""
     flags = np.zeros(shape, np.uint8)
     if "flat" not in without:
-        flags |= response_flags(found["flat"])
+        flags |= response_flags(masters["flat"])
     if "dark" not in without:
-        flags |= dark_flags(found["dark"])
+        flags |= dark_flags(masters["dark"])
     return flags
 
 
@@ -155,15 +155,15 @@ def _strips(ny: int) -> Iterator[slice]:
     yield from (slice(first, min(first + _ROWS, ny)) for first in range(0, ny, _ROWS))
 
 
-def reduced(
+def calibrate(
     electrons: Float,
-    full: Bool,
+    saturated: Bool,
     masters: Masters,
     scene: Scene,
     applied: Container[str],
     unit: float = 1.0,
     fringes: Float32 | None = None,
-) -> Reduced:
+) -> ReducedImage:
     """Calibrate a frame.
 
     electrons : [ny, nx] above the level of the overscan;  full : pixels that read no less than a saturated one
@@ -174,24 +174,24 @@ def reduced(
     Error     : of the weight: shot noise of the light that is expected (the sky, and what is far above it), not counted
     """
     time = scene.exposure_time_s
-    image = amplifiers.undone(electrons - masters.bias.mean, scene, applied)
+    image = amplifiers.undo_effects(electrons - masters.bias.mean, scene, applied)
     del electrons
-    flags = masters.flags | _edges(scene, applied)
-    np.bitwise_or(flags, np.uint8(SATURATED), out=flags, where=full)
-    flags[amplifiers.unread(scene)] = NO_DATA
+    flags = masters.flags | _edge_flags(scene, applied)
+    np.bitwise_or(flags, np.uint8(SATURATED), out=flags, where=saturated)
+    flags[amplifiers.unread_pixels(scene)] = NO_DATA
     used = flags & ~np.uint8(GOOD) == 0
     for rows in _strips(scene.ny):
         response = _response(masters, scene, applied, rows)
-        known = (flags[rows] & NO_DATA == 0) & (response > 0.0) & np.isfinite(image[rows])
-        used[rows] &= known
-        came = image[rows] - masters.dark.mean[rows] * time
-        image[rows] = np.where(known, came, 0.0) / np.where(known, response, 1.0)
+        has_value = (flags[rows] & NO_DATA == 0) & (response > 0.0) & np.isfinite(image[rows])
+        used[rows] &= has_value
+        signal = image[rows] - masters.dark.mean[rows] * time
+        image[rows] = np.where(has_value, signal, 0.0) / np.where(has_value, response, 1.0)
     if fringes is not None:
-        _take_off(image, fringes, used)
-    floor = float(np.median(_reading(scene, applied)))
-    sky, weight = Mesh.of(image, used), np.zeros(image.shape, np.float32)
+        _subtract_fringes(image, fringes, used)
+    floor = float(np.median(_amplifier_read_variance(scene, applied)))
+    sky, weight = SkyMesh.from_image(image, used), np.zeros(image.shape, np.float32)
     for rows in _strips(scene.ny):
-        light = _expected(image, used, sky, floor, rows)
+        light = _expected_light(image, used, sky, floor, rows)
         response = _response(masters, scene, applied, rows)
         variance = np.maximum(light * response + masters.dark.mean[rows] * time, 0.0)
         variance += reading_variance(scene, applied, rows)
@@ -199,27 +199,27 @@ def reduced(
         variance += (masters.dark.uncertainty[rows] * time) ** 2
         variance += (light * response * masters.flat.uncertainty[rows]) ** 2
         with np.errstate(divide="ignore", invalid="ignore"):
-            found = np.where(used[rows], response**2 / variance, 0.0)
-        weight[rows] = np.where(np.isfinite(found), found * unit**2, 0.0)
+            pixel_weight = np.where(used[rows], response**2 / variance, 0.0)
+        weight[rows] = np.where(np.isfinite(pixel_weight), pixel_weight * unit**2, 0.0)
     image /= unit
     singles: tuple[Any, Any] = (image.astype(np.float32), weight)
-    return Reduced(*singles, flags)
+    return ReducedImage(*singles, flags)
 
 
 def _response(masters: Masters, scene: Scene, applied: Container[str], rows: slice) -> Float:
     """What of the light that comes from the sky is counted in each pixel of some rows."""
     flat = masters.flat.mean[rows]
-    return np.asarray(flat * (1.0 if masters.flat.vignetted else illuminated(scene, applied, rows)), float)
+    return np.asarray(flat * (1.0 if masters.flat.vignetted else illumination_map(scene, applied, rows)), float)
 
 
-def _take_off(image: Float, fringes: Float32, used: Bool) -> None:
+def _subtract_fringes(image: Float, fringes: Float32, used: Bool) -> None:
     """Of the image, in place: fringes of the sky, whose level they follow."""
-    sky = Mesh.of(image / (1.0 + fringes), used)
+    sky = SkyMesh.from_image(image / (1.0 + fringes), used)
     for rows in _strips(len(image)):
         image[rows] -= sky.rows(rows) * fringes[rows]
 
 
-def _edges(scene: Scene, applied: Container[str]) -> Array:
+def _edge_flags(scene: Scene, applied: Container[str]) -> Array:
     """Bits [ny, nx] of the last pixels of a detector that the field at its edge displaces."""
     flags = np.zeros((scene.ny, scene.nx), np.uint8)
     if pixel_borders.EDGES.name in applied:
@@ -227,33 +227,35 @@ def _edges(scene: Scene, applied: Container[str]) -> Array:
     return flags
 
 
-def expected(image: Float, used: Bool, floor: float) -> Float:
+def expected_light(image: Float, used: Bool, floor: float) -> Float:
     """Light of the sky, on a mesh, and of what is far above it, smoothed: e- [ny, nx], nowhere below 0.
 
     floor : variance of a pixel without light.  A pixel's own noise must not tell its weight: means would be too low.
     """
-    return _expected(image, used, Mesh.of(image, used), floor, slice(0, len(image)))
+    return _expected_light(image, used, SkyMesh.from_image(image, used), floor, slice(0, len(image)))
 
 
-def _expected(image: Float, used: Bool, mesh: Mesh, floor: float, rows: slice) -> Float:
+def _expected_light(image: Float, used: Bool, mesh: SkyMesh, floor: float, rows: slice) -> Float:
     """The same of some rows, of which the mesh tells the sky."""
-    wide = slice(max(rows.start - _REACH, 0), min(rows.stop + _REACH, len(image)))
-    sky = mesh.rows(wide)
-    above = ndimage.gaussian_filter(np.where(used[wide], image[wide] - sky, 0.0), 1.0, mode="nearest", radius=_REACH)
-    inner = slice(rows.start - wide.start, rows.stop - wide.start)
+    padded = slice(max(rows.start - _SMOOTHING_REACH, 0), min(rows.stop + _SMOOTHING_REACH, len(image)))
+    sky = mesh.rows(padded)
+    above = ndimage.gaussian_filter(
+        np.where(used[padded], image[padded] - sky, 0.0), 1.0, mode="nearest", radius=_SMOOTHING_REACH
+    )
+    inner = slice(rows.start - padded.start, rows.stop - padded.start)
     sky, above = sky[inner], above[inner]
     # A Gaussian of one pixel averages the noise of 4 pi of them.
     noise = np.sqrt((np.maximum(sky, 0.0) + floor) / (4.0 * np.pi))
-    return np.asarray(np.maximum(sky, 0.0) + np.where(above > _SOURCE * noise, above, 0.0))
+    return np.asarray(np.maximum(sky, 0.0) + np.where(above > _SOURCE_SIGMA * noise, above, 0.0))
 
 
-def level(image: Float, used: Bool) -> Float:
+def sky_level(image: Float, used: Bool) -> Float:
     """The sky [ny, nx], of its mesh."""
-    return Mesh.of(image, used).rows(slice(0, len(image)))
+    return SkyMesh.from_image(image, used).rows(slice(0, len(image)))
 
 
 @dataclass(frozen=True, slots=True)
-class Mesh:
+class SkyMesh:
     """The sky of an image: medians of a mesh's squares, clipped from above twice, linear between their middles.
 
     values : [n, m];  middles : of the squares along the rows and along the columns;  shape : of the image
@@ -264,13 +266,15 @@ class Mesh:
     shape: tuple[int, int]
 
     @classmethod
-    def of(cls, image: Float, used: Bool) -> Mesh:
+    def from_image(cls, image: Float, used: Bool) -> SkyMesh:
         """Of an image [ny, nx], of the pixels that are used."""
         edges = [np.linspace(0, n, max(n // _MESH, 1) + 1).round().astype(int) for n in image.shape]
         mesh = np.zeros((len(edges[0]) - 1, len(edges[1]) - 1))
-        for i, (down, up) in enumerate(zip(edges[0][:-1], edges[0][1:], strict=True)):
-            for j, (left, right) in enumerate(zip(edges[1][:-1], edges[1][1:], strict=True)):
-                values = image[down:up, left:right][used[down:up, left:right]]
+        for i, (first_row, past_row) in enumerate(zip(edges[0][:-1], edges[0][1:], strict=True)):
+            for j, (first_column, past_column) in enumerate(zip(edges[1][:-1], edges[1][1:], strict=True)):
+                values = image[first_row:past_row, first_column:past_column][
+                    used[first_row:past_row, first_column:past_column]
+                ]
                 for _ in range(2):
                     middle = float(np.median(values)) if values.size else 0.0
                     spread = 1.4826 * float(np.median(np.abs(values - middle))) if values.size else 0.0
@@ -291,5 +295,5 @@ class Mesh:
         # In squares; the outermost level is held beyond their middles.
         at = np.interp(np.arange(rows.start, rows.stop), self.middles[0], np.arange(len(self.values)))
         low = np.minimum(at.astype(int), max(len(self.values) - 2, 0))
-        part, high = (at - low)[:, None], np.minimum(low + 1, len(self.values) - 1)
-        return np.asarray((1.0 - part) * across[low] + part * across[high])
+        fraction, high = (at - low)[:, None], np.minimum(low + 1, len(self.values) - 1)
+        return np.asarray((1.0 - fraction) * across[low] + fraction * across[high])

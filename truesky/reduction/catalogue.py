@@ -21,27 +21,27 @@ from scipy import ndimage
 
 from lake_schema.arrays import Array, Bool, Float
 from lake_schema.errors import OutOfRange
-from lake_schema.fits.ldac import Values
-from truesky.reduction.calibration import NO_DATA, SATURATED, Reduced
+from lake_schema.fits.ldac import ColumnData
+from truesky.reduction.calibration import NO_DATA, SATURATED, ReducedImage
 from truesky.render.camera import astrometry
 
 # Side of the mesh of the sky, and how many of its squares a median is of.
-_MESH, _SMOOTHED = 64, 3
+_MESH, _MESH_FILTER = 64, 3
 # Isophotal axes as far as which a Kron radius is taken; factor of it, and the least radius, pixels, of MAG_AUTO.
-_ISOPHOTES, _KRON, _LEAST_RADIUS = 6.0, 2.5, 1.75
+_ISOPHOTES, _KRON, _MIN_RADIUS = 6.0, 2.5, 1.75
 # Exact overlaps of pixels and apertures.
 _EXACT = 0
 # Of a FWHM, the standard deviation of a window about a source's centre.
 _WINDOW = 2.0 / (2.0 * np.sqrt(2.0 * np.log(2.0)))
 # Pixels of sources that are held at a time, of a tile; parts that a source is divided into on the way.
-_STACK, _PARTS = 0.5, 8192
+_PIXEL_STACK, _MAX_SUBOBJECTS = 0.5, 8192
 # Sources are found tile by tile, since sep compares each with every other and holds all their pixels: side of a tile,
 # and how far about it is looked at, pixels.
-_TILE, _BEYOND = 2048, 256
+_TILE, _TILE_MARGIN = 2048, 256
 # Pixels about a source that are no sky; what stands for no noise.
 _MARGIN, _FLOOR = 3, np.float32(1e-20)
 # What SourceExtractor writes where there is no magnitude; of a flux of 1, magnitudes.
-_NONE, _MAGNITUDE = 99.0, 2.5 / np.log(10.0)
+_NO_MAGNITUDE, _MAGNITUDE_PER_LN = 99.0, 2.5 / np.log(10.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ class Limits:
             raise OutOfRange("--least-pixels", self.pixels, 1, 10_000)
 
 
-def detected(image: Reduced, gain: float, radius: float, limits: Limits) -> dict[str, Array]:
+def detect_sources(image: ReducedImage, gain: float, radius: float, limits: Limits) -> dict[str, Array]:
     """Sources, tile by tile from below: columns of SourceExtractor, x and y from 0.
 
     gain   : electrons of the exposure in a unit of the image;  radius : of the aperture of MAG_APER, pixels
@@ -69,81 +69,85 @@ def detected(image: Reduced, gain: float, radius: float, limits: Limits) -> dict
     Error  : a source that reaches farther than 256 pixels from its brightest one may be cut there, and counted twice
     """
     masked = (image.flags & ~np.uint8(SATURATED) != 0) & (image.weight <= 0.0)
-    above, noise, sky = _above(image, masked, limits)
-    found, own = _extracted(above, noise, masked, limits, gain=gain)
-    where = found["x"], found["y"]
-    shape = found["a"], found["b"], np.clip(found["theta"], -np.pi / 2, np.pi / 2)
+    above, noise, sky = _subtract_sky(image, masked, limits)
+    sources, segmentation = _extract(above, noise, masked, limits, gain=gain)
+    centres = sources["x"], sources["y"]
+    shape = sources["a"], sources["b"], np.clip(sources["theta"], -np.pi / 2, np.pi / 2)
     common = {"err": noise, "mask": masked, "gain": gain, "subpix": _EXACT}
-    kron, _ = sep.kron_radius(above, *where, *shape, _ISOPHOTES, mask=masked)
+    kron, _ = sep.kron_radius(above, *centres, *shape, _ISOPHOTES, mask=masked)
     kron = _KRON * np.where(np.isfinite(kron) & (kron > 0.0), kron, 1.0)
-    small = kron * np.sqrt(shape[0] * shape[1]) < _LEAST_RADIUS
-    auto = sep.sum_ellipse(above, *where, *shape, kron, **common)
-    least = sep.sum_circle(above, *where, _LEAST_RADIUS, **common)
-    aperture = sep.sum_circle(above, *where, radius, **common)
-    flux, error, beyond = (np.where(small, b, a) for a, b in zip(auto, least, strict=True))
-    half, _ = sep.flux_radius(
-        above, *where, _ISOPHOTES * shape[0], 0.5, normflux=np.maximum(flux, 1e-20), subpix=5, mask=masked
+    small = kron * np.sqrt(shape[0] * shape[1]) < _MIN_RADIUS
+    auto = sep.sum_ellipse(above, *centres, *shape, kron, **common)
+    small_aperture = sep.sum_circle(above, *centres, _MIN_RADIUS, **common)
+    aperture = sep.sum_circle(above, *centres, radius, **common)
+    flux, error, auto_flags = (np.where(small, b, a) for a, b in zip(auto, small_aperture, strict=True))
+    half_light, _ = sep.flux_radius(
+        above, *centres, _ISOPHOTES * shape[0], 0.5, normflux=np.maximum(flux, 1e-20), subpix=5, mask=masked
     )
-    across, up, _ = sep.winpos(above, *where, np.maximum(_WINDOW * half, 0.5), mask=masked, subpix=_EXACT)
-    bits = _bits(own, image.flags, len(found))
-    flags = _flags(found["flag"], beyond | aperture[2], beyond, bits)
-    at = np.rint(where[1]).astype(int), np.rint(where[0]).astype(int)
+    xwin, ywin, _ = sep.winpos(above, *centres, np.maximum(_WINDOW * half_light, 0.5), mask=masked, subpix=_EXACT)
+    bits = _flag_bits(segmentation, image.flags, len(sources))
+    flags = _flags(sources["flag"], auto_flags | aperture[2], auto_flags, bits)
+    pixel = np.rint(centres[1]).astype(int), np.rint(centres[0]).astype(int)
     return {
-        "x": where[0], "y": where[1], "xwin": across, "ywin": up, "a": shape[0], "b": shape[1], "theta": shape[2],
-        "errors": _errors(found, flux / np.maximum(error, 1e-20)), "npix": found["npix"],
-        "fwhm": _width(above, own, found["peak"]),
-        "flux_iso": found["flux"], "flux_max": found["peak"], "threshold": found["thresh"], "kron": kron,
+        "x": centres[0], "y": centres[1], "xwin": xwin, "ywin": ywin, "a": shape[0], "b": shape[1], "theta": shape[2],
+        "errors": _errors(sources, flux / np.maximum(error, 1e-20)), "npix": sources["npix"],
+        "fwhm": _fwhm(above, segmentation, sources["peak"]),
+        "flux_iso": sources["flux"], "flux_max": sources["peak"], "threshold": sources["thresh"], "kron": kron,
         "flux_auto": flux, "fluxerr_auto": error, "flux_aper": aperture[0], "fluxerr_aper": aperture[1],
-        "flux_radius": half, "background": sky.back()[at], "flags": flags, "imaflags": bits,
+        "flux_radius": half_light, "background": sky.back()[pixel], "flags": flags, "imaflags": bits,
     }  # fmt: skip
 
 
-def _above(image: Reduced, masked: Bool, limits: Limits) -> tuple[Array, Array, sep.Background]:
+def _subtract_sky(image: ReducedImage, masked: Bool, limits: Limits) -> tuple[Array, Array, sep.Background]:
     """float32[ny, nx]: the image without the sky, rms of the sky; its level; what sources cover is none of it.
 
     image : with weights;  masked : pixels without value;  limits : what a source is
     """
     # What is not needed any more is freed: of a large detector each array is a third of a gigabyte.
     pixels = np.ascontiguousarray(image.image, np.float32)
-    mesh = {"bw": _MESH, "bh": _MESH, "fw": _SMOOTHED, "fh": _SMOOTHED}
+    mesh = {"bw": _MESH, "bh": _MESH, "fw": _MESH_FILTER, "fh": _MESH_FILTER}
     empty = image.weight > 0.0
     sky = sep.Background(pixels, mask=~empty, **mesh)
-    own = _extracted(_without(pixels, sky), _noise(sky), masked, limits, deblend_cont=1.0)[1] > 0
-    empty &= ~ndimage.binary_dilation(own, iterations=_MARGIN)
-    del own
+    on_source = _extract(_subtract_background(pixels, sky), _noise(sky), masked, limits, deblend_cont=1.0)[1] > 0
+    empty &= ~ndimage.binary_dilation(on_source, iterations=_MARGIN)
+    del on_source
     if empty.any():
         sky = sep.Background(pixels, mask=~empty, **mesh)
-    return _without(pixels, sky), _noise(sky), sky
+    return _subtract_background(pixels, sky), _noise(sky), sky
 
 
-def _extracted(above: Array, noise: Array, masked: Bool, limits: Limits, **about: float) -> tuple[Array, Array]:
+def _extract(above: Array, noise: Array, masked: Bool, limits: Limits, **options: float) -> tuple[Array, Array]:
     """Sources as sep describes them, and int32[ny, nx] the number of each pixel's one, from 1.
 
     above : without the sky;  noise : its rms;  masked : pixels without value;  about : as sep.extract takes it
     """
-    sep.set_sub_object_limit(_PARTS)
-    own, all_found, count = np.zeros(above.shape, np.int32), [], 0
-    for bottom, left in product(*(range(0, side, _TILE) for side in above.shape)):
-        wide = tuple(slice(max(first - _BEYOND, 0), first + _TILE + _BEYOND) for first in (bottom, left))
-        some, error, mask = (np.ascontiguousarray(array[wide]) for array in (above, noise, masked))
-        sep.set_extract_pixstack(max(300_000, int(_STACK * some.size)))
-        found, numbers = sep.extract(
-            some, limits.threshold, err=error, mask=mask, minarea=limits.pixels, segmentation_map=True, **about
+    sep.set_sub_object_limit(_MAX_SUBOBJECTS)
+    segmentation, all_sources, count = np.zeros(above.shape, np.int32), [], 0
+    for first_row, first_column in product(*(range(0, side, _TILE) for side in above.shape)):
+        padded = tuple(
+            slice(max(first - _TILE_MARGIN, 0), first + _TILE + _TILE_MARGIN) for first in (first_row, first_column)
         )
-        for axis, part in zip("yx", wide, strict=True):
+        tile, error, mask = (np.ascontiguousarray(array[padded]) for array in (above, noise, masked))
+        sep.set_extract_pixstack(max(300_000, int(_PIXEL_STACK * tile.size)))
+        sources, tile_segmentation = sep.extract(
+            tile, limits.threshold, err=error, mask=mask, minarea=limits.pixels, segmentation_map=True, **options
+        )
+        for axis, axis_slice in zip("yx", padded, strict=True):
             for name in (axis, f"{axis}min", f"{axis}max", f"{axis}peak", f"{axis}cpeak"):
-                found[name] += part.start
+                sources[name] += axis_slice.start
         # Its brightest pixel is in one tile alone.
-        kept = (found["ypeak"] // _TILE == bottom // _TILE) & (found["xpeak"] // _TILE == left // _TILE)
-        number = np.zeros(len(found) + 1, np.int32)
-        number[1:][kept] = count + np.arange(1, kept.sum() + 1)
-        np.copyto(own[wide], number[numbers], where=number[numbers] > 0)
-        all_found.append(found[kept])
-        count += int(kept.sum())
-    return np.concatenate(all_found), own
+        in_tile = (sources["ypeak"] // _TILE == first_row // _TILE) & (
+            sources["xpeak"] // _TILE == first_column // _TILE
+        )
+        number = np.zeros(len(sources) + 1, np.int32)
+        number[1:][in_tile] = count + np.arange(1, in_tile.sum() + 1)
+        np.copyto(segmentation[padded], number[tile_segmentation], where=number[tile_segmentation] > 0)
+        all_sources.append(sources[in_tile])
+        count += int(in_tile.sum())
+    return np.concatenate(all_sources), segmentation
 
 
-def _without(pixels: Array, sky: sep.Background) -> Array:
+def _subtract_background(pixels: Array, sky: sep.Background) -> Array:
     back = sky.back()
     return np.asarray(np.subtract(pixels, back, out=back))
 
@@ -153,75 +157,75 @@ def _noise(sky: sep.Background) -> Array:
     return np.asarray(np.maximum(rms, _FLOOR, out=rms))
 
 
-def _errors(found: Array, signal: Float) -> Float:
+def _errors(sources: Array, signal: Float) -> Float:
     """[3, n] second moments of the error of a source's place; signal : of its light, over the noise.
 
     Error : of a source with a masked pixel those of its light over the signal: sep knows no others
     """
-    known = np.stack([found[name] for name in ("errx2", "erry2", "errxy")])
-    own = np.stack([found[name] for name in ("x2", "y2", "xy")]) / np.maximum(signal, 1.0) ** 2
-    return np.where(np.isfinite(known).all(axis=0), known, own)
+    errors = np.stack([sources[name] for name in ("errx2", "erry2", "errxy")])
+    light_errors = np.stack([sources[name] for name in ("x2", "y2", "xy")]) / np.maximum(signal, 1.0) ** 2
+    return np.where(np.isfinite(errors).all(axis=0), errors, light_errors)
 
 
-def _width(above: Array, own: Array, peak: Float) -> Float:
+def _fwhm(above: Array, segmentation: Array, peak: Float) -> Float:
     """[n] diameter of a circle of as many pixels of a source as have at least half of what its brightest has, pixels.
 
     above : the image without the sky;  own : number of each pixel's source, from 1;  peak : [n] of the brightest
     """
-    inside = own > 0
-    which = own[inside] - 1
-    high = above[inside] >= 0.5 * peak[which]
-    return np.asarray(2.0 * np.sqrt(np.bincount(which[high], minlength=len(peak)) / np.pi))
+    inside = segmentation > 0
+    source_index = segmentation[inside] - 1
+    high = above[inside] >= 0.5 * peak[source_index]
+    return np.asarray(2.0 * np.sqrt(np.bincount(source_index[high], minlength=len(peak)) / np.pi))
 
 
-def _bits(own: Array, flags: Array, count: int) -> Array:
+def _flag_bits(segmentation: Array, flags: Array, count: int) -> Array:
     """int16[count] bits of the flag map in the pixels of each source; own : its number from 1, in its pixels."""
     bits = np.zeros(count + 1, np.int16)
-    some = (own > 0) & (flags > 0)
-    np.bitwise_or.at(bits, own[some], flags[some].astype(np.int16))
+    flagged = (segmentation > 0) & (flags > 0)
+    np.bitwise_or.at(bits, segmentation[flagged], flags[flagged].astype(np.int16))
     return bits[1:]
 
 
-def _flags(of_detection: Array, near: Array, auto: Array, bits: Array) -> Array:
+def _flags(detection_flags: Array, aperture_flags: Array, auto_flags: Array, bits: Array) -> Array:
     """SourceExtractor's, of sep's."""
-    flags = np.where(of_detection & sep.OBJ_MERGED, 2, 0) | np.where(of_detection & sep.OBJ_TRUNC, 8, 0)
-    flags |= np.where(auto & (sep.APER_HASMASKED | sep.APER_ALLMASKED), 1, 0)
-    flags |= np.where(near & sep.APER_TRUNC, 16, 0) | np.where(bits & NO_DATA, 8, 0)
+    flags = np.where(detection_flags & sep.OBJ_MERGED, 2, 0) | np.where(detection_flags & sep.OBJ_TRUNC, 8, 0)
+    flags |= np.where(auto_flags & (sep.APER_HASMASKED | sep.APER_ALLMASKED), 1, 0)
+    flags |= np.where(aperture_flags & sep.APER_TRUNC, 16, 0) | np.where(bits & NO_DATA, 8, 0)
     return np.asarray(flags | np.where(bits & SATURATED, 4, 0), np.int16)
 
 
-def columns(found: dict[str, Array], system: WCS, zero_point: float) -> list[Values]:
+def columns(sources: dict[str, Array], system: WCS, zero_point: float) -> list[ColumnData]:
     """Columns of FITS_LDAC.
 
     found      : of `detected`;  system : of the image
     zero_point : AB magnitude of 1 in its unit
     """
-    ra, dec = astrometry.sky_of_pixel(system, found["x"], found["y"])
-    ra_window, dec_window = astrometry.sky_of_pixel(system, found["xwin"], found["ywin"])
-    long, short, angle = _axes(*found["errors"])
+    ra, dec = astrometry.sky_of_pixel(system, sources["x"], sources["y"])
+    ra_window, dec_window = astrometry.sky_of_pixel(system, sources["xwin"], sources["ywin"])
+    long, short, angle = _axes(*sources["errors"])
     magnitudes = {
-        kind: _magnitudes(found[f"flux_{kind}"], found[f"fluxerr_{kind}"], zero_point) for kind in ("auto", "aper")
+        kind: _magnitudes(sources[f"flux_{kind}"], sources[f"fluxerr_{kind}"], zero_point) for kind in ("auto", "aper")
     }
-    a, b = found["a"], found["b"]
+    a, b = sources["a"], sources["b"]
     number = np.arange(1, len(a) + 1)
     return [
         ("NUMBER", "J", "", number),
-        ("X_IMAGE", "D", "pixel", found["x"] + 1.0), ("Y_IMAGE", "D", "pixel", found["y"] + 1.0),
-        ("XWIN_IMAGE", "D", "pixel", found["xwin"] + 1.0), ("YWIN_IMAGE", "D", "pixel", found["ywin"] + 1.0),
+        ("X_IMAGE", "D", "pixel", sources["x"] + 1.0), ("Y_IMAGE", "D", "pixel", sources["y"] + 1.0),
+        ("XWIN_IMAGE", "D", "pixel", sources["xwin"] + 1.0), ("YWIN_IMAGE", "D", "pixel", sources["ywin"] + 1.0),
         ("ERRA_IMAGE", "E", "pixel", long), ("ERRB_IMAGE", "E", "pixel", short), ("ERRTHETA_IMAGE", "E", "deg", angle),
         ("ALPHA_J2000", "D", "deg", ra), ("DELTA_J2000", "D", "deg", dec),
         ("ALPHAWIN_J2000", "D", "deg", ra_window), ("DELTAWIN_J2000", "D", "deg", dec_window),
-        ("FLUX_AUTO", "E", "count", found["flux_auto"]), ("FLUXERR_AUTO", "E", "count", found["fluxerr_auto"]),
+        ("FLUX_AUTO", "E", "count", sources["flux_auto"]), ("FLUXERR_AUTO", "E", "count", sources["fluxerr_auto"]),
         ("MAG_AUTO", "E", "mag", magnitudes["auto"][0]), ("MAGERR_AUTO", "E", "mag", magnitudes["auto"][1]),
-        ("FLUX_APER", "E", "count", found["flux_aper"]), ("FLUXERR_APER", "E", "count", found["fluxerr_aper"]),
+        ("FLUX_APER", "E", "count", sources["flux_aper"]), ("FLUXERR_APER", "E", "count", sources["fluxerr_aper"]),
         ("MAG_APER", "E", "mag", magnitudes["aper"][0]), ("MAGERR_APER", "E", "mag", magnitudes["aper"][1]),
-        ("FLUX_ISO", "E", "count", found["flux_iso"]), ("FLUX_MAX", "E", "count", found["flux_max"]),
-        ("FLUX_RADIUS", "E", "pixel", found["flux_radius"]), ("KRON_RADIUS", "E", "", found["kron"]),
-        ("BACKGROUND", "E", "count", found["background"]), ("THRESHOLD", "E", "count", found["threshold"]),
-        ("ISOAREA_IMAGE", "J", "pixel**2", found["npix"]), ("FWHM_IMAGE", "E", "pixel", found["fwhm"]),
+        ("FLUX_ISO", "E", "count", sources["flux_iso"]), ("FLUX_MAX", "E", "count", sources["flux_max"]),
+        ("FLUX_RADIUS", "E", "pixel", sources["flux_radius"]), ("KRON_RADIUS", "E", "", sources["kron"]),
+        ("BACKGROUND", "E", "count", sources["background"]), ("THRESHOLD", "E", "count", sources["threshold"]),
+        ("ISOAREA_IMAGE", "J", "pixel**2", sources["npix"]), ("FWHM_IMAGE", "E", "pixel", sources["fwhm"]),
         ("A_IMAGE", "E", "pixel", a), ("B_IMAGE", "E", "pixel", b),
-        ("THETA_IMAGE", "E", "deg", np.degrees(found["theta"])), ("ELLIPTICITY", "E", "", 1.0 - b / a),
-        ("FLAGS", "I", "", found["flags"]), ("IMAFLAGS_ISO", "I", "", found["imaflags"]),
+        ("THETA_IMAGE", "E", "deg", np.degrees(sources["theta"])), ("ELLIPTICITY", "E", "", 1.0 - b / a),
+        ("FLAGS", "I", "", sources["flags"]), ("IMAFLAGS_ISO", "I", "", sources["imaflags"]),
     ]  # fmt: skip
 
 
@@ -233,9 +237,9 @@ def _axes(xx: Float, yy: Float, xy: Float) -> tuple[Float, Float, Float]:
 
 
 def _magnitudes(flux: Float, error: Float, zero_point: float) -> tuple[Float, Float]:
-    shines: Bool = flux > 0.0
-    one = np.where(shines, flux, 1.0)
+    is_positive: Bool = flux > 0.0
+    safe_flux = np.where(is_positive, flux, 1.0)
     return (
-        np.where(shines, zero_point - 2.5 * np.log10(one), _NONE),
-        np.where(shines, _MAGNITUDE * error / one, _NONE),
+        np.where(is_positive, zero_point - 2.5 * np.log10(safe_flux), _NO_MAGNITUDE),
+        np.where(is_positive, _MAGNITUDE_PER_LN * error / safe_flux, _NO_MAGNITUDE),
     )

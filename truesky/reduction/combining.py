@@ -18,7 +18,7 @@ _ROWS = 64
 
 
 @dataclass(frozen=True, slots=True)
-class Combined:
+class CombinedFrame:
     """A combined frame.
 
     mean, uncertainty : float32[ny, nx], the latter of the mean, infinite where no frame is left
@@ -32,7 +32,7 @@ class Combined:
     vignetted: bool = False
 
 
-def clipped_mean(frames: Array, variance: Callable[[Float, slice], Float], clip: float = 5.0) -> Combined:
+def clipped_mean(frames: Array, variance: Callable[[Float, slice], Float], clip: float = 5.0) -> CombinedFrame:
     """Mean of frames [n, ny, nx] of what lies within `clip` standard deviations of their median, then of that mean.
 
     variance : (expected value of pixels [m, nx], their rows) -> variance of one frame's; known, so that few frames do
@@ -46,13 +46,15 @@ def clipped_mean(frames: Array, variance: Callable[[Float, slice], Float], clip:
     count: Array = np.zeros(shape, np.int16)
     for first in range(0, shape[0], _ROWS):
         rows = slice(first, first + _ROWS)
-        part = np.asarray(frames[:, rows], np.float64)
-        centre = np.median(part, axis=0) if len(part) > 2 else part.min(axis=0)
+        values = np.asarray(frames[:, rows], np.float64)
+        centre = np.median(values, axis=0) if len(values) > 2 else values.min(axis=0)
         for _ in range(2):
-            kept = np.abs(part - centre) <= clip * np.sqrt(variance(centre, rows))
-            left = kept.sum(axis=0)
-            centre = np.where(left > 0, np.where(kept, part, 0.0).sum(axis=0) / np.maximum(left, 1), centre)
-        mean[rows], count[rows] = centre, left
+            accepted = np.abs(values - centre) <= clip * np.sqrt(variance(centre, rows))
+            accepted_count = accepted.sum(axis=0)
+            centre = np.where(
+                accepted_count > 0, np.where(accepted, values, 0.0).sum(axis=0) / np.maximum(accepted_count, 1), centre
+            )
+        mean[rows], count[rows] = centre, accepted_count
         with np.errstate(divide="ignore"):
-            uncertainty[rows] = np.sqrt(variance(centre, rows) / left)
-    return Combined(mean, uncertainty, count)
+            uncertainty[rows] = np.sqrt(variance(centre, rows) / accepted_count)
+    return CombinedFrame(mean, uncertainty, count)

@@ -20,17 +20,17 @@ from lake_schema.fits.images import Card
 from lake_schema.mission.published import read_back as mission_of
 from lake_schema.store import read
 from lake_schema.tables.exposures import ExposureRow
-from truesky.fluxes.inputs import passband_of
+from truesky.fluxes.inputs import passband_from_facts
 from truesky.randomness import rng
 from truesky.reduction import amplifiers
 from truesky.render.camera import detectors
 from truesky.render.effects.light import fringes, pixel_area
 from truesky.render.effects.scene import Scene
-from truesky.render.exposure import scene_of
-from truesky.render.exposure.rendered import numbers_of
+from truesky.render.exposure import scene_factory
+from truesky.render.exposure.rendered_detector import random_identity
 from truesky.render.planning import variants
-from truesky.render.planning.parts import of_exposures
-from truesky.render.products import beside, read_back
+from truesky.render.planning.exposure_chunks import rows_of_exposures
+from truesky.render.products import read_back, sidecar_files
 from truesky.request.accuracy import Accuracy
 
 
@@ -65,7 +65,7 @@ class Frame:
     @property
     def mean_gain(self) -> float:
         """Of its amplifiers, electrons an ADU."""
-        return float(np.mean(self.scene.of_amplifiers("gain", "electron / adu")))
+        return float(np.mean(self.scene.amplifier_values("gain", "electron / adu")))
 
     def card(self, keyword: str) -> Any:
         """The value of a card of the common header."""
@@ -75,11 +75,11 @@ class Frame:
         """e- [ny, nx] above the level of each amplifier's overscan."""
         return np.asarray(read_back.electrons(self.path).data, np.float64)
 
-    def full(self) -> Bool:
+    def saturated_pixels(self) -> Bool:
         """Pixels [ny, nx] that read no less than a saturated one."""
-        levels = self._of_amplifiers("SATURATE")
+        levels = self._amplifier_values("SATURATE")
         adu = np.asarray(read_back.frame(self.path).data)
-        return amplifiers.at_least(adu, levels, self.scene)
+        return amplifiers.pixels_at_least(adu, levels, self.scene)
 
     def fringes(self) -> Float32 | None:
         """[ny, nx] over the sky that each pixel sees, as the mission declares them; None where there are none."""
@@ -87,12 +87,12 @@ class Frame:
         if effect.name not in self.applied:
             return None
         _, amplitude, period = effect.parameters(self.scene)
-        own = rng.stream(*numbers_of(effect, self.exposure, self.detector, int(self.card("SEED"))))
-        nothing = np.zeros((self.scene.ny, self.scene.nx))
-        found = effect.apply(nothing, 1.0, amplitude, period, rng=own)
+        generator = rng.stream(*random_identity(effect, self.exposure, self.detector, int(self.card("SEED"))))
+        zeros = np.zeros((self.scene.ny, self.scene.nx))
+        pattern = effect.apply(zeros, 1.0, amplitude, period, rng=generator)
         if pixel_area.EFFECT.name in self.applied:
-            found /= pixel_area.apply(np.ones_like(found), 1.0, *pixel_area.parameters(self.scene)[1:])
-        return np.asarray(found, np.float32)
+            pattern /= pixel_area.apply(np.ones_like(pattern), 1.0, *pixel_area.parameters(self.scene)[1:])
+        return np.asarray(pattern, np.float32)
 
     @property
     def ramp(self) -> tuple[int, int, int]:
@@ -100,7 +100,7 @@ class Frame:
         groups, reads, drops = (int(self.card(key)) for key in ("NG", "NR", "ND"))
         return groups, reads, drops
 
-    def misfit(self) -> Bool:
+    def misfit_pixels(self) -> Bool:
         """Pixels [ny, nx] whose ramp does not fit; of two groups nothing is known."""
         units = images.read_images(self.path)
         if len(units) < 3:
@@ -111,16 +111,16 @@ class Frame:
         flagged = any(key == "QUALFLAG" for key, _, _ in units[2].cards)
         return np.asarray(quality > (0 if flagged else float(self.card("QUALLIM"))))
 
-    def _of_amplifiers(self, keyword: str) -> float | Float:
+    def _amplifier_values(self, keyword: str) -> float | Float:
         """A card of the common header, else of the arrays' own, [q]."""
         if (value := self.card(keyword)) is not None:
             return float(value)
-        found = (dict((key, value) for key, value, _ in unit.cards) for unit in images.read_images(self.path)[1:])
-        return np.array([float(cards[keyword]) for cards in found])
+        headers = (dict((key, value) for key, value, _ in unit.cards) for unit in images.read_images(self.path)[1:])
+        return np.array([float(cards[keyword]) for cards in headers])
 
 
-def of_lake(
-    root: Path, wanted: Sequence[str] = (), exposures: Iterable[int] = (), request: str | None = None
+def from_lake(
+    root: Path, detector_names: Sequence[str] = (), exposures: Iterable[int] = (), request: str | None = None
 ) -> dict[tuple[str, str], list[Frame]]:
     """(camera, detector) -> its frames, by exposure; only those that are named where some are.
 
@@ -131,52 +131,54 @@ def of_lake(
     """
     version = read.version(root, "products", request=request)
     inputs = version.manifest["facts"]["inputs"]
-    made = version.rows()
-    held = of_exposures(read.version(root, "exposures", inputs["exposures"]), made["exposure_id"].unique().to_pylist())
-    planned = {row.exposure_id: row for row in map(ExposureRow.of, held.to_pylist())}
+    products = version.rows()
+    planned_rows = rows_of_exposures(
+        read.version(root, "exposures", inputs["exposures"]), products["exposure_id"].unique().to_pylist()
+    )
+    planned = {row.exposure_id: row for row in map(ExposureRow.from_row, planned_rows.to_pylist())}
     mission = mission_of(read.version(root, "mission", inputs["mission"]))
-    fluxes = read.version(root, "galaxy_fluxes", inputs["galaxy_fluxes"]).manifest["facts"]
-    own_request, only = version.manifest["facts"]["request"], set(exposures)
-    forced = dict.fromkeys(own_request["effects"]["on"], True) | dict.fromkeys(own_request["effects"]["off"], False)
-    found: dict[tuple[str, str], list[Frame]] = {}
-    rows = sorted(made.to_pylist(), key=lambda row: (row["exposure_id"], row["detector"]))
+    flux_facts = read.version(root, "galaxy_fluxes", inputs["galaxy_fluxes"]).manifest["facts"]
+    request_facts, exposure_numbers = version.manifest["facts"]["request"], set(exposures)
+    forced = dict.fromkeys(request_facts["effects"]["on"], True) | dict.fromkeys(request_facts["effects"]["off"], False)
+    by_detector: dict[tuple[str, str], list[Frame]] = {}
+    rows = sorted(products.to_pylist(), key=lambda row: (row["exposure_id"], row["detector"]))
     for row in rows:
-        if row["content"] != "science" or (wanted and row["detector"] not in wanted):
+        if row["content"] != "science" or (detector_names and row["detector"] not in detector_names):
             continue
-        if only and row["exposure_id"] not in only:
+        if exposure_numbers and row["exposure_id"] not in exposure_numbers:
             continue
-        exposed = planned[row["exposure_id"]]
-        own = variants.variant(exposed.settings, mission, Accuracy(**own_request["accuracy"]), forced)
-        detector = detectors.detector(exposed.camera, row["detector"], own.mission)
-        scene = scene_of.scene_of(exposed, detector, own.mission, own.accuracy)
-        scene = replace(scene, band=passband_of(root, fluxes, exposed.band), forced=own.forced)
-        path = version.file(row["path"])
+        exposure = planned[row["exposure_id"]]
+        variant = variants.variant(exposure.settings, mission, Accuracy(**request_facts["accuracy"]), forced)
+        detector = detectors.detector(exposure.camera, row["detector"], variant.mission)
+        scene = scene_factory.from_exposure(exposure, detector, variant.mission, variant.accuracy)
+        scene = replace(scene, band=passband_from_facts(root, flux_facts, exposure.band), forced=variant.forced)
+        path = version.sidecar_path(row["path"])
         cards = read_back.header(path)
-        key = (exposed.camera, row["detector"])
-        model = beside.psf_file(exposed.exposure_id, exposed.channel, exposed.band, row["detector"])
-        psf = version.file(model) if version.has(model) else None
-        found.setdefault(key, []).append(Frame(path, exposed, scene, _applied(cards), cards, psf))
-    for name in wanted:
-        if not any(detector == name for _, detector in found):
+        key = (exposure.camera, row["detector"])
+        psf_name = sidecar_files.psf_file(exposure.exposure_id, exposure.channel, exposure.band, row["detector"])
+        psf = version.sidecar_path(psf_name) if version.has_file(psf_name) else None
+        by_detector.setdefault(key, []).append(Frame(path, exposure, scene, _applied_effects(cards), cards, psf))
+    for name in detector_names:
+        if not any(detector == name for _, detector in by_detector):
             raise BadInput(f"table products: no image of detector {name!r}")
-    for number in only:
-        if not any(frame.exposure.exposure_id == number for frames in found.values() for frame in frames):
+    for number in exposure_numbers:
+        if not any(frame.exposure.exposure_id == number for frames in by_detector.values() for frame in frames):
             raise BadInput(f"table products: no image of exposure {number}")
-    return found
+    return by_detector
 
 
-def _applied(cards: Iterable[Card]) -> frozenset[str]:
+def _applied_effects(cards: Iterable[Card]) -> frozenset[str]:
     """Names of the effects that a header has as `on`."""
     texts = [str(value) for keyword, value, _ in cards if keyword.startswith("EFFECT")]
     return frozenset(name for name, _, state in (text.partition(": ") for text in texts) if state.startswith("on"))
 
 
-def of_types(frames: Sequence[Frame], kinds: Sequence[str]) -> list[Frame]:
+def select_types(frames: Sequence[Frame], image_types: Sequence[str]) -> list[Frame]:
     """Those of some image types."""
-    return [frame for frame in frames if frame.exposure.image_type in kinds]
+    return [frame for frame in frames if frame.exposure.image_type in image_types]
 
 
-def common(frames: Sequence[Frame], keywords: Sequence[str]) -> Mapping[str, Any]:
+def common_values(frames: Sequence[Frame], keywords: Sequence[str]) -> Mapping[str, Any]:
     """Values of cards that all frames share; BadInput names one in which they differ."""
     for keyword in keywords:
         values = {str(frame.card(keyword)) for frame in frames}

@@ -25,18 +25,18 @@ def profile(frame: Frame) -> Any:
     assert scene.detector is not None
     assert scene.band is not None
     if exposure.psf:
-        file = from_file.file_of(exposure.psf, frame.detector)
+        file = from_file.path_for_detector(exposure.psf, frame.detector)
         return from_file.read(file, scene.detector, scene.band).profile
-    channel = registry.channel_of(exposure.channel, exposure.image_type, f"exposure {exposure.exposure_id}")
+    channel = registry.find_channel(exposure.channel, exposure.image_type, f"exposure {exposure.exposure_id}")
     return channel.psf(exposure, scene.detector, scene.band, scene.mission, _POSITIONS).profile
 
 
-def enclosed(psf: Any, scale: float, radius: float) -> float:
+def enclosed_fraction(psf: Any, scale: float, radius: float) -> float:
     """Part of a point source's light in a circle about it.
 
     psf : galsim object, without the pixel;  scale : arcsec a pixel;  radius : pixels
     """
     side = 2 * int(np.ceil(radius)) + 5
-    seen = psf.drawImage(nx=side, ny=side, scale=scale, dtype=float).array
+    image = psf.drawImage(nx=side, ny=side, scale=scale, dtype=float).array
     middle = [side // 2]
-    return float(sep.sum_circle(np.ascontiguousarray(seen), middle, middle, radius, subpix=0)[0][0])
+    return float(sep.sum_circle(np.ascontiguousarray(image), middle, middle, radius, subpix=0)[0][0])

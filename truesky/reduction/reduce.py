@@ -22,21 +22,21 @@ from lake_schema.errors import BadInput
 from lake_schema.fits.images import Card
 from lake_schema.store import layout
 from truesky.reduction import calibration, cosmic_rays, files, level2
-from truesky.reduction import frames as frames_of
-from truesky.reduction.calibration import Masters, Reduced
+from truesky.reduction import frames as lake_frames
+from truesky.reduction.calibration import Masters, ReducedImage
 from truesky.reduction.catalogue import Limits
 from truesky.reduction.frames import Frame
 from truesky.reduction.infrared import nisp
-from truesky.reduction.infrared.foreseen import Foreseen
+from truesky.reduction.infrared.persistence_prediction import PersistencePrediction
 from truesky.render.channels import registry
 from truesky.render.channels.image_types import SKY_TYPES
 
 # Of a level 2 where none is asked for: van Dokkum 2001.
-_LIMIT = 4.5
+_COSMIC_RAY_SIGMA = 4.5
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
+class ReductionOptions:
     """What is made of a frame.
 
     unit        : of the pixels: electron, electron/s or adu
@@ -49,25 +49,27 @@ class Wish:
     cosmic_rays: float = 0.0
 
 
-def reduced(
-    frame: Frame, masters: Masters, wish: Wish, foreseen: Foreseen | None = None
-) -> tuple[Reduced, tuple[Card, ...]]:
+def reduce_frame(
+    frame: Frame, masters: Masters, reduction: ReductionOptions, prediction: PersistencePrediction | None = None
+) -> tuple[ReducedImage, tuple[Card, ...]]:
     """A frame with the masters of its detector: the image and its header.
 
     frame, masters, wish : what is made of it with what
     foreseen : what earlier exposures leave in a detector of NISP; None: that is left as it is
     """
-    electrons = {"electron": 1.0, "electron/s": frame.scene.exposure_time_s}.get(wish.unit) or frame.mean_gain
-    undone = frame.applied - set(wish.without)
+    electrons = {"electron": 1.0, "electron/s": frame.scene.exposure_time_s}.get(reduction.unit) or frame.mean_gain
+    corrected_effects = frame.applied - set(reduction.without)
     if frame.scene.ramp:
-        bent = () if "nonlinearity" in wish.without else tuple(undone)
-        found = nisp.reduced(frame, masters, foreseen, bent, electrons)
+        ramp_effects = () if "nonlinearity" in reduction.without else tuple(corrected_effects)
+        image = nisp.calibrate(frame, masters, prediction, ramp_effects, electrons)
     else:
-        fringes = frame.fringes() if "fringes" in undone else None
-        found = calibration.reduced(frame.electrons(), frame.full(), masters, frame.scene, undone, electrons, fringes)
-    if wish.cosmic_rays:
-        found = cosmic_rays.flagged(found, cosmic_rays.found(found, wish.cosmic_rays))
-    return found, files.reduced_cards(frame, wish.unit, electrons, wish.without)
+        fringes = frame.fringes() if "fringes" in corrected_effects else None
+        image = calibration.calibrate(
+            frame.electrons(), frame.saturated_pixels(), masters, frame.scene, corrected_effects, electrons, fringes
+        )
+    if reduction.cosmic_rays:
+        image = cosmic_rays.flag_hits(image, cosmic_rays.find_hits(image, reduction.cosmic_rays))
+    return image, files.reduced_cards(frame, reduction.unit, electrons, reduction.without)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -82,45 +84,47 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--detectors", nargs="+", default=[], metavar="NAME", help="default: all")
     parser.add_argument("--exposures", nargs="+", type=int, default=[], metavar="ID", help="default: all")
     parser.add_argument("--rate", action="store_true", help="electrons a second instead of those of the exposure")
-    parser.add_argument("--without", nargs="+", default=[], choices=files.UNDONE, help="what is left as it is")
+    parser.add_argument("--without", nargs="+", default=[], choices=files.CORRECTIONS, help="what is left as it is")
     parser.add_argument(
-        "--cosmic-rays", type=float, metavar="SIGMA", help=f"flag them; with --level2 {_LIMIT:g}, 0 = no"
+        "--cosmic-rays", type=float, metavar="SIGMA", help=f"flag them; with --level2 {_COSMIC_RAY_SIGMA:g}, 0 = no"
     )
     parser.add_argument("--level2", action="store_true", help="in counts, with sources, PSF and .head beside")
     parser.add_argument("--aperture", type=float, metavar="ARCSEC", help="diameter of MAG_APER (3 FWHM)")
     parser.add_argument("--threshold", type=float, default=Limits().threshold, metavar="SIGMA", help="of sources (1.5)")
     parser.add_argument("--least-pixels", type=int, default=Limits().pixels, metavar="N", help="of a source (5)")
     options = parser.parse_args(argv)
-    return command.status("reduce", lambda: _written(options))
+    return command.run("reduce", lambda: _write_images(options))
 
 
-def _written(options: argparse.Namespace) -> int:
-    out = user_files.folder(options.out)
-    wish, settings = _wish(options), _settings(options)
-    root = layout.lake(options.lake)
-    found = frames_of.of_lake(root, options.detectors, options.exposures, options.name)
-    science = [own for frames in found.values() if (own := [frame for frame in frames if _sees_sky(frame)])]
+def _write_images(options: argparse.Namespace) -> int:
+    out = user_files.check_folder(options.out)
+    reduction, settings = _reduction_options(options), _catalogue_settings(options)
+    root = layout.resolve_lake(options.lake)
+    by_detector = lake_frames.from_lake(root, options.detectors, options.exposures, options.name)
+    science = [
+        sky_frames for frames in by_detector.values() if (sky_frames := [frame for frame in frames if _sees_sky(frame)])
+    ]
     if not science:
         raise BadInput(f"lake {options.lake} has no such frame that sees the sky")
     if settings is not None:
-        level2.refuse([frame for frames in science for frame in frames])
+        level2.check_psfs([frame for frames in science for frame in frames])
     out.mkdir(parents=True, exist_ok=True)
-    every = frames_of.of_lake(root, options.detectors, (), options.name) if options.exposures else found
+    all_frames = lake_frames.from_lake(root, options.detectors, (), options.name) if options.exposures else by_detector
     for frames in science:
-        exposed, foreseen = frames[0].exposure, None
-        if frames[0].scene.ramp and "persistence" not in wish.without:
-            foreseen = Foreseen(every[exposed.camera, frames[0].detector])
-        for frame, masters in _with_masters(frames, options.masters, wish.without):
-            made, cards = reduced(frame, masters, wish, foreseen)
+        exposure, prediction = frames[0].exposure, None
+        if frames[0].scene.ramp and "persistence" not in reduction.without:
+            prediction = PersistencePrediction(all_frames[exposure.camera, frames[0].detector])
+        for frame, masters in _with_masters(frames, options.masters, reduction.without):
+            image, cards = reduce_frame(frame, masters, reduction, prediction)
             path = out / f"{frame.stem}.fits"
-            more = ""
+            suffix = ""
             if settings is None:
-                files.write_image(path, made, cards)
+                files.write_image(path, image, cards)
             else:
-                more = f", {level2.written(path, frame, made, cards, settings)} sources"
-            good = made.weight > 0.0
-            shown = f"sky {np.median(made.image[good]):.5g}" if good.any() else "no pixel is good"
-            print(f"{path}: {shown}, {100.0 * good.mean():.2f} % of the pixels are good{more}")
+                suffix = f", {level2.write(path, frame, image, cards, settings)} sources"
+            good = image.weight > 0.0
+            sky_text = f"sky {np.median(image.image[good]):.5g}" if good.any() else "no pixel is good"
+            print(f"{path}: {sky_text}, {100.0 * good.mean():.2f} % of the pixels are good{suffix}")
     return 0
 
 
@@ -128,14 +132,16 @@ def _with_masters(
     frames: Sequence[Frame], folder: Path | None, without: Sequence[str]
 ) -> Iterator[tuple[Frame, Masters]]:
     """Frames of a detector with its masters, which are read once a band, and a ramp."""
-    alike = [(frame.exposure.band, frame.ramp if frame.scene.ramp else ()) for frame in frames]
-    for kind in dict.fromkeys(alike):
-        own = [frame for frame, its in zip(frames, alike, strict=True) if its == kind]
-        needed = files.kinds(own[0])
-        if folder is None and not {*without} >= {*needed}:
-            raise BadInput(f"--masters: which folder? Or --without {' '.join(needed)}")
-        masters = (nisp.of_frame if own[0].scene.ramp else files.masters)(folder or Path(), own[0], without)
-        yield from ((frame, masters) for frame in own)
+    groups = [(frame.exposure.band, frame.ramp if frame.scene.ramp else ()) for frame in frames]
+    for group in dict.fromkeys(groups):
+        group_frames = [frame for frame, frame_group in zip(frames, groups, strict=True) if frame_group == group]
+        kinds = files.master_kinds(group_frames[0])
+        if folder is None and not {*without} >= {*kinds}:
+            raise BadInput(f"--masters: which folder? Or --without {' '.join(kinds)}")
+        masters = (nisp.read_masters if group_frames[0].scene.ramp else files.read_masters)(
+            folder or Path(), group_frames[0], without
+        )
+        yield from ((frame, masters) for frame in group_frames)
 
 
 def _sees_sky(frame: Frame) -> bool:
@@ -144,24 +150,24 @@ def _sees_sky(frame: Frame) -> bool:
     return kind in SKY_TYPES or (bool(frame.scene.ramp) and registry.CHANNELS[frame.exposure.channel].sees_sky(kind))
 
 
-def _wish(options: argparse.Namespace) -> Wish:
+def _reduction_options(options: argparse.Namespace) -> ReductionOptions:
     if options.level2 and options.rate:
         raise BadInput("--rate: images of level 2 are in counts")
     limit = options.cosmic_rays
     if limit is None:
-        limit = _LIMIT if options.level2 else 0.0
+        limit = _COSMIC_RAY_SIGMA if options.level2 else 0.0
     if limit:
-        cosmic_rays.check(limit)
+        cosmic_rays.check_limit(limit)
     unit = "adu" if options.level2 else "electron/s" if options.rate else "electron"
-    return Wish(unit, tuple(options.without), limit)
+    return ReductionOptions(unit, tuple(options.without), limit)
 
 
-def _settings(options: argparse.Namespace) -> level2.Settings | None:
+def _catalogue_settings(options: argparse.Namespace) -> level2.CatalogueSettings | None:
     limits = Limits(options.threshold, options.least_pixels)
     if not options.level2 and (limits != Limits() or options.aperture is not None):
         raise BadInput("--aperture, --threshold, --least-pixels: without --level2 there is no catalogue")
-    return level2.Settings(limits, options.aperture) if options.level2 else None
+    return level2.CatalogueSettings(limits, options.aperture) if options.level2 else None
 
 
 if __name__ == "__main__":
-    command.leave(main)
+    command.exit_with_status(main)

@@ -23,13 +23,13 @@ from scipy.interpolate import RectBivariateSpline
 
 from lake_schema.arrays import Array, Float, Float32
 from lake_schema.errors import BadInput, OutOfRange
-from truesky.reduction.calibration import Reduced
+from truesky.reduction.calibration import ReducedImage
 from truesky.render.camera import astrometry, pointing
 
 # Pixels between the places that are projected; between them the map is a cubic spline: 1e-6 pixels.
 _NODES = 64
 # Side of a grid.
-_LONGEST = 60_000
+_MAX_SIDE = 60_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,11 +41,11 @@ class Grid:
 
     def window(self, x: int, y: int, shape: tuple[int, int]) -> Grid:
         """A part of it, of which (x, y) is the first pixel."""
-        return Grid(astrometry.shifted(self.wcs, -x, -y), shape)
+        return Grid(astrometry.shift_pixels(self.wcs, -x, -y), shape)
 
 
 @dataclass(frozen=True, slots=True)
-class Resampled:
+class ResampledImage:
     """An image on a grid, float32[ny, nx].
 
     image    : light in a pixel of the grid, 0 where there is none
@@ -59,7 +59,7 @@ class Resampled:
     density: Float32
 
 
-def grid_of(images: Sequence[tuple[WCS, tuple[int, ...]]], scale: float) -> Grid:
+def covering_grid(images: Sequence[tuple[WCS, tuple[int, ...]]], scale: float) -> Grid:
     """A gnomonic map, north up, that covers images (their systems and shapes); scale : arcsec a pixel."""
     if not 1e-3 <= scale <= 100.0:
         raise OutOfRange("scale of the stack, arcsec", scale, 1e-3, 100.0)
@@ -80,9 +80,9 @@ def grid_of(images: Sequence[tuple[WCS, tuple[int, ...]]], scale: float) -> Grid
     # Edges bend: a pixel more on every side.
     first = [int(np.floor(v.min())) - 1 for v in (x, y)]
     nx, ny = (int(np.ceil(v.max())) + 2 - low for v, low in zip((x, y), first, strict=True))
-    if max(nx, ny) > _LONGEST:
-        raise BadInput(f"images so far apart make a stack of {ny} x {nx} pixels: more than {_LONGEST} along a side")
-    return Grid(astrometry.shifted(system, -first[0], -first[1]), (ny, nx))
+    if max(nx, ny) > _MAX_SIDE:
+        raise BadInput(f"images so far apart make a stack of {ny} x {nx} pixels: more than {_MAX_SIDE} along a side")
+    return Grid(astrometry.shift_pixels(system, -first[0], -first[1]), (ny, nx))
 
 
 def _corners(shape: tuple[int, ...]) -> tuple[Float, Float]:
@@ -104,7 +104,7 @@ def pixel_map(system: WCS, shape: tuple[int, ...], grid: Grid) -> tuple[Float, F
     return np.stack([spline(y, x) for spline in splines], axis=-1), np.abs(dx_dx * dy_dy - dx_dy * dy_dx)
 
 
-def resampled(image: Reduced, pixmap: Float, area: Float, shape: tuple[int, int]) -> Resampled:
+def resample(image: ReducedImage, pixmap: Float, area: Float, shape: tuple[int, int]) -> ResampledImage:
     """An image on a grid of a shape; of its pixels those that have weight.
 
     pixmap, area : where its pixels lie, of `pixel_map`
@@ -114,15 +114,20 @@ def resampled(image: Reduced, pixmap: Float, area: Float, shape: tuple[int, int]
     variance = np.zeros(image.weight.shape, np.float32)
     np.divide(1.0, image.weight, out=variance, where=good)
     brightness = np.where(good, image.image / area, 0.0).astype(np.float32)
-    one = Drizzle(kernel="square", out_shape=shape, fillval="0", disable_ctx=True)
+    image_drizzle = Drizzle(kernel="square", out_shape=shape, fillval="0", disable_ctx=True)
     common = {"exptime": 1.0, "pixmap": pixmap, "weight_map": good.astype(np.float32), "pixfrac": 1.0}
-    one.add_image(brightness, data2=(variance / area**2).astype(np.float32), **common)
-    other = Drizzle(kernel="square", out_shape=shape, fillval="0", disable_ctx=True)
-    other.add_image((variance / area).astype(np.float32), **common)
+    image_drizzle.add_image(brightness, data2=(variance / area**2).astype(np.float32), **common)
+    density_drizzle = Drizzle(kernel="square", out_shape=shape, fillval="0", disable_ctx=True)
+    density_drizzle.add_image((variance / area).astype(np.float32), **common)
     # The weight of a pixel is the part of its own area that falls onto the grid's.
-    cover = np.asarray(one.out_wht, np.float32) * float(np.mean(area))
-    return Resampled(_plain(one.out_img), cover, _plain(one.out_img2[0]), _plain(other.out_img))
+    cover = np.asarray(image_drizzle.out_wht, np.float32) * float(np.mean(area))
+    return ResampledImage(
+        _without_nan(image_drizzle.out_img),
+        cover,
+        _without_nan(image_drizzle.out_img2[0]),
+        _without_nan(density_drizzle.out_img),
+    )
 
 
-def _plain(values: Array) -> Float32:
+def _without_nan(values: Array) -> Float32:
     return np.nan_to_num(np.asarray(values, np.float32), copy=False, nan=0.0)

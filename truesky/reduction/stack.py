@@ -23,41 +23,43 @@ from lake_schema.errors import BadInput
 from lake_schema.fits.images import Card, Image
 from lake_schema.store import layout
 from truesky.reduction import files, point_sources, stacking
-from truesky.reduction import frames as frames_of
-from truesky.reduction.calibration import COSMIC_RAY, Reduced
+from truesky.reduction import frames as lake_frames
+from truesky.reduction.calibration import COSMIC_RAY, ReducedImage
 from truesky.reduction.files import ImageFile
 from truesky.reduction.frames import Frame
-from truesky.reduction.resampling import Grid, Resampled, grid_of, pixel_map, resampled
+from truesky.reduction.resampling import Grid, ResampledImage, covering_grid, pixel_map, resample
 from truesky.reduction.stacking import Contribution, Stack
 from truesky.render.camera import astrometry
 
 # What all images of a stack share.
-_SAME = ("INSTRUME", "CHANNEL", "FILTER", "ZEROPNT")
+_SHARED_CARDS = ("INSTRUME", "CHANNEL", "FILTER", "ZEROPNT")
 # What each of them says besides; the second are numbers above 0.
-_SAID, _NUMBERS = ("IMAGETYP", "DETECTOR"), ("EXPOSURE", "EXPTIME", "GAIN", "PIXSCALE")
+_REQUIRED_CARDS, _NUMBER_CARDS = ("IMAGETYP", "DETECTOR"), ("EXPOSURE", "EXPTIME", "GAIN", "PIXSCALE")
 
 
-def rate(image: ImageFile) -> Reduced:
+def to_rate(image: ImageFile) -> ReducedImage:
     """The image in e-/s."""
     if image.card("BUNIT") == "electron/s":
         return image.reduced
     # Seconds in which there is one unit for each e-/s.
     time = float(image.card("EXPTIME")) / float(image.card("GAIN"))
-    one = image.reduced
-    return Reduced((one.image / time).astype(np.float32), (one.weight * time**2).astype(np.float32), one.flags)
+    counts = image.reduced
+    return ReducedImage(
+        (counts.image / time).astype(np.float32), (counts.weight * time**2).astype(np.float32), counts.flags
+    )
 
 
-def stacked(images: Sequence[tuple[Reduced, WCS]], scale: float) -> tuple[Stack, Grid, list[float]]:
+def stack_images(images: Sequence[tuple[ReducedImage, WCS]], scale: float) -> tuple[Stack, Grid, list[float]]:
     """Images in e-/s, with their systems -> their stack, its grid, their weights; scale : arcsec a pixel."""
-    grid = grid_of([(system, image.image.shape) for image, system in images], scale)
-    placed: list[Resampled] = []
+    grid = covering_grid([(system, image.image.shape) for image, system in images], scale)
+    placed: list[ResampledImage] = []
     weights = []
     for image, system in images:
         pixmap, area = pixel_map(system, image.image.shape, grid)
-        placed.append(resampled(image, pixmap, area, grid.shape))
+        placed.append(resample(image, pixmap, area, grid.shape))
         good = image.weight > 0.0
         weights.append(float(np.median(image.weight[good])) if good.any() else 0.0)
-    return stacking.combined(placed, weights), grid, weights
+    return stacking.combine(placed, weights), grid, weights
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -69,92 +71,94 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--lake", help="folder of the lake that the images are of: for the PSF")
     parser.add_argument("--name", help="of the request whose frames are meant, where the lake has several")
     options = parser.parse_args(argv)
-    return command.status("stack", lambda: _written(options))
+    return command.run("stack", lambda: _write_stack(options))
 
 
-def _written(options: argparse.Namespace) -> int:
-    out = user_files.target(options.out, (".fits",))
-    found = [files.read_image(path) for path in options.images]
-    _refuse_different(options.images, found)
-    systems = [astrometry.from_cards(image.cards) for image in found]
-    scale = float(found[0].card("PIXSCALE")) if options.scale is None else options.scale
-    shapes = [image.reduced.image.shape for image in found]
-    stack, grid, weights = stacked(list(zip(map(rate, found), systems, strict=True)), scale)
-    more = []
+def _write_stack(options: argparse.Namespace) -> int:
+    out = user_files.check_target(options.out, (".fits",))
+    images = [files.read_image(path) for path in options.images]
+    _refuse_different(options.images, images)
+    systems = [astrometry.from_cards(image.cards) for image in images]
+    scale = float(images[0].card("PIXSCALE")) if options.scale is None else options.scale
+    shapes = [image.reduced.image.shape for image in images]
+    stack, grid, weights = stack_images(list(zip(map(to_rate, images), systems, strict=True)), scale)
+    extensions = []
     if options.lake:
-        frames = _frames(layout.lake(options.lake), found, options.name)
-        parts = [
+        frames = _find_frames(layout.resolve_lake(options.lake), images, options.name)
+        contributions = [
             Contribution(system, shape, point_sources.profile(frame), frame.scene.detector.pixel_scale, weight)
             for system, shape, frame, weight in zip(systems, shapes, frames, weights, strict=True)
             if frame.scene.detector is not None
         ]
-        more.append(_psf_of(parts, grid, stack))
+        extensions.append(_central_psf(contributions, grid, stack))
     correlation = stacking.noise_correlation(stack)
-    files.write_image(out, stack.reduced, _cards(found, grid, scale, correlation), more)
+    files.write_image(out, stack.reduced, _stack_cards(images, grid, scale, correlation), extensions)
     ny, nx = grid.shape
     hit = float(((stack.reduced.flags & COSMIC_RAY) > 0).mean())
     print(
-        f"{out}: {len(found)} images on {ny} x {nx} pixels of {scale:g} arcsec, "
+        f"{out}: {len(images)} images on {ny} x {nx} pixels of {scale:g} arcsec, "
         f"{100 * hit:.2f} % with a value rejected, "
         f"variance of 8x8 sums {correlation:.2f} times that of as many pixels alone"
     )
     return 0
 
 
-def _refuse_different(paths: Sequence[Path], found: Sequence[ImageFile]) -> None:
-    for path, image in zip(paths, found, strict=True):
+def _refuse_different(paths: Sequence[Path], images: Sequence[ImageFile]) -> None:
+    for path, image in zip(paths, images, strict=True):
         _refuse_other(path, image)
-        for keyword in _SAME:
-            if image.card(keyword) != found[0].card(keyword):
-                what = f"{keyword} = {image.card(keyword)}, that of {paths[0].name} is {found[0].card(keyword)}"
-                raise BadInput(f"{user_files.shown(path)}: {what}: they make no stack")
-    seen = [(image.card("EXPOSURE"), image.card("DETECTOR")) for image in found]
-    for path, one in zip(paths, seen, strict=True):
-        if seen.count(one) > 1:
-            raise BadInput(f"{user_files.shown(path)}: exposure {one[0]}, detector {one[1]} is given twice")
+        for keyword in _SHARED_CARDS:
+            if image.card(keyword) != images[0].card(keyword):
+                problem = f"{keyword} = {image.card(keyword)}, that of {paths[0].name} is {images[0].card(keyword)}"
+                raise BadInput(f"{user_files.format_path(path)}: {problem}: they make no stack")
+    identities = [(image.card("EXPOSURE"), image.card("DETECTOR")) for image in images]
+    for path, identity in zip(paths, identities, strict=True):
+        if identities.count(identity) > 1:
+            raise BadInput(
+                f"{user_files.format_path(path)}: exposure {identity[0]}, detector {identity[1]} is given twice"
+            )
 
 
 def _refuse_other(path: Path, image: ImageFile) -> None:
     """What is no image of truesky.reduction.reduce."""
     if image.card("IMAGETYP") == "stack":
-        raise BadInput(f"{user_files.shown(path)}: is a stack: give the images that it was made of")
-    for keyword in (*_SAME, *_SAID, *_NUMBERS):
+        raise BadInput(f"{user_files.format_path(path)}: is a stack: give the images that it was made of")
+    for keyword in (*_SHARED_CARDS, *_REQUIRED_CARDS, *_NUMBER_CARDS):
         value = image.card(keyword)
         if value is None:
-            raise BadInput(f"{user_files.shown(path)}: has no card {keyword}")
-        if keyword in _NUMBERS and not (isinstance(value, int | float) and 0.0 < value < np.inf):
-            raise BadInput(f"{user_files.shown(path)}: {keyword} = {value!r} is no number above 0")
+            raise BadInput(f"{user_files.format_path(path)}: has no card {keyword}")
+        if keyword in _NUMBER_CARDS and not (isinstance(value, int | float) and 0.0 < value < np.inf):
+            raise BadInput(f"{user_files.format_path(path)}: {keyword} = {value!r} is no number above 0")
 
 
-def _frames(root: Path, found: Sequence[ImageFile], request: str | None) -> list[Frame]:
+def _find_frames(root: Path, images: Sequence[ImageFile], request: str | None) -> list[Frame]:
     """The lake's frames of the images."""
-    numbers = {int(image.card("EXPOSURE")) for image in found}
-    names = sorted({str(image.card("DETECTOR")) for image in found})
-    known = {
+    numbers = {int(image.card("EXPOSURE")) for image in images}
+    names = sorted({str(image.card("DETECTOR")) for image in images})
+    frames_by_key = {
         (frame.exposure.exposure_id, frame.detector): frame
-        for frames in frames_of.of_lake(root, names, numbers, request).values()
+        for frames in lake_frames.from_lake(root, names, numbers, request).values()
         for frame in frames
     }
-    asked = [(int(image.card("EXPOSURE")), str(image.card("DETECTOR"))) for image in found]
-    for number, detector in asked:
-        if (number, detector) not in known:
+    keys = [(int(image.card("EXPOSURE")), str(image.card("DETECTOR"))) for image in images]
+    for number, detector in keys:
+        if (number, detector) not in frames_by_key:
             raise BadInput(f"lake {root}: table products has no image of exposure {number}, detector {detector}")
-    return [known[one] for one in asked]
+    return [frames_by_key[key] for key in keys]
 
 
-def _psf_of(parts: Sequence[Contribution], grid: Grid, stack: Stack) -> Image:
+def _central_psf(contributions: Sequence[Contribution], grid: Grid, stack: Stack) -> Image:
     """Where the stack is deepest, as near to its middle as can be."""
-    x, y = _middle(stack.reduced.weight)
+    x, y = _deepest_place(stack.reduced.weight)
     ra, dec = astrometry.sky_of_pixel(grid.wcs, [x], [y])
     cards: tuple[Card, ...] = (
         ("PSFSAMP", stacking.PSF_SAMPLES, "samples a pixel"),
         ("PSFRA", float(ra[0]), "[deg] place that it is of"),
         ("PSFDEC", float(dec[0]), "[deg] place that it is of"),
     )
-    return Image(stacking.effective_psf(parts, grid, x, y).astype(np.float32), cards, "PSF")
+    return Image(stacking.effective_psf(contributions, grid, x, y).astype(np.float32), cards, "PSF")
 
 
-def _middle(weight: Float) -> tuple[float, float]:
+def _deepest_place(weight: Float) -> tuple[float, float]:
     """(x, y): of the deepest quarter of the pixels, away from edges if some are, the one nearest to their mean."""
     if not weight.any():
         return 0.0, 0.0
@@ -165,16 +169,18 @@ def _middle(weight: Float) -> tuple[float, float]:
     return float(columns[nearest]), float(rows[nearest])
 
 
-def _cards(found: Sequence[ImageFile], grid: Grid, scale: float, correlation: float) -> tuple[Card, ...]:
-    first = found[0]
-    kept = {key: (key, value, comment) for key, value, comment in first.cards if key in (*_SAME, "SEED", "MISSION")}
-    exposures = sorted({(int(image.card("EXPOSURE")), float(image.card("EXPTIME"))) for image in found})
+def _stack_cards(images: Sequence[ImageFile], grid: Grid, scale: float, correlation: float) -> tuple[Card, ...]:
+    first = images[0]
+    shared_cards = {
+        key: (key, value, comment) for key, value, comment in first.cards if key in (*_SHARED_CARDS, "SEED", "MISSION")
+    }
+    exposures = sorted({(int(image.card("EXPOSURE")), float(image.card("EXPTIME"))) for image in images})
     return (
-        *kept.values(),
+        *shared_cards.values(),
         ("IMAGETYP", "stack", "image type"),
         ("BUNIT", "electron/s", "unit of SCI; of WHT its inverse square"),
         ("GAIN", sum(time for _, time in exposures), "[electron/(electron/s)] of the deepest places"),
-        ("NCOMBINE", len(found), "images"),
+        ("NCOMBINE", len(images), "images"),
         ("TEXPTIME", sum(time for _, time in exposures), "[s] of all exposures"),
         ("PIXSCALE", scale, "[arcsec/pix] pixel scale"),
         *(
@@ -190,4 +196,4 @@ def _cards(found: Sequence[ImageFile], grid: Grid, scale: float, correlation: fl
 
 
 if __name__ == "__main__":
-    command.leave(main)
+    command.exit_with_status(main)

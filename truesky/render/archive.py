@@ -28,11 +28,11 @@ from pyarrow import feather
 
 from lake_schema import command, sky, user_files
 from lake_schema.errors import BadInput
-from lake_schema.store import layout, names, read
+from lake_schema.store import layout, read, request_links
 from lake_schema.store.object_storage.s3 import Folder
 from lake_schema.store.provenance import code_version, file_sha256
 from truesky.explore.process import Process
-from truesky.numerics import sums
+from truesky.numerics import matrices
 from truesky.render.products import run_log
 
 # Bytes and s that a query of the archive may take.
@@ -56,15 +56,15 @@ def products(root: Path, request: str | None = None) -> pa.Table:
     """
     version = read.version(root, "products", request=request)
     files = {entry["path"]: entry for entry in version.manifest["files"]}
-    made = {line["part"]: line for line in _parts(root, request) if "error" not in line}
+    log_entries = {line["part"]: line for line in _log_entries(root, request) if "error" not in line}
     rows = []
     for part in version.manifest["parts"]:
-        about = made.get(part["name"], {})
-        for row in version.rows(parts=[part["name"]]).to_pylist():
-            measured = {key: about.get(key) for key in ("seconds", "peak_gb")}
+        log_entry = log_entries.get(part["name"], {})
+        for row in version.rows(partitions=[part["name"]]).to_pylist():
+            measured = {key: log_entry.get(key) for key in ("seconds", "peak_gb")}
             rows.append({**row, **{key: files[row["path"]][key] for key in ("sha256", "bytes")}, **measured})
-    own = [("sha256", pa.string()), ("bytes", pa.int64()), ("seconds", pa.float64()), ("peak_gb", pa.float64())]
-    return pa.Table.from_pylist(rows, pa.schema([*version.schema, *(pa.field(*column) for column in own)]))
+    log_columns = [("sha256", pa.string()), ("bytes", pa.int64()), ("seconds", pa.float64()), ("peak_gb", pa.float64())]
+    return pa.Table.from_pylist(rows, pa.schema([*version.schema, *(pa.field(*column) for column in log_columns)]))
 
 
 def exposures(root: Path, request: str | None = None) -> pa.Table:
@@ -77,8 +77,10 @@ def exposures(root: Path, request: str | None = None) -> pa.Table:
     if version.manifest["facts"]["products"] != images.key:
         raise BadInput('table exposure_files is of other images: run render_exposures with files = "exposure"')
     rows, files = version.rows(), {entry["path"]: entry for entry in version.manifest["files"]}
-    found = [[files[path][key] for path in rows["path"].to_pylist()] for key in ("sha256", "bytes")]
-    return rows.append_column("sha256", pa.array(found[0], pa.string())).append_column("bytes", pa.array(found[1]))
+    file_values = [[files[path][key] for path in rows["path"].to_pylist()] for key in ("sha256", "bytes")]
+    return rows.append_column("sha256", pa.array(file_values[0], pa.string())).append_column(
+        "bytes", pa.array(file_values[1])
+    )
 
 
 def failures(root: Folder, request: str | None = None) -> pa.Table:
@@ -86,12 +88,12 @@ def failures(root: Folder, request: str | None = None) -> pa.Table:
 
     request : whose detectors, None = of all requests
     """
-    last = {(line["request"], line["part"]): line for line in _parts(root, request)}
+    last = {(line["request"], line["part"]): line for line in _log_entries(root, request)}
     failed = [last[key] for key in sorted(last) if "error" in last[key]]
     return pa.Table.from_pylist([{k: line.get(k) for k in _FAILURES.names} for line in failed], _FAILURES)
 
 
-def covering(rows: pa.Table, ra: float, dec: float) -> pa.Table:
+def rows_at_place(rows: pa.Table, ra: float, dec: float) -> pa.Table:
     """Those of the products whose footprint (STC-S polygon of four corners) holds a place, its edge included."""
     if not rows.num_rows:
         return rows
@@ -99,18 +101,18 @@ def covering(rows: pa.Table, ra: float, dec: float) -> pa.Table:
     edges = sky.unit_vectors(corners[..., 0], corners[..., 1])
     place = sky.unit_vectors(ra, dec)
     # A place is inside where it is on one side of the great circles through all edges, and not at the antipode.
-    side = sums.product(np.cross(edges, np.roll(edges, -1, axis=1)), place)
+    side = matrices.matmul(np.cross(edges, np.roll(edges, -1, axis=1)), place)
     inside = (side >= 0).all(axis=1) | (side <= 0).all(axis=1)
-    return rows.filter(pa.array(inside & (sums.product(edges.sum(axis=1), place) > 0)))
+    return rows.filter(pa.array(inside & (matrices.matmul(edges.sum(axis=1), place) > 0)))
 
 
-def _parts(root: Folder, request: str | None = None) -> Iterator[dict[str, Any]]:
+def _log_entries(root: Folder, request: str | None = None) -> Iterator[dict[str, Any]]:
     """What the runs' logs say of parts of `products`, oldest first, each with its run; of a request, or of all."""
-    for path in run_log.of_products(root):
+    for path in run_log.logs_of_products(root):
         lines = run_log.lines(path)
-        own = next((str(line["request"]) for line in lines if "request" in line), "")
-        if request in (None, own):
-            yield from ({**line, "run": path.stem, "request": own} for line in lines if "part" in line)
+        request_name = next((str(line["request"]) for line in lines if "request" in line), "")
+        if request in (None, request_name):
+            yield from ({**line, "run": path.stem, "request": request_name} for line in lines if "part" in line)
 
 
 def search(rows: pa.Table, sql: str, memory: float = _MEMORY, timeout: float = _TIMEOUT) -> pa.Table:
@@ -141,7 +143,7 @@ def _objects(rows: pa.Table) -> list[str]:
         raise BadInput(f"--sql: the result has no form in JSON: {' '.join(str(error).split())[:300]}") from None
 
 
-def again(root: Path, product: str, out: Path, key: str | None = None, request: str | None = None) -> str:
+def render_again(root: Path, product: str, out: Path, key: str | None = None, request: str | None = None) -> str:
     """Render a product into a file of its own; returns what is to be said of it, empty where its bytes are the same.
 
     product : its path in the table;  key : of the version of `products` that has it, None = that of the request
@@ -154,13 +156,13 @@ def again(root: Path, product: str, out: Path, key: str | None = None, request: 
     rows = [row for row in version.rows().to_pylist() if row["path"] == product]
     if not rows:
         raise BadInput(f"table products: version {version.key} has no product {product}")
-    place = {name: rows[0][name] for name in ("exposure_id", "detector")}
-    (part,) = (part for part in version.manifest["parts"] if place.items() <= part["facts"].items())
+    detector_facts = {name: rows[0][name] for name in ("exposure_id", "detector")}
+    (part,) = (part for part in version.manifest["parts"] if detector_facts.items() <= part["facts"].items())
     facts = version.manifest["facts"]
-    render_exposures.work(root, {**facts, **part["facts"]}).files[product](out)
+    render_exposures.render_task(root, {**facts, **part["facts"]}).files[product](out)
     # Refused where it is no longer what was published.
-    version.file(product)
-    if file_sha256(out) == version.sha256(product):
+    version.sidecar_path(product)
+    if file_sha256(out) == version.file_sha256(product):
         return ""
     code = "" if facts["code"] == code_version() else ": it was made by another version of the code"
     return f"{out} differs from {product}{code}"
@@ -191,20 +193,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error("--failures and --exposures exclude each other")
     if (options.again is None) != (options.out is None):
         parser.error("--again and --out belong together")
-    return command.status("archive", lambda: _answered(options))
+    return command.run("archive", lambda: _answer(options))
 
 
-def _answered(options: argparse.Namespace) -> int:
-    root = layout.lake(options.lake)
+def _answer(options: argparse.Namespace) -> int:
+    root = layout.resolve_lake(options.lake)
     if options.again is not None:
-        said = again(root, options.again, user_files.target(options.out), options.version, options.name)
-        print(said or f"{options.out} equals {options.again}")
-        return int(bool(said))
+        difference = render_again(
+            root, options.again, user_files.check_target(options.out), options.version, options.name
+        )
+        print(difference or f"{options.out} equals {options.again}")
+        return int(bool(difference))
     if options.at is not None:
-        sky.checked(*([value] for value in options.at))
-    own = None if options.name is None else names.checked(root, options.name)
-    rows = (failures if options.failures else exposures if options.exposures else products)(root, own)
-    rows = rows if options.at is None else covering(rows, *options.at)
+        sky.check_positions(*([value] for value in options.at))
+    request_name = None if options.name is None else request_links.check_request(root, options.name)
+    rows = (failures if options.failures else exposures if options.exposures else products)(root, request_name)
+    rows = rows if options.at is None else rows_at_place(rows, *options.at)
     rows = rows if options.sql is None else search(rows, options.sql)
     for line in _objects(rows):
         print(line)
@@ -212,4 +216,4 @@ def _answered(options: argparse.Namespace) -> int:
 
 
 if __name__ == "__main__":
-    command.leave(main)
+    command.exit_with_status(main)

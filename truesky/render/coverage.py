@@ -24,15 +24,15 @@ from lake_schema.errors import BadInput
 from lake_schema.store import layout, read
 from truesky.render.camera import footprints, pointing
 from truesky.render.channels.image_types import SKY_TYPES
-from truesky.render.planning import parts
+from truesky.render.planning import exposure_chunks
 from truesky.request.area import Area
 
-_EXPOSURE = ("exposure_id", "channel", "band", "image_type", "exposure_time_s", "ra", "dec")
-_TASK = ("exposure_id", "ra", "dec", "radius", "s_region")
+_EXPOSURE_COLUMNS = ("exposure_id", "channel", "band", "image_type", "exposure_time_s", "ra", "dec")
+_TASK_COLUMNS = ("exposure_id", "ra", "dec", "radius", "s_region")
 # Places along a side of a map; the widest map, and how far inside an area its edge is no longer felt, deg.
 _SIDE, _WIDEST, _INSIDE = 500, 60.0, 0.5
 # Colours of a map, besides that of what nothing sees; more exposures than all but a few places have share the last.
-_COLOURS, _FEW, _NOTHING = 8, 0.01, "#efece6"
+_COLOURS, _TAIL_FRACTION, _UNSEEN_COLOUR = 8, 0.01, "#efece6"
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,13 +47,13 @@ class Depth:
     channel: str
     band: str
     exposures: int
-    seen: Int
+    counts: Int
     interior: Bool
     extent: float
 
-    def share(self, least: int) -> float:
+    def share(self, min_exposures: int) -> float:
         """Part of the interior that at least so many exposures see."""
-        return float((self.seen[self.interior] >= least).mean()) if self.interior.any() else 0.0
+        return float((self.counts[self.interior] >= min_exposures).mean()) if self.interior.any() else 0.0
 
 
 def depths(exposures: pa.Table, tasks: Callable[[], Iterable[pa.Table]], area: Area, side: int = _SIDE) -> list[Depth]:
@@ -62,13 +62,15 @@ def depths(exposures: pa.Table, tasks: Callable[[], Iterable[pa.Table]], area: A
     exposures : rows of the table;  tasks : rows of that table, a part after the other, whenever it is called
     area : of the request, where its interior lies;  side : pixels of the map
     """
-    looks = exposures.filter(pc.is_in(exposures["image_type"], pa.array(SKY_TYPES)))
-    if not looks.num_rows:
+    sky_exposures = exposures.filter(pc.is_in(exposures["image_type"], pa.array(SKY_TYPES)))
+    if not sky_exposures.num_rows:
         raise BadInput("table exposures has none of the sky")
-    ra0, dec0 = _centre(looks)
-    far = float(np.max(sky.separation(looks["ra"].to_numpy(), looks["dec"].to_numpy(), ra0, dec0)))
-    _refuse_wide(far)
-    extent = far + max(_reach(some, looks) for some in tasks())
+    ra0, dec0 = _centre(sky_exposures)
+    max_distance = float(
+        np.max(sky.separation(sky_exposures["ra"].to_numpy(), sky_exposures["dec"].to_numpy(), ra0, dec0))
+    )
+    _refuse_wide(max_distance)
+    extent = max_distance + max(_reach(task_rows, sky_exposures) for task_rows in tasks())
     _refuse_wide(extent)
     # Square on the tangent plane; x to the west.
     grid = np.tan(np.radians(extent)) * np.degrees(1.0) * 3600.0 * np.linspace(-1.0, 1.0, side)
@@ -76,13 +78,19 @@ def depths(exposures: pa.Table, tasks: Callable[[], Iterable[pa.Table]], area: A
     ra, dec = (a.ravel() for a in pointing.sky_of_plane(x, y, ra0, dec0, 0.0))
     inside = area.depth(ra, dec)
     interior = (inside > min(_INSIDE, 0.5 * float(inside.max()))).reshape(side, side)
-    kinds = looks.group_by(["channel", "band"]).aggregate([]).to_pylist()
-    long = {kind: _long(looks, *kind) for kind in sorted((row["channel"], row["band"]) for row in kinds)}
-    seen = {kind: np.zeros(side * side, np.int64) for kind in long}
-    for some in tasks():
-        for kind, numbers in long.items():
-            seen[kind] += footprints.counts(some.filter(pc.is_in(some["exposure_id"], numbers)), ra, dec)
-    return [Depth(*kind, len(long[kind]), seen[kind].reshape(side, side), interior, extent) for kind in long]
+    channel_bands = sky_exposures.group_by(["channel", "band"]).aggregate([]).to_pylist()
+    long_exposures = {
+        kind: _long_exposures(sky_exposures, *kind)
+        for kind in sorted((row["channel"], row["band"]) for row in channel_bands)
+    }
+    counts = {kind: np.zeros(side * side, np.int64) for kind in long_exposures}
+    for task_rows in tasks():
+        for kind, numbers in long_exposures.items():
+            counts[kind] += footprints.counts(task_rows.filter(pc.is_in(task_rows["exposure_id"], numbers)), ra, dec)
+    return [
+        Depth(*kind, len(long_exposures[kind]), counts[kind].reshape(side, side), interior, extent)
+        for kind in long_exposures
+    ]
 
 
 def _refuse_wide(extent: float) -> None:
@@ -90,11 +98,13 @@ def _refuse_wide(extent: float) -> None:
         raise BadInput(f"the exposures lie {2 * extent:.0f} deg apart: a map shows {_WIDEST:g} deg at most")
 
 
-def _long(exposures: pa.Table, channel: str, band: str) -> pa.Array:
+def _long_exposures(exposures: pa.Table, channel: str, band: str) -> pa.Array:
     """Numbers of a band's long exposures."""
-    own = exposures.filter(pc.and_(pc.equal(exposures["channel"], channel), pc.equal(exposures["band"], band)))
-    is_long = pc.greater(own["exposure_time_s"], 0.5 * pc.max(own["exposure_time_s"]).as_py())
-    return own.filter(is_long)["exposure_id"].combine_chunks()
+    band_exposures = exposures.filter(
+        pc.and_(pc.equal(exposures["channel"], channel), pc.equal(exposures["band"], band))
+    )
+    is_long = pc.greater(band_exposures["exposure_time_s"], 0.5 * pc.max(band_exposures["exposure_time_s"]).as_py())
+    return band_exposures.filter(is_long)["exposure_id"].combine_chunks()
 
 
 def _centre(exposures: pa.Table) -> tuple[float, float]:
@@ -104,40 +114,43 @@ def _centre(exposures: pa.Table) -> tuple[float, float]:
 
 def _reach(tasks: pa.Table, exposures: pa.Table) -> float:
     """How far from their boresights the tasks of some exposures look, deg; 0 where there are none of them."""
-    where = pc.index_in(tasks["exposure_id"], exposures["exposure_id"].combine_chunks()).combine_chunks()
-    own, where = tasks.filter(pc.is_valid(where)), where.drop_null()
-    ra, dec = (exposures[name].take(where).to_numpy() for name in ("ra", "dec"))
-    far = sky.separation(own["ra"].to_numpy(), own["dec"].to_numpy(), ra, dec) + own["radius"].to_numpy()
-    return float(np.max(far, initial=0.0))
+    indices = pc.index_in(tasks["exposure_id"], exposures["exposure_id"].combine_chunks()).combine_chunks()
+    matched_tasks, indices = tasks.filter(pc.is_valid(indices)), indices.drop_null()
+    ra, dec = (exposures[name].take(indices).to_numpy() for name in ("ra", "dec"))
+    distances = (
+        sky.separation(matched_tasks["ra"].to_numpy(), matched_tasks["dec"].to_numpy(), ra, dec)
+        + matched_tasks["radius"].to_numpy()
+    )
+    return float(np.max(distances, initial=0.0))
 
 
-def line(depth: Depth) -> str:
+def summary_line(depth: Depth) -> str:
     """What a person reads of a band."""
     shares = ", ".join(f">= {n}: {depth.share(n):.3f}" for n in range(1, 5))
     return f"{depth.channel:7} {depth.band:12} {depth.exposures:6,} exposures   of the interior {shares}"
 
 
-def picture(found: Sequence[Depth], path: Path) -> None:
+def draw_maps(depth_maps: Sequence[Depth], path: Path) -> None:
     """A map a band, north up, east to the left: how many exposures see each place; the interior outlined."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.colors import BoundaryNorm
     from matplotlib.figure import Figure
 
-    columns = int(np.ceil(np.sqrt(len(found))))
-    rows = -(-len(found) // columns)
+    columns = int(np.ceil(np.sqrt(len(depth_maps))))
+    rows = -(-len(depth_maps) // columns)
     figure = Figure(figsize=(5.6 * columns, 5.2 * rows), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
-    colours = matplotlib.colormaps["viridis"].with_extremes(under=_NOTHING)
-    for axes, depth in zip(np.ravel(figure.subplots(rows, columns, squeeze=False)), found, strict=False):
-        seen = depth.seen[depth.seen > 0]
-        most = int(np.quantile(seen, 1.0 - _FEW)) if seen.size else 1
-        step = -(-most // _COLOURS)
-        bounds = 0.5 + step * np.arange(-(-most // step) + 1)
+    colours = matplotlib.colormaps["viridis"].with_extremes(under=_UNSEEN_COLOUR)
+    for axes, depth in zip(np.ravel(figure.subplots(rows, columns, squeeze=False)), depth_maps, strict=False):
+        observed = depth.counts[depth.counts > 0]
+        max_count = int(np.quantile(observed, 1.0 - _TAIL_FRACTION)) if observed.size else 1
+        step = -(-max_count // _COLOURS)
+        bounds = 0.5 + step * np.arange(-(-max_count // step) + 1)
         half = depth.extent
         # x of the map runs to the west.
-        shown = axes.imshow(
-            np.minimum(depth.seen, most), origin="lower", extent=(half, -half, -half, half), cmap=colours,
+        map_image = axes.imshow(
+            np.minimum(depth.counts, max_count), origin="lower", extent=(half, -half, -half, half), cmap=colours,
             interpolation="nearest", norm=BoundaryNorm(bounds, colours.N),
         )  # fmt: skip
         if depth.interior.any() and not depth.interior.all():
@@ -147,10 +160,10 @@ def picture(found: Sequence[Depth], path: Path) -> None:
         axes.set_title(f"{depth.channel} {depth.band}: >= 3 over {100 * depth.share(3):.1f} %", fontsize=11)
         axes.set_xlabel("east [deg]")
         axes.set_ylabel("north [deg]")
-        bar = figure.colorbar(shown, ax=axes, shrink=0.8, label="exposures")
+        bar = figure.colorbar(map_image, ax=axes, shrink=0.8, label="exposures")
         lowest = [round(b + 0.5) for b in bounds[:-1]]
-        named = [f"{a}" if step == 1 else f"{a} - {a + step - 1}" for a in lowest]
-        bar.set_ticks(list((bounds[:-1] + bounds[1:]) / 2), labels=[*named[:-1], f">= {lowest[-1]}"])
+        labels = [f"{a}" if step == 1 else f"{a} - {a + step - 1}" for a in lowest]
+        bar.set_ticks(list((bounds[:-1] + bounds[1:]) / 2), labels=[*labels[:-1], f">= {lowest[-1]}"])
     for axes in figure.axes:
         if not axes.has_data():
             axes.set_visible(False)
@@ -180,22 +193,26 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--name", help="of the request whose plan is meant, where the lake has several")
     parser.add_argument("--out", type=Path, help="PNG of the maps")
     options = parser.parse_args(argv)
-    return command.status("coverage", lambda: _drawn(options.lake, options.name, options.out))
+    return command.run("coverage", lambda: _write_maps(options.lake, options.name, options.out))
 
 
-def _drawn(lake: str, name: str | None, out: Path | None) -> int:
+def _write_maps(lake: str, name: str | None, out: Path | None) -> int:
     if out is not None:
-        user_files.target(out, (".png",))
-    root = layout.lake(lake)
+        user_files.check_target(out, (".png",))
+    root = layout.resolve_lake(lake)
     exposures, tasks = (read.version(root, table, request=name) for table in ("exposures", "tasks"))
-    found = depths(exposures.rows(_EXPOSURE), partial(parts.each, tasks, _TASK), area_of(exposures))
-    for depth in found:
-        print(line(depth))
+    depth_maps = depths(
+        exposures.rows(_EXPOSURE_COLUMNS),
+        partial(exposure_chunks.rows_by_partition, tasks, _TASK_COLUMNS),
+        area_of(exposures),
+    )
+    for depth in depth_maps:
+        print(summary_line(depth))
     if out is not None:
-        picture(found, out)
+        draw_maps(depth_maps, out)
         print(out)
     return 0
 
 
 if __name__ == "__main__":
-    command.leave(main)
+    command.exit_with_status(main)

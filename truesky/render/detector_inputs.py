@@ -18,14 +18,14 @@ from lake_schema.store.object_storage.s3 import Folder
 from lake_schema.store.plan import Json
 from lake_schema.store.provenance import file_sha256
 from lake_schema.tables.exposures import ExposureRow
-from truesky.fluxes.inputs import library_of, passband_of, stars_of
+from truesky.fluxes.inputs import galaxy_library_from_facts, passband_from_facts, stellar_library_from_facts
 from truesky.render.camera import detectors
 from truesky.render.channels import registry
 from truesky.render.channels.aim import Aim
 from truesky.render.drawing import stamp_sizes
-from truesky.render.exposure import elsewhere, persistence, visible_sources, visible_spectra
-from truesky.render.exposure.records import Earlier, EarlierSky, Rows, Variant
-from truesky.render.planning import parts, variants
+from truesky.render.exposure import board_neighbours, persistence, visible_sources, visible_spectra
+from truesky.render.exposure.records import PreviousExposure, PreviousSky, Rows, Variant
+from truesky.render.planning import exposure_chunks, variants
 from truesky.render.psf import from_file
 from truesky.render.sources import catalogue_rows, ephemerides, galaxy_stamps, solar_system
 from truesky.render.sources.catalogue_rows import LENSES
@@ -35,111 +35,118 @@ from truesky.request.accuracy import Accuracy
 from truesky.request.structure import Arms, Stamps
 
 
-def aimed(lake: Folder, facts: Json) -> tuple[Aim, Variant, MissionConfiguration]:
+def load_aim(lake: Folder, facts: Json) -> tuple[Aim, Variant, MissionConfiguration]:
     """A detector as it looks at the sky, its exposure's variant, and the request's mission; facts : of `prepared`."""
     request = facts["request"]
     forced = dict.fromkeys(request["effects"]["on"], True) | dict.fromkeys(request["effects"]["off"], False)
     inputs = {
         name: read.version(lake, name, facts["inputs"][name]) for name in ("exposures", "galaxy_fluxes", "mission")
     }
-    number, here = [facts["exposure_id"]], pc.field("exposure_id") == facts["exposure_id"]
-    (exposed,) = map(ExposureRow.of, parts.rows(inputs["exposures"], number, where=here).to_pylist())
+    numbers, in_exposure = [facts["exposure_id"]], pc.field("exposure_id") == facts["exposure_id"]
+    (exposed,) = map(
+        ExposureRow.from_row, exposure_chunks.rows(inputs["exposures"], numbers, where=in_exposure).to_pylist()
+    )
     mission = read_back(inputs["mission"])
-    own = variants.variant(exposed.settings, mission, Accuracy(**request["accuracy"]), forced)
-    detector = detectors.detector(exposed.camera, facts["detector"], own.mission)
-    band = passband_of(lake, inputs["galaxy_fluxes"].manifest["facts"], exposed.band)
-    return Aim.of(exposed, detector, band, request["seed"], request["readout"]), own, mission
+    variant = variants.variant(exposed.settings, mission, Accuracy(**request["accuracy"]), forced)
+    detector = detectors.detector(exposed.camera, facts["detector"], variant.mission)
+    band = passband_from_facts(lake, inputs["galaxy_fluxes"].manifest["facts"], exposed.band)
+    return Aim.from_exposure(exposed, detector, band, request["seed"], request["readout"]), variant, mission
 
 
-def prepared(lake: Folder, facts: Json) -> tuple[Aim, Rows, Variant]:
+def load_inputs(lake: Folder, facts: Json) -> tuple[Aim, Rows, Variant]:
     """What a detector is rendered from.
 
     facts  : of the plan and of its part: exposure_id, detector
     Errors : BadInput where a file of the user's has changed since the plan was made
     """
-    request, (aim, own, mission) = facts["request"], aimed(lake, facts)
+    request, (aim, variant, mission) = facts["request"], load_aim(lake, facts)
     exposed, inputs = aim.exposure, {name: read.version(lake, name, key) for name, key in facts["inputs"].items()}
     number = facts["exposure_id"]
-    here = (pc.field("exposure_id") == number) & (pc.field("detector") == facts["detector"])
-    (task,) = parts.rows(inputs["tasks"], [number], where=here).to_pylist()
-    earlier = earlier_exposures(lake, inputs, exposed, task, mission, request["seed"])
-    for one in (exposed, *(before.exposure for before in earlier if isinstance(before, Earlier))):
-        if one.psf:
-            file = str(from_file.file_of(one.psf, task["detector"]))
+    in_detector = (pc.field("exposure_id") == number) & (pc.field("detector") == facts["detector"])
+    (task,) = exposure_chunks.rows(inputs["tasks"], [number], where=in_detector).to_pylist()
+    previous_exposures = find_previous_exposures(lake, inputs, exposed, task, mission, request["seed"])
+    for exposure_row in (
+        exposed,
+        *(previous.exposure for previous in previous_exposures if isinstance(previous, PreviousExposure)),
+    ):
+        if exposure_row.psf:
+            file = str(from_file.path_for_detector(exposure_row.psf, task["detector"]))
             if file_sha256(Path(file)) != facts["psf"][file]:
                 raise BadInput(f"{file}: has changed since the rendering began")
-    bodies = solar_system.nobody if request.get("bodies") == "none" else None
+    bodies = solar_system.empty_population if request.get("bodies") == "none" else None
     if registry.CHANNELS[exposed.channel].sees_bodies(exposed.image_type):
         for file, sha256 in facts.get("bodies", {}).items():
             if file_sha256(Path(file)) != sha256:
                 raise BadInput(f"{file}: has changed since the rendering began")
-            bodies = ephemerides.read(Path(file), sha256).of_day
-    rows = _rows(lake, inputs, aim, task, own, bodies, earlier, request["seed"])
-    return aim, _with_structure(rows, request, facts.get("stamps", {})), own
+            bodies = ephemerides.read(Path(file), sha256).on_day
+    rows = _read_rows(lake, inputs, aim, task, variant, bodies, previous_exposures, request["seed"])
+    return aim, _with_structure(rows, request, facts.get("stamps", {})), variant
 
 
 def _with_structure(rows: Rows, request: Json, files: Mapping[str, str]) -> Rows:
     """The rows, and what galaxies have beside their profiles; files : sha256 of a library, by file."""
-    wanted, seed = request.get("structure", {}), request["seed"]
-    if "arms" in wanted:
-        rows = replace(rows, discs=DiscStructure(Arms(**wanted["arms"]), seed))
+    structure, seed = request.get("structure", {}), request["seed"]
+    if "arms" in structure:
+        rows = replace(rows, discs=DiscStructure(Arms(**structure["arms"]), seed))
     for file, sha256 in files.items():
-        rows = replace(rows, stamps=galaxy_stamps.of_file(Stamps(Path(file), **wanted["stamps"]), seed, sha256))
+        rows = replace(rows, stamps=galaxy_stamps.from_file(Stamps(Path(file), **structure["stamps"]), seed, sha256))
     return rows
 
 
-def _rows(
+def _read_rows(
     lake: Folder,
     inputs: Mapping[str, read.Version],
     aim: Aim,
     task: Json,
-    own: Variant,
+    variant: Variant,
     bodies: Callable[[int], Population] | None,
-    earlier: tuple[Earlier | EarlierSky, ...],
+    previous_exposures: tuple[PreviousExposure | PreviousSky, ...],
     seed: int,
 ) -> Rows:
     """The sources of a detector, from its own cells and, where they shine so far, from those about."""
     exposed, detector, band = aim.exposure, aim.detector, aim.band
-    margin = aim.channel.margin(detector.section, own.mission)
-    spread = visible_spectra.beyond(exposed, detector, own.mission, band, seed)
-    farther = max(stamp_sizes.reach(detector.pixel_scale) - margin, spread - margin, 0.0)
-    limits = visible_sources.flux_limits(exposed, detector, band, own)
-    found = []
+    margin = aim.channel.margin(detector.section, variant.mission)
+    spread = visible_spectra.margin_arcsec(exposed, detector, variant.mission, band, seed)
+    extra_reach = max(stamp_sizes.reach(detector.pixel_scale) - margin, spread - margin, 0.0)
+    limits = visible_sources.flux_limits(exposed, detector, band, variant)
+    catalogues = []
     for rows, fluxes, columns, limit in (
         ("galaxies", "galaxy_fluxes", visible_sources.GALAXY_COLUMNS, limits.far_galaxy),
         ("stars", "star_fluxes", visible_sources.STAR_COLUMNS, limits.spikes),
     ):
-        bands = visible_spectra.bands(exposed, inputs[fluxes].schema.names)
+        bands = visible_spectra.flux_bands(exposed, inputs[fluxes].schema.names)
         versions = inputs[rows], inputs[fluxes]
-        found.append(catalogue_rows.sources(*versions, task, columns, bands, farther, limits.least, limit))
+        catalogues.append(
+            catalogue_rows.read_sources(*versions, task, columns, bands, extra_reach, limits.min_flux, limit)
+        )
     lenses = None
     if LENSES in inputs:
-        deflection = catalogue_rows.deflection_of(inputs["galaxies"])
-        lenses = catalogue_rows.lenses(inputs[LENSES], task, deflection, farther, limits.least)
+        deflection = catalogue_rows.max_deflection(inputs["galaxies"])
+        lenses = catalogue_rows.read_lenses(inputs[LENSES], task, deflection, extra_reach, limits.min_flux)
         versions = inputs["galaxies"], inputs["galaxy_fluxes"]
-        behind = catalogue_rows.with_lensed(found[0][:2], lenses, *versions, task, farther)
-        found[0] = *behind, found[0][2]
+        lensed_rows = catalogue_rows.add_lensed_galaxies(catalogues[0][:2], lenses, *versions, task, extra_reach)
+        catalogues[0] = *lensed_rows, catalogues[0][2]
     return Rows(
-        *found[0][:2],
-        *found[1][:2],
-        library=library_of(lake, inputs["galaxy_fluxes"].manifest["facts"]),
-        stellar=stars_of(lake, inputs["star_fluxes"].manifest["facts"]),
-        complete=margin + min(complete for *_, complete in found),
+        *catalogues[0][:2],
+        *catalogues[1][:2],
+        galaxy_library=galaxy_library_from_facts(lake, inputs["galaxy_fluxes"].manifest["facts"]),
+        stellar_library=stellar_library_from_facts(lake, inputs["star_fluxes"].manifest["facts"]),
+        complete_margin_arcsec=margin + min(complete for *_, complete in catalogues),
         lenses=lenses,
         bodies=bodies,
-        earlier=earlier,
-        beside=elsewhere.stars(inputs, aim, own),
+        previous_exposures=previous_exposures,
+        neighbours=board_neighbours.bright_stars(inputs, aim, variant),
     )
 
 
-def earlier_exposures(
+def find_previous_exposures(
     lake: Folder,
     inputs: Mapping[str, read.Version],
     exposed: ExposureRow,
     task: Json,
     mission: MissionConfiguration,
     seed: int,
-) -> tuple[Earlier | EarlierSky, ...]:
+) -> tuple[PreviousExposure | PreviousSky, ...]:
     """Find earlier exposures of a detector that left charge in it.
 
     Parameters
@@ -162,53 +169,61 @@ def earlier_exposures(
     tuple of Earlier or EarlierSky
         The exposures with their bright sources, or with the level of their sky alone if nothing renders them.
     """
-    if registry.CHANNELS[exposed.channel].remembers is None:
+    if registry.CHANNELS[exposed.channel].persistence_effect is None:
         return ()
-    own = variants.missions(mission)
-    since = exposed.mjd - persistence.window(exposed.camera, own(exposed.settings))
-    near = (pc.field("mjd") >= since) & (pc.field("mjd") <= exposed.mjd)
-    same = pc.field("camera") == exposed.camera
-    found = parts.rows(inputs["exposures"], dates=(since, exposed.mjd), where=near & same).to_pylist()
-    rows = {row.exposure_id: row for row in map(ExposureRow.of, found)}
-    here = pc.field("exposure_id").isin(list(rows)) & (pc.field("detector") == task["detector"])
-    tasks = parts.rows(inputs["tasks"], rows, where=here).to_pylist()
-    before = persistence.earlier_of(tasks, rows, own)[exposed.exposure_id, task["detector"]]
-    pairs = [(rows[one["exposure_id"]], one) for one in before]
-    drawn = [pair for pair in pairs if persistence.is_drawn(pair[0])]
-    again = {one.exposure.exposure_id: one for one in _drawn_again(lake, inputs, exposed, drawn, own, seed)}
-    return tuple(again.get(row.exposure_id, EarlierSky(row)) for row, _ in pairs)
+    mission_for = variants.mission_lookup(mission)
+    start_mjd = exposed.mjd - persistence.window_days(exposed.camera, mission_for(exposed.settings))
+    in_window = (pc.field("mjd") >= start_mjd) & (pc.field("mjd") <= exposed.mjd)
+    same_camera = pc.field("camera") == exposed.camera
+    candidates = exposure_chunks.rows(
+        inputs["exposures"], dates=(start_mjd, exposed.mjd), where=in_window & same_camera
+    ).to_pylist()
+    rows = {row.exposure_id: row for row in map(ExposureRow.from_row, candidates)}
+    in_detector = pc.field("exposure_id").isin(list(rows)) & (pc.field("detector") == task["detector"])
+    tasks = exposure_chunks.rows(inputs["tasks"], rows, where=in_detector).to_pylist()
+    previous_tasks = persistence.previous_tasks(tasks, rows, mission_for)[exposed.exposure_id, task["detector"]]
+    pairs = [(rows[previous_task["exposure_id"]], previous_task) for previous_task in previous_tasks]
+    pairs_with_sources = [pair for pair in pairs if persistence.is_drawn(pair[0])]
+    bright_by_exposure = {
+        previous.exposure.exposure_id: previous
+        for previous in _load_bright_sources(lake, inputs, exposed, pairs_with_sources, mission_for, seed)
+    }
+    return tuple(bright_by_exposure.get(row.exposure_id, PreviousSky(row)) for row, _ in pairs)
 
 
-def _drawn_again(
+def _load_bright_sources(
     lake: Folder,
     inputs: Mapping[str, read.Version],
     exposed: ExposureRow,
-    drawn: Sequence[tuple[ExposureRow, Json]],
+    pairs: Sequence[tuple[ExposureRow, Json]],
     mission_of: Callable[[str | None], MissionConfiguration],
     seed: int,
-) -> list[Earlier]:
+) -> list[PreviousExposure]:
     """With the sources of each that leave something; drawn : earlier exposures and the tasks of the same detector."""
-    if not drawn:
+    if not pairs:
         return []
     fluxes = inputs["galaxy_fluxes"].manifest["facts"]
     aims, galaxies, stars = [], [], []
-    for before, task in drawn:
-        mission = mission_of(before.settings)
-        detector = detectors.detector(before.camera, task["detector"], mission)
-        aim = Aim.of(before, detector, passband_of(lake, fluxes, before.band), seed)
-        least = persistence.least_flux(exposed, before, persistence.brightest_column(aim, mission))
-        beyond = visible_spectra.beyond(before, detector, mission, aim.band, seed)
-        farther = max(beyond - aim.channel.margin(detector.section, mission), 0.0)
+    for previous, task in pairs:
+        mission = mission_of(previous.settings)
+        detector = detectors.detector(previous.camera, task["detector"], mission)
+        aim = Aim.from_exposure(previous, detector, passband_from_facts(lake, fluxes, previous.band), seed)
+        min_flux = persistence.min_flux(exposed, previous, persistence.brightest_column_fraction(aim, mission))
+        spectral_reach = visible_spectra.margin_arcsec(previous, detector, mission, aim.band, seed)
+        extra_reach = max(spectral_reach - aim.channel.margin(detector.section, mission), 0.0)
         # In images their colours are taken as flat.
-        spread = aim.channel.disperses is not None
-        shapes = visible_sources.GALAXY_COLUMNS if spread else visible_sources.SHAPE_COLUMNS
-        galaxies.append(catalogue_rows.Bright(task, shapes, before.band, least, farther))
+        is_dispersed = aim.channel.dispersion is not None
+        shapes = visible_sources.GALAXY_COLUMNS if is_dispersed else visible_sources.SHAPE_COLUMNS
+        galaxies.append(catalogue_rows.BrightQuery(task, shapes, previous.band, min_flux, extra_reach))
         stars.append(replace(galaxies[-1], columns=visible_sources.STAR_COLUMNS))
         aims.append((aim, mission))
-    library, stellar = library_of(lake, fluxes), stars_of(lake, inputs["star_fluxes"].manifest["facts"])
-    of_galaxies = catalogue_rows.bright(inputs["galaxies"], inputs["galaxy_fluxes"], galaxies)
-    of_stars = catalogue_rows.bright(inputs["stars"], inputs["star_fluxes"], stars)
+    library, stellar = (
+        galaxy_library_from_facts(lake, fluxes),
+        stellar_library_from_facts(lake, inputs["star_fluxes"].manifest["facts"]),
+    )
+    of_galaxies = catalogue_rows.read_bright(inputs["galaxies"], inputs["galaxy_fluxes"], galaxies)
+    of_stars = catalogue_rows.read_bright(inputs["stars"], inputs["star_fluxes"], stars)
     return [
-        Earlier(aim, Rows(*some, *others, library=library, stellar=stellar), mission)
-        for (aim, mission), some, others in zip(aims, of_galaxies, of_stars, strict=True)
+        PreviousExposure(aim, Rows(*galaxy_rows, *star_rows, galaxy_library=library, stellar_library=stellar), mission)
+        for (aim, mission), galaxy_rows, star_rows in zip(aims, of_galaxies, of_stars, strict=True)
     ]

@@ -33,13 +33,13 @@ from truesky.render.exposure import visible_spectra
 from truesky.render.planning import planned_exposures
 
 
-def nominal(grism: str, detector: str, mission: MissionConfiguration) -> Aim:
+def nominal_aim(grism: str, detector: str, mission: MissionConfiguration) -> Aim:
     """A detector as it looks through a grism that is not turned; BadInput for one that the camera does not have.
 
     grism, detector : names;  mission : whose wheel's error is left to whoever asks for the orders
     """
-    row = planned_exposures.unturned(grism, mission)
-    return Aim.of(row, detectors.detector(row.camera, detector, mission))
+    row = planned_exposures.untilted_exposure(grism, mission)
+    return Aim.from_exposure(row, detectors.detector(row.camera, detector, mission))
 
 
 def orders(aim: Aim, mission: MissionConfiguration, seed: int) -> tuple[Order, ...]:
@@ -48,12 +48,12 @@ def orders(aim: Aim, mission: MissionConfiguration, seed: int) -> tuple[Order, .
     aim : the exposure and detector;  mission : the exposure's;  seed : of the request
     What a turned grism takes of the light of sources at the field's edge is not in it.
     """
-    per = electron_rate(aim.exposure) / (UJY_CGS * LIGHT_ANGSTROM_S * passbands.log_width(aim.band))
-    found = visible_spectra.orders(aim, mission, seed)
-    return tuple(replace(order, response=order.response * per) for order in found)
+    rate_per_flux = electron_rate(aim.exposure) / (UJY_CGS * LIGHT_ANGSTROM_S * passbands.log_width(aim.band))
+    trace_orders = visible_spectra.make_orders(aim, mission, seed)
+    return tuple(replace(order, response=order.response * rate_per_flux) for order in trace_orders)
 
 
-def of_exposure(
+def aims_of_exposure(
     root: Path, exposure: int, request: str | None = None
 ) -> Iterator[tuple[str, Aim, MissionConfiguration, int]]:
     """(detector, its aim, the exposure's mission, the request's seed) of every detector that was rendered.
@@ -67,25 +67,27 @@ def of_exposure(
         raise BadInput(f"table products has no exposure {exposure}")
     for part in parts:
         facts = {**version.manifest["facts"], **part}
-        aim, own, _ = detector_inputs.aimed(root, facts)
-        if aim.channel.disperses is None or not aim.sees_sky:
-            what = f"{aim.exposure.channel} {aim.exposure.image_type}"
-            raise BadInput(f"exposure {exposure}: {what} is no image of spectra")
-        yield part["detector"], aim, own.mission, facts["request"]["seed"]
+        aim, variant, _ = detector_inputs.load_aim(root, facts)
+        if aim.channel.dispersion is None or not aim.sees_sky:
+            description = f"{aim.exposure.channel} {aim.exposure.image_type}"
+            raise BadInput(f"exposure {exposure}: {description} is no image of spectra")
+        yield part["detector"], aim, variant.mission, facts["request"]["seed"]
 
 
-def _asked(options: argparse.Namespace) -> Iterator[tuple[str, Aim, MissionConfiguration, int]]:
+def _configurations(options: argparse.Namespace) -> Iterator[tuple[str, Aim, MissionConfiguration, int]]:
     """(name of a configuration, its aim, mission values and seed)."""
     if options.lake:
-        for name, aim, mission, seed in of_exposure(layout.lake(options.lake), options.exposure, options.name):
+        for name, aim, mission, seed in aims_of_exposure(
+            layout.resolve_lake(options.lake), options.exposure, options.name
+        ):
             if not options.detectors or name in options.detectors:
                 yield f"{aim.exposure.grism}_{options.exposure:06d}_{name}", aim, mission, seed
         return
     for grism in sorted(grism for names in planned_exposures.GRISMS.values() for grism in names):
-        camera = planned_exposures.unturned(grism, resolve()).camera
+        camera = planned_exposures.untilted_exposure(grism, resolve()).camera
         mission = resolve(overrides={f"{camera}.grism_wheel_error": (0.0, "deg")})
-        for name in options.detectors or [one.name for one in detectors.detectors(camera, mission)]:
-            yield f"{grism}_{name}", nominal(grism, name, mission), mission, 0
+        for name in options.detectors or [detector.name for detector in detectors.detectors(camera, mission)]:
+            yield f"{grism}_{name}", nominal_aim(grism, name, mission), mission, 0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -99,27 +101,27 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--name", help="of the request whose images are meant, where the lake has several")
     parser.add_argument("--detectors", nargs="+", metavar="NAME", help="these alone")
     options = parser.parse_args(argv)
-    return command.status("grisms", lambda: _written(options))
+    return command.run("grisms", lambda: _write_configurations(options))
 
 
-def _written(options: argparse.Namespace) -> int:
+def _write_configurations(options: argparse.Namespace) -> int:
     if bool(options.lake) != (options.exposure is not None):
         raise BadInput("--lake and --exposure are given together, or neither")
     if options.name and not options.lake:
         raise BadInput("--name is of a request of a lake: --lake is missing")
-    folder = user_files.folder(options.out)
+    folder = user_files.check_folder(options.out)
     # All of it is known to be right before the first file.
-    asked = list(_asked(options))
-    missing = set(options.detectors or ()) - {aim.detector.name for _, aim, _, _ in asked}
+    configurations = list(_configurations(options))
+    missing = set(options.detectors or ()) - {aim.detector.name for _, aim, _, _ in configurations}
     if missing:
         raise BadInput(f"exposure {options.exposure}: detector {min(missing)} has not been rendered")
     folder.mkdir(parents=True, exist_ok=True)
-    for name, aim, mission, seed in asked:
+    for name, aim, mission, seed in configurations:
         shape = aim.detector.ny, aim.detector.nx
         grism_files.write(folder, name, orders(aim, mission, seed), shape)
-    print(f"{options.out}: {len(asked)} configurations")
+    print(f"{options.out}: {len(configurations)} configurations")
     return 0
 
 
 if __name__ == "__main__":
-    command.leave(main)
+    command.exit_with_status(main)

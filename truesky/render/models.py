@@ -27,13 +27,13 @@ from lake_schema.fits.images import Image, write_images
 from lake_schema.store import layout, read
 from lake_schema.store.object_storage.s3 import Folder
 from truesky.render import detector_inputs
-from truesky.render.exposure import alone
-from truesky.render.exposure.alone import Alone
+from truesky.render.exposure import single_source_spectra
+from truesky.render.exposure.single_source_spectra import SourceSpectrum
 
 
 def models(
     root: Folder, version: read.Version, exposure: int, detector: str, ids: Sequence[int] | None = None
-) -> Iterator[Alone]:
+) -> Iterator[SourceSpectrum]:
     """Draw single sources of a published image.
 
     Parameters
@@ -52,38 +52,38 @@ def models(
     BadInput
         At the call, if there is no such image, it is not dispersed, or a source cannot have light in it.
     """
-    wanted = {"exposure_id": exposure, "detector": detector}
-    parts = [part["facts"] for part in version.manifest["parts"] if wanted.items() <= part["facts"].items()]
+    image_facts = {"exposure_id": exposure, "detector": detector}
+    parts = [part["facts"] for part in version.manifest["parts"] if image_facts.items() <= part["facts"].items()]
     if not parts:
         raise BadInput(f"table products has no detector {detector} of exposure {exposure}")
     facts = {**version.manifest["facts"], **parts[0]}
-    aim, rows, own = detector_inputs.prepared(root, facts)
-    return alone.spectra(aim, rows, own, facts["request"]["seed"], ids)
+    aim, rows, variant = detector_inputs.load_inputs(root, facts)
+    return single_source_spectra.draw_sources(aim, rows, variant, facts["request"]["seed"], ids)
 
 
 def frame(image: Image, shape: tuple[int, int]) -> Float:
     """float64[ny, nx] electrons of an extension; shape : ny, nx of the detector."""
     out, cards = np.zeros(shape), {key: value for key, value, _ in image.cards}
     if image.data is not None:
-        (height, width), left, low = image.data.shape, int(cards["X0"]), int(cards["Y0"])
-        out[low : low + height, left : left + width] = image.data
+        (height, width), first_column, first_row = image.data.shape, int(cards["X0"]), int(cards["Y0"])
+        out[first_row : first_row + height, first_column : first_column + width] = image.data
     return out
 
 
 def _extension(number: int, order: int | None, light: Float) -> Image:
     """Cut to what is not dark, one pixel at least."""
     rows, columns = (np.flatnonzero((light != 0.0).any(axis=axis)) for axis in (1, 0))
-    low, high = (rows[0], rows[-1] + 1) if len(rows) else (0, 1)
-    left, right = (columns[0], columns[-1] + 1) if len(columns) else (0, 1)
+    first_row, end_row = (rows[0], rows[-1] + 1) if len(rows) else (0, 1)
+    first_column, end_column = (columns[0], columns[-1] + 1) if len(columns) else (0, 1)
     cards = (
         ("SRC_ID", number, "source"),
         *((("ORDER", order, "of the grism"),) if order is not None else ()),
-        ("X0", int(left), "column of the first pixel, 0-based"),
-        ("Y0", int(low), "row of the first pixel, 0-based"),
+        ("X0", int(first_column), "column of the first pixel, 0-based"),
+        ("Y0", int(first_row), "row of the first pixel, 0-based"),
         ("BUNIT", "electron", "unit of the pixels: expected, of this source"),
     )
     name = f"{number}" if order is None else f"{number}.{order}"
-    return Image(light[low:high, left:right].astype(np.float32), cards, name)
+    return Image(light[first_row:end_row, first_column:end_column].astype(np.float32), cards, name)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -99,22 +99,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--orders", action="store_true", help="an extension for each order of each source")
     parser.add_argument("--out", type=Path, required=True, help="FITS file")
     options = parser.parse_args(argv)
-    return command.status("models", lambda: _written(options))
+    return command.run("models", lambda: _write_models(options))
 
 
-def _written(options: argparse.Namespace) -> int:
-    out = user_files.target(options.out, (".fits",))
+def _write_models(options: argparse.Namespace) -> int:
+    out = user_files.check_target(options.out, (".fits",))
     ids = list(dict.fromkeys(options.sources))
     images = [Image(None, (("EXPOSURE", options.exposure, "exposure"), ("DETECTOR", options.detector, "detector")))]
-    root = layout.opened(options.lake)
+    root = layout.open_lake(options.lake)
     version = read.version(root, "products", request=options.name)
-    for one in models(root, version, options.exposure, options.detector, ids):
-        layers = one.orders.items() if options.orders else [(None, one.frame)]
-        images += [_extension(one.id, order, light) for order, light in layers]
-        print(f"{one.id}: {one.frame.sum():.6g} electrons")
+    for model in models(root, version, options.exposure, options.detector, ids):
+        layers = model.orders.items() if options.orders else [(None, model.frame)]
+        images += [_extension(model.id, order, light) for order, light in layers]
+        print(f"{model.id}: {model.frame.sum():.6g} electrons")
     write_images(out, images)
     return 0
 
 
 if __name__ == "__main__":
-    command.leave(main)
+    command.exit_with_status(main)

@@ -14,21 +14,21 @@ from lake_schema.errors import BadInput
 from lake_schema.mission import checks, published
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.model import read_models
-from lake_schema.mission.parameter import read_all
+from lake_schema.mission.parameter import read_all_parameters
 from lake_schema.store import layout, read
-from lake_schema.store.plan import Json, Output, Part, Plan
+from lake_schema.store.plan import Json, Output, Plan, Task
 from lake_schema.store.provenance import digest
 from lake_schema.tables.exposures import EXPOSURES
 from lake_schema.tables.mission import MISSION
 from lake_schema.tables.tasks import TASKS
 from truesky.render.forecasting import forecast, speed
 from truesky.render.planning import ground_surveys, psf_files, source_counts, tasks, variants
-from truesky.render.planning.mission import PARTS, mission_of, user_filters
-from truesky.render.planning.parts import Layout, Piece
-from truesky.render.planning.prices import Files
+from truesky.render.planning.detector_costs import OutputFiles
+from truesky.render.planning.exposure_chunks import Chunk, Layout
+from truesky.render.planning.mission import PLAN_SECTIONS, mission_of, user_filters
 from truesky.request import universe
 from truesky.request.schema import Request
-from truesky.running.shell import Job, Step, common_facts
+from truesky.running.submitted_job import Job, Step, common_facts
 
 # Rows of `exposures` and of `tasks`.
 PlanRows = tuple[pa.Table, pa.Table]
@@ -49,66 +49,68 @@ class Planner:
     layout: Layout
 
     @classmethod
-    def of(cls, lake: Path | None, request: Request) -> Planner:
+    def from_request(cls, lake: Path | None, request: Request) -> Planner:
         """Errors : BadInput for whatever is wrong with pointings, observations and PSFs."""
         if not request.pointings and not request.observations:
             raise BadInput(f"request {request.name}: pointing and observation are missing: there is nothing to plan")
         mission = mission_of(request.mission)
         checks.check(mission)
-        found = Layout.of(request, mission)
-        psf_files.check(found.standing(), user_filters(request)[0], request.psfs)
-        return cls(lake, request, mission, found)
+        plan_layout = Layout.from_request(request, mission)
+        psf_files.check(plan_layout.representative_exposures(), user_filters(request)[0], request.psfs)
+        return cls(lake, request, mission, plan_layout)
 
     def exposures(self, lake: Path, facts: Json) -> Output:
         """A part of the table `exposures`; facts : its own."""
-        return Output(self.rows_of_exposures(self.layout.piece(facts)))
+        return Output(self.rows_of_exposures(self.layout.find_chunk(facts)))
 
     def tasks(self, lake: Path, facts: Json) -> Output:
         """A part of the table `tasks`; facts : its own, and the key of `exposures`."""
         exposures = read.version(lake, EXPOSURES.name, facts[_MADE_OF][EXPOSURES.name])
-        piece = self.layout.piece(facts)
-        return Output(self.rows_of_tasks(piece, exposures.rows(parts=[facts["part"]])))
+        chunk = self.layout.find_chunk(facts)
+        return Output(self.rows_of_tasks(chunk, exposures.rows(partitions=[facts["part"]])))
 
-    def rows_of_exposures(self, piece: Piece) -> pa.Table:
+    def rows_of_exposures(self, chunk: Chunk) -> pa.Table:
         """Rows of the table `exposures` of a part of the layout."""
-        return self.layout.exposures(piece, user_filters(self.request)[0], self.request.seed)
+        return self.layout.exposures(chunk, user_filters(self.request)[0], self.request.seed)
 
-    def rows_of_tasks(self, piece: Piece, exposures: pa.Table) -> pa.Table:
+    def rows_of_tasks(self, chunk: Chunk, exposures: pa.Table) -> pa.Table:
         """Rows of the table `tasks` of a part of the layout; exposures : its rows."""
         request = self.request
         densities = source_counts.Densities(
             self.mission, request.universe, [] if self.lake is None else _catalogues(self.lake, request)
         )
-        files = Files(request.files == "exposure", request.readout)
-        wanted, forced = self.layout.wanted(piece), variants.forced(request)
-        rows = tasks.table(exposures, wanted, self.mission, densities, request.truth, request.accuracy, forced, files)
-        days = tasks.remembered(exposures, self.mission)
-        about = self.layout.about(piece, days) if days else ()
-        return tasks.remembering(rows, exposures, about, self.mission)
+        files = OutputFiles(request.files == "exposure", request.readout)
+        detectors, forced = self.layout.requested_detectors(chunk), variants.forced_effects(request)
+        rows = tasks.table(
+            exposures, detectors, self.mission, densities, request.truth, request.accuracy, forced, files
+        )
+        days = tasks.persistence_days(exposures, self.mission)
+        nearby_exposures = self.layout.exposures_near_in_time(chunk, days) if days else ()
+        return tasks.add_persistence_cost(rows, exposures, nearby_exposures, self.mission)
 
     def tables(self) -> Iterator[PlanRows]:
         """Rows of `exposures` and `tasks`, a part after the other."""
-        for piece in self.layout.pieces:
-            exposures = self.rows_of_exposures(piece)
-            yield exposures, self.rows_of_tasks(piece, exposures)
+        for chunk in self.layout.chunks:
+            exposures = self.rows_of_exposures(chunk)
+            yield exposures, self.rows_of_tasks(chunk, exposures)
 
 
 def plan(lake: Path | None, request: Request) -> tuple[MissionConfiguration, pa.Table, pa.Table]:
     """The mission configuration, and rows of the tables `exposures` and `tasks`; lake : with catalogues, if any."""
-    planner = Planner.of(lake, request)
-    return planner.mission, *joined(planner.tables())
+    planner = Planner.from_request(lake, request)
+    return planner.mission, *concatenate(planner.tables())
 
 
-def joined(parts: Iterable[PlanRows]) -> PlanRows:
+def concatenate(parts: Iterable[PlanRows]) -> PlanRows:
     """Rows of a whole plan from those of its parts; tasks are sorted, the longest first."""
     exposures, rows = zip(*parts, strict=True)
-    return pa.concat_tables(exposures).combine_chunks(), tasks.in_order(pa.concat_tables(rows))
+    return pa.concat_tables(exposures).combine_chunks(), tasks.sort_by_cost(pa.concat_tables(rows))
 
 
 def _catalogues(lake: Path, request: Request) -> list[read.Version]:
     """The catalogues of the request, if it has them all."""
-    there = all(layout.current(lake, name).exists() for name in universe.CATALOGUES)
-    return [read.for_request(lake, name, request.name) for name in universe.CATALOGUES] if there else []
+    has_all = all(layout.current_link(lake, name).exists() for name in universe.CATALOGUES)
+    return [read.input_version(lake, name, request.name) for name in universe.CATALOGUES] if has_all else []
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
@@ -116,56 +118,69 @@ def steps(lake: Path, request: Request) -> list[Step]:
 
     A plan of one part is made on the driver, a larger one by the workers.
     """
-    universe.refuse_other(_catalogues(lake, request), request)
-    planner = Planner.of(lake, request)
-    _say_by_day(planner)
-    facts = {**common_facts(request, *PARTS), "mission": planner.mission.fingerprint, **user_filters(request)[1]}
-    about = {
+    universe.check_catalogues(_catalogues(lake, request), request)
+    planner = Planner.from_request(lake, request)
+    _warn_daylight(planner)
+    facts = {
+        **common_facts(request, *PLAN_SECTIONS),
+        "mission": planner.mission.fingerprint,
+        **user_filters(request)[1],
+    }
+    mission_facts = {
         "mission": planner.mission.fingerprint,
         "ladder": list(planner.mission.ladder),
-        "records": digest([repr(r) for r in (*read_all(), *read_models())]),
+        "records": digest([repr(r) for r in (*read_all_parameters(), *read_models())]),
     }
     parts = planner.layout.parts()
-    small = len(parts) == 1
+    on_driver = len(parts) == 1
     exposures = Plan(EXPOSURES, facts, parts)
     # What they cost depends on more than which they are.
-    counts = {v.table: v.key for v in _catalogues(lake, request)}
-    costs = {**facts, "counts": counts, "rendered": request.facts("accuracy", "effects", "files", "readout")}
+    catalogue_keys = {v.table: v.key for v in _catalogues(lake, request)}
+    costs = {**facts, "counts": catalogue_keys, "rendered": request.facts("accuracy", "effects", "files", "readout")}
     costs[_MADE_OF] = {EXPOSURES.name: exposures.key}
-    own = tuple(Part(part.name, {**part.facts, "part": part.name}) for part in parts)
-    whole = published.output(planner.mission)
+    task_parts = tuple(Task(part.name, {**part.facts, "part": part.name}) for part in parts)
+    mission_output = published.to_output(planner.mission)
     return [
-        Step(Plan(MISSION, about, (Part("all.parquet", {}),)), lambda lake, part: whole, on_driver=True),
-        Step(exposures, planner.exposures, on_driver=small),
-        Step(Plan(TASKS, costs, own), planner.tasks, on_driver=small, after=partial(_print_published, lake)),
+        Step(
+            Plan(MISSION, mission_facts, (Task("all.parquet", {}),)), lambda lake, part: mission_output, on_driver=True
+        ),
+        Step(exposures, planner.exposures, on_driver=on_driver),
+        Step(
+            Plan(TASKS, costs, task_parts),
+            planner.tasks,
+            on_driver=on_driver,
+            on_published=partial(_print_published, lake),
+        ),
     ]
 
 
 def _print_published(lake: Path, version: read.Version) -> None:
     """The forecast of published tasks."""
     exposures = read.version(lake, EXPOSURES.name, version.manifest["facts"][_MADE_OF][EXPOSURES.name])
-    columns = ["exposure_id", "survey", "image_type"], ["exposure_id", "detector", "channel", *forecast.SUMMED]
+    columns = ["exposure_id", "survey", "image_type"], ["exposure_id", "detector", "channel", *forecast.SUMMED_COLUMNS]
     _print_forecast(
-        lake, ((exposures.rows(columns[0], [part]), version.rows(columns[1], [part])) for part in version.parts)
+        lake, ((exposures.rows(columns[0], [part]), version.rows(columns[1], [part])) for part in version.partitions)
     )
 
 
 def print_forecast(lake: Path, request: Request, parts: Iterable[PlanRows]) -> None:
     """Print the forecast of a plan that is not published; parts : rows of `exposures` and `tasks`."""
-    universe.refuse_other(_catalogues(lake, request), request)
+    universe.check_catalogues(_catalogues(lake, request), request)
     _print_forecast(lake, parts)
-    _say_by_day(Planner.of(lake, request))
+    _warn_daylight(Planner.from_request(lake, request))
 
 
 def _print_forecast(lake: Path, parts: Iterable[PlanRows]) -> None:
-    machine = speed.of_machine(lake)
-    for line in forecast.text(forecast.of_parts(parts, machine.factor), machine):
+    machine = speed.estimate_speed(lake)
+    for line in forecast.format_table(forecast.summarise_chunks(parts, machine.factor), machine):
         print(line)
 
 
-def _say_by_day(planner: Planner) -> None:
-    if line := ground_surveys.by_day((exposure for exposure, _ in planner.layout.standing()), planner.mission):
-        command.say("plan_exposures", line, 0)
+def _warn_daylight(planner: Planner) -> None:
+    if line := ground_surveys.daylight_warning(
+        (exposure for exposure, _ in planner.layout.representative_exposures()), planner.mission
+    ):
+        command.print_error("plan_exposures", line, 0)
 
 
 JOB = Job(

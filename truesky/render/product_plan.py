@@ -14,15 +14,15 @@ from typing import Any
 import pyarrow as pa
 
 from lake_schema.mission.configuration import MissionConfiguration
-from lake_schema.store import layout, names, read, reuse
-from lake_schema.store.plan import Json, Part, Plan
+from lake_schema.store import layout, read, request_links, reuse
+from lake_schema.store.plan import Json, Plan, Task
 from lake_schema.store.provenance import code_version
 from lake_schema.tables.exposures import ExposureRow
 from lake_schema.tables.products import PRODUCTS
 from truesky.render.exposure import persistence
-from truesky.render.planning import parts, preconditions, variants
+from truesky.render.planning import exposure_chunks, preconditions, variants
+from truesky.render.planning.exposure_chunks import RenderSelection
 from truesky.render.planning.mission import mission_of
-from truesky.render.planning.parts import Chosen
 from truesky.render.planning.preconditions import INPUTS
 from truesky.render.products.keys import (
     ephemeris_files,
@@ -35,7 +35,7 @@ from truesky.render.products.keys import (
 from truesky.render.psf import from_file
 from truesky.render.sources.catalogue_rows import LENSES
 from truesky.request import structure
-from truesky.request.schema import WRITTEN, Request
+from truesky.request.schema import IMAGE_OPTIONS, Request
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,13 +63,13 @@ class RenderInputs:
     request: Request
     mission: MissionConfiguration
     versions: Mapping[str, read.Version]
-    published: Mapping[str, str]
-    chosen: Chosen
+    published_keys: Mapping[str, str]
+    selection: RenderSelection
     exposures: pa.Table
-    earlier: Mapping[tuple[int, str], Sequence[Json]]
+    previous_tasks: Mapping[tuple[int, str], Sequence[Json]]
 
     @classmethod
-    def of(cls, lake: Path, request: Request) -> RenderInputs:
+    def from_request(cls, lake: Path, request: Request) -> RenderInputs:
         """Resolve the inputs of a request's images.
 
         Parameters
@@ -91,13 +91,17 @@ class RenderInputs:
         """
         mission, versions = mission_of(request.mission), _versions(lake, request)
         preconditions.refuse_other_plan(versions, request, mission)
-        published = reuse.held(lake, PRODUCTS.name, request.name)
-        chosen = parts.chosen(versions["exposures"], versions["tasks"], request, exposures_of(published))
-        before = parts.before(versions, chosen.exposures, chosen.tasks, variants.missions(mission))
-        return cls(request, mission, versions, published, chosen, *before)
+        published = reuse.reusable_tasks(lake, PRODUCTS.name, request.name)
+        selection = exposure_chunks.select_for_rendering(
+            versions["exposures"], versions["tasks"], request, exposures_of(published)
+        )
+        exposures_and_tasks = exposure_chunks.with_previous_exposures(
+            versions, selection.exposures, selection.tasks, variants.mission_lookup(mission)
+        )
+        return cls(request, mission, versions, published, selection, *exposures_and_tasks)
 
     @classmethod
-    def of_plan(cls, lake: Path, request: Request, chosen: Chosen) -> RenderInputs:
+    def from_plan(cls, lake: Path, request: Request, selection: RenderSelection) -> RenderInputs:
         """Resolve the inputs of the images of a plan that is not published.
 
         Parameters
@@ -120,35 +124,45 @@ class RenderInputs:
             If a table is missing.
         """
         mission, versions = mission_of(request.mission), _versions(lake, request)
-        published = reuse.held(lake, PRODUCTS.name, request.name)
-        before = parts.before(versions, chosen.exposures, chosen.tasks, variants.missions(mission))
-        return cls(request, mission, versions, published, chosen, *before)
+        published = reuse.reusable_tasks(lake, PRODUCTS.name, request.name)
+        exposures_and_tasks = exposure_chunks.with_previous_exposures(
+            versions, selection.exposures, selection.tasks, variants.mission_lookup(mission)
+        )
+        return cls(request, mission, versions, published, selection, *exposures_and_tasks)
 
-    def with_earlier(self, tasks: Sequence[Json]) -> list[Json]:
+    def with_previous_tasks(self, tasks: Sequence[Json]) -> list[Json]:
         """Tasks, and earlier tasks of the same detectors whose sources are drawn again."""
-        if not self.earlier:
+        if not self.previous_tasks:
             return list(tasks)
-        rows = map(ExposureRow.of, self.exposures.to_pylist())
+        rows = map(ExposureRow.from_row, self.exposures.to_pylist())
         drawn = {row.exposure_id for row in rows if persistence.is_drawn(row)}
-        before = (one for task in tasks for one in self.earlier.get((task["exposure_id"], task["detector"]), ()))
-        return [*tasks, *(one for one in before if one["exposure_id"] in drawn)]
+        previous_tasks = (
+            previous_task
+            for task in tasks
+            for previous_task in self.previous_tasks.get((task["exposure_id"], task["detector"]), ())
+        )
+        return [*tasks, *(previous_task for previous_task in previous_tasks if previous_task["exposure_id"] in drawn)]
 
-    def kept_or_asked(self, asked: Set[str]) -> list[Json]:
+    def requested_or_reusable(self, requested: Set[str]) -> list[Json]:
         """Tasks whose parts are asked for, and those with images whose PSFs can still be read, in their order."""
         columns = (self.exposures[name].to_pylist() for name in ("exposure_id", "psf"))
         psfs = dict(zip(*columns, strict=True))
 
-        def stays(task: Json) -> bool:
-            drawn = [task, *self.earlier.get((task["exposure_id"], task["detector"]), ())]
-            files = [from_file.file_of(psf, one["detector"]) for one in drawn if (psf := psfs[one["exposure_id"]])]
-            return part_name(task) in self.published and all(file.is_file() for file in files)
+        def can_reuse(task: Json) -> bool:
+            drawn = [task, *self.previous_tasks.get((task["exposure_id"], task["detector"]), ())]
+            files = [
+                from_file.path_for_detector(psf, drawn_task["detector"])
+                for drawn_task in drawn
+                if (psf := psfs[drawn_task["exposure_id"]])
+            ]
+            return part_name(task) in self.published_keys and all(file.is_file() for file in files)
 
-        return [task for task in self.chosen.tasks if part_name(task) in asked or stays(task)]
+        return [task for task in self.selection.tasks if part_name(task) in requested or can_reuse(task)]
 
 
 def _versions(lake: Path, request: Request) -> dict[str, read.Version]:
     """Versions of the tables that the images are made of, by name."""
-    inputs = {name: read.for_request(lake, name, request.name) for name in INPUTS}
+    inputs = {name: read.input_version(lake, name, request.name) for name in INPUTS}
     lenses = _lenses(lake, request, inputs["galaxies"])
     return inputs if lenses is None else {**inputs, LENSES: lenses}
 
@@ -157,9 +171,12 @@ def _lenses(lake: Path, request: Request, galaxies: read.Version) -> read.Versio
     """The strong lenses, if there are some; those of another request only where they lie in the same galaxies."""
     if layout.current_key(lake, LENSES) is None:
         return None
-    found, own = read.for_request(lake, LENSES, request.name), names.key_of(lake, request.name, LENSES)
-    shared = own is None and found.key in names.holders(lake, LENSES).values()
-    return None if shared and found.manifest["facts"].get("galaxies") != galaxies.key else found
+    version, request_key = (
+        read.input_version(lake, LENSES, request.name),
+        request_links.linked_key(lake, request.name, LENSES),
+    )
+    shared = request_key is None and version.key in request_links.keys_by_request(lake, LENSES).values()
+    return None if shared and version.manifest["facts"].get("galaxies") != galaxies.key else version
 
 
 def products(inputs: RenderInputs) -> Plan:
@@ -177,26 +194,30 @@ def products(inputs: RenderInputs) -> Plan:
         now.
     """
     facts, exposures = _facts(inputs), inputs.exposures
-    asked = {part_name(task) for task in inputs.chosen.asked}
-    tasks = inputs.kept_or_asked(asked)
-    psfs = psf_files(exposures, inputs.with_earlier(tasks))
-    keys = product_keys({**facts, "psf": psfs}, exposures, tasks, inputs.versions, inputs.mission, inputs.earlier)
-    made = tuple(
-        Part(name, {"exposure_id": task["exposure_id"], "detector": task["detector"], reuse.PRODUCT: key})
-        for task, key in zip(tasks, keys, strict=True)
-        if (name := part_name(task)) in asked or inputs.published[name] == key
+    requested = {part_name(task) for task in inputs.selection.requested}
+    tasks = inputs.requested_or_reusable(requested)
+    psfs = psf_files(exposures, inputs.with_previous_tasks(tasks))
+    keys = product_keys(
+        {**facts, "psf": psfs}, exposures, tasks, inputs.versions, inputs.mission, inputs.previous_tasks
     )
-    if len(made) < len(tasks):
-        names_ = {part.name for part in made}
-        psfs = psf_files(exposures, inputs.with_earlier([task for task in tasks if part_name(task) in names_]))
-    return Plan(PRODUCTS, {**facts, "psf": psfs} if psfs else facts, made)
+    product_parts = tuple(
+        Task(name, {"exposure_id": task["exposure_id"], "detector": task["detector"], reuse.PRODUCT: key})
+        for task, key in zip(tasks, keys, strict=True)
+        if (name := part_name(task)) in requested or inputs.published_keys[name] == key
+    )
+    if len(product_parts) < len(tasks):
+        product_names = {part.name for part in product_parts}
+        psfs = psf_files(
+            exposures, inputs.with_previous_tasks([task for task in tasks if part_name(task) in product_names])
+        )
+    return Plan(PRODUCTS, {**facts, "psf": psfs} if psfs else facts, product_parts)
 
 
 def _facts(inputs: RenderInputs) -> Json:
     """Facts of the plan: all that its images share."""
     request = inputs.request
     facts: dict[str, Any] = {
-        "request": request.facts("seed", "noise_seed", "accuracy", "mission", "effects", "truth", *WRITTEN),
+        "request": request.facts("seed", "noise_seed", "accuracy", "mission", "effects", "truth", *IMAGE_OPTIONS),
         "code": code_version(),
         "mission": inputs.mission.fingerprint,
         "inputs": {name: version.key for name, version in inputs.versions.items()},
@@ -206,7 +227,7 @@ def _facts(inputs: RenderInputs) -> Json:
         facts["request"]["bodies"] = "none"
     facts["request"].update(structure.facts(request.structure))
     if request.bodies is not None:
-        facts["bodies"] = ephemeris_files(request.bodies, inputs.chosen.exposures)
+        facts["bodies"] = ephemeris_files(request.bodies, inputs.selection.exposures)
     if request.structure.stamps is not None:
         facts["stamps"] = stamp_files(request.structure.stamps.file)
     return facts

@@ -6,7 +6,7 @@ from pathlib import Path
 import pyarrow as pa
 
 from lake_schema.store import parquet, read, reuse
-from lake_schema.store.plan import Json, Output, Part, Plan
+from lake_schema.store.plan import Json, Output, Plan, Task
 from lake_schema.tables.exposures import ExposureRow
 from lake_schema.tables.rendered_truth import RENDERED_SPECTRA, RENDERED_TRUTH
 from truesky.render import detector_inputs, product_plan
@@ -15,12 +15,12 @@ from truesky.render.exposure import render
 from truesky.render.planning import preconditions
 from truesky.render.product_plan import RenderInputs
 from truesky.render.products import exposure_files, fits_files, truth_table
-from truesky.render.products.beside import psf_file, spectra_file, truth_file
+from truesky.render.products.sidecar_files import psf_file, spectra_file, truth_file
 from truesky.render.psf import to_psfex
 from truesky.render.sources import catalogue_rows, selection
 from truesky.request.schema import Request
-from truesky.running import heap
-from truesky.running.shell import Job, Step
+from truesky.running import memory_reuse
+from truesky.running.submitted_job import Job, Step
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
@@ -29,49 +29,66 @@ def steps(lake: Path, request: Request) -> list[Step]:
     Detectors that are not asked for, and that the request's present version has as they would be rendered now, stay:
     a part is added to what there is.
     """
-    inputs = RenderInputs.of(lake, request)
+    inputs = RenderInputs.from_request(lake, request)
     _refuse_uncovered(inputs)
     plan = product_plan.products(inputs)
-    drawn = tuple(Part(part.name, {"part": part.name, reuse.PRODUCT: part.facts[reuse.PRODUCT]}) for part in plan.parts)
-    steps = [Step(plan, work, unit="detector"), Step(Plan(RENDERED_TRUTH, {"products": plan.key}, drawn), truth_work)]
-    spread = _dispersed(inputs.chosen.exposures)
-    spectra = tuple(own for own, part in zip(drawn, plan.parts, strict=True) if part.facts["exposure_id"] in spread)
-    if spectra:
-        steps.append(Step(Plan(RENDERED_SPECTRA, {"products": plan.key}, spectra), spectra_work))
+    truth_parts = tuple(
+        Task(part.name, {"part": part.name, reuse.PRODUCT: part.facts[reuse.PRODUCT]}) for part in plan.tasks
+    )
+    steps = [
+        Step(plan, render_task, unit="detector"),
+        Step(Plan(RENDERED_TRUTH, {"products": plan.key}, truth_parts), read_truth),
+    ]
+    dispersed = _dispersed_exposures(inputs.selection.exposures)
+    spectra_parts = tuple(
+        truth_part
+        for truth_part, part in zip(truth_parts, plan.tasks, strict=True)
+        if part.facts["exposure_id"] in dispersed
+    )
+    if spectra_parts:
+        steps.append(Step(Plan(RENDERED_SPECTRA, {"products": plan.key}, spectra_parts), read_spectra))
     if request.files == "exposure":
-        steps.append(Step(exposure_files.plan(plan, inputs.chosen.planned), exposure_files.work, unit="exposure"))
+        steps.append(
+            Step(
+                exposure_files.plan(plan, inputs.selection.detector_counts),
+                exposure_files.make_exposure_file,
+                unit="exposure",
+            )
+        )
     return steps
 
 
 def _refuse_uncovered(inputs: RenderInputs) -> None:
     """The detectors that are asked for must lie where the catalogues were drawn."""
-    needed = inputs.with_earlier(inputs.chosen.asked)
-    places = {tuple(task[k] for k in ("ra", "dec", "radius")): task for task in needed if task["cells"]}
+    tasks = inputs.with_previous_tasks(inputs.selection.requested)
+    task_by_place = {tuple(task[k] for k in ("ra", "dec", "radius")): task for task in tasks if task["cells"]}
     for name in ("galaxies", "stars"):
         version = inputs.versions[name]
-        of_task = [selection.needed(task, catalogue_rows.deflection_of(version)) for task in places.values()]
+        of_task = [
+            selection.cells_of_task(task, catalogue_rows.max_deflection(version)) for task in task_by_place.values()
+        ]
         preconditions.refuse_uncovered(version, {cell for cells in of_task for cell in cells})
 
 
-def _dispersed(exposures: pa.Table) -> set[int]:
+def _dispersed_exposures(exposures: pa.Table) -> set[int]:
     """Exposures whose sources are spread out by a grism."""
-    found = set()
-    for row in map(ExposureRow.of, exposures.to_pylist()):
+    numbers = set()
+    for row in map(ExposureRow.from_row, exposures.to_pylist()):
         channel = registry.CHANNELS.get(row.channel)
-        if channel is not None and channel.disperses is not None and channel.sees_sky(row.image_type):
-            found.add(row.exposure_id)
-    return found
+        if channel is not None and channel.dispersion is not None and channel.sees_sky(row.image_type):
+            numbers.add(row.exposure_id)
+    return numbers
 
 
-def work(lake: Path, facts: Json) -> Output:
+def render_task(lake: Path, facts: Json) -> Output:
     """One detector: its sources from its own cells, its image, its files."""
     request = facts["request"]
-    with heap.kept():
-        aim, rows_, own = detector_inputs.prepared(lake, facts)
+    with memory_reuse.retain_freed_memory():
+        aim, source_rows, variant = detector_inputs.load_inputs(lake, facts)
         noise = request["noise_seed"]
-        rendered = render.render(aim, rows_, own, request["seed"], request["truth"], noise_seed=noise)
-    rice, form = request["compression"] == "rice", request["wcs"]
-    rows, files = fits_files.products(rendered, request["truth"], rice, form)
+        rendered = render.render(aim, source_rows, variant, request["seed"], request["truth"], noise_seed=noise)
+    rice, wcs_convention = request["compression"] == "rice", request["wcs"]
+    rows, files = fits_files.products(rendered, request["truth"], rice, wcs_convention)
     drawn = truth_table.truth(rendered)
     place = facts["exposure_id"], facts["detector"]
     files = {**files, truth_file(*place): lambda path: parquet.write(path, drawn, RENDERED_TRUTH)}
@@ -80,31 +97,31 @@ def work(lake: Path, facts: Json) -> Output:
         files[spectra_file(*place)] = lambda path: parquet.write(path, spectra, RENDERED_SPECTRA)
     if aim.channel.on_ground and rendered.psf is not None:
         model, exposure = rendered.psf, aim.exposure
-        beside = psf_file(exposure.exposure_id, exposure.channel, exposure.band, aim.detector.name)
-        files[beside] = lambda path: to_psfex.written(model, aim.detector, path)
+        psf_path = psf_file(exposure.exposure_id, exposure.channel, exposure.band, aim.detector.name)
+        files[psf_path] = lambda path: to_psfex.write(model, aim.detector, path)
     return Output(rows, files)
 
 
-def truth_work(lake: Path, facts: Json) -> Output:
+def read_truth(lake: Path, facts: Json) -> Output:
     """What was drawn on one detector, from beside its images."""
-    return _beside(lake, facts, truth_file)
+    return _read_sidecar(lake, facts, truth_file)
 
 
-def spectra_work(lake: Path, facts: Json) -> Output:
+def read_spectra(lake: Path, facts: Json) -> Output:
     """Where spectra lie on one detector, likewise."""
-    return _beside(lake, facts, spectra_file)
+    return _read_sidecar(lake, facts, spectra_file)
 
 
-def _beside(lake: Path, facts: Json, file_of: Callable[[int, str], str]) -> Output:
+def _read_sidecar(lake: Path, facts: Json, file_of: Callable[[int, str], str]) -> Output:
     products = read.version(lake, "products", facts["products"])
     (row, *_) = products.rows(["exposure_id", "detector"], [facts["part"]]).to_pylist()
-    return Output(products.beside(file_of(row["exposure_id"], row["detector"])))
+    return Output(products.read_sidecar(file_of(row["exposure_id"], row["detector"])))
 
 
 JOB = Job(
     "render_exposures",
     "Render every planned detector to FITS.",
     steps,
-    options=(("detectors", "only these of every exposure"),),
-    numbers=(("limit", "only the first so many of them, by exposure and detector"),),
+    list_options=(("detectors", "only these of every exposure"),),
+    integer_options=(("limit", "only the first so many of them, by exposure and detector"),),
 )

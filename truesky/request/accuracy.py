@@ -57,28 +57,28 @@ def preset(name: str) -> Accuracy:
 
 
 @cache
-def row_for(wanted: Accuracy) -> dict[str, float]:
+def fastest_row(allowed: Accuracy) -> dict[str, float]:
     """The row of accuracy.csv that takes the least time of those within an accuracy.
 
     A row is within it if its errors are, of the sources that it was chosen on and of the others (_held).
     Raises BadInput naming each number that is beyond reach, and the best there is: the last row's, in all four.
     """
     table = rows()
-    good = [row for row in table if all(_error(row, name) <= value for name, value in asdict(wanted).items())]
+    good = [row for row in table if all(_error(row, name) <= value for name, value in asdict(allowed).items())]
     if good:
         return min(good, key=lambda row: row["seconds"])
-    best = {name: _error(table[-1], name) for name in asdict(wanted)}
+    best = {name: _error(table[-1], name) for name in asdict(allowed)}
     lines = [
-        f"accuracy.{name} = {value:g} is beyond reach, the best is {_up(best[name])}"
-        for name, value in asdict(wanted).items()
+        f"accuracy.{name} = {value:g} is beyond reach, the best is {_round_up(best[name])}"
+        for name, value in asdict(allowed).items()
         if value < best[name]
     ]
     raise BadInput("; ".join(lines))
 
 
-def reached(wanted: Accuracy) -> Accuracy:
+def expected_errors(allowed: Accuracy) -> Accuracy:
     """Largest errors of drawing for an accuracy, of sources that its settings were not chosen on."""
-    row = row_for(wanted)
+    row = fastest_row(allowed)
     return Accuracy(**{item.name: row[f"{item.name}_held"] for item in fields(Accuracy)})
 
 
@@ -98,7 +98,7 @@ def _error(row: dict[str, float], name: str) -> float:
     return max(row[name], row[f"{name}_held"])
 
 
-def _up(value: float) -> str:
+def _round_up(value: float) -> str:
     """Two digits, rounded up: what is said to be the best can be asked for."""
     low = f"{value:.1e}"
     if float(low) >= value:

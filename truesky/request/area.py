@@ -17,14 +17,14 @@ from lake_schema.arrays import Bool, Float
 from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.sky.ecliptic import ecliptic, tile_corners, tile_count
-from truesky.numerics import sums
-from truesky.request.toml_values import Toml, boolean, checked_number, integer, number, pair, table_of
+from truesky.numerics import matrices
+from truesky.request.toml_values import Toml, as_table, boolean, checked_number, integer, number, number_pair
 
 _FORMS = ("polygon", "cone", "box", "tile", "patches", "wide")
 # The wide survey leaves out what lies nearer to the Galactic and the ecliptic plane, deg: limits that leave about the
 # 15 000 deg2 of Serrano et al. 2024 (adopted; its own region follows maps of stars, dust and zodiacal light).
 _GALACTIC_MIN, _ECLIPTIC_MIN = 30.0, 15.0
-_MOST_VERTICES, _MOST_PATCHES = 1000, 1000
+_MAX_VERTICES, _MAX_PATCHES = 1000, 1000
 _RA, _DEC = ("ra", -360.0, 360.0), ("dec", -90.0, 90.0)
 
 
@@ -46,12 +46,12 @@ class Area:
     def cells(self, order: int = GENERATION_ORDER) -> list[int]:
         """Nested cells of `order` that the area touches, ascending."""
         if self.wide:
-            every = np.arange(12 << (2 * order))
-            touched = self.contains(*sky.cell_centres(order, every), 2 * sky.cell_radius(order))
-            return [int(cell) for cell in every[touched]]
+            all_cells = np.arange(12 << (2 * order))
+            touched = self.contains(*sky.cell_centres(order, all_cells), 2 * sky.cell_radius(order))
+            return [int(cell) for cell in all_cells[touched]]
         if self.patches:
-            found = [sky.cells_in_cone(*patch, order) for patch in self.patches]
-            return [int(cell) for cell in np.unique(np.concatenate(found))]
+            patch_cells = [sky.cells_in_cone(*patch, order) for patch in self.patches]
+            return [int(cell) for cell in np.unique(np.concatenate(patch_cells))]
         if self.box is not None:
             return [int(cell) for cell in sky.cells_in_box(*self.box, order)]
         if self.vertices:
@@ -84,7 +84,7 @@ class Area:
             return _polygon_depth(self.vertices, lon, lat)
         return self.radius - sky.separation(lon, lat, self.ra, self.dec)
 
-    def bounds(self) -> tuple[float, float, float]:
+    def bounding_circle(self) -> tuple[float, float, float]:
         """ra, dec, radius of a circle that holds the area, deg."""
         if self.wide:
             return 0.0, 0.0, 180.0
@@ -110,10 +110,10 @@ def _polygon_depth(vertices: Sequence[tuple[float, float]], ra: Float, dec: Floa
     sides = np.cross(corners, np.roll(corners, -1, 0))
     sides /= np.sqrt(np.sum(sides**2, axis=1, keepdims=True))
     # Vertices may run either way round.
-    sides *= np.sign(sums.product(sides[0], corners[2]))
+    sides *= np.sign(matrices.matmul(sides[0], corners[2]))
     x, y = np.radians(ra), np.radians(dec)
     place = np.stack([np.cos(y) * np.cos(x), np.cos(y) * np.sin(x), np.sin(y)])
-    depth = np.degrees(np.arcsin(np.clip(sums.product(sides, place.reshape(3, -1)), -1.0, 1.0))).min(axis=0)
+    depth = np.degrees(np.arcsin(np.clip(matrices.matmul(sides, place.reshape(3, -1)), -1.0, 1.0))).min(axis=0)
     return np.asarray(depth.reshape(np.shape(ra)))
 
 
@@ -122,7 +122,7 @@ def _polygon_depth(vertices: Sequence[tuple[float, float]], ra: Float, dec: Floa
 
 def parse(table: Toml, path: str = "area") -> Area:
     """A parsed [area] -> Area; BadInput names the key."""
-    table = table_of(table, path, set(_FORMS))
+    table = as_table(table, path, set(_FORMS))
     if len(table) != 1:
         raise BadInput(f"{path} wants exactly one of {', '.join(_FORMS)}")
     readers = {
@@ -136,16 +136,16 @@ def parse(table: Toml, path: str = "area") -> Area:
     return readers[next(iter(table))]()
 
 
-def _cone(found: object, path: str) -> Area:
-    cone = table_of(found, path, {"ra", "dec", "radius"})
+def _cone(value: object, path: str) -> Area:
+    cone = as_table(value, path, {"ra", "dec", "radius"})
     ra = number(cone, f"{path}.ra", -360.0, 360.0) % 360.0
     return Area(ra=ra, dec=number(cone, f"{path}.dec", -90.0, 90.0), radius=number(cone, f"{path}.radius", 0.0, 180.0))
 
 
-def _box(found: object, path: str) -> Area:
-    box = table_of(found, path, {"ra", "dec"})
-    west, east = pair(box, f"{path}.ra", -360.0, 720.0)
-    south, north = pair(box, f"{path}.dec", -90.0, 90.0)
+def _box(value: object, path: str) -> Area:
+    box = as_table(value, path, {"ra", "dec"})
+    west, east = number_pair(box, f"{path}.ra", -360.0, 720.0)
+    south, north = number_pair(box, f"{path}.dec", -90.0, 90.0)
     # [350, 10] crosses 0.
     width = east - west + (360.0 if east < west else 0.0)
     if not 0.0 < width < 180.0:
@@ -155,8 +155,8 @@ def _box(found: object, path: str) -> Area:
     return Area(box=(west % 360.0, east % 360.0, south, north))
 
 
-def _polygon(found: object, path: str) -> Area:
-    vertices = tuple((ra, dec) for ra, dec in _places(found, path, 3, _MOST_VERTICES, _RA, _DEC))
+def _polygon(value: object, path: str) -> Area:
+    vertices = tuple((ra, dec) for ra, dec in _coordinate_lists(value, path, 3, _MAX_VERTICES, _RA, _DEC))
     try:
         sky.cells_in_polygon(vertices, 0)
     except BadInput as error:
@@ -168,27 +168,29 @@ def _tile(tile: int) -> Area:
     return Area(vertices=tuple((float(ra), float(dec)) for ra, dec in tile_corners(tile)))
 
 
-def _patches(found: object, path: str) -> Area:
-    circles = _places(found, path, 1, _MOST_PATCHES, _RA, _DEC, ("radius", 0.0, 90.0))
+def _patches(value: object, path: str) -> Area:
+    circles = _coordinate_lists(value, path, 1, _MAX_PATCHES, _RA, _DEC, ("radius", 0.0, 90.0))
     return Area(patches=tuple((ra, dec, radius) for ra, dec, radius in circles))
 
 
-def _places(found: object, path: str, least: int, most: int, *bounds: tuple[str, float, float]) -> list[list[float]]:
+def _coordinate_lists(
+    value: object, path: str, min_count: int, max_count: int, *bounds: tuple[str, float, float]
+) -> list[list[float]]:
     """A list of lists of numbers, right ascension first; bounds : name, from, to of each number."""
     form = f"[{', '.join(name for name, _, _ in bounds)}]"
-    if not isinstance(found, list) or not least <= len(found) <= most:
-        raise BadInput(f"{path} wants a list of {least} to {most} {form}")
+    if not isinstance(value, list) or not min_count <= len(value) <= max_count:
+        raise BadInput(f"{path} wants a list of {min_count} to {max_count} {form}")
     places = []
-    for i, place in enumerate(found):
+    for i, place in enumerate(value):
         if not isinstance(place, list) or len(place) != len(bounds):
             raise BadInput(f"{path}[{i}] wants {form}")
         numbers = zip(place, bounds, strict=True)
-        ra, *others = (checked_number(number, f"{path}[{i}].{name}", lo, hi) for number, (name, lo, hi) in numbers)
-        places.append([ra % 360.0, *others])
+        ra, *rest = (checked_number(number, f"{path}[{i}].{name}", lo, hi) for number, (name, lo, hi) in numbers)
+        places.append([ra % 360.0, *rest])
     return places
 
 
-def _wide(wanted: bool, path: str) -> Area:
-    if not wanted:
+def _wide(enabled: bool, path: str) -> Area:
+    if not enabled:
         raise BadInput(f"{path}.wide = false asks for nothing")
     return Area(wide=True)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from lake_schema.errors import BadInput
-from lake_schema.tables.exposures import CHOSEN_BY, EUCLID_BANDS
+from lake_schema.tables.exposures import EUCLID_BANDS, SELECTION_BANDS
 from truesky.request.observations import Observation
 from truesky.request.schema import Request
 
@@ -18,47 +18,47 @@ if TYPE_CHECKING:
     from lake_schema.mission.configuration import MissionConfiguration
 
 
-def of_request(request: Request, mission: MissionConfiguration) -> tuple[str, ...]:
+def requested_bands(request: Request, mission: MissionConfiguration) -> tuple[str, ...]:
     """Each passband once, in the order in which the request names them; then those in which sources are chosen.
 
     Errors : BadInput names the observation that asks for a band which its channels do not have
     """
-    found = [pointing.band for pointing in request.pointings]
+    bands = [pointing.band for pointing in request.pointings]
     for i, block in enumerate(request.observations):
         try:
-            found += of_block(block, mission)
+            bands += observation_bands(block, mission)
         except BadInput as error:
             raise BadInput(f"observation[{i}].bands: {error}") from None
-    return tuple(dict.fromkeys([*found, *_choosing(request)]))
+    return tuple(dict.fromkeys([*bands, *_selection_bands(request)]))
 
 
-def _choosing(request: Request) -> list[str]:
+def _selection_bands(request: Request) -> list[str]:
     """Passbands that no exposure need be taken in: sources are chosen by their fluxes in these."""
     channels = [pointing.channel for pointing in request.pointings]
     for block in request.observations:
         channels += block.channels if block.table is None else [channel for channel, _ in block.table.kinds]
-    return [CHOSEN_BY[channel] for channel in dict.fromkeys(channels) if channel in CHOSEN_BY]
+    return [SELECTION_BANDS[channel] for channel in dict.fromkeys(channels) if channel in SELECTION_BANDS]
 
 
-def of_block(block: Observation, mission: MissionConfiguration) -> tuple[str, ...]:
+def observation_bands(block: Observation, mission: MissionConfiguration) -> tuple[str, ...]:
     """Passbands in which an observation's exposures may be taken; BadInput names one that nothing of it has."""
     if block.table is not None:
         return block.table.bands
     if "EXT" in block.channels:
         rules = [row for row in mission.rows("survey.external") if row["survey"] == block.survey]
-        return _chosen(block.bands, [b for rule in rules for b in rule["bands"].split()], f"survey {block.survey}")
-    every = [b for channel in block.channels for b in EUCLID_BANDS[channel] if b != "nisp_blue" or block.blue]
-    chosen = _chosen(block.bands, every, ", ".join(block.channels))
+        return _select(block.bands, [b for rule in rules for b in rule["bands"].split()], f"survey {block.survey}")
+    available = [b for channel in block.channels for b in EUCLID_BANDS[channel] if b != "nisp_blue" or block.blue]
+    selected = _select(block.bands, available, ", ".join(block.channels))
     # A choice is one of filters: a channel of which none is named takes all of its own.
     return tuple(
         band
         for channel in block.channels
         for band in EUCLID_BANDS[channel]
-        if band in every and (band in chosen or not set(chosen) & set(EUCLID_BANDS[channel]))
+        if band in available and (band in selected or not set(selected) & set(EUCLID_BANDS[channel]))
     )
 
 
-def _chosen(wanted: Sequence[str], known: Sequence[str], who: str) -> tuple[str, ...]:
-    if unknown := [band for band in wanted if band not in known]:
-        raise BadInput(f"{who} has no band {unknown[0]!r} ({', '.join(known)})")
-    return tuple(band for band in known if not wanted or band in wanted)
+def _select(requested: Sequence[str], available: Sequence[str], owner: str) -> tuple[str, ...]:
+    if unknown := [band for band in requested if band not in available]:
+        raise BadInput(f"{owner} has no band {unknown[0]!r} ({', '.join(available)})")
+    return tuple(band for band in available if not requested or band in requested)

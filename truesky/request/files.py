@@ -20,13 +20,13 @@ from lake_schema import user_files
 from lake_schema.errors import BadInput
 from lake_schema.store import layout
 from lake_schema.store.provenance import file_sha256
-from truesky.request.toml_values import Toml, boolean, number, shown, string, strings, table_of
+from truesky.request.toml_values import Toml, as_table, boolean, number, quote_value, string, strings
 
 if TYPE_CHECKING:
     from lake_schema.mission.camera_folder import Camera
 
 # A kind of lake_schema.user_files.
-SOURCES = "table of sources"
+SOURCES_KIND = "table of sources"
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class Curves:
     files: tuple[Path, ...]
     format: str
     medium: str = ""
-    place: str = ""
+    location: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +98,7 @@ class Ingest:
 
 
 @dataclass(frozen=True, slots=True)
-class GivenSources:
+class UserSources:
     """Tables of the only sources that there are (truesky/catalogue/given_sources.py).
 
     band    : of their magnitudes
@@ -113,23 +113,25 @@ class GivenSources:
     def facts(self, bounds: tuple[float, float, float]) -> dict[str, Any]:
         """What tells these sources from others in the key of a plan; bounds : of the request's area."""
         files = {"galaxies": self.galaxies, "stars": self.stars}
-        sums = {name: file_sha256(_csv(file, f"sources.{name}")) for name, file in files.items() if file is not None}
+        checksums = {
+            name: file_sha256(_check_csv(file, f"sources.{name}")) for name, file in files.items() if file is not None
+        }
         grid = {"spacing": self.spacing, "bounds": list(bounds)} if self.spacing else {}
-        return {"sha256": sums, "band": self.band, **grid}
+        return {"sha256": checksums, "band": self.band, **grid}
 
 
-def _csv(file: Path, key: str) -> Path:
+def _check_csv(file: Path, key: str) -> Path:
     if file.suffix.lower() != ".csv":
-        raise BadInput(f"{key}: {user_files.shown(file)}: the ending is not .csv")
-    return user_files.checked(file, SOURCES, key)
+        raise BadInput(f"{key}: {user_files.format_path(file)}: the ending is not .csv")
+    return user_files.check_file(file, SOURCES_KIND, key)
 
 
-def file_of(folder: Path, name: str) -> Path:
+def resolve_path(folder: Path, name: str) -> Path:
     """A file by its name, found from the request's folder."""
-    return user_files.expanded(name, folder)
+    return user_files.expand_path(name, folder)
 
 
-def cameras(names: Sequence[str], folder: Path) -> tuple[Camera, ...]:
+def read_cameras(names: Sequence[str], folder: Path) -> tuple[Camera, ...]:
     """Read the folders of a user's own cameras.
 
     Parameters
@@ -154,22 +156,24 @@ def cameras(names: Sequence[str], folder: Path) -> tuple[Camera, ...]:
     # Reading units takes a second, which a request without cameras need not wait for.
     from lake_schema.mission import camera_folder
 
-    found: list[Camera] = []
+    user_cameras: list[Camera] = []
     for i, name in enumerate(names):
         try:
-            found.append(camera_folder.read(file_of(folder, name)))
+            user_cameras.append(camera_folder.read(resolve_path(folder, name)))
         except BadInput as error:
             raise BadInput(f"mission.cameras[{i}]: {error}") from None
-        if found[-1].name in [camera.name for camera in found[:-1]]:
-            raise BadInput(f"mission.cameras[{i}]: there are two cameras of the name {found[-1].name}")
-    return tuple(found)
+        if user_cameras[-1].name in [camera.name for camera in user_cameras[:-1]]:
+            raise BadInput(f"mission.cameras[{i}]: there are two cameras of the name {user_cameras[-1].name}")
+    return tuple(user_cameras)
 
 
 # By the ending of a file: a key of truesky/fluxes/libraries/spectrum_formats.toml.
 _CURVE_FORMATS = {".ecsv": "passband_ecsv", ".xml": "passband_svo", ".vot": "passband_svo"}
 
 
-def with_cameras(given: UserCurves, own: Sequence[Camera], bands: Collection[str]) -> UserCurves:
+def with_camera_passbands(
+    user_curves: UserCurves, user_cameras: Sequence[Camera], bands: Collection[str]
+) -> UserCurves:
     """Add the passbands of a user's cameras that a request observes in.
 
     Parameters
@@ -191,53 +195,59 @@ def with_cameras(given: UserCurves, own: Sequence[Camera], bands: Collection[str
     BadInput
         If two passbands have one name.
     """
-    found = dict(given.passbands)
-    every = [(i, curve) for i, camera in enumerate(own) for curve in camera.curves if curve.band in bands]
-    for i, curve in every:
-        place = f"mission.cameras[{i}]: {curve.place}"
+    passbands = dict(user_curves.passbands)
+    camera_curves = [
+        (i, curve) for i, camera in enumerate(user_cameras) for curve in camera.curves if curve.band in bands
+    ]
+    for i, curve in camera_curves:
+        location = f"mission.cameras[{i}]: {curve.location}"
         form = _CURVE_FORMATS.get(curve.file.suffix.lower(), "passband_ascii")
-        if curve.band in found:
-            other = found[curve.band].place or f"fluxes.passbands.{curve.band}"
-            what = f"band {curve.band} has another curve in {other}: all curves of a request have different names"
-            raise BadInput(f"{place}: {what}")
-        found[curve.band] = Curves((curve.file,), form, curve.medium, place)
-    return replace(given, passbands=tuple(found.items()))
+        if curve.band in passbands:
+            other = passbands[curve.band].location or f"fluxes.passbands.{curve.band}"
+            problem = f"band {curve.band} has another curve in {other}: all curves of a request have different names"
+            raise BadInput(f"{location}: {problem}")
+        passbands[curve.band] = Curves((curve.file,), form, curve.medium, location)
+    return replace(user_curves, passbands=tuple(passbands.items()))
 
 
-def curves(table: Toml, folder: Path) -> UserCurves:
+def parse_curves(table: Toml, folder: Path) -> UserCurves:
     """The section `fluxes`; files are found from `folder`.  BadInput names the key."""
-    filters = table_of(table.get("passbands", {}), "fluxes.passbands", None)
-    laws = table_of(table.get("extinction", {}), "fluxes.extinction", set("1234"))
-    passbands = [_curves(value, f"fluxes.passbands.{layout.name(key)}", folder, True) for key, value in filters.items()]
+    filters = as_table(table.get("passbands", {}), "fluxes.passbands", None)
+    laws = as_table(table.get("extinction", {}), "fluxes.extinction", set("1234"))
+    passbands = [
+        _curves(value, f"fluxes.passbands.{layout.check_name(key)}", folder, True) for key, value in filters.items()
+    ]
     extinction = [_curves(value, f"fluxes.extinction.{key}", folder) for key, value in laws.items()]
     templates = None
     if "templates" in table:
         path = "fluxes.templates"
-        given = table_of(table["templates"], path, {"files", "format"})
-        files = strings(given, f"{path}.files", distinct=False)
+        templates_table = as_table(table["templates"], path, {"files", "format"})
+        files = strings(templates_table, f"{path}.files", distinct=False)
         if not files:
             raise BadInput(f"{path}.files is missing")
-        templates = Curves(tuple(file_of(folder, file) for file in files), string(given, f"{path}.format"))
-    stars = table_of(table.get("stars", {}), "fluxes.stars", {"basel", "irtf"})
+        templates = Curves(
+            tuple(resolve_path(folder, file) for file in files), string(templates_table, f"{path}.format")
+        )
+    stars = as_table(table.get("stars", {}), "fluxes.stars", {"basel", "irtf"})
     if "stars" in table and not stars:
         raise BadInput("fluxes.stars names neither basel nor irtf")
     return UserCurves(
         tuple(zip(filters, passbands, strict=True)),
         templates,
         tuple(zip(map(int, laws), extinction, strict=True)),
-        file_of(folder, string(stars, "fluxes.stars.basel")) if "basel" in stars else None,
-        tuple(file_of(folder, name) for name in strings(stars, "fluxes.stars.irtf")),
+        resolve_path(folder, string(stars, "fluxes.stars.basel")) if "basel" in stars else None,
+        tuple(resolve_path(folder, name) for name in strings(stars, "fluxes.stars.irtf")),
         boolean(table, "fluxes.intergalactic", False),
     )
 
 
 def _curves(value: object, path: str, folder: Path, has_medium: bool = False) -> Curves:
-    table = table_of(value, path, {"file", "format", *(["medium"] if has_medium else [])})
+    table = as_table(value, path, {"file", "format", *(["medium"] if has_medium else [])})
     medium = string(table, f"{path}.medium", ("air", "vacuum")) if has_medium else ""
-    return Curves((file_of(folder, string(table, f"{path}.file")),), string(table, f"{path}.format"), medium)
+    return Curves((resolve_path(folder, string(table, f"{path}.file")),), string(table, f"{path}.format"), medium)
 
 
-def ingest(table: Toml, folder: Path) -> Ingest:
+def parse_ingest(table: Toml, folder: Path) -> Ingest:
     """The section `ingest`; files are found from `folder`.  BadInput names the key."""
     galaxies = _catalogue(table["galaxies"], "ingest.galaxies", folder) if "galaxies" in table else None
     halos, training = (
@@ -249,34 +259,34 @@ def ingest(table: Toml, folder: Path) -> Ingest:
         raise BadInput("ingest.training: the galaxies of a finished catalogue have their own spectra")
     dust = None
     if "dust" in table:
-        given = table_of(table["dust"], "ingest.dust", set(DustMap.__slots__))
+        dust_table = as_table(table["dust"], "ingest.dust", set(DustMap.__slots__))
         dust = DustMap(
-            file_of(folder, string(given, "ingest.dust.file")),
-            string(given, "ingest.dust.column"),
-            string(given, "ingest.dust.quantity", ("ebv", "a_v"), "ebv"),
-            string(given, "ingest.dust.ordering", ("RING", "NESTED"), "RING") if "ordering" in given else "",
-            string(given, "ingest.dust.coordinates", ("G", "C"), "G") if "coordinates" in given else "",
+            resolve_path(folder, string(dust_table, "ingest.dust.file")),
+            string(dust_table, "ingest.dust.column"),
+            string(dust_table, "ingest.dust.quantity", ("ebv", "a_v"), "ebv"),
+            string(dust_table, "ingest.dust.ordering", ("RING", "NESTED"), "RING") if "ordering" in dust_table else "",
+            string(dust_table, "ingest.dust.coordinates", ("G", "C"), "G") if "coordinates" in dust_table else "",
         )
     return Ingest(galaxies, halos, training, dust)
 
 
-def psfs(table: Toml, folder: Path) -> tuple[tuple[str, str], ...]:
+def parse_psfs(table: Toml, folder: Path) -> tuple[tuple[str, str], ...]:
     """The section `psf`: (band, file), found from `folder`; a band once for each file of a list.
 
     Errors : BadInput names the key
     """
-    found = []
+    band_files = []
     for band in sorted(table):
         path = f"psf.{band}"
-        several = isinstance(table[band], list)
-        names = strings(table, path) if several else (string(table, path),)
+        is_list = isinstance(table[band], list)
+        names = strings(table, path) if is_list else (string(table, path),)
         if not names:
             raise BadInput(f"{path} names no file")
-        found += [(layout.name(band), str(file_of(folder, name))) for name in names]
-    return tuple(found)
+        band_files += [(layout.check_name(band), str(resolve_path(folder, name))) for name in names]
+    return tuple(band_files)
 
 
-def sources(table: Toml, folder: Path) -> GivenSources | None:
+def parse_sources(table: Toml, folder: Path) -> UserSources | None:
     """The section `sources`; files are found from `folder`.  BadInput names the key."""
     if not table:
         return None
@@ -284,28 +294,30 @@ def sources(table: Toml, folder: Path) -> GivenSources | None:
     if "spacing" in table and not grid:
         raise BadInput('sources.spacing wants only = "grid": the sources of a table have places of their own')
     spacing = number(table, "sources.spacing", 0.01, 3600.0) if grid else 0.0
-    files = {name: file_of(folder, string(table, f"sources.{name}")) for name in ("galaxies", "stars") if name in table}
+    files = {
+        name: resolve_path(folder, string(table, f"sources.{name}")) for name in ("galaxies", "stars") if name in table
+    }
     if not files:
         raise BadInput("sources names neither galaxies nor stars")
     band = string(table, "sources.band", default="euclid_vis")
-    return GivenSources(files.get("galaxies"), files.get("stars"), band, spacing)
+    return UserSources(files.get("galaxies"), files.get("stars"), band, spacing)
 
 
 def _catalogue(value: object, path: str, folder: Path) -> Catalogue:
-    table = table_of(value, path, {"files", "columns", *(["format"] if path.endswith("galaxies") else [])})
+    table = as_table(value, path, {"files", "columns", *(["format"] if path.endswith("galaxies") else [])})
     files = strings(table, f"{path}.files")
     if not files:
         raise BadInput(f"{path}.files is missing or empty")
-    columns = table_of(table.get("columns", {}), f"{path}.columns", None)
+    columns = as_table(table.get("columns", {}), f"{path}.columns", None)
     return Catalogue(
-        tuple(file_of(folder, name) for name in files),
+        tuple(resolve_path(folder, name) for name in files),
         string(table, f"{path}.format", default=""),
-        tuple((key, _json(columns[key], f"{path}.columns.{key}")) for key in sorted(columns)),
+        tuple((key, _to_json(columns[key], f"{path}.columns.{key}")) for key in sorted(columns)),
     )
 
 
-def _json(value: object, path: str) -> str:
+def _to_json(value: object, path: str) -> str:
     try:
         return json.dumps(value, sort_keys=True, allow_nan=False)
     except (TypeError, ValueError):
-        raise BadInput(f"{path} wants texts, numbers and tables, got {shown(value)}") from None
+        raise BadInput(f"{path} wants texts, numbers and tables, got {quote_value(value)}") from None

@@ -82,25 +82,25 @@ from lake_schema import user_files
 from lake_schema.errors import BadInput
 from lake_schema.store import layout
 from truesky.request import area as areas
-from truesky.request import bands as passbands
+from truesky.request import bands as request_bands
 from truesky.request import checks, files, observations, structure
-from truesky.request.accuracy import SURVEY, Accuracy, preset, row_for
+from truesky.request.accuracy import SURVEY, Accuracy, fastest_row, preset
 from truesky.request.area import Area
-from truesky.request.files import GivenSources
+from truesky.request.files import UserSources
 from truesky.request.schema import (
-    ALWAYS,
+    ALWAYS_ON,
     BOX_CELLS,
     COMPRESSIONS,
-    CONVENTIONS,
-    DENSITIES,
+    DENSITY_MODELS,
     EFFECTS,
-    FILES,
+    FILE_LAYOUTS,
     LADDER,
     LENSING_NSIDES,
-    MOST_SHEAR,
+    MAX_SHEAR,
     READOUTS,
     STATUSES,
-    TRUTH,
+    TRUTH_CONTENTS,
+    WCS_CONVENTIONS,
     Effects,
     MissionChoice,
     Override,
@@ -109,31 +109,31 @@ from truesky.request.schema import (
     Universe,
 )
 from truesky.request.toml_values import Toml
+from truesky.request.toml_values import as_table as _as_table
 from truesky.request.toml_values import boolean as _boolean
+from truesky.request.toml_values import check_keys as _check_keys
 from truesky.request.toml_values import checked_number as _checked_number
-from truesky.request.toml_values import choice as _choice
 from truesky.request.toml_values import integer as _integer
-from truesky.request.toml_values import known as _known
+from truesky.request.toml_values import integer_choice as _integer_choice
 from truesky.request.toml_values import number as _number
-from truesky.request.toml_values import optional as _optional
+from truesky.request.toml_values import optional_number as _optional_number
+from truesky.request.toml_values import quote_value as _quote_value
+from truesky.request.toml_values import required_value as _required_value
 from truesky.request.toml_values import section as _section
-from truesky.request.toml_values import shown as _shown
 from truesky.request.toml_values import string as _string
 from truesky.request.toml_values import strings as _strings
-from truesky.request.toml_values import table_of as _table
-from truesky.request.toml_values import value as _value
 
 __all__ = ["Area", "Override", "Request", "parse"]
 
-_MOST_VARIANTS = 10_000
-_LARGEST_SEED = 2**63 - 1
+_MAX_VARIANTS = 10_000
+_MAX_SEED = 2**63 - 1
 _ALL = "all"
 _SECTIONS = (
     "area", "universe", "stars", "ingest", "sources", "strong_lenses", "structure", "mission", "fluxes",
     "psf", "solar_system", "effects", "explore", "products",
 )  # fmt: skip
 # A request's tables are a schema of its name in SQL (truesky/explore), where these have a meaning of their own.
-_TAKEN = ("information_schema", "main", "memory", "pg_catalog", "system", "temp")
+_RESERVED_NAMES = ("information_schema", "main", "memory", "pg_catalog", "system", "temp")
 
 
 def parse(path: Path) -> Request:
@@ -142,67 +142,73 @@ def parse(path: Path) -> Request:
     Errors : BadInput, one line that names the file and the key
     """
     try:
-        table = user_files.toml(path, "request")
+        table = user_files.read_toml(path, "request")
     except BadInput as error:
         raise BadInput(f"request {error}") from None
     try:
         return from_table(table, path.resolve().parent)
     except BadInput as error:
-        raise BadInput(f"request {user_files.shown(path)}: {error}") from None
+        raise BadInput(f"request {user_files.format_path(path)}: {error}") from None
 
 
 def _name(table: Toml) -> str:
-    found = layout.name(_string(table, "name"))
-    if found in _TAKEN:
-        raise BadInput(f"name = {found!r} has a meaning of its own in SQL, with {', '.join(_TAKEN)}: take another")
-    return found
+    name = layout.check_name(_string(table, "name"))
+    if name in _RESERVED_NAMES:
+        raise BadInput(
+            f"name = {name!r} has a meaning of its own in SQL, with {', '.join(_RESERVED_NAMES)}: take another"
+        )
+    return name
 
 
 def from_table(table: Toml, folder: Path = Path()) -> Request:
     """A parsed TOML table -> Request; files are found from `folder`.  BadInput names the key."""
-    _known(table, "", {"name", "seed", "noise_seed", "accuracy", "pointing", "observation", *_SECTIONS})
-    asked, blocks = observations.pointings(table), observations.observations(table, folder)
+    _check_keys(table, "", {"name", "seed", "noise_seed", "accuracy", "pointing", "observation", *_SECTIONS})
+    pointings, blocks = observations.parse_pointings(table), observations.parse_observations(table, folder)
     fluxes = _section(table, "fluxes", {"bands", "intergalactic", "passbands", "templates", "stars", "extinction"})
     bands = _strings(fluxes, "fluxes.bands")
     mission = _mission(_section(table, "mission", {"ladder", "overrides", "cameras"}), folder)
-    named = {*bands, *(pointing.band for pointing in asked), *(b for o in blocks if o.table for b in o.table.bands)}
-    curves = files.with_cameras(files.curves(fluxes, folder), mission.cameras, named)
-    products_ = _section(table, "products", {"truth", "compression", "wcs", "files", "readout"})
+    named_bands = {
+        *bands,
+        *(pointing.band for pointing in pointings),
+        *(b for o in blocks if o.table for b in o.table.bands),
+    }
+    curves = files.with_camera_passbands(files.parse_curves(fluxes, folder), mission.cameras, named_bands)
+    products_table = _section(table, "products", {"truth", "compression", "wcs", "files", "readout"})
     solar_system = _section(table, "solar_system", {"bodies"})
-    bodies = files.file_of(folder, _string(solar_system, "solar_system.bodies")) if solar_system else None
+    bodies = files.resolve_path(folder, _string(solar_system, "solar_system.bodies")) if solar_system else None
     universe = _universe(_section(table, "universe", set(Universe.__slots__)))
     request = Request(
         name=_name(table),
-        seed=_integer(table, "seed", 0, _LARGEST_SEED),
+        seed=_integer(table, "seed", 0, _MAX_SEED),
         accuracy=_accuracy(table.get("accuracy"), "accuracy"),
         area=areas.parse(_section(table, "area", None)),
         universe=universe,
         stars=_stars(_section(table, "stars", set(Stars.__slots__) - {"columns"}), folder, universe.star_limit),
         mission=mission,
         bands=bands,
-        pointings=asked,
-        truth=_truth(products_),
-        compression=_string(products_, "products.compression", COMPRESSIONS, "none"),
-        wcs=_string(products_, "products.wcs", CONVENTIONS) if "wcs" in products_ else None,
-        files=_string(products_, "products.files", FILES, "detector"),
-        readout=_string(products_, "products.readout", READOUTS, "raw"),
+        pointings=pointings,
+        truth=_truth(products_table),
+        compression=_string(products_table, "products.compression", COMPRESSIONS, "none"),
+        wcs=_string(products_table, "products.wcs", WCS_CONVENTIONS) if "wcs" in products_table else None,
+        files=_string(products_table, "products.files", FILE_LAYOUTS, "detector"),
+        readout=_string(products_table, "products.readout", READOUTS, "raw"),
         curves=curves,
         observations=blocks,
         effects=_effects(_section(table, "effects", {"on", "off"})),
         explore=_explore(_section(table, "explore", None)),
-        ingest=files.ingest(_section(table, "ingest", {"galaxies", "halos", "training", "dust"}), folder),
+        ingest=files.parse_ingest(_section(table, "ingest", {"galaxies", "halos", "training", "dust"}), folder),
         bodies=bodies,
-        sources=files.sources(_section(table, "sources", {"only", *GivenSources.__slots__}), folder),
+        sources=files.parse_sources(_section(table, "sources", {"only", *UserSources.__slots__}), folder),
         structure=structure.parse(_section(table, "structure", set(structure.Structure.__slots__)), folder),
-        noise_seed=_integer(table, "noise_seed", 0, _LARGEST_SEED) if "noise_seed" in table else None,
-        psfs=files.psfs(_section(table, "psf", None), folder),
+        noise_seed=_integer(table, "noise_seed", 0, _MAX_SEED) if "noise_seed" in table else None,
+        psfs=files.parse_psfs(_section(table, "psf", None), folder),
         strong_lens_boost=_number(_section(table, "strong_lenses", {"boost"}), "strong_lenses.boost", 1e-3, 1e5, 1.0),
     )
     checks.check_sources(request)
     checks.check_bands(request)
-    found = passbands.of_request(request, checks.check_mission(request))
-    own = (name for name, _ in curves.passbands)
-    return replace(request, bands=tuple(dict.fromkeys((*(bands or found), *own))))
+    default_bands = request_bands.requested_bands(request, checks.check_mission(request))
+    user_bands = (name for name, _ in curves.passbands)
+    return replace(request, bands=tuple(dict.fromkeys((*(bands or default_bands), *user_bands))))
 
 
 # ------------------------------------------------------------------------------------------------ sections
@@ -213,11 +219,11 @@ def _accuracy(value: object, path: str) -> Accuracy:
         return SURVEY
     if isinstance(value, str):
         return preset(value)
-    table = _table(value, path, {"flux", "shape", "position", "background"})
-    own = Accuracy(**{key: _number(table, f"{path}.{key}", 1e-12, 1.0) for key in Accuracy.__slots__})
+    table = _as_table(value, path, {"flux", "shape", "position", "background"})
+    accuracy = Accuracy(**{key: _number(table, f"{path}.{key}", 1e-12, 1.0) for key in Accuracy.__slots__})
     # What cannot be had is refused before anything is made.
-    row_for(own)
-    return own
+    fastest_row(accuracy)
+    return accuracy
 
 
 def _universe(table: Toml) -> Universe:
@@ -227,10 +233,10 @@ def _universe(table: Toml) -> Universe:
         galaxy_band=_string(table, "universe.galaxy_band", default=default.galaxy_band),
         star_limit=_number(table, "universe.star_limit", 0.0, 30.0, default.star_limit),
         z_max=_number(table, "universe.z_max", 0.01, 6.0, default.z_max),
-        box_cells=_choice(table, "universe.box_cells", BOX_CELLS, default.box_cells),
+        box_cells=_integer_choice(table, "universe.box_cells", BOX_CELLS, default.box_cells),
         high_redshift_boost=_number(table, "universe.high_redshift_boost", 0.0, 1e5, default.high_redshift_boost),
         quasar_boost=_number(table, "universe.quasar_boost", 0.0, 1e5, default.quasar_boost),
-        lensing_nside=_choice(table, "universe.lensing_nside", LENSING_NSIDES, default.lensing_nside),
+        lensing_nside=_integer_choice(table, "universe.lensing_nside", LENSING_NSIDES, default.lensing_nside),
         lensing=_lensing(table.get("lensing", "box")),
         alignment=_number(table, "universe.alignment", 0.0, 10.0, default.alignment),
         rotation=_number(table, "universe.rotation", -360.0, 360.0, default.rotation),
@@ -242,27 +248,29 @@ def _lensing(value: object) -> tuple[float, float] | None:
     path = "universe.lensing"
     if isinstance(value, str):
         return None if _string({"lensing": value}, path, ("box", "none")) == "box" else (0.0, 0.0)
-    table = _table(value, path, {"g1", "g2"})
+    table = _as_table(value, path, {"g1", "g2"})
     g1, g2 = (_number(table, f"{path}.{key}", -1.0, 1.0) for key in ("g1", "g2"))
-    if (size := math.hypot(g1, g2)) > MOST_SHEAR:
-        raise BadInput(f"{path} = {_shown(value)}: |g| = {size:.4g}, images are ellipses up to {MOST_SHEAR}")
+    if (size := math.hypot(g1, g2)) > MAX_SHEAR:
+        raise BadInput(f"{path} = {_quote_value(value)}: |g| = {size:.4g}, images are ellipses up to {MAX_SHEAR}")
     return g1, g2
 
 
 def _stars(table: Toml, folder: Path, star_limit: float) -> Stars:
     default = Stars()
-    bright_limit = _optional(table, "stars.bright_limit", -10.0, 30.0)
+    bright_limit = _optional_number(table, "stars.bright_limit", -10.0, 30.0)
     if bright_limit is not None and bright_limit >= star_limit:
         raise BadInput(f"stars.bright_limit = {bright_limit:g} leaves no star up to star_limit = {star_limit:g}")
     rows = _integer(table, "stars.rows_a_file", 1, 3_000_000) if "rows_a_file" in table else default.rows_a_file
     plane_limit = _number(table, "stars.plane_limit", 0.0, 30.0, math.nan)
-    given = _table(table.get("catalogue", {}), "stars.catalogue", {"file", "columns"})
-    columns = _table(given.get("columns", {}), "stars.catalogue.columns", None)
+    catalogue_table = _as_table(table.get("catalogue", {}), "stars.catalogue", {"file", "columns"})
+    columns = _as_table(catalogue_table.get("columns", {}), "stars.catalogue.columns", None)
     return Stars(
-        density=_string(table, "stars.density", DENSITIES) if "density" in table else default.density,
+        density=_string(table, "stars.density", DENSITY_MODELS) if "density" in table else default.density,
         brown_dwarf_boost=_number(table, "stars.brown_dwarf_boost", 0.0, 1e4, default.brown_dwarf_boost),
-        tycho2=tuple(files.file_of(folder, name) for name in _strings(table, "stars.tycho2")),
-        catalogue=files.file_of(folder, _string(given, "stars.catalogue.file")) if given else None,
+        tycho2=tuple(files.resolve_path(folder, name) for name in _strings(table, "stars.tycho2")),
+        catalogue=files.resolve_path(folder, _string(catalogue_table, "stars.catalogue.file"))
+        if catalogue_table
+        else None,
         columns=tuple((key, _string(columns, f"stars.catalogue.columns.{key}")) for key in sorted(columns)),
         plane_limit=None if math.isnan(plane_limit) else plane_limit,
         bright_limit=bright_limit,
@@ -272,34 +280,34 @@ def _stars(table: Toml, folder: Path, star_limit: float) -> Stars:
 
 def _mission(table: Toml, folder: Path) -> MissionChoice:
     ladder = _strings(table, "mission.ladder", STATUSES) or LADDER
-    overrides = _table(table.get("overrides", {}), "mission.overrides", None)
+    overrides = _as_table(table.get("overrides", {}), "mission.overrides", None)
     chosen = tuple(sorted((key, _override(value, key)) for key, value in overrides.items()))
-    return MissionChoice(ladder, chosen, files.cameras(_strings(table, "mission.cameras"), folder))
+    return MissionChoice(ladder, chosen, files.read_cameras(_strings(table, "mission.cameras"), folder))
 
 
 def _override(value: object, key: str) -> Override:
     path = f"mission.overrides.{key}"
-    table = _table(value, path, {"value", "unit"})
+    table = _as_table(value, path, {"value", "unit"})
     return Override(_number(table, f"{path}.value", -math.inf, math.inf), _string(table, f"{path}.unit"))
 
 
 def _truth(table: Toml) -> tuple[str, ...]:
-    return _strings(table, "products.truth", TRUTH)
+    return _strings(table, "products.truth", TRUTH_CONTENTS)
 
 
 def _effects(table: Toml) -> Effects:
     on, off = _strings(table, "effects.on", EFFECTS), _strings(table, "effects.off", (_ALL, *EFFECTS))
     if off == (_ALL,):
-        return Effects(on, tuple(name for name in EFFECTS if name not in (*ALWAYS, *on)))
+        return Effects(on, tuple(name for name in EFFECTS if name not in (*ALWAYS_ON, *on)))
     if _ALL in off:
         raise BadInput("effects.off: 'all' stands alone")
-    if both := sorted(set(on) & set(off)):
-        raise BadInput(f"effects: {both[0]!r} is both on and off")
+    if conflicts := sorted(set(on) & set(off)):
+        raise BadInput(f"effects: {conflicts[0]!r} is both on and off")
     return Effects(on, off)
 
 
 def _explore(table: Toml) -> tuple[tuple[str, tuple[str, ...]], ...]:
-    found, count = [], 1
+    explored, count = [], 1
     for key in sorted(table):
         values = _choices(key, table[key])
         if not values:
@@ -307,24 +315,24 @@ def _explore(table: Toml) -> tuple[tuple[str, tuple[str, ...]], ...]:
         if len(set(values)) != len(values):
             raise BadInput(f"explore.{key} names a value twice")
         count *= len(values)
-        if count > _MOST_VARIANTS:
-            raise BadInput(f"explore.{key}: the product of the values is more than {_MOST_VARIANTS} requests")
-        found.append((key, values))
-    return tuple(found)
+        if count > _MAX_VARIANTS:
+            raise BadInput(f"explore.{key}: the product of the values is more than {_MAX_VARIANTS} requests")
+        explored.append((key, values))
+    return tuple(explored)
 
 
 def _choices(key: str, value: object) -> tuple[str, ...]:
     """The values of one explored parameter, as JSON."""
     path = f"explore.{key}"
     if key != "accuracy" and not key.startswith("effects."):
-        table = _table(value, path, {"values", "unit"})
-        unit, numbers = _string(table, f"{path}.unit"), _value(table, f"{path}.values")
+        table = _as_table(value, path, {"values", "unit"})
+        unit, numbers = _string(table, f"{path}.unit"), _required_value(table, f"{path}.values")
         if not isinstance(numbers, list):
-            raise BadInput(f"{path}.values wants a list of numbers, got {_shown(numbers)}")
+            raise BadInput(f"{path}.values wants a list of numbers, got {_quote_value(numbers)}")
         checked = [_checked_number(n, f"{path}.values[{i}]", -math.inf, math.inf) for i, n in enumerate(numbers)]
         return tuple(json.dumps([number, unit]) for number in checked)
     if not isinstance(value, list):
-        raise BadInput(f"{path} wants a list, got {_shown(value)}")
+        raise BadInput(f"{path} wants a list, got {_quote_value(value)}")
     if key == "accuracy":
         return tuple(json.dumps(asdict(_accuracy(item, f"{path}[{i}]"))) for i, item in enumerate(value))
     if key.removeprefix("effects.") not in EFFECTS:

@@ -18,25 +18,25 @@ from truesky.request.area import Area
 from truesky.request.pointing_tables import CHANNELS, IMAGE_TYPES, Contents
 from truesky.request.toml_values import (
     Toml,
+    as_table,
     boolean,
     checked_number,
-    has,
+    has_key,
     integer,
     number,
-    optional,
+    optional_number,
+    quote_value,
     section,
-    shown,
     string,
     strings,
-    table_of,
-    tables,
+    table_list,
 )
 
-_MOST_POINTINGS, _MOST_OBSERVATIONS, _MOST_REALISATIONS = 100_000, 1000, 10_000
+_MAX_POINTINGS, _MAX_OBSERVATIONS, _MAX_REALISATIONS = 100_000, 1000, 10_000
 # Frames of a sequence whose parameter is listed.
-_MOST_VALUES = 1000
+_MAX_VALUES = 1000
 # Dithers of an observation's own: how many, and how far from its place, arcsec.
-_MOST_DITHERS, _FARTHEST = 1000, 36_000.0
+_MAX_DITHERS, _MAX_OFFSET = 1000, 36_000.0
 DITHERS = ("S", "J", "none")
 EUCLID_SURVEYS = ("wide", "deep", "edf_north", "edf_south", "edf_fornax")
 GROUND_SURVEYS = ("des", "lsst", "cfis", "jedis", "ps1", "wishes", "whigs")
@@ -53,23 +53,23 @@ _CALIBRATIONS = {
 }  # fmt: skip
 _SKY_TYPES = ("science", "deep")
 # Kinds of block, as messages call them.
-_SURVEY, _OWN = "fields of a Euclid survey", "a Euclid field at ra, dec"
-_GROUND, _GROUND_OWN = "a ground survey's pattern", "a ground camera's field at ra, dec"
+_SURVEY, _USER_FIELD = "fields of a Euclid survey", "a Euclid field at ra, dec"
+_GROUND, _GROUND_USER_FIELD = "a ground survey's pattern", "a ground camera's field at ra, dec"
 _TIMED, _UNTIMED = "dark and flat frames", "bias, charge_injection and trap_pumping frames"
 _DITHERED, _TABLE = "calibrations on the sky", "a table of pointings"
 _CALIBRATION = (_TIMED, _UNTIMED, _DITHERED)
 # The kinds that use a key; a key that is not here is used by all. EXT always has a survey, for its camera.
-_USERS = {
+_BLOCKS_OF_KEY = {
     "survey": (_SURVEY, _TABLE),
     "area": (_SURVEY, _GROUND, *_CALIBRATION),
     "fields": (_SURVEY,),
-    "visits": (_SURVEY, _OWN),
-    "exposures": (_GROUND, _GROUND_OWN, *_CALIBRATION),
-    "dither": (_SURVEY, _OWN, _GROUND_OWN),
-    "short": (_SURVEY, _OWN),
-    "flat": (_SURVEY, _OWN),
-    "blue": (_SURVEY, _OWN),
-    "bands": (_SURVEY, _OWN, _GROUND, _GROUND_OWN, *_CALIBRATION),
+    "visits": (_SURVEY, _USER_FIELD),
+    "exposures": (_GROUND, _GROUND_USER_FIELD, *_CALIBRATION),
+    "dither": (_SURVEY, _USER_FIELD, _GROUND_USER_FIELD),
+    "short": (_SURVEY, _USER_FIELD),
+    "flat": (_SURVEY, _USER_FIELD),
+    "blue": (_SURVEY, _USER_FIELD),
+    "bands": (_SURVEY, _USER_FIELD, _GROUND, _GROUND_USER_FIELD, *_CALIBRATION),
     "lamps": (_TIMED,),
     "phase_times_s": (_UNTIMED,),
     "defocus_nm": (_DITHERED,),
@@ -78,13 +78,13 @@ _USERS = {
     "intensities": (_TIMED,),
     "delays_s": (_TIMED,),
     "bright": (_TIMED,),
-    "macc": (_SURVEY, _OWN, _TIMED, _DITHERED, _TABLE),
-    "exposure_time_s": (_GROUND, _GROUND_OWN, _TIMED, _DITHERED, _TABLE),
+    "macc": (_SURVEY, _USER_FIELD, _TIMED, _DITHERED, _TABLE),
+    "exposure_time_s": (_GROUND, _GROUND_USER_FIELD, _TIMED, _DITHERED, _TABLE),
 }
 # Exposures that only one channel has.
-_CHANNELS_OF = {"short": ("VIS",), "flat": ("VIS",), "blue": ("NISP-S",), "macc": ("NISP-P", "NISP-S")}
+_CHANNELS_OF_KEY = {"short": ("VIS",), "flat": ("VIS",), "blue": ("NISP-S",), "macc": ("NISP-P", "NISP-S")}
 # Image types that a key of calibrations is for.
-_TYPES_OF = {
+_TYPES_OF_KEY = {
     "lamps": ("flat", "persistence"),
     "intensities": ("flat", "persistence"),
     "delays_s": ("persistence",),
@@ -95,7 +95,7 @@ _TYPES_OF = {
     "distance_deg": ("stray_light",),
 }
 # What is bright before darks that show what it left.
-BRIGHT = ("flat", "sky")
+BRIGHT_TYPES = ("flat", "sky")
 # LEDs of a calibration unit. A copy, since requests are read below the renderer (test_survey.py holds it to the lamps).
 LAMPS = {"VIS": 6, "NISP-P": 5, "NISP-S": 5}
 
@@ -183,47 +183,47 @@ class Observation:
     distance_deg: float | None = None
     intensities: tuple[float, ...] = ()
     delays_s: tuple[float, ...] = ()
-    bright: str = BRIGHT[0]
+    bright: str = BRIGHT_TYPES[0]
 
     @property
-    def place(self) -> tuple[float, float] | None:
+    def field_centre(self) -> tuple[float, float] | None:
         """ra, dec deg of the observation's own field, None where it has none."""
         return None if self.ra is None or self.dec is None else (self.ra, self.dec)
 
 
-def pointings(table: Toml) -> tuple[Pointing, ...]:
+def parse_pointings(table: Toml) -> tuple[Pointing, ...]:
     """Of a request's table.  BadInput names the key."""
-    found = tables(table, "pointing", _MOST_POINTINGS)
-    return tuple(_pointing(value, f"pointing[{i}]") for i, value in enumerate(found))
+    entries = table_list(table, "pointing", _MAX_POINTINGS)
+    return tuple(_pointing(value, f"pointing[{i}]") for i, value in enumerate(entries))
 
 
 def _pointing(value: object, path: str) -> Pointing:
-    table = table_of(value, path, set(Pointing.__slots__))
+    table = as_table(value, path, set(Pointing.__slots__))
     channel = string(table, f"{path}.channel", CHANNELS)
     return Pointing(
         channel=channel,
-        camera=layout.name(string(table, f"{path}.camera", default=channel.lower().partition("-")[0])),
-        band=layout.name(string(table, f"{path}.band")),
+        camera=layout.check_name(string(table, f"{path}.camera", default=channel.lower().partition("-")[0])),
+        band=layout.check_name(string(table, f"{path}.band")),
         ra=number(table, f"{path}.ra", -360.0, 360.0) % 360.0,
         dec=number(table, f"{path}.dec", -90.0, 90.0),
         position_angle=number(table, f"{path}.position_angle", -360.0, 360.0, 0.0),
         mjd=number(table, f"{path}.mjd", 40_000.0, 100_000.0),
         detectors=strings(table, f"{path}.detectors"),
         centre_on=string(table, f"{path}.centre_on") if "centre_on" in table else None,
-        exposure_time_s=optional(table, f"{path}.exposure_time_s", 0.0, 1e6),
-        realisations=integer(table, f"{path}.realisations", 1, _MOST_REALISATIONS, 1),
-        grism_angle=optional(table, f"{path}.grism_angle", -360.0, 360.0),
+        exposure_time_s=optional_number(table, f"{path}.exposure_time_s", 0.0, 1e6),
+        realisations=integer(table, f"{path}.realisations", 1, _MAX_REALISATIONS, 1),
+        grism_angle=optional_number(table, f"{path}.grism_angle", -360.0, 360.0),
     )
 
 
-def observations(table: Toml, folder: Path = Path()) -> tuple[Observation, ...]:
+def parse_observations(table: Toml, folder: Path = Path()) -> tuple[Observation, ...]:
     """Of a request's table; tables of pointings lie in `folder` or below.  BadInput names the key."""
-    found = tables(table, "observation", _MOST_OBSERVATIONS)
-    return tuple(_observation(value, f"observation[{i}]", folder) for i, value in enumerate(found))
+    entries = table_list(table, "observation", _MAX_OBSERVATIONS)
+    return tuple(_observation(value, f"observation[{i}]", folder) for i, value in enumerate(entries))
 
 
 def _observation(value: object, path: str, folder: Path) -> Observation:
-    table = table_of(value, path, set(Observation.__slots__) - {"table"})
+    table = as_table(value, path, set(Observation.__slots__) - {"table"})
     channels = strings(table, f"{path}.channels", CHANNELS)
     if not channels:
         raise BadInput(f"{path}.channels is missing or empty")
@@ -239,17 +239,17 @@ def _observation(value: object, path: str, folder: Path) -> Observation:
     surveys = GROUND_SURVEYS if ground else EUCLID_SURVEYS
     _refuse_two_places(table, path)
     _refuse_unused(table, channels, image_type, path)
-    file = _file(table, path, folder)
+    file = _pointings_file(table, path, folder)
     return Observation(
         channels=channels,
         image_type=image_type,
         survey=string(table, f"{path}.survey", surveys, None if ground else "wide"),
         pointings="" if file is None else str(file),
         table=None if file is None else _contents(file, channels, image_type, path),
-        ra=_turn(optional(table, f"{path}.ra", -360.0, 360.0)),
-        dec=optional(table, f"{path}.dec", -90.0, 90.0),
-        position_angle=optional(table, f"{path}.position_angle", -360.0, 360.0),
-        area=areas.parse(section(table, "area", None), f"{path}.area") if has(table, f"{path}.area") else None,
+        ra=_wrap_ra(optional_number(table, f"{path}.ra", -360.0, 360.0)),
+        dec=optional_number(table, f"{path}.dec", -90.0, 90.0),
+        position_angle=optional_number(table, f"{path}.position_angle", -360.0, 360.0),
+        area=areas.parse(section(table, "area", None), f"{path}.area") if has_key(table, f"{path}.area") else None,
         fields=integer(table, f"{path}.fields", 1, 1_000_000, 0),
         visits=integer(table, f"{path}.visits", 1, 1000, 0),
         exposures=integer(table, f"{path}.exposures", 1, 1_000_000, 0),
@@ -257,69 +257,69 @@ def _observation(value: object, path: str, folder: Path) -> Observation:
         short=boolean(table, f"{path}.short", True),
         flat=boolean(table, f"{path}.flat", True),
         blue=boolean(table, f"{path}.blue", False),
-        bands=tuple(layout.name(band) for band in strings(table, f"{path}.bands")),
+        bands=tuple(layout.check_name(band) for band in strings(table, f"{path}.bands")),
         detectors=strings(table, f"{path}.detectors"),
-        mjd=optional(table, f"{path}.mjd", 40_000.0, 100_000.0),
-        exposure_time_s=optional(table, f"{path}.exposure_time_s", 0.0, 1e6),
-        realisations=integer(table, f"{path}.realisations", 1, _MOST_REALISATIONS, 1),
+        mjd=optional_number(table, f"{path}.mjd", 40_000.0, 100_000.0),
+        exposure_time_s=optional_number(table, f"{path}.exposure_time_s", 0.0, 1e6),
+        realisations=integer(table, f"{path}.realisations", 1, _MAX_REALISATIONS, 1),
         lamps=_lamps(table, f"{path}.lamps", channels),
         macc=_macc(table, f"{path}.macc"),
         phase_times_s=_numbers(table, f"{path}.phase_times_s", 1e-6, 100.0),
         defocus_nm=_numbers(table, f"{path}.defocus_nm", -2000.0, 2000.0),
-        magnitude=optional(table, f"{path}.magnitude", -10.0, 30.0),
-        distance_deg=optional(table, f"{path}.distance_deg", 0.0, 10.0),
+        magnitude=optional_number(table, f"{path}.magnitude", -10.0, 30.0),
+        distance_deg=optional_number(table, f"{path}.distance_deg", 0.0, 10.0),
         intensities=_numbers(table, f"{path}.intensities", 1e-4, 1e4),
         delays_s=_numbers(table, f"{path}.delays_s", 1.0, 1e6),
-        bright=string(table, f"{path}.bright", BRIGHT, BRIGHT[0]),
+        bright=string(table, f"{path}.bright", BRIGHT_TYPES, BRIGHT_TYPES[0]),
     )
 
 
 def _lamps(table: Toml, path: str, channels: tuple[str, ...]) -> tuple[int, ...]:
     """Numbers of LEDs that all of the channels have."""
-    most = min(LAMPS.get(channel, 1) for channel in channels)
-    found = _integers(table, path, (), ((1, most),) * most)
-    if len(set(found)) < len(found):
-        raise BadInput(f"{path} = {shown(list(found))} names a lamp twice")
-    return found
+    lamp_count = min(LAMPS.get(channel, 1) for channel in channels)
+    lamps = _integers(table, path, (), ((1, lamp_count),) * lamp_count)
+    if len(set(lamps)) < len(lamps):
+        raise BadInput(f"{path} = {quote_value(list(lamps))} names a lamp twice")
+    return lamps
 
 
 def _macc(table: Toml, path: str) -> tuple[int, ...]:
-    found = _integers(table, path, ("groups", "reads", "drops"), ((2, 1000), (1, 1000), (0, 1000)))
-    if found and (frames := ramps.frames(*found)) > ramps.MOST_FRAMES:
-        raise BadInput(f"{path} = {shown(list(found))} has {frames} frames, more than {ramps.MOST_FRAMES}")
-    return found
+    macc = _integers(table, path, ("groups", "reads", "drops"), ((2, 1000), (1, 1000), (0, 1000)))
+    if macc and (frames := ramps.frame_count(*macc)) > ramps.MAX_FRAMES:
+        raise BadInput(f"{path} = {quote_value(list(macc))} has {frames} frames, more than {ramps.MAX_FRAMES}")
+    return macc
 
 
 def _integers(table: Toml, path: str, names: tuple[str, ...], bounds: tuple[tuple[int, int], ...]) -> tuple[int, ...]:
     """A list of whole numbers: as many as are named, or up to as many as have bounds; () where there is none."""
-    found = table.get(path.rpartition(".")[2])
-    if found is None:
+    values = table.get(path.rpartition(".")[2])
+    if values is None:
         return ()
-    if not isinstance(found, list) or not found or len(found) > len(bounds) or (names and len(found) != len(names)):
-        raise BadInput(f"{path} = {shown(found)} is not [{', '.join(names) or 'numbers'}]")
+    if not isinstance(values, list) or not values or len(values) > len(bounds) or (names and len(values) != len(names)):
+        raise BadInput(f"{path} = {quote_value(values)} is not [{', '.join(names) or 'numbers'}]")
     numbers = []
-    for i, (value, (least, most)) in enumerate(zip(found, bounds, strict=False)):
-        if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+    for i, (value, (low, high)) in enumerate(zip(values, bounds, strict=False)):
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
             name = f"{names[i]} = " if names else ""
-            raise BadInput(f"{path}: {name}{shown(value)} is not a whole number from {least} to {most}")
+            raise BadInput(f"{path}: {name}{quote_value(value)} is not a whole number from {low} to {high}")
         numbers.append(value)
     return tuple(numbers)
 
 
 def _numbers(table: Toml, path: str, lo: float, hi: float) -> tuple[float, ...]:
     """A list of different numbers; () where there is none."""
-    found = table.get(path.rpartition(".")[2])
-    if found is None:
+    values = table.get(path.rpartition(".")[2])
+    if values is None:
         return ()
-    if not isinstance(found, list) or not 1 <= len(found) <= _MOST_VALUES:
-        raise BadInput(f"{path} = {shown(found)} is not a list of 1 to {_MOST_VALUES} numbers")
-    numbers = tuple(checked_number(value, f"{path}[{i}]", lo, hi) for i, value in enumerate(found))
+    if not isinstance(values, list) or not 1 <= len(values) <= _MAX_VALUES:
+        raise BadInput(f"{path} = {quote_value(values)} is not a list of 1 to {_MAX_VALUES} numbers")
+    numbers = tuple(checked_number(value, f"{path}[{i}]", lo, hi) for i, value in enumerate(values))
     if len(set(numbers)) < len(numbers):
-        raise BadInput(f"{path} = {shown(found)} names a number twice")
+        raise BadInput(f"{path} = {quote_value(values)} names a number twice")
     return numbers
 
 
-def _turn(ra: float | None) -> float | None:
+def _wrap_ra(ra: float | None) -> float | None:
     return None if ra is None else ra % 360.0
 
 
@@ -338,18 +338,18 @@ def _refuse_two_places(table: Toml, path: str) -> None:
 def _refuse_unused(table: Toml, channels: tuple[str, ...], image_type: str, path: str) -> None:
     """A key that would change nothing."""
     ground = "EXT" in channels
-    kind = _kind(table, ground, image_type)
+    kind = _block_kind(table, ground, image_type)
     for key in table:
-        users = _USERS.get(key, (kind,))
-        if kind not in users and not (ground and key == "survey"):
-            raise BadInput(f"{path}.{key} is not for {kind}: used by {', '.join(users)}")
-        if key in _TYPES_OF and image_type not in _TYPES_OF[key]:
-            raise BadInput(f"{path}.{key} is not for {image_type}: used by {', '.join(_TYPES_OF[key])}")
-        if (some := _CHANNELS_OF.get(key)) is not None and not {*some} & {*channels}:
-            raise BadInput(f"{path}.{key} is not for {', '.join(channels)}: used by {', '.join(some)}")
+        used_by = _BLOCKS_OF_KEY.get(key, (kind,))
+        if kind not in used_by and not (ground and key == "survey"):
+            raise BadInput(f"{path}.{key} is not for {kind}: used by {', '.join(used_by)}")
+        if key in _TYPES_OF_KEY and image_type not in _TYPES_OF_KEY[key]:
+            raise BadInput(f"{path}.{key} is not for {image_type}: used by {', '.join(_TYPES_OF_KEY[key])}")
+        if (allowed := _CHANNELS_OF_KEY.get(key)) is not None and not {*allowed} & {*channels}:
+            raise BadInput(f"{path}.{key} is not for {', '.join(channels)}: used by {', '.join(allowed)}")
 
 
-def _kind(table: Toml, ground: bool, image_type: str) -> str:
+def _block_kind(table: Toml, ground: bool, image_type: str) -> str:
     if "pointings" in table:
         return _TABLE
     if image_type not in _SKY_TYPES:
@@ -357,17 +357,17 @@ def _kind(table: Toml, ground: bool, image_type: str) -> str:
         untimed = dict.fromkeys(("bias", "charge_injection", "trap_pumping"), _UNTIMED)
         return {**timed, **untimed}.get(image_type, _DITHERED)
     if ground:
-        return _GROUND_OWN if "ra" in table else _GROUND
-    return _OWN if "ra" in table else _SURVEY
+        return _GROUND_USER_FIELD if "ra" in table else _GROUND
+    return _USER_FIELD if "ra" in table else _SURVEY
 
 
-def _file(table: Toml, path: str, folder: Path) -> Path | None:
+def _pointings_file(table: Toml, path: str, folder: Path) -> Path | None:
     """The table of pointings, which may not lie outside the request's folder."""
     if not string(table, f"{path}.pointings", default=""):
         return None
     file = folder / string(table, f"{path}.pointings")
     try:
-        return user_files.checked(layout.within(folder, file), "table of pointings")
+        return user_files.check_file(layout.check_inside(folder, file), "table of pointings")
     except BadInput as error:
         raise BadInput(f"{path}.pointings: {error}") from None
 
@@ -381,13 +381,17 @@ def _contents(file: Path, channels: tuple[str, ...], image_type: str, path: str)
 
 def _dither(table: Toml, path: str, ground: bool) -> str | tuple[tuple[float, float], ...]:
     """A pattern's name, or offsets."""
-    found = table.get("dither", "none" if ground else "S")
-    if not isinstance(found, list):
-        pattern = string({"dither": found}, path, DITHERS)
+    dither = table.get("dither", "none" if ground else "S")
+    if not isinstance(dither, list):
+        pattern = string({"dither": dither}, path, DITHERS)
         if ground and pattern != "none":
-            raise BadInput(f"{path} = {shown(found)} is a pattern of Euclid's: name offsets in arcsec, [[x, y], ..]")
+            raise BadInput(
+                f"{path} = {quote_value(dither)} is a pattern of Euclid's: name offsets in arcsec, [[x, y], ..]"
+            )
         return pattern
-    if not 1 <= len(found) <= _MOST_DITHERS or not all(isinstance(step, list) and len(step) == 2 for step in found):
-        raise BadInput(f"{path} wants one of {', '.join(DITHERS)}, or 1 to {_MOST_DITHERS} offsets [x, y] in arcsec")
-    steps = [[checked_number(n, f"{path}[{i}]", -_FARTHEST, _FARTHEST) for n in step] for i, step in enumerate(found)]
+    if not 1 <= len(dither) <= _MAX_DITHERS or not all(isinstance(step, list) and len(step) == 2 for step in dither):
+        raise BadInput(f"{path} wants one of {', '.join(DITHERS)}, or 1 to {_MAX_DITHERS} offsets [x, y] in arcsec")
+    steps = [
+        [checked_number(n, f"{path}[{i}]", -_MAX_OFFSET, _MAX_OFFSET) for n in step] for i, step in enumerate(dither)
+    ]
     return tuple((x, y) for x, y in steps)

@@ -49,8 +49,8 @@ COLUMNS = (
 )
 _REQUIRED = tuple(name for name, _, _, default in COLUMNS if not default)
 _NAMES = tuple(name for name, *_ in COLUMNS)
-_MOST_ROWS, _LONGEST = 1_000_000, 1000
-_MOST_LINES, _LONGEST_LINE = 2 * _MOST_ROWS, 20 * _LONGEST
+_MAX_ROWS, _MAX_LENGTH = 1_000_000, 1000
+_MAX_LINES, _MAX_LINE_LENGTH = 2 * _MAX_ROWS, 20 * _MAX_LENGTH
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ class Row:
     where : file and line, for messages;  psf : path
     """
 
-    where: str
+    location: str
     channel: str
     camera: str
     band: str
@@ -100,78 +100,80 @@ def read(path: Path, channels: Sequence[str], image_type: str) -> list[Row]:
     channels, image_type : of the observation that the table belongs to
     Errors : BadInput names the file, the line and the column
     """
-    stream = io.StringIO(user_files.text(path, "table of pointings"), newline="")
-    numbered, at = _plain_lines(path, stream), 0
+    stream = io.StringIO(user_files.read_text(path, "table of pointings"), newline="")
+    numbered_lines, line_number = _data_lines(path, stream), 0
 
     def texts() -> Iterator[str]:
-        nonlocal at
-        for number, line in numbered:
-            at = number
+        nonlocal line_number
+        for number, line in numbered_lines:
+            line_number = number
             yield line
 
     lines = csv.DictReader(texts())
-    found: list[Row] = []
+    rows: list[Row] = []
     try:
         _refuse_columns(path, lines.fieldnames or [], channels)
         for row in lines:
-            if len(found) >= _MOST_ROWS:
-                raise BadInput(f"{path}: more than {_MOST_ROWS} pointings")
-            if not all(isinstance(text, str) and len(text) <= _LONGEST for text in row.values() if text is not None):
-                raise BadInput(f"{path} line {at}: a text is too long, or there are more than columns")
-            found.append(_of_line({k: (v or "").strip() for k, v in row.items()}, path, at, channels, image_type))
+            if len(rows) >= _MAX_ROWS:
+                raise BadInput(f"{path}: more than {_MAX_ROWS} pointings")
+            if not all(isinstance(text, str) and len(text) <= _MAX_LENGTH for text in row.values() if text is not None):
+                raise BadInput(f"{path} line {line_number}: a text is too long, or there are more than columns")
+            rows.append(
+                _row_from_line({k: (v or "").strip() for k, v in row.items()}, path, line_number, channels, image_type)
+            )
     except csv.Error as error:
         raise BadInput(f"{path}: {' '.join(str(error).split())}") from None
-    return found
+    return rows
 
 
 def _refuse_columns(path: Path, names: Sequence[str], channels: Sequence[str]) -> None:
-    needed = (*_REQUIRED, *(("channel",) if len(channels) > 1 else ()))
-    if missing := [name for name in needed if name not in names]:
+    required = (*_REQUIRED, *(("channel",) if len(channels) > 1 else ()))
+    if missing := [name for name in required if name not in names]:
         raise BadInput(f"{path}: column {missing[0]} is missing")
     if unknown := [name for name in names if name not in _NAMES]:
-        raise BadInput(f"{path}: column {user_files.shown(unknown[0])} is not known; known: {', '.join(_NAMES)}")
+        raise BadInput(f"{path}: column {user_files.format_path(unknown[0])} is not known; known: {', '.join(_NAMES)}")
     if twice := [name for name in names if list(names).count(name) > 1]:
         raise BadInput(f"{path}: column {twice[0]} stands there twice")
 
 
-def _plain_lines(path: Path, stream: Iterable[str]) -> Iterator[tuple[int, str]]:
+def _data_lines(path: Path, stream: Iterable[str]) -> Iterator[tuple[int, str]]:
     """Number and text of each line that is no comment, as many and as long as pointings need."""
     for number, line in enumerate(stream, start=1):
-        if number > _MOST_LINES or len(line) > _LONGEST_LINE:
-            raise BadInput(f"{path}: more than {_MOST_LINES} lines, or one of more than {_LONGEST_LINE} characters")
+        if number > _MAX_LINES or len(line) > _MAX_LINE_LENGTH:
+            raise BadInput(f"{path}: more than {_MAX_LINES} lines, or one of more than {_MAX_LINE_LENGTH} characters")
         if not line.startswith("#"):
             yield number, line
 
 
-def _of_line(row: Mapping[str, str], path: Path, line: int, channels: Sequence[str], image_type: str) -> Row:
-    where = f"{path} line {line}"
+def _row_from_line(row: Mapping[str, str], path: Path, line: int, channels: Sequence[str], image_type: str) -> Row:
+    location = f"{path} line {line}"
     channel = row.get("channel") or (channels[0] if len(channels) == 1 else "")
     if channel not in channels:
-        raise BadInput(f"{where}: channel = {channel!r} is none of the observation's: {', '.join(channels)}")
-    only = EUCLID_BANDS.get(channel, ())
-    band = row.get("band") or (only[0] if len(only) == 1 else "")
+        raise BadInput(f"{location}: channel = {channel!r} is none of the observation's: {', '.join(channels)}")
+    euclid_bands = EUCLID_BANDS.get(channel, ())
+    band = row.get("band") or (euclid_bands[0] if len(euclid_bands) == 1 else "")
     if not band:
-        raise BadInput(f"{where}: band is missing")
+        raise BadInput(f"{location}: band is missing")
     kind = row.get("image_type") or image_type
     if kind not in IMAGE_TYPES:
-        raise BadInput(f"{where}: image_type = {kind!r} is not one of {', '.join(IMAGE_TYPES)}")
+        raise BadInput(f"{location}: image_type = {kind!r} is not one of {', '.join(IMAGE_TYPES)}")
 
     def number_of(name: str, lo: float, hi: float) -> float:
         if not row[name]:
-            raise BadInput(f"{where}: {name} is missing")
+            raise BadInput(f"{location}: {name} is missing")
         try:
             value = float(row[name])
         except ValueError:
-            raise BadInput(f"{where}: {name} = {row[name]!r} is not a number") from None
+            raise BadInput(f"{location}: {name} = {row[name]!r} is not a number") from None
         if not lo <= value <= hi:
-            raise BadInput(f"{where}: {name} = {value} is outside {lo:g} to {hi:g}")
+            raise BadInput(f"{location}: {name} = {value} is outside {lo:g} to {hi:g}")
         return value
 
     def optional(name: str, lo: float, hi: float) -> float | None:
         return number_of(name, lo, hi) if row.get(name) else None
 
     return Row(
-        where=where,
+        location=location,
         channel=channel,
         camera=row.get("camera") or ("" if channel == "EXT" else channel.lower().partition("-")[0]),
         band=band,
@@ -184,7 +186,7 @@ def _of_line(row: Mapping[str, str], path: Path, line: int, channels: Sequence[s
         sky=optional("sky", 0.0, 1e6),
         seeing=optional("seeing", 0.01, 10.0) if channel == "EXT" else None,
         zero_point=optional("zero_point", 0.0, 50.0),
-        psf=str(user_files.expanded(row["psf"], path.parent)) if row.get("psf") else None,
+        psf=str(user_files.expand_path(row["psf"], path.parent)) if row.get("psf") else None,
         grism_angle=optional("grism_angle", -360.0, 360.0),
         detectors=tuple(row.get("detectors", "").split()),
     )

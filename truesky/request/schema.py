@@ -13,7 +13,7 @@ from lake_schema.tables import mission as database
 from lake_schema.tables import products
 from truesky.request.accuracy import Accuracy
 from truesky.request.area import Area
-from truesky.request.files import GivenSources, Ingest, UserCurves
+from truesky.request.files import Ingest, UserCurves, UserSources
 from truesky.request.observations import Observation, Pointing
 from truesky.request.structure import Structure
 
@@ -22,20 +22,20 @@ if TYPE_CHECKING:
 
 STATUSES = tuple(code for code, _ in database.STATUSES)
 LADDER = database.LADDER
-TRUTH = tuple(code for code, _ in products.CONTENTS if code != "science")
+TRUTH_CONTENTS = tuple(code for code, _ in products.CONTENTS if code != "science")
 COMPRESSIONS = ("none", "rice")
 # As truesky/render/camera/tpv.py (a test compares them).
-CONVENTIONS = ("sip", "tpv")
-FILES = ("detector", "exposure")
+WCS_CONVENTIONS = ("sip", "tpv")
+FILE_LAYOUTS = ("detector", "exposure")
 # Of ground cameras (truesky/render/channels/ground.py; test_readout.py compares them).
 READOUTS = ("raw", "amplifiers", "electrons")
 # Parts of a request that say how images are written.
-WRITTEN = ("compression", "wcs", "readout")
-DENSITIES = ("juric", "besancon")
+IMAGE_OPTIONS = ("compression", "wcs", "readout")
+DENSITY_MODELS = ("juric", "besancon")
 BOX_CELLS = (192, 256, 384)
 LENSING_NSIDES = (64, 128, 256, 512, 1024, 2048)
 # Largest reduced shear: beyond it, near a critical line, a single source is not a lensed ellipse.
-MOST_SHEAR = 0.9
+MAX_SHEAR = 0.9
 # Of all channels that are rendered. A copy, since requests are read below the renderer (test_effect.py holds it to the
 # registry of channels).
 EFFECTS = (
@@ -49,9 +49,9 @@ EFFECTS = (
     "signal_nonlinearity", "straylight", "trap_pumping", "tree_rings",
 )  # fmt: skip
 # What no image is a product without.
-ALWAYS = ("adc", "amplifiers", "macc", "quadrants", "ramp", "signal_adc")
+ALWAYS_ON = ("adc", "amplifiers", "macc", "quadrants", "ramp", "signal_adc")
 _NO_FILES = UserCurves()
-_NOTHING_TAKEN = Ingest()
+_NO_INGEST = Ingest()
 _SMOOTH = Structure()
 
 
@@ -166,7 +166,7 @@ class Request:
     observations: tuple[Observation, ...] = ()
     effects: Effects = Effects()
     explore: tuple[tuple[str, tuple[str, ...]], ...] = ()
-    ingest: Ingest = _NOTHING_TAKEN
+    ingest: Ingest = _NO_INGEST
     strong_lens_boost: float = 1.0
     compression: str = "none"
     wcs: str | None = None
@@ -175,17 +175,17 @@ class Request:
     psfs: tuple[tuple[str, str], ...] = ()
     bodies: Path | None = None
     noise_seed: int | None = None
-    sources: GivenSources | None = None
+    sources: UserSources | None = None
     structure: Structure = _SMOOTH
     detectors: tuple[str, ...] = ()
     limit: int | None = None
 
-    def facts(self, *parts: str) -> dict[str, Any]:
+    def facts(self, *names: str) -> dict[str, Any]:
         """The named parts of the request as JSON values, for the key of what depends on them."""
-        everything = asdict(self)
+        all_values = asdict(self)
         # Not where a camera's folder lies, but what it holds.
-        everything["mission"]["cameras"] = {camera.name: camera.sha256 for camera in self.mission.cameras}
-        return {part: everything[part] for part in parts}
+        all_values["mission"]["cameras"] = {camera.name: camera.sha256 for camera in self.mission.cameras}
+        return {name: all_values[name] for name in names}
 
     def variants(self) -> Iterator[dict[str, Any]]:
         """The product of what is explored: parameter -> value; one empty variant where nothing is."""

@@ -13,10 +13,10 @@ from typing import Any
 
 from lake_schema import user_files
 from lake_schema.errors import BadInput
-from truesky.request.toml_values import Toml, boolean, integer, number, string, table_of
+from truesky.request.toml_values import Toml, as_table, boolean, integer, number, string
 
 # Fewer knots would be no disc, and each is drawn.
-_KNOTS = (20, 5000)
+_KNOT_LIMITS = (20, 5000)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,14 +63,14 @@ def parse(table: Toml, folder: Path) -> Structure:
 
 def _stamps(value: object, folder: Path) -> Stamps:
     path = "structure.stamps"
-    given = table_of(value, path, set(Stamps.__slots__))
-    nearest = boolean(given, f"{path}.nearest", False)
-    if "least_radius" in given and not nearest:
+    stamps_table = as_table(value, path, set(Stamps.__slots__))
+    nearest = boolean(stamps_table, f"{path}.nearest", False)
+    if "least_radius" in stamps_table and not nearest:
         raise BadInput(f"{path}.least_radius wants nearest = true: a stamp that is named is drawn at any size")
     return Stamps(
-        user_files.expanded(string(given, f"{path}.file"), folder),
+        user_files.expand_path(string(stamps_table, f"{path}.file"), folder),
         nearest,
-        number(given, f"{path}.least_radius", 0.05, 60.0, 0.5),
+        number(stamps_table, f"{path}.least_radius", 0.05, 60.0, 0.5),
     )
 
 
@@ -78,12 +78,12 @@ def _arms(value: object) -> Arms | None:
     path, default = "structure.arms", Arms()
     if isinstance(value, bool):
         return default if value else None
-    given = table_of(value, path, set(Arms.__slots__))
+    arms_table = as_table(value, path, set(Arms.__slots__))
     arms = Arms(
-        number(given, f"{path}.contrast", 0.0, 2.0, default.contrast),
-        number(given, f"{path}.knots", 0.0, 0.5, default.knots),
-        integer(given, f"{path}.number", *_KNOTS) if "number" in given else default.number,
-        number(given, f"{path}.least_radius", 0.3, 60.0, default.least_radius),
+        number(arms_table, f"{path}.contrast", 0.0, 2.0, default.contrast),
+        number(arms_table, f"{path}.knots", 0.0, 0.5, default.knots),
+        integer(arms_table, f"{path}.number", *_KNOT_LIMITS) if "number" in arms_table else default.number,
+        number(arms_table, f"{path}.least_radius", 0.3, 60.0, default.least_radius),
     )
     if not arms.contrast and not arms.knots:
         raise BadInput(f"{path}: neither contrast nor knots: false leaves discs smooth")
@@ -92,9 +92,9 @@ def _arms(value: object) -> Arms | None:
 
 def facts(structure: Structure) -> dict[str, Any]:
     """Of a request that asks for some structure; nothing where galaxies are smooth.  A file's name is no part of it."""
-    found: dict[str, Any] = {}
+    structure_facts: dict[str, Any] = {}
     if structure.arms is not None:
-        found["arms"] = asdict(structure.arms)
+        structure_facts["arms"] = asdict(structure.arms)
     if structure.stamps is not None:
-        found["stamps"] = {name: getattr(structure.stamps, name) for name in ("nearest", "least_radius")}
-    return {"structure": found} if found else {}
+        structure_facts["stamps"] = {name: getattr(structure.stamps, name) for name in ("nearest", "least_radius")}
+    return {"structure": structure_facts} if structure_facts else {}

@@ -16,7 +16,7 @@ from typing import Any
 from lake_schema import user_files
 from lake_schema.errors import BadInput
 from lake_schema.external import rows as external_rows
-from lake_schema.store import names, read
+from lake_schema.store import read, request_links
 from lake_schema.store.plan import Json
 from lake_schema.store.provenance import canonical, file_sha256
 from truesky.request.files import Catalogue
@@ -26,17 +26,17 @@ CATALOGUES = ("galaxies", "stars")
 # What the formats of external catalogues are; some are of two files each.
 _FORMATS = Path(__file__).parents[1] / "catalogue" / "external" / "ingest_formats.toml"
 # What names files, or says how rows are filed.
-_NOT_VALUES = {"tycho2", "catalogue", "columns", "rows_a_file"}
+_FILE_KEYS = {"tycho2", "catalogue", "columns", "rows_a_file"}
 
 
-def wanted(request: Request) -> dict[str, Any]:
+def requested_values(request: Request) -> dict[str, Any]:
     """Seed and values of the sections universe and stars, by their names."""
     values = request.facts("universe", "stars")
-    own = {key: value for key, value in values["stars"].items() if key not in _NOT_VALUES}
-    return {"seed": request.seed, **values["universe"], **own}
+    star_values = {key: value for key, value in values["stars"].items() if key not in _FILE_KEYS}
+    return {"seed": request.seed, **values["universe"], **star_values}
 
 
-def refuse_other(catalogues: Iterable[read.Version], request: Request) -> None:
+def check_catalogues(catalogues: Iterable[read.Version], request: Request) -> None:
     """Every catalogue must be of the request's universe.  Errors: BadInput names the first that is not, and why"""
     for version in catalogues:
         if different := _difference(version, request):
@@ -44,82 +44,85 @@ def refuse_other(catalogues: Iterable[read.Version], request: Request) -> None:
             raise BadInput(f"table {version.table} has {different}: {first}")
 
 
-def refuse_others(root: Path, request: Request) -> None:
+def check_lake(root: Path, request: Request) -> None:
     """A lake holds one universe: that of its other requests.  A request that is alone in it may change its own."""
-    for name in names.names(root):
+    for name in request_links.request_names(root):
         for table in CATALOGUES if name != request.name else ():
-            if names.key_of(root, name, table) is not None:
+            if request_links.linked_key(root, name, table) is not None:
                 different = _difference(read.version(root, table, request=name), request)
                 if different:
-                    what = f"lake {root} holds the universe of request {name}: its {table} have {different}"
-                    raise BadInput(f"{what}: use another folder for request {request.name}")
+                    problem = f"lake {root} holds the universe of request {name}: its {table} have {different}"
+                    raise BadInput(f"{problem}: use another folder for request {request.name}")
 
 
 def _difference(version: read.Version, request: Request) -> str:
     """What tells a catalogue's universe from the request's; empty where nothing does."""
     facts = version.manifest["facts"]
-    values, own = wanted(request), request.sources
-    theirs = None if own is None else own.facts(request.area.bounds())
-    if canonical(facts.get("sources")) != canonical(theirs):
+    values, sources = requested_values(request), request.sources
+    source_facts = None if sources is None else sources.facts(request.area.bounding_circle())
+    if canonical(facts.get("sources")) != canonical(source_facts):
         return "other sources than the request"
     # A catalogue that was not drawn by us has no depth.
     for key in ("seed", *(key for key in values if key in facts and key != "seed")):
         if canonical(facts.get(key)) != canonical(values[key]):
             return f"{key} {facts.get(key)}, the request {values[key]}"
-    for key, given in _given(version.table, request) if own is None else ():
-        if (given is None) is (key in facts):
-            return f"{'no ' if given else ''}files of {key}, the request {'some' if given else 'none'}"
-        if given is not None:
-            for name, value in given.about.items():
+    for key, named in _named_files(version.table, request) if sources is None else ():
+        if (named is None) is (key in facts):
+            return f"{'no ' if named else ''}files of {key}, the request {'some' if named else 'none'}"
+        if named is not None:
+            for name, value in named.options.items():
                 if canonical(facts[key][name]) != canonical(value):
                     return f"{name} of {key} {facts[key][name] or 'none'}, the request {value or 'none'}"
-            if not _same(facts[key], given):
+            if not _is_same(facts[key], named):
                 return f"other files of {key} than the request"
     return ""
 
 
 @dataclass(frozen=True, slots=True)
-class _Given:
+class _NamedFiles:
     """Files that a request names; about : how they are read; beside : of the names of files that are read in pairs."""
 
     files: Sequence[Path]
-    about: Mapping[str, Any] = field(default_factory=dict)
-    beside: Sequence[str] = ()
+    options: Mapping[str, Any] = field(default_factory=dict)
+    pair_prefixes: Sequence[str] = ()
 
 
-def _given(table: str, request: Request) -> Iterator[tuple[str, _Given | None]]:
+def _named_files(table: str, request: Request) -> Iterator[tuple[str, _NamedFiles | None]]:
     """What a catalogue's facts call files, and those that the request names."""
-    own, stars = request.ingest, request.stars
-    dust = {} if own.dust is None else {name: value for name, value in asdict(own.dust).items() if name != "file"}
-    yield "dust", _Given((own.dust.file,), dust) if own.dust else None
+    ingest, stars = request.ingest, request.stars
+    dust = {} if ingest.dust is None else {name: value for name, value in asdict(ingest.dust).items() if name != "file"}
+    yield "dust", _NamedFiles((ingest.dust.file,), dust) if ingest.dust else None
     if table == "stars":
-        yield "tycho2", _Given(stars.tycho2) if stars.tycho2 else None
-        yield "catalogue", _Given((stars.catalogue,), {"columns": dict(stars.columns)}) if stars.catalogue else None
+        yield "tycho2", _NamedFiles(stars.tycho2) if stars.tycho2 else None
+        yield (
+            "catalogue",
+            _NamedFiles((stars.catalogue,), {"columns": dict(stars.columns)}) if stars.catalogue else None,
+        )
         return
-    yield "ingest", _catalogue(own.galaxies, format=True) if own.galaxies else None
-    if own.galaxies is None:
-        yield "halos", _catalogue(own.halos) if own.halos else None
-        yield "training", _catalogue(own.training) if own.training else None
+    yield "ingest", _catalogue_files(ingest.galaxies, with_format=True) if ingest.galaxies else None
+    if ingest.galaxies is None:
+        yield "halos", _catalogue_files(ingest.halos) if ingest.halos else None
+        yield "training", _catalogue_files(ingest.training) if ingest.training else None
 
 
-def _catalogue(given: Catalogue, format: bool = False) -> _Given:
-    columns = dict(given.columns)
-    about = {"format": given.format, "columns": columns} if format else {"columns": columns}
-    known = user_files.toml_tables(_FORMATS.read_text(encoding="utf-8")).get(given.format, {})
-    beside = json.loads(columns["beside"]) if "beside" in columns else known.get("beside", ())
-    return _Given(given.files, about, beside)
+def _catalogue_files(catalogue: Catalogue, with_format: bool = False) -> _NamedFiles:
+    columns = dict(catalogue.columns)
+    options = {"format": catalogue.format, "columns": columns} if with_format else {"columns": columns}
+    format_entry = user_files.parse_toml(_FORMATS.read_text(encoding="utf-8")).get(catalogue.format, {})
+    pair_prefixes = json.loads(columns["beside"]) if "beside" in columns else format_entry.get("beside", ())
+    return _NamedFiles(catalogue.files, options, pair_prefixes)
 
 
-def _same(facts: Json, given: _Given) -> bool:
+def _is_same(facts: Json, named: _NamedFiles) -> bool:
     """Are they the files that the facts have the sha256 of?  Those that have been moved away cannot be compared."""
-    if not all(path.exists() for path in given.files):
+    if not all(path.exists() for path in named.files):
         return True
-    every = [file for path in given.files for file in (external_rows.files(path) if path.is_dir() else [path])]
-    if given.beside:
+    all_files = [file for path in named.files for file in (external_rows.find_files(path) if path.is_dir() else [path])]
+    if named.pair_prefixes:
         # A folder of such pairs holds tables of other things as well.
-        first, second = given.beside
-        every = [file for file in every if file.name.startswith(first) and not file.name.startswith(second)]
-        every += [file.with_name(second + file.name.removeprefix(first)) for file in every]
-    sums = facts["sha256"]
-    there = [sums] if isinstance(sums, str) else sums
-    return sorted(there) == sorted(file_sha256(file) for file in every if file.exists())
+        first, second = named.pair_prefixes
+        all_files = [file for file in all_files if file.name.startswith(first) and not file.name.startswith(second)]
+        all_files += [file.with_name(second + file.name.removeprefix(first)) for file in all_files]
+    checksums = facts["sha256"]
+    recorded = [checksums] if isinstance(checksums, str) else checksums
+    return sorted(recorded) == sorted(file_sha256(file) for file in all_files if file.exists())

@@ -25,71 +25,71 @@ from pyspark.sql import SparkSession
 from lake_schema import instruction_set
 
 # What nobody from outside may reach, wherever the configuration says nothing else.
-_CLOSED = {"spark.ui.enabled": "false"}
+_SECURE_SETTINGS = {"spark.ui.enabled": "false"}
 # Prefix of Spark's settings of Unix domain sockets, and the longest folder name that leaves room for Spark's own name:
 # a socket's path has at most 104 characters on macOS and 108 on Linux. A longer one falls back to TCP.
-_SOCKETS, _LONGEST = "spark.python.unix.domain.socket", 56
+_SOCKET_PREFIX, _MAX_SOCKET_DIR = "spark.python.unix.domain.socket", 56
 # Spark makes a secret of its own for a local master; a cluster's is told to all of its machines (docs/cluster.md).
 _LOCAL = re.compile(r"local(\[[^\]]*\])?")
-_CLOSED_LOCAL = {
+_SECURE_LOCAL_SETTINGS = {
     "spark.driver.bindAddress": "127.0.0.1",
     "spark.driver.host": "127.0.0.1",
     "spark.authenticate": "true",
 }
 
 
-def session(name: str) -> SparkSession:
+def get_session(name: str) -> SparkSession:
     """The running session, or a new one under `name`."""
     # PySpark 4 warns of pandas 3 once; no row of ours passes through pandas.
     warnings.filterwarnings("ignore", "PySpark does not yet fully support pandas", FutureWarning)
     # Where Java is stopped in mid-sentence, its listener in this process would print a traceback; that it ended, and
     # what to do, is said in one line by the shell.
     for listener in (accumulators.AccumulatorTCPServer, accumulators.AccumulatorUnixServer):
-        listener.handle_error = _say_nothing  # type: ignore[assignment]
+        listener.handle_error = _ignore_error  # type: ignore[assignment]
     SparkContext._ensure_initialized()
     conf = SparkConf()
     builder = SparkSession.builder.appName(name)
-    wanted = dict(_CLOSED)
+    settings = dict(_SECURE_SETTINGS)
     # A worker's Python may import numpy before any module of ours.
-    wanted |= {f"spark.executorEnv.{name}": value for name, value in instruction_set.variables().items()}
+    settings |= {f"spark.executorEnv.{name}": value for name, value in instruction_set.variables().items()}
     local = _LOCAL.fullmatch(conf.get("spark.master", "local")) is not None
     if local:
-        wanted |= {**_CLOSED_LOCAL, "spark.executorEnv.PYTHONPATH": str(Path(__file__).resolve().parents[2])}
-        if len(sockets()) <= _LONGEST:
-            wanted |= {f"{_SOCKETS}.enabled": "true", f"{_SOCKETS}.dir": sockets()}
-            wanted["spark.python.daemon.module"] = "truesky.running.spark_workers"
+        settings |= {**_SECURE_LOCAL_SETTINGS, "spark.executorEnv.PYTHONPATH": str(Path(__file__).resolve().parents[2])}
+        if len(socket_dir()) <= _MAX_SOCKET_DIR:
+            settings |= {f"{_SOCKET_PREFIX}.enabled": "true", f"{_SOCKET_PREFIX}.dir": socket_dir()}
+            settings["spark.python.daemon.module"] = "truesky.running.spark_workers"
     # PySpark looks for its workers' Python in this variable alone, and would take any `python3` that is on PATH. On
     # this machine it is our own, whatever the variable says; on others the one that was named, else of the same path.
-    named = conf.get("spark.pyspark.python") or (None if local else os.environ.get("PYSPARK_PYTHON"))
-    os.environ["PYSPARK_PYTHON"] = named or sys.executable
-    for key, value in wanted.items():
+    worker_python = conf.get("spark.pyspark.python") or (None if local else os.environ.get("PYSPARK_PYTHON"))
+    os.environ["PYSPARK_PYTHON"] = worker_python or sys.executable
+    for key, value in settings.items():
         builder = builder if conf.contains(key) else builder.config(key, value)
-    before = signal.getsignal(signal.SIGINT)
+    previous_handler = signal.getsignal(signal.SIGINT)
     running = builder.getOrCreate()
     if threading.current_thread() is threading.main_thread():
         # PySpark's own handler calls Java from wherever the interrupt finds it, and fails.
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, previous_handler)
     return running
 
 
 @cache
-def sockets() -> str:
+def socket_dir() -> str:
     """A folder of this process that nobody else may enter, for sockets between Java and its Python workers.
 
     Through TCP, delayed acknowledgements cost each task 40 ms.
     """
     folder = tempfile.mkdtemp(prefix="truesky-")
-    atexit.register(remove_sockets)
+    atexit.register(remove_socket_dir)
     return folder
 
 
-def remove_sockets() -> None:
+def remove_socket_dir() -> None:
     """Remove the folder of sockets, if there is one."""
-    if sockets.cache_info().currsize:
-        shutil.rmtree(sockets(), ignore_errors=True)
+    if socket_dir.cache_info().currsize:
+        shutil.rmtree(socket_dir(), ignore_errors=True)
 
 
-def _say_nothing(listener: object, request: object, client_address: object) -> None:
+def _ignore_error(listener: object, request: object, client_address: object) -> None:
     """In place of socketserver's traceback."""
 
 

@@ -48,32 +48,37 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures of the universe to this file")
     parser.add_argument("--figures", type=Path, metavar="FOLDER", help="draw those of the universe into this folder")
     options = parser.parse_args(argv)
-    return command.status("validation", lambda: _validated(options))
+    return command.run("validation", lambda: _validate(options))
 
 
-def _validated(options: argparse.Namespace) -> int:
+def _validate(options: argparse.Namespace) -> int:
     if options.lake is not None:
-        return _of_lake(options)
+        return _validate_lake(options)
     for name in ("name", "exposures", "report"):
         if getattr(options, name):
             raise BadInput(f"--{name}: of which --lake?")
     # What is computed takes a quarter of an hour: where it is to go is looked at before.
     if options.json is not None:
-        user_files.target(options.json)
+        user_files.check_target(options.json)
     if options.figures is not None:
-        user_files.folder(options.figures)
+        user_files.check_folder(options.figures)
     figures = universe.run(universe.QUICK if options.quick else universe.FULL, options.figures)
-    results = checks.checks(figures)
+    results = checks.evaluate(figures)
     failed = checks.report(figures, results)
     if options.json is not None:
-        about = {"name": "validation", "commit": provenance.git_commit(), "machine": provenance.machine(), "repeats": 1}
+        metadata = {
+            "name": "validation",
+            "commit": provenance.git_commit(),
+            "machine": provenance.machine(),
+            "repeats": 1,
+        }
         summary = {"checks": len(results), "failed": ", ".join(failed), "load_average": round(os.getloadavg()[0], 2)}
-        found = {name: float(value) if math.isfinite(value) else None for name, value in figures.items()}
-        manifest.write_json(options.json, {**about, **summary, **found})
-    return int(any(check.unexpected for check in results))
+        values = {name: float(value) if math.isfinite(value) else None for name, value in figures.items()}
+        manifest.write_json(options.json, {**metadata, **summary, **values})
+    return int(any(check.is_unexpected_failure for check in results))
 
 
-def _of_lake(options: argparse.Namespace) -> int:
+def _validate_lake(options: argparse.Namespace) -> int:
     """Prints what fails or is undecided, and where the report is."""
     for name in ("json", "figures", "quick"):
         if getattr(options, name):
@@ -81,21 +86,21 @@ def _of_lake(options: argparse.Namespace) -> int:
     if options.processes < 1:
         raise BadInput(f"--processes: {options.processes} is less than 1")
     if options.report is not None:
-        user_files.target(options.report)
-    version = publishing.published(layout.lake(options.lake), options.name, options.exposures, options.processes)
+        user_files.check_target(options.report)
+    version = publishing.publish(layout.resolve_lake(options.lake), options.name, options.exposures, options.processes)
     rows = version.rows().to_pylist()
     for row in sorted(rows, key=lambda row: row["verdict"]):
         if row["verdict"] in (FAIL, UNDECIDED):
-            what = f"{row['verdict']:10} {row['place']:40} {row['check_name']} {row['quantity']}"
+            label = f"{row['verdict']:10} {row['place']:40} {row['check_name']} {row['quantity']}"
             if row["value"] is None or row["error"] is None:
-                print(f"{what}: {row['note']}")
+                print(f"{label}: {row['note']}")
                 continue
             bound = f"{row['kind']} {row['expected']:.4g}, tolerance {row['tolerance']:.3g}"
-            known = f", known to fail: {row['known']}" if row["known"] else ""
-            print(f"{what}: {row['value']:.4g} +- {row['error']:.2g} {row['value_unit']} ({bound}){known}")
-    counted = Counter(row["verdict"] for row in rows)
-    print(", ".join(f"{number} {verdict.replace('_', ' ')}" for verdict, number in sorted(counted.items())))
-    report = version.file(publishing.REPORT)
+            known_failure = f", known to fail: {row['known']}" if row["known"] else ""
+            print(f"{label}: {row['value']:.4g} +- {row['error']:.2g} {row['value_unit']} ({bound}){known_failure}")
+    verdict_counts = Counter(row["verdict"] for row in rows)
+    print(", ".join(f"{number} {verdict.replace('_', ' ')}" for verdict, number in sorted(verdict_counts.items())))
+    report = version.sidecar_path(publishing.REPORT)
     if options.report is not None:
         shutil.copyfile(report, options.report)
     print(options.report or report)
@@ -103,4 +108,4 @@ def _of_lake(options: argparse.Namespace) -> int:
 
 
 if __name__ == "__main__":
-    command.leave(main)
+    command.exit_with_status(main)

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from truesky.validation.verdicts import AROUND, FAIL, LEAST, MOST, PASS, UNDECIDED, verdict
+from truesky.validation.verdicts import AT_LEAST, AT_MOST, FAIL, PASS, UNDECIDED, WITHIN, verdict
 
 # What follows from the models' own sources, and what surveys observed.
 _LISTS = (Path(__file__).with_name("expectations.csv"), Path(__file__).with_name("observed.csv"))
@@ -29,54 +29,54 @@ class Check:
     """
 
     name: str
-    found: float
+    value: float
     expected: float
     tolerance: float
     kind: str
     source: str
     group: str = ""
-    known: str = ""
-    gates: bool = True
+    known_failure: str = ""
+    is_binding: bool = True
 
     @property
-    def least(self) -> float:
+    def lower_limit(self) -> float:
         """Smallest value that is as expected."""
-        return -math.inf if self.kind == MOST else self.expected - self.tolerance
+        return -math.inf if self.kind == AT_MOST else self.expected - self.tolerance
 
     @property
-    def most(self) -> float:
+    def upper_limit(self) -> float:
         """Largest value that is as expected."""
-        return math.inf if self.kind == LEAST else self.expected + self.tolerance
+        return math.inf if self.kind == AT_LEAST else self.expected + self.tolerance
 
     @property
-    def passed(self) -> bool:
+    def passes(self) -> bool:
         """True if the value is as expected; the tolerance has room for its error."""
-        return verdict(self.found, 0.0, self.expected, self.tolerance, self.kind) == PASS
+        return verdict(self.value, 0.0, self.expected, self.tolerance, self.kind) == PASS
 
     @property
     def verdict(self) -> str:
         """PASS or FAIL; UNDECIDED if the expectation is remembered."""
-        return (PASS if self.passed else FAIL) if self.gates else UNDECIDED
+        return (PASS if self.passes else FAIL) if self.is_binding else UNDECIDED
 
     @property
-    def unexpected(self) -> bool:
+    def is_unexpected_failure(self) -> bool:
         """Does it fail, and is not known to?"""
-        return self.verdict == FAIL and not self.known
+        return self.verdict == FAIL and not self.known_failure
 
 
-def checks(figures: Mapping[str, float], errors: float = 0.0) -> list[Check]:
+def evaluate(figures: Mapping[str, float], n_sigma: float = 0.0) -> list[Check]:
     """Every expectation of a figure that was measured; errors : how many of its own a tolerance is widened by."""
-    return [check for path in _LISTS for check in read(path, figures, errors)]
+    return [check for path in _LISTS for check in read(path, figures, n_sigma)]
 
 
-def read(path: Path, figures: Mapping[str, float], errors: float = 0.0) -> list[Check]:
+def read(path: Path, figures: Mapping[str, float], n_sigma: float = 0.0) -> list[Check]:
     """The expectations of a file.
 
     path : of a CSV with columns name, expected, kind (relative, absolute, factor, least, most), tolerance, source,
            known_to_fail, and maybe errors (how many of the figure's own widen the tolerance), confidence (M: no gate)
     figures, errors : as of `checks`
     """
-    found = []
+    results = []
     with path.open(newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
             name, expected, tolerance, kind = row["name"], float(row["expected"]), float(row["tolerance"]), row["kind"]
@@ -85,16 +85,16 @@ def read(path: Path, figures: Mapping[str, float], errors: float = 0.0) -> list[
             if kind == "relative":
                 tolerance *= abs(expected)
             elif kind == "factor":
-                least, most = expected / tolerance, expected * tolerance
-                expected, tolerance = 0.5 * (least + most), 0.5 * (most - least)
-            tolerance += max(float(row.get("errors") or 0.0), errors) * figures.get(f"{name}_error", 0.0)
-            if kind in (LEAST, MOST):
-                expected, tolerance = expected + (tolerance if kind == MOST else -tolerance), 0.0
+                lower, upper = expected / tolerance, expected * tolerance
+                expected, tolerance = 0.5 * (lower + upper), 0.5 * (upper - lower)
+            tolerance += max(float(row.get("errors") or 0.0), n_sigma) * figures.get(f"{name}_error", 0.0)
+            if kind in (AT_LEAST, AT_MOST):
+                expected, tolerance = expected + (tolerance if kind == AT_MOST else -tolerance), 0.0
             else:
-                kind = AROUND
-            about = row["source"], row.get("group") or "", row["known_to_fail"], row.get("confidence") != "M"
-            found.append(Check(name, figures[name], expected, tolerance, kind, *about))
-    return found
+                kind = WITHIN
+            details = row["source"], row.get("group") or "", row["known_to_fail"], row.get("confidence") != "M"
+            results.append(Check(name, figures[name], expected, tolerance, kind, *details))
+    return results
 
 
 def report(figures: Mapping[str, float], results: Sequence[Check]) -> list[str]:
@@ -105,13 +105,13 @@ def report(figures: Mapping[str, float], results: Sequence[Check]) -> list[str]:
             print(f"{'':9} {name:34} {value:12,.4g}")
     for check in results:
         error = f" +- {figures[check.name + '_error']:.2g}" if f"{check.name}_error" in figures else ""
-        span = f"{check.least:.4g} .. {check.most:.4g}"
-        print(f"{check.verdict:9} {check.name:34} {check.found:12,.4g}{error:10} {span:20} {check.source}")
-    failed = [check for check in results if not check.passed]
+        span = f"{check.lower_limit:.4g} .. {check.upper_limit:.4g}"
+        print(f"{check.verdict:9} {check.name:34} {check.value:12,.4g}{error:10} {span:20} {check.source}")
+    failed = [check for check in results if not check.passes]
     print(f"{len(results) - len(failed)} of {len(results)} as expected")
-    for check in (check for check in failed if check.gates):
-        print(f"  not: {check.name}{', known to fail: ' if check.known else ''}{check.known}")
+    for check in (check for check in failed if check.is_binding):
+        print(f"  not: {check.name}{', known to fail: ' if check.known_failure else ''}{check.known_failure}")
     for check in results:
-        if check.passed and check.known:
+        if check.passes and check.known_failure:
             print(f"  passes, listed as known to fail: {check.name}")
     return [check.name for check in failed]

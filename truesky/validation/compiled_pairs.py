@@ -9,17 +9,19 @@ from truesky.numerics.compiling import exact_jit
 
 
 @exact_jit
-def counted(first: Int, pair: Int, place: Float, kind: Int, patch: Int, edge: Float, sums: Float) -> None:
+def count_pairs(
+    cube_starts: Int, cube_pairs: Int, place: Float, kind: Int, patch: Int, edge: Float, sums: Float
+) -> None:
     """Pairs by the patches of both ends, separation, and kind: sums[patch, patch, bin, kind + kind].
 
     first : [c + 1] rows at which cubes begin;  pair : [2, m] cubes whose places may be near, each pair once
     place : [n, 3] unit vectors;  kind : 0 or 1;  edge : squared chords, ascending
     """
     last = edge.size - 1
-    for p in range(pair.shape[1]):
-        a, b = pair[0, p], pair[1, p]
-        for i in range(first[a], first[a + 1]):
-            for j in range(i + 1 if a == b else first[b], first[b + 1]):
+    for p in range(cube_pairs.shape[1]):
+        a, b = cube_pairs[0, p], cube_pairs[1, p]
+        for i in range(cube_starts[a], cube_starts[a + 1]):
+            for j in range(i + 1 if a == b else cube_starts[b], cube_starts[b + 1]):
                 dx, dy, dz = place[i, 0] - place[j, 0], place[i, 1] - place[j, 1], place[i, 2] - place[j, 2]
                 square = dx * dx + dy * dy + dz * dz
                 if square >= edge[last] or square < edge[0]:
@@ -31,16 +33,16 @@ def counted(first: Int, pair: Int, place: Float, kind: Int, patch: Int, edge: Fl
 
 
 @exact_jit
-def sum_products(first: Int, pair: Int, place: Float, value: Float, edge: Float, sums: Float) -> None:
+def sum_products(cube_starts: Int, cube_pairs: Int, place: Float, value: Float, edge: Float, sums: Float) -> None:
     """Number of pairs, sum of separations (rad) and sums of products of k kinds of values: sums[bin, 2 + k].
 
     value : [n, k] at each place;  first, pair, place, edge : as of `counted`
     """
     last = edge.size - 1
-    for p in range(pair.shape[1]):
-        a, b = pair[0, p], pair[1, p]
-        for i in range(first[a], first[a + 1]):
-            for j in range(i + 1 if a == b else first[b], first[b + 1]):
+    for p in range(cube_pairs.shape[1]):
+        a, b = cube_pairs[0, p], cube_pairs[1, p]
+        for i in range(cube_starts[a], cube_starts[a + 1]):
+            for j in range(i + 1 if a == b else cube_starts[b], cube_starts[b + 1]):
                 dx, dy, dz = place[i, 0] - place[j, 0], place[i, 1] - place[j, 1], place[i, 2] - place[j, 2]
                 square = dx * dx + dy * dy + dz * dz
                 if square >= edge[last] or square < edge[0]:
@@ -48,25 +50,27 @@ def sum_products(first: Int, pair: Int, place: Float, value: Float, edge: Float,
                 k = last - 1
                 while square < edge[k]:
                     k -= 1
-                own = sums[k]
-                own[0] += 1.0
-                own[1] += 2.0 * math.asin(0.5 * math.sqrt(square))
+                bin_sums = sums[k]
+                bin_sums[0] += 1.0
+                bin_sums[1] += 2.0 * math.asin(0.5 * math.sqrt(square))
                 for kind in range(value.shape[1]):
-                    own[2 + kind] += value[i, kind] * value[j, kind]
+                    bin_sums[2 + kind] += value[i, kind] * value[j, kind]
 
 
 @exact_jit
-def sheared(first: Int, pair: Int, frame: Float, shear: Float, patch: Int, edge: Float, sums: Float) -> None:
+def sum_shear_products(
+    cube_starts: Int, cube_pairs: Int, frame: Float, shear: Float, patch: Int, edge: Float, sums: Float
+) -> None:
     """The same of products of shear: number, xi+, xi-, cross, and of convergence with convergence, gamma_t, gamma_x.
 
     frame : [n, 3, 3] east, north and direction of each place;  shear : [n, 3] gamma1, gamma2, kappa
     sums  : [patch, patch, bin, 7];  first, pair, patch, edge : as of `counted`
     """
     last = edge.size - 1
-    for p in range(pair.shape[1]):
-        a, b = pair[0, p], pair[1, p]
-        for i in range(first[a], first[a + 1]):
-            for j in range(i + 1 if a == b else first[b], first[b + 1]):
+    for p in range(cube_pairs.shape[1]):
+        a, b = cube_pairs[0, p], cube_pairs[1, p]
+        for i in range(cube_starts[a], cube_starts[a + 1]):
+            for j in range(i + 1 if a == b else cube_starts[b], cube_starts[b + 1]):
                 dx = frame[j, 2, 0] - frame[i, 2, 0]
                 dy = frame[j, 2, 1] - frame[i, 2, 1]
                 dz = frame[j, 2, 2] - frame[i, 2, 2]
@@ -88,12 +92,12 @@ def sheared(first: Int, pair: Int, frame: Float, shear: Float, patch: Int, edge:
                 x_i = -(shear[i, 1] * cos_i - shear[i, 0] * sin_i)
                 t_j = -(shear[j, 0] * cos_j + shear[j, 1] * sin_j)
                 x_j = -(shear[j, 1] * cos_j - shear[j, 0] * sin_j)
-                one, other = shear[i, 2], shear[j, 2]
-                own = sums[patch[i], patch[j], k]
-                own[0] += 1.0
-                own[1] += t_i * t_j + x_i * x_j
-                own[2] += t_i * t_j - x_i * x_j
-                own[3] += 0.5 * (t_i * x_j + x_i * t_j)
-                own[4] += one * other
-                own[5] += 0.5 * (one * t_j + other * t_i)
-                own[6] += 0.5 * (one * x_j + other * x_i)
+                kappa_i, kappa_j = shear[i, 2], shear[j, 2]
+                bin_sums = sums[patch[i], patch[j], k]
+                bin_sums[0] += 1.0
+                bin_sums[1] += t_i * t_j + x_i * x_j
+                bin_sums[2] += t_i * t_j - x_i * x_j
+                bin_sums[3] += 0.5 * (t_i * x_j + x_i * t_j)
+                bin_sums[4] += kappa_i * kappa_j
+                bin_sums[5] += 0.5 * (kappa_i * t_j + kappa_j * t_i)
+                bin_sums[6] += 0.5 * (kappa_i * x_j + kappa_j * x_i)

@@ -22,9 +22,9 @@ from lake_schema.store import read
 from truesky.randomness.rng import stream
 
 # Patches, and the fewest that tell an error.
-PATCHES, FEWEST = 16, 6
+PATCHES, MIN_PATCHES = 16, 6
 # Sources that a cell holds in the mean where nobody says which cells were drawn, and the finest such cells.
-_FILLED, _FINEST = 40.0, 12
+_SOURCES_PER_CELL, _FINEST_ORDER = 40.0, 12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +36,7 @@ class Field:
     patch: Int
 
     @property
-    def patches(self) -> int:
+    def n_patches(self) -> int:
         return int(self.patch.max(initial=-1)) + 1
 
     @property
@@ -45,61 +45,65 @@ class Field:
         return len(self.cells) * sky.cell_area(self.order)
 
     @property
-    def side(self) -> float:
+    def patch_side(self) -> float:
         """Of a patch, deg, as if it were a square."""
-        return float(np.sqrt(self.area / max(self.patches, 1)))
+        return float(np.sqrt(self.area / max(self.n_patches, 1)))
 
     def patch_of(self, index: Int) -> Int:
         """Patch[n] of order-29 indices, -1 outside."""
-        cell = index >> 2 * (sky.DEEPEST - self.order)
+        cell = index >> 2 * (sky.MAX_ORDER - self.order)
         at = np.minimum(np.searchsorted(self.cells, cell), max(len(self.cells) - 1, 0))
         if not len(self.cells):
             return np.full(len(index), -1)
         return np.where(self.cells[at] == cell, self.patch[at], -1)
 
 
-def of_version(catalogue: read.Version, index: Int) -> Field:
+def from_version(catalogue: read.Version, index: Int) -> Field:
     """Where a catalogue was drawn; if it does not say, where it has sources.
 
     catalogue : of a lake;  index : int[n] order-29 indices of its sources
     """
-    drawn = {cell for part in catalogue.manifest["parts"] for cell in part["facts"].get("generation_cells", ())}
-    if drawn:
-        return of_cells(GENERATION_ORDER, np.array(sorted(drawn), np.int64))
+    generation_cells = {
+        cell for part in catalogue.manifest["parts"] for cell in part["facts"].get("generation_cells", ())
+    }
+    if generation_cells:
+        return from_cells(GENERATION_ORDER, np.array(sorted(generation_cells), np.int64))
     order = GENERATION_ORDER
-    while order < _FINEST and len(index) > _FILLED * 4 * len(_cells(index, order)):
+    while order < _FINEST_ORDER and len(index) > _SOURCES_PER_CELL * 4 * len(_occupied_cells(index, order)):
         order += 1
-    return of_cells(order, _cells(index, order))
+    return from_cells(order, _occupied_cells(index, order))
 
 
-def of_cells(order: int, cells: Int) -> Field:
+def from_cells(order: int, cells: Int) -> Field:
     """In patches of neighbouring cells, none smaller than one that is drawn; cells : int[c] of an order, ascending."""
-    many = max(min(PATCHES, len(cells) >> 2 * (order - GENERATION_ORDER)), 1)
-    return Field(order, cells, np.arange(len(cells)) * many // max(len(cells), 1))
+    n_patches = max(min(PATCHES, len(cells) >> 2 * (order - GENERATION_ORDER)), 1)
+    return Field(order, cells, np.arange(len(cells)) * n_patches // max(len(cells), 1))
 
 
-def _cells(index: Int, order: int) -> Int:
-    return np.unique(index >> 2 * (sky.DEEPEST - order))
+def _occupied_cells(index: Int, order: int) -> Int:
+    return np.unique(index >> 2 * (sky.MAX_ORDER - order))
 
 
-def random(field: Field, n: int, *identity: int | str) -> tuple[Float, Int]:
+def random_positions(field: Field, n: int, *identity: int | str) -> tuple[Float, Int]:
     """(unit vectors[m, 3], patch[m]) of about n places, as many in each cell.
 
     field : to be filled;  identity : of their stream
     """
-    each = max(n // max(len(field.cells), 1), 1)
-    places = [sky.random_in_cell(field.order, int(cell), each, stream(*identity, int(cell))) for cell in field.cells]
+    per_cell = max(n // max(len(field.cells), 1), 1)
+    places = [
+        sky.random_in_cell(field.order, int(cell), per_cell, stream(*identity, int(cell))) for cell in field.cells
+    ]
     ra, dec = (np.concatenate([part[i] for part in places]) for i in (1, 2))
-    return sky.unit_vectors(ra, dec), np.repeat(field.patch, each)
+    return sky.unit_vectors(ra, dec), np.repeat(field.patch, per_cell)
 
 
-def spread(without: Float | Sequence[float], fewest: int = FEWEST) -> Float:
+def jackknife_error(samples: Float | Sequence[float], min_patches: int = MIN_PATCHES) -> Float:
     """Standard error[...] of a figure, NaN of fewer than `fewest` patches.
 
     without : float[patch, ...] the figure without each patch;  fewest : patches that tell an error
     """
-    values = np.asarray(without, float)
-    if len(values) < fewest:
+    values = np.asarray(samples, float)
+    if len(values) < min_patches:
         return np.full(values.shape[1:], np.nan)
     n = len(values)
     return np.asarray(np.sqrt((n - 1) / n * np.sum((values - values.mean(0)) ** 2, axis=0)))

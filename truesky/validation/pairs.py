@@ -19,7 +19,7 @@ from truesky.randomness import rng
 from truesky.validation import compiled_pairs
 
 # Pairs of places in neighbouring cubes that are looked at, at most: 3 s.
-MOST = 1e8
+MAX_PAIRS = 1e8
 CHANNELS = 7
 # Half of the 26 neighbours of a cube, and itself.
 _OFFSETS = [(0, 0, 0)] + [
@@ -32,31 +32,38 @@ class Sums:
     """total : float[c, bin] of all pairs;  without : float[patch, c, bin] of those with no end in a patch."""
 
     total: Float
-    without: Float
+    jackknife: Float
 
 
-def counted(place: Float, kind: Int, patch: Int, edges: Float) -> Sums:
+def count_pairs(place: Float, kind: Int, patch: Int, edges: Float) -> Sums:
     """Pairs of two of kind 0, of one each, and of two of kind 1.
 
     place : float[n, 3] unit vectors;  kind : int[n] 0 or 1;  patch : int[n] from 0 on;  edges : of separations, rad
     """
-    order, first, pair = _cubes(place, edges[-1])
-    sums, own = _empty(3, edges, patch), (np.ascontiguousarray(place[order]), kind[order].astype(np.int64))
-    compiled_pairs.counted(first, pair, *own, patch[order].astype(np.int64), _chords(edges), sums)
-    return _without(sums)
+    order, cube_starts, cube_pairs = _sort_into_cubes(place, edges[-1])
+    sums, sorted_rows = _empty_sums(3, edges, patch), (np.ascontiguousarray(place[order]), kind[order].astype(np.int64))
+    compiled_pairs.count_pairs(
+        cube_starts, cube_pairs, *sorted_rows, patch[order].astype(np.int64), _chords(edges), sums
+    )
+    return _sums_with_jackknife(sums)
 
 
-def sheared(ra: Float, dec: Float, shear: Float, patch: Int, edges: Float) -> Sums:
+def sum_shear_products(ra: Float, dec: Float, shear: Float, patch: Int, edges: Float) -> Sums:
     """Sums of CHANNELS products: 1, xi+, xi-, cross, kappa kappa, kappa gamma_t, kappa gamma_x.
 
     ra, dec : float[n] deg;  shear : float[n, 3] gamma1, gamma2 in the frame (east, north), kappa
     patch   : int[n] from 0 on;  edges : of separations, rad
     """
     frame = frames(ra, dec)
-    order, first, pair = _cubes(frame[:, 2], edges[-1])
-    sums, own = _empty(CHANNELS, edges, patch), (np.ascontiguousarray(frame[order]), shear[order].astype(float))
-    compiled_pairs.sheared(first, pair, *own, patch[order].astype(np.int64), _chords(edges), sums)
-    return _without(sums)
+    order, cube_starts, cube_pairs = _sort_into_cubes(frame[:, 2], edges[-1])
+    sums, sorted_rows = (
+        _empty_sums(CHANNELS, edges, patch),
+        (np.ascontiguousarray(frame[order]), shear[order].astype(float)),
+    )
+    compiled_pairs.sum_shear_products(
+        cube_starts, cube_pairs, *sorted_rows, patch[order].astype(np.int64), _chords(edges), sums
+    )
+    return _sums_with_jackknife(sums)
 
 
 def sum_products(place: Float, values: Float, edges: Float) -> tuple[Float, Float, Float]:
@@ -78,18 +85,18 @@ def sum_products(place: Float, values: Float, edges: Float) -> tuple[Float, Floa
     product : ndarray of float64, shape (k, b)
         Sum of the products of the values at both ends.
     """
-    order, first, pair = _cubes(place, edges[-1])
+    order, cube_starts, cube_pairs = _sort_into_cubes(place, edges[-1])
     sums = np.zeros((len(edges) - 1, 2 + values.shape[1]))
     ordered = np.ascontiguousarray(place[order]), np.ascontiguousarray(values[order], np.float64)
-    compiled_pairs.sum_products(first, pair, *ordered, _chords(edges), sums)
+    compiled_pairs.sum_products(cube_starts, cube_pairs, *ordered, _chords(edges), sums)
     return sums[:, 0], sums[:, 1], sums[:, 2:].T
 
 
-def _without(sums: Float) -> Sums:
+def _sums_with_jackknife(sums: Float) -> Sums:
     """Of sums[patch, patch, bin, c]."""
     total = sums.sum((0, 1))
-    both = np.einsum("iikc->ikc", sums)
-    return Sums(total.T, np.swapaxes(total - sums.sum(0) - sums.sum(1) + both, 1, 2))
+    within_patch = np.einsum("iikc->ikc", sums)
+    return Sums(total.T, np.swapaxes(total - sums.sum(0) - sums.sum(1) + within_patch, 1, 2))
 
 
 def frames(ra: Float, dec: Float) -> Float:
@@ -100,41 +107,41 @@ def frames(ra: Float, dec: Float) -> Float:
     return np.stack([east, north, sky.unit_vectors(ra, dec)], 1)
 
 
-def thinned(ids: Int, place: Float, widest: float, most: float = MOST) -> Bool:
+def thin_sample(ids: Int, place: Float, max_separation: float, max_pairs: float = MAX_PAIRS) -> Bool:
     """Which of the places are kept, so that no more than `most` pairs are looked at; by their ids alone.
 
     ids : int[n];  place : float[n, 3] unit vectors;  widest : separation, rad
     """
-    _, first, pair = _cubes(place, widest)
-    number = np.diff(first).astype(float)
-    looked = float(np.sum(number[pair[0]] * number[pair[1]]))
-    if looked <= most:
+    _, cube_starts, cube_pairs = _sort_into_cubes(place, max_separation)
+    number = np.diff(cube_starts).astype(float)
+    n_pairs = float(np.sum(number[cube_pairs[0]] * number[cube_pairs[1]]))
+    if n_pairs <= max_pairs:
         return np.ones(len(ids), bool)
-    chance = rng.mixed(ids.astype(np.uint64) * rng.GOLDEN) / 2.0**64
-    return np.asarray(chance < np.sqrt(most / looked))
+    chance = rng.mix_bits(ids.astype(np.uint64) * rng.GOLDEN) / 2.0**64
+    return np.asarray(chance < np.sqrt(max_pairs / n_pairs))
 
 
 def _chords(edges: Float) -> Float:
     return np.asarray((2.0 * np.sin(0.5 * edges)) ** 2)
 
 
-def _empty(channels: int, edges: Float, patch: Int) -> Float:
-    many = int(patch.max(initial=-1)) + 1
-    return np.zeros((many, many, len(edges) - 1, channels))
+def _empty_sums(channels: int, edges: Float, patch: Int) -> Float:
+    n_patches = int(patch.max(initial=-1)) + 1
+    return np.zeros((n_patches, n_patches, len(edges) - 1, channels))
 
 
-def _cubes(place: Float, widest: float) -> tuple[Int, Int, Int]:
+def _sort_into_cubes(place: Float, max_separation: float) -> tuple[Int, Int, Int]:
     """Order of the places by cube, row at which each cube begins, and pairs [2, m] of cubes that touch."""
-    side = 2.0 * np.sin(0.5 * widest)
-    many = int(2.0 / side) + 3
+    side = 2.0 * np.sin(0.5 * max_separation)
+    n_side = int(2.0 / side) + 3
     at = np.floor((place + 1.0) / side).astype(np.int64) + 1
-    key = (at[:, 0] * many + at[:, 1]) * many + at[:, 2]
+    key = (at[:, 0] * n_side + at[:, 1]) * n_side + at[:, 2]
     order = np.argsort(key, kind="stable")
-    cube, first = np.unique(key[order], return_index=True)
-    found = []
+    cube, cube_starts = np.unique(key[order], return_index=True)
+    neighbours = []
     for x, y, z in _OFFSETS:
-        wanted = cube + (x * many + y) * many + z
-        other = np.minimum(np.searchsorted(cube, wanted), max(len(cube) - 1, 0))
-        here = np.flatnonzero(cube[other] == wanted) if len(cube) else other
-        found.append(np.stack([here, other[here]]))
-    return order, np.append(first, len(key)), np.ascontiguousarray(np.concatenate(found, 1))
+        neighbour_key = cube + (x * n_side + y) * n_side + z
+        neighbour_index = np.minimum(np.searchsorted(cube, neighbour_key), max(len(cube) - 1, 0))
+        matches = np.flatnonzero(cube[neighbour_index] == neighbour_key) if len(cube) else neighbour_index
+        neighbours.append(np.stack([matches, neighbour_index[matches]]))
+    return order, np.append(cube_starts, len(key)), np.ascontiguousarray(np.concatenate(neighbours, 1))

@@ -34,10 +34,10 @@ _STEPS, _FINE = 100, 40_000
 ELL = np.geomspace(1.0, 2e5, 160)
 
 
-def power(k: Float, z: float) -> Float:
+def nonlinear_power(k: Float, z: float) -> Float:
     """P(k)[n], (Mpc/h)^3, at one redshift; k : float[n] h/Mpc."""
     nodes, today = np.exp(_LN_K), float(density_box.growth(z)) ** 2
-    delta = nodes**3 * _today() * today / (2 * np.pi**2)
+    delta = nodes**3 * _linear_power_today() * today / (2 * np.pi**2)
 
     def sigma2(ln_r: float) -> float:
         return float(np.trapezoid(delta * np.exp(-((nodes * np.exp(ln_r)) ** 2)), _LN_K))
@@ -55,24 +55,24 @@ def power(k: Float, z: float) -> Float:
     beta = 2.0379 - 0.7354 * n + 0.3157 * n**2 + 1.2490 * n**3 + 0.3980 * n**4 - 0.1682 * c
     nu = 10 ** (5.2105 + 3.6902 * n)
     f1, f2, f3 = om**-0.0307, om**-0.0585, om**0.0743
-    smooth = k**3 * today * np.exp(np.interp(np.log(k), _LN_K, np.log(_today()))) / (2 * np.pi**2)
+    smooth = k**3 * today * np.exp(np.interp(np.log(k), _LN_K, np.log(_linear_power_today()))) / (2 * np.pi**2)
     y = k * np.exp(ln_r)
     quasi = smooth * (1 + smooth) ** beta / (1 + alpha * smooth) * np.exp(-(y / 4 + y**2 / 8))
     halo = a * y ** (3 * f1) / (1 + b * y**f2 + (g * f3 * y) ** (3 - gamma)) / (1 + nu / y**2)
     return np.asarray(2 * np.pi**2 * (quasi + halo) / k**3)
 
 
-def linear(k: Float, z: float) -> Float:
+def linear_power(k: Float, z: float) -> Float:
     """P(k)[n] of linear theory, (Mpc/h)^3, at one redshift; k : float[n] h/Mpc."""
     return np.asarray(density_box.linear_power(k) * float(density_box.growth(z)) ** 2)
 
 
 @cache
-def _today() -> Float:
+def _linear_power_today() -> Float:
     """Linear power at the nodes, z = 0: read-only."""
-    found = np.asarray(density_box.linear_power(np.exp(_LN_K)), float)
-    found.flags.writeable = False
-    return found
+    spectrum = np.asarray(density_box.linear_power(np.exp(_LN_K)), float)
+    spectrum.flags.writeable = False
+    return spectrum
 
 
 def lensing_weight(x: Float, chi: Float, weight: Float) -> Float:
@@ -85,8 +85,12 @@ def lensing_weight(x: Float, chi: Float, weight: Float) -> Float:
     return np.asarray(lens * np.sum(efficiency * weight, axis=1) / weight.sum())
 
 
-def convergence(
-    ell: Float, chi: Float, weight: Float, of: Callable[[Float, float], Float] = power, x: Float | None = None
+def convergence_power(
+    ell: Float,
+    chi: Float,
+    weight: Float,
+    power_spectrum: Callable[[Float, float], Float] = nonlinear_power,
+    x: Float | None = None,
 ) -> Float:
     """C_l[n] of the convergence.
 
@@ -95,7 +99,7 @@ def convergence(
     """
     x = np.linspace(5.0, float(chi.max()) - 1.0, _STEPS) if x is None else x
     z, lens = np.asarray(cosmology.redshift(x)), lensing_weight(x, chi, weight)
-    rows = [(w / d) ** 2 * of((ell + 0.5) / d, float(at)) for w, d, at in zip(lens, x, z, strict=True)]
+    rows = [(w / d) ** 2 * power_spectrum((ell + 0.5) / d, float(at)) for w, d, at in zip(lens, x, z, strict=True)]
     return np.asarray(np.trapezoid(np.array(rows), x, axis=0))
 
 
@@ -104,7 +108,7 @@ class Shells:
     """Galaxies by comoving distance: float[s] middle and width of each shell, Mpc/h, and share / (Mpc/h) times bias."""
 
     chi: Float
-    wide: Float
+    width: Float
     weight: Float
 
 
@@ -112,30 +116,32 @@ def shells(chi: Float, bias: Float, edges: Float) -> Shells:
     """Galaxies at chi[n] Mpc/h with these biases[n], in shells with edges[s + 1] Mpc/h."""
     number = np.histogram(chi, edges)[0].astype(float)
     mean = np.histogram(chi, edges, weights=bias)[0] / np.maximum(number, 1.0)
-    wide = np.diff(edges)
-    return Shells(0.5 * (edges[1:] + edges[:-1]), wide, number / number.sum() / wide * mean)
+    width = np.diff(edges)
+    return Shells(0.5 * (edges[1:] + edges[:-1]), width, number / number.sum() / width * mean)
 
 
-def galaxies(ell: Float, tracers: Shells, of: Callable[[Float, float], Float] = power) -> Float:
+def galaxy_power(
+    ell: Float, tracers: Shells, power_spectrum: Callable[[Float, float], Float] = nonlinear_power
+) -> Float:
     """C_l[n] of galaxies; ell : float[n];  tracers : the galaxies by distance;  of : P(k, z)"""
     total = np.zeros(len(ell))
-    for at, step, one in zip(tracers.chi, tracers.wide, tracers.weight, strict=True):
-        if one > 0.0:
-            total += step * (one / at) ** 2 * of((ell + 0.5) / at, float(cosmology.redshift(at)))
+    for chi, width, weight in zip(tracers.chi, tracers.width, tracers.weight, strict=True):
+        if weight > 0.0:
+            total += width * (weight / chi) ** 2 * power_spectrum((ell + 0.5) / chi, float(cosmology.redshift(chi)))
     return total
 
 
 def correlation(theta: Float, ell: Float, c_l: Float) -> Float:
     """w[n] at theta rad, of C_l at ascending ell."""
-    return _transformed(theta, ell, c_l, j0)
+    return _hankel_transform(theta, ell, c_l, j0)
 
 
 def shear_correlations(theta: Float, ell: Float, c_l: Float) -> tuple[Float, Float]:
     """xi+, xi- [n] at theta rad, of C_l at ascending ell."""
-    return _transformed(theta, ell, c_l, j0), _transformed(theta, ell, c_l, _j4)
+    return _hankel_transform(theta, ell, c_l, j0), _hankel_transform(theta, ell, c_l, _j4)
 
 
-def _transformed(theta: Float, ell: Float, c_l: Float, bessel: Callable[[Float], Float]) -> Float:
+def _hankel_transform(theta: Float, ell: Float, c_l: Float, bessel: Callable[[Float], Float]) -> Float:
     fine = np.geomspace(ell[0], ell[-1], _FINE)
     weight = fine**2 * np.exp(np.interp(np.log(fine), np.log(ell), np.log(np.maximum(c_l, 1e-300)))) / (2 * np.pi)
     # The sum ends softly: no ringing at small separations.
@@ -146,23 +152,23 @@ def _transformed(theta: Float, ell: Float, c_l: Float, bessel: Callable[[Float],
 
 def _j4(x: Float) -> Float:
     """Bessel's function of order 4 by those of 0 and 1, which are ten times as fast; by its series where x is small."""
-    far = np.maximum(x, 0.5)
-    found = (48.0 / far**3 - 8.0 / far) * j1(far) - (24.0 / far**2 - 1.0) * j0(far)
-    return np.where(x < 0.5, x**4 / 384.0 * (1.0 - x**2 / 20.0 + x**4 / 960.0), found)
+    large_x = np.maximum(x, 0.5)
+    value = (48.0 / large_x**3 - 8.0 / large_x) * j1(large_x) - (24.0 / large_x**2 - 1.0) * j0(large_x)
+    return np.where(x < 0.5, x**4 / 384.0 * (1.0 - x**2 / 20.0 + x**4 / 960.0), value)
 
 
-def aperture(edges: Float, plus: Float, minus: Float, radius: float) -> tuple[Float, Float]:
+def aperture_mass(edges: Float, plus: Float, minus: Float, radius: float) -> tuple[Float, Float]:
     """Mean square of the aperture mass and of its cross component, the latter 0 where there are no B modes.
 
     edges : float[n + 1] of bins of separation, from 0 on;  plus, minus : float[..., n] xi+ and xi- of each
     radius : in the unit of the edges, at most half the last edge
     """
-    middle, wide = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
+    middle, width = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
     x = np.minimum(middle / radius, 2.0)
-    measure = np.where(edges[1:] <= 2.0 * radius * (1 + 1e-9), middle * wide / radius**2, 0.0)
+    measure = np.where(edges[1:] <= 2.0 * radius * (1 + 1e-9), middle * width / radius**2, 0.0)
     t_plus = 1.2 * (2 - 15 * x**2) * (1 - 2 / np.pi * np.arcsin(x / 2))
     poly = 120 + 2320 * x**2 - 754 * x**4 + 132 * x**6 - 9 * x**8
     t_plus = t_plus + x * np.sqrt(4 - x**2) / (100 * np.pi) * poly
     t_minus = 192 / (35 * np.pi) * x**3 * (1 - x**2 / 4) ** 3.5
-    one, other = np.sum(measure * t_plus * plus, -1), np.sum(measure * t_minus * minus, -1)
-    return 0.5 * (one + other), 0.5 * (one - other)
+    from_plus, from_minus = np.sum(measure * t_plus * plus, -1), np.sum(measure * t_minus * minus, -1)
+    return 0.5 * (from_plus + from_minus), 0.5 * (from_plus - from_minus)

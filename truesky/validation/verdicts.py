@@ -8,12 +8,12 @@ from __future__ import annotations
 import math
 
 PASS, FAIL, UNDECIDED, NOT_APPLICABLE = "pass", "fail", "undecided", "not_applicable"
-AROUND, LEAST, MOST = "around", "least", "most"
+WITHIN, AT_LEAST, AT_MOST = "around", "least", "most"
 # Standard errors beyond the tolerance from which a value is wrong, whatever chance does.
-SURE = 3.0
+FAIL_SIGMAS = 3.0
 
 
-def verdict(value: float, error: float, expected: float, tolerance: float, kind: str = AROUND) -> str:
+def verdict(value: float, error: float, expected: float, tolerance: float, kind: str = WITHIN) -> str:
     """Return "pass", "fail" or "undecided".
 
     A value fails if it lies more than three standard errors beyond the tolerance. It passes if it lies within the
@@ -36,9 +36,9 @@ def verdict(value: float, error: float, expected: float, tolerance: float, kind:
     """
     if not (math.isfinite(value) and math.isfinite(error)):
         return UNDECIDED
-    off = {AROUND: abs(value - expected), LEAST: expected - value, MOST: value - expected}[kind]
-    beyond = off - tolerance
-    if beyond > SURE * error:
+    deviation = {WITHIN: abs(value - expected), AT_LEAST: expected - value, AT_MOST: value - expected}[kind]
+    excess = deviation - tolerance
+    if excess > FAIL_SIGMAS * error:
         return FAIL
-    sure = error <= tolerance or beyond < -SURE * error
-    return PASS if beyond <= 0.0 and sure else UNDECIDED
+    is_precise = error <= tolerance or excess < -FAIL_SIGMAS * error
+    return PASS if excess <= 0.0 and is_precise else UNDECIDED

@@ -20,22 +20,22 @@ from typing import Any
 
 from lake_schema import __version__, command
 from lake_schema.errors import BadInput, Damaged, Superseded
-from lake_schema.store import layout, manifest, names
+from lake_schema.store import layout, manifest, request_links
 from lake_schema.store.object_storage import s3
-from lake_schema.store.object_storage.s3 import CURRENT, MANIFEST, Address, Published
+from lake_schema.store.object_storage.s3 import CURRENT, MANIFEST, Address, PublishedVersions
 from lake_schema.store.provenance import file_sha256
 
 # A put holds at most 5 GB; a larger file goes in parts, each with a checksum of its own.
-_IN_ONE_PUT, _PART = 1 << 30, 256 << 20
-_PIECE = 8 << 20
+_MAX_PUT_BYTES, _PART_BYTES = 1 << 30, 256 << 20
+_CHUNK_BYTES = 8 << 20
 THREADS = 16
 # What services answer where a condition of a put does not hold, or another put is under way.
-_REFUSED = {"PreconditionFailed", "ConditionalRequestConflict", "412", "409"}
-_ABSENT = {"NoSuchKey", "404", "NotFound"}
+_REFUSED_CODES = {"PreconditionFailed", "ConditionalRequestConflict", "412", "409"}
+_ABSENT_CODES = {"NoSuchKey", "404", "NotFound"}
 
 
 @dataclass(frozen=True, slots=True)
-class Sent:
+class PushReport:
     """What a push did with a version: objects and bytes in all, objects and bytes that it sent."""
 
     table: str
@@ -62,29 +62,29 @@ class Bucket:
     Errors : BadInput where the storage does not answer, has no such bucket, or does not let us in
     """
 
-    def __init__(self, place: Address) -> None:
+    def __init__(self, address: Address) -> None:
         try:
             import boto3
             from botocore.config import Config
         except ImportError:
             raise BadInput("push wants the package boto3: pip install 'truesky[s3]', or boto3 alone") from None
-        self.place = place
+        self.address = address
         config = Config(
-            connect_timeout=s3.CONNECT,
-            read_timeout=s3.ANSWER,
-            retries={"mode": "standard", "max_attempts": s3.TRIES},
+            connect_timeout=s3.CONNECT_TIMEOUT,
+            read_timeout=s3.REQUEST_TIMEOUT,
+            retries={"mode": "standard", "max_attempts": s3.MAX_ATTEMPTS},
             max_pool_connections=2 * THREADS,
         )
-        told: dict[str, Any] = {"endpoint_url": place.service} if place.service else {}
-        with self._refusing():
+        options: dict[str, Any] = {"endpoint_url": address.service} if address.service else {}
+        with self._errors_as_bad_input():
             # Where nothing names a region, any serves: a service of one's own has but one, Amazon tells the right one.
             session = boto3.session.Session()
-            region = place.region or session.region_name or "us-east-1"
-            self._client = session.client("s3", region_name=region, config=config, **told)
-            self._client.head_bucket(Bucket=place.bucket)
+            region = address.region or session.region_name or "us-east-1"
+            self._client = session.client("s3", region_name=region, config=config, **options)
+            self._client.head_bucket(Bucket=address.bucket)
 
     @contextmanager
-    def _refusing(self) -> Iterator[None]:
+    def _errors_as_bad_input(self) -> Iterator[None]:
         from botocore.exceptions import BotoCoreError, ClientError
 
         try:
@@ -92,97 +92,99 @@ class Bucket:
         except ClientError as error:
             code = error.response["Error"].get("Code", "")
             if code in ("404", "NoSuchBucket"):
-                raise BadInput(f"{self.place}: there is no bucket {self.place.bucket}") from None
-            raise BadInput(f"{self.place}: {error}") from None
+                raise BadInput(f"{self.address}: there is no bucket {self.address.bucket}") from None
+            raise BadInput(f"{self.address}: {error}") from None
         except (BotoCoreError, ValueError) as error:
-            raise BadInput(f"{self.place}: {error}") from None
+            raise BadInput(f"{self.address}: {error}") from None
 
-    def published(self) -> tuple[Published, str | None]:
+    def read_published(self) -> tuple[PublishedVersions, str | None]:
         """What is published, and the tag of the object that says so; None where there is none.  Errors: Damaged"""
-        if (found := self._read(CURRENT)) is None:
-            return Published({}, {}), None
-        return s3.published(found[0], f"{self.place.plain}/{CURRENT}"), found[1]
+        if (current := self._read_object(CURRENT)) is None:
+            return PublishedVersions({}, {}), None
+        return s3.parse_published(current[0], f"{self.address.plain}/{CURRENT}"), current[1]
 
-    def _read(self, name: str) -> tuple[bytes, str] | None:
-        with self._refusing():
+    def _read_object(self, name: str) -> tuple[bytes, str] | None:
+        with self._errors_as_bad_input():
             try:
-                told = self._client.get_object(Bucket=self.place.bucket, Key=self.place.key(name))
-                return told["Body"].read(), told["ETag"]
+                response = self._client.get_object(Bucket=self.address.bucket, Key=self.address.key(name))
+                return response["Body"].read(), response["ETag"]
             except self._client.exceptions.NoSuchKey:
                 return None
 
-    def holds(self, one: _Object) -> bool:
+    def has_object(self, item: _Object) -> bool:
         """Whether an object is there with the bytes of its file, by its checksum or by reading it."""
         from botocore.exceptions import ClientError
 
-        name = self.place.key(one.name)
-        with self._refusing():
+        object_key = self.address.key(item.name)
+        with self._errors_as_bad_input():
             try:
-                told = self._client.head_object(Bucket=self.place.bucket, Key=name, ChecksumMode="ENABLED")
+                response = self._client.head_object(Bucket=self.address.bucket, Key=object_key, ChecksumMode="ENABLED")
             except ClientError as error:
-                if error.response["Error"].get("Code") in _ABSENT:
+                if error.response["Error"].get("Code") in _ABSENT_CODES:
                     return False
                 raise
-            if told["ContentLength"] != one.size:
+            if response["ContentLength"] != item.size:
                 return False
-            if said := told.get("ChecksumSHA256"):
+            if checksum := response.get("ChecksumSHA256"):
                 # Of one that came in parts it is a sum of their sums, and Amazon says how many behind a hyphen.
-                whole, in_parts, _ = said.partition("-")
-                in_parts = in_parts or "-" in told["ETag"]
-                return bool(whole == (_sum_of_parts(one) if in_parts else _base64(one.sha256)))
+                checksum_value, in_parts, _ = checksum.partition("-")
+                in_parts = in_parts or "-" in response["ETag"]
+                return bool(checksum_value == (_multipart_checksum(item) if in_parts else _base64(item.sha256)))
             # Sent by another program, or kept by a service that keeps no such checksums.
-            summed = hashlib.sha256()
-            body = self._client.get_object(Bucket=self.place.bucket, Key=name)["Body"]
-            for piece in body.iter_chunks(_PIECE):
-                summed.update(piece)
-            return summed.hexdigest() == one.sha256
+            file_hash = hashlib.sha256()
+            body = self._client.get_object(Bucket=self.address.bucket, Key=object_key)["Body"]
+            for piece in body.iter_chunks(_CHUNK_BYTES):
+                file_hash.update(piece)
+            return file_hash.hexdigest() == item.sha256
 
-    def send(self, one: _Object) -> None:
+    def send(self, item: _Object) -> None:
         """Put a file's bytes there, with their checksum."""
-        where = {"Bucket": self.place.bucket, "Key": self.place.key(one.name)}
-        with self._refusing():
-            if one.size <= _IN_ONE_PUT:
-                with one.path.open("rb") as stream:
-                    sums = {"ChecksumAlgorithm": "SHA256", "ChecksumSHA256": _base64(one.sha256)}
-                    self._client.put_object(Body=stream, **where, **sums)
+        target = {"Bucket": self.address.bucket, "Key": self.address.key(item.name)}
+        with self._errors_as_bad_input():
+            if item.size <= _MAX_PUT_BYTES:
+                with item.path.open("rb") as stream:
+                    checksums = {"ChecksumAlgorithm": "SHA256", "ChecksumSHA256": _base64(item.sha256)}
+                    self._client.put_object(Body=stream, **target, **checksums)
                 return
             from boto3.exceptions import S3UploadFailedError
             from boto3.s3.transfer import TransferConfig
 
-            parts = TransferConfig(multipart_threshold=_IN_ONE_PUT, multipart_chunksize=_PART, use_threads=False)
+            parts = TransferConfig(
+                multipart_threshold=_MAX_PUT_BYTES, multipart_chunksize=_PART_BYTES, use_threads=False
+            )
             try:
                 self._client.upload_file(
-                    str(one.path), *where.values(), ExtraArgs={"ChecksumAlgorithm": "SHA256"}, Config=parts
+                    str(item.path), *target.values(), ExtraArgs={"ChecksumAlgorithm": "SHA256"}, Config=parts
                 )
             except S3UploadFailedError as error:
-                raise BadInput(f"{self.place}: {error}") from None
+                raise BadInput(f"{self.address}: {error}") from None
 
-    def knows_conditions(self, name: str) -> bool:
+    def supports_conditions(self, name: str) -> bool:
         """Whether the service refuses a put whose condition does not hold.
 
         name : of an object that is there, and stays as it is either way
         """
-        if (there := self._read(name)) is None:
-            raise Damaged(f"{self.place.plain}/{name} is missing")
-        return not self._put(name, there[0], {"IfNoneMatch": "*"})
+        if (existing := self._read_object(name)) is None:
+            raise Damaged(f"{self.address.plain}/{name} is missing")
+        return not self._put_if(name, existing[0], {"IfNoneMatch": "*"})
 
-    def switch(self, wanted: Published, before: str | None) -> bool:
+    def replace_current(self, published: PublishedVersions, tag: str | None) -> bool:
         """Replace `current` if it still is the one of a tag (None: if there is none); False where it is not."""
-        condition = {"IfNoneMatch": "*"} if before is None else {"IfMatch": before}
-        if self._put(CURRENT, wanted.written(), condition):
+        condition = {"IfNoneMatch": "*"} if tag is None else {"IfMatch": tag}
+        if self._put_if(CURRENT, published.to_bytes(), condition):
             return True
         # Our own put, if its answer was lost and it was tried again.
-        now = self._read(CURRENT)
-        return now is not None and now[0] == wanted.written()
+        current = self._read_object(CURRENT)
+        return current is not None and current[0] == published.to_bytes()
 
-    def _put(self, name: str, data: bytes, condition: dict[str, str]) -> bool:
+    def _put_if(self, name: str, data: bytes, condition: dict[str, str]) -> bool:
         from botocore.exceptions import ClientError
 
-        with self._refusing():
+        with self._errors_as_bad_input():
             try:
-                self._client.put_object(Bucket=self.place.bucket, Key=self.place.key(name), Body=data, **condition)
+                self._client.put_object(Bucket=self.address.bucket, Key=self.address.key(name), Body=data, **condition)
             except ClientError as error:
-                if error.response["Error"].get("Code") in _REFUSED | _ABSENT:
+                if error.response["Error"].get("Code") in _REFUSED_CODES | _ABSENT_CODES:
                     return False
                 raise
         return True
@@ -192,19 +194,19 @@ def _base64(sha256: str) -> str:
     return base64.b64encode(bytes.fromhex(sha256)).decode()
 
 
-def _sum_of_parts(one: _Object) -> str:
+def _multipart_checksum(item: _Object) -> str:
     """sha256 over the sha256 of its parts, as S3 keeps it."""
-    summed = hashlib.sha256()
-    with one.path.open("rb") as stream:
-        while part := stream.read(_PART):
-            summed.update(hashlib.sha256(part).digest())
-    return base64.b64encode(summed.digest()).decode()
+    combined_hash = hashlib.sha256()
+    with item.path.open("rb") as stream:
+        while part := stream.read(_PART_BYTES):
+            combined_hash.update(hashlib.sha256(part).digest())
+    return base64.b64encode(combined_hash.digest()).decode()
 
 
 # ------------------------------------------------------------------------------------------------ a lake
 
 
-def push(root: Path, place: Address, only: Sequence[str] = (), threads: int = THREADS) -> Iterator[Sent]:
+def push(root: Path, address: Address, only: Sequence[str] = (), threads: int = THREADS) -> Iterator[PushReport]:
     """Put the published versions of a lake there, each told when it is; then switch `current`.
 
     root    : folder of the lake;  place : where it goes
@@ -213,79 +215,83 @@ def push(root: Path, place: Address, only: Sequence[str] = (), threads: int = TH
     Errors  : BadInput for what cannot be pushed, or where the storage refuses; Damaged names what is not as it was
               written, here or there; Superseded where another push has ended since this one began
     """
-    chosen = _chosen(root, only)
-    bucket = Bucket(place)
-    there, tag = bucket.published()
-    wanted = _merged(there, chosen, only)
-    versions = {(table, key) for table, key in chosen.tables.items()}
-    versions |= {(table, key) for own in chosen.names.values() for table, key in own.items()}
+    local_versions = _linked_versions(root, only)
+    bucket = Bucket(address)
+    remote_versions, tag = bucket.read_published()
+    new_versions = _merge_published(remote_versions, local_versions, only)
+    versions = {(table, key) for table, key in local_versions.tables.items()}
+    versions |= {
+        (table, key) for keys_by_table in local_versions.names.values() for table, key in keys_by_table.items()
+    }
     for number, (table, key) in enumerate(sorted(versions)):
-        sent = _sent(bucket, _objects(root, table, key), table, key, threads)
+        report = _push_version(bucket, _objects_of_version(root, table, key), table, key, threads)
         # As soon as there is an object to ask it with, not when hours of others have been sent.
-        if number == 0 and not bucket.knows_conditions(f"{table}/v-{key}/{MANIFEST}"):
-            raise BadInput(f"{place}: the storage takes no conditional puts: two who push could not be told apart")
-        yield sent
-    if (tag is None or wanted != there) and not bucket.switch(wanted, tag):
-        raise Superseded(f"{place}: another push has ended since this one began: run again to replace it")
+        if number == 0 and not bucket.supports_conditions(f"{table}/v-{key}/{MANIFEST}"):
+            raise BadInput(f"{address}: the storage takes no conditional puts: two who push could not be told apart")
+        yield report
+    if (tag is None or new_versions != remote_versions) and not bucket.replace_current(new_versions, tag):
+        raise Superseded(f"{address}: another push has ended since this one began: run again to replace it")
 
 
-def _chosen(root: Path, only: Sequence[str]) -> Published:
+def _linked_versions(root: Path, only: Sequence[str]) -> PublishedVersions:
     """What the links of a lake say, of all tables or of some.  Errors: BadInput"""
-    if not (known := layout.tables(root)):
+    if not (table_names := layout.table_names(root)):
         raise BadInput(f"lake {root} holds no table")
-    if unknown := sorted(set(only) - set(known)):
-        raise BadInput(f"lake {root} has no table {unknown[0]}; it has {', '.join(known)}")
-    found: dict[str, dict[str, str]] = {"": {}}
-    for table in only or known:
-        for name, key in {"": layout.current_key(root, table), **names.holders(root, table)}.items():
+    if unknown := sorted(set(only) - set(table_names)):
+        raise BadInput(f"lake {root} has no table {unknown[0]}; it has {', '.join(table_names)}")
+    keys_by_request: dict[str, dict[str, str]] = {"": {}}
+    for table in only or table_names:
+        for name, key in {"": layout.current_key(root, table), **request_links.keys_by_request(root, table)}.items():
             if key is not None:
-                found.setdefault(name, {})[table] = key
-    return Published(found.pop(""), found)
+                keys_by_request.setdefault(name, {})[table] = key
+    return PublishedVersions(keys_by_request.pop(""), keys_by_request)
 
 
-def _merged(there: Published, chosen: Published, only: Sequence[str]) -> Published:
+def _merge_published(
+    remote_versions: PublishedVersions, local_versions: PublishedVersions, only: Sequence[str]
+) -> PublishedVersions:
     """What is to be published."""
     if not only:
-        return chosen
-    found: dict[str, dict[str, str]] = {}
-    for name in sorted({*there.names, *chosen.names}):
-        kept = {table: key for table, key in there.names.get(name, {}).items() if table not in only}
-        if own := kept | dict(chosen.names.get(name, {})):
-            found[name] = own
-    return Published({**there.tables, **chosen.tables}, found)
+        return local_versions
+    keys_by_request: dict[str, dict[str, str]] = {}
+    for name in sorted({*remote_versions.names, *local_versions.names}):
+        remaining = {table: key for table, key in remote_versions.names.get(name, {}).items() if table not in only}
+        if keys_by_table := remaining | dict(local_versions.names.get(name, {})):
+            keys_by_request[name] = keys_by_table
+    return PublishedVersions({**remote_versions.tables, **local_versions.tables}, keys_by_request)
 
 
-def _objects(root: Path, table: str, key: str) -> list[_Object]:
+def _objects_of_version(root: Path, table: str, key: str) -> list[_Object]:
     """The files of a version, its manifest last.  Errors: Damaged where it is not what the manifest says"""
-    folder = layout.version(root, table, key)
+    folder = layout.version_folder(root, table, key)
     facts = manifest.load(folder, table)
-    if found := manifest.faults(folder, facts):
-        raise Damaged(found[0])
-    own, path = f"{table}/{folder.name}", folder / MANIFEST
-    files = [_Object(folder / f["path"], f"{own}/{f['path']}", f["bytes"], f["sha256"]) for f in facts["files"]]
-    return [*files, _Object(path, f"{own}/{MANIFEST}", path.stat().st_size, file_sha256(path))]
+    if faults := manifest.faults(folder, facts):
+        raise Damaged(faults[0])
+    prefix, path = f"{table}/{folder.name}", folder / MANIFEST
+    files = [_Object(folder / f["path"], f"{prefix}/{f['path']}", f["bytes"], f["sha256"]) for f in facts["files"]]
+    return [*files, _Object(path, f"{prefix}/{MANIFEST}", path.stat().st_size, file_sha256(path))]
 
 
-def _sent(bucket: Bucket, objects: Sequence[_Object], table: str, key: str, threads: int) -> Sent:
-    def settled(one: _Object) -> int:
-        if bucket.holds(one):
+def _push_version(bucket: Bucket, objects: Sequence[_Object], table: str, key: str, threads: int) -> PushReport:
+    def upload_if_missing(item: _Object) -> int:
+        if bucket.has_object(item):
             return 0
-        if file_sha256(one.path) != one.sha256:
-            raise Damaged(f"{one.path} has other contents than the manifest says")
-        bucket.send(one)
-        if not bucket.holds(one):
-            raise Damaged(f"{bucket.place.plain}/{one.name} is not what was sent")
+        if file_sha256(item.path) != item.sha256:
+            raise Damaged(f"{item.path} has other contents than the manifest says")
+        bucket.send(item)
+        if not bucket.has_object(item):
+            raise Damaged(f"{bucket.address.plain}/{item.name} is not what was sent")
         return 1
 
     with ThreadPoolExecutor(threads) as pool:
         try:
             # The manifest after all others: where it is, the version is whole.
-            new = [*pool.map(settled, objects[:-1]), settled(objects[-1])]
+            is_sent = [*pool.map(upload_if_missing, objects[:-1]), upload_if_missing(objects[-1])]
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
-    sent = [one.size for one, is_new in zip(objects, new, strict=True) if is_new]
-    return Sent(table, key, len(objects), sum(one.size for one in objects), len(sent), sum(sent))
+    sent_sizes = [item.size for item, was_sent in zip(objects, is_sent, strict=True) if was_sent]
+    return PushReport(table, key, len(objects), sum(item.size for item in objects), len(sent_sizes), sum(sent_sizes))
 
 
 # ------------------------------------------------------------------------------------------------ the command
@@ -304,19 +310,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--only", nargs="+", default=[], metavar="TABLE", help="these tables; what else is there stays")
     parser.add_argument("--threads", type=int, default=THREADS, help=f"objects at a time (default {THREADS})")
     options = parser.parse_args(argv)
-    return command.status("push", lambda: _pushed(options))
+    return command.run("push", lambda: _run_push(options))
 
 
-def _pushed(options: argparse.Namespace) -> int:
-    root, place = layout.lake(options.lake), s3.address(options.place, options.endpoint_url)
+def _run_push(options: argparse.Namespace) -> int:
+    root, address = layout.resolve_lake(options.lake), s3.parse_address(options.place, options.endpoint_url)
     if not 1 <= options.threads <= 256:
         raise BadInput(f"--threads {options.threads}: wanted 1 to 256")
-    for one in push(root, place, options.only, options.threads):
-        about = f"{one.objects:6,} objects {one.size / 1e6:10.1f} MB, sent {one.sent:6,} {one.sent_size / 1e6:10.1f} MB"
-        print(f"{one.table:16} v-{one.key} {about}", flush=True)
-    print(f"{place} is published")
+    for report in push(root, address, options.only, options.threads):
+        sent = f"sent {report.sent:6,} {report.sent_size / 1e6:10.1f} MB"
+        totals = f"{report.objects:6,} objects {report.size / 1e6:10.1f} MB, {sent}"
+        print(f"{report.table:16} v-{report.key} {totals}", flush=True)
+    print(f"{address} is published")
     return 0
 
 
 if __name__ == "__main__":
-    command.leave(main)
+    command.exit_with_status(main)

@@ -12,7 +12,7 @@ WANTED = ["gal_id", "ra", "lsst_r"]
 
 
 def read(path, columns=WANTED):
-    pieces = list(rows.pieces(path, columns, whole=["gal_id"]))
+    pieces = list(rows.read_batches(path, columns, integer_columns=["gal_id"]))
     return {name: np.concatenate([piece.columns[name] for piece in pieces]) for name in columns}, pieces
 
 
@@ -24,11 +24,11 @@ def test_rows_and_units_of_one_slice_and_of_several(tmp_path):
     assert pieces[0].units == {"ra": "deg", "lsst_r": "mag(AB)"}
     values, pieces = read(opencosmo.write(tmp_path / "two.h5", one, two))
     assert all(np.array_equal(values[name], np.append(one[name], two[name])) for name in WANTED)
-    assert [piece.first for piece in pieces] == [1, 201]
+    assert [piece.first_row for piece in pieces] == [1, 201]
 
 
 def test_slices_follow_one_another_by_number(tmp_path):
-    assert sorted(["487", "99", "a", "475"], key=hdf5._by_number) == ["99", "475", "487", "a"]
+    assert sorted(["487", "99", "a", "475"], key=hdf5._numeric_sort_key) == ["99", "475", "487", "a"]
 
 
 def test_a_piece_is_bounded(tmp_path):

@@ -8,7 +8,7 @@ from lake_schema.external import rows as external_rows
 
 
 def rows(path):
-    return [piece.columns["ra"] for piece in external_rows.pieces(path, ["ra"])]
+    return [piece.columns["ra"] for piece in external_rows.read_batches(path, ["ra"])]
 
 
 @pytest.mark.parametrize("title", ["c{}", ""])

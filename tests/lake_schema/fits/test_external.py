@@ -13,7 +13,7 @@ from lake_schema.fits import external
 
 READERS = {
     "read_numbers": lambda path: external.read_numbers(path, "catalogue of stars"),
-    "number_batches": lambda path: list(external.number_batches(path, ["a", "b"], ["name"])),
+    "number_batches": lambda path: list(external.read_batches(path, ["a", "b"], ["name"])),
     "read_table": lambda path: external.read_table(path, "curve"),
     "read_map": lambda path: external.read_map(path, "a"),
     "read_planes": lambda path: external.read_planes(path, "a"),
@@ -123,7 +123,7 @@ def test_packed_images_are_not_unpacked(tmp_path):
 
 def test_good_ones_are_read_plain_or_packed(good):
     for _ in range(2):
-        ((numbers, _),) = external.number_batches(good, ["a", "b"], ["name"])
+        ((numbers, _),) = external.read_batches(good, ["a", "b"], ["name"])
         assert (numbers["b"].tolist(), numbers["name"][3]) == (list(range(48)), "n3")
         assert (
             external.read_numbers(good, "catalogue of stars")["a"].sum()

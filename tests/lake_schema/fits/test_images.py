@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as hnp
 from lake_schema.columns import Column, Table
 from lake_schema.errors import BadInput, Damaged
 from lake_schema.fits import external, tables, write
-from lake_schema.fits.images import Image, read_images, text_of, write_images
+from lake_schema.fits.images import Image, cards_to_text, read_images, write_images
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.products import PRODUCTS
 from tests.universe import rows_of
@@ -79,7 +79,7 @@ def test_tiles_are_sixteen_rows_or_what_is_left_of_an_image(tmp_path, shape):
 def test_cards_that_are_equal_are_written_each_as_it_is():
     """0.0 and -0.0, 1, 1.0 and True are equal to Python: none stands in for another."""
     values = (0.0, -0.0, 1, 1.0, True, "1", -0.0, True, 1.0, 1, 0.0)
-    lines = text_of([("A", value, "") for value in values]).splitlines()
+    lines = cards_to_text([("A", value, "") for value in values]).splitlines()
     assert lines == [str(astropy_fits.Card("A", value, "")).rstrip() for value in values]
     assert len(set(lines)) == 6
 
@@ -115,7 +115,7 @@ def test_what_would_be_too_large_unpacked_is_refused(tmp_path):
     path = tmp_path / "a.fits"
     write_images(path, [Image(np.zeros((300, 300), np.uint16))], rice=True)
     with pytest.raises(BadInput, match="more than 100000 bytes"):
-        read_images(path, most_bytes=100_000)
+        read_images(path, max_bytes=100_000)
 
 
 def test_other_tools_find_it_sound(tmp_path):
@@ -158,7 +158,7 @@ def test_size_is_judged_from_the_header(tmp_path):
     path = tmp_path / "a.fits"
     write_images(path, [Image(science())])
     with pytest.raises(BadInput, match="more than 1000 bytes"):
-        read_images(path, most_bytes=1000)
+        read_images(path, max_bytes=1000)
     promises = path.read_bytes().replace(b"NAXIS1  =                   40", b"NAXIS1  =           2000000000")
     path.write_bytes(promises)
     with pytest.raises((BadInput, Damaged)):
@@ -252,8 +252,8 @@ def test_what_is_missing_is_told_from_every_number(tmp_path, kind):
 
 def test_a_column_of_all_numbers_has_none_for_what_is_missing():
     with pytest.raises(ValueError, match="every number of int8"):
-        tables._unused(np.arange(-128, 128).astype(np.int8))
-    assert tables._unused(np.array([], np.int16)) == -(2**15)
+        tables._lowest_unused_value(np.arange(-128, 128).astype(np.int8))
+    assert tables._lowest_unused_value(np.array([], np.int16)) == -(2**15)
 
 
 def test_a_missing_boolean_is_neither_true_nor_false(tmp_path):
@@ -308,7 +308,7 @@ def somebodys(path):
 def test_numbers_of_others_are_read_in_batches(tmp_path, rows):
     path = somebodys(tmp_path / "a.fits")
     names = ("number", "id", "flux", "good")
-    batches = list(external.number_batches(path, names, ("name", "absent"), rows))
+    batches = list(external.read_batches(path, names, ("name", "absent"), rows))
     assert [len(numbers["id"]) for numbers, _ in batches] == [min(rows, 3 - k) for k in range(0, 3, rows)]
     whole = {name: np.concatenate([numbers[name] for numbers, _ in batches]) for name in (*names, "name")}
     assert whole["id"].tolist() == [2**60, 2, 3]
@@ -328,7 +328,7 @@ def test_numbers_of_others_are_read_in_batches(tmp_path, rows):
 def test_what_is_no_number_a_row_is_refused(tmp_path, name, words):
     path = somebodys(tmp_path / "a.fits")
     with pytest.raises(BadInput, match=words):
-        list(external.number_batches(path, [name]))
+        list(external.read_batches(path, [name]))
 
 
 def test_a_map_is_read_in_the_order_of_its_file(tmp_path):

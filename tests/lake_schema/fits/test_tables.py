@@ -42,7 +42,9 @@ def rows(number):
     values["i"][:2] = -(2**63), -(2**63) + 1
     missing = {name: rng.random(number) < 0.2 for name in values}
     missing["i"][:3] = False, False, True
-    return pa.table({name: pa.array(own, mask=missing[name]) for name, own in values.items()}).cast(DECLARED.arrow())
+    return pa.table({name: pa.array(own, mask=missing[name]) for name, own in values.items()}).cast(
+        DECLARED.arrow_schema()
+    )
 
 
 def streamed(table, declared, size=7, most=None):
@@ -90,7 +92,7 @@ def test_no_rows():
 )
 def test_what_fits_cannot_hold(column, values, words):
     declared = Table("made", 1, (column,), "Made.", key=())
-    table = pa.table({column.name: values}).cast(declared.arrow())
+    table = pa.table({column.name: values}).cast(declared.arrow_schema())
     if not words:
         assert len(streamed(table, declared)) % 2880 == 0
         return

@@ -7,9 +7,9 @@ import pytest
 
 from lake_schema.errors import BadInput
 from lake_schema.mission import checks
-from lake_schema.mission.bounds import bounds_of
+from lake_schema.mission.bounds import bounds_of_parameter
 from lake_schema.mission.configuration import MissionConfiguration, resolve
-from lake_schema.mission.parameter import CAMERAS, STATUSES, read_all
+from lake_schema.mission.parameter import CAMERAS, STATUSES, read_all_parameters
 from lake_schema.tables.mission import LADDER
 
 MISSION = resolve()
@@ -21,10 +21,10 @@ def test_the_package_has_no_fault(ladder):
 
 
 def test_every_value_has_bounds_of_its_kind():
-    assert [p.key for p in MISSION.parameters if not bounds_of(p.key)] == []
-    for record in read_all():
+    assert [p.key for p in MISSION.parameters if not bounds_of_parameter(p.key)] == []
+    for record in read_all_parameters():
         # A bound that allows nothing else would be a second source of the number.
-        for lo, hi, _ in bounds_of(record.key):
+        for lo, hi, _ in bounds_of_parameter(record.key):
             assert lo < hi
 
 
@@ -160,7 +160,9 @@ def test_a_first_order_spectrum_is_512_pixels_long():
 def test_what_the_table_of_traces_says_is_no_value_beside_it():
     """A grism's ends and dispersion are the polynomials': a value of their own would be read by nobody."""
     grisms = {row["grism"].lower() for row in MISSION.rows("nisp.traces")}
-    beside = {record.key.split(".")[-1] for record in read_all() if record.key.split(".")[1] in {*grisms, "grism"}}
+    beside = {
+        record.key.split(".")[-1] for record in read_all_parameters() if record.key.split(".")[1] in {*grisms, "grism"}
+    }
     assert beside == {"resolving_power"}
 
 

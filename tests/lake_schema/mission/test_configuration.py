@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from lake_schema.errors import BadInput, OutOfRange
 from lake_schema.mission.configuration import resolve
-from lake_schema.mission.parameter import STATUSES, Parameter, read_all
+from lake_schema.mission.parameter import STATUSES, Parameter, read_all_parameters
 from lake_schema.tables.mission import LADDER
 
 RECORDS = (
@@ -33,7 +33,7 @@ def test_the_first_status_of_the_ladder_that_has_a_record_wins():
 def test_as_simulated_is_the_last_resort():
     assert LADDER[-1] == "SIM"
     everything = resolve()
-    with_other = {record.key for record in read_all() if record.status != "SIM"}
+    with_other = {record.key for record in read_all_parameters() if record.status != "SIM"}
     assert with_other
     assert all(p.status != "SIM" for p in everything.parameters if p.key in with_other)
 
@@ -41,7 +41,7 @@ def test_as_simulated_is_the_last_resort():
 @given(st.randoms(use_true_random=False), st.permutations(STATUSES))
 def test_the_order_of_the_records_does_not_matter(random, ladder):
     # Some of the records of each kind: every name of a camera, a few statuses of each.
-    records = [record for record in read_all() if record.key.startswith(("vis.", "svm."))]
+    records = [record for record in read_all_parameters() if record.key.startswith(("vis.", "svm."))]
     expected = resolve(records, ladder)
     random.shuffle(records)
     assert resolve(records, ladder) == expected
@@ -52,8 +52,8 @@ def test_the_order_of_the_records_does_not_matter(random, ladder):
 def test_there_is_exactly_one_value_a_name(ladder):
     chosen = resolve(ladder=ladder)
     keys = [p.key for p in chosen.parameters]
-    assert keys == sorted(set(keys)) == sorted({record.key for record in read_all()})
-    assert all(p in read_all() for p in chosen.parameters)
+    assert keys == sorted(set(keys)) == sorted({record.key for record in read_all_parameters()})
+    assert all(p in read_all_parameters() for p in chosen.parameters)
 
 
 def test_later_and_newer_records_win_when_they_hold():

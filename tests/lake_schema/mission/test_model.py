@@ -8,7 +8,7 @@ import pytest
 from lake_schema.errors import BadInput, Damaged
 from lake_schema.mission import model
 from lake_schema.mission.configuration import resolve
-from lake_schema.mission.model import Model, content, numbers, read_models, rows
+from lake_schema.mission.model import Model, parse_numbers, parse_rows, read_content, read_models
 
 ZODI = next(m for m in read_models() if m.key == "env.zodi.map")
 
@@ -16,23 +16,23 @@ ZODI = next(m for m in read_models() if m.key == "env.zodi.map")
 def test_every_file_is_the_one_that_is_named():
     assert ZODI in read_models()
     for one in read_models():
-        assert hashlib.sha256(content(one)).hexdigest() == one.sha256
+        assert hashlib.sha256(read_content(one)).hexdigest() == one.sha256
 
 
 def test_another_file_is_refused_with_both_sums(tmp_path):
     other = replace(ZODI, sha256="0" * 64)
     with pytest.raises(Damaged, match=f"env.zodi.map.*{ZODI.sha256}.*not 0000"):
-        content(other)
+        read_content(other)
     with pytest.raises(Damaged, match="is missing"):
-        content(replace(ZODI, file="nothing.csv"))
+        read_content(replace(ZODI, file="nothing.csv"))
     # What was published with an old product is found by its sum, and only if it is whole.
     old = b"an older table"
     digest = hashlib.sha256(old).hexdigest()
     (tmp_path / digest).write_bytes(old)
-    assert content(replace(ZODI, sha256=digest), tmp_path) == old
+    assert read_content(replace(ZODI, sha256=digest), tmp_path) == old
     (tmp_path / digest).write_bytes(old[:-1])
     with pytest.raises(Damaged, match="sha256"):
-        content(replace(ZODI, sha256=digest), tmp_path)
+        read_content(replace(ZODI, sha256=digest), tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -63,8 +63,8 @@ def test_other_columns_are_refused(tmp_path):
 
 def test_tables_of_numbers_and_of_texts():
     data = b"# a comment\na,b\n1,x\n2,\n"
-    assert rows(data) == ({"a": "1", "b": "x"}, {"a": "2", "b": ""})
-    values = numbers(b"# a comment\na,b\n1,\n2,3\n")
+    assert parse_rows(data) == ({"a": "1", "b": "x"}, {"a": "2", "b": ""})
+    values = parse_numbers(b"# a comment\na,b\n1,\n2,3\n")
     assert values[1] == (2.0, 3.0)
     assert values[0][0] == 1.0
     assert values[0][1] != values[0][1]
@@ -98,7 +98,7 @@ def test_the_fingerprint_follows_the_files():
 
 def test_a_table_is_read_once_and_nobody_changes_it():
     """A detector's effects ask for its amplifiers some hundred times."""
-    data = content(next(m for m in read_models() if m.key == "ext.gpc1.amplifiers"))
-    assert rows(data) is rows(data)
+    data = read_content(next(m for m in read_models() if m.key == "ext.gpc1.amplifiers"))
+    assert parse_rows(data) is parse_rows(data)
     with pytest.raises(TypeError):
-        rows(data)[0]["gain"] = "2"
+        parse_rows(data)[0]["gain"] = "2"

@@ -8,7 +8,7 @@ import pytest
 from lake_schema.errors import BadInput
 from lake_schema.mission import parameter
 from lake_schema.mission.configuration import resolve
-from lake_schema.mission.parameter import Parameter, convert, read, read_all
+from lake_schema.mission.parameter import Parameter, convert, read, read_all_parameters
 
 HEADER = "key,status,value,unit,version,valid_from,confidence,source\n"
 
@@ -52,7 +52,7 @@ def test_other_columns_are_refused(tmp_path):
 
 
 def test_every_record_of_the_package_names_a_publication():
-    records = read_all()
+    records = read_all_parameters()
     assert len(records) > 500
     for record in records:
         if record.confidence != "assumed":
@@ -63,7 +63,7 @@ def test_every_record_of_the_package_names_a_publication():
 
 def test_published_statuses_are_all_there():
     """The ladder has something to choose from."""
-    found = {(r.key, r.status): r.value for r in read_all()}
+    found = {(r.key, r.status): r.value for r in read_all_parameters()}
     assert {s for k, s in found if k == "vis.read_noise"} == {"REQ", "DES", "CBE", "SIM"}
     assert found["vis.gain", "CBE"] == 3.48
     assert found["vis.gain", "REQ"] == 3.1
@@ -75,7 +75,7 @@ def test_published_statuses_are_all_there():
 
 def test_no_zero_point_of_euclid_is_stored():
     """It follows from throughput and area: a second number could disagree. Ground surveys publish theirs."""
-    stored = [record.key for record in read_all() if "zp" in record.key or "zero_point" in record.key]
+    stored = [record.key for record in read_all_parameters() if "zp" in record.key or "zero_point" in record.key]
     assert {key.split(".")[0] for key in stored} == {"ext"}
 
 
@@ -112,7 +112,7 @@ def test_the_zodiacal_table_is_the_published_one():
 
 
 def test_statuses_and_sections_are_those_that_are_known():
-    records = read_all()
+    records = read_all_parameters()
     assert {record.status for record in records} <= set(parameter.STATUSES)
     prefixes = {record.key.split(".")[0] for record in records}
     assert prefixes == {"env", "plm", "svm", "vis", "nisp", "ext", "survey"}

@@ -11,9 +11,9 @@ from lake_schema.errors import BadInput, OutOfRange
 from lake_schema.mission import detector_overrides, listing
 from lake_schema.mission.checks import faults
 from lake_schema.mission.configuration import resolve
-from lake_schema.mission.detector_overrides import Place
+from lake_schema.mission.detector_overrides import DetectorPlace
 from lake_schema.mission.model import read_models
-from lake_schema.mission.parameter import CAMERAS, read_all
+from lake_schema.mission.parameter import CAMERAS, read_all_parameters
 
 GAIN = "electron / adu"
 MISSION = resolve()
@@ -21,7 +21,7 @@ CAMERA_SECTIONS = ("vis", "nisp", *(f"ext.{camera}" for camera in CAMERAS))
 
 
 def test_names_of_places_are_no_names_of_parameters():
-    keys = {record.key for record in (*read_all(), *read_models())}
+    keys = {record.key for record in (*read_all_parameters(), *read_models())}
     assert not {key for key in keys if "@" in key or key.rpartition(".")[0] in keys}
     for section in CAMERA_SECTIONS:
         found = detector_overrides.detectors(section, MISSION)
@@ -31,9 +31,9 @@ def test_names_of_places_are_no_names_of_parameters():
         assert len(detector_overrides.amplifiers(section, MISSION)) == count
 
 
-@pytest.mark.parametrize("pattern", [pattern for pattern, _ in detector_overrides._scopes()])
+@pytest.mark.parametrize("pattern", [pattern for pattern, _ in detector_overrides._read_scopes()])
 def test_each_pattern_is_of_some_parameter(pattern):
-    assert [record.key for record in read_all() if pattern.fullmatch(record.key)]
+    assert [record.key for record in read_all_parameters() if pattern.fullmatch(record.key)]
 
 
 @given(
@@ -49,10 +49,10 @@ def test_the_narrowest_holds(given, detector):
         )
         for name in "EFGH"
     )
-    found = mission.of_amplifiers("vis.gain", GAIN, detector)
+    found = mission.amplifier_values("vis.gain", GAIN, detector)
     assert (found * 4 if len(found) == 1 else found) == wanted
     # A detector's own, whatever one of its amplifiers has.
-    assert mission.value("vis.gain", place=Place(detector)) == given.get(f"@{detector}", given.get("", 3.48))
+    assert mission.value("vis.gain", place=DetectorPlace(detector)) == given.get(f"@{detector}", given.get("", 3.48))
     assert mission.value("vis.gain", "electron / adu") == given.get("", 3.48)
     assert (mission.fingerprint == MISSION.fingerprint) == ({**given, "": 3.48} == {"": given.get("", 3.48)})
     assert list(faults(mission)) == []
@@ -66,13 +66,15 @@ def test_each_camera_has_its_detectors():
             "vis.dark_current@3-4": (7.2, "electron / (h pix)"),
         }
     )
-    assert mission.value("nisp.dark_current", place=Place("DET23")) == 0.05
-    assert mission.value("nisp.dark_current", place=Place("DET22")) == 0.02
-    assert mission.value("ext.decam.gain", place=Place("N1")) == 4.0
-    assert mission.value("vis.dark_current", "electron / (s pix)", Place("3-4", "E")) == pytest.approx(0.002, abs=0)
-    later = mission.overridden_with({"nisp.dark_current@DET22": (0.03, "electron / (s pix)")})
-    assert later.value("nisp.dark_current", place=Place("DET22")) == 0.03
-    assert later.value("nisp.dark_current", place=Place("DET23")) == 0.05
+    assert mission.value("nisp.dark_current", place=DetectorPlace("DET23")) == 0.05
+    assert mission.value("nisp.dark_current", place=DetectorPlace("DET22")) == 0.02
+    assert mission.value("ext.decam.gain", place=DetectorPlace("N1")) == 4.0
+    assert mission.value("vis.dark_current", "electron / (s pix)", DetectorPlace("3-4", "E")) == pytest.approx(
+        0.002, abs=0
+    )
+    later = mission.with_overrides({"nisp.dark_current@DET22": (0.03, "electron / (s pix)")})
+    assert later.value("nisp.dark_current", place=DetectorPlace("DET22")) == 0.03
+    assert later.value("nisp.dark_current", place=DetectorPlace("DET23")) == 0.05
 
 
 @pytest.mark.parametrize(
@@ -95,8 +97,8 @@ def test_each_camera_has_its_detectors():
     ],
 )
 def test_a_place_that_is_not_there_is_refused_by_name(name, words):
-    key = detector_overrides.split(name, MISSION)[0]
-    unit = MISSION.parameter(key).unit if key in [record.key for record in read_all()] else ""
+    key = detector_overrides.split_name(name, MISSION)[0]
+    unit = MISSION.parameter(key).unit if key in [record.key for record in read_all_parameters()] else ""
     with pytest.raises(BadInput, match=words) as error:
         resolve(overrides={name: (3.0, unit)})
     assert str(error.value).startswith(f"mission override {name}: ")
@@ -115,7 +117,7 @@ def test_units_and_bounds_are_the_parameters():
 
 def test_the_list_has_every_name_with_its_bounds():
     mission = resolve(overrides={"vis.gain@3-4.E": (3.3, GAIN)})
-    entries = {entry.name: entry for entry in listing.listed(mission)}
+    entries = {entry.name: entry for entry in listing.list_entries(mission)}
     assert set(entries) == {p.key for p in mission.parameters} | {m.key for m in mission.models}
     for name in ("vis.gain", "vis.gain@3-4.E"):
         assert entries[name].bounds == (1e-3, 1e3)

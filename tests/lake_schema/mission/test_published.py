@@ -8,11 +8,11 @@ import pytest
 from lake_schema import __main__
 from lake_schema.errors import BadInput, Damaged
 from lake_schema.mission import compare, published
-from lake_schema.mission.configuration import MissionConfiguration, difference, resolve
+from lake_schema.mission.configuration import MissionConfiguration, differences, resolve
 from lake_schema.mission.model import Model
 from lake_schema.mission.parameter import Parameter
 from lake_schema.store import publish, read
-from lake_schema.store.plan import Part, Plan
+from lake_schema.store.plan import Plan, Task
 from lake_schema.tables.mission import LADDER, MISSION
 
 CHANGED = resolve(ladder=("SIM", *LADDER[:-1]), overrides={"vis.gain": (3.3, "electron / adu")})
@@ -20,8 +20,8 @@ CHANGED = resolve(ladder=("SIM", *LADDER[:-1]), overrides={"vis.gain": (3.3, "el
 
 def put(lake, configuration, **facts):
     about = {"mission": configuration.fingerprint, "ladder": list(configuration.ladder), **facts}
-    plan = Plan(MISSION, about, (Part("all.parquet", {}),))
-    publish.make(lake, plan, lambda root, facts: published.output(configuration))
+    plan = Plan(MISSION, about, (Task("all.parquet", {}),))
+    publish.make_version(lake, plan, lambda root, facts: published.to_output(configuration))
     return read.version(lake, "mission")
 
 
@@ -36,13 +36,13 @@ def test_it_comes_back_as_it_went(tmp_path, configuration):
         configuration.parameters, configuration.ladder, configuration.overridden, configuration.models, back.folder
     )
     assert back.fingerprint == configuration.fingerprint
-    assert list(difference(back, configuration)) == []
-    assert read.verify(version, deep=True) == []
+    assert list(differences(back, configuration)) == []
+    assert read.find_faults(version, deep=True) == []
     # Its own copies of the files serve where the package's have changed.
     for m in configuration.models:
         assert (back.folder / m.sha256).is_file()
     # What was read back can be published again, to the same rows.
-    assert published.table(back).equals(published.table(configuration))
+    assert published.to_table(back).equals(published.to_table(configuration))
 
 
 def test_records_that_the_package_no_longer_has_come_back_too(tmp_path):
@@ -106,11 +106,11 @@ def test_differences_are_named_with_both_values(tmp_path, capsys):
 
 def test_names_that_only_one_has():
     some = MissionConfiguration((Parameter("a.b", "CBE", 1.0, "s", source="x"),))
-    assert list(difference(some, MissionConfiguration(()))) == ["a.b: 1.0 s (CBE) -> absent"]
-    assert list(difference(MissionConfiguration(()), some)) == ["a.b: absent -> 1.0 s (CBE)"]
+    assert list(differences(some, MissionConfiguration(()))) == ["a.b: 1.0 s (CBE) -> absent"]
+    assert list(differences(MissionConfiguration(()), some)) == ["a.b: absent -> 1.0 s (CBE)"]
     # Another source or status of the same value acts alike.
     other = MissionConfiguration((Parameter("a.b", "BLT", 1.0, "s", source="y"),))
-    assert list(difference(some, other)) == []
+    assert list(differences(some, other)) == []
 
 
 @pytest.mark.parametrize(
@@ -131,15 +131,15 @@ def test_what_is_no_configuration_is_refused(tmp_path, capsys, text, words):
     assert words in error
     assert error.count("\n") == 1
     with pytest.raises(BadInput, match="neither"):
-        compare.configuration(str(tmp_path / "nothing"))
+        compare.load_configuration(str(tmp_path / "nothing"))
     with pytest.raises(BadInput, match="neither"):
-        compare.configuration("CBE,BEST")
+        compare.load_configuration("CBE,BEST")
 
 
 def test_a_lake_without_the_table(tmp_path):
     with pytest.raises(BadInput, match="no table mission"):
-        compare.configuration(str(tmp_path))
+        compare.load_configuration(str(tmp_path))
     (tmp_path / "mission").mkdir()
     (tmp_path / "mission" / "manifest.json").write_text(json.dumps({}))
     with pytest.raises(BadInput, match="no table mission"):
-        compare.configuration(str(tmp_path))
+        compare.load_configuration(str(tmp_path))

@@ -60,14 +60,14 @@ def tile_area(tile):
 
 def test_a_request_may_ask_for_a_tile():
     own = area.parse({"tile": 69_121})
-    ra, dec, radius = own.bounds()
+    ra, dec, radius = own.bounding_circle()
     west, east, south, north = bounds(69_121)
     (lon,), (lat,) = ecliptic([ra], [dec])
     assert west < lon < east
     assert south < lat < north
     assert 0.4 < radius < 0.6
     assert own.contains([ra], [dec]).all()
-    assert int(sky.cell_of([ra], [dec], 8)[0]) in own.cells()
+    assert int(sky.cell_at([ra], [dec], 8)[0]) in own.cells()
     with pytest.raises(BadInput, match=r"area\.tile"):
         area.parse({"tile": tile_count()})
     with pytest.raises(OutOfRange, match="tile"):

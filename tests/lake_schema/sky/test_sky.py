@@ -22,7 +22,7 @@ def test_a_cone_never_misses_a_cell(ra, dec, radius, order, seed):
         rng.uniform(0, 360, 200) * u.deg, radius * np.sqrt(rng.random(200)) * u.deg
     )
     cells = sky.cells_in_cone(ra, dec, radius, order)
-    assert np.isin(sky.cell_of(around.ra.deg, around.dec.deg, order), cells).all()
+    assert np.isin(sky.cell_at(around.ra.deg, around.dec.deg, order), cells).all()
     assert (np.diff(cells) > 0).all()
 
 
@@ -42,7 +42,7 @@ def test_no_cell_of_any_cone_is_missed(cones):
         bearing, lat = rng.uniform(0, 2 * np.pi, r.size), np.radians(dec[i])
         inside = np.arcsin(np.clip(np.sin(lat) * np.cos(r) + np.cos(lat) * np.sin(r) * np.cos(bearing), -1, 1))
         east = np.arctan2(np.sin(bearing) * np.sin(r) * np.cos(lat), np.cos(r) - np.sin(lat) * np.sin(inside))
-        cells = sky.cell_of(ra[i] + np.degrees(east), np.degrees(inside), order[i])
+        cells = sky.cell_at(ra[i] + np.degrees(east), np.degrees(inside), order[i])
         found = sky.cells_in_cone(ra[i], dec[i], radius[i], order[i])
         assert np.isin(cells, found).all(), (ra[i], dec[i], radius[i], order[i])
 
@@ -63,7 +63,7 @@ def test_a_polygon_never_misses_a_cell(ra, dec, size, corners, order, seed):
     inside = weights @ vectors
     lon, lat = hp.vec2ang(inside, lonlat=True)
     cells = sky.cells_in_polygon(np.stack([ring.ra.deg, ring.dec.deg], 1), order)
-    assert np.isin(sky.cell_of(lon, lat, order), cells).all()
+    assert np.isin(sky.cell_at(lon, lat, order), cells).all()
 
 
 def test_bad_polygons_are_refused():
@@ -99,8 +99,8 @@ def test_galactic_agrees_with_astropy(ra, dec):
 @given(st.floats(-1e6, 1e6))
 def test_a_wrapped_angle_is_below_a_full_turn(angle):
     for given_angle in (angle, -1e-300, np.float64(-1e-14)):
-        assert 0.0 <= sky.wrapped(given_angle) < 360.0
-    assert np.sin(np.radians(sky.wrapped(angle))) == pytest.approx(np.sin(np.radians(angle)), abs=1e-9)
+        assert 0.0 <= sky.wrap_angle(given_angle) < 360.0
+    assert np.sin(np.radians(sky.wrap_angle(angle))) == pytest.approx(np.sin(np.radians(angle)), abs=1e-9)
 
 
 @given(st.floats(-1e4, 1e4), st.sampled_from([np.float32, np.float64]))
@@ -108,7 +108,7 @@ def test_a_wrapped_angle_is_below_a_full_turn(angle):
 @example(-1e-9, np.float64)
 @example(179.9999999, np.float64)
 def test_a_position_angle_is_below_half_a_turn(angle, kind):
-    found = sky.position_angle(np.array([angle], kind))
+    found = sky.wrap_position_angle(np.array([angle], kind))
     assert found.dtype == np.float32
     assert 0.0 <= found[0] < 180.0
     assert np.sin(np.radians(2.0 * (found[0] - float(kind(angle))))) == pytest.approx(0.0, abs=1e-4)
@@ -128,7 +128,7 @@ def test_positions_that_are_none_are_refused(ra, dec):
 
 
 def test_right_ascension_is_wrapped():
-    ra, _ = sky.checked([-1e-20, -1e-9, 0, 360, 720, 359.5], [0] * 6)
+    ra, _ = sky.check_positions([-1e-20, -1e-9, 0, 360, 720, 359.5], [0] * 6)
     assert ((ra >= 0) & (ra < 360)).all()
     assert ra[[0, 2, 3, 4]].tolist() == [0, 0, 0, 0]
     assert ra[1] == pytest.approx(360)
@@ -138,9 +138,9 @@ def test_right_ascension_is_wrapped():
 def test_random_positions_are_uniform_and_sorted(cell):
     index, ra, dec = sky.random_in_cell(5, cell, 20_000, np.random.default_rng(1))
     assert (np.diff(index) >= 0).all()
-    assert (sky.cell_of(ra, dec, 5) == cell).all()
+    assert (sky.cell_at(ra, dec, 5) == cell).all()
     assert np.array_equal(sky.healpix_29(ra, dec), index)
-    counts = np.bincount(sky.cell_of(ra, dec, 7) - 16 * cell, minlength=16)
+    counts = np.bincount(sky.cell_at(ra, dec, 7) - 16 * cell, minlength=16)
     assert ((counts - 1250) ** 2 / 1250).sum() < 40  # chi2 of 15 degrees of freedom: 40 is one in 2000
 
 
@@ -161,9 +161,9 @@ def test_the_margin_holds_all_within_ten_arcsec(cell):
     near = SkyCoord(lon, lat, unit="deg").directional_offset_by(
         rng.uniform(0, 360, lon.size) * u.deg, rng.uniform(0, 10, lon.size) * u.arcsec
     )
-    outside = sky.cell_of(near.ra.deg, near.dec.deg, 5) != cell
+    outside = sky.cell_at(near.ra.deg, near.dec.deg, 5) != cell
     assert outside.sum() > 500
-    assert np.isin(sky.cell_of(near.ra.deg[outside], near.dec.deg[outside], 13), rim).all()
+    assert np.isin(sky.cell_at(near.ra.deg[outside], near.dec.deg[outside], 13), rim).all()
 
 
 @given(RA, st.floats(0.01, 179), DEC, st.floats(0.01, 60), st.integers(0, 6), st.integers(0, 2**32 - 1))
@@ -174,7 +174,7 @@ def test_a_box_never_misses_a_cell(west, span, south, height, order, seed):
     # Its four edges, where a polygon of great circles would go astray.
     dec[:40], dec[40:80], ra[80:120], ra[120:160] = south, north, west, west + span
     cells = sky.cells_in_box(west % 360, (west + span) % 360, south, north, order)
-    assert np.isin(sky.cell_of(ra, dec, order), cells).all()
+    assert np.isin(sky.cell_at(ra, dec, order), cells).all()
     assert (np.diff(cells) > 0).all()
 
 

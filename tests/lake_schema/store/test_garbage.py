@@ -11,8 +11,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from lake_schema.errors import Damaged
-from lake_schema.store import garbage, layout, locks, manifest, names, publish, read
-from lake_schema.store.plan import Part, Plan
+from lake_schema.store import garbage, layout, locks, manifest, publish, read, request_links
+from lake_schema.store.plan import Plan, Task
 from tests.universe import PLAIN, plain_plan, plain_work, toy_plan, toy_work
 
 TABLES = ("first", "second", "third")
@@ -20,7 +20,7 @@ TABLES = ("first", "second", "third")
 
 def plan_of(table, number, inputs=()):
     facts = {"seed": number, "made of": {f"x{i}": key for i, key in enumerate(inputs)}}
-    return Plan(replace(PLAIN, name=table), facts, (Part("0.parquet", {"part": 0}),))
+    return Plan(replace(PLAIN, name=table), facts, (Task("0.parquet", {"part": 0}),))
 
 
 # (table, request or none, which of the versions before it it was made of)
@@ -39,7 +39,7 @@ def test_nothing_that_is_reached_from_a_name_is_removed(published, chosen):
         for number, (table, request, before) in enumerate(published):
             inputs = [every[i % len(every)] for i in before if every]
             plan = plan_of(table, number, [key for _, key in inputs])
-            publish.make(root, plan, plain_work, name=request)
+            publish.make_version(root, plan, plain_work, name=request)
             this = (table, plan.key)
             every.append(this)
             made_of[this] = inputs
@@ -63,50 +63,50 @@ def test_nothing_that_is_reached_from_a_name_is_removed(published, chosen):
             assert garbage.collect(root, chosen, delete=True) == said
             assert garbage.collect(root, chosen) == []
         for table, key in there - rest:
-            assert read.verify(read.version(root, table, key), deep=True) == []
-        assert not any(layout.version(root, *one).exists() for one in rest)
+            assert read.find_faults(read.version(root, table, key), deep=True) == []
+        assert not any(layout.version_folder(root, *one).exists() for one in rest)
 
 
 def test_gc_says_and_does_not(lake):
     for seed in (1, 2):
-        publish.make(lake, plain_plan(seed), plain_work, name="a")
+        publish.make_version(lake, plain_plan(seed), plain_work, name="a")
     before = sorted(lake.rglob("*"))
-    assert garbage.collect(lake) == [layout.version(lake, "plain", plain_plan(1).key)]
+    assert garbage.collect(lake) == [layout.version_folder(lake, "plain", plain_plan(1).key)]
     assert sorted(lake.rglob("*")) == before
 
 
 def test_the_images_of_another_request_stay(lake):
-    publish.make(lake, plain_plan(1), plain_work, name="a")
-    publish.make(lake, plain_plan(2), plain_work, name="b")
+    publish.make_version(lake, plain_plan(1), plain_work, name="a")
+    publish.make_version(lake, plain_plan(2), plain_work, name="b")
     assert garbage.collect(lake, delete=True) == []
     assert [read.version(lake, "plain", request=name).num_rows for name in "ab"] == [60, 60]
 
 
 @pytest.mark.parametrize("what", ["manifest", "version", "link"])
 def test_nothing_is_removed_while_it_is_not_known_what_a_name_needs(lake, what):
-    publish.make(lake, plain_plan(1), plain_work)
-    first = publish.make(lake, toy_plan(1), toy_work, name="a")
-    publish.make(lake, toy_plan(2), toy_work, name="b")
-    publish.make(lake, plain_plan(2), plain_work)
+    publish.make_version(lake, plain_plan(1), plain_work)
+    first = publish.make_version(lake, toy_plan(1), toy_work, name="a")
+    publish.make_version(lake, toy_plan(2), toy_work, name="b")
+    publish.make_version(lake, plain_plan(2), plain_work)
     if what == "manifest":
         (first / "manifest.json").write_text("{}")
     elif what == "version":
         first.rename(lake / "elsewhere")
     else:
-        link = layout.pin(lake, "a", "toy")
+        link = layout.request_link(lake, "a", "toy")
         link.unlink()
         link.symlink_to("/etc")
     for delete in (False, True):
         with pytest.raises(Damaged):
             garbage.collect(lake, "plain", delete)
-    assert layout.version(lake, "plain", plain_plan(1).key).exists()
+    assert layout.version_folder(lake, "plain", plain_plan(1).key).exists()
 
 
 def test_a_stage_in_use_is_neither_said_nor_removed(lake):
     plan = plain_plan(1)
-    stage = layout.stage(lake, "plain", plan.key)
+    stage = layout.stage_folder(lake, "plain", plan.key)
     stage.mkdir(parents=True)
-    with locks.held(stage.parent / f".lock-{plan.key}", "in use"):
+    with locks.hold(stage.parent / f".lock-{plan.key}", "in use"):
         assert garbage.collect(lake) == garbage.collect(lake, delete=True) == []
     assert garbage.collect(lake) == garbage.collect(lake, delete=True) == [stage]
     assert not stage.exists()
@@ -115,7 +115,7 @@ def test_a_stage_in_use_is_neither_said_nor_removed(lake):
 def test_nobody_waits_while_manifests_are_read(lake, monkeypatch):
     """A lake of many versions takes longer to read than a run that publishes waits."""
     for seed in (1, 2):
-        publish.make(lake, plain_plan(seed), plain_work, name="a")
+        publish.make_version(lake, plain_plan(seed), plain_work, name="a")
     load, held = manifest.load, []
 
     def watched(*args):
@@ -123,45 +123,45 @@ def test_nobody_waits_while_manifests_are_read(lake, monkeypatch):
         return load(*args)
 
     monkeypatch.setattr(manifest, "load", watched)
-    assert garbage.collect(lake, delete=True) == [layout.version(lake, "plain", plain_plan(1).key)]
+    assert garbage.collect(lake, delete=True) == [layout.version_folder(lake, "plain", plain_plan(1).key)]
     assert held == [False]
 
 
 def test_what_is_published_while_manifests_are_read_stays_with_what_it_was_made_of(lake, monkeypatch):
     first, second = (plan_of("first", number) for number in (1, 2))
     for plan in (first, second):
-        publish.make(lake, plan, plain_work)
+        publish.make_version(lake, plan, plain_work)
     late, load = plan_of("second", 3, [first.key]), manifest.load
 
     def watched(*args):
         found = load(*args)
         monkeypatch.undo()
-        publish.make(lake, late, plain_work)
+        publish.make_version(lake, late, plain_work)
         return found
 
     monkeypatch.setattr(manifest, "load", watched)
     assert garbage.collect(lake, delete=True) == []
-    assert all(layout.version(lake, plan.table.name, plan.key).exists() for plan in (first, second, late))
+    assert all(layout.version_folder(lake, plan.table.name, plan.key).exists() for plan in (first, second, late))
 
 
 def test_who_asks_for_a_lock_is_in_nobodys_way(lake):
     plan = plain_plan(1)
-    lock = layout.table(lake, "plain") / f".lock-{plan.key}"
+    lock = layout.table_folder(lake, "plain") / f".lock-{plan.key}"
     lock.parent.mkdir()
     with lock.open("a") as stream:
         # What is_held does, for longer than it does.
         fcntl.flock(stream.fileno(), fcntl.LOCK_EX)
         timer = threading.Timer(0.2, fcntl.flock, (stream.fileno(), fcntl.LOCK_UN))
         timer.start()
-        publish.make(lake, plan, plain_work)
+        publish.make_version(lake, plan, plain_work)
         timer.join()
     assert read.version(lake, "plain").num_rows == 60
 
 
 def test_a_name_that_is_removed_by_hand_keeps_nothing(lake):
-    first = publish.make(lake, plain_plan(1), plain_work, name="a")
-    publish.make(lake, plain_plan(2), plain_work, name="b")
-    layout.pin(lake, "a", "plain").unlink()
-    layout.pin(lake, "a", "plain").parent.rmdir()
-    assert names.names(lake) == ["b"]
+    first = publish.make_version(lake, plain_plan(1), plain_work, name="a")
+    publish.make_version(lake, plain_plan(2), plain_work, name="b")
+    layout.request_link(lake, "a", "plain").unlink()
+    layout.request_link(lake, "a", "plain").parent.rmdir()
+    assert request_links.request_names(lake) == ["b"]
     assert garbage.collect(lake, delete=True) == [first]

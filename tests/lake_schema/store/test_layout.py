@@ -19,17 +19,21 @@ BAD = [
 @pytest.mark.parametrize("text", BAD)
 def test_bad_names_are_refused(text):
     with pytest.raises(BadInput, match="name"):
-        layout.name(text)
+        layout.check_name(text)
 
 
 @given(st.text())
 def test_whatever_is_a_name_stays_in_the_lake(tmp_path_factory, text):
     root = tmp_path_factory.getbasetemp()
     try:
-        name = layout.name(text)
+        name = layout.check_name(text)
     except BadInput:
         return
-    for path in (layout.table(root, name), layout.stage(root, name, name), layout.version(root, name, name)):
+    for path in (
+        layout.table_folder(root, name),
+        layout.stage_folder(root, name, name),
+        layout.version_folder(root, name, name),
+    ):
         assert path.resolve().is_relative_to(root.resolve())
         assert path.resolve() != root.resolve()
 
@@ -39,18 +43,18 @@ def test_a_link_out_of_the_lake_is_refused(tmp_path):
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "lake" / "galaxies").symlink_to(tmp_path / "elsewhere")
     with pytest.raises(BadInput, match="leaves"):
-        layout.table(tmp_path / "lake", "galaxies")
+        layout.table_folder(tmp_path / "lake", "galaxies")
 
 
 @pytest.mark.parametrize("text", ["file://{}/a b", "file:{}/a%20b", "FILE://localhost{}/a b", "{}/a b"])
 def test_a_folder_may_be_given_as_spark_names_files(tmp_path, text):
-    assert layout.lake(text.format(tmp_path)) == tmp_path / "a b"
+    assert layout.resolve_lake(text.format(tmp_path)) == tmp_path / "a b"
 
 
 @pytest.mark.parametrize("text", ["s3://bucket/lake", "hdfs://host/lake", "gs://x", "S3A://x", "file://host/x"])
 def test_object_stores_are_refused(text):
     with pytest.raises(BadInput, match="POSIX"):
-        layout.lake(text)
+        layout.resolve_lake(text)
 
 
 @pytest.mark.parametrize(
@@ -62,7 +66,7 @@ def test_what_cannot_be_a_lake_is_refused(tmp_path, monkeypatch, text, words):
     (tmp_path / "file").touch()
     (tmp_path / "loop").symlink_to("loop")
     with pytest.raises(BadInput, match=words):
-        layout.lake(text)
+        layout.resolve_lake(text)
 
 
 def test_cells_are_filed_as_hats_wants():

@@ -26,7 +26,7 @@ def test_a_version_says_on_which_machines_it_was_made(lake, monkeypatch):
             monkeypatch.setattr(stage, "machine", lambda number=number: f"kind {number % 2}")
             yield function(part)
 
-    publish.make(lake, plain_plan(1), plain_work)
+    publish.make_version(lake, plain_plan(1), plain_work)
     assert read.version(lake, "plain").manifest["machines"] == [machine()]
-    publish.make(lake, plain_plan(2), plain_work, elsewhere)
+    publish.make_version(lake, plain_plan(2), plain_work, elsewhere)
     assert read.version(lake, "plain").manifest["machines"] == ["kind 0", "kind 1"]

@@ -6,10 +6,10 @@ import shutil
 
 import pytest
 
-from lake_schema.errors import BadInput, Damaged, PartsFailed, Superseded
+from lake_schema.errors import BadInput, Damaged, Superseded, TasksFailed
 from lake_schema.store import garbage, hats_files, layout, locks, manifest, parquet, publish, read
-from lake_schema.store.plan import Output, Part, Plan, data_path
-from lake_schema.store.stage import attempt, missing
+from lake_schema.store.plan import Output, Plan, Task, data_path
+from lake_schema.store.stage import missing_tasks, run_task
 from tests.universe import CELLS, TOY, plain_plan, plain_work, toy_plan, toy_rows, toy_work
 
 
@@ -18,33 +18,33 @@ def sums(lake):
 
 
 def test_what_is_published_can_be_read(lake):
-    folder = publish.make(lake, toy_plan(), toy_work)
+    folder = publish.make_version(lake, toy_plan(), toy_work)
     version = read.version(lake, "toy")
     assert version.folder == folder
     assert version.num_rows == sum(n for _, n in CELLS) == version.rows().num_rows
-    assert read.verify(version, deep=True) == []
-    left = {path.name for path in layout.table(lake, "toy").iterdir()} - {".lock"}
+    assert read.find_faults(version, deep=True) == []
+    left = {path.name for path in layout.table_folder(lake, "toy").iterdir()} - {".lock"}
     assert left == {"current", folder.name}
 
 
 def test_the_same_plan_gives_the_same_bytes_in_any_order(lake, tmp_path):
-    publish.make(lake, toy_plan(), toy_work)
+    publish.make_version(lake, toy_plan(), toy_work)
     other = tmp_path / "other"
     other.mkdir()
-    publish.make(other, toy_plan(), toy_work, mapper=lambda f, parts: map(f, reversed(parts)))
+    publish.make_version(other, toy_plan(), toy_work, mapper=lambda f, parts: map(f, reversed(parts)))
     assert sums(lake) == sums(other)
-    assert (layout.current(lake, "toy") / "manifest.json").read_bytes() == (
-        layout.current(other, "toy") / "manifest.json"
+    assert (layout.current_link(lake, "toy") / "manifest.json").read_bytes() == (
+        layout.current_link(other, "toy") / "manifest.json"
     ).read_bytes()
 
 
 def test_a_second_run_makes_nothing(lake):
-    publish.make(lake, toy_plan(), toy_work)
+    publish.make_version(lake, toy_plan(), toy_work)
 
     def never(root, facts):
         raise AssertionError("made again")
 
-    publish.make(lake, toy_plan(), never)
+    publish.make_version(lake, toy_plan(), never)
 
 
 def test_what_failed_is_listed_and_the_rest_is_kept(lake):
@@ -56,18 +56,18 @@ def test_what_failed_is_listed_and_the_rest_is_kept(lake):
             raise ValueError("no luck")
         return toy_work(root, facts)
 
-    with pytest.raises(PartsFailed, match=r"1 of 4 parts failed: .*Npix=1608.*ValueError: no luck"):
-        publish.make(lake, toy_plan(), work)
+    with pytest.raises(TasksFailed, match=r"1 of 4 parts failed: .*Npix=1608.*ValueError: no luck"):
+        publish.make_version(lake, toy_plan(), work)
     with pytest.raises(BadInput, match="no table toy"):
         read.version(lake, "toy")
-    publish.make(lake, toy_plan(), work)
+    publish.make_version(lake, toy_plan(), work)
     assert made == [1607, 1608, 1610, 8000, 1608]
-    assert read.verify(read.version(lake, "toy"), deep=True) == []
+    assert read.find_faults(read.version(lake, "toy"), deep=True) == []
 
 
 def test_a_silent_worker_is_found_out(lake):
-    with pytest.raises(PartsFailed, match="ended without a receipt"):
-        publish.make(lake, toy_plan(), toy_work, mapper=lambda f, parts: [])
+    with pytest.raises(TasksFailed, match="ended without a receipt"):
+        publish.make_version(lake, toy_plan(), toy_work, mapper=lambda f, parts: [])
 
 
 @pytest.mark.parametrize("wrong", ["unsorted", "duplicate", "columns"])
@@ -82,8 +82,8 @@ def test_wrong_rows_are_never_published(lake, wrong):
             rows = rows.drop_columns(["flux"])
         return Output(rows)
 
-    with pytest.raises(PartsFailed, match="table toy"):
-        publish.make(lake, toy_plan(), work)
+    with pytest.raises(TasksFailed, match="table toy"):
+        publish.make_version(lake, toy_plan(), work)
 
 
 def test_whatever_goes_into_a_plan_changes_its_key():
@@ -91,8 +91,8 @@ def test_whatever_goes_into_a_plan_changes_its_key():
     others = [
         toy_plan(seed=2),
         toy_plan(cells=CELLS[:-1]),
-        Plan(TOY, {"seed": 1, "code": "x"}, plan.parts),
-        Plan(TOY, {"seed": 1}, (Part("x", {}),)),
+        Plan(TOY, {"seed": 1, "code": "x"}, plan.tasks),
+        Plan(TOY, {"seed": 1}, (Task("x", {}),)),
     ]
     keys = {p.key for p in [plan, *others]}
     assert len(keys) == len(others) + 1
@@ -101,53 +101,53 @@ def test_whatever_goes_into_a_plan_changes_its_key():
 
 def test_a_plan_names_a_part_once():
     with pytest.raises(BadInput, match="twice"):
-        Plan(TOY, {}, (Part("a", {}), Part("a", {})))
+        Plan(TOY, {}, (Task("a", {}), Task("a", {})))
 
 
 def test_a_catalogue_has_cells_though_they_may_be_empty(lake):
     with pytest.raises(BadInput, match="no cells"):
         Plan(TOY, {}, ())
-    publish.make(lake, toy_plan(cells=((8000, 0), (1607, 0))), toy_work)
+    publish.make_version(lake, toy_plan(cells=((8000, 0), (1607, 0))), toy_work)
     version = read.version(lake, "toy")
     assert version.rows().num_rows == version.cone(10.0, 10.0, 5.0).num_rows == 0
-    assert read.verify(version, deep=True) == []
+    assert read.find_faults(version, deep=True) == []
 
 
 def test_versions_follow_each_other_and_gc_keeps_the_last(lake):
-    first = publish.make(lake, toy_plan(1), toy_work)
-    second = publish.make(lake, toy_plan(2), toy_work)
+    first = publish.make_version(lake, toy_plan(1), toy_work)
+    second = publish.make_version(lake, toy_plan(2), toy_work)
     assert read.version(lake, "toy").folder == second
     assert first.exists()
     assert garbage.collect(lake, "toy", delete=True) == [first]
     assert not first.exists()
-    assert read.verify(read.version(lake, "toy"), deep=True) == []
+    assert read.find_faults(read.version(lake, "toy"), deep=True) == []
 
 
 def test_going_back_to_an_earlier_version_only_moves_the_link(lake):
-    first = publish.make(lake, toy_plan(1), toy_work)
-    publish.make(lake, toy_plan(2), toy_work)
-    publish.make(lake, toy_plan(1), None)
+    first = publish.make_version(lake, toy_plan(1), toy_work)
+    publish.make_version(lake, toy_plan(2), toy_work)
+    publish.make_version(lake, toy_plan(1), None)
     assert read.version(lake, "toy").folder == first
 
 
 def test_a_version_that_was_overtaken_is_not_published(lake):
-    publish.make(lake, toy_plan(1), toy_work)
+    publish.make_version(lake, toy_plan(1), toy_work)
     base = layout.current_key(lake, "toy")
-    publish.make(lake, toy_plan(2), toy_work)
+    publish.make_version(lake, toy_plan(2), toy_work)
     with pytest.raises(Superseded, match="published since"):
-        publish.make(lake, toy_plan(3), toy_work, base=base)
+        publish.make_version(lake, toy_plan(3), toy_work, base=base)
     assert read.version(lake, "toy").key == toy_plan(2).key
 
 
 def test_two_runs_of_one_plan_do_not_meet(lake, monkeypatch):
-    monkeypatch.setattr(locks, "MOMENT", 0.1)
+    monkeypatch.setattr(locks, "SHORT_TIMEOUT", 0.1)
 
     def work(root, facts):
         with pytest.raises(Superseded, match="another run is making"):
-            publish.make(lake, toy_plan(), toy_work)
+            publish.make_version(lake, toy_plan(), toy_work)
         return toy_work(root, facts)
 
-    publish.make(lake, toy_plan(), work)
+    publish.make_version(lake, toy_plan(), work)
 
 
 def test_files_beside_the_rows_are_published_with_them(lake):
@@ -156,85 +156,85 @@ def test_files_beside_the_rows_are_published_with_them(lake):
     def work(root, facts):
         return Output(toy_rows(facts["cell"], 3), {"images/a.txt": lambda path: path.write_text("pixels")})
 
-    publish.make(lake, Plan(table, {}, toy_plan().parts[:1]), work)
-    assert read.version(lake, "toy").file("images/a.txt").read_text() == "pixels"
+    publish.make_version(lake, Plan(table, {}, toy_plan().tasks[:1]), work)
+    assert read.version(lake, "toy").sidecar_path("images/a.txt").read_text() == "pixels"
     with pytest.raises(BadInput, match="no file"):
-        read.version(lake, "toy").file("images/b.txt")
+        read.version(lake, "toy").sidecar_path("images/b.txt")
 
 
 def test_a_file_that_would_leave_the_stage_is_refused(lake):
     def work(root, facts):
         return Output(toy_rows(facts["cell"], 3), {"../../../x": lambda path: path.write_text("out")})
 
-    with pytest.raises(PartsFailed, match="leaves"):
-        publish.make(lake, toy_plan(), work)
+    with pytest.raises(TasksFailed, match="leaves"):
+        publish.make_version(lake, toy_plan(), work)
     assert not (lake.parent / "x").exists()
 
 
 def test_a_receipt_without_its_file_does_not_count(lake):
     plan = toy_plan()
-    stage = layout.stage(lake, "toy", plan.key)
+    stage = layout.stage_folder(lake, "toy", plan.key)
     stage.mkdir(parents=True)
-    for part in plan.parts:
-        attempt(lake, plan.key, TOY, plan.facts, toy_work, part)
-    assert missing(stage, plan) == []
-    victim = stage / data_path(TOY, plan.parts[0].name)
+    for part in plan.tasks:
+        run_task(lake, plan.key, TOY, plan.facts, toy_work, part)
+    assert missing_tasks(stage, plan) == []
+    victim = stage / data_path(TOY, plan.tasks[0].name)
     os.truncate(victim, victim.stat().st_size - 1)
-    assert missing(stage, plan) == [plan.parts[0]]
+    assert missing_tasks(stage, plan) == [plan.tasks[0]]
     victim.unlink()
-    assert missing(stage, plan) == [plan.parts[0]]
+    assert missing_tasks(stage, plan) == [plan.tasks[0]]
 
 
 def test_copies_of_a_task_that_are_late_change_nothing(lake, monkeypatch):
     plan = toy_plan()
-    stage, part = layout.stage(lake, "toy", plan.key), plan.parts[0]
+    stage, part = layout.stage_folder(lake, "toy", plan.key), plan.tasks[0]
     path, first = stage / data_path(TOY, part.name), []
 
     def slow(root, facts):
         # Another copy ends while this one renders.
-        attempt(root, plan.key, TOY, plan.facts, toy_work, part)
+        run_task(root, plan.key, TOY, plan.facts, toy_work, part)
         first.append(path.stat().st_ino)
         return toy_work(root, facts)
 
     def mapper(function, parts):
-        yield attempt(lake, plan.key, TOY, plan.facts, slow, part)
+        yield run_task(lake, plan.key, TOY, plan.facts, slow, part)
         yield from map(function, parts)
 
-    write, writing = hats_files.write, manifest.temporary(path)
+    write, writing = hats_files.write_metadata, manifest.temporary_path(path)
 
     def while_another_writes(*given):
         write(*given)
         writing.write_bytes(b"half")
 
-    monkeypatch.setattr(hats_files, "write", while_another_writes)
-    folder = publish.make(lake, plan, toy_work, mapper)
+    monkeypatch.setattr(hats_files, "write_metadata", while_another_writes)
+    folder = publish.make_version(lake, plan, toy_work, mapper)
     assert (folder / data_path(TOY, part.name)).stat().st_ino == first[0]
     assert (folder / writing.relative_to(stage)).exists()
-    assert read.verify(read.version(lake, "toy"), deep=True) == []
-    assert "was published before" in attempt(lake, plan.key, TOY, plan.facts, toy_work, part)["error"]
+    assert read.find_faults(read.version(lake, "toy"), deep=True) == []
+    assert "was published before" in run_task(lake, plan.key, TOY, plan.facts, toy_work, part)["error"]
     assert not stage.exists()
-    assert publish.make(lake, plan, toy_work) == folder
+    assert publish.make_version(lake, plan, toy_work) == folder
 
 
 def test_what_is_done_needs_no_lock(lake, monkeypatch):
     """A lake that cannot be written is no reason to fail where nothing is left to do."""
-    folder = publish.make(lake, toy_plan(), toy_work)
-    monkeypatch.delattr(locks, "held")
-    assert publish.make(lake, toy_plan(), None) == folder
+    folder = publish.make_version(lake, toy_plan(), toy_work)
+    monkeypatch.delattr(locks, "hold")
+    assert publish.make_version(lake, toy_plan(), None) == folder
 
 
 def test_a_current_version_that_is_gone_can_be_made_again(lake):
-    folder = publish.make(lake, toy_plan(), toy_work)
+    folder = publish.make_version(lake, toy_plan(), toy_work)
     shutil.rmtree(folder)
     with pytest.raises(Damaged, match="which is missing"):
         read.version(lake, "toy")
-    assert read.tables(lake) == ["toy"]
-    assert publish.make(lake, toy_plan(), toy_work) == folder
-    assert read.verify(read.version(lake, "toy"), deep=True) == []
+    assert read.table_names(lake) == ["toy"]
+    assert publish.make_version(lake, toy_plan(), toy_work) == folder
+    assert read.find_faults(read.version(lake, "toy"), deep=True) == []
 
 
 def test_two_versions_that_changed_names_are_found_out(lake):
-    first, second = (publish.make(lake, toy_plan(seed), toy_work) for seed in (1, 2))
+    first, second = (publish.make_version(lake, toy_plan(seed), toy_work) for seed in (1, 2))
     other = first.with_name("other")
     first.rename(other)
     second.rename(first)
@@ -244,13 +244,13 @@ def test_two_versions_that_changed_names_are_found_out(lake):
             read.version(lake, "toy", key)
     for seed in (1, 2):
         with pytest.raises(Damaged, match="is that of table toy, version"):
-            publish.make(lake, toy_plan(seed), toy_work)
+            publish.make_version(lake, toy_plan(seed), toy_work)
 
 
 def test_a_link_to_another_table_is_found_out(lake):
-    folder = publish.make(lake, toy_plan(), toy_work)
-    publish.make(lake, plain_plan(), plain_work)
-    link = layout.current(lake, "plain")
+    folder = publish.make_version(lake, toy_plan(), toy_work)
+    publish.make_version(lake, plain_plan(), plain_work)
+    link = layout.current_link(lake, "plain")
     link.unlink()
     link.symlink_to(f"../toy/{folder.name}")
     with pytest.raises(Damaged, match="does not lead to a version of table plain"):
@@ -277,7 +277,7 @@ CHANGES = {
 
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES.keys())
 def test_a_manifest_of_another_form_is_damage(lake, change):
-    folder = publish.make(lake, toy_plan(), toy_work)
+    folder = publish.make_version(lake, toy_plan(), toy_work)
     facts = dict(read.version(lake, "toy").manifest)
     manifest.write(folder, facts)
     read.version(lake, "toy")
@@ -288,10 +288,10 @@ def test_a_manifest_of_another_form_is_damage(lake, change):
 
 
 def test_a_changed_page_is_not_read_while_a_version_is_made(lake):
-    version = read.version(lake, "toy", publish.make(lake, toy_plan(), toy_work).name[2:])
-    path = version.path(version.parts[0])
-    entry = manifest.file_facts(path, path.relative_to(lake).as_posix())
-    assert parquet.read(lake, entry, ["id"])["id"].equals(version.rows(["id"], [version.parts[0]])["id"])
+    version = read.version(lake, "toy", publish.make_version(lake, toy_plan(), toy_work).name[2:])
+    path = version.partition_path(version.partitions[0])
+    entry = manifest.file_entry(path, path.relative_to(lake).as_posix())
+    assert parquet.read(lake, entry, ["id"])["id"].equals(version.rows(["id"], [version.partitions[0]])["id"])
     data = bytearray(path.read_bytes())
     data[100] ^= 1
     path.write_bytes(data)
@@ -300,8 +300,8 @@ def test_a_changed_page_is_not_read_while_a_version_is_made(lake):
 
 
 def test_a_broken_manifest_is_named(lake):
-    publish.make(lake, toy_plan(), toy_work)
-    manifest = layout.current(lake, "toy") / "manifest.json"
+    publish.make_version(lake, toy_plan(), toy_work)
+    manifest = layout.current_link(lake, "toy") / "manifest.json"
     facts = json.loads(manifest.read_text())
     manifest.write_text(manifest.read_text()[:-20])
     with pytest.raises(Damaged, match=r"manifest\.json"):

@@ -16,7 +16,7 @@ from tests.universe import CELLS, toy_plan, toy_work
 
 @pytest.fixture
 def toy(lake):
-    publish.make(lake, toy_plan(), toy_work)
+    publish.make_version(lake, toy_plan(), toy_work)
     return read.version(lake, "toy")
 
 
@@ -25,12 +25,12 @@ def test_rows_of_some_cells(toy):
     fine = sky.parent(everything["_healpix_29"].to_numpy(), 29, 8)
     for cells in ([fine[0]], np.unique(fine)[::3], [5], []):
         wanted = everything.filter(pa.array(np.isin(fine, cells)))
-        assert toy.in_cells(cells, 8).equals(wanted)
-        assert toy.in_cells(cells, 8, ["id", "flux"]).equals(wanted.select(["id", "flux"]))
+        assert toy.rows_in_cells(cells, 8).equals(wanted)
+        assert toy.rows_in_cells(cells, 8, ["id", "flux"]).equals(wanted.select(["id", "flux"]))
 
 
 def test_coarse_cells_are_found_too(toy):
-    assert toy.in_cells([1607 >> 4], 3).num_rows == sum(n for c, n in CELLS if c >> 4 == 1607 >> 4)
+    assert toy.rows_in_cells([1607 >> 4], 3).num_rows == sum(n for c, n in CELLS if c >> 4 == 1607 >> 4)
 
 
 def test_filters_and_columns(toy):
@@ -65,7 +65,7 @@ def test_damage_is_named(toy, harm):
         data = bytearray(path.read_bytes())
         data[len(data) // 3] ^= 1
         path.write_bytes(data)
-    found = read.verify(toy, deep=True)
+    found = read.find_faults(toy, deep=True)
     assert len(found) == 1
     assert ("Npix=9999" if harm == "add" else path.name) in found[0]
     if harm == "add":
@@ -76,7 +76,7 @@ def test_damage_is_named(toy, harm):
 
 
 def test_any_hats_reader_can_open_it(toy):
-    folder = layout.current(toy.folder.parents[1], "toy")
+    folder = layout.current_link(toy.folder.parents[1], "toy")
     assert hats_readers.is_valid(folder)
     catalogue = hats_readers.open_catalog(folder)
     ra, dec = sky.cell_centre(5, 1607)
@@ -103,7 +103,7 @@ def test_pairs_across_cell_edges_are_matched(lake):
 
         ra, dec = hp.pix2ang(1 << 29, index, nest=True, lonlat=True)
         dec = dec + shift
-        here = sky.cell_of(ra, dec, 5) == cell
+        here = sky.cell_at(ra, dec, 5) == cell
         order = np.argsort(sky.healpix_29(ra[here], dec[here]))
         columns = {"id": np.flatnonzero(here)[order], "ra": ra[here][order], "dec": dec[here][order]}
         columns["_healpix_29"] = sky.healpix_29(columns["ra"], columns["dec"])
@@ -113,9 +113,9 @@ def test_pairs_across_cell_edges_are_matched(lake):
     cells = [(c, 0) for c in sorted({1607, *around})]
     other = lake.parent / "other"
     other.mkdir()
-    publish.make(lake, toy_plan(0, cells), work)
-    publish.make(other, toy_plan(1, cells), work)
-    left, right = (hats_readers.open_catalog(layout.current(root, "toy")) for root in (lake, other))
+    publish.make_version(lake, toy_plan(0, cells), work)
+    publish.make_version(other, toy_plan(1, cells), work)
+    left, right = (hats_readers.open_catalog(layout.current_link(root, "toy")) for root in (lake, other))
     pairs = left.crossmatch(right, radius_arcsec=1.5, n_neighbors=1, suffixes=("_a", "_b")).compute()
     same = (pairs["id_a"] == pairs["id_b"]).sum()
     assert same > 0.97 * read.version(lake, "toy").num_rows  # the rest have another neighbour within 1"

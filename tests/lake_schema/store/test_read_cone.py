@@ -11,7 +11,7 @@ from lake_schema import sky
 from lake_schema.columns import Column, Table
 from lake_schema.errors import BadInput
 from lake_schema.store import layout, publish, read
-from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.plan import Output, Plan, Task
 from tests import hats_readers
 from tests.universe import TOY, toy_plan, toy_work
 
@@ -53,12 +53,12 @@ def published(root, rows, orders=(5,)):
     for n, cell in enumerate(np.unique(index >> 48).tolist()):
         order = orders[n % len(orders)]
         cells = np.unique(index[index >> 48 == cell] >> (2 * (29 - order))).tolist()
-        parts += [Part(layout.cell_file(order, c), {"order": order, "cell": c}) for c in cells]
+        parts += [Task(layout.cell_file(order, c), {"order": order, "cell": c}) for c in cells]
 
     def work(lake, facts):
         return Output(rows.filter(index >> (2 * (29 - facts["order"])) == facts["cell"]))
 
-    publish.make(root, Plan(LENSED, {"orders": list(orders)}, tuple(parts)), work)
+    publish.make_version(root, Plan(LENSED, {"orders": list(orders)}, tuple(parts)), work)
     return read.version(root, "lensed")
 
 
@@ -99,7 +99,7 @@ def test_lensing_moves_sources_over_the_edge(catalogues):
         for row in range(0, N, 160):
             ra, dec = (float(rows[name][row].as_py()) for name in ("ra_true", "dec_true"))
             found = set(version.cone(ra, dec, radius, ["id"], "true")["id"].to_pylist())
-            unpadded = version.in_cells(sky.cells_in_cone(ra, dec, radius, 16), 16, ["id"])["id"].to_pylist()
+            unpadded = version.rows_in_cells(sky.cells_in_cone(ra, dec, radius, 16), 16, ["id"])["id"].to_pylist()
             lost += len(found - set(unpadded))
             assert row in found or rows["id"][row].as_py() in found
     assert lost > 3
@@ -131,10 +131,10 @@ def test_what_a_cone_refuses(lake, catalogues):
 
 
 def test_what_is_not_lensed_is_where_it_is_seen(lake):
-    publish.make(lake, toy_plan(), toy_work)
+    publish.make_version(lake, toy_plan(), toy_work)
     version = read.version(lake, "toy")
     ra, dec = sky.cell_centre(5, 1607)
-    found = [version.cone(ra, dec, 0.5, on=on) for on in read.ON]
+    found = [version.cone(ra, dec, 0.5, on=on) for on in read.POSITION_KINDS]
     assert 0 < found[0].num_rows < version.num_rows
     assert found[1].equals(found[0])
 
@@ -182,7 +182,7 @@ def test_a_cross_match_loses_no_pair_across_cells_of_other_orders(catalogues, tm
     file_of = {
         int(cell): part
         for one in (version, twins)
-        for part in one.parts
+        for part in one.partitions
         for cell in one.rows(["_healpix_29"], [part])["_healpix_29"].to_numpy()
     }
     moved = dict(zip(columns["id"].tolist(), columns["_healpix_29"].tolist(), strict=True))

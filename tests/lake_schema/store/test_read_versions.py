@@ -7,7 +7,7 @@ import pytest
 from lake_schema.columns import Column
 from lake_schema.errors import VersionMismatch
 from lake_schema.store import layout, publish, read
-from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.tables.galaxies import GALAXIES
 from tests.universe import PLAIN, plain_plan, plain_work, rows_of
 
@@ -16,7 +16,7 @@ COLOUR = Column("colour", "float32", doc="colour", nullable=True)
 
 @pytest.fixture
 def plain(lake):
-    publish.make(lake, plain_plan(), plain_work)
+    publish.make_version(lake, plain_plan(), plain_work)
     return read.version(lake, "plain")
 
 
@@ -39,22 +39,22 @@ BAD = {
 def test_other_columns_are_refused_by_name(plain, name):
     table, words = BAD[name]
     with pytest.raises(VersionMismatch, match=f"^table plain: {words}.*: another truesky wrote it$"):
-        read.as_declared(plain, table)
+        read.with_declared_schema(plain, table)
 
 
 @pytest.mark.parametrize(("was", "now"), [(3, 1), (1, 2)])
 def test_another_version_is_refused_naming_both(lake, was, now):
-    publish.make(lake, replace(plain_plan(), table=replace(PLAIN, version=was)), plain_work)
+    publish.make_version(lake, replace(plain_plan(), table=replace(PLAIN, version=was)), plain_work)
     who = "another version of truesky wrote it"
     line = f"table plain: {who}: its declaration is of version {was}, this truesky reads version {now}"
     with pytest.raises(VersionMismatch, match=f"^{line}$"):
-        read.as_declared(read.version(lake, "plain"), replace(PLAIN, version=now))
+        read.with_declared_schema(read.version(lake, "plain"), replace(PLAIN, version=now))
 
 
 def test_a_table_is_compared_with_its_declaration_without_being_asked(lake, monkeypatch):
     """`read.version` itself looks the table up."""
-    plan = Plan(GALAXIES, {}, (Part(layout.cell_file(5, 1607), {}),))
-    publish.make(lake, plan, lambda root, facts: Output(rows_of(GALAXIES, 12)))
+    plan = Plan(GALAXIES, {}, (Task(layout.cell_file(5, 1607), {}),))
+    publish.make_version(lake, plan, lambda root, facts: Output(rows_of(GALAXIES, 12)))
     monkeypatch.setattr("lake_schema.tables.galaxies.GALAXIES", replace(GALAXIES, columns=GALAXIES.columns[:-1]))
     with pytest.raises(VersionMismatch, match=r"^table galaxies: column stamp is not declared"):
         read.version(lake, "galaxies")
@@ -62,9 +62,9 @@ def test_a_table_is_compared_with_its_declaration_without_being_asked(lake, monk
 
 def test_a_unit_is_refused_after_the_right_one_was_read(plain):
     """Of the same columns and types: what a process has read before does not stand in for it."""
-    assert read.as_declared(plain, PLAIN).schema.names == plain.schema.names
+    assert read.with_declared_schema(plain, PLAIN).schema.names == plain.schema.names
     own = plain.schema.field(0)
     other = plain.schema.set(0, own.with_metadata({**(own.metadata or {}), b"unit": b"furlong"}))
     assert other == plain.schema
     with pytest.raises(VersionMismatch, match="unit 'furlong'"):
-        read.as_declared(replace(plain, schema=other), PLAIN)
+        read.with_declared_schema(replace(plain, schema=other), PLAIN)

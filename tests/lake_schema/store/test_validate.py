@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from lake_schema.errors import BadInput
 from lake_schema.store import manifest, parquet, validate
-from lake_schema.tables import declared
+from lake_schema.tables import all_tables
 from tests.universe import TOY, rows_of, toy_rows
 
-TABLES = declared(["euclid_vis", "lsst_r"])
+TABLES = all_tables(["euclid_vis", "lsst_r"])
 each_table = pytest.mark.parametrize("table", TABLES, ids=lambda table: table.name)
 
 
@@ -28,14 +28,14 @@ def bounded(table):
 
 def refused(rows, table, *words):
     with pytest.raises(BadInput) as found:
-        validate.check(rows, table)
+        validate.check_rows(rows, table)
     assert all(word in str(found.value) for word in (table.name, *words)), str(found.value)
 
 
 @each_table
 def test_good_rows_pass(table):
-    assert validate.violations(rows_of(table, 50), table) == []
-    assert validate.violations(table.empty(), table) == []
+    assert validate.find_violations(rows_of(table, 50), table) == []
+    assert validate.find_violations(table.empty(), table) == []
 
 
 @each_table
@@ -89,7 +89,7 @@ def test_the_bounds_themselves_are_legal(table):
         for bound in (column.lo, column.hi):
             if bound is not None and column.name not in table.key and not column.codes:
                 value = bound if column.is_float else int(bound)
-                assert validate.violations(changed(three_rows(table), column, value), table) == [], column.name
+                assert validate.find_violations(changed(three_rows(table), column, value), table) == [], column.name
 
 
 @each_table
@@ -100,7 +100,7 @@ def test_a_missing_value_only_where_declared(table):
         values[1] = None
         holed = rows.set_column(place, rows.schema.field(place), pa.array(values, rows.schema.field(place).type))
         if column.nullable:
-            assert validate.violations(holed, table) == [], column.name
+            assert validate.find_violations(holed, table) == [], column.name
         else:
             refused(holed, table, column.name, "row 1")
 
@@ -158,11 +158,11 @@ def test_an_odd_number_is_kept_or_refused_but_never_changed(table, number, tmp_p
         if not lo <= value <= hi:
             refused(own, table, column.name, "row 1")
             continue
-        assert validate.violations(own, table) == [], column.name
+        assert validate.find_violations(own, table) == [], column.name
         rows, kept[column.name] = changed(rows, column, float(value)), value
     parquet.write(tmp_path / "x.parquet", rows, table)
-    entry = manifest.file_facts(tmp_path / "x.parquet", "x.parquet")
-    back = parquet.dataset(tmp_path, [entry], table.arrow()).to_table()
+    entry = manifest.file_entry(tmp_path / "x.parquet", "x.parquet")
+    back = parquet.open_dataset(tmp_path, [entry], table.arrow_schema()).to_table()
     for name, value in kept.items():
         assert back[name].to_numpy()[1].tobytes() == value.tobytes(), name
 
@@ -196,7 +196,7 @@ def mutations(table, rows, column):
 @given(tables_and_rows(), st.data())
 def test_what_is_declared_passes_and_any_one_mutation_is_refused(example, data):
     table, rows = example
-    assert validate.violations(rows, table) == []
+    assert validate.find_violations(rows, table) == []
     column = data.draw(st.sampled_from(table.columns))
     for spoiled in mutations(table, rows, column):
         refused(spoiled, table, column.name)

@@ -14,7 +14,7 @@ import truesky
 from lake_schema import errors
 from lake_schema.fits import images
 from lake_schema.store import publish, read
-from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.tables.products import PRODUCTS
 from tests import requests
 from tests.universe import CELLS, plain_plan, plain_work, rows_of, toy_plan, toy_work
@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 @pytest.fixture
 def opened(lake):
-    publish.make(lake, plain_plan(1), plain_work)
+    publish.make_version(lake, plain_plan(1), plain_work)
     with truesky.open(lake) as found:
         yield found
 
@@ -47,7 +47,7 @@ def test_a_table_is_read_in_each_form(opened):
 
 
 def test_tables_are_pandas_unless_another_kind_is_named(lake):
-    publish.make(lake, toy_plan(), toy_work)
+    publish.make_version(lake, toy_plan(), toy_work)
     with truesky.open(lake) as found:
         for ask in (
             lambda **into: found.table("toy", ["id"], **into),
@@ -75,7 +75,7 @@ def test_rows_are_counted_in_bins(opened):
 
 
 def test_a_catalogue_is_counted_on_the_sky(lake):
-    publish.make(lake, toy_plan(), toy_work)
+    publish.make_version(lake, toy_plan(), toy_work)
     with truesky.open(lake) as found:
         cells, counts = found.skymap("toy", order=5)
     assert dict(zip(cells.tolist(), counts.tolist(), strict=True)) == {cell: n for cell, n in CELLS if n}
@@ -110,7 +110,7 @@ def test_models_are_of_the_lake_as_it_was_opened(lake, monkeypatch):
     rows, calls = Output(rows_of(PRODUCTS, 12)), []
 
     def published(seed):
-        publish.make(lake, Plan(PRODUCTS, {"seed": seed}, (Part("0.parquet", {}),)), lambda root, facts: rows)
+        publish.make_version(lake, Plan(PRODUCTS, {"seed": seed}, (Task("0.parquet", {}),)), lambda root, facts: rows)
 
     published(1)
     monkeypatch.setattr(models, "models", lambda *arguments: iter(calls.append(arguments) or ()))

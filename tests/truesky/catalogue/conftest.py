@@ -54,7 +54,7 @@ def box():
 @pytest.fixture(scope="session")
 def cells(universe):
     """What has been drawn of the universe in this run of tests."""
-    return population.Cells(universe.population)
+    return population.CellCache(universe.population)
 
 
 # Cells of a sky without structure, 1.7 deg2: a few degrees of a survey would be needed to tell as much.
@@ -70,7 +70,7 @@ def flat_sky():
 @cache
 def draw_flat_sky():
     """The galaxies of these cells."""
-    return mean_sky.rows(mean_sky.flat(made()), 0, FLAT_CELLS)
+    return mean_sky.rows(mean_sky.without_clustering(made()), 0, FLAT_CELLS)
 
 
 @pytest.fixture(scope="session")
@@ -82,7 +82,7 @@ def drawn():
 def draw_sky():
     """Five blocks of four cells spread over the sky (1.05 deg2): rows, columns by name, magnitudes by band."""
     universe, library = made(), templates.galaxy_library()
-    cells, dust = population.Cells(universe.population), dust_map.load(SEED)
+    cells, dust = population.CellCache(universe.population), dust_map.load(SEED)
     places = [4 * block + i for block in range(25, 3 << 16, (3 << 16) // 5) for i in range(4)]
     rows = pa.concat_tables([galaxies.draw(cell, universe, cells, dust) for cell in places])
     halos = pa.concat_tables([galaxies.halo_table(cell, universe.population, cells) for cell in places])
@@ -97,8 +97,8 @@ def draw_sky():
     def mag(band):
         table = band_ratios.load(library, band, matching.Z_LAST, 0.5)
         continuum = m_r + distance_modulus + band_ratios.offset(table, z, sed)
-        return emission_lines.brightened(
-            continuum, emission_lines.added(passbands.load(band), columns["z_obs"], columns)
+        return emission_lines.magnitude_with_light(
+            continuum, emission_lines.mean_line_flux(passbands.load(band), columns["z_obs"], columns)
         )
 
     area = len(places) * sky.cell_area(GENERATION_ORDER)

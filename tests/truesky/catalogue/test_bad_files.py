@@ -10,7 +10,7 @@ from tests.truesky.catalogue import synthetic, test_dust_map
 from tests.truesky.catalogue.galaxies import test_nearest_sed
 from tests.truesky.catalogue.halos import test_halo_catalogue
 from truesky.catalogue import build_galaxies, dust_map
-from truesky.running import shell
+from truesky.running import submitted_job
 
 GALAXIES = '[ingest.galaxies]\nfiles = ["theirs.parquet"]\nformat = "flagship2"\n'
 HALOS = (
@@ -26,7 +26,7 @@ DUST = '[ingest.dust]\nfile = "theirs.fits"\ncolumn = "EBV"\n'
 def refused(folder, text, capsys):
     """What a job says of a request."""
     path, lake = requests.written(folder, text, requests.FIELD.format(0.1)), folder / "lake"
-    assert shell.main(build_galaxies.JOB, ["--lake", str(lake), "--request", str(path)]) in (1, 2)
+    assert submitted_job.main(build_galaxies.JOB, ["--lake", str(lake), "--request", str(path)]) in (1, 2)
     assert not list(lake.glob("*/v-*"))
     said = capsys.readouterr().err.strip()
     assert "\n" not in said
@@ -67,7 +67,7 @@ def without(values, key):
 )
 def test_a_wrong_value_or_a_missing_column(tmp_path, monkeypatch, capsys, text, values, said):
     monkeypatch.setenv("TRUESKY_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(dust_map, "chosen", lambda seed, own: None)
+    monkeypatch.setattr(dust_map, "map_for_request", lambda seed, own: None)
     pq.write_table(pa.table(values), tmp_path / "theirs.parquet")
     found = refused(tmp_path, text, capsys)
     assert all(part in found for part in ("theirs.parquet", *said)), found
@@ -76,7 +76,7 @@ def test_a_wrong_value_or_a_missing_column(tmp_path, monkeypatch, capsys, text, 
 @pytest.mark.parametrize(("text", "values"), [(HALOS, halos()), (GALAXIES, galaxies())])
 def test_a_file_that_is_cut_short(tmp_path, monkeypatch, capsys, text, values):
     monkeypatch.setenv("TRUESKY_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(dust_map, "chosen", lambda seed, own: None)
+    monkeypatch.setattr(dust_map, "map_for_request", lambda seed, own: None)
     path = tmp_path / "theirs.parquet"
     pq.write_table(pa.table(values), path)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])

@@ -11,7 +11,7 @@ from truesky.catalogue import build_stars
 from truesky.fluxes import compute_fluxes
 from truesky.render.planning import preconditions
 from truesky.request.from_toml import from_table
-from truesky.running import shell
+from truesky.running import submitted_job
 
 # l = 0, b = 12
 AREA = {"cone": {"ra": 255.4, "dec": -22.2, "radius": 0.5}}
@@ -24,7 +24,7 @@ def wanted(**keys):
 
 def made(lake, **keys):
     (step,) = build_stars.steps(lake, wanted(**keys))
-    publish.make(lake, step.plan, step.work)
+    publish.make_version(lake, step.plan, step.run_task)
     return read.version(lake, "stars")
 
 
@@ -59,7 +59,7 @@ def test_files_hold_about_what_was_planned(versions):
 def test_every_order_is_valid_for_others(versions):
     for one in versions[:2]:
         assert hats_readers.is_valid(one.folder)
-        assert read.verify(one, deep=True) == []
+        assert read.find_faults(one, deep=True) == []
 
 
 def test_selections_do_not_depend_on_the_files(versions, rng):
@@ -70,20 +70,20 @@ def test_selections_do_not_depend_on_the_files(versions, rng):
         assert circle.num_rows > 10
         assert mixed.cone(float(ra[i]), float(dec[i]), 0.3).equals(circle)
         cells = sky.cells_in_cone(float(ra[i]), float(dec[i]), 0.3, 8).tolist()
-        assert mixed.in_cells(cells, 8).equals(whole.in_cells(cells, 8))
+        assert mixed.rows_in_cells(cells, 8).equals(whole.rows_in_cells(cells, 8))
 
 
 def test_fluxes_lie_beside_their_stars(versions):
     """In the same files and the same order, so that reading both needs no join."""
     mixed = versions[1]
     lake = mixed.folder.parents[1]
-    step = compute_fluxes.step_of("star", lake, wanted())
-    publish.make(lake, step.plan, step.work)
+    step = compute_fluxes.flux_step("star", lake, wanted())
+    publish.make_version(lake, step.plan, step.run_task)
     fluxes = read.version(lake, "star_fluxes")
-    assert fluxes.parts == mixed.parts
+    assert fluxes.partitions == mixed.parts
     assert hats_readers.is_valid(fluxes.folder)
     cells = sky.cells_in_cone(AREA["cone"]["ra"], AREA["cone"]["dec"], 0.3, 8).tolist()
-    stars, beside = (one.in_cells(cells, 8, ["id"]) for one in (mixed, fluxes))
+    stars, beside = (one.rows_in_cells(cells, 8, ["id"]) for one in (mixed, fluxes))
     assert stars.num_rows > 1000
     assert stars.equals(beside)
     preconditions.refuse_uncovered(mixed, set(cells))
@@ -98,7 +98,7 @@ def test_what_cannot_be_drawn_is_refused_before_anything_is_made(lake, tmp_path,
     with pytest.raises(BadInput, match=r"ask for a brighter stars\.plane_limit"):
         build_stars.steps(lake, wanted(area=plane, stars={"plane_limit": 26.0}))
     path = requests.written(tmp_path, area="cone = { ra = 266.4, dec = -28.9, radius = 0.1 }")
-    assert shell.main(build_stars.JOB, ["--lake", str(tmp_path / "l"), "--request", str(path)]) == 2
+    assert submitted_job.main(build_stars.JOB, ["--lake", str(tmp_path / "l"), "--request", str(path)]) == 2
     assert "stars.plane_limit" in capsys.readouterr().err
     assert not (tmp_path / "l").exists()
 
@@ -108,7 +108,7 @@ def test_the_plane_to_a_limit_of_its_own(lake):
     ra, dec = (float(x) for x in sky.equatorial(60.0, 5.0))
     version = made(lake, area={"cone": {"ra": ra, "dec": dec, "radius": 0.2}}, stars={"plane_limit": 12.0})
     rows = version.rows(["ra", "dec", "mag_h", "a_v"])
-    cell = sky.cell_of(rows["ra"].to_numpy(), rows["dec"].to_numpy(), ids.GENERATION_ORDER)
+    cell = sky.cell_at(rows["ra"].to_numpy(), rows["dec"].to_numpy(), ids.GENERATION_ORDER)
     _, b = sky.galactic(*sky.cell_centres(ids.GENERATION_ORDER, cell))
     seen = rows["mag_h"].to_numpy() + 0.178 * rows["a_v"].to_numpy()
     assert 11.5 < seen[np.abs(b) < 5].max() <= 12.001

@@ -20,7 +20,7 @@ def held(parts):
 def test_every_cell_lies_in_one_file_of_the_lowest_order_that_can_hold_it(generation, most, order):
     given_cells = np.array(list(generation))
     numbers = 1.0 + given_cells % 7
-    parts = cells.by_number(given_cells.tolist(), numbers, most, order)
+    parts = cells.tasks_by_row_count(given_cells.tolist(), numbers, most, order)
     assert held(parts) == sorted(generation)
     number = dict(zip(given_cells.tolist(), numbers, strict=True))
     for part in parts:
@@ -39,7 +39,7 @@ def test_files_are_those_that_hats_would_plan(rng):
 
     _, lat = sky.galactic(*sky.cell_centres(GENERATION_ORDER, np.arange(12 << 16)))
     numbers = rng.poisson(2000.0 * np.exp(-np.abs(lat) / 10.0)) + 1
-    parts = cells.by_number(range(numbers.size), numbers, 60_000, 3)
+    parts = cells.tasks_by_row_count(range(numbers.size), numbers, 60_000, 3)
     theirs = generate_alignment(numbers, highest_order=8, lowest_order=3, threshold=60_000)
     wanted = {(int(order), int(cell)) for order, cell, _ in set(map(tuple, theirs))}
     assert {layout.cell_of_file(part.name) for part in parts} == wanted
@@ -50,6 +50,6 @@ def test_files_are_those_that_hats_would_plan(rng):
 def test_the_order_of_the_cells_does_not_matter(most):
     found = Area(ra=10.0, dec=20.0, radius=1.0).cells()
     numbers = np.arange(1.0, len(found) + 1)
-    parts = cells.by_number(found, numbers, most, 3)
-    assert parts == cells.by_number(found[::-1], numbers[::-1], most, 3)
-    assert held(parts) == held(cells.parts(Area(ra=10.0, dec=20.0, radius=1.0)))
+    parts = cells.tasks_by_row_count(found, numbers, most, 3)
+    assert parts == cells.tasks_by_row_count(found[::-1], numbers[::-1], most, 3)
+    assert held(parts) == held(cells.tasks_of_area(Area(ra=10.0, dec=20.0, radius=1.0)))

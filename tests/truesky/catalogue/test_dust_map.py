@@ -29,7 +29,7 @@ def test_reddening_away_from_the_plane(dust):
 def test_the_cosecant_law_is_the_mean_of_all_maps():
     """E(B-V) = 0.020 / sin b: 0.020 at the poles, 0.040 at 30 deg."""
     small = dataclasses.replace(dust_map.cosecant(), nside=16, l_max=32)
-    mean = np.mean([dust_map.embedded(seed, small) for seed in range(60)], axis=0) / R_V
+    mean = np.mean([dust_map.make_map(seed, small) for seed in range(60)], axis=0) / R_V
     _, b = hp.pix2ang(16, np.arange(mean.size), lonlat=True)
     assert mean[np.abs(b) > 75].mean() == pytest.approx(0.0203, rel=0.06)
     assert mean[np.abs(np.abs(b) - 30) < 2].mean() == pytest.approx(0.040, rel=0.06)
@@ -48,12 +48,12 @@ def test_the_field_has_its_width_and_slope(dust):
 
 def test_maps_differ_by_seed_and_repeat():
     small = dataclasses.replace(dust_map.cosecant(), nside=32, l_max=64)
-    one = dust_map.embedded(1, small)
-    assert np.array_equal(one, dust_map.embedded(1, small))
-    assert not np.array_equal(one, dust_map.embedded(2, small))
+    one = dust_map.make_map(1, small)
+    assert np.array_equal(one, dust_map.make_map(1, small))
+    assert not np.array_equal(one, dust_map.make_map(2, small))
     # numpy's global generator has no part in it.
     np.random.seed(0)  # noqa: NPY002
-    assert np.array_equal(one, dust_map.embedded(1, small))
+    assert np.array_equal(one, dust_map.make_map(1, small))
 
 
 def test_the_map_is_read_in_galactic_coordinates():

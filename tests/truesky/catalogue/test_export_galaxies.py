@@ -7,7 +7,7 @@ from astropy.table import Table
 
 from lake_schema import sky
 from lake_schema.store import publish, read
-from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.tables.fluxes import fluxes
 from lake_schema.tables.galaxies import GALAXIES
 from truesky.catalogue import export_galaxies
@@ -27,16 +27,16 @@ def lake(tmp_path):
     values |= {"ra": ra, "dec": dec, "ra_true": ra, "dec_true": dec, "_healpix_29": index}
     values |= {name: rng.uniform(-0.1, 0.1, 50) for name in ("kappa", "gamma1", "gamma2")}
     values["position_angle"] = rng.uniform(0, 180, 50)
-    part = Part(f"Norder=5/Dir=0/Npix={CELL}.parquet", {})
+    part = Task(f"Norder=5/Dir=0/Npix={CELL}.parquet", {})
     plan = Plan(GALAXIES, {}, (part,))
-    publish.make(tmp_path, plan, lambda root, facts: Output(GALAXIES.build(values)))
+    publish.make_version(tmp_path, plan, lambda root, facts: Output(GALAXIES.build(values)))
     table = fluxes("galaxy", ["lsst_r"])
     light = {c.name: values[c.name] for c in table.columns if c.name in values} | {
         "f_nu_lsst_r": np.full(50, 3.631),
         "integrated": np.zeros(50, bool),
     }
     made = Plan(table, {"input": plan.key}, (part,))
-    publish.make(tmp_path, made, lambda root, facts: Output(table.build(light)))
+    publish.make_version(tmp_path, made, lambda root, facts: Output(table.build(light)))
     return tmp_path
 
 
@@ -53,13 +53,13 @@ def test_fits_tables_have_units_and_ucds(lake, tmp_path):
 
 def test_a_skycatalogs_set_comes_back_through_its_mapping(lake, tmp_path):
     written = export_galaxies.export(lake, tmp_path / "out", "skycatalogs")
-    pixel = sky.ring_of(5, CELL)
+    pixel = sky.ring_index(5, CELL)
     assert [path.name for path in written] == [
         f"galaxy_{pixel}.parquet",
         f"galaxy_flux_{pixel}.parquet",
         "skyCatalog.yaml",
     ]
-    (piece,) = mapping.read(written[:1], mapping.galaxies("skycatalogs", {}))
+    (piece,) = mapping.read(written[:1], mapping.galaxy_columns("skycatalogs", {}))
     rows = read.version(lake, "galaxies").rows()
     for name in ("gamma1", "gamma2", "kappa", "a_v", "z_true", "disk_axis_ratio", "bulge_half_light_radius"):
         assert piece.values[name] == pytest.approx(rows[name].to_numpy(), rel=1e-5), name
@@ -72,8 +72,8 @@ def test_a_skycatalogs_set_comes_back_through_its_mapping(lake, tmp_path):
 def test_fluxes_of_other_galaxies_are_refused(lake, tmp_path, capsys):
     table = fluxes("galaxy", ["lsst_r"])
     rows = read.version(lake, "galaxy_fluxes").rows()
-    part = Part(f"Norder=5/Dir=0/Npix={CELL}.parquet", {})
-    publish.make(lake, Plan(table, {"input": "other"}, (part,)), lambda root, facts: Output(rows))
+    part = Task(f"Norder=5/Dir=0/Npix={CELL}.parquet", {})
+    publish.make_version(lake, Plan(table, {"input": "other"}, (part,)), lambda root, facts: Output(rows))
     arguments = ["--lake", str(lake), "--out", str(tmp_path / "out"), "--form", "skycatalogs"]
     assert export_galaxies.main(arguments) == 2
     assert "run compute_fluxes first" in capsys.readouterr().err

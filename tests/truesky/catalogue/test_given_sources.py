@@ -12,7 +12,7 @@ from tests import requests
 from truesky.catalogue import build_galaxies, build_stars, given_sources
 from truesky.fluxes import integration, passbands
 from truesky.fluxes.libraries import templates
-from truesky.fluxes.sources import galaxies_of, stars_of
+from truesky.fluxes.sources import galaxies_from_table, stars_from_table
 from truesky.request.from_toml import parse
 
 TWO = "ra,dec,mag,position_angle,gamma1,stamp\n53.10,-27.80,20.0,30.0,0.05,3\n53.11,-27.81,24.5,140.0,-0.02,-1\n"
@@ -34,17 +34,21 @@ def made(folder, *args, **keys):
     lake.mkdir(exist_ok=True)
     for module in (build_galaxies, build_stars):
         for step in module.steps(lake, wanted):
-            publish.make(lake, step.plan, step.work)
+            publish.make_version(lake, step.plan, step.work)
     rows = [read.version(lake, name).rows() for name in ("galaxies", "stars")]
     for found, table in zip(rows, (GALAXIES, STARS), strict=True):
-        assert validate.violations(found, table) == []
+        assert validate.find_violations(found, table) == []
     return rows
 
 
 def vis_magnitudes(rows, stars):
     (vis,) = (passbands.load("euclid_vis"),)
-    galaxies = integration.galaxies(galaxies_of(rows, templates.galaxy_library()), [vis], templates.galaxy_library())
-    points = integration.stars(stars_of(stars, templates.stellar_library()), [vis], templates.stellar_library())
+    galaxies = integration.galaxy_fluxes(
+        galaxies_from_table(rows, templates.galaxy_library()), [vis], templates.galaxy_library()
+    )
+    points = integration.star_fluxes(
+        stars_from_table(stars, templates.stellar_library()), [vis], templates.stellar_library()
+    )
     return tuple(units.mag_of_f_nu(found[:, 0]) for found in (galaxies, points))
 
 
@@ -130,7 +134,7 @@ def test_a_table_that_changes_while_it_is_read_is_refused(tmp_path):
     step = build_galaxies.steps(tmp_path, wanted)[0]
     asked(tmp_path, galaxies=TWO.replace("20.0", "20.1"))
     with pytest.raises(BadInput, match="has changed since the job began"):
-        step.work(tmp_path, {**step.plan.facts, **step.plan.parts[0].facts})
+        step.run_task(tmp_path, {**step.plan.facts, **step.plan.tasks[0].facts})
     assert build_galaxies.steps(tmp_path, wanted)[0].plan.key != step.plan.key
 
 

@@ -24,7 +24,7 @@ def test_what_wants_a_clone_is_left_out():
     notebooks = (ROOT / "notebooks").glob("*.ipynb")
     cells = {path.name: "".join(map(str, json.loads(path.read_text())["cells"])) for path in notebooks}
     wanting = {name for name, text in cells.items() if "../benchmarks/" in text or "../truesky/render/" in text}
-    assert {path.name for path in examples.files() if path.suffix == ".ipynb"} == set(cells) - wanting
+    assert {path.name for path in examples.example_files() if path.suffix == ".ipynb"} == set(cells) - wanting
 
 
 def test_nothing_is_written_over(tmp_path, capsys):

@@ -13,7 +13,7 @@ from lake_schema import __version__
 from tests import requests
 from truesky.commands import __main__ as truesky
 from truesky.commands import submit
-from truesky.running import shell
+from truesky.running import submitted_job
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -27,8 +27,8 @@ def called(monkeypatch):
         calls.append(command[1:])
         return 7 * (len(calls) == 2)
 
-    monkeypatch.setattr(submit, "_call", call)
-    monkeypatch.setattr(submit, "_environment", lambda: Path("/environment"))
+    monkeypatch.setattr(submit, "_run_program", call)
+    monkeypatch.setattr(submit, "_spark_environment", lambda: Path("/environment"))
     return calls
 
 
@@ -52,7 +52,7 @@ def test_a_reader_of_the_help_may_close_the_pipe(word):
 
 def test_a_job_is_given_what_the_command_is(called):
     assert truesky.main(["fluxes", "--lake", "a b", "--request", "r", "--", "--master", "local[1]"]) == 0
-    file = str(ROOT / "truesky" / "running" / "submitted.py")
+    file = str(ROOT / "truesky" / "running" / "spark_entry.py")
     assert called == [
         ["--master", "local[1]", file, "truesky.fluxes.compute_fluxes", "--lake", "a b", "--request", "r"]
     ]
@@ -71,7 +71,7 @@ def test_a_job_in_this_process_says_and_returns_the_same(tmp_path, capsys, calle
     words = ["--lake", str(tmp_path / "lake"), "--request", str(path)]
     assert truesky.main(["--local", "plan", *words]) == 2
     said = capsys.readouterr()
-    assert shell.main(import_module("truesky.render.plan_exposures").JOB, words) == 2
+    assert submitted_job.main(import_module("truesky.render.plan_exposures").JOB, words) == 2
     assert capsys.readouterr() == said
     assert "colour" in said.err
     assert called == []

@@ -4,21 +4,21 @@ import json
 
 import pytest
 
-from lake_schema.errors import BadInput, Damaged, PartsFailed
+from lake_schema.errors import BadInput, Damaged, TasksFailed
 from lake_schema.store import layout, publish
-from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.tables.products import PRODUCTS
 from lake_schema.tables.tasks import TASKS
 from tests import requests
 from tests.universe import plain_plan, plain_work, rows_of
 from truesky.commands import report
 from truesky.request.from_toml import parse
-from truesky.running.shell import Job, Step
-from truesky.running.shell import run as run_job
+from truesky.running.submitted_job import Job, Step
+from truesky.running.submitted_job import run as run_job
 
 
 def log(root, name, *lines):
-    (folder := layout.runs(root)).mkdir(parents=True, exist_ok=True)
+    (folder := layout.runs_folder(root)).mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
 
 
@@ -38,7 +38,7 @@ def test_runs_add_up(lake):
     )
     log(lake, "2-x-1", first, part("b", rows=5, bytes=10**9, peak_gb=0.75), {"seconds": 4.0, "status": "done"})
     log(lake, "3-y-1", {"job": "other"}, part("c", rows=1))
-    one, other, total = report.rows(lake)
+    one, other, total = report.job_totals(lake)
     assert (one.job, one.runs, one.failed_runs, one.stopped, one.parts, one.failed) == ("draw", 2, 1, 0, 2, 1)
     assert (one.rows, one.seconds, one.cpu_s, one.gb, one.peak_gb) == (15, 15.0, 8.5, 3.0, 0.75)
     assert (other.job, other.stopped, other.parts, other.seconds) == ("other", 1, 1, 0.0)
@@ -49,7 +49,7 @@ def test_a_run_makes_several_tables(lake):
     """A log each; the number of its process ends their names, and may come again."""
     for name in ("1-x-7", "2-y-7", "3-x-8", "4-x-7"):
         log(lake, name, {"job": "draw", "table": name[2]}, part("a", rows=1), {"seconds": 1.0, "status": "done"})
-    assert (report.rows(lake)[0].runs, report.rows(lake)[0].parts) == (3, 4)
+    assert (report.job_totals(lake)[0].runs, report.job_totals(lake)[0].parts) == (3, 4)
 
 
 def test_what_is_not_known_is_said(lake, capsys):
@@ -69,8 +69,8 @@ def test_what_a_job_writes_is_read(tmp_path):
     plan = plain_plan(1, parts=3)
     job = Job("toy", "", lambda lake, request: [Step(plan, plain_work, on_driver=True)])
     run_job(job, root, parse(request))
-    line, _ = report.rows(root)
-    version = layout.version(root, plan.table.name, plan.key)
+    line, _ = report.job_totals(root)
+    version = layout.version_folder(root, plan.table.name, plan.key)
     size = sum(path.stat().st_size for path in (version / "dataset").iterdir())
     assert (line.job, line.runs, line.parts, line.failed) == ("toy", 1, 3, 0)
     assert line.gb * 1e9 == pytest.approx(size)
@@ -80,9 +80,9 @@ def test_what_a_job_writes_is_read(tmp_path):
         raise BadInput("no")
 
     other = Job("toy", "", lambda lake, request: [Step(plain_plan(2, parts=3), fails, on_driver=True)])
-    with pytest.raises(PartsFailed):
+    with pytest.raises(TasksFailed):
         run_job(other, root, parse(request))
-    line, _ = report.rows(root)
+    line, _ = report.job_totals(root)
     assert (line.runs, line.failed_runs, line.parts, line.failed) == (2, 1, 3, 3)
 
 
@@ -92,22 +92,22 @@ def rendered(lake, name, detectors):
     columns = {key: rows_of(TASKS, n)[key] for key in TASKS.names}
     columns |= {"exposure_id": [0] * n, "detector": [detector for detector, _ in detectors]}
     tasks = TASKS.build({**columns, "seconds": [10.0] * n, "bytes": [10**9] * n})
-    planned = Plan(TASKS, {"of": name}, (Part("all.parquet", {}),))
-    publish.make(lake, planned, lambda root, facts: Output(tasks), name=name)
-    parts = (Part(f"{d}.parquet", {"exposure_id": 0, "detector": d, "product": shape}) for d, shape in detectors)
+    planned = Plan(TASKS, {"of": name}, (Task("all.parquet", {}),))
+    publish.make_version(lake, planned, lambda root, facts: Output(tasks), name=name)
+    parts = (Task(f"{d}.parquet", {"exposure_id": 0, "detector": d, "product": shape}) for d, shape in detectors)
     plan = Plan(PRODUCTS, {"inputs": {"tasks": planned.key}}, tuple(parts))
-    publish.make(lake, plan, lambda root, facts: Output(PRODUCTS.empty()), name=name)
+    publish.make_version(lake, plan, lambda root, facts: Output(PRODUCTS.empty()), name=name)
 
 
 def test_the_forecast_is_of_all_requests(lake):
     """A detector that is the same in two of them is made once."""
     log(lake, "1-products-1", {"job": "render_exposures"}, part("a", rows=1), {"seconds": 5.0, "status": "done"})
     rendered(lake, "a", [("3-4", "x"), ("3-5", "y")])
-    line, _ = report.rows(lake)
+    line, _ = report.job_totals(lake)
     factor = line.forecast_s / 20.0
     assert line.forecast_gb == pytest.approx(2.0)
     rendered(lake, "b", [("3-4", "x"), ("3-5", "z")])
-    line, total = report.rows(lake)
+    line, total = report.job_totals(lake)
     assert (line.forecast_s, line.forecast_gb) == pytest.approx((30.0 * factor, 3.0))
     assert total.forecast_gb == pytest.approx(3.0)
 
@@ -117,4 +117,4 @@ def test_a_lake_without_logs_and_a_damaged_log_are_refused(lake, capsys):
     assert "no run has left a log" in capsys.readouterr().err
     log(lake, "1-x-1", {"job": "draw"}, part("a", rows="ten"), {"status": "done"})
     with pytest.raises(Damaged, match="line 2 is not what a run writes"):
-        report.rows(lake)
+        report.job_totals(lake)

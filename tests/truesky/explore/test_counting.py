@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lake_schema.errors import BadInput
-from truesky.explore.counting import MOST_CELLS, Chart, counted, held, points, span, tallied
+from truesky.explore.counting import MAX_CELLS, Chart, count_rows, count_with_outside, inspect_columns, points, span
 
 SPECIAL = [np.nan, np.inf, -np.inf, 0.0, -0.0, 1.0, 0.1, np.float32(0.3), -1.0, 3.4e38]
 
@@ -59,7 +59,7 @@ CHARTS = [
 )
 def test_the_same_as_duckdb(limits, threads):
     columns = rows(1)
-    for chart, counts in zip(CHARTS, counted(columns, CHARTS, limits, threads), strict=True):
+    for chart, counts in zip(CHARTS, count_rows(columns, CHARTS, limits, threads), strict=True):
         assert counts.sum() > 0
         np.testing.assert_array_equal(counts, by_duckdb(columns, chart, limits))
 
@@ -67,7 +67,7 @@ def test_the_same_as_duckdb(limits, threads):
 @given(st.lists(st.floats(width=32), max_size=30), st.integers(1, 5))
 def test_every_value_counts_at_most_once(values, bins):
     column = np.array(values, np.float32)
-    (counts,) = counted([column], [Chart((0,), ((-1.0, 1.0),), (bins,))], {})
+    (counts,) = count_rows([column], [Chart((0,), ((-1.0, 1.0),), (bins,))], {})
     with np.errstate(invalid="ignore"):
         assert counts.sum() == ((column >= -1.0) & (column <= 1.0)).sum()
 
@@ -78,16 +78,19 @@ def test_rows_beyond_the_spans(limits, threads):
     """Those that would count if the spans held every number, and do not: of few bins, and of more than rows."""
     columns, everything = rows(1), (-3.5e38, 3.5e38)
     grids = [*CHARTS, Chart((0, 3), ((-2.0, 2.0), (-1.0, 1.0)), (600, 700))]
-    wide = [Chart(one.columns, (everything,) * len(one.columns), (1,) * len(one.columns), one.own) for one in grids]
-    counts, beyond = tallied(columns, grids, limits, threads)
-    all_ = [int(one.sum()) for one in counted(columns, wide, limits)]
+    wide = [
+        Chart(one.columns, (everything,) * len(one.columns), (1,) * len(one.columns), one.ignored_limits)
+        for one in grids
+    ]
+    counts, beyond = count_with_outside(columns, grids, limits, threads)
+    all_ = [int(one.sum()) for one in count_rows(columns, wide, limits)]
     assert beyond == [most - one.sum() for most, one in zip(all_, counts, strict=True)]
     assert min(beyond) > 100
 
 
 def test_held():
     columns = rows(3)
-    found = held(columns)
+    found = inspect_columns(columns)
     assert found.missing == [int((~np.isfinite(column)).sum()) for column in columns]
     assert min(found.missing) > 0
     assert found.spans == [span(column) for column in columns]
@@ -109,18 +112,18 @@ def test_refusals():
         with pytest.raises(BadInput):
             Chart(axes, spans, bins)
     with pytest.raises(BadInput, match="of the same rows"):
-        counted([np.zeros(2, np.float32), np.zeros(3, np.float32)], CHARTS[:1], {})
+        count_rows([np.zeros(2, np.float32), np.zeros(3, np.float32)], CHARTS[:1], {})
     column = [np.zeros(2, np.float32)]
     for charts, limits in ((CHARTS[1:2], {}), ([Chart((-1,), ((0.0, 1.0),), (3,))], {}), (CHARTS[:1], {1: (0.0, 1.0)})):
         with pytest.raises(BadInput, match="none of the 1"):
-            counted(column, charts, limits)
+            count_rows(column, charts, limits)
 
 
 def test_all_charts_share_a_bound_of_bins():
-    column, wide = [np.full(3, 0.5, np.float32)], Chart((0,), ((0.0, 1.0),), (MOST_CELLS // 2,))
-    assert [counts.sum() for counts in counted(column, [wide] * 2, {}, threads=64)] == [3, 3]
+    column, wide = [np.full(3, 0.5, np.float32)], Chart((0,), ((0.0, 1.0),), (MAX_CELLS // 2,))
+    assert [counts.sum() for counts in count_rows(column, [wide] * 2, {}, threads=64)] == [3, 3]
     with pytest.raises(BadInput, match="together"):
-        counted(column, [wide] * 3, {})
+        count_rows(column, [wide] * 3, {})
 
 
 def test_span():
@@ -138,7 +141,7 @@ def test_points_are_of_the_rows_that_count(limits, most):
     columns = rows(4, 100_000)
     chart = Chart((0, 1), ((-1.0, 1.0), (0.0, 0.3)), (1, 1))
     places, step = points(columns, chart, limits, most)
-    (((total,),),) = counted(columns, [chart], limits)
+    (((total,),),) = count_rows(columns, [chart], limits)
     assert places.shape[1] == 2
     assert len(places) <= most
     found = {tuple(place) for place in places.tolist()}

@@ -15,7 +15,7 @@ from astropy.coordinates import SkyCoord
 from lake_schema import sky
 from lake_schema.errors import BadInput, Damaged
 from lake_schema.store import layout, publish, read
-from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.tables.galaxies import GALAXIES
 from tests.universe import plain_plan, plain_work, rows_of
 from truesky.explore.explorer import Explorer
@@ -259,8 +259,8 @@ def test_any_parameter_may_be_exported_to_a_file_of_the_home_folder(explorer, tm
 
 def test_a_table_of_another_version_is_not_listed_as_damaged(lake):
     table = replace(GALAXIES, version=GALAXIES.version + 1)
-    plan = Plan(table, {}, (Part(layout.cell_file(5, 1607), {}),))
-    publish.make(lake, plan, lambda root, facts: Output(rows_of(table, 12)))
+    plan = Plan(table, {}, (Task(layout.cell_file(5, 1607), {}),))
+    publish.make_version(lake, plan, lambda root, facts: Output(rows_of(table, 12)))
     with Explorer(lake) as other:
         row = other.tables().loc["galaxies"]
     assert row["version"] == "unreadable version"
@@ -326,17 +326,17 @@ def test_a_lake_without_tables(lake):
 
 
 def test_an_explorer_stays_with_the_versions_it_opened(lake):
-    publish.make(lake, plain_plan(1), plain_work)
+    publish.make_version(lake, plain_plan(1), plain_work)
     with Explorer(lake) as explorer:
-        publish.make(lake, plain_plan(2), plain_work)
+        publish.make_version(lake, plain_plan(2), plain_work)
         assert explorer.sql("SELECT DISTINCT value FROM plain")["value"].tolist() == [1.0]
     with Explorer(lake) as explorer:
         assert explorer.sql("SELECT DISTINCT value FROM plain")["value"].tolist() == [2.0]
 
 
 def test_a_changed_byte_is_damage_not_a_number(lake):
-    publish.make(lake, plain_plan(), plain_work)
-    path = read.version(lake, "plain").path("1.parquet")
+    publish.make_version(lake, plain_plan(), plain_work)
+    path = read.version(lake, "plain").partition_path("1.parquet")
     data = bytearray(path.read_bytes())
     with Explorer(lake) as explorer:
         assert explorer.sql("SELECT sum(value) AS s FROM plain")["s"][0] == 60.0

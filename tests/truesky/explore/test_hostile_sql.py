@@ -164,7 +164,7 @@ def test_the_locked_session_is_a_second_fence(explored, outside, before, text, m
     if any(word in text for word in ("POINTER", "5000", "(" * 100, "+1+1", "x" * 100)):
         return
     galaxies = read.version(explored, "galaxies")
-    part = galaxies.path(galaxies.parts[0])
+    part = galaxies.partition_path(galaxies.partitions[0])
     keys = {"galaxies": galaxies.key, "plain": read.version(explored, "plain").key}
     text = text.replace("{file}", str(outside / "secret.csv")).replace("{new}", str(outside / "new"))
     query = guard.Query(text.replace("{part}", str(part)), ("galaxies", "plain"), guard.Origins(None))
@@ -240,4 +240,4 @@ GOOD = [
 @pytest.mark.parametrize("text", GOOD)
 def test_usual_queries_are_possible(explorer, text):
     assert len(explorer.sql(text)) >= 0
-    assert guard.checked(text, explorer.versions).text == text
+    assert guard.check_query(text, explorer.versions).text == text

@@ -92,7 +92,7 @@ def test_a_lake_that_is_not_there(tmp_path, capsys):
 def test_damage_ends_with_1(explored, capsys, tmp_path):
     shutil.copytree(explored, tmp_path / "lake", symlinks=True)
     version = read.version(tmp_path / "lake", "plain")
-    path = version.path(version.parts[0])
+    path = version.partition_path(version.partitions[0])
     path.write_bytes(path.read_bytes()[:-1])
     assert main(["SELECT sum(value) FROM plain", "--lake", str(tmp_path / "lake")]) == 1
     assert path.name in capsys.readouterr().err

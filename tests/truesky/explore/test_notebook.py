@@ -23,11 +23,11 @@ def field(tmp_path_factory):
     """Galaxies, stars and fluxes, made without Spark."""
     folder = tmp_path_factory.mktemp("field")
     wanted = parse(requests.written(folder, SMALL, requests.FIELD.format(0.02), seed=7))
-    root = layout.lake(folder / "lake")
+    root = layout.resolve_lake(folder / "lake")
     root.mkdir()
     for job in (build_galaxies.JOB, build_stars.JOB, compute_fluxes.JOB):
         for step in job.steps(root, wanted):
-            publish.make(root, step.plan, step.work)
+            publish.make_version(root, step.plan, step.run_task)
     return root
 
 

@@ -21,7 +21,7 @@ def pushed(explored, object_storage):
         for name, value in storage.CREDENTIALS.items():
             patch.setenv(name, value)
         object_storage.client.create_bucket(Bucket=BUCKET)
-        place = s3.address(f"s3://{BUCKET}/lake", object_storage.url)
+        place = s3.parse_address(f"s3://{BUCKET}/lake", object_storage.url)
         list(push.push(explored, place))
     return str(place)
 
@@ -89,7 +89,7 @@ def test_lsdb_reads_it_through_pyarrow(explored, there, monkeypatch):
 def test_duckdb_reads_it_through_a_dataset(explored, there):
     import duckdb
 
-    rows = read.version(layout.opened(there), "galaxies").dataset()
+    rows = read.version(layout.open_lake(there), "galaxies").dataset()
     assert rows.count_rows() == 500
     n, least = duckdb.sql("SELECT count(*), min(z_obs) FROM rows").fetchall()[0]
     here = read.version(explored, "galaxies").rows(["z_obs"])["z_obs"].to_numpy()

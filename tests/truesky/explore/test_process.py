@@ -125,7 +125,7 @@ def test_a_query_that_another_thread_ends_by_closing_says_so(process):
 
 
 def test_an_answer_names_its_question(process):
-    answer = process._begun({"sql": "SELECT 1", "parameters": {}}, 20.0)
+    answer = process._send({"sql": "SELECT 1", "parameters": {}}, 20.0)
     answer.number += 1
     with pytest.raises(LakeError, match="got the answer to question"):
         process._next(answer)
@@ -139,12 +139,12 @@ def test_it_is_stopped_while_it_sends(process):
 
 
 def test_the_session_is_kept_and_begins_anew_after_an_error(lake):
-    publish.make(lake, plain_plan(), plain_work)
+    publish.make_version(lake, plain_plan(), plain_work)
     version = read.version(lake, "plain")
     session = Session(lake, {"plain": version.key}, 1 << 30)
 
     def ask(text):
-        return numbers(session.run(session.checked(text), {}))
+        return numbers(session.run(session.check_query(text), {}))
 
     assert ask("SELECT count(*) FROM plain") == [60]
     kept = session._database
@@ -155,7 +155,7 @@ def test_the_session_is_kept_and_begins_anew_after_an_error(lake):
     assert session._database is None
     assert ask("SELECT count(*) FROM plain") == [60]
     # A page that was compared for one question is compared again for the next.
-    path = version.path("1.parquet")
+    path = version.partition_path("1.parquet")
     data = bytearray(path.read_bytes())
     data[60] ^= 1
     path.write_bytes(data)

@@ -14,8 +14,8 @@ def two(tmp_path_factory):
     root = tmp_path_factory.mktemp("two") / "lake"
     root.mkdir()
     for name, seed in (("a", 1), ("my-b", 2)):
-        publish.make(root, toy_plan(), toy_work, name=name)
-        publish.make(root, plain_plan(seed), plain_work, name=name)
+        publish.make_version(root, toy_plan(), toy_work, name=name)
+        publish.make_version(root, plain_plan(seed), plain_work, name=name)
     return root
 
 

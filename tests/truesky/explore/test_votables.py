@@ -33,7 +33,7 @@ def made(most=None):
         [pa.field(k, column.type, metadata=facts if k == "double" else None) for k, column in COLUMNS.items()]
     )
     batch = pa.RecordBatch.from_arrays(list(COLUMNS.values()), schema=schema)
-    cut = votables.Cut(most)
+    cut = votables.RowLimit(most)
     return b"".join(votables.pieces([batch.slice(0, 0), batch.slice(0, 2), batch.slice(2)], cut)), cut
 
 
@@ -81,7 +81,7 @@ def test_characters_that_xml_lacks(character):
 def test_pieces_of_many_rows_are_small(most):
     """However many come at a time: as texts they take many times their size."""
     batch = pa.RecordBatch.from_pydict({"a": np.arange(100_000), "b": np.arange(100_000) / 7})
-    cut = votables.Cut(most)
+    cut = votables.RowLimit(most)
     pieces = [*votables.pieces([batch], cut)]
     assert max(map(len, pieces)) < 1 << 20
     assert b"".join(pieces).count(b"<TR>") == (100_000 if most is None else most)

@@ -142,7 +142,7 @@ def test_dust_is_applied_at_every_wavelength_not_to_the_band(bare, library):
         assert abs(dimming(band, a_v=3.1 * 0.5) - scaled) > error
     # Inside the galaxy: behind its own dust, at its E(B-V), against the sum over wavelengths.
     rest, band = library.wavelength, passbands.load("lsst_u")
-    dusty = library.flux[8] * extinction.transmitted(extinction.laws(rest)[2], 0.5)
+    dusty = library.flux[8] * extinction.transmission(extinction.laws(rest)[2], 0.5)
     ratio = passbands.ab_flux(band, rest * 1.4, dusty) / passbands.ab_flux(R01, rest * 1.4, dusty)
     got = flux(ext_law_1=2, ebv_1=0.5)["f_nu_lsst_u"][0].as_py() / float(units.f_nu_of_mag(20.0))
     assert got == pytest.approx(float(ratio), rel=1e-3)

@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 
 from truesky.fluxes import band_fluxes, bulges, passbands
 from truesky.fluxes.libraries import templates
-from truesky.fluxes.sources import galaxies_of
+from truesky.fluxes.sources import galaxies_from_table
 from truesky.fluxes.spectra import continuum
 
 LIBRARY = templates.galaxy_library()
 VIS, H = (passbands.load(name) for name in ("euclid_vis", "euclid_h"))
-OWN = bulges.ladder(LIBRARY)
+OWN = bulges.colour_sequence(LIBRARY)
 
 
 def rows(share=0.3, colour=0.2, z=0.5, sed=14.0, kind=0):
@@ -37,7 +37,7 @@ def rows(share=0.3, colour=0.2, z=0.5, sed=14.0, kind=0):
 
 
 def share_of(table, band):
-    return bulges.in_band(table, band, LIBRARY)["bulge_fraction"].to_numpy()
+    return bulges.with_fractions_in_band(table, band, LIBRARY)["bulge_fraction"].to_numpy()
 
 
 def odds(share):
@@ -53,7 +53,7 @@ def test_the_colour_is_that_of_the_column():
 
 
 def test_what_is_as_red_as_can_be_has_one_colour():
-    reddest = int(OWN.of[-1])
+    reddest = int(OWN.template[-1])
     np.testing.assert_allclose(share_of(rows(sed=float(reddest)), H), 0.3, rtol=1e-12)
     near = share_of(rows(sed=reddest + 0.01), H)
     np.testing.assert_allclose(near, 0.3, atol=1e-3)
@@ -62,21 +62,24 @@ def test_what_is_as_red_as_can_be_has_one_colour():
 @pytest.mark.parametrize("known", [{"colour": np.nan}, {"colour": 0.0}, {"kind": 2}, {"share": 1.0}, {"share": 0.0}])
 def test_what_says_nothing_of_a_colour_is_kept_to_the_bit(known):
     table = rows(**known)
-    assert bulges.in_band(table, VIS, LIBRARY) is table
-    assert bulges.in_band(table.drop_columns(["bulge_color"]), VIS, LIBRARY).num_columns == table.num_columns - 1
+    assert bulges.with_fractions_in_band(table, VIS, LIBRARY) is table
+    assert (
+        bulges.with_fractions_in_band(table.drop_columns(["bulge_color"]), VIS, LIBRARY).num_columns
+        == table.num_columns - 1
+    )
     missing = table.set_column(2, "bulge_color", pa.nulls(1, pa.float32()))
-    assert bulges.in_band(missing, VIS, LIBRARY) is missing
+    assert bulges.with_fractions_in_band(missing, VIS, LIBRARY) is missing
 
 
 @pytest.mark.parametrize("band", ["lsst_u", "euclid_vis", "euclid_y", "euclid_h"])
 @pytest.mark.parametrize("ebv", [0.0, 0.4])
 def test_against_whole_spectra(galaxies, band, ebv):
     """Of templates that are as far apart as the colour asks for, the light of their spectra, of one light in 0.1r."""
-    passband, z, dust = passbands.load(band), np.array([0.01, 0.2, 0.7, 1.4, 2.2, 4.0]), continuum.dust_of(LIBRARY)
+    passband, z, dust = passbands.load(band), np.array([0.01, 0.2, 0.7, 1.4, 2.2, 4.0]), continuum.dust_curves(LIBRARY)
     known = {f"{name}_{k}": value for k in (1, 2) for name, value in (("ebv", ebv), ("ext_law", 2))}
     light, first, count = [], int(passband.wavelength[0]), len(passband.wavelength)
     for sed in (18, 12):
-        mix = galaxies_of(galaxies(z.size, **known, sed_1=sed, sed_2=sed, z_obs=z, a_v=0.0), LIBRARY).mix
+        mix = galaxies_from_table(galaxies(z.size, **known, sed_1=sed, sed_2=sed, z_obs=z, a_v=0.0), LIBRARY).mix
         amplitude = continuum.amplitudes(mix, passbands.load(continuum.REFERENCE_BAND), LIBRARY, dust)
         spectra = continuum.observed_shape(mix, amplitude / amplitude.sum(), LIBRARY, dust, first, count)
         light.append(spectra.astype(float) @ passbands.weights(passband) * amplitude.sum())
@@ -107,7 +110,7 @@ def test_a_redder_bulge_has_more_of_the_infrared_and_less_of_the_blue():
 def test_bins_are_narrow_bands():
     grid = LIBRARY.wavelength
     flux = np.array([LIBRARY.flux[:, abs(grid - at) <= 300].mean(1) for at in (3500, 6000, 15000)], float).T
-    found = bulges.in_bins(rows(sed=[5.0, 20.5], z=1.0), flux, LIBRARY)
+    found = bulges.fractions_in_bins(rows(sed=[5.0, 20.5], z=1.0), flux, LIBRARY)
     for column, at in enumerate((3500, 6000, 15000)):
         seen = np.arange(at - 300, at + 301, dtype=float)
         band = passbands.Passband("narrow", seen, 1.0 / seen, "vacuum")
@@ -124,4 +127,4 @@ def test_fluxes_do_not_know_of_bulges(galaxies):
 def test_a_library_of_one_spectrum_has_one_colour():
     alone = replace(LIBRARY, flux=LIBRARY.flux[:1], names=LIBRARY.names[:1])
     table = rows()
-    assert bulges.in_band(table, VIS, alone) is table
+    assert bulges.with_fractions_in_band(table, VIS, alone) is table

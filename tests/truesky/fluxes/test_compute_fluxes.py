@@ -18,7 +18,7 @@ from truesky.fluxes import band_fluxes, compute_fluxes, inputs
 from truesky.fluxes.spectra import lines
 from truesky.request.accuracy import REFERENCE
 from truesky.request.from_toml import from_table, parse
-from truesky.running import shell
+from truesky.running import submitted_job
 
 CELLS = (1607, 1608)
 BANDS = ["euclid_vis", "euclid_h"]
@@ -43,8 +43,8 @@ def catalogue(lake, declared, columns):
             place |= {"ra_true": ra, "dec_true": dec}
         return plan.Output(declared.build({name: rows[name] for name in declared.names} | place | given))
 
-    parts = tuple(plan.Part(layout.cell_file(5, cell), {"cell": cell}) for cell in CELLS)
-    publish.make(lake, plan.Plan(declared, {"seed": wanted().seed, "columns": sorted(columns)}, parts), work)
+    parts = tuple(plan.Task(layout.cell_file(5, cell), {"cell": cell}) for cell in CELLS)
+    publish.make_version(lake, plan.Plan(declared, {"seed": wanted().seed, "columns": sorted(columns)}, parts), work)
 
 
 @pytest.fixture
@@ -70,7 +70,7 @@ def run(lake, asked, sources=False):
     for step in compute_fluxes.steps(lake, asked):
         # What fluxes were made with is read back only where the request brings its own.
         if sources or step.plan.table.is_catalogue:
-            publish.make(lake, step.plan, step.work)
+            publish.make_version(lake, step.plan, step.run_task)
 
 
 def test_every_source_has_its_fluxes_beside_it(filled):
@@ -78,7 +78,7 @@ def test_every_source_has_its_fluxes_beside_it(filled):
     for kind, name in compute_fluxes.CATALOGUES:
         source, made = read.version(filled, name), read.version(filled, f"{kind}_fluxes")
         assert made.num_rows == source.num_rows == 80
-        assert made.parts == source.parts
+        assert made.partitions == source.partitions
         assert made.rows()["id"].equals(source.rows()["id"])
         assert all((made.rows()[f"f_nu_{band}"].to_numpy() > 0.0).all() for band in BANDS)
 
@@ -159,10 +159,10 @@ format = "extinction"
     assert np.abs(np.log(np.asarray(truth["f_nu_euclid_h"]) / np.asarray(embedded["f_nu_euclid_h"]))).min() > 0.1
     assert (read.version(filled, "star_fluxes").rows()["f_nu_mine"].to_numpy() > 0.0).all()
     # What draws the galaxies finds their spectra, too.
-    np.testing.assert_array_equal(inputs.library_of(filled, facts).flux, own.library.flux)
+    np.testing.assert_array_equal(inputs.galaxy_library_from_facts(filled, facts).flux, own.library.flux)
     # Another content of the same file is another table.
     ascii_file(tmp_path / "mine.dat", BAND, RESPONSE**2)
-    assert compute_fluxes.step_of("galaxy", filled, parse(path)).plan.key != made.key
+    assert compute_fluxes.flux_step("galaxy", filled, parse(path)).plan.key != made.key
 
 
 def test_stars_of_the_user_make_the_fluxes(filled, tmp_path, stars_library):
@@ -172,8 +172,8 @@ def test_stars_of_the_user_make_the_fluxes(filled, tmp_path, stars_library):
     own = "[fluxes.stars]\nbasel = 'synthetic.cor'\nirtf = ['star.txt']\n"
     asked = parse(requests.written(tmp_path, f"fluxes.bands = {BANDS}\n{own}"))
     own = inputs.read(asked.curves)
-    for step in (*compute_fluxes.source_steps(own), compute_fluxes.step_of("star", filled, asked)):
-        publish.make(filled, step.plan, step.work)
+    for step in (*compute_fluxes.source_steps(own), compute_fluxes.flux_step("star", filled, asked)):
+        publish.make_version(filled, step.plan, step.run_task)
     made, rows = read.version(filled, "star_fluxes"), read.version(filled, "stars").rows()
     truth = band_fluxes.star_fluxes(rows, BANDS, own.stars, REFERENCE)
     embedded = band_fluxes.star_fluxes(rows, BANDS, stars_library, REFERENCE)
@@ -182,7 +182,7 @@ def test_stars_of_the_user_make_the_fluxes(filled, tmp_path, stars_library):
     assert np.abs(np.log(np.asarray(truth["f_nu_euclid_vis"]) / np.asarray(embedded["f_nu_euclid_vis"]))).min() > 0.05
     facts = made.manifest["facts"]
     assert facts["files"]["fluxes.stars.irtf.0"] == hashlib.sha256((tmp_path / "star.txt").read_bytes()).hexdigest()
-    np.testing.assert_array_equal(inputs.stars_of(filled, facts).flux, own.stars.flux)
+    np.testing.assert_array_equal(inputs.stellar_library_from_facts(filled, facts).flux, own.stars.flux)
 
 
 def test_what_is_there_is_not_prepared_again(filled, monkeypatch):
@@ -193,11 +193,11 @@ def test_what_is_there_is_not_prepared_again(filled, monkeypatch):
 
 def test_bands_may_be_named_on_the_command_line(filled, tmp_path, monkeypatch, capsys):
     asked = []
-    monkeypatch.setattr(shell, "_run", lambda job, step, *_: asked.append(step.plan.table))
+    monkeypatch.setattr(submitted_job, "_run_step", lambda job, step, *_: asked.append(step.plan.table))
     line = ["--lake", str(filled), "--request", str(requests.written(tmp_path)), "--bands"]
-    assert shell.main(compute_fluxes.JOB, [*line, "lsst_r", "euclid_h"]) == 0
+    assert submitted_job.main(compute_fluxes.JOB, [*line, "lsst_r", "euclid_h"]) == 0
     assert asked[-1].names[-3:] == ["f_nu_lsst_r", "f_nu_euclid_h", "integrated"]
-    assert shell.main(compute_fluxes.JOB, [*line, "lsst_q"]) == 2
+    assert submitted_job.main(compute_fluxes.JOB, [*line, "lsst_q"]) == 2
     assert "fluxes.bands: 'lsst_q' is not one of" in capsys.readouterr().err
 
 

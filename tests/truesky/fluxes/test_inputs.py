@@ -7,7 +7,7 @@ import pyarrow.compute as pc
 import pytest
 
 from lake_schema.errors import BadInput
-from lake_schema.store.validate import check
+from lake_schema.store.validate import check_rows
 from lake_schema.tables.galaxies import EMISSION_LINES
 from lake_schema.tables.passbands import PASSBANDS
 from lake_schema.tables.templates import EXTINCTION_LAWS, TEMPLATES
@@ -39,7 +39,7 @@ def own(tmp_path, **changes):
 
 def test_embedded_templates_say_where_they_are_from(embedded):
     rows = inputs.template_rows(embedded)
-    check(rows, TEMPLATES)
+    check_rows(rows, TEMPLATES)
     assert rows.num_rows == 31 + 9 + 15 + 768
     vega = next(row for row in rows.select(["name", "source", "sha256"]).to_pylist() if row["name"] == "Vega")
     assert vega["source"].startswith("vega.txt")
@@ -53,15 +53,15 @@ def test_embedded_templates_say_where_they_are_from(embedded):
 
 def test_embedded_passbands_and_laws_say_where_they_are_from(embedded):
     rows = inputs.passband_rows(embedded)
-    check(rows, PASSBANDS)
+    check_rows(rows, PASSBANDS)
     assert rows["name"].to_pylist() == list(passbands.names())
     by_name = {row["name"]: row for row in rows.to_pylist()}
     assert by_name["euclid_vis"]["source"].startswith("Euclid-VIS.ecsv")
     assert by_name["jedis_g"]["source"].startswith("passbands.csv: logistic:")
     assert len({row["sha256"] for row in by_name.values()}) > 30
     laws = inputs.law_rows(embedded)
-    check(laws, EXTINCTION_LAWS)
-    np.testing.assert_array_equal(np.stack(laws["k"].to_numpy()), continuum.dust_of(embedded.library))
+    check_rows(laws, EXTINCTION_LAWS)
+    np.testing.assert_array_equal(np.stack(laws["k"].to_numpy()), continuum.dust_curves(embedded.library))
 
 
 def test_vegas_level_is_that_of_the_published_spectrum_and_responses(embedded):
@@ -95,7 +95,7 @@ def test_own_files_take_their_places(tmp_path, embedded):
     }  # fmt: skip
     assert mine.sha256()["fluxes.extinction.3"] == hashlib.sha256((tmp_path / "law.dat").read_bytes()).hexdigest()
     assert mine.library.names == ("early", "late")
-    changed = (continuum.dust_of(mine.library) != continuum.dust_of(embedded.library)).any(1)
+    changed = (continuum.dust_curves(mine.library) != continuum.dust_curves(embedded.library)).any(1)
     assert changed.tolist() == [False, False, False, True, False]
     assert inputs.template_rows(mine)["source"][1].as_py() == "late.sed, read as cosmos"
     assert inputs.law_rows(mine)["source"].to_pylist()[3] == "law.dat, read as extinction"
@@ -107,7 +107,7 @@ def test_own_files_take_their_places(tmp_path, embedded):
 def test_a_law_alone_stands_before_the_embedded_galaxies(tmp_path, embedded):
     mine = inputs.read(own(tmp_path, templates=None, passbands=()))
     np.testing.assert_array_equal(mine.library.flux, embedded.library.flux)
-    k = continuum.dust_of(mine.library)[3]
+    k = continuum.dust_curves(mine.library)[3]
     assert k[mine.library.wavelength == 5500.0] == pytest.approx(4.05, rel=1e-4)
     # Beyond the file its ends go on.
     assert k[0] == k[mine.library.wavelength == 899.0]
@@ -149,13 +149,13 @@ def test_a_votable_without_its_own_unit_is_in_angstrom(tmp_path):
 def test_lines_are_published_with_wavelength_ratio_and_width(embedded, galaxies, library):
     """A reader with the lake alone has every line: the light that spectra have of it, and where, and how wide."""
     published = inputs.line_rows(embedded)
-    check(published, EMISSION_LINES)
+    check_rows(published, EMISSION_LINES)
     rows = published.to_pylist()
     assert len(rows) == 20
     assert {row["flux_column"] for row in rows} == set(lines.columns())
     assert all(len(row["sha256"]) == 64 and row["source"] for row in rows)
     table = galaxies(1, seed=3, abs_mag_r01=-20.5, z_obs=0.8)
-    (seen,) = sources.galaxies_of(table, library).lines
+    (seen,) = sources.galaxies_from_table(table, library).lines
     assert seen == pytest.approx(
         [row["ratio"] * table[row["flux_column"]][0].as_py() for row in rows], rel=1e-6, abs=0.0
     )

@@ -18,7 +18,7 @@ from aiohttp import web
 from lake_schema import ids, sky
 from lake_schema.fits import images
 from lake_schema.store import layout, parquet, publish
-from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.tables.exposures import EXPOSURES
 from lake_schema.tables.fluxes import fluxes
 from lake_schema.tables.galaxies import GALAXIES
@@ -28,8 +28,8 @@ from lake_schema.tables.stars import STARS
 from lake_schema.tables.tasks import TASKS
 from tests.truesky.page.browsing import at, tab_of
 from tests.universe import plain_plan, plain_work, rows_of
-from truesky.page.gate import Gate
-from truesky.page.opened import Lake
+from truesky.page.access_control import AccessRules
+from truesky.page.lake_session import LakeSession
 from truesky.page.server import Server
 from truesky.render.camera import astrometry
 
@@ -115,7 +115,7 @@ def images_work(x, y, identifiers):
 
 def published(root):
     """Galaxies with fluxes, stars, a plain table, products and their truth."""
-    part = Part(layout.cell_file(5, 1607), {})
+    part = Task(layout.cell_file(5, 1607), {})
     galaxies = rows_of(GALAXIES, GALAXIES_N, seed=3)
     shared = {name: galaxies[name] for name in ("id", "ra", "dec", "_healpix_29")}
     declared = fluxes("galaxy", ["euclid_vis"])
@@ -123,11 +123,11 @@ def published(root):
     stars, x, y, identifiers = star_rows()
     rows, files, truth = images_work(x, y, identifiers)
     for table, found in ((GALAXIES, galaxies), (declared, flux), (STARS, stars)):
-        publish.make(root, Plan(table, {}, (part,)), lambda lake, facts, found=found: Output(found))
-    one = Part("000001-1-1.parquet", {"exposure_id": 1, "detector": "1-1"})
-    publish.make(root, Plan(PRODUCTS, {}, (one,)), lambda lake, facts: Output(rows, files))
-    publish.make(root, Plan(RENDERED_TRUTH, {}, (one,)), lambda lake, facts: Output(truth))
-    publish.make(root, plain_plan(), plain_work)
+        publish.make_version(root, Plan(table, {}, (part,)), lambda lake, facts, found=found: Output(found))
+    one = Task("000001-1-1.parquet", {"exposure_id": 1, "detector": "1-1"})
+    publish.make_version(root, Plan(PRODUCTS, {}, (one,)), lambda lake, facts: Output(rows, files))
+    publish.make_version(root, Plan(RENDERED_TRUTH, {}, (one,)), lambda lake, facts: Output(truth))
+    publish.make_version(root, plain_plan(), plain_work)
 
 
 def square(ra, dec, half):
@@ -154,15 +154,15 @@ def planned(root):
         "s_region": [square(*place, 0.009) for place in places],
     }  # fmt: skip
     for table, found in ((EXPOSURES, exposures), (TASKS, TASKS.build(own))):
-        part = Part("all.parquet", {})
-        publish.make(root, Plan(table, {}, (part,)), lambda lake, facts, found=found: Output(found))
+        part = Task("all.parquet", {})
+        publish.make_version(root, Plan(table, {}, (part,)), lambda lake, facts, found=found: Output(found))
 
 
 @dataclass
 class Page:
     """A server that runs beside the tests."""
 
-    gate: Gate
+    gate: AccessRules
     server: Server
     loop: asyncio.AbstractEventLoop
 
@@ -206,8 +206,8 @@ class Page:
 def serving(root):
     """A page over a lake, until the end of the block."""
     listening = socket.create_server(("127.0.0.1", 0))
-    gate = Gate(("127.0.0.1", "localhost"), listening.getsockname()[1], TOKEN)
-    server = Server(lambda: Lake(root, memory=1e9, timeout=30.0), gate)
+    gate = AccessRules(("127.0.0.1", "localhost"), listening.getsockname()[1], TOKEN)
+    server = Server(lambda: LakeSession(root, memory=1e9, timeout=30.0), gate)
     loop, ready = asyncio.new_event_loop(), threading.Event()
 
     async def start():

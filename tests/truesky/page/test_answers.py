@@ -9,7 +9,7 @@ import pytest
 
 from lake_schema import sky
 from lake_schema.store import layout, publish, read
-from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.tables.halos import HALOS
 from tests.truesky.page.conftest import CENTRE, GALAXIES_N, NX, NY, asked, serving, system, unpacked
 from tests.universe import rows_of
@@ -145,7 +145,7 @@ def test_what_is_told_of_columns_is_looked_for_once(page, monkeypatch):
         raise AssertionError
 
     monkeypatch.setattr("truesky.explore.counting.span", refuse)
-    monkeypatch.setattr("truesky.explore.counting.held", refuse)
+    monkeypatch.setattr("truesky.explore.counting.inspect_columns", refuse)
     assert asked(page, **question)[0] == first
 
 
@@ -167,10 +167,10 @@ def test_points_are_rows_that_count(page, shown):
 
 
 def test_many_rows_are_sampled_first(page, monkeypatch):
-    monkeypatch.setattr(charts, "ROWS_A_CORE", 10)
+    monkeypatch.setattr(charts, "ROWS_PER_CORE", 10)
     question = {"source": "galaxies", "axes": ["z_obs"], "charts": [{"axes": [0], "bins": [5]}]}
     head, _ = asked(page, **question)
-    assert head["part"] == charts.PART
+    assert head["part"] == charts.SUBSAMPLING
     assert 0 < head["rows"] < GALAXIES_N / 16
     head, _ = asked(page, **question, part=1)
     assert (head["part"], head["rows"]) == (1, GALAXIES_N)
@@ -196,10 +196,10 @@ def test_sources_of_a_field(page, shown, monkeypatch):
     inside = sky.separation(rows["ra"].to_numpy(), rows["dec"].to_numpy(), ra, dec) <= radius
     assert 1 < inside.sum() < len(rows)
     assert set(found["id"]) == {str(i) for i in rows.filter(pa.array(inside))["id"].to_pylist()}
-    assert (found["total"], found["most"]) == (inside.sum(), sky_maps.MOST_SOURCES)
+    assert (found["total"], found["most"]) == (inside.sum(), sky_maps.MAX_SOURCES)
     nothing = page.json(f"sky/stars/sources?ra={ra}&dec={-dec}&radius={radius}")
     assert (nothing["id"], nothing["total"]) == ([], 0)
-    monkeypatch.setattr(sky_maps, "MOST_SOURCES", 2)
+    monkeypatch.setattr(sky_maps, "MAX_SOURCES", 2)
     found = page.json(f"sky/stars/sources?ra={ra}&dec={dec}&radius={radius}")
     assert (len(found["id"]), found["total"], found["most"]) == (2, inside.sum(), 2)
 
@@ -207,10 +207,10 @@ def test_sources_of_a_field(page, shown, monkeypatch):
 def test_of_halos_the_most_massive_come_first(tmp_path, monkeypatch):
     root, rows = tmp_path / "lake", rows_of(HALOS, 300, seed=2)
     root.mkdir()
-    part = Part(layout.cell_file(5, 1607), {})
-    publish.make(root, Plan(HALOS, {}, (part,)), lambda lake, facts: Output(rows))
+    part = Task(layout.cell_file(5, 1607), {})
+    publish.make_version(root, Plan(HALOS, {}, (part,)), lambda lake, facts: Output(rows))
     ra, dec = CENTRE
-    monkeypatch.setattr(sky_maps, "MOST_SOURCES", 20)
+    monkeypatch.setattr(sky_maps, "MAX_SOURCES", 20)
     with serving(root) as page:
         found = page.json(f"sky/halos/sources?ra={ra}&dec={dec}&radius=5")
     assert (found["by"], found["sense"], found["total"]) == ("log_mass", -1, 300)
@@ -275,7 +275,7 @@ def test_what_is_kept_is_compared_with_its_checksums_once(page, monkeypatch):
     question = {"source": "galaxies", "axes": ["z_obs * 1.5"], "charts": [charts_]}
     first = asked(page, **question)[1][0].tolist(), page.of_lake("tile/0/0/0/0")[2]
     compared = []
-    monkeypatch.setattr("truesky.numerics.cache.is_whole", lambda *given: compared.append(given) or True)
+    monkeypatch.setattr("truesky.numerics.cache.is_intact", lambda *given: compared.append(given) or True)
     for _ in range(3):
         assert asked(page, **question)[1][0].tolist() == first[0]
         assert page.of_lake("tile/0/0/0/0")[2] == first[1]

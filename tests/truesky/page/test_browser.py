@@ -62,7 +62,7 @@ def test_a_lake_that_is_published_anew_is_announced(browser, shown, tmp_path):
     with serving(root) as page, tab_of(browser, page, at("sql")) as tab:
         assert tab.locator("#changed").is_hidden()
         old = page.server.lake.key
-        publish.make(root, plain_plan(2), plain_work)
+        publish.make_version(root, plain_plan(2), plain_work)
         # The page looks by itself every half a minute, and whenever it is loaded.
         tab.reload()
         until(tab, "!document.getElementById('changed').hidden")
@@ -77,7 +77,7 @@ def test_a_tab_is_told_of_what_another_has_opened(browser, shown, tmp_path):
     root = shutil.copytree(shown, tmp_path / "lake", symlinks=True)
     with serving(root) as page, tab_of(browser, page, at("sql")) as tab, tab_of(browser, page, at("sql")) as other:
         old = page.server.lake.key
-        publish.make(root, plain_plan(2), plain_work)
+        publish.make_version(root, plain_plan(2), plain_work)
         tab.reload()
         until(tab, "!document.getElementById('changed').hidden")
         tab.click("#reopen")

@@ -182,7 +182,7 @@ def test_the_first_sources_are_the_largest(tab):
 
 
 def test_of_very_many_exposures_those_in_view_are_shown(browser, sky, monkeypatch):
-    monkeypatch.setattr(sky_maps, "MOST_EXPOSURES", 1)
+    monkeypatch.setattr(sky_maps, "MAX_EXPOSURES", 1)
     with tab_of(browser, sky, refused="/exposures") as tab:
         until(tab, f"{STATES}.includes('observed')")
         tab.select_option("#sky-footprints", "exposures")

@@ -112,7 +112,7 @@ def opened(tab):
 
 def test_of_very_many_true_sources_the_marked_ones_are_counted(tab, page, monkeypatch):
     total = page.json("truth/0")["total"]
-    monkeypatch.setattr(pictures.truth, "__defaults__", (40,))
+    monkeypatch.setattr(pictures.bright_sources, "__defaults__", (40,))
     opened(tab)
     tab.check("#image-truth")
     until(tab, f"document.getElementById('image-legend').textContent.includes('the brightest 40 of {total}')")

@@ -59,7 +59,7 @@ def test_a_held_brush_asks_nothing(tab):
 
 
 def test_of_many_rows_every_brush_counts_a_sample_first(browser, page, monkeypatch):
-    monkeypatch.setattr(charts, "ROWS_A_CORE", 10)
+    monkeypatch.setattr(charts, "ROWS_PER_CORE", 10)
     with tab_of(browser, page, at(VIEW)) as tab:
         asked = []
         tab.on("request", lambda one: asked.append(one.post_data_json["part"]) if "charts" in one.url else None)

@@ -104,7 +104,7 @@ def test_what_is_left_out_is_said(browser, sky, monkeypatch):
         gone_to(tab)
         caption = "document.querySelector('#sky-legend > div:last-child').textContent"
         whole = plain(until(tab, f"{caption}.includes('one by one') && {caption}")).split()[0]
-        monkeypatch.setattr(sky_maps, "MOST_SOURCES", 100)
+        monkeypatch.setattr(sky_maps, "MAX_SOURCES", 100)
         tab.fill("#sky-where", "dec > -90")
         tab.press("#sky-where", "Enter")
         until(tab, f"{LEGEND}.includes('the brightest 100')")

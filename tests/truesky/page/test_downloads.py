@@ -91,7 +91,7 @@ def test_an_error_in_the_midst_is_no_whole_file(page):
     ],
 )
 def test_a_file_that_is_made_on_disc_has_a_bound_of_bytes(page, sql, monkeypatch):
-    monkeypatch.setattr(results, "MOST_FITS_BYTES", 1 << 25)
+    monkeypatch.setattr(results, "MAX_FITS_BYTES", 1 << 25)
     status, _, body = page.of_lake(f"export?format=fits&sql={quote(sql)}")
     assert status == 400
     assert "GB: ask for less" in json.loads(body)["error"]

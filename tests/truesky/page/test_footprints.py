@@ -5,7 +5,7 @@ import pytest
 
 from lake_schema import sky
 from lake_schema.store import publish
-from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.tables.exposures import EXPOSURES
 from lake_schema.tables.products import PRODUCTS
 from lake_schema.tables.tasks import TASKS
@@ -41,9 +41,11 @@ def planned(tmp_path_factory):
     root = tmp_path_factory.mktemp("planned") / "lake"
     root.mkdir()
     for table, rows in ((TASKS, TASKS.build(columns)), (EXPOSURES, EXPOSURES.build(exposures))):
-        publish.make(root, Plan(table, {}, (Part("0.parquet", {}),)), lambda lake, facts, rows=rows: Output(rows))
+        publish.make_version(
+            root, Plan(table, {}, (Task("0.parquet", {}),)), lambda lake, facts, rows=rows: Output(rows)
+        )
     files = {path: lambda to: to.write_bytes(b"x") for path in done["path"].to_pylist()}
-    publish.make(root, Plan(PRODUCTS, {}, (Part("0.parquet", {}),)), lambda lake, facts: Output(done, files))
+    publish.make_version(root, Plan(PRODUCTS, {}, (Task("0.parquet", {}),)), lambda lake, facts: Output(done, files))
     with serving(root) as page:
         yield page
 
@@ -92,7 +94,7 @@ def test_exposures_of_a_part(planned):
 
 
 def test_too_many_exposures_are_refused(planned, monkeypatch):
-    monkeypatch.setattr(sky_maps, "MOST_EXPOSURES", 2)
+    monkeypatch.setattr(sky_maps, "MAX_EXPOSURES", 2)
     status, _, body = planned.of_lake("exposures")
     assert (status, b"look at a part" in body) == (400, True)
     assert len(planned.json("exposures?ra=10.5&dec=0.5&radius=0.1")) == 2
@@ -131,7 +133,7 @@ def test_coverage(planned):
 )
 def test_hulls(corners, wanted):
     """Also of places on one line; the parallel at -80 deg is bent, so that what lies on it to the south is a corner."""
-    hull = sky_maps._hull(np.array(corners, float))
+    hull = sky_maps._convex_hull(np.array(corners, float))
     assert {tuple(corner) for corner in hull} >= set(wanted)
     assert (10.5, 0.5) not in {tuple(corner) for corner in hull}
     x, y = -((hull[:, 0] + 180) % 360 - 180), hull[:, 1]

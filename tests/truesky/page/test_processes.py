@@ -17,18 +17,18 @@ from urllib.parse import quote
 import pytest
 
 from lake_schema.store import layout, publish
-from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.tables.stars import STARS
 from tests.truesky.page.conftest import GALAXIES_N, asked, serving, star_rows
 from tests.universe import plain_plan, plain_work
 from truesky.explore.process import Process
-from truesky.page.opened import Closed, Lane
+from truesky.page.lake_session import Closed, ProcessPool
 from truesky.page.tap.queries import Jobs
 
 
 def killed(lane):
     """Kill the processes of a lane, as the system does where memory is short."""
-    found = [process._worker.process for process in lane._all if process._worker is not None]
+    found = [process._worker.process for process in lane._processes if process._worker is not None]
     for worker in found:
         os.kill(worker.pid, signal.SIGKILL)
         worker.wait(30.0)
@@ -44,9 +44,9 @@ def until(condition, seconds=30.0):
 
 def test_a_killed_process_is_replaced(page):
     lake, question = page.server.lake, {"method": "POST", "body": b'{"sql": "SELECT 7 AS a"}'}
-    until(page.server._warming.done)
+    until(page.server._warm_up_task.done)
     chart = {"source": "galaxies", "axes": ["dec + 1"], "charts": [{"axes": [0], "bins": [5]}]}
-    assert killed(lake.questions)
+    assert killed(lake.user_queries)
     assert killed(lake.own)
     for _ in range(3):
         assert page.json("sql", **question)["rows"] == [[7]]
@@ -83,13 +83,13 @@ def test_a_process_is_stopped_while_it_ends():
 
 def test_who_asked_a_killed_process_is_told(page):
     """In the midst of a question: one line, and the next question is answered."""
-    until(page.server._warming.done)
+    until(page.server._warm_up_task.done)
     body = json.dumps({"sql": "SELECT count(*) FROM range(100000000000) a, range(100) b"}).encode()
     told = []
     asking = threading.Thread(target=lambda: told.append(page.of_lake("sql", method="POST", body=body)))
     asking.start()
     time.sleep(1.0)
-    assert killed(page.server.lake.questions)
+    assert killed(page.server.lake.user_queries)
     asking.join(30.0)
     ((status, _, answer),) = told
     assert status == 400
@@ -99,8 +99,8 @@ def test_who_asked_a_killed_process_is_told(page):
 
 def test_who_goes_away_stops_the_query(page):
     body = json.dumps({"sql": "SELECT count(*) FROM range(100000000000) a, range(100) b"}).encode()
-    lane = page.server.lake.questions
-    until(lambda: page.server._warming.done() and lane._free.qsize() == 2)
+    lane = page.server.lake.user_queries
+    until(lambda: page.server._warm_up_task.done() and lane._free.qsize() == 2)
     with socket.create_connection(("127.0.0.1", page.gate.port)) as connection:
         head = f"POST /api/{page.server.lake.key}/sql HTTP/1.1\r\nHost: 127.0.0.1:{page.gate.port}\r\n"
         connection.sendall(f"{head}Cookie: {page.cookie}\r\nContent-Length: {len(body)}\r\n\r\n".encode() + body)
@@ -115,7 +115,7 @@ def test_a_lake_that_is_published_anew_is_announced(shown, tmp_path):
     with serving(root) as page:
         old = page.server.lake.key
         assert json.loads(page.ask("/api/lake")[2])["is_changed"] is False
-        publish.make(root, plain_plan(2), plain_work)
+        publish.make_version(root, plain_plan(2), plain_work)
         told = json.loads(page.ask("/api/lake")[2])
         assert (told["is_changed"], told["key"]) == (True, old)
         sums = b'{"sql": "SELECT sum(value) AS s FROM plain"}'
@@ -131,11 +131,11 @@ def test_a_lake_that_is_published_anew_is_announced(shown, tmp_path):
 def test_a_table_that_is_new_is_announced(tmp_path):
     root = tmp_path / "lake"
     root.mkdir()
-    publish.make(root, plain_plan(), plain_work)
+    publish.make_version(root, plain_plan(), plain_work)
     with serving(root) as page:
         assert json.loads(page.ask("/api/lake")[2])["is_changed"] is False
-        part = Part(layout.cell_file(5, 1607), {})
-        publish.make(root, Plan(STARS, {}, (part,)), lambda lake, facts: Output(star_rows()[0]))
+        part = Task(layout.cell_file(5, 1607), {})
+        publish.make_version(root, Plan(STARS, {}, (part,)), lambda lake, facts: Output(star_rows()[0]))
         assert json.loads(page.ask("/api/lake")[2])["is_changed"] is True
 
 
@@ -143,17 +143,17 @@ def test_a_lake_is_opened_anew_beside_what_is_being_answered(tmp_path):
     """A download ends with all of its rows, though two ask at once to open the lake anew; nothing is left open."""
     root = tmp_path / "lake"
     root.mkdir()
-    publish.make(root, plain_plan(), plain_work)
+    publish.make_version(root, plain_plan(), plain_work)
     with serving(root) as page:
         server, opened = page.server, []
-        before, open_ = server.lake, server._open
-        server._open = lambda: opened.append(open_()) or opened[-1]
+        before, open_ = server.lake, server._open_lake
+        server._open_lake = lambda: opened.append(open_()) or opened[-1]
         connection = http.client.HTTPConnection("127.0.0.1", page.gate.port, timeout=60)
         address = f"/api/{before.key}/export?format=csv&sql=" + quote("SELECT range AS a FROM range(3000000)")
         connection.request("GET", address, headers={"Cookie": page.cookie})
         answer = connection.getresponse()
         first = answer.read(1000)
-        publish.make(root, plain_plan(2), plain_work)
+        publish.make_version(root, plain_plan(2), plain_work)
         both = [threading.Thread(target=page.ask, args=("/api/reopen", "POST", b"")) for _ in range(2)]
         for one in both:
             one.start()
@@ -164,14 +164,14 @@ def test_a_lake_is_opened_anew_beside_what_is_being_answered(tmp_path):
         assert (first + answer.read()).count(b"\n") == 3_000_001
         connection.close()
         ended = time.monotonic() + 30.0
-        while any(one._worker is not None and one._worker.is_alive for one in before.questions._all):
+        while any(one._worker is not None and one._worker.is_alive for one in before.user_queries._processes):
             assert time.monotonic() < ended
             time.sleep(0.05)
 
 
 def test_a_lane_that_is_closed_gives_no_process():
     async def run():
-        lane = Lane(lambda: Process(Path(), []), 1)
+        lane = ProcessPool(lambda: Process(Path(), []), 1)
         async with lane.process():
             waiting = asyncio.create_task(anext(aiter_of(lane)))
             await asyncio.sleep(0)
@@ -192,7 +192,7 @@ def test_a_lake_of_two_requests(tmp_path):
     root = tmp_path / "lake"
     root.mkdir()
     for name, seed in (("a", 1), ("my-b", 2)):
-        publish.make(root, plain_plan(seed), plain_work, name=name)
+        publish.make_version(root, plain_plan(seed), plain_work, name=name)
     with serving(root) as page:
         told = json.loads(page.ask("/api/lake")[2])
         assert [table["name"] for table in told["tables"]] == ["a.plain", "my-b.plain"]

@@ -14,16 +14,16 @@ import pytest
 
 from truesky.explore.process import Process
 from truesky.page import downloads, pictures, sky_maps
-from truesky.page.opened import MOST_IN_LINE, MOST_WAITING, PIXEL_THREADS, Busy, Closed, Lane, Pool
+from truesky.page.lake_session import MAX_QUEUED, MAX_WAITING, PIXEL_THREADS, Busy, Closed, ProcessPool, ThreadPool
 from truesky.page.tap import queries
-from truesky.page.tap.queries import AT_ONCE, Jobs
+from truesky.page.tap.queries import PARALLEL_JOBS, Jobs
 
 
 def test_a_pool_refuses_beyond_its_bound_and_takes_others_when_done():
     go = threading.Event()
 
     async def run():
-        pool = Pool(2, 3)
+        pool = ThreadPool(2, 3)
         asked = [asyncio.create_task(pool.run(go.wait)) for _ in range(5)]
         await asyncio.sleep(0)
         with pytest.raises(Busy, match="3 questions are waiting"):
@@ -51,7 +51,7 @@ def test_a_thread_whose_user_has_gone_is_in_use_until_it_is_done():
     go = threading.Event()
 
     async def run():
-        pool = Pool(1, 0)
+        pool = ThreadPool(1, 0)
         asked = asyncio.create_task(pool.run(go.wait))
         await asyncio.sleep(0.05)
         asked.cancel()
@@ -60,7 +60,7 @@ def test_a_thread_whose_user_has_gone_is_in_use_until_it_is_done():
             await pool.run(divmod, 1, 1)
         go.set()
         ended = time.monotonic() + 10.0
-        while pool._places._value == 0:
+        while pool._slots._value == 0:
             assert time.monotonic() < ended
             await asyncio.sleep(0.01)
         assert await pool.run(divmod, 1, 1) == (1, 0)
@@ -74,7 +74,7 @@ def test_tiles_are_refused_beyond_the_queue_and_hold_up_nothing_else(page, monke
     real = pictures.picture
     monkeypatch.setattr(pictures, "picture", lambda *given: started.append(1) or (go.wait(30.0) and real(*given)))
     told = []
-    number = PIXEL_THREADS + MOST_IN_LINE
+    number = PIXEL_THREADS + MAX_QUEUED
     asking = [
         threading.Thread(target=lambda: told.append(page.of_lake("tile/0/0/0/0")[0]), daemon=True)
         for _ in range(number)
@@ -131,19 +131,19 @@ def test_jobs_beyond_those_that_run_are_queued():
 
     async def run():
         jobs = Jobs(run_one)
-        many = [jobs.add({"number": k}, 1.0) for k in range(AT_ONCE + MOST_WAITING + 5)]
+        many = [jobs.add({"number": k}, 1.0) for k in range(PARALLEL_JOBS + MAX_WAITING + 5)]
         for job in many:
             jobs.start(job)
         await asyncio.sleep(0.05)
-        assert [job.phase for job in many] == ["EXECUTING"] * AT_ONCE + ["QUEUED"] * (len(many) - AT_ONCE)
-        assert all(job.started is None for job in many[AT_ONCE:])
-        jobs.abort(many[AT_ONCE])
+        assert [job.phase for job in many] == ["EXECUTING"] * PARALLEL_JOBS + ["QUEUED"] * (len(many) - PARALLEL_JOBS)
+        assert all(job.start_time is None for job in many[PARALLEL_JOBS:])
+        jobs.abort(many[PARALLEL_JOBS])
         go.set()
         await asyncio.gather(*(job.task for job in many), return_exceptions=True)
         phases = [job.phase for job in many]
-        assert phases.pop(AT_ONCE) == "ABORTED"
+        assert phases.pop(PARALLEL_JOBS) == "ABORTED"
         assert set(phases) == {"COMPLETED"}
-        assert AT_ONCE not in running
+        assert PARALLEL_JOBS not in running
         assert jobs.file(many[7]).read_bytes() == b"x" * 7
         await jobs.close()
 
@@ -152,16 +152,16 @@ def test_jobs_beyond_those_that_run_are_queued():
 
 def test_the_patient_are_not_refused():
     async def run():
-        lane = Lane(lambda: Process(Path(), []), 1)
+        lane = ProcessPool(lambda: Process(Path(), []), 1)
 
         async def one(is_patient):
             async with lane.process(is_patient):
                 return True
 
         async with lane.process():
-            patient = [asyncio.create_task(one(True)) for _ in range(MOST_WAITING + 4)]
+            patient = [asyncio.create_task(one(True)) for _ in range(MAX_WAITING + 4)]
             await asyncio.sleep(0)
-            others = [asyncio.create_task(one(False)) for _ in range(MOST_WAITING + 1)]
+            others = [asyncio.create_task(one(False)) for _ in range(MAX_WAITING + 1)]
             await asyncio.sleep(0)
         found = await asyncio.gather(*patient, *others, return_exceptions=True)
         assert [type(one) for one in found] == [bool] * (len(found) - 1) + [Busy]
@@ -171,8 +171,8 @@ def test_the_patient_are_not_refused():
 
 @pytest.mark.parametrize(("bounds", "words"), [((50, 1000), "the result has more"), ((1000, 150), "results of jobs")])
 def test_results_have_a_bound(monkeypatch, bounds, words):
-    monkeypatch.setattr(queries, "MOST_BYTES", bounds[0])
-    monkeypatch.setattr(queries, "MOST_BYTES_IN_ALL", bounds[1])
+    monkeypatch.setattr(queries, "MAX_RESULT_BYTES", bounds[0])
+    monkeypatch.setattr(queries, "MAX_TOTAL_BYTES", bounds[1])
 
     @asynccontextmanager
     async def run_one(parameters, seconds):
@@ -219,10 +219,10 @@ def test_of_a_job_that_is_aborted_nothing_stays():
         job = jobs.add({}, 1.0)
         jobs.start(job)
         await waiting.wait()
-        assert (job.size, jobs.file(job).exists()) == (1000, True)
+        assert (job.result_bytes, jobs.file(job).exists()) == (1000, True)
         jobs.abort(job)
         await asyncio.gather(job.task, return_exceptions=True)
-        assert (job.phase, job.size, jobs.file(job).exists()) == ("ABORTED", 0, False)
+        assert (job.phase, job.result_bytes, jobs.file(job).exists()) == ("ABORTED", 0, False)
         await jobs.close()
 
     asyncio.run(run())
@@ -254,7 +254,7 @@ def test_others_are_answered_while_a_result_is_written(monkeypatch):
         assert job.phase == "EXECUTING"
         go.set()
         await job.task
-        assert (job.phase, job.size) == ("COMPLETED", 1)
+        assert (job.phase, job.result_bytes) == ("COMPLETED", 1)
         await jobs.close()
 
     asyncio.run(run())
@@ -262,10 +262,10 @@ def test_others_are_answered_while_a_result_is_written(monkeypatch):
 
 def test_who_takes_nothing_loses_the_process(page, monkeypatch):
     """A reader that stands still is let go, and others are answered by as many processes as before."""
-    monkeypatch.setattr(downloads, "STALLED", 0.5)
-    lane = page.server.lake.questions
+    monkeypatch.setattr(downloads, "STALL_TIMEOUT", 0.5)
+    lane = page.server.lake.user_queries
     ended = time.monotonic() + 30.0
-    while not (page.server._warming.done() and lane._free.qsize() == 2):
+    while not (page.server._warm_up_task.done() and lane._free.qsize() == 2):
         assert time.monotonic() < ended
         time.sleep(0.02)
     sql = quote("SELECT range AS a FROM range(100000000)")

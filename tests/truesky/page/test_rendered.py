@@ -9,7 +9,7 @@ from tests.truesky.page.conftest import serving, unpacked
 from truesky.catalogue import build_galaxies, build_stars
 from truesky.fluxes import compute_fluxes
 from truesky.page import pictures
-from truesky.page.opened import Lake
+from truesky.page.lake_session import LakeSession
 from truesky.render import plan_exposures, render_exposures
 from truesky.request.from_toml import parse
 
@@ -49,10 +49,10 @@ def rendered(tmp_path_factory):
     pointings = POINTING.format("VIS", "vis", "euclid_vis", "3-4", "3-4")
     pointings += POINTING.format("NISP-S", "nisp", "nisp_red", "DET22", "DET22")
     request = parse(requests.written(folder, TEXT + pointings, requests.FIELD.format(0.25), seed=5))
-    root = layout.lake(folder / "lake")
+    root = layout.resolve_lake(folder / "lake")
     for module in (build_galaxies, build_stars, compute_fluxes, plan_exposures, render_exposures):
         for step in module.steps(root, request):
-            publish.make(root, step.plan, step.work)
+            publish.make_version(root, step.plan, step.work)
     return root
 
 
@@ -73,13 +73,13 @@ def peak(image, x, y):
 @pytest.mark.nightly
 def test_the_brightest_stars_are_where_the_truth_says(rendered):
     """In the noise-free image: saturation, trails of charge and noise move the peaks of a raw one."""
-    lake = Lake(rendered, memory=1e9)
+    lake = LakeSession(rendered, memory=1e9)
     try:
         (number,) = (
             n for n, one in enumerate(pictures.pictures(lake))
             if (one.row["content"], one.row["channel"]) == ("noise_free", "VIS")
         )  # fmt: skip
-        image, truth = pictures.picture(lake, number).levels()[0], pictures.truth(lake, number)
+        image, truth = pictures.picture(lake, number).levels()[0], pictures.bright_sources(lake, number)
     finally:
         lake.close()
     place = np.array([truth["x"], truth["y"]]).T

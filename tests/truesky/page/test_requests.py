@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from lake_schema.store import layout, publish
-from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.tables.exposures import EXPOSURES
 from lake_schema.tables.passbands import PASSBANDS
 from lake_schema.tables.tasks import TASKS
 from tests.truesky.page import test_traces
 from tests.truesky.page.conftest import CENTRE, serving, unpacked
 from tests.universe import plain_plan, plain_work, rows_of
-from truesky.page.opened import Lake
+from truesky.page.lake_session import LakeSession
 from truesky.page.tap import images
 
 # Of each request: its band, where its second exposure looks, the date of its first, the first pixel of its trace, and
@@ -49,9 +49,9 @@ def planned(root, name):
         "wavelength_step": [(ends[1] - ends[0]) / 10.0], "response": [[1.0] * 11],
     }  # fmt: skip
     for table, columns in ((EXPOSURES, exposures), (TASKS, tasks), (PASSBANDS, curve)):
-        plan = Plan(table, {"made_by": name}, (Part("0.parquet", {}),))
+        plan = Plan(table, {"made_by": name}, (Task("0.parquet", {}),))
         own = table.build(columns)
-        publish.make(root, plan, lambda lake, facts, own=own: Output(own), name=name)
+        publish.make_version(root, plan, lambda lake, facts, own=own: Output(own), name=name)
 
 
 @pytest.fixture(scope="module")
@@ -67,9 +67,9 @@ def two(tmp_path_factory):
             planned(root, name)
     # Shares the plan, too.
     for table in ("exposures", "tasks", "passbands"):
-        target = layout.pin(root, "b", table).readlink()
-        layout.pin(root, "c", table).symlink_to(target)
-    log = layout.runs(root) / "20260101-products-1.jsonl"
+        target = layout.request_link(root, "b", table).readlink()
+        layout.request_link(root, "c", table).symlink_to(target)
+    log = layout.runs_folder(root) / "20260101-products-1.jsonl"
     log.parent.mkdir(exist_ok=True)
     lines = [
         {"job": "render_exposures", "request": "a", "table": "products"},
@@ -95,10 +95,10 @@ def test_requests_that_share_everything_count_once(two):
 
 def test_of_one_request_nothing_says_which(two):
     page, _ = two
-    lake = Lake(page.server.lake.root, "b")
+    lake = LakeSession(page.server.lake.root, "b")
     try:
-        assert [(one.request, one.names) for one in lake.observed] == [(None, ("b",))]
-        assert lake.observed[0].rows("tasks", ["exposure_id"]) == [{"exposure_id": 7}, {"exposure_id": 8}]
+        assert [(one.request, one.names) for one in lake.observed_requests] == [(None, ("b",))]
+        assert lake.observed_requests[0].rows("tasks", ["exposure_id"]) == [{"exposure_id": 7}, {"exposure_id": 8}]
     finally:
         lake.close()
 
@@ -107,11 +107,11 @@ def test_what_was_made_before_there_were_names_is_of_every_request(tmp_path):
     root = tmp_path / "lake"
     root.mkdir()
     test_traces.published(root)
-    publish.make(root, plain_plan(), plain_work, name="new")
-    lake = Lake(root)
+    publish.make_version(root, plain_plan(), plain_work, name="new")
+    lake = LakeSession(root)
     try:
-        assert [one.names for one in lake.observed] == [("new",)]
-        assert len(lake.observed[0].rows("products")) == 1
+        assert [one.names for one in lake.observed_requests] == [("new",)]
+        assert len(lake.observed_requests[0].rows("products")) == 1
     finally:
         lake.close()
 
@@ -168,7 +168,7 @@ def test_traces_lie_on_the_images_of_their_request(two):
 
 def test_images_as_obscore_describes_them(two):
     page, _ = two
-    rows = images.obscore(page.server.lake, "http://here")
+    rows = images.obscore_rows(page.server.lake, "http://here")
     assert [(row["obs_id"], row["t_min"]) for row in rows] == [("a/7", 60000.0), ("b/7", 61000.0)]
     assert [(row["em_min"] * 1e10, row["em_max"] * 1e10) for row in rows] == [
         pytest.approx(REQUESTS[name][-1]) for name in "ab"

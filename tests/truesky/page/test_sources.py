@@ -6,7 +6,7 @@ import numpy as np
 
 from lake_schema import ids
 from lake_schema.store import layout, publish, read
-from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.tables.fluxes import fluxes
 from lake_schema.tables.galaxies import GALAXIES
 from tests.truesky.page.conftest import serving
@@ -18,7 +18,7 @@ NUMBER = 60
 
 def test_spectra_of_a_lake_of_two_requests(tmp_path, monkeypatch):
     """The spectrum is that of the request which has the source, of what its fluxes were made of."""
-    root, part, declared = tmp_path / "lake", Part(layout.cell_file(5, 1607), {}), fluxes("galaxy", ["euclid_vis"])
+    root, part, declared = tmp_path / "lake", Task(layout.cell_file(5, 1607), {}), fluxes("galaxy", ["euclid_vis"])
     root.mkdir()
     for seed, name in ((3, "a"), (4, "b")):
         rows = rows_of(GALAXIES, NUMBER, seed=seed)
@@ -27,9 +27,11 @@ def test_spectra_of_a_lake_of_two_requests(tmp_path, monkeypatch):
         flux = declared.build({**shared, "f_nu_euclid_vis": light, "integrated": [False] * NUMBER})
         for table, found in ((GALAXIES, rows), (declared, flux)):
             plan = Plan(table, {"made_by": name}, (part,))
-            publish.make(root, plan, lambda lake, facts, found=found: Output(found), name=name)
+            publish.make_version(root, plan, lambda lake, facts, found=found: Output(found), name=name)
     made_of = []
-    monkeypatch.setattr(sources.inputs, "library_of", lambda lake, facts: made_of.append(facts["made_by"]))
+    monkeypatch.setattr(
+        sources.inputs, "galaxy_library_from_facts", lambda lake, facts: made_of.append(facts["made_by"])
+    )
     grid = sources.passbands.grid()
     monkeypatch.setattr(
         sources.band_fluxes, "galaxy_spectra", lambda rows, library: np.full((1, len(grid)), rows["z_obs"][0].as_py())
@@ -47,12 +49,12 @@ def test_spectra_of_a_lake_of_two_requests(tmp_path, monkeypatch):
 
 
 def test_the_place_of_a_source_is_of_the_version_that_has_it(tmp_path):
-    root, part = tmp_path / "lake", Part(layout.cell_file(5, 1607), {})
+    root, part = tmp_path / "lake", Task(layout.cell_file(5, 1607), {})
     root.mkdir()
     rows = {name: rows_of(GALAXIES, number, seed=3) for name, number in (("a", NUMBER), ("b", NUMBER + 20))}
     for name in rows:
         plan = Plan(GALAXIES, {"made_by": name}, (part,))
-        publish.make(root, plan, lambda lake, facts, name=name: Output(rows[name]), name=name)
+        publish.make_version(root, plan, lambda lake, facts, name=name: Output(rows[name]), name=name)
     here = {name: {row["id"]: row for row in found.to_pylist()} for name, found in rows.items()}
     both, alone = next(iter(here["a"].keys() & here["b"])), next(iter(here["b"].keys() - here["a"]))
     with serving(root) as page:
@@ -63,4 +65,4 @@ def test_the_place_of_a_source_is_of_the_version_that_has_it(tmp_path):
             assert found["place"] == [row["ra"], row["dec"]]
             values = {fact["name"]: fact["value"] for fact in found["tables"]["galaxies"]}
             assert [values["ra"], values["dec"]] == found["place"]
-            assert ids.kind_of(np.array([own]))[0] == values["kind"]
+            assert ids.kind_from_id(np.array([own]))[0] == values["kind"]

@@ -70,8 +70,8 @@ def test_a_job_that_fails_says_why(service):
 def test_a_job_can_be_aborted(service, page):
     """Its process is given up: as many as before are free, though the query itself would take days."""
     assert service.search("SELECT 1 AS a")["a"].tolist() == [1]
-    lane = page.server.tap._served.lane
-    free = len(lane._all)
+    lane = page.server.tap._lake_processes.process_pool
+    free = len(lane._processes)
     job = service.submit_job("SELECT count(*) FROM galaxies a, galaxies b, galaxies c, galaxies d")
     job.run()
     ended = time.monotonic() + 30.0
@@ -89,8 +89,8 @@ def test_a_job_can_be_aborted(service, page):
 def test_a_cone_reads_cells_of_the_circle(service, shown, monkeypatch):
     """The same rows with and without the ranges of cells, whatever the circle's size."""
     rows, asked = read.version(shown, "stars").rows(["id", "ra", "dec"]), []
-    real = adql.in_sql
-    monkeypatch.setattr(adql, "in_sql", lambda *given: asked.append(real(*given)) or asked[-1])
+    real = adql.to_sql
+    monkeypatch.setattr(adql, "to_sql", lambda *given: asked.append(real(*given)) or asked[-1])
     for k, radius in enumerate((1e-5, 0.002, 0.02, 1.0, 60.0)):
         ra, dec = rows["ra"][k].as_py(), rows["dec"][k].as_py()
         inside = sky.separation(rows["ra"].to_numpy(), rows["dec"].to_numpy(), ra, dec) <= radius
@@ -136,7 +136,7 @@ def test_images_are_found_by_place(service, shown):
     assert len(service.search(cone.format(place["ra"], place["dec"] + 0.02, 0.001))) == 0
     assert len(service.search(cone.format(place["ra"], place["dec"] + 0.02, 0.015))) == 3
     dataset = row.getdataset().read()
-    path = read.version(shown, "products").file("images/000001/vis_science.fits")
+    path = read.version(shown, "products").sidecar_path("images/000001/vis_science.fits")
     assert dataset == path.read_bytes()
 
 

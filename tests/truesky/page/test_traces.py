@@ -7,7 +7,7 @@ import pytest
 
 from lake_schema.fits import images
 from lake_schema.store import layout, parquet, publish
-from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.products import PRODUCTS
 from lake_schema.tables.rendered_truth import RENDERED_SPECTRA, RENDERED_TRUTH
@@ -15,7 +15,7 @@ from tests.truesky.page.conftest import CENTRE, NX, NY, serving, system, unpacke
 from tests.universe import rows_of
 from truesky.fluxes.spectra import lines
 from truesky.render.camera import astrometry
-from truesky.render.products.beside import truth_file
+from truesky.render.products.sidecar_files import truth_file
 
 # A trace that falls and bends, from 1206 to 1892 nm; the line's wavelength.
 TRACE_X, TRACE_Y = [80.0, 500.0, 0.0], [300.0, -40.0, 12.0]
@@ -77,14 +77,14 @@ def published(root, trace_x=TRACE_X, name=None, band="nisp_red", seconds=0):
         path: lambda to: images.write_images(to, [images.Image(pixels, cards)]),
         truth_file(7, "DET22"): lambda to: parquet.write(to, truth, RENDERED_TRUTH),
     }
-    part = Part("000007-det22.parquet", {"exposure_id": 7, "detector": "DET22"})
-    cell = Part(layout.cell_file(5, 1607), {})
-    publish.make(root, Plan(GALAXIES, {}, (cell,)), lambda lake, facts: Output(rows), name=name)
+    part = Task("000007-det22.parquet", {"exposure_id": 7, "detector": "DET22"})
+    cell = Task(layout.cell_file(5, 1607), {})
+    publish.make_version(root, Plan(GALAXIES, {}, (cell,)), lambda lake, facts: Output(rows), name=name)
     for table, made in (
         (PRODUCTS, Output(products, files)), (RENDERED_TRUTH, Output(truth)), (RENDERED_SPECTRA, Output(spectra)),
     ):  # fmt: skip
         plan = Plan(table, {"seconds": seconds} if seconds else {}, (part,))
-        publish.make(root, plan, lambda lake, facts, made=made: made, name=name)
+        publish.make_version(root, plan, lambda lake, facts, made=made: made, name=name)
     return own, wavelength
 
 

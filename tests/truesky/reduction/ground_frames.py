@@ -11,12 +11,12 @@ from lake_schema.mission.configuration import resolve
 from tests.truesky.render import calibrated, fields, nominal
 from truesky.fluxes import passbands
 from truesky.reduction import files
-from truesky.reduction import frames as frames_of
+from truesky.reduction import frames as lake_frames
 from truesky.reduction.frames import Frame
 from truesky.render.camera import astrometry, detectors
 from truesky.render.camera.pointing import boresight_for
 from truesky.render.effects.readout import bias_structure
-from truesky.render.exposure.rendered import Rendered
+from truesky.render.exposure.rendered_detector import RenderedDetector
 from truesky.render.products import fits_files, head_files, read_back, truth_table
 from truesky.render.psf import to_psfex
 from truesky.request.accuracy import SURVEY
@@ -32,7 +32,7 @@ TRUTH = ("saturation", "cosmic_rays", "sky")
 class Ground:
     """A rendered part of a detector, its raw frame, and a folder with masters for it."""
 
-    one: Rendered
+    one: RenderedDetector
     frame: Frame
     masters: Path
     wcs: WCS
@@ -46,7 +46,7 @@ def made(folder, camera, side, electrons, pitch, sky=8.0, rays=1.0, forced=None,
     """
     usual = fields.MISSION.value(f"ext.{camera}.cosmic_rays.rate", "1 / s")
     mission = resolve(overrides={f"ext.{camera}.cosmic_rays.rate": (rays * usual, "1 / s"), **(overrides or {})})
-    detector = replace(detectors.detectors(camera, mission)[4], nx=side, ny=side, middle=0)
+    detector = replace(detectors.detectors(camera, mission)[4], nx=side, ny=side, injection_rows=0)
     ra, dec, angle = boresight_for(detector, 53.1, -27.8, 12.0)
     system = astrometry.wcs(detector, ra, dec, angle)
     where = astrometry.sky_of_pixel(system, *nominal.lattice(side, pitch))
@@ -69,17 +69,17 @@ def _written(folder, one):
     path, psf = folder / "raw.fits", folder / "raw.psf"
     name = rows["path"][0].as_py()
     writers[name](path)
-    writers[head_files.beside(name)](path.with_suffix(".head"))
-    to_psfex.written(one.psf, one.detector, psf)
+    writers[head_files.head_path(name)](path.with_suffix(".head"))
+    to_psfex.write(one.psf, one.detector, psf)
     cards = read_back.header(path)
     scene = replace(one.scene, band=passbands.load(one.exposure.band))
-    frame = Frame(path, one.exposure, scene, frames_of._applied(cards), cards, psf)
+    frame = Frame(path, one.exposure, scene, lake_frames._applied_effects(cards), cards, psf)
     masters = folder / "masters"
     masters.mkdir()
     # What an observer has: images without a word of ours, the flat of light that came through the telescope.
     flat = calibrated.flat(scene, SEED, frame.applied)
     for kind, values in (("flat", flat), ("bias", bias(frame))):
-        fits.writeto(files.master_name(masters, frame, kind), values.astype(np.float32))
+        fits.writeto(files.master_path(masters, frame, kind), values.astype(np.float32))
     return Ground(one, frame, masters, one.wcs)
 
 
@@ -90,11 +90,11 @@ def bias(frame):
         return np.zeros((scene.ny, scene.nx))
     camera, name = calibrated.camera_of(scene), bias_structure.EFFECT.name
     rng = calibrated.stream(SEED, camera, scene.detector.name, name)
-    width = layout.scans + layout.width
+    width = layout.scan_columns + layout.width
     columns = bias_structure.structure(len(layout.amplifiers), width, *bias_structure.EFFECT.parameters(scene), rng)
     behind = columns[:, layout.prescan + layout.width :] if layout.overscan else columns[:, : layout.prescan]
     columns = columns - behind.mean(axis=1, keepdims=True)
-    return layout.together(np.repeat(columns[:, None], layout.height + layout.rows, axis=1))
+    return layout.assemble(np.repeat(columns[:, None], layout.height + layout.rows, axis=1))
 
 
 def truth(ground):

@@ -49,17 +49,17 @@ def test_the_level_of_the_sky_does_not_see_sources():
     sky = 100.0 + 0.05 * x + 0.02 * y
     image = sky + np.random.default_rng(2).normal(0.0, 10.0, sky.shape)
     image[40:60, 70:100] += 1e5
-    found = calibration.level(image, np.ones(image.shape, bool))
+    found = calibration.sky_level(image, np.ones(image.shape, bool))
     inside = (slice(40, 220), slice(40, 260))
     assert np.abs(found - sky)[inside].max() < 2.0
-    assert calibration.level(image, np.zeros(image.shape, bool)).max() == 0.0
+    assert calibration.sky_level(image, np.zeros(image.shape, bool)).max() == 0.0
 
 
 def test_the_weight_of_a_pixel_does_not_know_its_own_noise():
     """Else weighted means would be too low: by 0.6 % for 150 electrons."""
     rng = np.random.default_rng(3)
     image = rng.poisson(150.0, (512, 512)) + rng.normal(0.0, 4.4, (512, 512))
-    light = calibration.expected(image, np.ones(image.shape, bool), 4.4**2)
+    light = calibration.expected_light(image, np.ones(image.shape, bool), 4.4**2)
     assert np.mean(1.0 / (light + 4.4**2)) * image.var() == pytest.approx(1.0, abs=0.01)
     assert np.average(image, weights=1.0 / (light + 4.4**2)) == pytest.approx(150.0, abs=0.1)
 
@@ -67,6 +67,6 @@ def test_the_weight_of_a_pixel_does_not_know_its_own_noise():
 def test_a_source_has_its_own_shot_noise():
     image = np.full((128, 128), 100.0)
     image[60:70, 60:70] += 5000.0
-    light = calibration.expected(image, np.ones(image.shape, bool), 20.0)
+    light = calibration.expected_light(image, np.ones(image.shape, bool), 20.0)
     assert light[65, 65] == pytest.approx(5100.0, rel=0.01)
     assert light[10, 10] == pytest.approx(100.0, rel=0.01)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from truesky.reduction import catalogue
-from truesky.reduction.calibration import Reduced
+from truesky.reduction.calibration import ReducedImage
 
 SIDE, WIDTH, NOISE = 512, 2.0, 10.0
 
@@ -21,13 +21,13 @@ def image():
     image = np.einsum("n,ny,nx->yx", light / (2 * np.pi * WIDTH**2), shape[1], shape[0])
     image += 100.0 + NOISE * rng.standard_normal(image.shape)
     weight = np.full(image.shape, NOISE**-2, np.float32)
-    return Reduced(image.astype(np.float32), weight, np.zeros(image.shape, np.uint8)), at, light
+    return ReducedImage(image.astype(np.float32), weight, np.zeros(image.shape, np.uint8)), at, light
 
 
 def found(image, monkeypatch, tile, beyond):
     monkeypatch.setattr(catalogue, "_TILE", tile)
-    monkeypatch.setattr(catalogue, "_BEYOND", beyond)
-    rows = catalogue.detected(image, 1.0, 6.0, catalogue.Limits(threshold=3.0, pixels=9))
+    monkeypatch.setattr(catalogue, "_TILE_MARGIN", beyond)
+    rows = catalogue.detect_sources(image, 1.0, 6.0, catalogue.Limits(threshold=3.0, pixels=9))
     order = np.lexsort((rows["x"], rows["y"]))
     return {name: column[..., order] for name, column in rows.items()}
 

@@ -11,7 +11,7 @@ from truesky.reduction import files
 def name(camera, band, detector, kind):
     exposure = SimpleNamespace(camera=camera, band=band, channel="EXT")
     frame = SimpleNamespace(exposure=exposure, detector=detector, scene=SimpleNamespace(ramp=None))
-    return files.master_name(Path(), frame, kind).name
+    return files.master_path(Path(), frame, kind).name
 
 
 def test_masters_of_shipped_cameras_keep_their_names():

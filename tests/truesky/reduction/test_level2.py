@@ -16,14 +16,14 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from lake_schema.fits import images
-from lake_schema.ids import kind_of
+from lake_schema.ids import kind_from_id
 from lake_schema.store import layout, publish, read
 from tests import requests
 from tests.truesky.reduction import ground_frames
 from tests.truesky.render.products import test_tools
 from tests.truesky.render.test_render_exposures_calibration import MODULES
 from truesky.reduction import calibration, files, masters, reduce, stack
-from truesky.reduction import frames as frames_of
+from truesky.reduction import frames as lake_frames
 from truesky.reduction.calibration import COSMIC_RAY, EDGE, NO_DATA, SATURATED
 from truesky.render.camera import astrometry, detectors
 from truesky.request.from_toml import parse
@@ -50,7 +50,7 @@ class Made:
 def reduced(ground, out, *more, wanted=0):
     """Level 2 by the command, of a frame as if a lake had it."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(frames_of, "of_lake", lambda *_: {("camera", "detector"): [ground.frame]})
+        patch.setattr(lake_frames, "from_lake", lambda *_: {("camera", "detector"): [ground.frame]})
         call = ["--lake", str(out.parent), "--masters", str(ground.masters), "--without", "dark", "--out", str(out)]
         assert reduce.main([*call, *more]) == wanted
     return out / f"{ground.frame.stem}.fits"
@@ -114,7 +114,7 @@ def check_flags(made):
     # No core of a star; a hot pixel is as sharp as a ray.
     near = ndimage.binary_dilation(hits > 0.0, np.ones((3, 3), bool))
     assert np.mean(found & ~near) < 1e-4
-    assert np.all((flags & NO_DATA > 0) == made.ground.frame.scene.layout.streets)
+    assert np.all((flags & NO_DATA > 0) == made.ground.frame.scene.layout.unread_pixels)
     inner = flags[10:-10, 10:-10]
     assert not (inner & EDGE).any()
     assert np.all(flags[:10][flags[:10] & NO_DATA == 0] & EDGE)
@@ -239,11 +239,11 @@ def test_counts_are_electrons_over_the_mean_gain(jpcam, tmp_path):
     electrons = files.read_image(path)
     assert (electrons.card("BUNIT"), jpcam.image.card("BUNIT")) == ("electron", "adu")
     assert sorted(file.suffix for file in path.parent.iterdir()) == [".fits"]
-    gain = float(np.mean(jpcam.ground.frame.scene.of_amplifiers("gain", "electron / adu")))
+    gain = float(np.mean(jpcam.ground.frame.scene.amplifier_values("gain", "electron / adu")))
     assert jpcam.image.card("GAIN") == pytest.approx(gain)
     np.testing.assert_allclose(jpcam.image.reduced.image * gain, electrons.reduced.image, rtol=1e-5)
     assert jpcam.image.card("MAGZERO") == pytest.approx(electrons.card("MAGZERO") - 2.5 * np.log10(gain))
-    rates = [stack.rate(image).image for image in (jpcam.image, electrons)]
+    rates = [stack.to_rate(image).image for image in (jpcam.image, electrons)]
     np.testing.assert_allclose(*rates, rtol=1e-5)
     assert not any(key.startswith(("DSEC", "CSEC", "BSEC", "DATASEC")) for key, *_ in electrons.cards)
 
@@ -313,14 +313,14 @@ def test_without_a_psf_nothing_is_written(jpcam, tmp_path, capsys):
 
 
 def test_a_master_of_another_size_is_refused(jpcam, tmp_path, capsys):
-    fits.writeto(files.master_name(tmp_path, jpcam.ground.frame, "flat"), np.ones((5, 7), np.float32))
+    fits.writeto(files.master_path(tmp_path, jpcam.ground.frame, "flat"), np.ones((5, 7), np.float32))
     reduced(jpcam.ground, tmp_path / "out", "--without", "bias", "dark", "--masters", str(tmp_path), wanted=2)
     assert "flat.fits: (5, 7) pixels, the frame has (448, 448)" in capsys.readouterr().err
 
 
 def test_where_a_flat_of_yours_says_nothing_a_pixel_is_not_used(jpcam):
-    found = files.masters(jpcam.ground.masters, jpcam.ground.frame, ("dark",))
-    blind = ~np.isfinite(fits.getdata(files.master_name(jpcam.ground.masters, jpcam.ground.frame, "flat")))
+    found = files.read_masters(jpcam.ground.masters, jpcam.ground.frame, ("dark",))
+    blind = ~np.isfinite(fits.getdata(files.master_path(jpcam.ground.masters, jpcam.ground.frame, "flat")))
     assert blind.any()
     assert np.all(found.flags[blind] & calibration.UNSURE)
     assert np.all(jpcam.image.reduced.weight[blind] == 0.0)
@@ -382,15 +382,15 @@ truth = ["noise_free", "sky", "cosmic_rays"]
 )
 def test_of_a_lake_with_masters_of_its_own_frames(tmp_path, survey, camera, band, detector, mjd, size):
     """From a request: biases and dome flats, a master flat that has its band's name, sources of the catalogues."""
-    root, listed = layout.lake(tmp_path / "lake"), detectors._listed
+    root, listed = layout.resolve_lake(tmp_path / "lake"), detectors._read_layout
     text = LAKE.format(survey=survey, camera=camera, band=band, detector=detector, mjd=mjd)
     wanted = parse(requests.written(tmp_path, text, requests.FIELD.format(0.2), seed=11))
     with pytest.MonkeyPatch.context() as patch:
         small = {"nx": size, "ny": size}
-        patch.setattr(detectors, "_listed", lambda *of: tuple(replace(d, **small) for d in listed(*of)))
+        patch.setattr(detectors, "_read_layout", lambda *of: tuple(replace(d, **small) for d in listed(*of)))
         for job in MODULES:
             for step in job.steps(root, wanted):
-                publish.make(root, step.plan, step.work)
+                publish.make_version(root, step.plan, step.work)
         own, out = str(tmp_path / "masters"), tmp_path / "level2"
         assert masters.main(["--lake", str(root), "--out", own]) == 0
         call = ["--lake", str(root), "--masters", own, "--without", "dark", "--out", str(out), "--level2"]
@@ -402,7 +402,7 @@ def test_of_a_lake_with_masters_of_its_own_frames(tmp_path, survey, camera, band
     found, version = files.read_image(path), read.version(root, "products")
     image = next(row["path"] for row in version.rows().to_pylist() if row["path"].endswith("_sky.fits"))
     sky, light, rays = (
-        images.read_images(version.file(image.replace("_sky", kind)))[0].data
+        images.read_images(version.sidecar_path(image.replace("_sky", kind)))[0].data
         for kind in ("_sky", "_noise_free", "_cosmic_rays")
     )
     # Outer light of galaxies is everywhere.
@@ -416,7 +416,7 @@ def test_of_a_lake_with_masters_of_its_own_frames(tmp_path, survey, camera, band
     assert len(means) > 100
     assert np.mean(np.abs(means) <= 0.003) >= 0.98
     truth = read.version(root, "rendered_truth").rows().to_pylist()
-    stars = [row for row in truth if row["expected"] and kind_of(row["id"]) == 5 and 17.0 < row["mag"] < 21.0]
+    stars = [row for row in truth if row["expected"] and kind_from_id(row["id"]) == 5 and 17.0 < row["mag"] < 21.0]
     rows = fits.getdata(path.with_suffix(".cat"), "LDAC_OBJECTS")
     distance, which = cKDTree(np.transpose([rows["XWIN_IMAGE"], rows["YWIN_IMAGE"]]) - 1.0).query(
         [(row["x"] + row["psf_x"], row["y"] + row["psf_y"]) for row in stars]

@@ -27,7 +27,7 @@ def made(tmp_path_factory):
 
 def build(folder, side, **counts):
     """A lake without cosmic rays in which the amplifiers have their own gains, its masters and calibrated images."""
-    root = layout.lake(folder / "lake")
+    root = layout.resolve_lake(folder / "lake")
     lakes.make(root, lakes.request(off=lakes.RAYS_OFF, overrides=GAINS, depth=(17.0, 12.0), **counts), side)
     with small_detectors(side):
         assert masters.main(["--lake", str(root), "--out", str(folder / "masters")]) == 0
@@ -38,13 +38,13 @@ def build(folder, side, **counts):
 
 def residuals(folder):
     """Of each science frame: (calibrated - truth, NaN where sources are or flags; weight; the sky's truth)."""
-    products = read.version(layout.lake(folder / "lake"), "products")
+    products = read.version(layout.resolve_lake(folder / "lake"), "products")
     for row in products.rows().to_pylist():
         path = folder / "images" / f"{row['exposure_id']:06d}_VIS_euclid_vis_3-4.fits"
         if row["content"] == "noise_free" and path.exists():
             found = files.read_image(path).reduced
-            light = images.read_images(products.file(row["path"]))[0].data
-            sky = images.read_images(products.file(row["path"].replace("noise_free", "sky")))[0].data
+            light = images.read_images(products.sidecar_path(row["path"]))[0].data
+            sky = images.read_images(products.sidecar_path(row["path"].replace("noise_free", "sky")))[0].data
             good = (found.flags == 0) & ~ndimage.binary_dilation(light > 2.0, iterations=5)
             if good.mean() < 0.5:
                 # A bright star fills the frame.
@@ -84,11 +84,11 @@ def test_the_sky_comes_back_and_its_weight_is_its_inverse_variance(made):
     check(made)
 
 
-# That a reader wants a name: tests/lake_schema/store/test_names.py.
+# That a reader wants a name: tests/lake_schema/store/test_request_links.py.
 @pytest.mark.nightly
 def test_of_two_requests_one_is_named(tmp_path, capsys):
     """Each has its own frames: two bias frames, or three."""
-    root, side = layout.lake(tmp_path / "lake"), 64
+    root, side = layout.resolve_lake(tmp_path / "lake"), 64
     for name, count in (("a", 2), ("b", 3)):
         wanted = lakes.request(off=["all"], truth=(), bias=count, dark=0, flat=0, depth=(16.0, 10.0), dither="none")
         lakes.make(root, replace(wanted, name=name), side, name)

@@ -11,7 +11,7 @@ from lake_schema.errors import BadInput, OutOfRange
 from tests.truesky.render import nominal
 from tests.truesky.render.fields import small
 from truesky.reduction import files, resampling, stack, stacking
-from truesky.reduction.calibration import COSMIC_RAY, Reduced
+from truesky.reduction.calibration import COSMIC_RAY, ReducedImage
 from truesky.render.camera import astrometry
 
 SIDE, SCALE, RADIUS = 260, 0.1, 18.0
@@ -44,7 +44,7 @@ def as_reduced(electrons, weight=None):
     """e- -> an image in e-/s."""
     weight = np.full(electrons.shape, 1.0 / (SKY + NOISE**2)) if weight is None else weight
     rate, weight = electrons / nominal.TIME, weight * nominal.TIME**2
-    return Reduced(rate.astype(np.float32), weight.astype(np.float32), np.zeros(rate.shape, np.uint8))
+    return ReducedImage(rate.astype(np.float32), weight.astype(np.float32), np.zeros(rate.shape, np.uint8))
 
 
 def fluxes(image, x, y):
@@ -64,7 +64,7 @@ def centroid(image, x, y):
 
 def test_no_light_is_lost_and_nothing_moves():
     images, where = dithers()
-    made, grid, _ = stack.stacked([(as_reduced(light), system) for light, system in images], SCALE)
+    made, grid, _ = stack.stack_images([(as_reduced(light), system) for light, system in images], SCALE)
     x, y = astrometry.pixel_of_sky(grid.wcs, *where)
     found = fluxes(made.reduced.image, x, y)
     single = np.mean(
@@ -86,11 +86,11 @@ def test_no_light_is_lost_and_nothing_moves():
 
 def test_all_light_of_an_image_is_on_the_grid():
     (light, system), *_ = dithers()[0]
-    grid = resampling.grid_of([(system, light.shape)], 0.13)
+    grid = resampling.covering_grid([(system, light.shape)], 0.13)
     pixmap, area = resampling.pixel_map(system, light.shape, grid)
     ra, dec = astrometry.sky_of_pixel(system, [3.0, 200.0], [7.0, 100.0])
     np.testing.assert_allclose(pixmap[[7, 100], [3, 200]].T, astrometry.pixel_of_sky(grid.wcs, ra, dec), atol=1e-6)
-    found = resampling.resampled(as_reduced(light), pixmap, area, grid.shape)
+    found = resampling.resample(as_reduced(light), pixmap, area, grid.shape)
     assert float((found.image * (found.cover > 0)).astype(float).sum()) * nominal.TIME >= light.sum() * 0.999
     whole = found.cover > 0.999
     assert float(found.image[whole].sum()) * nominal.TIME == pytest.approx(light.sum(), rel=2e-3)
@@ -111,8 +111,8 @@ def test_the_noise_is_as_the_weight_and_the_correlation_say():
 
     Sample of 300 sums or more; significance 3e-3 of their variance (3 standard errors).
     """
-    made, *_ = stack.stacked(noisy(1), SCALE)
-    truth, *_ = stack.stacked([(as_reduced(light + SKY), system) for light, system in dithers()[0]], SCALE)
+    made, *_ = stack.stack_images(noisy(1), SCALE)
+    truth, *_ = stack.stack_images([(as_reduced(light + SKY), system) for light, system in dithers()[0]], SCALE)
     deep = (made.reduced.weight > 3.0 * np.median(nominal.TIME**2 / (SKY + NOISE**2))) & (truth.reduced.flags == 0)
     off = np.where(deep, made.reduced.image.astype(float) - truth.reduced.image, np.nan)
     pull = off * np.sqrt(made.reduced.weight)
@@ -129,8 +129,8 @@ def test_the_noise_is_as_the_weight_and_the_correlation_say():
 
 
 def test_cosmic_rays_are_rejected():
-    hit, *_ = stack.stacked(noisy(1, hits=0.01), SCALE)
-    clean, *_ = stack.stacked(noisy(1), SCALE)
+    hit, *_ = stack.stack_images(noisy(1, hits=0.01), SCALE)
+    clean, *_ = stack.stack_images(noisy(1), SCALE)
     flagged = (hit.reduced.flags & COSMIC_RAY) > 0
     assert 0.02 < flagged.mean() < 0.4
     assert ((clean.reduced.flags & COSMIC_RAY) > 0).mean() < 2e-3
@@ -153,7 +153,7 @@ def test_of_two_the_fainter_is_believed_and_one_alone_is():
 
 def test_the_effective_psf_is_what_a_star_is_in_the_stack():
     images, where = dithers()
-    made, grid, weights = stack.stacked([(as_reduced(light), system) for light, system in images], SCALE)
+    made, grid, weights = stack.stack_images([(as_reduced(light), system) for light, system in images], SCALE)
     profile = nominal.psf_of(small("vis", "3-4", SIDE)).profile
     parts = [
         stacking.Contribution(system, light.shape, profile, SCALE, weight)
@@ -182,13 +182,13 @@ def test_the_effective_psf_is_what_a_star_is_in_the_stack():
 def test_what_makes_no_grid_is_refused():
     (light, system), *_ = dithers()[0]
     with pytest.raises(OutOfRange, match="scale"):
-        resampling.grid_of([(system, light.shape)], 0.0)
+        resampling.covering_grid([(system, light.shape)], 0.0)
     far = system.deepcopy()
     far.wcs.crval = [system.wcs.crval[0], system.wcs.crval[1] + 5.0]
     far.wcs.set()
     with pytest.raises(BadInput, match="so far apart"):
-        resampling.grid_of([(system, light.shape), (far, light.shape)], SCALE)
-    assert resampling.grid_of([(system, light.shape)], 1.0).shape[0] < 60
+        resampling.covering_grid([(system, light.shape), (far, light.shape)], SCALE)
+    assert resampling.covering_grid([(system, light.shape)], 1.0).shape[0] < 60
 
 
 CARDS = (
@@ -204,7 +204,7 @@ def image_file(path, **changes):
     cards = [(key, changes.get(key, value), text) for key, value, text in CARDS]
     cards = (*(card for card in cards if card[1] is not None), *astrometry.cards(astrometry.wcs(detector, 53, -28, 0)))
     ones = np.ones((20, 20), np.float32)
-    files.write_image(path, Reduced(ones, ones, np.zeros(ones.shape, np.uint8)), cards)
+    files.write_image(path, ReducedImage(ones, ones, np.zeros(ones.shape, np.uint8)), cards)
     return str(path)
 
 
@@ -233,7 +233,7 @@ def test_a_scale_of_nothing_is_refused(tmp_path, capsys):
 
 def test_an_image_that_the_lake_has_not_is_named(tmp_path, monkeypatch):
     """The lake has its exposure and its detector, not the one on the other."""
-    monkeypatch.setattr(stack.frames_of, "of_lake", lambda root, names, numbers, request: {("vis", "3-4"): []})
+    monkeypatch.setattr(stack.lake_frames, "from_lake", lambda root, names, numbers, request: {("vis", "3-4"): []})
     image = files.read_image(Path(image_file(tmp_path / "a.fits")))
     with pytest.raises(BadInput, match=r"table products has no image of exposure 1, detector 3-4"):
-        stack._frames(tmp_path, [image], None)
+        stack._find_frames(tmp_path, [image], None)

@@ -13,7 +13,7 @@ def electrons(raw, scene, seed, applied):
 
     applied : names of the effects that are in the image
     """
-    gain = np.reshape(scene.of_amplifiers("gain", "electron / adu"), (-1, 1, 1))
+    gain = np.reshape(scene.amplifier_values("gain", "electron / adu"), (-1, 1, 1))
     found = (raw.astype(float) - scene.value("bias", "adu")) * gain
 
     def fixed(effect):
@@ -26,10 +26,10 @@ def electrons(raw, scene, seed, applied):
         # To first order in the coefficients: 1e-8.
         found = 2.0 * found - crosstalk.apply(found, *crosstalk.EFFECT.parameters(scene))
     if "nonlinearity" in applied:
-        found = nonlinearity.linearised(found, *nonlinearity.EFFECT.parameters(scene))
+        found = nonlinearity.linearise(found, *nonlinearity.EFFECT.parameters(scene))
     if scene.layout is not None:
-        return scene.layout.together(found) / flat(scene, seed, applied)
-    return quadrants.assembled(found, *quadrants.sizes(scene)) / flat(scene, seed, applied)
+        return scene.layout.assemble(found) / flat(scene, seed, applied)
+    return quadrants.assemble(found, *quadrants.overscan_sizes(scene)) / flat(scene, seed, applied)
 
 
 def camera_of(scene):

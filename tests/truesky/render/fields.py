@@ -25,7 +25,7 @@ MISSION = resolve()
 @cache
 def small(camera, name, n=160):
     """A detector cut down to n x n pixels about its centre, as if they were all of one half."""
-    return replace(detectors.detector(camera, name, MISSION), nx=n, ny=n, middle=0)
+    return replace(detectors.detector(camera, name, MISSION), nx=n, ny=n, injection_rows=0)
 
 
 @cache
@@ -33,8 +33,8 @@ def psf_of(camera, name="3-4"):
     """A narrow round PSF for VIS (the optics have their own tests), the seeing disc for LSSTCam."""
     detector = small(camera, "R22_S11" if camera == "lsstcam" else name)
     if camera == "vis":
-        return seeing.ground_psf(0.16, 3.5, detector.pixel_scale)
-    return seeing.ground_psf(0.73, 3.0, detector.pixel_scale)
+        return seeing.moffat_psf(0.16, 3.5, detector.pixel_scale)
+    return seeing.moffat_psf(0.73, 3.0, detector.pixel_scale)
 
 
 DEFAULTS = {
@@ -109,7 +109,7 @@ def rendered(
     """One detector; exposed : columns of its exposure;  tables : galaxies, their fluxes, stars, theirs."""
     variant = Variant(mission, accuracy, forced or {})
     return render.render(
-        Aim.of(exposure(**exposed), detector, passband, way=way),
+        Aim.from_exposure(exposure(**exposed), detector, passband, readout_name=way),
         Rows(*tables, **rows),
         variant,
         seed,

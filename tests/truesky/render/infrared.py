@@ -41,7 +41,7 @@ def exposed(
 
 def tables(detector, columns, mags, x, y, body=None):
     """Rows and fluxes of stars (or galaxies: `body`, their columns) of AB magnitudes `mags` at pixels x, y."""
-    system = Aim.of(fields.exposure(**columns), detector).wcs
+    system = Aim.from_exposure(fields.exposure(**columns), detector).wcs
     where = astrometry.sky_of_pixel(system, np.atleast_1d(x).astype(float), np.atleast_1d(y).astype(float))
     bodies, points = galaxies(*where, **(body or {})), stars(*where)
     bodies, points = (bodies, points.slice(0, 0)) if body else (bodies.slice(0, 0), points)

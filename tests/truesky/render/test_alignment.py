@@ -25,10 +25,10 @@ def shears():
     """(gamma1, gamma2) that the catalogue has beside a round halo, at bearings north through east."""
     ra, dec = hp.pix2ang(NSIDE, np.arange(12 * NSIDE**2), nest=True, lonlat=True)
     kappa = 0.3 * np.exp(-0.5 * (sky.separation(ra, dec, RA, DEC) / WIDTH) ** 2)
-    fields = lensing.transform(kappa.astype(np.float32), NSIDE, np.ones(2 * NSIDE + 1))
+    fields = lensing.maps_of_convergence(kappa.astype(np.float32), NSIDE, np.ones(2 * NSIDE + 1))
     planes = lensing.Planes(NSIDE, np.array([1000.0]), (fields,))
     lon, lat = offset(6.0 * 3600, BEARINGS)
-    return lensing.at(planes, lon, lat, np.full(len(lon), 1000.0))[1:3]
+    return lensing.interpolate(planes, lon, lat, np.full(len(lon), 1000.0))[1:3]
 
 
 def offset(arcsec, bearing):
@@ -50,7 +50,7 @@ def test_alignment_about_a_halo_is_tangential(camera, name, angle, shears):
     band = passbands.load("euclid_vis" if camera == "vis" else "lsst_r")
     lon, lat = offset(50 * scale, BEARINGS)
     body = galaxies(lon, lat, disk_half_light_radius=3.5 * scale, gamma1=shears[0], gamma2=shears[1])
-    found, sizes = visible_sources.sources_of(
+    found, sizes = visible_sources.select_sources(
         Rows(body, None, stars([], []), None), (np.full(len(body), 1e6), np.zeros(0)), aimed(detector, system, band),
         psf_of(camera), NOISE, settings.settings_for(SURVEY),
     )  # fmt: skip

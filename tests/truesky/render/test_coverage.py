@@ -71,7 +71,7 @@ def test_a_plan_is_mapped_from_the_lake(lake, capsys):
     block = {"channels": ["VIS"], "fields": 1}
     wanted = from_table({"name": "x", "seed": 7, "area": area, "observation": [block]})
     for step in plan_exposures.steps(lake, wanted):
-        publish.make(lake, step.plan, step.work)
+        publish.make_version(lake, step.plan, step.run_task)
     picture = lake / "coverage.png"
     assert coverage.main(["--lake", str(lake), "--out", str(picture)]) == 0
     said = capsys.readouterr().out.splitlines()
@@ -81,10 +81,10 @@ def test_a_plan_is_mapped_from_the_lake(lake, capsys):
     exposures, tasks = (read.version(lake, name) for name in ("exposures", "tasks"))
     assert coverage.area_of(exposures) == wanted.area
     (depth,) = coverage.depths(exposures.rows(), lambda: [tasks.rows()], wanted.area, side=120)
-    assert depth.seen.max() == 4
+    assert depth.counts.max() == 4
     # The short exposure and the flat are no dithers; outside the field there is nothing.
-    assert (depth.seen[0] == 0).all()
-    middle = depth.seen[50:70, 50:70]
+    assert (depth.counts[0] == 0).all()
+    middle = depth.counts[50:70, 50:70]
     # Half of it in the gap between detectors once; hardly a place twice, and none four times.
     assert 0.3 < (middle == 4).mean() < 0.7
     assert (middle >= 3).mean() > 0.9

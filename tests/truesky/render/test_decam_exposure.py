@@ -49,7 +49,7 @@ centre_on = "S29"
 
 @pytest.fixture(scope="module")
 def lake(tmp_path_factory):
-    folder, listed = tmp_path_factory.mktemp("decam"), detectors._listed
+    folder, listed = tmp_path_factory.mktemp("decam"), detectors._read_layout
 
     def smaller(*args):
         return tuple(replace(d, nx=SIDE, ny=SIDE) for d in listed(*args))
@@ -61,9 +61,9 @@ def lake(tmp_path_factory):
     rows = f"53.117,-27.808,18.0\n53.1172,-27.8082,20.0\n{ra:.7f},{dec:.7f},12.0\n"
     (folder / "stars.csv").write_text(f"ra,dec,mag\n{rows}")
     request = parse(requests.written(folder, TEXT, requests.FIELD.format(0.45), seed=5))
-    root = layout.lake(folder / "lake")
+    root = layout.resolve_lake(folder / "lake")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(detectors, "_listed", smaller)
+        patch.setattr(detectors, "_read_layout", smaller)
         for module in (build_galaxies, build_stars, compute_fluxes, plan_exposures, render_exposures):
             make(root, module.steps(root, request))
         yield root
@@ -71,21 +71,21 @@ def lake(tmp_path_factory):
 
 def make(root, steps, mapper=map):
     for step in steps:
-        publish.make(root, step.plan, step.work, mapper, name="x")
+        publish.make_version(root, step.plan, step.work, mapper, name="x")
 
 
 @pytest.fixture(scope="module")
 def whole(lake):
     version = read.version(lake, "exposure_files")
     (row,) = version.rows().to_pylist()
-    return row, version.file(row["path"])
+    return row, version.sidecar_path(row["path"])
 
 
 def test_the_ccds_are_in_the_order_of_their_numbers(lake, whole):
     row, path = whole
     assert (row["detectors"], row["planned"]) == (2, 2)
     products = read.version(lake, "products")
-    files = {one["detector"]: products.file(one["path"]) for one in products.rows().to_pylist()}
+    files = {one["detector"]: products.sidecar_path(one["path"]) for one in products.rows().to_pylist()}
     with fits.open(path, checksum=True) as units:
         units.verify("exception")
         first, *ccds = units
@@ -138,11 +138,11 @@ def test_ccdproc_reduces_it_by_its_header(whole):
 
 def test_amplifiers_apart_are_extensions_of_their_ccds(lake, whole, tmp_path):
     """Asked for by the request; the pixels are the same."""
-    root = layout.lake(shutil.copytree(lake, tmp_path / "lake", symlinks=True))
+    root = layout.resolve_lake(shutil.copytree(lake, tmp_path / "lake", symlinks=True))
     make(root, render_exposures.steps(root, replace(parse(lake.parent / "r.toml"), readout="amplifiers")))
     version = read.version(root, "exposure_files")
     (row,) = version.rows().to_pylist()
-    with fits.open(version.file(row["path"]), checksum=True) as units, fits.open(whole[1]) as together:
+    with fits.open(version.sidecar_path(row["path"]), checksum=True) as units, fits.open(whole[1]) as together:
         assert [unit.name for unit in units[1:]] == [f"{name}.{letter}" for name in NUMBERS for letter in "AB"]
         for number, unit in enumerate(units[1:]):
             ccd, letter = together[1 + number // 2], "AB"[number % 2]
@@ -161,9 +161,9 @@ def test_what_is_read_back_has_the_true_place(lake):
     products = read.version(lake, "products")
     exposure = read.version(lake, "exposures").rows().to_pylist()[0]
     for row in products.rows().to_pylist():
-        cards = {key: value for key, value, _ in read_back.frame(products.file(row["path"])).cards}
+        cards = {key: value for key, value, _ in read_back.frame(products.sidecar_path(row["path"])).cards}
         assert (cards["CRVAL1"], cards["CRVAL2"]) == pytest.approx((exposure["ra"], exposure["dec"]), abs=1e-9)
-        assert products.file(head_files.beside(row["path"])).is_file()
+        assert products.sidecar_path(head_files.head_path(row["path"])).is_file()
 
 
 def test_what_ccds_see_of_each_other_is_the_same_whoever_is_rendered_with_whom(lake, tmp_path):
@@ -178,12 +178,12 @@ def test_what_ccds_see_of_each_other_is_the_same_whoever_is_rendered_with_whom(l
 
     found = []
     for name, mapper, some in (("one", map, ()), ("two", together, ()), ("alone", map, ("S29",))):
-        root = layout.lake(shutil.copytree(lake, tmp_path / name, symlinks=True))
-        shutil.rmtree(layout.table(root, "products"))
+        root = layout.resolve_lake(shutil.copytree(lake, tmp_path / name, symlinks=True))
+        shutil.rmtree(layout.table_folder(root, "products"))
         make(root, plan_exposures.steps(root, wanted))
         make(root, render_exposures.steps(root, replace(wanted, detectors=some)), mapper)
         version = read.version(root, "products")
-        found.append({row["detector"]: version.file(row["path"]) for row in version.rows().to_pylist()})
+        found.append({row["detector"]: version.sidecar_path(row["path"]) for row in version.rows().to_pylist()})
     one, two, alone = ({key: path.read_bytes() for key, path in files.items()} for files in found)
     assert one == two
     assert (len(one), alone) == (2, {"S29": one["S29"]})

@@ -62,12 +62,12 @@ def request_file(tmp_path_factory):
 
 def make(root, steps, mapper=map):
     for step in steps:
-        publish.make(root, step.plan, step.work, mapper, name="x")
+        publish.make_version(root, step.plan, step.work, mapper, name="x")
 
 
 @pytest.fixture(scope="module")
 def whole(request_file):
-    root, request = layout.lake(request_file.parent / "lake"), parse(request_file)
+    root, request = layout.resolve_lake(request_file.parent / "lake"), parse(request_file)
     for module in (build_galaxies, build_stars, compute_fluxes, plan_exposures, render_exposures):
         make(root, module.steps(root, request))
     return root
@@ -75,13 +75,13 @@ def whole(request_file):
 
 @pytest.fixture
 def lake(whole, tmp_path):
-    return layout.lake(shutil.copytree(whole, tmp_path / "lake", symlinks=True))
+    return layout.resolve_lake(shutil.copytree(whole, tmp_path / "lake", symlinks=True))
 
 
 def opened(root):
     """Row and images of each exposure, by channel."""
     version = read.version(root, "exposure_files")
-    return {row["channel"]: (row, version.file(row["path"])) for row in version.rows().to_pylist()}
+    return {row["channel"]: (row, version.sidecar_path(row["path"])) for row in version.rows().to_pylist()}
 
 
 @pytest.mark.parametrize(
@@ -92,7 +92,7 @@ def test_an_exposure_has_the_arrays_of_its_detectors(whole, channel, arrays):
     assert (row["detectors"], row["planned"], row["sources"]) == (2, 2, 2 * (row["sources"] // 2))
     products = read.version(whole, "products")
     files = {
-        one["detector"]: images.read_images(products.file(one["path"]))
+        one["detector"]: images.read_images(products.sidecar_path(one["path"]))
         for one in products.rows().to_pylist()
         if (one["channel"], one["content"]) == (channel, "science")
     }
@@ -115,7 +115,9 @@ def test_an_exposure_has_the_arrays_of_its_detectors(whole, channel, arrays):
         # What tools look for in each array stands there, though it is of all.
         assert {"INHERIT", "EXPTIME", "FILTER", "MJD-OBS", "DATASEC", "CCDSEC", "DETSEC"} <= set(own)
         assert ("GAIN" in {key for key, *_ in before.cards}) == (number != 1 or channel == "VIS")
-    heads = read.version(whole, "exposure_files").file(head_files.beside(row["path"])).read_text().split("END\n")
+    heads = (
+        read.version(whole, "exposure_files").sidecar_path(head_files.head_path(row["path"])).read_text().split("END\n")
+    )
     for head, unit in zip(heads[:-1], found, strict=True):
         own = {key: value for key, value, _ in unit.cards}
         assert fits.Header.fromstring(head, sep="\n")["CRPIX1"] == own["CRPIX1"]
@@ -130,22 +132,22 @@ def _killed(root, request):
     step = render_exposures.steps(root, request)[-1]
 
     def work(lake, facts):
-        output = step.work(lake, facts)
+        output = step.run_task(lake, facts)
 
         def torn(target):
             target.write_bytes(b"SIMPLE")
             os.kill(os.getpid(), signal.SIGKILL)
 
-        last = facts["exposure_id"] == step.plan.parts[-1].facts["exposure_id"]
+        last = facts["exposure_id"] == step.plan.tasks[-1].facts["exposure_id"]
         return replace(output, files=dict.fromkeys(output.files, torn)) if last else output
 
-    publish.make(root, step.plan, work, name="x")
+    publish.make_version(root, step.plan, work, name="x")
 
 
 def test_the_same_bytes_in_any_order_and_after_a_kill(lake, whole, request_file):
     request = parse(request_file)
-    shutil.rmtree(layout.table(lake, "exposure_files"))
-    layout.pin(lake, "x", "exposure_files").unlink()
+    shutil.rmtree(layout.table_folder(lake, "exposure_files"))
+    layout.request_link(lake, "x", "exposure_files").unlink()
     child = CONTEXT.Process(target=_killed, args=(lake, request))
     child.start()
     child.join()
@@ -163,15 +165,15 @@ def test_the_same_bytes_in_any_order_and_after_a_kill(lake, whole, request_file)
     assert [read.version(lake, name).manifest for name in names] == [
         read.version(whole, name).manifest for name in names
     ]
-    assert read.verify(read.version(lake, "exposure_files"), deep=True) == []
+    assert read.find_faults(read.version(lake, "exposure_files"), deep=True) == []
 
 
 def test_of_some_detectors_a_file_has_those_and_says_so(lake, request_file, tmp_path):
     """And all, once the others are there: what is there is used again."""
     request = parse(request_file)
     for name in ("products", "rendered_truth", "exposure_files"):
-        shutil.rmtree(layout.table(lake, name))
-        layout.pin(lake, "x", name).unlink()
+        shutil.rmtree(layout.table_folder(lake, name))
+        layout.request_link(lake, "x", name).unlink()
     make(lake, render_exposures.steps(lake, replace(request, detectors=("DET23",))))
     ((row, path),) = opened(lake).values()
     assert (row["channel"], row["detectors"], row["planned"]) == ("NISP-P", 1, 2)
@@ -197,8 +199,8 @@ def test_files_are_no_part_of_what_detectors_are(lake, request_file):
 def test_the_archive_lists_them(whole, capsys):
     version = read.version(whole, "exposure_files")
     for row in archive.exposures(whole).to_pylist():
-        path = version.file(row["path"])
-        assert (row["sha256"], row["bytes"]) == (version.sha256(row["path"]), path.stat().st_size)
+        path = version.sidecar_path(row["path"])
+        assert (row["sha256"], row["bytes"]) == (version.file_sha256(row["path"]), path.stat().st_size)
     assert archive.main(["--lake", str(whole), "--exposures", "--sql", "select sum(detectors) as n from products"]) == 0
     assert capsys.readouterr().out == '{"n": 4}\n'
 
@@ -215,4 +217,4 @@ def test_forecasts_count_them(whole, request_file):
     assert "exposure_files" in run.stages(request)[-1].tables
     assert "exposure_files" not in run.stages(replace(request, files="detector"))[-1].tables
     size = sum(entry["bytes"] for version in (products, files) for entry in version.manifest["files"])
-    assert space._images(whole, request, *both[1:]) == size
+    assert space._reusable_image_bytes(whole, request, *both[1:]) == size

@@ -63,7 +63,7 @@ def rendered(tmp_path_factory):
     lake.mkdir()
     for module in (build_galaxies, build_stars, compute_fluxes, plan_exposures, render_exposures):
         for step in module.steps(lake, wanted):
-            publish.make(lake, step.plan, step.work)
+            publish.make_version(lake, step.plan, step.work)
     return lake
 
 
@@ -71,7 +71,7 @@ def rendered(tmp_path_factory):
 def images(rendered):
     """Header and pixels by content."""
     version = read.version(rendered, "products")
-    files = {row["content"]: version.file(row["path"]) for row in version.rows().to_pylist()}
+    files = {row["content"]: version.sidecar_path(row["path"]) for row in version.rows().to_pylist()}
     opened = {content: fits.getdata(file, header=True) for content, file in files.items()}
     # Of the raw file its pixels, in electrons.
     opened["science"] = read_back.electrons(files["science"]).data, opened["science"][1]
@@ -115,7 +115,7 @@ def test_a_source_is_what_galsim_draws_of_its_row(images, row, body):
 def test_the_psf_lies_beside_the_image(rendered):
     version = read.version(rendered, "products")
     (row,) = (row for row in version.rows().to_pylist() if row["content"] == "science")
-    image = version.file(row["path"])
+    image = version.sidecar_path(row["path"])
     model = galsim.des.DES_PSFEx(str(image.with_name(image.name.replace("_science.fits", ".psf"))))
     found = model.getPSF(galsim.PositionD(2000.0, 2000.0)).drawImage(scale=0.25, method="no_pixel").calculateFWHM()
     with fits.open(image) as units:
@@ -124,7 +124,7 @@ def test_the_psf_lies_beside_the_image(rendered):
 
 def test_a_frame_has_its_psf_and_the_place_of_its_pixels(rendered, images):
     """Of the detector's first pixel, not of the file's."""
-    ((frame,),) = frames.of_lake(rendered).values()
+    ((frame,),) = frames.from_lake(rendered).values()
     assert frame.psf is not None
     assert frame.psf.name == frame.path.name.replace("_science.fits", ".psf")
     header, _ = images["noise_free"]

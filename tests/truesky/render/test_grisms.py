@@ -28,9 +28,9 @@ def test_every_grism_has_a_configuration_with_its_traces_and_sensitivities(folde
     assert found == [f"{grism}_{name}" for grism in ("BGS000", "RGS000", "RGS180") for name in ("DET22", "DET31")]
     for name in ("RGS180_DET31", "BGS000_DET22"):
         read, seen = grismconf.Config(str(folder / f"{name}.conf")), detector("nisp", name[-5:], MISSION)
-        aim = grisms.nominal(name[:6], name[-5:], MISSION)
-        still = MISSION.overridden_with({"nisp.grism_wheel_error": (0.0, "deg")})
-        traces = registry.CHANNELS["NISP-S"].disperses.traces(aim.exposure, seen, still, 0)
+        aim = grisms.nominal_aim(name[:6], name[-5:], MISSION)
+        still = MISSION.with_overrides({"nisp.grism_wheel_error": (0.0, "deg")})
+        traces = registry.CHANNELS["NISP-S"].dispersion.traces(aim.exposure, seen, still, 0)
         for trace in traces:
             order, t = f"{trace.order:+d}" if trace.order else "0", np.linspace(0.0, 1.0, 5)
             x, y = trace.offsets(300.0, 1700.0, read.DISPL(order, 300.0, 1700.0, t))
@@ -57,11 +57,11 @@ def test_a_line_has_its_flux_times_the_sensitivity_of_electrons_a_second(folder)
 
 def test_the_sensitivity_is_that_of_the_zero_point():
     """A source of flat f_nu gives what the exposure's magnitude of one electron a second says, in all wavelengths."""
-    aim = grisms.nominal("RGS000", "DET22", MISSION)
+    aim = grisms.nominal_aim("RGS000", "DET22", MISSION)
     order = next(one for one in grisms.orders(aim, MISSION, 0) if one.trace.order == 1)
     f_nu = 10.0 ** (-0.4 * (aim.exposure.zero_point + 48.6))
     assert (f_nu * 2.99792458e18 / order.wavelength**2 * order.response).sum() == pytest.approx(1.0, rel=1e-6)
-    brighter = grisms.Aim.of(
+    brighter = grisms.Aim.from_exposure(
         fields.exposure(**{**spectroscopic.exposed(strip()), "zero_point": aim.exposure.zero_point + 1.0}), strip()
     )
     twice = next(one for one in grisms.orders(brighter, MISSION, 0) if one.trace.order == 1)

@@ -92,19 +92,19 @@ def test_from_the_request_to_its_image(lake, tmp_path):
     wanted = asked(tmp_path)
     for steps in (build_galaxies.steps, build_stars.steps, compute_fluxes.steps, plan_exposures.steps):
         for step in steps(lake, wanted):
-            publish.make(lake, step.plan, step.work)
+            publish.make_version(lake, step.plan, step.run_task)
     own = inputs.read(wanted.curves).passbands["mine"]
     facts = read.version(lake, "galaxy_fluxes").manifest["facts"]
-    found = inputs.passband_of(lake, facts, "mine")
+    found = inputs.passband_from_facts(lake, facts, "mine")
     np.testing.assert_array_equal(found.response, own.response)
-    assert inputs.passband_of(lake, facts, "euclid_vis").name == passbands.load("euclid_vis").name
+    assert inputs.passband_from_facts(lake, facts, "euclid_vis").name == passbands.load("euclid_vis").name
     for step in render_exposures.steps(lake, wanted):
-        publish.make(lake, step.plan, step.work)
+        publish.make_version(lake, step.plan, step.run_task)
     rows = read.version(lake, "products").rows().to_pylist()
     assert {row["band"] for row in rows} == {"mine"}
     # A filter that is not the one of the fluxes is noticed.
     changed = asked(tmp_path, response=0.9 * RESPONSE)
     for step in plan_exposures.steps(lake, changed):
-        publish.make(lake, step.plan, step.work)
+        publish.make_version(lake, step.plan, step.run_task)
     with pytest.raises(BadInput, match=r"galaxy_fluxes was computed with another fluxes\.passbands\.mine"):
         render_exposures.steps(lake, changed)

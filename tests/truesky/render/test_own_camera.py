@@ -77,7 +77,7 @@ def rendered(tmp_path_factory):
     lake.mkdir()
     for module in (build_galaxies, build_stars, compute_fluxes, plan_exposures, render_exposures):
         for step in module.steps(lake, wanted):
-            publish.make(lake, step.plan, step.work)
+            publish.make_version(lake, step.plan, step.work)
     return lake
 
 
@@ -85,7 +85,7 @@ def rendered(tmp_path_factory):
 def files(rendered):
     version = read.version(rendered, "products")
     rows = version.rows().to_pylist()
-    return {(row["content"], row["detector"]): version.file(row["path"]) for row in rows}
+    return {(row["content"], row["detector"]): version.sidecar_path(row["path"]) for row in rows}
 
 
 def test_all_its_detectors_are_rendered_with_their_overscan(files):

@@ -18,9 +18,9 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from lake_schema import ids, sky, tables
-from lake_schema.errors import BadInput, PartsFailed
-from lake_schema.store import garbage, layout, names, publish, read, stage
-from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.errors import BadInput, TasksFailed
+from lake_schema.store import garbage, layout, publish, read, request_links, stage
+from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.store.provenance import file_sha256
 from lake_schema.tables.strong_lenses import STRONG_LENSES
 from tests import requests
@@ -38,7 +38,7 @@ from truesky.render.products import keys as products_keys
 from truesky.render.products import truth_table
 from truesky.render.sources import catalogue_rows
 from truesky.request.from_toml import from_table
-from truesky.running import shell
+from truesky.running import submitted_job
 
 # Eight amplifiers side by side.
 SIDE = 304
@@ -65,13 +65,13 @@ REQUEST = tomllib.loads(requests.text(SMALL, requests.FIELD.format(0.03), seed=7
 @contextmanager
 def small_detectors():
     """Detectors of LSSTCam cut down to their middles, close together."""
-    listed = detectors._listed
+    listed = detectors._read_layout
 
     def smaller(section, mission):
         return tuple(replace(d, nx=SIDE, ny=SIDE, x=d.x / 20, y=d.y / 20) for d in listed(section, mission))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(detectors, "_listed", smaller)
+        patch.setattr(detectors, "_read_layout", smaller)
         yield
 
 
@@ -83,7 +83,7 @@ def _small():
 
 @pytest.fixture(scope="module")
 def catalogues(tmp_path_factory):
-    root = layout.lake(tmp_path_factory.mktemp("render") / "lake")
+    root = layout.resolve_lake(tmp_path_factory.mktemp("render") / "lake")
     make(root, wanted(), build_galaxies, build_stars, compute_fluxes)
     return root
 
@@ -91,12 +91,12 @@ def catalogues(tmp_path_factory):
 @pytest.fixture
 def lake(catalogues, tmp_path):
     """A lake of catalogues and fluxes."""
-    return layout.lake(shutil.copytree(catalogues, tmp_path / "lake", symlinks=True))
+    return layout.resolve_lake(shutil.copytree(catalogues, tmp_path / "lake", symlinks=True))
 
 
 @pytest.fixture(scope="module")
 def _once(catalogues, tmp_path_factory):
-    root = layout.lake(shutil.copytree(catalogues, tmp_path_factory.mktemp("once") / "lake", symlinks=True))
+    root = layout.resolve_lake(shutil.copytree(catalogues, tmp_path_factory.mktemp("once") / "lake", symlinks=True))
     assert render(root, wanted()) == BOTH
     return root
 
@@ -104,7 +104,7 @@ def _once(catalogues, tmp_path_factory):
 @pytest.fixture
 def rendered(_once, tmp_path):
     """A lake with the products of `wanted()`."""
-    return layout.lake(shutil.copytree(_once, tmp_path / "rendered", symlinks=True))
+    return layout.resolve_lake(shutil.copytree(_once, tmp_path / "rendered", symlinks=True))
 
 
 def wanted(pointings=1, **sections):
@@ -116,7 +116,7 @@ def wanted(pointings=1, **sections):
 def make(root, request, *modules, spy=lambda work: work):
     for module in modules:
         for step in module.steps(root, request):
-            publish.make(root, step.plan, spy(step.work))
+            publish.make_version(root, step.plan, spy(step.work))
 
 
 def render(root, request, fail=()):
@@ -135,7 +135,7 @@ def render(root, request, fail=()):
 
     make(root, request, plan_exposures)
     if fail:
-        with pytest.raises(PartsFailed, match=r"1 of 2 parts failed: .*ValueError: no light"):
+        with pytest.raises(TasksFailed, match=r"1 of 2 parts failed: .*ValueError: no light"):
             make(root, request, render_exposures, spy=spy)
     else:
         make(root, request, render_exposures, spy=spy)
@@ -144,10 +144,10 @@ def render(root, request, fail=()):
 
 def images(root):
     version = read.version(root, "products")
-    return {row["path"]: version.file(row["path"]).read_bytes() for row in version.rows().to_pylist()}
+    return {row["path"]: version.sidecar_path(row["path"]).read_bytes() for row in version.rows().to_pylist()}
 
 
-WORK = render_exposures.work
+WORK = render_exposures.render_task
 BOTH = Counter({(1, "R22_S11"): 1, (1, "R22_S12"): 1})
 
 
@@ -163,7 +163,7 @@ def test_every_planned_detector_has_its_products_and_every_source_its_row(render
         drawn = truth.filter(pc.field("detector") == row["detector"])
         ids, x, y, expected, onto = (drawn[c].to_numpy() for c in ("id", "x", "y", "expected", "drawn"))
         assert (np.diff(ids) > 0).all()
-        with fits.open(version.file(row["path"])) as file:
+        with fits.open(version.sidecar_path(row["path"])) as file:
             electrons, system = file[0].data.astype(float), WCS(file[0].header)
         # The image is the sum of the stamps and of wings that are fainter than the noise: with the aureole, 4 %.
         assert onto.sum() <= electrons.sum() * (1 + 1e-5)
@@ -174,7 +174,7 @@ def test_every_planned_detector_has_its_products_and_every_source_its_row(render
         (middle,) = (one["mjd"] + 0.5 * one["exposure_time_s"] / 86400.0 for one in exposed.to_pylist())
         moving = read.version(rendered, "stars").rows(["id", "ra", "dec", "pm_ra", "pm_dec"])
         lensed = read.version(rendered, "galaxies").rows(["id", "ra", "dec"])
-        for rows_ in (lensed, catalogue_rows.at_time(moving, middle)):
+        for rows_ in (lensed, catalogue_rows.apply_proper_motion(moving, middle)):
             found = rows_.to_pydict()
             sky |= dict(zip(found["id"], zip(found["ra"], found["dec"], strict=True), strict=True))
         own = system.all_world2pix([sky[i] for i in ids.tolist()], 0)
@@ -188,8 +188,8 @@ def test_a_cone_about_an_image_of_a_galaxy_finds_it_in_the_catalogue_and_among_i
     matched = 0
     for row in products.rows(where=pc.field("content") == "noise_free").to_pylist():
         drawn = truth.rows(where=pc.field("detector") == row["detector"])
-        drawn = drawn.filter(pa.array(ids.kind_of(drawn["id"].to_numpy()) < 4))
-        with fits.open(products.file(row["path"])) as file:
+        drawn = drawn.filter(pa.array(ids.kind_from_id(drawn["id"].to_numpy()) < 4))
+        with fits.open(products.sidecar_path(row["path"])) as file:
             places = WCS(file[0].header).all_pix2world(drawn["x"].to_numpy(), drawn["y"].to_numpy(), 0)
         for source, ra, dec in zip(drawn["id"].to_pylist(), *(axis.tolist() for axis in places), strict=True):
             for catalogue in catalogues:
@@ -217,15 +217,17 @@ def test_a_bad_detector_is_a_row_and_not_the_end_of_the_run(lake, monkeypatch, t
     def bad(root, facts):
         raise ValueError("no light")
 
-    monkeypatch.setattr(shell, "_spark_map", here)
+    monkeypatch.setattr(submitted_job, "_spark_map", here)
     make(lake, wanted(), plan_exposures)
     step, part = render_exposures.steps(lake, wanted())[0], "000001-r22_s11.parquet"
     with monkeypatch.context() as patch:
         patch.setattr(
-            render_exposures, "work", lambda root, facts: (bad if facts["detector"] == "R22_S11" else WORK)(root, facts)
+            render_exposures,
+            "render_task",
+            lambda root, facts: (bad if facts["detector"] == "R22_S11" else WORK)(root, facts),
         )
-        with pytest.raises(PartsFailed, match=rf"1 of 2 parts failed: {part}: ValueError: no light"):
-            shell.run(render_exposures.JOB, lake, wanted())
+        with pytest.raises(TasksFailed, match=rf"1 of 2 parts failed: {part}: ValueError: no light"):
+            submitted_job.run(render_exposures.JOB, lake, wanted())
     assert layout.current_key(lake, "products") is None
     # Planned = made + failed.
     (failed,) = archive.failures(lake).to_pylist()
@@ -234,11 +236,11 @@ def test_a_bad_detector_is_a_row_and_not_the_end_of_the_run(lake, monkeypatch, t
     assert json.loads(capsys.readouterr().out.splitlines()[-1]) == {"error": failed["error"]}
     assert failed["seconds"] >= 0
     assert 0 < failed["peak_gb"] < 100
-    assert len(stage.missing(layout.stage(lake, "products", step.plan.key), step.plan)) == 1
+    assert len(stage.missing_tasks(layout.stage_folder(lake, "products", step.plan.key), step.plan)) == 1
     # Only what failed is made by the next run, and is then no failure any more.
     made = []
-    monkeypatch.setattr(render_exposures, "work", lambda root, facts: made.append(facts) or WORK(root, facts))
-    shell.run(render_exposures.JOB, lake, wanted())
+    monkeypatch.setattr(render_exposures, "render_task", lambda root, facts: made.append(facts) or WORK(root, facts))
+    submitted_job.run(render_exposures.JOB, lake, wanted())
     assert [facts["detector"] for facts in made] == ["R22_S11"]
     assert archive.failures(lake).num_rows == 0
     _check_archive(lake, capsys)
@@ -247,19 +249,19 @@ def test_a_bad_detector_is_a_row_and_not_the_end_of_the_run(lake, monkeypatch, t
 def _check_archive(lake, capsys):
     version, rows = read.version(lake, "products"), archive.products(lake)
     for row in rows.to_pylist():
-        assert row["sha256"] == file_sha256(version.file(row["path"]))
-        assert row["bytes"] == version.file(row["path"]).stat().st_size
+        assert row["sha256"] == file_sha256(version.sidecar_path(row["path"]))
+        assert row["bytes"] == version.sidecar_path(row["path"]).stat().st_size
         assert row["seconds"] > 0.01
         assert 0 < row["peak_gb"] < 100
-        assert row["path"] in archive.covering(rows, row["ra"], row["dec"])["path"].to_pylist()
+        assert row["path"] in archive.rows_at_place(rows, row["ra"], row["dec"])["path"].to_pylist()
         # Corners of the footprint are its own; half a degree away there is nothing, nor on the other side of the sky.
         ra, dec = map(float, row["s_region"].split()[2:4])
         edge = row["ra"] + (ra - row["ra"]) * 0.999, row["dec"] + (dec - row["dec"]) * 0.999
-        assert row["path"] in archive.covering(rows, *edge)["path"].to_pylist()
+        assert row["path"] in archive.rows_at_place(rows, *edge)["path"].to_pylist()
         out = row["ra"] + (ra - row["ra"]) * 1.001, row["dec"] + (dec - row["dec"]) * 1.001
-        assert row["path"] not in archive.covering(rows, *out)["path"].to_pylist()
-    assert archive.covering(rows, 53.117, -27.3).num_rows == 0
-    assert archive.covering(rows, (rows["ra"][0].as_py() + 180) % 360, -rows["dec"][0].as_py()).num_rows == 0
+        assert row["path"] not in archive.rows_at_place(rows, *out)["path"].to_pylist()
+    assert archive.rows_at_place(rows, 53.117, -27.3).num_rows == 0
+    assert archive.rows_at_place(rows, (rows["ra"][0].as_py() + 180) % 360, -rows["dec"][0].as_py()).num_rows == 0
     capsys.readouterr()
     query = "select detector from products where content = 'science' order by detector"
     assert archive.main(["--lake", str(lake), "--sql", query]) == 0
@@ -273,15 +275,15 @@ def test_a_source_beyond_the_reach_of_any_stamp_changes_no_byte(lake, rendered):
     """The same lake without the sources 8 minutes of arc and more from the detectors, in the cells that they read."""
     for name in ("galaxies", "stars"):
         version = read.version(lake, name)
-        table, whole = tables.find(name, version.schema.names), version.manifest
-        parts = tuple(Part(part["name"], {**part["facts"], "part": part["name"]}) for part in whole["parts"])
+        table, whole = tables.find_table(name, version.schema.names), version.manifest
+        parts = tuple(Task(part["name"], {**part["facts"], "part": part["name"]}) for part in whole["parts"])
 
         def near(root, facts, version=version):
-            rows = version.rows(parts=[facts["part"]])
+            rows = version.rows(partitions=[facts["part"]])
             distance = sky.separation(rows["ra"].to_numpy(), rows["dec"].to_numpy(), 53.117, -27.808)
             return Output(rows.filter(distance < 8 / 60))
 
-        publish.make(lake, Plan(table, {**whole["facts"], "without": "the far ones"}, parts), near)
+        publish.make_version(lake, Plan(table, {**whole["facts"], "without": "the far ones"}, parts), near)
         assert 20 < read.version(lake, name).num_rows < 0.95 * version.num_rows
     make(lake, wanted(), compute_fluxes)
     # Their files are others, so they are rendered, to the same bytes.
@@ -295,7 +297,7 @@ def _killed(root, request):
     """Render in a process that is killed while it writes its last image."""
 
     def work(lake, facts):
-        output = step.work(lake, facts)
+        output = step.run_task(lake, facts)
         (path,) = (path for path in output.files if path.endswith("science.fits"))
 
         def torn(target):
@@ -303,12 +305,12 @@ def _killed(root, request):
             os.truncate(target, target.stat().st_size // 2)
             os.kill(os.getpid(), signal.SIGKILL)
 
-        last = facts["detector"] == step.plan.parts[-1].facts["detector"]
+        last = facts["detector"] == step.plan.tasks[-1].facts["detector"]
         return replace(output, files={**output.files, path: torn}) if last else output
 
     with small_detectors():
         step = render_exposures.steps(root, request)[0]
-        publish.make(root, step.plan, work)
+        publish.make_version(root, step.plan, work)
 
 
 def test_a_run_that_is_killed_half_way_ends_with_the_same_bytes(lake, rendered):
@@ -318,7 +320,7 @@ def test_a_run_that_is_killed_half_way_ends_with_the_same_bytes(lake, rendered):
     child.join()
     assert child.exitcode == -signal.SIGKILL
     assert layout.current_key(lake, "products") is None
-    assert list(layout.table(lake, "products").glob(".stage-*/**/.*tmp*"))
+    assert list(layout.table_folder(lake, "products").glob(".stage-*/**/.*tmp*"))
     # What was done before is not done again.
     (made,) = render(lake, wanted()).items()
     assert made[1] == 1
@@ -332,7 +334,7 @@ def _manifests(root):
 
 def test_a_staged_image_that_changed_is_rendered_again(lake, rendered):
     render(lake, wanted(), fail=["R22_S11"])
-    (image,) = layout.table(lake, "products").glob(".stage-*/images/*/*science.fits")
+    (image,) = layout.table_folder(lake, "products").glob(".stage-*/images/*/*science.fits")
     data = bytearray(image.read_bytes())
     data[-5000] ^= 1
     image.write_bytes(data)
@@ -347,7 +349,7 @@ def test_what_an_older_version_holds_is_not_rendered_again(rendered):
     both = images(lake)
     assert len(both) == 8
     assert all(both[path] == data for path, data in first.items())
-    assert read.verify(read.version(lake, "products"), deep=True) == []
+    assert read.find_faults(read.version(lake, "products"), deep=True) == []
     assert read.version(lake, "rendered_truth").num_rows == sum(
         row["sources"] for row in read.version(lake, "products").rows().to_pylist() if row["content"] == "science"
     )
@@ -360,22 +362,22 @@ def named(root, request, *modules):
     """As `make`, for the request's name."""
     for module in modules:
         for step in module.steps(root, request):
-            publish.make(root, step.plan, step.work, name=request.name)
+            publish.make_version(root, step.plan, step.work, name=request.name)
 
 
 def planned_parts(root, request):
     """Of images and of what was drawn: the parts that the next version would have."""
-    return [sorted(part.name for part in step.plan.parts) for step in render_exposures.steps(root, request)]
+    return [sorted(part.name for part in step.plan.tasks) for step in render_exposures.steps(root, request)]
 
 
 def test_a_part_is_added_to_what_the_request_has(rendered):
     """Of a part that is asked for later nothing is lost; what has changed since does not stay."""
     lake, whole = rendered, wanted()
     named(lake, whole, plan_exposures, render_exposures)
-    before, key = images(lake), names.key_of(lake, whole.name, "products")
+    before, key = images(lake), request_links.linked_key(lake, whole.name, "products")
     for part in ({"limit": 1}, {"detectors": ("R22_S12",)}):
         named(lake, replace(whole, **part), render_exposures)
-        assert names.key_of(lake, whole.name, "products") == key
+        assert request_links.linked_key(lake, whole.name, "products") == key
     assert garbage.collect(lake, "products", delete=True) == []
     assert images(lake) == before
     one = ["000001-r22_s12.parquet"]
@@ -392,7 +394,7 @@ def test_a_part_is_added_to_what_the_request_has(rendered):
 
 
 def size_of(root, *tables):
-    folders = [layout.current(root, table).resolve() for table in tables]
+    folders = [layout.current_link(root, table).resolve() for table in tables]
     return sum(path.stat().st_size for folder in folders for path in folder.rglob("*") if path.is_file())
 
 
@@ -400,14 +402,14 @@ def test_what_is_used_again_needs_no_room(rendered):
     """Catalogues that stay, and those images whose product keys stay; of another request nothing."""
     lake, whole, files = rendered, wanted(), read.version(rendered, "products").manifest["files"]
     # As a job leaves the lake: the version belongs to the request.
-    names.pin(lake, whole.name, "products", str(layout.current_key(lake, "products")))
+    request_links.link_version(lake, whole.name, "products", str(layout.current_key(lake, "products")))
     catalogues = size_of(lake, "halos", "galaxies", "galaxy_fluxes", "stars", "star_fluxes")
     products = sum(entry["bytes"] for entry in files)
     one = sum(entry["bytes"] for entry in files if "R22_S12" in entry["path"] or "r22_s12" in entry["path"])
 
     def there(request, limit=None, detectors=()):
         plan = plan_exposures.plan(lake, request)[1:]
-        return space._there(lake, replace(request, limit=limit, detectors=detectors), plan)
+        return space._reusable_bytes(lake, replace(request, limit=limit, detectors=detectors), plan)
 
     assert there(whole) == there(wanted(pointings=2)) == catalogues + products
     assert there(whole, detectors=("R22_S12",)) == catalogues + one
@@ -419,7 +421,7 @@ def test_what_is_used_again_needs_no_room(rendered):
 
 def test_a_damaged_image_of_an_older_version_is_not_taken(rendered):
     lake = rendered
-    image = min(layout.current(lake, "products").resolve().glob("images/*/*R22_S12*science.fits"))
+    image = min(layout.current_link(lake, "products").resolve().glob("images/*/*R22_S12*science.fits"))
     data = bytearray(image.read_bytes())
     data[-5000] ^= 1
     image.write_bytes(data)
@@ -431,7 +433,7 @@ def keys(root, request, plan=False):
     """Part -> product key, as a run would have it, after another plan or with the one that is there."""
     if plan:
         make(root, request, plan_exposures)
-    return {part.name: part.facts["product"] for part in render_exposures.steps(root, request)[0].plan.parts}
+    return {part.name: part.facts["product"] for part in render_exposures.steps(root, request)[0].plan.tasks}
 
 
 def test_a_key_changes_with_everything_that_shapes_a_product(rendered, monkeypatch, tmp_path):
@@ -454,7 +456,7 @@ def test_a_key_changes_with_everything_that_shapes_a_product(rendered, monkeypat
         patch.setattr(products_keys, "file_sha256", lambda path: "another")
         step = render_exposures.steps(rendered, wanted(psf={"lsst_r": str(own)}))[0]
     with pytest.raises(BadInput, match=r"psf.fits: has changed since the rendering began"):
-        render_exposures.work(rendered, {**step.plan.facts, **step.plan.parts[0].facts})
+        render_exposures.render_task(rendered, {**step.plan.facts, **step.plan.tasks[0].facts})
     assert all(len({some[part] for some in found}) == len(found) for part in found[0])
     # What else is asked for is no part of it.
     assert found[0].items() < keys(rendered, wanted(pointings=2), plan=True).items()
@@ -496,7 +498,7 @@ def test_strong_lenses_of_the_lake_are_drawn(rendered, monkeypatch):
     # In an exposure of no time nothing shows: neither galaxies are read nor what lenses make of them.
     for least, shows in ((0.0, True), (np.inf, False)):
         tasks = read.version(lake, "tasks").rows().to_pylist()
-        found = sum(catalogue_rows.lenses(version, task, 0.1, 0.0, least).num_rows for task in tasks)
+        found = sum(catalogue_rows.read_lenses(version, task, 0.1, 0.0, least).num_rows for task in tasks)
         assert (found > 0) == shows
     assert set(drawn["id"].to_pylist()) <= set(version.rows(["id"])["id"].to_pylist())
     changed = {path for path, data in images(lake).items() if data != plain[path]}
@@ -555,17 +557,17 @@ def test_galaxies_of_a_library_are_drawn(rendered, tmp_path):
     fits.writeto(path, np.exp(-np.hypot(x, y) / 3.0)[None].astype(np.float32), overwrite=True)
     assert all(keys(rendered, asked)[part] != key for part, key in found.items())
     with pytest.raises(BadInput, match=r"library.fits: has changed since the rendering began"):
-        render_exposures.work(rendered, {**step.plan.facts, **step.plan.parts[0].facts})
+        render_exposures.render_task(rendered, {**step.plan.facts, **step.plan.tasks[0].facts})
 
 
 def test_a_product_is_rebuilt_from_its_own_manifest(rendered, tmp_path):
     version = read.version(rendered, "products")
     rebuilt = 0
     for part in version.manifest["parts"]:
-        output = render_exposures.work(rendered, {**version.manifest["facts"], **part["facts"]})
+        output = render_exposures.render_task(rendered, {**version.manifest["facts"], **part["facts"]})
         for path, writer in output.files.items():
             writer(tmp_path / "again")
-            assert file_sha256(tmp_path / "again") == file_sha256(version.file(path))
+            assert file_sha256(tmp_path / "again") == file_sha256(version.sidecar_path(path))
             rebuilt += path.endswith(".fits")
     assert rebuilt == 4
 
@@ -600,9 +602,9 @@ def test_an_exploration_is_rendered_with_what_each_of_its_requests_asks(lake):
     }
     rows = [row for row in version.rows().to_pylist() if row["content"] == "science"]
     assert len({row["mission"] for row in rows}) == 2
-    assert len({version.file(row["path"]).read_bytes() for row in rows}) == 4
+    assert len({version.sidecar_path(row["path"]).read_bytes() for row in rows}) == 4
     for row in rows:
-        asked, header = settings[row["exposure_id"]], fits.getheader(version.file(row["path"]))
+        asked, header = settings[row["exposure_id"]], fits.getheader(version.sidecar_path(row["path"]))
         assert header["RDNOISE"] == asked["ext.lsstcam.read_noise"][0]
         states = {header[key].split(":")[0]: header[key].split(":")[1] for key in header if key.startswith("EFFECT")}
         assert states["poisson"].startswith(" on" if asked["effects.poisson"] else " off (forced)")
@@ -616,15 +618,15 @@ def test_truth_maps_are_those_that_were_asked_for_and_that_a_channel_has(lake):
     assert Counter(version.rows()["content"].to_pylist()) == dict.fromkeys(
         ("science", "noise_free", "stars", "sky", "cosmic_rays", "saturation"), 2
     )
-    others = {"persistence", "ramp", "satellites", "traps", "dipoles", *truth_maps.ORDERS.values()}
-    assert set(everything) | others == set(truth_maps.BYTES)
-    maps = {row["content"]: fits.getdata(version.file(row["path"])) for row in version.rows().to_pylist()}
+    others = {"persistence", "ramp", "satellites", "traps", "dipoles", *truth_maps.ORDER_MAPS.values()}
+    assert set(everything) | others == set(truth_maps.BYTES_PER_PIXEL)
+    maps = {row["content"]: fits.getdata(version.sidecar_path(row["path"])) for row in version.rows().to_pylist()}
     exposed = read.version(lake, "exposures").rows().to_pylist()[0]
     np.testing.assert_allclose(maps["sky"], exposed["sky"] * exposed["exposure_time_s"], rtol=1e-6)
     assert (maps["stars"] <= maps["noise_free"] + 1e-3).all()
     for task in tasks:
         mine = [row for row in version.rows().to_pylist() if row["detector"] == task["detector"]]
-        measured = sum(version.file(row["path"]).stat().st_size for row in mine)
+        measured = sum(version.sidecar_path(row["path"]).stat().st_size for row in mine)
         assert task["bytes"] == pytest.approx(measured, rel=0.05)
 
 
@@ -669,10 +671,10 @@ def test_requests_lie_side_by_side(lake, tmp_path, capsys):
         request = replace(request, pointings=tuple(replace(p, mjd=mjd) for p in request.pointings))
         for module in (plan_exposures, render_exposures):
             for step in module.steps(lake, request):
-                publish.make(lake, step.plan, step.work, name=name)
+                publish.make_version(lake, step.plan, step.work, name=name)
         found[name] = archive.products(lake, name).to_pylist()
         assert {row["path"] for row in found[name]} == images_of(lake, name)
-    assert names.tables(lake, "b") == sorted((*preconditions.INPUTS, "products", "rendered_truth"))
+    assert request_links.tables_of_request(lake, "b") == sorted((*preconditions.INPUTS, "products", "rendered_truth"))
     assert read.version(lake, "galaxies", request="a").key == read.version(lake, "galaxies", request="b").key
     assert not {row["sha256"] for row in found["a"]} & {row["sha256"] for row in found["b"]}
     assert garbage.collect(lake, delete=True) == []
@@ -684,5 +686,5 @@ def test_requests_lie_side_by_side(lake, tmp_path, capsys):
     assert f"equals {path}" in capsys.readouterr().out
     # A plan anew of the same name frees what that name had before, and nothing else.
     for step in plan_exposures.steps(lake, replace(wanted(), name="b")):
-        publish.make(lake, step.plan, step.work, name="b")
+        publish.make_version(lake, step.plan, step.run_task, name="b")
     assert {path.parent.name for path in garbage.collect(lake)} <= {"exposures", "tasks"}

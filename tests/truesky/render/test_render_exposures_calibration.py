@@ -10,7 +10,7 @@ import pytest
 from astropy.io import fits
 
 from lake_schema.errors import BadInput
-from lake_schema.ids import kind_of
+from lake_schema.ids import kind_from_id
 from lake_schema.sky.ecliptic import ecliptic
 from lake_schema.store import layout, publish, read
 from tests import requests
@@ -21,7 +21,7 @@ from truesky.render.camera import detectors
 from truesky.render.products import read_back
 from truesky.render.sources import solar_system
 from truesky.request.from_toml import from_table
-from truesky.running import shell
+from truesky.running import submitted_job
 
 MODULES = (build_galaxies, build_stars, compute_fluxes, plan_exposures, render_exposures)
 BLOCK = {"channels": ["VIS"], "detectors": ["3-4"]}
@@ -51,14 +51,14 @@ def wanted():
 @contextmanager
 def small_detectors(side=256):
     """Detectors of VIS cut down to their middles, two halves and what is between them."""
-    mounted = detectors._mounted
+    mounted = detectors._apply_metrology
 
     def smaller(*args):
         for d in mounted(*args):
-            yield replace(d, nx=side, ny=side + d.middle)
+            yield replace(d, nx=side, ny=side + d.injection_rows)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(detectors, "_mounted", smaller)
+        patch.setattr(detectors, "_apply_metrology", smaller)
         yield
 
 
@@ -72,7 +72,7 @@ def check(lake, rows, columns):
     for row in science:
         exposed = exposures[row["exposure_id"]]
         kind = exposed["image_type"]
-        path = products.file(row["path"])
+        path = products.sidecar_path(row["path"])
         with fits.open(path) as units:
             header = units[0].header
             assert header["IMAGETYP"] == kind
@@ -108,7 +108,7 @@ def moving_of(lake):
     """Kind of image -> how many bodies are drawn on its frames."""
     exposures, found = exposures_of(lake), defaultdict(set)
     drawn = read.version(lake, "rendered_truth").rows(["exposure_id", "id"])
-    count = Counter(drawn["exposure_id"].to_numpy()[kind_of(drawn["id"].to_numpy()) == solar_system.KIND].tolist())
+    count = Counter(drawn["exposure_id"].to_numpy()[kind_from_id(drawn["id"].to_numpy()) == solar_system.KIND].tolist())
     for number, row in exposures.items():
         found[row["image_type"]].add(count[number])
     return found
@@ -121,18 +121,18 @@ def check_bodies(lake, request):
         assert (min(seen[kind]) > 0) == (max(seen[kind]) > 0) == (kind not in DARK)
     step = render_exposures.steps(lake, request)[0]
     exposures = exposures_of(lake)
-    before = {part.facts["exposure_id"]: part for part in step.plan.parts}
+    before = {part.facts["exposure_id"]: part for part in step.plan.tasks}
     one_body_each(lake, request.bodies, 17.0)
-    after = {part.facts["exposure_id"]: part for part in render_exposures.steps(lake, request)[0].plan.parts}
+    after = {part.facts["exposure_id"]: part for part in render_exposures.steps(lake, request)[0].plan.tasks}
     same = {number for number in before if before[number].facts["product"] == after[number].facts["product"]}
     assert same == {number for number, row in exposures.items() if row["image_type"] in DARK}
     for number, part in before.items():
         facts = {**step.plan.facts, **part.facts}
         if exposures[number]["image_type"] == "bias":
-            assert render_exposures.work(lake, facts).rows.num_rows
+            assert render_exposures.render_task(lake, facts).rows.num_rows
         elif number not in same:
             with pytest.raises(BadInput, match=r"bodies\.csv: has changed since the rendering began"):
-                render_exposures.work(lake, facts)
+                render_exposures.render_task(lake, facts)
 
 
 def test_each_kind_is_planned_rendered_and_published(lake, tmp_path):
@@ -142,14 +142,14 @@ def test_each_kind_is_planned_rendered_and_published(lake, tmp_path):
             if job is render_exposures:
                 request = replace(request, bodies=one_body_each(lake, tmp_path / "bodies.csv", 18.0))
             for step in job.steps(lake, request):
-                publish.make(lake, step.plan, step.work)
+                publish.make_version(lake, step.plan, step.work)
         check(lake, 128 + 20, 51 + 128 + 29)
         check_bodies(lake, request)
 
 
 @pytest.mark.nightly
 def test_by_spark_whole_detectors(spark, tmp_path):
-    root = layout.lake(tmp_path / "lake")
+    root = layout.resolve_lake(tmp_path / "lake")
     for module in MODULES:
-        shell.run(module.JOB, root, wanted())
+        submitted_job.run(module.JOB, root, wanted())
     check(root, 2086, 2128)

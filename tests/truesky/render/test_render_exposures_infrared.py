@@ -13,7 +13,7 @@ from truesky.fluxes import compute_fluxes
 from truesky.render import plan_exposures, render_exposures
 from truesky.render.products import read_back
 from truesky.request.from_toml import parse
-from truesky.running import shell
+from truesky.running import submitted_job
 
 MODULES = (build_galaxies, build_stars, compute_fluxes, plan_exposures, render_exposures)
 MJD, HOUR, FRAME = 60905.0, 1.0 / 24.0, 1.454
@@ -87,7 +87,9 @@ def opened(root, content):
     """Exposure -> the file's path, of a content."""
     version = read.version(root, "products")
     return {
-        row["exposure_id"]: version.file(row["path"]) for row in version.rows().to_pylist() if row["content"] == content
+        row["exposure_id"]: version.sidecar_path(row["path"])
+        for row in version.rows().to_pylist()
+        if row["content"] == content
     }
 
 
@@ -124,7 +126,7 @@ def check_what_is_left(root, files):
 def made(root, request, modules=MODULES):
     for module in modules:
         for step in module.steps(root, request):
-            publish.make(root, step.plan, step.work)
+            publish.make_version(root, step.plan, step.work)
 
 
 def test_each_kind_is_planned_rendered_and_published(lake, tmp_path):
@@ -135,9 +137,9 @@ def test_each_kind_is_planned_rendered_and_published(lake, tmp_path):
 
 @pytest.mark.nightly
 def test_by_spark_whole_detectors(spark, tmp_path):
-    root = layout.lake(tmp_path / "lake")
+    root = layout.resolve_lake(tmp_path / "lake")
     for module in MODULES:
-        shell.run(module.JOB, root, wanted(tmp_path))
+        submitted_job.run(module.JOB, root, wanted(tmp_path))
     check(root)
 
 

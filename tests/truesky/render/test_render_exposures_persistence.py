@@ -34,7 +34,7 @@ def frames(root):
     version, found = read.version(root, "products"), []
     for row in version.rows().to_pylist():
         if row["content"] == "science":
-            with fits.open(version.file(row["path"])) as units:
+            with fits.open(version.sidecar_path(row["path"])) as units:
                 header, border = units[0].header, units[0].header["REFPIX"]
                 pixels = units[1].data[border:-border, border:-border].astype(float)
                 start = header["MJD-OBS"] * 86400.0

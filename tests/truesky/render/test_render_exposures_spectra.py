@@ -22,7 +22,7 @@ from truesky.reduction import masters
 from truesky.render import grisms, models, plan_exposures, render_exposures
 from truesky.render.products import read_back
 from truesky.request.from_toml import parse
-from truesky.running import shell
+from truesky.running import submitted_job
 
 MODULES = (build_galaxies, build_stars, compute_fluxes, plan_exposures, render_exposures)
 MJD, NX, NY = 60905.0, 640, 96
@@ -89,7 +89,7 @@ def wanted(folder, more="", replaced=("", "")):
 def made(root, request, modules=MODULES):
     for module in modules:
         for step in module.steps(root, request):
-            publish.make(root, step.plan, step.work)
+            publish.make_version(root, step.plan, step.work)
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +99,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def rendered(folder):
-    root = layout.lake(folder / "lake")
+    root = layout.resolve_lake(folder / "lake")
     made(root, wanted(folder))
     return root
 
@@ -108,7 +108,9 @@ def opened(root, content):
     """Exposure -> the file's path, of a content."""
     version = read.version(root, "products")
     return {
-        row["exposure_id"]: version.file(row["path"]) for row in version.rows().to_pylist() if row["content"] == content
+        row["exposure_id"]: version.sidecar_path(row["path"])
+        for row in version.rows().to_pylist()
+        if row["content"] == content
     }
 
 
@@ -157,12 +159,12 @@ def test_grisms_at_opposite_angles_disperse_to_opposite_sides_and_tilts_along_ro
 
 @pytest.mark.nightly
 def test_by_spark_the_same_bytes(spark, rendered, tmp_path):
-    root = layout.lake(tmp_path / "lake")
+    root = layout.resolve_lake(tmp_path / "lake")
     for module in MODULES:
-        shell.run(module.JOB, root, wanted(tmp_path))
+        submitted_job.run(module.JOB, root, wanted(tmp_path))
     for name in ("products", "rendered_truth", "rendered_spectra"):
         assert read.version(root, name).manifest == read.version(rendered, name).manifest
-        assert read.verify(read.version(root, name), deep=True) == []
+        assert read.find_faults(read.version(root, name), deep=True) == []
 
 
 def test_sources_farther_away_than_images_are_read_have_a_first_order_on_the_detector(rendered):
@@ -197,7 +199,7 @@ def test_models_of_single_sources_add_up_to_the_published_image(rendered, folder
 
 
 def test_a_lake_on_object_storage_has_the_same_models(rendered, bucket):
-    source, place = drawn_first(rendered), s3.address(f"s3://{bucket[1]}/lake", bucket[0].url)
+    source, place = drawn_first(rendered), s3.parse_address(f"s3://{bucket[1]}/lake", bucket[0].url)
     list(push.push(rendered, place))
     found = []
     for address in (rendered, str(place)):

@@ -17,12 +17,12 @@ from truesky.catalogue import build_galaxies, build_stars
 from truesky.fluxes import compute_fluxes
 from truesky.randomness.rng import stream
 from truesky.render import detector_inputs, plan_exposures, render_exposures
-from truesky.render.effects.charge.persistence import Traps, pixels_of
-from truesky.render.exposure import persistence, scene_of
-from truesky.render.exposure.records import EarlierSky, Variant
+from truesky.render.effects.charge.persistence import PersistenceModel, variation_of_scene
+from truesky.render.exposure import persistence, scene_factory
+from truesky.render.exposure.records import PreviousSky, Variant
 from truesky.render.product_plan import RenderInputs
 from truesky.request.from_toml import parse
-from truesky.running import shell
+from truesky.running import submitted_job
 
 SIDE, COUNT = 256, 120
 # Where the telescope looked first, and then.
@@ -87,10 +87,10 @@ def wanted(folder, sequence=SEQUENCE):
 @pytest.fixture(scope="module")
 def planned(folder):
     """A lake with everything but images."""
-    root, request = layout.lake(folder / "lake"), wanted(folder)
+    root, request = layout.resolve_lake(folder / "lake"), wanted(folder)
     for module in (build_galaxies, build_stars, compute_fluxes, plan_exposures):
         for step in module.steps(root, request):
-            publish.make(root, step.plan, step.work)
+            publish.make_version(root, step.plan, step.work)
     return root
 
 
@@ -101,15 +101,15 @@ def backwards(function, parts):
 @pytest.fixture(scope="module")
 def whole(planned, folder):
     """With all of them, the last first."""
-    root = layout.lake(shutil.copytree(planned, folder / "whole", symlinks=True))
+    root = layout.resolve_lake(shutil.copytree(planned, folder / "whole", symlinks=True))
     for step in render_exposures.steps(root, wanted(folder)):
-        publish.make(root, step.plan, step.work, backwards)
+        publish.make_version(root, step.plan, step.run_task, backwards)
     return root
 
 
 @pytest.fixture
 def lake(planned, tmp_path):
-    return layout.lake(shutil.copytree(planned, tmp_path / "lake", symlinks=True))
+    return layout.resolve_lake(shutil.copytree(planned, tmp_path / "lake", symlinks=True))
 
 
 def _killed(root, request):
@@ -117,7 +117,7 @@ def _killed(root, request):
     step = render_exposures.steps(root, request)[0]
 
     def work(lake, facts):
-        output = step.work(lake, facts)
+        output = step.run_task(lake, facts)
 
         def torn(target):
             target.write_bytes(b"SIMPLE")
@@ -125,7 +125,7 @@ def _killed(root, request):
 
         return replace(output, files=dict.fromkeys(output.files, torn)) if facts["exposure_id"] == 4 else output
 
-    publish.make(root, step.plan, work)
+    publish.make_version(root, step.plan, work)
 
 
 @pytest.mark.spark
@@ -136,26 +136,26 @@ def test_the_same_bytes_in_any_order_and_after_a_kill(spark, lake, whole, folder
     child.start()
     child.join()
     assert child.exitcode == -signal.SIGKILL
-    left = len(list(layout.table(lake, "products").glob(".receipts-*/[!.]*.json")))
+    left = len(list(layout.table_folder(lake, "products").glob(".receipts-*/[!.]*.json")))
     assert 0 < left < len(BEFORE)
-    shell.run(render_exposures.JOB, lake, request)
+    submitted_job.run(render_exposures.JOB, lake, request)
     for name in ("products", "rendered_truth", "rendered_spectra", "exposure_files"):
         assert read.version(lake, name).manifest == read.version(whole, name).manifest
-        assert read.verify(read.version(lake, name), deep=True) == []
+        assert read.find_faults(read.version(lake, name), deep=True) == []
 
 
 def parts(root, request):
     step = render_exposures.steps(root, request)[0]
-    return step, {part.facts["exposure_id"]: part for part in step.plan.parts}
+    return step, {part.facts["exposure_id"]: part for part in step.plan.tasks}
 
 
 def test_the_last_alone_is_what_it_is_after_the_others(lake, whole, folder):
     step, found = parts(lake, wanted(folder))
-    publish.make(lake, replace(step.plan, parts=(found[5],)), step.work)
+    publish.make_version(lake, replace(step.plan, parts=(found[5],)), step.run_task)
     alone, among = (read.version(root, "products") for root in (lake, whole))
     rows = alone.rows().to_pylist()
     assert {row["content"] for row in rows} == {"science", "noise_free", "sky", "ghosts", "persistence"}
-    assert all(alone.sha256(row["path"]) == among.sha256(row["path"]) for row in rows)
+    assert all(alone.file_sha256(row["path"]) == among.file_sha256(row["path"]) for row in rows)
 
 
 def keys(root, request):
@@ -166,7 +166,7 @@ def changed(lake, folder, sequence):
     """Exposures whose products another sequence makes others."""
     before, request = keys(lake, wanted(folder)), wanted(folder, sequence)
     for step in plan_exposures.steps(lake, request):
-        publish.make(lake, step.plan, step.work)
+        publish.make_version(lake, step.plan, step.run_task)
     after = keys(lake, request)
     return {number for number in before if before[number] != after[number]}
 
@@ -190,7 +190,7 @@ def test_products_change_with_the_catalogue_about_exposures_before_them(lake, fo
     here = {part["name"] for part in stars if set(part["facts"]["generation_cells"]) & tasks[5]}
     assert there
     assert not there & here
-    sums = read.Version.part_sha256
+    sums = read.Version.partition_sha256
 
     def other(self, part):
         return "another" if self.table == "stars" and part in there else sums(self, part)
@@ -209,28 +209,30 @@ def test_products_change_with_the_catalogue_about_exposures_before_them(lake, fo
 
 def test_what_is_left_is_what_whole_images_leave(whole, folder):
     """Of everything that each earlier image expects, spectra among them: to 1.5 e- in any pixel."""
-    resolved = RenderInputs.of(whole, wanted(folder))
+    resolved = RenderInputs.from_request(whole, wanted(folder))
     inputs, mission = resolved.versions, resolved.mission
-    exposures = {row.exposure_id: row for row in map(ExposureRow.of, inputs["exposures"].rows().to_pylist())}
+    exposures = {row.exposure_id: row for row in map(ExposureRow.from_row, inputs["exposures"].rows().to_pylist())}
     tasks = {task["exposure_id"]: task for task in inputs["tasks"].rows().to_pylist()}
     version = read.version(whole, "products")
-    files = {(row["exposure_id"], row["content"]): version.file(row["path"]) for row in version.rows().to_pylist()}
+    files = {
+        (row["exposure_id"], row["content"]): version.sidecar_path(row["path"]) for row in version.rows().to_pylist()
+    }
     now = exposures[5]
-    earlier = detector_inputs.earlier_exposures(whole, inputs, now, tasks[5], mission, 5)
+    earlier = detector_inputs.find_previous_exposures(whole, inputs, now, tasks[5], mission, 5)
     assert [before.exposure.exposure_id for before in earlier] == BEFORE[5]
-    assert not any(isinstance(before, EarlierSky) for before in earlier)
+    assert not any(isinstance(before, PreviousSky) for before in earlier)
     aim = replace(earlier[-1].aim, exposure=now)
     variant = Variant(mission, wanted(folder).accuracy, {})
-    found = persistence.remembered(aim, earlier, variant, 5)
-    scene = scene_of.of_aim(aim, variant)
-    traps, expected = Traps.of(scene), np.zeros_like(found)
-    own = pixels_of(scene, stream(5, "nisp", aim.detector.name, "persistence_pixels"))
+    found = persistence.total_charge(aim, earlier, variant, 5)
+    scene = scene_factory.from_aim(aim, variant)
+    traps, expected = PersistenceModel.from_scene(scene), np.zeros_like(found)
+    own = variation_of_scene(scene, stream(5, "nisp", aim.detector.name, "persistence_pixels"))
     for number in BEFORE[5]:
         row = exposures[number]
         maps = [files.get((number, content)) for content in ("noise_free", "sky", "ghosts")]
         light = sum(images.read_images(file)[0].data.astype(float) for file in maps if file is not None)
         times = (now.mjd - row.mjd) / SECOND, now.exposure_time_s, row.exposure_time_s
-        expected += traps.left(light, *times, own)
+        expected += traps.released_charge(light, *times, own)
     assert expected.max() > 100.0
     assert np.abs(found - expected).max() < 1.5
     # Its own share of each pixel is in the image.

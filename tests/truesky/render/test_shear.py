@@ -29,7 +29,7 @@ KINDS = {
 
 def galaxy(scene: Scene, kind: str, magnitude: float) -> Sources:
     electrons = scene.exposure * 10 ** (0.4 * (scene.zero_point - magnitude))
-    middle = np.array([float(errors.COMPARED)])
+    middle = np.array([float(errors.COMPARED_SIDE)])
     form = galaxy_shapes.shapes(galaxies(0.0, 0.0, position_angle=31.0, **KINDS[kind]))
     jacobian = scene.scale * np.array([[[1.001, 0.002], [-0.003, 0.998]]])
     return Sources(np.array([1]), middle + 0.3, middle - 0.2, jacobian, np.array([electrons]), np.array([0]), form)
@@ -42,14 +42,14 @@ def psf_in(scene):
 @cache
 def truth(scene, kind, magnitude):
     one = galaxy(scene, kind, magnitude)
-    found = errors.response(errors.drawing(psf_in(scene), scene, errors.FULL), one, scene.scale)
+    found = errors.response(errors.make_drawer(psf_in(scene), scene, errors.FULL_SETTINGS), one, scene.scale)
     # The weight of the moments halves what shear does; nothing more is wrong with it.
     assert 0.2 < found[:2].min() <= found[:2].max() < 2.0
     return found
 
 
 def biases(scene, kind, magnitude, settings) -> tuple[float, float]:
-    draw = errors.drawing(psf_in(scene), scene, settings)
+    draw = errors.make_drawer(psf_in(scene), scene, settings)
     return errors.bias(
         errors.response(draw, galaxy(scene, kind, magnitude), scene.scale), truth(scene, kind, magnitude)
     )
@@ -77,14 +77,14 @@ def test_response_to_shear(tier, kind, magnitude):
 def test_response_of_many_galaxies_through_their_own_psf(scene, tier):
     accuracy, most_m, most_c = BOUNDS[tier]
     found, some = errors.shear_response(scene, {tier: settings_for(accuracy)}, 92, 24)
-    kinds = errors.worst_by_kind(found[tier], some, scene)
+    kinds = errors.worst_by_group(found[tier], some, scene)
     for kind, (_, m, c) in kinds.items():
         assert (m <= most_m, c <= most_c) == (True, True), (kind, m, c)
 
 
 def test_a_drawing_that_loses_wings_is_caught():
     """The measure itself: stamps too small by half bias the response."""
-    small = replace(settings_for(DRAFT), edge=1.0, aliased=1.0, least=1.6)
+    small = replace(settings_for(DRAFT), edge=1.0, aliased=1.0, min_size=1.6)
     assert abs(biases(VIS, "bulge", 20.0, small)[0]) > 1e-3
 
 
@@ -94,7 +94,7 @@ def test_galsim_responds_alike(kind):
     """The truth itself, against galsim's own drawing."""
 
     def by_galsim(one):
-        return reference.reference(one, 0, psf_in(VIS), 2 * errors.COMPARED)
+        return reference.draw_reference(one, 0, psf_in(VIS), 2 * errors.COMPARED_SIDE)
 
     found = errors.response(by_galsim, galaxy(VIS, kind, 20.0), VIS.scale)
     m, c = errors.bias(found, truth(VIS, kind, 20.0))

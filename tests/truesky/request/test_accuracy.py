@@ -24,7 +24,7 @@ def error(row, name):
 def test_each_number_alone_decides(name):
     """Whatever the others allow, a finer number takes another row, of more time."""
     asked = sorted((error(row, name) for row in accuracy.rows()), reverse=True)
-    seconds = [accuracy.row_for(replace(ANYTHING, **{name: value}))["seconds"] for value in asked]
+    seconds = [accuracy.fastest_row(replace(ANYTHING, **{name: value}))["seconds"] for value in asked]
     assert seconds == sorted(seconds)
     assert len(set(seconds)) >= 4, seconds
 
@@ -33,7 +33,7 @@ def test_each_number_alone_decides(name):
 def test_a_number_of_its_own_takes_what_it_needs(name):
     """Asked for no more than a row has, that row or a cheaper one; a little less, another."""
     for row in accuracy.rows():
-        own = accuracy.row_for(replace(ANYTHING, **{name: error(row, name)}))
+        own = accuracy.fastest_row(replace(ANYTHING, **{name: error(row, name)}))
         assert own["seconds"] <= row["seconds"]
         assert error(own, name) <= error(row, name)
 
@@ -41,40 +41,40 @@ def test_a_number_of_its_own_takes_what_it_needs(name):
 @pytest.mark.parametrize("preset", PRESETS)
 def test_presets_are_held_by_both_samples(preset):
     """By sources that the settings were chosen on, and by those that they were not."""
-    row, wanted = accuracy.row_for(PRESETS[preset]), asdict(PRESETS[preset])
+    row, wanted = accuracy.fastest_row(PRESETS[preset]), asdict(PRESETS[preset])
     for name, value in wanted.items():
         assert row[name] <= value
         assert row[f"{name}_held"] <= value
-    told = asdict(accuracy.reached(PRESETS[preset]))
+    told = asdict(accuracy.expected_errors(PRESETS[preset]))
     assert told == {name: row[f"{name}_held"] for name in wanted}
 
 
 def test_no_cheaper_row_would_do():
     for wanted in PRESETS.values():
-        mine = accuracy.row_for(wanted)
+        mine = accuracy.fastest_row(wanted)
         for row in accuracy.rows():
             within = all(error(row, name) <= value for name, value in asdict(wanted).items())
             assert not within or row["seconds"] >= mine["seconds"]
 
 
 def test_a_quicklook_takes_half_of_a_draft_at_most():
-    quick, draft = (accuracy.row_for(wanted)["seconds"] for wanted in (QUICKLOOK, DRAFT))
+    quick, draft = (accuracy.fastest_row(wanted)["seconds"] for wanted in (QUICKLOOK, DRAFT))
     assert 0.0 < quick <= 0.5 * draft
-    assert accuracy.row_for(ANYTHING)["seconds"] <= quick
+    assert accuracy.fastest_row(ANYTHING)["seconds"] <= quick
 
 
 @pytest.mark.parametrize("name", NUMBERS)
 def test_beyond_reach_is_refused_with_the_best_there_is(name):
     with pytest.raises(BadInput, match=rf"^accuracy\.{name} = 1e-12 is beyond reach, the best is \S+$") as refusal:
-        accuracy.row_for(replace(SURVEY, **{name: 1e-12}))
+        accuracy.fastest_row(replace(SURVEY, **{name: 1e-12}))
     best = float(str(refusal.value).rpartition(" ")[2])
-    row = accuracy.row_for(replace(ANYTHING, **{name: best}))
+    row = accuracy.fastest_row(replace(ANYTHING, **{name: best}))
     assert error(row, name) <= best <= 1.2 * error(accuracy.rows()[-1], name)
 
 
 def test_every_number_that_is_beyond_reach_is_named():
     with pytest.raises(BadInput) as refusal:
-        accuracy.row_for(Accuracy(1e-12, 1e-12, 1e-12, 1e-12))
+        accuracy.fastest_row(Accuracy(1e-12, 1e-12, 1e-12, 1e-12))
     assert all(f"accuracy.{name} = 1e-12" in str(refusal.value) for name in NUMBERS)
     assert "\n" not in str(refusal.value)
 
@@ -89,4 +89,4 @@ def test_a_request_is_refused_before_anything_is_made(where):
 
 def test_the_best_is_rounded_so_that_it_can_be_asked_for():
     for value in (1.01e-5, 9.96e-5, 2.0e-3, 0.0949, 1.0):
-        assert value <= float(accuracy._up(value)) <= 1.11 * value
+        assert value <= float(accuracy._round_up(value)) <= 1.11 * value

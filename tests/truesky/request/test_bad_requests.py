@@ -10,7 +10,7 @@ from truesky.catalogue import build_gaia, build_galaxies, build_stars
 from truesky.commands import check
 from truesky.fluxes import compute_fluxes
 from truesky.render import plan_exposures, render_exposures
-from truesky.running import shell
+from truesky.running import submitted_job
 
 JOBS = [module.JOB for module in (build_galaxies, build_stars, build_gaia, compute_fluxes, plan_exposures)]
 JOBS.append(render_exposures.JOB)
@@ -101,7 +101,7 @@ def _no_session(monkeypatch):
     def fail(*arguments):
         raise AssertionError("a session was asked for")
 
-    monkeypatch.setattr(shell, "_spark_map", fail)
+    monkeypatch.setattr(submitted_job, "_spark_map", fail)
 
 
 @pytest.mark.parametrize(("text", "words"), BAD.values(), ids=BAD)
@@ -115,7 +115,7 @@ def test_a_malformed_request_is_refused_by_the_check_and_by_every_job(tmp_path, 
     assert words in said
     assert said.count("\n") == 1
     for job in JOBS:
-        assert shell.main(job, ["--lake", str(lake), "--request", str(path)]) == 2
+        assert submitted_job.main(job, ["--lake", str(lake), "--request", str(path)]) == 2
         assert words in capsys.readouterr().err
     assert not lake.exists()
 

@@ -8,7 +8,7 @@ import pytest
 
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import resolve
-from lake_schema.tables.exposures import EUCLID_BANDS, RENDERED
+from lake_schema.tables.exposures import EUCLID_BANDS, RENDERED_TYPES
 from tests import requests
 from truesky.catalogue import build_galaxies, build_stars
 from truesky.commands import check, plan
@@ -16,7 +16,7 @@ from truesky.render.channels import registry
 from truesky.render.planning.planned_exposures import bands_of
 from truesky.request import checks, observations
 from truesky.request.from_toml import parse
-from truesky.running import shell
+from truesky.running import submitted_job
 
 REQUESTS = Path(__file__).resolve().parents[3] / "requests"
 # Euclid's three channels, and calibrations of NISP.
@@ -24,7 +24,7 @@ SURVEY = REQUESTS / "sc8_pilot.toml"
 
 
 def test_what_is_said_to_be_rendered_has_effects():
-    assert {name: set(kinds) for name, kinds in RENDERED.items()} == {
+    assert {name: set(kinds) for name, kinds in RENDERED_TYPES.items()} == {
         name: set(channel.effects) for name, channel in registry.CHANNELS.items()
     }
 
@@ -39,7 +39,7 @@ SHIPPED = [
 @pytest.mark.parametrize("channel", observations.CHANNELS)
 def test_what_is_rendered_can_be_asked_for(channel):
     asked = {*observations._SKY_TYPES, *observations._CALIBRATIONS[channel]}
-    assert set(RENDERED.get(channel, ())) <= asked <= set(observations.IMAGE_TYPES)
+    assert set(RENDERED_TYPES.get(channel, ())) <= asked <= set(observations.IMAGE_TYPES)
 
 
 def test_requests_know_the_bands_that_the_planner_knows():
@@ -93,8 +93,8 @@ def test_what_is_rendered_in_part_is_refused_and_the_rest_named(channels, kind, 
             checks.check_rendered(request)
     else:
         checks.check_rendered(request)
-    assert checks.skipped(request).startswith(said)
-    assert bool(checks.skipped(request)) == bool(said)
+    assert checks.describe_skipped(request).startswith(said)
+    assert bool(checks.describe_skipped(request)) == bool(said)
 
 
 def stars_by_decam(folder):
@@ -116,8 +116,8 @@ def test_the_command_refuses_in_one_line_and_plans_on_demand(tmp_path, capsys):
 
 def test_every_job_says_what_is_only_planned(tmp_path, capsys):
     path = requests.written(tmp_path, '[[observation]]\nchannels = ["VIS"]\n' + stars_by_decam(tmp_path))
-    job = shell.Job("sleep", "", lambda lake, request: [])
-    assert shell.main(job, ["--lake", str(tmp_path / "lake"), "--request", str(path)]) == 0
+    job = submitted_job.Job("sleep", "", lambda lake, request: [])
+    assert submitted_job.main(job, ["--lake", str(tmp_path / "lake"), "--request", str(path)]) == 0
     assert capsys.readouterr().err == (
         "sleep: EXT standard_star: planned and forecast, skipped by rendering (no simulator yet)\n"
     )

@@ -3,7 +3,7 @@
 import pytest
 
 from truesky.commands import check, plan
-from truesky.running import shell
+from truesky.running import submitted_job
 
 HEAD = 'name = "x"\nseed = 1\n'
 AREA = "[area]\ncone = { ra = 53.117, dec = -27.808, radius = 0.2 }\n"
@@ -162,7 +162,7 @@ def test_a_mistake_is_refused_in_one_line_and_nothing_is_written(tmp_path, capsy
     before = sorted(tmp_path.iterdir())
     for call in (
         lambda: check.main([str(path)]),
-        lambda: shell.main(plan.JOB, ["--lake", str(lake), "--request", str(path), "--dry-run"]),
+        lambda: submitted_job.main(plan.JOB, ["--lake", str(lake), "--request", str(path), "--dry-run"]),
     ):
         assert call() == 2
         said = capsys.readouterr()

@@ -8,7 +8,7 @@ import pytest
 
 from lake_schema.errors import BadInput
 from lake_schema.store import layout, publish, read
-from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.store.provenance import file_sha256
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.stars import STARS
@@ -18,7 +18,7 @@ from truesky.catalogue import build_galaxies, build_stars
 from truesky.request import universe
 from truesky.request.files import Catalogue, DustMap, Ingest
 from truesky.request.from_toml import from_table, parse
-from truesky.running import shell
+from truesky.running import submitted_job
 
 TABLES = {"galaxies": GALAXIES, "stars": STARS}
 # What a build job adds to the request's own.
@@ -43,15 +43,15 @@ def wanted(name="a", seed=11, **depth):
 
 def catalogue(lake, table, request, name=None, **facts):
     """A catalogue as a build job would publish it for a request."""
-    own = {key: value for key, value in universe.wanted(request).items() if key in keys()[table]}
-    plan = Plan(TABLES[table], {**own, **facts}, (Part(layout.cell_file(5, 1607), {}),))
-    publish.make(lake, plan, lambda root, facts: Output(rows_of(TABLES[table], 3)), name=name)
+    own = {key: value for key, value in universe.requested_values(request).items() if key in keys()[table]}
+    plan = Plan(TABLES[table], {**own, **facts}, (Task(layout.cell_file(5, 1607), {}),))
+    publish.make_version(lake, plan, lambda root, facts: Output(rows_of(TABLES[table], 3)), name=name)
     return read.version(lake, table, plan.key)
 
 
 def test_what_shapes_a_catalogue_is_in_the_universe():
     """A key that a build job writes down and this does not know would never be compared."""
-    known = universe.wanted(wanted())
+    known = universe.requested_values(wanted())
     assert set().union(*keys().values()) <= known.keys()
     assert not known.keys() & {"rows_a_file", "tycho2", "catalogue", "columns"}
 
@@ -72,13 +72,13 @@ def test_what_shapes_a_catalogue_is_in_the_universe():
 )
 def test_another_universe_is_refused_by_what_differs(lake, table, other, words):
     version = catalogue(lake, table, wanted())
-    universe.refuse_other([version], wanted())
+    universe.check_catalogues([version], wanted())
     with pytest.raises(BadInput, match=words):
-        universe.refuse_other([version], other)
+        universe.check_catalogues([version], other)
 
 
 def test_what_shapes_only_the_other_catalogue_is_no_difference(lake):
-    universe.refuse_other([catalogue(lake, "galaxies", wanted())], wanted(star_limit=20.0))
+    universe.check_catalogues([catalogue(lake, "galaxies", wanted())], wanted(star_limit=20.0))
 
 
 def test_files_are_compared_by_what_they_hold(lake, tmp_path):
@@ -94,19 +94,19 @@ def test_files_are_compared_by_what_they_hold(lake, tmp_path):
 
     version = catalogue(lake, "galaxies", wanted(), ingest=about(file))
     for path in (file, same):
-        universe.refuse_other([version], request(path))
+        universe.check_catalogues([version], request(path))
     with pytest.raises(BadInput, match="table galaxies has other files of ingest than the request"):
-        universe.refuse_other([version], request(other))
+        universe.check_catalogues([version], request(other))
     with pytest.raises(BadInput, match="table galaxies has files of ingest, the request none"):
-        universe.refuse_other([version], wanted())
+        universe.check_catalogues([version], wanted())
     # One more, or one fewer, is another catalogue.
     with pytest.raises(BadInput, match="table galaxies has other files of ingest than the request"):
-        universe.refuse_other([version], request(file, other))
+        universe.check_catalogues([version], request(file, other))
     two = catalogue(lake, "galaxies", wanted(), ingest=about(file, other))
     with pytest.raises(BadInput, match="table galaxies has other files of ingest than the request"):
-        universe.refuse_other([two], request(file))
+        universe.check_catalogues([two], request(file))
     file.unlink()
-    universe.refuse_other([version], request(file))
+    universe.check_catalogues([version], request(file))
 
 
 def test_files_are_compared_by_how_they_are_read(lake, tmp_path):
@@ -119,16 +119,16 @@ def test_files_are_compared_by_how_they_are_read(lake, tmp_path):
 
     about = {**sums, "format": "euclid", "columns": {"z_true": '"z"'}}
     version = catalogue(lake, "galaxies", wanted(), ingest=about)
-    universe.refuse_other([version], request('"z"'))
+    universe.check_catalogues([version], request('"z"'))
     with pytest.raises(BadInput, match="table galaxies has format of ingest euclid, the request flagship2: run"):
-        universe.refuse_other([version], request('"z"', "flagship2"))
+        universe.check_catalogues([version], request('"z"', "flagship2"))
     with pytest.raises(BadInput, match=r"table galaxies has columns of ingest .*, the request .*zz"):
-        universe.refuse_other([version], request('"zz"'))
+        universe.check_catalogues([version], request('"zz"'))
     for kind in ("halos", "training"):
         version = catalogue(lake, "galaxies", wanted(), **{kind: {**sums, "columns": {"z_true": '"z"'}}})
-        universe.refuse_other([version], request('"z"', "", kind=kind))
+        universe.check_catalogues([version], request('"z"', "", kind=kind))
         with pytest.raises(BadInput, match=f"table galaxies has columns of {kind} "):
-            universe.refuse_other([version], request('"zz"', "", kind=kind))
+            universe.check_catalogues([version], request('"zz"', "", kind=kind))
 
 
 @pytest.mark.parametrize("listed", [True, False])
@@ -140,10 +140,10 @@ def test_files_in_pairs_and_others_in_their_folder(lake, tmp_path, listed):
     version = catalogue(lake, "galaxies", wanted(), ingest={"sha256": sums, "format": "skycatalogs", "columns": {}})
     given = Catalogue((tmp_path / names[0] if listed else tmp_path,), "skycatalogs")
     request = replace(wanted(), ingest=Ingest(galaxies=given))
-    universe.refuse_other([version], request)
+    universe.check_catalogues([version], request)
     (tmp_path / names[1]).write_text("other")
     with pytest.raises(BadInput, match="other files of ingest"):
-        universe.refuse_other([version], request)
+        universe.check_catalogues([version], request)
 
 
 def test_dust_is_of_both_catalogues(lake, tmp_path):
@@ -151,29 +151,29 @@ def test_dust_is_of_both_catalogues(lake, tmp_path):
     dust = Ingest(dust=DustMap(tmp_path / "dust.fits", "EBV", "ebv", "", ""))
     for table in TABLES:
         with pytest.raises(BadInput, match=f"table {table} has no files of dust, the request some"):
-            universe.refuse_other([catalogue(lake, table, wanted())], replace(wanted(), ingest=dust))
+            universe.check_catalogues([catalogue(lake, table, wanted())], replace(wanted(), ingest=dust))
 
 
 def test_a_lake_holds_one_universe(lake):
     for table in TABLES:
         catalogue(lake, table, wanted("a"), name="a")
-    universe.refuse_others(lake, wanted("b"))
+    universe.check_lake(lake, wanted("b"))
     with pytest.raises(
         BadInput, match=r"holds the universe of request a: its galaxies have seed 11, the request 12: use"
     ):
-        universe.refuse_others(lake, wanted("b", seed=12))
+        universe.check_lake(lake, wanted("b", seed=12))
     with pytest.raises(BadInput, match=r"its stars have star_limit 26.0, .*: use another folder for request b"):
-        universe.refuse_others(lake, wanted("b", star_limit=20.0))
+        universe.check_lake(lake, wanted("b", star_limit=20.0))
     # Alone in its lake, a request may change its own.
-    universe.refuse_others(lake, wanted("a", seed=12))
+    universe.check_lake(lake, wanted("a", seed=12))
 
 
 def test_every_job_looks_before_it_computes(lake, tmp_path, capsys):
     catalogue(lake, "stars", wanted("a"), name="a")
     before = sorted(lake.rglob("*"))
-    job = shell.Job("toy", "", lambda root, request: pytest.fail("it began"))
+    job = submitted_job.Job("toy", "", lambda root, request: pytest.fail("it began"))
     file = requests.written(tmp_path, seed=12)
-    assert shell.main(job, ["--lake", str(lake), "--request", str(file)]) == 2
+    assert submitted_job.main(job, ["--lake", str(lake), "--request", str(file)]) == 2
     assert capsys.readouterr().err.endswith(
         f"lake {lake} holds the universe of request a: its stars have seed 11, the request 12: use another folder for "
         f"request {parse(file).name}\n"

@@ -8,15 +8,15 @@ import pytest
 
 from lake_schema.store import publish, read
 from tests.universe import CELLS, toy_plan, toy_work
-from truesky.running.session import session
+from truesky.running.session import get_session
 
 pytestmark = pytest.mark.spark
 
 
 def test_other_readers_find_the_same_rows(spark, lake):
-    publish.make(lake, toy_plan(), toy_work)
+    publish.make_version(lake, toy_plan(), toy_work)
     version = read.version(lake, "toy")
-    ours, files = version.rows().sort_by("id"), [str(version.path(part)) for part in version.parts]
+    ours, files = version.rows().sort_by("id"), [str(version.partition_path(part)) for part in version.partitions]
     toy = spark.read.parquet(*files)
     assert toy.columns == ours.column_names
     assert toy.orderBy("id").toArrow().equals(ours.cast(toy.toArrow().schema))
@@ -42,4 +42,4 @@ def test_nobody_else_can_reach_it(spark):
 
 
 def test_there_is_one_session(spark):
-    assert session("another").sparkContext is spark.sparkContext
+    assert get_session("another").sparkContext is spark.sparkContext

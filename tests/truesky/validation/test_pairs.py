@@ -9,7 +9,7 @@ from lake_schema import sky
 from lake_schema.ids import GENERATION_ORDER
 from truesky.validation import field as fields
 from truesky.validation import pairs, two_points
-from truesky.validation.two_points import ARCMIN, Measured
+from truesky.validation.two_points import ARCMIN, TwoPointFunction
 
 EDGES = np.radians([0.01, 0.1, 0.3, 0.8])
 
@@ -17,8 +17,8 @@ EDGES = np.radians([0.01, 0.1, 0.3, 0.8])
 def around(rng, ra, dec, n=150):
     """Places within 1 deg."""
     east, north = np.radians(rng.uniform(-0.7, 0.7, (2, n)))
-    ra, dec = sky.displaced(np.full(n, ra), np.full(n, dec), east, north)
-    return sky.wrapped(ra), dec
+    ra, dec = sky.offset_positions(np.full(n, ra), np.full(n, dec), east, north)
+    return sky.wrap_angle(ra), dec
 
 
 @pytest.mark.parametrize("centre", [(0.0, 12.0), (0.0, 90.0), (77.0, -90.0), (180.0, 0.0)])
@@ -26,12 +26,12 @@ def test_every_pair_is_counted_once(centre):
     rng = np.random.default_rng(2)
     ra, dec = around(rng, *centre)
     kind, patch = rng.integers(0, 2, 150), rng.integers(0, 3, 150)
-    found = pairs.counted(sky.unit_vectors(ra, dec), kind, patch, EDGES)
+    found = pairs.count_pairs(sky.unit_vectors(ra, dec), kind, patch, EDGES)
     one, other = np.triu_indices(150, 1)
     apart = np.radians(sky.separation(ra[one], dec[one], ra[other], dec[other]))
     for left_out in (None, 0, 1, 2):
         here = np.ones(len(one), bool) if left_out is None else (patch[one] != left_out) & (patch[other] != left_out)
-        sums = found.total if left_out is None else found.without[left_out]
+        sums = found.total if left_out is None else found.jackknife[left_out]
         for k in range(3):
             assert sums[k].tolist() == np.histogram(apart[here & (kind[one] + kind[other] == k)], EDGES)[0].tolist()
 
@@ -47,7 +47,7 @@ def test_shear_about_a_mass_is_tangential_everywhere(centre):
     twice = 2.0 * np.arctan2(towards[:, 1], towards[:, 0])
     shear = np.stack([-0.03 * np.cos(twice), -0.03 * np.sin(twice), np.zeros(150)], 1)
     shear[0] = 0.0, 0.0, 1.0
-    found = pairs.sheared(ra, dec, shear, np.zeros(150, int), EDGES)
+    found = pairs.sum_shear_products(ra, dec, shear, np.zeros(150, int), EDGES)
     apart = np.radians(sky.separation(ra[0], dec[0], ra[1:], dec[1:]))
     number = np.histogram(apart, EDGES)[0]
     assert found.total[5] == pytest.approx(0.5 * 0.03 * number, abs=1e-9)
@@ -58,25 +58,25 @@ def test_shear_about_a_mass_is_tangential_everywhere(centre):
 def test_uniform_shear_is_plus_alone():
     ra, dec = around(np.random.default_rng(4), 0.0, 0.0)
     shear = np.tile([0.02, -0.01, 0.0], (150, 1))
-    found = pairs.sheared(ra, dec, shear, np.zeros(150, int), EDGES)
+    found = pairs.sum_shear_products(ra, dec, shear, np.zeros(150, int), EDGES)
     assert found.total[1] / found.total[0] == pytest.approx(np.full(3, 5e-4), rel=1e-3, abs=0.0)
 
 
 def test_thinning_is_by_identifiers_and_as_much_as_is_wanted():
     ra, dec = around(np.random.default_rng(5), 30.0, 40.0, 2000)
     place, ids = sky.unit_vectors(ra, dec), np.arange(2000) + (1 << 58)
-    kept = pairs.thinned(ids, place, EDGES[-1], 5e5)
-    assert pairs.thinned(ids, place, EDGES[-1], 1e9).all()
+    kept = pairs.thin_sample(ids, place, EDGES[-1], 5e5)
+    assert pairs.thin_sample(ids, place, EDGES[-1], 1e9).all()
     assert 400 < kept.sum() < 1400
     order = np.random.default_rng(6).permutation(2000)
-    assert (pairs.thinned(ids[order], place[order], EDGES[-1], 5e5) == kept[order]).all()
+    assert (pairs.thin_sample(ids[order], place[order], EDGES[-1], 5e5) == kept[order]).all()
 
 
 def test_errors_of_patches_are_those_of_a_mean():
     values = np.random.default_rng(7).normal(size=(16, 400))
     without = (values.sum(0) - values) / 15
-    assert np.mean(fields.spread(without)) == pytest.approx(0.25, rel=0.05)
-    assert np.isnan(fields.spread(without[:4])).all()
+    assert np.mean(fields.jackknife_error(without)) == pytest.approx(0.25, rel=0.05)
+    assert np.isnan(fields.jackknife_error(without[:4])).all()
 
 
 def test_a_catalogue_that_does_not_say_where_it_was_drawn_is_where_its_sources_are():
@@ -86,17 +86,19 @@ def test_a_catalogue_that_does_not_say_where_it_was_drawn_is_where_its_sources_a
     )
 
     silent = SimpleNamespace(manifest={"parts": [{"facts": {}}]})
-    found = fields.of_version(silent, index)
+    found = fields.from_version(silent, index)
     assert found.order > GENERATION_ORDER + 1
-    assert found.patches <= 2
+    assert found.n_patches <= 2
     assert found.area == pytest.approx(32 * sky.cell_area(GENERATION_ORDER + 2), rel=0.02)
-    assert fields.of_version(silent, index[:0]).patch_of(index[:3]).tolist() == [-1, -1, -1]
+    assert fields.from_version(silent, index[:0]).patch_of(index[:3]).tolist() == [-1, -1, -1]
 
 
 def test_wide_bins_are_of_their_narrow_ones():
     edges, number = np.array([0.0, 1.0, 2.0, 4.0, 8.0]) * ARCMIN, np.array([0.0, 2.0, 6.0, 5.0])
-    fine = Measured(edges, number, np.array([[np.nan, 1.0, 3.0, 7.0]]), np.array([[[np.nan, 1.0, 3.0, 7.0]]] * 8))
-    wide = two_points.grouped(fine, edges[[1, 3, 4]])
+    fine = TwoPointFunction(
+        edges, number, np.array([[np.nan, 1.0, 3.0, 7.0]]), np.array([[[np.nan, 1.0, 3.0, 7.0]]] * 8)
+    )
+    wide = two_points.rebin(fine, edges[[1, 3, 4]])
     assert wide.value.tolist() == [[2.5, 7.0]]
     assert wide.number.tolist() == [8.0, 5.0]
 

@@ -15,11 +15,11 @@ def test_the_aperture_mass_of_waves():
     edges, radius = np.linspace(0.0, 20.0, 4001), 10.0
     theta = 0.5 * (edges[1:] + edges[:-1])
     for ell in (0.2, 0.5, 1.0):
-        mass, cross = theory.aperture(edges, j0(ell * theta), jv(4, ell * theta), radius)
+        mass, cross = theory.aperture_mass(edges, j0(ell * theta), jv(4, ell * theta), radius)
         wanted = (24.0 * jv(4, ell * radius) / (ell * radius) ** 2) ** 2
         assert mass == pytest.approx(wanted, rel=1e-3, abs=1e-6)
         assert cross == pytest.approx(0.0, abs=2e-5)
-        mass, cross = theory.aperture(edges, j0(ell * theta), -jv(4, ell * theta), radius)
+        mass, cross = theory.aperture_mass(edges, j0(ell * theta), -jv(4, ell * theta), radius)
         assert cross == pytest.approx(wanted, rel=1e-3, abs=1e-6)
 
 
@@ -41,7 +41,7 @@ def test_a_power_law_has_the_correlation_that_it_must():
 def test_power_is_linear_where_structure_is():
     """And eight times that and more within halos, by the published fit."""
     k = np.array([0.01, 0.02, 5.0])
-    ratio = theory.power(k, 0.5) / theory.linear(k, 0.5)
+    ratio = theory.nonlinear_power(k, 0.5) / theory.linear_power(k, 0.5)
     assert ratio[:2] == pytest.approx(np.ones(2), abs=0.03)
     assert 8.0 < ratio[2] < 40.0
 
@@ -49,7 +49,7 @@ def test_power_is_linear_where_structure_is():
 def test_sources_at_two_distances_are_between_those_at_each():
     chi, ell = np.asarray(cosmology.comoving_distance(np.array([0.8, 1.2]))), np.array([100.0, 1000.0])
     near, far, both = (
-        theory.convergence(ell, chi, np.array(weight)) for weight in ((1.0, 1e-9), (1e-9, 1.0), (1.0, 1.0))
+        theory.convergence_power(ell, chi, np.array(weight)) for weight in ((1.0, 1e-9), (1e-9, 1.0), (1.0, 1.0))
     )
     assert np.all((near < both) & (both < far))
     # Two screens that see the same matter: no less than the geometric mean of both.
@@ -58,5 +58,5 @@ def test_sources_at_two_distances_are_between_those_at_each():
 
 def test_galaxies_of_twice_the_bias_cluster_four_times_as_much():
     chi, edges, ell = np.array([1510.0, 1620.0, 1690.0]), np.array([1500.0, 1600.0, 1700.0]), np.array([300.0])
-    one, two = (theory.galaxies(ell, theory.shells(chi, np.full(3, bias), edges)) for bias in (1.0, 2.0))
+    one, two = (theory.galaxy_power(ell, theory.shells(chi, np.full(3, bias), edges)) for bias in (1.0, 2.0))
     assert two == pytest.approx(4 * one, rel=1e-12, abs=0.0)

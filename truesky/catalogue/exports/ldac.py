@@ -32,7 +32,7 @@ def write(path: Path, rows: pa.Table) -> None:
     ldac.write(path, _columns(rows))
 
 
-def _columns(rows: pa.Table) -> list[ldac.Values]:
+def _columns(rows: pa.Table) -> list[ldac.ColumnData]:
     def values(name: str, unknown: float = 0.0) -> Float:
         return np.asarray(pc.fill_null(rows[name], unknown).to_numpy(), float)
 

@@ -22,7 +22,7 @@ import yaml
 from lake_schema import __version__, sky, user_files
 from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
-from lake_schema.store import layout, names, read
+from lake_schema.store import layout, read, request_links
 from lake_schema.units import LIGHT_KM_S, electron_rate
 from truesky.catalogue.exports import stellar_spectra, tophat
 from truesky.fluxes import bulges, cosmology, inputs, passbands
@@ -31,9 +31,9 @@ from truesky.fluxes.spectra.extinction import MILKY_WAY_R_V
 # Of the pixels: Nside 32.
 ORDER = 5
 # Rows of a row group, of which the reader takes one at a time.
-_GROUP = 20_000
+_ROW_GROUP_SIZE = 20_000
 # What GalSim draws has a size, arcsec.
-_SMALLEST = 1e-3
+_MIN_SIZE = 1e-3
 _Maker = Callable[[pa.Table], pa.Table]
 
 
@@ -45,14 +45,14 @@ class _Catalogue:
     fluxes: read.Version
     bands: list[str] = field(default_factory=list)
 
-    def part(self, name: str) -> pa.Table:
+    def read_partition(self, name: str) -> pa.Table:
         """Rows of a part, with the columns f_nu_<band> behind them."""
-        rows = self.rows.rows(parts=[name])
-        found = self.fluxes.rows(["id", *(f"f_nu_{band}" for band in self.bands)], [name])
-        if not found["id"].equals(rows["id"]):
+        rows = self.rows.rows(partitions=[name])
+        flux_rows = self.fluxes.rows(["id", *(f"f_nu_{band}" for band in self.bands)], [name])
+        if not flux_rows["id"].equals(rows["id"]):
             raise BadInput(f"table {self.fluxes.table}: {name} does not hold the rows of table {self.rows.table}")
         for band in self.bands:
-            rows = rows.append_column(f"f_nu_{band}", found[f"f_nu_{band}"])
+            rows = rows.append_column(f"f_nu_{band}", flux_rows[f"f_nu_{band}"])
         return rows
 
 
@@ -61,27 +61,27 @@ def write(lake: Path, folder: Path, request: str | None = None) -> list[Path]:
 
     Errors: BadInput where fluxes are missing, or those of other rows
     """
-    found = {kind: _catalogue(lake, kind, request) for kind in ("galaxy", "star") if _has(lake, kind, request)}
-    if "galaxy" not in found:
+    catalogues = {kind: _catalogue(lake, kind, request) for kind in ("galaxy", "star") if _has(lake, kind, request)}
+    if "galaxy" not in catalogues:
         raise BadInput(f"lake {lake} has no table galaxies")
     folder.mkdir(parents=True, exist_ok=True)
-    written, about, templates = [], {}, set[int]()
-    for kind, catalogue in found.items():
+    written, object_types, templates = [], {}, set[int]()
+    for kind, catalogue in catalogues.items():
         makers = _galaxy_rows(lake, catalogue) if kind == "galaxy" else _star_rows(lake, catalogue)
         stem = {"galaxy": "galaxy", "star": "pointsource"}[kind]
         for pixel, rows in _by_pixel(catalogue):
-            number = sky.ring_of(ORDER, pixel)
+            number = sky.ring_index(ORDER, pixel)
             if kind == "star":
                 templates.update(np.unique(rows["sed"].to_numpy()).tolist())
             for name, maker in zip((f"{stem}_{number}", f"{stem}_flux_{number}"), makers, strict=True):
                 written.append(_parquet(folder / f"{name}.parquet", rows, maker))
-        about[kind] = _object_type(kind, stem)
-    if "star" in found:
-        library = inputs.stars_of(lake, found["star"].fluxes.manifest["facts"])
+        object_types[kind] = _object_type(kind, stem)
+    if "star" in catalogues:
+        library = inputs.stellar_library_from_facts(lake, catalogues["star"].fluxes.manifest["facts"])
         written += stellar_spectra.write(folder, library, sorted(templates))
     document = folder / "skyCatalog.yaml"
-    text = f"# Written by truesky {__version__}\n" + yaml.safe_dump(_document(about), sort_keys=False)
-    written.append(_replaced(document, lambda path: path.write_text(text, encoding="utf-8")))
+    text = f"# Written by truesky {__version__}\n" + yaml.safe_dump(_document(object_types), sort_keys=False)
+    written.append(_write_staged(document, lambda path: path.write_text(text, encoding="utf-8")))
     return written
 
 
@@ -90,10 +90,12 @@ def write(lake: Path, folder: Path, request: str | None = None) -> list[Path]:
 
 def _has(lake: Path, kind: str, request: str | None) -> bool:
     table = {"galaxy": "galaxies", "star": "stars"}[kind]
-    own = (
-        layout.current_key(lake, table) if request is None else names.key_of(lake, names.checked(lake, request), table)
+    key = (
+        layout.current_key(lake, table)
+        if request is None
+        else request_links.linked_key(lake, request_links.check_request(lake, request), table)
     )
-    return own is not None
+    return key is not None
 
 
 def _catalogue(lake: Path, kind: str, request: str | None) -> _Catalogue:
@@ -111,52 +113,54 @@ def _catalogue(lake: Path, kind: str, request: str | None) -> _Catalogue:
 
 def _by_pixel(catalogue: _Catalogue) -> Iterator[tuple[int, pa.Table]]:
     """(nested pixel, its rows) of every pixel that has some."""
-    for parts in _together(catalogue.rows.parts):
-        rows = pa.concat_tables([catalogue.part(part) for part in parts])
-        at = sky.parent(rows["_healpix_29"].to_numpy(), sky.DEEPEST, ORDER)
-        for pixel in np.unique(at).tolist():
-            yield pixel, rows.filter(pa.array(at == pixel))
+    for partitions in _group_by_pixel(catalogue.rows.partitions):
+        rows = pa.concat_tables([catalogue.read_partition(partition) for partition in partitions])
+        pixels = sky.parent(rows["_healpix_29"].to_numpy(), sky.MAX_ORDER, ORDER)
+        for pixel in np.unique(pixels).tolist():
+            yield pixel, rows.filter(pa.array(pixels == pixel))
 
 
-def _together(parts: Iterable[str]) -> list[list[str]]:
+def _group_by_pixel(partitions: Iterable[str]) -> list[list[str]]:
     """Parts that lie in one pixel, or alone where they are larger."""
-    found: dict[tuple[int, int], list[str]] = {}
-    for part in parts:
-        order, cell = layout.cell_of_file(part)
+    groups: dict[tuple[int, int], list[str]] = {}
+    for partition in partitions:
+        order, cell = layout.cell_of_file(partition)
         coarse = min(order, ORDER)
-        found.setdefault((coarse, cell >> 2 * (order - coarse)), []).append(part)
-    return list(found.values())
+        groups.setdefault((coarse, cell >> 2 * (order - coarse)), []).append(partition)
+    return list(groups.values())
 
 
 # ------------------------------------------------------------------------------------------------ columns
 
 
 def _galaxy_rows(lake: Path, catalogue: _Catalogue) -> tuple[_Maker, _Maker]:
-    library = inputs.library_of(lake, catalogue.fluxes.manifest["facts"])
+    library = inputs.galaxy_library_from_facts(lake, catalogue.fluxes.manifest["facts"])
 
-    def rows(given: pa.Table) -> pa.Table:
-        light = tophat.luminosities(given, library)
-        share = bulges.in_bins(given, tophat.templates_in_bins(library), library)
-        spectra = {"sed_val_bulge": _lists(light * share), "sed_val_disk": _lists(light * (1.0 - share))}
-        return pa.table({**_shapes(given), **spectra})
+    def rows(galaxies: pa.Table) -> pa.Table:
+        light = tophat.luminosities(galaxies, library)
+        share = bulges.fractions_in_bins(galaxies, tophat.templates_in_bins(library), library)
+        spectra = {"sed_val_bulge": _list_column(light * share), "sed_val_disk": _list_column(light * (1.0 - share))}
+        return pa.table({**_shapes(galaxies), **spectra})
 
     return rows, _fluxes("galaxy_id", catalogue.bands)
 
 
-def _shapes(given: pa.Table) -> dict[str, Any]:
+def _shapes(galaxies: pa.Table) -> dict[str, Any]:
     """Columns of galaxies but for their spectra.
 
     Sizes are half-light radii; shears are in GalSim's frame, whose x axis points west. Ellipticities are
     (a - b) / (a + b) along north and north-east: the reader turns them by 90 degrees.
     """
-    c: dict[str, Any] = {name: given[name].to_numpy() for name in given.column_names if not given[name].null_count}
+    c: dict[str, Any] = {
+        name: galaxies[name].to_numpy() for name in galaxies.column_names if not galaxies[name].null_count
+    }
     angle = c["position_angle"].astype(float)
     columns = {
         "galaxy_id": c["id"],
         "ra": c["ra"],
         "dec": c["dec"],
         "redshift": c["z_obs"].astype(np.float64),
-        "redshift_hubble": np.maximum(c["z_true"].astype(np.float64), tophat.NEAREST),
+        "redshift_hubble": np.maximum(c["z_true"].astype(np.float64), tophat.MIN_REDSHIFT),
         "peculiar_velocity": LIGHT_KM_S * ((1.0 + c["z_obs"].astype(float)) / (1.0 + c["z_true"]) - 1.0),
         "shear_1": c["gamma1"].astype(np.float64),
         "shear_2": -c["gamma2"].astype(np.float64),
@@ -168,7 +172,7 @@ def _shapes(given: pa.Table) -> dict[str, Any]:
         "sersic_disk": np.ones_like(c["a_v"]),
     }
     for name in ("bulge", "disk"):
-        size, ratio = np.maximum(c[f"{name}_half_light_radius"], np.float32(_SMALLEST)), c[f"{name}_axis_ratio"]
+        size, ratio = np.maximum(c[f"{name}_half_light_radius"], np.float32(_MIN_SIZE)), c[f"{name}_axis_ratio"]
         ellipticity = (1.0 - ratio.astype(float)) / (1.0 + ratio.astype(float))
         columns[f"size_{name}_true"] = size
         columns[f"size_minor_{name}_true"] = size * ratio
@@ -178,20 +182,20 @@ def _shapes(given: pa.Table) -> dict[str, Any]:
 
 
 def _star_rows(lake: Path, catalogue: _Catalogue) -> tuple[_Maker, _Maker]:
-    library = inputs.stars_of(lake, catalogue.fluxes.manifest["facts"])
+    library = inputs.stellar_library_from_facts(lake, catalogue.fluxes.manifest["facts"])
 
-    def rows(given: pa.Table) -> pa.Table:
-        n, sed = given.num_rows, given["sed"].to_numpy()
+    def rows(stars: pa.Table) -> pa.Table:
+        n, sed = stars.num_rows, stars["sed"].to_numpy()
         return pa.table(
             {
                 "object_type": pa.array(["star"] * n),
-                "id": given["id"],
-                "ra": given["ra"],
-                "dec": given["dec"],
-                "magnorm": stellar_spectra.magnorm(given, library),
+                "id": stars["id"],
+                "ra": stars["ra"],
+                "dec": stars["dec"],
+                "magnorm": stellar_spectra.magnorm(stars, library),
                 "MW_rv": np.full(n, MILKY_WAY_R_V, np.float32),
-                "MW_av": given["a_v"],
-                "sed_filepath": pa.array([stellar_spectra.file_of(k) for k in sed.tolist()]),
+                "MW_av": stars["a_v"],
+                "sed_filepath": pa.array([stellar_spectra.relative_path(k) for k in sed.tolist()]),
             }
         )
 
@@ -202,16 +206,17 @@ def _fluxes(identifier: str, bands: list[str]) -> _Maker:
     """Photons per second and cm2 through the whole system, magnified and behind the dust on the way."""
     width = {band: passbands.log_width(passbands.load(band)) for band in bands}
 
-    def rows(given: pa.Table) -> pa.Table:
+    def rows(sources: pa.Table) -> pa.Table:
         columns = {
-            f"lsst_flux_{band[-1]}": electron_rate(given[f"f_nu_{band}"].to_numpy(), 1.0, width[band]) for band in bands
+            f"lsst_flux_{band[-1]}": electron_rate(sources[f"f_nu_{band}"].to_numpy(), 1.0, width[band])
+            for band in bands
         }
-        return pa.table({identifier: given["id"], **{k: v.astype(np.float32) for k, v in columns.items()}})
+        return pa.table({identifier: sources["id"], **{k: v.astype(np.float32) for k, v in columns.items()}})
 
     return rows
 
 
-def _lists(values: Float) -> pa.Array:
+def _list_column(values: Float) -> pa.Array:
     offsets = np.arange(len(values) + 1, dtype=np.int32) * np.int32(values.shape[1])
     return pa.ListArray.from_arrays(offsets, values.astype(np.float32).ravel())
 
@@ -261,16 +266,16 @@ def _parquet(path: Path, rows: pa.Table, maker: _Maker) -> Path:
     """A file whose row groups are those of the file beside it, made one at a time."""
 
     def fill(temporary: Path) -> None:
-        first = maker(rows.slice(0, _GROUP))
+        first = maker(rows.slice(0, _ROW_GROUP_SIZE))
         with pq.ParquetWriter(temporary, first.schema, compression="zstd") as out:
-            out.write_table(first, row_group_size=_GROUP)
-            for start in range(_GROUP, rows.num_rows, _GROUP):
-                out.write_table(maker(rows.slice(start, _GROUP)), row_group_size=_GROUP)
+            out.write_table(first, row_group_size=_ROW_GROUP_SIZE)
+            for start in range(_ROW_GROUP_SIZE, rows.num_rows, _ROW_GROUP_SIZE):
+                out.write_table(maker(rows.slice(start, _ROW_GROUP_SIZE)), row_group_size=_ROW_GROUP_SIZE)
 
-    return _replaced(path, fill)
+    return _write_staged(path, fill)
 
 
-def _replaced(path: Path, fill: Callable[[Path], Any]) -> Path:
-    with user_files.staged(path) as temporary:
+def _write_staged(path: Path, fill: Callable[[Path], Any]) -> Path:
+    with user_files.replace_atomically(path) as temporary:
         fill(temporary)
     return path

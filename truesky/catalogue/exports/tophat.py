@@ -21,26 +21,33 @@ from lake_schema.units import LIGHT_ANGSTROM_S
 from truesky.fluxes import cosmology, high_redshift, passbands
 from truesky.fluxes.calibration import continuum_scale
 from truesky.fluxes.libraries.templates import Library
-from truesky.fluxes.sources import GALAXY_KINDS, Galaxies, column, galaxies_of
+from truesky.fluxes.sources import GALAXY_KINDS, Galaxies, column, galaxies_from_table
 from truesky.fluxes.spectra import extinction, intergalactic, lines
-from truesky.fluxes.spectra.continuum import COMPONENTS, REFERENCE_BAND, amplitudes, dust_of, observed_shape, within
-from truesky.numerics import sums
+from truesky.fluxes.spectra.continuum import (
+    COMPONENTS,
+    REFERENCE_BAND,
+    amplitudes,
+    check_range,
+    dust_curves,
+    observed_shape,
+)
+from truesky.numerics import matrices
 
 # Of the first and last bin, A: the ultraviolet of galaxies at z = 6, the infrared of near ones.
-FIRST, LAST = 450.5, 24499.5
+FIRST_EDGE, LAST_EDGE = 450.5, 24499.5
 # Of a bin, in ln(wavelength); half a window about a line, a fraction of its wavelength: 4 sigma of 300 km/s.
 _STEP, _WINDOW = 0.02, 0.004
 # Where spectra break, A: the Lyman limit, the lines of its series, redward of which hydrogen on the way absorbs less,
 # Lyman alpha with the red half of its line, narrow or wide, the Balmer limit.
-_SERIES = (917.5, 919.5, 920.5, 923.5, 926.5, 930.5, 937.5, 949.5, 972.5, 1025.5)
+_LYMAN_SERIES = (917.5, 919.5, 920.5, 923.5, 926.5, 930.5, 937.5, 949.5, 972.5, 1025.5)
 _RED_OF_ALPHA = (1216.5, 1217.5, 1219.5, 1222.5, 1226.5, 1231.5, 1236.5, 1241.5, 1246.5, 1251.5, 1260.5)
-_BREAKS = tuple((at, at) for at in (912.0, *_SERIES, 1215.5, *_RED_OF_ALPHA, 3646.0))
+_BREAKS = tuple((at, at) for at in (912.0, *_LYMAN_SERIES, 1215.5, *_RED_OF_ALPHA, 3646.0))
 # L_nu is in units of this, W/Hz: GCR Catalogs, SCHEMA.md.
 TOPHAT_W_HZ = 4.4659e13
 _MPC_CM = 3.085677581491367e24
 _ERG_W = 1e7
 # Nearer than this no luminosity distance is worth the name.
-NEAREST = 1e-5
+MIN_REDSHIFT = 1e-5
 # Rows whose spectra are made at a time: 25 MB an array.
 _BLOCK = 128
 # Of Fitzpatrick et al. 2019, A.
@@ -52,19 +59,19 @@ _LYMAN_ALPHA = 1215.67
 def edges() -> Float:
     """float64[n + 1] A, half-way between the samples of the templates."""
     lowest, highest = (1.0 + sign * _WINDOW for sign in (-1.0, 1.0))
-    about = [(line.vacuum * lowest, line.vacuum * highest) for line in lines.line_list()]
+    line_windows = [(line.vacuum * lowest, line.vacuum * highest) for line in lines.line_list()]
     windows: list[list[float]] = []
-    for low, high in sorted([*about, *_BREAKS]):
+    for low, high in sorted([*line_windows, *_BREAKS]):
         if windows and low < windows[-1][1]:
             windows[-1][1] = high
         else:
             windows.append([low, high])
-    found, at = [FIRST], FIRST
-    for low, high in [*windows, [LAST, LAST]]:
-        count = int(np.ceil(np.log(low / at) / _STEP))
-        found += [*np.geomspace(at, low, count + 1)[1:].tolist(), high]
-        at = high
-    return np.unique(np.floor(np.array(found)) + 0.5)
+    nodes, start = [FIRST_EDGE], FIRST_EDGE
+    for low, high in [*windows, [LAST_EDGE, LAST_EDGE]]:
+        count = int(np.ceil(np.log(low / start) / _STEP))
+        nodes += [*np.geomspace(start, low, count + 1)[1:].tolist(), high]
+        start = high
+    return np.unique(np.floor(np.array(nodes)) + 0.5)
 
 
 def luminosities(galaxies: pa.Table, library: Library) -> Float:
@@ -77,73 +84,76 @@ def luminosities(galaxies: pa.Table, library: Library) -> Float:
     for start in range(0, galaxies.num_rows, _BLOCK):
         rows = galaxies.slice(start, _BLOCK)
         z, a_v = column(rows, "z_obs"), column(rows, "a_v")
-        usual = np.isin(column(rows, "kind"), GALAXY_KINDS)
+        is_galaxy = np.isin(column(rows, "kind"), GALAXY_KINDS)
         f_lambda = np.empty((len(z), out.shape[1]))
-        if usual.any():
-            f_lambda[usual] = _galaxies(galaxies_of(rows.filter(pa.array(usual)), library), library)
-        if not usual.all():
-            f_lambda[~usual] = _high_redshift(rows.filter(pa.array(~usual)))
-        f_lambda *= extinction.transmitted(_excess(z), a_v[:, None])
+        if is_galaxy.any():
+            f_lambda[is_galaxy] = _galaxies(galaxies_from_table(rows.filter(pa.array(is_galaxy)), library), library)
+        if not is_galaxy.all():
+            f_lambda[~is_galaxy] = _high_redshift(rows.filter(pa.array(~is_galaxy)))
+        f_lambda *= extinction.transmission(_extinction_excess(z), a_v[:, None])
         out[start : start + _BLOCK] = f_lambda * _to_l_nu(z, column(rows, "z_true"))
     return out
 
 
 def _galaxies(rows: Galaxies, library: Library) -> Float:
     """f_lambda as observed, before magnification and the Milky Way, in each bin: float64[n, bins] erg s-1 cm-2 A-1."""
-    reference, dust = passbands.load(REFERENCE_BAND), dust_of(library)
+    reference, dust = passbands.load(REFERENCE_BAND), dust_curves(library)
     amplitude = amplitudes(rows.mix, reference, library, dust)
     # Of order 1 whatever the units, so that single precision does not underflow.
     amplitude /= amplitude.sum(0)
-    spectra, dust_in_bins = _in_bins(library)
+    spectra, dust_in_bins = _bin_library(library)
     total = np.zeros((len(rows), len(edges()) - 1))
     for k in range(len(COMPONENTS)):
-        behind = extinction.transmitted(dust_in_bins[rows.mix.law[k]], rows.mix.ebv[k][:, None])
-        total += amplitude[k][:, None] * spectra[rows.mix.sed[k]] * behind
+        transmission = extinction.transmission(dust_in_bins[rows.mix.law[k]], rows.mix.ebv[k][:, None])
+        total += amplitude[k][:, None] * spectra[rows.mix.sed[k]] * transmission
     count = len(reference.wavelength)
     shape = observed_shape(rows.mix, amplitude, library, dust, int(reference.wavelength[0]), count)
-    scale = continuum_scale(rows.mag_r01, sums.product(shape, passbands.weights(reference)))
+    scale = continuum_scale(rows.mag_r01, matrices.matmul(shape, passbands.weights(reference)))
     z = rows.mix.z_obs
     total *= (scale / (1.0 + z))[:, None]
     if library.intergalactic:
-        total *= _between_galaxies(z)
+        total *= _intergalactic_transmission(z)
     return total + _line_light(rows.lines) / (1.0 + z)[:, None]
 
 
 def templates_in_bins(library: Library) -> Float:
     """f_lambda of each template in each bin, float64[template, bins]."""
-    return _in_bins(library)[0]
+    return _bin_library(library)[0]
 
 
 @lru_cache(maxsize=2)
-def _in_bins(library: Library) -> tuple[Float, Float]:
+def _bin_library(library: Library) -> tuple[Float, Float]:
     """Templates and their laws of dust in bins: dust is smooth over one, so its mean is what it does."""
-    return binned(library.flux, library.wavelength), binned(dust_of(library), library.wavelength)
+    return bin_spectra(library.flux, library.wavelength), bin_spectra(dust_curves(library), library.wavelength)
 
 
 def _high_redshift(galaxies: pa.Table) -> Float:
     """The same of quasars and of galaxies beyond z = 6."""
     kind, z, mag, sed = (column(galaxies, name) for name in ("kind", "z_obs", "mag_r01", "sed_1"))
     out = np.empty((len(z), len(edges()) - 1))
-    for code in high_redshift.MAGNITUDE_AT:
-        here = kind == code
+    for code in high_redshift.MAGNITUDE_WAVELENGTH:
+        selected = kind == code
         templates, spectra = _templates(code)
-        which = sed[here].astype(np.int64)
-        within("sed_1", sed[here], 0, len(templates) - 1)
-        out[here] = high_redshift.scale(code, templates, which, mag[here], z[here])[:, None] * spectra[which]
-        if code == high_redshift.QUASAR and here.any():
-            out[here] *= _between_galaxies(z[here])
+        template_index = sed[selected].astype(np.int64)
+        check_range("sed_1", sed[selected], 0, len(templates) - 1)
+        out[selected] = (
+            high_redshift.template_scale(code, templates, template_index, mag[selected], z[selected])[:, None]
+            * spectra[template_index]
+        )
+        if code == high_redshift.QUASAR and selected.any():
+            out[selected] *= _intergalactic_transmission(z[selected])
     return out
 
 
 @lru_cache(maxsize=2)
 def _templates(kind: int) -> tuple[Library, Float]:
     """The library of a kind beyond the galaxies', and its spectra in bins."""
-    made = high_redshift.quasar_library if kind == high_redshift.QUASAR else high_redshift.high_redshift_library
-    library = made()
-    return library, binned(library.flux, library.wavelength)
+    make_library = high_redshift.quasar_library if kind == high_redshift.QUASAR else high_redshift.high_redshift_library
+    library = make_library()
+    return library, bin_spectra(library.flux, library.wavelength)
 
 
-def binned(spectra: Float32, wavelength: Float) -> Float:
+def bin_spectra(spectra: Float32, wavelength: Float) -> Float:
     """f_lambda that gives each bin the photons of the spectra in it: float64[n, bins].
 
     spectra : [n, m] f_lambda at wavelength[m], whole A in steps of 1
@@ -160,38 +170,38 @@ def _line_light(fluxes: Float) -> Float:
     fluxes : float64[n, lines] erg s-1 cm-2
     """
     vacuum = np.array([line.vacuum for line in lines.line_list()])
-    which = np.searchsorted(edges(), vacuum) - 1
-    low, high = edges()[which], edges()[which + 1]
+    bins = np.searchsorted(edges(), vacuum) - 1
+    low, high = edges()[bins], edges()[bins + 1]
     out = np.zeros((len(fluxes), len(edges()) - 1))
-    for k, place in enumerate(which.tolist()):
+    for k, place in enumerate(bins.tolist()):
         out[:, place] += fluxes[:, k] * vacuum[k] / (0.5 * (high[k] ** 2 - low[k] ** 2))
     return out
 
 
-def _between_galaxies(z: Float) -> Float:
+def _intergalactic_transmission(z: Float) -> Float:
     """Mean transmission of the intergalactic medium in each bin: float64[n, bins]."""
-    at = np.arange(1.0, np.ceil(_LYMAN_ALPHA * (1.0 + z.max())) + 2.0)
-    passed = intergalactic.transmission(at, z)
+    wavelength = np.arange(1.0, np.ceil(_LYMAN_ALPHA * (1.0 + z.max())) + 2.0)
+    transmissions = intergalactic.transmission(wavelength, z)
     out = np.empty((len(z), len(edges()) - 1))
-    for i, seen in enumerate(passed):
+    for i, transmission in enumerate(transmissions):
         # Beyond the series nothing absorbs.
-        total = np.append(0.0, np.cumsum(seen))
-        reach = edges() * (1.0 + z[i])
-        inside = np.interp(reach, np.append(at, at[-1] + 1.0) - 0.5, total)
-        inside += np.maximum(reach - at[-1] - 0.5, 0.0)
-        out[i] = np.diff(inside) / np.diff(reach)
+        cumulative = np.append(0.0, np.cumsum(transmission))
+        observed_edges = edges() * (1.0 + z[i])
+        integral = np.interp(observed_edges, np.append(wavelength, wavelength[-1] + 1.0) - 0.5, cumulative)
+        integral += np.maximum(observed_edges - wavelength[-1] - 0.5, 0.0)
+        out[i] = np.diff(integral) / np.diff(observed_edges)
     return out
 
 
-def _excess(z: Float) -> Float:
+def _extinction_excess(z: Float) -> Float:
     """A(lambda) / A(V) of ours less the reader's at each bin's observed wavelength: float64[n, bins]."""
-    middle = _middle() * (1.0 + z)[:, None]
-    grid, difference = _laws()
-    return np.interp(middle, grid, difference)
+    wavelength = _bin_centres() * (1.0 + z)[:, None]
+    grid, difference = _law_difference()
+    return np.interp(wavelength, grid, difference)
 
 
 @lru_cache(maxsize=1)
-def _laws() -> tuple[Float, Float]:
+def _law_difference() -> tuple[Float, Float]:
     """(A; A(lambda) / A(V) of ours less Fitzpatrick et al. 2019), R_V = 3.1, where that law is defined."""
     # Slow to import.
     import astropy.units as u
@@ -206,12 +216,12 @@ def _to_l_nu(z_obs: Float, z_true: Float) -> Float:
     """What turns f_lambda as observed (erg s-1 cm-2 A-1) into L_nu of a bin: float64[n, bins]."""
     low, high = edges()[:-1], edges()[1:]
     width = (high - low) / (LIGHT_ANGSTROM_S * (1.0 / low - 1.0 / high))
-    distance = cosmology.luminosity_distance(np.maximum(z_true, NEAREST)) / cosmology.HUBBLE * _MPC_CM
+    distance = cosmology.luminosity_distance(np.maximum(z_true, MIN_REDSHIFT)) / cosmology.HUBBLE * _MPC_CM
     dimming = 4.0 * np.pi * distance**2 * (1.0 + z_obs) / (_ERG_W * TOPHAT_W_HZ)
     return np.asarray(dimming[:, None] * width)
 
 
-def _middle() -> Float:
+def _bin_centres() -> Float:
     """Mean wavelength of each bin's photons, A."""
     low, high = edges()[:-1], edges()[1:]
     return 2.0 / 3.0 * (high**3 - low**3) / (high**2 - low**2)

@@ -21,14 +21,14 @@ from lake_schema import user_files
 from lake_schema.arrays import Array
 from lake_schema.errors import BadInput
 from lake_schema.external import rows as external_rows
-from lake_schema.external.rows import Piece
+from lake_schema.external.rows import RowBatch
 from lake_schema.tables.galaxies import GALAXIES
 from truesky.fluxes import cosmology
 
 Bounds = Mapping[str, tuple[float, float]]
 
 _FILE = Path(__file__).with_name("ingest_formats.toml")
-WHOLE = ("origin_id", "halo")
+IDENTIFIER_KEYS = ("origin_id", "halo")
 _FIELD_KEYS = (
     "column", "plus", "minus", "over", "kpc_at", "power10", "log10", "scale", "offset", "unit", "value", "beside",
 )  # fmt: skip
@@ -53,7 +53,7 @@ GALAXY_BOUNDS: Bounds = {
     "halo": (-(2.0**63), 2.0**63),
     "stamp": (-1, 1e6),
 }
-MAY_MISS = tuple(c.name for c in GALAXIES.columns if c.nullable)
+NULLABLE = tuple(c.name for c in GALAXIES.columns if c.nullable)
 HALO_BOUNDS: Bounds = {
     "ra": (-360.0, 360.0),
     "dec": (-90.0, 90.0),
@@ -102,16 +102,16 @@ class Columns:
 
     fields: Mapping[str, Field]
     bounds: Bounds
-    may_miss: tuple[str, ...] = ()
+    nullable: tuple[str, ...] = ()
     band: str = ""
-    beside: tuple[str, ...] = ()
+    companion_prefixes: tuple[str, ...] = ()
     seen_over_v: float | None = None
     lines_magnified: bool = False
 
-    def titles(self, beside: bool) -> list[str]:
+    def titles(self, in_companion: bool) -> list[str]:
         """Columns of the file that are read; beside : of the file beside it."""
-        found = [title for field in self.fields.values() if field.beside is beside for title in field.titles()]
-        return list(dict.fromkeys(found))
+        titles = [title for field in self.fields.values() if field.beside is in_companion for title in field.titles()]
+        return list(dict.fromkeys(titles))
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,99 +131,103 @@ def formats() -> dict[str, dict[str, Any]]:
 @cache
 def _formats(text: str) -> dict[str, dict[str, Any]]:
     """The formats in the text of the file."""
-    return user_files.toml_tables(text)
+    return user_files.parse_toml(text)
 
 
-def galaxies(name: str, own: Mapping[str, str]) -> Columns:
+def galaxy_columns(name: str, overrides: Mapping[str, str]) -> Columns:
     """The mapping of a format ("" = none), the request's entries (JSON) over it.
 
     Errors: BadInput names the key
     """
-    known = formats()
-    if name and name not in known:
-        raise BadInput(f"ingest.galaxies.format = {name!r} is not one of {', '.join(known)}")
-    form = known.get(name, {"columns": {}})
-    given = {key: json.loads(text) for key, text in own.items() if key not in _FORMAT_KEYS}
-    about = {**form, **{key: json.loads(text) for key, text in own.items() if key in _FORMAT_KEYS}}
-    fields = _fields({**form["columns"], **given}, GALAXY_BOUNDS, "ingest.galaxies.columns")
-    _need(fields, "ingest.galaxies.columns", ("ra",), ("dec",), ("z_true", "z_obs"), ("abs_mag_r01", "mag_r01", "mag"))
+    all_formats = formats()
+    if name and name not in all_formats:
+        raise BadInput(f"ingest.galaxies.format = {name!r} is not one of {', '.join(all_formats)}")
+    shipped = all_formats.get(name, {"columns": {}})
+    overriding_fields = {key: json.loads(text) for key, text in overrides.items() if key not in _FORMAT_KEYS}
+    settings = {**shipped, **{key: json.loads(text) for key, text in overrides.items() if key in _FORMAT_KEYS}}
+    fields = _fields({**shipped["columns"], **overriding_fields}, GALAXY_BOUNDS, "ingest.galaxies.columns")
+    _require(
+        fields, "ingest.galaxies.columns", ("ra",), ("dec",), ("z_true", "z_obs"), ("abs_mag_r01", "mag_r01", "mag")
+    )
     for group in (("ra_lensed", "dec_lensed"), ("kappa", "gamma1", "gamma2"), ("sed", "ext_law", "ebv"), _SED):
-        there = [key for key in group if key in fields]
-        if there and len(there) < len(group):
+        present = [key for key in group if key in fields]
+        if present and len(present) < len(group):
             missing = next(key for key in group if key not in fields)
-            raise BadInput(f"ingest.galaxies.columns: {there[0]} wants {missing} beside it")
-    if "mag" in fields and not about.get("band"):
+            raise BadInput(f"ingest.galaxies.columns: {present[0]} wants {missing} beside it")
+    if "mag" in fields and not settings.get("band"):
         raise BadInput("ingest.galaxies.columns: mag wants band beside it")
-    beside, seen = tuple(about.get("beside", ())), about.get("seen_over_v")
-    lines = bool(about.get("lines_magnified", False))
-    return Columns(fields, GALAXY_BOUNDS, MAY_MISS, about.get("band", ""), beside, seen, lines)
+    companion_prefixes, seen_over_v = tuple(settings.get("beside", ())), settings.get("seen_over_v")
+    lines = bool(settings.get("lines_magnified", False))
+    return Columns(fields, GALAXY_BOUNDS, NULLABLE, settings.get("band", ""), companion_prefixes, seen_over_v, lines)
 
 
-def unlensed(columns: Columns) -> Columns:
+def drop_lensed_positions(columns: Columns) -> Columns:
     """The same mapping without the observed positions."""
     fields = {key: field for key, field in columns.fields.items() if not key.endswith("_lensed")}
     return replace(columns, fields=fields)
 
 
-def halos(own: Mapping[str, str]) -> Columns:
+def halo_columns(entries: Mapping[str, str]) -> Columns:
     """The mapping of a request's halos."""
-    fields = _fields({key: json.loads(text) for key, text in own.items()}, HALO_BOUNDS, "ingest.halos.columns")
-    _need(fields, "ingest.halos.columns", ("ra",), ("dec",), ("z_true",), ("log_mass",))
+    fields = _fields({key: json.loads(text) for key, text in entries.items()}, HALO_BOUNDS, "ingest.halos.columns")
+    _require(fields, "ingest.halos.columns", ("ra",), ("dec",), ("z_true",), ("log_mass",))
     return Columns(fields, HALO_BOUNDS)
 
 
-def training(own: Mapping[str, str]) -> Columns:
+def training_columns(entries: Mapping[str, str]) -> Columns:
     """The mapping of a request's training table; each of its keys is needed."""
-    given = {key: json.loads(text) for key, text in own.items()}
-    fields = _fields(given, TRAINING_BOUNDS, "ingest.training.columns")
-    _need(fields, "ingest.training.columns", *((key,) for key in TRAINING_BOUNDS))
+    parsed = {key: json.loads(text) for key, text in entries.items()}
+    fields = _fields(parsed, TRAINING_BOUNDS, "ingest.training.columns")
+    _require(fields, "ingest.training.columns", *((key,) for key in TRAINING_BOUNDS))
     return Columns(fields, TRAINING_BOUNDS)
 
 
 def read(files: Sequence[Path], columns: Columns) -> Iterator[Rows]:
     """The rows of files, one after another; whole numbers as int64, everything else as float64."""
-    whole = [columns.fields[key].column for key in WHOLE if key in columns.fields]
+    identifier_columns = [columns.fields[key].column for key in IDENTIFIER_KEYS if key in columns.fields]
     for file in files:
-        pieces = external_rows.pieces(file, columns.titles(beside=False), whole)
-        for piece in _with_beside(file, pieces, columns) if columns.beside else pieces:
+        pieces = external_rows.read_batches(file, columns.titles(in_companion=False), identifier_columns)
+        for piece in _with_companion(file, pieces, columns) if columns.companion_prefixes else pieces:
             _check_units(piece, columns)
-            yield Rows(file, piece.first, _checked(piece, columns))
+            yield Rows(file, piece.first_row, _checked_values(piece, columns))
 
 
-def file_beside(file: Path, beside: Sequence[str]) -> Path:
+def companion_file(file: Path, prefixes: Sequence[str]) -> Path:
     """The file with a row's other columns."""
-    if not file.name.startswith(beside[0]):
-        raise BadInput(f"{file}: its name does not begin with {beside[0]}")
-    return file.with_name(beside[1] + file.name.removeprefix(beside[0]))
+    if not file.name.startswith(prefixes[0]):
+        raise BadInput(f"{file}: its name does not begin with {prefixes[0]}")
+    return file.with_name(prefixes[1] + file.name.removeprefix(prefixes[0]))
 
 
 # ------------------------------------------------------------------------------------------------ fields
 
 
 def _fields(table: Mapping[str, Any], bounds: Bounds, path: str) -> dict[str, Field]:
-    legal = [key for key in bounds if key not in _NOT_MAPPED] + [key for key in MAY_MISS if bounds is GALAXY_BOUNDS]
-    found = {}
-    for key, given in table.items():
+    legal = [key for key in bounds if key not in _NOT_MAPPED] + [key for key in NULLABLE if bounds is GALAXY_BOUNDS]
+    fields = {}
+    for key, entry in table.items():
         if key not in legal:
             raise BadInput(f"{path}.{key} is not one of {', '.join(dict.fromkeys(legal))}")
-        if given in ("", {}):
+        if entry in ("", {}):
             # An entry of the shipped mapping that this catalogue lacks.
             continue
-        found[key] = _field({"column": given} if isinstance(given, str) else given, f"{path}.{key}")
-    return found
+        fields[key] = _field({"column": entry} if isinstance(entry, str) else entry, f"{path}.{key}")
+    return fields
 
 
-def _field(given: Any, path: str) -> Field:
-    if not isinstance(given, dict):
-        raise BadInput(f"{path} wants a column's name or a table, got {given!r}"[:300])
-    for name, value in given.items():
+def _field(entry: Any, path: str) -> Field:
+    if not isinstance(entry, dict):
+        raise BadInput(f"{path} wants a column's name or a table, got {entry!r}"[:300])
+    for name, value in entry.items():
         if name not in _FIELD_KEYS:
             raise BadInput(f"{path}.{name} is not one of {', '.join(_FIELD_KEYS)}")
-        wanted = {"power10": bool, "log10": bool, "beside": bool, "scale": float, "offset": float, "value": float}
-        kind = wanted.get(name, str)
-        if not isinstance(value, (int, float) if kind is float else kind) or (kind is float and value != value):
-            raise BadInput(f"{path}.{name} wants {kind.__name__}, got {value!r}"[:300])
-    field = Field(**given)
+        types = {"power10": bool, "log10": bool, "beside": bool, "scale": float, "offset": float, "value": float}
+        expected_type = types.get(name, str)
+        if not isinstance(value, (int, float) if expected_type is float else expected_type) or (
+            expected_type is float and value != value
+        ):
+            raise BadInput(f"{path}.{name} wants {expected_type.__name__}, got {value!r}"[:300])
+    field = Field(**entry)
     if bool(field.column) == (field.value is not None):
         raise BadInput(f"{path} wants column or value, one of them")
     if field.unit:
@@ -231,10 +235,10 @@ def _field(given: Any, path: str) -> Field:
     return field
 
 
-def _need(fields: Mapping[str, Field], path: str, *groups: tuple[str, ...]) -> None:
-    for either in groups:
-        if not any(key in fields for key in either):
-            raise BadInput(f"{path} wants {' or '.join(either)}")
+def _require(fields: Mapping[str, Field], path: str, *groups: tuple[str, ...]) -> None:
+    for alternatives in groups:
+        if not any(key in fields for key in alternatives):
+            raise BadInput(f"{path} wants {' or '.join(alternatives)}")
 
 
 def _unit(text: str, where: str) -> Any:
@@ -250,38 +254,38 @@ def _unit(text: str, where: str) -> Any:
         raise BadInput(f"{where}: unit {text!r} is not one that astropy knows") from None
 
 
-def _check_units(piece: Piece, columns: Columns) -> None:
+def _check_units(piece: RowBatch, columns: Columns) -> None:
     for key, field in columns.fields.items():
-        said = piece.units.get(field.column, "")
-        if not field.unit or not said:
+        file_unit = piece.units.get(field.column, "")
+        if not field.unit or not file_unit:
             continue
         where = f"{piece.file}: column {field.column}"
-        if _unit(said, where) != _unit(field.unit, where):
-            raise BadInput(f"{where} ({key}) is in {said!r}, the mapping says {field.unit!r}")
+        if _unit(file_unit, where) != _unit(field.unit, where):
+            raise BadInput(f"{where} ({key}) is in {file_unit!r}, the mapping says {field.unit!r}")
 
 
 # ------------------------------------------------------------------------------------------------ values
 
 
-def _checked(piece: Piece, columns: Columns) -> dict[str, Array]:
+def _checked_values(piece: RowBatch, columns: Columns) -> dict[str, Array]:
     rows = len(next(iter(piece.columns.values())))
-    found = {key: _value(key, field, piece.columns, rows) for key, field in columns.fields.items()}
+    by_key = {key: _value(key, field, piece.columns, rows) for key, field in columns.fields.items()}
     for k in "12":
         # What a component without light says of its spectrum means nothing.
-        if f"frac_{k}" in found:
-            dark = found[f"frac_{k}"] == 0.0
+        if f"frac_{k}" in by_key:
+            dark = by_key[f"frac_{k}"] == 0.0
             for name in (f"sed_{k}", f"ext_law_{k}", f"ebv_{k}"):
-                found[name] = np.where(dark, 0.0, found[name])
-    for key, values in found.items():
-        _check(piece, key, columns, values)
-    return {key: values.astype(np.int64) if key in _INTEGERS else values for key, values in found.items()}
+                by_key[name] = np.where(dark, 0.0, by_key[name])
+    for key, values in by_key.items():
+        _check_bounds(piece, key, columns, values)
+    return {key: values.astype(np.int64) if key in _INTEGERS else values for key, values in by_key.items()}
 
 
 def _value(key: str, field: Field, columns: Mapping[str, Array], rows: int) -> Array:
     if field.value is not None:
         return np.full(rows, field.value)
     values = columns[field.column]
-    if key in WHOLE:
+    if key in IDENTIFIER_KEYS:
         return values.astype(np.int64) if values.dtype.kind in "iu" else values
     values = values.astype(np.float64)
     with np.errstate(all="ignore"):
@@ -302,51 +306,51 @@ def _value(key: str, field: Field, columns: Mapping[str, Array], rows: int) -> A
 
 def _kpc_per_arcsec(z: Array) -> Array:
     """NaN, which is refused, where a length has no angle."""
-    known = (z > 0.0) & (z <= cosmology.Z_MAX)
-    return np.where(known, cosmology.kpc_per_arcsec(np.where(known, z, 1.0)), np.nan)
+    valid = (z > 0.0) & (z <= cosmology.Z_MAX)
+    return np.where(valid, cosmology.kpc_per_arcsec(np.where(valid, z, 1.0)), np.nan)
 
 
-def _check(piece: Piece, key: str, columns: Columns, values: Array) -> None:
+def _check_bounds(piece: RowBatch, key: str, columns: Columns, values: Array) -> None:
     lo, hi = columns.bounds.get(key, (-np.inf, np.inf))
     single = key in GALAXIES.names and GALAXIES.column(key).type == "float32"
     slack = 1e-6 * max(abs(lo), abs(hi)) if single and np.isfinite(hi - lo) else 0.0
     bad = ~((values >= lo - slack) & (values <= hi + slack))
-    if key in columns.may_miss:
+    if key in columns.nullable:
         bad &= ~np.isnan(values) if values.dtype.kind == "f" else True
-    if key in (*WHOLE, *_INTEGERS) and values.dtype.kind == "f":
+    if key in (*IDENTIFIER_KEYS, *_INTEGERS) and values.dtype.kind == "f":
         bad |= values != np.floor(values)
     if bad.any():
         row = int(bad.argmax())
         where = f"{piece.file}: column {' and '.join(columns.fields[key].titles()) or key} ({key})"
-        wanted = f"in [{lo:g}, {hi:g}]" if key not in WHOLE else "a whole number"
-        raise BadInput(f"{where} of row {piece.first + row} is {values[row]:g}, wanted {wanted}")
+        allowed = f"in [{lo:g}, {hi:g}]" if key not in IDENTIFIER_KEYS else "a whole number"
+        raise BadInput(f"{where} of row {piece.first_row + row} is {values[row]:g}, wanted {allowed}")
     if slack:
         np.clip(values, lo, hi, out=values)
 
 
-def _with_beside(file: Path, pieces: Iterator[Piece], columns: Columns) -> Iterator[Piece]:
+def _with_companion(file: Path, pieces: Iterator[RowBatch], columns: Columns) -> Iterator[RowBatch]:
     """Pieces with the columns of the file beside theirs; the identifiers of both are compared, row by row."""
-    other = file_beside(file, columns.beside)
+    companion = companion_file(file, columns.companion_prefixes)
     name = columns.fields["origin_id"].column
-    titles = [name, *columns.titles(beside=True)]
-    rest: dict[str, Array] = {title: np.zeros(0) for title in titles}
-    stream = external_rows.pieces(other, titles, [name])
+    titles = [name, *columns.titles(in_companion=True)]
+    buffered: dict[str, Array] = {title: np.zeros(0) for title in titles}
+    stream = external_rows.read_batches(companion, titles, [name])
     for piece in pieces:
-        wanted = len(piece.columns[name])
-        while len(rest[name]) < wanted:
-            more = next(stream, None)
-            if more is None:
-                row = piece.first + len(rest[name])
-                raise BadInput(f"{other}: ends before row {row} of {file}, column {name}")
-            rest = (
-                {title: np.concatenate([rest[title], more.columns[title]]) for title in titles}
-                if len(rest[name])
-                else dict(more.columns)
+        row_count = len(piece.columns[name])
+        while len(buffered[name]) < row_count:
+            next_piece = next(stream, None)
+            if next_piece is None:
+                row = piece.first_row + len(buffered[name])
+                raise BadInput(f"{companion}: ends before row {row} of {file}, column {name}")
+            buffered = (
+                {title: np.concatenate([buffered[title], next_piece.columns[title]]) for title in titles}
+                if len(buffered[name])
+                else dict(next_piece.columns)
             )
-        part = {title: values[:wanted] for title, values in rest.items()}
-        rest = {title: values[wanted:] for title, values in rest.items()}
-        differ = part[name] != piece.columns[name]
+        companion_rows = {title: values[:row_count] for title, values in buffered.items()}
+        buffered = {title: values[row_count:] for title, values in buffered.items()}
+        differ = companion_rows[name] != piece.columns[name]
         if differ.any():
-            row = piece.first + int(differ.argmax())
-            raise BadInput(f"{other}: column {name} of row {row} is not that of the same row of {file.name}")
-        yield Piece(file, piece.first, {**part, **piece.columns}, piece.units)
+            row = piece.first_row + int(differ.argmax())
+            raise BadInput(f"{companion}: column {name} of row {row} is not that of the same row of {file.name}")
+        yield RowBatch(file, piece.first_row, {**companion_rows, **piece.columns}, piece.units)

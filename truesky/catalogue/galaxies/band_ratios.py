@@ -26,9 +26,9 @@ from lake_schema.arrays import Float, Float32, Int
 from truesky.fluxes import passbands
 from truesky.fluxes.libraries.templates import Library
 from truesky.fluxes.spectra import extinction
-from truesky.numerics import sums
+from truesky.numerics import matrices
 from truesky.numerics.cache import cached_arrays, content_key
-from truesky.numerics.code_keys import code_key
+from truesky.numerics.code_fingerprints import code_key
 
 REFERENCE_BAND = "sdss_r01"
 # Uniform steps of ln(1 + z), and numbers of Chebyshev-Lobatto nodes of E(B-V): the fewest whose error is below that,
@@ -48,7 +48,7 @@ class Sed:
     law: Int
     ebv: Float
 
-    def part(self, keep: npt.NDArray[np.generic]) -> Sed:
+    def select(self, keep: npt.NDArray[np.generic]) -> Sed:
         """The galaxies that are kept.
 
         keep : bool or int[m] rows
@@ -95,16 +95,16 @@ def _nodes(library: Library, band: str, z_max: float, ebv_max: float) -> Float:
         finer = 0.5 * ebv_max * (1.0 - np.cos(np.pi * np.arange(2 * count - 1) / (2 * count - 2)))
         if count == _EBV_NODES[-1]:
             break
-        found = _ln_ratios(library, band, z, finer)
-        off = sums.product(found[..., ::2], ebv_weights(finer[::2], finer[1::2]).T) - found[..., 1::2]
-        if 2.5 / np.log(10.0) * np.abs(off).max() < _EBV_ERROR:
+        ln_ratios = _ln_ratios(library, band, z, finer)
+        error = matrices.matmul(ln_ratios[..., ::2], ebv_weights(finer[::2], finer[1::2]).T) - ln_ratios[..., 1::2]
+        if 2.5 / np.log(10.0) * np.abs(error).max() < _EBV_ERROR:
             break
     return np.ascontiguousarray(finer[::2])
 
 
 def _ln_ratios(library: Library, band: str, redshifts: Float, ebv: Float) -> Float:
     """[z, 4, template, e]"""
-    dust = dusty(library, ebv)
+    dust = dust_transmission(library, ebv)
     spectra = library.flux.astype(np.float64).T
     reference = _band_flux(dust, spectra, band_weights(library, REFERENCE_BAND, 0.0))
     tiny = np.finfo(np.float32).tiny
@@ -125,21 +125,21 @@ def load(library: Library, band: str, z_max: float, ebv_max: float) -> BandRatio
     laws = extinction.laws(library.wavelength)
     key = content_key(code_key(__name__), z_max, ebv_max, library.wavelength, library.flux, laws, *responses)
 
-    def arrays() -> dict[str, npt.NDArray[np.generic]]:
-        made = build(library, band, z_max, ebv_max)
-        return {"ebv": made.ebv, "values": made.values}
+    def make_arrays() -> dict[str, npt.NDArray[np.generic]]:
+        table = build(library, band, z_max, ebv_max)
+        return {"ebv": table.ebv, "values": table.values}
 
-    found = cached_arrays(f"band_ratios_{band}", key, arrays)
-    return BandRatios(band, found["ebv"], found["values"])
+    cached = cached_arrays(f"band_ratios_{band}", key, make_arrays)
+    return BandRatios(band, cached["ebv"], cached["values"])
 
 
-def dusty(library: Library, ebv: Float) -> Float:
+def dust_transmission(library: Library, ebv: Float) -> Float:
     """Transmission of laws 1 .. 4 at each E(B-V), [4, e, lambda] on the library's wavelengths.
 
     ebv : float[e] mag
     """
     k = extinction.laws(library.wavelength)[1:]
-    return np.asarray(extinction.transmitted(k[:, None, :], ebv[None, :, None]), float)
+    return np.asarray(extinction.transmission(k[:, None, :], ebv[None, :, None]), float)
 
 
 def band_weights(library: Library, band: str, z: float) -> Float:
@@ -162,7 +162,7 @@ def _band_flux(dust: Float, spectra: Float, weights: Float) -> Float:
     """[4, e, template]"""
     used = np.flatnonzero(weights)
     cut = slice(used[0], used[-1] + 1)
-    return np.asarray(sums.product(dust[:, :, cut] * weights[cut], spectra[cut]))
+    return np.asarray(matrices.matmul(dust[:, :, cut] * weights[cut], spectra[cut]))
 
 
 def ln_ratio(table: BandRatios, z: Float, template: Int, law: Int, ebv: Float) -> Float:
@@ -175,9 +175,9 @@ def ln_ratio(table: BandRatios, z: Float, template: Int, law: Int, ebv: Float) -
     from truesky.catalogue.galaxies import ratio_sums
 
     redshift, dust = np.ascontiguousarray(z, np.float64), np.ascontiguousarray(ebv, np.float64)
-    kinds = np.ascontiguousarray(template, np.int64), np.ascontiguousarray(law, np.int64)
+    indices = np.ascontiguousarray(template, np.int64), np.ascontiguousarray(law, np.int64)
     out = np.empty(redshift.size)
-    ratio_sums.ln_ratios(table.values, _STEP, table.ebv, redshift, *kinds, dust, out)
+    ratio_sums.ln_ratios(table.values, _STEP, table.ebv, redshift, *indices, dust, out)
     return out
 
 
@@ -187,10 +187,10 @@ def ebv_weights(nodes: Float, ebv: Float) -> Float:
     nodes : float[e] mag;  ebv : float[n] mag
     """
     weights = np.ones((ebv.size, nodes.size))
-    for i, at in enumerate(nodes):
+    for i, node in enumerate(nodes):
         for j, other in enumerate(nodes):
             if i != j:
-                weights[:, i] *= (ebv - other) / (at - other)
+                weights[:, i] *= (ebv - other) / (node - other)
     return weights
 
 
@@ -199,19 +199,19 @@ def offset(table: BandRatios, z: Float, sed: Sed) -> Float:
 
     z : float[n];  sed : n spectra
     """
-    one = np.exp(ln_ratio(table, z, sed.template_1, sed.law, sed.ebv))
-    two = np.exp(ln_ratio(table, z, sed.template_2, sed.law, sed.ebv))
-    return np.asarray(-2.5 * np.log10(sed.frac_1 * one + sed.frac_2 * two))
+    ratio_1 = np.exp(ln_ratio(table, z, sed.template_1, sed.law, sed.ebv))
+    ratio_2 = np.exp(ln_ratio(table, z, sed.template_2, sed.law, sed.ebv))
+    return np.asarray(-2.5 * np.log10(sed.frac_1 * ratio_1 + sed.frac_2 * ratio_2))
 
 
-def brightest(table: BandRatios) -> tuple[Float, Float]:
+def brightest_offset(table: BandRatios) -> tuple[Float, Float]:
     """Redshifts[m], and the smallest m_b - M_r - DM[m] of any template, law and E(B-V) there."""
     z = np.expm1(_STEP * np.arange(table.values.shape[0]))
     highest = table.values.astype(np.float64).max(axis=(1, 2, 3))
     return z, -2.5 / np.log(10.0) * highest
 
 
-def invert(table: BandRatios, colour: Float, law: Int, ebv: Float) -> Sed:
+def sed_of_colour(table: BandRatios, colour: Float, law: Int, ebv: Float) -> Sed:
     """The spectra that have the wanted colours; the end of the library where dust leaves none that has.
 
     colour : float[n] 0.1(g - r) mag;  law : int[n];  ebv : float[n] mag
@@ -230,7 +230,7 @@ def invert(table: BandRatios, colour: Float, law: Int, ebv: Float) -> Sed:
     return Sed(template, 1.0 - share, template - 1, share, law, ebv)
 
 
-def between(index: Float, law: Int, ebv: Float) -> Sed:
+def sed_of_index(index: Float, law: Int, ebv: Float) -> Sed:
     """Of real template indices t[n] >= 0: i = max(ceil(t), 1) and i - 1, with shares 1 - f and f = i - t.
 
     index : float[n];  law : int[n];  ebv : float[n] mag

@@ -29,7 +29,7 @@ from truesky.catalogue.interpolation import bracket
 from truesky.fluxes import cosmology, passbands
 from truesky.fluxes.passbands import Passband
 from truesky.fluxes.spectra import extinction, lines
-from truesky.randomness.keyed import Draws
+from truesky.randomness.per_source import AnyGenerator
 
 _FILE = "emission_lines.toml"
 MATCHING = Path(__file__).with_name("halpha_matching.csv")
@@ -56,7 +56,7 @@ class Gas:
     pivot: float
     limits: tuple[float, float]
     polynomial: tuple[float, ...]
-    least: float
+    min_attenuation: float
     scatter: float
 
 
@@ -92,7 +92,7 @@ class Ratios:
 
 
 @dataclass(frozen=True, slots=True)
-class Others:
+class OtherLines:
     """emission_lines.toml, [others]."""
 
     siii: float
@@ -132,7 +132,7 @@ class LineModel:
     metals: Metals
     ratios: Ratios
     hydrogen: dict[str, float]
-    others: Others
+    other_lines: OtherLines
     dust: dict[str, float]
     z: Float
     log_l: Float
@@ -142,10 +142,10 @@ class LineModel:
 def model(matching: Path = MATCHING) -> LineModel:
     """The lines of the embedded universe."""
     table = np.loadtxt(matching, delimiter=",")
-    return unmatched(table[1:, 0], table[0, 1:], table[1:, 1:])
+    return model_from_table(table[1:, 0], table[0, 1:], table[1:, 1:])
 
 
-def unmatched(z: Float, log_l: Float, shift: Float) -> LineModel:
+def model_from_table(z: Float, log_l: Float, shift: Float) -> LineModel:
     """The lines with a table of one's own; a shift of nothing leaves H alpha as it is drawn.
 
     z : float[r];  log_l : float[l] log10 erg/s;  shift : float[r, l] dex
@@ -159,7 +159,7 @@ def unmatched(z: Float, log_l: Float, shift: Float) -> LineModel:
         Metals(**parameters.section(_FILE, "metals")),
         Ratios(**parameters.section(_FILE, "ratios")),
         parameters.section(_FILE, "hydrogen"),
-        Others(**parameters.section(_FILE, "others")),
+        OtherLines(**parameters.section(_FILE, "others")),
         relative,
         z,
         log_l,
@@ -167,39 +167,39 @@ def unmatched(z: Float, log_l: Float, shift: Float) -> LineModel:
     )
 
 
-def dimming(gas: Gas, log_mass: Float, normal: Float) -> Float:
+def halpha_attenuation(gas: Gas, log_mass: Float, normal: Float) -> Float:
     """A(H alpha)[n] mag of the gas.
 
     gas : constants;  log_mass : float[n] log10 Msun;  normal : float[n] normal deviates
     Ref: Garn & Best 2010, eq. 6
     """
     mean = np.polynomial.polynomial.polyval(np.clip(log_mass - gas.pivot, *gas.limits), gas.polynomial)
-    return np.asarray(np.maximum(mean, gas.least) * np.exp(gas.scatter * normal))
+    return np.asarray(np.maximum(mean, gas.min_attenuation) * np.exp(gas.scatter * normal))
 
 
-def raw_halpha(law: Halpha, log_sfr: Float, dimmed: Float, normal: Float) -> Float:
+def raw_halpha(law: Halpha, log_sfr: Float, a_halpha: Float, normal: Float) -> Float:
     """log10 of the observed H alpha luminosity[n], erg/s.
 
     log_sfr : float[n] log10 Msun/yr, Kroupa;  dimmed : float[n] A(H alpha) mag
     law     : constants of the calibration;  normal : float[n] normal deviates
     Ref: Kennicutt & Evans 2012
     """
-    return np.asarray(log_sfr + law.per_sfr + law.scatter * normal - 0.4 * dimmed)
+    return np.asarray(log_sfr + law.per_sfr + law.scatter * normal - 0.4 * a_halpha)
 
 
-def matched(lines: LineModel, z: Float, log_l: Float) -> Float:
+def match_abundance(line_model: LineModel, z: Float, log_l: Float) -> Float:
     """log10 L[n] with the observed abundance; bilinear in z and log L, held at the table's edges.
 
     z : float[n];  log_l : float[n] log10 erg/s
     """
-    row, part = bracket(lines.z, z)
-    column, share = bracket(lines.log_l, log_l)
-    low = lines.shift[row, column] * (1.0 - share) + lines.shift[row, column + 1] * share
-    high = lines.shift[row + 1, column] * (1.0 - share) + lines.shift[row + 1, column + 1] * share
+    row, part = bracket(line_model.z, z)
+    column, share = bracket(line_model.log_l, log_l)
+    low = line_model.shift[row, column] * (1.0 - share) + line_model.shift[row, column + 1] * share
+    high = line_model.shift[row + 1, column] * (1.0 - share) + line_model.shift[row + 1, column + 1] * share
     return np.asarray(log_l + low * (1.0 - part) + high * part)
 
 
-def shines(law: Halpha, log_sfr: Float, red: Bool) -> Bool:
+def has_lines(law: Halpha, log_sfr: Float, red: Bool) -> Bool:
     """Whether a galaxy has lines, bool[n].
 
     law : constants;  log_sfr : float[n] log10 Msun/yr;  red : bool[n] on the red sequence
@@ -219,7 +219,9 @@ def metallicity(law: Metals, log_mass: Float, log_sfr: Float, normal: Float) -> 
     return np.asarray(np.clip(law.highest - law.turn * fall + law.scatter * normal, *law.limits))
 
 
-def fluxes(own: LineModel, z: Float, log_mass: Float, log_sfr: Float, red: Bool, rng: Draws) -> dict[str, Float]:
+def fluxes(
+    line_model: LineModel, z: Float, log_mass: Float, log_sfr: Float, red: Bool, rng: AnyGenerator
+) -> dict[str, Float]:
     """Flux[n] of the primary component of each line, erg s-1 cm-2, before magnification and the Milky Way.
 
     z : float[n] true redshift;  log_mass, log_sfr : float[n] log10 Msun, log10 Msun/yr (Chabrier, Kroupa)
@@ -227,16 +229,18 @@ def fluxes(own: LineModel, z: Float, log_mass: Float, log_sfr: Float, red: Bool,
     own : constants and matching;  returns : by column of table `galaxies`
     """
     normals = np.stack([rng.standard_normal(z.size) for _ in range(_DEVIATES)])
-    dimmed = dimming(own.gas, log_mass, normals[0])
-    observed = matched(own, z, raw_halpha(own.halpha, log_sfr, dimmed, normals[1]))
-    excess = metallicity(own.metals, log_mass, log_sfr, normals[2]) - own.metals.sun
-    log_l = _luminosities(own, z, observed + 0.4 * dimmed, excess, normals[3:])
+    a_halpha = halpha_attenuation(line_model.gas, log_mass, normals[0])
+    observed = match_abundance(line_model, z, raw_halpha(line_model.halpha, log_sfr, a_halpha, normals[1]))
+    excess = metallicity(line_model.metals, log_mass, log_sfr, normals[2]) - line_model.metals.sun
+    log_l = _luminosities(line_model, z, observed + 0.4 * a_halpha, excess, normals[3:])
     area = np.log10(4.0 * np.pi) + 2.0 * np.log10(cosmology.luminosity_distance(z) / cosmology.HUBBLE * _CM_PER_MPC)
-    seen = np.where(shines(own.halpha, log_sfr, red), -area, -np.inf)
-    return {column: 10.0 ** (log_l[column] - 0.4 * k * dimmed + seen) for column, k in own.dust.items()}
+    log_dilution = np.where(has_lines(line_model.halpha, log_sfr, red), -area, -np.inf)
+    return {
+        column: 10.0 ** (log_l[column] - 0.4 * k * a_halpha + log_dilution) for column, k in line_model.dust.items()
+    }
 
 
-def added(band: Passband, z_obs: Float, fluxes: Mapping[str, Float]) -> Float:
+def mean_line_flux(band: Passband, z_obs: Float, fluxes: Mapping[str, Float]) -> Float:
     """f_nu[n] erg s-1 cm-2 Hz-1, averaged over the band, of all lines.
 
     band : that they are seen through;  z_obs : float[n];  fluxes : float[n] erg s-1 cm-2 by column of table `galaxies`
@@ -248,12 +252,12 @@ def added(band: Passband, z_obs: Float, fluxes: Mapping[str, Float]) -> Float:
         at = line.vacuum * (1.0 + z_obs) - band.wavelength[0] + 1.0
         place = np.clip(at, 0.0, weights.size - 1.0)
         below = np.minimum(place.astype(np.int64), weights.size - 2)
-        seen = weights[below] + (place - below) * (weights[below + 1] - weights[below])
-        total += line.ratio * fluxes[line.column] * seen
+        response = weights[below] + (place - below) * (weights[below + 1] - weights[below])
+        total += line.ratio * fluxes[line.column] * response
     return total
 
 
-def brightened(magnitude: Float, light: Float) -> Float:
+def magnitude_with_light(magnitude: Float, light: Float) -> Float:
     """AB magnitudes[n] of sources with more light.
 
     magnitude : float[n] AB, without it;  light : float[n] f_nu, erg s-1 cm-2 Hz-1
@@ -261,27 +265,27 @@ def brightened(magnitude: Float, light: Float) -> Float:
     return np.asarray(magnitude - 2.5 * np.log10(1.0 + light * 10.0 ** (0.4 * (magnitude + AB_CGS))))
 
 
-def expected_counts(flux: Float, near: float, far: float) -> Float:
+def expected_counts(flux: Float, z_min: float, z_max: float) -> Float:
     """Galaxies[n] per deg2 above H alpha fluxes[n], erg s-1 cm-2, between two redshifts.
 
     flux : float[n] erg s-1 cm-2
     Ref: Pozzetti et al. 2016, A&A 590, A3, model 3, in the cosmology of that paper
     """
     law = Pozzetti(**parameters.section(_FILE, "pozzetti"))
-    z = np.linspace(near, far, _Z_NODES)
+    z = np.linspace(z_min, z_max, _Z_NODES)
     rate = np.sqrt(law.omega_m * (1.0 + z) ** 3 + 1.0 - law.omega_m)
-    fine = np.linspace(0.0, far, 20 * _Z_NODES)
+    fine = np.linspace(0.0, z_max, 20 * _Z_NODES)
     inverse = 1.0 / np.sqrt(law.omega_m * (1.0 + fine) ** 3 + 1.0 - law.omega_m)
     hubble_distance = LIGHT_KM_S / (100.0 * law.hubble)
     steps = 0.5 * (inverse[1:] + inverse[:-1]) * np.diff(fine)
     chi = hubble_distance * np.interp(z, fine, np.concatenate([[0.0], np.cumsum(steps)]))
     volume = chi**2 * hubble_distance / rate * np.radians(1.0) ** 2
     area = 4.0 * np.pi * ((1.0 + z) * chi * _CM_PER_MPC) ** 2
-    totals = [np.trapezoid(volume * _brighter(law, z, np.log10(f * area)), z) for f in np.atleast_1d(flux)]
+    totals = [np.trapezoid(volume * _density_above(law, z, np.log10(f * area)), z) for f in np.atleast_1d(flux)]
     return np.array(totals)
 
 
-def _brighter(law: Pozzetti, z: Float, log_l: Float) -> Float:
+def _density_above(law: Pozzetti, z: Float, log_l: Float) -> Float:
     """n(> L)[n], Mpc^-3."""
     fitted = np.maximum(z, law.z_fit)
     log_star = law.l_inf + (1.5 / (1.0 + fitted)) ** law.beta * (law.l_half - law.l_inf)
@@ -293,27 +297,27 @@ def _brighter(law: Pozzetti, z: Float, log_l: Float) -> Float:
     return np.asarray(np.interp(log_l - log_star, log_y, above))
 
 
-def _luminosities(own: LineModel, z: Float, halpha: Float, excess: Float, normals: Float) -> dict[str, Float]:
+def _luminosities(line_model: LineModel, z: Float, halpha: Float, excess: Float, normals: Float) -> dict[str, Float]:
     """log10 of the intrinsic luminosities[n] by column; excess : 12 + log(O/H) less the Sun's."""
-    ratios, others = own.ratios, own.others
+    ratios, other_lines = line_model.ratios, line_model.other_lines
     n2, r3, r2, s2 = (_ratio(numbers, excess) for numbers in (ratios.n2, ratios.r3, ratios.r2, ratios.s2))
-    hbeta = halpha - np.log10(own.hydrogen["halpha"])
+    hbeta = halpha - np.log10(line_model.hydrogen["halpha"])
     r3 = r3 + ratios.r3_z * np.minimum(z, ratios.r3_z_last) + ratios.r3_scatter * normals[1]
     r2 = r2 + ratios.r2_r3 * normals[1] + ratios.r2_scatter * normals[2]
     sii = halpha + s2 + ratios.s2_scatter * normals[3]
-    siii = sii + others.siii + others.siii_scatter * normals[4]
-    helium = hbeta + others.hei_scatter * normals[5]
+    siii = sii + other_lines.siii + other_lines.siii_scatter * normals[4]
+    helium = hbeta + other_lines.hei_scatter * normals[5]
     return {
-        **{f"flux_{line}": hbeta + np.log10(ratio) for line, ratio in own.hydrogen.items()},
+        **{f"flux_{line}": hbeta + np.log10(ratio) for line, ratio in line_model.hydrogen.items()},
         "flux_hbeta": hbeta,
         # The catalogue holds one line of each pair: half of the doublets of equal lines, the stronger of the others.
         "flux_oii": hbeta + r2 + np.log10(0.5),
         "flux_oiii": hbeta + r3,
         "flux_nii": halpha + n2 + ratios.n2_scatter * normals[0],
         "flux_sii": sii + np.log10(0.5),
-        "flux_siii": siii + np.log10(others.siii_pair / (1.0 + others.siii_pair)),
-        "flux_hei": helium + np.log10(others.hei),
-        "flux_hei_5877": helium + np.log10(others.hei_5877),
+        "flux_siii": siii + np.log10(other_lines.siii_pair / (1.0 + other_lines.siii_pair)),
+        "flux_hei": helium + np.log10(other_lines.hei),
+        "flux_hei_5877": helium + np.log10(other_lines.hei_5877),
     }
 
 

@@ -30,13 +30,13 @@ from truesky.catalogue.galaxies.band_ratios import BandRatios, Sed
 from truesky.catalogue.galaxies.emission_lines import LineModel
 from truesky.catalogue.galaxies.lensing import Shear
 from truesky.catalogue.galaxies.morphology import Shapes
-from truesky.catalogue.galaxies.sequences import Colour, Colours, Limits
+from truesky.catalogue.galaxies.sequences import Colour, ColourLimits, Colours
 from truesky.catalogue.halos.population import SATELLITE
 from truesky.fluxes import cosmology, sources
 from truesky.fluxes.libraries import templates
 from truesky.randomness.rng import stream
 
-Given = Mapping[str, Array]
+CatalogueColumns = Mapping[str, Array]
 
 # Of a galaxy whose mapping says nothing of dust: as far as tables of E(B-V) reach at the least.
 _LEAST_EBV = 0.5
@@ -55,23 +55,27 @@ class IngestModel:
     rotation: float
     templates: int
     colours: Colours
-    ends: Limits
+    colour_limits: ColourLimits
     reference: BandRatios
     colour: BandRatios
-    seen: BandRatios | None
+    observed_band: BandRatios | None
     shapes: Shapes
     masses: stellar_mass.MassToLight
     star_formation: stellar_mass.StarFormation
     lines: LineModel
 
 
-def model(seed: int, columns: Columns, given: Split, lens: Shear | None = None, rotation: float = 0.0) -> IngestModel:
+def model(
+    seed: int, columns: Columns, split_catalogue: Split, lens: Shear | None = None, rotation: float = 0.0
+) -> IngestModel:
     """Tables as far as the catalogue reaches in redshift and E(B-V); lens, rotation : as of IngestModel.
 
     seed : of the request;  columns : of the mapping;  given : the catalogue, laid out by cell
     """
     # In steps, so that similar catalogues share their tables.
-    dustiest, z_max = (float(np.ceil(10.0 * x) / 10.0) for x in (max(_LEAST_EBV, given.ebv_max), given.z_max + 0.1))
+    dustiest, z_max = (
+        float(np.ceil(10.0 * x) / 10.0) for x in (max(_LEAST_EBV, split_catalogue.ebv_max), split_catalogue.z_max + 0.1)
+    )
     library = templates.galaxy_library()
     colours, colour = sequences.model(), band_ratios.load(library, "sdss_g01", 0.0, dustiest)
     return IngestModel(
@@ -81,7 +85,7 @@ def model(seed: int, columns: Columns, given: Split, lens: Shear | None = None, 
         rotation,
         library.flux.shape[0],
         colours,
-        sequences.limits(colour, colours.dust),
+        sequences.colour_limits(colour, colours.dust),
         band_ratios.load(library, band_ratios.REFERENCE_BAND, z_max, dustiest),
         colour,
         band_ratios.load(library, columns.band, z_max, dustiest) if "mag" in columns.fields else None,
@@ -92,154 +96,174 @@ def model(seed: int, columns: Columns, given: Split, lens: Shear | None = None, 
     )
 
 
-def draw(cell: int, given: Given, universe: IngestModel, dust: Float32) -> pa.Table:
+def draw(cell: int, catalogue: CatalogueColumns, universe: IngestModel, dust: Float32) -> pa.Table:
     """Table `galaxies` of one order-8 cell; given : truesky.catalogue.external.ingest.rows.
 
     dust : float32[pixel] map of A(V), mag (truesky.catalogue.dust_map)
     cell     : nested index at order 8
     universe : what completes the catalogue's columns
     """
-    if not given or not given["index"].size:
+    if not catalogue or not catalogue["index"].size:
         return GALAXIES.empty()
-    n, rng = given["index"].size, _streams(universe.seed, cell)
-    z = _first(given, "z_true", "z_obs")
+    n, rng = catalogue["index"].size, _streams(universe.seed, cell)
+    z = _first_column(catalogue, "z_true", "z_obs")
     z = np.maximum(z, 1e-4)
-    kind = given.get("kind", np.zeros(n, np.int64))
-    lens = _lensing(given, n)
+    kind = catalogue.get("kind", np.zeros(n, np.int64))
+    lens = _lensing(catalogue, n)
     if universe.columns.lines_magnified:
-        given = {**given, **{name: given[name] * _shrinking(lens) for name in given if name.startswith("flux_")}}
-    lens_seen = lens if universe.lens is None else lensing.columns(universe.lens, given["ra"] % 360.0, given["dec"], z)
-    a_v = given["a_v"] if "a_v" in given else dust_map.a_v(dust, lens_seen["ra"], lens_seen["dec"])
-    m_r, colour, sed, law_2, ebv_2 = _light(given, universe, z, kind, _seen(given, universe, lens, a_v), rng)
-    seen = m_r + cosmology.distance_modulus(z) + band_ratios.offset(universe.reference, z, sed)
-    log_mass = _known(given, "log_stellar_mass", stellar_mass.log_stellar_mass(universe.masses, m_r, colour.colour, z))
-    log_sfr = _known(given, "log_sfr", _star_formation(universe.star_formation, z, log_mass, colour, rng))
-    drawn = emission_lines.fluxes(universe.lines, z, log_mass, log_sfr, colour.red, rng("lines"))
+        catalogue = {
+            **catalogue,
+            **{name: catalogue[name] * _inverse_magnification(lens) for name in catalogue if name.startswith("flux_")},
+        }
+    lensed = (
+        lens if universe.lens is None else lensing.columns(universe.lens, catalogue["ra"] % 360.0, catalogue["dec"], z)
+    )
+    a_v = catalogue["a_v"] if "a_v" in catalogue else dust_map.a_v(dust, lensed["ra"], lensed["dec"])
+    m_r, colour, sed, law_2, ebv_2 = _light(
+        catalogue, universe, z, kind, _intrinsic_mag(catalogue, universe, lens, a_v), rng
+    )
+    reference_mag = m_r + cosmology.distance_modulus(z) + band_ratios.offset(universe.reference, z, sed)
+    log_mass = _value_or_computed(
+        catalogue, "log_stellar_mass", stellar_mass.log_stellar_mass(universe.masses, m_r, colour.colour, z)
+    )
+    log_sfr = _value_or_computed(
+        catalogue, "log_sfr", _star_formation(universe.star_formation, z, log_mass, colour, rng)
+    )
+    line_fluxes = emission_lines.fluxes(universe.lines, z, log_mass, log_sfr, colour.red, rng("lines"))
     columns: dict[str, Any] = {
-        **_identity(given, cell, kind),
-        **lens_seen,
+        **_identity(catalogue, cell, kind),
+        **lensed,
         "kind": kind,
         "density_boost": np.ones(n),
-        "z_true": _first(given, "z_true", "z_obs"),
-        "z_obs": _first(given, "z_obs", "z_true"),
+        "z_true": _first_column(catalogue, "z_true", "z_obs"),
+        "z_obs": _first_column(catalogue, "z_obs", "z_true"),
         "abs_mag_r01": m_r,
-        "mag_r01": given.get("mag_r01", seen),
+        "mag_r01": catalogue.get("mag_r01", reference_mag),
         "color_gr_01": colour.colour,
-        "log_halo_mass": _or_missing(given, "log_halo_mass", n),
+        "log_halo_mass": _column_or_nan(catalogue, "log_halo_mass", n),
         "log_stellar_mass": log_mass,
         "log_sfr": log_sfr,
         **band_ratios.columns(sed),
         "ext_law_2": law_2,
         "ebv_2": ebv_2,
-        **{name: _or_missing(given, name, n) if _has_lines(given) else values for name, values in drawn.items()},
-        **_shapes(given, universe.shapes, z, log_mass, colour.red, rng("shape")),
+        **{
+            name: _column_or_nan(catalogue, name, n) if _has_lines(catalogue) else values
+            for name, values in line_fluxes.items()
+        },
+        **_shapes(catalogue, universe.shapes, z, log_mass, colour.red, rng("shape")),
         "a_v": a_v,
     }
-    if "origin_id" in given:
-        columns["origin_id"] = given["origin_id"]
-    if "stamp" in given:
-        columns["stamp"] = np.ma.masked_less(given["stamp"], 0)
-    rows = GALAXIES.build({name: _masked(name, values) for name, values in columns.items()})
-    return cells.in_order(lensing.turned(rows, universe.rotation))
+    if "origin_id" in catalogue:
+        columns["origin_id"] = catalogue["origin_id"]
+    if "stamp" in catalogue:
+        columns["stamp"] = np.ma.masked_less(catalogue["stamp"], 0)
+    rows = GALAXIES.build({name: _mask_missing(name, values) for name, values in columns.items()})
+    return cells.sort_rows(lensing.rotate_position_angles(rows, universe.rotation))
 
 
 def _streams(seed: int, cell: int) -> Any:
-    return lambda what: stream(seed, f"ingest.{what}", cell)
+    return lambda purpose: stream(seed, f"ingest.{purpose}", cell)
 
 
-def _first(given: Given, *names: str) -> Float:
-    return np.asarray(next(given[name] for name in names if name in given), np.float64)
+def _first_column(catalogue: CatalogueColumns, *names: str) -> Float:
+    return np.asarray(next(catalogue[name] for name in names if name in catalogue), np.float64)
 
 
-def _known(given: Given, name: str, computed: Float) -> Float:
+def _value_or_computed(catalogue: CatalogueColumns, name: str, computed: Float) -> Float:
     """The catalogue's value, the computed one where it has none."""
-    return np.where(np.isnan(given[name]), computed, given[name]) if name in given else computed
+    return np.where(np.isnan(catalogue[name]), computed, catalogue[name]) if name in catalogue else computed
 
 
-def _or_missing(given: Given, name: str, n: int) -> Float:
-    return np.asarray(given[name] if name in given else np.full(n, np.nan), np.float64)
+def _column_or_nan(catalogue: CatalogueColumns, name: str, n: int) -> Float:
+    return np.asarray(catalogue[name] if name in catalogue else np.full(n, np.nan), np.float64)
 
 
-def _has_lines(given: Given) -> bool:
-    return any(name.startswith("flux_") for name in given)
+def _has_lines(catalogue: CatalogueColumns) -> bool:
+    return any(name.startswith("flux_") for name in catalogue)
 
 
-def _masked(name: str, values: Array) -> Any:
+def _mask_missing(name: str, values: Array) -> Any:
     if GALAXIES.column(name).nullable and values.dtype.kind == "f" and not isinstance(values, np.ma.MaskedArray):
         return np.ma.masked_invalid(values)
     return values
 
 
-def _identity(given: Given, cell: int, kind: Int) -> dict[str, Int]:
+def _identity(catalogue: CatalogueColumns, cell: int, kind: Int) -> dict[str, Int]:
     """Halos are numbered by their first galaxy; a halo's central is member 0, its satellites follow."""
-    n = given["index"].size
-    host = given["halo"] if "halo" in given else np.arange(n)
-    _, first, which = np.unique(host, return_index=True, return_inverse=True)
+    n = catalogue["index"].size
+    host = catalogue["halo"] if "halo" in catalogue else np.arange(n)
+    _, first, host_row = np.unique(host, return_index=True, return_inverse=True)
     number = np.empty(first.size, np.int64)
     number[np.argsort(first, kind="stable")] = np.arange(first.size)
-    order = np.lexsort((np.arange(n), kind, which))
-    begins = np.searchsorted(which[order], np.arange(first.size))
+    order = np.lexsort((np.arange(n), kind, host_row))
+    begins = np.searchsorted(host_row[order], np.arange(first.size))
     rank = np.empty(n, np.int64)
-    rank[order] = np.arange(n) - begins[which[order]]
+    rank[order] = np.arange(n) - begins[host_row[order]]
     # Halos without a central here begin with member 1, and so does nobody else's.
-    headless = np.ones(first.size, bool)
-    headless[which[kind != SATELLITE]] = False
-    source = ids.source_id(kind, cell, number[which], rank + headless[which])
-    return {"id": source, "halo_id": ids.halo_of(source)}
+    lacks_central = np.ones(first.size, bool)
+    lacks_central[host_row[kind != SATELLITE]] = False
+    source = ids.source_id(kind, cell, number[host_row], rank + lacks_central[host_row])
+    return {"id": source, "halo_id": ids.halo_from_id(source)}
 
 
-def _lensing(given: Given, n: int) -> dict[str, Array]:
+def _lensing(catalogue: CatalogueColumns, n: int) -> dict[str, Array]:
     zeros = np.zeros(n)
-    true = given["ra"], given["dec"]
-    seen = given.get("ra_lensed", true[0]), given.get("dec_lensed", true[1])
-    shear = {name: given.get(name, zeros) for name in ("kappa", "gamma1", "gamma2")}
-    return {**lensing.places(seen, true), **shear}
+    true = catalogue["ra"], catalogue["dec"]
+    observed = catalogue.get("ra_lensed", true[0]), catalogue.get("dec_lensed", true[1])
+    shear = {name: catalogue.get(name, zeros) for name in ("kappa", "gamma1", "gamma2")}
+    return {**lensing.position_columns(observed, true), **shear}
 
 
-def _seen(given: Given, universe: IngestModel, lens: Mapping[str, Array], a_v: Float) -> Float | None:
+def _intrinsic_mag(
+    catalogue: CatalogueColumns, universe: IngestModel, lens: Mapping[str, Array], a_v: Float
+) -> Float | None:
     """`mag` before magnification and the Milky Way."""
-    if "mag" not in given:
+    if "mag" not in catalogue:
         return None
     over_v = universe.columns.seen_over_v
     if over_v is None:
-        return given["mag"]
-    return np.asarray(given["mag"] - over_v * a_v - 2.5 * np.log10(_shrinking(lens)))
+        return catalogue["mag"]
+    return np.asarray(catalogue["mag"] - over_v * a_v - 2.5 * np.log10(_inverse_magnification(lens)))
 
 
-def _shrinking(lens: Mapping[str, Array]) -> Float:
+def _inverse_magnification(lens: Mapping[str, Array]) -> Float:
     """1 / magnification[n]; of galaxies nearer to a caustic, which go into quarantine, that at its edge."""
-    found = sources.determinant(*(lens[name] for name in ("kappa", "gamma1", "gamma2")))
-    return np.asarray(np.maximum(np.abs(found), lensing.settings().caustic))
+    determinant = sources.determinant(*(lens[name] for name in ("kappa", "gamma1", "gamma2")))
+    return np.asarray(np.maximum(np.abs(determinant), lensing.settings().caustic))
 
 
 def _light(
-    given: Given, universe: IngestModel, z: Float, kind: Int, seen: Float | None, rng: Any
+    catalogue: CatalogueColumns, universe: IngestModel, z: Float, kind: Int, intrinsic_mag: Float | None, rng: Any
 ) -> tuple[Float, Colour, Sed, Int, Float]:
     """M_r, colours, spectra, and law and E(B-V) of the second component."""
-    m_r = given.get("abs_mag_r01")
+    m_r = catalogue.get("abs_mag_r01")
     # Without an absolute magnitude, colours are drawn for that of a flat spectrum.
-    apparent = given.get("mag_r01", seen)
+    apparent = catalogue.get("mag_r01", intrinsic_mag)
     guess = m_r if m_r is not None else np.asarray(apparent) - cosmology.distance_modulus(z) - 2.5 * np.log10(1.0 + z)
     fraction = sequences.red_fraction(universe.colours.fraction, guess, z, kind)
-    found = sequences.draw(universe.colours, universe.ends, guess, z, fraction, rng("colour"))
-    if "color_gr_01" in given:
-        colour = given["color_gr_01"]
+    drawn_colour = sequences.draw(universe.colours, universe.colour_limits, guess, z, fraction, rng("colour"))
+    if "color_gr_01" in catalogue:
+        colour = catalogue["color_gr_01"]
         red = colour > np.quantile(colour, 1.0 - float(np.mean(fraction)))
-        found = sequences.known(universe.colours, guess, z, colour, red)
-    if "sed" in given or "sed_1" in given:
-        sed = _spectra(given, universe.templates)
-        if "color_gr_01" not in given:
+        drawn_colour = sequences.place_on_sequence(universe.colours, guess, z, colour, red)
+    if "sed" in catalogue or "sed_1" in catalogue:
+        sed = _spectra(catalogue, universe.templates)
+        if "color_gr_01" not in catalogue:
             realised = band_ratios.colours(universe.colour, sed)
-            found = sequences.known(universe.colours, guess, z, realised, sed.ebv <= 0.0)
+            drawn_colour = sequences.place_on_sequence(universe.colours, guess, z, realised, sed.ebv <= 0.0)
     else:
-        law, ebv = sequences.dust(universe.colours, universe.ends, guess, z, found, rng("dust"))
-        sed = band_ratios.invert(universe.colour, found.colour, law, ebv)
-        if "color_gr_01" not in given:
-            found = Colour(found.sequence, band_ratios.colours(universe.colour, sed), found.deviate)
+        law, ebv = sequences.draw_dust(universe.colours, universe.colour_limits, guess, z, drawn_colour, rng("dust"))
+        sed = band_ratios.sed_of_colour(universe.colour, drawn_colour.colour, law, ebv)
+        if "color_gr_01" not in catalogue:
+            drawn_colour = Colour(
+                drawn_colour.sequence, band_ratios.colours(universe.colour, sed), drawn_colour.deviate
+            )
     if m_r is None:
-        table = universe.reference if "mag_r01" in given or universe.seen is None else universe.seen
+        table = (
+            universe.reference if "mag_r01" in catalogue or universe.observed_band is None else universe.observed_band
+        )
         m_r = np.asarray(apparent) - cosmology.distance_modulus(z) - band_ratios.offset(table, z, sed)
-    return m_r, found, sed, given.get("ext_law_2", sed.law), given.get("ebv_2", sed.ebv)
+    return m_r, drawn_colour, sed, catalogue.get("ext_law_2", sed.law), catalogue.get("ebv_2", sed.ebv)
 
 
 def _star_formation(law: stellar_mass.StarFormation, z: Float, log_mass: Float, colour: Colour, rng: Any) -> Float:
@@ -247,11 +271,11 @@ def _star_formation(law: stellar_mass.StarFormation, z: Float, log_mass: Float, 
     return stellar_mass.log_sfr(law, main, colour.sequence, colour.deviate, rng("star_formation"))
 
 
-def _spectra(given: Given, count: int) -> Sed:
-    if "sed" in given:
-        sed = band_ratios.between(given["sed"], given["ext_law"], given["ebv"])
+def _spectra(catalogue: CatalogueColumns, count: int) -> Sed:
+    if "sed" in catalogue:
+        sed = band_ratios.sed_of_index(catalogue["sed"], catalogue["ext_law"], catalogue["ebv"])
     else:
-        sed = Sed(*(given[name] for name in ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")))
+        sed = Sed(*(catalogue[name] for name in ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")))
     highest = max(int(sed.template_1.max()), int(sed.template_2.max()))
     if highest >= count:
         raise BadInput(f"ingest.galaxies: a galaxy has template {highest}, the library holds 0 .. {count - 1}")
@@ -259,31 +283,31 @@ def _spectra(given: Given, count: int) -> Sed:
 
 
 def _shapes(
-    given: Given, shapes: Shapes, z: Float, log_mass: Float, red: Bool, rng: np.random.Generator
+    catalogue: CatalogueColumns, shapes: Shapes, z: Float, log_mass: Float, red: Bool, rng: np.random.Generator
 ) -> dict[str, Float]:
     n = z.size
     radius = morphology.half_light_radius(shapes.size, z, log_mass, red, cosmology.kpc_per_arcsec(z), rng)
-    fraction = given.get("bulge_fraction", morphology.bulge_fraction(shapes.bulge, log_mass, red, rng))
-    sersic = given.get("bulge_sersic_index", morphology.sersic_index(shapes.bulge, red, rng))
+    fraction = catalogue.get("bulge_fraction", morphology.bulge_fraction(shapes.bulge, log_mass, red, rng))
+    sersic = catalogue.get("bulge_sersic_index", morphology.sersic_index(shapes.bulge, red, rng))
     ratio = morphology.radius_ratio(shapes.bulge, red, rng)
     bulge, disc = morphology.component_radii(shapes, radius, fraction, ratio, sersic)
-    thin = morphology.disc_axis_ratio(shapes, n, rng)
-    if "inclination" in given:
+    disc_ratio = morphology.disc_axis_ratio(shapes, n, rng)
+    if "inclination" in catalogue:
         # q^2 = cos^2 i + h^2 sin^2 i: what table `galaxies` means by an inclination.
-        inclined = np.radians(given["inclination"])
-        thin = np.hypot(np.cos(inclined), shapes.scale_height * np.sin(inclined))
-    thin = given.get("disk_axis_ratio", thin)
-    found = {
-        "bulge_half_light_radius": given.get("bulge_half_light_radius", bulge),
-        "disk_half_light_radius": given.get("disk_half_light_radius", disc),
+        inclined = np.radians(catalogue["inclination"])
+        disc_ratio = np.hypot(np.cos(inclined), shapes.scale_height * np.sin(inclined))
+    disc_ratio = catalogue.get("disk_axis_ratio", disc_ratio)
+    columns = {
+        "bulge_half_light_radius": catalogue.get("bulge_half_light_radius", bulge),
+        "disk_half_light_radius": catalogue.get("disk_half_light_radius", disc),
         "bulge_fraction": fraction,
         "bulge_sersic_index": sersic,
-        "bulge_axis_ratio": given.get("bulge_axis_ratio", morphology.bulge_axis_ratio(shapes.bulge, n, rng)),
-        "disk_axis_ratio": thin,
-        "inclination": given.get("inclination", morphology.inclination(thin, shapes.scale_height)),
-        "position_angle": sky.position_angle(given.get("position_angle", morphology.position_angle(n, rng))),
+        "bulge_axis_ratio": catalogue.get("bulge_axis_ratio", morphology.bulge_axis_ratio(shapes.bulge, n, rng)),
+        "disk_axis_ratio": disc_ratio,
+        "inclination": catalogue.get("inclination", morphology.inclination(disc_ratio, shapes.scale_height)),
+        "position_angle": sky.wrap_position_angle(catalogue.get("position_angle", morphology.position_angle(n, rng))),
     }
     # A catalogue's own fraction stands for every band, unless it has a colour as well.
-    colour = np.full(n, np.nan) if "bulge_fraction" in given else morphology.bulge_colour(shapes.bulge, n, rng)
-    found["bulge_color"] = given.get("bulge_color", colour)
-    return {name: np.asarray(values, np.float64) for name, values in found.items()}
+    colour = np.full(n, np.nan) if "bulge_fraction" in catalogue else morphology.bulge_colour(shapes.bulge, n, rng)
+    columns["bulge_color"] = catalogue.get("bulge_color", colour)
+    return {name: np.asarray(values, np.float64) for name, values in columns.items()}

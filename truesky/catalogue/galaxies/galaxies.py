@@ -21,7 +21,7 @@ from lake_schema.arrays import Bool, Complex, Float, Float32, Int
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.halos import HALO_LIMITS, HALOS
 from truesky.catalogue import dust_map
-from truesky.catalogue.cells import in_order
+from truesky.catalogue.cells import sort_rows
 from truesky.catalogue.galaxies import (
     alignments,
     band_ratios,
@@ -38,24 +38,24 @@ from truesky.catalogue.galaxies.alignments import Alignments
 from truesky.catalogue.galaxies.band_ratios import BandRatios, Sed
 from truesky.catalogue.galaxies.emission_lines import LineModel
 from truesky.catalogue.galaxies.halo_lensing import Neighbourhood
-from truesky.catalogue.galaxies.high_redshift import Kind, Near
+from truesky.catalogue.galaxies.high_redshift import Kind, PositionFilter
 from truesky.catalogue.galaxies.lensing import Lens, Shear
 from truesky.catalogue.galaxies.morphology import Shapes
 from truesky.catalogue.galaxies.nearest_sed import Training
-from truesky.catalogue.galaxies.sequences import Colour, Colours, Limits
+from truesky.catalogue.galaxies.sequences import Colour, ColourLimits, Colours
 from truesky.catalogue.halos import luminosity_function, matching, population, quenching
 from truesky.catalogue.halos.halo_catalogue import LightCone
 from truesky.catalogue.halos.luminosity_function import Inverse, Schechter
-from truesky.catalogue.halos.population import Cells, Members, Population
+from truesky.catalogue.halos.population import CellCache, Members, Population
 from truesky.fluxes import cosmology, passbands
 from truesky.fluxes.libraries import templates
 from truesky.fluxes.passbands import Passband
-from truesky.randomness.keyed import Keyed
+from truesky.randomness.per_source import PerSourceGenerator
 from truesky.request.schema import Universe
 
 # Candidates are drawn this much deeper than the brightest SED needs, mag: emission lines brighten them, but for one
 # galaxy in 10^4 by no more (tests).  Of candidates, those are given lines whose continuum is so near to the limit.
-_MARGIN, _LINES = 0.25, 0.75
+_CANDIDATE_MARGIN, _LINE_MARGIN = 0.25, 0.75
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,7 +78,7 @@ class GalaxyModel:
     alignments: Alignments | None
     luminosities: Schechter
     colours: Colours
-    ends: Limits
+    colour_limits: ColourLimits
     halo_shares: quenching.Shares
     selection: BandRatios
     reference: BandRatios
@@ -92,7 +92,7 @@ class GalaxyModel:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Drawn:
+class SelectedGalaxies:
     """Selected galaxies, [n]: rows of members, z, M_r, as of `apparent`, colours that the spectra have, spectra."""
 
     row: Int
@@ -102,14 +102,14 @@ class Drawn:
     colour: Colour
     sed: Sed
 
-    def part(self, keep: Bool) -> Drawn:
+    def select(self, keep: Bool) -> SelectedGalaxies:
         """The galaxies that are kept: keep : bool[n]."""
-        found = self.row[keep], self.z[keep], self.m_r[keep], self.magnitude[keep]
-        return Drawn(*found, self.colour.part(keep), self.sed.part(keep))
+        rows = self.row[keep], self.z[keep], self.m_r[keep], self.magnitude[keep]
+        return SelectedGalaxies(*rows, self.colour.select(keep), self.sed.select(keep))
 
 
 def model(
-    seed: int, wanted: Universe, light_cone: LightCone | None = None, training: Training | None = None
+    seed: int, requested: Universe, light_cone: LightCone | None = None, training: Training | None = None
 ) -> GalaxyModel:
     """The embedded universe of a seed: its galaxies brighter than a limit in a band, and with z < z_max.
 
@@ -120,23 +120,25 @@ def model(
     seed                   : of the request;  wanted : section `universe` of the request
     """
     library, colours = templates.galaxy_library(), sequences.model()
-    selection = _selection(wanted, training)
+    selection = _selection(requested, training)
     dustiest = float(selection.ebv[-1])
-    found = halos_and_galaxies(seed, wanted, light_cone, training)
-    boosts = wanted.high_redshift_boost, wanted.quasar_boost
-    distant = high_redshift.model(*boosts, wanted.galaxy_limit, wanted.z_max)
+    halo_population = halos_and_galaxies(seed, requested, light_cone, training)
+    boosts = requested.high_redshift_boost, requested.quasar_boost
+    distant = high_redshift.model(*boosts, requested.galaxy_limit, requested.z_max)
     colour = band_ratios.load(library, "sdss_g01", 0.0, dustiest)
     return GalaxyModel(
-        limit=wanted.galaxy_limit,
-        band=passbands.load(wanted.galaxy_band),
-        population=found,
-        lens=_lens(found, wanted, far=bool(distant)),
-        rotation=wanted.rotation,
-        alignments=alignments.model(found.halos.box, found.halos.turned, wanted.alignment),
+        limit=requested.galaxy_limit,
+        band=passbands.load(requested.galaxy_band),
+        population=halo_population,
+        lens=_lens(halo_population, requested, with_far_planes=bool(distant)),
+        rotation=requested.rotation,
+        alignments=alignments.model(halo_population.halos.box, halo_population.halos.replicas, requested.alignment),
         luminosities=luminosity_function.schechter(),
         colours=colours,
-        ends=sequences.limits(colour, colours.dust),
-        halo_shares=quenching.shares(quenching.model(), found.masses, found.halos.matching.occupation),
+        colour_limits=sequences.colour_limits(colour, colours.dust),
+        halo_shares=quenching.shares(
+            quenching.model(), halo_population.masses, halo_population.halos.matching.occupation
+        ),
         selection=selection,
         reference=band_ratios.load(library, band_ratios.REFERENCE_BAND, matching.Z_LAST, dustiest),
         colour=colour,
@@ -150,19 +152,21 @@ def model(
 
 
 def halos_and_galaxies(
-    seed: int, wanted: Universe, light_cone: LightCone | None = None, training: Training | None = None
+    seed: int, requested: Universe, light_cone: LightCone | None = None, training: Training | None = None
 ) -> Population:
     """The population that a limit can be asked of: halos with their galaxies, before these have colours.
 
     seed, wanted, light_cone, training : as of `model`
     """
-    nodes, brightest = band_ratios.brightest(_selection(wanted, training))
+    nodes, brightest = band_ratios.brightest_offset(_selection(requested, training))
 
     def faintest(z: Float) -> Float:
-        return wanted.galaxy_limit + _MARGIN - cosmology.distance_modulus(z) - np.interp(z, nodes, brightest)
+        return (
+            requested.galaxy_limit + _CANDIDATE_MARGIN - cosmology.distance_modulus(z) - np.interp(z, nodes, brightest)
+        )
 
-    volume = luminosity_function.volume(wanted.z_max)
-    return population.model(seed, wanted.box_cells, volume, _inverse(), faintest, light_cone)
+    volume = luminosity_function.volume(requested.z_max)
+    return population.model(seed, requested.box_cells, volume, _inverse(), faintest, light_cone)
 
 
 @cache
@@ -171,34 +175,34 @@ def _inverse() -> Inverse:
     return luminosity_function.inverse(luminosity_function.schechter(), matching.Z_LAST)
 
 
-def _lens(found: Population, wanted: Universe, far: bool) -> Lens:
-    if wanted.lensing is not None:
-        return Shear(*wanted.lensing)
-    return lensing.load(found.halos.box, wanted.lensing_nside, far)
+def _lens(halo_population: Population, requested: Universe, with_far_planes: bool) -> Lens:
+    if requested.lensing is not None:
+        return Shear(*requested.lensing)
+    return lensing.load(halo_population.halos.box, requested.lensing_nside, with_far_planes)
 
 
-def _selection(wanted: Universe, training: Training | None) -> BandRatios:
+def _selection(requested: Universe, training: Training | None) -> BandRatios:
     dustiest = max(sequences.model().dust.highest, training.dustiest if training else 0.0)
-    return band_ratios.load(templates.galaxy_library(), wanted.galaxy_band, matching.Z_LAST, dustiest)
+    return band_ratios.load(templates.galaxy_library(), requested.galaxy_band, matching.Z_LAST, dustiest)
 
 
-def draw(cell: int, universe: GalaxyModel, cells: Cells, dust: Float32) -> pa.Table:
+def draw(cell: int, universe: GalaxyModel, cells: CellCache, dust: Float32) -> pa.Table:
     """Rows of table `galaxies` that are truly in one order-8 cell, sorted by _healpix_29 of where they are seen.
 
     cells : what has been drawn of the universe's population
     dust  : float32[pixel] mag, map of the Milky Way's A(V) (truesky.catalogue.dust_map)
     """
-    lens = halo_lensing.around(universe.lens, cells, cell)
-    return of_members(cell, universe, population.members(cells, cell), lens, dust)
+    lens = halo_lensing.lens_of_cell(universe.lens, cells, cell)
+    return draw_members(cell, universe, population.members(cells, cell), lens, dust)
 
 
-def of_members(
+def draw_members(
     cell: int,
     universe: GalaxyModel,
     members: Members,
     lens: Lens | Neighbourhood,
     dust: Float32,
-    near: Near | None = None,
+    position_filter: PositionFilter | None = None,
 ) -> pa.Table:
     """Those of them that are bright enough, and quasars and galaxies beyond the light-cone.
 
@@ -207,10 +211,12 @@ def of_members(
     cell, universe, dust : as of `draw`
     """
     seed = universe.population.seed
-    drawn, physical = _bright(universe, members, select(universe, *_light(seed, universe, members), _LINES))
+    drawn, physical = _bright(
+        universe, members, select(universe, *_draw_candidates(seed, universe, members), _LINE_MARGIN)
+    )
     distance_modulus = cosmology.distance_modulus(drawn.z)
     columns = {
-        **_places(lens, members, drawn.row, dust),
+        **_position_columns(lens, members, drawn.row, dust),
         "abs_mag_r01": drawn.m_r,
         "mag_r01": drawn.m_r + distance_modulus + band_ratios.offset(universe.reference, drawn.z, drawn.sed),
         "color_gr_01": drawn.colour.colour,
@@ -219,14 +225,14 @@ def of_members(
         **_shape_columns(universe, members, drawn, physical["log_stellar_mass"]),
     }
     rows = [GALAXIES.build(columns)]
-    rows += [high_redshift.draw(cell, seed, kind, lens, dust, near) for kind in universe.distant]
-    return in_order(lensing.turned(pa.concat_tables(rows), universe.rotation))
+    rows += [high_redshift.draw(cell, seed, kind, lens, dust, position_filter) for kind in universe.distant]
+    return sort_rows(lensing.rotate_position_angles(pa.concat_tables(rows), universe.rotation))
 
 
-def halo_table(cell: int, universe: Population, cells: Cells) -> pa.Table:
+def halo_table(cell: int, universe: Population, cells: CellCache) -> pa.Table:
     """Table `halos` of one order-8 cell, sorted by _healpix_29."""
     hosts = population.halos_of(cells, cell)
-    ra, dec = sky.positions(hosts.index)
+    ra, dec = sky.positions_of_indices(hosts.index)
     z = universe.halos.distances.redshift(hosts.chi)
     return HALOS.build(
         {
@@ -237,15 +243,15 @@ def halo_table(cell: int, universe: Population, cells: Cells) -> pa.Table:
             "z_true": z,
             "z_obs": population.observed_redshift(z, hosts.velocity),
             "log_mass": hosts.log_mass,
-            "concentration": universe.masses.at(universe.masses.concentration, z, hosts.log_mass),
+            "concentration": universe.masses.interpolate_pairs(universe.masses.concentration, z, hosts.log_mass),
         }
     )
 
 
 def halo_limits(universe: Population) -> pa.Table:
     """Table `halo_limits`, from the nearest halos to the request's end."""
-    chi = universe.halos.line.middle
-    chi = np.append(chi[chi < universe.halos.far], universe.halos.far)
+    chi = universe.halos.steps.middle
+    chi = np.append(chi[chi < universe.halos.max_distance], universe.halos.max_distance)
     return HALO_LIMITS.build(
         {
             "z_true": universe.halos.distances.redshift(chi),
@@ -254,35 +260,39 @@ def halo_limits(universe: Population) -> pa.Table:
     )
 
 
-def select(universe: GalaxyModel, z: Float, m_r: Float, colour: Colour, sed: Sed, deeper: float = 0.0) -> Drawn:
+def select(
+    universe: GalaxyModel, z: Float, m_r: Float, colour: Colour, sed: Sed, deeper: float = 0.0
+) -> SelectedGalaxies:
     """The galaxies whose continuum is brighter than the limit, with their realised colours.
 
     z, m_r : float[n] redshift, M_r mag;  colour, sed : of n galaxies, their colours as drawn and spectra
     universe : whose limit and passband hold;  deeper : mag, beyond the limit
     """
-    magnitude = apparent(universe, z, m_r, sed)
+    magnitude = apparent_magnitude(universe, z, m_r, sed)
     row = np.flatnonzero(magnitude < universe.limit + deeper)
-    kept = sed.part(row)
-    realised = replace(colour.part(row), colour=band_ratios.colours(universe.colour, kept))
-    return Drawn(row, z[row], m_r[row], magnitude[row], realised, kept)
+    selected_sed = sed.select(row)
+    realised = replace(colour.select(row), colour=band_ratios.colours(universe.colour, selected_sed))
+    return SelectedGalaxies(row, z[row], m_r[row], magnitude[row], realised, selected_sed)
 
 
-def _bright(universe: GalaxyModel, members: Members, drawn: Drawn) -> tuple[Drawn, dict[str, Float]]:
+def _bright(
+    universe: GalaxyModel, members: Members, drawn: SelectedGalaxies
+) -> tuple[SelectedGalaxies, dict[str, Float]]:
     """Those that are brighter than the limit with their lines; their masses, star formation rates and line fluxes."""
-    seed, own_ids, colour = universe.population.seed, members.id[drawn.row], drawn.colour
+    seed, source_ids, colour = universe.population.seed, members.id[drawn.row], drawn.colour
     log_mass = stellar_mass.log_stellar_mass(universe.masses, drawn.m_r, colour.colour, drawn.z)
     main = stellar_mass.main_sequence(universe.star_formation, log_mass, drawn.z)
-    rng = Keyed(own_ids, seed, "galaxies.star_formation")
+    rng = PerSourceGenerator(source_ids, seed, "galaxies.star_formation")
     log_sfr = stellar_mass.log_sfr(universe.star_formation, main, colour.sequence, colour.deviate, rng)
-    rng = Keyed(own_ids, seed, "galaxies.lines")
+    rng = PerSourceGenerator(source_ids, seed, "galaxies.lines")
     fluxes = emission_lines.fluxes(universe.lines, drawn.z, log_mass, log_sfr, colour.red, rng)
-    light = emission_lines.added(universe.band, members.z_obs[drawn.row], fluxes)
-    kept = emission_lines.brightened(drawn.magnitude, light) < universe.limit
+    light = emission_lines.mean_line_flux(universe.band, members.z_obs[drawn.row], fluxes)
+    is_bright = emission_lines.magnitude_with_light(drawn.magnitude, light) < universe.limit
     columns = {"log_stellar_mass": log_mass, "log_sfr": log_sfr, **fluxes}
-    return drawn.part(kept), {name: column[kept] for name, column in columns.items()}
+    return drawn.select(is_bright), {name: column[is_bright] for name, column in columns.items()}
 
 
-def apparent(universe: GalaxyModel, z: Float, m_r: Float, sed: Sed) -> Float:
+def apparent_magnitude(universe: GalaxyModel, z: Float, m_r: Float, sed: Sed) -> Float:
     """Magnitude[n] of the continuum in the limit's band, AB, unmagnified, before hydrogen and dust on the way to us.
 
     z, m_r : float[n] redshift, M_r mag;  sed : n spectra
@@ -292,22 +302,26 @@ def apparent(universe: GalaxyModel, z: Float, m_r: Float, sed: Sed) -> Float:
     return m_r + cosmology.distance_modulus(z) + band_ratios.offset(universe.selection, z, sed)
 
 
-def _light(seed: int, universe: GalaxyModel, members: Members) -> tuple[Float, Float, Colour, Sed]:
+def _draw_candidates(seed: int, universe: GalaxyModel, members: Members) -> tuple[Float, Float, Colour, Sed]:
     """Candidates of a cell: z, M_r, colours, spectra."""
-    z, colours, ends = members.z, universe.colours, universe.ends
+    z, colours, colour_limits = members.z, universe.colours, universe.colour_limits
     m_r = universe.population.halos.matching.magnitude(z, members.proxy)
     satellites = quenching.satellite_share(universe.halo_shares, members)
     share = sequences.red_fraction(colours.fraction, m_r, z, satellites)
     odds = quenching.odds(universe.halo_shares, members, share)
-    found = sequences.draw(colours, ends, m_r, z, odds, Keyed(members.id, seed, "galaxies.colour"))
+    colour = sequences.draw(
+        colours, colour_limits, m_r, z, odds, PerSourceGenerator(members.id, seed, "galaxies.colour")
+    )
     if universe.training is not None:
-        rng = Keyed(members.id, seed, "galaxies.nearest")
-        return z, m_r, found, nearest_sed.assign(universe.training, found.colour, m_r, z, rng)
-    law, ebv = sequences.dust(colours, ends, m_r, z, found, Keyed(members.id, seed, "galaxies.dust"))
-    return z, m_r, found, band_ratios.invert(universe.colour, found.colour, law, ebv)
+        rng = PerSourceGenerator(members.id, seed, "galaxies.nearest")
+        return z, m_r, colour, nearest_sed.assign(universe.training, colour.colour, m_r, z, rng)
+    law, ebv = sequences.draw_dust(
+        colours, colour_limits, m_r, z, colour, PerSourceGenerator(members.id, seed, "galaxies.dust")
+    )
+    return z, m_r, colour, band_ratios.sed_of_colour(universe.colour, colour.colour, law, ebv)
 
 
-def _places(
+def _position_columns(
     lens: Lens | Neighbourhood, members: Members, row: Int, dust: Float32
 ) -> dict[str, npt.NDArray[np.generic]]:
     places = halo_lensing.columns(lens, members.ra[row], members.dec[row], members.chi[row])
@@ -325,19 +339,21 @@ def _places(
 
 
 def _shape_columns(
-    universe: GalaxyModel, members: Members, drawn: Drawn, log_mass: Float
+    universe: GalaxyModel, members: Members, drawn: SelectedGalaxies, log_mass: Float
 ) -> dict[str, npt.NDArray[np.generic]]:
     source, seed, shapes = members.id[drawn.row], universe.population.seed, universe.shapes
     scale = cosmology.kpc_per_arcsec(drawn.z)
-    rng = Keyed(source, seed, "galaxies.size")
+    rng = PerSourceGenerator(source, seed, "galaxies.size")
     radius = morphology.half_light_radius(shapes.size, drawn.z, log_mass, drawn.colour.red, scale, rng)
-    rng = Keyed(source, seed, "galaxies.bulge")
+    rng = PerSourceGenerator(source, seed, "galaxies.bulge")
     fraction = morphology.bulge_fraction(shapes.bulge, log_mass, drawn.colour.red, rng)
     sersic = morphology.sersic_index(shapes.bulge, drawn.colour.red, rng)
     ratio = morphology.radius_ratio(shapes.bulge, drawn.colour.red, rng)
     bulge_radius, disc_radius = morphology.component_radii(shapes, radius, fraction, ratio, sersic)
-    colour = morphology.bulge_colour(shapes.bulge, source.size, Keyed(source, seed, "galaxies.bulge_colour"))
-    rng = Keyed(source, seed, "galaxies.shape")
+    colour = morphology.bulge_colour(
+        shapes.bulge, source.size, PerSourceGenerator(source, seed, "galaxies.bulge_colour")
+    )
+    rng = PerSourceGenerator(source, seed, "galaxies.shape")
     disc_ratio = morphology.disc_axis_ratio(shapes, drawn.z.size, rng)
     return {
         "bulge_half_light_radius": bulge_radius,
@@ -349,21 +365,26 @@ def _shape_columns(
         "disk_axis_ratio": disc_ratio,
         "inclination": morphology.inclination(disc_ratio, shapes.scale_height),
         "position_angle": alignments.position_angles(
-            universe.alignments, rng.random(drawn.z.size), _aligned(universe, members, drawn), drawn.colour.red
+            universe.alignments,
+            rng.random(drawn.z.size),
+            _mean_ellipticities(universe, members, drawn),
+            drawn.colour.red,
         ),
     }
 
 
-def _aligned(universe: GalaxyModel, members: Members, drawn: Drawn) -> Complex:
+def _mean_ellipticities(universe: GalaxyModel, members: Members, drawn: SelectedGalaxies) -> Complex:
     """Mean ellipticities that the places of galaxies ask for."""
-    mean, own = np.zeros(drawn.row.size, complex), universe.alignments
-    if own is None:
+    mean, alignment_model = np.zeros(drawn.row.size, complex), universe.alignments
+    if alignment_model is None:
         return mean
-    lone = members.kind[drawn.row] == population.CENTRAL
-    row, red = drawn.row[lone], drawn.colour.red[lone]
-    mean[lone] = alignments.of_centrals(own, members.ra[row], members.dec[row], members.chi[row], drawn.m_r[lone], red)
-    row, red = drawn.row[~lone], drawn.colour.red[~lone]
-    towards, apart = alignments.direction(members.ra[row], members.dec[row], members.host_index[row])
+    is_central = members.kind[drawn.row] == population.CENTRAL
+    row, red = drawn.row[is_central], drawn.colour.red[is_central]
+    mean[is_central] = alignments.central_ellipticity(
+        alignment_model, members.ra[row], members.dec[row], members.chi[row], drawn.m_r[is_central], red
+    )
+    row, red = drawn.row[~is_central], drawn.colour.red[~is_central]
+    direction, separation = alignments.direction_to_cells(members.ra[row], members.dec[row], members.host_index[row])
     radius = universe.population.masses.radius(members.host_mass[row]) / members.chi[row]
-    mean[~lone] = alignments.of_satellites(own, towards, apart / radius, red)
+    mean[~is_central] = alignments.satellite_ellipticity(alignment_model, direction, separation / radius, red)
     return mean

@@ -29,21 +29,21 @@ from truesky.catalogue.galaxies.lensing import Lens, Planes
 from truesky.catalogue.halos import lens_halos
 from truesky.catalogue.halos.halos import LEVELS, Halos
 from truesky.catalogue.halos.lens_halos import Settings
-from truesky.catalogue.halos.population import Cells, Population
+from truesky.catalogue.halos.population import CellCache, Population
 from truesky.fluxes import cosmology, sources
 
 # Sources of a cell of this order have the same halos to look through.
-_PIECE = 11
+_SOURCE_ORDER = 11
 # Rows of what is kept of halos: direction (3), those of halo_lensing_sums from the distance on, log10 of the mass.
 _CHI, _CIRCLE, _MASS = 3, 7, 9
 # Cells of halos that are kept: a cell's neighbourhood and that of the cells about it.
-_KEPT = 1024
+_MAX_CACHED_CELLS = 1024
 # How far all other halos but the strongest bend light together, rad.
-_OTHERS = float(np.radians(45.0 / 3600.0))
+_OTHER_DEFLECTION = float(np.radians(45.0 / 3600.0))
 # The grid goes this far beyond a cell, rad: no source is shown farther from where it is.
-_BEYOND = np.radians(7.0 / 60.0)
+_GRID_MARGIN = np.radians(7.0 / 60.0)
 # (order, cell) -> rad.
-Away = Callable[[int, int], float]
+MinDistance = Callable[[int, int], float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,10 +61,12 @@ class Neighbourhood:
     halos: Float
     planes: Float
     smooth: Float
-    farthest: float
+    max_deflection: float
 
 
-def around(lens: Lens, cells: Cells, cell: int, away: Away | None = None) -> Lens | Neighbourhood:
+def lens_of_cell(
+    lens: Lens, cells: CellCache, cell: int, min_distance: MinDistance | None = None
+) -> Lens | Neighbourhood:
     """The halos that reach into a generation cell, by distance, those of one distance by mass and identifier.
 
     lens  : the maps; where there is one shear for all, it stays so
@@ -74,21 +76,21 @@ def around(lens: Lens, cells: Cells, cell: int, away: Away | None = None) -> Len
     """
     if not isinstance(lens, Planes):
         return lens
-    chosen = lens_halos.settings()
+    settings = lens_halos.settings()
     centre = sky.cell_centre(GENERATION_ORDER, cell)
     frame = _frames(*np.atleast_2d(centre).T)[0]
-    radius = sky.cell_radius(GENERATION_ORDER) + chosen.strip / 60.0
-    every = _near(chosen, cell, centre, radius)
-    every = every if away is None else _reaching(chosen, every, away)
-    parts = [_lenses(chosen, lens, cells, *place) for place in every]
-    halos, own = np.concatenate([part[0] for part in parts], 1), np.concatenate([part[1] for part in parts])
+    radius = sky.cell_radius(GENERATION_ORDER) + settings.strip / 60.0
+    halo_cells = _cells_with_halos(settings, cell, centre, radius)
+    halo_cells = halo_cells if min_distance is None else _select_reaching(settings, halo_cells, min_distance)
+    parts = [_cached_lenses(settings, lens, cells, *place) for place in halo_cells]
+    halos, identifiers = np.concatenate([part[0] for part in parts], 1), np.concatenate([part[1] for part in parts])
     # A chord is no longer than its arc.
-    chord = np.sum((halos[:3] - frame[2][:, None]) ** 2, 0)
-    kept = chord <= (np.maximum(halos[_CHI + 2], halos[_CIRCLE]) + np.radians(radius)) ** 2
-    halos, own = halos[:, kept], own[kept]
-    halos = halos[:, np.lexsort((own, halos[_MASS], halos[_CHI]))]
+    squared_chord = np.sum((halos[:3] - frame[2][:, None]) ** 2, 0)
+    reaching = squared_chord <= (np.maximum(halos[_CHI + 2], halos[_CIRCLE]) + np.radians(radius)) ** 2
+    halos, identifiers = halos[:, reaching], identifiers[reaching]
+    halos = halos[:, np.lexsort((identifiers, halos[_MASS], halos[_CHI]))]
     table = np.concatenate([_stereographic(frame, halos[:3].T), halos[_CHI:_MASS]])
-    return Neighbourhood(lens, chosen, frame, table, *_grid(chosen, table), _farthest(table))
+    return Neighbourhood(lens, settings, frame, table, *_grid(settings, table), _max_deflection(table))
 
 
 def columns(lens: Lens | Neighbourhood, ra: Float, dec: Float, chi: Float) -> dict[str, Array]:
@@ -99,110 +101,130 @@ def columns(lens: Lens | Neighbourhood, ra: Float, dec: Float, chi: Float) -> di
     """
     if not isinstance(lens, Neighbourhood):
         return lensing.columns(lens, ra, dec, chi)
-    box = lensing.at(lens.box, ra, dec, chi)
-    seen = lensing.displaced(ra, dec, *box[3:])
-    found = images(lens, *seen, chi)
-    _refuse_beyond(lens, found[3:])
-    kappa, gamma1, gamma2 = box[:3] + found[:3]
+    box_terms = lensing.interpolate(lens.box, ra, dec, chi)
+    box_position = lensing.displace(ra, dec, *box_terms[3:])
+    halo_terms = lensing_at_images(lens, *box_position, chi)
+    _refuse_large_deflection(lens, halo_terms[3:])
+    kappa, gamma1, gamma2 = box_terms[:3] + halo_terms[:3]
     shear = {"kappa": kappa, "gamma1": gamma1, "gamma2": gamma2}
-    return {**lensing.places(lensing.displaced(*seen, *found[3:]), (ra, dec)), **shear}
+    return {**lensing.position_columns(lensing.displace(*box_position, *halo_terms[3:]), (ra, dec)), **shear}
 
 
-def images(lens: Neighbourhood, ra: Float, dec: Float, chi: Float) -> Float:
+def lensing_at_images(lens: Neighbourhood, ra: Float, dec: Float, chi: Float) -> Float:
     """[5, n] kappa, gamma1, gamma2, deflection east, north (rad) by halos, at the images of sources.
 
     Of each source alone, whichever others it comes with.
     ra, dec : float[n] deg, as the box alone shows the sources;  chi : float[n] Mpc/h
     lens    : of the cell that the sources are in, before anything bends their light
     """
-    cell = sky.cell_of(ra, dec, _PIECE)
+    cell = sky.cell_at(ra, dec, _SOURCE_ORDER)
     row = np.lexsort((-chi, cell))
-    cell, own = cell[row], _frames(ra[row], dec[row])
-    place, near = _stereographic(lens.frame, own[:, 2]), 1.0 / np.maximum(chi[row], 1e-9)
-    found = _summed(lens, place, near, cell)
-    again = _worth(lens.settings, found)
-    found[:, again] = _summed(lens, place[:, again] + _newton(found[:, again]), near[again], cell[again])
-    out = np.empty_like(found)
-    out[:, row] = _turned(found, lens.frame, own)
+    cell, frames = cell[row], _frames(ra[row], dec[row])
+    place, inverse_distance = _stereographic(lens.frame, frames[:, 2]), 1.0 / np.maximum(chi[row], 1e-9)
+    terms = _sum_halos(lens, place, inverse_distance, cell)
+    repeated = _rows_to_repeat(lens.settings, terms)
+    terms[:, repeated] = _sum_halos(
+        lens, place[:, repeated] + _newton_step(terms[:, repeated]), inverse_distance[repeated], cell[repeated]
+    )
+    out = np.empty_like(terms)
+    out[:, row] = _rotate_to_sources(terms, lens.frame, frames)
     return out
 
 
-def _refuse_beyond(lens: Neighbourhood, bent: Float) -> None:
+def _refuse_large_deflection(lens: Neighbourhood, deflection: Float) -> None:
     """Refuse what would be seen in a cell that does not look for it."""
-    most = float(np.hypot(*bent).max(initial=0.0))
-    if most > lens.farthest:
-        found, expected = (np.degrees(angle) * 3600.0 for angle in (most, lens.farthest))
-        raise BadInput(f"table galaxies: halos deflect light by {found:.0f} arcsec, {expected:.0f} are allowed for")
+    largest = float(np.hypot(*deflection).max(initial=0.0))
+    if largest > lens.max_deflection:
+        largest_arcsec, allowed_arcsec = (np.degrees(angle) * 3600.0 for angle in (largest, lens.max_deflection))
+        raise BadInput(
+            f"table galaxies: halos deflect light by {largest_arcsec:.0f} arcsec, {allowed_arcsec:.0f} are allowed for"
+        )
 
 
 # ------------------------------------------------------------------------------------------------ halos
 
 
-def _near(chosen: Settings, cell: int, centre: tuple[float, float], radius: float) -> list[tuple[int, int, float]]:
+def _cells_with_halos(
+    settings: Settings, cell: int, centre: tuple[float, float], radius: float
+) -> list[tuple[int, int, float]]:
     """(order, cell, least mass) of cells whose halos may reach into the generation cell, of some heavy ones only."""
-    close = set(sky.cells_in_cone(*centre, radius + chosen.wide / 60.0, GENERATION_ORDER).tolist())
-    every = sky.cells_in_cone(*centre, radius + chosen.reach / 60.0, GENERATION_ORDER).tolist()
-    found = [(GENERATION_ORDER, place, chosen.lowest if place in close else chosen.heavy) for place in every]
+    close_cells = set(sky.cells_in_cone(*centre, radius + settings.wide / 60.0, GENERATION_ORDER).tolist())
+    cells_in_reach = sky.cells_in_cone(*centre, radius + settings.reach / 60.0, GENERATION_ORDER).tolist()
+    selected = [
+        (GENERATION_ORDER, place, settings.lowest if place in close_cells else settings.heavy)
+        for place in cells_in_reach
+    ]
     for order in LEVELS[1:]:
-        own = cell >> 2 * (GENERATION_ORDER - order)
-        found += [(order, place, chosen.lowest) for place in (own, *sky.margin_cells(order, own, order).tolist())]
-    return found
+        parent_cell = cell >> 2 * (GENERATION_ORDER - order)
+        selected += [
+            (order, place, settings.lowest)
+            for place in (parent_cell, *sky.margin_cells(order, parent_cell, order).tolist())
+        ]
+    return selected
 
 
-def _reaching(chosen: Settings, every: list[tuple[int, int, float]], away: Away) -> list[tuple[int, int, float]]:
+def _select_reaching(
+    settings: Settings, candidates: list[tuple[int, int, float]], min_distance: MinDistance
+) -> list[tuple[int, int, float]]:
     """Those of `_near` whose halos may reach nodes about the sources."""
-    beyond = np.radians((chosen.strip + 2.0 * chosen.step) / 60.0)
-    wide, found = np.radians(chosen.wide / 60.0), []
-    for order, cell, least in every:
-        distance = away(order, cell) - beyond
-        if distance <= lens_halos.farthest(chosen, order):
-            light = least if order != GENERATION_ORDER or distance <= wide else chosen.heavy
-            found.append((order, cell, light))
-    return found
+    margin = np.radians((settings.strip + 2.0 * settings.step) / 60.0)
+    wide, selected = np.radians(settings.wide / 60.0), []
+    for order, cell, min_mass in candidates:
+        distance = min_distance(order, cell) - margin
+        if distance <= lens_halos.max_circle(settings, order):
+            mass_limit = min_mass if order != GENERATION_ORDER or distance <= wide else settings.heavy
+            selected.append((order, cell, mass_limit))
+    return selected
 
 
-def _lenses(chosen: Settings, box: Planes, cells: Cells, order: int, cell: int, least: float) -> tuple[Float, Int]:
+def _cached_lenses(
+    settings: Settings, box: Planes, cells: CellCache, order: int, cell: int, min_mass: float
+) -> tuple[Float, Int]:
     """([10, h], identifiers[h]) of halos above a mass that a cell of a level draws, where the box shows them."""
-    kept, which, every = cells.lenses, (order, cell, least), (order, cell, chosen.lowest)
-    if which not in kept:
-        far = chosen.far if least == chosen.lowest else min(chosen.far, chosen.far_of_wide)
-        if every in kept:
-            table, source = kept[every]
-            some = (table[_MASS] >= least) & (table[_CHI] < far)
-            kept[which] = table[:, some], source[some]
+    cache, key, full_key = cells.lenses, (order, cell, min_mass), (order, cell, settings.lowest)
+    if key not in cache:
+        max_distance = (
+            settings.max_distance if min_mass == settings.lowest else min(settings.max_distance, settings.wide_distance)
+        )
+        if full_key in cache:
+            table, source = cache[full_key]
+            selected = (table[_MASS] >= min_mass) & (table[_CHI] < max_distance)
+            cache[key] = table[:, selected], source[selected]
         else:
-            own = cells.population
-            kept[which] = _drawn(chosen, box, own, lens_halos.draw(own, least, far, order, cell), order)
-        if len(kept) > _KEPT:
-            kept.popitem(last=False)
-    kept.move_to_end(which)
-    return kept[which]
+            population = cells.population
+            cache[key] = _lens_table(
+                settings, box, population, lens_halos.draw(population, min_mass, max_distance, order, cell), order
+            )
+        if len(cache) > _MAX_CACHED_CELLS:
+            cache.popitem(last=False)
+    cache.move_to_end(key)
+    return cache[key]
 
 
-def _drawn(chosen: Settings, box: Planes, own: Population, hosts: Halos, order: int) -> tuple[Float, Int]:
+def _lens_table(settings: Settings, box: Planes, population: Population, hosts: Halos, order: int) -> tuple[Float, Int]:
     """What `_lenses` has of halos of a level."""
-    ra, dec = sky.positions(hosts.index)
-    bent = lensing.at(box, ra, dec, hosts.chi)[3:]
-    direction = _frames(*lensing.displaced(ra, dec, *bent))[:, 2]
-    z = own.halos.distances.redshift(hosts.chi)
-    size = lens_halos.sizes(own.masses, chosen, order, z, hosts.chi, hosts.log_mass)
+    ra, dec = sky.positions_of_indices(hosts.index)
+    deflection = lensing.interpolate(box, ra, dec, hosts.chi)[3:]
+    direction = _frames(*lensing.displace(ra, dec, *deflection))[:, 2]
+    z = population.halos.distances.redshift(hosts.chi)
+    size = lens_halos.sizes(population.masses, settings, order, z, hosts.chi, hosts.log_mass)
     return np.concatenate([direction.T, hosts.chi[None], size, hosts.log_mass[None]]), hosts.id
 
 
-def _farthest(halos: Float) -> float:
+def _max_deflection(halos: Float) -> float:
     """The strongest of the halos bends light by its own, infinitely far behind it; all others together by less."""
     # Its compiler takes a second to import.
     from truesky.catalogue.halos import halo_lensing_sums as sums
 
     amplitude, size = halos[sums.AMPLITUDE], halos[sums.SIZE]
     if not amplitude.size:
-        return _OTHERS
-    own = amplitude / size * np.interp(halos[sums.CONCENTRATION], *_steepest())
-    return float(own.max()) + _OTHERS
+        return _OTHER_DEFLECTION
+    deflection = amplitude / size * np.interp(halos[sums.CONCENTRATION], *_max_enclosed_ratio())
+    return float(deflection.max()) + _OTHER_DEFLECTION
 
 
 @lru_cache
-def _steepest() -> tuple[Float, Float]:
+def _max_enclosed_ratio() -> tuple[Float, Float]:
     """Concentrations, and the most that is enclosed, over the radius, both in units of the halo's own."""
     from truesky.catalogue.halos import projected_nfw
 
@@ -213,49 +235,49 @@ def _steepest() -> tuple[Float, Float]:
     return nodes, np.array(enclosed)
 
 
-def _grid(chosen: Settings, halos: Float) -> tuple[Float, Float]:
+def _grid(settings: Settings, halos: Float) -> tuple[Float, Float]:
     """(planes[p], smooth[p, side, side, 5]) of the halos that reach into a cell."""
     # Its compiler takes a second to import.
     from truesky.catalogue.halos import halo_lensing_sums as sums
 
-    step = np.radians(chosen.step / 60.0)
-    half = int(np.ceil((np.radians(sky.cell_radius(GENERATION_ORDER)) + _BEYOND) / step)) + 1
+    step = np.radians(settings.step / 60.0)
+    half = int(np.ceil((np.radians(sky.cell_radius(GENERATION_ORDER)) + _GRID_MARGIN) / step)) + 1
     side = 2 * half + 1
-    near = np.append(0.0, 1.0 / cosmology.comoving_distance(np.array(chosen.planes))[::-1])
-    at = step * np.arange(-half, half + 1)
-    y, x = np.meshgrid(at, at, indexing="ij")
-    place = np.tile(np.stack([x.ravel(), y.ravel()]), near.size)
+    inverse_distances = np.append(0.0, 1.0 / cosmology.comoving_distance(np.array(settings.planes))[::-1])
+    axis = step * np.arange(-half, half + 1)
+    y, x = np.meshgrid(axis, axis, indexing="ij")
+    place = np.tile(np.stack([x.ravel(), y.ravel()]), inverse_distances.size)
     out = np.zeros((5, place.shape[1]))
     wide = np.ascontiguousarray(halos[:, halos[sums.WIDE] > halos[sums.CLOSE]])
-    sums.add_smooth(place, np.repeat(near, side * side), wide, out)
-    return near, np.ascontiguousarray(out.T).reshape(near.size, side, side, 5)
+    sums.add_smooth(place, np.repeat(inverse_distances, side * side), wide, out)
+    return inverse_distances, np.ascontiguousarray(out.T).reshape(inverse_distances.size, side, side, 5)
 
 
 # ------------------------------------------------------------------------------------------------ sources
 
 
-def _summed(lens: Neighbourhood, place: Float, near: Float, cell: Int) -> Float:
+def _sum_halos(lens: Neighbourhood, place: Float, inverse_distance: Float, cell: Int) -> Float:
     """[5, n] in the tangent plane; sources by cell, in each the farthest first."""
     from truesky.catalogue.halos import halo_lensing_sums as sums
 
     first = np.append(np.unique(cell, return_index=True)[1], cell.size)
-    found = np.zeros((5, cell.size))
-    sums.add_halos(place, near, first, lens.halos, found)
-    sums.add_nodes(place, near, lens.planes, np.radians(lens.settings.step / 60.0), lens.smooth, found)
-    return found
+    terms = np.zeros((5, cell.size))
+    sums.add_halos(place, inverse_distance, first, lens.halos, terms)
+    sums.add_nodes(place, inverse_distance, lens.planes, np.radians(lens.settings.step / 60.0), lens.smooth, terms)
+    return terms
 
 
-def _worth(chosen: Settings, found: Float) -> Int:
+def _rows_to_repeat(settings: Settings, terms: Float) -> Int:
     """Rows of what is summed again where its image is: neither hardly lensed nor near a caustic."""
-    kappa, gamma1, gamma2 = found[:3]
-    strong = np.abs(kappa) + np.hypot(gamma1, gamma2) > chosen.again
-    weak = sources.determinant(kappa, gamma1, gamma2) >= chosen.least_determinant
+    kappa, gamma1, gamma2 = terms[:3]
+    strong = np.abs(kappa) + np.hypot(gamma1, gamma2) > settings.repeat_threshold
+    weak = sources.determinant(kappa, gamma1, gamma2) >= settings.least_determinant
     return np.flatnonzero(strong & weak & (kappa < 1.0))
 
 
-def _newton(found: Float) -> Float:
+def _newton_step(terms: Float) -> Float:
     """[2, n] rad, the step from theta = beta to the root of theta - alpha(theta) - beta."""
-    kappa, gamma1, gamma2, east, north = found
+    kappa, gamma1, gamma2, east, north = terms
     x = (1.0 - kappa + gamma1) * east + gamma2 * north
     y = gamma2 * east + (1.0 - kappa - gamma1) * north
     return np.asarray(np.stack([x, y]) / sources.determinant(kappa, gamma1, gamma2))
@@ -275,12 +297,12 @@ def _stereographic(frame: Float, direction: Float) -> Float:
     return np.asarray(np.stack([x, y]) * (2.0 / (1.0 + along)))
 
 
-def _turned(found: Float, frame: Float, own: Float) -> Float:
+def _rotate_to_sources(terms: Float, frame: Float, frames: Float) -> Float:
     """From the frame of the plane to the sources' own east and north."""
-    x, y = (np.sum(own[:, 0] * frame[axis], -1) for axis in range(2))
+    x, y = (np.sum(frames[:, 0] * frame[axis], -1) for axis in range(2))
     length = np.hypot(x, y)
     cos, sin = x / length, y / length
-    kappa, gamma1, gamma2, east, north = found
+    kappa, gamma1, gamma2, east, north = terms
     double, twice = cos * cos - sin * sin, 2.0 * sin * cos
     shear = double * gamma1 + twice * gamma2, double * gamma2 - twice * gamma1
     return np.stack([kappa, *shear, cos * east + sin * north, cos * north - sin * east])

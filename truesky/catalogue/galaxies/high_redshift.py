@@ -38,16 +38,16 @@ from truesky.fluxes.high_redshift import (
     QUASAR_STRENGTHS,
     ultraviolet_magnitude,
 )
-from truesky.randomness.keyed import Draws, Keyed
+from truesky.randomness.per_source import AnyGenerator, PerSourceGenerator
 from truesky.randomness.rng import stream
 
 _FILE = "high_redshift.toml"
 _STREAM = {HIGH_REDSHIFT: "high_redshift", QUASAR: "quasars"}
 # ra, dec [n] deg -> which of them.
-Near = Callable[[Float, Float], Bool]
+PositionFilter = Callable[[Float, Float], Bool]
 _Z_STEP, _M_STEP, _M_BRIGHTEST = 0.02, 0.02, -32.0
 # Where the light-cone of galaxies ends and other populations begin, and the brightest magnitude that is drawn.
-_BEYOND, _FIRST_MAGNITUDE = 6.0, 10
+_LIGHTCONE_END, _FIRST_MAGNITUDE = 6.0, 10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,14 +71,19 @@ class Kind:
     cells: tuple[Int, ...]
     counts: tuple[Float, ...]
 
-    def per_deg2(self, near: float = 0.0, far: float = np.inf) -> float:
+    def per_deg2(self, z_min: float = 0.0, z_max: float = np.inf) -> float:
         """How many there are in nature between two redshifts, deg-2: near, far, of whole steps of the table."""
         number = 0.0
         for cells, counts in zip(self.cells, self.counts, strict=True):
             z, m = (nodes[i] for nodes, i in zip((self.z, self.m), np.divmod(cells, self.m.size), strict=True))
-            seen = ultraviolet_magnitude(m + 0.5 * _M_STEP, z + 0.5 * _Z_STEP) < self.limit
-            kept = (z > near - 1e-6) & (z < far - 1e-6) & ((z < self.z_end) | (z > _BEYOND - 1e-6)) & seen
-            number += float(np.diff(counts, prepend=0.0)[kept].sum())
+            is_observable = ultraviolet_magnitude(m + 0.5 * _M_STEP, z + 0.5 * _Z_STEP) < self.limit
+            selected = (
+                (z > z_min - 1e-6)
+                & (z < z_max - 1e-6)
+                & ((z < self.z_end) | (z > _LIGHTCONE_END - 1e-6))
+                & is_observable
+            )
+            number += float(np.diff(counts, prepend=0.0)[selected].sum())
         return number
 
 
@@ -90,13 +95,18 @@ def model(
     galaxy_boost, quasar_boost : how many times denser than in nature
     limit : faintest magnitude, AB, at 1500 or 1450 A in the rest frame;  z_end : of the universe's galaxies
     """
-    wanted = ((HIGH_REDSHIFT, "galaxies", galaxy_boost), (QUASAR, "quasars", quasar_boost))
-    drawn = ((code, parameters.section(_FILE, name), boost) for code, name, boost in wanted if boost > 0.0)
-    return tuple(_kind(*about, limit, z_end) for about in drawn)
+    kinds = ((HIGH_REDSHIFT, "galaxies", galaxy_boost), (QUASAR, "quasars", quasar_boost))
+    included = ((code, parameters.section(_FILE, name), boost) for code, name, boost in kinds if boost > 0.0)
+    return tuple(_tabulate_kind(*arguments, limit, z_end) for arguments in included)
 
 
 def draw(
-    cell: int, seed: int, kind: Kind, lens: Lens | Neighbourhood, dust: Float32, near: Near | None = None
+    cell: int,
+    seed: int,
+    kind: Kind,
+    lens: Lens | Neighbourhood,
+    dust: Float32,
+    position_filter: PositionFilter | None = None,
 ) -> pa.Table:
     """Rows of one kind that are truly in a generation cell.
 
@@ -105,24 +115,24 @@ def draw(
     lens   : halos and maps, maps alone, or one shear for all
     near   : which true places are wanted, None = all
     """
-    found = [_of_magnitude(cell, seed, kind, step) for step in range(len(kind.cells))]
-    z, m, ra, dec = (np.concatenate(column) for column in zip(*found, strict=True))
-    kept = (ultraviolet_magnitude(m, z) < kind.limit) & ((z < kind.z_end) | (z >= _BEYOND))
-    if near is not None:
-        kept &= near(ra, dec)
+    samples = [_draw_magnitude(cell, seed, kind, step) for step in range(len(kind.cells))]
+    z, m, ra, dec = (np.concatenate(column) for column in zip(*samples, strict=True))
+    selected = (ultraviolet_magnitude(m, z) < kind.limit) & ((z < kind.z_end) | (z >= _LIGHTCONE_END))
+    if position_filter is not None:
+        selected &= position_filter(ra, dec)
     # Numbered with those that are left out.
-    own = ids.FIRST_NUMBER + np.flatnonzero(kept)
-    z, m, ra, dec = z[kept], m[kept], ra[kept], dec[kept]
-    source = ids.source_id(np.full(own.size, kind.code), cell, own)
-    rng = Keyed(source, seed, _STREAM[kind.code])
-    zeros = np.zeros(own.size)
+    numbers = ids.FIRST_NUMBER + np.flatnonzero(selected)
+    z, m, ra, dec = z[selected], m[selected], ra[selected], dec[selected]
+    source = ids.source_id(np.full(numbers.size, kind.code), cell, numbers)
+    rng = PerSourceGenerator(source, seed, _STREAM[kind.code])
+    zeros = np.zeros(numbers.size)
     places = halo_lensing.columns(lens, ra, dec, cosmology.comoving_distance(z))
     columns = {
         "id": source,
-        "halo_id": ids.halo_of(source),
+        "halo_id": ids.halo_from_id(source),
         **places,
-        "kind": np.full(own.size, kind.code),
-        "density_boost": np.full(own.size, kind.boost),
+        "kind": np.full(numbers.size, kind.code),
+        "density_boost": np.full(numbers.size, kind.boost),
         "z_true": z,
         "z_obs": z,
         "abs_mag_r01": m - 5.0 * np.log10(cosmology.HUBBLE),
@@ -139,7 +149,7 @@ def draw(
     return GALAXIES.build(columns)
 
 
-def _of_magnitude(cell: int, seed: int, kind: Kind, step: int) -> tuple[Float, Float, Float, Float]:
+def _draw_magnitude(cell: int, seed: int, kind: Kind, step: int) -> tuple[Float, Float, Float, Float]:
     """Redshifts[n], M[n], ra[n] and dec[n], deg, of one whole magnitude."""
     rng, counts = stream(seed, _STREAM[kind.code], cell, kind.first + step), kind.counts[step]
     total = float(counts[-1]) if counts.size else 0.0
@@ -157,24 +167,26 @@ def density(code: int, numbers: dict[str, Any], m: Float, z: Float) -> Float:
     m : float[...] absolute ultraviolet AB mag;  z : float[...]
     code    : kind of object;  numbers : constants of its luminosity function
     """
-    since = z - _BEYOND
+    z_offset = z - _LIGHTCONE_END
     if code == QUASAR:
-        beyond = numbers["phi"] * 10.0 ** (numbers["rate"] * since)
-        far = _double_power(beyond, numbers, m - numbers["m_star"])
-        return np.where(since < 0.0, _near_quasars(parameters.section(_FILE, "near_quasars"), m, z), far)
-    star = numbers["m_star"] + numbers["m_star_rate"] * since
-    phi = numbers["phi_star"] * 10.0 ** (numbers["phi_rate"] * since + numbers["phi_curve"] * since**2)
-    alpha = numbers["alpha"] + numbers["alpha_rate"] * since
+        amplitude = numbers["phi"] * 10.0 ** (numbers["rate"] * z_offset)
+        high_z_density = _double_power(amplitude, numbers, m - numbers["m_star"])
+        return np.where(
+            z_offset < 0.0, _low_redshift_quasars(parameters.section(_FILE, "near_quasars"), m, z), high_z_density
+        )
+    star = numbers["m_star"] + numbers["m_star_rate"] * z_offset
+    phi = numbers["phi_star"] * 10.0 ** (numbers["phi_rate"] * z_offset + numbers["phi_curve"] * z_offset**2)
+    alpha = numbers["alpha"] + numbers["alpha_rate"] * z_offset
     ln_x = -0.4 * np.log(10.0) * (m - star)
     return np.asarray(0.4 * np.log(10.0) * phi * np.exp((alpha + 1.0) * ln_x - np.exp(ln_x)))
 
 
-def _near_quasars(numbers: dict[str, Any], m: Float, z: Float) -> Float:
+def _low_redshift_quasars(numbers: dict[str, Any], m: Float, z: Float) -> Float:
     d = z - numbers["z_pivot"]
-    before, after = np.minimum(d, 0.0), np.maximum(d, 0.0)
-    star = numbers["m_star"] + numbers["near_rate"] * before + numbers["near_curve"] * before**2
-    star = star + numbers["far_rate"] * after
-    log_phi = numbers["log_phi"] + numbers["phi_rate"] * after + numbers["phi_curve"] * after**2
+    d_below, d_above = np.minimum(d, 0.0), np.maximum(d, 0.0)
+    star = numbers["m_star"] + numbers["near_rate"] * d_below + numbers["near_curve"] * d_below**2
+    star = star + numbers["far_rate"] * d_above
+    log_phi = numbers["log_phi"] + numbers["phi_rate"] * d_above + numbers["phi_curve"] * d_above**2
     return _double_power(10.0**log_phi, numbers, m - star)
 
 
@@ -183,9 +195,9 @@ def _double_power(phi: Float, numbers: dict[str, Any], brighter: Float) -> Float
     return np.asarray(phi / (10.0 ** ((numbers["faint"] + 1.0) * x) + 10.0 ** ((numbers["bright"] + 1.0) * x)))
 
 
-def _kind(code: int, numbers: dict[str, Any], boost: float, limit: float, z_end: float) -> Kind:
-    near = parameters.section(_FILE, "near_quasars")["z_min"] if code == QUASAR else _BEYOND
-    z = np.arange(near, numbers["z_max"] - 1e-9, _Z_STEP)
+def _tabulate_kind(code: int, numbers: dict[str, Any], boost: float, limit: float, z_end: float) -> Kind:
+    z_first = parameters.section(_FILE, "near_quasars")["z_min"] if code == QUASAR else _LIGHTCONE_END
+    z = np.arange(z_first, numbers["z_max"] - 1e-9, _Z_STEP)
     m = np.arange(_M_BRIGHTEST, -12.0, _M_STEP)
     middle_z, middle_m = z[:, None] + 0.5 * _Z_STEP, m[None, :] + 0.5 * _M_STEP
     volume = cosmology.comoving_volume(z, z + _Z_STEP)[:, None] * np.radians(1.0) ** 2 / cosmology.HUBBLE**3
@@ -194,11 +206,11 @@ def _kind(code: int, numbers: dict[str, Any], boost: float, limit: float, z_end:
     mag = np.floor(ultraviolet_magnitude(middle_m, middle_z))
     last = int(np.ceil(limit + 2.0 * _M_STEP))
     cells = tuple(np.flatnonzero(mag == step) for step in range(_FIRST_MAGNITUDE, last))
-    each = tuple(np.cumsum(counts.ravel()[place]) for place in cells)
-    return Kind(code, numbers, boost, z, m, limit, z_end, _FIRST_MAGNITUDE, cells, each)
+    cumulative = tuple(np.cumsum(counts.ravel()[place]) for place in cells)
+    return Kind(code, numbers, boost, z, m, limit, z_end, _FIRST_MAGNITUDE, cells, cumulative)
 
 
-def _templates(kind: Kind, m: Float, rng: Draws) -> Int:
+def _templates(kind: Kind, m: Float, rng: AnyGenerator) -> Int:
     """Index of the template: slope, then strength of the lines."""
     if kind.code == QUASAR:
         slope = rng.integers(0, len(QUASAR_OFFSETS), m.size)
@@ -212,7 +224,7 @@ def _templates(kind: Kind, m: Float, rng: Draws) -> Int:
     return np.asarray(nearest * len(LYMAN_ALPHA_WIDTHS) + width, np.int64)
 
 
-def _shapes(kind: Kind, z: Float, m: Float, rng: Draws) -> dict[str, npt.NDArray[np.generic]]:
+def _shapes(kind: Kind, z: Float, m: Float, rng: AnyGenerator) -> dict[str, npt.NDArray[np.generic]]:
     """One Sersic component: everything is in the bulge."""
     law, n = kind.numbers, z.size
     if kind.code == QUASAR:

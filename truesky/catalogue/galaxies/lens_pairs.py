@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 
 from truesky.numerics.compiling import exact_jit
-from truesky.randomness.compiled_draws import following, normal, uniform
+from truesky.randomness.compiled_draws import child_key, normal, uniform
 
 # Of a pair: what its numbers are for.
 CHANCE, RADIUS, SHAPE, OFFSET, ANGLE = range(5)
 
 
 @exact_jit
-def found(lenses: Any, sources: Any, apart: Any, out: Any) -> int:
+def find_pairs(lenses: Any, sources: Any, min_z_difference: Any, out: Any) -> int:
     """Number of pairs that are drawn; where out is long enough they are filled in.
 
     Of a lens those sources are looked at whose place on a circle is in its window, `window` of them all: so many fewer
@@ -24,23 +24,23 @@ def found(lenses: Any, sources: Any, apart: Any, out: Any) -> int:
     out     : lens, source int64[n];  key uint64[n];  float64[n, 4], the second normal, the others uniform
     """
     key, start, window, chance, z = lenses
-    of_source, place, z_source = sources
-    lens, source, pair, drawn = out
+    source_key, place, z_source = sources
+    lens, source, pair, deviates = out
     at = 0
     for i in range(key.size):
         first = np.searchsorted(place, start[i])
         for step in range(place.size):
             j = (first + step) % place.size
-            into = place[j] - start[i]
-            if (into if into >= 0.0 else into + 1.0) >= window[i]:
+            offset = place[j] - start[i]
+            if (offset if offset >= 0.0 else offset + 1.0) >= window[i]:
                 break
-            own = key[i] ^ of_source[j]
-            if z_source[j] > z[i] + apart and uniform(following(own, CHANCE)) * window[i] < chance[i]:
+            pair_key = key[i] ^ source_key[j]
+            if z_source[j] > z[i] + min_z_difference and uniform(child_key(pair_key, CHANCE)) * window[i] < chance[i]:
                 if at < lens.size:
-                    lens[at], source[at], pair[at] = i, j, following(own, ANGLE + 1)
-                    drawn[at, 0] = uniform(following(own, RADIUS))
-                    drawn[at, 1] = normal(following(own, SHAPE))
-                    drawn[at, 2] = uniform(following(own, OFFSET))
-                    drawn[at, 3] = uniform(following(own, ANGLE))
+                    lens[at], source[at], pair[at] = i, j, child_key(pair_key, ANGLE + 1)
+                    deviates[at, 0] = uniform(child_key(pair_key, RADIUS))
+                    deviates[at, 1] = normal(child_key(pair_key, SHAPE))
+                    deviates[at, 2] = uniform(child_key(pair_key, OFFSET))
+                    deviates[at, 3] = uniform(child_key(pair_key, ANGLE))
                 at += 1
     return at

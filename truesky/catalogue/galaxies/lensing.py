@@ -32,7 +32,7 @@ from truesky.catalogue import parameters
 from truesky.catalogue.matter.density_box import Box
 from truesky.fluxes import cosmology, sources
 from truesky.numerics.cache import cached_arrays, content_key
-from truesky.numerics.code_keys import code_key
+from truesky.numerics.code_fingerprints import code_key
 
 KAPPA, GAMMA_1, GAMMA_2, EAST, NORTH = range(5)
 
@@ -80,7 +80,7 @@ def settings() -> Settings:
     return Settings(**parameters.section("lensing.toml", "lensing"))
 
 
-def load(box: Box, nside: int, far: bool = False) -> Planes:
+def load(box: Box, nside: int, with_far_planes: bool = False) -> Planes:
     """The planes of a box; far : also those beyond the galaxies, for sources up to z = 10.
 
     Made once: 15 s for nside = 256, four times as long for twice the resolution.
@@ -89,12 +89,14 @@ def load(box: Box, nside: int, far: bool = False) -> Planes:
     if nside not in (1 << order for order in range(4, 12)):
         raise BadInput(f"lensing_nside = {nside} is not a power of two from 16 to 2048")
     chosen = settings()
-    z = np.array(chosen.planes + (chosen.far_planes if far else ()))
-    about = [np.atleast_1d(value).astype(float) for value in astuple(chosen)]
-    key = content_key(code_key(__name__), box.seed, box.n, *map(float, np.concatenate(about)), nside, int(far))
+    z = np.array(chosen.planes + (chosen.far_planes if with_far_planes else ()))
+    numbers = [np.atleast_1d(value).astype(float) for value in astuple(chosen)]
+    key = content_key(
+        code_key(__name__), box.seed, box.n, *map(float, np.concatenate(numbers)), nside, int(with_far_planes)
+    )
     chi = cosmology.comoving_distance(z)
     name = f"lensing_{nside}"
-    summed = cached_arrays(f"{name}_kappa", key, lambda: _summed(box, nside, chi, chosen))
+    summed = cached_arrays(f"{name}_kappa", key, lambda: _convergence_maps(box, nside, chi, chosen))
     planes = [
         cached_arrays(f"{name}_{i}", key, _plane_of(summed["kappa"][i], nside, summed["transfer"][i]))["field"]
         for i in range(z.size)
@@ -102,7 +104,7 @@ def load(box: Box, nside: int, far: bool = False) -> Planes:
     return Planes(nside, chi, tuple(planes))
 
 
-def at(planes: Planes, ra: Float, dec: Float, chi: Float) -> Float:
+def interpolate(planes: Planes, ra: Float, dec: Float, chi: Float) -> Float:
     """[5, n] kappa, gamma1, gamma2, deflection east, north (rad) of sources at chi[n] Mpc/h.
 
     ra, dec : float[n] deg, true;  chi : float[n] Mpc/h; beyond the last plane the lensing is that plane's
@@ -112,15 +114,15 @@ def at(planes: Planes, ra: Float, dec: Float, chi: Float) -> Float:
     node, chi = np.concatenate([[0.0], planes.chi]), np.minimum(chi, planes.chi[-1])
     upper = np.clip(np.searchsorted(node, chi, side="right"), 1, planes.chi.size)
     part = (chi - node[upper - 1]) / (node[upper] - node[upper - 1])
-    found = np.zeros((5, chi.size))
+    total = np.zeros((5, chi.size))
     # Nothing is lensed at the observer: the plane below the first is empty.
     for plane, share in ((upper - 1, part), (upper - 2, 1.0 - part)):
         for number in np.unique(plane[plane >= 0]).tolist():
             rows = np.flatnonzero(plane == number)
             for corner in range(4):
                 values = planes.maps[number][pixel[corner, rows]]
-                found[:, rows] += values.T * (weight[corner, rows] * share[rows])
-    return found
+                total[:, rows] += values.T * (weight[corner, rows] * share[rows])
+    return total
 
 
 def columns(lens: Lens, ra: Float, dec: Float, chi: Float) -> dict[str, Array]:
@@ -131,52 +133,54 @@ def columns(lens: Lens, ra: Float, dec: Float, chi: Float) -> dict[str, Array]:
     """
     if isinstance(lens, Shear):
         gamma = {"gamma1": np.full(ra.size, lens.g1), "gamma2": np.full(ra.size, lens.g2)}
-        return {**places((ra, dec), (ra, dec)), "kappa": np.zeros(ra.size), **gamma}
-    kappa, gamma1, gamma2, east, north = at(lens, ra, dec, chi)
+        return {**position_columns((ra, dec), (ra, dec)), "kappa": np.zeros(ra.size), **gamma}
+    kappa, gamma1, gamma2, east, north = interpolate(lens, ra, dec, chi)
     shear = {"kappa": kappa, "gamma1": gamma1, "gamma2": gamma2}
-    return {**places(displaced(ra, dec, east, north), (ra, dec)), **shear}
+    return {**position_columns(displace(ra, dec, east, north), (ra, dec)), **shear}
 
 
-def places(seen: tuple[Float, Float], true: tuple[Float, Float]) -> dict[str, Array]:
+def position_columns(observed: tuple[Float, Float], true: tuple[Float, Float]) -> dict[str, Array]:
     """Columns of positions: seen, true : ra and dec [n], deg."""
     return {
-        "ra": sky.wrapped(seen[0]),
-        "dec": seen[1],
-        "_healpix_29": sky.healpix_29(*seen),
-        "ra_true": sky.wrapped(true[0]),
+        "ra": sky.wrap_angle(observed[0]),
+        "dec": observed[1],
+        "_healpix_29": sky.healpix_29(*observed),
+        "ra_true": sky.wrap_angle(true[0]),
         "dec_true": true[1],
     }
 
 
-def farthest(planes: Planes, order: int, cell: int) -> float:
+def max_deflection(planes: Planes, order: int, cell: int) -> float:
     """How far the light of any source in a cell is bent at most, rad.
 
     Between nodes of a map, and between two planes, a deflection is a mean of theirs.
     order, cell : nested;  planes : maps
     """
-    own = int(np.log2(planes.nside))
-    coarse = min(order, own)
-    around = np.append(sky.margin_cells(coarse, cell >> 2 * (order - coarse), coarse), cell >> 2 * (order - coarse))
-    fine = 2 * (own - coarse)
-    pixels = (around[:, None] << fine) + np.arange(1 << fine)
+    map_order = int(np.log2(planes.nside))
+    coarse = min(order, map_order)
+    nearby_cells = np.append(
+        sky.margin_cells(coarse, cell >> 2 * (order - coarse), coarse), cell >> 2 * (order - coarse)
+    )
+    fine = 2 * (map_order - coarse)
+    pixels = (nearby_cells[:, None] << fine) + np.arange(1 << fine)
     return max(float(np.hypot(*field[pixels.ravel(), EAST:].T).max()) for field in planes.maps)
 
 
 # Where deflections lead.
-displaced = sky.displaced
+displace = sky.offset_positions
 
 
-def turned(rows: pa.Table, angle: float) -> pa.Table:
+def rotate_position_angles(rows: pa.Table, angle: float) -> pa.Table:
     """Rows of table `galaxies` with every position angle increased by `angle` deg: what is lensed, not the lensing."""
     if angle % 180.0 == 0.0:
         return rows
     number = rows.schema.get_field_index("position_angle")
-    angles = sky.position_angle(rows["position_angle"].to_numpy() + angle)
+    angles = sky.wrap_position_angle(rows["position_angle"].to_numpy() + angle)
     field = rows.schema.field(number)
     return rows.set_column(number, field, pa.array(angles, field.type))
 
 
-def near_caustic(kappa: Float, gamma1: Float, gamma2: Float, caustic: float) -> Bool:
+def is_near_caustic(kappa: Float, gamma1: Float, gamma2: Float, caustic: float) -> Bool:
     """Sources[n] that weak lensing cannot describe: at a caustic, or beyond it.
 
     kappa, gamma1, gamma2 : float[n];  caustic : least determinant that is described
@@ -184,7 +188,7 @@ def near_caustic(kappa: Float, gamma1: Float, gamma2: Float, caustic: float) -> 
     return np.asarray((sources.determinant(kappa, gamma1, gamma2) < caustic) | (kappa >= 1.0))
 
 
-def transform(kappa: Float32, nside: int, gain: Float) -> Float32:
+def maps_of_convergence(kappa: Float32, nside: int, gain: Float) -> Float32:
     """Convergence, shear and deflection, float32[12 nside^2, 5] nested, of a map whose kappa_lm are gain[l] as large.
 
     kappa : float32[12 nside^2], nested;  gain : float[l_max + 1]
@@ -198,26 +202,26 @@ def transform(kappa: Float32, nside: int, gain: Float) -> Float32:
     alm = hp.almxfl(hp.map2alm(ring, lmax=top, iter=0), gain)
     ell = np.arange(top + 1)
     inner = np.maximum(ell * (ell + 1.0), 1.0)
-    shear = hp.almxfl(alm, -np.sqrt(np.maximum((ell + 2.0) * (ell - 1.0), 0.0) / inner))
-    bend = hp.almxfl(alm, np.where(ell > 0, -2.0 / np.sqrt(inner), 0.0))
-    none = np.zeros_like(alm)
-    gamma = hp.alm2map_spin([shear, none], nside, 2, top)
-    south, east = hp.alm2map_spin([bend, none], nside, 1, top)
+    shear_alm = hp.almxfl(alm, -np.sqrt(np.maximum((ell + 2.0) * (ell - 1.0), 0.0) / inner))
+    deflection_alm = hp.almxfl(alm, np.where(ell > 0, -2.0 / np.sqrt(inner), 0.0))
+    zero_alm = np.zeros_like(alm)
+    gamma = hp.alm2map_spin([shear_alm, zero_alm], nside, 2, top)
+    south, east = hp.alm2map_spin([deflection_alm, zero_alm], nside, 1, top)
     fields = (hp.alm2map(alm, nside, lmax=top), *gamma, east, -south)
     return np.stack([field.astype(np.float32)[ring_of] for field in fields], 1)
 
 
-def _summed(box: Box, nside: int, chi: Float, chosen: Settings) -> dict[str, npt.NDArray[np.generic]]:
+def _convergence_maps(box: Box, nside: int, chi: Float, chosen: Settings) -> dict[str, npt.NDArray[np.generic]]:
     # Its compiler takes a second to import, and is not needed where the planes are in the cache.
     from truesky.catalogue.matter import convergence
 
     direction = np.stack(hp.pix2vec(nside, np.arange(hp.nside2npix(nside)), nest=True)).astype(np.float32)
-    width, how = hp.nside2resol(nside), (chosen.coarsest, chosen.stretch)
+    width, averaging = hp.nside2resol(nside), (chosen.coarsest, chosen.stretch)
     return {
-        "kappa": convergence.convergence(box, direction, width, chi, *how),
-        "transfer": convergence.transfer(box, width, chi, int(chosen.l_max * nside), *how),
+        "kappa": convergence.convergence(box, direction, width, chi, *averaging),
+        "transfer": convergence.transfer(box, width, chi, int(chosen.l_max * nside), *averaging),
     }
 
 
 def _plane_of(kappa: Float32, nside: int, gain: Float) -> Callable[[], dict[str, npt.NDArray[np.generic]]]:
-    return lambda: {"field": transform(kappa, nside, gain)}
+    return lambda: {"field": maps_of_convergence(kappa, nside, gain)}

@@ -21,7 +21,7 @@ from scipy.special import gammainc, gammaincinv, ndtr, ndtri
 from lake_schema.arrays import Bool, Float
 from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
 from truesky.catalogue import parameters
-from truesky.randomness.keyed import Draws
+from truesky.randomness.per_source import AnyGenerator
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +120,7 @@ def _log_nodes(limits: tuple[float, float], number: int) -> Float:
 
 
 def half_light_radius(
-    size: Size, z: Float, log_stellar_mass: Float, red: Bool, kpc_per_arcsec: Float, rng: Draws
+    size: Size, z: Float, log_stellar_mass: Float, red: Bool, kpc_per_arcsec: Float, rng: AnyGenerator
 ) -> Float:
     """Half-light semi-major axis[n] of the total light, arcsec.
 
@@ -131,19 +131,21 @@ def half_light_radius(
     """
     log_mass = log_stellar_mass - np.log10(size.pivot)
     knee = np.log10(size.knee / size.pivot)
-    early = _at(size, size.early_norm, z) + _at(size, size.early_slope, z) * np.maximum(log_mass, knee)
+    early = _at_redshift(size, size.early_norm, z) + _at_redshift(size, size.early_slope, z) * np.maximum(
+        log_mass, knee
+    )
     early += size.knee_slope * np.minimum(log_mass - knee, 0.0)
-    late = _at(size, size.late_norm, z) + _at(size, size.late_slope, z) * log_mass
-    scatter = np.where(red, _at(size, size.early_scatter, z), _at(size, size.late_scatter, z))
+    late = _at_redshift(size, size.late_norm, z) + _at_redshift(size, size.late_slope, z) * log_mass
+    scatter = np.where(red, _at_redshift(size, size.early_scatter, z), _at_redshift(size, size.late_scatter, z))
     log_kpc = np.where(red, early, late) + scatter * rng.standard_normal(z.size)
     return np.asarray(np.clip(10.0**log_kpc / kpc_per_arcsec, size.smallest, size.largest))
 
 
-def _at(size: Size, values: tuple[float, ...], z: Float) -> Float:
+def _at_redshift(size: Size, values: tuple[float, ...], z: Float) -> Float:
     return np.interp(z, size.z, values)
 
 
-def bulge_fraction(bulge: Bulge, log_stellar_mass: Float, red: Bool, rng: Draws) -> Float:
+def bulge_fraction(bulge: Bulge, log_stellar_mass: Float, red: Bool, rng: AnyGenerator) -> Float:
     """Flux of the bulge / total, [n] in [0, 1].
 
     log_stellar_mass : float[n] log10 Msun;  red : bool[n]
@@ -155,7 +157,7 @@ def bulge_fraction(bulge: Bulge, log_stellar_mass: Float, red: Bool, rng: Draws)
     return rng.beta(a, b)
 
 
-def sersic_index(bulge: Bulge, red: Bool, rng: Draws) -> Float:
+def sersic_index(bulge: Bulge, red: Bool, rng: AnyGenerator) -> Float:
     """Sersic index[n] of the bulge.
 
     red : bool[n] on the red sequence
@@ -164,7 +166,7 @@ def sersic_index(bulge: Bulge, red: Bool, rng: Draws) -> Float:
     return np.clip(10.0 ** (log_n + bulge.sersic_scatter * rng.standard_normal(red.size)), *bulge.sersic_limits)
 
 
-def radius_ratio(bulge: Bulge, red: Bool, rng: Draws) -> Float:
+def radius_ratio(bulge: Bulge, red: Bool, rng: AnyGenerator) -> Float:
     """Half-light radius of the bulge / that of the disc, [n].
 
     red : bool[n] on the red sequence
@@ -173,7 +175,7 @@ def radius_ratio(bulge: Bulge, red: Bool, rng: Draws) -> Float:
     return np.clip(10.0 ** (log_ratio + bulge.log_ratio_scatter * rng.standard_normal(red.size)), *bulge.ratio_limits)
 
 
-def bulge_colour(bulge: Bulge, n: int, rng: Draws) -> Float:
+def bulge_colour(bulge: Bulge, n: int, rng: AnyGenerator) -> Float:
     """0.1(g - r) of the bulge less that of the disc, [n] mag."""
     return np.asarray(np.clip(bulge.colour_mean + bulge.colour_scatter * rng.standard_normal(n), *bulge.colour_limits))
 
@@ -203,10 +205,10 @@ def light_within(r: npt.ArrayLike, half_light: npt.ArrayLike, sersic: npt.ArrayL
     Ref: Graham & Driver 2005, PASA 22, 118
     """
     n = np.asarray(sersic, float)
-    return _light(np.asarray(r, float) / np.asarray(half_light, float), n, gammaincinv(2.0 * n, 0.5))
+    return _enclosed_light(np.asarray(r, float) / np.asarray(half_light, float), n, gammaincinv(2.0 * n, 0.5))
 
 
-def _light(x: Float, n: Float, b: Float) -> Float:
+def _enclosed_light(x: Float, n: Float, b: Float) -> Float:
     return np.asarray(gammainc(2.0 * n, b * x ** (1.0 / n)))
 
 
@@ -217,23 +219,23 @@ def disc_radius(fraction: Float, ratio: Float, sersic: Float) -> Float:
     """
     # The total's radius lies between those of its parts, so the disc's between 1 and 1 / ratio.
     low, high = np.minimum(1.0, 1.0 / ratio), np.maximum(1.0, 1.0 / ratio)
-    one = np.ones(1)
-    b_bulge, b_disc = gammaincinv(2.0 * sersic, 0.5), gammaincinv(2.0 * one, 0.5)
+    disc_sersic = np.ones(1)
+    b_bulge, b_disc = gammaincinv(2.0 * sersic, 0.5), gammaincinv(2.0 * disc_sersic, 0.5)
     for _ in range(_BISECTIONS):
         middle = np.sqrt(low * high)
-        inside = fraction * _light(1.0 / (ratio * middle), sersic, b_bulge)
-        inside += (1.0 - fraction) * _light(1.0 / middle, one, b_disc)
+        inside = fraction * _enclosed_light(1.0 / (ratio * middle), sersic, b_bulge)
+        inside += (1.0 - fraction) * _enclosed_light(1.0 / middle, disc_sersic, b_disc)
         low, high = np.where(inside > 0.5, middle, low), np.where(inside > 0.5, high, middle)
     return np.asarray(np.sqrt(low * high))
 
 
-def disc_axis_ratio(model: Shapes, n: int, rng: Draws) -> Float:
+def disc_axis_ratio(model: Shapes, n: int, rng: AnyGenerator) -> Float:
     """Apparent minor / major axis[n] of discs.  Ref: Miller et al. 2013"""
     e = np.interp(rng.random(n), model.disc_cdf, model.disc_e)
     return (1.0 - e) / (1.0 + e)
 
 
-def bulge_axis_ratio(bulge: Bulge, n: int, rng: Draws) -> Float:
+def bulge_axis_ratio(bulge: Bulge, n: int, rng: AnyGenerator) -> Float:
     """Minor / major axis[n] of bulges: a truncated normal, by its inverse."""
     limits = (np.array(bulge.axis_ratio_limits) - bulge.axis_ratio_mean) / bulge.axis_ratio_scatter
     low, high = ndtr(limits)
@@ -255,7 +257,7 @@ def inclination(axis_ratio: npt.ArrayLike, scale_height: float) -> Float:
     return np.degrees(np.arctan2(across, along))
 
 
-def position_angle(n: int, rng: Draws) -> Float:
+def position_angle(n: int, rng: AnyGenerator) -> Float:
     """Position angle[n] of the major axis, deg in [0, 180)."""
     return 180.0 * rng.random(n)
 

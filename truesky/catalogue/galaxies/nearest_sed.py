@@ -26,8 +26,8 @@ from truesky.catalogue.galaxies import band_ratios
 from truesky.catalogue.galaxies.band_ratios import Sed
 from truesky.fluxes.libraries import templates
 from truesky.numerics.cache import cached_arrays, content_key
-from truesky.numerics.code_keys import code_key
-from truesky.randomness.keyed import Draws
+from truesky.numerics.code_fingerprints import code_key
+from truesky.randomness.per_source import AnyGenerator
 
 if TYPE_CHECKING:
     from scipy.spatial import KDTree
@@ -68,18 +68,18 @@ class Training:
         return float(self.ebv.max())
 
 
-def load(found: Sequence[Path], sha256: Sequence[str], columns: Columns) -> Training:
+def load(files: Sequence[Path], sha256: Sequence[str], columns: Columns) -> Training:
     """The training table of files.
 
     Errors: BadInput or Damaged names file, column and row of what cannot be used
     """
-    about = json.dumps(sorted((key, repr(field)) for key, field in columns.fields.items()))
+    columns_json = json.dumps(sorted((key, repr(field)) for key, field in columns.fields.items()))
     last = templates.galaxy_library().flux.shape[0] - 1
-    key = content_key(code_key(__name__), about, last, *sha256)
-    return training(cached_arrays("training", key, lambda: _read(found, columns, last)), last)
+    key = content_key(code_key(__name__), columns_json, last, *sha256)
+    return build_training(cached_arrays("training", key, lambda: _read(files, columns, last)), last)
 
 
-def training(values: dict[str, Array], last: int) -> Training:
+def build_training(values: dict[str, Array], last: int) -> Training:
     """Of columns by our key.
 
     values : float[t] each: colour 0.1(g - r) mag, m_r mag, z, sed, ext_law, ebv mag;  last : template of the library
@@ -88,37 +88,37 @@ def training(values: dict[str, Array], last: int) -> Training:
     from scipy.spatial import KDTree
 
     law = Nearness(**parameters.section("sed_assignment.toml", "nearest"))
-    tree = KDTree(_scaled(law, *(values[name] for name in _KEYS[:3])))
+    tree = KDTree(_scale(law, *(values[name] for name in _KEYS[:3])))
     return Training(law, tree, values["sed"], values["ext_law"], values["ebv"], last)
 
 
-def assign(given: Training, colour: Float, m_r: Float, z: Float, rng: Draws) -> Sed:
+def assign(training: Training, colour: Float, m_r: Float, z: Float, rng: AnyGenerator) -> Sed:
     """Spectra[n] of galaxies of 0.1(g - r), M_r and z.
 
     colour, m_r, z : float[n] 0.1(g - r) mag, M_r mag, redshift
     given          : observed galaxies with their spectra;  rng : of the scatter
     """
-    law, n = given.law, colour.size
-    _, nearest = given.tree.query(_scaled(law, colour, m_r, z), p=1)
-    index = np.clip(given.sed[nearest] + law.index * rng.standard_normal(n), 0.0, given.last)
+    law, n = training.law, colour.size
+    _, nearest = training.tree.query(_scale(law, colour, m_r, z), p=1)
+    index = np.clip(training.sed[nearest] + law.index * rng.standard_normal(n), 0.0, training.last)
     # Without a law there is no dust to scatter.
-    dusty = given.ext_law[nearest] > 0
-    ebv = np.clip(given.ebv[nearest] + law.ebv * rng.standard_normal(n), 0.0, given.dustiest)
-    return band_ratios.between(index, given.ext_law[nearest], np.where(dusty, ebv, 0.0))
+    dusty = training.ext_law[nearest] > 0
+    ebv = np.clip(training.ebv[nearest] + law.ebv * rng.standard_normal(n), 0.0, training.dustiest)
+    return band_ratios.sed_of_index(index, training.ext_law[nearest], np.where(dusty, ebv, 0.0))
 
 
-def _scaled(law: Nearness, colour: Float, m_r: Float, z: Float) -> Float:
+def _scale(law: Nearness, colour: Float, m_r: Float, z: Float) -> Float:
     return np.asarray(np.stack([colour, m_r, z], 1) / np.array(law.units))
 
 
-def _read(found: Sequence[Path], columns: Columns, last: int) -> dict[str, Array]:
-    pieces = list(mapping.read(found, columns))
+def _read(files: Sequence[Path], columns: Columns, last: int) -> dict[str, Array]:
+    pieces = list(mapping.read(files, columns))
     for piece in pieces:
-        beyond = piece.values["sed"] > last
-        if beyond.any():
-            row = int(beyond.argmax())
+        is_unknown = piece.values["sed"] > last
+        if is_unknown.any():
+            row = int(is_unknown.argmax())
             where = f"{piece.file}: column {columns.fields['sed'].column} (sed) of row {piece.first + row}"
             raise BadInput(f"{where} is {piece.values['sed'][row]:g}, the library's last template is {last}")
     if not sum(len(piece.values["sed"]) for piece in pieces):
-        raise BadInput(f"{found[0]}: holds no galaxy")
+        raise BadInput(f"{files[0]}: holds no galaxy")
     return {name: np.concatenate([piece.values[name] for piece in pieces]) for name in _KEYS}

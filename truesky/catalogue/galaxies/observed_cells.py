@@ -23,22 +23,22 @@ from lake_schema.arrays import Bool, Float, Float32, Int
 from lake_schema.errors import BadInput
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.tables.galaxies import GALAXIES
-from truesky.catalogue.cells import in_order
+from truesky.catalogue.cells import sort_rows
 from truesky.catalogue.galaxies import galaxies, halo_lensing, lensing
 from truesky.catalogue.galaxies.galaxies import GalaxyModel
 from truesky.catalogue.galaxies.halo_lensing import Neighbourhood
 from truesky.catalogue.galaxies.lensing import Planes
 from truesky.catalogue.halos import halos, population
-from truesky.catalogue.halos.population import Cells
+from truesky.catalogue.halos.population import CellCache
 
 # Distances are told of cells of this order, 26" wide: finer ones would cost more than they spare.
-_FINE = 13
+_BORDER_ORDER = 13
 # Largest deflection by halos that is allowed for, rad: twice that of a halo of 10^15.5 Msun/h.
-_MOST = float(np.radians(2.5 / 60.0))
+_MAX_HALO_DEFLECTION = float(np.radians(2.5 / 60.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Wanted:
+class _RequestedCells:
     """Generation cells, ascending, and directions of small cells along their borders.
 
     known : distances told, by (order, cell)
@@ -46,62 +46,64 @@ class _Wanted:
 
     cells: Int
     border: cKDTree
-    known: dict[tuple[int, int], float] = field(default_factory=dict)
+    distances: dict[tuple[int, int], float] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, wanted: Sequence[int]) -> _Wanted:
-        cells = np.unique(np.asarray(wanted, np.int64))
-        every = [sky.border_cells(GENERATION_ORDER, cell, _FINE) for cell in cells.tolist()]
-        return cls(cells, cKDTree(_directions(np.concatenate([*every, np.zeros(0, np.int64)]))))
+    def from_cells(cls, requested: Sequence[int]) -> _RequestedCells:
+        cells = np.unique(np.asarray(requested, np.int64))
+        borders = [sky.border_cells(GENERATION_ORDER, cell, _BORDER_ORDER) for cell in cells.tolist()]
+        return cls(cells, cKDTree(_directions(np.concatenate([*borders, np.zeros(0, np.int64)]))))
 
-    def hold(self, index: Int) -> Bool:
+    def contains(self, index: Int) -> Bool:
         """[n] Which order-29 places lie inside."""
-        return np.isin(sky.parent(index, sky.DEEPEST, GENERATION_ORDER), self.cells)
+        return np.isin(sky.parent(index, sky.MAX_ORDER, GENERATION_ORDER), self.cells)
 
-    def away(self, small: Int, most: float = np.inf) -> Float:
+    def min_distances(self, small_cells: Int, max_distance: float = np.inf) -> Float:
         """[n] No more than the distances, rad, of what lies in small cells from here; infinite beyond `most`."""
         # Both small cells are as wide as that; a chord is no longer than its arc.
-        slack = 2.0 * np.radians(sky.cell_radius(_FINE))
-        found, _ = self.border.query(_directions(small), distance_upper_bound=most + slack)
-        inside = np.isin(sky.parent(small, _FINE, GENERATION_ORDER), self.cells)
-        return np.where(inside, 0.0, found - slack)
+        slack = 2.0 * np.radians(sky.cell_radius(_BORDER_ORDER))
+        distances, _ = self.border.query(_directions(small_cells), distance_upper_bound=max_distance + slack)
+        inside = np.isin(sky.parent(small_cells, _BORDER_ORDER, GENERATION_ORDER), self.cells)
+        return np.where(inside, 0.0, distances - slack)
 
-    def near(self, ra: Float, dec: Float, angle: float) -> Bool:
+    def is_near(self, ra: Float, dec: Float, angle: float) -> Bool:
         """[n] Whichever places lie within an angle, rad, and some farther ones; ra, dec deg."""
-        small, which = np.unique(sky.cell_of(ra, dec, _FINE), return_inverse=True)
-        return np.asarray((self.away(small, angle) <= angle)[which])
+        small_cells, inverse = np.unique(sky.cell_at(ra, dec, _BORDER_ORDER), return_inverse=True)
+        return np.asarray((self.min_distances(small_cells, angle) <= angle)[inverse])
 
-    def away_of(self, order: int, cell: int) -> float:
+    def min_distance(self, order: int, cell: int) -> float:
         """No more than the distance, rad, of a nested cell from here, and hardly less; order <= 8."""
-        if (order, cell) not in self.known:
-            fine = order + _FINE - GENERATION_ORDER
-            found, _ = self.border.query(_directions(sky.border_cells(order, cell, fine), fine))
-            slack = np.radians(sky.cell_radius(fine) + sky.cell_radius(_FINE))
+        if (order, cell) not in self.distances:
+            fine = order + _BORDER_ORDER - GENERATION_ORDER
+            distances, _ = self.border.query(_directions(sky.border_cells(order, cell, fine), fine))
+            slack = np.radians(sky.cell_radius(fine) + sky.cell_radius(_BORDER_ORDER))
             holds = np.any(sky.parent(self.cells, GENERATION_ORDER, order) == cell)
-            self.known[order, cell] = 0.0 if holds else float(found.min()) - slack
-        return self.known[order, cell]
+            self.distances[order, cell] = 0.0 if holds else float(distances.min()) - slack
+        return self.distances[order, cell]
 
     def nearest(self, cell: int) -> int:
         """Of the cells, that whose centre is nearest to a cell that touches one of them."""
-        near = np.intersect1d(_about(cell), self.cells)
-        apart = sky.separation(*sky.cell_centre(GENERATION_ORDER, cell), *sky.cell_centres(GENERATION_ORDER, near))
-        return int(near[np.argmin(apart)])
+        neighbours = np.intersect1d(_adjacent_cells(cell), self.cells)
+        separations = sky.separation(
+            *sky.cell_centre(GENERATION_ORDER, cell), *sky.cell_centres(GENERATION_ORDER, neighbours)
+        )
+        return int(neighbours[np.argmin(separations)])
 
 
-def _directions(cells: Int, order: int = _FINE) -> Float:
+def _directions(cells: Int, order: int = _BORDER_ORDER) -> Float:
     return sky.unit_vectors(*sky.cell_centres(order, cells))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Sky:
+class _SkyModel:
     """What galaxies are drawn from (of `draw`)."""
 
     universe: GalaxyModel
-    cells: Cells
+    cells: CellCache
     dust: Float32
 
 
-def draw(wanted: Sequence[int], universe: GalaxyModel, cells: Cells, dust: Float32) -> pa.Table:
+def draw(requested: Sequence[int], universe: GalaxyModel, cells: CellCache, dust: Float32) -> pa.Table:
     """Table `galaxies` of generation cells, sorted by _healpix_29.
 
     wanted : nested indices at order 8
@@ -109,61 +111,85 @@ def draw(wanted: Sequence[int], universe: GalaxyModel, cells: Cells, dust: Float
     dust   : float32[pixel] mag, map of the Milky Way's A(V) (truesky.catalogue.dust_map)
     Errors : BadInput where light is deflected farther than is allowed for
     """
-    own = _Wanted.of(wanted)
-    found = [GALAXIES.empty()]
-    done, own_sky = set(own.cells.tolist()), _Sky(universe, cells, dust)
-    for cell in own.cells.tolist():
-        found.append(_kept(own, galaxies.draw(cell, universe, cells, dust)))
+    region = _RequestedCells.from_cells(requested)
+    tables = [GALAXIES.empty()]
+    done, sky_model = set(region.cells.tolist()), _SkyModel(universe, cells, dust)
+    for cell in region.cells.tolist():
+        tables.append(_rows_inside(region, galaxies.draw(cell, universe, cells, dust)))
         if isinstance(universe.lens, Planes):
             # While their neighbours are still kept.
-            for other in _about(cell):
-                if other not in done and own.nearest(other) == cell:
+            for other in _adjacent_cells(cell):
+                if other not in done and region.nearest(other) == cell:
                     done.add(other)
-                    found.append(_kept(own, _from_outside(other, own, own_sky)))
-    beyond = {far for near in done for far in _about(near)} - done if isinstance(universe.lens, Planes) else set()
-    while beyond:
+                    tables.append(_rows_inside(region, _from_outside(other, region, sky_model)))
+    outer_cells = (
+        {outer_cell for done_cell in done for outer_cell in _adjacent_cells(done_cell)} - done
+        if isinstance(universe.lens, Planes)
+        else set()
+    )
+    while outer_cells:
         # Nothing comes from so far, but where cells are narrow or light is bent most.
-        done |= beyond
-        near = [cell for cell in sorted(beyond) if _reach(own_sky, cell) > own.away_of(GENERATION_ORDER, cell)]
-        found += [_kept(own, _from_outside(cell, own, own_sky)) for cell in near]
-        beyond = {far for cell in near for far in _about(cell)} - done
-    return in_order(pa.concat_tables(found))
+        done |= outer_cells
+        reaching = [
+            cell
+            for cell in sorted(outer_cells)
+            if _max_deflection(sky_model, cell) > region.min_distance(GENERATION_ORDER, cell)
+        ]
+        tables += [_rows_inside(region, _from_outside(cell, region, sky_model)) for cell in reaching]
+        outer_cells = {outer_cell for cell in reaching for outer_cell in _adjacent_cells(cell)} - done
+    return sort_rows(pa.concat_tables(tables))
 
 
-def _about(cell: int) -> list[int]:
+def _adjacent_cells(cell: int) -> list[int]:
     """The generation cells that touch one."""
-    found: list[int] = sky.margin_cells(GENERATION_ORDER, cell, GENERATION_ORDER).tolist()
-    return found
+    neighbours: list[int] = sky.margin_cells(GENERATION_ORDER, cell, GENERATION_ORDER).tolist()
+    return neighbours
 
 
-def _kept(own: _Wanted, rows: pa.Table) -> pa.Table:
-    return rows.filter(pa.array(own.hold(rows["_healpix_29"].to_numpy())))
+def _rows_inside(region: _RequestedCells, rows: pa.Table) -> pa.Table:
+    return rows.filter(pa.array(region.contains(rows["_healpix_29"].to_numpy())))
 
 
-def _reach(sky_: _Sky, cell: int) -> float:
+def _max_deflection(sky_model: _SkyModel, cell: int) -> float:
     """How far light of a cell is bent at most, rad."""
-    planes = sky_.universe.lens
+    planes = sky_model.universe.lens
     assert isinstance(planes, Planes)
-    return lensing.farthest(planes, GENERATION_ORDER, cell) + _MOST
+    return lensing.max_deflection(planes, GENERATION_ORDER, cell) + _MAX_HALO_DEFLECTION
 
 
-def _from_outside(cell: int, own: _Wanted, sky_: _Sky) -> pa.Table:
+def _from_outside(cell: int, region: _RequestedCells, sky_model: _SkyModel) -> pa.Table:
     """Galaxies of a cell outside that may be seen inside."""
-    universe, cells = sky_.universe, sky_.cells
-    farthest = _reach(sky_, cell)
-    lens = halo_lensing.around(universe.lens, cells, cell, lambda *place: own.away_of(*place) - farthest)
+    universe, cells = sky_model.universe, sky_model.cells
+    max_deflection = _max_deflection(sky_model, cell)
+    lens = halo_lensing.lens_of_cell(
+        universe.lens, cells, cell, lambda *place: region.min_distance(*place) - max_deflection
+    )
     assert isinstance(lens, Neighbourhood)
-    if lens.farthest > _MOST:
-        found, allowed = (np.degrees(angle) * 3600.0 for angle in (lens.farthest, _MOST))
-        raise BadInput(f"table galaxies: halos may deflect light by {found:.0f} arcsec, {allowed:.0f} are allowed for")
-    farthest += lens.farthest - _MOST
+    if lens.max_deflection > _MAX_HALO_DEFLECTION:
+        deflection_arcsec, allowed_arcsec = (
+            np.degrees(angle) * 3600.0 for angle in (lens.max_deflection, _MAX_HALO_DEFLECTION)
+        )
+        raise BadInput(
+            f"table galaxies: halos may deflect light by {deflection_arcsec:.0f} arcsec, "
+            f"{allowed_arcsec:.0f} are allowed for"
+        )
+    max_deflection += lens.max_deflection - _MAX_HALO_DEFLECTION
     # Satellites of others land too far away.
-    members = population.members(cells, cell, lambda *place: own.away_of(*place) <= farthest + halos.reach(place[0]))
-    members = members.part(own.near(members.ra, members.dec, farthest))
-    bent = lensing.at(lens.box, members.ra, members.dec, members.chi)[3:]
-    members = members.part(own.near(*lensing.displaced(members.ra, members.dec, *bent), lens.farthest))
+    members = population.members(
+        cells, cell, lambda *place: region.min_distance(*place) <= max_deflection + halos.reach(place[0])
+    )
+    members = members.select(region.is_near(members.ra, members.dec, max_deflection))
+    deflection = lensing.interpolate(lens.box, members.ra, members.dec, members.chi)[3:]
+    members = members.select(
+        region.is_near(*lensing.displace(members.ra, members.dec, *deflection), lens.max_deflection)
+    )
     index = halo_lensing.columns(lens, members.ra, members.dec, members.chi)["_healpix_29"]
-    members = members.part(own.hold(index))
-    return galaxies.of_members(
-        cell, universe, members, lens, sky_.dust, near=lambda ra, dec: own.near(ra, dec, farthest)
+    members = members.select(region.contains(index))
+    return galaxies.draw_members(
+        cell,
+        universe,
+        members,
+        lens,
+        sky_model.dust,
+        position_filter=lambda ra, dec: region.is_near(ra, dec, max_deflection),
     )

@@ -23,7 +23,7 @@ def ln_ratios(values: Any, step: Any, nodes: Any, z: Any, template: Any, law: An
         for j in range(count):
             if i != j:
                 scale[i] /= nodes[i] - nodes[j]
-    above = np.empty(count)
+    upper_products = np.empty(count)
     for k in range(z.size):
         at = np.log1p(z[k]) / step
         row = min(max(int(at), 0), values.shape[0] - 2)
@@ -33,12 +33,12 @@ def ln_ratios(values: Any, step: Any, nodes: Any, z: Any, template: Any, law: An
             out[k] = (1.0 - part) * low[0] + part * high[0]
             continue
         # The product of all differences but one: those before it times those after it.
-        after = 1.0
+        upper_product = 1.0
         for i in range(count - 1, -1, -1):
-            above[i] = after
-            after *= ebv[k] - nodes[i]
-        before, total = 1.0, 0.0
+            upper_products[i] = upper_product
+            upper_product *= ebv[k] - nodes[i]
+        lower_product, total = 1.0, 0.0
         for i in range(count):
-            total += before * above[i] * scale[i] * ((1.0 - part) * low[i] + part * high[i])
-            before *= ebv[k] - nodes[i]
+            total += lower_product * upper_products[i] * scale[i] * ((1.0 - part) * low[i] + part * high[i])
+            lower_product *= ebv[k] - nodes[i]
         out[k] = total

@@ -21,15 +21,15 @@ from lake_schema.arrays import Bool, Float, Int
 from truesky.catalogue import parameters
 from truesky.catalogue.galaxies.band_ratios import BandRatios, ebv_weights
 from truesky.fluxes.spectra.extinction import CALZETTI, LAW_COUNT, PREVOT
-from truesky.numerics import sums
-from truesky.randomness.keyed import Draws
+from truesky.numerics import matrices
+from truesky.randomness.per_source import AnyGenerator
 
 _FILE = "sed_assignment.toml"
 BLUE, GREEN, RED = 0, 1, 2
 # The sequences are written in M_r + 20.
 _PIVOT = -20.0
 # Galaxies of other catalogues are no further from a sequence, in its scatter.
-_FURTHEST = 3.0
+_MAX_DEVIATE = 3.0
 # Nodes of E(B-V) at which the bluest template's colour is known, and of the Gamma distribution in units of its
 # mean / shape, denser towards 0: 1e-4 of a value.
 _EBV_NODES, _GAMMA_NODES = 65, 60.0 * np.linspace(0.0, 1.0, 8001) ** 3
@@ -63,7 +63,7 @@ class Green:
     excess: float
     usual: float
     z_ramp: tuple[float, float]
-    most: float
+    max_share: float
     redder: float
     scatter: float
     ebv: float
@@ -124,7 +124,7 @@ class Colours:
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class ColourLimits:
     """Of the colours that the templates have.
 
     bluest, reddest : 0.1(g - r) mag, without dust
@@ -134,7 +134,7 @@ class Limits:
     bluest: float
     reddest: float
     ebv: Float
-    behind: Float
+    bluest_dusty: Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,7 +150,7 @@ class Colour:
         """bool[n]"""
         return np.asarray(self.sequence == RED)
 
-    def part(self, keep: npt.NDArray[np.generic]) -> Colour:
+    def select(self, keep: npt.NDArray[np.generic]) -> Colour:
         """The galaxies that are kept: keep : bool or int[m] rows."""
         return Colour(self.sequence[keep], self.colour[keep], self.deviate[keep])
 
@@ -165,7 +165,7 @@ def model() -> Colours:
     )
 
 
-def limits(table: BandRatios, dust: Dust) -> Limits:
+def colour_limits(table: BandRatios, dust: Dust) -> ColourLimits:
     """Of the colours of a library.
 
     table : of 0.1g at z = 0;  dust : how much of it there may be
@@ -173,8 +173,8 @@ def limits(table: BandRatios, dust: Dust) -> Limits:
     ebv = np.linspace(0.0, dust.highest, _EBV_NODES)
     ln_ratio = table.values[0].astype(np.float64)
     bare = -2.5 / np.log(10.0) * ln_ratio[0, :, 0]
-    behind = -2.5 / np.log(10.0) * sums.product(ln_ratio[:, -1, :], ebv_weights(table.ebv, ebv).T)
-    return Limits(float(bare[-1]), float(bare[0]), ebv, np.maximum.accumulate(behind, axis=1))
+    bluest_dusty = -2.5 / np.log(10.0) * matrices.matmul(ln_ratio[:, -1, :], ebv_weights(table.ebv, ebv).T)
+    return ColourLimits(float(bare[-1]), float(bare[0]), ebv, np.maximum.accumulate(bluest_dusty, axis=1))
 
 
 def red_fraction(law: RedFraction, m_r: Float, z: Float, satellite: Float | Int) -> Float:
@@ -188,7 +188,7 @@ def red_fraction(law: RedFraction, m_r: Float, z: Float, satellite: Float | Int)
     bright = np.clip(1.0 - (law.blue + law.blue_rate * (m_r - _PIVOT)), *law.limits)
     times = law.times[0] + (law.times[1] - law.times[0]) * satellite
     evolved = law.z_norm - law.z_rate * z * (1.0 + law.z_bright * (m_r - law.z_pivot))
-    shares = bright * times * np.clip(evolved, *law.z_limits) * _dwarfs(law, m_r)
+    shares = bright * times * np.clip(evolved, *law.z_limits) * _dwarf_factor(law, m_r)
     return np.asarray(np.minimum(shares, law.highest))
 
 
@@ -198,53 +198,55 @@ def green_share(law: Green, fraction: RedFraction, m_r: Float, z: Float) -> Floa
     m_r, z : float[n] M_r mag, redshift;  law, fraction : constants
     """
     bright = np.clip(1.0 - (fraction.blue + fraction.blue_rate * (m_r - _PIVOT)), *fraction.limits)
-    old = bright * np.clip(law.z_norm - law.z_rate * z, law.z_floor, 1.0) * _dwarfs(fraction, m_r)
+    old = bright * np.clip(law.z_norm - law.z_rate * z, law.z_floor, 1.0) * _dwarf_factor(fraction, m_r)
     red = red_fraction(fraction, m_r, z, np.zeros(m_r.size))
     ramp = np.clip((law.z_ramp[1] - z) / (law.z_ramp[1] - law.z_ramp[0]), 0.0, 1.0)
-    share = np.clip(law.excess * np.maximum(old - red, 0.0) + law.usual * ramp, 0.0, law.most)
+    share = np.clip(law.excess * np.maximum(old - red, 0.0) + law.usual * ramp, 0.0, law.max_share)
     return np.asarray(np.minimum(share / (1.0 - red), 1.0))
 
 
-def draw(own: Colours, ends: Limits, m_r: Float, z: Float, odds: Float, rng: Draws) -> Colour:
+def draw(colours: Colours, limits: ColourLimits, m_r: Float, z: Float, odds: Float, rng: AnyGenerator) -> Colour:
     """Sequence and colour of galaxies.
 
     m_r, z : float[n] M_r mag, redshift;  odds : float[n] of being red
     own    : the sequences;  ends : of the templates' colours;  rng : of the sequence, then of the place on it
     """
-    law, chosen, uniform = own.sequence, rng.random(z.size), _open(rng, z.size)
+    law, chosen, uniform = colours.sequence, rng.random(z.size), _open_uniform(rng, z.size)
     # Of what is not red, the first part is green: one number says both.
-    green = odds + (1.0 - odds) * green_share(own.green, own.fraction, m_r, z)
+    green = odds + (1.0 - odds) * green_share(colours.green, colours.fraction, m_r, z)
     sequence = np.where(chosen < odds, RED, np.where(chosen < green, GREEN, BLUE))
-    mean, scatter = _placed(own, m_r, z, sequence)
-    low = ends.bluest + law.inside[0]
-    least = np.where(sequence == RED, max(law.red_least, low), low)
-    most = ends.reddest - law.inside[1]
-    colour = mean + scatter * truncated_normal((least - mean) / scatter, (most - mean) / scatter, uniform)
-    return Colour(sequence, np.clip(colour, least, most), ndtri(uniform))
+    mean, scatter = _mean_and_scatter(colours, m_r, z, sequence)
+    low = limits.bluest + law.inside[0]
+    min_colour = np.where(sequence == RED, max(law.red_least, low), low)
+    max_colour = limits.reddest - law.inside[1]
+    colour = mean + scatter * truncated_normal((min_colour - mean) / scatter, (max_colour - mean) / scatter, uniform)
+    return Colour(sequence, np.clip(colour, min_colour, max_colour), ndtri(uniform))
 
 
-def known(own: Colours, m_r: Float, z: Float, colour: Float, red: Bool) -> Colour:
+def place_on_sequence(colours: Colours, m_r: Float, z: Float, colour: Float, red: Bool) -> Colour:
     """Galaxies whose colours are given, with their places on the sequences.
 
     m_r, z : float[n] M_r mag, redshift;  colour : float[n] 0.1(g - r) mag;  red : bool[n];  own : the sequences
     """
     sequence = np.where(red, RED, BLUE)
-    mean, scatter = _placed(own, m_r, z, sequence)
-    return Colour(sequence, colour, np.clip((colour - mean) / scatter, -_FURTHEST, _FURTHEST))
+    mean, scatter = _mean_and_scatter(colours, m_r, z, sequence)
+    return Colour(sequence, colour, np.clip((colour - mean) / scatter, -_MAX_DEVIATE, _MAX_DEVIATE))
 
 
-def _placed(own: Colours, m_r: Float, z: Float, sequence: Int) -> tuple[Float, Float]:
+def _mean_and_scatter(colours: Colours, m_r: Float, z: Float, sequence: Int) -> tuple[Float, Float]:
     """Mean and scatter[n] of 0.1(g - r) of each galaxy's sequence."""
-    law, x = own.sequence, m_r - _PIVOT
+    law, x = colours.sequence, m_r - _PIVOT
     red_mean = law.red + law.red_rate * x - law.red_z_rate * z
     blue_mean = np.clip(law.blue + law.blue_rate * x, *law.blue_limits)
     blue_mean = blue_mean - law.blue_z_rate * np.clip(z - law.z_first, 0.0, law.z_range)
     blue_mean = blue_mean - law.far_z_rate * np.clip(z - law.far_z, 0.0, law.far_z_range)
     red_scatter = np.clip(law.red_scatter + law.red_scatter_rate * x, *law.red_scatter_limits)
     blue_scatter = np.clip(law.blue_scatter + law.blue_scatter_rate * x, *law.blue_scatter_limits)
-    green = 0.5 * (red_mean + blue_mean) + own.green.redder
+    green = 0.5 * (red_mean + blue_mean) + colours.green.redder
     mean = np.where(sequence == RED, red_mean, np.where(sequence == GREEN, green, blue_mean))
-    return mean, np.where(sequence == RED, red_scatter, np.where(sequence == GREEN, own.green.scatter, blue_scatter))
+    return mean, np.where(
+        sequence == RED, red_scatter, np.where(sequence == GREEN, colours.green.scatter, blue_scatter)
+    )
 
 
 def truncated_normal(low: Float, high: Float, uniform: Float) -> Float:
@@ -257,39 +259,41 @@ def truncated_normal(low: Float, high: Float, uniform: Float) -> Float:
     below, above = ndtr(a), ndtr(b)
     u = np.where(mirrored, 1.0 - uniform, uniform)
     # Both limits 30 standard deviations away leave nothing between: the nearer one.
-    found = ndtri(np.clip(below + u * (above - below), 1e-300, 1.0 - 1e-16))
-    return np.asarray(np.where(mirrored, -found, found))
+    deviate = ndtri(np.clip(below + u * (above - below), 1e-300, 1.0 - 1e-16))
+    return np.asarray(np.where(mirrored, -deviate, deviate))
 
 
-def dust(own: Colours, ends: Limits, m_r: Float, z: Float, found: Colour, rng: Draws) -> tuple[Int, Float]:
+def draw_dust(
+    colours: Colours, limits: ColourLimits, m_r: Float, z: Float, colour: Colour, rng: AnyGenerator
+) -> tuple[Int, Float]:
     """(extinction law[n], E(B-V)[n] mag); red galaxies have no dust.
 
     m_r, z : float[n] mag, redshift;  found : their colours;  rng : of E(B-V), then of the law
     own    : laws and the distribution of E(B-V);  ends : of the templates' colours
     Ref: Ilbert et al. 2009
     """
-    law = own.dust
+    law = colours.dust
     amount, odds = rng.random(z.size), np.cumsum(law.calzetti_odds)
     calzetti = CALZETTI + np.searchsorted(odds[:-1], rng.random(z.size) * odds[-1], side="right")
-    curve = np.where(found.colour > law.prevot_colour, PREVOT, calzetti)
-    green = found.sequence == GREEN
+    curve = np.where(colour.colour > law.prevot_colour, PREVOT, calzetti)
+    green = colour.sequence == GREEN
     curve = np.where(green, CALZETTI, curve)
     mean = np.clip(law.mean + law.mean_rate * (m_r - law.pivot), *law.mean_limits)
     mean = mean * (1.0 - law.far_z_rate * np.clip(z - law.far_z, 0.0, law.far_z_range))
-    scale = np.where(green, own.green.ebv, mean) / law.shape
+    scale = np.where(green, colours.green.ebv, mean) / law.shape
     # No more than leaves the bluest template as blue as the galaxy.
-    most = np.empty(m_r.size)
+    max_ebv = np.empty(m_r.size)
     for code in range(1, LAW_COUNT):
-        here = np.flatnonzero(curve == code)
-        most[here] = np.interp(found.colour[here], ends.behind[code - 1], ends.ebv)
+        selected = np.flatnonzero(curve == code)
+        max_ebv[selected] = np.interp(colour.colour[selected], limits.bluest_dusty[code - 1], limits.ebv)
     cumulative = _gamma_table(law.shape)
-    reach = np.interp(most / scale, _GAMMA_NODES, cumulative)
+    reach = np.interp(max_ebv / scale, _GAMMA_NODES, cumulative)
     ebv = scale * np.interp(amount * reach, cumulative, _GAMMA_NODES)
-    clean = found.red | (ebv < law.lowest)
+    clean = colour.red | (ebv < law.lowest)
     return np.where(clean, 0, curve), np.where(clean, 0.0, ebv)
 
 
-def _open(rng: Draws, n: int) -> Float:
+def _open_uniform(rng: AnyGenerator, n: int) -> Float:
     """Uniform in (0, 1), [n]: numpy's own may be 0."""
     return np.maximum(rng.random(n), 2.0**-54)
 
@@ -299,5 +303,5 @@ def _gamma_table(shape: float) -> Float:
     return np.asarray(gammainc(shape, _GAMMA_NODES))
 
 
-def _dwarfs(law: RedFraction, m_r: Float) -> Float:
+def _dwarf_factor(law: RedFraction, m_r: Float) -> Float:
     return np.asarray(10.0 ** (-law.dwarf_rate * np.maximum(m_r - law.dwarf, 0.0)))

@@ -19,7 +19,7 @@ from lake_schema.arrays import Float, Int
 from truesky.catalogue import parameters
 from truesky.catalogue.galaxies.sequences import GREEN, RED
 from truesky.fluxes import cosmology
-from truesky.randomness.keyed import Draws
+from truesky.randomness.per_source import AnyGenerator
 
 _FILE = "stellar_mass.toml"
 
@@ -77,10 +77,10 @@ def log_stellar_mass(law: MassToLight, m_r: Float, colour: Float, z: Float) -> F
     Ref: Bell et al. 2003, appendix 2
     """
     g_r = np.clip(colour - law.to_rest, *law.limits)
-    since = np.log10(1.0 + np.minimum(z, law.z_last))
-    zero = law.intercept + law.intercept_l * since + law.intercept_l2 * since**2
+    log_1pz = np.log10(1.0 + np.minimum(z, law.z_last))
+    zero = law.intercept + law.intercept_l * log_1pz + law.intercept_l2 * log_1pz**2
     light = -0.4 * (m_r + 5.0 * np.log10(cosmology.HUBBLE) - law.sun)
-    return np.asarray(light + zero + (law.slope + law.slope_l * since) * g_r)
+    return np.asarray(light + zero + (law.slope + law.slope_l * log_1pz) * g_r)
 
 
 def main_sequence(law: StarFormation, log_mass: Float, z: Float) -> Float:
@@ -91,11 +91,11 @@ def main_sequence(law: StarFormation, log_mass: Float, z: Float) -> Float:
     """
     age = cosmology.age(z, law.omega_m, law.hubble)
     below = law.bend * (law.bend_mass - law.bend_mass_t * age - log_mass)
-    bent = np.logaddexp(0.0, np.log(10.0) * below) / np.log(10.0)
-    return np.asarray(law.sequence - law.sequence_t * age - bent + law.median)
+    bend_term = np.logaddexp(0.0, np.log(10.0) * below) / np.log(10.0)
+    return np.asarray(law.sequence - law.sequence_t * age - bend_term + law.median)
 
 
-def log_sfr(law: StarFormation, main: Float, sequence: Int, deviate: Float, rng: Draws) -> Float:
+def log_sfr(law: StarFormation, main: Float, sequence: Int, deviate: Float, rng: AnyGenerator) -> Float:
     """log10 of the star formation rate[n] / (Msun/yr), Kroupa: bluer galaxies of the blue sequence form more.
 
     main     : float[n] of `main_sequence`;  sequence : int[n];  deviate : float[n] of the colour on it

@@ -28,8 +28,8 @@ from truesky.catalogue.halos.halos import HaloModel, Halos
 from truesky.catalogue.halos.matching import Masses
 from truesky.fluxes import cosmology
 from truesky.numerics.cache import cached_arrays, content_key
-from truesky.numerics.code_keys import code_key
-from truesky.randomness.keyed import Keyed
+from truesky.numerics.code_fingerprints import code_key
+from truesky.randomness.per_source import PerSourceGenerator
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,14 +45,14 @@ class LightCone:
     velocity: Float
 
 
-def load(found: Sequence[Path], sha256: Sequence[str], columns: Columns) -> LightCone:
+def load(files: Sequence[Path], sha256: Sequence[str], columns: Columns) -> LightCone:
     """The halos of files; all of them are held in memory once, and mapped from the cache afterwards.
 
     Errors: BadInput or Damaged names file, column and row of what cannot be used
     """
-    about = json.dumps(sorted((key, repr(field)) for key, field in columns.fields.items()))
+    columns_json = json.dumps(sorted((key, repr(field)) for key, field in columns.fields.items()))
     arrays = cached_arrays(
-        "halo_light_cone", content_key(code_key(__name__), about, *sha256), lambda: _read(found, columns)
+        "halo_light_cone", content_key(code_key(__name__), columns_json, *sha256), lambda: _read(files, columns)
     )
     return LightCone(**arrays)
 
@@ -67,27 +67,31 @@ def draw(model: HaloModel, masses: Masses, cone: LightCone, seed: int, order: in
     index, velocity = cone.index[rows], cone.velocity[rows]
     chi, log_mass = cone.chi[rows], cone.log_mass[rows]
     # Numbered in their generation cells as the file has them, whatever is kept.
-    home = index >> 2 * (sky.DEEPEST - GENERATION_ORDER)
-    own = ids.source_id(0, home, np.arange(home.size) - np.searchsorted(home, home))
-    proxy = log_mass + model.matching.occupation.scatter * Keyed(own, seed, "halos").standard_normal()
-    kept = halos.levels(masses.radius(log_mass) / np.maximum(chi, 1e-3)) == order
+    generation_cell = index >> 2 * (sky.MAX_ORDER - GENERATION_ORDER)
+    identifiers = ids.source_id(
+        0, generation_cell, np.arange(generation_cell.size) - np.searchsorted(generation_cell, generation_cell)
+    )
+    proxy = (
+        log_mass + model.matching.occupation.scatter * PerSourceGenerator(identifiers, seed, "halos").standard_normal()
+    )
+    selected = halos.levels(masses.radius(log_mass) / np.maximum(chi, 1e-3)) == order
     limit = model.mass_limit(chi)
-    kept &= (log_mass >= limit + model.host_offset) | (proxy >= limit)
-    kept &= (chi > model.line.edge[0]) & (chi < model.far + model.box.model.cell)
-    found = Halos(index, chi, log_mass, proxy, velocity, own, np.full(own.size, ids.MEMBER_BITS))
-    return found.part(np.flatnonzero(kept))
+    selected &= (log_mass >= limit + model.host_offset) | (proxy >= limit)
+    selected &= (chi > model.steps.edge[0]) & (chi < model.max_distance + model.box.model.cell)
+    drawn = Halos(index, chi, log_mass, proxy, velocity, identifiers, np.full(identifiers.size, ids.MEMBER_BITS))
+    return drawn.select(np.flatnonzero(selected))
 
 
-def _read(found: Sequence[Path], columns: Columns) -> dict[str, Array]:
-    pieces = list(mapping.read(found, columns))
+def _read(files: Sequence[Path], columns: Columns) -> dict[str, Array]:
+    pieces = list(mapping.read(files, columns))
     if not sum(len(piece.values["ra"]) for piece in pieces):
-        raise BadInput(f"{found[0]}: holds no halo")
+        raise BadInput(f"{files[0]}: holds no halo")
     values = {name: np.concatenate([piece.values[name] for piece in pieces]) for name in pieces[0].values}
-    ra, dec = sky.checked(values["ra"], values["dec"])
+    ra, dec = sky.check_positions(values["ra"], values["dec"])
     index, z = sky.healpix_29(ra, dec), values["z_true"]
     chi = cosmology.comoving_distance(z)
     if "origin_id" in values:
-        _refuse_twice(pieces, columns.fields["origin_id"].column)
+        _refuse_duplicates(pieces, columns.fields["origin_id"].column)
     velocity = values.get("velocity", np.zeros(z.size))
     if "z_obs" in values:
         velocity = LIGHT_KM_S * ((1.0 + values["z_obs"]) / (1.0 + z) - 1.0)
@@ -96,17 +100,21 @@ def _read(found: Sequence[Path], columns: Columns) -> dict[str, Array]:
     return {name: np.asarray(column)[order] for name, column in arrays.items()}
 
 
-def _refuse_twice(pieces: Sequence[mapping.Rows], column: str) -> None:
-    own = np.concatenate([piece.values["origin_id"] for piece in pieces])
-    order = np.argsort(own, kind="stable")
-    same = np.flatnonzero(np.diff(own[order]) == 0)
-    if not same.size:
+def _refuse_duplicates(pieces: Sequence[mapping.Rows], column: str) -> None:
+    identifiers = np.concatenate([piece.values["origin_id"] for piece in pieces])
+    order = np.argsort(identifiers, kind="stable")
+    duplicates = np.flatnonzero(np.diff(identifiers[order]) == 0)
+    if not duplicates.size:
         return
     edges = np.cumsum([len(piece.values["origin_id"]) for piece in pieces])
 
     def place(row: int) -> tuple[int, Path]:
-        which = int(np.searchsorted(edges, row, side="right"))
-        return pieces[which].first + row - (0 if which == 0 else int(edges[which - 1])), pieces[which].file
+        piece_number = int(np.searchsorted(edges, row, side="right"))
+        return pieces[piece_number].first + row - (0 if piece_number == 0 else int(edges[piece_number - 1])), pieces[
+            piece_number
+        ].file
 
-    (row, file), (other, where) = (place(int(order[same[0] + i])) for i in (1, 0))
-    raise BadInput(f"{file}: column {column} of row {row} is {own[order[same[0]]]}, as in row {other} of {where}")
+    (row, file), (other, where) = (place(int(order[duplicates[0] + i])) for i in (1, 0))
+    raise BadInput(
+        f"{file}: column {column} of row {row} is {identifiers[order[duplicates[0]]]}, as in row {other} of {where}"
+    )

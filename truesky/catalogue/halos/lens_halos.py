@@ -39,16 +39,16 @@ class Settings:
     step: float
     planes: tuple[float, ...]
     strip: float
-    again: float
+    repeat_threshold: float
     least_determinant: float
 
     @property
-    def far(self) -> float:
+    def max_distance(self) -> float:
         """Mpc/h, to which halos lens."""
         return float(cosmology.comoving_distance(self.z_max))
 
     @property
-    def far_of_wide(self) -> float:
+    def wide_distance(self) -> float:
         """Mpc/h, beyond which no halo's theta_c is larger than `wide`."""
         return float(self.span / np.radians(self.wide / 60.0))
 
@@ -58,7 +58,7 @@ def settings() -> Settings:
     return Settings(**parameters.section("lens_halos.toml", "lenses"))
 
 
-def draw(population: Population, least: float, far: float, order: int, cell: int) -> Halos:
+def draw(population: Population, min_log_mass: float, max_distance: float, order: int, cell: int) -> Halos:
     """Halos of one level in a nested cell of its order, down to a mass; they are among those of a deep request.
 
     population  : whose halos they are;  least : log10 M_200m / (Msun/h);  far : Mpc/h
@@ -66,14 +66,14 @@ def draw(population: Population, least: float, far: float, order: int, cell: int
     """
     model = population.halos
     if population.light_cone is None:
-        wanted = np.where(model.line.edge[:-1] < far, least, np.inf)
-        found = halos.draw(model, population.seed, order, cell, wanted)
+        limits = np.where(model.steps.edge[:-1] < max_distance, min_log_mass, np.inf)
+        drawn = halos.draw(model, population.seed, order, cell, limits)
     else:
         # Of halos whose central would be seen.
-        deep = replace(model, limit=np.full(model.limit.shape, least), far=far)
+        deep = replace(model, limit=np.full(model.limit.shape, min_log_mass), max_distance=max_distance)
         cone, seed = population.light_cone, population.seed
-        found = halo_catalogue.draw(deep, population.masses, cone, seed, order, cell)
-    return found.part((found.log_mass >= least) & (found.chi < far))
+        drawn = halo_catalogue.draw(deep, population.masses, cone, seed, order, cell)
+    return drawn.select((drawn.log_mass >= min_log_mass) & (drawn.chi < max_distance))
 
 
 def sizes(masses: Masses, chosen: Settings, order: int, z: Float, chi: Float, log_mass: Float) -> Float:
@@ -92,12 +92,14 @@ def sizes(masses: Masses, chosen: Settings, order: int, z: Float, chi: Float, lo
     circle = np.where(
         log_mass >= chosen.heavy, np.maximum(chosen.span / chi, wide), np.minimum(chosen.radii * radius, wide)
     )
-    circle = np.minimum(circle, farthest(chosen, order))
-    near = np.minimum(np.maximum(chosen.close_radii * radius, close), circle)
-    return np.stack([amplitude, radius, near, circle, masses.at(masses.concentration, z, log_mass)])
+    circle = np.minimum(circle, max_circle(chosen, order))
+    close_circle = np.minimum(np.maximum(chosen.close_radii * radius, close), circle)
+    return np.stack(
+        [amplitude, radius, close_circle, circle, masses.interpolate_pairs(masses.concentration, z, log_mass)]
+    )
 
 
-def farthest(chosen: Settings, order: int) -> float:
+def max_circle(chosen: Settings, order: int) -> float:
     """Largest theta_c, rad, of a level: what the cells about one hold."""
     if order == GENERATION_ORDER:
         return float(np.radians(chosen.reach / 60.0))

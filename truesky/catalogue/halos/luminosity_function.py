@@ -49,20 +49,20 @@ class Schechter:
     far_phi_star: tuple[float, ...]
     far_alpha: tuple[float, ...]
 
-    def at(self, z: npt.ArrayLike) -> tuple[Float, Float, Float]:
+    def parameters_at(self, z: npt.ArrayLike) -> tuple[Float, Float, Float]:
         """z[n] -> M*[n] mag, phi*[n] (Mpc/h)^-3, alpha[n]."""
         redshift = np.asarray(z, float)
-        since = redshift - self.z_anchor
-        m_star = self.m_star + self.m_star_rate * self.m_star_scale * np.expm1(-since / self.m_star_scale)
-        phi_star = self.phi_star * 10.0 ** (-self.phi_star_rate * since)
+        z_offset = redshift - self.z_anchor
+        m_star = self.m_star + self.m_star_rate * self.m_star_scale * np.expm1(-z_offset / self.m_star_scale)
+        phi_star = self.phi_star * 10.0 ** (-self.phi_star_rate * z_offset)
         alpha = self.alpha - self.alpha_rate * np.minimum(redshift, self.alpha_z_max)
-        far = redshift > self.far_z[0]
-        if not far.any():
+        is_far = redshift > self.far_z[0]
+        if not is_far.any():
             return m_star, phi_star, alpha
         knots = (self.far_m_star, np.log(self.far_phi_star), self.far_alpha)
         m_far, ln_phi_far, alpha_far = (np.interp(redshift, self.far_z, knot) for knot in knots)
-        beyond = ((m_far, m_star), (np.exp(ln_phi_far), phi_star), (alpha_far, alpha))
-        m_star, phi_star, alpha = (np.where(far, there, here) for there, here in beyond)
+        value_pairs = ((m_far, m_star), (np.exp(ln_phi_far), phi_star), (alpha_far, alpha))
+        m_star, phi_star, alpha = (np.where(is_far, far_value, near_value) for far_value, near_value in value_pairs)
         return m_star, phi_star, alpha
 
 
@@ -112,7 +112,7 @@ def density(lf: Schechter, m: npt.ArrayLike, z: npt.ArrayLike) -> Float:
     m : float[n] M_r mag;  z : float[n]
     Ref: Schechter 1976
     """
-    m_star, phi_star, alpha = lf.at(z)
+    m_star, phi_star, alpha = lf.parameters_at(z)
     ln_x = -_LN10_04 * (np.asarray(m, float) - m_star)
     return np.asarray(_LN10_04 * phi_star * np.exp((alpha + 1.0) * ln_x - np.exp(ln_x)))
 
@@ -122,7 +122,7 @@ def number_density(lf: Schechter, m: npt.ArrayLike, z: npt.ArrayLike) -> Float:
 
     m : float[n] M_r mag;  z : float[n]
     """
-    m_star, phi_star, alpha = lf.at(z)
+    m_star, phi_star, alpha = lf.parameters_at(z)
     x = np.exp(-_LN10_04 * (np.asarray(m, float) - m_star))
     return phi_star * upper_gamma(alpha + 1.0, x)
 
@@ -152,7 +152,7 @@ def upper_gamma(a: npt.ArrayLike, x: npt.ArrayLike) -> Float:
 
 def inverse(lf: Schechter, z_max: float = _Z_MAX_LIMIT) -> Inverse:
     """The table that `magnitude` reads: ln(L/L*) where Gamma(a, L/L*) = g."""
-    alpha = lf.at(np.linspace(0.0, z_max, _A_NODES))[2]
+    alpha = lf.parameters_at(np.linspace(0.0, z_max, _A_NODES))[2]
     a = np.linspace(alpha.min(), alpha.max() + _A_MARGIN, _A_NODES) + 1.0
     ln_x = np.linspace(*_LN_X_RANGE, _X_NODES)
     with np.errstate(divide="ignore"):
@@ -169,7 +169,7 @@ def magnitude(table: Inverse, number: npt.ArrayLike, z: npt.ArrayLike) -> Float:
     number : float[n] comoving (Mpc/h)^-3;  z : float[n]
     Error: < 0.003 mag over 1e-12 .. 1 (Mpc/h)^-3 (tests/truesky/catalogue/halos/test_luminosity_function.py)
     """
-    m_star, phi_star, alpha = table.schechter.at(z)
+    m_star, phi_star, alpha = table.schechter.parameters_at(z)
     row, above_row = bracket(table.a, alpha + 1.0)
     col, above_col = bracket(table.ln_g, np.log(np.asarray(number, float) / phi_star))
     low = table.ln_x[row, col] * (1.0 - above_col) + table.ln_x[row, col + 1] * above_col

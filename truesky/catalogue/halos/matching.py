@@ -21,7 +21,7 @@ from truesky.catalogue.halos import luminosity_function
 from truesky.catalogue.halos.luminosity_function import Inverse
 from truesky.catalogue.matter import linear_theory
 from truesky.fluxes import cosmology
-from truesky.numerics import sums
+from truesky.numerics import matrices
 
 # Tables reach beyond redshift 6, uniform in ln(1 + z), and 0.02 dex.
 Z_LAST, _Z_NODES = 6.1, 69
@@ -32,7 +32,7 @@ _LOG_MASS = np.linspace(8.0, 16.4, 421)
 class Occupation:
     """Satellites of a halo (halos.toml, [occupation])."""
 
-    least: float
+    min_mass_ratio: float
     ratio: float
     ratio_z: float
     z_pivot: float
@@ -81,17 +81,17 @@ class Masses:
 
         table : float[z nodes, masses];  z : float[a];  log_mass : float[b] log10 Msun/h
         """
-        row, part = _place(z, table.shape[0])
-        column, share = _column(log_mass, self.log_mass)
+        row, part = _redshift_node(z, table.shape[0])
+        column, share = _mass_node(log_mass, self.log_mass)
         along = table[:, column] * (1.0 - share) + table[:, column + 1] * share
         return np.asarray(along[row] * (1.0 - part)[:, None] + along[row + 1] * part[:, None])
 
-    def at(self, table: Float, z: Float, log_mass: Float) -> Float:
+    def interpolate_pairs(self, table: Float, z: Float, log_mass: Float) -> Float:
         """[n] of pairs (z[n], log_mass[n]).
 
         table : float[z nodes, masses];  z, log_mass : float[n] redshift, log10 Msun/h
         """
-        return _pairs(table, self.log_mass, z, log_mass)
+        return _interpolate_pairs(table, self.log_mass, z, log_mass)
 
     def radius(self, log_mass: Float) -> Float:
         """R_200m[n], comoving Mpc/h.
@@ -124,14 +124,14 @@ class Matching:
 
         z : float[n];  proxy : float[n] log10 Msun/h
         """
-        return _pairs(self.m_r, self.log_mass, z, proxy)
+        return _interpolate_pairs(self.m_r, self.log_mass, z, proxy)
 
-    def mass_of(self, z: Float, m_r: Float) -> Float:
+    def proxy_mass(self, z: Float, m_r: Float) -> Float:
         """log10 of the proxy mass[n] of galaxies of M_r[n].
 
         z : float[n];  m_r : float[n] mag
         """
-        row, part = _place(z, self.m_r.shape[0])
+        row, part = _redshift_node(z, self.m_r.shape[0])
         curves = self.m_r[row] * (1.0 - part)[:, None] + self.m_r[row + 1] * part[:, None]
         return np.array([np.interp(-m, -curve, self.log_mass) for m, curve in zip(m_r, curves, strict=True)])
 
@@ -145,31 +145,31 @@ def masses() -> Masses:
     return Masses(_LOG_MASS, z, density, tables["bias"], tables["concentration"], shape)
 
 
-def matching(halos: Masses, luminosities: Inverse) -> Matching:
+def match_luminosities(halos: Masses, luminosities: Inverse) -> Matching:
     """M_r of every proxy mass and redshift."""
     occupation = Occupation(**parameters.section("halos.toml", "occupation"))
     rows = [
         luminosity_function.magnitude(luminosities, number, np.full(number.size, z))
-        for z, number in zip(halos.z, proxies(halos, occupation), strict=True)
+        for z, number in zip(halos.z, proxy_density(halos, occupation), strict=True)
     ]
     # Where nothing is left of the mass function the magnitudes stay at the brightest.
     return Matching(halos.log_mass, np.minimum.accumulate(np.array(rows), axis=1), occupation)
 
 
-def proxies(halos: Masses, occupation: Occupation) -> Float:
+def proxy_density(halos: Masses, occupation: Occupation) -> Float:
     """n_tot(> m'), [z, m] comoving (Mpc/h)^-3: centrals and satellites, scattered."""
     step = halos.log_mass[1] - halos.log_mass[0]
     number = np.exp(halos.ln_density) * step
-    satellites = sums.product(number, satellites_above(halos.log_mass, occupation).T)
-    satellites *= satellites_at(halos.z, occupation)[:, None]
+    satellites = matrices.matmul(number, satellites_above(halos.log_mass, occupation).T)
+    satellites *= satellite_evolution(halos.z, occupation)[:, None]
     # Of the cumulative count of satellites, what lies in each interval.
     inside = number + np.concatenate([satellites[:, :-1] - satellites[:, 1:], satellites[:, -1:]], axis=1)
-    smooth = scattered(inside, step, occupation)
+    smooth = scatter_masses(inside, step, occupation)
     above = np.cumsum(smooth[:, ::-1], axis=1)[:, ::-1]
     return np.maximum(above - 0.5 * smooth, 1e-30)
 
 
-def scattered(number: Float, step: float, occupation: Occupation) -> Float:
+def scatter_masses(number: Float, step: float, occupation: Occupation) -> Float:
     """[z, m] in bins of the proxy mass, of numbers in bins of the mass.
 
     number : float[z, m];  step : width of a bin, dex;  occupation : of which the scatter is
@@ -178,7 +178,7 @@ def scattered(number: Float, step: float, occupation: Occupation) -> Float:
     kernel = np.exp(-0.5 * (np.arange(-half, half + 1) * step / occupation.scatter) ** 2)
     kernel /= kernel.sum()
     padded = np.pad(number, ((0, 0), (half, half)), mode="reflect", reflect_type="odd")
-    smooth: Float = sums.product(sliding_window_view(np.maximum(padded, 0.0), kernel.size, axis=1), kernel)
+    smooth: Float = matrices.matmul(sliding_window_view(np.maximum(padded, 0.0), kernel.size, axis=1), kernel)
     return smooth
 
 
@@ -188,10 +188,10 @@ def satellites_above(log_mass: Float, occupation: Occupation) -> Float:
     log_mass : float[m] log10 Msun/h, of halos and of sub-masses
     """
     over = 10.0 ** (log_mass[None, :] - log_mass[:, None])
-    return np.asarray(np.maximum(over - occupation.least, 0.0) / occupation.ratio)
+    return np.asarray(np.maximum(over - occupation.min_mass_ratio, 0.0) / occupation.ratio)
 
 
-def satellites_at(z: Float, occupation: Occupation) -> Float:
+def satellite_evolution(z: Float, occupation: Occupation) -> Float:
     """How many times more satellites a halo has than one at z = z_pivot, [n].
 
     z : float[n]
@@ -199,21 +199,21 @@ def satellites_at(z: Float, occupation: Occupation) -> Float:
     return np.asarray(occupation.ratio / occupation.ratio_at(z))
 
 
-def _place(z: Float, nodes: int) -> tuple[Int, Float]:
+def _redshift_node(z: Float, nodes: int) -> tuple[Int, Float]:
     step = np.log1p(np.asarray(z, float)) * ((nodes - 1) / np.log1p(Z_LAST))
     row = np.clip(step.astype(np.int64), 0, nodes - 2)
     return row, step - row
 
 
-def _column(log_mass: Float, nodes: Float) -> tuple[Int, Float]:
+def _mass_node(log_mass: Float, nodes: Float) -> tuple[Int, Float]:
     step = (np.asarray(log_mass, float) - nodes[0]) / (nodes[1] - nodes[0])
     column = np.clip(step.astype(np.int64), 0, nodes.size - 2)
     return column, step - column
 
 
-def _pairs(table: Float, nodes: Float, z: Float, log_mass: Float) -> Float:
-    row, part = _place(z, table.shape[0])
-    column, share = _column(log_mass, nodes)
+def _interpolate_pairs(table: Float, nodes: Float, z: Float, log_mass: Float) -> Float:
+    row, part = _redshift_node(z, table.shape[0])
+    column, share = _mass_node(log_mass, nodes)
     low = table[row, column] * (1.0 - share) + table[row, column + 1] * share
     high = table[row + 1, column] * (1.0 - share) + table[row + 1, column + 1] * share
     return np.asarray(low * (1.0 - part) + high * part)

@@ -32,7 +32,7 @@ from truesky.catalogue.matter import density_box
 
 CENTRAL, SATELLITE = 0, 1
 # Drawn cells that are kept: a block of cells and its rim are at most so many.
-_KEPT = 64
+_MAX_CACHED_CELLS = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,14 +68,14 @@ class Members:
     host_index: Int
     radius: Float
 
-    def part(self, keep: Bool) -> Members:
+    def select(self, keep: Bool) -> Members:
         """The same halos, and the galaxies that are kept: keep : bool[n]."""
         columns = (getattr(self, name)[keep] for name in self.__slots__ if name != "halos")
         return Members(self.halos, *columns)
 
 
 @dataclass(slots=True, eq=False)
-class Cells:
+class CellCache:
     """Cells of one population that have been drawn: (order, cell) -> halos and all their satellites.
 
     lenses : what halos of (order, cell) above a mass do to light
@@ -85,17 +85,19 @@ class Cells:
     drawn: OrderedDict[tuple[int, int], tuple[Halos, Satellites]] = field(default_factory=OrderedDict)
     lenses: OrderedDict[tuple[int, int, float], tuple[Float, Int]] = field(default_factory=OrderedDict)
 
-    def at(self, order: int, cell: int) -> tuple[Halos, Satellites]:
+    def halos_and_satellites(self, order: int, cell: int) -> tuple[Halos, Satellites]:
         """Halos drawn by a cell of a level, and their satellites, wherever these are."""
         place = (order, cell)
         if place not in self.drawn:
-            own = self.population
-            if own.light_cone is None:
-                hosts = halos.draw(own.halos, own.seed, order, cell)
+            population = self.population
+            if population.light_cone is None:
+                hosts = halos.draw(population.halos, population.seed, order, cell)
             else:
-                hosts = halo_catalogue.draw(own.halos, own.masses, own.light_cone, own.seed, order, cell)
-            self.drawn[place] = hosts, satellites.draw(own.halos, own.masses, hosts, own.seed)
-            if len(self.drawn) > _KEPT:
+                hosts = halo_catalogue.draw(
+                    population.halos, population.masses, population.light_cone, population.seed, order, cell
+                )
+            self.drawn[place] = hosts, satellites.draw(population.halos, population.masses, hosts, population.seed)
+            if len(self.drawn) > _MAX_CACHED_CELLS:
                 self.drawn.popitem(last=False)
         self.drawn.move_to_end(place)
         return self.drawn[place]
@@ -104,7 +106,7 @@ class Cells:
 def model(
     seed: int,
     box_cells: int,
-    space: Volume,
+    volume: Volume,
     luminosities: Inverse,
     faintest: Callable[[Float], Float],
     light_cone: LightCone | None = None,
@@ -117,50 +119,65 @@ def model(
     luminosities    : inverse of the luminosity function
     """
     masses = matching.masses()
-    matched = matching.matching(masses, luminosities)
+    matched = matching.match_luminosities(masses, luminosities)
 
-    def wanted(z: Float) -> Float:
-        return np.minimum(faintest(z), space.m_faintest)
+    def faintest_drawn(z: Float) -> Float:
+        return np.minimum(faintest(z), volume.m_faintest)
 
     box = density_box.load(seed, box_cells)
-    drawn_from = halos.model(box, space, masses, matched, wanted)
-    return Population(seed, drawn_from, masses, light_cone)
+    halo_model = halos.model(box, volume, masses, matched, faintest_drawn)
+    return Population(seed, halo_model, masses, light_cone)
 
 
-def halos_of(cells: Cells, cell: int) -> Halos:
+def halos_of(cells: CellCache, cell: int) -> Halos:
     """Halos of the request that lie in a generation cell, sorted by position.
 
     cells : what has been drawn;  cell : nested index at order 8
     """
-    own, far = [], cells.population.halos.far
+    selected, max_distance = [], cells.population.halos.max_distance
     for order in LEVELS:
-        hosts, _ = cells.at(order, cell >> 2 * (GENERATION_ORDER - order))
-        own.append(hosts.part((hosts.index >> 2 * (sky.DEEPEST - GENERATION_ORDER) == cell) & (hosts.chi < far)))
-    together = Halos(*(np.concatenate([getattr(part, name) for part in own]) for name in Halos.__slots__))
-    return together.part(np.lexsort((together.id, together.index)))
+        hosts, _ = cells.halos_and_satellites(order, cell >> 2 * (GENERATION_ORDER - order))
+        selected.append(
+            hosts.select((hosts.index >> 2 * (sky.MAX_ORDER - GENERATION_ORDER) == cell) & (hosts.chi < max_distance))
+        )
+    combined = Halos(*(np.concatenate([getattr(part, name) for part in selected]) for name in Halos.__slots__))
+    return combined.select(np.lexsort((combined.id, combined.index)))
 
 
-def members(cells: Cells, cell: int, wanted: Callable[[int, int], bool] | None = None) -> Members:
+def members(cells: CellCache, cell: int, is_requested: Callable[[int, int], bool] | None = None) -> Members:
     """Halos and candidate galaxies of one generation cell.
 
     cells  : what has been drawn;  cell : nested index at order 8
     wanted : (order, cell) of what draws halos -> are their satellites wanted? None = all
     """
-    own = halos_of(cells, cell)
-    lit = own.part(own.proxy >= cells.population.halos.mass_limit(own.chi))
-    places = [(order, around) for order in LEVELS for around in _around(order, cell)]
-    places = places if wanted is None else [place for place in places if wanted(*place)]
-    landed = [_landed(cells, *place, cell) for place in places]
-    ra, dec = sky.positions(lit.index)
-    own_columns = (lit.id, lit.id, lit.index, ra, dec, lit.chi, lit.velocity, lit.proxy, lit.log_mass, lit.index)
-    central = (*own_columns, np.zeros(lit.chi.size))
-    columns = [np.concatenate(column) for column in zip(central, *landed, strict=True)]
+    cell_halos = halos_of(cells, cell)
+    bright = cell_halos.select(cell_halos.proxy >= cells.population.halos.mass_limit(cell_halos.chi))
+    places = [(order, neighbour) for order in LEVELS for neighbour in _cells_around(order, cell)]
+    places = places if is_requested is None else [place for place in places if is_requested(*place)]
+    satellite_columns = [_satellites_inside(cells, *place, cell) for place in places]
+    ra, dec = sky.positions_of_indices(bright.index)
+    central_columns = (
+        bright.id,
+        bright.id,
+        bright.index,
+        ra,
+        dec,
+        bright.chi,
+        bright.velocity,
+        bright.proxy,
+        bright.log_mass,
+        bright.index,
+    )
+    central = (*central_columns, np.zeros(bright.chi.size))
+    columns = [np.concatenate(column) for column in zip(central, *satellite_columns, strict=True)]
     order = np.lexsort((columns[0], columns[2]))
-    source, halo_id, index, ra, dec, chi, velocity, proxy, mass, home, radius = (column[order] for column in columns)
+    source, halo_id, index, ra, dec, chi, velocity, proxy, mass, host_index, radius = (
+        column[order] for column in columns
+    )
     z = cells.population.halos.distances.redshift(chi)
     z_obs = observed_redshift(z, velocity)
-    kind = ids.kind_of(source)
-    return Members(own, source, halo_id, kind, index, ra, dec, chi, z, z_obs, proxy, mass, home, radius)
+    kind = ids.kind_from_id(source)
+    return Members(cell_halos, source, halo_id, kind, index, ra, dec, chi, z, z_obs, proxy, mass, host_index, radius)
 
 
 def observed_redshift(z: Float, velocity: Float) -> Float:
@@ -171,28 +188,32 @@ def observed_redshift(z: Float, velocity: Float) -> Float:
     return np.asarray((1.0 + z) * (1.0 + velocity / LIGHT_KM_S) - 1.0)
 
 
-def _around(order: int, cell: int) -> list[int]:
-    own = cell >> 2 * (GENERATION_ORDER - order)
-    return [own, *sky.margin_cells(order, own, order).tolist()]
+def _cells_around(order: int, cell: int) -> list[int]:
+    parent_cell = cell >> 2 * (GENERATION_ORDER - order)
+    return [parent_cell, *sky.margin_cells(order, parent_cell, order).tolist()]
 
 
-def _landed(cells: Cells, order: int, around: int, cell: int) -> tuple[npt.NDArray[np.generic], ...]:
+def _satellites_inside(cells: CellCache, order: int, host_cell: int, cell: int) -> tuple[npt.NDArray[np.generic], ...]:
     """Satellites of one cell's halos that lie in the generation cell: the columns of `members`."""
-    hosts, found = cells.at(order, around)
+    hosts, candidates = cells.halos_and_satellites(order, host_cell)
     model = cells.population.halos
-    found = found.part(_near(found, cell) & (found.chi > model.line.edge[0]) & (found.chi < model.far))
-    index = sky.healpix_29(found.ra, found.dec)
-    inside = index >> 2 * (sky.DEEPEST - GENERATION_ORDER) == cell
-    found, index = found.part(inside), index[inside]
-    halo = hosts.id[found.host]
-    source = ids.satellite_id(halo, found.member, hosts.bits[found.host])
-    mass, home = hosts.log_mass[found.host], hosts.index[found.host]
-    place = found.ra, found.dec, found.chi
-    return source, halo, index, *place, found.velocity, found.proxy, mass, home, found.radius
+    candidates = candidates.select(
+        _may_be_inside(candidates, cell)
+        & (candidates.chi > model.steps.edge[0])
+        & (candidates.chi < model.max_distance)
+    )
+    index = sky.healpix_29(candidates.ra, candidates.dec)
+    inside = index >> 2 * (sky.MAX_ORDER - GENERATION_ORDER) == cell
+    candidates, index = candidates.select(inside), index[inside]
+    halo = hosts.id[candidates.host]
+    source = ids.satellite_id(halo, candidates.member, hosts.bits[candidates.host])
+    mass, host_index = hosts.log_mass[candidates.host], hosts.index[candidates.host]
+    place = candidates.ra, candidates.dec, candidates.chi
+    return source, halo, index, *place, candidates.velocity, candidates.proxy, mass, host_index, candidates.radius
 
 
-def _near(found: Satellites, cell: int) -> Bool:
+def _may_be_inside(candidates: Satellites, cell: int) -> Bool:
     """Satellites that may lie in the cell: no further from its centre than its corners."""
     ra, dec = sky.cell_centre(GENERATION_ORDER, cell)
     radius = sky.cell_radius(GENERATION_ORDER)
-    return np.asarray(sky.separation(found.ra, found.dec, ra, dec) <= 1.001 * radius)
+    return np.asarray(sky.separation(candidates.ra, candidates.dec, ra, dec) <= 1.001 * radius)

@@ -18,7 +18,7 @@ from truesky.numerics.compiling import exact_jit
 # Closer to the centre than this the first terms are enough, x^2 ln x.
 _CENTRE = 1e-4
 # |v| up to which the series of so many terms is taken: 0.04^9 / 21 of Psi.
-_NEAR, _TERMS = 0.04, 9
+_SERIES_LIMIT, _SERIES_TERMS = 0.04, 9
 
 
 @exact_jit
@@ -39,10 +39,10 @@ def profile(x: float, c: float) -> tuple[float, float]:
         return centre, 0.5 * x * x * (centre + 0.5)
     v = (1.0 - x) * (c - x) / ((1.0 + x) * (c + x))
     s = np.sqrt((c - x) / (c + x))
-    if abs(v) < _NEAR:
+    if abs(v) < _SERIES_LIMIT:
         psi = 0.0
-        for i in range(_TERMS):
-            psi = psi * v + 1.0 / (2.0 * (_TERMS - i) + 1.0)
+        for i in range(_SERIES_TERMS):
+            psi = psi * v + 1.0 / (2.0 * (_SERIES_TERMS - i) + 1.0)
         phi = 1.0 + v * psi
     else:
         root = np.sqrt(abs(v))
@@ -53,8 +53,8 @@ def profile(x: float, c: float) -> tuple[float, float]:
         else:
             phi = np.arctan(root) / root
         psi = (phi - 1.0) / v
-    near = 2.0 * (c - x) * psi / ((1.0 + x) ** 2 * (c + x))
-    surface = s / (1.0 + x) * (near + (c + 2.0 + x) / ((1.0 + x) * (1.0 + c)))
+    psi_term = 2.0 * (c - x) * psi / ((1.0 + x) ** 2 * (c + x))
+    surface = s / (1.0 + x) * (psi_term + (c + 2.0 + x) / ((1.0 + x) * (1.0 + c)))
     edge = c + s * (c + x)
     mass = -x * x / ((1.0 + c) * edge) + np.log(x * (1.0 + c) / edge) + 2.0 * s * phi / (1.0 + x)
     return surface, mass

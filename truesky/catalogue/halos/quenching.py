@@ -20,7 +20,7 @@ from truesky.catalogue import parameters
 from truesky.catalogue.halos import matching, satellites
 from truesky.catalogue.halos.matching import Masses, Occupation
 from truesky.catalogue.halos.population import SATELLITE, Members
-from truesky.numerics import sums
+from truesky.numerics import matrices
 
 # Shares of satellites are written in log10 M - 13.
 _PIVOT = 13.0
@@ -76,17 +76,17 @@ def shares(law: Quenching, masses: Masses, occupation: Occupation) -> Shares:
     inside = np.concatenate([above[:-1] - above[1:], above[-1:]])
     z = np.repeat(masses.z, masses.log_mass.size)
     mass = np.tile(masses.log_mass, masses.z.size)
-    radius = _mean_radius(occupation.concentration * masses.at(masses.concentration, z, mass))
+    radius = _mean_radius(occupation.concentration * masses.interpolate_pairs(masses.concentration, z, mass))
     red = quenched_central(law, z, mass), quenched_satellite(law, z, mass, radius)
     of_central, of_satellite = (share.reshape(centrals.shape) for share in red)
-    more = matching.satellites_at(masses.z, occupation)[:, None]
+    evolution = matching.satellite_evolution(masses.z, occupation)[:, None]
     numbers = (
         centrals,
-        more * sums.product(centrals, inside.T),
+        evolution * matrices.matmul(centrals, inside.T),
         centrals * of_central,
-        more * sums.product(centrals * of_satellite, inside.T),
+        evolution * matrices.matmul(centrals * of_satellite, inside.T),
     )
-    central, satellite, red_central, red_satellite = (matching.scattered(n, step, occupation) for n in numbers)
+    central, satellite, red_central, red_satellite = (matching.scatter_masses(n, step, occupation) for n in numbers)
     # Beyond the mass function's end there is nothing to average.
     total = np.maximum(central + satellite, 1e-30)
     return Shares(law, masses, satellite / total, (red_central + red_satellite) / total)
@@ -97,7 +97,7 @@ def satellite_share(average: Shares, members: Members) -> Float:
 
     average : of `shares`;  members : n galaxies
     """
-    return average.masses.at(average.satellites, members.z, members.proxy)
+    return average.masses.interpolate_pairs(average.satellites, members.z, members.proxy)
 
 
 def odds(average: Shares, members: Members, share: Float) -> Float:
@@ -106,7 +106,7 @@ def odds(average: Shares, members: Members, share: Float) -> Float:
     average : of `shares`;  members : n galaxies in their halos;  share : float[n] of their luminosity that are red
     """
     z, halo = members.z, members.host_mass
-    mean = average.masses.at(average.quenched, z, members.proxy)
+    mean = average.masses.interpolate_pairs(average.quenched, z, members.proxy)
     central = quenched_central(average.law, z, halo)
     satellite = quenched_satellite(average.law, z, halo, members.radius)
     return red_odds(share, np.where(members.kind == SATELLITE, satellite, central), mean)
@@ -126,9 +126,9 @@ def quenched_satellite(law: Quenching, z: Float, log_mass: Float, radius: Float)
 
     radius : float[...] distance from the halo's centre / R_200m;  law, z, log_mass : as of `quenched_central`
     """
-    most = np.clip(law.satellite + law.satellite_rate * (log_mass - _PIVOT), *law.satellite_limits)
+    max_share = np.clip(law.satellite + law.satellite_rate * (log_mass - _PIVOT), *law.satellite_limits)
     inside = law.inner - law.outer * np.minimum(law.projection * radius, 1.0)
-    return np.asarray(np.minimum(most * (1.0 + z) ** law.satellite_z * inside, law.highest))
+    return np.asarray(np.minimum(max_share * (1.0 + z) ** law.satellite_z * inside, law.highest))
 
 
 def red_odds(share: Float, quenched: Float | float = 0.0, mean: Float | float = 0.0) -> Float:
@@ -137,8 +137,8 @@ def red_odds(share: Float, quenched: Float | float = 0.0, mean: Float | float = 
     share    : float[n] of all galaxies of the luminosity that are red
     quenched : float[n] what the galaxy's halo quenches of what is not yet red;  mean : float[n] over all such galaxies
     """
-    before = np.clip((share - mean) / (1.0 - np.asarray(mean)), 0.0, 1.0)
-    return np.asarray(before + quenched * (1.0 - before))
+    red_before = np.clip((share - mean) / (1.0 - np.asarray(mean)), 0.0, 1.0)
+    return np.asarray(red_before + quenched * (1.0 - red_before))
 
 
 def _mean_radius(concentration: Float) -> Float:

@@ -20,7 +20,7 @@ from truesky.catalogue.halos import compiled_halos
 from truesky.catalogue.halos.halos import HaloModel, Halos
 from truesky.catalogue.halos.matching import Masses
 from truesky.catalogue.interpolation import bracket
-from truesky.randomness import keyed
+from truesky.randomness import per_source
 
 # Nodes of the inverse of the NFW mass profile, in concentration and in enclosed mass: 1e-3 of a radius.
 _C_NODES, _U_NODES = np.geomspace(1.0, 60.0, 40), np.linspace(0.0, 1.0, 256)
@@ -45,7 +45,7 @@ class Satellites:
     velocity: Float
     radius: Float
 
-    def part(self, keep: npt.NDArray[np.generic]) -> Satellites:
+    def select(self, keep: npt.NDArray[np.generic]) -> Satellites:
         """The satellites that are kept: keep : bool or int[m] rows."""
         return Satellites(*(getattr(self, name)[keep] for name in self.__slots__))
 
@@ -56,32 +56,32 @@ def draw(halos: HaloModel, masses: Masses, hosts: Halos, seed: int) -> Satellite
     A host's satellites are drawn by falling sub-mass, each with numbers of its own: a deeper request goes on with them.
     halos, masses : tables of halos, and by mass;  hosts : n halos;  seed : of the request
     """
-    own, limit, z = halos.matching.occupation, halos.mass_limit(hosts.chi), halos.distances.redshift(hosts.chi)
-    ratio = own.ratio_at(z)
-    about = (
-        keyed.keys(hosts.id, seed, "satellites"),
+    occupation, limit, z = halos.matching.occupation, halos.mass_limit(hosts.chi), halos.distances.redshift(hosts.chi)
+    ratio = occupation.ratio_at(z)
+    arguments = (
+        per_source.keys(hosts.id, seed, "satellites"),
         hosts.log_mass,
         limit,
-        own.least,
+        occupation.min_mass_ratio,
         ratio,
-        own.scatter,
-        own.depth,
+        occupation.scatter,
+        occupation.depth,
     )
-    over = 10.0 ** np.maximum(hosts.log_mass - limit + own.depth, np.log10(own.least))
-    out = _room(int(np.sum((over - own.least) / ratio)))
-    count = compiled_halos.satellites(*about, out)
+    mass_ratio = 10.0 ** np.maximum(hosts.log_mass - limit + occupation.depth, np.log10(occupation.min_mass_ratio))
+    out = _allocate(int(np.sum((mass_ratio - occupation.min_mass_ratio) / ratio)))
+    count = compiled_halos.fill_satellites(*arguments, out)
     if count > out[0].size:
-        out = _room(count)
-        compiled_halos.satellites(*about, out)
+        out = _allocate(count)
+        compiled_halos.fill_satellites(*arguments, out)
     host, member, proxy, numbers = out[0][:count], out[1][:count], out[2][:count], out[3][:count]
-    offset = _offsets(masses, own.concentration, hosts.log_mass, z, host, numbers)
+    offset = _offsets(masses, occupation.concentration, hosts.log_mass, z, host, numbers)
     kick = masses.dispersion(hosts.log_mass, z)[host] * numbers[:, 3]
-    ra, dec, chi = _moved(hosts, host, offset)
+    ra, dec, chi = _positions(hosts, host, offset)
     radius = np.sqrt(np.sum(offset**2, 1)) / masses.radius(hosts.log_mass)[host]
     return Satellites(host, member, proxy, ra, dec, chi, hosts.velocity[host] + kick, radius)
 
 
-def _room(count: int) -> tuple[Int, Int, Float, Float]:
+def _allocate(count: int) -> tuple[Int, Int, Float, Float]:
     return np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count), np.empty((count, 4))
 
 
@@ -107,20 +107,22 @@ def _squares() -> Float:
     return np.array([np.interp(_U_NODES, row / row[-1], _X_NODES**2) for row in inside])
 
 
-def _offsets(masses: Masses, times: float, log_mass: Float, z: Float, host: Int, numbers: Float) -> Float:
+def _offsets(
+    masses: Masses, concentration_factor: float, log_mass: Float, z: Float, host: Int, numbers: Float
+) -> Float:
     """Offsets from the hosts' centres, [n, 3] comoving Mpc/h."""
-    c = times * masses.at(masses.concentration, z, log_mass)
+    c = concentration_factor * masses.interpolate_pairs(masses.concentration, z, log_mass)
     radius = masses.radius(log_mass)[host] * nfw_radius(np.clip(c, 1.0, 60.0)[host], numbers[:, 0])
-    up, around = 2.0 * numbers[:, 1] - 1.0, 2.0 * np.pi * numbers[:, 2]
-    flat = np.sqrt((1.0 - up) * (1.0 + up))
-    return np.asarray(np.stack([flat * np.cos(around), flat * np.sin(around), up], 1) * radius[:, None])
+    height, azimuth = 2.0 * numbers[:, 1] - 1.0, 2.0 * np.pi * numbers[:, 2]
+    flat = np.sqrt((1.0 - height) * (1.0 + height))
+    return np.asarray(np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), height], 1) * radius[:, None])
 
 
-def _moved(hosts: Halos, host: Int, offset: Float) -> tuple[Float, Float, Float]:
-    unit = sky.unit_vectors(*sky.positions(hosts.index))
+def _positions(hosts: Halos, host: Int, offset: Float) -> tuple[Float, Float, Float]:
+    unit = sky.unit_vectors(*sky.positions_of_indices(hosts.index))
     x, y, z = ((unit * hosts.chi[:, None])[host] + offset).T
     flat = np.hypot(x, y)
-    return sky.wrapped(np.degrees(np.arctan2(y, x))), np.degrees(np.arctan2(z, flat)), np.hypot(flat, z)
+    return sky.wrap_angle(np.degrees(np.arctan2(y, x))), np.degrees(np.arctan2(z, flat)), np.hypot(flat, z)
 
 
 _SQUARES = _squares()

@@ -22,7 +22,7 @@ from lake_schema.arrays import Float, Float32, Int
 from truesky.catalogue.matter import density_box, lightcone
 from truesky.catalogue.matter.density_box import Box, BoxModel
 from truesky.fluxes import cosmology
-from truesky.numerics import sums
+from truesky.numerics import matrices
 from truesky.numerics.compiling import exact_jit
 
 # Tables reach this redshift, however near the last plane is: it leaves the nearer ones as they are.
@@ -31,11 +31,11 @@ _GAIN_NODES, _ELL_NODES, _K_BINS, _K_NODES = 9, 60, 24, 48
 # The window is averaged over so many directions, with images on so many sides, up to this many times the highest k.
 _DIRECTIONS, _IMAGES, _WINDOWS = 48, 2, 8.0
 # Where more power than this is missing, in amplitude, it stays so: sources at z < 0.3.
-_MOST_TRANSFER = 2.0
+_MAX_TRANSFER = 2.0
 # Pixels whose sums are taken together: few enough that the cells of the box they share stay in the processor's cache.
-_PATCH = 1024
+_PATCH_SIZE = 1024
 # Patches that a thread takes at a time.
-_PATCHES = 48
+_PATCHES_PER_CALL = 48
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,11 +52,11 @@ class Layers:
     factor: Int
     stretch: Int
     growth: Float
-    now: Float
+    growth_here: Float
     gain: Float
     weight: Float
 
-    def part(self, cut: slice) -> Layers:
+    def select(self, cut: slice) -> Layers:
         """The layers of a cut."""
         return Layers(*(getattr(self, field.name)[cut] for field in fields(self)))
 
@@ -70,44 +70,44 @@ def convergence(box: Box, direction: Float32, width: float, chi: Float, coarsest
     coarsest  : most cells a side that matter is averaged over;  stretch : Mpc/h in which its growth is linear
     box       : of matter
     """
-    direction = np.ascontiguousarray(direction.reshape(3, -1, _PATCH).swapaxes(0, 1))
-    turned = lightcone.replicas(box, float(chi[-1]))
+    direction = np.ascontiguousarray(direction.reshape(3, -1, _PATCH_SIZE).swapaxes(0, 1))
+    replicas = lightcone.draw_replicas(box, float(chi[-1]))
     slabs = layers(box, width, float(chi[-1]), coarsest, stretch)
     # kappa(chi) = first - second / chi: two sums serve every plane.
-    sums = np.zeros((len(direction), 2, _PATCH), np.float32)
-    planes = np.empty((chi.size, len(direction), _PATCH), np.float32)
+    sums = np.zeros((len(direction), 2, _PATCH_SIZE), np.float32)
+    planes = np.empty((chi.size, len(direction), _PATCH_SIZE), np.float32)
     done = 0
     with ThreadPoolExecutor(min(os.cpu_count() or 1, 4)) as pool:
-        for cut in _together(slabs, np.searchsorted(chi, slabs.middle)):
+        for cut in _group_layers(slabs, np.searchsorted(chi, slabs.middle)):
             while done < chi.size and chi[done] <= slabs.middle[cut.start]:
                 planes[done] = sums[:, 0] - sums[:, 1] / np.float32(chi[done])
                 done += 1
-            _add(box, turned, slabs.part(cut), direction, sums, pool)
+            _add_group(box, replicas, slabs.select(cut), direction, sums, pool)
     planes[done:] = sums[:, 0] - sums[:, 1] / chi[done:, None, None].astype(np.float32)
     return planes.reshape(chi.size, -1)
 
 
-def layers(box: Box, width: float, far: float, coarsest: int, stretch: float) -> Layers:
+def layers(box: Box, width: float, max_distance: float, coarsest: int, stretch: float) -> Layers:
     """Layers out to `far` Mpc/h, as thick as the cells that a pixel of `width` rad is averaged over.
 
     box : of matter;  coarsest, stretch : as of `convergence`
     """
     middle, factor, at = [], [], 0.0
-    while at < far:
+    while at < max_distance:
         cells = min(1 << max(int(np.log2(max(width * at / box.model.cell, 1.0))), 0), coarsest)
         middle.append(at + 0.5 * cells * box.model.cell)
         factor.append(cells)
         at += cells * box.model.cell
     chi, thick = np.array(middle), np.array(factor)
-    table = lightcone.distances(_Z_LAST)
+    table = lightcone.distance_table(_Z_LAST)
     number = (chi / stretch).astype(np.int64)
     growth = density_box.growth(table.redshift((number + 0.5) * stretch))
     z = table.redshift(chi)
-    now = density_box.growth(z)
+    growth_here = density_box.growth(z)
     nodes = np.linspace(float(density_box.growth(table.z[-1])), 1.0, _GAIN_NODES)
-    gain = np.interp(now, nodes, density_box.matter_gain(box.model, nodes))
+    gain = np.interp(growth_here, nodes, density_box.matter_gain(box.model, nodes))
     weight = 1.5 * cosmology.OMEGA_M / cosmology.HUBBLE_DISTANCE**2 * thick * box.model.cell * chi * (1.0 + z)
-    return Layers(chi, thick, number, growth, now, gain, weight)
+    return Layers(chi, thick, number, growth, growth_here, gain, weight)
 
 
 def transfer(box: Box, width: float, chi: Float, l_max: int, coarsest: int, stretch: float) -> Float:
@@ -122,28 +122,28 @@ def transfer(box: Box, width: float, chi: Float, l_max: int, coarsest: int, stre
     ell = np.unique(np.concatenate([np.arange(32), np.geomspace(32, l_max, _ELL_NODES).astype(int)]))
     k = (ell[:, None] + 0.5) / slabs.middle
     linear = density_box.linear_power(k.ravel()).reshape(k.shape)
-    seen = linear * _seen(box.model, slabs, k)
+    box_power = linear * _sampled_power_ratio(box.model, slabs, k)
     rows = []
-    for far in chi:
-        lens = slabs.weight * slabs.now * np.maximum(1.0 - slabs.middle / far, 0.0)
+    for source_chi in chi:
+        lens = slabs.weight * slabs.growth_here * np.maximum(1.0 - slabs.middle / source_chi, 0.0)
         share = lens**2 / (slabs.middle**2 * slabs.factor)
-        ratio = np.sqrt(sums.product(linear, share) / sums.product(seen, share))
-        rows.append(np.interp(np.arange(l_max + 1), ell, np.minimum(ratio, _MOST_TRANSFER)))
+        ratio = np.sqrt(matrices.matmul(linear, share) / matrices.matmul(box_power, share))
+        rows.append(np.interp(np.arange(l_max + 1), ell, np.minimum(ratio, _MAX_TRANSFER)))
     return np.array(rows)
 
 
-def _seen(model: BoxModel, slabs: Layers, k: Float) -> Float:
+def _sampled_power_ratio(model: BoxModel, slabs: Layers, k: Float) -> Float:
     """Power of the matter that lines of sight meet / linear power, [l, s]."""
-    growths = np.linspace(float(slabs.now.min()), 1.0, _GAIN_NODES)
+    growths = np.linspace(float(slabs.growth_here.min()), 1.0, _GAIN_NODES)
     edges = np.linspace(0.0, np.pi / model.cell, _K_BINS + 1)
     at, share = density_box.linear_share(model, growths, edges)
     nodes = np.geomspace(1e-3, _WINDOWS * np.pi / model.cell, _K_NODES)
     ratio = np.empty(k.shape)
     for factor in np.unique(slabs.factor).tolist():
-        here = slabs.factor == factor
-        ratio[:, here] = np.interp(k[:, here], nodes, window(model.cell, factor, nodes))
-    for s, now in enumerate(slabs.now):
-        by_k = [np.interp(now, growths, column) for column in share.T]
+        selected = slabs.factor == factor
+        ratio[:, selected] = np.interp(k[:, selected], nodes, window(model.cell, factor, nodes))
+    for s, growth_here in enumerate(slabs.growth_here):
+        by_k = [np.interp(growth_here, growths, column) for column in share.T]
         ratio[:, s] *= slabs.gain[s] ** 2 * np.interp(k[:, s], at, by_k)
     return ratio
 
@@ -171,14 +171,14 @@ def window(cell: float, factor: int, k: Float) -> Float:
         # np.sinc(x) is sin(pi x) / (pi x).
         average = np.sinc(source * wide / (2.0 * np.pi)) / np.sinc(source * cell / (2.0 * np.pi))
         length = np.sqrt((source**2).sum(-1))
-        known = np.all(np.abs(source) < np.pi / cell, -1)
-        power = np.where(known, np.exp(np.interp(np.log(np.maximum(length, 1e-4)), ln_k, ln_power)), 0.0)
-        held = np.prod(np.sinc(wave * wide / (2.0 * np.pi)) ** 2, -1)
-        mean[i] = np.mean(held * np.sum(power * np.prod(average**2, -1), 1))
+        in_lattice = np.all(np.abs(source) < np.pi / cell, -1)
+        power = np.where(in_lattice, np.exp(np.interp(np.log(np.maximum(length, 1e-4)), ln_k, ln_power)), 0.0)
+        damping = np.prod(np.sinc(wave * wide / (2.0 * np.pi)) ** 2, -1)
+        mean[i] = np.mean(damping * np.sum(power * np.prod(average**2, -1), 1))
     return mean / density_box.linear_power(k)
 
 
-def averaged(box: Box, growth: float, factor: int, pool: ThreadPoolExecutor) -> Float32:
+def average_density(box: Box, growth: float, factor: int, pool: ThreadPoolExecutor) -> Float32:
     """Matter overdensity at a growth, in cubes of factor^3 cells: float32[(n / factor)^3].
 
     box  : of n^3 cells;  growth : of linear density, 1 today;  factor : cells a side that are averaged
@@ -199,7 +199,7 @@ def averaged(box: Box, growth: float, factor: int, pool: ThreadPoolExecutor) -> 
     return mean
 
 
-def _together(slabs: Layers, plane: Int) -> Iterator[slice]:
+def _group_layers(slabs: Layers, plane: Int) -> Iterator[slice]:
     """Stretches of layers that share their matter and the planes behind them."""
     same = zip(slabs.stretch.tolist(), slabs.factor.tolist(), plane.tolist(), strict=True)
     at = 0
@@ -209,24 +209,24 @@ def _together(slabs: Layers, plane: Int) -> Iterator[slice]:
         at += size
 
 
-def _add(
-    box: Box, turned: lightcone.Replicas, slabs: Layers, direction: Float32, sums: Float32, pool: ThreadPoolExecutor
+def _add_group(
+    box: Box, replicas: lightcone.Replicas, slabs: Layers, direction: Float32, sums: Float32, pool: ThreadPoolExecutor
 ) -> None:
     """Add layers of one growth and factor to both sums."""
     factor = int(slabs.factor[0])
-    delta = averaged(box, float(slabs.growth[0]), factor, pool).ravel()
+    delta = average_density(box, float(slabs.growth[0]), factor, pool).ravel()
     shell = (slabs.middle // box.length).astype(np.int64)
-    scale = (turned.sign[shell] * (slabs.middle / box.length)[:, None]).astype(np.float32)
-    shift = (turned.shift[shell] / box.length).astype(np.float32)
-    axes = turned.axes[shell]
-    weight = slabs.weight * slabs.gain * slabs.now / slabs.growth
+    scale = (replicas.sign[shell] * (slabs.middle / box.length)[:, None]).astype(np.float32)
+    shift = (replicas.shift[shell] / box.length).astype(np.float32)
+    axes = replicas.axes[shell]
+    weight = slabs.weight * slabs.gain * slabs.growth_here / slabs.growth
     weights = np.stack([weight, weight * slabs.middle]).astype(np.float32)
 
-    def part(first: int) -> None:
-        cut = slice(first, first + _PATCHES)
+    def add_patches(first: int) -> None:
+        cut = slice(first, first + _PATCHES_PER_CALL)
         add_layers(direction[cut], delta, box.n // factor, axes, scale, shift, weights, sums[cut])
 
-    list(pool.map(part, range(0, len(direction), _PATCHES)))
+    list(pool.map(add_patches, range(0, len(direction), _PATCHES_PER_CALL)))
 
 
 @exact_jit
@@ -265,8 +265,8 @@ def add_layers(
                 # In single precision a little less than 0 is 1 above the integer below it: the last cell, none after.
                 i, j, k = min(int(x * n), n - 1), min(int(y * n), n - 1), min(int(z * n), n - 1)
                 index[p] = (i * n + j) * n + k
-            one, other = weights[0, s], weights[1, s]
+            first_weight, second_weight = weights[0, s], weights[1, s]
             for p in range(pixels):
-                found = delta[index[p]]
-                first[p] += one * found
-                second[p] += other * found
+                density = delta[index[p]]
+                first[p] += first_weight * density
+                second[p] += second_weight * density

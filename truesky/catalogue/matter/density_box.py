@@ -33,7 +33,7 @@ from truesky.catalogue import parameters
 from truesky.catalogue.matter import linear_theory
 from truesky.fluxes import cosmology
 from truesky.numerics.cache import cached_arrays, content_key
-from truesky.numerics.code_keys import code_key
+from truesky.numerics.code_fingerprints import code_key
 from truesky.randomness.rng import stream
 
 _FILE = "density_box.toml"
@@ -43,7 +43,7 @@ _K_NODES = 2000
 _GAIN_CELLS = 96
 _BIAS_NODES = 10
 # More threads do not make the transforms of a box any faster.
-_MOST_WORKERS = 8
+_MAX_WORKERS = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,15 +97,15 @@ def load(seed: int, n: int) -> Box:
     model = box_model()
     numbers = [value for field in fields(model) for value in np.atleast_1d(getattr(model, field.name))]
     key = content_key(code_key(__name__), seed, n, *map(float, numbers))
-    stored = partial(_stored, key)
-    with fft.set_workers(min(os.cpu_count() or 1, _MOST_WORKERS)):
-        g = stored("box_g", lambda: _gaussian(seed, n, model.cell))
+    cached = partial(_cached_field, key)
+    with fft.set_workers(min(os.cpu_count() or 1, _MAX_WORKERS)):
+        g = cached("box_g", lambda: _gaussian(seed, n, model.cell))
         smooth = [
-            stored(f"box_g{i}", partial(_smoothed, g, model.cell, radius)) if radius else g
+            cached(f"box_g{i}", partial(_smooth, g, model.cell, radius)) if radius else g
             for i, radius in enumerate(model.smoothing)
         ]
-        velocity = tuple(stored(f"box_u{axis}", partial(_displacement, g, model.cell, axis)) for axis in range(3))
-    variance = stored("box_variance", lambda: np.array([field.var(dtype=float) for field in smooth]))
+        velocity = tuple(cached(f"box_u{axis}", partial(_displacement, g, model.cell, axis)) for axis in range(3))
+    variance = cached("box_variance", lambda: np.array([field.var(dtype=float) for field in smooth]))
     return Box(model, n, seed, tuple(smooth), np.asarray(variance, float), velocity)
 
 
@@ -116,12 +116,12 @@ def tides(box: Box) -> tuple[Float32, ...]:
     box : of matter
     """
     key = content_key(code_key(__name__), box.seed, box.n, box.model.cell)
-    g, found = box.smoothed[0], []
-    with fft.set_workers(min(os.cpu_count() or 1, _MOST_WORKERS)):
-        for name, one, other in (("xx", 0, 0), ("yy", 1, 1), ("xy", 0, 1), ("xz", 0, 2), ("yz", 1, 2)):
-            made = partial(_tide, g, box.model.cell, one, other)
-            found.append(_stored(key, f"box_t{name}", made))
-    return tuple(found)
+    g, tide_fields = box.smoothed[0], []
+    with fft.set_workers(min(os.cpu_count() or 1, _MAX_WORKERS)):
+        for name, axis_1, axis_2 in (("xx", 0, 0), ("yy", 1, 1), ("xy", 0, 1), ("xz", 0, 2), ("yz", 1, 2)):
+            make_tide = partial(_tide, g, box.model.cell, axis_1, axis_2)
+            tide_fields.append(_cached_field(key, f"box_t{name}", make_tide))
+    return tuple(tide_fields)
 
 
 def growth(z: npt.ArrayLike) -> Float:
@@ -131,7 +131,7 @@ def growth(z: npt.ArrayLike) -> Float:
     Ref: Carroll, Press & Turner 1992, ARA&A 30, 499 (its hypergeometric form)
     """
     a = 1.0 / (1.0 + np.asarray(z, float))
-    return np.asarray(a * _growing(a) / _growing(np.ones(())))
+    return np.asarray(a * _growth_integral(a) / _growth_integral(np.ones(())))
 
 
 def growth_rate(z: npt.ArrayLike, index: float) -> Float:
@@ -173,7 +173,7 @@ def matter_gain(model: BoxModel, growths: Float) -> Float:
     return np.asarray(1.0 / np.sqrt(share[:, 0]))
 
 
-def biased(model: BoxModel, x: Float) -> tuple[Int, Float]:
+def biased_field(model: BoxModel, x: Float) -> tuple[Int, Float]:
     """The field that halos of x = b D follow, and its amplitude A, each of x's shape.
 
     Halos drawn in voxels from exp(A g_R) have the power x^2 P_linear(z = 0) in the band of the model; A = x would be
@@ -187,8 +187,8 @@ def biased(model: BoxModel, x: Float) -> tuple[Int, Float]:
     place = np.searchsorted(np.array(model.bias_edges), x)
     amplitude = np.empty(x.shape)
     for i in range(len(model.bias_field)):
-        here = place == i
-        amplitude[here] = np.interp(x[here], table["bias"][i], table["amplitude"][i])
+        selected = place == i
+        amplitude[selected] = np.interp(x[selected], table["bias"][i], table["amplitude"][i])
     return np.array(model.bias_field)[place], amplitude
 
 
@@ -198,17 +198,17 @@ def linear_share(model: BoxModel, growths: Float, edges: Float) -> tuple[Float, 
     growths : float[n];  edges : float[bins + 1] h/Mpc
     """
     n, cell = _GAIN_CELLS, model.cell
-    power = _on_modes(n, cell)
+    power = _power_on_modes(n, cell)
     k = np.sqrt(_k_squared(n, cell))
     place = np.digitize(k.ravel(), edges)
 
-    def binned(values: Float32) -> Float:
+    def bin_modes(values: Float32) -> Float:
         return np.asarray(np.bincount(place, values.ravel().astype(float), edges.size + 1)[1:-1], float)
 
-    wanted = binned(power)
+    linear = bin_modes(power)
     log_correlation = np.log1p(fft.irfftn(power, (n, n, n)) / np.float32(cell**3))
-    found = [binned(fft.rfftn(np.expm1(np.float32(d**2) * log_correlation)).real) * cell**3 for d in growths]
-    return binned(k) / binned(np.ones_like(k)), np.array(found) / (growths[:, None] ** 2 * wanted)
+    powers = [bin_modes(fft.rfftn(np.expm1(np.float32(d**2) * log_correlation)).real) * cell**3 for d in growths]
+    return bin_modes(k) / bin_modes(np.ones_like(k)), np.array(powers) / (growths[:, None] ** 2 * linear)
 
 
 def linear_power(k: npt.ArrayLike) -> Float:
@@ -225,11 +225,11 @@ def linear_power(k: npt.ArrayLike) -> Float:
 def _bias_table(model: BoxModel) -> dict[str, Float]:
     """Bias[i, m] at z = 0 that amplitudes[i, m] of the i-th range of x give, voxels and all."""
     n, cell = _GAIN_CELLS, model.cell
-    power, k_squared = _on_modes(n, cell), _k_squared(n, cell)
+    power, k_squared = _power_on_modes(n, cell), _k_squared(n, cell)
     band = (k_squared > model.bias_band[0] ** 2) & (k_squared < model.bias_band[1] ** 2)
     # Each ln k counts the same, so that the many modes of small scales do not decide alone.
     weight = k_squared[band].astype(float) ** -1.5 / power[band]
-    wanted, held = np.sum(weight * power[band]), weight * np.exp(-(model.bias_hold**2) * k_squared[band])
+    linear_sum, damped_weight = np.sum(weight * power[band]), weight * np.exp(-(model.bias_hold**2) * k_squared[band])
     log_power, edge = _log_power(n, cell), (0.0, *model.bias_edges, model.bias_most)
     amplitude, bias = np.empty((2, len(model.bias_field), _BIAS_NODES))
     for i, field in enumerate(model.bias_field):
@@ -238,16 +238,16 @@ def _bias_table(model: BoxModel) -> dict[str, Float]:
         correlation = fft.irfftn(smooth, (n, n, n)) / np.float32(cell**3)
         amplitude[i] = np.linspace(max(0.4 * edge[i], 0.01), 1.2 * edge[i + 1], _BIAS_NODES)
         for j, times in enumerate(amplitude[i]):
-            found = fft.rfftn(np.expm1(np.float32(times**2) * correlation)).real[band] * cell**3
-            bias[i, j] = np.sqrt(np.sum(held * found) / wanted)
+            halo_power = fft.rfftn(np.expm1(np.float32(times**2) * correlation)).real[band] * cell**3
+            bias[i, j] = np.sqrt(np.sum(damped_weight * halo_power) / linear_sum)
     return {"bias": bias, "amplitude": amplitude}
 
 
-def _growing(a: Float) -> Float:
+def _growth_integral(a: Float) -> Float:
     return np.asarray(hyp2f1(1.0 / 3.0, 1.0, 11.0 / 6.0, -(a**3) * cosmology.OMEGA_LAMBDA / cosmology.OMEGA_M))
 
 
-def _stored(key: str, name: str, make: Callable[[], npt.NDArray[np.generic]]) -> Float32:
+def _cached_field(key: str, name: str, make: Callable[[], npt.NDArray[np.generic]]) -> Float32:
     return np.asarray(cached_arrays(name, key, lambda: {"field": make()})["field"])
 
 
@@ -260,19 +260,19 @@ def _gaussian(seed: int, n: int, cell: float) -> Float32:
     modes = fft.rfftn(noise, overwrite_x=True)
     del noise
     modes *= np.sqrt(_log_power(n, cell) / np.float32(cell**3))
-    return _real(modes, n)
+    return _to_real(modes, n)
 
 
 def _log_power(n: int, cell: float) -> Float32:
     """Power of g on the modes of the box: that of ln(1 + xi), (Mpc/h)^3."""
-    power = _on_modes(n, cell)
+    power = _power_on_modes(n, cell)
     correlation = fft.irfftn(power, (n, n, n), overwrite_x=True) / np.float32(cell**3)
     transformed = fft.rfftn(np.log1p(correlation), overwrite_x=True).real * np.float32(cell**3)
     transformed[0, 0, 0] = 0.0
     return np.asarray(np.maximum(transformed, np.float32(0.0)))
 
 
-def _on_modes(n: int, cell: float) -> Float32:
+def _power_on_modes(n: int, cell: float) -> Float32:
     """Linear P on the modes of the box, 0 at k = 0."""
     k = np.sqrt(_k_squared(n, cell))
     largest = np.sqrt(3.0) * np.pi / cell
@@ -284,26 +284,26 @@ def _on_modes(n: int, cell: float) -> Float32:
     return np.asarray(power)
 
 
-def _smoothed(g: Float32, cell: float, radius: float) -> Float32:
+def _smooth(g: Float32, cell: float, radius: float) -> Float32:
     modes = fft.rfftn(g)
     modes *= np.exp(np.float32(-0.5 * radius * abs(radius)) * _k_squared(g.shape[0], cell))
-    return _real(modes, g.shape[0])
+    return _to_real(modes, g.shape[0])
 
 
 def _displacement(g: Float32, cell: float, axis: int) -> Float32:
     """u of one axis, Mpc/h: i k / k^2 times the linear density."""
     modes, k_squared = _linear_modes(g, cell)
     modes *= (1j * _k_signed(g.shape[0], cell, axis) / k_squared).astype(np.complex64)
-    return _real(modes, g.shape[0])
+    return _to_real(modes, g.shape[0])
 
 
-def _tide(g: Float32, cell: float, one: int, other: int) -> Float32:
+def _tide(g: Float32, cell: float, axis_1: int, axis_2: int) -> Float32:
     """k_i k_j / k^2 times the linear density, less a third of this where i = j."""
     modes, k_squared = _linear_modes(g, cell)
     n = g.shape[0]
-    product = _k_signed(n, cell, one) * _k_signed(n, cell, other) / k_squared
-    modes *= (product - (one == other) / 3.0).astype(np.float32)
-    return _real(modes, n)
+    product = _k_signed(n, cell, axis_1) * _k_signed(n, cell, axis_2) / k_squared
+    modes *= (product - (axis_1 == axis_2) / 3.0).astype(np.float32)
+    return _to_real(modes, n)
 
 
 def _linear_modes(g: Float32, cell: float) -> tuple[Complex64, Float32]:
@@ -312,7 +312,7 @@ def _linear_modes(g: Float32, cell: float) -> tuple[Complex64, Float32]:
     modes = fft.rfftn(g)
     log_power = _log_power(n, cell)
     empty = np.zeros(modes.shape, np.float32)
-    modes *= np.sqrt(np.divide(_on_modes(n, cell), log_power, out=empty, where=log_power > 0.0))
+    modes *= np.sqrt(np.divide(_power_on_modes(n, cell), log_power, out=empty, where=log_power > 0.0))
     k_squared = _k_squared(n, cell)
     k_squared[0, 0, 0] = 1.0
     return modes, k_squared
@@ -336,5 +336,5 @@ def _k_squared(n: int, cell: float) -> Float32:
     return np.asarray((x**2 + y**2).astype(np.float32) + (z**2).astype(np.float32))
 
 
-def _real(modes: Complex64, n: int) -> Float32:
+def _to_real(modes: Complex64, n: int) -> Float32:
     return np.asarray(fft.irfftn(modes, (n, n, n), overwrite_x=True), np.float32)

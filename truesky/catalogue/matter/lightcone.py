@@ -91,14 +91,14 @@ class Distances:
         return np.asarray(low + (at - node) * (self.z[node + 1] - low))
 
 
-def distances(z_max: float) -> Distances:
+def distance_table(z_max: float) -> Distances:
     """The table out to z_max, or a step of it further."""
     steps = int(np.ceil(float(cosmology.comoving_distance(z_max)) / _CHI_STEP))
     chi = np.asarray(_CHI_STEP * np.arange(steps + 1), float)
     return Distances(chi, cosmology.redshift(chi))
 
 
-def replicas(box: Box, chi_max: float) -> Replicas:
+def draw_replicas(box: Box, chi_max: float) -> Replicas:
     """Replicas out to chi_max, from the box's seed; the nearest is not turned."""
     turns = [(axes, sign) for axes in permutations(range(3)) for sign in product((1.0, -1.0), repeat=3)]
     shells = int(chi_max // box.length) + 1
@@ -112,48 +112,48 @@ def replicas(box: Box, chi_max: float) -> Replicas:
     return Replicas(np.array(axes), np.array(sign), np.array(shifts))
 
 
-def box_cells(box: Box, turned: Replicas, direction: Float, chi: Float) -> tuple[Int, Float]:
+def box_cells(box: Box, replicas: Replicas, direction: Float, chi: Float) -> tuple[Int, Float]:
     """(flat cell of the box[n], direction in the box's frame [n, 3]).
 
     direction : [n, 3] unit vectors;  chi : [n] Mpc/h
     box       : of matter;  turned : how each replica of it is turned
     """
     shell = np.broadcast_to(np.asarray(chi // box.length, np.int64), direction.shape[:1])
-    seen = turned.sign[shell] * np.take_along_axis(direction, turned.axes[shell], 1)
-    place = (seen * np.reshape(chi, (-1, 1)) + turned.shift[shell]) / box.model.cell
+    box_direction = replicas.sign[shell] * np.take_along_axis(direction, replicas.axes[shell], 1)
+    place = (box_direction * np.reshape(chi, (-1, 1)) + replicas.shift[shell]) / box.model.cell
     x, y, z = np.floor(place).astype(np.int64).T % box.n
-    return (x * box.n + y) * box.n + z, seen
+    return (x * box.n + y) * box.n + z, box_direction
 
 
-def steps(cell: float, near: float, far: float, table: Distances) -> Steps:
+def radial_steps(cell: float, start: float, end: float, table: Distances) -> Steps:
     """Steps of `cell` Mpc/h from near to far.
 
     cell : side of the box's cells;  near, far : Mpc/h;  table : of distances
     """
-    inner = np.arange(np.floor(near / cell) + 1, np.ceil(far / cell)) * cell
-    edge = np.concatenate([[near], inner, [far]])
+    inner = np.arange(np.floor(start / cell) + 1, np.ceil(end / cell)) * cell
+    edge = np.concatenate([[start], inner, [end]])
     return Steps(edge, table.redshift(0.5 * (edge[1:] + edge[:-1])))
 
 
-def voxels(box: Box, turned: Replicas, line: Steps, order: int, cell: int, used: Bool) -> Voxels:
+def voxels(box: Box, replicas: Replicas, steps: Steps, order: int, cell: int, used: Bool) -> Voxels:
     """Voxels of a nested cell, in the steps that are used (bool[s]).
 
     order, cell : of the nested cell;  used : bool[s]
     box, turned : of matter, and how each replica of it is turned;  line : steps along the line of sight
     """
-    wanted = np.ceil(np.log2(np.maximum(_SIDE * line.middle / (_WIDEST * box.model.cell), 1.0)))
-    orders = np.maximum(wanted.astype(np.int64), order)
+    min_order = np.ceil(np.log2(np.maximum(_SIDE * steps.middle / (_WIDEST * box.model.cell), 1.0)))
+    orders = np.maximum(min_order.astype(np.int64), order)
     pieces: list[tuple[Int, Int, Int, Float]] = []
     for fine in np.unique(orders[used]).tolist():
-        here = np.flatnonzero(used & (orders == fine))
+        selected_steps = np.flatnonzero(used & (orders == fine))
         inside = (np.int64(cell) << 2 * (fine - order)) + np.arange(1 << 2 * (fine - order))
-        step, sub = np.repeat(here, inside.size), np.tile(inside, here.size)
+        step, sub = np.repeat(selected_steps, inside.size), np.tile(inside, selected_steps.size)
         vector = np.stack(hp.pix2vec(1 << fine, inside, nest=True), 1)
-        pieces.append((step, np.full(step.size, fine), sub, np.tile(vector, (here.size, 1))))
+        pieces.append((step, np.full(step.size, fine), sub, np.tile(vector, (selected_steps.size, 1))))
     if not pieces:
-        none = np.zeros(0, np.int64)
-        return Voxels(none, none, none, none, np.zeros(0))
-    step, at, sub = (np.concatenate([piece[i] for piece in pieces]) for i in range(3))
-    index, seen = box_cells(box, turned, np.concatenate([piece[3] for piece in pieces]), line.middle[step])
-    velocity = np.sum([box.velocity[axis].ravel()[index] * seen[:, axis] for axis in range(3)], 0)
-    return Voxels(step, at, sub, index, velocity)
+        empty = np.zeros(0, np.int64)
+        return Voxels(empty, empty, empty, empty, np.zeros(0))
+    step, voxel_order, sub = (np.concatenate([piece[i] for piece in pieces]) for i in range(3))
+    index, directions = box_cells(box, replicas, np.concatenate([piece[3] for piece in pieces]), steps.middle[step])
+    velocity = np.sum([box.velocity[axis].ravel()[index] * directions[:, axis] for axis in range(3)], 0)
+    return Voxels(step, voxel_order, sub, index, velocity)

@@ -19,7 +19,7 @@ import numpy as np
 from lake_schema.arrays import Float
 from truesky.fluxes import cosmology
 from truesky.numerics.cache import cache_dir, cached_arrays, content_key
-from truesky.numerics.code_keys import code_key
+from truesky.numerics.code_fingerprints import code_key
 
 MASS_DEFINITION = "200m"
 _POWER, _MASS_FUNCTION, _BIAS, _CONCENTRATION = "eisenstein98", "tinker08", "tinker10", "diemer19"
@@ -32,7 +32,7 @@ def power(k: Float) -> Float:
 
     k : float[n] h/Mpc
     """
-    return np.asarray(_of_power().matterPowerSpectrum(k, 0.0, model=_POWER), float)
+    return np.asarray(_power_cosmology().matterPowerSpectrum(k, 0.0, model=_POWER), float)
 
 
 def halo_tables(log_mass: Float, z: Float) -> dict[str, Float]:
@@ -49,26 +49,26 @@ def halo_tables(log_mass: Float, z: Float) -> dict[str, Float]:
 
 
 def _halo_tables(log_mass: Float, z: Float) -> dict[str, Float]:
-    _universe()
+    _set_cosmology()
     from colossus.halo import concentration
     from colossus.lss import bias, mass_function
 
     mass, args = 10.0**log_mass, {"mdef": MASS_DEFINITION}
     rows = [mass_function.massFunction(mass, at, model=_MASS_FUNCTION, q_out="dndlnM", **args) for at in z]
     biases = [bias.haloBias(mass, at, model=_BIAS, **args) for at in z]
-    few, coarse = log_mass[::_COARSE], np.expm1(np.linspace(np.log1p(z[0]), np.log1p(z[-1]), _Z_COARSE))
-    c = [concentration.concentration(10.0**few, MASS_DEFINITION, at, model=_CONCENTRATION) for at in coarse]
-    fine = np.array([np.exp(np.interp(log_mass, few, np.log(row))) for row in c])
-    return {"density": np.log(10.0) * np.array(rows), "bias": np.array(biases), "concentration": fine}
+    coarse_mass, coarse_z = log_mass[::_COARSE], np.expm1(np.linspace(np.log1p(z[0]), np.log1p(z[-1]), _Z_COARSE))
+    c = [concentration.concentration(10.0**coarse_mass, MASS_DEFINITION, at, model=_CONCENTRATION) for at in coarse_z]
+    concentrations = np.array([np.exp(np.interp(log_mass, coarse_mass, np.log(row))) for row in c])
+    return {"density": np.log(10.0) * np.array(rows), "bias": np.array(biases), "concentration": concentrations}
 
 
 @cache
-def _of_power() -> Any:
+def _power_cosmology() -> Any:
     """The cosmology of `power`: each new one integrates its normalisation and makes its table of k again."""
-    return _universe()
+    return _set_cosmology()
 
 
-def _universe() -> Any:
+def _set_cosmology() -> Any:
     """The cosmology of colossus, which is told to keep its files in our cache and to write none."""
     from colossus import settings
     from colossus.cosmology import cosmology as colossus

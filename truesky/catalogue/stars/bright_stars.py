@@ -27,7 +27,7 @@ from lake_schema.store.provenance import file_sha256
 from truesky.catalogue import parameters
 from truesky.fluxes.libraries.stellar import StellarTypes
 from truesky.numerics.cache import cached_arrays, content_key
-from truesky.numerics.code_keys import code_key
+from truesky.numerics.code_fingerprints import code_key
 
 # Fields between the bars of a record: how many there are, mean position, observed position, B_T, V_T.
 _FIELDS = {"tyc2.dat": (32, (2, 3), (24, 25), 17, 19), "suppl_1.dat": (18, (2, 3), (2, 3), 11, 13)}
@@ -56,30 +56,30 @@ class BrightStars:
     dec: Float
     mag_v: Float
     color_bv: Float
-    read: int
+    record_count: int
     without_color: int
     without_magnitude: int
 
 
 def sha256(files: tuple[Path, ...]) -> list[str]:
     """What the files hold, for the key of what is made from them."""
-    return [file_sha256(user_files.checked(file, _KIND, "stars.tycho2")) for file in files]
+    return [file_sha256(user_files.check_file(file, _KIND, "stars.tycho2")) for file in files]
 
 
-def load(files: tuple[Path, ...], sums: list[str]) -> BrightStars:
+def load(files: tuple[Path, ...], checksums: list[str]) -> BrightStars:
     """Stars brighter than the hand-over of tyc2.dat and suppl_1.dat, or of FITS forms of them, read once.
 
     sums   : sha256 of each
     Errors : BadInput names the file and the record
     """
-    key = content_key(code_key(__name__), *sums)
+    key = content_key(code_key(__name__), *checksums)
     arrays = cached_arrays("tycho2", key, lambda: _read(files))
     index, ra, dec, mag_v, color_bv = (arrays[name] for name in ("index", "ra", "dec", "mag_v", "color_bv"))
     counts = arrays["counts"].tolist()
     return BrightStars(_numbers()["hand_over"], index, ra, dec, mag_v, color_bv, *counts)
 
 
-def of_cell(stars: BrightStars, cell: int) -> slice:
+def rows_of_cell(stars: BrightStars, cell: int) -> slice:
     """The stars of an order-8 cell."""
     first, last = np.searchsorted(stars.index, sky.cell_range(GENERATION_ORDER, cell))
     return slice(int(first), int(last))
@@ -88,7 +88,7 @@ def of_cell(stars: BrightStars, cell: int) -> slice:
 def columns(stars: BrightStars, rows: slice, types: StellarTypes) -> dict[str, Any]:
     """Template, magnitude and temperature by B - V; what Tycho-2 does not know is masked."""
     nearest = np.abs(types.color_bv - stars.color_bv[rows, None]).argmin(1)
-    blank = unknown(nearest.size)
+    blank = masked_column(nearest.size)
     return {
         "sed": nearest,
         "mag_h": stars.mag_v[rows] - types.v_minus_h[nearest],
@@ -100,7 +100,7 @@ def columns(stars: BrightStars, rows: slice, types: StellarTypes) -> dict[str, A
     }
 
 
-def unknown(n: int) -> np.ma.MaskedArray[Any, Any]:
+def masked_column(n: int) -> np.ma.MaskedArray[Any, Any]:
     """A column of which nothing is known."""
     return np.ma.MaskedArray(np.zeros(n, np.int64), mask=True)
 
@@ -112,28 +112,28 @@ def _numbers() -> dict[str, Any]:
 def _read(files: tuple[Path, ...]) -> dict[str, Array]:
     numbers = _numbers()
     place, bt, vt = (np.concatenate(values, -1) for values in zip(*map(_records, files), strict=True))
-    known = np.isfinite(bt) | np.isfinite(vt)
+    has_magnitude = np.isfinite(bt) | np.isfinite(vt)
     color = bt - vt
-    without_color = known & ~np.isfinite(color)
+    without_color = has_magnitude & ~np.isfinite(color)
     color = np.where(without_color, numbers["usual_bt_vt"], color)
     mag_v = np.where(np.isfinite(vt), vt, bt - color) + numbers["v_per_color"] * color
-    kept = known & (mag_v < numbers["hand_over"])
-    ra, dec = sky.checked(*place[:, kept])
+    is_bright = has_magnitude & (mag_v < numbers["hand_over"])
+    ra, dec = sky.check_positions(*place[:, is_bright])
     index = sky.healpix_29(ra, dec)
     order = np.argsort(index, kind="stable")
     return {
         "index": index[order],
         "ra": ra[order],
         "dec": dec[order],
-        "mag_v": mag_v[kept][order],
-        "color_bv": numbers["bv_per_color"] * color[kept][order],
-        "counts": np.array([bt.size, without_color.sum(), np.sum(~known)]),
+        "mag_v": mag_v[is_bright][order],
+        "color_bv": numbers["bv_per_color"] * color[is_bright][order],
+        "counts": np.array([bt.size, without_color.sum(), np.sum(~has_magnitude)]),
     }
 
 
 def _records(file: Path) -> tuple[Float, Float, Float]:
     """Positions [2, n], B_T and V_T [n], NaN where blank; the observed position where there is no mean one."""
-    values = _fits(file) if file.suffix.lower() in (".fits", ".fit", ".fz") else _text(file)
+    values = _read_fits(file) if file.suffix.lower() in (".fits", ".fit", ".fz") else _read_text(file)
     mean, observed = np.stack(values[:2]), np.stack(values[2:4])
     place = np.where(np.isfinite(mean), mean, observed)
     bad = ~((place[0] >= 0.0) & (place[0] <= 360.0) & (np.abs(place[1]) <= 90.0))
@@ -144,52 +144,52 @@ def _records(file: Path) -> tuple[Float, Float, Float]:
     return place, values[4], values[5]
 
 
-def _text(file: Path) -> list[Float]:
-    with user_files.opened(file, _KIND) as stream:
+def _read_text(file: Path) -> list[Float]:
+    with user_files.open_file(file, _KIND) as stream:
         line = stream.readline(_LONGEST_LINE)
     if len(line) == _LONGEST_LINE:
         # Room would be made for every field that it has.
         raise BadInput(f"{file}: the first record has {_LONGEST_LINE} characters or more")
     count = line.count(b"|") + 1
-    found = [about for about in _FIELDS.values() if about[0] == count]
-    if not found:
+    layouts = [layout for layout in _FIELDS.values() if layout[0] == count]
+    if not layouts:
         raise BadInput(f"{file}: records of {count} fields, wanted 32 (tyc2.dat) or 18 (suppl_1.dat) between bars")
-    _, mean, observed, bt, vt = found[0]
+    _, mean, observed, bt, vt = layouts[0]
     names = [f"f{k}" for k in (*mean, *observed, bt, vt)]
-    wanted = list(dict.fromkeys(names))
+    unique_names = list(dict.fromkeys(names))
     try:
         rows = csv.read_csv(
             file,
             csv.ReadOptions(autogenerate_column_names=True),
             csv.ParseOptions(delimiter="|", quote_char=False),
-            csv.ConvertOptions(include_columns=wanted, column_types=dict.fromkeys(wanted, pa.string())),
+            csv.ConvertOptions(include_columns=unique_names, column_types=dict.fromkeys(unique_names, pa.string())),
         )
     except pa.ArrowException as error:
         raise BadInput(f"{file}: {' '.join(str(error).split())[:200]}") from None
-    return [_floats(file, rows[name]) for name in names]
+    return [_parse_floats(file, rows[name]) for name in names]
 
 
-def _floats(file: Path, texts: pa.ChunkedArray) -> Float:
+def _parse_floats(file: Path, texts: pa.ChunkedArray) -> Float:
     trimmed = pc.utf8_trim_whitespace(texts)
     blank = pc.equal(trimmed, "")
-    strange = pc.invert(pc.or_(blank, pc.match_substring_regex(trimmed, _NUMBER)))
-    if pc.any(strange).as_py():
-        record = pc.index(strange, True).as_py()
-        shown = repr(trimmed[record].as_py())[:40]
-        raise BadInput(f"{file}: record {record + 1}: {shown} is no number ({pc.sum(strange).as_py()} like it)")
+    invalid = pc.invert(pc.or_(blank, pc.match_substring_regex(trimmed, _NUMBER)))
+    if pc.any(invalid).as_py():
+        record = pc.index(invalid, True).as_py()
+        text = repr(trimmed[record].as_py())[:40]
+        raise BadInput(f"{file}: record {record + 1}: {text} is no number ({pc.sum(invalid).as_py()} like it)")
     return np.asarray(pc.cast(pc.if_else(blank, None, trimmed), pa.float64()).to_numpy(), float)
 
 
-def _fits(file: Path) -> list[Float]:
+def _read_fits(file: Path) -> list[Float]:
     mean, observed, bt, vt = _TITLES
     table = external.read_numbers(file, _KIND)
-    given = [_first(table, titles) for titles in (*mean, *observed, bt, vt)]
-    for titles, values in zip((bt, vt), given[4:], strict=True):
+    file_columns = [_first_present(table, titles) for titles in (*mean, *observed, bt, vt)]
+    for titles, values in zip((bt, vt), file_columns[4:], strict=True):
         if values is None:
             raise BadInput(f"{file}: has no column {' or '.join(titles)}; it has {', '.join(table)}")
-    blank = np.full(len(given[4]), np.nan)
-    return [blank if values is None else values for values in given]
+    blank = np.full(len(file_columns[4]), np.nan)
+    return [blank if values is None else values for values in file_columns]
 
 
-def _first(table: dict[str, Float], titles: tuple[str, ...]) -> Any:
+def _first_present(table: dict[str, Float], titles: tuple[str, ...]) -> Any:
     return next((table[title] for title in titles if title in table), None)

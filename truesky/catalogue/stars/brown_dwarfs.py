@@ -21,7 +21,7 @@ from truesky.catalogue.stars.density_laws import Exponential, density
 from truesky.catalogue.stars.milky_way import MilkyWay
 from truesky.fluxes.libraries import brown_dwarfs as spectra
 from truesky.fluxes.libraries import stellar
-from truesky.numerics import sums
+from truesky.numerics import matrices
 
 _FILE = "milky_way.toml"
 
@@ -40,8 +40,8 @@ class BrownDwarfs:
     log_g: float
     metallicity: tuple[float, float]
     boost: float
-    first: int
-    local: Float
+    first_template: int
+    local_density: Float
     teff: Float
     m_h: Float
 
@@ -59,15 +59,24 @@ def brown_dwarfs(boost: float) -> BrownDwarfs:
     numbers = parameters.section(_FILE, "brown_dwarfs")
     templates = spectra.templates()
     share = 1.0 / np.bincount(templates.subtype)
-    local = (np.array(numbers["local"]) * share)[templates.subtype]
+    local_density = (np.array(numbers["local"]) * share)[templates.subtype]
     law = Exponential(np.inf, numbers["height"])
-    first = len(stellar.types().names)
+    first_template = len(stellar.types().names)
     return BrownDwarfs(
-        law, numbers["log_g"], numbers["metallicity"], boost, first, local, templates.teff, templates.abs_mag_h
+        law,
+        numbers["log_g"],
+        numbers["metallicity"],
+        boost,
+        first_template,
+        local_density,
+        templates.teff,
+        templates.abs_mag_h,
     )
 
 
-def numbers(dwarfs: BrownDwarfs, galaxy: MilkyWay, lon: Float, lat: Float, area: float, h_limit: Float) -> Float:
+def expected_counts(
+    dwarfs: BrownDwarfs, galaxy: MilkyWay, lon: Float, lat: Float, area: float, h_limit: Float
+) -> Float:
     """Dwarfs[n] of cells before their dust; arguments as milky_way.numbers.
 
     lon, lat : float[n] deg, Galactic;  area : deg2;  h_limit : float[n] mag, Vega
@@ -76,9 +85,11 @@ def numbers(dwarfs: BrownDwarfs, galaxy: MilkyWay, lon: Float, lat: Float, area:
     total = np.zeros(lon.size)
     for limit in np.unique(h_limit):
         chosen = np.flatnonzero(h_limit == limit)
-        per_shell = (_seen(dwarfs, galaxy, float(limit)) * dwarfs.local[:, None]).sum(0)
-        r, z, _ = milky_way.cylindrical(galaxy, lon[chosen, None], lat[chosen, None], milky_way.middles(galaxy))
-        total[chosen] = sums.product(density(dwarfs.law, galaxy.sun, r, z), per_shell * milky_way.volumes(galaxy, area))
+        per_shell = (_is_bright_enough(dwarfs, galaxy, float(limit)) * dwarfs.local_density[:, None]).sum(0)
+        r, z, _ = milky_way.cylindrical(galaxy, lon[chosen, None], lat[chosen, None], milky_way.shell_distances(galaxy))
+        total[chosen] = matrices.matmul(
+            density(dwarfs.law, galaxy.sun, r, z), per_shell * milky_way.shell_volumes(galaxy, area)
+        )
     return dwarfs.boost * total
 
 
@@ -90,13 +101,13 @@ def draw(
     lon, lat : Galactic, of the cell's centre, deg; area : deg2
     dwarfs, galaxy : as of `numbers`;  h_limit : mag, Vega;  rng : random numbers
     """
-    r, z, _ = milky_way.cylindrical(galaxy, lon, lat, milky_way.middles(galaxy))
-    per_shell = dwarfs.boost * density(dwarfs.law, galaxy.sun, r, z) * milky_way.volumes(galaxy, area)
-    mean = _seen(dwarfs, galaxy, h_limit) * dwarfs.local[:, None] * per_shell
-    template, distance = milky_way.in_shells(galaxy, mean, rng)
+    r, z, _ = milky_way.cylindrical(galaxy, lon, lat, milky_way.shell_distances(galaxy))
+    per_shell = dwarfs.boost * density(dwarfs.law, galaxy.sun, r, z) * milky_way.shell_volumes(galaxy, area)
+    mean = _is_bright_enough(dwarfs, galaxy, h_limit) * dwarfs.local_density[:, None] * per_shell
+    template, distance = milky_way.draw_in_shells(galaxy, mean, rng)
     return Sample(template, distance)
 
 
-def _seen(dwarfs: BrownDwarfs, galaxy: MilkyWay, h_limit: float) -> Bool:
+def _is_bright_enough(dwarfs: BrownDwarfs, galaxy: MilkyWay, h_limit: float) -> Bool:
     """[365, s] whether a template is brighter than the limit at the near edge of a shell."""
     return np.asarray(dwarfs.m_h[:, None] + 5.0 * np.log10(galaxy.distance[:-1]) - 5.0 < h_limit)

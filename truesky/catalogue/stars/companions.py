@@ -24,7 +24,7 @@ _FILE = "milky_way.toml"
 _RATIOS = (np.arange(16) + 0.5) / 16
 _DAY_PER_YEAR = 365.25
 # Tracks lie behind one another on a line of log mass, so far apart.
-_APART = 10.0
+_TRACK_SPACING = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,17 +38,17 @@ class Companions:
     log_g: Float
 
 
-def expected(tracks: Tracks, pieces: Pieces, m_h: Float) -> Float:
+def expected_density(tracks: Tracks, pieces: Pieces, m_h: Float) -> Float:
     """Companions pc^-3 [b] in bins of M_H with edges[b + 1], of primaries on stretches of isochrones."""
     law = _law()
     log_mass = pieces.log_mass.mean(0)
-    number = pieces.number * _fraction(law, log_mass) / _RATIOS.size
+    number = pieces.number * _binary_fraction(law, log_mass) / _RATIOS.size
     total = np.zeros(m_h.size - 1)
     for chance in _RATIOS:
-        second = log_mass + np.log10(_ratio(law, log_mass, np.full(log_mass.size, chance)))
+        second = log_mass + np.log10(_mass_ratio(law, log_mass, np.full(log_mass.size, chance)))
         living = second >= tracks.log_mass[0, 0]
-        at = _at(tracks, pieces.track[living], second[living])[0]
-        total += np.histogram(at, m_h, weights=number[living])[0]
+        magnitudes = _main_sequence_values(tracks, pieces.track[living], second[living])[0]
+        total += np.histogram(magnitudes, m_h, weights=number[living])[0]
     return total
 
 
@@ -62,15 +62,15 @@ def draw(tracks: Tracks, track: Int, mass: Float, rng: np.random.Generator) -> C
     chance, ratio = rng.random((2, track.size))
     with np.errstate(invalid="ignore"):
         log_mass = np.log10(np.where(track < 0, 1.0, mass))
-    has = np.flatnonzero((track >= 0) & (chance < _fraction(law, log_mass)))
-    second = log_mass[has] + np.log10(_ratio(law, log_mass[has], ratio[has]))
+    has_companion = np.flatnonzero((track >= 0) & (chance < _binary_fraction(law, log_mass)))
+    second = log_mass[has_companion] + np.log10(_mass_ratio(law, log_mass[has_companion], ratio[has_companion]))
     living = second >= tracks.log_mass[0, 0]
-    has, second = has[living], second[living]
-    m_h, log_teff, log_g = _at(tracks, track[has], second)
-    return Companions(has, 10.0**second, m_h, 10.0**log_teff, log_g)
+    has_companion, second = has_companion[living], second[living]
+    m_h, log_teff, log_g = _main_sequence_values(tracks, track[has_companion], second)
+    return Companions(has_companion, 10.0**second, m_h, 10.0**log_teff, log_g)
 
 
-def separation(primary: Float, companion: Float, rng: np.random.Generator) -> tuple[Float, Float]:
+def projected_offsets(primary: Float, companion: Float, rng: np.random.Generator) -> tuple[Float, Float]:
     """Offsets of companions east and north of their primaries, AU: semi-major axes seen from random directions.
 
     primary, companion : float[n] Msun
@@ -83,8 +83,8 @@ def separation(primary: Float, companion: Float, rng: np.random.Generator) -> tu
     of_sun = np.cbrt((primary + companion) * years**2)
     of_dwarf = 10.0 ** (law["log_axis_dwarf"] + law["log_axis_dwarf_scatter"] * deviate)
     axis = np.minimum(np.where(primary < law["dwarf_below"], of_dwarf, of_sun), law["widest"])
-    seen = axis * np.sqrt(1.0 - cosine**2)
-    return seen * np.sin(angle), seen * np.cos(angle)
+    projected = axis * np.sqrt(1.0 - cosine**2)
+    return projected * np.sin(angle), projected * np.cos(angle)
 
 
 @lru_cache(maxsize=1)
@@ -92,22 +92,22 @@ def _law() -> dict[str, Any]:
     return parameters.section(_FILE, "binaries")
 
 
-def _fraction(law: dict[str, Any], log_mass: Float) -> Float:
+def _binary_fraction(law: dict[str, Any], log_mass: Float) -> Float:
     return np.asarray(np.interp(log_mass, np.log10(law["mass"]), law["fraction"]))
 
 
-def _ratio(law: dict[str, Any], log_mass: Float, chance: Float) -> Float:
+def _mass_ratio(law: dict[str, Any], log_mass: Float, chance: Float) -> Float:
     """Mass ratio[n] in (0, 1], of a power law, by the part of all ratios that are smaller."""
     slope = np.interp(log_mass, np.log10(law["mass"]), law["ratio_slope"])
     return np.asarray(np.maximum(chance, 1e-12) ** (1.0 / (1.0 + slope)))
 
 
-def _at(tracks: Tracks, track: Int, log_mass: Float) -> tuple[Float, Float, Float]:
+def _main_sequence_values(tracks: Tracks, track: Int, log_mass: Float) -> tuple[Float, Float, Float]:
     """M_H, log Teff, log g of stars of masses on the main sequences of tracks; heavier than these: at their ends."""
     last = tracks.evolved
-    behind = _APART * np.arange(tracks.age.size)[:, None]
-    line = (tracks.log_mass[:, :last] + behind).ravel()
-    at = np.clip(log_mass, tracks.log_mass[track, 0], tracks.log_mass[track, last - 1]) + _APART * track
+    track_offset = _TRACK_SPACING * np.arange(tracks.age.size)[:, None]
+    line = (tracks.log_mass[:, :last] + track_offset).ravel()
+    at = np.clip(log_mass, tracks.log_mass[track, 0], tracks.log_mass[track, last - 1]) + _TRACK_SPACING * track
     low = np.clip(np.searchsorted(line, at, side="right") - 1, track * last, track * last + last - 2)
     part = (at - line[low]) / (line[low + 1] - line[low])
     values = (each[:, :last].ravel() for each in (tracks.m_h, tracks.log_teff, tracks.log_g))

@@ -45,7 +45,7 @@ class PowerLaw:
 
 
 @dataclass(frozen=True, slots=True)
-class Aged:
+class OldDisc:
     """exp(-sqrt(1/4 + a^2 / outer^2)) - exp(-sqrt(1/4 + a^2 / inner^2)), a^2 = R^2 + (z / flattening)^2"""
 
     flattening: float
@@ -54,7 +54,7 @@ class Aged:
 
 
 @dataclass(frozen=True, slots=True)
-class Young:
+class YoungDisc:
     """exp(-a^2 / outer^2) - exp(-a^2 / inner^2), a as in Aged"""
 
     flattening: float
@@ -94,7 +94,7 @@ class Bar:
     perpendicular: float
 
 
-Law = Bar | Exponential | PowerLaw | Aged | Young | Parabolic | CoredPowerLaw
+Law = Bar | Exponential | PowerLaw | OldDisc | YoungDisc | Parabolic | CoredPowerLaw
 
 
 def density(law: Law, sun: Sun, radius: npt.ArrayLike, height: npt.ArrayLike, azimuth: npt.ArrayLike = 0.0) -> Float:
@@ -106,13 +106,13 @@ def density(law: Law, sun: Sun, radius: npt.ArrayLike, height: npt.ArrayLike, az
     """
     r, z = np.asarray(radius, float), np.asarray(height, float)
     if isinstance(law, Bar):
-        return _bar(law, r, z, np.asarray(azimuth, float))
-    at_sun = _log(law, np.asarray(sun.radius), np.asarray(sun.height))
+        return _bar_density(law, r, z, np.asarray(azimuth, float))
+    at_sun = _log_density(law, np.asarray(sun.radius), np.asarray(sun.height))
     # A difference of logarithms: far out the densities themselves are not numbers any more.
-    return np.asarray(np.exp(_log(law, r, z) - at_sun))
+    return np.asarray(np.exp(_log_density(law, r, z) - at_sun))
 
 
-def _bar(law: Bar, r: Float, z: Float, azimuth: Float) -> Float:
+def _bar_density(law: Bar, r: Float, z: Float, azimuth: Float) -> Float:
     along = azimuth - np.radians(law.angle)
     flat = np.abs(r * np.cos(along) / law.length) ** law.perpendicular
     flat = flat + np.abs(r * np.sin(along) / law.width) ** law.perpendicular
@@ -122,7 +122,7 @@ def _bar(law: Bar, r: Float, z: Float, azimuth: Float) -> Float:
     return np.asarray((2.0 * falling / (1.0 + falling**2)) ** 2)
 
 
-def _log(law: Law, r: Float, z: Float) -> Float:
+def _log_density(law: Law, r: Float, z: Float) -> Float:
     match law:
         case Exponential():
             return np.asarray(-r / law.length - np.abs(z) / law.height)
@@ -130,14 +130,14 @@ def _log(law: Law, r: Float, z: Float) -> Float:
             return np.asarray(0.5 * law.slope * np.log(_a2(law.flattening, r, z) + law.core**2))
         case CoredPowerLaw():
             return np.asarray(0.5 * law.slope * np.log(np.maximum(_a2(law.flattening, r, z), law.core**2)))
-        case Aged():
+        case OldDisc():
             a2 = _a2(law.flattening, r, z)
             return _log_difference(np.sqrt(0.25 + a2 / law.outer**2), np.sqrt(0.25 + a2 / law.inner**2))
-        case Young():
+        case YoungDisc():
             a2 = _a2(law.flattening, r, z)
             return _log_difference(a2 / law.outer**2, a2 / law.inner**2)
         case Bar():
-            return np.asarray(np.log(_bar(law, r, z, np.zeros(()))))
+            return np.asarray(np.log(_bar_density(law, r, z, np.zeros(()))))
         case Parabolic():
             return np.asarray(-r / law.length + _log_parabolic(law, np.abs(z)))
 
@@ -146,10 +146,10 @@ def _a2(flattening: float, r: Float, z: Float) -> Float:
     return np.asarray(r**2 + (z / flattening) ** 2)
 
 
-def _log_difference(near: Float, far: Float) -> Float:
+def _log_difference(small: Float, large: Float) -> Float:
     """log(exp(-near) - exp(-far)), far >= near; -inf in the hole at the centre."""
     with np.errstate(divide="ignore"):
-        return np.asarray(-near + np.log(-np.expm1(near - far)))
+        return np.asarray(-small + np.log(-np.expm1(small - large)))
 
 
 def _log_parabolic(law: Parabolic, z: Float) -> Float:

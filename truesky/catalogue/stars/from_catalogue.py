@@ -29,7 +29,7 @@ from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store.provenance import canonical
 from truesky.catalogue import parameters
 from truesky.numerics.cache import cached_arrays, content_key
-from truesky.numerics.code_keys import code_key
+from truesky.numerics.code_fingerprints import code_key
 
 # Key -> lowest and highest legal value.  Of keys with a bar between them one is enough.
 KEYS = {
@@ -47,12 +47,12 @@ KEYS = {
     "age_class": (1.0, 10.0),  # the Besancon model's: 1-7 thin disc, 8 thick disc, 9 spheroid, 10 bulge
     "luminosity_class": (1.0, 7.0),  # its own: 1-3 giants, 4 5 7 main sequence, 6 white dwarfs
 }  # fmt: skip
-_NEEDED = (("ra", "l"), ("dec", "b"), ("mag_h", "mag_h_seen"), ("teff", "log_teff"))
+_REQUIRED_KEYS = (("ra", "l"), ("dec", "b"), ("mag_h", "mag_h_seen"), ("teff", "log_teff"))
 _COMPONENT = np.array([0] * 8 + [1, 2, 5])
 _STAGE = np.array([0, 1, 1, 1, 0, 0, 2, 0])
 _LONGEST_LINE = 100_000
 # Lines before that of the titles: what a model of the Galaxy was run with.
-_MOST_BEFORE = 10_000
+_MAX_HEADER_LINES = 10_000
 KIND = "catalogue of stars"
 
 
@@ -64,14 +64,14 @@ class StarCatalogue:
     values: Mapping[str, Array]
 
 
-def checked_columns(columns: Mapping[str, str]) -> None:
+def check_columns(columns: Mapping[str, str]) -> None:
     """Refuse a mapping of our keys to titles that does not say enough."""
     for key in columns:
         if key not in KEYS:
             raise BadInput(f"stars.catalogue.columns.{key} is not one of {', '.join(KEYS)}")
-    for either in _NEEDED:
-        if sum(key in columns for key in either) != 1:
-            raise BadInput(f"stars.catalogue.columns wants one of {' and '.join(either)}")
+    for alternatives in _REQUIRED_KEYS:
+        if sum(key in columns for key in alternatives) != 1:
+            raise BadInput(f"stars.catalogue.columns wants one of {' and '.join(alternatives)}")
     if ("ra" in columns) != ("dec" in columns):
         raise BadInput("stars.catalogue.columns wants ra and dec, or l and b")
     if "mag_h_seen" in columns and "a_v" not in columns:
@@ -89,17 +89,17 @@ def load(file: Path, sha256: str, columns: Mapping[str, str]) -> StarCatalogue:
     return StarCatalogue(arrays["index"], {name: values for name, values in arrays.items() if name != "index"})
 
 
-def numbers(stars: StarCatalogue, cells: npt.ArrayLike) -> Float:
+def star_counts(stars: StarCatalogue, cells: npt.ArrayLike) -> Float:
     """Stars[n] of order-8 cells.
 
     cells : int[n] nested
     """
     edges = np.stack([np.asarray(cells, np.int64), np.asarray(cells, np.int64) + 1])
-    first, last = np.searchsorted(stars.index, edges << 2 * (sky.DEEPEST - GENERATION_ORDER))
+    first, last = np.searchsorted(stars.index, edges << 2 * (sky.MAX_ORDER - GENERATION_ORDER))
     return np.asarray(last - first, float)
 
 
-def of_cell(stars: StarCatalogue, cell: int) -> dict[str, Array]:
+def stars_of_cell(stars: StarCatalogue, cell: int) -> dict[str, Array]:
     """The values of an order-8 cell's stars, with `index`.
 
     returns : [n] each, in the units of `load`
@@ -109,13 +109,14 @@ def of_cell(stars: StarCatalogue, cell: int) -> dict[str, Array]:
 
 
 def _read(file: Path, columns: Mapping[str, str]) -> dict[str, Array]:
-    table = _table(file, list(columns.values()))
+    table = _read_table(file, list(columns.values()))
     values: dict[str, Array] = {
-        key: external_rows.within(file, f"{title} ({key})", table[title], KEYS[key]) for key, title in columns.items()
+        key: external_rows.check_bounds(file, f"{title} ({key})", table[title], KEYS[key])
+        for key, title in columns.items()
     }
     if "l" in values:
         values["ra"], values["dec"] = sky.equatorial(values.pop("l"), values.pop("b"))
-    values["ra"], values["dec"] = sky.checked(values["ra"], values["dec"])
+    values["ra"], values["dec"] = sky.check_positions(values["ra"], values["dec"])
     if "log_teff" in values:
         values["teff"] = 10.0 ** values.pop("log_teff")
     if "distance_kpc" in values:
@@ -135,40 +136,45 @@ def _h_over_v() -> float:
     return float(parameters.section("milky_way.toml", "extinction")["h_over_v"])
 
 
-def _table(file: Path, titles: list[str]) -> Mapping[str, Float]:
+def _read_table(file: Path, titles: list[str]) -> Mapping[str, Float]:
     if file.suffix.lower() in (".fits", ".fit"):
-        found = external.read_numbers(file, KIND)
-        if absent := [title for title in titles if title not in found]:
-            raise BadInput(f"{file}: has no column {', '.join(absent)}; it has {', '.join(found)}")
-        return found
-    return _text(file, titles)
+        columns = external.read_numbers(file, KIND)
+        if absent := [title for title in titles if title not in columns]:
+            raise BadInput(f"{file}: has no column {', '.join(absent)}; it has {', '.join(columns)}")
+        return columns
+    return _read_text(file, titles)
 
 
-def _text(file: Path, titles: list[str]) -> Mapping[str, Float]:
-    with user_files.opened(file, KIND) as opened, TextIOWrapper(opened, "utf-8", "replace") as stream:
+def _read_text(file: Path, titles: list[str]) -> Mapping[str, Float]:
+    with user_files.open_file(file, KIND) as binary, TextIOWrapper(binary, "utf-8", "replace") as stream:
         lines = iter(lambda: stream.readline(_LONGEST_LINE), "")
         head: list[str] = next(
-            (found for line in islice(lines, _MOST_BEFORE) if set(titles) <= set(found := _fields(line))), []
+            (
+                candidate
+                for line in islice(lines, _MAX_HEADER_LINES)
+                if set(titles) <= set(candidate := _split_line(line))
+            ),
+            [],
         )
         if not head:
-            raise BadInput(f"{file}: none of the first {_MOST_BEFORE} lines holds the titles {', '.join(titles)}")
-        if twice := [title for title in titles if head.count(title) > 1]:
-            raise BadInput(f"{file}: the title {twice[0]} stands twice in its line")
+            raise BadInput(f"{file}: none of the first {_MAX_HEADER_LINES} lines holds the titles {', '.join(titles)}")
+        if duplicates := [title for title in titles if head.count(title) > 1]:
+            raise BadInput(f"{file}: the title {duplicates[0]} stands twice in its line")
         values = {title: array("d") for title in titles}
         for line in lines:
-            fields = _fields(line)
+            fields = _split_line(line)
             if len(fields) != len(head):
                 break
             for title in titles:
-                values[title].append(_number(file, title, fields[head.index(title)], len(values[title]) + 1))
+                values[title].append(_parse_number(file, title, fields[head.index(title)], len(values[title]) + 1))
     return {title: np.array(column) for title, column in values.items()}
 
 
-def _fields(line: str) -> list[str]:
+def _split_line(line: str) -> list[str]:
     return [field.strip() for field in line.split(",")] if "," in line else line.split()
 
 
-def _number(file: Path, title: str, text: str, row: int) -> float:
+def _parse_number(file: Path, title: str, text: str, row: int) -> float:
     try:
         return float(text)
     except ValueError:

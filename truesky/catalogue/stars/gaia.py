@@ -44,16 +44,16 @@ def observe(stars: pa.Table, fluxes: pa.Table, seed: int) -> pa.Table:
     """
     ids = stars["id"].to_numpy()
     chance = uniforms(ids, _COUNT, seed, "gaia")
-    true = [units.mag_of_f_nu(fluxes[name].to_numpy().astype(float)) for name in FLUX_COLUMNS]
+    true_mags = [units.mag_of_f_nu(fluxes[name].to_numpy().astype(float)) for name in FLUX_COLUMNS]
     vega = ab_minus_vega()
-    g = true[0] - vega[0]
+    g = true_mags[0] - vega[0]
     listed = np.flatnonzero(chance[_LISTED] < completeness(g))
-    noise, seen = ndtri(chance[:, listed]), stars.take(pa.array(listed))
-    columns: dict[str, Any] = {"id": ids[listed], **_astrometry(seen, g[listed], noise)}
-    columns |= _motion(seen, g[listed], noise)
+    noise, listed_stars = ndtri(chance[:, listed]), stars.take(pa.array(listed))
+    columns: dict[str, Any] = {"id": ids[listed], **_astrometry(listed_stars, g[listed], noise)}
+    columns |= _motion(listed_stars, g[listed], noise)
     columns["ruwe"] = _ruwe(chance[_RUWE, listed])
     for k, (short, kind) in enumerate((("g", "g"), ("bp", "xp"), ("rp", "xp"))):
-        columns |= _photometry(short, true[k][listed], vega[k], kind, noise[_G + k])
+        columns |= _photometry(short, true_mags[k][listed], vega[k], kind, noise[_G + k])
     order = np.lexsort((columns["id"], columns["_healpix_29"]))
     return GAIA.build({name: values[order] for name, values in columns.items()})
 
@@ -80,8 +80,8 @@ def astrometric_errors(g: npt.ArrayLike) -> tuple[Float, Float, Float]:
     law = parameters.section(_FILE, "astrometry")
     z = 10.0 ** (0.4 * (np.maximum(np.asarray(g, float), law["bright"]) - 15.0))
     parallax = 1e-3 * law["scale"] * np.sqrt(law["c0"] + law["c1"] * z + law["c2"] * z**2)
-    ra, dec, own = (np.maximum(factor * parallax, law["floor"]) for factor in (law["ra"], law["dec"], 1.0))
-    return ra, dec, own
+    ra, dec, parallax_error = (np.maximum(factor * parallax, law["floor"]) for factor in (law["ra"], law["dec"], 1.0))
+    return ra, dec, parallax_error
 
 
 def proper_motion_errors(g: npt.ArrayLike) -> tuple[Float, Float]:
@@ -102,17 +102,19 @@ def mean_flux(mag: npt.ArrayLike, band: int) -> Float:
 def photometric_errors(mag: npt.ArrayLike, kind: str) -> Float:
     """Standard error[n], mag, at a magnitude (Vega) in its own band; kind: "g", or "xp" for BP and RP."""
     law = parameters.section(_FILE, "photometry")
-    at, error = np.array(law[kind]), np.log(law[f"{kind}_error"])
-    slope = np.diff(error) / np.diff(at)
+    nodes, error = np.array(law[kind]), np.log(law[f"{kind}_error"])
+    slope = np.diff(error) / np.diff(nodes)
     magnitude = np.asarray(mag, float)
-    beyond = slope[-1] * np.maximum(magnitude - at[-1], 0.0) + slope[0] * np.minimum(magnitude - at[0], 0.0)
-    return np.asarray(np.exp(np.interp(magnitude, at, error) + beyond))
+    extrapolation = slope[-1] * np.maximum(magnitude - nodes[-1], 0.0) + slope[0] * np.minimum(
+        magnitude - nodes[0], 0.0
+    )
+    return np.asarray(np.exp(np.interp(magnitude, nodes, error) + extrapolation))
 
 
 def _astrometry(stars: pa.Table, g: Float, noise: Float) -> dict[str, Any]:
     errors = astrometric_errors(g)
     east, north = (_MAS * error * noise[k] for error, k in zip(errors[:2], (_RA, _DEC), strict=True))
-    ra, dec = sky.displaced(stars["ra"].to_numpy(), stars["dec"].to_numpy(), np.radians(east), np.radians(north))
+    ra, dec = sky.offset_positions(stars["ra"].to_numpy(), stars["dec"].to_numpy(), np.radians(east), np.radians(north))
     distance = np.asarray(pc.fill_null(stars["distance"], np.nan).to_numpy(), float)
     parallax = 1e3 / distance + errors[2] * noise[_PARALLAX]
     return {
@@ -129,11 +131,11 @@ def _astrometry(stars: pa.Table, g: Float, noise: Float) -> dict[str, Any]:
 def _motion(stars: pa.Table, g: Float, noise: Float) -> dict[str, Any]:
     """Of stars that have none nothing is known."""
     true = [np.asarray(pc.fill_null(stars[name], np.nan).to_numpy(), float) for name in ("pm_ra", "pm_dec")]
-    errors, found = proper_motion_errors(g), {}
-    for name, value, error, own in zip(("pmra", "pmdec"), true, errors, noise[_PMRA : _PMDEC + 1], strict=True):
-        found[name] = np.ma.masked_invalid(value + error * own)
-        found[f"{name}_error"] = np.ma.MaskedArray(error, mask=np.isnan(value))
-    return found
+    errors, columns = proper_motion_errors(g), {}
+    for name, value, error, deviate in zip(("pmra", "pmdec"), true, errors, noise[_PMRA : _PMDEC + 1], strict=True):
+        columns[name] = np.ma.masked_invalid(value + error * deviate)
+        columns[f"{name}_error"] = np.ma.MaskedArray(error, mask=np.isnan(value))
+    return columns
 
 
 def _ruwe(chance: Float) -> Float:

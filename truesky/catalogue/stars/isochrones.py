@@ -23,8 +23,8 @@ from lake_schema.arrays import Float, Int
 
 TABLE = Path(__file__).with_name("isochrones.csv")
 # Main sequence: these masses, and from the last of them fractions of the logarithm up to the mass that leaves it.
-FIXED = (0.5, 0.6)
-UPPER = (0.2, 0.4, 0.55, 0.68, 0.78, 0.86, 0.91, 0.94, 0.96, 0.98, 1.0)
+FIXED_MASSES = (0.5, 0.6)
+UPPER_FRACTIONS = (0.2, 0.4, 0.55, 0.68, 0.78, 0.86, 0.91, 0.94, 0.96, 0.98, 1.0)
 # Ends of the main sequence (454), of the red giant branch (605), start and end of core helium burning (631, 707), the
 # first thermal pulse (808), and points between.  Ref: Dotter 2016, ApJS 222, 8, Table 2
 PHASES = (
@@ -62,7 +62,7 @@ class Isochrones:
     @property
     def main_sequence(self) -> int:
         """Number of points on the main sequence."""
-        return len(FIXED) + len(UPPER)
+        return len(FIXED_MASSES) + len(UPPER_FRACTIONS)
 
 
 @lru_cache(maxsize=1)
@@ -71,58 +71,60 @@ def coefficients() -> dict[str, Float]:
     with TABLE.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
     names = ("log_l", "log_teff", "mass")
-    shape = (points(), len(AGES), DEGREE + 1)
+    shape = (point_count(), len(AGES), DEGREE + 1)
     return {
         name: np.array([[float(row[f"{name}_{k}"] or "nan") for k in range(DEGREE + 1)] for row in rows]).reshape(shape)
         for name in names
     }
 
 
-def points() -> int:
+def point_count() -> int:
     """Of an isochrone."""
-    return len(FIXED) + len(UPPER) + len(PHASES) - 1
+    return len(FIXED_MASSES) + len(UPPER_FRACTIONS) + len(PHASES) - 1
 
 
 def isochrones(age: npt.ArrayLike, metallicity: npt.ArrayLike) -> Isochrones:
     """Of ages[k] Gyr and metallicities[k]; both are taken to the nearest ends of the fit."""
-    ages, given = np.asarray(age, float), np.asarray(metallicity, float)
+    ages, requested_metallicity = np.asarray(age, float), np.asarray(metallicity, float)
     log_age = np.log10(ages) + 9.0
-    metals = np.clip(given, lowest(log_age), METALLICITIES[-1])
-    knots, weight = place(log_age)
-    found = {name: _value(each, knots, weight, metals) for name, each in coefficients().items()}
-    mass = masses(found["mass"])
-    log_g = _SUN_LOG_G + np.log10(mass) + 4.0 * (found["log_teff"] - np.log10(_SUN_TEFF)) - found["log_l"]
-    return Isochrones(ages, metals, mass, found["log_l"], found["log_teff"], log_g)
+    metals = np.clip(requested_metallicity, min_metallicity(log_age), METALLICITIES[-1])
+    knots, weight = bracket_age(log_age)
+    values = {name: _evaluate_fit(each, knots, weight, metals) for name, each in coefficients().items()}
+    mass = initial_masses(values["mass"])
+    log_g = _SUN_LOG_G + np.log10(mass) + 4.0 * (values["log_teff"] - np.log10(_SUN_TEFF)) - values["log_l"]
+    return Isochrones(ages, metals, mass, values["log_l"], values["log_teff"], log_g)
 
 
-def masses(fitted: Float) -> Float:
+def initial_masses(fitted: Float) -> Float:
     """Initial masses [k, p], Msun, from what is fitted of them: log10 of the one that leaves the main sequence, and
     of its multiples by which the masses of later points differ from the points before.
     """
-    first = len(FIXED) + len(UPPER) - 1
-    leaves = 10.0 ** fitted[:, first]
+    first = len(FIXED_MASSES) + len(UPPER_FRACTIONS) - 1
+    turnoff_mass = 10.0 ** fitted[:, first]
     out = np.empty_like(fitted)
-    out[:, : len(FIXED)] = FIXED
-    out[:, len(FIXED) : first + 1] = FIXED[-1] * (leaves / FIXED[-1])[:, None] ** np.array(UPPER)
-    out[:, first + 1 :] = leaves[:, None] * (1.0 + np.cumsum(10.0 ** fitted[:, first + 1 :], 1))
+    out[:, : len(FIXED_MASSES)] = FIXED_MASSES
+    out[:, len(FIXED_MASSES) : first + 1] = FIXED_MASSES[-1] * (turnoff_mass / FIXED_MASSES[-1])[:, None] ** np.array(
+        UPPER_FRACTIONS
+    )
+    out[:, first + 1 :] = turnoff_mass[:, None] * (1.0 + np.cumsum(10.0 ** fitted[:, first + 1 :], 1))
     return out
 
 
-def lowest(log_age: Float) -> Float:
+def min_metallicity(log_age: Float) -> Float:
     """[M/H] down to which the fit reaches at log10 of ages, yr."""
     return np.where(log_age < _YOUNG, METALLICITIES[1], METALLICITIES[0])
 
 
-def place(log_age: Float) -> tuple[Int, Float]:
+def bracket_age(log_age: Float) -> tuple[Int, Float]:
     """(knot before, share of the one after) of log10 of ages, yr."""
     at = np.clip(log_age, AGES[0], AGES[-1])
-    before = np.clip(np.searchsorted(AGES, at, side="right") - 1, 0, len(AGES) - 2)
-    low, high = np.array(AGES)[before], np.array(AGES)[before + 1]
-    return before, (at - low) / (high - low)
+    lower_knot = np.clip(np.searchsorted(AGES, at, side="right") - 1, 0, len(AGES) - 2)
+    low, high = np.array(AGES)[lower_knot], np.array(AGES)[lower_knot + 1]
+    return lower_knot, (at - low) / (high - low)
 
 
-def _value(each: Float, knot: Int, weight: Float, metallicity: Float) -> Float:
+def _evaluate_fit(table: Float, knot: Int, weight: Float, metallicity: Float) -> Float:
     powers = metallicity[:, None] ** np.arange(DEGREE + 1)
-    at = (1.0 - weight)[:, None, None] * each[:, knot].swapaxes(0, 1)
-    at += weight[:, None, None] * each[:, knot + 1].swapaxes(0, 1)
+    at = (1.0 - weight)[:, None, None] * table[:, knot].swapaxes(0, 1)
+    at += weight[:, None, None] * table[:, knot + 1].swapaxes(0, 1)
     return np.asarray(np.einsum("kpd,kd->kp", at, powers))

@@ -40,13 +40,13 @@ def velocities(
     table, motion, _, gradient = _numbers()
     out = np.empty((3, ra.size))
     _velocities(
-        ra, dec, distance, ellipsoid(component, age), np.ascontiguousarray(deviates), table, motion,
+        ra, dec, distance, ellipsoid_index(component, age), np.ascontiguousarray(deviates), table, motion,
         sky.TO_GALACTIC, gradient, out,
     )  # fmt: skip
     return out[0], out[1], out[2]
 
 
-def ellipsoid(component: Int, age: Float) -> Int:
+def ellipsoid_index(component: Int, age: Float) -> Int:
     """Column[n] of the table: of the thin disc by age, the others behind, in the order of their codes."""
     edges = _numbers()[2]
     with np.errstate(invalid="ignore"):
@@ -70,13 +70,13 @@ def _numbers() -> tuple[Float, Float, Float, float]:
 
 @exact_jit
 def _velocities(
-    ra: Float, dec: Float, distance: Float, which: Int, deviates: Float, table: Float, motion: Float, turn: Float,
+    ra: Float, dec: Float, distance: Float, ellipsoids: Int, deviates: Float, table: Float, motion: Float, turn: Float,
     gradient: float, out: Float,
 ) -> None:  # fmt: skip
     """Fills out[3, n]; table [6, ellipsoid], motion (U, V, W, R, V_c), turn [3, 3] equatorial to Galactic."""
     axis = np.empty((3, 3))
     for i in range(ra.size):
-        a, d, far = math.radians(ra[i]), math.radians(dec[i]), distance[i]
+        a, d, distance_pc = math.radians(ra[i]), math.radians(dec[i]), distance[i]
         sin_a, cos_a, sin_d, cos_d = math.sin(a), math.cos(a), math.sin(d), math.cos(d)
         # East, north, outwards; along the Sun's axes to the centre, the rotation, the pole.
         for k in range(3):
@@ -84,17 +84,19 @@ def _velocities(
             axis[1, k] = (-turn[k, 0] * cos_a - turn[k, 1] * sin_a) * sin_d + turn[k, 2] * cos_d
             axis[2, k] = (turn[k, 0] * cos_a + turn[k, 1] * sin_a) * cos_d + turn[k, 2] * sin_d
         # From the centre to the star: what turns the axes at the Sun into those at the star.
-        x, y = far * axis[2, 0] - motion[3], far * axis[2, 1]
+        x, y = distance_pc * axis[2, 0] - motion[3], distance_pc * axis[2, 1]
         radius = max(math.sqrt(x * x + y * y), 1.0)
-        w = which[i]
-        wider = math.exp(-0.5 * gradient * (radius - motion[3])) if table[4, w] > 0.0 else 1.0
-        inwards = table[0, w] * wider * deviates[0, i]
-        forwards = table[1, w] * wider * deviates[1, i]
-        forwards += (motion[4] - table[3, w] * wider * wider) * min(radius / max(table[5, w], 1.0), 1.0)
+        w = ellipsoids[i]
+        dispersion_factor = math.exp(-0.5 * gradient * (radius - motion[3])) if table[4, w] > 0.0 else 1.0
+        inwards = table[0, w] * dispersion_factor * deviates[0, i]
+        forwards = table[1, w] * dispersion_factor * deviates[1, i]
+        forwards += (motion[4] - table[3, w] * dispersion_factor * dispersion_factor) * min(
+            radius / max(table[5, w], 1.0), 1.0
+        )
         u = (-inwards * x + forwards * y) / radius - motion[0]
         v = (-inwards * y - forwards * x) / radius - motion[1] - motion[4]
-        z = table[2, w] * wider * deviates[2, i] - motion[2]
-        scale = 1.0 / (_KM_S * 1e-3 * far)
+        z = table[2, w] * dispersion_factor * deviates[2, i] - motion[2]
+        scale = 1.0 / (_KM_S * 1e-3 * distance_pc)
         out[0, i] = (u * axis[0, 0] + v * axis[0, 1] + z * axis[0, 2]) * scale
         out[1, i] = (u * axis[1, 0] + v * axis[1, 1] + z * axis[1, 2]) * scale
-        out[2, i] = u * axis[2, 0] + v * axis[2, 1] + z * axis[2, 2] if far == far else math.nan
+        out[2, i] = u * axis[2, 0] + v * axis[2, 1] + z * axis[2, 2] if distance_pc == distance_pc else math.nan

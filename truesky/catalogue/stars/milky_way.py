@@ -22,19 +22,19 @@ from lake_schema.arrays import Bool, Float, Int
 from truesky.catalogue import parameters
 from truesky.catalogue.stars import companions, stellar_populations
 from truesky.catalogue.stars.density_laws import (
-    Aged,
     Bar,
     CoredPowerLaw,
     Exponential,
     Law,
+    OldDisc,
     Parabolic,
     PowerLaw,
     Sun,
-    Young,
+    YoungDisc,
     density,
 )
 from truesky.catalogue.stars.stellar_populations import MassFunction, Pieces, Population, Tracks
-from truesky.numerics import sums
+from truesky.numerics import matrices
 
 MODELS = ("juric", "besancon")
 THIN, THICK, HALO, BULGE = 0, 1, 2, 5
@@ -80,7 +80,7 @@ class MilkyWay:
     m_h: Float
     pieces: Pieces
     first: Int
-    below: Float
+    cumulative: Float
     local: Float
     companions: Float
 
@@ -111,45 +111,58 @@ def milky_way(model: str = "juric") -> MilkyWay:
     sampling = parameters.section(_FILE, "sampling")
     sun, components = _juric() if model == "juric" else _besancon()
     masses = MassFunction(**parameters.section(_FILE, "mass_function"))
-    every = Population(*(np.concatenate(v) for v in zip(*map(_cells, components), strict=True)))
-    tracks = stellar_populations.tracks(every.age, every.metallicity)
+    population_cells = Population(*(np.concatenate(v) for v in zip(*map(_population_columns, components), strict=True)))
+    tracks = stellar_populations.build_tracks(population_cells.age, population_cells.metallicity)
     m_h = sampling["brightest"] + sampling["bin_mag"] * np.arange(sampling["bins"] + 1)
     owner = np.repeat(np.arange(len(components)), [c.population.age.size for c in components])
-    pieces = stellar_populations.pieces_of(tracks, every.share, masses, m_h)
+    pieces = stellar_populations.build_pieces(tracks, population_cells.share, masses, m_h)
     # As many systems live below a solar mass as are counted near the Sun.
-    of = owner[pieces.track]
+    piece_owner = owner[pieces.track]
     share = np.array([component.share for component in components])
-    living = np.bincount(of, pieces.number * (pieces.log_mass.mean(0) < np.log10(masses.reference)), share.size)
+    living = np.bincount(
+        piece_owner, pieces.number * (pieces.log_mass.mean(0) < np.log10(masses.reference)), share.size
+    )
     scale = masses.local * share / living
-    dwarfs = stellar_populations.white_dwarfs(m_h)
-    parts, starts, begun = [], [], 0
+    dwarfs = stellar_populations.white_dwarf_pieces(m_h)
+    parts, starts, offset = [], [], 0
     second = np.zeros((share.size, m_h.size - 1))
     for k in range(share.size):
-        own = pieces.take(of == k)
-        own = own.take(np.argsort(own.bin, kind="stable"))
-        own = _times(own, float(scale[k]))
-        second[k] = companions.expected(tracks, own, m_h)
-        own = stellar_populations.joined([own, _times(dwarfs, float(share[k]))])
-        own = own.take(np.argsort(own.bin, kind="stable"))
-        starts.append(begun + np.searchsorted(own.bin, np.arange(m_h.size)))
-        begun += own.bin.size
-        parts.append(own)
-    whole, first = stellar_populations.joined(parts), np.stack(starts)
-    below = np.concatenate([[0.0], np.cumsum(whole.number)])
+        component_pieces = pieces.take(piece_owner == k)
+        component_pieces = component_pieces.take(np.argsort(component_pieces.bin, kind="stable"))
+        component_pieces = _scale_number(component_pieces, float(scale[k]))
+        second[k] = companions.expected_density(tracks, component_pieces, m_h)
+        component_pieces = stellar_populations.concatenate([component_pieces, _scale_number(dwarfs, float(share[k]))])
+        component_pieces = component_pieces.take(np.argsort(component_pieces.bin, kind="stable"))
+        starts.append(offset + np.searchsorted(component_pieces.bin, np.arange(m_h.size)))
+        offset += component_pieces.bin.size
+        parts.append(component_pieces)
+    all_pieces, first = stellar_populations.concatenate(parts), np.stack(starts)
+    cumulative = np.concatenate([[0.0], np.cumsum(all_pieces.number)])
     distance = np.geomspace(sampling["nearest"], sampling["farthest"], sampling["shells"] + 1)
     limits = parameters.section(_FILE, "metallicity")["limits"]
-    local = below[first[:, 1:]] - below[first[:, :-1]]
+    local = cumulative[first[:, 1:]] - cumulative[first[:, :-1]]
     return MilkyWay(
-        sun, components, tracks, every.width, limits, distance, m_h, whole, first, below, local, second
-    )  # fmt: skip
+        sun,
+        components,
+        tracks,
+        population_cells.width,
+        limits,
+        distance,
+        m_h,
+        all_pieces,
+        first,
+        cumulative,
+        local,
+        second,
+    )
 
 
-def _cells(component: Component) -> tuple[Float, Float, Float, Float]:
-    own = component.population
-    return own.age, own.metallicity, own.width, own.share
+def _population_columns(component: Component) -> tuple[Float, Float, Float, Float]:
+    population = component.population
+    return population.age, population.metallicity, population.width, population.share
 
 
-def _times(pieces: Pieces, factor: float) -> Pieces:
+def _scale_number(pieces: Pieces, factor: float) -> Pieces:
     return replace(pieces, number=pieces.number * factor)
 
 
@@ -161,21 +174,21 @@ def _thin(numbers: dict[str, Any], bins: slice) -> Population:
     """Born at a constant rate over some of the bins of age."""
     law = parameters.section(_FILE, "metallicity")
     edges, parts = np.array(law["thin_age"]), np.array(law["thin_parts"])
-    ages, shares, of = [], [], []
+    ages, shares, bin_of_age = [], [], []
     for k in range(parts.size)[bins]:
         inner = np.linspace(edges[k], edges[k + 1], parts[k] + 1)
         ages += list(0.5 * (inner[1:] + inner[:-1]))
         shares += list(np.diff(inner))
-        of += [k] * int(parts[k])
-    mean, scatter = (np.array(numbers[name])[of] for name in ("thin_metallicity", "thin_scatter"))
-    return stellar_populations.population(np.array(ages), np.array(shares), mean, scatter, law["thin_cells"])
+        bin_of_age += [k] * int(parts[k])
+    mean, scatter = (np.array(numbers[name])[bin_of_age] for name in ("thin_metallicity", "thin_scatter"))
+    return stellar_populations.build_population(np.array(ages), np.array(shares), mean, scatter, law["thin_cells"])
 
 
-def _old(numbers: dict[str, Any], name: str) -> Population:
+def _single_age(numbers: dict[str, Any], name: str) -> Population:
     """Of one age."""
     law = parameters.section(_FILE, "metallicity")
-    age, mean, scatter = (np.array([numbers[f"{name}_{what}"]]) for what in ("age", "metallicity", "scatter"))
-    return stellar_populations.population(age, np.ones(1), mean, scatter, law["old_cells"])
+    age, mean, scatter = (np.array([numbers[f"{name}_{quantity}"]]) for quantity in ("age", "metallicity", "scatter"))
+    return stellar_populations.build_population(age, np.ones(1), mean, scatter, law["old_cells"])
 
 
 def _bulge() -> Component:
@@ -184,7 +197,7 @@ def _bulge() -> Component:
     masses = MassFunction(**parameters.section(_FILE, "mass_function"))
     share = number["central_density"] * number["systems_per_mass"] / masses.local
     law = Bar(*(number[name] for name in ("angle", "length", "width", "height", "parallel", "perpendicular")))
-    return Component(law, share, BULGE, _old(number, "bulge"))
+    return Component(law, share, BULGE, _single_age(number, "bulge"))
 
 
 def _juric() -> tuple[Sun, tuple[Component, ...]]:
@@ -198,8 +211,8 @@ def _juric() -> tuple[Sun, tuple[Component, ...]]:
     share /= share.sum()
     components = (
         Component(thin, float(share[0]), THIN, _thin(born, slice(None))),
-        Component(thick, float(share[1]), THICK, _old(born, "thick")),
-        Component(halo, float(share[2]), HALO, _old(born, "halo")),
+        Component(thick, float(share[1]), THICK, _single_age(born, "thick")),
+        Component(halo, float(share[2]), HALO, _single_age(born, "halo")),
         _bulge(),
     )
     return Sun(number["sun_radius"], number["sun_height"]), components
@@ -210,17 +223,18 @@ def _besancon() -> tuple[Sun, tuple[Component, ...]]:
     number: dict[str, Any] = parameters.section(_FILE, "besancon")
     born = _populations("besancon")
     flattening = number["thin_flattening"]
-    thin: list[Law] = [Aged(value, number["outer"], number["inner"]) for value in flattening]
-    thin[0] = Young(flattening[0], number["young_outer"], number["young_inner"])
+    thin: list[Law] = [OldDisc(value, number["outer"], number["inner"]) for value in flattening]
+    thin[0] = YoungDisc(flattening[0], number["young_outer"], number["young_inner"])
     thick = Parabolic(number["thick_length"], number["thick_height"], number["thick_joint"])
     halo = CoredPowerLaw(number["halo_flattening"], number["halo_slope"], number["halo_core"])
     local = np.array([*number["thin_local"], number["thick_local"], number["halo_local"]])
     share = (local / local.sum()).tolist()
     components = [Component(law, share[k], THIN, _thin(born, slice(k, k + 1))) for k, law in enumerate(thin)]
     components += [
-        Component(thick, share[-2], THICK, _old(born, "thick")), Component(halo, share[-1], HALO, _old(born, "halo")),
+        Component(thick, share[-2], THICK, _single_age(born, "thick")),
+        Component(halo, share[-1], HALO, _single_age(born, "halo")),
         _bulge(),
-    ]  # fmt: skip
+    ]
     return Sun(number["sun_radius"], number["sun_height"]), tuple(components)
 
 
@@ -238,7 +252,7 @@ def cylindrical(
     return np.hypot(x, y), galaxy.sun.height + distance * np.sin(b_rad), np.arctan2(y, x)
 
 
-def numbers(galaxy: MilkyWay, lon: Float, lat: Float, area: float, h_limit: Float) -> Float:
+def expected_counts(galaxy: MilkyWay, lon: Float, lat: Float, area: float, h_limit: Float) -> Float:
     """Stars[n] of cells before their dust: the sum of `expected` of each, and of their companions.
 
     lon, lat : [n] Galactic, of the cells' centres, deg; area : of one of them, deg2; h_limit : [n]
@@ -247,38 +261,40 @@ def numbers(galaxy: MilkyWay, lon: Float, lat: Float, area: float, h_limit: Floa
     total, local = np.zeros(lon.size), galaxy.local + galaxy.companions
     for limit in np.unique(h_limit):
         chosen = np.flatnonzero(h_limit == limit)
-        per_shell = sums.product(_seen(galaxy, float(limit)), local.T) * volumes(galaxy, area)[:, None]
-        for some in np.array_split(chosen, -(-chosen.size // _CELLS_AT_A_TIME)):
-            r, z, azimuth = cylindrical(galaxy, lon[some, None], lat[some, None], middles(galaxy))
+        per_shell = (
+            matrices.matmul(_may_be_visible(galaxy, float(limit)), local.T) * shell_volumes(galaxy, area)[:, None]
+        )
+        for batch in np.array_split(chosen, -(-chosen.size // _CELLS_AT_A_TIME)):
+            r, z, azimuth = cylindrical(galaxy, lon[batch, None], lat[batch, None], shell_distances(galaxy))
             for component, weights in zip(galaxy.components, per_shell.T, strict=True):
-                total[some] += sums.product(density(component.law, galaxy.sun, r, z, azimuth), weights)
+                total[batch] += matrices.matmul(density(component.law, galaxy.sun, r, z, azimuth), weights)
     return total
 
 
-def expected(galaxy: MilkyWay, lon: float, lat: float, area: float, h_limit: float) -> Float:
+def expected_per_bin(galaxy: MilkyWay, lon: float, lat: float, area: float, h_limit: float) -> Float:
     """Single stars and primaries of a cell in every (component, shell, bin), [c, s, b]; 0 where all are too faint.
 
     lon, lat : Galactic, of the cell's centre, deg; area : deg2
     galaxy   : components, their populations and laws;  h_limit : mag, Vega
     """
-    r, z, azimuth = cylindrical(galaxy, lon, lat, middles(galaxy))
+    r, z, azimuth = cylindrical(galaxy, lon, lat, shell_distances(galaxy))
     relative = np.stack([density(component.law, galaxy.sun, r, z, azimuth) for component in galaxy.components])
-    per_shell = relative * volumes(galaxy, area)
-    return np.where(_seen(galaxy, h_limit), per_shell[:, :, None] * galaxy.local[:, None, :], 0.0)
+    per_shell = relative * shell_volumes(galaxy, area)
+    return np.where(_may_be_visible(galaxy, h_limit), per_shell[:, :, None] * galaxy.local[:, None, :], 0.0)
 
 
-def middles(galaxy: MilkyWay) -> Float:
+def shell_distances(galaxy: MilkyWay) -> Float:
     """Where in a shell its density is taken, [s] pc."""
     return np.asarray(np.sqrt(galaxy.distance[:-1] * galaxy.distance[1:]))
 
 
-def volumes(galaxy: MilkyWay, area: float) -> Float:
+def shell_volumes(galaxy: MilkyWay, area: float) -> Float:
     """Of the shells within an area, deg2, [s] pc^3."""
-    near, far = galaxy.distance[:-1], galaxy.distance[1:]
-    return np.asarray(area * _SR_PER_DEG2 * (far - near) * (far**2 + far * near + near**2) / 3.0)
+    inner, outer = galaxy.distance[:-1], galaxy.distance[1:]
+    return np.asarray(area * _SR_PER_DEG2 * (outer - inner) * (outer**2 + outer * inner + inner**2) / 3.0)
 
 
-def _seen(galaxy: MilkyWay, h_limit: float) -> Bool:
+def _may_be_visible(galaxy: MilkyWay, h_limit: float) -> Bool:
     """[s, b] whether a star of the bin may be brighter than the limit in the shell."""
     return np.asarray(galaxy.m_h[None, :-1] + 5.0 * np.log10(galaxy.distance[:-1, None]) - 5.0 < h_limit)
 
@@ -290,47 +306,47 @@ def draw(galaxy: MilkyWay, mean: Float, rng: np.random.Generator, labels: np.ran
     mean        : float[c, s, b]
     labels      : of metallicities within their cells
     """
-    drawn = _boxes(mean, rng)
+    drawn = _draw_boxes(mean, rng)
     owner, shell, m_bin = np.unravel_index(drawn, mean.shape)
-    distance = _distance(galaxy, shell, rng)
-    first, last = galaxy.below[galaxy.first[owner, m_bin]], galaxy.below[galaxy.first[owner, m_bin + 1]]
-    piece = np.searchsorted(galaxy.below, first + (last - first) * rng.random(drawn.size), side="right") - 1
+    distance = _draw_distance(galaxy, shell, rng)
+    first, last = galaxy.cumulative[galaxy.first[owner, m_bin]], galaxy.cumulative[galaxy.first[owner, m_bin + 1]]
+    piece = np.searchsorted(galaxy.cumulative, first + (last - first) * rng.random(drawn.size), side="right") - 1
     # The product may round up to the end itself.
     piece = np.clip(piece, galaxy.first[owner, m_bin], galaxy.first[owner, m_bin + 1] - 1)
-    own, along = galaxy.pieces, rng.random(drawn.size)
+    pieces, along = galaxy.pieces, rng.random(drawn.size)
 
-    def at(ends: Float) -> Float:
+    def interpolate(ends: Float) -> Float:
         low = ends[0, piece]
         return np.asarray(low + (ends[1, piece] - low) * along)
 
-    track = own.track[piece]
+    track = pieces.track[piece]
     cooling = track < 0
     metals = galaxy.tracks.metallicity[track] + galaxy.width[track] * (labels.random(drawn.size) - 0.5)
     codes = np.array([component.code for component in galaxy.components])
     return Sample(
         component=codes[owner],
-        stage=own.stage[piece],
+        stage=pieces.stage[piece],
         track=track,
         distance=distance,
-        m_h=at(own.m_h),
-        mass=np.where(cooling, np.nan, 10.0 ** at(own.log_mass)),
-        teff=10.0 ** at(own.log_teff),
-        log_g=at(own.log_g),
+        m_h=interpolate(pieces.m_h),
+        mass=np.where(cooling, np.nan, 10.0 ** interpolate(pieces.log_mass)),
+        teff=10.0 ** interpolate(pieces.log_teff),
+        log_g=interpolate(pieces.log_g),
         metallicity=np.clip(metals, *galaxy.limits),
         age=np.where(cooling, np.nan, galaxy.tracks.age[track]),
     )
 
 
-def in_shells(galaxy: MilkyWay, mean: Float, rng: np.random.Generator) -> tuple[Int, Float]:
+def draw_in_shells(galaxy: MilkyWay, mean: Float, rng: np.random.Generator) -> tuple[Int, Float]:
     """Poisson sample of expected numbers [k, s] of k kinds: kind[n], distance[n] pc, uniform in volume in a shell.
 
     mean : float[k, s]
     """
-    kind, shell = np.unravel_index(_boxes(mean, rng), mean.shape)
-    return np.asarray(kind), _distance(galaxy, shell, rng)
+    kind, shell = np.unravel_index(_draw_boxes(mean, rng), mean.shape)
+    return np.asarray(kind), _draw_distance(galaxy, shell, rng)
 
 
-def _boxes(mean: Float, rng: np.random.Generator) -> Int:
+def _draw_boxes(mean: Float, rng: np.random.Generator) -> Int:
     """Flat index[n] of the box that each of a Poisson number of draws falls into."""
     boxes = np.flatnonzero(mean)
     cumulative = np.cumsum(mean.ravel()[boxes])
@@ -340,6 +356,6 @@ def _boxes(mean: Float, rng: np.random.Generator) -> Int:
     return boxes[np.minimum(np.searchsorted(cumulative, rng.random(n) * total, side="right"), max(boxes.size - 1, 0))]
 
 
-def _distance(galaxy: MilkyWay, shell: Int, rng: np.random.Generator) -> Float:
+def _draw_distance(galaxy: MilkyWay, shell: Int, rng: np.random.Generator) -> Float:
     near3, far3 = galaxy.distance[shell] ** 3, galaxy.distance[shell + 1] ** 3
     return np.asarray(np.cbrt(near3 + (far3 - near3) * rng.random(shell.size)))

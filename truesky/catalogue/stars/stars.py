@@ -40,13 +40,13 @@ from truesky.randomness.rng import stream
 # A lot of stars of a cell: values by column, without identifiers.
 Lot = dict[str, Any]
 # Galactic l, b of a cell's centre, its area, deg2, and the faintest H.
-Where = tuple[float, float, float, float]
+CellView = tuple[float, float, float, float]
 
 STAR = 5
 BRIGHT, BROWN = 3, 4
 _BROWN_DWARF = 3
 # A generation cell is drawn whole: 2e6 stars take 1.6 GB, and fewer than the 22 bits of an id can number.
-_MOST_STARS = 2e6
+_MAX_STARS = 2e6
 # Nearer to the Galactic plane than so many deg, and before the bulge (|l|, |b|), cells have a limit of their own.
 PLANE, BULGE = 5.0, (20.0, 10.0)
 # One AU, seen from a pc, deg.
@@ -72,7 +72,7 @@ class StarModel:
     brightest: float
     galaxy: MilkyWay
     catalogue: StarCatalogue | None
-    brown: BrownDwarfs | None
+    brown_dwarfs: BrownDwarfs | None
     bright: BrightStars | None
     layer: dust_map.Layer
     sin_b_min: float
@@ -105,7 +105,7 @@ def model(
         brightest=brightest,
         galaxy=milky_way.milky_way(density),
         catalogue=catalogue,
-        brown=brown_dwarfs.brown_dwarfs(brown_dwarf_boost) if brown_dwarf_boost else None,
+        brown_dwarfs=brown_dwarfs.brown_dwarfs(brown_dwarf_boost) if brown_dwarf_boost else None,
         bright=bright,
         layer=dust_map.layer(),
         sin_b_min=dust_map.cosecant().sin_b_min,
@@ -116,7 +116,7 @@ def model(
     )
 
 
-def numbers(cells: npt.ArrayLike, universe: StarModel) -> Float:
+def expected_counts(cells: npt.ArrayLike, universe: StarModel) -> Float:
     """Stars to expect in order-8 cells, before their dust, float64[n] (20 us a cell).
 
     cells : int[n] nested
@@ -126,20 +126,20 @@ def numbers(cells: npt.ArrayLike, universe: StarModel) -> Float:
     limit = _limits(lon, lat, universe)
     where = (lon, lat, sky.cell_area(GENERATION_ORDER), limit)
     if universe.catalogue is None:
-        found = milky_way.numbers(universe.galaxy, *where)
+        counts = milky_way.expected_counts(universe.galaxy, *where)
     else:
-        found = from_catalogue.numbers(universe.catalogue, cells)
-    if universe.brown is not None:
-        found += brown_dwarfs.numbers(universe.brown, universe.galaxy, *where)
-    if found.max(initial=0.0) > _MOST_STARS:
-        worst = int(found.argmax())
-        key = "stars.plane_limit" if _crowded(lon[worst], lat[worst]) else "universe.star_limit"
+        counts = from_catalogue.star_counts(universe.catalogue, cells)
+    if universe.brown_dwarfs is not None:
+        counts += brown_dwarfs.expected_counts(universe.brown_dwarfs, universe.galaxy, *where)
+    if counts.max(initial=0.0) > _MAX_STARS:
+        worst = int(counts.argmax())
+        key = "stars.plane_limit" if _is_crowded(lon[worst], lat[worst]) else "universe.star_limit"
         raise BadInput(
-            f"{np.sum(found > _MOST_STARS)} of the area's cells hold more than {_MOST_STARS:.3g} stars, the one at l = "
-            f"{lon[worst]:.1f}, b = {lat[worst]:.1f} {found[worst]:.3g} to H = {limit[worst]:g}: ask for a brighter "
+            f"{np.sum(counts > _MAX_STARS)} of the area's cells hold more than {_MAX_STARS:.3g} stars, the one at l = "
+            f"{lon[worst]:.1f}, b = {lat[worst]:.1f} {counts[worst]:.3g} to H = {limit[worst]:g}: ask for a brighter "
             f"{key}, or leave them out"
         )
-    return found
+    return counts
 
 
 def _centres(cells: npt.ArrayLike) -> tuple[Float, Float]:
@@ -147,15 +147,15 @@ def _centres(cells: npt.ArrayLike) -> tuple[Float, Float]:
     return sky.galactic(*sky.cell_centres(GENERATION_ORDER, cells))
 
 
-def _crowded(lon: npt.ArrayLike, lat: npt.ArrayLike) -> Bool:
+def _is_crowded(lon: npt.ArrayLike, lat: npt.ArrayLike) -> Bool:
     """Is a cell near the Galactic plane, or before the bulge?"""
-    beside = np.abs((np.asarray(lon) + 180.0) % 360.0 - 180.0) < BULGE[0]
-    return np.asarray((np.abs(lat) < PLANE) | (beside & (np.abs(lat) < BULGE[1])))
+    in_bulge_longitude = np.abs((np.asarray(lon) + 180.0) % 360.0 - 180.0) < BULGE[0]
+    return np.asarray((np.abs(lat) < PLANE) | (in_bulge_longitude & (np.abs(lat) < BULGE[1])))
 
 
 def _limits(lon: Float, lat: Float, universe: StarModel) -> Float:
     """Faintest H[n] of cells at Galactic coordinates."""
-    in_plane = _crowded(lon, lat)
+    in_plane = _is_crowded(lon, lat)
     if not in_plane.any():
         return np.full(lat.size, universe.limit)
     if universe.plane_limit is None:
@@ -179,109 +179,132 @@ def draw(cell: int, seed: int, universe: StarModel, dust: Float32) -> pa.Table:
     limit = float(_limits(lon, lat, universe)[0])
     where = (float(lon[0]), float(lat[0]), sky.cell_area(GENERATION_ORDER), limit)
     if universe.catalogue is None:
-        lots = _drawn(cell, seed, universe, dust, where)
+        lots = _draw_model_stars(cell, seed, universe, dust, where)
     else:
-        lots = [_given(cell, seed, universe.catalogue, universe, dust)]
-    if universe.brown is not None:
-        lots.append(_brown(cell, seed, universe, universe.brown, dust, where))
-    kept = [_selected(universe, lot, limit) for lot in lots]
+        lots = [_stars_of_catalogue(cell, seed, universe.catalogue, universe, dust)]
+    if universe.brown_dwarfs is not None:
+        lots.append(_draw_brown_dwarfs(cell, seed, universe, universe.brown_dwarfs, dust, where))
+    selections = [_is_selected(universe, lot, limit) for lot in lots]
     if universe.bright is not None:
-        lots.append(_catalogued(cell, universe.bright, universe.types))
-        kept.append((lots[-1]["mag_h"] < limit) & (lots[-1]["mag_h"] >= universe.brightest))
+        lots.append(_tycho_stars(cell, universe.bright, universe.types))
+        selections.append((lots[-1]["mag_h"] < limit) & (lots[-1]["mag_h"] >= universe.brightest))
     first = np.cumsum([0, *(len(lot["ra"]) for lot in lots)])
     tables = [
         STARS.build(
             {"id": ids.source_id(STAR, cell, start + np.flatnonzero(keep)), **{k: v[..., keep] for k, v in lot.items()}}
         )
-        for start, lot, keep in zip(first[:-1], lots, kept, strict=True)
+        for start, lot, keep in zip(first[:-1], lots, selections, strict=True)
     ]
     rows = pa.concat_tables(tables)
     return rows if len(lots) == 1 else rows.sort_by([("_healpix_29", "ascending"), ("id", "ascending")])
 
 
-def _drawn(cell: int, seed: int, universe: StarModel, dust: Float32, where: Where) -> list[Lot]:
+def _draw_model_stars(cell: int, seed: int, universe: StarModel, dust: Float32, where: CellView) -> list[Lot]:
     """Stars of the Milky Way's model, and their companions."""
     galaxy = universe.galaxy
-    rngs = (stream(seed, f"stars.{what}", cell) for what in ("luminosity", "metallicity"))
-    stars = milky_way.draw(galaxy, milky_way.expected(galaxy, *where), *rngs)
-    place = _placed(cell, universe, dust, stars.distance, stream(seed, "stars.position", cell))
+    rngs = (stream(seed, f"stars.{quantity}", cell) for quantity in ("luminosity", "metallicity"))
+    stars = milky_way.draw(galaxy, milky_way.expected_per_bin(galaxy, *where), *rngs)
+    place = _draw_positions(cell, universe, dust, stars.distance, stream(seed, "stars.position", cell))
     deviates = stream(seed, "stars.velocity", cell).standard_normal((3, stars.distance.size))
     common = {
         "component": stars.component,
         "metallicity": stars.metallicity,
         "age": np.ma.masked_invalid(stars.age),
         "density_boost": np.ones(stars.age.size),
-        **_moving(place, stars.component, stars.age, deviates),
+        **_motion_columns(place, stars.component, stars.age, deviates),
     }
-    own = {"stage": stars.stage, "mass": np.ma.masked_invalid(stars.mass)}
+    primary_columns = {"stage": stars.stage, "mass": np.ma.masked_invalid(stars.mass)}
     lot = (
-        place | common | own | _spectra(universe, stars.m_h, stars.distance, stars.teff, stars.log_g, stars.metallicity)
+        place
+        | common
+        | primary_columns
+        | _spectrum_columns(universe, stars.m_h, stars.distance, stars.teff, stars.log_g, stars.metallicity)
     )
     rng = stream(seed, "stars.companions", cell)
-    found = companions.draw(galaxy.tracks, stars.track, stars.mass, rng)
-    of = found.primary
-    offset = companions.separation(stars.mass[of], found.mass, rng)
-    second = {name: values[of] for name, values in (place | common).items()}
-    second |= _beside(cell, place, of, offset)
-    second |= _spectra(universe, found.m_h, stars.distance[of], found.teff, found.log_g, stars.metallicity[of])
-    second |= {"stage": np.zeros(of.size, np.int64), "mass": found.mass, "companion_of": ids.source_id(STAR, cell, of)}
-    return [lot | {"companion_of": bright_stars.unknown(stars.age.size)}, second]
+    secondaries = companions.draw(galaxy.tracks, stars.track, stars.mass, rng)
+    primary = secondaries.primary
+    offset = companions.projected_offsets(stars.mass[primary], secondaries.mass, rng)
+    companion_lot = {name: values[primary] for name, values in (place | common).items()}
+    companion_lot |= _companion_positions(cell, place, primary, offset)
+    companion_lot |= _spectrum_columns(
+        universe,
+        secondaries.m_h,
+        stars.distance[primary],
+        secondaries.teff,
+        secondaries.log_g,
+        stars.metallicity[primary],
+    )
+    companion_lot |= {
+        "stage": np.zeros(primary.size, np.int64),
+        "mass": secondaries.mass,
+        "companion_of": ids.source_id(STAR, cell, primary),
+    }
+    return [lot | {"companion_of": bright_stars.masked_column(stars.age.size)}, companion_lot]
 
 
-def _spectra(universe: StarModel, m_h: Float, distance: Float, teff: Float, log_g: Float, metallicity: Float) -> Lot:
+def _spectrum_columns(
+    universe: StarModel, m_h: Float, distance: Float, teff: Float, log_g: Float, metallicity: Float
+) -> Lot:
     """Magnitudes, labels and what the spectra are mixed of; white dwarfs take the dwarfs of their temperature."""
-    found = model_stars.mixture(universe.types, universe.models, teff, log_g, metallicity)
+    mixture = model_stars.mixture(universe.types, universe.models, teff, log_g, metallicity)
     lot: Lot = {
-        "sed": found.sed[0],
-        "mag_h": m_h + _modulus(distance),
+        "sed": mixture.sed[0],
+        "mag_h": m_h + _distance_modulus(distance),
         "abs_mag_h": m_h,
         "teff": teff,
         "log_g": log_g,
     }
-    for k in range(1, model_stars.PARTS):
+    for k in range(1, model_stars.MIXTURE_SIZE):
         # As they are stored: a crowded cell is large.
-        lot |= {f"sed_{k + 1}": found.sed[k].astype(np.int16), f"frac_{k + 1}": found.frac[k].astype(np.float32)}
+        lot |= {f"sed_{k + 1}": mixture.sed[k].astype(np.int16), f"frac_{k + 1}": mixture.frac[k].astype(np.float32)}
     return lot
 
 
-def _moving(place: Lot, component: Int, age: Float, deviates: Float) -> Lot:
-    ra, dec, far = (np.asarray(place[name], float) for name in ("ra", "dec", "distance"))
-    motion = kinematics.velocities(ra, dec, far, component, age, deviates)
+def _motion_columns(place: Lot, component: Int, age: Float, deviates: Float) -> Lot:
+    ra, dec, distance = (np.asarray(place[name], float) for name in ("ra", "dec", "distance"))
+    motion = kinematics.velocities(ra, dec, distance, component, age, deviates)
     names = ("pm_ra", "pm_dec", "radial_velocity")
     return {name: np.ma.masked_invalid(v.astype(np.float32)) for name, v in zip(names, motion, strict=True)}
 
 
-def _beside(cell: int, place: Lot, of: Int, offset: tuple[Float, Float]) -> Lot:
+def _companion_positions(cell: int, place: Lot, primary: Int, offset: tuple[Float, Float]) -> Lot:
     """Where companions are: on the other side of their star where they would leave the cell, else on it."""
-    ra, dec, index = (place[name][of].copy() for name in ("ra", "dec", "_healpix_29"))
-    east, north = (np.radians(_AU_PC * axis / place["distance"][of]) for axis in offset)
-    todo = np.arange(of.size)
+    ra, dec, index = (place[name][primary].copy() for name in ("ra", "dec", "_healpix_29"))
+    east, north = (np.radians(_AU_PC * axis / place["distance"][primary]) for axis in offset)
+    remaining = np.arange(primary.size)
     for side in (1.0, -1.0):
-        there = sky.displaced(place["ra"][of[todo]], place["dec"][of[todo]], side * east[todo], side * north[todo])
-        at = sky.healpix_29(*there)
-        inside = at >> 2 * (sky.DEEPEST - GENERATION_ORDER) == cell
-        chosen = todo[inside]
-        ra[chosen], dec[chosen], index[chosen] = there[0][inside], there[1][inside], at[inside]
-        todo = todo[~inside]
+        positions = sky.offset_positions(
+            place["ra"][primary[remaining]],
+            place["dec"][primary[remaining]],
+            side * east[remaining],
+            side * north[remaining],
+        )
+        indices = sky.healpix_29(*positions)
+        inside = indices >> 2 * (sky.MAX_ORDER - GENERATION_ORDER) == cell
+        chosen = remaining[inside]
+        ra[chosen], dec[chosen], index[chosen] = positions[0][inside], positions[1][inside], indices[inside]
+        remaining = remaining[~inside]
     return {"ra": ra, "dec": dec, "_healpix_29": index}
 
 
-def _brown(cell: int, seed: int, universe: StarModel, dwarfs: BrownDwarfs, dust: Float32, where: Where) -> Lot:
+def _draw_brown_dwarfs(
+    cell: int, seed: int, universe: StarModel, dwarfs: BrownDwarfs, dust: Float32, where: CellView
+) -> Lot:
     """L and T dwarfs."""
-    found = brown_dwarfs.draw(dwarfs, universe.galaxy, *where, stream(seed, "brown_dwarfs.number", cell))
-    n = found.template.size
-    m_h = dwarfs.m_h[found.template]
-    place = _placed(cell, universe, dust, found.distance, stream(seed, "brown_dwarfs.position", cell))
+    dwarf_sample = brown_dwarfs.draw(dwarfs, universe.galaxy, *where, stream(seed, "brown_dwarfs.number", cell))
+    n = dwarf_sample.template.size
+    m_h = dwarfs.m_h[dwarf_sample.template]
+    place = _draw_positions(cell, universe, dust, dwarf_sample.distance, stream(seed, "brown_dwarfs.position", cell))
     deviates = stream(seed, "brown_dwarfs.velocity", cell).standard_normal((3, n))
     rng, metals = stream(seed, "brown_dwarfs.metallicity", cell), dwarfs.metallicity
     return {
         **place,
-        **_moving(place, np.full(n, BROWN), np.full(n, np.nan), deviates),
+        **_motion_columns(place, np.full(n, BROWN), np.full(n, np.nan), deviates),
         "component": np.full(n, BROWN),
-        "sed": dwarfs.first + found.template,
-        "mag_h": m_h + _modulus(found.distance),
+        "sed": dwarfs.first_template + dwarf_sample.template,
+        "mag_h": m_h + _distance_modulus(dwarf_sample.distance),
         "abs_mag_h": m_h,
-        "teff": dwarfs.teff[found.template],
+        "teff": dwarfs.teff[dwarf_sample.template],
         "log_g": np.full(n, dwarfs.log_g),
         "metallicity": np.clip(rng.normal(*metals, n), *universe.galaxy.limits),
         "density_boost": np.full(n, dwarfs.boost),
@@ -289,28 +312,28 @@ def _brown(cell: int, seed: int, universe: StarModel, dwarfs: BrownDwarfs, dust:
     }
 
 
-def _placed(cell: int, universe: StarModel, dust: Float32, distance: Float, rng: np.random.Generator) -> Lot:
+def _draw_positions(cell: int, universe: StarModel, dust: Float32, distance: Float, rng: np.random.Generator) -> Lot:
     """Places uniform in a cell, ascending, and the dust on the way."""
     index, ra, dec = sky.random_in_cell(GENERATION_ORDER, cell, distance.size, rng)
     a_v = _extinction(universe, distance, dust, ra, dec)
     return {"_healpix_29": index, "ra": ra, "dec": dec, "distance": distance, "a_v": a_v}
 
 
-def _given(cell: int, seed: int, catalogue: StarCatalogue, universe: StarModel, dust: Float32) -> Lot:
+def _stars_of_catalogue(cell: int, seed: int, catalogue: StarCatalogue, universe: StarModel, dust: Float32) -> Lot:
     """Stars of an external catalogue; what it does not say is null, dust and velocities are ours."""
-    values = from_catalogue.of_cell(catalogue, cell)
+    values = from_catalogue.stars_of_cell(catalogue, cell)
     n = len(values["ra"])
-    unknown = bright_stars.unknown(n)
+    unknown = bright_stars.masked_column(n)
     lot: Lot = {name: values.get(name, unknown) for name in ("distance", "log_g", "metallicity", "stage")}
-    far = np.full(n, np.inf)
+    infinity = np.full(n, np.inf)
     a_v = values.get("a_v")
     if a_v is None:
-        a_v = _extinction(universe, values.get("distance", far), dust, values["ra"], values["dec"])
-    known = "distance" in values
+        a_v = _extinction(universe, values.get("distance", infinity), dust, values["ra"], values["dec"])
+    has_distance = "distance" in values
     component = values.get("component", np.full(n, milky_way.THIN))
-    if known:
+    if has_distance:
         deviates = stream(seed, "stars.velocity", cell).standard_normal((3, n))
-        lot |= _moving(values, component, np.full(n, np.nan), deviates)
+        lot |= _motion_columns(values, component, np.full(n, np.nan), deviates)
     return lot | {
         "_healpix_29": values["index"],
         "ra": values["ra"],
@@ -318,36 +341,36 @@ def _given(cell: int, seed: int, catalogue: StarCatalogue, universe: StarModel, 
         "component": component,
         "sed": nearest_template(universe.types.teff, values["teff"]),
         "mag_h": values["mag_h"],
-        "abs_mag_h": values["mag_h"] - _modulus(values["distance"]) if known else unknown,
+        "abs_mag_h": values["mag_h"] - _distance_modulus(values["distance"]) if has_distance else unknown,
         "teff": values["teff"],
         "a_v": a_v,
         "density_boost": np.ones(n),
     }
 
 
-def _catalogued(cell: int, bright: BrightStars, types: StellarTypes) -> Lot:
+def _tycho_stars(cell: int, bright: BrightStars, types: StellarTypes) -> Lot:
     """Stars of Tycho-2, as they are seen: no extinction is put before them."""
-    rows = bright_stars.of_cell(bright, cell)
-    found = bright_stars.columns(bright, rows, types)
-    n = len(found["sed"])
-    return found | {
+    rows = bright_stars.rows_of_cell(bright, cell)
+    columns = bright_stars.columns(bright, rows, types)
+    n = len(columns["sed"])
+    return columns | {
         "_healpix_29": bright.index[rows],
         "ra": bright.ra[rows],
         "dec": bright.dec[rows],
         "component": np.full(n, BRIGHT),
         "a_v": np.zeros(n),
         "density_boost": np.ones(n),
-        "stage": bright_stars.unknown(n),
+        "stage": bright_stars.masked_column(n),
     }
 
 
-def _selected(universe: StarModel, lot: Mapping[str, Any], limit: float) -> Bool:
+def _is_selected(universe: StarModel, lot: Mapping[str, Any], limit: float) -> Bool:
     """[n] brighter than the limit, not too bright, and not where Tycho-2 has the stars."""
     mag = lot["mag_h"] + universe.h_over_v * lot["a_v"]
-    seen = (mag < limit) & (mag >= universe.brightest)
+    is_visible = (mag < limit) & (mag >= universe.brightest)
     if universe.bright is None:
-        return np.asarray(seen)
-    return np.asarray(seen & (mag_v(universe, lot) >= universe.bright.hand_over))
+        return np.asarray(is_visible)
+    return np.asarray(is_visible & (mag_v(universe, lot) >= universe.bright.hand_over))
 
 
 def mag_v(universe: StarModel, lot: Mapping[str, Any]) -> Float:
@@ -357,20 +380,22 @@ def mag_v(universe: StarModel, lot: Mapping[str, Any]) -> Float:
     light[:n], light[universe.models :] = 10.0 ** (0.4 * dwarfs[:n]), 10.0 ** (0.4 * dwarfs[n:])
     # Light in H for as much in V; of L and T dwarfs there is none in V.
     light[n : universe.models] = np.inf
-    seen = _of_main(lot) * light[lot["sed"]]
-    for k in range(2, model_stars.PARTS + 1):
+    light_v = _main_fraction(lot) * light[lot["sed"]]
+    for k in range(2, model_stars.MIXTURE_SIZE + 1):
         if f"sed_{k}" in lot:
-            seen = seen + lot[f"frac_{k}"] * light[lot[f"sed_{k}"]]
-    return np.asarray(lot["mag_h"] + 2.5 * np.log10(seen) + lot["a_v"])
+            light_v = light_v + lot[f"frac_{k}"] * light[lot[f"sed_{k}"]]
+    return np.asarray(lot["mag_h"] + 2.5 * np.log10(light_v) + lot["a_v"])
 
 
-def _of_main(lot: Mapping[str, Any]) -> Float:
+def _main_fraction(lot: Mapping[str, Any]) -> Float:
     """Share of the template of each star's largest share."""
-    others = [lot[name] for name in (f"frac_{k}" for k in range(2, model_stars.PARTS + 1)) if name in lot]
-    return 1.0 - sum(others, np.zeros(len(lot["sed"])))
+    other_fractions = [
+        lot[name] for name in (f"frac_{k}" for k in range(2, model_stars.MIXTURE_SIZE + 1)) if name in lot
+    ]
+    return 1.0 - sum(other_fractions, np.zeros(len(lot["sed"])))
 
 
-def _modulus(distance: Float) -> Float:
+def _distance_modulus(distance: Float) -> Float:
     return np.asarray(5.0 * np.log10(distance) - 5.0)
 
 

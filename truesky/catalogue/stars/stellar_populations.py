@@ -33,7 +33,7 @@ _STEPS = 500
 # Nominal values of the Sun (IAU 2015).
 _SUN_TEFF, _SUN_M_BOL = 5772.0, 4.74
 # Masses, Msun, between which nearby dwarfs go over into isochrones.
-_NEARBY, _MODELLED = 0.5, 0.7
+_NEARBY_MASS, _MODEL_MASS = 0.5, 0.7
 # An evolved star is a subgiant as long as log g is larger.
 _GIANT_LOG_G = 3.5
 # Cells of a normal distribution of metallicity reach to so many standard deviations.
@@ -114,12 +114,12 @@ class Pieces:
         return Pieces(*(getattr(self, field.name)[..., chosen] for field in fields(self)))
 
 
-def joined(parts: list[Pieces]) -> Pieces:
+def concatenate(parts: list[Pieces]) -> Pieces:
     """All of them, one after another."""
     return Pieces(*(np.concatenate([getattr(part, f.name) for part in parts], -1) for f in fields(Pieces)))
 
 
-def population(ages: Float, shares: Float, mean: Float, scatter: Float, cells: int) -> Population:
+def build_population(ages: Float, shares: Float, mean: Float, scatter: Float, cells: int) -> Population:
     """Ages[a] Gyr with their shares, and about each mean[a] of [M/H] a normal law, cut at 3 sigma, in cells.
 
     ages, shares   : float[a] Gyr, and of the systems born;  cells : of each age
@@ -133,33 +133,40 @@ def population(ages: Float, shares: Float, mean: Float, scatter: Float, cells: i
     return Population(np.repeat(ages, cells), metals.ravel(), np.repeat(scatter * step, cells), share.ravel())
 
 
-def tracks(age: Float, metallicity: Float) -> Tracks:
+def build_tracks(age: Float, metallicity: Float) -> Tracks:
     """Of ages[k] Gyr and metallicities[k]."""
-    found, types = isochrones.isochrones(age, metallicity), stellar.types()
+    model, types = isochrones.isochrones(age, metallicity), stellar.types()
     solar = isochrones.isochrones(age, np.zeros(age.size))
-    nearby = _nearby(types)
-    light = nearby.log_mass[0] < np.log10(_NEARBY) - 1e-9
-    known = (nearby.log_mass, nearby.log_teff, nearby.log_g, nearby.m_h)
-    low = [np.tile(values[0, light], (age.size, 1)) for values in known]
-    log_mass = np.log10(found.mass)
+    nearby = _nearby_dwarfs(types)
+    is_low_mass = nearby.log_mass[0] < np.log10(_NEARBY_MASS) - 1e-9
+    quantities = (nearby.log_mass, nearby.log_teff, nearby.log_g, nearby.m_h)
+    low = [np.tile(values[0, is_low_mass], (age.size, 1)) for values in quantities]
+    log_mass = np.log10(model.mass)
     # What is known of nearby dwarfs at the isochrones' masses, and its share.
-    own = np.clip((_MODELLED - found.mass) / (_MODELLED - _NEARBY), 0.0, 1.0)
-    hotter = (found.log_teff - solar.log_teff)[:, :1]
-    at = [np.interp(log_mass, nearby.log_mass[0], values[0]) for values in (nearby.log_teff, nearby.log_g, nearby.m_h)]
+    nearby_weight = np.clip((_MODEL_MASS - model.mass) / (_MODEL_MASS - _NEARBY_MASS), 0.0, 1.0)
+    hotter = (model.log_teff - solar.log_teff)[:, :1]
+    nearby_values = [
+        np.interp(log_mass, nearby.log_mass[0], values[0]) for values in (nearby.log_teff, nearby.log_g, nearby.m_h)
+    ]
     vega = vega_magnitude(passbands.load(STAR_BAND))
     shape = log_mass.shape
     correction = model_stars.bolometric_h(
-        types, vega, 10.0 ** found.log_teff.ravel(), found.log_g.ravel(), np.repeat(metallicity, shape[1])
+        types, vega, 10.0 ** model.log_teff.ravel(), model.log_g.ravel(), np.repeat(metallicity, shape[1])
     )
-    m_h = _SUN_M_BOL - 2.5 * found.log_l - correction.reshape(shape)
-    log_teff = own * (at[0] + hotter) + (1.0 - own) * found.log_teff
-    parts = (log_mass, log_teff, own * at[1] + (1.0 - own) * found.log_g, own * at[2] + (1.0 - own) * m_h)
+    m_h = _SUN_M_BOL - 2.5 * model.log_l - correction.reshape(shape)
+    log_teff = nearby_weight * (nearby_values[0] + hotter) + (1.0 - nearby_weight) * model.log_teff
+    parts = (
+        log_mass,
+        log_teff,
+        nearby_weight * nearby_values[1] + (1.0 - nearby_weight) * model.log_g,
+        nearby_weight * nearby_values[2] + (1.0 - nearby_weight) * m_h,
+    )
     low[1] = low[1] + hotter
     values = [np.concatenate(pair, 1) for pair in zip(low, parts, strict=True)]
-    return Tracks(age, metallicity, int(light.sum()) + found.main_sequence, *values)
+    return Tracks(age, metallicity, int(is_low_mass.sum()) + model.main_sequence, *values)
 
 
-def _nearby(types: stellar.StellarTypes) -> Tracks:
+def _nearby_dwarfs(types: stellar.StellarTypes) -> Tracks:
     """The mean dwarf sequence.  Ref: Pecaut & Mamajek 2013, Table 5 and its updates."""
     order = np.argsort(-types.abs_mag_h)
     log_mass = np.log10(types.mass[order])
@@ -171,60 +178,66 @@ def _nearby(types: stellar.StellarTypes) -> Tracks:
     return Tracks(np.zeros(1), np.zeros(1), order.size, *(v[None, :] for v in values))
 
 
-def pieces_of(found: Tracks, share: Float, masses: MassFunction, m_h: Float) -> Pieces:
+def build_pieces(tracks: Tracks, share: Float, masses: MassFunction, m_h: Float) -> Pieces:
     """Stretches of isochrones, with the systems of a mass function whose integral below `reference` is 1 if all live.
 
     found : k isochrones;  share : [k] of the systems that each has
     masses : the mass function;  m_h : [b + 1] edges of the bins, ascending
     """
-    born = _power_law(masses, np.maximum(10.0**found.log_mass, masses.lightest))
+    born = _power_law(masses, np.maximum(10.0**tracks.log_mass, masses.lightest))
     number = np.diff(born, axis=1) / _power_law(masses, np.asarray(masses.reference)) * share[:, None]
     q = number.shape[1]
     step = np.arange(q)
-    living = np.broadcast_to(step != found.evolved - 1 + isochrones.FLASH, number.shape) & (number > 0.0)
+    living = np.broadcast_to(step != tracks.evolved - 1 + isochrones.FLASH, number.shape) & (number > 0.0)
     row, at = np.nonzero(living)
-    along = (found.log_mass, found.log_teff, found.log_g, found.m_h)
+    along = (tracks.log_mass, tracks.log_teff, tracks.log_g, tracks.m_h)
     ends = [np.stack([values[row, at], values[row, at + 1]]) for values in along]
-    stage = np.where(at >= found.evolved - 1, GIANT, DWARF)
+    stage = np.where(at >= tracks.evolved - 1, GIANT, DWARF)
     cut = _in_bins(Pieces(row, stage, np.zeros(row.size, np.int64), number[row, at], *ends), m_h)
     young = (cut.stage == GIANT) & (cut.log_g.mean(0) > _GIANT_LOG_G)
     return replace(cut, stage=np.where(young, SUBGIANT, cut.stage))
 
 
-def _in_bins(whole: Pieces, edges: Float) -> Pieces:
+def _in_bins(pieces: Pieces, edges: Float) -> Pieces:
     """The stretches cut at the edges of the bins; what lies outside of all is left out."""
     step, first = edges[1] - edges[0], edges[0]
-    place = (whole.m_h - first) / step
+    place = (pieces.m_h - first) / step
     low, high = place.min(0), place.max(0)
     start = np.floor(low).astype(np.int64)
     count = np.maximum(np.ceil(high).astype(np.int64) - start, 1)
-    of = np.repeat(np.arange(start.size), count)
-    which = start[of] + np.arange(of.size) - np.repeat(np.cumsum(count) - count, count)
-    span = np.maximum(high - low, 1e-12)[of]
+    piece_index = np.repeat(np.arange(start.size), count)
+    bin_index = start[piece_index] + np.arange(piece_index.size) - np.repeat(np.cumsum(count) - count, count)
+    span = np.maximum(high - low, 1e-12)[piece_index]
     # Along the stretch, from its fainter or brighter end.
-    part = np.clip((np.stack([which, which + 1]) - low[of]) / span, 0.0, 1.0)
-    part[:, count[of] == 1] = np.array([0.0, 1.0])[:, None]
-    falling = place[0, of] > place[1, of]
+    part = np.clip((np.stack([bin_index, bin_index + 1]) - low[piece_index]) / span, 0.0, 1.0)
+    part[:, count[piece_index] == 1] = np.array([0.0, 1.0])[:, None]
+    falling = place[0, piece_index] > place[1, piece_index]
     along = np.where(falling, 1.0 - part, part)
     ends = [
-        values[0, of] + (values[1, of] - values[0, of]) * along
-        for values in (whole.log_mass, whole.log_teff, whole.log_g, whole.m_h)
+        values[0, piece_index] + (values[1, piece_index] - values[0, piece_index]) * along
+        for values in (pieces.log_mass, pieces.log_teff, pieces.log_g, pieces.m_h)
     ]
-    out = Pieces(whole.track[of], whole.stage[of], which, whole.number[of] * (part[1] - part[0]), *ends)
-    return out.take((which >= 0) & (which < edges.size - 1) & (out.number > 0.0))
+    out = Pieces(
+        pieces.track[piece_index],
+        pieces.stage[piece_index],
+        bin_index,
+        pieces.number[piece_index] * (part[1] - part[0]),
+        *ends,
+    )
+    return out.take((bin_index >= 0) & (bin_index < edges.size - 1) & (out.number > 0.0))
 
 
-def white_dwarfs(m_h: Float) -> Pieces:
+def white_dwarf_pieces(m_h: Float) -> Pieces:
     """Cooling white dwarfs of one radius, in bins of M_H with these edges[b + 1]."""
     numbers = WhiteDwarfs(**parameters.section(_FILE, "white_dwarfs"))
     m_bol, at = _white_dwarf_magnitudes(numbers)
-    number = np.diff(white_dwarfs_below(numbers, m_h))
-    kept = np.flatnonzero(number > 0.0)
-    edges = np.stack([m_h[kept], m_h[kept + 1]])
+    number = np.diff(cumulative_white_dwarfs(numbers, m_h))
+    bins = np.flatnonzero(number > 0.0)
+    edges = np.stack([m_h[bins], m_h[bins + 1]])
     log_teff = np.log10(np.interp(edges, at, _white_dwarf_teff(numbers, m_bol)))
-    none, g = np.zeros(edges.shape), np.full(edges.shape, numbers.log_g)
-    stage = np.full(kept.size, WHITE_DWARF)
-    return Pieces(np.full(kept.size, -1), stage, kept, number[kept], none, log_teff, g, edges)
+    zeros, g = np.zeros(edges.shape), np.full(edges.shape, numbers.log_g)
+    stage = np.full(bins.size, WHITE_DWARF)
+    return Pieces(np.full(bins.size, -1), stage, bins, number[bins], zeros, log_teff, g, edges)
 
 
 def _white_dwarf_magnitudes(numbers: WhiteDwarfs) -> tuple[Float, Float]:
@@ -253,7 +266,7 @@ def _power_law(masses: MassFunction, m: Float) -> Float:
     return np.asarray(total)
 
 
-def white_dwarfs_below(numbers: WhiteDwarfs, m_h: Float) -> Float:
+def cumulative_white_dwarfs(numbers: WhiteDwarfs, m_h: Float) -> Float:
     """White dwarfs pc^-3 at the Sun brighter than M_H.
 
     m_h : float[n] mag, Vega

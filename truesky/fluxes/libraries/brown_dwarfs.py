@@ -28,7 +28,7 @@ _J = _BANDS.index("twomass_j")
 _COLOR_YJ = 0.8
 # Scatter of J - H and H - Ks within a subtype, mag (adopted).
 _SCATTER = 0.07
-_UNTIL = 1e-4, 200
+_TOLERANCE = 1e-4, 200
 # Bands of methane and water: centre, width, A, and depth (adopted: texture, the colours come after).
 _METHANE = ((11_500.0, 700.0, 0.6), (16_700.0, 900.0, 0.8), (22_500.0, 1200.0, 0.8))
 _WATER = ((9_300.0, 300.0, 0.4), (14_000.0, 700.0, 0.7), (18_700.0, 900.0, 0.8))
@@ -48,8 +48,11 @@ def subtypes() -> Subtypes:
     """L0 .. T8 of Pecaut & Mamajek 2013."""
     names, column = stellar.table(_FIRST, _LAST)
     # T4.5, T5.5 and T7.5 are in the table, too.
-    whole = np.array(["." not in name for name in names])
-    names, column = tuple(np.array(names)[whole].tolist()), {title: values[whole] for title, values in column.items()}
+    is_whole_subtype = np.array(["." not in name for name in names])
+    names, column = (
+        tuple(np.array(names)[is_whole_subtype].tolist()),
+        {title: values[is_whole_subtype] for title, values in column.items()},
+    )
     j, h, ks = (_vega(band) for band in _BANDS[_J:])
     zj = column["z-Y"] + _COLOR_YJ
     jh, hk = column["J-H"] + j - h, column["H-Ks"] + h - ks
@@ -93,21 +96,21 @@ def spectra() -> Float:
     """
     grid, types = passbands.grid(), subtypes()
     bands = [passbands.load(name) for name in _BANDS]
-    seen = np.zeros((len(grid), len(bands)))
+    response = np.zeros((len(grid), len(bands)))
     for k, band in enumerate(bands):
-        seen[band.first : band.first + len(band.wavelength), k] = passbands.weights(band)
+        response[band.first : band.first + len(band.wavelength), k] = passbands.weights(band)
     pivots = np.log([passbands.pivot_wavelength(band) for band in bands])
     out, mean = [], np.zeros(len(bands))
     for name in template_names():
         subtype, _, number = name.partition("-")
         k = types.names.index(subtype)
-        start = stellar.planck(grid, types.teff[k]) * _absorbed(grid, k / (len(types.names) - 1.0))
+        start = stellar.planck(grid, types.teff[k]) * _band_transmission(grid, k / (len(types.names) - 1.0))
         colors = types.colors[k] + _scatter(subtype, int(number))
-        found = stellar.matching(np.log(grid), start, seen, pivots, colors, _J, _UNTIL, mean)
+        correction = stellar.color_correction(np.log(grid), start, response, pivots, colors, _J, _TOLERANCE, mean)
         if number == "00":
-            mean = found
-        out.append(stellar.corrected(np.log(grid), start, pivots, found))
-    return stellar.normalised(grid, np.stack(out))
+            mean = correction
+        out.append(stellar.apply_correction(np.log(grid), start, pivots, correction))
+    return stellar.normalise(grid, np.stack(out))
 
 
 def _scatter(subtype: str, number: int) -> Float:
@@ -118,10 +121,10 @@ def _scatter(subtype: str, number: int) -> Float:
     return np.array([0.0, 0.0, 0.0, -jh, -jh - hk])
 
 
-def _absorbed(wavelength: Float, place: float) -> Float:
+def _band_transmission(wavelength: Float, position: float) -> Float:
     """Transmission of water, all along the sequence, and methane, in its second half; place = 0 at L0, 1 at T8."""
     transmission = np.ones_like(wavelength)
-    for bands, strength in ((_WATER, 0.5 + 0.5 * place), (_METHANE, max(2.0 * place - 1.0, 0.0))):
+    for bands, strength in ((_WATER, 0.5 + 0.5 * position), (_METHANE, max(2.0 * position - 1.0, 0.0))):
         for centre, width, depth in bands:
             transmission *= 1.0 - strength * depth * np.exp(-0.5 * ((wavelength - centre) / width) ** 2)
     return transmission

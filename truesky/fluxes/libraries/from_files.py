@@ -27,19 +27,19 @@ from lake_schema.errors import BadInput, LakeError
 from lake_schema.fits.external import read_table
 from truesky.fluxes import passbands
 from truesky.fluxes.libraries import text_tables, votable
-from truesky.fluxes.libraries.stellar import normalised
+from truesky.fluxes.libraries.stellar import normalise
 from truesky.fluxes.libraries.templates import Library
 from truesky.fluxes.passbands import Passband
 
 _FORMATS = Path(__file__).with_name("spectrum_formats.toml")
 # Of a VOTable; room would be made for as many rows.
-_COUNT = re.compile(r"""\bnrows\s*=\s*["'][^"']*["']""")
+_ROW_COUNT = re.compile(r"""\bnrows\s*=\s*["'][^"']*["']""")
 ANGSTROM = {"Angstrom": 1.0, "nm": 10.0, "um": 1e4}
 # f_lambda beyond the red end of a file of galaxies.
 _RED_SLOPE = -3.2
 
 # k of the steepest law, at 912 A, is some 25.
-_MOST_EXTINCTION = 100.0
+_MAX_EXTINCTION = 100.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,31 +52,31 @@ class Curve:
 
 def formats() -> Mapping[str, Mapping[str, Any]]:
     """The formats by name."""
-    return user_files.toml_tables(_FORMATS.read_text(encoding="utf-8"))
+    return user_files.parse_toml(_FORMATS.read_text(encoding="utf-8"))
 
 
-def read(path: Path, name: str) -> Curve:
+def read(path: Path, format_name: str) -> Curve:
     """A file in one of the `formats`.
 
     Errors: BadInput for a file that is absent, too large or not of that form; one row; wavelengths not ascending,
             repeated or in another unit; negative, infinite or missing values; nothing but zeros; a gap
     """
-    known = formats()
-    if name not in known:
-        raise BadInput(f"format {name!r} is not one of {', '.join(known)}")
-    form = known[name]
+    all_formats = formats()
+    if format_name not in all_formats:
+        raise BadInput(f"format {format_name!r} is not one of {', '.join(all_formats)}")
+    form = all_formats[format_name]
     try:
         wavelength, value = _columns(path, form)
     except LakeError:
         raise
     except Exception as error:
         # What the libraries' readers raise of a user's file has no end.
-        raise BadInput(f"{path}: cannot be read as {name}: {' '.join(str(error).split())[:200]}") from None
-    check(path, wavelength, value, form)
+        raise BadInput(f"{path}: cannot be read as {format_name}: {' '.join(str(error).split())[:200]}") from None
+    check_curve(path, wavelength, value, form)
     return Curve(wavelength, value)
 
 
-def library(files: Sequence[Path], name: str = "cosmos") -> Library:
+def library(files: Sequence[Path], format_name: str = "cosmos") -> Library:
     """Galaxy templates from files, earliest first, on the rest-frame grid of the embedded library, normalised.
 
     Each bin of 1 A gets the mean of the file's spectrum over it: flux is conserved. Without flux beyond the blue end;
@@ -85,15 +85,15 @@ def library(files: Sequence[Path], name: str = "cosmos") -> Library:
     from truesky.fluxes.libraries.rest_grid import rest_grid
 
     grid = rest_grid()
-    flux = np.stack([resampled(grid, read(path, name)) for path in files])
+    flux = np.stack([resample(grid, read(path, format_name)) for path in files])
     names = tuple(path.stem for path in files)
-    return Library(grid, normalised(grid, flux).astype(np.float32), names, own=True)
+    return Library(grid, normalise(grid, flux).astype(np.float32), names, external=True)
 
 
-def law(path: Path, name: str, wavelength: Float) -> Float:
+def law(path: Path, format_name: str, wavelength: Float) -> Float:
     """k(lambda) = A / E(B-V) of an extinction law, linear between the file's wavelengths, constant beyond them."""
-    curve = read(path, name)
-    _refuse(path, curve.value > _MOST_EXTINCTION, f"is more than k = {_MOST_EXTINCTION:g}: is it A / E(B-V)?")
+    curve = read(path, format_name)
+    _refuse(path, curve.value > _MAX_EXTINCTION, f"is more than k = {_MAX_EXTINCTION:g}: is it A / E(B-V)?")
     return np.interp(wavelength, curve.wavelength, curve.value)
 
 
@@ -105,7 +105,7 @@ def passband(path: Path, name: str, medium: str, form: str = "passband_ascii") -
     if medium not in ("air", "vacuum"):
         raise BadInput(f"{path}: medium {medium!r} is not air or vacuum")
     curve = read(path, form)
-    wavelength, response = passbands.resampled(curve.wavelength, curve.value)
+    wavelength, response = passbands.resample_to_grid(curve.wavelength, curve.value)
     if not len(wavelength):
         first, last = passbands.GRID_FIRST, passbands.GRID_LAST
         raise BadInput(f"{path}: lies outside {first} .. {last} A")
@@ -117,7 +117,7 @@ def _columns(path: Path, form: Mapping[str, Any]) -> tuple[Float, Float]:
     reader, names = form["reader"], (form["wavelength"], form["value"])
     scale = ANGSTROM[form["unit"]]
     if reader == "ascii":
-        lines = user_files.text(path, "curve").splitlines()
+        lines = user_files.read_text(path, "curve").splitlines()
         if not any(line.partition("#")[0].strip() for line in lines):
             raise BadInput(f"{path}: has no rows")
         rows = np.loadtxt(lines, comments="#", usecols=[names[0] - 1, names[1] - 1], ndmin=2)
@@ -129,29 +129,29 @@ def _columns(path: Path, form: Mapping[str, Any]) -> tuple[Float, Float]:
     wavelength, value = (table[name] for name in names)
     if isinstance(wavelength, Quantity) and wavelength.unit != dimensionless_unscaled:
         wavelength, scale = wavelength.to_value("Angstrom"), 1.0
-    return _plain(wavelength) * scale, _plain(value)
+    return _without_unit(wavelength) * scale, _without_unit(value)
 
 
 def _table(path: Path, reader: str) -> Any:
     """An astropy table of a text file; given to astropy as text, for a path it would unpack, or fetch."""
     from astropy.table import QTable
 
-    text = user_files.text(path, "table of a curve")
+    text = user_files.read_text(path, "table of a curve")
     if reader != "votable":
         lines = text.splitlines()
         text_tables.refuse_large(lines, has_header=reader == "ecsv")
         return QTable.read(lines, format=f"ascii.{reader}", guess=False)
     votable.refuse_large(text)
-    return QTable.read(BytesIO(_COUNT.sub("", text).encode()), format="votable")
+    return QTable.read(BytesIO(_ROW_COUNT.sub("", text).encode()), format="votable")
 
 
-def _plain(column: Any) -> Float:
+def _without_unit(column: Any) -> Float:
     """A column without its unit; what is masked becomes NaN, to be refused."""
     bare = getattr(column, "value", column)
     return np.asarray(np.ma.filled(np.ma.asarray(bare, dtype=float), np.nan), float)
 
 
-def check(path: Path, wavelength: Float, value: Float, form: Mapping[str, Any]) -> None:
+def check_curve(path: Path, wavelength: Float, value: Float, form: Mapping[str, Any]) -> None:
     """Refuse what is no curve, naming the row; form : bounds, largest_gap and covers as in the formats.
 
     path : named in the refusal;  wavelength, value : float[n] of the curve
@@ -179,12 +179,12 @@ def check(path: Path, wavelength: Float, value: Float, form: Mapping[str, Any]) 
     _refuse(path, np.append(False, wide), "follows a gap")
 
 
-def _refuse(path: Path, bad: Bool, what: str) -> None:
+def _refuse(path: Path, bad: Bool, problem: str) -> None:
     if bad.any():
-        raise BadInput(f"{path}: row {int(np.flatnonzero(bad)[0]) + 1} {what}")
+        raise BadInput(f"{path}: row {int(np.flatnonzero(bad)[0]) + 1} {problem}")
 
 
-def resampled(grid: Float, curve: Curve) -> Float:
+def resample(grid: Float, curve: Curve) -> Float:
     """Mean over each bin of 1 A, from the integral of the piecewise linear spectrum."""
     at, value = curve.wavelength, curve.value
     if at[-1] < grid[-1] + 0.5:
@@ -192,7 +192,7 @@ def resampled(grid: Float, curve: Curve) -> Float:
         at, value = np.append(at, tail), np.append(value, value[-1] * (tail / at[-1]) ** _RED_SLOPE)
     edges = np.append(grid, grid[-1] + 1.0) - 0.5
     # The integral is exact where the spectrum is sampled; the edges of the bins are added to the samples.
-    every = np.union1d(at, edges)
-    sampled = np.interp(every, at, value, left=0.0)
-    integral = np.append(0.0, np.cumsum(0.5 * (sampled[1:] + sampled[:-1]) * np.diff(every)))
-    return np.diff(np.interp(edges, every, integral))
+    nodes = np.union1d(at, edges)
+    sampled = np.interp(nodes, at, value, left=0.0)
+    integral = np.append(0.0, np.cumsum(0.5 * (sampled[1:] + sampled[:-1]) * np.diff(nodes)))
+    return np.diff(np.interp(edges, nodes, integral))

@@ -31,16 +31,16 @@ TEFF = np.geomspace(3600.0, 8500.0, 18)
 LOG_G = np.array([1.6, 3.2, 4.6])
 METALLICITY = np.array([-2.5, -1.5, -1.0, -0.5, 0.0, 0.5])
 # Spectra that a star is a mixture of.
-PARTS = 4
+MIXTURE_SIZE = 4
 BANDS = ("sdss_u", "sdss_g", "sdss_r", "sdss_i", "sdss_z", "twomass_j", "twomass_h", "twomass_ks")
-_DWARF = len(LOG_G) - 1
+_DWARF_GRAVITY = len(LOG_G) - 1
 # The models' share at the hottest nodes, from the last, and at a dwarf's coolest, from the first.
-_HOT, _COOL = (0.0, 0.5), (0.0, 1 / 3, 2 / 3)
+_HOT_SHARES, _COOL_SHARES = (0.0, 0.5), (0.0, 1 / 3, 2 / 3)
 # Cooler than the models, stars of lower gravity are giants, and take the coolest of them.
 _GIANT = 3.9
 _V = "bessell_v"
 # Largest error of a colour, mag, and passes.
-_UNTIL = 1e-4, 100
+_TOLERANCE = 1e-4, 100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,13 +76,13 @@ def names() -> tuple[str, ...]:
 
 
 @lru_cache(maxsize=1)
-def own_share() -> Float:
+def model_share() -> Float:
     """[teff, log_g, metallicity] share of the models at their nodes; the rest is the dwarf of that temperature."""
     share = np.ones((TEFF.size, LOG_G.size, METALLICITY.size))
-    for k, value in enumerate(_HOT):
+    for k, value in enumerate(_HOT_SHARES):
         share[-1 - k] *= value
-    for k, value in enumerate(_COOL):
-        share[k, _DWARF] *= value
+    for k, value in enumerate(_COOL_SHARES):
+        share[k, _DWARF_GRAVITY] *= value
     return share
 
 
@@ -92,39 +92,49 @@ def spectra(dwarfs: Float, types: StellarTypes) -> Float:
     dwarfs : float64[m, 23401] normalised spectra of the types
     Error  : colours within 1e-4 mag of the table's where nothing of the dwarfs is mixed in
     """
-    grid, table, share = passbands.grid(), models(), own_share()
+    grid, table, share = passbands.grid(), models(), model_share()
     bands = [passbands.load(name) for name in (*BANDS, _V)]
     pivots = np.array([passbands.pivot_wavelength(band) for band in bands])
     order = np.argsort(pivots)
     response = np.zeros((grid.size, len(bands)))
     for k, band in enumerate(bands):
         response[band.first : band.first + len(band.wavelength), k] = passbands.weights(band)
-    tied = int(np.flatnonzero(order == len(BANDS))[0])
-    out, beside = [], of_dwarfs(dwarfs, types)
+    reference = int(np.flatnonzero(order == len(BANDS))[0])
+    out, interpolated_dwarfs = [], dwarf_spectra(dwarfs, types)
     for i, teff in enumerate(TEFF):
-        start = stellar.planck(grid, teff) * stellar.absorbed(grid, teff)
+        start = stellar.planck(grid, teff) * stellar.feature_transmission(grid, teff)
         first = np.zeros(len(bands))
-        dwarf = beside[i * LOG_G.size * METALLICITY.size]
+        dwarf = interpolated_dwarfs[i * LOG_G.size * METALLICITY.size]
         for j in range(LOG_G.size):
             for k in range(METALLICITY.size):
-                wanted = np.append(table.colors[i, j, k], 0.0)[order]
-                args = np.log(grid), start, response[:, order], np.log(pivots[order]), wanted, tied, _UNTIL
-                first = stellar.matching(*args, first)
-                own = stellar.normalised(grid, stellar.corrected(np.log(grid), start, np.log(pivots[order]), first))
-                out.append(share[i, j, k] * own + (1.0 - share[i, j, k]) * dwarf)
-    return stellar.normalised(grid, np.stack(out))
+                target_colors = np.append(table.colors[i, j, k], 0.0)[order]
+                args = (
+                    np.log(grid),
+                    start,
+                    response[:, order],
+                    np.log(pivots[order]),
+                    target_colors,
+                    reference,
+                    _TOLERANCE,
+                )
+                first = stellar.color_correction(*args, first)
+                model = stellar.normalise(
+                    grid, stellar.apply_correction(np.log(grid), start, np.log(pivots[order]), first)
+                )
+                out.append(share[i, j, k] * model + (1.0 - share[i, j, k]) * dwarf)
+    return stellar.normalise(grid, np.stack(out))
 
 
-def of_dwarfs(dwarfs: Float, types: StellarTypes) -> Float:
+def dwarf_spectra(dwarfs: Float, types: StellarTypes) -> Float:
     """Spectra of dwarfs at the models' temperatures, [n, m], of those of the types, [k, m], linear in ln Teff."""
-    before, weight = _between(types, TEFF)
-    found = (1.0 - weight)[:, None] * dwarfs[before[0]] + weight[:, None] * dwarfs[before[1]]
-    return np.repeat(found, LOG_G.size * METALLICITY.size, axis=0)
+    neighbours, weight = _neighbour_dwarfs(types, TEFF)
+    interpolated = (1.0 - weight)[:, None] * dwarfs[neighbours[0]] + weight[:, None] * dwarfs[neighbours[1]]
+    return np.repeat(interpolated, LOG_G.size * METALLICITY.size, axis=0)
 
 
 def nearest_dwarfs(types: StellarTypes) -> Int:
     """Index of the hotter of the two dwarfs that stand beside each model."""
-    return np.repeat(_between(types, TEFF)[0][0], LOG_G.size * METALLICITY.size)
+    return np.repeat(_neighbour_dwarfs(types, TEFF)[0][0], LOG_G.size * METALLICITY.size)
 
 
 def mixture(types: StellarTypes, first: int, teff: Float, log_g: Float, metallicity: Float) -> Mixture:
@@ -134,7 +144,7 @@ def mixture(types: StellarTypes, first: int, teff: Float, log_g: Float, metallic
     teff, log_g, metallicity : float64[n] K, cm s-2, [M/H]
     """
     n = teff.size
-    sed, frac = np.zeros((PARTS, n), np.int64), np.zeros((PARTS, n))
+    sed, frac = np.zeros((MIXTURE_SIZE, n), np.int64), np.zeros((MIXTURE_SIZE, n))
     t, g, z = (np.ascontiguousarray(values, float) for values in (teff, log_g, metallicity))
     _mix(t, g, z, np.log(TEFF), LOG_G, METALLICITY, np.log(types.teff), first, _GIANT, sed, frac)
     return Mixture(sed, frac)
@@ -146,11 +156,11 @@ def bolometric_h(types: StellarTypes, vega: float, teff: Float, log_g: Float, me
     types : the dwarfs;  vega : AB magnitude of Vega in H
     teff, log_g, metallicity : float64[n] K, cm s-2, [M/H]
     """
-    found = mixture(types, types.teff.size, teff, log_g, metallicity)
-    own = own_share() * (models().bolometric_h + vega)
+    mixed = mixture(types, types.teff.size, teff, log_g, metallicity)
+    of_models = model_share() * (models().bolometric_h + vega)
     dwarf = np.interp(-np.log(TEFF), -np.log(types.teff), types.bolometric_h)
-    each = np.concatenate([types.bolometric_h, (own + (1.0 - own_share()) * dwarf[:, None, None]).ravel()])
-    return np.asarray((found.frac * each[found.sed]).sum(0))
+    values = np.concatenate([types.bolometric_h, (of_models + (1.0 - model_share()) * dwarf[:, None, None]).ravel()])
+    return np.asarray((mixed.frac * values[mixed.sed]).sum(0))
 
 
 def v_minus_h(types: StellarTypes, vega: tuple[float, float]) -> Float:
@@ -160,12 +170,12 @@ def v_minus_h(types: StellarTypes, vega: tuple[float, float]) -> Float:
     """
     of_models = -models().colors[..., BANDS.index("twomass_h")] - vega[0] + vega[1]
     dwarf = np.interp(-np.log(TEFF), -np.log(types.teff), types.v_minus_h)[:, None, None]
-    share = own_share()
+    share = model_share()
     light = share * 10.0 ** (0.4 * of_models) + (1.0 - share) * 10.0 ** (0.4 * dwarf)
     return np.concatenate([types.v_minus_h, 2.5 * np.log10(light).ravel()])
 
 
-def _between(types: StellarTypes, teff: Float) -> tuple[Int, Float]:
+def _neighbour_dwarfs(types: StellarTypes, teff: Float) -> tuple[Int, Float]:
     """The two dwarfs about temperatures [2, n], and the second's share[n], linear in ln Teff."""
     ln_teff = np.log(types.teff)
     cooler = np.clip(np.searchsorted(-ln_teff, -np.log(teff)), 1, ln_teff.size - 1)
@@ -190,9 +200,9 @@ def _mix(
             w = min(max((dwarfs[k - 1] - t) / (dwarfs[k - 1] - dwarfs[k]), 0.0), 1.0)
             sed[0, i], sed[1, i], frac[0, i], frac[1, i] = k - 1, k, 1.0 - w, w
         else:
-            a, along = _place(ln_teff, t)
-            b, up = _place(gravities, log_g[i])
-            c, rich = _place(metals, metallicity[i])
+            a, along = _find_node(ln_teff, t)
+            b, up = _find_node(gravities, log_g[i])
+            c, rich = _find_node(metals, metallicity[i])
             size_a, size_b = gravities.size * metals.size, metals.size
             # The three axes by falling share of the way.
             x, y, z = along, up, rich
@@ -215,7 +225,7 @@ def _mix(
 
 
 @exact_jit
-def _place(nodes: Float, value: float) -> tuple[int, float]:
+def _find_node(nodes: Float, value: float) -> tuple[int, float]:
     """(node before, share of the way to the next), inside the nodes."""
     low = min(max(int(np.searchsorted(nodes, value, side="right")) - 1, 0), nodes.size - 2)
     return low, min(max((value - nodes[low]) / (nodes[low + 1] - nodes[low]), 0.0), 1.0)

@@ -27,9 +27,9 @@ def spectra(vega_wavelength: Float, vega_flux: Float) -> Float:
     """f_lambda of NAMES on the grid of passbands.grid(), float64[3, 23401], mean 1 between 5450 and 5550 A."""
     grid = passbands.grid()
     vega = np.interp(grid, vega_wavelength, vega_flux, left=0.0)
-    balmer = stellar.shape("series", grid, _LOWER_LEVEL, _BALMER_WIDTH)
+    balmer = stellar.feature_profile("series", grid, _LOWER_LEVEL, _BALMER_WIDTH)
     white_dwarf = stellar.planck(grid, _WHITE_DWARF_TEFF) * (1.0 - _BALMER_DEPTH * balmer)
-    return stellar.normalised(grid, np.stack([vega, white_dwarf, _nebula(grid)]))
+    return stellar.normalise(grid, np.stack([vega, white_dwarf, _nebula(grid)]))
 
 
 def _nebula(grid: Float) -> Float:

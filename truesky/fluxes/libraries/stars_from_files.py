@@ -24,8 +24,8 @@ from lake_schema.errors import BadInput
 from lake_schema.units import LIGHT_ANGSTROM_S
 from truesky.fluxes import passbands
 from truesky.fluxes.libraries import from_files, model_stars, stellar, templates
-from truesky.fluxes.libraries.from_files import ANGSTROM, Curve, check, resampled
-from truesky.fluxes.libraries.stellar import StellarTypes, normalised
+from truesky.fluxes.libraries.from_files import ANGSTROM, Curve, check_curve, resample
+from truesky.fluxes.libraries.stellar import StellarTypes, normalise
 from truesky.fluxes.libraries.templates import Library
 from truesky.fluxes.passbands import Passband
 
@@ -35,7 +35,7 @@ _BASEL_COUNT, _BASEL_WAVELENGTH_WIDTH, _BASEL_FLUX_WIDTH = 1221, 10, 11
 _BASEL_HEADER = (0, 6, 12, 18, 24)
 
 # Where spectra are normalised, A.
-_VISUAL = float(np.mean(stellar.NORMALISED))
+_VISUAL = float(np.mean(stellar.NORMALISATION_RANGE))
 
 # The colour by which stars are compared, and the stretch of IRTF spectra that is used, A.
 SPLICE_BANDS = ("euclid_y", "euclid_h")
@@ -60,66 +60,68 @@ def library(models: Path | None, infrared: Sequence[Path]) -> tuple[Library, Int
     """
     embedded, types = templates.stellar_library(), stellar.types()
     grid, n = embedded.wavelength, len(types.names)
-    flux = embedded.flux[:n].astype(float) if models is None else dwarfs(models, types, grid)
-    chosen = np.full(n, -1)
+    flux = embedded.flux[:n].astype(float) if models is None else dwarf_spectra(models, types, grid)
+    infrared_index = np.full(n, -1)
     first = templates.first_model()
-    others = embedded.flux[first:].astype(float)
+    model_flux = embedded.flux[first:].astype(float)
     if infrared:
         curves = [from_files.read(path, "irtf") for path in infrared]
-        flux, chosen = splice(grid, flux, curves)
-        others, _ = splice(grid, others, curves)
-    flux = normalised(grid, flux)
+        flux, infrared_index = splice(grid, flux, curves)
+        model_flux, _ = splice(grid, model_flux, curves)
+    flux = normalise(grid, flux)
     if models is not None:
         # A file is of one metallicity: its dwarfs stand for the stars of any.
-        others = model_stars.of_dwarfs(flux, types)
-    own = np.concatenate([flux, embedded.flux[n:first], normalised(grid, others)]).astype(np.float32)
-    return replace(embedded, flux=own, own=True), chosen
+        model_flux = model_stars.dwarf_spectra(flux, types)
+    all_flux = np.concatenate([flux, embedded.flux[n:first], normalise(grid, model_flux)]).astype(np.float32)
+    return replace(embedded, flux=all_flux, external=True), infrared_index
 
 
-def dwarfs(path: Path, types: StellarTypes, grid: Float) -> Float:
+def dwarf_spectra(path: Path, types: StellarTypes, grid: Float) -> Float:
     """f_lambda of each type, float64[n, n_lambda], normalised, from the models of a BaSeL file.
 
     Of the metallicity nearest to the Sun's; at each model temperature the gravity nearest to the type's; in between
     ln f is linear in 1 / T, as of black bodies.
     """
-    found = basel(path)
-    solar = np.abs(found.metallicity)
+    models = read_basel(path)
+    solar = np.abs(models.metallicity)
     usable = np.flatnonzero(solar == solar.min())
-    known = np.unique(found.teff[usable])
-    if types.teff.min() < known[0] or types.teff.max() > known[-1]:
+    temperatures = np.unique(models.teff[usable])
+    if types.teff.min() < temperatures[0] or types.teff.max() > temperatures[-1]:
         ends = f"{types.teff.min():g} .. {types.teff.max():g} K"
-        raise BadInput(f"{path}: models of {known[0]:g} .. {known[-1]:g} K do not cover the dwarfs' {ends}")
+        raise BadInput(
+            f"{path}: models of {temperatures[0]:g} .. {temperatures[-1]:g} K do not cover the dwarfs' {ends}"
+        )
 
     def model(teff: float, log_g: float) -> int:
-        same = usable[found.teff[usable] == teff]
-        return int(same[np.argmin(np.abs(found.log_g[same] - log_g))])
+        same = usable[models.teff[usable] == teff]
+        return int(same[np.argmin(np.abs(models.log_g[same] - log_g))])
 
     @cache
     def ln_flux(k: int) -> Float:
-        spectrum = resampled(grid, Curve(found.wavelength, found.flux[k]))
+        spectrum = resample(grid, Curve(models.wavelength, models.flux[k]))
         if not np.interp(_VISUAL, grid, spectrum) > 0.0:
-            raise BadInput(f"{path}: the model of {found.teff[k]:g} K, log g = {found.log_g[k]:g} is dark at 5500 A")
-        return np.asarray(np.log(np.maximum(normalised(grid, spectrum), np.finfo(np.float32).tiny)))
+            raise BadInput(f"{path}: the model of {models.teff[k]:g} K, log g = {models.log_g[k]:g} is dark at 5500 A")
+        return np.asarray(np.log(np.maximum(normalise(grid, spectrum), np.finfo(np.float32).tiny)))
 
     out = np.empty((len(types.teff), len(grid)))
     for spectrum, teff, log_g in zip(out, types.teff, types.log_g, strict=True):
-        hot = int(np.clip(np.searchsorted(known, teff), 1, len(known) - 1))
-        cool, warm = known[hot - 1], known[hot]
+        hot = int(np.clip(np.searchsorted(temperatures, teff), 1, len(temperatures) - 1))
+        cool, warm = temperatures[hot - 1], temperatures[hot]
         share = (1.0 / cool - 1.0 / teff) / (1.0 / cool - 1.0 / warm)
         spectrum[:] = np.exp((1.0 - share) * ln_flux(model(cool, log_g)) + share * ln_flux(model(warm, log_g)))
-    return normalised(grid, out)
+    return normalise(grid, out)
 
 
-def basel(path: Path) -> BaselModels:
+def read_basel(path: Path) -> BaselModels:
     """All models of a BaSeL file, lcb[mp]NN.cor."""
     try:
-        lines = user_files.text(path, "library of spectra").splitlines()
-        wavelength, at = _numbers(lines, 0, _BASEL_COUNT, _BASEL_WAVELENGTH_WIDTH)
+        lines = user_files.read_text(path, "library of spectra").splitlines()
+        wavelength, at = _read_numbers(lines, 0, _BASEL_COUNT, _BASEL_WAVELENGTH_WIDTH)
         labels, spectra = [], []
         while at < len(lines) and lines[at].strip():
             head = lines[at]
             labels.append([float(head[a:b]) for a, b in zip(_BASEL_HEADER[1:], (*_BASEL_HEADER[2:], 30), strict=True)])
-            h_nu, at = _numbers(lines, at + 1, _BASEL_COUNT, _BASEL_FLUX_WIDTH)
+            h_nu, at = _read_numbers(lines, at + 1, _BASEL_COUNT, _BASEL_FLUX_WIDTH)
             spectra.append(h_nu)
     except (ValueError, IndexError) as error:
         raise BadInput(f"{path}: cannot be read as BaSeL: {error}") from None
@@ -127,7 +129,7 @@ def basel(path: Path) -> BaselModels:
         raise BadInput(f"{path}: holds no model")
     angstrom = wavelength * ANGSTROM["nm"]
     for h_nu in spectra:
-        check(path, angstrom, h_nu, {"bounds": [1.0, 1e8], "covers": [2000.0, 20000.0], "largest_gap": 0.1})
+        check_curve(path, angstrom, h_nu, {"bounds": [1.0, 1e8], "covers": [2000.0, 20000.0], "largest_gap": 0.1})
     teff, log_g, metallicity = np.array(labels)[:, :3].T
     flux = 4.0 * np.stack(spectra) * LIGHT_ANGSTROM_S / angstrom**2
     return BaselModels(angstrom, teff, log_g, metallicity, flux)
@@ -160,13 +162,13 @@ def _color(bands: Sequence[Passband], wavelength: Float, flux: Float) -> float:
     return -2.5 * math.log10(y / h)
 
 
-def _numbers(lines: Sequence[str], at: int, count: int, width: int) -> tuple[Float, int]:
+def _read_numbers(lines: Sequence[str], at: int, count: int, width: int) -> tuple[Float, int]:
     """`count` numbers of fixed width from line `at` on, and the line after them."""
-    found: list[float] = []
-    while len(found) < count:
+    numbers: list[float] = []
+    while len(numbers) < count:
         line = lines[at].rstrip()
-        found += [float(line[k : k + width]) for k in range(0, len(line), width)]
+        numbers += [float(line[k : k + width]) for k in range(0, len(line), width)]
         at += 1
-    if len(found) != count:
+    if len(numbers) != count:
         raise ValueError(f"line {at} holds too many numbers")
-    return np.array(found), at
+    return np.array(numbers), at

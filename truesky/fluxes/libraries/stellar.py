@@ -22,11 +22,11 @@ from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 from lake_schema.units import BOLTZMANN_ERG_K, LIGHT_ANGSTROM_S, PLANCK_ERG_S
 from truesky.fluxes import passbands
-from truesky.numerics import cache, sums
-from truesky.numerics.code_keys import code_key
+from truesky.numerics import cache, matrices
+from truesky.numerics.code_fingerprints import code_key
 
 # Every spectrum of a library has mean f_lambda = 1 between these, A, so that mixtures are linear in flux.
-NORMALISED = (5450.0, 5550.0)
+NORMALISATION_RANGE = (5450.0, 5550.0)
 
 _FIRST, _LAST = "O9V", "M9V"
 # Passbands of the table's colours; all are tied to V.
@@ -42,7 +42,7 @@ _BANDS = (
 )
 _V = _BANDS.index("bessell_v")
 # Colours are matched to this, mag; the late M dwarfs take the most passes (about 100).
-_UNTIL = 2e-7, 400
+_TOLERANCE = 2e-7, 400
 # log10 of the Sun's surface gravity, cm s-2 (IAU 2015 nominal values).
 _LOG_G_SUN = 4.438
 # Hydrogen: Rydberg's wavelength in vacuum, A; lines of a series that are drawn.
@@ -109,11 +109,11 @@ def table(first: str, last: str) -> tuple[tuple[str, ...], dict[str, Float]]:
     with TABLE.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
     names = [row["SpT"] for row in rows]
-    kept = slice(names.index(first), names.index(last) + 1)
+    selected = slice(names.index(first), names.index(last) + 1)
     columns = {
-        title: np.array([float(row[title] or "nan") for row in rows[kept]]) for title in rows[0] if title != "SpT"
+        title: np.array([float(row[title] or "nan") for row in rows[selected]]) for title in rows[0] if title != "SpT"
     }
-    return tuple(names[kept]), columns
+    return tuple(names[selected]), columns
 
 
 def fingerprint() -> str:
@@ -136,42 +136,42 @@ def spectra(stars: StellarTypes, vega_wavelength: Float, vega_flux: Float) -> Fl
     pivots = np.log([passbands.pivot_wavelength(band) for band in bands])
     out = []
     for teff, colors in zip(stars.teff, stars.colors, strict=True):
-        start = planck(grid, teff) * absorbed(grid, teff)
-        out.append(_matched(np.log(grid), start, response / vega, pivots, colors))
-    return normalised(grid, np.stack(out))
+        start = planck(grid, teff) * feature_transmission(grid, teff)
+        out.append(_match_colors(np.log(grid), start, response / vega, pivots, colors))
+    return normalise(grid, np.stack(out))
 
 
 def planck(wavelength: Float, temperature: float) -> Float:
     """Planck's f_lambda, 1 at 5500 A; wavelength A, temperature K."""
-    middle = float(np.mean(NORMALISED))
+    middle = float(np.mean(NORMALISATION_RANGE))
     scale = PLANCK_ERG_S * LIGHT_ANGSTROM_S / (BOLTZMANN_ERG_K * temperature)
     at, reference = scale / wavelength, scale / middle
     # exp(-x) / (1 - exp(-x)), not 1 / (exp(x) - 1), which overflows in the far ultraviolet of cool stars.
     return np.asarray((middle / wavelength) ** 5 * np.exp(reference - at) * np.expm1(-reference) / np.expm1(-at))
 
 
-def normalised(wavelength: Float, flux: Float) -> Float:
+def normalise(wavelength: Float, flux: Float) -> Float:
     """flux [..., n_lambda] divided by its mean between 5450 and 5550 A."""
-    inside = (wavelength >= NORMALISED[0]) & (wavelength <= NORMALISED[1])
+    inside = (wavelength >= NORMALISATION_RANGE[0]) & (wavelength <= NORMALISATION_RANGE[1])
     return np.asarray(flux / flux[..., inside].mean(-1, keepdims=True))
 
 
-def _matched(log_wavelength: Float, start: Float, response: Float, pivots: Float, colors: Float) -> Float:
+def _match_colors(log_wavelength: Float, start: Float, response: Float, pivots: Float, colors: Float) -> Float:
     """`start` times 10^(-0.4 c) with the wanted colours; c is cubic between the pivots, constant outside."""
-    known = np.isfinite(colors)
-    at, v = pivots[known], int(np.sum(known[:_V]))
-    found = matching(log_wavelength, start, response[:, known], at, colors[known], v, _UNTIL)
-    return corrected(log_wavelength, start, at, found)
+    has_color = np.isfinite(colors)
+    at, v = pivots[has_color], int(np.sum(has_color[:_V]))
+    correction = color_correction(log_wavelength, start, response[:, has_color], at, colors[has_color], v, _TOLERANCE)
+    return apply_correction(log_wavelength, start, at, correction)
 
 
-def matching(
+def color_correction(
     log_wavelength: Float,
     start: Float,
     response: Float,
     pivots: Float,
     colors: Float,
-    tied: int,
-    until: tuple[float, int],
+    reference: int,
+    tolerance: tuple[float, int],
     first: Float | None = None,
 ) -> Float:
     """The correction at the pivots, mag, that brings the colours m_band - m_(band `tied`); see `corrected`.
@@ -182,17 +182,17 @@ def matching(
     pivots, colors : float64[n_band] log wavelengths of the correction, and the colours that are wanted, mag
     """
     correction = np.zeros(len(pivots)) if first is None else first
-    for _ in range(until[1]):
-        seen = sums.product(corrected(log_wavelength, start, pivots, correction), response)
-        mags = -2.5 * np.log10(seen)
-        missing = colors - (mags - mags[tied])
-        if np.abs(missing).max() < until[0]:
+    for _ in range(tolerance[1]):
+        fluxes = matrices.matmul(apply_correction(log_wavelength, start, pivots, correction), response)
+        mags = -2.5 * np.log10(fluxes)
+        color_error = colors - (mags - mags[reference])
+        if np.abs(color_error).max() < tolerance[0]:
             break
-        correction = correction + missing
+        correction = correction + color_error
     return correction
 
 
-def corrected(log_wavelength: Float, start: Float, pivots: Float, correction: Float) -> Float:
+def apply_correction(log_wavelength: Float, start: Float, pivots: Float, correction: Float) -> Float:
     """`start` times 10^(-0.4 c): c is the correction, cubic between the pivots, constant outside.
 
     log_wavelength, start : float64[n_lambda];  pivots, correction : float64[n_band] log wavelengths and mag there
@@ -203,7 +203,7 @@ def corrected(log_wavelength: Float, start: Float, pivots: Float, correction: Fl
     return np.asarray(start * 10.0 ** (-0.4 * PchipInterpolator(pivots, correction)(inside)))
 
 
-def absorbed(wavelength: Float, teff: float) -> Float:
+def feature_transmission(wavelength: Float, teff: float) -> Float:
     """Transmission of the features (stellar_features.csv) at a temperature: texture, colours come after."""
     transmission = np.ones_like(wavelength)
     hydrogen = np.exp(-0.5 * (np.log(teff / _HYDROGEN_PEAK) / _HYDROGEN_WIDTH) ** 2)
@@ -215,11 +215,11 @@ def absorbed(wavelength: Float, teff: float) -> Float:
                 strength = float(np.clip((hot - teff) / (hot - cool), 0.0, 1.0))
             else:
                 strength = float(hydrogen)
-            transmission *= 1.0 - strength * depth * shape(row["kind"], wavelength, centre, width)
+            transmission *= 1.0 - strength * depth * feature_profile(row["kind"], wavelength, centre, width)
     return transmission
 
 
-def shape(kind: str, wavelength: Float, centre: float, width: float) -> Float:
+def feature_profile(kind: str, wavelength: Float, centre: float, width: float) -> Float:
     """Shape with peak 1: line, band shaded to the red, edge, or hydrogen series (centre = lower level).
 
     kind       : line, band, edge or series

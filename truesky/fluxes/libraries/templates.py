@@ -21,9 +21,9 @@ import numpy as np
 from lake_schema.arrays import Float, Float32
 from truesky.fluxes import passbands
 from truesky.fluxes.libraries import brown_dwarfs, model_stars, rest_grid, standards, stellar, vega
-from truesky.fluxes.libraries.stellar import normalised, planck
+from truesky.fluxes.libraries.stellar import normalise, planck
 from truesky.numerics import cache
-from truesky.numerics.code_keys import code_key
+from truesky.numerics.code_fingerprints import code_key
 
 _ANCHORS = ("E", "Sbc", "Scd", "Im")
 # The published spectra end at 22050 A.
@@ -65,7 +65,7 @@ class Library:
     names: tuple[str, ...]
     types: stellar.StellarTypes | None = None
     dust: Float32 | None = None
-    own: bool = False
+    external: bool = False
     intergalactic: bool = False
 
     def __len__(self) -> int:
@@ -81,14 +81,14 @@ def galaxy_library() -> Library:
         *(vega.spectrum_file(f"CWW_{name}_ext.sed").read_bytes() for name in _ANCHORS),
     )
     wavelength = rest_grid.rest_grid()
-    arrays = cache.cached_arrays("galaxy_library", key, lambda: {"flux": galaxies(wavelength).astype(np.float32)})
+    arrays = cache.cached_arrays("galaxy_library", key, lambda: {"flux": galaxy_spectra(wavelength).astype(np.float32)})
     names = tuple(
         name for first, last, early, late, *_ in _SEQUENCE for name in [f"{early}-{late}"] * (last - first + 1)
     )
     return Library(wavelength, arrays["flux"], tuple(f"{k:02d} {name}" for k, name in enumerate(names)))
 
 
-def anchors_of(template: int) -> tuple[str, str]:
+def template_anchors(template: int) -> tuple[str, str]:
     """Names of the two spectra that a galaxy template is mixed of."""
     row = next(row for row in _SEQUENCE if row[0] <= template <= row[1])
     return row[2], row[3]
@@ -103,7 +103,7 @@ def stellar_library() -> Library:
     names = (*types.names, *brown_dwarfs.template_names(), *standards.NAMES, *model_stars.names())
     files = vega.spectrum_file("vega.txt").read_bytes(), model_stars.TABLE.read_bytes()
     key = cache.content_key(code_key(__name__), *files, stellar.fingerprint())
-    arrays = cache.cached_arrays("stellar_library", key, lambda: {"flux": _stars(types)})
+    arrays = cache.cached_arrays("stellar_library", key, lambda: {"flux": _star_spectra(types)})
     return Library(passbands.grid(), arrays["flux"], names, types)
 
 
@@ -112,7 +112,7 @@ def first_model() -> int:
     return len(stellar.types().names) + brown_dwarfs.COUNT + len(standards.NAMES)
 
 
-def _stars(types: stellar.StellarTypes) -> Float32:
+def _star_spectra(types: stellar.StellarTypes) -> Float32:
     dwarfs = stellar.spectra(types, *vega.vega())
     parts = [dwarfs, brown_dwarfs.spectra(), standards.spectra(*vega.vega()), model_stars.spectra(dwarfs, types)]
     return np.concatenate(parts).astype(np.float32)
@@ -124,34 +124,34 @@ def emission_wavelengths() -> Float:
         return np.array([float(row["vacuum"]) for row in csv.DictReader(file) if int(row["bridged"])])
 
 
-def galaxies(wavelength: Float, bridged: float = _LINE_MASK) -> Float:
+def galaxy_spectra(wavelength: Float, bridge_width: float = _LINE_MASK) -> Float:
     """f_lambda of the sequence, float64[31, n_lambda].
 
     bridged : a straight line stands in place of the spectrum so far about each emission line, A; < 0 = nowhere
     """
-    anchors = {name: _anchor(name, wavelength, bridged) for name in _ANCHORS}
-    anchors[YOUNG] = _young(wavelength)
+    anchors = {name: _anchor_spectrum(name, wavelength, bridge_width) for name in _ANCHORS}
+    anchors[YOUNG] = _young_spectrum(wavelength)
     spectra = []
     for first, last, early, late, offset, denominator, factor in _SEQUENCE:
         for k in range(first, last + 1):
             x = factor * (k - offset) / denominator
             spectra.append((1.0 - x) * anchors[early] + x * anchors[late])
-    return normalised(wavelength, np.stack(spectra))
+    return normalise(wavelength, np.stack(spectra))
 
 
-def _anchor(name: str, wavelength: Float, bridged: float) -> Float:
+def _anchor_spectrum(name: str, wavelength: Float, bridge_width: float) -> Float:
     table = np.loadtxt(vega.spectrum_file(f"CWW_{name}_ext.sed").read_text().splitlines())
     at, flux = table[:, 0], table[:, 1]
     # In the logarithm: the ultraviolet is sampled every 100 A, over which an elliptical fades by half.
     sampled = np.exp(np.interp(wavelength, at, np.log(flux), left=-np.inf))
     sampled = np.where(wavelength > at[-1], flux[-1] * (wavelength / at[-1]) ** _INFRARED_SLOPE, sampled)
-    away = (np.abs(wavelength[:, None] - emission_wavelengths()) > bridged).all(1)
-    return normalised(wavelength, np.interp(wavelength, wavelength[away], sampled[away]))
+    line_free = (np.abs(wavelength[:, None] - emission_wavelengths()) > bridge_width).all(1)
+    return normalise(wavelength, np.interp(wavelength, wavelength[line_free], sampled[line_free]))
 
 
-def _young(wavelength: Float) -> Float:
+def _young_spectrum(wavelength: Float) -> Float:
     parts = [
         share * planck(wavelength, temperature) * np.where(wavelength < _BALMER_EDGE, factor, 1.0)
         for temperature, share, factor in _YOUNG
     ]
-    return normalised(wavelength, np.sum(parts, 0) * np.where(wavelength < _LYMAN_EDGE, _BELOW_LYMAN, 1.0))
+    return normalise(wavelength, np.sum(parts, 0) * np.where(wavelength < _LYMAN_EDGE, _BELOW_LYMAN, 1.0))

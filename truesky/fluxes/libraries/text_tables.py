@@ -13,7 +13,7 @@ from itertools import takewhile
 import yaml
 
 # Characters of a line, of a header, and of all words, were each as long as the longest line.
-_LONGEST_LINE, _LONGEST_HEADER, _MOST_ROOM = 4096, 64 << 10, 64 << 20
+_MAX_LINE_LENGTH, _MAX_HEADER_LENGTH, _MAX_CHARACTERS = 4096, 64 << 10, 64 << 20
 # What ECSV names, and no type of numpy's besides: 9999999D is one, of 80 MB a row.
 _DATATYPES = {"bool", "string"} | {
     f"{kind}{bits}" for kind in ("int", "uint", "float") for bits in (8, 16, 32, 64, 128)
@@ -27,15 +27,15 @@ def refuse_large(lines: Sequence[str], has_header: bool) -> None:
 
     has_header : in YAML, as ECSV has it
     """
-    if max(map(len, lines), default=0) > _LONGEST_LINE:
-        raise ValueError(f"a line has more than {_LONGEST_LINE} characters")
+    if max(map(len, lines), default=0) > _MAX_LINE_LENGTH:
+        raise ValueError(f"a line has more than {_MAX_LINE_LENGTH} characters")
     header = list(takewhile(_is_header, lines)) if has_header else []
     _refuse_header([line.strip()[1:] for line in header])
     rows = lines[len(header) :]
     if any(line.count('"') % 2 for line in rows):
         raise ValueError("a text in quotes goes over more than one line")
     columns = 1 + max((line.count(",") + line.count(" ") + line.count("\t") for line in rows), default=0)
-    if len(rows) * columns * max(map(len, rows), default=0) > _MOST_ROOM:
+    if len(rows) * columns * max(map(len, rows), default=0) > _MAX_CHARACTERS:
         raise ValueError(f"{len(rows)} rows of {columns} words are too many where one is as long as its longest line")
 
 
@@ -44,9 +44,9 @@ def _is_header(line: str) -> bool:
 
 
 def _refuse_header(lines: Sequence[str]) -> None:
-    if sum(map(len, lines)) > _LONGEST_HEADER:
-        raise ValueError(f"its header has more than {_LONGEST_HEADER} characters")
-    before = None
+    if sum(map(len, lines)) > _MAX_HEADER_LENGTH:
+        raise ValueError(f"its header has more than {_MAX_HEADER_LENGTH} characters")
+    previous = None
     for event in yaml.parse(textwrap.dedent("\n".join(lines)), Loader=yaml.SafeLoader):
         if getattr(event, "anchor", None) is not None:
             raise ValueError(f"{event.anchor[:40]!r} in its header refers to another place of it")
@@ -55,6 +55,6 @@ def _refuse_header(lines: Sequence[str]) -> None:
         word = getattr(event, "value", None)
         if word == "subtype":
             raise ValueError("a curve's columns are numbers, none has a subtype")
-        if before == "datatype" and word is not None and word not in _DATATYPES:
+        if previous == "datatype" and word is not None and word not in _DATATYPES:
             raise ValueError(f"{word[:40]!r} is no datatype of ECSV")
-        before = word
+        previous = word

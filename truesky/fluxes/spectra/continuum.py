@@ -24,7 +24,7 @@ from truesky.fluxes import passbands
 from truesky.fluxes.libraries.templates import Library
 from truesky.fluxes.passbands import Passband
 from truesky.fluxes.spectra import extinction, intergalactic
-from truesky.numerics import sums
+from truesky.numerics import matrices
 
 REFERENCE_BAND = "sdss_r01"
 COMPONENTS = (1, 2)
@@ -32,7 +32,7 @@ EBV_MAX = 3.0
 
 
 @dataclass(frozen=True, slots=True)
-class Mix:
+class TemplateMix:
     """Two components of n galaxies.
 
     z_obs     : float64[n]
@@ -49,36 +49,36 @@ class Mix:
     def __len__(self) -> int:
         return len(self.z_obs)
 
-    def rows(self, chosen: Int | slice) -> Mix:
-        return Mix(
-            picked(self.z_obs, chosen),
-            picked(self.sed, chosen),
-            picked(self.law, chosen),
-            picked(self.frac, chosen),
-            picked(self.ebv, chosen),
+    def select(self, indices: Int | slice) -> TemplateMix:
+        return TemplateMix(
+            take_last_axis(self.z_obs, indices),
+            take_last_axis(self.sed, indices),
+            take_last_axis(self.law, indices),
+            take_last_axis(self.frac, indices),
+            take_last_axis(self.ebv, indices),
         )
 
 
 _Array = TypeVar("_Array", Float, Int)
 
 
-def picked(values: _Array, chosen: Int | slice) -> _Array:
+def take_last_axis(values: _Array, indices: Int | slice) -> _Array:
     """values[..., chosen]; by `take`, which is twice as fast as indexing."""
-    return values[..., chosen] if isinstance(chosen, slice) else np.take(values, chosen, -1)
+    return values[..., indices] if isinstance(indices, slice) else np.take(values, indices, -1)
 
 
-def dust_of(library: Library) -> Float32:
+def dust_curves(library: Library) -> Float32:
     """k(lambda) of the five laws on the grid of a library, float32[5, n_lambda]."""
     return extinction.laws(library.wavelength).astype(np.float32) if library.dust is None else library.dust
 
 
-def mix_of(columns: Mapping[str, npt.ArrayLike], library: Library) -> Mix:
+def mix_from_columns(columns: Mapping[str, npt.ArrayLike], library: Library) -> TemplateMix:
     """Checked Mix from the columns z_obs, sed_k, frac_k, ext_law_k, ebv_k (k = 1, 2) of the table `galaxies`.
 
     Errors: BadInput for a missing column or NaN; OutOfRange names the column
     """
-    needed = ["z_obs", *(f"{name}_{k}" for name in ("sed", "frac", "ext_law", "ebv") for k in COMPONENTS)]
-    if absent := [name for name in needed if name not in columns]:
+    required = ["z_obs", *(f"{name}_{k}" for name in ("sed", "frac", "ext_law", "ebv") for k in COMPONENTS)]
+    if absent := [name for name in required if name not in columns]:
         raise BadInput(f"galaxies: column {', '.join(absent)} is missing")
     grid = library.wavelength
     z_lo, z_hi = passbands.GRID_LAST / float(grid[-1]) - 1.0, passbands.GRID_FIRST / float(grid[0]) - 1.0
@@ -88,18 +88,18 @@ def mix_of(columns: Mapping[str, npt.ArrayLike], library: Library) -> Mix:
         "frac": (0.0, 1.0),
         "ebv": (0.0, EBV_MAX),
     }
-    values = {name: np.asarray(columns[name], float) for name in needed}
-    for name in needed:
-        within(name, values[name], *limits.get(name[:-2], (z_lo, z_hi)))
+    values = {name: np.asarray(columns[name], float) for name in required}
+    for name in required:
+        check_range(name, values[name], *limits.get(name[:-2], (z_lo, z_hi)))
     sed, frac, law, ebv = (
         np.stack([values[f"{name}_{k}"] for k in COMPONENTS]) for name in ("sed", "frac", "ext_law", "ebv")
     )
     if (frac.sum(0) <= 0.0).any():
         raise BadInput("galaxies: frac_1 and frac_2 are both 0")
-    return Mix(values["z_obs"], sed.astype(np.int64), law.astype(np.int64), frac, ebv)
+    return TemplateMix(values["z_obs"], sed.astype(np.int64), law.astype(np.int64), frac, ebv)
 
 
-def within(name: str, values: Float, lo: float, hi: float) -> None:
+def check_range(name: str, values: Float, lo: float, hi: float) -> None:
     """OutOfRange for the first value outside [lo, hi]; NaN is outside.
 
     name : in the refusal;  values : float64[...]
@@ -118,12 +118,12 @@ def rest_flux(sed: Int, law: Int, ebv: Float, band: Passband, library: Library, 
     first = int(band.wavelength[0] - library.wavelength[0])
     stretch = slice(first, first + len(band.wavelength))
     ebv32 = ebv.astype(np.float32)[:, None]
-    spectra = library.flux[:, stretch][sed] * extinction.transmitted(dust[:, stretch][law], ebv32)
+    spectra = library.flux[:, stretch][sed] * extinction.transmission(dust[:, stretch][law], ebv32)
     # Summed in double precision: the rounding then averages out, and no sum depends on its neighbours.
-    return np.asarray(sums.product(spectra, passbands.weights(band)))
+    return np.asarray(matrices.matmul(spectra, passbands.weights(band)))
 
 
-def amplitudes(mix: Mix, band: Passband, library: Library, dust: Float32) -> Float:
+def amplitudes(mix: TemplateMix, band: Passband, library: Library, dust: Float32) -> Float:
     """float64[2, n]: frac / rest-frame f_nu of each component in the reference band.
 
     mix  : components of n galaxies;  band : passband
@@ -137,7 +137,9 @@ def amplitudes(mix: Mix, band: Passband, library: Library, dust: Float32) -> Flo
     )
 
 
-def observed_shape(mix: Mix, amplitude: Float, library: Library, dust: Float32, first: int, count: int) -> Float32:
+def observed_shape(
+    mix: TemplateMix, amplitude: Float, library: Library, dust: Float32, first: int, count: int
+) -> Float32:
     """f_lambda in the observed frame at `count` whole angstroms from `first`: float32[n, count].
 
     amplitude : float64[2, n] factor of each component
@@ -147,13 +149,13 @@ def observed_shape(mix: Mix, amplitude: Float, library: Library, dust: Float32, 
     """
     shrink = 1.0 / (1.0 + mix.z_obs)
     start = first * shrink - library.wavelength[0]
-    whole = np.floor(start).astype(np.int64)
+    first_index = np.floor(start).astype(np.int64)
     # One sample more than the last one needs, to interpolate to.
-    width = int(np.max(np.floor(start + (count - 1) * shrink).astype(np.int64) - whole)) + 2
-    rest = _rest_shape(mix, (amplitude * shrink).astype(np.float32), library, dust, whole, width)
+    width = int(np.max(np.floor(start + (count - 1) * shrink).astype(np.int64) - first_index)) + 2
+    rest = _rest_shape(mix, (amplitude * shrink).astype(np.float32), library, dust, first_index, width)
     # Positions in double precision: 24000 A times the single-precision step would be off by 1e-3 A.
     position = shrink[:, None] * np.arange(float(count))
-    position += (start - whole + width * np.arange(len(mix)))[:, None]
+    position += (start - first_index + width * np.arange(len(mix)))[:, None]
     floor = np.floor(position)
     index = floor.astype(np.int64)
     position -= floor
@@ -168,7 +170,9 @@ def observed_shape(mix: Mix, amplitude: Float, library: Library, dust: Float32, 
     return shape
 
 
-def _rest_shape(mix: Mix, amplitude: Float32, library: Library, dust: Float32, start: Int, width: int) -> Float32:
+def _rest_shape(
+    mix: TemplateMix, amplitude: Float32, library: Library, dust: Float32, start: Int, width: int
+) -> Float32:
     """Combined and extinguished on `width` samples of the library's grid from `start`: float32[n, width]."""
     shared = bool((mix.law[0] == mix.law[1]).all() and (mix.ebv[0] == mix.ebv[1]).all())
     total = _windows(library.flux, mix.sed[0], start, width)
@@ -185,9 +189,9 @@ def _rest_shape(mix: Mix, amplitude: Float32, library: Library, dust: Float32, s
     return total
 
 
-def _transmission(mix: Mix, component: int, dust: Float32, start: Int, width: int) -> Float32:
+def _transmission(mix: TemplateMix, component: int, dust: Float32, start: Int, width: int) -> Float32:
     k = _windows(dust, mix.law[component], start, width)
-    out: Float32 = extinction.transmitted(k, mix.ebv[component].astype(np.float32)[:, None])
+    out: Float32 = extinction.transmission(k, mix.ebv[component].astype(np.float32)[:, None])
     return out
 
 
@@ -195,6 +199,6 @@ def _windows(table: Float32, row: Int, start: Int, width: int) -> Float32:
     """table[row[i], start[i] : start[i] + width] for every i; copying slices is faster than indexing."""
     out = np.zeros((len(row), width), np.float32)
     for i, (r, s) in enumerate(zip(row.tolist(), start.tolist(), strict=True)):
-        part = table[r, s : s + width]
-        out[i, : len(part)] = part
+        window = table[r, s : s + width]
+        out[i, : len(window)] = window
     return out

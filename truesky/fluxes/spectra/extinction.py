@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lake_schema.arrays import Float
-from truesky.numerics import sums
+from truesky.numerics import matrices
 
 LAW_COUNT = 5
 PREVOT, CALZETTI = 1, 2
@@ -72,7 +72,7 @@ def milky_way(wavelength: npt.ArrayLike) -> Float:
     return np.asarray(curve(1e4 / lam / u.um), float)
 
 
-def transmitted(k: npt.ArrayLike, ebv: npt.ArrayLike) -> Any:
+def transmission(k: npt.ArrayLike, ebv: npt.ArrayLike) -> Any:
     """10^(-0.4 k E(B-V)), in the precision of the arguments."""
     return np.exp(_LN_PER_MAG * np.asarray(k) * np.asarray(ebv))
 
@@ -95,8 +95,8 @@ def _prevot(lam: Float) -> Float:
 def _calzetti(lam: Float) -> Float:
     x = 1e4 / np.maximum(lam, _CALZETTI_FIRST)
     powers = x[None, :] ** np.arange(4)[:, None]
-    blue = _CALZETTI_SLOPE * sums.product(np.array(_CALZETTI_BLUE), powers) + _CALZETTI_R_V
-    red = _CALZETTI_SLOPE * sums.product(np.array(_CALZETTI_RED), powers[:2]) + _CALZETTI_R_V
+    blue = _CALZETTI_SLOPE * matrices.matmul(np.array(_CALZETTI_BLUE), powers) + _CALZETTI_R_V
+    red = _CALZETTI_SLOPE * matrices.matmul(np.array(_CALZETTI_RED), powers[:2]) + _CALZETTI_R_V
     # Below its first wavelength the law goes on along its tangent.
     x0 = 1e4 / _CALZETTI_FIRST
     tangent = -_CALZETTI_SLOPE * np.polyval(np.polyder(np.array(_CALZETTI_BLUE[::-1])), x0) * x0 / _CALZETTI_FIRST

@@ -27,11 +27,15 @@ LYMAN_LIMIT = 911.8
 _FOREST_LINES, _DAMPED_LINES = ((1.2, 3.7, 5.5), (2.2, 5.7)), ((2.0, 3.0), (3.0,))
 # Continuum: (amplitude, powers, breaks) of what is integrated over 1 + z; the section of hydrogen falls as lambda^-2.1
 # in the forest (its amplitude 0.3248 x 0.9), damped systems are opaque but for a part in lambda^-0.3.
-_FOREST, _FOREST_SECTION = (0.29232, (-1.9, 0.6, 2.4), (2.2, 5.7)), 2.1
-_OPAQUE, _CLEARER, _CLEARER_SECTION = (0.4226, (1.0, 2.0), (3.0,)), (0.176203, (1.3, 2.3), (3.0,)), -0.3
+_FOREST, _FOREST_CROSS_SECTION = (0.29232, (-1.9, 0.6, 2.4), (2.2, 5.7)), 2.1
+_DAMPED_OPAQUE, _DAMPED_LEAK, _DAMPED_LEAK_CROSS_SECTION = (
+    (0.4226, (1.0, 2.0), (3.0,)),
+    (0.176203, (1.3, 2.3), (3.0,)),
+    -0.3,
+)
 # A damped system of 1 + z lets through, by these laws, more than falls onto it below 912 A (1 + z) / 18.5: nothing is
 # absorbed there.
-_TRANSPARENT = (_CLEARER[0] / _OPAQUE[0]) ** (1.0 / _CLEARER_SECTION)
+_TRANSPARENCY_LIMIT = (_DAMPED_LEAK[0] / _DAMPED_OPAQUE[0]) ** (1.0 / _DAMPED_LEAK_CROSS_SECTION)
 
 
 def transmission(wavelength: npt.ArrayLike, z: npt.ArrayLike) -> Float:
@@ -41,52 +45,60 @@ def transmission(wavelength: npt.ArrayLike, z: npt.ArrayLike) -> Float:
     """
     at, stretch = np.asarray(wavelength, float), 1.0 + np.atleast_1d(np.asarray(z, float))
     depth = np.zeros((stretch.size, at.size))
-    for line, forest, damped in zip(*series(), strict=True):
-        seen = int(np.searchsorted(at, line * stretch.max(initial=0.0) + 0.5))
-        if not seen:
+    for line, forest, damped in zip(*lyman_series(), strict=True):
+        count = int(np.searchsorted(at, line * stretch.max(initial=0.0) + 0.5))
+        if not count:
             break
-        cloud = at[:seen] / line
-        deep = forest * _broken(cloud, *_FOREST_LINES) + damped * _broken(cloud, *_DAMPED_LINES)
+        cloud = at[:count] / line
+        cloud_depth = forest * _broken_power_law(cloud, *_FOREST_LINES) + damped * _broken_power_law(
+            cloud, *_DAMPED_LINES
+        )
         # The part of a bin in which there are clouds: behind us, and in front of the source.
-        inside = np.clip(line * stretch[:, None] - at[:seen] + 0.5, 0.0, 1.0) * (cloud > 1.0)
-        depth[:, :seen] += deep * inside
+        inside = np.clip(line * stretch[:, None] - at[:count] + 0.5, 0.0, 1.0) * (cloud > 1.0)
+        depth[:, :count] += cloud_depth * inside
     # Far below the limit the approximation's depth is less than nothing.
-    return np.asarray(np.exp(-np.maximum(depth + _continuum(at, stretch), 0.0)))
+    return np.asarray(np.exp(-np.maximum(depth + _continuum_depth(at, stretch), 0.0)))
 
 
-def sees(band: Passband, z: float) -> bool:
+def is_absorbed(band: Passband, z: float) -> bool:
     """Does it see absorption of some source up to this redshift?"""
-    return bool(band.wavelength[0] < series()[0][0] * (1.0 + z))
+    return bool(band.wavelength[0] < lyman_series()[0][0] * (1.0 + z))
 
 
 @lru_cache(maxsize=1)
-def series() -> tuple[tuple[float, ...], ...]:
+def lyman_series() -> tuple[tuple[float, ...], ...]:
     """(wavelength A, descending; depth in the forest; depth in damped systems) of the lines, at z = 0."""
     with TABLE.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     return tuple(tuple(float(row[name]) for row in rows) for name in ("wavelength", "forest", "damped"))
 
 
-def _continuum(at: Float, stretch: Float) -> Float:
+def _continuum_depth(at: Float, stretch: Float) -> Float:
     """Optical depth beyond the Lyman limit, [n, n_lambda]."""
     depth = np.zeros((stretch.size, at.size))
-    seen = int(np.searchsorted(at, LYMAN_LIMIT * stretch.max(initial=0.0) + 0.5))
-    if not seen:
+    count = int(np.searchsorted(at, LYMAN_LIMIT * stretch.max(initial=0.0) + 0.5))
+    if not count:
         return depth
-    x, whole = at[:seen] / LYMAN_LIMIT, np.maximum(stretch, 1.0)[:, None]
+    x, upper = at[:count] / LYMAN_LIMIT, np.maximum(stretch, 1.0)[:, None]
     # Clouds between us and the source whose limit lies redwards of the wavelength.
-    near = np.minimum(np.maximum(x, 1.0), whole)
-    damped = np.maximum(np.minimum(whole, _TRANSPARENT * x), near) if _TRANSPARENT * x[0] < whole.max() else whole
+    lower = np.minimum(np.maximum(x, 1.0), upper)
+    damped = (
+        np.maximum(np.minimum(upper, _TRANSPARENCY_LIMIT * x), lower)
+        if _TRANSPARENCY_LIMIT * x[0] < upper.max()
+        else upper
+    )
 
-    def between(law: tuple[float, tuple[float, ...], tuple[float, ...]], far: Float) -> Float:
-        return np.asarray(_integral(far, *law) - _integral(near, *law))
+    def depth_integral(law: tuple[float, tuple[float, ...], tuple[float, ...]], limit: Float) -> Float:
+        return np.asarray(_integral(limit, *law) - _integral(lower, *law))
 
-    depth[:, :seen] = x**_FOREST_SECTION * between(_FOREST, whole) + between(_OPAQUE, damped)
-    depth[:, :seen] -= x**_CLEARER_SECTION * between(_CLEARER, damped)
+    depth[:, :count] = x**_FOREST_CROSS_SECTION * depth_integral(_FOREST, upper) + depth_integral(
+        _DAMPED_OPAQUE, damped
+    )
+    depth[:, :count] -= x**_DAMPED_LEAK_CROSS_SECTION * depth_integral(_DAMPED_LEAK, damped)
     return depth
 
 
-def _broken(u: Float, powers: tuple[float, ...], breaks: tuple[float, ...]) -> Float:
+def _broken_power_law(u: Float, powers: tuple[float, ...], breaks: tuple[float, ...]) -> Float:
     """Continuous broken power law, 1 at u = 1."""
     value = u ** powers[0]
     for i, edge in enumerate(breaks):
@@ -98,7 +110,7 @@ def _integral(u: Float, amplitude: float, powers: tuple[float, ...], breaks: tup
     """Of amplitude times the broken power law from 1 to u >= 1."""
     total, lower = np.zeros(np.shape(u)), 1.0
     for power, upper in zip(powers, (*breaks, np.inf), strict=True):
-        at_lower = float(_broken(np.array([lower]), powers, breaks)[0])
+        at_lower = float(_broken_power_law(np.array([lower]), powers, breaks)[0])
         reach = np.clip(u, lower, upper)
         total += at_lower * lower / (power + 1.0) * ((reach / lower) ** (power + 1.0) - 1.0)
         lower = upper

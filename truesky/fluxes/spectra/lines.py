@@ -140,18 +140,18 @@ def profiles(
     from scipy.special import erf
 
     vacuum = np.array([line.vacuum for line in line_list()])
-    row, which = np.nonzero(fluxes > 0.0)
-    centre = observed_wavelength(vacuum[which], z_obs[row], medium)
+    row, line_index = np.nonzero(fluxes > 0.0)
+    centre = observed_wavelength(vacuum[line_index], z_obs[row], medium)
     width = sigma[row] / LIGHT_KM_S * centre
     reach = _REACH * width + 1.0
-    near = (centre + reach >= first_wanted) & (centre - reach <= last_wanted)
-    row, which, centre, width = row[near], which[near], centre[near], width[near]
+    in_range = (centre + reach >= first_wanted) & (centre - reach <= last_wanted)
+    row, line_index, centre, width = row[in_range], line_index[in_range], centre[in_range], width[in_range]
     half = int(np.ceil(_REACH * width.max(initial=0.0))) + 1
     first = np.rint(centre).astype(np.int64) - half
     edges = first[:, None] - 0.5 + np.arange(2 * half + 2)
     cumulative = 0.5 * erf((edges - centre[:, None]) / (np.sqrt(2.0) * width[:, None]))
     inside = cumulative[:, -1:] - cumulative[:, :1]
-    return Profiles(row, first, np.diff(cumulative, axis=1) * (fluxes[row, which][:, None] / inside))
+    return Profiles(row, first, np.diff(cumulative, axis=1) * (fluxes[row, line_index][:, None] / inside))
 
 
 def add(spectra: Float, first: int, lines: Profiles) -> Float:

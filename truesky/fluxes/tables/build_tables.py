@@ -20,9 +20,9 @@ from truesky.fluxes import passbands
 from truesky.fluxes.libraries.templates import Library
 from truesky.fluxes.passbands import Passband
 from truesky.fluxes.spectra import extinction, intergalactic, lines
-from truesky.fluxes.spectra.continuum import REFERENCE_BAND, dust_of, rest_flux
-from truesky.numerics import cache, sums
-from truesky.numerics.code_keys import code_key
+from truesky.fluxes.spectra.continuum import REFERENCE_BAND, dust_curves, rest_flux
+from truesky.numerics import cache, matrices
+from truesky.numerics.code_fingerprints import code_key
 
 # What the tables of galaxies cover: any redshift that a request may ask for, with its peculiar velocity.
 Z_FIRST, Z_LAST = -0.021, 3.03
@@ -63,7 +63,7 @@ class Setting:
 def library_key(library: Library) -> str:
     """Key of a library's spectra and of the dust in front of them; a tenth of a second, once a library."""
     absorbed = [code_key(intergalactic.__name__)] if library.intergalactic else []
-    return cache.content_key(library.wavelength, np.asarray(library.flux), dust_of(library), *absorbed)
+    return cache.content_key(library.wavelength, np.asarray(library.flux), dust_curves(library), *absorbed)
 
 
 def galaxy_table(band: Passband, library: Library, setting: Setting, key: str) -> Float32:
@@ -76,9 +76,11 @@ def galaxy_table(band: Passband, library: Library, setting: Setting, key: str) -
     """
     reference = passbands.load(REFERENCE_BAND)
     numbers = (setting.step, setting.n_ebv, setting.n_av)
-    full_key = cache.content_key(code_key(__name__), key, *numbers, *_curve(band), *_curve(reference))
+    full_key = cache.content_key(code_key(__name__), key, *numbers, *_curve_arrays(band), *_curve_arrays(reference))
     arrays = cache.cached_arrays(
-        f"galaxy_table_{band.name}", full_key, lambda: {"galaxies": _galaxies(library, band, reference, setting)}
+        f"galaxy_table_{band.name}",
+        full_key,
+        lambda: {"galaxies": _compute_galaxy_table(library, band, reference, setting)},
     )
     return arrays["galaxies"]
 
@@ -88,8 +90,10 @@ def star_table(band: Passband, library: Library, key: str) -> Float32:
 
     Error: 1e-6 (tests/truesky/fluxes/tables/test_flux_tables.py)
     """
-    full_key = cache.content_key(code_key(__name__), key, *_curve(band))
-    arrays = cache.cached_arrays(f"star_table_{band.name}", full_key, lambda: {"stars": _stars(library, band)})
+    full_key = cache.content_key(code_key(__name__), key, *_curve_arrays(band))
+    arrays = cache.cached_arrays(
+        f"star_table_{band.name}", full_key, lambda: {"stars": _compute_star_table(library, band)}
+    )
     return arrays["stars"]
 
 
@@ -98,12 +102,12 @@ def line_table(band: Passband) -> tuple[float, Float32]:
 
     Uniform in ln(lambda) by LINE_STEP; the columns are LINE_SIGMA.
     """
-    full_key = cache.content_key(code_key(__name__), LINE_SIGMA, *_curve(band))
-    arrays = cache.cached_arrays(f"line_table_{band.name}", full_key, lambda: _lines(band))
+    full_key = cache.content_key(code_key(__name__), LINE_SIGMA, *_curve_arrays(band))
+    arrays = cache.cached_arrays(f"line_table_{band.name}", full_key, lambda: _compute_line_table(band))
     return float(arrays["first"][0]), arrays["lines"]
 
 
-def nodes(count: int, last: float) -> Float:
+def chebyshev_nodes(count: int, last: float) -> Float:
     """Chebyshev's nodes in [0, last]; a single one is for what stands before the dust."""
     if count == 1:
         return np.zeros(1)
@@ -115,14 +119,14 @@ def chebyshev(values: Float, last: float, count: int) -> Float:
     return np.asarray(np.polynomial.chebyshev.chebvander(2.0 * values / last - 1.0, count - 1))
 
 
-def _curve(band: Passband) -> tuple[Float, Float]:
+def _curve_arrays(band: Passband) -> tuple[Float, Float]:
     return band.wavelength, band.response
 
 
-def _galaxies(library: Library, band: Passband, reference: Passband, setting: Setting) -> Float32:
+def _compute_galaxy_table(library: Library, band: Passband, reference: Passband, setting: Setting) -> Float32:
     """By the transposed problem: at each redshift the weights of the band are moved, once for all spectra."""
-    dust = dust_of(library)
-    ebv, a_v = nodes(setting.n_ebv, EBV_LAST), nodes(setting.n_av, A_V_LAST)
+    dust = dust_curves(library)
+    ebv, a_v = chebyshev_nodes(setting.n_ebv, EBV_LAST), chebyshev_nodes(setting.n_av, A_V_LAST)
     shape = (len(library), extinction.LAW_COUNT - 1, setting.n_ebv)
     sed, law, node = (axis.ravel() for axis in np.indices(shape))
     law += 1
@@ -131,41 +135,41 @@ def _galaxies(library: Library, band: Passband, reference: Passband, setting: Se
     first = int(band.wavelength[0] / np.exp(farthest) - library.wavelength[0])
     last = int(band.wavelength[-1] / np.exp(nearest) - library.wavelength[0]) + 2
     spectra = library.flux[sed, first:last]
-    spectra *= extinction.transmitted(dust[law, first:last], ebv[node].astype(np.float32)[:, None])
+    spectra *= extinction.transmission(dust[law, first:last], ebv[node].astype(np.float32)[:, None])
     # By wavelength, as the sums go.
     spectra = np.ascontiguousarray(spectra.T)
     weights = passbands.weights(band)
     total = float(weights.sum())
-    dimmed = weights / total * extinction.transmitted(extinction.milky_way(band.wavelength), a_v[:, None])
+    dimmed = weights / total * extinction.transmission(extinction.milky_way(band.wavelength), a_v[:, None])
     observed = np.empty((setting.z_count, len(sed), setting.n_av))
     for i in range(setting.z_count):
         stretch = np.exp(setting.log_z(i))
-        left = dimmed / stretch
+        weights_at_z = dimmed / stretch
         if library.intergalactic:
-            left = left * intergalactic.transmission(band.wavelength, stretch - 1.0)
-        low, moved = _moved(band.wavelength / stretch - library.wavelength[first], left)
-        observed[i] = sums.product(moved, spectra[low : low + moved.shape[1]]).T
+            weights_at_z = weights_at_z * intergalactic.transmission(band.wavelength, stretch - 1.0)
+        low, shifted = _shift_weights(band.wavelength / stretch - library.wavelength[first], weights_at_z)
+        observed[i] = matrices.matmul(shifted, spectra[low : low + shifted.shape[1]]).T
     # A template without flux that far in the ultraviolet: as faint as single precision goes.
     np.maximum(observed, np.finfo(np.float32).tiny, out=observed)
     observed *= (total / at_rest)[:, None]
     log_ratio = np.log(observed).reshape(setting.z_count, *shape, setting.n_av)
     to_ebv, to_av = _to_coefficients(setting.n_ebv), _to_coefficients(setting.n_av)
-    in_av = np.moveaxis(sums.product(log_ratio, to_av.T), 3, 4)
-    table = np.moveaxis(sums.product(in_av, to_ebv.T), (0, 4), (2, 3))
+    in_av = np.moveaxis(matrices.matmul(log_ratio, to_av.T), 3, 4)
+    table = np.moveaxis(matrices.matmul(in_av, to_ebv.T), (0, 4), (2, 3))
     return np.ascontiguousarray(table.reshape(*shape[:2], setting.z_count, -1), np.float32)
 
 
-def _stars(library: Library, band: Passband) -> Float32:
-    a_v = nodes(STAR_COEFFICIENTS, STAR_A_V_LAST)
+def _compute_star_table(library: Library, band: Passband) -> Float32:
+    a_v = chebyshev_nodes(STAR_COEFFICIENTS, STAR_A_V_LAST)
     inside = slice(band.first, band.first + len(band.wavelength))
-    dimmed = passbands.weights(band) * extinction.transmitted(extinction.milky_way(band.wavelength), a_v[:, None])
-    f_nu = sums.product(library.flux[:, inside], dimmed.T)
+    dimmed = passbands.weights(band) * extinction.transmission(extinction.milky_way(band.wavelength), a_v[:, None])
+    f_nu = matrices.matmul(library.flux[:, inside], dimmed.T)
     # Cool stars have nothing left in the ultraviolet.
     f_nu = np.maximum(f_nu, np.finfo(float).tiny)
-    return np.asarray(sums.product(np.log(f_nu), _to_coefficients(STAR_COEFFICIENTS).T), np.float32)
+    return np.asarray(matrices.matmul(np.log(f_nu), _to_coefficients(STAR_COEFFICIENTS).T), np.float32)
 
 
-def _lines(band: Passband) -> dict[str, npt.NDArray[np.generic]]:
+def _compute_line_table(band: Passband) -> dict[str, npt.NDArray[np.generic]]:
     """The band's weights, constant over each bin of 1 A, convolved with Gaussians."""
     from scipy.special import erf
 
@@ -182,26 +186,28 @@ def _lines(band: Passband) -> dict[str, npt.NDArray[np.generic]]:
         width = sigma * centre
         low = np.searchsorted(edges, centre - _LINE_REACH * width)
         index = low[:, None] + np.arange(int(2.0 * _LINE_REACH * width[-1]) + 2)
-        near = index < len(edges)
+        inside = index < len(edges)
         index = np.minimum(index, len(edges) - 1)
-        passed = 0.5 * (1.0 + erf((centre[:, None] - edges[index]) / (np.sqrt(2.0) * width[:, None])))
+        cumulative = 0.5 * (1.0 + erf((centre[:, None] - edges[index]) / (np.sqrt(2.0) * width[:, None])))
         # All steps further down have been passed by the whole line.
-        out[:, k] = np.where(low > 0, level[low - 1], 0.0) + (np.where(near, steps[index], 0.0) * passed).sum(1)
+        out[:, k] = np.where(low > 0, level[low - 1], 0.0) + (np.where(inside, steps[index], 0.0) * cumulative).sum(1)
     return {"first": np.array([first]), "lines": out}
 
 
-def _moved(position: Float, weights: Float) -> tuple[int, Float]:
+def _shift_weights(position: Float, weights: Float) -> tuple[int, Float]:
     """Weights [m, n] of linear interpolation at positions [n], summed on the whole ones: (first, [m, w])."""
     index = np.floor(position).astype(np.int64)
-    part = position - index
+    fraction = position - index
     low, width = int(index[0]), int(index[-1] - index[0]) + 2
     index -= low
-    sums = [np.bincount(index, w * (1.0 - part), width) + np.bincount(index + 1, w * part, width) for w in weights]
-    return low, np.stack(sums)
+    shifted = [
+        np.bincount(index, w * (1.0 - fraction), width) + np.bincount(index + 1, w * fraction, width) for w in weights
+    ]
+    return low, np.stack(shifted)
 
 
 def _to_coefficients(count: int) -> Float:
     """Matrix from values at the nodes to coefficients: at the nodes the polynomials are orthogonal."""
     return np.asarray(
-        chebyshev(nodes(count, 1.0), 1.0, count).T * np.where(np.arange(count) > 0, 2.0, 1.0)[:, None] / count
+        chebyshev(chebyshev_nodes(count, 1.0), 1.0, count).T * np.where(np.arange(count) > 0, 2.0, 1.0)[:, None] / count
     )

@@ -17,12 +17,12 @@ from truesky.fluxes.libraries.templates import Library
 from truesky.fluxes.passbands import Passband
 from truesky.fluxes.sources import Galaxies
 from truesky.fluxes.spectra import extinction, intergalactic, lines
-from truesky.fluxes.spectra.continuum import Mix
+from truesky.fluxes.spectra.continuum import TemplateMix
 from truesky.fluxes.tables import build_tables, flux_tables, settings
 from truesky.fluxes.tables.build_tables import Setting
 from truesky.fluxes.tables.settings import CANDIDATES, MARGIN, Choice
 from truesky.numerics import cache
-from truesky.numerics.code_keys import code_key
+from truesky.numerics.code_fingerprints import code_key
 from truesky.request.accuracy import Accuracy
 
 # The largest error of so few is less than that of many; the margin is for that.
@@ -35,40 +35,40 @@ def choose(bands: Sequence[Passband], accuracy: Accuracy, library: Library) -> t
     For an external passband or library, or one behind absorbing gas, the errors of 4000 random galaxies decide, from
     the setting upwards that is fine enough for all bands with the embedded library.
     """
-    known = settings.choose([band.name for band in bands], accuracy)
+    embedded_choices = settings.choose([band.name for band in bands], accuracy)
     return tuple(
-        _fine_enough(band, choice, accuracy, library)
-        if library.own or band.name not in settings.known() or _is_absorbed(band, library)
+        _smallest_choice(band, choice, accuracy, library)
+        if library.external or band.name not in settings.measured_bands() or _is_absorbed(band, library)
         else choice
-        for band, choice in zip(bands, known, strict=True)
+        for band, choice in zip(bands, embedded_choices, strict=True)
     )
 
 
 def _is_absorbed(band: Passband, library: Library) -> bool:
-    return library.intergalactic and intergalactic.sees(band, build_tables.Z_LAST)
+    return library.intergalactic and intergalactic.is_absorbed(band, build_tables.Z_LAST)
 
 
-def measured(band: Passband, setting: Setting, library: Library) -> Choice:
+def measure(band: Passband, setting: Setting, library: Library) -> Choice:
     """Errors of a setting, rms and largest, against integration."""
     library_key = build_tables.library_key(library)
     numbers = (setting.step, setting.n_ebv, setting.n_av)
-    about = (*numbers, band.wavelength, band.response, band.medium, _SAMPLE, _SEED)
-    key = cache.content_key(code_key(__name__), library_key, *about)
+    key_values = (*numbers, band.wavelength, band.response, band.medium, _SAMPLE, _SEED)
+    key = cache.content_key(code_key(__name__), library_key, *key_values)
 
     def make() -> dict[str, Array]:
-        rows = drawn(_SAMPLE, len(library), np.random.default_rng(_SEED))
-        fast = flux_tables.galaxies(rows, flux_tables.open_grid([band], [setting], library))
-        error = np.abs(fast / integration.galaxies(rows, [band], library) - 1.0)
+        rows = draw_galaxies(_SAMPLE, len(library), np.random.default_rng(_SEED))
+        fast = flux_tables.galaxy_fluxes(rows, flux_tables.open_grid([band], [setting], library))
+        error = np.abs(fast / integration.galaxy_fluxes(rows, [band], library) - 1.0)
         return {"errors": np.array([np.sqrt(np.mean(error**2)), error.max()])}
 
     rms, largest = cache.cached_arrays(f"flux_errors_{band.name}", key, make)["errors"]
     return Choice(setting, float(f"{rms:.2e}"), float(f"{largest:.2e}"))
 
 
-def drawn(n: int, n_template: int, rng: np.random.Generator) -> Galaxies:
+def draw_galaxies(n: int, n_template: int, rng: np.random.Generator) -> Galaxies:
     """Galaxies in two components with all their lines, uniform over all that the tables cover."""
     frac = rng.uniform(0.0, 1.0, n)
-    mix = Mix(
+    mix = TemplateMix(
         rng.uniform(build_tables.Z_FIRST, build_tables.Z_LAST, n),
         rng.integers(0, n_template, (2, n)),
         rng.integers(0, extinction.LAW_COUNT, (2, n)),
@@ -85,11 +85,11 @@ def drawn(n: int, n_template: int, rng: np.random.Generator) -> Galaxies:
     )
 
 
-def _fine_enough(band: Passband, first: Choice, accuracy: Accuracy, library: Library) -> Choice:
-    if first.setting is None:
-        return first
-    for setting in CANDIDATES[CANDIDATES.index(first.setting) :]:
-        choice = measured(band, setting, library)
+def _smallest_choice(band: Passband, first_choice: Choice, accuracy: Accuracy, library: Library) -> Choice:
+    if first_choice.setting is None:
+        return first_choice
+    for setting in CANDIDATES[CANDIDATES.index(first_choice.setting) :]:
+        choice = measure(band, setting, library)
         if MARGIN * choice.largest <= accuracy.flux:
             return choice
     return settings.INTEGRATED

@@ -27,7 +27,7 @@ from truesky.fluxes.libraries.templates import Library
 from truesky.fluxes.passbands import Passband
 from truesky.fluxes.sources import Galaxies, Stars
 from truesky.fluxes.spectra import extinction, lines
-from truesky.fluxes.spectra.continuum import REFERENCE_BAND, Mix
+from truesky.fluxes.spectra.continuum import REFERENCE_BAND, TemplateMix
 from truesky.fluxes.tables import build_tables, kernels
 from truesky.fluxes.tables.build_tables import (
     A_V_LAST,
@@ -91,7 +91,7 @@ def open_grid(bands: Sequence[Passband], settings: Sequence[Setting], library: L
     )
 
 
-def galaxies(rows: Galaxies, grid: Grid) -> Float:
+def galaxy_fluxes(rows: Galaxies, grid: Grid) -> Float:
     """f_nu, float64[n, n_band] microjansky, of galaxies that are `covered`: what integration.galaxies gives.
 
     Error: as measured of each setting in each band (flux_errors.csv)
@@ -102,41 +102,60 @@ def galaxies(rows: Galaxies, grid: Grid) -> Float:
     order = np.argsort((np.log1p(np.maximum(rows.mix.z_obs - Z_FIRST, 0.0)) * span).astype(np.uint16), kind="stable")
     out = np.empty((len(rows), len(grid.tables)))
     for start in range(0, len(rows), _CHUNK):
-        part = order[start : start + _CHUNK]
-        _chunk(rows.rows(part), grid, part, out)
+        indices = order[start : start + _CHUNK]
+        _fill_chunk(rows.select(indices), grid, indices, out)
     return out
 
 
-def _chunk(rows: Galaxies, grid: Grid, part: Int, out: Float) -> None:
+def _fill_chunk(rows: Galaxies, grid: Grid, indices: Int, out: Float) -> None:
     """Fills out[part]."""
     log_z = np.log1p(rows.mix.z_obs)
-    observed = _ratios(rows.mix, log_z, np.zeros(len(rows)), (REFERENCE_SETTING,), (grid.reference,))[0]
-    ratios = _ratios(rows.mix, log_z, rows.a_v, grid.settings, grid.tables)
+    observed = _component_ratios(rows.mix, log_z, np.zeros(len(rows)), (REFERENCE_SETTING,), (grid.reference,))[0]
+    ratios = _component_ratios(rows.mix, log_z, rows.a_v, grid.settings, grid.tables)
     scale = continuum_scale(rows.mag_r01, (rows.mix.frac * observed).sum(0))
     sigma = lines.velocity_dispersion(rows.abs_mag_r01, rows.mix.z_obs)
     width = np.clip(np.searchsorted(LINE_SIGMA, sigma, "right") - 1, 0, len(LINE_SIGMA) - 2)
     low, high = LINE_SIGMA[width] ** 2, LINE_SIGMA[width + 1] ** 2
-    drawn = grid.lines
+    line_grid = grid.lines
     centre, flux = np.empty((*rows.lines.shape, 2)), np.empty((*rows.lines.shape, 2))
     kernels.line_centres(
-        rows.lines, log_z, rows.a_v, drawn.vacuum, lines.refractivity_terms(), grid.milky_way,
+        rows.lines, log_z, rows.a_v, line_grid.vacuum, lines.refractivity_terms(), grid.milky_way,
         float(passbands.GRID_FIRST), centre, flux,
     )  # fmt: skip
-    kernels.add_up(
-        ratios, rows.mix.frac, scale, centre, flux, width, (sigma**2 - low) / (high - low), drawn.tables, drawn.start,
-        drawn.last, drawn.medium, drawn.first, LINE_STEP, drawn.cells, drawn.members, drawn.cell_first, _CELL,
-        units.ujy_of_cgs(rows.magnification), part, out,
-    )  # fmt: skip
+    kernels.sum_components(
+        ratios,
+        rows.mix.frac,
+        scale,
+        centre,
+        flux,
+        width,
+        (sigma**2 - low) / (high - low),
+        line_grid.tables,
+        line_grid.start,
+        line_grid.last,
+        line_grid.medium,
+        line_grid.first,
+        LINE_STEP,
+        line_grid.cells,
+        line_grid.members,
+        line_grid.cell_first,
+        _CELL,
+        units.ujy_of_cgs(rows.magnification),
+        indices,
+        out,
+    )
 
 
 def compile_kernels(grid: Grid) -> None:
     """Compile, by computing one galaxy."""
-    one, two = np.ones(1), np.zeros((2, 1))
-    mix = Mix(one, two.astype(np.int64), two.astype(np.int64), two + 0.5, two)
-    galaxies(Galaxies(mix, -20.0 * one, 20.0 * one, np.full((1, len(lines.line_list())), 1e-17), one, one), grid)
+    ones, zeros = np.ones(1), np.zeros((2, 1))
+    mix = TemplateMix(ones, zeros.astype(np.int64), zeros.astype(np.int64), zeros + 0.5, zeros)
+    galaxy_fluxes(
+        Galaxies(mix, -20.0 * ones, 20.0 * ones, np.full((1, len(lines.line_list())), 1e-17), ones, ones), grid
+    )
 
 
-def stars(rows: Stars, bands: Sequence[Passband], library: Library) -> Float:
+def star_fluxes(rows: Stars, bands: Sequence[Passband], library: Library) -> Float:
     """f_nu, float64[n, n_band] microjansky, of stars that are covered: what integration.stars gives, within 1e-6."""
     key = build_tables.library_key(library)
     basis = build_tables.chebyshev(rows.a_v, STAR_A_V_LAST, build_tables.STAR_COEFFICIENTS)
@@ -148,12 +167,12 @@ def stars(rows: Stars, bands: Sequence[Passband], library: Library) -> Float:
     return units.ujy_of_cgs(f_nu).T
 
 
-def covered(rows: Galaxies) -> Bool:
+def covered_galaxies(rows: Galaxies) -> Bool:
     """Which galaxies the tables cover, bool[n]; a component without flux, or without a law, may have any E(B-V)."""
     mix = rows.mix
     dusty = (mix.ebv > EBV_LAST) & (mix.law > 0) & (mix.frac > 0.0)
-    near = (mix.z_obs >= Z_FIRST) & (mix.z_obs <= Z_LAST)
-    return np.asarray(near & ~dusty.any(0) & (rows.a_v <= A_V_LAST))
+    in_range = (mix.z_obs >= Z_FIRST) & (mix.z_obs <= Z_LAST)
+    return np.asarray(in_range & ~dusty.any(0) & (rows.a_v <= A_V_LAST))
 
 
 def covered_stars(rows: Stars) -> Bool:
@@ -161,30 +180,34 @@ def covered_stars(rows: Stars) -> Bool:
     return np.asarray(rows.a_v <= STAR_A_V_LAST)
 
 
-def _ratios(mix: Mix, log_z: Float, a_v: Float, settings: Sequence[Setting], tables: Sequence[Float32]) -> Float32:
+def _component_ratios(
+    mix: TemplateMix, log_z: Float, a_v: Float, settings: Sequence[Setting], tables: Sequence[Float32]
+) -> Float32:
     """f_nu of each component in each band relative to the reference band at rest: float32[n_band, 2, n]."""
     # Most bands share their nodes, or their polynomials, with another.
     distinct = set(settings)
     steps = {s.step: s for s in distinct}
-    places = {step: _place(setting, mix, log_z) for step, setting in steps.items()}
+    nodes = {step: _find_nodes(setting, mix, log_z) for step, setting in steps.items()}
     orders = {(s.n_ebv, s.n_av): s for s in distinct}
-    products = {order: _products(setting, mix, a_v) for order, setting in orders.items()}
+    products = {order: _chebyshev_products(setting, mix, a_v) for order, setting in orders.items()}
     out = np.empty((len(tables), 2, len(mix)), np.float32)
     for k, (setting, table) in enumerate(zip(settings, tables, strict=True)):
-        kernels.log_ratios(table, *places[setting.step], products[setting.n_ebv, setting.n_av], out[k])
+        kernels.log_ratios(table, *nodes[setting.step], products[setting.n_ebv, setting.n_av], out[k])
     return np.exp(out, out=out)
 
 
-def _place(setting: Setting, mix: Mix, log_z: Float) -> tuple[Int, Float32]:
+def _find_nodes(setting: Setting, mix: TemplateMix, log_z: Float) -> tuple[Int, Float32]:
     first, z_weights = np.empty((2, len(mix)), np.int64), np.empty((len(mix), 4), np.float32)
     n_law = extinction.LAW_COUNT - 1
-    kernels.place(log_z, mix.sed, mix.law, n_law, setting.log_z(0), setting.step, setting.z_count, first, z_weights)
+    kernels.find_nodes(
+        log_z, mix.sed, mix.law, n_law, setting.log_z(0), setting.step, setting.z_count, first, z_weights
+    )
     return first, z_weights
 
 
-def _products(setting: Setting, mix: Mix, a_v: Float) -> Float32:
+def _chebyshev_products(setting: Setting, mix: TemplateMix, a_v: Float) -> Float32:
     basis = np.empty((2, len(mix), setting.n_ebv * setting.n_av), np.float32)
-    kernels.products(mix.law, mix.ebv, a_v, EBV_LAST, A_V_LAST, setting.n_ebv, setting.n_av, basis)
+    kernels.chebyshev_products(mix.law, mix.ebv, a_v, EBV_LAST, A_V_LAST, setting.n_ebv, setting.n_av, basis)
     return basis
 
 

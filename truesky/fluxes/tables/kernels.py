@@ -18,7 +18,7 @@ from truesky.numerics.compiling import exact_jit, jit
 
 
 @jit
-def place(
+def find_nodes(
     log_z: Float, sed: Int, law: Int, n_law: int, log_first: float, step: float, z_count: int,
     first: Int, z_weights: Float32,
 ) -> None:  # fmt: skip
@@ -41,7 +41,7 @@ def place(
 
 
 @jit
-def products(
+def chebyshev_products(
     law: Int, ebv: Float, a_v: Float, ebv_last: float, a_v_last: float, n_ebv: int, n_av: int, basis: Float32
 ) -> None:
     """Fills basis, float32[2, n, n_ebv * n_av]: products of Chebyshev polynomials in E(B-V), [2, n], and A_V, [n].
@@ -53,21 +53,21 @@ def products(
     in_av, flat, n, width = np.empty(n_av, np.float32), basis.ravel(), len(a_v), np.uint64(n_av)
     for i in range(n):
         x = 2.0 * a_v[i] / a_v_last - 1.0
-        before, now = x, 1.0
+        previous, current = x, 1.0
         for q in range(n_av):
-            in_av[q] = now
-            before, now = now, 2.0 * x * now - before
+            in_av[q] = current
+            previous, current = current, 2.0 * x * current - previous
         for k in range(2):
             # A component without flux may have any E(B-V).
             x = 2.0 * (min(ebv[k, i], ebv_last) if law[k, i] > 0 else 0.0) / ebv_last - 1.0
-            before, now = x, 1.0
+            previous, current = x, 1.0
             at = np.uint64((k * n + i) * n_ebv * n_av)
             for _ in range(n_ebv):
-                factor = np.float32(now)
+                factor = np.float32(current)
                 for q in range(width):
                     flat[at + q] = factor * in_av[q]
                 at += width
-                before, now = now, 2.0 * x * now - before
+                previous, current = current, 2.0 * x * current - previous
 
 
 @jit
@@ -114,9 +114,9 @@ def line_centres(
             if fluxes[i, j] == 0.0 or position < 0.0 or position >= len(curve) - 1:
                 continue
             square = 1e8 / (lam * lam)
-            part = 1e-8 * (ciddor[0, 0] / (ciddor[0, 1] - square) + ciddor[1, 0] / (ciddor[1, 1] - square))
+            refractivity = 1e-8 * (ciddor[0, 0] / (ciddor[0, 1] - square) + ciddor[1, 0] / (ciddor[1, 1] - square))
             # ln(1 + part), to 1e-11.
-            shift = part * (1.0 - 0.5 * part)
+            shift = refractivity * (1.0 - 0.5 * refractivity)
             centre[i, j, 0] = log_vacuum[j] + log_z[i]
             centre[i, j, 1] = centre[i, j, 0] - shift
             low = int(position)
@@ -127,7 +127,7 @@ def line_centres(
 
 
 @jit
-def add_up(
+def sum_components(
     ratios: Float32, frac: Float, scale: Float, centre: Float, flux: Float, width: Int, share: Float,
     tables: Float32, start: UInt32, last: Int32, medium: UInt32, first: Float, step: float, cells: Int,
     members: UInt32, cell_first: float, cell_step: float, magnification: Float, rows: Int, out: Float,
@@ -145,7 +145,7 @@ def add_up(
     cell_first, cell_step : ln(lambda) where the first wavelength cell begins, and the width of a cell
     """
     per_row, per_cell, n_band = 1.0 / step, 1.0 / cell_step, len(first)
-    flat, widths, one = tables.ravel(), np.uint32(tables.shape[1]), np.uint32(1)
+    flat, widths, unit = tables.ravel(), np.uint32(tables.shape[1]), np.uint32(1)
     total = np.empty(n_band)
     for i in range(len(rows)):
         early, late = frac[0, i] * scale[i], frac[1, i] * scale[i]
@@ -162,11 +162,11 @@ def add_up(
                 low = np.int32(position)
                 if position < 0.0 or low >= last[b]:
                     continue
-                part = np.float32(position - np.float64(low))
+                fraction = np.float32(position - np.float64(low))
                 blue = (start[b] + np.uint32(low)) * widths + column
                 red = blue + widths
-                narrow = flat[blue] + part * (flat[red] - flat[blue])
-                wide = flat[blue + one] + part * (flat[red + one] - flat[blue + one])
+                narrow = flat[blue] + fraction * (flat[red] - flat[blue])
+                wide = flat[blue + unit] + fraction * (flat[red + unit] - flat[blue + unit])
                 total[b] += flux[i, j, medium[b]] * (narrow + wider * (wide - narrow))
         for b in range(n_band):
             out[rows[i], b] = total[b] * magnification[i]

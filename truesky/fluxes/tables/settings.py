@@ -40,11 +40,11 @@ CANDIDATES = tuple(
 # The measured largest error times this is taken for the largest of all galaxies.
 MARGIN = 1.5
 # From here on nothing is interpolated: what the tables are measured against is not measured against itself.
-_INTEGRATED = 1e-4
+_MIN_TABLE_ERROR = 1e-4
 # Of integration, against the whole spectrum in double precision (the templates are in single precision).
 _INTEGRATION_ERROR = 1e-6
 
-COVERED = {"z_obs": [Z_FIRST, Z_LAST], "ebv": [0.0, EBV_LAST], "a_v": [0.0, A_V_LAST]}
+COVERED_RANGES = {"z_obs": [Z_FIRST, Z_LAST], "ebv": [0.0, EBV_LAST], "a_v": [0.0, A_V_LAST]}
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,43 +69,43 @@ def choose(bands: Sequence[str], accuracy: Accuracy) -> tuple[Choice, ...]:
 
     A band that was not measured (a user's) takes a setting that is fine enough for every band that was.
     """
-    measured = _measured()
+    measured = _read_errors()
     return tuple(_smallest(measured, band, accuracy.flux) for band in bands)
 
 
-def known() -> frozenset[str]:
+def measured_bands() -> frozenset[str]:
     """Names of the bands that were measured."""
-    return frozenset(name for of_bands in _measured().values() for name in of_bands)
+    return frozenset(name for of_bands in _read_errors().values() for name in of_bands)
 
 
 def stars_tabulated(accuracy: Accuracy) -> bool:
     """Whether stars come from tables, whose error is 1e-6 in all bands."""
-    return accuracy.flux > _INTEGRATED
+    return accuracy.flux > _MIN_TABLE_ERROR
 
 
-def of_stars(accuracy: Accuracy) -> dict[str, Any]:
+def star_error_facts(accuracy: Accuracy) -> dict[str, Any]:
     """What is stored with the fluxes of stars, as JSON values."""
     covered = {"a_v": [0.0, STAR_A_V_LAST]} if stars_tabulated(accuracy) else None
     return {"covered": covered, "largest": _INTEGRATION_ERROR}
 
 
 def _smallest(measured: dict[Setting, dict[str, Choice]], band: str, allowed: float) -> Choice:
-    if allowed > _INTEGRATED:
+    if allowed > _MIN_TABLE_ERROR:
         for setting in CANDIDATES:
             of_bands = measured.get(setting, {})
-            choice = of_bands.get(band) or _worst(setting, of_bands)
+            choice = of_bands.get(band) or _worst_choice(setting, of_bands)
             if choice is not None and MARGIN * choice.largest <= allowed:
                 return choice
     return INTEGRATED
 
 
-def _worst(setting: Setting, of_bands: dict[str, Choice]) -> Choice | None:
+def _worst_choice(setting: Setting, of_bands: dict[str, Choice]) -> Choice | None:
     if not of_bands:
         return None
     return Choice(setting, max(c.rms for c in of_bands.values()), max(c.largest for c in of_bands.values()))
 
 
-def _measured() -> dict[Setting, dict[str, Choice]]:
+def _read_errors() -> dict[Setting, dict[str, Choice]]:
     out: dict[Setting, dict[str, Choice]] = {}
     with ERRORS.open(newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):

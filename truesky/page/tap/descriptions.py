@@ -9,28 +9,28 @@ from collections.abc import Iterable, Mapping
 from datetime import datetime
 from xml.sax.saxutils import escape, quoteattr
 
-from truesky.page.tap.tables import KEYS, SCHEMAS, Listed, columns_of
+from truesky.page.tap.tables import FOREIGN_KEYS, SCHEMA_DESCRIPTIONS, TableEntry, describe_columns
 
 FORMATS = {
     "application/x-votable+xml": ("votable", "vot"),
     "text/csv": ("csv",),
     "application/vnd.apache.parquet": ("parquet",),
 }
-_HEAD = '<?xml version="1.0" encoding="UTF-8"?>\n'
+_XML_HEADER = '<?xml version="1.0" encoding="UTF-8"?>\n'
 _XSI = 'xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance"'
 _FEATURES = ("POINT", "CIRCLE", "POLYGON", "CONTAINS", "INTERSECTS", "DISTANCE", "COORD1", "COORD2")
 _ADQL_GEO = "ivo://ivoa.net/std/TAPRegExt#features-adqlgeo"
 
 
-def availability(since: datetime) -> str:
+def availability(up_since: datetime) -> str:
     """That it answers."""
     return (
-        f'{_HEAD}<vosi:availability xmlns:vosi="http://www.ivoa.net/xml/VOSIAvailability/v1.0">'
-        f"<vosi:available>true</vosi:available><vosi:upSince>{moment(since)}</vosi:upSince></vosi:availability>\n"
+        f'{_XML_HEADER}<vosi:availability xmlns:vosi="http://www.ivoa.net/xml/VOSIAvailability/v1.0">'
+        f"<vosi:available>true</vosi:available><vosi:upSince>{format_time(up_since)}</vosi:upSince></vosi:availability>\n"
     )
 
 
-def capabilities(address: str, most_rows: int, usual_rows: int, seconds: float) -> str:
+def capabilities(address: str, max_rows: int, default_rows: int, seconds: float) -> str:
     """What it can do, and where.
 
     address : of the service;  seconds : that a query may take
@@ -47,7 +47,7 @@ def capabilities(address: str, most_rows: int, usual_rows: int, seconds: float) 
     )
     features = "".join(f"<feature><form>{name}</form></feature>" for name in _FEATURES)
     return (
-        f'{_HEAD}<vosi:capabilities xmlns:vosi="http://www.ivoa.net/xml/VOSICapabilities/v1.0" {_XSI} '
+        f'{_XML_HEADER}<vosi:capabilities xmlns:vosi="http://www.ivoa.net/xml/VOSICapabilities/v1.0" {_XSI} '
         f'xmlns:vs="http://www.ivoa.net/xml/VODataService/v1.1" xmlns:tr="http://www.ivoa.net/xml/TAPRegExt/v1.0">\n'
         f'{vosi}<capability standardID="ivo://ivoa.net/std/TAP" xsi:type="tr:TableAccess">'
         f'<interface xsi:type="vs:ParamHTTP" role="std" version="1.1">'
@@ -59,42 +59,42 @@ def capabilities(address: str, most_rows: int, usual_rows: int, seconds: float) 
         f'<languageFeatures type="{_ADQL_GEO}">{features}</languageFeatures></language>\n'
         f"{formats}<retentionPeriod><default>86400</default></retentionPeriod>"
         f"<executionDuration><default>{seconds:.0f}</default><hard>{seconds:.0f}</hard></executionDuration>"
-        f'<outputLimit><default unit="row">{usual_rows}</default><hard unit="row">{most_rows}</hard></outputLimit>'
+        f'<outputLimit><default unit="row">{default_rows}</default><hard unit="row">{max_rows}</hard></outputLimit>'
         f"</capability>\n</vosi:capabilities>\n"
     )
 
 
-def tables(listed: Iterable[Listed]) -> str:
+def describe_tables(entries: Iterable[TableEntry]) -> str:
     """The tables with their columns and keys."""
-    by_schema: dict[str, list[Listed]] = {}
-    for table in listed:
+    by_schema: dict[str, list[TableEntry]] = {}
+    for table in entries:
         by_schema.setdefault(table.schema, []).append(table)
     schemas = "".join(
         f"<schema><name>{escape(name)}</name>"
-        f"<description>{escape(SCHEMAS.get(name, f'Tables of request {name}.'))}</description>\n"
-        f"{''.join(map(_table, own))}</schema>\n"
-        for name, own in by_schema.items()
+        f"<description>{escape(SCHEMA_DESCRIPTIONS.get(name, f'Tables of request {name}.'))}</description>\n"
+        f"{''.join(map(_table, schema_entries))}</schema>\n"
+        for name, schema_entries in by_schema.items()
     )
     return (
-        f'{_HEAD}<vosi:tableset xmlns:vosi="http://www.ivoa.net/xml/VOSITables/v1.0" {_XSI} '
+        f'{_XML_HEADER}<vosi:tableset xmlns:vosi="http://www.ivoa.net/xml/VOSITables/v1.0" {_XSI} '
         f'xmlns:vs="http://www.ivoa.net/xml/VODataService/v1.1">\n{schemas}</vosi:tableset>\n'
     )
 
 
-def _table(table: Listed) -> str:
-    columns = "".join(_column(column) for column in columns_of(table))
+def _table(entry: TableEntry) -> str:
+    columns = "".join(_column(column) for column in describe_columns(entry))
     keys = "".join(
-        f"<foreignKey><targetTable>{target}</targetTable><fkColumn><fromColumn>{a}</fromColumn>"
-        f"<targetColumn>{b}</targetColumn></fkColumn></foreignKey>"
-        for _, own, a, target, b in KEYS
-        if own == table.name
+        f"<foreignKey><targetTable>{target_table}</targetTable><fkColumn><fromColumn>{from_column}</fromColumn>"
+        f"<targetColumn>{target_column}</targetColumn></fkColumn></foreignKey>"
+        for _, from_table, from_column, target_table, target_column in FOREIGN_KEYS
+        if from_table == entry.name
     )
-    about = f"<description>{escape(table.description)}</description>" if table.description else ""
-    return f'<table type="table"><name>{escape(table.name)}</name>{about}\n{columns}{keys}</table>\n'
+    description = f"<description>{escape(entry.description)}</description>" if entry.description else ""
+    return f'<table type="table"><name>{escape(entry.name)}</name>{description}\n{columns}{keys}</table>\n'
 
 
 def _column(column: Mapping[str, object]) -> str:
-    texts = "".join(
+    text_elements = "".join(
         f"<{tag}>{escape(str(column[key]))}</{tag}>"
         for tag, key in (
             ("name", "column_name"),
@@ -105,11 +105,11 @@ def _column(column: Mapping[str, object]) -> str:
         )
         if column[key]
     )
-    shape = f" arraysize={quoteattr(str(column['arraysize']))}" if column["arraysize"] else ""
-    shape += f" extendedType={quoteattr(str(column['xtype']))}" if column["xtype"] else ""
+    shape_attributes = f" arraysize={quoteattr(str(column['arraysize']))}" if column["arraysize"] else ""
+    shape_attributes += f" extendedType={quoteattr(str(column['xtype']))}" if column["xtype"] else ""
     flags = "<flag>indexed</flag>" if column["indexed"] else ""
-    kind = f'<dataType xsi:type="vs:VOTableType"{shape}>{column["datatype"]}</dataType>'
-    return f'<column std="{"true" if column["std"] else "false"}">{texts}{kind}{flags}</column>\n'
+    type_element = f'<dataType xsi:type="vs:VOTableType"{shape_attributes}>{column["datatype"]}</dataType>'
+    return f'<column std="{"true" if column["std"] else "false"}">{text_elements}{type_element}{flags}</column>\n'
 
 
 # ------------------------------------------------------------------------------------------------ jobs
@@ -118,64 +118,65 @@ def _column(column: Mapping[str, object]) -> str:
 _UWS = 'xmlns:uws="http://www.ivoa.net/xml/UWS/v1.0" xmlns:xlink="http://www.w3.org/1999/xlink" ' + _XSI
 
 
-def job(facts: Mapping[str, object], parameters: Mapping[str, str], result: str | None, error: str) -> str:
+def describe_job(facts: Mapping[str, object], parameters: Mapping[str, str], result: str | None, error: str) -> str:
     """A job of UWS.
 
     facts  : by UWS's names, None where there is none yet;  parameters : as they were given
     result : address of the result, None = none yet;  error : "" = none
     """
-    return f'{_HEAD}<uws:job {_UWS} version="1.1">\n{_facts(facts)}{parameters_of(parameters, False)}' + (
-        f"{results_of(result, False)}{_error(error)}</uws:job>\n"
+    return (
+        f'{_XML_HEADER}<uws:job {_UWS} version="1.1">\n{_job_elements(facts)}{describe_parameters(parameters, False)}'
+        + (f"{describe_results(result, False)}{_error_element(error)}</uws:job>\n")
     )
 
 
-def parameters_of(parameters: Mapping[str, str], alone: bool = True) -> str:
+def describe_parameters(parameters: Mapping[str, str], is_document: bool = True) -> str:
     """The parameters of a job, as a document or as a part of one."""
     rows = "".join(
         f"<uws:parameter id={quoteattr(name)}>{escape(value)}</uws:parameter>" for name, value in parameters.items()
     )
-    return _alone("parameters", rows, alone)
+    return _wrap_element("parameters", rows, is_document)
 
 
-def results_of(result: str | None, alone: bool = True) -> str:
+def describe_results(result: str | None, is_document: bool = True) -> str:
     """The results of a job, as a document or as a part of one."""
     row = f'<uws:result id="result" xlink:type="simple" xlink:href={quoteattr(result)}/>' if result else ""
-    return _alone("results", row, alone)
+    return _wrap_element("results", row, is_document)
 
 
-def jobs(rows: Iterable[tuple[str, str, str, datetime]]) -> str:
+def list_jobs(rows: Iterable[tuple[str, str, str, datetime]]) -> str:
     """A list of jobs: identifier, address, phase, creation time of each."""
-    own = "".join(
+    references = "".join(
         f'<uws:jobref id={quoteattr(name)} xlink:type="simple" xlink:href={quoteattr(address)}>'
-        f"<uws:phase>{phase}</uws:phase><uws:creationTime>{moment(made)}</uws:creationTime></uws:jobref>\n"
-        for name, address, phase, made in rows
+        f"<uws:phase>{phase}</uws:phase><uws:creationTime>{format_time(creation_time)}</uws:creationTime></uws:jobref>\n"
+        for name, address, phase, creation_time in rows
     )
-    return f'{_HEAD}<uws:jobs {_UWS} version="1.1">\n{own}</uws:jobs>\n'
+    return f'{_XML_HEADER}<uws:jobs {_UWS} version="1.1">\n{references}</uws:jobs>\n'
 
 
-def _alone(name: str, inner: str, alone: bool) -> str:
-    head = f"{_HEAD}<uws:{name} {_UWS}>" if alone else f"<uws:{name}>"
-    return f"{head}{inner}</uws:{name}>\n"
+def _wrap_element(name: str, content: str, is_document: bool) -> str:
+    start_tag = f"{_XML_HEADER}<uws:{name} {_UWS}>" if is_document else f"<uws:{name}>"
+    return f"{start_tag}{content}</uws:{name}>\n"
 
 
-def _facts(facts: Mapping[str, object]) -> str:
+def _job_elements(facts: Mapping[str, object]) -> str:
     out = []
     for name, value in facts.items():
         if value is None:
             out.append(f'<uws:{name} xsi:nil="true"/>\n')
         else:
-            shown = moment(value) if isinstance(value, datetime) else str(value)
-            out.append(f"<uws:{name}>{escape(shown)}</uws:{name}>\n")
+            text = format_time(value) if isinstance(value, datetime) else str(value)
+            out.append(f"<uws:{name}>{escape(text)}</uws:{name}>\n")
     return "".join(out)
 
 
-def _error(error: str) -> str:
+def _error_element(error: str) -> str:
     if not error:
         return ""
     message = f"<uws:message>{escape(error)}</uws:message>"
     return f'<uws:errorSummary type="fatal" hasDetail="true">{message}</uws:errorSummary>\n'
 
 
-def moment(when: datetime) -> str:
+def format_time(time: datetime) -> str:
     """ISO 8601, ms, UTC."""
-    return when.strftime("%Y-%m-%dT%H:%M:%S.%f")[:-3] + "Z"
+    return time.strftime("%Y-%m-%dT%H:%M:%S.%f")[:-3] + "Z"

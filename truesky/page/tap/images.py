@@ -11,67 +11,70 @@ from lake_schema import sky
 from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 from lake_schema.store import read
-from truesky.page.opened import Lake, Requested
+from truesky.page.lake_session import LakeSession, RequestTables
 from truesky.page.pictures import pictures
-from truesky.page.tap.tables import image_row
+from truesky.page.tap.tables import obscore_row
 
 # A passband's response at its ends, of its largest.
-_FAINTEST = 0.01
+_MIN_RESPONSE = 0.01
 
 
-def obscore(lake: Lake, address: str) -> list[dict[str, Any]]:
+def obscore_rows(lake: LakeSession, address: str) -> list[dict[str, Any]]:
     """Rows of ivoa.obscore.
 
     address : of the service from which the files can be had
     """
-    owns = {own.request: own for own in lake.observed}
-    known = pictures(lake)
-    numbers: dict[str | None, set[int]] = {name: set() for name in owns}
-    for one in known:
-        numbers[one.own.request].add(one.row["exposure_id"])
+    tables_by_request = {request_tables.request: request_tables for request_tables in lake.observed_requests}
+    images = pictures(lake)
+    exposure_ids: dict[str | None, set[int]] = {name: set() for name in tables_by_request}
+    for image in images:
+        exposure_ids[image.request_tables.request].add(image.row["exposure_id"])
     exposures = {
         (name, row["exposure_id"]): row
-        for name, own in owns.items()
-        for row in own.rows("exposures", None, numbers[name])
+        for name, request_tables in tables_by_request.items()
+        for row in request_tables.rows("exposures", None, exposure_ids[name])
     }
-    bands = {name: _bands(own) for name, own in owns.items()}
-    found = []
-    for number, one in enumerate(known):
-        entry = one.version.manifest.by_path[one.row["path"]]
-        corners = np.array([float(text) for text in one.row["s_region"].split()[2:]]).reshape(-1, 2)
-        header = {key: value for key, value, _ in one.cards}
-        about = {
-            "url": f"{address}/file/{lake.key}/{number}", "kbyte": entry["bytes"] // 1024, "version": one.version.key,
-            "fov": _diameter(one.row["ra"], one.row["dec"], corners),
-            "wavelengths": bands[one.own.request].get(one.row["band"]),
-            "exposure": "/".join(str(part) for part in one.place[:2] if part is not None),
-            "nx": header.get("NAXIS1"), "ny": header.get("NAXIS2"),
-        }  # fmt: skip
-        found.append(image_row(number, one.row, exposures.get(one.place[:2], {}), about))
-    return found
+    bands = {name: _wavelength_ranges(request_tables) for name, request_tables in tables_by_request.items()}
+    rows = []
+    for number, image in enumerate(images):
+        manifest_entry = image.version.manifest.by_path[image.row["path"]]
+        corners = np.array([float(text) for text in image.row["s_region"].split()[2:]]).reshape(-1, 2)
+        header = {key: value for key, value, _ in image.header_cards}
+        file_facts = {
+            "url": f"{address}/file/{lake.key}/{number}",
+            "kbyte": manifest_entry["bytes"] // 1024,
+            "version": image.version.key,
+            "fov": _diameter(image.row["ra"], image.row["dec"], corners),
+            "wavelengths": bands[image.request_tables.request].get(image.row["band"]),
+            "exposure": "/".join(str(part) for part in image.detector_key[:2] if part is not None),
+            "nx": header.get("NAXIS1"),
+            "ny": header.get("NAXIS2"),
+        }
+        rows.append(obscore_row(number, image.row, exposures.get(image.detector_key[:2], {}), file_facts))
+    return rows
 
 
 def _diameter(ra: float, dec: float, corners: Float) -> float:
     return 2.0 * float(np.max(sky.separation(corners[:, 0], corners[:, 1], ra, dec)))
 
 
-def _bands(own: Requested) -> dict[str, tuple[float, float]]:
+def _wavelength_ranges(request_tables: RequestTables) -> dict[str, tuple[float, float]]:
     """Passband -> shortest and longest wavelength, angstrom."""
-    found = {}
-    for row in own.rows("passbands", ["name", "first_wavelength", "wavelength_step", "response"]):
+    wavelength_ranges = {}
+    for row in request_tables.rows("passbands", ["name", "first_wavelength", "wavelength_step", "response"]):
         response = np.array(row["response"])
-        seen = np.flatnonzero((response > 0.0) & (response >= _FAINTEST * response.max(initial=0.0)))
-        if not seen.size:
+        transmitting = np.flatnonzero((response > 0.0) & (response >= _MIN_RESPONSE * response.max(initial=0.0)))
+        if not transmitting.size:
             continue
-        ends = row["first_wavelength"] + row["wavelength_step"] * seen[[0, -1]]
-        found[str(row["name"])] = float(ends[0]), float(ends[1])
-    return found
+        ends = row["first_wavelength"] + row["wavelength_step"] * transmitting[[0, -1]]
+        wavelength_ranges[str(row["name"])] = float(ends[0]), float(ends[1])
+    return wavelength_ranges
 
 
-def file(lake: Lake, number: int) -> Path:
+def find_file(lake: LakeSession, number: int) -> Path:
     """A FITS file, compared with its sha256.  Errors: BadInput where the lake has none of that number"""
-    known = pictures(lake)
-    if not 0 <= number < len(known):
-        raise BadInput(f"the lake has no image {number}; it has {len(known)}")
-    version: read.Version = known[number].version
-    return version.file(known[number].row["path"])
+    images = pictures(lake)
+    if not 0 <= number < len(images):
+        raise BadInput(f"the lake has no image {number}; it has {len(images)}")
+    version: read.Version = images[number].version
+    return version.sidecar_path(images[number].row["path"])

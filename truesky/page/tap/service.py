@@ -21,14 +21,14 @@ from aiohttp import web
 from lake_schema.errors import BadInput, LakeError
 from truesky.explore import adql, results, votables
 from truesky.page import downloads
+from truesky.page.access_control import AccessRules
 from truesky.page.answers import is_catalogue
-from truesky.page.gate import Gate
-from truesky.page.opened import Busy, Lake, Lane, pieces
-from truesky.page.tap import descriptions, waiting
-from truesky.page.tap.queries import AT_ONCE, Jobs
-from truesky.page.tap.tables import listed, written
+from truesky.page.lake_session import Busy, LakeSession, ProcessPool, iterate_in_thread
+from truesky.page.tap import descriptions, uws_jobs
+from truesky.page.tap.queries import PARALLEL_JOBS, Jobs
+from truesky.page.tap.tables import list_tables, write_tables
 
-MOST_ROWS, USUAL_ROWS = 20_000_000, 1_000_000
+MAX_ROWS, DEFAULT_ROWS = 20_000_000, 1_000_000
 _LANGUAGES = ("ADQL", "ADQL-2.0", "ADQL-2.1")
 _VOTABLE, _XML = "application/x-votable+xml", "text/xml"
 _FORMATS = {
@@ -40,59 +40,61 @@ _FORMATS = {
 
 
 @dataclass(slots=True)
-class _Served:
+class _LakeProcesses:
     """The processes that answer for one opened lake, the folder of the tables that they have beside its own, and those
     of its tables that have positions.
     """
 
-    lake: Lake
-    lane: Lane
+    lake: LakeSession
+    process_pool: ProcessPool
     folder: tempfile.TemporaryDirectory[str]
     catalogues: set[str]
 
     def close(self) -> None:
-        self.lane.close()
+        self.process_pool.close()
         self.folder.cleanup()
 
 
 class Service:
     """TAP of whichever lake is open."""
 
-    def __init__(self, gate: Gate) -> None:
-        self._gate, self._since = gate, datetime.now(UTC)
-        self._served: _Served | None = None
+    def __init__(self, access: AccessRules) -> None:
+        self._access, self._up_since = access, datetime.now(UTC)
+        self._lake_processes: _LakeProcesses | None = None
         self._opening = asyncio.Lock()
-        self._lake: Callable[[], Lake]
-        self.jobs = Jobs(self.answered)
+        self._current_lake: Callable[[], LakeSession]
+        self.jobs = Jobs(self.run_query)
 
-    def add_routes(self, router: web.UrlDispatcher, path: str, lake: Callable[[], Lake]) -> None:
+    def add_routes(self, router: web.UrlDispatcher, path: str, lake: Callable[[], LakeSession]) -> None:
         """Answer below a path.
 
         lake : the lake that is open
         """
-        self._lake = lake
+        self._current_lake = lake
         for method in ("GET", "POST"):
-            router.add_route(method, f"{path}/sync", self._told(self._sync))
-        router.add_get(f"{path}/availability", self._told(self._availability))
-        router.add_get(f"{path}/capabilities", self._told(self._capabilities))
-        router.add_get(f"{path}/tables", self._told(self._tables))
-        router.add_get(f"{path}/file/{{key}}/{{number}}", self._told(self._image))
-        waiting.Routes(self.jobs, self.address, self.check, lambda: self._lake().timeout).add(router, path, self._told)
+            router.add_route(method, f"{path}/sync", self._errors_to_votable(self._sync))
+        router.add_get(f"{path}/availability", self._errors_to_votable(self._availability))
+        router.add_get(f"{path}/capabilities", self._errors_to_votable(self._capabilities))
+        router.add_get(f"{path}/tables", self._errors_to_votable(self._tables))
+        router.add_get(f"{path}/file/{{key}}/{{number}}", self._errors_to_votable(self._image))
+        uws_jobs.Routes(
+            self.jobs, self.service_address, self.check_parameters, lambda: self._current_lake().timeout
+        ).add(router, path, self._errors_to_votable)
 
     async def close(self) -> None:
         """End jobs and processes."""
         await self.jobs.close()
-        if self._served is not None:
-            self._served.close()
+        if self._lake_processes is not None:
+            self._lake_processes.close()
 
-    def address(self, request: web.Request) -> str:
+    def service_address(self, request: web.Request) -> str:
         """Of the service, absolute."""
-        return f"http://{request.headers['Host']}/tap/{self._gate.tap_token}"
+        return f"http://{request.headers['Host']}/tap/{self._access.tap_token}"
 
     # -------------------------------------------------------------------------------------------- questions
 
     @asynccontextmanager
-    async def answered(
+    async def run_query(
         self, parameters: dict[str, str], seconds: float, is_patient: bool = True
     ) -> AsyncIterator[tuple[str, AsyncIterator[bytes]]]:
         """Content type and pieces of the answer to a question.
@@ -100,20 +102,20 @@ class Service:
         parameters : of TAP;  seconds : that it may take;  is_patient : as of `Lane.process`
         Errors     : BadInput, Damaged, Busy
         """
-        self.check(parameters)
-        kind, ending = _format(parameters)
-        most = _most_rows(parameters)
-        served = await self._opened()
-        text = adql.in_sql(parameters["QUERY"], served.catalogues)
-        async with served.lane.process(is_patient) as process:
-            batches = process.batches(text, {}, min(seconds, served.lake.timeout), most + 1)
-            if ending == ".vot":
-                data = votables.pieces(batches, votables.Cut(most))
+        self.check_parameters(parameters)
+        content_type, suffix = _output_format(parameters)
+        max_rows = _max_rows(parameters)
+        lake_processes = await self._open_processes()
+        text = adql.to_sql(parameters["QUERY"], lake_processes.catalogues)
+        async with lake_processes.process_pool.process(is_patient) as process:
+            batches = process.batches(text, {}, min(seconds, lake_processes.lake.timeout), max_rows + 1)
+            if suffix == ".vot":
+                data = votables.pieces(batches, votables.RowLimit(max_rows))
             else:
-                data = results.streamed(_cut(batches, most), ending)
-            yield kind, pieces(data)
+                data = results.stream_file(_limit_rows(batches, max_rows), suffix)
+            yield content_type, iterate_in_thread(data)
 
-    def check(self, parameters: dict[str, str]) -> None:
+    def check_parameters(self, parameters: dict[str, str]) -> None:
         """Refuse what is no question of ours."""
         if parameters.get("REQUEST", "doQuery") != "doQuery":
             raise BadInput(f"REQUEST = {parameters['REQUEST'][:40]} is not doQuery")
@@ -124,89 +126,95 @@ class Service:
             raise BadInput("QUERY is missing")
         if "UPLOAD" in parameters:
             raise BadInput("UPLOAD: this service takes no tables")
-        _format(parameters)
-        _most_rows(parameters)
+        _output_format(parameters)
+        _max_rows(parameters)
 
-    async def _opened(self) -> _Served:
-        lake = self._lake()
+    async def _open_processes(self) -> _LakeProcesses:
+        lake = self._current_lake()
         async with self._opening:
-            if self._served is None or self._served.lake is not lake:
-                if self._served is not None:
-                    self._served.close()
+            if self._lake_processes is None or self._lake_processes.lake is not lake:
+                if self._lake_processes is not None:
+                    self._lake_processes.close()
                 from truesky.page.tap import images
 
                 folder = tempfile.TemporaryDirectory(prefix="truesky-")
-                address = f"http://{self._gate.hosts[0]}:{self._gate.port}/tap/{self._gate.tap_token}"
-                rows = await asyncio.to_thread(images.obscore, lake, address)
-                extra = await asyncio.to_thread(written, lake.listed, rows, Path(folder.name))
+                address = f"http://{self._access.hosts[0]}:{self._access.port}/tap/{self._access.tap_token}"
+                rows = await asyncio.to_thread(images.obscore_rows, lake, address)
+                table_files = await asyncio.to_thread(write_tables, lake.listed_versions, rows, Path(folder.name))
                 # One more than jobs take: they never hold up who waits for an answer.
-                lane = Lane(lambda: lake.explorer.process(extra), AT_ONCE + 1)
+                process_pool = ProcessPool(lambda: lake.explorer.process(table_files), PARALLEL_JOBS + 1)
                 catalogues = {name.lower() for name, version in lake.versions.items() if is_catalogue(version)}
-                self._served = _Served(lake, lane, folder, catalogues)
-            return self._served
+                self._lake_processes = _LakeProcesses(lake, process_pool, folder, catalogues)
+            return self._lake_processes
 
     # -------------------------------------------------------------------------------------------- addresses
 
-    def _told(
+    def _errors_to_votable(
         self, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
     ) -> Callable[[web.Request], Awaitable[web.StreamResponse]]:
         """What is refused is said in a VOTable."""
 
-        async def told(request: web.Request) -> web.StreamResponse:
+        async def respond(request: web.Request) -> web.StreamResponse:
             try:
                 return await handler(request)
             except (LakeError, OSError) as error:
                 status = 503 if isinstance(error, Busy) else 400 if isinstance(error, BadInput) else 500
                 return web.Response(body=votables.refusal(str(error)), content_type=_VOTABLE, status=status)
 
-        return told
+        return respond
 
     async def _sync(self, request: web.Request) -> web.StreamResponse:
-        parameters = await waiting.parameters(request)
-        async with self.answered(parameters, self._lake().timeout, is_patient=False) as (kind, data):
-            return await downloads.sent(request, data, kind, None)
+        parameters = await uws_jobs.read_parameters(request)
+        async with self.run_query(parameters, self._current_lake().timeout, is_patient=False) as (content_type, data):
+            return await downloads.send_stream(request, data, content_type, None)
 
     async def _availability(self, request: web.Request) -> web.StreamResponse:
-        return web.Response(text=descriptions.availability(self._since), content_type=_XML)
+        return web.Response(text=descriptions.availability(self._up_since), content_type=_XML)
 
     async def _capabilities(self, request: web.Request) -> web.StreamResponse:
-        text = descriptions.capabilities(self.address(request), MOST_ROWS, USUAL_ROWS, self._lake().timeout)
+        text = descriptions.capabilities(
+            self.service_address(request), MAX_ROWS, DEFAULT_ROWS, self._current_lake().timeout
+        )
         return web.Response(text=text, content_type=_XML)
 
     async def _tables(self, request: web.Request) -> web.StreamResponse:
-        return web.Response(text=descriptions.tables(listed(self._lake().listed)), content_type=_XML)
+        return web.Response(
+            text=descriptions.describe_tables(list_tables(self._current_lake().listed_versions)), content_type=_XML
+        )
 
     async def _image(self, request: web.Request) -> web.StreamResponse:
         """A FITS file of the products, by its number in the lake of a key."""
         from truesky.page import pictures
         from truesky.page.tap import images
 
-        lake, number = self._lake(), request.match_info["number"]
+        lake, number = self._current_lake(), request.match_info["number"]
         if request.match_info["key"] != lake.key or not (number.isascii() and number.isdigit() and len(number) < 10):
             raise web.HTTPNotFound
-        if int(number) >= len(await lake.tables.run(pictures.pictures, lake)):
+        if int(number) >= len(await lake.table_pool.run(pictures.pictures, lake)):
             raise web.HTTPNotFound
-        path = await lake.tables.run(images.file, lake, int(number))
-        return await downloads.sent(request, pieces(downloads.chunks(path)), "application/fits", path.name)
+        path = await lake.table_pool.run(images.find_file, lake, int(number))
+        return await downloads.send_stream(
+            request, iterate_in_thread(downloads.read_chunks(path)), "application/fits", path.name
+        )
 
 
-def _format(parameters: dict[str, str]) -> tuple[str, str]:
+def _output_format(parameters: dict[str, str]) -> tuple[str, str]:
     """Content type, and the ending of such a file."""
-    wanted = parameters.get("RESPONSEFORMAT") or parameters.get("FORMAT") or "votable"
-    if (found := _FORMATS.get(wanted.lower().replace(" ", ""))) is None:
-        raise BadInput(f"RESPONSEFORMAT = {wanted[:60]!r} is not one of {', '.join(_FORMATS)}")
-    return found
+    format_name = parameters.get("RESPONSEFORMAT") or parameters.get("FORMAT") or "votable"
+    if (output_format := _FORMATS.get(format_name.lower().replace(" ", ""))) is None:
+        raise BadInput(f"RESPONSEFORMAT = {format_name[:60]!r} is not one of {', '.join(_FORMATS)}")
+    return output_format
 
 
-def _most_rows(parameters: dict[str, str]) -> int:
-    wanted = parameters.get("MAXREC", str(USUAL_ROWS))
-    if not (wanted.isascii() and wanted.isdigit() and len(wanted) < 19):
-        raise BadInput(f"MAXREC = {wanted[:40]!r} is not a whole number")
-    return min(int(wanted), MOST_ROWS)
+def _max_rows(parameters: dict[str, str]) -> int:
+    limit_text = parameters.get("MAXREC", str(DEFAULT_ROWS))
+    if not (limit_text.isascii() and limit_text.isdigit() and len(limit_text) < 19):
+        raise BadInput(f"MAXREC = {limit_text[:40]!r} is not a whole number")
+    return min(int(limit_text), MAX_ROWS)
 
 
-def _cut(batches: Iterator[pa.RecordBatch], most: int) -> Iterator[pa.RecordBatch]:
-    sent = 0
+def _limit_rows(batches: Iterator[pa.RecordBatch], max_rows: int) -> Iterator[pa.RecordBatch]:
+    num_sent = 0
     for batch in batches:
-        yield batch.slice(0, max(most - sent, 0))
-        sent += batch.num_rows
+        yield batch.slice(0, max(max_rows - num_sent, 0))
+        num_sent += batch.num_rows

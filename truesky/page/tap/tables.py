@@ -17,10 +17,10 @@ import pyarrow as pa
 from pyarrow import feather
 
 from lake_schema.store import read
-from truesky.explore.votables import datatype, facts_of
+from truesky.explore.votables import datatype, field_facts
 
 LAKE = "lake"
-_LIGHT_M = 1e-10
+_METRES_PER_ANGSTROM = 1e-10
 Json = dict[str, Any]
 
 
@@ -62,24 +62,28 @@ _SCHEMAS: dict[str, tuple[str, pa.Schema]] = {
 }  # fmt: skip
 
 
-def _obscore() -> pa.Schema:
+def _obscore_schema() -> pa.Schema:
     """The columns of ivoa.obscore, from the table beside this module: ObsCore 1.1, table 1, and two of our own."""
     with Path(__file__).with_name("obscore.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
-    known = ("unit", "ucd", "utype", "xtype", "description")
+    metadata_keys = ("unit", "ucd", "utype", "xtype", "description")
     return pa.schema(
         [
-            pa.field(row["name"], pa.type_for_alias(row["type"]), metadata={key: row[key] for key in known if row[key]})
+            pa.field(
+                row["name"],
+                pa.type_for_alias(row["type"]),
+                metadata={key: row[key] for key in metadata_keys if row[key]},
+            )
             for row in rows
         ]
     )
 
 
-_SCHEMAS["ivoa.obscore"] = ("The images, as ObsCore describes observations.", _obscore())
+_SCHEMAS["ivoa.obscore"] = ("The images, as ObsCore describes observations.", _obscore_schema())
 
 
 @dataclass(frozen=True, slots=True)
-class Listed:
+class TableEntry:
     """A table as TAP_SCHEMA and VOSI list it.
 
     name : as it stands in a query
@@ -92,18 +96,19 @@ class Listed:
     is_standard: bool
 
 
-def listed(versions: Mapping[str, read.Version]) -> list[Listed]:
+def list_tables(versions: Mapping[str, read.Version]) -> list[TableEntry]:
     """All tables, those of the lake first."""
-    own = [
-        Listed(
+    lake_tables = [
+        TableEntry(
             name.rpartition(".")[0] or LAKE, ".".join(map(column_name, name.split("."))),
             (version.schema.metadata or {}).get(b"description", b"").decode(), version.schema, False,
         )
         for name, version in versions.items()
         if version.schema.names
     ]  # fmt: skip
-    return own + [
-        Listed(name.partition(".")[0], name, about, fields, True) for name, (about, fields) in _SCHEMAS.items()
+    return lake_tables + [
+        TableEntry(name.partition(".")[0], name, description, fields, True)
+        for name, (description, fields) in _SCHEMAS.items()
     ]
 
 
@@ -123,68 +128,79 @@ def column_name(name: str) -> str:
     return name if plain and name.lower() not in _RESERVED else f'"{name}"'
 
 
-def columns_of(table: Listed) -> Iterator[Json]:
+def describe_columns(table: TableEntry) -> Iterator[Json]:
     """The columns of a table as TAP_SCHEMA.columns has them."""
     for number, field in enumerate(table.fields, start=1):
-        about = facts_of(field)
-        kind, size = datatype(field.type)
+        metadata = field_facts(field)
+        datatype_name, size = datatype(field.type)
         yield {
-            "table_name": table.name, "column_name": column_name(field.name), "datatype": kind,
+            "table_name": table.name, "column_name": column_name(field.name), "datatype": datatype_name,
             "arraysize": size or None,
-            "xtype": about.xtype or None, "size": None, "description": about.description or None,
-            "utype": about.utype or None,
-            "unit": about.unit or None, "ucd": about.ucd or None,
+            "xtype": metadata.xtype or None, "size": None, "description": metadata.description or None,
+            "utype": metadata.utype or None,
+            "unit": metadata.unit or None, "ucd": metadata.ucd or None,
             "indexed": int(field.name in ("_healpix_29",)), "principal": int(number <= 12),
             "std": int(table.is_standard), "column_index": number,
         }  # fmt: skip
 
 
 # Of TAP_SCHEMA's own tables: key, table, column, table that it leads to, column.
-KEYS = (
+FOREIGN_KEYS = (
     ("tables_schema", "tap_schema.tables", "schema_name", "tap_schema.schemas", "schema_name"),
     ("columns_table", "tap_schema.columns", "table_name", "tap_schema.tables", "table_name"),
     ("keys_from", "tap_schema.keys", "from_table", "tap_schema.tables", "table_name"),
     ("keys_target", "tap_schema.keys", "target_table", "tap_schema.tables", "table_name"),
     ("key_columns_key", "tap_schema.key_columns", "key_id", "tap_schema.keys", "key_id"),
 )
-SCHEMAS = {
+SCHEMA_DESCRIPTIONS = {
     LAKE: "Tables that all requests of the lake share.",
     "tap_schema": "What there is to ask.",
     "ivoa": "Tables of the Virtual Observatory.",
 }
 
 
-def written(versions: Mapping[str, read.Version], images: list[Json], folder: Path) -> list[str]:
+def write_tables(versions: Mapping[str, read.Version], images: list[Json], folder: Path) -> list[str]:
     """NAME=@FILE of every table, as a process of queries wants them.
 
     versions : of the lake's tables;  images : rows of ivoa.obscore;  folder : where the files go
     """
-    tables = listed(versions)
+    tables = list_tables(versions)
     names = list(dict.fromkeys(table.schema for table in tables))
     rows: dict[str, list[Json]] = {
         "tap_schema.schemas": [
-            {"schema_name": name, "description": SCHEMAS.get(name, f"Tables of request {name}."), "schema_index": k}
+            {
+                "schema_name": name,
+                "description": SCHEMA_DESCRIPTIONS.get(name, f"Tables of request {name}."),
+                "schema_index": k,
+            }
             for k, name in enumerate(names, start=1)
         ],
         "tap_schema.tables": [
-            {"schema_name": table.schema, "table_name": table.name, "table_type": "table",
-             "description": table.description, "table_index": k}
+            {
+                "schema_name": table.schema,
+                "table_name": table.name,
+                "table_type": "table",
+                "description": table.description,
+                "table_index": k,
+            }
             for k, table in enumerate(tables, start=1)
         ],
-        "tap_schema.columns": [column for table in tables for column in columns_of(table)],
-        "tap_schema.keys": [{"key_id": key, "from_table": a, "target_table": b} for key, a, _, b, _ in KEYS],
-        "tap_schema.key_columns": [{"key_id": key, "from_column": a, "target_column": b} for key, _, a, _, b in KEYS],
+        "tap_schema.columns": [column for table in tables for column in describe_columns(table)],
+        "tap_schema.keys": [{"key_id": key, "from_table": a, "target_table": b} for key, a, _, b, _ in FOREIGN_KEYS],
+        "tap_schema.key_columns": [
+            {"key_id": key, "from_column": a, "target_column": b} for key, _, a, _, b in FOREIGN_KEYS
+        ],
         "ivoa.obscore": images,
-    }  # fmt: skip
-    found = []
+    }
+    table_files = []
     for name, (_, schema) in _SCHEMAS.items():
         file = folder / f"{name}.arrow"
         feather.write_feather(pa.Table.from_pylist(rows[name], schema), file, compression="uncompressed")
-        found.append(f"{name}=@{file}")
-    return found
+        table_files.append(f"{name}=@{file}")
+    return table_files
 
 
-def image_row(number: int, row: Mapping[str, Any], exposure: Mapping[str, Any], file: Mapping[str, Any]) -> Json:
+def obscore_row(number: int, row: Mapping[str, Any], exposure: Mapping[str, Any], file: Mapping[str, Any]) -> Json:
     """An image as a row of ivoa.obscore.
 
     number   : by which it can be had;  row : of `products`;  exposure : its row of `exposures`, {} where there is none
@@ -194,17 +210,37 @@ def image_row(number: int, row: Mapping[str, Any], exposure: Mapping[str, Any], 
     start, seconds = exposure.get("mjd"), exposure.get("exposure_time_s")
     wavelengths = file["wavelengths"] or (None, None)
     return {
-        "dataproduct_type": "image", "dataproduct_subtype": row["content"], "calib_level": 1,
-        "obs_collection": exposure.get("survey") or "truesky", "obs_id": file["exposure"],
-        "obs_publisher_did": f"ivo://truesky.local/{file['version']}?{row['path']}", "access_url": file["url"],
-        "access_format": "application/fits", "access_estsize": file["kbyte"], "target_name": None,
-        "s_ra": row["ra"], "s_dec": row["dec"], "s_fov": file["fov"], "s_region": row["s_region"],
-        "s_resolution": exposure.get("seeing") or None, "s_xel1": file["nx"], "s_xel2": file["ny"],
-        "t_min": start, "t_max": None if start is None or seconds is None else start + seconds / 86400.0,
-        "t_exptime": seconds, "t_resolution": seconds, "t_xel": 1,
-        "em_min": wavelengths[0] and wavelengths[0] * _LIGHT_M, "em_max": wavelengths[1] and wavelengths[1] * _LIGHT_M,
-        "em_res_power": None, "em_xel": 1, "o_ucd": "phot.count", "pol_states": None, "pol_xel": None,
+        "dataproduct_type": "image",
+        "dataproduct_subtype": row["content"],
+        "calib_level": 1,
+        "obs_collection": exposure.get("survey") or "truesky",
+        "obs_id": file["exposure"],
+        "obs_publisher_did": f"ivo://truesky.local/{file['version']}?{row['path']}",
+        "access_url": file["url"],
+        "access_format": "application/fits",
+        "access_estsize": file["kbyte"],
+        "target_name": None,
+        "s_ra": row["ra"],
+        "s_dec": row["dec"],
+        "s_fov": file["fov"],
+        "s_region": row["s_region"],
+        "s_resolution": exposure.get("seeing") or None,
+        "s_xel1": file["nx"],
+        "s_xel2": file["ny"],
+        "t_min": start,
+        "t_max": None if start is None or seconds is None else start + seconds / 86400.0,
+        "t_exptime": seconds,
+        "t_resolution": seconds,
+        "t_xel": 1,
+        "em_min": wavelengths[0] and wavelengths[0] * _METRES_PER_ANGSTROM,
+        "em_max": wavelengths[1] and wavelengths[1] * _METRES_PER_ANGSTROM,
+        "em_res_power": None,
+        "em_xel": 1,
+        "o_ucd": "phot.count",
+        "pol_states": None,
+        "pol_xel": None,
         "facility_name": "Euclid" if not str(row["channel"]).startswith("EXT") else str(exposure.get("camera", "")),
         "instrument_name": str(exposure.get("camera") or row["channel"]),
-        "band_name": row["band"], "detector": row["detector"],
-    }  # fmt: skip
+        "band_name": row["band"],
+        "detector": row["detector"],
+    }

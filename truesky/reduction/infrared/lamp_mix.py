@@ -17,7 +17,7 @@ from truesky.render.effects.scene import Scene
 from truesky.render.sky import diffuse_light
 
 # What the sum, the mean wavelength and its square count in the fit, and that weights are alike.
-_SUM, _MEAN, _SQUARE, _EVEN = 1e4, 1e2, 1.0, 1e-2
+_SUM_WEIGHT, _MEAN_WEIGHT, _SQUARE_WEIGHT, _EVENNESS_WEIGHT = 1e4, 1e2, 1.0, 1e-2
 # Sky whose colour is matched, e-/s in a pixel: zodiacal light where surveys look.
 _SKY = 1.0
 
@@ -29,25 +29,31 @@ def weights(scene: Scene, lamps: Sequence[int]) -> tuple[float, ...]:
     scene : of a flat in the band;  lamps : their numbers
     Error : of lamps that all lie on one side of the sky's mean wavelength the nearest is taken
     """
-    band = chromatic_response.band_of(scene)
-    wide = float(band.wavelength[-1] - band.wavelength[0])
+    band = chromatic_response.band_of_scene(scene)
+    band_width = float(band.wavelength[-1] - band.wavelength[0])
     sky = diffuse_light.photons(scene.section, _SKY, band, scene.mission)
-    target = _moments(band, sky, 0.0, wide)
-    rows = np.array(
+    target = _moments(band, sky, 0.0, band_width)
+    lamp_moments = np.array(
         [
-            _moments(band, calibration_lamp.photons(band, lamp, scene.section, scene.mission), target[0], wide)
+            _moments(
+                band, calibration_lamp.detected_photons(band, lamp, scene.section, scene.mission), target[0], band_width
+            )
             for lamp in lamps
         ]
     ).T
-    of_sky = _moments(band, sky, target[0], wide)
-    scale = np.array([_MEAN, _SQUARE])
-    system = np.vstack([np.full(len(lamps), _SUM), scale[:, None] * rows, _EVEN * np.eye(len(lamps))])
-    wanted = np.concatenate([[_SUM], scale * of_sky, np.full(len(lamps), _EVEN / len(lamps))])
-    found, _ = nnls(system, wanted)
-    return tuple((found / found.sum()).tolist())
+    sky_moments = _moments(band, sky, target[0], band_width)
+    scale = np.array([_MEAN_WEIGHT, _SQUARE_WEIGHT])
+    system = np.vstack(
+        [np.full(len(lamps), _SUM_WEIGHT), scale[:, None] * lamp_moments, _EVENNESS_WEIGHT * np.eye(len(lamps))]
+    )
+    target_values = np.concatenate(
+        [[_SUM_WEIGHT], scale * sky_moments, np.full(len(lamps), _EVENNESS_WEIGHT / len(lamps))]
+    )
+    solution, _ = nnls(system, target_values)
+    return tuple((solution / solution.sum()).tolist())
 
 
-def _moments(band: Passband, photons: Float, about: float, wide: float) -> Float:
+def _moments(band: Passband, photons: Float, origin: float, band_width: float) -> Float:
     """Mean and mean square of the wavelength over the band's width, told from `about`."""
-    x = band.wavelength / wide - about
+    x = band.wavelength / band_width - origin
     return np.array([np.average(x, weights=photons), np.average(x**2, weights=photons)])

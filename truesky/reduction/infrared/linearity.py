@@ -15,25 +15,25 @@ from pathlib import Path
 import numpy as np
 
 from lake_schema.arrays import Array, Float
-from truesky.reduction.combining import Combined
+from truesky.reduction.combining import CombinedFrame
 from truesky.reduction.frames import Frame
-from truesky.reduction.infrared.ramps import Bend, Estimator
+from truesky.reduction.infrared.ramps import Estimator, RampNonlinearity
 
 # Levels, the brightest over the faintest at least, rounds of the fit, standard deviations of a frame that is left out.
-_LEVELS, _RANGE, _ROUNDS, _CLIP = 3, 3.0, 4, 5.0
+_MIN_LEVELS, _MIN_RANGE, _ROUNDS, _CLIP = 3, 3.0, 4, 5.0
 # Rows that are fitted at a time: memory.
 _ROWS = 32
 
 
-def series(flats: Sequence[Frame]) -> list[Frame]:
+def longest_series(flats: Sequence[Frame]) -> list[Frame]:
     """Flats of one channel, band, lamp and ramp at three levels or more; of several series the longest; else none."""
     groups: dict[tuple[object, ...], list[Frame]] = defaultdict(list)
     for frame in flats:
         groups[frame.exposure.channel, frame.exposure.band, frame.scene.lamp, frame.ramp].append(frame)
     useful = [
-        own
-        for own in groups.values()
-        if len(levels := {_level(frame) for frame in own}) >= _LEVELS and max(levels) > _RANGE * min(levels)
+        group
+        for group in groups.values()
+        if len(levels := {_level(frame) for frame in group}) >= _MIN_LEVELS and max(levels) > _MIN_RANGE * min(levels)
     ]
     return max(useful, key=len, default=[])
 
@@ -42,7 +42,9 @@ def _level(frame: Frame) -> float:
     return frame.scene.value("flat.signal", "electron")
 
 
-def fitted(frames: Sequence[Frame], added: Callable[[Frame], tuple[Float, Float | float]], scratch: Path) -> Combined:
+def fit(
+    frames: Sequence[Frame], extra_charge: Callable[[Frame], tuple[Float, Float | float]], scratch: Path
+) -> CombinedFrame:
     """b of every pixel, 1/e-, and its uncertainty: of each pixel's own fit what its noise allows, else the median.
 
     frames  : of `series`;  added : frame -> e- [ny, nx] of persistence and of dark current in it
@@ -50,59 +52,65 @@ def fitted(frames: Sequence[Frame], added: Callable[[Frame], tuple[Float, Float 
     Error   : the lamp's levels are taken as exact, as they are told; what a pixel's traps have of their own is unknown
     """
     scene, applied = frames[0].scene, frames[0].applied
-    estimator, bend = Estimator.of(scene, applied), Bend.of(scene, applied)
+    estimator, nonlinearity = Estimator.from_scene(scene, applied), RampNonlinearity.from_scene(scene, applied)
     levels = np.array([_level(frame) for frame in frames]) / max(map(_level, frames))
     shape, spread = (scene.ny, scene.nx), scene.value("persistence.spread", "")
-    seen, more = (np.memmap(scratch / name, np.float32, "w+", shape=(len(frames), *shape)) for name in ("seen", "more"))
+    observed, extra = (
+        np.memmap(scratch / name, np.float32, "w+", shape=(len(frames), *shape)) for name in ("seen", "more")
+    )
     noise = np.zeros(len(frames))
     for number, frame in enumerate(frames):
-        estimated, (left, dark) = frame.electrons(), added(frame)
-        seen[number] = estimated - estimator.bias(estimated)
-        more[number] = left + dark
-        typical, remembered = float(np.median(estimated)), float(np.median(left))
-        noise[number] = float(estimator.variance(np.array(typical))) + (spread * remembered) ** 2
+        estimated, (persistence, dark) = frame.electrons(), extra_charge(frame)
+        observed[number] = estimated - estimator.bias(estimated)
+        extra[number] = persistence + dark
+        typical, typical_persistence = float(np.median(estimated)), float(np.median(persistence))
+        noise[number] = float(estimator.variance(np.array(typical))) + (spread * typical_persistence) ** 2
     b, sigma, count = np.zeros(shape), np.ones(shape), np.zeros(shape, np.int16)
     for first in range(0, shape[0], _ROWS):
         rows = slice(first, first + _ROWS)
-        part = np.asarray(seen[:, rows], float), np.asarray(more[:, rows], float)
-        b[rows], sigma[rows], count[rows] = _of_rows(*part, levels, noise, bend)
-    del seen, more
+        block = np.asarray(observed[:, rows], float), np.asarray(extra[:, rows], float)
+        b[rows], sigma[rows], count[rows] = _fit_rows(*block, levels, noise, nonlinearity)
+    del observed, extra
     for name in ("seen", "more"):
         (scratch / name).unlink()
-    return _as_sure_as_it_is(b, sigma, count)
+    return _shrink_to_median(b, sigma, count)
 
 
-def _of_rows(seen: Float, added: Float, levels: Float, noise: Float, bend: Bend) -> tuple[Float, Float, Array]:
+def _fit_rows(
+    observed: Float, extra: Float, levels: Float, noise: Float, nonlinearity: RampNonlinearity
+) -> tuple[Float, Float, Array]:
     """(b, its uncertainty, frames that are left) of pixels [rows, nx], of frames of which these [n, rows, nx] are seen.
 
     seen, added : e- that are seen, and of these what is no light of the lamp's
     levels, noise : [n] of the lamp, and variance of what is seen;  bend : of the ramp
     """
-    b, kept, x = np.zeros(seen.shape[1:]), np.ones(seen.shape, bool), levels[:, None, None]
+    b, accepted, x = np.zeros(observed.shape[1:]), np.ones(observed.shape, bool), levels[:, None, None]
     sigma = np.full(b.shape, np.inf)
     for _ in range(_ROUNDS):
-        came = bend.linearised(seen, b)
-        y, c = came - added, bend.slope(came)
-        weight = kept / noise[:, None, None]
-        xx, xc, cc, xy, cy = ((weight * part).sum(axis=0) for part in (x * x, -x * c, c * c, x * y, -c * y))
+        linear = nonlinearity.linearise(observed, b)
+        y, c = linear - extra, nonlinearity.slope(linear)
+        weight = accepted / noise[:, None, None]
+        xx, xc, cc, xy, cy = ((weight * term).sum(axis=0) for term in (x * x, -x * c, c * c, x * y, -c * y))
         determinant = xx * cc - xc * xc
         with np.errstate(divide="ignore", invalid="ignore"):
-            gain, more, sigma = (cc * xy - xc * cy) / determinant, (xx * cy - xc * xy) / determinant, xx / determinant
-        enough = (kept.sum(axis=0) >= _LEVELS) & np.isfinite(more)
-        gain, more = np.where(enough, gain, 0.0), np.where(enough, more, 0.0)
-        kept = np.abs(y + more * c - gain * x) <= _CLIP * np.sqrt(noise)[:, None, None]
+            gain, b_step, sigma = (cc * xy - xc * cy) / determinant, (xx * cy - xc * xy) / determinant, xx / determinant
+        enough = (accepted.sum(axis=0) >= _MIN_LEVELS) & np.isfinite(b_step)
+        gain, b_step = np.where(enough, gain, 0.0), np.where(enough, b_step, 0.0)
+        accepted = np.abs(y + b_step * c - gain * x) <= _CLIP * np.sqrt(noise)[:, None, None]
         # A tenth of its own signal at most: a dead pixel has no b.
-        b = np.clip(b + more, 0.0, 0.1 / np.maximum(y.max(axis=0), 1.0))
-    return b, np.where(enough, np.sqrt(sigma), np.inf), kept.sum(axis=0).astype(np.int16)
+        b = np.clip(b + b_step, 0.0, 0.1 / np.maximum(y.max(axis=0), 1.0))
+    return b, np.where(enough, np.sqrt(sigma), np.inf), accepted.sum(axis=0).astype(np.int16)
 
 
-def _as_sure_as_it_is(b: Float, sigma: Float, count: Array) -> Combined:
+def _shrink_to_median(b: Float, sigma: Float, count: Array) -> CombinedFrame:
     """Each pixel's b and the median of all, by their variances."""
-    sure = np.isfinite(sigma) & (b > 0.0)
-    middle = float(np.median(b[sure])) if sure.any() else 0.0
-    width = 1.4826 * float(np.median(np.abs(b[sure] - middle))) if sure.any() else 0.0
-    own = max(width**2 - float(np.median(sigma[sure])) ** 2, (0.01 * middle) ** 2) if sure.any() else 0.0
+    is_measured = np.isfinite(sigma) & (b > 0.0)
+    median = float(np.median(b[is_measured])) if is_measured.any() else 0.0
+    width = 1.4826 * float(np.median(np.abs(b[is_measured] - median))) if is_measured.any() else 0.0
+    intrinsic_variance = (
+        max(width**2 - float(np.median(sigma[is_measured])) ** 2, (0.01 * median) ** 2) if is_measured.any() else 0.0
+    )
     with np.errstate(invalid="ignore", divide="ignore"):
-        share = np.where(sure, own / (own + sigma**2), 0.0)
-    mean = middle + share * (b - middle)
-    return Combined(mean.astype(np.float32), np.sqrt((1.0 - share) * own).astype(np.float32), count)
+        share = np.where(is_measured, intrinsic_variance / (intrinsic_variance + sigma**2), 0.0)
+    mean = median + share * (b - median)
+    return CombinedFrame(mean.astype(np.float32), np.sqrt((1.0 - share) * intrinsic_variance).astype(np.float32), count)

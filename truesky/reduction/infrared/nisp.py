@@ -17,83 +17,95 @@ from lake_schema.arrays import Bool, Float
 from lake_schema.errors import BadInput
 from lake_schema.fits.images import Card
 from truesky.reduction import calibration, files
-from truesky.reduction import frames as frames_of
-from truesky.reduction.calibration import COSMIC_RAY, PERSISTENCE, SATURATED, Masters, Reduced
-from truesky.reduction.combining import Combined, clipped_mean
+from truesky.reduction import frames as lake_frames
+from truesky.reduction.calibration import COSMIC_RAY, PERSISTENCE, SATURATED, Masters, ReducedImage
+from truesky.reduction.combining import CombinedFrame, clipped_mean
 from truesky.reduction.frames import Frame
 from truesky.reduction.infrared import lamp_mix, linearity
-from truesky.reduction.infrared.foreseen import Foreseen
-from truesky.reduction.infrared.ramps import Bend, Estimator
+from truesky.reduction.infrared.persistence_prediction import PersistencePrediction
+from truesky.reduction.infrared.ramps import Estimator, RampNonlinearity
 from truesky.render.effects.charge import ramp_nonlinearity
 from truesky.render.effects.light import calibration_lamp, illumination
 
 # chi^2 that non-linearity alone makes of a ramp, above which that it does not fit says nothing of cosmic rays.
-_BENT = 1.0
+_MAX_NONLINEAR_CHI2 = 1.0
 # Of the pixels of a flat that are full; of its brightest flats the least level of those that a master is of.
-_FULL, _BRIGHT = 0.01, 0.3
+_MAX_SATURATED, _MIN_RELATIVE_LEVEL = 0.01, 0.3
 
 
 @dataclass(frozen=True, slots=True)
-class Made:
+class Master:
     """A master: its kind, what it is, the frames that it is of, and more cards of its header."""
 
     kind: str
-    combined: Combined
+    combined: CombinedFrame
     frames: Sequence[Frame]
     cards: tuple[Card, ...] = ()
 
 
-def counted(frame: Frame, b: Float | float, left: Float | float) -> Float:
+def incoming_charge(frame: Frame, b: Float | float, persistence: Float | float) -> Float:
     """Electrons [ny, nx] that came into each pixel, dark current with them, without what earlier exposures left.
 
     b : of N (1 - b N), 1/e-; 0 = as it is read;  left : e- of persistence
     """
     estimated = frame.electrons()
-    estimated -= Estimator.of(frame.scene, frame.applied).bias(estimated)
-    return np.asarray(Bend.of(frame.scene, frame.applied).linearised(estimated, np.asarray(b)) - left)
+    estimated -= Estimator.from_scene(frame.scene, frame.applied).bias(estimated)
+    return np.asarray(
+        RampNonlinearity.from_scene(frame.scene, frame.applied).linearise(estimated, np.asarray(b)) - persistence
+    )
 
 
-def declared(frame: Frame) -> float:
+def declared_nonlinearity(frame: Frame) -> float:
     """b of the usual pixel as the mission has it; 0 where a frame has none."""
-    bent = {ramp_nonlinearity.EFFECT.name, ramp_nonlinearity.SIGNAL.name} & frame.applied
-    return frame.scene.value("nonlinearity", "1 / electron") if bent else 0.0
+    nonlinear_effects = {ramp_nonlinearity.EFFECT.name, ramp_nonlinearity.SIGNAL.name} & frame.applied
+    return frame.scene.value("nonlinearity", "1 / electron") if nonlinear_effects else 0.0
 
 
-def masters(frames: Sequence[Frame], scratch: Path) -> Iterator[Made]:
+def make_masters(frames: Sequence[Frame], scratch: Path) -> Iterator[Master]:
     """Masters of what a detector's frames allow: dark of each ramp, linearity, flat of each band.
 
     frames  : all of one detector: of what they show the others' persistence is taken off
     scratch : folder for the frames while they are combined: 4 bytes a pixel and frame
     Errors  : BadInput where there is neither a dark nor a flat
     """
-    foreseen, darks = Foreseen(frames), dict[tuple[int, int, int], Combined]()
-    for own in _alike(frames_of.of_types(frames, ("dark",)), lambda frame: (frame.exposure.channel, *frame.ramp)):
-        made = _combined(own, [frame.exposure.exposure_time_s for frame in own], (foreseen, 0.0, None), scratch)
-        darks[own[0].ramp] = made
-        yield Made("dark", made, own)
-    flats = [frame for frame in frames_of.of_types(frames, ("flat",)) if frame.full().mean() < _FULL]
+    prediction, darks = PersistencePrediction(frames), dict[tuple[int, int, int], CombinedFrame]()
+    for group in _group_frames(
+        lake_frames.select_types(frames, ("dark",)), lambda frame: (frame.exposure.channel, *frame.ramp)
+    ):
+        combined = _combine_frames(
+            group, [frame.exposure.exposure_time_s for frame in group], (prediction, 0.0, None), scratch
+        )
+        darks[group[0].ramp] = combined
+        yield Master("dark", combined, group)
+    flats = [
+        frame
+        for frame in lake_frames.select_types(frames, ("flat",))
+        if frame.saturated_pixels().mean() < _MAX_SATURATED
+    ]
     if not darks and not flats:
         raise BadInput(f"detector {frames[0].detector}: the lake has no dark and no flat of it")
     b: Float | float | None = None
-    if series := linearity.series(flats):
-        made = linearity.fitted(series, lambda frame: (foreseen.of(frame), _dark(frame, darks)), scratch)
-        b = made.mean.astype(float)
-        yield Made("linearity", made, series)
-    for own in _alike(flats, lambda frame: (frame.exposure.channel, frame.exposure.band)):
-        yield _flat(own, (foreseen, declared(own[0]) if b is None else b, darks), scratch)
+    if series := linearity.longest_series(flats):
+        combined = linearity.fit(
+            series, lambda frame: (prediction.charge_in(frame), _dark_charge(frame, darks)), scratch
+        )
+        b = combined.mean.astype(float)
+        yield Master("linearity", combined, series)
+    for group in _group_frames(flats, lambda frame: (frame.exposure.channel, frame.exposure.band)):
+        yield _make_flat(group, (prediction, declared_nonlinearity(group[0]) if b is None else b, darks), scratch)
 
 
-def _alike(frames: Sequence[Frame], key: object) -> list[list[Frame]]:
-    found: dict[object, list[Frame]] = {}
+def _group_frames(frames: Sequence[Frame], key: object) -> list[list[Frame]]:
+    groups: dict[object, list[Frame]] = {}
     for frame in frames:
-        found.setdefault(key(frame), []).append(frame)  # type: ignore[operator]
-    return list(found.values())
+        groups.setdefault(key(frame), []).append(frame)  # type: ignore[operator]
+    return list(groups.values())
 
 
-Undone = tuple[Foreseen, Float | float, Mapping[tuple[int, int, int], Combined] | None]
+Corrections = tuple[PersistencePrediction, Float | float, Mapping[tuple[int, int, int], CombinedFrame] | None]
 
 
-def _dark(frame: Frame, darks: Mapping[tuple[int, int, int], Combined] | None) -> Float | float:
+def _dark_charge(frame: Frame, darks: Mapping[tuple[int, int, int], CombinedFrame] | None) -> Float | float:
     """Electrons of its dark current: of its own ramp's master, else of another's."""
     if not darks:
         return 0.0
@@ -101,58 +113,71 @@ def _dark(frame: Frame, darks: Mapping[tuple[int, int, int], Combined] | None) -
     return np.asarray(master.mean * frame.exposure.exposure_time_s)
 
 
-def _combined(frames: Sequence[Frame], units: Sequence[Float | float], undone: Undone, scratch: Path) -> Combined:
+def _combine_frames(
+    frames: Sequence[Frame], units: Sequence[Float | float], corrections: Corrections, scratch: Path
+) -> CombinedFrame:
     """Mean of frames in their units; units : electrons [ny, nx] of each that are 1 in the master."""
-    foreseen, b, darks = undone
-    frames_of.common(frames, (*files.SAME,))
+    prediction, b, darks = corrections
+    lake_frames.common_values(frames, (*files.SHARED_CARDS,))
     scene = frames[0].scene
     stack = np.memmap(scratch / "frames", np.float32, "w+", shape=(len(frames), scene.ny, scene.nx))
-    mean, left = np.zeros((scene.ny, scene.nx)), np.zeros((scene.ny, scene.nx))
+    mean_unit, mean_persistence = np.zeros((scene.ny, scene.nx)), np.zeros((scene.ny, scene.nx))
     for number, (frame, unit) in enumerate(zip(frames, units, strict=True)):
-        persistence = foreseen.of(frame)
-        stack[number] = (counted(frame, b, persistence) - _dark(frame, darks)) / unit
-        mean += np.asarray(unit) / len(frames)
-        left += persistence / len(frames)
-    estimator = Estimator.of(scene, frames[0].applied)
+        persistence = prediction.charge_in(frame)
+        stack[number] = (incoming_charge(frame, b, persistence) - _dark_charge(frame, darks)) / unit
+        mean_unit += np.asarray(unit) / len(frames)
+        mean_persistence += persistence / len(frames)
+    estimator = Estimator.from_scene(scene, frames[0].applied)
     spread = scene.value("persistence.spread", "")
 
     def variance(expected: Float, rows: slice) -> Float:
-        read = estimator.variance(np.maximum(expected, 0.0) * mean[rows] + left[rows])
-        return np.asarray((read + (spread * left[rows]) ** 2) / mean[rows] ** 2)
+        read_variance = estimator.variance(np.maximum(expected, 0.0) * mean_unit[rows] + mean_persistence[rows])
+        return np.asarray((read_variance + (spread * mean_persistence[rows]) ** 2) / mean_unit[rows] ** 2)
 
-    found = clipped_mean(stack, variance)
+    combined = clipped_mean(stack, variance)
     del stack
     (scratch / "frames").unlink()
-    return found
+    return combined
 
 
-def _flat(frames: Sequence[Frame], undone: Undone, scratch: Path) -> Made:
+def _make_flat(frames: Sequence[Frame], corrections: Corrections, scratch: Path) -> Master:
     """Of each lamp that shines in the band its master over its light; and their mix that the sky's light is like."""
     brightest = max(frame.scene.value("flat.signal", "electron") for frame in frames)
-    some = [frame for frame in frames if frame.scene.value("flat.signal", "electron") >= _BRIGHT * brightest]
-    by_lamp = _alike(some, lambda frame: frame.scene.lamp)
-    found = [_combined(own, [_lamp(frame) for frame in own], undone, scratch) for own in by_lamp]
-    scene, numbers = some[0].scene, [own[0].scene.lamp for own in by_lamp]
+    bright_frames = [
+        frame for frame in frames if frame.scene.value("flat.signal", "electron") >= _MIN_RELATIVE_LEVEL * brightest
+    ]
+    by_lamp = _group_frames(bright_frames, lambda frame: frame.scene.lamp)
+    lamp_flats = [
+        _combine_frames(group, [_lamp_charge(frame) for frame in group], corrections, scratch) for group in by_lamp
+    ]
+    scene, numbers = bright_frames[0].scene, [group[0].scene.lamp for group in by_lamp]
     weights = lamp_mix.weights(scene, numbers)
-    mean = np.sum([weight * one.mean for weight, one in zip(weights, found, strict=True)], axis=0)
-    parts = [np.where(weight > 0.0, weight * one.uncertainty, 0.0) for weight, one in zip(weights, found, strict=True)]
-    used = [one.count for weight, one in zip(weights, found, strict=True) if weight > 0.0]
-    mixed = Combined(
-        mean.astype(np.float32), np.sqrt(np.sum(np.square(parts), axis=0)).astype(np.float32), np.min(used, axis=0)
+    mean = np.sum([weight * lamp_flat.mean for weight, lamp_flat in zip(weights, lamp_flats, strict=True)], axis=0)
+    uncertainties = [
+        np.where(weight > 0.0, weight * lamp_flat.uncertainty, 0.0)
+        for weight, lamp_flat in zip(weights, lamp_flats, strict=True)
+    ]
+    counts = [lamp_flat.count for weight, lamp_flat in zip(weights, lamp_flats, strict=True) if weight > 0.0]
+    mixed = CombinedFrame(
+        mean.astype(np.float32),
+        np.sqrt(np.sum(np.square(uncertainties), axis=0)).astype(np.float32),
+        np.min(counts, axis=0),
     )
     cards: list[Card] = []
     for i, (number, weight) in enumerate(zip(numbers, weights, strict=True), start=1):
         cards += [(f"LAMP{i}", number, "LED of the calibration unit"), (f"WEIGHT{i}", weight, "of it in the mix")]
-    return Made("flat", mixed, some, tuple(cards))
+    return Master("flat", mixed, bright_frames, tuple(cards))
 
 
-def _lamp(frame: Frame) -> Float:
+def _lamp_charge(frame: Frame) -> Float:
     """Electrons [ny, nx] that the lamp of a flat would bring were all its light counted."""
     electrons, *pattern = calibration_lamp.EFFECT.parameters(frame.scene)
     return np.asarray(electrons * illumination.apply(np.ones((frame.scene.ny, frame.scene.nx)), *pattern))
 
 
-def reduced(frame: Frame, own: Masters, foreseen: Foreseen | None, undone: Sequence[str], unit: float) -> Reduced:
+def calibrate(
+    frame: Frame, masters: Masters, prediction: PersistencePrediction | None, effects: Sequence[str], unit: float
+) -> ReducedImage:
     """A calibrated frame that sees the sky.
 
     own      : masters of its detector, of which the bias is b of N (1 - b N)
@@ -162,45 +187,48 @@ def reduced(frame: Frame, own: Masters, foreseen: Foreseen | None, undone: Seque
                pixel's noise is less than that of the mean of many tells
     """
     time = frame.scene.exposure_time_s
-    dark = own.dark.mean * time
-    left = np.zeros(dark.shape) if foreseen is None else foreseen.of(frame)
-    bent = {ramp_nonlinearity.EFFECT.name, ramp_nonlinearity.SIGNAL.name} & {*undone}
-    b = own.bias.mean.astype(float) if bent else np.zeros(1)
-    came = counted(frame, b, left)
-    response = np.asarray(own.flat.mean, float)
-    flags = own.flags | np.where(frame.full(), SATURATED, 0).astype(np.uint8)
-    flags |= np.where(_hit(frame, came, b) & (flags & SATURATED == 0), COSMIC_RAY, 0).astype(np.uint8)
-    known = (response > 0.0) & np.isfinite(came)
-    image = np.where(known, came - dark, 0.0) / np.where(known, response, 1.0)
-    used = known & (flags & ~np.uint8(calibration.GOOD) == 0)
-    estimator = Estimator.of(frame.scene, frame.applied)
-    light = calibration.expected(image, used, float(estimator.variance(np.zeros(1))[0]))
-    variance = estimator.variance(np.maximum(light * response + dark + left, 0.0))
-    flags |= np.where(left > np.sqrt(variance), PERSISTENCE, 0).astype(np.uint8)
-    variance += (frame.scene.value("persistence.spread", "") * left) ** 2
-    variance += (own.dark.uncertainty * time) ** 2 + (light * response * own.flat.uncertainty) ** 2
+    dark = masters.dark.mean * time
+    persistence = np.zeros(dark.shape) if prediction is None else prediction.charge_in(frame)
+    nonlinear_effects = {ramp_nonlinearity.EFFECT.name, ramp_nonlinearity.SIGNAL.name} & {*effects}
+    b = masters.bias.mean.astype(float) if nonlinear_effects else np.zeros(1)
+    charge = incoming_charge(frame, b, persistence)
+    response = np.asarray(masters.flat.mean, float)
+    flags = masters.flags | np.where(frame.saturated_pixels(), SATURATED, 0).astype(np.uint8)
+    flags |= np.where(_hit_pixels(frame, charge, b) & (flags & SATURATED == 0), COSMIC_RAY, 0).astype(np.uint8)
+    has_value = (response > 0.0) & np.isfinite(charge)
+    image = np.where(has_value, charge - dark, 0.0) / np.where(has_value, response, 1.0)
+    used = has_value & (flags & ~np.uint8(calibration.GOOD) == 0)
+    estimator = Estimator.from_scene(frame.scene, frame.applied)
+    light = calibration.expected_light(image, used, float(estimator.variance(np.zeros(1))[0]))
+    variance = estimator.variance(np.maximum(light * response + dark + persistence, 0.0))
+    flags |= np.where(persistence > np.sqrt(variance), PERSISTENCE, 0).astype(np.uint8)
+    variance += (frame.scene.value("persistence.spread", "") * persistence) ** 2
+    variance += (masters.dark.uncertainty * time) ** 2 + (light * response * masters.flat.uncertainty) ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
         weight = np.where(used, response**2 / variance, 0.0)
     weight = np.where(np.isfinite(weight), weight * unit**2, 0.0).astype(np.float32)
-    return Reduced((image / unit).astype(np.float32), weight, flags)
+    return ReducedImage((image / unit).astype(np.float32), weight, flags)
 
 
-def _hit(frame: Frame, came: Float, b: Float) -> Bool:
+def _hit_pixels(frame: Frame, charge: Float, b: Float) -> Bool:
     """Pixels [ny, nx] whose ramp has a step."""
-    bend = Bend.of(frame.scene, frame.applied)
-    return np.asarray(frame.misfit() & (bend.misfit(came, np.maximum(b, declared(frame))) < _BENT))
+    nonlinearity = RampNonlinearity.from_scene(frame.scene, frame.applied)
+    return np.asarray(
+        frame.misfit_pixels()
+        & (nonlinearity.chi_square(charge, np.maximum(b, declared_nonlinearity(frame))) < _MAX_NONLINEAR_CHI2)
+    )
 
 
-def of_frame(folder: Path, frame: Frame, without: Sequence[str]) -> Masters:
+def read_masters(folder: Path, frame: Frame, without: Sequence[str]) -> Masters:
     """The masters of a frame; without : those that are not wanted, and `nonlinearity`: as it is read."""
-    shape, found, dark_time = (frame.scene.ny, frame.scene.nx), {}, np.inf
-    for kind in files.kinds(frame):
+    shape, combined, dark_time = (frame.scene.ny, frame.scene.nx), {}, np.inf
+    for kind in files.master_kinds(frame):
         if kind in without or (kind == "linearity" and "nonlinearity" in without):
-            neutral = {"flat": 1.0, "dark": 0.0, "linearity": declared(frame)}[kind]
-            found[kind] = calibration.nothing(shape, neutral)
+            neutral = {"flat": 1.0, "dark": 0.0, "linearity": declared_nonlinearity(frame)}[kind]
+            combined[kind] = calibration.neutral_master(shape, neutral)
         else:
-            found[kind], time = files.read_master(files.master_name(folder, frame, kind), kind, frame)
+            combined[kind], time = files.read_master(files.master_path(folder, frame, kind), kind, frame)
             dark_time = time if kind == "dark" else dark_time
-    flags = calibration.master_flags(shape, found, without)
-    flat = replace(found["flat"], vignetted=True)
-    return Masters(found["linearity"], found["dark"], flat, flags, dark_time)
+    flags = calibration.master_flags(shape, combined, without)
+    flat = replace(combined["flat"], vignetted=True)
+    return Masters(combined["linearity"], combined["dark"], flat, flags, dark_time)

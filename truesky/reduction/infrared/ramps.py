@@ -51,11 +51,11 @@ class Estimator:
     rounding: float
 
     @classmethod
-    def of(cls, scene: Scene, applied: Container[str]) -> Estimator:
+    def from_scene(cls, scene: Scene, applied: Container[str]) -> Estimator:
         """Of a frame's detector; applied : names of the effects that are in it."""
         side, diagonal = ipc.EFFECT.parameters(scene) if ipc.EFFECT.name in applied else (0.0, 0.0)
         return cls(
-            ramp.mode_of(scene),
+            ramp.mode_of_scene(scene),
             scene.value("read_noise", "electron"),
             scene.value(f"drift_{scene.ramp}", "electron") if ramp_noise.DRIFT.name in applied else 0.0,
             (1.0 - 4.0 * (side + diagonal)) ** 2 + 4.0 * (side**2 + diagonal**2),
@@ -72,10 +72,10 @@ class Estimator:
 
     def _moments(self, signal: Float) -> tuple[Float, Float]:
         mode, n = self.mode, self.mode.differences
-        r, part = float(mode.reads), mode.reads + mode.drops
+        r, frames_per_group = float(mode.reads), mode.reads + mode.drops
         light, noise, big = signal / n, self.read_noise**2 / r, 1.0 + mode.alpha
         d = light + macc.beta(mode, self.read_noise)
-        f = light / part
+        f = light / frames_per_group
         a = self.coupling * light * big + 2.0 * noise
         b = (self.coupling * f * (r * r - 1.0) / (6.0 * r) - noise) if n > 1 else np.zeros_like(a)
         total = n * a + 2.0 * (n - 1) * b
@@ -89,45 +89,45 @@ class Estimator:
 
 
 @dataclass(frozen=True, slots=True)
-class Bend:
+class RampNonlinearity:
     """What a ramp's frames make of non-linearity.
 
     first, second : k1 and k2;  uneven : what differences depart from their mean of, of chi^2
     """
 
-    first: float
-    second: float
-    uneven: float
+    k1: float
+    k2: float
+    misfit_factor: float
 
     @classmethod
-    def of(cls, scene: Scene, applied: Container[str]) -> Bend:
+    def from_scene(cls, scene: Scene, applied: Container[str]) -> RampNonlinearity:
         """Of a frame; applied : names of the effects that are in it."""
-        mode = ramp.mode_of(scene)
+        mode = ramp.mode_of_scene(scene)
         if ramp_nonlinearity.SIGNAL.name in applied:
             return cls(1.0, 1.0, 0.0)
-        part = mode.reads + mode.drops
-        frames = np.arange(mode.groups)[:, None] * part + np.arange(1, mode.reads + 1)
-        steps = np.diff((frames.astype(float) ** 2).mean(axis=1)) / part
-        mean, square, all_frames = float(steps.mean()), float((steps**2).mean()), mode.integrated
+        frames_per_group = mode.reads + mode.drops
+        frames = np.arange(mode.groups)[:, None] * frames_per_group + np.arange(1, mode.reads + 1)
+        steps = np.diff((frames.astype(float) ** 2).mean(axis=1)) / frames_per_group
+        mean, square, all_frames = float(steps.mean()), float((steps**2).mean()), mode.integration_frames
         return cls(mean / all_frames, square / all_frames**2, (square - mean**2) / all_frames**2 / (1.0 + mode.alpha))
 
-    def bent(self, signal: Float, b: Float) -> Float:
+    def nonlinear_signal(self, signal: Float, b: Float) -> Float:
         """What is seen of a signal, e-; b : 1/e-."""
-        part = b * np.maximum(signal, 0.0)
-        return np.asarray(signal * np.sqrt(np.maximum(1.0 - 2.0 * self.first * part + self.second * part**2, 0.0)))
+        loss = b * np.maximum(signal, 0.0)
+        return np.asarray(signal * np.sqrt(np.maximum(1.0 - 2.0 * self.k1 * loss + self.k2 * loss**2, 0.0)))
 
-    def linearised(self, seen: Float, b: Float) -> Float:
+    def linearise(self, observed: Float, b: Float) -> Float:
         """The signal of which this is seen, e-; b : 1/e-.  Error: of what no signal gives, about the largest."""
-        out = np.array(seen, float)
+        out = np.array(observed, float)
         for _ in range(_ROUNDS):
-            part = b * np.maximum(out, 0.0)
-            out = seen / np.sqrt(np.maximum(1.0 - 2.0 * self.first * part + self.second * part**2, 0.1))
+            loss = b * np.maximum(out, 0.0)
+            out = observed / np.sqrt(np.maximum(1.0 - 2.0 * self.k1 * loss + self.k2 * loss**2, 0.1))
         return out
 
     def slope(self, signal: Float) -> Float:
         """What a signal changes with b where that is small, e-^2."""
-        return np.asarray(self.first * np.maximum(signal, 0.0) ** 2)
+        return np.asarray(self.k1 * np.maximum(signal, 0.0) ** 2)
 
-    def misfit(self, signal: Float, b: Float) -> Float:
+    def chi_square(self, signal: Float, b: Float) -> Float:
         """chi^2 that non-linearity alone makes of a ramp."""
-        return np.asarray(self.uneven * b**2 * np.maximum(signal, 0.0) ** 3)
+        return np.asarray(self.misfit_factor * b**2 * np.maximum(signal, 0.0) ** 3)

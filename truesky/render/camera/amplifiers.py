@@ -28,7 +28,7 @@ import numpy.typing as npt
 from lake_schema.arrays import Bool, Float
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
-from lake_schema.mission.detector_overrides import Place
+from lake_schema.mission.detector_overrides import DetectorPlace
 from truesky.randomness import rng
 from truesky.render.camera.detectors import Detector
 from truesky.render.camera.sections import Section, Sections
@@ -36,10 +36,10 @@ from truesky.render.camera.sections import Section, Sections
 Number = TypeVar("Number", bound=np.generic)
 
 # Standard deviations at which an amplifier's own value ends: none is far off.
-_MOST_SPREAD = 3.0
+_MAX_DEVIATION = 3.0
 # Crosstalk falls off with the distance of two outputs, in amplifiers, as so high a power, up to so many; outputs at the
 # other end of the columns are as much farther away (as measured in LSSTCam: less than 5e-5 beyond the neighbours).
-_FALL, _FARTHEST, _OTHER_END = 2.6, 4.0, 2.0
+_FALLOFF_POWER, _MAX_DISTANCE, _OPPOSITE_END_DISTANCE = 2.6, 4.0, 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class Amplifier:
     pixels: Section
     read_right: bool
     read_top: bool
-    relative: tuple[float, float] = (1.0, 1.0)
+    ratios_to_first: tuple[float, float] = (1.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +70,7 @@ class Layout:
     ny: int
     prescan: int
     overscan: int
-    rows: int
+    overscan_rows: int
     amplifiers: tuple[Amplifier, ...]
 
     @property
@@ -84,111 +84,111 @@ class Layout:
         return self.amplifiers[0].pixels.ny
 
     @property
-    def scans(self) -> int:
+    def scan_columns(self) -> int:
         """Columns that are no pixels, of an amplifier."""
         return self.prescan + self.overscan
 
     @property
-    def runs(self) -> tuple[tuple[int, int, bool], ...]:
+    def column_segments(self) -> tuple[tuple[int, int, bool], ...]:
         """First row, the one past the last, and whether the register lies above them: of each piece of a column."""
         pieces = {(a.pixels.y, a.pixels.y + a.pixels.ny, a.read_top) for a in self.amplifiers}
         return tuple(sorted(pieces))
 
     @property
-    def streets(self) -> Bool:
+    def unread_pixels(self) -> Bool:
         """[ny, nx] where no amplifier reads."""
         out = np.ones((self.ny, self.nx), bool)
         for amplifier in self.amplifiers:
             out[amplifier.pixels.slices] = False
         return out
 
-    def apart(self, frame: npt.NDArray[Number]) -> npt.NDArray[Number]:
+    def split(self, frame: npt.NDArray[Number]) -> npt.NDArray[Number]:
         """[ny, nx] -> [q, rows, columns] in readout order, 0 in pre- and overscan."""
         if frame.shape != (self.ny, self.nx):
             raise BadInput(f"a frame of {frame.shape} pixels for amplifiers of {self.ny} x {self.nx}")
-        shape = len(self.amplifiers), self.height + self.rows, self.scans + self.width
+        shape = len(self.amplifiers), self.height + self.overscan_rows, self.scan_columns + self.width
         out = np.zeros(shape, frame.dtype)
         for plane, amplifier in zip(out, self.amplifiers, strict=True):
-            plane[: self.height, self.prescan : self.prescan + self.width] = _turned(
+            plane[: self.height, self.prescan : self.prescan + self.width] = _flip_to_readout_order(
                 frame[amplifier.pixels.slices], amplifier
             )
         return out
 
-    def together(self, planes: npt.NDArray[Number]) -> npt.NDArray[Number]:
+    def assemble(self, planes: npt.NDArray[Number]) -> npt.NDArray[Number]:
         """[q, rows, columns] in readout order -> [ny, nx], 0 where no amplifier reads."""
         out = np.zeros((self.ny, self.nx), planes.dtype)
         for plane, amplifier in zip(planes, self.amplifiers, strict=True):
             pixels = plane[: self.height, self.prescan : self.prescan + self.width]
-            out[amplifier.pixels.slices] = _turned(pixels, amplifier)
+            out[amplifier.pixels.slices] = _flip_to_readout_order(pixels, amplifier)
         return out
 
     @property
-    def data(self) -> Section:
+    def data_section(self) -> Section:
         """The pixels of the detector in its raw file."""
         across, up = (len(starts) for starts in self._starts)
-        return Section((across // 2) * self.scans, (up // 2) * self.rows, self.nx, self.ny)
+        return Section((across // 2) * self.scan_columns, (up // 2) * self.overscan_rows, self.nx, self.ny)
 
     @property
     def raw_shape(self) -> tuple[int, int]:
         """ny, nx of the raw file."""
         across, up = (len(starts) for starts in self._starts)
-        return self.ny + up * self.rows, self.nx + across * self.scans
+        return self.ny + up * self.overscan_rows, self.nx + across * self.scan_columns
 
-    def pixels_of(self, number: int) -> Section:
+    def amplifier_data_section(self, number: int) -> Section:
         """An amplifier's pixels in the raw file."""
-        own, data = self.amplifiers[number].pixels, self.data
-        return Section(data.x + own.x, data.y + own.y, own.nx, own.ny)
+        pixels, data = self.amplifiers[number].pixels, self.data_section
+        return Section(data.x + pixels.x, data.y + pixels.y, pixels.nx, pixels.ny)
 
-    def bias_of(self, number: int) -> Section:
+    def amplifier_bias_section(self, number: int) -> Section:
         """Its overscan columns beside its pixels in the raw file; its prescan where it has no others."""
-        first, many = (self.prescan, self.overscan) if self.overscan else (0, self.prescan)
-        return self._columns_of(number, first, many)
+        first, count = (self.prescan, self.overscan) if self.overscan else (0, self.prescan)
+        return self._scan_columns_section(number, first, count)
 
-    def prescan_of(self, number: int) -> Section:
+    def amplifier_prescan_section(self, number: int) -> Section:
         """Its columns that are read before its pixels, in the raw file."""
-        return self._columns_of(number, 0, self.prescan)
+        return self._scan_columns_section(number, 0, self.prescan)
 
-    def overscan_rows_of(self, number: int) -> Section:
+    def amplifier_overscan_section(self, number: int) -> Section:
         """The rows that are read after its pixels, in the columns of these, in the raw file."""
-        own, (_, band) = self.pixels_of(number), self._strips(number)
-        return Section(own.x, band, own.nx, self.rows)
+        pixels, (_, scan_y) = self.amplifier_data_section(number), self._scan_origin(number)
+        return Section(pixels.x, scan_y, pixels.nx, self.overscan_rows)
 
-    def _columns_of(self, number: int, first: int, many: int) -> Section:
+    def _scan_columns_section(self, number: int, first: int, count: int) -> Section:
         """So many of what of an amplifier is no pixel, from one on as they are read."""
-        amplifier, (strip, _) = self.amplifiers[number], self._strips(number)
+        amplifier, (scan_x, _) = self.amplifiers[number], self._scan_origin(number)
         if amplifier.read_right:
-            first = self.scans - first - many
-        return Section(strip + first, self.pixels_of(number).y, many, self.height)
+            first = self.scan_columns - first - count
+        return Section(scan_x + first, self.amplifier_data_section(number).y, count, self.height)
 
-    def placed(self, plane: npt.NDArray[Number], number: int) -> npt.NDArray[Number]:
+    def to_detector_axes(self, plane: npt.NDArray[Number], number: int) -> npt.NDArray[Number]:
         """What an amplifier reads [rows, columns] in readout order -> as it lies on the detector."""
-        return _turned(plane, self.amplifiers[number])
+        return _flip_to_readout_order(plane, self.amplifiers[number])
 
-    def sections_of(self, number: int) -> Sections:
+    def amplifier_sections(self, number: int) -> Sections:
         """Of an amplifier's pixels with their pre- and overscan, as `placed` has them."""
         amplifier = self.amplifiers[number]
         x = self.overscan if amplifier.read_right else self.prescan
-        data = Section(x, self.rows if amplifier.read_top else 0, self.width, self.height)
-        before, after = (0, self.prescan), (self.prescan + self.width, self.overscan)
-        first, many = after if self.overscan else before
+        data = Section(x, self.overscan_rows if amplifier.read_top else 0, self.width, self.height)
+        prescan, overscan = (0, self.prescan), (self.prescan + self.width, self.overscan)
+        first, count = overscan if self.overscan else prescan
         if amplifier.read_right:
-            first = self.scans + self.width - first - many
-        bias = Section(first, 0, many, self.height + self.rows) if many else None
+            first = self.scan_columns + self.width - first - count
+        bias = Section(first, 0, count, self.height + self.overscan_rows) if count else None
         return Sections(data, amplifier.pixels, bias)
 
-    def raw(self, planes: npt.NDArray[Number]) -> npt.NDArray[Number]:
+    def to_raw_image(self, planes: npt.NDArray[Number]) -> npt.NDArray[Number]:
         """[q, rows, columns] in readout order -> the raw file's image."""
         out = np.zeros(self.raw_shape, planes.dtype)
         for number, (plane, amplifier) in enumerate(zip(planes, self.amplifiers, strict=True)):
-            own, (strip, band) = self.pixels_of(number), self._strips(number)
+            pixels, (scan_x, scan_y) = self.amplifier_data_section(number), self._scan_origin(number)
             # In readout order, each with its place in the file.
-            turned = _turned(plane, amplifier)
-            columns = _parts(self.prescan, self.width, self.overscan, own.x, strip, amplifier.read_right)
-            rows = _parts(0, self.height, self.rows, own.y, band, amplifier.read_top)
-            for here_y, there_y, many_y in rows:
-                for here_x, there_x, many_x in columns:
-                    some = turned[here_y : here_y + many_y, here_x : here_x + many_x]
-                    out[there_y : there_y + many_y, there_x : there_x + many_x] = some
+            flipped = _flip_to_readout_order(plane, amplifier)
+            columns = _scan_segments(self.prescan, self.width, self.overscan, pixels.x, scan_x, amplifier.read_right)
+            rows = _scan_segments(0, self.height, self.overscan_rows, pixels.y, scan_y, amplifier.read_top)
+            for source_y, target_y, count_y in rows:
+                for source_x, target_x, count_x in columns:
+                    block = flipped[source_y : source_y + count_y, source_x : source_x + count_x]
+                    out[target_y : target_y + count_y, target_x : target_x + count_x] = block
         return out
 
     @property
@@ -197,30 +197,32 @@ class Layout:
         places = [amplifier.pixels for amplifier in self.amplifiers]
         return sorted({place.x for place in places}), sorted({place.y for place in places})
 
-    def _strips(self, number: int) -> tuple[int, int]:
+    def _scan_origin(self, number: int) -> tuple[int, int]:
         """First column and row in the raw file of what of an amplifier is no pixel."""
-        own, (across, up) = self.amplifiers[number].pixels, self._starts
-        i, j = across.index(own.x), up.index(own.y)
-        x = i * self.scans + (self.nx if i >= len(across) // 2 else 0)
-        y = j * self.rows + (self.ny if j >= len(up) // 2 else 0)
+        pixels, (across, up) = self.amplifiers[number].pixels, self._starts
+        i, j = across.index(pixels.x), up.index(pixels.y)
+        x = i * self.scan_columns + (self.nx if i >= len(across) // 2 else 0)
+        y = j * self.overscan_rows + (self.ny if j >= len(up) // 2 else 0)
         return x, y
 
 
-def _turned(plane: npt.NDArray[Number], amplifier: Amplifier) -> npt.NDArray[Number]:
+def _flip_to_readout_order(plane: npt.NDArray[Number], amplifier: Amplifier) -> npt.NDArray[Number]:
     """In readout order -> as it lies on the detector, and back."""
     return plane[:: -1 if amplifier.read_top else 1, :: -1 if amplifier.read_right else 1]
 
 
-def _parts(before: int, pixels: int, after: int, place: int, strip: int, turned: bool) -> list[tuple[int, int, int]]:
+def _scan_segments(
+    n_before: int, pixels: int, n_after: int, pixels_start: int, scan_start: int, is_flipped: bool
+) -> list[tuple[int, int, int]]:
     """(first in the plane, first in the file, how many) of what lies before the pixels, of them, of what is after."""
-    parts = [(before, strip), (pixels, place), (after, strip + before)]
-    if turned:
-        parts = [(after, strip), (pixels, place), (before, strip + after)]
-    found, here = [], 0
-    for many, there in parts:
-        found.append((here, there, many))
-        here += many
-    return found
+    parts = [(n_before, scan_start), (pixels, pixels_start), (n_after, scan_start + n_before)]
+    if is_flipped:
+        parts = [(n_after, scan_start), (pixels, pixels_start), (n_before, scan_start + n_after)]
+    segments, source = [], 0
+    for count, target in parts:
+        segments.append((source, target, count))
+        source += count
+    return segments
 
 
 @lru_cache(maxsize=256)
@@ -233,7 +235,7 @@ def layout(detector: Detector, mission: MissionConfiguration) -> Layout | None:
     if not rows:
         return None
     first = rows[0]
-    prescan, overscan, more = (int(first[key]) for key in ("prescan", "overscan", "overscan_rows"))
+    prescan, overscan, overscan_rows = (int(first[key]) for key in ("prescan", "overscan", "overscan_rows"))
     across, up = (sorted({int(row[axis]) for row in rows}) for axis in "xy")
     width, height = int(first["nx"]), int(first["ny"])
     if (detector.nx, detector.ny) != full_size(detector, mission):
@@ -243,7 +245,7 @@ def layout(detector: Detector, mission: MissionConfiguration) -> Layout | None:
         raise BadInput(f"detector {detector.name}: {detector.nx} x {detector.ny} pixels for {len(rows)} amplifiers")
     places = [sorted({int(row[axis]) for row in rows}) for axis in "xy"]
     reference = _table(detector.section, mission)[0]
-    found = tuple(
+    amplifiers = tuple(
         Amplifier(
             row["amplifier"],
             Section(across[places[0].index(int(row["x"]))], up[places[1].index(int(row["y"]))], width, height),
@@ -253,7 +255,7 @@ def layout(detector: Detector, mission: MissionConfiguration) -> Layout | None:
         )
         for row in rows
     )
-    return Layout(detector.nx, detector.ny, prescan, overscan, more, found)
+    return Layout(detector.nx, detector.ny, prescan, overscan, overscan_rows, amplifiers)
 
 
 def _table(section: str, mission: MissionConfiguration) -> tuple[Mapping[str, str], ...]:
@@ -274,7 +276,9 @@ _RELATIVE = {"gain": 0, "read_noise": 1}
 
 
 @lru_cache(maxsize=1024)
-def values(key: str, unit: str, detector: Detector, mission: MissionConfiguration, own: Layout) -> float | Float:
+def values(
+    key: str, unit: str, detector: Detector, mission: MissionConfiguration, detector_layout: Layout
+) -> float | Float:
     """A parameter of each amplifier [q]; one number where all agree.
 
     Of the parameters `key` and `key`_spread: mean, and rms between amplifiers, which differ in the same way in every
@@ -285,42 +289,46 @@ def values(key: str, unit: str, detector: Detector, mission: MissionConfiguratio
     name, spread = f"{detector.section}.{key}", f"{detector.section}.{key}_spread"
     rms = mission.value(spread, unit) if spread in mission else 0.0
     exact = name in mission.overridden and spread not in mission.overridden
-    found = np.empty(len(own.amplifiers))
-    for number, amplifier in enumerate(own.amplifiers):
-        place = Place(detector.name, amplifier.name)
-        found[number] = mission.value(name, unit, place)
-        if not exact and not mission.is_own(name, place):
+    results = np.empty(len(detector_layout.amplifiers))
+    for number, amplifier in enumerate(detector_layout.amplifiers):
+        place = DetectorPlace(detector.name, amplifier.name)
+        results[number] = mission.value(name, unit, place)
+        if not exact and not mission.is_overridden_at(name, place):
             deviation = float(rng.stream(0, name, detector.name, amplifier.name).standard_normal())
-            relative = amplifier.relative[_RELATIVE[key]] if key in _RELATIVE else 1.0
-            found[number] = relative * found[number] + rms * float(np.clip(deviation, -_MOST_SPREAD, _MOST_SPREAD))
-    found.setflags(write=False)
-    return found if np.ptp(found) > 0.0 else float(found[0])
+            relative = amplifier.ratios_to_first[_RELATIVE[key]] if key in _RELATIVE else 1.0
+            results[number] = relative * results[number] + rms * float(
+                np.clip(deviation, -_MAX_DEVIATION, _MAX_DEVIATION)
+            )
+    results.setflags(write=False)
+    return results if np.ptp(results) > 0.0 else float(results[0])
 
 
 # What an amplifier's own value may not be below: as bounds.csv has it of the mean.
-_LEAST = {"gain": ("electron / adu", 1e-3), "read_noise": ("electron", 0.0)}
+_MIN_VALUES = {"gain": ("electron / adu", 1e-3), "read_noise": ("electron", 0.0)}
 
 
 def refuse_spread(detectors: Sequence[Detector], mission: MissionConfiguration) -> None:
     """BadInput names the first amplifier of a camera that would have no gain, or less than no noise."""
     for detector in detectors:
-        own = layout(detector, mission)
-        for key, (unit, least) in _LEAST.items() if own else ():
-            assert own is not None
+        detector_layout = layout(detector, mission)
+        for key, (unit, minimum) in _MIN_VALUES.items() if detector_layout else ():
+            assert detector_layout is not None
             name = f"{detector.section}.{key}_spread"
             rms = mission.value(name, unit) if name in mission else 0.0
             mean = mission.value(f"{detector.section}.{key}", unit)
-            lowest = mean * min(amplifier.relative[_RELATIVE[key]] for amplifier in own.amplifiers)
-            if lowest - _MOST_SPREAD * rms >= least:
+            lowest = mean * min(amplifier.ratios_to_first[_RELATIVE[key]] for amplifier in detector_layout.amplifiers)
+            if lowest - _MAX_DEVIATION * rms >= minimum:
                 continue
-            found = np.broadcast_to(values(key, unit, detector, mission, own), len(own.amplifiers))
-            worst = int(np.argmin(found))
-            if found[worst] < least:
-                who = f"amplifier {own.amplifiers[worst].name} of detector {detector.name}"
-                raise BadInput(f"mission: {name} = {rms:g}: {who} would have {found[worst]:.3g} {unit}")
+            amplifier_values = np.broadcast_to(
+                values(key, unit, detector, mission, detector_layout), len(detector_layout.amplifiers)
+            )
+            worst = int(np.argmin(amplifier_values))
+            if amplifier_values[worst] < minimum:
+                label = f"amplifier {detector_layout.amplifiers[worst].name} of detector {detector.name}"
+                raise BadInput(f"mission: {name} = {rms:g}: {label} would have {amplifier_values[worst]:.3g} {unit}")
 
 
-def couplings(median: float, largest: float, detector: Detector, own: Layout) -> Float:
+def crosstalk_couplings(median: float, largest: float, detector: Detector, detector_layout: Layout) -> Float:
     """Crosstalk [q, q] of signal from the second index into the first, 0 on the diagonal.
 
     Of neighbours log-normal about the median, 3 sigma at the largest; it falls off with distance, and is the camera's
@@ -329,12 +337,14 @@ def couplings(median: float, largest: float, detector: Detector, own: Layout) ->
     median, largest : of the signal
     detector, own   : whose
     """
-    places = np.array([[a.pixels.x / own.width, a.pixels.y / own.height] for a in own.amplifiers])
+    places = np.array(
+        [[a.pixels.x / detector_layout.width, a.pixels.y / detector_layout.height] for a in detector_layout.amplifiers]
+    )
     distance = np.hypot(*(places[:, None] - places[None, :]).T)
-    top = np.array([a.read_top for a in own.amplifiers])
-    distance = distance + _OTHER_END * (top[:, None] != top[None, :])
-    spread = np.log(max(largest / median, 1.0)) / _MOST_SPREAD if median > 0.0 else 0.0
-    drawn = rng.stream(0, f"{detector.section}.crosstalk", detector.name).standard_normal(distance.shape)
-    pairs = np.minimum(median * np.exp(spread * drawn), max(median, largest))
-    near = (distance > 0.0) & (distance <= _FARTHEST)
-    return np.asarray(np.where(near, pairs / np.maximum(distance, 1.0) ** _FALL, 0.0))
+    top = np.array([a.read_top for a in detector_layout.amplifiers])
+    distance = distance + _OPPOSITE_END_DISTANCE * (top[:, None] != top[None, :])
+    spread = np.log(max(largest / median, 1.0)) / _MAX_DEVIATION if median > 0.0 else 0.0
+    normal_draws = rng.stream(0, f"{detector.section}.crosstalk", detector.name).standard_normal(distance.shape)
+    pairs = np.minimum(median * np.exp(spread * normal_draws), max(median, largest))
+    in_range = (distance > 0.0) & (distance <= _MAX_DISTANCE)
+    return np.asarray(np.where(in_range, pairs / np.maximum(distance, 1.0) ** _FALLOFF_POWER, 0.0))

@@ -23,7 +23,7 @@ from astropy.wcs import WCS, Sip
 from lake_schema import sky
 from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
-from truesky.numerics import sums
+from truesky.numerics import matrices
 from truesky.render.camera import distortion, pointing, tpv
 from truesky.render.camera.detectors import Detector
 from truesky.render.camera.pointing import ARCSEC
@@ -41,19 +41,21 @@ def wcs(detector: Detector, ra: float, dec: float, position_angle: float) -> WCS
     # Columns: the directions (east, north) of the focal plane's x and y axes.
     axes = np.array([[-np.cos(angle), np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    from_centre = sums.product(rotation.T, np.array([-detector.x, -detector.y])) / detector.pixel_scale
+    from_centre = matrices.matmul(rotation.T, np.array([-detector.x, -detector.y])) / detector.pixel_scale
     system = WCS(naxis=2)
-    bends = bool(detector.bending)
-    system.wcs.ctype = [f"{axis}{_PROJECTIONS[bends]}" for axis in ("RA---", "DEC--")]
+    has_distortion = bool(detector.distortion_terms)
+    system.wcs.ctype = [f"{axis}{_PROJECTIONS[has_distortion]}" for axis in ("RA---", "DEC--")]
     system.wcs.cunit = ["deg", "deg"]
     system.wcs.crval = [ra, dec]
     system.wcs.crpix = [(detector.nx + 1) / 2 + from_centre[0], (detector.ny + 1) / 2 + from_centre[1]]
-    system.wcs.cd = sums.product(axes, rotation) * detector.pixel_scale / 3600.0
+    system.wcs.cd = matrices.matmul(axes, rotation) * detector.pixel_scale / 3600.0
     system.wcs.radesys = "ICRS"
     # Else north would be turned by 180 deg for a boresight at the pole itself.
     system.wcs.lonpole = 180.0
-    if bends:
-        system.sip = Sip(*distortion.sip(detector.bending, detector.pixel_scale * rotation), None, None, _crpix(system))
+    if has_distortion:
+        system.sip = Sip(
+            *distortion.sip(detector.distortion_terms, detector.pixel_scale * rotation), None, None, _crpix(system)
+        )
     system.wcs.set()
     return system
 
@@ -69,7 +71,7 @@ def _crpix(system: WCS) -> Float:
 def sky_of_pixel(system: WCS, column: npt.ArrayLike, row: npt.ArrayLike) -> tuple[Float, Float]:
     """0-based pixel coordinates [n] -> ra [n] in [0, 360), dec [n], deg."""
     ra, dec = system.all_pix2world(np.asarray(column, float), np.asarray(row, float), 0)
-    return sky.wrapped(ra), np.asarray(dec)
+    return sky.wrap_angle(ra), np.asarray(dec)
 
 
 def pixel_of_sky(system: WCS, ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:
@@ -81,7 +83,7 @@ def pixel_of_sky(system: WCS, ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Fl
     if system.sip is None:
         return np.asarray(column), np.asarray(row)
     x0, y0 = _crpix(system) - 1.0
-    u, v = distortion.straight(column - x0, row - y0, system.sip.a, system.sip.b)
+    u, v = distortion.undo_sip(column - x0, row - y0, system.sip.a, system.sip.b)
     return u + x0, v + y0
 
 
@@ -127,12 +129,12 @@ def s_region(detector: Detector, system: WCS) -> str:
 
 def cards(system: WCS) -> tuple[tuple[str, Any, str], ...]:
     """The world coordinate system as FITS cards (a card holds 16 characters of a number: 1e-14)."""
-    header, bends = system.wcs, system.sip is not None
-    projection = "gnomonic projection" + (", distortion as SIP" if bends else "")
+    header, has_distortion = system.wcs, system.sip is not None
+    projection = "gnomonic projection" + (", distortion as SIP" if has_distortion else "")
     return (
         ("WCSAXES", 2, "number of world coordinate axes"),
-        ("CTYPE1", f"RA---{_PROJECTIONS[bends]}", projection),
-        ("CTYPE2", f"DEC--{_PROJECTIONS[bends]}", projection),
+        ("CTYPE1", f"RA---{_PROJECTIONS[has_distortion]}", projection),
+        ("CTYPE2", f"DEC--{_PROJECTIONS[has_distortion]}", projection),
         ("CUNIT1", "deg", "unit of CRVAL1, CD1_1, CD1_2"),
         ("CUNIT2", "deg", "unit of CRVAL2, CD2_1, CD2_2"),
         ("CRVAL1", float(header.crval[0]), "[deg] boresight right ascension"),
@@ -145,7 +147,7 @@ def cards(system: WCS) -> tuple[tuple[str, Any, str], ...]:
         ("CD2_2", float(header.cd[1, 1]), "[deg/pix]"),
         ("LONPOLE", 180.0, "[deg] native longitude of the celestial pole"),
         ("RADESYS", "ICRS", "celestial reference system"),
-        *(_sip_cards(system.sip) if bends else ()),
+        *(_sip_cards(system.sip) if has_distortion else ()),
     )
 
 
@@ -157,7 +159,7 @@ def _sip_cards(sip: Sip) -> Iterator[tuple[str, Any, str]]:
             yield f"{name}_{p}_{q}", float(coefficients[p, q]), f"[pix] times u^{p} v^{q}"
 
 
-def shifted(system: WCS, columns: float, rows: float) -> WCS:
+def shift_pixels(system: WCS, columns: float, rows: float) -> WCS:
     """The same sky on a frame in which every pixel lies so many columns and rows farther on."""
     out = system.deepcopy()
     out.wcs.crpix = [out.wcs.crpix[0] + columns, out.wcs.crpix[1] + rows]
@@ -183,7 +185,7 @@ def from_cards(header: Iterable[tuple[str, Any, str]]) -> WCS:
             system.sip = Sip(*(_coefficients(values, name) for name in "AB"), None, None, _crpix(system))
         if str(values["CTYPE1"]).endswith("-TPV"):
             system.wcs.ctype = [f"{axis}{_PROJECTIONS[True]}" for axis in ("RA---", "DEC--")]
-            system.sip = Sip(*tpv.sip_of(values), None, None, _crpix(system))
+            system.sip = Sip(*tpv.to_sip(values), None, None, _crpix(system))
     except KeyError as error:
         raise BadInput(f"the header has no card {error.args[0]}") from None
     system.wcs.set()

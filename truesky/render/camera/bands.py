@@ -12,13 +12,13 @@ from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.mission.parameter import SPACE_CAMERAS
 
 
-def of_ground(camera: str, mission: MissionConfiguration) -> tuple[str, ...]:
+def ground_bands(camera: str, mission: MissionConfiguration) -> tuple[str, ...]:
     """Names of a ground camera's passbands; () of any other camera."""
     prefix = f"ext.{camera}."
     keys = (p.key for p in mission.parameters if p.key.startswith(prefix) and p.key.endswith(".zero_point"))
     return () if camera in SPACE_CAMERAS else tuple(key.removeprefix(prefix).partition(".")[0] for key in keys)
 
 
-def of_one(only: str, *bands: str) -> Callable[[str, MissionConfiguration], tuple[str, ...]]:
+def single_camera_bands(only_camera: str, *bands: str) -> Callable[[str, MissionConfiguration], tuple[str, ...]]:
     """(camera, mission) -> these passbands of the camera `only`; () of any other camera."""
-    return lambda camera, mission: bands if camera == only else ()
+    return lambda camera, mission: bands if camera == only_camera else ()

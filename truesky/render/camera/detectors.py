@@ -30,7 +30,7 @@ class FilterWheel:
     bend  : the same times the square of the distance from the axis, rad on the sky
     """
 
-    error: float
+    tilt_rms: float
     shift: float
     bend: float
 
@@ -58,9 +58,9 @@ class Detector:
     y: float
     rotation: float
     pixel_scale: float
-    bending: distortion.Terms = ()
-    middle: int = 0
-    wheel: FilterWheel | None = None
+    distortion_terms: distortion.Terms = ()
+    injection_rows: int = 0
+    filter_wheel: FilterWheel | None = None
     kind: str = ""
 
     @property
@@ -79,21 +79,21 @@ def detectors(camera: str, mission: MissionConfiguration) -> tuple[Detector, ...
 
     Ref : VIS and NISP, Scaramella et al. 2022, Table 1 (gaps); ground cameras, the mission database's layouts
     """
-    found = _of_camera(camera, mission)
-    farthest = max(float(np.hypot(d.x, d.y)) + d.half_diagonal for d in found)
-    scale = found[0].pixel_scale
-    distortion.refuse_folded(found[0].bending, farthest / scale, scale, camera)
-    return found
+    camera_detectors = _load_detectors(camera, mission)
+    farthest = max(float(np.hypot(d.x, d.y)) + d.half_diagonal for d in camera_detectors)
+    scale = camera_detectors[0].pixel_scale
+    distortion.require_invertible(camera_detectors[0].distortion_terms, farthest / scale, scale, camera)
+    return camera_detectors
 
 
-def _of_camera(camera: str, mission: MissionConfiguration) -> tuple[Detector, ...]:
+def _load_detectors(camera: str, mission: MissionConfiguration) -> tuple[Detector, ...]:
     if camera == "vis":
         _refuse_odd("vis", mission)
-        return _of_grid("vis", lambda row, column: column >= _VIS_FIRST_ROTATED_COLUMN, mission)
+        return _grid_detectors("vis", lambda row, column: column >= _VIS_FIRST_ROTATED_COLUMN, mission)
     if camera == "nisp":
-        return _of_grid("nisp", lambda row, column: row >= _NISP_FIRST_ROTATED_ROW, mission)
+        return _grid_detectors("nisp", lambda row, column: row >= _NISP_FIRST_ROTATED_ROW, mission)
     if camera in mission.ground_cameras:
-        return _listed(f"ext.{camera}", mission)
+        return _read_layout(f"ext.{camera}", mission)
     raise BadInput(f"camera {camera!r} is not one of vis, nisp, {', '.join(mission.ground_cameras)}")
 
 
@@ -113,33 +113,42 @@ def _refuse_odd(section: str, mission: MissionConfiguration) -> None:
             raise BadInput(f"mission parameter {section}.fpa.{name} = {count:g}: must be an even number")
 
 
-def _of_grid(
-    section: str, upside_down: Callable[[int, int], bool], mission: MissionConfiguration
+def _grid_detectors(
+    section: str, is_upside_down: Callable[[int, int], bool], mission: MissionConfiguration
 ) -> tuple[Detector, ...]:
     """As mounted, behind the optics of their camera."""
-    planned, bending = _grid(mission, section, upside_down), distortion.terms(section, mission)
-    wheel = _wheel(section, mission)
-    return tuple(replace(d, bending=bending, wheel=wheel) for d in _mounted(planned, section, mission))
+    designed, distortion_terms = _designed_grid(mission, section, is_upside_down), distortion.terms(section, mission)
+    wheel = _load_filter_wheel(section, mission)
+    return tuple(
+        replace(d, distortion_terms=distortion_terms, filter_wheel=wheel)
+        for d in _apply_metrology(designed, section, mission)
+    )
 
 
-def _wheel(section: str, mission: MissionConfiguration) -> FilterWheel | None:
+def _load_filter_wheel(section: str, mission: MissionConfiguration) -> FilterWheel | None:
     """A filter is a plane-parallel plate in the beam between collimator and camera."""
     if f"{section}.filter_wheel_error" not in mission:
         return None
-    thickness, n = (
+    thickness, refractive_index = (
         mission.value(f"{section}.filter.thickness", "mm"),
         mission.value(f"{section}.filter.refractive_index"),
     )
     plate_scale = mission.value(f"{section}.fpa.pixel_scale", "arcsec / pix") / mission.value(
         f"{section}.fpa.pixel_size", "mm / pix"
     )
-    wider = mission.value("plm.focal_length", "m") / mission.value(f"{section}.collimator_focal_length", "m")
-    third = (n**2 - 1.0) / (2.0 * n**3)
+    magnification = mission.value("plm.focal_length", "m") / mission.value(f"{section}.collimator_focal_length", "m")
+    cubic_term = (refractive_index**2 - 1.0) / (2.0 * refractive_index**3)
     error = mission.value(f"{section}.filter_wheel_error", "rad")
-    return FilterWheel(error, plate_scale * thickness * (1.0 - 1.0 / n), plate_scale * thickness * third * wider**2)
+    return FilterWheel(
+        error,
+        plate_scale * thickness * (1.0 - 1.0 / refractive_index),
+        plate_scale * thickness * cubic_term * magnification**2,
+    )
 
 
-def _grid(mission: MissionConfiguration, section: str, upside_down: Callable[[int, int], bool]) -> Iterator[Detector]:
+def _designed_grid(
+    mission: MissionConfiguration, section: str, is_upside_down: Callable[[int, int], bool]
+) -> Iterator[Detector]:
     """Rows from the top, columns from the left; upside_down : row, column -> whether one is mounted so.
 
     The pitch is of the published rows, without those of charge injection, and gaps: VIS fills 0.7781 deg.
@@ -148,7 +157,7 @@ def _grid(mission: MissionConfiguration, section: str, upside_down: Callable[[in
     scale = mission.value(f"{section}.fpa.pixel_scale", "arcsec / pix")
     nx, ny, rows, columns = (int(mission.value(f"{section}.fpa.{key}")) for key in ("nx", "ny", "rows", "columns"))
     key = f"{section}.fpa.charge_injection_rows"
-    middle = int(mission.value(key, "pix")) if key in mission else 0
+    injection_rows = int(mission.value(key, "pix")) if key in mission else 0
     pitch_x = nx * scale + mission.value(f"{section}.fpa.gap_x", "arcsec")
     pitch_y = ny * scale + mission.value(f"{section}.fpa.gap_y", "arcsec")
     for row in range(1, rows + 1):
@@ -157,24 +166,24 @@ def _grid(mission: MissionConfiguration, section: str, upside_down: Callable[[in
                 name=detector_overrides.GRID_NAMES[section].format(row=row, column=column),
                 section=section,
                 nx=nx,
-                ny=ny + middle,
+                ny=ny + injection_rows,
                 x=(column - (columns + 1) / 2) * pitch_x,
                 y=((rows + 1) / 2 - row) * pitch_y,
-                rotation=180.0 if upside_down(row, column) else 0.0,
+                rotation=180.0 if is_upside_down(row, column) else 0.0,
                 pixel_scale=scale,
-                middle=middle,
+                injection_rows=injection_rows,
             )
 
 
-def _mounted(planned: Iterable[Detector], section: str, mission: MissionConfiguration) -> Iterator[Detector]:
+def _apply_metrology(designed: Iterable[Detector], section: str, mission: MissionConfiguration) -> Iterator[Detector]:
     """Detectors as they were mounted: shifted and turned a little, each in its own way."""
     key = f"{section}.fpa.metrology"
     if key not in mission:
-        yield from planned
+        yield from designed
         return
     measured = {row["detector"]: row for row in mission.rows(key)}
     shift, turn = (mission.value(f"{key}_{kind}", unit) for kind, unit in (("shift", "pix"), ("rotation", "deg")))
-    for d in planned:
+    for d in designed:
         row = measured.get(d.name)
         if row is None:
             yield d
@@ -183,9 +192,9 @@ def _mounted(planned: Iterable[Detector], section: str, mission: MissionConfigur
         yield replace(d, x=d.x + x, y=d.y + y, rotation=d.rotation + turn * float(row["rotation"]))
 
 
-def _listed(section: str, mission: MissionConfiguration) -> tuple[Detector, ...]:
+def _read_layout(section: str, mission: MissionConfiguration) -> tuple[Detector, ...]:
     """Detectors of a layout in millimetres."""
-    bending = distortion.terms(section, mission)
+    distortion_terms = distortion.terms(section, mission)
     scale = mission.value(f"{section}.fpa.pixel_scale", "arcsec / pix")
     plate_scale = scale / mission.value(f"{section}.fpa.pixel_size", "mm / pix")
     return tuple(
@@ -198,7 +207,7 @@ def _listed(section: str, mission: MissionConfiguration) -> tuple[Detector, ...]
             y=float(row["y_mm"]) * plate_scale,
             rotation=float(row["rotation_deg"]),
             pixel_scale=scale,
-            bending=bending,
+            distortion_terms=distortion_terms,
             kind=row["type"],
         )
         for row in mission.rows(f"{section}.layout")

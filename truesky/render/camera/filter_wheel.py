@@ -28,7 +28,7 @@ from truesky.render.camera.detectors import Detector
 from truesky.render.camera.pointing import ARCSEC
 
 
-def tilted(detector: Detector, exposure: str, seed: int) -> Detector:
+def apply_random_tilt(detector: Detector, exposure: str, seed: int) -> Detector:
     """The detector as the exposure's filter lets it see: displaced, and behind another distortion.
 
     The tilt is normally distributed, of the wheel's error in both directions together.
@@ -36,28 +36,30 @@ def tilted(detector: Detector, exposure: str, seed: int) -> Detector:
 
     detector : of the camera;  exposure : what its tilt is keyed by;  seed : of the request
     """
-    wheel = detector.wheel
-    if wheel is None or not wheel.error:
+    filter_wheel = detector.filter_wheel
+    if filter_wheel is None or not filter_wheel.tilt_rms:
         return detector
     stream = rng.stream(seed, "filter_wheel", exposure)
-    across, up = (float(part) for part in stream.normal(0.0, wheel.error * 0.5**0.5, 2))
-    return displaced(detector, across, up)
+    tilt_x, tilt_y = (float(part) for part in stream.normal(0.0, filter_wheel.tilt_rms * 0.5**0.5, 2))
+    return apply_tilt(detector, tilt_x, tilt_y)
 
 
-def displaced(detector: Detector, across: float, up: float) -> Detector:
+def apply_tilt(detector: Detector, tilt_x: float, tilt_y: float) -> Detector:
     """The same for a tilt (rad) by which the filter's normal leans along the focal plane's x and y axes.
 
     A place of the detector sees what, without the tilt, is seen so much before it.
     detector : of the camera;  across, up : of the tilt
     """
-    wheel = detector.wheel
-    if wheel is None:
+    filter_wheel = detector.filter_wheel
+    if filter_wheel is None:
         return detector
-    shift, bend = wheel.shift, wheel.bend * ARCSEC**2
-    own = (
-        (2, 0, -3.0 * bend * across, -bend * up),
-        (1, 1, -2.0 * bend * up, -2.0 * bend * across),
-        (0, 2, -bend * across, -3.0 * bend * up),
+    shift, bend = filter_wheel.shift, filter_wheel.bend * ARCSEC**2
+    tilt_terms = (
+        (2, 0, -3.0 * bend * tilt_x, -bend * tilt_y),
+        (1, 1, -2.0 * bend * tilt_y, -2.0 * bend * tilt_x),
+        (0, 2, -bend * tilt_x, -3.0 * bend * tilt_y),
     )
-    bending = distortion.joined(detector.bending, own)
-    return replace(detector, x=detector.x - shift * across, y=detector.y - shift * up, bending=bending)
+    distortion_terms = distortion.add_terms(detector.distortion_terms, tilt_terms)
+    return replace(
+        detector, x=detector.x - shift * tilt_x, y=detector.y - shift * tilt_y, distortion_terms=distortion_terms
+    )

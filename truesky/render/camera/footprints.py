@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from lake_schema.arrays import Int
-from truesky.numerics import sums
+from truesky.numerics import matrices
 from truesky.render.camera import pointing
 
 
@@ -19,14 +19,14 @@ def counts(tasks: pa.Table, ra: npt.ArrayLike, dec: npt.ArrayLike) -> Int:
     from scipy.spatial import cKDTree
 
     places = pointing.basis(np.asarray(ra, float), np.asarray(dec, float))[2].T
-    found = np.zeros(len(places), np.int64)
+    footprint_counts = np.zeros(len(places), np.int64)
     centres = pointing.basis(tasks["ra"].to_numpy(), tasks["dec"].to_numpy())[2].T
     chords = 2.0 * np.sin(np.radians(tasks["radius"].to_numpy()) / 2.0)
-    nearby = cKDTree(places).query_ball_point(centres, chords) if len(tasks) else []
-    for near, region in zip(nearby, tasks["s_region"].to_pylist(), strict=True):
-        if near:
+    nearby_places = cKDTree(places).query_ball_point(centres, chords) if len(tasks) else []
+    for indices, region in zip(nearby_places, tasks["s_region"].to_pylist(), strict=True):
+        if indices:
             corners = np.array(region.split()[2:], float).reshape(-1, 2)
             edges = pointing.basis(corners[:, 0], corners[:, 1])[2].T
-            side = sums.product(places[near], np.cross(edges, np.roll(edges, -1, axis=0)).T)
-            found[near] += (side >= 0).all(axis=1) | (side <= 0).all(axis=1)
-    return found
+            side = matrices.matmul(places[indices], np.cross(edges, np.roll(edges, -1, axis=0)).T)
+            footprint_counts[indices] += (side >= 0).all(axis=1) | (side <= 0).all(axis=1)
+    return footprint_counts

@@ -15,7 +15,7 @@ from truesky.randomness import rng
 from truesky.render.camera import traces
 
 # Spectra are followed along the columns: a grism that is turned by more is none of NISP's, deg.
-MOST_TURNED = 45.0
+MAX_TILT = 45.0
 
 
 def tilt(grism: str, angle: float, section: str, mission: MissionConfiguration) -> float:
@@ -28,17 +28,21 @@ def tilt(grism: str, angle: float, section: str, mission: MissionConfiguration) 
     return (angle - traces.direction(grism, section, mission) + 180.0) % 360.0 - 180.0
 
 
-def turned(asked: float, exposure: str, section: str, mission: MissionConfiguration, seed: int) -> float:
+def tilt_with_error(
+    requested_tilt: float, exposure: str, section: str, mission: MissionConfiguration, seed: int
+) -> float:
     """The tilt that a grism has in an exposure, deg: as asked for, and the wheel's error.
 
     asked            : deg;  exposure : what the error is keyed by, with the seed of the request
     section, mission : of the camera in the mission database
     """
     error = mission.value(f"{section}.grism_wheel_error", "deg")
-    return asked + float(rng.stream(seed, "grism_wheel", exposure).normal(0.0, error))
+    return requested_tilt + float(rng.stream(seed, "grism_wheel", exposure).normal(0.0, error))
 
 
-def vignetted(x: Float, y: Float, along: float, asked: float, section: str, mission: MissionConfiguration) -> Float:
+def vignetting_throughput(
+    x: Float, y: Float, dispersion_angle: float, requested_tilt: float, section: str, mission: MissionConfiguration
+) -> Float:
     """[n] part of the light of sources at places (x, y) [n] arcsec of the focal plane that a grism lets through.
 
     x, y             : of the undispersed images;  along : the angle at which spectra run, deg
@@ -49,7 +53,7 @@ def vignetted(x: Float, y: Float, along: float, asked: float, section: str, miss
     """
     key = f"{section}.vignetting"
     low, high = (mission.value(f"{key}.angle_{end}", "arcsec") for end in ("low", "high"))
-    depth = mission.value(f"{key}.depth", "") * abs(asked) / mission.value(f"{key}.tilt", "deg")
-    turn = np.radians(along)
-    away = np.sign(asked) * (np.cos(turn) * y - np.sin(turn) * x)
+    depth = mission.value(f"{key}.depth", "") * abs(requested_tilt) / mission.value(f"{key}.tilt", "deg")
+    turn = np.radians(dispersion_angle)
+    away = np.sign(requested_tilt) * (np.cos(turn) * y - np.sin(turn) * x)
     return np.asarray(1.0 - np.minimum(depth * np.clip((away - low) / (high - low), 0.0, 1.0), 1.0))

@@ -21,14 +21,14 @@ class Observatory:
     instrument: str
     convention: str
     time_scale: str = "UTC"
-    ahead: float = 0.0
+    seconds_ahead_of_utc: float = 0.0
 
 
 # TAI - UTC since 2017.
 _TAI = 37.0
 # VIS: its distortion model is fitted as SIP (Euclid Data Product Description Document, VIS, Distortion Model). LSST and
 # HSC share a pipeline, which writes SIP; those of the others are built about SCAMP and SWarp, which read TPV.
-_KNOWN = {
+_OBSERVATORIES = {
     "vis": Observatory("Euclid", "VIS", "sip"),
     "nisp": Observatory("Euclid", "NISP", "sip"),
     "decam": Observatory("CTIO 4.0-m telescope", "DECam", "tpv"),
@@ -40,6 +40,6 @@ _KNOWN = {
 }
 
 
-def of(camera: str) -> Observatory:
+def for_camera(camera: str) -> Observatory:
     """Of a camera; of one that nothing is known of, with its name, somewhere."""
-    return _KNOWN.get(camera, Observatory("", camera, "sip"))
+    return _OBSERVATORIES.get(camera, Observatory("", camera, "sip"))

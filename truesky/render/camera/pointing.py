@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lake_schema.arrays import Float
-from truesky.numerics import sums
+from truesky.numerics import matrices
 from truesky.render.camera import distortion
 from truesky.render.camera.detectors import Detector
 
@@ -31,18 +31,18 @@ def boresight_for(detector: Detector, ra: float, dec: float, position_angle: flo
                      target because meridians converge; defined everywhere, poles included
     """
     # Right-handed: (east-like = -x, y, outward).
-    x, y = (float(place) for place in distortion.bent(detector.x, detector.y, detector.bending))
+    x, y = (float(place) for place in distortion.distort(detector.x, detector.y, detector.distortion_terms))
     centre = np.array([-x * ARCSEC, y * ARCSEC, 1.0])
     camera = _triad(centre, np.array([0.0, 1.0, 0.0]))
     east, north, out = basis(ra, dec)
     angle = np.radians(position_angle)
     sky = _triad(out, np.sin(angle) * east + np.cos(angle) * north)
-    rotation = sums.product(sky, camera.T)
+    rotation = matrices.matmul(sky, camera.T)
     boresight, up = rotation[:, 2], rotation[:, 1]
     ra0 = float(np.degrees(np.arctan2(boresight[1], boresight[0])) % 360.0)
     dec0 = float(np.degrees(np.arctan2(boresight[2], np.hypot(boresight[0], boresight[1]))))
     east0, north0, _ = basis(ra0, dec0)
-    return ra0, dec0, float(np.degrees(np.arctan2(sums.product(up, east0), sums.product(up, north0))))
+    return ra0, dec0, float(np.degrees(np.arctan2(matrices.matmul(up, east0), matrices.matmul(up, north0))))
 
 
 def sky_of_plane(
@@ -63,18 +63,18 @@ def sky_of_plane(
     return lon.reshape(u.shape), lat.reshape(u.shape)
 
 
-def outline(some: Sequence[Detector]) -> tuple[Float, Float]:
+def outline(detectors: Sequence[Detector]) -> tuple[Float, Float]:
     """x, y [n, 5] arcsec on the tangent plane: what each detector's centre and corners see; corners as of `corners`."""
     column = np.array([0.0, -0.5, 0.5, 0.5, -0.5])
     row = np.array([0.0, -0.5, -0.5, 0.5, 0.5])
-    width = np.array([[d.nx * d.pixel_scale] for d in some]) * column
-    height = np.array([[d.ny * d.pixel_scale] for d in some]) * row
-    turn = np.radians([[d.rotation] for d in some])
-    x = np.array([[d.x] for d in some]) + np.cos(turn) * width - np.sin(turn) * height
-    y = np.array([[d.y] for d in some]) + np.sin(turn) * width + np.cos(turn) * height
-    for bending in {d.bending for d in some if d.bending}:
-        bends = np.array([d.bending == bending for d in some])
-        x[bends], y[bends] = distortion.bent(x[bends], y[bends], bending)
+    width = np.array([[d.nx * d.pixel_scale] for d in detectors]) * column
+    height = np.array([[d.ny * d.pixel_scale] for d in detectors]) * row
+    turn = np.radians([[d.rotation] for d in detectors])
+    x = np.array([[d.x] for d in detectors]) + np.cos(turn) * width - np.sin(turn) * height
+    y = np.array([[d.y] for d in detectors]) + np.sin(turn) * width + np.cos(turn) * height
+    for bending in {d.distortion_terms for d in detectors if d.distortion_terms}:
+        has_terms = np.array([d.distortion_terms == bending for d in detectors])
+        x[has_terms], y[has_terms] = distortion.distort(x[has_terms], y[has_terms], bending)
     return x, y
 
 
@@ -90,7 +90,7 @@ def basis(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float, Float]:
 
 def _triad(direction: Float, along: Float) -> Float:
     """Orthonormal columns: direction, `along` made perpendicular to it, their cross product."""
-    first = direction / np.sqrt(sums.product(direction, direction))
-    second = along - first * sums.product(first, along)
-    second = second / np.sqrt(sums.product(second, second))
+    first = direction / np.sqrt(matrices.matmul(direction, direction))
+    second = along - first * matrices.matmul(first, along)
+    second = second / np.sqrt(matrices.matmul(second, second))
     return np.stack([first, second, np.cross(first, second)], axis=1)

@@ -38,7 +38,7 @@ class Section:
         return slice(self.y, self.y + self.ny), slice(self.x, self.x + self.nx)
 
     @classmethod
-    def of(cls, text: str) -> Section:
+    def from_text(cls, text: str) -> Section:
         """From a header's text."""
         (x, past_x), (y, past_y) = (map(int, part.split(":")) for part in text.strip("[] ").split(","))
         return cls(x - 1, y - 1, past_x - x + 1, past_y - y + 1)
@@ -57,13 +57,13 @@ class Sections:
     bias: Section | None = None
 
     @classmethod
-    def whole(cls, nx: int, ny: int) -> Sections:
+    def full_frame(cls, nx: int, ny: int) -> Sections:
         """Of an array that is the detector's pixels."""
-        every = Section(0, 0, nx, ny)
-        return cls(every, every)
+        section = Section(0, 0, nx, ny)
+        return cls(section, section)
 
 
-def in_mosaic(detector: Detector, section: Section, every: Sequence[Detector]) -> str | None:
+def to_mosaic_section(detector: Detector, section: Section, detectors: Sequence[Detector]) -> str | None:
     """A section of a detector's pixels as the mosaic's, whose pixels go on where the gaps are.
 
     every   : detectors of its camera, along most of which the mosaic's columns are, and whose first corner is its
@@ -71,41 +71,45 @@ def in_mosaic(detector: Detector, section: Section, every: Sequence[Detector]) -
               columns there are no columns here
     Error   : half a pixel, and what detectors are turned by besides quarters of a turn
     """
-    one, *others = _laid((detector, *every))
-    if _quarters(one) not in _ALONG:
+    aligned_detector, *aligned_camera = _align_to_mosaic((detector, *detectors))
+    if _quarter_turns(aligned_detector) not in _ALONG:
         return None
-    left, low = (round(own - first) for own, first in zip(_corner(one), _first(others), strict=True))
+    x_offset, y_offset = (
+        round(position - first)
+        for position, first in zip(_corner(aligned_detector), _mosaic_origin(aligned_camera), strict=True)
+    )
     columns, rows = (section.x + 1, section.x + section.nx), (section.y + 1, section.y + section.ny)
-    if one.upside_down:
+    if aligned_detector.upside_down:
         columns, rows = (
             (size + 1 - first, size + 1 - last) for size, (first, last) in ((detector.nx, columns), (detector.ny, rows))
         )
-    return f"[{left + columns[0]}:{left + columns[1]},{low + rows[0]}:{low + rows[1]}]"
+    return f"[{x_offset + columns[0]}:{x_offset + columns[1]},{y_offset + rows[0]}:{y_offset + rows[1]}]"
 
 
-def mosaic_size(every: Sequence[Detector]) -> str:
+def mosaic_size(detectors: Sequence[Detector]) -> str:
     """The mosaic of these detectors as DETSIZE."""
-    laid = _laid(every)
+    aligned = _align_to_mosaic(detectors)
     right, top = (
-        max(round(_corner(d)[axis] - first) + _sides(d)[axis] for d in laid) for axis, first in enumerate(_first(laid))
+        max(round(_corner(d)[axis] - first) + _sides(d)[axis] for d in aligned)
+        for axis, first in enumerate(_mosaic_origin(aligned))
     )
     return f"[1:{right},1:{top}]"
 
 
-def _laid(every: Sequence[Detector]) -> Sequence[Detector]:
+def _align_to_mosaic(detectors: Sequence[Detector]) -> Sequence[Detector]:
     """Detectors on axes along which most of them lie: those of the focal plane, or a quarter of a turn from them."""
-    if 2 * sum(_quarters(d) in _ALONG for d in every) >= len(every):
-        return every
-    return [replace(d, x=d.y, y=-d.x, rotation=d.rotation - 90.0) for d in every]
+    if 2 * sum(_quarter_turns(d) in _ALONG for d in detectors) >= len(detectors):
+        return detectors
+    return [replace(d, x=d.y, y=-d.x, rotation=d.rotation - 90.0) for d in detectors]
 
 
-def _quarters(detector: Detector) -> int:
+def _quarter_turns(detector: Detector) -> int:
     return round(detector.rotation / 90.0) % 4
 
 
 def _sides(detector: Detector) -> tuple[int, int]:
     """Columns and rows of the mosaic that it fills."""
-    along = _quarters(detector) in _ALONG
+    along = _quarter_turns(detector) in _ALONG
     return (detector.nx, detector.ny) if along else (detector.ny, detector.nx)
 
 
@@ -115,6 +119,6 @@ def _corner(detector: Detector) -> tuple[float, float]:
     return detector.x / detector.pixel_scale - nx / 2, detector.y / detector.pixel_scale - ny / 2
 
 
-def _first(every: Sequence[Detector]) -> tuple[float, float]:
-    corners = [_corner(d) for d in every]
+def _mosaic_origin(detectors: Sequence[Detector]) -> tuple[float, float]:
+    corners = [_corner(d) for d in detectors]
     return min(x for x, _ in corners), min(y for _, y in corners)

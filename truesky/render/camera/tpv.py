@@ -18,7 +18,7 @@ import numpy as np
 
 from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
-from truesky.numerics import sums
+from truesky.numerics import matrices
 from truesky.render.camera import distortion
 
 Card = tuple[str, Any, str]
@@ -29,7 +29,7 @@ CONVENTIONS = ("sip", "tpv")
 _FIRST = (0, 1, 4, 7, 12, 17, 24, 31)
 
 
-def cards(header: Sequence[Card]) -> tuple[Card, ...]:
+def from_sip(header: Sequence[Card]) -> tuple[Card, ...]:
     """A header with SIP -> the same with TPV in its place; a header without SIP as it is.
 
     header : cards of an image
@@ -39,9 +39,9 @@ def cards(header: Sequence[Card]) -> tuple[Card, ...]:
     if not str(values.get("CTYPE1", "")).endswith("-SIP"):
         return tuple(header)
     # From the tangent plane to pixels.
-    inverse = sums.inverse(_cd(values))
-    bent = _rewritten(_sip(values, "A"), _sip(values, "B"), inverse)
-    order = len(bent[0]) - 1
+    inverse = matrices.inverse(_cd(values))
+    tpv_terms = _change_basis(_sip_coefficients(values, "A"), _sip_coefficients(values, "B"), inverse)
+    order = len(tpv_terms[0]) - 1
     if order >= len(_FIRST):
         raise BadInput(f"the distortion is of order {order}: TPV has orders up to {len(_FIRST) - 1}; take SIP")
     out: list[Card] = []
@@ -51,22 +51,22 @@ def cards(header: Sequence[Card]) -> tuple[Card, ...]:
         elif not is_sip(keyword):
             out.append((keyword, value, comment))
         elif keyword == "A_ORDER":
-            out += [card for axis in (1, 2) for card in _pv_cards(axis, bent[axis - 1])]
+            out += [card for axis in (1, 2) for card in _pv_cards(axis, tpv_terms[axis - 1])]
     return tuple(out)
 
 
-def sip_of(values: Mapping[str, Any]) -> tuple[Float, Float]:
+def to_sip(values: Mapping[str, Any]) -> tuple[Float, Float]:
     """Coefficients [n, n] of u^p v^q that SIP has where a header has these PV."""
-    found = [_of_pv(values, axis) for axis in (1, 2)]
-    side = max(len(each) for each in found)
-    to_x, to_y = (np.pad(each, (0, side - len(each))) for each in found)
+    polynomials = [_pv_coefficients(values, axis) for axis in (1, 2)]
+    side = max(len(each) for each in polynomials)
+    to_x, to_y = (np.pad(each, (0, side - len(each))) for each in polynomials)
     # What PV has of first order beyond the identity is the plane itself.
     to_x[1, 0] -= 1.0
     to_y[0, 1] -= 1.0
-    return _rewritten(to_x, to_y, _cd(values))
+    return _change_basis(to_x, to_y, _cd(values))
 
 
-def _rewritten(to_x: Float, to_y: Float, matrix: Float) -> tuple[Float, Float]:
+def _change_basis(to_x: Float, to_y: Float, matrix: Float) -> tuple[Float, Float]:
     """Polynomials added to a vector, written in another basis: matrix [2, 2] from the new coordinates to the old."""
     terms = tuple(
         (int(p), int(q), float(to_x[p, q]), float(to_y[p, q])) for p, q in np.argwhere((to_x != 0) | (to_y != 0))
@@ -78,7 +78,7 @@ def _cd(values: Mapping[str, Any]) -> Float:
     return np.array([[values["CD1_1"], values["CD1_2"]], [values["CD2_1"], values["CD2_2"]]], float)
 
 
-def _sip(values: Mapping[str, Any], name: str) -> Float:
+def _sip_coefficients(values: Mapping[str, Any], name: str) -> Float:
     side = max(int(values[f"{other}_ORDER"]) for other in "AB") + 1
     return np.array([[float(values.get(f"{name}_{p}_{q}", 0.0)) for q in range(side)] for p in range(side)])
 
@@ -93,23 +93,23 @@ def _pv_cards(axis: int, coefficients: Float) -> list[Card]:
     """PV of an axis, whose own coordinate comes first, with the identity; terms that are not 0."""
     full = np.array(coefficients if axis == 1 else coefficients.T)
     full[1, 0] += 1.0
-    own, other = ("xi", "eta") if axis == 1 else ("eta", "xi")
+    first, second = ("xi", "eta") if axis == 1 else ("eta", "xi")
     return [
-        (f"PV{axis}_{_FIRST[p + q] + q}", float(full[p, q]), f"times {own}^{p} {other}^{q}")
+        (f"PV{axis}_{_FIRST[p + q] + q}", float(full[p, q]), f"times {first}^{p} {second}^{q}")
         for p, q in sorted(np.argwhere(full).tolist(), key=lambda power: _FIRST[sum(power)] + power[1])
     ]
 
 
-def _of_pv(values: Mapping[str, Any], axis: int) -> Float:
+def _pv_coefficients(values: Mapping[str, Any], axis: int) -> Float:
     """Coefficients [n, n] by the powers of the first and the second coordinate."""
-    found = {
+    terms = {
         (order - q, q): float(values[key])
         for order, first in enumerate(_FIRST)
         for q in range(order + 1)
         if (key := f"PV{axis}_{first + q}") in values
     }
-    side = max((sum(power) for power in found), default=1) + 1
+    side = max((sum(power) for power in terms), default=1) + 1
     out = np.zeros((max(side, 2), max(side, 2)))
-    for (p, q), value in found.items():
+    for (p, q), value in terms.items():
         out[p, q] = value
     return out if axis == 1 else np.array(out.T)

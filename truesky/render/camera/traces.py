@@ -28,7 +28,7 @@ import numpy.typing as npt
 from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
-from truesky.numerics import sums
+from truesky.numerics import matrices
 from truesky.render.camera.detectors import Detector, detectors
 
 
@@ -57,7 +57,7 @@ class Trace:
     def polynomials(self, column: npt.ArrayLike, row: npt.ArrayLike) -> tuple[Float, Float]:
         """Coefficients [i] of t^i of a source's own trace, columns and rows, pixels; [i, n] of n sources."""
         place = np.array([np.ones_like(column, float), column, row])
-        return np.asarray(sums.product(self.x, place)), np.asarray(sums.product(self.y, place))
+        return np.asarray(matrices.matmul(self.x, place)), np.asarray(matrices.matmul(self.y, place))
 
 
 def traces(grism: str, tilt: float, detector: Detector, mission: MissionConfiguration) -> tuple[Trace, ...]:
@@ -67,33 +67,33 @@ def traces(grism: str, tilt: float, detector: Detector, mission: MissionConfigur
     detector, mission : of the camera, and the mission database
     Error : field coordinates of a source are those of its pixel, without the optics' distortion
     """
-    rows = _rows(grism, detector.section, mission)
-    to_field = _field(detector, mission)
+    rows = _grism_rows(grism, detector.section, mission)
+    to_field = _to_field_matrix(detector, mission)
     # From the grism's direction to the detector's columns and rows.
     turn = np.radians(float(rows[0]["direction_deg"]) + tilt - detector.rotation)
     cosine, sine = float(np.cos(turn)), float(np.sin(turn))
-    found = []
+    order_traces = []
     for order in sorted({int(row["order"]) for row in rows}, reverse=True):
-        own = [row for row in rows if int(row["order"]) == order]
-        highest = max(int(row["power"]) for row in own)
-        along, across = (_coefficients(own, axis, highest, to_field) for axis in ("along", "across"))
-        first, last = (float(own[0][name]) * 10.0 for name in ("first_nm", "last_nm"))
-        found.append(Trace(order, first, last, along * cosine - across * sine, along * sine + across * cosine))
-    return tuple(found)
+        order_rows = [row for row in rows if int(row["order"]) == order]
+        highest = max(int(row["power"]) for row in order_rows)
+        along, across = (_coefficients(order_rows, axis, highest, to_field) for axis in ("along", "across"))
+        first, last = (float(order_rows[0][name]) * 10.0 for name in ("first_nm", "last_nm"))
+        order_traces.append(Trace(order, first, last, along * cosine - across * sine, along * sine + across * cosine))
+    return tuple(order_traces)
 
 
 def direction(grism: str, section: str, mission: MissionConfiguration) -> float:
     """Of the spectra of a grism that is not turned, deg from the focal plane's x axis to y."""
-    return float(_rows(grism, section, mission)[0]["direction_deg"])
+    return float(_grism_rows(grism, section, mission)[0]["direction_deg"])
 
 
-def _rows(grism: str, section: str, mission: MissionConfiguration) -> list[Mapping[str, str]]:
+def _grism_rows(grism: str, section: str, mission: MissionConfiguration) -> list[Mapping[str, str]]:
     """Of a grism's laws; BadInput where there is none of that name."""
     rows = mission.rows(f"{section}.traces")
-    own = [row for row in rows if row["grism"] == grism]
-    if not own:
+    grism_rows = [row for row in rows if row["grism"] == grism]
+    if not grism_rows:
         raise BadInput(f"grism {grism!r} is not one of {', '.join(sorted({row['grism'] for row in rows}))}")
-    return own
+    return grism_rows
 
 
 def _coefficients(rows: Sequence[Mapping[str, str]], axis: str, highest: int, to_field: Float) -> Float:
@@ -102,19 +102,19 @@ def _coefficients(rows: Sequence[Mapping[str, str]], axis: str, highest: int, to
     out = np.zeros((highest + 1, 3))
     for power, row in powers.items():
         # Of 1, and of both field coordinates.
-        own = np.array([float(row[name]) for name in ("constant", "slope_x", "slope_y")])
-        out[power] = sums.product(own, to_field)
+        field_terms = np.array([float(row[name]) for name in ("constant", "slope_x", "slope_y")])
+        out[power] = matrices.matmul(field_terms, to_field)
     return out
 
 
-def _field(detector: Detector, mission: MissionConfiguration) -> Float:
+def _to_field_matrix(detector: Detector, mission: MissionConfiguration) -> Float:
     """float64[3, 3]: (1, x0, y0) -> 1 and the field coordinates, -1 .. 1 over the detectors' outer edges."""
-    everything = detectors(detector.section, mission)
+    all_detectors = detectors(detector.section, mission)
     turn = np.radians(detector.rotation)
     half = np.array([(detector.nx - 1) / 2, (detector.ny - 1) / 2])
     out = np.array([[1.0, 0.0, 0.0]] * 3)
     for axis, name in enumerate("xy"):
-        reach = max(abs(getattr(d, name)) + (d.nx, d.ny)[axis] * d.pixel_scale / 2 for d in everything)
+        reach = max(abs(getattr(d, name)) + (d.nx, d.ny)[axis] * d.pixel_scale / 2 for d in all_detectors)
         step = np.array([(np.cos(turn), -np.sin(turn)), (np.sin(turn), np.cos(turn))][axis]) * detector.pixel_scale
         out[axis + 1] = np.array([getattr(detector, name) - float((step * half).sum()), *step]) / reach
     return out
@@ -147,6 +147,6 @@ def source_rectangle(
     """
     waves = np.linspace(*wavelength, 33)
     corners = [(x, y) for x in (0.0, nx - 1.0) for y in (0.0, ny - 1.0)]
-    found = [trace.offsets(*corner, waves) for corner in corners]
-    x, y = np.array([x for x, _ in found]), np.array([y for _, y in found])
+    corner_offsets = [trace.offsets(*corner, waves) for corner in corners]
+    x, y = np.array([x for x, _ in corner_offsets]), np.array([y for _, y in corner_offsets])
     return float(-x.max()), float(nx - 1 - x.min()), float(-y.max()), float(ny - 1 - y.min())

@@ -34,8 +34,13 @@ class Aim:
     effects: tuple[Effect, ...]
 
     @classmethod
-    def of(
-        cls, exposure: ExposureRow, detector: Detector, band: Passband | None = None, seed: int = 0, way: str = "raw"
+    def from_exposure(
+        cls,
+        exposure: ExposureRow,
+        detector: Detector,
+        band: Passband | None = None,
+        seed: int = 0,
+        readout_name: str = "raw",
     ) -> Aim:
         """Of a planned exposure; BadInput where nothing renders it.
 
@@ -44,11 +49,15 @@ class Aim:
         way      : in which its files are wanted (Channel.read_as)
         """
         kind = exposure.image_type
-        channel = registry.channel_of(exposure.channel, kind, f"exposure {exposure.exposure_id}").read_as(way)
+        channel = registry.find_channel(exposure.channel, kind, f"exposure {exposure.exposure_id}").with_readout(
+            readout_name
+        )
         # Exposures that differ in their noise alone see alike; no filter is in front of a grism.
         identity = image_types.identity(replace(exposure, realisation=None))
-        seen = filter_wheel.tilted(detector, identity, seed) if channel.disperses is None else detector
-        system = astrometry.wcs(seen, exposure.ra, exposure.dec, exposure.position_angle)
+        tilted_detector = (
+            filter_wheel.apply_random_tilt(detector, identity, seed) if channel.dispersion is None else detector
+        )
+        system = astrometry.wcs(tilted_detector, exposure.ra, exposure.dec, exposure.position_angle)
         band = band or passbands.load(exposure.band)
         return cls(exposure, detector, system, band, channel, channel.effects[kind])
 
@@ -58,7 +67,7 @@ class Aim:
         return self.channel.sees_sky(self.exposure.image_type)
 
     @property
-    def electrons(self) -> float:
+    def electrons_per_microjansky(self) -> float:
         """Expected of a source of one microjansky in the exposure."""
         return electron_rate(self.exposure) * self.exposure.exposure_time_s
 

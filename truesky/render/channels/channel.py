@@ -39,10 +39,10 @@ class Dispersion:
 
     traces: Callable[[ExposureRow, Detector, MissionConfiguration, int], tuple[Trace, ...]]
     throughput: Callable[[ExposureRow, int, Float, Detector, MissionConfiguration], Float]
-    vignetted: Callable[[ExposureRow, Detector, Float, Float, MissionConfiguration], Float]
+    vignetting: Callable[[ExposureRow, Detector, Float, Float, MissionConfiguration], Float]
     psf: Callable[[Detector, Float, MissionConfiguration, int], Psf]
     reach: Callable[[str, MissionConfiguration], float]
-    chosen_by: str
+    selection_band: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,31 +78,34 @@ class Channel:
     cost: Cost
     on_ground: bool = False
     sky_types: tuple[str, ...] = SKY_TYPES
-    drawn: Effect | None = None
-    pupil: Callable[[Detector, Passband, MissionConfiguration], Edges | None] | None = None
-    moving: bool = False
-    own_light: tuple[Effect, ...] = ()
-    tracks: tuple[Effect, ...] = ()
-    scattered: bool = False
-    ramp: str = ""
-    remembers: Effect | None = None
-    coloured: Effect | None = None
-    disperses: Dispersion | None = None
-    readouts: Mapping[str, ReadoutMode] = field(default_factory=dict)
+    transfer_effect: Effect | None = None
+    diffraction_edges: Callable[[Detector, Passband, MissionConfiguration], Edges | None] | None = None
+    draws_moving_bodies: bool = False
+    non_source_effects: tuple[Effect, ...] = ()
+    track_effects: tuple[Effect, ...] = ()
+    has_scattered_light: bool = False
+    ramp_name: str = ""
+    persistence_effect: Effect | None = None
+    chromatic_effect: Effect | None = None
+    dispersion: Dispersion | None = None
+    alternative_readouts: Mapping[str, ReadoutMode] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for effects in self.effects.values():
             for effect in effects:
                 if not effect.cost > 0.0:
-                    what = f"effect {effect.name} has the cost {effect.cost:g}: a forecast would take it as free"
-                    raise BadInput(f"{what}; python -m benchmarks.effects measures it")
+                    problem = f"effect {effect.name} has the cost {effect.cost:g}: a forecast would take it as free"
+                    raise BadInput(f"{problem}; python -m benchmarks.effects measures it")
 
-    def read_as(self, way: str) -> Channel:
+    def with_readout(self, readout_name: str) -> Channel:
         """With the files that a request asks for; as it is where it has no other way of that name."""
-        if way not in self.readouts:
+        if readout_name not in self.alternative_readouts:
             return self
-        mode = self.readouts[way]
-        effects = {kind: tuple(takewhile(lambda e: e.name != mode.before, own)) for kind, own in self.effects.items()}
+        mode = self.alternative_readouts[readout_name]
+        effects = {
+            kind: tuple(takewhile(lambda e: e.name != mode.stop_before, kind_effects))
+            for kind, kind_effects in self.effects.items()
+        }
         return replace(self, readout=mode, effects=effects)
 
     def sees_sky(self, image_type: str) -> bool:
@@ -111,9 +114,9 @@ class Channel:
 
     def margin(self, section: str, mission: MissionConfiguration) -> float:
         """How far beyond a detector all sources are read, arcsec; section : of its camera in the mission database."""
-        spread = 0.0 if self.disperses is None else self.disperses.reach(section, mission)
+        spread = 0.0 if self.dispersion is None else self.dispersion.reach(section, mission)
         return mission.value("survey.selection_margin", "arcsec") + spread
 
     def sees_bodies(self, image_type: str) -> bool:
         """Whether moving bodies are drawn."""
-        return self.moving and self.sees_sky(image_type)
+        return self.draws_moving_bodies and self.sees_sky(image_type)

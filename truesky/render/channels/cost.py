@@ -22,7 +22,7 @@ class Cost:
     galaxy_s: float
     star_s: float
     base_gb: float
-    held: float
-    held_sky: float
-    written: float
-    again_s: float = 0.0
+    bytes_per_pixel: float
+    sky_bytes_per_pixel: float
+    file_bytes_per_pixel: float
+    redraw_s: float = 0.0

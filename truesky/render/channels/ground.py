@@ -66,37 +66,46 @@ SKY = (
 )
 
 
-def _from(first: Effect) -> tuple[Effect, ...]:
+def _effects_from(first: Effect) -> tuple[Effect, ...]:
     """Of the effects on the sky's light this one, and those after it."""
     return SKY[SKY.index(first) :]
 
 
 # Of the dome, by day: no sky, and no stars. The lamp's light comes through the telescope, as theirs does.
-FLAT = (calibration_lamp.EFFECT, illumination.EFFECT, *_from(pixel_response.EFFECT))
+FLAT = (calibration_lamp.EFFECT, illumination.EFFECT, *_effects_from(pixel_response.EFFECT))
 
 EFFECTS: Mapping[str, tuple[Effect, ...]] = {
     "science": SKY,
     "deep": SKY,
     "flat": FLAT,
-    "dark": _from(dark_current.EFFECT),
-    "bias": _from(quadrants.AMPLIFIERS),
+    "dark": _effects_from(dark_current.EFFECT),
+    "bias": _effects_from(quadrants.AMPLIFIERS),
 }
 
 
 # As VIS, of a detector of each camera but HSC with every effect (benchmarks/ext.py; 1.1e4 to 1.4e5 sources): most of
 # sky_s is reading of catalogues, colours of galaxies, PSFs.
-COST = Cost(frame_s=0.2, sky_s=1.9, galaxy_s=2.5e-5, star_s=4.5e-5, base_gb=0.8, held=33.0, held_sky=34.0, written=2.0)
+COST = Cost(
+    frame_s=0.2,
+    sky_s=1.9,
+    galaxy_s=2.5e-5,
+    star_s=4.5e-5,
+    base_gb=0.8,
+    bytes_per_pixel=33.0,
+    sky_bytes_per_pixel=34.0,
+    file_bytes_per_pixel=2.0,
+)
 
 CHANNEL = Channel(
     effects=EFFECTS,
-    psf=seeing.of_exposure,
+    psf=seeing.exposure_psf,
     readout=readout.AMPLIFIERS,
-    bands=bands.of_ground,
+    bands=bands.ground_bands,
     sky=diffuse_light.ground_sky,
     cost=COST,
     on_ground=True,
-    own_light=(calibration_lamp.EFFECT, satellite_trails.EFFECT),
-    tracks=(cosmic_rays.EFFECT,),
-    pupil=seeing.edges_of,
-    readouts={"amplifiers": readout.BY_AMPLIFIER, "electrons": readout.ELECTRONS},
+    non_source_effects=(calibration_lamp.EFFECT, satellite_trails.EFFECT),
+    track_effects=(cosmic_rays.EFFECT,),
+    diffraction_edges=seeing.typical_edges,
+    alternative_readouts={"amplifiers": readout.BY_AMPLIFIER, "electrons": readout.ELECTRONS},
 )

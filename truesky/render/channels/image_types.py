@@ -15,7 +15,7 @@ from lake_schema.tables.exposures import ExposureRow
 SKY_TYPES = ("science", "deep", "self_calibration")
 
 # In settings before the name of a parameter that is an exposure's own, and no value that a request explores.
-OWN = "own:"
+EXPOSURE_ONLY_PREFIX = "own:"
 
 
 def section(camera: str) -> str:
@@ -31,15 +31,15 @@ def identity(exposure: ExposureRow) -> str:
     Of several alike the first has the numbers that it has alone.
     """
     places = (exposure.ra, exposure.dec, exposure.position_angle, exposure.mjd)
-    turned = () if exposure.grism is None else (exposure.grism, (exposure.grism_angle or 0.0).hex())
+    grism = () if exposure.grism is None else (exposure.grism, (exposure.grism_angle or 0.0).hex())
     number = exposure.realisation or 1
-    again = (str(number),) if number > 1 else ()
-    return ":".join((exposure.camera, exposure.band, *(place.hex() for place in places), *turned, *again))
+    repeat = (str(number),) if number > 1 else ()
+    return ":".join((exposure.camera, exposure.band, *(place.hex() for place in places), *grism, *repeat))
 
 
 @lru_cache(maxsize=1024)
-def family(settings: str | None) -> str | None:
+def shared_settings(settings: str | None) -> str | None:
     """Settings of an exposure without what is its own alone: those of the variant of an exploration."""
     values = json.loads(settings) if settings else {}
-    shared = {key: value for key, value in values.items() if not key.startswith(OWN)}
+    shared = {key: value for key, value in values.items() if not key.startswith(EXPOSURE_ONLY_PREFIX)}
     return json.dumps(shared, sort_keys=True) if shared else None

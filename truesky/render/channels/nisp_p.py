@@ -92,23 +92,30 @@ def _psf(
 # the machine that costs are of (forecasting/speed.py).  Again: the last image of a visit of four dithers takes 10.5 s
 # of CPU there, of which 0.28 s are for each of eleven images of NISP-P before it, and 0.6 s for each of four of NISP-S.
 COST = Cost(
-    frame_s=0.05, sky_s=0.3, galaxy_s=1.3e-4, star_s=1.3e-4, base_gb=0.5, held=120.0, held_sky=160.0, written=3.0,
-    again_s=0.3,
-)  # fmt: skip
+    frame_s=0.05,
+    sky_s=0.3,
+    galaxy_s=1.3e-4,
+    star_s=1.3e-4,
+    base_gb=0.5,
+    bytes_per_pixel=120.0,
+    sky_bytes_per_pixel=160.0,
+    file_bytes_per_pixel=3.0,
+    redraw_s=0.3,
+)
 
 CHANNEL = Channel(
     effects=EFFECTS,
     psf=_psf,
     readout=readout.RAMP,
-    bands=bands.of_one("nisp", "euclid_y", "euclid_j", "euclid_h"),
+    bands=bands.single_camera_bands("nisp", "euclid_y", "euclid_j", "euclid_h"),
     sky=diffuse_light.thermal_sky,
     cost=COST,
     sky_types=(*SKY_TYPES, "standard_star"),
-    pupil=euclid.nisp_edges,
-    moving=True,
-    own_light=(calibration_lamp.EFFECT,),
-    scattered=True,
-    ramp="photometric",
-    remembers=persistence.EFFECT,
-    coloured=chromatic_response.EFFECT,
+    diffraction_edges=euclid.nisp_edges,
+    draws_moving_bodies=True,
+    non_source_effects=(calibration_lamp.EFFECT,),
+    has_scattered_light=True,
+    ramp_name="photometric",
+    persistence_effect=persistence.EFFECT,
+    chromatic_effect=chromatic_response.EFFECT,
 )

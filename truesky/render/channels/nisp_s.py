@@ -13,7 +13,7 @@ import numpy as np
 from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
-from lake_schema.tables.exposures import CHOSEN_BY, ExposureRow
+from lake_schema.tables.exposures import SELECTION_BANDS, ExposureRow
 from truesky.fluxes.passbands import Passband
 from truesky.render.camera import bands, grism_wheel, traces
 from truesky.render.camera.detectors import Detector, detectors
@@ -53,50 +53,54 @@ EFFECTS: Mapping[str, tuple[Effect, ...]] = {
 }
 
 
-def _turned(exposure: ExposureRow, section: str, mission: MissionConfiguration) -> tuple[str, float]:
+def _grism_and_tilt(exposure: ExposureRow, section: str, mission: MissionConfiguration) -> tuple[str, float]:
     """(grism, the tilt that was asked for, deg); BadInput for an exposure without a grism, or one that is across."""
     where = f"exposure {exposure.exposure_id}"
     if exposure.grism is None or exposure.grism_angle is None:
         raise BadInput(f"{where}: a spectrum wants a grism and its angle")
-    asked = grism_wheel.tilt(exposure.grism, exposure.grism_angle, section, mission)
-    if abs(asked) > grism_wheel.MOST_TURNED:
+    requested_tilt = grism_wheel.tilt(exposure.grism, exposure.grism_angle, section, mission)
+    if abs(requested_tilt) > grism_wheel.MAX_TILT:
         angle = f"grism_angle = {exposure.grism_angle:g} deg"
         raise BadInput(
-            f"{where}: {angle} turns {exposure.grism} by {asked:g} deg, more than {grism_wheel.MOST_TURNED:g}"
+            f"{where}: {angle} turns {exposure.grism} by {requested_tilt:g} deg, more than {grism_wheel.MAX_TILT:g}"
         )
-    return exposure.grism, asked
+    return exposure.grism, requested_tilt
 
 
 def _traces(exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, seed: int) -> tuple[Trace, ...]:
-    grism, asked = _turned(exposure, detector.section, mission)
+    grism, requested_tilt = _grism_and_tilt(exposure, detector.section, mission)
     # Exposures that differ in their noise alone see alike.
     identity = image_types.identity(replace(exposure, realisation=None))
-    return traces.traces(grism, grism_wheel.turned(asked, identity, detector.section, mission, seed), detector, mission)
+    return traces.traces(
+        grism, grism_wheel.tilt_with_error(requested_tilt, identity, detector.section, mission, seed), detector, mission
+    )
 
 
 def _throughput(
     exposure: ExposureRow, order: int, wavelength: Float, detector: Detector, mission: MissionConfiguration
 ) -> Float:
-    grism, _ = _turned(exposure, detector.section, mission)
+    grism, _ = _grism_and_tilt(exposure, detector.section, mission)
     return traces.throughput(grism, order, wavelength, detector, mission)
 
 
-def _vignetted(
+def _vignetting_throughput(
     exposure: ExposureRow, detector: Detector, column: Float, row: Float, mission: MissionConfiguration
 ) -> Float:
-    _, asked = _turned(exposure, detector.section, mission)
+    _, requested_tilt = _grism_and_tilt(exposure, detector.section, mission)
     angle = np.radians(detector.rotation)
     u = (column - (detector.nx - 1) / 2) * detector.pixel_scale
     v = (row - (detector.ny - 1) / 2) * detector.pixel_scale
     x = detector.x + np.cos(angle) * u - np.sin(angle) * v
     y = detector.y + np.sin(angle) * u + np.cos(angle) * v
-    return grism_wheel.vignetted(x, y, float(exposure.grism_angle or 0.0), asked, detector.section, mission)
+    return grism_wheel.vignetting_throughput(
+        x, y, float(exposure.grism_angle or 0.0), requested_tilt, detector.section, mission
+    )
 
 
 def _reach(section: str, mission: MissionConfiguration) -> float:
     """Of the first order of any of the grisms."""
     first = detectors(section, mission)[0]
-    found = [
+    distances = [
         abs(edge - inside)
         for grism in sorted({row["grism"] for row in mission.rows(f"{section}.traces")})
         for trace in traces.traces(grism, 0.0, first, mission)
@@ -107,7 +111,7 @@ def _reach(section: str, mission: MissionConfiguration) -> float:
             strict=True,
         )
     ]
-    return max(found) * first.pixel_scale
+    return max(distances) * first.pixel_scale
 
 
 def _psf(
@@ -130,22 +134,29 @@ def _psf_at(detector: Detector, waves: Float, mission: MissionConfiguration, pos
 # foreseen.  By Spark, with eight maps of truth of which four are orders: 1.55 to 1.71 GB; darks and flats with four
 # maps 1.39 to 1.49 GB.  Again: as nisp_p.py says.
 COST = Cost(
-    frame_s=0.05, sky_s=0.5, galaxy_s=3.2e-3, star_s=3.2e-3, base_gb=0.6, held=190.0, held_sky=240.0, written=3.0,
-    again_s=0.65,
-)  # fmt: skip
+    frame_s=0.05,
+    sky_s=0.5,
+    galaxy_s=3.2e-3,
+    star_s=3.2e-3,
+    base_gb=0.6,
+    bytes_per_pixel=190.0,
+    sky_bytes_per_pixel=240.0,
+    file_bytes_per_pixel=3.0,
+    redraw_s=0.65,
+)
 
 CHANNEL = Channel(
     effects=EFFECTS,
     psf=_psf,
     readout=readout.RAMP_AND_CHI2,
-    bands=bands.of_one("nisp", "nisp_red", "nisp_blue"),
+    bands=bands.single_camera_bands("nisp", "nisp_red", "nisp_blue"),
     sky=diffuse_light.thermal_sky,
     cost=COST,
     sky_types=(*SKY_TYPES, "standard_star", "planetary_nebula"),
-    moving=True,
-    own_light=(calibration_lamp.EFFECT,),
-    ramp="spectroscopic",
-    coloured=chromatic_response.EFFECT,
-    remembers=persistence.EFFECT,
-    disperses=Dispersion(_traces, _throughput, _vignetted, _psf_at, _reach, CHOSEN_BY["NISP-S"]),
+    draws_moving_bodies=True,
+    non_source_effects=(calibration_lamp.EFFECT,),
+    ramp_name="spectroscopic",
+    chromatic_effect=chromatic_response.EFFECT,
+    persistence_effect=persistence.EFFECT,
+    dispersion=Dispersion(_traces, _throughput, _vignetting_throughput, _psf_at, _reach, SELECTION_BANDS["NISP-S"]),
 )

@@ -17,22 +17,22 @@ CHANNELS: Mapping[str, Channel] = {
 }
 
 
-def channel_of(name: str, image_type: str, where: str) -> Channel:
+def find_channel(name: str, image_type: str, where: str) -> Channel:
     """A channel by its name; BadInput where nothing renders this kind of image."""
     if name not in CHANNELS:
         raise BadInput(f"{where}: channel {name!r} is not one of {', '.join(CHANNELS)}")
-    kinds = CHANNELS[name].effects
-    if image_type not in kinds:
-        raise BadInput(f"{where}: {name} has no image type {image_type!r}, only {', '.join(kinds)}")
+    effects_by_type = CHANNELS[name].effects
+    if image_type not in effects_by_type:
+        raise BadInput(f"{where}: {name} has no image type {image_type!r}, only {', '.join(effects_by_type)}")
     return CHANNELS[name]
 
 
-def effects_of(name: str, image_type: str, where: str) -> tuple[Effect, ...]:
+def find_effects(name: str, image_type: str, where: str) -> tuple[Effect, ...]:
     """The effects of a kind of image, in their order; BadInput where nothing renders it."""
-    return channel_of(name, image_type, where).effects[image_type]
+    return find_channel(name, image_type, where).effects[image_type]
 
 
-def effects_or_none(name: str, image_type: str) -> tuple[Effect, ...] | None:
+def find_effects_or_none(name: str, image_type: str) -> tuple[Effect, ...] | None:
     """The same, None where nothing renders it."""
     channel = CHANNELS.get(name)
     return None if channel is None else channel.effects.get(image_type)

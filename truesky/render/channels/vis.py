@@ -54,7 +54,7 @@ from truesky.render.psf.model import Psf
 from truesky.render.sky import diffuse_light
 
 # What the pixels do to the light while sources are drawn: part of their transfer function.
-DRAWN = intra_pixel.EFFECT
+TRANSFER_EFFECT = intra_pixel.EFFECT
 
 _LIGHT = (
     ghosts.EFFECT,
@@ -127,21 +127,30 @@ def _psf(
 
 # CPU of the demo's detector 3-4 (5.5e3 predicted sources), of others with 3e2 and 2.7e4, of bias, dark and flat frames:
 # Intel Xeon 2.5 GHz, 2 shared cores.
-COST = Cost(frame_s=0.05, sky_s=1.5, galaxy_s=5.0e-4, star_s=8.5e-4, base_gb=0.5, held=48.0, held_sky=57.0, written=2.1)
+COST = Cost(
+    frame_s=0.05,
+    sky_s=1.5,
+    galaxy_s=5.0e-4,
+    star_s=8.5e-4,
+    base_gb=0.5,
+    bytes_per_pixel=48.0,
+    sky_bytes_per_pixel=57.0,
+    file_bytes_per_pixel=2.1,
+)
 
 CHANNEL = Channel(
     effects=EFFECTS,
     psf=_psf,
     readout=readout.QUADRANTS,
-    bands=bands.of_one("vis", "euclid_vis"),
+    bands=bands.single_camera_bands("vis", "euclid_vis"),
     sky=diffuse_light.starlit_sky,
     cost=COST,
     # A flat is taken with the shutter open.
     sky_types=(*SKY_TYPES, *_CHECKS, "flat"),
-    drawn=DRAWN,
-    pupil=euclid.vis_edges,
-    moving=True,
-    own_light=(calibration_lamp.EFFECT, *_INJECTED, trap_pumping.EFFECT),
-    tracks=(cosmic_rays.EFFECT, readout_cosmic_rays.READOUT),
-    scattered=True,
+    transfer_effect=TRANSFER_EFFECT,
+    diffraction_edges=euclid.vis_edges,
+    draws_moving_bodies=True,
+    non_source_effects=(calibration_lamp.EFFECT, *_INJECTED, trap_pumping.EFFECT),
+    track_effects=(cosmic_rays.EFFECT, readout_cosmic_rays.READOUT),
+    has_scattered_light=True,
 )

@@ -68,8 +68,8 @@ def sensitivity(order: Order) -> pa.Table:
     """
     response = np.pad(order.response, 2)
     wavelength = order.first - 2 + np.arange(float(len(response)))
-    none = np.zeros(len(response))
-    return SENSITIVITY.build({"WAVELENGTH": wavelength, "SENSITIVITY": response, "ERROR": none})
+    zero_error = np.zeros(len(response))
+    return SENSITIVITY.build({"WAVELENGTH": wavelength, "SENSITIVITY": response, "ERROR": zero_error})
 
 
 def write(folder: Path, name: str, orders: Sequence[Order], shape: tuple[int, int]) -> Path:
@@ -81,7 +81,7 @@ def write(folder: Path, name: str, orders: Sequence[Order], shape: tuple[int, in
     for order, file in zip(orders, files, strict=True):
         table_to_fits(folder / file, sensitivity(order), SENSITIVITY)
     path = folder / f"{name}.conf"
-    with user_files.staged(path) as temporary:
+    with user_files.replace_atomically(path) as temporary:
         text = configuration(name, [order.trace for order in orders], shape, files)
         temporary.write_text(text, encoding="utf-8")
     return path

@@ -29,7 +29,7 @@ import scipy.fft
 from scipy.ndimage import uniform_filter1d
 
 from lake_schema.arrays import Array, Bool, Float, Float32, Int
-from truesky.numerics import sums
+from truesky.numerics import matrices
 from truesky.render.dispersing import kernels
 from truesky.render.drawing import arcs, transfer
 from truesky.render.psf.model import Psf
@@ -120,36 +120,36 @@ def planes(psf: Psf, sampling: Sampling) -> Planes:
     factor = sampling.along * sampling.across * np.sinc(fx / step) * np.sinc(fy / step) * sign / spline
     factor *= _split(sampling, fx / step, fy / step)
     if step > 1:
-        factor /= _cubic(fx) * _cubic(fy)
+        factor /= _spline_transfer(fx) * _spline_transfer(fy)
     # Of the lowest frequencies alone the PSF's pixels tell as much as its samples.
     fold = psf.planes.samples if step > 1 and psf.planes.samples % 2 else 1
-    factor /= _triangle(fx / step, fold) * _triangle(fy / step, fold)
+    factor /= _bin_transfer(fx / step, fold) * _bin_transfer(fy / step, fold)
     images = [*psf.planes.images, *psf.planes.drift]
-    images = [_summed(image, fold) for image in images] if fold > 1 else images
-    found = np.empty((len(images), count, len(iv)), np.complex64)
-    for image, out in zip(images, found, strict=True):
+    images = [_bin_pixels(image, fold) for image in images] if fold > 1 else images
+    spectra = np.empty((len(images), count, len(iv)), np.complex64)
+    for image, out in zip(images, spectra, strict=True):
         passed = transfer.sheared_spectrum(image, psf.planes.samples // fold * n * step, len(iv), sampling.shear)
         out[:] = passed[iu] * factor
     ku, kv = ((2 * np.pi * f / step).astype(np.float32) for f in (fu[:, 0], fy))
-    return Planes(sampling, ku, kv, found)
+    return Planes(sampling, ku, kv, spectra)
 
 
-def _summed(image: Float32, fold: int) -> Float32:
+def _bin_pixels(image: Float32, fold: int) -> Float32:
     """An image [n, n], n odd, on pixels of fold x fold samples, odd, one of them about its middle: triangles' sums."""
     middle = len(image) // 2
     count = -(-middle // fold)
-    whole = np.pad(image, fold * count + fold // 2 - middle)
+    padded = np.pad(image, fold * count + fold // 2 - middle)
     for axis in (0, 1):
-        whole = uniform_filter1d(whole, fold, axis, mode="constant")
-    return np.asarray(whole.reshape(2 * count + 1, fold, 2 * count + 1, fold).sum(axis=(1, 3)))
+        padded = uniform_filter1d(padded, fold, axis, mode="constant")
+    return np.asarray(padded.reshape(2 * count + 1, fold, 2 * count + 1, fold).sum(axis=(1, 3)))
 
 
-def _triangle(f: Float, fold: int) -> Float:
+def _bin_transfer(f: Float, fold: int) -> Float:
     """What such sums leave of f cycles a pixel: of what is beyond half a cycle little folds onto the lowest."""
     return np.asarray((np.sinc(f) / np.sinc(f / fold)) ** 2)
 
 
-def _cubic(f: Float) -> Float:
+def _spline_transfer(f: Float) -> Float:
     """Of f cycles a pixel: what a cubic spline is at the pixels, of its coefficients there."""
     return np.asarray((2.0 + np.cos(2 * np.pi * f)) / 3.0)
 
@@ -167,7 +167,7 @@ def _split(sampling: Sampling, fx: Float, fy: Float) -> Float:
 
 
 @dataclass(frozen=True, slots=True)
-class Bodies:
+class Profiles:
     """Profiles of n sources, as kernels.zones takes them.
 
     body     : bool[n] False for a point;  fraction : float64[n] of the light in the bulge
@@ -183,37 +183,37 @@ class Bodies:
     row: Int
     row_weights: Float
 
-    def take(self, some: Int) -> Bodies:
+    def take(self, selected: Int) -> Profiles:
         """Some of them."""
-        return Bodies(*(getattr(self, field.name)[some] for field in fields(self)))
+        return Profiles(*(getattr(self, field.name)[selected] for field in fields(self)))
 
 
-def bodies(sources: Sources, shear: float) -> Bodies:
+def source_profiles(sources: Sources, shear: float) -> Profiles:
     """Of sources, in coordinates whose rows rise by `shear` rows a column."""
     n, body = len(sources), sources.shape >= 0
     shapes = sources.shapes.take(sources.shape[body])
-    form = galaxy_shapes.forms(shapes, sheared(sources.jacobian[body], shear))
+    form = galaxy_shapes.forms(shapes, shear_jacobian(sources.jacobian[body], shear))
     fraction, row, weights = np.zeros(n), np.zeros(n, np.int64), np.zeros((n, 4))
     bulge, disk, thick = np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2))
     fraction[body], bulge[body], disk[body], thick[body] = shapes.bulge_fraction, form.bulge, form.disk, form.thick
-    row[body], weights[body] = sersic.row_of(shapes.sersic_index)
-    return Bodies(body, fraction, bulge, disk, thick, row, weights)
+    row[body], weights[body] = sersic.interpolation_weights(shapes.sersic_index)
+    return Profiles(body, fraction, bulge, disk, thick, row, weights)
 
 
-def sheared(jacobian: Float, shear: float) -> Float:
+def shear_jacobian(jacobian: Float, shear: float) -> Float:
     """[.., 2, 2] arcsec by (u, v) of arcsec by pixels."""
-    return np.asarray(sums.product(jacobian, np.array([[1.0, 0.0], [shear, 1.0]])), float)
+    return np.asarray(matrices.matmul(jacobian, np.array([[1.0, 0.0], [shear, 1.0]])), float)
 
 
-def spread_over(some: Planes, sources: Sources, i: int) -> Array | None:
+def spread_transform(stamp_planes: Planes, sources: Sources, i: int) -> Array | None:
     """[rows, columns] transform of a picture, or of a trail, over which source i's light is spread; None: nothing."""
-    picture, trail, shear = sources.picture_of(i), sources.trail, some.sampling.shear
+    picture, trail, shear = sources.picture_of(i), sources.trail, stamp_planes.sampling.shear
     if picture is None and (trail is None or not trail[i].any()):
         return None
-    ku, kv = np.broadcast_arrays(some.ku[:, None], some.kv)
+    ku, kv = np.broadcast_arrays(stamp_planes.ku[:, None], stamp_planes.kv)
     if picture is not None:
-        found = arcs.transform(picture, sheared(sources.jacobian[i], shear), ku.ravel(), kv.ravel())
-        return np.asarray(found.reshape(ku.shape).astype(np.complex64))
+        picture_transform = arcs.transform(picture, shear_jacobian(sources.jacobian[i], shear), ku.ravel(), kv.ravel())
+        return np.asarray(picture_transform.reshape(ku.shape).astype(np.complex64))
     assert trail is not None
     across, up = float(trail[i, 0]), float(trail[i, 1] - shear * trail[i, 0])
     return np.asarray(np.sinc((ku * across + kv * up) / (2 * np.pi)).astype(np.float32))
@@ -224,19 +224,30 @@ def _sersic() -> Float32:
     return sersic.table()
 
 
-def coefficients(some: Planes, weights: Float, of: Bodies, over: list[Array | None]) -> Float32:
+def coefficients(stamp_planes: Planes, weights: Float, profiles: Profiles, transforms: list[Array | None]) -> Float32:
     """float32[m, b, n along, n across] of kernels.spread: of m sources of one electron.
 
     some : the planes;  weights : [m, b, p] of them, for each node;  of : the sources
     over : what each is spread over, of `spread_over`
     """
-    zones = np.empty((*weights.shape[:2], *some.planes.shape[1:]), np.complex64)
+    zones = np.empty((*weights.shape[:2], *stamp_planes.planes.shape[1:]), np.complex64)
     kernels.zones(
-        some.planes, weights.astype(np.float32), some.ku, some.kv, of.body, of.fraction, of.bulge, of.disk, of.thick,
-        _sersic(), of.row, of.row_weights, zones,
-    )  # fmt: skip
-    for part, transform in zip(zones, over, strict=True):
+        stamp_planes.planes,
+        weights.astype(np.float32),
+        stamp_planes.ku,
+        stamp_planes.kv,
+        profiles.body,
+        profiles.fraction,
+        profiles.bulge,
+        profiles.disk,
+        profiles.thick,
+        _sersic(),
+        profiles.row,
+        profiles.row_weights,
+        zones,
+    )
+    for part, transform in zip(zones, transforms, strict=True):
         if transform is not None:
             part *= transform
-    n, along, across = some.sampling.n, some.sampling.along, some.sampling.across
+    n, along, across = stamp_planes.sampling.n, stamp_planes.sampling.along, stamp_planes.sampling.across
     return np.asarray(scipy.fft.irfft2(zones, s=(n * along, n * across), overwrite_x=True))

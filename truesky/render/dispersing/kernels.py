@@ -14,7 +14,7 @@ import numpy as np
 from lake_schema.arrays import Bool, Float, Float32, Int
 from truesky.numerics.compiling import jit
 from truesky.render.drawing.kernels import fourier
-from truesky.render.drawing.kernels.frame import smaller
+from truesky.render.drawing.kernels.frame import min_singular_squared
 
 # Wavelengths that are taken together.
 _WAVES = 64
@@ -38,8 +38,13 @@ def zones(
     for m in range(len(weights)):
         profile[:] = np.float32(1.0)
         if body[m] and fraction[m] > 0.0:
-            fourier.interpolate(
-                sersic, row[m], row_weights[m], 0.99 * step**2 * smaller(bulge[m]), reach * np.sum(bulge[m] ** 2), table
+            fourier.interpolate_sersic(
+                sersic,
+                row[m],
+                row_weights[m],
+                0.99 * step**2 * min_singular_squared(bulge[m]),
+                reach * np.sum(bulge[m] ** 2),
+                table,
             )
         for r in range(rows):
             if body[m]:
@@ -59,7 +64,9 @@ def zones(
 
 
 @jit
-def brightest(spectra: Float32, factor: Float, response: Float, window: int, peak: Float, total: Float) -> None:
+def measure_peak_and_total(
+    spectra: Float32, factor: Float, response: Float, window: int, peak: Float, total: Float
+) -> None:
     """Fills [k] with the electrons of spectra [k, w], and with the most among `window` neighbours, by half windows.
 
     factor : [k] of each spectrum;  response : [w] electrons for each of its units, or less than none
@@ -67,20 +74,20 @@ def brightest(spectra: Float32, factor: Float, response: Float, window: int, pea
     """
     half = max(window // 2, 1)
     for k in range(len(spectra)):
-        most, everything, before, start = 0.0, 0.0, 0.0, 0
+        highest, sum_all, previous, start = 0.0, 0.0, 0.0, 0
         while start < len(response):
-            some, through = spectra[k, start : start + half], response[start : start + half]
-            own = 0.0
-            for i in range(len(some)):
-                own += abs(some[i] * through[i])
-            most = max(most, before + own)
-            everything += own
-            before, start = own, start + half
-        peak[k], total[k] = factor[k] * most, factor[k] * everything
+            segment, segment_response = spectra[k, start : start + half], response[start : start + half]
+            segment_sum = 0.0
+            for i in range(len(segment)):
+                segment_sum += abs(segment[i] * segment_response[i])
+            highest = max(highest, previous + segment_sum)
+            sum_all += segment_sum
+            previous, start = segment_sum, start + half
+        peak[k], total[k] = factor[k] * highest, factor[k] * sum_all
 
 
 @jit
-def lay(
+def add_to_trace(
     electrons: Float, along: Float, times: tuple[float, float], start: float, samples: int, share: Float, first: int,
     out: Float,
 ) -> None:  # fmt: skip
@@ -94,51 +101,53 @@ def lay(
     weights = np.empty((6, _WAVES))
     w0, w1, w2, w3, w4, w5 = weights
     for begin in range(0, len(electrons), _WAVES):
-        some = electrons[begin : begin + _WAVES]
-        if np.max(np.abs(some)) == 0.0:
+        batch = electrons[begin : begin + _WAVES]
+        if np.max(np.abs(batch)) == 0.0:
             continue
         # By whole vectors; then each to its samples.
         places[:] = along[len(along) - 1]
         for j in range(len(along) - 2, -1, -1):
             for i in range(_WAVES):
                 places[i] = places[i] * (times[0] + times[1] * (begin + i)) + along[j]
-        for i in range(len(some)):
+        for i in range(len(batch)):
             place = samples * (start + places[i])
-            whole = np.floor(place)
-            low[i] = np.int64(whole) - 2 - first
-            t = place - whole
-            s, e = 1.0 - t, some[i] / 120.0
+            floor_place = np.floor(place)
+            low[i] = np.int64(floor_place) - 2 - first
+            t = place - floor_place
+            s, e = 1.0 - t, batch[i] / 120.0
             t2, s2 = t * t, s * s
             w0[i], w5[i] = e * s2 * s2 * s, e * t2 * t2 * t
             w1[i] = e * (26.0 + t * (-50.0 + t * (20.0 + t * (20.0 + t * (-20.0 + 5.0 * t)))))
             w4[i] = e * (26.0 + s * (-50.0 + s * (20.0 + s * (20.0 + s * (-20.0 + 5.0 * s)))))
             w2[i] = e * (66.0 + t2 * (-60.0 + t2 * (30.0 - 10.0 * t)))
             w3[i] = e * (66.0 + s2 * (-60.0 + s2 * (30.0 - 10.0 * s)))
-        start_of, stop = 0, 0
-        while start_of < len(some):
+        group_start, stop = 0, 0
+        while group_start < len(batch):
             # Those that lie between the same samples are added up first.
-            at, stop = low[start_of], start_of + 1
-            while stop < len(some) and low[stop] == at:
+            at, stop = low[group_start], group_start + 1
+            while stop < len(batch) and low[stop] == at:
                 stop += 1
             if 0 <= at <= count - 6:
                 for b in range(out.shape[0]):
-                    _add(weights[:, start_of:stop], share[b, begin + start_of : begin + stop], out[b, at : at + 6])
-            start_of = stop
+                    _add_weighted(
+                        weights[:, group_start:stop], share[b, begin + group_start : begin + stop], out[b, at : at + 6]
+                    )
+            group_start = stop
 
 
 @jit
-def _add(weights: Float, share: Float, out: Float) -> None:
+def _add_weighted(weights: Float, share: Float, out: Float) -> None:
     """Adds weights [6, k] by shares [k] to out [6]."""
     w0, w1, w2, w3, w4, w5 = weights
     s0 = s1 = s2 = s3 = s4 = s5 = 0.0
     for i in range(len(share)):
-        own = share[i]
-        s0 += own * w0[i]
-        s1 += own * w1[i]
-        s2 += own * w2[i]
-        s3 += own * w3[i]
-        s4 += own * w4[i]
-        s5 += own * w5[i]
+        weight = share[i]
+        s0 += weight * w0[i]
+        s1 += weight * w1[i]
+        s2 += weight * w2[i]
+        s3 += weight * w3[i]
+        s4 += weight * w4[i]
+        s5 += weight * w5[i]
     out[0] += s0
     out[1] += s1
     out[2] += s2

@@ -13,7 +13,7 @@ import numpy as np
 
 from lake_schema.arrays import Float, Float32, Int
 from truesky.numerics.compiling import jit
-from truesky.render.dispersing.kernels import lay
+from truesky.render.dispersing.kernels import add_to_trace
 
 # Places along a trace between which it is taken as straight.
 _NODES = 129
@@ -40,7 +40,7 @@ def _path(along: Float, across: Float, times: tuple[float, float], count: int, s
 
 
 @jit
-def _between(path: Float, x: float, ends: tuple[float, float]) -> tuple[float, float, float]:
+def _interpolate_path(path: Float, x: float, ends: tuple[float, float]) -> tuple[float, float, float]:
     """(row, number of the wavelength, rows a column) of a path at column x; ends : rows a column before and behind."""
     columns = path[0]
     last = len(columns) - 1
@@ -68,10 +68,17 @@ def _slope(path: Float, i: int) -> float:
 
 
 @jit
-def follow(
-    images: Float32, laid: Float, first: int, path: Float, slope: float, shear: float, shape: tuple[int, int, int],
-    corner: tuple[int, int], out: Float32,
-) -> None:  # fmt: skip
+def add_samples(
+    images: Float32,
+    trace_electrons: Float,
+    first: int,
+    path: Float,
+    slope: float,
+    shear: float,
+    shape: tuple[int, int, int],
+    corner: tuple[int, int],
+    out: Float32,
+) -> None:
     """Adds a source's image at every sample of its trace to out [h, w], with a PSF and rows of its own.
 
     images : [b, n along, n across] spline coefficients of the source seen through PSF b, of a stamp of n pixels; the
@@ -83,24 +90,24 @@ def follow(
     n, ox, oy = shape
     line = np.empty(n * oy, np.float32)
     wrapped, fine = np.empty(n * oy + oy + 4, np.float32), np.empty(n * oy, np.float32)
-    for m in range(laid.shape[1]):
+    for m in range(trace_electrons.shape[1]):
         electrons = 0.0
-        for b in range(len(laid)):
-            electrons += abs(laid[b, m])
+        for b in range(len(trace_electrons)):
+            electrons += abs(trace_electrons[b, m])
         place = first + m - (n // 2) * ox
         phase = (-place) % ox
-        left = (place + phase) // ox - corner[0]
-        if electrons == 0.0 or left >= out.shape[1] or left + n <= 0:
+        first_column = (place + phase) // ox - corner[0]
+        if electrons == 0.0 or first_column >= out.shape[1] or first_column + n <= 0:
             continue
-        row, _, _ = _between(path, (first + m) / ox, (slope, slope))
-        for i in range(max(0, -left), min(n, out.shape[1] - left)):
+        row, _, _ = _interpolate_path(path, (first + m) / ox, (slope, slope))
+        for i in range(max(0, -first_column), min(n, out.shape[1] - first_column)):
             line[:] = np.float32(0.0)
-            for b in range(len(laid)):
-                weight, some = np.float32(laid[b, m]), images[b, i * ox + phase]
+            for b in range(len(trace_electrons)):
+                weight, image_line = np.float32(trace_electrons[b, m]), images[b, i * ox + phase]
                 for v in range(len(line)):
-                    line[v] += weight * some[v]
-            aside = shear * (corner[0] + left + i - (first + m) / ox)
-            _add_line(line, row + aside, n, oy, corner[1], wrapped, fine, out[:, left + i])
+                    line[v] += weight * image_line[v]
+            aside = shear * (corner[0] + first_column + i - (first + m) / ox)
+            _add_line(line, row + aside, n, oy, corner[1], wrapped, fine, out[:, first_column + i])
 
 
 @jit
@@ -110,8 +117,8 @@ def _add_line(
     """Adds a column of an image, oy samples a row, its middle at `row`, to out [h] from row `low` on."""
     tall, begin = len(line), int(np.ceil(row - n // 2))
     v = oy * (begin - row + n // 2)
-    whole = int(np.floor(v))
-    t = v - whole
+    floor_v = int(np.floor(v))
+    t = v - floor_v
     s = 1.0 - t
     w0, w3 = np.float32(s * s * s / 6.0), np.float32(t * t * t / 6.0)
     w1 = np.float32((4.0 + t * t * (3.0 * t - 6.0)) / 6.0)
@@ -120,7 +127,7 @@ def _add_line(
     wrapped[0] = line[tall - 1]
     wrapped[1 : tall + 1] = line
     wrapped[tall + 1 :] = line[: len(wrapped) - tall - 1]
-    a0, a1, a2, a3 = wrapped[whole:], wrapped[whole + 1 :], wrapped[whole + 2 :], wrapped[whole + 3 :]
+    a0, a1, a2, a3 = wrapped[floor_v:], wrapped[floor_v + 1 :], wrapped[floor_v + 2 :], wrapped[floor_v + 3 :]
     # Of every sample, in whole vectors, which is faster than of every row.
     for i in range(len(fine) - oy + 1):
         fine[i] = w0 * a0[i] + w1 * a1[i] + w2 * a2[i] + w3 * a3[i]
@@ -129,10 +136,18 @@ def _add_line(
 
 
 @jit
-def convolve(
-    images: Float32, laid: Float, first: int, path: Float, slope: float, share: Float, shape: tuple[int, int, int],
-    tile: int, low: int, out: Float32,
-) -> None:  # fmt: skip
+def convolve_trace(
+    images: Float32,
+    trace_electrons: Float,
+    first: int,
+    path: Float,
+    slope: float,
+    share: Float,
+    shape: tuple[int, int, int],
+    tile: int,
+    low: int,
+    out: Float32,
+) -> None:
     """Adds a source's image at every sample of its trace to out [w, n across]: columns from `low` on, about the trace.
 
     images : of `follow`, in coordinates that rise by `slope` rows a column;  laid : [m] electrons
@@ -142,14 +157,14 @@ def convolve(
     n, ox, oy = shape
     tall = n * oy
     steep = np.empty((n * ox, tall), np.float32)
-    _steep(images[len(images) // 2], ox, oy, steep)
+    _steepness_image(images[len(images) // 2], ox, oy, steep)
     count = (n * ox * tall + _CLOSE - 1) // _CLOSE
     for k in range(count):
         # By some of the samples across, which then stay in the processor's cache.
         begin, end = k * tall // count, (k + 1) * tall // count
         parts = _by_phase(images, steep, ox, begin, end)
         lines = np.zeros((len(out), end - begin), np.float32)
-        _convolve(parts, laid, first, path, slope, share, shape, tile, low, lines)
+        _convolve_strip(parts, trace_electrons, first, path, slope, share, shape, tile, low, lines)
         out[:, begin:end] += lines
 
 
@@ -166,27 +181,35 @@ def _by_phase(images: Float32, steep: Float32, ox: int, begin: int, end: int) ->
 
 
 @jit
-def _convolve(
-    parts: Float32, laid: Float, first: int, path: Float, slope: float, share: Float, shape: tuple[int, int, int],
-    tile: int, low: int, out: Float32,
-) -> None:  # fmt: skip
+def _convolve_strip(
+    parts: Float32,
+    trace_electrons: Float,
+    first: int,
+    path: Float,
+    slope: float,
+    share: Float,
+    shape: tuple[int, int, int],
+    tile: int,
+    low: int,
+    out: Float32,
+) -> None:
     """Adds to out [w, wide] what `convolve` does, of parts [b + 1, ox, n x wide] of `_by_phase`."""
     n, ox, _ = shape
     tall, pad = out.shape[1], STEP - 1
     mixed, amounts = np.zeros((ox, (n + 2 * pad) * tall), np.float32), np.empty(len(parts), np.float32)
-    flat, weights, all_of_them = out.reshape(-1), np.empty(tile, np.float32), len(laid)
+    flat, weights, n_samples = out.reshape(-1), np.empty(tile, np.float32), len(trace_electrons)
     ends = _slope(path, 0), _slope(path, _NODES - 2)
-    for q in range(first // ox, (first + all_of_them - 1) // ox + 2, tile):
-        left = q - n // 2 - low
-        if left < 0 or (left + n + tile + pad) * tall > len(flat):
+    for q in range(first // ox, (first + n_samples - 1) // ox + 2, tile):
+        first_column = q - n // 2 - low
+        if first_column < 0 or (first_column + n + tile + pad) * tall > len(flat):
             continue
         total, mean = 0.0, 0.0
-        for m in range(max(ox * (q - 1) + 1 - first, 0), min(ox * (q + tile - 1) + 1 - first, all_of_them)):
-            total += abs(laid[m])
-            mean += m * abs(laid[m])
+        for m in range(max(ox * (q - 1) + 1 - first, 0), min(ox * (q + tile - 1) + 1 - first, n_samples)):
+            total += abs(trace_electrons[m])
+            mean += m * abs(trace_electrons[m])
         if total == 0.0:
             continue
-        _, number, rise = _between(path, (first + mean / total) / ox, ends)
+        _, number, rise = _interpolate_path(path, (first + mean / total) / ox, ends)
         # A trace that is steeper by d than the image's rows has I(u, v + d u) for its image: I + d u dI / dv.
         amounts[:-1], amounts[-1] = share[int(number)], rise - slope
         for phase in range(ox):
@@ -194,32 +217,32 @@ def _convolve(
         for phase in range(ox):
             for k in range(tile):
                 m = ox * (q + k) - phase - first
-                weights[k] = np.float32(laid[m]) if 0 <= m < all_of_them else np.float32(0.0)
+                weights[k] = np.float32(trace_electrons[m]) if 0 <= m < n_samples else np.float32(0.0)
             for k in range(0, tile, STEP):
                 w0, w1, w2, w3 = weights[k], weights[k + 1], weights[k + 2], weights[k + 3]
                 if abs(w0) + abs(w1) + abs(w2) + abs(w3) == 0.0:
                     continue
                 length = (n + pad) * tall
-                some, source = flat[(left + k) * tall : (left + k) * tall + length], mixed[phase]
+                target, source = flat[(first_column + k) * tall : (first_column + k) * tall + length], mixed[phase]
                 a0, a1 = source[3 * tall : 3 * tall + length], source[2 * tall : 2 * tall + length]
                 a2, a3 = source[tall : tall + length], source[:length]
                 for e in range(np.uint64(length)):
-                    some[e] += w0 * a0[e] + w1 * a1[e] + w2 * a2[e] + w3 * a3[e]
+                    target[e] += w0 * a0[e] + w1 * a1[e] + w2 * a2[e] + w3 * a3[e]
 
 
 @jit
-def _steep(image: Float32, ox: int, oy: int, out: Float32) -> None:
+def _steepness_image(image: Float32, ox: int, oy: int, out: Float32) -> None:
     """Fills out [n along, n across] with u dI / dv of an image I: what it gains where its trace is steeper."""
     tall = image.shape[1]
     out[:] = np.float32(0.0)
     for j in range(len(image)):
-        one, moved = image[j], np.float32((j - len(image) // 2) / ox * oy / 12.0)
-        inner, up, down = out[j, 2 : tall - 2], one[3 : tall - 1], one[1 : tall - 3]
+        column, factor = image[j], np.float32((j - len(image) // 2) / ox * oy / 12.0)
+        inner, up, down = out[j, 2 : tall - 2], column[3 : tall - 1], column[1 : tall - 3]
         for v in range(len(inner)):
             inner[v] = up[v] - down[v]
-        higher, lower = one[4:tall], one[: tall - 4]
+        higher, lower = column[4:tall], column[: tall - 4]
         for v in range(len(inner)):
-            inner[v] = moved * (np.float32(8.0) * inner[v] - (higher[v] - lower[v]))
+            inner[v] = factor * (np.float32(8.0) * inner[v] - (higher[v] - lower[v]))
 
 
 @jit
@@ -240,7 +263,7 @@ def _mix(parts: Float32, phase: int, amounts: Float32, out: Float32) -> None:
 
 
 @jit
-def settle(
+def add_lines(
     lines: Float32, low: int, path: Float, shape: tuple[int, int, int], corner: tuple[int, int], out: Float32
 ) -> None:
     """Adds columns of `convolve`, the first column `low`, to out [h, w], where the trace has them.
@@ -251,31 +274,31 @@ def settle(
     wrapped, fine = np.empty(n * oy + oy + 4, np.float32), np.empty(n * oy, np.float32)
     ends = _slope(path, 0), _slope(path, _NODES - 2)
     for c in range(out.shape[1]):
-        row, _, _ = _between(path, float(corner[0] + c), ends)
+        row, _, _ = _interpolate_path(path, float(corner[0] + c), ends)
         _add_line(lines[corner[0] + c - low], row, n, oy, corner[1], wrapped, fine, out[:, c])
 
 
 @jit
-def add(piece: Float32, corner: tuple[int, int], unit: float, frame: Int) -> float:
+def add_piece(piece: Float32, corner: tuple[int, int], unit: float, frame: Int) -> float:
     """Adds piece [h, w] with its first pixel at corner (column, row) to the frame, `unit` to an electron.
 
     returns : electrons that fell there
     """
     ny, nx = frame.shape
-    left, right = max(0, -corner[0]), min(piece.shape[1], nx - corner[0])
+    first, stop = max(0, -corner[0]), min(piece.shape[1], nx - corner[0])
     total = np.int64(0)
     for r in range(max(0, -corner[1]), min(piece.shape[0], ny - corner[1])):
-        if left < right:
-            some, out = piece[r, left:right], frame[corner[1] + r, corner[0] + left : corner[0] + right]
-            for c in range(len(some)):
-                units = np.int64(np.rint(np.float64(some[c]) * unit))
+        if first < stop:
+            piece_row, out = piece[r, first:stop], frame[corner[1] + r, corner[0] + first : corner[0] + stop]
+            for c in range(len(piece_row)):
+                units = np.int64(np.rint(np.float64(piece_row[c]) * unit))
                 out[c] += units
                 total += units
     return total / unit
 
 
 @jit
-def refine(coarse: Int, step: int, frame: Int) -> int:
+def add_refined(coarse: Int, step: int, frame: Int) -> int:
     """Adds a cubic spline to the frame: coarse [h, w] its coefficients, of pixels as wide as `step` of the frame's.
 
     The frame's first pixel is at (1, 1), and what is added to it is a share of a coarse one; returns the units added.
@@ -288,9 +311,14 @@ def refine(coarse: Int, step: int, frame: Int) -> int:
         weights[k, 0], weights[k, 3] = s * s * s / 6.0, t * t * t / 6.0
         weights[k, 1], weights[k, 2] = (4.0 + t * t * (3.0 * t - 6.0)) / 6.0, (4.0 + s * s * (3.0 * s - 6.0)) / 6.0
     for y in range(ny):
-        own, some = weights[y % step] / step**2, coarse[y // step : y // step + 4]
+        row_weights, coarse_rows = weights[y % step] / step**2, coarse[y // step : y // step + 4]
         for c in range(len(wide)):
-            wide[c] = own[0] * some[0, c] + own[1] * some[1, c] + own[2] * some[2, c] + own[3] * some[3, c]
+            wide[c] = (
+                row_weights[0] * coarse_rows[0, c]
+                + row_weights[1] * coarse_rows[1, c]
+                + row_weights[2] * coarse_rows[2, c]
+                + row_weights[3] * coarse_rows[3, c]
+            )
         if np.max(np.abs(wide)) == 0.0:
             continue
         for k in range(step):
@@ -323,26 +351,26 @@ def spread(
     for i in range(len(response)):
         electrons[i] = factor * np.float64(spectrum[i]) * response[i]
     path = _path(along, across, times, len(response), start)
-    left, right = path[0, 0], path[0, _NODES - 1]
+    x_first, x_last = path[0, 0], path[0, _NODES - 1]
     bottom, top = np.min(path[1]), np.max(path[1])
-    first = int(np.floor(ox * left)) - 3
-    laid = np.zeros((1 if tile > 0 else share.shape[1], int(np.ceil(ox * right)) + 4 - first))
+    first = int(np.floor(ox * x_first)) - 3
+    trace_electrons = np.zeros((1 if tile > 0 else share.shape[1], int(np.ceil(ox * x_last)) + 4 - first))
     # One that is straight has the shares of its tiles.
-    own = np.ones((1, len(response))) if tile > 0 else np.ascontiguousarray(share.T)
-    lay(electrons, along, times, start[0], ox, own, first, laid)
+    wave_share = np.ones((1, len(response))) if tile > 0 else np.ascontiguousarray(share.T)
+    add_to_trace(electrons, along, times, start[0], ox, wave_share, first, trace_electrons)
     steepest = max(np.abs(_slope(path, 0)), np.abs(_slope(path, _NODES - 2)))
     wing = (steepest if tile > 0 else abs(shear)) * (n // 2 + 2.0)
-    begin = max(int(np.floor(left)) - n // 2 - 2, 0), max(int(np.floor(bottom - wing)) - n // 2 - 1, 0)
-    width = min(int(np.ceil(right)) + n // 2 + 3, nx) - begin[0]
+    begin = max(int(np.floor(x_first)) - n // 2 - 2, 0), max(int(np.floor(bottom - wing)) - n // 2 - 1, 0)
+    width = min(int(np.ceil(x_last)) + n // 2 + 3, nx) - begin[0]
     height = min(int(np.ceil(top + wing)) + n // 2 + 2, ny) - begin[1]
     if width <= 0 or height <= 0:
         return 0.0
     piece = np.zeros((height, width), np.float32)
     if tile == 0:
-        follow(images, laid, first, path, slope, shear, shape, begin, piece)
+        add_samples(images, trace_electrons, first, path, slope, shear, shape, begin, piece)
     else:
         low = begin[0] - n - 2 * tile
         lines = np.zeros((width + 2 * n + 4 * tile + 2 * STEP, n * oy), np.float32)
-        convolve(images, laid[0], first, path, shear, share, shape, tile, low, lines)
-        settle(lines, low, path, shape, begin, piece)
-    return add(piece, begin, unit, frame)
+        convolve_trace(images, trace_electrons[0], first, path, shear, share, shape, tile, low, lines)
+        add_lines(lines, low, path, shape, begin, piece)
+    return add_piece(piece, begin, unit, frame)

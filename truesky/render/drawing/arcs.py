@@ -14,7 +14,7 @@ import numpy as np
 import scipy.fft
 
 from lake_schema.arrays import Array, Float
-from truesky.numerics import sums
+from truesky.numerics import matrices
 from truesky.render.drawing.kernels import fourier
 from truesky.render.drawing.transfer import Grid, Transfer
 from truesky.render.sources.lensed_arcs import Picture
@@ -43,29 +43,34 @@ def transform(picture: Picture, jacobian: Float, kx: Array, ky: Array) -> Array:
     jacobian : [2, 2] d(u, v) / d(column, row), arcsec, u to the west
     Error    : 1e-6 of the flux (tests/truesky/render/drawing/test_arcs.py)
     """
-    on_sky = sums.product(sums.inverse(jacobian).T, np.stack([kx, ky]).astype(float))
-    across, up = sums.product(picture.matrix.T, on_sky)
+    on_sky = matrices.matmul(matrices.inverse(jacobian).T, np.stack([kx, ky]).astype(float))
+    across, up = matrices.matmul(picture.matrix.T, on_sky)
     rows, columns = picture.image.shape
-    found = np.empty(len(kx), complex)
-    fourier.between(_spectrum(picture.image), across, up, _WIDTH, _SLOPE, found)
+    values = np.empty(len(kx), complex)
+    fourier.interpolate_spectrum(_spectrum(picture.image), across, up, _WIDTH, _SLOPE, values)
     if rows % 2 == 0 or columns % 2 == 0:
         # The middle lies between pixels.
-        found *= np.exp(-0.5j * (across * (columns % 2 == 0) + up * (rows % 2 == 0)))
-    found = found * quintic(across) * quintic(up)
+        values *= np.exp(-0.5j * (across * (columns % 2 == 0) + up * (rows % 2 == 0)))
+    values = values * quintic(across) * quintic(up)
     if picture.thick is not None:
         # q / sinh q, as of the disc's smooth light.
-        q = np.maximum(np.abs(sums.product(picture.thick, on_sky)), _THIN)
-        found = found * (2.0 * q * np.exp(-q) / -np.expm1(-2.0 * q))
-    return np.asarray(found)
+        q = np.maximum(np.abs(matrices.matmul(picture.thick, on_sky)), _THIN)
+        values = values * (2.0 * q * np.exp(-q) / -np.expm1(-2.0 * q))
+    return np.asarray(values)
 
 
-def through(passed: Transfer, picture: Picture, jacobian: Float) -> Transfer:
+def apply_picture(psf_transfer: Transfer, picture: Picture, jacobian: Float) -> Transfer:
     """One plane, as of a point -> as of the picture."""
-    grid: Grid = passed.grid
-    found = transform(picture, jacobian, grid.kx, grid.ky)
-    re, im = passed.planes[0].astype(float)
-    turned = np.stack([re * found.real - im * found.imag, re * found.imag + im * found.real])
-    return Transfer(grid, turned[None].astype(passed.planes.dtype))
+    grid: Grid = psf_transfer.grid
+    picture_transform = transform(picture, jacobian, grid.kx, grid.ky)
+    re, im = psf_transfer.planes[0].astype(float)
+    product = np.stack(
+        [
+            re * picture_transform.real - im * picture_transform.imag,
+            re * picture_transform.imag + im * picture_transform.real,
+        ]
+    )
+    return Transfer(grid, product[None].astype(psf_transfer.planes.dtype))
 
 
 def _spectrum(image: Array) -> Array:
@@ -80,7 +85,7 @@ def _spectrum(image: Array) -> Array:
 
 def _window_transform(place: Array, period: int) -> Array:
     """What the window about a frequency makes of a pixel at `place`."""
-    z, weights = sums.gauss_legendre(_NODES)
+    z, weights = matrices.gauss_legendre(_NODES)
     window = weights * np.exp(_SLOPE * (np.sqrt((1 - z) * (1 + z)) - 1.0))
     half = 0.5 * _WIDTH
-    return np.asarray(sums.product(half * np.cos(np.outer(2 * np.pi * place / period, half * z)), window))
+    return np.asarray(matrices.matmul(half * np.cos(np.outer(2 * np.pi * place / period, half * z)), window))

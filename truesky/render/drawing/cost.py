@@ -27,12 +27,12 @@ _PICTURE_BYTES = 370
 _STAMP_S, _PLANE_S, _FRAME_S, _BLOCK_S, _START_S = 2.0e-8, 2.3e-7, 1.1e-8, 1.5e-8, 0.01
 
 
-def work(sources: Sources, sizes: Int, psf: Psf) -> tuple[int, int]:
+def count_work(sources: Sources, sizes: Int, psf: Psf) -> tuple[int, int]:
     """(pixels of stamps, samples' places of the PSF's planes) that `draw` goes through, before anything is drawn."""
     planes, transformed = transfer.plane_count(psf), 0
     for size in np.unique(sizes).tolist():
-        alone, together = stamps.split_by_size(sources, sizes, psf, size, stamps.in_double_precision(sources, None))
-        transformed += size**2 * (len(alone) + planes * (len(together) > 0))
+        individual, sharing = stamps.split_by_size(sources, sizes, psf, size, stamps.in_double_precision(sources, None))
+        transformed += size**2 * (len(individual) + planes * (len(sharing) > 0))
     return int((sizes.astype(np.int64) ** 2).sum()), transformed
 
 
@@ -42,18 +42,20 @@ def seconds(sources: Sources, sizes: Int, psf: Psf, nx: int, ny: int) -> float:
     sources, sizes : as of `draw`;  psf : of the detector;  nx, ny : its pixels
     Error : between half and twice of what the machine takes that it was measured on
     """
-    pieces, trail, whole = stamps.in_pieces(sources)
-    sizes = sizes[whole]
-    here, body = selection.touching(pieces.column, pieces.row, sizes, nx, ny), pieces.shape >= 0
-    pixels, transformed = work(pieces.take(here), sizes[here], psf)
-    reach, _ = stamp_sizes.beyond_stamps(pieces.shapes.take(pieces.shape[body]), sizes[body], psf.pixel_scale)
+    pieces, trail, parent = stamps.split_into_pieces(sources)
+    sizes = sizes[parent]
+    on_frame, body = selection.overlaps_frame(pieces.column, pieces.row, sizes, nx, ny), pieces.shape >= 0
+    pixels, transformed = count_work(pieces.take(on_frame), sizes[on_frame], psf)
+    reach, _ = stamp_sizes.light_beyond_stamps(pieces.shapes.take(pieces.shape[body]), sizes[body], psf.pixel_scale)
     blocks = float(((2 * reach / wings.BLOCK) ** 2).sum())
-    far = stamp_sizes.has_far_light(pieces.electrons, sizes, pieces.shape, pieces.picture, psf)
-    far_s = far_light.seconds(sources.length[np.unique(whole[far])], nx, ny)
-    far_s += far_light.remove_aliased_seconds(np.hypot(*trail[here & far].T), sizes[here & far])
+    with_far_light = stamp_sizes.has_far_light(pieces.electrons, sizes, pieces.shape, pieces.picture, psf)
+    far_s = far_light.seconds(sources.trail_length[np.unique(parent[with_far_light])], nx, ny)
+    far_s += far_light.remove_aliased_seconds(
+        np.hypot(*trail[on_frame & with_far_light].T), sizes[on_frame & with_far_light]
+    )
     largest = stamp_sizes.on_largest(pieces.shape, sizes)
     far_s += outskirts.FRAME_S * nx * ny * float(largest.sum())
-    far_s += outskirts.STAMP_S * float(SIZES[-1]) ** 2 * float((largest & here).sum())
+    far_s += outskirts.STAMP_S * float(SIZES[-1]) ** 2 * float((largest & on_frame).sum())
     return _STAMP_S * pixels + _PLANE_S * transformed + _BLOCK_S * blocks + far_s + _FRAME_S * nx * ny + _START_S
 
 
@@ -67,8 +69,8 @@ def memory(electrons: Float, sizes: Int, nx: int, ny: int, picture: Int | None =
     bright = electrons > BRIGHT
     pictured = np.zeros(len(sizes), bool) if picture is None else picture >= 0
     largest = [
-        of * float(sizes[chosen].max(initial=0)) ** 2
-        for of, chosen in (
+        bytes_per_pixel * float(sizes[chosen].max(initial=0)) ** 2
+        for bytes_per_pixel, chosen in (
             (_STAMP_BYTES, ~bright),
             (_DOUBLE_BYTES, bright),
             (_DEEP_BYTES, bright & (sizes <= DEEP)),

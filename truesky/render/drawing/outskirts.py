@@ -26,7 +26,7 @@ from scipy.special import gammaincc, gammaln
 
 from lake_schema.arrays import Array, Float, Int
 from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
-from truesky.numerics import sums
+from truesky.numerics import matrices
 from truesky.numerics.compiling import jit
 from truesky.render.drawing import transfer
 from truesky.render.drawing.kernels.frame import BULGE, BULGE_FORM, DISK, DISK_FORM, POWER
@@ -46,14 +46,14 @@ _BLOCK, _FINEST_BLOCK, _SLIM, _MOST_NODES = 8, 2, 0.025, 1536
 # differ from even light by less than this, electrons a pixel.
 _RINGS, _UNEVEN = 64, 0.05
 # Pixels between the nodes of a ring: at least, of a stamp's side at most, and of the width of an ellipse so far out.
-_FINEST, _COARSEST, _PART = 4, 1.0 / 16.0, 0.2
+_FINEST, _COARSEST, _SPACING_FRACTION = 4, 1.0 / 16.0, 0.2
 # A PSF without planes is looked at so far, pixels: behind an atmosphere 1e-5 of the light lies farther out.
 _MOFFAT = 128
 # Of a disc's table: nodes a direction, t of u = sinh t between them, points along the line of sight, scale lengths and
 # scale heights as far as which there is light, the least of it.
 _NODES, _STEP, _POINTS, _LENGTHS, _HEIGHTS, _DARK = 76, 1.0 / 16.0, 512, 45.0, 20.0, 1e-40
 # Light that is less than this, electrons a pixel, is left out.
-_NONE = 1e-4
+_NEGLIGIBLE = 1e-4
 # Axis ratio of the thinnest sources, bulges.
 _THINNEST = 0.02
 # Directions in which a profile is summed beyond a square.
@@ -76,30 +76,30 @@ class Outskirts:
     block: int
 
 
-def of_galaxy(shape: Shapes, form: Forms, electrons: float, psf: Psf, weights: Float, farthest: float) -> Outskirts:
+def from_galaxy(shape: Shapes, form: Forms, electrons: float, psf: Psf, weights: Float, farthest: float) -> Outskirts:
     """Of a galaxy, the only one of `shape` and `form`.
 
     electrons : expected;  psf : of the detector;  weights : [planes] of transfer.basis_weights
     farthest  : pixels, along columns or rows, that it is asked for
     Error     : next to the stamp 1e-3 of the light there; of bulges slimmer than 1 : 50 along the axis a few per cent
     """
-    light = galaxy_shapes.on_the_sky(shape, form)[0].copy()
+    light = galaxy_shapes.real_space_profile(shape, form)[0].copy()
     inclination = float(shape.inclination[0])
     cosine, sine = np.cos(np.radians(inclination)), np.sin(np.radians(inclination))
     across = form.disk[0, :, 1] * cosine + form.thick[0] / (0.5 * np.pi * DISK_SCALE_HEIGHT) * sine
     matrix = np.column_stack([form.disk[0, :, 0], across])
-    area = abs(float(sums.determinant(matrix)))
+    area = abs(float(matrices.determinant(matrix)))
     if light[DISK] > 0.0:
         light[DISK] = (1.0 - shape.bulge_fraction[0]) / area
-        light[DISK_FORM : DISK_FORM + 4] = sums.inverse(matrix).ravel()
+        light[DISK_FORM : DISK_FORM + 4] = matrices.inverse(matrix).ravel()
     light[[BULGE, DISK]] *= electrons
     disk, wide = surface_disk(inclination)
     block = _block(slimness(light, wide), farthest)
     cells = _cells(psf, weights, block)
     half = int(np.ceil(farthest / block)) + 1 + len(cells) // 2
-    alone = np.zeros((2 * half + 1, 2 * half + 1))
-    _sample(light, disk, wide, float(half * block), float(half * block), float(block), alone)
-    return Outskirts(light, disk, wide, fftconvolve(alone, cells, mode="valid"), block)
+    unblurred = np.zeros((2 * half + 1, 2 * half + 1))
+    _sample(light, disk, wide, float(half * block), float(half * block), float(block), unblurred)
+    return Outskirts(light, disk, wide, fftconvolve(unblurred, cells, mode="valid"), block)
 
 
 @lru_cache(maxsize=16)
@@ -151,7 +151,7 @@ def _cells(psf: Psf, weights: Float, block: int) -> Float:
         image = np.asarray(transfer.image_of(psf.planes, weights), float)
     samples = SAMPLES if psf.planes is None else psf.planes.samples
     sides = [_shares(length, block, samples) for length in image.shape]
-    out: Float = sums.product(sides[0].T, sums.product(image, sides[1]))
+    out: Float = matrices.matmul(sides[0].T, matrices.matmul(image, sides[1]))
     out[len(out) // 2, len(out) // 2] -= 1.0
     return np.asarray(out)
 
@@ -177,18 +177,22 @@ def _shares(length: int, block: int, samples: int) -> Float:
     return out
 
 
-def take_in(some: Outskirts, stamp: Array, x: float, y: float) -> None:
+def remove_aliased(galaxy: Outskirts, stamp: Array, x: float, y: float) -> None:
     """Takes off a stamp [N, N], in place, what has come in at its edges of `some` galaxy at (x, y) of it, pixels."""
-    size, middle = len(stamp), some.block * (len(some.blurred) // 2)
-    more, blurred, pixels = from_afar(some, size, x, y), _spline(some.blurred, some.block), np.arange(size)
+    size, middle = len(stamp), galaxy.block * (len(galaxy.blurred) // 2)
+    aliased, blurred, pixels = (
+        distant_image_light(galaxy, size, x, y),
+        _spline(galaxy.blurred, galaxy.block),
+        np.arange(size),
+    )
     for up in (-size, 0, size):
         for right in (-size, 0, size):
             if up or right:
-                more += blurred(pixels - y - up + middle, pixels - x - right + middle)
-    _take_in(some.light, some.disk, some.across, more, x, y, stamp)
+                aliased += blurred(pixels - y - up + middle, pixels - x - right + middle)
+    _remove_aliased(galaxy.light, galaxy.disk, galaxy.across, aliased, x, y, stamp)
 
 
-def from_afar(some: Outskirts, size: int, x: float, y: float) -> Float:
+def distant_image_light(galaxy: Outskirts, size: int, x: float, y: float) -> Float:
     """What comes into a stamp of a galaxy at (x, y) from all of its images but those in the eight stamps next to it.
 
     An ellipse's images are even light only where they are as wide as a stamp: the slimmer it is, the farther out.
@@ -196,24 +200,26 @@ def from_afar(some: Outskirts, size: int, x: float, y: float) -> Float:
     some    : the galaxy's outskirts
     Error   : 0.05 electrons; of axis ratio 0.02 1e-3 of the light
     """
-    slim, pixels = slimness(some.light, some.across), np.arange(size)
-    out, onto, step = np.zeros((size, size)), np.zeros((1, 1)), 0
-    left = _beyond(some.light, some.across, 1.5 * size) / size**2
+    slim, pixels = slimness(galaxy.light, galaxy.across), np.arange(size)
+    out, ring_sum, step = np.zeros((size, size)), np.zeros((1, 1)), 0
+    remaining = _light_outside_square(galaxy.light, galaxy.across, 1.5 * size) / size**2
     for ring in range(2, _RINGS + 1):
-        wanted = 2 ** int(np.log2(np.clip(_PART * slim * ring * size, _FINEST, _COARSEST * size)))
-        if wanted != step:
+        ring_step = 2 ** int(np.log2(np.clip(_SPACING_FRACTION * slim * ring * size, _FINEST, _COARSEST * size)))
+        if ring_step != step:
             if step:
-                out += _spline(onto, step)(pixels, pixels)
-            step, onto = wanted, np.zeros((size // wanted + 1, size // wanted + 1))
-        one = np.zeros(onto.shape)
+                out += _spline(ring_sum, step)(pixels, pixels)
+            step, ring_sum = ring_step, np.zeros((size // ring_step + 1, size // ring_step + 1))
+        ring_light = np.zeros(ring_sum.shape)
         for up in range(-ring, ring + 1):
             for right in range(-ring, ring + 1) if abs(up) == ring else (-ring, ring):
-                _sample(some.light, some.disk, some.across, x + right * size, y + up * size, float(step), one)
-        onto += one
-        even, left = left, _beyond(some.light, some.across, (ring + 0.5) * size) / size**2
-        if ring * np.abs(one - (even - left)).max() < _UNEVEN:
+                _sample(
+                    galaxy.light, galaxy.disk, galaxy.across, x + right * size, y + up * size, float(step), ring_light
+                )
+        ring_sum += ring_light
+        even, remaining = remaining, _light_outside_square(galaxy.light, galaxy.across, (ring + 0.5) * size) / size**2
+        if ring * np.abs(ring_light - (even - remaining)).max() < _UNEVEN:
             break
-    out += _spline(onto + left, step)(pixels, pixels)
+    out += _spline(ring_sum + remaining, step)(pixels, pixels)
     return out
 
 
@@ -229,13 +235,13 @@ def slimness(light: Float, across: float) -> float:
     for middle, first, width in ((BULGE, BULGE_FORM, 1.0), (DISK, DISK_FORM, across)):
         if light[middle] > 0.0:
             matrix = light[first : first + 4].reshape(2, 2) / np.array([[1.0], [width]])
-            half, area = 0.5 * float((matrix**2).sum()), abs(float(sums.determinant(matrix)))
+            half, area = 0.5 * float((matrix**2).sum()), abs(float(matrices.determinant(matrix)))
             out = min(out, area / (half + np.sqrt(max(half**2 - area**2, 0.0))))
     return out
 
 
 def add(
-    some: Outskirts, frame: Int, column: float, row: float, hole: tuple[int, int, int], unread: tuple[int, int],
+    galaxy: Outskirts, frame: Int, column: float, row: float, hole: tuple[int, int, int], unread_rows: tuple[int, int],
     unit: float,
 ) -> int:  # fmt: skip
     """Adds a galaxy at (column, row) to a frame of `unit` an electron, but for a stamp; returns how many units.
@@ -244,30 +250,46 @@ def add(
     some : the galaxy's outskirts;  frame : integers
     """
     return int(
-        _add(some.light, some.disk, some.across, some.blurred, some.block, frame, column, row, hole, unread, unit)
-    )  # fmt: skip
+        _add_galaxy(
+            galaxy.light,
+            galaxy.disk,
+            galaxy.across,
+            galaxy.blurred,
+            galaxy.block,
+            frame,
+            column,
+            row,
+            hole,
+            unread_rows,
+            unit,
+        )
+    )
 
 
-def reach(electrons: Float, shapes: Shapes, pixel_scale: float, noise: float, least: float) -> Float:
+def reach(electrons: Float, shapes: Shapes, pixel_scale: float, noise: float, min_radius: float) -> Float:
     """float64[n] arcsec as far as which galaxies are noticed, from `least` in steps of a tenth, at most FARTHEST.
 
     electrons   : float64[n] expected;  shapes : of the n galaxies
     pixel_scale : arcsec;  noise : of a pixel, electrons;  least : arcsec
     """
-    out, left = np.full(len(electrons), min(least, FARTHEST)), np.arange(len(electrons))
-    while len(left):
-        found = galaxy_shapes.surface(shapes.take(left), out[left[:1]])[:, 0] * pixel_scale**2 * electrons[left]
-        left = left[(found > _NOTICED * noise) & (out[left] < FARTHEST)]
-        out[left] = np.minimum(1.1 * out[left], FARTHEST)
+    out, remaining = np.full(len(electrons), min(min_radius, FARTHEST)), np.arange(len(electrons))
+    while len(remaining):
+        brightness = (
+            galaxy_shapes.surface_brightness(shapes.take(remaining), out[remaining[:1]])[:, 0]
+            * pixel_scale**2
+            * electrons[remaining]
+        )
+        remaining = remaining[(brightness > _NOTICED * noise) & (out[remaining] < FARTHEST)]
+        out[remaining] = np.minimum(1.1 * out[remaining], FARTHEST)
     return out
 
 
-def least_electrons(distance: float, pixel_scale: float, noise: float) -> float:
+def min_noticeable_electrons(distance: float, pixel_scale: float, noise: float) -> float:
     """Electrons of a galaxy that may be noticed at a distance, arcsec: no profile rises outward."""
     return float(_NOTICED * noise * np.pi * _THINNEST * (distance / pixel_scale) ** 2)
 
 
-def _beyond(light: Float, across: float, half: float) -> float:
+def _light_outside_square(light: Float, across: float, half: float) -> float:
     """Electrons outside a square of a half side about the middle, pixels.
 
     across : of Outskirts. Error : the disc is thin
@@ -277,17 +299,17 @@ def _beyond(light: Float, across: float, half: float) -> float:
     total = 0.0
     if light[BULGE] > 0.0:
         n, inverse = 0.5 / light[POWER], light[BULGE_FORM : BULGE_FORM + 4].reshape(2, 2)
-        edge = half / np.abs(sums.product(sums.inverse(inverse), ray)).max(axis=0)
-        whole = light[BULGE] * np.exp(_log_whole(n)) / abs(float(sums.determinant(inverse)))
-        total += whole * float(gammaincc(2 * n, edge ** (1.0 / n)).mean())
+        edge = half / np.abs(matrices.matmul(matrices.inverse(inverse), ray)).max(axis=0)
+        bulge_light = light[BULGE] * np.exp(_log_bulge_total(n)) / abs(float(matrices.determinant(inverse)))
+        total += bulge_light * float(gammaincc(2 * n, edge ** (1.0 / n)).mean())
     if light[DISK] > 0.0:
         inverse = light[DISK_FORM : DISK_FORM + 4].reshape(2, 2)
-        edge = half / np.abs(sums.product(sums.inverse(inverse), ray * [[1.0], [across]])).max(axis=0)
-        total += light[DISK] / abs(float(sums.determinant(inverse))) * float(((1.0 + edge) * np.exp(-edge)).mean())
+        edge = half / np.abs(matrices.matmul(matrices.inverse(inverse), ray * [[1.0], [across]])).max(axis=0)
+        total += light[DISK] / abs(float(matrices.determinant(inverse))) * float(((1.0 + edge) * np.exp(-edge)).mean())
     return total
 
 
-def _log_whole(n: float) -> float:
+def _log_bulge_total(n: float) -> float:
     """Log of all of a bulge's light over that in the middle, where exp(-(u^2 + v^2)^p), p = 1 / 2n."""
     return float(np.log(2 * np.pi * n) + gammaln(2 * n))
 
@@ -302,7 +324,7 @@ def _light(light: Float, disk: Float, across: float, x: float, y: float) -> Any:
         out += light[BULGE] * np.exp(-np.exp(light[POWER] * np.log(u * u + v * v + 1e-300)))
     if light[DISK] > 0.0:
         u = abs(light[DISK_FORM] * x + light[DISK_FORM + 1] * y)
-        if light[DISK] * np.exp(-u) > _NONE:
+        if light[DISK] * np.exp(-u) > _NEGLIGIBLE:
             v = abs(light[DISK_FORM + 2] * x + light[DISK_FORM + 3] * y) / across
             out += light[DISK] * _from_table(disk, np.log(u + np.sqrt(u * u + 1.0)), np.log(v + np.sqrt(v * v + 1.0)))
     return out
@@ -320,10 +342,10 @@ def _from_table(disk: Float, u: float, v: float) -> Any:
     total = 0.0
     for r in range(4):
         line = disk[i - 1 + r]
-        some = 0.0
+        row_sum = 0.0
         for c in range(4):
-            some += _cubic(b, c) * line[j - 1 + c]
-        total += _cubic(a, r) * some
+            row_sum += _cubic(b, c) * line[j - 1 + c]
+        total += _cubic(a, r) * row_sum
     return np.exp(total)
 
 
@@ -340,7 +362,7 @@ def _cubic(part: float, node: int) -> Any:
 
 
 @jit
-def _between(nodes: Float, x: float, y: float) -> Any:
+def _bilinear(nodes: Float, x: float, y: float) -> Any:
     """Linear between nodes a pixel of theirs apart; nothing beyond them."""
     i, j = int(np.floor(y)), int(np.floor(x))
     if i < 0 or j < 0 or i + 1 >= nodes.shape[0] or j + 1 >= nodes.shape[1]:
@@ -351,11 +373,11 @@ def _between(nodes: Float, x: float, y: float) -> Any:
 
 
 @jit
-def _seen(light: Float, disk: Float, across: float, blurred: Float, block: int, x: float, y: float) -> Any:
+def _pixel_light(light: Float, disk: Float, across: float, blurred: Float, block: int, x: float, y: float) -> Any:
     """Electrons in a pixel at (x, y) from a galaxy's middle."""
     middle = blurred.shape[0] // 2
-    more = _between(blurred, x / block + middle, y / block + middle)
-    return max(_light(light, disk, across, x, y) + more, 0.0)
+    blur_light = _bilinear(blurred, x / block + middle, y / block + middle)
+    return max(_light(light, disk, across, x, y) + blur_light, 0.0)
 
 
 @jit
@@ -367,34 +389,34 @@ def _sample(light: Float, disk: Float, across: float, x: float, y: float, step: 
 
 
 @jit
-def _take_in(light: Float, disk: Float, across: float, more: Float, x: float, y: float, stamp: Any) -> None:
+def _remove_aliased(light: Float, disk: Float, across: float, aliased: Float, x: float, y: float, stamp: Any) -> None:
     size = stamp.shape[0]
     for r in range(size):
         for c in range(size):
-            some = more[r, c]
+            excess = aliased[r, c]
             for up in (-size, 0, size):
                 for right in (-size, 0, size):
                     if up != 0 or right != 0:
-                        some += _light(light, disk, across, c - x - right, r - y - up)
-            stamp[r, c] -= some
+                        excess += _light(light, disk, across, c - x - right, r - y - up)
+            stamp[r, c] -= excess
 
 
 @jit
-def _add(
+def _add_galaxy(
     light: Float, disk: Float, across: float, blurred: Float, block: int, frame: Int, x: float, y: float,
-    hole: tuple[int, int, int], unread: tuple[int, int], unit: float,
+    hole: tuple[int, int, int], unread_rows: tuple[int, int], unit: float,
 ) -> Any:  # fmt: skip
     ny, nx = frame.shape
-    left, low, size = hole
+    hole_x, hole_y, size = hole
     total = np.int64(0)
     for r in range(ny):
-        inside = low <= r < low + size
-        read = not unread[0] <= r < unread[1]
+        inside = hole_y <= r < hole_y + size
+        read = not unread_rows[0] <= r < unread_rows[1]
         for c in range(nx):
-            if inside and left <= c < left + size:
+            if inside and hole_x <= c < hole_x + size:
                 continue
-            some = np.int64(np.rint(_seen(light, disk, across, blurred, block, c - x, r - y) * unit))
-            frame[r, c] += some
+            units = np.int64(np.rint(_pixel_light(light, disk, across, blurred, block, c - x, r - y) * unit))
+            frame[r, c] += units
             if read:
-                total += some
+                total += units
     return total

@@ -19,7 +19,9 @@ from truesky.render.sources.source_list import Sources
 _POINT = 1e-6
 
 
-def reference(sources: Sources, i: int, psf: Psf, size: int, folding: float = 1e-4, highest: float = 1e-4) -> Float:
+def draw_reference(
+    sources: Sources, i: int, psf: Psf, size: int, folding: float = 1e-4, highest: float = 1e-4
+) -> Float:
     """Source i by galsim.Convolve and drawImage, tight thresholds: slow, with none of `draw`'s transforms.
 
     folding, highest : galsim's folding_threshold and maxk_threshold; what is cut at 1e-4 shows as 3e-3 of the noise in
@@ -38,11 +40,11 @@ def reference(sources: Sources, i: int, psf: Psf, size: int, folding: float = 1e
         profile = _profile(sources, i)
         # World frame, arcsec -> pixels, the flux kept.
         parts.append(galsim.JacobianWCS(*sources.jacobian[i].ravel()).toImage(profile))
-    whole = galsim.Convolve(parts, gsparams=settings) * float(sources.electrons[i])
+    convolved = galsim.Convolve(parts, gsparams=settings) * float(sources.electrons[i])
     x0, y0 = (int(np.rint(position[i])) - size // 2 for position in (sources.column, sources.row))
     centre = galsim.PositionD(sources.column[i] - x0, sources.row[i] - y0)
     image = galsim.ImageD(galsim.BoundsI(0, size - 1, 0, size - 1), scale=1.0)
-    whole.drawImage(image, center=centre, method="no_pixel")
+    convolved.drawImage(image, center=centre, method="no_pixel")
     return np.asarray(image.array)
 
 
@@ -50,17 +52,17 @@ def _profile(sources: Sources, i: int) -> galsim.GSObject:
     """Of flux 1, world frame, arcsec; the structure of a disc as if it were thin."""
     picture = sources.picture_of(i)
     if sources.shape[i] < 0 and picture is not None:
-        return _of(picture, picture.image)
-    shape, which = sources.shapes, int(sources.shape[i])
-    smooth = galaxy_shapes.profile(shape, which, _POINT)
+        return _galsim_image(picture, picture.image)
+    shape, galaxy = sources.shapes, int(sources.shape[i])
+    smooth = galaxy_shapes.profile(shape, galaxy, _POINT)
     if picture is None:
         return smooth
     # galsim has no image of flux 0: what is added, and what is taken.
-    more, less = (_of(picture, np.maximum(sign * picture.image, 0.0)) for sign in (1.0, -1.0))
-    return smooth + (more - less) * (1.0 - float(shape.bulge_fraction[which]))
+    positive, negative = (_galsim_image(picture, np.maximum(sign * picture.image, 0.0)) for sign in (1.0, -1.0))
+    return smooth + (positive - negative) * (1.0 - float(shape.bulge_fraction[galaxy]))
 
 
-def _of(picture: Picture, pixels: Float32) -> galsim.GSObject:
+def _galsim_image(picture: Picture, pixels: Float32) -> galsim.GSObject:
     """Some pixels of a picture as galsim interpolates them, world frame (u to the west), of the flux that they have."""
     image = galsim.Image(np.ascontiguousarray(pixels, float), scale=1.0)
     # Padded more than by default: the transform is as good as the reference should be.

@@ -27,22 +27,22 @@ class Settings:
     edge: float
     aliased: float
     floor: float
-    least: float
+    min_size_arcsec: float
     positions: int
     colours: int = 8
 
 
-def settings_for(wanted: Accuracy) -> Settings:
+def settings_for(requested: Accuracy) -> Settings:
     """The cheapest settings whose measured errors are within an accuracy; BadInput where none are."""
-    return of_row(accuracy.row_for(wanted))
+    return from_row(accuracy.fastest_row(requested))
 
 
-def of_row(row: Mapping[str, float]) -> Settings:
+def from_row(row: Mapping[str, float]) -> Settings:
     """Settings of a row of the measured table."""
-    whole = {name: int(row[name]) for name in ("positions", "colours")}
-    return Settings(row["edge"], row["aliased"], row["floor"], row["least"], **whole)
+    integers = {name: int(row[name]) for name in ("positions", "colours")}
+    return Settings(row["edge"], row["aliased"], row["floor"], row["least"], **integers)
 
 
-def seconds_for(wanted: Accuracy) -> float:
+def seconds_for(requested: Accuracy) -> float:
     """CPU s of the sources of a VIS detector, measured with these settings."""
-    return accuracy.row_for(wanted)["seconds"]
+    return accuracy.fastest_row(requested)["seconds"]

@@ -77,7 +77,7 @@ def stamp_sizes(
     psf: Psf,
     noise: float,
     settings: Settings,
-    wider: Float | None = None,
+    extra_pixels: Float | None = None,
 ) -> Int:
     """Side of each source's stamp, pixels: int64[n], one of SIZES.
 
@@ -88,43 +88,43 @@ def stamp_sizes(
     psf       : of the detector;  settings : of the accuracy
     """
     # The PSF's wings beyond a stamp are those of a point: the larger a galaxy, the farther out that may begin.
-    least = np.full(len(shape), float(settings.least))
+    min_size = np.full(len(shape), float(settings.min_size_arcsec))
     body = shape >= 0
-    least[body] += _EXTENT * galaxy_shapes.half_light(shapes)[shape[body]]
+    min_size[body] += _EXTENT * galaxy_shapes.half_light(shapes)[shape[body]]
     # Of a galaxy the PSF's spikes, as wide as its core, are smeared over its width.
     smeared, core = np.ones(len(shape)), psf.fwhm / psf.pixel_scale
     smeared[body] = core / (core + 2.0 * galaxy_shapes.half_light(shapes)[shape[body]] / psf.pixel_scale)
     aperture = np.pi * (_APERTURE / psf.pixel_scale) ** 2
-    found, left = np.full(len(shape), SIZES[-1]), np.arange(len(shape))
+    allowed_sizes, remaining = np.full(len(shape), SIZES[-1]), np.arange(len(shape))
     for size in SIZES[:-1]:
-        psf_light = _beyond_the_table(psf, psf.surface, np.array([size // 2, size]))
-        (rim,) = _beyond_the_table(psf, psf.rim, np.array([size // 2]))
-        psf_edge = psf_light[0] + smeared[left] * (rim - psf_light[0])
-        light, body = np.zeros((len(left), 3)), shape[left] >= 0
+        psf_light = _extrapolate_profile(psf, psf.surface, np.array([size // 2, size]))
+        (rim,) = _extrapolate_profile(psf, psf.rim, np.array([size // 2]))
+        psf_edge = psf_light[0] + smeared[remaining] * (rim - psf_light[0])
+        light, body = np.zeros((len(remaining), 3)), shape[remaining] >= 0
         if body.any():
             at = np.array([size // 2, size, _SLOPE_RATIO * size]) * psf.pixel_scale
-            light[body] = galaxy_shapes.surface(shapes.take(shape[left[body]]), at) * psf.pixel_scale**2
-        edge, near, far = light.T
-        steepness = np.log(np.maximum(near, 1e-300) / np.maximum(far, 1e-300))
+            light[body] = galaxy_shapes.surface_brightness(shapes.take(shape[remaining[body]]), at) * psf.pixel_scale**2
+        edge, one_side_away, farther_away = light.T
+        steepness = np.log(np.maximum(one_side_away, 1e-300) / np.maximum(farther_away, 1e-300))
         # What shear makes of the light that wraps goes with how steeply it falls.
         steeper = np.maximum(steepness / (_RESPONSE * np.log(_SLOPE_RATIO)), 1.0)
         # A PSF in planes is cut to the stamp and does not wrap.
         wings = _LATTICE_PSF * psf_light[1] * (psf.planes is None)
-        wrapped = (wings + _LATTICE_GALAXY * steeper * near) * aperture
-        enough = (electrons[left] * (psf_edge + edge) < settings.edge * noise) & (wrapped < settings.aliased)
-        enough &= size * psf.pixel_scale >= least[left]
+        wrapped = (wings + _LATTICE_GALAXY * steeper * one_side_away) * aperture
+        enough = (electrons[remaining] * (psf_edge + edge) < settings.edge * noise) & (wrapped < settings.aliased)
+        enough &= size * psf.pixel_scale >= min_size[remaining]
         # A point has no light beyond the PSF's planes.
         enough |= ~body & (psf.planes is not None) & (size >= psf.side)
-        found[left[enough]] = size
-        left = left[~enough]
-    if wider is None:
-        return np.asarray(found)
-    return np.asarray(SIZES[np.minimum(np.searchsorted(SIZES, found + wider), len(SIZES) - 1)])
+        allowed_sizes[remaining[enough]] = size
+        remaining = remaining[~enough]
+    if extra_pixels is None:
+        return np.asarray(allowed_sizes)
+    return np.asarray(SIZES[np.minimum(np.searchsorted(SIZES, allowed_sizes + extra_pixels), len(SIZES) - 1)])
 
 
-def holding(sizes: Int, wanted: Float) -> Int:
+def smallest_allowed_sizes(sizes: Int, min_sides: Float) -> Int:
     """Sides [n], one of SIZES, that are no smaller; wanted : [n] pixels that they hold besides, as far as any does."""
-    return np.asarray(SIZES[np.minimum(np.searchsorted(SIZES, np.maximum(sizes, wanted)), len(SIZES) - 1)])
+    return np.asarray(SIZES[np.minimum(np.searchsorted(SIZES, np.maximum(sizes, min_sides)), len(SIZES) - 1)])
 
 
 def reach(pixel_scale: float) -> float:
@@ -132,7 +132,7 @@ def reach(pixel_scale: float) -> float:
     return _FARTHEST * pixel_scale
 
 
-def least_electrons(distance: float, pixel_scale: float, noise: float, settings: Settings) -> float:
+def min_noticeable_electrons(distance: float, pixel_scale: float, noise: float, settings: Settings) -> float:
     """Electrons of which a source must have more to show at a distance, arcsec, from its middle.
 
     No profile rises outward: at its edge an ellipse is no brighter than all of the light spread over it.
@@ -143,7 +143,7 @@ def least_electrons(distance: float, pixel_scale: float, noise: float, settings:
     return float(settings.edge * noise * pixels)
 
 
-def _beyond_the_table(psf: Psf, light: Float, radius: Int) -> Float:
+def _extrapolate_profile(psf: Psf, light: Float, radius: Int) -> Float:
     """psf.surface or psf.rim at any radius, pixels: wings of r^-3 beyond the table, nothing beyond planes."""
     last = len(light) - 1
     wing = light[np.minimum(radius, last)] * (np.minimum(radius, last) / radius) ** 3
@@ -174,20 +174,24 @@ def touching_frame(sources: Sources, sizes: Int, psf: Psf, noise: float, nx: int
     column, row, electrons, shape, shapes = (
         sources.column, sources.row, sources.electrons, sources.shape, sources.shapes,
     )  # fmt: skip
-    wide = reaches(electrons, sizes, shape, sources.picture, psf, noise)
+    visible_sides_of_sources = visible_sides(electrons, sizes, shape, sources.picture, psf, noise)
     largest = on_largest(shape, sizes)
     farthest = outskirts.reach(
         electrons[largest], shapes.take(shape[largest]), psf.pixel_scale, noise, 0.5 * SIZES[-1] * psf.pixel_scale
     )
-    wide[largest] = np.ceil(2.0 * farthest / psf.pixel_scale).astype(np.int64)
-    here = selection.touching(column, row, wide, nx, ny)
+    visible_sides_of_sources[largest] = np.ceil(2.0 * farthest / psf.pixel_scale).astype(np.int64)
+    on_frame = selection.overlaps_frame(column, row, visible_sides_of_sources, nx, ny)
     # What else of a galaxy may be seen there is looked at closer.
-    most = 2.0 * np.minimum(_STEPS[-1] * sizes / 2, _FARTHEST)
-    more = np.flatnonzero(~here & (shape >= 0) & ~largest)
-    more = more[selection.touching(column[more], row[more], wings.around(most[more]), nx, ny)]
-    beyond, _ = beyond_stamps(shapes.take(shape[more]), sizes[more], psf.pixel_scale)
-    here[more] = (beyond > 0) & selection.touching(column[more], row[more], wings.around(2.0 * beyond), nx, ny)
-    return here
+    max_sides = 2.0 * np.minimum(_STEPS[-1] * sizes / 2, _FARTHEST)
+    candidates = np.flatnonzero(~on_frame & (shape >= 0) & ~largest)
+    candidates = candidates[
+        selection.overlaps_frame(column[candidates], row[candidates], wings.region_side(max_sides[candidates]), nx, ny)
+    ]
+    light_reach, _ = light_beyond_stamps(shapes.take(shape[candidates]), sizes[candidates], psf.pixel_scale)
+    on_frame[candidates] = (light_reach > 0) & selection.overlaps_frame(
+        column[candidates], row[candidates], wings.region_side(2.0 * light_reach), nx, ny
+    )
+    return on_frame
 
 
 def has_far_light(electrons: Float, sizes: Int, shape: Int, picture: Int | None, psf: Psf) -> Bool:
@@ -200,7 +204,7 @@ def has_far_light(electrons: Float, sizes: Int, shape: Int, picture: Int | None,
     return np.asarray(point & (sizes >= psf.side) & (electrons > BRIGHT) & (psf.edges is not None))
 
 
-def reaches(
+def visible_sides(
     electrons: Float,
     sizes: Int,
     shape: Int,
@@ -220,10 +224,10 @@ def reaches(
     length = np.zeros(len(sizes)) if length is None else length
     pieces = piece_count(length)
     sides = np.maximum(sizes, 0.0 if psf.planes is None else 2.0 * wings.MARGIN * wings.BLOCK)
-    far = has_far_light(electrons / pieces, sizes, shape, picture, psf)
-    if psf.edges is not None and far.any():
-        spikes = psf_spikes.reach(psf.edges, electrons[far], NOTICEABLE * noise)
-        sides[far] = 2.0 * np.maximum(spikes, reach(1.0))
+    with_far_light = has_far_light(electrons / pieces, sizes, shape, picture, psf)
+    if psf.edges is not None and with_far_light.any():
+        spikes = psf_spikes.reach(psf.edges, electrons[with_far_light], NOTICEABLE * noise)
+        sides[with_far_light] = 2.0 * np.maximum(spikes, reach(1.0))
     return np.ceil(sides + length).astype(np.int64)
 
 
@@ -232,16 +236,18 @@ def on_largest(shape: Int, sizes: Int) -> Bool:
     return np.asarray((shape >= 0) & (sizes >= SIZES[-1]))
 
 
-def beyond_stamps(shapes: Shapes, sizes: Int, pixel_scale: float) -> tuple[Float, Float]:
+def light_beyond_stamps(shapes: Shapes, sizes: Int, pixel_scale: float) -> tuple[Float, Float]:
     """Of galaxies [n], (how far their light is drawn, pixels, 0 where none is beyond its stamp; the part of it there).
 
     Until no more than _LOST of the light lies farther out.
     """
     half = sizes / 2
-    leaves = galaxy_shapes.outside(shapes, half * pixel_scale)
-    far, left = np.full(len(half), _STEPS[0]), np.flatnonzero(leaves > _LOST)
-    for step, next_one in pairwise(_STEPS):
-        left = left[galaxy_shapes.outside(shapes.take(left), half[left] * step * pixel_scale) > _LOST]
-        far[left] = next_one
-    far = np.maximum(np.minimum(half * far, _FARTHEST), _STEPS[0] * half)
-    return np.where(leaves > _OUTSIDE, far, 0.0), leaves
+    outside_fraction = galaxy_shapes.flux_outside(shapes, half * pixel_scale)
+    light_reach, remaining = np.full(len(half), _STEPS[0]), np.flatnonzero(outside_fraction > _LOST)
+    for step, next_step in pairwise(_STEPS):
+        remaining = remaining[
+            galaxy_shapes.flux_outside(shapes.take(remaining), half[remaining] * step * pixel_scale) > _LOST
+        ]
+        light_reach[remaining] = next_step
+    light_reach = np.maximum(np.minimum(half * light_reach, _FARTHEST), _STEPS[0] * half)
+    return np.where(outside_fraction > _OUTSIDE, light_reach, 0.0), outside_fraction

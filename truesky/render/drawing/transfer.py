@@ -23,21 +23,21 @@ import scipy.fft
 from scipy.ndimage import maximum
 
 from lake_schema.arrays import Array, Float, Float32, Int
-from truesky.numerics import sums
+from truesky.numerics import matrices
 from truesky.render.drawing import far_light
 from truesky.render.drawing.kernels import fourier
 from truesky.render.effects.light import intra_pixel
-from truesky.render.psf.model import SIDE, Planes, Psf, galsim_profile, spectrum_of
+from truesky.render.psf.model import SIDE, Planes, Psf, galsim_profile, profile_spectrum
 
 # radian / pixel between the samples of `passing`: those of a stamp of 32 pixels.
 STEP = 2 * np.pi / 32
 # What passes less than this in single precision passes nothing; in double precision that is less than this.
-NOTHING, LEAST = 1e-7, 1e-14
+NEGLIGIBLE, NEGLIGIBLE_DOUBLE = 1e-7, 1e-14
 # Frequencies beyond this are not looked at through a PSF without planes, which has no last frequency: two and a half
 # times the Nyquist frequency; of bright sources four times.
 HIGHEST, _HIGHEST_BRIGHT = 2.5 * np.pi, 4.0 * np.pi
 # Samples that the kernel takes together: their planes stay in the cache.
-_TOGETHER = 1024
+_PIECE_SAMPLES = 1024
 # A PSF, pixel included, of fewer pixels FWHM passes so much beyond half a cycle a pixel that what is left out there
 # folds onto the frequencies that sizes and shapes are measured at; and the part that may still be left out. Chosen on
 # 144 sources through NISP's PSF in Y and H: their R2 is then wrong by 1.2e-4 at the most, their ellipticity by 3.7e-5
@@ -65,7 +65,7 @@ def basis_weights(psf: Psf, photons: Float | None, column: Float, row: Float) ->
     # Beyond the border the polynomial is held.
     x = np.clip((column - planes.half[0]) / (planes.half[0] + 0.5), -1.0, 1.0)
     y = np.clip((row - planes.half[1]) / (planes.half[1] + 0.5), -1.0, 1.0)
-    redder = sums.product(photons, waves) - waves.mean()
+    redder = matrices.matmul(photons, waves) - waves.mean()
     drift = [x**i * y**j * redder**colour for i, j, colour in planes.powers]
     return np.column_stack([photons, *drift])
 
@@ -102,11 +102,11 @@ class Transfer:
 
 def grid(size: int, reach: float) -> Grid:
     """Samples of a stamp of `size` pixels at |k| <= reach, radian / pixel."""
-    return _kept(size, reach) if size <= SIDE else _grid(size, reach)
+    return _cached_grid(size, reach) if size <= SIDE else _grid(size, reach)
 
 
 @lru_cache(maxsize=32)
-def _kept(size: int, reach: float) -> Grid:
+def _cached_grid(size: int, reach: float) -> Grid:
     return _grid(size, reach)
 
 
@@ -120,7 +120,7 @@ def _grid(size: int, reach: float) -> Grid:
     first, ix, iy, shell = runs.T
     # A piece is full after so many samples, or at the end of its shell.
     start = first[np.searchsorted(shell, shell)]
-    part = (first - start) // _TOGETHER + shell * (samples // _TOGETHER + 1)
+    part = (first - start) // _PIECE_SAMPLES + shell * (samples // _PIECE_SAMPLES + 1)
     pieces = np.concatenate([[0], np.flatnonzero(np.diff(part)) + 1]).astype(np.int64)
     length = np.diff(first)
     along = np.arange(samples) - np.repeat(first[:-1] - ix[:-1], length)
@@ -134,13 +134,13 @@ def plane_count(psf: Psf) -> int:
     return 1 if psf.planes is None else len(psf.planes.images) + len(psf.planes.drift)
 
 
-def passing(psf: Psf, least: float = NOTHING) -> Float:
+def max_transfer(psf: Psf, min_value: float = NEGLIGIBLE) -> Float:
     """float64[m]: the largest modulus of PSF times pixel at k = i STEP radian / pixel; less than `least` beyond.
 
     least : below NOTHING of a PSF without planes, for what is drawn in double precision
     """
-    bright = least < NOTHING
-    probe = grid(_PROBE, _HIGHEST_BRIGHT if bright else psf.planes.highest if psf.planes else HIGHEST)
+    bright = min_value < NEGLIGIBLE
+    probe = grid(_PROBE, _HIGHEST_BRIGHT if bright else psf.planes.max_frequency if psf.planes else HIGHEST)
     if psf.planes is None:
         planes = _planes(psf, probe, np.float64 if bright else np.float32)
     else:
@@ -152,36 +152,36 @@ def passing(psf: Psf, least: float = NOTHING) -> Float:
     modulus = np.hypot(planes[:, 0], planes[:, 1]).max(axis=0)
     ring = (np.hypot(probe.kx, probe.ky) / STEP).astype(int)
     rings = np.asarray(maximum(modulus, ring, np.arange(ring.max() + 1)), float)
-    something = np.flatnonzero(rings > least)
-    return rings[: something[-1] + 1]
+    above_minimum = np.flatnonzero(rings > min_value)
+    return rings[: above_minimum[-1] + 1]
 
 
-def folding(psf: Psf) -> float:
+def neglect_factor(psf: Psf) -> float:
     """Of the Fourier samples that may be left out of a source, the part that may be through this PSF."""
     return _FOLDING if psf.fwhm < _COARSE * psf.pixel_scale else 1.0
 
 
 def transfer(psf: Psf, size: int, reach: float) -> Transfer:
     """All planes of a PSF for stamps of `size` pixels, single precision, up to |k| = reach."""
-    some = grid(size, reach)
-    return Transfer(some, _planes(psf, some, np.float32))
+    stamp_grid = grid(size, reach)
+    return Transfer(stamp_grid, _planes(psf, stamp_grid, np.float32))
 
 
-def collapsed(psf: Psf, weights: Float, some: Grid, dtype: type[Any], fading: bool = False) -> Transfer:
+def source_transfer(psf: Psf, weights: Float, stamp_grid: Grid, dtype: type[Any], fading: bool = False) -> Transfer:
     """One plane: a source's own PSF, for large stamps or in double precision (float64).
 
     weights : [planes] from basis_weights;  fading : towards its border, into what far_light.py draws
     psf     : of the detector;  some : the stamp's Fourier grid;  dtype : of the plane
     """
     if psf.planes is None:
-        return Transfer(some, _planes(psf, some, dtype))
+        return Transfer(stamp_grid, _planes(psf, stamp_grid, dtype))
     samples = psf.planes.samples
-    image = _image(psf.planes, weights, samples * some.size).astype(dtype)
+    image = _sum_planes(psf.planes, weights, samples * stamp_grid.size).astype(dtype)
     if fading:
         # A stamp may be wider than the plane, for a trail.
-        left = far_light.left(psf.side, samples, len(image))
-        image *= left[:, None] * left
-    return Transfer(some, _on_grid([image], samples, some, psf.intra_pixel, dtype))
+        window = far_light.fading_window(psf.side, samples, len(image))
+        image *= window[:, None] * window
+    return Transfer(stamp_grid, _on_grid([image], samples, stamp_grid, psf.intra_pixel, dtype))
 
 
 def profile_of(psf: Psf, weights: Float) -> Any:
@@ -193,42 +193,42 @@ def profile_of(psf: Psf, weights: Float) -> Any:
 
 def image_of(planes: Planes, weights: Float) -> Float32:
     """A source's own PSF in the planes' samples."""
-    return _image(planes, weights, planes.images.shape[1])
+    return _sum_planes(planes, weights, planes.images.shape[1])
 
 
-def _planes(psf: Psf, some: Grid, dtype: type[Any]) -> Array:
+def _planes(psf: Psf, stamp_grid: Grid, dtype: type[Any]) -> Array:
     if psf.planes is None:
-        step = 2 * np.pi / some.size
-        reach = int(np.rint(max(some.kx.max(), -some.kx.min(), some.ky.max()) / step))
-        out = np.empty((1, 2, len(some.kx)), dtype)
-        spectrum = spectrum_of(psf, some.size, reach)
-        _move_out(spectrum, psf, some.size)
-        fourier.take(spectrum, some.runs, _pixel(some, psf.intra_pixel), out[0])
+        step = 2 * np.pi / stamp_grid.size
+        reach = int(np.rint(max(stamp_grid.kx.max(), -stamp_grid.kx.min(), stamp_grid.ky.max()) / step))
+        out = np.empty((1, 2, len(stamp_grid.kx)), dtype)
+        spectrum = profile_spectrum(psf, stamp_grid.size, reach)
+        _move_wings_to_edges(spectrum, psf, stamp_grid.size)
+        fourier.take_samples(spectrum, stamp_grid.runs, _pixel(stamp_grid, psf.intra_pixel), out[0])
         return out
     images = [*psf.planes.images, *psf.planes.drift]
-    return _on_grid(images, psf.planes.samples, some, psf.intra_pixel, dtype)
+    return _on_grid(images, psf.planes.samples, stamp_grid, psf.intra_pixel, dtype)
 
 
-def _move_out(spectrum: Array, psf: Psf, size: int) -> None:
+def _move_wings_to_edges(spectrum: Array, psf: Psf, size: int) -> None:
     """The wings that come into a stamp at its edges leave its middle for its edges: no light is lost.
 
     Harmonics of the stamp, one (cos u + cos v) + both cos u cos v, are added that cancel them in the middle to second
     order in u, v = 2 pi x / size, 2 pi y / size.
     spectrum : of spectrum_of
     """
-    near, across = size / 8.0, size / 8.0 / np.sqrt(2.0)
-    middle = _images(psf, size, 0.0, 0.0)
-    off = 0.5 * (_images(psf, size, near, 0.0) + _images(psf, size, across, across))
+    axis_distance, diagonal_step = size / 8.0, size / 8.0 / np.sqrt(2.0)
+    middle = _image_light(psf, size, 0.0, 0.0)
+    off = 0.5 * (_image_light(psf, size, axis_distance, 0.0) + _image_light(psf, size, diagonal_step, diagonal_step))
     # The images' light is middle + slope (u^2 + v^2).
     slope = (off - middle) / (2 * np.pi / 8.0) ** 2
-    one, both = -middle - 2.0 * slope, middle + 4.0 * slope
+    axis_amplitude, product_amplitude = -middle - 2.0 * slope, middle + 4.0 * slope
     for iy in (-1, 0, 1):
         for ix in (0, 1):
             if ix or iy:
-                spectrum[iy, ix] += size**2 * (both / 4.0 if ix and iy else one / 2.0)
+                spectrum[iy, ix] += size**2 * (product_amplitude / 4.0 if ix and iy else axis_amplitude / 2.0)
 
 
-def _images(psf: Psf, size: int, x: float, y: float) -> float:
+def _image_light(psf: Psf, size: int, x: float, y: float) -> float:
     """Of a star's light, that of its images in the stamps about, two deep, in a pixel at (x, y) from its middle."""
     steps = [n * size for n in range(-2, 3)]
     places = [(x - c, y - r) for r in steps for c in steps if r or c]
@@ -236,25 +236,27 @@ def _images(psf: Psf, size: int, x: float, y: float) -> float:
     return float(np.sum(light)) * psf.pixel_scale**2
 
 
-def _on_grid(images: list[Array], samples: int, some: Grid, strength: float | None, dtype: type[Any]) -> Array:
-    out = np.empty((len(images), 2, len(some.kx)), dtype)
-    columns = int(np.rint(np.abs(some.kx).max() * some.size / (2 * np.pi))) + 1
-    pixel = _pixel(some, strength)
+def _on_grid(images: list[Array], samples: int, stamp_grid: Grid, strength: float | None, dtype: type[Any]) -> Array:
+    out = np.empty((len(images), 2, len(stamp_grid.kx)), dtype)
+    columns = int(np.rint(np.abs(stamp_grid.kx).max() * stamp_grid.size / (2 * np.pi))) + 1
+    pixel = _pixel(stamp_grid, strength)
     for image, plane in zip(images, out, strict=True):
-        fourier.take(spectrum(image, samples * some.size, columns), some.runs, pixel, plane)
+        fourier.take_samples(spectrum(image, samples * stamp_grid.size, columns), stamp_grid.runs, pixel, plane)
     return out
 
 
-def _pixel(some: Grid, strength: float | None) -> Float:
+def _pixel(stamp_grid: Grid, strength: float | None) -> Float:
     """The pixel's transfer function at |iy|, |ix|; strength : of its response, 0 = even all over, None = 1."""
-    step = 2 * np.pi / some.size
-    columns, rows = (np.arange(round(float(np.abs(k).max(initial=0.0)) / step) + 1) for k in (some.kx, some.ky))
+    step = 2 * np.pi / stamp_grid.size
+    columns, rows = (
+        np.arange(round(float(np.abs(k).max(initial=0.0)) / step) + 1) for k in (stamp_grid.kx, stamp_grid.ky)
+    )
     if strength is None:
         return np.ones((len(rows), len(columns)))
-    return intra_pixel.apply(columns / some.size, rows[:, None] / some.size, strength)
+    return intra_pixel.apply(columns / stamp_grid.size, rows[:, None] / stamp_grid.size, strength)
 
 
-def _image(planes: Planes, weights: Float, side: int) -> Float32:
+def _sum_planes(planes: Planes, weights: Float, side: int) -> Float32:
     """The planes' sum, cut to `side` samples or one more."""
     images, drift = _middle(planes.images, side), _middle(planes.drift, side)
     image = np.zeros(images.shape[1:], np.float32)

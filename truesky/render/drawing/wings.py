@@ -38,11 +38,13 @@ def wings(
     out = _layer(nx, ny)
     if psf.planes is None:
         return out / unit
-    cells = _cells(psf.planes.images.mean(axis=0), psf.planes.samples)
+    cells = _half_block_sums(psf.planes.images.mean(axis=0), psf.planes.samples)
     x, y = ((at - (BLOCK - 1) / 2) / BLOCK + MARGIN for at in (column, row))
     for size in np.unique(sizes[sizes < psf.side]):
-        some = sizes == size
-        frame.smooth(out, _beyond(cells, int(size)) / BLOCK**2, x[some], y[some], electrons[some], unit)
+        selected = sizes == size
+        frame.add_smoothed(
+            out, _light_outside_square(cells, int(size)) / BLOCK**2, x[selected], y[selected], electrons[selected], unit
+        )
     return out / unit
 
 
@@ -50,7 +52,7 @@ def _layer(nx: int, ny: int) -> Int:
     return np.zeros((-(-ny // BLOCK) + 2 * MARGIN, -(-nx // BLOCK) + 2 * MARGIN), np.int64)
 
 
-class Outside(NamedTuple):
+class OutsideLight(NamedTuple):
     """Light of galaxies [n] outside their stamps.
 
     profile : float64[n, 11] galaxy_shapes.on_the_sky;  electrons : [n] that leave the stamp;  reach : [n] pixels
@@ -61,7 +63,7 @@ class Outside(NamedTuple):
     reach: Float
 
 
-def galaxies(column: Float, row: Float, outside: Outside, sizes: Int, nx: int, ny: int, unit: float) -> Float:
+def galaxies(column: Float, row: Float, outside: OutsideLight, sizes: Int, nx: int, ny: int, unit: float) -> Float:
     """Electrons a pixel of galaxies [n] outside stamps of `sizes`, on the blocks of `wings`.
 
     column, row : float64[n] pixels;  outside : what is taken off their stamps
@@ -71,27 +73,29 @@ def galaxies(column: Float, row: Float, outside: Outside, sizes: Int, nx: int, n
               a block has whole units a pixel: of the faintest little is seen
     """
     out = _layer(nx, ny)
-    some = (outside.electrons > 0) & selection.touching(column, row, around(2.0 * outside.reach), nx, ny)
-    profile, electrons, reach = (part[some] for part in outside)
-    frame.spill(out, BLOCK, MARGIN, sizes[some], reach, column[some], row[some], profile, electrons, unit)
+    selected = (outside.electrons > 0) & selection.overlaps_frame(column, row, region_side(2.0 * outside.reach), nx, ny)
+    profile, electrons, reach = (part[selected] for part in outside)
+    frame.add_spilled(
+        out, BLOCK, MARGIN, sizes[selected], reach, column[selected], row[selected], profile, electrons, unit
+    )
     return out / unit
 
 
-def around(sides: Float) -> Float:
+def region_side(sides: Float) -> Float:
     """Sides of the squares, pixels, that light shows in that is drawn on blocks in squares of such sides."""
     return sides + 2.0 * _WIDER
 
 
-def _cells(plane: Float32, samples: int) -> Float:
+def _half_block_sums(plane: Float32, samples: int) -> Float:
     """A plane, `samples` a pixel, summed on squares of half a block, an even number of them about its middle."""
     middle, step = len(plane) // 2, samples * BLOCK // 2
     count = (middle // step - 1) // 2 * 2 + 1
-    kept = slice(middle - count * step, middle + count * step)
-    whole = plane[kept, kept].reshape(2 * count, step, 2 * count, step)
-    return np.asarray(whole.sum(axis=(1, 3), dtype=float))
+    central = slice(middle - count * step, middle + count * step)
+    squares = plane[central, central].reshape(2 * count, step, 2 * count, step)
+    return np.asarray(squares.sum(axis=(1, 3), dtype=float))
 
 
-def _beyond(cells: Float, size: int) -> Float:
+def _light_outside_square(cells: Float, size: int) -> Float:
     """What lies outside a square of `size` pixels, on blocks about the middle one, and a border of nothing."""
     middle, half = len(cells) // 2, min(size // BLOCK, len(cells) // 2)
     hollow = cells.copy()

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lake_schema.errors import BadInput
-from truesky.render.effects.scene import NOTICEABLE, STACK, Frame, Scene
+from truesky.render.effects.scene import NOTICEABLE, STACK_SIZE, Frame, Scene
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,48 +35,50 @@ class Effect:
     optional: bool = True
     fixed: bool = False
     shared: bool = False
-    numbers: str = ""
+    random_stream: str = ""
     cost: float = 0.0
-    repeated: Callable[[Scene], float] | None = None
+    systematic: Callable[[Scene], float] | None = None
 
     def margin(self, scene: Scene) -> float:
         """Contribution over what would be noticed, in a pixel or in a mean: above 1 the effect is needed."""
         change = float(self.contribution(scene))
-        repeated = change if self.repeated is None else float(self.repeated(scene))
-        change = max(change, math.sqrt(STACK) * repeated)
+        systematic = change if self.systematic is None else float(self.systematic(scene))
+        change = max(change, math.sqrt(STACK_SIZE) * systematic)
         noise = NOTICEABLE * scene.pixel_noise
         # Without any noise everything is noticed.
         return change / noise if noise > 0.0 else math.inf if change > 0.0 else 0.0
 
-    def needed_if(self, scene: Scene) -> bool:
+    def is_needed(self, scene: Scene) -> bool:
         """Whether the scene needs it, or no frame can do without it, whatever a request forces."""
         return not self.optional or self.margin(scene) > 1.0
 
-    def applied(self, scene: Scene) -> bool:
+    def is_applied(self, scene: Scene) -> bool:
         """Whether it is applied to the scene: as its request forces it, else as the scene needs it."""
-        return scene.forced.get(self.name, self.needed_if(scene))
+        return scene.forced.get(self.name, self.is_needed(scene))
 
 
-def nothing(scene: Scene) -> float:
+def zero_contribution(scene: Scene) -> float:
     """Of a contribution what a mean keeps, where it is noise."""
     return 0.0
 
 
-def by_pixel(kernel: Callable[..., None], frame: Frame, *numbers: Any) -> Frame:
+def map_pixels(kernel: Callable[..., None], frame: Frame, *arguments: Any) -> Frame:
     """A new frame of the same shape, in which a compiled kernel(before [n], after [n], *numbers) has set each pixel.
 
     numbers : each for the frame, or [q] for its q amplifiers, which are then set one by one: frame [q, ..]
     """
     out = np.empty(frame.shape)
-    before, after = np.ascontiguousarray(frame, dtype=float).reshape(-1), out.reshape(-1)
-    parts = max(np.size(number) for number in numbers)
-    if parts == 1:
-        kernel(before, after, *numbers)
+    pixels, out_pixels = np.ascontiguousarray(frame, dtype=float).reshape(-1), out.reshape(-1)
+    n_amplifiers = max(np.size(number) for number in arguments)
+    if n_amplifiers == 1:
+        kernel(pixels, out_pixels, *arguments)
         return out
-    if frame.shape[0] != parts:
-        raise BadInput(f"numbers of {parts} amplifiers for a frame of {frame.shape[0]}")
-    for number, (one, other) in enumerate(zip(np.split(before, parts), np.split(after, parts), strict=True)):
-        kernel(one, other, *(n[number] if np.ndim(n) else n for n in numbers))
+    if frame.shape[0] != n_amplifiers:
+        raise BadInput(f"numbers of {n_amplifiers} amplifiers for a frame of {frame.shape[0]}")
+    for number, (amplifier_pixels, amplifier_out) in enumerate(
+        zip(np.split(pixels, n_amplifiers), np.split(out_pixels, n_amplifiers), strict=True)
+    ):
+        kernel(amplifier_pixels, amplifier_out, *(n[number] if np.ndim(n) else n for n in arguments))
     return out
 
 
@@ -93,15 +95,15 @@ class Decision:
 def decide(effects: Sequence[Effect], scene: Scene) -> tuple[Decision, ...]:
     """What a scene needs, and what is forced on or off in it (effects of other channels do nothing)."""
     for effect in effects:
-        if not effect.optional and not effect.applied(scene):
+        if not effect.optional and not effect.is_applied(scene):
             raise BadInput(f"effect {effect.name} cannot be switched off")
-    found = []
+    decisions = []
     for effect in effects:
         # Once: some contributions take as long as the effect itself.
         margin = effect.margin(scene)
         applied = scene.forced.get(effect.name, not effect.optional or margin > 1.0)
-        found.append(Decision(effect.name, applied, effect.name in scene.forced, margin))
-    return tuple(found)
+        decisions.append(Decision(effect.name, applied, effect.name in scene.forced, margin))
+    return tuple(decisions)
 
 
 def apply_all(
@@ -109,7 +111,7 @@ def apply_all(
     effects: Sequence[Effect],
     scene: Scene,
     stream: Callable[[Effect], np.random.Generator],
-    watch: Callable[[str, Frame, Frame], None] | None = None,
+    callback: Callable[[str, Frame, Frame], None] | None = None,
 ) -> tuple[Frame, tuple[Decision, ...]]:
     """Apply a channel's effects in their order.
 
@@ -120,9 +122,9 @@ def apply_all(
     decisions = decide(effects, scene)
     for effect, decision in zip(effects, decisions, strict=True):
         if decision.applied:
-            before, frame = frame, effect.apply(frame, *effect.parameters(scene), rng=stream(effect))
-            if watch is not None:
-                watch(effect.name, before, frame)
+            previous, frame = frame, effect.apply(frame, *effect.parameters(scene), rng=stream(effect))
+            if callback is not None:
+                callback(effect.name, previous, frame)
             # Frames are large: the next effect needs one.
-            del before
+            del previous
     return frame, decisions

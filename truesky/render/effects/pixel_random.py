@@ -20,14 +20,14 @@ import numpy as np
 
 from lake_schema.arrays import Float
 from truesky.numerics.compiling import jit
-from truesky.randomness.rng import GOLDEN, mixed
+from truesky.randomness.rng import GOLDEN, mix_bits
 
 _S11, _LAYER, _SIGN = np.uint64(11), np.uint64(255), np.uint64(256)
 # Of 256 layers of equal area under exp(-x^2 / 2): where the tail begins, and the area (Doornik 2005).
 _TAIL, _AREA = 3.6541528853610088, 4.92867323399e-3
 
 
-def key(rng: np.random.Generator) -> np.uint64:
+def draw_key(rng: np.random.Generator) -> np.uint64:
     """What a frame's random numbers count on from."""
     return rng.integers(0, 2**64, dtype=np.uint64)
 
@@ -45,19 +45,19 @@ _INSIDE = _ENDS[1:] / _ENDS[:-1]
 _HEIGHTS = np.exp(-0.5 * _ENDS**2)
 
 
-_mixed = jit(mixed)
+_mix_bits = jit(mix_bits)
 
 
 @jit
-def word(frame_key: Any, pixel: int) -> Any:
+def pixel_bits(frame_key: Any, pixel: int) -> Any:
     """64 random bits, uint64, of a pixel of the frame that has the key (uint64); pixel : its number in the frame."""
-    return _mixed(frame_key + np.uint64(pixel) * GOLDEN)
+    return _mix_bits(frame_key + np.uint64(pixel) * GOLDEN)
 
 
 @jit
-def next_word(before: Any) -> Any:
+def next_bits(bits: Any) -> Any:
     """64 more, where a pixel wants more than one number; before : its last ones."""
-    return _mixed(before + GOLDEN)
+    return _mix_bits(bits + GOLDEN)
 
 
 @jit
@@ -76,21 +76,21 @@ def normal(bits: Any) -> Any:
         x = part * _ENDS[layer]
         if part >= _INSIDE[layer]:
             sign = bits & _SIGN
-            bits = next_word(bits)
+            bits = next_bits(bits)
             if layer == 0:
                 # Beyond the last layer: Marsaglia's exponential tail.
                 x = -math.log(uniform(bits)) / _TAIL
-                bits = next_word(bits)
+                bits = next_bits(bits)
                 y = -2.0 * math.log(uniform(bits))
                 while y < x * x:
-                    bits = next_word(bits)
+                    bits = next_bits(bits)
                     x = -math.log(uniform(bits)) / _TAIL
-                    bits = next_word(bits)
+                    bits = next_bits(bits)
                     y = -2.0 * math.log(uniform(bits))
                 return -_TAIL - x if sign else _TAIL + x
             low, high = _HEIGHTS[layer], _HEIGHTS[layer + 1]
             if low + uniform(bits) * (high - low) >= math.exp(-0.5 * x * x):
-                bits = next_word(bits)
+                bits = next_bits(bits)
                 continue
             return -x if sign else x
         return -x if bits & _SIGN else x

@@ -10,7 +10,7 @@ import numpy as np
 from lake_schema.arrays import Float, Float32, Int
 from lake_schema.errors import OutOfRange
 from lake_schema.mission.configuration import MissionConfiguration
-from lake_schema.mission.detector_overrides import Place
+from lake_schema.mission.detector_overrides import DetectorPlace
 from truesky.fluxes.passbands import Passband
 from truesky.render.camera import amplifiers
 from truesky.render.camera.amplifiers import Layout
@@ -22,7 +22,7 @@ Frame = Float
 # An effect is needed where its largest contribution exceeds this part of a pixel's noise; and what comes back in every
 # frame, or in every pixel, where it exceeds this part of the noise that is left in the mean of so many: 32 x 32 pixels
 # of the sky, or of one in a stack of 1024 frames.
-NOTICEABLE, STACK = 0.1, 1024
+NOTICEABLE, STACK_SIZE = 0.1, 1024
 
 
 # Boltzmann's constant, eV / K (CODATA 2018).
@@ -53,17 +53,17 @@ class Lights:
     row: Frame = field(default_factory=lambda: np.zeros(0))
     electrons: Frame = field(default_factory=lambda: np.zeros(0))
 
-    def joined(self, more: Lights) -> Lights:
+    def concatenate(self, other: Lights) -> Lights:
         """These, then those."""
         return Lights(
-            np.append(self.column, more.column),
-            np.append(self.row, more.row),
-            np.append(self.electrons, more.electrons),
+            np.append(self.column, other.column),
+            np.append(self.row, other.row),
+            np.append(self.electrons, other.electrons),
         )
 
 
 @dataclass(frozen=True, slots=True)
-class Elsewhere:
+class NeighbourCharge:
     """What other detectors hold while one is read.
 
     pixel     : int64[n] of the parts of the detector in readout order, counted on; each once
@@ -110,23 +110,23 @@ class Scene:
     band: Passband | None = None
     track_electrons: float = 0.0
     ramp: str = ""
-    remembered: Frame | None = None
-    tints: Float32 | None = None
-    tint_electrons: float = 0.0
-    spread_sky: Frame | None = None
-    elsewhere: Elsewhere | None = None
+    persistence_charge: Frame | None = None
+    chromatic_light: Float32 | None = None
+    chromatic_electrons: float = 0.0
+    sky_change: Frame | None = None
+    neighbour_charge: NeighbourCharge | None = None
     seeing: float = 0.0
     zero_point: float = 0.0
 
     def value(self, key: str, unit: str) -> float:
         """A parameter of the detector."""
-        return self.mission.value(f"{self.section}.{key}", unit, Place(self._name))
+        return self.mission.value(f"{self.section}.{key}", unit, DetectorPlace(self._detector_name))
 
-    def of_amplifiers(self, key: str, unit: str) -> float | Float:
+    def amplifier_values(self, key: str, unit: str) -> float | Float:
         """A parameter of its amplifiers: float64[q] in the order in which they are read; one number where all agree."""
         if self.detector is not None and self.layout is not None:
             return amplifiers.values(key, unit, self.detector, self.mission, self.layout)
-        values = self.mission.of_amplifiers(f"{self.section}.{key}", unit, self._name)
+        values = self.mission.amplifier_values(f"{self.section}.{key}", unit, self._detector_name)
         return np.array(values) if len(values) > 1 else values[0]
 
     @property
@@ -135,15 +135,15 @@ class Scene:
         return None if self.detector is None else amplifiers.layout(self.detector, self.mission)
 
     @property
-    def runs(self) -> tuple[tuple[int, int, bool], ...]:
+    def column_segments(self) -> tuple[tuple[int, int, bool], ...]:
         """Pieces of its columns: first row, the one past the last, whether their charge leaves upwards."""
         if self.layout is not None:
-            return self.layout.runs
-        lower, upper = self.unread
+            return self.layout.column_segments
+        lower, upper = self.unread_rows
         return (0, lower, False), (upper, self.ny, True)
 
     @property
-    def _name(self) -> str:
+    def _detector_name(self) -> str:
         return self.detector.name if self.detector is not None else ""
 
     @property
@@ -157,19 +157,19 @@ class Scene:
         return self.detector.ny if self.detector is not None else int(self.value("fpa.ny", "pix"))
 
     @property
-    def middle(self) -> int:
+    def injection_rows(self) -> int:
         """Rows between the halves, that are not read."""
-        return self.detector.middle if self.detector is not None else 0
+        return self.detector.injection_rows if self.detector is not None else 0
 
     @property
     def half_rows(self) -> int:
         """Rows that are read through one register, of two."""
-        return (self.ny - self.middle) // 2
+        return (self.ny - self.injection_rows) // 2
 
     @property
-    def unread(self) -> tuple[int, int]:
+    def unread_rows(self) -> tuple[int, int]:
         """The first row between the halves, and the first of the upper half."""
-        return self.half_rows, self.half_rows + self.middle
+        return self.half_rows, self.half_rows + self.injection_rows
 
     @property
     def sky_electrons(self) -> float:
@@ -202,8 +202,8 @@ class Scene:
     def pixel_noise(self) -> float:
         """Electrons rms of a pixel without a source: sky, dark current, reading."""
         # In the mean over the detector.
-        orders = 0.0 if self.spread_sky is None else float(self.spread_sky.mean())
-        return float(np.sqrt(max(self.sky_electrons + orders, 0.0) + self.dark_electrons + self.reading_noise**2))
+        dispersed = 0.0 if self.sky_change is None else float(self.sky_change.mean())
+        return float(np.sqrt(max(self.sky_electrons + dispersed, 0.0) + self.dark_electrons + self.reading_noise**2))
 
     @property
     def reading_noise(self) -> float:
@@ -212,7 +212,7 @@ class Scene:
         Error : of a ramp, that of the difference of its last group and its first: 4 % below the estimator's
         """
         # Of the quietest amplifier: what is noticed there matters.
-        read_noise = float(np.min(self.of_amplifiers("read_noise", "electron")))
+        read_noise = float(np.min(self.amplifier_values("read_noise", "electron")))
         if not self.ramp:
             return read_noise
         reads = self.value(f"macc.{self.ramp}.reads", "")

@@ -12,32 +12,32 @@ from truesky.render.effects.scene import Lights
 from truesky.render.sources.source_list import Sources
 
 # Electrons of a source that may shine where it is not.
-_LIGHT = 1e6
+_MIN_ELECTRONS = 1e6
 # Pixels of a trail whose scattered light is that of a point.
 _PIECE = 32.0
 
 
-def bright_lights(galaxies: tuple[pa.Table, Float], stars: tuple[pa.Table, Float], system: WCS) -> Lights:
+def catalogue_lights(galaxies: tuple[pa.Table, Float], stars: tuple[pa.Table, Float], wcs: WCS) -> Lights:
     """Bright sources on the detector and around it, as far as rows were given.
 
     galaxies, stars : rows, and expected electrons of each
     system          : world coordinates of the detector
     """
-    found = []
+    columns = []
     for rows, electrons in (galaxies, stars):
-        bright = np.flatnonzero(electrons > _LIGHT)
+        bright = np.flatnonzero(electrons > _MIN_ELECTRONS)
         chosen = rows.select(["id", "ra", "dec"]).take(bright)
-        column, row = astrometry.pixel_of_sky(system, chosen["ra"].to_numpy(), chosen["dec"].to_numpy())
-        found.append((chosen["id"].to_numpy(), column, row, electrons[bright]))
-    ids, column, row, electrons = (np.concatenate(part) for part in zip(*found, strict=True))
+        column, row = astrometry.pixel_of_sky(wcs, chosen["ra"].to_numpy(), chosen["dec"].to_numpy())
+        columns.append((chosen["id"].to_numpy(), column, row, electrons[bright]))
+    ids, column, row, electrons = (np.concatenate(part) for part in zip(*columns, strict=True))
     order = np.argsort(ids)
     return Lights(column[order], row[order], electrons[order])
 
 
-def trails(bodies: Sources) -> Lights:
+def trail_lights(bodies: Sources) -> Lights:
     """Bright bodies as points along their trails, close to each other beside the extent of scattered light."""
-    bright = np.flatnonzero(bodies.electrons > _LIGHT)
-    pieces = np.ceil(bodies.length[bright] / _PIECE).astype(np.int64) + 1
+    bright = np.flatnonzero(bodies.electrons > _MIN_ELECTRONS)
+    pieces = np.ceil(bodies.trail_length[bright] / _PIECE).astype(np.int64) + 1
     body, first = np.repeat(bright, pieces), np.repeat(np.cumsum(pieces) - pieces, pieces)
     count = np.repeat(pieces, pieces)
     # Of the trail, from its middle.

@@ -42,18 +42,18 @@ class Rows:
     star_fluxes: pa.Table
     lenses: pa.Table | None = None
     bodies: Callable[[int], Population] | None = None
-    library: Library | None = None
-    stellar: Library | None = None
-    complete: float = 0.0
-    earlier: tuple[Earlier | EarlierSky, ...] = ()
+    galaxy_library: Library | None = None
+    stellar_library: Library | None = None
+    complete_margin_arcsec: float = 0.0
+    previous_exposures: tuple[PreviousExposure | PreviousSky, ...] = ()
     discs: DiscStructure | None = None
     stamps: GalaxyStamps | None = None
-    bulges: Float | None = None
-    beside: tuple[Beside, ...] = ()
+    bulge_fractions: Float | None = None
+    neighbours: tuple[NeighbourDetector, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
-class Beside:
+class NeighbourDetector:
     """Another detector of the same exposure; stars : on it;  fluxes : row by row theirs."""
 
     detector: Detector
@@ -62,7 +62,7 @@ class Beside:
 
 
 @dataclass(frozen=True, slots=True)
-class Earlier:
+class PreviousExposure:
     """An exposure of the same detector before; rows : of its bright sources;  mission : None = as the later one's."""
 
     aim: Aim
@@ -75,7 +75,7 @@ class Earlier:
 
 
 @dataclass(frozen=True, slots=True)
-class EarlierSky:
+class PreviousSky:
     """An exposure of the same detector before that nothing renders: of what shone there the sky alone is known."""
 
     exposure: ExposureRow

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lake_schema.arrays import Array, Float, Int
-from lake_schema.ids import kind_of
+from lake_schema.ids import kind_from_id
 from truesky.randomness import rng
 from truesky.render.channels.aim import Aim
 from truesky.render.dispersing import draw as dispersing
@@ -20,10 +20,19 @@ from truesky.render.drawing.stamps import Tally
 from truesky.render.effects.effect import Effect, apply_all
 from truesky.render.effects.readout import trap_pumping
 from truesky.render.effects.scene import Frame, Scene
-from truesky.render.exposure import elsewhere, limits, persistence, rendered, scene_of, spread_sky, tints, truth_maps
+from truesky.render.exposure import (
+    board_neighbours,
+    chromatic_response_map,
+    limits,
+    persistence,
+    rendered_detector,
+    scene_factory,
+    sky_through_grism,
+    truth_maps,
+)
 from truesky.render.exposure.records import Rows, Variant
-from truesky.render.exposure.rendered import Rendered
-from truesky.render.exposure.traced import Columns, traced
+from truesky.render.exposure.rendered_detector import RenderedDetector
+from truesky.render.exposure.spectrum_truth import Columns, truth_columns
 from truesky.render.exposure.visible_sources import Light, visible_light
 from truesky.render.exposure.visible_spectra import visible_spectra
 from truesky.render.sources.source_list import Sources
@@ -40,7 +49,7 @@ def render(
     truth: Sequence[str] = (),
     progress: Callable[[int], None] | None = None,
     noise_seed: int | None = None,
-) -> Rendered:
+) -> RenderedDetector:
     """Render one detector.
 
     truth    : maps that are wanted besides the noise-free one, of lake_schema.tables.products.CONTENTS
@@ -49,18 +58,23 @@ def render(
     aim      : the exposure and detector;  rows : catalogue rows that it may see
     variant  : mission, accuracy, and the effects that are forced on or off;  seed : of the request
     """
-    scene = replace(scene_of.of_aim(aim, variant), remembered=persistence.remembered(aim, rows.earlier, variant, seed))
-    scene = spread_sky.with_sky(scene, aim, seed)
-    spread = aim.channel.disperses is not None and aim.sees_sky
-    light = (visible_spectra if spread else visible_light)(aim, rows, scene, seed)
+    scene = replace(
+        scene_factory.from_aim(aim, variant),
+        persistence_charge=persistence.total_charge(aim, rows.previous_exposures, variant, seed),
+    )
+    scene = sky_through_grism.with_sky_change(scene, aim, seed)
+    is_dispersed = aim.channel.dispersion is not None and aim.sees_sky
+    light = (visible_spectra if is_dispersed else visible_light)(aim, rows, scene, seed)
     limits.refuse_too_large(aim, light)
-    light = elsewhere.with_charge(light, aim, rows, variant, seed)
-    drawn, frame = _drawn(aim, light, truth, progress) if light.dispersed is None else _spread(aim, rows, light, truth)
-    return _detected(aim, rows, light, drawn, frame, (seed, noise_seed, truth))
+    light = board_neighbours.with_neighbour_charge(light, aim, rows, variant, seed)
+    drawn, frame = (
+        _draw_images(aim, light, truth, progress) if light.dispersed is None else _draw_spectra(aim, rows, light, truth)
+    )
+    return _apply_effects(aim, rows, light, drawn, frame, (seed, noise_seed, truth))
 
 
 @dataclass(frozen=True, slots=True)
-class _Drawn:
+class _DrawnLight:
     """What was drawn.
 
     sources, sizes, electrons : those with light of their stamps on pixels that are read, and what of it fell there
@@ -77,75 +91,93 @@ class _Drawn:
     spectra: Columns | None = None
 
 
-def _drawn(
+def _draw_images(
     aim: Aim, light: Light, truth: Sequence[str], progress: Callable[[int], None] | None
-) -> tuple[_Drawn, list[Frame]]:
+) -> tuple[_DrawnLight, list[Frame]]:
     """(what was drawn, [expected electrons of the sources alone]): handed over, to be freed as early as can be."""
     sources, sizes, scene, detector = light.sources, light.sizes, light.scene, aim.detector
     if light.psf is None:
         empty = np.zeros((detector.ny, detector.nx))
         maps: dict[str, Array] = {"noise_free": empty.astype(np.float32)}
-        return _Drawn(sources, sizes, np.zeros(0), maps, scene), [empty]
-    drawn, maps = np.zeros(len(sources)), {}
+        return _DrawnLight(sources, sizes, np.zeros(0), maps, scene), [empty]
+    drawn_electrons, maps = np.zeros(len(sources)), {}
     frame = stamps.draw(
-        sources, sizes, light.psf, detector.nx, detector.ny, progress, light.neglected, Tally(drawn, scene.unread)
+        sources,
+        sizes,
+        light.psf,
+        detector.nx,
+        detector.ny,
+        progress,
+        light.neglected,
+        Tally(drawn_electrons, scene.unread_rows),
     )
-    scene = tints.with_tints(scene_of.with_peak(scene, frame), aim, light)
+    scene = chromatic_response_map.with_chromatic_light(scene_factory.with_peak_electrons(scene, frame), aim, light)
     if "stars" in truth:
-        of_stars = kind_of(sources.ids) == _STAR
-        some, neglected = sources.take(of_stars), light.neglected[of_stars]
-        light_of = stamps.draw(some, sizes[of_stars], light.psf, detector.nx, detector.ny, None, neglected)
-        maps["stars"] = light_of.astype(np.float32)
+        is_star = kind_from_id(sources.ids) == _STAR
+        stars, neglected = sources.take(is_star), light.neglected[is_star]
+        star_light = stamps.draw(stars, sizes[is_star], light.psf, detector.nx, detector.ny, None, neglected)
+        maps["stars"] = star_light.astype(np.float32)
     # What sends in no more than faint wings is drawn, not listed.
-    a_piece = sources.electrons / stamp_sizes.piece_count(sources.length)
-    listed = (drawn > 0.0) | stamp_sizes.has_far_light(a_piece, sizes, sources.shape, sources.picture, light.psf)
+    piece_electrons = sources.electrons / stamp_sizes.piece_count(sources.trail_length)
+    is_listed = (drawn_electrons > 0.0) | stamp_sizes.has_far_light(
+        piece_electrons, sizes, sources.shape, sources.picture, light.psf
+    )
     maps["noise_free"] = frame.astype(np.float32)
-    return _Drawn(sources.take(listed), sizes[listed], drawn[listed], maps, scene), [frame]
+    return _DrawnLight(sources.take(is_listed), sizes[is_listed], drawn_electrons[is_listed], maps, scene), [frame]
 
 
-def _spread(aim: Aim, rows: Rows, light: Light, truth: Sequence[str]) -> tuple[_Drawn, list[Frame]]:
+def _draw_spectra(aim: Aim, rows: Rows, light: Light, truth: Sequence[str]) -> tuple[_DrawnLight, list[Frame]]:
     """The same of sources whose light a grism spreads out; what is listed has light of some order on the detector."""
     assert light.dispersed is not None
     assert light.psf is not None
     sources, dispersed, psf, noise = light.sources, light.dispersed, light.psf, light.scene.pixel_noise
-    shape, tally = (aim.detector.ny, aim.detector.nx), dispersing.Tally.of(len(sources), len(dispersed.orders))
+    shape, tally = (aim.detector.ny, aim.detector.nx), dispersing.Tally.empty(len(sources), len(dispersed.orders))
     layers: dict[int, Float] = {}
-    known: dispersing.Known = {}
-    asked = {order: name for order, name in truth_maps.ORDERS.items() if name in truth}
-    frame = dispersing.draw(sources, dispersed, psf, shape, noise, tally, layers if asked else None, known)
+    planes_cache: dispersing.PlanesCache = {}
+    requested_orders = {order: name for order, name in truth_maps.ORDER_MAPS.items() if name in truth}
+    frame = dispersing.draw(
+        sources, dispersed, psf, shape, noise, tally, layers if requested_orders else None, planes_cache
+    )
     maps: dict[str, Array] = {"noise_free": frame.astype(np.float32)}
-    for order, name in asked.items():
+    for order, name in requested_orders.items():
         maps[name] = layers.get(order, np.zeros(shape)).astype(np.float32)
     if "stars" in truth:
-        of_stars = np.flatnonzero(kind_of(sources.ids) == _STAR)
-        some = replace(dispersed, spectra=lambda chosen: dispersed.spectra(of_stars[chosen]))
-        maps["stars"] = dispersing.draw(sources.take(of_stars), some, psf, shape, noise).astype(np.float32)
-    fallen, scene = tally.electrons.sum(axis=1), scene_of.with_peak(light.scene, frame)
-    listed, expected = fallen > 0.0, replace(sources, electrons=tally.expected.sum(axis=1))
-    scene = tints.with_spread_tints(scene, aim, light, tally, known)
-    spectra = traced(light, tally, aim, rows, scene)
-    return _Drawn(expected.take(listed), tally.sizes[listed], fallen[listed], maps, scene, spectra), [frame]
+        star_indices = np.flatnonzero(kind_from_id(sources.ids) == _STAR)
+        star_spectra = replace(dispersed, spectra=lambda chosen: dispersed.spectra(star_indices[chosen]))
+        maps["stars"] = dispersing.draw(sources.take(star_indices), star_spectra, psf, shape, noise).astype(np.float32)
+    drawn_electrons, scene = tally.electrons.sum(axis=1), scene_factory.with_peak_electrons(light.scene, frame)
+    is_listed, expected = drawn_electrons > 0.0, replace(sources, electrons=tally.expected.sum(axis=1))
+    scene = chromatic_response_map.with_dispersed_light(scene, aim, light, tally, planes_cache)
+    spectra = truth_columns(light, tally, aim, rows, scene)
+    return _DrawnLight(
+        expected.take(is_listed), tally.sizes[is_listed], drawn_electrons[is_listed], maps, scene, spectra
+    ), [frame]
 
 
-def _detected(
-    aim: Aim, rows: Rows, light: Light, drawn: _Drawn, frame: list[Frame], asked: tuple[int, int | None, Sequence[str]]
-) -> Rendered:
+def _apply_effects(
+    aim: Aim,
+    rows: Rows,
+    light: Light,
+    drawn: _DrawnLight,
+    frame: list[Frame],
+    seeds_and_truth: tuple[int, int | None, Sequence[str]],
+) -> RenderedDetector:
     """The frame, taken from its list, after all effects of the channel; asked : seeds and truth maps."""
-    exposure, detector, (seed, noise_seed, truth) = aim.exposure, aim.detector, asked
-    scene = scene_of.with_own_light(drawn.scene, aim.channel, aim.effects)
+    exposure, detector, (seed, noise_seed, truth) = aim.exposure, aim.detector, seeds_and_truth
+    scene = scene_factory.with_non_source_light(drawn.scene, aim.channel, aim.effects)
 
     def stream(effect: Effect) -> np.random.Generator:
-        return rng.stream(*rendered.numbers_of(effect, exposure, detector.name, seed, noise_seed))
+        return rng.stream(*rendered_detector.random_identity(effect, exposure, detector.name, seed, noise_seed))
 
     mode = aim.channel.readout
-    watch = truth_maps.watch(drawn.maps, scene, truth, mode)
-    found, decisions = apply_all(frame.pop(), aim.effects, scene, stream, watch)
+    record_truth = truth_maps.map_recorder(drawn.maps, scene, truth, mode)
+    final_frame, decisions = apply_all(frame.pop(), aim.effects, scene, stream, record_truth)
     if "traps" in truth and trap_pumping.EFFECT in aim.effects:
         drawn.maps["traps"] = trap_pumping.trap_map(scene, stream(trap_pumping.EFFECT))
-    readout = mode.arrays(found, scene, detector.name, aim.wcs)
+    readout = mode.make_readout(final_frame, scene, detector.name, aim.wcs)
     truth_maps.complete(drawn.maps, readout.raw, aim.effects, scene, truth, mode)
-    return Rendered(
+    return RenderedDetector(
         exposure, detector, aim.wcs, light.psf, readout, drawn.maps, drawn.sources, drawn.sizes, drawn.electrons,
-        exposure.zero_point, scene, (*light.decisions, *decisions), scene.accuracy, seed, rows.complete,
+        exposure.zero_point, scene, (*light.decisions, *decisions), scene.accuracy, seed, rows.complete_margin_arcsec,
         noise_seed, drawn.spectra,
     )  # fmt: skip

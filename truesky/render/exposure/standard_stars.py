@@ -39,7 +39,7 @@ _BRIGHTNESS = {
 _OUTSIDE = "stray_light"
 # Assumed: in parts of the detector's sides; of a detector whose middle rows are not read, none in the middle.
 _PLACES = ((0.25, 0.25), (0.75, 0.25), (0.5, 0.5), (0.25, 0.75), (0.75, 0.75))
-_OF_HALVES = ((0.25, 0.25), (0.75, 0.25), (0.4, 0.4), (0.25, 0.75), (0.75, 0.75))
+_PLACES_OF_HALVES = ((0.25, 0.25), (0.75, 0.25), (0.4, 0.4), (0.25, 0.75), (0.75, 0.75))
 # Of an identifier: stars, of which catalogues have no members; and the order whose cells number 22 bits in one of it.
 _STAR, _MEMBER, _FINE = 5, 1, GENERATION_ORDER + 11
 
@@ -57,25 +57,25 @@ def with_standards(rows: Rows, aim: Aim, mission: MissionConfiguration) -> Rows:
         raise BadInput(
             f"exposure {aim.exposure.exposure_id}: target {target!r} is none of {', '.join(standards.NAMES)}"
         )
-    ra, dec = places(aim, mission)
-    cell = sky.cell_of(ra, dec, GENERATION_ORDER)
-    number = sky.cell_of(ra, dec, _FINE) - (cell << 2 * (_FINE - GENERATION_ORDER))
+    ra, dec = star_positions(aim, mission)
+    cell = sky.cell_at(ra, dec, GENERATION_ORDER)
+    number = sky.cell_at(ra, dec, _FINE) - (cell << 2 * (_FINE - GENERATION_ORDER))
     ids = source_id(_STAR, cell, number, _MEMBER)
     library = templates.stellar_library()
     # A user's own library has the same standards.
     sed = library.names.index(target)
-    magnitude, known = brightness(aim.exposure, mission)
-    seen, reference = (
+    magnitude, magnitude_band = brightness(aim.exposure, mission)
+    band_flux, reference_flux = (
         float(passbands.ab_flux(band, library.wavelength, library.flux[sed].astype(float)))
-        for band in (aim.band, aim.band if known == aim.exposure.band else passbands.load(known))
+        for band in (aim.band, aim.band if magnitude_band == aim.exposure.band else passbands.load(magnitude_band))
     )
-    f_nu = 10.0 ** (0.4 * (units.AB_UJY - magnitude)) * seen / reference
+    f_nu = 10.0 ** (0.4 * (units.AB_UJY - magnitude)) * band_flux / reference_flux
     # Of the spectrum the shape alone is taken: its H matters not.
     star = {"id": ids, "ra": ra, "dec": dec, "sed": sed, "mag_h": magnitude, "a_v": 0.0}
     return replace(
         rows,
-        stars=_appended(rows.stars, star),
-        star_fluxes=_appended(rows.star_fluxes, {"id": ids, f"f_nu_{aim.exposure.band}": f_nu}),
+        stars=_append_rows(rows.stars, star),
+        star_fluxes=_append_rows(rows.star_fluxes, {"id": ids, f"f_nu_{aim.exposure.band}": f_nu}),
     )
 
 
@@ -85,18 +85,18 @@ def brightness(exposure: ExposureRow, mission: MissionConfiguration) -> tuple[fl
     return mission.value(key, "mag"), band or exposure.band
 
 
-def places(aim: Aim, mission: MissionConfiguration) -> tuple[Float, Float]:
+def star_positions(aim: Aim, mission: MissionConfiguration) -> tuple[Float, Float]:
     """Where they are: ra [n], dec [n], deg; mission : the mission database."""
     exposure, nx, ny = aim.exposure, aim.detector.nx, aim.detector.ny
     if exposure.image_type == _OUTSIDE:
         # On the tangent plane, which stretches the angle.
-        far = np.tan(mission.value("survey.stray_light.distance", "rad")) / pointing.ARCSEC
-        return pointing.sky_of_plane([0.0], [far], exposure.ra, exposure.dec, exposure.position_angle)
-    x, y = np.array(_OF_HALVES if aim.detector.middle else _PLACES).T
+        offset_arcsec = np.tan(mission.value("survey.stray_light.distance", "rad")) / pointing.ARCSEC
+        return pointing.sky_of_plane([0.0], [offset_arcsec], exposure.ra, exposure.dec, exposure.position_angle)
+    x, y = np.array(_PLACES_OF_HALVES if aim.detector.injection_rows else _PLACES).T
     return astrometry.sky_of_pixel(aim.wcs, x * (nx - 1), y * (ny - 1))
 
 
-def _appended(table: pa.Table, values: Mapping[str, Any]) -> pa.Table:
+def _append_rows(table: pa.Table, values: Mapping[str, Any]) -> pa.Table:
     """A table with one more row a place; its columns without a value are null there."""
     n = len(values["id"])
     columns = [

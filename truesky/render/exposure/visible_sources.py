@@ -24,15 +24,15 @@ from truesky.render.camera import astrometry
 from truesky.render.camera.detectors import Detector
 from truesky.render.channels import registry
 from truesky.render.channels.aim import Aim, electron_rate
-from truesky.render.dispersing.draw import Dispersed
+from truesky.render.dispersing.draw import DispersedSources
 from truesky.render.drawing import outskirts, stamp_sizes
 from truesky.render.drawing.settings import Settings, settings_for
 from truesky.render.effects.effect import Decision, decide
 from truesky.render.effects.scene import NOTICEABLE, Lights, Scene
-from truesky.render.exposure import bright_lights, scene_of, standard_stars
+from truesky.render.exposure import bright_lights, scene_factory, standard_stars
 from truesky.render.exposure.records import Rows, Variant
 from truesky.render.psf import from_file, spikes, sub_bands
-from truesky.render.psf.model import Psf, of_colours
+from truesky.render.psf.model import Psf, reduce_colours
 from truesky.render.sources import (
     catalogue_rows,
     colours,
@@ -50,9 +50,9 @@ SHAPE_COLUMNS = ("id", "kind", "ra", "dec", *galaxy_shapes.COLUMNS)
 GALAXY_COLUMNS = tuple(dict.fromkeys((*SHAPE_COLUMNS, galaxy_stamps.COLUMN, *colours.GALAXY_COLUMNS, *bulges.COLUMNS)))
 STAR_COLUMNS = ("id", "ra", "dec", "pm_ra", "pm_dec", *colours.STAR_COLUMNS)
 # Of a source: more would leave the frame's integers to a tenth of an electron (fourier.units_of).
-_MOST_ELECTRONS = 1e17
+_MAX_ELECTRONS = 1e17
 # Light of a spectrum that may be noticed, of a pixel's noise: all in one line it has a signal-to-noise ratio of 0.7.
-LEAST_SPECTRUM = 2.0
+MIN_SPECTRUM_NOISE = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,13 +75,13 @@ class Light:
     psf: Psf | None
     scene: Scene
     decisions: tuple[Decision, ...] = ()
-    dispersed: Dispersed | None = None
-    of: Int = field(default_factory=lambda: np.zeros(0, np.int64))
+    dispersed: DispersedSources | None = None
+    spectrum_rows: Int = field(default_factory=lambda: np.zeros(0, np.int64))
     let_through: Float = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True, slots=True)
-class Listed:
+class CandidateSources:
     """Galaxies, stars and arcs, [n] each; form : of all galaxies, those that are drawn as pictures among them.
 
     electrons : expected;  shape, picture : as of Sources
@@ -94,12 +94,12 @@ class Listed:
     electrons: Float
     shape: Int
     picture: Int
-    of: Int
+    spectrum_rows: Int
     form: galaxy_shapes.Shapes
     pictures: tuple[lensed_arcs.Picture, ...]
 
 
-def listed(rows: Rows, electrons: tuple[Float, Float]) -> Listed:
+def list_candidates(rows: Rows, electrons: tuple[Float, Float]) -> CandidateSources:
     """All rows, as what may be drawn; electrons : expected of each of the galaxies, and of the stars.
 
     Errors : BadInput where a source is given twice, or shines too brightly
@@ -107,11 +107,11 @@ def listed(rows: Rows, electrons: tuple[Float, Float]) -> Listed:
     catalogue, points = rows.galaxies, rows.stars
     form, n, stars = galaxy_shapes.shapes(catalogue), len(catalogue), len(points)
     arcs = _arcs(rows.lenses, catalogue, electrons[0], form)
-    stamp, stamps = galaxy_stamps.of_rows(catalogue, _of_all_bands(form, rows), rows.stamps)
+    stamp, stamps = galaxy_stamps.assign_pictures(catalogue, _with_catalogue_bulges(form, rows), rows.stamps)
     ids = np.concatenate([catalogue["id"].to_numpy(), points["id"].to_numpy(), arcs.ids]).astype(np.int64)
     light = np.concatenate([*electrons, arcs.electrons])
-    _check(ids, light)
-    return Listed(
+    _check_sources(ids, light)
+    return CandidateSources(
         ids,
         np.concatenate([catalogue["ra"].to_numpy(), points["ra"].to_numpy(), arcs.ra]),
         np.concatenate([catalogue["dec"].to_numpy(), points["dec"].to_numpy(), arcs.dec]),
@@ -133,24 +133,28 @@ def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
     """
     if not aim.sees_sky:
         return Light(_no_sources(rows.galaxies), np.zeros(0, np.int64), np.zeros(0), None, scene)
-    rows, column = rows_of(rows, aim, scene.mission), f"f_nu_{aim.exposure.band}"
+    rows, column = rows_at_exposure(rows, aim, scene.mission), f"f_nu_{aim.exposure.band}"
     pairs = ((rows.galaxies, rows.galaxy_fluxes), (rows.stars, rows.star_fluxes))
-    galaxies, stars = (fluxes_of(*pair, column) * electron_rate(aim.exposure) * scene.exposure_time_s for pair in pairs)
+    galaxies, stars = (
+        row_fluxes(*pair, column) * electron_rate(aim.exposure) * scene.exposure_time_s for pair in pairs
+    )
     settings, noise = settings_for(scene.accuracy), scene.pixel_noise
-    psf = psf_of(aim, scene, settings)
-    sources, sizes = sources_of(rows, (galaxies, stars), aim, psf, noise, settings)
-    bright = Lights()
-    if aim.channel.moving:
-        sources, sizes, bright = _with_moving((sources, sizes), aim, rows, scene, psf, settings, seed)
-    if aim.channel.scattered:
-        around = bright_lights.bright_lights((rows.galaxies, galaxies), (rows.stars, stars), aim.wcs)
-        scene = replace(scene, lights=around.joined(bright))
-    psf, decisions = _with_pixels(aim, scene, psf, sources.electrons[touching(sources, sizes, aim.detector)])
+    psf = exposure_psf(aim, scene, settings)
+    sources, sizes = select_sources(rows, (galaxies, stars), aim, psf, noise, settings)
+    moving_lights = Lights()
+    if aim.channel.draws_moving_bodies:
+        sources, sizes, moving_lights = _with_moving((sources, sizes), aim, rows, scene, psf, settings, seed)
+    if aim.channel.has_scattered_light:
+        catalogue_lights = bright_lights.catalogue_lights((rows.galaxies, galaxies), (rows.stars, stars), aim.wcs)
+        scene = replace(scene, lights=catalogue_lights.concatenate(moving_lights))
+    psf, decisions = _with_intra_pixel(
+        aim, scene, psf, sources.electrons[touches_detector(sources, sizes, aim.detector)]
+    )
     neglected = stamp_sizes.neglected_flux(sources.electrons, noise, settings)
     return Light(sources, sizes, neglected, psf, scene, decisions)
 
 
-def rows_of(rows: Rows, aim: Aim, mission: MissionConfiguration) -> Rows:
+def rows_at_exposure(rows: Rows, aim: Aim, mission: MissionConfiguration) -> Rows:
     """Rows as an exposure sees them.
 
     Bulges have their share of the light in its band, stars are where they are in its middle, and the standard star's
@@ -160,38 +164,42 @@ def rows_of(rows: Rows, aim: Aim, mission: MissionConfiguration) -> Rows:
     Errors : BadInput for a target that is no standard star
     """
     middle = aim.exposure.mjd + 0.5 * aim.exposure.exposure_time_s / 86400.0
-    galaxies = bulges.in_band(rows.galaxies, aim.band, rows.library or templates.galaxy_library())
+    galaxies = bulges.with_fractions_in_band(rows.galaxies, aim.band, rows.galaxy_library or templates.galaxy_library())
     shares = np.asarray(rows.galaxies["bulge_fraction"].to_numpy(), float)
-    rows = replace(rows, galaxies=galaxies, stars=catalogue_rows.at_time(rows.stars, middle), bulges=shares)
+    rows = replace(
+        rows, galaxies=galaxies, stars=catalogue_rows.apply_proper_motion(rows.stars, middle), bulge_fractions=shares
+    )
     return standard_stars.with_standards(rows, aim, mission)
 
 
-def psf_of(aim: Aim, scene: Scene, settings: Settings) -> Psf:
+def exposure_psf(aim: Aim, scene: Scene, settings: Settings) -> Psf:
     """The exposure's own, or its channel's; of as many places and colours as the settings say."""
     if aim.exposure.psf:
-        found = from_file.read(from_file.file_of(aim.exposure.psf, aim.detector.name), aim.detector, aim.band)
+        psf = from_file.read(from_file.path_for_detector(aim.exposure.psf, aim.detector.name), aim.detector, aim.band)
     else:
-        found = aim.channel.psf(aim.exposure, aim.detector, aim.band, scene.mission, settings.positions)
-    return of_colours(found, settings.colours)
+        psf = aim.channel.psf(aim.exposure, aim.detector, aim.band, scene.mission, settings.positions)
+    return reduce_colours(psf, settings.colours)
 
 
-def _with_pixels(aim: Aim, scene: Scene, psf: Psf, electrons: Float) -> tuple[Psf, tuple[Decision, ...]]:
+def _with_intra_pixel(aim: Aim, scene: Scene, psf: Psf, electrons: Float) -> tuple[Psf, tuple[Decision, ...]]:
     """(PSF with the effect that acts while sources are drawn, decision); electrons : of what is on the frame."""
-    drawn = aim.channel.drawn
-    if drawn is None:
+    effect = aim.channel.transfer_effect
+    if effect is None:
         return psf, ()
     peak = float(psf.surface[0]) * float(electrons.max(initial=0.0))
     scene = replace(scene, peak_electrons=peak)
-    decisions = decide((drawn,), scene)
+    decisions = decide((effect,), scene)
     if decisions[0].applied and psf.intra_pixel is not None:
-        (strength,) = drawn.parameters(scene)
+        (strength,) = effect.parameters(scene)
         psf = replace(psf, intra_pixel=strength)
     return psf, decisions
 
 
 def _no_sources(galaxies: pa.Table) -> Sources:
-    none, whole = np.zeros(0), np.zeros(0, np.int64)
-    return Sources(whole, none, none, np.zeros((0, 2, 2)), none, whole, galaxy_shapes.shapes(galaxies.slice(0, 0)))
+    empty, empty_int = np.zeros(0), np.zeros(0, np.int64)
+    return Sources(
+        empty_int, empty, empty, np.zeros((0, 2, 2)), empty, empty_int, galaxy_shapes.shapes(galaxies.slice(0, 0))
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,7 +217,7 @@ class FluxLimits:
         Faintest galaxy that is noticed from farther out.
     """
 
-    least: float = np.inf
+    min_flux: float = np.inf
     spikes: float = np.inf
     far_galaxy: float = np.inf
 
@@ -236,16 +244,16 @@ def flux_limits(exposure: ExposureRow, detector: Detector, band: Passband, varia
     time, channel = exposure.exposure_time_s, registry.CHANNELS[exposure.channel]
     if time == 0.0 or not channel.sees_sky(exposure.image_type):
         return FluxLimits()
-    noise = scene_of.scene_of(exposure, detector, variant.mission, variant.accuracy).pixel_noise
+    noise = scene_factory.from_exposure(exposure, detector, variant.mission, variant.accuracy).pixel_noise
     electrons = electron_rate(exposure) * time
     spikes_ = _spike_electrons(exposure, detector, band, variant.mission, noise) / electrons
-    if channel.disperses is not None:
-        return FluxLimits(LEAST_SPECTRUM * noise / electrons, spikes_)
+    if channel.dispersion is not None:
+        return FluxLimits(MIN_SPECTRUM_NOISE * noise / electrons, spikes_)
     margin, scale = variant.mission.value("survey.selection_margin", "arcsec"), detector.pixel_scale
     return FluxLimits(
-        stamp_sizes.least_electrons(margin, scale, noise, settings_for(variant.accuracy)) / electrons,
+        stamp_sizes.min_noticeable_electrons(margin, scale, noise, settings_for(variant.accuracy)) / electrons,
         spikes_,
-        outskirts.least_electrons(stamp_sizes.reach(scale), scale, noise) / electrons,
+        outskirts.min_noticeable_electrons(stamp_sizes.reach(scale), scale, noise) / electrons,
     )
 
 
@@ -253,17 +261,17 @@ def _spike_electrons(
     exposure: ExposureRow, detector: Detector, band: Passband, mission: MissionConfiguration, noise: float
 ) -> float:
     """Electrons of the faintest star whose spikes are noticed from beyond the reach of stamps; or infinite."""
-    pupil_of = registry.CHANNELS[exposure.channel].pupil
+    pupil_of = registry.CHANNELS[exposure.channel].diffraction_edges
     if pupil_of is None or exposure.psf:
         return np.inf
     pupil = pupil_of(detector, band, mission)
     if pupil is None:
         return np.inf
-    (one,) = spikes.reach(pupil, np.ones(1), NOTICEABLE * noise)
-    return float((stamp_sizes.reach(1.0) / one) ** 2)
+    (reach,) = spikes.reach(pupil, np.ones(1), NOTICEABLE * noise)
+    return float((stamp_sizes.reach(1.0) / reach) ** 2)
 
 
-def sources_of(
+def select_sources(
     rows: Rows, electrons: tuple[Float, Float], aim: Aim, psf: Psf, noise: float, settings: Settings
 ) -> tuple[Sources, Int]:
     """Everything that shines onto the detector, with its stamp or beyond it, ascending id, and the stamps' sides.
@@ -272,48 +280,61 @@ def sources_of(
     rows : catalogue rows that the detector may see;  aim : the exposure and detector
     psf  : of the detector;  settings : of the accuracy
     """
-    detector, system, every = aim.detector, aim.wcs, listed(rows, electrons)
-    light, shape, picture, form = every.electrons, every.shape, every.picture, every.form
-    farthest = np.where((shape < 0) & (picture < 0), _spikes(light, detector, psf, noise), 0.0)
-    farthest[: len(form)] = _outskirts(light[: len(form)], form, detector, noise)
-    reach = detector.half_diagonal + np.maximum(farthest, stamp_sizes.reach(detector.pixel_scale))
-    seen = selection.near(every.ra, every.dec, astrometry.centre(detector, system), reach / 3600.0) & (light > 0)
-    kept = np.flatnonzero(seen)[np.argsort(every.ids[seen], kind="stable")]
-    column, row = astrometry.pixel_of_sky(system, every.ra[kept], every.dec[kept])
-    wide = np.array([0.0, *(found.diagonal for found in every.pictures)])[picture[kept] + 1] / detector.pixel_scale
-    sizes = stamp_sizes.stamp_sizes(light[kept], shape[kept], form, psf, noise, settings, wide)
-    structure = np.append(disc_structure.sides(_of_all_bands(form, rows), rows.discs), 0.0)[shape[kept]]
-    sizes = stamp_sizes.holding(sizes, structure / detector.pixel_scale)
-    found = Sources(
-        every.ids[kept], column, row, np.zeros((len(kept), 2, 2)), light[kept], shape[kept], form, None,
-        picture[kept], every.pictures,
-    )  # fmt: skip
-    here = stamp_sizes.touching_frame(found, sizes, psf, noise, detector.nx, detector.ny)
-    kept, found = kept[here], found.take(here)
-    colourful = psf.planes is not None and len(psf.planes.wavelength) > 1
-    photons = _colours(every.of[kept], rows, aim.band) if colourful else None
-    jacobian = astrometry.jacobian(system, found.column, found.row)
-    found = replace(found, jacobian=jacobian, photons=photons)
-    return disc_structure.added(found, _of_all_bands(form, rows), rows.discs), sizes[here]
+    detector, wcs, candidates = aim.detector, aim.wcs, list_candidates(rows, electrons)
+    light, shape, picture, form = candidates.electrons, candidates.shape, candidates.picture, candidates.form
+    extra_reach = np.where((shape < 0) & (picture < 0), _spike_reach(light, detector, psf, noise), 0.0)
+    extra_reach[: len(form)] = _outskirt_reach(light[: len(form)], form, detector, noise)
+    reach = detector.half_diagonal + np.maximum(extra_reach, stamp_sizes.reach(detector.pixel_scale))
+    is_near = selection.within_radius(
+        candidates.ra, candidates.dec, astrometry.centre(detector, wcs), reach / 3600.0
+    ) & (light > 0)
+    indices = np.flatnonzero(is_near)[np.argsort(candidates.ids[is_near], kind="stable")]
+    column, row = astrometry.pixel_of_sky(wcs, candidates.ra[indices], candidates.dec[indices])
+    picture_sides = (
+        np.array([0.0, *(arc_picture.diagonal for arc_picture in candidates.pictures)])[picture[indices] + 1]
+        / detector.pixel_scale
+    )
+    sizes = stamp_sizes.stamp_sizes(light[indices], shape[indices], form, psf, noise, settings, picture_sides)
+    structure = np.append(disc_structure.sides(_with_catalogue_bulges(form, rows), rows.discs), 0.0)[shape[indices]]
+    sizes = stamp_sizes.smallest_allowed_sizes(sizes, structure / detector.pixel_scale)
+    sources = Sources(
+        candidates.ids[indices],
+        column,
+        row,
+        np.zeros((len(indices), 2, 2)),
+        light[indices],
+        shape[indices],
+        form,
+        None,
+        picture[indices],
+        candidates.pictures,
+    )
+    on_frame = stamp_sizes.touching_frame(sources, sizes, psf, noise, detector.nx, detector.ny)
+    indices, sources = indices[on_frame], sources.take(on_frame)
+    is_chromatic = psf.planes is not None and len(psf.planes.wavelength) > 1
+    photons = _photon_fractions(candidates.spectrum_rows[indices], rows, aim.band) if is_chromatic else None
+    jacobian = astrometry.jacobian(wcs, sources.column, sources.row)
+    sources = replace(sources, jacobian=jacobian, photons=photons)
+    return disc_structure.add_structure(sources, _with_catalogue_bulges(form, rows), rows.discs), sizes[on_frame]
 
 
-def _of_all_bands(form: galaxy_shapes.Shapes, rows: Rows) -> galaxy_shapes.Shapes:
+def _with_catalogue_bulges(form: galaxy_shapes.Shapes, rows: Rows) -> galaxy_shapes.Shapes:
     """Galaxies with what they have of bulges in the catalogue: what they look like is not another thing in a band."""
-    return form if rows.bulges is None else replace(form, bulge_fraction=rows.bulges)
+    return form if rows.bulge_fractions is None else replace(form, bulge_fraction=rows.bulge_fractions)
 
 
-def _spikes(electrons: Float, detector: Detector, psf: Psf, noise: float) -> Float:
+def _spike_reach(electrons: Float, detector: Detector, psf: Psf, noise: float) -> Float:
     """[n] arcsec as far as which points' spikes are noticed."""
     if psf.edges is None:
         return np.zeros(len(electrons))
     return spikes.reach(psf.edges, electrons, NOTICEABLE * noise) * detector.pixel_scale
 
 
-def _outskirts(electrons: Float, form: galaxy_shapes.Shapes, detector: Detector, noise: float) -> Float:
+def _outskirt_reach(electrons: Float, form: galaxy_shapes.Shapes, detector: Detector, noise: float) -> Float:
     """[n] arcsec as far as which galaxies are noticed that may be from beyond what else is read, 0 of others."""
-    out, least = np.zeros(len(electrons)), stamp_sizes.reach(detector.pixel_scale)
-    some = np.flatnonzero(electrons > outskirts.least_electrons(least, detector.pixel_scale, noise))
-    out[some] = outskirts.reach(electrons[some], form.take(some), detector.pixel_scale, noise, least)
+    out, min_reach = np.zeros(len(electrons)), stamp_sizes.reach(detector.pixel_scale)
+    bright = np.flatnonzero(electrons > outskirts.min_noticeable_electrons(min_reach, detector.pixel_scale, noise))
+    out[bright] = outskirts.reach(electrons[bright], form.take(bright), detector.pixel_scale, noise, min_reach)
     return out
 
 
@@ -326,44 +347,56 @@ def _arcs(
 
 
 def _with_moving(
-    still: tuple[Sources, Int], aim: Aim, rows: Rows, scene: Scene, psf: Psf, settings: Settings, seed: int
+    fixed: tuple[Sources, Int], aim: Aim, rows: Rows, scene: Scene, psf: Psf, settings: Settings, seed: int
 ) -> tuple[Sources, Int, Lights]:
     """The sources with those that move, whose identifiers are the largest; and bright ones around, as far as read."""
-    (sources, sizes), detector = still, aim.detector
+    (sources, sizes), detector = fixed, aim.detector
     reach = (detector.half_diagonal + stamp_sizes.reach(detector.pixel_scale)) / 3600.0
-    found = solar_system.sources(aim, scene.mission, seed, reach, sources.shapes, rows.bodies)
-    length = stamp_sizes.piece_length(found.length)
-    own = stamp_sizes.stamp_sizes(found.electrons, found.shape, found.shapes, psf, scene.pixel_noise, settings, length)
-    wide = stamp_sizes.reaches(found.electrons, own, found.shape, None, psf, scene.pixel_noise, found.length)
-    here = selection.touching(found.column, found.row, wide, detector.nx, detector.ny) & (found.electrons > 0)
-    if not here.any():
-        return sources, sizes, bright_lights.trails(found)
-    return sources.with_moving(found.take(here)), np.concatenate([sizes, own[here]]), bright_lights.trails(found)
+    bodies = solar_system.trailed_sources(aim, scene.mission, seed, reach, sources.shapes, rows.bodies)
+    length = stamp_sizes.piece_length(bodies.trail_length)
+    body_sizes = stamp_sizes.stamp_sizes(
+        bodies.electrons, bodies.shape, bodies.shapes, psf, scene.pixel_noise, settings, length
+    )
+    body_reach = stamp_sizes.visible_sides(
+        bodies.electrons, body_sizes, bodies.shape, None, psf, scene.pixel_noise, bodies.trail_length
+    )
+    on_detector = selection.overlaps_frame(bodies.column, bodies.row, body_reach, detector.nx, detector.ny) & (
+        bodies.electrons > 0
+    )
+    if not on_detector.any():
+        return sources, sizes, bright_lights.trail_lights(bodies)
+    return (
+        sources.with_moving(bodies.take(on_detector)),
+        np.concatenate([sizes, body_sizes[on_detector]]),
+        bright_lights.trail_lights(bodies),
+    )
 
 
-def touching(sources: Sources, sizes: Int, detector: Detector) -> Bool:
+def touches_detector(sources: Sources, sizes: Int, detector: Detector) -> Bool:
     """Sources with a stamp on the detector."""
-    return selection.touching(sources.column, sources.row, sizes + sources.length, detector.nx, detector.ny)
+    return selection.overlaps_frame(sources.column, sources.row, sizes + sources.trail_length, detector.nx, detector.ny)
 
 
-def _colours(kept: Int, rows: Rows, band: Passband) -> Float:
+def _photon_fractions(spectrum_rows: Int, rows: Rows, band: Passband) -> Float:
     """Photon fractions of the rows that are drawn; `kept` counts on from the galaxies to the stars."""
-    of_galaxy = kept < len(rows.galaxies)
-    out = np.empty((len(kept), sub_bands.PARTS))
-    out[of_galaxy] = colours.galaxies(rows.galaxies.take(kept[of_galaxy]), band, rows.library)
-    out[~of_galaxy] = colours.stars(rows.stars.take(kept[~of_galaxy] - len(rows.galaxies)), band, rows.stellar)
+    of_galaxy = spectrum_rows < len(rows.galaxies)
+    out = np.empty((len(spectrum_rows), sub_bands.N_SUB_BANDS))
+    out[of_galaxy] = colours.galaxies(rows.galaxies.take(spectrum_rows[of_galaxy]), band, rows.galaxy_library)
+    out[~of_galaxy] = colours.stars(
+        rows.stars.take(spectrum_rows[~of_galaxy] - len(rows.galaxies)), band, rows.stellar_library
+    )
     return out
 
 
-def _check(ids: Int, electrons: Float) -> None:
+def _check_sources(ids: Int, electrons: Float) -> None:
     if len(np.unique(ids)) != len(ids):
         raise BadInput("a source is given twice")
-    bad = ~((electrons >= 0) & (electrons <= _MOST_ELECTRONS))
+    bad = ~((electrons >= 0) & (electrons <= _MAX_ELECTRONS))
     if bad.any():
         raise BadInput(f"source {ids[np.argmax(bad)]}: {electrons[np.argmax(bad)]} electrons, outside 0 .. 1e17")
 
 
-def fluxes_of(rows: pa.Table, fluxes: pa.Table, column: str) -> Float:
+def row_fluxes(rows: pa.Table, fluxes: pa.Table, column: str) -> Float:
     """float64[n] f_nu of catalogue rows, microjansky; BadInput where the flux table is not of the same rows."""
     if column not in fluxes.column_names:
         raise BadInput(f"the flux table has no column {column}")

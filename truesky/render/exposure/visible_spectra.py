@@ -31,12 +31,12 @@ from truesky.render.channels import registry
 from truesky.render.channels.aim import Aim, electron_rate
 from truesky.render.channels.channel import Dispersion
 from truesky.render.dispersing import draw, images
-from truesky.render.dispersing.draw import Dispersed, Order
+from truesky.render.dispersing.draw import DispersedSources, Order
 from truesky.render.effects.scene import Scene
 from truesky.render.exposure import visible_sources
 from truesky.render.exposure.records import Rows
-from truesky.render.exposure.visible_sources import LEAST_SPECTRUM, Light, Listed
-from truesky.render.sky.diffuse_light import solar
+from truesky.render.exposure.visible_sources import MIN_SPECTRUM_NOISE, CandidateSources, Light
+from truesky.render.sky.diffuse_light import solar_irradiance
 from truesky.render.sources import selection, solar_system, spectra
 from truesky.render.sources.source_list import Sources
 
@@ -54,40 +54,49 @@ def visible_spectra(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
     scene  : before anything is drawn;  seed : of the request
     Errors : BadInput for a PSF of the user's
     """
-    exposure, mission, band, dispersion = aim.exposure, scene.mission, aim.band, _of(aim)
+    exposure, mission, band, dispersion = aim.exposure, scene.mission, aim.band, _dispersion_of(aim)
     if exposure.psf:
         raise BadInput(f"exposure {exposure.exposure_id}: psf: spectra are drawn through the camera's own PSF alone")
-    rows, settings = visible_sources.rows_of(rows, aim, mission), draw.settings_for(scene.accuracy)
-    found = orders(aim, mission, seed)
-    traced = tuple(order.trace for order in found)
-    sources, which = _sources(aim, rows, scene, _rectangles(traced, aim.detector, band), seed)
-    left = dispersion.vignetted(exposure, aim.detector, sources.column, sources.row, mission)
-    sources = replace(sources, electrons=sources.electrons * left)
-    sun = solar(band.wavelength / 10.0, mission)
-    own = spectra.of_rows(which, rows.galaxies, rows.stars, band, sun, (rows.library, rows.stellar))
-    nodes = images.nodes(traced[0].first, traced[0].last, settings.nodes)
+    rows, settings = visible_sources.rows_at_exposure(rows, aim, mission), draw.settings_for(scene.accuracy)
+    grism_orders = make_orders(aim, mission, seed)
+    order_traces = tuple(order.trace for order in grism_orders)
+    sources, spectrum_rows = _select_sources(aim, rows, scene, _rectangles(order_traces, aim.detector, band), seed)
+    let_through = dispersion.vignetting(exposure, aim.detector, sources.column, sources.row, mission)
+    sources = replace(sources, electrons=sources.electrons * let_through)
+    sun = solar_irradiance(band.wavelength / 10.0, mission)
+    source_spectra = spectra.spectrum_function(
+        spectrum_rows, rows.galaxies, rows.stars, band, sun, (rows.galaxy_library, rows.stellar_library)
+    )
+    nodes = images.nodes(order_traces[0].first, order_traces[0].last, settings.nodes)
     psf = dispersion.psf(aim.detector, nodes, mission, settings.positions)
-    none = np.zeros(len(sources))
-    dispersed = Dispersed(own, found, settings)
+    zeros = np.zeros(len(sources))
+    dispersed = DispersedSources(source_spectra, grism_orders, settings)
     return Light(
-        sources, none.astype(np.int64), none, psf, scene, dispersed=dispersed, of=which, let_through=left
-    )  # fmt: skip
+        sources,
+        zeros.astype(np.int64),
+        zeros,
+        psf,
+        scene,
+        dispersed=dispersed,
+        spectrum_rows=spectrum_rows,
+        let_through=let_through,
+    )
 
 
-def orders(aim: Aim, mission: MissionConfiguration, seed: int) -> tuple[Order, ...]:
+def make_orders(aim: Aim, mission: MissionConfiguration, seed: int) -> tuple[Order, ...]:
     """Of the grism: what each detects of f_lambda on the scale of `sources.spectra`, A.
 
     aim : the exposure and detector;  mission : the exposure's;  seed : of the request
     """
-    dispersion, band, exposure = _of(aim), aim.band, aim.exposure
-    found = []
+    dispersion, band, exposure = _dispersion_of(aim), aim.band, aim.exposure
+    grism_orders = []
     for trace in dispersion.traces(exposure, aim.detector, mission, seed):
         light = dispersion.throughput(exposure, trace.order, band.wavelength, aim.detector, mission)
-        found.append(Order(trace, int(band.wavelength[0]), band.response * band.wavelength * light))
-    return tuple(found)
+        grism_orders.append(Order(trace, int(band.wavelength[0]), band.response * band.wavelength * light))
+    return tuple(grism_orders)
 
 
-def beyond(
+def margin_arcsec(
     exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, band: Passband, seed: int
 ) -> float:
     """How far beyond a detector's circle sources lie whose light of some order is on it, arcsec; 0 without a grism.
@@ -96,31 +105,33 @@ def beyond(
     seed : of the request
     """
     channel = registry.CHANNELS[exposure.channel]
-    if channel.disperses is None or not channel.sees_sky(exposure.image_type):
+    if channel.dispersion is None or not channel.sees_sky(exposure.image_type):
         return 0.0
-    boxes = _rectangles(channel.disperses.traces(exposure, detector, mission, seed), detector, band)
+    boxes = _rectangles(channel.dispersion.traces(exposure, detector, mission, seed), detector, band)
     return max(_radius(boxes, detector) - detector.half_diagonal, 0.0)
 
 
-def bands(exposure: ExposureRow, known: Sequence[str]) -> list[str]:
+def flux_bands(exposure: ExposureRow, columns: Sequence[str]) -> list[str]:
     """An exposure's own, and that in which sources are chosen where its fluxes are known.
 
     exposure : its row;  known : columns of the table of fluxes
     """
-    dispersion = registry.CHANNELS[exposure.channel].disperses
-    more = [] if dispersion is None or f"f_nu_{dispersion.chosen_by}" not in known else [dispersion.chosen_by]
-    return [exposure.band, *more]
+    dispersion = registry.CHANNELS[exposure.channel].dispersion
+    selection_band = (
+        [] if dispersion is None or f"f_nu_{dispersion.selection_band}" not in columns else [dispersion.selection_band]
+    )
+    return [exposure.band, *selection_band]
 
 
-def _of(aim: Aim) -> Dispersion:
-    assert aim.channel.disperses is not None
-    return aim.channel.disperses
+def _dispersion_of(aim: Aim) -> Dispersion:
+    assert aim.channel.dispersion is not None
+    return aim.channel.dispersion
 
 
-def _rectangles(found: tuple[Trace, ...], detector: Detector, band: Passband) -> Float:
+def _rectangles(order_traces: tuple[Trace, ...], detector: Detector, band: Passband) -> Float:
     """float64[orders, 4] pixels: left, right, low, high of undispersed images."""
     ends = float(band.wavelength[0]), float(band.wavelength[-1])
-    return np.array([traces.source_rectangle(trace, detector.nx, detector.ny, ends) for trace in found])
+    return np.array([traces.source_rectangle(trace, detector.nx, detector.ny, ends) for trace in order_traces])
 
 
 def _radius(boxes: Float, detector: Detector) -> float:
@@ -130,74 +141,86 @@ def _radius(boxes: Float, detector: Detector) -> float:
     return float(np.hypot(across + _FAR_WING, up + _FAR_WING).max()) * detector.pixel_scale * _DISTORTION
 
 
-def _sources(aim: Aim, rows: Rows, scene: Scene, boxes: Float, seed: int) -> tuple[Sources, Int]:
+def _select_sources(aim: Aim, rows: Rows, scene: Scene, boxes: Float, seed: int) -> tuple[Sources, Int]:
     """(sources in the rectangles, ascending id, those that move behind; whose spectrum each has)."""
-    detector, system, column = aim.detector, aim.wcs, f"f_nu_{aim.exposure.band}"
+    detector, wcs, column = aim.detector, aim.wcs, f"f_nu_{aim.exposure.band}"
     pairs = ((rows.galaxies, rows.galaxy_fluxes), (rows.stars, rows.star_fluxes))
     factor = electron_rate(aim.exposure) * scene.exposure_time_s
-    galaxies, stars = (visible_sources.fluxes_of(*pair, column) * factor for pair in pairs)
-    every = visible_sources.listed(rows, (galaxies, stars))
+    galaxies, stars = (visible_sources.row_fluxes(*pair, column) * factor for pair in pairs)
+    candidates = visible_sources.list_candidates(rows, (galaxies, stars))
     reach = _radius(boxes, detector) / 3600.0
-    centre = astrometry.centre(detector, system)
-    seen = selection.near(every.ra, every.dec, centre, reach) & _selected(every, rows, aim, scene)
-    kept = np.flatnonzero(seen)[np.argsort(every.ids[seen], kind="stable")]
-    x, y = astrometry.pixel_of_sky(system, every.ra[kept], every.dec[kept])
-    here = _inside(x, y, every.electrons[kept], np.zeros(len(kept)), boxes)
-    kept, x, y = kept[here], x[here], y[here]
-    found = Sources(
-        every.ids[kept], x, y, astrometry.jacobian(system, x, y), every.electrons[kept], every.shape[kept], every.form,
-        None, every.picture[kept], every.pictures,
-    )  # fmt: skip
-    which = every.of[kept]
-    if not aim.channel.moving:
-        return found, which
-    bodies = solar_system.sources(aim, scene.mission, seed, reach, found.shapes, rows.bodies)
-    shining = bodies.electrons > LEAST_SPECTRUM * scene.pixel_noise
-    here = shining & _inside(bodies.column, bodies.row, bodies.electrons, bodies.length, boxes)
-    if not here.any():
-        return found, which
-    moving = replace(bodies.take(here), photons=None)
-    return replace(found.with_moving(moving), photons=None), np.append(which, np.full(len(moving), -1))
+    centre = astrometry.centre(detector, wcs)
+    is_near = selection.within_radius(candidates.ra, candidates.dec, centre, reach) & _is_selected(
+        candidates, rows, aim, scene
+    )
+    indices = np.flatnonzero(is_near)[np.argsort(candidates.ids[is_near], kind="stable")]
+    x, y = astrometry.pixel_of_sky(wcs, candidates.ra[indices], candidates.dec[indices])
+    is_inside = _is_inside(x, y, candidates.electrons[indices], np.zeros(len(indices)), boxes)
+    indices, x, y = indices[is_inside], x[is_inside], y[is_inside]
+    sources = Sources(
+        candidates.ids[indices],
+        x,
+        y,
+        astrometry.jacobian(wcs, x, y),
+        candidates.electrons[indices],
+        candidates.shape[indices],
+        candidates.form,
+        None,
+        candidates.picture[indices],
+        candidates.pictures,
+    )
+    spectrum_rows = candidates.spectrum_rows[indices]
+    if not aim.channel.draws_moving_bodies:
+        return sources, spectrum_rows
+    bodies = solar_system.trailed_sources(aim, scene.mission, seed, reach, sources.shapes, rows.bodies)
+    shining = bodies.electrons > MIN_SPECTRUM_NOISE * scene.pixel_noise
+    is_inside = shining & _is_inside(bodies.column, bodies.row, bodies.electrons, bodies.trail_length, boxes)
+    if not is_inside.any():
+        return sources, spectrum_rows
+    moving = replace(bodies.take(is_inside), photons=None)
+    return replace(sources.with_moving(moving), photons=None), np.append(spectrum_rows, np.full(len(moving), -1))
 
 
-def _selected(every: Listed, rows: Rows, aim: Aim, scene: Scene) -> Bool:
+def _is_selected(candidates: CandidateSources, rows: Rows, aim: Aim, scene: Scene) -> Bool:
     """[n] What may be noticed; or what Serrano et al. 2024 drew, where the mission says so.
 
     Error : where the fluxes in the band that these were chosen in are not known, those in the exposure's own band tell
     """
     if scene.value("spectra.selection", "") < 0.5:
-        return np.asarray(every.electrons > LEAST_SPECTRUM * scene.pixel_noise)
+        return np.asarray(candidates.electrons > MIN_SPECTRUM_NOISE * scene.pixel_noise)
     tables = rows.galaxy_fluxes, rows.star_fluxes
-    column = f"f_nu_{_of(aim).chosen_by}"
+    column = f"f_nu_{_dispersion_of(aim).selection_band}"
     if not all(column in table.column_names for table in tables):
         column = f"f_nu_{aim.exposure.band}"
-    own = f"f_nu_{aim.exposure.band}"
-    f_nu, seen = (np.concatenate([table[name].to_numpy() for table in tables]) for name in (column, own))
+    band_column = f"f_nu_{aim.exposure.band}"
+    f_nu, band_f_nu = (np.concatenate([table[name].to_numpy() for table in tables]) for name in (column, band_column))
     # A standard star has no fluxes but in the exposure's band.
-    f_nu = np.where(np.isnan(f_nu), seen, f_nu)
+    f_nu = np.where(np.isnan(f_nu), band_f_nu, f_nu)
     bright = f_nu >= 10.0 ** (0.4 * (units.AB_UJY - scene.value("spectra.faintest", "mag")))
     if _HALPHA in rows.galaxies.column_names:
-        bright[: len(rows.galaxies)] |= _line_seen(rows) >= scene.value("spectra.faintest_line", "erg / (s cm2)")
-    return np.asarray(bright[every.of] & (every.electrons > 0.0))
+        bright[: len(rows.galaxies)] |= _halpha_flux(rows) >= scene.value("spectra.faintest_line", "erg / (s cm2)")
+    return np.asarray(bright[candidates.spectrum_rows] & (candidates.electrons > 0.0))
 
 
-def _line_seen(rows: Rows) -> Float:
+def _halpha_flux(rows: Rows) -> Float:
     """[galaxies] erg s-1 cm-2 of H alpha as it is observed: magnified, behind the Milky Way's dust; 0 of no line."""
     flux = np.nan_to_num(rows.galaxies[_HALPHA].to_numpy(zero_copy_only=False).astype(float))
-    (some,) = np.nonzero(flux > 0.0)
-    shining = rows.galaxies.take(some)
-    flux[some] *= checked.magnification_of(shining)
+    (with_line,) = np.nonzero(flux > 0.0)
+    shining = rows.galaxies.take(with_line)
+    flux[with_line] *= checked.table_magnification(shining)
     if {"z_obs", "a_v"} <= set(shining.column_names):
         vacuum = next(line.vacuum for line in lines.line_list() if line.column == _HALPHA)
-        at = lines.observed_wavelength(np.full(len(some), vacuum), checked.column(shining, "z_obs"), "vacuum")
-        flux[some] *= extinction.transmitted(extinction.milky_way(at), checked.column(shining, "a_v"))
+        observed = lines.observed_wavelength(
+            np.full(len(with_line), vacuum), checked.column(shining, "z_obs"), "vacuum"
+        )
+        flux[with_line] *= extinction.transmission(extinction.milky_way(observed), checked.column(shining, "a_v"))
     return np.asarray(flux)
 
 
-def _inside(x: Float, y: Float, electrons: Float, length: Float, boxes: Float) -> Bool:
+def _is_inside(x: Float, y: Float, electrons: Float, length: Float, boxes: Float) -> Bool:
     """[n] Undispersed images of which some order sends light onto the detector."""
     wing = np.where(electrons > _BRIGHT, _FAR_WING, _WING) + length / 2
-    found = np.zeros(len(x), bool)
-    for left, right, low, high in boxes:
-        found |= (x > left - wing) & (x < right + wing) & (y > low - wing) & (y < high + wing)
-    return found
+    is_inside = np.zeros(len(x), bool)
+    for x_min, x_max, y_min, y_max in boxes:
+        is_inside |= (x > x_min - wing) & (x < x_max + wing) & (y > y_min - wing) & (y < y_max + wing)
+    return is_inside

@@ -17,7 +17,7 @@ import pyarrow as pa
 from truesky.render.forecasting.speed import Speed
 
 # Columns of `tasks` that a forecast adds up; what stands for all surveys of a channel.
-SUMMED = ("sources", "seconds", "bytes", "memory")
+SUMMED_COLUMNS = ("sources", "seconds", "bytes", "memory")
 _ALL = "all"
 
 
@@ -36,13 +36,13 @@ class Line:
     memory_gb: float
 
 
-def rows(exposures: pa.Table, tasks: pa.Table, factor: float = 1.0) -> list[Line]:
+def summarise(exposures: pa.Table, tasks: pa.Table, factor: float = 1.0) -> list[Line]:
     """Sums by channel, survey and image type, in that order; by channel; of everything.
 
     factor : CPU s of the machine that is asked about over those of `tasks` (speed.of_machine)
     """
-    about = exposures.select(["exposure_id", "survey", "image_type"])
-    joined = tasks.select(["exposure_id", "detector", "channel", *SUMMED]).join(about, "exposure_id")
+    exposure_columns = exposures.select(["exposure_id", "survey", "image_type"])
+    joined = tasks.select(["exposure_id", "detector", "channel", *SUMMED_COLUMNS]).join(exposure_columns, "exposure_id")
     keys = ["channel", "survey", "image_type"]
     sums = joined.group_by(keys).aggregate(
         [
@@ -54,22 +54,22 @@ def rows(exposures: pa.Table, tasks: pa.Table, factor: float = 1.0) -> list[Line
             ("memory", "max"),
         ]
     )
-    return _with_sums([_line(row, factor) for row in sums.to_pylist()])
+    return _add_totals([_line(row, factor) for row in sums.to_pylist()])
 
 
-def of_parts(parts: Iterable[tuple[pa.Table, pa.Table]], factor: float = 1.0) -> list[Line]:
+def summarise_chunks(chunks: Iterable[tuple[pa.Table, pa.Table]], factor: float = 1.0) -> list[Line]:
     """As `rows`, of a plan of which a part comes after the other: exposures, and the tasks of these."""
-    return _with_sums([line for own in parts for line in rows(*own, factor) if line.survey != _ALL])
+    return _add_totals([line for chunk in chunks for line in summarise(*chunk, factor) if line.survey != _ALL])
 
 
-def _with_sums(lines: list[Line]) -> list[Line]:
-    own: dict[tuple[str, str, str], list[Line]] = defaultdict(list)
+def _add_totals(lines: list[Line]) -> list[Line]:
+    lines_of_kind: dict[tuple[str, str, str], list[Line]] = defaultdict(list)
     for line in lines:
-        own[line.channel, line.survey, line.image_type].append(line)
-    kinds = [_sum(*key, some) for key, some in sorted(own.items())]
-    channels = sorted({line.channel for line in kinds})
-    of_channels = [_sum(name, _ALL, "", [line for line in kinds if line.channel == name]) for name in channels]
-    return [*kinds, *of_channels, _sum("all", _ALL, "", kinds)]
+        lines_of_kind[line.channel, line.survey, line.image_type].append(line)
+    kind_lines = [_sum(*key, group) for key, group in sorted(lines_of_kind.items())]
+    channels = sorted({line.channel for line in kind_lines})
+    channel_lines = [_sum(name, _ALL, "", [line for line in kind_lines if line.channel == name]) for name in channels]
+    return [*kind_lines, *channel_lines, _sum("all", _ALL, "", kind_lines)]
 
 
 def _sum(channel: str, survey: str, image_type: str, lines: list[Line]) -> Line:
@@ -100,7 +100,7 @@ def _line(row: dict[str, Any], factor: float) -> Line:
     )
 
 
-def text(lines: list[Line], speed: Speed) -> Iterator[str]:
+def format_table(lines: list[Line], speed: Speed) -> Iterator[str]:
     """The forecast as lines of text; the last says whose core-hours they are."""
     yield (
         f"{'channel':8} {'survey':12} {'image type':17} {'exposures':>10} {'detectors':>10} {'sources':>14} "

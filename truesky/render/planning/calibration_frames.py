@@ -19,8 +19,8 @@ from truesky.render.camera import pointing
 from truesky.render.camera.lamps import LAMPS
 from truesky.render.channels import image_types, registry
 from truesky.render.effects.readout import trap_pumping
-from truesky.render.planning import after_bright, lit_flats
-from truesky.render.planning.observing_sequence import FILTERS, RED, SETTINGS, offsets
+from truesky.render.planning import lit_flats, persistence_darks
+from truesky.render.planning.observing_sequence import FILTERS, N_GRISM_ANGLES, RED, offsets
 from truesky.render.planning.planned_exposures import Exposure, bands_of, elapsed_time, exposure_time, through_grism
 from truesky.render.sky.solar_aspect import check_aspect, next_allowed, position_angle
 from truesky.request.observations import Observation
@@ -35,7 +35,7 @@ TARGETS = {
     "white_dwarf": ("white dwarf DA",),
 }
 # Of an image type what every one of its exposures may be asked for: key of the request, of the mission, and unit.
-_ASKED = (("magnitude", "magnitude", "mag"), ("distance_deg", "distance", "deg"))
+_TARGET_PARAMETERS = (("magnitude", "magnitude", "mag"), ("distance_deg", "distance", "deg"))
 # Frames of trap pumping that the mission lists.
 _PHASE_TIMES = 4
 # From the end of a frame to the start of the next, s: the slowest of the read-outs.
@@ -51,9 +51,9 @@ def exposures(
     centre : ra, dec deg of the block's own field or of the request's area
     block  : of the request;  mission : the mission database;  seed : of the request;  start : MJD
     """
-    own = [registry.CHANNELS[channel] for channel in block.channels]
-    of_sky = block.image_type == "persistence" and block.bright == "sky"
-    if of_sky or any(not channel.on_ground and block.image_type in channel.sky_types for channel in own):
+    channels = [registry.CHANNELS[channel] for channel in block.channels]
+    bright_sky = block.image_type == "persistence" and block.bright == "sky"
+    if bright_sky or any(not channel.on_ground and block.image_type in channel.sky_types for channel in channels):
         if block.mjd is None:
             start = next_allowed(*centre, start, mission)
         check_aspect(*centre, start, mission, "mjd")
@@ -63,124 +63,128 @@ def exposures(
         angle = block.position_angle
         if angle is None:
             angle = 0.0 if channel == "EXT" else position_angle(*centre, start)
-        first = Exposure(
+        template = Exposure(
             channel, name, "", block.image_type, *centre, angle, start, 0.0, "calibration", detectors=block.detectors
         )
         if block.image_type == "persistence":
-            for frame in after_bright.exposures(first, block, mission, now):
+            for frame in persistence_darks.exposures(template, block, mission, now):
                 yield frame
-                now = after_bright.forgotten(frame, mission)
+                now = persistence_darks.persistence_end_mjd(frame, mission)
             continue
-        for frame in _frames(first, block, mission, seed):
+        for frame in _frames(template, block, mission, seed):
             yield replace(frame, mjd=now)
             # A ramp is read out meanwhile, and longer where it has few groups.
             now += max(frame.exposure_time_s + _PAUSE, elapsed_time(frame, mission)) / _DAY_S
 
 
-def _frames(first: Exposure, block: Observation, mission: MissionConfiguration, seed: int) -> Iterator[Exposure]:
-    in_bands = [
-        replace(first, band=band, exposure_time_s=_seconds(first, band, block, mission))
-        for band in lit_flats.chosen(block.bands, _bands(first, block, mission))
+def _frames(template: Exposure, block: Observation, mission: MissionConfiguration, seed: int) -> Iterator[Exposure]:
+    band_exposures = [
+        replace(template, band=band, exposure_time_s=_seconds(template, band, block, mission))
+        for band in lit_flats.select_bands(block.bands, _bands(template, block, mission))
     ]
-    if first.image_type == "self_calibration":
+    if template.image_type == "self_calibration":
         dithers = block.exposures or int(mission.value("survey.self_calibration.dithers"))
-        for i, (x, y) in enumerate(_scattered(first.camera, dithers, mission, seed)):
-            yield from (replace(_moved(frame, x, y), dither=i + 1) for frame in in_bands)
-    elif first.image_type in TARGETS:
-        yield from _targets([_asked(frame, block) for frame in in_bands], block, mission, seed)
-    elif first.image_type == "defocus":
-        yield from _out_of_focus(in_bands, block, mission, seed)
-    elif first.image_type == "trap_pumping":
-        yield from _pumped(in_bands[0], block, mission)
+        for i, (x, y) in enumerate(_random_offsets(template.camera, dithers, mission, seed)):
+            yield from (replace(_shift_pointing(frame, x, y), dither=i + 1) for frame in band_exposures)
+    elif template.image_type in TARGETS:
+        yield from _target_frames(
+            [_with_target_parameters(frame, block) for frame in band_exposures], block, mission, seed
+        )
+    elif template.image_type == "defocus":
+        yield from _defocused_frames(band_exposures, block, mission, seed)
+    elif template.image_type == "trap_pumping":
+        yield from _pumping_frames(band_exposures[0], block, mission)
     elif not block.exposures:
-        raise BadInput(f"an observation of image_type {first.image_type} wants exposures = how many frames")
-    elif first.image_type == "flat" and first.camera in LAMPS:
-        lit = lit_flats.by_lamp(in_bands, block, mission)
+        raise BadInput(f"an observation of image_type {template.image_type} wants exposures = how many frames")
+    elif template.image_type == "flat" and template.camera in LAMPS:
+        frames_by_lamp = lit_flats.by_lamp(band_exposures, block, mission)
         for i in range(block.exposures):
-            turn, own = i // len(lit), lit[i % len(lit)]
-            yield from lit_flats.at_levels(own[turn % len(own)], block, mission)
+            cycle, lamp_frames = i // len(frames_by_lamp), frames_by_lamp[i % len(frames_by_lamp)]
+            yield from lit_flats.at_levels(lamp_frames[cycle % len(lamp_frames)], block, mission)
     else:
-        lamp = 1 if first.image_type == "flat" else None
+        lamp = 1 if template.image_type == "flat" else None
         for i in range(block.exposures):
-            frame = replace(in_bands[i % len(in_bands)], lamp=lamp)
+            frame = replace(band_exposures[i % len(band_exposures)], lamp=lamp)
             yield from lit_flats.at_levels(frame, block, mission) if lamp else [frame]
 
 
-def _pumped(frame: Exposure, block: Observation, mission: MissionConfiguration) -> Iterator[Exposure]:
+def _pumping_frames(frame: Exposure, block: Observation, mission: MissionConfiguration) -> Iterator[Exposure]:
     """Frames without rows between the injected ones; charge has time to gather while it is pumped."""
     section = image_types.section(frame.camera)
-    listed = [mission.value(f"{section}.pumping.phase_time_{i + 1}", "s") for i in range(_PHASE_TIMES)]
-    for phase in block.phase_times_s or listed:
-        own = ((f"{section}.injection.off", 0.0, "pix"), (f"{section}.pumping.phase_time", phase, "s"))
+    mission_times = [mission.value(f"{section}.pumping.phase_time_{i + 1}", "s") for i in range(_PHASE_TIMES)]
+    for phase in block.phase_times_s or mission_times:
+        parameters = ((f"{section}.injection.off", 0.0, "pix"), (f"{section}.pumping.phase_time", phase, "s"))
         seconds = trap_pumping.duration(phase, section, mission)
         for _ in range(block.exposures or 1):
-            yield replace(frame, exposure_time_s=seconds, parameters=own)
+            yield replace(frame, exposure_time_s=seconds, parameters=parameters)
 
 
-def _out_of_focus(
-    in_bands: Sequence[Exposure], block: Observation, mission: MissionConfiguration, seed: int
+def _defocused_frames(
+    band_exposures: Sequence[Exposure], block: Observation, mission: MissionConfiguration, seed: int
 ) -> Iterator[Exposure]:
     """At each place all wavefronts, one after the other."""
     nominal = mission.value("survey.defocus.wavefront", "nm")
-    for frame in _dithered(in_bands, block, mission, seed):
+    for frame in _dithered_frames(band_exposures, block, mission, seed):
         key = f"{image_types.section(frame.camera)}.psf.defocus"
         for nm in block.defocus_nm or (-nominal, nominal):
             yield replace(frame, parameters=((key, nm, "nm"),))
 
 
-def _asked(frame: Exposure, block: Observation) -> Exposure:
+def _with_target_parameters(frame: Exposure, block: Observation) -> Exposure:
     """With what the block asks of its target instead of what the mission says."""
-    values = ((getattr(block, asked), key, unit) for asked, key, unit in _ASKED)
-    own = tuple((f"survey.{block.image_type}.{key}", value, unit) for value, key, unit in values if value is not None)
-    return replace(frame, parameters=own)
+    values = ((getattr(block, attribute), key, unit) for attribute, key, unit in _TARGET_PARAMETERS)
+    parameters = tuple(
+        (f"survey.{block.image_type}.{key}", value, unit) for value, key, unit in values if value is not None
+    )
+    return replace(frame, parameters=parameters)
 
 
-def _seconds(first: Exposure, band: str, block: Observation, mission: MissionConfiguration) -> float:
-    if first.image_type in ("bias", "charge_injection", "trap_pumping"):
+def _seconds(template: Exposure, band: str, block: Observation, mission: MissionConfiguration) -> float:
+    if template.image_type in ("bias", "charge_injection", "trap_pumping"):
         return 0.0
     if block.exposure_time_s is not None:
         return block.exposure_time_s
-    key = f"{image_types.section(first.camera)}.exposure_time_flat"
-    if first.image_type == "flat" and key in mission:
+    key = f"{image_types.section(template.camera)}.exposure_time_flat"
+    if template.image_type == "flat" and key in mission:
         return mission.value(key, "s")
-    return exposure_time(first.channel, first.camera, band, mission)
+    return exposure_time(template.channel, template.camera, band, mission)
 
 
-def _bands(first: Exposure, block: Observation, mission: MissionConfiguration) -> tuple[str, ...]:
-    if first.channel == "NISP-P":
+def _bands(template: Exposure, block: Observation, mission: MissionConfiguration) -> tuple[str, ...]:
+    if template.channel == "NISP-P":
         # A dark needs no filter; the closing position is that of the last, or of those that are named.
-        return FILTERS[-1:] if first.image_type == "dark" and not block.bands else FILTERS
-    if first.channel == "NISP-S":
+        return FILTERS[-1:] if template.image_type == "dark" and not block.bands else FILTERS
+    if template.channel == "NISP-S":
         return (RED,)
-    return bands_of(first.channel, first.camera, mission)[
-        : 1 if first.image_type in ("bias", "dark", "charge_injection", "trap_pumping") else None
+    return bands_of(template.channel, template.camera, mission)[
+        : 1 if template.image_type in ("bias", "dark", "charge_injection", "trap_pumping") else None
     ]
 
 
-def _targets(
-    in_bands: Sequence[Exposure], block: Observation, mission: MissionConfiguration, seed: int
+def _target_frames(
+    band_exposures: Sequence[Exposure], block: Observation, mission: MissionConfiguration, seed: int
 ) -> Iterator[Exposure]:
     """Each target in each band, or in each setting of the grisms, dithered."""
-    kind, channel = in_bands[0].image_type, in_bands[0].channel
+    kind, channel = band_exposures[0].image_type, band_exposures[0].channel
     # A nebula is seen in every setting, a star in one a dither.
-    settings = SETTINGS if kind == "planetary_nebula" else 1
+    settings = N_GRISM_ANGLES if kind == "planetary_nebula" else 1
     for target in TARGETS[kind]:
         for setting in range(settings):
-            for frame in _dithered(in_bands, block, mission, seed):
-                moved = replace(frame, target=target)
-                number = setting if settings > 1 else ((frame.dither or 1) - 1) % SETTINGS
-                yield _through_grism(moved, number, mission) if channel == "NISP-S" else moved
+            for frame in _dithered_frames(band_exposures, block, mission, seed):
+                exposure = replace(frame, target=target)
+                number = setting if settings > 1 else ((frame.dither or 1) - 1) % N_GRISM_ANGLES
+                yield _through_grism(exposure, number, mission) if channel == "NISP-S" else exposure
 
 
-def _dithered(
-    in_bands: Sequence[Exposure], block: Observation, mission: MissionConfiguration, seed: int
+def _dithered_frames(
+    band_exposures: Sequence[Exposure], block: Observation, mission: MissionConfiguration, seed: int
 ) -> Iterator[Exposure]:
     """All bands at each place of the pattern."""
-    kind, channel = in_bands[0].image_type, in_bands[0].channel
+    kind, channel = band_exposures[0].image_type, band_exposures[0].channel
     steps = offsets("S", mission, seed, kind, channel)
     for i in range(block.exposures or int(mission.value(f"survey.{kind}.dithers"))):
-        for frame in in_bands:
-            yield replace(_moved(frame, *steps[i % len(steps)]), dither=i + 1)
+        for frame in band_exposures:
+            yield replace(_shift_pointing(frame, *steps[i % len(steps)]), dither=i + 1)
 
 
 def _through_grism(frame: Exposure, number: int, mission: MissionConfiguration) -> Exposure:
@@ -188,13 +192,13 @@ def _through_grism(frame: Exposure, number: int, mission: MissionConfiguration) 
     return through_grism(frame, mission.value(key, "deg"), mission, key)
 
 
-def _scattered(camera: str, dithers: int, mission: MissionConfiguration, seed: int) -> Float:
+def _random_offsets(camera: str, dithers: int, mission: MissionConfiguration, seed: int) -> Float:
     """[dithers, 2] arcsec: uniform within half a detector and its gap, both ways."""
     fpa = {key: mission.value(f"{camera}.fpa.{key}") for key in ("nx", "ny", "pixel_scale", "gap_x", "gap_y")}
     half = [0.5 * (fpa[f"n{axis}"] * fpa["pixel_scale"] + fpa[f"gap_{axis}"]) for axis in "xy"]
     return rng.stream(seed, "self_calibration", camera).uniform(-1.0, 1.0, (dithers, 2)) * half
 
 
-def _moved(frame: Exposure, x: float, y: float) -> Exposure:
+def _shift_pointing(frame: Exposure, x: float, y: float) -> Exposure:
     ra, dec = pointing.sky_of_plane([x], [y], frame.ra, frame.dec, frame.position_angle)
     return replace(frame, ra=float(ra[0]), dec=float(dec[0]))

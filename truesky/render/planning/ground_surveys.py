@@ -23,7 +23,7 @@ from truesky.render.camera.detectors import Detector
 from truesky.render.channels import image_types, registry
 from truesky.render.planning import calibration_frames
 from truesky.render.planning.planned_exposures import Exposure, bands_of, exposure_time, through_grism
-from truesky.render.sky.observatory import Site, next_dark, sun_altitude
+from truesky.render.sky.observatory import Site, next_dark_time, sun_altitude
 from truesky.render.sky.solar_aspect import next_allowed, position_angle
 from truesky.request import pointing_tables
 from truesky.request.area import Area
@@ -32,7 +32,7 @@ from truesky.request.pointing_tables import Row
 
 _DAY_S, _OVERHEAD_S = 86400.0, 30.0
 # Nautical twilight: the Sun brightens the sky while it is higher, deg.
-_NIGHT = -12.0
+_NIGHT_SUN_ALTITUDE = -12.0
 
 
 def camera_of(survey: str, mission: MissionConfiguration) -> str:
@@ -60,23 +60,27 @@ def exposures(
         if not bands:
             continue
         section = image_types.section(rule["camera"])
-        site, error = Site.of(section, mission), mission.value(f"{section}.pointing_error", "arcsec")
-        places = _places(rule, block, area, mission, seed) if block.place is None else _own(block)
+        site, error = Site.from_mission(section, mission), mission.value(f"{section}.pointing_error", "arcsec")
+        places = (
+            _pattern_pointings(rule, block, area, mission, seed)
+            if block.field_centre is None
+            else _user_field_pointings(block)
+        )
         for i, (ra, dec) in enumerate(places):
             # Where the survey shares its exposures among bands, they take turns.
-            whole = rule["shared"] == "0" or (block.place is not None and not block.exposures)
-            turn = bands if whole else (bands[i % len(bands)],)
-            for band in turn:
+            all_bands = rule["shared"] == "0" or (block.field_centre is not None and not block.exposures)
+            selected_bands = bands if all_bands else (bands[i % len(bands)],)
+            for band in selected_bands:
                 seconds = _seconds(rule, band, mission) if block.exposure_time_s is None else block.exposure_time_s
-                now = next_dark(ra, dec, now, site) if block.mjd is None else now
-                there = _missed((ra, dec), error, rng.stream(seed, "pointing", block.survey, band, i))
+                now = next_dark_time(ra, dec, now, site) if block.mjd is None else now
+                actual = _with_pointing_error((ra, dec), error, rng.stream(seed, "pointing", block.survey, band, i))
                 yield Exposure(
                     channel="EXT",
                     camera=rule["camera"],
                     band=band,
                     image_type=block.image_type,
-                    ra=there[0],
-                    dec=there[1],
+                    ra=actual[0],
+                    dec=actual[1],
                     position_angle=block.position_angle or 0.0,
                     mjd=now,
                     exposure_time_s=seconds,
@@ -89,11 +93,11 @@ def exposures(
 
 def _seconds(rule: Mapping[str, str], band: str, mission: MissionConfiguration) -> float:
     """Exposure time of a survey in a band: the band's own, where the camera has one."""
-    own = f"{image_types.section(rule['camera'])}.{band}.exposure_time"
-    return mission.value(own, "s") if own in mission else float(rule["exposure_time_s"])
+    key = f"{image_types.section(rule['camera'])}.{band}.exposure_time"
+    return mission.value(key, "s") if key in mission else float(rule["exposure_time_s"])
 
 
-def _missed(place: tuple[float, float], error: float, rng: np.random.Generator) -> tuple[float, float]:
+def _with_pointing_error(place: tuple[float, float], error: float, rng: np.random.Generator) -> tuple[float, float]:
     """Where a telescope points that misses a place by an error, arcsec rms of each coordinate; as it is without one."""
     if error == 0.0:
         return place
@@ -106,7 +110,7 @@ def _rules(survey: str, mission: MissionConfiguration) -> list[Mapping[str, str]
     return [row for row in mission.rows("survey.external") if row["survey"] == survey]
 
 
-def _places(
+def _pattern_pointings(
     rule: Mapping[str, str], block: Observation, area: Area, mission: MissionConfiguration, seed: int
 ) -> list[tuple[float, float]]:
     """Pointings of a pattern, in passes over the area, those nearest to it kept."""
@@ -115,38 +119,42 @@ def _places(
     half = [0.5 * float(axis.max() - axis.min()) / 3600.0 for axis in (x, y)]
     margin = float(rule["margin_deg"])
     if rule["pattern"] == "chips":
-        return _by_chips(detectors, half, block.exposures, area, margin)
+        return _chip_pointings(detectors, half, block.exposures, area, margin)
     count = block.exposures
     # As large a step as the filled part of a round field allows: neighbours just touch.
     filled = 0.9
     passes = max(int(rule["passes"]), 1)
     if not count:
-        return [place for k in range(passes) for place in _pass(area, half, filled, margin, k, seed, rule["survey"])]
+        return [
+            place for k in range(passes) for place in _pattern_pass(area, half, filled, margin, k, seed, rule["survey"])
+        ]
     lo, hi = 0.02, 20.0
     for _ in range(40):
         middle = np.sqrt(lo * hi)
-        found = sum(len(_pass(area, half, middle, margin, k, seed, rule["survey"])) for k in range(passes))
-        lo, hi = (middle, hi) if found >= count else (lo, middle)
-    places = [place for k in range(passes) for place in _pass(area, half, lo, margin, k, seed, rule["survey"])]
+        n_pointings = sum(
+            len(_pattern_pass(area, half, middle, margin, k, seed, rule["survey"])) for k in range(passes)
+        )
+        lo, hi = (middle, hi) if n_pointings >= count else (lo, middle)
+    places = [place for k in range(passes) for place in _pattern_pass(area, half, lo, margin, k, seed, rule["survey"])]
     depth = area.depth(*np.array(places).T)
-    kept = np.sort(np.argsort(-depth, kind="stable")[:count])
-    return [places[i] for i in kept]
+    deepest = np.sort(np.argsort(-depth, kind="stable")[:count])
+    return [places[i] for i in deepest]
 
 
-def _own(block: Observation) -> list[tuple[float, float]]:
+def _user_field_pointings(block: Observation) -> list[tuple[float, float]]:
     """The place of an observation's own with its dithers, as often as exposures are asked for, else once each."""
-    assert block.place is not None
+    assert block.field_centre is not None
     steps = np.zeros((1, 2)) if isinstance(block.dither, str) else np.array(block.dither)
-    ra, dec = pointing.sky_of_plane(steps[:, 0], steps[:, 1], *block.place, block.position_angle or 0.0)
+    ra, dec = pointing.sky_of_plane(steps[:, 0], steps[:, 1], *block.field_centre, block.position_angle or 0.0)
     count = block.exposures or len(steps)
     return [(float(ra[i % len(steps)]), float(dec[i % len(steps)])) for i in range(count)]
 
 
-def _pass(
+def _pattern_pass(
     area: Area, half: list[float], step: float, margin: float, number: int, seed: int, survey: str
 ) -> list[tuple[float, float]]:
     """One pass: rows of declination, each row equally spaced, the whole shifted at random from pass to pass."""
-    ra0, dec0, radius = area.bounds()
+    ra0, dec0, radius = area.bounding_circle()
     reach = radius + margin
     step_x, step_y = 2 * half[0] * step, 2 * half[1] * step
     shift = rng.stream(seed, "pattern", survey, number).random(2)
@@ -162,51 +170,55 @@ def _pass(
     if not lon:
         return []
     ra, dec = np.concatenate(lon), np.concatenate(lat)
-    near = area.contains(ra, dec, margin)
-    return list(zip(ra[near].tolist(), dec[near].tolist(), strict=True))
+    in_area = area.contains(ra, dec, margin)
+    return list(zip(ra[in_area].tolist(), dec[in_area].tolist(), strict=True))
 
 
-def _by_chips(
+def _chip_pointings(
     detectors: tuple[Detector, ...], half: list[float], count: int, area: Area, margin: float
 ) -> list[tuple[float, float]]:
     """Each pointing as often as there are detectors, shifted so that every one of them sees its centre."""
-    base = _pass(area, half, 1.0, margin, 0, 0, "chips")
-    wanted = int(np.ceil(count / len(detectors))) if count else len(base)
+    centres = _pattern_pass(area, half, 1.0, margin, 0, 0, "chips")
+    n_centres = int(np.ceil(count / len(detectors))) if count else len(centres)
     lo, hi = 0.02, 20.0
     for _ in range(40):
         middle = np.sqrt(lo * hi)
-        lo, hi = (middle, hi) if len(_pass(area, half, middle, margin, 0, 0, "chips")) >= wanted else (lo, middle)
-    base = _pass(area, half, lo, margin, 0, 0, "chips") if count else base
-    depth = area.depth(*np.array(base).T)
-    base = [base[i] for i in np.sort(np.argsort(-depth, kind="stable")[:wanted])]
+        lo, hi = (
+            (middle, hi) if len(_pattern_pass(area, half, middle, margin, 0, 0, "chips")) >= n_centres else (lo, middle)
+        )
+    centres = _pattern_pass(area, half, lo, margin, 0, 0, "chips") if count else centres
+    depth = area.depth(*np.array(centres).T)
+    centres = [centres[i] for i in np.sort(np.argsort(-depth, kind="stable")[:n_centres])]
     places = []
-    for ra, dec in base:
+    for ra, dec in centres:
         x, y = np.array([[-d.x, -d.y] for d in detectors]).T
         lon, lat = pointing.sky_of_plane(x, y, ra, dec, 0.0)
         places += list(zip(lon.tolist(), lat.tolist(), strict=True))
     return places[:count] if count else places
 
 
-def by_day(exposures: Iterable[Exposure], mission: MissionConfiguration) -> str:
+def daylight_warning(exposures: Iterable[Exposure], mission: MissionConfiguration) -> str:
     """A line about ground exposures of the sky that are dated by day or in twilight, empty where there are none."""
-    found, count = [], 0
+    daytime, count = [], 0
     sites: dict[str, Site] = {}
-    for row in exposures:
-        own = registry.CHANNELS[row.channel]
-        if not (own.on_ground and own.sees_sky(row.image_type)):
+    for exposure in exposures:
+        channel = registry.CHANNELS[exposure.channel]
+        if not (channel.on_ground and channel.sees_sky(exposure.image_type)):
             continue
         count += 1
-        if row.camera not in sites:
-            sites[row.camera] = Site.of(image_types.section(row.camera), mission)
-        high = float(sun_altitude(np.array([row.mjd]), sites[row.camera])[0])
-        if high > _NIGHT:
-            found.append((high, row))
-    if not found:
+        if exposure.camera not in sites:
+            sites[exposure.camera] = Site.from_mission(image_types.section(exposure.camera), mission)
+        altitude = float(sun_altitude(np.array([exposure.mjd]), sites[exposure.camera])[0])
+        if altitude > _NIGHT_SUN_ALTITUDE:
+            daytime.append((altitude, exposure))
+    if not daytime:
         return ""
-    high, row = max(found, key=lambda one: one[0])
-    what = f"{len(found)} of {count} exposures of the sky are dated when the Sun is above {_NIGHT:g} deg"
-    where = f"{row.camera} on MJD {row.mjd:.3f}, the Sun at {high:+.0f} deg"
-    return f"EXT: {what} ({where}): their sky has no light of the Sun; without a date a survey observes at night"
+    altitude, exposure = max(daytime, key=lambda entry: entry[0])
+    summary = (
+        f"{len(daytime)} of {count} exposures of the sky are dated when the Sun is above {_NIGHT_SUN_ALTITUDE:g} deg"
+    )
+    example = f"{exposure.camera} on MJD {exposure.mjd:.3f}, the Sun at {altitude:+.0f} deg"
+    return f"EXT: {summary} ({example}): their sky has no light of the Sun; without a date a survey observes at night"
 
 
 # ------------------------------------------------------------------------------------------------ tables
@@ -218,29 +230,29 @@ def read(path: Path, block: Observation, mission: MissionConfiguration) -> list[
     Errors : BadInput names the file, the line and the column
     """
     rows = pointing_tables.read(path, block.channels, block.image_type)
-    return [_of_row(row, number, block, mission) for number, row in enumerate(rows, start=1)]
+    return [_exposure_of_row(row, number, block, mission) for number, row in enumerate(rows, start=1)]
 
 
-def _of_row(row: Row, number: int, block: Observation, mission: MissionConfiguration) -> Exposure:
+def _exposure_of_row(row: Row, number: int, block: Observation, mission: MissionConfiguration) -> Exposure:
     camera = row.camera or camera_of(block.survey, mission)
     try:
         bands = bands_of(row.channel, camera, mission)
     except BadInput as error:
-        raise BadInput(f"{row.where}: {error}") from None
+        raise BadInput(f"{row.location}: {error}") from None
     if row.band not in bands:
-        raise BadInput(f"{row.where}: camera {camera} has no band {row.band!r} ({', '.join(bands)})")
+        raise BadInput(f"{row.location}: camera {camera} has no band {row.band!r} ({', '.join(bands)})")
     mjd, angle = row.mjd if row.mjd is not None else block.mjd, row.position_angle
-    euclid = row.channel != "EXT"
+    is_euclid = row.channel != "EXT"
     if mjd is None:
         mjd = mission.value("svm.launch", "d")
-        if euclid:
+        if is_euclid:
             mjd = next_allowed(row.ra, row.dec, mjd, mission)
         else:
-            mjd = next_dark(row.ra, row.dec, mjd, Site.of(image_types.section(camera), mission))
+            mjd = next_dark_time(row.ra, row.dec, mjd, Site.from_mission(image_types.section(camera), mission))
     if angle is None:
-        angle = position_angle(row.ra, row.dec, mjd) if euclid else 0.0
+        angle = position_angle(row.ra, row.dec, mjd) if is_euclid else 0.0
     seconds = block.exposure_time_s if row.exposure_time_s is None else row.exposure_time_s
-    found = Exposure(
+    exposure = Exposure(
         channel=row.channel,
         camera=camera,
         band=row.band,
@@ -259,4 +271,4 @@ def _of_row(row: Row, number: int, block: Observation, mission: MissionConfigura
         psf=row.psf,
         detectors=row.detectors or block.detectors,
     )
-    return through_grism(found, row.grism_angle, mission, f"{row.where}: grism_angle")
+    return through_grism(exposure, row.grism_angle, mission, f"{row.location}: grism_angle")

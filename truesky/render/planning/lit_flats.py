@@ -20,29 +20,33 @@ from truesky.render.planning.planned_exposures import Exposure, through_grism
 from truesky.request.observations import Observation
 
 # Of a lamp's light, over what the camera's bands see where they see best: with less a flat is not taken.
-_SEES = 0.05
+_MIN_RELATIVE_SIGNAL = 0.05
 
 
-def by_lamp(in_bands: Sequence[Exposure], block: Observation, mission: MissionConfiguration) -> list[list[Exposure]]:
+def by_lamp(
+    band_exposures: Sequence[Exposure], block: Observation, mission: MissionConfiguration
+) -> list[list[Exposure]]:
     """Of each lamp a flat in every band that sees it; lamps that no band sees are not lit.
 
     in_bands : a flat in each band;  block : of the request;  mission : the mission database
     Errors   : BadInput for a lamp of the block's that none of its bands sees, and where that are all of them
     """
-    camera, found = in_bands[0].camera, []
-    curves = {frame.band: passbands.load(frame.band) for frame in in_bands}
+    camera, flats = band_exposures[0].camera, []
+    curves = {frame.band: passbands.load(frame.band) for frame in band_exposures}
     for lamp in block.lamps or range(1, LAMPS[camera][0] + 1):
-        sees = {band: calibration_lamp.seen_in(curve, lamp, camera, mission) for band, curve in curves.items()}
-        lit = [replace(frame, lamp=lamp) for frame in in_bands if sees[frame.band] > _SEES]
+        signals = {
+            band: calibration_lamp.led_efficiency(curve, lamp, camera, mission) for band, curve in curves.items()
+        }
+        frames = [replace(frame, lamp=lamp) for frame in band_exposures if signals[frame.band] > _MIN_RELATIVE_SIGNAL]
         # Flats of spectra are taken with the grism in.
-        own = [through_grism(frame, None, mission) for frame in lit]
-        if block.lamps and not own:
+        lamp_flats = [through_grism(frame, None, mission) for frame in frames]
+        if block.lamps and not lamp_flats:
             raise BadInput(f"lamps: {lamp} does not shine in {', '.join(curves)}")
-        if own:
-            found.append(own)
-    if not found:
+        if lamp_flats:
+            flats.append(lamp_flats)
+    if not flats:
         raise BadInput(f"bands: no lamp shines in {', '.join(curves)}")
-    return found
+    return flats
 
 
 def at_levels(flat: Exposure, block: Observation, mission: MissionConfiguration) -> Iterator[Exposure]:
@@ -53,6 +57,6 @@ def at_levels(flat: Exposure, block: Observation, mission: MissionConfiguration)
         yield flat if intensity == 1.0 else replace(flat, parameters=(level,))
 
 
-def chosen(wanted: Sequence[str], own: Sequence[str]) -> Sequence[str]:
+def select_bands(requested: Sequence[str], channel_bands: Sequence[str]) -> Sequence[str]:
     """Those of a channel's bands that a block names, all where it names none of them."""
-    return [band for band in own if band in wanted] or own
+    return [band for band in channel_bands if band in requested] or channel_bands

@@ -10,7 +10,7 @@ from truesky.request.files import UserCurves
 from truesky.request.schema import MissionChoice, Request
 
 # What of a request decides which exposures are taken and what they cost.
-PARTS = ("seed", "area", "universe", "pointings", "observations", "explore", "truth", "psfs")
+PLAN_SECTIONS = ("seed", "area", "universe", "pointings", "observations", "explore", "truth", "psfs")
 
 
 def mission_of(choice: MissionChoice) -> MissionConfiguration:
@@ -21,14 +21,14 @@ def mission_of(choice: MissionChoice) -> MissionConfiguration:
 
 def user_filters(request: Request) -> tuple[dict[str, Passband], Json]:
     """The request's own passbands that it points in, by name, and their sha256 as facts of a plan."""
-    wanted = {pointing.band for pointing in request.pointings}
-    wanted |= {band for block in request.observations if block.table for band in block.table.bands}
-    given = UserCurves(tuple(own for own in request.curves.passbands if own[0] in wanted))
-    found, origins = inputs.filters(given)
-    if unknown := sorted(wanted - {*found, *passbands.names()}):
+    requested = {pointing.band for pointing in request.pointings}
+    requested |= {band for block in request.observations if block.table for band in block.table.bands}
+    curves = UserCurves(tuple(curve for curve in request.curves.passbands if curve[0] in requested))
+    bands, origins = inputs.read_passbands(curves)
+    if unknown := sorted(requested - {*bands, *passbands.names()}):
         raise BadInput(f"band {unknown[0]}: truesky has no passband of this name, and no curve is given for it")
-    for name, band in found.items():
+    for name, band in bands.items():
         if band.response.max() > 1.0:
-            what = f"responds with {band.response.max():.4g}: a pointing wants the fraction of photons detected"
-            raise BadInput(f"{dict(given.passbands)[name].place or inputs.FILTER + name}: {what}")
-    return found, {"files": {key: origin.sha256 for key, origin in origins.items()}} if found else {}
+            problem = f"responds with {band.response.max():.4g}: a pointing wants the fraction of photons detected"
+            raise BadInput(f"{dict(curves.passbands)[name].location or inputs.FILTER_PREFIX + name}: {problem}")
+    return bands, {"files": {key: origin.sha256 for key, origin in origins.items()}} if bands else {}

@@ -28,7 +28,7 @@ _DAY_S = 86400.0
 FILTERS = ("euclid_j", "euclid_h", "euclid_y")
 RED, BLUE = "nisp_red", "nisp_blue"
 # Angles at which spectra run in turn: survey.grism_angle_1 and so on.
-SETTINGS = 4
+N_GRISM_ANGLES = 4
 
 
 def offsets(pattern: str, mission: MissionConfiguration, seed: int, *key: int | str) -> Float:
@@ -47,7 +47,7 @@ def offsets(pattern: str, mission: MissionConfiguration, seed: int, *key: int | 
     return planned + np.cumsum(errors, axis=0)
 
 
-def sequence(
+def visit_exposures(
     field: Field, block: Observation, survey: str, mission: MissionConfiguration, seed: int
 ) -> Iterator[Exposure]:
     """The exposures of one visit of a field, in the order they begin.
@@ -57,7 +57,7 @@ def sequence(
     """
     if isinstance(block.dither, str):
         # Fields of the user's own have no number: their places tell them apart.
-        place = () if block.place is None else tuple(angle.hex() for angle in block.place)
+        place = () if block.field_centre is None else tuple(angle.hex() for angle in block.field_centre)
         steps = offsets(block.dither, mission, seed, survey, field.number, field.visit, *place)
         # The pattern is laid about the field's centre.
         steps = steps - steps.mean(axis=0)
@@ -68,24 +68,24 @@ def sequence(
     length = _dither_time(mission)
     for i in range(len(steps)):
         start = field.mjd + i * (length + mission.value("svm.dither_slew_time", "s")) / _DAY_S
-        at = _At(block, field, survey, mission, float(ra[i]), float(dec[i]), start, i + 1)
-        yield from at.exposures(last=i + 1 == len(steps))
+        dither = _Dither(block, field, survey, mission, float(ra[i]), float(dec[i]), start, i + 1)
+        yield from dither.exposures(is_last=i + 1 == len(steps))
 
 
 def _dither_time(mission: MissionConfiguration) -> float:
     """Seconds from the start of a dither to the end of its last filter."""
-    spectrum, photometry = (_commanded(kind, mission) for kind in ("spectroscopic", "photometric"))
-    settle, to_filter, wheel = _moves(mission)
+    spectrum, photometry = (_commanded_seconds(kind, mission) for kind in ("spectroscopic", "photometric"))
+    settle, to_filter, wheel = _move_times(mission)
     return settle + spectrum + to_filter + len(FILTERS) * photometry + (len(FILTERS) - 1) * wheel
 
 
-def _commanded(kind: str, mission: MissionConfiguration) -> float:
+def _commanded_seconds(kind: str, mission: MissionConfiguration) -> float:
     """Seconds that NISP is commanded to take; more where its ramps take longer."""
     seconds = exposure_time("NISP-S" if kind == "spectroscopic" else "NISP-P", "nisp", "", mission)
-    return max(mission.value(f"nisp.commanded_time_{kind}", "s"), ramp.elapsed(kind, seconds, "nisp", mission))
+    return max(mission.value(f"nisp.commanded_time_{kind}", "s"), ramp.duration(kind, seconds, "nisp", mission))
 
 
-def _moves(mission: MissionConfiguration) -> tuple[float, float, float]:
+def _move_times(mission: MissionConfiguration) -> tuple[float, float, float]:
     return (
         mission.value("svm.settle_time", "s"),
         mission.value("nisp.grism_to_filter_time", "s"),
@@ -94,7 +94,7 @@ def _moves(mission: MissionConfiguration) -> tuple[float, float, float]:
 
 
 @dataclass(frozen=True, slots=True)
-class _At:
+class _Dither:
     """One dither: where it points (deg), when it starts (MJD), its number from 1."""
 
     block: Observation
@@ -106,39 +106,39 @@ class _At:
     start: float
     dither: int
 
-    def exposures(self, last: bool) -> Iterator[Exposure]:
+    def exposures(self, is_last: bool) -> Iterator[Exposure]:
         block, mission = self.block, self.mission
         # A block may name some of the filters; VIS has but one.
         bands = set(block.bands) & set(FILTERS) or set(FILTERS)
-        settle, to_filter, wheel = _moves(mission)
+        settle, to_filter, wheel = _move_times(mission)
         if "VIS" in block.channels:
-            yield self._one("VIS", "euclid_vis", settle)
+            yield self._exposure("VIS", "euclid_vis", settle)
         if "NISP-S" in block.channels:
-            yield self._spectrum(settle)
-        begin = settle + _commanded("spectroscopic", mission) + to_filter
-        step = _commanded("photometric", mission) + wheel
+            yield self._spectral_exposure(settle)
+        begin = settle + _commanded_seconds("spectroscopic", mission) + to_filter
+        step = _commanded_seconds("photometric", mission) + wheel
         for i, band in enumerate(FILTERS):
             if "NISP-P" in block.channels and band in bands:
-                yield self._one("NISP-P", band, begin + i * step)
+                yield self._exposure("NISP-P", band, begin + i * step)
         if "VIS" in block.channels and block.short and self.dither == 1:
             # Beside the last filter (Serrano et al. 2024: in the first dither only).
             seconds = mission.value("vis.exposure_time_short", "s")
-            yield self._one("VIS", "euclid_vis", begin + (len(FILTERS) - 1) * step, seconds)
-        if "VIS" in block.channels and block.flat and last:
+            yield self._exposure("VIS", "euclid_vis", begin + (len(FILTERS) - 1) * step, seconds)
+        if "VIS" in block.channels and block.flat and is_last:
             seconds = mission.value("vis.exposure_time_flat", "s")
             # One LED after the other, from field to field and from visit to visit.
             lamp = (self.field.number + self.field.visit) % LEDS + 1
-            flat = self._one("VIS", "euclid_vis", _dither_time(mission), seconds)
+            flat = self._exposure("VIS", "euclid_vis", _dither_time(mission), seconds)
             yield replace(flat, image_type="flat", lamp=lamp)
 
-    def _spectrum(self, after: float) -> Exposure:
+    def _spectral_exposure(self, delay: float) -> Exposure:
         if self.block.blue and self.field.visit % 2 == 0:
-            return through_grism(self._one("NISP-S", BLUE, after), None, self.mission)
-        number = (self.dither - 1) % SETTINGS + 1
+            return through_grism(self._exposure("NISP-S", BLUE, delay), None, self.mission)
+        number = (self.dither - 1) % N_GRISM_ANGLES + 1
         angle = self.mission.value(f"survey.grism_angle_{number}", "deg")
-        return through_grism(self._one("NISP-S", RED, after), angle, self.mission, f"survey.grism_angle_{number}")
+        return through_grism(self._exposure("NISP-S", RED, delay), angle, self.mission, f"survey.grism_angle_{number}")
 
-    def _one(self, channel: str, band: str, after: float, seconds: float | None = None) -> Exposure:
+    def _exposure(self, channel: str, band: str, delay: float, seconds: float | None = None) -> Exposure:
         """One that begins `after` seconds of the dither's start;  seconds : it takes, None = the mission's."""
         camera = "vis" if channel == "VIS" else "nisp"
         nominal = exposure_time(channel, camera, band, self.mission)
@@ -150,7 +150,7 @@ class _At:
             ra=self.ra,
             dec=self.dec,
             position_angle=self.field.position_angle,
-            mjd=self.start + after / _DAY_S,
+            mjd=self.start + delay / _DAY_S,
             exposure_time_s=nominal if seconds is None else seconds,
             survey=self.survey,
             field=self.field.number,

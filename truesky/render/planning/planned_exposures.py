@@ -38,7 +38,7 @@ from truesky.request.observations import Observation
 GRISMS: Mapping[str, tuple[str, ...]] = {"nisp_red": ("RGS000", "RGS180"), "nisp_blue": ("BGS000",)}
 _DARK_TYPES = ("bias", "dark", "charge_injection", "trap_pumping", "persistence")
 # Columns that are counted here.
-_NUMBERS = ("exposure_id", "realisation", "airmass", "zenith")
+_COMPUTED_COLUMNS = ("exposure_id", "realisation", "airmass", "zenith")
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,10 +79,10 @@ class Exposure:
 
 def bands_of(channel: str, camera: str, mission: MissionConfiguration) -> tuple[str, ...]:
     """Passbands that a camera has; BadInput where the channel has no such camera."""
-    found = registry.CHANNELS[channel].bands(camera, mission)
-    if not found:
+    bands = registry.CHANNELS[channel].bands(camera, mission)
+    if not bands:
         raise BadInput(f"channel {channel} has no camera {camera!r}")
-    return found
+    return bands
 
 
 def through_grism(exposure: Exposure, angle: float | None, mission: MissionConfiguration, where: str = "") -> Exposure:
@@ -100,9 +100,9 @@ def through_grism(exposure: Exposure, angle: float | None, mission: MissionConfi
     angle, section = angle or 0.0, image_types.section(exposure.camera)
     tilts = [abs(grism_wheel.tilt(grism, angle, section, mission)) for grism in grisms]
     nearest = int(np.argmin(tilts))
-    if tilts[nearest] > grism_wheel.MOST_TURNED:
-        many = ", ".join(grisms)
-        raise BadInput(f"{where} = {angle:g} deg turns {many} by more than {grism_wheel.MOST_TURNED:g} deg")
+    if tilts[nearest] > grism_wheel.MAX_TILT:
+        names = ", ".join(grisms)
+        raise BadInput(f"{where} = {angle:g} deg turns {names} by more than {grism_wheel.MAX_TILT:g} deg")
     return replace(exposure, grism=grisms[nearest], grism_angle=angle)
 
 
@@ -112,18 +112,18 @@ def exposure_time(channel: str, camera: str, band: str, mission: MissionConfigur
     channel, camera, band : names;  mission : the mission database
     """
     if camera == "nisp":
-        kind = f"nisp.macc.{_ramp_of(channel)}"
+        kind = f"nisp.macc.{_ramp_name(channel)}"
         groups, reads, drops = (mission.value(f"{kind}.{part}") for part in ("groups", "reads", "drops"))
         return (groups - 1) * (reads + drops) * mission.value("nisp.frame_time", "s")
-    own = f"{image_types.section(camera)}.{band}.exposure_time"
-    return mission.value(own if own in mission else f"{image_types.section(camera)}.exposure_time", "s")
+    key = f"{image_types.section(camera)}.{band}.exposure_time"
+    return mission.value(key if key in mission else f"{image_types.section(camera)}.exposure_time", "s")
 
 
 def elapsed_time(exposure: Exposure, mission: MissionConfiguration) -> float:
     """Seconds from the start of an exposure until its detectors may be exposed again: of a ramp, to its last read."""
     if exposure.camera != "nisp":
         return exposure.exposure_time_s
-    return ramp.elapsed(_ramp_of(exposure.channel), exposure.exposure_time_s, exposure.camera, mission)
+    return ramp.duration(_ramp_name(exposure.channel), exposure.exposure_time_s, exposure.camera, mission)
 
 
 def check_ramp(channel: str, camera: str, seconds: float, mission: MissionConfiguration, where: str = "") -> None:
@@ -134,7 +134,7 @@ def check_ramp(channel: str, camera: str, seconds: float, mission: MissionConfig
     """
     if camera == "nisp":
         try:
-            ramp.mode_for(_ramp_of(channel), seconds, camera, mission)
+            ramp.find_mode(_ramp_name(channel), seconds, camera, mission)
         except BadInput as error:
             raise BadInput(f"{where}: {error}" if where else str(error)) from None
 
@@ -146,9 +146,11 @@ def check_macc(block: Observation, mission: MissionConfiguration) -> None:
     """
     if not block.macc or block.exposure_time_s is None:
         return
-    takes = exposure_time(channel_of_macc(block), "nisp", "", mission)
-    if abs(block.exposure_time_s / takes - 1.0) > ramp.FRAME_TOLERANCE:
-        raise BadInput(f"macc = {[*block.macc]} takes {takes:.4g} s, not exposure_time_s = {block.exposure_time_s:g}")
+    ramp_seconds = exposure_time(channel_of_macc(block), "nisp", "", mission)
+    if abs(block.exposure_time_s / ramp_seconds - 1.0) > ramp.FRAME_TOLERANCE:
+        raise BadInput(
+            f"macc = {[*block.macc]} takes {ramp_seconds:.4g} s, not exposure_time_s = {block.exposure_time_s:g}"
+        )
 
 
 def channel_of_macc(block: Observation) -> str:
@@ -156,23 +158,23 @@ def channel_of_macc(block: Observation) -> str:
     return "NISP-P" if "NISP-P" in block.channels else "NISP-S"
 
 
-def ramp_of(block: Observation) -> dict[str, tuple[float, str]]:
+def ramp_overrides(block: Observation) -> dict[str, tuple[float, str]]:
     """What a block's ramp changes of the mission: key -> (value, unit)."""
-    key = f"nisp.macc.{_ramp_of(channel_of_macc(block))}"
+    key = f"nisp.macc.{_ramp_name(channel_of_macc(block))}"
     return {f"{key}.{part}": (n, "") for part, n in zip(("groups", "reads", "drops"), block.macc, strict=False)}
 
 
-def _ramp_of(channel: str) -> str:
+def _ramp_name(channel: str) -> str:
     return "spectroscopic" if channel == "NISP-S" else "photometric"
 
 
 def table(
     exposures: Sequence[Exposure],
     missions: Sequence[MissionConfiguration],
-    own: Mapping[str, Passband] | None = None,
+    user_passbands: Mapping[str, Passband] | None = None,
     seed: int = 0,
     first: int = 1,
-    before: Iterable[Exposure] = (),
+    previous: Iterable[Exposure] = (),
 ) -> pa.Table:
     """Rows of the table `exposures`, numbered in their order.
 
@@ -184,25 +186,25 @@ def table(
     if not exposures:
         return EXPOSURES.empty()
     bands: dict[tuple[int, str, str, str], _Band] = {}
-    rows, taken = [], Counter(map(_alike, before))
+    rows, occurrences = [], Counter(map(_realisation_key, previous))
     for number, (exposure, mission) in enumerate(zip(exposures, missions, strict=True), start=first):
         key = (id(mission), exposure.channel, exposure.camera, exposure.band)
         if key not in bands:
-            bands[key] = _Band.of(exposure, mission, (own or {}).get(exposure.band))
+            bands[key] = _Band.from_exposure(exposure, mission, (user_passbands or {}).get(exposure.band))
         row = _row(number, exposure, bands[key], mission, seed)
-        alike = _alike(exposure)
-        taken[alike] += 1
-        rows.append({**row, "realisation": taken[alike]})
+        identity = _realisation_key(exposure)
+        occurrences[identity] += 1
+        rows.append({**row, "realisation": occurrences[identity]})
     return EXPOSURES.build({name: _column(name, [row[name] for row in rows]) for name in EXPOSURES.names})
 
 
-def _alike(e: Exposure) -> tuple[Any, ...]:
+def _realisation_key(e: Exposure) -> tuple[Any, ...]:
     """What two exposures have in common whose random numbers would be the same, of one request of an exploration."""
-    angle = _turned(e.position_angle)
+    angle = _wrap_angle(e.position_angle)
     return e.settings, e.camera, e.band, e.ra % 360.0, e.dec, angle, e.mjd, e.grism, e.grism_angle
 
 
-def _turned(angle: float) -> float:
+def _wrap_angle(angle: float) -> float:
     return (angle + 180.0) % 360.0 - 180.0
 
 
@@ -219,7 +221,7 @@ class _Band:
     curve: Passband | None = None
 
     @classmethod
-    def of(cls, exposure: Exposure, mission: MissionConfiguration, curve: Passband | None) -> _Band:
+    def from_exposure(cls, exposure: Exposure, mission: MissionConfiguration, curve: Passband | None) -> _Band:
         camera, band = exposure.camera, exposure.band
         prefix = image_types.section(camera)
         first = detectors.detectors(camera, mission)[0]
@@ -229,7 +231,7 @@ class _Band:
             return cls(zero_point, sky)
         seeing = mission.value(f"{prefix}.{band}.seeing", "arcsec")
         curve = curve or passbands.load(band)
-        night = Night.of(first, band, (zero_point, sky.constant), mission, curve)
+        night = Night.from_detector(first, band, (zero_point, sky.constant), mission, curve)
         return cls(zero_point, sky, seeing, mission.value(f"{prefix}.seeing_scatter", "dex"), night, first, curve)
 
 
@@ -240,30 +242,30 @@ def _column(name: str, values: list[Any]) -> Any:
 
 
 def _row(number: int, e: Exposure, band: _Band, mission: MissionConfiguration, seed: int) -> dict[str, Any]:
-    sky, night, fainter = e.sky, band.night, 0.0
+    sky, night, extinction_mag = e.sky, band.night, 0.0
     airmass: float | None = None
     zenith: float | None = None
     seeing = _seeing(e, band, seed) if e.seeing is None else e.seeing
     if night is not None and band.detector is not None and band.curve is not None:
         if e.psf is None:
             ground_psf.check(seeing, band.detector, band.curve, mission)
-        airmass, zenith = observatory.aloft(e.ra, e.dec, e.mjd, night.site)
-        fainter = night_sky.fainter(night, airmass)
-    own = registry.CHANNELS[e.channel]
-    if e.image_type in _DARK_TYPES or (own.on_ground and not own.sees_sky(e.image_type)):
+        airmass, zenith = observatory.airmass_and_zenith(e.ra, e.dec, e.mjd, night.site)
+        extinction_mag = night_sky.extra_extinction(night, airmass)
+    channel = registry.CHANNELS[e.channel]
+    if e.image_type in _DARK_TYPES or (channel.on_ground and not channel.sees_sky(e.image_type)):
         sky = 0.0
     elif sky is None and night is not None:
         sky = night_sky.sky_rate(night, e.ra, e.dec, e.mjd, mission)
     elif sky is None:
         sky = sky_rate(band.sky, e.ra, e.dec, e.mjd, mission)
     return {
-        **{name: getattr(e, name) for name in EXPOSURES.names if name not in _NUMBERS},
+        **{name: getattr(e, name) for name in EXPOSURES.names if name not in _COMPUTED_COLUMNS},
         "exposure_id": number,
         "ra": e.ra % 360.0,
-        "position_angle": _turned(e.position_angle),
+        "position_angle": _wrap_angle(e.position_angle),
         "sky": sky,
         "seeing": seeing,
-        "zero_point": band.zero_point - fainter if e.zero_point is None else e.zero_point,
+        "zero_point": band.zero_point - extinction_mag if e.zero_point is None else e.zero_point,
         "airmass": airmass,
         "zenith": zenith,
     }
@@ -278,7 +280,7 @@ def _seeing(e: Exposure, band: _Band, seed: int) -> float:
     return float(band.seeing * 10.0 ** (band.scatter * normal))
 
 
-def unturned(grism: str, mission: MissionConfiguration) -> ExposureRow:
+def untilted_exposure(grism: str, mission: MissionConfiguration) -> ExposureRow:
     """An exposure of a second through a grism that is not turned, at nothing in particular.
 
     grism : one of GRISMS;  mission : the mission database

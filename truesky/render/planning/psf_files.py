@@ -19,8 +19,8 @@ from truesky.render.psf import from_file
 
 def check(
     exposures: Iterable[tuple[Exposure, MissionConfiguration]],
-    own: Mapping[str, Passband],
-    given: Sequence[tuple[str, str]] = (),
+    user_passbands: Mapping[str, Passband],
+    request_psfs: Sequence[tuple[str, str]] = (),
 ) -> None:
     """Refuse exposures whose detectors have no PSF that can be read.
 
@@ -28,15 +28,15 @@ def check(
     own       : passbands besides the embedded ones
     given     : band and file of each PSF that the request draws an exposure's from
     """
-    seen: set[tuple[str, str, Path]] = set()
+    checked: set[tuple[str, str, Path]] = set()
     for exposure, mission in exposures:
         if exposure.psf is None:
             continue
-        drawn = [file for band, file in given if band == exposure.band]
-        files = drawn if exposure.psf in drawn else [exposure.psf]
+        candidates = [file for band, file in request_psfs if band == exposure.band]
+        files = candidates if exposure.psf in candidates else [exposure.psf]
         for file, detector in product(files, detectors.detectors(exposure.camera, mission)):
-            path = from_file.file_of(file, detector.name)
-            wanted = not exposure.detectors or detector.name in exposure.detectors
-            if wanted and (exposure.camera, exposure.band, path) not in seen:
-                seen.add((exposure.camera, exposure.band, path))
-                from_file.read(path, detector, own.get(exposure.band) or passbands.load(exposure.band))
+            path = from_file.path_for_detector(file, detector.name)
+            is_used = not exposure.detectors or detector.name in exposure.detectors
+            if is_used and (exposure.camera, exposure.band, path) not in checked:
+                checked.add((exposure.camera, exposure.band, path))
+                from_file.read(path, detector, user_passbands.get(exposure.band) or passbands.load(exposure.band))

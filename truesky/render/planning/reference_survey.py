@@ -28,7 +28,7 @@ from truesky.request.area import Area
 # Half the diagonal of the field of view, deg: fields whose centre is nearer to an area than this may see it.
 _REACH = 0.52
 # The Sun's largest daily motion, deg; how many half-years are looked through for a free date.
-_SUN_RATE, _MOST_SEASONS = 1.02, 40
+_SUN_RATE, _MAX_SEASONS = 1.02, 40
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,15 +92,15 @@ def _dates(
     lon: Float, lat: Float, start: float, mission: MissionConfiguration, visits: int
 ) -> Iterator[tuple[int, int, float]]:
     """(field, visit, MJD): each visit in a season of its own, whoever's season ends first goes first."""
-    before, after = _windows(lat, mission)
+    days_before, days_after = _windows(lat, mission)
     slot = mission.value("svm.field_time", "d")
     # A field is at right angles to the Sun twice a year; seasons are counted from the first that is not over.
     waiting: list[tuple[float, float, int, int, int]] = []
     for i in range(len(lon)):
         season = _season(float(lon[i]), start, 0)
-        first = 0 if season + float(after[i]) >= start + slot else 1
+        first = 0 if season + float(days_after[i]) >= start + slot else 1
         middle = _season(float(lon[i]), start, first)
-        heapq.heappush(waiting, (middle - float(before[i]), middle + float(after[i]), i, 0, first))
+        heapq.heappush(waiting, (middle - float(days_before[i]), middle + float(days_after[i]), i, 0, first))
     ready: list[tuple[float, float, int, int, int]] = []
     now = start
     while waiting or ready:
@@ -116,10 +116,16 @@ def _dates(
             yield i, visit, now
             now += slot
         if not done or visit + 1 < visits:
-            if season_number >= _MOST_SEASONS:
-                raise BadInput(f"{len(lon)} fields of {visits} visits do not fit into {_MOST_SEASONS // 2} years")
+            if season_number >= _MAX_SEASONS:
+                raise BadInput(f"{len(lon)} fields of {visits} visits do not fit into {_MAX_SEASONS // 2} years")
             middle = _season(float(lon[i]), start, season_number + 1)
-            entry = (middle - float(before[i]), middle + float(after[i]), i, visit + int(done), season_number + 1)
+            entry = (
+                middle - float(days_before[i]),
+                middle + float(days_after[i]),
+                i,
+                visit + int(done),
+                season_number + 1,
+            )
             heapq.heappush(waiting, entry)
 
 
@@ -142,8 +148,8 @@ def _windows(lat: Float, mission: MissionConfiguration) -> tuple[Float, Float]:
 def _season(lon: float, start: float, number: int) -> float:
     """MJD of the number-th time after `start` at which the Sun is 90 deg from an ecliptic longitude."""
     half_turns = 0.5 * 365.2422 * number
-    wanted = (lon - 90.0 - sun_longitude(start)) % 180.0
-    date = start + wanted / 360.0 * 365.2422 + half_turns
+    remaining_angle = (lon - 90.0 - sun_longitude(start)) % 180.0
+    date = start + remaining_angle / 360.0 * 365.2422 + half_turns
     for _ in range(4):
         error = (lon - 90.0 - sun_longitude(date) + 90.0) % 180.0 - 90.0
         date += error / 360.0 * 365.2422
@@ -160,7 +166,7 @@ def deep(area: Area, mission: MissionConfiguration, start: float, visits: int, c
     area  : of the request;  mission : the mission database
     start : MJD before which nothing is observed;  visits : of the field
     """
-    ra0, dec0, _ = area.bounds()
+    ra0, dec0, _ = area.bounding_circle()
     lon, lat = (float(x) for x in ecliptic(ra0, dec0))
     fields: list[Field] = []
     now = start
@@ -168,8 +174,8 @@ def deep(area: Area, mission: MissionConfiguration, start: float, visits: int, c
         now = max(now, date)
         angle = position_angle(ra0, dec0, now)
         for number, (ra, dec) in enumerate(_raster(area, ra0, dec0, angle, mission, count), start=1):
-            at = position_angle(ra, dec, now)
-            fields.append(Field(number, visit + 1, ra, dec, at, now))
+            field_angle = position_angle(ra, dec, now)
+            fields.append(Field(number, visit + 1, ra, dec, field_angle, now))
             now += mission.value("svm.field_time", "d")
     return fields
 
@@ -193,19 +199,19 @@ def _raster(
     area: Area, ra0: float, dec0: float, angle: float, mission: MissionConfiguration, count: int
 ) -> Sequence[tuple[float, float]]:
     step_x, step_y = (mission.value(f"survey.step_{axis}", "deg") for axis in "xy")
-    reach = area.bounds()[2] + _REACH
+    reach = area.bounding_circle()[2] + _REACH
     nx, ny = (int(np.ceil(reach / step)) for step in (step_x, step_y))
     x, y = np.meshgrid(np.arange(-nx, nx + 1) * step_x, np.arange(-ny, ny + 1) * step_y)
     ra, dec = pointing.sky_of_plane(x.ravel() * 3600.0, y.ravel() * 3600.0, ra0, dec0, angle)
     depth = area.depth(ra, dec)
-    kept = np.flatnonzero(depth >= -_REACH) if not count else np.sort(np.argsort(-depth, kind="stable")[:count])
-    return [(float(ra[i]), float(dec[i])) for i in kept]
+    inside = np.flatnonzero(depth >= -_REACH) if not count else np.sort(np.argsort(-depth, kind="stable")[:count])
+    return [(float(ra[i]), float(dec[i])) for i in inside]
 
 
 # ------------------------------------------------------------------------------------------------ a field of one's own
 
 
-def own(
+def user_field_visits(
     place: tuple[float, float], mission: MissionConfiguration, start: float, visits: int, angle: float | None = None
 ) -> list[Field]:
     """Visits of a field, one after another, each at the first date that the Sun allows.
@@ -217,7 +223,7 @@ def own(
     now = start
     for visit in range(visits):
         now = next_allowed(*place, now, mission)
-        turned = position_angle(*place, now) if angle is None else angle
-        fields.append(Field(1, visit + 1, *place, turned, now))
+        visit_angle = position_angle(*place, now) if angle is None else angle
+        fields.append(Field(1, visit + 1, *place, visit_angle, now))
         now += mission.value("svm.field_time", "d")
     return fields

@@ -29,7 +29,7 @@ class Densities:
     """
 
     def __init__(self, mission: MissionConfiguration, universe: Universe, catalogues: Sequence[Version] = ()) -> None:
-        self.published = [_published(version) for version in catalogues]
+        self.published = [_catalogue_density(version) for version in catalogues]
         counts = np.array(mission.numbers("survey.galaxy_counts"))
         self.galaxies = float(np.exp(np.interp(universe.galaxy_limit, counts[:, 0], np.log(counts[:, 1]))))
         stars = np.array(mission.numbers("survey.star_counts"))
@@ -44,23 +44,23 @@ class Densities:
         model = self._model(ra, dec)
         if not self.published:
             return model
-        cells = [int(cell) for cell in sky.cell_of(ra, dec, GENERATION_ORDER)]
-        found = np.array([[table.get(cell, np.nan) for cell in cells] for table in self.published])
-        return np.where(np.isfinite(found).all(axis=0), found, model)
+        cells = [int(cell) for cell in sky.cell_at(ra, dec, GENERATION_ORDER)]
+        published = np.array([[table.get(cell, np.nan) for cell in cells] for table in self.published])
+        return np.where(np.isfinite(published).all(axis=0), published, model)
 
     def _model(self, ra: Float, dec: Float) -> Float:
         lon, lat = sky.galactic(ra, dec)
-        beside = (lon + 180.0) % 360.0 - 180.0
-        i = np.clip(np.searchsorted(self.lon, beside, "right") - 1, 0, self.lon.size - 2)
+        wrapped_lon = (lon + 180.0) % 360.0 - 180.0
+        i = np.clip(np.searchsorted(self.lon, wrapped_lon, "right") - 1, 0, self.lon.size - 2)
         j = np.clip(np.searchsorted(self.lat, lat, "right") - 1, 0, self.lat.size - 2)
-        s = (beside - self.lon[i]) / (self.lon[i + 1] - self.lon[i])
+        s = (wrapped_lon - self.lon[i]) / (self.lon[i + 1] - self.lon[i])
         t = (lat - self.lat[j]) / (self.lat[j + 1] - self.lat[j])
         low = (1 - s) * self.stars[i, j] + s * self.stars[i + 1, j]
         high = (1 - s) * self.stars[i, j + 1] + s * self.stars[i + 1, j + 1]
         return np.stack([np.full(lon.shape, self.galaxies), np.exp((1 - t) * low + t * high)])
 
 
-def _published(version: Version) -> dict[int, float]:
+def _catalogue_density(version: Version) -> dict[int, float]:
     """Density of each generation cell that a catalogue covers: that of its file."""
     density: dict[int, float] = {}
     for part in version.manifest["parts"]:
@@ -68,6 +68,6 @@ def _published(version: Version) -> dict[int, float]:
         order, file = layout.cell_of_file(part["name"])
         if any(cell >> 2 * (GENERATION_ORDER - order) != file for cell in cells):
             raise BadInput(f"table {version.table}: part {part['name']} names cells of another file")
-        mean = version.part_rows(part["name"]) / (len(cells) * sky.cell_area(GENERATION_ORDER))
+        mean = version.partition_rows(part["name"]) / (len(cells) * sky.cell_area(GENERATION_ORDER))
         density.update(dict.fromkeys(cells, mean))
     return density

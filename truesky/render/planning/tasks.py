@@ -31,18 +31,18 @@ from truesky.render.camera import amplifiers, pointing
 from truesky.render.camera import detectors as camera_detectors
 from truesky.render.channels import registry
 from truesky.render.effects.readout import adc
-from truesky.render.exposure import persistence, scene_of
+from truesky.render.exposure import persistence, scene_factory
 from truesky.render.exposure.records import Variant
 from truesky.render.planning import variants
+from truesky.render.planning.detector_costs import CostModel, OutputFiles, cost_model
 from truesky.render.planning.planned_exposures import Exposure
-from truesky.render.planning.prices import Files, Price, price
 from truesky.render.planning.source_counts import Densities
 from truesky.request.accuracy import SURVEY, Accuracy
 from truesky.request.schema import Request
 
-_ITS_OWN = Files()
+_DETECTOR_FILES = OutputFiles()
 # Pointings whose detectors' cells are found at once: within so many deg of the first, and as many.
-_TOGETHER, _MOST_TOGETHER = 0.5, 16
+_GROUP_RADIUS, _MAX_GROUP = 0.5, 16
 _POLYGON = "POLYGON ICRS " + " ".join(["%.7f"] * 8)
 
 # ------------------------------------------------------------------------------------------------ tasks
@@ -56,7 +56,7 @@ def table(
     truth: Sequence[str] = (),
     accuracy: Accuracy = SURVEY,
     forced: Mapping[str, bool] | None = None,
-    files: Files = _ITS_OWN,
+    files: OutputFiles = _DETECTOR_FILES,
 ) -> pa.Table:
     """Rows of the table `tasks`.
 
@@ -67,34 +67,42 @@ def table(
     """
     pairs = set(zip(exposures["camera"].to_pylist(), exposures["channel"].to_pylist(), strict=True))
     cameras = {pair: _Camera(*pair, mission) for pair in pairs}
-    rows = [ExposureRow.of(row) for row in exposures.to_pylist()]
-    looking = {_where(row, cameras): cameras[row.camera, row.channel] for row in rows}
-    places = dict(zip(looking, _places(looking, densities), strict=True))
-    prices: dict[tuple[Any, ...], Price] = {}
-    planned: list[_Planned] = []
-    for row, wanted in zip(rows, detectors, strict=True):
+    rows = [ExposureRow.from_row(row) for row in exposures.to_pylist()]
+    camera_by_pointing = {_pointing_key(row, cameras): cameras[row.camera, row.channel] for row in rows}
+    places = dict(zip(camera_by_pointing, _places(camera_by_pointing, densities), strict=True))
+    costs: dict[tuple[Any, ...], CostModel] = {}
+    planned: list[_ExposureTasks] = []
+    for row, detector_names in zip(rows, detectors, strict=True):
         kind = (row.camera, row.channel, row.image_type, row.exposure_time_s, row.lamp, row.settings)
-        if kind not in prices:
-            own = variants.variant(row.settings, mission, accuracy, forced or {})
-            prices[kind] = _price(row, own, truth, files)
+        if kind not in costs:
+            variant = variants.variant(row.settings, mission, accuracy, forced or {})
+            costs[kind] = _cost_of_exposure(row, variant, truth, files)
         camera = cameras[row.camera, row.channel]
-        planned.append(_Planned.of(row, wanted, camera, places[_where(row, cameras)], prices[kind]))
+        planned.append(
+            _ExposureTasks.from_exposure(row, detector_names, camera, places[_pointing_key(row, cameras)], costs[kind])
+        )
     return _rows(planned, list(places.values()))
 
 
-def _remembering(exposures: pa.Table) -> set[str]:
+def _cameras_with_persistence(exposures: pa.Table) -> set[str]:
     """Cameras of the exposures whose detectors have something left of those before."""
-    kinds = zip(exposures["camera"].to_pylist(), exposures["channel"].to_pylist(), strict=True)
-    return {camera for camera, channel in dict.fromkeys(kinds) if registry.CHANNELS[channel].remembers is not None}
+    camera_channels = zip(exposures["camera"].to_pylist(), exposures["channel"].to_pylist(), strict=True)
+    return {
+        camera
+        for camera, channel in dict.fromkeys(camera_channels)
+        if registry.CHANNELS[channel].persistence_effect is not None
+    }
 
 
-def remembered(exposures: pa.Table, mission: MissionConfiguration) -> float:
+def persistence_days(exposures: pa.Table, mission: MissionConfiguration) -> float:
     """How long before one of the exposures another leaves something in its detectors, days; 0 where none does."""
-    return max((persistence.window(camera, mission) for camera in _remembering(exposures)), default=0.0)
+    return max(
+        (persistence.window_days(camera, mission) for camera in _cameras_with_persistence(exposures)), default=0.0
+    )
 
 
-def remembering(
-    rows: pa.Table, exposures: pa.Table, plan: Iterable[Exposure], mission: MissionConfiguration
+def add_persistence_cost(
+    rows: pa.Table, exposures: pa.Table, candidates: Iterable[Exposure], mission: MissionConfiguration
 ) -> pa.Table:
     """Rows of `tasks` with the time that it takes to draw anew what earlier exposures left in the detectors.
 
@@ -102,36 +110,36 @@ def remembering(
     plan      : exposures that begin while these do, or before them as long as some are remembered
     Error     : as if each exposure were of all detectors
     """
-    if not (cameras := _remembering(exposures)):
+    if not (cameras := _cameras_with_persistence(exposures)):
         return rows
-    left: dict[str, dict[float, float]] = {camera: {} for camera in cameras}
-    for one in plan:
-        channel = registry.CHANNELS[one.channel]
+    redraw_cost: dict[str, dict[float, float]] = {camera: {} for camera in cameras}
+    for candidate in candidates:
+        channel = registry.CHANNELS[candidate.channel]
         # Of those that begin at once one has been.
-        if one.camera in cameras and channel.sees_sky(one.image_type):
-            left[one.camera][one.mjd] = channel.cost.again_s
-    more = {}
+        if candidate.camera in cameras and channel.sees_sky(candidate.image_type):
+            redraw_cost[candidate.camera][candidate.mjd] = channel.cost.redraw_s
+    extra_seconds = {}
     # Whole microseconds: sums of a part are those of the whole.
-    for camera, dated in left.items():
-        days = persistence.window(camera, mission)
-        began = np.array(sorted(dated))
-        total = np.cumsum([0, *(round(1e6 * dated[mjd]) for mjd in began.tolist())])
+    for camera, cost_by_mjd in redraw_cost.items():
+        days = persistence.window_days(camera, mission)
+        start_mjds = np.array(sorted(cost_by_mjd))
+        total = np.cumsum([0, *(round(1e6 * cost_by_mjd[mjd]) for mjd in start_mjds.tolist())])
         for row in exposures.select(["exposure_id", "camera", "channel", "mjd"]).to_pylist():
-            if row["camera"] == camera and registry.CHANNELS[row["channel"]].remembers is not None:
-                first, last = np.searchsorted(began, (row["mjd"] - days, row["mjd"]))
-                more[row["exposure_id"]] = 1e-6 * float(total[last] - total[first])
-    own = [more.get(number, 0.0) for number in rows["exposure_id"].to_pylist()]
-    at = rows.schema.get_field_index("seconds")
-    seconds = pa.array(rows["seconds"].to_numpy() + np.array(own), rows.schema.field(at).type)
-    return _longest_first(rows.set_column(at, rows.schema.field(at), seconds))
+            if row["camera"] == camera and registry.CHANNELS[row["channel"]].persistence_effect is not None:
+                first, last = np.searchsorted(start_mjds, (row["mjd"] - days, row["mjd"]))
+                extra_seconds[row["exposure_id"]] = 1e-6 * float(total[last] - total[first])
+    task_seconds = [extra_seconds.get(number, 0.0) for number in rows["exposure_id"].to_pylist()]
+    column = rows.schema.get_field_index("seconds")
+    seconds = pa.array(rows["seconds"].to_numpy() + np.array(task_seconds), rows.schema.field(column).type)
+    return _longest_first(rows.set_column(column, rows.schema.field(column), seconds))
 
 
-def _where(row: ExposureRow, cameras: Mapping[tuple[str, str], _Camera]) -> tuple[Any, ...]:
+def _pointing_key(row: ExposureRow, cameras: Mapping[tuple[str, str], _Camera]) -> tuple[Any, ...]:
     """What exposures have in common whose detectors look at the same places."""
     return row.camera, cameras[row.camera, row.channel].margin, row.ra, row.dec, row.position_angle
 
 
-def in_order(tasks: pa.Table) -> pa.Table:
+def sort_by_cost(tasks: pa.Table) -> pa.Table:
     """Rows of several parts, longest first; of one part they are already."""
     return tasks.combine_chunks() if tasks["exposure_id"].num_chunks < 2 else _longest_first(tasks)
 
@@ -141,18 +149,18 @@ def _longest_first(tasks: pa.Table) -> pa.Table:
     return tasks.sort_by(keys).combine_chunks()
 
 
-def part(tasks: pa.Table, request: Request) -> list[dict[str, Any]]:
+def select_requested(tasks: pa.Table, request: Request) -> list[dict[str, Any]]:
     """Rows of the request's detectors, the first so many of them by exposure and name where it has a limit.
 
     Errors : BadInput where no exposure has a detector of that name, or the limit leaves none
     """
-    narrowed = Narrowed(request)
-    found: list[dict[str, Any]] = narrowed.of(tasks).to_pylist()
-    narrowed.refuse_unknown()
-    return found
+    selection = TaskSelection(request)
+    rows: list[dict[str, Any]] = selection.select(tasks).to_pylist()
+    selection.refuse_unknown()
+    return rows
 
 
-class Narrowed:
+class TaskSelection:
     """What is wanted of tasks that come a part after the other, in the order of their exposures.
 
     Errors : BadInput where the request's limit leaves none
@@ -161,36 +169,36 @@ class Narrowed:
     def __init__(self, request: Request) -> None:
         if request.limit is not None and request.limit < 1:
             raise BadInput(f"limit = {request.limit} leaves no detector")
-        self.request, self._left = request, request.limit
-        self._known: set[str] = set()
+        self.request, self._remaining = request, request.limit
+        self._planned_names: set[str] = set()
 
     @property
-    def is_narrow(self) -> bool:
+    def is_restricted(self) -> bool:
         """Whether anything may be left out."""
         return bool(self.request.detectors) or self.request.limit is not None
 
     @property
     def is_done(self) -> bool:
         """Whether nothing is wanted of what comes yet."""
-        return self._left == 0 and {*self.request.detectors} <= self._known
+        return self._remaining == 0 and {*self.request.detectors} <= self._planned_names
 
-    def of(self, tasks: pa.Table) -> pa.Table:
+    def select(self, tasks: pa.Table) -> pa.Table:
         """Rows of the request's detectors, as long as there are not too many."""
         if self.request.detectors:
-            self._known |= {*tasks["detector"].unique().to_pylist()}
+            self._planned_names |= {*tasks["detector"].unique().to_pylist()}
             tasks = tasks.filter(pc.is_in(tasks["detector"], pa.array(self.request.detectors, pa.string())))
-        if self._left is not None:
+        if self._remaining is not None:
             order = pc.sort_indices(tasks, [("exposure_id", "ascending"), ("detector", "ascending")])
-            tasks = tasks.take(pa.array(np.sort(order.slice(0, self._left).to_numpy())))
-            self._left -= tasks.num_rows
+            tasks = tasks.take(pa.array(np.sort(order.slice(0, self._remaining).to_numpy())))
+            self._remaining -= tasks.num_rows
         return tasks
 
     def refuse_unknown(self) -> None:
         """BadInput where none of the tasks had a detector that the request names."""
-        if unknown := sorted({*self.request.detectors} - self._known):
-            plan = f"the plan of request {self.request.name}"
-            some = ", ".join(sorted(self._known)[:4])
-            raise BadInput(f"detectors: {unknown[0]} is not in {plan}, which has {some}, ...")
+        if unknown := sorted({*self.request.detectors} - self._planned_names):
+            plan_name = f"the plan of request {self.request.name}"
+            examples = ", ".join(sorted(self._planned_names)[:4])
+            raise BadInput(f"detectors: {unknown[0]} is not in {plan_name}, which has {examples}, ...")
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,65 +216,69 @@ class _Places:
 
 
 @dataclass(frozen=True, slots=True)
-class _Planned:
+class _ExposureTasks:
     """The detectors of an exposure that are wanted: where they look, by number, and what each will cost."""
 
     exposure_id: int
     channel: str
-    looks: bool
-    places: Int
+    sees_sky: bool
+    place_numbers: Int
     sources: Int
     seconds: Float
     memory: Float
     bytes: Int
 
     @classmethod
-    def of(cls, row: ExposureRow, wanted: tuple[str, ...], camera: _Camera, places: _Places, cost: Price) -> _Planned:
-        looks = row.image_type in registry.CHANNELS[row.channel].sky_types
-        chosen = [camera.index[name] for name in dict.fromkeys(wanted)] or range(len(camera.detectors))
-        which = np.array(chosen, np.int64)
-        galaxies, stars = places.density[:, which] * (camera.area[which] * looks)
-        pixels = camera.pixels[which]
+    def from_exposure(
+        cls, row: ExposureRow, detector_names: tuple[str, ...], camera: _Camera, places: _Places, cost: CostModel
+    ) -> _ExposureTasks:
+        sees_sky = row.image_type in registry.CHANNELS[row.channel].sky_types
+        selected = [camera.index[name] for name in dict.fromkeys(detector_names)] or range(len(camera.detectors))
+        indices = np.array(selected, np.int64)
+        galaxies, stars = places.density[:, indices] * (camera.area[indices] * sees_sky)
+        pixels = camera.pixels[indices]
         return cls(
             row.exposure_id,
             row.channel,
-            looks,
-            places.first + which,
+            sees_sky,
+            places.first + indices,
             np.ceil(galaxies + stars).astype(np.int64),
             cost.seconds(pixels, galaxies, stars),
             cost.memory(pixels),
-            cost.bytes(pixels, camera.read[which]),
+            cost.bytes(pixels, camera.read_pixels[indices]),
         )
 
 
-def _rows(planned: Sequence[_Planned], places: Sequence[_Places]) -> pa.Table:
+def _rows(planned: Sequence[_ExposureTasks], places: Sequence[_Places]) -> pa.Table:
     """The detectors of all exposures, longest first."""
     if not planned:
         return TASKS.empty()
-    numbers = np.array([one.exposure_id for one in planned], np.int64)
-    channels = np.array([one.channel for one in planned], object)
-    of = np.repeat(np.arange(len(planned)), [len(one.places) for one in planned])
-    where = np.concatenate([one.places for one in planned])
-    names = np.array([name for one in places for name in one.names], object)
-    seconds = np.concatenate([one.seconds for one in planned])
-    order = np.lexsort((_ranks(names)[where], numbers[of], -seconds))
-    of, where = of[order], where[order]
-    regions = np.array([region for one in places for region in one.regions], object)
-    looks = np.array([one.looks for one in planned])
-    lists, none = _lists([cells for one in places for cells in one.cells])
-    sky_of = {name: np.concatenate([getattr(one, name) for one in places])[where] for name in ("ra", "dec", "radius")}
+    numbers = np.array([item.exposure_id for item in planned], np.int64)
+    channels = np.array([item.channel for item in planned], object)
+    exposure_index = np.repeat(np.arange(len(planned)), [len(item.place_numbers) for item in planned])
+    place_index = np.concatenate([item.place_numbers for item in planned])
+    names = np.array([name for item in places for name in item.names], object)
+    seconds = np.concatenate([item.seconds for item in planned])
+    order = np.lexsort((_ranks(names)[place_index], numbers[exposure_index], -seconds))
+    exposure_index, place_index = exposure_index[order], place_index[order]
+    regions = np.array([region for item in places for region in item.regions], object)
+    sees_sky = np.array([item.sees_sky for item in planned])
+    cell_lists, empty_list = _cell_lists([cells for item in places for cells in item.cells])
+    sky_of = {
+        name: np.concatenate([getattr(item, name) for item in places])[place_index] for name in ("ra", "dec", "radius")
+    }
     costs = {
-        name: np.concatenate([getattr(one, name) for one in planned])[order]
+        name: np.concatenate([getattr(item, name) for item in planned])[order]
         for name in ("sources", "seconds", "memory", "bytes")
     }
     return TASKS.build(
         {
-            "exposure_id": numbers[of],
-            "detector": names[where],
-            "channel": channels[of],
+            "exposure_id": numbers[exposure_index],
+            "detector": names[place_index],
+            "channel": channels[exposure_index],
             **sky_of,
-            "cells": lists.take(pa.array(np.where(looks[of], where, none))),
-            "s_region": regions[where],
+            "cells": cell_lists.take(pa.array(np.where(sees_sky[exposure_index], place_index, empty_list))),
+            "s_region": regions[place_index],
             **costs,
         }
     )
@@ -277,7 +289,7 @@ def _ranks(names: npt.NDArray[np.object_]) -> Int:
     return np.unique(names.astype(str), return_inverse=True)[1]
 
 
-def _lists(cells: Sequence[Int]) -> tuple[pa.ListArray, int]:
+def _cell_lists(cells: Sequence[Int]) -> tuple[pa.ListArray, int]:
     """Lists of cells, and the number of one more that is empty."""
     ends = np.cumsum([0, *map(len, cells), 0], dtype=np.int32)
     return pa.ListArray.from_arrays(ends, np.concatenate([*cells, np.empty(0, np.int64)])), len(cells)
@@ -301,56 +313,58 @@ class _Camera:
         self.radius = (reach + self.margin) / 3600.0
         self.pixels = np.array([detector.nx * detector.ny for detector in self.detectors])
         layouts = [amplifiers.layout(detector, mission) for detector in self.detectors]
-        read = [layout and math.prod(layout.raw_shape) for layout in layouts]
-        self.read = np.array([n or pixels for n, pixels in zip(read, self.pixels, strict=True)])
+        raw_pixels = [layout and math.prod(layout.raw_shape) for layout in layouts]
+        self.read_pixels = np.array([n or pixels for n, pixels in zip(raw_pixels, self.pixels, strict=True)])
         self.area = np.array([d.nx * d.ny * (d.pixel_scale / 3600.0) ** 2 for d in self.detectors])
 
 
-def _places(looking: Mapping[tuple[Any, ...], _Camera], densities: Densities) -> Iterator[_Places]:
+def _places(camera_by_pointing: Mapping[tuple[Any, ...], _Camera], densities: Densities) -> Iterator[_Places]:
     """Where the detectors look of each camera that points somewhere."""
-    first, waiting = 0, list(looking.items())
+    first, waiting = 0, list(camera_by_pointing.items())
     while waiting:
         # The dithers of a field: their detectors share most of their cells.
         _, _, ra, dec, _ = waiting[0][0]
-        near = (float(sky.separation(ra, dec, *place[2:4])) < _TOGETHER for place, _ in waiting[:_MOST_TOGETHER])
-        many = sum(1 for _ in takewhile(bool, near))
-        group, waiting = waiting[:many], waiting[many:]
+        close_flags = (float(sky.separation(ra, dec, *place[2:4])) < _GROUP_RADIUS for place, _ in waiting[:_MAX_GROUP])
+        n_close = sum(1 for _ in takewhile(bool, close_flags))
+        group, waiting = waiting[:n_close], waiting[n_close:]
         outlines = [pointing.sky_of_plane(camera.x, camera.y, *place[2:]) for place, camera in group]
-        lon, lat = (np.concatenate([one[axis] for one in outlines]) for axis in (0, 1))
+        lon, lat = (np.concatenate([outline[axis] for outline in outlines]) for axis in (0, 1))
         radius = np.concatenate([camera.radius for _, camera in group])
         cells = sky.cells_in_cones(lon[:, 0], lat[:, 0], radius, GENERATION_ORDER)
         corners = np.stack([lon[:, 1:], lat[:, 1:]], axis=2).reshape(len(lon), -1).tolist()
         density = densities.at(lon[:, 0], lat[:, 0])
         start = 0
         for _, camera in group:
-            own = slice(start, start + len(camera.names))
-            start = own.stop
+            in_camera = slice(start, start + len(camera.names))
+            start = in_camera.stop
             yield _Places(
                 first,
                 camera.names,
-                lon[own, 0],
-                lat[own, 0],
+                lon[in_camera, 0],
+                lat[in_camera, 0],
                 camera.radius,
-                cells[own],
-                [_POLYGON % tuple(some) for some in corners[own]],
-                density[:, own],
+                cells[in_camera],
+                [_POLYGON % tuple(polygon) for polygon in corners[in_camera]],
+                density[:, in_camera],
             )
             first += len(camera.names)
 
 
-def _price(row: ExposureRow, own: Variant, truth: Sequence[str], files: Files) -> Price:
+def _cost_of_exposure(row: ExposureRow, variant: Variant, truth: Sequence[str], files: OutputFiles) -> CostModel:
     """Of the detectors of an exposure.
 
     Somewhere on a detector there is light enough for every effect; of a frame without a sky the scene is known.
     """
     channel, kind = row.channel, row.image_type
-    looks = kind in registry.CHANNELS[channel].sky_types
-    effects = registry.CHANNELS[channel].read_as(files.readout).effects.get(kind)
+    sees_sky = kind in registry.CHANNELS[channel].sky_types
+    effects = registry.CHANNELS[channel].with_readout(files.readout).effects.get(kind)
     if effects is not None:
-        every = camera_detectors.detectors(row.camera, own.mission)
-        amplifiers.refuse_spread(every, own.mission)
-        scene = replace(scene_of.scene_of(row, every[0], own.mission, own.accuracy), forced=own.forced)
-        scene = scene_of.with_own_light(scene, registry.CHANNELS[channel], effects)
-        files = replace(files, wide=adc.pixel_type(scene) is np.int32)
-        effects = tuple(e for e in effects if own.forced.get(e.name, looks or e.needed_if(scene)))
-    return price(channel, looks, effects, own.accuracy, truth, files)
+        all_detectors = camera_detectors.detectors(row.camera, variant.mission)
+        amplifiers.refuse_spread(all_detectors, variant.mission)
+        scene = replace(
+            scene_factory.from_exposure(row, all_detectors[0], variant.mission, variant.accuracy), forced=variant.forced
+        )
+        scene = scene_factory.with_non_source_light(scene, registry.CHANNELS[channel], effects)
+        files = replace(files, has_32_bits=adc.pixel_type(scene) is np.int32)
+        effects = tuple(e for e in effects if variant.forced.get(e.name, sees_sky or e.is_needed(scene)))
+    return cost_model(channel, sees_sky, effects, variant.accuracy, truth, files)

@@ -13,7 +13,7 @@ from functools import cache
 from typing import Any
 
 from lake_schema.mission.configuration import MissionConfiguration
-from truesky.render.channels.image_types import OWN
+from truesky.render.channels.image_types import EXPOSURE_ONLY_PREFIX
 from truesky.render.exposure.records import Variant
 from truesky.request.accuracy import SURVEY, Accuracy
 from truesky.request.schema import Request
@@ -24,28 +24,33 @@ def variant(
 ) -> Variant:
     """The mission, accuracy and forced effects of an exposure, from its `settings`."""
     values: dict[str, Any] = json.loads(settings) if settings else {}
-    numbers = {k: (v[0], v[1]) for k, v in values.items() if k != "accuracy" and not k.startswith("effects.")}
-    explored = {k: v for k, v in numbers.items() if not k.startswith(OWN)}
+    parameters = {k: (v[0], v[1]) for k, v in values.items() if k != "accuracy" and not k.startswith("effects.")}
+    explored = {k: v for k, v in parameters.items() if not k.startswith(EXPOSURE_ONLY_PREFIX)}
     # What an exposure is taken with goes before what is explored.
-    overrides = {**explored, **{k.removeprefix(OWN): v for k, v in numbers.items() if k.startswith(OWN)}}
+    overrides = {
+        **explored,
+        **{
+            k.removeprefix(EXPOSURE_ONLY_PREFIX): v for k, v in parameters.items() if k.startswith(EXPOSURE_ONLY_PREFIX)
+        },
+    }
     effects = {k.removeprefix("effects."): bool(v) for k, v in values.items() if k.startswith("effects.")}
     return Variant(
-        mission.overridden_with(overrides) if overrides else mission,
+        mission.with_overrides(overrides) if overrides else mission,
         Accuracy(**values["accuracy"]) if "accuracy" in values else accuracy,
         {**forced, **effects},
     )
 
 
-def missions(mission: MissionConfiguration) -> Callable[[str | None], MissionConfiguration]:
+def mission_lookup(mission: MissionConfiguration) -> Callable[[str | None], MissionConfiguration]:
     """An exposure's settings -> its mission; mission : of the request."""
     return cache(lambda settings: variant(settings, mission, SURVEY, {}).mission)
 
 
-def own(parameters: Mapping[str, tuple[float, str]]) -> dict[str, tuple[float, str]]:
+def exposure_overrides(parameters: Mapping[str, tuple[float, str]]) -> dict[str, tuple[float, str]]:
     """Parameters that an exposure is taken with instead of the request's, as its settings have them."""
-    return {f"{OWN}{key}": value for key, value in parameters.items()}
+    return {f"{EXPOSURE_ONLY_PREFIX}{key}": value for key, value in parameters.items()}
 
 
-def forced(request: Request) -> dict[str, bool]:
+def forced_effects(request: Request) -> dict[str, bool]:
     """Effect -> on or off, of a request."""
     return {**dict.fromkeys(request.effects.on, True), **dict.fromkeys(request.effects.off, False)}

@@ -16,24 +16,27 @@ _INJECTED = ("charge_injection", "trap_pumping")
 def cards(exposure: ExposureRow, scene: Scene) -> tuple[Card, ...]:
     """Cards of an exposure besides its lamp and its target, () where its type has no parameters; scene : of it."""
     kind = exposure.image_type
-    found: tuple[Card, ...] = ()
+    type_cards: tuple[Card, ...] = ()
     if kind in _INJECTED:
-        found += (
+        type_cards += (
             ("INJLEVEL", scene.value("injection.level", "electron"), "[electron] injected into a pixel"),
             ("INJON", int(scene.value("injection.on", "pix")), "[pix] rows of a block that is injected"),
             ("INJOFF", int(scene.value("injection.off", "pix")), "[pix] rows before each block"),
         )
     if kind == "trap_pumping":
-        found += (
+        type_cards += (
             ("NSHUFFLE", int(scene.value("pumping.shuffles", "")), "cycles of trap pumping"),
             ("PHASETIM", scene.value("pumping.phase_time", "s"), "[s] under an electrode in a cycle"),
         )
     if kind == "defocus":
-        found += (("DEFOCUS", scene.value("psf.defocus", "nm"), "[nm] rms of the defocus, Noll's fourth term"),)
+        type_cards += (("DEFOCUS", scene.value("psf.defocus", "nm"), "[nm] rms of the defocus, Noll's fourth term"),)
     if exposure.target:
         magnitude, band = standard_stars.brightness(exposure, scene.mission)
-        found += (("TARGMAG", magnitude, "[mag] AB, of the calibration source"), ("TARGBAND", band, "band of TARGMAG"))
+        type_cards += (
+            ("TARGMAG", magnitude, "[mag] AB, of the calibration source"),
+            ("TARGBAND", band, "band of TARGMAG"),
+        )
     if kind == "stray_light":
         angle = scene.mission.value("survey.stray_light.distance", "deg")
-        found += (("TARGDIST", angle, "[deg] of the source from the boresight, along y"),)
-    return found
+        type_cards += (("TARGDIST", angle, "[deg] of the source from the boresight, along y"),)
+    return type_cards

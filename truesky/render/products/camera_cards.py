@@ -14,20 +14,20 @@ import numpy as np
 from lake_schema.fits.images import Card
 from truesky.render.camera import detectors, sections
 from truesky.render.camera.amplifiers import Amplifier
-from truesky.render.exposure.rendered import Rendered
+from truesky.render.exposure.rendered_detector import RenderedDetector
 from truesky.render.products import headers
 
 # What an observer of DECam calls an image type.
 _OBSTYPES = {"science": "object", "deep": "object", "flat": "dome flat", "dark": "dark", "bias": "zero"}
 
 
-def cards(rendered: Rendered) -> tuple[Card, ...]:
+def cards(rendered: RenderedDetector) -> tuple[Card, ...]:
     """Cards of a science file, beside those that all cameras have; none of a camera whose words nobody has told."""
-    own = _OWN.get(rendered.exposure.camera)
-    return own(rendered) if own else ()
+    make_cards = _CARDS_BY_CAMERA.get(rendered.exposure.camera)
+    return make_cards(rendered) if make_cards else ()
 
 
-def _decam(rendered: Rendered) -> tuple[Card, ...]:
+def _decam(rendered: RenderedDetector) -> tuple[Card, ...]:
     """Of a CCD, and of its amplifiers A and B, whose letters end the keywords."""
     exposure = rendered.exposure
     return (
@@ -35,27 +35,27 @@ def _decam(rendered: Rendered) -> tuple[Card, ...]:
         ("PROCTYPE", "RAW", "data processing level"),
         ("PRODTYPE", "image", "data product"),
         ("EXPNUM", exposure.exposure_id, "exposure number"),
-        ("CCDNUM", _number(rendered) + 1, "CCD number"),
+        ("CCDNUM", _detector_number(rendered) + 1, "CCD number"),
         ("DETPOS", rendered.detector.name, "position of the CCD in the focal plane"),
         ("CCDSUM", "1 1", "binning along columns and rows"),
-        *_of_letters(rendered),
+        *_amplifier_cards(rendered),
     )
 
 
-def _lsstcam(rendered: Rendered) -> tuple[Card, ...]:
+def _lsstcam(rendered: RenderedDetector) -> tuple[Card, ...]:
     """Of a sensor; the rotator turns the camera against the sky, the angle that a table of pointings gives."""
     exposure, (raft, sensor) = rendered.exposure, rendered.detector.name.split("_")
     seconds = exposure.exposure_time_s
     return (
         ("OBSID", f"MC_S_{exposure.exposure_id:08d}", "of the exposure"),
         ("SEQNUM", exposure.exposure_id, "of the exposure"),
-        ("IMGTYPE", _IMAGES[exposure.image_type], "type of observation"),
+        ("IMGTYPE", _IMAGE_TYPES[exposure.image_type], "type of observation"),
         ("CONTRLLR", "S", "simulated"),
         ("RAFTBAY", raft, "raft"),
         ("CCDSLOT", sensor, "sensor in the raft"),
         ("CHIPID", rendered.detector.name, "raft and sensor"),
-        ("DETNUM", _number(rendered), "sensor, from 0"),
-        ("LSST_NUM", f"{rendered.detector.kind.upper()}-{_number(rendered):03d}", "sensor by maker"),
+        ("DETNUM", _detector_number(rendered), "sensor, from 0"),
+        ("LSST_NUM", f"{rendered.detector.kind.upper()}-{_detector_number(rendered):03d}", "sensor by maker"),
         ("ROTPA", exposure.position_angle % 360.0, "[deg] of the y axis, north through east"),
         ("ROTCOORD", "sky", "ROTPA is against the sky"),
         ("RASTART", exposure.ra, "[deg] boresight as the exposure begins"),
@@ -67,50 +67,52 @@ def _lsstcam(rendered: Rendered) -> tuple[Card, ...]:
     )
 
 
-def _file_name(rendered: Rendered) -> tuple[Card, ...]:
+def _file_name(rendered: RenderedDetector) -> tuple[Card, ...]:
     """As imSim 0.6 calls such files; of one array with pre- and overscan it has none."""
     exposure, arrays = rendered.exposure, rendered.readout.extensions
     kind = "eimage" if arrays[0].unit == "electron" else "amp" if len(arrays) > 1 else ""
     if not kind:
         return ()
     band = exposure.band.rpartition("_")[2]
-    name = f"{kind}_{exposure.exposure_id:08d}-0-{band}-{rendered.detector.name}-det{_number(rendered):03d}.fits"
+    name = (
+        f"{kind}_{exposure.exposure_id:08d}-0-{band}-{rendered.detector.name}-det{_detector_number(rendered):03d}.fits"
+    )
     return (("FILENAME", name, "as the survey calls it"),)
 
 
-_IMAGES = {"science": "SKYEXP", "deep": "SKYEXP", "flat": "FLAT", "dark": "DARK", "bias": "BIAS"}
-_OWN: Mapping[str, Callable[[Rendered], tuple[Card, ...]]] = {"decam": _decam, "lsstcam": _lsstcam}
+_IMAGE_TYPES = {"science": "SKYEXP", "deep": "SKYEXP", "flat": "FLAT", "dark": "DARK", "bias": "BIAS"}
+_CARDS_BY_CAMERA: Mapping[str, Callable[[RenderedDetector], tuple[Card, ...]]] = {"decam": _decam, "lsstcam": _lsstcam}
 
 
-def _number(rendered: Rendered) -> int:
+def _detector_number(rendered: RenderedDetector) -> int:
     """Place of a detector in its camera's layout, from 0."""
-    every = detectors.detectors(rendered.exposure.camera, rendered.scene.mission)
-    return [detector.name for detector in every].index(rendered.detector.name)
+    all_detectors = detectors.detectors(rendered.exposure.camera, rendered.scene.mission)
+    return [detector.name for detector in all_detectors].index(rendered.detector.name)
 
 
-def _of_letters(rendered: Rendered) -> tuple[Card, ...]:
+def _amplifier_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
     """Sections and numbers of each amplifier of one array, those that the readout's own cards do not have."""
-    own, arrays = rendered.scene.layout, rendered.readout.extensions
-    if own is None or len(arrays) > 1 or arrays[0].unit != "adu":
+    layout, arrays = rendered.scene.layout, rendered.readout.extensions
+    if layout is None or len(arrays) > 1 or arrays[0].unit != "adu":
         return ()
-    every = detectors.detectors(rendered.exposure.camera, rendered.scene.mission)
-    numbers = {key: value for key, value, _ in headers.of_amplifiers(rendered)}
-    found: list[Card] = []
-    for number, amplifier in enumerate(own.amplifiers):
-        letter, pixels = amplifier.name, own.pixels_of(number)
-        place = sections.in_mosaic(rendered.detector, amplifier.pixels, every)
-        found += [
-            (f"AMPSEC{letter}", _as_read(amplifier), "CCDSEC in the order in which it is read"),
+    all_detectors = detectors.detectors(rendered.exposure.camera, rendered.scene.mission)
+    numbers = {key: value for key, value, _ in headers.amplifier_values(rendered)}
+    letter_cards: list[Card] = []
+    for number, amplifier in enumerate(layout.amplifiers):
+        letter, pixels = amplifier.name, layout.amplifier_data_section(number)
+        place = sections.to_mosaic_section(rendered.detector, amplifier.pixels, all_detectors)
+        letter_cards += [
+            (f"AMPSEC{letter}", _readout_section(amplifier), "CCDSEC in the order in which it is read"),
             (f"TRIMSEC{letter}", pixels.text, "its pixels"),
-            (f"PRESEC{letter}", own.prescan_of(number).text, "columns before them"),
-            (f"POSTSEC{letter}", own.overscan_rows_of(number).text, "rows after them"),
+            (f"PRESEC{letter}", layout.amplifier_prescan_section(number).text, "columns before them"),
+            (f"POSTSEC{letter}", layout.amplifier_overscan_section(number).text, "rows after them"),
             *(((f"DETSEC{letter}", place, "its pixels in the mosaic"),) if place else ()),
             *(
-                (f"{key}{letter}", float(np.broadcast_to(numbers[name], len(own.amplifiers))[number]), text)
+                (f"{key}{letter}", float(np.broadcast_to(numbers[name], len(layout.amplifiers))[number]), text)
                 for key, name, text in _NUMBERS
             ),
         ]
-    return tuple(found)
+    return tuple(letter_cards)
 
 
 _NUMBERS = (
@@ -120,7 +122,7 @@ _NUMBERS = (
 )
 
 
-def _as_read(amplifier: Amplifier) -> str:
+def _readout_section(amplifier: Amplifier) -> str:
     """Its pixels in the order in which they are read."""
     (x, y), pixels = (axis + 1 for axis in (amplifier.pixels.x, amplifier.pixels.y)), amplifier.pixels
     columns, rows = (x, x + pixels.nx - 1), (y, y + pixels.ny - 1)

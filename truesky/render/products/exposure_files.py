@@ -19,16 +19,16 @@ from lake_schema.fits import joined
 from lake_schema.fits.images import Card
 from lake_schema.mission.published import read_back
 from lake_schema.store import read, reuse
-from lake_schema.store.plan import Json, Output, Part, Plan
+from lake_schema.store.plan import Json, Output, Plan, Task
 from lake_schema.store.provenance import digest
 from lake_schema.tables.products import EXPOSURE_FILES
 from truesky.render.camera import detectors
-from truesky.render.planning.parts import rows as planned_rows
+from truesky.render.planning.exposure_chunks import rows as planned_rows
 from truesky.render.products import head_files, headers
 from truesky.render.products.keys import part_name
 
 # Keywords of detectors' headers that are the exposure's.
-_OF_EXPOSURE = (
+_EXPOSURE_KEYWORDS = (
     "TELESCOP", "INSTRUME", "OBJECT", "RA", "DEC", "AIRMASS", "DETSIZE", "CHANNEL", "FILTER", "IMAGETYP", "LAMP",
     "TARGET", "EXPOSURE", "EXPTIME", "DATE-OBS", "MJD-OBS", "TIMESYS", "SEEING", "ZEROPNT", "SEED", "NOISSEED",
     "REALIS", "MISSION", "TRUESKY", "ACCFLUX", "ACCSHAPE", "ACCPOS", "ACCBACK", "READMODE", "NG", "NR", "ND", "FRTIME",
@@ -39,36 +39,36 @@ _OF_EXPOSURE = (
 )  # fmt: skip
 
 
-def plan(products: Plan, planned: Mapping[int, int]) -> Plan:
+def plan(products: Plan, detector_counts: Mapping[int, int]) -> Plan:
     """One part an exposure, of the detectors that the products' plan has of it, by name.
 
     products : the plan of the detectors' files;  planned : how many are planned of each exposure
     """
-    held: dict[int, dict[str, str]] = defaultdict(dict)
-    for part in products.parts:
-        held[part.facts["exposure_id"]][part.facts["detector"]] = part.facts[reuse.PRODUCT]
+    keys_by_exposure: dict[int, dict[str, str]] = defaultdict(dict)
+    for part in products.tasks:
+        keys_by_exposure[part.facts["exposure_id"]][part.facts["detector"]] = part.facts[reuse.PRODUCT]
     parts = []
-    for number, keys in sorted(held.items()):
+    for number, keys in sorted(keys_by_exposure.items()):
         names = sorted(keys)
-        about = {"exposure_id": number, "detectors": names, "planned": planned[number]}
-        key = digest({**about, "products": [keys[name] for name in names]})
-        parts.append(Part(f"{number:06d}.parquet", {**about, reuse.PRODUCT: key}))
+        exposure_facts = {"exposure_id": number, "detectors": names, "planned": detector_counts[number]}
+        key = digest({**exposure_facts, "products": [keys[name] for name in names]})
+        parts.append(Task(f"{number:06d}.parquet", {**exposure_facts, reuse.PRODUCT: key}))
     return Plan(EXPOSURE_FILES, {"products": products.key}, tuple(parts))
 
 
-def work(lake: Path, facts: Json) -> Output:
+def make_exposure_file(lake: Path, facts: Json) -> Output:
     """One exposure's file, from those of its detectors."""
     products = read.version(lake, "products", facts["products"])
-    here = pc.field("exposure_id") == facts["exposure_id"]
+    in_exposure = pc.field("exposure_id") == facts["exposure_id"]
     # Of 100,000 files only its own are opened.
-    own = {part_name({"exposure_id": facts["exposure_id"], "detector": name}) for name in facts["detectors"]}
-    held = [name for name in products.parts if name in own]
-    found = products.rows(parts=held, where=here & (pc.field("content") == "science"))
-    rows = {row["detector"]: row for row in found.to_pylist()}
+    part_names = {part_name({"exposure_id": facts["exposure_id"], "detector": name}) for name in facts["detectors"]}
+    partitions = [name for name in products.partitions if name in part_names]
+    science_rows = products.rows(partitions=partitions, where=in_exposure & (pc.field("content") == "science"))
+    rows = {row["detector"]: row for row in science_rows.to_pylist()}
     if sorted(rows) != facts["detectors"]:
         raise Damaged(f"table products: version {products.key} lacks detectors of exposure {facts['exposure_id']}")
     exposures = read.version(lake, "exposures", products.manifest["facts"]["inputs"]["exposures"])
-    (exposure,) = planned_rows(exposures, [facts["exposure_id"]], where=here).to_pylist()
+    (exposure,) = planned_rows(exposures, [facts["exposure_id"]], where=in_exposure).to_pylist()
     first = rows[facts["detectors"][0]]
     path = f"images/{exposure['exposure_id']:06d}/{exposure['channel']}_{exposure['band']}_science.fits"
     table = EXPOSURE_FILES.build(
@@ -81,17 +81,20 @@ def work(lake: Path, facts: Json) -> Output:
             "sources": [sum(row["sources"] for row in rows.values())],
         }
     )
-    order = _in_order(lake, products, exposure["camera"], facts["detectors"])
-    files = [(name, products.file(rows[name]["path"])) for name in order]
-    heads = [products.file(head_files.beside(rows[name]["path"])) for name in order]
-    writers = {path: partial(_write, files, _cards(exposure, facts)), head_files.beside(path): partial(_heads, heads)}
+    order = _sort_detectors(lake, products, exposure["camera"], facts["detectors"])
+    files = [(name, products.sidecar_path(rows[name]["path"])) for name in order]
+    heads = [products.sidecar_path(head_files.head_path(rows[name]["path"])) for name in order]
+    writers = {
+        path: partial(_write, files, _cards(exposure, facts)),
+        head_files.head_path(path): partial(_write_heads, heads),
+    }
     return Output(table, writers)
 
 
-def _in_order(lake: Path, products: read.Version, camera: str, names: Sequence[str]) -> list[str]:
+def _sort_detectors(lake: Path, products: read.Version, camera: str, names: Sequence[str]) -> list[str]:
     """Detectors as the camera's layout numbers them."""
     mission = read_back(read.version(lake, "mission", products.manifest["facts"]["inputs"]["mission"]))
-    return [one.name for one in detectors.detectors(camera, mission) if one.name in names]
+    return [detector.name for detector in detectors.detectors(camera, mission) if detector.name in names]
 
 
 def _cards(exposure: dict[str, Any], facts: Json) -> tuple[Card, ...]:
@@ -102,9 +105,9 @@ def _cards(exposure: dict[str, Any], facts: Json) -> tuple[Card, ...]:
     )
 
 
-def _heads(files: Sequence[Path], path: Path) -> None:
+def _write_heads(files: Sequence[Path], path: Path) -> None:
     head_files.write((file.read_text(encoding="ascii") for file in files), path)
 
 
 def _write(files: Sequence[tuple[str, Path]], cards: Sequence[Card], path: Path) -> None:
-    joined.join(path, files, _OF_EXPOSURE, cards, headers.IN_EACH)
+    joined.join(path, files, _EXPOSURE_KEYWORDS, cards, headers.PER_ARRAY_KEYWORDS)

@@ -18,14 +18,14 @@ import pyarrow as pa
 from lake_schema.fits.images import Card, Image, write_images
 from lake_schema.tables.products import PRODUCTS
 from truesky.render.camera import astrometry, observatories, tpv
-from truesky.render.exposure.rendered import Rendered
+from truesky.render.exposure.rendered_detector import RenderedDetector
 from truesky.render.products import camera_cards, head_files, headers, raw_pointing
 
 Writer = Callable[[Path], None]
 
 
 def products(
-    rendered: Rendered, truth: Sequence[str] = ("noise_free",), rice: bool = False, wcs: str | None = None
+    rendered: RenderedDetector, truth: Sequence[str] = ("noise_free",), rice: bool = False, wcs: str | None = None
 ) -> tuple[pa.Table, dict[str, Writer]]:
     """Rows of `products` and, by path, what writes each file; beside each image its head file.
 
@@ -33,14 +33,16 @@ def products(
     truth : truth maps that are wanted beside the science image;  rice : images of whole numbers are packed
     wcs   : how headers tell the optics' distortion, one of tpv.CONVENTIONS; None = as the instrument's pipeline
     """
-    images = {"science": _science(rendered)}
+    images = {"science": _science_images(rendered)}
     for content in truth:
         if content in rendered.maps:
             images[content] = [Image(rendered.maps[content], headers.truth_cards(rendered, content))]
     heads = {key: head_files.text(units) for key, units in images.items()}
-    images["science"] = [replace(unit, cards=_told(rendered, unit.cards)) for unit in images["science"]]
-    if (wcs or observatories.of(rendered.exposure.camera).convention) == "tpv":
-        images = {key: [replace(unit, cards=tpv.cards(unit.cards)) for unit in units] for key, units in images.items()}
+    images["science"] = [replace(unit, cards=_with_raw_pointing(rendered, unit.cards)) for unit in images["science"]]
+    if (wcs or observatories.for_camera(rendered.exposure.camera).convention) == "tpv":
+        images = {
+            key: [replace(unit, cards=tpv.from_sip(unit.cards)) for unit in units] for key, units in images.items()
+        }
     exposure, detector = rendered.exposure, rendered.detector
     stem = f"images/{exposure.exposure_id:06d}/{exposure.channel}_{exposure.band}_{detector.name}"
     paths = {content: f"{stem}_{content}.fits" for content in images}
@@ -62,13 +64,13 @@ def products(
         }
     )
     writers: dict[str, Writer] = {paths[content]: partial(_write, units, rice) for content, units in images.items()}
-    for content, said in heads.items():
-        if said:
-            writers[head_files.beside(paths[content])] = partial(head_files.write, [said])
+    for content, head_text in heads.items():
+        if head_text:
+            writers[head_files.head_path(paths[content])] = partial(head_files.write, [head_text])
     return rows, writers
 
 
-def _told(rendered: Rendered, cards: tuple[Card, ...]) -> tuple[Card, ...]:
+def _with_raw_pointing(rendered: RenderedDetector, cards: tuple[Card, ...]) -> tuple[Card, ...]:
     return raw_pointing.cards(cards, rendered.exposure, rendered.detector, rendered.scene.mission, rendered.seed)
 
 
@@ -76,16 +78,16 @@ def _write(units: Sequence[Image], rice: bool, path: Path) -> None:
     write_images(path, units, rice)
 
 
-def _science(rendered: Rendered) -> list[Image]:
+def _science_images(rendered: RenderedDetector) -> list[Image]:
     """The image; or a header that holds for all, and an extension for each array of the readout."""
     readout = rendered.readout
     cards = (*headers.science_cards(rendered), *camera_cards.cards(rendered), *readout.cards)
     if [extension.name for extension in readout.extensions] == [""]:
-        (only,) = readout.extensions
+        (array,) = readout.extensions
         # Its own stand for the detector's: its WCS counts what lies around the pixels, too.
-        more = (*only.cards, *headers.section_cards(rendered, only))
-        own = {keyword for keyword, *_ in more}
-        return [Image(only.data, (*(card for card in cards if card[0] not in own), *more))]
+        array_cards = (*array.cards, *headers.section_cards(rendered, array))
+        array_keywords = {keyword for keyword, *_ in array_cards}
+        return [Image(array.data, (*(card for card in cards if card[0] not in array_keywords), *array_cards))]
     arrays = [
         Image(extension.data, headers.array_cards(rendered, extension, cards), extension.name)
         for extension in readout.extensions

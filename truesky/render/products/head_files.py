@@ -21,40 +21,42 @@ from lake_schema.fits.images import Card, Image
 from truesky.render.camera import tpv
 
 # Of a header, what stands in such a text: the WCS.
-_KEPT = ("RADESYS", "CTYPE", "CUNIT", "CRVAL", "CRPIX", "CD", "PV")
+_WCS_KEYWORDS = ("RADESYS", "CTYPE", "CUNIT", "CRVAL", "CRPIX", "CD", "PV")
 
 
-def beside(path: str) -> str:
+def head_path(path: str) -> str:
     """Path of an image -> of what lies beside it."""
     return str(PurePosixPath(path).with_suffix(".head"))
 
 
 def text(units: Sequence[Image]) -> str:
     """Cards of each image of two axes, in the order of the file; "" where none has a place on the sky."""
-    return "".join(_block(unit) for unit in units if unit.data is not None and unit.data.ndim == 2)
+    return "".join(_image_text(unit) for unit in units if unit.data is not None and unit.data.ndim == 2)
 
 
-def write(said: Iterable[str], path: Path) -> None:
+def write(texts: Iterable[str], path: Path) -> None:
     """Texts of one file's images, one after the other."""
-    path.write_text("".join(said), encoding="ascii")
+    path.write_text("".join(texts), encoding="ascii")
 
 
-def first(path: Path) -> tuple[Card, ...]:
+def first_cards(path: Path) -> tuple[Card, ...]:
     """Of an image's file, what the text beside it says of its first image; nothing where there is none."""
-    said = path.with_suffix(".head")
-    if not said.is_file():
+    head_file = path.with_suffix(".head")
+    if not head_file.is_file():
         return ()
-    return tuple(card for card in images.cards_of_text(said.read_text("ascii").split("END\n")[0]) if is_place(card[0]))
+    return tuple(
+        card for card in images.cards_from_text(head_file.read_text("ascii").split("END\n")[0]) if is_wcs(card[0])
+    )
 
 
-def is_place(keyword: str) -> bool:
+def is_wcs(keyword: str) -> bool:
     """Whether a card is of the WCS."""
-    return keyword.rstrip("0123456789_") in _KEPT
+    return keyword.rstrip("0123456789_") in _WCS_KEYWORDS
 
 
-def _block(unit: Image) -> str:
-    cards = [card for card in tpv.cards(unit.cards) if is_place(card[0])]
+def _image_text(unit: Image) -> str:
+    cards = [card for card in tpv.from_sip(unit.cards) if is_wcs(card[0])]
     if not cards:
         return ""
     # J2000 is as near to ICRS as these tools tell.
-    return f"{images.text_of([('EQUINOX', 2000.0, 'mean equinox'), *cards])}END\n"
+    return f"{images.cards_to_text([('EQUINOX', 2000.0, 'mean equinox'), *cards])}END\n"

@@ -19,14 +19,14 @@ from truesky.render.camera.detectors import Detector
 from truesky.render.channels import registry
 from truesky.render.drawing import stamp_sizes
 from truesky.render.effects.readout import detector_crosstalk
-from truesky.render.exposure import elsewhere, persistence
+from truesky.render.exposure import board_neighbours, persistence
 from truesky.render.planning import variants
 from truesky.render.psf import from_file
 from truesky.render.sources import catalogue_rows, ephemerides, galaxy_stamps, selection
 from truesky.render.sources.catalogue_rows import CATALOGUES, CELLS, FARTHEST, LENSES
 from truesky.request.accuracy import SURVEY
 
-Beside = Callable[[ExposureRow, str], Json]
+NeighbourFiles = Callable[[ExposureRow, str], Json]
 
 
 def product_keys(
@@ -35,7 +35,7 @@ def product_keys(
     tasks: Sequence[Json],
     inputs: Mapping[str, read.Version],
     mission: MissionConfiguration,
-    earlier: Mapping[tuple[int, str], Sequence[Json]] = MappingProxyType({}),
+    previous_tasks: Mapping[tuple[int, str], Sequence[Json]] = MappingProxyType({}),
 ) -> list[str]:
     """Of each task, the digest of everything that shapes its products, and of nothing else.
 
@@ -47,48 +47,60 @@ def product_keys(
     flux_facts = inputs["galaxy_fluxes"].manifest["facts"]
     shared = {key: facts[key] for key in ("request", "mission", "code")}
     shared["library"] = [flux_facts.get("files"), flux_facts.get("sources")]
-    rows = {row.exposure_id: row for row in map(ExposureRow.of, exposures.to_pylist())}
+    rows = {row.exposure_id: row for row in map(ExposureRow.from_row, exposures.to_pylist())}
     files = {
-        name: (catalogue_rows.deflection_of(inputs[name]), _files_of_cells(inputs[name], inputs[fluxes]))
+        name: (catalogue_rows.max_deflection(inputs[name]), _files_of_cells(inputs[name], inputs[fluxes]))
         for name, fluxes in CATALOGUES
     }
     if LENSES in inputs:
-        files[LENSES] = catalogue_rows.deflection_of(inputs["galaxies"]), _files_of_cells(inputs[LENSES])
+        files[LENSES] = catalogue_rows.max_deflection(inputs["galaxies"]), _files_of_cells(inputs[LENSES])
 
-    def catalogues(task: Json) -> list[list[tuple[str, ...]]]:
+    def catalogue_files(task: Json) -> list[list[tuple[str, ...]]]:
         exposure, detector = rows[task["exposure_id"]], task["detector"]
         reach = stamp_sizes.reach(detectors.detector(exposure.camera, detector, mission).pixel_scale)
         reaches = {name: reach for name in files}
         reaches["galaxies"] = max(FARTHEST, reach)
         channel = registry.CHANNELS[exposure.channel]
         # Of the sources stars alone have spikes; a grism puts any source's light far from it.
-        if channel.pupil is not None or channel.disperses is not None:
+        if channel.diffraction_edges is not None or channel.dispersion is not None:
             reaches["stars"] = max(FARTHEST, reach)
-        if channel.disperses is not None:
+        if channel.dispersion is not None:
             reaches[LENSES] = max(FARTHEST, reach)
         return [
-            sorted({sums for cell in selection.within(task, deflection, reaches[name]) for sums in found.get(cell, ())})
-            for name, (deflection, found) in files.items()
+            sorted(
+                {
+                    checksums
+                    for cell in selection.cells_within_reach(task, deflection, reaches[name])
+                    for checksums in files_by_cell.get(cell, ())
+                }
+            )
+            for name, (deflection, files_by_cell) in files.items()
         ]
 
-    beside = _beside(files["stars"], mission)
+    neighbour_files = _neighbour_files(files["stars"], mission)
 
-    def drawn(task: Json) -> Json:
+    def facts_of_task(task: Json) -> Json:
         return {
             "exposure": asdict(rows[task["exposure_id"]]),
             "task": {name: task[name] for name in ("detector", "cells", "radius")},
-            "catalogues": catalogues(task) if task["cells"] else [],
-            **(beside(rows[task["exposure_id"]], task["detector"]) if task["cells"] else {}),
-            **_own_files(facts, rows[task["exposure_id"]], task["detector"]),
+            "catalogues": catalogue_files(task) if task["cells"] else [],
+            **(neighbour_files(rows[task["exposure_id"]], task["detector"]) if task["cells"] else {}),
+            **_user_file_checksums(facts, rows[task["exposure_id"]], task["detector"]),
         }
 
-    def left(task: Json) -> Json:
+    def facts_of_previous(task: Json) -> Json:
         row = rows[task["exposure_id"]]
-        return drawn(task) if persistence.is_drawn(row) else {"exposure": asdict(row)}
+        return facts_of_task(task) if persistence.is_drawn(row) else {"exposure": asdict(row)}
 
-    before = ([left(one) for one in earlier.get((task["exposure_id"], task["detector"]), ())] for task in tasks)
-    also = ({"earlier": some} if some else {} for some in before)
-    return [digest({**shared, **drawn(task), **more}) for task, more in zip(tasks, also, strict=True)]
+    previous = (
+        [
+            facts_of_previous(previous_task)
+            for previous_task in previous_tasks.get((task["exposure_id"], task["detector"]), ())
+        ]
+        for task in tasks
+    )
+    extras = ({"earlier": previous_facts} if previous_facts else {} for previous_facts in previous)
+    return [digest({**shared, **facts_of_task(task), **extra}) for task, extra in zip(tasks, extras, strict=True)]
 
 
 def part_name(task: Json) -> str:
@@ -101,33 +113,37 @@ def exposures_of(names: Iterable[str]) -> set[int]:
     return {int(number) for name in names if (number := name.partition("-")[0]).isdigit()}
 
 
-def _beside(stars: tuple[float, Mapping[int, list[tuple[str, ...]]]], mission: MissionConfiguration) -> Beside:
+def _neighbour_files(
+    stars: tuple[float, Mapping[int, list[tuple[str, ...]]]], mission: MissionConfiguration
+) -> NeighbourFiles:
     """What an image shows of the stars of detectors that are read with its own: the files that hold them.
 
     stars : how far they move, deg, and their files by cell;  mission : the mission database
     """
     boards: dict[tuple[str, str, str | None], tuple[Detector, ...]] = {}
 
-    def of(exposure: ExposureRow, detector: str) -> Json:
-        if detector_crosstalk.EFFECT not in (registry.effects_or_none(exposure.channel, exposure.image_type) or ()):
+    def files_of_neighbours(exposure: ExposureRow, detector: str) -> Json:
+        if detector_crosstalk.EFFECT not in (
+            registry.find_effects_or_none(exposure.channel, exposure.image_type) or ()
+        ):
             return {}
-        which = exposure.camera, detector, exposure.settings
-        if which not in boards:
-            own = variants.variant(exposure.settings, mission, SURVEY, {}).mission
-            boards[which] = elsewhere.neighbours(exposure.camera, detector, own)
-        places = [elsewhere.circle(exposure, other) for other in boards[which]]
-        cells = {cell for place in places for cell in selection.within(place, stars[0], 0.0)}
-        sums = sorted({each for cell in cells for each in stars[1].get(cell, ())})
-        return {"beside": sums} if sums else {}
+        key = exposure.camera, detector, exposure.settings
+        if key not in boards:
+            variant_mission = variants.variant(exposure.settings, mission, SURVEY, {}).mission
+            boards[key] = board_neighbours.other_detectors(exposure.camera, detector, variant_mission)
+        places = [board_neighbours.detector_circle(exposure, neighbour) for neighbour in boards[key]]
+        cells = {cell for place in places for cell in selection.cells_within_reach(place, stars[0], 0.0)}
+        checksums = sorted({checksum for cell in cells for checksum in stars[1].get(cell, ())})
+        return {"beside": checksums} if checksums else {}
 
-    return of
+    return files_of_neighbours
 
 
-def _own_files(facts: Json, exposure: ExposureRow, detector: str) -> Json:
+def _user_file_checksums(facts: Json, exposure: ExposureRow, detector: str) -> Json:
     """sha256 of the user's files that an image is made of."""
     files = {}
     if psf := exposure.psf:
-        files["psf"] = facts["psf"][str(from_file.file_of(psf, detector))]
+        files["psf"] = facts["psf"][str(from_file.path_for_detector(psf, detector))]
     if "bodies" in facts and registry.CHANNELS[exposure.channel].sees_bodies(exposure.image_type):
         (files["bodies"],) = facts["bodies"].values()
     if "stamps" in facts:
@@ -137,33 +153,33 @@ def _own_files(facts: Json, exposure: ExposureRow, detector: str) -> Json:
 
 def psf_files(exposures: pa.Table, tasks: Sequence[Json]) -> dict[str, str]:
     """sha256 of the PSFs that the tasks' exposures name, by file."""
-    named = dict(zip(exposures["exposure_id"].to_pylist(), exposures["psf"].to_pylist(), strict=True))
-    pairs = {(named[task["exposure_id"]], task["detector"]) for task in tasks}
-    files = [from_file.file_of(psf, detector) for psf, detector in pairs if psf]
-    return {str(file): file_sha256(user_files.checked(file, "PSF")) for file in files}
+    psf_by_exposure = dict(zip(exposures["exposure_id"].to_pylist(), exposures["psf"].to_pylist(), strict=True))
+    pairs = {(psf_by_exposure[task["exposure_id"]], task["detector"]) for task in tasks}
+    files = [from_file.path_for_detector(psf, detector) for psf, detector in pairs if psf]
+    return {str(file): file_sha256(user_files.check_file(file, "PSF")) for file in files}
 
 
 def ephemeris_files(file: Path, exposures: pa.Table) -> dict[str, str]:
     """sha256 of the user's moving bodies, by file; refused before anything is rendered where they cannot be read."""
-    sha256 = file_sha256(user_files.checked(file, "table of bodies", "solar_system.bodies"))
-    rows = map(ExposureRow.of, exposures.to_pylist())
-    seen = [row.mjd for row in rows if registry.CHANNELS[row.channel].sees_bodies(row.image_type)]
-    ephemerides.check(ephemerides.read(file, sha256), file, seen)
+    sha256 = file_sha256(user_files.check_file(file, "table of bodies", "solar_system.bodies"))
+    rows = map(ExposureRow.from_row, exposures.to_pylist())
+    dates = [row.mjd for row in rows if registry.CHANNELS[row.channel].sees_bodies(row.image_type)]
+    ephemerides.check(ephemerides.read(file, sha256), file, dates)
     return {str(file): sha256}
 
 
 def stamp_files(file: Path) -> dict[str, str]:
     """sha256 of the user's library of galaxies, by file; refused before anything is rendered where it is none."""
-    sha256 = file_sha256(user_files.checked(file, galaxy_stamps.KIND, "structure.stamps.file"))
+    sha256 = file_sha256(user_files.check_file(file, galaxy_stamps.KIND, "structure.stamps.file"))
     galaxy_stamps.read(file, sha256)
     return {str(file): sha256}
 
 
 def _files_of_cells(*tables: read.Version) -> Mapping[int, list[tuple[str, ...]]]:
     """Generation cell -> sha256 of the files that hold it, of each of the tables."""
-    found: dict[int, list[tuple[str, ...]]] = defaultdict(list)
+    files_by_cell: dict[int, list[tuple[str, ...]]] = defaultdict(list)
     for part in tables[0].manifest["parts"]:
-        sums = tuple(table.part_sha256(part["name"]) for table in tables)
+        checksums = tuple(table.partition_sha256(part["name"]) for table in tables)
         for cell in part["facts"][CELLS]:
-            found[cell].append(sums)
-    return found
+            files_by_cell[cell].append(checksums)
+    return files_by_cell

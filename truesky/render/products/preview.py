@@ -19,7 +19,7 @@ from lake_schema.arrays import Array, Bool, Float
 from lake_schema.fits import images
 from lake_schema.fits.images import Card
 from lake_schema.store import read
-from truesky.numerics import sums
+from truesky.numerics import matrices
 from truesky.render.camera import astrometry
 from truesky.render.products import preview_labels, read_back
 from truesky.render.products.preview_labels import CLOSE_UP_ARCSEC, CLOSE_UP_SHAPE, CLOSE_UPS, LABELS, Label
@@ -28,9 +28,9 @@ _INCHES, _DPI = (13.2, 9.6), 100
 # Largest side of the overview, pixels; close-ups are shown at full resolution.  Labels a kind.
 _OVERVIEW = 1000
 # Room that a label takes, of the image's width and height.
-_TEXT = (0.14, 0.035)
+_LABEL_SIZE = (0.14, 0.035)
 # Pixels on each side that mend a cosmic ray.
-_MEND = 2
+_MEND_RADIUS = 2
 # Pixels that tell sky and noise of a whole image.
 _STRIDE = 8
 # Black this many sigma below the sky; the stretch turns from linear to logarithmic at _KNEE sigma; white at
@@ -40,55 +40,55 @@ _INK, _PAPER, _GALAXY, _STAR = "#e8e6df", "#0b0d12", "#ffd27d", "#9fd3ff"
 _SCALE_BARS = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600)
 
 
-def previews(root: Path, out: Path, most: int | None = None, request: str | None = None) -> list[Path]:
+def previews(root: Path, out: Path, max_images: int | None = None, request: str | None = None) -> list[Path]:
     """A PNG beside each other in `out` for the science images of a request, or of the lake; returns their paths.
 
     root : of the lake;  most : so many of them, as `shown` chooses, None = all
     request : its name, where the lake has several
     """
     version = read.version(root, "products", request=request)
-    made_of = version.manifest["facts"]["inputs"]
-    made, rows = [], version.rows().to_pylist()
-    hits = {_frame_of(row): row["path"] for row in rows if row["content"] == "cosmic_rays"}
-    for row in shown([row for row in rows if row["content"] == "science"], most):
-        image = read_back.electrons(version.file(row["path"]))
-        if _frame_of(row) in hits:
-            (truth,) = images.read_images(version.file(hits[_frame_of(row)]))
-            image = images.Image(mended(np.asarray(image.data), np.asarray(truth.data) > 0), image.cards)
+    input_keys = version.manifest["facts"]["inputs"]
+    paths, rows = [], version.rows().to_pylist()
+    hits = {_detector_key(row): row["path"] for row in rows if row["content"] == "cosmic_rays"}
+    for row in select_images([row for row in rows if row["content"] == "science"], max_images):
+        image = read_back.electrons(version.sidecar_path(row["path"]))
+        if _detector_key(row) in hits:
+            (truth,) = images.read_images(version.sidecar_path(hits[_detector_key(row)]))
+            image = images.Image(repair_cosmic_rays(np.asarray(image.data), np.asarray(truth.data) > 0), image.cards)
         path = out / f"{row['channel']}_{row['band']}_{row['detector']}_{row['exposure_id']}.png".lower()
-        picture(path, np.asarray(image.data), image.cards, preview_labels.labels(root, row, image, made_of))
-        made.append(path)
-    return made
+        picture(path, np.asarray(image.data), image.cards, preview_labels.labels(root, row, image, input_keys))
+        paths.append(path)
+    return paths
 
 
-def shown(rows: Sequence[dict[str, Any]], most: int | None) -> list[dict[str, Any]]:
+def select_images(rows: Sequence[dict[str, Any]], max_images: int | None) -> list[dict[str, Any]]:
     """So many rows of `products`, in their order: one of every channel and band before a second one of any."""
-    seen: Counter[tuple[str, str]] = Counter()
-    turn = []
+    counts: Counter[tuple[str, str]] = Counter()
+    order = []
     for i, row in enumerate(rows):
         kind = row["channel"], row["band"]
-        turn.append((seen[kind], i))
-        seen[kind] += 1
-    return [rows[i] for i in sorted(i for _, i in sorted(turn)[:most])]
+        order.append((counts[kind], i))
+        counts[kind] += 1
+    return [rows[i] for i in sorted(i for _, i in sorted(order)[:max_images])]
 
 
-def _frame_of(row: dict[str, Any]) -> tuple[Any, ...]:
+def _detector_key(row: dict[str, Any]) -> tuple[Any, ...]:
     return row["exposure_id"], row["detector"]
 
 
-def mended(image: Float, hit: Bool) -> Float:
+def repair_cosmic_rays(image: Float, hit_pixels: Bool) -> Float:
     """Pixels that cosmic rays hit take the median of those around them that none did."""
-    rows, columns = np.nonzero(hit)
-    whole = np.where(hit, np.nan, image)
-    step = np.arange(-_MEND, _MEND + 1)
+    rows, columns = np.nonzero(hit_pixels)
+    masked = np.where(hit_pixels, np.nan, image)
+    step = np.arange(-_MEND_RADIUS, _MEND_RADIUS + 1)
     r = np.clip(rows[:, None, None] + step[:, None], 0, image.shape[0] - 1)
     c = np.clip(columns[:, None, None] + step, 0, image.shape[1] - 1)
-    around = np.sort(whole[r, c].reshape(len(rows), step.size**2), axis=1)
+    neighbours = np.sort(masked[r, c].reshape(len(rows), step.size**2), axis=1)
     # Sorted, what is missing comes last.
-    count = np.isfinite(around).sum(axis=1)
-    middle = around[np.arange(len(rows)), np.maximum(count - 1, 0) // 2]
+    count = np.isfinite(neighbours).sum(axis=1)
+    median = neighbours[np.arange(len(rows)), np.maximum(count - 1, 0) // 2]
     out = image.copy()
-    out[rows, columns] = np.where(count > 0, middle, image[rows, columns])
+    out[rows, columns] = np.where(count > 0, median, image[rows, columns])
     return out
 
 
@@ -112,9 +112,9 @@ def picture(path: Path, image: Array, cards: Sequence[Card], names: Sequence[Lab
     upside_down = astrometry.jacobian(system, [0.0], [0.0])[0, 1, 1] < 0
     main = figure.add_axes((0.01, 0.01, 0.715, 0.93))
     block = max(1, int(np.ceil(max(image.shape) / _OVERVIEW)))
-    _show(main, _shrunk(image, block), block, image.shape, upside_down)
-    text_x, text_y = _TEXT[0] * image.shape[1], _TEXT[1] * image.shape[0]
-    _annotate(main, preview_labels.moved_apart(names, text_x, text_y, LABELS), image.shape, upside_down)
+    _show_image(main, _shrink(image, block), block, image.shape, upside_down)
+    text_x, text_y = _LABEL_SIZE[0] * image.shape[1], _LABEL_SIZE[1] * image.shape[0]
+    _annotate(main, preview_labels.without_overlaps(names, text_x, text_y, LABELS), image.shape, upside_down)
     _scale_bar(main, header["PIXSCALE"], image.shape, image.shape[1] / 6)
     _compass(main, system, image.shape)
     for number, label in enumerate(preview_labels.close_ups(names, image.shape, header["PIXSCALE"])):
@@ -136,16 +136,16 @@ def _caption(header: dict[str, Any], system: WCS, shape: tuple[int, ...]) -> str
     )
 
 
-def _shrunk(image: Array, block: int) -> Float:
+def _shrink(image: Array, block: int) -> Float:
     ny, nx = (n // block for n in image.shape)
     return np.asarray(image[: ny * block, : nx * block].reshape(ny, block, nx, block).mean((1, 3), dtype=float))
 
 
-def _show(axes: Any, image: Float, block: int, shape: tuple[int, ...], upside_down: bool) -> None:
+def _show_image(axes: Any, image: Float, block: int, shape: tuple[int, ...], upside_down: bool) -> None:
     ny, nx = (n * block for n in image.shape)
     extent = (-0.5, nx - 0.5, -0.5, ny - 0.5)
-    shown = _stretched(image, *_levels(image))
-    axes.imshow(shown, origin="lower", extent=extent, cmap="gray", vmin=0, vmax=1, interpolation="none")
+    stretched = _stretch(image, *_sky_and_noise(image))
+    axes.imshow(stretched, origin="lower", extent=extent, cmap="gray", vmin=0, vmax=1, interpolation="none")
     _frame(axes, (-0.5, shape[1] - 0.5), (-0.5, shape[0] - 0.5), upside_down)
 
 
@@ -161,14 +161,14 @@ def _frame(axes: Any, x: tuple[float, float], y: tuple[float, float], upside_dow
         side.set_edgecolor("#3a4150")
 
 
-def _levels(image: Array) -> tuple[float, float]:
+def _sky_and_noise(image: Array) -> tuple[float, float]:
     """Sky and noise, from the median and the pixels below it."""
     level = float(np.median(image))
     below = image[image < level] - level
     return level, float(np.sqrt(np.mean(below**2))) if below.size else 1.0
 
 
-def _stretched(image: Array, level: float, noise: float) -> Float:
+def _stretch(image: Array, level: float, noise: float) -> Float:
     """Electrons or ADU -> 0 .. 1 by asinh."""
     signal = np.clip((image - level) / noise, _BLACK, _WHITE)
     lo, hi = np.arcsinh(_BLACK / _KNEE), np.arcsinh(_WHITE / _KNEE)
@@ -222,12 +222,12 @@ def _scale_bar(axes: Any, pixel_scale: float, shape: tuple[int, ...], longest: f
 def _compass(axes: Any, system: WCS, shape: tuple[int, ...]) -> None:
     """North and east as they are at the centre, lower right."""
     x, y = (shape[1] - 1) / 2, (shape[0] - 1) / 2
-    inverse = sums.inverse(astrometry.jacobian(system, [x], [y])[0])
+    inverse = matrices.inverse(astrometry.jacobian(system, [x], [y])[0])
     flip = np.array([1 if lim[0] < lim[1] else -1 for lim in (axes.get_xlim(), axes.get_ylim())])
     origin = np.array([0.93, 0.05])
     # u points west.
     for name, world in (("N", (0.0, 1.0)), ("E", (-1.0, 0.0))):
-        step = sums.product(inverse, np.array(world)) * flip
+        step = matrices.matmul(inverse, np.array(world)) * flip
         step = step / np.hypot(*step) * 0.055
         axes.annotate(
             "",
@@ -262,9 +262,9 @@ def _close_up(
     half_x = half_y * CLOSE_UP_SHAPE
     x0, x1 = max(round(label.column - half_x), 0), min(round(label.column + half_x), image.shape[1])
     y0, y1 = max(round(label.row - half_y), 0), min(round(label.row + half_y), image.shape[0])
-    shown = _stretched(image[y0:y1, x0:x1], *_levels(image[::_STRIDE, ::_STRIDE]))
+    stretched = _stretch(image[y0:y1, x0:x1], *_sky_and_noise(image[::_STRIDE, ::_STRIDE]))
     extent = (x0 - 0.5, x1 - 0.5, y0 - 0.5, y1 - 0.5)
-    axes.imshow(shown, origin="lower", extent=extent, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+    axes.imshow(stretched, origin="lower", extent=extent, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
     _frame(axes, extent[:2], extent[2:], upside_down)
     text = f"{letter}   {label.kind} {label.text}"
     axes.text(0.04, 0.92, text, color=_GALAXY, fontsize=10, transform=axes.transAxes).set_path_effects(_outline())

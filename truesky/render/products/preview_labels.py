@@ -38,7 +38,7 @@ class Label:
     text: str
 
 
-def labels(root: Path, product: dict[str, Any], image: images.Image, made_of: Mapping[str, str]) -> list[Label]:
+def labels(root: Path, product: dict[str, Any], image: images.Image, input_keys: Mapping[str, str]) -> list[Label]:
     """The brightest sources inside a product's frame, brightest first.
 
     root    : of the lake;  product, image : a row of `products`, and what its file holds
@@ -51,18 +51,18 @@ def labels(root: Path, product: dict[str, Any], image: images.Image, made_of: Ma
     corner = astrometry.sky_of_pixel(system, [-0.5], [-0.5])
     radius = float(sky.separation(*centre, *corner)[0])
     cells = sky.cells_in_cone(*centre, radius, GENERATION_ORDER).tolist()
-    found: list[Label] = []
+    candidates: list[Label] = []
     for kind, table in (("galaxy", "galaxies"), ("star", "stars")):
-        version = read.version(root, table, made_of[table])
+        version = read.version(root, table, input_keys[table])
         columns = ["id", "ra", "dec"] + (["z_obs"] if kind == "galaxy" else [])
-        rows = version.in_cells(cells, GENERATION_ORDER, columns)
-        fluxes = read.version(root, f"{kind}_fluxes", made_of[f"{kind}_fluxes"])
-        flux = fluxes.in_cells(cells, GENERATION_ORDER, ["id", column])
-        near = sky.separation(*centre, *(rows[name].to_numpy() for name in ("ra", "dec"))) < radius
-        near &= flux[column].to_numpy() > 0
-        if near.any():
-            found += _labels_of(kind, rows.filter(near), flux[column].to_numpy()[near], system, (ny, nx))
-    return sorted(found, key=lambda label: label.mag)
+        rows = version.rows_in_cells(cells, GENERATION_ORDER, columns)
+        fluxes = read.version(root, f"{kind}_fluxes", input_keys[f"{kind}_fluxes"])
+        flux = fluxes.rows_in_cells(cells, GENERATION_ORDER, ["id", column])
+        in_view = sky.separation(*centre, *(rows[name].to_numpy() for name in ("ra", "dec"))) < radius
+        in_view &= flux[column].to_numpy() > 0
+        if in_view.any():
+            candidates += _labels_of(kind, rows.filter(in_view), flux[column].to_numpy()[in_view], system, (ny, nx))
+    return sorted(candidates, key=lambda label: label.mag)
 
 
 def _labels_of(kind: str, rows: pa.Table, flux: Float, system: WCS, shape: tuple[int, int]) -> list[Label]:
@@ -76,17 +76,17 @@ def _labels_of(kind: str, rows: pa.Table, flux: Float, system: WCS, shape: tuple
     return [Label(float(x), float(y), kind, float(m), t) for x, y, m, t in zip(column, row, mag, texts, strict=True)]
 
 
-def moved_apart(names: Sequence[Label], wide: float, high: float, most: int) -> list[Label]:
+def without_overlaps(names: Sequence[Label], width: float, height: float, max_per_kind: int) -> list[Label]:
     """Labels that do not cover each other, brightest first, at most so many of a kind; wide and high in pixels.
 
     names : where they are to point, brightest first;  most : of a kind
     """
-    kept: list[Label] = []
+    accepted: list[Label] = []
     for label in names:
-        free = all(abs(label.column - x.column) > wide or abs(label.row - x.row) > high for x in kept)
-        if free and sum(x.kind == label.kind for x in kept) < most:
-            kept.append(label)
-    return kept
+        free = all(abs(label.column - x.column) > width or abs(label.row - x.row) > height for x in accepted)
+        if free and sum(x.kind == label.kind for x in accepted) < max_per_kind:
+            accepted.append(label)
+    return accepted
 
 
 def close_ups(names: Sequence[Label], shape: tuple[int, ...], pixel_scale: float) -> list[Label]:
@@ -95,4 +95,4 @@ def close_ups(names: Sequence[Label], shape: tuple[int, ...], pixel_scale: float
     inside = [
         x for x in names if x.kind == "galaxy" and half < x.column < shape[1] - half and half < x.row < shape[0] - half
     ]
-    return moved_apart(inside, 2 * half, 2 * half, CLOSE_UPS)
+    return without_overlaps(inside, 2 * half, 2 * half, CLOSE_UPS)

@@ -11,7 +11,7 @@ import numpy as np
 
 from lake_schema.arrays import Array
 from truesky.numerics import cache
-from truesky.numerics.code_keys import code_key
+from truesky.numerics.code_fingerprints import code_key
 from truesky.render.products import preview, read_back
 
 TILE = 512
@@ -25,24 +25,24 @@ def levels(path: Path, has_unit: bool, hits: Path | None, contents: tuple[str, s
     contents : sha256 of the image, and of the truth or ""
     """
     key = cache.content_key(code_key(__name__), *contents, TILE)
-    found = cache.cached_arrays("pyramid", key, lambda: _made(path, has_unit, hits))
-    return [found[str(level)] for level in range(len(found))]
+    arrays = cache.cached_arrays("pyramid", key, lambda: _build_levels(path, has_unit, hits))
+    return [arrays[str(level)] for level in range(len(arrays))]
 
 
-def _made(path: Path, has_unit: bool, hits: Path | None) -> dict[str, Array]:
+def _build_levels(path: Path, has_unit: bool, hits: Path | None) -> dict[str, Array]:
     image = np.asarray((read_back.electrons(path) if has_unit else read_back.frame(path)).data)
     if hits is not None:
         truth = np.asarray(read_back.frame(hits).data)
-        image = preview.mended(image.astype(float), truth > 0)
-    made = [image.astype(np.float32)]
-    while max(made[-1].shape) > TILE:
-        made.append(_halved(made[-1]))
-    return {str(number): level for number, level in enumerate(made)}
+        image = preview.repair_cosmic_rays(image.astype(float), truth > 0)
+    images = [image.astype(np.float32)]
+    while max(images[-1].shape) > TILE:
+        images.append(_halve(images[-1]))
+    return {str(number): level for number, level in enumerate(images)}
 
 
-def _halved(image: Array) -> Array:
+def _halve(image: Array) -> Array:
     """Means of 2 x 2 pixels; of an odd last row or column those that are there."""
     ny, nx = image.shape
-    even = np.pad(image, ((0, ny % 2), (0, nx % 2)), mode="edge")
-    mean: Array = even.reshape(even.shape[0] // 2, 2, even.shape[1] // 2, 2).mean(axis=(1, 3), dtype=np.float32)
+    padded = np.pad(image, ((0, ny % 2), (0, nx % 2)), mode="edge")
+    mean: Array = padded.reshape(padded.shape[0] // 2, 2, padded.shape[1] // 2, 2).mean(axis=(1, 3), dtype=np.float32)
     return mean

@@ -24,7 +24,7 @@ ERRORS = ("CSYER1", "CSYER2")
 _TEXT = "[deg] rms error of CRVAL; true: .head"
 
 
-def believed(
+def commanded_pointing(
     exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, seed: int
 ) -> tuple[float, float, float]:
     """Boresight and position angle as all raw headers of an exposure have them, deg; the true ones without an error.
@@ -34,14 +34,14 @@ def believed(
     exposure : its row;  detector : of its camera;  mission : the mission database;  seed : of the request
     """
     true = exposure.ra, exposure.dec, exposure.position_angle
-    offset, rotation = _errors(detector, mission)
+    offset, rotation = _rms_errors(detector, mission)
     if offset == rotation == 0.0:
         return true
     draws = rng.stream(seed, "exposures.header", image_types.identity(replace(exposure, realisation=None)))
     x, y, turn = (float(normal) for normal in draws.standard_normal(3))
     # As if what is at (x, y) of the field were in its middle: right at the poles, too.
-    seen = replace(detector, x=offset * x, y=offset * y, bending=())
-    ra, dec, angle = pointing.boresight_for(seen, true[0], true[1], true[2] + rotation * turn / 3600.0)
+    shifted_detector = replace(detector, x=offset * x, y=offset * y, distortion_terms=())
+    ra, dec, angle = pointing.boresight_for(shifted_detector, true[0], true[1], true[2] + rotation * turn / 3600.0)
     return ra, dec, angle
 
 
@@ -53,26 +53,30 @@ def cards(
     header : with the true system, the distortion as SIP
     exposure, detector, mission, seed : of `believed`
     """
-    offset, rotation = _errors(detector, mission)
+    offset, rotation = _rms_errors(detector, mission)
     if offset == rotation == 0.0:
         return tuple(header)
-    ra, dec, angle = believed(exposure, detector, mission, seed)
-    told = {"RA": ra, "DEC": dec}
-    told |= {key: value for key, value, _ in astrometry.cards(astrometry.wcs(detector, ra, dec, angle)) if _moves(key)}
+    ra, dec, angle = commanded_pointing(exposure, detector, mission, seed)
+    raw_values = {"RA": ra, "DEC": dec}
+    raw_values |= {
+        key: value
+        for key, value, _ in astrometry.cards(astrometry.wcs(detector, ra, dec, angle))
+        if _depends_on_pointing(key)
+    }
     out: list[Card] = []
     for key, value, comment in header:
-        out.append((key, told.get(key, value), comment))
+        out.append((key, raw_values.get(key, value), comment))
         if key == "RADESYS":
             out += [(error, offset / 3600.0, _TEXT) for error in ERRORS]
     return tuple(out)
 
 
-def _moves(keyword: str) -> bool:
+def _depends_on_pointing(keyword: str) -> bool:
     """Of a system, what another boresight changes: pixels and their distortion are the detector's."""
     return keyword.startswith(("CRVAL", "CD"))
 
 
-def _errors(detector: Detector, mission: MissionConfiguration) -> tuple[float, float]:
+def _rms_errors(detector: Detector, mission: MissionConfiguration) -> tuple[float, float]:
     """arcsec rms of each coordinate, and of the position angle; of spacecraft nothing is known of one."""
     keys = (f"{detector.section}.header.{name}" for name in ("offset", "rotation"))
     offset, rotation = (mission.value(key, "arcsec") if key in mission else 0.0 for key in keys)

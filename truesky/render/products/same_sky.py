@@ -22,7 +22,7 @@ from lake_schema.store import read
 from lake_schema.tables.exposures import CHANNELS
 from truesky.fluxes import passbands
 from truesky.render.camera import astrometry, footprints, pointing
-from truesky.render.planning.parts import of_exposures
+from truesky.render.planning.exposure_chunks import rows_of_exposures
 from truesky.render.products import read_back
 
 # Side of a patch, arcsec, and pixels of a picture of it; that of the colours is larger.
@@ -30,7 +30,7 @@ SIDE, _PIXELS, _COLOUR_PIXELS = 100.0, 440, 1000
 # Of each camera the band is shown whose wavelength is nearest to this, A: the longest that silicon sees.
 _WAVELENGTH = 9000.0
 # Places that are tried for a patch, along a side of a detector.
-_TRIED = 9
+_GRID_SIZE = 9
 # Red, green, blue: the first of these that the lake has.
 _COLOURS = (("euclid_h", "euclid_y", "euclid_vis"), ("lsst_i", "lsst_r", "lsst_g"), ("des_i", "des_r", "des_g"))
 # Shown from black to white: sigma below the sky, where logarithmic begins, sigma above.
@@ -55,23 +55,23 @@ def draw(root: Path, out: Path, request: str | None = None) -> list[Path]:
     cameras = sorted({_camera(row) for row in rows}, key=lambda camera: (order.index(camera[0]), camera))
     if len(cameras) < 3:
         return []
-    place = _shared(rows, cameras)
-    made = []
+    place = _best_place(rows, cameras)
+    paths = []
     panels = []
     for camera in cameras:
-        if seen := _holding(place, [row for row in rows if _camera(row) == camera]):
-            row = min(seen, key=lambda row: (_off(row), row["exposure_id"]))
+        if candidates := _rows_with_patch(place, [row for row in rows if _camera(row) == camera]):
+            row = min(candidates, key=lambda row: (_wavelength_offset(row), row["exposure_id"]))
             panels.append((row, patch(row["file"], place, _PIXELS, order=0)))
     if len(panels) > 2:
-        made.append(_panels(out / "same_sky.png", panels, place))
+        paths.append(_draw_panels(out / "same_sky.png", panels, place))
     bands: dict[str, list[Row]] = {}
-    for row in _holding(place, rows):
+    for row in _rows_with_patch(place, rows):
         bands.setdefault(row["band"], []).append(row)
     for names in _COLOURS:
         if all(name in bands for name in names):
-            made.append(_coloured(out / "colour.png", {name: bands[name] for name in names}, place))
+            paths.append(_draw_colours(out / "colour.png", {name: bands[name] for name in names}, place))
             break
-    return made
+    return paths
 
 
 def patch(file: Path, place: tuple[float, float], pixels: int, order: int) -> Float:
@@ -102,22 +102,22 @@ def _rows(root: Path, request: str | None) -> list[Row]:
     """Science images of the sky with their footprints and exposures."""
     version = read.version(root, "products", request=request)
     inputs = version.manifest["facts"]["inputs"]
-    made = version.rows()
-    numbers = made["exposure_id"].unique().to_pylist()
-    planned = (of_exposures(read.version(root, name, inputs[name]), numbers) for name in ("tasks", "exposures"))
-    some, exposed = (table.to_pylist() for table in planned)
-    tasks = {(task["exposure_id"], task["detector"]): task for task in some}
-    exposures = {row["exposure_id"]: row for row in exposed}
-    found = []
-    for row in made.to_pylist():
+    product_rows = version.rows()
+    numbers = product_rows["exposure_id"].unique().to_pylist()
+    planned = (rows_of_exposures(read.version(root, name, inputs[name]), numbers) for name in ("tasks", "exposures"))
+    task_rows, exposure_rows = (table.to_pylist() for table in planned)
+    tasks = {(task["exposure_id"], task["detector"]): task for task in task_rows}
+    exposures = {row["exposure_id"]: row for row in exposure_rows}
+    image_rows = []
+    for row in product_rows.to_pylist():
         exposure = exposures[row["exposure_id"]]
         if row["content"] == "science" and exposure["image_type"] in ("science", "deep"):
             task = tasks[row["exposure_id"], row["detector"]]
-            found.append({**exposure, **task, "file": version.file(row["path"])})
-    return found
+            image_rows.append({**exposure, **task, "file": version.sidecar_path(row["path"])})
+    return image_rows
 
 
-def _off(row: Row) -> float:
+def _wavelength_offset(row: Row) -> float:
     """A between its band and the one that is shown of each camera."""
     return abs(passbands.pivot_wavelength(passbands.load(row["band"])) - _WAVELENGTH)
 
@@ -126,19 +126,19 @@ def _camera(row: Row) -> tuple[str, str]:
     return row["channel"], row["camera"]
 
 
-def _shared(rows: Sequence[Row], cameras: Sequence[tuple[str, str]]) -> tuple[float, float]:
+def _best_place(rows: Sequence[Row], cameras: Sequence[tuple[str, str]]) -> tuple[float, float]:
     """The place whose patch most cameras see whole: of a grid over the detectors of the camera with the fewest."""
-    own = {camera: [row for row in rows if _camera(row) == camera] for camera in cameras}
-    fewest = own[min(cameras, key=lambda camera: (len(own[camera]), camera))]
-    step = np.linspace(-1.0, 1.0, _TRIED) * 3600.0 * max(row["radius"] for row in fewest) / np.sqrt(2.0)
+    rows_by_camera = {camera: [row for row in rows if _camera(row) == camera] for camera in cameras}
+    fewest = rows_by_camera[min(cameras, key=lambda camera: (len(rows_by_camera[camera]), camera))]
+    step = np.linspace(-1.0, 1.0, _GRID_SIZE) * 3600.0 * max(row["radius"] for row in fewest) / np.sqrt(2.0)
     across, up = (axis.ravel() for axis in np.meshgrid(step, step))
-    tried = [pointing.sky_of_plane(across, up, row["ra"], row["dec"], 0.0) for row in fewest]
-    ra, dec = (np.concatenate([place[i] for place in tried]) for i in (0, 1))
+    candidates = [pointing.sky_of_plane(across, up, row["ra"], row["dec"], 0.0) for row in fewest]
+    ra, dec = (np.concatenate([place[i] for place in candidates]) for i in (0, 1))
     corners = _corners(ra, dec)
-    seen = np.sum([_whole(own[camera], corners) for camera in cameras], axis=0)
+    n_cameras = np.sum([_contains_patch(rows_by_camera[camera], corners) for camera in cameras], axis=0)
     # Of several the one nearest to a detector's middle.
-    off = np.tile(np.hypot(across, up), len(fewest))
-    best = int(np.lexsort((off, -seen))[0])
+    distance = np.tile(np.hypot(across, up), len(fewest))
+    best = int(np.lexsort((distance, -n_cameras))[0])
     return float(ra[best]), float(dec[best])
 
 
@@ -149,33 +149,33 @@ def _corners(ra: Float, dec: Float) -> Float:
     return np.array([np.transpose(pointing.sky_of_plane(x, y, a, d, 0.0)) for a, d in zip(ra, dec, strict=True)])
 
 
-def _whole(rows: Sequence[Row], corners: Float) -> Int:
+def _contains_patch(rows: Sequence[Row], corners: Float) -> Int:
     """[n] 1 where one of the images has the whole patch of these corners, else 0."""
     flat = corners.reshape(-1, 2)
-    found = np.zeros(len(corners), bool)
+    contained = np.zeros(len(corners), bool)
     for row in rows:
-        found |= (footprints.counts(_footprint(row), flat[:, 0], flat[:, 1]).reshape(-1, 4) > 0).all(axis=1)
-    return found.astype(np.int64)
+        contained |= (footprints.counts(_footprint(row), flat[:, 0], flat[:, 1]).reshape(-1, 4) > 0).all(axis=1)
+    return contained.astype(np.int64)
 
 
-def _holding(place: tuple[float, float], rows: Sequence[Row]) -> list[Row]:
+def _rows_with_patch(place: tuple[float, float], rows: Sequence[Row]) -> list[Row]:
     """The images that have the patch about a place whole."""
     corners = _corners(np.array([place[0]]), np.array([place[1]]))
-    return [row for row in rows if _whole([row], corners)[0]]
+    return [row for row in rows if _contains_patch([row], corners)[0]]
 
 
 def _footprint(row: Row) -> pa.Table:
     return pa.Table.from_pylist([{name: row[name] for name in ("ra", "dec", "radius", "s_region")}])
 
 
-def _levels(image: Float) -> tuple[float, float]:
+def _sky_and_noise(image: Float) -> tuple[float, float]:
     """Sky and noise, from the median and the quartile below it: gaps between cells and cosmic rays are few."""
-    some = image[np.isfinite(image)]
-    low, level = np.quantile(some, (0.25, 0.5))
+    finite = image[np.isfinite(image)]
+    low, level = np.quantile(finite, (0.25, 0.5))
     return float(level), max(float(level - low) / _QUARTILE, 1e-12)
 
 
-def _panels(path: Path, panels: Sequence[tuple[Row, Float]], place: tuple[float, float]) -> Path:
+def _draw_panels(path: Path, panels: Sequence[tuple[Row, Float]], place: tuple[float, float]) -> Path:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -184,7 +184,7 @@ def _panels(path: Path, panels: Sequence[tuple[Row, Float]], place: tuple[float,
     FigureCanvasAgg(figure)
     for number, (row, image) in enumerate(panels):
         axes = figure.add_subplot(lines, _COLUMNS, number + 1)
-        level, noise = _levels(image)
+        level, noise = _sky_and_noise(image)
         signal = np.clip((image - level) / noise, _BLACK, _WHITE)
         axes.imshow(np.arcsinh(signal / _KNEE), origin="lower", cmap="gray", interpolation="none")
         axes.set_axis_off()
@@ -198,7 +198,7 @@ def _panels(path: Path, panels: Sequence[tuple[Row, Float]], place: tuple[float,
     return path
 
 
-def _coloured(path: Path, bands: Mapping[str, Sequence[Row]], place: tuple[float, float]) -> Path:
+def _draw_colours(path: Path, bands: Mapping[str, Sequence[Row]], place: tuple[float, float]) -> Path:
     """The median of each band's exposures, in which no cosmic ray is left where there are three or more."""
     from matplotlib.image import imsave
 
@@ -206,11 +206,11 @@ def _coloured(path: Path, bands: Mapping[str, Sequence[Row]], place: tuple[float
     for rows in bands.values():
         # To the flux of an AB magnitude, the same in all bands.
         scale = [10.0 ** (-0.4 * row["zero_point"]) / row["exposure_time_s"] for row in rows]
-        some = [patch(row["file"], place, _COLOUR_PIXELS, order=1) for row in rows]
-        above = np.sort([s * (p - _levels(p)[0]) for s, p in zip(scale, some, strict=True)], axis=0)
+        patches = [patch(row["file"], place, _COLOUR_PIXELS, order=1) for row in rows]
+        above = np.sort([s * (p - _sky_and_noise(p)[0]) for s, p in zip(scale, patches, strict=True)], axis=0)
         # Of two the lower.
         layers.append(above[(len(above) - 1) // 2])
-    made = colours(*(layer / _levels(layer)[1] for layer in layers))
+    picture = colours(*(layer / _sky_and_noise(layer)[1] for layer in layers))
     path.parent.mkdir(parents=True, exist_ok=True)
-    imsave(path, made, origin="lower")
+    imsave(path, picture, origin="lower")
     return path

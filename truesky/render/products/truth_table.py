@@ -12,7 +12,7 @@ import pyarrow as pa
 from lake_schema.arrays import Float, Int
 from lake_schema.tables.rendered_truth import RENDERED_SPECTRA, RENDERED_TRUTH
 from truesky.render.drawing import transfer
-from truesky.render.exposure.rendered import Rendered
+from truesky.render.exposure.rendered_detector import RenderedDetector
 from truesky.render.psf import centroids
 from truesky.render.sources.source_list import Sources
 
@@ -20,7 +20,7 @@ from truesky.render.sources.source_list import Sources
 POINT, PROFILE, PICTURE, TRAIL = 0, 1, 2, 3
 
 
-def truth(rendered: Rendered) -> pa.Table:
+def truth(rendered: RenderedDetector) -> pa.Table:
     """One row a source that was drawn, ascending id."""
     sources, n, (psf_x, psf_y) = rendered.sources, len(rendered.sources), _centroids(rendered)
     trail = np.zeros((n, 2)) if sources.trail is None else sources.trail
@@ -32,7 +32,7 @@ def truth(rendered: Rendered) -> pa.Table:
             "x": sources.column,
             "y": sources.row,
             "expected": sources.electrons,
-            "drawn": rendered.drawn,
+            "drawn": rendered.drawn_electrons,
             "stamp": rendered.sizes,
             "method": _methods(sources),
             "trail_x": trail[:, 0],
@@ -44,7 +44,7 @@ def truth(rendered: Rendered) -> pa.Table:
     )
 
 
-def _centroids(rendered: Rendered) -> tuple[Float | None, Float | None]:
+def _centroids(rendered: RenderedDetector) -> tuple[Float | None, Float | None]:
     """Of a point of each source's colour, from its place, pixels; None where light is spread out."""
     sources, psf = rendered.sources, rendered.psf
     if psf is None or rendered.spectra is not None:
@@ -52,7 +52,7 @@ def _centroids(rendered: Rendered) -> tuple[Float | None, Float | None]:
     return centroids.offsets(psf, transfer.basis_weights(psf, sources.photons, sources.column, sources.row))
 
 
-def _magnitudes(rendered: Rendered) -> Float:
+def _magnitudes(rendered: RenderedDetector) -> Float:
     """By the zero point and the exposure time of the header; null where nothing is expected."""
     electrons = rendered.sources.electrons
     shines = electrons > 0.0
@@ -60,7 +60,7 @@ def _magnitudes(rendered: Rendered) -> Float:
     return np.ma.masked_array(rendered.zero_point - 2.5 * np.log10(rate), ~shines)
 
 
-def spectra(rendered: Rendered) -> pa.Table | None:
+def spectra(rendered: RenderedDetector) -> pa.Table | None:
     """One row a source and order with light on the detector; None where nothing is dispersed."""
     if rendered.spectra is None:
         return None
@@ -77,4 +77,4 @@ def spectra(rendered: Rendered) -> pa.Table | None:
 def _methods(sources: Sources) -> Int:
     pictured = np.zeros(len(sources), bool) if sources.picture is None else sources.picture >= 0
     method = np.where(sources.shape >= 0, PROFILE, np.where(pictured, PICTURE, POINT))
-    return np.where(sources.length > 0, TRAIL, method)
+    return np.where(sources.trail_length > 0, TRAIL, method)

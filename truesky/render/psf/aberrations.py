@@ -22,7 +22,7 @@ FARTHEST = 3.0
 # Samples across the pupil, of the transform that its overlaps are made by; steps of the lattice out to FARTHEST.
 _ACROSS, _TRANSFORM, _LATTICE = 120, 256, 10
 # Distance at which the phase tells where the light's centroid is, m.
-_NEAR = 0.06
+_CENTROID_LAG = 0.06
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ class Telescope:
     outer: float
 
     @classmethod
-    def of(cls, section: str, mission: MissionConfiguration) -> Telescope:
+    def from_mission(cls, section: str, mission: MissionConfiguration) -> Telescope:
         """Of a camera's section of the mission database; what is not clear of its aperture is in the middle."""
         radius = 0.5 * mission.value(f"{section}.aperture_diameter", "m")
         area = mission.value(f"{section}.collecting_area", "m2")
@@ -45,14 +45,14 @@ class Telescope:
 
 
 @dataclass(frozen=True, slots=True)
-class Ratio:
+class TransferRatio:
     """The optics' transfer function over that without aberrations: complex[2 m + 1, 2 m + 1] at lags `step` m apart."""
 
     values: Complex
     step: float
 
     @classmethod
-    def of(cls, nm: Float, telescope: Telescope, wave: float, fried: float, turn: float) -> Ratio:
+    def from_wavefront(cls, nm: Float, telescope: Telescope, wave: float, fried: float, turn: float) -> TransferRatio:
         """Of a wavefront, nm by Noll number, in axes that are turned by `turn`, radian.
 
         telescope : its pupil;  wave : A;  fried : m
@@ -66,11 +66,11 @@ class Ratio:
         field = scipy.fft.fft2(clear * np.exp(1j * phase), (_TRANSFORM, _TRANSFORM))
         overlap = scipy.fft.ifft2(np.abs(field) ** 2)[np.ix_(lags, lags)]
         values = overlap / plain[np.ix_(lags, lags)]
-        near = max(round(_NEAR / (stride * step)), 1)
+        lag_steps = max(round(_CENTROID_LAG / (stride * step)), 1)
         middle, along = _LATTICE + 1, stride * step * (np.arange(len(lags)) - _LATTICE - 1)
         tilts = [
-            float(np.angle(v)) / (near * stride * step)
-            for v in (values[middle, middle + near], values[middle + near, middle])
+            float(np.angle(v)) / (lag_steps * stride * step)
+            for v in (values[middle, middle + lag_steps], values[middle + lag_steps, middle])
         ]
         values = values * np.exp(-1j * (tilts[0] * along + tilts[1] * along[:, None]))
         return cls(values, stride * step)
@@ -88,23 +88,40 @@ def _pupil(radius: float, inner: float) -> tuple[Float, Float, Float, Float]:
     return x, y, clear, np.asarray(overlap)
 
 
-def clear(distance: Float, radius: float, inner: float) -> Float:
+def ideal_transfer(distance: Float, radius: float, inner: float) -> Float:
     """Overlap of a ring with itself, moved by a distance, of its area: the transfer function of perfect optics.
 
     distance : [...] m;  radius, inner : of the ring, m
     """
     area = np.pi * (radius**2 - inner**2)
-    whole = _lens(distance, radius, radius) - 2.0 * _lens(distance, radius, inner) + _lens(distance, inner, inner)
-    return np.asarray(whole / area)
+    overlap = (
+        _circle_overlap(distance, radius, radius)
+        - 2.0 * _circle_overlap(distance, radius, inner)
+        + _circle_overlap(distance, inner, inner)
+    )
+    return np.asarray(overlap / area)
 
 
-def _lens(distance: Float, one: float, other: float) -> Float:
+def _circle_overlap(distance: Float, first_radius: float, second_radius: float) -> Float:
     """Area that two circles have in common whose middles lie a distance apart."""
-    small = min(one, other)
+    small = min(first_radius, second_radius)
     if small == 0.0:
         return np.zeros_like(distance)
-    d = np.clip(distance, max(abs(one - other), 1e-12), one + other)
-    a, b = (d * d + one**2 - other**2) / (2.0 * d * one), (d * d + other**2 - one**2) / (2.0 * d * other)
-    rim = np.maximum((one + other - d) * (d + one - other) * (d - one + other) * (d + one + other), 0.0)
-    area = one**2 * np.arccos(np.clip(a, -1.0, 1.0)) + other**2 * np.arccos(np.clip(b, -1.0, 1.0)) - 0.5 * np.sqrt(rim)
-    return np.asarray(np.where(distance <= abs(one - other), np.pi * small**2, area))
+    d = np.clip(distance, max(abs(first_radius - second_radius), 1e-12), first_radius + second_radius)
+    a, b = (
+        (d * d + first_radius**2 - second_radius**2) / (2.0 * d * first_radius),
+        (d * d + second_radius**2 - first_radius**2) / (2.0 * d * second_radius),
+    )
+    rim = np.maximum(
+        (first_radius + second_radius - d)
+        * (d + first_radius - second_radius)
+        * (d - first_radius + second_radius)
+        * (d + first_radius + second_radius),
+        0.0,
+    )
+    area = (
+        first_radius**2 * np.arccos(np.clip(a, -1.0, 1.0))
+        + second_radius**2 * np.arccos(np.clip(b, -1.0, 1.0))
+        - 0.5 * np.sqrt(rim)
+    )
+    return np.asarray(np.where(distance <= abs(first_radius - second_radius), np.pi * small**2, area))

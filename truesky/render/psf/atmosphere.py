@@ -51,7 +51,7 @@ def fwhm(wavelength: float, fried: float, outer: float) -> float:
 
 
 @lru_cache(maxsize=256)
-def finest(wavelength: float, outer: float) -> float:
+def finest_seeing(wavelength: float, outer: float) -> float:
     """The least FWHM, arcsec, that is looked for; wavelength : A;  outer : outer scale, m."""
     return fwhm(wavelength, _LONGEST * outer, outer)
 
@@ -64,14 +64,14 @@ def fried_length(seeing: float, wavelength: float, outer: float) -> float:
     Errors : OutOfRange for a seeing that the turbulence does not make
     """
     ends = tuple(ratio * outer for ratio in (_SHORTEST, _LONGEST))
-    worst, best = fwhm(wavelength, ends[0], outer), finest(wavelength, outer)
+    worst, best = fwhm(wavelength, ends[0], outer), finest_seeing(wavelength, outer)
     if not best <= seeing <= worst:
         raise OutOfRange("seeing, arcsec", seeing, best, worst)
     # Of an infinite outer scale the length would be this: it is between that and half of it but for the sharpest.
-    about = 0.976 * wavelength * 1e-10 / (seeing * _ARCSEC)
-    low, high = (max(ends[0], 0.4 * about), min(ends[1], 1.02 * about))
-    found = brentq(lambda fried: np.log(fwhm(wavelength, float(fried), outer) / seeing), low, high, rtol=1e-7)
-    return float(found)
+    estimate = 0.976 * wavelength * 1e-10 / (seeing * _ARCSEC)
+    low, high = (max(ends[0], 0.4 * estimate), min(ends[1], 1.02 * estimate))
+    length = brentq(lambda fried: np.log(fwhm(wavelength, float(fried), outer) / seeing), low, high, rtol=1e-7)
+    return float(length)
 
 
 def refraction(wavelength: Float, height: float) -> Float:

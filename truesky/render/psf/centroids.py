@@ -14,7 +14,7 @@ import numpy as np
 from scipy.ndimage import correlate1d
 
 from lake_schema.arrays import Array, Float
-from truesky.numerics import sums
+from truesky.numerics import matrices
 from truesky.render.psf.model import SAMPLES, Psf
 
 # Of a Gaussian's rms, its FWHM, which is also its half-light diameter.
@@ -30,22 +30,22 @@ def offsets(psf: Psf, weights: Float) -> tuple[Float, Float]:
     Error   : 3 % of the offset where it is a sixth of the window's rms (one step towards the even place); VIS, 0.5 mas,
               as a tenth more of a window moves the centroid by 1.2 mas
     """
-    planes, samples = _sampled(psf)
+    planes, samples = _sample_planes(psf)
     # With the pixel, which all that is measured has in it; apertures take its light as even in it.
     inside = 0 if psf.intra_pixel is None else 1
-    seen = np.sum(planes[: _colours(psf)], axis=0)
+    image = np.sum(planes[: _colour_count(psf)], axis=0)
     for _ in range(1 + inside):
-        seen = _averaged(_averaged(seen, samples, 0), samples, 1)
-    window = _half_light_diameter(seen, samples) / _FWHM
+        image = _average_over_pixel(_average_over_pixel(image, samples, 0), samples, 1)
+    window = _half_light_diameter(image, samples) / _FWHM
     moments = np.stack([_moments(plane, samples, window, inside) for plane in planes])
-    zeroth, x, y, xx, xy, yy = sums.product(weights, moments).T
+    zeroth, x, y, xx, xy, yy = matrices.matmul(weights, moments).T
     # How fast the window's first moments fall where it is moved.
     a, b, c = zeroth - xx / window**2, -xy / window**2, zeroth - yy / window**2
     scale = a * c - b * b
     return np.asarray((c * x - b * y) / scale), np.asarray((a * y - b * x) / scale)
 
 
-def _sampled(psf: Psf) -> tuple[list[Array], int]:
+def _sample_planes(psf: Psf) -> tuple[list[Array], int]:
     """The middle of the planes, and samples a pixel."""
     if psf.planes is not None:
         samples = psf.planes.samples
@@ -61,14 +61,14 @@ def _middle(plane: Array, reach: int) -> Array:
     return plane[middle - reach : middle + reach + 1, middle - reach : middle + reach + 1]
 
 
-def _averaged(plane: Array, samples: int, axis: int) -> Float:
+def _average_over_pixel(plane: Array, samples: int, axis: int) -> Float:
     """Over a pixel about each sample; of an even number of samples the outermost count half."""
     weights = np.full(samples + 1 - samples % 2, 1.0 / samples)
     weights[[0, -1]] *= 1.0 if samples % 2 else 0.5
     return np.asarray(correlate1d(np.asarray(plane, float), weights, axis))
 
 
-def _colours(psf: Psf) -> int:
+def _colour_count(psf: Psf) -> int:
     return 1 if psf.planes is None else len(psf.planes.images)
 
 
@@ -82,15 +82,15 @@ def _half_light_diameter(plane: Array, samples: int) -> float:
     radius, light = np.hypot(axis, axis[:, None]).ravel(), np.asarray(plane, float).ravel()
     order = np.argsort(radius, kind="stable")
     grown = np.cumsum(light[order])
-    half, near = 0.5 * grown[-1], float(radius[order][np.searchsorted(grown, 0.5 * grown[-1])])
+    half, half_radius = 0.5 * grown[-1], float(radius[order][np.searchsorted(grown, 0.5 * grown[-1])])
     # What is farther from the edge is inside or outside, however far the edge is moved.
-    low, high = max(near - 1.0 / samples, 0.0), near + 1.0 / samples
+    low, high = max(half_radius - 1.0 / samples, 0.0), half_radius + 1.0 / samples
     edge = (radius > low - 1.0 / samples) & (radius < high + 1.0 / samples)
     inside, radius, light = float(light[radius <= low - 1.0 / samples].sum()), radius[edge], light[edge]
     for _ in range(40):
         middle = 0.5 * (low + high)
-        held = inside + float((light * np.clip((middle - radius) * samples + 0.5, 0.0, 1.0)).sum())
-        low, high = (middle, high) if held < half else (low, middle)
+        enclosed = inside + float((light * np.clip((middle - radius) * samples + 0.5, 0.0, 1.0)).sum())
+        low, high = (middle, high) if enclosed < half else (low, middle)
     return low + high
 
 
@@ -103,7 +103,7 @@ def _moments(plane: Array, samples: int, window: float, inside: int) -> Float:
     axis = (np.arange(len(plane)) - len(plane) // 2) / samples
     powers = np.exp(-0.5 * (axis / window) ** 2) * axis ** np.arange(3)[:, None]
     if inside:
-        powers = _averaged(powers, samples, 1)
+        powers = _average_over_pixel(powers, samples, 1)
     # [3, 3] along y, along x.
     along_x = (np.asarray(plane, float) * powers[:, None]).sum(axis=2)
     m = (powers[:, None] * along_x).sum(axis=2)

@@ -77,7 +77,7 @@ def optics_of(wavelength: float, sampling: float, mission: MissionConfiguration,
     return Optics(transform, transmission, x[lit] / radius, y[lit] / radius, wavelength)
 
 
-def diffracted(nm: Float, optics: Optics, side: int | None = None) -> Float32:
+def diffraction_image(nm: Float, optics: Optics, side: int | None = None) -> Float32:
     """|FFT of the pupil|^2 of unit flux over the whole sky, the soft edges' loss made good: [side, side].
 
     nm   : by Noll number;  side : samples about the middle, side // 2; None: the whole transform's

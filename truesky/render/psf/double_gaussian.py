@@ -37,23 +37,23 @@ def widths(ee50: float, ee80: float, part: float) -> tuple[float, float]:
     if not 0.0 < ee50 < ee80:
         raise BadInput(f"radii of 50 and 80 % of the light, {ee50:g} and {ee80:g}, do not rise")
 
-    def wide(core: float) -> float:
+    def outer_width(core: float) -> float:
         """s2, of what is left of the core's light beyond EE50."""
         return float(ee50 / np.sqrt(-2.0 * np.log((0.5 - part * core) / (1.0 - part))))
 
-    def narrow(core: float) -> float:
+    def core_width(core: float) -> float:
         return float(ee50 / np.sqrt(-2.0 * np.log(core)))
 
-    def beyond(core: float) -> float:
-        light = (part, narrow(core)), (1.0 - part, wide(core))
-        return sum(own * float(np.exp(-0.5 * (ee80 / s) ** 2)) for own, s in light) - 0.2
+    def light_excess(core: float) -> float:
+        light = (part, core_width(core)), (1.0 - part, outer_width(core))
+        return sum(fraction * float(np.exp(-0.5 * (ee80 / s) ** 2)) for fraction, s in light) - 0.2
 
     # From a wider Gaussian without an end to two that are one.
     ends = (0.5 - (1.0 - part)) / part * (1.0 + 1e-9), 0.5
-    if beyond(ends[1]) >= 0.0:
-        return narrow(0.5), narrow(0.5)
-    found = float(brentq(beyond, *ends, xtol=1e-14))
-    return narrow(found), wide(found)
+    if light_excess(ends[1]) >= 0.0:
+        return core_width(0.5), core_width(0.5)
+    best_core = float(brentq(light_excess, *ends, xtol=1e-14))
+    return core_width(best_core), outer_width(best_core)
 
 
 def psf_at(detector: Detector, waves: Float, mission: MissionConfiguration) -> Psf:
@@ -66,10 +66,10 @@ def psf_at(detector: Detector, waves: Float, mission: MissionConfiguration) -> P
     radius = np.hypot(*np.meshgrid(*[np.arange(side * samples + 1) - side * samples // 2] * 2))
     images = []
     for wavelength in waves.tolist():
-        away = (wavelength - _MIDDLE) / 1e4
+        wavelength_offset = (wavelength - _MIDDLE) / 1e4
         ee50, ee80 = (
             mission.value(f"{section}.spectra.ee{part}", "arcsec")
-            + away * mission.value(f"{section}.spectra.ee{part}_slope", "arcsec / um")
+            + wavelength_offset * mission.value(f"{section}.spectra.ee{part}_slope", "arcsec / um")
             for part in (50, 80)
         )
         image = np.zeros(radius.shape)
@@ -79,4 +79,4 @@ def psf_at(detector: Detector, waves: Float, mission: MissionConfiguration) -> P
         images.append(image.astype(np.float32))
     half = (detector.nx - 1) / 2, (detector.ny - 1) / 2
     planes = Planes(waves, np.stack(images), np.zeros((0, *radius.shape), np.float32), half, samples=samples)
-    return model.sampled(planes, detector.pixel_scale, has_pixel=False, side=side)
+    return model.from_planes(planes, detector.pixel_scale, has_pixel=False, side=side)

@@ -20,12 +20,12 @@ from scipy.ndimage import uniform_filter
 from lake_schema.arrays import Array, Float, Float32
 from lake_schema.mission.configuration import MissionConfiguration
 from truesky.fluxes.passbands import Passband
-from truesky.numerics import cache, sums
-from truesky.numerics.code_keys import code_key
+from truesky.numerics import cache, matrices
+from truesky.numerics.code_fingerprints import code_key
 from truesky.numerics.compiling import jit
 from truesky.render.camera.detectors import Detector, detectors
 from truesky.render.psf import model, spikes
-from truesky.render.psf.diffraction import diffracted, optics_of
+from truesky.render.psf.diffraction import diffraction_image, optics_of
 from truesky.render.psf.model import DETAIL, SAMPLES, SIDE, Planes, Psf
 from truesky.render.psf.spikes import Edges
 from truesky.render.psf.sub_bands import sub_bands
@@ -90,7 +90,7 @@ def nisp_psf_at(detector: Detector, waves: Float, mission: MissionConfiguration,
     detector, mission, positions : as of vis_psf
     """
     planes = _planes(NISP, detector, waves, mission, positions)
-    return model.sampled(planes, detector.pixel_scale, has_pixel=False, side=NISP.side)
+    return model.from_planes(planes, detector.pixel_scale, has_pixel=False, side=NISP.side)
 
 
 def vis_edges(detector: Detector, band: Passband, mission: MissionConfiguration) -> Edges:
@@ -108,15 +108,15 @@ def _psf(sampling: Sampling, detector: Detector, band: Passband, mission: Missio
     parts = sub_bands(band)
     waves = np.array([np.sqrt(np.average(p.wavelength**2, weights=p.response / p.wavelength)) for p in parts])
     planes = _planes(sampling, detector, waves, mission, positions)
-    found = model.sampled(planes, detector.pixel_scale, has_pixel=False, side=sampling.side)
-    return replace(found, edges=_edges(sampling, detector, band, mission))
+    psf = model.from_planes(planes, detector.pixel_scale, has_pixel=False, side=sampling.side)
+    return replace(psf, edges=_edges(sampling, detector, band, mission))
 
 
 def _edges(sampling: Sampling, detector: Detector, band: Passband, mission: MissionConfiguration) -> Edges:
     parts = sub_bands(band)
     waves = np.concatenate([part.wavelength for part in parts])
     blur = float(np.sqrt(np.mean(_blur_variances(detector, float(waves.mean()), mission))))
-    return spikes.of_pupil(parts, blur, detector.pixel_scale, sampling.transform / sampling.samples, mission)
+    return spikes.from_euclid_pupil(parts, blur, detector.pixel_scale, sampling.transform / sampling.samples, mission)
 
 
 # ------------------------------------------------------------------------------------------------ the optics
@@ -138,13 +138,13 @@ def wavefront(x: float, y: float, section: str, mission: MissionConfiguration) -
 
 
 def _planes(
-    sampled: Sampling, detector: Detector, waves: Float, mission: MissionConfiguration, positions: int
+    camera_sampling: Sampling, detector: Detector, waves: Float, mission: MissionConfiguration, positions: int
 ) -> Planes:
     """Of wavelengths [w] A."""
     section = detector.section
     nodes, powers = _nodes(positions), _powers(positions)
-    places = [_field(detector, *place, mission) for place in ((0.0, 0.0), *nodes)]
-    sampling = detector.pixel_scale / sampled.samples
+    places = [_field_position(detector, *place, mission) for place in ((0.0, 0.0), *nodes)]
+    sampling = detector.pixel_scale / camera_sampling.samples
     wavefronts = np.array([wavefront(*place, section, mission) for place in places])
     blurs = [_blur_variances(detector, float(wavelength), mission) for wavelength in waves]
     optics = [p for p in mission.parameters if p.key.startswith("plm.")]
@@ -153,37 +153,43 @@ def _planes(
         wavefronts,
         waves,
         repr([(p.key, p.value, p.unit) for p in optics]),
-        repr((sampled, sampling, *blurs)),
+        repr((camera_sampling, sampling, *blurs)),
     )
 
     def make() -> dict[str, Array]:
-        coefficients = [centred(nm, waves, sampled, sampling, mission) for nm in wavefronts]
+        coefficients = [centre_wavefront(nm, waves, camera_sampling, sampling, mission) for nm in wavefronts]
         centre = [
-            _plane(coefficients[0], w, sampled, sampling, blur, mission) for w, blur in zip(waves, blurs, strict=True)
+            _plane(coefficients[0], w, camera_sampling, sampling, blur, mission)
+            for w, blur in zip(waves, blurs, strict=True)
         ]
         # Of the drift, a part in a hundred of the light, the mean's blur is blur enough.
         blur = tuple(np.mean(blurs, axis=0).tolist())
         return {
             "images": np.stack(centre).astype(np.float32),
-            "drift": _drift(coefficients, positions, waves, sampled, sampling, blur, mission).astype(np.float32),
+            "drift": _drift(coefficients, positions, waves, camera_sampling, sampling, blur, mission).astype(
+                np.float32
+            ),
         }
 
     arrays = cache.cached_arrays(f"{section}_psf", key, make)
-    turned = slice(None, None, -1 if detector.upside_down else 1)
+    axis_order = slice(None, None, -1 if detector.upside_down else 1)
     # Upside down, both the planes and the places that the drift is written in are turned.
     sign = np.array([(-1) ** (i + j) for i, j, _ in powers], np.float32)[:, None, None]
-    drift = arrays["drift"][:, turned, turned] * (sign if detector.upside_down else np.float32(1.0))
+    drift = arrays["drift"][:, axis_order, axis_order] * (sign if detector.upside_down else np.float32(1.0))
     half = ((detector.nx - 1) / 2, (detector.ny - 1) / 2)
-    return Planes(waves, arrays["images"][:, turned, turned], drift, half, powers, sampled.samples)
+    return Planes(waves, arrays["images"][:, axis_order, axis_order], drift, half, powers, camera_sampling.samples)
 
 
-def _field(detector: Detector, x: float, y: float, mission: MissionConfiguration) -> tuple[float, float]:
+def _field_position(detector: Detector, x: float, y: float, mission: MissionConfiguration) -> tuple[float, float]:
     """Field coordinates, -1 .. 1 over the focal plane's outer edges, of a place in half sides from the centre."""
-    everything = detectors(detector.section, mission)
+    all_detectors = detectors(detector.section, mission)
     half_x, half_y = (n * detector.pixel_scale / 2 for n in (detector.nx, detector.ny))
-    reach_x, reach_y = (max(abs(getattr(d, axis)) for d in everything) for axis in ("x", "y"))
-    whole = everything[0]
-    reach_x, reach_y = reach_x + whole.nx * whole.pixel_scale / 2, reach_y + whole.ny * whole.pixel_scale / 2
+    reach_x, reach_y = (max(abs(getattr(d, axis)) for d in all_detectors) for axis in ("x", "y"))
+    first_detector = all_detectors[0]
+    reach_x, reach_y = (
+        reach_x + first_detector.nx * first_detector.pixel_scale / 2,
+        reach_y + first_detector.ny * first_detector.pixel_scale / 2,
+    )
     return (detector.x + x * half_x) / reach_x, (detector.y + y * half_y) / reach_y
 
 
@@ -223,8 +229,8 @@ def _powers(positions: int) -> tuple[tuple[int, int, int], ...]:
     """Planes.powers of the drift: of the mean PSF, then of its slope with wavelength."""
     return tuple(
         (degree - j, j, colour)
-        for colour, most in enumerate(DEGREES[positions])
-        for degree in range(1, most + 1)
+        for colour, max_degree in enumerate(DEGREES[positions])
+        for degree in range(1, max_degree + 1)
         for j in range(degree + 1)
     )
 
@@ -233,23 +239,23 @@ def _drift(
     coefficients: Sequence[Float],
     positions: int,
     waves: Float,
-    sampled: Sampling,
+    camera_sampling: Sampling,
     sampling: float,
     blur: tuple[float, float],
     mission: MissionConfiguration,
 ) -> Float:
     """Planes of Planes.drift in the focal plane's axes, by least squares; coefficients: of the centre and the nodes."""
-    powers, weights = _powers(positions), _weights_of(blur, sampling)
-    side = sampled.core_side * sampled.samples + 1
+    powers, weights = _powers(positions), _blur_weights(blur, sampling)
+    side = camera_sampling.core_side * camera_sampling.samples + 1
     if not powers:
         return np.zeros((0, side, side))
     side += 2 * _margin(weights)
     mean, slope = np.zeros((2, len(coefficients), side, side))
     redder = (waves - waves.mean()) / np.sum((waves - waves.mean()) ** 2)
     for wavelength, tilt in zip(waves, redder, strict=True):
-        optics = optics_of(float(wavelength), sampling, mission, sampled.core_transform)
+        optics = optics_of(float(wavelength), sampling, mission, camera_sampling.core_transform)
         for i, nm in enumerate(coefficients):
-            image = diffracted(nm, optics, side)
+            image = diffraction_image(nm, optics, side)
             mean[i] += image / len(waves)
             slope[i] += image * tilt
     x, y = np.array(_nodes(positions)).T
@@ -257,65 +263,74 @@ def _drift(
     for order, images in enumerate((mean, slope)):
         terms = [x**i * y**j for i, j, colour in powers if colour == order]
         if terms:
-            from_nodes = sums.least_squares(np.stack(terms, axis=1), np.eye(len(x)))
-            change = sums.product(from_nodes, (images[1:] - images[0]).reshape(len(x), -1)).reshape(-1, side, side)
+            from_nodes = matrices.least_squares(np.stack(terms, axis=1), np.eye(len(x)))
+            change = matrices.matmul(from_nodes, (images[1:] - images[0]).reshape(len(x), -1)).reshape(-1, side, side)
             # The blur is the same for all, and linear.
-            changes += [_blurred(image, weights) for image in change]
+            changes += [_blur_image(image, weights) for image in change]
     return np.stack(changes)
 
 
-def centred(nm: Float, waves: Float, sampled: Sampling, sampling: float, mission: MissionConfiguration) -> Float:
+def centre_wavefront(
+    nm: Float, waves: Float, camera_sampling: Sampling, sampling: float, mission: MissionConfiguration
+) -> Float:
     """A wavefront with the tilt that puts the windowed centroid of its light in a pixel at the middle sample.
 
     nm : by Noll number;  waves : [w] A;  sampling : arcsec;  sampled, mission : of the camera
     Error : 0.1 mas
     """
-    if not sampled.window:
+    if not camera_sampling.window:
         return nm
     # Of a band two wavelengths tell the mean.
     off = 0.58 * 0.5 * (waves.max() - waves.min())
-    optics = [optics_of(float(waves.mean() + part), sampling, mission, sampled.core_transform) for part in (-off, off)]
-    side = 2 * round(_WINDOWS * sampled.window / sampling) + 1
+    optics = [
+        optics_of(float(waves.mean() + part), sampling, mission, camera_sampling.core_transform) for part in (-off, off)
+    ]
+    side = 2 * round(_WINDOWS * camera_sampling.window / sampling) + 1
     axis = sampling * (np.arange(side) - side // 2)
-    window = np.exp(-0.5 * (axis / sampled.window) ** 2)
+    window = np.exp(-0.5 * (axis / camera_sampling.window) ** 2)
 
-    def centroid(own: Float) -> Float:
-        light = np.sum([diffracted(own, one, side) for one in optics], axis=0, dtype=float)
-        seen = uniform_filter(light, sampled.samples, mode="nearest") * window * window[:, None]
-        return np.asarray(np.array([(seen * axis).sum(), (seen * axis[:, None]).sum()]) / seen.sum())
+    def centroid(coefficients: Float) -> Float:
+        light = np.sum(
+            [diffraction_image(coefficients, pupil_optics, side) for pupil_optics in optics], axis=0, dtype=float
+        )
+        weighted = uniform_filter(light, camera_sampling.samples, mode="nearest") * window * window[:, None]
+        return np.asarray(np.array([(weighted * axis).sum(), (weighted * axis[:, None]).sum()]) / weighted.sum())
 
-    own, step = nm.copy(), 10.0
-    at = centroid(own)
-    own[2:4] += step
-    before, at = at, centroid(own)
-    response = (at - before) / step
+    tilted_nm, step = nm.copy(), 10.0
+    position = centroid(tilted_nm)
+    tilted_nm[2:4] += step
+    previous, position = position, centroid(tilted_nm)
+    response = (position - previous) / step
     for _ in range(3):
-        own[2:4] -= at / response
-        at = centroid(own)
-    return own
+        tilted_nm[2:4] -= position / response
+        position = centroid(tilted_nm)
+    return tilted_nm
 
 
 def _plane(
-    nm: Float, wavelength: float, sampled: Sampling, sampling: float, blur: tuple[float, float],
+    nm: Float, wavelength: float, camera_sampling: Sampling, sampling: float, blur: tuple[float, float],
     mission: MissionConfiguration,
 ) -> Float32:  # fmt: skip
     """One wavelength's PSF: [side * samples + 1] square, in the focal plane's axes."""
-    weights = _weights_of(blur, sampling)
-    optics = optics_of(wavelength, sampling, mission, sampled.transform)
-    return _blurred(diffracted(nm, optics, sampled.side * sampled.samples + 1 + 2 * _margin(weights)), weights)
+    weights = _blur_weights(blur, sampling)
+    optics = optics_of(wavelength, sampling, mission, camera_sampling.transform)
+    return _blur_image(
+        diffraction_image(nm, optics, camera_sampling.side * camera_sampling.samples + 1 + 2 * _margin(weights)),
+        weights,
+    )
 
 
-def _blurred(image: Array, weights: tuple[Float, Float]) -> Float32:
+def _blur_image(image: Array, weights: tuple[Float, Float]) -> Float32:
     """Diffracted light -> blurred by weights along x and y, without a margin.
 
     On the image: of a transform's rounding the bright core would cover the wings.
     """
     across, along = (w.astype(np.float32) for w in weights)
-    return _summed(image.astype(np.float32), across, along, len(image) - 2 * _margin(weights))
+    return _convolve_separable(image.astype(np.float32), across, along, len(image) - 2 * _margin(weights))
 
 
 @jit
-def _summed(image: Float32, across: Float32, along: Float32, side: int) -> Float32:
+def _convolve_separable(image: Float32, across: Float32, along: Float32, side: int) -> Float32:
     """The middle [side, side] of an image, summed with weights [odd] along columns (across) and rows (along)."""
     margin, reach_x, reach_y = (len(image) - side) // 2, len(across) // 2, len(along) // 2
     out = np.zeros((side, side), np.float32)
@@ -327,9 +342,9 @@ def _summed(image: Float32, across: Float32, along: Float32, side: int) -> Float
             for c in range(len(row)):
                 line[c] += weight * row[c]
         for j in range(len(across)):
-            weight, some = across[j], line[margin + j - reach_x : margin + j - reach_x + side]
+            weight, segment = across[j], line[margin + j - reach_x : margin + j - reach_x + side]
             for c in range(side):
-                out[r, c] += weight * some[c]
+                out[r, c] += weight * segment[c]
     return out
 
 
@@ -337,13 +352,13 @@ def _margin(weights: tuple[Float, Float]) -> int:
     return max(len(w) // 2 for w in weights)
 
 
-def _weights_of(blur: tuple[float, float], sampling: float) -> tuple[Float, Float]:
-    across, along = (_weights(float(np.sqrt(variance)) / sampling) for variance in blur)
+def _blur_weights(blur: tuple[float, float], sampling: float) -> tuple[Float, Float]:
+    across, along = (_gaussian_weights(float(np.sqrt(variance)) / sampling) for variance in blur)
     return across, along
 
 
 @lru_cache(maxsize=64)
-def _weights(sigma: float) -> Float:
+def _gaussian_weights(sigma: float) -> Float:
     """float64[odd]: a Gaussian of sigma samples, for images without detail finer than _DETAIL; their sum is 1.
 
     Error : of the transfer function, 1e-7
@@ -353,6 +368,6 @@ def _weights(sigma: float) -> Float:
     while True:
         half += 1
         basis = 1.0 - np.cos(k[:, None] * np.arange(1, half + 1))
-        outer = sums.least_squares(basis, lost)
-        if np.abs(sums.product(basis, outer) - lost).max() < 1e-7:
+        outer = matrices.least_squares(basis, lost)
+        if np.abs(matrices.matmul(basis, outer) - lost).max() < 1e-7:
             return np.concatenate([outer[::-1] / 2, [1.0 - outer.sum()], outer / 2])

@@ -24,9 +24,9 @@ from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 from lake_schema.fits import external
 from truesky.fluxes.passbands import Passband
-from truesky.numerics import sums
+from truesky.numerics import matrices
 from truesky.render.camera.detectors import Detector
-from truesky.render.psf.model import SAMPLES, SIDE, Planes, Psf, sampled
+from truesky.render.psf.model import SAMPLES, SIDE, Planes, Psf, from_planes
 from truesky.render.psf.sub_bands import sub_bands
 
 _ARCSEC = {"arcsec": 1.0, "mas": 1e-3, "deg": 3600.0}
@@ -43,7 +43,7 @@ _LEAST_SIDE = 3 * 66 + 1
 _OF_PSFEX, _OF_CUBES = 3, 15
 
 
-def file_of(name: str, detector: str) -> Path:
+def path_for_detector(name: str, detector: str) -> Path:
     """A PSF's file for a detector: {detector} in its name stands for the detector's."""
     return Path(name.replace("{detector}", detector))
 
@@ -59,8 +59,8 @@ def read(path: Path, detector: Detector, band: Passband) -> Psf:
         if not np.isfinite(data).all():
             raise BadInput("holds values that are not numbers")
         if "POLNAXIS" in header:
-            return sampled(_psfex(data, header, detector), detector.pixel_scale, has_pixel=True)
-        return sampled(_cube(data, header, detector, band), detector.pixel_scale, has_pixel=_has_pixel(header))
+            return from_planes(_psfex(data, header, detector), detector.pixel_scale, has_pixel=True)
+        return from_planes(_cube(data, header, detector, band), detector.pixel_scale, has_pixel=_has_pixel(header))
     except BadInput as error:
         raise BadInput(f"{path}: {error}") from None
 
@@ -80,17 +80,17 @@ def _cube(data: Float, header: Mapping[str, Any], detector: Detector, band: Pass
         _number(header, f"CRPIX{axis}", (n + 1) / 2) - 1 for axis, n in ((2, data.shape[-2]), (1, data.shape[-1]))
     ]
     waves, weights = _colours(header, len(planes), band)
-    spaced = sums.product(weights, planes.reshape(len(planes), -1)).reshape(-1, *planes.shape[1:])
+    spaced = matrices.matmul(weights, planes.reshape(len(planes), -1)).reshape(-1, *planes.shape[1:])
     turns = round(detector.rotation / 90.0)
-    images = np.stack([np.rot90(_resampled(p, step / detector.pixel_scale, middle, _OF_CUBES), turns) for p in spaced])
+    images = np.stack([np.rot90(_resample(p, step / detector.pixel_scale, middle, _OF_CUBES), turns) for p in spaced])
     return Planes(waves, images.astype(np.float32), np.zeros((0, *images.shape[1:]), np.float32), _half(detector))
 
 
 def _has_pixel(header: Mapping[str, Any]) -> bool:
-    found = header.get("PIXEL", False)
-    if not isinstance(found, bool):
-        raise BadInput(f"PIXEL = {found!r} is not T or F")
-    return found
+    value = header.get("PIXEL", False)
+    if not isinstance(value, bool):
+        raise BadInput(f"PIXEL = {value!r} is not T or F")
+    return value
 
 
 def _colours(header: Mapping[str, Any], count: int, band: Passband) -> tuple[Float, Float]:
@@ -137,7 +137,7 @@ def _psfex(data: Float, header: Mapping[str, Any], detector: Detector) -> Planes
         raise BadInput(f"PSF_MASK has {list(data.shape)} samples, wanted {len(powers)} planes of degree {degree}")
     half = _half(detector)
     # (x - zero) / scale = shift + stretch * (place as Planes has it).
-    zero, scale = ([_card(header, f"POL{what}{axis}") for axis in (1, 2)] for what in ("ZERO", "SCAL"))
+    zero, scale = ([_card(header, f"POL{kind}{axis}") for axis in (1, 2)] for kind in ("ZERO", "SCAL"))
     if not all(scale):
         raise BadInput("POLSCAL1 or POLSCAL2 is 0")
     shift = [(half[k] + 1.0 - zero[k]) / scale[k] for k in (0, 1)]
@@ -149,7 +149,7 @@ def _psfex(data: Float, header: Mapping[str, Any], detector: Detector) -> Planes
             if i >= p and j >= q:
                 along = comb(i, p) * shift[0] ** (i - p) * stretch[0] ** p
                 planes[number] += along * comb(j, q) * shift[1] ** (j - q) * stretch[1] ** q * term
-    drawn = np.stack([_resampled(plane, _card(header, "PSF_SAMP"), middle, _OF_PSFEX) for plane in planes])
+    drawn = np.stack([_resample(plane, _card(header, "PSF_SAMP"), middle, _OF_PSFEX) for plane in planes])
     totals = drawn.sum(axis=(1, 2))
     if not totals[0] > 0.0:
         raise BadInput(f"its PSF in the middle of the detector sums to {totals[0]:.4g}")
@@ -167,7 +167,7 @@ def _psfex(data: Float, header: Mapping[str, Any], detector: Detector) -> Planes
 # ------------------------------------------------------------------------------------------------ samples
 
 
-def _resampled(plane: Float, spacing: float, middle: list[float], lobes: int) -> Float:
+def _resample(plane: Float, spacing: float, middle: list[float], lobes: int) -> Float:
     """A plane of samples `spacing` pixels apart about `middle` (row, column) -> that of Planes."""
     if not _SPACING[0] <= spacing <= _SPACING[1]:
         raise BadInput(f"its samples are {spacing:.4g} pixels apart, wanted {_SPACING[0]:g} to {_SPACING[1]:g}")
@@ -175,7 +175,7 @@ def _resampled(plane: Float, spacing: float, middle: list[float], lobes: int) ->
     half = max(min(int(reach * spacing * SAMPLES), SIDE * SAMPLES // 2), _LEAST_SIDE // 2)
     at = np.arange(-half, half + 1) / (SAMPLES * spacing)
     rows, columns = (_interpolant(at + m, n, lobes) for m, n in zip(middle, plane.shape, strict=True))
-    return np.asarray(sums.product(rows, sums.product(plane, columns.T)) / (SAMPLES * spacing) ** 2)
+    return np.asarray(matrices.matmul(rows, matrices.matmul(plane, columns.T)) / (SAMPLES * spacing) ** 2)
 
 
 def _interpolant(at: Float, count: int, lobes: int) -> Float:
@@ -184,8 +184,8 @@ def _interpolant(at: Float, count: int, lobes: int) -> Float:
     kernel = np.where(np.abs(distance) < lobes, np.sinc(distance) * np.sinc(distance / lobes), 0.0)
     # The kernel's sum over all samples, were there some everywhere.
     steps = (at % 1.0)[:, None] - np.arange(1 - lobes, lobes + 1)
-    whole = (np.sinc(steps) * np.sinc(steps / lobes)).sum(axis=1, keepdims=True)
-    return np.asarray(kernel / whole)
+    total = (np.sinc(steps) * np.sinc(steps / lobes)).sum(axis=1, keepdims=True)
+    return np.asarray(kernel / total)
 
 
 def _half(detector: Detector) -> tuple[float, float]:
@@ -199,14 +199,14 @@ def _card(header: Mapping[str, Any], key: str) -> float:
 
 
 def _number(header: Mapping[str, Any], key: str, default: float) -> float:
-    found = header.get(key, default)
-    if isinstance(found, bool) or not isinstance(found, (int, float)) or not abs(found) < _LARGEST:
-        raise BadInput(f"{key} = {found!r} is not a number")
-    return float(found)
+    value = header.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < _LARGEST:
+        raise BadInput(f"{key} = {value!r} is not a number")
+    return float(value)
 
 
-def _unit(header: Mapping[str, Any], key: str, known: Mapping[str, float]) -> float:
-    found = str(header.get(key, "")).strip()
-    if found not in known:
-        raise BadInput(f"{key} = {found!r} is not one of {', '.join(known)}")
-    return known[found]
+def _unit(header: Mapping[str, Any], key: str, units: Mapping[str, float]) -> float:
+    name = str(header.get(key, "")).strip()
+    if name not in units:
+        raise BadInput(f"{key} = {name!r} is not one of {', '.join(units)}")
+    return units[name]

@@ -31,14 +31,14 @@ from lake_schema.errors import OutOfRange
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.tables.exposures import ExposureRow
 from truesky.fluxes.passbands import Passband
-from truesky.numerics import sums
+from truesky.numerics import matrices
 from truesky.randomness import rng
 from truesky.render.camera.detectors import Detector, detectors
 from truesky.render.psf import atmosphere, euclid, model, spikes
-from truesky.render.psf.aberrations import FARTHEST, Ratio, Telescope, clear
+from truesky.render.psf.aberrations import FARTHEST, Telescope, TransferRatio, ideal_transfer
 from truesky.render.psf.model import Planes, Psf
 from truesky.render.psf.spikes import ARCSEC, LONG, STEP, Edges
-from truesky.render.psf.sub_bands import PARTS, sub_bands
+from truesky.render.psf.sub_bands import N_SUB_BANDS, sub_bands
 
 # Of the planes, and of what changes across a detector, pixels: beyond them the aureole is nearly all there is.
 SIDE, _DRIFT_SIDE = 256, 64
@@ -68,12 +68,12 @@ class Air:
     seeing: float
     shear: tuple[float, float] = (0.0, 0.0)
     slope: float = 0.0
-    lift: float = 0.0
+    tan_zenith_distance: float = 0.0
     zenith: float = 0.0
     height: float = 0.0
 
 
-def air_of(exposure: ExposureRow, detector: Detector, mission: MissionConfiguration) -> Air:
+def exposure_air(exposure: ExposureRow, detector: Detector, mission: MissionConfiguration) -> Air:
     """The air of an exposure; its ellipticity is drawn, the same for all detectors.
 
     exposure : its row;  detector : of its camera;  mission : the mission database
@@ -92,8 +92,10 @@ def air_of(exposure: ExposureRow, detector: Detector, mission: MissionConfigurat
         return Air(exposure.seeing, shear, slope)
     # At position angle 0 the focal plane's x axis runs west.
     zenith = float(np.radians(90.0 + exposure.zenith - exposure.position_angle - detector.rotation))
-    lift = float(np.sqrt(max(exposure.airmass**2 - 1.0, 0.0))) * mission.value(f"{section}.psf.refraction", "")
-    return Air(exposure.seeing, shear, slope, lift, zenith, mission.value(f"{section}.site.height", "m"))
+    tan_zenith_distance = float(np.sqrt(max(exposure.airmass**2 - 1.0, 0.0))) * mission.value(
+        f"{section}.psf.refraction", ""
+    )
+    return Air(exposure.seeing, shear, slope, tan_zenith_distance, zenith, mission.value(f"{section}.site.height", "m"))
 
 
 def check(seeing: float, detector: Detector, band: Passband, mission: MissionConfiguration) -> None:
@@ -101,15 +103,18 @@ def check(seeing: float, detector: Detector, band: Passband, mission: MissionCon
 
     detector : of the camera;  band : passband;  mission : the mission database
     """
-    outer, slope = Telescope.of(detector.section, mission).outer, mission.value(f"{detector.section}.psf.seeing_slope")
-    waves = _waves(band, Air(seeing, slope=slope, lift=1.0))
-    best = max(atmosphere.finest(wave, outer) * (wave / waves.mean()) ** -slope for wave in waves.tolist())
+    outer, slope = (
+        Telescope.from_mission(detector.section, mission).outer,
+        mission.value(f"{detector.section}.psf.seeing_slope"),
+    )
+    waves = _waves(band, Air(seeing, slope=slope, tan_zenith_distance=1.0))
+    best = max(atmosphere.finest_seeing(wave, outer) * (wave / waves.mean()) ** -slope for wave in waves.tolist())
     if not max(best, detector.pixel_scale) <= seeing <= _WORST:
         name = f"seeing of {detector.section} through a turbulent atmosphere, arcsec"
         raise OutOfRange(name, seeing, max(best, detector.pixel_scale), _WORST)
 
 
-def through_air(air: Air, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int) -> Psf:
+def atmospheric_psf(air: Air, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int) -> Psf:
     """The PSF of a detector of a ground camera.
 
     air       : of the exposure;  positions : where it is computed, one of euclid.DEGREES; polynomials lie between
@@ -121,31 +126,31 @@ def through_air(air: Air, detector: Detector, band: Passband, mission: MissionCo
     scale = detector.pixel_scale
     waves = _waves(band, air)
     widths = air.seeing * (waves / waves.mean()) ** air.slope
-    telescope = Telescope.of(detector.section, mission)
+    telescope = Telescope.from_mission(detector.section, mission)
     fried = [
         atmosphere.fried_length(width, wave, telescope.outer)
         for width, wave in zip(widths.tolist(), waves.tolist(), strict=True)
     ]
     samples = int(np.clip(np.ceil(_SAMPLES_OF_FWHM * scale / widths.min()), _LEAST_SAMPLES, _MOST_SAMPLES))
-    whole = _Grid.of(SIDE, samples, scale)
-    lifts = atmosphere.refraction(waves, air.height) * air.lift
+    grid = _Grid.from_pixels(SIDE, samples, scale)
+    lifts = atmosphere.refraction(waves, air.height) * air.tan_zenith_distance
     middle, turn = _wavefront(detector, 0.0, 0.0, mission), float(np.radians(detector.rotation))
     images = []
     for wave, length, lift in zip(waves, fried, lifts - lifts.mean(), strict=True):
-        ratio = Ratio.of(middle, telescope, float(wave), length, turn)
-        passed = whole.passed(float(wave), length, telescope, air) * whole.interpolated(ratio, float(wave))
+        ratio = TransferRatio.from_wavefront(middle, telescope, float(wave), length, turn)
+        plane_transfer = grid.transfer(float(wave), length, telescope, air) * grid.interpolate_ratio(ratio, float(wave))
         if lift != 0.0:
-            passed *= whole.moved(lift * ARCSEC * np.cos(air.zenith), lift * ARCSEC * np.sin(air.zenith))
-        images.append(whole.image(passed))
-    halo, around = _around(air, detector, band, mission, samples)
-    total = 1.0 + float(around.sum())
-    halo = _going_on(halo, np.mean(images, axis=0), samples)
-    planes = ((np.stack(images) + around) / total).astype(np.float32)
+            plane_transfer *= grid.phase_shift(lift * ARCSEC * np.cos(air.zenith), lift * ARCSEC * np.sin(air.zenith))
+        images.append(grid.image(plane_transfer))
+    pupil_edges, outer_light = _outer_light(air, detector, band, mission, samples)
+    total = 1.0 + float(outer_light.sum())
+    pupil_edges = _match_rings(pupil_edges, np.mean(images, axis=0), samples)
+    planes = ((np.stack(images) + outer_light) / total).astype(np.float32)
     drift = _drift(air, detector, float(waves.mean()), positions, telescope, samples, mission) / total
     half = ((detector.nx - 1) / 2, (detector.ny - 1) / 2)
-    found = Planes(waves, planes, drift.astype(np.float32), half, _powers(positions), samples)
-    psf = model.sampled(found, scale, has_pixel=False, side=SIDE)
-    return replace(psf, edges=replace(halo, halo=(halo.halo[0] / total, halo.halo[1])))
+    psf_planes = Planes(waves, planes, drift.astype(np.float32), half, _powers(positions), samples)
+    psf = model.from_planes(psf_planes, scale, has_pixel=False, side=SIDE)
+    return replace(psf, edges=replace(pupil_edges, halo=(pupil_edges.halo[0] / total, pupil_edges.halo[1])))
 
 
 def edges(air: Air, detector: Detector, band: Passband, mission: MissionConfiguration) -> Edges:
@@ -153,7 +158,7 @@ def edges(air: Air, detector: Detector, band: Passband, mission: MissionConfigur
 
     air, detector, band, mission : as of `through_air`
     """
-    section, telescope = detector.section, Telescope.of(detector.section, mission)
+    section, telescope = detector.section, Telescope.from_mission(detector.section, mission)
     vanes = int(mission.value(f"{section}.pupil.vanes"))
     width = mission.value(f"{section}.pupil.vane_width", "mm")
     # Of an altazimuth mount the spider keeps its place against the zenith.
@@ -174,7 +179,13 @@ def _waves(band: Passband, air: Air) -> Float:
     """[w] A: means of as many photons of flat f_nu; one where the air does the same to all."""
     photons = band.response / band.wavelength
     mean = float((photons * band.wavelength).sum() / photons.sum())
-    count = 1 if air.slope == 0.0 and air.lift == 0.0 else PARTS // 2 if mean > _REDDER else PARTS
+    count = (
+        1
+        if air.slope == 0.0 and air.tan_zenith_distance == 0.0
+        else N_SUB_BANDS // 2
+        if mean > _REDDER
+        else N_SUB_BANDS
+    )
     parts = sub_bands(band, count)
     return np.array([np.average(p.wavelength, weights=p.response / p.wavelength) for p in parts])
 
@@ -199,39 +210,43 @@ class _Grid:
     along: Float
 
     @classmethod
-    def of(cls, side: int, samples: int, scale: float) -> _Grid:
+    def from_pixels(cls, side: int, samples: int, scale: float) -> _Grid:
         """Of a plane of `side` pixels of `scale` arcsec, `samples` a pixel."""
         step = scale * ARCSEC / samples
         n = side * samples
         return cls(np.asarray(np.fft.rfftfreq(n, step), float), np.asarray(np.fft.fftfreq(n, step), float))
 
-    def passed(self, wave: float, fried: float, telescope: Telescope, air: Air) -> Float:
+    def transfer(self, wave: float, fried: float, telescope: Telescope, air: Air) -> Float:
         """Of air and of perfect optics: wave : A;  fried : m."""
         farthest = FARTHEST * fried
         rho = np.linspace(0.0, farthest, _TABLE)
-        table = atmosphere.transfer(rho, fried, telescope.outer) * clear(rho, telescope.radius, telescope.inner)
+        table = atmosphere.transfer(rho, fried, telescope.outer) * ideal_transfer(
+            rho, telescope.radius, telescope.inner
+        )
         (e1, e2), metres = air.shear, wave * 1e-10
         x, y = metres * self.across, metres * self.along[:, None]
         distance = np.sqrt((1.0 + e1) * x * x + (1.0 - e1) * y * y + 2.0 * e2 * x * y)
         return np.interp(distance, rho, table, right=0.0)
 
-    def interpolated(self, ratio: Ratio, wave: float) -> Complex:
+    def interpolate_ratio(self, ratio: TransferRatio, wave: float) -> Complex:
         """Between the lags of a ratio; beyond them it is not wanted.  wave : A."""
         count = (len(ratio.values) - 1) // 2
         lags = ratio.step * (np.arange(len(ratio.values)) - count)
         rows, columns = (_spline(np.asarray(lags, float), wave * 1e-10 * axis) for axis in (self.along, self.across))
-        parts = [sums.product(rows, sums.product(part, columns.T)) for part in (ratio.values.real, ratio.values.imag)]
+        parts = [
+            matrices.matmul(rows, matrices.matmul(part, columns.T)) for part in (ratio.values.real, ratio.values.imag)
+        ]
         return np.asarray(parts[0] + 1j * parts[1])
 
-    def moved(self, x: float, y: float) -> Complex:
+    def phase_shift(self, x: float, y: float) -> Complex:
         """What moves an image by x, y radian."""
         return np.asarray(np.exp(-2j * np.pi * x * self.across) * np.exp(-2j * np.pi * y * self.along[:, None]))
 
-    def image(self, passed: Array) -> Float:
+    def image(self, plane_transfer: Array) -> Float:
         """[n + 1, n + 1] about the middle sample; what lies on the border belongs to both sides."""
         n = len(self.along)
-        whole = np.fft.fftshift(scipy.fft.irfft2(passed, (n, n)))
-        out = np.pad(whole, ((0, 1), (0, 1)), mode="wrap")
+        centred_image = np.fft.fftshift(scipy.fft.irfft2(plane_transfer, (n, n)))
+        out = np.pad(centred_image, ((0, 1), (0, 1)), mode="wrap")
         out[[0, -1]] *= 0.5
         out[:, [0, -1]] *= 0.5
         return np.asarray(out)
@@ -267,52 +282,55 @@ def _drift(
 ) -> Float:  # fmt: skip
     """Planes of Planes.drift, by least squares of the optics' ratio at the nodes, at the mean wavelength."""
     powers, nodes = _powers(positions), _nodes(positions)
-    grid = _Grid.of(_DRIFT_SIDE, samples, detector.pixel_scale)
+    grid = _Grid.from_pixels(_DRIFT_SIDE, samples, detector.pixel_scale)
     if not powers:
         return np.zeros((0, len(grid.along) + 1, len(grid.along) + 1))
     fried = atmosphere.fried_length(air.seeing, wave, telescope.outer)
     turn = float(np.radians(detector.rotation))
     fronts = [_wavefront(detector, *at, mission) for at in ((0.0, 0.0), *nodes)]
-    ratios = [Ratio.of(front, telescope, wave, fried, turn) for front in fronts]
+    ratios = [TransferRatio.from_wavefront(front, telescope, wave, fried, turn) for front in fronts]
     x, y = np.array(nodes).T
-    from_nodes = sums.least_squares(np.stack([x**i * y**j for i, j, _ in powers], axis=1), np.eye(len(nodes)))
+    from_nodes = matrices.least_squares(np.stack([x**i * y**j for i, j, _ in powers], axis=1), np.eye(len(nodes)))
     off = np.stack([r.values - ratios[0].values for r in ratios[1:]])
     flat = off.reshape(len(nodes), -1)
-    terms = sums.product(from_nodes, flat.real) + 1j * sums.product(from_nodes, flat.imag)
-    passed = grid.passed(wave, fried, telescope, air)
+    terms = matrices.matmul(from_nodes, flat.real) + 1j * matrices.matmul(from_nodes, flat.imag)
+    plane_transfer = grid.transfer(wave, fried, telescope, air)
     changes = terms.reshape(-1, *off.shape[1:])
     return np.stack(
-        [grid.image(passed * grid.interpolated(replace(ratios[0], values=change), wave)) for change in changes]
+        [
+            grid.image(plane_transfer * grid.interpolate_ratio(replace(ratios[0], values=change), wave))
+            for change in changes
+        ]
     )
 
 
-def _going_on(edges_: Edges, image: Float, samples: int) -> Edges:
+def _match_rings(edges_: Edges, image: Float, samples: int) -> Edges:
     """With rings that are as bright where the plane ends as what is in it, the wings of the air.
 
     Error : these fall as r^-11/3; twice as far out they are too bright by a half
     """
     axis = (np.arange(len(image)) - len(image) // 2) / samples
     r = np.hypot(axis, axis[:, None])
-    some = (r > 0.4 * SIDE) & (r < 0.48 * SIDE)
-    level = float((image[some] * r[some] ** 3).mean()) * samples**2
-    now = spikes.ring(edges_, np.full(PARTS, 1.0 / PARTS))
-    return replace(edges_, round=edges_.round * max(level / now, 1.0))
+    annulus = (r > 0.4 * SIDE) & (r < 0.48 * SIDE)
+    level = float((image[annulus] * r[annulus] ** 3).mean()) * samples**2
+    now = spikes.ring_light(edges_, np.full(N_SUB_BANDS, 1.0 / N_SUB_BANDS))
+    return replace(edges_, perimeter=edges_.perimeter * max(level / now, 1.0))
 
 
-def _around(
+def _outer_light(
     air: Air, detector: Detector, band: Passband, mission: MissionConfiguration, samples: int
 ) -> tuple[Edges, Float32]:
     """(edges, [n + 1, n + 1] their light inside a plane, but for the rings that its optics have)."""
-    found = edges(air, detector, band, mission)
+    pupil_edges = edges(air, detector, band, mission)
     step = 1.0 / samples
     axis = (np.arange(SIDE * samples + 1) - SIDE * samples // 2) * step
     x, y = axis, axis[:, None]
-    amplitude, core = found.halo
-    light = amplitude / (x * x + y * y + (core / found.pixel_scale) ** 2)
-    photons = np.full(PARTS, 1.0 / PARTS)
-    for (angle, _, _), line in zip(found.bars, spikes.spikes(found, photons, SIDE), strict=True):
+    amplitude, core = pupil_edges.halo
+    light = amplitude / (x * x + y * y + (core / pupil_edges.pixel_scale) ** 2)
+    photons = np.full(N_SUB_BANDS, 1.0 / N_SUB_BANDS)
+    for (angle, _, _), line in zip(pupil_edges.bars, spikes.spike_light(pupil_edges, photons, SIDE), strict=True):
         t, r = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
-        near = np.abs(t) < STEP * (line.shape[1] - 1)
-        places = np.stack([np.abs(r[near]) / LONG, np.abs(t[near]) / STEP])
-        light[near] += map_coordinates(line, places, order=1, mode="nearest")
-    return found, (light * step**2).astype(np.float32)
+        on_spike = np.abs(t) < STEP * (line.shape[1] - 1)
+        places = np.stack([np.abs(r[on_spike]) / LONG, np.abs(t[on_spike]) / STEP])
+        light[on_spike] += map_coordinates(line, places, order=1, mode="nearest")
+    return pupil_edges, (light * step**2).astype(np.float32)

@@ -48,7 +48,7 @@ class Planes:
     samples: int = SAMPLES
 
     @property
-    def highest(self) -> float:
+    def max_frequency(self) -> float:
         """Beyond it nothing is looked at, radian / pixel: a quarter of a cycle a pixel before the samples' last."""
         return (self.samples - 0.5) * np.pi
 
@@ -87,7 +87,7 @@ class Psf:
         return 2 * len(self.surface)
 
 
-def of_colours(psf: Psf, colours: int) -> Psf:
+def reduce_colours(psf: Psf, colours: int) -> Psf:
     """The same PSF of so many wavelengths at most: each the mean of neighbours, which are of as many photons."""
     planes = psf.planes
     if planes is None or len(planes.wavelength) <= colours:
@@ -118,17 +118,17 @@ def galsim_profile(image: Array, sampling: float, exact: bool = False) -> galsim
     )
 
 
-def sampled(planes: Planes, pixel_scale: float, has_pixel: bool, side: int = SIDE) -> Psf:
+def from_planes(planes: Planes, pixel_scale: float, has_pixel: bool, side: int = SIDE) -> Psf:
     """A PSF of planes.
 
     pixel_scale : arcsec;  has_pixel : the detector's pixel is in them
     side        : of a point's largest stamp through them, pixels
     """
     mean = planes.images.mean(axis=0, dtype=float)
-    return tabulated(galsim_profile(mean, pixel_scale / planes.samples), pixel_scale, planes, has_pixel, side)
+    return from_profile(galsim_profile(mean, pixel_scale / planes.samples), pixel_scale, planes, has_pixel, side)
 
 
-def tabulated(
+def from_profile(
     profile: galsim.GSObject,
     pixel_scale: float,
     planes: Planes | None = None,
@@ -148,8 +148,8 @@ def tabulated(
     total = np.bincount(ring[inside], image[inside])
     surface = np.maximum(total / np.bincount(ring[inside]), 0.0)
     square = np.maximum(*np.meshgrid(np.abs(grid), np.abs(grid)))
-    around = np.asarray(maximum(image, square, np.arange(side // 2)))
-    rim = np.maximum(np.maximum.accumulate(around[::-1])[::-1], 0.0)
+    ring_max = np.asarray(maximum(image, square, np.arange(side // 2)))
+    rim = np.maximum(np.maximum.accumulate(ring_max[::-1])[::-1], 0.0)
     outside = np.maximum(profile.flux - np.cumsum(total), 0.0)
     fwhm = _width(profile, pixel_scale, has_pixel)
     return Psf(profile, pixel_scale, surface, rim, outside, fwhm, planes, None if has_pixel else 0.0)
@@ -172,7 +172,7 @@ def _width(profile: galsim.GSObject, pixel_scale: float, has_pixel: bool) -> flo
     return float(galsim.Image(with_pixel, scale=pixel_scale / samples).calculateFWHM(center=galsim.PositionD(x, y)))
 
 
-def spectrum_of(psf: Psf, size: int, reach: int) -> Array:
+def profile_spectrum(psf: Psf, size: int, reach: int) -> Array:
     """Fourier transform of `profile` on the grid of a stamp of `size` pixels, without the pixel.
 
     returns : complex[2 reach + 1, reach + 1], [iy, ix] at (ix, iy) times 2 pi / size radian / pixel

@@ -20,7 +20,7 @@ from truesky.render.psf.spikes import Edges
 _GAUSSIAN, _MOFFAT = 0.0, 1.0
 
 
-def of_exposure(
+def exposure_psf(
     exposure: ExposureRow, detector: Detector, band: Passband, mission: MissionConfiguration, positions: int
 ) -> Psf:
     """The PSF of a detector of a ground camera, as wide as the exposure's seeing.
@@ -31,10 +31,10 @@ def of_exposure(
     section, scale = detector.section, detector.pixel_scale
     profile = mission.value(f"{section}.psf.profile")
     if profile == _GAUSSIAN:
-        return model.tabulated(galsim.Gaussian(fwhm=exposure.seeing), scale)
+        return model.from_profile(galsim.Gaussian(fwhm=exposure.seeing), scale)
     if profile == _MOFFAT:
-        return ground_psf(exposure.seeing, mission.value(f"{section}.psf.moffat_beta"), scale)
-    return ground.through_air(ground.air_of(exposure, detector, mission), detector, band, mission, positions)
+        return moffat_psf(exposure.seeing, mission.value(f"{section}.psf.moffat_beta"), scale)
+    return ground.atmospheric_psf(ground.exposure_air(exposure, detector, mission), detector, band, mission, positions)
 
 
 def check(seeing: float, detector: Detector, band: Passband, mission: MissionConfiguration) -> None:
@@ -46,7 +46,7 @@ def check(seeing: float, detector: Detector, band: Passband, mission: MissionCon
         ground.check(seeing, detector, band, mission)
 
 
-def edges_of(detector: Detector, band: Passband, mission: MissionConfiguration) -> Edges | None:
+def typical_edges(detector: Detector, band: Passband, mission: MissionConfiguration) -> Edges | None:
     """What shines beyond the planes, in the seeing that is usual; None of a profile without planes.
 
     detector : of a ground camera;  band : passband;  mission : the mission database
@@ -55,15 +55,15 @@ def edges_of(detector: Detector, band: Passband, mission: MissionConfiguration) 
     if mission.value(f"{section}.psf.profile") in (_GAUSSIAN, _MOFFAT):
         return None
     key = f"{section}.{band.name}.seeing"
-    usual = mission.value(key, "arcsec") if key in mission else 1.0
-    return ground.edges(ground.Air(usual), detector, band, mission)
+    typical_seeing = mission.value(key, "arcsec") if key in mission else 1.0
+    return ground.edges(ground.Air(typical_seeing), detector, band, mission)
 
 
-def ground_psf(seeing: float, beta: float, pixel_scale: float) -> Psf:
+def moffat_psf(seeing: float, beta: float, pixel_scale: float) -> Psf:
     """A round Moffat profile.
 
     seeing : FWHM, arcsec;  beta : exponent, > 1;  pixel_scale : arcsec
     """
     # galsim ends it where 1e-5 of the light is left; of bright stars that is seen.
-    far = galsim.GSParams(xvalue_accuracy=1e-12)
-    return model.tabulated(galsim.Moffat(beta=beta, fwhm=seeing, gsparams=far), pixel_scale)
+    accuracy_settings = galsim.GSParams(xvalue_accuracy=1e-12)
+    return model.from_profile(galsim.Moffat(beta=beta, fwhm=seeing, gsparams=accuracy_settings), pixel_scale)

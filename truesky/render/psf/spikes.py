@@ -36,7 +36,7 @@ import numpy as np
 from lake_schema.arrays import Float
 from lake_schema.mission.configuration import MissionConfiguration
 from truesky.fluxes.passbands import Passband
-from truesky.numerics import sums
+from truesky.numerics import matrices
 
 # Wavelengths in each sub-band: a bar's fringes run through each other.
 _WAVES = 8
@@ -65,7 +65,7 @@ class Edges:
 
     wavelength: Float
     area: float
-    round: float
+    perimeter: float
     bars: Float
     blur: float
     pixel_scale: float
@@ -88,7 +88,7 @@ def wavelengths(parts: tuple[Passband, ...]) -> Float:
     return np.array(waves)
 
 
-def of_pupil(
+def from_euclid_pupil(
     parts: tuple[Passband, ...], blur: float, pixel_scale: float, period: float, mission: MissionConfiguration
 ) -> Edges:
     """Of the Euclid pupil: the aperture stop, the central stop and three bars, as far as the stops let them be seen.
@@ -105,25 +105,25 @@ def of_pupil(
         angle = mission.value(f"plm.pupil.{bar}.angle", "rad")
         along = np.linspace(-reach, reach, _POINTS)
         x, y = x + along * np.cos(angle), y + along * np.sin(angle)
-        seen = (np.hypot(x, y) < radius) & (np.hypot(x, y - stop_y) > stop)
-        bars.append((angle, width, 2.0 * reach * float(seen.mean())))
+        visible = (np.hypot(x, y) < radius) & (np.hypot(x, y - stop_y) > stop)
+        bars.append((angle, width, 2.0 * reach * float(visible.mean())))
     blocked = sum(width * length for _, width, length in bars)
     area = np.pi * (radius**2 - stop**2) - blocked
     circles = 2.0 * np.pi * (radius + stop)
     return Edges(wavelengths(parts), area, circles, np.array(bars), blur, pixel_scale, period)
 
 
-def ring(edges: Edges, photons: Float) -> float:
+def ring_light(edges: Edges, photons: Float) -> float:
     """Of a star's light in a pixel at a distance of one pixel, were the law r^-3 good there.
 
     photons : [w] share of each sub-band
     Error   : 3 % beyond 5", 1 % of it where the bars hide the circles
     """
-    wavelength = float(sums.product(photons, edges.wavelength.mean(axis=1))) * 1e-7
-    return wavelength * edges.round / (4.0 * np.pi**3 * edges.area) / (edges.pixel_scale * ARCSEC)
+    wavelength = float(matrices.matmul(photons, edges.wavelength.mean(axis=1))) * 1e-7
+    return wavelength * edges.perimeter / (4.0 * np.pi**3 * edges.area) / (edges.pixel_scale * ARCSEC)
 
 
-def spikes(edges: Edges, photons: Float, reach: float) -> Float:
+def spike_light(edges: Edges, photons: Float, reach: float) -> Float:
     """float64[b, r, t] of a star's light in a pixel on each bar's spike: r times 8 pixels out, t times 1/4 across.
 
     reach : pixels
@@ -133,15 +133,17 @@ def spikes(edges: Edges, photons: Float, reach: float) -> Float:
     out = LONG * np.arange(int(reach / LONG) + 2)
     # Wider than it is kept: what the blur brings in.
     across = STEP * np.arange(2 * round(WIDE / STEP))
-    found = []
+    lines = []
     for _, width, length in edges.bars:
         height = share * (width * length * cycles) ** 2 / edges.area
         along = np.sinc(width * cycles * out[:, None]) ** 2 * height
-        found.append(_blurred(np.sinc(length * cycles[:, None] * across) ** 2, edges.blur / edges.pixel_scale, along))
-    return np.stack(found)
+        lines.append(
+            _blur_lines(np.sinc(length * cycles[:, None] * across) ** 2, edges.blur / edges.pixel_scale, along)
+        )
+    return np.stack(lines)
 
 
-def reach(edges: Edges, electrons: Float, least: float) -> Float:
+def reach(edges: Edges, electrons: Float, min_electrons: float) -> Float:
     """float64[n] pixels as far as which a star's brightest spike, or its aureole, has a pixel of `least` electrons.
 
     At most FARTHEST.
@@ -152,29 +154,31 @@ def reach(edges: Edges, electrons: Float, least: float) -> Float:
     cycles = edges.pixel_scale * ARCSEC / (edges.wavelength.ravel() * 1e-7)
     across, blur = STEP * np.arange(2 * round(WIDE / STEP)), edges.blur / edges.pixel_scale
     # What the blur takes of each place into the middle, of both sides.
-    taken = np.fft.irfft(_passed(2 * len(across) - 1, blur), 2 * len(across) - 1)[: len(across)]
-    taken[1:] *= 2.0
+    blur_kernel = np.fft.irfft(_blur_transfer(2 * len(across) - 1, blur), 2 * len(across) - 1)[: len(across)]
+    blur_kernel[1:] *= 2.0
     # Of fringes whose mean is half of r^-2.
     middle = [
         share
-        * float(np.maximum((np.sinc(length * cycles[:, None] * across) ** 2 * taken).sum(axis=1), 0.0).sum())
+        * float(np.maximum((np.sinc(length * cycles[:, None] * across) ** 2 * blur_kernel).sum(axis=1), 0.0).sum())
         * (length / np.pi) ** 2
         / (2.0 * edges.area)
         for _, _, length in edges.bars
     ]
     farthest = FARTHEST / edges.pixel_scale
-    return np.asarray(np.minimum(np.sqrt(max(*middle, edges.halo[0]) * electrons / max(least, 1e-300)), farthest))
+    return np.asarray(
+        np.minimum(np.sqrt(max(*middle, edges.halo[0]) * electrons / max(min_electrons, 1e-300)), farthest)
+    )
 
 
-def _blurred(lines: Float, blur: float, along: Float) -> Float:
+def _blur_lines(lines: Float, blur: float, along: Float) -> Float:
     """Sum of the lines [w, t], t >= 0, through jitter, diffusion and pixel: [r, t] up to _WIDE."""
-    both = np.concatenate([lines[:, :0:-1], lines], axis=1)
-    passed = np.fft.rfft(both, axis=1) * _passed(both.shape[1], blur)
-    smooth = np.fft.irfft(passed, both.shape[1], axis=1)[:, lines.shape[1] - 1 :]
-    return np.asarray(sums.product(along, np.maximum(smooth[:, : round(WIDE / STEP) + 2], 0.0)))
+    symmetric = np.concatenate([lines[:, :0:-1], lines], axis=1)
+    passed = np.fft.rfft(symmetric, axis=1) * _blur_transfer(symmetric.shape[1], blur)
+    smooth = np.fft.irfft(passed, symmetric.shape[1], axis=1)[:, lines.shape[1] - 1 :]
+    return np.asarray(matrices.matmul(along, np.maximum(smooth[:, : round(WIDE / STEP) + 2], 0.0)))
 
 
-def _passed(many: int, blur: float) -> Float:
+def _blur_transfer(count: int, blur: float) -> Float:
     """Of each frequency of so many samples, what jitter, diffusion and pixel leave."""
-    k = 2.0 * np.pi * np.fft.rfftfreq(many, STEP)
+    k = 2.0 * np.pi * np.fft.rfftfreq(count, STEP)
     return np.asarray(np.exp(-0.5 * (blur * k) ** 2) * np.sinc(k / (2.0 * np.pi)))

@@ -10,15 +10,15 @@ import numpy as np
 from truesky.fluxes.passbands import Passband
 
 # Eight reproduce the second moments of a PSF of continuous colour to 2e-4 (benchmarks/render.py).
-PARTS = 8
+N_SUB_BANDS = 8
 
 
-def sub_bands(band: Passband, parts: int = PARTS) -> tuple[Passband, ...]:
+def sub_bands(band: Passband, count: int = N_SUB_BANDS) -> tuple[Passband, ...]:
     """A band cut into parts of equal photon number for flat f_nu, blue to red."""
     photons = band.response / band.wavelength
     rank = (np.cumsum(photons) - 0.5 * photons) / photons.sum()
-    part = np.minimum((rank * parts).astype(int), parts - 1)
+    part = np.minimum((rank * count).astype(int), count - 1)
     return tuple(
         Passband(f"{band.name}_{i}", band.wavelength[part == i], band.response[part == i], band.medium)
-        for i in range(parts)
+        for i in range(count)
     )

@@ -17,27 +17,27 @@ from truesky.render.camera.detectors import Detector
 from truesky.render.psf.model import Planes, Psf
 
 # Half the side of a model, FWHM and at most samples; samples a pixel of a PSF without planes.
-_HALF, _MOST, _SAMPLES = 5.0, 63, 2
+_HALF, _MAX_HALF, _SAMPLES = 5.0, 63, 2
 
 
-def written(psf: Psf, detector: Detector, path: Path) -> None:
+def write(psf: Psf, detector: Detector, path: Path) -> None:
     """Write the model of a detector; its flux is 1 within its side, 10 FWHM or as much as 127 samples hold.
 
     Error : what of the PSF goes with a source's colour is left out;  size 1e-3, ellipticity 1e-3
     """
-    planes, step = model_of(psf)
+    planes, step = psfex_planes(psf)
     middle = ((detector.nx + 1) / 2, (detector.ny + 1) / 2)
     psfex.write(path, planes, step, psf.fwhm / psf.pixel_scale, middle, (detector.nx / 2, detector.ny / 2))
 
 
-def model_of(psf: Psf) -> tuple[Float32, float]:
+def psfex_planes(psf: Psf) -> tuple[Float32, float]:
     """(planes float32[n, s, s] in PSFEx's order, pixels between samples); x, y = -1 .. 1 across the detector."""
     samples = psf.planes.samples if psf.planes else _SAMPLES
-    half = min(int(np.ceil(_HALF * psf.fwhm / psf.pixel_scale * samples)), _MOST)
+    half = min(int(np.ceil(_HALF * psf.fwhm / psf.pixel_scale * samples)), _MAX_HALF)
     if psf.planes is None:
-        seen = galsim.Convolve(psf.profile, galsim.Pixel(psf.pixel_scale))
+        with_pixel = galsim.Convolve(psf.profile, galsim.Pixel(psf.pixel_scale))
         side, scale = 2 * half + 1, psf.pixel_scale / samples
-        image = seen.drawImage(nx=side, ny=side, scale=scale, method="no_pixel", dtype=float).array
+        image = with_pixel.drawImage(nx=side, ny=side, scale=scale, method="no_pixel", dtype=float).array
         return (image / image.sum()).astype(np.float32)[None], 1.0 / samples
     has_pixel = psf.intra_pixel is None
     terms = {(0, 0): psf.planes.images.mean(axis=0, dtype=float)}
@@ -45,14 +45,16 @@ def model_of(psf: Psf) -> tuple[Float32, float]:
         (i, j): drift for (i, j, colour), drift in zip(psf.planes.powers, psf.planes.drift, strict=True) if not colour
     }
     degree = max(i + j for i, j in terms)
-    found = []
+    planes = []
     for power in ((i, j) for j in range(degree + 1) for i in range(degree + 1 - j)):
         plane = terms.get(power)
-        found.append(np.zeros((2 * half + 1,) * 2) if plane is None else _seen(plane, psf.planes, half, has_pixel))
-    return (np.stack(found) / found[0].sum()).astype(np.float32), 1.0 / samples
+        planes.append(
+            np.zeros((2 * half + 1,) * 2) if plane is None else _central_plane(plane, psf.planes, half, has_pixel)
+        )
+    return (np.stack(planes) / planes[0].sum()).astype(np.float32), 1.0 / samples
 
 
-def _seen(plane: Array, planes: Planes, half: int, has_pixel: bool) -> Float:
+def _central_plane(plane: Array, planes: Planes, half: int, has_pixel: bool) -> Float:
     """The middle of a plane, 2 half + 1 samples, averaged over pixels; beyond the plane there is nothing."""
     # Room for a pixel beyond the border.
     margin = half + planes.samples - len(plane) // 2

@@ -24,7 +24,7 @@ from lake_schema.sky.ecliptic import ecliptic
 from lake_schema.units import LIGHT_ANGSTROM_S, PLANCK_ERG_S
 from truesky.fluxes import passbands
 from truesky.fluxes.passbands import Passband
-from truesky.numerics import sums
+from truesky.numerics import matrices
 from truesky.render.camera.detectors import Detector
 from truesky.render.sky import thermal
 
@@ -69,7 +69,7 @@ def starlit_sky(detector: Detector, band: str, mission: MissionConfiguration, cu
     rate = mission.value(f"{detector.section}.scattered_light", "electron / (s pix)")
     # Of the light that a telescope scatters a band has its part, which for flat f_nu goes with its width.
     part = passbands.log_width(curve) / passbands.log_width(passbands.load(_VIS)) if curve else 1.0
-    return SkyBand(0.0, *_zodiacal_of(detector, band, mission, curve), rate * part)
+    return SkyBand(0.0, *_zodiacal_terms(detector, band, mission, curve), rate * part)
 
 
 def thermal_sky(detector: Detector, band: str, mission: MissionConfiguration, curve: Passband | None = None) -> SkyBand:
@@ -81,7 +81,7 @@ def thermal_sky(detector: Detector, band: str, mission: MissionConfiguration, cu
     section, key = detector.section, f"{detector.section}.{band}.scattered_light"
     warm = thermal.rate(section, band, curve or passbands.load(band), mission)
     scattered = mission.value(key, "electron / (s pix)") if key in mission else 0.0
-    return SkyBand(warm, *_zodiacal_of(detector, band, mission, curve), scattered)
+    return SkyBand(warm, *_zodiacal_terms(detector, band, mission, curve), scattered)
 
 
 def ground_sky(detector: Detector, band: str, mission: MissionConfiguration, curve: Passband | None = None) -> SkyBand:
@@ -98,14 +98,14 @@ def ground_sky(detector: Detector, band: str, mission: MissionConfiguration, cur
     return SkyBand(float(10.0 ** (0.4 * contrast) * detector.pixel_scale**2))
 
 
-def sky_rate(own: SkyBand, ra: float, dec: float, mjd: float, mission: MissionConfiguration) -> float:
+def sky_rate(sky_band: SkyBand, ra: float, dec: float, mjd: float, mission: MissionConfiguration) -> float:
     """Electrons per second in a pixel of a band, at a place and date.
 
     own          : of a band;  mission : the mission database
     ra, dec, mjd : deg, and date
     """
-    scattered = own.stars * starlight(ra, dec, mission) if own.stars else 0.0
-    return own.constant + scattered + (_zodiacal(own, ra, dec, mjd, mission) if own.zodi else 0.0)
+    scattered = sky_band.stars * starlight(ra, dec, mission) if sky_band.stars else 0.0
+    return sky_band.constant + scattered + (_zodiacal_rate(sky_band, ra, dec, mjd, mission) if sky_band.zodi else 0.0)
 
 
 def photons(section: str, rate: float, band: Passband, mission: MissionConfiguration) -> Float:
@@ -115,15 +115,15 @@ def photons(section: str, rate: float, band: Passband, mission: MissionConfigura
     rate    : of all of the sky, e-/s;  band : passband;  mission : the mission database
     Error   : what is not thermal is taken as zodiacal light 90 deg from the Sun
     """
-    warm_light = warm(section, band, mission)
-    red, blue = _reddening(90.0, mission)
+    warm_light = thermal_photons(section, band, mission)
+    red, blue = _reddening_slopes(90.0, mission)
     decades = np.log10(band.wavelength / (10.0 * mission.value("env.zodi.reference_wavelength", "nm")))
     reddened = 1.0 + red * np.maximum(decades, 0.0) + blue * np.minimum(decades, 0.0)
-    sun = solar(band.wavelength / 10.0, mission) * band.response * band.wavelength * reddened
+    sun = solar_irradiance(band.wavelength / 10.0, mission) * band.response * band.wavelength * reddened
     return np.asarray(warm_light + max(rate - float(warm_light.sum()), 0.0) * sun / sun.sum())
 
 
-def warm(section: str, band: Passband, mission: MissionConfiguration) -> Float:
+def thermal_photons(section: str, band: Passband, mission: MissionConfiguration) -> Float:
     """float64[n] what of `photons` is thermal light: 0 where the mission has none in the band."""
     if f"{section}.{band.name}.thermal" not in mission:
         return np.zeros(len(band.wavelength))
@@ -173,7 +173,7 @@ def zodiacal_intensity(from_sun: float, latitude: float, mission: MissionConfigu
     s = (distance - longitudes[i]) / (longitudes[i + 1] - longitudes[i])
     t = (beta - _LATITUDES[j]) / (_LATITUDES[j + 1] - _LATITUDES[j])
     corner = np.log(values[i : i + 2, j : j + 2])
-    mean = sums.product(sums.product(np.array([1 - s, s]), corner), np.array([1 - t, t]))
+    mean = matrices.matmul(matrices.matmul(np.array([1 - s, s]), corner), np.array([1 - t, t]))
     return float(np.exp(mean)) * _TABLE_UNIT
 
 
@@ -183,11 +183,11 @@ _LATITUDES = np.array([0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 45.0, 60.0, 75.0,
 
 def _zodiacal_table(mission: MissionConfiguration) -> tuple[Float, Float]:
     """|longitude from the Sun| [19] deg, values [19, 11]; an empty entry takes the next away from the Sun."""
-    return _filled(mission.numbers("env.zodi.map"))
+    return _fill_table(mission.numbers("env.zodi.map"))
 
 
 @lru_cache(maxsize=8)
-def _filled(rows: tuple[tuple[float, ...], ...]) -> tuple[Float, Float]:
+def _fill_table(rows: tuple[tuple[float, ...], ...]) -> tuple[Float, Float]:
     table = np.array(rows)
     values = table[:, 1:]
     for row in range(len(values) - 2, -1, -1):
@@ -206,16 +206,16 @@ def zodiacal_sky(band: Passband, area: float, pixel_scale: float, mission: Missi
     return SkyBand(0.0, *_zodiacal_integrals(band, area, pixel_scale, mission))
 
 
-def _zodiacal(own: SkyBand, ra: float, dec: float, mjd: float, mission: MissionConfiguration) -> float:
+def _zodiacal_rate(sky_band: SkyBand, ra: float, dec: float, mjd: float, mission: MissionConfiguration) -> float:
     longitude, latitude = (float(angle) for angle in ecliptic(ra, dec))
     from_sun = longitude - sun_longitude(mjd)
     cosine = np.cos(np.radians(latitude)) * np.cos(np.radians(from_sun))
     elongation = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-    red, blue = _reddening(elongation, mission)
-    return zodiacal_intensity(from_sun, latitude, mission) * (own.zodi + red * own.red + blue * own.blue)
+    red, blue = _reddening_slopes(elongation, mission)
+    return zodiacal_intensity(from_sun, latitude, mission) * (sky_band.zodi + red * sky_band.red + blue * sky_band.blue)
 
 
-def _zodiacal_of(
+def _zodiacal_terms(
     detector: Detector, band: str, mission: MissionConfiguration, curve: Passband | None
 ) -> tuple[float, float, float]:
     area = mission.value("plm.collecting_area", "m2")
@@ -227,7 +227,7 @@ def _zodiacal_integrals(
 ) -> tuple[float, float, float]:
     wavelength = band.wavelength / 10.0
     reference = mission.value("env.zodi.reference_wavelength", "nm")
-    spectrum = solar(wavelength, mission) / solar(np.array([reference]), mission)
+    spectrum = solar_irradiance(wavelength, mission) / solar_irradiance(np.array([reference]), mission)
     energy = PLANCK_ERG_S * 1e-7 * LIGHT_ANGSTROM_S / band.wavelength
     # W m-2 sr-1 um-1 over steps of 1 A = 1e-4 um.
     photons = spectrum * band.response / energy * (1e-4 * area * (pixel_scale * _ARCSEC) ** 2)
@@ -237,7 +237,7 @@ def _zodiacal_integrals(
     return zodi, red, blue
 
 
-def solar(wavelength: Float, mission: MissionConfiguration) -> Float:
+def solar_irradiance(wavelength: Float, mission: MissionConfiguration) -> Float:
     """Solar spectral irradiance, W m-2 nm-1, 25 nm means; wavelength in nm.  Ref: Gueymard 2004."""
     table = np.array(mission.numbers("env.sun.spectrum"))
     if wavelength.min() < table[0, 0] or wavelength.max() > table[-1, 0]:
@@ -245,7 +245,7 @@ def solar(wavelength: Float, mission: MissionConfiguration) -> Float:
     return np.asarray(np.interp(wavelength, table[:, 0], table[:, 1]))
 
 
-def _reddening(elongation: float, mission: MissionConfiguration) -> tuple[float, float]:
+def _reddening_slopes(elongation: float, mission: MissionConfiguration) -> tuple[float, float]:
     """Slopes k of f_co = 1 + k log10(lambda / 500 nm), Leinert et al. 1998: red of 500 nm, blue of it."""
     ends = [mission.value(f"env.zodi.elongation_{end}", "deg") for end in ("near", "far")]
     red, blue = (

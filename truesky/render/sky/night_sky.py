@@ -27,7 +27,7 @@ from truesky.render.sky.diffuse_light import SkyBand
 from truesky.render.sky.observatory import Site
 
 # Where zodiacal light is least, deg; the airglow has at least this part of a dark sky.
-_POLE, _LEAST_AIRGLOW = 90.0, 0.2
+_POLE, _MIN_AIRGLOW = 90.0, 0.2
 # V: nanolamberts of B = 34.08 exp(20.7233 - 0.92104 V), and the wavelength, A.
 _NANOLAMBERTS, _V_ZERO, _V = 34.08, 20.7233, 5510.0
 # The Moon nearer than this is taken as there, deg.
@@ -53,11 +53,11 @@ class Night:
     sky: SkyBand
     scale: float
     extinction: float
-    reference: float
+    reference_airmass: float
     site: Site
 
     @classmethod
-    def of(
+    def from_detector(
         cls, detector: Detector, band: str, photometry: tuple[float, float], mission: MissionConfiguration,
         curve: Passband | None,
     ) -> Night:  # fmt: skip
@@ -77,8 +77,8 @@ class Night:
         key = f"{section}.{band}.extinction"
         extinction = mission.value(key, "mag") if key in mission else 0.0
         return cls(
-            level, mission.value(f"{section}.sky_model") == 1.0, min(pole, (1.0 - _LEAST_AIRGLOW) * level), float(moon),
-            sky, scale, extinction, mission.value(f"{section}.zero_point_airmass"), Site.of(section, mission),
+            level, mission.value(f"{section}.sky_model") == 1.0, min(pole, (1.0 - _MIN_AIRGLOW) * level), float(moon),
+            sky, scale, extinction, mission.value(f"{section}.zero_point_airmass"), Site.from_mission(section, mission),
         )  # fmt: skip
 
 
@@ -92,16 +92,16 @@ def sky_rate(night: Night, ra: float, dec: float, mjd: float, mission: MissionCo
     """
     if not night.modelled:
         return night.level
-    airmass, _ = observatory.aloft(ra, dec, mjd, night.site)
+    airmass, _ = observatory.airmass_and_zenith(ra, dec, mjd, night.site)
     dimmed = 10.0 ** (-0.4 * night.extinction * (airmass - 1.0))
-    airglow = (night.level - night.zodiacal) * _path(float(np.arcsin(1.0 / airmass))) * dimmed
+    airglow = (night.level - night.zodiacal) * _path_length(float(np.arcsin(1.0 / airmass))) * dimmed
     zodiacal = night.scale * diffuse_light.sky_rate(night.sky, ra, dec, mjd, mission)
     return float(airglow + zodiacal * dimmed + night.moon * moonlight(night, ra, dec, mjd, airmass))
 
 
-def fainter(night: Night, airmass: float) -> float:
+def extra_extinction(night: Night, airmass: float) -> float:
     """Magnitudes by which the air dims a source more than at the airmass that the zero point is of."""
-    return night.extinction * (airmass - night.reference)
+    return night.extinction * (airmass - night.reference_airmass)
 
 
 def moonlight(night: Night, ra: float, dec: float, mjd: float, airmass: float) -> float:
@@ -110,19 +110,19 @@ def moonlight(night: Night, ra: float, dec: float, mjd: float, airmass: float) -
     night : of the band;  ra, dec, mjd : deg, and date;  airmass : of the field
     Ref   : Krisciunas & Schaefer 1991, eqs. 3, 15, 17 to 21
     """
-    moon_ra, moon_dec, phase = (float(x) for x in observatory.moon(mjd))
+    moon_ra, moon_dec, phase = (float(x) for x in observatory.moon_position(mjd))
     up = float(observatory.moon_altitude(mjd, night.site))
     if up <= 0.0:
         return 0.0
     away = max(float(separation(ra, dec, moon_ra, moon_dec)), _NEAREST_MOON)
-    shone = 10.0 ** (-0.4 * (3.84 + 0.026 * abs(phase) + 4e-9 * phase**4))
+    moon_brightness = 10.0 ** (-0.4 * (3.84 + 0.026 * abs(phase) + 4e-9 * phase**4))
     scattered = 10.0**5.36 * (1.06 + np.cos(np.radians(away)) ** 2) + 10.0 ** (6.15 - away / 40.0)
-    arrives = 10.0 ** (-0.4 * night.extinction * _path(float(np.radians(up))))
-    turned = 1.0 - 10.0 ** (-0.4 * night.extinction * _path(float(np.arcsin(1.0 / airmass))))
-    return float(shone * scattered * arrives * turned)
+    transmission = 10.0 ** (-0.4 * night.extinction * _path_length(float(np.radians(up))))
+    scattered_fraction = 1.0 - 10.0 ** (-0.4 * night.extinction * _path_length(float(np.arcsin(1.0 / airmass))))
+    return float(moon_brightness * scattered * transmission * scattered_fraction)
 
 
-def _path(altitude: float) -> float:
+def _path_length(altitude: float) -> float:
     """Through a layer high above the ground, in its height; altitude : radian.  Ref: Krisciunas & Schaefer, eq. 3."""
     return float((1.0 - 0.96 * np.cos(altitude) ** 2) ** -0.5)
 
@@ -132,7 +132,7 @@ def _sun_colour(band: Passband, mission: MissionConfiguration) -> float:
     photons = band.response / band.wavelength
 
     def f_nu(wavelength: Float) -> Float:
-        return diffuse_light.solar(wavelength / 10.0, mission) * wavelength**2
+        return diffuse_light.solar_irradiance(wavelength / 10.0, mission) * wavelength**2
 
     mean = float((photons * f_nu(band.wavelength)).sum() / photons.sum())
     return float(-2.5 * np.log10(mean / f_nu(np.array([_V]))[0]))

@@ -35,7 +35,7 @@ _MOON_MEAN, _PRECESSION = (218.32, 481267.881), 1.39697
 # The Moon's parallax, deg.
 _PARALLAX = 0.95
 # Surveys observe while the Sun is lower than this, and away from the Moon, deg; up to this airmass.
-_TWILIGHT, _FROM_MOON, _MOST_AIRMASS = -15.0, 30.0, 2.0
+_TWILIGHT, _FROM_MOON, _MAX_AIRMASS = -15.0, 30.0, 2.0
 # A date's airmass is not taken beyond: the field is then taken as at its highest, at no more than this.
 HIGHEST_AIRMASS = 3.0
 # Steps of a search, days, and how far it goes.
@@ -51,22 +51,22 @@ class Site:
     height: float
 
     @classmethod
-    def of(cls, section: str, mission: MissionConfiguration) -> Site:
+    def from_mission(cls, section: str, mission: MissionConfiguration) -> Site:
         """Of a ground camera's section of the mission database."""
         latitude, longitude = (mission.value(f"{section}.site.{key}", "deg") for key in ("latitude", "longitude"))
         return cls(latitude, longitude, mission.value(f"{section}.site.height", "m"))
 
     def altitude(self, ra: npt.ArrayLike, dec: npt.ArrayLike, mjd: npt.ArrayLike) -> Float:
         """deg [...] above the horizon, without refraction.  Error: 0.2 deg, of precession and nutation since 2000."""
-        hour, dec, here = self._hour_angle(ra, mjd), np.radians(dec), np.radians(self.latitude)
-        sine = np.sin(here) * np.sin(dec) + np.cos(here) * np.cos(dec) * np.cos(hour)
+        hour, dec, latitude = self._hour_angle(ra, mjd), np.radians(dec), np.radians(self.latitude)
+        sine = np.sin(latitude) * np.sin(dec) + np.cos(latitude) * np.cos(dec) * np.cos(hour)
         return np.asarray(np.degrees(np.arcsin(np.clip(sine, -1.0, 1.0))))
 
     def zenith(self, ra: float, dec: float, mjd: float) -> float:
         """Position angle of the zenith from a field, north through east, deg: the parallactic angle."""
-        hour, here, down = float(self._hour_angle(ra, mjd)), np.radians(self.latitude), np.radians(dec)
-        east = np.sin(hour) * np.cos(here)
-        north = np.sin(here) * np.cos(down) - np.cos(here) * np.sin(down) * np.cos(hour)
+        hour, latitude, declination = float(self._hour_angle(ra, mjd)), np.radians(self.latitude), np.radians(dec)
+        east = np.sin(hour) * np.cos(latitude)
+        north = np.sin(latitude) * np.cos(declination) - np.cos(latitude) * np.sin(declination) * np.cos(hour)
         return float(np.degrees(np.arctan2(east, north)))
 
     def _hour_angle(self, ra: npt.ArrayLike, mjd: npt.ArrayLike) -> Float:
@@ -76,7 +76,7 @@ class Site:
 
 def sun_altitude(mjd: npt.ArrayLike, site: Site) -> Float:
     """deg [...] above the horizon of a site."""
-    sun = _sun(np.asarray(mjd, float))
+    sun = _sun_longitudes(np.asarray(mjd, float))
     return site.altitude(*equatorial(sun, np.zeros_like(sun)), mjd)
 
 
@@ -86,7 +86,7 @@ def airmass(altitude: npt.ArrayLike) -> Float:
     return np.asarray(np.maximum(1.0 / (np.sin(np.radians(up)) + 0.50572 * (up + 6.07995) ** -1.6364), 1.0))
 
 
-def aloft(ra: float, dec: float, mjd: float, site: Site) -> tuple[float, float]:
+def airmass_and_zenith(ra: float, dec: float, mjd: float, site: Site) -> tuple[float, float]:
     """(airmass, position angle of the zenith in deg) of a field at a date.
 
     ra, dec, mjd : deg, and date;  site : of the observatory
@@ -94,25 +94,25 @@ def aloft(ra: float, dec: float, mjd: float, site: Site) -> tuple[float, float]:
     exposures.
     """
     altitude = float(site.altitude(ra, dec, mjd))
-    found = float(airmass(altitude))
-    if altitude > 0.0 and found <= HIGHEST_AIRMASS:
-        return found, site.zenith(ra, dec, mjd)
+    field_airmass = float(airmass(altitude))
+    if altitude > 0.0 and field_airmass <= HIGHEST_AIRMASS:
+        return field_airmass, site.zenith(ra, dec, mjd)
     highest = 90.0 - abs(dec - site.latitude)
-    found = min(float(airmass(highest)), HIGHEST_AIRMASS) if highest > 0.0 else HIGHEST_AIRMASS
-    return found, 0.0 if dec < site.latitude else 180.0
+    field_airmass = min(float(airmass(highest)), HIGHEST_AIRMASS) if highest > 0.0 else HIGHEST_AIRMASS
+    return field_airmass, 0.0 if dec < site.latitude else 180.0
 
 
-def moon(mjd: npt.ArrayLike) -> tuple[Float, Float, Float]:
+def moon_position(mjd: npt.ArrayLike) -> tuple[Float, Float, Float]:
     """(ra, dec, phase angle) of the Moon, deg [...]: 0 when full.  Error: 0.5 deg, seen from the Earth's centre."""
     century = (np.asarray(mjd, float) - _MJD_J2000) / 36525.0
 
-    def of(terms: tuple[tuple[float, float, float], ...]) -> Float:
+    def sum_series(terms: tuple[tuple[float, float, float], ...]) -> Float:
         total = sum(size * np.sin(np.radians(phase + rate * century)) for size, phase, rate in terms)
         return np.asarray(total, float)
 
-    longitude = _MOON_MEAN[0] + _MOON_MEAN[1] * century + of(_MOON_LONGITUDE) - _PRECESSION * century
-    latitude = of(_MOON_LATITUDE)
-    sun = _sun(np.asarray(mjd, float))
+    longitude = _MOON_MEAN[0] + _MOON_MEAN[1] * century + sum_series(_MOON_LONGITUDE) - _PRECESSION * century
+    latitude = sum_series(_MOON_LATITUDE)
+    sun = _sun_longitudes(np.asarray(mjd, float))
     elongation = np.degrees(np.arccos(np.cos(np.radians(latitude)) * np.cos(np.radians(longitude - sun))))
     ra, dec = equatorial(longitude % 360.0, latitude)
     return ra, dec, 180.0 - elongation
@@ -120,39 +120,39 @@ def moon(mjd: npt.ArrayLike) -> tuple[Float, Float, Float]:
 
 def moon_altitude(mjd: npt.ArrayLike, site: Site) -> Float:
     """deg [...] above the horizon of a site, parallax taken off."""
-    ra, dec, _ = moon(mjd)
+    ra, dec, _ = moon_position(mjd)
     high = site.altitude(ra, dec, mjd)
     return np.asarray(high - _PARALLAX * np.cos(np.radians(high)))
 
 
-def next_dark(ra: float, dec: float, start: float, site: Site) -> float:
+def next_dark_time(ra: float, dec: float, start: float, site: Site) -> float:
     """MJD from `start` on when a field is up at night away from the Moon, to a quarter of an hour; `start` if never.
 
     ra, dec : deg;  site : of the observatory
     """
-    if float(airmass(90.0 - abs(dec - site.latitude))) > _MOST_AIRMASS:
+    if float(airmass(90.0 - abs(dec - site.latitude))) > _MAX_AIRMASS:
         return start
     # Most exposures follow one another in a night.
-    if _dark(ra, dec, np.array([start]), site)[0]:
+    if _is_dark(ra, dec, np.array([start]), site)[0]:
         return start
     for day in range(_DAYS):
         times: Float = start + day + _STEP * np.arange(float(round(1.0 / _STEP)))
-        good = np.flatnonzero(_dark(ra, dec, times, site))
+        good = np.flatnonzero(_is_dark(ra, dec, times, site))
         if len(good):
             return float(times[good[0]])
     return start
 
 
-def _sun(mjd: Float) -> Float:
+def _sun_longitudes(mjd: Float) -> Float:
     """Ecliptic longitude, deg [...]."""
     return np.array([sun_longitude(float(t)) for t in mjd.ravel()]).reshape(mjd.shape)
 
 
-def _dark(ra: float, dec: float, mjd: Float, site: Site) -> Bool:
+def _is_dark(ra: float, dec: float, mjd: Float, site: Site) -> Bool:
     night = sun_altitude(mjd, site) < _TWILIGHT
-    up = airmass(site.altitude(ra, dec, mjd)) <= _MOST_AIRMASS
+    up = airmass(site.altitude(ra, dec, mjd)) <= _MAX_AIRMASS
     if not (night & up).any():
         return night & up
-    moon_ra, moon_dec, _ = moon(mjd)
+    moon_ra, moon_dec, _ = moon_position(mjd)
     away = separation(np.full(len(mjd), ra), np.full(len(mjd), dec), moon_ra, moon_dec) > _FROM_MOON
     return np.asarray(night & up & (away | (moon_altitude(mjd, site) < 0.0)))

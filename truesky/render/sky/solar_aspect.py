@@ -20,7 +20,7 @@ from lake_schema.arrays import Float
 from lake_schema.errors import BadInput
 from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.sky.ecliptic import equatorial
-from truesky.numerics import sums
+from truesky.numerics import matrices
 from truesky.render.camera import pointing
 from truesky.render.sky.diffuse_light import sun_longitude
 
@@ -40,18 +40,18 @@ def sun_vector(mjd: float) -> Float:
 
 def solar_aspect(ra: float, dec: float, mjd: float) -> float:
     """Angle between a pointing and the Sun, deg."""
-    return float(np.degrees(np.arccos(np.clip(sums.product(sky.unit_vectors(ra, dec), sun_vector(mjd)), -1.0, 1.0))))
+    return float(np.degrees(np.arccos(np.clip(matrices.matmul(sky.unit_vectors(ra, dec), sun_vector(mjd)), -1.0, 1.0))))
 
 
 def position_angle(ra: float, dec: float, mjd: float) -> float:
     """Of the focal plane's y axis, deg, north through east: across the direction of the Sun, z x p."""
     p, s = sky.unit_vectors(ra, dec), sun_vector(mjd)
-    towards = s - sums.product(s, p) * p
-    if sums.product(towards, towards) < 1e-12:
+    towards = s - matrices.matmul(s, p) * p
+    if matrices.matmul(towards, towards) < 1e-12:
         raise BadInput(f"a pointing at ra {ra:g}, dec {dec:g} on MJD {mjd:g} looks along the Sun's direction")
     y = np.cross(towards, p)
     east, north, _ = pointing.basis(ra, dec)
-    return float(np.degrees(np.arctan2(sums.product(y, east), sums.product(y, north))))
+    return float(np.degrees(np.arctan2(matrices.matmul(y, east), matrices.matmul(y, north))))
 
 
 def limits(mission: MissionConfiguration) -> tuple[float, float]:
@@ -68,28 +68,30 @@ def is_allowed(ra: float, dec: float, mjd: float, mission: MissionConfiguration)
     return lowest - _TOLERANCE <= solar_aspect(ra, dec, mjd) <= highest + _TOLERANCE
 
 
-def allowed(ra: float, dec: float, start: float, mission: MissionConfiguration) -> Iterator[tuple[float, float]]:
+def allowed_intervals(
+    ra: float, dec: float, start: float, mission: MissionConfiguration
+) -> Iterator[tuple[float, float]]:
     """Stretches of dates (MJD from, to) within 400 days at which a place is seen.  Error: 0.001 d
 
     ra, dec : deg;  start : MJD;  mission : the mission database
     """
     lowest, highest = limits(mission)
-    days, suns = _suns(start)
-    aspect = np.degrees(np.arccos(np.clip(sums.product(suns, sky.unit_vectors(ra, dec)), -1.0, 1.0)))
+    days, suns = _sun_directions(start)
+    aspect = np.degrees(np.arccos(np.clip(matrices.matmul(suns, sky.unit_vectors(ra, dec)), -1.0, 1.0)))
     free = ((lowest - _TOLERANCE <= aspect) & (aspect <= highest + _TOLERANCE)).tolist()
     first = start if free[0] else None
-    for before, after, was, is_ in zip(days[:-1], days[1:], free[:-1], free[1:], strict=True):
-        if is_ and not was:
-            first = _edge(ra, dec, float(before), float(after), mission)
-        elif was and not is_ and first is not None:
-            yield first, _edge(ra, dec, float(after), float(before), mission)
+    for day, next_day, was_free, is_free in zip(days[:-1], days[1:], free[:-1], free[1:], strict=True):
+        if is_free and not was_free:
+            first = _edge(ra, dec, float(day), float(next_day), mission)
+        elif was_free and not is_free and first is not None:
+            yield first, _edge(ra, dec, float(next_day), float(day), mission)
             first = None
     if first is not None:
         yield first, float(days[-1])
 
 
 @lru_cache(maxsize=8)
-def _suns(start: float) -> tuple[Float, Float]:
+def _sun_directions(start: float) -> tuple[Float, Float]:
     """Dates [n] MJD from `start` on, and the Sun's directions [n, 3] at them."""
     days = start + np.arange(0.0, _SPAN + _STEP, _STEP)
     return days, np.stack([sun_vector(float(day)) for day in days])
@@ -110,7 +112,7 @@ def next_allowed(ra: float, dec: float, start: float, mission: MissionConfigurat
     """
     if is_allowed(ra, dec, start, mission):
         return start
-    for first, _ in allowed(ra, dec, start, mission):
+    for first, _ in allowed_intervals(ra, dec, start, mission):
         return first
     lowest, highest = limits(mission)
     raise BadInput(f"ra {ra:g}, dec {dec:g} is {lowest:g} to {highest:g} deg from the Sun on no day of the next year")
@@ -125,7 +127,9 @@ def check_aspect(ra: float, dec: float, mjd: float, mission: MissionConfiguratio
         return
     lowest, highest = limits(mission)
     angle = solar_aspect(ra, dec, mjd)
-    stretches = [f"{_date(first, 'up')} to {_date(last, 'down')}" for first, last in allowed(ra, dec, mjd, mission)]
+    stretches = [
+        f"{_date(first, 'up')} to {_date(last, 'down')}" for first, last in allowed_intervals(ra, dec, mjd, mission)
+    ]
     when = f"next allowed: MJD {', '.join(stretches[:2])}" if stretches else "no day of the next year is allowed"
     raise BadInput(
         f"{where}: {angle:.1f} deg from the Sun on MJD {mjd:g}, the telescope looks {lowest:g} to {highest:g} deg from "

@@ -55,7 +55,7 @@ def rate(section: str, name: str, band: Passband, mission: MissionConfiguration)
     section, name : of the camera in the mission database, and the band's
     band, mission : the passband, and the database
     """
-    return _level(section, name, mission) * sum(part for part, _ in _parts(section, band, mission))
+    return _level(section, name, mission) * sum(part for part, _ in _body_levels(section, band, mission))
 
 
 def photons(section: str, name: str, band: Passband, mission: MissionConfiguration) -> Float:
@@ -65,7 +65,7 @@ def photons(section: str, name: str, band: Passband, mission: MissionConfigurati
     band, mission : the passband, and the database
     """
     total = np.zeros(len(band.wavelength))
-    for part, now in _parts(section, band, mission):
+    for part, now in _body_levels(section, band, mission):
         occupied, weight = _spectrum(band, now)
         total += part * np.exp(occupied - logsumexp(occupied, b=weight)) * weight
     return np.asarray(_level(section, name, mission) * total)
@@ -75,10 +75,10 @@ def _level(section: str, name: str, mission: MissionConfiguration) -> float:
     return mission.value(f"{section}.{name}.thermal", "electron / (s pix)")
 
 
-def _parts(section: str, band: Passband, mission: MissionConfiguration) -> list[tuple[float, float]]:
+def _body_levels(section: str, band: Passband, mission: MissionConfiguration) -> list[tuple[float, float]]:
     """(part of the level, temperature K) of each body."""
-    own, found = mission.value(f"{section}.thermal.telescope_part", ""), []
-    for body, part in zip(_BODIES, (own, 1.0 - own), strict=True):
+    telescope_fraction, levels = mission.value(f"{section}.thermal.telescope_part", ""), []
+    for body, part in zip(_BODIES, (telescope_fraction, 1.0 - telescope_fraction), strict=True):
         now, then = (mission.value(f"{section}.thermal.{body}_{key}", "K") for key in ("temperature", "reference"))
-        found.append((part * float(np.exp(brightness(band, now) - brightness(band, then))), now))
-    return found
+        levels.append((part * float(np.exp(brightness(band, now) - brightness(band, then))), now))
+    return levels

@@ -19,13 +19,13 @@ from truesky.fluxes import high_redshift, integration, passbands
 from truesky.fluxes.libraries import templates
 from truesky.fluxes.libraries.templates import Library
 from truesky.fluxes.passbands import Passband
-from truesky.fluxes.sources import GALAXY_KINDS, STAR_PARTS, galaxies_of, stars_of
+from truesky.fluxes.sources import GALAXY_KINDS, STAR_COMPONENTS, galaxies_from_table, stars_from_table
 from truesky.fluxes.spectra.continuum import COMPONENTS
 from truesky.fluxes.spectra.lines import line_list
 from truesky.fluxes.tables import flux_tables
 from truesky.fluxes.tables.build_tables import Setting
 from truesky.render.psf import sub_bands
-from truesky.render.psf.sub_bands import PARTS
+from truesky.render.psf.sub_bands import N_SUB_BANDS
 
 # Of the tables of f_nu by redshift and dust: 1e-3 of a part's share is 1e-5 of second moments.
 _SETTING = Setting(0.01, 4, 3)
@@ -36,8 +36,8 @@ GALAXY_COLUMNS = (
     *sorted({line.column for line in line_list()}),
 )
 # What a star must have for a spectrum; a user's own catalogue has no second template.
-OF_ONE_TEMPLATE = ("sed", "mag_h", "a_v")
-STAR_COLUMNS = (*OF_ONE_TEMPLATE, *(f"{name}_{k}" for k in STAR_PARTS for name in ("sed", "frac")))
+ONE_TEMPLATE_COLUMNS = ("sed", "mag_h", "a_v")
+STAR_COLUMNS = (*ONE_TEMPLATE_COLUMNS, *(f"{name}_{k}" for k in STAR_COMPONENTS for name in ("sed", "frac")))
 
 
 def galaxies(rows: pa.Table, band: Passband, library: Library | None = None) -> Float:
@@ -50,41 +50,43 @@ def galaxies(rows: pa.Table, band: Passband, library: Library | None = None) -> 
         return _flat(len(rows))
     parts = sub_bands.sub_bands(band)
     f_nu = np.empty((len(rows), len(parts)))
-    usual = np.isin(rows["kind"].to_numpy(), GALAXY_KINDS) if "kind" in rows.column_names else np.ones(len(rows), bool)
-    if not usual.all():
-        f_nu[~usual] = high_redshift.fluxes(rows.filter(pa.array(~usual)), parts)
-    f_nu[usual] = _usual(rows.filter(pa.array(usual)), parts, library or templates.galaxy_library())
+    in_library = (
+        np.isin(rows["kind"].to_numpy(), GALAXY_KINDS) if "kind" in rows.column_names else np.ones(len(rows), bool)
+    )
+    if not in_library.all():
+        f_nu[~in_library] = high_redshift.fluxes(rows.filter(pa.array(~in_library)), parts)
+    f_nu[in_library] = _library_fluxes(rows.filter(pa.array(in_library)), parts, library or templates.galaxy_library())
     return _shares(f_nu, parts)
 
 
-def _usual(rows: pa.Table, parts: Sequence[Passband], library: Library) -> Float:
+def _library_fluxes(rows: pa.Table, parts: Sequence[Passband], library: Library) -> Float:
     """f_nu of galaxies whose spectra are in the galaxy library."""
-    found = galaxies_of(rows, library)
-    tabulated = flux_tables.covered(found)
-    f_nu = np.empty((len(found), len(parts)))
+    parameters = galaxies_from_table(rows, library)
+    tabulated = flux_tables.covered_galaxies(parameters)
+    f_nu = np.empty((len(parameters), len(parts)))
     if tabulated.any():
         grid = flux_tables.open_grid(parts, (_SETTING,) * len(parts), library)
-        f_nu[tabulated] = flux_tables.galaxies(found.rows(np.flatnonzero(tabulated)), grid)
+        f_nu[tabulated] = flux_tables.galaxy_fluxes(parameters.select(np.flatnonzero(tabulated)), grid)
     if not tabulated.all():
-        f_nu[~tabulated] = integration.galaxies(found.rows(np.flatnonzero(~tabulated)), parts, library)
+        f_nu[~tabulated] = integration.galaxy_fluxes(parameters.select(np.flatnonzero(~tabulated)), parts, library)
     return f_nu
 
 
 def stars(rows: pa.Table, band: Passband, library: Library | None = None) -> Float:
     """float64[n, PARTS] fractions of the detected photons of rows of the table `stars`; library as in `galaxies`."""
-    if not len(rows) or not set(OF_ONE_TEMPLATE) <= set(rows.column_names):
+    if not len(rows) or not set(ONE_TEMPLATE_COLUMNS) <= set(rows.column_names):
         return _flat(len(rows))
     library, parts = library or templates.stellar_library(), sub_bands.sub_bands(band)
-    found = stars_of(rows, library)
-    tabulated = flux_tables.covered_stars(found)
-    f_nu = np.empty((len(found), len(parts)))
-    for chosen, kernel in ((tabulated, flux_tables.stars), (~tabulated, integration.stars)):
+    parameters = stars_from_table(rows, library)
+    tabulated = flux_tables.covered_stars(parameters)
+    f_nu = np.empty((len(parameters), len(parts)))
+    for chosen, kernel in ((tabulated, flux_tables.star_fluxes), (~tabulated, integration.star_fluxes)):
         if chosen.any():
-            f_nu[chosen] = kernel(found.rows(np.flatnonzero(chosen)), parts, library)
+            f_nu[chosen] = kernel(parameters.select(np.flatnonzero(chosen)), parts, library)
     return _shares(f_nu, parts)
 
 
-def of_spectrum(band: Passband, f_lambda: Float) -> Float:
+def spectrum_fractions(band: Passband, f_lambda: Float) -> Float:
     """float64[PARTS] fractions of the detected photons of a spectrum given on the band's wavelengths."""
     parts = sub_bands.sub_bands(band)
     f_nu = np.array([[passbands.ab_flux(part, band.wavelength, f_lambda) for part in parts]])
@@ -92,10 +94,10 @@ def of_spectrum(band: Passband, f_lambda: Float) -> Float:
 
 
 def _flat(n: int) -> Float:
-    return np.full((n, PARTS), 1.0 / PARTS)
+    return np.full((n, N_SUB_BANDS), 1.0 / N_SUB_BANDS)
 
 
 def _shares(f_nu: Float, parts: tuple[Passband, ...]) -> Float:
     photons = f_nu * np.array([passbands.log_width(part) for part in parts])
     total = photons.sum(axis=1, keepdims=True)
-    return np.where(total > 0, photons / np.where(total > 0, total, 1.0), 1.0 / PARTS)
+    return np.where(total > 0, photons / np.where(total > 0, total, 1.0), 1.0 / N_SUB_BANDS)

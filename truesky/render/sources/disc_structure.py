@@ -55,7 +55,7 @@ _RING = 0.12
 class DiscStructure:
     """What structure discs have; wanted : numbers of the request;  seed : of the request"""
 
-    wanted: Arms
+    arms: Arms
     seed: int
 
 
@@ -67,36 +67,36 @@ def sides(shape: Shapes, discs: DiscStructure | None) -> Float:
     if discs is None:
         return np.zeros(len(shape))
     # The half-light radius along the major axis, of the disc alone, as it is seen.
-    seen = galaxy_shapes.half_light(replace(shape, bulge_fraction=np.zeros(len(shape))))
-    wide = 2 * REACH / EXPONENTIAL_RADIUS * seen
-    some = (shape.disk_radius >= discs.wanted.least_radius) & (shape.bulge_fraction < _SMOOTH) & (wide < _WIDEST)
-    return np.where(some, wide, 0.0)
+    half_light_radius = galaxy_shapes.half_light(replace(shape, bulge_fraction=np.zeros(len(shape))))
+    wide = 2 * REACH / EXPONENTIAL_RADIUS * half_light_radius
+    has_structure = (shape.disk_radius >= discs.arms.least_radius) & (shape.bulge_fraction < _SMOOTH) & (wide < _WIDEST)
+    return np.where(has_structure, wide, 0.0)
 
 
-def added(sources: Sources, shape: Shapes, discs: DiscStructure | None) -> Sources:
+def add_structure(sources: Sources, shape: Shapes, discs: DiscStructure | None) -> Sources:
     """The sources, with pictures of the structure of those discs that have one; shape : of all galaxies."""
     if discs is None:
         return sources
-    which = np.flatnonzero(np.append(sides(shape, discs) > 0.0, False)[sources.shape])
-    found = _pictures(sources.ids[which], shape.take(sources.shape[which]), discs)
+    indices = np.flatnonzero(np.append(sides(shape, discs) > 0.0, False)[sources.shape])
+    new_pictures = _pictures(sources.ids[indices], shape.take(sources.shape[indices]), discs)
     picture = np.full(len(sources), -1) if sources.picture is None else sources.picture.copy()
-    picture[which] = len(sources.pictures) + np.arange(len(which))
-    return replace(sources, picture=picture, pictures=(*sources.pictures, *found))
+    picture[indices] = len(sources.pictures) + np.arange(len(indices))
+    return replace(sources, picture=picture, pictures=(*sources.pictures, *new_pictures))
 
 
 def _pictures(ids: Int, shape: Shapes, discs: DiscStructure) -> tuple[Picture, ...]:
     form = galaxy_shapes.forms(shape, np.broadcast_to(np.eye(2), (len(ids), 2, 2)))
-    found = []
+    pictures = []
     for i, galaxy in enumerate(ids.tolist()):
         length = float(shape.disk_radius[i]) / EXPONENTIAL_RADIUS
         side = int(_SIDES[min(int(np.searchsorted(_SIDES, 2 * REACH * length / _FINE)), len(_SIDES) - 1)])
-        numbers = rng.stream(discs.seed, "disc structure", galaxy)
-        image = arms_and_knots(side, float(shape.bulge_fraction[i]), discs.wanted, numbers)
-        found.append(Picture(image, form.disk[i] * (2 * REACH / side), form.thick[i]))
-    return tuple(found)
+        generator = rng.stream(discs.seed, "disc structure", galaxy)
+        image = arms_and_knots(side, float(shape.bulge_fraction[i]), discs.arms, generator)
+        pictures.append(Picture(image, form.disk[i] * (2 * REACH / side), form.thick[i]))
+    return tuple(pictures)
 
 
-def arms_and_knots(side: int, bulge_fraction: float, wanted: Arms, numbers: np.random.Generator) -> Float32:
+def arms_and_knots(side: int, bulge_fraction: float, arms: Arms, generator: np.random.Generator) -> Float32:
     """float32[side, side] of sum 0: the structure of a face-on exponential disc of flux 1, 2 REACH scale lengths wide.
 
     bulge_fraction : of the galaxy's light;  wanted : numbers of the request;  numbers : random ones
@@ -104,14 +104,14 @@ def arms_and_knots(side: int, bulge_fraction: float, wanted: Arms, numbers: np.r
     step = 2 * REACH / side
     at: Float = (np.arange(float(side)) - 0.5 * (side - 1)) * step
     radius, angle = np.hypot(at, at[:, None]), np.arctan2(at[:, None], at)
-    winding = _Winding.drawn(bulge_fraction, numbers)
+    winding = _Winding.draw(bulge_fraction, generator)
     smooth = np.exp(-radius) * (step**2 / (2 * np.pi))
     window = _rise(radius, *_INNER) * (1.0 - _rise(radius, *_OUTER))
-    pattern = _pattern(np.log(np.maximum(radius, step)), angle, winding, wanted.contrast, numbers)
+    pattern = _pattern(np.log(np.maximum(radius, step)), angle, winding, arms.contrast, generator)
     light = smooth * (1.0 + window * (pattern - 1.0))
-    light *= 1.0 - wanted.knots * window
-    light += window * _knots(at, winding, wanted, numbers)
-    return _balanced(light, smooth, radius, window, step)
+    light *= 1.0 - arms.knots * window
+    light += window * _knots(at, winding, arms, generator)
+    return _balance_rings(light, smooth, radius, window, step)
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,79 +124,85 @@ class _Winding:
     wander: Float
 
     @classmethod
-    def drawn(cls, bulge_fraction: float, numbers: np.random.Generator) -> _Winding:
-        arms = int(numbers.choice(_ARMS, p=_ODDS))
-        pitch = _OPEN + (_TIGHT - _OPEN) * bulge_fraction / _SMOOTH + _SCATTER * numbers.standard_normal()
-        hand = 1.0 if numbers.random() < 0.5 else -1.0
+    def draw(cls, bulge_fraction: float, generator: np.random.Generator) -> _Winding:
+        arms = int(generator.choice(_ARMS, p=_ODDS))
+        pitch = _OPEN + (_TIGHT - _OPEN) * bulge_fraction / _SMOOTH + _SCATTER * generator.standard_normal()
+        hand = 1.0 if generator.random() < 0.5 else -1.0
         slope = hand / np.tan(np.radians(np.clip(pitch, *_PITCHES)))
-        first = 2 * np.pi * numbers.random()
-        return cls(arms, slope, first, numbers.uniform(-1.0, 1.0, (2, 3)))
+        first = 2 * np.pi * generator.random()
+        return cls(arms, slope, first, generator.uniform(-1.0, 1.0, (2, 3)))
 
     def angle(self, log_radius: Float) -> Float:
         """Of the first arm, radian."""
-        found = self.first + self.slope * log_radius
+        arm_angle = self.first + self.slope * log_radius
         for wave, (cosine, sine) in enumerate(self.wander.T, start=2):
-            found = found + (0.25 / wave) * (cosine * np.cos(wave * log_radius) + sine * np.sin(wave * log_radius))
-        return np.asarray(found)
+            arm_angle = arm_angle + (0.25 / wave) * (
+                cosine * np.cos(wave * log_radius) + sine * np.sin(wave * log_radius)
+            )
+        return np.asarray(arm_angle)
 
 
 def _pattern(
-    log_radius: Float, angle: Float, winding: _Winding, contrast: float, numbers: np.random.Generator
+    log_radius: Float, angle: Float, winding: _Winding, contrast: float, generator: np.random.Generator
 ) -> Float:
     """Light of arms with spurs and patches over the mean of its circle, about."""
-    narrow = numbers.uniform(*_NARROW)
+    narrow = generator.uniform(*_NARROW)
     mean = i0e(narrow)
-    strength = contrast * numbers.uniform(0.7, 1.1) / (1.0 / mean - 1.0)
+    strength = contrast * generator.uniform(0.7, 1.1) / (1.0 / mean - 1.0)
     phase = angle - winding.angle(log_radius)
     ridge = np.exp(narrow * (np.cos(winding.arms * phase) - 1.0)) / mean
     # One arm is not as bright as the other, nor all along.
-    uneven = 1.0 + 0.35 * np.cos(phase + numbers.uniform(0, 2 * np.pi) + 1.3 * log_radius)
+    uneven = 1.0 + 0.35 * np.cos(phase + generator.uniform(0, 2 * np.pi) + 1.3 * log_radius)
     pattern = 1.0 + min(strength, 0.95) * (ridge * uneven - 1.0)
     patches = np.zeros_like(pattern)
     for _ in range(_WAVES):
-        number, tilt = int(numbers.integers(2, 10)), numbers.uniform(0.35, 1.1)
-        patches += np.cos(number * (angle - tilt * winding.slope * log_radius) + numbers.uniform(0, 2 * np.pi))
+        number, tilt = int(generator.integers(2, 10)), generator.uniform(0.35, 1.1)
+        patches += np.cos(number * (angle - tilt * winding.slope * log_radius) + generator.uniform(0, 2 * np.pi))
     spread = contrast / (contrast + 1.0) * 2.0 * _PATCHY * np.sqrt(2.0 / _WAVES)
     return np.asarray(np.maximum(pattern, 0.05) * np.exp(spread * patches))
 
 
-def _knots(at: Float, winding: _Winding, wanted: Arms, numbers: np.random.Generator) -> Float:
+def _knots(at: Float, winding: _Winding, arms: Arms, generator: np.random.Generator) -> Float:
     """Light of knots along the arms; at : [side] scale lengths of the picture's columns and rows."""
-    light, count = np.zeros((len(at), len(at))), wanted.number
-    if not count or not wanted.knots:
+    light, count = np.zeros((len(at), len(at))), arms.number
+    if not count or not arms.knots:
         return light
     step = at[1] - at[0]
     steps = np.linspace(0.0, REACH, 501)
     inside = np.cumsum(steps * np.exp(-steps))
     # As many in each part of the disc as it has light.
-    radius = np.interp((np.arange(count) + numbers.random(count)) / count, inside / inside[-1], steps)
-    flux = 1.0 / (1.0 - numbers.random(count) * (1.0 - 1.0 / _RANGE))
-    width = numbers.uniform(*_WIDTHS, count) * (flux / flux.mean()) ** 0.2
-    arm = numbers.integers(0, winding.arms, count) + _ASTRAY * numbers.standard_normal(count)
-    arm = np.where(numbers.random(count) < _FIELD, winding.arms * numbers.random(count), arm)
+    radius = np.interp((np.arange(count) + generator.random(count)) / count, inside / inside[-1], steps)
+    flux = 1.0 / (1.0 - generator.random(count) * (1.0 - 1.0 / _RANGE))
+    width = generator.uniform(*_WIDTHS, count) * (flux / flux.mean()) ** 0.2
+    arm = generator.integers(0, winding.arms, count) + _ASTRAY * generator.standard_normal(count)
+    arm = np.where(generator.random(count) < _FIELD, winding.arms * generator.random(count), arm)
     angle = winding.angle(np.log(np.maximum(radius, step))) + 2 * np.pi * arm / winding.arms
     for x, y, s, f in zip(
         radius * np.cos(angle), radius * np.sin(angle), np.maximum(width, 0.8 * step), flux / flux.sum(), strict=True
     ):
-        left, low = (max(int(np.searchsorted(at, p - 4 * s)), 0) for p in (x, y))
-        right, high = (int(np.searchsorted(at, p + 4 * s)) for p in (x, y))
-        across, up = (np.exp(-0.5 * ((part - p) / s) ** 2) for part, p in ((at[left:right], x), (at[low:high], y)))
-        light[low:high, left:right] += wanted.knots * f * (step / s) ** 2 / (2 * np.pi) * up[:, None] * across
+        x_first, y_first = (max(int(np.searchsorted(at, p - 4 * s)), 0) for p in (x, y))
+        x_stop, y_stop = (int(np.searchsorted(at, p + 4 * s)) for p in (x, y))
+        across, up = (
+            np.exp(-0.5 * ((part - p) / s) ** 2) for part, p in ((at[x_first:x_stop], x), (at[y_first:y_stop], y))
+        )
+        light[y_first:y_stop, x_first:x_stop] += arms.knots * f * (step / s) ** 2 / (2 * np.pi) * up[:, None] * across
     return light
 
 
-def _balanced(light: Float, smooth: Float, radius: Float, window: Float, step: float) -> Float32:
+def _balance_rings(light: Float, smooth: Float, radius: Float, window: Float, step: float) -> Float32:
     """What is left of light [side, side] without the smooth disc, once circles have as much of both."""
     ring = (radius / step).astype(np.int64).ravel()
-    has, wants = (gaussian_filter1d(np.bincount(ring, part.ravel()), _RING / step) for part in (light, smooth))
-    middles = (np.arange(len(has)) + 0.5) * step
-    light = light * np.interp(radius, middles, wants / has)
-    found = window * (light - smooth)
+    ring_light, smooth_light = (
+        gaussian_filter1d(np.bincount(ring, part.ravel()), _RING / step) for part in (light, smooth)
+    )
+    middles = (np.arange(len(ring_light)) + 0.5) * step
+    light = light * np.interp(radius, middles, smooth_light / ring_light)
+    structure = window * (light - smooth)
     # What the width of a ring leaves over, within the half-light radius and beyond.
     within = radius < EXPONENTIAL_RADIUS
     for weight in (window * smooth * within, window * smooth * ~within):
-        found -= weight * (found.sum(where=weight > 0.0) / weight.sum())
-    return np.asarray(found, np.float32)
+        structure -= weight * (structure.sum(where=weight > 0.0) / weight.sum())
+    return np.asarray(structure, np.float32)
 
 
 def _rise(radius: Float, low: float, high: float) -> Float:

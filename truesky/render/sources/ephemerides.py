@@ -50,7 +50,7 @@ class Bodies:
     day: Int
     rows: Population
 
-    def of_day(self, day: int) -> Population:
+    def on_day(self, day: int) -> Population:
         """Those of one day."""
         return self.rows.take(self.day == day)
 
@@ -60,12 +60,12 @@ def read(file: Path, sha256: str) -> Bodies:
     """A table of bodies; BadInput names the file, and the column and row that is wrong.  sha256 : of the file."""
     values, names = _table(file)
     for key, bounds in KEYS.items():
-        external_rows.within(file, key, values[key], bounds)
+        external_rows.check_bounds(file, key, values[key], bounds)
     day = np.floor(values["mjd"]).astype(np.int64)
     if names is not None:
-        _refuse_twice(file, names, day)
+        _refuse_duplicates(file, names, day)
     hour = 24.0 * (values["mjd"] - day - 0.5)
-    cell = sky.cell_of(*equatorial(values["lon"], values["lat"]), GENERATION_ORDER)
+    cell = sky.cell_at(*equatorial(values["lon"], values["lat"]), GENERATION_ORDER)
     ids = source_id(KIND, cell, np.arange(len(day)), day)
     lon, lat, east, north, mag = (values[key] for key in ("lon", "lat", "east", "north", "mag"))
     return Bodies(day, Population(ids, lon, lat, east, north, mag, hour))
@@ -83,7 +83,7 @@ def _table(file: Path) -> tuple[dict[str, Float], pa.ChunkedArray | None]:
     """Columns of KEYS, and names where it has some."""
     parts: dict[str, list[Float]] = {key: [np.zeros(0)] for key in KEYS}
     names, rows = [], 0
-    for piece in external_rows.pieces(file, list(KEYS), texts=[_NAME], kind="table of bodies"):
+    for piece in external_rows.read_batches(file, list(KEYS), text_columns=[_NAME], kind="table of bodies"):
         rows += len(piece.columns["mjd"])
         if rows > _MOST_ROWS:
             raise BadInput(f"{file}: has more than {_MOST_ROWS} rows")
@@ -94,7 +94,7 @@ def _table(file: Path) -> tuple[dict[str, Float], pa.ChunkedArray | None]:
     return {key: np.concatenate(column) for key, column in parts.items()}, pa.chunked_array(names) if names else None
 
 
-def _refuse_twice(file: Path, names: pa.ChunkedArray, day: Int) -> None:
+def _refuse_duplicates(file: Path, names: pa.ChunkedArray, day: Int) -> None:
     """One row a name and day."""
     if (absent := pc.index(names, "").as_py()) >= 0:
         raise BadInput(f"{file}: {_NAME} of row {absent + 1} is missing")
@@ -104,5 +104,7 @@ def _refuse_twice(file: Path, names: pa.ChunkedArray, day: Int) -> None:
     if len(same):
         # Sorting keeps the order of equals.
         row = int(order[same + 1].min())
-        here = f"{_NAME} of row {row + 1} is {names[row].as_py()[:40]!r}, which has a row of MJD {day[row]} before it"
-        raise BadInput(f"{file}: {here} ({len(same)} of {len(day)} rows like it)")
+        problem = (
+            f"{_NAME} of row {row + 1} is {names[row].as_py()[:40]!r}, which has a row of MJD {day[row]} before it"
+        )
+        raise BadInput(f"{file}: {problem} ({len(same)} of {len(day)} rows like it)")

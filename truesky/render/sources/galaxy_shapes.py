@@ -22,14 +22,14 @@ from scipy.special import gammaincc, gammaincinv, gammaln
 
 from lake_schema.arrays import Float, Int
 from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
-from truesky.numerics import sums
+from truesky.numerics import matrices
 from truesky.render.sources import sersic
-from truesky.request.schema import MOST_SHEAR
+from truesky.request.schema import MAX_SHEAR
 
 # Half-light radius of a face-on exponential disc in scale lengths: (1 + x) exp(-x) = 1/2.
 EXPONENTIAL_RADIUS = 1.6783469900166605
 # Inverse magnification near a critical line: beyond it, as beyond MOST_SHEAR, a single source is not a lensed ellipse.
-_LEAST_DETERMINANT = 1e-3
+_MIN_DETERMINANT = 1e-3
 # An ellipse has an area: thinner than this is a line.
 _SLIMMEST = 1e-4
 # From this index on Sersic's b_n is taken from its series.
@@ -93,9 +93,9 @@ def shapes(galaxies: pa.Table) -> Shapes:
     columns = {name: np.asarray(galaxies[name].to_numpy(), float) for name in COLUMNS}
     stretch = 1.0 - columns["kappa"]
     gamma = np.hypot(columns["gamma1"], columns["gamma2"])
-    determinant = np.maximum(np.abs((stretch - gamma) * (stretch + gamma)), _LEAST_DETERMINANT)
+    determinant = np.maximum(np.abs((stretch - gamma) * (stretch + gamma)), _MIN_DETERMINANT)
     with np.errstate(divide="ignore", invalid="ignore"):
-        reduced = np.where(gamma > 0, np.minimum(1.0, MOST_SHEAR * np.abs(stretch) / gamma) / stretch, 0.0)
+        reduced = np.where(gamma > 0, np.minimum(1.0, MAX_SHEAR * np.abs(stretch) / gamma) / stretch, 0.0)
     return Shapes(
         bulge_radius=columns["bulge_half_light_radius"],
         disk_radius=columns["disk_half_light_radius"],
@@ -135,14 +135,14 @@ def forms(shape: Shapes, jacobian: Float) -> Forms:
     turn = _matrices(cos_beta, -sin_beta, sin_beta, cos_beta)
     scale = np.sqrt(shape.magnification / ((1 - shape.g1) * (1 + shape.g1) - shape.g2**2))
     lens = _matrices(1 + shape.g1, shape.g2, shape.g2, 1 - shape.g1) * scale[:, None, None]
-    to_pixels = sums.product(sums.product(sums.inverse(jacobian), lens), turn)
-    one = np.ones(len(shape))
-    bulge = to_pixels * (shape.bulge_radius[:, None] * np.stack([one, shape.bulge_axis_ratio], 1))[:, None]
+    to_pixels = matrices.matmul(matrices.matmul(matrices.inverse(jacobian), lens), turn)
+    ones = np.ones(len(shape))
+    bulge = to_pixels * (shape.bulge_radius[:, None] * np.stack([ones, shape.bulge_axis_ratio], 1))[:, None]
     disk = to_pixels * (shape.disk_radius / EXPONENTIAL_RADIUS)[:, None, None]
     inclination = np.radians(shape.inclination)
-    seen = disk * np.stack([one, np.cos(inclination)], 1)[:, None]
+    projected_disk = disk * np.stack([ones, np.cos(inclination)], 1)[:, None]
     thick = disk[:, :, 1] * (0.5 * np.pi * DISK_SCALE_HEIGHT * np.sin(inclination))[:, None]
-    return Forms(bulge, seen, thick)
+    return Forms(bulge, projected_disk, thick)
 
 
 def _matrices(a: Float, b: Float, c: Float, d: Float) -> Float:
@@ -194,7 +194,7 @@ def _disk(shape: Shapes, i: int, smallest: float) -> galsim.GSObject:
 # ------------------------------------------------------------------------------------------------ extent
 
 
-def surface(shape: Shapes, radius: Float) -> Float:
+def surface_brightness(shape: Shapes, radius: Float) -> Float:
     """Fraction of the flux per arcsec2 along the major axis, an upper bound for every other direction.
 
     radius : [m] arcsec;  returns [n, m]
@@ -209,7 +209,7 @@ def surface(shape: Shapes, radius: Float) -> Float:
     )
 
 
-def line(shape: Shapes, distance: float) -> Float:
+def line_brightness(shape: Shapes, distance: float) -> Float:
     """Fraction of the flux per arcsec of a line at a distance from the middle: of the major axis, along the minor.
 
     distance : arcsec, > 0;  returns [n], an upper bound for lines of every other direction. Error : 1 %
@@ -219,15 +219,15 @@ def line(shape: Shapes, distance: float) -> Float:
     # Both sides of the nearest point, by the trapezoidal rule: x = distance sinh t, dx = radius dt.
     weights = 2.0 * _LINE_STEP * radius
     weights[0] *= 0.5
-    one, parts = np.ones(len(shape)), ((shape.bulge_radius, shape.sersic_index), (shape.disk_radius, None))
+    ones, parts = np.ones(len(shape)), ((shape.bulge_radius, shape.sersic_index), (shape.disk_radius, None))
     bulge, disk = (
-        sums.product(_sersic_surface(radius, size * stretch, one if n is None else n, one), weights)
+        matrices.matmul(_sersic_surface(radius, size * stretch, ones if n is None else n, ones), weights)
         for size, n in parts
     )
     return np.asarray(shape.bulge_fraction * bulge + (1 - shape.bulge_fraction) * disk)
 
 
-def outside(shape: Shapes, radius: Float) -> Float:
+def flux_outside(shape: Shapes, radius: Float) -> Float:
     """Fraction of the flux beyond a radius along the major axis, an upper bound for what is beyond that circle.
 
     radius : [n] arcsec;  returns [n]
@@ -240,7 +240,7 @@ def outside(shape: Shapes, radius: Float) -> Float:
     return np.asarray(shape.bulge_fraction * bulge + (1 - shape.bulge_fraction) * disk)
 
 
-def on_the_sky(shape: Shapes, form: Forms) -> Float:
+def real_space_profile(shape: Shapes, form: Forms) -> Float:
     """float64[n, 11]: what drawing/kernels/frame.py takes the light at a place from, of unit flux.
 
     Of the bulge and of the disc the light in the middle, by square pixel; of the bulge, of pixels (x, y) from the
@@ -255,19 +255,19 @@ def on_the_sky(shape: Shapes, form: Forms) -> Float:
     areas = [
         np.abs(matrix[:, 0, 0] * matrix[:, 1, 1] - matrix[:, 0, 1] * matrix[:, 1, 0]) for matrix in (form.bulge, disk)
     ]
-    some = [area > _NO_AREA for area in areas]
-    areas = [np.where(kept, area, 1.0) for kept, area in zip(some, areas, strict=True)]
+    has_area = [area > _NO_AREA for area in areas]
+    areas = [np.where(valid, area, 1.0) for valid, area in zip(has_area, areas, strict=True)]
     middles = (
         shape.bulge_fraction * np.exp(2 * n * np.log(b) - np.log(2 * np.pi * n) - gammaln(2 * n)) / areas[0],
         (1 - shape.bulge_fraction) / (2 * np.pi) / areas[1],
     )
     inverse = [
-        sums.inverse(np.where(kept[:, None, None], m, np.eye(2)))
-        for kept, m in zip(some, (form.bulge, disk), strict=True)
+        matrices.inverse(np.where(valid[:, None, None], m, np.eye(2)))
+        for valid, m in zip(has_area, (form.bulge, disk), strict=True)
     ]
     return np.column_stack(
         [
-            *(np.where(kept, middle, 0.0) for kept, middle in zip(some, middles, strict=True)),
+            *(np.where(valid, middle, 0.0) for valid, middle in zip(has_area, middles, strict=True)),
             (inverse[0] * (b**n)[:, None, None]).reshape(-1, 4),
             0.5 / n,
             inverse[1].reshape(-1, 4),

@@ -24,7 +24,7 @@ from lake_schema.errors import BadInput
 from lake_schema.fits import external
 from lake_schema.store.provenance import file_sha256
 from lake_schema.tables.galaxies import DISK_SCALE_HEIGHT
-from truesky.numerics import sums
+from truesky.numerics import matrices
 from truesky.randomness import rng
 from truesky.render.sources import galaxy_shapes
 from truesky.render.sources.galaxy_shapes import EXPONENTIAL_RADIUS, Shapes
@@ -39,7 +39,7 @@ KIND, COLUMN = "library of galaxies", "stamp"
 _SIDE_BOUNDS, _BELOW, _COARSEST = (16, 1024), 0.01, 1.5
 # Rounds in which a Gaussian weight takes the shape of the light under it, until it changes by less, on pixels that are
 # joined to so many a side; and the slimmest that it may have.
-_ROUNDS, _SETTLED, _JOINED, _SLIMMEST = 60, 1e-5, 128, 0.05
+_ROUNDS, _TOLERANCE, _MAX_REBINNED_SIDE, _SLIMMEST = 60, 1e-5, 128, 0.05
 # Of the nearest in shape one is drawn; arcsec that a stamp is narrower than, so that the largest of the finest pixels
 # holds it.
 _NEAREST, _WIDEST = 8, 180.0
@@ -76,9 +76,9 @@ def read(file: Path, sha256: str) -> Library:
         if data.ndim != 3:
             raise BadInput(f"is an image of {data.ndim} axes, wanted three: columns, rows, stamps")
         if not all(_SIDE_BOUNDS[0] <= side <= _SIDE_BOUNDS[1] for side in data.shape[1:]):
-            wanted = f"{_SIDE_BOUNDS[0]} to {_SIDE_BOUNDS[1]}"
-            raise BadInput(f"its stamps are of {data.shape[2]} x {data.shape[1]} pixels, wanted {wanted}")
-        measured = np.array([_measured(number, stamp) for number, stamp in enumerate(data)])
+            limits = f"{_SIDE_BOUNDS[0]} to {_SIDE_BOUNDS[1]}"
+            raise BadInput(f"its stamps are of {data.shape[2]} x {data.shape[1]} pixels, wanted {limits}")
+        measured = np.array([_measure_stamp(number, stamp) for number, stamp in enumerate(data)])
     except BadInput as error:
         raise BadInput(f"{file}: {error}") from None
     for stamp in data:
@@ -87,7 +87,7 @@ def read(file: Path, sha256: str) -> Library:
     return Library(file, data.astype(np.float32), *measured.T)
 
 
-def _measured(number: int, stamp: Float) -> tuple[float, float, float, float]:
+def _measure_stamp(number: int, stamp: Float) -> tuple[float, float, float, float]:
     """(radius, ratio, angle, inner) of Library."""
     if not (np.abs(stamp) < _LARGEST).all():
         raise BadInput(f"stamp {number} holds values that are not numbers below {_LARGEST:g}")
@@ -115,13 +115,13 @@ def _places(light: Float) -> Float:
     return np.asarray(np.mgrid[: light.shape[0], : light.shape[1]] - 0.5 * (np.array(light.shape)[:, None, None] - 1))
 
 
-def _joined(light: Float) -> Float:
+def _rebin(light: Float) -> Float:
     """Pixels, some of them added up where there are many, about the same middle."""
-    some = max(min(light.shape) // _JOINED, 1)
-    cut = [(side % some) // 2 for side in light.shape]
-    rows, columns = (side // some for side in light.shape)
-    kept = light[cut[0] : cut[0] + rows * some, cut[1] : cut[1] + columns * some]
-    return np.asarray(kept.reshape(rows, some, columns, some).sum(axis=(1, 3)))
+    factor = max(min(light.shape) // _MAX_REBINNED_SIDE, 1)
+    cut = [(side % factor) // 2 for side in light.shape]
+    rows, columns = (side // factor for side in light.shape)
+    central = light[cut[0] : cut[0] + rows * factor, cut[1] : cut[1] + columns * factor]
+    return np.asarray(central.reshape(rows, factor, columns, factor).sum(axis=(1, 3)))
 
 
 def _ellipse(light: Float) -> tuple[float, float]:
@@ -129,11 +129,11 @@ def _ellipse(light: Float) -> tuple[float, float]:
 
     Ref : Bernstein & Jarvis 2002, AJ 123, 583 (adaptive moments)
     """
-    light = _joined(light)
+    light = _rebin(light)
     y, x = _places(light)
     xx, xy, yy = (0.05 * light.shape[1]) ** 2, 0.0, (0.05 * light.shape[0]) ** 2
     for _ in range(_ROUNDS):
-        before, area = (xx, xy, yy), xx * yy - xy**2
+        previous, area = (xx, xy, yy), xx * yy - xy**2
         weight = np.exp(-0.5 * (yy * x**2 - 2 * xy * x * y + xx * y**2) / area) * light
         total = weight.sum()
         if not total > 0.0:
@@ -142,7 +142,7 @@ def _ellipse(light: Float) -> tuple[float, float]:
         # A Gaussian that has shrunk to less than a pixel weighs nothing.
         xx, yy = max(xx, 0.5), max(yy, 0.5)
         xy = float(np.clip(xy, -0.99 * np.sqrt(xx * yy), 0.99 * np.sqrt(xx * yy)))
-        if max(abs(now - then) for now, then in zip((xx, xy, yy), before, strict=True)) < _SETTLED * (xx + yy):
+        if max(abs(now - then) for now, then in zip((xx, xy, yy), previous, strict=True)) < _TOLERANCE * (xx + yy):
             break
     mean, half = 0.5 * (xx + yy), float(np.hypot(0.5 * (xx - yy), xy))
     ratio = float(np.sqrt(max(mean - half, 0.0) / (mean + half)))
@@ -154,18 +154,18 @@ class GalaxyStamps:
     """What is drawn in place of profiles; wanted : of the request;  seed : of the request"""
 
     library: Library
-    wanted: Stamps
+    options: Stamps
     seed: int
 
 
-def of_file(wanted: Stamps, seed: int, sha256: str) -> GalaxyStamps:
+def from_file(options: Stamps, seed: int, sha256: str) -> GalaxyStamps:
     """The same of a file that has to be as it was; wanted, seed : of the request;  sha256 : of the file then."""
-    if file_sha256(wanted.file) != sha256:
-        raise BadInput(f"{wanted.file}: has changed since the rendering began")
-    return GalaxyStamps(read(wanted.file, sha256), wanted, seed)
+    if file_sha256(options.file) != sha256:
+        raise BadInput(f"{options.file}: has changed since the rendering began")
+    return GalaxyStamps(read(options.file, sha256), options, seed)
 
 
-def of_rows(galaxies: pa.Table, shape: Shapes, stamps: GalaxyStamps | None) -> tuple[Int, tuple[Picture, ...]]:
+def assign_pictures(galaxies: pa.Table, shape: Shapes, stamps: GalaxyStamps | None) -> tuple[Int, tuple[Picture, ...]]:
     """(number of its picture of each galaxy, -1 = it has none; the pictures).
 
     galaxies : rows of the table;  shape : theirs;  stamps : None: there are none
@@ -175,54 +175,65 @@ def of_rows(galaxies: pa.Table, shape: Shapes, stamps: GalaxyStamps | None) -> t
     if stamps is None or not len(galaxies):
         return number, ()
     ids, library = galaxies["id"].to_numpy().astype(np.int64), stamps.library
-    stamp = _named(galaxies, library)
-    if stamps.wanted.nearest:
-        own = shape.bulge_fraction * shape.bulge_radius + (1 - shape.bulge_fraction) * shape.disk_radius
-        free = np.flatnonzero((stamp < 0) & (own >= stamps.wanted.least_radius))
-        stamp[free] = _drawn(ids[free], shape.take(free), library, stamps.seed)
-    some = np.flatnonzero(stamp >= 0)
-    matrices = _matrices(shape.take(some), library, stamp[some])
-    found = [Picture(library.images[which], matrix) for which, matrix in zip(stamp[some], matrices, strict=True)]
-    fits = np.array([picture.diagonal < _WIDEST for picture in found], bool)
-    number[some[fits]] = np.arange(int(fits.sum()))
-    return number, tuple(picture for picture, fit in zip(found, fits, strict=True) if fit)
+    stamp = _stamps_in_rows(galaxies, library)
+    if stamps.options.nearest:
+        half_light_radius = shape.bulge_fraction * shape.bulge_radius + (1 - shape.bulge_fraction) * shape.disk_radius
+        free = np.flatnonzero((stamp < 0) & (half_light_radius >= stamps.options.least_radius))
+        stamp[free] = _draw_stamps(ids[free], shape.take(free), library, stamps.seed)
+    with_stamp = np.flatnonzero(stamp >= 0)
+    stamp_matrices = _matrices(shape.take(with_stamp), library, stamp[with_stamp])
+    pictures = [
+        Picture(library.images[stamp_number], matrix)
+        for stamp_number, matrix in zip(stamp[with_stamp], stamp_matrices, strict=True)
+    ]
+    fits = np.array([picture.diagonal < _WIDEST for picture in pictures], bool)
+    number[with_stamp[fits]] = np.arange(int(fits.sum()))
+    return number, tuple(picture for picture, fit in zip(pictures, fits, strict=True) if fit)
 
 
-def _named(galaxies: pa.Table, library: Library) -> Int:
+def _stamps_in_rows(galaxies: pa.Table, library: Library) -> Int:
     """int64[n] stamps that rows name, -1 = none."""
     if COLUMN not in galaxies.column_names:
         return np.full(len(galaxies), -1)
     named: Array = galaxies[COLUMN].fill_null(-1).to_numpy().astype(np.int64)
     if (bad := named >= len(library)).any():
-        one = int(bad.argmax())
-        which = f"galaxy {galaxies['id'][one].as_py()}: stamp {named[one]}"
-        raise BadInput(f"{which} is not one of the {len(library)} of {library.file}, counted from 0")
+        row = int(bad.argmax())
+        label = f"galaxy {galaxies['id'][row].as_py()}: stamp {named[row]}"
+        raise BadInput(f"{label} is not one of the {len(library)} of {library.file}, counted from 0")
     return named
 
 
-def _drawn(ids: Int, shape: Shapes, library: Library, seed: int) -> Int:
+def _draw_stamps(ids: Int, shape: Shapes, library: Library, seed: int) -> Int:
     """int64[n] stamps drawn among those nearest in axis ratio and concentration."""
     fraction = shape.bulge_fraction
     disk = np.hypot(np.cos(np.radians(shape.inclination)), DISK_SCALE_HEIGHT)
     ratio = fraction * shape.bulge_axis_ratio + (1 - fraction) * np.minimum(disk, 1.0)
-    inner = 1.0 - galaxy_shapes.outside(shape, 0.5 * galaxy_shapes.half_light(shape))
+    inner = 1.0 - galaxy_shapes.flux_outside(shape, 0.5 * galaxy_shapes.half_light(shape))
     count = min(_NEAREST, len(library))
     turn = (rng.uniforms(ids, 1, seed, "galaxy stamps")[0] * count).astype(np.int64)
     stamp = np.empty(len(ids), np.int64)
     for i in range(len(ids)):
-        apart = (library.ratio - ratio[i]) ** 2 + (library.inner - inner[i]) ** 2
-        stamp[i] = np.argsort(apart, kind="stable")[turn[i]]
+        distance = (library.ratio - ratio[i]) ** 2 + (library.inner - inner[i]) ** 2
+        stamp[i] = np.argsort(distance, kind="stable")[turn[i]]
     return stamp
 
 
 def _matrices(shape: Shapes, library: Library, stamp: Int) -> Float:
     """float64[n, 2, 2] of Picture, of stamps [n] on galaxies [n]."""
-    own = shape.bulge_fraction * shape.bulge_radius + (1 - shape.bulge_fraction) * shape.disk_radius
+    half_light_radius = shape.bulge_fraction * shape.bulge_radius + (1 - shape.bulge_fraction) * shape.disk_radius
     face_on = Shapes(
-        np.zeros(len(own)), own * EXPONENTIAL_RADIUS / library.radius[stamp], np.zeros(len(own)), shape.sersic_index,
-        shape.bulge_axis_ratio, np.zeros(len(own)), shape.beta, shape.g1, shape.g2, shape.magnification,
-    )  # fmt: skip
-    turned = galaxy_shapes.forms(face_on, np.broadcast_to(np.eye(2), (len(own), 2, 2))).disk
+        np.zeros(len(half_light_radius)),
+        half_light_radius * EXPONENTIAL_RADIUS / library.radius[stamp],
+        np.zeros(len(half_light_radius)),
+        shape.sersic_index,
+        shape.bulge_axis_ratio,
+        np.zeros(len(half_light_radius)),
+        shape.beta,
+        shape.g1,
+        shape.g2,
+        shape.magnification,
+    )
+    disk_matrices = galaxy_shapes.forms(face_on, np.broadcast_to(np.eye(2), (len(half_light_radius), 2, 2))).disk
     cosine, sine = np.cos(library.angle[stamp]), np.sin(library.angle[stamp])
     back = np.stack([np.stack([cosine, sine], -1), np.stack([-sine, cosine], -1)], -2)
-    return np.asarray(sums.product(turned, back))
+    return np.asarray(matrices.matmul(disk_matrices, back))

@@ -34,7 +34,7 @@ class Picture:
     thick: Float | None = None
 
     @classmethod
-    def of_sky(cls, image: Float32, scale: float) -> Picture:
+    def from_sky_image(cls, image: Float32, scale: float) -> Picture:
         """An image of sum 1, south to north and west to east; scale : arcsec."""
         return cls(image, np.array([[-scale, 0.0], [0.0, scale]]))
 
@@ -78,24 +78,24 @@ def arcs(rows: pa.Table, ids: Int, electrons: Float) -> Arcs:
 
     ids, electrons : [m] of galaxies, without the magnification of their own that fluxes hold
     """
-    wanted, order = rows["source_id"].to_numpy(), np.argsort(ids, kind="stable")
-    at = np.searchsorted(ids, wanted, sorter=order)
-    source = order[np.minimum(at, len(ids) - 1)] if len(ids) else np.zeros(len(wanted), np.int64)
-    for lens, of, i in zip(rows["id"].to_pylist(), wanted.tolist(), source.tolist(), strict=True):
-        if not len(ids) or ids[i] != of:
-            raise BadInput(f"strong lens {lens}: its source {of} is not among the galaxies")
+    source_ids, order = rows["source_id"].to_numpy(), np.argsort(ids, kind="stable")
+    at = np.searchsorted(ids, source_ids, sorter=order)
+    source = order[np.minimum(at, len(ids) - 1)] if len(ids) else np.zeros(len(source_ids), np.int64)
+    for lens, source_id, i in zip(rows["id"].to_pylist(), source_ids.tolist(), source.tolist(), strict=True):
+        if not len(ids) or ids[i] != source_id:
+            raise BadInput(f"strong lens {lens}: its source {source_id} is not among the galaxies")
     drawn = rows["stamp"].combine_chunks()
     pixels, ends = drawn.flatten().to_numpy(zero_copy_only=False), np.cumsum(drawn.value_lengths().to_numpy())
     lenses, sides = rows["id"].to_pylist(), rows["stamp_side"].to_pylist()
     stamps = np.split(pixels, ends[:-1]) if len(ends) else []
-    found = [_picture(*some) for some in zip(lenses, sides, stamps, strict=True)]
+    pictures = [_picture(*arguments) for arguments in zip(lenses, sides, stamps, strict=True)]
     return Arcs(
         rows["id"].to_numpy().astype(np.int64),
         rows["ra"].to_numpy(),
         rows["dec"].to_numpy(),
-        electrons[source] * np.array([total for _, total in found]),
+        electrons[source] * np.array([total for _, total in pictures]),
         source,
-        tuple(picture for picture, _ in found),
+        tuple(picture for picture, _ in pictures),
     )
 
 
@@ -104,4 +104,4 @@ def _picture(lens: int, side: int, pixels: Array) -> tuple[Picture, float]:
     total = float(pixels.sum(dtype=float))
     if len(pixels) != side**2 or not total > 0.0 or not np.isfinite(total):
         raise BadInput(f"strong lens {lens}: its stamp of side {side} has {len(pixels)} pixels of sum {total:g}")
-    return Picture.of_sky((pixels / total).reshape(side, side).astype(np.float32), ARC_SCALE), total
+    return Picture.from_sky_image((pixels / total).reshape(side, side).astype(np.float32), ARC_SCALE), total

@@ -30,7 +30,7 @@ _ROUNDING = 1e-9
 _STEP = 1.0
 
 
-def needed(task: Mapping[str, Any], deflection: float) -> list[int]:
+def cells_of_task(task: Mapping[str, Any], deflection: float) -> list[int]:
     """Order-8 cells of every source that is seen within a task's circle.
 
     task : ra, dec, radius of the table `tasks`;  deflection : largest of the catalogue, deg
@@ -38,12 +38,14 @@ def needed(task: Mapping[str, Any], deflection: float) -> list[int]:
     return _cells(task, deflection)
 
 
-def within(task: Mapping[str, Any], deflection: float, reach: float) -> list[int]:
+def cells_within_reach(task: Mapping[str, Any], deflection: float, reach: float) -> list[int]:
     """Order-8 cells of every source whose light may be on the detector; reach : stamps.reach, arcsec."""
     return _cells(task, deflection + reach / 3600.0)
 
 
-def beyond(task: Mapping[str, Any], deflection: float, farther: float, drawn: Set[int]) -> tuple[list[int], float]:
+def cells_beyond_task(
+    task: Mapping[str, Any], deflection: float, reach_arcsec: float, catalogue_cells: Set[int]
+) -> tuple[list[int], float]:
     """(the catalogue's order-8 cells outside the needed ones, how far it is complete), as far as sources shine.
 
     farther : how far beyond the task's circle a source may be seen and reach the detector, arcsec
@@ -52,16 +54,16 @@ def beyond(task: Mapping[str, Any], deflection: float, farther: float, drawn: Se
     returns : the second in arcsec beyond the task's circle, at most `farther`, rounded down to 1"
     """
     inner = set(_cells(task, deflection))
-    wanted = set(_cells(task, deflection + farther / 3600.0))
-    if wanted <= drawn:
-        return sorted(wanted - inner), farther
-    steps = np.arange(0.0, farther, _STEP)
+    cells = set(_cells(task, deflection + reach_arcsec / 3600.0))
+    if cells <= catalogue_cells:
+        return sorted(cells - inner), reach_arcsec
+    steps = np.arange(0.0, reach_arcsec, _STEP)
     low, high = 0, len(steps)
     while high - low > 1:
         middle = (low + high) // 2
-        has = set(_cells(task, deflection + steps[middle] / 3600.0)) <= drawn
+        has = set(_cells(task, deflection + steps[middle] / 3600.0)) <= catalogue_cells
         low, high = (middle, high) if has else (low, middle)
-    return sorted((wanted - inner) & drawn), float(steps[low]) if len(steps) else 0.0
+    return sorted((cells - inner) & catalogue_cells), float(steps[low]) if len(steps) else 0.0
 
 
 def _cells(task: Mapping[str, Any], wider: float) -> list[int]:
@@ -74,7 +76,7 @@ def _in_circle(ra: float, dec: float, radius: float) -> tuple[int, ...]:
     return tuple(sky.cells_in_cone(ra, dec, min(radius, 180.0), GENERATION_ORDER).tolist())
 
 
-def near(ra: Float, dec: Float, centre: tuple[float, float], radius: float | Float) -> Bool:
+def within_radius(ra: Float, dec: Float, centre: tuple[float, float], radius: float | Float) -> Bool:
     """[n] True within `radius` deg of a centre; a gnomonic projection is then safe.
 
     ra, dec : float64[n] deg;  centre : ra, dec deg
@@ -82,7 +84,7 @@ def near(ra: Float, dec: Float, centre: tuple[float, float], radius: float | Flo
     return np.asarray(sky.separation(ra, dec, centre[0], centre[1]) <= radius)
 
 
-def touching(column: Float, row: Float, sizes: Int | Float, nx: int, ny: int) -> Bool:
+def overlaps_frame(column: Float, row: Float, sizes: Int | Float, nx: int, ny: int) -> Bool:
     """[n] True where a stamp of `sizes` pixels about (column, row) overlaps a frame of nx x ny pixels."""
     half = sizes / 2 + 1
     across = (column + half > 0) & (column - half < nx - 1)

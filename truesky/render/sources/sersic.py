@@ -16,7 +16,7 @@ from scipy.special import gammainccinv, gammaln
 
 from lake_schema.arrays import Float, Float32, Int
 from truesky.numerics import cache
-from truesky.numerics.code_keys import code_key
+from truesky.numerics.code_fingerprints import code_key
 
 # galsim.Sersic, the reference, accepts these.
 INDEX_LO, INDEX_HI = 0.3, 6.2
@@ -40,10 +40,10 @@ def table() -> Float32:
     Ref   : Hamilton 2000 (logarithmic Hankel transform)
     """
     key = cache.content_key(code_key(__name__))
-    return cache.cached_arrays("sersic", key, lambda: {"transform": _make()})["transform"]
+    return cache.cached_arrays("sersic", key, lambda: {"transform": _make_table()})["transform"]
 
 
-def row_of(index: Float) -> tuple[Int, Float]:
+def interpolation_weights(index: Float) -> tuple[Int, Float]:
     """Where indices lie: the first of four rows [n], and the four weights [n, 4] of cubic interpolation in ln n."""
     position = (np.log(np.clip(index, INDEX_LO, INDEX_HI)) - _LOG_LO) / _LOG_STEP
     first = np.clip(np.floor(position).astype(np.int64) - 1, 0, ROWS - 4)
@@ -63,7 +63,7 @@ def nodes() -> Float:
     return bits.astype(np.int32).view(np.float32).astype(float)
 
 
-def _make() -> Float32:
+def _make_table() -> Float32:
     log_k = 0.5 * np.log(nodes())
     rows = np.stack([transform(np.exp(_LOG_LO + i * _LOG_STEP), log_k) for i in range(ROWS)])
     rows[:, 0] = 1.0

@@ -27,7 +27,7 @@ from truesky.fluxes.passbands import Passband
 from truesky.randomness import rng
 from truesky.render.camera import astrometry, pointing
 from truesky.render.channels.aim import Aim
-from truesky.render.sky.diffuse_light import solar
+from truesky.render.sky.diffuse_light import solar_irradiance
 from truesky.render.sources import colours
 from truesky.render.sources.galaxy_shapes import Shapes
 from truesky.render.sources.source_list import Sources
@@ -59,23 +59,25 @@ class Population:
     mag: Float
     hour: float | Float = 0.0
 
-    def after(self, hours: float | Float) -> tuple[Float, Float]:
+    def positions_after(self, hours: float | Float) -> tuple[Float, Float]:
         """ra, dec [n] deg so many hours after noon."""
         across = np.maximum(np.cos(np.radians(self.lat)), _LEAST_COSINE)
-        since = (hours - self.hour) / 3600.0
-        return equatorial(self.lon + self.east * since / across, np.clip(self.lat + self.north * since, -90.0, 90.0))
+        elapsed = (hours - self.hour) / 3600.0
+        return equatorial(
+            self.lon + self.east * elapsed / across, np.clip(self.lat + self.north * elapsed, -90.0, 90.0)
+        )
 
-    def take(self, some: Bool | Int) -> Population:
+    def take(self, selected: Bool | Int) -> Population:
         """Some of the bodies."""
         return Population(
-            *(np.broadcast_to(getattr(self, field.name), self.ids.shape)[some] for field in fields(Population))
+            *(np.broadcast_to(getattr(self, field.name), self.ids.shape)[selected] for field in fields(Population))
         )
 
 
-def nobody(day: int) -> Population:
+def empty_population(day: int) -> Population:
     """The bodies of a day on which there are none."""
-    none = np.zeros(0)
-    return Population(np.zeros(0, np.int64), none, none, none, none, none)
+    empty = np.zeros(0)
+    return Population(np.zeros(0, np.int64), empty, empty, empty, empty, empty)
 
 
 def population(
@@ -89,12 +91,12 @@ def population(
     # Away from where it is at noon.
     reach = min(radius + hours * fastest / 3600.0, 180.0)
     # A database without a faintest magnitude is of a sky without them.
-    some = f"{_KEY}.faintest" in mission and mission.value(f"{_KEY}.density") > 0.0
-    cells = sky.cells_in_cone(ra, dec, reach, FILE_ORDER).tolist() if some else []
-    parts = [_of_cell(cell, day, mission, seed) for cell in cells]
+    has_bodies = f"{_KEY}.faintest" in mission and mission.value(f"{_KEY}.density") > 0.0
+    cells = sky.cells_in_cone(ra, dec, reach, FILE_ORDER).tolist() if has_bodies else []
+    parts = [_draw_cell(cell, day, mission, seed) for cell in cells]
     if not parts:
-        none = np.zeros(0)
-        return Population(np.zeros(0, np.int64), none, none, none, none, none)
+        empty = np.zeros(0)
+        return Population(np.zeros(0, np.int64), empty, empty, empty, empty, empty)
     return Population(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
@@ -111,17 +113,17 @@ def _slope(mission: MissionConfiguration) -> float:
     return mission.value(f"{_KEY}.counts_slope", "dex / mag")
 
 
-def _of_cell(cell: int, day: int, mission: MissionConfiguration, seed: int) -> tuple[Any, ...]:
+def _draw_cell(cell: int, day: int, mission: MissionConfiguration, seed: int) -> tuple[Any, ...]:
     """ids and columns of Population of an order-5 cell."""
-    own = rng.stream(seed, "solar_system", day, cell)
+    generator = rng.stream(seed, "solar_system", day, cell)
     centre = ecliptic(*sky.cell_centre(FILE_ORDER, cell))[1]
-    most = float(density(max(abs(float(centre)) - sky.cell_radius(FILE_ORDER), 0.0), mission))
-    count = int(own.poisson(most * sky.cell_area(FILE_ORDER)))
-    _, ra, dec = sky.random_in_cell(FILE_ORDER, cell, count, own)
+    max_density = float(density(max(abs(float(centre)) - sky.cell_radius(FILE_ORDER), 0.0), mission))
+    count = int(generator.poisson(max_density * sky.cell_area(FILE_ORDER)))
+    _, ra, dec = sky.random_in_cell(FILE_ORDER, cell, count, generator)
     lon, lat = ecliptic(ra, dec)
-    chosen, brightness, fast, pace, angle = own.random((5, count))
-    here = np.flatnonzero(chosen * most < density(lat, mission))
-    lon, lat, brightness, fast, pace, angle = (x[here] for x in (lon, lat, brightness, fast, pace, angle))
+    chosen, brightness, fast, pace, angle = generator.random((5, count))
+    accepted = np.flatnonzero(chosen * max_density < density(lat, mission))
+    lon, lat, brightness, fast, pace, angle = (x[accepted] for x in (lon, lat, brightness, fast, pace, angle))
     slow, usual, fastest = (
         mission.value(f"{_KEY}.{key}", "arcsec / h") for key in ("rate_min", "rate_max", "fast_rate_max")
     )
@@ -132,17 +134,17 @@ def _of_cell(cell: int, day: int, mission: MissionConfiguration, seed: int) -> t
     # 1 - u lies in (0, 1].
     mag = mission.value(f"{_KEY}.faintest", "mag") + np.log10(1.0 - brightness) / _slope(mission)
     sub_cells = 4 ** (GENERATION_ORDER - FILE_ORDER)
-    ids = source_id(KIND, cell * sub_cells, np.arange(len(here)), day)
+    ids = source_id(KIND, cell * sub_cells, np.arange(len(accepted)), day)
     return ids, lon, lat, rate * np.cos(turn), rate * np.sin(turn), mag
 
 
-def sources(
+def trailed_sources(
     aim: Aim,
     mission: MissionConfiguration,
     seed: int,
     reach: float,
     shapes: Shapes,
-    own: Callable[[int], Population] | None = None,
+    day_population: Callable[[int], Population] | None = None,
 ) -> Sources:
     """Bodies whose trail comes within `reach` deg of a detector's centre, ascending id.
 
@@ -156,31 +158,36 @@ def sources(
     centre = astrometry.centre(aim.detector, system)
     # An exposure belongs to the day that it begins on.
     day = int(np.floor(start))
-    since = 24.0 * (start - day - 0.5)
-    until = max(12.0, since + seconds / _HOUR_S)
-    found = own(day) if own else population(*centre, reach, day, mission, seed, until)
-    near, first, last = _passing(found.after(since), found.after(since + seconds / _HOUR_S), centre, reach)
-    order = np.argsort(found.ids[near])
-    near, first, last = near[order], first[order], last[order]
-    some = found.take(near)
+    start_hours = 24.0 * (start - day - 0.5)
+    end_hours = max(12.0, start_hours + seconds / _HOUR_S)
+    candidates = day_population(day) if day_population else population(*centre, reach, day, mission, seed, end_hours)
+    indices, first, last = _bodies_in_reach(
+        candidates.positions_after(start_hours),
+        candidates.positions_after(start_hours + seconds / _HOUR_S),
+        centre,
+        reach,
+    )
+    order = np.argsort(candidates.ids[indices])
+    indices, first, last = indices[order], first[order], last[order]
+    bodies = candidates.take(indices)
     begin, middle, end = (
-        astrometry.pixel_of_sky(system, *some.after(since + part * seconds / _HOUR_S))
+        astrometry.pixel_of_sky(system, *bodies.positions_after(start_hours + part * seconds / _HOUR_S))
         for part in (first, 0.5 * (first + last), last)
     )
-    photons = colours.of_spectrum(band, solar(band.wavelength / 10.0, mission))
+    photons = colours.spectrum_fractions(band, solar_irradiance(band.wavelength / 10.0, mission))
     return Sources(
-        some.ids,
+        bodies.ids,
         *middle,
         astrometry.jacobian(system, *middle),
-        aim.electrons * flux(some.mag, band, mission) * (last - first),
-        np.full(len(near), -1),
+        aim.electrons_per_microjansky * flux(bodies.mag, band, mission) * (last - first),
+        np.full(len(indices), -1),
         shapes,
-        np.tile(photons, (len(near), 1)),
+        np.tile(photons, (len(indices), 1)),
         trail=np.stack(end, axis=1) - np.stack(begin, axis=1),
     )
 
 
-def _passing(
+def _bodies_in_reach(
     begin: tuple[Float, Float], end: tuple[Float, Float], centre: tuple[float, float], reach: float
 ) -> tuple[Int, Float, Float]:
     """(bodies that come within `reach` deg of a centre on their way, parts of it from which to which they are kept)."""
@@ -189,20 +196,20 @@ def _passing(
     length = np.sqrt(np.sum(way**2, axis=0))
     nearest = np.sum((there - start) * way, axis=0) / np.maximum(length, 1e-30) ** 2
     place = start + np.clip(nearest, 0.0, 1.0) * way
-    away = np.sqrt(np.sum((place / np.sqrt(np.sum(place**2, axis=0)) - there) ** 2, axis=0))
+    distance = np.sqrt(np.sum((place / np.sqrt(np.sum(place**2, axis=0)) - there) ** 2, axis=0))
     radius = 2.0 * np.sin(0.5 * np.radians(min(reach, 180.0)))
-    near = np.flatnonzero(away <= radius)
-    length, nearest, away = length[near], nearest[near], away[near]
+    indices = np.flatnonzero(distance <= radius)
+    length, nearest, distance = length[indices], nearest[indices], distance[indices]
     half = np.where(length > 2.0 * radius, radius / np.maximum(length, 1e-30), np.inf)
-    return near, np.maximum(nearest - half, 0.0), np.minimum(nearest + half, 1.0)
+    return indices, np.maximum(nearest - half, 0.0), np.minimum(nearest + half, 1.0)
 
 
 def flux(mag: Float, band: Passband, mission: MissionConfiguration) -> Float:
     """f_nu [n] in a band, microjansky, of bodies of a magnitude in I_E."""
-    own, reference = (_sun(b, mission) for b in (band, passbands.load(_BAND)))
-    return np.asarray(10.0 ** (0.4 * (units.AB_UJY - mag)) * own / reference)
+    band_flux, reference_flux = (_sun_flux(b, mission) for b in (band, passbands.load(_BAND)))
+    return np.asarray(10.0 ** (0.4 * (units.AB_UJY - mag)) * band_flux / reference_flux)
 
 
-def _sun(band: Passband, mission: MissionConfiguration) -> float:
+def _sun_flux(band: Passband, mission: MissionConfiguration) -> float:
     wavelength = band.wavelength / 10.0
-    return float(passbands.ab_flux(band, band.wavelength, solar(wavelength, mission)))
+    return float(passbands.ab_flux(band, band.wavelength, solar_irradiance(wavelength, mission)))

@@ -68,20 +68,20 @@ class Sources:
     def with_moving(self, moving: Sources) -> Sources:
         """These, at rest, and points that move, of later identifiers and the same shapes."""
         names = ("ids", "column", "row", "jacobian", "electrons", "shape")
-        both: dict[str, Any] = {n: np.concatenate([getattr(self, n), getattr(moving, n)]) for n in names}
+        columns: dict[str, Any] = {n: np.concatenate([getattr(self, n), getattr(moving, n)]) for n in names}
         photons = None if self.photons is None else np.concatenate([self.photons, moving.photons])
         picture = None if self.picture is None else np.concatenate([self.picture, np.full(len(moving), -1)])
         trail = np.concatenate([np.zeros((len(self), 2)), moving.trail])
         return Sources(
-            **both, shapes=self.shapes, photons=photons, picture=picture, pictures=self.pictures, trail=trail
+            **columns, shapes=self.shapes, photons=photons, picture=picture, pictures=self.pictures, trail=trail
         )
 
     @property
-    def structured(self) -> Bool:
+    def has_structure(self) -> Bool:
         """[n] True of galaxies whose disc has a structure of its own."""
         return np.zeros(len(self), bool) if self.picture is None else (self.shape >= 0) & (self.picture >= 0)
 
     @property
-    def length(self) -> Float:
+    def trail_length(self) -> Float:
         """Of the trails, pixels."""
         return np.zeros(len(self)) if self.trail is None else np.hypot(*self.trail.T)

@@ -11,19 +11,19 @@ import numpy as np
 import pyarrow as pa
 
 from lake_schema.arrays import Float, Float32, Int
-from truesky.fluxes import high_redshift, stretches
+from truesky.fluxes import high_redshift, wavelength_windows
 from truesky.fluxes.libraries import templates
 from truesky.fluxes.libraries.templates import Library
 from truesky.fluxes.passbands import Passband
-from truesky.fluxes.sources import GALAXY_KINDS, galaxies_of, stars_of
-from truesky.numerics import sums
+from truesky.fluxes.sources import GALAXY_KINDS, galaxies_from_table, stars_from_table
+from truesky.numerics import matrices
 from truesky.render.sources import colours
 
 Spectra = Callable[[Int], Float32]
 
 
-def of_rows(
-    which: Int, galaxies: pa.Table, stars: pa.Table, band: Passband, sun: Float,
+def spectrum_function(
+    spectrum_rows: Int, galaxies: pa.Table, stars: pa.Table, band: Passband, sun: Float,
     libraries: tuple[Library | None, Library | None] = (None, None),
 ) -> Spectra:  # fmt: skip
     """(numbers of sources [k]) -> float32[k, w] f_lambda of each over the band, of which it detects one photon.
@@ -37,19 +37,19 @@ def of_rows(
     count, weights = len(band.wavelength), band.response * band.wavelength
     of_galaxy, of_star = _galaxies(galaxies, band, libraries[0]), _stars(stars, band, libraries[1])
 
-    def of(some: Int) -> Float32:
-        rows, out = which[some], np.empty((len(some), count), np.float32)
+    def spectra_of_sources(numbers: Int) -> Float32:
+        rows, out = spectrum_rows[numbers], np.empty((len(numbers), count), np.float32)
         galaxy, star = (rows >= 0) & (rows < len(galaxies)), rows >= len(galaxies)
         if galaxy.any():
             out[galaxy] = of_galaxy(rows[galaxy])
         if star.any():
             out[star] = of_star(rows[star] - len(galaxies))
         out[rows < 0] = sun
-        detected = sums.product(out, weights)
-        out *= np.divide(1.0, detected, out=np.zeros(len(some)), where=detected > 0.0).astype(np.float32)[:, None]
+        detected = matrices.matmul(out, weights)
+        out *= np.divide(1.0, detected, out=np.zeros(len(numbers)), where=detected > 0.0).astype(np.float32)[:, None]
         return out
 
-    return of
+    return spectra_of_sources
 
 
 def _flat(band: Passband) -> Spectra:
@@ -61,25 +61,31 @@ def _galaxies(rows: pa.Table, band: Passband, library: Library | None) -> Spectr
     if not len(rows) or not set(colours.GALAXY_COLUMNS) <= set(rows.column_names):
         return _flat(band)
     first, count, library = int(band.wavelength[0]), len(band.wavelength), library or templates.galaxy_library()
-    kinds = rows["kind"].to_numpy() if "kind" in rows.column_names else np.full(len(rows), GALAXY_KINDS[0])
-    usual = np.isin(kinds, GALAXY_KINDS)
-    found, row = galaxies_of(rows.filter(pa.array(usual)), library), np.cumsum(usual) - 1
+    galaxy_kinds = rows["kind"].to_numpy() if "kind" in rows.column_names else np.full(len(rows), GALAXY_KINDS[0])
+    in_library = np.isin(galaxy_kinds, GALAXY_KINDS)
+    parameters, row = galaxies_from_table(rows.filter(pa.array(in_library)), library), np.cumsum(in_library) - 1
 
-    def of(some: Int) -> Float32:
-        out = np.empty((len(some), count), np.float32)
-        own = usual[some]
-        if own.any():
-            out[own] = stretches.galaxies(found.rows(row[some[own]]), first, count, library)
-        if not own.all():
-            out[~own] = high_redshift.spectra(rows.take(some[~own]))[:, band.first : band.first + count]
+    def spectra_of_rows(numbers: Int) -> Float32:
+        out = np.empty((len(numbers), count), np.float32)
+        from_library = in_library[numbers]
+        if from_library.any():
+            out[from_library] = wavelength_windows.galaxy_spectra(
+                parameters.select(row[numbers[from_library]]), first, count, library
+            )
+        if not from_library.all():
+            out[~from_library] = high_redshift.spectra(rows.take(numbers[~from_library]))[
+                :, band.first : band.first + count
+            ]
         return out
 
-    return of
+    return spectra_of_rows
 
 
 def _stars(rows: pa.Table, band: Passband, library: Library | None) -> Spectra:
-    if not len(rows) or not set(colours.OF_ONE_TEMPLATE) <= set(rows.column_names):
+    if not len(rows) or not set(colours.ONE_TEMPLATE_COLUMNS) <= set(rows.column_names):
         return _flat(band)
     library = library or templates.stellar_library()
-    found = stars_of(rows, library)
-    return lambda some: stretches.stars(found.rows(some), int(band.wavelength[0]), len(band.wavelength), library)
+    parameters = stars_from_table(rows, library)
+    return lambda some: wavelength_windows.star_spectra(
+        parameters.select(some), int(band.wavelength[0]), len(band.wavelength), library
+    )

@@ -51,39 +51,48 @@ class Census:
     halos: Mapping[str, Array]
     halo_block: Int
 
-    def per_deg2(self, kept: Bool) -> Float:
+    def per_deg2(self, selected: Bool) -> Float:
         """Galaxies[block] deg-2."""
-        return np.asarray(np.bincount(self.block[kept], minlength=self.blocks) * (self.blocks / self.area))
+        return np.asarray(np.bincount(self.block[selected], minlength=self.blocks) * (self.blocks / self.area))
 
 
 def blocks(count: int, side_order: int) -> list[list[int]]:
     """Nested blocks of 4^side_order generation cells, spread over the sky."""
-    many, inside = 12 << 2 * (GENERATION_ORDER - side_order), 1 << 2 * side_order
-    first = ((np.arange(count) + 0.31) * many / count).astype(int)
+    n_blocks, inside = 12 << 2 * (GENERATION_ORDER - side_order), 1 << 2 * side_order
+    first = ((np.arange(count) + 0.31) * n_blocks / count).astype(int)
     return [[int(block) * inside + i for i in range(inside)] for block in first]
 
 
 def draw(universe: GalaxyModel, dust: Float32, places: Sequence[Sequence[int]]) -> Census:
     """What the catalogue holds in the blocks."""
-    drawn, library = population.Cells(universe.population), templates.galaxy_library()
+    halo_cells, library = population.CellCache(universe.population), templates.galaxy_library()
     rows, hosts, mags = [], [], []
     for place in places:
-        found = pa.concat_tables([galaxies.draw(cell, universe, drawn, dust).select(COLUMNS) for cell in place])
-        found = found.filter(pa.array(found["kind"].to_numpy() < 2))
-        rows.append({name: found[name].to_numpy() for name in COLUMNS})
+        galaxy_table = pa.concat_tables(
+            [galaxies.draw(cell, universe, halo_cells, dust).select(COLUMNS) for cell in place]
+        )
+        galaxy_table = galaxy_table.filter(pa.array(galaxy_table["kind"].to_numpy() < 2))
+        rows.append({name: galaxy_table[name].to_numpy() for name in COLUMNS})
         mags.append(magnitudes(rows[-1], library, matching.Z_LAST))
-        table = pa.concat_tables([galaxies.halo_table(cell, universe.population, drawn) for cell in place])
+        table = pa.concat_tables([galaxies.halo_table(cell, universe.population, halo_cells) for cell in place])
         hosts.append({name: table[name].to_numpy() for name in HALO_COLUMNS})
 
-    def together(parts: Sequence[Mapping[str, Array]]) -> Mapping[str, Array]:
+    def concatenate(parts: Sequence[Mapping[str, Array]]) -> Mapping[str, Array]:
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
-    def which(parts: Sequence[Mapping[str, Array]]) -> Int:
+    def block_numbers(parts: Sequence[Mapping[str, Array]]) -> Int:
         return np.repeat(np.arange(len(parts)), [part["z_true"].size for part in parts])
 
     area = sum(len(place) for place in places) * AREA
     return Census(
-        len(places), area, universe.limit, together(rows), which(rows), together(mags), together(hosts), which(hosts)
+        len(places),
+        area,
+        universe.limit,
+        concatenate(rows),
+        block_numbers(rows),
+        concatenate(mags),
+        concatenate(hosts),
+        block_numbers(hosts),
     )
 
 
@@ -103,9 +112,9 @@ def _mean(values: Float) -> tuple[float, float]:
     return float(values.mean()), float(values.std(ddof=1) / np.sqrt(values.size))
 
 
-def _with_errors(found: dict[str, Float]) -> dict[str, float]:
+def _with_errors(per_block: dict[str, Float]) -> dict[str, float]:
     figures: dict[str, float] = {}
-    for name, values in found.items():
+    for name, values in per_block.items():
         figures[name], figures[f"{name}_error"] = _mean(values)
     return figures
 
@@ -113,10 +122,10 @@ def _with_errors(found: dict[str, Float]) -> dict[str, float]:
 def counts(census: Census) -> dict[str, float]:
     """Galaxies per arcmin2, their slope, and how many are satellites."""
     vis = census.mags["euclid_vis"]
-    found = {"vis_26": census.per_deg2(vis < 26.0) / ARCMIN2}
+    per_block = {"vis_26": census.per_deg2(vis < 26.0) / ARCMIN2}
     bright = vis < 24.5
     number = [np.sum(np.abs(vis - at) < 0.5) for at in (20, 21, 22, 23)]
-    return _with_errors(found) | {
+    return _with_errors(per_block) | {
         "vis_slope_20_23": float(np.mean(np.diff(np.log10(number)))),
         "satellites_24.5": float(np.mean(census.rows["kind"][bright])),
     }
@@ -136,14 +145,14 @@ def colours(census: Census) -> dict[str, float]:
     }
 
 
-def half_light(rows: Mapping[str, Array], part: Int) -> Float:
+def half_light_of_rows(rows: Mapping[str, Array], part: Int) -> Float:
     """Half-light radius[n] of both components together, arcsec, by bisection."""
     names = ("bulge_half_light_radius", "disk_half_light_radius", "bulge_fraction", "bulge_sersic_index")
     bulge, disc, fraction, sersic = (rows[name][part].astype(float) for name in names)
-    return bisected(bulge, disc, fraction, sersic)
+    return half_light_radius(bulge, disc, fraction, sersic)
 
 
-def bisected(bulge: Float, disc: Float, fraction: Float, sersic: Float) -> Float:
+def half_light_radius(bulge: Float, disc: Float, fraction: Float, sersic: Float) -> Float:
     """Half-light radius[n] of a bulge and an exponential disc together, arcsec, by bisection.
 
     bulge, disc : float[n] half-light radii of the components, arcsec
@@ -163,8 +172,8 @@ def sizes(census: Census) -> dict[str, float]:
     vis, figures = census.mags["euclid_vis"], {}
     for bright, faint in SIZE_BINS:
         inside = np.flatnonzero((vis >= bright) & (vis < faint))
-        some = inside[:: max(inside.size // _SIZED, 1)]
-        figures[f"size_{bright}_{faint}"] = float(np.median(half_light(census.rows, some)))
+        sample = inside[:: max(inside.size // _SIZED, 1)]
+        figures[f"size_{bright}_{faint}"] = float(np.median(half_light_of_rows(census.rows, sample)))
     sersic = census.rows["bulge_sersic_index"]
     figures |= {"sersic_least": float(sersic.min()), "sersic_most": float(sersic.max())}
     rng, n, shapes = np.random.default_rng(3), _SIZED, morphology.shapes()
@@ -172,8 +181,8 @@ def sizes(census: Census) -> dict[str, float]:
     fraction, radius = rng.random(n), np.exp(rng.uniform(np.log(0.01), np.log(10.0), n))
     red = rng.random(n) < 0.3
     index, ratio = morphology.sersic_index(bulge, red, rng), morphology.radius_ratio(bulge, red, rng)
-    both = morphology.component_radii(shapes, radius, fraction, ratio, index)
-    figures["half_light_worst"] = float(np.abs(bisected(*both, fraction, index) / radius - 1.0).max())
+    radii = morphology.component_radii(shapes, radius, fraction, ratio, index)
+    figures["half_light_worst"] = float(np.abs(half_light_radius(*radii, fraction, index) / radius - 1.0).max())
     return figures
 
 
@@ -181,29 +190,29 @@ def halpha(census: Census) -> dict[str, float]:
     """H alpha emitters / the published numbers, with Poisson's error."""
     z, flux = census.rows["z_true"], census.rows["flux_halpha"]
     figures = {}
-    for near, far in HALPHA_SHELLS:
+    for z_min, z_max in HALPHA_SHELLS:
         for limit in HALPHA_LIMITS:
-            expected = float(emission_lines.expected_counts(np.array([limit]), near, far)[0]) * census.area
-            found = float(np.sum((z > near) & (z < far) & (flux > limit)))
-            name = f"halpha_{limit:g}_{near}_{far}"
-            figures[name], figures[f"{name}_error"] = found / expected, np.sqrt(found) / expected
+            expected = float(emission_lines.expected_counts(np.array([limit]), z_min, z_max)[0]) * census.area
+            n_emitters = float(np.sum((z > z_min) & (z < z_max) & (flux > limit)))
+            name = f"halpha_{limit:g}_{z_min}_{z_max}"
+            figures[name], figures[f"{name}_error"] = n_emitters / expected, np.sqrt(n_emitters) / expected
     return figures
 
 
-def luminosities(census: Census, law: luminosity_function.Schechter, near: float, far: float) -> dict[str, float]:
+def luminosities(census: Census, law: luminosity_function.Schechter, z_min: float, z_max: float) -> dict[str, float]:
     """Galaxies / those of the luminosity function, where all spectra beat the limit; shells between near and far.
 
     census : what was drawn;  law : the luminosity function;  near, far : redshifts
     """
     z, m = census.rows["z_true"], census.rows["abs_mag_r01"]
-    found = {}
+    ratios = {}
     for at, half, reddest in SHELLS:
-        if not near < at < far:
+        if not z_min < at < z_max:
             continue
         faintest = min(census.limit - float(cosmology.distance_modulus(at + half)) - reddest, -16.0)
         number = per_deg2(lambda shell, m=faintest: luminosity_function.number_density(law, m, shell), at, half)  # type: ignore[misc]
-        found[f"luminosity_function_z{at}"] = census.per_deg2((np.abs(z - at) < half) & (m < faintest)) / number
-    return _with_errors(found)
+        ratios[f"luminosity_function_z{at}"] = census.per_deg2((np.abs(z - at) < half) & (m < faintest)) / number
+    return _with_errors(ratios)
 
 
 def per_deg2(density: Callable[[Float], Float], at: float, half: float) -> float:
@@ -217,14 +226,14 @@ def per_deg2(density: Callable[[Float], Float], at: float, half: float) -> float
 def halos(census: Census, published: Callable[[float, float], float]) -> dict[str, float]:
     """Halos above a mass / the published number density(mass, z), in thin shells."""
     z, mass = census.halos["z_true"], census.halos["log_mass"]
-    found = {}
+    ratios = {}
     for at, half in HALO_SHELLS:
         volume = float(cosmology.comoving_volume(at - half, at + half)) * np.radians(1.0) ** 2
-        for least in HALO_MASSES:
-            kept = (np.abs(z - at) < half) & (mass > least)
-            each = np.bincount(census.halo_block[kept], minlength=census.blocks) * (census.blocks / census.area)
-            found[f"halos_{least:g}_z{at}"] = each / (volume * published(least, at))
-    return _with_errors(found)
+        for min_log_mass in HALO_MASSES:
+            selected = (np.abs(z - at) < half) & (mass > min_log_mass)
+            each = np.bincount(census.halo_block[selected], minlength=census.blocks) * (census.blocks / census.area)
+            ratios[f"halos_{min_log_mass:g}_z{at}"] = each / (volume * published(min_log_mass, at))
+    return _with_errors(ratios)
 
 
 def redshifts(census: Census) -> tuple[Float, Float]:

@@ -38,7 +38,7 @@ _SPARSE = 16
 # Nodes of separations: of the pairs of a bin, and of w where it is summed.
 _NODES, _THETAS = 2000, 300
 # Shells in which the redshift distribution and the bias are taken, Mpc/h, and multipoles.
-_SHELL, _ELL_MOST = 80.0, 20_000
+_SHELL, _ELL_MAX = 80.0, 20_000
 # Cells a side that the power of the Gaussian field is tabulated on.
 _MODES = 128
 
@@ -50,24 +50,24 @@ class Tracers:
     ra: Float
     dec: Float
     chi: Float
-    x: Float
+    bias_growth: Float
     satellite: Bool
     log_mass: Float
     proxy: Float
     velocity: Float
 
-    def part(self, keep: npt.NDArray[np.generic]) -> Tracers:
-        return Tracers(*(getattr(self, name)[keep] for name in self.__slots__))
+    def select(self, mask: npt.NDArray[np.generic]) -> Tracers:
+        return Tracers(*(getattr(self, name)[mask] for name in self.__slots__))
 
 
-def joined(parts: Sequence[Tracers]) -> Tracers:
+def concatenate(parts: Sequence[Tracers]) -> Tracers:
     return Tracers(*(np.concatenate([getattr(part, name) for part in parts]) for name in Tracers.__slots__))
 
 
 # ------------------------------------------------------------------------------------------------ the box
 
 
-def _binned(field: npt.NDArray[np.floating], cell: float, edges: Float) -> Float:
+def _power_ratio(field: npt.NDArray[np.floating], cell: float, edges: Float) -> Float:
     """P(k)[bin] of a cube, k h/Mpc between edges."""
     n = field.shape[0]
     power = (np.abs(fft.rfftn(field)) ** 2).ravel() * (cell**3 / n**3)
@@ -83,23 +83,23 @@ def _binned(field: npt.NDArray[np.floating], cell: float, edges: Float) -> Float
 
 def box_power(box: Box, edges: Float) -> Float:
     """P(k) / P_linear(k)[bin] of the matter at z = 0."""
-    return _binned(np.expm1(box.smoothed[0] - np.float32(0.5 * box.variance[0])), box.model.cell, edges)
+    return _power_ratio(np.expm1(box.smoothed[0] - np.float32(0.5 * box.variance[0])), box.model.cell, edges)
 
 
 def halo_bias(box: Box, x: Sequence[float], edges: Float) -> Float:
     """Bias[x, bin] that the fields of halos of x = b D have against the matter's own, / x."""
     matter = box_power(box, edges)
-    field, amplitude = density_box.biased(box.model, np.array(x))
+    field, amplitude = density_box.biased_field(box.model, np.array(x))
     rows = []
     for i, times in zip(field.tolist(), amplitude.tolist(), strict=True):
         number = np.exp(np.float32(times) * box.smoothed[i] - np.float32(0.5 * times**2 * box.variance[i]))
-        rows.append(np.sqrt(_binned(number, box.model.cell, edges) / matter))
+        rows.append(np.sqrt(_power_ratio(number, box.model.cell, edges) / matter))
     return np.asarray(np.array(rows) / np.array(x)[:, None])
 
 
-def velocities(box: Box, x: float) -> float:
+def velocity_rms(box: Box, x: float) -> float:
     """rms of one component of the velocity, km/s, of halos of bias x at z = 0, anywhere in the box."""
-    field, amplitude = (value[0] for value in density_box.biased(box.model, np.array([x])))
+    field, amplitude = (value[0] for value in density_box.biased_field(box.model, np.array([x])))
     weight = np.exp(np.float32(amplitude) * box.smoothed[int(field)])
     square = [np.average(u**2, weights=weight) for u in box.velocity]
     return float(density_box.velocity_factor(box.model, 0.0) * np.sqrt(np.mean(square)))
@@ -108,40 +108,42 @@ def velocities(box: Box, x: float) -> float:
 # ------------------------------------------------------------------------------------------------ on the sky
 
 
-def population_above(seed: int, box_cells: int, near: float, far: float, log_mass: float) -> Population:
+def population_above(seed: int, box_cells: int, z_min: float, z_max: float, log_mass: float) -> Population:
     """Halos, and galaxies of a proxy mass, above log_mass.
 
     seed, box_cells : of the box of matter, and its cells a side
     near, far       : redshifts;  log_mass : log10 of the least mass, as of table `halos`
     """
     table, inverse = matching.masses(), luminosity_function.inverse(luminosity_function.schechter(), matching.Z_LAST)
-    matched = matching.matching(table, inverse)
-    volume = Volume(near, far, 0.0)
+    matched = matching.match_luminosities(table, inverse)
+    volume = Volume(z_min, z_max, 0.0)
     return population.model(
         seed, box_cells, volume, inverse, lambda z: matched.magnitude(z, np.full(np.size(z), log_mass))
     )
 
 
-def tracers(universe: Population, order: int, block: int) -> Tracers:
+def draw_tracers(universe: Population, order: int, block: int) -> Tracers:
     """Halos of a cell of any order, and their satellites that lie in it."""
     parts = []
     for level in halos.LEVELS:
-        many = 1 << 2 * max(level - order, 0)
+        n_cells = 1 << 2 * max(level - order, 0)
         first = block << 2 * (level - order) if level >= order else block >> 2 * (order - level)
-        for cell in range(first, first + many):
+        for cell in range(first, first + n_cells):
             hosts = halos.draw(universe.halos, universe.seed, level, cell)
-            found = satellites.draw(universe.halos, universe.masses, hosts, universe.seed)
-            ra, dec = sky.positions(hosts.index)
+            members = satellites.draw(universe.halos, universe.masses, hosts, universe.seed)
+            ra, dec = sky.positions_of_indices(hosts.index)
             z = universe.halos.distances.redshift(hosts.chi)
-            x = universe.masses.at(universe.masses.bias, z, hosts.log_mass) * density_box.growth(z)
-            is_satellite = np.repeat([False, True], [ra.size, found.ra.size])
-            host = np.concatenate([np.arange(ra.size), found.host])
-            pairs = ((ra, found.ra), (dec, found.dec), (hosts.chi, found.chi), (hosts.proxy, found.proxy))
+            x = universe.masses.interpolate_pairs(universe.masses.bias, z, hosts.log_mass) * density_box.growth(z)
+            is_satellite = np.repeat([False, True], [ra.size, members.ra.size])
+            host = np.concatenate([np.arange(ra.size), members.host])
+            pairs = ((ra, members.ra), (dec, members.dec), (hosts.chi, members.chi), (hosts.proxy, members.proxy))
             ra, dec, chi, proxy = (np.concatenate(pair) for pair in pairs)
-            speed = np.concatenate([hosts.velocity, found.velocity])
-            inside = sky.cell_of(ra, dec, order) == block
-            parts.append(Tracers(ra, dec, chi, x[host], is_satellite, hosts.log_mass[host], proxy, speed).part(inside))
-    return joined(parts)
+            speed = np.concatenate([hosts.velocity, members.velocity])
+            inside = sky.cell_at(ra, dec, order) == block
+            parts.append(
+                Tracers(ra, dec, chi, x[host], is_satellite, hosts.log_mass[host], proxy, speed).select(inside)
+            )
+    return concatenate(parts)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -170,61 +172,63 @@ class Pairs:
     of_pixel: Float
     of_all: Float
 
-    def left(self, w: Float) -> tuple[Float, Float]:
+    def subtract_block_mean(self, w: Float) -> tuple[Float, Float]:
         """w[m] at the nodes -> (w[bin], what is left of it[bin] where each pixel is held against the block's mean)."""
-        mean, pixel, every = (shares @ w for shares in (self.of_bin, self.of_pixel, self.of_all))
-        return mean, mean - 2.0 * pixel + every
+        mean, pixel, block_mean = (shares @ w for shares in (self.of_bin, self.of_pixel, self.of_all))
+        return mean, mean - 2.0 * pixel + block_mean
 
 
 def correlation(blocks: Sequence[tuple[int, Sequence[Tracers | Float]]], order: int, edges: Float) -> list[Correlation]:
     """w(theta) of each kind of tracer in blocks, cells of an order; or of maps of their pixels."""
-    found = [[_delta(one, order, cell) for one in given] for cell, given in blocks]
-    delta, chance = (np.array([[pair[i] for pair in row] for row in found]) for i in range(2))
-    bins, kinds = edges.size - 1, delta.shape[1]
-    product, number, angle = np.zeros((len(blocks), kinds, bins)), np.zeros((len(blocks), bins)), np.zeros(bins)
+    deltas = [[_overdensity(tracers, order, cell) for tracers in by_kind] for cell, by_kind in blocks]
+    delta, chance = (np.array([[pair[i] for pair in row] for row in deltas]) for i in range(2))
+    bins, n_kinds = edges.size - 1, delta.shape[1]
+    product, number, angle = np.zeros((len(blocks), n_kinds, bins)), np.zeros((len(blocks), bins)), np.zeros(bins)
     for row, (cell, _) in enumerate(blocks):
-        number[row], apart, product[row] = pairs.sum_products(_vectors(order, cell), delta[row].T, np.radians(edges))
-        angle += np.degrees(apart)
+        number[row], separation_sum, product[row] = pairs.sum_products(
+            _vectors(order, cell), delta[row].T, np.radians(edges)
+        )
+        angle += np.degrees(separation_sum)
     product += chance[:, :, None] * number[:, None]
     scatter = np.std(product / number[:, None], axis=0, ddof=1) / np.sqrt(len(blocks))
     total = product.sum(0) / number.sum(0)
-    separations = _pairs(order, blocks[0][0], edges)
+    separations = _pixel_pairs(order, blocks[0][0], edges)
     theta = angle / number.sum(0)
     return [Correlation(theta, w, error, separations) for w, error in zip(total, scatter, strict=True)]
 
 
-def _separations(some: Float, every: Float, edges: Float) -> tuple[Int, Float]:
+def _separations(first: Float, second: Float, edges: Float) -> tuple[Int, Float]:
     """Bin of the separation of each pair, -1 or the number of bins outside; and the separation, deg."""
-    theta = np.degrees(np.arccos(np.clip(some @ every.T, -1.0, 1.0))).ravel()
+    theta = np.degrees(np.arccos(np.clip(first @ second.T, -1.0, 1.0))).ravel()
     return np.searchsorted(edges, theta) - 1, theta
 
 
-def _pairs(order: int, cell: int, edges: Float) -> Pairs:
+def _pixel_pairs(order: int, cell: int, edges: Float) -> Pairs:
     """Of every _SPARSE-th pixel with all."""
     place, bins = _vectors(order, cell), edges.size - 1
     fine = np.linspace(0.0, 3.0 * sky.cell_radius(order), _NODES + 1)
     of_bin, of_pixel, of_all = np.zeros((bins, _NODES)), np.zeros((bins, _NODES)), np.zeros(_NODES)
-    for one in place[::_SPARSE]:
-        which, theta = _separations(one[None, :], place, edges)
+    for vector in place[::_SPARSE]:
+        bin_index, theta = _separations(vector[None, :], place, edges)
         node = np.searchsorted(fine, theta, side="right") - 1
-        every = np.bincount(node, minlength=_NODES)
-        of_all += every
+        node_counts = np.bincount(node, minlength=_NODES)
+        of_all += node_counts
         for i in range(bins):
-            inside = node[which == i]
+            inside = node[bin_index == i]
             of_bin[i] += np.bincount(inside, minlength=_NODES)
-            of_pixel[i] += inside.size * every
+            of_pixel[i] += inside.size * node_counts
     shares = [part / part.sum(-1, keepdims=True) for part in (of_bin, of_pixel, of_all)]
     return Pairs(0.5 * (fine[1:] + fine[:-1]), *shares)
 
 
-def _delta(one: Tracers | Float, order: int, cell: int) -> tuple[Float, float]:
+def _overdensity(tracers: Tracers | Float, order: int, cell: int) -> tuple[Float, float]:
     """Overdensity of the pixels, and what n points, which are nowhere else, keep from one another: 1 / n.
 
     What is common to a block says nothing of its inside, and is most of the noise.
     """
-    if not isinstance(one, Tracers):
-        return np.asarray(one - one.mean()), 0.0
-    pixel = sky.cell_of(one.ra, one.dec, order + DEPTH) - (cell << 2 * DEPTH)
+    if not isinstance(tracers, Tracers):
+        return np.asarray(tracers - tracers.mean()), 0.0
+    pixel = sky.cell_at(tracers.ra, tracers.dec, order + DEPTH) - (cell << 2 * DEPTH)
     inside = (pixel >= 0) & (pixel < 1 << 2 * DEPTH)
     number = np.bincount(pixel[inside], minlength=1 << 2 * DEPTH)
     return np.asarray(number / number.mean() - 1.0), 1.0 / float(number.sum())
@@ -234,39 +238,42 @@ def _vectors(order: int, cell: int) -> Float:
     return sky.unit_vectors(*sky.cell_centres(order + DEPTH, (cell << 2 * DEPTH) + np.arange(1 << 2 * DEPTH)))
 
 
-def shells(everything: Tracers, near: float, far: float) -> Shells:
+def shells(tracers: Tracers, z_min: float, z_max: float) -> Shells:
     """The tracers between two redshifts, with their bias times growth, in shells of equal width."""
-    first, last = (float(cosmology.comoving_distance(z)) for z in (near, far))
+    first, last = (float(cosmology.comoving_distance(z)) for z in (z_min, z_max))
     edges = np.linspace(first, last, int(np.ceil((last - first) / _SHELL)) + 1)
-    return theory.shells(everything.chi, everything.x, edges)
+    return theory.shells(tracers.chi, tracers.bias_growth, edges)
 
 
-def limber(seen: Shells, found: Correlation, power: Callable[[Float], Float]) -> tuple[Float, Float]:
+def limber(tracer_shells: Shells, measured: Correlation, power: Callable[[Float], Float]) -> tuple[Float, Float]:
     """w of a power P(k) over the pairs of each bin, and what is left of it in blocks whose means are their own."""
-    ell = np.geomspace(1.0, _ELL_MOST, 400)
-    c_l = theory.galaxies(ell, seen, lambda k, _: power(k))
-    every = np.arange(1, _ELL_MOST + 1)
+    ell = np.geomspace(1.0, _ELL_MAX, 400)
+    c_l = theory.galaxy_power(ell, tracer_shells, lambda k, _: power(k))
+    multipoles = np.arange(1, _ELL_MAX + 1)
     # Beyond the multipoles of the smallest separation the sum ends softly.
-    weight = (2 * every + 1) / (4 * np.pi) * np.interp(np.log(every), np.log(ell), c_l)
-    weight *= np.exp(-((every / (0.5 * _ELL_MOST)) ** 2))
-    nodes = found.pairs.nodes
+    weight = (2 * multipoles + 1) / (4 * np.pi) * np.interp(np.log(multipoles), np.log(ell), c_l)
+    weight *= np.exp(-((multipoles / (0.5 * _ELL_MAX)) ** 2))
+    nodes = measured.pairs.nodes
     theta = np.geomspace(nodes[0], nodes[-1], _THETAS)
-    w = np.array([np.sum(weight * j0((every + 0.5) * np.radians(at))) for at in theta])
-    return found.pairs.left(np.interp(np.log(nodes), np.log(theta), w))
+    w = np.array([np.sum(weight * j0((multipoles + 0.5) * np.radians(at))) for at in theta])
+    return measured.pairs.subtract_block_mean(np.interp(np.log(nodes), np.log(theta), w))
 
 
-def structure(box: Box, order: int, cell: int, seen: Shells) -> Float:
+def projected_field(box: Box, order: int, cell: int, tracer_shells: Shells) -> Float:
     """The Gaussian field of the box along the lines of sight of a block's pixels, weighted as the tracers are.
 
     box         : of matter;  order, cell : of the nested block
     seen        : the tracers' numbers by distance
     """
-    turned, direction = lightcone.replicas(box, float(seen.chi[-1] + seen.wide[-1])), _vectors(order, cell)
+    box_replicas, direction = (
+        lightcone.draw_replicas(box, float(tracer_shells.chi[-1] + tracer_shells.width[-1])),
+        _vectors(order, cell),
+    )
     step, g, total = box.model.cell, box.smoothed[0].ravel(), np.zeros(len(direction))
-    ends = seen.chi[0] - 0.5 * seen.wide[0], seen.chi[-1] + 0.5 * seen.wide[-1]
+    ends = tracer_shells.chi[0] - 0.5 * tracer_shells.width[0], tracer_shells.chi[-1] + 0.5 * tracer_shells.width[-1]
     for chi in np.arange(ends[0] + 0.5 * step, ends[1], step):
-        place, _ = lightcone.box_cells(box, turned, direction, np.full(len(direction), chi))
-        total += step * np.interp(chi, seen.chi, seen.weight) * g[place]
+        place, _ = lightcone.box_cells(box, box_replicas, direction, np.full(len(direction), chi))
+        total += step * np.interp(chi, tracer_shells.chi, tracer_shells.weight) * g[place]
     return total
 
 
@@ -279,8 +286,8 @@ def gaussian_power(k: Float) -> Float:
     place = np.digitize(length[1:], edges)
     number = np.maximum(np.bincount(place), 1)
     at, share = (np.bincount(place, value) / number for value in (length[1:], on_modes[1:]))
-    kept = at > 0
-    ratio = np.interp(k, at[kept], share[kept] / density_box.linear_power(at[kept]))
+    is_filled = at > 0
+    ratio = np.interp(k, at[is_filled], share[is_filled] / density_box.linear_power(at[is_filled]))
     nodes = np.geomspace(1e-3, 1.2, 40)
     ratio *= np.interp(k, nodes, convergence.window(cell, 1, nodes))
     return np.where(k < 1.2, density_box.linear_power(k) * ratio, 0.0)

@@ -20,14 +20,14 @@ from truesky.catalogue.halos import population
 _CLEAR = np.zeros(12, np.float32)
 
 
-def flat(universe: GalaxyModel) -> GalaxyModel:
+def without_clustering(universe: GalaxyModel) -> GalaxyModel:
     """The universe with its halos where the mean says, unlensed."""
     halos = universe.population.halos
-    even = replace(halos, amplitude=np.zeros_like(halos.amplitude))
-    return replace(universe, population=replace(universe.population, halos=even), lens=Shear())
+    uniform = replace(halos, amplitude=np.zeros_like(halos.amplitude))
+    return replace(universe, population=replace(universe.population, halos=uniform), lens=Shear())
 
 
 def rows(universe: GalaxyModel, first: int, count: int) -> pa.Table:
     """Table `galaxies` of generation cells [first, first + count) of a universe of `flat`."""
-    drawn = population.Cells(universe.population)
-    return pa.concat_tables([galaxies.draw(cell, universe, drawn, _CLEAR) for cell in range(first, first + count)])
+    halo_cells = population.CellCache(universe.population)
+    return pa.concat_tables([galaxies.draw(cell, universe, halo_cells, _CLEAR) for cell in range(first, first + count)])

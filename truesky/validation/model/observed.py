@@ -42,7 +42,7 @@ _HALPHA, _NEAR_INFRARED = 6564.6, "euclid_h"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sky:
+class GalaxySample:
     """Galaxies of kinds 0 and 1: columns, magnitudes by band, M_UV, area deg2; quasars deg-2 of r < 22.5, if known."""
 
     rows: Mapping[str, Array]
@@ -54,14 +54,14 @@ class Sky:
     def __getitem__(self, name: str) -> Float:
         return np.asarray(self.rows[name], float)
 
-    def per_deg2(self, kept: Bool) -> float:
+    def per_deg2(self, selected: Bool) -> float:
         """Of the galaxies that are kept: kept : bool[n]."""
-        return float(np.count_nonzero(kept) / self.area)
+        return float(np.count_nonzero(selected) / self.area)
 
-    def volume(self, near: float, far: float) -> float:
+    def volume(self, z_min: float, z_max: float) -> float:
         """Mpc^3 (h = 0.67) between two redshifts."""
         steradian = self.area * np.radians(1.0) ** 2
-        return float(cosmology.comoving_volume(near, far) * steradian / cosmology.HUBBLE**3)
+        return float(cosmology.comoving_volume(z_min, z_max) * steradian / cosmology.HUBBLE**3)
 
 
 COLUMNS = (
@@ -71,30 +71,30 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def in_version(galaxies: read.Version) -> tuple[Sky, Int]:
+def from_version(galaxies: read.Version) -> tuple[GalaxySample, Int]:
     """(galaxies of a version of the table, the generation cell of each that is no quasar).
 
     The area is that of the cells which it was drawn in.
     """
     table = galaxies.rows([*COLUMNS, "_healpix_29"])
-    cell = table["_healpix_29"].to_numpy() >> 2 * (sky.DEEPEST - GENERATION_ORDER)
+    cell = table["_healpix_29"].to_numpy() >> 2 * (sky.MAX_ORDER - GENERATION_ORDER)
     drawn = [cell for part in galaxies.manifest["parts"] for cell in part["facts"].get("generation_cells", ())]
     number = len(set(drawn)) or np.unique(cell).size
-    return sky_of(table, number * sky.cell_area(GENERATION_ORDER)), cell[table["kind"].to_numpy() < 2]
+    return from_table(table, number * sky.cell_area(GENERATION_ORDER)), cell[table["kind"].to_numpy() < 2]
 
 
-def sky_of(table: pa.Table, area: float) -> Sky:
+def from_table(table: pa.Table, area: float) -> GalaxySample:
     """Of rows of table `galaxies` with COLUMNS; area : deg2."""
     galaxies = table.filter(pa.array(table["kind"].to_numpy() < 2))
-    seen = of_columns({name: galaxies[name].to_numpy() for name in COLUMNS}, area)
+    sample = from_columns({name: galaxies[name].to_numpy() for name in COLUMNS}, area)
     quasars = table.filter(pa.array(table["kind"].to_numpy() == QUASAR))
     mag, z, boost = (quasars[name].to_numpy().astype(float) for name in ("mag_r01", "z_true", "density_boost"))
     # f_nu ~ nu^-0.5 from 1450 A to the middle of r.
     red = mag - 1.25 * np.log10(_R_PIVOT / (1450.0 * (1.0 + z)))
-    return replace(seen, quasars=float(np.sum((red < 22.5) / boost)) / area)
+    return replace(sample, quasars=float(np.sum((red < 22.5) / boost)) / area)
 
 
-def of_columns(rows: Mapping[str, Array], area: float, z_max: float = matching.Z_LAST) -> Sky:
+def from_columns(rows: Mapping[str, Array], area: float, z_max: float = matching.Z_LAST) -> GalaxySample:
     """Of columns[n] by name, of galaxies of kinds 0 and 1.
 
     rows : COLUMNS of table `galaxies`;  area : deg2;  z_max : at least the largest redshift
@@ -103,138 +103,138 @@ def of_columns(rows: Mapping[str, Array], area: float, z_max: float = matching.Z
     sed = _spectra(rows)
     z, m_r = rows["z_true"].astype(float), rows["abs_mag_r01"].astype(float)
     dustiest = _dustiest(sed)
-    mags = {band: apparent(rows, band, z_max) for band in BANDS}
-    seen = band_ratios.load(library, _ULTRAVIOLET_BAND, z_max, dustiest)
+    mags = {band: apparent_magnitudes(rows, band, z_max) for band in BANDS}
+    band_table = band_ratios.load(library, _ULTRAVIOLET_BAND, z_max, dustiest)
     curve = passbands.load(_ULTRAVIOLET_BAND)
     from_z = passbands.pivot_wavelength(curve) / _ULTRAVIOLET_AT - 1.0
-    rest = m_r + band_ratios.offset(seen, np.full(z.size, from_z), sed) + 2.5 * np.log10(1.0 + from_z)
-    return Sky(rows, mags, rest + 5.0 * np.log10(cosmology.HUBBLE), area)
+    rest = m_r + band_ratios.offset(band_table, np.full(z.size, from_z), sed) + 2.5 * np.log10(1.0 + from_z)
+    return GalaxySample(rows, mags, rest + 5.0 * np.log10(cosmology.HUBBLE), area)
 
 
-def apparent(rows: Mapping[str, Array], band: str, z_max: float = matching.Z_LAST) -> Float:
+def apparent_magnitudes(rows: Mapping[str, Array], band: str, z_max: float = matching.Z_LAST) -> Float:
     """AB[n] in a band, before lines, magnification and the Milky Way; rows, z_max : as of `of_columns`."""
     sed, z = _spectra(rows), rows["z_true"].astype(float)
     table = band_ratios.load(templates.galaxy_library(), band, z_max, _dustiest(sed))
     return np.asarray(rows["abs_mag_r01"] + cosmology.distance_modulus(z) + band_ratios.offset(table, z, sed))
 
 
-def figures(seen: Sky) -> dict[str, float]:
+def figures(sample: GalaxySample) -> dict[str, float]:
     """Everything that the list has a row for, as far as a sky to I_E < 26 tells."""
     return {
-        **counts(seen),
-        **masses(seen),
-        **star_formation(seen),
-        **lines(seen),
-        **environment(seen),
-        **ultraviolet(seen),
-        **({} if seen.quasars is None else {"quasars_r_22.5": seen.quasars}),
+        **counts(sample),
+        **masses(sample),
+        **star_formation(sample),
+        **lines(sample),
+        **environment(sample),
+        **ultraviolet(sample),
+        **({} if sample.quasars is None else {"quasars_r_22.5": sample.quasars}),
     }
 
 
-def counts(seen: Sky) -> dict[str, float]:
+def counts(sample: GalaxySample) -> dict[str, float]:
     """Galaxies by magnitude, and their redshifts."""
-    i_band, r_band, vis, z = seen.mags["lsst_i"], seen.mags["lsst_r"], seen.mags["euclid_vis"], seen["z_true"]
-    found = {f"i_{limit}": seen.per_deg2(i_band < limit) / ARCMIN2 for limit in range(20, 27)}
+    i_band, r_band, vis, z = sample.mags["lsst_i"], sample.mags["lsst_r"], sample.mags["euclid_vis"], sample["z_true"]
+    values = {f"i_{limit}": sample.per_deg2(i_band < limit) / ARCMIN2 for limit in range(20, 27)}
     for at in 19.25 + 0.5 * np.arange(11):
-        found |= _log(f"log_i_{at:g}", np.count_nonzero(np.abs(i_band - at) < 0.25), 0.5 * seen.area)
-    found |= {f"r_{limit:g}": seen.per_deg2(r_band < limit) for limit in (17.77, 19.5, 19.8, 20.175)}
-    found["vis_24.5"] = seen.per_deg2(vis < 24.5) / ARCMIN2
-    return found | {"z_vis_24.5": _median(z[vis < 24.5]), "z_i_22.5": _median(z[i_band < 22.5])}
+        values |= _log_density(f"log_i_{at:g}", np.count_nonzero(np.abs(i_band - at) < 0.25), 0.5 * sample.area)
+    values |= {f"r_{limit:g}": sample.per_deg2(r_band < limit) for limit in (17.77, 19.5, 19.8, 20.175)}
+    values["vis_24.5"] = sample.per_deg2(vis < 24.5) / ARCMIN2
+    return values | {"z_vis_24.5": _median(z[vis < 24.5]), "z_i_22.5": _median(z[i_band < 22.5])}
 
 
-def masses(seen: Sky) -> dict[str, float]:
+def masses(sample: GalaxySample) -> dict[str, float]:
     """log10 of galaxies / Mpc^3 dex, and the share of red ones, by stellar mass and redshift."""
-    z, mass, red = seen["z_true"], seen["log_stellar_mass"], is_red(seen)
-    found: dict[str, float] = {}
-    for at, (near, far) in MASS_SHELLS.items():
-        inside = (z > near) & (z < far)
+    z, mass, red = sample["z_true"], sample["log_stellar_mass"], is_red(sample)
+    values: dict[str, float] = {}
+    for at, (z_min, z_max) in MASS_SHELLS.items():
+        inside = (z > z_min) & (z < z_max)
         for m in MASSES:
             number = np.count_nonzero(inside & (np.abs(mass - m) < MASS_HALF))
-            found |= _log(f"mass_function_{m:g}_z{at}", number, 2.0 * MASS_HALF * seen.volume(near, far))
-    for at, (near, far) in RED_SHELLS.items():
+            values |= _log_density(f"mass_function_{m:g}_z{at}", number, 2.0 * MASS_HALF * sample.volume(z_min, z_max))
+    for at, (z_min, z_max) in RED_SHELLS.items():
         for m in RED_MASSES:
-            here = (z > near) & (z < far) & (np.abs(mass - m) < RED_HALF)
-            found[f"red_{m:g}_z{at}"] = float(np.mean(red[here])) if here.any() else np.nan
-    return found
+            selected = (z > z_min) & (z < z_max) & (np.abs(mass - m) < RED_HALF)
+            values[f"red_{m:g}_z{at}"] = float(np.mean(red[selected])) if selected.any() else np.nan
+    return values
 
 
-def star_formation(seen: Sky) -> dict[str, float]:
+def star_formation(sample: GalaxySample) -> dict[str, float]:
     """log10 of Msun/yr/Mpc^3 by redshift; median and scatter of the main sequence at 10^10 Msun."""
-    z, mass, rate, forming = seen["z_true"], seen["log_stellar_mass"], seen["log_sfr"], is_blue(seen)
-    found = {}
-    for near, far in STAR_FORMATION_SHELLS:
-        inside = (z > near) & (z < far)
+    z, mass, rate, forming = sample["z_true"], sample["log_stellar_mass"], sample["log_sfr"], is_blue(sample)
+    values = {}
+    for z_min, z_max in STAR_FORMATION_SHELLS:
+        inside = (z > z_min) & (z < z_max)
         total = float(np.sum(10.0 ** rate[inside]))
-        found[f"sfrd_{near}_{far}"] = float(np.log10(max(total, 1e-30) / seen.volume(near, far)))
+        values[f"sfrd_{z_min}_{z_max}"] = float(np.log10(max(total, 1e-30) / sample.volume(z_min, z_max)))
     for at in (0.4, 1.0, 2.0):
-        here = forming & (np.abs(z - at) < 0.15) & (np.abs(mass - 10.0) < 0.1)
-        found[f"main_sequence_z{at}"] = _median(rate[here])
-        found[f"main_sequence_scatter_z{at}"] = float(np.std(rate[here])) if here.any() else np.nan
-    return found
+        selected = forming & (np.abs(z - at) < 0.15) & (np.abs(mass - 10.0) < 0.1)
+        values[f"main_sequence_z{at}"] = _median(rate[selected])
+        values[f"main_sequence_scatter_z{at}"] = float(np.std(rate[selected])) if selected.any() else np.nan
+    return values
 
 
-def lines(seen: Sky) -> dict[str, float]:
+def lines(sample: GalaxySample) -> dict[str, float]:
     """Emitters deg-2, the ratio [O III] / H beta by mass, and the equivalent width of the brightest."""
-    z, mass = seen["z_true"], seen["log_stellar_mass"]
-    oiii, both = seen["flux_oiii"], seen["flux_halpha"] + (1.0 + 1.0 / 3.05) * seen["flux_nii"]
-    near, far = (z > 0.9) & (z < 1.6), (z > 1.5) & (z < 2.3)
-    found = {
-        "halpha_nii_2e-16": seen.per_deg2(near & (both > 2e-16)),
-        "oiii_2e-16": seen.per_deg2(far & (oiii > 2e-16)),
-        "oiii_1e-16": seen.per_deg2(far & (oiii > 1e-16)),
+    z, mass = sample["z_true"], sample["log_stellar_mass"]
+    oiii, halpha_nii = sample["flux_oiii"], sample["flux_halpha"] + (1.0 + 1.0 / 3.05) * sample["flux_nii"]
+    halpha_range, oiii_range = (z > 0.9) & (z < 1.6), (z > 1.5) & (z < 2.3)
+    values = {
+        "halpha_nii_2e-16": sample.per_deg2(halpha_range & (halpha_nii > 2e-16)),
+        "oiii_2e-16": sample.per_deg2(oiii_range & (oiii > 2e-16)),
+        "oiii_1e-16": sample.per_deg2(oiii_range & (oiii > 1e-16)),
     }
-    bright = (z > 1.3) & (z < 1.6) & (both > 2e-16)
-    found["ew_halpha_nii"] = _median(both[bright] / (_continuum(seen, bright) * (1.0 + z[bright])))
-    r3 = np.log10(np.maximum(oiii, 1e-30) / np.maximum(seen["flux_hbeta"], 1e-30))
+    bright = (z > 1.3) & (z < 1.6) & (halpha_nii > 2e-16)
+    values["ew_halpha_nii"] = _median(halpha_nii[bright] / (_continuum(sample, bright) * (1.0 + z[bright])))
+    r3 = np.log10(np.maximum(oiii, 1e-30) / np.maximum(sample["flux_hbeta"], 1e-30))
     for at, low, high in ((1.6, 1.3, 1.8), (2.3, 2.0, 2.6)):
         for m in (9.5, 10.0, 10.5):
-            here = (z > low) & (z < high) & (np.abs(mass - m) < 0.15) & (oiii > 0.0)
-            found[f"r3_{m:g}_z{at}"] = _median(r3[here])
-    return found
+            selected = (z > low) & (z < high) & (np.abs(mass - m) < 0.15) & (oiii > 0.0)
+            values[f"r3_{m:g}_z{at}"] = _median(r3[selected])
+    return values
 
 
-def environment(seen: Sky) -> dict[str, float]:
+def environment(sample: GalaxySample) -> dict[str, float]:
     """Red centrals of groups and clusters."""
-    halo, z, red = seen["log_halo_mass"], seen["z_true"], is_red(seen)
-    centrals = (seen.rows["kind"] == 0) & (halo > 13.5) & (z > 0.8) & (z < 1.2)
+    halo, z, red = sample["log_halo_mass"], sample["z_true"], is_red(sample)
+    centrals = (sample.rows["kind"] == 0) & (halo > 13.5) & (z > 0.8) & (z < 1.2)
     return {"red_centrals_13.5_z1": float(np.mean(red[centrals])) if centrals.any() else np.nan}
 
 
-def ultraviolet(seen: Sky) -> dict[str, float]:
+def ultraviolet(sample: GalaxySample) -> dict[str, float]:
     """Galaxies / Mpc^3 mag at 1500 A, log10, where I_E < 26 sees them all."""
-    z = seen["z_true"]
-    found: dict[str, float] = {}
+    z = sample["z_true"]
+    values: dict[str, float] = {}
     for at, magnitudes in ULTRAVIOLET.items():
-        near, far = at - 0.3, min(at + 0.3, 6.0)
-        inside = (z > near) & (z < far)
+        z_min, z_max = at - 0.3, min(at + 0.3, 6.0)
+        inside = (z > z_min) & (z < z_max)
         for m in magnitudes:
-            number = np.count_nonzero(inside & (np.abs(seen.ultraviolet - m) < 0.25))
-            found |= _log(f"uv_{-m}_z{at}", number, 0.5 * seen.volume(near, far))
-    return found
+            number = np.count_nonzero(inside & (np.abs(sample.ultraviolet - m) < 0.25))
+            values |= _log_density(f"uv_{-m}_z{at}", number, 0.5 * sample.volume(z_min, z_max))
+    return values
 
 
-def is_red(seen: Sky) -> Bool:
+def is_red(sample: GalaxySample) -> Bool:
     """Redder than what lies half-way between the sequences."""
-    return np.asarray(seen["color_gr_01"] > 0.78 - 0.02 * (seen["abs_mag_r01"] + 20.0))
+    return np.asarray(sample["color_gr_01"] > 0.78 - 0.02 * (sample["abs_mag_r01"] + 20.0))
 
 
-def is_blue(seen: Sky) -> Bool:
+def is_blue(sample: GalaxySample) -> Bool:
     """Bluer than the valley between the sequences."""
-    since = np.clip(seen["z_true"] - 0.1, 0.0, 1.6)
-    return np.asarray(seen["color_gr_01"] < 0.80 - 0.07 * (seen["abs_mag_r01"] + 20.0) - 0.16 * since)
+    redshift_step = np.clip(sample["z_true"] - 0.1, 0.0, 1.6)
+    return np.asarray(sample["color_gr_01"] < 0.80 - 0.07 * (sample["abs_mag_r01"] + 20.0) - 0.16 * redshift_step)
 
 
-def _continuum(seen: Sky, kept: Bool) -> Float:
+def _continuum(sample: GalaxySample, selected: Bool) -> Float:
     """Observed f_lambda[n] at redshifted H alpha, erg s-1 cm-2 A-1."""
-    library, rows = templates.galaxy_library(), {name: values[kept] for name, values in seen.rows.items()}
+    library, rows = templates.galaxy_library(), {name: values[selected] for name, values in sample.rows.items()}
     sed = _spectra(rows)
     z = rows["z_true"].astype(float)
     # Seen in a band from the redshift at which H alpha is at its middle.
     at = passbands.pivot_wavelength(passbands.load(_NEAR_INFRARED)) / _HALPHA - 1.0
     table = band_ratios.load(library, _NEAR_INFRARED, matching.Z_LAST, _dustiest(sed))
     rest = rows["abs_mag_r01"] + band_ratios.offset(table, np.full(z.size, at), sed) + 2.5 * np.log10(1.0 + at)
-    apparent = rest + cosmology.distance_modulus(z) - 2.5 * np.log10(1.0 + z)
-    f_nu = 10.0 ** (-0.4 * (apparent + units.AB_CGS))
+    apparent_mag = rest + cosmology.distance_modulus(z) - 2.5 * np.log10(1.0 + z)
+    f_nu = 10.0 ** (-0.4 * (apparent_mag + units.AB_CGS))
     return np.asarray(f_nu * units.LIGHT_ANGSTROM_S / (_HALPHA * (1.0 + z)) ** 2)
 
 
@@ -251,7 +251,7 @@ def _median(values: Sequence[float] | Float) -> float:
     return float(np.median(values)) if len(values) else np.nan
 
 
-def _log(name: str, number: int | np.signedinteger[Any], per: float) -> dict[str, float]:
+def _log_density(name: str, number: int | np.signedinteger[Any], per: float) -> dict[str, float]:
     """A logarithmic density and its Poisson error."""
     if not number:
         return {name: -np.inf}

@@ -14,7 +14,7 @@ import numpy as np
 from lake_schema import sky
 from lake_schema.arrays import Float, Float32
 from truesky.catalogue.stars import isochrones, kinematics, milky_way, stars
-from truesky.catalogue.stars.stellar_populations import DWARF, GIANT, WHITE_DWARF, tracks
+from truesky.catalogue.stars.stellar_populations import DWARF, GIANT, WHITE_DWARF, build_tracks
 from truesky.fluxes import passbands
 from truesky.fluxes.libraries import model_stars, templates
 from truesky.fluxes.libraries.vega import vega_magnitude
@@ -28,7 +28,7 @@ _BULGE = ((1, -4), (10, -10))
 _WHITE_DWARF_MASS = 0.6
 _SUN_M_BOL = 4.74
 # Distance, pc, at which Oort's constants are read off.
-_NEAR = 50.0
+_OORT_DISTANCE = 50.0
 
 
 def figures(universe: stars.StarModel, dust: Float32, step: int = 61) -> dict[str, float]:
@@ -37,32 +37,32 @@ def figures(universe: stars.StarModel, dust: Float32, step: int = 61) -> dict[st
     dust : float32[pixel] map of A(V), mag;  step : of the cells in which the whole sky is looked at
     """
     limits = (15.0, 18.0, 20.0)
-    pole = star_counts.brighter(universe, (0.0, 90.0), limits)
+    pole = star_counts.count_brighter(universe, (0.0, 90.0), limits)
     return {
         **{f"pole_v{limit:g}": float(value) for limit, value in zip(limits, pole, strict=True)},
-        "sky_v11": star_counts.whole_sky(universe, 11.0, dust, step),
-        **nearby(universe),
-        **evolved(),
+        "sky_v11": star_counts.count_whole_sky(universe, 11.0, dust, step),
+        **local_densities(universe),
+        **isochrone_points(),
         **colours(universe),
         **motions(),
         **bulge(universe.galaxy),
     }
 
 
-def checks(found: Mapping[str, float]) -> dict[str, list[Check]]:
+def checks_by_group(values: Mapping[str, float]) -> dict[str, list[Check]]:
     """Every row of the list by its group."""
     groups: dict[str, list[Check]] = {}
-    for check in read(LIST, found):
+    for check in read(LIST, values):
         groups.setdefault(check.group, []).append(check)
     return groups
 
 
-def nearby(universe: stars.StarModel) -> dict[str, float]:
+def local_densities(universe: stars.StarModel) -> dict[str, float]:
     """Densities at the Sun, pc^-3."""
-    galaxy, own = universe.galaxy, universe.galaxy.pieces
-    at_sun = np.arange(own.number.size) < galaxy.first[-1, 0]
-    number, stage = own.number * at_sun, own.stage
-    light = (own.log_mass.mean(0) < 0.0) & (stage != WHITE_DWARF)
+    galaxy, pieces = universe.galaxy, universe.galaxy.pieces
+    at_sun = np.arange(pieces.number.size) < galaxy.first[-1, 0]
+    number, stage = pieces.number * at_sun, pieces.stage
+    light = (pieces.log_mass.mean(0) < 0.0) & (stage != WHITE_DWARF)
     giants = stage == GIANT
     return {
         "systems_local": float(number[light].sum()),
@@ -70,26 +70,26 @@ def nearby(universe: stars.StarModel) -> dict[str, float]:
         "giants_local": float(number[giants].sum()),
         "giants_bright_local": float(number[giants & (star_counts.absolute_v(universe) < 1.0)].sum()),
         "white_dwarfs_local": float(number[stage == WHITE_DWARF].sum()),
-        "clump_m_h": _clump(galaxy),
+        "clump_m_h": _clump_magnitude(galaxy),
     }
 
 
-def _clump(galaxy: milky_way.MilkyWay) -> float:
+def _clump_magnitude(galaxy: milky_way.MilkyWay) -> float:
     """M_H that most of the thin disc's giants between -3 and 0 have."""
-    own, thin = galaxy.pieces, np.arange(galaxy.pieces.number.size) < galaxy.first[1, 0]
+    pieces, thin = galaxy.pieces, np.arange(galaxy.pieces.number.size) < galaxy.first[1, 0]
     edges = np.arange(-3.0, 0.01, 0.1)
-    number, _ = np.histogram(own.m_h.mean(0), edges, weights=own.number * thin * (own.stage == GIANT))
+    number, _ = np.histogram(pieces.m_h.mean(0), edges, weights=pieces.number * thin * (pieces.stage == GIANT))
     smooth = number + np.append(0.0, number[:-1]) + np.append(number[1:], 0.0)
     return float(edges[smooth.argmax()] + 0.05)
 
 
-def evolved() -> dict[str, float]:
+def isochrone_points() -> dict[str, float]:
     """Points of isochrones."""
     old = isochrones.isochrones([12.5, 10.0, 4.6], [-1.5, -0.5, 0.0])
     main = old.main_sequence + 4
     hot = old.log_teff[:, :main].argmax(1)
     tip = old.main_sequence - 1 + isochrones.FLASH
-    sun = tracks(np.array([4.6]), np.zeros(1))
+    sun = build_tracks(np.array([4.6]), np.zeros(1))
     return {
         "halo_turn_off_teff": float(10.0 ** old.log_teff[0, hot[0]]),
         "halo_turn_off_mass": float(old.mass[0, hot[0]]),
@@ -103,24 +103,24 @@ def colours(universe: stars.StarModel, area: float = 40.0) -> dict[str, float]:
     """g - r (SDSS) of the stars of so many deg2 at b = 60 with 18 < r < 19.5, without dust."""
     galaxy = universe.galaxy
     rngs = (stream(star_counts.SEED, "colours", name) for name in ("number", "labels"))
-    drawn = milky_way.draw(galaxy, milky_way.expected(galaxy, 90.0, 60.0, area, 21.0), *rngs)
-    found = model_stars.mixture(universe.types, universe.models, drawn.teff, drawn.log_g, drawn.metallicity)
+    drawn = milky_way.draw(galaxy, milky_way.expected_per_bin(galaxy, 90.0, 60.0, area, 21.0), *rngs)
+    mixture = model_stars.mixture(universe.types, universe.models, drawn.teff, drawn.log_g, drawn.metallicity)
     library = templates.stellar_library()
     light = {}
     for name in ("sdss_g", "sdss_r", "twomass_h"):
         band = passbands.load(name)
-        seen = library.flux[:, band.first : band.first + len(band.wavelength)].astype(float)
-        each = seen @ passbands.weights(band)
-        light[name] = (found.frac * each[found.sed]).sum(0)
+        band_flux = library.flux[:, band.first : band.first + len(band.wavelength)].astype(float)
+        each = band_flux @ passbands.weights(band)
+        light[name] = (mixture.frac * each[mixture.sed]).sum(0)
     mag_h = drawn.m_h + 5.0 * np.log10(drawn.distance) - 5.0 + vega_magnitude(passbands.load("twomass_h"))
     mag_r = mag_h - 2.5 * np.log10(light["sdss_r"] / light["twomass_h"])
     color = -2.5 * np.log10(light["sdss_g"] / light["sdss_r"])
-    seen = (mag_r > 18.0) & (mag_r < 19.5)
-    halo = seen & (drawn.component == milky_way.HALO) & (color < 0.6)
+    selected = (mag_r > 18.0) & (mag_r < 19.5)
+    halo = selected & (drawn.component == milky_way.HALO) & (color < 0.6)
     number, edges = np.histogram(color[halo], np.arange(0.0, 0.61, 0.04))
-    dwarfs = seen & (drawn.component == milky_way.HALO) & (drawn.stage == DWARF)
+    dwarfs = selected & (drawn.component == milky_way.HALO) & (drawn.stage == DWARF)
     return {
-        "gr_b60_below_0.5": float(np.mean(color[seen] < 0.5)),
+        "gr_b60_below_0.5": float(np.mean(color[selected] < 0.5)),
         "gr_b60_mode": float(edges[number.argmax()] + 0.02),
         "gr_b60_edge": float(np.quantile(color[dwarfs], 0.05)),
     }
@@ -129,8 +129,8 @@ def colours(universe: stars.StarModel, area: float = 40.0) -> dict[str, float]:
 def motions() -> dict[str, float]:
     """Oort's constants, km/s/kpc, of the youngest stars' mean, and the halo's lag and dispersion, km/s."""
     lon = np.arange(0.0, 360.0, 5.0)
-    none, young = np.zeros((3, lon.size)), np.full(lon.size, 0.1)
-    mean = [_along(lon, far, none, young) for far in (_NEAR, 0.5 * _NEAR)]
+    zeros, young = np.zeros((3, lon.size)), np.full(lon.size, 0.1)
+    mean = [_longitude_motion(lon, distance_pc, zeros, young) for distance_pc in (_OORT_DISTANCE, 0.5 * _OORT_DISTANCE)]
     rotation = 4.74047 * (2.0 * mean[0] - mean[1])
     rng, n = stream(star_counts.SEED, "motions"), 20_000
     ra, dec = sky.equatorial(np.array([0.0, 90.0]), np.array([0.0, 0.0]))
@@ -154,24 +154,24 @@ def motions() -> dict[str, float]:
     }
 
 
-def _along(lon: Float, far: float, deviates: Float, age: Float) -> Float:
+def _longitude_motion(lon: Float, distance_pc: float, deviates: Float, age: Float) -> Float:
     """Proper motion along Galactic longitude, mas/yr, in the plane: by a step of it."""
     ra, dec = sky.equatorial(lon, np.zeros(lon.size))
-    distance, thin = np.full(lon.size, far), np.zeros(lon.size, np.int64)
+    distance, thin = np.full(lon.size, distance_pc), np.zeros(lon.size, np.int64)
     east, north, _ = kinematics.velocities(ra, dec, distance, thin, age, deviates)
-    beside = sky.equatorial(lon + 1e-3, np.zeros(lon.size))
-    step = np.stack([((beside[0] - ra + 180.0) % 360.0 - 180.0) * np.cos(np.radians(dec)), beside[1] - dec])
+    stepped = sky.equatorial(lon + 1e-3, np.zeros(lon.size))
+    step = np.stack([((stepped[0] - ra + 180.0) % 360.0 - 180.0) * np.cos(np.radians(dec)), stepped[1] - dec])
     step /= np.hypot(*step)
     return np.asarray(east * step[0] + north * step[1])
 
 
 def bulge(galaxy: milky_way.MilkyWay) -> dict[str, float]:
     """Msun deg^-2 along lines of sight."""
-    own, inside = galaxy.pieces, np.arange(galaxy.pieces.number.size) >= galaxy.first[-1, 0]
-    each = np.where(own.stage == WHITE_DWARF, _WHITE_DWARF_MASS, 10.0 ** own.log_mass.mean(0))
-    mass = float((each * own.number * inside).sum() / galaxy.local[-1].sum())
-    found = {}
+    pieces, inside = galaxy.pieces, np.arange(galaxy.pieces.number.size) >= galaxy.first[-1, 0]
+    each = np.where(pieces.stage == WHITE_DWARF, _WHITE_DWARF_MASS, 10.0 ** pieces.log_mass.mean(0))
+    mass = float((each * pieces.number * inside).sum() / galaxy.local[-1].sum())
+    masses = {}
     for lon, lat in _BULGE:
-        number = milky_way.expected(galaxy, float(lon), float(lat), 1.0, 60.0)[-1].sum()
-        found[f"bulge_mass_{lon}_{lat}"] = mass * float(number)
-    return found
+        number = milky_way.expected_per_bin(galaxy, float(lon), float(lat), 1.0, 60.0)[-1].sum()
+        masses[f"bulge_mass_{lon}_{lat}"] = mass * float(number)
+    return masses

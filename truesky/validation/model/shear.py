@@ -29,9 +29,9 @@ _SIGHT_NSIDE = 128
 RINGS, _DIRECTIONS = (0.1, 0.2, 0.4, 0.8), 8
 
 
-def theory(ell: Float, chi: float) -> Float:
+def linear_theory(ell: Float, chi: float) -> Float:
     """C_l of the convergence of sources at chi Mpc/h, linear theory, by Limber's approximation."""
-    return theories.convergence(ell, np.array([chi]), np.ones(1), theories.linear, _distances(chi))
+    return theories.convergence_power(ell, np.array([chi]), np.ones(1), theories.linear_power, _distances(chi))
 
 
 def _distances(chi: float) -> Float:
@@ -39,11 +39,11 @@ def _distances(chi: float) -> Float:
     return np.linspace(2.0, chi - 0.5, _STEPS)
 
 
-def bands(power: Float, chi: float, edges: Sequence[int]) -> Float:
+def band_ratio(power: Float, chi: float, edges: Sequence[int]) -> Float:
     """C_l / theory between multipoles, each l counting as its number of modes."""
     ell = np.arange(edges[0], edges[-1] + 1)
     nodes = np.unique(np.geomspace(edges[0], edges[-1], 60).astype(int))
-    expected = np.exp(np.interp(np.log(ell), np.log(nodes), np.log(theory(nodes.astype(float), chi))))
+    expected = np.exp(np.interp(np.log(ell), np.log(nodes), np.log(linear_theory(nodes.astype(float), chi))))
     ratio = (2 * ell + 1) * power[ell] / expected
     modes = 2.0 * ell + 1.0
     place = np.digitize(ell, edges) - 1
@@ -51,7 +51,7 @@ def bands(power: Float, chi: float, edges: Sequence[int]) -> Float:
     return np.bincount(place, ratio) / np.bincount(place, modes)
 
 
-def sums(box: Box, nside: int, redshifts: Sequence[float], l_max: int) -> tuple[Float32, Float]:
+def convergence_maps(box: Box, nside: int, redshifts: Sequence[float], l_max: int) -> tuple[Float32, Float]:
     """Convergence [plane, pixel] (nested) along lines of sight, and what its multipoles are multiplied by for maps.
 
     box       : of matter;  nside : of the maps;  redshifts : of the sources, a plane each;  l_max : highest multipole
@@ -59,10 +59,10 @@ def sums(box: Box, nside: int, redshifts: Sequence[float], l_max: int) -> tuple[
     chosen = lensing.settings()
     direction = np.stack(hp.pix2vec(nside, np.arange(hp.nside2npix(nside)), nest=True)).astype(np.float32)
     chi = np.asarray(cosmology.comoving_distance(np.array(redshifts)))
-    width, how = hp.nside2resol(nside), (chosen.coarsest, chosen.stretch)
+    width, step_settings = hp.nside2resol(nside), (chosen.coarsest, chosen.stretch)
     return (
-        convergence.convergence(box, direction, width, chi, *how),
-        convergence.transfer(box, width, chi, l_max, *how),
+        convergence.convergence(box, direction, width, chi, *step_settings),
+        convergence.transfer(box, width, chi, l_max, *step_settings),
     )
 
 
@@ -79,48 +79,50 @@ def power_of_box(seed: int, n: int, nside: int, redshifts: Sequence[float], edge
     seed, n   : of the box of matter, and its cells a side;  nside : of the maps
     redshifts : of the sources, a plane each;  edges : of the bands in l
     """
-    kappa, gain = sums(gaussian_box(seed, n), nside, redshifts, edges[-1])
+    kappa, gain = convergence_maps(gaussian_box(seed, n), nside, redshifts, edges[-1])
     rows = []
     for plane, z in enumerate(redshifts):
         power = hp.anafast(hp.reorder(kappa[plane].astype(float), n2r=True), lmax=edges[-1], iter=0)
-        rows.append(bands(power * gain[plane] ** 2, float(cosmology.comoving_distance(z)), edges))
+        rows.append(band_ratio(power * gain[plane] ** 2, float(cosmology.comoving_distance(z)), edges))
     return np.array(rows)
 
 
-def power_of(planes: Planes, numbers: Sequence[int], edges: Sequence[int]) -> Float:
+def power_of_maps(planes: Planes, numbers: Sequence[int], edges: Sequence[int]) -> Float:
     """C_l / theory [plane, band] of the catalogue's own maps."""
     rows = []
     for number in numbers:
         ring = hp.reorder(planes.maps[number][:, lensing.KAPPA].astype(float), n2r=True)
-        rows.append(bands(hp.anafast(ring, lmax=edges[-1], iter=0), float(planes.chi[number]), edges))
+        rows.append(band_ratio(hp.anafast(ring, lmax=edges[-1], iter=0), float(planes.chi[number]), edges))
     return np.array(rows)
 
 
-def sight_rms(box: Box, redshifts: Sequence[float]) -> list[tuple[float, float]]:
+def line_of_sight_rms(box: Box, redshifts: Sequence[float]) -> list[tuple[float, float]]:
     """rms of the convergence along lines of sight through cells of the box, and what linear theory gives such cells."""
     chosen, chi = lensing.settings(), np.asarray(cosmology.comoving_distance(np.array(redshifts)))
     direction = np.stack(hp.pix2vec(_SIGHT_NSIDE, np.arange(12 * _SIGHT_NSIDE**2), nest=True)).astype(np.float32)
     kappa = convergence.convergence(box, direction, hp.nside2resol(_SIGHT_NSIDE), chi, 1, chosen.stretch)
     k = np.geomspace(1e-3, 2.0 * np.pi, 300)
     power = density_box.linear_power(k) * convergence.window(box.model.cell, 1, k)
-    inside, found = np.trapezoid(k * power / (2 * np.pi), k), []
-    for plane, far in zip(kappa, chi, strict=True):
-        x = _distances(float(far))
-        weight = theories.lensing_weight(x, np.array([far]), np.ones(1)) * density_box.growth(cosmology.redshift(x))
-        found.append((float(plane.std(dtype=float)), float(np.sqrt(np.trapezoid(weight**2, x) * inside))))
-    return found
+    inside, rms_values = np.trapezoid(k * power / (2 * np.pi), k), []
+    for plane, source_chi in zip(kappa, chi, strict=True):
+        x = _distances(float(source_chi))
+        weight = theories.lensing_weight(x, np.array([source_chi]), np.ones(1)) * density_box.growth(
+            cosmology.redshift(x)
+        )
+        rms_values.append((float(plane.std(dtype=float)), float(np.sqrt(np.trapezoid(weight**2, x) * inside))))
+    return rms_values
 
 
 def skipping_rms(box: Box, redshift: float, step: float) -> float:
     """rms of the sums over single cells every `step` Mpc/h, as if each stood for all between: too large."""
-    far, width = float(cosmology.comoving_distance(redshift)), 0.5 * step
+    source_chi, width = float(cosmology.comoving_distance(redshift)), 0.5 * step
     direction = np.stack(hp.pix2vec(_SIGHT_NSIDE // 2, np.arange(3 * _SIGHT_NSIDE**2), nest=True), 1)
-    turned, kappa = lightcone.replicas(box, far), np.zeros(len(direction))
-    for chi in np.arange(width, far, step):
+    box_replicas, kappa = lightcone.draw_replicas(box, source_chi), np.zeros(len(direction))
+    for chi in np.arange(width, source_chi, step):
         z = cosmology.redshift(chi)
         growths = np.full(len(direction), density_box.growth(z))
-        place, _ = lightcone.box_cells(box, turned, direction, np.full(len(direction), chi))
-        lens = float(theories.lensing_weight(np.array([chi]), np.array([far]), np.ones(1))[0])
+        place, _ = lightcone.box_cells(box, box_replicas, direction, np.full(len(direction), chi))
+        lens = float(theories.lensing_weight(np.array([chi]), np.array([source_chi]), np.ones(1))[0])
         kappa += step * lens * density_box.overdensity(box, place, growths)
     return float(kappa.std())
 
@@ -129,11 +131,11 @@ def map_rms(chi: float, l_max: int) -> float:
     """rms that linear theory gives a map to that multipole."""
     ell = np.arange(2, l_max + 1)
     nodes = np.unique(np.geomspace(2, l_max, 80).astype(int))
-    power = np.exp(np.interp(np.log(ell), np.log(nodes), np.log(theory(nodes.astype(float), chi))))
+    power = np.exp(np.interp(np.log(ell), np.log(nodes), np.log(linear_theory(nodes.astype(float), chi))))
     return float(np.sqrt(np.sum((2 * ell + 1) / (4 * np.pi) * power)))
 
 
-def maps(planes: Planes, number: int, name: str) -> dict[str, float]:
+def map_statistics(planes: Planes, number: int, name: str) -> dict[str, float]:
     """Moments of one plane's maps, and the share of B modes."""
     fields, chi, l_max = planes.maps[number], float(planes.chi[number]), int(lensing.settings().l_max * planes.nside)
     kappa = fields[:, lensing.KAPPA].astype(float)
@@ -152,18 +154,18 @@ def maps(planes: Planes, number: int, name: str) -> dict[str, float]:
     }
 
 
-def tangential(planes: Planes, halos: Tracers, chi: float) -> tuple[Float, Float]:
+def tangential_shear(planes: Planes, halos: Tracers, chi: float) -> tuple[Float, Float]:
     """Mean tangential shear[ring] of sources at chi about halos, and its error."""
     mean, error = [], []
     for radius in RINGS:
-        around = np.zeros(halos.ra.size)
+        shear_sum = np.zeros(halos.ra.size)
         for turn in 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS:
             east, north = radius * np.sin(turn), radius * np.cos(turn)
             offset = np.radians(np.full((2, halos.ra.size), [[east], [north]]))
-            ra, dec = lensing.displaced(halos.ra, halos.dec, *offset)
-            found = lensing.at(planes, ra, dec, np.full(ra.size, chi))
+            ra, dec = lensing.displace(halos.ra, halos.dec, *offset)
+            lens_values = lensing.interpolate(planes, ra, dec, np.full(ra.size, chi))
             # Position angle from north to east; gamma1 > 0 is north-south.
-            around += found[1] * np.cos(2 * turn) - found[2] * np.sin(2 * turn)
-        mean.append(np.mean(around) / _DIRECTIONS)
-        error.append(np.std(around) / _DIRECTIONS / np.sqrt(around.size))
+            shear_sum += lens_values[1] * np.cos(2 * turn) - lens_values[2] * np.sin(2 * turn)
+        mean.append(np.mean(shear_sum) / _DIRECTIONS)
+        error.append(np.std(shear_sum) / _DIRECTIONS / np.sqrt(shear_sum.size))
     return np.array(mean), np.array(error)

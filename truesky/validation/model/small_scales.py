@@ -25,18 +25,18 @@ from truesky.validation.model import clustering
 
 # Projected separations, Mpc/h; the galaxies' redshifts and luminosities; the power law's length, Mpc/h, and slope.
 EDGES = np.array([0.04, 0.16, 0.32, 1.28, 5.12])
-NEAR, FAR, BRIGHT = 0.4, 0.6, -20.0
+Z_MIN, Z_MAX, MAX_ABS_MAG = 0.4, 0.6, -20.0
 LENGTH, SLOPE = 5.5, 1.8
 ORDER = 5
 # Random points of a cell, and bins of distance.
 _RANDOM, _BINS = 20_000, 40
 
 
-def universe_of(seed: int, box_cells: int) -> Population:
+def galaxy_population(seed: int, box_cells: int) -> Population:
     """Halos with galaxies as bright as that; seed, box_cells : of the box."""
     matched = luminosity_function.inverse(luminosity_function.schechter(), matching.Z_LAST)
-    space = Volume(NEAR - 0.05, FAR + 0.05, BRIGHT)
-    return population.model(seed, box_cells, space, matched, lambda z: np.full(np.size(z), BRIGHT))
+    space = Volume(Z_MIN - 0.05, Z_MAX + 0.05, MAX_ABS_MAG)
+    return population.model(seed, box_cells, space, matched, lambda z: np.full(np.size(z), MAX_ABS_MAG))
 
 
 def figures(universe: Population, count: int) -> dict[str, float]:
@@ -44,22 +44,22 @@ def figures(universe: Population, count: int) -> dict[str, float]:
 
     universe : of `universe_of`;  count : order-5 cells, spread over the sky
     """
-    low, high = (float(cosmology.comoving_distance(z)) for z in (NEAR, FAR))
+    low, high = (float(cosmology.comoving_distance(z)) for z in (Z_MIN, Z_MAX))
     theta = EDGES / (0.75 * (high**4 - low**4) / (high**3 - low**3))
     cells = ((np.arange(count) + 0.31) * (12 << 2 * ORDER) / count).astype(int).tolist()
-    found_pairs, chance, number, chi = np.zeros((count, 4)), np.zeros((count, 4)), np.zeros(count), []
+    pair_counts, chance, number, chi = np.zeros((count, 4)), np.zeros((count, 4)), np.zeros(count), []
     for row, cell in enumerate(cells):
-        found = clustering.tracers(universe, ORDER, cell)
-        z = universe.halos.distances.redshift(found.chi)
-        bright = universe.halos.matching.magnitude(z, found.proxy) < BRIGHT
-        found = found.part(bright & (found.chi > low) & (found.chi < high))
-        number[row] = found.chi.size
-        chi.append(found.chi)
-        found_pairs[row] = _pairs(found.ra, found.dec, theta)
+        sample = clustering.draw_tracers(universe, ORDER, cell)
+        z = universe.halos.distances.redshift(sample.chi)
+        bright = universe.halos.matching.magnitude(z, sample.proxy) < MAX_ABS_MAG
+        sample = sample.select(bright & (sample.chi > low) & (sample.chi < high))
+        number[row] = sample.chi.size
+        chi.append(sample.chi)
+        pair_counts[row] = _count_pairs(sample.ra, sample.dec, theta)
         _, ra, dec = sky.random_in_cell(ORDER, cell, _RANDOM, stream(universe.seed, "small_scales", cell))
-        chance[row] = _pairs(ra, dec, theta) / _RANDOM**2
+        chance[row] = _count_pairs(ra, dec, theta) / _RANDOM**2
     expected = chance.mean(0) * number.mean() ** 2
-    ratio = (found_pairs / expected - 1.0) / power_law(np.concatenate(chi), theta)
+    ratio = (pair_counts / expected - 1.0) / power_law(np.concatenate(chi), theta)
     names = [f"w_m20_{edge:g}" for edge in EDGES[:-1]]
     error = ratio.std(0, ddof=1) / np.sqrt(count)
     return {
@@ -68,10 +68,10 @@ def figures(universe: Population, count: int) -> dict[str, float]:
     }
 
 
-def _pairs(ra: Float, dec: Float, theta: Float) -> Float:
+def _count_pairs(ra: Float, dec: Float, theta: Float) -> Float:
     """Ordered pairs in each bin of separation, edges theta in rad."""
     same = np.zeros(ra.size, np.int64)
-    return np.asarray(2.0 * pairs.counted(sky.unit_vectors(ra, dec), same, same, theta).total[0])
+    return np.asarray(2.0 * pairs.count_pairs(sky.unit_vectors(ra, dec), same, same, theta).total[0])
 
 
 def power_law(chi: Float, theta: Float) -> Float:

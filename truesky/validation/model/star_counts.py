@@ -41,7 +41,7 @@ DWARFS = {30: (62, 267, 458, 6, 60, 330), 60: (32, 81, 105, 5, 35, 116), 90: (25
 PARALLAX = {15.0: 0.037, 17.0: 0.098, 20.0: 0.765}
 
 
-def around(b: float, cells: int, south: bool = False) -> list[int]:
+def cells_at_latitude(b: float, cells: int, south: bool = False) -> list[int]:
     """Generation cells at Galactic latitude b, evenly in longitude; with `south`, every other one at -b.
 
     The Sun stands north of the plane, so that there are more stars in the south.
@@ -49,7 +49,7 @@ def around(b: float, cells: int, south: bool = False) -> list[int]:
     lon = np.arange(cells) * 360.0 / cells
     # At a pole the parallel is too short for them.
     lat = np.minimum(b, 89.9 - 0.1 * np.arange(cells)) * np.where(south & (np.arange(cells) % 2 == 1), -1.0, 1.0)
-    return sorted({int(cell) for cell in sky.cell_of(*sky.equatorial(lon, lat), GENERATION_ORDER)})
+    return sorted({int(cell) for cell in sky.cell_at(*sky.equatorial(lon, lat), GENERATION_ORDER)})
 
 
 def counts(b: float, cells: int, universe: stars.StarModel, dust: Float32) -> Float:
@@ -58,29 +58,33 @@ def counts(b: float, cells: int, universe: stars.StarModel, dust: Float32) -> Fl
     b        : Galactic latitude, deg;  cells : that are drawn there
     universe : the model of stars;  dust : float32[pixel] map of A(V), mag
     """
-    drawn, total = around(b, cells), np.zeros(len(LIMITS))
+    drawn, total = cells_at_latitude(b, cells), np.zeros(len(LIMITS))
     for cell in drawn:
         rows = stars.draw(cell, SEED, universe, dust)
         stage = rows["stage"].fill_null(0).to_numpy()
-        wanted = rows["companion_of"].is_null().to_numpy() & ~np.isin(stage, (WHITE_DWARF, BROWN_DWARF))
-        h = rows["mag_h"].to_numpy()[wanted]
+        selected = rows["companion_of"].is_null().to_numpy() & ~np.isin(stage, (WHITE_DWARF, BROWN_DWARF))
+        h = rows["mag_h"].to_numpy()[selected]
         total += [np.sum(h < limit) for limit in LIMITS]
     return np.asarray(total / (len(drawn) * AREA))
 
 
 def absolute_v(universe: stars.StarModel) -> Float:
     """M_V[n] of the stretches of isochrones and of white dwarfs that stars are drawn on, in their middles."""
-    galaxy, own = universe.galaxy, universe.galaxy.pieces
-    metals = np.where(own.track < 0, 0.0, galaxy.tracks.metallicity[own.track])
-    teff, log_g = 10.0 ** own.log_teff.mean(0), own.log_g.mean(0)
-    found = model_stars.mixture(universe.types, universe.models, teff, log_g, metals)
-    lot = {
-        f"{name}_{k + 1}": values[k] for name, values in (("sed", found.sed), ("frac", found.frac)) for k in range(4)
+    galaxy, pieces = universe.galaxy, universe.galaxy.pieces
+    metals = np.where(pieces.track < 0, 0.0, galaxy.tracks.metallicity[pieces.track])
+    teff, log_g = 10.0 ** pieces.log_teff.mean(0), pieces.log_g.mean(0)
+    mixture = model_stars.mixture(universe.types, universe.models, teff, log_g, metals)
+    star_columns = {
+        f"{name}_{k + 1}": values[k]
+        for name, values in (("sed", mixture.sed), ("frac", mixture.frac))
+        for k in range(4)
     }
-    return stars.mag_v(universe, lot | {"sed": found.sed[0], "mag_h": own.m_h.mean(0), "a_v": np.zeros(teff.size)})
+    return stars.mag_v(
+        universe, star_columns | {"sed": mixture.sed[0], "mag_h": pieces.m_h.mean(0), "a_v": np.zeros(teff.size)}
+    )
 
 
-def brighter(
+def count_brighter(
     universe: stars.StarModel, place: tuple[float, float], limits: Sequence[float], a_v: Float | None = None
 ) -> Float:
     """Single stars and primaries deg-2 to expect brighter than V (Vega), [limit].
@@ -93,37 +97,39 @@ def brighter(
         absolute_v(universe),
         np.searchsorted(galaxy.first[:, 0], np.arange(galaxy.pieces.number.size), "right") - 1,
     )
-    r, z, azimuth = milky_way.cylindrical(galaxy, *place, milky_way.middles(galaxy))
-    volume, total = milky_way.volumes(galaxy, 1.0), np.zeros(len(limits))
-    far = 5.0 * np.log10(galaxy.distance) - 5.0 + (0.0 if a_v is None else np.append(a_v, a_v[-1]))
+    r, z, azimuth = milky_way.cylindrical(galaxy, *place, milky_way.shell_distances(galaxy))
+    volume, total = milky_way.shell_volumes(galaxy, 1.0), np.zeros(len(limits))
+    distance_modulus = 5.0 * np.log10(galaxy.distance) - 5.0 + (0.0 if a_v is None else np.append(a_v, a_v[-1]))
     for k, component in enumerate(galaxy.components):
         inside = np.append(0.0, np.cumsum(density(component.law, galaxy.sun, r, z, azimuth) * volume))
-        own = owner == k
+        in_component = owner == k
         for i, limit in enumerate(limits):
-            total[i] += (galaxy.pieces.number[own] * np.interp(limit - m_v[own], far, inside)).sum()
+            total[i] += (
+                galaxy.pieces.number[in_component] * np.interp(limit - m_v[in_component], distance_modulus, inside)
+            ).sum()
     return total
 
 
-def whole_sky(universe: stars.StarModel, limit: float, dust: Float32, step: int) -> float:
+def count_whole_sky(universe: stars.StarModel, limit: float, dust: Float32, step: int) -> float:
     """Single stars and primaries of the whole sky to expect brighter than V, behind the dust, from every step-th cell.
 
     universe : the model of stars;  limit : V, mag;  dust : float32[pixel] map of A(V), mag;  step : of order-4 cells
     """
     cells, total = np.arange(step // 2, 12 << 2 * _SKY_ORDER, step), 0.0
-    distance = milky_way.middles(universe.galaxy)
+    distance = milky_way.shell_distances(universe.galaxy)
     for ra, dec in zip(*sky.cell_centres(_SKY_ORDER, cells), strict=True):
         lon, lat = sky.galactic([ra], [dec])
-        far = dust_map.a_v(dust, np.array([ra]), np.array([dec]))
-        a_v = dust_map.a_v_at(far, distance, lat, universe.layer, universe.sin_b_min)
-        total += float(brighter(universe, (float(lon[0]), float(lat[0])), [limit], a_v)[0])
+        total_a_v = dust_map.a_v(dust, np.array([ra]), np.array([dec]))
+        a_v = dust_map.a_v_at(total_a_v, distance, lat, universe.layer, universe.sin_b_min)
+        total += float(count_brighter(universe, (float(lon[0]), float(lat[0])), [limit], a_v)[0])
     return total * sky.cell_area(_SKY_ORDER) * (12 << 2 * _SKY_ORDER) / cells.size
 
 
 def dwarf_counts(b: float, area: float) -> Float:
     """L and T dwarfs drawn deg-2 at a latitude, as in DWARFS: one draw over so many deg2, without dust."""
     galaxy, dwarfs, types = milky_way.milky_way(), brown_dwarfs.brown_dwarfs(1.0), spectra_of_dwarfs.templates()
-    found = brown_dwarfs.draw(dwarfs, galaxy, 90.0, b, area, 28.0, stream(SEED, "benchmark", int(b)))
-    j = types.abs_mag_j[found.template] + 5.0 * np.log10(found.distance) - 5.0
-    is_t = types.subtype[found.template] >= 10
+    drawn = brown_dwarfs.draw(dwarfs, galaxy, 90.0, b, area, 28.0, stream(SEED, "benchmark", int(b)))
+    j = types.abs_mag_j[drawn.template] + 5.0 * np.log10(drawn.distance) - 5.0
+    is_t = types.subtype[drawn.template] >= 10
     total = [np.sum(~is_t & (j < m)) for m in (22, 24, 26)] + [np.sum(is_t & (j < m)) for m in (22, 24, 26)]
     return np.array(total) / area

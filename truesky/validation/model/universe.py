@@ -35,7 +35,7 @@ SEED = 7
 POWER_EDGES = np.array([0.02, 0.05, 0.10, 0.15, 0.20])
 BIASES, BIAS_EDGES = (0.7, 1.0, 1.4, 2.0, 2.9), np.array([0.03, 0.10])
 # Of the sample whose clustering is measured: redshifts, and log10 of the least halo and proxy mass.
-NEAR, FAR, LOG_MASS = 0.4, 0.8, 12.0
+Z_MIN, Z_MAX, MIN_LOG_MASS = 0.4, 0.8, 12.0
 WIDE_EDGES, NARROW_EDGES = np.array([0.3, 0.5, 0.7, 1.0, 1.5]), np.array([0.03, 0.05, 0.08, 0.13, 0.2, 0.3])
 TRACERS = ("halos", "galaxies")
 BANDS = (30, 64, 128, 256, 384, 512)
@@ -51,7 +51,7 @@ K_CORRECTIONS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Size:
+class SampleSize:
     """How much is drawn.
 
     settings : of the universe;  blocks : of 4^side_order generation cells;  deep : blocks of one cell to I_E < 28
@@ -63,16 +63,16 @@ class Size:
     settings: Universe
     blocks: int
     side_order: int
-    deep: int
-    wide: int
-    near: int
-    pixels: int
-    boxes: tuple[int, ...]
-    stars: int
+    deep_blocks: int
+    wide_blocks: int
+    nearby_blocks: int
+    halo_cells: int
+    box_seeds: tuple[int, ...]
+    star_cells: int
 
 
-FULL = Size(Universe(), 160, 0, 8, 20, 3, 16, (8, 9), 12)
-QUICK = Size(Universe(box_cells=192, lensing_nside=64), 4, 0, 0, 2, 0, 0, (), 0)
+FULL = SampleSize(Universe(), 160, 0, 8, 20, 3, 16, (8, 9), 12)
+QUICK = SampleSize(Universe(box_cells=192, lensing_nside=64), 4, 0, 0, 2, 0, 0, (), 0)
 
 
 # ------------------------------------------------------------------------------------------------ figures
@@ -85,130 +85,149 @@ def theory() -> dict[str, float]:
     window = 3.0 * (np.sin(x) - x * np.cos(x)) / x**3
     variance = np.trapezoid(density_box.linear_power(k) * window**2 * k**3 / (2 * np.pi**2), np.log(k))
     figures = {"sigma_8": float(np.sqrt(variance)), "chi_2.3": float(cosmology.comoving_distance(2.3))}
-    wavelength, kinds = rest_grid.rest_grid(), list(K_CORRECTIONS["sdss_r01"])
+    wavelength, template_numbers = rest_grid.rest_grid(), list(K_CORRECTIONS["sdss_r01"])
     # The numbers are of the observed spectra with their weak lines, which the library bridges.
-    flux = templates.galaxies(wavelength, bridged=-1.0)[kinds].astype(np.float32)
-    library = templates.Library(wavelength, flux, tuple(map(str, kinds)))
-    z, none = np.array(K_REDSHIFTS), np.zeros(len(K_REDSHIFTS), int)
+    flux = templates.galaxy_spectra(wavelength, bridge_width=-1.0)[template_numbers].astype(np.float32)
+    library = templates.Library(wavelength, flux, tuple(map(str, template_numbers)))
+    z, zeros = np.array(K_REDSHIFTS), np.zeros(len(K_REDSHIFTS), int)
     for band, published in K_CORRECTIONS.items():
         table = band_ratios.build(library, band, 2.3, 0.5)
         for row, (kind, expected) in enumerate(published.items()):
-            found = -2.5 / np.log(10.0) * band_ratios.ln_ratio(table, z, none + row, none, np.zeros(z.size))
-            off = found - np.array(expected)
-            figures[f"k_{band}_t{kind}_off"] = float(off[np.abs(off).argmax()])
+            k_correction = -2.5 / np.log(10.0) * band_ratios.ln_ratio(table, z, zeros + row, zeros, np.zeros(z.size))
+            offset = k_correction - np.array(expected)
+            figures[f"k_{band}_t{kind}_off"] = float(offset[np.abs(offset).argmax()])
     return figures
 
 
-def matter(size: Size) -> dict[str, float]:
+def matter(size: SampleSize) -> dict[str, float]:
     """Power and bias of the box, velocities."""
     cells = size.settings.box_cells
     box = density_box.load(SEED, cells)
-    boxes = [box, *(shear.gaussian_box(seed, cells) for seed in size.boxes)]
+    boxes = [box, *(shear.gaussian_box(seed, cells) for seed in size.box_seeds)]
     figures = {}
-    if size.boxes:
+    if size.box_seeds:
         power = np.array([clustering.box_power(box, POWER_EDGES) for box in boxes])
-        figures = _named("box_power_k{:.2f}", POWER_EDGES, power.mean(0), power.std(0, ddof=1) / np.sqrt(len(boxes)))
+        figures = _figures_by_edge(
+            "box_power_k{:.2f}", POWER_EDGES, power.mean(0), power.std(0, ddof=1) / np.sqrt(len(boxes))
+        )
     bias = clustering.halo_bias(box, BIASES, BIAS_EDGES)[:, 0]
     figures |= {f"halo_bias_x{x}": float(value) for x, value in zip(BIASES, bias, strict=True)}
     masses = matching.masses()
-    of_12 = float(masses.at(masses.bias, np.zeros(1), np.full(1, 12.0))[0])
-    return figures | {"velocity_rms": clustering.velocities(box, of_12)}
+    of_12 = float(masses.interpolate_pairs(masses.bias, np.zeros(1), np.full(1, 12.0))[0])
+    return figures | {"velocity_rms": clustering.velocity_rms(box, of_12)}
 
 
-def _named(pattern: str, edges: Sequence[float] | Float, values: Float, errors: Float) -> dict[str, float]:
+def _figures_by_edge(pattern: str, edges: Sequence[float] | Float, values: Float, errors: Float) -> dict[str, float]:
     names = [pattern.format(edge) for edge in edges[:-1]]
     figures = {name: float(value) for name, value in zip(names, values, strict=True)}
     return figures | {f"{name}_error": float(value) for name, value in zip(names, errors, strict=True)}
 
 
-def published_halos() -> Callable[[float, float], float]:
+def mass_function() -> Callable[[float, float], float]:
     """Halos above a mass at z, (Mpc/h)^-3: the mass function itself, without what the draw makes of it."""
     masses = matching.masses()
 
-    def number(least: float, z: float) -> float:
-        log_mass = np.linspace(least, 16.0, 501)
+    def number(min_log_mass: float, z: float) -> float:
+        log_mass = np.linspace(min_log_mass, 16.0, 501)
         ln_density = masses.interpolate(masses.ln_density, np.array([z]), log_mass)[0]
         return float(np.trapezoid(np.exp(ln_density), log_mass))
 
     return number
 
 
-def counted(size: Size) -> tuple[dict[str, float], census.Census]:
+def count_galaxies(size: SampleSize) -> tuple[dict[str, float], census.Census]:
     """Everything that the galaxies of small blocks tell."""
     universe = galaxies.model(SEED, size.settings)
     dust, law = dust_map.load(SEED), luminosity_function.schechter()
-    seen = census.draw(universe, dust, census.blocks(size.blocks, size.side_order))
-    figures = {"galaxies": float(seen.block.size), "galaxies_deg2": seen.area}
-    figures |= census.counts(seen) | census.colours(seen) | census.sizes(seen) | census.halpha(seen)
-    figures |= observed.figures(observed.of_columns(seen.rows, seen.area))
-    figures |= census.halos(seen, published_halos()) | census.luminosities(seen, law, 0.0, 1.5)
-    if size.deep:
+    sample = census.draw(universe, dust, census.blocks(size.blocks, size.side_order))
+    figures = {"galaxies": float(sample.block.size), "galaxies_deg2": sample.area}
+    figures |= census.counts(sample) | census.colours(sample) | census.sizes(sample) | census.halpha(sample)
+    figures |= observed.figures(observed.from_columns(sample.rows, sample.area))
+    figures |= census.halos(sample, mass_function()) | census.luminosities(sample, law, 0.0, 1.5)
+    if size.deep_blocks:
         deep = galaxies.model(SEED, replace(size.settings, galaxy_limit=28.0))
-        far = census.draw(deep, dust, census.blocks(size.deep, 0))
-        figures |= census.luminosities(far, law, 1.5, 2.3)
-    return figures, seen
+        deep_sample = census.draw(deep, dust, census.blocks(size.deep_blocks, 0))
+        figures |= census.luminosities(deep_sample, law, 1.5, 2.3)
+    return figures, sample
 
 
-def compared(
-    found: clustering.Correlation, of: Shells, power: Callable[[Float], Float]
+def compare_with_limber(
+    measured: clustering.Correlation, tracer_shells: Shells, power: Callable[[Float], Float]
 ) -> tuple[Float, Float, Float, Float]:
     """theta, w, its error, and Limber's: the mean of a block takes as much from what is found as from that."""
-    expected, left = clustering.limber(of, found, power)
-    return found.theta, found.w + expected - left, found.error, expected
+    expected, mean_subtracted = clustering.limber(tracer_shells, measured, power)
+    return measured.theta, measured.w + expected - mean_subtracted, measured.error, expected
 
 
-def clustered(size: Size) -> tuple[dict[str, float], dict[str, Any], clustering.Tracers]:
+def measure_clustering(size: SampleSize) -> tuple[dict[str, float], dict[str, Any], clustering.Tracers]:
     """w(theta) of halos and of galaxies over Limber's, all boxes together; the curves; the halos of the first box."""
-    many, seeds = 12 << 2 * clustering.BLOCK_ORDER, (SEED, *size.boxes)
-    cells = ((np.arange(size.wide) + 0.37) * many / size.wide).astype(int).tolist()
-    whole, pieces, curves = [], [], {}
+    n_blocks, seeds = 12 << 2 * clustering.BLOCK_ORDER, (SEED, *size.box_seeds)
+    cells = ((np.arange(size.wide_blocks) + 0.37) * n_blocks / size.wide_blocks).astype(int).tolist()
+    wide_samples, narrow_samples, curves = [], [], {}
     figures: dict[str, float] = {}
     for seed in seeds:
         # The boxes of other seeds are not kept.
-        with nullcontext() if seed == SEED else cache.temporary():
-            universe = clustering.population_above(seed, size.settings.box_cells, NEAR, FAR, LOG_MASS)
+        with nullcontext() if seed == SEED else cache.use_temporary_dir():
+            universe = clustering.population_above(seed, size.settings.box_cells, Z_MIN, Z_MAX, MIN_LOG_MASS)
             for cell in cells:
-                one = clustering.tracers(universe, clustering.BLOCK_ORDER, cell)
-                kinds = (one.part(~one.satellite & (one.log_mass > LOG_MASS)), one.part(one.proxy > LOG_MASS))
-                whole.append((cell, kinds))
-                pieces.append((cell << 2 * (clustering.PIECE_ORDER - clustering.BLOCK_ORDER), kinds))
-    seen = [clustering.shells(clustering.joined([kinds[i] for _, kinds in whole]), NEAR, FAR) for i in range(2)]
-    for given, order, edges in (
-        (whole, clustering.BLOCK_ORDER, WIDE_EDGES),
-        (pieces, clustering.PIECE_ORDER, NARROW_EDGES),
+                sample = clustering.draw_tracers(universe, clustering.BLOCK_ORDER, cell)
+                samples = (
+                    sample.select(~sample.satellite & (sample.log_mass > MIN_LOG_MASS)),
+                    sample.select(sample.proxy > MIN_LOG_MASS),
+                )
+                wide_samples.append((cell, samples))
+                narrow_samples.append((cell << 2 * (clustering.PIECE_ORDER - clustering.BLOCK_ORDER), samples))
+    shells_by_kind = [
+        clustering.shells(clustering.concatenate([samples[i] for _, samples in wide_samples]), Z_MIN, Z_MAX)
+        for i in range(2)
+    ]
+    for samples_by_cell, order, edges in (
+        (wide_samples, clustering.BLOCK_ORDER, WIDE_EDGES),
+        (narrow_samples, clustering.PIECE_ORDER, NARROW_EDGES),
     ):
-        for name, of, found in zip(TRACERS, seen, clustering.correlation(given, order, edges), strict=True):
-            theta, w, error, expected = compared(found, of, density_box.linear_power)
+        for name, tracer_shells, measured in zip(
+            TRACERS, shells_by_kind, clustering.correlation(samples_by_cell, order, edges), strict=True
+        ):
+            theta, w, error, expected = compare_with_limber(measured, tracer_shells, density_box.linear_power)
             curves[f"{name}_{'wide' if edges is WIDE_EDGES else 'narrow'}"] = (theta, w, error, expected)
-            figures |= _named(f"w_{name}_{{:g}}", edges, w / expected, error / expected)
+            figures |= _figures_by_edge(f"w_{name}_{{:g}}", edges, w / expected, error / expected)
     maps = []
     for seed in seeds:
         box = shear.gaussian_box(seed, size.settings.box_cells)
-        maps += [(cell, (clustering.structure(box, clustering.BLOCK_ORDER, cell, seen[0]),)) for cell in cells]
-    (found,) = clustering.correlation(maps, clustering.BLOCK_ORDER, WIDE_EDGES)
-    _, w, error, expected = compared(found, seen[0], clustering.gaussian_power)
-    figures |= _named("w_structure_{:g}", WIDE_EDGES, w / expected, error / expected)
+        maps += [
+            (cell, (clustering.projected_field(box, clustering.BLOCK_ORDER, cell, shells_by_kind[0]),))
+            for cell in cells
+        ]
+    (measured,) = clustering.correlation(maps, clustering.BLOCK_ORDER, WIDE_EDGES)
+    _, w, error, expected = compare_with_limber(measured, shells_by_kind[0], clustering.gaussian_power)
+    figures |= _figures_by_edge("w_structure_{:g}", WIDE_EDGES, w / expected, error / expected)
     for name in TRACERS:
         for edge in WIDE_EDGES[:-1]:
-            alone = figures[f"w_structure_{edge:g}"]
-            figures[f"w_{name}_{edge:g}_to_structure"] = figures[f"w_{name}_{edge:g}"] / alone
-    figures["clustering_deg2"] = len(whole) * sky.cell_area(clustering.BLOCK_ORDER)
-    return figures, curves, clustering.joined([kinds[0] for _, kinds in whole[: size.wide]])
+            structure_ratio = figures[f"w_structure_{edge:g}"]
+            figures[f"w_{name}_{edge:g}_to_structure"] = figures[f"w_{name}_{edge:g}"] / structure_ratio
+    figures["clustering_deg2"] = len(wide_samples) * sky.cell_area(clustering.BLOCK_ORDER)
+    return figures, curves, clustering.concatenate([samples[0] for _, samples in wide_samples[: size.wide_blocks]])
 
 
-def abundances(size: Size) -> dict[str, float]:
+def abundances(size: SampleSize) -> dict[str, float]:
     """Halos above a mass / the mass function, in thin shells of order-5 cells; the error from their scatter."""
-    number, cells = published_halos(), ((np.arange(size.pixels) + 0.43) * (12 << 10) / size.pixels).astype(int).tolist()
+    number, cells = (
+        mass_function(),
+        ((np.arange(size.halo_cells) + 0.43) * (12 << 10) / size.halo_cells).astype(int).tolist(),
+    )
     figures, area = {}, sky.cell_area(5) * np.radians(1.0) ** 2
     for at, half in census.HALO_SHELLS:
         universe = clustering.population_above(
             SEED, size.settings.box_cells, at - half, at + half, census.HALO_MASSES[0]
         )
-        found = [clustering.tracers(universe, 5, cell) for cell in cells]
+        samples = [clustering.draw_tracers(universe, 5, cell) for cell in cells]
         volume = float(cosmology.comoving_volume(at - half, at + half)) * area
-        for least in census.HALO_MASSES:
-            each = [np.sum(~one.satellite & (one.log_mass > least)) / volume / number(least, at) for one in found]
-            name = f"halos_{least:g}_z{at}"
+        for min_log_mass in census.HALO_MASSES:
+            each = [
+                np.sum(~sample.satellite & (sample.log_mass > min_log_mass)) / volume / number(min_log_mass, at)
+                for sample in samples
+            ]
+            name = f"halos_{min_log_mass:g}_z{at}"
             figures[name], figures[f"{name}_error"] = (
                 float(np.mean(each)),
                 float(np.std(each, ddof=1) / len(each) ** 0.5),
@@ -216,72 +235,75 @@ def abundances(size: Size) -> dict[str, float]:
     return figures
 
 
-def nearby(size: Size) -> dict[str, float]:
+def nearby_satellites(size: SampleSize) -> dict[str, float]:
     """Satellites of M_r < -20 at z = 0.1, SDSS's limit of volume."""
     universe = clustering.population_above(SEED, size.settings.box_cells, 0.05, 0.15, 11.8)
-    cells = ((np.arange(size.near) + 0.4) * 192 / size.near).astype(int).tolist()
-    found = clustering.joined([clustering.tracers(universe, 2, cell) for cell in cells])
-    z = universe.halos.distances.redshift(found.chi)
-    bright = universe.halos.matching.magnitude(z, found.proxy) < -20.0
-    share = float(np.mean(found.satellite[bright]))
+    cells = ((np.arange(size.nearby_blocks) + 0.4) * 192 / size.nearby_blocks).astype(int).tolist()
+    sample = clustering.concatenate([clustering.draw_tracers(universe, 2, cell) for cell in cells])
+    z = universe.halos.distances.redshift(sample.chi)
+    bright = universe.halos.matching.magnitude(z, sample.proxy) < -20.0
+    share = float(np.mean(sample.satellite[bright]))
     return {"satellites_m20_z0.1": share, "satellites_m20_z0.1_number": float(bright.sum())}
 
 
-def lensed(size: Size, halos: clustering.Tracers) -> tuple[dict[str, float], Float]:
+def measure_lensing(size: SampleSize, halos: clustering.Tracers) -> tuple[dict[str, float], Float]:
     """Maps, their power in several boxes, shear about halos; C_l over theory [plane, band]."""
     cells, nside = size.settings.box_cells, size.settings.lensing_nside
     box = density_box.load(SEED, cells)
-    planes = lensing.load(box, nside, far=True)
+    planes = lensing.load(box, nside, with_far_planes=True)
     figures: dict[str, float] = {}
     for number, z in PLANES:
-        figures |= shear.maps(planes, number, f"z{z}")
-    heavy = halos.part(halos.log_mass > 13.5)
-    mean, error = shear.tangential(planes, heavy, float(cosmology.comoving_distance(1.2)))
-    for radius, value, wrong in zip(shear.RINGS, mean, error, strict=True):
-        figures[f"gamma_t_{radius}deg"], figures[f"gamma_t_{radius}deg_in_errors"] = float(value), float(value / wrong)
-    if not size.boxes:
+        figures |= shear.map_statistics(planes, number, f"z{z}")
+    heavy = halos.select(halos.log_mass > 13.5)
+    mean, error = shear.tangential_shear(planes, heavy, float(cosmology.comoving_distance(1.2)))
+    for radius, value, value_error in zip(shear.RINGS, mean, error, strict=True):
+        figures[f"gamma_t_{radius}deg"], figures[f"gamma_t_{radius}deg_in_errors"] = (
+            float(value),
+            float(value / value_error),
+        )
+    if not size.box_seeds:
         return figures, np.ones((0, 0))
-    for z, (rms, linear) in zip(SIGHTS, shear.sight_rms(box, SIGHTS), strict=True):
+    for z, (rms, linear) in zip(SIGHTS, shear.line_of_sight_rms(box, SIGHTS), strict=True):
         figures |= {f"kappa_sight_rms_z{z}": rms, f"kappa_sight_rms_z{z}_to_theory": rms / linear}
         figures[f"kappa_skipping_rms_z{z}"] = shear.skipping_rms(box, z, SKIPPING)
-    found = np.stack(
-        [shear.power_of(planes, [number for number, _ in PLANES], BANDS)]
-        + [shear.power_of_box(seed, cells, nside, [z for _, z in PLANES], BANDS) for seed in size.boxes]
+    ratios = np.stack(
+        [shear.power_of_maps(planes, [number for number, _ in PLANES], BANDS)]
+        + [shear.power_of_box(seed, cells, nside, [z for _, z in PLANES], BANDS) for seed in size.box_seeds]
     )
     for plane, (_, z) in enumerate(PLANES):
-        error = found[:, plane].std(0, ddof=1) / np.sqrt(len(found))
-        figures |= _named(f"c_l_z{z}_{{}}", BANDS, found[:, plane].mean(0), error)
-    return figures, found.mean(0)
+        error = ratios[:, plane].std(0, ddof=1) / np.sqrt(len(ratios))
+        figures |= _figures_by_edge(f"c_l_z{z}_{{}}", BANDS, ratios[:, plane].mean(0), error)
+    return figures, ratios.mean(0)
 
 
-def milky_way(size: Size) -> dict[str, float]:
+def milky_way(size: SampleSize) -> dict[str, float]:
     """Stars and dwarfs against other code, the errors of Gaia."""
     universe, dust, figures = milky_way_stars.model(), dust_map.load(SEED), {}
     for b, published in star_counts.COUNTS.items():
-        off = star_counts.counts(b, size.stars, universe, dust) / np.array(published) - 1.0
-        figures[f"stars_b{b}_off"] = float(off[np.abs(off).argmax()])
-    for b, counted_there in star_counts.DWARFS.items():
-        off = star_counts.dwarf_counts(b, 1000.0) / np.array(counted_there) - 1.0
-        figures[f"dwarfs_b{b}_off"] = float(off[np.abs(off).argmax()])
+        offset = star_counts.counts(b, size.star_cells, universe, dust) / np.array(published) - 1.0
+        figures[f"stars_b{b}_off"] = float(offset[np.abs(offset).argmax()])
+    for b, published_dwarfs in star_counts.DWARFS.items():
+        offset = star_counts.dwarf_counts(b, 1000.0) / np.array(published_dwarfs) - 1.0
+        figures[f"dwarfs_b{b}_off"] = float(offset[np.abs(offset).argmax()])
     return figures | {f"gaia_parallax_g{g:g}": float(gaia.astrometric_errors(g)[2]) for g in star_counts.PARALLAX}
 
 
-def run(size: Size, folder: Path | None = None) -> dict[str, float]:
+def run(size: SampleSize, folder: Path | None = None) -> dict[str, float]:
     """All figures; their pictures into a folder."""
     started = time.process_time()
-    figures, seen = counted(size)
-    found, curves, halos = clustered(size)
-    figures |= theory() | matter(size) | found
-    found, power = lensed(size, halos)
-    figures |= found
-    if size.near:
-        figures |= nearby(size)
-    if size.pixels:
+    figures, sample = count_galaxies(size)
+    new_figures, curves, halos = measure_clustering(size)
+    figures |= theory() | matter(size) | new_figures
+    new_figures, power = measure_lensing(size, halos)
+    figures |= new_figures
+    if size.nearby_blocks:
+        figures |= nearby_satellites(size)
+    if size.halo_cells:
         figures |= abundances(size)
-        bright = small_scales.universe_of(SEED, size.settings.box_cells)
-        figures |= small_scales.figures(bright, 4 * size.pixels)
-    if size.stars:
+        bright = small_scales.galaxy_population(SEED, size.settings.box_cells)
+        figures |= small_scales.figures(bright, 4 * size.halo_cells)
+    if size.star_cells:
         figures |= milky_way(size)
     if folder is not None:
-        pictures.draw(folder, seen, curves, power, BANDS, figures)
+        pictures.draw(folder, sample, curves, power, BANDS, figures)
     return figures | {"cpu_s": time.process_time() - started}

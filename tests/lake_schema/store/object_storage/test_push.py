@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from lake_schema.errors import BadInput, Damaged, Superseded
-from lake_schema.store import layout, names, publish, read
+from lake_schema.store import layout, publish, read, request_links
 from lake_schema.store.object_storage import push, s3
 from tests.universe import plain_plan, plain_work, toy_plan, toy_work
 
@@ -22,14 +22,14 @@ CELLS = ((1607, 60), (1608, 40))
 
 @pytest.fixture
 def place(bucket):
-    return s3.address(f"s3://{bucket[1]}/lakes/one")
+    return s3.parse_address(f"s3://{bucket[1]}/lakes/one")
 
 
 @pytest.fixture
 def filled(lake):
     """A catalogue and a plain table."""
-    publish.make(lake, toy_plan(cells=CELLS), toy_work)
-    publish.make(lake, plain_plan(1), plain_work, name="first")
+    publish.make_version(lake, toy_plan(cells=CELLS), toy_work)
+    publish.make_version(lake, plain_plan(1), plain_work, name="first")
     return lake
 
 
@@ -38,7 +38,7 @@ def pushed(lake, place, **options):
 
 
 def opened(place):
-    return layout.opened(str(place))
+    return layout.open_lake(str(place))
 
 
 def seed(place):
@@ -53,22 +53,22 @@ def test_what_was_pushed_is_read_as_it_is_in_the_folder(filled, place):
     assert [one.table for one in told] == ["plain", "toy"]
     assert all(one.sent == one.objects and one.sent_size == one.size for one in told)
     there = opened(place)
-    assert read.tables(there) == ["plain", "toy"]
-    assert names.names(there) == ["first"]
-    assert names.tables(there, "first") == ["plain"]
+    assert read.table_names(there) == ["plain", "toy"]
+    assert request_links.request_names(there) == ["first"]
+    assert request_links.tables_of_request(there, "first") == ["plain"]
     for table in ("plain", "toy"):
         here, far = read.version(filled, table), read.version(there, table)
         assert far.rows().equals(here.rows())
         assert far.schema.equals(here.schema, check_metadata=True)
-        assert read.verify(far, deep=True) == []
+        assert read.find_faults(far, deep=True) == []
         assert far.fingerprint == here.fingerprint
     toy, part = read.version(there, "toy"), layout.cell_file(5, 1607)
     ra, dec = (toy.rows()[name][0].as_py() for name in ("ra", "dec"))
     assert toy.cone(ra, dec, 0.3).equals(read.version(filled, "toy").cone(ra, dec, 0.3))
-    assert toy.margin(part).equals(read.version(filled, "toy").margin(part))
+    assert toy.read_margin(part).equals(read.version(filled, "toy").read_margin(part))
     assert (
-        toy.file("toy/hats.properties").read_bytes()
-        == (layout.current(filled, "toy") / "toy" / "hats.properties").read_bytes()
+        toy.sidecar_path("toy/hats.properties").read_bytes()
+        == (layout.current_link(filled, "toy") / "toy" / "hats.properties").read_bytes()
     )
 
 
@@ -78,7 +78,7 @@ def test_what_is_there_is_not_sent_again(filled, place, bucket):
     assert {one.sent for one in pushed(filled, place)} == {0}
     # The one that must be refused.
     assert [path.rpartition("/")[2] for path in bucket[0].recorder.sent()] == ["manifest.json"]
-    publish.make(filled, plain_plan(2), plain_work)
+    publish.make_version(filled, plain_plan(2), plain_work)
     told = {(one.table, one.key): one.sent for one in pushed(filled, place)}
     assert sorted(told.values()) == [0, 0, 4]
     assert seed(place) == 2.0
@@ -90,7 +90,7 @@ def test_a_reader_stays_with_what_it_opened(filled, place):
     pushed(filled, place)
     before = opened(place)
     first = read.version(before, "plain")
-    publish.make(filled, plain_plan(2), plain_work, name="first")
+    publish.make_version(filled, plain_plan(2), plain_work, name="first")
     pushed(filled, place)
     assert read.version(before, "plain").key == first.key
     assert set(first.rows()["value"].to_pylist()) == {1.0}
@@ -101,20 +101,20 @@ def test_a_reader_stays_with_what_it_opened(filled, place):
 def test_some_tables_leave_the_others_as_they_were(filled, place):
     pushed(filled, place)
     key = read.version(filled, "toy").key
-    publish.make(filled, toy_plan(2, cells=CELLS), toy_work)
-    publish.make(filled, plain_plan(2), plain_work, name="second")
+    publish.make_version(filled, toy_plan(2, cells=CELLS), toy_work)
+    publish.make_version(filled, plain_plan(2), plain_work, name="second")
     assert {one.table for one in pushed(filled, place, only=["plain"])} == {"plain"}
     there = opened(place)
     assert read.version(there, "toy").key == key != read.version(filled, "toy").key
-    assert names.holders(there, "plain") == names.holders(filled, "plain")
-    assert names.names(there) == ["first", "second"]
+    assert request_links.keys_by_request(there, "plain") == request_links.keys_by_request(filled, "plain")
+    assert request_links.request_names(there) == ["first", "second"]
     with pytest.raises(BadInput, match="has no table stars; it has plain, toy"):
         pushed(filled, place, only=["stars"])
 
 
 def test_a_push_that_ends_anywhere_is_completed_by_the_next(filled, place, bucket):
     pushed(filled, place, only=["plain"])
-    publish.make(filled, plain_plan(2), plain_work, name="first")
+    publish.make_version(filled, plain_plan(2), plain_work, name="first")
     service = bucket[0]
     for most in range(100):
         before = len(service.recorder.sent())
@@ -130,20 +130,20 @@ def test_a_push_that_ends_anywhere_is_completed_by_the_next(filled, place, bucke
         except BadInput:
             service.recorder.answer = None
             assert seed(place) == 1.0
-            assert read.tables(opened(place)) == ["plain"]
+            assert read.table_names(opened(place)) == ["plain"]
     service.recorder.answer = None
     # The first runs ended before anything was there, and each went farther than the one before.
     assert 2 < most < 20
     assert seed(place) == 2.0
-    assert read.verify(read.version(opened(place), "toy"), deep=True) == []
+    assert read.find_faults(read.version(opened(place), "toy"), deep=True) == []
 
 
 def test_of_two_who_push_the_second_is_refused(filled, tmp_path, place):
     pushed(filled, place)
-    publish.make(filled, plain_plan(2), plain_work, name="first")
+    publish.make_version(filled, plain_plan(2), plain_work, name="first")
     other = tmp_path / "other"
     shutil.copytree(filled, other, symlinks=True)
-    publish.make(other, plain_plan(3), plain_work, name="first")
+    publish.make_version(other, plain_plan(3), plain_work, name="first")
     slow = push.push(filled, place)
     next(slow)
     pushed(other, place)
@@ -193,8 +193,8 @@ def test_an_object_that_is_not_as_it_was_is_refused_by_name_and_sent_again(fille
         refused.value
     )
     with pytest.raises(Damaged, match=f"s3://{name}/{key} "):
-        version.path("1.parquet")
-    assert [line for line in read.verify(version, deep=True) if key in line]
+        version.partition_path("1.parquet")
+    assert [line for line in read.find_faults(version, deep=True) if key in line]
     assert sum(one.sent for one in pushed(filled, place)) == 1
     assert service.data(name, key) == data
 
@@ -208,7 +208,7 @@ def test_a_manifest_that_was_changed_is_refused(filled, place, bucket):
         read.version(opened(place), "plain")
     service.client.put_object(Bucket=name, Key="lakes/one/current", Body=b'{"tables": {"../x": "1"}}')
     with pytest.raises(Damaged, match="current does not say"):
-        read.tables(opened(place))
+        read.table_names(opened(place))
     with pytest.raises(Damaged, match="current does not say"):
         pushed(filled, place)
 
@@ -235,15 +235,15 @@ def test_a_service_without_conditions_is_refused(filled, place, bucket):
 
 
 def test_a_large_file_goes_in_parts(place, tmp_path, monkeypatch, bucket):
-    monkeypatch.setattr(push, "_IN_ONE_PUT", 5 << 20)
-    monkeypatch.setattr(push, "_PART", 5 << 20)
+    monkeypatch.setattr(push, "_MAX_PUT_BYTES", 5 << 20)
+    monkeypatch.setattr(push, "_PART_BYTES", 5 << 20)
     path, data = tmp_path / "large", random.Random(1).randbytes(12 << 20)
     path.write_bytes(data)
     one = push._Object(path, "large", len(data), push.file_sha256(path))
     there = push.Bucket(place)
-    assert not there.holds(one)
+    assert not there.has_object(one)
     there.send(one)
-    assert there.holds(one)
+    assert there.has_object(one)
     assert bucket[0].data(bucket[1], "lakes/one/large") == data
     # Amazon ends the sum of an object that came in parts with their number.
     head, sums = there._client.head_object, []
@@ -254,14 +254,14 @@ def test_a_large_file_goes_in_parts(place, tmp_path, monkeypatch, bucket):
         return {**told, "ChecksumSHA256": f"{sums[-1].partition('-')[0]}-3"}
 
     monkeypatch.setattr(there._client, "head_object", as_amazon)
-    assert there.holds(one)
+    assert there.has_object(one)
     assert sums
     path.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
-    assert not there.holds(one)
+    assert not there.has_object(one)
 
 
 def test_a_version_that_is_not_whole_is_not_pushed(filled, place, bucket):
-    folder = layout.current(filled, "plain").resolve()
+    folder = layout.current_link(filled, "plain").resolve()
     file = folder / "dataset" / "1.parquet"
     data = file.read_bytes()
     file.unlink()
@@ -272,7 +272,7 @@ def test_a_version_that_is_not_whole_is_not_pushed(filled, place, bucket):
         pushed(filled, place)
     file.write_bytes(data)
     # What is no table is compared when it is sent.
-    beside = layout.current(filled, "toy").resolve() / "toy" / "hats.properties"
+    beside = layout.current_link(filled, "toy").resolve() / "toy" / "hats.properties"
     beside.write_bytes(beside.read_bytes().replace(b"toy", b"TOY"))
     with pytest.raises(Damaged, match=r"hats\.properties has other contents than the manifest says"):
         pushed(filled, place)
@@ -347,8 +347,8 @@ def test_a_push_that_is_killed_at_any_moment_is_completed(filled, place, bucket)
     command = [sys.executable, "-m", "lake_schema.store.object_storage.push", str(filled), str(place), "--threads", "2"]
     rng, killed = random.Random(7), 0
     for number in range(2, 14):
-        publish.make(filled, plain_plan(number), plain_work, name="first")
-        publish.make(filled, toy_plan(number, cells=CELLS), toy_work)
+        publish.make_version(filled, plain_plan(number), plain_work, name="first")
+        publish.make_version(filled, toy_plan(number, cells=CELLS), toy_work)
         before = len(bucket[0].recorder.sent())
         most = rng.randrange(0, 26)
         with subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL) as process:
@@ -357,7 +357,7 @@ def test_a_push_that_is_killed_at_any_moment_is_completed(filled, place, bucket)
             process.send_signal(signal.SIGKILL)
         killed += process.returncode == -signal.SIGKILL
         assert seed(place) in (number - 1.0, float(number))
-        assert read.verify(read.version(opened(place), "toy"), deep=True) == []
+        assert read.find_faults(read.version(opened(place), "toy"), deep=True) == []
         subprocess.run(command, env=environment, check=True, capture_output=True)
         assert seed(place) == number
     assert killed > 6

@@ -16,21 +16,21 @@ from tests.universe import plain_plan, plain_work, toy_plan, toy_work
     ["s3://sky", "s3://sky/a/b", "s3://sky/a?endpoint_override=http://127.0.0.1:9000", "s3://sky/a?region=eu-west-1"],
 )
 def test_an_address_is_written_as_it_is_read(text):
-    assert str(s3.address(text)) == text
-    assert str(layout.opened(text)) == text
-    assert layout.opened(layout.opened(text)) == layout.opened(text)
+    assert str(s3.parse_address(text)) == text
+    assert str(layout.open_lake(text)) == text
+    assert layout.open_lake(layout.open_lake(text)) == layout.open_lake(text)
 
 
 def test_an_endpoint_is_what_is_asked_for_or_named_or_in_the_environment(monkeypatch):
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://environment")
     named = "s3://sky/a?endpoint_override=http://address"
-    assert s3.address("s3://sky/a").service == "http://environment"
-    assert s3.address(named).service == "http://address"
-    assert s3.address(named, "http://option").service == "http://option"
-    assert s3.address("s3://sky/a").key("galaxies", "x") == "a/galaxies/x"
-    assert s3.address("s3://sky").key("galaxies", "x") == "galaxies/x"
+    assert s3.parse_address("s3://sky/a").service == "http://environment"
+    assert s3.parse_address(named).service == "http://address"
+    assert s3.parse_address(named, "http://option").service == "http://option"
+    assert s3.parse_address("s3://sky/a").key("galaxies", "x") == "a/galaxies/x"
+    assert s3.parse_address("s3://sky").key("galaxies", "x") == "galaxies/x"
     with pytest.raises(BadInput, match="an endpoint does not go with it"):
-        layout.opened("/lake", "http://option")
+        layout.open_lake("/lake", "http://option")
 
 
 @pytest.mark.parametrize(
@@ -44,7 +44,7 @@ def test_an_endpoint_is_what_is_asked_for_or_named_or_in_the_environment(monkeyp
     ],
 )
 def test_no_credentials_are_shown(text, endpoint):
-    for open_it in (lambda: s3.address(text, endpoint), lambda: layout.lake(text)):
+    for open_it in (lambda: s3.parse_address(text, endpoint), lambda: layout.resolve_lake(text)):
         with pytest.raises(BadInput) as refused:
             open_it()
         assert "hidden" not in str(refused.value)
@@ -53,8 +53,8 @@ def test_no_credentials_are_shown(text, endpoint):
 
 
 def test_what_is_published_is_written_as_it_is_read():
-    told = s3.Published({"galaxies": "0" * 16}, {"demo": {"galaxies": "1" * 16}})
-    assert s3.published(told.written(), "here") == told
+    told = s3.PublishedVersions({"galaxies": "0" * 16}, {"demo": {"galaxies": "1" * 16}})
+    assert s3.parse_published(told.to_bytes(), "here") == told
     assert told.links() == {"galaxies/current": "v-" + "0" * 16, "names/demo/galaxies": "../../galaxies/v-" + "1" * 16}
 
 
@@ -64,7 +64,7 @@ def test_what_is_published_is_written_as_it_is_read():
 )
 def test_what_is_of_another_form_is_refused(data):
     with pytest.raises(Damaged, match="here does not say"):
-        s3.published(data, "here")
+        s3.parse_published(data, "here")
 
 
 @pytest.mark.parametrize(
@@ -85,8 +85,8 @@ def test_where_no_lake_is_one_line_says_so(bucket, capsys, place, words):
 
 
 def test_a_lake_is_looked_after_where_it_is(lake, bucket, capsys):
-    publish.make(lake, toy_plan(cells=((1607, 30),)), toy_work)
-    publish.make(lake, plain_plan(1), plain_work, name="first")
+    publish.make_version(lake, toy_plan(cells=((1607, 30),)), toy_work)
+    publish.make_version(lake, plain_plan(1), plain_work, name="first")
     place = f"s3://{bucket[1]}"
     assert push.main([str(lake), place]) == 0
     capsys.readouterr()

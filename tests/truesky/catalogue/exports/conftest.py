@@ -7,7 +7,7 @@ import pytest
 
 from lake_schema import ids, sky, units
 from lake_schema.store import layout, publish, read
-from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.tables.fluxes import fluxes
 from lake_schema.tables.galaxies import GALAXIES
 from lake_schema.tables.stars import STARS
@@ -122,8 +122,8 @@ def stars(n=30, seed=5):
 
 def published(lake, table, parts, facts):
     """Publish rows by file; returns the version's key."""
-    plan = Plan(table, facts, tuple(Part(name, {"name": name}) for name in parts))
-    publish.make(lake, plan, lambda root, facts: Output(parts[facts["name"]]))
+    plan = Plan(table, facts, tuple(Task(name, {"name": name}) for name in parts))
+    publish.make_version(lake, plan, lambda root, facts: Output(parts[facts["name"]]))
     return plan.key
 
 

@@ -75,7 +75,7 @@ def test_the_document_says_what_is_there_and_nothing_of_this_machine(written):
 
 def test_columns_of_galaxies_and_of_their_components(lake, written):
     folder, _ = written
-    pixel = sky.ring_of(5, CELL)
+    pixel = sky.ring_index(5, CELL)
     rows = pq.read_table(folder / f"galaxy_{pixel}.parquet")
     truth = read.version(lake, "galaxies").rows()
     kept = np.isin(truth["id"].to_numpy(), rows["galaxy_id"].to_numpy())
@@ -106,7 +106,7 @@ def _shares(total, low, high):
 
 def test_bulges_are_redder_than_discs(written):
     folder, _ = written
-    rows = pq.read_table(folder / f"galaxy_{sky.ring_of(5, CELL)}.parquet")
+    rows = pq.read_table(folder / f"galaxy_{sky.ring_index(5, CELL)}.parquet")
     total = [
         np.stack(rows[f"sed_val_{name}"].to_numpy(zero_copy_only=False)).astype(float) for name in ("bulge", "disk")
     ]
@@ -121,8 +121,8 @@ def test_a_galaxy_is_in_the_file_of_the_pixel_where_it_is_seen(lake, written):
     found = {p.stem: pq.read_table(p) for p in folder.glob("galaxy_[0-9]*.parquet")}
     assert sum(len(rows) for rows in found.values()) == read.version(lake, "galaxies").num_rows
     for name, rows in found.items():
-        at = sky.cell_of(rows["ra"].to_numpy(), rows["dec"].to_numpy(), 5)
-        assert {sky.ring_of(5, int(cell)) for cell in at} == {int(name.removeprefix("galaxy_"))}
+        at = sky.cell_at(rows["ra"].to_numpy(), rows["dec"].to_numpy(), 5)
+        assert {sky.ring_index(5, int(cell)) for cell in at} == {int(name.removeprefix("galaxy_"))}
         light = pq.read_table(folder / f"{name.replace('galaxy', 'galaxy_flux')}.parquet")
         assert light["galaxy_id"].equals(rows["galaxy_id"])
     assert len(found) == 2
@@ -162,7 +162,7 @@ def test_the_spectra_give_the_lake_s_fluxes(lake, written):
 
 def test_stars_have_a_spectrum_and_its_level(lake, written):
     folder, _ = written
-    rows = pq.read_table(folder / f"pointsource_{sky.ring_of(5, CELL)}.parquet").to_pylist()
+    rows = pq.read_table(folder / f"pointsource_{sky.ring_index(5, CELL)}.parquet").to_pylist()
     wanted = counts(lake, "star")
     assert len(rows) == len(wanted)
     for row in rows:
@@ -188,7 +188,7 @@ def test_edges_lie_about_every_line():
 
 def test_a_dark_template_has_a_level():
     library = templates.stellar_library()
-    wavelength, flux = stellar_spectra._sampled(library)
+    wavelength, flux = stellar_spectra._rebin(library)
     assert 5000.0 in wavelength
     assert (flux > 0).all()
 

@@ -13,7 +13,7 @@ def test_every_column_of_every_format_is_in_its_table():
     ]
     found = {row[0].strip("`"): dict(zip(rows[0][1:], row[1:], strict=True)) for row in rows[2:]}
     for form in mapping.formats():
-        columns = mapping.galaxies(form, {})
+        columns = mapping.galaxy_columns(form, {})
         for key, field in columns.fields.items():
             assert [name for name in field.titles() if f"`{name}`" not in found[key][form]] == [], (form, key)
             assert field.unit in found[key][form]

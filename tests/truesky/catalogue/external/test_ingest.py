@@ -19,7 +19,7 @@ from truesky.catalogue.external import mapping
 from truesky.fluxes import band_fluxes, cosmology, sources
 from truesky.fluxes.libraries import templates
 from truesky.request.from_toml import parse
-from truesky.running import shell
+from truesky.running import submitted_job
 
 FORMATS = ("flagship1", "flagship2", "euclid", "skycatalogs")
 
@@ -46,7 +46,7 @@ def build(folder, file, more):
     wanted, lake = parse(asked(folder, file, more)), folder / "lake"
     lake.mkdir(exist_ok=True)
     for step in build_galaxies.steps(lake, wanted):
-        publish.make(lake, step.plan, step.work)
+        publish.make_version(lake, step.plan, step.run_task)
     return read.version(lake, "galaxies").rows()
 
 
@@ -59,7 +59,7 @@ def test_a_catalogue_comes_through(tmp_path, form):
     values = synthetic.columns()
     rows = build(tmp_path, synthetic.write(tmp_path, form, values), f'format = "{form}"')
     order = np.argsort(values["origin_id"])
-    assert validate.violations(rows, GALAXIES) == []
+    assert validate.find_violations(rows, GALAXIES) == []
     assert np.array_equal(by_origin(rows, "origin_id"), values["origin_id"][order])
     mapped = mapping.formats()[form]["columns"]
     seen = PLACES if "ra_lensed" in mapped else {}
@@ -97,10 +97,10 @@ def test_identifiers_name_halos(tmp_path):
     values = synthetic.columns()
     rows = build(tmp_path, synthetic.write(tmp_path, "flagship2", values), 'format = "flagship2"')
     own, halo, kind = (by_origin(rows, name) for name in ("id", "halo_id", "kind"))
-    assert np.array_equal(ids.halo_of(own), halo)
-    assert np.array_equal(ids.kind_of(own), kind)
+    assert np.array_equal(ids.halo_from_id(own), halo)
+    assert np.array_equal(ids.kind_from_id(own), kind)
     theirs = values["halo"][np.argsort(values["origin_id"])]
-    cell = sky.cell_of(by_origin(rows, "ra"), by_origin(rows, "dec"), ids.GENERATION_ORDER)
+    cell = sky.cell_at(by_origin(rows, "ra"), by_origin(rows, "dec"), ids.GENERATION_ORDER)
     assert len(set(zip(theirs, cell, strict=True))) == len(set(halo.tolist()))
 
 
@@ -144,17 +144,17 @@ def test_galaxies_at_a_caustic_are_kept_apart_and_counted(tmp_path):
     rows = build(tmp_path, synthetic.write(tmp_path, "skycatalogs", values), 'format = "skycatalogs"')
     apart = read.version(tmp_path / "lake", "quarantine").rows()
     assert (rows.num_rows, apart.num_rows) == (296, 4)
-    assert validate.violations(rows, GALAXIES) == []
-    assert validate.violations(apart, QUARANTINE) == []
+    assert validate.find_violations(rows, GALAXIES) == []
+    assert validate.find_violations(apart, QUARANTINE) == []
     assert set(apart["origin_id"].to_pylist()) == set(values["origin_id"][:4].tolist())
     assert sorted(apart["determinant"].to_pylist()) == pytest.approx([0.0, 0.01, 0.0139, 0.24], abs=1e-6)
     assert not set(rows["id"].to_pylist()) & set(apart["id"].to_pylist())
-    sources.magnification_of(rows)
+    sources.table_magnification(rows)
 
 
 def test_without_any_at_a_caustic_the_quarantine_is_an_empty_table(tmp_path):
     build(tmp_path, synthetic.write(tmp_path, "flagship2"), 'format = "flagship2"')
-    assert read.version(tmp_path / "lake", "quarantine").rows().schema.equals(QUARANTINE.arrow())
+    assert read.version(tmp_path / "lake", "quarantine").rows().schema.equals(QUARANTINE.arrow_schema())
     assert read.version(tmp_path / "lake", "quarantine").num_rows == 0
 
 
@@ -181,7 +181,7 @@ def test_a_region_without_galaxies_is_an_empty_table(tmp_path):
     values["ra_lensed"] += 90.0
     rows = build(tmp_path, synthetic.write(tmp_path, "flagship2", values), 'format = "flagship2"')
     assert rows.num_rows == 0
-    assert validate.violations(rows, GALAXIES) == []
+    assert validate.find_violations(rows, GALAXIES) == []
 
 
 def broken(values, key, row, value):
@@ -228,7 +228,7 @@ def test_a_file_that_is_cut_short(tmp_path, form):
     path = synthetic.write(tmp_path, form)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     arguments = ["--lake", str(tmp_path / "lake"), "--request", str(asked(tmp_path, path, f'format = "{form}"'))]
-    assert shell.main(build_galaxies.JOB, arguments) != 0
+    assert submitted_job.main(build_galaxies.JOB, arguments) != 0
     assert not list((tmp_path / "lake").glob("galaxies/v-*"))
 
 
@@ -274,7 +274,7 @@ def test_a_mapping_that_does_not_fit(tmp_path, more, said):
 def test_a_diffsky_mock_comes_through(tmp_path):
     slices = [opencosmo.columns(seed=seed) for seed in (1, 2)]
     rows = build(tmp_path, opencosmo.write(tmp_path / "mock.hdf5", *slices), 'format = "opencosmo"')
-    assert validate.violations(rows, GALAXIES) == []
+    assert validate.find_violations(rows, GALAXIES) == []
     given = {name: np.concatenate([one[name] for one in slices]) for name in slices[0]}
     order = np.argsort(given["gal_id"])
     found = rows.sort_by("origin_id")
@@ -294,7 +294,7 @@ def test_a_diffsky_mock_comes_through(tmp_path):
     # Magnitudes are of the continuum: lines are drawn.
     bare = found.drop_columns([name for name in found.column_names if name.startswith("flux_")])
     light = band_fluxes.galaxy_fluxes(bare, ["lsst_r"], templates.galaxy_library())["f_nu_lsst_r"].to_numpy()
-    unseen = light / sources.magnification_of(found)
+    unseen = light / sources.table_magnification(found)
     dust = 0.87 * found["a_v"].to_numpy()
     mag = 23.9 - 2.5 * np.log10(unseen) - dust
     assert mag == pytest.approx(given["lsst_r"][order], abs=0.1)

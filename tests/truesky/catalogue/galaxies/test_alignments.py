@@ -52,7 +52,7 @@ def test_the_tide_is_that_of_the_linear_density(box):
     """Of the variance s^2 of the density, <T_xx^2> = 4 s^2 / 45 and <T_xy^2> = s^2 / 15, but for a cube's corners."""
     xx, yy, *mixed = density_box.tides(box)
     modes, _ = density_box._linear_modes(box.smoothed[0], box.model.cell)
-    density = density_box._real(modes, box.n)
+    density = density_box._to_real(modes, box.n)
     for one in (xx, yy, xx + yy):
         assert np.mean(one.astype(float) ** 2) == pytest.approx(4 / 45 * density.var(), rel=0.12)
     for one in mixed:
@@ -64,7 +64,7 @@ def test_galaxies_point_to_matter(universe, own, rng):
     box, turned = universe.population.halos.box, universe.population.halos.turned
     index, ra, dec = sky.random_in_cell(0, 5, 40_000, rng)
     chi = rng.uniform(100, 3000, index.size)
-    e = alignments.of_centrals(own, ra, dec, chi, np.full(chi.size, -22.0), np.ones(chi.size, bool))
+    e = alignments.central_ellipticity(own, ra, dec, chi, np.full(chi.size, -22.0), np.ones(chi.size, bool))
     assert np.sqrt(np.mean(np.abs(e) ** 2)) == pytest.approx(0.02, abs=0.01)
     angle, step = 0.5 * np.angle(e), 8.0 / chi
     sides = []
@@ -72,7 +72,7 @@ def test_galaxies_point_to_matter(universe, own, rng):
         beside = np.zeros(chi.size)
         for way in (1, -1):
             east, north = way * step * np.cos(angle + turn), way * step * np.sin(angle + turn)
-            lon, lat = np.radians(lensing.displaced(ra, dec, east, north))
+            lon, lat = np.radians(lensing.displace(ra, dec, east, north))
             direction = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], 1)
             cell, _ = lightcone.box_cells(box, turned, direction, chi)
             beside += box.smoothed[0].ravel()[cell]
@@ -83,11 +83,13 @@ def test_galaxies_point_to_matter(universe, own, rng):
 def test_blue_galaxies_do_not_follow_and_amplitudes_multiply(universe, own, rng):
     _, ra, dec = sky.random_in_cell(0, 5, 100, rng)
     chi, m_r, red = np.full(100, 1500.0), np.full(100, -22.0), np.ones(100, bool)
-    once = alignments.of_centrals(own, ra, dec, chi, m_r, red)
-    twice = alignments.of_centrals(replace(own, times=2.0), ra, dec, chi, m_r, red)
+    once = alignments.central_ellipticity(own, ra, dec, chi, m_r, red)
+    twice = alignments.central_ellipticity(replace(own, times=2.0), ra, dec, chi, m_r, red)
     assert twice == pytest.approx(2 * once, abs=1e-15)
-    assert alignments.of_centrals(own, ra, dec, chi, m_r - 2.5 / 1.2, red) == pytest.approx(10 * once, abs=1e-12)
-    assert not alignments.of_centrals(own, ra, dec, chi, m_r, ~red).any()
+    assert alignments.central_ellipticity(own, ra, dec, chi, m_r - 2.5 / 1.2, red) == pytest.approx(
+        10 * once, abs=1e-12
+    )
+    assert not alignments.central_ellipticity(own, ra, dec, chi, m_r, ~red).any()
     assert alignments.model(own.box, own.turned, 0.0) is None
 
 
@@ -95,23 +97,23 @@ def test_satellites_point_to_their_central(own):
     """North-east of it, at the pole's side, and across the first meridian."""
     ra, dec = np.array([10.1, 0.01, 200.0]), np.array([60.05, 0.0, -89.9])
     to = sky.healpix_29(np.array([10.0, 359.99, 200.0]), np.array([60.0, 0.0, -89.8]))
-    towards, apart = alignments.direction(ra, dec, to)
+    towards, apart = alignments.direction_to_cells(ra, dec, to)
     assert np.degrees(apart) == pytest.approx([np.hypot(0.05, 0.05), 0.02, 0.1], rel=2e-3)
     assert np.degrees(towards) % 180 == pytest.approx([45.0, 0.0, 90.0], abs=0.2)
-    mean = alignments.of_satellites(own, towards, np.array([0.1, 0.5, 4.0]), np.ones(3, bool))
+    mean = alignments.satellite_ellipticity(own, towards, np.array([0.1, 0.5, 4.0]), np.ones(3, bool))
     assert np.abs(mean) == pytest.approx([0.024, 0.02, 0.0], abs=1e-9)
 
 
 def drawn_and_wanted(universe, cells, dust, monkeypatch, places):
     """(drawn over wanted, its error) of red galaxies in cells, with alignments that are twice as strong."""
-    strong, wanted, inner = replace(universe.alignments, times=2.0), [], galaxies._aligned
+    strong, wanted, inner = replace(universe.alignments, times=2.0), [], galaxies._mean_ellipticities
 
     def recorded(own, members, drawn):
         mean = inner(own, members, drawn)
         wanted.append((members.id[drawn.row], mean))
         return mean
 
-    monkeypatch.setattr(galaxies, "_aligned", recorded)
+    monkeypatch.setattr(galaxies, "_mean_ellipticities", recorded)
     aligned = replace(universe, alignments=strong, lens=lensing.Shear(), distant=())
     rows = pa.concat_tables([galaxies.draw(cell, aligned, cells, dust) for cell in places])
     own, mean = (np.concatenate(part) for part in zip(*wanted, strict=True))
@@ -132,7 +134,7 @@ def test_as_strong_in_the_catalogue_as_wanted(universe, cells, dust, monkeypatch
 @pytest.mark.nightly
 def test_as_strong_in_a_large_catalogue_as_wanted(universe, dust, monkeypatch):
     first = CELL // 64 * 64
-    cells = population.Cells(universe.population)
+    cells = population.CellCache(universe.population)
     ratio, error = drawn_and_wanted(universe, cells, dust, monkeypatch, range(first, first + 128))
     assert error < 0.03
     assert ratio == pytest.approx(1.0, abs=0.10)

@@ -40,7 +40,7 @@ K_CORRECTIONS = {
 def with_lines():
     """The library whose observed spectra keep their weak lines."""
     wavelength = rest_grid.rest_grid()
-    flux = templates.galaxies(wavelength, bridged=-1.0)[[0, 13, 25]].astype(np.float32)
+    flux = templates.galaxy_spectra(wavelength, bridge_width=-1.0)[[0, 13, 25]].astype(np.float32)
     return templates.Library(wavelength, flux, ("0", "13", "25"))
 
 
@@ -93,7 +93,7 @@ def test_table_against_integration_of_the_dusty_redshifted_spectrum(library, ban
 
 @given(st.floats(0.0, 2.3), st.integers(1, 30), st.floats(0.0, 1.0), st.integers(0, 4), st.floats(0.0, 0.5))
 def test_no_spectrum_is_brighter_than_the_brightest(vis, z, template, share, law, ebv):
-    nodes, brightest = band_ratios.brightest(vis)
+    nodes, brightest = band_ratios.brightest_offset(vis)
     one = np.ones(1)
     early, late = template * one.astype(int) - 1, template * one.astype(int)
     sed = band_ratios.Sed(late, one - share, early, share * one, law * one.astype(int), ebv * one)
@@ -154,7 +154,7 @@ def test_templates_grow_bluer_along_the_library_for_every_dust(rest_gr):
 def test_spectra_have_the_wanted_colours(rest_gr, rng):
     n = 5000
     wanted, law, ebv = rng.uniform(-0.2, 1.01, n), rng.integers(0, 5, n), rng.uniform(0.0, 0.5, n)
-    spectra = band_ratios.invert(rest_gr, wanted, law, ebv)
+    spectra = band_ratios.sed_of_colour(rest_gr, wanted, law, ebv)
     realised = band_ratios.colours(rest_gr, spectra)
     inside = (spectra.frac_1 > 0) & (spectra.frac_1 < 1)
     assert inside.mean() > 0.5
@@ -168,7 +168,7 @@ def test_spectra_have_the_wanted_colours(rest_gr, rng):
 
 @given(st.floats(-0.5, 1.5), st.integers(0, 4), st.floats(0.0, 0.5))
 def test_every_spectrum_is_two_neighbours_with_shares(rest_gr, colour, law, ebv):
-    spectrum = band_ratios.invert(rest_gr, np.array([colour]), np.array([law]), np.array([ebv]))
+    spectrum = band_ratios.sed_of_colour(rest_gr, np.array([colour]), np.array([law]), np.array([ebv]))
     assert 1 <= spectrum.template_1[0] <= 30
     assert spectrum.template_2[0] == spectrum.template_1[0] - 1
     assert 0.0 <= spectrum.frac_1[0] <= 1.0

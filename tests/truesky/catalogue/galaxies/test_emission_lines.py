@@ -11,7 +11,7 @@ from truesky.fluxes import cosmology, passbands
 from truesky.fluxes.spectra import lines as line_list
 
 FLUXES = np.array([5e-17, 1e-16, 2e-16, 3e-16])
-PLAIN = emission_lines.unmatched(np.array([0.0, 9.0]), np.array([0.0, 99.0]), np.zeros((2, 2)))
+PLAIN = emission_lines.model_from_table(np.array([0.0, 9.0]), np.array([0.0, 99.0]), np.zeros((2, 2)))
 
 
 @pytest.mark.parametrize(
@@ -31,7 +31,7 @@ def test_the_matching_is_monotone():
     lines = emission_lines.model()
     for z in (0.05, 0.5, 1.3, 2.9, 5.5):
         log_l = np.linspace(38.0, 45.0, 500)
-        assert np.all(np.diff(emission_lines.matched(lines, np.full(500, z), log_l)) > -1e-9)
+        assert np.all(np.diff(emission_lines.match_abundance(lines, np.full(500, z), log_l)) > -1e-9)
 
 
 def fluxes(n, z, log_mass, rng, lines=PLAIN, log_sfr=None):
@@ -74,7 +74,7 @@ def test_nitrogen_and_oxygen_lie_on_the_sequence_of_star_forming_galaxies(rng):
 
 def test_hydrogen_is_case_b_behind_the_dust_of_the_gas(rng):
     """All ratios to H beta tell the same A(H alpha), by Calzetti's law; massive galaxies have more of it."""
-    clear = replace(PLAIN, gas=replace(PLAIN.gas, polynomial=(0.0,), least=0.0))
+    clear = replace(PLAIN, gas=replace(PLAIN.gas, polynomial=(0.0,), min_attenuation=0.0))
     found = fluxes(100, 1.0, 10.0, rng, clear)
     for line, ratio in PLAIN.hydrogen.items():
         assert found[f"flux_{line}"] / found["flux_hbeta"] == pytest.approx(np.full(100, ratio), rel=1e-9)
@@ -113,7 +113,7 @@ def test_red_galaxies_that_form_no_stars_have_no_lines(drawn):
 
 def test_flux_of_a_luminosity(rng):
     """One galaxy, no dust, no scatter, no matching: 10^41.27 SFR over the sphere."""
-    plain = replace(PLAIN, gas=replace(PLAIN.gas, polynomial=(0.0,), least=0.0))
+    plain = replace(PLAIN, gas=replace(PLAIN.gas, polynomial=(0.0,), min_attenuation=0.0))
     plain = replace(plain, halpha=replace(plain.halpha, scatter=0.0))
     flux = fluxes(1, 1.0, 10.0, rng, plain, log_sfr=1.0)["flux_halpha"]
     distance = float(cosmology.luminosity_distance(1.0)) / 0.67 * 3.0856775814913673e24
@@ -129,7 +129,7 @@ def test_added_light_is_that_of_the_spectrum(band, rng):
     spectra = np.zeros((n, passbands.GRID_LAST - passbands.GRID_FIRST + 1))
     line_list.add(spectra, passbands.GRID_FIRST, line_list.profiles(every, z, np.full(n, 100.0), "vacuum"))
     expected = spectra[:, curve.wavelength.astype(int) - passbands.GRID_FIRST] @ passbands.weights(curve)
-    found = emission_lines.added(curve, z, fluxes)
+    found = emission_lines.mean_line_flux(curve, z, fluxes)
     # At the edges of a band a line is narrower here than it is.
     off = np.abs(found - expected) / expected.max()
     assert np.percentile(off, 95) < 0.01
@@ -139,7 +139,7 @@ def test_added_light_is_that_of_the_spectrum(band, rng):
 
 def test_no_light_brightens_nothing_and_as_much_again_by_three_quarters():
     flux = 10.0 ** (-0.4 * (np.array([20.0, 26.0]) + AB_CGS))
-    assert emission_lines.brightened(np.array([20.0, 26.0]), np.zeros(2)).tolist() == [20.0, 26.0]
-    assert emission_lines.brightened(np.array([20.0, 26.0]), flux) == pytest.approx(
+    assert emission_lines.magnitude_with_light(np.array([20.0, 26.0]), np.zeros(2)).tolist() == [20.0, 26.0]
+    assert emission_lines.magnitude_with_light(np.array([20.0, 26.0]), flux) == pytest.approx(
         [20.0 - 0.7526, 26.0 - 0.7526], abs=1e-4
     )

@@ -108,7 +108,7 @@ def test_the_luminosity_function_comes_out_of_the_catalogue(drawn, universe, z, 
 @pytest.mark.nightly
 def test_the_luminosity_function_comes_out_of_a_deep_catalogue_at_z_2(dust):
     deep = galaxies.model(SEED, Universe(galaxy_limit=28.0, **SMALL))
-    drawn, cells = population.Cells(deep.population), (4000, 4001, 4002, 4003, 40_000, 40_001)
+    drawn, cells = population.CellCache(deep.population), (4000, 4001, 4002, 4003, 40_000, 40_001)
     rows = pa.concat_tables([galaxies.draw(cell, deep, drawn, dust) for cell in cells])
     z, m_r = rows["z_true"].to_numpy(), rows["abs_mag_r01"].to_numpy()
     faintest = 28.0 - float(cosmology.distance_modulus(2.15)) - 4.0
@@ -129,8 +129,8 @@ def test_cosmic_star_formation(drawn, z):
 
 
 def test_rows_are_what_the_table_declares(drawn):
-    assert validate.violations(drawn.every, GALAXIES) == []
-    assert validate.violations(drawn.halos, HALOS) == []
+    assert validate.find_violations(drawn.every, GALAXIES) == []
+    assert validate.find_violations(drawn.halos, HALOS) == []
 
 
 def test_rows_are_sorted_inside_their_cell(cell):
@@ -139,7 +139,7 @@ def test_rows_are_sorted_inside_their_cell(cell):
     assert np.all(np.diff(index) >= 0)
     assert np.unique(cell["id"].to_numpy()).size == len(cell)
     true = (cell[name].to_numpy() for name in ("ra_true", "dec_true"))
-    assert np.all(sky.cell_of(*true, ids.GENERATION_ORDER) == CELL)
+    assert np.all(sky.cell_at(*true, ids.GENERATION_ORDER) == CELL)
     assert np.array_equal(sky.healpix_29(ra, dec), index)
 
 
@@ -160,7 +160,7 @@ def test_galaxies_name_halos_of_the_table(drawn):
 def test_satellite_fraction():
     """Zehavi et al. 2011: 0.21 with M_r < -20 nearby; in 10 deg2, for a cluster moves that of a few cells."""
     universe = galaxies.halos_and_galaxies(SEED, Universe(galaxy_limit=22.0, z_max=0.35, **SMALL))
-    cells, bright = population.Cells(universe), []
+    cells, bright = population.CellCache(universe), []
     for cell in range(25, 12 << 16, (12 << 16) // 200):
         found = population.members(cells, cell)
         bright.append(found.kind[universe.halos.matching.magnitude(found.z, found.proxy) < -20.0])
@@ -188,13 +188,13 @@ def test_a_cell_is_the_same_alone_or_among_others(dust, monkeypatch):
     universe = galaxies.model(SEED, Universe(galaxy_limit=22.5, **SMALL))
     other = pickle.loads(pickle.dumps(universe))
     monkeypatch.setattr(build_galaxies, "_universe", lambda facts, own: other)
-    monkeypatch.setattr(dust_map, "chosen", lambda seed, own: dust)
+    monkeypatch.setattr(dust_map, "map_for_request", lambda seed, own: dust)
     facts = {"seed": SEED, "generation_cells": [CELL + 1, CELL, CELL - 1]}
-    rows = build_galaxies.work(Path(), facts).rows
+    rows = build_galaxies.draw_galaxies(Path(), facts).rows
     first, last = np.searchsorted(rows["_healpix_29"].to_numpy(), sky.cell_range(ids.GENERATION_ORDER, CELL))
     assert 0 < first < last < rows.num_rows
     again = rows.slice(first, last - first).combine_chunks()
-    cell = observed_cells.draw([CELL], universe, population.Cells(universe.population), dust)
+    cell = observed_cells.draw([CELL], universe, population.CellCache(universe.population), dust)
     assert again.equals(cell.combine_chunks())
     # Null columns apart, the bytes themselves.
     for name in cell.column_names:
@@ -227,22 +227,22 @@ def test_the_apparent_reference_magnitude_is_near_the_seen_ones(drawn):
 
 def test_an_empty_cell_is_an_empty_table(dust):
     shallow = galaxies.model(SEED, Universe(galaxy_limit=10.0, **SMALL, **NEARBY))
-    rows = galaxies.draw(0, shallow, population.Cells(shallow.population), dust)
+    rows = galaxies.draw(0, shallow, population.CellCache(shallow.population), dust)
     # High-redshift galaxies and quasars have limits of their own.
     assert (rows["z_true"].to_numpy() < 6).sum() < 5
-    assert rows.schema.equals(GALAXIES.arrow())
-    assert validate.violations(rows, GALAXIES) == []
+    assert rows.schema.equals(GALAXIES.arrow_schema())
+    assert validate.find_violations(rows, GALAXIES) == []
 
 
 @pytest.mark.parametrize(("band", "limit"), [("euclid_h", 21.5), ("lsst_g", 23.0)])
 def test_a_limit_in_another_band(drawn, dust, band, limit):
     """As many as a deeper catalogue has there, none fainter, and of fewer halos."""
     there = galaxies.model(SEED, Universe(galaxy_limit=limit, galaxy_band=band, **SMALL, **NEARBY))
-    cells = population.Cells(there.population)
+    cells = population.CellCache(there.population)
     places = drawn.places[:2]
     rows = pa.concat_tables([galaxies.draw(cell, there, cells, dust) for cell in places])
     true = drawn.columns["ra_true"], drawn.columns["dec_true"]
-    wanted = np.isin(sky.cell_of(*true, ids.GENERATION_ORDER), places)
+    wanted = np.isin(sky.cell_at(*true, ids.GENERATION_ORDER), places)
     expected = np.sum(drawn.mags[band][wanted] < limit)
     assert rows.num_rows == pytest.approx(expected, rel=0.1)
     z, m_r = (rows[name].to_numpy().astype(float) for name in ("z_true", "abs_mag_r01"))
@@ -251,8 +251,8 @@ def test_a_limit_in_another_band(drawn, dust, band, limit):
     )
     names = [name for name in rows.column_names if name.startswith("flux_")]
     lines = {name: rows[name].to_numpy() for name in names}
-    light = emission_lines.added(there.band, rows["z_obs"].to_numpy(), lines)
-    seen = emission_lines.brightened(galaxies.apparent(there, z, m_r, sed), light)
+    light = emission_lines.mean_line_flux(there.band, rows["z_obs"].to_numpy(), lines)
+    seen = emission_lines.magnitude_with_light(galaxies.apparent_magnitude(there, z, m_r, sed), light)
     assert limit - 0.1 < seen.max() < limit + 1e-3
     halos = sum(galaxies.halo_table(cell, there.population, cells).num_rows for cell in places)
     assert halos < 0.5 * drawn.halos.num_rows * len(places) / len(drawn.places)
@@ -262,17 +262,17 @@ def test_a_shallow_limit_needs_little_of_the_volume():
     """Halos a steradian that are drawn, by distance."""
     wanted = (Universe(galaxy_limit=limit, **SMALL) for limit in (18.0, 26.0))
     near, deep = (galaxies.halos_and_galaxies(SEED, one).halos for one in wanted)
-    number = [np.sum(m.drawn(m.lowest - 0.6) * m.number, 1) * m.line.volume for m in (near, deep)]
+    number = [np.sum(m.blocks_above(m.min_mass_limit - 0.6) * m.number, 1) * m.steps.volume for m in (near, deep)]
     assert number[0].sum() < 0.01 * number[1].sum()
-    assert np.sum(number[0][near.line.z > 1.2]) < 1e-3 * number[0].sum()
-    assert np.sum(number[1][deep.line.z > 1.2]) > 0.3 * number[1].sum()
+    assert np.sum(number[0][near.steps.z > 1.2]) < 1e-3 * number[0].sum()
+    assert np.sum(number[1][deep.steps.z > 1.2]) > 0.3 * number[1].sum()
 
 
 @pytest.mark.parametrize("place", [(0.0, 90.0), pytest.param((0.0, -90.0), marks=pytest.mark.nightly), (0.0, 0.0)])
 def test_poles_and_the_first_meridian(universe, dust, place):
-    at = int(sky.cell_of([place[0]], [place[1]], ids.GENERATION_ORDER)[0])
-    rows = galaxies.draw(at, universe, population.Cells(universe.population), dust)
-    assert validate.violations(rows, GALAXIES) == []
+    at = int(sky.cell_at([place[0]], [place[1]], ids.GENERATION_ORDER)[0])
+    rows = galaxies.draw(at, universe, population.CellCache(universe.population), dust)
+    assert validate.find_violations(rows, GALAXIES) == []
     assert len(rows) == pytest.approx(19_200, rel=0.3)
     # On both sides of the meridian; at the poles a quarter of all right ascensions.
     west = np.mean(rows["ra_true"].to_numpy() > 180.0)
@@ -282,8 +282,8 @@ def test_poles_and_the_first_meridian(universe, dust, place):
 @pytest.mark.nightly
 def test_the_deepest_and_widest_request(dust):
     deep = galaxies.model(SEED, Universe(galaxy_limit=28.0, **SMALL))
-    rows = galaxies.draw((12 << 16) - 1, deep, population.Cells(deep.population), dust)
-    assert validate.violations(rows, GALAXIES) == []
+    rows = galaxies.draw((12 << 16) - 1, deep, population.CellCache(deep.population), dust)
+    assert validate.find_violations(rows, GALAXIES) == []
     assert rows.filter(pa.array(rows["kind"].to_numpy() < 2))["z_true"].to_numpy().max() > 5.7
     nearer = np.sum(rows["z_true"].to_numpy() < 2.3) / sky.cell_area(ids.GENERATION_ORDER)
     # Twice those of I_E < 26 and more; fewer than the counts to i = 26 extrapolated (LSST Science Book 2009, eq. 3.7).

@@ -13,7 +13,7 @@ from truesky.catalogue.galaxies import galaxies, halo_lensing, lensing
 from truesky.catalogue.galaxies.halo_lensing import Neighbourhood
 from truesky.catalogue.halos import lens_halos, projected_nfw
 from truesky.catalogue.halos.halo_catalogue import LightCone
-from truesky.catalogue.halos.population import Cells
+from truesky.catalogue.halos.population import CellCache
 from truesky.fluxes import cosmology, sources
 from truesky.request.schema import Universe
 
@@ -24,7 +24,7 @@ ARCMIN = np.radians(1 / 60)
 
 @pytest.fixture(scope="module")
 def near(universe, cells):
-    return halo_lensing.around(universe.lens, cells, CELL)
+    return halo_lensing.lens_of_cell(universe.lens, cells, CELL)
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def test_shear_is_tangential_and_sources_are_pushed_away(universe, ra, dec):
     """As everywhere in the table: gamma1 < 0 east and west of a mass, gamma2 < 0 north-east of it, at any place."""
     halo, angle = lone(universe.lens, ra, dec), np.arange(16) * np.pi / 8
     east, north = 5 * ARCMIN * np.sin(angle), 5 * ARCMIN * np.cos(angle)
-    places = lensing.displaced(np.full(16, ra), np.full(16, dec), east, north)
+    places = lensing.displace(np.full(16, ra), np.full(16, dec), east, north)
     found = halo_lensing.columns(halo, *places, np.full(16, CHI))
     # The direction back to the halo, from each source's own north.
     frame = halo_lensing._frames(*places)
@@ -73,12 +73,12 @@ def test_convergence_and_shear_are_those_at_the_image(universe, rng):
     """theta = beta + alpha(theta), with convergence and shear of theta: one Newton step, beside a rich cluster."""
     halo = lone(universe.lens, 40.0, 20.0, amplitude=3e-8)
     angle, radius = 2 * np.pi * rng.random(300), ARCMIN * rng.uniform(0.7, 10, 300)
-    beta = lensing.displaced(np.full(300, 40.0), np.full(300, 20.0), radius * np.sin(angle), radius * np.cos(angle))
+    beta = lensing.displace(np.full(300, 40.0), np.full(300, 20.0), radius * np.sin(angle), radius * np.cos(angle))
     found = halo_lensing.columns(halo, *beta, np.full(300, CHI))
     theta = found["ra"], found["dec"]
     once = replace(halo, settings=replace(halo.settings, again=np.inf))
-    there = halo_lensing.images(once, *theta, np.full(300, CHI))
-    again = lensing.displaced(*theta, *-there[3:])
+    there = halo_lensing.lensing_at_images(once, *theta, np.full(300, CHI))
+    again = lensing.displace(*theta, *-there[3:])
     wrong = 3600 * sky.separation(*again, *beta)
     moved = 3600 * sky.separation(*theta, *beta)
     well = sources.determinant(*there[:3]) > 0.3
@@ -103,20 +103,20 @@ def test_a_galaxy_behind_a_centre_is_finite_or_set_apart(universe):
 def test_the_lens_equation_holds(near, behind):
     """theta - alpha(theta) = beta of the sources of a cell, within 0.5" of 99 % of them: what is moved by up to 30"."""
     ra, dec, chi = behind
-    found = halo_lensing.images(near, ra, dec, chi)
+    found = halo_lensing.lensing_at_images(near, ra, dec, chi)
     once = replace(near, settings=replace(near.settings, again=np.inf))
-    theta = lensing.displaced(ra, dec, *found[3:])
-    back = lensing.displaced(*theta, *-halo_lensing.images(once, *theta, chi)[3:])
+    theta = lensing.displace(ra, dec, *found[3:])
+    back = lensing.displace(*theta, *-halo_lensing.lensing_at_images(once, *theta, chi)[3:])
     assert np.percentile(3600 * sky.separation(*back, ra, dec), 99) < 0.5
     assert np.percentile(3600 * sky.separation(*theta, ra, dec), 99) > 5.0
 
 
 def test_sources_are_the_same_in_any_company(near, behind):
-    whole = halo_lensing.images(near, *behind)
+    whole = halo_lensing.lensing_at_images(near, *behind)
     assert np.abs(whole[0]).max() > 0.05
     rng = np.random.default_rng(1)
     for rows in (np.arange(0, 4000, 2), rng.permutation(4000)[:1000], np.array([17])):
-        part = halo_lensing.images(near, *(values[rows] for values in behind))
+        part = halo_lensing.lensing_at_images(near, *(values[rows] for values in behind))
         assert part.tobytes() == np.ascontiguousarray(whole[:, rows]).tobytes()
 
 
@@ -124,7 +124,7 @@ def test_sources_are_the_same_in_any_company(near, behind):
 def test_lensing_does_not_know_the_limit_of_a_request(universe, near, changed):
     """The same halos, and so the same lensing of the same galaxies, bit by bit."""
     other = galaxies.halos_and_galaxies(SEED, Universe(**SMALL, **changed))
-    found = halo_lensing.around(universe.lens, Cells(other), CELL)
+    found = halo_lensing.lens_of_cell(universe.lens, CellCache(other), CELL)
     assert near.halos.shape[1] > 5000
     assert found.halos.tobytes() == near.halos.tobytes()
     assert found.smooth.tobytes() == near.smooth.tobytes()
@@ -148,13 +148,13 @@ def test_halos_of_the_catalogue_are_those_that_lens(universe, cells):
 def test_no_halo_is_missed_that_reaches_a_cell(universe, near, monkeypatch):
     """With all cells drawn twice as far, the same halos."""
     chosen = lens_halos.settings()
-    every = halo_lensing._near
+    every = halo_lensing._cells_with_halos
 
     def farther(settings, cell, centre, radius):
         return every(replace(settings, wide=1.5 * chosen.wide, reach=1.5 * chosen.reach), cell, centre, radius)
 
-    monkeypatch.setattr(halo_lensing, "_near", farther)
-    found = halo_lensing.around(universe.lens, Cells(universe.population), CELL)
+    monkeypatch.setattr(halo_lensing, "_cells_with_halos", farther)
+    found = halo_lensing.lens_of_cell(universe.lens, CellCache(universe.population), CELL)
     # Light is bent by less than the strip, with very few exceptions at its border.
     assert found.halos.shape[1] == pytest.approx(near.halos.shape[1], rel=1e-3)
 
@@ -162,9 +162,9 @@ def test_no_halo_is_missed_that_reaches_a_cell(universe, near, monkeypatch):
 def test_the_smooth_part_of_halos_is_that_of_a_direct_sum(universe, cells, near, behind, monkeypatch):
     chosen = lens_halos.settings()
     monkeypatch.setattr(lens_halos, "settings", lambda: replace(chosen, close=90.0))
-    direct = halo_lensing.around(universe.lens, Cells(universe.population), CELL)
+    direct = halo_lensing.lens_of_cell(universe.lens, CellCache(universe.population), CELL)
     once = [replace(one, settings=replace(one.settings, again=np.inf)) for one in (near, direct)]
-    split, whole = (halo_lensing.images(one, *behind) for one in once)
+    split, whole = (halo_lensing.lensing_at_images(one, *behind) for one in once)
     assert not direct.smooth.any()
     assert np.all(np.std(split - whole, axis=1)[:3] < 0.01 * np.std(whole, axis=1)[:3])
     assert 3600 * np.degrees(np.abs(split - whole)[3:].max()) < 0.5
@@ -172,7 +172,7 @@ def test_the_smooth_part_of_halos_is_that_of_a_direct_sum(universe, cells, near,
 
 def test_the_table_of_galaxies_has_the_lensing_of_halos(universe, cells, dust, monkeypatch):
     rows = galaxies.draw(CELL, universe, cells, dust).sort_by("id")
-    monkeypatch.setattr(halo_lensing, "around", lambda lens, cells, cell: lens)
+    monkeypatch.setattr(halo_lensing, "lens_of_cell", lambda lens, cells, cell: lens)
     bare = galaxies.draw(CELL, universe, cells, dust).sort_by("id")
     changed = {name for name in rows.column_names if not rows[name].equals(bare[name])}
     assert changed - {"a_v"} == {"ra", "dec", "_healpix_29", "kappa", "gamma1", "gamma2"}
@@ -185,14 +185,14 @@ def test_no_cell_misses_a_monster(universe):
     ra, dec = 217.0, 33.0
     index, chi = sky.healpix_29([ra], [dec]), cosmology.comoving_distance(np.array([0.05]))
     cone = LightCone(index, chi, np.array([15.5]), np.zeros(1))
-    cells = Cells(replace(universe.population, light_cone=cone))
+    cells = CellCache(replace(universe.population, light_cone=cone))
     seen = {}
     for away in (0.0, 1.0, 2.0, 4.0, 4.5, 5.5, 8.0):
-        cell = int(sky.cell_of([ra], [dec - away], GENERATION_ORDER)[0])
-        near = halo_lensing.around(universe.lens, cells, cell)
+        cell = int(sky.cell_at([ra], [dec - away], GENERATION_ORDER)[0])
+        near = halo_lensing.lens_of_cell(universe.lens, cells, cell)
         assert near.halos.shape[1] == (away < 5)
         lon, lat = (np.array([value]) for value in sky.cell_centre(GENERATION_ORDER, cell))
-        found = halo_lensing.images(near, lon, lat, np.array([CHI]))
+        found = halo_lensing.lensing_at_images(near, lon, lat, np.array([CHI]))
         assert np.isfinite(found).all()
         seen[away] = np.hypot(*found[1:3, 0])
     assert seen[1.0] > seen[2.0] > seen[4.0] > seen[5.5] == 0
@@ -202,16 +202,16 @@ def test_no_cell_misses_a_monster(universe):
 def test_what_is_right_behind_a_cluster_is_set_apart(universe):
     """A galaxy exactly behind the centre of a halo of 10^15 Msun/h at z = 0.3 is one for the quarantine."""
     index, chi = sky.healpix_29([217.0], [33.0]), cosmology.comoving_distance(np.array([0.3]))
-    cells = Cells(replace(universe.population, light_cone=LightCone(index, chi, np.array([15.0]), np.zeros(1))))
+    cells = CellCache(replace(universe.population, light_cone=LightCone(index, chi, np.array([15.0]), np.zeros(1))))
     empty = replace(universe.lens, maps=tuple(np.zeros_like(one) for one in universe.lens.maps))
     cell = int(index[0] >> 2 * (29 - GENERATION_ORDER))
-    near = halo_lensing.around(empty, cells, cell)
-    ra, dec = sky.positions(index)
+    near = halo_lensing.lens_of_cell(empty, cells, cell)
+    ra, dec = sky.positions_of_indices(index)
     for north in (0.0, 1e-6, 5.0):
         found = halo_lensing.columns(near, ra, dec + north / 60, np.full(1, CHI))
         kappa, gamma1, gamma2 = (found[name] for name in ("kappa", "gamma1", "gamma2"))
         assert np.isfinite([*found.values()]).all()
-        assert lensing.near_caustic(kappa, gamma1, gamma2, lensing.settings().caustic)[0] == (north < 1)
+        assert lensing.is_near_caustic(kappa, gamma1, gamma2, lensing.settings().caustic)[0] == (north < 1)
         assert all(-1 <= value < 100 for value in (kappa[0], gamma1[0], gamma2[0]))
 
 
@@ -232,10 +232,12 @@ def profile(theta, halo):
 def stacked(universe, places, least, number):
     """(tangential, cross shear, halos alone) by ring, and halos, of sources at z = 1 as they are seen."""
     edges, kept = np.array([0.5, 1.0, 2.0, 4.0]), []
-    rng, drawn = np.random.default_rng(3), Cells(universe.population)
+    rng, drawn = np.random.default_rng(3), CellCache(universe.population)
     for place in places:
-        near = halo_lensing.around(universe.lens, drawn, place)
-        halos, _ = halo_lensing._lenses(near.settings, near.box, drawn, GENERATION_ORDER, place, near.settings.lowest)
+        near = halo_lensing.lens_of_cell(universe.lens, drawn, place)
+        halos, _ = halo_lensing._cached_lenses(
+            near.settings, near.box, drawn, GENERATION_ORDER, place, near.settings.lowest
+        )
         nearby = (halos[3] > FROM) & (halos[3] < TO) & (halos[9] > least)
         _, ra, dec = sky.random_in_cell(GENERATION_ORDER, place, number, rng)
         found = halo_lensing.columns(near, ra, dec, np.full(number, CHI))

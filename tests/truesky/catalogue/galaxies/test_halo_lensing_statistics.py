@@ -15,7 +15,7 @@ from tests.truesky.catalogue.conftest import SEED
 from tests.truesky.catalogue.galaxies.test_halo_lensing import profile
 from truesky.catalogue.galaxies import galaxies, halo_lensing, lensing
 from truesky.catalogue.halos import lens_halos, matching
-from truesky.catalogue.halos.population import Cells
+from truesky.catalogue.halos.population import CellCache
 from truesky.catalogue.matter import density_box
 from truesky.fluxes import cosmology, sources
 from truesky.request.schema import Universe
@@ -41,16 +41,16 @@ def sample():
         patch.setattr(lensing, "settings", lambda: near)
         patch.setattr(lens_halos, "settings", lambda: chosen)
         population = galaxies.halos_and_galaxies(SEED, Universe(lensing_nside=NSIDE))
-        box, cells, halos = lensing.load(population.halos.box, NSIDE), Cells(population), []
+        box, cells, halos = lensing.load(population.halos.box, NSIDE), CellCache(population), []
         for cell in range(FIRST, FIRST + CELLS):
-            around = halo_lensing.around(box, cells, cell)
+            around = halo_lensing.lens_of_cell(box, cells, cell)
             _, ra, dec = sky.random_in_cell(GENERATION_ORDER, cell, SOURCES, rng)
             chi = np.full(SOURCES, CHI)
-            of_box = lensing.at(box, ra, dec, chi)
-            found = halo_lensing.images(around, *lensing.displaced(ra, dec, *of_box[3:]), chi)
-            seen = lensing.displaced(*lensing.displaced(ra, dec, *of_box[3:]), *found[3:])
+            of_box = lensing.interpolate(box, ra, dec, chi)
+            found = halo_lensing.lensing_at_images(around, *lensing.displace(ra, dec, *of_box[3:]), chi)
+            seen = lensing.displace(*lensing.displace(ra, dec, *of_box[3:]), *found[3:])
             drawn.append(np.stack([*seen, *of_box[:3], *found[:3]]))
-            own, _ = halo_lensing._lenses(chosen, box, cells, GENERATION_ORDER, cell, chosen.lowest)
+            own, _ = halo_lensing._cached_lenses(chosen, box, cells, GENERATION_ORDER, cell, chosen.lowest)
             halos.append(own[:, own[9] > 13.2])
     ra, dec, kappa, *shear = np.concatenate(drawn, 1)
     by_box, kappa = shear[0] + 1j * shear[1], kappa + shear[2]
@@ -87,7 +87,7 @@ def test_mean_convergence_and_its_least(sample):
 def with_neighbours(theta, z, log_mass):
     """Mean tangential shear[n] of the linear matter about halos, at theta rad."""
     ell, chi = np.geomspace(5, 1e5, 3000), float(cosmology.comoving_distance(z))
-    bias = matching.masses().at(matching.masses().bias, np.array([z]), np.array([log_mass]))[0]
+    bias = matching.masses().interpolate_pairs(matching.masses().bias, np.array([z]), np.array([log_mass]))[0]
     power = density_box.linear_power((ell + 0.5) / chi) * float(density_box.growth(z)) ** 2
     lens = 1.5 * cosmology.OMEGA_M / cosmology.HUBBLE_DISTANCE**2 * (1 + z) * (1 - chi / CHI) / chi
     c_l = lens * bias * power * np.exp(-((ell / 5e4) ** 2))
@@ -189,7 +189,8 @@ def test_correlations_of_shear_are_those_of_non_linear_theory(sample):
     )
     ell = np.unique(np.geomspace(5, 3e5, 500))
     linear, whole_power = (
-        theory.convergence(ell, np.array([CHI]), np.ones(1), of) for of in (theory.linear, theory.power)
+        theory.convergence_power(ell, np.array([CHI]), np.ones(1), of)
+        for of in (theory.linear_power, theory.nonlinear_power)
     )
     box, wanted = expected(ell, np.where(ell < 1.5 * NSIDE, linear, 0)), expected(ell, whole_power)
     plus, minus = (

@@ -66,10 +66,10 @@ def test_a_boost_is_written_beside_its_rows(universe, dust):
         (QUASAR, high_redshift.model(0.0, 20.0)[0]),
     ):
         rows = high_redshift.draw(1234, 5, kind, universe.lens, dust)
-        assert validate.violations(rows, GALAXIES) == []
+        assert validate.find_violations(rows, GALAXIES) == []
         assert len(rows) == pytest.approx(kind.boost * kind.per_deg2() * 0.05245, abs=5 * np.sqrt(len(rows)))
         assert np.all(rows["density_boost"].to_numpy() == kind.boost)
-        assert np.all(ids.kind_of(rows["id"].to_numpy()) == code)
+        assert np.all(ids.kind_from_id(rows["id"].to_numpy()) == code)
         assert rows["mag_r01"].to_numpy().max() < 26.0
         assert rows["z_true"].to_numpy().min() >= (0.3 if code == QUASAR else 6.0)
         assert np.unique(rows["id"].to_numpy()).size == len(rows)

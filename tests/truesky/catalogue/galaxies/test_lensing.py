@@ -15,7 +15,7 @@ from truesky.catalogue.galaxies import galaxies, lensing
 from truesky.catalogue.matter import density_box
 from truesky.fluxes import cosmology, sources
 from truesky.render.sources import galaxy_shapes
-from truesky.request.schema import MOST_SHEAR
+from truesky.request.schema import MAX_SHEAR
 
 BUMP_NSIDE = 128
 RA, DEC, WIDTH = 40.0, 20.0, np.radians(2.0)
@@ -27,14 +27,14 @@ def bump():
     ra, dec = hp.pix2ang(BUMP_NSIDE, np.arange(12 * BUMP_NSIDE**2), nest=True, lonlat=True)
     angle = np.radians(sky.separation(ra, dec, RA, DEC))
     kappa = 0.1 * np.exp(-0.5 * (angle / WIDTH) ** 2)
-    fields = lensing.transform(kappa.astype(np.float32), BUMP_NSIDE, np.ones(2 * BUMP_NSIDE + 1))
+    fields = lensing.maps_of_convergence(kappa.astype(np.float32), BUMP_NSIDE, np.ones(2 * BUMP_NSIDE + 1))
     return lensing.Planes(BUMP_NSIDE, np.array([1000.0]), (fields,))
 
 
 def at(planes, east, north):
     """Fields at offsets, deg, from the lens."""
     ra = RA + east / np.cos(np.radians(DEC))
-    return lensing.at(planes, np.array([ra]), np.array([DEC + north]), np.array([1000.0]))[:, 0]
+    return lensing.interpolate(planes, np.array([ra]), np.array([DEC + north]), np.array([1000.0]))[:, 0]
 
 
 def test_shear_is_tangential(bump):
@@ -62,7 +62,7 @@ def test_sources_are_pushed_away(bump):
     for east, north in ((3, 0), (-3, 0), (0, 3), (0, -3)):
         fields = at(bump, east, north)
         ra, dec = RA + east / np.cos(np.radians(DEC)), DEC + north
-        moved = lensing.displaced(np.array([ra]), np.array([dec]), fields[3:4], fields[4:5])
+        moved = lensing.displace(np.array([ra]), np.array([dec]), fields[3:4], fields[4:5])
         before, after = sky.separation(ra, dec, RA, DEC), sky.separation(moved[0], moved[1], RA, DEC)
         assert 0.1 < after - before < 0.5
 
@@ -71,7 +71,7 @@ def test_sources_are_pushed_away(bump):
 def test_displacements_are_great_circles(dec, rng):
     east, north = 0.002 * rng.standard_normal((2, 50))
     ra = 360.0 * rng.random(50)
-    lon, lat = lensing.displaced(ra, np.full(50, dec), east, north)
+    lon, lat = lensing.displace(ra, np.full(50, dec), east, north)
     assert sky.separation(ra, np.full(50, dec), lon, lat) == pytest.approx(np.degrees(np.hypot(east, north)), rel=1e-6)
     assert np.all((lon >= 0) & (lon < 360))
     if abs(dec) < 80:
@@ -83,18 +83,18 @@ def test_right_ascensions_are_below_360(dec):
     """True and observed ones, of what lies on the meridian of 0 and is moved over it, by as little as can be."""
     ra = np.array([0.0, -0.0, -1e-300, -1e-16, 360.0, np.nextafter(360.0, 0.0), 720.0])
     for east in (-1e-3, -1e-18, 0.0, 1e-18, 1e-3):
-        seen = lensing.displaced(ra, np.full(ra.size, dec), np.full(ra.size, east), np.zeros(ra.size))
-        columns = lensing.places(seen, (ra, np.full(ra.size, dec)))
+        seen = lensing.displace(ra, np.full(ra.size, dec), np.full(ra.size, east), np.zeros(ra.size))
+        columns = lensing.position_columns(seen, (ra, np.full(ra.size, dec)))
         for name in ("ra", "ra_true"):
             assert np.all((columns[name] >= 0.0) & (columns[name] < 360.0))
         assert np.array_equal(columns["_healpix_29"], sky.healpix_29(columns["ra"], columns["dec"]))
 
 
 def test_interpolation_in_distance(bump):
-    half = lensing.at(bump, np.array([RA]), np.array([DEC]), np.array([500.0]))
-    whole = lensing.at(bump, np.array([RA]), np.array([DEC]), np.array([1000.0]))
+    half = lensing.interpolate(bump, np.array([RA]), np.array([DEC]), np.array([500.0]))
+    whole = lensing.interpolate(bump, np.array([RA]), np.array([DEC]), np.array([1000.0]))
     assert half == pytest.approx(0.5 * whole, rel=1e-9, abs=0.0)
-    assert not lensing.at(bump, np.array([RA]), np.array([DEC]), np.array([0.0])).any()
+    assert not lensing.interpolate(bump, np.array([RA]), np.array([DEC]), np.array([0.0])).any()
 
 
 def limber(ell, chi):
@@ -134,7 +134,9 @@ def test_tangential_shear_about_massive_halos(universe, drawn):
     shear = []
     for angle in np.arange(8) * np.pi / 4:
         east, north = 1.0 * np.sin(angle), 1.0 * np.cos(angle)
-        found = lensing.at(universe.lens, ra + east / np.cos(np.radians(dec)), dec + north, np.full(ra.size, 2600.0))
+        found = lensing.interpolate(
+            universe.lens, ra + east / np.cos(np.radians(dec)), dec + north, np.full(ra.size, 2600.0)
+        )
         # Position angle from north to east; gamma1 > 0 is north-south.
         shear.append(found[1] * np.cos(2 * angle) - found[2] * np.sin(2 * angle))
     assert ra.size > 20
@@ -145,9 +147,9 @@ def test_determinants_and_caustics():
     kappa, none = np.array([0.0, 0.1, 0.95, 1.2]), np.zeros(4)
     assert sources.determinant(kappa, none, none) == pytest.approx([1.0, 0.81, 0.0025, 0.04])
     assert sources.determinant(np.array([0.1]), np.array([0.3]), np.array([0.4])) == pytest.approx([0.81 - 0.25])
-    assert lensing.near_caustic(kappa, none, none, 0.05).tolist() == [False, False, True, True]
+    assert lensing.is_near_caustic(kappa, none, none, 0.05).tolist() == [False, False, True, True]
     # Beyond both caustics the determinant is positive again.
-    assert lensing.near_caustic(np.array([2.5]), none[:1], none[:1], 0.05).all()
+    assert lensing.is_near_caustic(np.array([2.5]), none[:1], none[:1], 0.05).all()
 
 
 def test_a_resolution_that_healpix_has_not_is_refused(box):
@@ -189,7 +191,7 @@ def test_without_lensing_everything_else_is_the_same(drawn_with, unlensed):
     assert all(np.all(unlensed[name].to_numpy() == 0) for name in LENSED[4:])
 
 
-@given(size=st.floats(0.0, MOST_SHEAR - 1e-6), angle=st.floats(0.0, 6.3))
+@given(size=st.floats(0.0, MAX_SHEAR - 1e-6), angle=st.floats(0.0, 6.3))
 def test_a_constant_shear_acts_on_every_ellipticity(drawn_with, unlensed, size, angle):
     """e -> (e + g) / (1 + g* e), at the same places; g2 is of (east, north), shapes are drawn in (west, north)."""
     g1, g2 = size * np.cos(angle), size * np.sin(angle)
@@ -198,7 +200,7 @@ def test_a_constant_shear_acts_on_every_ellipticity(drawn_with, unlensed, size, 
     g = np.complex128(np.float32(g1) - 1j * np.float32(g2))
     for before, after in zip(ellipticities(unlensed), ellipticities(rows), strict=True):
         np.testing.assert_allclose(after, (before + g) / (1 + np.conj(g) * before), rtol=0, atol=1e-6)
-    mu = sources.magnification_of(rows)
+    mu = sources.table_magnification(rows)
     np.testing.assert_allclose(mu, 1 / (1 - abs(g) ** 2), rtol=1e-5)
 
 
@@ -220,9 +222,9 @@ def test_a_rotation_by_90_degrees_turns_the_intrinsic_ellipticity_alone(drawn_wi
 
 
 def test_requests_are_refused_where_ellipses_are_not_drawn():
-    assert lensing.settings().caustic < 1.0 - MOST_SHEAR**2
+    assert lensing.settings().caustic < 1.0 - MAX_SHEAR**2
 
 
 def test_an_axis_that_is_turned_by_next_to_nothing_stays_below_half_a_turn():
     rows = pa.table({"position_angle": pa.array([0.0, 90.0], pa.float32())})
-    assert lensing.turned(rows, -1e-9)["position_angle"].to_pylist() == [0.0, 90.0]
+    assert lensing.rotate_position_angles(rows, -1e-9)["position_angle"].to_pylist() == [0.0, 90.0]

@@ -37,7 +37,7 @@ def observed(number=400, seed=4):
 
 @pytest.fixture
 def given():
-    return nearest_sed.training(observed(), 30)
+    return nearest_sed.build_training(observed(), 30)
 
 
 def wanted(rng, n=300):
@@ -60,7 +60,7 @@ def test_the_nearest_is_that_of_a_search_through_all(given, rng):
 def test_the_scatter_is_as_stated_and_stays_in_the_library(given, rng):
     n = 20_000
     theirs = {name: np.full(1, value) for name, value in zip(KEYS, (0.5, -20.0, 0.5, 12.3, 2, 0.2), strict=True)}
-    one = nearest_sed.training({**theirs, "ebv": np.array([0.3])}, 30)
+    one = nearest_sed.build_training({**theirs, "ebv": np.array([0.3])}, 30)
     found = nearest_sed.assign(one, np.zeros(n), np.full(n, -20.0), np.full(n, 0.5), rng)
     index = found.template_1 * found.frac_1 + found.template_2 * found.frac_2
     assert np.mean(index) == pytest.approx(12.3, abs=0.02)
@@ -78,9 +78,9 @@ def test_the_scatter_is_as_stated_and_stays_in_the_library(given, rng):
 def test_galaxies_are_drawn_with_these_spectra(universe, dust, given):
     """Those that a training table decides on are in the library, in the table's bounds, and of the usual number."""
     there = dataclasses.replace(universe, training=given)
-    rows = galaxies.draw(303_117, there, population.Cells(there.population), dust)
-    assert validate.violations(rows, GALAXIES) == []
-    again = galaxies.draw(303_117, there, population.Cells(there.population), dust)
+    rows = galaxies.draw(303_117, there, population.CellCache(there.population), dust)
+    assert validate.find_violations(rows, GALAXIES) == []
+    again = galaxies.draw(303_117, there, population.CellCache(there.population), dust)
     assert rows.equals(again)
     theirs = set(observed()["ext_law"].tolist())
     assert set(np.unique(rows["ext_law_1"].to_numpy()).tolist()) == theirs
@@ -99,11 +99,11 @@ def test_a_request_with_a_training_table(tmp_path):
         text = requests.shallow(20.0, 18.0, more) + own
         path = requests.written(tmp_path, text, requests.FIELD.format(0.05), name)
         for step in build_galaxies.steps(tmp_path / name, parse(path)):
-            publish.make(tmp_path / name, step.plan, step.work)
+            publish.make_version(tmp_path / name, step.plan, step.run_task)
         found.append(read.version(tmp_path / name, "galaxies"))
     with_table, without = (version.rows() for version in found)
     assert found[0].manifest["facts"]["training"]["columns"] == {key: f'"{key}"' for key in KEYS}
-    assert validate.violations(with_table, GALAXIES) == []
+    assert validate.find_violations(with_table, GALAXIES) == []
     assert with_table.num_rows > 20
     assert not with_table["ebv_1"].equals(without["ebv_1"])
 
@@ -124,8 +124,8 @@ def test_a_template_that_the_library_has_not(tmp_path, monkeypatch):
     values["sed"][4] = 30.5
     path = tmp_path / "synthetic.parquet"
     pq.write_table(pa.table(values), path)
-    columns = mapping.training({key: f'"{key}"' for key in KEYS})
+    columns = mapping.training_columns({key: f'"{key}"' for key in KEYS})
     with pytest.raises(BadInput, match=r"synthetic\.parquet: column sed \(sed\) of row 5 is 30\.5, the library's last"):
         nearest_sed.load([path], ["x"], columns)
     with pytest.raises(BadInput, match=r"ingest\.training\.columns wants ebv"):
-        mapping.training({key: f'"{key}"' for key in KEYS[:-1]})
+        mapping.training_columns({key: f'"{key}"' for key in KEYS[:-1]})

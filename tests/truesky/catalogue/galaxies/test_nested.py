@@ -22,7 +22,7 @@ LIMITS, REDSHIFTS = (20.0, 23.0, 26.0), (1.0, 2.3)
 def model(limit, z_max, seed=SEED):
     maps = {} if seed == SEED else {"lensing": (0.02, -0.01)}
     universe = galaxies.model(seed, Universe(galaxy_limit=limit, z_max=z_max, **SMALL, **maps))
-    return universe, population.Cells(universe.population)
+    return universe, population.CellCache(universe.population)
 
 
 @cache
@@ -42,9 +42,13 @@ def magnitude(universe, rows):
     """In the limit's band."""
     z, m_r = (rows[name].to_numpy().astype(float) for name in ("z_true", "abs_mag_r01"))
     names = ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")
-    continuum = galaxies.apparent(universe, z, m_r, band_ratios.Sed(*(rows[name].to_numpy() for name in names)))
+    continuum = galaxies.apparent_magnitude(
+        universe, z, m_r, band_ratios.Sed(*(rows[name].to_numpy() for name in names))
+    )
     lines = {name: rows[name].to_numpy() for name in rows.column_names if name.startswith("flux_")}
-    return emission_lines.brightened(continuum, emission_lines.added(universe.band, rows["z_obs"].to_numpy(), lines))
+    return emission_lines.magnitude_with_light(
+        continuum, emission_lines.mean_line_flux(universe.band, rows["z_obs"].to_numpy(), lines)
+    )
 
 
 def same(one, other):
@@ -97,7 +101,9 @@ def test_nothing_is_missing_at_the_limit():
     assert np.isin(many["id"].to_numpy()[seen], few["id"].to_numpy()).all()
     z, m_r = (few[name].to_numpy().astype(float) for name in ("z_true", "abs_mag_r01"))
     names = ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")
-    continuum = galaxies.apparent(universe, z, m_r, band_ratios.Sed(*(few[name].to_numpy() for name in names)))
+    continuum = galaxies.apparent_magnitude(
+        universe, z, m_r, band_ratios.Sed(*(few[name].to_numpy() for name in names))
+    )
     assert 0.005 < np.mean(continuum > 23.0) < 0.05
 
 
@@ -126,10 +132,10 @@ def test_hosts_behind_the_end_of_a_request_have_their_satellites_before_it():
     (near, of_near), (_, of_far) = ((one.population, cells) for one, cells in (model(23.0, 0.3), model(23.0, 0.6)))
     for cell in range(303_104, 303_120):
         a, b = population.members(of_near, cell), population.members(of_far, cell)
-        assert np.array_equal(a.id, b.id[b.chi < near.halos.far])
-    hosts, _ = of_near.at(halos.LEVELS[0], 303_117)
-    assert hosts.chi.max() > near.halos.far
-    assert np.all(hosts.chi < near.halos.far + 2 * near.halos.box.model.cell)
+        assert np.array_equal(a.id, b.id[b.chi < near.halos.max_distance])
+    hosts, _ = of_near.halos_and_satellites(halos.LEVELS[0], 303_117)
+    assert hosts.chi.max() > near.halos.max_distance
+    assert np.all(hosts.chi < near.halos.max_distance + 2 * near.halos.box.model.cell)
 
 
 def test_strong_lenses_of_a_shallower_catalogue_are_among_those_of_a_deeper_one():

@@ -12,7 +12,7 @@ from lake_schema.store import validate
 from lake_schema.tables.galaxies import GALAXIES
 from tests.truesky.catalogue.conftest import SEED, SMALL
 from truesky.catalogue.galaxies import galaxies, lensing, observed_cells
-from truesky.catalogue.halos.population import Cells
+from truesky.catalogue.halos.population import CellCache
 from truesky.request.schema import Universe
 
 ORDER = ids.GENERATION_ORDER
@@ -33,11 +33,11 @@ def shallow():
 
 @pytest.fixture(scope="module")
 def population(shallow):
-    return Cells(shallow.population)
+    return CellCache(shallow.population)
 
 
 def cell_at(place):
-    return int(sky.cell_of([place[0]], [place[1]], ORDER)[0])
+    return int(sky.cell_at([place[0]], [place[1]], ORDER)[0])
 
 
 def around(cell):
@@ -45,13 +45,13 @@ def around(cell):
 
 
 def seen_in(rows, cells):
-    inside = np.isin(sky.cell_of(rows["ra"].to_numpy(), rows["dec"].to_numpy(), ORDER), cells)
+    inside = np.isin(sky.cell_at(rows["ra"].to_numpy(), rows["dec"].to_numpy(), ORDER), cells)
     return rows.filter(pa.array(inside))
 
 
 def crossing(rows):
     """How many are seen in another cell than that which they are truly in."""
-    seen, true = (sky.cell_of(rows[ra].to_numpy(), rows[dec].to_numpy(), ORDER) for ra, dec in NAMES)
+    seen, true = (sky.cell_at(rows[ra].to_numpy(), rows[dec].to_numpy(), ORDER) for ra, dec in NAMES)
     return int(np.sum(seen != true))
 
 
@@ -74,14 +74,14 @@ def test_a_cell_holds_what_is_seen_in_it_wherever_it_truly_is(place, shallow, po
     own = galaxies.draw(cell, shallow, population, dust)
     assert len(seen_in(own, [cell])) < len(own)
     assert np.all(np.diff(found["_healpix_29"].to_numpy()) >= 0)
-    assert validate.violations(found, GALAXIES) == []
+    assert validate.find_violations(found, GALAXIES) == []
 
 
 def test_files_made_apart_hold_every_galaxy_once(shallow, population, dust):
     """On both sides of a border of files, each in one order of drawing, alone and together."""
     first = cell_at(PLACES[3])
     second = next(cell for cell in around(first) if cell >> 6 != first >> 6)
-    apart = [observed_cells.draw([cell], shallow, Cells(shallow.population), dust) for cell in (second, first)]
+    apart = [observed_cells.draw([cell], shallow, CellCache(shallow.population), dust) for cell in (second, first)]
     together = observed_cells.draw([first, second], shallow, population, dust)
     both = pa.concat_tables(apart)
     assert np.unique(both["id"].to_numpy()).size == len(both)
@@ -92,7 +92,7 @@ def test_files_made_apart_hold_every_galaxy_once(shallow, population, dust):
 def test_a_shallower_request_has_fewer_of_the_same(shallow, population, dust):
     cell = cell_at(PLACES[3])
     deep, bright = observed_cells.draw([cell], shallow, population, dust), made(20.5)
-    found = observed_cells.draw([cell], bright, Cells(bright.population), dust)
+    found = observed_cells.draw([cell], bright, CellCache(bright.population), dust)
     assert 50 < len(found) < 0.5 * len(deep)
     again = deep.filter(pa.array(np.isin(deep["id"].to_numpy(), found["id"].to_numpy())))
     assert again.sort_by("id").equals(found.sort_by("id"))
@@ -109,7 +109,7 @@ def test_without_lensing_nothing_crosses_a_border(shallow, population, dust):
 
 
 def test_light_that_is_bent_too_far_is_refused(shallow, population, dust, monkeypatch):
-    monkeypatch.setattr(observed_cells, "_MOST", np.radians(10.0 / 3600.0))
+    monkeypatch.setattr(observed_cells, "_MAX_HALO_DEFLECTION", np.radians(10.0 / 3600.0))
     with pytest.raises(BadInput, match="halos may deflect light by"):
         observed_cells.draw([cell_at(PLACES[0])], shallow, population, dust)
 
@@ -117,25 +117,25 @@ def test_light_that_is_bent_too_far_is_refused(shallow, population, dust, monkey
 @given(st.floats(0, 360, exclude_max=True), st.floats(-90, 90), st.integers(0, 999), st.sampled_from([8, 5]))
 def test_the_bound_on_the_deflection_of_the_box_holds(universe, ra, dec, seed, order):
     """Of whatever source in the cell, at any distance."""
-    cell = int(sky.cell_of([ra], [dec], order)[0])
+    cell = int(sky.cell_at([ra], [dec], order)[0])
     rng = np.random.default_rng(seed)
     _, lon, lat = sky.random_in_cell(order, cell, 50, rng)
-    bent = np.hypot(*lensing.at(universe.lens, lon, lat, rng.uniform(0.0, 9000.0, 50))[3:])
-    assert bent.max() <= lensing.farthest(universe.lens, order, cell)
+    bent = np.hypot(*lensing.interpolate(universe.lens, lon, lat, rng.uniform(0.0, 9000.0, 50))[3:])
+    assert bent.max() <= lensing.max_deflection(universe.lens, order, cell)
 
 
 @given(st.integers(0, (12 << 16) - 1), st.floats(1e-5, 2e-3), st.integers(0, 999))
 def test_what_is_near_is_found_and_what_is_far_is_not(cell, angle, seed):
     """Distances from a cell, against those of places on its border."""
-    own = observed_cells._Wanted.of([cell])
+    own = observed_cells._RequestedCells.from_cells([cell])
     edge = sky.cell_corners(ORDER, [cell])[0]
     rng = np.random.default_rng(seed)
     corner = edge[rng.integers(0, 4, 40)]
     offset = rng.uniform(-2.0, 2.0, (2, 40)) * angle
-    lon, lat = lensing.displaced(corner[:, 0], np.clip(corner[:, 1], -90, 90), *offset)
-    near = own.near(lon, lat, angle)
+    lon, lat = lensing.displace(corner[:, 0], np.clip(corner[:, 1], -90, 90), *offset)
+    near = own.is_near(lon, lat, angle)
     within = np.radians(sky.separation(lon, lat, corner[:, 0], corner[:, 1])) <= 0.999 * angle
-    inside = sky.cell_of(lon, lat, ORDER) == cell
+    inside = sky.cell_at(lon, lat, ORDER) == cell
     assert near[within | inside].all()
     width = 4.0 * np.radians(sky.cell_radius(13))
     centre = sky.cell_centre(ORDER, cell)

@@ -27,12 +27,12 @@ def killed_at(root, number):
 
     def work(lake, facts):
         begun.append(facts)
-        rows = step.work(lake, facts)
+        rows = step.run_task(lake, facts)
         if len(begun) == number:
             os.kill(os.getpid(), signal.SIGKILL)
         return rows
 
-    publish.make(root, step.plan, work)
+    publish.make_version(root, step.plan, work)
 
 
 def made(root):
@@ -41,9 +41,9 @@ def made(root):
 
     def work(lake, facts):
         begun.append(facts)
-        return step.work(lake, facts)
+        return step.run_task(lake, facts)
 
-    publish.make(root, step.plan, work)
+    publish.make_version(root, step.plan, work)
     version = read.version(root, "galaxies")
     return len(begun), (version.folder / "manifest.json").read_bytes(), version
 
@@ -60,7 +60,7 @@ def test_a_run_that_is_killed_goes_on_with_the_same_galaxies(tmp_path):
     rows = version.rows(["id", "ra", "dec", "ra_true", "dec_true"])
     assert np.unique(rows["id"].to_numpy()).size == len(rows) > 100
     seen, true = (
-        sky.cell_of(rows[ra].to_numpy(), rows[dec].to_numpy(), ids.GENERATION_ORDER)
+        sky.cell_at(rows[ra].to_numpy(), rows[dec].to_numpy(), ids.GENERATION_ORDER)
         for ra, dec in (("ra", "dec"), ("ra_true", "dec_true"))
     )
     assert np.count_nonzero(seen != true) > 3

@@ -22,7 +22,7 @@ def table(library):
 
 @pytest.fixture(scope="module")
 def ends(table):
-    return sequences.limits(table, MODEL.dust)
+    return sequences.colour_limits(table, MODEL.dust)
 
 
 def drawn(ends, rng, m_r, z, n=40_000, odds=None, model=MODEL):
@@ -88,8 +88,8 @@ def test_no_colour_and_no_dust_occurs_twice(table, ends, rng, m_r, z):
     """Clipped colours put every twelfth galaxy on the bluest template, hundreds on the very same colour."""
     found = drawn(ends, rng, m_r, z, 20_000)
     m, at = np.full(20_000, m_r), np.full(20_000, z)
-    law, ebv = sequences.dust(MODEL, ends, m, at, found, rng)
-    spectra = band_ratios.invert(table, found.colour, law, ebv)
+    law, ebv = sequences.draw_dust(MODEL, ends, m, at, found, rng)
+    spectra = band_ratios.sed_of_colour(table, found.colour, law, ebv)
     assert np.unique(found.colour).size == found.colour.size
     assert np.unique(ebv[law > 0]).size == np.sum(law > 0)
     # Every colour is had: none lies beyond the last template behind its dust.
@@ -114,7 +114,7 @@ def test_dust_is_in_galaxies_that_are_not_red(ends, rng):
     m, z = np.full(n, -19.5), np.full(n, 0.3)
     colour = rng.uniform(0.3, 0.9, n)
     found = sequences.Colour(rng.choice([BLUE, GREEN, RED], n), colour, np.zeros(n))
-    law, ebv = sequences.dust(MODEL, ends, m, z, found, rng)
+    law, ebv = sequences.draw_dust(MODEL, ends, m, z, found, rng)
     assert np.all(law[found.red] == 0)
     assert np.all(ebv[law == 0] == 0.0)
     dusty, blue = law > 0, found.sequence == BLUE
@@ -133,14 +133,16 @@ def test_dust_leaves_room_for_the_bluest_colours(ends, rng):
     n = 2000
     for colour in (ends.bluest + 0.01, ends.bluest + 0.1):
         found = sequences.Colour(np.full(n, BLUE), np.full(n, colour), np.zeros(n))
-        law, ebv = sequences.dust(MODEL, ends, np.full(n, -19.5), np.full(n, 2.0), found, rng)
+        law, ebv = sequences.draw_dust(MODEL, ends, np.full(n, -19.5), np.full(n, 2.0), found, rng)
         for code in set(law.tolist()) - {0}:
             most = np.interp(colour, ends.behind[code - 1], ends.ebv)
             assert ebv[law == code].max() <= most + 1e-9
 
 
 def test_galaxies_of_other_catalogues_have_places_on_the_sequences():
-    found = sequences.known(MODEL, np.full(3, -20.0), np.full(3, 0.1), np.array([0.62, 0.74, 5.0]), np.zeros(3, bool))
+    found = sequences.place_on_sequence(
+        MODEL, np.full(3, -20.0), np.full(3, 0.1), np.array([0.62, 0.74, 5.0]), np.zeros(3, bool)
+    )
     assert found.deviate == pytest.approx([0.0, 1.0, 3.0])
 
 

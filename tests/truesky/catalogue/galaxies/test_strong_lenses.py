@@ -73,7 +73,7 @@ def test_the_deflection_diverges_as_the_convergence():
 )
 def test_rays_end_at_the_analytic_images(lens, east, north):
     """A small source: one spot an image, where it must be, with the flux of its magnification."""
-    picture = strong_lenses.shoot(lens, Disc(east, north, 0.02, 1.0, 0.0), STAMPS, SIDE)
+    picture = strong_lenses.shoot_rays(lens, Disc(east, north, 0.02, 1.0, 0.0), STAMPS, SIDE)
     found = strong_lenses.image_positions(lens, east, north)
     mu = np.abs(strong_lenses.magnification(lens, found[:, 0], found[:, 1]))
     assert picture.sum() == pytest.approx(mu.sum(), rel=0.02)
@@ -88,14 +88,14 @@ def test_rays_end_at_the_analytic_images(lens, east, north):
 
 def test_finer_rays_do_not_change_the_picture():
     lens, source = Lens(1.2, 0.75, 40.0), Disc(0.15, -0.1, 0.2, 0.6, 70.0)
-    coarse = strong_lenses.shoot(lens, source, STAMPS, SIDE)
-    fine = strong_lenses.shoot(lens, source, replace(STAMPS, samples=(16, 16)), SIDE)
+    coarse = strong_lenses.shoot_rays(lens, source, STAMPS, SIDE)
+    fine = strong_lenses.shoot_rays(lens, source, replace(STAMPS, samples=(16, 16)), SIDE)
     assert coarse.sum() == pytest.approx(fine.sum(), rel=1e-3)
     assert np.abs(coarse - fine).sum() < 5e-3 * fine.sum()
 
 
 def test_far_away_from_the_lens_nothing_is_magnified():
-    weak = strong_lenses.shoot(Lens(1e-3, 0.8, 0.0), Disc(0.4, 0.3, 0.3, 0.5, 30.0), STAMPS, SIDE)
+    weak = strong_lenses.shoot_rays(Lens(1e-3, 0.8, 0.0), Disc(0.4, 0.3, 0.3, 0.5, 30.0), STAMPS, SIDE)
     assert weak.sum() == pytest.approx(1.0, abs=3e-3)
     middle = ndimage.center_of_mass(weak)
     assert np.interp(middle, np.arange(SIDE), place()) == pytest.approx((0.3, 0.4), abs=2e-3)
@@ -110,7 +110,7 @@ def test_einstein_radius_of_a_massive_galaxy():
 @pytest.fixture(scope="module")
 def systems(drawn):
     """Many times as many as there are, in the cells that were drawn."""
-    index = drawn.rows["_healpix_29"].to_numpy() >> 2 * (sky.DEEPEST - 8)
+    index = drawn.rows["_healpix_29"].to_numpy() >> 2 * (sky.MAX_ORDER - 8)
     found = [
         strong_lenses.draw(cell, drawn.rows.filter(pa.array(index == cell)), SEED, BOOST) for cell in drawn.places[:8]
     ]
@@ -127,7 +127,7 @@ def test_dispersions_are_those_of_nearby_galaxies(flat_sky):
     phi, alpha, beta = 8.0e-3, 2.32, 2.67
     expected = phi * gamma((alpha + 4.0) / beta) / gamma(alpha / beta)
     near = (z > 0.1) & (z < 0.7) & (colour > law.reddest_blue)
-    m_star, _, _ = luminosity_function.schechter().at(z[near])
+    m_star, _, _ = luminosity_function.schechter().parameters_at(z[near])
     fourth = 10.0 ** (0.4 * (m_star - m_r[near])) * np.exp(8.0 * (law.scatter * np.log(10.0)) ** 2)
     volume = float(cosmology.comoving_volume(0.1, 0.7)) * np.radians(1.0) ** 2 * FLAT_CELLS * sky.cell_area(8)
     assert law.sigma_star == 161.0
@@ -162,12 +162,12 @@ def test_there_are_as_many_as_expected(systems, drawn):
 def test_an_empty_cell_has_none():
     rows = strong_lenses.draw(7, GALAXIES.empty(), SEED, 1.0)
     assert rows.num_rows == 0
-    assert validate.violations(rows, STRONG_LENSES) == []
+    assert validate.find_violations(rows, STRONG_LENSES) == []
 
 
 def test_rows_are_what_the_table_declares(systems, drawn):
     rows, _ = systems
-    assert validate.violations(rows, STRONG_LENSES) == []
+    assert validate.find_violations(rows, STRONG_LENSES) == []
     magnification = rows["magnification"].to_numpy()
     assert magnification.min() > 3.0
     assert rows["einstein_radius"].to_numpy().min() > 0.5
@@ -183,13 +183,13 @@ def test_rows_are_what_the_table_declares(systems, drawn):
 
 def test_a_published_table(tmp_path, drawn):
     index, cell = drawn.rows["_healpix_29"].to_numpy(), drawn.places[0]
-    own = drawn.rows.filter(pa.array(index >> 2 * (sky.DEEPEST - 8) == cell))
+    own = drawn.rows.filter(pa.array(index >> 2 * (sky.MAX_ORDER - 8) == cell))
     name = f"Norder=5/Dir=0/Npix={cell >> 6}.parquet"
-    part = plan.Part(name, {"generation_cells": [cell]})
-    publish.make(tmp_path, plan.Plan(GALAXIES, {"seed": 7}, (part,)), lambda lake, facts: plan.Output(own))
+    part = plan.Task(name, {"generation_cells": [cell]})
+    publish.make_version(tmp_path, plan.Plan(GALAXIES, {"seed": 7}, (part,)), lambda lake, facts: plan.Output(own))
     path = requests.written(tmp_path, "[strong_lenses]\nboost = 3.0\n", seed=7)
     (step,) = build_strong_lenses.steps(tmp_path, parse(path))
-    publish.make(tmp_path, step.plan, step.work)
+    publish.make_version(tmp_path, step.plan, step.run_task)
     rows = read.version(tmp_path, "strong_lenses").rows()
     assert rows.num_rows > 0
     assert rows.equals(strong_lenses.draw(cell, own, 7, 3.0))

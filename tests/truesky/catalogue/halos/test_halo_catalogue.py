@@ -58,7 +58,7 @@ def write(path, values):
 
 
 def loaded(path, columns=COLUMNS):
-    return halo_catalogue.load([path], [file_sha256(path)], mapping.halos(columns))
+    return halo_catalogue.load([path], [file_sha256(path)], mapping.halo_columns(columns))
 
 
 @pytest.mark.parametrize("ending", ["parquet", "fits", "csv"])
@@ -66,8 +66,8 @@ def test_the_halos_of_a_cell_are_those_of_the_file(tmp_path, ending):
     values = synthetic()
     cone = loaded(write(tmp_path / f"synthetic.{ending}", values))
     universe = galaxies.halos_and_galaxies(SEED, Universe(galaxy_limit=24.5, box_cells=BOX_CELLS), cone)
-    rows = galaxies.halo_table(CELL, universe, population.Cells(universe))
-    inside = sky.cell_of(values["ra"], values["dec"], ids.GENERATION_ORDER) == CELL
+    rows = galaxies.halo_table(CELL, universe, population.CellCache(universe))
+    inside = sky.cell_at(values["ra"], values["dec"], ids.GENERATION_ORDER) == CELL
     bright = inside & (np.log10(values["mass"]) > universe.halos.mass_limit(cosmology.comoving_distance(values["z"])))
     there = universe.halos.mass_limit(cosmology.comoving_distance(rows["z_true"].to_numpy().astype(float)))
     found = rows.filter(pa.array(rows["log_mass"].to_numpy() > there))
@@ -79,7 +79,7 @@ def test_the_halos_of_a_cell_are_those_of_the_file(tmp_path, ending):
 def test_galaxies_live_in_them_and_none_is_lost_between_cells(tmp_path):
     cone = loaded(write(tmp_path / "synthetic.parquet", synthetic()))
     universe = galaxies.halos_and_galaxies(SEED, Universe(galaxy_limit=24.5, box_cells=BOX_CELLS), cone)
-    cells = population.Cells(universe)
+    cells = population.CellCache(universe)
     parts = [population.members(cells, cell) for cell in range(CELL >> 4 << 4, (CELL >> 4 << 4) + 16)]
     own, host = (np.concatenate([getattr(part, name) for part in parts]) for name in ("id", "halo_id"))
     known = np.concatenate([part.halos.id for part in parts])

@@ -28,7 +28,7 @@ def test_a_reach_never_leads_beyond_the_cells_about(order, rng):
         moved = vector * np.cos(np.radians(length)) + np.sin(np.radians(length)) * (
             np.cos(angle) * north + np.sin(angle) * east
         )
-        to = sky.cell_of(np.degrees(np.arctan2(moved[1], moved[0])), np.degrees(np.arcsin(moved[2])), order)
+        to = sky.cell_at(np.degrees(np.arctan2(moved[1], moved[0])), np.degrees(np.arcsin(moved[2])), order)
         assert np.isin(to, [cell, *sky.margin_cells(order, cell, order).tolist()]).all()
 
 
@@ -63,8 +63,8 @@ def test_halos_above_a_mass_are_the_same_to_any_limit(model, order):
     every, few = halos.draw(model, SEED, order, 70, least), halos.draw(model, SEED, order, 70)
     shallow = dataclasses.replace(model, limit=model.limit + 1.0, far=2000.0)
     again = halos.draw(shallow, SEED, order, 70, least)
-    both = few.part((few.log_mass >= 12.0) & (few.chi < 2000.0))
-    kept = every.part(
+    both = few.select((few.log_mass >= 12.0) & (few.chi < 2000.0))
+    kept = every.select(
         (every.log_mass >= np.maximum(12.0, model.mass_limit(every.chi) + model.host_offset)) & (every.chi < 2000.0)
     )
     assert kept.id.size > 0 or order == 2

@@ -86,7 +86,7 @@ def test_there_is_no_step_where_the_knots_begin():
 
 def test_knots_are_joined_by_straight_lines():
     """Of M*, log phi* and alpha: halfway between z = 3 and 3.8."""
-    m_star, phi_star, alpha = SCHECHTER.at(np.array([3.4]))
+    m_star, phi_star, alpha = SCHECHTER.parameters_at(np.array([3.4]))
     assert m_star == pytest.approx(0.5 * (-22.15 - 22.00))
     assert phi_star == pytest.approx(np.sqrt(1.603e-3 * 5.968e-4))
     assert alpha == pytest.approx(0.5 * (-1.597 - 1.858))

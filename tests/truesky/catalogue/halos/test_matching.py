@@ -7,7 +7,7 @@ from truesky.catalogue.halos import luminosity_function, matching
 
 HALOS = matching.masses()
 LF = luminosity_function.schechter()
-MATCHED = matching.matching(HALOS, luminosity_function.inverse(LF, matching.Z_LAST))
+MATCHED = matching.match_luminosities(HALOS, luminosity_function.inverse(LF, matching.Z_LAST))
 
 
 @pytest.mark.parametrize(
@@ -30,7 +30,7 @@ def test_abundance_and_bias(z, numbers, biases):
 
 def test_concentrations():
     """Diemer & Joyce 2019."""
-    found = HALOS.at(HALOS.concentration, np.array([0.0, 1.0]), np.array([12.0, 12.0]))
+    found = HALOS.interpolate_pairs(HALOS.concentration, np.array([0.0, 1.0]), np.array([12.0, 12.0]))
     assert found == pytest.approx([13.5, 5.7], rel=0.03)
 
 
@@ -62,26 +62,28 @@ def test_the_luminosity_function_comes_out(z, rng):
     density[HALOS.log_mass < 10.5] = 0.0
     mass = np.repeat(HALOS.log_mass, rng.poisson(volume * density)) + 0.02 * (rng.random() - 0.5)
     over = 10 ** (mass - 10.5)
-    count = rng.poisson(np.maximum(over - occupation.least, 0) / occupation.ratio_at(z))
+    count = rng.poisson(np.maximum(over - occupation.min_mass_ratio, 0) / occupation.ratio_at(z))
     host = np.repeat(np.arange(mass.size), count)
-    sub = mass[host] - np.log10(occupation.least + (over[host] - occupation.least) * rng.random(host.size))
+    sub = mass[host] - np.log10(
+        occupation.min_mass_ratio + (over[host] - occupation.min_mass_ratio) * rng.random(host.size)
+    )
     proxy = np.concatenate([mass, sub]) + occupation.scatter * rng.standard_normal(mass.size + sub.size)
     m_r = MATCHED.magnitude(np.full(proxy.size, z), proxy)
-    for limit in luminosity_function.schechter().at(z)[0] + np.array([-1.0, 0.0, 1.0]):
+    for limit in luminosity_function.schechter().parameters_at(z)[0] + np.array([-1.0, 0.0, 1.0]):
         expected = volume * float(luminosity_function.number_density(LF, limit, z))
         assert np.sum(m_r < limit) == pytest.approx(expected, rel=0.05, abs=5 * np.sqrt(expected))
 
 
 def test_mass_of_inverts_magnitude():
     z, proxy = np.array([0.1, 0.8, 1.9]), np.array([11.0, 12.3, 13.1])
-    assert MATCHED.mass_of(z, MATCHED.magnitude(z, proxy)) == pytest.approx(proxy, abs=1e-6)
+    assert MATCHED.proxy_mass(z, MATCHED.magnitude(z, proxy)) == pytest.approx(proxy, abs=1e-6)
 
 
 @pytest.mark.parametrize(("m_r", "fraction"), [(-19.0, 0.28), (-20.0, 0.21), (-21.0, 0.13)])
 def test_satellite_fraction_nearby(m_r, fraction):
     """Zehavi et al. 2011, z = 0.1."""
     z, occupation = np.array([0.1]), MATCHED.occupation
-    least = float(MATCHED.mass_of(z, np.array([m_r]))[0])
+    least = float(MATCHED.proxy_mass(z, np.array([m_r]))[0])
     number = np.exp(HALOS.interpolate(HALOS.ln_density, z, HALOS.log_mass))[0] * 0.02
     above = matching.satellites_above(HALOS.log_mass, occupation) @ number
     sub = above[:-1] - above[1:]
@@ -95,7 +97,7 @@ def test_satellite_fraction_nearby(m_r, fraction):
 def test_halos_have_more_satellites_at_high_redshift_up_to_an_end():
     own = MATCHED.occupation
     assert own.ratio_at(np.array([own.z_pivot]))[0] == pytest.approx(own.ratio)
-    more = matching.satellites_at(np.array([0.1, 0.5, 1.0, 3.0]), own)
+    more = matching.satellite_evolution(np.array([0.1, 0.5, 1.0, 3.0]), own)
     assert more[1] == pytest.approx((1.5 / 1.1) ** own.ratio_z)
     assert (np.diff(more[:3]) > 0).all()
     assert more[2] == more[3]

@@ -5,7 +5,7 @@ import pytest
 
 from lake_schema import ids, sky
 from truesky.catalogue.halos import halos, population, satellites
-from truesky.catalogue.halos.population import Cells
+from truesky.catalogue.halos.population import CellCache
 
 # A block of four cells at an edge of an order-5 cell and of a base cell, and what lies about it.
 BLOCK = [4 * ((3 << 16) // 4 - 1) + i for i in range(4)]
@@ -13,13 +13,13 @@ BLOCK = [4 * ((3 << 16) // 4 - 1) + i for i in range(4)]
 
 @pytest.fixture(scope="module")
 def block(universe):
-    drawn = Cells(universe.population)
+    drawn = CellCache(universe.population)
     return {cell: population.members(drawn, cell) for cell in BLOCK}
 
 
 def falling_in(universe, block):
     """Identifiers of all satellites of all halos near, wherever they fall: of those that fall into the block."""
-    drawn = Cells(universe.population)
+    drawn = CellCache(universe.population)
     found_in = []
     for order in halos.LEVELS:
         own = {cell >> 2 * (8 - order) for cell in block}
@@ -27,9 +27,11 @@ def falling_in(universe, block):
         # One ring more than is needed: nothing comes from there.
         wide = {int(c) for cell in ring for c in sky.margin_cells(order, cell, order)} if order == 8 else set()
         for cell in sorted(own | ring | wide):
-            hosts, found = drawn.at(order, cell)
-            inside = np.isin(sky.cell_of(found.ra, found.dec, 8), block)
-            inside &= (found.chi > universe.population.halos.line.edge[0]) & (found.chi < universe.population.halos.far)
+            hosts, found = drawn.halos_and_satellites(order, cell)
+            inside = np.isin(sky.cell_at(found.ra, found.dec, 8), block)
+            inside &= (found.chi > universe.population.halos.line.edge[0]) & (
+                found.chi < universe.population.halos.max_distance
+            )
             own = ids.satellite_id(hosts.id[found.host], found.member, hosts.bits[found.host])
             found_in.append(own[inside])
     return np.sort(np.concatenate(found_in))
@@ -51,8 +53,8 @@ def test_satellites_are_neither_lost_nor_doubled(universe, block):
     ("ra", "dec"), [((45, 135, 225, 315), 89.9), ((45, 135, 225, 315), -89.9), ((359.9, 0, 0.1), 0.1)]
 )
 def test_nor_at_a_pole_or_across_the_first_meridian(universe, ra, dec):
-    places = sorted({int(cell) for cell in sky.cell_of(np.array(ra, float), np.full(len(ra), dec), 8)})
-    drawn = Cells(universe.population)
+    places = sorted({int(cell) for cell in sky.cell_at(np.array(ra, float), np.full(len(ra), dec), 8)})
+    drawn = CellCache(universe.population)
     found = satellites_of([population.members(drawn, cell) for cell in places])
     assert found.size > 500
     assert np.array_equal(found, falling_in(universe, places))
@@ -79,7 +81,7 @@ def test_members_lie_in_their_cell_sorted(block):
 
 
 def test_a_cell_alone_is_the_same(universe, block):
-    alone = population.members(Cells(universe.population), BLOCK[2])
+    alone = population.members(CellCache(universe.population), BLOCK[2])
     for name in ("id", "index", "chi", "z_obs", "proxy", "host_mass"):
         assert getattr(alone, name).tobytes() == getattr(block[BLOCK[2]], name).tobytes()
 
@@ -97,7 +99,7 @@ def test_satellites_lie_within_their_halo(universe):
     model = universe.population
     hosts = halos.draw(model.halos, 3, 8, 1234)
     found = satellites.draw(model.halos, model.masses, hosts, 1)
-    ra, dec = sky.positions(hosts.index)
+    ra, dec = sky.positions_of_indices(hosts.index)
     angle = np.radians(sky.separation(found.ra, found.dec, ra[found.host], dec[found.host]))
     apart = np.hypot(hosts.chi[found.host] * angle, found.chi - hosts.chi[found.host])
     radius = model.masses.radius(hosts.log_mass)[found.host]

@@ -11,7 +11,9 @@ from truesky.catalogue.halos.population import SATELLITE
 
 MODEL = sequences.model()
 MASSES = matching.masses()
-MATCHED = matching.matching(MASSES, luminosity_function.inverse(luminosity_function.schechter(), matching.Z_LAST))
+MATCHED = matching.match_luminosities(
+    MASSES, luminosity_function.inverse(luminosity_function.schechter(), matching.Z_LAST)
+)
 SHARES = quenching.shares(quenching.model(), MASSES, MATCHED.occupation)
 
 
@@ -32,10 +34,14 @@ def odds(of):
 @pytest.mark.parametrize(("m_r", "fraction"), [(-19.0, 0.28), (-20.0, 0.21), (-21.0, 0.13)])
 def test_satellites_of_a_luminosity(m_r, fraction):
     """Zehavi et al. 2011, z = 0.1, of galaxies brighter than that."""
-    least = MATCHED.mass_of(np.array([0.1]), np.array([m_r]))[0]
-    above = MASSES.interpolate(np.log(matching.proxies(MASSES, MATCHED.occupation)), np.array([0.1]), MASSES.log_mass)
+    least = MATCHED.proxy_mass(np.array([0.1]), np.array([m_r]))[0]
+    above = MASSES.interpolate(
+        np.log(matching.proxy_density(MASSES, MATCHED.occupation)), np.array([0.1]), MASSES.log_mass
+    )
     number = np.diff(-np.exp(above[0]))[MASSES.log_mass[:-1] > least]
-    share = MASSES.at(SHARES.satellites, np.full(number.size, 0.1), MASSES.log_mass[:-1][MASSES.log_mass[:-1] > least])
+    share = MASSES.interpolate_pairs(
+        SHARES.satellites, np.full(number.size, 0.1), MASSES.log_mass[:-1][MASSES.log_mass[:-1] > least]
+    )
     assert np.average(share, weights=number) == pytest.approx(fraction, abs=0.03)
 
 
@@ -60,7 +66,9 @@ def test_the_mean_over_halos_is_the_share_of_the_sequence(rng, z, proxy):
     """Centrals and satellites drawn by mass function, occupation and scatter, of one proxy mass."""
     occupation, step = MATCHED.occupation, 0.02
     density = np.exp(MASSES.interpolate(MASSES.ln_density, np.array([z]), MASSES.log_mass))[0] * step
-    above = matching.satellites_above(MASSES.log_mass, occupation) * matching.satellites_at(np.array(z), occupation)
+    above = matching.satellites_above(MASSES.log_mass, occupation) * matching.satellite_evolution(
+        np.array(z), occupation
+    )
     inside = np.concatenate([above[:-1] - above[1:], above[-1:]])
     scatter = np.exp(-0.5 * ((MASSES.log_mass - proxy) / occupation.scatter) ** 2)
     weight = np.concatenate([density * scatter, (inside * density * scatter[:, None]).ravel()])
@@ -71,8 +79,10 @@ def test_the_mean_over_halos_is_the_share_of_the_sequence(rng, z, proxy):
     radius = np.where(satellite, quenching._mean_radius(np.full(n, 8.0)), 0.0)
     of = members(np.full(n, z), MASSES.log_mass[host], satellite.astype(int), radius, np.full(n, proxy))
     m_r = MATCHED.magnitude(of.z[:1], of.proxy[:1])
-    share = sequences.red_fraction(MODEL.fraction, m_r, of.z[:1], MASSES.at(SHARES.satellites, of.z[:1], of.proxy[:1]))
-    assert MASSES.at(SHARES.quenched, of.z[:1], of.proxy[:1])[0] < share[0]
+    share = sequences.red_fraction(
+        MODEL.fraction, m_r, of.z[:1], MASSES.interpolate_pairs(SHARES.satellites, of.z[:1], of.proxy[:1])
+    )
+    assert MASSES.interpolate_pairs(SHARES.quenched, of.z[:1], of.proxy[:1])[0] < share[0]
     assert odds(of).mean() == pytest.approx(share[0], abs=0.015)
 
 

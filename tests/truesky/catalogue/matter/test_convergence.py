@@ -14,7 +14,7 @@ def test_sums_are_those_of_the_cells_that_lines_of_sight_meet(box, rng):
     direction = rng.standard_normal((3, 2, 512))
     direction = (direction / np.sqrt((direction**2).sum(0))).astype(np.float32)
     middle = np.array([3.0, 500.0, 1000.0, 2500.0])
-    turned = lightcone.replicas(box, 3000.0)
+    turned = lightcone.draw_replicas(box, 3000.0)
     weights = rng.random((2, middle.size)).astype(np.float32)
     shell = (middle // box.length).astype(np.int64)
     sums = np.zeros((2, 2, 512), np.float32)
@@ -56,7 +56,7 @@ def test_no_cell_lies_beyond_the_last():
 @pytest.mark.parametrize("factor", [1, 2, 4])
 def test_averages(box, factor):
     with ThreadPoolExecutor(2) as pool:
-        found = convergence.averaged(box, 0.7, factor, pool)
+        found = convergence.average_density(box, 0.7, factor, pool)
     delta = density_box.overdensity(box, np.arange(box.n**3), 0.7)
     n = box.n // factor
     wanted = delta.reshape(n, factor, n, factor, n, factor).mean((1, 3, 5))

@@ -10,7 +10,7 @@ from truesky.fluxes import cosmology
 
 
 def test_distance_and_redshift(rng):
-    table = lightcone.distances(2.3)
+    table = lightcone.distance_table(2.3)
     assert table.chi[-1] == pytest.approx(3844.0, rel=1e-3)
     z = 2.3 * rng.random(1000)
     assert table.redshift(cosmology.comoving_distance(z)) == pytest.approx(z, abs=1e-7)
@@ -18,9 +18,9 @@ def test_distance_and_redshift(rng):
 
 def test_voxels_fill_the_cell(box):
     """Every voxel lies in the cell, and together they have its volume."""
-    table = lightcone.distances(2.3)
-    line = lightcone.steps(box.model.cell, 6.0, float(table.chi[-1]), table)
-    turned = lightcone.replicas(box, float(table.chi[-1]))
+    table = lightcone.distance_table(2.3)
+    line = lightcone.radial_steps(box.model.cell, 6.0, float(table.chi[-1]), table)
+    turned = lightcone.draw_replicas(box, float(table.chi[-1]))
     used = np.ones(line.z.size, bool)
     found = lightcone.voxels(box, turned, line, 8, 5000, used)
     assert np.all(found.cell >> 2 * (found.order - 8) == 5000)
@@ -34,7 +34,7 @@ def test_voxels_fill_the_cell(box):
 
 def test_replicas_are_turns_of_one_box(box):
     """Neighbours on the sky are neighbours in the box, inside a shell; the direction keeps its length."""
-    turned = lightcone.replicas(box, 5000.0)
+    turned = lightcone.draw_replicas(box, 5000.0)
     assert np.array_equal(turned.axes[0], [0, 1, 2])
     assert len({tuple(row) for row in np.hstack([turned.axes, turned.sign]).tolist()}) > 2
     direction = np.stack(hp.ang2vec(np.array([1.0, 1.0]), np.array([2.0, 2.0])))
@@ -48,8 +48,8 @@ def test_replicas_are_turns_of_one_box(box):
 
 def test_nothing_lies_across_the_edge_of_the_box(box):
     """Steps end where a replica does; positions a side apart are one cell, also where a side ends."""
-    table = lightcone.distances(2.3)
-    line = lightcone.steps(box.model.cell, 6.0, float(table.chi[-1]), table)
+    table = lightcone.distance_table(2.3)
+    line = lightcone.radial_steps(box.model.cell, 6.0, float(table.chi[-1]), table)
     edges = box.length * np.arange(1, int(table.chi[-1] // box.length) + 1)
     assert edges.size == 5
     assert np.isin(edges, line.edge).all()
@@ -65,6 +65,6 @@ def test_nothing_lies_across_the_edge_of_the_box(box):
 
 
 def test_a_deeper_light_cone_leaves_the_nearer_shells(box):
-    near, far = lightcone.replicas(box, 2000.0), lightcone.replicas(box, 6000.0)
+    near, far = lightcone.draw_replicas(box, 2000.0), lightcone.draw_replicas(box, 6000.0)
     assert np.array_equal(near.shift, far.shift[: len(near.shift)])
     assert np.array_equal(near.sign, far.sign[: len(near.sign)])

@@ -50,7 +50,7 @@ def record(ra="  2.31750494", dec="  2.23184345", bt=" 9.000", vt=" 8.000"):
 def test_records_as_they_are_published(tmp_path, end):
     main = written(tmp_path / "tyc2.dat", MEAN, OBSERVED, record(), end=end)
     found = loaded(main, written(tmp_path / "suppl_1.dat", SUPPLEMENT, end=end))
-    assert (found.read, found.without_color, found.without_magnitude) == (4, 0, 0)
+    assert (found.record_count, found.without_color, found.without_magnitude) == (4, 0, 0)
     order = np.argsort(found.mag_v)
     # V = 12.1 is left to the model.
     assert found.mag_v[order] == pytest.approx([4.995 - 0.09 * 0.345, 8.0 - 0.09, 8.67 - 0.09 * 1.818])
@@ -64,7 +64,7 @@ def test_blank_magnitudes(tmp_path):
     blank = "      "
     main = written(tmp_path / "tyc2.dat", record(bt=blank), record(vt=blank), record(bt=blank, vt=blank))
     found = loaded(main)
-    assert (found.read, found.without_color, found.without_magnitude) == (3, 2, 1)
+    assert (found.record_count, found.without_color, found.without_magnitude) == (3, 2, 1)
     assert found.mag_v == pytest.approx([8.0 - 0.063, 9.0 - 0.7 - 0.063])
 
 
@@ -186,4 +186,4 @@ def test_model_stars_beyond_the_hand_over_stay_as_they_were(tmp_path, dust):
     assert len(before) - len(after) == np.sum(v < 11)
     kept = np.isin(before["id"].to_numpy(), after["id"].to_numpy())
     assert before.filter(kept).equals(after)
-    assert sky.cell_of(empty.ra, empty.dec, 8).size == 0
+    assert sky.cell_at(empty.ra, empty.dec, 8).size == 0

@@ -35,7 +35,9 @@ def test_counts(b, rng):
 def test_numbers_are_those_that_are_drawn(rng):
     """Sample of 50 deg2, and of ten times as many; significance 6e-7 (5 standard errors)."""
     place = (90.0, 40.0, 50.0, 24.0)
-    expected = brown_dwarfs.numbers(DWARFS, GALAXY, *(np.array([v]) for v in place[:2]), 50.0, np.array([24.0]))[0]
+    expected = brown_dwarfs.expected_counts(
+        DWARFS, GALAXY, *(np.array([v]) for v in place[:2]), 50.0, np.array([24.0])
+    )[0]
     assert brown_dwarfs.draw(DWARFS, GALAXY, *place, rng).distance.size == pytest.approx(
         expected, abs=5 * expected**0.5
     )
@@ -52,8 +54,8 @@ def test_all_templates_take_part(rng):
 def test_templates_have_the_colours_that_are_said():
     """J - H of the spectra themselves."""
     library = templates.stellar_library()
-    assert library.names[DWARFS.first : DWARFS.first + 365] == spectra.template_names()
-    flux = library.flux[DWARFS.first : DWARFS.first + 365].astype(float)
+    assert library.names[DWARFS.first_template : DWARFS.first_template + 365] == spectra.template_names()
+    flux = library.flux[DWARFS.first_template : DWARFS.first_template + 365].astype(float)
     mags = []
     for name in ("twomass_j", "twomass_h"):
         band = passbands.load(name)
@@ -78,4 +80,4 @@ def test_a_boost_is_written_beside_each_dwarf_and_changes_no_other_star(dust):
     assert np.all(rows["stage"].to_numpy() == 3)
     assert np.all((rows["sed"].to_numpy() >= 76) & (rows["sed"].to_numpy() < 441))
     assert np.all(rows["teff"].to_numpy() < 2400)
-    assert np.all(sky.cell_of(rows["ra"].to_numpy(), rows["dec"].to_numpy(), 8) == cell)
+    assert np.all(sky.cell_at(rows["ra"].to_numpy(), rows["dec"].to_numpy(), 8) == cell)

@@ -44,7 +44,7 @@ def written(path, text=BESANCON):
 
 
 def loaded(path, columns=COLUMNS):
-    from_catalogue.checked_columns(columns)
+    from_catalogue.check_columns(columns)
     return from_catalogue.load(path, file_sha256(path), columns)
 
 
@@ -107,7 +107,7 @@ def test_bad_tables_are_named(tmp_path, change, words):
 )
 def test_bad_mappings_are_named(columns, words):
     with pytest.raises(BadInput, match=words):
-        from_catalogue.checked_columns(columns)
+        from_catalogue.check_columns(columns)
 
 
 def asked(path, **keys):
@@ -119,11 +119,11 @@ def asked(path, **keys):
 
 def test_they_become_the_table(lake, tmp_path):
     (step,) = build_stars.steps(lake, asked(written(tmp_path / "field.resu")))
-    publish.make(lake, step.plan, step.work)
+    publish.make_version(lake, step.plan, step.run_task)
     version = read.version(lake, "stars")
     rows = version.rows()
     assert rows.num_rows == 4
-    assert validate.violations(rows, STARS) == []
+    assert validate.find_violations(rows, STARS) == []
     assert sorted(rows["a_v"].to_pylist()) == pytest.approx([0.0, 0.03, 0.11, 0.15])
     assert version.manifest["facts"]["catalogue"]["columns"] == COLUMNS
     again = written(tmp_path / "moved.resu")
@@ -136,12 +136,12 @@ def test_what_a_table_does_not_say_is_null_and_dust_is_ours(tmp_path, dust):
     columns = {"ra": "l", "dec": "b", "mag_h": "H", "teff": "T"}
     path = written(tmp_path / "few.txt", "l b H T\n53.1 -27.8 20.0 5000\n53.2 -27.9 21.0 4000\n")
     universe = stars.model(26.0, brown_dwarf_boost=0.0, catalogue=loaded(path, columns))
-    (cell,) = {*sky.cell_of([53.1], [-27.8], 8).tolist()}
+    (cell,) = {*sky.cell_at([53.1], [-27.8], 8).tolist()}
     rows = stars.draw(cell, 1, universe, dust)
     assert rows["mag_h"].to_pylist() == [20.0]
     assert rows["distance"].null_count == rows["metallicity"].null_count == rows["stage"].null_count == 1
     assert rows["a_v"].to_numpy()[0] > 0.0
-    assert stars.numbers([cell, cell + 7], universe).tolist() == [1.0, 0.0]
+    assert stars.expected_counts([cell, cell + 7], universe).tolist() == [1.0, 0.0]
 
 
 def test_no_file(lake):

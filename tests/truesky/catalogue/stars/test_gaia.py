@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from lake_schema import ids, sky, units
 from lake_schema.errors import BadInput
 from lake_schema.store import layout, publish, read, validate
-from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.tables.fluxes import fluxes
 from lake_schema.tables.gaia import EXPORT, GAIA
 from lake_schema.tables.stars import EPOCH, STARS
@@ -103,7 +103,7 @@ def test_a_flux_below_zero_has_no_magnitude():
     assert 100 < missing < 2500
     assert found["mag_bp_ab"].null_count == found["phot_bp_mean_flux_over_error"].null_count == missing
     assert found["phot_g_mean_mag"].null_count == 0
-    assert validate.violations(found, GAIA) == []
+    assert validate.find_violations(found, GAIA) == []
 
 
 def test_completeness():
@@ -136,7 +136,7 @@ def test_near_a_pole_positions_stay_on_the_sky():
     stars, flux = stars_of(np.full(500, 20.0))
     stars = stars.set_column(2, "dec", pa.array(np.full(500, 90.0 - 1e-7)))
     found = gaia.observe(stars, flux, 7)
-    assert validate.violations(found, GAIA) == []
+    assert validate.find_violations(found, GAIA) == []
     apart = sky.separation(found["ra"].to_numpy(), found["dec"].to_numpy(), 0.0, 90.0) / MAS
     assert apart.max() < 6.0
 
@@ -178,14 +178,14 @@ def filled(lake):
         return Output(STARS.build({name: rows[name] for name in STARS.names} | given_columns))
 
     def beside(root, facts):
-        rows = read.version(root, "stars").rows(parts=[layout.cell_file(5, facts["cell"])])
+        rows = read.version(root, "stars").rows(partitions=[layout.cell_file(5, facts["cell"])])
         flux = {f"f_nu_{b}": np.full(len(rows), units.f_nu_of_mag(20.5 + v)) for b, v in zip(BANDS, VEGA, strict=True)}
         flux["integrated"] = np.zeros(len(rows), bool)
         return Output(flux_table.build({name: rows[name] for name in ("id", "ra", "dec", "_healpix_29")} | flux))
 
-    parts = tuple(Part(layout.cell_file(5, cell), {"cell": cell}) for cell in files)
-    publish.make(lake, Plan(STARS, {"seed": asked().seed}, parts), stars)
-    publish.make(lake, Plan(flux_table, {"input": read.version(lake, "stars").key}, parts), beside)
+    parts = tuple(Task(layout.cell_file(5, cell), {"cell": cell}) for cell in files)
+    publish.make_version(lake, Plan(STARS, {"seed": asked().seed}, parts), stars)
+    publish.make_version(lake, Plan(flux_table, {"input": read.version(lake, "stars").key}, parts), beside)
     return index
 
 
@@ -196,7 +196,7 @@ def asked():
 
 def built(lake):
     (step,) = build_gaia.steps(lake, asked())
-    publish.make(lake, step.plan, step.work)
+    publish.make_version(lake, step.plan, step.run_task)
     return read.version(lake, "gaia")
 
 
@@ -253,8 +253,8 @@ def test_what_it_must_have_is_named(lake):
         "integrated": np.zeros(0, bool),
         **{name: np.zeros(0, flux.column(name).type) for name in ("id", "ra", "dec", "_healpix_29")},
     }
-    part = (Part(layout.cell_file(5, 1607), {}),)
-    publish.make(lake, Plan(flux, {}, part), lambda root, facts: Output(flux.build(rows)))
+    part = (Task(layout.cell_file(5, 1607), {}),)
+    publish.make_version(lake, Plan(flux, {}, part), lambda root, facts: Output(flux.build(rows)))
     with pytest.raises(BadInput, match=r"no column f_nu_gaia_g, .* into fluxes\.bands and run compute_fluxes"):
         build_gaia.steps(lake, asked())
 

@@ -29,7 +29,7 @@ def galactic_motions(lon, lat, distance, component, deviates, age=np.nan):
 def test_towards_the_pole_and_the_centre_the_ellipsoid_is_seen(component, age):
     """At the pole the motion is that in the plane, in the anticentre the two others; the mean is lag and Sun."""
     n, rng = 20_000, np.random.default_rng(component)
-    k = kinematics.ellipsoid(np.array([component]), np.array([age]))[0]
+    k = kinematics.ellipsoid_index(np.array([component]), np.array([age]))[0]
     assert k == (AGES + component if np.isnan(age) else {0.1: 0, 2.5: 3, 9.0: 6}[age])
     deviates, far = rng.normal(size=(3, n)), np.full(n, 100.0)
     populations = np.full(n, component)
@@ -81,7 +81,7 @@ def test_space_velocities_are_those_of_astropy(rng):
     found = seen.velocity.d_xyz.to_value(u.km / u.s).T + SUN["motion"] + np.array([0.0, SUN["circular"], 0.0])
     place = seen.cartesian.xyz.to_value(u.pc).T - np.array([SUN["radius"], 0.0, 0.0])
     radius = np.hypot(place[:, 0], place[:, 1])
-    k = kinematics.ellipsoid(component, np.full(n, np.nan))
+    k = kinematics.ellipsoid_index(component, np.full(n, np.nan))
     wider = np.exp(-0.1e-3 * (radius - SUN["radius"]) * np.array(ELLIPSOIDS["grows"])[k])
     outwards = (found[:, 0] * place[:, 0] + found[:, 1] * place[:, 1]) / radius
     turning = (found[:, 0] * place[:, 1] - found[:, 1] * place[:, 0]) / radius

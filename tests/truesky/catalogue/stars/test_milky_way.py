@@ -40,7 +40,7 @@ def mean_counts(b):
     total, longitudes = np.zeros(len(LIMITS)), np.arange(0, 360, 30)
     for lon in longitudes:
         # Without the bulge, which the sums leave out.
-        number = mw.expected(GALAXY, float(lon), float(b), 1.0, 40.0)[:3].sum(0)
+        number = mw.expected_per_bin(GALAXY, float(lon), float(b), 1.0, 40.0)[:3].sum(0)
         total += [number[mag_h < limit].sum() for limit in LIMITS]
     return total / len(longitudes)
 
@@ -55,11 +55,11 @@ def test_star_counts(b):
 
 @given(GALAXIES, st.floats(0.0, 360.0), st.floats(-90.0, 90.0), st.floats(0.0, 30.0))
 def test_numbers_are_the_sum_of_what_is_expected(galaxy, lon, lat, limit):
-    found = mw.numbers(galaxy, np.array([lon, lon]), np.array([lat, -lat]), 0.05, np.array([limit, 12.0]))
+    found = mw.expected_counts(galaxy, np.array([lon, lon]), np.array([lat, -lat]), 0.05, np.array([limit, 12.0]))
     alone = dataclasses.replace(galaxy, companions=0.0 * galaxy.companions)
-    single = mw.numbers(alone, np.array([lon, lon]), np.array([lat, -lat]), 0.05, np.array([limit, 12.0]))
-    assert single[0] == pytest.approx(mw.expected(galaxy, lon, lat, 0.05, limit).sum(), rel=1e-9, abs=0.0)
-    assert single[1] == pytest.approx(mw.expected(galaxy, lon, -lat, 0.05, 12.0).sum(), rel=1e-9)
+    single = mw.expected_counts(alone, np.array([lon, lon]), np.array([lat, -lat]), 0.05, np.array([limit, 12.0]))
+    assert single[0] == pytest.approx(mw.expected_per_bin(galaxy, lon, lat, 0.05, limit).sum(), rel=1e-9, abs=0.0)
+    assert single[1] == pytest.approx(mw.expected_per_bin(galaxy, lon, -lat, 0.05, 12.0).sum(), rel=1e-9)
     assert np.all(found <= 1.3 * single)
     assert np.all(found >= single)
 
@@ -67,14 +67,14 @@ def test_numbers_are_the_sum_of_what_is_expected(galaxy, lon, lat, limit):
 @given(GALAXIES, st.floats(0.0, 360.0), st.floats(20.0, 60.0), st.floats(0.1, 10.0), st.floats(5.0, 30.0))
 def test_there_are_fewer_stars_away_from_the_plane(galaxy, lon, lat, step, limit):
     """Not so about the poles, which are nearer to the Galactic centre than the anticentre's side of them."""
-    near, far = mw.numbers(galaxy, np.array([lon] * 2), np.array([lat, lat + step]), 1.0, np.array([limit] * 2))
+    near, far = mw.expected_counts(galaxy, np.array([lon] * 2), np.array([lat, lat + step]), 1.0, np.array([limit] * 2))
     assert 0.0 < far < near < np.inf
 
 
 def test_all_that_may_be_bright_enough_is_expected(rng):
     """Sample of 0.05 deg2, drawn twice; significance 2e-5 of the difference (6 Poisson errors of one)."""
-    everything = mw.expected(GALAXY, 40.0, 30.0, 0.05, 60.0)
-    bright = mw.expected(GALAXY, 40.0, 30.0, 0.05, 22.0)
+    everything = mw.expected_per_bin(GALAXY, 40.0, 30.0, 0.05, 60.0)
+    bright = mw.expected_per_bin(GALAXY, 40.0, 30.0, 0.05, 22.0)
     assert np.all((bright == everything) | (bright == 0.0))
     drawn = mw.draw(GALAXY, everything, rng, rng)
     apparent = drawn.m_h + 5 * np.log10(drawn.distance) - 5
@@ -86,7 +86,7 @@ def test_all_that_may_be_bright_enough_is_expected(rng):
 
 def test_a_sample_has_the_expected_distribution(rng):
     """Sample of 4 deg2; significance 6e-7 of each number (5 standard errors)."""
-    mean = mw.expected(GALAXY, 120.0, -50.0, 4.0, 26.0)
+    mean = mw.expected_per_bin(GALAXY, 120.0, -50.0, 4.0, 26.0)
     sample = mw.draw(GALAXY, mean, rng, rng)
     n = sample.m_h.size
     assert n == pytest.approx(mean.sum(), abs=5 * np.sqrt(mean.sum()))
@@ -107,7 +107,7 @@ def test_nothing_expected_nothing_drawn(rng):
 
 def test_labels(rng):
     """The thin disc of every age, the others of one; metallicities as the populations are said to have."""
-    sample = mw.draw(GALAXY, mw.expected(GALAXY, 90.0, 60.0, 10.0, 24.0), rng, rng)
+    sample = mw.draw(GALAXY, mw.expected_per_bin(GALAXY, 90.0, 60.0, 10.0, 24.0), rng, rng)
     born = sample.stage != WHITE_DWARF
     for code, mean, scatter in ((mw.THIN, -0.10, 0.2), (mw.THICK, -0.60, 0.3), (mw.HALO, -1.50, 0.4)):
         here = born & (sample.component == code)
@@ -125,7 +125,7 @@ def test_labels(rng):
 
 def test_the_halo_turns_off_where_it_is_observed(rng):
     """Its hottest main-sequence stars have 6400 to 6700 K; dwarfs of 0.2 Msun are hotter than those of the disc."""
-    sample = mw.draw(GALAXY, mw.expected(GALAXY, 90.0, 80.0, 200.0, 20.0), rng, rng)
+    sample = mw.draw(GALAXY, mw.expected_per_bin(GALAXY, 90.0, 80.0, 200.0, 20.0), rng, rng)
     halo = (sample.component == mw.HALO) & (sample.stage == 0)
     assert np.quantile(sample.teff[halo], 0.98) == pytest.approx(6500, abs=200)
     light = (sample.mass > 0.3) & (sample.mass < 0.35)
@@ -146,8 +146,8 @@ def test_stars_of_the_solar_neighbourhood():
 
 
 def test_white_dwarfs_are_few():
-    share = mw.expected(GALAXY, 90.0, 60.0, 1.0, 24.0)[:3].sum((1, 2))
-    sample = mw.draw(GALAXY, mw.expected(GALAXY, 90.0, 60.0, 20.0, 24.0), *2 * [np.random.default_rng(1)])
+    share = mw.expected_per_bin(GALAXY, 90.0, 60.0, 1.0, 24.0)[:3].sum((1, 2))
+    sample = mw.draw(GALAXY, mw.expected_per_bin(GALAXY, 90.0, 60.0, 20.0, 24.0), *2 * [np.random.default_rng(1)])
     assert share.sum() * 20 == pytest.approx(sample.m_h.size, rel=0.02)
     assert 0.005 < np.mean(sample.stage == WHITE_DWARF) < 0.05
 
@@ -161,18 +161,18 @@ def test_the_bulge_where_it_is_looked_at():
     weight = np.where(own.stage == WHITE_DWARF, 0.6, 10.0 ** own.log_mass.mean(0)) * own.number
     mass = weight[OWNER == 3].sum() / GALAXY.local[3].sum()
     for (lon, lat), published in (((1.0, -4.0), 4.8e7), ((0.0, -6.0), 1.5e7), ((10.0, -10.0), 1.6e6)):
-        found = mass * mw.expected(GALAXY, lon, lat, 1.0, 40.0)[3].sum()
+        found = mass * mw.expected_per_bin(GALAXY, lon, lat, 1.0, 40.0)[3].sum()
         assert 0.6 < found / published < 1.4
-    near, far = (mw.expected(GALAXY, lon, 6.0, 1.0, 40.0)[3].sum() for lon in (8.0, -8.0))
+    near, far = (mw.expected_per_bin(GALAXY, lon, 6.0, 1.0, 40.0)[3].sum() for lon in (8.0, -8.0))
     assert near > 1.2 * far
 
 
 def test_the_besancon_model_has_the_same_number_of_stars_at_the_sun():
     systems = [galaxy.local[:-1].sum() for galaxy in (GALAXY, BESANCON)]
     assert systems[1] == pytest.approx(systems[0], rel=0.02)
-    near = [mw.expected(galaxy, 200.0, 80.0, 1.0, 12.0).sum() for galaxy in (GALAXY, BESANCON)]
+    near = [mw.expected_per_bin(galaxy, 200.0, 80.0, 1.0, 12.0).sum() for galaxy in (GALAXY, BESANCON)]
     assert near[1] == pytest.approx(near[0], rel=0.5)
 
 
 def test_a_request_can_choose_every_model():
-    assert schema.DENSITIES == mw.MODELS
+    assert schema.DENSITY_MODELS == mw.MODELS

@@ -31,7 +31,7 @@ def galactic_cell(lon, lat):
     from astropy.coordinates import SkyCoord
 
     at = SkyCoord(lon, lat, unit="deg", frame="galactic").icrs
-    return int(sky.cell_of([at.ra.deg], [at.dec.deg], ids.GENERATION_ORDER)[0])
+    return int(sky.cell_at([at.ra.deg], [at.dec.deg], ids.GENERATION_ORDER)[0])
 
 
 @pytest.mark.parametrize(("b", "published"), [(b, found[-1]) for b, found in star_counts.COUNTS.items()])
@@ -43,13 +43,13 @@ def test_counts_with_dust(dust, b, published):
 
 
 def test_rows_are_what_the_table_declares(cell):
-    assert validate.violations(cell, STARS) == []
+    assert validate.find_violations(cell, STARS) == []
     index = cell["_healpix_29"].to_numpy()
     assert np.all(np.diff(index) >= 0)
     assert np.unique(cell["id"].to_numpy()).size == len(cell)
-    assert np.all(ids.kind_of(cell["id"].to_numpy()) == stars.STAR)
+    assert np.all(ids.kind_from_id(cell["id"].to_numpy()) == stars.STAR)
     ra, dec = cell["ra"].to_numpy(), cell["dec"].to_numpy()
-    assert np.all(sky.cell_of(ra, dec, ids.GENERATION_ORDER) == CELL)
+    assert np.all(sky.cell_at(ra, dec, ids.GENERATION_ORDER) == CELL)
     assert np.array_equal(sky.healpix_29(ra, dec), index)
 
 
@@ -85,7 +85,7 @@ def test_a_brighter_limit_has_fewer_stars(dust, cell):
     assert len(bright) == pytest.approx(wanted, abs=6 * np.sqrt(wanted))
     empty = stars.draw(CELL, SEED, stars.model(0.0), dust)
     assert len(empty) == 0
-    assert empty.schema.equals(STARS.arrow())
+    assert empty.schema.equals(STARS.arrow_schema())
 
 
 def test_bright_stars_are_left_out_and_the_others_are_the_same(dust, cell):
@@ -105,7 +105,7 @@ def test_templates_are_the_nearest_in_temperature(rng):
 
 def test_stars_are_what_their_templates_are(cell):
     """The mean of a star's templates has its temperature; dwarfs, models and white dwarfs."""
-    found = sources.stars_of(cell, templates.stellar_library())
+    found = sources.stars_from_table(cell, templates.stellar_library())
     grid = [
         np.log(float(name.split(" K")[0])) if " K " in name else np.nan for name in templates.stellar_library().names
     ]
@@ -160,30 +160,30 @@ def test_a_cell_in_the_plane(dust):
     """H < 17 towards the Galactic centre: many stars behind 9 mag of dust, all inside their bounds."""
     rows = stars.draw(galactic_cell(0.0, 0.5), SEED, stars.model(26.0, plane_limit=17.0), dust)
     assert len(rows) > 20_000
-    assert validate.violations(rows, STARS) == []
+    assert validate.find_violations(rows, STARS) == []
 
 
 def test_numbers_are_those_that_are_drawn(dust):
     """Sample of four cells; significance 2e-9 (6 standard errors), or 1 % for the finer grid of the draws."""
     cells = np.arange(CELL, CELL + 4)
-    found = stars.numbers(cells, UNIVERSE)
+    found = stars.expected_counts(cells, UNIVERSE)
     drawn = [len(stars.draw(int(cell), SEED, UNIVERSE, 0 * dust)) for cell in cells]
     assert found == pytest.approx(drawn, rel=0.01, abs=6 * np.sqrt(found.max()))
-    assert np.all(stars.numbers(cells, stars.model(18.0)) < 0.1 * found)
-    assert stars.numbers([], UNIVERSE).size == 0
+    assert np.all(stars.expected_counts(cells, stars.model(18.0)) < 0.1 * found)
+    assert stars.expected_counts([], UNIVERSE).size == 0
 
 
 def test_the_plane_is_refused_or_has_its_own_limit():
     high, low = galactic_cell(90.0, 6.0), galactic_cell(0.0, 0.5)
-    assert [bool(stars._crowded(*at)) for at in ((0.0, 10.5), (21.0, 6.0), (340.5, -9.5))] == [False, False, True]
+    assert [bool(stars._is_crowded(*at)) for at in ((0.0, 10.5), (21.0, 6.0), (340.5, -9.5))] == [False, False, True]
     with pytest.raises(BadInput, match=r"1 of the area's cells lie within 5 deg .* stars\.plane_limit"):
-        stars.numbers([high, low], UNIVERSE)
+        stars.expected_counts([high, low], UNIVERSE)
     with pytest.raises(BadInput, match=r"1 of the area's cells hold more than .* brighter stars\.plane_limit"):
-        stars.numbers([high, low], stars.model(26.0, plane_limit=26.0))
-    high_alone = stars.numbers([high], UNIVERSE)
-    both = stars.numbers([high, low], stars.model(26.0, plane_limit=18.0))
+        stars.expected_counts([high, low], stars.model(26.0, plane_limit=26.0))
+    high_alone = stars.expected_counts([high], UNIVERSE)
+    both = stars.expected_counts([high, low], stars.model(26.0, plane_limit=18.0))
     assert both[0] == high_alone[0]
-    assert both[1] == stars.numbers([low], stars.model(18.0, plane_limit=18.0))[0]
+    assert both[1] == stars.expected_counts([low], stars.model(18.0, plane_limit=18.0))[0]
 
 
 def test_seeds_at_both_ends(dust):
@@ -192,4 +192,4 @@ def test_seeds_at_both_ends(dust):
         rows = [stars.draw(galactic_cell(0.0, lat), seed, stars.model(20.0), dust) for seed in (0, 2**63 - 1)]
         assert not rows[0].equals(rows[1])
         for each in rows:
-            assert validate.violations(each, STARS) == []
+            assert validate.find_violations(each, STARS) == []

@@ -19,7 +19,7 @@ def systems_between(low, high):
     log_mass = np.linspace(np.log10(low), np.log10(high), 30)[None, :]
     flat = np.zeros_like(log_mass)
     track = populations.Tracks(np.ones(1), np.zeros(1), log_mass.size, log_mass, flat, flat, flat)
-    return populations.pieces_of(track, np.ones(1), MASSES, EDGES).number.sum()
+    return populations.build_pieces(track, np.ones(1), MASSES, EDGES).number.sum()
 
 
 def test_stars_between_the_hydrogen_limit_and_the_sun():
@@ -50,12 +50,12 @@ def test_more_stars_are_below_a_larger_mass(m1, m2):
 
 @pytest.fixture(scope="module")
 def tracks():
-    return populations.tracks(np.array([5.0, 10.0, 12.5]), np.array([0.0, -0.6, -1.5]))
+    return populations.build_tracks(np.array([5.0, 10.0, 12.5]), np.array([0.0, -0.6, -1.5]))
 
 
 def test_the_sun_is_on_its_track(tracks):
     """1 Msun, 4.6 Gyr: 5772 K, M_H = 3.3, log g = 4.44 (IAU 2015; Willmer 2018, ApJS 236, 47)."""
-    sun = populations.tracks(np.array([4.6]), np.zeros(1))
+    sun = populations.build_tracks(np.array([4.6]), np.zeros(1))
     found = {name: np.interp(0.0, sun.log_mass[0, : sun.evolved], getattr(sun, name)[0, : sun.evolved])
              for name in ("log_teff", "m_h", "log_g")}  # fmt: skip
     assert 10 ** found["log_teff"] == pytest.approx(5772, rel=0.015)
@@ -81,7 +81,7 @@ def test_tracks_go_up_in_mass_and_the_main_sequence_in_light(tracks):
 
 def test_pieces_are_the_mass_function_cut_at_the_bins(tracks):
     share = np.array([0.5, 0.3, 0.2])
-    found = populations.pieces_of(tracks, share, MASSES, EDGES)
+    found = populations.build_pieces(tracks, share, MASSES, EDGES)
     for k in range(3):
         own = found.number[found.track == k].sum()
         heaviest = 10 ** tracks.log_mass[k, -1]
@@ -96,7 +96,7 @@ def test_pieces_are_the_mass_function_cut_at_the_bins(tracks):
 
 
 def test_stages_are_in_the_order_of_gravity(tracks):
-    found = populations.pieces_of(tracks, np.ones(3) / 3, MASSES, EDGES)
+    found = populations.build_pieces(tracks, np.ones(3) / 3, MASSES, EDGES)
     log_g, stage = found.log_g.mean(0), found.stage
     assert log_g[stage == populations.GIANT].max() <= 3.5
     assert log_g[stage == populations.SUBGIANT].min() > 3.5
@@ -110,7 +110,7 @@ def test_stages_are_in_the_order_of_gravity(tracks):
 
 @given(st.floats(-2.5, 0.4), st.floats(0.05, 0.5), st.integers(4, 30))
 def test_cells_of_a_population_have_its_metallicity(mean, scatter, cells):
-    found = populations.population(np.array([1.0, 3.0]), np.array([1.0, 2.0]), np.array([mean, 0.0]),
+    found = populations.build_population(np.array([1.0, 3.0]), np.array([1.0, 2.0]), np.array([mean, 0.0]),
                                    np.array([scatter, 0.1]), cells)  # fmt: skip
     assert found.share.sum() == pytest.approx(1.0)
     young = found.age == 1.0
@@ -123,7 +123,7 @@ def test_cells_of_a_population_have_its_metallicity(mean, scatter, cells):
 
 def test_white_dwarfs_cool_along_their_sequence():
     """4.6e-3 pc^-3, Harris et al. 2006; 12,000 K at M_H = 11.9, 6000 K at 12.8."""
-    found = populations.white_dwarfs(EDGES)
+    found = populations.white_dwarf_pieces(EDGES)
     assert found.number.sum() == pytest.approx(4e-3, rel=1e-6)
     order = np.argsort(found.log_teff.mean(0))
     at = np.interp(np.log10([12_000.0, 6000.0]), found.log_teff.mean(0)[order], found.m_h.mean(0)[order])

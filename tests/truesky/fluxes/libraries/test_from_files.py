@@ -164,7 +164,7 @@ def test_a_votable_declares_no_entities(tmp_path):
 
 
 def test_large_files_are_not_opened(tmp_path, monkeypatch):
-    monkeypatch.setitem(user_files.LARGEST, "curve", 100)
+    monkeypatch.setitem(user_files.MAX_BYTES, "curve", 100)
     with pytest.raises(BadInput, match="is larger than 100 bytes"):
         from_files.read(ascii_file(tmp_path / "sed"), "cosmos")
 
@@ -217,7 +217,7 @@ def test_a_library_keeps_the_flux_of_its_files(tmp_path):
 @pytest.mark.parametrize("last", [1500.0, 2600.0])
 def test_bins_of_a_straight_spectrum_hold_its_middles_and_those_beyond_it_go_on(last):
     grid, at = np.arange(1000.0, 2001.0), np.arange(900.0, last + 1.0, 5.0)
-    found = from_files.resampled(grid, from_files.Curve(at, at / 1000.0))
+    found = from_files.resample(grid, from_files.Curve(at, at / 1000.0))
     inside = grid < at[-1]
     np.testing.assert_allclose(found[inside], grid[inside] / 1000.0, rtol=1e-12)
     wanted = at[-1] / 1000.0 * (grid[~inside] / at[-1]) ** -3.2

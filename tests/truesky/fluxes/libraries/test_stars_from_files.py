@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lake_schema.errors import BadInput
-from lake_schema.store.validate import check
+from lake_schema.store.validate import check_rows
 from lake_schema.tables.templates import TEMPLATES
 from truesky.fluxes import inputs, passbands
 from truesky.fluxes.libraries import from_files, stars_from_files, stellar, templates
@@ -50,7 +50,7 @@ def irtf_file(path, slope, wiggle=0.05):
 
 
 def test_basel(tmp_path):
-    models = stars_from_files.basel(basel_file(tmp_path / "synthetic_lcbm05.cor"))
+    models = stars_from_files.read_basel(basel_file(tmp_path / "synthetic_lcbm05.cor"))
     assert models.teff.tolist() == [5750.0, 3500.0]
     assert models.log_g.tolist() == [4.5, 1.0]
     assert models.metallicity.tolist() == [-0.5, 0.2]
@@ -74,7 +74,7 @@ def test_damaged_basel_files_are_refused(tmp_path, damage):
     elif damage == "absent":
         path.unlink()
     with pytest.raises(BadInput, match=r"lcb\.cor"):
-        stars_from_files.basel(path)
+        stars_from_files.read_basel(path)
 
 
 def test_dwarfs_have_the_models_of_their_temperature_and_gravity(tmp_path):
@@ -86,12 +86,12 @@ def test_dwarfs_have_the_models_of_their_temperature_and_gravity(tmp_path):
     first = templates.first_model()
     np.testing.assert_array_equal(library.flux[n:first], embedded.flux[n:first])
     # Stars of any metallicity are the file's black bodies, too.
-    truth = stellar.normalised(grid, stellar.planck(grid, 3600.0))
+    truth = stellar.normalise(grid, stellar.planck(grid, 3600.0))
     seen = (grid > 4000.0) & (grid < 23_000.0)
     np.testing.assert_allclose(library.flux[first, seen], truth[seen], rtol=0.02)
     seen = (grid > 4000.0) & (grid < 23_000.0)
     for k in (0, 30, n - 1):
-        truth = stellar.normalised(grid, stellar.planck(grid, types.teff[k]))
+        truth = stellar.normalise(grid, stellar.planck(grid, types.teff[k]))
         np.testing.assert_allclose(library.flux[k, seen], truth[seen], rtol=0.02)
 
 
@@ -118,7 +118,7 @@ def test_each_star_says_which_files_it_is_of(tmp_path):
     own = inputs.read(UserCurves(basel=models, irtf=irtf))
     assert set(own.sha256()) == {"fluxes.stars.basel", "fluxes.stars.irtf.0", "fluxes.stars.irtf.1"}
     rows = inputs.template_rows(own)
-    check(rows, TEMPLATES)
+    check_rows(rows, TEMPLATES)
     stars = [row for row in rows.select(["library", "sed", "source", "sha256"]).to_pylist() if row["library"] == "star"]
     assert stars[0]["source"] == "synthetic.cor, hot.txt: read as basel; the last, read as irtf, in the infrared"
     assert stars[0]["sha256"] == hashlib.sha256(models.read_bytes() + irtf[0].read_bytes()).hexdigest()

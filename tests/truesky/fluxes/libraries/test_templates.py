@@ -32,7 +32,7 @@ def test_galaxies_cover_all_that_is_observed(library):
 
 
 def test_a_template_is_named_after_what_it_is_mixed_of(library):
-    named = tuple(f"{k:02d} " + "-".join(templates.anchors_of(k)) for k in range(len(library)))
+    named = tuple(f"{k:02d} " + "-".join(templates.template_anchors(k)) for k in range(len(library)))
     assert library.names == named
 
 
@@ -79,7 +79,7 @@ def test_red_tail_and_lyman_edge(library):
 def test_made_once(library, monkeypatch):
     """By all processes; within one it is not even read again."""
     assert templates.galaxy_library() is library
-    monkeypatch.setattr(templates, "galaxies", lambda *_: pytest.fail("made again"))
+    monkeypatch.setattr(templates, "galaxy_spectra", lambda *_: pytest.fail("made again"))
     again = templates.galaxy_library.__wrapped__()
     np.testing.assert_array_equal(again.flux, library.flux)
     assert not again.flux.flags.writeable

@@ -6,7 +6,7 @@ import pytest
 from lake_schema.errors import BadInput, OutOfRange
 from truesky.fluxes import passbands
 from truesky.fluxes.spectra import continuum, extinction
-from truesky.fluxes.spectra.continuum import mix_of
+from truesky.fluxes.spectra.continuum import mix_from_columns
 
 REFERENCE = passbands.load("sdss_r01")
 
@@ -20,7 +20,7 @@ def random_mix(library, n=40, seed=3, **columns):
         values[f"ext_law_{k}"] = rng.integers(0, 5, n)
         values[f"ebv_{k}"] = rng.uniform(0.0, 0.6, n)
     fixed = {name: np.full(n, value) if np.ndim(value) == 0 else value for name, value in columns.items()}
-    return mix_of(values | fixed, library)
+    return mix_from_columns(values | fixed, library)
 
 
 def slow_shape(mix, i, library, grid):
@@ -38,8 +38,8 @@ def slow_shape(mix, i, library, grid):
 def test_shapes_are_the_slow_ones(library, shared):
     mix = random_mix(library)
     if shared:
-        mix = continuum.Mix(mix.z_obs, mix.sed, mix.law[[0, 0]], mix.frac, mix.ebv[[0, 0]])
-    dust = continuum.dust_of(library)
+        mix = continuum.TemplateMix(mix.z_obs, mix.sed, mix.law[[0, 0]], mix.frac, mix.ebv[[0, 0]])
+    dust = continuum.dust_curves(library)
     amplitude = continuum.amplitudes(mix, REFERENCE, library, dust)
     first, count = 3000, 9000
     fast = continuum.observed_shape(mix, amplitude / amplitude.sum(0), library, dust, first, count)
@@ -51,9 +51,9 @@ def test_shapes_are_the_slow_ones(library, shared):
 def test_the_whole_grid_is_covered_at_both_ends(library):
     ends = 24000.0 / library.wavelength[-1] - 1.0 + 1e-9, 600.0 / library.wavelength[0] - 1.0 - 1e-9
     mix = random_mix(library, n=2, z_obs=np.array(ends), ebv_1=0.0, ebv_2=0.0)
-    shape = continuum.observed_shape(mix, np.ones((2, 2)), library, continuum.dust_of(library), 600, 23401)
+    shape = continuum.observed_shape(mix, np.ones((2, 2)), library, continuum.dust_curves(library), 600, 23401)
     for i in range(2):
-        flat = continuum.Mix(mix.z_obs, mix.sed, mix.law, mix.frac, mix.ebv)
+        flat = continuum.TemplateMix(mix.z_obs, mix.sed, mix.law, mix.frac, mix.ebv)
         rest = library.flux[flat.sed[:, i]].sum(0, dtype=float)
         shifted = 1.0 + ends[i]
         slow = np.interp(passbands.grid(), library.wavelength * shifted, rest / shifted)
@@ -62,7 +62,7 @@ def test_the_whole_grid_is_covered_at_both_ends(library):
 
 def test_components_have_their_share_of_the_reference_flux_after_dust(library):
     mix = random_mix(library, z_obs=0.0)
-    dust = continuum.dust_of(library)
+    dust = continuum.dust_curves(library)
     amplitude = continuum.amplitudes(mix, REFERENCE, library, dust)
     first = int(REFERENCE.wavelength[0])
     weights = passbands.weights(REFERENCE)
@@ -77,7 +77,7 @@ def test_components_have_their_share_of_the_reference_flux_after_dust(library):
 def test_one_law_is_the_papers_form(library):
     # Combined first, then extinguished, as in Serrano et al. 2024.
     mix = random_mix(library, ext_law_1=2, ext_law_2=2, ebv_1=0.3, ebv_2=0.3, z_obs=0.5, sed_1=12, sed_2=11)
-    dust = continuum.dust_of(library)
+    dust = continuum.dust_curves(library)
     amplitude = continuum.amplitudes(mix, REFERENCE, library, dust)
     shape = continuum.observed_shape(mix, amplitude / amplitude.sum(0), library, dust, 5000, 3000)
     weight = amplitude[0] / amplitude.sum(0)
@@ -110,7 +110,7 @@ def test_impossible_mixes_are_refused_by_name(library, name, value):
 
 def test_missing_columns_and_empty_mixes_are_refused(library):
     with pytest.raises(BadInput, match="sed_1, sed_2"):
-        mix_of(
+        mix_from_columns(
             {"z_obs": [0.1], **{f"{n}_{k}": [0.0] for n in ("frac", "ext_law", "ebv") for k in (1, 2)}},
             library,
         )

@@ -99,7 +99,7 @@ def test_band_coefficients_of_the_milky_way(name, wanted):
 def dimming(name: str, ebv: float) -> float:
     band = passbands.load(name)
     flux = band.wavelength**-2.0
-    dust = extinction.transmitted(3.1 * extinction.milky_way(band.wavelength), ebv)
+    dust = extinction.transmission(3.1 * extinction.milky_way(band.wavelength), ebv)
     weights = passbands.weights(band)
     return float(-2.5 * np.log10((weights @ (flux * dust)) / (weights @ flux)))
 
@@ -112,6 +112,6 @@ def test_scaling_a_bands_extinction_linearly_would_be_wrong():
 
 def test_transmitted_keeps_single_precision():
     curve = np.ones((2, 3), np.float32)
-    out = extinction.transmitted(curve, np.array([[1.0], [2.0]], np.float32))
+    out = extinction.transmission(curve, np.array([[1.0], [2.0]], np.float32))
     assert out.dtype == np.float32
     np.testing.assert_allclose(out[:, 0], [10**-0.4, 10**-0.8], rtol=1e-6)

@@ -45,7 +45,7 @@ def published(z, x):
 
 @pytest.mark.parametrize(("z", "x"), [(1.0, 1.5), (1.6, 2.3), (1.6, 1.2), (2.8, 3.4), (2.8, 2.5), (2.8, 2.0)])
 def test_the_continuum_is_the_published_one(z, x):
-    found = intergalactic._continuum(np.array([x * intergalactic.LYMAN_LIMIT]), np.array([1.0 + z]))[0, 0]
+    found = intergalactic._continuum_depth(np.array([x * intergalactic.LYMAN_LIMIT]), np.array([1.0 + z]))[0, 0]
     assert found == pytest.approx(published(z, x), rel=2e-3, abs=1e-3)
 
 
@@ -59,7 +59,7 @@ def test_more_clouds_let_less_through(z, further, wavelength):
 
 
 def test_series_of_lines():
-    wavelength, forest, damped = (np.array(column) for column in intergalactic.series())
+    wavelength, forest, damped = (np.array(column) for column in intergalactic.lyman_series())
     assert wavelength.size == 39
     # Rydberg: 1 / (1 - 1 / n^2) of the limit.
     n = np.arange(2, 41)
@@ -82,8 +82,8 @@ def test_only_what_is_blue_and_far_is_dimmed(galaxies, library):
     table = galaxies(60, z_obs=np.linspace(0.05, 2.95, 60))
     names = ("gaia_bp", "lsst_u", "lsst_g", "lsst_r")
     bands = [passbands.load(name) for name in names]
-    rows, z = sources.galaxies_of(table, library), np.linspace(0.05, 2.95, 60)
-    clear, dimmed = (integration.galaxies(rows, bands, each) for each in (library, behind))
+    rows, z = sources.galaxies_from_table(table, library), np.linspace(0.05, 2.95, 60)
+    clear, dimmed = (integration.galaxy_fluxes(rows, bands, each) for each in (library, behind))
     for k, band in enumerate(bands):
         far = z > band.wavelength[0] / 1215.67 - 1.0
         assert np.array_equal(dimmed[~far, k], clear[~far, k])
@@ -98,9 +98,9 @@ def test_only_what_is_blue_and_far_is_dimmed(galaxies, library):
 
 def differing(band, setting, behind, seed):
     """Largest error of tables against integration."""
-    rows = errors_measured.drawn(400, len(behind), np.random.default_rng(seed))
-    fast = flux_tables.galaxies(rows, flux_tables.open_grid([band], [setting], behind))
-    return np.abs(fast / integration.galaxies(rows, [band], behind) - 1.0).max()
+    rows = errors_measured.draw_galaxies(400, len(behind), np.random.default_rng(seed))
+    fast = flux_tables.galaxy_fluxes(rows, flux_tables.open_grid([band], [setting], behind))
+    return np.abs(fast / integration.galaxy_fluxes(rows, [band], behind) - 1.0).max()
 
 
 def test_tables_hold_it(library):
@@ -113,8 +113,8 @@ def test_a_request_asks_for_it():
     """From the request to the library of the workers."""
     wanted = from_table(tomllib.loads(requests.text("[fluxes]\nintergalactic = true\n")))
     assert inputs.read(wanted.curves).library.intergalactic
-    assert inputs.library_of(Path(), {"intergalactic": True}).intergalactic
-    assert not inputs.library_of(Path(), {}).intergalactic
+    assert inputs.galaxy_library_from_facts(Path(), {"intergalactic": True}).intergalactic
+    assert not inputs.galaxy_library_from_facts(Path(), {}).intergalactic
 
 
 @pytest.mark.nightly

@@ -13,7 +13,7 @@ from truesky.fluxes.libraries import templates
 from truesky.fluxes.libraries.templates import Library
 from truesky.fluxes.sources import Galaxies, Stars
 from truesky.fluxes.spectra import lines
-from truesky.fluxes.spectra.continuum import Mix
+from truesky.fluxes.spectra.continuum import TemplateMix
 from truesky.fluxes.tables import build_tables, errors_measured, flux_tables
 from truesky.fluxes.tables.settings import choose
 from truesky.request.accuracy import DRAFT, REFERENCE, SURVEY
@@ -35,14 +35,14 @@ def grid(library):
 def drawn(n, seed=5):
     """Galaxies uniform over all that the tables cover."""
     rng = np.random.default_rng(seed)
-    return dataclasses.replace(errors_measured.drawn(n, 31, rng), magnification=rng.uniform(0.5, 3.0, n))
+    return dataclasses.replace(errors_measured.draw_galaxies(n, 31, rng), magnification=rng.uniform(0.5, 3.0, n))
 
 
 @pytest.mark.parametrize("accuracy", [DRAFT, SURVEY])
 def test_fast_is_slow_within_the_accuracy(library, accuracy):
     rows = drawn(1500)
-    fast = flux_tables.galaxies(rows, flux_tables.open_grid(CURVES, chosen(accuracy), library))
-    slow = integration.galaxies(rows, CURVES, library)
+    fast = flux_tables.galaxy_fluxes(rows, flux_tables.open_grid(CURVES, chosen(accuracy), library))
+    slow = integration.galaxy_fluxes(rows, CURVES, library)
     assert np.abs(fast / slow - 1.0).max() <= accuracy.flux
 
 
@@ -58,18 +58,18 @@ def test_fast_is_slow_within_the_accuracy(library, accuracy):
     abs_mag=st.floats(-30.0, 5.0),
 )
 def test_fast_is_slow_for_any_galaxy(library, grid, z, sed, law, ebv, frac, a_v, line, abs_mag):
-    mix = Mix(*(np.array(x)[..., None] for x in (z, sed, law, (frac, 1.0 - frac), ebv)))
+    mix = TemplateMix(*(np.array(x)[..., None] for x in (z, sed, law, (frac, 1.0 - frac), ebv)))
     one = np.ones(1)
     rows = Galaxies(mix, abs_mag * one, 20.0 * one, np.full((1, len(lines.line_list())), line), one, a_v * one)
-    assert flux_tables.covered(rows).all()
-    slow = integration.galaxies(rows, CURVES, library)
-    np.testing.assert_allclose(flux_tables.galaxies(rows, grid), slow, rtol=SURVEY.flux)
+    assert flux_tables.covered_galaxies(rows).all()
+    slow = integration.galaxy_fluxes(rows, CURVES, library)
+    np.testing.assert_allclose(flux_tables.galaxy_fluxes(rows, grid), slow, rtol=SURVEY.flux)
 
 
 def test_lines_alone(library, grid):
     # Where a band sees at least 1 % of what it can; out in the wing of a line there is nothing to be right about.
     rows = dataclasses.replace(drawn(400), mag_r01=np.full(400, 45.0))
-    fast, slow = flux_tables.galaxies(rows, grid), integration.galaxies(rows, CURVES, library)
+    fast, slow = flux_tables.galaxy_fluxes(rows, grid), integration.galaxy_fluxes(rows, CURVES, library)
     bright = slow > 0.01 * slow.max(0)
     assert bright.sum() > 300
     np.testing.assert_allclose(fast[bright], slow[bright], rtol=5e-3)
@@ -77,22 +77,22 @@ def test_lines_alone(library, grid):
 
 def test_a_source_does_not_depend_on_its_neighbours(grid):
     rows = drawn(300)
-    wanted = flux_tables.galaxies(rows, grid)
+    wanted = flux_tables.galaxy_fluxes(rows, grid)
     order = np.random.default_rng(8).permutation(300)
-    np.testing.assert_array_equal(flux_tables.galaxies(rows.rows(order), grid), wanted[order])
-    np.testing.assert_array_equal(flux_tables.galaxies(rows.rows(slice(7, 8)), grid), wanted[7:8])
+    np.testing.assert_array_equal(flux_tables.galaxy_fluxes(rows.select(order), grid), wanted[order])
+    np.testing.assert_array_equal(flux_tables.galaxy_fluxes(rows.select(slice(7, 8)), grid), wanted[7:8])
 
 
 def test_flux_is_linear_in_what_it_is_linear_in(grid):
     rows = drawn(100)
-    wanted = flux_tables.galaxies(rows, grid)
+    wanted = flux_tables.galaxy_fluxes(rows, grid)
     lensed = dataclasses.replace(rows, magnification=3.0 * rows.magnification)
-    np.testing.assert_allclose(flux_tables.galaxies(lensed, grid), 3.0 * wanted, rtol=1e-12)
+    np.testing.assert_allclose(flux_tables.galaxy_fluxes(lensed, grid), 3.0 * wanted, rtol=1e-12)
     brighter = dataclasses.replace(rows, mag_r01=rows.mag_r01 - 2.5, lines=10.0 * rows.lines)
-    np.testing.assert_allclose(flux_tables.galaxies(brighter, grid), 10.0 * wanted, rtol=1e-12)
+    np.testing.assert_allclose(flux_tables.galaxy_fluxes(brighter, grid), 10.0 * wanted, rtol=1e-12)
     dark = dataclasses.replace(rows, lines=np.zeros_like(rows.lines))
     only = dataclasses.replace(rows, mag_r01=np.full(100, 60.0))
-    added = flux_tables.galaxies(dark, grid) + flux_tables.galaxies(only, grid)
+    added = flux_tables.galaxy_fluxes(dark, grid) + flux_tables.galaxy_fluxes(only, grid)
     np.testing.assert_allclose(added, wanted, rtol=1e-7)
 
 
@@ -102,17 +102,19 @@ def test_two_equal_components_are_one(grid):
     twice = dataclasses.replace(rows, mix=dataclasses.replace(rows.mix, **same))
     once_frac = np.stack([np.ones(50), np.zeros(50)])
     once = dataclasses.replace(twice, mix=dataclasses.replace(twice.mix, frac=once_frac))
-    np.testing.assert_allclose(flux_tables.galaxies(twice, grid), flux_tables.galaxies(once, grid), rtol=1e-12)
+    np.testing.assert_allclose(
+        flux_tables.galaxy_fluxes(twice, grid), flux_tables.galaxy_fluxes(once, grid), rtol=1e-12
+    )
 
 
 def test_without_a_law_there_is_no_dust(grid):
     rows = drawn(50)
     lawless = dataclasses.replace(rows.mix, law=np.zeros((2, 50), np.int64))
     clean = dataclasses.replace(lawless, ebv=np.zeros((2, 50)))
-    results = [flux_tables.galaxies(dataclasses.replace(rows, mix=mix), grid) for mix in (lawless, clean)]
+    results = [flux_tables.galaxy_fluxes(dataclasses.replace(rows, mix=mix), grid) for mix in (lawless, clean)]
     np.testing.assert_array_equal(*results)
     beyond = dataclasses.replace(rows, mix=dataclasses.replace(lawless, ebv=np.full((2, 50), 2.0)))
-    assert flux_tables.covered(beyond).all()
+    assert flux_tables.covered_galaxies(beyond).all()
 
 
 def test_a_component_without_flux_may_have_any_dust(grid):
@@ -120,8 +122,8 @@ def test_a_component_without_flux_may_have_any_dust(grid):
     single = dataclasses.replace(rows.mix, frac=np.stack([np.ones(50), np.zeros(50)]))
     ebv = np.stack([rows.mix.ebv[0], np.full(50, 3.0)])
     both = [dataclasses.replace(rows, mix=mix) for mix in (single, dataclasses.replace(single, ebv=ebv))]
-    assert flux_tables.covered(both[1]).all()
-    np.testing.assert_array_equal(*(flux_tables.galaxies(each, grid) for each in both))
+    assert flux_tables.covered_galaxies(both[1]).all()
+    np.testing.assert_array_equal(*(flux_tables.galaxy_fluxes(each, grid) for each in both))
 
 
 @pytest.mark.parametrize(
@@ -131,8 +133,8 @@ def test_what_lies_beyond_the_tables_is_integrated_not_extrapolated(galaxies, li
     values = galaxies()[column].to_numpy().copy()
     values[[3, 11]] = value
     table = galaxies(**{column: values, "ext_law_1": 2, "ext_law_2": 1})
-    rows = sources.galaxies_of(table, library)
-    assert list(np.flatnonzero(~flux_tables.covered(rows))) == [3, 11]
+    rows = sources.galaxies_from_table(table, library)
+    assert list(np.flatnonzero(~flux_tables.covered_galaxies(rows))) == [3, 11]
     survey, reference = (band_fluxes.galaxy_fluxes(table, BANDS, library, a) for a in (SURVEY, REFERENCE))
     assert list(np.flatnonzero(survey["integrated"])) == [3, 11]
     assert all(reference["integrated"].to_pylist())
@@ -154,7 +156,10 @@ def test_stars_fast_are_slow(stars_library):
         rng.uniform(0.0, build_tables.STAR_A_V_LAST, n),
     )
     curves = [*CURVES, passbands.load("gaia_g")]
-    fast, slow = flux_tables.stars(rows, curves, stars_library), integration.stars(rows, curves, stars_library)
+    fast, slow = (
+        flux_tables.star_fluxes(rows, curves, stars_library),
+        integration.star_fluxes(rows, curves, stars_library),
+    )
     np.testing.assert_allclose(fast, slow, rtol=5e-6)
 
 
@@ -169,8 +174,8 @@ def test_stars_behind_too_much_dust_are_integrated(stars, stars_library):
 
 
 def test_tables_are_made_once_and_mapped(library, grid, monkeypatch):
-    monkeypatch.setattr(build_tables, "_galaxies", None)
-    monkeypatch.setattr(build_tables, "_lines", None)
+    monkeypatch.setattr(build_tables, "_compute_galaxy_table", None)
+    monkeypatch.setattr(build_tables, "_compute_line_table", None)
     again = flux_tables.open_grid(CURVES, chosen(SURVEY), library)
     assert all(not table.flags.writeable and not table.flags.owndata for table in again.tables)
 
@@ -193,11 +198,11 @@ def test_the_tables_are_small(grid):
 
 def test_hundreds_of_times_faster(library, grid):
     rows = drawn(20_000)
-    flux_tables.galaxies(rows.rows(slice(0, 10)), grid)
+    flux_tables.galaxy_fluxes(rows.select(slice(0, 10)), grid)
     times = []
     for work in (
-        lambda: flux_tables.galaxies(rows, grid),
-        lambda: integration.galaxies(rows.rows(slice(0, 200)), CURVES, library),
+        lambda: flux_tables.galaxy_fluxes(rows, grid),
+        lambda: integration.galaxy_fluxes(rows.select(slice(0, 200)), CURVES, library),
     ):
         best = np.inf
         for _ in range(2):
@@ -216,14 +221,14 @@ def test_the_example_compiles(grid):
 def test_a_library_is_hashed_once(monkeypatch):
     library = dataclasses.replace(templates.stellar_library())
     key = build_tables.library_key(library)
-    monkeypatch.setattr(build_tables, "dust_of", None)
+    monkeypatch.setattr(build_tables, "dust_curves", None)
     assert build_tables.library_key(library) == key
 
 
 def test_prepare_leaves_nothing_to_make(monkeypatch):
     wanted = (CURVES, chosen(SURVEY), templates.galaxy_library(), templates.stellar_library(), SURVEY)
     band_fluxes.prepare(*wanted)
-    monkeypatch.setattr(build_tables, "_galaxies", None)
-    monkeypatch.setattr(build_tables, "_stars", None)
+    monkeypatch.setattr(build_tables, "_compute_galaxy_table", None)
+    monkeypatch.setattr(build_tables, "_compute_star_table", None)
     band_fluxes.prepare(*wanted)
     assert templates.GALAXY_LIBRARY_SIZE == 31

@@ -22,7 +22,7 @@ BANDS = (
 
 
 def test_every_band_and_setting_was_measured():
-    measured = settings._measured()
+    measured = settings._read_errors()
     assert set(measured) == set(CANDIDATES)
     for of_bands in measured.values():
         assert set(BANDS) <= set(of_bands) <= set(passbands.names())
@@ -38,7 +38,7 @@ def test_the_choice_is_the_smallest_that_is_good_enough(band, allowed):
         smaller = CANDIDATES[: CANDIDATES.index(choice.setting)]
     if allowed > 1e-4:
         for setting in smaller:
-            assert MARGIN * settings._measured()[setting][band].largest > allowed
+            assert MARGIN * settings._read_errors()[setting][band].largest > allowed
 
 
 def test_the_reference_is_integrated():
@@ -70,10 +70,10 @@ def test_more_accurate_is_never_smaller():
 def test_an_unknown_band_takes_what_is_right_for_all():
     [choice] = choose(["my_filter"], SURVEY)
     assert choice.setting is not None
-    assert choice.largest == max(c.largest for c in settings._measured()[choice.setting].values())
+    assert choice.largest == max(c.largest for c in settings._read_errors()[choice.setting].values())
 
 
 def test_what_is_stored_is_json():
     assert json.loads(json.dumps([choice.facts() for choice in choose(BANDS, SURVEY)]))
-    assert json.loads(json.dumps(settings.of_stars(SURVEY)))["covered"] == {"a_v": [0.0, 5.0]}
-    assert json.loads(json.dumps(settings.of_stars(REFERENCE)))["covered"] is None
+    assert json.loads(json.dumps(settings.star_error_facts(SURVEY)))["covered"] == {"a_v": [0.0, 5.0]}
+    assert json.loads(json.dumps(settings.star_error_facts(REFERENCE)))["covered"] is None

@@ -11,7 +11,7 @@ from tests.truesky.render.test_render_exposures_calibration import small_detecto
 from tests.truesky.render.test_render_exposures_infrared import MODULES
 from truesky.randomness.rng import stream
 from truesky.reduction import calibration, files, masters, reduce
-from truesky.reduction import frames as frames_of
+from truesky.reduction import frames as lake_frames
 from truesky.render.effects.charge import ramp_nonlinearity
 from truesky.render.effects.effect import Effect
 from truesky.request.from_toml import parse
@@ -55,14 +55,14 @@ stars = "stars.csv"
 
 def build(folder, side, flats, sources=STARS):
     """A field in four dithers and frames that calibrate it, their masters and calibrated images."""
-    root = layout.lake(folder / "lake")
+    root = layout.resolve_lake(folder / "lake")
     text = REQUEST.format(flats=flats, sources=sources)
     (folder / "stars.csv").write_text("ra,dec,mag\n53.117,-27.808,17.0\n53.119,-27.807,20.0\n")
     wanted = parse(requests.written(folder, text, requests.FIELD.format(0.5), seed=SEED))
     with small_detectors(side):
         for module in MODULES:
             for step in module.steps(root, wanted):
-                publish.make(root, step.plan, step.work)
+                publish.make_version(root, step.plan, step.work)
         assert masters.main(["--lake", str(root), "--out", str(folder / "masters")]) == 0
         call = ["--lake", str(root), "--masters", str(folder / "masters"), "--out", str(folder / "images")]
         assert reduce.main(call) == 0
@@ -80,14 +80,14 @@ def master(made, name):
 
 def residuals(made):
     """Of each science frame: (calibrated - truth, NaN where sources are or flags; weight; the sky's truth)."""
-    products = read.version(layout.lake(made / "lake"), "products")
+    products = read.version(layout.resolve_lake(made / "lake"), "products")
     for row in products.rows().to_pylist():
         found = list((made / "images").glob(f"{row['exposure_id']:06d}_*.fits"))
         if row["content"] != "noise_free" or not found:
             continue
         image = files.read_image(found[0]).reduced
-        light = images.read_images(products.file(row["path"]))[0].data
-        sky = images.read_images(products.file(row["path"].replace("noise_free", "sky")))[0].data
+        light = images.read_images(products.sidecar_path(row["path"]))[0].data
+        sky = images.read_images(products.sidecar_path(row["path"].replace("noise_free", "sky")))[0].data
         good = (image.weight > 0.0) & ~ndimage.binary_dilation(light > 2.0, iterations=5)
         if good.mean() > 0.5:
             yield np.where(good, image.image - light - sky, np.nan), image.weight, sky
@@ -122,9 +122,9 @@ def test_a_quarter_of_a_detector(tmp_path):
 
 
 def test_masters_are_what_the_detector_has(made):
-    root = layout.lake(made / "lake")
+    root = layout.resolve_lake(made / "lake")
     with small_detectors(192):
-        (own,) = frames_of.of_lake(root).values()
+        (own,) = lake_frames.from_lake(root).values()
     scene = own[0].scene
     dark, error = master(made, "NISP-P_4-16-4_DET22_dark.fits")
     assert np.median(dark) == pytest.approx(0.02, abs=2e-3)
@@ -150,7 +150,7 @@ def own_numbers(effect: Effect):
 
 
 def frames_of_master(mean, error):
-    return calibration.Combined(mean, error, np.ones(mean.shape, np.int16))
+    return calibration.CombinedFrame(mean, error, np.ones(mean.shape, np.int16))
 
 
 def test_a_calibrated_image_says_what_it_is(made):

@@ -8,7 +8,7 @@ import pytest
 from tests.truesky.render import infrared
 from truesky.fluxes import passbands
 from truesky.reduction.infrared import lamp_mix
-from truesky.reduction.infrared.ramps import Bend, Estimator
+from truesky.reduction.infrared.ramps import Estimator, RampNonlinearity
 from truesky.render.effects.charge import ipc, ramp
 from truesky.render.effects.readout import macc, ramp_noise
 
@@ -22,7 +22,7 @@ def scene_of(kind="photometric"):
 
 def estimated(scene, signal, b=0.0, coupled=False, seed=1):
     """Signals of SIDE x SIDE ramps, read noise in them and no drift."""
-    rng, mode = np.random.default_rng(seed), ramp.mode_of(scene)
+    rng, mode = np.random.default_rng(seed), ramp.mode_of_scene(scene)
     light = np.full((SIDE, SIDE), signal)
     frame = light if b == 0.0 else np.stack([light, 0 * light, 0 * light, 0 * light + b])
     groups = ramp.apply(frame, mode, 1.3e5, rng=rng)
@@ -36,7 +36,7 @@ def estimated(scene, signal, b=0.0, coupled=False, seed=1):
 @pytest.mark.parametrize(("kind", "signal"), [("photometric", 1.7), ("photometric", 130.0), ("spectroscopic", 600.0)])
 def test_bias_and_variance_are_those_of_drawn_ramps(kind, signal):
     scene = scene_of(kind)
-    estimator = replace(Estimator.of(scene, EVERY - {"drift"}), rounding=0.0)
+    estimator = replace(Estimator.from_scene(scene, EVERY - {"drift"}), rounding=0.0)
     found = estimated(scene, signal, coupled=True)[0]
     error = found.std() / SIDE
     assert found.mean() - signal == pytest.approx(float(estimator.bias(np.array(signal))), abs=4 * error)
@@ -48,14 +48,14 @@ def test_bias_and_variance_are_those_of_drawn_ramps(kind, signal):
 @pytest.mark.parametrize(("kind", "signal"), [("photometric", 6e4), ("spectroscopic", 4e4)])
 def test_a_bent_ramp_is_straightened(kind, signal):
     scene, b = scene_of(kind), 6e-7
-    bend = Bend.of(scene, EVERY)
+    bend = RampNonlinearity.from_scene(scene, EVERY)
     found, misfit = estimated(scene, signal, b=b)
     seen = found.mean()
     assert seen < 0.98 * signal
-    assert float(bend.bent(np.array(signal), np.array(b))) == pytest.approx(seen, rel=5e-4)
-    assert float(bend.linearised(np.array(seen), np.array(b))) == pytest.approx(signal, rel=5e-4)
+    assert float(bend.nonlinear_signal(np.array(signal), np.array(b))) == pytest.approx(seen, rel=5e-4)
+    assert float(bend.linearise(np.array(seen), np.array(b))) == pytest.approx(signal, rel=5e-4)
     straight = estimated(scene, signal)[1]
-    more = float(bend.misfit(np.array(signal), np.array(b)))
+    more = float(bend.chi_square(np.array(signal), np.array(b)))
     assert misfit.mean() - straight.mean() == pytest.approx(more, rel=0.1, abs=0.1)
 
 
@@ -73,7 +73,9 @@ def test_a_mix_of_lamps_has_the_sky_s_colour(band, lamps):
     assert min(weights) >= 0.0
     assert sum(weights) == pytest.approx(1.0)
     x = curve.wavelength
-    of_lamps = [np.average(x, weights=calibration_lamp.photons(curve, lamp, "nisp", scene.mission)) for lamp in lamps]
+    of_lamps = [
+        np.average(x, weights=calibration_lamp.detected_photons(curve, lamp, "nisp", scene.mission)) for lamp in lamps
+    ]
     of_sky = np.average(x, weights=diffuse_light.photons("nisp", 1.0, curve, scene.mission))
     assert np.dot(weights, of_lamps) == pytest.approx(of_sky, abs=0.002 * (x[-1] - x[0]))
     assert lamp_mix.weights(scene, lamps[:1]) == (1.0,)

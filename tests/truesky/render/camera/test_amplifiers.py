@@ -32,19 +32,19 @@ def test_every_pixel_is_read_once_and_found_again(camera):
     """In the planes, in the raw file, and in the sections that its header names."""
     own = layout_of(first(camera, nx=96, ny=80))
     frame = np.arange(1, 96 * 80 + 1).reshape(80, 96)
-    planes = own.apart(frame)
-    there = ~own.streets
-    np.testing.assert_array_equal(own.together(planes), np.where(there, frame, 0))
+    planes = own.split(frame)
+    there = ~own.unread_pixels
+    np.testing.assert_array_equal(own.assemble(planes), np.where(there, frame, 0))
     assert np.count_nonzero(planes) == there.sum()
     # Pre- and overscan, too, are in the file once, each of them.
     marked = np.arange(1, planes.size + 1).reshape(planes.shape)
-    raw = own.raw(marked)
+    raw = own.to_raw_image(marked)
     np.testing.assert_array_equal(np.sort(raw[raw > 0]), marked.ravel())
-    data = own.raw(planes)
-    np.testing.assert_array_equal(data[own.data.slices], np.where(there, frame, 0))
+    data = own.to_raw_image(planes)
+    np.testing.assert_array_equal(data[own.data_section.slices], np.where(there, frame, 0))
     for number, amplifier in enumerate(own.amplifiers):
-        np.testing.assert_array_equal(data[own.pixels_of(number).slices], frame[amplifier.pixels.slices])
-        bias = raw[own.bias_of(number).slices]
+        np.testing.assert_array_equal(data[own.amplifier_data_section(number).slices], frame[amplifier.pixels.slices])
+        bias = raw[own.amplifier_bias_section(number).slices]
         height, pixels = own.height, own.prescan + own.width
         read = marked[number, :height, pixels:] if own.overscan else marked[number, :height, : own.prescan]
         np.testing.assert_array_equal(np.sort(bias, axis=None), np.sort(read, axis=None))
@@ -54,7 +54,7 @@ def test_every_pixel_is_read_once_and_found_again(camera):
 def test_the_first_pixel_to_be_read_is_at_its_corner(camera):
     own = layout_of(first(camera, nx=96, ny=80))
     frame = np.arange(96 * 80).reshape(80, 96)
-    for plane, amplifier in zip(own.apart(frame), own.amplifiers, strict=True):
+    for plane, amplifier in zip(own.split(frame), own.amplifiers, strict=True):
         part = frame[amplifier.pixels.slices]
         assert plane[0, own.prescan] == part[-int(amplifier.read_top), -int(amplifier.read_right)]
 
@@ -69,7 +69,7 @@ def test_sensors_of_two_makers_are_read_in_their_own_ways():
     makers = {d.kind: d for d in detectors.detectors("lsstcam", MISSION)}
     e2v, itl = (layout_of(makers[kind]) for kind in ("e2v", "itl"))
     for own in (e2v, itl):
-        assert (own.width + own.scans, own.height + own.rows) == (576, 2048)
+        assert (own.width + own.scan_columns, own.height + own.overscan_rows) == (576, 2048)
         assert len(own.amplifiers) == 16
     still = resolve(overrides={"ext.lsstcam.gain_spread": (0.0, GAIN)})
     gains = [amplifiers.values("gain", GAIN, makers[k], still, own) for k, own in (("e2v", e2v), ("itl", itl))]
@@ -79,8 +79,8 @@ def test_sensors_of_two_makers_are_read_in_their_own_ways():
 @given(st.tuples(*[st.integers(0, 5000)] * 2), st.tuples(*[st.integers(1, 5000)] * 2))
 def test_sections_are_written_and_read(start, size):
     section = Section(*start, *size)
-    assert Section.of(section.text) == section
-    assert Section.of("[1:1024,51:4146]") == Section(0, 50, 1024, 4096)
+    assert Section.from_text(section.text) == section
+    assert Section.from_text("[1:1024,51:4146]") == Section(0, 50, 1024, 4096)
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
@@ -91,7 +91,9 @@ def test_each_amplifier_has_its_own_gain_the_same_in_every_lake(camera):
     np.testing.assert_array_equal(gain, amplifiers.values("gain", GAIN, one, MISSION, own))
     assert len(set(gain)) == len(own.amplifiers)
     mean, spread = (MISSION.value(f"ext.{camera}.{key}", GAIN) for key in ("gain", "gain_spread"))
-    assert np.abs(gain / mean - 1.0).max() <= 3.0 * spread / mean * max(a.relative[0] for a in own.amplifiers) + 0.1
+    assert (
+        np.abs(gain / mean - 1.0).max() <= 3.0 * spread / mean * max(a.ratios_to_first[0] for a in own.amplifiers) + 0.1
+    )
     other = detectors.detectors(camera, MISSION)[1]
     assert (gain != amplifiers.values("gain", GAIN, other, MISSION, layout_of(other))).all()
 
@@ -118,7 +120,7 @@ def test_crosstalk_beyond_neighbours_is_as_little_as_measured():
     """Rubin Observatory, LSSTCam: 1.5e-4 to 2.9e-4 between neighbours, less than 5e-5 between others."""
     for one in detectors.detectors("lsstcam", MISSION)[:60]:
         own = layout_of(one)
-        found = amplifiers.couplings(2.2e-4, 2.9e-4, one, own)
+        found = amplifiers.crosstalk_couplings(2.2e-4, 2.9e-4, one, own)
         columns, top = np.array([(a.pixels.x // own.width, a.read_top) for a in own.amplifiers]).T
         neighbours = (np.abs(columns[:, None] - columns) == 1) & (top[:, None] == top)
         assert 1.4e-4 < found[neighbours].min() < found[neighbours].max() <= 2.9e-4

@@ -54,8 +54,8 @@ def test_between_the_halves_of_a_vis_detector_nothing_is_read():
     def half_rows(detector):
         return Scene(MISSION, detector.section, 1.0, 0.0, 0.0, detector).half_rows
 
-    assert {(d.nx, d.ny, d.middle, half_rows(d)) for d in VIS} == {(4096, 4136, 4, 2066)}
-    assert {(d.middle, half_rows(d)) for d in LSST} == {(0, 2002), (0, 2000)}
+    assert {(d.nx, d.ny, d.injection_rows, half_rows(d)) for d in VIS} == {(4096, 4136, 4, 2066)}
+    assert {(d.injection_rows, half_rows(d)) for d in LSST} == {(0, 2002), (0, 2000)}
 
 
 @pytest.mark.parametrize("name", ["nx", "ny", "charge_injection_rows"])
@@ -180,7 +180,7 @@ def test_a_pointing_puts_the_detector_on_its_target(pointing, d):
     system = wcs(d, *boresight_for(d, ra, dec, angle))
     x, y = pixel_of_sky(system, [ra], [dec])
     assert np.hypot(x[0] - (d.nx - 1) / 2, y[0] - (d.ny - 1) / 2) < 1e-6
-    if abs(dec) < 89.9 and not d.bending:
+    if abs(dec) < 89.9 and not d.distortion_terms:
         # At the target itself, the detector's axes have the angle that was asked for.
         j = jacobian(system, x, y)[0]
         measured = np.degrees(np.arctan2(-j[0, 1], j[1, 1])) - d.rotation

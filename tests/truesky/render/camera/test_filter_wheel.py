@@ -38,9 +38,11 @@ def test_a_ray_is_displaced_as_snell_has_it(tilt, place):
     upright = np.array([0.0, 0.0, 1.0])
     # 0.3 arcsec are 18 um.
     traced = 0.3 / 0.018 * (leaves(ray, normal, thickness, n) - leaves(ray, upright, thickness, n))
-    seen = filter_wheel.displaced(replace(NISP[5], x=0.0, y=0.0, bending=()), *tilt)
+    seen = filter_wheel.apply_tilt(replace(NISP[5], x=0.0, y=0.0, distortion_terms=()), *tilt)
     shift = -np.array([seen.x, seen.y])
-    bend = -np.array([sum(t[axis] * place[0] ** t[0] * place[1] ** t[1] for t in seen.bending) for axis in (2, 3)])
+    bend = -np.array(
+        [sum(t[axis] * place[0] ** t[0] * place[1] ** t[1] for t in seen.distortion_terms) for axis in (2, 3)]
+    )
     size = np.hypot(*shift)
     assert size > 0.05
     np.testing.assert_allclose(shift + bend, traced, atol=5e-4 * size)
@@ -56,7 +58,7 @@ def test_the_header_knows_it():
         here = []
         for d in NISP:
             still = astrometry.wcs(d, row.ra, row.dec, row.position_angle)
-            seen = Aim.of(row, d).wcs
+            seen = Aim.from_exposure(row, d).wcs
             x, y = astrometry.pixel_of_sky(seen, *astrometry.sky_of_pixel(still, [1000.0], [1000.0]))
             sign = -1 if d.upside_down else 1
             here.append([sign * (x[0] - 1000.0), sign * (y[0] - 1000.0)])
@@ -71,7 +73,7 @@ def test_the_header_knows_it():
 
 def test_another_seed_is_another_tilt():
     row = exposure(camera="nisp", channel="NISP-P", band="euclid_y")
-    first, again, other = (Aim.of(row, NISP[3], seed=seed).wcs.wcs.crpix for seed in (1, 1, 2))
+    first, again, other = (Aim.from_exposure(row, NISP[3], seed=seed).wcs.wcs.crpix for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 0.01
 
@@ -80,8 +82,10 @@ def test_the_error_is_the_mission_s():
     """Sample of 400 positions; significance 6e-5 of the mean (4 standard errors), 1e-3 of the rms (8 %)."""
     tilts = []
     for number in range(400):
-        seen = filter_wheel.tilted(NISP[5], str(number), 1)
-        tilts.append([(NISP[5].x - seen.x) / NISP[5].wheel.shift, (NISP[5].y - seen.y) / NISP[5].wheel.shift])
+        seen = filter_wheel.apply_random_tilt(NISP[5], str(number), 1)
+        tilts.append(
+            [(NISP[5].x - seen.x) / NISP[5].filter_wheel.shift, (NISP[5].y - seen.y) / NISP[5].filter_wheel.shift]
+        )
     rms = np.sqrt((np.array(tilts) ** 2).sum(axis=1).mean())
     assert np.degrees(rms) * 60 == pytest.approx(6.0, rel=0.08)
     assert np.abs(np.mean(tilts, axis=0)).max() < 4 * rms / np.sqrt(2 * 400)
@@ -89,17 +93,17 @@ def test_the_error_is_the_mission_s():
 
 def test_other_cameras_and_a_still_wheel_change_nothing():
     still = detectors("nisp", resolve(overrides={"nisp.filter_wheel_error": (0.0, "arcmin")}))[3]
-    assert filter_wheel.tilted(still, "1", 1) is still
+    assert filter_wheel.apply_random_tilt(still, "1", 1) is still
     vis = detectors("vis", MISSION)[3]
-    assert filter_wheel.tilted(vis, "1", 1) is vis
-    assert filter_wheel.displaced(vis, 1e-3, 0.0) is vis
+    assert filter_wheel.apply_random_tilt(vis, "1", 1) is vis
+    assert filter_wheel.apply_tilt(vis, 1e-3, 0.0) is vis
 
 
 def test_a_shift_of_the_image_is_a_shift_of_the_sky():
-    d = replace(NISP[5], bending=())
-    moved = replace(filter_wheel.displaced(d, 2e-3, 0.0), bending=())
+    d = replace(NISP[5], distortion_terms=())
+    moved = replace(filter_wheel.apply_tilt(d, 2e-3, 0.0), distortion_terms=())
     before, after = (astrometry.wcs(each, 10.0, 0.0, 0.0) for each in (d, moved))
     here, there = (
         SkyCoord(*astrometry.sky_of_pixel(system, [500.0], [500.0]), unit="deg") for system in (before, after)
     )
-    assert here.separation(there).arcsec[0] == pytest.approx(2e-3 * d.wheel.shift, rel=1e-4)
+    assert here.separation(there).arcsec[0] == pytest.approx(2e-3 * d.filter_wheel.shift, rel=1e-4)

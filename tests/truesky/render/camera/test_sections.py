@@ -8,7 +8,7 @@ import pytest
 from lake_schema.mission.configuration import resolve
 from lake_schema.mission.parameter import CAMERAS
 from truesky.render.camera.detectors import detectors
-from truesky.render.camera.sections import Section, Sections, in_mosaic, mosaic_size
+from truesky.render.camera.sections import Section, Sections, mosaic_size, to_mosaic_section
 
 MISSION = resolve()
 
@@ -19,14 +19,14 @@ def numbers(text):
 
 def test_as_fits_counts():
     assert Section(0, 20, 300, 100).text == "[1:300,21:120]"
-    assert Sections.whole(4, 3) == Sections(Section(0, 0, 4, 3), Section(0, 0, 4, 3))
+    assert Sections.full_frame(4, 3) == Sections(Section(0, 0, 4, 3), Section(0, 0, 4, 3))
 
 
 @pytest.mark.parametrize("camera", ["vis", "nisp", *CAMERAS])
 def test_no_two_detectors_share_a_pixel_and_all_are_inside(camera):
     every = detectors(camera, MISSION)
     _, right, _, top = numbers(mosaic_size(every))
-    places = {d.name: in_mosaic(d, Section(0, 0, d.nx, d.ny), every) for d in every}
+    places = {d.name: to_mosaic_section(d, Section(0, 0, d.nx, d.ny), every) for d in every}
     # Those that lie across have no such section: in HSC four.
     assert sum(place is None for place in places.values()) == (4 if camera == "hsc" else 0)
     found = [numbers(place) for place in places.values() if place]
@@ -48,7 +48,7 @@ def test_a_pixel_of_the_mosaic_lies_where_it_lies_in_the_focal_plane(camera):
     every, corners = detectors(camera, MISSION), []
     for d in every:
         section = Section(3, 7, d.nx // 2, d.ny // 3)
-        x0, x1, y0, y1 = numbers(in_mosaic(d, section, every))
+        x0, x1, y0, y1 = numbers(to_mosaic_section(d, section, every))
         angle = np.radians(d.rotation)
         u, v = (3 - (d.nx - 1) / 2, 7 - (d.ny - 1) / 2)
         x = d.x / d.pixel_scale + np.cos(angle) * u - np.sin(angle) * v

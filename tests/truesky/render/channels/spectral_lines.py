@@ -11,13 +11,13 @@ from scipy.ndimage import convolve
 from lake_schema import units
 from tests.truesky.render import fields, infrared, spectroscopic
 from tests.truesky.render.spectroscopic import MISSION, TIME
-from truesky.fluxes import passbands, stretches
+from truesky.fluxes import passbands, wavelength_windows
 from truesky.fluxes.libraries import templates
-from truesky.fluxes.sources import galaxies_of
+from truesky.fluxes.sources import galaxies_from_table
 from truesky.randomness import rng
 from truesky.render.channels import registry
 from truesky.render.effects.effect import apply_all
-from truesky.render.exposure.rendered import numbers_of
+from truesky.render.exposure.rendered_detector import random_identity
 from truesky.render.sources import colours
 
 BAND = passbands.load("nisp_red")
@@ -42,7 +42,7 @@ class Lines:
 def trace(detector, grism, angle, number=1):
     """Of the first order."""
     row = fields.exposure(**spectroscopic.exposed(detector, grism, angle, number=number))
-    return next(one for one in CHANNEL.disperses.traces(row, detector, MISSION, infrared.SEED) if one.order == 1)
+    return next(one for one in CHANNEL.dispersion.traces(row, detector, MISSION, infrared.SEED) if one.order == 1)
 
 
 def grid(detector, step):
@@ -72,7 +72,9 @@ def exposure(lines, places, detector, shining=True, **columns):
     }  # fmt: skip
     library = templates.galaxy_library()
     table = pa.table({**body, "id": np.arange(n)})
-    spectra = stretches.galaxies(galaxies_of(table, library), int(BAND.wavelength[0]), len(BAND.wavelength), library)
+    spectra = wavelength_windows.galaxy_spectra(
+        galaxies_from_table(table, library), int(BAND.wavelength[0]), len(BAND.wavelength), library
+    )
     flux = np.array([passbands.ab_flux(BAND, BAND.wavelength, one) for one in spectra])
     mags = units.AB_UJY - 2.5 * np.log10(units.ujy_of_cgs(flux))
     return spectroscopic.rendered(mags, *places, detector=detector, body=body, forced=CLEAN, **columns)
@@ -198,8 +200,8 @@ def _again(one, noise_seed):
     """float64[ny, nx] e- of the same light in a detector of the same pixels, with noise of another seed."""
 
     def stream(effect):
-        return rng.stream(*numbers_of(effect, one.exposure, one.detector.name, one.seed, noise_seed))
+        return rng.stream(*random_identity(effect, one.exposure, one.detector.name, one.seed, noise_seed))
 
     found, _ = apply_all(one.noise_free.astype(float), CHANNEL.effects["science"], one.scene, stream)
-    readout = CHANNEL.readout.arrays(found, one.scene, one.detector.name, one.wcs)
+    readout = CHANNEL.readout.make_readout(found, one.scene, one.detector.name, one.wcs)
     return infrared.electrons(SimpleNamespace(science=readout.pixels, scene=one.scene))

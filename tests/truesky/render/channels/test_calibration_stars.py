@@ -31,8 +31,8 @@ QUIET = dict.fromkeys(
 
 def rendered(kind, magnitude, name="3-4", forced=None, truth=("noise_free", "saturation", "sky"), **parameters):
     """A field without any other source."""
-    mission = MISSION.overridden_with({f"survey.{kind}.magnitude": (magnitude, "mag"), **parameters})
-    detector = replace(detectors.detector("vis", name, mission), nx=SIDE, ny=SIDE, middle=0)
+    mission = MISSION.with_overrides({f"survey.{kind}.magnitude": (magnitude, "mag"), **parameters})
+    detector = replace(detectors.detector("vis", name, mission), nx=SIDE, ny=SIDE, injection_rows=0)
     target = "white dwarf DA" if kind == "white_dwarf" else "Vega"
     row = {
         "channel": "VIS", "camera": "vis", "band": "euclid_vis", "image_type": kind, "target": target, "ra": 53.117,
@@ -61,8 +61,8 @@ def test_five_are_on_a_detector(kind, magnitude):
 def test_none_lies_on_rows_that_are_not_read():
     mission, whole = MISSION, detectors.detector("vis", "3-4", MISSION)
     for kind in PER_DETECTOR:
-        aim = Aim.of(fields.exposure(image_type=kind, target="Vega", ra=53.117, dec=-27.808), whole)
-        _, row = astrometry.pixel_of_sky(aim.wcs, *standard_stars.places(aim, mission))
+        aim = Aim.from_exposure(fields.exposure(image_type=kind, target="Vega", ra=53.117, dec=-27.808), whole)
+        _, row = astrometry.pixel_of_sky(aim.wcs, *standard_stars.star_positions(aim, mission))
         assert len(row) == 5
         assert (np.abs(row - (whole.ny - 1) / 2) > 300).all()
 
@@ -89,15 +89,15 @@ def test_what_bleeds_is_as_long_as_the_charge_that_does_not_fit():
 
 def test_a_star_beside_the_field_measures_the_halo():
     """Some arcmin from what is cut out of detector 1-3: its light outside of its image gives fraction and scale."""
-    detector = replace(detectors.detector("vis", "1-3", MISSION), nx=SIDE, ny=SIDE, middle=0)
+    detector = replace(detectors.detector("vis", "1-3", MISSION), nx=SIDE, ny=SIDE, injection_rows=0)
     distance = (detector.y + 0.1 * SIDE / 2 + 36.0) / 3600
     own = {"survey.stray_light.distance": (distance, "deg")}
     one, header = rendered("stray_light", 2.0, "1-3", **own)
     without, _ = rendered("stray_light", 30.0, "1-3", **own)
     assert header["TARGDIST"] == pytest.approx(distance)
     halo = (one.maps["sky"] - without.maps["sky"]).astype(float)
-    aim = Aim.of(one.exposure, detector)
-    star = astrometry.pixel_of_sky(aim.wcs, *standard_stars.places(aim, one.scene.mission))
+    aim = Aim.from_exposure(one.exposure, detector)
+    star = astrometry.pixel_of_sky(aim.wcs, *standard_stars.star_positions(aim, one.scene.mission))
     assert not (0 <= star[0][0] < SIDE and 0 <= star[1][0] < SIDE)
     y, x = np.mgrid[:SIDE, :SIDE]
     r = 0.1 * np.hypot(x - star[0][0], y - star[1][0])

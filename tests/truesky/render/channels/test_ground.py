@@ -51,7 +51,7 @@ def sections(path):
     with astropy_fits.open(path) as units:
         raw, header = units[0].data.astype(float), units[0].header
     numbers = range(1, header["NAMPS"] + 1)
-    cut = [[raw[Section.of(header[f"{key}{n}"]).slices] for n in numbers] for key in ("DSEC", "BSEC")]
+    cut = [[raw[Section.from_text(header[f"{key}{n}"]).slices] for n in numbers] for key in ("DSEC", "BSEC")]
     return *cut, header
 
 
@@ -109,14 +109,14 @@ def check_crosstalk(camera, nx, ny):
     own, count = scene.layout, len(scene.layout.amplifiers)
     # Of a band; the last is dark in all of them.
     rows = own.height // (count + 1)
-    planes = np.zeros((count, own.height + own.rows, own.scans + own.width))
+    planes = np.zeros((count, own.height + own.overscan_rows, own.scan_columns + own.width))
     bands = [slice(q * rows, (q + 1) * rows) for q in range(count)]
     for q, band in enumerate(bands):
         planes[q, band, own.prescan : own.prescan + own.width] = 5e4
-    found, decisions = apply_all(own.together(planes), ground.SKY, scene, lambda effect: stream(1, effect.name))
+    found, decisions = apply_all(own.assemble(planes), ground.SKY, scene, lambda effect: stream(1, effect.name))
     assert {d.name for d in decisions if d.applied} >= {"crosstalk", "parallel_loss", "serial_loss", "amplifiers"}
     level = found[:, count * rows + 6 : own.height].mean(axis=1, keepdims=True)
-    light = (found - level) * scene.of_amplifiers("gain", "electron / adu")[:, None, None]
+    light = (found - level) * scene.amplifier_values("gain", "electron / adu")[:, None, None]
     # Borders of pixels beside another amplifier's light are displaced.
     pixels = slice(own.prescan + 4, own.prescan + own.width - 4)
     # Charge that transfers have left behind is in the first rows of the next band.

@@ -18,7 +18,7 @@ from tests.truesky.render.fields import MISSION, fluxes
 from tests.truesky.render.products import test_tools as tools
 from truesky.fluxes import passbands
 from truesky.reduction import files, masters, reduce
-from truesky.reduction import frames as frames_of
+from truesky.reduction import frames as lake_frames
 from truesky.reduction.frames import Frame
 from truesky.render.camera import detectors
 from truesky.render.channels import image_types
@@ -54,7 +54,7 @@ def test_forty_flats_and_ten_biases_are_planned(planned):
 
 
 def test_no_two_of_them_have_the_same_noise(planned):
-    rows = [ExposureRow.of(row) for row in planned[0]]
+    rows = [ExposureRow.from_row(row) for row in planned[0]]
     assert len({image_types.identity(row) for row in rows}) == len(rows)
     for kind in ("flat", "bias"):
         start = np.sort([row.mjd for row in rows if row.image_type == kind]) * 86400.0
@@ -73,9 +73,9 @@ def frame(camera, kind, number=1, seconds=10.0, forced=(), sky=0.0):
     body, points = NOBODY
     tables = body, fluxes(body, BANDS[camera], []), points, fluxes(points, BANDS[camera], [])
     shown = fields.rendered(exposed, one, tables, MISSION, SURVEY, 1, forced=dict(forced))
-    gain = np.reshape(shown.scene.of_amplifiers("gain", "electron / adu"), (-1, 1, 1))
+    gain = np.reshape(shown.scene.amplifier_values("gain", "electron / adu"), (-1, 1, 1))
     raw = shown.raw.astype(float) * gain
-    return shown.scene.layout.together(raw), shown
+    return shown.scene.layout.assemble(raw), shown
 
 
 QUIET = (("cosmic_rays", False), ("brighter_fatter", False), ("nonlinearity", False))
@@ -104,7 +104,7 @@ def test_biases_have_read_noise_of_their_own_and_a_pattern_in_common(camera):
     """Sample of four frames; the pattern exceeds noise at a significance of 6e-7 (5 standard errors)."""
     frames = np.array([frame(camera, "bias", number)[0] for number in range(1, 5)])
     _, one = frame(camera, "bias")
-    noise = np.hypot(*(np.mean(one.scene.of_amplifiers(*key)) / part for key, part in (
+    noise = np.hypot(*(np.mean(one.scene.amplifier_values(*key)) / part for key, part in (
         (("read_noise", "electron"), 1.0), (("gain", "electron / adu"), np.sqrt(12.0)))))  # fmt: skip
     for i in range(4):
         for j in range(i):
@@ -128,7 +128,7 @@ def stored(one, folder):
     """The raw file, with what is known of it."""
     path = put(one, folder)["science"]
     cards, scene = read_back.header(path), replace(one.scene, band=passbands.load(one.exposure.band))
-    return Frame(path, one.exposure, scene, frames_of._applied(cards), cards)
+    return Frame(path, one.exposure, scene, lake_frames._applied_effects(cards), cards)
 
 
 @pytest.fixture(scope="module")
@@ -137,13 +137,13 @@ def calibrated(tmp_path_factory):
     folder = tmp_path_factory.mktemp("calibrated")
     kinds = ((kind, number) for kind in ("bias", "flat") for number in range(1, FRAMES + 1))
     raw = [stored(frame("decam", kind, number + 50 * (kind == "flat"))[1], folder) for kind, number in kinds]
-    made = [(kind, own) for kind, master, own in masters.made(raw, folder) if write(folder, master, kind, own)]
+    made = [(kind, own) for kind, master, own in masters.from_frames(raw, folder) if write(folder, master, kind, own)]
     assert [(kind, len(own)) for kind, own in made] == [("bias", FRAMES), ("flat", FRAMES)]
     return folder, stored(frame("decam", "science", 200, 90.0, QUIET[:1], 100.0)[1], folder)
 
 
 def write(folder, master, kind, own):
-    path = files.master_name(folder, own[0], kind)
+    path = files.master_path(folder, own[0], kind)
     files.write_master(path, master, kind, own)
     return path.is_file()
 
@@ -163,7 +163,7 @@ def test_ccdproc_with_the_masters_leaves_a_flat_sky(calibrated):
     ccdproc = pytest.importorskip("ccdproc", reason="ccdproc is not installed (extra test)")
     folder, science = calibrated
     (bias, _), (flat, _) = (
-        files.read_master(files.master_name(folder, science, kind), kind, science) for kind in ("bias", "flat")
+        files.read_master(files.master_path(folder, science, kind), kind, science) for kind in ("bias", "flat")
     )
     found = np.full((SIDE, SIDE), np.nan)
     for text, image in tools.reduced(science.path):
@@ -182,6 +182,8 @@ def test_ccdproc_with_the_masters_leaves_a_flat_sky(calibrated):
 def test_our_reduction_does_so_too(calibrated):
     """Vignetting is undone once."""
     folder, science = calibrated
-    image, _ = reduce.reduced(science, files.masters(folder, science, ("dark",)), reduce.Wish(without=("dark",)))
+    image, _ = reduce.reduce_frame(
+        science, files.read_masters(folder, science, ("dark",)), reduce.ReductionOptions(without=("dark",))
+    )
     assert (image.weight > 0.0).mean() > 0.9
     check_flat(np.where(image.weight > 0.0, image.image, np.nan), science.scene)

@@ -12,7 +12,7 @@ from truesky.fluxes import passbands
 from truesky.render.camera import bands, detectors
 from truesky.render.channels import ground
 from truesky.render.effects.scene import Scene
-from truesky.render.exposure import elsewhere
+from truesky.render.exposure import board_neighbours
 from truesky.render.planning import calibration_frames, ground_surveys, planned_exposures
 from truesky.render.products import raw_pointing
 from truesky.request.area import Area
@@ -37,25 +37,25 @@ def asked(camera, mission, monkeypatch):
     found = set()
     for name in ("parameter", "model"):
         monkeypatch.setattr(MissionConfiguration, name, seen(getattr(MissionConfiguration, name), found))
-    for band in bands.of_ground(camera, mission):
+    for band in bands.ground_bands(camera, mission):
         exposed = {"channel": "EXT", "camera": camera, "band": band, "seeing": 0.8}
-        planned_exposures._Band.of(SimpleNamespace(**exposed), mission, None)
+        planned_exposures._Band.from_exposure(SimpleNamespace(**exposed), mission, None)
         planned_exposures.exposure_time("EXT", camera, band, mission)
         one = detectors.detectors(camera, mission)[0]
         shown = fields.exposure(**exposed, airmass=1.3, zenith=20.0)
         for profile in (1.0, 2.0):
-            own = mission.overridden_with({f"ext.{camera}.psf.profile": (profile, "")})
+            own = mission.with_overrides({f"ext.{camera}.psf.profile": (profile, "")})
             ground.CHANNEL.psf(shown, one, passbands.load(band), own, 1)
-    raw_pointing.believed(shown, one, mission, 1)
+    raw_pointing.commanded_pointing(shown, one, mission, 1)
     surveys = [row["survey"] for row in mission.rows("survey.external") if row["camera"] == camera]
     block = Observation(("EXT",), survey=surveys[0], exposures=1)
     assert [*ground_surveys.exposures(block, Area(ra=60.0, dec=0.0, radius=1.0), mission, 1, 60500.0)]
     flat = Observation(("EXT",), "flat", surveys[0], exposures=1)
     assert [*calibration_frames.exposures(flat, camera, (60.0, 0.0), mission, 1, 60500.0)]
-    elsewhere.neighbours(camera, one.name, mission)
-    crossed = mission.overridden_with({"survey.satellites.rate": (0.1, "1 / (deg s)")})
+    board_neighbours.other_detectors(camera, one.name, mission)
+    crossed = mission.with_overrides({"survey.satellites.rate": (0.1, "1 / (deg s)")})
     every = {effect.name: effect for effects in ground.EFFECTS.values() for effect in effects}
-    for band in bands.of_ground(camera, mission):
+    for band in bands.ground_bands(camera, mission):
         scene = Scene(crossed, one.section, 90.0, 10.0, 1e6, one, band=passbands.load(band))
         for effect in every.values():
             effect.parameters(scene)

@@ -34,7 +34,7 @@ def files(tmp_path_factory):
 
 
 def test_requests_know_the_ways():
-    assert ("raw", *ground.CHANNEL.readouts) == schema.READOUTS
+    assert ("raw", *ground.CHANNEL.alternative_readouts) == schema.READOUTS
 
 
 def test_amplifiers_have_the_pixels_and_the_scans_of_the_one_image(files):
@@ -50,19 +50,21 @@ def test_amplifiers_have_the_pixels_and_the_scans_of_the_one_image(files):
         for n, unit in enumerate(arrays, 1):
             header = unit.header
             assert header["AMPNAME"] == whole[f"AMP{n}"]
-            together[Section.of(header["CCDSEC"]).slices] = unit.data[Section.of(header["DATASEC"]).slices]
-            rows = Section.of(whole[f"BSEC{n}"])
-            bias = unit.data[Section.of(header["BIASSEC"]).slices]
-            of_pixels = Section.of(header["DATASEC"])
+            together[Section.from_text(header["CCDSEC"]).slices] = unit.data[
+                Section.from_text(header["DATASEC"]).slices
+            ]
+            rows = Section.from_text(whole[f"BSEC{n}"])
+            bias = unit.data[Section.from_text(header["BIASSEC"]).slices]
+            of_pixels = Section.from_text(header["DATASEC"])
             np.testing.assert_array_equal(bias[of_pixels.y : of_pixels.y + rows.ny], raw[rows.slices])
             assert header["GAIN"] == pytest.approx(whole[f"GAIN{n}"])
             assert header["RDNOISE"] == pytest.approx(whole[f"RDN{n}"])
             layout = rendered("raw").scene.layout
-            assert unit.data.shape == (layout.height + layout.rows, layout.scans + layout.width)
-        np.testing.assert_array_equal(together, raw[Section.of(whole["DATASEC"]).slices])
+            assert unit.data.shape == (layout.height + layout.overscan_rows, layout.scan_columns + layout.width)
+        np.testing.assert_array_equal(together, raw[Section.from_text(whole["DATASEC"]).slices])
         np.testing.assert_array_equal(together, rendered("raw").science)
         # Each pixel of the mosaic is one amplifier's.
-        place = [Section.of(unit.header["DETSEC"]) for unit in arrays]
+        place = [Section.from_text(unit.header["DETSEC"]) for unit in arrays]
         assert (
             sum(p.nx * p.ny for p in place)
             == together.size
@@ -84,7 +86,7 @@ def test_what_is_read_back_is_the_same(files, way):
 def test_each_amplifier_looks_where_its_pixels_do(files):
     system = rendered("raw").wcs
     for header, pixels in tools.arrays(files["amplifiers"]):
-        data, place = Section.of(header["DATASEC"]), Section.of(header["CCDSEC"])
+        data, place = Section.from_text(header["DATASEC"]), Section.from_text(header["CCDSEC"])
         assert pixels[data.slices].shape == (place.ny, place.nx)
         here = WCS(header).all_pix2world([data.x + 3.0], [data.y + 5.0], 0)
         there = system.all_pix2world([place.x + 3.0], [place.y + 5.0], 0)
@@ -106,7 +108,7 @@ def test_electrons_are_what_the_raw_frame_was_before_it_was_read(files):
     faint = one.noise_free < 100.0
     left = (read_back.electrons(files["raw"]).data - pixels)[faint]
     scene = rendered("raw").scene
-    noise = np.hypot(*(np.mean(scene.of_amplifiers(*key)) / part for key, part in (
+    noise = np.hypot(*(np.mean(scene.amplifier_values(*key)) / part for key, part in (
         (("read_noise", "electron"), 1.0), (("gain", "electron / adu"), np.sqrt(12.0)))))  # fmt: skip
     assert left.std() == pytest.approx(noise, rel=0.1)
     assert abs(np.median(left)) < 0.5 * noise

@@ -46,7 +46,7 @@ def test_a_full_pixel_reads_what_its_well_holds_and_bleeds_along_its_column(came
     header, full = fits.getheader(files["science"]), one.scene.value("full_well", "electron")
     electrons, raw = read_back.electrons(files["science"]).data, read_back.frame(files["science"]).data
     # Below the end of the converter: the well is what is full.
-    gains, biases = (one.scene.of_amplifiers(*of) for of in (("gain", "electron / adu"), ("bias", "adu")))
+    gains, biases = (one.scene.amplifier_values(*of) for of in (("gain", "electron / adu"), ("bias", "adu")))
     assert header["SATURATE"] == pytest.approx(np.min(0.985 * full / gains + biases), rel=0.02)
     assert header["SATURATE"] < raw.max() < 1.02 * np.max(full / gains + biases) < LARGEST[camera]
     truth = fits.getdata(files["saturation"]) > 0
@@ -56,7 +56,7 @@ def test_a_full_pixel_reads_what_its_well_holds_and_bleeds_along_its_column(came
     rows, columns = np.nonzero(truth)
     assert np.ptp(rows) > 3 * np.ptp(columns) > 0
     # No charge is lost on the way; the optics let this part through.
-    shown = calibration.illuminated(one.scene, ["illumination"])
+    shown = calibration.illumination_map(one.scene, ["illumination"])
     (tmp_path / "faint").mkdir()
     sky = read_back.electrons(put(star(camera, 1.0), tmp_path / "faint")["science"]).data
     assert (electrons - sky).sum() == pytest.approx((one.noise_free * shown).sum(), rel=0.02)

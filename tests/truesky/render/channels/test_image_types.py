@@ -16,7 +16,7 @@ from truesky.render.channels import vis
 from truesky.render.effects.effect import apply_all
 from truesky.render.effects.light import calibration_lamp
 from truesky.render.effects.scene import Scene
-from truesky.render.exposure import rendered, scene_of
+from truesky.render.exposure import rendered_detector, scene_factory
 from truesky.render.plan_exposures import plan
 from truesky.render.planning import variants
 from truesky.render.products import fits_files, read_back
@@ -43,7 +43,7 @@ def written(planned, row, folder, forced=None, magnitude=20.0):
     """(what was rendered, what is read of its file): a galaxy and a star in the lower half of the detector."""
     request, mission, _ = planned
     mission = variants.variant(row["settings"], mission, request.accuracy, {}).mission
-    detector = replace(detectors.detector("vis", "3-4", mission), nx=SIDE, ny=SIDE, middle=0)
+    detector = replace(detectors.detector("vis", "3-4", mission), nx=SIDE, ny=SIDE, injection_rows=0)
     system = astrometry.wcs(detector, row["ra"], row["dec"], row["position_angle"])
     where = [astrometry.sky_of_pixel(system, [x], [30.0]) for x in (30.0, 90.0)]
     flux = 10 ** (0.4 * (23.9 - magnitude))
@@ -114,7 +114,9 @@ def test_each_is_rendered_and_read(planned, tmp_path, key, least, most):
         assert (told is not None) == (decision.applied and decision.name in effects)
         if told is not None:
             mine = np.random.Philox(key=np.array([int(told[:16], 16), int(told[16:], 16)], np.uint64))
-            identity = rendered.numbers_of(effects[decision.name], exposure(**row), "3-4", planned[0].seed)
+            identity = rendered_detector.random_identity(
+                effects[decision.name], exposure(**row), "3-4", planned[0].seed
+            )
             again = rng.stream(*identity)
             assert np.random.Generator(mine).random() == again.random()
 
@@ -147,7 +149,7 @@ def test_lamps_shine_from_their_own_side(planned, tmp_path):
     slopes = {}
     for lamp in (1, 2, 4):
         # Each as bright as the others, whatever the band sees of it.
-        seen = calibration_lamp.seen(Scene(mission, "vis", 10.0, 0.0, 0.0), lamp)
+        seen = calibration_lamp.efficiency_of_scene(Scene(mission, "vis", 10.0, 0.0, 0.0), lamp)
         level = mission.value("vis.flat.signal", "electron") / seen
         as_bright = resolve(overrides={"vis.flat.signal": (level, "electron")})
         one, header = written((planned[0], as_bright, rows), rows["flat", 10, lamp], tmp_path, quiet, magnitude=25.0)
@@ -172,8 +174,8 @@ def test_forcing_one_effect_leaves_the_numbers_of_all_others(planned, kind):
     """
     row = next(row for (name, *_), row in planned[2].items() if name == kind)
     _, mission, _ = planned
-    detector = replace(detectors.detector("vis", "3-4", mission), nx=32, ny=32, middle=0)
-    scene = scene_of.scene_of(exposure(**row), detector, mission, planned[0].accuracy)
+    detector = replace(detectors.detector("vis", "3-4", mission), nx=32, ny=32, injection_rows=0)
+    scene = scene_factory.from_exposure(exposure(**row), detector, mission, planned[0].accuracy)
 
     def keys(forced):
         found = {}
@@ -187,7 +189,7 @@ def test_forcing_one_effect_leaves_the_numbers_of_all_others(planned, kind):
             return replace(effect, apply=apply)
 
         def stream(effect):
-            return rng.stream(*rendered.numbers_of(effect, exposure(**row), "3-4", 1))
+            return rng.stream(*rendered_detector.random_identity(effect, exposure(**row), "3-4", 1))
 
         apply_all(
             np.full((32, 32), 50.0), [watched(e) for e in vis.EFFECTS[kind]], replace(scene, forced=forced), stream
@@ -197,7 +199,7 @@ def test_forcing_one_effect_leaves_the_numbers_of_all_others(planned, kind):
     everything = {e.name: True for e in vis.EFFECTS[kind]}
     all_on = keys(everything)
     assert set(all_on) == set(everything)
-    follows = {e.name: e.numbers for e in vis.EFFECTS[kind] if e.numbers}
+    follows = {e.name: e.random_stream for e in vis.EFFECTS[kind] if e.random_stream}
     assert follows == ({"readout_trail": "pixel_response"} if kind == "flat" else {})
     assert {name: all_on[other] for name, other in follows.items()}.items() <= all_on.items()
     assert len(set(all_on.values())) == len(all_on) - len(follows)

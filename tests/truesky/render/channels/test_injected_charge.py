@@ -20,7 +20,7 @@ def electrons(kind, shape, seconds, truth=(), forced=None, **overrides):
     """(what was rendered, electrons of a frame [ny, nx] above the bias)."""
     mission = resolve(overrides={f"vis.{key}": value for key, value in overrides.items()})
     ny, nx = shape
-    detector = replace(detectors.detector("vis", "3-4", mission), nx=nx, ny=ny, middle=0)
+    detector = replace(detectors.detector("vis", "3-4", mission), nx=nx, ny=ny, injection_rows=0)
     none = fields.galaxies([], []), fields.stars([], [])
     tables = none[0], fields.fluxes(none[0], "euclid_vis", 0.0), none[1], fields.fluxes(none[1], "euclid_vis", 0.0)
     row = {"image_type": kind, "exposure_time_s": seconds}

@@ -57,7 +57,7 @@ def model(psf, x, y):
     one = Sources(
         np.zeros(1, int), np.array([x]), np.array([y]), 0.3 * np.eye(2)[None], np.ones(1), np.array([-1]), None
     )
-    return references.by_series(one, own, 2 * HALF + 1)
+    return references.image_by_series(one, own, 2 * HALF + 1)
 
 
 def fitted(image, psfs, x, y):
@@ -93,7 +93,7 @@ def residuals(detector, row, where, psf, folder):
     x, y = (rows[name].to_numpy() for name in "xy")
     seen = inside(detector, x, y)
     order, x, y = order[seen], x[seen], y[seen]
-    psfs = [scenes.own(psf, one.sources, i) for i in np.flatnonzero(seen)]
+    psfs = [scenes.psf_of_source(psf, one.sources, i) for i in np.flatnonzero(seen)]
     found, out = fitted(one.noise_free, psfs, x, y), []
     for convention in ("sip", "tpv"):
         rows, writers = fits_files.products(one, ("noise_free",), wcs=convention)
@@ -111,7 +111,7 @@ def residuals(detector, row, where, psf, folder):
 def field(detector, row, pitch):
     """Places of the sky on a lattice over a detector in an exposure."""
     x, y = nominal.lattice(detector.nx, pitch)
-    return astrometry.sky_of_pixel(Aim.of(fields.exposure(**row), detector).wcs, x, y)
+    return astrometry.sky_of_pixel(Aim.from_exposure(fields.exposure(**row), detector).wcs, x, y)
 
 
 def rms(offsets):
@@ -132,7 +132,7 @@ def check(name, pitch, count, psf, folder):
         offsets.append(alone)
         # Without its tilt the image would lie elsewhere.
         still = astrometry.wcs(detector, row["ra"], row["dec"], row["position_angle"])
-        seen = Aim.of(fields.exposure(**row), detector).wcs
+        seen = Aim.from_exposure(fields.exposure(**row), detector).wcs
         moved = off(astrometry.sky_of_pixel(still, [100.0], [900.0]), astrometry.sky_of_pixel(seen, [100.0], [900.0]))
         print(name, row["exposure_id"], len(order), f"rms {rms(found[0]):.1e} mas, tilt {np.hypot(*moved)[0]:.1f} mas")
         assert np.hypot(*moved)[0] > 3.0
@@ -160,7 +160,7 @@ def test_no_light_is_lost_where_the_optics_distort():
     detector = detectors.detector("nisp", "DET11", MISSION)
     row = infrared.exposed(detector, band="euclid_h")
     psf = infrared.psf_of(detector, row["band"])
-    system = Aim.of(fields.exposure(**row), detector).wcs
+    system = Aim.from_exposure(fields.exposure(**row), detector).wcs
     jacobian = astrometry.jacobian(system, np.array([60.0]), np.array([60.0]))[0]
     middle = astrometry.jacobian(system, np.array([1980.0]), np.array([1980.0]))[0]
     assert abs(np.linalg.det(jacobian) / np.linalg.det(middle) - 1) > 1e-3

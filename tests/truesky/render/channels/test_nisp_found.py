@@ -49,7 +49,7 @@ def test_sources_are_found_where_headers_say(tmp_path):
     assert len(set(which[mine])) >= len(exact) - 2
     assert (~mine).sum() < 0.05 * len(exact)
     # On the sky: through the header against the exposure's own projection.
-    system = Aim.of(fields.exposure(**infrared.exposed(found.detector)), found.detector).wcs
+    system = Aim.from_exposure(fields.exposure(**infrared.exposed(found.detector)), found.detector).wcs
     assert signal.header["CTYPE1"] == "RA---TPV"
     seen, there = WCS(signal.header).all_pix2world(x[mine], y[mine], 0), system.all_pix2world(exact[which[mine]], 0).T
     east = (seen[0] - there[0]) * np.cos(np.radians(there[1])) * 3.6e6

@@ -14,7 +14,7 @@ from tests.truesky.render import infrared
 from tests.truesky.render.fields import small
 from truesky.fluxes import passbands
 from truesky.render.effects.charge import ramp
-from truesky.render.effects.charge.persistence import Traps
+from truesky.render.effects.charge.persistence import PersistenceModel
 from truesky.render.effects.readout import macc, ramp_noise
 from truesky.render.products import fits_files, read_back
 
@@ -100,7 +100,7 @@ def test_the_signal_is_as_noisy_as_was_measured(kind, noise):
     own, rng = resolve(), np.random.default_rng(1)
     shape = ramp.Mode(*(int(own.value(f"nisp.macc.{kind}.{part}")) for part in ("groups", "reads", "drops")))
     rate, read_noise = own.value("nisp.dark_current"), own.value("nisp.read_noise", "electron")
-    dark = np.full((256, 1024), rate * shape.integrated * own.value("nisp.frame_time", "s"), np.float32)
+    dark = np.full((256, 1024), rate * shape.integration_frames * own.value("nisp.frame_time", "s"), np.float32)
     groups = ramp_noise.apply(ramp.apply(dark, shape, 1e8, rng=rng), read_noise, shape.reads, rng)
     groups = ramp_noise.apply_drift(groups, own.value(f"nisp.drift_{kind}", "electron"), rng)
     signal, _ = macc.apply(groups, shape, read_noise, rng)
@@ -115,8 +115,8 @@ def test_detectors_are_no_worse_than_is_required():
         band = passbands.load(name)
         assert band.response.max() < own.value("nisp.quantum_efficiency")
         assert band.wavelength[band.response > 0.01].max() < own.value("nisp.cutoff", "Angstrom")
-    traps = Traps.of(infrared.rendered().scene)
-    left = traps.left(np.array([0.0, 8e4]), traps.reference, traps.length)[1]
+    traps = PersistenceModel.from_scene(infrared.rendered().scene)
+    left = traps.released_charge(np.array([0.0, 8e4]), traps.reference, traps.nominal_length)[1]
     assert 0.5 < left / 8e4 / own.value("nisp.persistence.fraction") < 1.0
 
 

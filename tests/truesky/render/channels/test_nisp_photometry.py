@@ -35,13 +35,13 @@ def undone(one):
 
     found = infrared.electrons(one)
     found /= output_gain.apply(np.ones(found.shape), *output_gain.EFFECT.parameters(scene), fixed(output_gain.EFFECT))
-    mode = ramp.mode_of(scene)
+    mode = ramp.mode_of_scene(scene)
     bend = ramp_nonlinearity.apply(
         np.zeros(found.shape), *ramp_nonlinearity.EFFECT.parameters(scene), fixed(ramp_nonlinearity.EFFECT)
     )[3]
     # Of N electrons a frame the last group lacks b N^2 times the mean of its frames' squares, the first its own.
     squares = [np.mean(np.arange(end - mode.reads + 1, end + 1.0) ** 2) for end in (mode.frames, mode.reads)]
-    part = (squares[0] - squares[1]) / mode.integrated**2
+    part = (squares[0] - squares[1]) / mode.integration_frames**2
     linear = found.copy()
     for _ in range(20):
         linear = found + part * bend * linear**2
@@ -53,7 +53,7 @@ def undone(one):
     if "chromatic_response" in applied:
         # Of light of flat f_nu: what the colour of a star changes stays.
         _, even, *strength = chromatic_response.EFFECT.parameters(scene)
-        maps = chromatic_response.maps(found.shape, *strength, fixed(chromatic_response.EFFECT))
+        maps = chromatic_response.draw_maps(found.shape, *strength, fixed(chromatic_response.EFFECT))
         response *= 1.0 + even[0] * maps[0] + even[1] * maps[1]
     flag = one.readout.extensions[1].data[4:-4, 4:-4] if len(one.readout.extensions) > 1 else 0
     dark = dark_map.apply(np.zeros(found.shape), *dark_map.EFFECT.parameters(scene), fixed(dark_map.EFFECT))

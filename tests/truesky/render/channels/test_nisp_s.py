@@ -17,7 +17,7 @@ from truesky.fluxes import passbands
 from truesky.render.camera import detectors
 from truesky.render.channels import registry
 from truesky.render.channels.aim import Aim
-from truesky.render.exposure import alone, persistence, visible_spectra
+from truesky.render.exposure import persistence, single_source_spectra, visible_spectra
 from truesky.render.exposure.records import Rows, Variant
 from truesky.render.products import fits_files, read_back, truth_table
 from truesky.request.accuracy import DRAFT
@@ -62,8 +62,8 @@ def test_an_order_has_the_light_of_the_table_where_its_trace_runs():
     found = one()
     detector, row = strip(), fields.exposure(**spectroscopic.exposed(strip()))
     total = 10 ** (-0.4 * (18.0 - row.zero_point)) * TIME
-    assert found.drawn[0] == pytest.approx(total, rel=0.03)
-    (first,) = (trace for trace in CHANNEL.disperses.traces(row, detector, MISSION, SEED) if trace.order == 1)
+    assert found.drawn_electrons[0] == pytest.approx(total, rel=0.03)
+    (first,) = (trace for trace in CHANNEL.dispersion.traces(row, detector, MISSION, SEED) if trace.order == 1)
     x, y = first.offsets(290.2, 30.6, BAND.wavelength)
     photons = BAND.response / BAND.wavelength
     columns = np.arange(640)
@@ -91,15 +91,15 @@ def test_the_margin_holds_the_first_order_and_the_rest_is_looked_for_as_far_as_a
     exposure = fields.exposure(**spectroscopic.exposed(whole))
     assert CHANNEL.margin("nisp", MISSION) == pytest.approx(60.0 + 293 * 0.3, rel=0.02)
     assert registry.CHANNELS["NISP-P"].margin("nisp", MISSION) == 60.0
-    assert 2019 * 0.3 < visible_spectra.beyond(exposure, whole, MISSION, BAND, SEED) < 1200.0
-    assert visible_spectra.beyond(replace(exposure, image_type="dark"), whole, MISSION, BAND, SEED) == 0.0
+    assert 2019 * 0.3 < visible_spectra.margin_arcsec(exposure, whole, MISSION, BAND, SEED) < 1200.0
+    assert visible_spectra.margin_arcsec(replace(exposure, image_type="dark"), whole, MISSION, BAND, SEED) == 0.0
 
 
 def wheel_errors(rows, seed):
     """[n] deg, by the direction of the first order of each exposure."""
     found = []
     for row in rows:
-        (first,) = (trace for trace in CHANNEL.disperses.traces(row, strip(), MISSION, seed) if trace.order == 1)
+        (first,) = (trace for trace in CHANNEL.dispersion.traces(row, strip(), MISSION, seed) if trace.order == 1)
         along, across = first.polynomials(0.0, 0.0)
         found.append(np.degrees(np.arctan2(across[1:].sum(), along[1:].sum())) - row.grism_angle)
     return np.array(found)
@@ -140,10 +140,10 @@ def test_turned_grisms_darken_the_side_that_they_are_turned_to():
     x, y = np.full(2, 1000.0), np.array([0.0, 2039.0])
     for grism, angle, loses in (("RGS000", 0.0, 0), ("RGS000", -4.0, -1), ("RGS180", 184.0, -1), ("RGS180", 180.0, 0)):
         rows = [fields.exposure(**spectroscopic.exposed(one, grism, angle)) for one in (top, bottom)]
-        left = [CHANNEL.disperses.vignetted(*pair, x, y, MISSION) for pair in zip(rows, (top, bottom), strict=True)]
+        left = [CHANNEL.dispersion.vignetting(*pair, x, y, MISSION) for pair in zip(rows, (top, bottom), strict=True)]
         assert [one.min() < 1.0 for one in left] == [loses > 0, loses < 0]
         assert np.min(left) >= 0.9
-    exact = CHANNEL.disperses.vignetted(
+    exact = CHANNEL.dispersion.vignetting(
         fields.exposure(**spectroscopic.exposed(top, "RGS000", 4.0)),
         replace(top, x=0.0, y=0.385 * 3600, rotation=0.0),
         np.array([(top.nx - 1) / 2]), np.array([(top.ny - 1) / 2]), MISSION,
@@ -190,14 +190,14 @@ def test_a_pixel_is_sky_dark_and_noise():
 def test_neighbours_and_their_order_change_no_bit_of_another_s_light():
     mags, x, y = [18.0, 19.0, 20.0], [250.0, 300.0, 350.0], [20.0, 48.0, 70.0]
     row, variant = spectroscopic.exposed(strip()), Variant(MISSION, DRAFT, {})
-    aim = Aim.of(fields.exposure(**row), strip())
+    aim = Aim.from_exposure(fields.exposure(**row), strip())
     frames = [
-        next(alone.spectra(aim, Rows(*infrared.tables(strip(), row, *one)), variant, 1)).frame
+        next(single_source_spectra.draw_sources(aim, Rows(*infrared.tables(strip(), row, *one)), variant, 1)).frame
         for one in zip(mags, x, y, strict=True)
     ]
     together = spectroscopic.rendered(mags, x, y, accuracy=DRAFT)
     np.testing.assert_array_equal(together.noise_free, sum(frames).astype(np.float32))
-    assert together.drawn.sum() == pytest.approx(sum(float(frame.sum()) for frame in frames), rel=1e-6)
+    assert together.drawn_electrons.sum() == pytest.approx(sum(float(frame.sum()) for frame in frames), rel=1e-6)
 
 
 def test_layers_of_orders_add_up_to_the_frame():

@@ -30,7 +30,7 @@ def pulls(detector, seed, images, grism="RGS000", angle=0.0):
     places = spectral_lines.undispersed(path, lines.wavelength, at)
     noisy, without = (spectral_lines.exposure(lines, places, detector, on, **columns) for on in (True, False))
     # Of the sky by all orders.
-    sky = SKY + noisy.scene.spread_sky.mean() / TIME
+    sky = SKY + noisy.scene.sky_change.mean() / TIME
     noise = Noise(sky + noisy.scene.dark_rate, (detector.ny, detector.nx), np.random.default_rng(seed))
     flux, error = spectral_lines.measured(noisy, without, at, noise, images)
     return ((flux - 1.0) / error).ravel()

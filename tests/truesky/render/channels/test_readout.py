@@ -16,7 +16,7 @@ TRUTH = ("noise_free", "stars", "sky", "cosmic_rays", "ghosts", "saturation")
 
 def ramp(found, scene, detector, system):
     """A slope, a flag, the quality of the fit and the groups: what a detector read up the ramp delivers."""
-    found = scene.layout.together(found)
+    found = scene.layout.assemble(found)
     slope = np.rint(np.clip(found, 0.0, 65535.0)).astype(np.uint16)
     flag = (slope > np.median(slope)).astype(np.uint8)
     groups = np.stack([np.rint(found * part).astype(np.int32) for part in (0.25, 0.5, 1.0)])
@@ -35,9 +35,9 @@ def ramp(found, scene, detector, system):
 
 MODE = replace(
     readout.FRAME,
-    arrays=ramp,
-    pixels=lambda read: np.asarray(read[1].data),
-    electrons=lambda read: np.asarray(read[1].data) * dict(c[:2] for c in read[0].cards)["EXPTIME"],
+    make_readout=ramp,
+    read_pixels=lambda read: np.asarray(read[1].data),
+    read_electrons=lambda read: np.asarray(read[1].data) * dict(c[:2] for c in read[0].cards)["EXPTIME"],
 )
 
 
@@ -108,5 +108,5 @@ def test_a_file_of_no_channel_is_refused(monkeypatch, tmp_path):
 def test_what_an_effect_leaves_is_assembled_before_and_after_it_is_cut_into_quadrants():
     one = render("VIS")
     mode = vis.CHANNEL.readout
-    np.testing.assert_array_equal(mode.assembled(one.raw, one.scene), one.science)
-    np.testing.assert_array_equal(mode.assembled(one.science, one.scene), one.science)
+    np.testing.assert_array_equal(mode.assemble(one.raw, one.scene), one.science)
+    np.testing.assert_array_equal(mode.assemble(one.science, one.scene), one.science)

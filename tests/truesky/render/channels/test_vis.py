@@ -104,11 +104,11 @@ def test_the_curvature_of_photon_transfer_is_the_predicted_one():
     a, b = flats(level, 768, forced)
     scene = Scene(MISSION, "vis", 10.0, 0.25, 0.0)
     parameters = nonlinearity.EFFECT.parameters(scene)
-    there = nonlinearity.linearised(np.array([np.mean(a + b) / 2]), *parameters)
+    there = nonlinearity.linearise(np.array([np.mean(a + b) / 2]), *parameters)
     slope = np.diff(nonlinearity.apply(np.array([there[0] - 50, there[0] + 50]), *parameters))[0] / 100
     noise = MISSION.value("vis.read_noise") ** 2 + MISSION.value("vis.gain") ** 2 / 12
     found = (np.var(a - b) / 2 - noise) / there[0]
     softness = brighter_fatter.EFFECT.parameters(scene)
-    expected = slope**2 * (1 - brighter_fatter.curvature(*softness[:2]) * there[0])
+    expected = slope**2 * (1 - brighter_fatter.variance_slope(*softness[:2]) * there[0])
     assert 1 - expected > 0.08
     assert 1 - found == pytest.approx(1 - expected, rel=0.1)

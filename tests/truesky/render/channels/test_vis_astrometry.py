@@ -79,7 +79,7 @@ def test_the_truth_table_tells_where_sources_are(name, ra, dec):
     where = astrometry.sky_of_pixel(system, rng.uniform(-0.5, 4095.5, 300), rng.uniform(-0.5, 4131.5, 300))
     points = stars(*where)
     none = galaxies(0.0, 0.0).slice(0, 0)
-    drawn, sizes = visible_sources.sources_of(
+    drawn, sizes = visible_sources.select_sources(
         Rows(none, None, points, None), (np.zeros(0), np.full(300, 1e3)), aimed(detector, system, BAND),
         psf_of("vis"), 13.0, settings.settings_for(SURVEY),
     )  # fmt: skip
@@ -155,7 +155,7 @@ def drawn_stars(detector, columns, rows):
     n = len(columns)
     sources = Sources(
         np.arange(n), columns, rows, np.tile(0.1 * np.eye(2), (n, 1, 1)), np.full(n, 1e6), np.full(n, -1),
-        alone().sources.shapes, np.full((n, sub_bands.PARTS), 1.0 / sub_bands.PARTS),
+        alone().sources.shapes, np.full((n, sub_bands.N_SUB_BANDS), 1.0 / sub_bands.N_SUB_BANDS),
     )  # fmt: skip
     return stamps.draw(sources, np.full(n, 128), psf, detector.nx, detector.ny)
 

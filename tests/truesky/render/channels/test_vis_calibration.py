@@ -33,8 +33,8 @@ def combined(frames):
 
 
 def linearised(frame, one):
-    electrons = nonlinearity.linearised(frame.astype(float), *nonlinearity.EFFECT.parameters(one.scene))
-    return quadrants.assembled(electrons, *quadrants.sizes(one.scene))
+    electrons = nonlinearity.linearise(frame.astype(float), *nonlinearity.EFFECT.parameters(one.scene))
+    return quadrants.assemble(electrons, *quadrants.overscan_sizes(one.scene))
 
 
 @cache

@@ -87,7 +87,7 @@ def test_what_the_effects_take_is_what_the_benchmark_says():
     places = replace(
         without.sources, column=rows["x"].to_numpy(), row=rows["y"].to_numpy(), electrons=rows["expected"].to_numpy()
     )
-    told = effects.changes(without.scene, places, without.noise_free.astype(float))
+    told = effects.effect_changes(without.scene, places, without.noise_free.astype(float))
     expected = sum(np.nanmean(told[name][:, 0]) for name in nominal.CHARGE)
     print(f"shift {1e3 * found:.2f} mmag, by the benchmark {1e3 * expected:.2f}, noise of a star {1e3 * noise[0]:.2f}")
     assert expected > 0.003

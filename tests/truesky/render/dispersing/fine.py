@@ -86,9 +86,9 @@ def profile(source, fx, fy):
     """[rows, columns] transform of the only galaxy."""
     shapes = source.shapes.take(source.shape)
     form = galaxy_shapes.forms(shapes, source.jacobian)
-    row, weights = sersic.row_of(shapes.sersic_index)
+    row, weights = sersic.interpolation_weights(shapes.sersic_index)
     table = np.empty(sersic.table().shape[1], np.float32)
-    fourier.interpolate(sersic.table(), int(row[0]), weights[0], 0.0, 1e9, table)
+    fourier.interpolate_sersic(sersic.table(), int(row[0]), weights[0], 0.0, 1e9, table)
     out, square = np.ones((len(fy), len(fx)), np.float32), np.empty(len(fx), np.float32)
     for line, f in zip(out, fy, strict=True):
         fourier.profile_at(

@@ -46,4 +46,4 @@ def one(sources, i):
 
 def drawn(sources, spectra, orders, through, shape, noise, settings, tally=None):
     """The frame of sources with their spectra."""
-    return draw.draw(sources, draw.Dispersed(spectra, tuple(orders), settings), through, shape, noise, tally)
+    return draw.draw(sources, draw.DispersedSources(spectra, tuple(orders), settings), through, shape, noise, tally)

@@ -27,7 +27,7 @@ def test_straight_traces_are_drawn_as_sample_by_sample(slope, sag, along):
         fast, slow = (
             drawn(
                 source, lambda some: spectrum, [order(path)], through, (128, 640), 1.0,
-                draw.Settings(edge=1e-6, least=64, block=block),
+                draw.Settings(edge=1e-6, min_size=64, block=block),
             )
             for block in (110.0, 0.0)
         )  # fmt: skip
@@ -48,10 +48,16 @@ def test_orders_share_images_and_are_drawn_as_from_their_own(slope, monkeypatch)
     for i in (1, 4):
         source, shape, found = placed(8, i, 150.3, 60.6), (128, 720), []
         for block in (110.0, 0.0):
-            settings, layers = draw.Settings(edge=0.01, least=64, block=block), {}
+            settings, layers = draw.Settings(edge=0.01, min_size=64, block=block), {}
             made.clear()
             draw.draw(
-                source, draw.Dispersed(lambda some: spectrum, tuple(orders), settings), psf(), shape, 1.0, None, layers
+                source,
+                draw.DispersedSources(lambda some: spectrum, tuple(orders), settings),
+                psf(),
+                shape,
+                1.0,
+                None,
+                layers,
             )
             found.append(layers[0])
             assert {sampling.straight for sampling in made} == {block > 0.0}
@@ -83,7 +89,7 @@ def test_spectra_are_the_series_of_every_wavelength(i, slope):
     spectrum = continuum_and_line(3000.0)
     shape = (72, 160)
     wanted = fine.series(source, spectrum, [order(short)], fine.Seen.of(through, shape))
-    settings = draw.Settings(edge=1e-9, faint=0.0, least=64)
+    settings = draw.Settings(edge=1e-9, faint=0.0, min_size=64)
     found = drawn(source, lambda some: spectrum[None].astype(np.float32), [order(short)], through, shape, 1.0, settings)
     assert np.abs(found - wanted).max() < 5e-3 * wanted.max()
     finely = drawn(source, lambda some: spectrum[None].astype(np.float32), [order(short)], through, shape, 1.0, FINE)
@@ -96,7 +102,7 @@ def test_laying_keeps_the_total_and_the_mean_of_a_line():
         electrons, along = rng.random(50), np.array([rng.uniform(0, 3), rng.uniform(5, 40), rng.uniform(-2, 2)])
         laid = np.zeros((1, 400))
         times = (rng.uniform(-0.1, 0.1), 0.02)
-        kernels.lay(electrons, along, times, 7.25, 3, np.ones((1, 50)), -20, laid)
+        kernels.add_to_trace(electrons, along, times, 7.25, 3, np.ones((1, 50)), -20, laid)
         t = times[0] + times[1] * np.arange(50)
         places = 3 * (7.25 + np.polynomial.polynomial.polyval(t, along))
         samples = -20 + np.arange(400)
@@ -119,8 +125,8 @@ def test_all_light_of_an_order_is_on_a_frame_that_holds_it():
     source, through = placed(8, 1, 140.0, 60.0), psf()
     spectrum = continuum_and_line()
     orders = [order(trace((-60.0, 120.0), 0.03)), order(trace((-70.0, 3.0, 1.0, -0.5), order=0), 0.1)]
-    tally = draw.Tally.of(1, 2)
-    settings = draw.Settings(edge=1e-9, faint=0.0, least=96)
+    tally = draw.Tally.empty(1, 2)
+    settings = draw.Settings(edge=1e-9, faint=0.0, min_size=96)
     frame = drawn(
         source, lambda some: spectrum[None].astype(np.float32), orders, through, (160, 300), 1.0, settings, tally
     )
@@ -135,7 +141,7 @@ def test_light_below_zero_is_taken_off():
     response, found = np.sin(np.linspace(0.0, 9.0, len(WAVES))), []
     for own in (response, np.maximum(response, 0.0), np.maximum(-response, 0.0)):
         orders = [replace(order(trace((-10.0, 512.0), 0.07)), response=own)]
-        found.append(drawn(source, lambda _: spectrum, orders, through, (128, 640), 1.0, draw.Settings(least=64)))
+        found.append(drawn(source, lambda _: spectrum, orders, through, (128, 640), 1.0, draw.Settings(min_size=64)))
     both, added, taken = found
     assert added.max() > 1.0 < taken.max()
     assert np.abs(both - (added - taken)).max() < 2e-3 * added.max()
@@ -181,7 +187,7 @@ def test_a_line_lies_where_its_wavelength_does():
             through,
             (84, 160),
             1.0,
-            draw.Settings(edge=1e-6, least=64),
+            draw.Settings(edge=1e-6, min_size=64),
         )
         x, y = path.offsets(float(source.column[0]), float(source.row[0]), WAVES[3000:3001])
         rows, columns = np.indices(frame.shape)
@@ -197,7 +203,7 @@ def draw_of_all(source, through, column, row):
     flat = [order(trace((0.0, 1e-6)))]
     spectrum = np.zeros((1, len(WAVES)), np.float32)
     spectrum[0, 3000] = 1000.0
-    frame = drawn(still, lambda some: spectrum, flat, through, (84, 160), 1.0, draw.Settings(edge=1e-6, least=64))
+    frame = drawn(still, lambda some: spectrum, flat, through, (84, 160), 1.0, draw.Settings(edge=1e-6, min_size=64))
     rows, columns = np.indices(frame.shape)
     return (frame * columns).sum() / frame.sum(), (frame * rows).sum() / frame.sum()
 

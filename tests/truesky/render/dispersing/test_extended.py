@@ -64,7 +64,7 @@ def test_a_trail_of_a_thousand_pixels_is_its_points():
     body, trail = source(), np.array([998.0, 40.0])
     part = (np.arange(1000) + 0.5) / 1000 - 0.5
     alike = points(body, body.column + part * trail[0], body.row + part * trail[1], np.full(1000, 1e3))
-    check(replace(body, trail=trail[None]), alike, 1.0, replace(SETTINGS, least=64))
+    check(replace(body, trail=trail[None]), alike, 1.0, replace(SETTINGS, min_size=64))
 
 
 def test_an_arc_is_its_pixels():
@@ -76,5 +76,5 @@ def test_an_arc_is_its_pixels():
     # Columns of a picture run to the east; the world frame's first axis points west.
     across, up = np.linalg.solve(body.jacobian[0], scale * np.stack([-x.ravel(), y.ravel()]))
     alike = points(body, body.column + across, body.row + up, 1e6 * light.ravel())
-    arc = replace(body, picture=np.array([0]), pictures=(Picture.of_sky(light.astype(np.float32), scale),))
+    arc = replace(body, picture=np.array([0]), pictures=(Picture.from_sky_image(light.astype(np.float32), scale),))
     check(arc, alike, 1.0)

@@ -14,7 +14,7 @@ from truesky.request.accuracy import DRAFT, SURVEY
 
 COUNT = LAST - FIRST + 1
 FLAT = np.full((1, COUNT), 1e4 / COUNT, np.float32)
-SETTINGS = replace(draw.settings_for(SURVEY), least=64)
+SETTINGS = replace(draw.settings_for(SURVEY), min_size=64)
 
 
 def some(i=1):
@@ -23,7 +23,7 @@ def some(i=1):
 
 
 def total(orders, spectrum=FLAT, i=1):
-    tally = draw.Tally.of(1, len(orders))
+    tally = draw.Tally.empty(1, len(orders))
     frame = drawn(some(i), lambda _: spectrum, orders, psf(), (128, 128), 1.0, SETTINGS, tally)
     assert np.isfinite(frame).all()
     assert frame.sum() == pytest.approx(tally.electrons.sum(), rel=1e-9)
@@ -87,7 +87,7 @@ def test_a_crowd_takes_the_memory_of_a_frame(count, settings):
     rng, shape = np.random.default_rng(1), (2040, 2040 * count // 50_000)
     crowd = scenes.sources(scenes.NISP, 5, galaxies=count * 9 // 10, stars=count // 10)
     crowd.column[:], crowd.row[:] = rng.uniform(0, shape[1], len(crowd)), rng.uniform(0, shape[0], len(crowd))
-    tally, spectrum = draw.Tally.of(len(crowd), 1), np.full(COUNT, 10.0 / COUNT, np.float32)
+    tally, spectrum = draw.Tally.empty(len(crowd), 1), np.full(COUNT, 10.0 / COUNT, np.float32)
     orders = [order(trace((-219.0, 512.0), 0.05))]
     through = psf()
     tracemalloc.start()

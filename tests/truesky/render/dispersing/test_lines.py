@@ -111,7 +111,7 @@ def test_lines_of_many_galaxies():
 @pytest.mark.parametrize(("block", "error"), [(1.0, 1e-6), (SETTINGS.block, 5e-6)])
 def test_a_line_and_a_continuum_apart_are_the_two_together(block, error):
     """On stamps of one size: but for what shares one PSF, 1e-6 of the light in any pixel; single precision in all."""
-    rng, settings = np.random.default_rng(SEED), replace(SETTINGS, least=96, edge=0.1, block=block)
+    rng, settings = np.random.default_rng(SEED), replace(SETTINGS, min_size=96, edge=0.1, block=block)
     for i, (grism, tilt) in enumerate(TURNS):
         trace = first_order(grism, tilt)
         spectrum, centre = halpha(rng)

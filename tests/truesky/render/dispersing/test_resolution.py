@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks import _scenes as scenes
-from lake_schema.mission.parameter import read_all
+from lake_schema.mission.parameter import read_all_parameters
 from tests.truesky.render.dispersing import fine
 from tests.truesky.render.dispersing.made import DETECTOR, MISSION, drawn, one, order
 from truesky.render.camera import traces
@@ -55,7 +55,7 @@ SETTINGS = draw.settings_for(SURVEY)
     ("grism", "tilt"), [("RGS000", 0.0), pytest.param("RGS180", 4.0, marks=pytest.mark.nightly), ("BGS000", 0.0)]
 )
 def test_lines_are_resolved_as_required(grism, tilt):
-    required = {record.key: record.value for record in read_all() if record.status == "REQ"}
+    required = {record.key: record.value for record in read_all_parameters() if record.status == "REQ"}
     least = required[f"nisp.{grism.lower()}.resolving_power"]
     path = next(part for part in traces.traces(grism, tilt, DETECTOR, MISSION) if part.order == 1)
     psf = euclid.nisp_psf_at(DETECTOR, images.nodes(path.first, path.last, 3), MISSION, 1)

@@ -37,7 +37,7 @@ def grey():
 
 
 def frame(source, path, spectrum, through):
-    of, whole = spectrum[None].astype(np.float32), replace(SETTINGS, least=64, edge=10.0)
+    of, whole = spectrum[None].astype(np.float32), replace(SETTINGS, min_size=64, edge=10.0)
     return drawn(source, lambda _: of, [order(path)], through, (SIDE, SIDE), NOISE, whole)
 
 

@@ -30,7 +30,7 @@ def ring(side=40, seed=3):
     y, x = (np.mgrid[:side, :side] - 0.5 * (side - 1)) / side
     light = np.exp(-0.5 * ((np.hypot(x, y) - 0.2) / 0.06) ** 2) * (1.2 + np.cos(np.arctan2(y, x) - 0.7))
     light *= 1 + 0.3 * np.random.default_rng(seed).random(light.shape)
-    return Picture.of_sky((light / light.sum()).astype(np.float32), 0.05)
+    return Picture.from_sky_image((light / light.sum()).astype(np.float32), 0.05)
 
 
 def pictured(camera, name, picture, electrons, column=80.3, row=77.6):
@@ -51,7 +51,7 @@ def drawn(source, psf, accuracy=SURVEY):
 def test_the_transform_is_that_of_the_pixels_under_the_interpolant(rows, columns, seed):
     rng = np.random.default_rng(seed)
     image = rng.random((rows, columns)).astype(np.float32)
-    picture = Picture.of_sky(image / image.sum(), 0.05)
+    picture = Picture.from_sky_image(image / image.sum(), 0.05)
     jacobian, k = 0.1 * (np.eye(2) + 0.3 * rng.random((2, 2))), rng.uniform(-8, 8, (2, 40))
     west, north = 0.05 * np.linalg.inv(jacobian).T @ k
     y, x = np.mgrid[:rows, :columns] - 0.5 * np.array([rows - 1, columns - 1])[:, None, None]
@@ -68,7 +68,7 @@ def test_a_picture_is_what_galsim_draws(camera, name, side, electrons):
     """Also in double precision; to what galsim's own interpolation in Fourier space is good for."""
     source, psf = pictured(camera, name, ring(side), electrons), psf_of(camera)
     ours, _ = drawn(source, psf, REFERENCE)
-    theirs = np.roll(reference.reference(source, 0, psf, 160), (78 - 80, 80 - 80), (0, 1))
+    theirs = np.roll(reference.draw_reference(source, 0, psf, 160), (78 - 80, 80 - 80), (0, 1))
     assert np.abs(ours - theirs)[8:-8, 8:-8].max() < 2e-4 * theirs.max()
     assert ours.sum() == pytest.approx(electrons, rel=1e-5)
 

@@ -13,7 +13,7 @@ from truesky.fluxes import passbands
 from truesky.render.camera.astrometry import wcs
 from truesky.render.camera.pointing import boresight_for
 from truesky.render.drawing import cost, far_light, stamp_sizes, stamps
-from truesky.render.drawing.kernels.far_light import left_compiled, remove_aliased_compiled
+from truesky.render.drawing.kernels.far_light import fading_compiled, remove_aliased_compiled
 from truesky.render.drawing.kernels.frame import FIXED_POINT
 from truesky.render.drawing.settings import settings_for
 from truesky.render.psf import diffraction, spikes, sub_bands
@@ -30,7 +30,7 @@ BRIGHT = 5e10
 
 
 def of_pupil(blur=0.034, pixel_scale=0.1, parts=PARTS):
-    return spikes.of_pupil(parts, blur, pixel_scale, 2048 / 3, MISSION)
+    return spikes.from_euclid_pupil(parts, blur, pixel_scale, 2048 / 3, MISSION)
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def test_the_ring_is_airy_s(wavelength):
     radius = np.linspace(20.0, 60.0, 40001)
     mean = np.mean([airy.xValue(r, 0.0) * r**3 for r in radius])
     # In pixels of 0.1"; the bars leave less of the light, and none of the edges.
-    ours = spikes.ring(own, np.ones(1)) * own.area / clear * 0.1
+    ours = spikes.ring_light(own, np.ones(1)) * own.area / clear * 0.1
     assert ours == pytest.approx(mean, rel=0.01)
 
 
@@ -81,8 +81,11 @@ def test_a_spike_is_the_pupil_s_transform(bar):
         turns = np.exp(-2j * np.pi * np.outer(radius * ARCSEC / wavelength, axis))
         found += np.abs(turns @ projected * step) ** 2 / (wavelength**2 * projected.sum() * step)
     theirs = found / own.wavelength[:, 1::3].size * (0.02 * ARCSEC) ** 2
-    line = spikes.spikes(own, EQUAL, 70.0 / 0.02)[bar, :, 0]
-    ours = np.interp(radius / 0.02, 8.0 * np.arange(len(line)), line) + spikes.ring(own, EQUAL) / (radius / 0.02) ** 3
+    line = spikes.spike_light(own, EQUAL, 70.0 / 0.02)[bar, :, 0]
+    ours = (
+        np.interp(radius / 0.02, 8.0 * np.arange(len(line)), line)
+        + spikes.ring_light(own, EQUAL) / (radius / 0.02) ** 3
+    )
     assert (ours * radius**2).mean() == pytest.approx((theirs * radius**2).mean(), rel=0.05)
 
 
@@ -94,7 +97,7 @@ def test_wings_are_those_of_the_mission_database(vis):
     )
     bars = 2 * own.bars[:, 2].sum()
     # Of light in a pixel, at ten pixels; per square arcsec.
-    strength = spikes.ring(own, EQUAL) / 10.0**3 / 0.1**2 * (circles + bars) / circles
+    strength = spikes.ring_light(own, EQUAL) / 10.0**3 / 0.1**2 * (circles + bars) / circles
     assert strength == pytest.approx(MISSION.value("vis.psf.wing_strength"), rel=0.03)
     frame = shone(vis, 1401, 700.0, 700.0)
     y, x = np.mgrid[-700:701, -700:701].astype(float)
@@ -110,12 +113,12 @@ def test_no_light_is_lost_beyond_the_plane(vis):
     side = 3000
     light = shone(vis, side, side / 2, side / 2).sum() / BRIGHT
     # What the frame does not show of r^-3 around a square, and of the spikes, whose fringes leave a half of r^-2.
-    beyond = spikes.ring(vis.edges, EQUAL) * 4 * np.sqrt(2) / (side / 2)
+    beyond = spikes.ring_light(vis.edges, EQUAL) * 4 * np.sqrt(2) / (side / 2)
     wavelength = vis.edges.wavelength.mean() * 1e-7
     for turn, _, length in vis.edges.bars:
         border = side / 2 / max(abs(np.cos(turn)), abs(np.sin(turn)))
         beyond += 2 * length * wavelength / (2 * np.pi**2 * vis.edges.area * 0.1 * ARCSEC * border)
-    left = far_light.left(SIDE, 3, vis.planes.images.shape[1])
+    left = far_light.fading_window(SIDE, 3, vis.planes.images.shape[1])
     kept = (vis.planes.images.mean(axis=0, dtype=float) * left[:, None] * left).sum()
     assert 0.997 < kept < 0.998
     assert light + beyond == pytest.approx(1 - kept, rel=0.05)
@@ -129,7 +132,7 @@ def test_the_frame_has_no_seam(vis):
     y, x = np.mgrid[:1200, :1200]
     dx, dy = x - 600.3, y - 599.8
     radius, clear = np.hypot(dx, dy), off_spikes(vis, dx, dy, 40.0)
-    law = spikes.ring(vis.edges, EQUAL) * BRIGHT
+    law = spikes.ring_light(vis.edges, EQUAL) * BRIGHT
     for inner, outer in ((150, 200), (200, 250), (250, 300), (300, 360), (360, 420), (420, 560)):
         here = clear & (radius >= inner) & (radius < outer)
         assert (image * radius**3)[here].mean() == pytest.approx(law, rel=0.06)
@@ -153,7 +156,7 @@ def test_the_frame_of_a_trail_has_no_seam(vis, length):
     moving = replace(source, trail=trail[None])
     size = stamp_sizes.stamp_sizes(
         moving.electrons, moving.shape, moving.shapes, vis, NOISE, settings_for(SURVEY),
-        stamp_sizes.piece_length(moving.length),
+        stamp_sizes.piece_length(moving.trail_length),
     )  # fmt: skip
     assert size[0] > SIDE
     image = stamps.draw(moving, size, vis, side, side)
@@ -164,7 +167,7 @@ def test_the_frame_of_a_trail_has_no_seam(vis, length):
     law, clear = np.zeros((side, side)), np.ones((side, side), bool)
     for a in along:
         dx, dy = x - middle[0] - a * trail[0], y - middle[1] - a * trail[1]
-        law += spikes.ring(vis.edges, EQUAL) * BRIGHT / len(along) / np.maximum(np.hypot(dx, dy), 1.0) ** 3
+        law += spikes.ring_light(vis.edges, EQUAL) * BRIGHT / len(along) / np.maximum(np.hypot(dx, dy), 1.0) ** 3
         clear &= off_spikes(vis, dx, dy, 40.0)
     radius = np.hypot(x - middle[0], y - middle[1])
     for inner, outer in ((150, 200), (200, 230), (230, 260), (260, 290), (290, 330), (330, 400), (400, 500)):
@@ -205,7 +208,7 @@ def test_a_line_of_light_is_many_points(vis, x, y, trail):
         far_light.add(
             many, far_light.Star(x + a * trail[0], y + a * trail[1], BRIGHT / points, None, SIDE, 0.0, vis.edges)
         )
-    level = BRIGHT * spikes.ring(vis.edges, EQUAL) / 400.0**3 * FIXED_POINT
+    level = BRIGHT * spikes.ring_light(vis.edges, EQUAL) / 400.0**3 * FIXED_POINT
     wrong = np.abs(line - many) / np.maximum(many, level)
     assert np.quantile(wrong, 0.99) < 0.02
     assert wrong.max() < 0.06
@@ -218,18 +221,18 @@ def test_a_trail_is_unfolded_as_its_points_are(vis):
     along, inner = (np.arange(points) + 0.5) / points - 0.5, SIDE / 2 - 2.0
     # The corner that has most of it.
     x, y = 260.2 + along * trail[0], 259.7 + along * trail[1]
-    level = BRIGHT / points * spikes.ring(vis.edges, EQUAL)
+    level = BRIGHT / points * spikes.ring_light(vis.edges, EQUAL)
     pixels = np.arange(corner)
     light = np.zeros((corner, corner))
     for px, py in zip(x, y, strict=True):
-        faded = [[left_compiled(float(abs(p - at)), inner) for p in pixels] for at in (px, py)]
+        faded = [[fading_compiled(float(abs(p - at)), inner) for p in pixels] for at in (px, py)]
         light += np.outer(faded[1], faded[0]) * level / np.hypot(pixels - px, pixels[:, None] - py) ** 3
     fast, slow = np.ones((size, size)), light.copy()
     fast[60 : 60 + corner, 60 : 60 + corner] = light
     star = far_light.Star(320.2, 319.7, BRIGHT, None, SIDE, 0.0, vis.edges, trail)
     far_light.remove_aliased(star, fast, 0, 0, size, size)
     turned = np.stack([np.cos(vis.edges.bars[:, 0]), np.sin(vis.edges.bars[:, 0])], axis=1)
-    lines = BRIGHT / points * spikes.spikes(vis.edges, EQUAL, vis.edges.period)
+    lines = BRIGHT / points * spikes.spike_light(vis.edges, EQUAL, vis.edges.period)
     remove_aliased_compiled(slow, x, y, inner, level, turned, lines, vis.edges.period)
     whole = points * level / np.hypot(pixels - 260.2, pixels[:, None] - 259.7) ** 3
     assert ((light - slow) / whole).max() > 0.05
@@ -255,7 +258,7 @@ def test_colours_differ(vis):
     """The ring goes with the wavelength: a red star's is brighter."""
     red, blue = np.zeros(len(PARTS)), np.zeros(len(PARTS))
     red[-1], blue[0] = 1.0, 1.0
-    ratio = spikes.ring(vis.edges, red) / spikes.ring(vis.edges, blue)
+    ratio = spikes.ring_light(vis.edges, red) / spikes.ring_light(vis.edges, blue)
     assert ratio == pytest.approx(vis.planes.wavelength[-1] / vis.planes.wavelength[0], rel=0.01)
 
 
@@ -324,7 +327,7 @@ def test_spikes_reach_as_far_as_they_are_noticed(vis):
     np.testing.assert_allclose(far[:2], far[0] * np.sqrt(electrons[:2] / 1e8), rtol=1e-12)
     assert far[2] == spikes.FARTHEST / 0.1
     for bright, away in zip(electrons[:2], far[:2], strict=True):
-        middle = bright * spikes.spikes(vis.edges, EQUAL, 5000.0)[:, :, 0]
+        middle = bright * spikes.spike_light(vis.edges, EQUAL, 5000.0)[:, :, 0]
         here = round(away / 8.0)
         # Over some fringes.
         assert middle[:, here - 25 : here + 26].mean(axis=1).max() == pytest.approx(least, rel=0.15)
@@ -352,6 +355,6 @@ def test_a_star_beside_the_detector_shines_in(away):
     """Its stamp of 51" ends before the frame does: an exposure draws its light nevertheless, from up to 145"."""
     field = small("vis", "3-4", 256)
     found = rendered(field, [5.0], [-away], [200.0], forced=off(*COSMIC_RAYS))
-    law = 10 ** (0.4 * (found.zero_point - 5.0)) * TIME * spikes.ring(found.psf.edges, EQUAL)
+    law = 10 ** (0.4 * (found.zero_point - 5.0)) * TIME * spikes.ring_light(found.psf.edges, EQUAL)
     assert found.noise_free[190:211, 0].mean() == pytest.approx(law / away**3, rel=0.3)
     assert found.noise_free.min() > 0.5 * law / (away + 330.0) ** 3

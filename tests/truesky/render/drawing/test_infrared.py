@@ -49,7 +49,7 @@ def sample(band, count, seed):
 def chosen(band, psf, number, side):
     """(one of sixty, its own PSF, the scene)."""
     some, scene = sample(band, 60, 4711)
-    return scenes.moved(some, number, side), scenes.own(psf, some, number), scene
+    return scenes.centred_source(some, number, side), scenes.psf_of_source(psf, some, number), scene
 
 
 def held(band, psf, count, seed, side):
@@ -57,11 +57,13 @@ def held(band, psf, count, seed, side):
     some, scene = sample(band, count, seed)
     found = []
     for i in range(len(some)):
-        one, own = scenes.moved(some, i, side), scenes.own(psf, some, i)
+        one, own = scenes.centred_source(some, i, side), scenes.psf_of_source(psf, some, i)
         star = one.shape[0] < 0
-        truth = references.by_series(one, own, side) if star else references.image(one, own, side)
+        truth = references.image_by_series(one, own, side) if star else references.reference_image(one, own, side)
         if truth is not None:
-            found.append(errors.errors(scenes.draw(one, own, scene, settings_for(SURVEY), side), truth, scene, one))
+            found.append(
+                errors.errors(scenes.draw_sources(one, own, scene, settings_for(SURVEY), side), truth, scene, one)
+            )
     return np.array(found)
 
 
@@ -94,8 +96,8 @@ def test_a_few_sources_are_as_galsim_draws_them(band, psf):
 def test_what_is_left_out_does_not_fold_onto_shapes(band, psf, number):
     """Round discs, whose transform falls through what may be left out where it folds onto low frequencies."""
     one, own, scene = chosen(band, psf, number, 128)
-    drawn = scenes.draw(one, own, scene, settings_for(SURVEY), 128)
-    within(np.array([errors.errors(drawn, references.by_series(one, own, 128), scene, one)]))
+    drawn = scenes.draw_sources(one, own, scene, settings_for(SURVEY), 128)
+    within(np.array([errors.errors(drawn, references.image_by_series(one, own, 128), scene, one)]))
 
 
 def test_a_star_s_light_has_no_seam_where_its_plane_ends(band, psf):
@@ -109,14 +111,14 @@ def test_a_star_s_light_has_no_seam_where_its_plane_ends(band, psf):
     turns = psf.edges.bars[:, 0]
     clear = np.min([np.abs(dx * np.cos(a) + dy * np.sin(a)) for a in turns], axis=0) > 20
     radius = np.hypot(dx, dy)
-    law = spikes.ring(psf.edges, np.full(8, 1 / 8)) * BRIGHT
+    law = spikes.ring_light(psf.edges, np.full(8, 1 / 8)) * BRIGHT
     for inner, outer in ((70, 95), (95, 120), (120, 140), (140, 180), (180, 240), (240, 440)):
         here = clear & (radius >= inner) & (radius < outer)
         assert (image * radius**3)[here].mean() == pytest.approx(law, rel=0.08), (inner, outer)
     assert image.min() > -1e-3 * NOISE
     # The optics' transform on this side of the border, straight bars on that.
     along, across = dy * np.cos(turns[2]) - dx * np.sin(turns[2]), np.abs(dx * np.cos(turns[2]) + dy * np.sin(turns[2]))
-    line = spikes.spikes(psf.edges, np.full(8, 1 / 8), 200.0)[2]
+    line = spikes.spike_light(psf.edges, np.full(8, 1 / 8), 200.0)[2]
     steps = spikes.LONG * np.arange(len(line)), spikes.STEP * np.arange(line.shape[1])
     for inner, outer in ((90, 108), (108, 126), (130, 148), (148, 166)):
         here = (across < 8) & (along >= inner) & (along < outer)
@@ -132,12 +134,12 @@ def test_no_light_of_a_star_is_lost_beyond_its_plane(psf):
     far_light.add(frame, star)
     equal = np.full(8, 1 / 8)
     light = frame.sum() / FIXED_POINT / BRIGHT
-    beyond = spikes.ring(psf.edges, equal) * 4 * np.sqrt(2) / (side / 2)
+    beyond = spikes.ring_light(psf.edges, equal) * 4 * np.sqrt(2) / (side / 2)
     wavelength = psf.edges.wavelength.mean() * 1e-7
     for turn, _, length in psf.edges.bars:
         border = side / 2 / max(abs(np.cos(turn)), abs(np.sin(turn)))
         beyond += 2 * length * wavelength / (2 * np.pi**2 * psf.edges.area * 0.3 * spikes.ARCSEC * border)
-    left = far_light.left(SIDE, psf.planes.samples, psf.planes.images.shape[1])
+    left = far_light.fading_window(SIDE, psf.planes.samples, psf.planes.images.shape[1])
     kept = (psf.planes.images.mean(axis=0, dtype=float) * left[:, None] * left).sum()
     assert 0.995 < kept < 0.9985
     assert light + beyond == pytest.approx(1 - kept, rel=0.05)

@@ -197,10 +197,10 @@ def test_what_comes_into_a_stamp_is_the_light_of_all_images(index, ratio, angle,
     form = galaxy_shapes.forms(source.shapes, source.jacobian)
     weights = transfer.basis_weights(psf, None, source.column, source.row)[0]
     some = replace(
-        outskirts.of_galaxy(source.shapes, form, electrons, psf, weights, 1.0), blurred=np.zeros((9, 9))
+        outskirts.from_galaxy(source.shapes, form, electrons, psf, weights, 1.0), blurred=np.zeros((9, 9))
     )  # fmt: skip
     stamp = np.zeros((side, side))
-    outskirts.take_in(some, stamp, side / 2 + 0.3, side / 2 - 0.2)
+    outskirts.remove_aliased(some, stamp, side / 2 + 0.3, side / 2 - 0.2)
     rings = 8 if disc else 200
     image = side * np.mgrid[-rings : rings + 1, -rings : rings + 1].reshape(2, -1)
     image = image[:, image.any(axis=0)]
@@ -253,7 +253,7 @@ def test_all_light_is_somewhere():
     detector = small("lsstcam", "R22_S11", 3000)
     system, drawn = wcs(detector, *boresight_for(detector, 10.0, 20.0, 33.0)), np.zeros(1)
     source = one_source(detector, system, 1e9, **shape)
-    with mock.patch.object(outskirts, "of_galaxy", wraps=outskirts.of_galaxy) as made:
+    with mock.patch.object(outskirts, "from_galaxy", wraps=outskirts.from_galaxy) as made:
         image = stamps.draw(source, stamp_sizes.SIZES[-1:], psf_of("lsstcam"), 3000, 3000, tally=stamps.Tally(drawn))
     made.assert_called_once()
     # Of the frame every third pixel of every third row.

@@ -10,7 +10,7 @@ import pytest
 from benchmarks import _errors as errors
 from benchmarks import _positions as positions
 from benchmarks import _scenes as scenes
-from benchmarks._scenes import NISP, VIS, psf_of
+from benchmarks._scenes import NISP, VIS, scene_psf
 from lake_schema.errors import BadInput
 from truesky.render.drawing import stamp_sizes, stamps, transfer
 from truesky.render.drawing.settings import Settings, settings_for
@@ -19,7 +19,7 @@ from truesky.request import accuracy
 from truesky.request.accuracy import DRAFT, PRESETS, QUICKLOOK, REFERENCE, SURVEY
 
 # As good as it gets: nothing but the stamp is left out, and that is large.
-FULL = Settings(edge=1e-7, aliased=1e-9, floor=0.0, least=25.6, positions=9)
+FULL = Settings(edge=1e-7, aliased=1e-9, floor=0.0, min_size_arcsec=25.6, positions=9)
 SIDE = 256
 
 
@@ -33,7 +33,7 @@ def test_more_is_asked_for_more_is_taken():
     for field in ("edge", "aliased", "floor"):
         of = [getattr(tier, field) for tier in tiers]
         assert of == sorted(of, reverse=True)
-    for field in ("least", "positions", "colours"):
+    for field in ("min_size_arcsec", "positions", "colours"):
         of = [getattr(tier, field) for tier in tiers]
         assert of == sorted(of)
     assert [tier.positions for tier in tiers][-1] == max(euclid.DEGREES)
@@ -42,11 +42,11 @@ def test_more_is_asked_for_more_is_taken():
 @pytest.fixture(scope="module")
 def sample():
     """Galaxies and stars of 14.5 to 26 mag, of a seed of its own, each with its image at its best."""
-    some, full = scenes.stratified(VIS, 58, 1), psf_of(VIS)
+    some, full = scenes.stratified_sample(VIS, 58, 1), scene_psf(VIS)
     out = []
     for i in range(len(some)):
-        one, own = scenes.moved(some, i, SIDE), scenes.own(full, some, i)
-        out.append((one, own, scenes.draw(one, own, VIS, FULL, SIDE)))
+        one, own = scenes.centred_source(some, i, SIDE), scenes.psf_of_source(full, some, i)
+        out.append((one, own, scenes.draw_sources(one, own, VIS, FULL, SIDE)))
     return out
 
 
@@ -55,13 +55,13 @@ def test_what_is_left_out_is_within_what_is_promised(preset, sample):
     """Of bright stars, whose spikes rise above the mean PSF at a stamp's edge, as of all others."""
     wanted, settings = PRESETS[preset], settings_for(PRESETS[preset])
     for one, own, image in sample:
-        found = errors.errors(scenes.draw(one, own, VIS, settings, SIDE), image, VIS, one)
+        found = errors.errors(scenes.draw_sources(one, own, VIS, settings, SIDE), image, VIS, one)
         magnitude, star = float(scenes.magnitudes(one, VIS)[0]), one.shape[0] < 0
         assert found[0] / 1.0857 <= wanted.flux, magnitude
         assert found[1] / 1e3 / VIS.scale <= wanted.position, magnitude
         assert found[3] / 2 <= wanted.shape, magnitude
         assert found[4] <= wanted.background, (magnitude, star)
-        assert not star or positions.LENSED * found[2] <= wanted.shape, magnitude
+        assert not star or positions.R2_RATIO * found[2] <= wanted.shape, magnitude
 
 
 def test_a_quicklook_is_half_of_the_work_of_a_draft():
@@ -69,7 +69,7 @@ def test_a_quicklook_is_half_of_the_work_of_a_draft():
     some, found = scenes.sources(VIS, 1), []
     for wanted in (QUICKLOOK, DRAFT):
         settings = settings_for(wanted)
-        through = psf_of(VIS, settings.positions, settings.colours)
+        through = scene_psf(VIS, settings.positions, settings.colours)
         sizes = stamp_sizes.stamp_sizes(some.electrons, some.shape, some.shapes, through, VIS.noise, settings)
         pixels = (sizes.astype(float) ** 2).sum()
         found.append((pixels, pixels * transfer.plane_count(through)))
@@ -79,9 +79,9 @@ def test_a_quicklook_is_half_of_the_work_of_a_draft():
 
 
 def test_planes_of_fewer_colours_are_means_of_neighbours():
-    whole = psf_of(VIS, 9)
-    less = model.of_colours(whole, 2)
-    assert model.of_colours(whole, 8) is whole
+    whole = scene_psf(VIS, 9)
+    less = model.reduce_colours(whole, 2)
+    assert model.reduce_colours(whole, 8) is whole
     np.testing.assert_allclose(less.planes.images[0], whole.planes.images[:4].mean(axis=0), rtol=1e-5, atol=1e-12)
     photons = np.array([[0.3, 0.1, 0.1, 0.1, 0.2, 0.1, 0.05, 0.05]])
     at = np.array([2000.0])
@@ -93,14 +93,14 @@ def test_planes_of_fewer_colours_are_means_of_neighbours():
     both = [transfer.image_of(one.planes, transfer.basis_weights(one, flat, at, at)[0]) for one in (less, whole)]
     np.testing.assert_allclose(both[0], both[1], rtol=1e-4, atol=1e-9)
     with pytest.raises(BadInput, match="8 wavelengths of a PSF are not a multiple of 3"):
-        model.of_colours(whole, 3)
+        model.reduce_colours(whole, 3)
 
 
 def test_the_rim_is_the_brightest_pixel_farther_out():
     """Of a star on its largest stamp, too, but for its colour."""
-    full = replace(psf_of(VIS), edges=None)
-    one = scenes.moved(scenes.stratified(VIS, 3, 1), 8, SIDE)
-    star = scenes.draw(one, full, VIS, FULL, SIDE) / one.electrons[0]
+    full = replace(scene_psf(VIS), edges=None)
+    one = scenes.centred_source(scenes.stratified_sample(VIS, 3, 1), 8, SIDE)
+    star = scenes.draw_sources(one, full, VIS, FULL, SIDE) / one.electrons[0]
     away = np.maximum(*np.abs(np.indices(star.shape) - SIDE // 2))
     for r in (20, 48, 80):
         assert star[away >= r].max() == pytest.approx(full.rim[r], rel=0.5)
@@ -108,7 +108,7 @@ def test_the_rim_is_the_brightest_pixel_farther_out():
     assert (full.rim >= full.surface - 1e-12)[20:].all()
     # Spikes: several times the mean.
     assert full.rim[48] > 4.0 * full.surface[48]
-    ground = seeing.ground_psf(0.7, 3.0, 0.2)
+    ground = seeing.moffat_psf(0.7, 3.0, 0.2)
     np.testing.assert_allclose(ground.rim[8:200], ground.surface[8:200], rtol=0.1)
 
 
@@ -116,21 +116,21 @@ def test_the_rim_is_the_brightest_pixel_farther_out():
 def test_between_its_positions_the_psf_is_as_wrong_as_the_table_says(scene, file):
     """Against the optics computed at the place of a star."""
     table = {row["positions"]: row for row in rows(file) if row["nearest"] == 0}
-    at = positions.optics(scene)
-    star, planes = positions.star(at, np.random.default_rng(8)), psf_of(scene, 9).planes
-    flux, moved, r2, ellipticity = positions.errors_of(at((0.0, 0.0)) + positions.drift(planes, star), star, scene)
+    at = positions.make_optics(scene)
+    star, planes = positions.draw_star(at, np.random.default_rng(8)), scene_psf(scene, 9).planes
+    flux, moved, r2, ellipticity = positions.star_errors(at((0.0, 0.0)) + positions.drift(planes, star), star, scene)
     assert flux <= table[9]["flux_error"]
     assert moved <= table[9]["position_error"]
     assert r2 <= table[9]["r2_error"]
     assert ellipticity <= table[9]["ellipticity_error"]
-    assert positions.errors_of(at((0.0, 0.0)), star, scene)[2] > 3 * r2
+    assert positions.star_errors(at((0.0, 0.0)), star, scene)[2] > 3 * r2
 
 
 def test_a_row_counts_the_error_of_its_psf():
     """No row promises more than the stars say of its positions and colours."""
     table = accuracy.rows()
     kinds = [(int(row["positions"]), int(row["colours"])) for row in table]
-    found = positions.largest(7, 4, list(dict.fromkeys(kinds)))
+    found = positions.largest_errors(7, 4, list(dict.fromkeys(kinds)))
     for row, kind in zip(table, kinds, strict=True):
         for name, error in found[kind].items():
             assert error <= 1.3 * max(row[name], row[f"{name}_held"])

@@ -52,7 +52,7 @@ def test_a_stamp_is_what_galsim_draws(camera, name, kind):
     detector, system, psf = scene(camera, name)
     source = one_source(detector, system, 2e4, 80.3, 77.6, **KINDS[kind])
     image = drawn(source, psf)
-    theirs = reference.reference(source, 0, psf, 160)
+    theirs = reference.draw_reference(source, 0, psf, 160)
     # The reference's lower left pixel is at round(position) - 80.
     theirs = np.roll(theirs, (78 - 80, 80 - 80), (0, 1))[8:-8, 8:-8]
     ours = image[8:-8, 8:-8]
@@ -314,15 +314,15 @@ def test_what_is_drawn_through_was_counted_before(monkeypatch):
 
         return call
 
-    add = stamps._draw_some
+    add = stamps._draw_batch
     monkeypatch.setattr(
-        stamps, "_draw_some", watched(add, "stamps", lambda _, one, chosen, p, *a: chosen.size * p.grid.size**2)
+        stamps, "_draw_batch", watched(add, "stamps", lambda _, one, chosen, p, *a: chosen.size * p.grid.size**2)
     )
     for name in ("transfer", "collapsed"):
         made = watched(getattr(transfer, name), "planes", lambda t, *a: len(t.planes) * t.grid.size**2)
         monkeypatch.setattr(transfer, name, made)
     stamps.draw(sources, sizes, psf, 160, 160)
-    assert cost.work(sources, sizes, psf) == (counted["stamps"], counted["planes"])
+    assert cost.count_work(sources, sizes, psf) == (counted["stamps"], counted["planes"])
 
 
 def test_seconds_follow_the_stamps():

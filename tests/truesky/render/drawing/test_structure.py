@@ -39,13 +39,13 @@ def test_a_sheared_spiral_is_what_galsim_draws(camera, name, electrons):
     system = wcs(detector, *boresight_for(detector, 10.0, 20.0, 33.0))
     shape = {**SPIRAL, "position_angle": 25.0, "kappa": 0.1, "gamma1": 0.15, "gamma2": -0.1}
     source = one_source(detector, system, electrons, 128.3, 126.8, **shape)
-    source = disc_structure.added(source, source.shapes, DISCS)
+    source = disc_structure.add_structure(source, source.shapes, DISCS)
     settings = settings_for(REFERENCE)
     sizes = stamp_sizes.stamp_sizes(source.electrons, source.shape, source.shapes, psf, NOISE, settings)
-    sizes = stamp_sizes.holding(sizes, disc_structure.sides(source.shapes, DISCS) / psf.pixel_scale)
+    sizes = stamp_sizes.smallest_allowed_sizes(sizes, disc_structure.sides(source.shapes, DISCS) / psf.pixel_scale)
     neglected = stamp_sizes.neglected_flux(source.electrons, NOISE, settings)
     ours = stamps.draw(source, sizes, psf, 256, 256, neglected=neglected)
-    theirs = np.roll(reference.reference(source, 0, psf, 256), (127 - 128, 0), (0, 1))
+    theirs = np.roll(reference.draw_reference(source, 0, psf, 256), (127 - 128, 0), (0, 1))
     plain = replace(source, picture=None, pictures=())
     smooth = stamps.draw(plain, sizes, psf, 256, 256, neglected=neglected)
     assert np.abs(ours - theirs)[8:-8, 8:-8].max() < 4e-4 * theirs.max()
@@ -59,7 +59,7 @@ def test_structure_is_as_thick_as_its_disc(inclination):
     detector = small("vis", "2-3")
     system = wcs(detector, *boresight_for(detector, 10.0, 20.0, 33.0))
     source = one_source(detector, system, inclination=inclination, position_angle=90.0, disk_half_light_radius=1.2)
-    (picture,) = disc_structure.added(source, source.shapes, DISCS).pictures
+    (picture,) = disc_structure.add_structure(source, source.shapes, DISCS).pictures
     k = np.random.default_rng(1).uniform(-8, 8, (2, 50))
     thick, thin = arcs.transform(picture, np.eye(2), *k), arcs.transform(replace(picture, thick=None), np.eye(2), *k)
     # A position angle of 90 deg: the major axis lies east-west.
@@ -128,13 +128,13 @@ def test_a_bulge_that_is_brighter_in_a_band_is_another_bulge_in_the_same_picture
     if kind == "stamps":
         fits.writeto(tmp_path / "two.fits", np.array([blob(q) for q in (1.0, 0.9, 0.5)], np.float32))
         sha256 = file_sha256(tmp_path / "two.fits")
-        asked = {"discs": None, "stamps": galaxy_stamps.of_file(Stamps(tmp_path / "two.fits", True), 1, sha256)}
+        asked = {"discs": None, "stamps": galaxy_stamps.from_file(Stamps(tmp_path / "two.fits", True), 1, sha256)}
     plain = with_structure("VIS", **asked)[0].sources
 
     def in_band(rows, *_):
         return rows.set_column(rows.schema.get_field_index("bulge_fraction"), "bulge_fraction", pa.array([0.6]))
 
-    monkeypatch.setattr(bulges, "in_band", in_band)
+    monkeypatch.setattr(bulges, "with_fractions_in_band", in_band)
     red = with_structure("VIS", **asked)[0].sources
     assert red.shapes.bulge_fraction.tolist() == [0.6]
     (one,), (other,) = plain.pictures, red.pictures
@@ -175,8 +175,8 @@ def test_one_row_of_truth_and_nothing_else_changes():
     found, smooth = (with_structure("VIS", discs)[0] for discs in (DISCS, None))
     rows, plain = (truth_table.truth(one).drop(["stamp", "drawn"]) for one in (found, smooth))
     assert rows.equals(plain)
-    assert found.drawn[0] == pytest.approx(smooth.drawn[0], rel=1e-3)
-    psf, small_discs = psf_of("vis"), replace(DISCS, wanted=Arms(least_radius=3.0))
+    assert found.drawn_electrons[0] == pytest.approx(smooth.drawn_electrons[0], rel=1e-3)
+    psf, small_discs = psf_of("vis"), replace(DISCS, arms=Arms(least_radius=3.0))
     np.testing.assert_array_equal(with_structure("VIS", small_discs)[0].science, smooth.science)
     both = [cost.seconds(one.sources, one.sizes, psf, SIDE, SIDE) for one in (found, smooth)]
     assert both[0] > both[1]

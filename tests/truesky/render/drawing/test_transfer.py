@@ -11,7 +11,7 @@ from truesky.render.camera import astrometry
 from truesky.render.drawing import stamps, transfer
 from truesky.render.psf import model
 from truesky.render.psf.model import SAMPLES, Planes
-from truesky.render.psf.seeing import ground_psf
+from truesky.render.psf.seeing import moffat_psf
 from truesky.render.sources import galaxy_shapes, source_list
 
 
@@ -23,7 +23,7 @@ def planes_psf(widths=(0.09, 0.13), place=0.0):
     images = np.stack([image / image.sum() for image in images]).astype(np.float32)
     drift = (place * (images[1] - images[0]))[None]
     planes = Planes(np.array([6000.0, 8000.0])[: len(widths)], images, drift, (79.5, 79.5), ((1, 0, 0),))
-    return model.tabulated(model.galsim_profile(images.mean(axis=0), 0.1 / SAMPLES), 0.1, planes)
+    return model.from_profile(model.galsim_profile(images.mean(axis=0), 0.1 / SAMPLES), 0.1, planes)
 
 
 def test_places_on_a_detector_are_in_units_of_its_own_sides():
@@ -105,7 +105,7 @@ def test_what_is_left_out_is_below_its_floor(index):
 
 def test_passing_is_an_upper_bound_of_the_seeing_disc_s_transform():
     psf = psf_of("lsstcam")
-    passing = transfer.passing(psf)
+    passing = transfer.max_transfer(psf)
     k = (np.arange(len(passing)) + 0.5) * transfer.STEP
     profile = galsim.Convolve(psf.profile.dilate(5.0), galsim.Pixel(1.0))
     for at, most in zip(k, passing, strict=True):
@@ -116,7 +116,7 @@ def test_passing_is_an_upper_bound_of_the_seeing_disc_s_transform():
 @pytest.mark.parametrize("size", [32, 40, 64])
 def test_wings_that_come_in_are_not_in_the_middle(size, beta):
     """Behind an atmosphere, against a stamp that none reach: nine tenths of them are where the stamp ends."""
-    detector, seeing = small("lsstcam", "R22_S11"), ground_psf(0.7, beta, 0.2)
+    detector, seeing = small("lsstcam", "R22_S11"), moffat_psf(0.7, beta, 0.2)
     source = one_source(detector, astrometry.wcs(detector, 10.0, 20.0, 0.0), 1e9, 80.0, 80.0)
     image, whole = (stamps.draw(source, np.array([n]), seeing, 160, 160) for n in (size, 1024))
     assert image.sum() == pytest.approx(1e9, rel=1e-9)

@@ -22,7 +22,7 @@ from truesky.request.accuracy import SURVEY
 SIDE, NOISE = 256, 12.0
 BAND = passbands.load("euclid_vis")
 BULGE = {"bulge_fraction": 1.0, "bulge_sersic_index": 4.0, "bulge_half_light_radius": 4.0}
-SETTINGS = settings.Settings(edge=0.01, aliased=1e-4, floor=3e-4, least=6.4, positions=9)
+SETTINGS = settings.Settings(edge=0.01, aliased=1e-4, floor=3e-4, min_size_arcsec=6.4, positions=9)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def found(psf, galaxy=None, star=None):
         np.zeros((2, 0)) if at is None else sky_of_pixel(system, *np.array(at)[:, None]) for at in (galaxy, star)
     )
     rows = galaxies(*body, **BULGE), stars(*points)
-    some, sizes = visible_sources.sources_of(
+    some, sizes = visible_sources.select_sources(
         Rows(rows[0], None, rows[1], None), (np.full(len(rows[0]), 1e6), np.full(len(rows[1]), 1e5)),
         aimed(detector, system, BAND), psf, NOISE, SETTINGS,
     )  # fmt: skip
@@ -119,6 +119,6 @@ def test_the_border_of_a_crowded_field_is_as_bright_as_its_middle(vis):
         assert abs(border.mean()) < 0.1 * SURVEY.background * NOISE
     assert np.abs(missing).max() < SURVEY.background * NOISE
     # What stamps alone bring misses more than that.
-    touching = selection.touching(some.column, some.row, sizes, SIDE, SIDE)
+    touching = selection.overlaps_frame(some.column, some.row, sizes, SIDE, SIDE)
     less = ours - stamps.draw(some.take(touching), sizes[touching], vis, SIDE, SIDE)
     assert less[:8].mean() > 0.1 * SURVEY.background * NOISE

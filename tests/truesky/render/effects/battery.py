@@ -13,7 +13,7 @@ from truesky.render.effects.light.ghosts import Pupil
 from truesky.render.effects.light.satellite_trails import Blur, Satellites
 from truesky.render.effects.readout.trap_pumping import Pumping
 from truesky.render.effects.readout.traps import Sweeps, Traps
-from truesky.render.effects.scene import Elsewhere, Lights
+from truesky.render.effects.scene import Lights, NeighbourCharge
 
 # Every effect of a channel, by its name.
 EFFECTS = {
@@ -84,7 +84,7 @@ def tinted(electrons, even=(0.0, 0.0)):
 
 def beside(electrons):
     """A star in the first pixel of another detector."""
-    return lambda shape: (Elsewhere(np.array([0]), np.array([electrons])), 1e-4)
+    return lambda shape: (NeighbourCharge(np.array([0]), np.array([electrons])), 1e-4)
 
 
 def halves(shape):

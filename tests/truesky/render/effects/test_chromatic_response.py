@@ -19,25 +19,25 @@ from truesky.render.drawing import stamp_sizes, stamps
 from truesky.render.drawing.settings import settings_for
 from truesky.render.effects.light import calibration_lamp, chromatic_response
 from truesky.render.effects.scene import NOTICEABLE
-from truesky.render.exposure import scene_of, tints, visible_sources
+from truesky.render.exposure import chromatic_response_map, scene_factory, visible_sources
 from truesky.render.exposure.records import Variant
 from truesky.render.exposure.visible_sources import Light
 from truesky.render.psf import euclid
-from truesky.render.psf.sub_bands import PARTS, sub_bands
+from truesky.render.psf.sub_bands import N_SUB_BANDS, sub_bands
 from truesky.render.sky import diffuse_light, thermal
 from truesky.request.accuracy import SURVEY
 
 MISSION = resolve()
 Y = passbands.load("euclid_y")
 SLOPE, CURVATURE = (MISSION.value(f"nisp.response.{key}", "") for key in ("slope", "curvature"))
-TABLE = chromatic_response.table("nisp", Y, MISSION)
-EVEN = chromatic_response.means("nisp", Y, MISSION)
+TABLE = chromatic_response.sub_band_components("nisp", Y, MISSION)
+EVEN = chromatic_response.band_means("nisp", Y, MISSION)
 # rms of a signal without a source.
 NOISE = 12.0
 
 
 def drawn_maps(shape=(400, 300), slope=SLOPE, curvature=CURVATURE, seed=3):
-    return chromatic_response.maps(shape, slope, curvature, np.random.default_rng(seed))
+    return chromatic_response.draw_maps(shape, slope, curvature, np.random.default_rng(seed))
 
 
 def test_maps_have_the_mission_s_rms():
@@ -64,13 +64,15 @@ def test_there_are_forty_wavelengths_over_the_range():
     assert (np.diff(rows[:, 0]) > 0).all()
 
 
-@given(st.lists(st.floats(0.01, 1.0), min_size=PARTS, max_size=PARTS))
+@given(st.lists(st.floats(0.01, 1.0), min_size=N_SUB_BANDS, max_size=N_SUB_BANDS))
 def test_colours_are_means_of_the_components(weights):
     """And flat f_nu is where they are told from."""
     shares = np.array([weights]) / np.sum(weights)
-    own = chromatic_response.colours(shares, TABLE)
+    own = chromatic_response.source_colours(shares, TABLE)
     assert np.abs(own).max() <= np.abs(TABLE).max()
-    np.testing.assert_allclose(chromatic_response.colours(np.full((1, PARTS), 1 / PARTS), TABLE), 0.0, atol=1e-15)
+    np.testing.assert_allclose(
+        chromatic_response.source_colours(np.full((1, N_SUB_BANDS), 1 / N_SUB_BANDS), TABLE), 0.0, atol=1e-15
+    )
     parts = sub_bands(Y)
     photons = np.concatenate(
         [
@@ -78,13 +80,15 @@ def test_colours_are_means_of_the_components(weights):
             for w, p in zip(shares[0], parts, strict=True)
         ]
     )
-    lines = chromatic_response.of_lines("nisp", Y, np.concatenate([p.wavelength for p in parts]), photons, MISSION)
+    lines = chromatic_response.colour_of_lines(
+        "nisp", Y, np.concatenate([p.wavelength for p in parts]), photons, MISSION
+    )
     np.testing.assert_allclose(own[0], lines, atol=1e-12)
 
 
 def test_a_lamp_at_the_band_s_edge_has_a_colour_of_its_own():
     """1.19 um in Y: 0.1 um from the middle, of which the slope changes by 1 in 0.95."""
-    own = chromatic_response.of_lines("nisp", Y, np.array([11900.0]), np.ones(1), MISSION)
+    own = chromatic_response.colour_of_lines("nisp", Y, np.array([11900.0]), np.ones(1), MISSION)
     middle = np.average(Y.wavelength, weights=Y.response / Y.wavelength)
     assert own[0] == pytest.approx((1.19 - 1e-4 * middle) / 0.95, abs=5e-3)
     # Noticed in a flat of 30 000 e-.
@@ -109,8 +113,8 @@ def field():
 def slowly(some, response, draw):
     """Every part of the band drawn by itself, times what pixels see of it."""
     each = 0.0
-    for part in range(PARTS):
-        alone = np.zeros((len(some), PARTS))
+    for part in range(N_SUB_BANDS):
+        alone = np.zeros((len(some), N_SUB_BANDS))
         alone[:, part] = 1.0
         f = TABLE[part] + EVEN
         factor = 1.0 + response[0] * f[0] + response[1] * f[1]
@@ -122,14 +126,14 @@ def test_three_drawings_are_one_for_each_wavelength(field):
     some, draw = field
     response = drawn_maps((200, 200))
     light = draw(some.electrons)
-    lit = chromatic_response.tints(some.electrons, some.photons, TABLE, draw)
+    lit = chromatic_response.weighted_light(some.electrons, some.photons, TABLE, draw)
     found = chromatic_response.apply(light, lit, EVEN, SLOPE, CURVATURE, np.random.default_rng(3))
     each = slowly(some, response, draw)
     # Told from what all light of the band meets.
     change = np.abs(each - light * (1.0 + response[0] * EVEN[0] + response[1] * EVEN[1]))
     np.testing.assert_allclose(found, each, atol=1e-3 * change.max())
     # The colours of whole sources are not all of it: blue light is in the middle of the PSF.
-    own = chromatic_response.colours(some.photons, TABLE)
+    own = chromatic_response.source_colours(some.photons, TABLE)
     whole = sum(response[k] * (draw(some.electrons * (own[:, k] + 1.0)) + (EVEN[k] - 1.0) * light) for k in (0, 1))
     assert np.abs(light + whole - each).max() > 0.02 * change.max()
     assert np.abs(light + whole - each).max() < change.max()
@@ -138,10 +142,10 @@ def test_three_drawings_are_one_for_each_wavelength(field):
 def test_ordinary_sources_do_not_need_it():
     """Fainter than 18.2 mag, of the colours of galaxies and stars: less than a tenth of the noise in a pixel."""
     shares = scenes.colours(400, np.random.default_rng(1))
-    own = chromatic_response.colours(shares / shares.sum(axis=1, keepdims=True), TABLE)
+    own = chromatic_response.source_colours(shares / shares.sum(axis=1, keepdims=True), TABLE)
     for magnitude, needed in ((18.2, False), (14.0, True)):
         peak = np.full(400, 0.3 * 87.24 * 10 ** (0.4 * (25.0 - magnitude)))
-        change = chromatic_response.changes(peak, own, TABLE, (SLOPE, CURVATURE)).max()
+        change = chromatic_response.colour_changes(peak, own, TABLE, (SLOPE, CURVATURE)).max()
         noise = np.hypot(NOISE, np.sqrt(peak[0]))
         print(magnitude, f"{change:.2f} e- in a pixel of {peak[0]:.0f}, noise {noise:.1f}")
         assert (change > NOTICEABLE * noise) == needed
@@ -155,11 +159,11 @@ def test_an_exposure_draws_again_what_is_noticed():
     side = 256
     small_one = fields.small("nisp", "DET22", side)
     row = infrared.exposed(small_one, band="euclid_y")
-    aim = Aim.of(fields.exposure(**row), small_one)
+    aim = Aim.from_exposure(fields.exposure(**row), small_one)
     psf = euclid.nisp_psf(small_one, Y, MISSION, 4)
-    some = scenes.stratified(scenes.Scene("nisp", side, side, 0.3, 87.24, 25.0, NOISE, 0, 0), 5, 12)
+    some = scenes.stratified_sample(scenes.Scene("nisp", side, side, 0.3, 87.24, 25.0, NOISE, 0, 0), 5, 12)
     settings, mission = settings_for(SURVEY), resolve(overrides={"nisp.response.slope": (0.05, "")})
-    scene = replace(scene_of.of_aim(aim, Variant(mission, SURVEY, {})))
+    scene = replace(scene_factory.from_aim(aim, Variant(mission, SURVEY, {})))
     sizes = stamp_sizes.stamp_sizes(some.electrons, some.shape, some.shapes, psf, scene.pixel_noise, settings)
     neglected = stamp_sizes.neglected_flux(some.electrons, scene.pixel_noise, settings)
     light = Light(some, sizes, neglected, psf, scene)
@@ -170,13 +174,13 @@ def test_an_exposure_draws_again_what_is_noticed():
     with pytest.MonkeyPatch.context() as patch:
         counted = []
         patch.setattr(stamps, "draw", lambda *args, kept=stamps.draw: counted.append(len(args[0])) or kept(*args))
-        found = tints.with_tints(scene, aim, light)
+        found = chromatic_response_map.with_chromatic_light(scene, aim, light)
     assert len(counted) == 3
     assert 5 < counted[0] < 0.8 * len(some)
     response = drawn_maps((side, side), slope=0.05)
     frame = draw(some.electrons)
     change = slowly(some, response, draw) - frame * (1.0 + response[0] * EVEN[0] + response[1] * EVEN[1])
-    fast = response[0] * found.tints[0] + response[1] * found.tints[1]
+    fast = response[0] * found.chromatic_light[0] + response[1] * found.chromatic_light[1]
     noise = np.sqrt(scene.pixel_noise**2 + frame)
     wrong = np.abs((fast - change) / noise).max()
     print(f"change {np.abs(change / noise).max():.2f} sigma, wrong by {wrong:.3f}")
@@ -184,8 +188,13 @@ def test_an_exposure_draws_again_what_is_noticed():
     assert wrong < NOTICEABLE
     assert np.abs(fast - change).max() < 0.03 * np.abs(change).max()
     # The most that is told is about the most that there is, of maps with 5 sigma.
-    assert found.tint_electrons < 5 * np.abs(change).max() < 25 * found.tint_electrons
-    assert tints.with_tints(replace(scene, forced={"chromatic_response": False}), aim, light).tints is None
+    assert found.chromatic_electrons < 5 * np.abs(change).max() < 25 * found.chromatic_electrons
+    assert (
+        chromatic_response_map.with_chromatic_light(
+            replace(scene, forced={"chromatic_response": False}), aim, light
+        ).chromatic_light
+        is None
+    )
 
 
 def test_a_flat_has_the_colour_of_its_lamp():
@@ -198,9 +207,9 @@ def test_a_flat_has_the_colour_of_its_lamp():
         for on in (False, True)
     ]
     before, after = (infrared.electrons(one) for one in both)
-    led = calibration_lamp.photons(Y, 2, "nisp", MISSION)
-    own = chromatic_response.of_lines("nisp", Y, Y.wavelength, led, MISSION)
-    maps = chromatic_response.maps(
+    led = calibration_lamp.detected_photons(Y, 2, "nisp", MISSION)
+    own = chromatic_response.colour_of_lines("nisp", Y, Y.wavelength, led, MISSION)
+    maps = chromatic_response.draw_maps(
         (96, 96), SLOPE, CURVATURE, rng.stream(infrared.SEED, "nisp", "DET22", "chromatic_response")
     )
     own = own + EVEN
@@ -235,17 +244,17 @@ def flat(band, lamp, mission=MISSION):
 def met(band, lamp):
     """[2] f1 and f2 that the light of a lamp meets."""
     curve = passbands.load(band)
-    light = calibration_lamp.photons(curve, lamp, "nisp", MISSION)
-    return chromatic_response.of_lines("nisp", curve, curve.wavelength, light, MISSION) + chromatic_response.means(
-        "nisp", curve, MISSION
-    )
+    light = calibration_lamp.detected_photons(curve, lamp, "nisp", MISSION)
+    return chromatic_response.colour_of_lines(
+        "nisp", curve, curve.wavelength, light, MISSION
+    ) + chromatic_response.band_means("nisp", curve, MISSION)
 
 
 def test_flats_of_two_bands_differ_by_the_response_to_their_light():
     """By half a part in a hundred from pixel to pixel: LED 1 in Y and LED 5 in H; counted with many electrons."""
     bright = resolve(overrides={"nisp.response.slope": (0.02, ""), **BRIGHT})
     ratio = flat("euclid_y", 1, bright) / flat("euclid_h", 5, bright) - 1.0
-    maps = chromatic_response.maps(
+    maps = chromatic_response.draw_maps(
         (96, 96), 0.02, CURVATURE, rng.stream(infrared.SEED, "nisp", "DET22", "chromatic_response")
     )
     y, h = ((own[:, None, None] * maps).sum(axis=0) for own in (met("euclid_y", 1), met("euclid_h", 5)))
@@ -281,15 +290,15 @@ def test_stars_have_their_colours_in_an_image():
     """A bright red star: what is drawn again of it is its colour times its light."""
     one = infrared.rendered([20.0], [48.0], [48.0], band="euclid_y")
     assert {d.name: d.applied for d in one.decisions}["chromatic_response"]
-    assert one.scene.tints is None
-    shares = np.linspace(0.5, 1.5, PARTS)[None] / PARTS
+    assert one.scene.chromatic_light is None
+    shares = np.linspace(0.5, 1.5, N_SUB_BANDS)[None] / N_SUB_BANDS
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(visible_sources, "_colours", lambda kept, *_: np.tile(shares, (len(kept), 1)))
+        patch.setattr(visible_sources, "_photon_fractions", lambda kept, *_: np.tile(shares, (len(kept), 1)))
         red = infrared.rendered([14.0], [48.0], [48.0], band="euclid_y")
     assert {d.name: d.applied for d in red.decisions}["chromatic_response"]
     middle = np.s_[46:51, 46:51]
-    seen, light = red.scene.tints[0][middle].sum(), red.noise_free[middle].sum()
-    assert seen / light == pytest.approx(chromatic_response.colours(shares, TABLE)[0, 0], rel=0.3)
+    seen, light = red.scene.chromatic_light[0][middle].sum(), red.noise_free[middle].sum()
+    assert seen / light == pytest.approx(chromatic_response.source_colours(shares, TABLE)[0, 0], rel=0.3)
 
 
 def test_pixels_that_see_nothing_are_dark():
@@ -314,5 +323,5 @@ def test_the_sky_has_the_colour_of_its_light():
         photons = diffuse_light.photons("nisp", rate, band, mission)
         assert photons.sum() == pytest.approx(rate)
         assert (photons >= 0).all()
-        own = chromatic_response.of_lines("nisp", band, band.wavelength, photons, mission)
+        own = chromatic_response.colour_of_lines("nisp", band, band.wavelength, photons, mission)
         assert (own[0] > 0) == red

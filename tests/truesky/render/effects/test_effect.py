@@ -86,7 +86,7 @@ def test_the_order_of_physics(effects):
 
 
 def test_every_effect_has_its_place():
-    named = {name for chain in ORDER for name in chain} | {vis.DRAWN.name}
+    named = {name for chain in ORDER for name in chain} | {vis.TRANSFER_EFFECT.name}
     assert named == set(schema.EFFECTS)
     for effects in vis.EFFECTS.values():
         assert effects[-len(vis.EFFECTS["bias"]) :] == vis.EFFECTS["bias"]
@@ -96,9 +96,9 @@ def test_a_request_may_name_every_effect():
     """Of every channel, those that act while sources are drawn among them; and no other."""
     channels = registry.CHANNELS.values()
     found = [effect for channel in channels for effects in channel.effects.values() for effect in effects]
-    found += [channel.drawn for channel in channels if channel.drawn is not None]
+    found += [channel.transfer_effect for channel in channels if channel.transfer_effect is not None]
     assert sorted(schema.EFFECTS) == sorted({effect.name for effect in found})
-    assert set(schema.ALWAYS) == {effect.name for effect in found if not effect.optional}
+    assert set(schema.ALWAYS_ON) == {effect.name for effect in found if not effect.optional}
 
 
 def test_pixel_noise_is_sky_dark_and_reading():
@@ -148,7 +148,7 @@ def test_a_contribution_is_computed_once_for_a_decision():
     (dark,) = (e for e in ground.SKY if e.name == "dark_current")
     for kept in (None, lambda scene: 3.0):
         asked = []
-        counted = replace(dark, contribution=lambda scene, asked=asked: asked.append(scene) or 2.0, repeated=kept)
+        counted = replace(dark, contribution=lambda scene, asked=asked: asked.append(scene) or 2.0, systematic=kept)
         (decision,) = decide([counted], SCENE)
         assert len(asked) == 1
         assert decision.margin == pytest.approx(32.0 * (2.0 if kept is None else 3.0) / (0.1 * SCENE.pixel_noise))
@@ -181,5 +181,5 @@ def test_margins_tell_the_ratio():
     counts = np.sqrt(SCENE.peak_electrons + SCENE.sky_electrons)
     assert counted.margin(SCENE) == pytest.approx(counts / (0.1 * SCENE.pixel_noise))
     longer = replace(SCENE, exposure_time_s=1e5, sky_rate=0.0)
-    assert dark.needed_if(longer)
-    assert not dark.needed_if(replace(SCENE, exposure_time_s=0.1))
+    assert dark.is_needed(longer)
+    assert not dark.is_needed(replace(SCENE, exposure_time_s=0.1))

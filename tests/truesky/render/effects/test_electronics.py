@@ -13,7 +13,7 @@ from truesky.render.effects.charge import charge_injection, dark_current, poisso
 from truesky.render.effects.effect import apply_all
 from truesky.render.effects.readout import bias_structure, crosstalk, nonlinearity, quadrants
 from truesky.render.effects.scene import Scene, dark_current_scaling
-from truesky.render.exposure.rendered import numbers_of
+from truesky.render.exposure.rendered_detector import random_identity
 
 SCENE = Scene(resolve(), "vis", 560.53, 0.25, 1e4)
 CURVE = (0.05, 2.28e5, 0.01, 2e3)
@@ -33,23 +33,23 @@ def test_quadrants_are_put_together_again(half_y, half_x, pre, over, rows, middl
     parts = quadrants.apply(frame, pre, over, rows, middle)
     assert parts.shape == (4, half_y + rows, pre + half_x + over)
     frame[half_y : half_y + middle] = 0.0
-    np.testing.assert_array_equal(quadrants.assembled(parts, pre, over, rows, middle), frame)
+    np.testing.assert_array_equal(quadrants.assemble(parts, pre, over, rows, middle), frame)
     assert (parts > 0).sum() == 4 * half_y * half_x
     shape = parts.shape[1:]
     for number in range(4):
-        across, up = quadrants.origin(number, shape, pre, over, rows, middle)
-        placed = quadrants.placed(parts[number], number)
+        across, up = quadrants.pixel_offset(number, shape, pre, over, rows, middle)
+        placed = quadrants.to_detector_axes(parts[number], number)
         row, column = (half_y + middle) * (number < 2), half_x * (number in (1, 2))
         assert placed[row + up, column + across] == frame[row, column]
     for number in range(4):
-        turned = quadrants.placed(parts[number], number)
-        np.testing.assert_array_equal(quadrants.placed(turned, number), parts[number])
+        turned = quadrants.to_detector_axes(parts[number], number)
+        np.testing.assert_array_equal(quadrants.to_detector_axes(turned, number), parts[number])
 
 
 def test_each_corner_is_read_first():
     frame = np.zeros((4132, 4096))
     frame[-1, 0], frame[-1, -1], frame[0, -1], frame[0, 0] = 1, 2, 3, 4
-    parts = quadrants.apply(frame, *quadrants.sizes(SCENE))
+    parts = quadrants.apply(frame, *quadrants.overscan_sizes(SCENE))
     assert parts.shape == (4, 2086, 2128)
     assert "".join(quadrants.NAMES) == "EFGH"
     assert [parts[i, 0, 51] for i in range(4)] == [1, 2, 3, 4]
@@ -70,7 +70,7 @@ def test_nonlinearity_and_its_inverse(electrons, high, low):
     curve = (high, 2.28e5, low, 2e3)
     measured = nonlinearity.apply(np.array([electrons]), *curve)
     assert 0 <= measured[0] <= electrons
-    again = nonlinearity.linearised(measured, *curve)
+    again = nonlinearity.linearise(measured, *curve)
     assert again[0] == pytest.approx(electrons, rel=1e-9, abs=1e-6)
 
 
@@ -82,7 +82,7 @@ def test_nonlinearity_is_one_and_five_per_cent():
     steps = nonlinearity.apply(np.linspace(0, 1e6, 10_001), *CURVE)
     assert (np.diff(steps) > 0).all()
     np.testing.assert_array_equal(nonlinearity.apply(np.array([-5.0]), *CURVE), [-5.0])
-    assert nonlinearity.linearised(np.array([1e9]), *CURVE)[0] == np.inf
+    assert nonlinearity.linearise(np.array([1e9]), *CURVE)[0] == np.inf
     assert nonlinearity.parameters(SCENE) == pytest.approx((0.05, 65535 * 3.48, 0.01, 2000.0))
     for wrong in ((-1.0, *CURVE[1:]), (*CURVE[:2], 1.0, 2e3), (0.05, 0.0, 0.01, 2e3), (*CURVE[:3], 0.0)):
         with pytest.raises(OutOfRange, match=r"non-linearity|saturation"):
@@ -150,7 +150,7 @@ def test_columns_take_the_same_charge_in_every_exposure():
         for mjd in (60905.0, 60906.0):
 
             def own(effect, when=mjd, name=detector):
-                return stream(*numbers_of(effect, exposure(**row, mjd=when), name, 1))
+                return stream(*random_identity(effect, exposure(**row, mjd=when), name, 1))
 
             both = (charge_injection.EFFECT, charge_injection.NOISE)
             found[detector, mjd] = apply_all(np.zeros((900, 200)), both, SCENE, own)[0]

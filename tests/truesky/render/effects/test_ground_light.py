@@ -14,7 +14,7 @@ from truesky.render.camera import astrometry, detectors
 from truesky.render.effects.light import fringes, satellite_trails
 from truesky.render.effects.light.satellite_trails import Blur, Satellites
 from truesky.render.effects.scene import Scene
-from truesky.render.exposure import rendered
+from truesky.render.exposure import rendered_detector
 from truesky.request.accuracy import SURVEY
 
 CROSSED = resolve(overrides={"survey.satellites.rate": (0.05, "1 / (deg s)")})
@@ -53,7 +53,9 @@ def test_fringes_are_as_strong_and_as_wide_as_the_parameters_say(period):
 
 def test_a_detector_has_its_own_fringes_in_every_exposure():
     numbers = [
-        rendered.numbers_of(fringes.EFFECT, fields.exposure(camera="lsstcam", exposure_id=i, mjd=60000.0 + i), name, 1)
+        rendered_detector.random_identity(
+            fringes.EFFECT, fields.exposure(camera="lsstcam", exposure_id=i, mjd=60000.0 + i), name, 1
+        )
         for i, name in ((1, "R22_S11"), (2, "R22_S11"), (1, "R22_S12"))
     ]
     same, again, other = (added(rng.stream(*n).integers(1 << 30)) for n in numbers)
@@ -64,8 +66,8 @@ def test_a_detector_has_its_own_fringes_in_every_exposure():
 def test_fringes_are_in_red_bands():
     amplitudes = {band: fringes.parameters(scene(band=band))[1] for band in ("lsst_u", "lsst_g", "lsst_r", "lsst_y")}
     assert amplitudes == {"lsst_u": 0.0, "lsst_g": 0.0, "lsst_r": 0.0, "lsst_y": 0.01}
-    assert fringes.EFFECT.needed_if(scene())
-    assert not fringes.EFFECT.needed_if(scene(band="lsst_r"))
+    assert fringes.EFFECT.is_needed(scene())
+    assert not fringes.EFFECT.is_needed(scene(band="lsst_r"))
 
 
 # ------------------------------------------------------------------------------------------------ satellites
@@ -121,7 +123,7 @@ def test_a_trail_is_as_bright_as_the_satellite():
     assert some.electrons == pytest.approx(wanted, rel=1e-6)
     flat = np.zeros((400, 400))
     table = some.electrons * satellite_trails.profile(blur)
-    satellite_trails._add(flat, np.array([-10.0, 500.0]), np.array([150.0, 250.0]), table)
+    satellite_trails._add_trail(flat, np.array([-10.0, 500.0]), np.array([150.0, 250.0]), table)
     slope = 100.0 / 510.0
     # Of each column what a line has that runs as obliquely.
     assert flat[:, 200].sum() == pytest.approx(wanted * np.sqrt(1.0 + slope**2), rel=2e-3)
@@ -130,15 +132,15 @@ def test_a_trail_is_as_bright_as_the_satellite():
 def test_nobody_has_satellites_who_has_not_asked_for_them():
     one = scene()
     assert satellite_trails.EFFECT.contribution(one) == 0.0
-    assert not satellite_trails.EFFECT.needed_if(one)
-    assert satellite_trails.EFFECT.needed_if(replace(one, mission=CROSSED))
+    assert not satellite_trails.EFFECT.is_needed(one)
+    assert satellite_trails.EFFECT.is_needed(replace(one, mission=CROSSED))
 
 
 def test_the_truth_has_satellites():
     d = small("lsstcam", "R22_S11", 256)
     band, body, points = "lsst_r", galaxies([], []), stars([], [])
     plain = resolve(overrides={"ext.lsstcam.psf.profile": (1.0, "")})
-    crossed = plain.overridden_with({"survey.satellites.rate": (2.0, "1 / (deg s)")})
+    crossed = plain.with_overrides({"survey.satellites.rate": (2.0, "1 / (deg s)")})
     exposed = {"channel": "EXT", "camera": "lsstcam", "band": band, "seeing": 0.8, "sky": 10.0, "zero_point": 28.36}
     tables = body, fluxes(body, band, []), points, fluxes(points, band, [])
     one = fields.rendered(exposed, d, tables, crossed, SURVEY, truth=("satellites", "sky"))

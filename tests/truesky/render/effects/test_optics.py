@@ -18,8 +18,8 @@ from truesky.render.effects.charge import pixel_response
 from truesky.render.effects.effect import apply_all
 from truesky.render.effects.light import calibration_lamp, ghosts, illumination, intra_pixel, pixel_area, straylight
 from truesky.render.effects.readout import readout_trail
-from truesky.render.effects.scene import NOTICEABLE, STACK, Lights, Scene
-from truesky.render.exposure import rendered
+from truesky.render.effects.scene import NOTICEABLE, STACK_SIZE, Lights, Scene
+from truesky.render.exposure import rendered_detector
 from truesky.render.psf import diffraction
 
 MISSION = resolve()
@@ -123,7 +123,7 @@ def test_what_no_ghost_shows_is_left_out():
     edge = NOTICEABLE * noise * np.sqrt(np.pi) * 56 / 1e-6
     for factor, shown in ((0.9, False), (1.1, True)):
         one = scene(lights=light(100, 100, factor * edge))
-        assert ghosts.EFFECT.needed_if(one) == shown
+        assert ghosts.EFFECT.is_needed(one) == shown
         assert len(ghosts.parameters(one)[0].electrons) == shown
         image = ghosts.apply(EMPTY, one.lights, 1e-6, (0.0, 100.0), ghosts.Pupil(56.0, 0.33, (), 0.0))
         if not shown:
@@ -145,7 +145,7 @@ def test_ghosts_of_plates_before_the_infrared_detectors(effect, radius, offset):
     for magnitude, shown in ((MISSION.value("nisp.ghost.star_limit", "mag"), True), (14.5, False)):
         star = light(150, 130, 10 ** (0.4 * (25.0 - magnitude)) * 87.24)
         for one in infrared(star):
-            assert effect.needed_if(one) == shown
+            assert effect.is_needed(one) == shown
             image = effect.apply(EMPTY, *effect.parameters(one))
             noise = one.pixel_noise * np.sqrt(np.pi) * radius
             if not shown:
@@ -165,7 +165,7 @@ def test_the_halo_of_a_star_before_an_infrared_detector():
     """1e-3 of a star of 8 mag in a halo of 60 arcsec: f / (2 pi s^2) of it in the pixel under it."""
     star = light(150, 200, 10 ** (0.4 * (25.0 - 8.0)) * 87.24)
     for one in infrared(star):
-        assert straylight.EFFECT.needed_if(one)
+        assert straylight.EFFECT.is_needed(one)
         image = straylight.EFFECT.apply(EMPTY, *straylight.EFFECT.parameters(one))
         assert image[200, 150] == pytest.approx(1e-3 * star.electrons[0] / (2 * np.pi * 200.0**2), rel=5e-3)
         assert image[200, 150 + 140] / image[200, 150] == pytest.approx((1 + 0.7**2) ** -1.5, rel=5e-3)
@@ -212,16 +212,16 @@ def test_a_pixel_sees_of_the_sky_what_the_jacobian_says(name):
     electrons, u, v, stretch = pixel_area.parameters(one)
     assert electrons == one.sky_electrons
     column, row = (np.array(at) for at in ((0, 4095, 2000, 0, 4095), (0, 0, 2000, 4131, 4131)))
-    found = np.diag(pixel_area.change(u[column], v[row], stretch))
+    found = np.diag(pixel_area.area_change(u[column], v[row], stretch))
     system = astrometry.wcs(one.detector, 150.0, 2.0, 33.0)
     area = np.abs(np.linalg.det(astrometry.jacobian(system, column, row))) / 0.1**2
     # The tangent plane is 1.2e-4 larger than the sky at the corners of the field.
     np.testing.assert_allclose(found, area - 1.0, atol=1e-5)
-    assert np.abs(pixel_area.change(np.zeros(1), np.zeros(1), stretch)).max() == 0
+    assert np.abs(pixel_area.area_change(np.zeros(1), np.zeros(1), stretch)).max() == 0
     # In a mean of many pixels, everywhere in the field; in one pixel, in its corner.
-    assert pixel_area.EFFECT.needed_if(one)
-    assert (pixel_area.EFFECT.margin(one) > np.sqrt(STACK)) == (name == "1-1")
-    assert not pixel_area.EFFECT.needed_if(replace(one, sky_rate=1e-4))
+    assert pixel_area.EFFECT.is_needed(one)
+    assert (pixel_area.EFFECT.margin(one) > np.sqrt(STACK_SIZE)) == (name == "1-1")
+    assert not pixel_area.EFFECT.is_needed(replace(one, sky_rate=1e-4))
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
@@ -233,11 +233,11 @@ def test_a_pixel_of_a_ground_camera_too(camera):
     column, row = (np.array(at) for at in ((0, d.nx - 1, 0, d.nx - 1), (0, 0, d.ny - 1, d.ny - 1)))
     system = astrometry.wcs(d, 150.0, 2.0, 33.0)
     area = np.abs(np.linalg.det(astrometry.jacobian(system, column, row))) / d.pixel_scale**2
-    found = np.diag(pixel_area.change(u[column], v[row], stretch))
+    found = np.diag(pixel_area.area_change(u[column], v[row], stretch))
     np.testing.assert_allclose(found, area - 1.0, atol=1e-4)
     # It is what the sky lacks there.
     assert found.max() < -2e-3
-    assert pixel_area.EFFECT.needed_if(one)
+    assert pixel_area.EFFECT.is_needed(one)
 
 
 def test_without_distortion_only_the_projection_is_left():
@@ -297,7 +297,7 @@ def test_lamps_differ_in_where_they_shine():
     with pytest.raises(OutOfRange, match="LED"):
         calibration_lamp.pattern(scene(), 7, 60, 40)
     with pytest.raises(OutOfRange, match="LED"):
-        calibration_lamp.seen(scene(), 0)
+        calibration_lamp.efficiency_of_scene(scene(), 0)
     with pytest.raises(OutOfRange, match="lamp"):
         calibration_lamp.apply(ones, -1.0, np.zeros(60), np.zeros(40))
 
@@ -309,13 +309,13 @@ def test_lamps_differ_in_what_is_seen_of_them():
         line = stats.norm(centre, 400 / (2 * np.sqrt(2 * np.log(2))))
         edges = np.append(band.wavelength - 0.5, band.wavelength[-1] + 0.5)
         wanted = np.diff(line.cdf(edges)) @ band.response / band.response.max()
-        assert calibration_lamp.seen(scene(), led) == pytest.approx(wanted, rel=1e-5)
+        assert calibration_lamp.efficiency_of_scene(scene(), led) == pytest.approx(wanted, rel=1e-5)
         level, *_ = calibration_lamp.EFFECT.parameters(scene(lamp=led))
         assert level == pytest.approx(MISSION.value("vis.flat.signal", "electron") * wanted, rel=1e-5)
     # Half of the bluest shines where the band has not begun.
-    assert calibration_lamp.seen(scene(), 1) < 0.75 * calibration_lamp.seen(scene(), 2)
+    assert calibration_lamp.efficiency_of_scene(scene(), 1) < 0.75 * calibration_lamp.efficiency_of_scene(scene(), 2)
     red = passbands.Passband("red", np.arange(8800.0, 9201.0), np.full(401, 0.8), "vacuum")
-    own = [calibration_lamp.seen(scene(band=red), led) for led in range(1, 7)]
+    own = [calibration_lamp.efficiency_of_scene(scene(band=red), led) for led in range(1, 7)]
     assert own[5] > 0.5
     assert max(own[:4]) < 1e-6
 
@@ -460,13 +460,13 @@ def test_light_of_a_trail_is_seen_by_the_pixels_that_it_falls_on():
     # Old pixels, some dead.
     worn = resolve(overrides={"vis.prnu": (0.2, ""), "vis.dead_pixels": (0.05, "")})
     ny, nx = 40, 30
-    detector = replace(detectors.detector("vis", "3-4", worn), nx=nx, ny=ny, middle=4)
+    detector = replace(detectors.detector("vis", "3-4", worn), nx=nx, ny=ny, injection_rows=4)
     one = Scene(worn, "vis", 10.0, 0.25, 1e5, detector)
     row = {"exposure_id": 1, "channel": "VIS", "camera": "vis", "image_type": "flat"}
     frame = np.random.default_rng(2).uniform(0.0, 1e5, (ny, nx))
 
     def stream(effect):
-        return rng.stream(*rendered.numbers_of(effect, exposure(**row), "3-4", 1))
+        return rng.stream(*rendered_detector.random_identity(effect, exposure(**row), "3-4", 1))
 
     both = (readout_trail.EFFECT, pixel_response.EFFECT)
     found, _ = apply_all(frame, both, replace(one, forced={"readout_trail": True, "pixel_response": True}), stream)

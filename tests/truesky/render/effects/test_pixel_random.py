@@ -14,7 +14,7 @@ from truesky.render.effects.readout import read_noise
 
 # Pixels: a correlation of 4.4e-3 is found at a significance of 7e-6, by night one of half as much.
 COUNTS = [pytest.param(1 << 20, id="short"), pytest.param(1 << 22, id="long", marks=pytest.mark.nightly)]
-KEY = pixel_random.key(np.random.default_rng(5))
+KEY = pixel_random.draw_key(np.random.default_rng(5))
 # One in a thousand good generators would be refused.
 LEAST = 1e-3
 
@@ -24,9 +24,9 @@ def rolled(key, pixels, again):
     """Words, uniform and normal deviates of pixels; again : how many words later."""
     words, uniform, normal = np.empty(len(pixels), np.uint64), np.empty(len(pixels)), np.empty(len(pixels))
     for i in range(len(pixels)):
-        bits = pixel_random.word(key, pixels[i])
+        bits = pixel_random.pixel_bits(key, pixels[i])
         for _ in range(again):
-            bits = pixel_random.next_word(bits)
+            bits = pixel_random.next_bits(bits)
         words[i], uniform[i], normal[i] = bits, pixel_random.uniform(bits), pixel_random.normal(bits)
     return words, uniform, normal
 
@@ -36,7 +36,7 @@ def far_out(key, count, least):
     """Those of many normal deviates that are this far from 0."""
     found, n = np.empty(count // 1000), 0
     for i in range(count):
-        deviate = pixel_random.normal(pixel_random.word(key, i))
+        deviate = pixel_random.normal(pixel_random.pixel_bits(key, i))
         if abs(deviate) > least:
             found[n] = deviate
             n += 1

@@ -11,7 +11,7 @@ from tests.truesky.render.fields import small
 from truesky.randomness import rng
 from truesky.render.channels import nisp_p
 from truesky.render.effects.effect import apply_all
-from truesky.render.effects.scene import NOTICEABLE, STACK, Scene
+from truesky.render.effects.scene import NOTICEABLE, STACK_SIZE, Scene
 
 MISSION, N = resolve(), 128
 # What has another value in every frame.
@@ -23,7 +23,7 @@ def scene(sky=1.0, peak=2e4, remembered=None, **values):
     database = {f"nisp.{key.replace('__', '.')}": (value, units[key]) for key, value in values.items()}
     return Scene(
         resolve(overrides=database), "nisp", 87.24, sky, peak, small("nisp", "DET22", N), ramp="photometric",
-        remembered=remembered,
+        persistence_charge=remembered,
     )  # fmt: skip
 
 
@@ -61,7 +61,7 @@ def test_what_is_left_out_is_not_noticed(name):
     effect, needed = EFFECTS[name], []
     for size in np.geomspace(1e-5, 1e4, 10):
         one = CASES[name](size)
-        needed.append(effect.needed_if(one))
+        needed.append(effect.is_needed(one))
         if needed[-1]:
             continue
         change = signal(one, name, True) - signal(one, name, False)
@@ -69,7 +69,7 @@ def test_what_is_left_out_is_not_noticed(name):
         assert np.abs(change).max() < one.pixel_noise
         # A mean of so many frames or pixels is not biased by a tenth of the noise that it has left.
         chance = 5.0 * change.std() / N if name in RANDOM else 0.0
-        assert abs(change.mean()) < NOTICEABLE * one.pixel_noise / np.sqrt(STACK) + chance
+        assert abs(change.mean()) < NOTICEABLE * one.pixel_noise / np.sqrt(STACK_SIZE) + chance
     assert sorted(needed) == needed
     assert len(set(needed)) == 2
 
@@ -86,12 +86,12 @@ def test_hot_pixels_and_hits_are_read_as_any_light(name):
         given = replace(one, forced={**forced, "dark_map": True, "ramp_cosmic_rays": True, name: applied})
         found.append(apply_all(frame, some, given, lambda e: rng.stream(1, e.name))[0][0])
     assert np.abs(found[0] - found[1]).max() > one.pixel_noise
-    assert EFFECTS[name].needed_if(one)
+    assert EFFECTS[name].is_needed(one)
 
 
 @pytest.mark.parametrize("name", ALWAYS)
 def test_what_is_always_there(name):
-    assert EFFECTS[name].needed_if(scene(sky=0.0, peak=0.0))
+    assert EFFECTS[name].is_needed(scene(sky=0.0, peak=0.0))
 
 
 def test_noise_is_that_of_the_signal():
@@ -102,5 +102,5 @@ def test_noise_is_that_of_the_signal():
 def test_one_of_the_two_non_linearities_acts():
     for choice, wanted in ((0.0, "ramp_nonlinearity"), (1.0, "signal_nonlinearity")):
         one = scene(nonlinearity_of_signal=choice)
-        both = [name for name in ("ramp_nonlinearity", "signal_nonlinearity") if EFFECTS[name].needed_if(one)]
+        both = [name for name in ("ramp_nonlinearity", "signal_nonlinearity") if EFFECTS[name].is_needed(one)]
         assert both == [wanted]

@@ -16,7 +16,7 @@ from truesky.render.camera import detectors
 from truesky.render.channels import vis
 from truesky.render.effects.charge import cosmic_rays
 from truesky.render.effects.effect import apply_all
-from truesky.render.effects.scene import NOTICEABLE, STACK, Elsewhere, Lights, Scene
+from truesky.render.effects.scene import NOTICEABLE, STACK_SIZE, Lights, NeighbourCharge, Scene
 
 MISSION = resolve()
 DETECTOR = detectors.detector("vis", "1-1", MISSION)
@@ -45,7 +45,7 @@ def ground(sky=10.0, peak=1e4, **values):
 def crossed():
     """The same, of a field with ten trails."""
     rate = {"survey.satellites.rate": (0.05, "1 / (deg s)")}
-    return replace(ground(), mission=MISSION.overridden_with(rate), seeing=0.9)
+    return replace(ground(), mission=MISSION.with_overrides(rate), seeing=0.9)
 
 
 def star(electrons):
@@ -83,7 +83,7 @@ CASES = {
     "nonlinearity": lambda x: scene(nonlinearity__low=min(1e-4 * x, 0.9), nonlinearity__high=1e-4 * x),
     "crosstalk": lambda x: scene(crosstalk=min(1e-4 * x, 0.1)),
     "detector_crosstalk": lambda x: replace(
-        scene(crosstalk_detectors=1e-4), elsewhere=Elsewhere(np.array([0]), np.array([1e3 * x]))
+        scene(crosstalk_detectors=1e-4), elsewhere=NeighbourCharge(np.array([0]), np.array([1e3 * x]))
     ),
     "bias_structure": lambda x: scene(bias_offset=0.1 * x, bias_settling=0.1 * x, bias_stripes=0.1 * x),
     "read_noise": lambda x: scene(sky=10.0, read_noise=x),
@@ -123,7 +123,7 @@ def test_no_effect_is_left_out_here():
     up_the_ramp = {*test_ramp_thresholds.CASES, *test_ramp_thresholds.ALWAYS}
     # Ghosts of another plate are ghosts.
     assert optional == set(CASES) | up_the_ramp | {"cosmic_rays", "readout_cosmic_rays", "filter_ghosts"}
-    assert vis.DRAWN.optional
+    assert vis.TRANSFER_EFFECT.optional
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -133,7 +133,7 @@ def test_what_is_left_out_is_not_noticed(name):
     needed = []
     for size in np.geomspace(1e-5, 1e4, 19):
         one = CASES[name](size)
-        needed.append(effect.needed_if(one))
+        needed.append(effect.is_needed(one))
         if needed[-1]:
             continue
         before = frame(name, one)
@@ -148,7 +148,7 @@ def test_what_is_left_out_is_not_noticed(name):
         assert np.sqrt(np.mean(change**2)) < NOTICEABLE * one.pixel_noise
         assert np.abs(change).max() < one.pixel_noise
         # A mean of so many frames or pixels is not biased by a tenth of the noise that it has left.
-        left = NOTICEABLE * one.pixel_noise / np.sqrt(STACK)
+        left = NOTICEABLE * one.pixel_noise / np.sqrt(STACK_SIZE)
         chance = 5.0 * change.std() / np.sqrt(change.size) if name in RANDOM else 0.0
         assert abs(change.mean()) < left + chance
         if name not in RANDOM:
@@ -161,9 +161,9 @@ def test_what_is_left_out_is_not_noticed(name):
 @pytest.mark.parametrize("name", ["cosmic_rays", "readout_cosmic_rays"])
 def test_cosmic_rays_are_always_needed_but_without_time(name):
     effect = EFFECTS[name]
-    assert effect.needed_if(scene())
+    assert effect.is_needed(scene())
     nothing = Scene(MISSION, "vis", 0.0, 0.25, 0.0, DETECTOR)
-    assert effect.needed_if(nothing) == (name == "readout_cosmic_rays")
+    assert effect.is_needed(nothing) == (name == "readout_cosmic_rays")
 
 
 def test_a_pixel_s_own_response_is_left_out_of_faint_stars():
@@ -172,14 +172,14 @@ def test_a_pixel_s_own_response_is_left_out_of_faint_stars():
     for mag in (29.5, 26.0, 22.0):
         with_it, without = (
             nominal.rendered(detector, [mag], [31.8], [32.3], forced={**nominal.off(*nominal.COSMIC_RAYS), **forced})
-            for forced in ({vis.DRAWN.name: True}, {vis.DRAWN.name: False})
+            for forced in ({vis.TRANSFER_EFFECT.name: True}, {vis.TRANSFER_EFFECT.name: False})
         )
-        needed.append(vis.DRAWN.needed_if(with_it.scene))
+        needed.append(vis.TRANSFER_EFFECT.is_needed(with_it.scene))
         change = (with_it.noise_free.astype(float) - without.noise_free)[30:35, 30:35]
         noticed = np.sqrt(np.mean(change**2)) / with_it.scene.pixel_noise
         assert noticed > 0.0
         if not needed[-1]:
-            assert noticed < NOTICEABLE / np.sqrt(STACK)
+            assert noticed < NOTICEABLE / np.sqrt(STACK_SIZE)
     assert sorted(needed) == needed
     assert len(set(needed)) == 2
     assert noticed > NOTICEABLE
@@ -206,7 +206,7 @@ def test_all_that_a_scene_does_without_is_not_noticed_together(mag):
     change = read(left_out)[0] - found
     assert 0.0 < np.sqrt(np.mean(change**2)) < NOTICEABLE * one.scene.pixel_noise, left_out
     # Nor in the mean of the sky: what is left out of every pixel is seen there.
-    biased = NOTICEABLE * one.scene.pixel_noise / np.sqrt(STACK)
+    biased = NOTICEABLE * one.scene.pixel_noise / np.sqrt(STACK_SIZE)
     assert abs(change.mean()) < biased + 5.0 * change.std() / np.sqrt(change.size), left_out
 
 
@@ -214,16 +214,16 @@ def test_all_that_a_scene_does_without_is_not_noticed_together(mag):
 def test_a_stack_of_darks_has_its_dark_current(seconds):
     """However little a frame has of it: left out, a thousand frames would show it."""
     one = Scene(MISSION, "vis", seconds, 0.0, 0.0, DETECTOR)
-    bias = one.dark_electrons * np.sqrt(STACK) / one.pixel_noise
-    assert EFFECTS["dark_current"].needed_if(one) == (bias > NOTICEABLE)
+    bias = one.dark_electrons * np.sqrt(STACK_SIZE) / one.pixel_noise
+    assert EFFECTS["dark_current"].is_needed(one) == (bias > NOTICEABLE)
     assert (bias > NOTICEABLE) == (seconds > 50.0)
 
 
 def test_tracks_bleed_where_they_do_not_fit():
     """In a dark, too: a pixel of 5000 e- does not hold what a cosmic ray may leave."""
     small_well = scene(sky=0.0, peak=0.0, full_well=5e3)
-    assert not EFFECTS["bleeding"].needed_if(small_well)
-    assert EFFECTS["bleeding"].needed_if(replace(small_well, track_electrons=cosmic_rays.brightest(small_well)))
+    assert not EFFECTS["bleeding"].is_needed(small_well)
+    assert EFFECTS["bleeding"].is_needed(replace(small_well, track_electrons=cosmic_rays.brightest_pixel(small_well)))
 
 
 @pytest.mark.parametrize(

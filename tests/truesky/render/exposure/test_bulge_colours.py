@@ -38,9 +38,9 @@ def image(band, **known):
     none = fields.stars([], [])
     aim = aimed(detector, system, passbands.load(band), {"band": band})
     rows = Rows(body, fluxes(body, band, 1.0), none, fluxes(none, band, 1.0))
-    rows = visible_sources.rows_of(rows, aim, MISSION)
+    rows = visible_sources.rows_at_exposure(rows, aim, MISSION)
     light = np.array([ELECTRONS]), np.zeros(0)
-    found, sizes = visible_sources.sources_of(rows, light, aim, psf, 1.0, settings_for(SURVEY))
+    found, sizes = visible_sources.select_sources(rows, light, aim, psf, 1.0, settings_for(SURVEY))
     return stamps.draw(found, sizes, psf, SIDE, SIDE, None, np.zeros(len(found)))
 
 

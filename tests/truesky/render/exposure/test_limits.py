@@ -11,7 +11,7 @@ from truesky.render.camera import detectors
 from truesky.render.channels.registry import CHANNELS
 from truesky.render.drawing import cost
 from truesky.render.exposure import limits
-from truesky.render.planning import prices
+from truesky.render.planning import detector_costs
 
 
 def refused(camera, count, monkeypatch):
@@ -44,4 +44,4 @@ def test_a_deep_field_is_drawn(camera, count, monkeypatch):
 
 
 def test_it_is_what_the_forecast_says():
-    assert prices.price("EXT", True, ()).memory(9216 * 9232) == pytest.approx(3.69, abs=0.05)
+    assert detector_costs.cost_model("EXT", True, ()).memory(9216 * 9232) == pytest.approx(3.69, abs=0.05)

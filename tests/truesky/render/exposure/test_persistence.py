@@ -11,51 +11,55 @@ from tests.truesky.render import fields, infrared, spectroscopic
 from tests.truesky.render.fields import MISSION, small
 from truesky.render.camera import astrometry
 from truesky.render.channels.aim import Aim
-from truesky.render.effects.charge.persistence import Traps
+from truesky.render.effects.charge.persistence import PersistenceModel
 from truesky.render.exposure import persistence
-from truesky.render.exposure.records import Earlier, EarlierSky, Rows, Variant
+from truesky.render.exposure.records import PreviousExposure, PreviousSky, Rows, Variant
 from truesky.render.psf import euclid
 from truesky.request.accuracy import SURVEY
 
 DETECTOR = small("nisp", "DET22", 96)
-TRAPS = Traps(120.0, 150.0, 2e4, -0.9, 100.0, 87.24, 1.3e5, 0.2)
+TRAPS = PersistenceModel(120.0, 150.0, 2e4, -0.9, 100.0, 87.24, 1.3e5, 0.2)
 SECOND = 1.0 / 86400.0
 EXPLORED = '{"nisp.gain": [1.0, "electron / adu"]}'
 # Without bodies that move.
 STRIP = spectroscopic.strip()
 # In which all pixels are alike, but for the number of their traps.
 ALIKE = dict.fromkeys((f"nisp.persistence.{name}_spread" for name in ("p2", "time_power")), (0.0, ""))
-EVEN, QUIET = MISSION.overridden_with(ALIKE), spectroscopic.MISSION.overridden_with(ALIKE)
+EVEN, QUIET = MISSION.with_overrides(ALIKE), spectroscopic.MISSION.with_overrides(ALIKE)
 
 
 def earlier(before, mags, x, y, **columns):
     """An exposure so many seconds before, with its stars."""
     row = infrared.exposed(DETECTOR, mjd=infrared.MJD - before * SECOND, number=9, **columns)
-    return Earlier(Aim.of(fields.exposure(**row), DETECTOR), Rows(*infrared.tables(DETECTOR, row, mags, x, y)))
+    return PreviousExposure(
+        Aim.from_exposure(fields.exposure(**row), DETECTOR), Rows(*infrared.tables(DETECTOR, row, mags, x, y))
+    )
 
 
 def left(*before, mission=EVEN, **columns):
     """[ny, nx] e- in an exposure now."""
-    aim = Aim.of(fields.exposure(**infrared.exposed(DETECTOR, **columns)), DETECTOR)
+    aim = Aim.from_exposure(fields.exposure(**infrared.exposed(DETECTOR, **columns)), DETECTOR)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(euclid, "nisp_psf", lambda d, band, *_: infrared.psf_of(d, "euclid_h"))
-        return persistence.remembered(aim, before, Variant(mission, SURVEY, {}), infrared.SEED)
+        return persistence.total_charge(aim, before, Variant(mission, SURVEY, {}), infrared.SEED)
 
 
 def test_the_formula():
     """Of 80, 20, 6 and 1.5 ke- 100 s later; falling as time to the power -0.9; nothing above the full well."""
-    found = TRAPS.left(np.array([8e4, 2e4, 6e3, 1.5e3, 0.0, -5.0]), 100.0, 87.24)
+    found = TRAPS.released_charge(np.array([8e4, 2e4, 6e3, 1.5e3, 0.0, -5.0]), 100.0, 87.24)
     np.testing.assert_allclose(found, [236, 95, 33, 9, 0, 0], atol=0.8)
-    assert TRAPS.left(np.array([8e4]), 1000.0, 87.24) == pytest.approx(236 * 10**-0.9, rel=0.01)
-    assert TRAPS.left(np.array([1e9]), 100.0, 87.24) == TRAPS.left(np.array([1.3e5]), 100.0, 87.24)
+    assert TRAPS.released_charge(np.array([8e4]), 1000.0, 87.24) == pytest.approx(236 * 10**-0.9, rel=0.01)
+    assert TRAPS.released_charge(np.array([1e9]), 100.0, 87.24) == TRAPS.released_charge(
+        np.array([1.3e5]), 100.0, 87.24
+    )
     # Twice as long: not twice as much, since it fades meanwhile.
     longer = (274.48**0.1 - 100**0.1) / (187.24**0.1 - 100**0.1)
     assert 1.6 < longer < 1.7
-    assert TRAPS.left(np.array([8e4]), 100.0, 2 * 87.24) == pytest.approx(longer * 235.6, rel=0.01)
+    assert TRAPS.released_charge(np.array([8e4]), 100.0, 2 * 87.24) == pytest.approx(longer * 235.6, rel=0.01)
     # What is held for longer fills more traps.
-    assert TRAPS.left(np.array([8e4]), 100.0, 87.24, 10 * 87.24) == pytest.approx(10**0.2 * 235.6, rel=0.01)
+    assert TRAPS.released_charge(np.array([8e4]), 100.0, 87.24, 10 * 87.24) == pytest.approx(10**0.2 * 235.6, rel=0.01)
     with pytest.raises(OutOfRange, match="delay"):
-        TRAPS.left(np.array([1.0]), 0.0, 87.24)
+        TRAPS.released_charge(np.array([1.0]), 0.0, 87.24)
 
 
 def test_nothing_is_left_by_nothing():
@@ -75,7 +79,7 @@ def test_what_is_left_adds_up_and_fades():
 @pytest.mark.parametrize("mag", [8.0, pytest.param(0.0, marks=pytest.mark.nightly)])
 def test_no_pixel_held_more_than_its_full_well(mag):
     """A star of AB 0, and an hour later."""
-    least = TRAPS.left(np.array([1.3e5]), 3600.0, 87.24)[0]
+    least = TRAPS.released_charge(np.array([1.3e5]), 3600.0, 87.24)[0]
     assert left(earlier(3600.0, [mag], [40.0], [50.0])).max() == pytest.approx(least, rel=1e-6)
 
 
@@ -89,9 +93,9 @@ def test_faint_sources_leave_nothing_that_is_missed():
         row = infrared.exposed(DETECTOR, mjd=infrared.MJD - before * SECOND)
         whole = infrared.rendered(mags, x, y, mjd=row["mjd"])
         sky = infrared.SKY * infrared.TIME
-        expected = TRAPS.left(whole.noise_free.astype(float) + sky, before, infrared.TIME)
+        expected = TRAPS.released_charge(whole.noise_free.astype(float) + sky, before, infrared.TIME)
         now = fields.exposure(**infrared.exposed(DETECTOR))
-        least = persistence.least_flux(now, fields.exposure(**row))
+        least = persistence.min_flux(now, fields.exposure(**row))
         bright = 10 ** (-0.4 * (mags - 23.9)) >= least
         assert 0 < bright.sum() < count
         found = left(earlier(before, mags[bright], x[bright], y[bright]))
@@ -101,7 +105,7 @@ def test_faint_sources_leave_nothing_that_is_missed():
 
 def test_a_flat_leaves_its_light_a_dark_nothing():
     flat = left(earlier(134.0, [], [], [], kind="flat", lamp=5))
-    assert TRAPS.left(np.array([2e4]), 134.0, 87.24)[0] < np.median(flat)
+    assert TRAPS.released_charge(np.array([2e4]), 134.0, 87.24)[0] < np.median(flat)
     assert (left(earlier(134.0, [], [], [], kind="dark", sky=0.0)) == 0.0).all()
 
 
@@ -109,12 +113,12 @@ def spectrum_before(before, mags, x, y):
     """Spectra so many seconds before an image of the same strip: (now, earlier, what they were as an image)."""
     columns = {"mjd": infrared.MJD - before * SECOND, "number": 9, "sky": 1.09}
     row = spectroscopic.exposed(STRIP, **columns)
-    now = Aim.of(fields.exposure(**infrared.exposed(STRIP)), STRIP)
-    aim = Aim.of(fields.exposure(**row), STRIP)
-    bright = persistence.least_flux(now.exposure, aim.exposure, persistence.brightest_column(aim, QUIET))
+    now = Aim.from_exposure(fields.exposure(**infrared.exposed(STRIP)), STRIP)
+    aim = Aim.from_exposure(fields.exposure(**row), STRIP)
+    bright = persistence.min_flux(now.exposure, aim.exposure, persistence.brightest_column_fraction(aim, QUIET))
     some = 10 ** (-0.4 * (mags - 23.9)) >= bright
     assert 0 < some.sum() < len(mags)
-    earlier = Earlier(aim, Rows(*infrared.tables(STRIP, row, mags[some], x[some], y[some])))
+    earlier = PreviousExposure(aim, Rows(*infrared.tables(STRIP, row, mags[some], x[some], y[some])))
     return now, earlier, spectroscopic.rendered(mags, x, y, detector=STRIP, truth=("sky",), **columns)
 
 
@@ -126,23 +130,23 @@ def test_traces_leave_what_whole_spectra_leave(before):
     x, y, mags = rng.uniform(-1200.0, 1800.0, count), rng.uniform(0, 96, count), rng.uniform(12.0, 23.0, count)
     now, earlier, whole = spectrum_before(before, mags, x, y)
     light = whole.noise_free.astype(float) + whole.maps["sky"]
-    expected = TRAPS.left(light, before, infrared.TIME, spectroscopic.TIME)
-    found = persistence.remembered(now, (earlier,), Variant(QUIET, SURVEY, {}), infrared.SEED)
-    even = TRAPS.left(np.array([1.09 * spectroscopic.TIME]), before, infrared.TIME, spectroscopic.TIME)[0]
+    expected = TRAPS.released_charge(light, before, infrared.TIME, spectroscopic.TIME)
+    found = persistence.total_charge(now, (earlier,), Variant(QUIET, SURVEY, {}), infrared.SEED)
+    even = TRAPS.released_charge(np.array([1.09 * spectroscopic.TIME]), before, infrared.TIME, spectroscopic.TIME)[0]
     print("left at most", expected.max() - even, "missed at most", np.abs(found - expected).max())
     assert expected.max() > even + 5.0
     assert np.abs(found - expected).max() < 1.5
     np.testing.assert_array_equal(
-        found, persistence.remembered(now, (earlier,), Variant(QUIET, SURVEY, {}), infrared.SEED)
+        found, persistence.total_charge(now, (earlier,), Variant(QUIET, SURVEY, {}), infrared.SEED)
     )
 
 
 def test_the_brightest_column_of_a_point():
     """Half of an image; of a grism that of order 0, in ten columns, or a five-hundredth part of the first."""
     _, earlier, _ = spectrum_before(700.0, np.array([15.0, 23.0]), np.array([300.0, 300.0]), np.array([40.0, 60.0]))
-    assert 1.0 / 512 < persistence.brightest_column(earlier.aim, QUIET) < 0.02
-    image = Aim.of(fields.exposure(**infrared.exposed(DETECTOR)), DETECTOR)
-    assert persistence.brightest_column(image, MISSION) == 0.5
+    assert 1.0 / 512 < persistence.brightest_column_fraction(earlier.aim, QUIET) < 0.02
+    image = Aim.from_exposure(fields.exposure(**infrared.exposed(DETECTOR)), DETECTOR)
+    assert persistence.brightest_column_fraction(image, MISSION) == 0.5
 
 
 def test_the_sky_of_what_nothing_renders_leaves_something():
@@ -151,14 +155,14 @@ def test_the_sky_of_what_nothing_renders_leaves_something():
     spectrum = fields.exposure(**{**row, "channel": "NISP-S", "band": "nisp_red"})
     assert persistence.is_drawn(spectrum)
     assert persistence.is_drawn(fields.exposure(**row))
-    found = left(EarlierSky(spectrum))
+    found = left(PreviousSky(spectrum))
     np.testing.assert_allclose(found, 1.1 * (550.0 / 87.24) ** 0.2, atol=0.2)
     np.testing.assert_array_equal(found, found[0, 0])
     for kind, seen in (
         ("dark", False), ("flat", False), ("standard_star", True), ("planetary_nebula", True), ("deep", True)
     ):  # fmt: skip
         other = fields.exposure(**{**row, "channel": "NISP-S", "band": "nisp_red", "image_type": kind})
-        np.testing.assert_array_equal(left(EarlierSky(other)), found * seen)
+        np.testing.assert_array_equal(left(PreviousSky(other)), found * seen)
 
 
 def test_a_star_left_its_light_where_it_was_that_day():
@@ -200,7 +204,7 @@ def test_a_detector_has_one_exposure_at_a_time():
     def asked(seconds, detector="DET22", **more):
         rows = [nominal, replace(nominal, exposure_id=2, mjd=infrared.MJD + seconds * SECOND, **more)]
         tasks = [{"exposure_id": n, "detector": name} for n, name in ((1, "DET22"), (2, detector))]
-        return persistence.earlier_of(tasks, {one.exposure_id: one for one in rows}, lambda settings: MISSION)
+        return persistence.previous_tasks(tasks, {one.exposure_id: one for one in rows}, lambda settings: MISSION)
 
     for seconds in (0.0, 110.6, 134.0):
         asked(seconds)
@@ -224,7 +228,7 @@ def test_which_exposures_count():
     ]  # fmt: skip
     tasks = [{"exposure_id": one.exposure_id, "detector": "DET22"} for one in rows[:8]]
     tasks.append({"exposure_id": 9, "detector": "DET23"})
-    found = persistence.earlier_of(tasks, {one.exposure_id: one for one in rows}, lambda settings: MISSION)
+    found = persistence.previous_tasks(tasks, {one.exposure_id: one for one in rows}, lambda settings: MISSION)
     numbers = {key: [task["exposure_id"] for task in some] for key, some in found.items()}
     assert numbers[6, "DET22"] == numbers[7, "DET22"] == [2, 4]
     assert numbers[8, "DET22"] == [2, 4, 6]
@@ -232,7 +236,7 @@ def test_which_exposures_count():
     assert numbers[4, "DET22"] == [2]
     assert numbers[1, "DET22"] == []
     assert numbers[9, "DET23"] == []
-    shuffled = persistence.earlier_of(tasks[::-1], {one.exposure_id: one for one in rows}, lambda settings: MISSION)
+    shuffled = persistence.previous_tasks(tasks[::-1], {one.exposure_id: one for one in rows}, lambda settings: MISSION)
     assert shuffled == found
 
 
@@ -265,16 +269,16 @@ def test_exposures_of_a_sequence_with_ramps_of_their_own_remember_one_another():
         for n, settings in enumerate((flat, explored, ramp, None))
     ]
     tasks = [{"exposure_id": one.exposure_id, "detector": "DET22"} for one in rows]
-    found = persistence.earlier_of(tasks, {one.exposure_id: one for one in rows}, lambda settings: MISSION)
+    found = persistence.previous_tasks(tasks, {one.exposure_id: one for one in rows}, lambda settings: MISSION)
     assert [[one["exposure_id"] for one in found[n, "DET22"]] for n in range(4)] == [[], [], [0], [0, 2]]
 
 
 def test_an_earlier_flat_had_its_own_lamp():
     """Twice as bright: of the frame before its own settings hold, not those of the frame that it is seen in."""
     flat = earlier(134.0, [], [], [], kind="flat", lamp=5)
-    bright = EVEN.overridden_with({"nisp.flat.signal": (6e4, "electron")})
+    bright = EVEN.with_overrides({"nisp.flat.signal": (6e4, "electron")})
     found = [np.median(left(replace(flat, mission=mission))) for mission in (EVEN, bright)]
-    usual = np.median(TRAPS.left(np.array([2.5e4, 5e4]), 134.0, 87.24).reshape(2, 1), axis=1)
+    usual = np.median(TRAPS.released_charge(np.array([2.5e4, 5e4]), 134.0, 87.24).reshape(2, 1), axis=1)
     assert found[1] / found[0] == pytest.approx(usual[1] / usual[0], rel=0.1)
 
 
@@ -290,8 +294,8 @@ def test_calibration_sources_leave_their_light(channel, kind, target):
     strip = spectroscopic.strip(nx=900)
     of_channel = spectroscopic if channel == "NISP-S" else infrared
     row = of_channel.exposed(strip, kind=kind, target=target, mjd=infrared.MJD - 700 * SECOND, number=9)
-    aim = Aim.of(fields.exposure(**row), strip)
-    now = Aim.of(fields.exposure(**infrared.exposed(strip)), strip)
+    aim = Aim.from_exposure(fields.exposure(**row), strip)
+    now = Aim.from_exposure(fields.exposure(**infrared.exposed(strip)), strip)
     stars = fields.stars([], [])
     for name in ("sed", "mag_h", "a_v"):
         stars = stars.append_column(name, pa.array([], pa.int64() if name == "sed" else pa.float64()))
@@ -300,7 +304,9 @@ def test_calibration_sources_leave_their_light(channel, kind, target):
     with pytest.MonkeyPatch.context() as patch:
         if channel == "NISP-P":
             patch.setattr(euclid, "nisp_psf", lambda d, band, *_: infrared.psf_of(d, row["band"]))
-        found = persistence.remembered(now, (Earlier(aim, nothing),), Variant(QUIET, SURVEY, {}), infrared.SEED)
+        found = persistence.total_charge(
+            now, (PreviousExposure(aim, nothing),), Variant(QUIET, SURVEY, {}), infrared.SEED
+        )
     sky = np.median(found)
     assert (found > sky + 1.0).sum() >= 5
     if channel == "NISP-P":

@@ -11,7 +11,7 @@ import pytest
 
 from lake_schema import units
 from lake_schema.errors import BadInput
-from lake_schema.ids import kind_of
+from lake_schema.ids import kind_from_id
 from tests.truesky.render import calibrated, fields, nominal
 from tests.truesky.render.fields import MISSION, fluxes, galaxies, small, stars
 from truesky.fluxes import passbands
@@ -253,7 +253,7 @@ def test_image_types(kind):
     truth = ("cosmic_rays", "saturation", "sky", "stars")
     one = render("VIS", kind=kind, truth=truth)
     looks, names = kind in ("flat", "self_calibration"), [d.name for d in one.decisions]
-    assert set(one.maps) == {"noise_free", *truth_maps.made(truth, names, looks)}
+    assert set(one.maps) == {"noise_free", *truth_maps.available_maps(truth, names, looks)}
     assert ("sky" in one.maps) == ("stars" in one.maps) == looks
     if looks:
         # With the starlight that strays, where that is noticed.
@@ -272,7 +272,7 @@ def test_image_types(kind):
         assert np.nanstd(found) == pytest.approx(np.hypot(4.4, 3.48 / 12**0.5), rel=0.03)
     elif kind == "flat":
         assert len(one.sources) > 10
-        lamp = 20_000 * calibration_lamp.seen(one.scene, 1)
+        lamp = 20_000 * calibration_lamp.efficiency_of_scene(one.scene, 1)
         assert middle == pytest.approx(lamp + one.scene.sky_electrons, rel=0.05)
     elif kind == "charge_injection":
         half = np.nanmean(found, axis=1)[: SIDE // 2]
@@ -315,7 +315,7 @@ def test_the_same_sky_with_other_noise(changed):
     base, other = render("VIS"), render("VIS", **changed)
     np.testing.assert_array_equal(base.noise_free, other.noise_free)
     assert (base.science != other.science).mean() > 0.5
-    off = dict.fromkeys(schema.EFFECTS, False) | dict.fromkeys(schema.ALWAYS, True)
+    off = dict.fromkeys(schema.EFFECTS, False) | dict.fromkeys(schema.ALWAYS_ON, True)
     noisy = off | dict.fromkeys(("background", "poisson", "read_noise"), True)
     shots = [render("VIS", forced=noisy, **more).science.astype(float) for more in ({}, changed)]
     dark = base.noise_free < 5.0
@@ -330,19 +330,19 @@ def test_without_any_effect_the_image_is_the_truth_in_whole_numbers():
     for channel, keep in (("VIS", ()), ("EXT", ()), ("VIS", ("background",))):
         asked = {"effects": {"on": list(keep), "off": ["all"]}}
         request = from_table({"name": "x", "seed": 1, "area": {"cone": {"ra": 0, "dec": 0, "radius": 1}}, **asked})
-        one = render(channel, forced=variants.forced(request))
+        one = render(channel, forced=variants.forced_effects(request))
         needed = {"adc", "quadrants", "amplifiers"} & {decision.name for decision in one.decisions}
         assert {decision.name for decision in one.decisions if decision.applied} == needed | set(keep)
         light = one.noise_free.astype(float) + bool(keep) * one.scene.sky_electrons
-        gain, bias = one.scene.of_amplifiers("gain", "electron / adu"), one.scene.value("bias", "adu")
+        gain, bias = one.scene.amplifier_values("gain", "electron / adu"), one.scene.value("bias", "adu")
         if one.scene.layout is not None:
-            gain = one.scene.layout.together(np.broadcast_to(np.reshape(gain, (-1, 1, 1)), one.raw.shape))
+            gain = one.scene.layout.assemble(np.broadcast_to(np.reshape(gain, (-1, 1, 1)), one.raw.shape))
         assert np.abs(one.science - bias - light / gain).max() == pytest.approx(0.5, abs=1e-2)
 
 
 def test_a_source_just_outside_still_shines_in():
     one = render("VIS", flux=3000.0)
-    kinds = kind_of(one.sources.ids)
+    kinds = kind_from_id(one.sources.ids)
     outside = (one.sources.column < -0.5) | (one.sources.column > SIDE - 0.5)
     assert (outside & (kinds == 5)).any()
     alone = stamps.draw(one.sources.take(outside), np.full(outside.sum(), 256), one.psf, SIDE, SIDE)
@@ -361,7 +361,7 @@ def test_rows_that_are_not_read_count_for_nothing():
     total = one.noise_free.sum(dtype=float)
     assert 0 < total < 0.3 * one.sources.electrons[0]
     # The map has wings from beyond the stamp besides.
-    assert 0.9 * total < one.drawn[0] < total * (1 + 1e-6)
+    assert 0.9 * total < one.drawn_electrons[0] < total * (1 + 1e-6)
     assert one.scene.peak_electrons == pytest.approx(float(one.noise_free.max()), rel=1e-6)
 
 
@@ -374,9 +374,9 @@ def test_what_sends_in_no_more_than_wings_is_not_listed():
     giant = galaxies(lon, lat, bulge_fraction=1.0, bulge_sersic_index=4.0, bulge_half_light_radius=4.0)
     one = render("VIS", giant, points.slice(0, 0), flux=300.0)
     assert one.noise_free.sum() > 10.0
-    assert len(one.sources) == len(one.sizes) == len(one.drawn) == 0
+    assert len(one.sources) == len(one.sizes) == len(one.drawn_electrons) == 0
     both = render("VIS")
-    assert (both.drawn > 0).all()
+    assert (both.drawn_electrons > 0).all()
 
 
 def test_sources_of_no_flux_are_left_out():

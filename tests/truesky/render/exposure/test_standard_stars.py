@@ -11,7 +11,7 @@ from truesky.fluxes import passbands
 from truesky.fluxes.libraries import templates
 from truesky.render.channels.aim import Aim
 from truesky.render.exposure import persistence
-from truesky.render.exposure.records import Earlier, Rows, Variant
+from truesky.render.exposure.records import PreviousExposure, Rows, Variant
 from truesky.render.products import exposure_files, fits_files, headers, truth_table
 from truesky.render.psf import euclid
 from truesky.request.accuracy import SURVEY
@@ -94,11 +94,11 @@ def test_other_images_have_none_and_other_targets_are_refused():
 def test_they_leave_persistence():
     """Where they were, with no star of the catalogue about."""
     row = exposed("Vega", mjd=infrared.MJD - 134 / 86400, exposure_id=9)
-    before = Earlier(Aim.of(fields.exposure(**row), DETECTOR), Rows(*tables(row)))
-    now = Aim.of(fields.exposure(**infrared.exposed(DETECTOR)), DETECTOR)
+    before = PreviousExposure(Aim.from_exposure(fields.exposure(**row), DETECTOR), Rows(*tables(row)))
+    now = Aim.from_exposure(fields.exposure(**infrared.exposed(DETECTOR)), DETECTOR)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(euclid, "nisp_psf", lambda d, found, *_: infrared.psf_of(d, "euclid_y"))
-        left = persistence.remembered(now, (before,), Variant(MISSION, SURVEY, {}), infrared.SEED)
+        left = persistence.total_charge(now, (before,), Variant(MISSION, SURVEY, {}), infrared.SEED)
     x, y = np.rint(PLACES).astype(int).T
     assert (left[y, x] > 20.0).all()
     assert np.median(left) < 1.5

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lake_schema.store import layout, publish
-from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.tables.fluxes import fluxes
 from lake_schema.tables.galaxies import GALAXIES
 from tests import requests
@@ -16,7 +16,7 @@ from tests.universe import rows_of
 from truesky.catalogue import build_galaxies, build_stars
 from truesky.fluxes import compute_fluxes
 from truesky.render.forecasting import catalogue_forecast
-from truesky.request.files import Catalogue, GivenSources, Ingest
+from truesky.request.files import Catalogue, Ingest, UserSources
 from truesky.request.from_toml import from_table
 
 # Cone, limits and bands of three areas, and what their jobs made and took on an AMD EPYC whose calibration gave
@@ -56,7 +56,7 @@ def request(cone, galaxies, stars, bands, **more):
 
 
 def forecast(wanted, factor=1.0):
-    return {line.job: line for line in catalogue_forecast.of_request(wanted, factor)}
+    return {line.job: line for line in catalogue_forecast.for_request(wanted, factor)}
 
 
 def test_more_is_dearer():
@@ -98,14 +98,14 @@ def few_sources(tmp_path_factory):
     )))  # fmt: skip
     for job in (build_galaxies, build_stars, compute_fluxes):
         for step in job.steps(lake, wanted):
-            publish.make(lake, step.plan, step.work)
+            publish.make_version(lake, step.plan, step.work)
     return lake, wanted
 
 
 @pytest.mark.nightly
 def test_what_is_drawn_is_what_was_forecast(few_sources):
     lake, wanted = few_sources
-    held = {line.job: line for line in catalogue_forecast.of_lake(lake)}
+    held = {line.job: line for line in catalogue_forecast.for_lake(lake)}
     for job, line in forecast(wanted).items():
         assert (held[job].rows, held[job].gb) == pytest.approx((line.rows, line.gb), rel=1e-6)
         tables = {"build_galaxies": ["halos", "galaxies"], "build_stars": ["stars"]}.get(
@@ -117,13 +117,13 @@ def test_what_is_drawn_is_what_was_forecast(few_sources):
 
 def test_requests_of_a_lake_add_up_and_what_they_share_is_made_once(lake):
     def made(table, facts, name):
-        part = Part(layout.cell_file(5, 1607), {"generation_cells": [1607 << 6]})
+        part = Task(layout.cell_file(5, 1607), {"generation_cells": [1607 << 6]})
         plan = Plan(table, facts, (part,))
-        publish.make(lake, plan, lambda root, facts: Output(rows_of(table, 3)), name=name)
+        publish.make_version(lake, plan, lambda root, facts: Output(rows_of(table, 3)), name=name)
         return plan.key
 
     def lines():
-        return {line.job: line for line in catalogue_forecast.of_lake(lake)}
+        return {line.job: line for line in catalogue_forecast.for_lake(lake)}
 
     key = made(GALAXIES, {"galaxy_limit": 22.0}, "a")
     made(fluxes("galaxy", ["x"]), {"input": key, "bands": ["x"]}, "a")
@@ -144,7 +144,7 @@ def test_an_external_catalogue_is_not_forecast(tmp_path):
     lines = forecast(replace(wanted, ingest=Ingest(galaxies=given)))
     assert list(lines) == ["build_stars", "compute_fluxes"]
     assert lines["compute_fluxes"].rows == lines["build_stars"].rows
-    assert "\n".join(catalogue_forecast.text(list(lines.values()))).count("\n") == 2
+    assert "\n".join(catalogue_forecast.format_table(list(lines.values()))).count("\n") == 2
 
 
 def test_given_sources_are_as_many_as_their_tables_say(tmp_path):
@@ -152,7 +152,7 @@ def test_given_sources_are_as_many_as_their_tables_say(tmp_path):
     (tmp_path / "g.csv").write_text("ra,dec,mag\n53,-28,20\n53,-28.01,21\n")
     (tmp_path / "s.csv").write_text("mag\n18\n")
     wanted = request((53.0, -28.0, 0.3), 24.0, 22.0, ["euclid_vis"])
-    own = GivenSources(tmp_path / "g.csv", None, "euclid_vis", 0.0)
+    own = UserSources(tmp_path / "g.csv", None, "euclid_vis", 0.0)
     lines = forecast(replace(wanted, sources=own))
     assert {job: line.rows for job, line in lines.items()} == {"build_galaxies": 2, "compute_fluxes": 2}
     # Every 36 arcsec on a circle of 0.3 deg, two places in three a galaxy.

@@ -6,14 +6,14 @@ import pytest
 
 from lake_schema.errors import Damaged
 from lake_schema.store import layout, publish
-from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.store.provenance import machine
 from lake_schema.tables.products import PRODUCTS
 from lake_schema.tables.tasks import TASKS
 from tests.universe import rows_of
 from truesky.render import archive
 from truesky.render.forecasting import speed
-from truesky.running.measured import Measured
+from truesky.running.task_metrics import WithMetrics
 
 TASK = {
     "detector": "3-4", "channel": "VIS", "ra": 1.0, "dec": 1.0, "radius": 0.1, "cells": [], "s_region": "",
@@ -30,17 +30,17 @@ def own_cache(tmp_path, monkeypatch):
 def rendered(lake):
     """Four detectors that were to take 10, 20, 30 and 40 s."""
     rows = [{**TASK, "exposure_id": n, "seconds": 10.0 * n} for n in range(1, 5)]
-    tasks = Plan(TASKS, {}, (Part("all.parquet", {}),))
+    tasks = Plan(TASKS, {}, (Task("all.parquet", {}),))
     columns = {name: [row[name] for row in rows] for name in TASKS.names}
-    publish.make(lake, tasks, lambda root, facts: Output(TASKS.build(columns)))
-    parts = tuple(Part(f"{n}.parquet", {"exposure_id": n, "detector": "3-4", "part_path": f"{n}"}) for n in range(1, 5))
+    publish.make_version(lake, tasks, lambda root, facts: Output(TASKS.build(columns)))
+    parts = tuple(Task(f"{n}.parquet", {"exposure_id": n, "detector": "3-4", "part_path": f"{n}"}) for n in range(1, 5))
     plan = Plan(PRODUCTS, {"inputs": {"tasks": tasks.key}}, parts)
 
     def product(root, facts):
         rows = rows_of(PRODUCTS, 1)
         return Output(rows.set_column(rows.column_names.index("path"), rows.field("path"), [[facts["part_path"]]]))
 
-    publish.make(lake, plan, product)
+    publish.make_version(lake, plan, product)
     return plan.key
 
 
@@ -50,14 +50,16 @@ def log(lake, key, factors, **about):
         {"part": f"{n}.parquet", "cpu_s": 10.0 * n * factor, "machine": machine(), **about}
         for n, factor in enumerate(factors, 1)
     ]
-    layout.runs(lake).mkdir(exist_ok=True)
+    layout.runs_folder(lake).mkdir(exist_ok=True)
     text = "\n".join(json.dumps(line) for line in lines)
-    (layout.runs(lake) / f"2026-products-{len(list(layout.runs(lake).iterdir()))}.jsonl").write_text(text + "\n{cut")
+    (layout.runs_folder(lake) / f"2026-products-{len(list(layout.runs_folder(lake).iterdir()))}.jsonl").write_text(
+        text + "\n{cut"
+    )
 
 
 def test_the_lake_is_learnt_from(lake, rendered):
     log(lake, rendered, [2.0, 0.5, 0.4, 0.3])
-    found = speed.of_machine(lake)
+    found = speed.estimate_speed(lake)
     assert found.factor == pytest.approx(0.45)
     assert "4 detectors" in found.source
 
@@ -66,28 +68,28 @@ def test_what_says_nothing_of_this_machine_is_left_out(lake, rendered):
     log(lake, rendered, [9.0] * 4, machine="another")
     log(lake, "of another version", [9.0] * 4)
     log(lake, rendered, [9.0] * 4, error="it failed")
-    assert "calibration" in speed.of_machine(lake).source
+    assert "calibration" in speed.estimate_speed(lake).source
 
 
 def test_a_log_that_is_damaged_teaches_nothing(lake, rendered):
     """Nor does it keep others from it; the archive names it."""
     log(lake, rendered, [9.0] * 4)
-    (path,) = layout.runs(lake).iterdir()
+    (path,) = layout.runs_folder(lake).iterdir()
     path.write_text(path.read_text().replace('"2.parquet"', "2"))
     log(lake, rendered, [2.0, 0.5, 0.4, 0.3])
-    assert "4 detectors" in speed.of_machine(lake).source
+    assert "4 detectors" in speed.estimate_speed(lake).source
     with pytest.raises(Damaged, match=f"{path.name} line 3 is not what a run writes"):
         archive.failures(lake)
 
 
 def test_a_calibration_is_made_once(lake, monkeypatch):
-    first = speed.of_machine(lake)
+    first = speed.estimate_speed(lake)
     assert 0.02 < first.factor < 50.0
-    monkeypatch.setattr(speed, "calibration", None)
-    assert speed.of_machine(lake) == first
+    monkeypatch.setattr(speed, "run_calibration", None)
+    assert speed.estimate_speed(lake) == first
 
 
 def test_a_measured_part_is_what_is_looked_for():
     """What the log is read for is what is written into it."""
-    took = Measured(lambda part: {"part": part.name, "machine": machine()})(Part("a", {}))
+    took = WithMetrics(lambda part: {"part": part.name, "machine": machine()})(Task("a", {}))
     assert {"cpu_s", "machine", "part"} <= took.keys()

@@ -102,11 +102,11 @@ def test_bands_that_the_challenge_has_not_are_planned_as_the_others(name, camera
 def test_dates_by_day_are_named():
     """The Sun's altitude as astropy has it."""
     none = survey_of("lsst", 4, bands=("lsst_r",))
-    assert ground_surveys.by_day(none, MISSION) == ""
+    assert ground_surveys.daylight_warning(none, MISSION) == ""
     # 11:30 of local time.
     dated = [replace(one, mjd=60500.68 if i else one.mjd) for i, one in enumerate(none[:2])]
     dated.append(replace(dated[1], image_type="flat"))
-    line = ground_surveys.by_day(dated, MISSION)
+    line = ground_surveys.daylight_warning(dated, MISSION)
     where = EarthLocation.from_geodetic(-70.7494, -30.2446, 2663.0)
     when = Time(60500.68, format="mjd")
     high = get_sun(when).transform_to(AltAz(obstime=when, location=where)).alt.deg
@@ -139,7 +139,7 @@ def test_seeing_is_drawn_for_each_exposure():
 def test_a_row_without_a_date_is_observed_at_night(tmp_path):
     """A field beside the Sun at the date that counts begin with: zodiacal light would be 20 times a dark sky."""
     (bare,) = read(tmp_path, "channel,camera,band,ra,dec\nEXT,lsstcam,lsst_r,100.0,20.0\n")
-    site = ground_surveys.Site.of("ext.lsstcam", MISSION)
+    site = ground_surveys.Site.from_mission("ext.lsstcam", MISSION)
     assert site.altitude(bare.ra, bare.dec, bare.mjd) > 29.0
     (row,) = planned_exposures.table([bare], [MISSION]).to_pylist()
     assert 32.95 < row["sky"] < 150.0

@@ -43,7 +43,7 @@ def test_a_lamp_shines_in_bands_that_see_it():
     assert flats(exposures=4, bands=["euclid_h"]) == {(4, "euclid_h"): 2, (5, "euclid_h"): 2}
     assert flats(exposures=4, lamps=[5, 3]) == {(5, "euclid_h"): 2, (3, "euclid_j"): 2}
     for lamp, band in flats(exposures=30):
-        assert calibration_lamp.seen_in(passbands.load(band), lamp, "nisp", MISSION) > 0.05
+        assert calibration_lamp.led_efficiency(passbands.load(band), lamp, "nisp", MISSION) > 0.05
 
 
 def test_lamps_that_cannot_be_lit():
@@ -220,7 +220,7 @@ def test_a_block_of_spectra_has_its_own_ramp(block):
         assert exposure.exposure_time_s == pytest.approx(seconds)
         assert mission.value("nisp.macc.spectroscopic.groups") == 8.0
         assert mission.value("nisp.macc.photometric.groups") == 4.0
-        assert image_types.family(exposure.settings) is None
+        assert image_types.shared_settings(exposure.settings) is None
 
 
 def test_flats_at_intensities():
@@ -237,7 +237,7 @@ def test_flats_at_intensities():
     explored = {"nisp.flat.signal": {"values": [1e4, 2e4], "unit": "electron"}}
     two = exposures({**FLAT, "exposures": 1, "lamps": [3], "intensities": [3.0]}, explore=explored)
     assert [mission.value("nisp.flat.signal") for _, mission in two] == [3e4, 6e4]
-    assert len({image_types.family(e.settings) for e, _ in two}) == 2
+    assert len({image_types.shared_settings(e.settings) for e, _ in two}) == 2
     for values, message in (([], "not a list"), ([0.0], r"intensities\[0\]"), ([1.0, 1.0], "twice")):
         with pytest.raises(BadInput, match=rf"observation\[0\]\.intensities.*{message}|{message}"):
             exposures({**FLAT, "exposures": 1, "intensities": values})

@@ -110,7 +110,7 @@ def test_a_box_may_cross_zero(ra, inside, outside):
     area = parse({"box": {"ra": ra, "dec": [-5, 5]}})
     assert area.contains(inside, np.zeros(len(inside))).all()
     assert not area.contains(outside, np.zeros(len(outside))).any()
-    assert set(sky.cell_of(inside, np.zeros(len(inside)), 8)) <= set(area.cells())
+    assert set(sky.cell_at(inside, np.zeros(len(inside)), 8)) <= set(area.cells())
 
 
 def test_a_table_s_columns_have_their_defaults(tmp_path):

@@ -42,8 +42,8 @@ def made(**sections):
 
 def planned(tmp_path, **sections):
     _, exposures, rows = plan(tmp_path, made(**sections))
-    assert validate.violations(exposures, EXPOSURES) == []
-    assert validate.violations(rows, TASKS) == []
+    assert validate.find_violations(exposures, EXPOSURES) == []
+    assert validate.find_violations(rows, TASKS) == []
     return exposures, rows
 
 
@@ -83,7 +83,7 @@ def test_cells_hold_everything_that_a_detector_sees(ra, dec, angle):
     exposures = planned_exposures.table([exposure], [MISSION])
     densities = source_counts.Densities(MISSION, schema.Universe())
     rows = tasks.table(exposures, [("1-6",)], MISSION, densities)
-    assert validate.violations(exposures, EXPOSURES) == []
+    assert validate.find_violations(exposures, EXPOSURES) == []
     (exposed,), (task,) = exposures.to_pylist(), rows.to_pylist()
     detector = camera_detectors.detector("vis", "1-6", MISSION)
     system = astrometry.wcs(detector, *(exposed[k] for k in ("ra", "dec", "position_angle")))
@@ -93,7 +93,7 @@ def test_cells_hold_everything_that_a_detector_sees(ra, dec, angle):
     x, y = rng.uniform(-margin, detector.nx + margin, 200), rng.uniform(-margin, detector.ny + margin, 200)
     seen = astrometry.sky_of_pixel(system, x, y)
     assert (sky.separation(task["ra"], task["dec"], *seen) <= task["radius"]).all()
-    assert set(sky.cell_of(*seen, 8)) <= set(task["cells"])
+    assert set(sky.cell_at(*seen, 8)) <= set(task["cells"])
     # Footprints of all detectors at once are those of each one's own projection.
     corners = np.array(task["s_region"].split()[2:], float).reshape(4, 2)
     own = astrometry.corners(detector, system)
@@ -221,7 +221,7 @@ def test_deep_fields_are_visited_again(tmp_path):
 def test_the_deep_fields_have_their_published_areas(name, area):
     place = survey.deep_area(f"survey.{name}", MISSION)
     cells = np.array(place.cells(8))
-    ra, dec = sky.positions((cells << 42) + (1 << 41))
+    ra, dec = sky.positions_of_indices((cells << 42) + (1 << 41))
     found = place.contains(ra, dec).sum() * sky.cell_area(8)
     assert found == pytest.approx(area, rel=0.06)
     assert place.contains([MISSION.value(f"survey.{name}.ra")], [MISSION.value(f"survey.{name}.dec")]).all()
@@ -239,7 +239,7 @@ def test_an_exploration_is_the_product_of_requests(tmp_path):
     assert sorted({v.mission.value("vis.read_noise") for v in own}) == [4.0, 5.0, 6.0]
     assert {v.accuracy.flux for v in own} == {5e-3, 1e-3}
     # Each variant has the same noise but for what it changes.
-    assert len({image_types.identity(ExposureRow.of(row)) for row in exposures.to_pylist()}) == 1
+    assert len({image_types.identity(ExposureRow.from_row(row)) for row in exposures.to_pylist()}) == 1
     forced = variants.variant('{"effects.bleeding": false}', MISSION, accuracy.SURVEY, {"bleeding": True}).forced
     assert forced == {"bleeding": False}
 
@@ -250,12 +250,12 @@ def test_exposures_alike_are_numbered(tmp_path):
     explored = {"effects.poisson": [True, False]}
     exposures, rows = planned(tmp_path, pointing=[twice, other, {**VIS, "detectors": ["3-4"]}], explore=explored)
     assert exposures["realisation"].to_pylist() == [1, 2, 1, 3] * 2
-    identities = [image_types.identity(ExposureRow.of(row)) for row in exposures.to_pylist()]
+    identities = [image_types.identity(ExposureRow.from_row(row)) for row in exposures.to_pylist()]
     assert len(set(identities)) == 4
     assert identities[:4] == identities[4:]
     # The first is what it is alone, also in lakes that have not numbered it.
     (alone,) = planned(tmp_path, pointing=[VIS])[0].to_pylist()
-    row = ExposureRow.of({**alone, "realisation": None})
+    row = ExposureRow.from_row({**alone, "realisation": None})
     assert (
         image_types.identity(row)
         == identities[0]
@@ -274,7 +274,7 @@ def test_a_pointing_in_front_changes_nobody_else_s_noise(tmp_path):
     both, _ = planned(tmp_path, pointing=[first, second])
     (a,), (_, b) = alone.to_pylist(), both.to_pylist()
     assert a["exposure_id"] != b["exposure_id"]
-    assert image_types.identity(ExposureRow.of(a)) == image_types.identity(ExposureRow.of(b))
+    assert image_types.identity(ExposureRow.from_row(a)) == image_types.identity(ExposureRow.from_row(b))
 
 
 # ------------------------------------------------------------------------------------------------ ground surveys
@@ -310,7 +310,7 @@ def test_ground_surveys_see_the_main_run_as_often_as_theirs_did():
         if rule["shared"] == "0":
             taken = [e for e in taken if e.band == taken[0].band]
         assert len(taken) == block.exposures
-        ra, dec, radius = block.area.bounds()
+        ra, dec, radius = block.area.bounding_circle()
         places = np.random.default_rng(5).uniform(-radius, radius, (2, 1000))
         ra, dec = ra + places[0] / np.cos(np.radians(dec)), dec + places[1]
         inside = block.area.contains(ra, dec)

@@ -23,7 +23,9 @@ def plan(tmp_path_factory):
 
 
 def places(plan, **wanted):
-    return [(row["exposure_id"], row["detector"]) for row in tasks.part(plan, replace(parse(DEMO), **wanted))]
+    return [
+        (row["exposure_id"], row["detector"]) for row in tasks.select_requested(plan, replace(parse(DEMO), **wanted))
+    ]
 
 
 def test_all_of_a_plan_unless_a_part_is_asked_for(plan):
@@ -55,7 +57,7 @@ def test_what_earlier_exposures_left_is_drawn_again_and_takes_its_time(tmp_path,
     ]
     exposures, rows = planned(tmp_path, observation=blocks)
     with monkeypatch.context() as patch:
-        patch.setattr(tasks, "remembering", lambda rows, *_: rows)
+        patch.setattr(tasks, "add_persistence_cost", lambda rows, *_: rows)
         _, alone = planned(tmp_path, observation=blocks)
     without = {(row["exposure_id"], row["detector"]): row["seconds"] for row in alone.to_pylist()}
     every, days = exposures.to_pylist(), resolve().value("nisp.persistence.window", "d")
@@ -63,7 +65,7 @@ def test_what_earlier_exposures_left_is_drawn_again_and_takes_its_time(tmp_path,
     for row in rows.to_pylist():
         (own,) = (one for one in every if one["exposure_id"] == row["exposure_id"])
         before = [
-            registry.CHANNELS[one["channel"]].cost.again_s
+            registry.CHANNELS[one["channel"]].cost.redraw_s
             for one in every
             if own["camera"] == one["camera"] == "nisp"
             and own["mjd"] - days <= one["mjd"] < own["mjd"]

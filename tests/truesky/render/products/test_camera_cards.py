@@ -48,7 +48,7 @@ def test_sections_of_both_amplifiers_cover_the_frame(decam):
             seen[tools.window(header[f"{key}{letter}"])] += 1
     assert seen.max() == 1
     layout = one.scene.layout
-    assert (seen == 0).sum() == layout.rows * layout.scans * 2
+    assert (seen == 0).sum() == layout.rows * layout.scan_columns * 2
     data = np.zeros(pixels.shape, bool)
     data[tools.window(header["DATASEC"])] = True
     for letter in "AB":
@@ -81,7 +81,7 @@ def test_amplifiers_are_read_from_their_own_sides(decam):
 def test_numbers_are_each_amplifiers(decam):
     one, header, _ = decam
     for key, unit, name in (("gain", "electron / adu", "GAIN"), ("read_noise", "electron", "RDNOISE")):
-        values = np.broadcast_to(one.scene.of_amplifiers(key, unit), 2)
+        values = np.broadcast_to(one.scene.amplifier_values(key, unit), 2)
         assert values[0] != values[1]
         np.testing.assert_allclose([header[f"{name}{letter}"] for letter in "AB"], values)
     assert header["SATURATE"] == min(header["SATURATA"], header["SATURATB"])

@@ -38,7 +38,7 @@ def written(rendered, tmp_path_factory):
 
 def test_rows_are_as_declared(rendered, written):
     folder, rows = written
-    assert validate.violations(rows, PRODUCTS) == []
+    assert validate.find_violations(rows, PRODUCTS) == []
     assert rows["content"].to_pylist() == ["science", "noise_free"]
     for row in rows.to_pylist():
         assert (folder / row["path"]).is_file()
@@ -89,9 +89,9 @@ def test_images_without_a_place_have_nothing_beside(rendered):
 
 @pytest.mark.parametrize("convention", ["sip", "tpv"])
 def test_usually_the_distortion_is_as_the_pipeline_reads_it(rendered, monkeypatch, convention, tmp_path):
-    known = observatories.of("vis")
+    known = observatories.for_camera("vis")
     assert known.convention == "sip"
-    monkeypatch.setitem(observatories._KNOWN, "vis", replace(known, convention=convention))
+    monkeypatch.setitem(observatories._OBSERVATORIES, "vis", replace(known, convention=convention))
     rows, writers = fits_files.products(rendered, ())
     writers[rows["path"][0].as_py()](tmp_path / "one.fits")
     for number in range(5):
@@ -149,8 +149,8 @@ def test_the_header_tells_what_was_allowed_and_what_was_reached(rendered, writte
     folder, rows = written
     header = astropy_fits.getheader(folder / rows["path"][0].as_py())
     applied = [decision.name for decision in rendered.decisions if decision.applied]
-    made = [asdict(accuracy.reached(rendered.accuracy))]
-    made += [charge_transfer.errors(rendered.scene, name) for name in applied]
+    made = [asdict(accuracy.expected_errors(rendered.accuracy))]
+    made += [charge_transfer.source_errors(rendered.scene, name) for name in applied]
     short = {"flux": "FLUX", "shape": "SHAPE", "position": "POS", "background": "BACK"}
     for name, value in asdict(rendered.accuracy).items():
         assert header[f"ACC{short[name]}"] == value
@@ -165,11 +165,11 @@ def test_drawing_and_charge_transfer_together_are_within_what_is_allowed(preset)
     wanted = accuracy.PRESETS[preset]
     mission = resolve()
     scene = Scene(mission, "vis", 560.0, 0.25, 1e5, detectors.detector("vis", "3-4", mission), accuracy=wanted)
-    made = [asdict(accuracy.reached(wanted))]
-    made += [charge_transfer.errors(scene, name) for name in ("parallel_cti", "serial_cti")]
+    made = [asdict(accuracy.expected_errors(wanted))]
+    made += [charge_transfer.source_errors(scene, name) for name in ("parallel_cti", "serial_cti")]
     for name, value in asdict(wanted).items():
         assert sum(cause.get(name, 0.0) ** 2 for cause in made) ** 0.5 <= value, name
-    assert charge_transfer.errors(scene, "bleeding") == {}
+    assert charge_transfer.source_errors(scene, "bleeding") == {}
 
 
 @pytest.mark.parametrize("forced", [{}, nominal.off("nonlinearity"), {"parallel_cti": True, "serial_cti": True}])

@@ -56,7 +56,7 @@ def test_every_array_has_what_tools_look_for(channel, rice, tmp_path):
         for header in arrays:
             assert set(header) >= IN_EACH
             assert (header["EXPTIME"], header["BUNIT"]) == (100.0, "adu")
-            assert header["GAIN"] == pytest.approx(np.mean(one.scene.of_amplifiers("gain", "electron / adu")))
+            assert header["GAIN"] == pytest.approx(np.mean(one.scene.amplifier_values("gain", "electron / adu")))
             if channel == "VIS":
                 assert header["INHERIT"] is True
         first = units[0].header if channel == "VIS" else arrays[0]
@@ -98,7 +98,7 @@ def test_read_noise_is_the_detectors_though_it_was_not_drawn(tmp_path):
     """As where a request forbids it."""
     for forced, drawn in (({}, 1.0), (nominal.off("read_noise"), 0.0)):
         one = render("EXT", forced=forced, exposed={"sky": 0.0})
-        of_detector = np.mean(one.scene.of_amplifiers("read_noise", "electron"))
+        of_detector = np.mean(one.scene.amplifier_values("read_noise", "electron"))
         with science(one, tmp_path) as units:
             assert 4.0 < units[0].header["RDNOISE"] == pytest.approx(of_detector)
             assert units[0].header["RDNDRAWN"] == pytest.approx(drawn * of_detector, abs=1e-9)
@@ -113,6 +113,6 @@ def test_where_a_bright_sky_hides_the_read_noise(tmp_path):
     one = fields.rendered(exposed, detector, tables, MISSION, SURVEY)
     assert "read_noise" not in {decision.name for decision in one.decisions if decision.applied}
     with science(one, tmp_path) as units:
-        of_detector = np.mean(one.scene.of_amplifiers("read_noise", "electron"))
+        of_detector = np.mean(one.scene.amplifier_values("read_noise", "electron"))
         assert 4.0 < units[0].header["RDNOISE"] == pytest.approx(of_detector)
         assert units[0].header["RDNDRAWN"] == 0.0

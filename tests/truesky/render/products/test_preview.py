@@ -38,29 +38,29 @@ def test_stretch():
     rng = np.random.default_rng(1)
     image = rng.normal(1000.0, 5.0, (200, 200))
     image[:3] = 3000.0
-    level, noise = preview._levels(image)
+    level, noise = preview._sky_and_noise(image)
     assert level == pytest.approx(1000.0, abs=0.5)
     assert noise == pytest.approx(5.0, rel=0.05)
-    shown = preview._stretched(np.array([[level - 99, level, level + 20, level + 1e9]]), level, noise)
+    shown = preview._stretch(np.array([[level - 99, level, level + 20, level + 1e9]]), level, noise)
     assert shown[0, 0] == 0.0
     assert shown[0, 3] == pytest.approx(1.0)
     assert (np.diff(shown[0]) > 0).all()
-    assert np.isfinite(preview._stretched(np.zeros((4, 4)), *preview._levels(np.zeros((4, 4))))).all()
+    assert np.isfinite(preview._stretch(np.zeros((4, 4)), *preview._sky_and_noise(np.zeros((4, 4))))).all()
 
 
 def test_shrinking_keeps_the_mean():
     image = np.arange(42 * 31, dtype=np.uint16).reshape(42, 31)
-    small = preview._shrunk(image, 5)
+    small = preview._shrink(image, 5)
     assert small.shape == (8, 6)
     assert small.mean() == pytest.approx(image[:40, :30].mean())
 
 
 def test_labels_stand_apart():
     names = [Label(float(x), 0.0, "star", float(x), "") for x in range(10)]
-    assert [n.column for n in preview_labels.moved_apart(names, 2.5, 1.0, 4)] == [0.0, 3.0, 6.0, 9.0]
+    assert [n.column for n in preview_labels.without_overlaps(names, 2.5, 1.0, 4)] == [0.0, 3.0, 6.0, 9.0]
     # The brightest keeps its name, whatever its kind, and does not use up another kind's.
     galaxy = Label(0.0, 0.5, "galaxy", 9.0, "")
-    assert preview_labels.moved_apart([galaxy, *names], 2.5, 1.0, 2) == [galaxy, names[3], names[6]]
+    assert preview_labels.without_overlaps([galaxy, *names], 2.5, 1.0, 2) == [galaxy, names[3], names[6]]
 
 
 def test_cosmic_rays_are_mended_from_around_them():
@@ -68,10 +68,10 @@ def test_cosmic_rays_are_mended_from_around_them():
     hit = np.zeros(image.shape, bool)
     hit[20, 3:25] = hit[0, 0] = True
     spoiled = np.where(hit, 1e5, image)
-    mended = preview.mended(spoiled, hit)
+    mended = preview.repair_cosmic_rays(spoiled, hit)
     np.testing.assert_array_equal(mended[~hit], image[~hit])
     assert np.abs(mended - image).max() <= 1.0
-    everything = preview.mended(spoiled, np.ones(image.shape, bool))
+    everything = preview.repair_cosmic_rays(spoiled, np.ones(image.shape, bool))
     np.testing.assert_array_equal(everything, spoiled)
 
 
@@ -80,7 +80,7 @@ def test_of_many_images_each_kind_is_shown_first():
     rows = [{"channel": channel, "band": band, "number": i} for i, (channel, band) in enumerate(kinds)]
 
     def numbers(most):
-        return [row["number"] for row in preview.shown(rows, most)]
+        return [row["number"] for row in preview.select_images(rows, most)]
 
     assert numbers(3) == [0, 4, 5]
     assert numbers(5) == [0, 1, 4, 5, 6]

@@ -28,7 +28,7 @@ def believed(place, number=None, camera="decam", seed=SEED, own=MISSION):
     exposed = fields.exposure(
         channel="EXT", camera=camera, band="des_r", ra=ra, dec=dec, position_angle=angle, realisation=number
     )
-    return raw_pointing.believed(exposed, detectors(camera, own)[0], own, seed)
+    return raw_pointing.commanded_pointing(exposed, detectors(camera, own)[0], own, seed)
 
 
 def apart(one, other):
@@ -55,7 +55,7 @@ def test_they_are_of_the_pointing_and_of_the_seed():
 
 def test_a_camera_without_errors_says_where_it_looks():
     assert believed(POINTED, camera="lsstcam") == POINTED
-    own = MISSION.overridden_with({"ext.lsstcam.header.offset": (5.0, "arcsec")})
+    own = MISSION.with_overrides({"ext.lsstcam.header.offset": (5.0, "arcsec")})
     east, north, turn = apart(POINTED, believed(POINTED, camera="lsstcam", own=own))
     assert 0.0 < np.hypot(east, north) < 25.0
     assert abs(turn) < 1e-3
@@ -67,7 +67,8 @@ def test_they_are_as_small_at_the_poles(dec, ra):
     one = detector("decam", "N4", MISSION)
     exposed = fields.exposure(channel="EXT", camera="decam", band="des_r", ra=ra, dec=dec)
     systems = [
-        astrometry.wcs(one, *place) for place in ((ra, dec, 0.0), raw_pointing.believed(exposed, one, MISSION, SEED))
+        astrometry.wcs(one, *place)
+        for place in ((ra, dec, 0.0), raw_pointing.commanded_pointing(exposed, one, MISSION, SEED))
     ]
     true, told = (SkyCoord(*astrometry.sky_of_pixel(s, [0.0, 2000.0], [0.0, 4000.0]), unit="deg") for s in systems)
     assert (true.separation(told).arcsec < 6.0 * np.hypot(3.0, 3.0) + 1.0).all()
@@ -163,8 +164,8 @@ def test_scamp_recovers_the_place_of_four_dithered_frames(tmp_path):
     command = tools.tool("scamp")
     tools.tool("source-extractor")
     one = small("decam", "N4", 1024)
-    bent = tools.farthest("decam").bending
-    one = replace(one, bending=one.bending or bent)
+    bent = tools.farthest("decam").distortion_terms
+    one = replace(one, bending=one.distortion_terms or bent)
     middle = astrometry.wcs(one, *POINTED)
     spread = np.random.default_rng(5)
     stars = astrometry.sky_of_pixel(middle, *spread.uniform(-200.0, 1224.0, (2, 70)))

@@ -8,7 +8,7 @@ from matplotlib.image import imread
 
 from lake_schema.fits import images
 from lake_schema.mission.configuration import resolve
-from lake_schema.sky import displaced
+from lake_schema.sky import offset_positions
 from truesky.render.camera import astrometry, detectors
 from truesky.render.products import same_sky
 
@@ -46,7 +46,7 @@ def rows(tmp_path_factory):
         data = rng.normal(100.0, 10.0, (detector.ny, detector.nx)).astype(np.float32)
         for east, north, electrons in STARS:
             step = np.radians(np.array([[east], [north]]) / 3600.0)
-            at = displaced(np.array([PLACE[0]]), np.array([PLACE[1]]), *step)
+            at = offset_positions(np.array([PLACE[0]]), np.array([PLACE[1]]), *step)
             column, row = (round(float(v[0])) for v in astrometry.pixel_of_sky(system, *at))
             data[row - 3 : row + 4, column - 3 : column + 4] += electrons / 49
         file = folder / f"{number}.fits"

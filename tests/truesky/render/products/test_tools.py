@@ -47,7 +47,7 @@ def tool(name, where="Debian: apt install source-extractor scamp swarp"):
 
 
 # Raw headers that are sure of their place.
-SURE = MISSION.overridden_with(
+SURE = MISSION.with_overrides(
     {f"ext.{camera}.header.{error}": (0.0, "arcsec") for camera in CAMERAS for error in ("offset", "rotation")}
 )
 
@@ -158,7 +158,7 @@ def said(path):
 
 def test_stars_are_where_the_headers_have_them(field):
     """Of the file, and of the text beside it, as astropy reads them."""
-    convention = observatories.of(field.one.exposure.camera).convention
+    convention = observatories.for_camera(field.one.exposure.camera).convention
     of_file = [header for header, _ in arrays(field.path)]
     for headers, form in ((of_file, convention), (said(field.path), "tpv")):
         assert all(header["CTYPE1"].endswith(form.upper()) for header in headers)
@@ -197,7 +197,7 @@ def test_source_extractor_reads_the_saturation_and_the_gain(vis):
     bright = row[row["FLUX_AUTO"] > 1e4]
     assert len(bright) == STARS
     assert not (bright["FLAGS"] & 4).any()
-    electrons = bright["FLUX_AUTO"] * vis.one.scene.of_amplifiers("gain", "electron / adu")
+    electrons = bright["FLUX_AUTO"] * vis.one.scene.amplifier_values("gain", "electron / adu")
     assert bright["FLUX_AUTO"] / bright["FLUXERR_AUTO"] == pytest.approx(np.sqrt(electrons), rel=0.1)
 
 
@@ -308,5 +308,5 @@ def test_ccdproc_reduces_a_raw_frame_by_its_header(camera, tmp_path):
     left = found - np.asarray(one.noise_free, float)
     # Of VIS the amplifiers' response is not linear.
     assert np.median(left) == pytest.approx(sky, rel=0.02)
-    noise = np.hypot(np.sqrt(sky), np.mean(one.scene.of_amplifiers("read_noise", "electron")))
+    noise = np.hypot(np.sqrt(sky), np.mean(one.scene.amplifier_values("read_noise", "electron")))
     assert 1.4826 * np.median(np.abs(left - np.median(left))) == pytest.approx(noise, rel=0.1)

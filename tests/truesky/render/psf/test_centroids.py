@@ -24,7 +24,7 @@ def shifted(x, y, sigma=0.9, samples=3, side=24):
 def psf_of(*planes, drift=(), samples=3):
     images, more = np.stack(planes), np.stack(drift) if drift else np.zeros((0, *planes[0].shape), np.float32)
     waves = 6000.0 + 1000.0 * np.arange(len(planes))
-    return model.sampled(
+    return model.from_planes(
         model.Planes(waves, images, more, (50.0, 50.0), ((1, 0, 0),) * len(drift), samples), 0.1, False, 24
     )
 
@@ -46,7 +46,7 @@ def test_of_a_shifted_gaussian_it_is_the_shift(samples):
 def test_of_an_even_number_of_samples_it_is_the_shift():
     waves, none = np.array([6000.0]), np.zeros((0, 49, 49), np.float32)
     planes = model.Planes(waves, shifted(0.1, -0.05, samples=2)[None], none, (50.0, 50.0), (), 2)
-    x, y = offsets(model.sampled(planes, 0.1, False, 24), np.ones((1, 1)))
+    x, y = offsets(model.from_planes(planes, 0.1, False, 24), np.ones((1, 1)))
     assert (x[0], y[0]) == pytest.approx((0.1, -0.05), rel=0.05)
 
 
@@ -63,7 +63,7 @@ def test_of_colours_and_places_it_is_between():
 
 
 def test_of_a_round_disc_it_is_nothing():
-    psf = seeing.ground_psf(0.73, 3.0, 0.2)
+    psf = seeing.moffat_psf(0.73, 3.0, 0.2)
     assert np.abs(offsets(psf, np.ones((3, 1)))).max() < 1e-6
 
 

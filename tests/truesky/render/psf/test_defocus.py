@@ -19,7 +19,7 @@ def image(nm, place=(0.4, -0.6)):
     """Diffracted light of a place in the field, without any blur."""
     mission = at(nm)
     own = euclid.wavefront(*place, "vis", mission)
-    return diffraction.diffracted(own, diffraction.optics_of(10 * WAVELENGTH, SAMPLING, mission, 2048), SIDE)
+    return diffraction.diffraction_image(own, diffraction.optics_of(10 * WAVELENGTH, SAMPLING, mission, 2048), SIDE)
 
 
 def test_in_focus_it_is_the_psf_of_science_exposures():
@@ -74,6 +74,6 @@ def test_on_either_side_of_the_focus_the_pupil_is_upside_down():
     mission, one, other = at(0.0), *(np.zeros(5) for _ in range(2))
     one[4], other[4] = 300.0, -300.0
     optics = diffraction.optics_of(10 * WAVELENGTH, SAMPLING, mission, 2048)
-    before, after = (diffraction.diffracted(nm, optics, SIDE) for nm in (one, other))
+    before, after = (diffraction.diffraction_image(nm, optics, SIDE) for nm in (one, other))
     np.testing.assert_allclose(before, after[::-1, ::-1], atol=1e-3 * before.max())
     assert np.abs(before - after).max() > 0.2 * before.max()

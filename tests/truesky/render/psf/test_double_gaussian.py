@@ -60,7 +60,7 @@ def test_the_core_is_a_value_of_the_mission():
     detector, waves = detectors.detector("nisp", "DET22", GAUSSIANS), np.array([15_000.0])
     images = []
     for core in (0.6, 0.75):
-        own = GAUSSIANS.overridden_with({"nisp.spectra.core": (core, "")})
+        own = GAUSSIANS.with_overrides({"nisp.spectra.core": (core, "")})
         images.append(double_gaussian.psf_at(detector, waves, own).planes.images[0].astype(float))
     assert np.abs(images[0] - images[1]).max() > 0.05 * images[0].max()
 

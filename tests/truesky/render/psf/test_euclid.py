@@ -13,7 +13,7 @@ from lake_schema.mission.configuration import resolve
 from truesky.fluxes import passbands
 from truesky.render.camera.detectors import detector
 from truesky.render.psf import diffraction, euclid, sub_bands
-from truesky.render.psf.seeing import ground_psf
+from truesky.render.psf.seeing import moffat_psf
 
 # The published widths are for 25 mas of jitter on each axis.
 MISSION = resolve(overrides={f"svm.aocs.jitter_{axis}": (25.0, "mas") for axis in "xy"})
@@ -61,7 +61,7 @@ def test_wavefront_error_over_the_field():
 
 
 def plane(nm, wavelength):
-    return diffraction.diffracted(nm, diffraction.optics_of(wavelength, SAMPLING, MISSION, 2048), 513)
+    return diffraction.diffraction_image(nm, diffraction.optics_of(wavelength, SAMPLING, MISSION, 2048), 513)
 
 
 def test_diffraction_is_galsims():
@@ -96,7 +96,7 @@ def test_wings_hold_what_edges_diffract(wavelength):
     clear = diffraction.pupil(x, y, 1.0, MISSION)
     perimeter = np.hypot(*np.gradient(clear)).sum()
     optics = diffraction.optics_of(wavelength, SAMPLING, MISSION, 2048)
-    image = diffraction.diffracted(np.zeros(12), optics).astype(float)
+    image = diffraction.diffraction_image(np.zeros(12), optics).astype(float)
     grid = (np.arange(len(image)) - len(image) // 2) * SAMPLING
     radius = np.hypot(*np.meshgrid(grid, grid))
     for angle in (5.0, 10.0, 25.0):
@@ -106,7 +106,7 @@ def test_wings_hold_what_edges_diffract(wavelength):
 
 def test_a_part_of_the_light_is_a_part_of_the_whole():
     nm, optics = euclid.wavefront(-0.4, 0.8, "vis", MISSION), diffraction.optics_of(6000.0, SAMPLING, MISSION, 768)
-    whole, part = diffraction.diffracted(nm, optics), diffraction.diffracted(nm, optics, 201)
+    whole, part = diffraction.diffraction_image(nm, optics), diffraction.diffraction_image(nm, optics, 201)
     np.testing.assert_allclose(part, whole[284:485, 284:485], rtol=1e-5, atol=1e-12)
 
 
@@ -114,11 +114,11 @@ def test_a_part_of_the_light_is_a_part_of_the_whole():
 def test_blur_is_a_gaussian_in_fourier_space(blur):
     """arcsec2 along x and y; against the product of transforms, of the light as diffracted."""
     nm, n = euclid.wavefront(0.6, 0.3, "vis", MISSION), 768
-    optics, weights = diffraction.optics_of(5500.0, SAMPLING, MISSION, n), euclid._weights_of(blur, SAMPLING)
-    found = euclid._blurred(diffraction.diffracted(nm, optics, 301 + 2 * euclid._margin(weights)), weights)
+    optics, weights = diffraction.optics_of(5500.0, SAMPLING, MISSION, n), euclid._blur_weights(blur, SAMPLING)
+    found = euclid._blur_image(diffraction.diffraction_image(nm, optics, 301 + 2 * euclid._margin(weights)), weights)
     k = 2 * np.pi * np.fft.fftfreq(n, SAMPLING)
     passed = np.exp(-0.5 * (blur[0] * k**2 + blur[1] * k[:, None] ** 2))
-    sky = np.fft.fft2(diffraction.diffracted(nm, optics).astype(float)) * passed
+    sky = np.fft.fft2(diffraction.diffraction_image(nm, optics).astype(float)) * passed
     expected = np.fft.ifft2(sky).real[n // 2 - 150 : n // 2 + 151, n // 2 - 150 : n // 2 + 151]
     assert found.sum() == pytest.approx(expected.sum(), rel=1e-6)
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6 * expected.max())
@@ -157,7 +157,7 @@ def test_the_psf_is_as_wide_as_measured(vis):
 def test_blue_light_spreads_wider_in_the_silicon(vis):
     """Against light that spreads as at 800 nm: a Gaussian of 0.32 pixel times the wavelength to the power of -0.35."""
     even = euclid.vis_psf(
-        detector("vis", "3-4", MISSION), BAND, MISSION.overridden_with({"vis.diffusion_slope": (0.0, "")})
+        detector("vis", "3-4", MISSION), BAND, MISSION.with_overrides({"vis.diffusion_slope": (0.0, "")})
     )
     for wavelength, image, less in zip(vis.planes.wavelength, vis.planes.images, even.planes.images, strict=True):
         sigma = np.array([0.32 * (wavelength / 8000) ** -0.35, 0.32]) * 3
@@ -222,7 +222,7 @@ def test_planes_carry_equal_photons():
 
 @pytest.mark.parametrize(("seeing", "beta", "pixel"), [(0.73, 3.0, 0.2), (1.2, 3.5, 0.26)])
 def test_the_seeing_disc(seeing, beta, pixel):
-    disc = ground_psf(seeing, beta, pixel)
+    disc = moffat_psf(seeing, beta, pixel)
     assert disc.fwhm == pytest.approx(np.hypot(seeing, 0.6 * pixel), rel=0.02)
     scale = seeing / (2 * np.sqrt(2 ** (1 / beta) - 1))
     for r in (5, 10, 20):

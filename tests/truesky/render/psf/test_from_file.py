@@ -59,7 +59,7 @@ def test_a_cube_of_one_plane(tmp_path):
     theirs = 1e5 * y[:, None] * x
     np.testing.assert_allclose(star(psf, detector), theirs, atol=2e-4 * theirs.max())
     one = one_source(detector, wcs(detector, 10.0, 20.0, 0.0), 1e5, 80.3, 77.6, inclination=50.0)
-    ours, theirs = stamps.draw(one, np.array([128]), psf, 160, 160), reference.reference(one, 0, psf, 160)
+    ours, theirs = stamps.draw(one, np.array([128]), psf, 160, 160), reference.draw_reference(one, 0, psf, 160)
     theirs = np.roll(theirs, (78 - 80, 80 - 80), (0, 1))
     assert np.abs(ours - theirs)[10:-10, 10:-10].max() < 2e-4 * theirs.max()
 
@@ -161,7 +161,7 @@ def test_galaxies_through_a_psfex_file(tmp_path):
     system = wcs(detector, *boresight_for(detector, 10.0, 20.0, 33.0))
     source = one_source(detector, system, 1e5, 80.3, 77.6, inclination=50.0, disk_half_light_radius=1.2)
     ours = stamps.draw(source, np.array([128]), psf, 160, 160)
-    theirs = np.roll(reference.reference(source, 0, psf, 160), (78 - 80, 80 - 80), (0, 1))
+    theirs = np.roll(reference.draw_reference(source, 0, psf, 160), (78 - 80, 80 - 80), (0, 1))
     assert np.abs(ours - theirs)[10:-10, 10:-10].max() < 2e-4 * theirs.max()
 
 
@@ -216,7 +216,7 @@ def test_a_request_names_it_by_band_and_detector(lake, tmp_path):
         psfex(tmp_path / f"{name}.psf")
     _, exposures, _ = plan_exposures.plan(lake, asked(tmp_path, lsst_r="{detector}.psf"))
     (row,) = exposures.to_pylist()
-    assert from_file.file_of(row["psf"], "R22_S12") == tmp_path / "R22_S12.psf"
+    assert from_file.path_for_detector(row["psf"], "R22_S12") == tmp_path / "R22_S12.psf"
     (tmp_path / "R22_S12.psf").unlink()
     with pytest.raises(BadInput, match=r"R22_S12.psf: no such file"):
         plan_exposures.plan(lake, asked(tmp_path, lsst_r="{detector}.psf"))

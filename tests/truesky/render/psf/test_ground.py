@@ -44,7 +44,7 @@ def detector_of(camera):
 @cache
 def psf_of(camera="lsstcam", positions=9, mission=None, air=AIR):
     band = passbands.load(CASES[camera][1])
-    return ground.through_air(air, detector_of(camera), band, mission or MISSION, positions)
+    return ground.atmospheric_psf(air, detector_of(camera), band, mission or MISSION, positions)
 
 
 def shape_of(image, step, width=0.5):
@@ -86,13 +86,13 @@ def test_air_refracts_as_published():
 )
 def test_the_whole_of_it_is_galsim_s(camera):
     """Atmosphere, obscured pupil and aberrations of one wavelength, but for where the centroid lies."""
-    detector, telescope = detector_of(camera), aberrations.Telescope.of(f"ext.{camera}", MISSION)
+    detector, telescope = detector_of(camera), aberrations.Telescope.from_mission(f"ext.{camera}", MISSION)
     wave, nm = 6200.0, ground._wavefront(detector, 0.5, -0.8, MISSION)
     fried = atmosphere.fried_length(0.7, wave, telescope.outer)
     samples, step = 3, detector.pixel_scale / 3
-    grid = ground._Grid.of(128, samples, detector.pixel_scale)
-    ratio = aberrations.Ratio.of(nm, telescope, wave, fried, 0.0)
-    ours = grid.image(grid.passed(wave, fried, telescope, AIR) * grid.interpolated(ratio, wave))
+    grid = ground._Grid.from_pixels(128, samples, detector.pixel_scale)
+    ratio = aberrations.TransferRatio.from_wavefront(nm, telescope, wave, fried, 0.0)
+    ours = grid.image(grid.transfer(wave, fried, telescope, AIR) * grid.interpolate_ratio(ratio, wave))
     middle, half = len(ours) // 2, 60
     ours = ours[middle - half : middle + half + 1, middle - half : middle + half + 1]
     optics = galsim.OpticalPSF(
@@ -126,7 +126,7 @@ def test_it_changes_across_a_detector_as_the_optics_do(positions, size, elliptic
     mission, whole = bare("lsstcam"), detector_of("lsstcam")
     psf = psf_of(positions=positions, mission=mission)
     there = replace(whole, x=whole.x + 0.6 * whole.nx * 0.1, y=whole.y - 0.8 * whole.ny * 0.1)
-    wanted = ground.through_air(AIR, there, passbands.load("lsst_r"), mission, 1)
+    wanted = ground.atmospheric_psf(AIR, there, passbands.load("lsst_r"), mission, 1)
     column, row = ((n - 1) / 2 + 0.5 * part * n for n, part in ((whole.nx, 0.6), (whole.ny, -0.8)))
     weights = transfer.basis_weights(psf, None, np.array([column]), np.array([row]))[0]
     step = whole.pixel_scale / psf.planes.samples
@@ -143,7 +143,7 @@ def test_it_changes_across_a_detector_as_the_optics_do(positions, size, elliptic
 
 def test_blue_light_is_wider_and_lifted_towards_the_zenith():
     """FWHM as lambda^-0.3; the centroids of wavelengths lie where refraction puts them, the mean in the middle."""
-    air = replace(AIR, slope=-0.3, lift=0.66, zenith=np.radians(30.0), height=2700.0)
+    air = replace(AIR, slope=-0.3, tan_zenith_distance=0.66, zenith=np.radians(30.0), height=2700.0)
     psf = psf_of("decam", 1, bare("decam", **{"psf.wavefront_scale": (0.0, "")}), air)
     waves, step = psf.planes.wavelength, 0.2637 / psf.planes.samples
     assert len(waves) == 8
@@ -173,10 +173,10 @@ def test_the_air_s_ellipticity_is_the_exposure_s():
 
     first = detector_of("lsstcam")
     turned = replace(first, rotation=90.0)
-    airs = [ground.air_of(row(60000.0 + 0.01 * i), first, MISSION).shear for i in range(400)]
+    airs = [ground.exposure_air(row(60000.0 + 0.01 * i), first, MISSION).shear for i in range(400)]
     assert np.std(airs, axis=0) == pytest.approx([0.01, 0.01], rel=0.12)
     assert np.abs(np.mean(airs, axis=0)).max() < 0.002
-    np.testing.assert_allclose(ground.air_of(row(60000.0), turned, MISSION).shear, -np.array(airs[0]), atol=1e-12)
+    np.testing.assert_allclose(ground.exposure_air(row(60000.0), turned, MISSION).shear, -np.array(airs[0]), atol=1e-12)
     plain = bare("lsstcam", **{"psf.wavefront_scale": (0.0, "")})
     psf = psf_of("lsstcam", 1, plain, replace(AIR, shear=(0.03, -0.02)))
     step, wave = 0.2000587 / psf.planes.samples, float(psf.planes.wavelength[0])
@@ -194,7 +194,7 @@ def test_a_profile_is_chosen_by_a_number():
     detector, band = small("lsstcam", "R22_S11"), passbands.load("lsst_r")
     row = ExposureRow(1, "EXT", "lsstcam", "lsst_r", "science", 10.0, -20.0, 0.0, 6e4, 30.0, 1.0, 0.9, 28.0, "x")
     missions = [resolve(overrides={"ext.lsstcam.psf.profile": (float(i), "")}) for i in (0, 1, 2)]
-    round_, moffat, air = (seeing.of_exposure(row, detector, band, mission, 4) for mission in missions)
+    round_, moffat, air = (seeing.exposure_psf(row, detector, band, mission, 4) for mission in missions)
     assert [psf.planes is None for psf in (round_, moffat, air)] == [True, True, False]
     for psf in (round_, moffat, air):
         assert psf.fwhm == pytest.approx(np.hypot(0.9, 0.6 * 0.2), rel=0.03)
@@ -202,7 +202,7 @@ def test_a_profile_is_chosen_by_a_number():
     beyond = [float(psf.outside[15]) for psf in (round_, moffat, air)]
     assert beyond[0] < 1e-9
     assert 0.002 < beyond[1] < 0.01 < beyond[2] < 0.04
-    assert [seeing.edges_of(detector, band, mission) is None for mission in missions] == [True, True, False]
+    assert [seeing.typical_edges(detector, band, mission) is None for mission in missions] == [True, True, False]
 
 
 def test_a_seeing_finer_than_a_pixel_is_refused():
@@ -214,22 +214,22 @@ def test_a_seeing_that_turbulence_does_not_make_is_refused_before_it_is_rendered
     """Waves of two metres at most have no air of half an arcsec."""
     calm = resolve(overrides={"ext.lsstcam.psf.outer_scale": (2.0, "m")})
     detector, band = small("lsstcam", "R22_S11"), passbands.load("lsst_r")
-    for found in (seeing.check, lambda wide, *others: ground.through_air(ground.Air(wide), *others, 1)):
+    for found in (seeing.check, lambda wide, *others: ground.atmospheric_psf(ground.Air(wide), *others, 1)):
         with pytest.raises(OutOfRange, match=r"seeing of ext\.lsstcam .*0.5 is outside"):
             found(0.5, detector, band, calm)
     seeing.check(1.1, detector, band, calm)
-    assert ground.through_air(ground.Air(1.1), detector, band, calm, 1).fwhm == pytest.approx(1.1, rel=0.05)
+    assert ground.atmospheric_psf(ground.Air(1.1), detector, band, calm, 1).fwhm == pytest.approx(1.1, rel=0.05)
 
 
 @pytest.mark.parametrize("wide", [4.0, 9.5])
 def test_the_worst_seeing_has_its_width(wide):
     """Of what is wider than the core in which a FWHM is looked for; its PSFEx model has more than a sample."""
     detector, band = small("lsstcam", "R22_S11"), passbands.load("lsst_r")
-    psf = ground.through_air(ground.Air(wide), detector, band, MISSION, 1)
+    psf = ground.atmospheric_psf(ground.Air(wide), detector, band, MISSION, 1)
     assert psf.fwhm == pytest.approx(psf.profile.calculateFWHM(), rel=5e-3)
     # Spikes are as narrow as in any seeing.
     assert psf.fwhm == pytest.approx(wide, rel=0.04)
-    planes, _ = to_psfex.model_of(psf)
+    planes, _ = to_psfex.psfex_planes(psf)
     assert planes.shape[-1] > 100
 
 
@@ -237,7 +237,7 @@ def test_the_brightest_star_has_no_seam_and_no_hole():
     """Sirius in LSST: rings, aureole and spikes go on beyond the plane, and nowhere is less than nothing."""
     detector = replace(small("lsstcam", "R22_S11"), nx=700, ny=700)
     band, electrons = passbands.load("lsst_r"), 30.0 * 10 ** (0.4 * (28.36 + 1.0))
-    psf = ground.through_air(AIR, detector, band, MISSION, 1)
+    psf = ground.atmospheric_psf(AIR, detector, band, MISSION, 1)
     star = one_source(detector, wcs(detector, 10.0, -20.0, 0.0), electrons, 350.3, 349.6)
     image = stamps.draw(star, np.array([256]), psf, 700, 700)
     assert image.min() > 0.0
@@ -245,7 +245,7 @@ def test_the_brightest_star_has_no_seam_and_no_hole():
     x, y = x - 350.3, y - 349.6
     amplitude, core = psf.edges.aureole
     r2 = x**2 + y**2
-    law = electrons * (amplitude / (r2 + core) + spikes.ring(psf.edges, np.full(8, 1 / 8)) / r2**1.5)
+    law = electrons * (amplitude / (r2 + core) + spikes.ring_light(psf.edges, np.full(8, 1 / 8)) / r2**1.5)
     # Away from the spikes, which lie along the diagonals.
     off = (np.abs(np.abs(x) - np.abs(y)) > 60) & (r2 > 60**2)
     ratio = image[off] / law[off]
@@ -270,8 +270,8 @@ def test_refraction_lifts_towards_the_zenith_on_the_sky(camera, name):
             1, "EXT", camera, "x", "science", 10.0, -20.0, 33.0, 6e4, 30.0, 1.0, 0.7, 28.0, "x",
             airmass=1.4, zenith=zenith,
         )  # fmt: skip
-        air = ground.air_of(row, detector, MISSION)
-        assert air.lift == pytest.approx(np.sqrt(1.4**2 - 1.0))
+        air = ground.exposure_air(row, detector, MISSION)
+        assert air.tan_zenith_distance == pytest.approx(np.sqrt(1.4**2 - 1.0))
         system = wcs(detector, 10.0, -20.0, 33.0)
         middle = (detector.nx - 1) / 2, (detector.ny - 1) / 2
         turns = np.cos(air.zenith), np.sin(air.zenith)
@@ -283,4 +283,4 @@ def test_refraction_lifts_towards_the_zenith_on_the_sky(camera, name):
         found.append(ground.edges(air, detector, band, MISSION).bars[0, 0] - air.zenith)
     assert (found[0] == pytest.approx(found[1])) == (camera == "lsstcam")
     without = resolve(overrides={f"ext.{camera}.psf.refraction": (0.0, "")})
-    assert ground.air_of(row, detector, without).lift == 0.0
+    assert ground.exposure_air(row, detector, without).tan_zenith_distance == 0.0

@@ -47,9 +47,9 @@ def test_galsim_opens_it_and_sees_the_same_stars(tmp_path, camera, name, band, s
     mission = resolve(overrides={f"ext.{camera}.psf.wavefront_scale": (strength, "")})
     whole = detectors.detector(camera, name, mission)
     air = ground.Air(0.7, (0.02, -0.01), -0.3)
-    psf = ground.through_air(air, whole, passbands.load(band), mission, 9)
+    psf = ground.atmospheric_psf(air, whole, passbands.load(band), mission, 9)
     path = tmp_path / "a.psf"
-    to_psfex.written(psf, whole, path)
+    to_psfex.write(psf, whole, path)
     model, found = galsim.des.DES_PSFEx(str(path)), []
     for column, row in ((60.3, 80.6), ((whole.nx - 1) / 2, (whole.ny - 1) / 2), (whole.nx - 50.2, whole.ny - 70.9)):
         star = one_source(whole, wcs(whole, 10.0, 20.0, 0.0), 1e6, column, row)
@@ -72,8 +72,8 @@ def test_galsim_opens_it_and_sees_the_same_stars(tmp_path, camera, name, band, s
 
 def test_a_profile_without_planes_is_written_too(tmp_path):
     detector = cut("jpcam", detectors.detectors("jpcam", MISSION)[0].name)
-    psf, path = seeing.ground_psf(1.1, 3.0, detector.pixel_scale), tmp_path / "a.psf"
-    to_psfex.written(psf, detector, path)
+    psf, path = seeing.moffat_psf(1.1, 3.0, detector.pixel_scale), tmp_path / "a.psf"
+    to_psfex.write(psf, detector, path)
     star = one_source(detector, wcs(detector, 10.0, 20.0, 0.0), 1e6, 150.2, 149.7)
     ours = stamps.draw(star, np.array([256]), psf, 300, 300)
     place = galsim.PositionD(151.2, 150.7)
@@ -84,7 +84,7 @@ def test_a_profile_without_planes_is_written_too(tmp_path):
     with fits.open(path, checksum=True) as units:
         assert units[1].header["PSF_FWHM"] == pytest.approx(psf.fwhm / detector.pixel_scale)
     first = path.read_bytes()
-    to_psfex.written(psf, detector, path)
+    to_psfex.write(psf, detector, path)
     assert path.read_bytes() == first
 
 

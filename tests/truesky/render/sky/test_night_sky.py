@@ -21,7 +21,7 @@ def night(camera, band):
     zero_point = MISSION.value(f"ext.{camera}.{band}.zero_point", "mag")
     detector = detectors.detectors(camera, MISSION)[0]
     level = diffuse_light.ground_sky(detector, band, MISSION).constant
-    return zero_point, Night.of(detector, band, (zero_point, level), MISSION, None)
+    return zero_point, Night.from_detector(detector, band, (zero_point, level), MISSION, None)
 
 
 def brightness(camera, band, ra, dec, mjd):
@@ -89,10 +89,10 @@ def test_moonlight_is_krisciunas_and_schaefer_s():
     site = own.site
     times = 60918.0 + np.arange(0.0, 14.0, 0.01)
     for mjd in times[::37]:
-        moon_ra, moon_dec, phase = (float(x) for x in observatory.moon(mjd))
+        moon_ra, moon_dec, phase = (float(x) for x in observatory.moon_position(mjd))
         up = float(observatory.moon_altitude(mjd, site))
         ra, dec = (moon_ra + 60.0) % 360.0, moon_dec
-        airmass = observatory.aloft(ra, dec, mjd, site)[0]
+        airmass = observatory.airmass_and_zenith(ra, dec, mjd, site)[0]
         found = night_sky.moonlight(own, ra, dec, mjd, airmass)
         if up <= 0.0:
             assert found == 0.0
@@ -108,7 +108,7 @@ def test_moonlight_is_krisciunas_and_schaefer_s():
     # A full Moon at 60 deg: some 3 mag brighter in V than 21.6; the less the redder.
     full = 60925.76 + np.arange(-1.0, 1.0, 0.02)
     mjd = float(full[np.argmax([observatory.moon_altitude(t, site) for t in full])])
-    ra, dec, _ = (float(x) for x in observatory.moon(mjd))
+    ra, dec, _ = (float(x) for x in observatory.moon_position(mjd))
     changes = []
     for band in ("lsst_g", "lsst_r", "lsst_i", "lsst_y"):
         zero_point, one = night("lsstcam", band)
@@ -127,7 +127,8 @@ def test_zodiacal_light_is_brightest_in_the_ecliptic():
         rates = [
             night_sky.sky_rate(night("lsstcam", "lsst_g")[1], ra, dec, t, MISSION)
             for t in 60940.0 + np.arange(0.0, 1.0, 0.01)
-            if observatory.moon_altitude(t, site) < 0 and abs(observatory.aloft(ra, dec, t, site)[0] - 1.2) < 0.1
+            if observatory.moon_altitude(t, site) < 0
+            and abs(observatory.airmass_and_zenith(ra, dec, t, site)[0] - 1.2) < 0.1
         ]
         found.append(np.mean(rates))
     assert 1.1 < found[0] / found[1] < 1.8
@@ -135,6 +136,6 @@ def test_zodiacal_light_is_brightest_in_the_ecliptic():
 
 def test_the_air_dims_what_the_zero_point_is_of():
     _, own = night("lsstcam", "lsst_u")
-    assert night_sky.fainter(own, 1.0) == 0.0
-    assert night_sky.fainter(own, 1.5) == pytest.approx(0.2455)
-    assert night_sky.fainter(night("decam", "des_r")[1], 1.2) == pytest.approx(0.0, abs=1e-12)
+    assert night_sky.extra_extinction(own, 1.0) == 0.0
+    assert night_sky.extra_extinction(own, 1.5) == pytest.approx(0.2455)
+    assert night_sky.extra_extinction(night("decam", "des_r")[1], 1.2) == pytest.approx(0.0, abs=1e-12)

@@ -10,7 +10,7 @@ from lake_schema.sky import separation
 from truesky.render.sky import observatory
 
 MISSION = resolve()
-LSST, CFHT = (observatory.Site.of(f"ext.{camera}", MISSION) for camera in ("lsstcam", "megacam"))
+LSST, CFHT = (observatory.Site.from_mission(f"ext.{camera}", MISSION) for camera in ("lsstcam", "megacam"))
 
 
 @pytest.mark.parametrize("site", [LSST, CFHT], ids=["south", "north"])
@@ -32,7 +32,7 @@ def test_altitudes_and_zenith_are_astropy_s(site):
         ours = np.array([site.zenith(53.1, -27.8, mjd) for mjd in times.mjd])
         assert np.abs((ours - theirs + 180.0) % 360.0 - 180.0).max() < 0.4
         body = get_body("moon", times)
-        ra, dec, phase = observatory.moon(times.mjd)
+        ra, dec, phase = observatory.moon_position(times.mjd)
         assert separation(ra, dec, body.ra.deg, body.dec.deg).max() < 0.5
         moon = get_body("moon", times, place).transform_to(frame)
         assert np.abs(moon.alt.deg - observatory.moon_altitude(times.mjd, site)).max() < 0.5
@@ -50,33 +50,35 @@ def test_airmass():
 
 @given(st.floats(0.0, 359.9), st.floats(-90.0, 90.0), st.floats(60000.0, 62000.0), st.sampled_from([LSST, CFHT]))
 def test_every_field_has_an_airmass(ra, dec, mjd, site):
-    found, zenith = observatory.aloft(ra, dec, mjd, site)
+    found, zenith = observatory.airmass_and_zenith(ra, dec, mjd, site)
     assert 1.0 <= found <= observatory.HIGHEST_AIRMASS
     assert -180.0 <= zenith <= 180.0
 
 
 @pytest.mark.parametrize("start", [60000.0, 60100.3, 60290.9])
 def test_surveys_wait_for_the_night(start):
-    found = observatory.next_dark(53.1, -27.8, start, LSST)
+    found = observatory.next_dark_time(53.1, -27.8, start, LSST)
     assert start <= found < start + 120.0
     sun = observatory.equatorial(observatory.sun_longitude(found), 0.0)
     assert LSST.altitude(*sun, found) < -15.0
-    assert observatory.aloft(53.1, -27.8, found, LSST)[0] <= 2.0
-    ra, dec, _ = observatory.moon(found)
+    assert observatory.airmass_and_zenith(53.1, -27.8, found, LSST)[0] <= 2.0
+    ra, dec, _ = observatory.moon_position(found)
     assert observatory.moon_altitude(found, LSST) < 0.0 or separation(53.1, -27.8, ra, dec) > 30.0
     # The pole star is never seen from there.
-    assert observatory.next_dark(30.0, 89.0, start, LSST) == start
+    assert observatory.next_dark_time(30.0, 89.0, start, LSST) == start
 
 
 def test_a_field_that_never_rises_is_not_waited_for(monkeypatch):
     """400 days of each of a survey's exposures would be looked through in vain."""
     looked = []
-    monkeypatch.setattr(observatory, "_dark", lambda ra, dec, mjd, site: looked.append(mjd) or np.zeros(len(mjd), bool))
-    assert observatory.next_dark(30.0, 80.0, 60000.3, LSST) == 60000.3
-    assert observatory.next_dark(30.0, -60.0, 60000.3, CFHT) == 60000.3
+    monkeypatch.setattr(
+        observatory, "_is_dark", lambda ra, dec, mjd, site: looked.append(mjd) or np.zeros(len(mjd), bool)
+    )
+    assert observatory.next_dark_time(30.0, 80.0, 60000.3, LSST) == 60000.3
+    assert observatory.next_dark_time(30.0, -60.0, 60000.3, CFHT) == 60000.3
     assert looked == []
     # One that does is, whether it is high or just high enough.
     for dec in (-30.0, 29.0):
-        observatory.next_dark(30.0, dec, 60000.3, LSST)
+        observatory.next_dark_time(30.0, dec, 60000.3, LSST)
         assert looked
         looked.clear()

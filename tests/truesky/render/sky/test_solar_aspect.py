@@ -31,7 +31,7 @@ def test_the_stretches_are_those_in_which_the_sun_is_where_it_should(ra, dec, st
     days = np.arange(start, start + 399.0, 0.5)
     aspect = by_astropy(ra, dec, days)
     inside = np.zeros(days.size, bool)
-    for first, last in solar_aspect.allowed(ra, dec, start, MISSION):
+    for first, last in solar_aspect.allowed_intervals(ra, dec, start, MISSION):
         inside |= (first <= days) & (days <= last)
     # The tolerance is 0.05 deg, the Sun is good to 0.02.
     assert inside[(aspect > LOWEST) & (aspect < HIGHEST)].all()
@@ -40,7 +40,7 @@ def test_the_stretches_are_those_in_which_the_sun_is_where_it_should(ra, dec, st
 
 
 def test_the_poles_of_the_ecliptic_are_always_allowed():
-    assert list(solar_aspect.allowed(270.0, 66.5607, 60300.0, MISSION)) == [(60300.0, 60700.0)]
+    assert list(solar_aspect.allowed_intervals(270.0, 66.5607, 60300.0, MISSION)) == [(60300.0, 60700.0)]
 
 
 def test_a_refusal_names_dates_that_are_allowed():

@@ -49,10 +49,10 @@ class Catalogue:
     def padding(self):
         return self.bent
 
-    def place(self):
+    def position_columns(self):
         return "ra", "dec"
 
-    def in_cells(self, cells, order, columns):
+    def rows_in_cells(self, cells, order, columns):
         assert order == 8
         return self.rows.filter(pa.array(np.isin(self.cells, cells)))
 
@@ -61,7 +61,7 @@ def place():
     """A place such that what is seen 3 minutes of arc north of the detector lies in cells that are not needed."""
     for dec in np.arange(-28.0, -27.0, 0.01):
         task = {"ra": 53.1, "dec": dec, "radius": (DETECTOR.half_diagonal + MARGIN) / 3600}
-        if sky.cell_of([53.1], [dec + 190.0 / 3600], 8)[0] not in selection.needed(task, 0.0):
+        if sky.cell_at([53.1], [dec + 190.0 / 3600], 8)[0] not in selection.cells_of_task(task, 0.0):
             return task
     raise AssertionError("no such place")
 
@@ -81,10 +81,10 @@ def rendered(distance, flux=1e6, drawn=None, found=True, **shape):
     light = fluxes(body, BAND, flux)
     complete = 0.0
     if found:
-        cells = sky.cell_of([task["ra"]], [task["dec"] + distance / 3600], 8)
+        cells = sky.cell_at([task["ra"]], [task["dec"] + distance / 3600], 8)
         wanted = set(sky.cells_in_cone(task["ra"], task["dec"], 1.0, 8).tolist()) if drawn is None else drawn(task)
-        least = limits_of(exposed, DETECTOR, "lsst_r").least
-        body, light, complete = catalogue_rows.sources(
+        least = limits_of(exposed, DETECTOR, "lsst_r").min_flux
+        body, light, complete = catalogue_rows.read_sources(
             Catalogue(body, cells, wanted), Catalogue(light, cells, wanted), task, [], [BAND], FARTHER, least
         )
     tables = body, light, nothing, fluxes(nothing, BAND, 1.0)
@@ -100,7 +100,7 @@ def test_a_large_bright_source_fades_across_the_margin_and_never_vanishes():
         light.append(float(one.noise_free.sum()))
     assert (np.diff(light) < 0).all()
     assert light[-1] > 0
-    assert one.complete == pytest.approx(stamp_sizes.reach(0.2), abs=0.5)
+    assert one.complete_margin_arcsec == pytest.approx(stamp_sizes.reach(0.2), abs=0.5)
 
 
 def test_what_lies_beyond_the_reach_or_is_faint_changes_no_byte():
@@ -117,9 +117,9 @@ def test_what_lies_beyond_the_reach_or_is_faint_changes_no_byte():
 
 def test_where_the_catalogue_ends_is_said():
     """With the needed cells alone nothing is refused, but the giant beyond them is not known."""
-    one = rendered(190.0, drawn=lambda task: set(selection.needed(task, 0.0)))
+    one = rendered(190.0, drawn=lambda task: set(selection.cells_of_task(task, 0.0)))
     assert len(one.sources) == 0
-    assert MARGIN <= one.complete < 190.0 - DETECTOR.half_diagonal
+    assert MARGIN <= one.complete_margin_arcsec < 190.0 - DETECTOR.half_diagonal
 
 
 @given(st.floats(0, 360, exclude_max=True), st.floats(-90, 90), st.floats(0, 0.05), st.floats(0, 1), st.floats(0, 6.28))
@@ -132,33 +132,33 @@ def test_sources_are_found_however_they_are_deflected(ra, dec, deflection, where
     height = np.clip(np.sin(b) * np.cos(d) + np.cos(b) * np.sin(d) * np.cos(direction), -1, 1)
     turned = np.arctan2(np.sin(direction) * np.sin(d) * np.cos(b), np.cos(d) - np.sin(b) * height)
     true = (ra + np.degrees(turned)) % 360.0, np.degrees(np.arcsin(height))
-    assert sky.cell_of([true[0]], [true[1]], 8)[0] in selection.needed(task, deflection)
+    assert sky.cell_at([true[0]], [true[1]], 8)[0] in selection.cells_of_task(task, deflection)
 
 
 @given(st.floats(0, 360, exclude_max=True), st.floats(-89, 89), st.floats(0, 400), st.integers(0, 9))
 def test_completeness_ends_before_the_first_cell_that_is_missing(ra, dec, farther, which):
     task = {"ra": ra, "dec": dec, "radius": 0.1}
-    near = selection.needed(task, 0.01)
+    near = selection.cells_of_task(task, 0.01)
     drawn = set(sky.cells_in_cone(ra, dec, 0.5, 8).tolist())
-    whole, complete = selection.beyond(task, 0.01, farther, drawn)
+    whole, complete = selection.cells_beyond_task(task, 0.01, farther, drawn)
     assert complete == farther
     assert not set(whole) & set(near)
     if whole:
         missing = whole[which % len(whole)]
-        some, complete = selection.beyond(task, 0.01, farther, drawn - {missing})
+        some, complete = selection.cells_beyond_task(task, 0.01, farther, drawn - {missing})
         assert set(some) == set(whole) - {missing}
         assert complete < farther
-        assert missing not in selection.needed({**task, "radius": 0.1 + complete / 3600}, 0.01)
+        assert missing not in selection.cells_of_task({**task, "radius": 0.1 + complete / 3600}, 0.01)
 
 
 def test_the_bound_on_what_shows_holds():
     """Whatever the profile, a source below the bound is below the edge at that distance."""
     settings = settings_for(SURVEY)
-    least = stamp_sizes.least_electrons(MARGIN, 0.2, 40.0, settings)
+    least = stamp_sizes.min_noticeable_electrons(MARGIN, 0.2, 40.0, settings)
     for index in (0.5, 1.0, 4.0, 6.0):
         for radius in (1.0, 10.0, 60.0):
             form = galaxies(0.0, 0.0, bulge_sersic_index=index, bulge_half_light_radius=radius, bulge_fraction=1.0)
-            surface = galaxy_shapes.surface(galaxy_shapes.shapes(form), np.array([MARGIN]))[0, 0]
+            surface = galaxy_shapes.surface_brightness(galaxy_shapes.shapes(form), np.array([MARGIN]))[0, 0]
             assert least * surface * 0.2**2 < settings.edge * 40.0
 
 
@@ -167,12 +167,12 @@ def test_the_bound_on_what_shows_holds():
 def test_a_frame_that_no_source_shows_in_reads_none(dark):
     exposed = {**field_of("VIS")[1], **dark}
     detector, task = small("vis", "3-4"), place()
-    least = limits_of(exposed, detector).least
+    least = limits_of(exposed, detector).min_flux
     assert least == np.inf
-    cells = sky.cell_of([task["ra"]], [task["dec"]], 8)
-    assert np.isfinite(limits_of(field_of("VIS")[1], detector).least)
+    cells = sky.cell_at([task["ra"]], [task["dec"]], 8)
+    assert np.isfinite(limits_of(field_of("VIS")[1], detector).min_flux)
     body = Catalogue(galaxies(task["ra"], task["dec"], **GIANT), cells, set(cells.tolist()))
-    rows, light, complete = catalogue_rows.sources(body, body, task, [], [BAND], FARTHER, least)
+    rows, light, complete = catalogue_rows.read_sources(body, body, task, [], [BAND], FARTHER, least)
     assert len(rows) == len(light) == 0
     assert complete == FARTHER
 
@@ -186,12 +186,12 @@ def test_bright_stars_are_read_from_as_far_away_as_their_spikes_show():
     assert 23.9 - 2.5 * np.log10(spikes) == pytest.approx(11.2, abs=0.3)
     rows = stars([task["ra"]] * 2, [task["dec"] - 0.3] * 2)
     light = fluxes(rows, "euclid_vis", np.array([1.5, 0.5]) * spikes)
-    cells = sky.cell_of(rows["ra"].to_numpy(), rows["dec"].to_numpy(), 8)
+    cells = sky.cell_at(rows["ra"].to_numpy(), rows["dec"].to_numpy(), 8)
     drawn = set(sky.cells_in_cone(task["ra"], task["dec"], 1.0, 8).tolist())
     catalogues = Catalogue(rows, cells, drawn), Catalogue(light, cells, drawn)
-    least = limits_of(exposed, detector).least
+    least = limits_of(exposed, detector).min_flux
     for limit, wanted in ((spikes, [0]), (np.inf, [])):
-        found, light, complete = catalogue_rows.sources(*catalogues, task, [], ["euclid_vis"], 85.0, least, limit)
+        found, light, complete = catalogue_rows.read_sources(*catalogues, task, [], ["euclid_vis"], 85.0, least, limit)
         assert found.equals(rows.take(pa.array(wanted, pa.int64())))
         assert light["id"].equals(found["id"])
         assert complete == 85.0
@@ -216,13 +216,13 @@ class Whole:
         self.schema = self.table.schema
         self.manifest = {"parts": [{"name": "all", "facts": {"generation_cells": self.cells}}], "facts": {}}
 
-    def rows(self, columns, parts, where):
-        return self.table.filter(where).select(columns) if parts else self.table.slice(0, 0).select(columns)
+    def rows(self, columns, partitions, where):
+        return self.table.filter(where).select(columns) if partitions else self.table.slice(0, 0).select(columns)
 
     def padding(self):
         return 0.0
 
-    def place(self):
+    def position_columns(self):
         return "ra", "dec"
 
 
@@ -231,20 +231,20 @@ def test_arcs_are_read_from_as_far_away_as_other_sources(farther, seen):
     """A lens 200" beyond the circle, and what lies behind it, however faint."""
     task = place()
     where = task["ra"], task["dec"] + task["radius"] + 200.0 / 3600
-    cells = sky.cell_of([where[0]], [where[1]], 8)
+    cells = sky.cell_at([where[0]], [where[1]], 8)
     behind = galaxies(*where)
     row = test_arcs.lens(int(behind["id"][0].as_py()), *where, [(0.0, 0.0, 1.0)])
     table, light = Whole(row, cells.tolist()), fluxes(behind, BAND, 1e-6)
-    table.in_cells = lambda wanted, order, columns: row.filter(pa.array(np.isin(cells, wanted)))
-    found = catalogue_rows.lenses(table, task, 0.0, farther, 1.0)
+    table.rows_in_cells = lambda wanted, order, columns: row.filter(pa.array(np.isin(cells, wanted)))
+    found = catalogue_rows.read_lenses(table, task, 0.0, farther, 1.0)
     assert found["id"].to_pylist() == row["id"].to_pylist()[:seen]
     none = behind.slice(0, 0), light.slice(0, 0)
     versions = Whole(behind, cells.tolist()), Whole(light, cells.tolist())
-    rows, its = catalogue_rows.with_lensed(none, found, *versions, task, farther)
+    rows, its = catalogue_rows.add_lensed_galaxies(none, found, *versions, task, farther)
     assert rows["id"].to_pylist() == its["id"].to_pylist() == behind["id"].to_pylist()[:seen]
-    again, _ = catalogue_rows.with_lensed((rows, its), found, *versions, task, farther)
+    again, _ = catalogue_rows.add_lensed_galaxies((rows, its), found, *versions, task, farther)
     assert again.equals(rows)
-    assert len(catalogue_rows.lenses(table, task, 0.0, farther, np.inf)) == 0
+    assert len(catalogue_rows.read_lenses(table, task, 0.0, farther, np.inf)) == 0
 
 
 def test_what_several_exposures_share_is_read_once_and_each_has_its_own():
@@ -253,38 +253,38 @@ def test_what_several_exposures_share_is_read_once_and_each_has_its_own():
     task = place()
     ra, dec = (task[name] + rng.uniform(-0.8, 0.8, 400) for name in ("ra", "dec"))
     rows = galaxies(ra, dec)
-    cells = sky.cell_of(ra, dec, 8)
+    cells = sky.cell_at(ra, dec, 8)
     bands = {f"f_nu_{band}": rng.uniform(0.0, 9.0, 400).astype(np.float32) for band in ("euclid_y", "euclid_h")}
     light = pa.table({"id": rows["id"], "_healpix_29": sky.healpix_29(ra, dec), **bands})
     versions = Whole(rows, cells.tolist()), Whole(light, cells.tolist())
     asked = []
 
-    def in_cells(wanted, order, columns):
+    def rows_in_cells(wanted, order, columns):
         asked.append(columns)
         return light.filter(pa.array(np.isin(cells, wanted))).select(columns)
 
-    versions[1].in_cells = in_cells
+    versions[1].rows_in_cells = rows_in_cells
     least = float(bands["f_nu_euclid_h"][7])
     aside = {**task, "dec": task["dec"] + 0.4}
     wanted = [
-        catalogue_rows.Bright(task, ["id", "ra"], "euclid_h", least),
-        catalogue_rows.Bright(aside, ["dec", "id"], "euclid_y", 2.0, 600.0),
-        catalogue_rows.Bright(aside, ["id"], "euclid_h", np.inf),
-        catalogue_rows.Bright(task, ["ra"], "euclid_y", 100.0),
+        catalogue_rows.BrightQuery(task, ["id", "ra"], "euclid_h", least),
+        catalogue_rows.BrightQuery(aside, ["dec", "id"], "euclid_y", 2.0, 600.0),
+        catalogue_rows.BrightQuery(aside, ["id"], "euclid_h", np.inf),
+        catalogue_rows.BrightQuery(task, ["ra"], "euclid_y", 100.0),
     ]
-    found = catalogue_rows.bright(*versions, wanted)
+    found = catalogue_rows.read_bright(*versions, wanted)
     assert len(asked) == 1
     for one, (its, own) in zip(wanted, found, strict=True):
-        near = selection.within(one.task, 0.0, one.farther) if np.isfinite(one.least) else []
+        near = selection.cells_within_reach(one.task, 0.0, one.reach_arcsec) if np.isfinite(one.min_flux) else []
         flux = bands[f"f_nu_{one.band}"].astype(float)
-        expected = np.flatnonzero(np.isin(cells, near) & (flux >= one.least))
+        expected = np.flatnonzero(np.isin(cells, near) & (flux >= one.min_flux))
         assert own.equals(light.take(expected).select(["id", f"f_nu_{one.band}"]))
         assert its.equals(rows.take(expected).select(one.columns))
-        assert len(its) == 0 or one.least < 100.0
+        assert len(its) == 0 or one.min_flux < 100.0
     assert len(found[0][0]) > 5
     assert len(found[1][0]) > 5
-    assert catalogue_rows.bright(*versions, []) == []
-    alone = [catalogue_rows.bright(*versions, [one])[0] for one in wanted]
+    assert catalogue_rows.read_bright(*versions, []) == []
+    alone = [catalogue_rows.read_bright(*versions, [one])[0] for one in wanted]
     assert all(a.equals(c) and b.equals(d) for (a, b), (c, d) in zip(alone, found, strict=True))
 
 
@@ -304,7 +304,7 @@ class Files:
     def padding(self):
         return 0.0
 
-    def part_sha256(self, name):
+    def partition_sha256(self, name):
         return self.sums[name]
 
 
@@ -319,10 +319,10 @@ def test_large_galaxies_are_read_and_drawn_from_as_far_away_as_they_show(channel
     rows = galaxies([task["ra"]] * 3, [task["dec"] - 0.3] * 3, bulge_fraction=1.0, **form)
     mags = np.array([7.0, 7.0, 27.0])
     light = fluxes(rows, "euclid_vis", 10 ** (-0.4 * (mags - 23.9)))
-    cells = sky.cell_of(np.full(3, task["ra"]), np.full(3, task["dec"] - 0.3), 8)
+    cells = sky.cell_at(np.full(3, task["ra"]), np.full(3, task["dec"] - 0.3), 8)
     drawn = set(sky.cells_in_cone(task["ra"], task["dec"], 1.0, 8).tolist())
     catalogues = Catalogue(rows, cells, drawn), Catalogue(light, cells, drawn)
-    found, light, _ = catalogue_rows.sources(*catalogues, task, [], ["euclid_vis"], 85.0, limit, limit)
+    found, light, _ = catalogue_rows.read_sources(*catalogues, task, [], ["euclid_vis"], 85.0, limit, limit)
     assert found["id"].to_pylist() == rows["id"].to_pylist()[:2]
     assert light["id"].equals(found["id"])
     system = astrometry.wcs(detector, *pointing.boresight_for(detector, task["ra"], task["dec"], 0.0))
@@ -330,7 +330,7 @@ def test_large_galaxies_are_read_and_drawn_from_as_far_away_as_they_show(channel
     noise, settings = 12.0, settings_for(SURVEY)
     aim = fields.aimed(detector, system, passbands.load(band))
     given = Rows(found, light, stars([], []), light.slice(0, 0))
-    seen, sizes = visible_sources.sources_of(given, (electrons, np.zeros(0)), aim, psf_of(camera), noise, settings)
+    seen, sizes = visible_sources.select_sources(given, (electrons, np.zeros(0)), aim, psf_of(camera), noise, settings)
     assert seen.ids.tolist() == rows["id"].to_pylist()[:1]
     image = stamps.draw(seen, sizes, psf_of(camera), detector.nx, detector.ny)
     assert image.min() > 0.1 * noise
@@ -340,8 +340,8 @@ def test_large_galaxies_are_read_and_drawn_from_as_far_away_as_they_show(channel
 def test_a_product_is_of_what_it_may_show_from_far_away():
     """A file that changes a quarter of a degree away: of galaxies for all, of stars where there are spikes."""
     task = place()
-    cells = {"near": selection.needed(task, 0.0)}
-    cells["far"] = [int(sky.cell_of([task["ra"]], [task["dec"] - 0.3], 8)[0])]
+    cells = {"near": selection.cells_of_task(task, 0.0)}
+    cells["far"] = [int(sky.cell_at([task["ra"]], [task["dec"] - 0.3], 8)[0])]
     assert not set(cells["near"]) & set(cells["far"])
     some = [
         asdict(exposure(exposure_id=1, camera="vis", channel="VIS", psf="")),
@@ -379,7 +379,7 @@ def test_stars_move_along_great_circles(dec, east, north, mjd):
     rows = stars([10.0, 10.0], [dec, dec])
     rows = rows.append_column("pm_ra", pa.array([east, None], pa.float32()))
     rows = rows.append_column("pm_dec", pa.array([north, None], pa.float32()))
-    found = catalogue_rows.at_time(rows, mjd)
+    found = catalogue_rows.apply_proper_motion(rows, mjd)
     assert (found["ra"][1].as_py(), found["dec"][1].as_py()) == pytest.approx((10.0, dec), abs=1e-12)
     there = SkyCoord(
         10.0 * u.deg,
@@ -392,4 +392,4 @@ def test_stars_move_along_great_circles(dec, east, north, mjd):
     # astropy's path is straight in space: a millionth of its length beside the circle's.
     assert 3.6e6 * apart[0] < 0.1
     assert found.schema.equals(rows.schema)
-    assert catalogue_rows.at_time(stars([10.0], [dec]), mjd).equals(stars([10.0], [dec]))
+    assert catalogue_rows.apply_proper_motion(stars([10.0], [dec]), mjd).equals(stars([10.0], [dec]))

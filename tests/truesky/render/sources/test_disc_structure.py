@@ -91,12 +91,12 @@ def test_of_a_galaxy_s_own():
     assert disc_structure.sides(form, discs).astype(bool).tolist() == [True, True, False, False]
     assert disc_structure.sides(form, discs)[0] == pytest.approx(2 * REACH * 2.0 / EXPONENTIAL_RADIUS)
     assert not disc_structure.sides(form, None).any()
-    found = disc_structure.added(four, form, discs)
+    found = disc_structure.add_structure(four, form, discs)
     assert found.picture.tolist() == [0, 1, -1, -1]
-    assert found.structured.tolist() == [True, True, False, False]
+    assert found.has_structure.tolist() == [True, True, False, False]
     first, second = (picture.image for picture in found.pictures)
     assert np.abs(first - second).max() > 0.1 * np.abs(first).max()
-    alone = disc_structure.added(four.take(np.array([1])), form, discs).pictures[0]
+    alone = disc_structure.add_structure(four.take(np.array([1])), form, discs).pictures[0]
     np.testing.assert_array_equal(alone.image, second)
-    other = disc_structure.added(four, form, replace(discs, seed=4)).pictures[0].image
+    other = disc_structure.add_structure(four, form, replace(discs, seed=4)).pictures[0].image
     assert np.abs(first - other).max() > 0.1 * np.abs(first).max()

@@ -14,7 +14,7 @@ from astropy.table import Table
 from lake_schema import sky
 from lake_schema.errors import BadInput
 from lake_schema.external import rows as external_rows
-from lake_schema.ids import kind_of
+from lake_schema.ids import kind_from_id
 from lake_schema.sky.ecliptic import ecliptic, equatorial
 from tests.truesky.render import fields, nominal
 from tests.truesky.render.fields import MISSION, aimed, small
@@ -55,29 +55,29 @@ def test_a_table_of_our_own_population_is_drawn_as_ours(tmp_path):
     system = astrometry.wcs(detector, ra, dec, angle)
     aim = aimed(detector, system, passbands.load("euclid_vis"), {**row, "zero_point": 25.9})
     about = (aim, MISSION, 1, 0.1, None)
-    expected = solar_system.sources(*about)
+    expected = solar_system.trailed_sources(*about)
     assert len(expected) > 3
     order = np.argsort(expected.column)
     for kind in FORMATS:
         file = written(tmp_path / f"bodies.{kind}", {"name": [str(i) for i in ours.ids], **columns(ours)})
         bodies = ephemerides.read(file, kind)
-        found = solar_system.sources(*about, bodies.of_day)
-        assert set(kind_of(found.ids)) == {solar_system.KIND}
+        found = solar_system.trailed_sources(*about, bodies.on_day)
+        assert set(kind_from_id(found.ids)) == {solar_system.KIND}
         assert len(np.unique(found.ids)) == len(found)
         mine = np.argsort(found.column)
         for name in ("column", "row", "electrons", "trail"):
             np.testing.assert_allclose(getattr(found, name)[mine], getattr(expected, name)[order], rtol=1e-9, atol=1e-6)
-        assert len(bodies.of_day(DAY + 1).ids) == 0
+        assert len(bodies.on_day(DAY + 1).ids) == 0
 
 
 def test_a_body_is_where_the_table_says_when_it_says(tmp_path):
     values = {"mjd": [DAY + 0.25], "lon": [359.99], "lat": [-3.0], "east": [36.0], "north": [-18.0], "mag": [20]}
-    body = ephemerides.read(written(tmp_path / "one.csv", values), "one").of_day(DAY)
+    body = ephemerides.read(written(tmp_path / "one.csv", values), "one").on_day(DAY)
     hours = 24 * (0.25 - 0.5)
-    np.testing.assert_allclose(body.after(hours), np.array(equatorial([359.99], [-3.0])), atol=1e-9)
+    np.testing.assert_allclose(body.positions_after(hours), np.array(equatorial([359.99], [-3.0])), atol=1e-9)
     # Ten hours later, 360" east and 180" south.
     wanted = equatorial([359.99 + 0.1 / np.cos(np.radians(3.0))], [-3.05])
-    np.testing.assert_allclose(body.after(hours + 10.0), np.array(wanted), atol=1e-6)
+    np.testing.assert_allclose(body.positions_after(hours + 10.0), np.array(wanted), atol=1e-6)
 
 
 def test_an_exposure_shows_the_table_s_bodies_alone(tmp_path):
@@ -89,7 +89,7 @@ def test_an_exposure_shows_the_table_s_bodies_alone(tmp_path):
     start = 60905.0 + 1
     values = {"mjd": [start], "lon": [lon], "lat": [lat], "east": [60.0], "north": [0.0], "mag": [18.0]}
     file = written(tmp_path / "one.parquet", values)
-    one = nominal.rendered(detector, [], [], [], asteroids=ephemerides.read(file, "exposure").of_day)
+    one = nominal.rendered(detector, [], [], [], asteroids=ephemerides.read(file, "exposure").on_day)
     assert len(one.sources) == 1
     length = np.hypot(*one.sources.trail[0]) * 0.1
     assert length == pytest.approx(60.0 * nominal.TIME / 3600, rel=1e-3)
@@ -109,7 +109,7 @@ def test_bright_bodies_shine_around_corners(tmp_path):
     values = {"mjd": [start] * 3, "lon": lon, "lat": lat, "east": [60.0, 0.0, 0.0], "north": [0.0] * 3}
     file = written(tmp_path / "bright.parquet", {**values, "mag": [12.0, 8.0, 21.0]})
     forced = nominal.off("cosmic_rays", "readout_cosmic_rays")
-    one = nominal.rendered(detector, [], [], [], forced=forced, asteroids=ephemerides.read(file, "b").of_day)
+    one = nominal.rendered(detector, [], [], [], forced=forced, asteroids=ephemerides.read(file, "b").on_day)
     lights = one.scene.lights
     rate = nominal.TIME * 10 ** (0.4 * (one.zero_point - np.array([12.0, 8.0])))
     still = np.isclose(lights.electrons.max(), lights.electrons, rtol=1e-3, atol=0.0)
@@ -136,9 +136,9 @@ def test_a_bright_body_beside_the_detector_shines_in(tmp_path, rate, away):
     values = {"mjd": [start], "lon": lon - east, "lat": lat, "east": [rate], "north": [0.0], "mag": [5.0]}
     file = written(tmp_path / "beside.parquet", values)
     quiet = nominal.off(*nominal.COSMIC_RAYS)
-    found = nominal.rendered(detector, [], [], [], forced=quiet, asteroids=ephemerides.read(file, f"{away}").of_day)
+    found = nominal.rendered(detector, [], [], [], forced=quiet, asteroids=ephemerides.read(file, f"{away}").on_day)
     star = nominal.rendered(detector, [5.0], [127.5], [-away], forced=quiet)
-    assert found.sources.length == pytest.approx([rate * nominal.TIME / 360.0], rel=1e-3, abs=0.01)
+    assert found.sources.trail_length == pytest.approx([rate * nominal.TIME / 360.0], rel=1e-3, abs=0.01)
     # Where no spikes are; it is bluer than the star.
     law = np.median(star.noise_free, axis=1)
     assert law.min() > 1.0
@@ -261,14 +261,14 @@ def test_what_no_table_of_ours_looks_like_is_refused(tmp_path):
 @pytest.mark.parametrize("kind", ["parquet", "fits"])
 def test_what_is_too_long_is_not_read_to_its_end(tmp_path, monkeypatch, kind):
     file = written(tmp_path / f"long.{kind}", {key: np.full(300_000, 1.0) for key in ephemerides.KEYS})
-    sizes, pieces = [], external_rows.pieces
+    sizes, pieces = [], external_rows.read_batches
 
     def counted(*args, **options):
         for piece in pieces(*args, **options):
             sizes.append(len(piece.columns["mjd"]))
             yield piece
 
-    monkeypatch.setattr(external_rows, "pieces", counted)
+    monkeypatch.setattr(external_rows, "read_batches", counted)
     monkeypatch.setattr(ephemerides, "_MOST_ROWS", 1000)
     with pytest.raises(BadInput, match="has more than 1000 rows"):
         ephemerides.read(file, "longer")
@@ -354,10 +354,10 @@ def test_a_fast_body_is_seen_however_far_its_trail_goes(tmp_path, rate, turn):
     values = {"mjd": [when], "lon": [lon], "lat": [lat], "east": [rate * np.cos(turn)], "north": [rate * np.sin(turn)]}
     file = written(tmp_path / "fast.parquet", {**values, "mag": [12.0]})
     quiet = nominal.off(*nominal.COSMIC_RAYS)
-    one = nominal.rendered(detector, [], [], [], forced=quiet, asteroids=ephemerides.read(file, f"{rate}").of_day)
+    one = nominal.rendered(detector, [], [], [], forced=quiet, asteroids=ephemerides.read(file, f"{rate}").on_day)
     assert len(one.sources) == 1
     # What is far from the detector is cut off.
-    (length,), (trail,) = one.sources.length, one.sources.trail
+    (length,), (trail,) = one.sources.trail_length, one.sources.trail
     whole = rate * nominal.TIME / 360.0
     reach = 10.0 * (detector.half_diagonal + 204.8)
     assert length == pytest.approx(min(0.1 * whole, reach) + min(0.9 * whole, reach), rel=1e-2)
@@ -385,14 +385,14 @@ def test_a_body_comes_near_on_its_way():
     system = astrometry.wcs(detector, *row.values())
     row |= {"mjd": DAY + 0.5, "exposure_time_s": 600.0, "zero_point": 25.9}
     aim = aimed(detector, system, passbands.load("euclid_vis"), row)
-    found = solar_system.sources(aim, MISSION, 1, reach, None, lambda day: bodies)
+    found = solar_system.trailed_sources(aim, MISSION, 1, reach, None, lambda day: bodies)
     hours = np.linspace(0.0, 1 / 6, 501)
-    away = np.min([sky.separation(*bodies.after(hour), *PLACE) for hour in hours], axis=0)
+    away = np.min([sky.separation(*bodies.positions_after(hour), *PLACE) for hour in hours], axis=0)
     sure = np.abs(away - reach) > 1e-3
     np.testing.assert_array_equal(np.isin(bodies.ids, found.ids)[sure], (away < reach)[sure])
     assert 100 < len(found) < 1000
     # No more of a trail is kept than the circle is wide, as bright as the whole.
-    kept = found.length * detector.pixel_scale / 3600.0
+    kept = found.trail_length * detector.pixel_scale / 3600.0
     assert kept.max() <= 2.01 * reach
-    light = found.electrons / found.length * rate[found.ids]
+    light = found.electrons / found.trail_length * rate[found.ids]
     np.testing.assert_allclose(light, np.median(light), rtol=0.05)

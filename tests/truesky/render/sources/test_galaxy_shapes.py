@@ -136,8 +136,8 @@ def test_critical_lines_do_no_harm(kappa, gamma1, gamma2):
 def test_half_of_the_light_lies_inside_the_half_light_radius(index):
     assert galaxy_shapes._b(np.array([index]))[0] == pytest.approx(gammaincinv(2 * index, 0.5), rel=4e-5)
     one = shape(bulge_fraction=1.0, bulge_sersic_index=index, bulge_half_light_radius=2.0)
-    assert galaxy_shapes.outside(one, np.array([2.0]))[0] == pytest.approx(0.5, abs=1e-4)
-    sky = galaxy_shapes.on_the_sky(one, galaxy_shapes.forms(one, np.eye(2)[None]))[0]
+    assert galaxy_shapes.flux_outside(one, np.array([2.0]))[0] == pytest.approx(0.5, abs=1e-4)
+    sky = galaxy_shapes.real_space_profile(one, galaxy_shapes.forms(one, np.eye(2)[None]))[0]
     # The light in the middle and the area of exp(-r^(1 / n)) make up all of the flux.
     whole = sky[0] * 2 * np.pi * index * np.exp(gammaln(2 * index)) / np.linalg.det(sky[2:6].reshape(2, 2))
     assert (abs(whole), sky[6]) == pytest.approx((1.0, 0.5 / index), rel=1e-5)
@@ -149,7 +149,7 @@ def test_surface_brightness_along_the_major_axis(kind):
     image = galaxy_shapes.profile(shape(**kind, **lens), 0, 1e-3)
     blurred = galsim.Convolve(image, galsim.Gaussian(sigma=0.02)).drawImage(**FINE).array / 0.02**2
     radius = np.array([0.6, 1.0, 1.6])
-    bound = galaxy_shapes.surface(shape(**kind, **lens), radius)[0]
+    bound = galaxy_shapes.surface_brightness(shape(**kind, **lens), radius)[0]
     v, u = (np.mgrid[:401, :401] - 200) * 0.02
     for r, most in zip(radius, bound, strict=True):
         ring = blurred[np.abs(np.hypot(u, v) - r) < 0.015]
@@ -167,10 +167,10 @@ def test_light_of_a_line_is_the_sum_along_it(index, distance):
             bulge_fraction=fraction, bulge_half_light_radius=0.7, bulge_sersic_index=index, bulge_axis_ratio=1.0,
             disk_half_light_radius=1.1, inclination=0.0,
         )  # fmt: skip
-        along = galaxy_shapes.surface(one, np.hypot(distance, np.sinh(t)))[0]
+        along = galaxy_shapes.surface_brightness(one, np.hypot(distance, np.sinh(t)))[0]
         wanted = np.trapezoid(along * np.cosh(t), t)
         # The disc's surface counts its thickness in: 0.5 %.
-        assert galaxy_shapes.line(one, distance)[0] == pytest.approx(wanted, rel=0.015, abs=1e-12)
+        assert galaxy_shapes.line_brightness(one, distance)[0] == pytest.approx(wanted, rel=0.015, abs=1e-12)
 
 
 def test_a_point_has_no_size():

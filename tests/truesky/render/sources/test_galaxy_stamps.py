@@ -44,7 +44,7 @@ def library(path):
 
 def stamps(path, seed=1, **wanted):
     wanted = Stamps(path, **wanted)
-    return galaxy_stamps.of_file(wanted, seed, file_sha256(path))
+    return galaxy_stamps.from_file(wanted, seed, file_sha256(path))
 
 
 def rows(stamp, **columns):
@@ -100,7 +100,7 @@ def test_a_stamp_of_a_profile_is_drawn_as_the_profile(cube, number, body, monkey
 def test_a_stamp_lies_along_the_row_s_position_angle(cube):
     """Its major axis, whichever way it lies in the file, and as long as the row says."""
     table = rows([0, 2, 3], position_angle=[10.0, 80.0, 140.0], disk_half_light_radius=[1.0, 2.0, 0.5])
-    number, found = galaxy_stamps.of_rows(table, galaxy_shapes.shapes(table), stamps(cube))
+    number, found = galaxy_stamps.assign_pictures(table, galaxy_shapes.shapes(table), stamps(cube))
     assert number.tolist() == [0, 1, 2]
     own = library(cube)
     for picture, which, angle, radius in zip(found, (0, 2, 3), (10.0, 80.0, 140.0), (1.0, 2.0, 0.5), strict=True):
@@ -118,20 +118,20 @@ def test_the_nearest_in_shape_are_drawn_by_the_galaxy_s_identifier(tmp_path):
     n = 300
     table = rows([None] * n, inclination=np.full(n, 30.0), disk_half_light_radius=np.r_[np.full(n - 1, 1.0), 0.1])
     shape, wanted = galaxy_shapes.shapes(table), stamps(path, nearest=True)
-    number, found = galaxy_stamps.of_rows(table, shape, wanted)
+    number, found = galaxy_stamps.assign_pictures(table, shape, wanted)
     assert number[-1] == -1
     which = [int(np.argmax([np.array_equal(p.image, image) for image in wanted.library.images])) for p in found]
     # Eight of them, all nearly as round as the disc is seen, about as often.
     assert set(which) == set(range(8, 16)) or set(which) == set(range(9, 16)) | {7}
     assert np.bincount(which)[min(which) :].min() > 15
     some = np.arange(0, n, 7)
-    again, fewer = galaxy_stamps.of_rows(table.take(some), shape.take(some), wanted)
+    again, fewer = galaxy_stamps.assign_pictures(table.take(some), shape.take(some), wanted)
     pairs = [(fewer[a].image, found[b].image) for a, b in zip(again, number[some], strict=True) if b >= 0]
     assert all(np.array_equal(*pair) for pair in pairs)
-    _, other = galaxy_stamps.of_rows(table, shape, replace(wanted, seed=2))
+    _, other = galaxy_stamps.assign_pictures(table, shape, replace(wanted, seed=2))
     assert any(not np.array_equal(a.image, b.image) for a, b in zip(found, other, strict=True))
     # Where it is not asked for, those that name a stamp have one alone.
-    assert not galaxy_stamps.of_rows(table, shape, stamps(path))[1]
+    assert not galaxy_stamps.assign_pictures(table, shape, stamps(path))[1]
 
 
 def test_bad_libraries_are_refused(tmp_path, cube):
@@ -162,14 +162,14 @@ def test_bad_libraries_are_refused(tmp_path, cube):
         keys.stamp_files(tmp_path / "nowhere.fits")
     table = rows([1, 4])
     with pytest.raises(BadInput, match=r"galaxy \d+: stamp 4 is not one of the 4 of .*library.fits, counted from 0"):
-        galaxy_stamps.of_rows(table, galaxy_shapes.shapes(table), stamps(cube))
+        galaxy_stamps.assign_pictures(table, galaxy_shapes.shapes(table), stamps(cube))
     with pytest.raises(BadInput, match=r"library.fits: has changed since the rendering began"):
-        galaxy_stamps.of_file(Stamps(cube), 1, "another")
+        galaxy_stamps.from_file(Stamps(cube), 1, "another")
 
 
 def test_a_galaxy_that_no_stamp_of_the_drawing_holds_is_a_profile(cube):
     table = rows([0, 0], disk_half_light_radius=[1.0, 40.0])
     own = GalaxyStamps(library(cube), Stamps(cube), 1)
-    number, found = galaxy_stamps.of_rows(table, galaxy_shapes.shapes(table), own)
+    number, found = galaxy_stamps.assign_pictures(table, galaxy_shapes.shapes(table), own)
     assert number.tolist() == [0, -1]
     assert len(found) == 1

@@ -11,7 +11,7 @@ from truesky.render.sources import selection
 def test_a_stamp_that_overlaps_is_taken(x, y, size):
     x0, y0 = int(np.rint(x)) - size // 2, int(np.rint(y)) - size // 2
     overlaps = x0 < 100 and x0 + size > 0 and y0 < 80 and y0 + size > 0
-    (taken,) = selection.touching(np.array([x]), np.array([y]), np.array([size]), 100, 80)
+    (taken,) = selection.overlaps_frame(np.array([x]), np.array([y]), np.array([size]), 100, 80)
     assert taken >= overlaps
     if taken:
         # No more than two pixels too generous.
@@ -23,5 +23,5 @@ def test_a_stamp_that_overlaps_is_taken(x, y, size):
 
 def test_near_works_across_the_wrap_and_the_pole():
     ra, dec = np.array([359.9, 0.1, 180.0, 0.0]), np.array([0.0, 0.0, 0.0, 0.15])
-    assert selection.near(ra, dec, (0.0, 0.0), 0.2).tolist() == [True, True, False, True]
-    assert selection.near(np.array([0.0, 180.0]), np.array([89.95, 89.95]), (90.0, 90.0), 0.06).all()
+    assert selection.within_radius(ra, dec, (0.0, 0.0), 0.2).tolist() == [True, True, False, True]
+    assert selection.within_radius(np.array([0.0, 180.0]), np.array([89.95, 89.95]), (90.0, 90.0), 0.06).all()

@@ -14,7 +14,7 @@ K = np.geomspace(2e-4, 200.0, 300)
 
 def looked_up(index, k):
     """Linear between the nodes, as the kernel does it."""
-    first, weights = sersic.row_of(np.array([index]))
+    first, weights = sersic.interpolation_weights(np.array([index]))
     row = weights[0] @ sersic.table()[first[0] : first[0] + 4]
     return np.interp(k**2, sersic.nodes(), row)
 

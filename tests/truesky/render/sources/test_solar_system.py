@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from lake_schema import sky
-from lake_schema.ids import kind_of
+from lake_schema.ids import kind_from_id
 from lake_schema.mission.configuration import resolve
 from lake_schema.sky.ecliptic import ecliptic, equatorial
 from tests.truesky.render import fields
@@ -32,7 +32,7 @@ def test_counts_and_motions_are_the_mission_s():
     """Sample of all within two degrees; significance 6e-7 of numbers (5 standard errors), 1e-4 of the law of rates."""
     found = solar_system.population(*ECLIPTIC, 1.0, DAY, MISSION, 1)
     assert len(np.unique(found.ids)) == len(found.ids)
-    assert set(kind_of(found.ids)) == {solar_system.KIND}
+    assert set(kind_from_id(found.ids)) == {solar_system.KIND}
     inside = np.abs(found.lat) < 1.0
     # The volume of a strip about the ecliptic, within what was drawn around it.
     chosen = inside & (sky.separation(*equatorial(found.lon, found.lat), *ECLIPTIC) < 2.0)
@@ -60,7 +60,7 @@ def test_a_body_is_where_its_motion_takes_it_whoever_looks():
     assert len(i) > 1000
     for name in ("lon", "lat", "east", "north", "mag"):
         np.testing.assert_array_equal(getattr(one, name)[i], getattr(other, name)[j])
-    moved = sky.separation(*one.after(0.0), *one.after(2.0)) * 3600.0
+    moved = sky.separation(*one.positions_after(0.0), *one.positions_after(2.0)) * 3600.0
     np.testing.assert_allclose(moved, 2.0 * np.hypot(one.east, one.north), rtol=2e-3)
     assert not set(solar_system.population(*ECLIPTIC, 0.2, DAY + 1, MISSION, 1).ids) & set(one.ids)
     assert not set(solar_system.population(*ECLIPTIC, 0.2, DAY, MISSION, 2).mag) & set(one.mag)
@@ -86,7 +86,7 @@ def test_a_trail_is_a_row_of_points(line):
     psf = psf_of("vis")
     settings = settings_for(SURVEY)
     sizes = stamp_sizes.stamp_sizes(
-        body.electrons, body.shape, body.shapes, psf, 12.0, settings, piece_length(body.length)
+        body.electrons, body.shape, body.shapes, psf, 12.0, settings, piece_length(body.trail_length)
     )
     drawn = np.zeros(1)
     image = stamps.draw(body, sizes, psf, SIDE, SIDE, tally=stamps.Tally(drawn))

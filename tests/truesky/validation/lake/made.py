@@ -6,7 +6,7 @@ from astropy.wcs import WCS
 from scipy.special import erf
 
 from lake_schema.fits import images
-from truesky.validation.lake.measure import seen
+from truesky.validation.lake.measure import frame_context
 from truesky.validation.lake.measure.references import Reference
 from truesky.validation.lake.measure.rows import Place
 
@@ -118,7 +118,7 @@ def vis(folder, rng=None, of=None, hits=HITS, sky=SKY, stretched=1.0, bright=1.0
     expected = light(of, round_=stretched) * bright + sky * SECONDS
     counted = hit(rng, rng.poisson(expected).astype(float), hits)
     path = vis_file(folder / "vis.fits", counted, rng, **wrong)
-    return seen.seen(path, Place("VIS", "euclid_vis", 1, "1-1"), of), of
+    return frame_context.measure_frame(path, Place("VIS", "euclid_vis", 1, "1-1"), of), of
 
 
 def ramp_file(path, chi2, channel="NISP-S", border=4):

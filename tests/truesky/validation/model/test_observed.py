@@ -11,7 +11,7 @@ import pytest
 from lake_schema import sky
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store import layout, publish, read
-from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.tables.galaxies import GALAXIES
 from tests.truesky.catalogue.conftest import FLAT_CELLS, made
 from truesky.catalogue.galaxies import high_redshift
@@ -27,12 +27,12 @@ FEW = 4
 
 
 def seen(rows, cells):
-    return observed.sky_of(rows, cells * sky.cell_area(GENERATION_ORDER))
+    return observed.from_table(rows, cells * sky.cell_area(GENERATION_ORDER))
 
 
 @pytest.fixture(scope="module")
 def flat():
-    return mean_sky.flat(made())
+    return mean_sky.without_clustering(made())
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def whole(flat_sky):
 
 def off(figures):
     """Names of what is not as observed."""
-    return {check.name for check in checks.checks(figures, 2.0) if not check.passed}
+    return {check.name for check in checks.evaluate(figures, 2.0) if not check.passes}
 
 
 def test_the_list_says_where_its_numbers_are_from():
@@ -61,25 +61,25 @@ def test_every_row_is_measured(whole):
 
 def test_the_mean_sky_is_as_observed(whole):
     """1.7 deg2: within two Poisson errors more than the list says."""
-    results = checks.checks(whole, 2.0)
-    assert [(check.name, check.found) for check in results if check.unexpected] == []
+    results = checks.evaluate(whole, 2.0)
+    assert [(check.name, check.value) for check in results if check.is_unexpected_failure] == []
     # Numbers from memory gate nothing one by one; were many of them off, so would be the sky.
-    remembered = [check for check in results if not check.gates]
-    assert sum(check.passed for check in remembered) > 0.85 * len(remembered)
+    remembered = [check for check in results if not check.is_binding]
+    assert sum(check.passes for check in remembered) > 0.85 * len(remembered)
 
 
 def test_a_lake_is_compared(flat, tmp_path, capsys):
     """By the command: the same figures as of the rows themselves, in the table that it publishes."""
     rows = mean_sky.rows(flat, 0, 2)
-    plan = Plan(GALAXIES, {}, (Part(layout.cell_file(5, 0), {}),))
-    publish.make(tmp_path, plan, lambda root, facts: Output(rows))
-    seen, _ = observed.in_version(read.version(tmp_path, "galaxies"))
+    plan = Plan(GALAXIES, {}, (Task(layout.cell_file(5, 0), {}),))
+    publish.make_version(tmp_path, plan, lambda root, facts: Output(rows))
+    seen, _ = observed.from_version(read.version(tmp_path, "galaxies"))
     found = observed.figures(seen)
-    assert found == observed.figures(observed.sky_of(rows, 2 * sky.cell_area(GENERATION_ORDER)))
+    assert found == observed.figures(observed.from_table(rows, 2 * sky.cell_area(GENERATION_ORDER)))
     status = __main__.main(["--lake", str(tmp_path)])
     table = [row for row in read.version(tmp_path, "validation").rows().to_pylist() if row["check_name"] == "observed"]
     assert {row["quantity"]: row["value"] for row in table if row["value"] is not None} == {
-        check.name: check.found for check in checks.checks(found) if np.isfinite(check.found)
+        check.name: check.value for check in checks.evaluate(found) if np.isfinite(check.value)
     }
     # Two cells are too few to tell an error of.
     assert {row["verdict"] for row in table} == {"undecided"}
@@ -91,13 +91,13 @@ def test_a_lake_is_compared(flat, tmp_path, capsys):
 def patch(flat_sky):
     """(a lake's sky of eight cells, the cell of each galaxy)."""
     rows = flat_sky
-    cell = rows["_healpix_29"].to_numpy() >> 2 * (sky.DEEPEST - GENERATION_ORDER)
+    cell = rows["_healpix_29"].to_numpy() >> 2 * (sky.MAX_ORDER - GENERATION_ORDER)
     part = rows.filter(pa.array(cell < 2 * FEW))
     return seen(part, 2 * FEW), cell[(cell < 2 * FEW) & (rows["kind"].to_numpy() < 2)]
 
 
 def verdicts(seen, cell):
-    return {row.quantity: row.verdict for row in observed_sky.compared(seen, cell)}
+    return {row.quantity: row.verdict for row in observed_sky.compare(seen, cell)}
 
 
 def failed(seen, cell):

@@ -17,8 +17,8 @@ def universe():
 
 def failed(found):
     """Names by group of checks that fail and gate."""
-    return {group: names for group, checks in observed_stars.checks(found).items()
-            if (names := [check.name for check in checks if check.unexpected])}  # fmt: skip
+    return {group: names for group, checks in observed_stars.checks_by_group(found).items()
+            if (names := [check.name for check in checks if check.is_unexpected_failure])}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def test_all_groups_pass(figures):
 
 
 def test_remembered_numbers_are_near_too(figures):
-    far = [c.name for checks in observed_stars.checks(figures).values() for c in checks if not c.passed]
+    far = [c.name for checks in observed_stars.checks_by_group(figures).values() for c in checks if not c.passes]
     assert set(far) <= {"giants_local"}
 
 
@@ -51,7 +51,7 @@ def test_without_isochrones_of_old_stars_the_turn_off_fails(monkeypatch, figures
     """Solar metals for all: the halo turns off 900 K too cool."""
     solar = isochrones.isochrones
     monkeypatch.setattr(isochrones, "isochrones", lambda age, metals: solar(age, 0.0 * np.asarray(metals)))
-    assert set(failed(figures | observed_stars.evolved())) == {"halo_turn_off"}
+    assert set(failed(figures | observed_stars.isochrone_points())) == {"halo_turn_off"}
 
 
 def test_a_fifth_more_stars_fail_the_counts(universe, figures):
@@ -59,17 +59,17 @@ def test_a_fifth_more_stars_fail_the_counts(universe, figures):
     galaxy = dataclasses.replace(universe.galaxy, pieces=more)
     mutant = dataclasses.replace(universe, galaxy=galaxy)
     limits = (15.0, 18.0, 20.0)
-    found = observed_stars.star_counts.brighter(mutant, (0.0, 90.0), limits)
+    found = observed_stars.star_counts.count_brighter(mutant, (0.0, 90.0), limits)
     counts = {f"pole_v{limit:g}": value for limit, value in zip(limits, found, strict=True)}
     assert "pole_v20" in failed(figures | counts)["star_counts"]
-    assert "systems_local" in failed(figures | observed_stars.nearby(mutant))["stars_near_the_sun"]
+    assert "systems_local" in failed(figures | observed_stars.local_densities(mutant))["stars_near_the_sun"]
 
 
 def test_without_companions_the_neighbourhood_fails(monkeypatch, figures, universe):
     law = companions._law()
     monkeypatch.setattr(companions, "_law", lambda: law | {"fraction": tuple(0.5 * f for f in law["fraction"])})
     single = dataclasses.replace(universe, galaxy=milky_way.milky_way.__wrapped__())
-    assert failed(figures | observed_stars.nearby(single)) == {"stars_near_the_sun": ["companions_per_star"]}
+    assert failed(figures | observed_stars.local_densities(single)) == {"stars_near_the_sun": ["companions_per_star"]}
 
 
 def test_a_halo_that_turns_with_the_disc_fails(monkeypatch, figures):
@@ -78,14 +78,16 @@ def test_a_halo_that_turns_with_the_disc_fails(monkeypatch, figures):
     still[3] = 0.0
     monkeypatch.setattr(kinematics, "_numbers", lambda: (still, *others))
     (lag,) = (
-        c for c in observed_stars.checks(figures | observed_stars.motions())["kinematics"] if c.name == "sun_v_lag"
+        c
+        for c in observed_stars.checks_by_group(figures | observed_stars.motions())["kinematics"]
+        if c.name == "sun_v_lag"
     )
-    assert not lag.passed
+    assert not lag.passes
     # A remembered number shows it, and gates nothing.
-    assert not lag.unexpected
+    assert not lag.is_unexpected_failure
 
 
 def test_giants_a_magnitude_too_faint_fail(monkeypatch, figures, universe):
     faint = dataclasses.replace(universe.galaxy.pieces, m_h=universe.galaxy.pieces.m_h + 0.5)
     mutant = dataclasses.replace(universe, galaxy=dataclasses.replace(universe.galaxy, pieces=faint))
-    assert "clump_m_h" in failed(figures | observed_stars.nearby(mutant))["giants"]
+    assert "clump_m_h" in failed(figures | observed_stars.local_densities(mutant))["giants"]

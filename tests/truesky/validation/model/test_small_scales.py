@@ -17,7 +17,7 @@ CELLS = 8
 def test_pairs_are_counted_by_their_separation():
     ra, dec = np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.01, 0.04])
     theta = np.radians([0.005, 0.02, 0.035, 0.1])
-    assert small_scales._pairs(ra, dec, theta).tolist() == [2.0, 2.0, 2.0]
+    assert small_scales._count_pairs(ra, dec, theta).tolist() == [2.0, 2.0, 2.0]
 
 
 def test_the_power_law_is_the_integral_along_the_line_of_sight():
@@ -35,19 +35,19 @@ def test_the_power_law_is_the_integral_along_the_line_of_sight():
 
 @pytest.fixture(scope="module")
 def found():
-    return small_scales.figures(small_scales.universe_of(SEED, BOX_CELLS), CELLS)
+    return small_scales.figures(small_scales.galaxy_population(SEED, BOX_CELLS), CELLS)
 
 
 def test_galaxies_cluster_as_observed(found):
     """A few cells: within two of their errors more than the list says."""
-    results = [check for check in checks.checks(found, 2.0) if check.name.startswith("w_m20")]
+    results = [check for check in checks.evaluate(found, 2.0) if check.name.startswith("w_m20")]
     assert len(results) == 3
-    assert [(check.name, check.found) for check in results if check.unexpected] == []
+    assert [(check.name, check.value) for check in results if check.is_unexpected_failure] == []
 
 
 def test_with_the_satellites_of_today_they_would_cluster_less(found, monkeypatch):
     monkeypatch.setattr(matching, "Occupation", lambda **values: replace(_OCCUPATION(**values), ratio_z=0.0))
-    fewer = small_scales.figures(small_scales.universe_of(SEED, BOX_CELLS), CELLS)
+    fewer = small_scales.figures(small_scales.galaxy_population(SEED, BOX_CELLS), CELLS)
     assert fewer["w_m20_0.04"] < 0.85 * found["w_m20_0.04"]
 
 

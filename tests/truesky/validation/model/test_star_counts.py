@@ -26,7 +26,7 @@ def test_counts_of_drawn_stars(b, dust):
 
 
 def test_stars_far_from_the_plane():
-    assert benchmark.far_from_the_plane(1024) == pytest.approx(benchmark.SKY_20, rel=0.15)
+    assert benchmark.count_far_from_plane(1024) == pytest.approx(benchmark.SKY_20, rel=0.15)
 
 
 def test_bright_stars_of_the_whole_sky(dust):
@@ -36,7 +36,7 @@ def test_bright_stars_of_the_whole_sky(dust):
 
 def test_stars_at_the_pole(dust):
     """To G = 20 and V = 20, from the flux table: Bahcall & Soneira 1980, good to 15 %."""
-    found = benchmark.pole(12, dust)
+    found = benchmark.pole_figures(12, dust)
     assert found["against_pole_g20"] == pytest.approx(1.0, abs=0.2)
     assert found["against_pole_v20"] == pytest.approx(1.0, abs=0.2)
 

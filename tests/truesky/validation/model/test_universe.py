@@ -23,7 +23,7 @@ from truesky.validation.model import universe as measured
 def seen(drawn):
     """The drawn sky, as the validation counts it."""
     first = np.array(drawn.places[::4]) // 4
-    deepest = 2 * (sky.DEEPEST - GENERATION_ORDER) + 2
+    deepest = 2 * (sky.MAX_ORDER - GENERATION_ORDER) + 2
 
     def block(index):
         return np.searchsorted(first, index >> deepest)
@@ -42,7 +42,7 @@ def seen(drawn):
 
 
 def failed(figures):
-    return [(check.name, check.found) for check in checks.checks(figures, 2.0) if not check.passed]
+    return [(check.name, check.value) for check in checks.evaluate(figures, 2.0) if not check.passes]
 
 
 def test_colours(seen):
@@ -58,7 +58,7 @@ def test_halpha(seen):
 
 
 def test_halos(seen):
-    assert failed(census.halos(seen, measured.published_halos())) == []
+    assert failed(census.halos(seen, measured.mass_function())) == []
 
 
 def test_luminosities(seen):
@@ -74,9 +74,9 @@ def test_a_figure_that_is_off_fails():
     assert [name for name, _ in failed({**bad, "log_i_21.75_error": 0.03})] == ["sigma_8", "log_i_21.75"]
     # The share of emitters is given the error of their number.
     counted = {"halpha_2e-16_0.9_1.8": 1.07, "halpha_2e-16_0.9_1.8_error": 0.03}
-    (check,) = checks.checks(counted)
-    assert check.passed
-    assert check.most == pytest.approx(1.08)
+    (check,) = checks.evaluate(counted)
+    assert check.passes
+    assert check.upper_limit == pytest.approx(1.08)
 
 
 @pytest.fixture
@@ -106,13 +106,13 @@ def test_uniform_points_are_not_correlated(coarse, rng):
 def test_what_the_mean_of_a_block_takes_away(coarse):
     """Against the covariance of all its pixels, each less the mean."""
     edges, order, cell = np.array([0.6, 1.0, 2.0]), clustering.BLOCK_ORDER, 100
-    pairs = clustering._pairs(order, cell, edges)
+    pairs = clustering._pixel_pairs(order, cell, edges)
     place = clustering._vectors(order, cell)
     theta = np.degrees(np.arccos(np.clip(place @ place.T, -1.0, 1.0)))
     many = len(place)
     less = np.eye(many) - 1.0 / many
     left = less @ np.exp(-theta) @ less
-    found, wanted = pairs.left(np.exp(-pairs.nodes)), []
+    found, wanted = pairs.subtract_block_mean(np.exp(-pairs.nodes)), []
     for first, last in pairwise(edges):
         inside = (theta > first) & (theta < last)
         wanted.append((np.exp(-theta[inside]).mean(), left[inside].mean()))
@@ -126,7 +126,7 @@ def test_points_of_a_dense_half_are_correlated(coarse, rng):
     edges, order, blocks = np.array([0.4, 0.6]), clustering.BLOCK_ORDER, []
     for cell in (3, 100, 500, 767):
         _, ra, dec = sky.random_in_cell(order, cell, 60_000, rng)
-        dense = sky.cell_of(ra, dec, order + 1) % 4 < 2
+        dense = sky.cell_at(ra, dec, order + 1) % 4 < 2
         kept = dense | (rng.random(ra.size) < 1 / 3)
         blocks.append((cell, (points(ra[kept], dec[kept]),)))
     (found,) = clustering.correlation(blocks, order, edges)
@@ -137,9 +137,9 @@ def test_theories_agree():
     """Of C_l with the sums of the lensing tests; of a band with itself."""
     ell = np.array([50.0, 200.0, 400.0])
     chi = float(cosmology.comoving_distance(1.0))
-    assert shear.theory(ell, chi) == pytest.approx(limber(ell, chi), rel=0.02)
-    power = np.concatenate([np.zeros(30), shear.theory(np.arange(30.0, 129.0), chi)])
-    assert shear.bands(power, chi, (30, 64, 128)) == pytest.approx([1.0, 1.0], abs=1e-3)
+    assert shear.linear_theory(ell, chi) == pytest.approx(limber(ell, chi), rel=0.02)
+    power = np.concatenate([np.zeros(30), shear.linear_theory(np.arange(30.0, 129.0), chi)])
+    assert shear.band_ratio(power, chi, (30, 64, 128)) == pytest.approx([1.0, 1.0], abs=1e-3)
 
 
 @pytest.mark.nightly

@@ -20,7 +20,7 @@ import numpy as np
 
 from lake_schema.arrays import Array, Bool, Float, Float32, Int
 from truesky.numerics.compiling import jit
-from truesky.render.drawing.kernels.frame import FIXED_POINT, FULL, smaller
+from truesky.render.drawing.kernels.frame import FIXED_POINT, FULL, min_singular_squared
 from truesky.render.sources.sersic import FIRST_BITS
 
 _TWO_PI = 2.0 * np.pi
@@ -55,59 +55,65 @@ def nyquist_zones(
     ky, runs    : of transfer.Grid
     """
     m, n, columns = zones.shape
-    most, low, high, far = 0, 0, 0, 0
+    longest_piece, low, high, max_iy = 0, 0, 0, 0
     for p in range(len(inner)):
-        most = max(most, runs[pieces[p + 1], 0] - runs[pieces[p], 0])
+        longest_piece = max(longest_piece, runs[pieces[p + 1], 0] - runs[pieces[p], 0])
     for j in range(len(runs) - 1):
         low, high = min(low, runs[j, 1]), max(high, runs[j, 1] + runs[j + 1, 0] - runs[j, 0])
-        far = max(far, abs(runs[j, 2]))
+        max_iy = max(max_iy, abs(runs[j, 2]))
     # Phase by column and by row; the electrons enter with the rows.
-    of_column, of_row = np.empty((m, 2, high - low), planes.dtype), np.empty((m, 2, 2 * far + 1), planes.dtype)
+    of_column, of_row = np.empty((m, 2, high - low), planes.dtype), np.empty((m, 2, 2 * max_iy + 1), planes.dtype)
     tables = np.empty((m, sersic.shape[1]), np.float32)
     sums = np.zeros((m, 2, n, columns), planes.dtype)
     step = _TWO_PI / n
     for i in range(m):
         for c in range(low, high):
             of_column[i, 0, c - low], of_column[i, 1, c - low] = np.cos(step * c * x[i]), -np.sin(step * c * x[i])
-        for r in range(-far, far + 1):
-            of_row[i, 0, r + far] = electrons[i] * np.cos(step * r * y[i])
-            of_row[i, 1, r + far] = -electrons[i] * np.sin(step * r * y[i])
+        for r in range(-max_iy, max_iy + 1):
+            of_row[i, 0, r + max_iy] = electrons[i] * np.cos(step * r * y[i])
+            of_row[i, 1, r + max_iy] = -electrons[i] * np.sin(step * r * y[i])
         if body[i] and fraction[i] > 0.0:
             # Pieces are taken whole: to the inner edge of the first that is not.
-            outer = step * np.hypot(far, max(-low, high))
+            outer = step * np.hypot(max_iy, max(-low, high))
             for p in range(len(inner) - 1, -1, -1):
                 outer = inner[p] if inner[p] >= cut[i] else outer
-            most_square = 1.01 * (outer + 2.0 * step) ** 2 * np.sum(bulge[i] ** 2)
-            interpolate(sersic, row[i], row_weights[i], 0.99 * step**2 * smaller(bulge[i]), most_square, tables[i])
-    re, im = np.empty(most, planes.dtype), np.empty(most, planes.dtype)
-    profile, square = np.empty(most, np.float32), np.empty(most, np.float32)
+            max_square = 1.01 * (outer + 2.0 * step) ** 2 * np.sum(bulge[i] ** 2)
+            interpolate_sersic(
+                sersic, row[i], row_weights[i], 0.99 * step**2 * min_singular_squared(bulge[i]), max_square, tables[i]
+            )
+    re, im = np.empty(longest_piece, planes.dtype), np.empty(longest_piece, planes.dtype)
+    profile, square = np.empty(longest_piece, np.float32), np.empty(longest_piece, np.float32)
     bits = square.view(np.int32)
     for p in range(len(inner)):
         first, last = runs[pieces[p], 0], runs[pieces[p + 1], 0]
         # From 0 over a slice: only so does the compiler use whole vectors.
-        some_re, some_im, some = re[: last - first], im[: last - first], profile[: last - first]
+        piece_re, piece_im, piece_profile = re[: last - first], im[: last - first], profile[: last - first]
         for i in range(m):
             if inner[p] >= cut[i]:
                 continue
-            _collapse(planes, weights[i], first, last, some_re, some_im)
+            _collapse(planes, weights[i], first, last, piece_re, piece_im)
             if body[i]:
                 profile_at(
                     fraction[i], bulge[i], disk[i], thick[i], tables[i], kx[first:last], ky[first:last], square, bits,
-                    some,
+                    piece_profile,
                 )  # fmt: skip
-                for c in range(len(some)):
-                    some_re[c] *= some[c]
-                    some_im[c] *= some[c]
+                for c in range(len(piece_profile)):
+                    piece_re[c] *= piece_profile[c]
+                    piece_im[c] *= piece_profile[c]
             if trail[i, 0] != 0.0 or trail[i, 1] != 0.0:
-                _smear(trail[i, 0], trail[i, 1], kx[first:last], ky[first:last], some_re, some_im)
+                _smear(trail[i, 0], trail[i, 1], kx[first:last], ky[first:last], piece_re, piece_im)
             for j in range(pieces[p], pieces[p + 1]):
                 start, ix, iy = runs[j]
-                length, left, up = runs[j + 1, 0] - start, ix % n, iy % n
-                _add_turned(
-                    of_column[i, :, ix - low : ix - low + length], of_row[i, 0, iy + far], of_row[i, 1, iy + far],
-                    re[start - first : start - first + length], im[start - first : start - first + length],
-                    sums[i, 0, up, left : left + length], sums[i, 1, up, left : left + length],
-                )  # fmt: skip
+                length, first_column, zone_row = runs[j + 1, 0] - start, ix % n, iy % n
+                _add_shifted(
+                    of_column[i, :, ix - low : ix - low + length],
+                    of_row[i, 0, iy + max_iy],
+                    of_row[i, 1, iy + max_iy],
+                    re[start - first : start - first + length],
+                    im[start - first : start - first + length],
+                    sums[i, 0, zone_row, first_column : first_column + length],
+                    sums[i, 1, zone_row, first_column : first_column + length],
+                )
     for i in range(m):
         for r in range(n):
             for c in range(columns):
@@ -133,7 +139,7 @@ def _collapse(planes: Any, weights: Any, first: int, last: int, re: Any, im: Any
 
 
 @jit
-def _add_turned(column: Any, cosine: Any, sine: Any, re: Any, im: Any, sum_re: Any, sum_im: Any) -> None:
+def _add_shifted(column: Any, cosine: Any, sine: Any, re: Any, im: Any, sum_re: Any, sum_im: Any) -> None:
     cosines, sines = column[0], column[1]
     for c in range(len(re)):
         turn_re = cosines[c] * cosine - sines[c] * sine
@@ -151,14 +157,14 @@ def profile_at(
 
     fraction, bulge, disk, thick : of one galaxy, as of `nyquist_zones`;  table : of its Sersic index (`interpolate`)
     """
-    one, share = np.float32(1.0), np.float32(1.0 - fraction)
+    unit, share = np.float32(1.0), np.float32(1.0 - fraction)
     if fraction < 1.0:
         u0, u1 = np.float32(disk[0, 0]), np.float32(disk[1, 0])
         v0, v1 = np.float32(disk[0, 1]), np.float32(disk[1, 1])
         t0, t1 = np.float32(thick[0]), np.float32(thick[1])
         for c in range(len(out)):
             u, v, q = u0 * kx[c] + u1 * ky[c], v0 * kx[c] + v1 * ky[c], t0 * kx[c] + t1 * ky[c]
-            s = one + (u * u + v * v)
+            s = unit + (u * u + v * v)
             out[c] = share / (s * np.sqrt(s) * _sinh_over(q * q))
     else:
         for c in range(len(out)):
@@ -192,21 +198,21 @@ def _smear(across: float, along: float, kx: Float32, ky: Float32, re: Any, im: A
 def _sinh_over(square: Any) -> Any:
     """sinh q / q from q^2: Taylor's series, 1e-7 for q < 4, and huge where 1e-7 matters no more."""
     # Written out: a loop over a tuple would divide each time.
-    one = np.float32(1.0)
-    out = one + square * np.float32(1.0 / 342.0)
-    out = one + square * np.float32(1.0 / 272.0) * out
-    out = one + square * np.float32(1.0 / 210.0) * out
-    out = one + square * np.float32(1.0 / 156.0) * out
-    out = one + square * np.float32(1.0 / 110.0) * out
-    out = one + square * np.float32(1.0 / 72.0) * out
-    out = one + square * np.float32(1.0 / 42.0) * out
-    out = one + square * np.float32(1.0 / 20.0) * out
-    return one + square * np.float32(1.0 / 6.0) * out
+    unit = np.float32(1.0)
+    out = unit + square * np.float32(1.0 / 342.0)
+    out = unit + square * np.float32(1.0 / 272.0) * out
+    out = unit + square * np.float32(1.0 / 210.0) * out
+    out = unit + square * np.float32(1.0 / 156.0) * out
+    out = unit + square * np.float32(1.0 / 110.0) * out
+    out = unit + square * np.float32(1.0 / 72.0) * out
+    out = unit + square * np.float32(1.0 / 42.0) * out
+    out = unit + square * np.float32(1.0 / 20.0) * out
+    return unit + square * np.float32(1.0 / 6.0) * out
 
 
 @jit
-def reaches(
-    passing: Float, step: float, body: Bool, fraction: Float, bulge: Float, disk: Float, sersic: Float32, row: Int,
+def fourier_reach(
+    max_transfer: Float, step: float, body: Bool, fraction: Float, bulge: Float, disk: Float, sersic: Float32, row: Int,
     floor: Float,
 ) -> Float:  # fmt: skip
     """[m] the |k|, radian / pixel, beyond which profile times PSF is below `floor` [m] in every direction.
@@ -215,34 +221,36 @@ def reaches(
     step    : radian / pixel;  floor : [m] part of the flux
     body, fraction, bulge, disk, sersic, row : as of `nyquist_zones`
     """
-    out = np.full(len(body), step * len(passing))
+    out = np.full(len(body), step * len(max_transfer))
     square = np.empty(1, np.float32)
     bits = square.view(np.int32)
     for j in range(len(body)):
-        slim_disk, slim_bulge = smaller(disk[j]), smaller(bulge[j])
-        for i in range(len(passing) - 1, -1, -1):
+        slim_disk, slim_bulge = min_singular_squared(disk[j]), min_singular_squared(bulge[j])
+        for i in range(len(max_transfer) - 1, -1, -1):
             out[j] = step * (i + 1)
             k2 = (step * i) ** 2
-            most = 0.0 if body[j] else 1.0
+            upper_bound = 0.0 if body[j] else 1.0
             if body[j] and fraction[j] < 1.0:
-                most += (1.0 - fraction[j]) * (1.0 + slim_disk * k2) ** -1.5
+                upper_bound += (1.0 - fraction[j]) * (1.0 + slim_disk * k2) ** -1.5
             if body[j] and fraction[j] > 0.0:
                 square[0] = slim_bulge * k2
                 column = min(max((bits[0] >> 16) - np.int32(_FIRST), np.int32(0)), np.int32(sersic.shape[1] - 1))
-                most += fraction[j] * max(abs(sersic[row[j] + 1, column]), abs(sersic[row[j] + 2, column]))
-            if most * passing[i] > floor[j]:
+                upper_bound += fraction[j] * max(abs(sersic[row[j] + 1, column]), abs(sersic[row[j] + 2, column]))
+            if upper_bound * max_transfer[i] > floor[j]:
                 break
     return out
 
 
 @jit
-def interpolate(sersic: Float32, row: int, row_weights: Float, least: float, most: float, table: Float32) -> None:
+def interpolate_sersic(
+    sersic: Float32, row: int, row_weights: Float, min_square: float, max_square: float, table: Float32
+) -> None:
     """One index's transform, where the source needs it, into `table`.
 
     sersic      : of all indices;  row, row_weights : of the four about the one that is wanted
     least, most : squared frequencies, times the square of the radius
     """
-    ends = np.array([least, most], np.float32)
+    ends = np.array([min_square, max_square], np.float32)
     bits = ends.view(np.int32)
     last = sersic.shape[1] - 1
     low = min(max((bits[0] >> 16) - _FIRST, 0), last)
@@ -257,20 +265,20 @@ def interpolate(sersic: Float32, row: int, row_weights: Float, least: float, mos
 
 
 @jit
-def take(spectrum: Array, runs: Int, pixel: Float, out: Array) -> None:
+def take_samples(spectrum: Array, runs: Int, pixel: Float, out: Array) -> None:
     """Fills out [2, s] with the samples of transfer.Grid.runs: real and imaginary part of spectrum times pixel.
 
     spectrum : complex[iy, ix], ix >= 0 of a real image;  pixel : [|iy|, |ix|] the pixel's own transform
     """
     for j in range(len(runs) - 1):
-        start, left, iy = runs[j]
+        start, first_ix, iy = runs[j]
         for c in range(runs[j + 1, 0] - start):
-            ix = left + c
-            through = pixel[abs(iy), abs(ix)]
+            ix = first_ix + c
+            pixel_transfer = pixel[abs(iy), abs(ix)]
             # What lies to the left of kx = 0 is the mirror image's conjugate.
             sample = spectrum[iy, ix] if ix >= 0 else spectrum[-iy, -ix]
-            out[0, start + c] = through * sample.real
-            out[1, start + c] = through * (sample.imag if ix >= 0 else -sample.imag)
+            out[0, start + c] = pixel_transfer * sample.real
+            out[1, start + c] = pixel_transfer * (sample.imag if ix >= 0 else -sample.imag)
 
 
 @jit
@@ -325,7 +333,7 @@ def add_planes(image: Float32, planes: Float32, weights: Float, margin: int) -> 
 
 
 @jit
-def between(spectrum: Array, across: Float, up: Float, width: int, slope: float, out: Array) -> None:
+def interpolate_spectrum(spectrum: Array, across: Float, up: Float, width: int, slope: float, out: Array) -> None:
     """Fills out [s] with the sums of a periodic spectrum [ny, nx] under a window about frequencies, radian / pixel.
 
     window : exp(slope (sqrt(1 - z^2) - 1)), z = -1 .. 1 over `width` samples a direction
@@ -335,15 +343,15 @@ def between(spectrum: Array, across: Float, up: Float, width: int, slope: float,
     x_weights, y_weights = np.empty(width), np.empty(width)
     for i in range(len(out)):
         x, y = across[i] * nx / _TWO_PI, up[i] * ny / _TWO_PI
-        left, low = int(np.ceil(x - 0.5 * width)), int(np.ceil(y - 0.5 * width))
+        first_x, first_y = int(np.ceil(x - 0.5 * width)), int(np.ceil(y - 0.5 * width))
         for j in range(width):
-            zx, zy = 2.0 * (left + j - x) / width, 2.0 * (low + j - y) / width
+            zx, zy = 2.0 * (first_x + j - x) / width, 2.0 * (first_y + j - y) / width
             x_weights[j] = np.exp(slope * (np.sqrt(max(1.0 - zx * zx, 0.0)) - 1.0))
             y_weights[j] = np.exp(slope * (np.sqrt(max(1.0 - zy * zy, 0.0)) - 1.0))
         total = complex(0.0)
         for r in range(width):
             line = complex(0.0)
             for c in range(width):
-                line += x_weights[c] * spectrum[(low + r) % ny, (left + c) % nx]
+                line += x_weights[c] * spectrum[(first_y + r) % ny, (first_x + c) % nx]
             total += y_weights[r] * line
         out[i] = total

@@ -33,7 +33,7 @@ _CANCELLED = 0.25
 
 
 @jit
-def smaller(form: Float) -> Any:
+def min_singular_squared(form: Float) -> Any:
     """Square of the smaller singular value of a 2 x 2 matrix."""
     half = 0.5 * np.sum(form**2)
     determinant = form[0, 0] * form[1, 1] - form[0, 1] * form[1, 0]
@@ -42,7 +42,7 @@ def smaller(form: Float) -> Any:
 
 @jit
 def accumulate(
-    frame: Int, stamps: Array, x0: Int, y0: Int, unread: tuple[int, int], unit: float
+    frame: Int, stamps: Array, x0: Int, y0: Int, unread_rows: tuple[int, int], unit: float
 ) -> Int:  # fmt: skip
     """Adds stamps [m, N, N] with their lower left pixels at (x0, y0) to the frame, `unit` to an electron.
 
@@ -53,46 +53,46 @@ def accumulate(
     ny, nx = frame.shape
     added = np.zeros(len(stamps), np.int64)
     for i in range(len(stamps)):
-        left, right = max(0, -x0[i]), min(stamps.shape[2], nx - x0[i])
+        first, stop = max(0, -x0[i]), min(stamps.shape[2], nx - x0[i])
         for r in range(max(0, -y0[i]), min(stamps.shape[1], ny - y0[i])):
-            if left < right:
-                some, out = stamps[i, r, left:right], frame[y0[i] + r, x0[i] + left : x0[i] + right]
+            if first < stop:
+                stamp_row, out = stamps[i, r, first:stop], frame[y0[i] + r, x0[i] + first : x0[i] + stop]
                 total = np.int64(0)
-                for c in range(len(some)):
-                    units = np.int64(np.rint(np.float64(some[c]) * unit))
+                for c in range(len(stamp_row)):
+                    units = np.int64(np.rint(np.float64(stamp_row[c]) * unit))
                     out[c] += units
                     total += units
-                if not unread[0] <= y0[i] + r < unread[1]:
+                if not unread_rows[0] <= y0[i] + r < unread_rows[1]:
                     added[i] += total
     return added
 
 
 @jit
-def subtract_aliased(stamps: Array, x: Float, y: Float, curve: Float, taken: Float) -> None:
+def subtract_aliased(stamps: Array, x: Float, y: Float, curve: Float, removed: Float) -> None:
     """Takes curve [m, 5] of `aliased_light` about (x, y) [m] off stamps [m, N, N]; no pixel becomes negative.
 
     taken : [m] filled with the electrons
     """
     for i in range(len(stamps)):
-        taken[i] = 0.0
+        removed[i] = 0.0
         if curve[i, 0] == 0.0:
             continue
         for r in range(stamps.shape[1]):
             up = r - y[i]
             level, slope = curve[i, 0] + curve[i, 3] * up * up, curve[i, 2] * up
-            some = stamps[i, r]
+            stamp_row = stamps[i, r]
             total = 0.0
-            for c in range(len(some)):
+            for c in range(len(stamp_row)):
                 across = c - x[i]
-                before = some[c]
-                more = max(level + across * (slope + across * curve[i, 1]), 0.0)
-                some[c] = before - min(more, max(np.float64(before), 0.0))
-                total += np.float64(before) - np.float64(some[c])
-            taken[i] += total
+                original = stamp_row[c]
+                aliased = max(level + across * (slope + across * curve[i, 1]), 0.0)
+                stamp_row[c] = original - min(aliased, max(np.float64(original), 0.0))
+                total += np.float64(original) - np.float64(stamp_row[c])
+            removed[i] += total
 
 
 @jit
-def aliased_light(size: Int, x: Float, y: Float, profile: Float, most: Float) -> Float:
+def aliased_light(size: Int, x: Float, y: Float, profile: Float, max_electrons: Float) -> Float:
     """[m, 5] light that enters stamps at their edges: its level in the middle, terms of x^2, x y and y^2; all of it.
 
     size, x, y : [m] side of the stamp, position in it, pixels;  profile : [m, 11] galaxy_shapes.on_the_sky, electrons
@@ -106,29 +106,29 @@ def aliased_light(size: Int, x: Float, y: Float, profile: Float, most: Float) ->
         if profile[i, BULGE] == 0.0 and profile[i, DISK] == 0.0:
             continue
         # The lattice of the stamp's images has no odd terms.
-        middle, rising = _images(profile[i], n, 0.0, 0.0), _images(profile[i], n, h, h)
-        right, up = _images(profile[i], n, h, 0.0), _images(profile[i], n, 0.0, h)
-        falling = _images(profile[i], n, h, -h)
+        middle, rising = _image_light(profile[i], n, 0.0, 0.0), _image_light(profile[i], n, h, h)
+        right, up = _image_light(profile[i], n, h, 0.0), _image_light(profile[i], n, 0.0, h)
+        falling = _image_light(profile[i], n, h, -h)
         highest, lowest = max(max(right, up), max(rising, falling)), min(min(right, up), min(rising, falling))
         uneven = max(highest - middle, middle - lowest) / middle if middle > 0.0 else _STEEP
         across2, up2 = (right - middle) / h**2, (up - middle) / h**2
-        both = 0.5 * (rising - falling) / h**2
+        cross_term = 0.5 * (rising - falling) / h**2
         across, along = 0.5 * (n - 1) - x[i], 0.5 * (n - 1) - y[i]
         spread = (n * n - 1) / 12.0
-        second = across2 * (across**2 + spread) + both * across * along + up2 * (along**2 + spread)
+        second = across2 * (across**2 + spread) + cross_term * across * along + up2 * (along**2 + spread)
         light = n * n * (middle + second)
         if light > 0.0:
             # By and by: if it ended at once, a galaxy and the same one sheared would differ by more than by the shear.
             z = min((_STEEP - uneven) / (_STEEP - _EVEN), light / (_CANCELLED * n * n * middle))
             z = min(max(z, 0.0), 1.0)
             part = z * z * (3.0 - 2.0 * z)
-            part = min(part, most[i] / light)
-            out[i] = part * middle, part * across2, part * both, part * up2, part * light
+            part = min(part, max_electrons[i] / light)
+            out[i] = part * middle, part * across2, part * cross_term, part * up2, part * light
     return out
 
 
 @jit
-def _images(profile: Float, size: int, x: float, y: float) -> Any:
+def _image_light(profile: Float, size: int, x: float, y: float) -> Any:
     """Light of a source's images in the stamps about its own, three deep."""
     total = 0.0
     for r in range(-3, 4):
@@ -161,7 +161,7 @@ def _square(profile: Float, form: int, x: float, y: float) -> Any:
 
 
 @jit
-def smooth(blocks: Int, image: Float, x: Float, y: Float, electrons: Float, unit: float) -> None:
+def add_smoothed(blocks: Int, image: Float, x: Float, y: Float, electrons: Float, unit: float) -> None:
     """Adds an image about points (x, y) [m], blocks, each shared among the four nearest, `unit` to an electron.
 
     image : electrons a pixel of one electron, on blocks, its middle one the point's, with a border of nothing
@@ -169,17 +169,17 @@ def smooth(blocks: Int, image: Float, x: Float, y: Float, electrons: Float, unit
     ny, nx = blocks.shape
     side = len(image) - 1
     for i in range(len(x)):
-        left, low = int(np.floor(x[i])), int(np.floor(y[i]))
-        right, up = x[i] - left, y[i] - low
+        x_first, y_first = int(np.floor(x[i])), int(np.floor(y[i]))
+        x_fraction, y_fraction = x[i] - x_first, y[i] - y_first
         light = electrons[i] * unit
-        w0, w1 = light * (1.0 - right) * (1.0 - up), light * right * (1.0 - up)
-        w2, w3 = light * (1.0 - right) * up, light * right * up
-        left, low = left - (side - 1) // 2, low - (side - 1) // 2
-        first, last = max(0, -left), min(side, nx - left)
+        w0, w1 = light * (1.0 - x_fraction) * (1.0 - y_fraction), light * x_fraction * (1.0 - y_fraction)
+        w2, w3 = light * (1.0 - x_fraction) * y_fraction, light * x_fraction * y_fraction
+        x_first, y_first = x_first - (side - 1) // 2, y_first - (side - 1) // 2
+        first, last = max(0, -x_first), min(side, nx - x_first)
         if first >= last:
             continue
-        for r in range(max(0, -low), min(side, ny - low)):
-            out = blocks[low + r, left + first : left + last]
+        for r in range(max(0, -y_first), min(side, ny - y_first)):
+            out = blocks[y_first + r, x_first + first : x_first + last]
             a, b = image[r + 1, first + 1 : last + 1], image[r + 1, first:last]
             c, d = image[r, first + 1 : last + 1], image[r, first:last]
             for j in range(len(out)):
@@ -187,7 +187,7 @@ def smooth(blocks: Int, image: Float, x: Float, y: Float, electrons: Float, unit
 
 
 @jit
-def spill(
+def add_spilled(
     blocks: Int, side: int, margin: int, size: Int, reach: Float, column: Float, row: Float, profile: Float,
     light: Float, unit: float,
 ) -> None:  # fmt: skip
@@ -203,17 +203,17 @@ def spill(
     for i in range(len(size)):
         half = size[i] // 2
         form = profile[i, BULGE_FORM : BULGE_FORM + 4].copy()
-        least = max(half - 0.5 * side - 1.0, 1.0) ** 2 * smaller(form.reshape(2, 2))
-        bulge, first = _by_square(profile[i], least, 3.0 * (reach[i] + side) ** 2 * np.sum(form**2))
+        min_square = max(half - 0.5 * side - 1.0, 1.0) ** 2 * min_singular_squared(form.reshape(2, 2))
+        bulge, first = _tabulate_bulge(profile[i], min_square, 3.0 * (reach[i] + side) ** 2 * np.sum(form**2))
         x0, y0 = np.rint(column[i]) - half - 0.5, np.rint(row[i]) - half - 0.5
-        left, low = int(np.floor((column[i] - reach[i]) / side)), int(np.floor((row[i] - reach[i]) / side))
-        right, high = int(np.ceil((column[i] + reach[i]) / side)), int(np.ceil((row[i] + reach[i]) / side))
-        image = np.zeros((high - low + 1, right - left + 1))
+        x_first, y_first = int(np.floor((column[i] - reach[i]) / side)), int(np.floor((row[i] - reach[i]) / side))
+        x_last, y_last = int(np.ceil((column[i] + reach[i]) / side)), int(np.ceil((row[i] + reach[i]) / side))
+        image = np.zeros((y_last - y_first + 1, x_last - x_first + 1))
         for r in range(len(image)):
-            bottom = (low + r) * side - 0.5
+            bottom = (y_first + r) * side - 0.5
             covered_y = max(min(bottom + side, y0 + size[i]) - max(bottom, y0), 0.0) / side
             for c in range(image.shape[1]):
-                edge = (left + c) * side - 0.5
+                edge = (x_first + c) * side - 0.5
                 covered_x = max(min(edge + side, x0 + size[i]) - max(edge, x0), 0.0) / side
                 outside = 1.0 - covered_x * covered_y
                 if outside > 0.0:
@@ -221,27 +221,29 @@ def spill(
                     square[0] = _square(profile[i], BULGE_FORM, x, y)
                     place = min(max((bits[0] >> _COARSE) - first, 0), len(bulge) - 2)
                     part = (bits[0] & ((1 << _COARSE) - 1)) / (1 << _COARSE)
-                    some = bulge[place] + part * (bulge[place + 1] - bulge[place]) + _disk_light(profile[i], x, y)
-                    image[r, c] = outside * some
-        whole = np.sum(image) * side**2
-        if whole > 0.0:
-            _add(blocks, image, left + margin, low + margin, light[i] / whole * unit)
+                    pixel_light = (
+                        bulge[place] + part * (bulge[place + 1] - bulge[place]) + _disk_light(profile[i], x, y)
+                    )
+                    image[r, c] = outside * pixel_light
+        total = np.sum(image) * side**2
+        if total > 0.0:
+            _add_image(blocks, image, x_first + margin, y_first + margin, light[i] / total * unit)
 
 
 @jit
-def _add(blocks: Int, image: Float, left: int, low: int, scale: float) -> None:
+def _add_image(blocks: Int, image: Float, x_first: int, y_first: int, scale: float) -> None:
     """Adds an image times `scale`, rounded, to blocks from (left, low) on, as far as it lies on them."""
     ny, nx = blocks.shape
-    first, last = max(0, -left), min(image.shape[1], nx - left)
-    for r in range(max(0, -low), min(len(image), ny - low)):
+    first, last = max(0, -x_first), min(image.shape[1], nx - x_first)
+    for r in range(max(0, -y_first), min(len(image), ny - y_first)):
         for c in range(first, last):
-            blocks[low + r, left + c] += np.int64(np.rint(scale * image[r, c]))
+            blocks[y_first + r, x_first + c] += np.int64(np.rint(scale * image[r, c]))
 
 
 @jit
-def _by_square(profile: Float, least: float, most: float) -> tuple[Float, int]:
+def _tabulate_bulge(profile: Float, min_square: float, max_square: float) -> tuple[Float, int]:
     """(light of the bulge by u^2 + v^2, 16 places an octave, linear between; the top bits of the first)."""
-    ends = np.array([max(least, 1e-30), min(max(most, 1e-30), 1e30)], np.float32)
+    ends = np.array([max(min_square, 1e-30), min(max(max_square, 1e-30), 1e30)], np.float32)
     bits = ends.view(np.int32)
     first, last = bits[0] >> _COARSE, (bits[1] >> _COARSE) + 2
     nodes = ((np.arange(last - first) + first) << _COARSE).astype(np.int32).view(np.float32)
@@ -253,25 +255,29 @@ def _by_square(profile: Float, least: float, most: float) -> tuple[Float, int]:
 
 
 @jit
-def electrons_of(frame: Int, unit: float, blocks: Float, side: int, margin: int) -> Float:
+def to_electrons(frame: Int, unit: float, blocks: Float, side: int, margin: int) -> Float:
     """The electrons of a frame of `unit` to each, with those of blocks of `side` pixels, `margin` before its first.
 
     blocks : electrons a pixel, interpolated linearly between the blocks' centres
     returns : float64[ny, nx] in the place of the frame, which is lost
     """
     ny, nx = frame.shape
-    out, one = frame.view(np.float64), 1.0 / unit
+    out, electrons_per_unit = frame.view(np.float64), 1.0 / unit
     middle = 0.5 * (side - 1)
-    left, part = np.empty(nx, np.int64), np.empty(nx)
+    block_column, column_fraction = np.empty(nx, np.int64), np.empty(nx)
     for c in range(nx):
         x = (c - middle) / side + margin
-        left[c] = int(np.floor(x))
-        part[c] = x - left[c]
+        block_column[c] = int(np.floor(x))
+        column_fraction[c] = x - block_column[c]
     for r in range(ny):
         y = (r - middle) / side + margin
-        low = int(np.floor(y))
-        up = y - low
-        line = (1.0 - up) * blocks[low] + up * blocks[low + 1]
+        block_row = int(np.floor(y))
+        row_fraction = y - block_row
+        line = (1.0 - row_fraction) * blocks[block_row] + row_fraction * blocks[block_row + 1]
         for c in range(nx):
-            out[r, c] = frame[r, c] * one + line[left[c]] + part[c] * (line[left[c] + 1] - line[left[c]])
+            out[r, c] = (
+                frame[r, c] * electrons_per_unit
+                + line[block_column[c]]
+                + column_fraction[c] * (line[block_column[c] + 1] - line[block_column[c]])
+            )
     return out

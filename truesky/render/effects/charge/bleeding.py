@@ -22,19 +22,19 @@ from truesky.numerics.compiling import jit
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
 
-Runs = Sequence[tuple[int, int, bool]]
+Segments = Sequence[tuple[int, int, bool]]
 
 
-def apply(frame: Frame, capacity: float, runs: Runs, rng: np.random.Generator | None = None) -> Frame:
+def apply(frame: Frame, capacity: float, segments: Segments, rng: np.random.Generator | None = None) -> Frame:
     """frame [ny, nx] whole e- -> no pixel above `capacity`.
 
     capacity : of a pixel, e-;  rng : not used
     runs     : as of `bleed`
     """
-    return bleed(frame, capacity, runs)[0]
+    return bleed(frame, capacity, segments)[0]
 
 
-def bleed(frame: Frame, capacity: float, runs: Runs) -> tuple[Frame, float]:
+def bleed(frame: Frame, capacity: float, segments: Segments) -> tuple[Frame, float]:
     """The frame after bleeding, and the electrons that left through the serial registers.
 
     frame    : float64[ny, nx] e- >= 0
@@ -45,7 +45,7 @@ def bleed(frame: Frame, capacity: float, runs: Runs) -> tuple[Frame, float]:
     """
     if not 1.0 <= capacity < np.inf:
         raise OutOfRange("full well", capacity, 1.0, np.inf)
-    for first, past, _ in runs:
+    for first, past, _ in segments:
         if not 0 <= first <= past <= len(frame):
             raise OutOfRange("rows of a column", first if first < 0 else past, 0, len(frame))
     out = np.array(frame, dtype=np.float64, order="C")
@@ -54,54 +54,54 @@ def bleed(frame: Frame, capacity: float, runs: Runs) -> tuple[Frame, float]:
         return out, 0.0
     full, lost = float(np.floor(capacity)), 0.0
     columns = np.flatnonzero(highest > full)
-    for first, past, upwards in runs:
+    for first, past, register_above in segments:
         if past > first:
-            piece = out[first:past]
-            lost += _bleed(piece[::-1] if upwards else piece, columns, full)
+            segment = out[first:past]
+            lost += _bleed_segment(segment[::-1] if register_above else segment, columns, full)
     return out, lost
 
 
 @jit
-def _bleed(half: Any, columns: Any, full: float) -> float:
+def _bleed_segment(segment: Any, columns: Any, full: float) -> float:
     """One piece of columns, its serial register below row 0, in place; returns what left it."""
-    n = half.shape[0]
+    n = segment.shape[0]
     down = np.empty(n)
     lost = 0.0
     for x in columns:
         carried = 0.0
         for y in range(n):
-            charge = half[y, x]
+            charge = segment[y, x]
             # Of its own excess half goes each way; what comes from below goes on upwards.
             excess = max(charge - full, 0.0)
             upwards = np.ceil(0.5 * excess)
             down[y] = excess - upwards
             charge = charge - excess + carried
             over = max(charge - full, 0.0)
-            half[y, x] = charge - over
+            segment[y, x] = charge - over
             carried = over + upwards
         # The stop at the far end turns it back.
         for y in range(n - 1, -1, -1):
-            charge = half[y, x] + carried
+            charge = segment[y, x] + carried
             over = max(charge - full, 0.0)
-            half[y, x] = charge - over
+            segment[y, x] = charge - over
             carried = over + down[y]
         lost += carried
     return lost
 
 
-def saturated(frame: Frame, capacity: float) -> Bool:
+def saturated_pixels(frame: Frame, capacity: float) -> Bool:
     """Pixels [ny, nx] that hold all they can."""
     return np.asarray(frame >= np.floor(capacity))
 
 
-def capacity(scene: Scene) -> float:
+def full_well(scene: Scene) -> float:
     """Electrons."""
     return scene.value("full_well", "electron")
 
 
 def _contribution(scene: Scene) -> float:
     """What the brightest pixel has too many."""
-    return max(scene.brightest_electrons - capacity(scene), 0.0)
+    return max(scene.brightest_electrons - full_well(scene), 0.0)
 
 
-EFFECT = Effect("bleeding", apply, lambda scene: (capacity(scene), scene.runs), _contribution, cost=5e-3)
+EFFECT = Effect("bleeding", apply, lambda scene: (full_well(scene), scene.column_segments), _contribution, cost=5e-3)

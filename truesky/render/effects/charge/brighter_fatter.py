@@ -25,16 +25,16 @@ from truesky.render.effects.scene import Frame, Scene
 # Pixels to each side that a border feels.
 REACH = 2
 # Pixels of a row that are looked at together.
-_RUN = 64
+_BLOCK = 64
 # Of R^2 of a VIS star: it grows by so many times the shift for each electron of its brightest pixel. A Gaussian of 0.7
 # pixels rms, 2e5 electrons high, grows by 1.0 (mean of 50); the rest is safety.
-_GROWTH = 1.25
+_R2_GROWTH = 1.25
 # Of a pixel's charge, the part that can leave it over one border: strips are thin.
-MOST = 0.2
+MAX_CROSSING = 0.2
 
 
 def apply(
-    frame: Frame, shift: float, softening: float, capacity: float, dim: float, between: int, rng: np.random.Generator
+    frame: Frame, shift: float, softening: float, capacity: float, threshold: float, gap: int, rng: np.random.Generator
 ) -> Frame:
     """frame [ny, nx] whole e- >= 0 -> whole e- >= 0, the same sum.
 
@@ -47,7 +47,7 @@ def apply(
     """
     for name, value, low, high in (
         ("brighter-fatter shift", shift, 0.0, 1e-4), ("full well", capacity, 1.0, 1e9),
-        ("brighter-fatter dim", dim, 0.0, np.inf),
+        ("brighter-fatter dim", threshold, 0.0, np.inf),
     ):  # fmt: skip
         if not low <= value <= high:
             raise OutOfRange(name, value, low, high)
@@ -55,18 +55,18 @@ def apply(
     if shift == 0.0 or out.size == 0 or out.max() <= 0.0:
         return out
     # In single precision: whole electrons below 2^24 are exact, and what crosses to 1e-7 of it.
-    held = np.empty((out.shape[0] + 2 * REACH, out.shape[1] + 2 * REACH), np.float32)
-    np.minimum(out, capacity, out=held[REACH:-REACH, REACH:-REACH], casting="same_kind")
-    for sides in (held, held.T):
-        sides[:REACH], sides[-REACH:] = sides[REACH], sides[-REACH - 1]
-    first = (len(out) - between) // 2
-    held[REACH + first : REACH + first + between] = 0.0
+    charge = np.empty((out.shape[0] + 2 * REACH, out.shape[1] + 2 * REACH), np.float32)
+    np.minimum(out, capacity, out=charge[REACH:-REACH, REACH:-REACH], casting="same_kind")
+    for padded in (charge, charge.T):
+        padded[:REACH], padded[-REACH:] = padded[REACH], padded[-REACH - 1]
+    gap_start = (len(out) - gap) // 2
+    charge[REACH + gap_start : REACH + gap_start + gap] = 0.0
     weights = kernel(shift, softening).astype(np.float32)
     # Of each run of pixels, and none after the last.
-    most = np.zeros((len(held), -(-held.shape[1] // _RUN) + 1), np.float32)
-    _highest(held.view(np.int32), most.view(np.int32))
-    for down in (False, True):
-        _cross(held, most, out, weights, pixel_random.key(rng), down, dim, first, between)
+    block_max = np.zeros((len(charge), -(-charge.shape[1] // _BLOCK) + 1), np.float32)
+    _find_block_max(charge.view(np.int32), block_max.view(np.int32))
+    for vertical in (False, True):
+        _move_charge(charge, block_max, out, weights, pixel_random.draw_key(rng), vertical, threshold, gap_start, gap)
     return out
 
 
@@ -82,14 +82,22 @@ def kernel(shift: float, softening: float) -> Frame:
     return np.asarray(shift * field / field[REACH, 0])
 
 
-def curvature(shift: float, softening: float) -> float:
+def variance_slope(shift: float, softening: float) -> float:
     """Variance of a flat field: mean (1 - curvature mean), to first order.  Own charge, four borders."""
     return 4.0 * float(kernel(shift, softening)[REACH, 0])
 
 
 @jit
-def _cross(
-    held: Any, most: Any, out: Any, weights: Any, key: Any, down: bool, dim: float, drained: int, between: int
+def _move_charge(
+    charge: Any,
+    block_max: Any,
+    out: Any,
+    weights: Any,
+    key: Any,
+    vertical: bool,
+    threshold: float,
+    gap_start: int,
+    gap: int,
 ) -> None:
     """Moves charge over the borders between neighbours in a row (or, `down`, in a column), in place.
 
@@ -98,77 +106,80 @@ def _cross(
     drained, between : first of the rows that hold nothing, and how many they are
     """
     ny, nx = out.shape
-    last_row, last = (ny - 1, nx) if down else (ny, nx - 1)
-    displaced = np.empty(_RUN, np.float32)
-    for r in range(last_row):
-        for run in range((last + _RUN - 1) // _RUN):
+    n_rows, n_columns = (ny - 1, nx) if vertical else (ny, nx - 1)
+    displacements = np.empty(_BLOCK, np.float32)
+    for r in range(n_rows):
+        for block in range((n_columns + _BLOCK - 1) // _BLOCK):
             # A border feels the margin, too: it lies in the next run.
-            if most[r : r + 2 * REACH + 1 + down, run : run + 2].max() < dim:
+            if block_max[r : r + 2 * REACH + 1 + vertical, block : block + 2].max() < threshold:
                 continue
-            first = run * _RUN
-            some = displaced[: min(_RUN, last - first)]
-            _displace(held, weights, down, r, first, some)
-            here, there = held[r + REACH, first + REACH :], held[r + REACH + down, first + REACH + 1 - down :]
+            first = block * _BLOCK
+            displacement = displacements[: min(_BLOCK, n_columns - first)]
+            _compute_displacement(charge, weights, vertical, r, first, displacement)
+            side_1, side_2 = (
+                charge[r + REACH, first + REACH :],
+                charge[r + REACH + vertical, first + REACH + 1 - vertical :],
+            )
             # The strip lies in the row that holds charge.
-            if down and between and r + 1 == drained:
-                there = here
-            if down and between and r + 1 == drained + between:
-                here = there
-            giver, taker = out[r, first:], out[r + down, first + 1 - down :]
-            for c in range(len(some)):
+            if vertical and gap and r + 1 == gap_start:
+                side_2 = side_1
+            if vertical and gap and r + 1 == gap_start + gap:
+                side_1 = side_2
+            giver, taker = out[r, first:], out[r + vertical, first + 1 - vertical :]
+            for c in range(len(displacement)):
                 # The border moves towards the fuller side, on average by half: what falls into the strip changes sides.
-                strip = np.float32(0.25) * some[c] * (here[c] + there[c])
+                strip = np.float32(0.25) * displacement[c] * (side_1[c] + side_2[c])
                 # What crosses is a whole number of electrons, right in the mean.
-                moved = np.floor(strip + pixel_random.uniform(pixel_random.word(key, r * nx + first + c)))
-                most_moved = np.floor(MOST * (giver[c] if moved > 0.0 else taker[c]))
-                moved = min(max(moved, -most_moved), most_moved)
+                moved = np.floor(strip + pixel_random.uniform(pixel_random.pixel_bits(key, r * nx + first + c)))
+                limit = np.floor(MAX_CROSSING * (giver[c] if moved > 0.0 else taker[c]))
+                moved = min(max(moved, -limit), limit)
                 giver[c] -= moved
                 taker[c] += moved
 
 
 @jit
-def _highest(bits: Any, most: Any) -> None:
+def _find_block_max(bits: Any, block_max: Any) -> None:
     """Of each run of pixels of each row; by their bits, which are in the order of the numbers >= 0 they stand for."""
     for r in range(len(bits)):
-        for run in range(most.shape[1] - 1):
-            line, highest = bits[r, run * _RUN : (run + 1) * _RUN], np.int32(0)
-            for c in range(len(line)):
-                highest = max(highest, line[c])
-            most[r, run] = highest
+        for block in range(block_max.shape[1] - 1):
+            pixels, highest = bits[r, block * _BLOCK : (block + 1) * _BLOCK], np.int32(0)
+            for c in range(len(pixels)):
+                highest = max(highest, pixels[c])
+            block_max[r, block] = highest
 
 
 @jit
-def _displace(held: Any, weights: Any, down: bool, r: int, first: int, displaced: Any) -> None:
+def _compute_displacement(charge: Any, weights: Any, vertical: bool, r: int, first: int, displacement: Any) -> None:
     """Of the borders of a row from a pixel on."""
-    displaced[:] = np.float32(0.0)
+    displacement[:] = np.float32(0.0)
     for i in range(2 * REACH + 1):
         for j in range(REACH):
             # Pixels j from the border on this side, and on the other.
-            if down:
-                near, far = held[r + REACH - j, first + i :], held[r + REACH + 1 + j, first + i :]
+            if vertical:
+                side_1, side_2 = charge[r + REACH - j, first + i :], charge[r + REACH + 1 + j, first + i :]
             else:
-                near, far = held[r + i, first + REACH - j :], held[r + i, first + REACH + 1 + j :]
+                side_1, side_2 = charge[r + i, first + REACH - j :], charge[r + i, first + REACH + 1 + j :]
             weight = weights[i, j]
-            for c in range(len(displaced)):
-                displaced[c] += weight * (near[c] - far[c])
+            for c in range(len(displacement)):
+                displacement[c] += weight * (side_1[c] - side_2[c])
 
 
 def _parameters(scene: Scene) -> tuple[float, float, float, float, int]:
     shift, softening = scene.value("bfe.shift", "pix / electron"), scene.value("bfe.softening", "pix")
     # Over a border between pixels of n e- at most sum(kernel) n x 2 n / 4 cross; a pixel has four.
-    noise = scene.accuracy.background * scene.pixel_noise / 4.0
-    dim = min(
-        np.sqrt(2.0 * noise / max(float(kernel(shift, softening).sum()), 1e-30)),
-        scene.accuracy.shape / (_GROWTH * max(shift, 1e-30)),
+    max_noise = scene.accuracy.background * scene.pixel_noise / 4.0
+    threshold = min(
+        np.sqrt(2.0 * max_noise / max(float(kernel(shift, softening).sum()), 1e-30)),
+        scene.accuracy.shape / (_R2_GROWTH * max(shift, 1e-30)),
     )
-    return shift, softening, scene.value("full_well", "electron"), float(dim), scene.middle
+    return shift, softening, scene.value("full_well", "electron"), float(threshold), scene.injection_rows
 
 
 def _contribution(scene: Scene) -> float:
     shift, _, capacity, *_ = _parameters(scene)
-    full = min(scene.peak_electrons, capacity) + scene.sky_electrons
+    peak = min(scene.peak_electrons, capacity) + scene.sky_electrons
     # Four borders, half the final displacement, two thirds of the light at a border: 1.2 of this for a VIS star.
-    return 1.5 * shift * full**2
+    return 1.5 * shift * peak**2
 
 
 EFFECT = Effect("brighter_fatter", apply, _parameters, _contribution, cost=1e-2)

@@ -12,15 +12,15 @@ import numpy as np
 from lake_schema.errors import OutOfRange
 from truesky.numerics.compiling import jit
 from truesky.render.effects import pixel_random
-from truesky.render.effects.effect import Effect, by_pixel
+from truesky.render.effects.effect import Effect, map_pixels
 from truesky.render.effects.scene import Frame, Scene
 
 # A hot pixel of a warm detector: more would make no difference to any well.
-_OVERFLOWING = 1e11
+_MAX_HOT_ELECTRONS = 1e11
 
 
 def apply(
-    frame: Frame, electrons: float, spread: float, hot: float, hot_electrons: float, rng: np.random.Generator
+    frame: Frame, electrons: float, spread: float, hot_fraction: float, hot_electrons: float, rng: np.random.Generator
 ) -> Frame:
     """Expected e- [ny, nx] -> plus the dark current's.
 
@@ -29,35 +29,35 @@ def apply(
     hot           : fraction of the pixels;  hot_electrons : mean of what they have more, exponentially distributed
     rng           : random numbers of the detector's pixels
     """
-    for name, value, most in (
+    for name, value, highest in (
         ("dark electrons", electrons, 1e12), ("spread of the dark current", spread, 3.0),
-        ("hot pixels", hot, 1.0), ("hot electrons", hot_electrons, 1e12),
+        ("hot pixels", hot_fraction, 1.0), ("hot electrons", hot_electrons, 1e12),
     ):  # fmt: skip
-        if not 0.0 <= value <= most:
-            raise OutOfRange(name, value, 0.0, most)
+        if not 0.0 <= value <= highest:
+            raise OutOfRange(name, value, 0.0, highest)
     # The mean of exp(s z) is exp(s^2 / 2).
-    out = by_pixel(_add, frame, electrons * np.exp(-0.5 * spread**2), spread, pixel_random.key(rng))
-    count = int(rng.binomial(out.size, hot))
-    where = rng.integers(0, max(out.size, 1), count)
-    np.add.at(out.reshape(-1), where, hot_electrons * rng.standard_exponential(count))
+    out = map_pixels(_add_dark, frame, electrons * np.exp(-0.5 * spread**2), spread, pixel_random.draw_key(rng))
+    count = int(rng.binomial(out.size, hot_fraction))
+    hot_pixels = rng.integers(0, max(out.size, 1), count)
+    np.add.at(out.reshape(-1), hot_pixels, hot_electrons * rng.standard_exponential(count))
     return out
 
 
 @jit
-def _add(frame: Any, out: Any, electrons: float, spread: float, key: Any) -> None:
+def _add_dark(frame: Any, out: Any, median: float, spread: float, key: Any) -> None:
     for i in range(len(frame)):
-        out[i] = frame[i] + electrons * np.exp(spread * pixel_random.normal(pixel_random.word(key, i)))
+        out[i] = frame[i] + median * np.exp(spread * pixel_random.normal(pixel_random.pixel_bits(key, i)))
 
 
 def _parameters(scene: Scene) -> tuple[float, float, float, float]:
     rate = scene.value("hot_current", "electron / (s pix)") * scene.dark_current_scaling
-    hot = min(rate * scene.exposure_time_s, _OVERFLOWING)
-    return scene.dark_electrons, scene.value("dark_spread", ""), scene.value("hot_pixels", ""), hot
+    hot_electrons = min(rate * scene.exposure_time_s, _MAX_HOT_ELECTRONS)
+    return scene.dark_electrons, scene.value("dark_spread", ""), scene.value("hot_pixels", ""), hot_electrons
 
 
 def _contribution(scene: Scene) -> float:
-    electrons, _, hot, hot_electrons = _parameters(scene)
-    return electrons + hot_electrons * (hot > 0.0)
+    electrons, _, hot_fraction, hot_electrons = _parameters(scene)
+    return electrons + hot_electrons * (hot_fraction > 0.0)
 
 
 EFFECT = Effect("dark_map", apply, _parameters, _contribution, fixed=True, cost=1e-2)

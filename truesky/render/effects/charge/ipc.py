@@ -15,7 +15,7 @@ import numpy as np
 
 from lake_schema.errors import BadInput, OutOfRange
 from truesky.numerics.compiling import jit
-from truesky.render.effects.effect import Effect, nothing
+from truesky.render.effects.effect import Effect, zero_contribution
 from truesky.render.effects.scene import Frame, Scene
 
 
@@ -31,31 +31,31 @@ def apply(frame: Frame, side: float, diagonal: float, rng: np.random.Generator) 
     if 4.0 * (side + diagonal) > 0.5:
         raise BadInput(f"inter-pixel capacitance: {4.0 * (side + diagonal):g} of a pixel's charge is seen by others")
     out = np.empty_like(frame)
-    for plane, seen in zip(frame.reshape(-1, *frame.shape[-2:]), out.reshape(-1, *frame.shape[-2:]), strict=True):
-        _coupled(np.ascontiguousarray(plane), seen, side, diagonal)
+    for plane, coupled in zip(frame.reshape(-1, *frame.shape[-2:]), out.reshape(-1, *frame.shape[-2:]), strict=True):
+        _couple_plane(np.ascontiguousarray(plane), coupled, side, diagonal)
     return out
 
 
 @jit
-def _coupled(plane: Any, seen: Any, side: float, diagonal: float) -> None:
+def _couple_plane(plane: Any, coupled: Any, side: float, diagonal: float) -> None:
     ny, nx = plane.shape
     for y in range(ny):
         for x in range(nx):
-            own, more = float(plane[y, x]), 0.0
+            charge, change = float(plane[y, x]), 0.0
             for dy in range(-1, 2):
                 for dx in range(-1, 2):
                     if 0 <= y + dy < ny and 0 <= x + dx < nx:
                         share = side if dx == 0 or dy == 0 else diagonal
                         # Its own difference is 0.
-                        more += share * (float(plane[y + dy, x + dx]) - own)
-            seen[y, x] = own + more
+                        change += share * (float(plane[y + dy, x + dx]) - charge)
+            coupled[y, x] = charge + change
 
 
 def _parameters(scene: Scene) -> tuple[float, float]:
     """A mission may have it in one of its ramps and not in the other."""
     key = f"ipc_{scene.ramp}"
-    own = scene.value(key, "") if f"{scene.section}.{key}" in scene.mission else 1.0
-    return own * scene.value("ipc.side", ""), own * scene.value("ipc.diagonal", "")
+    scaling = scene.value(key, "") if f"{scene.section}.{key}" in scene.mission else 1.0
+    return scaling * scene.value("ipc.side", ""), scaling * scene.value("ipc.diagonal", "")
 
 
 def _contribution(scene: Scene) -> float:
@@ -64,4 +64,4 @@ def _contribution(scene: Scene) -> float:
     return 4.0 * (side + diagonal) * scene.value("full_well", "electron")
 
 
-EFFECT = Effect("ipc", apply, _parameters, _contribution, cost=1.1e-2, repeated=nothing)
+EFFECT = Effect("ipc", apply, _parameters, _contribution, cost=1.1e-2, systematic=zero_contribution)

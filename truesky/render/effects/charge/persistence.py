@@ -34,11 +34,11 @@ from truesky.render.effects.scene import Frame, Scene
 from truesky.render.effects.series import SMALL, SMALL_EXP, small_exp, small_expm1
 
 # Of a pixel's second number: other bits than of its first, of which the ziggurat may take more.
-_OTHER = np.uint64(0x5851F42D4C957F2D)
+_SECOND_STREAM = np.uint64(0x5851F42D4C957F2D)
 
 
 @dataclass(frozen=True, slots=True)
-class Traps:
+class PersistenceModel:
     """Of a detector.
 
     p0, p1, p2      : e-, no unit, e-, of the formula
@@ -53,25 +53,30 @@ class Traps:
     p2: float
     power: float
     reference: float
-    length: float
+    nominal_length: float
     full_well: float
     soak: float = 0.0
 
     @classmethod
-    def of(cls, scene: Scene) -> Traps:
+    def from_scene(cls, scene: Scene) -> PersistenceModel:
         """Of the mission database."""
 
-        def of(name: str, unit: str) -> float:
+        def value(name: str, unit: str) -> float:
             return scene.value(f"persistence.{name}", unit)
 
         return cls(
-            p0=of("p0", "electron"), p1=of("p1", ""), p2=of("p2", "electron"), power=of("time_power", ""),
-            reference=of("time_reference", "s"), length=of("exposure_time", "s"),
-            full_well=scene.value("full_well", "electron"), soak=of("soak_power", ""),
+            p0=value("p0", "electron"), p1=value("p1", ""), p2=value("p2", "electron"), power=value("time_power", ""),
+            reference=value("time_reference", "s"), nominal_length=value("exposure_time", "s"),
+            full_well=scene.value("full_well", "electron"), soak=value("soak_power", ""),
         )  # fmt: skip
 
-    def left(
-        self, charge: Frame, delay: float, seconds: float, lasted: float | None = None, own: Pixels | None = None
+    def released_charge(
+        self,
+        charge: Frame,
+        delay: float,
+        seconds: float,
+        earlier_seconds: float | None = None,
+        variation: PixelVariation | None = None,
     ) -> Frame:
         """Of charge [..] e- what comes `delay` s later in an exposure of `seconds` s, e-.
 
@@ -80,43 +85,53 @@ class Traps:
         own    : of each pixel; None = all are as the usual one
         Error  : how much more comes in a longer exposure is of the usual pixel's power of time
         """
-        held = np.clip(charge, 0.0, self.full_well)
-        scale = self.scale(delay, seconds, lasted)
-        if own is not None:
-            held = np.ascontiguousarray(np.broadcast_to(held, own.p2.shape), dtype=float)
-            found = np.empty(held.shape)
-            numbers = (self.p0, 1e-5 * self.p1, self.p2, scale, float(np.log(delay / self.reference)), -self.power)
-            _leave(held.reshape(-1), own.p2.reshape(-1), own.power.reshape(-1), numbers, found.reshape(-1))
-            return found
+        filling = np.clip(charge, 0.0, self.full_well)
+        scale = self.time_scaling(delay, seconds, earlier_seconds)
+        if variation is not None:
+            filling = np.ascontiguousarray(np.broadcast_to(filling, variation.p2.shape), dtype=float)
+            released = np.empty(filling.shape)
+            constants = (self.p0, 1e-5 * self.p1, self.p2, scale, float(np.log(delay / self.reference)), -self.power)
+            _release(
+                filling.reshape(-1),
+                variation.p2.reshape(-1),
+                variation.power.reshape(-1),
+                constants,
+                released.reshape(-1),
+            )
+            return released
         # Most pixels have the sky alone, all the same.
-        least = held.min(initial=self.full_well)
-        more = held > least
-        found = np.full(held.shape, self._of(least) * scale)
-        found[more] = self._of(held[more]) * scale
-        return found
+        lowest = filling.min(initial=self.full_well)
+        above = filling > lowest
+        released = np.full(filling.shape, self._charge_at_reference(lowest) * scale)
+        released[above] = self._charge_at_reference(filling[above]) * scale
+        return released
 
-    def scale(self, delay: float, seconds: float, lasted: float | None = None) -> float:
+    def time_scaling(self, delay: float, seconds: float, earlier_seconds: float | None = None) -> float:
         """What times do to what is left, over the reference time and nominal lengths; as of `left`."""
         if not delay > 0.0:
             raise OutOfRange("delay of persistence", delay, 0.0, np.inf)
-        return float(self._filled(lasted) * (delay / self.reference) ** self.power * self._more(delay, seconds))
+        return float(
+            self._soak_factor(earlier_seconds)
+            * (delay / self.reference) ** self.power
+            * self._length_factor(delay, seconds)
+        )
 
-    def _filled(self, lasted: float | None) -> float:
+    def _soak_factor(self, earlier_seconds: float | None) -> float:
         """Traps that are filled in an exposure of `lasted` s, over those in one of the nominal length."""
-        return 1.0 if lasted is None else float((lasted / self.length) ** self.soak)
+        return 1.0 if earlier_seconds is None else float((earlier_seconds / self.nominal_length) ** self.soak)
 
-    def _more(self, delay: float, seconds: float) -> float:
+    def _length_factor(self, delay: float, seconds: float) -> float:
         """What comes from a delay on in so many seconds, over what comes in the nominal length."""
-        one, power = (np.log1p(time / delay) for time in (seconds, self.length)), 1.0 + self.power
-        counted, nominal = (x if power == 0.0 else np.expm1(power * x) / power for x in one)
-        return float(counted / nominal)
+        logs, power = (np.log1p(time / delay) for time in (seconds, self.nominal_length)), 1.0 + self.power
+        charge, nominal = (x if power == 0.0 else np.expm1(power * x) / power for x in logs)
+        return float(charge / nominal)
 
-    def _of(self, held: Frame) -> Frame:
-        return np.asarray((self.p0 + 1e-5 * self.p1 * held) * -np.expm1(-held / self.p2))
+    def _charge_at_reference(self, filling: Frame) -> Frame:
+        return np.asarray((self.p0 + 1e-5 * self.p1 * filling) * -np.expm1(-filling / self.p2))
 
 
 @dataclass(frozen=True, slots=True)
-class Pixels:
+class PixelVariation:
     """Of each pixel of a detector, float32[ny, nx].
 
     p2 : over the usual one;  power : what its power of time is more
@@ -126,7 +141,9 @@ class Pixels:
     power: Float32
 
 
-def pixels(shape: tuple[int, int], p2_spread: float, power_spread: float, rng: np.random.Generator) -> Pixels | None:
+def draw_variation(
+    shape: tuple[int, int], p2_spread: float, power_spread: float, rng: np.random.Generator
+) -> PixelVariation | None:
     """What each pixel has of its own, normally distributed; None = nothing.
 
     shape : ny, nx;  p2_spread : rms as a fraction, no pixel has less than a tenth of the usual p2
@@ -137,41 +154,41 @@ def pixels(shape: tuple[int, int], p2_spread: float, power_spread: float, rng: n
             raise OutOfRange(f"spread of persistence, {name}", value, 0.0, 1.0)
     if p2_spread == 0.0 == power_spread:
         return None
-    found = np.empty((2, *shape), np.float32)
-    _draw(found[0].reshape(-1), found[1].reshape(-1), p2_spread, power_spread, pixel_random.key(rng))
-    return Pixels(found[0], found[1])
+    planes = np.empty((2, *shape), np.float32)
+    _draw(planes[0].reshape(-1), planes[1].reshape(-1), p2_spread, power_spread, pixel_random.draw_key(rng))
+    return PixelVariation(planes[0], planes[1])
 
 
-def pixels_of(scene: Scene, rng: np.random.Generator) -> Pixels | None:
+def variation_of_scene(scene: Scene, rng: np.random.Generator) -> PixelVariation | None:
     """Of a detector by the mission database; rng : as of `pixels`."""
     p2, power = (scene.value(f"persistence.{name}_spread", "") for name in ("p2", "time_power"))
-    return pixels((scene.ny, scene.nx), p2, power, rng)
+    return draw_variation((scene.ny, scene.nx), p2, power, rng)
 
 
 @jit
 def _draw(p2: Any, power: Any, p2_spread: float, power_spread: float, key: Any) -> None:
     for i in range(len(p2)):
-        word = pixel_random.word(key, i)
-        p2[i] = max(1.0 + p2_spread * pixel_random.normal(word), 0.1)
-        power[i] = power_spread * pixel_random.normal(pixel_random.next_word(word ^ _OTHER))
+        bits = pixel_random.pixel_bits(key, i)
+        p2[i] = max(1.0 + p2_spread * pixel_random.normal(bits), 0.1)
+        power[i] = power_spread * pixel_random.normal(pixel_random.next_bits(bits ^ _SECOND_STREAM))
 
 
 @jit
-def _leave(held: Any, p2: Any, power: Any, numbers: Any, out: Any) -> None:
-    constant, slope, usual, scale, log_time, steepest = numbers
-    inverse = 1.0 / usual
-    for i in range(len(held)):
+def _release(filling: Any, p2: Any, power: Any, constants: Any, out: Any) -> None:
+    offset, slope, median_p2, scale, log_time, max_power = constants
+    inverse = 1.0 / median_p2
+    for i in range(len(filling)):
         # Nothing that is left becomes more with time.
-        grown = small_exp(min(power[i], steepest) * log_time)
-        out[i] = (constant + slope * held[i]) * -small_expm1(-held[i] * inverse / p2[i]) * scale * grown
+        growth = small_exp(min(power[i], max_power) * log_time)
+        out[i] = (offset + slope * filling[i]) * -small_expm1(-filling[i] * inverse / p2[i]) * scale * growth
     # Most pixels are faint: a branch above would cost more than the few that are done twice.
-    for i in range(len(held)):
-        light, time = held[i] * inverse / p2[i], min(power[i], steepest) * log_time
-        if light > SMALL or abs(time) > SMALL_EXP:
-            out[i] = (constant + slope * held[i]) * -math.expm1(-light) * scale * math.exp(time)
+    for i in range(len(filling)):
+        x, time = filling[i] * inverse / p2[i], min(power[i], max_power) * log_time
+        if x > SMALL or abs(time) > SMALL_EXP:
+            out[i] = (offset + slope * filling[i]) * -math.expm1(-x) * scale * math.exp(time)
 
 
-def apply(frame: Frame, remembered: Frame | None, spread: float, rng: np.random.Generator) -> Frame:
+def apply(frame: Frame, released: Frame | None, spread: float, rng: np.random.Generator) -> Frame:
     """Expected e- [ny, nx] -> plus what earlier exposures left.
 
     frame      : expected e-
@@ -181,28 +198,28 @@ def apply(frame: Frame, remembered: Frame | None, spread: float, rng: np.random.
     if not 0.0 <= spread <= 10.0:
         raise OutOfRange("spread of persistence", spread, 0.0, 10.0)
     out = np.array(frame, dtype=float, order="C")
-    if remembered is None:
+    if released is None:
         return out
-    if remembered.shape != frame.shape:
-        raise BadInput(f"persistence of {remembered.shape} pixels for a frame of {frame.shape}")
-    left = np.ascontiguousarray(remembered, dtype=float)
-    _add(out.reshape(-1), left.reshape(-1), spread, pixel_random.key(rng))
+    if released.shape != frame.shape:
+        raise BadInput(f"persistence of {released.shape} pixels for a frame of {frame.shape}")
+    charge = np.ascontiguousarray(released, dtype=float)
+    _add_released(out.reshape(-1), charge.reshape(-1), spread, pixel_random.draw_key(rng))
     return out
 
 
 @jit
-def _add(out: Any, left: Any, spread: float, key: Any) -> None:
+def _add_released(out: Any, released: Any, spread: float, key: Any) -> None:
     for i in range(len(out)):
-        if left[i] != 0.0:
-            out[i] += left[i] * max(1.0 + spread * pixel_random.normal(pixel_random.word(key, i)), 0.0)
+        if released[i] != 0.0:
+            out[i] += released[i] * max(1.0 + spread * pixel_random.normal(pixel_random.pixel_bits(key, i)), 0.0)
 
 
 def _parameters(scene: Scene) -> tuple[Frame | None, float]:
-    return scene.remembered, scene.value("persistence.spread", "")
+    return scene.persistence_charge, scene.value("persistence.spread", "")
 
 
 def _contribution(scene: Scene) -> float:
-    return 0.0 if scene.remembered is None else float(scene.remembered.max(initial=0.0))
+    return 0.0 if scene.persistence_charge is None else float(scene.persistence_charge.max(initial=0.0))
 
 
 EFFECT = Effect("persistence", apply, _parameters, _contribution, fixed=True, cost=1e-2)

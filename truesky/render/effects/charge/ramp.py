@@ -51,11 +51,11 @@ from lake_schema import ramps
 from lake_schema.arrays import Bool, Float
 from lake_schema.errors import BadInput, OutOfRange
 from lake_schema.mission.configuration import MissionConfiguration
-from lake_schema.ramps import MOST_FRAMES
+from lake_schema.ramps import MAX_FRAMES
 from truesky.numerics.compiling import jit
 from truesky.render.effects import pixel_random
 from truesky.render.effects.charge import poisson
-from truesky.render.effects.effect import Effect, nothing
+from truesky.render.effects.effect import Effect, zero_contribution
 from truesky.render.effects.scene import Frame, Scene
 
 # Electrons at a ramp's end above which the noise of a pixel is not linear in its charge, and every frame is drawn:
@@ -64,9 +64,9 @@ LINEAR_BELOW = 3000.0
 # By what part a frame's time may differ from the mission's, so that a ramp takes an exposure time.
 FRAME_TOLERANCE = 0.02
 # Of a number of drops: exposure times that differ by less are the same.
-_SAME = 1e-6
+_DROPS_TOLERANCE = 1e-6
 # Groups, reads or drops of a ramp.
-_MOST = 1000
+_MAX_COUNT = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,11 +81,11 @@ class Mode:
     drops: int
 
     def __post_init__(self) -> None:
-        for name, least in (("groups", 2), ("reads", 1), ("drops", 0)):
-            if not least <= getattr(self, name) <= _MOST:
-                raise OutOfRange(f"{name} of a ramp", getattr(self, name), least, _MOST)
-        if self.frames > MOST_FRAMES:
-            raise BadInput(f"{self}: {self.frames} frames are more than {MOST_FRAMES}")
+        for name, lowest in (("groups", 2), ("reads", 1), ("drops", 0)):
+            if not lowest <= getattr(self, name) <= _MAX_COUNT:
+                raise OutOfRange(f"{name} of a ramp", getattr(self, name), lowest, _MAX_COUNT)
+        if self.frames > MAX_FRAMES:
+            raise BadInput(f"{self}: {self.frames} frames are more than {MAX_FRAMES}")
 
     def __str__(self) -> str:
         return f"MACC({self.groups},{self.reads},{self.drops})"
@@ -98,10 +98,10 @@ class Mode:
     @property
     def frames(self) -> int:
         """From the reset to the last read."""
-        return ramps.frames(self.groups, self.reads, self.drops)
+        return ramps.frame_count(self.groups, self.reads, self.drops)
 
     @property
-    def integrated(self) -> int:
+    def integration_frames(self) -> int:
         """Frames between the first group and the last: the exposure time of the signal."""
         return self.differences * (self.reads + self.drops)
 
@@ -126,12 +126,12 @@ class Mode:
         return float((total**3).sum()), float((total * g).sum()), float((g**2).sum())
 
 
-def mode_of(scene: Scene) -> Mode:
+def mode_of_scene(scene: Scene) -> Mode:
     """That of the scene's ramp, with as many drops as its exposure time wants; errors as of `mode_for`."""
-    return mode_for(scene.ramp, scene.exposure_time_s, scene.section, scene.mission)
+    return find_mode(scene.ramp, scene.exposure_time_s, scene.section, scene.mission)
 
 
-def mode_for(kind: str, seconds: float, section: str, mission: MissionConfiguration) -> Mode:
+def find_mode(kind: str, seconds: float, section: str, mission: MissionConfiguration) -> Mode:
     """How an exposure of a length is read: the mission's mode, with as many drops as it takes.
 
     kind    : "photometric" or "spectroscopic";  seconds : exposure time
@@ -140,63 +140,63 @@ def mode_for(kind: str, seconds: float, section: str, mission: MissionConfigurat
               long
     """
     key = f"{section}.macc.{kind}"
-    groups, reads, drops = (int(mission.value(f"{key}.{part}")) for part in ("groups", "reads", "drops"))
-    nominal, time = Mode(groups, reads, drops), mission.value(f"{section}.frame_time", "s")
-    wanted = seconds / (time * nominal.differences) - reads
-    if abs(wanted - drops) < _SAME:
+    groups, reads, drops = (int(mission.value(f"{key}.{name}")) for name in ("groups", "reads", "drops"))
+    nominal, frame_s = Mode(groups, reads, drops), mission.value(f"{section}.frame_time", "s")
+    best_drops = seconds / (frame_s * nominal.differences) - reads
+    if abs(best_drops - drops) < _DROPS_TOLERANCE:
         return nominal
-    if round(wanted) < 0:
-        least = time * nominal.differences * reads
-        raise BadInput(f"exposure time {seconds:g} s: {nominal} takes {least:.4g} s without any drops")
-    if round(wanted) > _MOST:
-        raise BadInput(f"exposure time {seconds:g} s: {nominal} takes {wanted:.4g} drops, more than {_MOST}")
-    found = Mode(groups, reads, round(wanted))
-    if abs(seconds / (time * found.integrated) - 1.0) > FRAME_TOLERANCE:
+    if round(best_drops) < 0:
+        shortest = frame_s * nominal.differences * reads
+        raise BadInput(f"exposure time {seconds:g} s: {nominal} takes {shortest:.4g} s without any drops")
+    if round(best_drops) > _MAX_COUNT:
+        raise BadInput(f"exposure time {seconds:g} s: {nominal} takes {best_drops:.4g} drops, more than {_MAX_COUNT}")
+    mode = Mode(groups, reads, round(best_drops))
+    if abs(seconds / (frame_s * mode.integration_frames) - 1.0) > FRAME_TOLERANCE:
         raise BadInput(
-            f"exposure time {seconds:g} s: {found} takes {time * found.integrated:.4g} s, which differs by more than "
-            f"{FRAME_TOLERANCE:.0%}"
+            f"exposure time {seconds:g} s: {mode} takes {frame_s * mode.integration_frames:.4g} s, which differs by "
+            f"more than {FRAME_TOLERANCE:.0%}"
         )
-    return found
+    return mode
 
 
-def elapsed(kind: str, seconds: float, section: str, mission: MissionConfiguration) -> float:
+def duration(kind: str, seconds: float, section: str, mission: MissionConfiguration) -> float:
     """Seconds from the reset to the last read of an exposure of a length; errors as of `mode_for`.
 
     kind, seconds, section, mission : of `mode_for`
     """
-    mode = mode_for(kind, seconds, section, mission)
-    return seconds * mode.frames / mode.integrated
+    mode = find_mode(kind, seconds, section, mission)
+    return seconds * mode.frames / mode.integration_frames
 
 
 def frame_time(scene: Scene) -> float:
     """Seconds from frame to frame: the mission's, where the exposure time is a multiple of it, else near it."""
-    return scene.exposure_time_s / mode_of(scene).integrated
+    return scene.exposure_time_s / mode_of_scene(scene).integration_frames
 
 
-def planes(frame: Frame, count: int) -> Frame:
+def with_planes(frame: Frame, count: int) -> Frame:
     """A new float32[count, ny, nx] of `apply`: what the frame has, and zeros."""
     out = np.empty((count, *frame.shape[-2:]), np.float32)
-    given = frame.reshape(-1, *frame.shape[-2:])
-    out[: len(given)], out[len(given) :] = given, 0.0
+    planes = frame.reshape(-1, *frame.shape[-2:])
+    out[: len(planes)], out[len(planes) :] = planes, 0.0
     return out
 
 
-def full_signal(scene: Scene, of_charge: float = 0.0, of_signal: float = 0.0) -> float:
+def signal_at_full_well(scene: Scene, charge_b: float = 0.0, signal_b: float = 0.0) -> float:
     """Electrons that are measured in the integration time of a pixel that is full at the ramp's end.
 
     of_charge, of_signal : b of N (1 - b N), what is seen of N electrons in a frame, and of those of the signal, 1/e-
     """
-    mode, full = mode_of(scene), scene.value("full_well", "electron")
-    signal = full * (1.0 - of_charge * full) * mode.integrated / mode.frames
+    mode, full = mode_of_scene(scene), scene.value("full_well", "electron")
+    signal = full * (1.0 - charge_b * full) * mode.integration_frames / mode.frames
     # Of more than 1 / 2 b is seen what is seen of these.
-    signal = min(signal, 0.5 / of_signal) if of_signal > 0.0 else signal
-    return signal * (1.0 - of_signal * signal)
+    signal = min(signal, 0.5 / signal_b) if signal_b > 0.0 else signal
+    return signal * (1.0 - signal_b * signal)
 
 
-def full(frame: Frame, mode: Mode, full_well: float) -> Bool:
+def full_pixels(frame: Frame, mode: Mode, full_well: float) -> Bool:
     """[ny, nx] pixels of a frame of `apply` that are expected to be full at the ramp's end."""
     light, charge = (frame[0], frame[1]) if frame.ndim == 3 else (frame, 0.0)
-    return np.asarray(light * (mode.frames / mode.integrated) + charge >= full_well)
+    return np.asarray(light * (mode.frames / mode.integration_frames) + charge >= full_well)
 
 
 def apply(
@@ -221,25 +221,33 @@ def apply(
         raise OutOfRange("full well", full_well, 0.0, 1e9)
     planes = [*frame] if frame.ndim == 3 else [frame]
     out = np.empty((mode.groups, *planes[0].shape), np.float32)
-    inputs = [np.ascontiguousarray(part, dtype=np.float32).reshape(-1) for part in planes]
-    expected, hit, when, bend = inputs + [np.zeros(0, np.float32)] * (4 - len(inputs))
-    _accumulate(
-        expected,
-        hit,
-        when,
-        bend,
+    inputs = [np.ascontiguousarray(plane, dtype=np.float32).reshape(-1) for plane in planes]
+    light, hit_charge, hit_time, coefficient = inputs + [np.zeros(0, np.float32)] * (4 - len(inputs))
+    _draw_ramps(
+        light,
+        hit_charge,
+        hit_time,
+        coefficient,
         out.reshape(mode.groups, -1),
         (mode.groups, mode.reads, mode.drops),
         mode.third_moments(),
         (full_well, linear_below),
-        (pixel_random.key(rng), pixel_random.key(rng)),
+        (pixel_random.draw_key(rng), pixel_random.draw_key(rng)),
     )
     return out
 
 
 @jit
-def _accumulate(
-    light: Any, charge: Any, moment: Any, bend: Any, out: Any, shape: Any, cumulants: Any, limits: Any, keys: Any
+def _draw_ramps(
+    light: Any,
+    hit_charge: Any,
+    hit_time: Any,
+    coefficient: Any,
+    out: Any,
+    shape: Any,
+    cumulants: Any,
+    limits: Any,
+    keys: Any,
 ) -> None:
     groups, reads, drops = shape
     full_well, linear_below = limits
@@ -254,16 +262,16 @@ def _accumulate(
             squares[i] += float(i * (reads + drops) + j + 1) ** 2 / reads
     for p in range(size):
         f = max(light[p], 0.0) / ((groups - 1) * (reads + drops))
-        hit = charge[p] if len(charge) > 0 else 0.0
-        b = bend[p] if len(bend) > 0 else 0.0
+        hit = hit_charge[p] if len(hit_charge) > 0 else 0.0
+        b = coefficient[p] if len(coefficient) > 0 else 0.0
         end = f * frames
         if hit != 0.0 or end > linear_below or end + 10.0 * math.sqrt(end) > full_well:
-            when = int(moment[p] * frames) if len(charge) > 0 else 0
-            _every_frame(f, hit, when, shape, full_well, b, keys[1], p, group)
+            hit_frame = int(hit_time[p] * frames) if len(hit_charge) > 0 else 0
+            _draw_frames(f, hit, hit_frame, shape, full_well, b, keys[1], p, group)
         else:
             for i in range(groups + 1):
-                e[i] = pixel_random.normal(pixel_random.word(keys[0], p + i * size))
-            _vector(f, shape, cumulants, e, group)
+                e[i] = pixel_random.normal(pixel_random.pixel_bits(keys[0], p + i * size))
+            _draw_groups(f, shape, cumulants, e, group)
             for i in range(groups):
                 group[i] -= b * f * f * squares[i]
         for i in range(groups):
@@ -271,7 +279,7 @@ def _accumulate(
 
 
 @jit
-def _vector(f: float, shape: Any, cumulants: Any, e: Any, group: Any) -> None:
+def _draw_groups(f: float, shape: Any, cumulants: Any, e: Any, group: Any) -> None:
     """Groups of a pixel from groups + 1 normal deviates e: the linear law of the module's head."""
     groups, reads, drops = shape
     n = groups - 1
@@ -299,9 +307,9 @@ def _vector(f: float, shape: Any, cumulants: Any, e: Any, group: Any) -> None:
             v_g = 2.0 * (n * a * a + 2.0 * (n - 1) * b * b - 2.0 / n * ends + v_t * v_t / (n * n))
             v_s = v_g + f * c4
             mixed = k_mixed * f
-            part = mixed / v_t * (v_g / v_s) * (mixed / v_s)
+            fraction = mixed / v_t * (v_g / v_s) * (mixed / v_s)
             # sqrt(1 - part) - 1, without the difference.
-            shift += total * (-part / (1.0 + math.sqrt(1.0 - part)))
+            shift += total * (-fraction / (1.0 + math.sqrt(1.0 - fraction)))
             shift += mixed / v_s * (square - (n * a - v_t / n))
     group[0] = 0.5 * f * (r + 1.0) + c1 * e[0] + math.sqrt(max(v - c1 * c1, 0.0)) * e[groups]
     for i in range(n):
@@ -309,28 +317,30 @@ def _vector(f: float, shape: Any, cumulants: Any, e: Any, group: Any) -> None:
 
 
 @jit
-def _every_frame(
-    f: float, hit: float, when: int, shape: Any, full_well: float, bend: float, key: Any, pixel: int, group: Any
+def _draw_frames(
+    f: float, hit: float, hit_frame: int, shape: Any, full_well: float, b: float, key: Any, pixel: int, group: Any
 ) -> None:
     """Groups of a pixel, a count a frame."""
     groups, reads, drops = shape
     frames = groups * reads + (groups - 1) * drops
-    none = math.exp(-f) if f < poisson._SUMMED_BELOW else 0.0
-    held = 0.0
+    p_zero = math.exp(-f) if f < poisson._EXACT_BELOW else 0.0
+    charge = 0.0
     for i in range(groups):
         group[i] = 0.0
     for k in range(frames):
-        held += poisson.counted(f, none, pixel_random.word(key, pixel * frames + k))
-        if k == when:
-            held += hit
-        held = min(held, full_well)
+        charge += poisson.draw_count(f, p_zero, pixel_random.pixel_bits(key, pixel * frames + k))
+        if k == hit_frame:
+            charge += hit
+        charge = min(charge, full_well)
         i = k // (reads + drops)
         if k - i * (reads + drops) < reads:
-            group[i] += held * (1.0 - bend * held) / reads
+            group[i] += charge * (1.0 - b * charge) / reads
 
 
 def _parameters(scene: Scene) -> tuple[Mode, float]:
-    return mode_of(scene), scene.value("full_well", "electron")
+    return mode_of_scene(scene), scene.value("full_well", "electron")
 
 
-EFFECT = Effect("ramp", apply, _parameters, poisson.EFFECT.contribution, optional=False, cost=8e-2, repeated=nothing)
+EFFECT = Effect(
+    "ramp", apply, _parameters, poisson.EFFECT.contribution, optional=False, cost=8e-2, systematic=zero_contribution
+)

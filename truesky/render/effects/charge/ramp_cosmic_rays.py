@@ -10,11 +10,11 @@ import numpy as np
 
 from lake_schema.errors import OutOfRange
 from truesky.render.effects.charge import cosmic_rays, ramp
-from truesky.render.effects.effect import Effect, nothing
+from truesky.render.effects.effect import Effect, zero_contribution
 from truesky.render.effects.scene import Frame, Scene
 
 # Expected hits that nobody waits for.
-_FEW = 1e-3
+_NEGLIGIBLE = 1e-3
 _SQUARE_CM = 1e-8
 
 
@@ -29,15 +29,15 @@ def apply(
     Error     : a pixel that two particles hit has all of their charge at the moment of the second
     rng       : random numbers of the hits
     """
-    for name, value, most in (
+    for name, value, highest in (
         ("thickness", thickness, 1e3), ("charge of a path", electrons, 1e8), ("scatter of the charge", scatter, 3.0)
     ):  # fmt: skip
-        if not 0.0 <= value <= most:
-            raise OutOfRange(name, value, 0.0, most)
-    count = cosmic_rays.event_count(expected, rng)
+        if not 0.0 <= value <= highest:
+            raise OutOfRange(name, value, 0.0, highest)
+    count = cosmic_rays.draw_event_count(expected, rng)
     if count == 0 or frame.size == 0:
         return np.array(frame, dtype=float)
-    out = ramp.planes(frame, 3)
+    out = ramp.with_planes(frame, 3)
     ny, nx = frame.shape
     angle, x, y = 2.0 * np.pi * rng.random(count), nx * rng.random(count), ny * rng.random(count)
     # In (0, 1]: the part of the tracks that are longer.
@@ -46,17 +46,17 @@ def apply(
     charge = np.rint(electrons * np.hypot(length, thickness) * 10.0**logarithm)
     moment = rng.random(count)
     # A track of no length at all has one pixel, too.
-    tracks = (x, y, np.cos(angle), np.sin(angle), np.maximum(length, 1e-9), charge)
-    hit, columns, rows, brought = cosmic_rays.hits(tracks)
-    cosmic_rays.add_track(out[1], rows, columns, brought)
-    out[2][rows % ny, columns % nx] = moment[hit]
+    events = (x, y, np.cos(angle), np.sin(angle), np.maximum(length, 1e-9), charge)
+    event, columns, rows, pixel_charge = cosmic_rays.pixels_of_events(events)
+    cosmic_rays.add_charge(out[1], rows, columns, pixel_charge)
+    out[2][rows % ny, columns % nx] = moment[event]
     return out
 
 
 def _parameters(scene: Scene) -> tuple[float, float, float, float]:
     """Of the whole ramp, from its reset."""
     pixel = scene.value("fpa.pixel_size", "um / pix")
-    seconds = ramp.mode_of(scene).frames * ramp.frame_time(scene)
+    seconds = ramp.mode_of_scene(scene).frames * ramp.frame_time(scene)
     area = scene.nx * scene.ny * pixel**2 * _SQUARE_CM
     rate = scene.mission.value("env.cosmic_rays.flux", "cm-2 s-1") * area
     deposit = scene.mission.value("env.cosmic_rays.hgcdte_deposit", "electron / um")
@@ -67,7 +67,7 @@ def _parameters(scene: Scene) -> tuple[float, float, float, float]:
 def _contribution(scene: Scene) -> float:
     """Of the usual particle, straight through."""
     expected, thickness, electrons, _ = _parameters(scene)
-    return electrons * thickness * (expected > _FEW)
+    return electrons * thickness * (expected > _NEGLIGIBLE)
 
 
-EFFECT = Effect("ramp_cosmic_rays", apply, _parameters, _contribution, cost=1e-2, repeated=nothing)
+EFFECT = Effect("ramp_cosmic_rays", apply, _parameters, _contribution, cost=1e-2, systematic=zero_contribution)

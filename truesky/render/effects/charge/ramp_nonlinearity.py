@@ -28,8 +28,8 @@ def apply(frame: Frame, mean: float, spread: float, rng: np.random.Generator) ->
     frame : of ramp.apply;  mean : of b, 1/e-;  spread : of b from pixel to pixel, as a fraction
     rng   : random numbers of the detector's pixels
     """
-    out = ramp.planes(frame, 4)
-    _fill(out[3].reshape(-1), *_checked(mean, spread), pixel_random.key(rng))
+    out = ramp.with_planes(frame, 4)
+    _draw_coefficients(out[3].reshape(-1), *_check_parameters(mean, spread), pixel_random.draw_key(rng))
     return out
 
 
@@ -41,11 +41,11 @@ def apply_signal(frame: Frame, mean: float, spread: float, rng: np.random.Genera
     Error             : of more than 1 / 2 b electrons is seen what is seen of these, as the most
     """
     out = np.array(frame, dtype=float, order="C")
-    _squeeze(out[0].reshape(-1), *_checked(mean, spread), pixel_random.key(rng))
+    _bend_signal(out[0].reshape(-1), *_check_parameters(mean, spread), pixel_random.draw_key(rng))
     return out
 
 
-def _checked(mean: float, spread: float) -> tuple[float, float]:
+def _check_parameters(mean: float, spread: float) -> tuple[float, float]:
     if not 0.0 <= mean <= 1e-3:
         raise OutOfRange("non-linearity", mean, 0.0, 1e-3)
     if not 0.0 <= spread <= 10.0:
@@ -54,41 +54,41 @@ def _checked(mean: float, spread: float) -> tuple[float, float]:
 
 
 @jit
-def _fill(bend: Any, mean: float, spread: float, key: Any) -> None:
-    for i in range(len(bend)):
-        bend[i] = mean * max(1.0 + spread * pixel_random.normal(pixel_random.word(key, i)), 0.0)
+def _draw_coefficients(coefficients: Any, mean: float, spread: float, key: Any) -> None:
+    for i in range(len(coefficients)):
+        coefficients[i] = mean * max(1.0 + spread * pixel_random.normal(pixel_random.pixel_bits(key, i)), 0.0)
 
 
 @jit
-def _squeeze(signal: Any, mean: float, spread: float, key: Any) -> None:
+def _bend_signal(signal: Any, mean: float, spread: float, key: Any) -> None:
     for i in range(len(signal)):
-        b = mean * max(1.0 + spread * pixel_random.normal(pixel_random.word(key, i)), 0.0)
-        seen = signal[i]
+        b = mean * max(1.0 + spread * pixel_random.normal(pixel_random.pixel_bits(key, i)), 0.0)
+        electrons = signal[i]
         if b > 0.0:
-            seen = min(seen, 0.5 / b)
-        if seen > 0.0:
-            signal[i] = seen * (1.0 - b * seen)
+            electrons = min(electrons, 0.5 / b)
+        if electrons > 0.0:
+            signal[i] = electrons * (1.0 - b * electrons)
 
 
 def _parameters(scene: Scene) -> tuple[float, float]:
     return scene.value("nonlinearity", "1 / electron"), scene.value("nonlinearity_spread", "")
 
 
-def _of_signal(scene: Scene) -> bool:
+def _acts_on_signal(scene: Scene) -> bool:
     return scene.value("nonlinearity_of_signal", "") > 0.5
 
 
-def _change(scene: Scene) -> float:
+def _change_at_full_well(scene: Scene) -> float:
     """Of a full pixel: a hot pixel or a cosmic ray may fill any, also where nothing shines."""
     return _parameters(scene)[0] * scene.value("full_well", "electron") ** 2
 
 
 def _contribution(scene: Scene) -> float:
-    return 0.0 if _of_signal(scene) else _change(scene)
+    return 0.0 if _acts_on_signal(scene) else _change_at_full_well(scene)
 
 
 def _contribution_to_signal(scene: Scene) -> float:
-    return _change(scene) if _of_signal(scene) else 0.0
+    return _change_at_full_well(scene) if _acts_on_signal(scene) else 0.0
 
 
 EFFECT = Effect("ramp_nonlinearity", apply, _parameters, _contribution, fixed=True, cost=1e-2)
@@ -98,6 +98,6 @@ SIGNAL = Effect(
     _parameters,
     _contribution_to_signal,
     fixed=True,
-    numbers=EFFECT.name,
+    random_stream=EFFECT.name,
     cost=1e-2,
 )

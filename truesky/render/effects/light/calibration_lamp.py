@@ -49,13 +49,13 @@ def pattern(scene: Scene, led: int, nx: int, ny: int) -> tuple[Frame, Frame]:
     return illumination.pattern(scene, nx, ny, scene.value("flat.illumination", ""), direction)
 
 
-def seen(scene: Scene, led: int) -> float:
+def efficiency_of_scene(scene: Scene, led: int) -> float:
     """What the scene's band detects of an LED's photons, as `seen_in`."""
     band = scene.band or passbands.load(LAMPS[scene.section][1][0])
-    return seen_in(band, led, scene.section, scene.mission)
+    return led_efficiency(band, led, scene.section, scene.mission)
 
 
-def seen_in(band: Passband, led: int, section: str, mission: MissionConfiguration) -> float:
+def led_efficiency(band: Passband, led: int, section: str, mission: MissionConfiguration) -> float:
     """What a band detects of an LED's photons, over what the embedded bands would where they see best; no unit.
 
     led     : its number, from 1;  band : passband
@@ -64,17 +64,17 @@ def seen_in(band: Passband, led: int, section: str, mission: MissionConfiguratio
     Errors  : OutOfRange for a number that no LED has
     """
     width = _width(section, mission)
-    detected = float(np.sum(photons(band, led, section, mission)) / (width * np.sqrt(2.0 * np.pi)))
-    return detected / _best(section)
+    detected = float(np.sum(detected_photons(band, led, section, mission)) / (width * np.sqrt(2.0 * np.pi)))
+    return detected / _best_response(section)
 
 
 @cache
-def _best(section: str) -> float:
+def _best_response(section: str) -> float:
     """The largest response of the embedded bands of a camera."""
     return max(float(passbands.load(name).response.max()) for name in LAMPS[section][1])
 
 
-def photons(band: Passband, led: int, section: str, mission: MissionConfiguration) -> Float:
+def detected_photons(band: Passband, led: int, section: str, mission: MissionConfiguration) -> Float:
     """float64[n] what a band detects of an LED's photons, at its wavelengths 1 A apart, on any scale; as `seen_in`.
 
     band, led, section, mission : of `seen_in`
@@ -82,8 +82,8 @@ def photons(band: Passband, led: int, section: str, mission: MissionConfiguratio
     leds, _ = LAMPS[section]
     if not 1 <= led <= leds:
         raise OutOfRange("LED", led, 1, leds)
-    off = (band.wavelength - 10.0 * mission.value(f"{section}.flat.led_{led}", "nm")) / _width(section, mission)
-    return np.asarray(band.response * np.exp(-0.5 * off**2))
+    offset = (band.wavelength - 10.0 * mission.value(f"{section}.flat.led_{led}", "nm")) / _width(section, mission)
+    return np.asarray(band.response * np.exp(-0.5 * offset**2))
 
 
 def _width(section: str, mission: MissionConfiguration) -> float:
@@ -93,7 +93,7 @@ def _width(section: str, mission: MissionConfiguration) -> float:
 
 def _level(scene: Scene) -> float:
     level = scene.value("flat.signal", "electron")
-    return level * seen(scene, scene.lamp) if scene.section in LAMPS else level
+    return level * efficiency_of_scene(scene, scene.lamp) if scene.section in LAMPS else level
 
 
 def _parameters(scene: Scene) -> tuple[float, Frame, Frame]:

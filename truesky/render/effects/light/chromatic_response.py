@@ -34,7 +34,7 @@ from lake_schema.errors import OutOfRange
 from lake_schema.mission.configuration import MissionConfiguration
 from truesky.fluxes import passbands
 from truesky.fluxes.passbands import Passband
-from truesky.numerics import sums
+from truesky.numerics import matrices
 from truesky.numerics.compiling import jit
 from truesky.render.camera.lamps import LAMPS
 from truesky.render.effects import pixel_random
@@ -51,7 +51,14 @@ _NODES = 9
 _PSF_COLOUR = 0.1
 
 
-def apply(frame: Frame, lit: Frame, even: Float, slope: float, curvature: float, rng: np.random.Generator) -> Frame:
+def apply(
+    frame: Frame,
+    chromatic_light: Frame,
+    mean_components: Float,
+    slope: float,
+    curvature: float,
+    rng: np.random.Generator,
+) -> Frame:
     """frame [ny, nx] expected e- -> as the pixels see it.
 
     lit  : [2, ny, nx] e- of the frame's light, each photon of it times f1, and times f2, told from their means
@@ -59,46 +66,54 @@ def apply(frame: Frame, lit: Frame, even: Float, slope: float, curvature: float,
     slope, curvature, rng : as of `maps`
     """
     out = np.array(frame, float)
-    up, across = _ends(out.shape)
-    for part, nodes, rms, key in _patterns(slope, curvature, rng):
-        _add(out, np.ascontiguousarray(lit[part] + even[part] * frame), nodes, up, across, rms, key)
+    up, across = _node_positions(out.shape)
+    for component, nodes, rms, key in _draw_patterns(slope, curvature, rng):
+        _add_pattern(
+            out,
+            np.ascontiguousarray(chromatic_light[component] + mean_components[component] * frame),
+            nodes,
+            up,
+            across,
+            rms,
+            key,
+        )
     return np.asarray(np.maximum(out, 0.0, out=out))
 
 
-def maps(shape: tuple[int, int], slope: float, curvature: float, rng: np.random.Generator) -> Frame:
+def draw_maps(shape: tuple[int, int], slope: float, curvature: float, rng: np.random.Generator) -> Frame:
     """float64[2, ny, nx]: s and c of every pixel, normally distributed; half of their variance is of the smooth map.
 
     shape : ny, nx;  slope, curvature : rms of s and c
     rng   : random numbers of the detector's pixels
     """
     out = np.zeros((2, *shape))
-    up, across = _ends(shape)
-    for part, nodes, rms, key in _patterns(slope, curvature, rng):
-        _add(out[part], np.ones(shape), nodes, up, across, rms, key)
+    up, across = _node_positions(shape)
+    for component, nodes, rms, key in _draw_patterns(slope, curvature, rng):
+        _add_pattern(out[component], np.ones(shape), nodes, up, across, rms, key)
     return out
 
 
-def _patterns(slope: float, curvature: float, rng: np.random.Generator) -> list[tuple[int, Float, float, Any]]:
+def _draw_patterns(slope: float, curvature: float, rng: np.random.Generator) -> list[tuple[int, Float, float, Any]]:
     """(0 or 1, nodes of its smooth map, rms, key of the random numbers of its pixels) of s, and of c."""
-    found = []
-    for part, (name, value) in enumerate((("slope", slope), ("curvature", curvature))):
+    patterns = []
+    for component, (name, value) in enumerate((("slope", slope), ("curvature", curvature))):
         if not 0.0 <= value <= 0.5:
             raise OutOfRange(f"chromatic response, {name}", value, 0.0, 0.5)
         nodes = rng.standard_normal((_NODES, _NODES))
         # To the mean and the rms that are asked for, of so few numbers.
         nodes = (nodes - nodes.mean()) / nodes.std()
-        found.append((part, nodes, value * float(np.sqrt(0.5)), pixel_random.key(rng)))
-    return found
+        patterns.append((component, nodes, value * float(np.sqrt(0.5)), pixel_random.draw_key(rng)))
+    return patterns
 
 
-def _ends(shape: tuple[int, ...]) -> tuple[Float, Float]:
+def _node_positions(shape: tuple[int, ...]) -> tuple[Float, Float]:
     """Of each row and of each column its place among the nodes."""
     up, across = (np.linspace(0.0, _NODES - 1.0, max(n, 2))[:n] for n in shape)
     return up, across
 
 
 @jit
-def _add(out: Any, light: Any, nodes: Any, up: Any, across: Any, rms: float, key: Any) -> None:
+def _add_pattern(out: Any, light: Any, nodes: Any, up: Any, across: Any, rms: float, key: Any) -> None:
     """Adds light times the map."""
     ny, nx = out.shape
     for y in range(ny):
@@ -111,49 +126,51 @@ def _add(out: Any, light: Any, nodes: Any, up: Any, across: Any, rms: float, key
             high = (1.0 - u) * nodes[j + 1, i] + u * nodes[j + 1, i + 1]
             # Of numbers between nodes the variance is 4/9 of that at the nodes, in both directions together.
             smooth = 1.5 * ((1.0 - v) * low + v * high)
-            out[y, x] += light[y, x] * rms * (smooth + pixel_random.normal(pixel_random.word(key, y * nx + x)))
+            out[y, x] += light[y, x] * rms * (smooth + pixel_random.normal(pixel_random.pixel_bits(key, y * nx + x)))
 
 
-def _in_parts(section: str, band: Passband, mission: MissionConfiguration) -> Float:
+def _components_in_sub_bands(section: str, band: Passband, mission: MissionConfiguration) -> Float:
     """float64[PARTS, 2]: f1 and f2 in the parts of a band."""
     parts = sub_bands(band)
     return np.array([_mean(section, part.wavelength, part.response / part.wavelength, mission) for part in parts])
 
 
-def means(section: str, band: Passband, mission: MissionConfiguration) -> Float:
+def band_means(section: str, band: Passband, mission: MissionConfiguration) -> Float:
     """float64[2]: f1 and f2 that light of flat f_nu meets in a band.
 
     section, mission : of the camera in the mission database;  band : a passband
     """
-    return np.asarray(np.mean(_in_parts(section, band, mission), axis=0))
+    return np.asarray(np.mean(_components_in_sub_bands(section, band, mission), axis=0))
 
 
-def table(section: str, band: Passband, mission: MissionConfiguration) -> Float:
+def sub_band_components(section: str, band: Passband, mission: MissionConfiguration) -> Float:
     """float64[PARTS, 2]: f1 and f2 in the parts of a band, told from their means over it.
 
     section, mission : of the camera in the mission database;  band : a passband
     """
-    found = _in_parts(section, band, mission)
-    return np.asarray(found - np.mean(found, axis=0))
+    components = _components_in_sub_bands(section, band, mission)
+    return np.asarray(components - np.mean(components, axis=0))
 
 
-def spectrum(section: str, wavelength: Float, band: Passband, mission: MissionConfiguration) -> Float:
+def component_spectra(section: str, wavelength: Float, band: Passband, mission: MissionConfiguration) -> Float:
     """float64[w, 2]: f1 and f2 told from their means over a band.
 
     wavelength : [w] A;  section, mission : of the camera in the mission database;  band : a passband
     """
     nodes, *components = np.array(mission.numbers(f"{section}.response.components")).T
-    found = np.stack([np.interp(1e-4 * wavelength, nodes, f) for f in components], axis=1)
-    return np.asarray(found - means(section, band, mission))
+    values = np.stack([np.interp(1e-4 * wavelength, nodes, f) for f in components], axis=1)
+    return np.asarray(values - band_means(section, band, mission))
 
 
-def of_lines(section: str, band: Passband, wavelength: Float, photons: Float, mission: MissionConfiguration) -> Float:
+def colour_of_lines(
+    section: str, band: Passband, wavelength: Float, photons: Float, mission: MissionConfiguration
+) -> Float:
     """float64[2]: F1 and F2 of light of which a band detects `photons` [n] at wavelengths [n] A, as of `colours`.
 
     section, mission    : of the camera in the mission database;  band : a passband
     wavelength, photons : of the light
     """
-    return np.asarray(_mean(section, wavelength, photons, mission) - means(section, band, mission))
+    return np.asarray(_mean(section, wavelength, photons, mission) - band_means(section, band, mission))
 
 
 def _mean(section: str, wavelength: Float, photons: Float, mission: MissionConfiguration) -> Float:
@@ -161,15 +178,17 @@ def _mean(section: str, wavelength: Float, photons: Float, mission: MissionConfi
     return np.array([np.average(np.interp(1e-4 * wavelength, nodes, f), weights=photons) for f in components])
 
 
-def colours(shares: Float, components: Float) -> Float:
+def source_colours(shares: Float, components: Float) -> Float:
     """float64[n, 2]: F1 and F2 of lights.
 
     shares : [n, PARTS] of their photons in the parts of a band;  components : of `table`
     """
-    return np.asarray(sums.product(shares, components))
+    return np.asarray(matrices.matmul(shares, components))
 
 
-def tints(electrons: Float, shares: Float, components: Float, draw: Callable[[Float, Float], Frame]) -> Float32:
+def weighted_light(
+    electrons: Float, shares: Float, components: Float, draw: Callable[[Float, Float], Frame]
+) -> Float32:
     """float32[2, ny, nx]: the light of sources, each photon of it times f1, and times f2.
 
     Blue light is concentrated in the middle of the PSF: what two colours change of a pixel is not the colour of the
@@ -181,30 +200,30 @@ def tints(electrons: Float, shares: Float, components: Float, draw: Callable[[Fl
     out = np.empty((2, *drawn.shape), np.float32)
     for k in (0, 1):
         # No part has less than no light.
-        least = float(components[:, k].min())
-        weighted = shares * (components[:, k] - least)
-        part = weighted.sum(axis=1)
-        own = np.divide(weighted, part[:, None], out=shares.copy(), where=part[:, None] > 0.0)
-        out[k] = draw(electrons * part, own) + least * drawn
+        lowest = float(components[:, k].min())
+        weighted = shares * (components[:, k] - lowest)
+        weight = weighted.sum(axis=1)
+        weighted_shares = np.divide(weighted, weight[:, None], out=shares.copy(), where=weight[:, None] > 0.0)
+        out[k] = draw(electrons * weight, weighted_shares) + lowest * drawn
     return out
 
 
-def changes(peak: Float, own: Float, components: Float, strength: tuple[float, float]) -> Float:
+def colour_changes(peak: Float, colours: Float, components: Float, strength: tuple[float, float]) -> Float:
     """[n] the most that the colour of each source changes in a pixel, e- rms.
 
     peak : [n] e- in the brightest pixel of each;  own, components : of `colours` and `table`
     strength : slope and curvature, rms of the maps
     """
-    largest = np.abs(own) + _PSF_COLOUR * components.std(axis=0)
+    largest = np.abs(colours) + _PSF_COLOUR * components.std(axis=0)
     return np.asarray(peak * np.hypot(*(largest * np.array(strength)).T))
 
 
-def strength(scene: Scene) -> tuple[float, float]:
+def map_strength(scene: Scene) -> tuple[float, float]:
     """rms of s and of c."""
     return scene.value("response.slope", ""), scene.value("response.curvature", "")
 
 
-def band_of(scene: Scene) -> Passband:
+def band_of_scene(scene: Scene) -> Passband:
     """The exposure's passband; without one, the first of the camera's."""
     return scene.band or passbands.load(LAMPS[scene.section][1][0])
 
@@ -212,66 +231,78 @@ def band_of(scene: Scene) -> Passband:
 # ---------------------------------------------------------------------------------------------- the sky, and a lamp
 
 
-def _colour(scene: Scene, photons: Float) -> Float:
+def _colour_of_light(scene: Scene, photons: Float) -> Float:
     """F1 and F2 of light of which the band detects photons [n] by wavelength; 0 where it detects none."""
-    band = band_of(scene)
+    band = band_of_scene(scene)
     if not photons.sum() > 0.0:
         return np.zeros(2)
-    return of_lines(scene.section, band, band.wavelength, photons, scene.mission)
+    return colour_of_lines(scene.section, band, band.wavelength, photons, scene.mission)
 
 
-def _sky(scene: Scene) -> Float:
+def _sky_colour(scene: Scene) -> Float:
     """e- of the sky times F1, and F2.  Error: of its light all but the thermal is taken as the Sun's."""
     if not scene.sky_rate > 0.0:
         return np.zeros(2)
-    photons = diffuse_light.photons(scene.section, scene.sky_rate, band_of(scene), scene.mission)
-    return scene.sky_electrons * _colour(scene, photons)
+    photons = diffuse_light.photons(scene.section, scene.sky_rate, band_of_scene(scene), scene.mission)
+    return scene.sky_electrons * _colour_of_light(scene, photons)
 
 
-def _even(scene: Scene) -> Float:
-    return means(scene.section, band_of(scene), scene.mission)
+def _band_means_of_scene(scene: Scene) -> Float:
+    return band_means(scene.section, band_of_scene(scene), scene.mission)
 
 
-def _rms(scene: Scene, light: Float) -> float:
+def _change_rms(scene: Scene, light: Float) -> float:
     """e- rms that the maps change of light [2], e- times f1, and f2."""
-    return float(np.hypot(*(np.array(strength(scene)) * light)))
+    return float(np.hypot(*(np.array(map_strength(scene)) * light)))
 
 
 def _parameters(scene: Scene) -> tuple[Frame | Float32, Float, float, float]:
-    lit = np.empty((2, scene.ny, scene.nx), np.float32)
-    lit[:] = _sky(scene)[:, None, None]
-    if scene.tints is not None:
-        lit += scene.tints
-    return lit, _even(scene), *strength(scene)
+    chromatic_light = np.empty((2, scene.ny, scene.nx), np.float32)
+    chromatic_light[:] = _sky_colour(scene)[:, None, None]
+    if scene.chromatic_light is not None:
+        chromatic_light += scene.chromatic_light
+    return chromatic_light, _band_means_of_scene(scene), *map_strength(scene)
 
 
 def _contribution(scene: Scene) -> float:
     brightest = scene.peak_electrons + scene.sky_electrons
-    return max(scene.tint_electrons, _rms(scene, brightest * _even(scene)), _of_sky(scene))
+    return max(
+        scene.chromatic_electrons, _change_rms(scene, brightest * _band_means_of_scene(scene)), _sky_change(scene)
+    )
 
 
-def _of_sky(scene: Scene) -> float:
+def _sky_change(scene: Scene) -> float:
     """What a source changes is not there again in the next dither."""
-    return _rms(scene, _sky(scene) + scene.sky_electrons * _even(scene))
+    return _change_rms(scene, _sky_colour(scene) + scene.sky_electrons * _band_means_of_scene(scene))
 
 
-def _lamp(scene: Scene) -> Float:
+def _lamp_colour(scene: Scene) -> Float:
     """e- of a lamp, where it shines straight, times F1, and F2."""
-    band = band_of(scene)
+    band = band_of_scene(scene)
     level = calibration_lamp.EFFECT.contribution(scene)
-    return level * _colour(scene, calibration_lamp.photons(band, scene.lamp, scene.section, scene.mission))
+    return level * _colour_of_light(
+        scene, calibration_lamp.detected_photons(band, scene.lamp, scene.section, scene.mission)
+    )
 
 
 def _lamp_parameters(scene: Scene) -> tuple[Float32, Float, float, float]:
     columns, rows = calibration_lamp.pattern(scene, scene.lamp, scene.nx, scene.ny)
     shape = illumination.apply(np.ones((scene.ny, scene.nx)), columns, rows)
-    return (_lamp(scene)[:, None, None] * shape).astype(np.float32), _even(scene), *strength(scene)
+    return (
+        (_lamp_colour(scene)[:, None, None] * shape).astype(np.float32),
+        _band_means_of_scene(scene),
+        *map_strength(scene),
+    )
 
 
-def _of_lamp(scene: Scene) -> float:
-    return _rms(scene, _lamp(scene) + calibration_lamp.EFFECT.contribution(scene) * _even(scene))
+def _lamp_change(scene: Scene) -> float:
+    return _change_rms(
+        scene, _lamp_colour(scene) + calibration_lamp.EFFECT.contribution(scene) * _band_means_of_scene(scene)
+    )
 
 
 # Most of the cost of the first is for the light that is drawn again.
-EFFECT = Effect("chromatic_response", apply, _parameters, _contribution, fixed=True, repeated=_of_sky, cost=5e-2)
-LAMP = Effect("lamp_response", apply, _lamp_parameters, _of_lamp, fixed=True, numbers=EFFECT.name, cost=1.5e-2)
+EFFECT = Effect("chromatic_response", apply, _parameters, _contribution, fixed=True, systematic=_sky_change, cost=5e-2)
+LAMP = Effect(
+    "lamp_response", apply, _lamp_parameters, _lamp_change, fixed=True, random_stream=EFFECT.name, cost=1.5e-2
+)

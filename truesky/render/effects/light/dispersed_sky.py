@@ -24,24 +24,24 @@ def apply(frame: Frame, nodes: Frame | None, rng: np.random.Generator | None = N
     if min(nodes.shape) < 2 or not np.isfinite(nodes).all():
         raise BadInput(f"a dispersed sky of {nodes.shape} places, or one that is not finite")
     ny, nx = frame.shape
-    right, left = _between(nodes.shape[1], nx)
-    across = nodes[:, left] * (1.0 - right) + nodes[:, left + 1] * right
-    up, low = _between(nodes.shape[0], ny)
-    out = across[low] * (1.0 - up)[:, None]
-    out += across[low + 1] * up[:, None]
+    x_fraction, x_node = _node_fractions(nodes.shape[1], nx)
+    across = nodes[:, x_node] * (1.0 - x_fraction) + nodes[:, x_node + 1] * x_fraction
+    y_fraction, y_node = _node_fractions(nodes.shape[0], ny)
+    out = across[y_node] * (1.0 - y_fraction)[:, None]
+    out += across[y_node + 1] * y_fraction[:, None]
     out += frame
     return np.asarray(out)
 
 
-def _between(nodes: int, pixels: int) -> tuple[Frame, np.ndarray[tuple[int], np.dtype[np.int64]]]:
+def _node_fractions(nodes: int, pixels: int) -> tuple[Frame, np.ndarray[tuple[int], np.dtype[np.int64]]]:
     """(part of the way to the next node, the node before) of each pixel."""
-    place = np.linspace(0.0, nodes - 1.0, pixels)
-    before = np.minimum(place.astype(np.int64), nodes - 2)
-    return place - before, before
+    position = np.linspace(0.0, nodes - 1.0, pixels)
+    node = np.minimum(position.astype(np.int64), nodes - 2)
+    return position - node, node
 
 
 def _contribution(scene: Scene) -> float:
-    return 0.0 if scene.spread_sky is None else float(np.abs(scene.spread_sky).max())
+    return 0.0 if scene.sky_change is None else float(np.abs(scene.sky_change).max())
 
 
-EFFECT = Effect("dispersed_sky", apply, lambda scene: (scene.spread_sky,), _contribution, cost=2e-2)
+EFFECT = Effect("dispersed_sky", apply, lambda scene: (scene.sky_change,), _contribution, cost=2e-2)

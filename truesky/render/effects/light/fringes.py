@@ -14,7 +14,7 @@ import numpy as np
 
 from lake_schema.arrays import Float
 from lake_schema.errors import OutOfRange
-from truesky.numerics import sums
+from truesky.numerics import matrices
 from truesky.numerics.compiling import jit
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
@@ -25,7 +25,7 @@ _LINES = ((0.965, 0.2), (0.99, 0.35), (1.0, 0.25), (1.03, 0.2))
 # waves along each side, of which the longer are the larger.
 _ORDERS, _MODES, _STEEPNESS = 120.0, 4, 1.5
 # Pixels between places at which the thickness is told, and steps of a cycle in the table.
-_NODES, _STEPS = 8, 64
+_NODE_SPACING, _STEPS_PER_CYCLE = 8, 64
 
 
 def apply(frame: Frame, electrons: float, amplitude: float, period: float, rng: np.random.Generator) -> Frame:
@@ -45,17 +45,17 @@ def apply(frame: Frame, electrons: float, amplitude: float, period: float, rng: 
         return out
     nodes = phase(frame.shape[1], frame.shape[0], period, rng)
     first = float(nodes.min())
-    steps = np.arange(math.ceil((float(nodes.max()) - first) * _STEPS) + 2) / _STEPS
+    steps = np.arange(math.ceil((float(nodes.max()) - first) * _STEPS_PER_CYCLE) + 2) / _STEPS_PER_CYCLE
     table = contrast(first + steps)
-    _add(out, nodes, electrons * amplitude / float(np.abs(table).max()) * table, first)
+    _add_fringes(out, nodes, electrons * amplitude / float(np.abs(table).max()) * table, first)
     return out
 
 
 def contrast(cycles: Float) -> Float:
     """In [-1, 1] where light of the mean wave number is so many cycles behind."""
     waves, light = np.array(_LINES).T
-    found = np.cos(2.0 * np.pi * np.multiply.outer(cycles, waves)) * (light / light.sum())
-    return np.asarray(found.sum(axis=1))
+    terms = np.cos(2.0 * np.pi * np.multiply.outer(cycles, waves)) * (light / light.sum())
+    return np.asarray(terms.sum(axis=1))
 
 
 def phase(nx: int, ny: int, period: float, rng: np.random.Generator) -> Float:
@@ -63,34 +63,34 @@ def phase(nx: int, ny: int, period: float, rng: np.random.Generator) -> Float:
 
     nx, ny : pixels;  period : pixels;  rng : random numbers of the detector
     """
-    across, up = (np.arange((n - 1) // _NODES + 2) * float(_NODES) for n in (nx, ny))
+    across, up = (np.arange((n - 1) // _NODE_SPACING + 2) * float(_NODE_SPACING) for n in (nx, ny))
     # Over the longer side, so that fringes are as wide in both directions.
-    side = float(max(nx, ny, 4 * _NODES))
+    side = float(max(nx, ny, 4 * _NODE_SPACING))
     number = np.arange(_MODES + 1)
     strength = rng.standard_normal((_MODES + 1, _MODES + 1)) / (1.0 + np.hypot.outer(number, number)) ** _STEEPNESS
     strength[0, 0] = 0.0
     waves = [np.cos(np.pi * np.multiply.outer(at / side, number)) for at in (across, up)]
     slopes = [-np.pi / side * number * np.sin(np.pi * np.multiply.outer(at / side, number)) for at in (across, up)]
     slope_x, slope_y, height = (
-        sums.product(sums.product(up_, strength), across_.T)
+        matrices.matmul(matrices.matmul(up_, strength), across_.T)
         for up_, across_ in ((waves[1], slopes[0]), (slopes[1], waves[0]), (waves[1], waves[0]))
     )
-    steep = float(np.sqrt(np.mean(slope_x**2 + slope_y**2)))
-    return np.asarray(_ORDERS + height / (steep * period))
+    rms_slope = float(np.sqrt(np.mean(slope_x**2 + slope_y**2)))
+    return np.asarray(_ORDERS + height / (rms_slope * period))
 
 
 @jit
-def _add(frame: Any, nodes: Any, table: Any, first: float) -> None:
+def _add_fringes(frame: Any, nodes: Any, table: Any, first: float) -> None:
     """Adds the table at the phase of each pixel, bilinear between the nodes."""
     ny, nx = frame.shape
     line = np.empty(nodes.shape[1])
     for r in range(ny):
-        low, part = r // _NODES, (r % _NODES) / _NODES
+        low, part = r // _NODE_SPACING, (r % _NODE_SPACING) / _NODE_SPACING
         for k in range(len(line)):
             line[k] = nodes[low, k] + part * (nodes[low + 1, k] - nodes[low, k])
         for c in range(nx):
-            k, share = c // _NODES, (c % _NODES) / _NODES
-            place = (line[k] + share * (line[k + 1] - line[k]) - first) * _STEPS
+            k, share = c // _NODE_SPACING, (c % _NODE_SPACING) / _NODE_SPACING
+            place = (line[k] + share * (line[k + 1] - line[k]) - first) * _STEPS_PER_CYCLE
             i = min(max(int(place), 0), len(table) - 2)
             frame[r, c] += table[i] + (place - i) * (table[i + 1] - table[i])
 

@@ -19,7 +19,7 @@ from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import NOTICEABLE, Frame, Lights, Scene
 
 # Samples across a pixel of the border, for pixels that are cut.
-_FINE = 4
+_SUBSAMPLES = 4
 
 
 class Pupil(NamedTuple):
@@ -46,32 +46,32 @@ def apply(
     lights : positions and electrons of stars;  pupil : shape of a ghost;  rng : not used
     """
     radius, hole, arms, width = pupil
-    for name, value, least, most in (
+    for name, value, lowest, highest in (
         ("ghost ratio", ratio, 0.0, 1.0), ("ghost radius", radius, 0.5, 1e4), ("ghost hole", hole, 0.0, 0.99),
         ("ghost arms", width, 0.0, radius),
     ):  # fmt: skip
-        if not least <= value <= most:
-            raise OutOfRange(name, value, least, most)
+        if not lowest <= value <= highest:
+            raise OutOfRange(name, value, lowest, highest)
     out = np.array(frame, dtype=float, order="C")
     if ratio == 0.0 or out.size == 0 or not len(lights.electrons):
         return out
-    stamp = _pupil(radius, hole, np.array(arms, float).reshape(-1, 4), width)
+    stamp = _pupil_image(radius, hole, np.array(arms, float).reshape(-1, 4), width)
     stamp /= stamp.sum()
-    _add(out, lights.column + offset[0], lights.row + offset[1], ratio * lights.electrons, stamp)
+    _add_stamps(out, lights.column + offset[0], lights.row + offset[1], ratio * lights.electrons, stamp)
     return out
 
 
 @jit
-def _pupil(radius: float, hole: float, arms: Any, width: float) -> Any:
+def _pupil_image(radius: float, hole: float, arms: Any, width: float) -> Any:
     """What of each pixel is lit: [n, n], n odd, its middle the centre."""
     half = int(np.ceil(radius)) + 1
     stamp = np.zeros((2 * half + 1, 2 * half + 1))
     for r in range(2 * half + 1):
         for c in range(2 * half + 1):
             lit = 0
-            for i in range(_FINE):
-                for j in range(_FINE):
-                    x, y = c - half + (j + 0.5) / _FINE - 0.5, r - half + (i + 0.5) / _FINE - 0.5
+            for i in range(_SUBSAMPLES):
+                for j in range(_SUBSAMPLES):
+                    x, y = c - half + (j + 0.5) / _SUBSAMPLES - 0.5, r - half + (i + 0.5) / _SUBSAMPLES - 0.5
                     distance = np.hypot(x, y)
                     inside = hole * radius <= distance <= radius
                     for arm in arms:
@@ -79,12 +79,12 @@ def _pupil(radius: float, hole: float, arms: Any, width: float) -> Any:
                         across = dy * np.cos(angle) - dx * np.sin(angle)
                         inside = inside and not (np.hypot(dx, dy) <= arm[3] and abs(across) < 0.5 * width)
                     lit += inside
-            stamp[r, c] = lit / (_FINE * _FINE)
+            stamp[r, c] = lit / (_SUBSAMPLES * _SUBSAMPLES)
     return stamp
 
 
 @jit
-def _add(frame: Any, column: Any, row: Any, electrons: Any, stamp: Any) -> None:
+def _add_stamps(frame: Any, column: Any, row: Any, electrons: Any, stamp: Any) -> None:
     """Adds stamps, shifted by parts of a pixel: shares of four pixels each."""
     ny, nx = frame.shape
     half = len(stamp) // 2
@@ -109,29 +109,34 @@ def parameters(scene: Scene, plate: str = "ghost") -> tuple[Any, ...]:
 
     plate : whose ghosts, a prefix of their parameters
     """
-    turn = scene.detector.rotation if scene.detector is not None else 0.0
-    cosine, sine = float(np.cos(np.radians(turn))), float(np.sin(np.radians(turn)))
+    rotation = scene.detector.rotation if scene.detector is not None else 0.0
+    cosine, sine = float(np.cos(np.radians(rotation))), float(np.sin(np.radians(rotation)))
     length = scene.value(f"{plate}.offset_y", "pix")
     radius = scene.value(f"{plate}.radius_out", "pix")
     aperture = 0.5 * scene.mission.value("plm.aperture_diameter", "mm")
 
-    def of(key: str, unit: str) -> float:
+    def pupil_value(key: str, unit: str) -> float:
         return scene.mission.value(f"plm.pupil.{key}", unit)
 
     scale = radius / aperture
-    reach = scale * of("spider_half_length", "mm")
-    places = [[scale * of(f"spider{number}.{axis}", "mm") for axis in "xy"] for number in (1, 2, 3)]
+    reach = scale * pupil_value("spider_half_length", "mm")
+    places = [[scale * pupil_value(f"spider{number}.{axis}", "mm") for axis in "xy"] for number in (1, 2, 3)]
     # From the focal plane's axes to the detector's.
     arms = tuple(
-        (x * cosine + y * sine, y * cosine - x * sine, of(f"spider{number}.angle", "deg") - turn, reach)
+        (x * cosine + y * sine, y * cosine - x * sine, pupil_value(f"spider{number}.angle", "deg") - rotation, reach)
         for number, (x, y) in enumerate(places, start=1)
     )
-    width = scale * of("spider_width", "mm")
+    width = scale * pupil_value("spider_width", "mm")
     ratio, hole = scene.value(f"{plate}.flux_ratio", ""), scene.value(f"{plate}.radius_in_ratio", "")
-    return noticeable(scene, ratio, plate), ratio, (length * sine, length * cosine), Pupil(radius, hole, arms, width)
+    return (
+        noticeable_lights(scene, ratio, plate),
+        ratio,
+        (length * sine, length * cosine),
+        Pupil(radius, hole, arms, width),
+    )
 
 
-def noticeable(scene: Scene, ratio: float, plate: str = "ghost") -> Lights:
+def noticeable_lights(scene: Scene, ratio: float, plate: str = "ghost") -> Lights:
     """The lights whose ghost, taken as a whole, is not lost in the noise of the pixels it covers."""
     area = np.pi * scene.value(f"{plate}.radius_out", "pix") ** 2
     lights = scene.lights
@@ -146,17 +151,17 @@ def _contribution(scene: Scene, plate: str = "ghost") -> float:
     return ratio * brightest / float(np.sqrt(np.pi) * radius)
 
 
-def _level(scene: Scene, plate: str = "ghost") -> float:
+def _mean_contribution(scene: Scene, plate: str = "ghost") -> float:
     """In a pixel: a mean over as many as share it is what it is judged by already."""
     return _contribution(scene, plate) / float(np.sqrt(np.pi) * scene.value(f"{plate}.radius_out", "pix"))
 
 
-EFFECT = Effect("ghosts", apply, parameters, _contribution, cost=4.5e-3, repeated=_level)
+EFFECT = Effect("ghosts", apply, parameters, _contribution, cost=4.5e-3, systematic=_mean_contribution)
 FILTER = Effect(
     "filter_ghosts",
     apply,
     partial(parameters, plate="filter_ghost"),
     partial(_contribution, plate="filter_ghost"),
     cost=4.5e-3,
-    repeated=partial(_level, plate="filter_ghost"),
+    systematic=partial(_mean_contribution, plate="filter_ghost"),
 )

@@ -64,29 +64,35 @@ def _half_sides(scene: Scene) -> tuple[float, float]:
     )
 
 
-def _vignetting(scene: Scene) -> tuple[Frame, Frame]:
+def _vignetting_pattern(scene: Scene) -> tuple[Frame, Frame]:
     return pattern(scene, scene.nx, scene.ny, scene.value("illumination", ""), (0.0, 0.0))
 
 
-def _shutter(scene: Scene) -> tuple[Frame, Frame]:
-    return pattern(scene, scene.nx, scene.ny, 0.0, (0.0, _longer(scene)))
+def _shutter_pattern(scene: Scene) -> tuple[Frame, Frame]:
+    return pattern(scene, scene.nx, scene.ny, 0.0, (0.0, _shutter_excess(scene)))
 
 
-def _longer(scene: Scene) -> float:
+def _shutter_excess(scene: Scene) -> float:
     """At the side of the focal plane, of the exposure time: the blades take as long whatever that is."""
     time = scene.exposure_time_s
     return float(np.clip(scene.value("shutter_map", "s") / time, -1.0, 1.0)) if time > 0.0 else 0.0
 
 
-def _brightest(scene: Scene) -> float:
+def _brightest_electrons(scene: Scene) -> float:
     return scene.peak_electrons + scene.sky_electrons
 
 
 EFFECT = Effect(
     "illumination",
     apply,
-    _vignetting,
-    lambda scene: abs(scene.value("illumination", "")) * _brightest(scene),
+    _vignetting_pattern,
+    lambda scene: abs(scene.value("illumination", "")) * _brightest_electrons(scene),
     cost=5e-3,
 )
-SHUTTER = Effect("shutter", apply, _shutter, lambda scene: abs(_longer(scene)) * _brightest(scene), cost=5e-3)
+SHUTTER = Effect(
+    "shutter",
+    apply,
+    _shutter_pattern,
+    lambda scene: abs(_shutter_excess(scene)) * _brightest_electrons(scene),
+    cost=5e-3,
+)

@@ -30,11 +30,11 @@ def apply(x: npt.ArrayLike, y: npt.ArrayLike, strength: float) -> Frame:
         raise OutOfRange("intra-pixel strength", strength, 0.0, 0.5)
     x, y = np.asarray(x, float), np.asarray(y, float)
     plain_x, plain_y = np.sinc(x), np.sinc(y)
-    dip = plain_x * _second(y) + _second(x) * plain_y
+    dip = plain_x * _second_moment(y) + _second_moment(x) * plain_y
     return np.asarray((plain_x * plain_y - strength * dip) / (1.0 - strength * 2.0 / 3.0))
 
 
-def _second(x: Frame) -> Frame:
+def _second_moment(x: Frame) -> Frame:
     """Mean of u^2 cos(pi x u) over -1 .. 1."""
     phase = np.pi * np.abs(x)
     q = np.where(phase < _SMALL, 1.0, phase)

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.polynomial import polynomial
 
 from lake_schema.errors import OutOfRange
-from truesky.numerics import sums
+from truesky.numerics import matrices
 from truesky.render.camera import distortion
 from truesky.render.camera.pointing import ARCSEC
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
 
 # Pixels between places at which the largest change is looked for: it is a smooth polynomial.
-_EVERY = 64
+_SAMPLE_STEP = 64
 
 
 def apply(
@@ -30,19 +30,19 @@ def apply(
     """
     if not 0.0 <= electrons < np.inf:
         raise OutOfRange("sky electrons", electrons, 0.0, np.inf)
-    out = change(u, v, electrons * stretch)
+    out = area_change(u, v, electrons * stretch)
     out += frame
     return out
 
 
-def change(u: Frame, v: Frame, stretch: Frame) -> Frame:
+def area_change(u: Frame, v: Frame, stretch: Frame) -> Frame:
     """[ny, nx] a pixel's area over that at the boresight, less 1.
 
     u [nx], v [ny] : pixels from the boresight;  stretch : coefficients of u^p v^q
     Error          : 1e-4, of what distortion and projection do to each other
     """
     across, along = (polynomial.polyvander(at, n - 1) for at, n in zip((u, v), stretch.shape, strict=True))
-    return np.asarray(sums.product(along, sums.product(stretch.T, across.T)))
+    return np.asarray(matrices.matmul(along, matrices.matmul(stretch.T, across.T)))
 
 
 def parameters(scene: Scene) -> tuple[float, Frame, Frame, Frame]:
@@ -55,8 +55,8 @@ def parameters(scene: Scene) -> tuple[float, Frame, Frame, Frame]:
     v = np.arange(d.ny) - (d.ny - 1) / 2 + (cosine * d.y - sine * d.x) / d.pixel_scale
     matrix = d.pixel_scale * np.array([[cosine, -sine], [sine, cosine]])
     stretch = np.zeros((3, 3))
-    if d.bending:
-        stretch = distortion.stretch(d.bending, matrix)
+    if d.distortion_terms:
+        stretch = distortion.area_change(d.distortion_terms, matrix)
     # Of the sky a tangent plane has (1 + r^2)^(-3/2).
     flat = -1.5 * (d.pixel_scale * ARCSEC) ** 2
     stretch[2, 0] += flat
@@ -66,8 +66,8 @@ def parameters(scene: Scene) -> tuple[float, Frame, Frame, Frame]:
 
 def _contribution(scene: Scene) -> float:
     electrons, u, v, stretch = parameters(scene)
-    some_u, some_v = (np.append(at[::_EVERY], at[-1:]) for at in (u, v))
-    return electrons * float(np.abs(change(some_u, some_v, stretch)).max(initial=0.0))
+    sampled_u, sampled_v = (np.append(at[::_SAMPLE_STEP], at[-1:]) for at in (u, v))
+    return electrons * float(np.abs(area_change(sampled_u, sampled_v, stretch)).max(initial=0.0))
 
 
 EFFECT = Effect("pixel_area", apply, parameters, _contribution, cost=5e-3)

@@ -15,8 +15,8 @@ from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import NOTICEABLE, Frame, Lights, Scene
 
 # The halo is drawn at nodes this part of its scale apart and interpolated linearly: 2e-3 of it.
-_NODES = 1.0 / 16.0
-_MOST_STEP = 256
+_NODE_SPACING = 1.0 / 16.0
+_MAX_STEP = 256
 
 
 def apply(frame: Frame, lights: Lights, fraction: float, scale: float, rng: np.random.Generator | None = None) -> Frame:
@@ -32,17 +32,17 @@ def apply(frame: Frame, lights: Lights, fraction: float, scale: float, rng: np.r
     out = np.array(frame, dtype=float, order="C")
     if fraction == 0.0 or out.size == 0 or not len(lights.electrons):
         return out
-    step = int(np.clip(scale * _NODES, 1, _MOST_STEP))
+    step = int(np.clip(scale * _NODE_SPACING, 1, _MAX_STEP))
     ny, nx = out.shape
     nodes = np.zeros(((ny - 1) // step + 2, (nx - 1) // step + 2))
     height = lights.electrons * fraction / (2.0 * np.pi * scale**2)
-    _halos(nodes, step, lights.column, lights.row, height, 1.0 / scale**2)
+    _add_halos(nodes, step, lights.column, lights.row, height, 1.0 / scale**2)
     _interpolate(out, nodes, step)
     return out
 
 
 @jit
-def _halos(nodes: Any, step: int, column: Any, row: Any, height: Any, inverse: float) -> None:
+def _add_halos(nodes: Any, step: int, column: Any, row: Any, height: Any, inverse: float) -> None:
     for i in range(len(column)):
         for r in range(nodes.shape[0]):
             dy = r * step - row[i]
@@ -61,19 +61,19 @@ def _interpolate(frame: Any, nodes: Any, step: int) -> None:
         for k in range(len(line)):
             line[k] = nodes[low, k] + part * (nodes[low + 1, k] - nodes[low, k])
         for k in range(len(line) - 1):
-            some, slope = frame[r, k * step : min((k + 1) * step, nx)], (line[k + 1] - line[k]) / step
-            for c in range(len(some)):
-                some[c] += line[k] + c * slope
+            segment, slope = frame[r, k * step : min((k + 1) * step, nx)], (line[k + 1] - line[k]) / step
+            for c in range(len(segment)):
+                segment[c] += line[k] + c * slope
 
 
-def _halo(scene: Scene) -> tuple[float, float]:
+def _halo_parameters(scene: Scene) -> tuple[float, float]:
     """Fraction, scale in pixels."""
     pixel_scale = scene.value("fpa.pixel_scale", "arcsec / pix")
     return scene.value("halo.fraction", ""), scene.value("halo.radius", "arcsec") / pixel_scale
 
 
 def _parameters(scene: Scene) -> tuple[Any, ...]:
-    fraction, scale = _halo(scene)
+    fraction, scale = _halo_parameters(scene)
     lights = scene.lights
     # A thousand halos that are each below a thousandth of what would be noticed are left out.
     height = fraction * lights.electrons / (2.0 * np.pi * scale**2)
@@ -82,7 +82,7 @@ def _parameters(scene: Scene) -> tuple[Any, ...]:
 
 
 def _contribution(scene: Scene) -> float:
-    fraction, scale = _halo(scene)
+    fraction, scale = _halo_parameters(scene)
     return fraction * float(scene.lights.electrons.sum()) / (2.0 * np.pi * scale**2)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from lake_schema.arrays import Array, Float
 from lake_schema.errors import OutOfRange
 from truesky.numerics.compiling import jit
-from truesky.render.effects.effect import Effect, by_pixel
+from truesky.render.effects.effect import Effect, map_pixels
 from truesky.render.effects.scene import Frame, Scene
 
 
@@ -30,7 +30,7 @@ def apply(
     """
     if not (np.min(gain) > 0.0 and np.max(gain) < np.inf):
         raise OutOfRange("gain", gain, 0.0, np.inf)
-    return by_pixel(_convert, frame, gain, bias + 0.5, largest)
+    return map_pixels(_convert, frame, gain, bias + 0.5, largest)
 
 
 def apply_signal(
@@ -50,25 +50,25 @@ def _convert(electrons: Any, numbers: Any, gain: float, offset: float, largest: 
 
 
 def _parameters(scene: Scene) -> tuple[float | Float, float | Float, float | Float]:
-    gain, bias = scene.of_amplifiers("gain", "electron / adu"), scene.of_amplifiers("bias", "adu")
-    return gain, bias, scene.of_amplifiers("adc_max", "adu")
+    gain, bias = scene.amplifier_values("gain", "electron / adu"), scene.amplifier_values("bias", "adu")
+    return gain, bias, scene.amplifier_values("adc_max", "adu")
 
 
 def pixel_type(scene: Scene) -> type[np.uint16] | type[np.int32]:
     """Of a file: 16 bits without a sign; 32 where a converter has more than 16."""
-    largest = float(np.max(scene.of_amplifiers("adc_max", "adu")))
+    largest = float(np.max(scene.amplifier_values("adc_max", "adu")))
     return np.uint16 if largest <= np.iinfo(np.uint16).max else np.int32
 
 
-def as_stored(numbers: Frame, scene: Scene) -> Array:
+def to_file_type(numbers: Frame, scene: Scene) -> Array:
     """Whole ADU, as `apply` gives them -> the same in the type of a file."""
     return numbers.astype(pixel_type(scene))
 
 
-def converted(groups: Frame, scene: Scene) -> Array:
+def convert_groups(groups: Frame, scene: Scene) -> Array:
     """Groups of a ramp [groups, ny, nx] e- -> ADU."""
     numbers = _parameters(scene)
-    return np.stack([as_stored(apply(group, *numbers), scene) for group in groups])
+    return np.stack([to_file_type(apply(group, *numbers), scene) for group in groups])
 
 
 def _contribution(scene: Scene) -> float:

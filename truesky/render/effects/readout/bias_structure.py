@@ -34,23 +34,23 @@ def structure(
     stripes : rms between columns, e-
     quadrants, nx : amplifiers, and columns of each;  rng : random numbers of the detector
     """
-    for name, value, least in (
+    for name, value, lowest in (
         ("bias offset", offset, 0.0), ("bias stripes", stripes, 0.0), ("bias settling length", length, 1e-3)
     ):  # fmt: skip
-        if not (np.min(value) >= least and np.max(value) < np.inf):
-            raise OutOfRange(name, value, least, np.inf)
+        if not (np.min(value) >= lowest and np.max(value) < np.inf):
+            raise OutOfRange(name, value, lowest, np.inf)
     offset, settling, length, stripes = (np.reshape(number, (-1, 1)) for number in (offset, settling, length, stripes))
-    own = offset * rng.standard_normal((quadrants, 1))
+    offsets = offset * rng.standard_normal((quadrants, 1))
     settled = settling * np.exp(-np.arange(nx) / length)
-    return np.asarray(own + settled + stripes * rng.standard_normal((quadrants, nx)))
+    return np.asarray(offsets + settled + stripes * rng.standard_normal((quadrants, nx)))
 
 
 def _parameters(scene: Scene) -> tuple[Number, Number, Number, Number]:
-    gain = scene.of_amplifiers("gain", "electron / adu")
+    gain = scene.amplifier_values("gain", "electron / adu")
     offset, settling, stripes = (
-        gain * scene.of_amplifiers(f"bias_{key}", "adu") for key in ("offset", "settling", "stripes")
+        gain * scene.amplifier_values(f"bias_{key}", "adu") for key in ("offset", "settling", "stripes")
     )
-    return offset, settling, scene.of_amplifiers("bias_settling_length", "pix"), stripes
+    return offset, settling, scene.amplifier_values("bias_settling_length", "pix"), stripes
 
 
 def _contribution(scene: Scene) -> float:

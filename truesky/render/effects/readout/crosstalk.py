@@ -18,7 +18,7 @@ from truesky.render.effects.scene import Frame, Scene
 
 # Of the coupling between neighbours (assumed).
 _DIAGONAL = 0.5
-_RUN = 1024
+_BLOCK = 1024
 # Each time what is left is smaller by the sum of an amplifier's coefficients: a hundredth at most.
 _ITERATIONS = 3
 
@@ -39,7 +39,7 @@ def apply(frame: Frame, coefficients: Frame, rng: np.random.Generator | None = N
     return out.reshape(frame.shape)
 
 
-def removed(frame: Frame, coefficients: Frame) -> Frame:
+def remove(frame: Frame, coefficients: Frame) -> Frame:
     """Parts [q, ny, nx] as `apply` left them -> as they were.
 
     coefficients : of `apply`
@@ -54,12 +54,12 @@ def removed(frame: Frame, coefficients: Frame) -> Frame:
 @jit
 def _mix(frame: Any, coefficients: Any, out: Any) -> None:
     # As many pixels at a time as the processor has near at hand.
-    for start in range(0, frame.shape[1], _RUN):
+    for start in range(0, frame.shape[1], _BLOCK):
         for victim in range(len(frame)):
-            line = out[victim, start : start + _RUN]
-            line[:] = frame[victim, start : start + _RUN]
+            line = out[victim, start : start + _BLOCK]
+            line[:] = frame[victim, start : start + _BLOCK]
             for source in range(len(frame)):
-                share, other = coefficients[victim, source], frame[source, start : start + _RUN]
+                share, other = coefficients[victim, source], frame[source, start : start + _BLOCK]
                 if source != victim and share != 0.0:
                     for i in range(len(line)):
                         line[i] += share * other[i]
@@ -69,12 +69,17 @@ def coefficients(scene: Scene) -> Frame:
     """Of quadrants: the mission's for neighbours along a side, half of it across the diagonal; else of each pair."""
     if scene.layout is not None and scene.detector is not None:
         largest = scene.value("crosstalk_max", "")
-        return amplifiers.couplings(scene.value("crosstalk", ""), largest, scene.detector, scene.layout)
-    near = far = scene.value("crosstalk", "")
-    diagonal = _DIAGONAL * near
+        return amplifiers.crosstalk_couplings(scene.value("crosstalk", ""), largest, scene.detector, scene.layout)
+    row_neighbour = column_neighbour = scene.value("crosstalk", "")
+    diagonal = _DIAGONAL * row_neighbour
     # E F G H: upper left, upper right, lower right, lower left.
     return np.array(
-        [[0, near, diagonal, far], [near, 0, far, diagonal], [diagonal, far, 0, near], [far, diagonal, near, 0]]
+        [
+            [0, row_neighbour, diagonal, column_neighbour],
+            [row_neighbour, 0, column_neighbour, diagonal],
+            [diagonal, column_neighbour, 0, row_neighbour],
+            [column_neighbour, diagonal, row_neighbour, 0],
+        ]
     )
 
 

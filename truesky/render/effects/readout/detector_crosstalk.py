@@ -8,12 +8,12 @@ from __future__ import annotations
 import numpy as np
 
 from lake_schema.errors import OutOfRange
-from truesky.render.effects.effect import Effect, nothing
-from truesky.render.effects.scene import Elsewhere, Frame, Scene
+from truesky.render.effects.effect import Effect, zero_contribution
+from truesky.render.effects.scene import Frame, NeighbourCharge, Scene
 
 
 def apply(
-    frame: Frame, elsewhere: Elsewhere | None, coefficient: float, rng: np.random.Generator | None = None
+    frame: Frame, neighbour_charge: NeighbourCharge | None, coefficient: float, rng: np.random.Generator | None = None
 ) -> Frame:
     """Parts [q, ny, nx] in readout order -> each plus its share of what the other detectors' have.
 
@@ -24,9 +24,9 @@ def apply(
     if not abs(coefficient) <= 1.0:
         raise OutOfRange("crosstalk between detectors", coefficient, -1.0, 1.0)
     out = np.array(frame, dtype=float, order="C")
-    if elsewhere is not None:
+    if neighbour_charge is not None:
         # No pixel is in it twice.
-        out.reshape(-1)[elsewhere.pixel] += coefficient * elsewhere.electrons
+        out.reshape(-1)[neighbour_charge.pixel] += coefficient * neighbour_charge.electrons
     return out
 
 
@@ -37,7 +37,7 @@ def coefficient(scene: Scene) -> float:
 
 
 def _contribution(scene: Scene) -> float:
-    brightest = 0.0 if scene.elsewhere is None else float(scene.elsewhere.electrons.max(initial=0.0))
+    brightest = 0.0 if scene.neighbour_charge is None else float(scene.neighbour_charge.electrons.max(initial=0.0))
     return abs(coefficient(scene)) * brightest
 
 
@@ -45,8 +45,8 @@ def _contribution(scene: Scene) -> float:
 EFFECT = Effect(
     "detector_crosstalk",
     apply,
-    lambda scene: (scene.elsewhere, coefficient(scene)),
+    lambda scene: (scene.neighbour_charge, coefficient(scene)),
     _contribution,
     cost=2e-3,
-    repeated=nothing,
+    systematic=zero_contribution,
 )

@@ -25,7 +25,7 @@ import numpy as np
 
 from lake_schema.errors import OutOfRange
 from truesky.numerics.compiling import jit
-from truesky.render.effects.charge.ramp import Mode, mode_of
+from truesky.render.effects.charge.ramp import Mode, mode_of_scene
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
 
@@ -73,7 +73,7 @@ def _estimate(groups: Any, out: Any, beta: float, a: float) -> None:
 
 
 def _parameters(scene: Scene) -> tuple[Mode, float]:
-    return mode_of(scene), scene.value("read_noise", "electron")
+    return mode_of_scene(scene), scene.value("read_noise", "electron")
 
 
 EFFECT = Effect("macc", apply, _parameters, lambda scene: scene.pixel_noise, optional=False, cost=1.7e-2)

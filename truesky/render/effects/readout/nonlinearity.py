@@ -15,7 +15,7 @@ import numpy as np
 from lake_schema.arrays import Float
 from lake_schema.errors import OutOfRange
 from truesky.numerics.compiling import jit
-from truesky.render.effects.effect import Effect, by_pixel
+from truesky.render.effects.effect import Effect, map_pixels
 from truesky.render.effects.scene import Frame, Scene
 from truesky.render.effects.series import SMALL, small_expm1
 
@@ -34,8 +34,8 @@ def apply(
     high : a, what is missing at `saturation` e-;  low : b, what is missing of the first electrons;  knee : n0, e-
     rng  : not used
     """
-    _check(high, saturation, low, knee)
-    return by_pixel(_respond, frame, high / saturation, low * knee, 1.0 / knee)
+    _check_parameters(high, saturation, low, knee)
+    return map_pixels(_respond, frame, high / saturation, low * knee, 1.0 / knee)
 
 
 @jit
@@ -51,52 +51,52 @@ def _respond(light: Any, signal: Any, high: float, low: float, inverse: float) -
             signal[i] = response + low * np.expm1(-response * inverse)
 
 
-def linearised(measured: Frame, high: Number, saturation: Number, low: Number, knee: Number) -> Frame:
+def linearise(measured: Frame, high: Number, saturation: Number, low: Number, knee: Number) -> Frame:
     """The electrons that `apply` made into `measured`; beyond what it can give: infinite.
 
     measured : e-;  high, saturation, low, knee : as of `apply`
     """
-    _check(high, saturation, low, knee)
+    _check_parameters(high, saturation, low, knee)
     high, saturation, low, knee = (
         np.reshape(n, (-1, *[1] * (measured.ndim - 1))) if np.ndim(n) else n for n in (high, saturation, low, knee)
     )
     light = np.maximum(measured, 0.0)
     response = light / (1.0 - low * np.exp(-light / knee))
     for _ in range(_ITERATIONS):
-        wrong = response + low * knee * np.expm1(-response / knee) - light
-        response = np.maximum(response - wrong / (1.0 - low * np.exp(-response / knee)), 0.0)
-    left = 1.0 - high / saturation * response
+        residual = response + low * knee * np.expm1(-response / knee) - light
+        response = np.maximum(response - residual / (1.0 - low * np.exp(-response / knee)), 0.0)
+    remaining = 1.0 - high / saturation * response
     with np.errstate(divide="ignore"):
-        out = np.where(left > 0.0, response / np.maximum(left, 0.0), np.inf)
+        out = np.where(remaining > 0.0, response / np.maximum(remaining, 0.0), np.inf)
     return np.asarray(out + np.minimum(measured, 0.0))
 
 
-def _check(high: Number, saturation: Number, low: Number, knee: Number) -> None:
-    for name, value, least, most in (
+def _check_parameters(high: Number, saturation: Number, low: Number, knee: Number) -> None:
+    for name, value, lowest, highest in (
         ("non-linearity at saturation", high, 0.0, 10.0),
         ("amplifier saturation", saturation, 1.0, 1e9),
         ("non-linearity of low signals", low, 0.0, 0.99),
         ("non-linearity knee", knee, 1e-3, 1e9),
     ):
-        if not (np.min(value) >= least and np.max(value) <= most):
-            raise OutOfRange(name, value, least, most)
+        if not (np.min(value) >= lowest and np.max(value) <= highest):
+            raise OutOfRange(name, value, lowest, highest)
 
 
 def parameters(scene: Scene) -> tuple[Number, Number, Number, Number]:
     """high, saturation, low, knee: the converter's range is the amplifier's."""
-    saturation = scene.of_amplifiers("adc_max", "adu") * scene.of_amplifiers("gain", "electron / adu")
+    saturation = scene.amplifier_values("adc_max", "adu") * scene.amplifier_values("gain", "electron / adu")
     return (
-        scene.of_amplifiers("nonlinearity.high", ""),
+        scene.amplifier_values("nonlinearity.high", ""),
         saturation,
-        scene.of_amplifiers("nonlinearity.low", ""),
-        scene.of_amplifiers("nonlinearity.low_scale", "electron"),
+        scene.amplifier_values("nonlinearity.low", ""),
+        scene.amplifier_values("nonlinearity.low_scale", "electron"),
     )
 
 
 def _contribution(scene: Scene) -> float:
-    there = min(scene.brightest_electrons, scene.value("full_well", "electron") + scene.sky_electrons)
+    brightest = min(scene.brightest_electrons, scene.value("full_well", "electron") + scene.sky_electrons)
     curve = parameters(scene)
-    light = np.full(max(np.size(number) for number in curve), there)
+    light = np.full(max(np.size(number) for number in curve), brightest)
     return float(np.max(light - apply(light, *curve)))
 
 

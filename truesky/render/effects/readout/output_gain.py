@@ -23,8 +23,8 @@ def apply(frame: Frame, spread: float, rng: np.random.Generator) -> Frame:
     """
     if not 0.0 <= spread <= 1.0:
         raise OutOfRange("spread of the outputs' gains", spread, 0.0, 1.0)
-    own = 1.0 + spread * (rng.random(ramp_noise.OUTPUTS) - 0.5)
-    columns = np.repeat(own, np.diff(ramp_noise.edges(frame.shape[-1])))
+    gains = 1.0 + spread * (rng.random(ramp_noise.OUTPUTS) - 0.5)
+    columns = np.repeat(gains, np.diff(ramp_noise.edges(frame.shape[-1])))
     return np.asarray(frame * columns.astype(frame.dtype))
 
 

@@ -35,35 +35,45 @@ Number = TypeVar("Number", bound=np.generic)
 
 
 def apply(
-    frame: Frame, prescan: int, overscan: int, rows: int, middle: int = 0, rng: np.random.Generator | None = None
+    frame: Frame,
+    prescan: int,
+    overscan: int,
+    rows: int,
+    injection_rows: int = 0,
+    rng: np.random.Generator | None = None,
 ) -> Frame:
     """frame [ny, nx] e- -> quadrants [4, (ny - middle) / 2 + rows, prescan + nx / 2 + overscan] e-.
 
     prescan, overscan, rows : columns before and after the pixels, and rows after them;  rng : not used
     middle                  : rows between the halves, which have no pixels
     """
-    for name, value in (("prescan", prescan), ("overscan", overscan), ("overscan rows", rows), ("middle rows", middle)):
+    for name, value in (
+        ("prescan", prescan),
+        ("overscan", overscan),
+        ("overscan rows", rows),
+        ("middle rows", injection_rows),
+    ):
         if not 0 <= value <= 4096:
             raise OutOfRange(name, value, 0, 4096)
     ny, nx = frame.shape
-    if ny % 2 or nx % 2 or middle % 2 or middle > ny:
+    if ny % 2 or nx % 2 or injection_rows % 2 or injection_rows > ny:
         raise BadInput(f"a detector of {ny} x {nx} pixels has no quadrants: its sides must be even")
-    half_y, half_x = (ny - middle) // 2, nx // 2
+    half_y, half_x = (ny - injection_rows) // 2, nx // 2
     out = np.zeros((4, half_y + rows, prescan + half_x + overscan), frame.dtype)
     for number in range(4):
-        y, x = (half_y + middle) * _UPPER[number], half_x * _RIGHT[number]
+        y, x = (half_y + injection_rows) * _UPPER[number], half_x * _RIGHT[number]
         part = frame[y : y + half_y, x : x + half_x]
-        out[number, :half_y, prescan : prescan + half_x] = placed(part, number)
+        out[number, :half_y, prescan : prescan + half_x] = to_detector_axes(part, number)
     return out
 
 
-def placed(quadrant: npt.NDArray[Number], number: int) -> npt.NDArray[Number]:
+def to_detector_axes(quadrant: npt.NDArray[Number], number: int) -> npt.NDArray[Number]:
     """A quadrant [ny, nx] in readout order -> in the detector's own axes; applied twice it is itself."""
     return quadrant[:: -1 if _UPPER[number] else 1, :: -1 if _RIGHT[number] else 1]
 
 
-def origin(
-    number: int, shape: tuple[int, ...], prescan: int, overscan: int, rows: int, middle: int = 0
+def pixel_offset(
+    number: int, shape: tuple[int, ...], prescan: int, overscan: int, rows: int, injection_rows: int = 0
 ) -> tuple[int, int]:
     """What is added to a detector's (column, row) to find it in a quadrant [ny, nx] as it is `placed`.
 
@@ -72,10 +82,12 @@ def origin(
     """
     ny, nx = shape
     across = overscan - (nx - prescan - overscan) if _RIGHT[number] else prescan
-    return across, rows - (ny - rows) - middle if _UPPER[number] else 0
+    return across, rows - (ny - rows) - injection_rows if _UPPER[number] else 0
 
 
-def sections(number: int, shape: tuple[int, ...], prescan: int, overscan: int, rows: int, middle: int = 0) -> Sections:
+def sections(
+    number: int, shape: tuple[int, ...], prescan: int, overscan: int, rows: int, injection_rows: int = 0
+) -> Sections:
     """Of a quadrant [ny, nx] as it is `placed`: the bias from the last half of its overscan.
 
     Charge that traps gave back is in the first half.
@@ -83,42 +95,44 @@ def sections(number: int, shape: tuple[int, ...], prescan: int, overscan: int, r
     number : of the quadrant;  shape : ny, nx of it
     prescan, overscan, rows, middle : as of `apply`
     """
-    (ny, nx), (across, up) = shape, origin(number, shape, prescan, overscan, rows, middle)
+    (ny, nx), (across, up) = shape, pixel_offset(number, shape, prescan, overscan, rows, injection_rows)
     x, y = overscan if _RIGHT[number] else prescan, rows if _UPPER[number] else 0
     data = Section(x, y, nx - prescan - overscan, ny - rows)
-    behind = max(overscan // 2, 1)
-    bias = Section(0 if _RIGHT[number] else nx - behind, 0, behind, ny) if overscan else None
+    bias_columns = max(overscan // 2, 1)
+    bias = Section(0 if _RIGHT[number] else nx - bias_columns, 0, bias_columns, ny) if overscan else None
     return Sections(data, Section(x - across, y - up, data.nx, data.ny), bias)
 
 
-def assembled(
-    quadrants: npt.NDArray[Number], prescan: int, overscan: int, rows: int, middle: int = 0
+def assemble(
+    quadrants: npt.NDArray[Number], prescan: int, overscan: int, rows: int, injection_rows: int = 0
 ) -> npt.NDArray[Number]:
     """Quadrants [4, ..] in readout order -> detector [ny, nx], pre- and overscan cut off, 0 in the rows between.
 
     quadrants                       : of `apply`
     prescan, overscan, rows, middle : as of `apply`
     """
-    pixels = [placed(q[: q.shape[0] - rows, prescan : q.shape[1] - overscan], i) for i, q in enumerate(quadrants)]
+    pixels = [
+        to_detector_axes(q[: q.shape[0] - rows, prescan : q.shape[1] - overscan], i) for i, q in enumerate(quadrants)
+    ]
     e, f, g, h = pixels
-    between = np.zeros((middle, h.shape[1] + g.shape[1]), quadrants.dtype)
-    return np.concatenate([np.hstack([h, g]), between, np.hstack([e, f])])
+    middle_block = np.zeros((injection_rows, h.shape[1] + g.shape[1]), quadrants.dtype)
+    return np.concatenate([np.hstack([h, g]), middle_block, np.hstack([e, f])])
 
 
-def sizes(scene: Scene) -> tuple[int, int, int, int]:
+def overscan_sizes(scene: Scene) -> tuple[int, int, int, int]:
     """prescan, overscan, overscan rows, rows between the halves."""
     prescan, overscan, rows = (
         int(scene.value(f"fpa.{key}", "pix")) for key in ("prescan", "overscan", "parallel_overscan")
     )
-    return prescan, overscan, rows, scene.middle
+    return prescan, overscan, rows, scene.injection_rows
 
 
-def apply_amplifiers(frame: Frame, own: Layout, rng: np.random.Generator | None = None) -> Frame:
+def apply_amplifiers(frame: Frame, layout: Layout, rng: np.random.Generator | None = None) -> Frame:
     """frame [ny, nx] e- -> [q, rows, columns] e- in readout order, with pre- and overscan; what is not read is lost.
 
     own : the detector's amplifiers;  rng : not used
     """
-    return own.apart(frame)
+    return layout.split(frame)
 
 
 def _layout(scene: Scene) -> tuple[Layout]:
@@ -127,5 +141,5 @@ def _layout(scene: Scene) -> tuple[Layout]:
     return (scene.layout,)
 
 
-EFFECT = Effect("quadrants", apply, sizes, lambda scene: 0.0, optional=False, cost=3e-3)
+EFFECT = Effect("quadrants", apply, overscan_sizes, lambda scene: 0.0, optional=False, cost=3e-3)
 AMPLIFIERS = Effect("amplifiers", apply_amplifiers, _layout, lambda scene: 0.0, optional=False, cost=3e-3)

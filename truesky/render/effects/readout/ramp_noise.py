@@ -25,12 +25,12 @@ from lake_schema.arrays import Int
 from lake_schema.errors import OutOfRange
 from truesky.numerics.compiling import jit
 from truesky.render.effects import pixel_random
-from truesky.render.effects.effect import Effect, nothing
+from truesky.render.effects.effect import Effect, zero_contribution
 from truesky.render.effects.scene import Frame, Scene
 
 OUTPUTS = 32
 # Rows in which reference pixels follow a drift (assumed): what is slower was subtracted.
-_FOLLOWED = 64
+_REFERENCE_ROWS = 64
 
 
 def edges(columns: int) -> Int:
@@ -46,14 +46,14 @@ def apply(frame: Frame, sigma: float, reads: int, rng: np.random.Generator) -> F
     if not 0.0 <= sigma < 1e5:
         raise OutOfRange("read noise", sigma, 0.0, 1e5)
     out = np.empty_like(frame)
-    _add(frame.reshape(-1), out.reshape(-1), sigma / np.sqrt(reads), pixel_random.key(rng))
+    _add(frame.reshape(-1), out.reshape(-1), sigma / np.sqrt(reads), pixel_random.draw_key(rng))
     return out
 
 
 @jit
 def _add(frame: Any, out: Any, sigma: float, key: Any) -> None:
     for i in range(len(frame)):
-        out[i] = frame[i] + sigma * pixel_random.normal(pixel_random.word(key, i))
+        out[i] = frame[i] + sigma * pixel_random.normal(pixel_random.pixel_bits(key, i))
 
 
 def apply_drift(frame: Frame, width: float, rng: np.random.Generator) -> Frame:
@@ -68,15 +68,15 @@ def apply_drift(frame: Frame, width: float, rng: np.random.Generator) -> Frame:
     groups, ny, nx = frame.shape
     drift = np.empty((ny, nx), np.float32)
     for first, last in pairwise(edges(nx).tolist()):
-        drift[:, first:last] = _one_over_f(ny * (last - first), rng, max(ny // _FOLLOWED, 1)).reshape(ny, -1)
+        drift[:, first:last] = _one_over_f(ny * (last - first), rng, max(ny // _REFERENCE_ROWS, 1)).reshape(ny, -1)
     out = np.empty_like(frame)
     for group, read, step in zip(frame, out, (np.arange(groups) / (groups - 1.0)).tolist(), strict=True):
-        _shift(np.ascontiguousarray(group).reshape(-1), drift.reshape(-1), step * width, read.reshape(-1))
+        _add_drift(np.ascontiguousarray(group).reshape(-1), drift.reshape(-1), step * width, read.reshape(-1))
     return out
 
 
 @jit
-def _shift(group: Any, drift: Any, width: float, out: Any) -> None:
+def _add_drift(group: Any, drift: Any, width: float, out: Any) -> None:
     for i in range(len(group)):
         out[i] = group[i] + width * drift[i]
 
@@ -87,14 +87,14 @@ def apply_reset(frame: Frame, sigma: float, rng: np.random.Generator) -> Frame:
         raise OutOfRange("reset noise", sigma, 0.0, 1e6)
     out = np.empty_like(frame)
     groups = np.ascontiguousarray(frame).reshape(len(frame), -1)
-    _lift(groups, out.reshape(len(frame), -1), sigma, pixel_random.key(rng))
+    _add_levels(groups, out.reshape(len(frame), -1), sigma, pixel_random.draw_key(rng))
     return out
 
 
 @jit
-def _lift(groups: Any, out: Any, sigma: float, key: Any) -> None:
+def _add_levels(groups: Any, out: Any, sigma: float, key: Any) -> None:
     for p in range(groups.shape[1]):
-        level = sigma * pixel_random.normal(pixel_random.word(key, p))
+        level = sigma * pixel_random.normal(pixel_random.pixel_bits(key, p))
         for i in range(len(groups)):
             out[i, p] = groups[i, p] + level
 
@@ -116,7 +116,7 @@ def _one_over_f(count: int, rng: np.random.Generator, slowest: int = 1) -> Frame
     return np.asarray(scipy.fft.irfft(spectrum, size, norm="forward")[:count])
 
 
-def _reads(scene: Scene) -> tuple[float, int]:
+def _read_parameters(scene: Scene) -> tuple[float, int]:
     return scene.value("read_noise", "electron"), int(scene.value(f"macc.{scene.ramp}.reads", ""))
 
 
@@ -128,12 +128,14 @@ def _reset(scene: Scene) -> float:
     return scene.value("reset_noise", "adu") * scene.value("gain", "electron / adu")
 
 
-def _of_reads(scene: Scene) -> float:
+def _difference_noise(scene: Scene) -> float:
     """Of the difference of two groups."""
-    sigma, reads = _reads(scene)
+    sigma, reads = _read_parameters(scene)
     return sigma * float(np.sqrt(2.0 / reads))
 
 
-EFFECT = Effect("group_noise", apply, _reads, _of_reads, cost=1.7e-2, repeated=nothing)
-DRIFT = Effect("drift", apply_drift, lambda scene: (_drift(scene),), _drift, cost=3.2e-2, repeated=nothing)
-RESET = Effect("reset_level", apply_reset, lambda scene: (_reset(scene),), _reset, cost=1e-2, repeated=nothing)
+EFFECT = Effect("group_noise", apply, _read_parameters, _difference_noise, cost=1.7e-2, systematic=zero_contribution)
+DRIFT = Effect("drift", apply_drift, lambda scene: (_drift(scene),), _drift, cost=3.2e-2, systematic=zero_contribution)
+RESET = Effect(
+    "reset_level", apply_reset, lambda scene: (_reset(scene),), _reset, cost=1e-2, systematic=zero_contribution
+)

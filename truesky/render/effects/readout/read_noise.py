@@ -10,7 +10,7 @@ from lake_schema.arrays import Float
 from lake_schema.errors import OutOfRange
 from truesky.numerics.compiling import jit
 from truesky.render.effects import pixel_random
-from truesky.render.effects.effect import Effect, by_pixel, nothing
+from truesky.render.effects.effect import Effect, map_pixels, zero_contribution
 from truesky.render.effects.scene import Frame, Scene
 
 
@@ -20,17 +20,17 @@ def apply(frame: Frame, sigma: float | Float, rng: np.random.Generator) -> Frame
         raise OutOfRange("read noise", sigma, 0.0, np.inf)
     # The number of an amplifier's first pixel in the frame.
     first = np.arange(len(frame)) * frame[0].size if np.ndim(sigma) else 0
-    return by_pixel(_add, frame, sigma, pixel_random.key(rng), first)
+    return map_pixels(_add, frame, sigma, pixel_random.draw_key(rng), first)
 
 
 @jit
 def _add(frame: Any, out: Any, sigma: float, key: Any, first: int) -> None:
     for i in range(len(frame)):
-        out[i] = frame[i] + sigma * pixel_random.normal(pixel_random.word(key, first + i))
+        out[i] = frame[i] + sigma * pixel_random.normal(pixel_random.pixel_bits(key, first + i))
 
 
 def _sigma(scene: Scene) -> float | Float:
-    return scene.of_amplifiers("read_noise", "electron")
+    return scene.amplifier_values("read_noise", "electron")
 
 
 EFFECT = Effect(
@@ -39,5 +39,5 @@ EFFECT = Effect(
     lambda scene: (_sigma(scene),),
     lambda scene: float(np.max(_sigma(scene))),
     cost=9e-3,
-    repeated=nothing,
+    systematic=zero_contribution,
 )

@@ -39,33 +39,33 @@ def apply(
         raise OutOfRange("halves of a column", halves, 1, 2)
     light = np.ascontiguousarray(frame, dtype=float)
     if response is None or rng is None or share == 0.0:
-        own = np.ones(light.shape)
+        sensitivity = np.ones(light.shape)
     else:
-        own = pixel_response.response(light.shape, *response, rng)
+        sensitivity = pixel_response.response(light.shape, *response, rng)
     out = np.empty(light.shape)
     middle = (len(out) + 1) // 2 if halves == 2 else len(out)
-    _pass(light[:middle], own[:middle], share, out[:middle])
-    _pass(light[middle:][::-1], own[middle:][::-1], share, out[middle:][::-1])
+    _add_trail(light[:middle], sensitivity[:middle], share, out[:middle])
+    _add_trail(light[middle:][::-1], sensitivity[middle:][::-1], share, out[middle:][::-1])
     return out
 
 
 @jit
-def _pass(light: Any, own: Any, share: float, out: Any) -> None:
+def _add_trail(light: Any, sensitivity: Any, share: float, out: Any) -> None:
     """Fills `out`: a row passes over those that are read before it, the first of all is row 0."""
-    before = np.zeros(light.shape[1])
+    collected = np.zeros(light.shape[1])
     for r in range(len(light)):
         for c in range(light.shape[1]):
             out[r, c] = light[r, c]
-            if own[r, c] > 0.0:
-                out[r, c] += share * before[c] / own[r, c]
-                before[c] += light[r, c] * own[r, c]
+            if sensitivity[r, c] > 0.0:
+                out[r, c] += share * collected[c] / sensitivity[r, c]
+                collected[c] += light[r, c] * sensitivity[r, c]
 
 
 def _parameters(scene: Scene) -> tuple[float, int, pixel_response.Parameters | None]:
     # A row takes as long whatever part of a detector is looked at.
     rows = scene.value("fpa.ny", "pix") / 2 + scene.value("fpa.parallel_overscan", "pix")
     share = scene.value("readout_time", "s") / rows / max(scene.exposure_time_s, 1e-3)
-    return share, 2, pixel_response.parameters(scene) if pixel_response.EFFECT.applied(scene) else None
+    return share, 2, pixel_response.parameters(scene) if pixel_response.EFFECT.is_applied(scene) else None
 
 
 def _contribution(scene: Scene) -> float:
@@ -79,6 +79,6 @@ EFFECT = Effect(
     _parameters,
     _contribution,
     fixed=True,
-    numbers=pixel_response.EFFECT.name,
+    random_stream=pixel_response.EFFECT.name,
     cost=1.3e-2,
 )

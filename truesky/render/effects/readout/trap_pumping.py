@@ -37,7 +37,7 @@ from truesky.render.effects.scene import Frame, Scene
 # Phases of a cycle: over four electrodes, one pair after the other, to the next pixel's and back.
 _PHASES = 6
 # Traps that are drawn at a time.
-_SOME = 1 << 19
+_CHUNK_SIZE = 1 << 19
 # Of a pixel's number in the truth map: traps of a species, those of the next one above.
 _PER_SPECIES = 256
 
@@ -59,7 +59,7 @@ class Pumping:
 
 
 def apply(
-    frame: Frame, lattice: Traps, pumping: Pumping, runs: Sequence[tuple[int, int, bool]], rng: np.random.Generator
+    frame: Frame, silicon: Traps, pumping: Pumping, segments: Sequence[tuple[int, int, bool]], rng: np.random.Generator
 ) -> Frame:
     """frame [ny, nx] e- >= 0 -> the same charge, whole electrons of it moved to the next row or the one before.
 
@@ -67,35 +67,35 @@ def apply(
     runs    : pieces of the columns, between which no charge is moved: first row, the one past the last, whatever else
     rng     : random numbers of the traps' places
     """
-    for name, value, most in (
+    for name, value, highest in (
         ("shuffles", pumping.shuffles, 1e9), ("pumping efficiency", pumping.efficiency, 1.0),
         ("capture", pumping.capture, 1.0),
     ):  # fmt: skip
-        if not 0.0 <= value <= most:
-            raise OutOfRange(name, value, 0.0, most)
-    before = np.asarray(frame, dtype=float)
+        if not 0.0 <= value <= highest:
+            raise OutOfRange(name, value, 0.0, highest)
+    charge = np.asarray(frame, dtype=float)
     # For each row where a packet may not go: from the last of a piece up, from the first down.
-    up, down = np.zeros((2, len(before)), bool)
-    for first, end, _ in runs:
+    up, down = np.zeros((2, len(charge)), bool)
+    for first, end, _ in segments:
         up[first : end - 1], down[first + 1 : end] = True, True
-    flows = np.zeros((2, *before.shape))
-    electrons = np.array([moved(tau, pumping) for tau in lattice.release])
-    for some in _drawn(before.shape, lattice.density, rng):
-        for flow, free, pumped in ((flows[0], up, some.upward(pumping)), (flows[1], down, some.downward(pumping))):
-            kept = np.flatnonzero(pumped & free[some.row])
-            kept = kept[some.height[kept] < lattice.volume(before[some.row[kept], some.column[kept]])]
-            np.add.at(flow, (some.row[kept], some.column[kept]), electrons[some.species[kept]])
-    both = np.rint(flows)
-    given = both.sum(axis=0)
-    short = given > before
-    both[:, short] = np.floor(both[:, short] * (before[short] / given[short]))
-    out = before - both.sum(axis=0)
-    out[1:] += both[0, :-1]
-    out[:-1] += both[1, 1:]
+    flows = np.zeros((2, *charge.shape))
+    electrons = np.array([moved_electrons(tau, pumping) for tau in silicon.release])
+    for traps in _draw_traps(charge.shape, silicon.density, rng):
+        for flow, free, pumped in ((flows[0], up, traps.upward(pumping)), (flows[1], down, traps.downward(pumping))):
+            indices = np.flatnonzero(pumped & free[traps.row])
+            indices = indices[traps.height[indices] < silicon.volume(charge[traps.row[indices], traps.column[indices]])]
+            np.add.at(flow, (traps.row[indices], traps.column[indices]), electrons[traps.species[indices]])
+    whole_flows = np.rint(flows)
+    outflow = whole_flows.sum(axis=0)
+    short = outflow > charge
+    whole_flows[:, short] = np.floor(whole_flows[:, short] * (charge[short] / outflow[short]))
+    out = charge - whole_flows.sum(axis=0)
+    out[1:] += whole_flows[0, :-1]
+    out[:-1] += whole_flows[1, 1:]
     return np.asarray(out)
 
 
-def moved(tau: float, pumping: Pumping) -> float:
+def moved_electrons(tau: float, pumping: Pumping) -> float:
     """Electrons that a trap moves; tau : its release time, in transfers."""
     x = pumping.phase / (tau * pumping.dwell)
     # exp(-x) - exp(-2 x) without the difference of almost equal numbers.
@@ -103,7 +103,7 @@ def moved(tau: float, pumping: Pumping) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class _Some:
+class _TrapChunk:
     """Traps [n]: number of the species, place, height in parts of the volume, and where between the electrodes."""
 
     species: Int
@@ -121,16 +121,16 @@ class _Some:
         return np.asarray(self.electrode > 1.0 - 0.5 * pumping.efficiency)
 
 
-def _drawn(shape: tuple[int, ...], density: Sequence[float], rng: np.random.Generator) -> Iterator[_Some]:
+def _draw_traps(shape: tuple[int, ...], density: Sequence[float], rng: np.random.Generator) -> Iterator[_TrapChunk]:
     """The traps of a detector, some at a time, in the order in which they came to be."""
     (ny, nx), total = shape, float(sum(density))
     shares = np.cumsum(density) / total if total > 0.0 else np.ones(len(density))
-    left = int(stats.poisson.ppf(rng.random(), total * ny * nx)) if total > 0.0 and ny * nx > 0 else 0
-    while left > 0:
-        which, y, x, height, electrode = rng.random((min(left, _SOME), 5)).T
-        species = np.minimum(np.searchsorted(shares, which, side="right"), len(density) - 1)
-        yield _Some(species, (y * ny).astype(np.int64), (x * nx).astype(np.int64), height, electrode)
-        left -= _SOME
+    remaining = int(stats.poisson.ppf(rng.random(), total * ny * nx)) if total > 0.0 and ny * nx > 0 else 0
+    while remaining > 0:
+        rank, y, x, height, electrode = rng.random((min(remaining, _CHUNK_SIZE), 5)).T
+        species = np.minimum(np.searchsorted(shares, rank, side="right"), len(density) - 1)
+        yield _TrapChunk(species, (y * ny).astype(np.int64), (x * nx).astype(np.int64), height, electrode)
+        remaining -= _CHUNK_SIZE
 
 
 def trap_map(scene: Scene, rng: np.random.Generator) -> Int32:
@@ -138,10 +138,10 @@ def trap_map(scene: Scene, rng: np.random.Generator) -> Int32:
 
     scene : of the exposure;  rng : the numbers that EFFECT has
     """
-    lattice = charge_transfer.lattice(scene, "parallel")
+    silicon = charge_transfer.silicon_traps(scene, "parallel")
     out = np.zeros((scene.ny, scene.nx), np.int32)
-    for some in _drawn(out.shape, lattice.density, rng):
-        np.add.at(out, (some.row, some.column), (_PER_SPECIES**some.species).astype(np.int32))
+    for traps in _draw_traps(out.shape, silicon.density, rng):
+        np.add.at(out, (traps.row, traps.column), (_PER_SPECIES**traps.species).astype(np.int32))
     return out
 
 
@@ -158,13 +158,15 @@ def _parameters(scene: Scene) -> tuple[Traps, Pumping, tuple[tuple[int, int, boo
         int(scene.value("pumping.shuffles", "")), scene.value("pumping.phase_time", "s"),
         scene.value("pumping.efficiency", ""), scene.value("pumping.capture", ""), scene.value("cti.dwell_time", "s"),
     )  # fmt: skip
-    return charge_transfer.lattice(scene, "parallel"), pumping, scene.runs
+    return charge_transfer.silicon_traps(scene, "parallel"), pumping, scene.column_segments
 
 
 def _contribution(scene: Scene) -> float:
-    lattice, pumping, _ = _parameters(scene)
-    some = [moved(tau, pumping) for rho, tau in zip(lattice.density, lattice.release, strict=True) if rho > 0.0]
-    return max(some, default=0.0) if pumping.efficiency > 0.0 else 0.0
+    silicon, pumping, _ = _parameters(scene)
+    electrons = [
+        moved_electrons(tau, pumping) for rho, tau in zip(silicon.density, silicon.release, strict=True) if rho > 0.0
+    ]
+    return max(electrons, default=0.0) if pumping.efficiency > 0.0 else 0.0
 
 
 EFFECT = Effect("trap_pumping", apply, _parameters, _contribution, fixed=True, cost=1.5e-2)

@@ -44,7 +44,7 @@ _BLOCK = 64
 # Species are followed together, in one register; those that are missing have no traps.
 _SPECIES = 3
 # Of a packet, what it may be wrong by where the height of its cloud is told: 0.6 of it in V.
-_SMALL = 1e-4
+_MAX_GAIN = 1e-4
 # V(n) is tabulated: 2^6 linear segments of an octave of n, and octaves below the full well.
 _SEGMENT_BITS, _OCTAVES = 6, 60
 
@@ -100,8 +100,8 @@ class Sweeps:
     levels: int = 0
 
     def __post_init__(self) -> None:
-        if self.levels and not trap_levels.FEWEST <= self.levels <= 1000:
-            raise OutOfRange("levels of traps", self.levels, trap_levels.FEWEST, 1000)
+        if self.levels and not trap_levels.MIN_LEVELS <= self.levels <= 1000:
+            raise OutOfRange("levels of traps", self.levels, trap_levels.MIN_LEVELS, 1000)
         if self.levels and (self.steps, self.order) != (1, 1):
             raise BadInput(f"{self.levels} levels of traps take one sweep of one step")
         if not 1 <= self.steps <= 10_000:
@@ -110,7 +110,9 @@ class Sweeps:
             raise OutOfRange("sweeps a step", self.order, 1, 2)
 
 
-def shifted(frame: Float, traps: Traps, sweeps: Sweeps, axis: int, pixels: int | None = None) -> tuple[Float, float]:
+def shift_charge(
+    frame: Float, traps: Traps, sweeps: Sweeps, axis: int, pixels: int | None = None
+) -> tuple[Float, float]:
     """Read out lines of packets over traps.
 
     frame  : float64[.., ny, nx] electrons >= 0; the output lies at index 0 of `axis` (-2: rows, -1: columns)
@@ -130,30 +132,30 @@ def shifted(frame: Float, traps: Traps, sweeps: Sweeps, axis: int, pixels: int |
     missing = _SPECIES - len(traps.density)
     density, release = np.array(traps.density + (0.0,) * missing), np.array(traps.release + (1.0,) * missing)
     # What a species' traps in a pixel that were filled so many transfers ago still hold.
-    left = density * np.exp(-np.arange(n + 1)[:, None] / release)
+    occupancy = density * np.exp(-np.arange(n + 1)[:, None] / release)
     # 1 - exp(-1 / tau) without the difference of almost equal numbers.
     released = -np.expm1(-1.0 / release)
     edges = np.rint(np.linspace(physical, 0, min(sweeps.steps, max(physical, 1)) + 1)).astype(np.int64)
-    volumes = _volumes(traps)
-    ends = trap_levels.heights(out, traps.notch, sweeps.levels) if sweeps.levels else None
+    volumes = _volume_table(traps)
+    ends = trap_levels.level_ends(out, traps.notch, sweeps.levels) if sweeps.levels else None
     trapped = 0.0
     for plane in out.reshape(-1, *out.shape[-2:]):
         if ends is not None:
             trapped += trap_levels.shift(plane, axis, physical, density, released, ends, traps.volume(ends))
         elif axis == -1:
-            trapped += _shift(plane, density, left, released, *volumes, edges, sweeps.order)
+            trapped += _shift_lines(plane, density, occupancy, released, *volumes, edges, sweeps.order)
         else:
             # Some columns at a time: their packets lie far apart in memory.
             lines = np.empty((_BLOCK, n))
             for start in range(0, plane.shape[1], _BLOCK):
-                some = lines[: plane.shape[1] - start]
-                some[:] = plane[:, start : start + _BLOCK].T
-                trapped += _shift(some, density, left, released, *volumes, edges, sweeps.order)
-                plane[:, start : start + _BLOCK] = some.T
+                block = lines[: plane.shape[1] - start]
+                block[:] = plane[:, start : start + _BLOCK].T
+                trapped += _shift_lines(block, density, occupancy, released, *volumes, edges, sweeps.order)
+                plane[:, start : start + _BLOCK] = block.T
     return out, trapped
 
 
-def _volumes(traps: Traps) -> tuple[Float, float, float]:
+def _volume_table(traps: Traps) -> tuple[Float, float, float]:
     """V at the ends of the segments of (n - notch) / (full_well - notch), from 2^-_OCTAVES to 1; notch; 1 / range."""
     octave = np.arange(_OCTAVES)[:, None] - _OCTAVES
     part = np.ldexp(1.0 + np.arange(1 << _SEGMENT_BITS) / (1 << _SEGMENT_BITS), octave).ravel()
@@ -162,15 +164,22 @@ def _volumes(traps: Traps) -> tuple[Float, float, float]:
 
 
 @jit
-def _shift(
-    lines: Any, density: Float, left: Float, released: Float, volumes: Float, notch: float, scale: float, edges: Any,
+def _shift_lines(
+    lines: Any,
+    density: Float,
+    occupancy: Float,
+    released: Float,
+    volumes: Float,
+    notch: float,
+    scale: float,
+    edges: Any,
     order: int,
-) -> float:  # fmt: skip
+) -> float:
     """Every line lines[k, :], in place; returns what is still trapped."""
     n = lines.shape[1]
     first, second = np.empty(n), np.empty(n)
-    seen, inverse, reached, part = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-    height, full, since = np.empty(n + 2), np.empty(n + 2), np.empty(n + 2, np.int64)
+    counts, inverse, reached, part = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    height, full, filled_at = np.empty(n + 2), np.empty(n + 2), np.empty(n + 2, np.int64)
     trapped = 0.0
     for line in lines:
         if line.max() <= notch:
@@ -178,18 +187,50 @@ def _shift(
         for e in range(len(edges) - 1):
             high, low = edges[e], edges[e + 1]
             for i in range(low, n):
-                seen[i] = min(min(i, edges[0] - 1) + 1, high) - low
-                inverse[i] = 1.0 / max(seen[i], 1.0)
-            _reach(line, volumes, notch, scale, part, part.view(np.int64), reached)
-            held_back = _sweep(line, first, low, seen, inverse, reached, density, left, released, volumes, notch, scale,
-                               height, full, since, part)  # fmt: skip
+                counts[i] = min(min(i, edges[0] - 1) + 1, high) - low
+                inverse[i] = 1.0 / max(counts[i], 1.0)
+            _volumes_of_line(line, volumes, notch, scale, part, part.view(np.int64), reached)
+            held_back = _sweep(
+                line,
+                first,
+                low,
+                counts,
+                inverse,
+                reached,
+                density,
+                occupancy,
+                released,
+                volumes,
+                notch,
+                scale,
+                height,
+                full,
+                filled_at,
+                part,
+            )
             for i in range(n):
                 first[i] += line[i]
             if order == 2:
-                _reach(first, volumes, notch, scale, part, part.view(np.int64), reached)
-                again = _sweep(first, second, low, seen, inverse, reached, density, left, released, volumes, notch,
-                               scale, height, full, since, part)  # fmt: skip
-                held_back = 0.5 * (held_back + again)
+                _volumes_of_line(first, volumes, notch, scale, part, part.view(np.int64), reached)
+                second_held = _sweep(
+                    first,
+                    second,
+                    low,
+                    counts,
+                    inverse,
+                    reached,
+                    density,
+                    occupancy,
+                    released,
+                    volumes,
+                    notch,
+                    scale,
+                    height,
+                    full,
+                    filled_at,
+                    part,
+                )
+                held_back = 0.5 * (held_back + second_held)
                 for i in range(n):
                     line[i] = 0.5 * (line[i] + first[i] + second[i])
             else:
@@ -200,9 +241,23 @@ def _shift(
 
 @jit
 def _sweep(
-    line: Any, change: Any, low: int, seen: Float, inverse: Float, reached: Float, density: Float, left: Float,
-    released: Float, volumes: Float, notch: float, scale: float, height: Float, full: Float, since: Any, part: Float,
-) -> float:  # fmt: skip
+    line: Any,
+    change: Any,
+    low: int,
+    counts: Float,
+    inverse: Float,
+    reached: Float,
+    density: Float,
+    occupancy: Float,
+    released: Float,
+    volumes: Float,
+    notch: float,
+    scale: float,
+    height: Float,
+    full: Float,
+    filled_at: Any,
+    part: Float,
+) -> float:
     """Fills `change` with what pixels from `low` on do to the packets; returns what they hold at the end.
 
     seen, inverse       : how many of them see each packet, and 1 over that
@@ -213,85 +268,97 @@ def _sweep(
     d0, d1, d2 = density[0], density[1], density[2]
     r0, r1, r2 = released[0], released[1], released[2]
     h0, h1, h2 = 0.0, 0.0, 0.0
-    total, held = d0 + d1 + d2, 0.0
+    total, held_charge = d0 + d1 + d2, 0.0
     # The lowest watermark in registers, too. Below all no pixel is full: that of a cloud that nothing reaches.
     th, tf, ti = np.inf, 0.0, 0
     depth = -1
     for i in range(min(low, len(line))):
         change[i] = 0.0
     for i in range(low, len(line)):
-        count, top = seen[i], reached[i]
+        count, top = counts[i], reached[i]
         h0, h1, h2 = h0 - h0 * r0, h1 - h1 * r1, h2 - h2 * r2
-        after = h0 + h1 + h2
-        gain = held - after
+        remaining = h0 + h1 + h2
+        gain = held_charge - remaining
         # What a pixel gives back makes a cloud hardly larger: where it does not, which watermarks a cloud reaches is
         # known before what the traps hold, and the processor need not wait for that.
-        if gain * inverse[i] > _SMALL * line[i]:
+        if gain * inverse[i] > _MAX_GAIN * line[i]:
             top = _volume(line[i] + gain * inverse[i], volumes, notch, scale, part, part.view(np.int64))
         if top <= 0.0:
-            change[i], held = gain, after
+            change[i], held_charge = gain, remaining
             continue
         e0, e1, e2, bottom = 0.0, 0.0, 0.0, 0.0
-        most = line[i] + gain
-        if top * count * total <= most:
+        available = line[i] + gain
+        if top * count * total <= available:
             if th > top:
                 emptied, age = top * tf, i - ti
-                e0, e1, e2 = _more(e0, e1, e2, emptied, left, age)
+                e0, e1, e2 = _add_occupied(e0, e1, e2, emptied, occupancy, age)
                 depth += 1
-                height[depth], full[depth], since[depth] = th, tf, ti
+                height[depth], full[depth], filled_at[depth] = th, tf, ti
             else:
                 emptied, age = th * tf, i - ti
-                e0, e1, e2 = _more(e0, e1, e2, emptied, left, age)
+                e0, e1, e2 = _add_occupied(e0, e1, e2, emptied, occupancy, age)
                 bottom = th
                 while height[depth] <= top:
-                    emptied, age = (height[depth] - bottom) * full[depth], i - since[depth]
-                    e0, e1, e2 = _more(e0, e1, e2, emptied, left, age)
+                    emptied, age = (height[depth] - bottom) * full[depth], i - filled_at[depth]
+                    e0, e1, e2 = _add_occupied(e0, e1, e2, emptied, occupancy, age)
                     bottom = height[depth]
                     depth -= 1
-                emptied, age = (top - bottom) * full[depth], i - since[depth]
-                e0, e1, e2 = _more(e0, e1, e2, emptied, left, age)
+                emptied, age = (top - bottom) * full[depth], i - filled_at[depth]
+                e0, e1, e2 = _add_occupied(e0, e1, e2, emptied, occupancy, age)
         else:
             # Never more than the packet has: the cloud then ends lower.
             depth += 1
-            height[depth], full[depth], since[depth] = th, tf, ti
-            top, depth, e0, e1, e2 = _short(most, top, count * total, i, depth, left, height, full, since)
+            height[depth], full[depth], filled_at[depth] = th, tf, ti
+            top, depth, e0, e1, e2 = _fill_partly(
+                available, top, count * total, i, depth, occupancy, height, full, filled_at
+            )
         if top <= 0.0:
-            th, tf, ti = height[depth], full[depth], since[depth]
+            th, tf, ti = height[depth], full[depth], filled_at[depth]
             depth -= 1
         else:
             th, tf, ti = top, count, i
             filled = top * count
             h0, h1, h2 = h0 + (filled * d0 - e0), h1 + (filled * d1 - e1), h2 + (filled * d2 - e2)
-        after = h0 + h1 + h2
-        change[i], held = held - after, after
-    return float(held)
+        remaining = h0 + h1 + h2
+        change[i], held_charge = held_charge - remaining, remaining
+    return float(held_charge)
 
 
 @jit
-def _more(e0: float, e1: float, e2: float, emptied: float, left: Float, age: int) -> tuple[float, float, float]:
+def _add_occupied(
+    e0: float, e1: float, e2: float, emptied: float, occupancy: Float, age: int
+) -> tuple[float, float, float]:
     """Of each species what pixels held that a cloud has filled again: plus so many, last filled so long ago."""
-    return e0 + emptied * left[age, 0], e1 + emptied * left[age, 1], e2 + emptied * left[age, 2]
+    return e0 + emptied * occupancy[age, 0], e1 + emptied * occupancy[age, 1], e2 + emptied * occupancy[age, 2]
 
 
 @jit
-def _short(
-    most: float, top: float, empty: float, i: int, depth: int, left: Float, height: Float, full: Float, since: Any
+def _fill_partly(
+    available: float,
+    top: float,
+    empty: float,
+    i: int,
+    depth: int,
+    occupancy: Float,
+    height: Float,
+    full: Float,
+    filled_at: Any,
 ) -> tuple[float, int, float, float, float]:
     """What a packet takes that may have less than its cloud would reach: where it ends, the stack's depth, the rest.
 
     empty : electrons that all traps hold;  most : electrons of the packet
     """
-    e0, e1, e2, taken, bottom = 0.0, 0.0, 0.0, 0.0, 0.0
+    e0, e1, e2, captured, bottom = 0.0, 0.0, 0.0, 0.0, 0.0
     while bottom < top:
-        end, age = height[depth], i - since[depth]
-        still = left[age, 0] + left[age, 1] + left[age, 2]
-        free, step = empty - full[depth] * still, min(end, top) - bottom
-        if taken + step * free > most:
-            step = (most - taken) / free
+        end, age = height[depth], i - filled_at[depth]
+        occupied = occupancy[age, 0] + occupancy[age, 1] + occupancy[age, 2]
+        free, step = empty - full[depth] * occupied, min(end, top) - bottom
+        if captured + step * free > available:
+            step = (available - captured) / free
             top = bottom + step
-        taken += step * free
+        captured += step * free
         emptied = step * full[depth]
-        e0, e1, e2 = _more(e0, e1, e2, emptied, left, age)
+        e0, e1, e2 = _add_occupied(e0, e1, e2, emptied, occupancy, age)
         if end > top:
             break
         bottom = end
@@ -300,15 +367,17 @@ def _short(
 
 
 @jit
-def _reach(line: Any, volumes: Float, notch: float, scale: float, part: Float, bits: Any, reached: Float) -> None:
+def _volumes_of_line(
+    line: Any, volumes: Float, notch: float, scale: float, part: Float, bits: Any, reached: Float
+) -> None:
     """V of every packet of a line, as `_volume`;  part, bits : scratch, numbers and their binary form."""
     for i in range(len(line)):
         part[i] = min(max((line[i] - notch) * scale, 0.0), 1.0)
     for i in range(len(line)):
         at = (bits[i] >> (52 - _SEGMENT_BITS)) - ((1023 - _OCTAVES) << _SEGMENT_BITS)
-        beyond = (bits[i] & ((1 << (52 - _SEGMENT_BITS)) - 1)) * 2.0 ** (_SEGMENT_BITS - 52)
-        here = max(at, 0)
-        volume = volumes[here] + beyond * (volumes[here + 1] - volumes[here])
+        fraction = (bits[i] & ((1 << (52 - _SEGMENT_BITS)) - 1)) * 2.0 ** (_SEGMENT_BITS - 52)
+        segment = max(at, 0)
+        volume = volumes[segment] + fraction * (volumes[segment + 1] - volumes[segment])
         reached[i] = volume if at >= 0 else 0.0
 
 
@@ -322,5 +391,5 @@ def _volume(electrons: float, volumes: Float, notch: float, scale: float, part: 
     at = (bits[0] >> (52 - _SEGMENT_BITS)) - ((1023 - _OCTAVES) << _SEGMENT_BITS)
     if at < 0:
         return 0.0
-    beyond = (bits[0] & ((1 << (52 - _SEGMENT_BITS)) - 1)) * 2.0 ** (_SEGMENT_BITS - 52)
-    return float(volumes[at] + beyond * (volumes[at + 1] - volumes[at]))
+    fraction = (bits[0] & ((1 << (52 - _SEGMENT_BITS)) - 1)) * 2.0 ** (_SEGMENT_BITS - 52)
+    return float(volumes[at] + fraction * (volumes[at + 1] - volumes[at]))

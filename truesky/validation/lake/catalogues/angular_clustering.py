@@ -19,10 +19,10 @@ from truesky.fluxes import cosmology
 from truesky.validation import checks, theory, two_points
 from truesky.validation import field as fields
 from truesky.validation.field import Field
+from truesky.validation.lake.measure.frame_context import Result
 from truesky.validation.lake.measure.rows import Place, Row, not_applicable, row_of_check
-from truesky.validation.lake.measure.seen import Result
 from truesky.validation.model import observed, small_scales
-from truesky.validation.two_points import ARCMIN, Measured
+from truesky.validation.two_points import ARCMIN, TwoPointFunction
 
 NAME = "clustering"
 SOURCE = "Limber's approximation with the bias of the galaxies' halos (Tinker et al. 2010, ApJ 724, 878)"
@@ -30,8 +30,8 @@ BAND, LIMITS = "euclid_vis", (22.0, 23.0, 24.0)
 _SED = ("abs_mag_r01", "sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")
 COLUMNS = ("id", "ra", "dec", "_healpix_29", "kind", "z_true", "mag_r01", "log_halo_mass", *_SED)
 # How much fainter than in I_E galaxies may be in their reference band, at 5600 A; how far short a catalogue may fall.
-_REDDEST, _SHORT = 3.0, 0.1
-_FEWEST = 200
+_REDDEST, _DEPTH_MARGIN = 3.0, 0.1
+_MIN_GALAXIES = 200
 # Separations, arcmin; from where on theory is good to the smaller tolerance.
 EDGES = np.array([0.3, 0.6, 1.2, 2.4, 4.8, 9.6, 18.0, 36.0, 60.0, 90.0])
 _LINEAR, _NEAR_TOLERANCE, _FAR_TOLERANCE = 18.0, 0.5, 0.2
@@ -41,108 +41,112 @@ _SHELL = 100.0
 _LUMINOUS = 23.5
 
 
-def measured(galaxies: read.Version) -> Result:
+def measure(galaxies: read.Version) -> Result:
     """Of a lake's galaxies."""
     missing = [name for name in COLUMNS if name not in galaxies.schema.names]
     if missing:
-        return _none(f"galaxies have no {' and '.join(missing)}")
+        return _no_result(f"galaxies have no {' and '.join(missing)}")
     table = galaxies.rows(list(COLUMNS))
     index, bright = table["_healpix_29"].to_numpy(), table["mag_r01"].to_numpy() < max(LIMITS) + _REDDEST
-    field = fields.of_version(galaxies, index)
+    field = fields.from_version(galaxies, index)
     bright &= table["kind"].to_numpy() < 2
-    return compared({name: table[name].to_numpy()[bright] for name in COLUMNS}, field)
+    return compare({name: table[name].to_numpy()[bright] for name in COLUMNS}, field)
 
 
-def compared(columns: Mapping[str, Array], field: Field) -> Result:
+def compare(columns: Mapping[str, Array], field: Field) -> Result:
     """Of columns[n] by name, of all galaxies that may be brighter than the faintest limit, in a field."""
-    if len(columns["id"]) < _FEWEST:
-        return _none(f"{len(columns['id'])} galaxies brighter than {max(LIMITS):g}; {_FEWEST} are wanted")
-    edges = EDGES[60.0 * field.side * (1 + 1e-9) >= EDGES]
+    if len(columns["id"]) < _MIN_GALAXIES:
+        return _no_result(f"{len(columns['id'])} galaxies brighter than {max(LIMITS):g}; {_MIN_GALAXIES} are wanted")
+    edges = EDGES[60.0 * field.patch_side * (1 + 1e-9) >= EDGES]
     if len(edges) < 3:
-        return _none(f"patches of the field are {60.0 * field.side:.1f}' wide: too small")
-    mag = observed.apparent(columns, BAND)
+        return _no_result(f"patches of the field are {60.0 * field.patch_side:.1f}' wide: too small")
+    mag = observed.apparent_magnitudes(columns, BAND)
     deepest, rows, series = float(np.percentile(mag, 99.5)), [], {}
     for limit in LIMITS:
-        kept = mag < limit
-        if deepest < limit - _SHORT or np.count_nonzero(kept) < _FEWEST:
-            why = f"{np.count_nonzero(kept)} galaxies with I_E < {limit:g}; the catalogue reaches {deepest:.2f}"
+        brighter = mag < limit
+        if deepest < limit - _DEPTH_MARGIN or np.count_nonzero(brighter) < _MIN_GALAXIES:
+            why = f"{np.count_nonzero(brighter)} galaxies with I_E < {limit:g}; the catalogue reaches {deepest:.2f}"
             rows.append(not_applicable(NAME, Place(), why, SOURCE, f"w_vis_{limit:g}"))
             continue
-        found = _of(columns, kept, field, edges * ARCMIN)
-        known = kept & np.isfinite(columns["log_halo_mass"])
-        if np.count_nonzero(known) < 0.9 * np.count_nonzero(kept):
+        correlation = _correlate(columns, brighter, field, edges * ARCMIN)
+        with_halo = brighter & np.isfinite(columns["log_halo_mass"])
+        if np.count_nonzero(with_halo) < 0.9 * np.count_nonzero(brighter):
             why = "the halos' masses, and so the bias of the galaxies, are not known"
             rows.append(not_applicable(NAME, Place(), why, SOURCE, f"w_vis_{limit:g}"))
             continue
-        curve, wanted = expected(columns, known, field, found)
-        note = f"{np.count_nonzero(kept)} galaxies with I_E < {limit:g}, {field.area:.3g} deg2"
-        rows += _rows(f"w_vis_{limit:g}", found, wanted, note)
-        series[f"w_{limit:g}"] = np.stack([found.theta / ARCMIN, found.value[0], found.error[0], wanted])
+        curve, w_theory = expected_correlation(columns, with_halo, field, correlation)
+        note = f"{np.count_nonzero(brighter)} galaxies with I_E < {limit:g}, {field.area:.3g} deg2"
+        rows += _rows(f"w_vis_{limit:g}", correlation, w_theory, note)
+        series[f"w_{limit:g}"] = np.stack(
+            [correlation.theta / ARCMIN, correlation.value[0], correlation.error[0], w_theory]
+        )
         series[f"w_theory_{limit:g}"] = np.stack(curve)
-    rows += _luminous(columns, field, deepest)
+    rows += _luminous_rows(columns, field, deepest)
     return Result(Place(), rows, series)
 
 
-def _of(columns: Mapping[str, Array], kept: Bool, field: Field, edges: Float) -> Measured:
-    ids, ra, dec, index = (columns[name][kept] for name in ("id", "ra", "dec", "_healpix_29"))
-    return two_points.angular(ids, ra, dec, index, field, edges)
+def _correlate(columns: Mapping[str, Array], selected: Bool, field: Field, edges: Float) -> TwoPointFunction:
+    ids, ra, dec, index = (columns[name][selected] for name in ("id", "ra", "dec", "_healpix_29"))
+    return two_points.angular_correlation(ids, ra, dec, index, field, edges)
 
 
-def _rows(name: str, found: Measured, wanted: Float, note: str) -> list[Row]:
+def _rows(name: str, correlation: TwoPointFunction, w_theory: Float, note: str) -> list[Row]:
     rows = []
-    for k, low in enumerate(found.edges[:-1] / ARCMIN):
+    for k, low in enumerate(correlation.edges[:-1] / ARCMIN):
         tolerance = _FAR_TOLERANCE if low > _LINEAR * 0.99 else _NEAR_TOLERANCE
-        about = f"{found.value[0, k]:.3g}, by theory {wanted[k]:.3g}; {note}"
-        value, error = found.value[0, k] / wanted[k], found.error[0, k] / wanted[k]
+        full_note = f"{correlation.value[0, k]:.3g}, by theory {w_theory[k]:.3g}; {note}"
+        value, error = correlation.value[0, k] / w_theory[k], correlation.error[0, k] / w_theory[k]
         rows.append(
-            Row(NAME, f"{name}_{low:g}", Place(), float(value), float(error), 1.0, tolerance, "", SOURCE, note=about)
+            Row(
+                NAME, f"{name}_{low:g}", Place(), float(value), float(error), 1.0, tolerance, "", SOURCE, note=full_note
+            )
         )
     return rows
 
 
-def expected(
-    columns: Mapping[str, Array], kept: Bool, field: Field, found: Measured
+def expected_correlation(
+    columns: Mapping[str, Array], selected: Bool, field: Field, correlation: TwoPointFunction
 ) -> tuple[tuple[Float, Float], Float]:
     """(separations, arcmin, and w there, as a field that knows its own mean alone shows it; w[bin]).
 
     columns, kept : galaxies;  field : where;  found : of the bins
     """
-    z, mass = columns["z_true"][kept].astype(float), columns["log_halo_mass"][kept].astype(float)
+    z, mass = columns["z_true"][selected].astype(float), columns["log_halo_mass"][selected].astype(float)
     chi, halos = np.asarray(cosmology.comoving_distance(z)), matching.masses()
-    bias = halos.at(halos.bias, z, mass)
+    bias = halos.interpolate_pairs(halos.bias, z, mass)
     edges = np.arange(chi.min() * 0.999, chi.max() + _SHELL, _SHELL)
-    c_l = theory.galaxies(theory.ELL, theory.shells(chi, bias, edges))
+    c_l = theory.galaxy_power(theory.ELL, theory.shells(chi, bias, edges))
     curve = np.geomspace(EDGES[0] * ARCMIN, np.radians(20.0), 80)
     w = theory.correlation(curve, theory.ELL, c_l)
     # A field's own mean hides what all of its pairs have in common.
-    hidden = two_points.of_all_pairs(field, curve, w)
-    shown = curve < found.edges[-1]
-    return (curve[shown] / ARCMIN, w[shown] - hidden), np.interp(found.theta, curve, w) - hidden
+    field_mean = two_points.mean_over_pairs(field, curve, w)
+    in_range = curve < correlation.edges[-1]
+    return (curve[in_range] / ARCMIN, w[in_range] - field_mean), np.interp(correlation.theta, curve, w) - field_mean
 
 
-def _luminous(columns: Mapping[str, Array], field: Field, deepest: float) -> list[Row]:
+def _luminous_rows(columns: Mapping[str, Array], field: Field, deepest: float) -> list[Row]:
     """Galaxies of M_r - 5 log h < -20 at 0.4 < z < 0.6, over the power law."""
-    near, far = small_scales.NEAR, small_scales.FAR
+    z_min, z_max = small_scales.Z_MIN, small_scales.Z_MAX
     z = columns["z_true"].astype(float)
-    kept = (columns["abs_mag_r01"] < small_scales.BRIGHT) & (z > near) & (z < far)
-    many = int(np.count_nonzero(kept))
-    low, high = (float(cosmology.comoving_distance(at)) for at in (near, far))
+    selected = (columns["abs_mag_r01"] < small_scales.MAX_ABS_MAG) & (z > z_min) & (z < z_max)
+    n_galaxies = int(np.count_nonzero(selected))
+    low, high = (float(cosmology.comoving_distance(at)) for at in (z_min, z_max))
     edges = small_scales.EDGES / (0.75 * (high**4 - low**4) / (high**3 - low**3))
-    edges = edges[edges <= np.radians(field.side)]
+    edges = edges[edges <= np.radians(field.patch_side)]
     names = [f"w_m20_{edge:g}" for edge in small_scales.EDGES[: len(edges) - 1]]
-    if deepest < _LUMINOUS - _SHORT or many < _FEWEST or not names:
-        why = f"{many} galaxies of M_r < -20 at 0.4 < z < 0.6; the catalogue reaches I_E = {deepest:.2f}"
+    if deepest < _LUMINOUS - _DEPTH_MARGIN or n_galaxies < _MIN_GALAXIES or not names:
+        why = f"{n_galaxies} galaxies of M_r < -20 at 0.4 < z < 0.6; the catalogue reaches I_E = {deepest:.2f}"
         return [not_applicable(NAME, Place(), why, SOURCE, "w_m20")]
-    found = _of(columns, kept, field, edges)
-    law = small_scales.power_law(np.asarray(cosmology.comoving_distance(z[kept])), edges)
-    value = dict(zip(names, (found.value[0] / law).tolist(), strict=True))
-    error = dict(zip(names, (found.error[0] / law).tolist(), strict=True))
+    correlation = _correlate(columns, selected, field, edges)
+    law = small_scales.power_law(np.asarray(cosmology.comoving_distance(z[selected])), edges)
+    value = dict(zip(names, (correlation.value[0] / law).tolist(), strict=True))
+    error = dict(zip(names, (correlation.error[0] / law).tolist(), strict=True))
     rows = []
-    for check in checks.checks(value):
-        note = f"{many} galaxies of M_r - 5 log h < -20 at 0.4 < z < 0.6, from {check.name[6:]} Mpc/h on"
+    for check in checks.evaluate(value):
+        note = f"{n_galaxies} galaxies of M_r - 5 log h < -20 at 0.4 < z < 0.6, from {check.name[6:]} Mpc/h on"
         rows.append(row_of_check(NAME, check, error[check.name], note))
     return rows
 
 
-def _none(why: str) -> Result:
+def _no_result(why: str) -> Result:
     return Result(Place(), [not_applicable(NAME, Place(), why, SOURCE)], {})

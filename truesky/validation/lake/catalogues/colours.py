@@ -19,8 +19,8 @@ from truesky.fluxes import band_fluxes, passbands, sources
 from truesky.randomness import rng
 from truesky.validation import field as fields
 from truesky.validation.field import Field
+from truesky.validation.lake.measure.frame_context import Result
 from truesky.validation.lake.measure.rows import Place, Row, not_applicable
-from truesky.validation.lake.measure.seen import Result
 from truesky.validation.model import observed
 
 NAME = "colours"
@@ -30,44 +30,47 @@ COLUMNS = ("id", "_healpix_29", "kind", "z_true", "mag_r01", "a_v", "kappa", "ga
            "color_gr_01", "sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")  # fmt: skip
 _FLUX = "f_nu_"
 # Galaxies that are taken: to that magnitude, where lines are few and no gas between galaxies absorbs; how many.
-_BRIGHT, _FAR, _MOST, _FEWEST = 23.0, 1.5, 30_000, 100
+_MAX_MAG, _MAX_REDSHIFT, _MAX_GALAXIES, _MIN_GALAXIES = 23.0, 1.5, 30_000, 100
 _TOLERANCE, _PER_DUST = 0.03, 0.06
 # Of the extinction, to interpolate between.
 _NODES = 12
 # Redshifts and luminosity of the red galaxies whose colours are known.
 _RED, _RED_MAG = ((0.15, 0.25), (0.25, 0.35)), -20.5
-_LOCUS_TOLERANCE, _SOME = 0.05, 20
+_LOCUS_TOLERANCE, _MIN_RED_GALAXIES = 0.05, 20
 _EDGES = np.linspace(-0.5, 2.5, 91)
 
 
-def measured(galaxies: read.Version, fluxes: read.Version) -> Result:
+def measure(galaxies: read.Version, fluxes: read.Version) -> Result:
     """Of a lake's galaxies and their fluxes."""
     missing = [name for name in COLUMNS if name not in galaxies.schema.names]
     if missing:
-        return _none(f"galaxies have no {' and '.join(missing)}")
+        return _no_result(f"galaxies have no {' and '.join(missing)}")
     names = [name for name in fluxes.schema.names if name.startswith(_FLUX)]
     bands = [name.removeprefix(_FLUX) for name in names if name.removeprefix(_FLUX) in passbands.names()]
     table, light = galaxies.rows(list(COLUMNS)), fluxes.rows(["id", *(_FLUX + band for band in bands)])
     columns = {name: table[name].to_numpy() for name in COLUMNS}
-    field = fields.of_version(galaxies, columns["_healpix_29"])
-    kept = np.flatnonzero(
-        (columns["kind"] < 2) & (columns["mag_r01"] < _BRIGHT) & (columns["z_true"] < _FAR) & (columns["sed_1"] >= 0)
+    field = fields.from_version(galaxies, columns["_healpix_29"])
+    selected = np.flatnonzero(
+        (columns["kind"] < 2)
+        & (columns["mag_r01"] < _MAX_MAG)
+        & (columns["z_true"] < _MAX_REDSHIFT)
+        & (columns["sed_1"] >= 0)
     )
-    chance = rng.mixed(columns["id"][kept].astype(np.uint64) * rng.GOLDEN) / 2.0**64
-    kept = kept[chance < _MOST / max(len(kept), 1)]
-    columns = {name: values[kept] for name, values in columns.items()}
-    own = light["id"].to_numpy()
-    order = np.argsort(own)
-    at = np.minimum(np.searchsorted(own[order], columns["id"]), max(len(own) - 1, 0))
-    if len(kept) and (not len(own) or (own[order][at] != columns["id"]).any()):
-        return _none("galaxy_fluxes lacks galaxies of galaxies: it is of another request, which --name names")
-    return compared(columns, {band: light[_FLUX + band].to_numpy()[order[at]] for band in bands}, field)
+    chance = rng.mix_bits(columns["id"][selected].astype(np.uint64) * rng.GOLDEN) / 2.0**64
+    selected = selected[chance < _MAX_GALAXIES / max(len(selected), 1)]
+    columns = {name: values[selected] for name, values in columns.items()}
+    flux_ids = light["id"].to_numpy()
+    order = np.argsort(flux_ids)
+    at = np.minimum(np.searchsorted(flux_ids[order], columns["id"]), max(len(flux_ids) - 1, 0))
+    if len(selected) and (not len(flux_ids) or (flux_ids[order][at] != columns["id"]).any()):
+        return _no_result("galaxy_fluxes lacks galaxies of galaxies: it is of another request, which --name names")
+    return compare(columns, {band: light[_FLUX + band].to_numpy()[order[at]] for band in bands}, field)
 
 
-def compared(columns: Mapping[str, Array], flux: Mapping[str, Array], field: Field) -> Result:
+def compare(columns: Mapping[str, Array], flux: Mapping[str, Array], field: Field) -> Result:
     """Of columns[n] by name and fluxes[n], uJy, by band, of galaxies in a field."""
-    if len(columns["id"]) < _FEWEST or not flux:
-        return _none(f"{len(columns['id'])} galaxies with {len(flux)} bands; {_FEWEST} and 1 are wanted")
+    if len(columns["id"]) < _MIN_GALAXIES or not flux:
+        return _no_result(f"{len(columns['id'])} galaxies with {len(flux)} bands; {_MIN_GALAXIES} and 1 are wanted")
     patch = field.patch_of(columns["_healpix_29"])
     with np.errstate(divide="ignore", invalid="ignore"):
         mag = {band: 23.9 - 2.5 * np.log10(values.astype(float)) for band, values in flux.items()}
@@ -75,25 +78,29 @@ def compared(columns: Mapping[str, Array], flux: Mapping[str, Array], field: Fie
         np.abs(sources.determinant(columns["kappa"], columns["gamma1"], columns["gamma2"])), 1e-3
     )
     rows, tolerance = [], _TOLERANCE + _PER_DUST * float(np.median(columns["a_v"]))
-    for band, found in mag.items():
-        dust = _transmitted(band, columns["a_v"].astype(float))
-        off = found - observed.apparent(columns, band) + 2.5 * np.log10(magnified * dust)
+    for band, magnitudes in mag.items():
+        dust = _transmission(band, columns["a_v"].astype(float))
+        offset = magnitudes - observed.apparent_magnitudes(columns, band) + 2.5 * np.log10(magnified * dust)
         # A band that is empty is wrong, too.
-        off = np.where(np.isfinite(off), off, np.inf)
-        value, error = _median(off, patch, field.patches)
-        note = f"median of {len(off)} galaxies" if np.isfinite(value) else f"most of {len(off)} galaxies have no flux"
+        offset = np.where(np.isfinite(offset), offset, np.inf)
+        value, error = _median(offset, patch, field.n_patches)
+        note = (
+            f"median of {len(offset)} galaxies"
+            if np.isfinite(value)
+            else f"most of {len(offset)} galaxies have no flux"
+        )
         value, error = (value, error) if np.isfinite(value) else (99.0, 0.0)
         rows.append(Row(NAME, f"flux_{band}", Place(), value, error, 0.0, tolerance, "mag", SOURCE, note=note))
     series: dict[str, Float] = {}
     if {"lsst_g", "lsst_r", "lsst_i"} <= set(mag):
         gr, ri = mag["lsst_g"] - mag["lsst_r"], mag["lsst_r"] - mag["lsst_i"]
-        rows += _locus(columns, gr, ri)
+        rows += _locus_rows(columns, gr, ri)
         series["colour_colour"] = np.histogram2d(gr, ri, (_EDGES, _EDGES))[0]
         series["colour_edges"] = _EDGES
     return Result(Place(), rows, series)
 
 
-def _transmitted(band: str, a_v: Float) -> Float:
+def _transmission(band: str, a_v: Float) -> Float:
     """Share of a flat spectrum's light that the Milky Way lets through, [n] of A(V)[n] mag."""
     curve, nodes = passbands.load(band), np.linspace(0.0, max(float(a_v.max()), 1e-3), _NODES)
     weight = curve.response / curve.wavelength
@@ -101,35 +108,35 @@ def _transmitted(band: str, a_v: Float) -> Float:
     return np.asarray(np.interp(a_v, nodes, np.sum(through * weight, 1) / np.sum(weight)))
 
 
-def _median(values: Float, patch: Int, many: int) -> tuple[float, float]:
+def _median(values: Float, patch: Int, n_patches: int) -> tuple[float, float]:
     """And its error, of the patches or of the values' own scatter, whichever is larger."""
     middle = float(np.median(values))
-    rest = [np.median(values[patch != one]) for one in range(many)]
-    usual = values[np.isfinite(values)]
-    usual = usual[np.abs(usual - middle) < 1.0]
-    own = 1.25 * float(np.std(usual)) / np.sqrt(max(len(usual), 1)) if len(usual) else 0.0
-    by_patch = float(fields.spread(rest)) if np.isfinite(rest).all() else np.nan
-    return middle, float(np.nanmax([own, by_patch]))
+    rest = [np.median(values[patch != left_out]) for left_out in range(n_patches)]
+    typical = values[np.isfinite(values)]
+    typical = typical[np.abs(typical - middle) < 1.0]
+    sample_error = 1.25 * float(np.std(typical)) / np.sqrt(max(len(typical), 1)) if len(typical) else 0.0
+    by_patch = float(fields.jackknife_error(rest)) if np.isfinite(rest).all() else np.nan
+    return middle, float(np.nanmax([sample_error, by_patch]))
 
 
-def _locus(columns: Mapping[str, Array], gr: Float, ri: Float) -> list[Row]:
+def _locus_rows(columns: Mapping[str, Array], gr: Float, ri: Float) -> list[Row]:
     """Red luminous galaxies, whose r - i is (g - r) / 4 + 0.18 up to z = 0.4; the number is remembered."""
     m_r, z = columns["abs_mag_r01"], columns["z_true"]
     red = (columns["color_gr_01"] > 0.78 - 0.02 * (m_r + 20.0)) & (m_r < _RED_MAG)
     rows = []
-    for near, far in _RED:
-        own = red & (z > near) & (z < far)
-        many = int(np.count_nonzero(own))
-        name = f"c_perp_z{0.5 * (near + far):g}"
-        if many < _SOME:
-            why = f"{many} red galaxies of M_r - 5 log h < {_RED_MAG:g} at {near:g} < z < {far:g}"
+    for z_min, z_max in _RED:
+        in_shell = red & (z > z_min) & (z < z_max)
+        n_galaxies = int(np.count_nonzero(in_shell))
+        name = f"c_perp_z{0.5 * (z_min + z_max):g}"
+        if n_galaxies < _MIN_RED_GALAXIES:
+            why = f"{n_galaxies} red galaxies of M_r - 5 log h < {_RED_MAG:g} at {z_min:g} < z < {z_max:g}"
             rows.append(not_applicable(NAME, Place(), why, _LOCUS, name))
             continue
-        off = float(np.median((ri - gr / 4.0 - 0.18)[own]))
-        note = f"{many} red galaxies; a remembered number: it decides nothing"
-        rows.append(Row(NAME, name, Place(), off, np.nan, 0.0, _LOCUS_TOLERANCE, "mag", _LOCUS, note=note))
+        offset = float(np.median((ri - gr / 4.0 - 0.18)[in_shell]))
+        note = f"{n_galaxies} red galaxies; a remembered number: it decides nothing"
+        rows.append(Row(NAME, name, Place(), offset, np.nan, 0.0, _LOCUS_TOLERANCE, "mag", _LOCUS, note=note))
     return rows
 
 
-def _none(why: str) -> Result:
+def _no_result(why: str) -> Result:
     return Result(Place(), [not_applicable(NAME, Place(), why, SOURCE)], {})

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from lake_schema.ids import GENERATION_ORDER
-from lake_schema.sky import DEEPEST
+from lake_schema.sky import MAX_ORDER
 from lake_schema.store import read
 from truesky.validation.lake.measure.rows import Place, Row, not_applicable
 
 NAME, SOURCE = "duplicates", "a source has one identifier and one place"
 # Of the galaxies of a cell over the median of the cells: 0.05 deg2 of the deepest sky vary by 20 %.
-_MOST = 0.6
+_DENSITY_TOLERANCE = 0.6
 
 
 def rows(catalogue: read.Version) -> list[Row]:
@@ -26,12 +26,24 @@ def rows(catalogue: read.Version) -> list[Row]:
             "", SOURCE, note=f"{len(ids)} rows")
         for name, values in (("ids", ids), ("places", place))
     ]  # fmt: skip
-    cell = table["_healpix_29"].to_numpy() >> 2 * (DEEPEST - GENERATION_ORDER)
+    cell = table["_healpix_29"].to_numpy() >> 2 * (MAX_ORDER - GENERATION_ORDER)
     drawn = [c for part in catalogue.manifest["parts"] for c in part["facts"].get("generation_cells", ())]
     _, count = np.unique(cell, return_counts=True)
     if len(count) >= 4 and catalogue.table == "galaxies":
         middle = float(np.median(count))
-        most = float(count.max()) / middle
-        out.append(Row(NAME, f"{catalogue.table}_densest_cell", Place(), most, 1.0 / np.sqrt(middle), 1.0, _MOST, "",
-                       SOURCE, note=f"{len(count)} of {len(set(drawn)) or len(count)} cells with sources"))  # fmt: skip
+        densest = float(count.max()) / middle
+        out.append(
+            Row(
+                NAME,
+                f"{catalogue.table}_densest_cell",
+                Place(),
+                densest,
+                1.0 / np.sqrt(middle),
+                1.0,
+                _DENSITY_TOLERANCE,
+                "",
+                SOURCE,
+                note=f"{len(count)} of {len(set(drawn)) or len(count)} cells with sources",
+            )
+        )
     return out

@@ -15,77 +15,82 @@ from lake_schema.arrays import Float, Int
 from lake_schema.store import read
 from truesky.validation import checks
 from truesky.validation import field as fields
+from truesky.validation.lake.measure.frame_context import Result
 from truesky.validation.lake.measure.rows import Place, Row, not_applicable, row_of_check
-from truesky.validation.lake.measure.seen import Result
 from truesky.validation.model import observed
-from truesky.validation.model.observed import Sky
+from truesky.validation.model.observed import GalaxySample
 
 NAME = "observed"
 # Patches that are left out in turn, and the fewest that tell an error.
-_PATCHES, _FEWEST = 8, 4
+_PATCHES, _MIN_PATCHES = 8, 4
 # Counts to a magnitude, i, r or I_E; how much fainter in I_E a galaxy of it may be; depth that all others want, and
 # by how much a catalogue's faintest galaxy may fall short of its limit.
 _LIMIT = re.compile(r"(?:log_)?(?:z_)?(?:i|r|vis)_([0-9.]+)")
-_REDDER, _WHOLE, _SHORT = 0.5, 26.0, 0.1
+_REDDER, _FULL_DEPTH, _DEPTH_MARGIN = 0.5, 26.0, 0.1
 
 
 # Bins of redshift, and limits in I_E and i, of what is drawn; percentiles of colours, and galaxies that have some.
 _REDSHIFTS, _REDSHIFT_LIMIT = np.linspace(0.0, 3.0, 31), 24.5
-_COLOUR_BINS, _COLOUR_LIMIT, _LEVELS, _SOME = np.linspace(0.0, 1.2, 25), 22.5, (5, 16, 50, 84, 95), 30
+_COLOUR_BINS, _COLOUR_LIMIT, _LEVELS, _MIN_GALAXIES = np.linspace(0.0, 1.2, 25), 22.5, (5, 16, 50, 84, 95), 30
 
 
-def measured(galaxies: read.Version) -> Result:
+def measure(galaxies: read.Version) -> Result:
     """A row a figure that observed.csv has; galaxies : of the lake."""
-    seen, cell = observed.in_version(galaxies)
-    return Result(Place(), compared(seen, cell), _series(seen, cell) if len(cell) else {})
+    sample, cell = observed.from_version(galaxies)
+    return Result(Place(), compare(sample, cell), _series(sample, cell) if len(cell) else {})
 
 
-def _series(seen: Sky, cell: Int) -> dict[str, Float]:
+def _series(sample: GalaxySample, cell: Int) -> dict[str, Float]:
     """Redshifts of galaxies, arcmin-2 per unit z, and colours against redshift, with errors of the lake's patches."""
     groups = _groups(cell)
     patch = np.zeros(len(cell), np.int64)
     for number, group in enumerate(groups):
         patch[np.isin(cell, group)] = number
-    z, number = seen["z_true"], len(groups)
-    faint = seen.mags["euclid_vis"] < _REDSHIFT_LIMIT
+    z, number = sample["z_true"], len(groups)
+    faint = sample.mags["euclid_vis"] < _REDSHIFT_LIMIT
     low, high = _REDSHIFTS[:-1], _REDSHIFTS[1:]
-    per = seen.area * observed.ARCMIN2 * (high - low)
-    count = np.array([np.histogram(z[faint & (patch == one)], _REDSHIFTS)[0] for one in range(number)], float)
+    per = sample.area * observed.ARCMIN2 * (high - low)
+    count = np.array(
+        [np.histogram(z[faint & (patch == patch_number)], _REDSHIFTS)[0] for patch_number in range(number)], float
+    )
     area = np.array([len(group) for group in groups], float)[:, None] / len(np.unique(cell))
-    without = (count.sum(0) - count) / (1.0 - area) if number > 1 else count
-    bright, colour = seen.mags["lsst_i"] < _COLOUR_LIMIT, seen.mags["lsst_r"] - seen.mags["lsst_i"]
+    jackknife = (count.sum(0) - count) / (1.0 - area) if number > 1 else count
+    bright, colour = sample.mags["lsst_i"] < _COLOUR_LIMIT, sample.mags["lsst_r"] - sample.mags["lsst_i"]
     place, lines = np.digitize(z, _COLOUR_BINS) - 1, []
-    for one in range(len(_COLOUR_BINS) - 1):
-        own = np.flatnonzero(bright & (place == one))
-        if len(own) >= _SOME:
-            rest = [np.median(left) for left in (colour[own[patch[own] != left_out]] for left_out in range(number))
-                    if len(left)]  # fmt: skip
-            middle = 0.5 * (_COLOUR_BINS[one] + _COLOUR_BINS[one + 1])
-            lines.append([middle, *np.percentile(colour[own], _LEVELS), float(fields.spread(rest))])
-    series = {"redshifts": np.stack([low, high, count.sum(0) / per, fields.spread(without) / per])}
+    for bin_number in range(len(_COLOUR_BINS) - 1):
+        in_bin = np.flatnonzero(bright & (place == bin_number))
+        if len(in_bin) >= _MIN_GALAXIES:
+            rest = [
+                np.median(remaining)
+                for remaining in (colour[in_bin[patch[in_bin] != left_out]] for left_out in range(number))
+                if len(remaining)
+            ]
+            middle = 0.5 * (_COLOUR_BINS[bin_number] + _COLOUR_BINS[bin_number + 1])
+            lines.append([middle, *np.percentile(colour[in_bin], _LEVELS), float(fields.jackknife_error(rest))])
+    series = {"redshifts": np.stack([low, high, count.sum(0) / per, fields.jackknife_error(jackknife) / per])}
     return series | ({"colours": np.array(lines).T} if lines else {})
 
 
-def compared(seen: Sky, cell: Int) -> list[Row]:
+def compare(sample: GalaxySample, cell: Int) -> list[Row]:
     """The same of a sky; cell : the generation cell of each of its galaxies."""
-    found = observed.figures(seen)
-    errors = _errors(seen, cell)
+    figures = observed.figures(sample)
+    errors = _errors(sample, cell)
     out = []
     # Magnitudes here are before magnification: some are fainter than the catalogue's limit.
-    deepest = float(np.percentile(seen.mags["euclid_vis"], 99.0)) if len(cell) else 0.0
-    for check in checks.checks(found):
-        if (needed := _needed(check.name)) > deepest + _SHORT:
-            why = f"{check.name} wants galaxies to I_E = {needed:g}; 99 % are brighter than {deepest:.2f}"
+    deepest = float(np.percentile(sample.mags["euclid_vis"], 99.0)) if len(cell) else 0.0
+    for check in checks.evaluate(figures):
+        if (depth := _required_depth(check.name)) > deepest + _DEPTH_MARGIN:
+            why = f"{check.name} wants galaxies to I_E = {depth:g}; 99 % are brighter than {deepest:.2f}"
             out.append(replace(not_applicable(NAME, Place(), why, check.source), quantity=check.name))
             continue
         out.append(row_of_check(NAME, check, errors.get(check.name, math.nan), ""))
     return out
 
 
-def _needed(name: str) -> float:
+def _required_depth(name: str) -> float:
     """I_E of the faintest galaxies that a figure is of; a sky to 26 tells all of them."""
     match = _LIMIT.fullmatch(name)
-    return min(float(match[1]) + _REDDER, _WHOLE) if match else _WHOLE
+    return min(float(match[1]) + _REDDER, _FULL_DEPTH) if match else _FULL_DEPTH
 
 
 def _groups(cell: Int) -> list[Int]:
@@ -93,19 +98,22 @@ def _groups(cell: Int) -> list[Int]:
     return [group for group in np.array_split(cells, min(_PATCHES, len(cells))) if len(group)]
 
 
-def _errors(seen: Sky, cell: Int) -> dict[str, float]:
+def _errors(sample: GalaxySample, cell: Int) -> dict[str, float]:
     """Standard error by figure; none where there are too few cells to tell."""
     cells, groups = np.unique(cell), _groups(cell)
-    if len(groups) < _FEWEST:
+    if len(groups) < _MIN_PATCHES:
         return {}
-    found = []
+    figures = []
     for group in groups:
-        kept = ~np.isin(cell, group)
-        part = Sky(
-            {name: values[kept] for name, values in seen.rows.items()},
-            {band: values[kept] for band, values in seen.mags.items()},
-            seen.ultraviolet[kept], seen.area * (1.0 - len(group) / len(cells)), seen.quasars,
+        remaining = ~np.isin(cell, group)
+        part = GalaxySample(
+            {name: values[remaining] for name, values in sample.rows.items()},
+            {band: values[remaining] for band, values in sample.mags.items()},
+            sample.ultraviolet[remaining], sample.area * (1.0 - len(group) / len(cells)), sample.quasars,
         )  # fmt: skip
-        found.append(observed.figures(part))
-    errors = {name: float(fields.spread([each.get(name, math.nan) for each in found], _FEWEST)) for name in found[0]}
+        figures.append(observed.figures(part))
+    errors = {
+        name: float(fields.jackknife_error([each.get(name, math.nan) for each in figures], _MIN_PATCHES))
+        for name in figures[0]
+    }
     return {name: error for name, error in errors.items() if math.isfinite(error) and error > 0.0}

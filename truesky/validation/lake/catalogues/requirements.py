@@ -12,7 +12,7 @@ from lake_schema.arrays import Float
 from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store import read
 from truesky.validation.lake.measure.rows import Place, Row, not_applicable
-from truesky.validation.verdicts import LEAST
+from truesky.validation.verdicts import AT_LEAST
 
 NAME = "requirement"
 SOURCE = "requirements named by Serrano et al. 2024"
@@ -20,7 +20,7 @@ _BAND = "euclid_vis"
 _LIMIT, _PER_ARCMIN2, _REDSHIFT = 24.5, 30.0, 0.8
 _LINE, _EMITTERS, _FROM, _TO = 2e-16, 3500.0, 0.4, 1.8
 # What a lake does not tell, and why.
-_UNTOLD = (
+_UNDETERMINED = (
     ("mean_redshift_of_bins", "no photometric redshifts are measured"),
     ("psf_ellipticity_known", "no model of the PSF is fitted to the stars"),
     ("straylight", "frames hold all of the sky together"),
@@ -33,7 +33,7 @@ _UNTOLD = (
 
 def rows(galaxies: read.Version, fluxes: read.Version) -> list[Row]:
     """Of the catalogue; galaxies, fluxes : versions of the two tables."""
-    out = [_untold(name, why) for name, why in _UNTOLD]
+    out = [_undetermined_row(name, why) for name, why in _UNDETERMINED]
     if f"f_nu_{_BAND}" not in fluxes.schema.names:
         return [*out, not_applicable(NAME, Place(), "galaxy_fluxes has no I_E", SOURCE)]
     facts = galaxies.manifest.get("facts", {})
@@ -43,17 +43,17 @@ def rows(galaxies: read.Version, fluxes: read.Version) -> list[Row]:
         return [*out, not_applicable(NAME, Place(), why, SOURCE)]
     light = fluxes.rows(["id", f"f_nu_{_BAND}"])
     table = galaxies.rows(["id", "z_obs", "flux_halpha", "density_boost", "_healpix_29"])
-    ids, own, flux = (column.to_numpy() for column in (table["id"], light["id"], light[f"f_nu_{_BAND}"]))
-    order = np.argsort(own)
-    at = order[np.minimum(np.searchsorted(own[order], ids), max(len(own) - 1, 0))] if len(own) else order
-    if len(ids) and (not len(own) or (own[at] != ids).any()):
+    ids, flux_ids, flux = (column.to_numpy() for column in (table["id"], light["id"], light[f"f_nu_{_BAND}"]))
+    order = np.argsort(flux_ids)
+    at = order[np.minimum(np.searchsorted(flux_ids[order], ids), max(len(flux_ids) - 1, 0))] if len(flux_ids) else order
+    if len(ids) and (not len(flux_ids) or (flux_ids[at] != ids).any()):
         why = "galaxy_fluxes lacks galaxies of galaxies: it is of another request, which --name names"
         return [*out, not_applicable(NAME, Place(), why, SOURCE)]
     with np.errstate(divide="ignore"):
         mag = 23.9 - 2.5 * np.log10(flux[at[: len(ids)]].astype(float))
     weight = 1.0 / table["density_boost"].to_numpy().astype(float)
     z, line = (table[name].to_numpy().astype(float) for name in ("z_obs", "flux_halpha"))
-    cell = table["_healpix_29"].to_numpy() >> 2 * (sky.DEEPEST - GENERATION_ORDER)
+    cell = table["_healpix_29"].to_numpy() >> 2 * (sky.MAX_ORDER - GENERATION_ORDER)
     cells = np.unique(cell)
     drawn = {c for part in galaxies.manifest["parts"] for c in part["facts"].get("generation_cells", ())} or cells
     area = sky.cell_area(GENERATION_ORDER)
@@ -62,20 +62,42 @@ def rows(galaxies: read.Version, fluxes: read.Version) -> list[Row]:
         np.array([weight[chosen & (cell == c)].sum() for c in sorted(drawn)]) / area for chosen in (bright, emits)
     ]
     density, lines = (_mean(values) for values in per_cell)
-    near = z[bright]
-    spread = float(near.std() / np.sqrt(max(len(near), 1))) if len(near) else np.nan
+    redshifts = z[bright]
+    spread = float(redshifts.std() / np.sqrt(max(len(redshifts), 1))) if len(redshifts) else np.nan
     # Galaxies cluster: medians of cells scatter more than galaxies do.
     medians = [float(np.median(z[bright & (cell == c)])) for c in cells if (bright & (cell == c)).sum() > 20]
     error = max(spread, float(np.std(medians) / np.sqrt(len(medians)))) if len(medians) > 1 else np.inf
     note = f"{len(drawn)} cells of {area:.3g} deg2"
     return [
-        Row(NAME, "galaxies_24.5", Place(), density[0] / 3600.0, density[1] / 3600.0, _PER_ARCMIN2, 0.0, "arcmin-2",
-            SOURCE, LEAST, note),
-        Row(NAME, "median_redshift", Place(), float(np.median(near)) if len(near) else np.nan, error, _REDSHIFT, 0.0,
-            "", SOURCE, LEAST, note),
-        Row(NAME, "halpha_emitters", Place(), lines[0], lines[1], _EMITTERS, 0.0, "deg-2", SOURCE, LEAST, note),
+        Row(
+            NAME,
+            "galaxies_24.5",
+            Place(),
+            density[0] / 3600.0,
+            density[1] / 3600.0,
+            _PER_ARCMIN2,
+            0.0,
+            "arcmin-2",
+            SOURCE,
+            AT_LEAST,
+            note,
+        ),
+        Row(
+            NAME,
+            "median_redshift",
+            Place(),
+            float(np.median(redshifts)) if len(redshifts) else np.nan,
+            error,
+            _REDSHIFT,
+            0.0,
+            "",
+            SOURCE,
+            AT_LEAST,
+            note,
+        ),
+        Row(NAME, "halpha_emitters", Place(), lines[0], lines[1], _EMITTERS, 0.0, "deg-2", SOURCE, AT_LEAST, note),
         *out,
-    ]  # fmt: skip
+    ]
 
 
 def _mean(values: Float) -> tuple[float, float]:
@@ -84,6 +106,6 @@ def _mean(values: Float) -> tuple[float, float]:
     return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values)))
 
 
-def _untold(name: str, why: str) -> Row:
+def _undetermined_row(name: str, why: str) -> Row:
     nan = float("nan")
     return Row(NAME, name, Place(), nan, nan, nan, nan, "", SOURCE, note=why, applies=False)

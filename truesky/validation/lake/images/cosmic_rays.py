@@ -6,51 +6,63 @@ from typing import Any
 
 import numpy as np
 
-from truesky.validation.lake.measure.blank import SIDE
+from truesky.validation.lake.measure.blank_sky import SIDE
+from truesky.validation.lake.measure.frame_context import FrameCheck, FrameContext, require_blank_sky
 from truesky.validation.lake.measure.rows import Row
-from truesky.validation.lake.measure.seen import Check, Seen, wants_blank
 
 SOURCE = (
     "VIS: 1 cm-2 s-1 with STARDUST track lengths, 2 to 3 % of the pixels in 565 s (Niemi 2015); NISP: 2.6 cm-2 s-1 "
     "through 7 um of HgCdTe"
 )
 # Part of the pixels that are hit a second, and how far from that it may be, as a part of it: VIS.
-_VIS, _VIS_MOST = 0.025 / 565.0, 0.4
+_VIS, _VIS_TOLERANCE = 0.025 / 565.0, 0.4
 # NISP: hits a pixel (18 um) and second, pixels that show one, neighbours to which charge leaks among them.
-_NISP, _PIXELS, _NISP_MOST = 2.6 * 1.8e-3**2, 2.0, 0.6
+_NISP, _PIXELS, _NISP_TOLERANCE = 2.6 * 1.8e-3**2, 2.0, 0.6
 
 
-def check(of: Seen) -> list[Row]:
+def check(context: FrameContext) -> list[Row]:
     """Part of the blank pixels that are hit, over what is expected."""
-    assert of.tiles is not None
-    seen = of.tiles.blank | of.tiles.hit
-    hit = of.tiles.hit & _stepped(of)
-    hits, pixels = int(hit.sum()), int(seen.sum())
-    if of.channel == "VIS":
-        told, tolerance = _VIS * of.frame.seconds, _VIS_MOST
+    assert context.tiles is not None
+    usable = context.tiles.blank | context.tiles.hit
+    hit = context.tiles.hit & _has_step(context)
+    hits, pixels = int(hit.sum()), int(usable.sum())
+    if context.channel == "VIS":
+        expected, tolerance = _VIS * context.frame.seconds, _VIS_TOLERANCE
     else:
-        told, tolerance = _NISP * _PIXELS * float(of.frame.header["ELAPTIME"]), _NISP_MOST
+        expected, tolerance = _NISP * _PIXELS * float(context.frame.header["ELAPTIME"]), _NISP_TOLERANCE
     # A track is of many pixels that are hit together.
-    each = hit.sum(axis=(1, 2)) / np.maximum(seen.sum(axis=(1, 2)), 1)
-    error = float(each.std() / np.sqrt(len(each))) if hits else float(np.sqrt(told / pixels))
+    tile_shares = hit.sum(axis=(1, 2)) / np.maximum(usable.sum(axis=(1, 2)), 1)
+    error = float(tile_shares.std() / np.sqrt(len(tile_shares))) if hits else float(np.sqrt(expected / pixels))
     note = f"{pixels} pixels without sources, {hits} of them hit"
-    return [Row("cosmic_rays", "cover", of.place, hits / pixels / told, error / told, 1.0, tolerance, "", SOURCE,
-                note=note)]  # fmt: skip
+    return [
+        Row(
+            "cosmic_rays",
+            "cover",
+            context.place,
+            hits / pixels / expected,
+            error / expected,
+            1.0,
+            tolerance,
+            "",
+            SOURCE,
+            note=note,
+        )
+    ]
 
 
-def _stepped(of: Seen) -> Any:
+def _has_step(context: FrameContext) -> Any:
     """Pixels of the tiles whose ramp has a step: a hot pixel has none."""
-    assert of.tiles is not None
-    if of.frame.quality is None:
+    assert context.tiles is not None
+    if context.frame.quality is None:
         return True
-    places = zip(of.tiles.row, of.tiles.column, strict=True)
-    return np.stack([of.frame.quality[r : r + SIDE, c : c + SIDE] > 0 for r, c in places])
+    places = zip(context.tiles.row, context.tiles.column, strict=True)
+    return np.stack([context.frame.quality[r : r + SIDE, c : c + SIDE] > 0 for r, c in places])
 
 
-def _applies(of: Seen) -> str:
-    if of.channel not in ("VIS", "NISP-P"):
+def _why_not_applicable(context: FrameContext) -> str:
+    if context.channel not in ("VIS", "NISP-P"):
         return "no rate of its site is published with its tracks"
-    return wants_blank(of)
+    return require_blank_sky(context)
 
 
-COSMIC_RAYS = Check("cosmic_rays", SOURCE, _applies, check)
+COSMIC_RAYS = FrameCheck("cosmic_rays", SOURCE, _why_not_applicable, check)

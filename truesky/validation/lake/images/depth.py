@@ -8,39 +8,41 @@ from __future__ import annotations
 
 import numpy as np
 
+from truesky.validation.lake.measure.frame_context import FrameCheck, FrameContext, require_blank_sky
 from truesky.validation.lake.measure.rows import Row
-from truesky.validation.lake.measure.seen import Check, Seen, wants_blank
-from truesky.validation.verdicts import LEAST
+from truesky.validation.verdicts import AT_LEAST
 
 SOURCE = "requirements named by Serrano et al. 2024: NISP 24 AB (point, 5 sigma), VIS S/N 10 at 24.5 (extended)"
 # Exposures of a place, in the reference sequence.
 _DITHERS = 4
 _POINT, _POINT_SIGMA, _GALAXY = 24.0, 5.0, 24.5
 # An exponential disc of 0.3": part of its light within 1.3" of diameter, with the PSF of VIS.
-_HELD, _DIAMETER = 0.80, 1.3
+_APERTURE_FRACTION, _DIAMETER = 0.80, 1.3
 
 
-def check(of: Seen) -> list[Row]:
+def check(context: FrameContext) -> list[Row]:
     """Of four frames like this one."""
-    assert of.tiles is not None
-    spread = float(np.sqrt(np.mean((of.tiles.pixels - of.tiles.level[:, None, None])[of.tiles.blank] ** 2)))
-    error = 1.0 / np.sqrt(2.0 * of.tiles.blank.sum())
-    header, seconds = of.frame.header, of.frame.seconds
-    if of.channel == "VIS":
+    assert context.tiles is not None
+    spread = float(
+        np.sqrt(np.mean((context.tiles.pixels - context.tiles.level[:, None, None])[context.tiles.blank] ** 2))
+    )
+    error = 1.0 / np.sqrt(2.0 * context.tiles.blank.sum())
+    header, seconds = context.frame.header, context.frame.seconds
+    if context.channel == "VIS":
         light = seconds * 10.0 ** (-0.4 * (_GALAXY - float(header["ZEROPNT"])))
-        area = np.pi * (0.5 * _DIAMETER / of.frame.scale) ** 2
-        ratio = np.sqrt(_DITHERS) * _HELD * light / np.sqrt(_HELD * light + area * spread**2)
-        return [Row("requirement", "vis_snr_24.5", of.place, ratio, ratio * error, 10.0, 0.0, "", SOURCE, LEAST,
+        area = np.pi * (0.5 * _DIAMETER / context.frame.scale) ** 2
+        ratio = np.sqrt(_DITHERS) * _APERTURE_FRACTION * light / np.sqrt(_APERTURE_FRACTION * light + area * spread**2)
+        return [Row("requirement", "vis_snr_24.5", context.place, ratio, ratio * error, 10.0, 0.0, "", SOURCE, AT_LEAST,
                     f"four frames, noise of blank sky {spread:.4g} e-")]  # fmt: skip
-    sigma = float(header["PSFFWHM"]) / of.frame.scale / 2.3548
+    sigma = float(header["PSFFWHM"]) / context.frame.scale / 2.3548
     noise = np.sqrt(4.0 * np.pi * sigma**2 * spread**2 / _DITHERS)
     depth = float(header["ZEROPNT"]) - 2.5 * np.log10(_POINT_SIGMA * noise / seconds)
-    return [Row("requirement", "nisp_depth", of.place, depth, 1.0857 * error, _POINT, 0.0, "mag", SOURCE, LEAST,
+    return [Row("requirement", "nisp_depth", context.place, depth, 1.0857 * error, _POINT, 0.0, "mag", SOURCE, AT_LEAST,
                 f"four frames, noise of blank sky {spread:.4g} e-")]  # fmt: skip
 
 
-def _applies(of: Seen) -> str:
-    return wants_blank(of) if of.channel in ("VIS", "NISP-P") else "no requirement of its depth"
+def _why_not_applicable(context: FrameContext) -> str:
+    return require_blank_sky(context) if context.channel in ("VIS", "NISP-P") else "no requirement of its depth"
 
 
-DEPTH = Check("requirement", SOURCE, _applies, check)
+DEPTH = FrameCheck("requirement", SOURCE, _why_not_applicable, check)

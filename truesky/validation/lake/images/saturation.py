@@ -6,59 +6,81 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from lake_schema.arrays import Bool, Float
+from truesky.validation.lake.measure.frame_context import FrameCheck, FrameContext
 from truesky.validation.lake.measure.rows import Row, not_applicable
-from truesky.validation.lake.measure.seen import Check, Seen
-from truesky.validation.verdicts import LEAST, MOST
+from truesky.validation.verdicts import AT_LEAST, AT_MOST
 
 SOURCE = "part of a point's light in its brightest pixel, from the frame's own fainter stars; SATURATE of the header"
 # Times the full well from which a star must be full, and up to which it must not.
 _OVER, _UNDER = 2.5, 0.4
-_WRONG, _LEAST, _ALONE = 0.1, 5, 30.0
+_TOLERANCE, _MIN_STARS, _ISOLATION_RADIUS = 0.1, 5, 30.0
 
 
-def check(of: Seen) -> list[Row]:
+def check(context: FrameContext) -> list[Row]:
     """Parts of the stars, bright and fainter, that have a saturated pixel."""
-    assert of.measured is not None
-    stars = of.measured.stars
+    assert context.measurements is not None
+    stars = context.measurements.stars
     part = float(np.median(stars.peak / stars.flux))
-    expected, full = _alone(of)
+    expected, full = _isolated_stars(context)
     peak = expected * part
     out = []
-    for name, chosen, kind, told in (
-        ("bright_full", peak > _OVER * of.frame.full, LEAST, 1.0),
-        ("faint_full", (peak < _UNDER * of.frame.full) & (peak > 0.05 * of.frame.full), MOST, 0.0),
+    for name, chosen, kind, expected_share in (
+        ("bright_full", peak > _OVER * context.frame.saturation_level, AT_LEAST, 1.0),
+        (
+            "faint_full",
+            (peak < _UNDER * context.frame.saturation_level) & (peak > 0.05 * context.frame.saturation_level),
+            AT_MOST,
+            0.0,
+        ),
     ):
         n = int(chosen.sum())
-        if n >= _LEAST:
+        if n >= _MIN_STARS:
             value = float(full[chosen].mean())
             # Of a share, that of Agresti and Coull, which is not 0 where all are alike.
-            near = (full[chosen].sum() + 2.0) / (n + 4.0)
-            error = float(np.sqrt(near * (1.0 - near) / (n + 4.0)))
-            out.append(Row("saturation", name, of.place, value, error, told, _WRONG, "", SOURCE, kind, f"{n} stars"))
-    return out or [not_applicable("saturation", of.place, "too few stars near the full well", SOURCE)]
+            adjusted_share = (full[chosen].sum() + 2.0) / (n + 4.0)
+            error = float(np.sqrt(adjusted_share * (1.0 - adjusted_share) / (n + 4.0)))
+            out.append(
+                Row(
+                    "saturation",
+                    name,
+                    context.place,
+                    value,
+                    error,
+                    expected_share,
+                    _TOLERANCE,
+                    "",
+                    SOURCE,
+                    kind,
+                    f"{n} stars",
+                )
+            )
+    return out or [not_applicable("saturation", context.place, "too few stars near the full well", SOURCE)]
 
 
-def _alone(of: Seen) -> tuple[Float, Bool]:
+def _isolated_stars(context: FrameContext) -> tuple[Float, Bool]:
     """(expected e-, whether a pixel is saturated) of points that no brighter source is near."""
-    known, (ny, nx) = of.known, of.frame.electrons.shape
-    inside = known.point & (known.x > 8) & (known.x < nx - 9) & (known.y > 8) & (known.y < ny - 9)
-    index = np.flatnonzero(inside & (known.expected > 1e-3 * of.frame.full))
+    sources, (ny, nx) = context.sources, context.frame.electrons.shape
+    inside = sources.point & (sources.x > 8) & (sources.x < nx - 9) & (sources.y > 8) & (sources.y < ny - 9)
+    index = np.flatnonzero(inside & (sources.expected > 1e-3 * context.frame.saturation_level))
     if not index.size:
         return np.zeros(0), np.zeros(0, bool)
-    tree = cKDTree(np.stack([known.x, known.y], axis=1))
-    near = tree.query_ball_point(np.stack([known.x[index], known.y[index]], axis=1), _ALONE)
-    alone = [max(known.expected[j] for j in others) <= known.expected[i] for i, others in zip(index, near, strict=True)]
-    index = index[np.array(alone, bool)]
-    saturated = of.frame.saturated()
-    where = zip(np.rint(known.x[index]).astype(int), np.rint(known.y[index]).astype(int), strict=True)
-    full = [bool(saturated[y - 2 : y + 3, x - 2 : x + 3].any()) for x, y in where]
-    return known.expected[index], np.array(full, bool)
+    tree = cKDTree(np.stack([sources.x, sources.y], axis=1))
+    neighbours = tree.query_ball_point(np.stack([sources.x[index], sources.y[index]], axis=1), _ISOLATION_RADIUS)
+    is_isolated = [
+        max(sources.expected[j] for j in nearby) <= sources.expected[i]
+        for i, nearby in zip(index, neighbours, strict=True)
+    ]
+    index = index[np.array(is_isolated, bool)]
+    saturated = context.frame.saturated_pixels()
+    positions = zip(np.rint(sources.x[index]).astype(int), np.rint(sources.y[index]).astype(int), strict=True)
+    full = [bool(saturated[y - 2 : y + 3, x - 2 : x + 3].any()) for x, y in positions]
+    return sources.expected[index], np.array(full, bool)
 
 
-def _applies(of: Seen) -> str:
-    if of.measured is None:
+def _why_not_applicable(context: FrameContext) -> str:
+    if context.measurements is None:
         return "no direct image of the sky"
-    return "" if len(of.measured.stars) >= _LEAST else "too few stars to tell how peaked a point is"
+    return "" if len(context.measurements.stars) >= _MIN_STARS else "too few stars to tell how peaked a point is"
 
 
-SATURATION = Check("saturation", SOURCE, _applies, check)
+SATURATION = FrameCheck("saturation", SOURCE, _why_not_applicable, check)

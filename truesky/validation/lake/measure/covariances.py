@@ -17,39 +17,39 @@ _INNER = tuple((i, sign * j) for i, j in ((3, 1), (3, 2), (3, 3), (2, 3), (1, 3)
 _OUTER = tuple((2 * i, 2 * j) for i, j in _INNER)
 
 
-def own_variance(values: Array, kept: Bool, near: int) -> tuple[float, float]:
+def pixel_variance(values: Array, mask: Bool, reach: int) -> tuple[float, float]:
     """(variance of a pixel with what its neighbours have of it, its standard error from the scatter of the tiles).
 
     values : float[t, n, n];  kept : which of them count;  near : pixels to either side that share charge
     """
-    n = kept.sum(axis=(1, 2))
-    mean = (values * kept).sum(axis=(1, 2), dtype=float) / n
-    off = np.where(kept, values - mean[:, None, None], 0.0)
+    n = mask.sum(axis=(1, 2))
+    mean = (values * mask).sum(axis=(1, 2), dtype=float) / n
+    deviation = np.where(mask, values - mean[:, None, None], 0.0)
     row, column, inner, outer = (
-        np.mean([_covariance(off, kept, *lag) for lag in lags], 0) for lags in (_ROW, _COLUMN, _INNER, _OUTER)
+        np.mean([_covariance(deviation, mask, *lag) for lag in lags], 0) for lags in (_ROW, _COLUMN, _INNER, _OUTER)
     )
     # What is smooth falls with the square of the distance: so much higher is it where the pixels are nearer.
-    nearer = _square(_INNER) - 2.0 * near * (near + 1) / 3.0
-    smooth = inner + (inner - outer) * nearer / (_square(_OUTER) - _square(_INNER))
-    side = 2 * near + 1
+    nearer = _mean_square_distance(_INNER) - 2.0 * reach * (reach + 1) / 3.0
+    smooth = inner + (inner - outer) * nearer / (_mean_square_distance(_OUTER) - _mean_square_distance(_INNER))
+    side = 2 * reach + 1
     # Each stands for that on the other side of the pixel, too.
-    half = [(i, j) for i in range(near + 1) for j in range(-near, near + 1) if i > 0 or j > 0]
-    total = _covariance(off, kept, 0, 0) + 2.0 * np.sum([_covariance(off, kept, *lag) for lag in half], 0)
-    own = total - side * (row - inner) - side * (column - inner) - side**2 * smooth
+    half = [(i, j) for i in range(reach + 1) for j in range(-reach, reach + 1) if i > 0 or j > 0]
+    total = _covariance(deviation, mask, 0, 0) + 2.0 * np.sum([_covariance(deviation, mask, *lag) for lag in half], 0)
+    tile_variance = total - side * (row - inner) - side * (column - inner) - side**2 * smooth
     weight = n / n.sum()
-    value = float((weight * own).sum())
-    return value, float(np.sqrt((weight**2 * (own - value) ** 2).sum()))
+    value = float((weight * tile_variance).sum())
+    return value, float(np.sqrt((weight**2 * (tile_variance - value) ** 2).sum()))
 
 
-def _square(lags: Sequence[tuple[int, int]]) -> float:
+def _mean_square_distance(lags: Sequence[tuple[int, int]]) -> float:
     """Mean square of the distance."""
     return float(np.mean([i**2 + j**2 for i, j in lags]))
 
 
-def _covariance(off: Float, kept: Bool, down: int, across: int) -> Float:
+def _covariance(deviation: Float, mask: Bool, down: int, across: int) -> Float:
     """float[t] of pixels that lie so many rows and columns apart; down is not negative."""
-    ny, nx = off.shape[1:]
+    ny, nx = deviation.shape[1:]
     first = (slice(None), slice(0, ny - down), slice(max(-across, 0), nx - max(across, 0)))
     second = (slice(None), slice(down, ny), slice(max(across, 0), nx - max(-across, 0)))
-    pairs = np.count_nonzero(kept[first] & kept[second], axis=(1, 2))
-    return np.asarray(np.einsum("tij,tij->t", off[first], off[second]) / np.maximum(pairs, 1))
+    pairs = np.count_nonzero(mask[first] & mask[second], axis=(1, 2))
+    return np.asarray(np.einsum("tij,tij->t", deviation[first], deviation[second]) / np.maximum(pairs, 1))

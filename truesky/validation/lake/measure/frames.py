@@ -24,18 +24,18 @@ from lake_schema.fits import images
 
 _SECTION = re.compile(r"\[(\d+):(\d+),(\d+):(\d+)\]")
 # Of a system on the sky; distortions as SIP or TPV.
-_PLACE = re.compile(
+_WCS_KEYWORD = re.compile(
     r"(CTYPE|CRVAL|CRPIX|CUNIT|CDELT)[12]|(CD|PC)[12]_[12]|PV\d_\d+|[AB]P?_(ORDER|\d_\d)|LONPOLE|LATPOLE|RADESYS"
 )
 # How the plane of a ramp's chi^2 ends its name.
 _QUALITY = ".CHI2"
 _FLAGS = "QUALFLAG"
 # Of a header that is not sure of its place (FITS, paper I); the true one is then in the .head file beside it.
-_UNSURE = "CSYER1"
+_UNCERTAIN_POINTING = "CSYER1"
 # Overscan columns next to the pixels that are left out: charge that traps gave back is in them.
 _SKIPPED = 0.5
 # Differences of neighbours in the overscan that are no noise, in units of their spread.
-_FAR = 5.0
+_CLIP = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,13 +52,13 @@ class Amplifier:
     gain: float
     level: float
     noise: float
-    told: float
+    header_read_noise: float
     samples: int
-    full: float
+    saturation_level: float
 
 
 @dataclass(frozen=True, slots=True)
-class Curve:
+class NonlinearityCurve:
     """How an amplifier falls behind: s = n / (1 + high n / range), of which low * knee (1 - exp(-s / knee)) is missing.
 
     high, low : parts of the signal, at the converter's range and of the first electrons;  knee : e-
@@ -70,12 +70,12 @@ class Curve:
     knee: float = 2000.0
     range: float = 65535.0
 
-    def light(self, read: Float, most: float) -> Float:
+    def linearize(self, read: Float, max_signal: float) -> Float:
         """Electrons [..] of what was read; most : e- of the converter's range."""
         signal = np.asarray(read, float)
         for _ in range(3):
             signal = read - self.low * self.knee * np.expm1(-np.maximum(signal, 0.0) / self.knee)
-        return np.where(signal > 0.0, signal / np.maximum(1.0 - self.high * signal / most, 0.1), signal)
+        return np.where(signal > 0.0, signal / np.maximum(1.0 - self.high * signal / max_signal, 0.1), signal)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,9 +86,9 @@ class Instrument:
     bowl     : part of the light that the optics keep from the corner of the focal plane
     """
 
-    curve: Curve = Curve()
-    bowl: float = 0.0
-    response: float = 0.0
+    curve: NonlinearityCurve = NonlinearityCurve()
+    vignetting: float = 0.0
+    pixel_response_rms: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,16 +111,16 @@ class Frame:
 
     def illumination(self, x: Float, y: Float) -> Float:
         """What of the light the optics bring to places [n] in pixels: 1 - bowl r^2, r = 1 at the corner of DETSIZE."""
-        if self.instrument.bowl == 0.0:
+        if self.instrument.vignetting == 0.0:
             return np.ones(len(x))
         wide, high = (axis.stop - axis.start for axis in section(self.header["DETSIZE"]))
         across, up = x + 1.0 - self.wcs.wcs.crpix[0], y + 1.0 - self.wcs.wcs.crpix[1]
-        return np.asarray(1.0 - self.instrument.bowl * (across**2 + up**2) / (0.25 * (wide**2 + high**2)))
+        return np.asarray(1.0 - self.instrument.vignetting * (across**2 + up**2) / (0.25 * (wide**2 + high**2)))
 
-    def light(self, read: Float) -> Float:
+    def linearize(self, read: Float) -> Float:
         """e- [..] that were collected where so many were read."""
-        most = self.instrument.curve.range * float(np.mean([amplifier.gain for amplifier in self.amplifiers]))
-        return self.instrument.curve.light(read, most)
+        max_signal = self.instrument.curve.range * float(np.mean([amplifier.gain for amplifier in self.amplifiers]))
+        return self.instrument.curve.linearize(read, max_signal)
 
     @property
     def seconds(self) -> float:
@@ -132,19 +132,19 @@ class Frame:
         return float(self.header["PIXSCALE"])
 
     @property
-    def full(self) -> float:
+    def saturation_level(self) -> float:
         """e- of the lowest saturated pixel of all amplifiers."""
-        return min(amplifier.full for amplifier in self.amplifiers)
+        return min(amplifier.saturation_level for amplifier in self.amplifiers)
 
-    def saturated(self) -> Bool:
+    def saturated_pixels(self) -> Bool:
         """bool[ny, nx]"""
         out = np.zeros(self.electrons.shape, bool)
         for amplifier in self.amplifiers:
-            out[amplifier.pixels] = self.electrons[amplifier.pixels] >= amplifier.full
+            out[amplifier.pixels] = self.electrons[amplifier.pixels] >= amplifier.saturation_level
         return out
 
 
-def opened(path: Path, instrument: Instrument | None = None) -> Frame:
+def open_frame(path: Path, instrument: Instrument | None = None) -> Frame:
     """A science file.
 
     path : of it;  instrument : that took it, as the lake's mission database has it; None = linear and even
@@ -170,24 +170,24 @@ def _frame(units: Sequence[images.Image], path: Path) -> Frame:
         electrons[ccd] = (data - np.float32(amplifier.level)) * np.float32(amplifier.gain)
         amplifiers.append(amplifier)
     quality = next((unit for unit in planes if unit.name.endswith(_QUALITY)), None)
-    own = {} if quality is None else _header(quality)
-    found = None if quality is None else np.asarray(quality.data)[section(own["DATASEC"])]
+    quality_header = {} if quality is None else _header(quality)
+    quality_plane = None if quality is None else np.asarray(quality.data)[section(quality_header["DATASEC"])]
     # What the plane is stands in its own header.
-    first |= {_FLAGS: own[_FLAGS]} if _FLAGS in own else {}
-    return Frame(electrons, tuple(amplifiers), found, first, _wcs(_header(signal[0]), path, first))
+    first |= {_FLAGS: quality_header[_FLAGS]} if _FLAGS in quality_header else {}
+    return Frame(electrons, tuple(amplifiers), quality_plane, first, _wcs(_header(signal[0]), path, first))
 
 
 def _header(unit: images.Image) -> dict[str, Any]:
     return {key: value for key, value, _ in unit.cards} | ({"EXTNAME": unit.name} if unit.name else {})
 
 
-_Part = tuple[tuple[slice, slice], Array, Array | None, Mapping[str, Any], str]
+_AmplifierData = tuple[tuple[slice, slice], Array, Array | None, Mapping[str, Any], str]
 
 
-def _parts(header: dict[str, Any], array: Array) -> list[_Part]:
+def _parts(header: dict[str, Any], array: Array) -> list[_AmplifierData]:
     """Of an array: where its pixels are on the detector, the pixels, columns of bias, cards, the amplifier's name."""
     if "NAMPS" in header:
-        return [_lettered(header, array, n) for n in range(1, int(header["NAMPS"]) + 1)]
+        return [_numbered_amplifier(header, array, n) for n in range(1, int(header["NAMPS"]) + 1)]
     ny, nx = array.shape
     data = section(header["DATASEC"]) if "DATASEC" in header else (slice(0, ny), slice(0, nx))
     size = [axis.stop - axis.start for axis in data]
@@ -196,32 +196,32 @@ def _parts(header: dict[str, Any], array: Array) -> list[_Part]:
     return [(ccd, array[data], bias, header, str(header.get("EXTNAME", "")))]
 
 
-def _lettered(header: dict[str, Any], array: Array, n: int) -> _Part:
+def _numbered_amplifier(header: dict[str, Any], array: Array, n: int) -> _AmplifierData:
     """Amplifier n of several in one array."""
-    own = {**header, "GAIN": header[f"GAIN{n}"]}
+    cards = {**header, "GAIN": header[f"GAIN{n}"]}
     if f"RDN{n}" in header and header.get("RDNDRAWN", 1.0) > 0.0:
-        own["RDNDRAWN"] = header[f"RDN{n}"]
+        cards["RDNDRAWN"] = header[f"RDN{n}"]
     bias = array[section(header[f"BSEC{n}"])]
     place = section(header[f"CSEC{n}"])
-    return place, array[section(header[f"DSEC{n}"])], bias if bias.size else None, own, str(header[f"AMP{n}"])
+    return place, array[section(header[f"DSEC{n}"])], bias if bias.size else None, cards, str(header[f"AMP{n}"])
 
 
 def _amplifier(name: str, ccd: tuple[slice, slice], bias: Array | None, cards: Mapping[str, Any]) -> Amplifier:
-    gain, told = float(cards["GAIN"]), float(cards["RDNDRAWN"])
+    gain, read_noise = float(cards["GAIN"]), float(cards["RDNDRAWN"])
     level, noise, samples = float(cards.get("BIAS", 0.0)), np.nan, 0
     if bias is not None:
         # Of whichever side the pixels are on, the middle half is farthest from what follows them.
         cut = int(0.5 * _SKIPPED * bias.shape[1])
-        kept = bias[:, cut : bias.shape[1] - cut].astype(float)
-        level = float(kept.mean())
+        overscan = bias[:, cut : bias.shape[1] - cut].astype(float)
+        level = float(overscan.mean())
         # Rows and columns have offsets of their own.
-        step = np.diff(np.diff(kept, axis=1), axis=0)
+        step = np.diff(np.diff(overscan, axis=1), axis=0)
         # But for what a cosmic ray left behind.
-        step = step[np.abs(step) < _FAR * 1.4826 * max(float(np.median(np.abs(step))), 1.0)]
+        step = step[np.abs(step) < _CLIP * 1.4826 * max(float(np.median(np.abs(step))), 1.0)]
         noise = float(np.std(step) / 2.0) * gain if step.size else np.nan
-        samples = kept.size
-    full = (float(cards["SATURATE"]) - (level if cards.get("BUNIT", "adu") != "electron" else 0.0)) * gain
-    return Amplifier(name, ccd, gain, level, noise, told, samples, full)
+        samples = overscan.size
+    saturation_level = (float(cards["SATURATE"]) - (level if cards.get("BUNIT", "adu") != "electron" else 0.0)) * gain
+    return Amplifier(name, ccd, gain, level, noise, read_noise, samples, saturation_level)
 
 
 def section(text: str) -> tuple[slice, slice]:
@@ -236,23 +236,23 @@ def section(text: str) -> tuple[slice, slice]:
 def _wcs(header: dict[str, Any], path: Path, first: Mapping[str, Any]) -> WCS:
     """Of the detector's pixels: what stands before them in the array is taken off; true where the header is unsure."""
     cards = header if "CTYPE1" in header else first
-    beside = path.with_suffix(".head")
-    if (_UNSURE in header or _UNSURE in first) and beside.is_file():
-        lines = beside.read_text("ascii").split("END\n")[0]
-        cards = {key: value for key, value, _ in images.cards_of_text(lines)}
-    kept = {key: value for key, value in cards.items() if _PLACE.fullmatch(key)}
-    whole = {**first, **header}
-    names = ("DSEC1", "CSEC1") if "DSEC1" in whole else ("DATASEC", "CCDSEC")
-    if all(name in whole for name in names):
-        (dy, dx), (cy, cx) = (section(whole[name]) for name in names)
-        kept["CRPIX1"] -= dx.start - cx.start
-        kept["CRPIX2"] -= dy.start - cy.start
+    head_file = path.with_suffix(".head")
+    if (_UNCERTAIN_POINTING in header or _UNCERTAIN_POINTING in first) and head_file.is_file():
+        lines = head_file.read_text("ascii").split("END\n")[0]
+        cards = {key: value for key, value, _ in images.cards_from_text(lines)}
+    wcs_cards = {key: value for key, value in cards.items() if _WCS_KEYWORD.fullmatch(key)}
+    all_cards = {**first, **header}
+    names = ("DSEC1", "CSEC1") if "DSEC1" in all_cards else ("DATASEC", "CCDSEC")
+    if all(name in all_cards for name in names):
+        (dy, dx), (cy, cx) = (section(all_cards[name]) for name in names)
+        wcs_cards["CRPIX1"] -= dx.start - cx.start
+        wcs_cards["CRPIX2"] -= dy.start - cy.start
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FITSFixedWarning)
-        return WCS(kept)
+        return WCS(wcs_cards)
 
 
-def pixels_of(wcs: WCS, ra: Float, dec: Float) -> tuple[Float, Float]:
+def sky_to_pixel(wcs: WCS, ra: Float, dec: Float) -> tuple[Float, Float]:
     """Columns and rows [n] of places, from 0; deg."""
     if not len(ra):
         return np.zeros(0), np.zeros(0)

@@ -13,7 +13,7 @@ from truesky.numerics.compiling import exact_jit
 
 
 @exact_jit
-def discs(x: Float, y: Float, radius: Float, out: Bool) -> None:
+def mark_discs(x: Float, y: Float, radius: Float, out: Bool) -> None:
     """Mark pixels within a radius of places.
 
     x, y   : [n] pixels, no disc where either is not finite
@@ -32,17 +32,17 @@ def discs(x: Float, y: Float, radius: Float, out: Bool) -> None:
                 out[row, column] = True
 
 
-def grown(mask: Bool, corners: bool = False, times: int = 1) -> Bool:
+def dilate(mask: Bool, corners: bool = False, times: int = 1) -> Bool:
     """bool[.., ny, nx]: binary dilation by the neighbours along rows and columns.
 
     corners : diagonal neighbours, too;  times : number of iterations
     """
     out = mask.copy()
     for _ in range(times):
-        before = out.copy()
-        out[..., 1:, :] |= before[..., :-1, :]
-        out[..., :-1, :] |= before[..., 1:, :]
-        across = out.copy() if corners else before
+        previous = out.copy()
+        out[..., 1:, :] |= previous[..., :-1, :]
+        out[..., :-1, :] |= previous[..., 1:, :]
+        across = out.copy() if corners else previous
         out[..., 1:] |= across[..., :-1]
         out[..., :-1] |= across[..., 1:]
     return out

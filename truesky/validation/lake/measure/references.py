@@ -37,22 +37,22 @@ class Catalogue:
     flux_id: Int
     fluxes: dict[str, Float]
 
-    def seen(self, ids: Int, mjd: float) -> tuple[Float, Float]:
+    def positions_at(self, ids: Int, mjd: float) -> tuple[Float, Float]:
         """Where stars are at a time, deg [n]; NaN of what is not in the catalogue."""
         if not self.id.size:
             return np.full(len(ids), np.nan), np.full(len(ids), np.nan)
-        at, known = _find(self.id, ids)
+        at, is_known = _find(self.id, ids)
         years = _JULIAN_2000 + (mjd - _MJD_2000) / _YEAR - EPOCH
         dec = self.dec[at] + years * self.pm_dec[at] / _MAS_A_DEG
         ra = self.ra[at] + years * self.pm_ra[at] / _MAS_A_DEG / np.cos(np.radians(self.dec[at]))
-        return np.where(known, ra, np.nan), np.where(known, dec, np.nan)
+        return np.where(is_known, ra, np.nan), np.where(is_known, dec, np.nan)
 
     def magnitudes(self, ids: Int, band: str) -> Float:
         """AB [n]; NaN of what is not there."""
         if band not in self.fluxes or not self.flux_id.size:
             return np.full(len(ids), np.nan)
-        at, known = _find(self.flux_id, ids)
-        flux = np.where(known, self.fluxes[band][at], np.nan)
+        at, is_known = _find(self.flux_id, ids)
+        flux = np.where(is_known, self.fluxes[band][at], np.nan)
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(ZERO - 2.5 * np.log10(flux))
 
@@ -80,48 +80,56 @@ class Reference:
         return len(self.id)
 
 
-def catalogue(tables: Mapping[str, read.Version], ids: Int, bands: Sequence[str]) -> Catalogue:
+def load_catalogue(tables: Mapping[str, read.Version], ids: Int, bands: Sequence[str]) -> Catalogue:
     """Of the stars that a lake's frames show; what the lake has no table of is left empty.
 
     tables : of the lake, by name;  ids : that are wanted, ascending;  bands : whose fluxes are wanted
     """
-    none = np.zeros(0)
-    columns = {name: none for name in ("id", "ra", "dec", "pm_ra", "pm_dec")}
+    empty = np.zeros(0)
+    columns = {name: empty for name in ("id", "ra", "dec", "pm_ra", "pm_dec")}
     if (stars := tables.get("stars")) is not None:
-        wanted = [name for name in columns if name in stars.schema.names]
-        rows = _sorted(stars.rows(wanted, where=pc.field("id").isin(pa.array(ids))))
+        star_columns = [name for name in columns if name in stars.schema.names]
+        rows = _sort_by_id(stars.rows(star_columns, where=pc.field("id").isin(pa.array(ids))))
         columns = {name: np.zeros(len(rows)) for name in columns} | {
-            name: pc.fill_null(rows[name], 0).to_numpy() for name in wanted
+            name: pc.fill_null(rows[name], 0).to_numpy() for name in star_columns
         }
-    fluxes = pa.table({"id": none})
+    fluxes = pa.table({"id": empty})
     if (table := tables.get("star_fluxes")) is not None:
-        kept = [f"f_nu_{band}" for band in bands if f"f_nu_{band}" in table.schema.names]
-        fluxes = _sorted(table.rows(["id", *kept], where=pc.field("id").isin(pa.array(ids))))
+        flux_columns = [f"f_nu_{band}" for band in bands if f"f_nu_{band}" in table.schema.names]
+        fluxes = _sort_by_id(table.rows(["id", *flux_columns], where=pc.field("id").isin(pa.array(ids))))
     ra, dec, pm_ra, pm_dec = (np.asarray(columns[name], float) for name in ("ra", "dec", "pm_ra", "pm_dec"))
-    own = {band: f"f_nu_{band}" for band in bands if f"f_nu_{band}" in fluxes.schema.names}
+    band_columns = {band: f"f_nu_{band}" for band in bands if f"f_nu_{band}" in fluxes.schema.names}
     return Catalogue(
         np.asarray(columns["id"], np.int64), ra, dec, pm_ra, pm_dec, np.asarray(fluxes["id"].to_numpy(), np.int64),
-        {band: fluxes[name].to_numpy().astype(float) for band, name in own.items()},
+        {band: fluxes[name].to_numpy().astype(float) for band, name in band_columns.items()},
     )  # fmt: skip
 
 
-def reference(truth: pa.Table, known: Catalogue, band: str, mjd: float) -> Reference:
+def build_reference(truth: pa.Table, catalogue: Catalogue, band: str, mjd: float) -> Reference:
     """Of one frame: truth : its rows of `rendered_truth`;  known : of the lake;  band, mjd : of the exposure."""
     ids = truth["id"].to_numpy()
-    own = {name: pc.fill_null(truth[name], np.nan).to_numpy() for name in ("psf_x", "psf_y")}
-    ra, dec = known.seen(ids, mjd)
+    psf_offsets = {name: pc.fill_null(truth[name], np.nan).to_numpy() for name in ("psf_x", "psf_y")}
+    ra, dec = catalogue.positions_at(ids, mjd)
     return Reference(
-        ids, truth["x"].to_numpy(), truth["y"].to_numpy(), truth["expected"].to_numpy(),
-        truth["method"].to_numpy() == POINT, own["psf_x"], own["psf_y"], ra, dec, known.magnitudes(ids, band),
-    )  # fmt: skip
+        ids,
+        truth["x"].to_numpy(),
+        truth["y"].to_numpy(),
+        truth["expected"].to_numpy(),
+        truth["method"].to_numpy() == POINT,
+        psf_offsets["psf_x"],
+        psf_offsets["psf_y"],
+        ra,
+        dec,
+        catalogue.magnitudes(ids, band),
+    )
 
 
-def _sorted(rows: pa.Table) -> pa.Table:
+def _sort_by_id(rows: pa.Table) -> pa.Table:
     return rows.sort_by("id")
 
 
-def _find(own: Array, ids: Int) -> tuple[Int, Bool]:
-    if not len(own):
+def _find(sorted_ids: Array, ids: Int) -> tuple[Int, Bool]:
+    if not len(sorted_ids):
         return np.zeros(0, np.int64), np.zeros(len(ids), bool)
-    at = np.minimum(np.searchsorted(own, ids), len(own) - 1)
-    return at, own[at] == ids
+    at = np.minimum(np.searchsorted(sorted_ids, ids), len(sorted_ids) - 1)
+    return at, sorted_ids[at] == ids

@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 
 from truesky.validation.checks import Check
-from truesky.validation.verdicts import AROUND, NOT_APPLICABLE, verdict
+from truesky.validation.verdicts import NOT_APPLICABLE, WITHIN, verdict
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,10 +51,10 @@ class Row:
     tolerance: float
     unit: str
     source: str
-    kind: str = AROUND
+    kind: str = WITHIN
     note: str = ""
     applies: bool = True
-    known: str = ""
+    known_failure: str = ""
 
     @property
     def verdict(self) -> str:
@@ -93,9 +93,19 @@ def row_of_check(name: str, check: Check, error: float, note: str) -> Row:
     Row
         Its verdict is undecided if the expectation is remembered.
     """
-    sure = error if check.gates else math.nan
-    about = "" if check.gates else "a remembered number: it decides nothing"
+    row_error = error if check.is_binding else math.nan
+    default_note = "" if check.is_binding else "a remembered number: it decides nothing"
     return Row(
-        name, check.name, Place(), check.found, sure, check.expected, check.tolerance, "", check.source, check.kind,
-        note or about, known=check.known,
-    )  # fmt: skip
+        name,
+        check.name,
+        Place(),
+        check.value,
+        row_error,
+        check.expected,
+        check.tolerance,
+        "",
+        check.source,
+        check.kind,
+        note or default_note,
+        known_failure=check.known_failure,
+    )

@@ -16,147 +16,157 @@ from matplotlib.figure import Figure
 from lake_schema.arrays import Float
 from truesky.validation.lake.measure.rows import Row
 
-_INK, _OTHERS = "#1f4e79", ("#1f4e79", "#b8541a", "#2e7d4f")
+_INK, _PALETTE = "#1f4e79", ("#1f4e79", "#b8541a", "#2e7d4f")
 _COUNT = re.compile(r"log_i_([0-9.]+)")
-_LEFT = "Errors leave out patches of the field in turn"
+_ERROR_NOTE = "Errors leave out patches of the field in turn"
 
 
-def drawn(rows: Sequence[Row], series: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
+def draw_all(rows: Sequence[Row], series: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
     """Of the rows and the series of all checks of catalogues."""
     counts = [row for row in rows if row.check == "observed" and _COUNT.fullmatch(row.quantity)]
     counts = [row for row in counts if np.isfinite(row.value)]
     if counts:
-        yield f"galaxies: counts against magnitude, and those of {counts[0].source}. {_LEFT}.", _counts(counts)
+        yield (
+            f"galaxies: counts against magnitude, and those of {counts[0].source}. {_ERROR_NOTE}.",
+            _plot_counts(counts),
+        )
     if "redshifts" in series and "colours" in series:
         text = "galaxies: redshifts of those with I_E < 24.5, and colours of those with i < 22.5 against redshift"
-        yield f"{text}. {_LEFT}.", _redshifts(series)
+        yield f"{text}. {_ERROR_NOTE}.", _plot_redshifts(series)
     if "colour_colour" in series:
         text = "galaxies: colours of the fluxes of those brighter than 23 at 5600 A and nearer than z = 1.5"
-        yield f"{text}; the line is where red ones at z < 0.4 are observed (Eisenstein et al. 2001).", _colours(series)
+        yield (
+            f"{text}; the line is where red ones at z < 0.4 are observed (Eisenstein et al. 2001).",
+            _plot_colours(series),
+        )
     limits = [name.removeprefix("w_theory_") for name in series if name.startswith("w_theory_")]
     if limits:
         text = "galaxies: how they cluster on the sky, and non-linear theory with the bias of their halos"
-        yield f"{text}. {_LEFT}.", _clustering(series, limits)
+        yield f"{text}. {_ERROR_NOTE}.", _plot_clustering(series, limits)
     if "shear" in series:
         text = "galaxies: two points of shear at 0.8 < z < 1.2, and non-linear theory"
-        yield f"{text}. {_LEFT}; neighbouring points are not independent.", _shear(series)
+        yield f"{text}. {_ERROR_NOTE}; neighbouring points are not independent.", _plot_shear(series)
 
 
-def _counts(rows: Sequence[Row]) -> Figure:
+def _plot_counts(rows: Sequence[Row]) -> Figure:
     figure = Figure(figsize=(10.0, 4.0), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    left_axes, right_axes = figure.subplots(1, 2)
     mag = np.array([float(match[1]) for row in rows if (match := _COUNT.fullmatch(row.quantity))])
-    value, error, wanted, half = (
+    value, error, expected, tolerance = (
         np.array([getattr(row, name) for row in rows]) for name in ("value", "error", "expected", "tolerance")
     )
     error = np.nan_to_num(error)
-    for axis, zero in ((left, 0.0), (right, wanted)):
-        axis.fill_between(mag, wanted - half - zero, wanted + half - zero, color="k", alpha=0.12, lw=0)
-        axis.plot(mag, wanted - zero, "k-", lw=1, label="observed, and its tolerance")
+    for axis, zero in ((left_axes, 0.0), (right_axes, expected)):
+        axis.fill_between(mag, expected - tolerance - zero, expected + tolerance - zero, color="k", alpha=0.12, lw=0)
+        axis.plot(mag, expected - zero, "k-", lw=1, label="observed, and its tolerance")
         axis.errorbar(mag, value - zero, error, fmt="o", ms=4, color=_INK, capsize=2, label="this lake")
         axis.set_xlabel("i, AB mag")
-    left.set_ylabel("log$_{10}$ of galaxies mag$^{-1}$ deg$^{-2}$")
-    right.set_ylabel("the same less that observed, dex")
-    left.legend()
+    left_axes.set_ylabel("log$_{10}$ of galaxies mag$^{-1}$ deg$^{-2}$")
+    right_axes.set_ylabel("the same less that observed, dex")
+    left_axes.legend()
     return figure
 
 
-def _redshifts(series: Mapping[str, Any]) -> Figure:
+def _plot_redshifts(series: Mapping[str, Any]) -> Figure:
     figure = Figure(figsize=(10.0, 4.0), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    left_axes, right_axes = figure.subplots(1, 2)
     low, high, number, error = series["redshifts"]
     middle = 0.5 * (low + high)
-    left.stairs(number, np.append(low, high[-1]), color=_INK, label="this lake")
-    left.errorbar(middle, number, np.nan_to_num(error), fmt="none", ecolor=_INK, capsize=2, lw=1)
+    left_axes.stairs(number, np.append(low, high[-1]), color=_INK, label="this lake")
+    left_axes.errorbar(middle, number, np.nan_to_num(error), fmt="none", ecolor=_INK, capsize=2, lw=1)
     # The distribution that forecasts of Euclid take: a median of 0.9.
     z = np.linspace(0.0, float(high[-1]), 200)
     shape = z**2 * np.exp(-((z * 1.412 / 0.9) ** 1.5))
-    whole = float(np.sum(number * (high - low)))
-    left.plot(z, shape * whole / np.trapezoid(shape, z), "k--", lw=1, label="z$^2$ exp(-(z/z$_0$)$^{1.5}$), median 0.9")
-    left.set(xlabel="redshift", ylabel="galaxies with I$_E$ < 24.5, arcmin$^{-2}$ per unit z", xlim=(0, high[-1]))
-    left.set_ylim(bottom=0.0)
-    left.legend()
+    total = float(np.sum(number * (high - low)))
+    left_axes.plot(
+        z, shape * total / np.trapezoid(shape, z), "k--", lw=1, label="z$^2$ exp(-(z/z$_0$)$^{1.5}$), median 0.9"
+    )
+    left_axes.set(xlabel="redshift", ylabel="galaxies with I$_E$ < 24.5, arcmin$^{-2}$ per unit z", xlim=(0, high[-1]))
+    left_axes.set_ylim(bottom=0.0)
+    left_axes.legend()
     at, *levels = series["colours"]
-    right.fill_between(at, levels[0], levels[4], color=_INK, alpha=0.15, lw=0, label="5 to 95 %")
-    right.fill_between(at, levels[1], levels[3], color=_INK, alpha=0.3, lw=0, label="16 to 84 %")
-    right.errorbar(at, levels[2], np.nan_to_num(levels[5]), fmt="o-", ms=3, lw=1, color=_INK, label="median")
-    right.set(xlabel="redshift", ylabel="r - i of LSST, mag, of galaxies with i < 22.5")
-    right.legend()
+    right_axes.fill_between(at, levels[0], levels[4], color=_INK, alpha=0.15, lw=0, label="5 to 95 %")
+    right_axes.fill_between(at, levels[1], levels[3], color=_INK, alpha=0.3, lw=0, label="16 to 84 %")
+    right_axes.errorbar(at, levels[2], np.nan_to_num(levels[5]), fmt="o-", ms=3, lw=1, color=_INK, label="median")
+    right_axes.set(xlabel="redshift", ylabel="r - i of LSST, mag, of galaxies with i < 22.5")
+    right_axes.legend()
     return figure
 
 
-def _colours(series: Mapping[str, Any]) -> Figure:
+def _plot_colours(series: Mapping[str, Any]) -> Figure:
     figure = Figure(figsize=(10.0, 4.5), layout="constrained")
     axis, edges = figure.subplots(), series["colour_edges"]
     number = np.ma.masked_equal(series["colour_colour"].T, 0.0)
-    drawn = axis.pcolormesh(edges, edges, number, norm=LogNorm(), cmap="Blues", rasterized=True)
-    figure.colorbar(drawn, label="galaxies in 0.033 mag by 0.033 mag")
+    mesh = axis.pcolormesh(edges, edges, number, norm=LogNorm(), cmap="Blues", rasterized=True)
+    figure.colorbar(mesh, label="galaxies in 0.033 mag by 0.033 mag")
     gr = np.array([1.0, 1.7])
-    axis.plot(gr, gr / 4.0 + 0.18, "-", color=_OTHERS[1], lw=1.5, label="r - i = (g - r) / 4 + 0.18")
+    axis.plot(gr, gr / 4.0 + 0.18, "-", color=_PALETTE[1], lw=1.5, label="r - i = (g - r) / 4 + 0.18")
     axis.set(xlabel="g - r, AB mag of LSST", ylabel="r - i, AB mag of LSST", xlim=(-0.5, 2.3), ylim=(-0.4, 1.6))
     axis.legend(loc="upper left")
     return figure
 
 
-def _clustering(series: Mapping[str, Any], limits: Sequence[str]) -> Figure:
+def _plot_clustering(series: Mapping[str, Any], limits: Sequence[str]) -> Figure:
     figure = Figure(figsize=(10.0, 4.5), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    for limit, color in zip(limits, _OTHERS, strict=False):
-        theta, w, error, wanted = series[f"w_{limit}"]
+    left_axes, right_axes = figure.subplots(1, 2)
+    for limit, color in zip(limits, _PALETTE, strict=False):
+        theta, w, error, w_theory = series[f"w_{limit}"]
         curve, expected = series[f"w_theory_{limit}"]
         shift = 1.0 + 0.04 * limits.index(limit)
-        _bars(left, theta, w, error, color, f"I$_E$ < {limit}")
-        left.plot(curve, expected, "-", lw=1, color=color)
-        right.errorbar(theta * shift, w / wanted, np.nan_to_num(error / wanted), fmt="o", ms=4, color=color, capsize=2)
-    left.set(xscale="log", yscale="log", xlabel="separation, arcmin", ylabel="w")
-    _plain(left)
-    left.plot([], [], "-", lw=1, color="0.4", label="theory")
-    left.legend()
-    _ratio(right, "w over theory", 0.5)
+        _plot_points(left_axes, theta, w, error, color, f"I$_E$ < {limit}")
+        left_axes.plot(curve, expected, "-", lw=1, color=color)
+        right_axes.errorbar(
+            theta * shift, w / w_theory, np.nan_to_num(error / w_theory), fmt="o", ms=4, color=color, capsize=2
+        )
+    left_axes.set(xscale="log", yscale="log", xlabel="separation, arcmin", ylabel="w")
+    _plain_ticks(left_axes)
+    left_axes.plot([], [], "-", lw=1, color="0.4", label="theory")
+    left_axes.legend()
+    _format_ratio_axes(right_axes, "w over theory", 0.5)
     return figure
 
 
-def _shear(series: Mapping[str, Any]) -> Figure:
+def _plot_shear(series: Mapping[str, Any]) -> Figure:
     figure = Figure(figsize=(10.0, 4.5), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    left_axes, right_axes = figure.subplots(1, 2)
     theta, plus, minus, cross, *errors = series["shear"]
     curve, *expected = series["shear_theory"]
-    for name, value, error, wanted, color in zip(
-        ("$\\xi_+$", "$\\xi_-$"), (plus, minus), errors, expected, _OTHERS, strict=False
+    for name, value, error, prediction, color in zip(
+        ("$\\xi_+$", "$\\xi_-$"), (plus, minus), errors, expected, _PALETTE, strict=False
     ):
-        _bars(left, theta, value, error, color, name)
-        left.plot(curve, wanted, "-", lw=1, color=color)
-    left.plot([], [], "-", lw=1, color="0.4", label="theory")
-    left.set(xscale="log", yscale="log", xlabel="separation, arcmin", ylabel="$\\xi$")
-    _plain(left)
-    left.legend()
-    right.axhline(0.0, lw=0.8, color="k")
-    right.errorbar(theta, cross / plus, np.nan_to_num(errors[2] / plus), fmt="o", ms=4, color=_INK, capsize=2)
-    right.axhspan(-0.1, 0.1, color="k", alpha=0.08)
-    right.set(xscale="log", xlabel="separation, arcmin", ylabel="cross component / $\\xi_+$", ylim=(-0.3, 0.3))
-    _plain(right)
+        _plot_points(left_axes, theta, value, error, color, name)
+        left_axes.plot(curve, prediction, "-", lw=1, color=color)
+    left_axes.plot([], [], "-", lw=1, color="0.4", label="theory")
+    left_axes.set(xscale="log", yscale="log", xlabel="separation, arcmin", ylabel="$\\xi$")
+    _plain_ticks(left_axes)
+    left_axes.legend()
+    right_axes.axhline(0.0, lw=0.8, color="k")
+    right_axes.errorbar(theta, cross / plus, np.nan_to_num(errors[2] / plus), fmt="o", ms=4, color=_INK, capsize=2)
+    right_axes.axhspan(-0.1, 0.1, color="k", alpha=0.08)
+    right_axes.set(xscale="log", xlabel="separation, arcmin", ylabel="cross component / $\\xi_+$", ylim=(-0.3, 0.3))
+    _plain_ticks(right_axes)
     return figure
 
 
-def _bars(axis: Any, x: Float, y: Float, error: Float, color: str, label: str) -> None:
+def _plot_points(axis: Any, x: Float, y: Float, error: Float, color: str, label: str) -> None:
     """Points on logarithmic axes; open ones below 0, at what they would be above."""
     for sign, fill in ((1.0, color), (-1.0, "none")):
-        own = sign * y > 0.0
-        if own.any():
-            bar = np.nan_to_num(error[own])
+        has_sign = sign * y > 0.0
+        if has_sign.any():
+            bar = np.nan_to_num(error[has_sign])
             # A bar that reaches below 0 ends near the axis.
-            bars = np.stack([np.minimum(bar, 0.9 * np.abs(y[own])), bar])
-            axis.errorbar(x[own], sign * y[own], bars, fmt="o", ms=4, color=color, mfc=fill, capsize=2,
+            bars = np.stack([np.minimum(bar, 0.9 * np.abs(y[has_sign])), bar])
+            axis.errorbar(x[has_sign], sign * y[has_sign], bars, fmt="o", ms=4, color=color, mfc=fill, capsize=2,
                           label=label if sign > 0 else f"-{label}")  # fmt: skip
 
 
-def _ratio(axis: Any, label: str, tolerance: float) -> None:
+def _format_ratio_axes(axis: Any, label: str, tolerance: float) -> None:
     axis.axhline(1.0, lw=0.8, color="k")
     axis.axhspan(1.0 - tolerance, 1.0 + tolerance, color="k", alpha=0.08)
     axis.set(xscale="log", xlabel="separation, arcmin", ylabel=label, ylim=(0.0, 2.5))
-    _plain(axis)
+    _plain_ticks(axis)
 
 
-def _plain(axis: Any) -> None:
+def _plain_ticks(axis: Any) -> None:
     """1 and 10 for 10^0 and 10^1."""
     axis.xaxis.set_major_formatter("{x:g}")

@@ -15,7 +15,7 @@ from truesky.validation.lake.catalogues import (
 )
 from truesky.validation.lake.images.astrometry import ASTROMETRY
 from truesky.validation.lake.images.background import BACKGROUND
-from truesky.validation.lake.images.between import BETWEEN
+from truesky.validation.lake.images.common_bias import COMMON_BIAS
 from truesky.validation.lake.images.completeness import COMPLETENESS
 from truesky.validation.lake.images.cosmic_rays import COSMIC_RAYS
 from truesky.validation.lake.images.depth import DEPTH
@@ -24,15 +24,15 @@ from truesky.validation.lake.images.noise import NOISE
 from truesky.validation.lake.images.photometry import PHOTOMETRY
 from truesky.validation.lake.images.psf import PSF
 from truesky.validation.lake.images.quality import QUALITY
+from truesky.validation.lake.images.repeatability import REPEATABILITY
 from truesky.validation.lake.images.saturation import SATURATION
 from truesky.validation.lake.images.spectra import SPECTRA
-from truesky.validation.lake.images.together import TOGETHER
+from truesky.validation.lake.measure.frame_context import Result
 from truesky.validation.lake.measure.rows import Place, Row
-from truesky.validation.lake.measure.seen import Result
 
 
 @dataclass(frozen=True, slots=True)
-class Catalogued:
+class CatalogueCheck:
     """A check of catalogues.
 
     tables : that it wants, in the order in which `measured` takes their versions;  source : of its expectations
@@ -40,17 +40,17 @@ class Catalogued:
 
     name: str
     tables: tuple[str, ...]
-    measured: Callable[..., Result]
+    measure: Callable[..., Result]
     source: str
 
 
-def _plain(rows: Callable[..., list[Row]]) -> Callable[..., Result]:
+def _without_series(rows: Callable[..., list[Row]]) -> Callable[..., Result]:
     """Of a check that no figure is drawn of."""
     return lambda *versions: Result(Place(), rows(*versions), {})
 
 
 # Of one frame each.
-OF_FRAMES = (
+FRAME_CHECKS = (
     ASTROMETRY,
     PHOTOMETRY,
     BACKGROUND,
@@ -65,14 +65,16 @@ OF_FRAMES = (
     SPECTRA,
 )
 # Of all frames together.
-OF_SEVERAL = (BETWEEN, TOGETHER)
+EXPOSURE_CHECKS = (REPEATABILITY, COMMON_BIAS)
 # Of the lake's tables.
-OF_CATALOGUES = (
-    Catalogued(observed_sky.NAME, ("galaxies",), observed_sky.measured, "observed.csv"),
-    Catalogued(angular_clustering.NAME, ("galaxies",), angular_clustering.measured, angular_clustering.SOURCE),
-    Catalogued(cosmic_shear.NAME, ("galaxies",), cosmic_shear.measured, cosmic_shear.SOURCE),
-    Catalogued(colours.NAME, ("galaxies", "galaxy_fluxes"), colours.measured, colours.SOURCE),
-    Catalogued(duplicates.NAME, ("galaxies",), _plain(duplicates.rows), duplicates.SOURCE),
-    Catalogued(duplicates.NAME, ("stars",), _plain(duplicates.rows), duplicates.SOURCE),
-    Catalogued(requirements.NAME, ("galaxies", "galaxy_fluxes"), _plain(requirements.rows), requirements.SOURCE),
+CATALOGUE_CHECKS = (
+    CatalogueCheck(observed_sky.NAME, ("galaxies",), observed_sky.measure, "observed.csv"),
+    CatalogueCheck(angular_clustering.NAME, ("galaxies",), angular_clustering.measure, angular_clustering.SOURCE),
+    CatalogueCheck(cosmic_shear.NAME, ("galaxies",), cosmic_shear.measure, cosmic_shear.SOURCE),
+    CatalogueCheck(colours.NAME, ("galaxies", "galaxy_fluxes"), colours.measure, colours.SOURCE),
+    CatalogueCheck(duplicates.NAME, ("galaxies",), _without_series(duplicates.rows), duplicates.SOURCE),
+    CatalogueCheck(duplicates.NAME, ("stars",), _without_series(duplicates.rows), duplicates.SOURCE),
+    CatalogueCheck(
+        requirements.NAME, ("galaxies", "galaxy_fluxes"), _without_series(requirements.rows), requirements.SOURCE
+    ),
 )

@@ -14,49 +14,47 @@ import pyarrow as pa
 
 from lake_schema.store import publish as store
 from lake_schema.store import read
-from lake_schema.store.plan import Json, Output, Part, Plan
+from lake_schema.store.plan import Json, Output, Plan, Task
 from lake_schema.store.provenance import code_version
 from lake_schema.tables.validation import VALIDATION
 from truesky.validation.lake.measure.rows import Row
 from truesky.validation.lake.suite import inventory, report, running
-from truesky.validation.lake.suite.inventory import Held
+from truesky.validation.lake.suite.inventory import LakeContents
 
 REPORT = "report.html"
 _PART = "all.parquet"
 
 
-def plan(held: Held, exposures: Sequence[int] = ()) -> Plan:
+def plan(contents: LakeContents, exposures: Sequence[int] = ()) -> Plan:
     """Of what a lake holds; exposures : only these, () = all."""
-    facts = {"inputs": held.keys, "exposures": sorted(exposures), "code": code_version()}
-    return Plan(VALIDATION, facts, (Part(_PART, {}),))
+    facts = {"inputs": contents.version_keys, "exposures": sorted(exposures), "code": code_version()}
+    return Plan(VALIDATION, facts, (Task(_PART, {}),))
 
 
-def published(
-    root: Path, request: str | None = None, exposures: Sequence[int] = (), processes: int = 2
-) -> read.Version:
+def publish(root: Path, request: str | None = None, exposures: Sequence[int] = (), processes: int = 2) -> read.Version:
     """The table of a lake, made where it is not there yet.
 
     root      : of the lake;  request : whose tables, where it has those of several
     exposures : only these, () = all;  processes : that look at frames and catalogues at a time
     Errors    : as of `inventory.look`
     """
-    held = inventory.look(root, request, exposures)
-    wanted = plan(held, exposures)
+    contents = inventory.read_contents(root, request, exposures)
+    table_plan = plan(contents, exposures)
 
-    def work(lake: Path, facts: Json) -> Output:
-        found = running.validated(held, processes)
-        page = report.page(lake.name, found)
+    def build_output(lake: Path, facts: Json) -> Output:
+        results = running.run_checks(contents, processes)
+        page = report.page(lake.name, results)
 
         def write(path: Path) -> None:
             path.write_text(page, encoding="utf-8")
 
-        return Output(table(found.rows), {REPORT: write})
+        return Output(build_table(results.rows), {REPORT: write})
 
-    store.make(root, wanted, work, name=request)
-    return read.version(root, VALIDATION.name, wanted.key)
+    store.make_version(root, table_plan, build_output, name=request)
+    return read.version(root, VALIDATION.name, table_plan.key)
 
 
-def table(rows: Sequence[Row]) -> pa.Table:
+def build_table(rows: Sequence[Row]) -> pa.Table:
     """Rows of the table `validation`."""
     numbers = {
         name: np.ma.masked_invalid(np.array([getattr(row, name) for row in rows], float))
@@ -76,7 +74,7 @@ def table(rows: Sequence[Row]) -> pa.Table:
             "value_unit": [row.unit for row in rows],
             "source": [row.source for row in rows],
             "note": [row.note for row in rows],
-            "known": [row.known for row in rows],
+            "known": [row.known_failure for row in rows],
             "verdict": [row.verdict for row in rows],
         }
     )

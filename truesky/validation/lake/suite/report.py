@@ -12,7 +12,7 @@ from html import escape
 from lake_schema import __version__
 from truesky.validation.lake.measure.rows import Row
 from truesky.validation.lake.suite import figures
-from truesky.validation.lake.suite.running import Found
+from truesky.validation.lake.suite.running import LakeResults
 from truesky.validation.verdicts import FAIL, NOT_APPLICABLE, PASS, UNDECIDED
 
 _ORDER = (FAIL, UNDECIDED, PASS, NOT_APPLICABLE)
@@ -26,26 +26,26 @@ details { margin-bottom: 1em; } summary { cursor: pointer; }
 """
 
 
-def page(name: str, found: Found) -> str:
+def page(name: str, results: LakeResults) -> str:
     """HTML; name : of the lake."""
-    counted = Counter(row.verdict for row in found.rows)
-    said = ", ".join(f'<span class="{v}">{counted[v]} {v.replace("_", " ")}</span>' for v in _ORDER)
+    verdict_counts = Counter(row.verdict for row in results.rows)
+    summary = ", ".join(f'<span class="{v}">{verdict_counts[v]} {v.replace("_", " ")}</span>' for v in _ORDER)
     parts = [
         f"<!DOCTYPE html><html lang='en'><head><meta charset='utf-8'><title>Validation of {escape(name)}</title>",
         f"<style>{_STYLE}</style></head><body><h1>Validation of {escape(name)}</h1>",
-        f"<p>truesky {__version__}: {len(found.rows)} figures, {said}.</p>",
+        f"<p>truesky {__version__}: {len(results.rows)} figures, {summary}.</p>",
         "<p>A figure fails where it is more than three standard errors beyond its tolerance; it is undecided where its "
         "error is too large to tell.</p>",
-        _summary(found.rows),
+        _summary(results.rows),
         *(
             f"<figure><img alt='{escape(text)}' src='data:image/png;base64,{image}'><figcaption>{escape(text)}"
             "</figcaption></figure>"
-            for text, image in figures.drawn(found)
+            for text, image in figures.draw_all(results)
         ),
-        _details("What fails", [row for row in found.rows if row.verdict == FAIL], True),
-        _details("What is undecided", [row for row in found.rows if row.verdict == UNDECIDED], False),
-        _details("What does not apply, and why", [row for row in found.rows if row.verdict == NOT_APPLICABLE], False),
-        _details("What passes", [row for row in found.rows if row.verdict == PASS], False),
+        _details("What fails", [row for row in results.rows if row.verdict == FAIL], True),
+        _details("What is undecided", [row for row in results.rows if row.verdict == UNDECIDED], False),
+        _details("What does not apply, and why", [row for row in results.rows if row.verdict == NOT_APPLICABLE], False),
+        _details("What passes", [row for row in results.rows if row.verdict == PASS], False),
         "</body></html>",
     ]
     return "\n".join(parts)
@@ -58,10 +58,12 @@ def _summary(rows: Sequence[Row]) -> str:
         groups.setdefault((row.check, " ".join(filter(None, (row.place.channel, row.place.band)))), []).append(row)
     head = "<table><tr><th>check</th><th>of</th>" + "".join(f"<th>{v.replace('_', ' ')}</th>" for v in _ORDER)
     lines = [f"{head}<th>source</th></tr>"]
-    for (check, place), own in sorted(groups.items()):
-        counted = Counter(row.verdict for row in own)
-        cells = "".join(f"<td class='n {v if counted[v] else ''}'>{counted[v] or ''}</td>" for v in _ORDER)
-        source = escape("; ".join(dict.fromkeys(row.source for row in own)))
+    for (check, place), group in sorted(groups.items()):
+        verdict_counts = Counter(row.verdict for row in group)
+        cells = "".join(
+            f"<td class='n {v if verdict_counts[v] else ''}'>{verdict_counts[v] or ''}</td>" for v in _ORDER
+        )
+        source = escape("; ".join(dict.fromkeys(row.source for row in group)))
         lines.append(f"<tr><td>{escape(check)}</td><td>{escape(place)}</td>{cells}<td>{source}</td></tr>")
     return "\n".join([*lines, "</table>"])
 
@@ -78,16 +80,23 @@ def _details(title: str, rows: Sequence[Row], unfolded: bool) -> str:
 
 
 def _line(row: Row) -> str:
-    cells: Iterable[str] = (row.check, row.quantity, row.place.text, shown(row), expected(row), _noted(row))
+    cells: Iterable[str] = (
+        row.check,
+        row.quantity,
+        row.place.text,
+        format_value(row),
+        format_expected(row),
+        _note_text(row),
+    )
     first, *rest = (f"<td>{escape(cell)}</td>" for cell in cells)
     return f"<tr class='{row.verdict}'>{first}{''.join(rest)}</tr>"
 
 
-def _noted(row: Row) -> str:
-    return "; ".join(filter(None, (row.note, row.known and f"known to fail: {row.known}")))
+def _note_text(row: Row) -> str:
+    return "; ".join(filter(None, (row.note, row.known_failure and f"known to fail: {row.known_failure}")))
 
 
-def shown(row: Row) -> str:
+def format_value(row: Row) -> str:
     """A value with its error; "" of what was not measured."""
     if row.value != row.value:
         return ""
@@ -95,7 +104,7 @@ def shown(row: Row) -> str:
     return f"{row.value:.5g}{error} {row.unit}".strip()
 
 
-def expected(row: Row) -> str:
+def format_expected(row: Row) -> str:
     """What a value should be; "" of what does not apply."""
     if not row.applies:
         return ""

@@ -16,17 +16,17 @@ from tqdm import tqdm
 
 from lake_schema.store import read
 from lake_schema.tables.rendered_truth import RENDERED_TRUTH
-from truesky.validation.lake.measure import references, seen
+from truesky.validation.lake.measure import frame_context, references
+from truesky.validation.lake.measure.frame_context import PartnerFrame, Result
 from truesky.validation.lake.measure.frames import Instrument
 from truesky.validation.lake.measure.references import Reference
 from truesky.validation.lake.measure.rows import Place, Row, not_applicable
-from truesky.validation.lake.measure.seen import Before, Result
 from truesky.validation.lake.suite import checks, inventory
-from truesky.validation.lake.suite.inventory import Held, Shot
+from truesky.validation.lake.suite.inventory import LakeContents, ScienceFile
 
 
 @dataclass(frozen=True, slots=True)
-class Task:
+class FrameTask:
     """One frame: its file, what it is of, and what is known of its sources and its camera.
 
     before : the path in `products`, exposure and sources of another frame that its gain is told with
@@ -35,89 +35,102 @@ class Task:
     products: read.Version
     path: str
     place: Place
-    known: Reference
+    sources: Reference
     spectra: pa.Table | None
     instrument: Instrument | None
-    before: tuple[str, int, Reference] | None = None
+    partner: tuple[str, int, Reference] | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class LakeResults:
     """All rows of a lake, and the numbers of its frames and of its catalogues that figures are drawn of."""
 
     rows: list[Row]
-    results: list[Result]
-    catalogues: list[Result] = field(default_factory=list)
+    frame_results: list[Result]
+    catalogue_results: list[Result] = field(default_factory=list)
 
 
-def validated(held: Held, processes: int = 2) -> Found:
+def run_checks(contents: LakeContents, processes: int = 2) -> LakeResults:
     """Run all checks that a lake has something for; processes : at a time, for frames and checks of catalogues."""
     if processes <= 1:
-        catalogues, results = [*map(of_catalogues, _catalogued(held))], [*_shown(map(of_frame, _tasks(held)), held)]
+        catalogues, results = (
+            [*map(run_catalogue_check, _catalogue_tasks(contents))],
+            [*_with_progress_bar(map(check_frame, _frame_tasks(contents)), contents)],
+        )
     else:
         with ProcessPoolExecutor(processes, multiprocessing.get_context("forkserver")) as pool:
             try:
                 # A few that take long: begun while the frames' sources are looked up.
-                begun = [pool.submit(of_catalogues, one) for one in _catalogued(held)]
-                results = [*_shown(pool.map(of_frame, _tasks(held)), held)]
-                catalogues = [one.result() for one in begun]
+                futures = [
+                    pool.submit(run_catalogue_check, catalogue_task) for catalogue_task in _catalogue_tasks(contents)
+                ]
+                results = [*_with_progress_bar(pool.map(check_frame, _frame_tasks(contents)), contents)]
+                catalogues = [future.result() for future in futures]
             except BaseException:
                 # Of what has not begun nothing begins.
                 pool.shutdown(cancel_futures=True)
                 raise
     rows = [row for result in results for row in result.rows]
-    together = [row for check in checks.OF_SEVERAL for row in check.rows(results)]
-    return Found([*rows, *together, *(row for result in catalogues for row in result.rows)], results, catalogues)
+    combined_rows = [row for check in checks.EXPOSURE_CHECKS for row in check.rows(results)]
+    return LakeResults(
+        [*rows, *combined_rows, *(row for result in catalogues for row in result.rows)], results, catalogues
+    )
 
 
-def _shown(results: Iterator[Result], held: Held) -> Iterator[Result]:
+def _with_progress_bar(results: Iterator[Result], contents: LakeContents) -> Iterator[Result]:
     """The results of frames, under a bar that counts them."""
-    return iter(tqdm(results, total=len(held.shots), unit="detector", desc="validation", disable=None))
+    return iter(tqdm(results, total=len(contents.science_files), unit="detector", desc="validation", disable=None))
 
 
-def _catalogued(held: Held) -> list[tuple[int, tuple[read.Version | None, ...]]]:
+def _catalogue_tasks(contents: LakeContents) -> list[tuple[int, tuple[read.Version | None, ...]]]:
     """Each check of catalogues by its number, and the tables that it wants, None where the lake has not one."""
-    return [(n, tuple(map(held.tables.get, check.tables))) for n, check in enumerate(checks.OF_CATALOGUES)]
+    return [(n, tuple(map(contents.tables.get, check.tables))) for n, check in enumerate(checks.CATALOGUE_CHECKS)]
 
 
-def of_catalogues(wanted: tuple[int, tuple[read.Version | None, ...]]) -> Result:
+def run_catalogue_check(catalogue_task: tuple[int, tuple[read.Version | None, ...]]) -> Result:
     """What a check of catalogues measures; a row that says what is missing where it has not its tables."""
-    number, versions = wanted
-    check = checks.OF_CATALOGUES[number]
+    number, versions = catalogue_task
+    check = checks.CATALOGUE_CHECKS[number]
     missing = [name for name, version in zip(check.tables, versions, strict=True) if version is None]
     if not missing:
-        return check.measured(*versions)
+        return check.measure(*versions)
     why = f"the lake has no table {' and '.join(missing)}"
     return Result(Place(), [not_applicable(check.name, Place(), why, check.source, check.tables[0])], {})
 
 
-def _tasks(held: Held) -> Sequence[Task]:
-    if not held.shots:
+def _frame_tasks(contents: LakeContents) -> Sequence[FrameTask]:
+    if not contents.science_files:
         return []
-    truth, spectra = inventory.truth(held), inventory.spectra(held)
-    stars, cameras = inventory.stars_of(held, truth), inventory.instruments(held)
-    partners, out = inventory.partners(held.shots), []
+    truth, spectra = inventory.truth(contents), inventory.spectra(contents)
+    stars, cameras = inventory.star_catalogue(contents, truth), inventory.instruments(contents)
+    partners, out = inventory.gain_partners(contents.science_files), []
 
-    def known(shot: Shot) -> Reference:
-        key = (int(shot.place.exposure_id or 0), str(shot.place.detector))
-        rows, row = truth.get(key, RENDERED_TRUTH.empty()), shot.exposure
-        return references.reference(rows, stars, str(row["band"]), float(row["mjd"]))
+    def find_sources(file: ScienceFile) -> Reference:
+        key = (int(file.place.exposure_id or 0), str(file.place.detector))
+        rows, row = truth.get(key, RENDERED_TRUTH.empty()), file.exposure
+        return references.build_reference(rows, stars, str(row["band"]), float(row["mjd"]))
 
-    for shot in held.shots:
-        key = (int(shot.place.exposure_id or 0), str(shot.place.detector))
-        camera, other = str(shot.exposure["camera"]), partners.get(shot.path)
-        before = None if other is None else (other.path, int(other.place.exposure_id or 0), known(other))
-        products, own = held.tables["products"], spectra.get(key)
-        out.append(Task(products, shot.path, shot.place, known(shot), own, cameras.get(camera), before))
+    for file in contents.science_files:
+        key = (int(file.place.exposure_id or 0), str(file.place.detector))
+        camera, partner_file = str(file.exposure["camera"]), partners.get(file.path)
+        partner = (
+            None
+            if partner_file is None
+            else (partner_file.path, int(partner_file.place.exposure_id or 0), find_sources(partner_file))
+        )
+        products, frame_spectra = contents.tables["products"], spectra.get(key)
+        out.append(
+            FrameTask(products, file.path, file.place, find_sources(file), frame_spectra, cameras.get(camera), partner)
+        )
     return out
 
 
-def of_frame(task: Task) -> Result:
+def check_frame(task: FrameTask) -> Result:
     """Rows of one frame."""
-    path: Path = task.products.file(task.path)
-    found = seen.seen(path, task.place, task.known, task.spectra, task.instrument)
-    if task.before is not None:
-        other, exposure_id, known = task.before
-        found.before = Before(task.products.file(other), exposure_id, known)
-    rows = seen.all_rows(checks.OF_FRAMES, found)
-    return Result(task.place, rows, found.series)
+    path: Path = task.products.sidecar_path(task.path)
+    context = frame_context.measure_frame(path, task.place, task.sources, task.spectra, task.instrument)
+    if task.partner is not None:
+        partner_path, exposure_id, partner_sources = task.partner
+        context.partner = PartnerFrame(task.products.sidecar_path(partner_path), exposure_id, partner_sources)
+    rows = frame_context.all_rows(checks.FRAME_CHECKS, context)
+    return Result(task.place, rows, context.series)

@@ -86,7 +86,7 @@ def test_full_columns_and_frames():
     out, lost = bleed(calm, FULL, 2)
     assert lost == 0
     np.testing.assert_array_equal(out, calm)
-    assert bleeding.saturated(out, FULL).all()
+    assert bleeding.saturated_pixels(out, FULL).all()
 
 
 def test_length_of_a_trail():
@@ -96,7 +96,7 @@ def test_length_of_a_trail():
         light = np.exp(-((x - 15) ** 2 + (y - 1000) ** 2) / (2 * 1.0**2))
         frame = np.rint(electrons * light / light.sum())
         out, lost = bleed(frame, 2e5, 1)
-        rows = bleeding.saturated(out, 2e5).sum() / 5
+        rows = bleeding.saturated_pixels(out, 2e5).sum() / 5
         assert lost == 0
         assert rows == pytest.approx(electrons * 0.95 / 2e5 / 5, rel=0.3)
 

@@ -47,7 +47,7 @@ def test_variance_of_a_flat_falls_as_predicted():
     out = brighter_fatter.apply(flat, SHIFT, SOFT, FULL, 0.0, 0, np.random.default_rng(2))
     assert out.sum() == flat.sum()
     lost = 1 - out.var() / flat.var()
-    assert lost == pytest.approx(brighter_fatter.curvature(SHIFT, SOFT) * level, rel=0.1)
+    assert lost == pytest.approx(brighter_fatter.variance_slope(SHIFT, SOFT) * level, rel=0.1)
     # What a pixel loses of its fluctuation its neighbours get.
     rest = out - out.mean()
     assert (rest[:, 1:] * rest[:, :-1]).mean() > 0.0015 * level
@@ -169,8 +169,8 @@ def test_a_pixel_never_gives_more_than_it_can_spare():
     assert out.min() >= 0
     assert out.sum() == frame.sum()
     # One border after the other, each of what is left.
-    assert out[4, 4] == pytest.approx(1e5 * (1 - brighter_fatter.MOST) ** 4, abs=4)
-    assert out[4, 3] == brighter_fatter.MOST * 1e5
+    assert out[4, 4] == pytest.approx(1e5 * (1 - brighter_fatter.MAX_CROSSING) ** 4, abs=4)
+    assert out[4, 3] == brighter_fatter.MAX_CROSSING * 1e5
 
 
 @pytest.mark.parametrize(

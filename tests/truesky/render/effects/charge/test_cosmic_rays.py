@@ -24,24 +24,24 @@ def test_a_nominal_exposure_is_covered_to_two_or_three_per_cent():
     expected, quantiles = cosmic_rays.EFFECT.parameters(SCENE)
     assert expected == pytest.approx(1.0 * 4096 * 4136 * (12e-4) ** 2 * 560.53)
     # A sixteenth of a detector, and of its tracks.
-    image = cosmic_rays.tracks((1033, 1024), expected / 16, quantiles, np.random.default_rng(5))
+    image = cosmic_rays.draw_tracks((1033, 1024), expected / 16, quantiles, np.random.default_rng(5))
     assert 0.02 < (image > 0).mean() < MISSION.value("vis.cosmic_rays.covering")
 
 
 def test_charge_and_number():
     """Whole electrons; the total is that of the tracks drawn, wherever they end."""
-    image = cosmic_rays.tracks((300, 200), 400.0, TRACKS, np.random.default_rng(5))
+    image = cosmic_rays.draw_tracks((300, 200), 400.0, TRACKS, np.random.default_rng(5))
     np.testing.assert_array_equal(image, np.rint(image))
     assert image.min() == 0
     rng = np.random.default_rng(5)
     count = rng.poisson(400.0)
-    *_, electrons = cosmic_rays.events(count, 300, 200, TRACKS, rng)
+    *_, electrons = cosmic_rays.draw_events(count, 300, 200, TRACKS, rng)
     assert image.sum() == electrons.sum()
 
 
 def test_quantiles():
     """Median length 10.6 pixels, median charge 12.2 ke-, the longest the most."""
-    x, y, cosine, sine, length, electrons = cosmic_rays.events(40_000, 100, 100, TRACKS, np.random.default_rng(1))
+    x, y, cosine, sine, length, electrons = cosmic_rays.draw_events(40_000, 100, 100, TRACKS, np.random.default_rng(1))
     assert np.median(length) == pytest.approx(10.56, rel=0.02)
     assert np.median(electrons) == pytest.approx(12_216, rel=0.03)
     assert np.percentile(length, 90) == pytest.approx(29.4, rel=0.05)
@@ -52,7 +52,7 @@ def test_quantiles():
 
 def test_a_track_is_one_pixel_thin_and_straight():
     one = tuple(np.array([value]) for value in (5.5, 8.5, np.cos(0.3), np.sin(0.3), 20.0, 10_001.0))
-    event, columns, rows, charge = cosmic_rays.hits(one)
+    event, columns, rows, charge = cosmic_rays.pixels_of_events(one)
     assert (event == 0).all()
     image = np.zeros((40, 40))
     image[rows, columns] = charge
@@ -72,7 +72,7 @@ def test_a_pixel_holds_what_the_path_within_it_left(angle):
     """From anywhere in a pixel, in any direction: against the same path in a million steps."""
     x, y, length, electrons = 15.2, 18.7, 9.3, 1e6
     one = tuple(np.array([value]) for value in (x, y, np.cos(angle), np.sin(angle), length, electrons))
-    _, columns, rows, charge = cosmic_rays.hits(one)
+    _, columns, rows, charge = cosmic_rays.pixels_of_events(one)
     image = np.zeros((40, 40))
     np.add.at(image, (rows, columns), charge)
     along = length * (np.arange(1_000_000) + 0.5) / 1_000_000
@@ -83,7 +83,7 @@ def test_a_pixel_holds_what_the_path_within_it_left(angle):
 
 
 def test_even_over_the_frame():
-    image = cosmic_rays.tracks((200, 200), 40_000.0, TRACKS, np.random.default_rng(2)) > 0
+    image = cosmic_rays.draw_tracks((200, 200), 40_000.0, TRACKS, np.random.default_rng(2)) > 0
     border = np.concatenate([image[:5].ravel(), image[-5:].ravel(), image[:, :5].ravel(), image[:, -5:].ravel()])
     assert border.mean() == pytest.approx(image.mean(), rel=0.02)
 
@@ -91,7 +91,7 @@ def test_even_over_the_frame():
 def test_readout_hits_lie_in_readout_coordinates():
     """Rows that are read later have been on the detector for longer; prescan and overscan columns have no silicon."""
     expected, _, rows, prescan, columns, silicon = readout_cosmic_rays.READOUT.parameters(SCENE)
-    assert silicon == charge_transfer.lattice(SCENE, "parallel")
+    assert silicon == charge_transfer.silicon_traps(SCENE, "parallel")
     assert readout_cosmic_rays.READOUT.parameters(replace(SCENE, forced={"parallel_cti": False}))[-1] is None
     assert (rows, prescan, columns) == (2066, 51, 2048)
     assert expected == pytest.approx(72 * 2066 * 2048 * (12e-4) ** 2)
@@ -135,7 +135,7 @@ def test_a_readout_hit_passes_the_traps_from_its_row_on(rows, charges):
 def test_too_many_are_refused():
     for wrong in (-1.0, np.nan, 1e12):
         with pytest.raises(OutOfRange, match="cosmic"):
-            cosmic_rays.tracks((3, 3), wrong, TRACKS, np.random.default_rng(1))
+            cosmic_rays.draw_tracks((3, 3), wrong, TRACKS, np.random.default_rng(1))
 
 
 def test_muons_come_at_the_site_s_rate_through_the_silicon_s_thickness():
@@ -146,7 +146,7 @@ def test_muons_come_at_the_site_s_rate_through_the_silicon_s_thickness():
     assert expected == pytest.approx(0.2 * 30.0)
     quarter = replace(scene, detector=replace(lsst, nx=lsst.nx // 2, ny=lsst.ny // 2))
     assert cosmic_rays.EFFECT.parameters(quarter)[0] == pytest.approx(0.25 * expected)
-    *_, length, electrons = cosmic_rays.events(100_000, 100, 100, quantiles, np.random.default_rng(1))
+    *_, length, electrons = cosmic_rays.draw_events(100_000, 100, 100, quantiles, np.random.default_rng(1))
     thickness, pixel = 100.0, 10.0
     cosine = 80.0 * thickness / electrons
     across = thickness / pixel * np.sqrt(1 / cosine**2 - 1)

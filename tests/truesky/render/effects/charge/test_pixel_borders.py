@@ -70,8 +70,8 @@ def test_a_flat_shows_them_with_the_stated_amplitude():
 def test_sources_are_displaced_as_all_their_light_is(sigma, moved, widened):
     """Against every piece of light displaced for itself: centroids in pixels, second moments relative."""
     axis, phase = axis_and_phase()
-    near, far = pixel_borders.distances(SIDE, SIDE, tuple(axis))
-    table = pixel_borders.displacement(AMPLITUDE, (PERIOD, PERIOD), phase, near, far)
+    near, far = pixel_borders.distance_range(SIDE, SIDE, tuple(axis))
+    table = pixel_borders.radial_displacement(AMPLITUDE, (PERIOD, PERIOD), phase, near, far)
 
     def move(x, y):
         distance = np.hypot(x - axis[0], y - axis[1])

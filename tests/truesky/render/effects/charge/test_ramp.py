@@ -26,7 +26,7 @@ def every_frame(mode, per_frame, count, rng, charge=0.0, moment=0.0, bend=0.0, f
 
 
 def fast(mode, per_frame, count, rng, **more):
-    light = np.full((1, count), per_frame * mode.integrated)
+    light = np.full((1, count), per_frame * mode.integration_frames)
     return ramp.apply(light, mode, 130_000.0, **more, rng=rng)[:, 0]
 
 
@@ -37,8 +37,8 @@ def read(groups, mode, rng):
 
 def test_modes():
     assert (PHOTOMETRIC.frames, SPECTROSCOPIC.frames) == (76, 394)
-    assert PHOTOMETRIC.integrated * FRAME_TIME == pytest.approx(87.2, abs=0.05)
-    assert SPECTROSCOPIC.integrated * FRAME_TIME == pytest.approx(549.6, abs=0.05)
+    assert PHOTOMETRIC.integration_frames * FRAME_TIME == pytest.approx(87.2, abs=0.05)
+    assert SPECTROSCOPIC.integration_frames * FRAME_TIME == pytest.approx(549.6, abs=0.05)
     assert (PHOTOMETRIC.alpha, SPECTROSCOPIC.alpha) == (-0.265625, pytest.approx(-0.196759, abs=1e-6))
     assert PHOTOMETRIC.third_moments() == pytest.approx((52.03, 24.06, 12.52), abs=0.005)
     assert SPECTROSCOPIC.third_moments() == pytest.approx((370.03, 274.54, 217.16), abs=0.005)
@@ -102,7 +102,7 @@ def pixels(mode, count, rng, electrons, charge=0.0, bend=0.0):
     per_frame, moment = electrons / mode.frames, rng.random(count)
     slow = every_frame(mode, per_frame, count, rng, charge, moment, bend)
     frame = np.array(
-        [np.full(count, per_frame * mode.integrated), np.full(count, charge), moment, np.full(count, bend)]
+        [np.full(count, per_frame * mode.integration_frames), np.full(count, charge), moment, np.full(count, bend)]
     )
     quick = ramp.apply(frame[:, None, :], mode, 130_000.0, rng=rng)[:, 0]
     return np.array([read(groups, mode, rng) for groups in (slow, quick)])
@@ -172,8 +172,8 @@ def test_non_linearity_is_the_same_where_the_law_changes():
     Sample of 40,000 pixels; significance 7e-6 (4.5 standard errors).
     """
     bend, count = 6e-7, 40_000
-    light = np.full((1, count), 2990.0 * PHOTOMETRIC.integrated / PHOTOMETRIC.frames)
-    bent = ramp.planes(light, 4)
+    light = np.full((1, count), 2990.0 * PHOTOMETRIC.integration_frames / PHOTOMETRIC.frames)
+    bent = ramp.with_planes(light, 4)
     bent[3] = bend
     law = ramp.apply(bent, PHOTOMETRIC, 1.3e5, rng=np.random.default_rng(1))
     drawn = ramp.apply(bent, PHOTOMETRIC, 1.3e5, 0.0, rng=np.random.default_rng(2))

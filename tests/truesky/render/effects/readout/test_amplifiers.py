@@ -45,7 +45,7 @@ def test_each_amplifier_is_as_if_all_were_like_it(apply, numbers):
 
 def test_the_inverse_of_the_response_is_by_amplifier_too():
     curve = (0.05, np.array([2e5, 1e5, 3e5, 2e5]), 0.01, np.array([2e3, 1e3, 2e3, 5e3]))
-    np.testing.assert_allclose(nonlinearity.linearised(nonlinearity.apply(FRAME, *curve), *curve), FRAME, rtol=1e-9)
+    np.testing.assert_allclose(nonlinearity.linearise(nonlinearity.apply(FRAME, *curve), *curve), FRAME, rtol=1e-9)
 
 
 def test_the_camera_and_the_mission_name_the_same_places():
@@ -60,14 +60,14 @@ def test_the_camera_and_the_mission_name_the_same_places():
 def test_a_scene_without_values_of_its_own_has_numbers():
     scene = Scene(MISSION, "vis", 560.0, 0.25, 1e4, small("vis", "3-4"))
     for key, unit in UNITS.items():
-        assert scene.of_amplifiers(key, unit) == scene.value(key, unit)
-        assert type(scene.of_amplifiers(key, unit)) is float
+        assert scene.amplifier_values(key, unit) == scene.value(key, unit)
+        assert type(scene.amplifier_values(key, unit)) is float
     one = Scene(resolve(overrides=OWN), "vis", 560.0, 0.25, 1e4, small("vis", "3-4"))
-    np.testing.assert_array_equal(one.of_amplifiers("gain", GAIN), [3.0, 3.48, 3.48, 4.0])
+    np.testing.assert_array_equal(one.amplifier_values("gain", GAIN), [3.0, 3.48, 3.48, 4.0])
     assert one.dark_rate / scene.dark_rate == pytest.approx(0.05 / MISSION.value("vis.dark_current"))
     # The quietest amplifier tells what is noticed.
     assert one.pixel_noise == pytest.approx(np.sqrt(560 * 0.25 + one.dark_electrons + 4.4**2))
-    assert Scene(one.mission, "vis", 560.0, 0.25, 1e4, small("vis", "1-1")).of_amplifiers("gain", GAIN) == 9.0
+    assert Scene(one.mission, "vis", 560.0, 0.25, 1e4, small("vis", "1-1")).amplifier_values("gain", GAIN) == 9.0
 
 
 def test_a_frame_is_read_with_them_and_says_so(tmp_path):

@@ -18,7 +18,7 @@ from truesky.request import accuracy
 
 ISRAEL = Traps((0.02, 0.03, 0.95), (0.8, 3.5, 20.0), 2e5, 0.0, 0.58)
 PIXELS, UNIT = 2066, 0.001
-SURVEY = charge_transfer.sweeps_for(accuracy.SURVEY, PIXELS)
+SURVEY = charge_transfer.choose_sweeps(accuracy.SURVEY, PIXELS)
 EXACT, LEVELS, MANY = Sweeps(64, 2), Sweeps(1, 1, 9), Sweeps(1, 1, 900)
 
 
@@ -62,10 +62,10 @@ def every_transfer(line, silicon, pixels, hits=(), levels=10_000):
 @pytest.mark.parametrize("name", ["clean", "hit"])
 def test_as_arctic_does_it(name, preset, limit):
     image, wanted, _ = reference(name)
-    sweeps = charge_transfer.sweeps_for(accuracy.preset(preset), PIXELS)
-    found, _ = traps.shifted(image, ISRAEL, sweeps, -2, PIXELS)
+    sweeps = charge_transfer.choose_sweeps(accuracy.preset(preset), PIXELS)
+    found, _ = traps.shift_charge(image, ISRAEL, sweeps, -2, PIXELS)
     assert rms(found - wanted) <= limit * rms(wanted - image)
-    turned, _ = traps.shifted(image.T, ISRAEL, sweeps, -1, PIXELS)
+    turned, _ = traps.shift_charge(image.T, ISRAEL, sweeps, -1, PIXELS)
     np.testing.assert_array_equal(turned.T, found)
 
 
@@ -87,7 +87,7 @@ def measured(image, table):
 @pytest.mark.parametrize("name", ["clean", "hit"])
 def test_each_galaxy_is_changed_as_by_arctic(name):
     image, wanted, table = reference(name)
-    found, _ = traps.shifted(image, ISRAEL, SURVEY, -2, PIXELS)
+    found, _ = traps.shift_charge(image, ISRAEL, SURVEY, -2, PIXELS)
     before = measured(image, table)
     use = (before[:, 0] > 300) & (np.abs(before[:, 3:]) < 1).all(1)
     assert use.sum() > 25
@@ -112,18 +112,20 @@ def test_as_one_transfer_after_the_other():
     errors = {}
     each = Sweeps(36, 1)
     for sweeps in (Sweeps(1, 1), Sweeps(1, 2), each):
-        found, still = traps.shifted(line[None], silicon, sweeps, -1, 36)
+        found, still = traps.shift_charge(line[None], silicon, sweeps, -1, 36)
         errors[sweeps] = rms(found[0] - wanted) / change
         assert found.sum() + still == pytest.approx(line.sum(), rel=1e-13)
     assert errors[each] < 1e-3
     assert errors[Sweeps(1, 2)] < 0.3 * errors[Sweeps(1, 1)]
-    assert traps.shifted(line[None], silicon, each, -1, 36)[1] == pytest.approx(trapped, rel=1e-3)
+    assert traps.shift_charge(line[None], silicon, each, -1, 36)[1] == pytest.approx(trapped, rel=1e-3)
 
 
 def test_smaller_steps_converge():
     image, _, _ = reference("hit")
-    best, _ = traps.shifted(image, ISRAEL, EXACT, -2, PIXELS)
-    errors = [rms(traps.shifted(image, ISRAEL, s, -2, PIXELS)[0] - best) for s in (Sweeps(1, 1), SURVEY, Sweeps(4, 2))]
+    best, _ = traps.shift_charge(image, ISRAEL, EXACT, -2, PIXELS)
+    errors = [
+        rms(traps.shift_charge(image, ISRAEL, s, -2, PIXELS)[0] - best) for s in (Sweeps(1, 1), SURVEY, Sweeps(4, 2))
+    ]
     assert errors[0] > 5 * errors[1] > 5 * errors[2]
 
 
@@ -132,7 +134,7 @@ def test_first_pixel_trail_of_a_lone_packet():
     line = np.zeros((1, 60))
     line[0, 30] = 1e4
     silicon = Traps((0.5,), (5.0,), 1e5, 0.0, 0.5)
-    found, still = traps.shifted(line, silicon, Sweeps(200, 2), -1)
+    found, still = traps.shift_charge(line, silicon, Sweeps(200, 2), -1)
     captured = 0.5 * np.sqrt(0.1)
     assert (found[0, :30] == 0).all()
     assert found[0, 30] == pytest.approx(1e4 - 31 * captured, rel=1e-4)
@@ -152,7 +154,7 @@ def test_charge_is_conserved(seed, scale, notch, sweeps, level):
     frame[rng.random(frame.shape) < 0.02] = 2e5
     silicon = replace(ISRAEL, density=tuple(scale * d for d in ISRAEL.density), notch=notch)
     for axis, pixels in ((-1, 20), (-2, 17)):
-        out, still = traps.shifted(frame, silicon, sweeps, axis, pixels)
+        out, still = traps.shift_charge(frame, silicon, sweeps, axis, pixels)
         assert out.min() >= -1e-9
         assert still >= 0
         assert out.sum() + still == pytest.approx(frame.sum(), rel=1e-12, abs=1e-12)
@@ -162,15 +164,15 @@ def test_volume_from_its_table():
     """Packets of every size lose what their volume says."""
     n = np.geomspace(1e-3, 1e6, 400)
     silicon = Traps((1e-6,), (1e6,), 2e5, 0.0, 0.58)
-    found, _ = traps.shifted(n[:, None], silicon, Sweeps(1, 1), -1)
+    found, _ = traps.shift_charge(n[:, None], silicon, Sweeps(1, 1), -1)
     np.testing.assert_allclose((n - found[:, 0]) * 1e6, silicon.volume(n), rtol=2e-4, atol=2e-10 / 1e-6 * 1e-3)
 
 
 def test_young_detectors_are_followed_less_closely():
     presets = [accuracy.preset(name) for name in ("draft", "survey", "reference")]
-    old = [charge_transfer.sweeps_for(preset, PIXELS) for preset in presets]
+    old = [charge_transfer.choose_sweeps(preset, PIXELS) for preset in presets]
     assert old == [Sweeps(1, 1), Sweeps(1, 2), Sweeps(4, 2)]
-    young = [charge_transfer.sweeps_for(preset, 0.03 * PIXELS) for preset in presets]
+    young = [charge_transfer.choose_sweeps(preset, 0.03 * PIXELS) for preset in presets]
     assert young == [LEVELS, Sweeps(1, 1), Sweeps(1, 1)]
 
 
@@ -185,9 +187,9 @@ def test_what_following_less_closely_does_to_galaxies(name, preset, age):
     """Flux, position and ellipticity of every galaxy, against small steps: within the errors that are allowed."""
     image, _, table = reference(name)
     silicon = replace(ISRAEL, density=tuple(age * d for d in ISRAEL.density))
-    chosen = charge_transfer.sweeps_for(preset, age * PIXELS)
+    chosen = charge_transfer.choose_sweeps(preset, age * PIXELS)
     assert (chosen == LEVELS) == (preset == accuracy.DRAFT)
-    found, best = (measured(traps.shifted(image, silicon, s, -2, PIXELS)[0], table) for s in (chosen, EXACT))
+    found, best = (measured(traps.shift_charge(image, silicon, s, -2, PIXELS)[0], table) for s in (chosen, EXACT))
     bright = table[:, 2] > 2000
     assert np.abs(found / best - 1)[bright, 0].max() < preset.flux
     assert np.abs(found - best)[bright, 1].max() < preset.position
@@ -198,8 +200,8 @@ def test_what_following_less_closely_does_to_galaxies(name, preset, age):
 def test_levels_of_traps(name):
     """They tend to the watermarks; few of them have the pixels' change to a quarter, and sources' mean change."""
     image, _, _ = reference(name)
-    best, _ = traps.shifted(image, ISRAEL, Sweeps(1, 1), -2, PIXELS)
-    few, some, many = (traps.shifted(image, ISRAEL, s, -2, PIXELS)[0] for s in (LEVELS, Sweeps(1, 1, 48), MANY))
+    best, _ = traps.shift_charge(image, ISRAEL, Sweeps(1, 1), -2, PIXELS)
+    few, some, many = (traps.shift_charge(image, ISRAEL, s, -2, PIXELS)[0] for s in (LEVELS, Sweeps(1, 1, 48), MANY))
     errors = [rms(found - best) / rms(best - image) for found in (few, some, many)]
     assert errors[0] < 0.25
     assert errors[0] > errors[1] > errors[2]
@@ -214,8 +216,8 @@ def test_a_draft_leaves_out_what_it_allows_to_be_wrong():
         (0.02, accuracy.DRAFT, False), (0.02, accuracy.SURVEY, True), (0.3, accuracy.DRAFT, True)
     ):  # fmt: skip
         scene = Scene(resolve(overrides={"vis.cti.age": (age, "")}), "vis", 560.0, 0.25, 1e4, accuracy=preset)
-        assert charge_transfer.PARALLEL.needed_if(scene) == needed
-        found, _ = traps.shifted(image, charge_transfer.lattice(scene, "parallel"), SURVEY, -2, PIXELS)
+        assert charge_transfer.PARALLEL.is_needed(scene) == needed
+        found, _ = traps.shift_charge(image, charge_transfer.silicon_traps(scene, "parallel"), SURVEY, -2, PIXELS)
         before, after = measured(image, table), measured(found, table)
         bright = table[:, 2] > 2000
         worst = (
@@ -230,9 +232,9 @@ def test_a_draft_leaves_out_what_it_allows_to_be_wrong():
 
 def test_damage_grows_with_age():
     new, old = (Scene(resolve(overrides={"vis.cti.age": (age, "")}), "vis", 560.0, 0.25, 1e4) for age in (0.03, 1.0))
-    assert sum(charge_transfer.lattice(new, "parallel").density) == pytest.approx(0.03)
-    assert sum(charge_transfer.lattice(old, "parallel").density) == pytest.approx(1.0)
-    assert sum(charge_transfer.lattice(old, "serial").density) == pytest.approx(1 / 3)
+    assert sum(charge_transfer.silicon_traps(new, "parallel").density) == pytest.approx(0.03)
+    assert sum(charge_transfer.silicon_traps(old, "parallel").density) == pytest.approx(1.0)
+    assert sum(charge_transfer.silicon_traps(old, "serial").density) == pytest.approx(1 / 3)
     for effect in (charge_transfer.PARALLEL, charge_transfer.SERIAL):
         assert effect.margin(old) > effect.margin(new) > 0
 
@@ -258,9 +260,9 @@ def test_other_mistakes_are_refused():
     with pytest.raises(BadInput, match="levels"):
         Sweeps(2, 1, 9)
     with pytest.raises(OutOfRange, match="axis"):
-        traps.shifted(np.zeros((2, 2)), ISRAEL, SURVEY, 0)
+        traps.shift_charge(np.zeros((2, 2)), ISRAEL, SURVEY, 0)
     with pytest.raises(OutOfRange, match="pixels"):
-        traps.shifted(np.zeros((2, 2)), ISRAEL, SURVEY, -1, 3)
+        traps.shift_charge(np.zeros((2, 2)), ISRAEL, SURVEY, -1, 3)
 
 
 def clocked(column, loss, rows):

@@ -40,7 +40,7 @@ def test_a_trap_moves_what_cycles_one_by_one_do(tau, phase):
     cycles = 200_000
     held = np.random.default_rng(1).exponential(tau * DWELL, cycles)
     carried = ((held > phase) & (held < 2 * phase)).sum()
-    expected = trap_pumping.moved(tau, Pumping(cycles, phase, 0.5, 1.0, DWELL))
+    expected = trap_pumping.moved_electrons(tau, Pumping(cycles, phase, 0.5, 1.0, DWELL))
     assert expected == pytest.approx(carried, abs=4 * np.sqrt(carried))
 
 
@@ -52,7 +52,7 @@ def test_a_trap_is_a_dipole_along_its_column():
     up, down = (change[np.clip(row + step, 0, SHAPE[0] - 1), column] for step in (1, -1))
     assert ((up == -change[row, column]) ^ (down == -change[row, column])).all()
     assert 0.2 < np.mean(up < 0) < 0.8
-    expected = trap_pumping.moved(20.0, Pumping(2000, 0.1, 0.5, 1.0, DWELL))
+    expected = trap_pumping.moved_electrons(20.0, Pumping(2000, 0.1, 0.5, 1.0, DWELL))
     np.testing.assert_array_equal(change[row, column], np.rint(expected))
     assert change.sum() == 0
 

@@ -9,7 +9,7 @@ from truesky.validation import field as fields
 from truesky.validation import theory
 
 CELLS = sky.cells_in_cone(0.0, 0.0, 0.9, GENERATION_ORDER)
-FIELD = fields.of_cells(GENERATION_ORDER, CELLS)
+FIELD = fields.from_cells(GENERATION_ORDER, CELLS)
 WAVES, LOWEST, HIGHEST = 500, 100.0, 2e4
 
 
@@ -37,7 +37,7 @@ def sheared(seed=1, n=8000):
     """Columns of galaxies at z = 1, whose shear and convergence are derivatives of one potential."""
     rng = np.random.default_rng(seed)
     index, ra, dec = scattered(rng, n)
-    c_l = theory.convergence(theory.ELL, cosmology.comoving_distance(np.ones(1)), np.ones(1))
+    c_l = theory.convergence_power(theory.ELL, cosmology.comoving_distance(np.ones(1)), np.ones(1))
     ell, variance, (kx, ky), phase = waves(rng, c_l)
     east, north = plane(ra, dec)
     # psi = sum of -2 kappa / l^2 cos(k x + phase): kappa = (psi_xx + psi_yy) / 2.
@@ -63,7 +63,7 @@ def clustered(seed=1, n=6000, log_mass=12.5):
     edges = np.asarray(cosmology.comoving_distance(np.array([0.6, 0.65, 0.7, 0.75, 0.8])))
     wide = np.diff(edges)
     shells = theory.Shells(0.5 * (edges[1:] + edges[:-1]), wide, 0.25 / wide * bias(log_mass))
-    c_l = theory.galaxies(theory.ELL, shells)
+    c_l = theory.galaxy_power(theory.ELL, shells)
     ell, variance, (kx, ky), phase = waves(rng, c_l)
     east, north = plane(ra, dec)
     g = np.cos(np.outer(east, kx) + np.outer(north, ky) + phase) * np.sqrt(2 * variance)
@@ -76,5 +76,5 @@ def bias(log_mass):
     """Of halos at z = 0.7, by Tinker et al. 2010 in their own formula: an overdensity of 200 times the mean."""
     from colossus.lss import bias as halo_bias
 
-    theory.linear(np.ones(1), 0.0)
+    theory.linear_power(np.ones(1), 0.0)
     return float(halo_bias.haloBias(10.0**log_mass, 0.7, mdef="200m", model="tinker10"))

@@ -36,9 +36,9 @@ def tables():
         "gamma2": rng.normal(0, 0.02, N), "color_gr_01": np.full(N, 0.5),
     }  # fmt: skip
     columns["sed_2"] = np.minimum(columns["sed_1"] + 1, 30)
-    columns["mag_r01"] = observed.apparent(columns, "sdss_r01")
-    found = band_fluxes.galaxy_fluxes_by(
-        GALAXIES.build(columns), band_fluxes._curves(BANDS), [None] * len(BANDS), library
+    columns["mag_r01"] = observed.apparent_magnitudes(columns, "sdss_r01")
+    found = band_fluxes.fluxes_with_settings(
+        GALAXIES.build(columns), band_fluxes._load_passbands(BANDS), [None] * len(BANDS), library
     )
     order = rng.permutation(N)
     return columns, {name: found[name].to_numpy()[order] for name in ("id", *(f"f_nu_{band}" for band in BANDS))}
@@ -46,11 +46,11 @@ def tables():
 
 @pytest.fixture(autouse=True)
 def all_of_them(monkeypatch):
-    monkeypatch.setattr(colours, "_BRIGHT", 40.0)
+    monkeypatch.setattr(colours, "_MAX_MAG", 40.0)
 
 
 def verdicts(galaxies, fluxes):
-    result = colours.measured(Version("galaxies", galaxies, mocks.CELLS), Version("galaxy_fluxes", fluxes))
+    result = colours.measure(Version("galaxies", galaxies, mocks.CELLS), Version("galaxy_fluxes", fluxes))
     return {row.quantity: row.verdict for row in result.rows}, result
 
 

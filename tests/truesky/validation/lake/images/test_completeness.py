@@ -47,6 +47,6 @@ def test_sources_that_are_fainter_than_they_should_be(faint):
 def test_objects_that_cover_everything_tell_nothing(faint, noise, why):
     """Of a noise that is too small most pixels are of objects, and of one that is far too small more than sep holds."""
     wrong = replace(faint, noise=noise * faint.noise, series={})
-    (row,) = COMPLETENESS.of(wrong)
+    (row,) = COMPLETENESS.run(wrong)
     assert row.verdict == NOT_APPLICABLE
     assert why in row.note

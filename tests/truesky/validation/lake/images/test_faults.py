@@ -16,7 +16,7 @@ from truesky.validation.lake.images.photometry import PHOTOMETRY
 from truesky.validation.lake.images.psf import PSF
 from truesky.validation.lake.images.quality import QUALITY
 from truesky.validation.lake.images.saturation import SATURATION
-from truesky.validation.lake.measure import seen
+from truesky.validation.lake.measure import frame_context
 from truesky.validation.lake.measure.frames import Instrument
 from truesky.validation.lake.measure.rows import Place
 from truesky.validation.verdicts import FAIL, NOT_APPLICABLE, PASS, UNDECIDED
@@ -49,7 +49,7 @@ def test_numbers_are_those_that_were_put_in(good):
     assert of.measured.fwhm == pytest.approx(made.FWHM / made.SCALE, rel=0.05)
     assert of.tiles.level.mean() == pytest.approx(made.SKY * made.SECONDS, rel=2e-3)
     assert np.abs(np.median(of.measured.stars.dx)) < 0.01
-    rows = {row.quantity: row for row in ASTROMETRY.of(of)}
+    rows = {row.quantity: row for row in ASTROMETRY.run(of)}
     assert abs(rows["offset_x"].value) < 5.0 * rows["offset_x"].error
 
 
@@ -67,7 +67,7 @@ def test_a_scale_that_is_wrong(good):
     """By 0.2 pixels at the edge."""
     of, stars = good
     frame = replace(of.frame, wcs=made.system(stretch=1.0 + 4e-4))
-    wrong = replace(of, frame=frame, measured=seen.stars.measured(frame, stars, of.noise), series={})
+    wrong = replace(of, frame=frame, measured=frame_context.stars.measure_stars(frame, stars, of.noise), series={})
     assert turned(ASTROMETRY, wrong, "stretch_x")
 
 
@@ -89,7 +89,7 @@ def test_a_read_noise_that_is_a_fifth_off(folder, good):
 
 def test_a_band_whose_flux_is_shifted(good):
     of, stars = good
-    measured = seen.stars.measured(of.frame, replace(stars, mag=stars.mag + 0.05), of.noise)
+    measured = frame_context.stars.measure_stars(of.frame, replace(stars, mag=stars.mag + 0.05), of.noise)
     for quantity in ("offset", "psf_offset"):
         assert turned(PHOTOMETRY, replace(of, measured=measured, series={}), quantity)
 
@@ -101,14 +101,16 @@ def test_optics_that_keep_light_from_the_corners(folder, good):
     of, stars = made.vis(folder, of=good[1], bright=bowl)
     assert made.verdicts(PHOTOMETRY, of)["offset"] != PASS
     header = {**of.frame.header, "DETSIZE": f"[1:{2 * made.SIDE},1:{2 * made.SIDE}]"}
-    told = replace(of.frame, instrument=Instrument(bowl=0.1), header=header)
-    known = replace(of, frame=told, measured=seen.stars.measured(told, stars, of.noise), series={})
+    told = replace(of.frame, instrument=Instrument(vignetting=0.1), header=header)
+    known = replace(of, frame=told, measured=frame_context.stars.measure_stars(told, stars, of.noise), series={})
     assert made.verdicts(PHOTOMETRY, known)["offset"] == PASS
 
 
 def test_magnitudes_that_are_not_linear(good):
     of, stars = good
-    measured = seen.stars.measured(of.frame, replace(stars, mag=20.0 + 1.05 * (stars.mag - 20.0)), of.noise)
+    measured = frame_context.stars.measure_stars(
+        of.frame, replace(stars, mag=20.0 + 1.05 * (stars.mag - 20.0)), of.noise
+    )
     for quantity in ("slope", "psf_slope"):
         assert turned(PHOTOMETRY, replace(of, measured=measured, series={}), quantity)
 
@@ -140,7 +142,9 @@ def test_cosmic_rays_that_are_off_or_too_many(folder, good, hits):
 def test_no_cosmic_ray_where_one_is_expected_decides_nothing(folder, good):
     of, _ = made.vis(folder, of=good[1], hits=0.0)
     few = np.arange(len(of.tiles.row)) < 2
-    short = replace(of, tiles=of.tiles.where(few), frame=replace(of.frame, header={**of.frame.header, "EXPTIME": 20.0}))
+    short = replace(
+        of, tiles=of.tiles.select(few), frame=replace(of.frame, header={**of.frame.header, "EXPTIME": 20.0})
+    )
     assert made.verdicts(COSMIC_RAYS, short) == {"cover": UNDECIDED}
 
 
@@ -148,7 +152,7 @@ def test_stars_that_do_not_saturate(good):
     """A header that promises a saturation which nothing reaches, and one that is below the sky."""
     of, _ = good
     for factor, quantity in ((1.5, "bright_full"), (0.2, "faint_full")):
-        amplifiers = tuple(replace(a, full=a.full * factor) for a in of.frame.amplifiers)
+        amplifiers = tuple(replace(a, saturation_level=a.saturation_level * factor) for a in of.frame.amplifiers)
         frame = replace(of.frame, amplifiers=amplifiers)
         wrong = replace(of, frame=frame)
         if factor < 1.0:
@@ -160,7 +164,7 @@ def test_stars_that_do_not_saturate(good):
 def ramps(folder, chi2, channel="NISP-S"):
     path = made.ramp_file(folder / "ramp.fits", np.clip(np.rint(chi2), 0, 255), channel)
     nobody = made.known(np.zeros(0), np.zeros(0), np.zeros(0))
-    return seen.seen(path, Place(channel, "nisp_red", 1, "DET11"), nobody)
+    return frame_context.measure_frame(path, Place(channel, "nisp_red", 1, "DET11"), nobody)
 
 
 def test_ramps_that_fit_and_others(folder):
@@ -179,7 +183,7 @@ def test_ramps_that_fit_and_others(folder):
 def test_a_frame_without_stars_is_said_to_have_none(folder):
     of, _ = made.vis(folder, of=made.known(np.zeros(0), np.zeros(0), np.zeros(0)))
     for check in (ASTROMETRY, PHOTOMETRY, PSF, SATURATION, QUALITY):
-        (row,) = check.of(of)
+        (row,) = check.run(of)
         assert row.verdict == NOT_APPLICABLE
         assert row.note
 

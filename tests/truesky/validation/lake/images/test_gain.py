@@ -10,7 +10,7 @@ from lake_schema.tables.rendered_truth import RENDERED_TRUTH
 from tests.truesky.validation.lake import made
 from truesky.validation.lake.images.gain import GAIN
 from truesky.validation.lake.images.noise import NOISE
-from truesky.validation.lake.measure import references, seen
+from truesky.validation.lake.measure import frame_context, references
 from truesky.validation.lake.measure.rows import Place
 from truesky.validation.lake.suite import inventory
 from truesky.validation.verdicts import FAIL, NOT_APPLICABLE, PASS
@@ -19,8 +19,8 @@ SIDE = 2 * made.SIDE
 
 
 def empty():
-    nothing = references.catalogue({}, np.zeros(0, np.int64), ())
-    return references.reference(RENDERED_TRUTH.empty(), nothing, "euclid_vis", 6e4)
+    nothing = references.load_catalogue({}, np.zeros(0, np.int64), ())
+    return references.build_reference(RENDERED_TRUTH.empty(), nothing, "euclid_vis", 6e4)
 
 
 def pair(folder, levels=(350.0, 300.0), told=made.GAIN, sharing=0.0, response=0.03):
@@ -37,13 +37,13 @@ def pair(folder, levels=(350.0, 300.0), told=made.GAIN, sharing=0.0, response=0.
         path = folder / f"{n}.fits"
         # The sky is flat enough that the level itself is shared out evenly.
         paths.append(made.vis_file(path, shared, rng, told=told))
-    of = seen.seen(paths[0], Place("EXT", "des_g", 2, "N4"), empty())
-    of.before = seen.Before(paths[1], 1, empty())
+    of = frame_context.measure_frame(paths[0], Place("EXT", "des_g", 2, "N4"), empty())
+    of.partner = frame_context.PartnerFrame(paths[1], 1, empty())
     return of
 
 
 def rows(of):
-    return {row.quantity: row for row in GAIN.of(of)}
+    return {row.quantity: row for row in GAIN.run(of)}
 
 
 @pytest.mark.parametrize("sharing", [0.0, 0.005])
@@ -56,7 +56,7 @@ def test_a_response_that_a_single_frame_takes_for_noise(tmp_path, sharing):
 
 
 def test_a_single_frame_is_misled(tmp_path):
-    single = {row.quantity: row for row in NOISE.of(pair(tmp_path)) if row.check == "gain"}
+    single = {row.quantity: row for row in NOISE.run(pair(tmp_path)) if row.check == "gain"}
     assert single["ratio"].value < 0.9
 
 
@@ -67,16 +67,16 @@ def test_a_gain_that_is_off(tmp_path, wrong):
 
 def test_frames_that_are_too_unlike(tmp_path):
     of = pair(tmp_path, levels=(3500.0, 50.0))
-    assert {row.verdict for row in GAIN.of(of)} == {NOT_APPLICABLE}
+    assert {row.verdict for row in GAIN.run(of)} == {NOT_APPLICABLE}
     of = pair(tmp_path, levels=(350.0, 300.0))
     lit = replace(of, frame=replace(of.frame, header={**of.frame.header, "IMAGETYP": "flat"}))
-    assert {row.verdict for row in GAIN.of(lit)} == {NOT_APPLICABLE}
-    assert {row.verdict for row in GAIN.of(replace(of, before=None))} == {NOT_APPLICABLE}
+    assert {row.verdict for row in GAIN.run(lit)} == {NOT_APPLICABLE}
+    assert {row.verdict for row in GAIN.run(replace(of, before=None))} == {NOT_APPLICABLE}
 
 
 def shot(number, band, image_type="science", channel="EXT", sky=10.0, lamp=None):
     exposure = {"camera": "decam", "image_type": image_type, "sky": sky, "exposure_time_s": 90.0, "lamp": lamp}
-    return inventory.Shot(f"{number}.fits", Place(channel, band, number, "N4"), exposure)
+    return inventory.ScienceFile(f"{number}.fits", Place(channel, band, number, "N4"), exposure)
 
 
 def test_which_frames_are_told_together():
@@ -87,12 +87,12 @@ def test_which_frames_are_told_together():
         shot(3, "des_z", sky=30.0),
         shot(4, "des_i", sky=11.0),
     ]
-    assert {path: other.path for path, other in inventory.partners(bands).items()} == {"4.fits": "2.fits"}
+    assert {path: other.path for path, other in inventory.gain_partners(bands).items()} == {"4.fits": "2.fits"}
     again = [*bands, shot(5, "des_g", sky=20.0)]
-    assert {path: other.path for path, other in inventory.partners(again).items()} == {"5.fits": "1.fits"}
+    assert {path: other.path for path, other in inventory.gain_partners(again).items()} == {"5.fits": "1.fits"}
     flats = [shot(n, "euclid_h", "flat", "NISP-P", lamp=lamp) for n, lamp in ((1, 1), (2, 2), (3, 1), (4, 2), (5, 3))]
-    assert {path: other.path for path, other in inventory.partners(flats).items()} == {
+    assert {path: other.path for path, other in inventory.gain_partners(flats).items()} == {
         "3.fits": "1.fits",
         "4.fits": "2.fits",
     }
-    assert not inventory.partners([shot(n, "euclid_vis", channel="VIS") for n in (1, 2)])
+    assert not inventory.gain_partners([shot(n, "euclid_vis", channel="VIS") for n in (1, 2)])

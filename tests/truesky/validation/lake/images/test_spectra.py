@@ -8,9 +8,9 @@ from lake_schema.store import validate
 from lake_schema.tables.validation import VALIDATION
 from tests.truesky.validation.lake import made
 from truesky.validation.lake.images.spectra import SPECTRA
+from truesky.validation.lake.measure.frame_context import FrameContext
 from truesky.validation.lake.measure.frames import Frame
 from truesky.validation.lake.measure.rows import Place
-from truesky.validation.lake.measure.seen import Seen
 from truesky.validation.lake.suite import publishing
 from truesky.validation.verdicts import FAIL, NOT_APPLICABLE, PASS
 
@@ -39,7 +39,9 @@ def frame(up=0.0, brighter=1.0, redder=0.0, n=12):
     still = np.zeros(n)
     known = made.known(still, still, still + 20.0)
     known.id[:] = np.arange(n)
-    of = Seen(Place("NISP-S", "nisp_red", 1, "DET11"), Frame(image.astype(np.float32), (), None, header, None), known)
+    of = FrameContext(
+        Place("NISP-S", "nisp_red", 1, "DET11"), Frame(image.astype(np.float32), (), None, header, None), known
+    )
     of.spectra, of.noise = pa.Table.from_pylist(rows), 10.0
     return of
 
@@ -70,8 +72,8 @@ def test_lines_far_from_their_places_are_missed(redder):
 
 
 def test_too_few_are_said():
-    found = SPECTRA.of(frame(n=2))
+    found = SPECTRA.run(frame(n=2))
     assert [row.verdict for row in found] == [NOT_APPLICABLE] * 3
     assert found[0].note.startswith("flux: 2 spectra")
     # They are rows of a table, whose keys differ.
-    validate.check(publishing.table(found), VALIDATION)
+    validate.check_rows(publishing.build_table(found), VALIDATION)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.ndimage
 
-from truesky.validation.lake.measure.covariances import own_variance
+from truesky.validation.lake.measure.covariances import pixel_variance
 
 
 @pytest.mark.parametrize("near", [0, 1, 2])
@@ -19,7 +19,7 @@ def test_the_variance_that_neighbours_share(near):
     values += np.linspace(-5.0, 5.0, 64)
     kept = rng.random(values.shape) < 0.5
     plain = float(np.var(values[kept]))
-    value, error = own_variance(np.where(kept, values, 1e6), kept, near)
+    value, error = pixel_variance(np.where(kept, values, 1e6), kept, near)
     assert value == pytest.approx(49.0, abs=4.0 * error)
     assert error < 2.0
     assert abs(plain - 49.0) > 5.0 * error

@@ -18,7 +18,7 @@ def test_discs_hold_what_is_within_their_radius(seed, widest):
     radius[0] = 0.0
     out = rng.random((20, 30)) < 0.02
     before = out.copy()
-    masks.discs(x, y, radius, out)
+    masks.mark_discs(x, y, radius, out)
     rows, columns = np.mgrid[0:20, 0:30]
     near = [(columns - a) ** 2 + (rows - b) ** 2 <= r * r for a, b, r in zip(x, y, radius, strict=True) if r > 0.0]
     assert (out == np.logical_or.reduce([before, *near])).all()
@@ -27,7 +27,7 @@ def test_discs_hold_what_is_within_their_radius(seed, widest):
 @pytest.mark.parametrize("radius", [np.nan, -1.0, 0.0])
 def test_no_disc_without_a_radius(radius):
     out = np.zeros((5, 5), bool)
-    masks.discs(np.array([2.0]), np.array([2.0]), np.array([radius]), out)
+    masks.mark_discs(np.array([2.0]), np.array([2.0]), np.array([radius]), out)
     assert not out.any()
 
 
@@ -39,5 +39,5 @@ def test_a_mask_grows_as_scipy_has_it(seed, corners, times):
     if times:
         structure = (SQUARE if corners else CROSS)[None]
         told = ndimage.binary_dilation(mask, structure=structure, iterations=times)
-    assert (masks.grown(mask, corners, times) == told).all()
+    assert (masks.dilate(mask, corners, times) == told).all()
     assert (mask == before).all()

@@ -33,34 +33,34 @@ def frame(rng, strength, slope, band="euclid_vis"):
 def test_wings_that_were_put_in(slope):
     there = Wings(0.09, slope)
     of, known = frame(np.random.default_rng(4), there.strength, slope)
-    found = wings.told(of, known, np.arange(16), NOISE, 20)
+    found = wings.measure(of, known, np.arange(16), NOISE, 20)
     assert found.slope == pytest.approx(slope, abs=0.15)
-    assert found.beyond(9.0) == pytest.approx(there.beyond(9.0), rel=0.08)
+    assert found.fraction_beyond(9.0) == pytest.approx(there.fraction_beyond(9.0), rel=0.08)
     assert found.error < 0.1 * found.strength
 
 
 def test_all_light_of_the_ground_has_an_end():
     of, known = frame(np.random.default_rng(4), 0.09, 3.0, "des_r")
-    found = wings.told(of, known, np.arange(16), NOISE, 20)
-    assert found.whole == pytest.approx(250.0)
-    assert Wings(0.09, 3.0, whole=250.0).beyond(10.0) == pytest.approx(0.18 * np.pi * (0.1 - 0.004))
+    found = wings.measure(of, known, np.arange(16), NOISE, 20)
+    assert found.outer_radius == pytest.approx(250.0)
+    assert Wings(0.09, 3.0, outer_radius=250.0).fraction_beyond(10.0) == pytest.approx(0.18 * np.pi * (0.1 - 0.004))
 
 
 def test_points_without_wings():
     of, known = frame(np.random.default_rng(4), 0.0, 3.0)
-    found = wings.told(of, known, np.arange(16), NOISE, 20)
+    found = wings.measure(of, known, np.arange(16), NOISE, 20)
     assert 0.0 <= found.strength < 4.0 * found.error
-    assert found.error < 0.1 * wings.usual(of).strength
+    assert found.error < 0.1 * wings.typical(of).strength
 
 
 @pytest.mark.parametrize(("band", "unsure"), [("euclid_vis", 0.2), ("des_r", 0.5)])
 def test_a_frame_that_does_not_tell_its_wings_has_the_usual_ones(band, unsure):
     of, known = frame(np.random.default_rng(4), 0.0, 3.0, band)
-    alone, usual = wings.told(of, known, np.arange(1), NOISE, 20), wings.usual(of)
+    alone, usual = wings.measure(of, known, np.arange(1), NOISE, 20), wings.typical(of)
     assert alone == usual
     assert usual.error == unsure * usual.strength
     # Of faint stars nothing is seen.
-    faint = wings.told(of, known, np.arange(16, 30), NOISE, 20)
+    faint = wings.measure(of, known, np.arange(16, 30), NOISE, 20)
     assert faint.strength == pytest.approx(usual.strength * 20.0 ** (faint.slope - usual.slope), rel=0.3)
 
 
@@ -75,4 +75,4 @@ def test_the_usual_wings_of_space_are_those_of_the_edges_of_the_pupil(band, wave
     edges = 2 * np.pi * (outer + inner) + 6 * (outer - inner)
     wanted = wavelength * edges / (4 * np.pi**3 * area) * np.degrees(1.0) * 3600.0
     of, _ = frame(np.random.default_rng(4), 0.0, 3.0, band)
-    assert wings.usual(of).strength * of.scale == pytest.approx(wanted, rel=0.15)
+    assert wings.typical(of).strength * of.scale == pytest.approx(wanted, rel=0.15)

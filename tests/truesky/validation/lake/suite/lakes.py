@@ -4,7 +4,7 @@ import numpy as np
 
 from lake_schema import sky
 from lake_schema.store import layout, publish
-from lake_schema.store.plan import Output, Part, Plan
+from lake_schema.store.plan import Output, Plan, Task
 from lake_schema.tables.exposures import EXPOSURES
 from lake_schema.tables.fluxes import fluxes
 from lake_schema.tables.products import PRODUCTS
@@ -20,7 +20,7 @@ BAND = "euclid_vis"
 def lake(root, files=2, **wrong):
     """A lake of as many frames of one field; wrong : of made.vis_file, of the last of them."""
     root.mkdir(parents=True, exist_ok=True)
-    root = layout.lake(root)
+    root = layout.resolve_lake(root)
     rng = np.random.default_rng(8)
     of = made.scene(rng)
     _stars(root, of)
@@ -32,8 +32,8 @@ def lake(root, files=2, **wrong):
 
 
 def _published(root, table, facts, rows, part="all.parquet", written=None):
-    plan = Plan(table, facts, (Part(part, {}),))
-    publish.make(root, plan, lambda lake, facts: Output(rows, written or {}))
+    plan = Plan(table, facts, (Task(part, {}),))
+    publish.make_version(root, plan, lambda lake, facts: Output(rows, written or {}))
     return plan.key
 
 
@@ -44,7 +44,7 @@ def _joined(parts):
 def _stars(root, of):
     index = sky.healpix_29(of.ra, of.dec)
     order = np.argsort(index)
-    cell = int(sky.parent(index, sky.DEEPEST, 3)[0])
+    cell = int(sky.parent(index, sky.MAX_ORDER, 3)[0])
     part = layout.cell_file(3, cell)
     like = rows_of(STARS, len(of))
     columns = {name: like[name] for name in like.column_names}

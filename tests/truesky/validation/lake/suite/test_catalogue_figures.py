@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from truesky.validation.lake.measure.frame_context import Result
 from truesky.validation.lake.measure.rows import Place, Row
-from truesky.validation.lake.measure.seen import Result
 from truesky.validation.lake.suite import catalogue_figures, report
-from truesky.validation.lake.suite.running import Found
+from truesky.validation.lake.suite.running import LakeResults
 
 
 def count(mag, value, error=0.03):
@@ -34,7 +34,7 @@ def series():
 
 
 def test_each_axis_says_what_it_is_and_points_have_errors(series):
-    drawn = list(catalogue_figures.drawn(ROWS, series))
+    drawn = list(catalogue_figures.draw_all(ROWS, series))
     assert len(drawn) == 5
     for caption, figure in drawn:
         assert caption.startswith("galaxies: ")
@@ -45,13 +45,13 @@ def test_each_axis_says_what_it_is_and_points_have_errors(series):
 
 
 def test_what_was_not_measured_is_not_drawn():
-    assert list(catalogue_figures.drawn([], {})) == []
-    assert list(catalogue_figures.drawn(ROWS[2:], {})) == []
-    (one,) = catalogue_figures.drawn(ROWS, {})
+    assert list(catalogue_figures.draw_all([], {})) == []
+    assert list(catalogue_figures.draw_all(ROWS[2:], {})) == []
+    (one,) = catalogue_figures.draw_all(ROWS, {})
     assert "a survey" in one[0]
 
 
 def test_the_report_has_them(series):
-    text = report.page("lake", Found(ROWS, [], [Result(Place(), ROWS, series)]))
+    text = report.page("lake", LakeResults(ROWS, [], [Result(Place(), ROWS, series)]))
     assert text.count("src='data:image/png;base64,") == 5
     assert "non-linear theory" in text

@@ -6,7 +6,13 @@ import pytest
 
 from tests.truesky.validation.lake.catalogues import test_colours, test_two_points
 from tests.truesky.validation.lake.catalogues import test_faults as catalogues
-from tests.truesky.validation.lake.images import test_between, test_completeness, test_gain, test_spectra, test_together
+from tests.truesky.validation.lake.images import (
+    test_common_bias,
+    test_completeness,
+    test_gain,
+    test_repeatability,
+    test_spectra,
+)
 from tests.truesky.validation.lake.images import test_faults as images
 from tests.truesky.validation.model import test_observed
 from truesky.validation.lake.suite import checks
@@ -32,8 +38,8 @@ FAULTS = {
     "completeness": ((test_completeness.test_sources_that_were_not_drawn, "a third of the sources elsewhere"),
                      (test_completeness.test_sources_that_are_fainter_than_they_should_be, "two magnitudes fainter")),
     "spectra": ((test_spectra.test_what_is_off_is_found, "trace, flux and wavelength off"),),
-    "between_images": ((test_between.test_the_frame_that_is_off, "one frame off by 10 mas, one by 0.05 mag"),),
-    "common_offset": ((test_together.test_a_bias_that_all_detectors_share, "all detectors off by 2 mas, 0.03 mag"),),
+    "between_images": ((test_repeatability.test_the_frame_that_is_off, "one frame off by 10 mas, one by 0.05 mag"),),
+    "common_offset": ((test_common_bias.test_a_bias_that_all_detectors_share, "all detectors off by 2 mas, 0.03 mag"),),
     "clustering": ((test_two_points.test_places_that_are_shuffled, "positions shuffled"),
                    (test_two_points.test_galaxies_of_other_halos, "halos of another mass"),
                    (test_two_points.test_clustering_of_luminous_galaxies_that_are_shuffled, "luminous ones shuffled")),
@@ -51,12 +57,12 @@ FAULTS = {
 
 
 def names():
-    return [check.name for check in (*checks.OF_FRAMES, *checks.OF_SEVERAL, *checks.OF_CATALOGUES)]
+    return [check.name for check in (*checks.FRAME_CHECKS, *checks.EXPOSURE_CHECKS, *checks.CATALOGUE_CHECKS)]
 
 
 def test_no_check_without_a_fault():
     assert set(names()) == set(FAULTS)
-    assert all(check.source for check in (*checks.OF_FRAMES, *checks.OF_SEVERAL, *checks.OF_CATALOGUES))
+    assert all(check.source for check in (*checks.FRAME_CHECKS, *checks.EXPOSURE_CHECKS, *checks.CATALOGUE_CHECKS))
 
 
 @pytest.mark.parametrize("name", FAULTS)

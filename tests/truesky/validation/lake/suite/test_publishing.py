@@ -19,7 +19,7 @@ def lake(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def version(lake):
-    return publishing.published(lake, processes=1)
+    return publishing.publish(lake, processes=1)
 
 
 def test_the_fault_is_found_where_it_is(version):
@@ -53,9 +53,9 @@ def test_a_second_run_finds_it_there(lake, version, capsys, tmp_path):
 
 
 def test_it_is_named_by_what_it_is_made_of(lake, version):
-    held = inventory.look(lake)
+    held = inventory.read_contents(lake)
     assert publishing.plan(held).key == version.key
-    assert publishing.plan(inventory.look(lake, exposures=[1]), [1]).key != version.key
+    assert publishing.plan(inventory.read_contents(lake, exposures=[1]), [1]).key != version.key
     assert set(version.manifest["facts"]["inputs"]) == {
         "exposures", "products", "rendered_truth", "star_fluxes", "stars",
     }  # fmt: skip
@@ -65,13 +65,13 @@ def test_it_is_named_by_what_it_is_made_of(lake, version):
 def test_frames_in_several_processes_give_the_same(lake, version):
     from truesky.validation.lake.suite import running
 
-    found = running.validated(inventory.look(lake), processes=2)
-    assert publishing.table(found.rows).to_pylist() == version.rows().to_pylist()
+    found = running.run_checks(inventory.read_contents(lake), processes=2)
+    assert publishing.build_table(found.rows).to_pylist() == version.rows().to_pylist()
 
 
 def test_what_is_not_there_is_refused(lake, tmp_path, capsys):
     with pytest.raises(BadInput, match="no image of exposure 7"):
-        inventory.look(lake, exposures=[7])
+        inventory.read_contents(lake, exposures=[7])
     (tmp_path / "empty").mkdir()
     for words in (["--lake", str(tmp_path / "empty")], ["--lake", str(lake), "--processes", "0"], ["--exposures", "1"]):
         assert __main__.main(words) == 2

@@ -1,0 +1,144 @@
+"""A plan in parts: each is made by itself, and together they are the plan."""
+
+import pickle
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from lake_schema.errors import TasksFailed
+from lake_schema.store import layout, publish, read
+from tests.truesky.render.planning.test_survey import VIS
+from truesky.render import plan_exposures
+from truesky.render.planning import exposure_chunks, survey, tasks
+from truesky.render.planning.mission import mission_of
+from truesky.request.from_toml import from_table
+
+# Two blocks of the same fields and dates, of which exposures differ in their noise alone; a pointing taken five times;
+# frames without a sky; a camera on the ground.
+BLOCK = {"channels": ["VIS", "NISP-P"], "fields": 3, "mjd": 60400.0}
+WANTED = {
+    "name": "parts",
+    "seed": 7,
+    "area": {"cone": {"ra": 60.0, "dec": -50.0, "radius": 1.0}},
+    "pointing": [{**VIS, "detectors": ["3-4", "1-1"], "realisations": 5}],
+    "observation": [
+        BLOCK,
+        {"channels": ["VIS"], "image_type": "bias", "exposures": 4},
+        {"channels": ["EXT"], "survey": "des", "exposures": 3},
+        {**BLOCK, "realisations": 2},
+    ],
+}
+
+
+@pytest.fixture(scope="module")
+def request_():
+    return from_table(WANTED)
+
+
+@pytest.fixture(scope="module")
+def whole(request_):
+    """Rows of `exposures` and `tasks` of the plan as one part."""
+    return plan_exposures.plan(None, request_)[1:]
+
+
+def planner(request_, most):
+    mission = mission_of(request_.mission)
+    found = plan_exposures.Planner.from_request(None, request_)
+    return replace(found, layout=exposure_chunks.Layout.from_request(request_, mission, most))
+
+
+@pytest.mark.parametrize("most", [1, 100, 700, 9000])
+def test_parts_of_any_size_are_together_the_plan(request_, whole, most):
+    own = planner(request_, most)
+    assert (len(own.layout.chunks) > 1) == (most < 9000)
+    tables = list(own.tables())
+    # Exposures that stand in other parts are counted, too.
+    assert pa.concat_tables([exposures for exposures, _ in tables]).equals(whole[0])
+    assert max(whole[0]["realisation"].to_pylist()) == 5
+    # A part is no larger than wanted, unless a field is.
+    largest = max(rows.num_rows for _, rows in tables)
+    assert largest <= max(most, 4 * (36 + 3 * 16 + 2 * 36) * 2)
+    together = tasks.sort_by_cost(pa.concat_tables([rows for _, rows in tables]))
+    assert together.equals(whole[1])
+
+
+def test_realisations_go_on_where_an_earlier_part_has_the_same_exposure(request_, whole):
+    rows = whole[0].to_pylist()
+    alike = [row for row in rows if row["survey"] == "wide" and row["image_type"] == "science"]
+    first = {(row["camera"], row["band"], row["mjd"], row["exposure_time_s"]): [] for row in alike}
+    for row in alike:
+        first[row["camera"], row["band"], row["mjd"], row["exposure_time_s"]].append(row["realisation"])
+    assert set(map(tuple, first.values())) == {(1, 2, 3)}
+
+
+def test_what_makes_a_part_crosses_to_a_worker(request_):
+    own = planner(request_, 200)
+    other = pickle.loads(pickle.dumps(own))
+    piece = own.layout.chunks[3]
+    exposures = other.rows_of_exposures(other.layout.pieces[3])
+    assert exposures.equals(own.rows_of_exposures(piece))
+    assert other.rows_of_tasks(piece, exposures).equals(own.rows_of_tasks(piece, exposures))
+
+
+def test_parts_say_which_exposures_they_hold_and_when_they_begin(request_, whole):
+    own = planner(request_, 200)
+    dates = dict(zip(whole[0]["exposure_id"].to_pylist(), whole[0]["mjd"].to_pylist(), strict=True))
+    named = own.layout.parts()
+    assert [part.facts["exposures"][0] for part in named] == [piece.first for piece in own.layout.chunks]
+    for before, now in pairwise(named):
+        assert before.facts["exposures"][1] + 1 == now.facts["exposures"][0]
+    for part in named:
+        first, last = part.facts["exposures"]
+        since, until = part.facts["mjd"]
+        assert all(since <= dates[number] <= until for number in range(first, last + 1))
+    assert own.layout.parts()[-1].facts["exposures"][1] == len(dates)
+
+
+def published(root, request_, monkeypatch, mapper, most=200):
+    monkeypatch.setattr(exposure_chunks, "MAX_TASKS_PER_CHUNK", most)
+    monkeypatch.setattr(exposure_chunks.Layout.from_request.__func__, "__defaults__", (most,))
+    for step in plan_exposures.steps(root, request_):
+        publish.make_version(root, step.plan, step.run_task, mapper, name=request_.name)
+    return {name: read.version(root, name) for name in ("exposures", "tasks")}
+
+
+def test_whichever_part_is_made_first_and_after_whatever_death_the_bytes_are_the_same(
+    request_, whole, tmp_path, monkeypatch
+):
+    one = published(layout.resolve_lake(tmp_path / "one"), request_, monkeypatch, map)
+    assert len(one["tasks"].partitions) > 5
+
+    def dying(function, some):
+        return (function(part) for part in some[::-1][: len(some) // 2])
+
+    other = layout.resolve_lake(tmp_path / "other")
+    for _ in range(2):
+        with pytest.raises(TasksFailed):
+            published(other, request_, monkeypatch, dying)
+    two = published(other, request_, monkeypatch, lambda function, some: map(function, some[::-1]))
+    for name, version in one.items():
+        assert version.key == two[name].key
+        assert version.fingerprint == two[name].fingerprint
+        assert read.find_faults(two[name], deep=True) == []
+    assert tasks.sort_by_cost(one["tasks"].rows()).equals(whole[1])
+    # Of a large plan a reader opens what it needs.
+    numbers = [1, 2, whole[0].num_rows]
+    holders = exposure_chunks.partition_names(one["tasks"], numbers)
+    assert holders == [one["tasks"].partitions[0], one["tasks"].partitions[-1]]
+    assert exposure_chunks.rows(one["exposures"], numbers)["exposure_id"].to_pylist()[0] == 1
+    began = whole[0]["mjd"].to_numpy()
+    near = (float(began[20]) - 0.01, float(began[20]))
+    found = exposure_chunks.rows(one["exposures"], dates=near)["exposure_id"].to_numpy()
+    assert {*(np.flatnonzero((began >= near[0]) & (began <= near[1])) + 1)} <= {*found}
+
+
+def test_fields_are_checked_before_any_is_laid_out(request_, monkeypatch):
+    """Of 100,000 exposures no more are made to say that they are good than of one field and its twin."""
+    made, lay = [], survey.visit_exposures
+    monkeypatch.setattr(survey, "visit_exposures", lambda field, **rest: made.append(field) or lay(field, **rest))
+    wide = replace(request_, pointings=(), observations=(replace(request_.observations[0], fields=40),))
+    assert len(exposure_chunks.Layout.from_request(wide, mission_of(wide.mission)).chunks[0]) > 600
+    assert len(made) <= 4

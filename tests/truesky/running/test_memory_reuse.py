@@ -1,0 +1,167 @@
+"""Memory that is kept while arrays come and go, and given back: as the C library counts it, not as a machine does."""
+
+import ctypes
+import functools
+import mmap
+import platform
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+
+import numpy as np
+import pytest
+
+from truesky.running import memory_reuse
+
+# More than the 32 MB up to which the library may learn to keep memory by itself.
+SIZE = 64 << 20
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _memory_is_reused():
+    """These tests measure memory, so none is kept for them."""
+
+
+class Counted(ctypes.Structure):
+    """mallinfo2 of malloc.h.
+
+    arena    : bytes of the heap, of which uordblks are in use and fordblks are free
+    hblkhd   : bytes that the operating system was asked for directly
+    keepcost : free bytes at the heap's end, which could be given back
+    """
+
+    _fields_ = tuple(
+        (name, ctypes.c_size_t)
+        for name in (
+            "arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks", "uordblks", "fordblks", "keepcost",
+        )
+    )  # fmt: skip
+
+
+def counts():
+    """mallinfo2, or nothing where the C library has none."""
+    try:
+        function = ctypes.CDLL(None).mallinfo2
+    except (AttributeError, OSError, TypeError):
+        return None
+    function.restype = Counted
+    return function
+
+
+COUNTS = counts()
+# Told by the system, not by what is tested: a `heap` that no longer finds the library fails here.
+on_gnu = pytest.mark.skipif(
+    platform.libc_ver()[0] != "glibc" or COUNTS is None,
+    reason="only GNU's C library, from 2.33 on, says where memory is; that others are left alone is tested below",
+)
+
+
+def alone(test):
+    """The test in a process of its own: in a heap that others left, even a large array may find room."""
+
+    @functools.wraps(test)
+    def in_a_process():
+        with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+            pool.submit(_called, test.__name__).result(300)
+
+    return in_a_process
+
+
+def _called(name):
+    globals()[name].__wrapped__()
+
+
+def heap_and_mapped():
+    now = COUNTS()
+    return now.arena, now.hblkhd
+
+
+def resident():
+    """Bytes of this process that are in memory.
+
+    The heap's size would not do for what is given back: one small block that is left at its end keeps it as long as
+    it was, though no page before that block is in memory any more.
+    """
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * mmap.PAGESIZE
+
+
+@on_gnu
+@alone
+def test_without_it_each_array_is_asked_for():
+    heap_before, mapped_before = heap_and_mapped()
+    array = np.ones(SIZE, np.uint8)
+    size, mapped = heap_and_mapped()
+    assert size < heap_before + SIZE // 8
+    assert mapped >= mapped_before + SIZE
+    del array
+    assert heap_and_mapped()[1] == mapped_before
+
+
+@on_gnu
+@alone
+def test_later_arrays_find_the_memory_of_those_before():
+    mapped_before = heap_and_mapped()[1]
+    with memory_reuse.retain_freed_memory():
+        places, sizes = set(), set()
+        for _ in range(5):
+            array = np.ones(SIZE, np.uint8)
+            places.add(array.ctypes.data)
+            del array
+            # It stays with the process when the array is gone; nothing comes from elsewhere.
+            assert COUNTS().fordblks >= SIZE
+            size, mapped = heap_and_mapped()
+            assert mapped == mapped_before
+            sizes.add(size)
+        assert len(places) == len(sizes) == 1
+
+
+@on_gnu
+@alone
+def test_it_is_given_back():
+    before, mapped = resident(), heap_and_mapped()[1]
+    with memory_reuse.retain_freed_memory():
+        np.ones(SIZE, np.uint8)
+        assert COUNTS().fordblks >= SIZE
+        assert resident() >= before + SIZE * 7 // 8
+    assert resident() < before + SIZE // 8
+    # As the library is used to: the next array is asked for, and given back.
+    array = np.ones(SIZE, np.uint8)
+    assert heap_and_mapped()[1] >= mapped + SIZE
+    del array
+    # And smaller ones, which are in the heap, leave nothing at its end.
+    many = [np.ones(100_000, np.uint8) for _ in range(SIZE // 100_000)]
+    assert COUNTS().uordblks >= SIZE - 100_000
+    del many
+    assert COUNTS().keepcost < SIZE // 8
+
+
+@on_gnu
+@alone
+def test_it_is_given_back_after_an_error():
+    before = resident()
+
+    @memory_reuse.retain_freed_memory()
+    def fails():
+        np.ones(SIZE, np.uint8)
+        raise KeyError("of the work")
+
+    with pytest.raises(KeyError, match="of the work"):
+        fails()
+    assert resident() < before + SIZE // 8
+
+
+def no_such_library(name):
+    raise OSError(f"{name}: not found")
+
+
+@pytest.mark.parametrize("opened", [lambda name: object(), no_such_library])
+def test_another_library_is_left_alone(monkeypatch, opened):
+    """One without GNU's functions, and none at all."""
+    monkeypatch.setattr(memory_reuse.ctypes, "CDLL", opened)
+    monkeypatch.setattr(memory_reuse, "_library", memory_reuse._library.__wrapped__)
+    with memory_reuse.retain_freed_memory():
+        assert memory_reuse._library() is None
+        array = np.ones(SIZE, np.uint8)
+        if COUNTS is not None:
+            assert heap_and_mapped()[1] >= SIZE
+        del array

@@ -1,0 +1,185 @@
+"""Addresses of the jobs of a TAP service, as UWS wants them.
+
+Ref: IVOA Recommendation UWS 1.1, section 2
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Awaitable, Callable
+from datetime import UTC, datetime
+
+from aiohttp import web
+
+from lake_schema.errors import BadInput
+from truesky.explore import votables
+from truesky.page import downloads
+from truesky.page.lake_session import iterate_in_thread
+from truesky.page.tap import descriptions
+from truesky.page.tap.queries import RETENTION, Job, Jobs
+
+_XML, _TEXT = "text/xml", "text/plain"
+_MAX_WAIT = 60.0
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+async def read_parameters(request: web.Request) -> dict[str, str]:
+    """What a tool asks with, in the address or as a form; names in capitals.  Errors: BadInput for a file"""
+    values = {name.upper(): value for name, value in request.query.items()}
+    if request.method == "POST":
+        for name, value in (await request.post()).items():
+            if not isinstance(value, str):
+                raise BadInput(f"{name[:40]}: this service takes no files")
+            values[name.upper()] = value
+    return values
+
+
+class Routes:
+    """Handlers of the addresses below async.
+
+    address : of the service, for a request;  check : refuses a question;  seconds : that a question may take
+    """
+
+    def __init__(
+        self,
+        jobs: Jobs,
+        address: Callable[[web.Request], str],
+        check: Callable[[dict[str, str]], None],
+        max_seconds: Callable[[], float],
+    ) -> None:
+        self._jobs, self._address, self._check, self._max_seconds = jobs, address, check, max_seconds
+
+    def add(self, router: web.UrlDispatcher, path: str, wrap: Callable[[Handler], Handler]) -> None:
+        """Answer below a path; `told` says what is refused."""
+        router.add_get(f"{path}/async", wrap(self._list))
+        router.add_post(f"{path}/async", wrap(self._create))
+        router.add_get(f"{path}/async/{{job}}", wrap(self._describe_job))
+        router.add_post(f"{path}/async/{{job}}", wrap(self._change))
+        router.add_delete(f"{path}/async/{{job}}", wrap(self._delete))
+        router.add_get(f"{path}/async/{{job}}/{{part}}", wrap(self._job_attribute))
+        router.add_post(f"{path}/async/{{job}}/{{part}}", wrap(self._change))
+        router.add_get(f"{path}/async/{{job}}/results/result", wrap(self._result))
+
+    def _find_job(self, request: web.Request) -> Job:
+        job = self._jobs.get(request.match_info["job"])
+        if job is None:
+            raise web.HTTPNotFound
+        return job
+
+    def _redirect(self, request: web.Request, job: Job | None = None) -> web.Response:
+        """Lead to a job, or to their list; tools want absolute addresses."""
+        location = f"{self._address(request)}/async" + (f"/{job.name}" if job else "")
+        return web.Response(status=303, headers={"Location": location})
+
+    async def _list(self, request: web.Request) -> web.StreamResponse:
+        address = f"{self._address(request)}/async"
+        rows = [(job.name, f"{address}/{job.name}", job.phase, job.creation_time) for job in self._jobs.all()]
+        phases = request.query.getall("PHASE", [])
+        rows = [row for row in rows if not phases or row[2] in phases]
+        return web.Response(text=descriptions.list_jobs(rows), content_type=_XML)
+
+    async def _create(self, request: web.Request) -> web.StreamResponse:
+        values = await read_parameters(request)
+        phase = values.pop("PHASE", "")
+        job = self._jobs.add(values, self._max_seconds())
+        if phase == "RUN":
+            self._jobs.start(job)
+        return self._redirect(request, job)
+
+    async def _describe_job(self, request: web.Request) -> web.StreamResponse:
+        job = self._find_job(request)
+        await _wait_for_change(job, request)
+        facts: dict[str, object] = {
+            "jobId": job.name, "runId": job.parameters.get("RUNID"), "ownerId": None, "phase": job.phase, "quote": None,
+            "creationTime": job.creation_time, "startTime": job.start_time, "endTime": job.end_time,
+            "executionDuration": math.ceil(job.max_seconds), "destruction": job.destruction_time,
+        }  # fmt: skip
+        if facts["runId"] is None:
+            del facts["runId"]
+        text = descriptions.describe_job(facts, job.parameters, self._result_address(request, job), job.error)
+        return web.Response(text=text, content_type=_XML)
+
+    def _result_address(self, request: web.Request, job: Job) -> str | None:
+        return f"{self._address(request)}/async/{job.name}/results/result" if job.phase == "COMPLETED" else None
+
+    async def _delete(self, request: web.Request) -> web.StreamResponse:
+        self._jobs.remove(self._find_job(request).name)
+        return self._redirect(request)
+
+    async def _change(self, request: web.Request) -> web.StreamResponse:
+        """Start, abort or delete a job, or change a parameter of one that waits."""
+        job, values = self._find_job(request), await read_parameters(request)
+        if values.get("ACTION") == "DELETE":
+            return await self._delete(request)
+        attribute = request.match_info.get("part", "")
+        if (phase := values.pop("PHASE", None)) is not None:
+            if phase not in ("RUN", "ABORT"):
+                raise BadInput(f"PHASE = {phase[:40]!r} is not one of RUN, ABORT")
+            (self._jobs.start if phase == "RUN" else self._jobs.abort)(job)
+        elif attribute == "executionduration":
+            job.max_seconds = _parse_seconds(values.get("EXECUTIONDURATION", ""), self._max_seconds())
+        elif attribute == "destruction":
+            job.destruction_time = min(_parse_time(values.get("DESTRUCTION", "")), job.creation_time + RETENTION)
+        elif attribute in ("", "parameters"):
+            if job.phase != "PENDING":
+                raise BadInput("parameters can be changed only before a job is started")
+            job.parameters |= values
+        else:
+            raise BadInput(f"{attribute[:40]} cannot be changed")
+        return self._redirect(request, job)
+
+    async def _job_attribute(self, request: web.Request) -> web.StreamResponse:
+        job, attribute = self._find_job(request), request.match_info["part"]
+        if attribute == "error" and job.phase == "ERROR":
+            return web.Response(body=votables.refusal(job.error), content_type="application/x-votable+xml")
+        if attribute == "parameters":
+            return web.Response(text=descriptions.describe_parameters(job.parameters), content_type=_XML)
+        if attribute == "results":
+            text = descriptions.describe_results(self._result_address(request, job))
+            return web.Response(text=text, content_type=_XML)
+        attribute_values = {
+            "phase": job.phase, "quote": "", "owner": "", "executionduration": str(math.ceil(job.max_seconds)),
+            "destruction": descriptions.format_time(job.destruction_time),
+        }  # fmt: skip
+        if attribute not in attribute_values:
+            raise web.HTTPNotFound
+        return web.Response(text=attribute_values[attribute], content_type=_TEXT)
+
+    async def _result(self, request: web.Request) -> web.StreamResponse:
+        job = self._find_job(request)
+        if job.phase != "COMPLETED":
+            raise web.HTTPNotFound
+        return await downloads.send_stream(
+            request, iterate_in_thread(downloads.read_chunks(self._jobs.file(job))), job.content_type, None
+        )
+
+
+async def _wait_for_change(job: Job, request: web.Request) -> None:
+    """WAIT=s: answer only when the phase changes, or the job has ended."""
+    wait = request.query.get("WAIT")
+    if wait is None or job.has_ended or request.query.get("PHASE", job.phase) != job.phase:
+        return
+    if job.phase == "PENDING":
+        return
+    seconds = _MAX_WAIT if wait == "-1" else min(_parse_seconds(wait, _MAX_WAIT), _MAX_WAIT)
+    changed = job.phase_changed
+    try:
+        await asyncio.wait_for(changed.wait(), seconds)
+    except TimeoutError:
+        return
+
+
+def _parse_seconds(text: str, max_seconds: float) -> float:
+    """Whole seconds, 0 = as many as possible."""
+    if not (text.isascii() and text.isdigit() and len(text) < 10):
+        raise BadInput(f"{text[:40]!r} is not a number of seconds")
+    return min(float(text) or max_seconds, max_seconds)
+
+
+def _parse_time(text: str) -> datetime:
+    try:
+        time = datetime.fromisoformat(text)
+    except ValueError:
+        raise BadInput(f"{text[:40]!r} is not a moment, ISO 8601") from None
+    return time if time.tzinfo else time.replace(tzinfo=UTC)

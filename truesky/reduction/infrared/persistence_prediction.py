@@ -1,0 +1,70 @@
+"""Persistence as an observer foresees it: of the earlier frames of a detector of a lake, by the mission's numbers.
+
+foreseen      electrons that the frames before one left in it
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lake_schema.arrays import Float, Float32
+from truesky.reduction.frames import Frame
+from truesky.render.channels import registry
+from truesky.render.channels.image_types import shared_settings
+from truesky.render.effects.charge.persistence import PersistenceModel
+from truesky.render.exposure import persistence
+
+_DAY_S = 86400.0
+# Frames whose charge is kept in memory: 4 bytes a pixel.
+_CACHE_SIZE = 48
+# Nothing shone on them.
+_DARK_TYPES = ("bias", "dark", "persistence")
+
+
+@dataclass(slots=True)
+class PersistencePrediction:
+    """What is left in frames of a detector; frames : all that there are of it, of whatever channel.
+
+    Error : of what each pixel's traps have of their own nothing is known; what no frame of the lake shows is missed
+    """
+
+    frames: Sequence[Frame]
+    _charge_cache: OrderedDict[int, Float32] = field(default_factory=OrderedDict)
+
+    def charge_in(self, frame: Frame) -> Float:
+        """e- [ny, nx] in a frame of it."""
+        out = np.zeros((frame.scene.ny, frame.scene.nx))
+        exposure, traps = frame.exposure, PersistenceModel.from_scene(frame.scene)
+        start_mjd = exposure.mjd - persistence.window_days(exposure.camera, frame.scene.mission)
+        for previous_frame in self.frames:
+            previous = previous_frame.exposure
+            if (
+                not start_mjd <= previous.mjd < exposure.mjd
+                or previous.image_type in _DARK_TYPES
+                or (previous.realisation or 1) > 1
+            ):
+                continue
+            if registry.CHANNELS[previous.channel].persistence_effect is None or shared_settings(
+                previous.settings
+            ) != shared_settings(exposure.settings):
+                continue
+            times = (exposure.mjd - previous.mjd) * _DAY_S, exposure.exposure_time_s, previous.exposure_time_s
+            out += traps.time_scaling(*times) * self._charge_at_reference(previous_frame, traps)
+        return out
+
+    def _charge_at_reference(self, previous_frame: Frame, traps: PersistenceModel) -> Float32:
+        """e- of a frame's charge after the reference time, in an exposure of the nominal length."""
+        number = previous_frame.exposure.exposure_id
+        if number not in self._charge_cache:
+            charge = np.where(previous_frame.saturated_pixels(), traps.full_well, previous_frame.electrons())
+            self._charge_cache[number] = traps.released_charge(charge, traps.reference, traps.nominal_length).astype(
+                np.float32
+            )
+            if len(self._charge_cache) > _CACHE_SIZE:
+                self._charge_cache.popitem(last=False)
+        self._charge_cache.move_to_end(number)
+        return self._charge_cache[number]

@@ -1,0 +1,269 @@
+"""Truth of spectra: where each source's orders lie on a detector, what of them overlaps, how well lines are seen.
+
+traced     rows of it
+overlaps   which traces lie beside which
+lines_of   emission lines of galaxies in a first order
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.ndimage import uniform_filter
+
+from lake_schema import units
+from lake_schema.arrays import Bool, Float, Int
+from truesky.fluxes import passbands
+from truesky.fluxes.libraries import templates
+from truesky.fluxes.sources import GALAXY_KINDS, galaxies_from_table
+from truesky.fluxes.spectra import extinction, lines
+from truesky.render.camera.traces import Trace
+from truesky.render.channels.aim import Aim
+from truesky.render.dispersing.draw import Tally
+from truesky.render.effects.scene import Scene
+from truesky.render.exposure.records import Rows
+from truesky.render.exposure.visible_sources import Light
+from truesky.render.sources import colours, galaxy_shapes
+
+# Pixels of a trace that are compared at a time; places along a trace between which it is taken as straight; the widest
+# a trace is taken to be, half, pixels.
+_BIN, _PLACES, _WIDEST = 8, 33, 20.0
+# Electrons a column of a trace that counts as a contaminant, of a pixel's noise.  In an extraction that is as long as
+# wide, such as of a resolution element, it then brings at least as much light as there is noise: a bias of one sigma.
+MIN_CONTAMINATION = 1.0
+
+Columns = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class TracePaths:
+    """Traces of n orders of sources on a detector.
+
+    source : int[n] which;  order : int[n]
+    along  : [n] polynomials: columns of t^i;  across : rows
+    half   : float64[n] half of their widths, pixels
+    level  : float64[n] electrons a column on the detector, in the mean
+    """
+
+    source: Int
+    order: Int
+    along: list[Float]
+    across: list[Float]
+    half: Float
+    level: Float
+
+
+def truth_columns(light: Light, tally: Tally, aim: Aim, rows: Rows, scene: Scene) -> Columns:
+    """Columns of the table `rendered_spectra`, but for exposure and detector, one row an order with light there.
+
+    light : what shines onto the detector;  tally : what each source brought to it
+    aim, rows, scene : the exposure and detector, the catalogue rows, and what effects know
+    """
+    assert light.dispersed is not None
+    sources, orders = light.sources, light.dispersed.orders
+    numbers = np.array([order.trace.order for order in orders])
+    # Ascending identifier, ascending order.
+    by_order = np.argsort(numbers)
+    source, at = np.nonzero(tally.electrons[:, by_order] > 0.0)
+    order_index = by_order[at]
+    paths = _find_paths(light, tally, source, order_index, aim)
+    overlap, contaminants = find_overlaps(paths, aim.detector.nx, MIN_CONTAMINATION * scene.pixel_noise)
+    line_columns = emission_line_columns(light, source, paths, aim, rows, scene)
+    first = paths.order == 1
+    return {
+        "id": sources.ids[source],
+        "order": paths.order,
+        "wavelength_first": np.array([orders[m].trace.first for m in order_index], float),
+        "wavelength_last": np.array([orders[m].trace.last for m in order_index], float),
+        **{f"{axis}_first": np.array([p[0] for p in polynomials], float) for axis, polynomials in _axes(paths)},
+        **{f"{axis}_last": np.array([p.sum() for p in polynomials], float) for axis, polynomials in _axes(paths)},
+        **{f"trace_{axis}": polynomials for axis, polynomials in _axes(paths)},
+        "expected": tally.expected[source, order_index],
+        "drawn": tally.electrons[source, order_index],
+        "overlapped": np.ma.masked_array(overlap, ~first),
+        "contaminants": [np.unique(sources.ids[other]) if len(other) else sources.ids[:0] for other in contaminants],
+        **line_columns,
+    }
+
+
+def _axes(paths: TracePaths) -> tuple[tuple[str, list[Float]], tuple[str, list[Float]]]:
+    return ("x", paths.along), ("y", paths.across)
+
+
+def _find_paths(light: Light, tally: Tally, source: Int, order_index: Int, aim: Aim) -> TracePaths:
+    assert light.dispersed is not None
+    assert light.psf is not None
+    sources, scale = light.sources, light.psf.pixel_scale
+    is_galaxy = sources.shape >= 0
+    half = np.full(len(sources), 0.5 * light.psf.fwhm / scale)
+    half[is_galaxy] += galaxy_shapes.half_light(sources.shapes.take(sources.shape[is_galaxy])) / scale
+    for i in np.unique(source).tolist():
+        picture = None if is_galaxy[i] else sources.picture_of(i)
+        half[i] += 0.0 if picture is None else picture.half_light / scale
+    half += 0.5 * sources.trail_length
+    along, across = ([np.zeros(0)] * len(source) for _ in "xy")
+    order, columns = np.zeros(len(source), np.int64), np.ones(len(source))
+    for m, dispersed_order in enumerate(light.dispersed.orders):
+        (indices,) = np.nonzero(order_index == m)
+        order[indices] = dispersed_order.trace.order
+        column, row = sources.column[source[indices]], sources.row[source[indices]]
+        x, y = dispersed_order.trace.polynomials(column, row)
+        x[0] += column
+        y[0] += row
+        low, high = np.sort([x[0], x.sum(axis=0)], axis=0)
+        columns[indices] = np.maximum(np.minimum(high, aim.detector.nx - 1.0) - np.maximum(low, 0.0), 1.0)
+        for k, path_x, path_y in zip(indices.tolist(), x.T.copy(), y.T.copy(), strict=True):
+            along[k], across[k] = path_x, path_y
+    level = tally.electrons[source, order_index] / columns
+    return TracePaths(source, order, along, across, np.minimum(half, _WIDEST)[source], level)
+
+
+# ---------------------------------------------------------------------------------------------- what overlaps
+
+
+def find_overlaps(paths: TracePaths, nx: int, min_level: float) -> tuple[Float, list[Int]]:
+    """(float64[n] part of each first order beside which others lie, their sources), 0 and none of other orders.
+
+    paths : traces on a detector of nx columns;  least : electrons a column of a trace that counts
+    Error : in steps of 8 pixels of the trace's length
+    """
+    path, at, row = _bins(paths, nx)
+    order = np.argsort(at, kind="stable")
+    path, at, row = path[order], at[order], row[order]
+    ends = np.searchsorted(at, np.arange(at.max(initial=-1) + 2))
+    covered, sources = np.zeros(len(paths.order)), int(paths.source.max(initial=0)) + 1
+    previous_pairs, new_pairs = np.zeros(0, np.int64), [np.zeros(0, np.int64)]
+    for start, stop in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True):
+        target, other = _find_neighbours(paths, path[start:stop], row[start:stop], min_level)
+        is_overlapped = np.zeros(len(covered), bool)
+        is_overlapped[target] = True
+        covered += is_overlapped
+        # Most pairs go on from bin to bin: a pair is held where it begins.
+        pairs = np.unique(target * sources + paths.source[other])
+        new_pairs.append(np.setdiff1d(pairs, previous_pairs, assume_unique=True))
+        previous_pairs = pairs
+    length = np.bincount(path, minlength=len(covered))
+    first, source = np.divmod(np.unique(np.concatenate(new_pairs)), sources)
+    split = np.searchsorted(first, np.arange(1, len(covered)))
+    return covered / np.maximum(length, 1), np.split(source, split) if len(covered) else []
+
+
+def _find_neighbours(paths: TracePaths, path: Int, row: Float, min_level: float) -> tuple[Int, Int]:
+    """(first orders, traces of other sources beside them) of those that pass one bin at rows."""
+    bright = np.flatnonzero(paths.level[path] >= min_level)
+    bright = bright[np.argsort(row[bright], kind="stable")]
+    first = np.flatnonzero(paths.order[path] == 1)
+    widest = float(paths.half[path[bright]].max(initial=0.0))
+    reach = paths.half[path[first]] + widest
+    low = np.searchsorted(row[bright], row[first] - reach)
+    count = np.searchsorted(row[bright], row[first] + reach, "right") - low
+    target = np.repeat(first, count)
+    begin = np.repeat(low - (np.cumsum(count) - count), count)
+    other = bright[begin + np.arange(len(target))] if len(target) else bright[:0]
+    separation = np.abs(row[target] - row[other])
+    touches = separation < paths.half[path[target]] + paths.half[path[other]]
+    touches &= paths.source[path[target]] != paths.source[path[other]]
+    return path[target[touches]], path[other[touches]]
+
+
+def _bins(paths: TracePaths, nx: int) -> tuple[Int, Int, Float]:
+    """(path, bin of 8 columns, row there) of all traces on the detector."""
+    t = np.linspace(0.0, 1.0, _PLACES)
+    column, row = (
+        np.polynomial.polynomial.polyval(t, _stack_coefficients(part).T) for part in (paths.along, paths.across)
+    )
+    order = np.argsort(column, axis=1)
+    column, row = (np.take_along_axis(part, order, axis=1) for part in (column, row))
+    low, high = np.maximum(column[:, 0], 0.0), np.minimum(column[:, -1], nx - 1.0)
+    first = low.astype(int) // _BIN
+    count = np.where(high >= low, high.astype(int) // _BIN - first + 1, 0)
+    path, ends = np.repeat(np.arange(len(count)), count), np.cumsum(count)
+    at = np.arange(len(path)) - np.repeat(ends - count - first, count)
+    rows, middle = np.empty(len(path)), (at + 0.5) * _BIN
+    for i, (start, stop) in enumerate(zip((ends - count).tolist(), ends.tolist(), strict=True)):
+        rows[start:stop] = np.interp(middle[start:stop], column[i], row[i])
+    return path, at, rows
+
+
+def _stack_coefficients(polynomials: list[Float]) -> Float:
+    """[n, i] coefficients of polynomials, those that one does not have 0."""
+    out = np.zeros((len(polynomials), max((len(coefficients) for coefficients in polynomials), default=1)))
+    for row, coefficients in zip(out, polynomials, strict=True):
+        row[: len(coefficients)] = coefficients
+    return out
+
+
+# ---------------------------------------------------------------------------------------------- lines
+
+
+def emission_line_columns(light: Light, source: Int, paths: TracePaths, aim: Aim, rows: Rows, scene: Scene) -> Columns:
+    """Columns of emission lines on the detector, of first orders of galaxies whose lines are known.
+
+    light, source, paths : sources, and those of the traces;  aim, rows, scene : as of `traced`
+    Error : of the signal-to-noise ratio 20 %: a galaxy is taken as a Gaussian
+    """
+    assert light.dispersed is not None
+    names = ("line_wavelength", "line_expected", "line_snr")
+    columns: Columns = {name: [np.zeros(0)] * len(source) for name in names}
+    has_lines = _has_lines(light, source, paths, rows)
+    if not has_lines.any():
+        return columns
+    at = np.flatnonzero(has_lines)
+    galaxies = galaxies_from_table(
+        rows.galaxies.take(light.spectrum_rows[source[at]]), rows.galaxy_library or templates.galaxy_library()
+    )
+    vacuum = np.array([line.vacuum for line in lines.line_list()])
+    wavelength = lines.observed_wavelength(vacuum[None], galaxies.mix.z_obs[:, None], "vacuum")
+    curve = extinction.milky_way(wavelength.ravel()).reshape(wavelength.shape)
+    dimmed = galaxies.magnification[:, None] * extinction.transmission(curve, galaxies.a_v[:, None])
+    response = np.interp(wavelength, aim.band.wavelength, aim.band.response, left=0.0, right=0.0)
+    # Square centimetres times seconds, by the exposure's own zero point, as all that is drawn.
+    area = aim.electrons_per_microjansky / units.electron_rate(1.0, 1.0, passbands.log_width(aim.band))
+    electrons = galaxies.lines * dimmed * response * area * wavelength / (units.PLANCK_ERG_S * units.LIGHT_ANGSTROM_S)
+    electrons *= light.let_through[source[at]][:, None]
+    (first,) = (order.trace for order in light.dispersed.orders if order.trace.order == 1)
+    continuum = paths.level[at] / np.maximum(2.0 * paths.half[at], 1.0)
+    noise = _image_area(light, source[at]) * (scene.pixel_noise**2 + continuum)
+    snr = electrons / np.sqrt(noise[:, None] + np.maximum(electrons, 1e-30))
+    for i, line_wavelength, line_electrons, line_snr in zip(at.tolist(), wavelength, electrons, snr, strict=True):
+        is_visible = (line_electrons > 0.0) & _is_on_detector(
+            first, (paths.along[i], paths.across[i]), line_wavelength, aim
+        )
+        for name, values in zip(names, (line_wavelength, line_electrons, line_snr), strict=True):
+            columns[name][i] = values[is_visible]
+    return columns
+
+
+def _is_on_detector(trace: Trace, path: tuple[Float, Float], wavelength: Float, aim: Aim) -> Bool:
+    """[n] Whether the middle of a line falls onto a pixel; path : columns and rows, polynomials of t."""
+    t = (wavelength - trace.first) / (trace.last - trace.first)
+    column, row = (np.polynomial.polynomial.polyval(t, part) for part in path)
+    in_columns = (column > -0.5) & (column < aim.detector.nx - 0.5)
+    return np.asarray(in_columns & (row > -0.5) & (row < aim.detector.ny - 0.5))
+
+
+def _has_lines(light: Light, source: Int, paths: TracePaths, rows: Rows) -> Bool:
+    """[n] First orders of galaxies; pictures of lenses are not told apart by their lines."""
+    if not len(rows.galaxies) or not set(colours.GALAXY_COLUMNS) <= set(rows.galaxies.column_names):
+        return np.zeros(len(source), bool)
+    galaxy_kinds = (
+        rows.galaxies["kind"].to_numpy() if "kind" in rows.galaxies.column_names else np.zeros(len(rows.galaxies))
+    )
+    is_galaxy = light.sources.shape[source] >= 0
+    is_catalogue_galaxy = np.isin(galaxy_kinds[np.where(is_galaxy, light.spectrum_rows[source], 0)], GALAXY_KINDS)
+    return np.asarray((paths.order == 1) & is_galaxy & is_catalogue_galaxy)
+
+
+def _image_area(light: Light, source: Int) -> Float:
+    """[n] pixels: one over the sum of the squares of a source's image, of unit sum; those of Gaussians add up."""
+    assert light.psf is not None
+    assert light.psf.planes is not None
+    planes, scale = light.psf.planes, light.psf.pixel_scale
+    radius = galaxy_shapes.half_light(light.sources.shapes.take(light.sources.shape[source])) / scale
+    # In a pixel that is anywhere.
+    pixel = uniform_filter(planes.images.mean(axis=0, dtype=float), planes.samples) * planes.samples**2
+    point = planes.samples**2 / float((pixel**2).sum())
+    # A Gaussian with the second moments of an exponential disc, whose scale length is the half-light radius over 1.678.
+    return np.asarray(point + 12.0 * np.pi * (radius / 1.678) ** 2)

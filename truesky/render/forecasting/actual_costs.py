@@ -1,0 +1,185 @@
+"""What a request's detectors took, beside their forecast: CPU, memory, bytes, core-hours a square degree.
+
+rows     a line a channel, camera and image type, one a channel, one of all
+text     the table that a person reads
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from lake_schema import sky
+from lake_schema.errors import LakeError
+from lake_schema.store import read
+from truesky.render.camera import footprints
+from truesky.render.planning import exposure_chunks
+from truesky.render.products import run_log
+
+# Cells of the sky that are counted where their centre is seen, 0.2 arcmin2: of a detector's area right to 2 %.
+_ORDER = 13
+_ALL = "all"
+# Image types that survey the sky: others are taken where it is bright or dense.
+_SURVEY_TYPES = ("science", "deep")
+_TASK_COLUMNS = ("exposure_id", "detector", "channel", "seconds", "bytes", "ra", "dec", "radius", "s_region")
+# Channel, camera, image type.
+_Kind = tuple[str, str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One kind of exposure.
+
+    planned, made, measured : detectors; of which the lake has images; of which a log says what they took
+    cpu_s, forecast_s       : of those that were measured
+    peak_gb                 : largest memory of a process that made one
+    gb, forecast_gb         : of those that are made
+    deg2                    : of the sky that those see that are measured, each place once; 0 = none is of a survey
+    core_hours_deg2         : of these, as often as each place is seen; of sums the sum; 0 = none is of a survey
+    """
+
+    channel: str
+    camera: str
+    image_type: str
+    planned: int
+    rendered: int
+    measured: int
+    cpu_s: float
+    forecast_s: float
+    peak_gb: float
+    gb: float
+    forecast_gb: float
+    deg2: float
+    core_hours_deg2: float
+
+
+def summarise(root: Path, request: str | None = None, factor: float = 1.0) -> list[Line]:
+    """Of a request's images, or of the lake's only ones.
+
+    factor : CPU s of this machine over those of the forecast
+    """
+    products = read.version(root, "products", request=request)
+    input_versions = products.manifest["facts"]["inputs"]
+    tasks, exposures = (read.version(root, name, input_versions[name]) for name in ("tasks", "exposures"))
+    sizes = {entry["path"]: entry["bytes"] for entry in products.manifest["files"]}
+    task_facts = {part["name"]: part for part in products.manifest["parts"]}
+    metrics = _task_metrics(root, products.key)
+    rendered = {
+        (part["facts"]["exposure_id"], part["facts"]["detector"]): (
+            sum(sizes[path] for path in part.get("files", ())),
+            metrics.get(name, {}),
+        )
+        for name, part in task_facts.items()
+    }
+    exposure_columns = exposures.rows(("exposure_id", "camera", "image_type"))
+    tasks_of_kind: dict[_Kind, list[dict[str, Any]]] = defaultdict(list)
+    # Of a large plan a small part may be made: of the others it counts how many there are.
+    exposure_ids = {number for number, _ in rendered}
+    exposure_rows = {
+        row["exposure_id"]: row
+        for row in exposure_chunks.rows_of_exposures(exposures, exposure_ids, exposure_columns.column_names).to_pylist()
+    }
+    for task in exposure_chunks.rows_of_exposures(tasks, exposure_ids, _TASK_COLUMNS).to_pylist():
+        tasks_of_kind[_kind({**task, **exposure_rows[task["exposure_id"]]})].append(task)
+    lines = [
+        _line(kind, number, tasks_of_kind[kind], rendered, factor)
+        for kind, number in sorted(_planned_counts(tasks, exposure_columns).items())
+    ]
+    channels = sorted({line.channel for line in lines})
+    sums = [_sum(channel, [line for line in lines if line.channel == channel]) for channel in channels]
+    return [*lines, *sums, _sum(_ALL, lines)]
+
+
+RenderedTasks = Mapping[tuple[int, str], tuple[int, Mapping[str, Any]]]
+
+
+def _kind(row: Mapping[str, Any]) -> _Kind:
+    return row["channel"], row["camera"], row["image_type"]
+
+
+def _planned_counts(tasks: read.Version, exposures: pa.Table) -> dict[_Kind, int]:
+    """How many detectors of each kind are planned."""
+    counts: Counter[_Kind] = Counter()
+    for table in exposure_chunks.rows_by_partition(tasks, ("exposure_id", "channel")):
+        sums = table.join(exposures, "exposure_id").group_by(["channel", "camera", "image_type"])
+        for row in sums.aggregate([("exposure_id", "count")]).to_pylist():
+            counts[_kind(row)] += row["exposure_id_count"]
+    return counts
+
+
+def _line(kind: _Kind, planned: int, tasks: Sequence[dict[str, Any]], rendered: RenderedTasks, factor: float) -> Line:
+    rendered_tasks = [
+        (task, *rendered[place]) for task in tasks if (place := (task["exposure_id"], task["detector"])) in rendered
+    ]
+    measured_tasks = [(task, metrics) for task, _, metrics in rendered_tasks if metrics]
+    cpu = sum(metrics["cpu_s"] for _, metrics in measured_tasks)
+    deg2 = _covered_area([task for task, _ in measured_tasks]) if kind[2] in _SURVEY_TYPES else 0.0
+    return Line(
+        *kind,
+        planned=planned,
+        rendered=len(rendered_tasks),
+        measured=len(measured_tasks),
+        cpu_s=cpu,
+        forecast_s=factor * sum(task["seconds"] for task, _ in measured_tasks),
+        peak_gb=max((metrics.get("peak_gb", 0.0) for _, metrics in measured_tasks), default=0.0),
+        gb=sum(size for _, size, _ in rendered_tasks) / 1e9,
+        forecast_gb=sum(task["bytes"] for task, *_ in rendered_tasks) / 1e9,
+        deg2=deg2,
+        core_hours_deg2=cpu / 3600.0 / deg2 if deg2 else 0.0,
+    )
+
+
+def _sum(name: str, lines: Sequence[Line]) -> Line:
+    names = ("planned", "rendered", "measured", "cpu_s", "forecast_s", "gb", "forecast_gb", "core_hours_deg2")
+    total = {field: sum(getattr(line, field) for line in lines) for field in names}
+    peak = max((line.peak_gb for line in lines), default=0.0)
+    return Line(name, _ALL, "", **total, peak_gb=peak, deg2=0.0)
+
+
+def _covered_area(tasks: Sequence[dict[str, Any]]) -> float:
+    """Area, deg2, that footprints cover together."""
+    footprint_rows = [{name: task[name] for name in ("ra", "dec", "radius", "s_region")} for task in tasks]
+    if not footprint_rows:
+        return 0.0
+    cells = np.unique(
+        np.concatenate([sky.cells_in_cone(t["ra"], t["dec"], t["radius"], _ORDER) for t in footprint_rows])
+    )
+    counts = footprints.counts(pa.Table.from_pylist(footprint_rows), *sky.cell_centres(_ORDER, cells))
+    return float((counts > 0).sum() * sky.cell_area(_ORDER))
+
+
+def _task_metrics(root: Path, key: str) -> dict[str, Mapping[str, Any]]:
+    """Of each part of a version of `products` that a run made, what its log says; the last run of several."""
+    metrics: dict[str, Mapping[str, Any]] = {}
+    for path in run_log.logs_of_products(root):
+        with contextlib.suppress(LakeError, OSError):
+            first, *lines = run_log.lines(path) or [{}]
+            if first.get("key") == key:
+                metrics |= {
+                    line["part"]: line for line in lines if "part" in line and "error" not in line and "cpu_s" in line
+                }
+    return metrics
+
+
+def format_table(lines: Sequence[Line]) -> Iterator[str]:
+    """The lines as a table; a dash where there is nothing to say."""
+    yield (
+        f"{'channel':8} {'camera':9} {'image type':17} {'detectors':>9} {'of':>6} {'measured':>8} {'CPU s':>9} "
+        f"{'forecast':>9} {'peak GB':>8} {'GB':>8} {'forecast':>8} {'deg2':>7} {'core-h/deg2':>11}"
+    )
+    for line in lines:
+        area = f"{line.deg2:7.3f}" if line.deg2 else f"{'-':>7}"
+        hours = f"{line.core_hours_deg2:11.3f}" if line.core_hours_deg2 else f"{'-':>11}"
+        yield (
+            f"{line.channel:8} {line.camera:9} {line.image_type:17} {line.rendered:9,} {line.planned:6,} "
+            f"{line.measured:8,} {line.cpu_s:9,.1f} {line.forecast_s:9,.1f} {line.peak_gb:8.2f} {line.gb:8.3f} "
+            f"{line.forecast_gb:8.3f} "
+            f"{area} {hours}"
+        )

@@ -1,0 +1,103 @@
+"""Bright exposures of NISP, each with darks after it that show what it left in the detectors.
+
+exposures   what an observation block of the image type persistence asks for
+forgotten   when nothing is seen any more of what an exposure leaves
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import count, pairwise, takewhile
+
+from lake_schema.errors import BadInput
+from lake_schema.mission.configuration import MissionConfiguration
+from truesky.render.channels import registry
+from truesky.render.planning import lit_flats
+from truesky.render.planning.observing_sequence import FILTERS, RED
+from truesky.render.planning.planned_exposures import Exposure, elapsed_time, exposure_time, through_grism
+from truesky.request.observations import Observation
+
+_DAY_S = 86400.0
+
+
+def exposures(template: Exposure, block: Observation, mission: MissionConfiguration, now: float) -> Iterator[Exposure]:
+    """Each bright exposure, then its darks; the next when it is forgotten.
+
+    first   : where they point;  now : MJD of the first of them
+    block   : of the request;  mission : the mission database
+    Errors  : BadInput for darks that begin before another has ended, or so late that nothing is looked for any more
+    """
+    band = FILTERS[-1] if template.channel == "NISP-P" else RED
+    nominal = exposure_time(template.channel, template.camera, band, mission)
+    dark = replace(template, band=band, exposure_time_s=block.exposure_time_s or nominal)
+    dark_duration = elapsed_time(dark, mission)
+    for bright in _bright_exposures(template, block, mission):
+        end_mjd = now + elapsed_time(bright, mission) / _DAY_S
+        max_delay = mission.value(f"{template.camera}.persistence.window", "s") - (end_mjd - now) * _DAY_S
+        delays = (
+            _check_delays(block.delays_s, dark_duration, max_delay)
+            if block.delays_s
+            else _mission_delays(dark_duration, max_delay, mission)
+        )
+        yield replace(bright, mjd=now)
+        darks = [replace(dark, band=bright.band, mjd=end_mjd + seconds / _DAY_S) for seconds in delays]
+        yield from darks
+        now = persistence_end_mjd(darks[-1], mission)
+
+
+def persistence_end_mjd(exposure: Exposure, mission: MissionConfiguration) -> float:
+    """MJD from which nothing is seen of what an exposure leaves in NISP's detectors; mission : the mission database."""
+    window = mission.value(f"{exposure.camera}.persistence.window", "d")
+    return exposure.mjd + elapsed_time(exposure, mission) / _DAY_S + window
+
+
+def _check_delays(delays: Sequence[float], dark_duration: float, max_delay: float) -> Sequence[float]:
+    """The block's in their order; busy : s that a dark takes;  longest : s that are looked back from one's start."""
+    delays = sorted(delays)
+    for delay, next_delay in pairwise(delays):
+        if next_delay < delay + dark_duration:
+            raise BadInput(
+                f"delays_s: a dark at {next_delay:g} s begins before that at {delay:g} s, "
+                f"of {dark_duration:.1f} s, ends"
+            )
+    if delays[-1] > max_delay:
+        raise BadInput(f"delays_s: {delays[-1]:g} s is more than nisp.persistence.window looks back, {max_delay:g} s")
+    return delays
+
+
+def _mission_delays(dark_duration: float, max_delay: float, mission: MissionConfiguration) -> Sequence[float]:
+    """Of the mission's those that such darks can be taken at; busy, longest, mission : as of `_checked`."""
+    delays: list[float] = []
+    names = takewhile(mission.__contains__, (f"nisp.persistence.delay_{i}" for i in count(1)))
+    for seconds in (mission.value(name, "s") for name in names):
+        if (not delays or seconds >= delays[-1] + dark_duration) and seconds <= max_delay:
+            delays.append(seconds)
+    if not delays:
+        raise BadInput(f"delays_s: of the mission's none is within the {max_delay:g} s that are looked back")
+    return delays
+
+
+def _bright_exposures(template: Exposure, block: Observation, mission: MissionConfiguration) -> Iterator[Exposure]:
+    """Flats of the block's lamps at its intensities, or a field of stars in each band."""
+    is_sky, channel = block.bright == "sky", template.channel
+    if is_sky and (block.lamps or block.intensities):
+        raise BadInput(f"{'lamps' if block.lamps else 'intensities'}: bright = 'sky' has no lamp")
+    if not is_sky:
+        kind = "flat"
+    else:
+        kind = "self_calibration" if "self_calibration" in registry.CHANNELS[channel].effects else "science"
+    band_exposures = [
+        replace(
+            template, image_type=kind, band=band, exposure_time_s=exposure_time(channel, template.camera, band, mission)
+        )
+        for band in lit_flats.select_bands(block.bands, FILTERS if channel == "NISP-P" else (RED,))
+    ]
+    if is_sky:
+        frames_by_lamp = [[through_grism(frame, None, mission) for frame in band_exposures]]
+    else:
+        frames_by_lamp = lit_flats.by_lamp(band_exposures, block, mission)
+    for i in range(block.exposures or 1):
+        cycle, lamp_frames = i // len(frames_by_lamp), frames_by_lamp[i % len(frames_by_lamp)]
+        exposure = lamp_frames[cycle % len(lamp_frames)]
+        yield from [exposure] if is_sky else lit_flats.at_levels(exposure, block, mission)
