@@ -26,6 +26,11 @@ def check_number(name: str, value: object, lo: float = -math.inf, hi: float = ma
     lo, hi : float, optional
         Smallest and largest number that is allowed.
 
+    Returns
+    -------
+    float
+        The number.
+
     Raises
     ------
     BadInput
@@ -52,6 +57,11 @@ def check_integer(name: str, value: object, lo: int, hi: int) -> int:
         What the user gave, such as an int or an integer of numpy.
     lo, hi : int
         Smallest and largest number that is allowed.
+
+    Returns
+    -------
+    int
+        The number.
 
     Raises
     ------

@@ -72,7 +72,7 @@ def limit_resource(name: str, limit: int) -> None:
     ----------
     name : str
         A name of the module `resource`, such as "RLIMIT_AS".
-    most : int
+    limit : int
         Bytes, or seconds of CPU time.
     """
     with contextlib.suppress(OSError, ValueError, AttributeError):

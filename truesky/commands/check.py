@@ -44,7 +44,7 @@ def check_request(request: Request, plan_only: bool = False) -> None:
     ----------
     request : Request
         The parsed request.
-    alone : bool, optional
+    plan_only : bool, optional
         Check the plan only, not the catalogues.
     """
     # What reads files and plans takes seconds to import: only a request whose keys are good is worth them.

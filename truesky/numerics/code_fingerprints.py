@@ -1,8 +1,6 @@
-"""Keys of code: what is cached is made anew when any code that may have shaped it changes, or any table of numbers.
+"""Fingerprints of code: keys of caches change if code that may have shaped the contents changes, or a table of numbers.
 
-code_key     of a module and of all that it imports, for truesky.numerics.cache.content_key
-modules      which these are
-data_files   the tables of numbers that they read
+Docstrings, comments and blank lines do not change a fingerprint.
 """
 
 from __future__ import annotations
@@ -13,6 +11,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from truesky.numerics.cache import content_key
+from truesky.numerics.code_text import code_text
 
 _ROOT = Path(__file__).resolve().parents[2]
 _ENDINGS = (".csv", ".toml")
@@ -28,33 +27,39 @@ _RELEVANT = ("truesky.request.accuracy",)
 
 @lru_cache
 def code_key(module: str) -> str:
-    """sha256 (hex) of the code of a module, `__name__`, and of every module of ours that it imports, however far.
+    """Return the sha256 (hex) of the code of a module and of all our modules that it imports, directly or not.
 
-    A function that moves from one of them to another changes the key, and so does one that comes from a new module.
-    The tables of numbers (.csv, .toml) that they read are in it; what they are given, such as the mission's parameters
-    and the user's files, goes into the key of what is made of it.
+    A function that moves from one module to another changes the key, and so does a new module. The key also covers the
+    tables of numbers (.csv, .toml) that the modules read. It does not cover the arguments of functions, such as the
+    parameters of the mission and the files of the user: the caller adds them to the key of its result.
     """
-    code = (part for name in required_modules(module) for part in (name, _source(name)))
+    code = (part for name in required_modules(module) for part in (name, _code(_source(name))))
     data = (part for file in data_files(module) for part in (file.name, _content(file)))
     return content_key(*code, *data)
 
 
 def data_files(module: str) -> tuple[Path, ...]:
-    """Tables of numbers that the code of a module and of what it imports names, wherever in `truesky` they lie; sorted.
+    """Return the tables of numbers that a module and the modules that it imports name, sorted by path.
 
-    A file is named by its whole name as a constant, or by the ending alone where it has the module's own name.
+    Code names a file by its whole name as a constant, or by the suffix alone if the file has the name of the module.
     """
-    return tuple(sorted({file for name in required_modules(module) for file in _named_files(name)}))
+    return tuple(sorted({file for name in required_modules(module) for file in _scan(name)[1]}))
 
 
 def required_modules(module: str) -> tuple[str, ...]:
-    """Names of a module and of those of ours that it imports, directly or not, sorted; ImportError where it is none."""
+    """Return the names of a module and of all our modules that it imports, directly or not, sorted.
+
+    Raises
+    ------
+    ImportError
+        If there is no such module.
+    """
     names, pending = set[str](), [module]
     while pending:
         name = pending.pop()
         if name not in names:
             names.add(name)
-            pending.extend(_direct_imports(name))
+            pending.extend(_scan(name)[0])
     return tuple(sorted(names))
 
 
@@ -76,27 +81,29 @@ def _content(file: Path) -> bytes:
 
 @lru_cache
 def _data() -> dict[str, Path]:
-    """Every table of `truesky` by its name."""
+    """Return the path of every table in `truesky` by file name."""
     return {file.name: file for file in (_ROOT / "truesky").rglob("*") if file.suffix in _ENDINGS}
 
 
 @lru_cache
-def _named_files(module: str) -> tuple[Path, ...]:
-    texts = {node.value for node in ast.walk(ast.parse(_source(module))) if isinstance(node, ast.Constant)}
-    names = {module.rpartition(".")[2] + text if text in _ENDINGS else text for text in texts}
-    return tuple(_data()[name] for name in names if isinstance(name, str) and name in _data())
+def _code(source: bytes) -> str:
+    return code_text(source.decode())
 
 
 @lru_cache
-def _direct_imports(module: str) -> tuple[str, ...]:
-    """Modules of ours that one imports itself, wherever in its file."""
-    return tuple(_imports(ast.parse(_source(module))))
+def _scan(module: str) -> tuple[tuple[str, ...], tuple[Path, ...]]:
+    """Return the modules that a module imports itself, anywhere in its file, and the tables that it names."""
+    tree = ast.parse(_source(module))
+    texts = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
+    names = {module.rpartition(".")[2] + text if text in _ENDINGS else text for text in texts}
+    files = tuple(_data()[name] for name in names if isinstance(name, str) and name in _data())
+    return tuple(_imports(tree)), files
 
 
 def _imports(tree: ast.AST) -> Iterator[str]:
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module:
-            # What is imported from a package may be a module, else is in the package's own file.
+            # A name that is imported from a package is a module, or is defined in the package's __init__.py.
             names = [f"{node.module}.{alias.name}" for alias in node.names]
             yield from (
                 _relevant_module(name) or _relevant_module(node.module)
@@ -108,7 +115,7 @@ def _imports(tree: ast.AST) -> Iterator[str]:
 
 
 def _relevant_module(module: str) -> str:
-    """The module, if it is one of ours that may shape an array."""
+    """Return the module if it is one of ours that may shape an array, else ""."""
     if module.split(".")[0] not in ("lake_schema", "truesky") or _file(module) is None:
         return ""
     if module in _RELEVANT:

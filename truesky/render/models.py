@@ -47,6 +47,11 @@ def models(
     ids : sequence of int, optional
         Identifiers of the sources. The default is all sources that may have light in the image.
 
+    Returns
+    -------
+    iterator of SourceSpectrum
+        Each source with its frame.
+
     Raises
     ------
     BadInput

@@ -52,10 +52,10 @@ class RenderInputs:
         Versions of the tables that are read, by name.
     published : mapping of str to str
         Key of each product that the request has already, by the name of its part.
-    chosen : Chosen
+    selection : RenderSelection
         Exposures, tasks that are asked for, and tasks whose images may be kept.
     exposures : pyarrow.Table
-        Rows of `chosen.exposures`, and of earlier exposures that left something in their detectors.
+        Rows of `selection.exposures`, and of earlier exposures that left something in their detectors.
     earlier : mapping of (int, str) to list
         Tasks of these earlier exposures, by exposure and detector.
     """
@@ -110,7 +110,7 @@ class RenderInputs:
             Folder of the lake.
         request : Request
             The request.
-        chosen : Chosen
+        selection : RenderSelection
             Exposures and tasks of the plan.
 
         Returns

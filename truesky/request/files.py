@@ -178,9 +178,9 @@ def with_camera_passbands(
 
     Parameters
     ----------
-    given : UserCurves
+    user_curves : UserCurves
         The section `fluxes` of the request.
-    own : sequence of Camera
+    user_cameras : sequence of Camera
         The user's cameras.
     bands : collection of str
         Bands that the request names.

@@ -39,7 +39,7 @@ def test_a_byte_of_any_module_changes_the_key(name, monkeypatch):
     for other in listed:
         with monkeypatch.context() as patch:
             patch.setattr(
-                code_fingerprints, "_source", lambda module, other=other: real(module) + b" " * (module == other)
+                code_fingerprints, "_source", lambda module, other=other: real(module) + b"\nx = 1" * (module == other)
             )
             assert key(name) != before, other
     assert key(name) == before

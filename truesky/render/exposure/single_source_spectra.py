@@ -45,6 +45,11 @@ def draw_sources(
     ids : sequence of int, optional
         Identifiers of the sources. The default is all sources that may have light on the detector.
 
+    Returns
+    -------
+    iterator of SourceSpectrum
+        Each source with its frame.
+
     Raises
     ------
     BadInput

@@ -66,16 +66,11 @@ def product_keys(
             reaches["stars"] = max(FARTHEST, reach)
         if channel.dispersion is not None:
             reaches[LENSES] = max(FARTHEST, reach)
-        return [
-            sorted(
-                {
-                    checksums
-                    for cell in selection.cells_within_reach(task, deflection, reaches[name])
-                    for checksums in files_by_cell.get(cell, ())
-                }
-            )
-            for name, (deflection, files_by_cell) in files.items()
-        ]
+        checksums = []
+        for name, (deflection, files_by_cell) in files.items():
+            cells = selection.cells_within_reach(task, deflection, reaches[name])
+            checksums.append(sorted({of_file for cell in cells for of_file in files_by_cell.get(cell, ())}))
+        return checksums
 
     neighbour_files = _neighbour_files(files["stars"], mission)
 
@@ -92,13 +87,10 @@ def product_keys(
         row = rows[task["exposure_id"]]
         return facts_of_task(task) if persistence.is_drawn(row) else {"exposure": asdict(row)}
 
-    previous = (
-        [
-            facts_of_previous(previous_task)
-            for previous_task in previous_tasks.get((task["exposure_id"], task["detector"]), ())
-        ]
-        for task in tasks
-    )
+    def previous_facts_of(task: Json) -> list[Json]:
+        return [facts_of_previous(t) for t in previous_tasks.get((task["exposure_id"], task["detector"]), ())]
+
+    previous = map(previous_facts_of, tasks)
     extras = ({"earlier": previous_facts} if previous_facts else {} for previous_facts in previous)
     return [digest({**shared, **facts_of_task(task), **extra}) for task, extra in zip(tasks, extras, strict=True)]
 

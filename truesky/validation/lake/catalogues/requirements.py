@@ -67,37 +67,18 @@ def rows(galaxies: read.Version, fluxes: read.Version) -> list[Row]:
     # Galaxies cluster: medians of cells scatter more than galaxies do.
     medians = [float(np.median(z[bright & (cell == c)])) for c in cells if (bright & (cell == c)).sum() > 20]
     error = max(spread, float(np.std(medians) / np.sqrt(len(medians)))) if len(medians) > 1 else np.inf
+    median = float(np.median(redshifts)) if len(redshifts) else np.nan
     note = f"{len(drawn)} cells of {area:.3g} deg2"
     return [
-        Row(
-            NAME,
-            "galaxies_24.5",
-            Place(),
-            density[0] / 3600.0,
-            density[1] / 3600.0,
-            _PER_ARCMIN2,
-            0.0,
-            "arcmin-2",
-            SOURCE,
-            AT_LEAST,
-            note,
-        ),
-        Row(
-            NAME,
-            "median_redshift",
-            Place(),
-            float(np.median(redshifts)) if len(redshifts) else np.nan,
-            error,
-            _REDSHIFT,
-            0.0,
-            "",
-            SOURCE,
-            AT_LEAST,
-            note,
-        ),
-        Row(NAME, "halpha_emitters", Place(), lines[0], lines[1], _EMITTERS, 0.0, "deg-2", SOURCE, AT_LEAST, note),
+        _minimum_row("galaxies_24.5", (density[0] / 3600.0, density[1] / 3600.0), _PER_ARCMIN2, "arcmin-2", note),
+        _minimum_row("median_redshift", (median, error), _REDSHIFT, "", note),
+        _minimum_row("halpha_emitters", lines, _EMITTERS, "deg-2", note),
         *out,
     ]
+
+
+def _minimum_row(quantity: str, measured: tuple[float, float], minimum: float, unit: str, note: str) -> Row:
+    return Row(NAME, quantity, Place(), *measured, minimum, 0.0, unit, SOURCE, AT_LEAST, note)
 
 
 def _mean(values: Float) -> tuple[float, float]:
