@@ -163,8 +163,8 @@ def test_a_generation_cell_is_the_same_in_every_request(tmp_path):
                 # Taken from the tables of the others.
                 continue
             facts = step.plan.facts
-            alone = step.work(tmp_path, {**facts, "generation_cells": [574971]}).rows
-            among = step.work(tmp_path, {**facts, "generation_cells": [574970, 574972, 574971]}).rows
+            alone = step.run_task(tmp_path, {**facts, "generation_cells": [574971]}).rows
+            among = step.run_task(tmp_path, {**facts, "generation_cells": [574970, 574972, 574971]}).rows
             ids = set(alone["id"].to_pylist())
             assert len(ids) > 10
             assert among.filter([i in ids for i in among["id"].to_pylist()]).equals(alone)

@@ -131,7 +131,7 @@ READERS = {
     "taken": actual_costs.summarise,
     "report": lambda root: report._forecast(root, 1.0),
     "coverage": drawn,
-    "page, runs": partial(paged, ask=lambda lake: runs._remaining_work(lake.observed[0], {(1, "none")})),
+    "page, runs": partial(paged, ask=lambda lake: runs._remaining_work(lake.observed_requests[0], {(1, "none")})),
     "page, footprints": partial(paged, ask=sky_maps.regions),
     "page, exposures": partial(paged, ask=in_view),
     "page, bands": partial(paged, ask=sky_maps.bands),

@@ -75,7 +75,7 @@ def read_batches(
         for first in range(0, len(hdu.data), rows_per_batch):
             batch = slice(first, first + rows_per_batch)
             numbers = {
-                name: _native_numbers(hdu.data[name][batch], columns_by_name[name].null_value) for name in columns
+                name: _native_numbers(hdu.data[name][batch], columns_by_name[name].null) for name in columns
             }
             yield (
                 {**numbers, **{name: _decode_texts(stored[batch]) for name, stored in text_values.items()}},
@@ -185,8 +185,8 @@ def _number_columns(hdu: Any) -> dict[str, Float]:
         if values.dtype.kind not in "fiu" or values.ndim != 1:
             continue
         numbers = values.astype(np.float64)
-        if values.dtype.kind in "iu" and column.null_value is not None:
-            numbers[values == column.null_value] = np.nan
+        if values.dtype.kind in "iu" and column.null is not None:
+            numbers[values == column.null] = np.nan
         columns[str(column.name)] = numbers
     return columns
 

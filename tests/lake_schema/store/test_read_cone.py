@@ -83,7 +83,7 @@ def test_no_source_is_lost_at_an_edge(catalogues, data, on):
     towards = st.floats(-SPREAD, SPREAD)
     centre = (ra + data.draw(towards)) % 360, np.clip(dec + data.draw(towards), -90, 90)
     radius = data.draw(st.floats(1e-4, 2 * SPREAD))
-    there = (rows[name].to_numpy() for name in version.place(on))
+    there = (rows[name].to_numpy() for name in version.position_columns(on))
     wanted = rows["id"].to_numpy()[sky.separation(*there, *centre) <= radius]
     found = version.cone(*centre, radius, ["id"], on)
     assert found.column_names == ["id"]
@@ -94,7 +94,7 @@ def test_lensing_moves_sources_over_the_edge(catalogues):
     """The padding matters: without it, sources whose observed cell is not touched would be lost."""
     lost = 0
     for _, rows, version in catalogues:
-        assert 0.3 * DEFLECTION < version.deflection() <= DEFLECTION
+        assert 0.3 * DEFLECTION < version.max_deflection() <= DEFLECTION
         radius = 5 / 3600
         for row in range(0, N, 160):
             ra, dec = (float(rows[name][row].as_py()) for name in ("ra_true", "dec_true"))

@@ -34,7 +34,7 @@ def made(folder, *args, **keys):
     lake.mkdir(exist_ok=True)
     for module in (build_galaxies, build_stars):
         for step in module.steps(lake, wanted):
-            publish.make_version(lake, step.plan, step.work)
+            publish.make_version(lake, step.plan, step.run_task)
     rows = [read.version(lake, name).rows() for name in ("galaxies", "stars")]
     for found, table in zip(rows, (GALAXIES, STARS), strict=True):
         assert validate.find_violations(found, table) == []

@@ -47,7 +47,7 @@ def test_a_killed_process_is_replaced(page):
     until(page.server._warm_up_task.done)
     chart = {"source": "galaxies", "axes": ["dec + 1"], "charts": [{"axes": [0], "bins": [5]}]}
     assert killed(lake.user_queries)
-    assert killed(lake.own)
+    assert killed(lake.page_queries)
     for _ in range(3):
         assert page.json("sql", **question)["rows"] == [[7]]
     assert asked(page, **chart)[0]["rows"] == GALAXIES_N

@@ -83,7 +83,7 @@ def test_tiles_are_refused_beyond_the_queue_and_hold_up_nothing_else(page, monke
         one.start()
     try:
         ended = time.monotonic() + 30.0
-        while page.server.lake.pixels._places._value:
+        while page.server.lake.pixel_pool._slots._value:
             assert time.monotonic() < ended
             time.sleep(0.02)
         status, _, body = page.of_lake("tile/0/0/0/0")

@@ -52,7 +52,7 @@ def rendered(tmp_path_factory):
     root = layout.resolve_lake(folder / "lake")
     for module in (build_galaxies, build_stars, compute_fluxes, plan_exposures, render_exposures):
         for step in module.steps(root, request):
-            publish.make_version(root, step.plan, step.work)
+            publish.make_version(root, step.plan, step.run_task)
     return root
 
 

@@ -34,7 +34,7 @@ def make(lake, wanted, side, name=None):
     with small_detectors(side):
         for job in MODULES:
             for step in job.steps(lake, wanted):
-                publish.make_version(lake, step.plan, step.work, name=name)
+                publish.make_version(lake, step.plan, step.run_task, name=name)
 
 
 __all__ = ["RAYS_OFF", "make", "plan_exposures", "render_exposures", "request"]

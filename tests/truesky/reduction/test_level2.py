@@ -390,7 +390,7 @@ def test_of_a_lake_with_masters_of_its_own_frames(tmp_path, survey, camera, band
         patch.setattr(detectors, "_read_layout", lambda *of: tuple(replace(d, **small) for d in listed(*of)))
         for job in MODULES:
             for step in job.steps(root, wanted):
-                publish.make_version(root, step.plan, step.work)
+                publish.make_version(root, step.plan, step.run_task)
         own, out = str(tmp_path / "masters"), tmp_path / "level2"
         assert masters.main(["--lake", str(root), "--out", own]) == 0
         call = ["--lake", str(root), "--masters", own, "--without", "dark", "--out", str(out), "--level2"]

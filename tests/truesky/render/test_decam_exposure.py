@@ -71,7 +71,7 @@ def lake(tmp_path_factory):
 
 def make(root, steps, mapper=map):
     for step in steps:
-        publish.make_version(root, step.plan, step.work, mapper, name="x")
+        publish.make_version(root, step.plan, step.run_task, mapper, name="x")
 
 
 @pytest.fixture(scope="module")

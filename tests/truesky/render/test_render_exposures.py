@@ -116,7 +116,7 @@ def wanted(pointings=1, **sections):
 def make(root, request, *modules, spy=lambda work: work):
     for module in modules:
         for step in module.steps(root, request):
-            publish.make_version(root, step.plan, spy(step.work))
+            publish.make_version(root, step.plan, spy(step.run_task))
 
 
 def render(root, request, fail=()):
@@ -362,7 +362,7 @@ def named(root, request, *modules):
     """As `make`, for the request's name."""
     for module in modules:
         for step in module.steps(root, request):
-            publish.make_version(root, step.plan, step.work, name=request.name)
+            publish.make_version(root, step.plan, step.run_task, name=request.name)
 
 
 def planned_parts(root, request):
@@ -671,7 +671,7 @@ def test_requests_lie_side_by_side(lake, tmp_path, capsys):
         request = replace(request, pointings=tuple(replace(p, mjd=mjd) for p in request.pointings))
         for module in (plan_exposures, render_exposures):
             for step in module.steps(lake, request):
-                publish.make_version(lake, step.plan, step.work, name=name)
+                publish.make_version(lake, step.plan, step.run_task, name=name)
         found[name] = archive.products(lake, name).to_pylist()
         assert {row["path"] for row in found[name]} == images_of(lake, name)
     assert request_links.tables_of_request(lake, "b") == sorted((*preconditions.INPUTS, "products", "rendered_truth"))

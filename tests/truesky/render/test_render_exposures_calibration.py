@@ -142,7 +142,7 @@ def test_each_kind_is_planned_rendered_and_published(lake, tmp_path):
             if job is render_exposures:
                 request = replace(request, bodies=one_body_each(lake, tmp_path / "bodies.csv", 18.0))
             for step in job.steps(lake, request):
-                publish.make_version(lake, step.plan, step.work)
+                publish.make_version(lake, step.plan, step.run_task)
         check(lake, 128 + 20, 51 + 128 + 29)
         check_bodies(lake, request)
 

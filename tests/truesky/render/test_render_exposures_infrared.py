@@ -126,7 +126,7 @@ def check_what_is_left(root, files):
 def made(root, request, modules=MODULES):
     for module in modules:
         for step in module.steps(root, request):
-            publish.make_version(root, step.plan, step.work)
+            publish.make_version(root, step.plan, step.run_task)
 
 
 def test_each_kind_is_planned_rendered_and_published(lake, tmp_path):

@@ -89,7 +89,7 @@ def wanted(folder, more="", replaced=("", "")):
 def made(root, request, modules=MODULES):
     for module in modules:
         for step in module.steps(root, request):
-            publish.make_version(root, step.plan, step.work)
+            publish.make_version(root, step.plan, step.run_task)
 
 
 @pytest.fixture(scope="module")

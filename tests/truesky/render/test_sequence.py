@@ -90,7 +90,7 @@ def planned(folder):
     root, request = layout.resolve_lake(folder / "lake"), wanted(folder)
     for module in (build_galaxies, build_stars, compute_fluxes, plan_exposures):
         for step in module.steps(root, request):
-            publish.make_version(root, step.plan, step.work)
+            publish.make_version(root, step.plan, step.run_task)
     return root
 
 

@@ -61,7 +61,7 @@ def test_the_tide_is_that_of_the_linear_density(box):
 
 def test_galaxies_point_to_matter(universe, own, rng):
     """Along the direction that they point to, the density on both sides is higher than across it, in every replica."""
-    box, turned = universe.population.halos.box, universe.population.halos.turned
+    box, turned = universe.population.halos.box, universe.population.halos.replicas
     index, ra, dec = sky.random_in_cell(0, 5, 40_000, rng)
     chi = rng.uniform(100, 3000, index.size)
     e = alignments.central_ellipticity(own, ra, dec, chi, np.full(chi.size, -22.0), np.ones(chi.size, bool))
@@ -90,7 +90,7 @@ def test_blue_galaxies_do_not_follow_and_amplitudes_multiply(universe, own, rng)
         10 * once, abs=1e-12
     )
     assert not alignments.central_ellipticity(own, ra, dec, chi, m_r, ~red).any()
-    assert alignments.model(own.box, own.turned, 0.0) is None
+    assert alignments.model(own.box, own.replicas, 0.0) is None
 
 
 def test_satellites_point_to_their_central(own):

@@ -77,14 +77,14 @@ def expected_number(lf, near, far, faintest, area):
 def richness(universe, places, near, far, log_mass):
     """Density that the box has in these cells for halos of a mass, against its mean: what structure does to counts."""
     model = universe.population.halos
-    steps = (model.line.z > near) & (model.line.z < far)
+    steps = (model.steps.z > near) & (model.steps.z < far)
     column = np.searchsorted(model.log_mass, log_mass) - 1
     total = []
     for place in places:
-        found = lightcone.voxels(model.box, model.turned, model.line, ids.GENERATION_ORDER, place, steps)
+        found = lightcone.voxels(model.box, model.replicas, model.steps, ids.GENERATION_ORDER, place, steps)
         amplitude, field = model.amplitude[found.step, column], model.field[found.step, column]
         g = np.stack([smooth.ravel()[found.box] for smooth in model.box.smoothed], 1)[np.arange(field.size), field]
-        volume = model.line.volume[found.step] / 4.0**found.order
+        volume = model.steps.volume[found.step] / 4.0**found.order
         density = np.exp(amplitude * g - 0.5 * amplitude**2 * model.box.variance[field])
         total.append([np.sum(volume * density), np.sum(volume)])
     return float(np.divide(*np.sum(total, 0)))

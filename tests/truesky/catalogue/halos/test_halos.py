@@ -36,7 +36,7 @@ def test_every_halo_has_one_level(model):
     """Each mass bin above the limit is drawn by one order; less than one halo of the sky is too wide for all."""
     wanted = model.log_mass[None, 1:] >= (model.lowest - model.matching.occupation.depth)[:, None]
     left_out = wanted & (model.level == -1)
-    expected = np.sum(np.where(left_out, model.number, 0.0) * model.line.volume[:, None]) * 4 * np.pi
+    expected = np.sum(np.where(left_out, model.number, 0.0) * model.steps.volume[:, None]) * 4 * np.pi
     assert expected < 1.0
     assert set(np.unique(model.level)) == {-1, *halos.LEVELS}
 
@@ -59,7 +59,7 @@ def test_halos_lie_in_their_cell(model, order):
 @pytest.mark.parametrize("order", halos.LEVELS)
 def test_halos_above_a_mass_are_the_same_to_any_limit(model, order):
     """What is drawn for lensing, whatever the request asks of its galaxies."""
-    least = np.where(model.line.z < 1.5, 12.0, np.inf)
+    least = np.where(model.steps.z < 1.5, 12.0, np.inf)
     every, few = halos.draw(model, SEED, order, 70, least), halos.draw(model, SEED, order, 70)
     shallow = dataclasses.replace(model, limit=model.limit + 1.0, far=2000.0)
     again = halos.draw(shallow, SEED, order, 70, least)
@@ -81,7 +81,7 @@ def test_the_fullest_block_has_room_for_its_numbers(model):
     """
     most = np.array([float(smooth.max()) for smooth in model.box.smoothed])
     peak = np.exp(model.amplitude * most[model.field] - 0.5 * model.amplitude**2 * model.box.variance[model.field])
-    mean = model.number * (model.line.volume * np.radians(1.0) ** 2 * sky.cell_area(8))[:, None] * peak
+    mean = model.number * (model.steps.volume * np.radians(1.0) ** 2 * sky.cell_area(8))[:, None] * peak
     room = 2.0 ** (23 - ids.member_bits(model.log_mass[:-1]))
     # A block is wider than a cell of the box only where its pieces are of several: its densest is of one.
     assert np.max((mean + 6.0 * np.sqrt(mean)) / room) < 1.0
@@ -94,10 +94,10 @@ def test_mass_function_comes_out(model, drawn):
     """
     z, mass = (drawn.halos[name].to_numpy() for name in ("z_true", "log_mass"))
     for low, high in ((0.5, 1.0), (1.0, 1.6), (1.6, 2.2)):
-        steps = (model.line.z > low) & (model.line.z < high)
+        steps = (model.steps.z > low) & (model.steps.z < high)
         for least in (11.0, 12.0, 13.0):
             bins = np.round(model.log_mass[:-1], 3) >= least - 1e-3
-            mean = np.sum(model.number[np.ix_(steps, bins)].sum(1) * model.line.volume[steps])
+            mean = np.sum(model.number[np.ix_(steps, bins)].sum(1) * model.steps.volume[steps])
             mean *= drawn.area * np.radians(1.0) ** 2
             found = np.sum((z > low) & (z < high) & (mass > least))
             assert found == pytest.approx(mean, rel=0.10, abs=4 * np.sqrt(mean))
@@ -110,7 +110,7 @@ def test_bias_of_the_field_that_halos_follow(model, low, high, redshift, low_k):
     from tests.truesky.catalogue.matter.test_density_box import spectrum
     from truesky.catalogue.matter import density_box
 
-    box, step = model.box, int(np.searchsorted(model.line.z, max(redshift, 0.003)))
+    box, step = model.box, int(np.searchsorted(model.steps.z, max(redshift, 0.003)))
     growth = float(density_box.growth(redshift))
     for column in (np.searchsorted(model.log_mass, low), np.searchsorted(model.log_mass, high)):
         x, field, amplitude = (float(table[step, column]) for table in (model.x, model.field, model.amplitude))

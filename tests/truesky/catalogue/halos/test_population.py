@@ -29,7 +29,7 @@ def falling_in(universe, block):
         for cell in sorted(own | ring | wide):
             hosts, found = drawn.halos_and_satellites(order, cell)
             inside = np.isin(sky.cell_at(found.ra, found.dec, 8), block)
-            inside &= (found.chi > universe.population.halos.line.edge[0]) & (
+            inside &= (found.chi > universe.population.halos.steps.edge[0]) & (
                 found.chi < universe.population.halos.max_distance
             )
             own = ids.satellite_id(hosts.id[found.host], found.member, hosts.bits[found.host])

@@ -62,7 +62,7 @@ def build(folder, side, flats, sources=STARS):
     with small_detectors(side):
         for module in MODULES:
             for step in module.steps(root, wanted):
-                publish.make_version(root, step.plan, step.work)
+                publish.make_version(root, step.plan, step.run_task)
         assert masters.main(["--lake", str(root), "--out", str(folder / "masters")]) == 0
         call = ["--lake", str(root), "--masters", str(folder / "masters"), "--out", str(folder / "images")]
         assert reduce.main(call) == 0

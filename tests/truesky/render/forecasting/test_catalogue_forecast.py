@@ -98,7 +98,7 @@ def few_sources(tmp_path_factory):
     )))  # fmt: skip
     for job in (build_galaxies, build_stars, compute_fluxes):
         for step in job.steps(lake, wanted):
-            publish.make_version(lake, step.plan, step.work)
+            publish.make_version(lake, step.plan, step.run_task)
     return lake, wanted
 
 

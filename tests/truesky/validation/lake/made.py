@@ -142,4 +142,4 @@ def ramp_file(path, chi2, channel="NISP-S", border=4):
 
 def verdicts(check, of):
     """Quantity -> verdict."""
-    return {row.quantity: row.verdict for row in check.of(of)}
+    return {row.quantity: row.verdict for row in check.run(of)}

@@ -37,11 +37,11 @@ def psf():
 def test_it_is_the_point_that_was_drawn(psf):
     rng = np.random.default_rng(6)
     x, y = rng.uniform(-1.8, 1.8, (2, 500))
-    value, rise, climb = psf.at(x, y)
+    value, rise, climb = psf.evaluate(x, y)
     assert value == pytest.approx(point(x, y), abs=0.01 * point(0.0, 0.0))
     step = 1e-4
-    assert rise == pytest.approx((psf.at(x + step, y)[0] - psf.at(x - step, y)[0]) / (2 * step), abs=1e-6)
-    assert climb == pytest.approx((psf.at(x, y + step)[0] - psf.at(x, y - step)[0]) / (2 * step), abs=1e-6)
+    assert rise == pytest.approx((psf.evaluate(x + step, y)[0] - psf.evaluate(x - step, y)[0]) / (2 * step), abs=1e-6)
+    assert climb == pytest.approx((psf.evaluate(x, y + step)[0] - psf.evaluate(x, y - step)[0]) / (2 * step), abs=1e-6)
 
 
 def fitted(psf, u, v, read, flux):
@@ -63,8 +63,8 @@ def test_a_cosmic_ray_is_left_out_and_a_fit_is_that_of_scipy(psf):
     u, v, read = cut(np.random.default_rng(8), 50000.0, NOISE)
 
     def left(p):
-        value = p[0] * psf.at(u - p[1], v - p[2])[0]
-        return (read - value) / np.sqrt(NOISE**2 + np.maximum(50000.0 * psf.at(u, v)[0], 0.0))
+        value = p[0] * psf.evaluate(u - p[1], v - p[2])[0]
+        return (read - value) / np.sqrt(NOISE**2 + np.maximum(50000.0 * psf.evaluate(u, v)[0], 0.0))
 
     told = scipy.optimize.least_squares(left, [50000.0, 0.0, 0.0], x_scale=[1e4, 0.1, 0.1]).x[0]
     assert fitted(psf, u, v, read, 50000.0)[0][0] == pytest.approx(told, rel=2e-3)
