@@ -91,7 +91,7 @@ def test_a_band_that_is_not_there(tmp_path, capsys):
 def test_a_map_in_the_wrong_ordering(tmp_path, capsys):
     test_dust_map.written_map(tmp_path / "theirs.fits", test_dust_map.synthetic_map(), ORDERING="NESTED")
     found = refused(tmp_path, DUST, capsys)
-    assert "theirs.fits: column EBV: ORDERING is said to be NESTED" in found
+    assert "theirs.fits: column EBV: ORDERING is NESTED in the header or request" in found
 
 
 def test_a_map_with_a_pixel_that_is_no_dust(tmp_path, capsys):

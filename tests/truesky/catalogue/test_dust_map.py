@@ -122,13 +122,13 @@ def test_a_fine_map_is_averaged(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("cards", "more", "said"),
     [
-        ({"ORDERING": "NESTED"}, {}, "smooth in RING only"),
+        ({"ORDERING": "NESTED"}, {}, "smooth only as RING"),
         ({"ORDERING": "ROUND"}, {}, "ORDERING is 'ROUND'"),
         ({"ORDERING": None}, {}, "no ORDERING"),
         ({"COORDSYS": None}, {}, "no COORDSYS"),
         ({"COORDSYS": "E"}, {}, "COORDSYS is 'E'"),
-        ({}, {"ordering": "NESTED"}, "ORDERING is 'RING', ingest.dust.ordering says 'NESTED'"),
-        ({"NSIDE": 32}, {}, "NSIDE is 32"),
+        ({}, {"ordering": "NESTED"}, "ORDERING is 'RING', but ingest.dust.ordering is 'NESTED'"),
+        ({"NSIDE": 32}, {}, "header says NSIDE = 32"),
         ({}, {"column": "TAU"}, "no column TAU"),
     ],
 )
