@@ -212,7 +212,7 @@ def test_an_identifier_twice_is_named(tmp_path):
     values = synthetic.columns()
     values = broken(values, "origin_id", 200, values["origin_id"][3])
     path = synthetic.write(tmp_path, "flagship2", values)
-    with pytest.raises(BadInput, match=r"column unique_gal_id: \d+ stands in row 201 of .* and in row 4 of"):
+    with pytest.raises(BadInput, match=r"column unique_gal_id: \d+ is in row 201 of .* and in row 4 of"):
         build(tmp_path, path, 'format = "flagship2"')
 
 
@@ -249,7 +249,7 @@ def test_a_unit_that_the_file_itself_denies(tmp_path):
     table = pq.read_table(path)
     field = table.schema.field("ra_gal").with_metadata({"unit": "rad"})
     pq.write_table(table.set_column(table.schema.get_field_index("ra_gal"), field, table["ra_gal"]), path)
-    with pytest.raises(BadInput, match=r"column ra_gal \(ra\) is in 'rad', the mapping says 'deg'"):
+    with pytest.raises(BadInput, match=r"column ra_gal \(ra\) has unit 'rad', but the mapping has 'deg'"):
         build(tmp_path, path, 'format = "flagship2"')
 
 
@@ -258,9 +258,9 @@ def test_a_unit_that_the_file_itself_denies(tmp_path):
     [
         ('format = "flagship3"', "flagship3"),
         ('format = "flagship2"\ncolumns = { colour = "x" }', "columns.colour"),
-        ('columns = { ra = "ra" }', "wants dec"),
+        ('columns = { ra = "ra" }', "must have dec"),
         ('format = "flagship2"\ncolumns = { ra = { column = "ra", times = 2.0 } }', "columns.ra.times"),
-        ('format = "flagship2"\ncolumns = { gamma2 = "" }', "kappa wants gamma2"),
+        ('format = "flagship2"\ncolumns = { gamma2 = "" }', "kappa requires gamma2"),
     ],
 )
 def test_a_mapping_that_does_not_fit(tmp_path, more, said):
@@ -318,7 +318,7 @@ def test_a_wrong_value_of_a_mock_is_named(tmp_path, name, value, said):
 
 def test_another_unit_of_a_mock_is_named(tmp_path):
     path = opencosmo.write(tmp_path / "mock.hdf5", opencosmo.columns(), units={**opencosmo.UNITS, "r50_disk_2d": "Mpc"})
-    with pytest.raises(BadInput, match=r"r50_disk_2d \(disk_half_light_radius\) is in 'Mpc', the mapping says 'kpc'"):
+    with pytest.raises(BadInput, match=r"r50_disk_2d \(disk_half_light_radius\) has unit 'Mpc', but the mapping has 'kpc'"):
         build(tmp_path, path, 'format = "opencosmo"')
 
 

@@ -127,5 +127,5 @@ def test_a_template_that_the_library_has_not(tmp_path, monkeypatch):
     columns = mapping.training_columns({key: f'"{key}"' for key in KEYS})
     with pytest.raises(BadInput, match=r"synthetic\.parquet: column sed \(sed\) of row 5 is 30\.5, the library's last"):
         nearest_sed.load([path], ["x"], columns)
-    with pytest.raises(BadInput, match=r"ingest\.training\.columns wants ebv"):
+    with pytest.raises(BadInput, match=r"ingest\.training\.columns must have ebv"):
         mapping.training_columns({key: f'"{key}"' for key in KEYS[:-1]})

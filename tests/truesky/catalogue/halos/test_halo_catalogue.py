@@ -98,7 +98,7 @@ def broken(key, row, value):
     ("values", "said"),
     [
         (broken("ra", 4, np.nan), r"column ra \(ra\) of row 5 is nan"),
-        (broken("mass", 9, 1e13 / 1e10), r"column mass \(log_mass\) of row 10 is 3, wanted in \[8, 16.5\]"),
+        (broken("mass", 9, 1e13 / 1e10), r"column mass \(log_mass\) of row 10 is 3, must be in \[8, 16.5\]"),
         (broken("z", 0, -0.1), r"column z \(z_true\) of row 1 is -0.1"),
         (broken("halo_id", 7, synthetic(100)["halo_id"][2]), r"column halo_id of row 8 is \d+, as in row 3 of"),
         ({name: v for name, v in synthetic(100).items() if name != "mass"}, "has no column mass; it has halo_id"),
@@ -113,12 +113,12 @@ def test_a_file_in_other_units(tmp_path):
     table = Table(synthetic(100))
     table["mass"].unit = "kg"
     table.write(tmp_path / "synthetic.fits")
-    with pytest.raises(BadInput, match=r"column mass \(log_mass\) is in 'kg', the mapping says 'Msun/h'"):
+    with pytest.raises(BadInput, match=r"column mass \(log_mass\) has unit 'kg', but the mapping has 'Msun/h'"):
         loaded(tmp_path / "synthetic.fits")
     # A logarithm where the mass itself is wanted.
     values = synthetic(100)
     values["mass"] = np.log10(values["mass"])
-    with pytest.raises(BadInput, match=r"column mass \(log_mass\) of row 1 is 1\.\d+, wanted"):
+    with pytest.raises(BadInput, match=r"column mass \(log_mass\) of row 1 is 1\.\d+, must be"):
         loaded(write(tmp_path / "logarithm.parquet", values))
 
 
