@@ -188,7 +188,8 @@ def _refuse_large_deflection(lens: Neighbourhood, deflection: Float) -> None:
     if largest > lens.max_deflection:
         largest_arcsec, allowed_arcsec = (np.degrees(angle) * 3600.0 for angle in (largest, lens.max_deflection))
         raise BadInput(
-            f"table galaxies: halos deflect light by {largest_arcsec:.0f} arcsec, at most {allowed_arcsec:.0f} are allowed"
+            f"table galaxies: halos deflect light by {largest_arcsec:.0f} arcsec, "
+            f"at most {allowed_arcsec:.0f} are allowed"
         )
 
 
@@ -343,7 +344,7 @@ def _frames(ra: Float, dec: Float) -> Float:
 
 
 def _stereographic(frame: Float, direction: Float) -> Float:
-    """Stereographic (conformal) projection of directions (n, 3) around the centre of a frame, shape (2, n), rad."""
+    """Project directions (n, 3) stereographically (conformally) around the centre of a frame, shape (2, n), rad."""
     x, y, along = (np.sum(direction * axis, -1) for axis in frame)
     return np.asarray(np.stack([x, y]) * (2.0 / (1.0 + along)))
 
