@@ -300,8 +300,10 @@ def sed_of_colour(table: BandRatios, colour: Float, law: Int, ebv: Float) -> Sed
     Sed
         Spectra. If no spectrum behind this dust has the colour, the end of the library.
 
-    Notes ----- A mixture of templates i and i - 1 with fractions 1 - f and f of the 0.1r flux mixes their 0.1g / 0.1r
-    ratios with the same fractions, so the inversion is exact.
+    Notes
+    -----
+    A mixture of templates i and i - 1 with fractions 1 - f and f of the 0.1r flux mixes their 0.1g / 0.1r ratios with
+    the same fractions, so the inversion is exact.
     """
     weights = ebv_weights(table.ebv, np.where(law > 0, ebv, 0.0))
     by_law = table.values[0].astype(np.float64)[np.maximum(law, 1) - 1]

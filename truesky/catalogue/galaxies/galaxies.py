@@ -176,9 +176,11 @@ def model(
     GalaxyModel
         The model.
 
-    Notes ----- The halos and galaxies of a nearer or shallower universe also exist in a deeper one, because both draw
-    from the same distributions with the same random numbers. The model takes 1 s to make. With an empty cache, the box
-    and its lensing take longer (density_box.load, lensing.load).
+    Notes
+    -----
+    The halos and galaxies of a nearer or shallower universe also exist in a deeper one, because both draw from the same
+    distributions with the same random numbers. The model takes 1 s to make. With an empty cache, the box and its
+    lensing take longer (density_box.load, lensing.load).
     """
     library, colours = templates.galaxy_library(), sequences.model()
     selection = _selection(requested, training)

@@ -164,8 +164,10 @@ def draw(cell: int, galaxies: pa.Table, seed: int, boost: float) -> pa.Table:
     Table
         Rows of table `strong_lenses`.
 
-    Notes ----- The position of a source is independent of lenses: it is as likely within an Einstein radius of a lens
-    as in any other area of the same size.
+    Notes
+    -----
+    The position of a source is independent of lenses: it is as likely within an Einstein radius of a lens as in any
+    other area of the same size.
     """
     law, stamp_settings = laws(), stamps()
     columns = {name: galaxies[name].to_numpy() for name in COLUMNS}
