@@ -95,7 +95,7 @@ def test_what_cannot_be_drawn_is_refused_before_anything_is_made(lake, tmp_path,
     plane = {"cone": {"ra": 266.4, "dec": -28.9, "radius": 0.1}}
     with pytest.raises(BadInput, match=r"within 5 deg of the Galactic plane"):
         build_stars.steps(lake, wanted(area=plane))
-    with pytest.raises(BadInput, match=r"ask for a brighter stars\.plane_limit"):
+    with pytest.raises(BadInput, match=r"set a brighter stars\.plane_limit"):
         build_stars.steps(lake, wanted(area=plane, stars={"plane_limit": 26.0}))
     path = requests.written(tmp_path, area="cone = { ra = 266.4, dec = -28.9, radius = 0.1 }")
     assert submitted_job.main(build_stars.JOB, ["--lake", str(tmp_path / "l"), "--request", str(path)]) == 2

@@ -83,10 +83,10 @@ def test_commas_and_fits_say_the_same(tmp_path):
     [
         (("3.763", "9.999"), r"LTef \(log_teff\) of row 1 is 9.999, not in \[2.4, 5\] \(1 of 4 rows like it\)"),
         (("12.005", "nan   "), r"H \(mag_h_seen\) of row 1 is nan"),
-        (("18.020", "18.x20"), r"H of row 2 is '18.x20', no number"),
-        (("  Dist ", "  Far  "), "lines holds the titles"),
-        (("  Dist ", "\n" * 10_000 + "  Dist "), "none of the first 10000 lines holds the titles"),
-        (("  Mv ", " Av "), "the title Av stands twice"),
+        (("18.020", "18.x20"), r"H of row 2 is '18.x20', not a number"),
+        (("  Dist ", "  Far  "), "lines has the columns"),
+        (("  Dist ", "\n" * 10_000 + "  Dist "), "none of the first 10000 lines has the columns"),
+        (("  Mv ", " Av "), "the column name Av must not occur twice"),
     ],
 )
 def test_bad_tables_are_named(tmp_path, change, words):
@@ -99,10 +99,10 @@ def test_bad_tables_are_named(tmp_path, change, words):
     ("columns", "words"),
     [
         ({**COLUMNS, "colour": "J-H"}, "columns.colour is not one of ra, dec"),
-        ({k: v for k, v in COLUMNS.items() if k != "l"}, "wants one of ra and l"),
-        ({**COLUMNS, "ra": "ra"}, "wants one of ra and l"),
-        ({k: v for k, v in COLUMNS.items() if k != "a_v"}, "mag_h_seen wants a_v"),
-        ({**{k: v for k, v in COLUMNS.items() if k != "l"}, "ra": "l"}, "wants ra and dec, or l and b"),
+        ({k: v for k, v in COLUMNS.items() if k != "l"}, "must have one of ra and l"),
+        ({**COLUMNS, "ra": "ra"}, "must have one of ra and l"),
+        ({k: v for k, v in COLUMNS.items() if k != "a_v"}, "mag_h_seen requires a_v"),
+        ({**{k: v for k, v in COLUMNS.items() if k != "l"}, "ra": "l"}, "must have ra and dec, or l and b"),
     ],
 )
 def test_bad_mappings_are_named(columns, words):

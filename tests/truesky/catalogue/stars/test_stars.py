@@ -178,7 +178,7 @@ def test_the_plane_is_refused_or_has_its_own_limit():
     assert [bool(stars._is_crowded(*at)) for at in ((0.0, 10.5), (21.0, 6.0), (340.5, -9.5))] == [False, False, True]
     with pytest.raises(BadInput, match=r"1 of the area's cells lie within 5 deg .* stars\.plane_limit"):
         stars.expected_counts([high, low], UNIVERSE)
-    with pytest.raises(BadInput, match=r"1 of the area's cells hold more than .* brighter stars\.plane_limit"):
+    with pytest.raises(BadInput, match=r"1 of the area's cells contain more than .* brighter stars\.plane_limit"):
         stars.expected_counts([high, low], stars.model(26.0, plane_limit=26.0))
     high_alone = stars.expected_counts([high], UNIVERSE)
     both = stars.expected_counts([high, low], stars.model(26.0, plane_limit=18.0))
