@@ -16,9 +16,8 @@ from truesky.numerics.compiling import exact_jit
 
 X, Y, CHI, AMPLITUDE, SIZE, CLOSE, WIDE, CONCENTRATION = range(8)
 _profile, _total = projected_nfw.profile, projected_nfw.total
-# Inner radius in units of theta_200. Closer to the centre, values are those at this radius; shear and deflection are 0
-# at
-# the centre.
+# Inner radius in units of theta_200. Closer to the centre, values are frozen at this radius, except that shear and
+# deflection are 0 at the centre.
 _CENTRE = 1e-6
 # Margin for rounding errors in the comparison of distances.
 _ROUNDING_ERROR = 1e-9

@@ -104,7 +104,7 @@ def test_the_fits_form_says_the_same(tmp_path):
         ([MEAN, record(dec=" 92.23184345")], "record 2 lies at 2.3175, 92.2318"),
         ([record(vt="   nan")], "record 1: 'nan' is not a number"),
         ([MEAN, MEAN[:100]], "Expected 32 columns"),
-        (["a,b,c"], "records of 1 fields, wanted 32"),
+        (["a,b,c"], "records have 1 fields between bars, must have 32"),
         ([MEAN + " " * 1000 + "|" * 5000], "the first record has 1000 characters or more"),
     ],
 )
