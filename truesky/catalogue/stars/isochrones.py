@@ -23,7 +23,7 @@ TABLE = Path(__file__).with_name("isochrones.csv")
 FIXED_MASSES = (0.5, 0.6)
 UPPER_FRACTIONS = (0.2, 0.4, 0.55, 0.68, 0.78, 0.86, 0.91, 0.94, 0.96, 0.98, 1.0)
 # Equivalent evolutionary points (Dotter 2016, ApJS 222, 8, Table 2): ends of the main sequence (454) and of the red
-# giant branch (605), start and end of core helium burning (631, 707), the first thermal pulse (808), and points between.
+# giant branch (605), start and end of core helium burning (631, 707), the first thermal pulse (808), and between.
 PHASES = (
     454, 462, 470, 480, 490, 500, 510, 522, 535, 550, 565, 580, 592, 600, 605, 631, 650, 670, 690, 707, 730, 760, 790,
     808,
