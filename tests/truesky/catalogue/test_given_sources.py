@@ -1,4 +1,4 @@
-"""Tables of the only sources that there are: what they say is in the catalogue, what is wrong in them is named."""
+"""Tables that list all sources of a request: the catalogue contains their values, and errors name their rows."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def asked(folder, more='only = "table"', galaxies=TWO, stars=STAR, extra="", rad
 
 
 def made(folder, *args, **keys):
-    """Tables `galaxies` and `stars` of a request."""
+    """Return tables `galaxies` and `stars` of a request."""
     wanted, lake = asked(folder, *args, **keys), folder / "lake"
     lake.mkdir(exist_ok=True)
     for module in (build_galaxies, build_stars):
@@ -70,7 +70,7 @@ def test_the_tables_are_the_catalogue(tmp_path):
     assert stars == pytest.approx([18.0], abs=1e-4)
 
 
-def test_keys_of_an_experiment_act_on_them(tmp_path):
+def test_lensing_and_rotation_apply_to_given_galaxies(tmp_path):
     keys = "[universe]\nlensing = { g1 = 0.0, g2 = 0.1 }\nrotation = 90.0"
     rows, points = made(tmp_path, stars=None, extra=keys)
     assert rows.sort_by("origin_id")["position_angle"].to_pylist() == [120.0, 50.0]

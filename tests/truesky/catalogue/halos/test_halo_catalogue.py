@@ -1,4 +1,4 @@
-"""An external halo light-cone in place of ours: a synthetic one, and what is refused."""
+"""The user's halo light-cone replaces the drawn halos: a synthetic one, and refused ones."""
 
 import numpy as np
 import pyarrow as pa
@@ -35,7 +35,7 @@ def own_cache(tmp_path, monkeypatch):
 
 
 def synthetic(number=2000):
-    """Made up: massive halos spread over one generation cell and its surroundings."""
+    """Return synthetic massive halos in one generation cell and its surroundings."""
     rng = np.random.default_rng(8)
     _, ra, dec = sky.random_in_cell(6, CELL >> 4, number, rng)
     z = rng.uniform(0.1, 1.5, number)
@@ -84,7 +84,7 @@ def test_galaxies_live_in_them_and_none_is_lost_between_cells(tmp_path):
     own, host = (np.concatenate([getattr(part, name) for part in parts]) for name in ("id", "halo_id"))
     known = np.concatenate([part.halos.id for part in parts])
     assert np.unique(own).size == own.size > known.size
-    # Of halos of the file there are none outside these cells.
+    # There are no halos of the file outside these cells.
     assert np.isin(host, known).all()
 
 
@@ -115,7 +115,7 @@ def test_a_file_in_other_units(tmp_path):
     table.write(tmp_path / "synthetic.fits")
     with pytest.raises(BadInput, match=r"column mass \(log_mass\) has unit 'kg', but the mapping has 'Msun/h'"):
         loaded(tmp_path / "synthetic.fits")
-    # A logarithm where the mass itself is wanted.
+    # The column contains a logarithm instead of the mass.
     values = synthetic(100)
     values["mass"] = np.log10(values["mass"])
     with pytest.raises(BadInput, match=r"column mass \(log_mass\) of row 1 is 1\.\d+, must be"):
