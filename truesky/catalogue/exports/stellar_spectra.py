@@ -69,7 +69,7 @@ def magnorm(stars: pa.Table, library: Library) -> Float:
 
 
 def _rebin(library: Library) -> tuple[Float, Float]:
-    """(A; f_lambda[template]) every 10 A, averaged over the samples around each wavelength."""
+    """Return (A; f_lambda[template]) every 10 A, averaged over the samples around each wavelength."""
     half = _SAMPLES_PER_BIN // 2
     start = int((_LEVEL_WAVELENGTH - library.wavelength[0] - half) % _SAMPLES_PER_BIN)
     count = (library.flux.shape[1] - start - 1) // _SAMPLES_PER_BIN

@@ -199,7 +199,7 @@ def _refuse_large_deflection(lens: Neighbourhood, deflection: Float) -> None:
 def _cells_with_halos(
     settings: Settings, cell: int, centre: tuple[float, float], radius: float
 ) -> list[tuple[int, int, float]]:
-    """(order, cell, lowest mass) of cells whose halos may lens the generation cell."""
+    """Return (order, cell, lowest mass) of cells whose halos may lens the generation cell."""
     close_cells = set(sky.cells_in_cone(*centre, radius + settings.wide / 60.0, GENERATION_ORDER).tolist())
     cells_in_reach = sky.cells_in_cone(*centre, radius + settings.reach / 60.0, GENERATION_ORDER).tolist()
     selected = [
@@ -232,7 +232,7 @@ def _select_reaching(
 def _cached_lenses(
     settings: Settings, box: Planes, cells: CellCache, order: int, cell: int, min_mass: float
 ) -> tuple[Float, Int]:
-    """(table, shape (10, h); identifiers) of halos above a mass in a cell, where the box alone shows them."""
+    """Return (table, shape (10, h); identifiers) of halos above a mass in a cell, where the box alone shows them."""
     cache, key, full_key = cells.lenses, (order, cell, min_mass), (order, cell, settings.lowest)
     if key not in cache:
         max_distance = (
@@ -277,7 +277,7 @@ def _max_deflection(halos: Float) -> float:
 
 @lru_cache
 def _max_enclosed_ratio() -> tuple[Float, Float]:
-    """(concentrations; largest enclosed mass / radius, both in units of the halo's values)."""
+    """Return (concentrations; largest enclosed mass / radius, both in units of the halo's values)."""
     from truesky.catalogue.halos import projected_nfw
 
     nodes, shares = np.geomspace(1.0, 100.0, 25), np.linspace(0.02, 0.99, 98)
@@ -288,7 +288,7 @@ def _max_enclosed_ratio() -> tuple[Float, Float]:
 
 
 def _grid(settings: Settings, halos: Float) -> tuple[Float, Float]:
-    """(planes[p]; smooth[p, side, side, 5]) of the halos that reach into a cell."""
+    """Return (planes[p]; smooth[p, side, side, 5]) of the halos that reach into a cell."""
     # Import here, because compiling takes a second.
     from truesky.catalogue.halos import halo_lensing_sums as sums
 

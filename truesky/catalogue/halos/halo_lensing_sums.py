@@ -25,7 +25,7 @@ _ROUNDING_ERROR = 1e-9
 
 @exact_jit
 def add_halos(place: Float, inverse_distance: Float, first: Int, halo: Float, out: Float) -> None:
-    """Add the short-range lensing of halos to sources behind them: each halo's mass is compensated within theta_s.
+    """Add the short-range lensing of halos to sources behind them, with masses compensated within theta_s.
 
     Parameters
     ----------

@@ -289,7 +289,7 @@ def levels(angle: Float) -> Int:
 def _draw_blocks(
     halos: HaloModel, used: Bool, voxels: Voxels, thresholds: tuple[Float, Float], key: int
 ) -> tuple[Int, Int, Int, npt.NDArray[np.uint64], Float]:
-    """(voxel, mass bin, number in the block, random bits, random numbers (n, 3)) of the halos, sorted by block."""
+    """Return (voxel, mass bin, number in the block, random bits, random numbers (n, 3)) of the halos, sorted by block."""
     steps, first = np.unique(voxels.step, return_index=True)
     first = np.append(first, voxels.step.size)
     amplitude, field = halos.amplitude[steps], halos.field[steps]
@@ -313,7 +313,7 @@ def _draw_blocks(
 
 
 def _identifiers(halos: HaloModel, step: Int, column: Int, index: Int, number: Int | None) -> tuple[Int, Int]:
-    """(identifiers, member bits) of halos; halos of larger cells are numbered here in their generation cells."""
+    """Return (identifiers, member bits) of halos; halos of larger cells are numbered here in their generation cells."""
     block, cell = step * (halos.log_mass.size - 1) + column, index >> 2 * (sky.MAX_ORDER - GENERATION_ORDER)
     if number is None:
         number = np.empty(block.size, np.int64)

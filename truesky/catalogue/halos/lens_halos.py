@@ -108,12 +108,16 @@ def sizes(masses: Masses, chosen: Settings, order: int, z: Float, chi: Float, lo
     Returns
     -------
     float array, shape (5, n)
-        Amplitude, theta_200, theta_s, theta_c (rad) and concentration.
+        Amplitude; theta_200, theta_s and theta_c in rad; concentration.
 
     Notes
     -----
     The convergence of a halo is the amplitude times 1 - chi / chi_source times a function of angle. The mean of this
     function inside theta is 1 / theta^2 if the circle contains the whole mass.
+
+    theta_200 is the angle of R_200m. Halos are summed for each source within theta_s; the rest of their lensing is
+    smooth. The mass of a halo is compensated by an equal negative mass within theta_c, so that the mean density does
+    not change and there is no lensing beyond.
     """
     # c^2 / (4 pi G) in Msun / Mpc, from the critical density of `masses`.
     bending = masses.shape.critical_density * cosmology.HUBBLE_DISTANCE**2 / 1.5
