@@ -232,7 +232,7 @@ def _extinction_excess(z: Float) -> Float:
 
 @lru_cache(maxsize=1)
 def _law_difference() -> tuple[Float, Float]:
-    """Return (wavelength in A; our A(lambda) / A(V) minus Fitzpatrick et al. 2019 with R_V = 3.1) in the range of that law."""
+    """Return wavelengths (A), and our A(lambda) / A(V) minus Fitzpatrick et al. 2019 with R_V = 3.1, in its range."""
     # Import here, because these packages are slow to import.
     import astropy.units as u
     from dust_extinction.parameter_averages import F19

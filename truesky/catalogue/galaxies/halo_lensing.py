@@ -4,8 +4,7 @@ Notes
 -----
 The matter of the box deflects the light of a halo as well as the light of sources behind it, by 20 to 40 arcsec less.
 Distances between halos and sources are therefore measured between the positions at which the box alone shows them. From
-there, one Newton step of theta = beta + alpha(theta) leads to the image by the halos, and the lensing is summed again
-there.
+there, one Newton step of theta = beta + alpha(theta) leads to the image, and the lensing is summed again at the image.
 
 The lens equation is solved to 0.5 arcsec for 99 % of the sources (tests). Terms of about kappa^2, in which halos lens
 the light of other halos, are left out.

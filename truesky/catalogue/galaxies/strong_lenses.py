@@ -2,9 +2,9 @@
 
 All galaxies redder than the blue sequence are lenses. At 0.1 < z < 0.7 the fourth moment of their dispersions, which
 determines the total cross-section, agrees with Choi et al. 2007 within 15 %. With the detection criteria of Collett
-2015, the number is 10.2 +- 1.1 deg-2 for sources with I_E < 26 and z < 2.3, compared to 11.3 there (in total
-14.9 +- 1.3). Central galaxies of halos above 10^12.7 Msun/h are only a fifth of the lenses: most lenses
-are galaxies of smaller halos.
+2015, the number is 10.2 +- 1.1 deg-2 for sources with I_E < 26 and z < 2.3 (14.9 +- 1.3 in total), compared to 11.3 of
+Collett 2015. Central galaxies of halos above 10^12.7 Msun/h are only a fifth of the lenses: most lenses are galaxies of
+smaller halos.
 
 Coordinates are in arcsec east and north of the lens on the tangent plane. The images contain only the smooth lens; weak
 lensing by matter in front of and behind the lens is left out.

@@ -289,7 +289,7 @@ def levels(angle: Float) -> Int:
 def _draw_blocks(
     halos: HaloModel, used: Bool, voxels: Voxels, thresholds: tuple[Float, Float], key: int
 ) -> tuple[Int, Int, Int, npt.NDArray[np.uint64], Float]:
-    """Return (voxel, mass bin, number in the block, random bits, random numbers (n, 3)) of the halos, sorted by block."""
+    """Return (voxel, mass bin, number in the block, random bits, random numbers (n, 3)) of halos, sorted by block."""
     steps, first = np.unique(voxels.step, return_index=True)
     first = np.append(first, voxels.step.size)
     amplitude, field = halos.amplitude[steps], halos.field[steps]

@@ -2,7 +2,7 @@
 
 A star moves with the mean rotation of its population around the Galactic centre. A normal deviate along each axis of
 the ellipsoid is added, and the motion of the Sun is subtracted. The ellipsoids point to the centre. Ellipsoids of discs
-are larger closer to the centre, where discs also have a larger lag. The parameters and their sources are in
+are larger closer to the centre, where the lag of discs is also larger. The parameters and their sources are in
 kinematics.toml.
 
 References
