@@ -1,6 +1,6 @@
 """Build the table `gaia` of a lake's stars: spark-submit jobs/catalogue/build_gaia.py --lake LAKE --request REQUEST.
 
-The request's fluxes.bands must have held gaia_g, gaia_bp and gaia_rp.
+The key `fluxes.bands` of the request must contain gaia_g, gaia_bp and gaia_rp.
 """
 
 from pathlib import Path
@@ -21,7 +21,25 @@ from truesky.running.submitted_job import Job, Step
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
-    """One part a file of the stars."""
+    """Plan the table `gaia` with one task per partition of the stars.
+
+    Parameters
+    ----------
+    lake : Path
+        Folder of the lake.
+    request : Request
+        The request; its catalogues of stars and star fluxes must be in the lake.
+
+    Returns
+    -------
+    list of Step
+        One step, which observes the stars.
+
+    Raises
+    ------
+    BadInput
+        If the Gaia bands are missing in the table `star_fluxes`, or if it was computed from another version of `stars`.
+    """
     stars, fluxes = (read.input_version(lake, name, request.name) for name in ("stars", "star_fluxes"))
     universe.check_catalogues([stars], request)
     if missing := [name for name in gaia.FLUX_COLUMNS if name not in fluxes.schema.names]:
@@ -37,7 +55,24 @@ def steps(lake: Path, request: Request) -> list[Step]:
 
 
 def observe_stars(lake: Path, facts: Json) -> Output:
-    """What Gaia finds in a file's cell: also stars from beside it, whose measured place may lie inside."""
+    """Draw Gaia's measurements of the stars in one partition.
+
+    Parameters
+    ----------
+    lake : Path
+        Folder of the lake.
+    facts : dict
+        Facts of the plan and of the task; `part` is the partition.
+
+    Returns
+    -------
+    Output
+        Rows of table `gaia` in the cell of the partition.
+
+    Notes
+    -----
+    Stars in the margin around the cell are included, because their measured positions may lie inside it.
+    """
     partition = facts["part"]
     stars = _rows(read.version(lake, "stars", facts["stars"]), partition, gaia.STAR_COLUMNS)
     fluxes = _rows(read.version(lake, "star_fluxes", facts["star_fluxes"]), partition, gaia.FLUX_COLUMNS)
@@ -51,4 +86,4 @@ def _rows(version: read.Version, partition: str, columns: list[str]) -> pa.Table
     return pa.concat_tables([version.rows(columns, [partition]), version.read_margin(partition, columns)])
 
 
-JOB = Job("build_gaia", "List the stars as Gaia would.", steps)
+JOB = Job("build_gaia", "Draw Gaia's measurements of the stars.", steps)

@@ -38,13 +38,32 @@ _GALAXY_FACTS = (*_HALO_FACTS, "lensing_nside", "alignment", *_LENS_FACTS, "high
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
-    """Tables of one part an order-5 cell each, made of the generation cells that the request's area touches.
+    """Plan the tables with one task per order-5 cell, which draws the generation cells that the request's area touches.
 
-    Galaxies of a finished catalogue have no table of halos: these are not known. Galaxies that weak lensing cannot
-    describe lie in files beside the others, and are a table of their own.
+    Parameters
+    ----------
+    lake : Path
+        Folder of the lake.
+    request : Request
+        The request.
+
+    Returns
+    -------
+    list of Step
+        Steps of `halos` and `halo_limits` (only if galaxies are drawn in halos), of `galaxies` and of `quarantine`.
+
+    Raises
+    ------
+    BadInput
+        If a file of the user is missing or wrong.
+
+    Notes
+    -----
+    The halos of galaxies from a user's catalogue are not known. Galaxies that weak lensing cannot describe are stored
+    in sidecar files of `galaxies` and are collected in the table `quarantine`.
     """
     check_rendered(request)
-    # Whatever is wrong with a file is said before anything is published.
+    # Report problems with the user's files before any table is published.
     dust_map.map_for_request(request.seed, request.ingest.dust)
     if request.sources is not None:
         table_steps = [_given_step(request, request.sources)]
@@ -62,7 +81,7 @@ def _draw_steps(lake: Path, request: Request) -> list[Step]:
     del universe["star_limit"]
     user_inputs = request.ingest
     check_band(request)
-    # The spectra of a training table say how faint a halo's galaxy may be.
+    # The limit of a halo's galaxies depends on the spectra of the training table.
     external_facts = (
         {"halos": _input_facts(user_inputs.halos, mapping.halo_columns(dict(user_inputs.halos.columns)))}
         if user_inputs.halos
@@ -83,11 +102,11 @@ def _draw_steps(lake: Path, request: Request) -> list[Step]:
     tasks = cells.tasks_of_area(request.area)
     halo_facts = {key: facts[key] for key in ("seed", *_HALO_FACTS, "galaxy_band", *external_facts, "code")}
     halos, limits = Plan(HALOS, halo_facts, tasks), Plan(HALO_LIMITS, halo_facts, (Task("all.parquet", {}),))
-    # Up to this multipole the lensing has the power of linear theory within 10 %.
+    # The power of the lensing agrees with linear theory within 10 % up to this multipole.
     multipole_limit = {"lensing_l_max": facts["lensing_nside"]} if request.universe.lensing is None else {}
     plan = Plan(GALAXIES, {**facts, **multipole_limit}, tasks)
     if not layout.version_folder(lake, GALAXIES.name, plan.key).exists():
-        # The box and its lensing are made here, once, and only mapped by the workers.
+        # Make the box and its lensing once on the driver; the workers map them from the cache.
         _universe(facts, user_inputs)
     return [
         Step(halos, partial(draw_halos, user_inputs=user_inputs)),
@@ -97,7 +116,22 @@ def _draw_steps(lake: Path, request: Request) -> list[Step]:
 
 
 def draw_halos(lake: Path, facts: Json, user_inputs: Ingest | None = None) -> Output:
-    """The halos of one order-5 cell."""
+    """Draw the halos of one order-5 cell.
+
+    Parameters
+    ----------
+    lake : Path
+        Not used.
+    facts : dict
+        Facts of the plan and of the task.
+    user_inputs : Ingest, optional
+        Section `ingest` of the request.
+
+    Returns
+    -------
+    Output
+        Rows of table `halos`.
+    """
     light_cone, training = _load_external(facts, user_inputs)
     universe = galaxies.halos_and_galaxies(facts["seed"], _universe_section(facts, _HALO_FACTS), light_cone, training)
     drawn_cells = population.CellCache(universe)
@@ -105,14 +139,44 @@ def draw_halos(lake: Path, facts: Json, user_inputs: Ingest | None = None) -> Ou
 
 
 def list_halo_limits(lake: Path, facts: Json, user_inputs: Ingest | None = None) -> Output:
-    """From which mass on all halos are listed."""
+    """List the mass above which the halos are complete, by redshift.
+
+    Parameters
+    ----------
+    lake : Path
+        Not used.
+    facts : dict
+        Facts of the plan.
+    user_inputs : Ingest, optional
+        Section `ingest` of the request.
+
+    Returns
+    -------
+    Output
+        Rows of table `halo_limits`.
+    """
     light_cone, training = _load_external(facts, user_inputs)
     universe = galaxies.halos_and_galaxies(facts["seed"], _universe_section(facts, _HALO_FACTS), light_cone, training)
     return Output(galaxies.halo_limits(universe))
 
 
 def draw_galaxies(lake: Path, facts: Json, user_inputs: Ingest | None = None) -> Output:
-    """The galaxies that are seen in one order-5 cell."""
+    """Draw the galaxies whose lensed positions are in one order-5 cell.
+
+    Parameters
+    ----------
+    lake : Path
+        Not used.
+    facts : dict
+        Facts of the plan and of the task.
+    user_inputs : Ingest, optional
+        Section `ingest` of the request.
+
+    Returns
+    -------
+    Output
+        Rows of table `galaxies`, with a sidecar file of quarantined galaxies if there are any.
+    """
     universe = _universe(facts, user_inputs)
     dust = dust_map.map_for_request(facts["seed"], user_inputs.dust if user_inputs else None)
     drawn_cells = population.CellCache(universe.population)
@@ -120,7 +184,20 @@ def draw_galaxies(lake: Path, facts: Json, user_inputs: Ingest | None = None) ->
 
 
 def collect_quarantine(lake: Path, facts: Json) -> Output:
-    """What lies beside the galaxies of all cells."""
+    """Collect the quarantined galaxies from the sidecar files of all cells.
+
+    Parameters
+    ----------
+    lake : Path
+        Folder of the lake.
+    facts : dict
+        Facts of the plan; `galaxies` is the key of the version.
+
+    Returns
+    -------
+    Output
+        Rows of table `quarantine`.
+    """
     version = read.version(lake, GALAXIES.name, facts["galaxies"])
     existing = {entry["path"] for entry in version.manifest["files"]}
     names = (quarantine_file(part["facts"]["generation_cells"]) for part in version.manifest["parts"])
@@ -129,7 +206,7 @@ def collect_quarantine(lake: Path, facts: Json) -> Output:
 
 
 def quarantine_file(generation_cells: Sequence[int]) -> str:
-    """Where a version of `galaxies` keeps what weak lensing cannot describe; not there where nothing is."""
+    """Return the relative path of the sidecar file with quarantined galaxies, which exists only if there are any."""
     return f"quarantine/{layout.cell_file(FILE_ORDER, generation_cells[0] >> 2 * (GENERATION_ORDER - FILE_ORDER))}"
 
 
@@ -158,7 +235,7 @@ def _universe_section(facts: Json, names: Sequence[str]) -> Universe:
 
 
 def _load_external(facts: Json, user_inputs: Ingest | None) -> tuple[LightCone | None, Training | None]:
-    """The user's halos and observed galaxies, where the request names some."""
+    """Return the user's halos and training galaxies, each None if the request does not name them."""
     light_cone = training = None
     if user_inputs is not None and user_inputs.halos is not None:
         columns = mapping.halo_columns(dict(user_inputs.halos.columns))
@@ -195,10 +272,10 @@ def _ingest_step(lake: Path, request: Request, catalogue: Catalogue) -> Step:
     return Step(plan, partial(ingest_galaxies, catalogue=catalogue, dust=dust))
 
 
-def _columns(catalogue: Catalogue, is_lensed_anew: bool) -> mapping.Columns:
-    """The mapping of a catalogue, which is seen where it says; where it is, if a request lenses it in another way."""
+def _columns(catalogue: Catalogue, replaces_lensing: bool) -> mapping.Columns:
+    """Return the column mapping of a catalogue, without lensed positions if the request replaces the lensing."""
     columns = mapping.galaxy_columns(catalogue.format, dict(catalogue.columns))
-    return mapping.drop_lensed_positions(columns) if is_lensed_anew else columns
+    return mapping.drop_lensed_positions(columns) if replaces_lensing else columns
 
 
 def _given_step(request: Request, source_tables: UserSources) -> Step:
@@ -215,10 +292,23 @@ def _given_step(request: Request, source_tables: UserSources) -> Step:
 
 
 def draw_given_galaxies(lake: Path, facts: Json, source_tables: UserSources, area: Area) -> Output:
-    """The galaxies of a request that names them all, of one order-5 cell.
+    """Draw the galaxies of one order-5 cell for a request that lists all sources.
 
-    lake  : not used;  facts : of the part
-    own   : the tables;  area : of the request
+    Parameters
+    ----------
+    lake : Path
+        Not used.
+    facts : dict
+        Facts of the plan and of the task.
+    source_tables : UserSources
+        The user's tables of sources.
+    area : Area
+        Area of the request.
+
+    Returns
+    -------
+    Output
+        Rows of table `galaxies`, with a sidecar file of quarantined galaxies if there are any.
     """
     source_columns = given_sources.load(source_tables, area, facts["sources"])
     model = given_sources.model(facts["seed"], source_tables, source_columns, _shear(facts), facts["rotation"])
@@ -232,10 +322,23 @@ def _shear(facts: Json) -> Shear | None:
 
 
 def ingest_galaxies(lake: Path, facts: Json, catalogue: Catalogue, dust: DustMap | None) -> Output:
-    """A catalogue's galaxies of one order-5 cell.
+    """Convert the galaxies of a user's catalogue in one order-5 cell.
 
-    lake  : folder of the lake;  facts : of the plan and of the part, which has its cell
-    given : the catalogue's files and columns;  dust : an external map of dust, None = the embedded one
+    Parameters
+    ----------
+    lake : Path
+        Not used.
+    facts : dict
+        Facts of the plan and of the task; `generation_cells` are the cells to draw.
+    catalogue : Catalogue
+        Files and columns of the user's catalogue.
+    dust : DustMap or None
+        The user's dust map; None for the embedded map.
+
+    Returns
+    -------
+    Output
+        Rows of table `galaxies`, with a sidecar file of quarantined galaxies if there are any.
     """
     columns = _columns(catalogue, facts["lensing"] is not None)
     files, _ = ingest.list_files(catalogue.files, columns)

@@ -17,12 +17,25 @@ from truesky.request.files import DustMap, UserSources
 from truesky.request.schema import Request, Stars
 from truesky.running.submitted_job import Job, Step
 
-# Lowest order of a file: 54 deg2, what a bright limit leaves in them is soon drawn.
+# Lowest order of a file's cell (54 deg2). With a bright limit, such a cell has few stars and is drawn quickly.
 _MIN_FILE_ORDER = 3
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
-    """Files of about as many rows, made of the generation cells that the request's area touches."""
+    """Plan the table `stars` in files with similar numbers of rows.
+
+    Parameters
+    ----------
+    lake : Path
+        Folder of the lake.
+    request : Request
+        The request; the generation cells that its area touches are drawn.
+
+    Returns
+    -------
+    list of Step
+        One step, which draws the stars.
+    """
     check_rendered(request)
     choice = request.stars
     if request.sources is not None:
@@ -59,26 +72,52 @@ def _given_step(request: Request, source_tables: UserSources) -> Step:
 
 
 def draw_given_stars(lake: Path, facts: Json, source_tables: UserSources, area: Area) -> Output:
-    """The stars of a request that names them all, of one file's cell.
+    """Draw the stars of one file for a request that lists all sources.
 
-    lake  : not used;  facts : of the part
-    own   : the tables;  area : of the request
+    Parameters
+    ----------
+    lake : Path
+        Not used.
+    facts : dict
+        Facts of the plan and of the task.
+    source_tables : UserSources
+        The user's tables of sources.
+    area : Area
+        Area of the request.
+
+    Returns
+    -------
+    Output
+        Rows of table `stars`.
     """
     model, dust = _given_model(source_tables, area, facts["sources"]), np.zeros(12, np.float32)
     return Output(cells.draw_rows(facts, STARS, lambda cell: stars.draw(cell, facts["seed"], model, dust)))
 
 
 def _given_model(source_tables: UserSources, area: Area, planned: Json | None = None) -> stars.StarModel:
-    """Each star, however faint and wherever it is."""
+    """Return a model that contains exactly the listed stars, without any magnitude limit."""
     catalogue = given_sources.stars(given_sources.load(source_tables, area, planned), source_tables.band)
     return stars.model(math.inf, math.inf, brown_dwarf_boost=0.0, catalogue=catalogue)
 
 
 def draw_stars(lake: Path, facts: Json, choice: Stars, user_dust_map: DustMap | None = None) -> Output:
-    """The stars of one file's cell.
+    """Draw the stars of one file.
 
-    lake   : folder of the lake;  facts : of the plan and of the part, which has its cell
-    choice : section `stars` of the request;  own : an external map of dust, None = the embedded one
+    Parameters
+    ----------
+    lake : Path
+        Not used.
+    facts : dict
+        Facts of the plan and of the task; `generation_cells` are the cells to draw.
+    choice : Stars
+        Section `stars` of the request.
+    user_dust_map : DustMap, optional
+        The user's dust map; None for the embedded map.
+
+    Returns
+    -------
+    Output
+        Rows of table `stars`.
     """
     model = request_checks.star_model(facts["star_limit"], choice, facts)
     dust = dust_map.map_for_request(facts["seed"], user_dust_map)

@@ -1,4 +1,4 @@
-"""Build table `strong_lenses` of a lake's galaxies, with pictures of the arcs.
+"""Build the table `strong_lenses` of a lake's galaxies, with images of the arcs.
 
 spark-submit jobs/catalogue/build_strong_lenses.py --lake LAKE --request REQUEST
 """
@@ -22,7 +22,7 @@ from truesky.running.submitted_job import Job, Step
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
-    """One part a file of the galaxies."""
+    """Plan the table `strong_lenses` with one task per partition of the galaxies."""
     galaxies = read.input_version(lake, "galaxies", request.name)
     universe.check_catalogues([galaxies], request)
     facts = {"seed": request.seed, "galaxies": galaxies.key, "boost": request.strong_lens_boost, "code": code_version()}
@@ -35,7 +35,10 @@ def steps(lake: Path, request: Request) -> list[Step]:
 
 
 def draw_lenses(lake: Path, facts: Json) -> Output:
-    """The strong lenses of one file: sources are galaxies that are seen in the lens' own generation cell."""
+    """Draw the strong lenses of one partition.
+
+    The sources are galaxies whose lensed positions are in the same generation cell as the lens.
+    """
     rows = read.version(lake, "galaxies", facts["galaxies"]).rows(strong_lenses.COLUMNS, [facts["part"]])
     index = rows["_healpix_29"].to_numpy()
 

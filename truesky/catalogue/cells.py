@@ -1,12 +1,7 @@
-"""Generation cells and the files that hold them: draws are by whole order-8 cells, files by larger ones.
+"""Generation cells, and the files in which their rows are stored.
 
-parts      one file an order-5 cell
-by_number  files of about as many rows, in cells of whatever order that takes
-rows       what a file holds
-in_order   rows of a cell as files hold them
-
-A generation cell is always drawn whole, so that its rows are the same bytes in every request that touches it, and in
-whichever file it lies.
+Rows are drawn for whole order-8 cells (generation cells) and stored in files of larger cells. A generation cell is
+always drawn completely, so that its rows are identical in every request that touches it and in files of any size.
 """
 
 from __future__ import annotations
@@ -27,7 +22,7 @@ from truesky.request.area import Area
 
 
 def tasks_of_area(area: Area) -> tuple[Task, ...]:
-    """One part an order-5 cell, with the generation cells of it that the area touches."""
+    """Return one task per order-5 cell, with the generation cells inside it that the area touches."""
     cells_by_file: dict[int, list[int]] = defaultdict(list)
     for cell in area.cells(GENERATION_ORDER):
         cells_by_file[cell >> 2 * (GENERATION_ORDER - FILE_ORDER)].append(cell)
@@ -40,11 +35,23 @@ def tasks_of_area(area: Area) -> tuple[Task, ...]:
 def tasks_by_row_count(
     generation_cells: Sequence[int], row_counts: npt.ArrayLike, max_rows: float, min_order: int
 ) -> tuple[Task, ...]:
-    """The largest cells that hold at most so many rows, along the order of _healpix_29.
+    """Divide generation cells into files that contain at most `max_rows` rows, in the order of _healpix_29.
 
-    generation_cells : distinct; numbers : [n] rows expected in each
-    most             : of a file, though no generation cell is split
-    order            : lowest order of a file
+    Parameters
+    ----------
+    generation_cells : sequence of int
+        Nested indices of distinct order-8 cells.
+    row_counts : float array, shape (n,)
+        Expected number of rows of each cell.
+    max_rows : float
+        Largest number of rows per file. A generation cell with more rows is not split.
+    min_order : int
+        Lowest order of a file's cell.
+
+    Returns
+    -------
+    tuple of Task
+        One task per file. Each file is the largest cell that keeps the limit.
     """
     remaining = np.sort(np.asarray(generation_cells, np.int64))
     expected = np.asarray(row_counts, float)[np.argsort(generation_cells)]
@@ -64,10 +71,25 @@ def tasks_by_row_count(
 
 
 def draw_rows(facts: Json, table: Table, draw: Callable[[int], pa.Table]) -> pa.Table:
-    """Rows of a part: its generation cells one after another, which is the order of _healpix_29."""
+    """Draw the rows of a file, one generation cell after another.
+
+    Parameters
+    ----------
+    facts : dict
+        Facts of the task; `generation_cells` are the cells to draw.
+    table : Table
+        Schema of the rows.
+    draw : callable
+        Function that returns the rows of a generation cell, sorted as `sort_rows` does.
+
+    Returns
+    -------
+    Table
+        Rows in the order of _healpix_29.
+    """
     return pa.concat_tables([table.empty(), *(draw(cell) for cell in sorted(facts["generation_cells"]))])
 
 
 def sort_rows(rows: pa.Table) -> pa.Table:
-    """Rows by _healpix_29, those of one place by identifier."""
+    """Sort rows by _healpix_29, and by identifier if these are equal."""
     return rows.take(np.lexsort((rows["id"].to_numpy(), rows["_healpix_29"].to_numpy())))

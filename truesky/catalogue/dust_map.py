@@ -1,12 +1,8 @@
-"""The dust of the Milky Way: extinction A(V) to infinity from a full-sky map, and to a distance.
+"""Extinction A(V) by the dust of the Milky Way, to infinity from a full-sky map and to a distance.
 
-embedded    the default map: a cosecant law times a log-normal field, from the universe's seed
-chosen      the map of a request: a file of its own, else the default
-facts       what stands for the file in a plan
-a_v         read a map at sky positions
-a_v_at      the part of it in front of a star
-
-Maps are HEALPix, RING, Galactic.  Ref: the numbers and their sources are in dust_map.toml.
+The embedded map is a cosecant law times a log-normal field that depends on the seed of the universe. A request can
+replace it by a file. Maps are in HEALPix RING ordering and Galactic coordinates. The parameters and their sources are
+in dust_map.toml.
 """
 
 from __future__ import annotations
@@ -32,15 +28,15 @@ from truesky.numerics.code_fingerprints import code_key
 from truesky.randomness.rng import stream
 from truesky.request.files import DustMap
 
-# Table `galaxies` holds no more.
+# Largest A(V) that table `galaxies` can store, mag.
 _MAX_A_V = 40.0
-# Of the steps between neighbours, the other ordering's over that which the header says.
+# A map is refused if the steps between neighbouring pixels are smaller than this fraction in the other ordering.
 _SMOOTHNESS_RATIO = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Cosecant:
-    """The embedded map's numbers (dust_map.toml, [map])."""
+    """Parameters of the embedded map (dust_map.toml, [map])."""
 
     nside: int
     ebv_pole: float
@@ -55,23 +51,23 @@ class Cosecant:
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """Where along the line of sight the dust lies (dust_map.toml, [layer]); height in pc."""
+    """Scale height of the dust layer in pc (dust_map.toml, [layer])."""
 
     height: float
 
 
 def cosecant() -> Cosecant:
-    """The dust of the embedded universe."""
+    """Return the parameters of the embedded map."""
     return Cosecant(**parameters.section("dust_map.toml", "map"))
 
 
 def layer() -> Layer:
-    """The dust layer of the embedded universe."""
+    """Return the dust layer of the embedded universe."""
     return Layer(**parameters.section("dust_map.toml", "layer"))
 
 
 def make_map(seed: int, model: Cosecant) -> Float32:
-    """Map of A(V), float32[12 nside^2] mag."""
+    """Make the embedded map of a seed: A(V) in mag, float32, shape (12 nside^2,)."""
     _, b = hp.pix2ang(model.nside, np.arange(hp.nside2npix(model.nside)), lonlat=True)
     field = _gaussian_field(seed, model)
     sin_b = np.maximum(np.abs(np.sin(np.radians(b))), model.sin_b_min)
@@ -80,28 +76,59 @@ def make_map(seed: int, model: Cosecant) -> Float32:
 
 
 def a_v(sky_map: Float32, ra: Float, dec: Float) -> Float:
-    """A(V)[n] mag at ICRS positions, deg, bilinear between the map's pixels.
+    """Interpolate A(V) bilinearly between the pixels of a map.
 
-    sky_map : float32[pixel] mag, RING, Galactic;  ra, dec : float[n] deg
+    Parameters
+    ----------
+    sky_map : float32 array, shape (pixels,)
+        A(V) in mag, RING ordering, Galactic coordinates.
+    ra, dec : float array, shape (n,)
+        ICRS positions, deg.
+
+    Returns
+    -------
+    float array, shape (n,)
+        A(V) in mag.
     """
     lon, lat = galactic(ra, dec)
     return np.asarray(hp.get_interp_val(sky_map, lon, lat, lonlat=True), float)
 
 
 def a_v_at(to_infinity: Float, distance: Float, b: npt.ArrayLike, dust: Layer, sin_b_min: float) -> Float:
-    """A(V)[n] mag on the way to a star.
+    """Return the extinction A(V) between the Sun and stars.
 
-    to_infinity : [n] mag; distance : [n] pc; b : Galactic latitude, deg; sin_b_min : as in the map
-    dust        : the layer that the dust lies in
+    Parameters
+    ----------
+    to_infinity : float array, shape (n,)
+        A(V) to infinity in mag.
+    distance : float array, shape (n,)
+        Distance of each star in pc.
+    b : float array, shape (n,)
+        Galactic latitude in deg.
+    dust : Layer
+        The dust layer.
+    sin_b_min : float
+        Lower limit of |sin b|, the same as in the map.
+
+    Returns
+    -------
+    float array, shape (n,)
+        A(V) in mag.
+
+    Notes
+    -----
+    The dust density falls exponentially with height above the plane, so that::
+
+        A(d) = A(infinity) (1 - exp(-d |sin b| / height))
     """
     sin_b = np.maximum(np.abs(np.sin(np.radians(np.asarray(b, float)))), sin_b_min)
     return np.asarray(-to_infinity * np.expm1(-distance * sin_b / dust.height))
 
 
 def load(seed: int) -> Float32:
-    """The embedded map of a seed, from the cache or made now (1 s).
+    """Return the embedded map of a seed, from the cache or made now (1 s).
 
-    returns : float32[pixel] A(V) mag, RING, Galactic
+    The map is A(V) in mag, float32, RING ordering, Galactic coordinates.
     """
     model = cosecant()
     key = content_key(code_key(__name__), version("healpy"), seed, *astuple(model))
@@ -109,7 +136,10 @@ def load(seed: int) -> Float32:
 
 
 def facts(user_map: DustMap | None) -> dict[str, Any]:
-    """Empty without a file; BadInput where it is not there."""
+    """Return the facts that identify the user's dust map in a plan, {} without a map.
+
+    Raises BadInput if the file does not exist.
+    """
     if user_map is None:
         return {}
     user_files.check_file(user_map.file, "map of dust", "ingest.dust.file")
@@ -118,9 +148,19 @@ def facts(user_map: DustMap | None) -> dict[str, Any]:
 
 
 def map_for_request(seed: int, user_map: DustMap | None) -> Float32:
-    """Map of A(V), RING and Galactic, of a request's file (from the cache or read now), or the embedded one.
+    """Return the map of A(V) for a request: the user's map (from the cache or read now), or the embedded one.
 
-    returns : float32[pixel] mag
+    Parameters
+    ----------
+    seed : int
+        Seed of the request.
+    user_map : DustMap or None
+        The user's dust map; None for the embedded map.
+
+    Returns
+    -------
+    float32 array, shape (pixels,)
+        A(V) in mag, RING ordering, Galactic coordinates.
     """
     if user_map is None:
         return load(seed)
@@ -129,10 +169,22 @@ def map_for_request(seed: int, user_map: DustMap | None) -> Float32:
 
 
 def read(user_map: DustMap) -> Float32:
-    """An external map in the form of the embedded one: A(V), RING, Galactic, not finer than the embedded one.
+    """Read a user's map and convert it to A(V), RING ordering and Galactic coordinates.
 
-    returns : float32[pixel] mag
-    Errors: BadInput names the file, and what is missing or wrong: ordering, coordinates, or the row of a pixel
+    Parameters
+    ----------
+    user_map : DustMap
+        The user's dust map.
+
+    Returns
+    -------
+    float32 array, shape (pixels,)
+        A(V) in mag. The resolution is at most that of the embedded map.
+
+    Raises
+    ------
+    BadInput
+        If the size, the ordering, the coordinates or the value of a pixel is missing or wrong.
     """
     values, cards = read_map(user_map.file, user_map.column)
     where = f"{user_map.file}: column {user_map.column}"
@@ -143,17 +195,18 @@ def read(user_map: DustMap) -> Float32:
         user_map, "COORDSYS", "coordinates", cards, {"G": "G", "GALACTIC": "G", "C": "C", "Q": "C"}
     )
     if not values.size or not hp.isnpixok(values.size):
-        raise BadInput(f"{where}: {values.size} pixels are not those of a HEALPix map of the whole sky")
+        raise BadInput(f"{where}: {values.size} pixels, but a full-sky HEALPix map has 12 nside^2")
     nside = hp.npix2nside(values.size)
     if cards.get("NSIDE", nside) != nside:
-        raise BadInput(f"{where}: NSIDE is {cards['NSIDE']}, {values.size} pixels are of {nside}")
+        raise BadInput(f"{where}: header says NSIDE = {cards['NSIDE']}, but {values.size} pixels mean NSIDE = {nside}")
     model = cosecant()
     to_a_v = model.r_v if user_map.quantity == "ebv" else 1.0
     bad = ~((values >= 0.0) & (values * to_a_v <= _MAX_A_V))
     if bad.any():
         row = int(bad.argmax())
         raise BadInput(
-            f"{where} of row {row + 1} is {values[row]:g} ({bad.sum()} rows like it), no {user_map.quantity}"
+            f"{where} of row {row + 1} is {values[row]:g} ({bad.sum()} bad rows): {user_map.quantity} must be from 0 "
+            f"to {_MAX_A_V / to_a_v:g} mag"
         )
     _refuse_other_ordering(where, values, ordering)
     ring = hp.reorder(values, n2r=True) if ordering == "NESTED" else values
@@ -168,21 +221,19 @@ def read(user_map: DustMap) -> Float32:
 def _header_or_request(
     user_map: DustMap, card: str, key: str, cards: Mapping[str, Any], names: Mapping[str, str]
 ) -> str:
-    """What header and request say; one of them is enough."""
+    """Return the value in the header or in the request; at least one must be present, and both must agree."""
     header_value, requested = str(cards.get(card, "")).strip().upper(), getattr(user_map, key)
     if header_value and header_value not in names:
         raise BadInput(f"{user_map.file}: {card} is {header_value!r}, not one of {', '.join(names)}")
     if header_value and requested and names[header_value] != requested:
-        raise BadInput(f"{user_map.file}: {card} is {header_value!r}, ingest.dust.{key} says {requested!r}")
+        raise BadInput(f"{user_map.file}: {card} is {header_value!r}, but ingest.dust.{key} is {requested!r}")
     if not header_value and not requested:
-        raise BadInput(
-            f"{user_map.file}: column {user_map.column}: no {card} in its header: name it by ingest.dust.{key}"
-        )
+        raise BadInput(f"{user_map.file}: column {user_map.column}: the header has no {card}: set ingest.dust.{key}")
     return names[header_value] if header_value else str(requested)
 
 
 def _refuse_other_ordering(where: str, values: Float, ordering: str) -> None:
-    """Dust is smooth: where neighbours differ much less in the other ordering, that is the map's own."""
+    """Raise BadInput if neighbouring pixels differ much less in the other ordering, because dust maps are smooth."""
     nside = hp.npix2nside(values.size)
     pixel = np.unique(np.linspace(0, values.size - 1, 20_000).astype(np.int64))
     step = {}
@@ -191,12 +242,14 @@ def _refuse_other_ordering(where: str, values: Float, ordering: str) -> None:
         step[name] = np.mean(np.abs(np.where(neighbours >= 0, values[neighbours] - values[pixel], 0.0)))
     other = "RING" if ordering == "NESTED" else "NESTED"
     if step[other] < _SMOOTHNESS_RATIO * step[ordering]:
-        raise BadInput(f"{where}: ORDERING is said to be {ordering}, but the map is smooth in {other} only")
+        raise BadInput(
+            f"{where}: ORDERING is {ordering} in the header or request, but the map is smooth only as {other}"
+        )
 
 
 def _gaussian_field(seed: int, model: Cosecant) -> Float:
     ell, m = hp.Alm.getlm(model.l_max)
-    # healpy's synalm draws from numpy's global generator.
+    # Draw here, because healpy's synalm uses numpy's global generator.
     normal = stream(seed, "dust_map").standard_normal((2, ell.size))
     used = ell >= model.l_min
     amplitude = np.where(used, np.where(used, ell, 1.0) ** (-0.5 * model.slope), 0.0)

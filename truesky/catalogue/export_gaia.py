@@ -1,7 +1,7 @@
-"""Write the table `gaia` for others: python -m truesky.catalogue.export_gaia --lake LAKE --out FILE
+"""Export the table `gaia`: python -m truesky.catalogue.export_gaia --lake LAKE --out FILE.
 
-table  CSV or FITS under the names of Gaia's archive, --release dr3 with DR3's columns in its order
-ldac   FITS_LDAC as SCAMP reads it (ASTREF_CATALOG FILE), with its own names of columns
+table  CSV or FITS with the column names of Gaia's archive; --release dr3 uses DR3's columns in DR3's order
+ldac   FITS_LDAC for SCAMP (ASTREF_CATALOG FILE), with the column names that SCAMP expects
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _MAS = np.pi / 180.0 / 3.6e6
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit status: 0 done, 1 something is wrong with the lake, 2 the call is wrong."""
+    """Run the command and return its exit status: 0 success, 1 a problem in the lake, 2 wrong arguments."""
     parser = argparse.ArgumentParser(
         prog="export_gaia",
         description=__doc__,
@@ -40,12 +40,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--lake", required=True, help="folder of the lake")
-    parser.add_argument("--name", help="of the request whose stars are meant, where the lake has several")
-    parser.add_argument("--out", required=True, type=Path, help="file to write: .csv or .fits; ldac .fits, .cat, .ldac")
+    parser.add_argument("--name", help="name of the request to export, if the lake contains several")
+    parser.add_argument(
+        "--out", required=True, type=Path, help="file to write: .csv or .fits; for ldac .fits, .cat or .ldac"
+    )
     parser.add_argument("--form", default="table", choices=FORMS)
-    parser.add_argument("--release", default="dr2", choices=RELEASES, help="whose columns; the values are those of DR2")
-    parser.add_argument("--epoch", type=float, help="year to which stars are carried by their measured motions: "
-                        "for programs that take references where they are")  # fmt: skip
+    parser.add_argument(
+        "--release", default="dr2", choices=RELEASES, help="release with the column names; the values are always of DR2"
+    )
+    parser.add_argument("--epoch", type=float, help="year to which positions are moved with the measured proper "
+                        "motions, for programs that ignore proper motions")  # fmt: skip
     options = parser.parse_args(argv)
 
     def run_export() -> int:
@@ -61,16 +65,33 @@ def export(
     lake: Path, path: Path, declared: Table = EXPORT, form: str = "table", epoch: float | None = None,
     request: str | None = None,
 ) -> int:  # fmt: skip
-    """Write the published table `gaia` to a file, replaced in one rename; returns its rows.
+    """Write the published table `gaia` to a file, which is replaced atomically.
 
-    lake     : root of the lake
-    path     : of the file, with an ending of its form
-    declared : the columns of form "table"
-    form     : "table" or "ldac"
-    epoch    : year to which stars are carried by their proper motions, None = that of the catalogue
-    request  : whose stars, where a lake has those of several
-    Errors   : BadInput for another ending than those of FORMS, an epoch that no proper motion reaches, and where the
-               table is one without proper motions
+    Parameters
+    ----------
+    lake : Path
+        Folder of the lake.
+    path : Path
+        File to write; the ending must be one of its form in FORMS.
+    declared : Table
+        Columns of the form "table".
+    form : str
+        "table" or "ldac".
+    epoch : float, optional
+        Year from 1900 to 2100 to which the proper motions move the positions; None for the epoch of the catalogue.
+    request : str, optional
+        Name of the request to export, if the lake contains several.
+
+    Returns
+    -------
+    int
+        Number of rows written.
+
+    Raises
+    ------
+    BadInput
+        If the ending of the file does not fit the form, the epoch is outside its range, or the table has no proper
+        motions.
     """
     user_files.check_target(path, FORMS[form])
     if epoch is not None and not 1900.0 <= epoch <= 2100.0:
@@ -96,10 +117,10 @@ def _select_columns(rows: pa.Table, declared: Table) -> pa.Table:
 
 
 def _release_columns(version: read.Version, partition: str, epoch: float | None) -> pa.Table:
-    """Rows of a part with every column that any release has."""
+    """Return the rows of a partition with all columns of all releases."""
     rows = version.rows(partitions=[partition])
     if rows.num_rows and rows["ruwe"].null_count:
-        raise BadInput("table gaia has no proper motions: it was built before it had them; run build_gaia again")
+        raise BadInput("table gaia has no proper motions: it was built by an older version; run build_gaia again")
     columns: dict[str, Any] = {name: rows[name] for name in rows.column_names}
     columns |= {"source_id": rows["id"], "bp_rp": pc.subtract(rows["phot_bp_mean_mag"], rows["phot_rp_mean_mag"])}
     catalogue_epoch = parameters.section("gaia.toml", "astrometry")["epoch"]
@@ -123,7 +144,7 @@ def _release_columns(version: read.Version, partition: str, epoch: float | None)
 
 
 def _correlations(has_motion: pa.ChunkedArray) -> dict[str, Any]:
-    """Errors are drawn one by one: where all five parameters are known their correlations are 0."""
+    """Return the correlations of the parameters: 0, because errors are drawn independently, or null if unknown."""
     zero = pc.if_else(has_motion, pa.scalar(0.0, pa.float32()), pa.scalar(None, pa.float32()))
     pairs = [(first, second) for i, first in enumerate(PARAMETERS) for second in PARAMETERS[i + 1 :]]
     position = pa.array(np.zeros(len(has_motion), np.float32))
@@ -131,7 +152,7 @@ def _correlations(has_motion: pa.ChunkedArray) -> dict[str, Any]:
 
 
 def _advance_positions(rows: pa.Table, years: float) -> tuple[Any, Any]:
-    """Positions to which the proper motions lead in so many years."""
+    """Return positions after `years` of proper motion."""
     east, north = (_MAS * years * pc.fill_null(rows[name], 0.0).to_numpy() for name in ("pmra", "pmdec"))
     return sky.offset_positions(rows["ra"].to_numpy(), rows["dec"].to_numpy(), east, north)
 

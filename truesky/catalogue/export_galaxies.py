@@ -1,10 +1,10 @@
-"""Write the table `galaxies` in a format of other programs.
+"""Export the table `galaxies` in formats that other programs read.
 
 python -m truesky.catalogue.export_galaxies --lake LAKE --out FOLDER --form FORM
 
-fits         a binary table for each Nside-32 cell (nested), every column, units (TUNIT) and UCDs (TUCD)
-skycatalogs  LSST DESC skyCatalogs 2: galaxies, and stars where the lake has them, with spectra and LSST fluxes;
-             skyCatalog.yaml is what it opens (docs/exports.md)
+fits         one binary table per Nside-32 cell (nested) with all columns, units (TUNIT) and UCDs (TUCD)
+skycatalogs  LSST DESC skyCatalogs 2: galaxies, and stars if the lake contains them, with spectra and LSST fluxes;
+             open skyCatalog.yaml with skyCatalogs (docs/exports.md)
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ FORMS = ("fits", "skycatalogs")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit status: 0 done, 1 something is wrong with the lake, 2 the call is wrong."""
+    """Run the command and return its exit status: 0 success, 1 a problem in the lake, 2 wrong arguments."""
     parser = argparse.ArgumentParser(
         prog="export_galaxies",
         description=__doc__,
@@ -31,9 +31,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--lake", required=True, help="folder of the lake")
-    parser.add_argument("--out", required=True, type=Path, help="folder to write to (made where it is not there)")
+    parser.add_argument(
+        "--out", required=True, type=Path, help="folder to write to; it is created if it does not exist"
+    )
     parser.add_argument("--form", required=True, choices=FORMS)
-    parser.add_argument("--name", help="of the request whose tables are meant, where the lake has several")
+    parser.add_argument("--name", help="name of the request to export, if the lake contains several")
     options = parser.parse_args(argv)
     return command.run("export_galaxies", lambda: _run_export(options))
 
@@ -46,10 +48,23 @@ def _run_export(options: argparse.Namespace) -> int:
 
 
 def export(lake: Path, folder: Path, form: str, request: str | None = None) -> list[Path]:
-    """Write the published galaxies, a file a cell, each replaced in one rename; returns the files.
+    """Write the published galaxies, one file per partition; each file is replaced atomically.
 
-    lake : folder of the lake;  folder : to write to;  form : one of FORMS
-    request : whose galaxies, where a lake has those of several
+    Parameters
+    ----------
+    lake : Path
+        Folder of the lake.
+    folder : Path
+        Folder to write to; it is created if it does not exist.
+    form : str
+        Format, one of FORMS.
+    request : str, optional
+        Name of the request to export, if the lake contains several.
+
+    Returns
+    -------
+    list of Path
+        Files written.
     """
     if form == "skycatalogs":
         return skycatalogs.write(lake, folder, request)

@@ -1,11 +1,8 @@
-"""The sources of a request that names them all: small tables, at places of their own or on a grid.
+"""Sources of a request that lists every source: small tables, with positions in the table or on a grid.
 
-load      all of them, checked
-galaxies  rows of table `galaxies` of a generation cell, as for a catalogue of others
-stars     what stands for the Milky Way
-
-A table is CSV with a line of titles; a column that is not there has the value of GALAXIES or STARS. mag is AB, in the
-request's band, before magnification and the Milky Way's dust a_v. Emission lines are not added.
+A table is a CSV file with a line of column names. A column that is absent has its default in GALAXIES or STARS. `mag`
+is an AB magnitude in the band of the request, before magnification and before the Milky Way's extinction `a_v`.
+Emission lines are not added.
 """
 
 from __future__ import annotations
@@ -38,7 +35,7 @@ from truesky.request.files import SOURCES_KIND, UserSources
 from truesky.request.schema import MAX_SHEAR
 
 _POSITION = ("ra", "dec")
-# What a column holds that is not there; None = it has to be there. Units and frames are those of table `galaxies`.
+# Default of each column if it is absent; None if it is required. Units and frames are the same as in table `galaxies`.
 GALAXIES: Mapping[str, float | None] = {
     "mag": None, "z_true": 0.2, "sed": 15.0, "ext_law": 0.0, "ebv": 0.0, "bulge_fraction": 0.0,
     "bulge_half_light_radius": 0.3, "disk_half_light_radius": 0.3, "bulge_sersic_index": 4.0, "bulge_axis_ratio": 1.0,
@@ -47,27 +44,50 @@ GALAXIES: Mapping[str, float | None] = {
 }  # fmt: skip
 STARS: Mapping[str, float | None] = {"mag": None, "teff": 5800.0, "a_v": 0.0}
 _GALAXY_BOUNDS = {**GALAXY_BOUNDS, "sed": (0.0, 30.0), "stamp": (-1.0, GALAXY_BOUNDS["stamp"][1])}
-# Columns of whole numbers.
+# Columns with integers.
 _INTEGER_COLUMNS = ("ext_law", "stamp")
 _STAR_BOUNDS = {**KEYS, "mag": GALAXY_BOUNDS["mag"]}
-# Of a grid, on the square about the area.
+# Largest number of grid positions in the square around the area.
 _MAX_GRID_POSITIONS = 4_000_000
-# Each galaxy says how much there is before it.
+# The dust map adds nothing, because each galaxy has its own extinction `a_v`.
 _NO_DUST: Float32 = np.zeros(12, np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SourceColumns:
-    """Sources by column, [n] each, ascending in index (order-29 cell); origin_id : row of the table, from 1."""
+    """Columns of the sources, sorted by `index`.
+
+    Attributes
+    ----------
+    galaxies, stars : mapping of str to array, shape (n,)
+        Columns by name; `index` is the order-29 cell and `origin_id` the row number of the user's table, from 1.
+    """
 
     galaxies: Mapping[str, Array]
     stars: Mapping[str, Array]
 
 
 def load(source_tables: UserSources, area: Area, planned: Json | None = None) -> SourceColumns:
-    """The sources, from their files; BadInput names the file, and the column and the row that is wrong.
+    """Read and check the user's tables of sources.
 
-    planned : facts of the plan that they are read for
+    Parameters
+    ----------
+    source_tables : UserSources
+        The user's tables of sources.
+    area : Area
+        Area of the request, which must contain all sources.
+    planned : dict, optional
+        Facts of the plan, with which the files must still agree.
+
+    Returns
+    -------
+    SourceColumns
+        The sources.
+
+    Raises
+    ------
+    BadInput
+        If a file has changed or is wrong; the message names the file, the column and the row.
     """
     if planned is not None and canonical(source_tables.facts(area.bounding_circle())) != canonical(planned):
         raise BadInput("sources: a table has changed since the job began")
@@ -87,7 +107,7 @@ def load(source_tables: UserSources, area: Area, planned: Json | None = None) ->
         outside = ~np.isin(cell, area.cells(GENERATION_ORDER))
         if outside.any():
             row = values["origin_id"][outside.argmax()]
-            raise BadInput(f"{file}: ra, dec of row {row} are not in the request's area")
+            raise BadInput(f"{file}: ra, dec of row {row} must be in the request's area")
         values["index"] = sky.healpix_29(values["ra"], values["dec"])
     return SourceColumns(*(_sort_by_cell(values) for values in tables.values()))
 
@@ -95,11 +115,25 @@ def load(source_tables: UserSources, area: Area, planned: Json | None = None) ->
 def model(
     seed: int, source_tables: UserSources, sources: SourceColumns, lens: lensing.Shear | None, rotation: float
 ) -> IngestModel:
-    """What `galaxies` takes.
+    """Return the model with which `galaxies` draws.
 
-    seed, own      : of the request
-    given          : of `load`
-    lens, rotation : in place of the rows' lensing, None = as they say; deg, added to position angles
+    Parameters
+    ----------
+    seed : int
+        Seed of the request.
+    source_tables : UserSources
+        The user's tables of sources.
+    sources : SourceColumns
+        The sources, from `load`.
+    lens : lensing.Shear or None
+        Uniform lensing that replaces that of the rows; None to use the rows.
+    rotation : float
+        Angle that is added to the position angles, deg.
+
+    Returns
+    -------
+    IngestModel
+        The model.
     """
     columns = Columns({"mag": Field(column="mag")}, GALAXY_BOUNDS, band=source_tables.band)
     maxima = [float(sources.galaxies[name].max(initial=0.0)) for name in ("z_true", "ebv")]
@@ -107,14 +141,29 @@ def model(
 
 
 def galaxies(cell: int, sources: SourceColumns, universe: IngestModel) -> pa.Table:
-    """Table `galaxies` of one generation cell."""
+    """Return the rows of table `galaxies` in one generation cell.
+
+    Parameters
+    ----------
+    cell : int
+        Nested index of an order-8 cell.
+    sources : SourceColumns
+        The sources, from `load`.
+    universe : IngestModel
+        The model, from `model`.
+
+    Returns
+    -------
+    Table
+        Rows of table `galaxies`.
+    """
     first, last = np.searchsorted(sources.galaxies["index"], sky.cell_range(GENERATION_ORDER, cell))
     rows = {name: values[first:last] for name, values in sources.galaxies.items()}
     return from_catalogue.draw(cell, {**rows, "flux_halpha": np.full(last - first, np.nan)}, universe, _NO_DUST)
 
 
 def stars(sources: SourceColumns, band: str) -> StarCatalogue:
-    """The stars with their H, of the spectrum of the nearest temperature."""
+    """Return the stars with their H magnitudes, computed with the template of the nearest temperature."""
     library, values = templates.stellar_library(), dict(sources.stars)
     temperatures = stellar.types().teff
     zeros = np.zeros(temperatures.size)
@@ -127,13 +176,15 @@ def stars(sources: SourceColumns, band: str) -> StarCatalogue:
 def _read(
     file: Path | None, defaults: Mapping[str, float | None], bounds: Mapping[str, tuple[float, float]]
 ) -> dict[str, Array]:
-    """The columns of a table that are known, with those that it lacks; of no table: none of each."""
+    """Return the columns of a table with defaults for absent ones; all columns are empty without a file."""
     if file is None:
         return {name: np.zeros(0) for name in defaults} | {"origin_id": np.zeros(0, np.int64)}
     titles = external_rows.csv_column_names(file, SOURCES_KIND)
     for title in titles:
         if title not in defaults:
-            raise BadInput(f"{user_files.format_path(file)}: column {title} is none of {', '.join(defaults)}")
+            raise BadInput(
+                f"{user_files.format_path(file)}: unknown column {title}, must be one of {', '.join(defaults)}"
+            )
     for name, value in defaults.items():
         if value is None and name not in titles:
             raise BadInput(f"{user_files.format_path(file)}: column {name} is missing")
@@ -141,7 +192,7 @@ def _read(
     columns = {title: np.concatenate([np.zeros(0), *(piece.columns[title] for piece in pieces)]) for title in titles}
     n = len(columns["mag"])
     if n == 0:
-        raise BadInput(f"{user_files.format_path(file)}: holds no source")
+        raise BadInput(f"{user_files.format_path(file)}: the table has no rows")
     for title, values in columns.items():
         external_rows.check_bounds(file, title, values, bounds[title])
     for title in _INTEGER_COLUMNS:
@@ -155,7 +206,7 @@ def _read(
 
 
 def _refuse_caustics(file: Path | None, values: Mapping[str, Array]) -> None:
-    """What is no ellipse would be left out of the images, or be less sheared than it says."""
+    """Raise BadInput for galaxies near a caustic: the images could not show the requested shear."""
     kappa, gamma1, gamma2 = (values[name] for name in ("kappa", "gamma1", "gamma2"))
     bad = lensing.is_near_caustic(kappa, gamma1, gamma2, lensing.settings().caustic)
     bad |= np.hypot(gamma1, gamma2) > MAX_SHEAR * np.abs(1.0 - kappa)
@@ -167,7 +218,7 @@ def _refuse_caustics(file: Path | None, values: Mapping[str, Array]) -> None:
 
 
 def _on_grid(tables: Mapping[str, dict[str, Array]], area: Area, spacing: float) -> dict[str, dict[str, Array]]:
-    """The rows of all tables in turn at the places of a grid."""
+    """Place the rows of all tables in turn on the positions of a grid."""
     ra, dec = _grid(area, spacing)
     first_rows = np.cumsum([0, *(len(values["mag"]) for values in tables.values())])
     row_number = np.arange(ra.size) % first_rows[-1]
@@ -180,19 +231,19 @@ def _on_grid(tables: Mapping[str, dict[str, Array]], area: Area, spacing: float)
 
 
 def _grid(area: Area, spacing: float) -> tuple[Float, Float]:
-    """Places in an area, `spacing` arcsec apart to the east and north of its middle, from the south, west to east."""
+    """Return grid positions in an area, `spacing` arcsec apart, from south to north and from west to east."""
     ra, dec, radius = area.bounding_circle()
     half = int(radius * 3600.0 / spacing)
     if (2 * half + 1) ** 2 > _MAX_GRID_POSITIONS:
         raise BadInput(
-            f"sources.spacing = {spacing:g}: the square about the area has more than {_MAX_GRID_POSITIONS} places"
+            f"sources.spacing = {spacing:g}: the grid around the area must have at most {_MAX_GRID_POSITIONS} positions"
         )
     steps = np.radians(np.arange(-half, half + 1) * spacing / 3600.0)
     north, east = (axis.ravel() for axis in np.meshgrid(steps, steps, indexing="ij"))
     places = lensing.displace(np.full(east.size, ra), np.full(east.size, dec), east, north)
     inside = area.contains(*places)
     if not inside.any():
-        raise BadInput("sources: no place of the grid lies in the area")
+        raise BadInput("sources: no position of the grid is in the area")
     return places[0][inside], places[1][inside]
 
 

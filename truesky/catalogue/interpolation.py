@@ -1,4 +1,4 @@
-"""Places of values between the nodes of a table, for linear interpolation."""
+"""Indices and weights for linear interpolation between the nodes of a table."""
 
 from __future__ import annotations
 
@@ -8,10 +8,23 @@ from lake_schema.arrays import Float, Int
 
 
 def bracket(nodes: Float, values: Float, extrapolated: bool = False) -> tuple[Int, Float]:
-    """(index of the node below, weight of the node above) of each value.
+    """Find the nodes around each value, and the weight of the upper one.
 
-    nodes        : float64[m] ascending;  values : float64[...]
-    extrapolated : whether weights go below 0 and above 1 beyond the nodes; else the outermost nodes hold there
+    Parameters
+    ----------
+    nodes : float array, shape (m,)
+        Nodes in ascending order, m >= 2.
+    values : float array
+        Values, of any shape.
+    extrapolated : bool
+        If True, weights are below 0 and above 1 beyond the nodes; otherwise they are limited to 0 to 1.
+
+    Returns
+    -------
+    index : int array
+        Index of the node below each value, 0 to m - 2.
+    weight : float array
+        Weight of the node above each value.
     """
     index = np.clip(np.searchsorted(nodes, values, side="right") - 1, 0, nodes.size - 2)
     weight = (values - nodes[index]) / (nodes[index + 1] - nodes[index])

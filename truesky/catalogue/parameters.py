@@ -1,4 +1,4 @@
-"""Numbers of the models, read from the data files beside the modules; each of their tables has a source."""
+"""Parameters of the models, read from the TOML files in this folder; each table in them has a source."""
 
 from __future__ import annotations
 
@@ -13,20 +13,35 @@ _FOLDER = Path(__file__).resolve().parent
 
 
 def section(file: str, name: str) -> dict[str, Any]:
-    """One table of a TOML file of this folder, without its `source`: the arguments of a dataclass.
+    """Return a table of a TOML file in this folder without its `source`, as arguments of a dataclass.
 
-    Errors: BadInput where the table is absent or has no source
+    Parameters
+    ----------
+    file : str
+        Name of the file.
+    name : str
+        Name of the table.
+
+    Returns
+    -------
+    dict
+        Values by key; arrays become tuples.
+
+    Raises
+    ------
+    BadInput
+        If the table does not exist or has no `source`.
     """
     tables = _tables((_FOLDER / file).read_text(encoding="utf-8"))
     if name not in tables:
         raise BadInput(f"{file} has no table [{name}]")
     numbers = dict(tables[name])
     if not str(numbers.pop("source", "")).strip():
-        raise BadInput(f"{file}: table [{name}] states no source")
+        raise BadInput(f"{file}: table [{name}] must have a key source")
     return {key: tuple(value) if isinstance(value, list) else value for key, value in numbers.items()}
 
 
 @cache
 def _tables(text: str) -> dict[str, Any]:
-    """The tables of a file's text: a model reads dozens of tables from a few files."""
+    """Parse a file's text; cached, because a model reads dozens of tables from a few files."""
     return user_files.parse_toml(text)

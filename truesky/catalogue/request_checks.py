@@ -1,9 +1,4 @@
-"""What the catalogues' jobs would refuse of a request, before any of them computes anything.
-
-refuse         whatever is wrong with the files, bands and places of the galaxies and stars that a request wants
-star_files     what the files of stars hold, as facts of a plan
-star_model     what a request's stars are drawn from
-"""
+"""Checks of a request's catalogue inputs before a job computes anything."""
 
 from __future__ import annotations
 
@@ -24,9 +19,10 @@ from truesky.request.schema import Request, Stars
 
 
 def check_request(request: Request) -> None:
-    """BadInput names the key, or the file and its column or row.
+    """Check the files, bands and positions of the galaxies and stars of a request.
 
-    Of a large catalogue the first rows are read; the job that splits it into cells reads all of them.
+    Raises BadInput with the key, or with the file and its column or row. Only the first rows of a large catalogue are
+    read here; the job that splits the catalogue into cells reads all rows.
     """
     user_inputs = request.ingest
     if user_inputs.dust is not None:
@@ -49,7 +45,7 @@ def check_request(request: Request) -> None:
 
 
 def check_band(request: Request) -> None:
-    """The band of the faintest galaxies must be one of the embedded ones."""
+    """Raise BadInput if the band of the galaxy limit is not an embedded passband."""
     if request.ingest.galaxies is None and request.universe.galaxy_band not in passbands.names():
         band_names = ", ".join(passbands.names())
         raise BadInput(f"universe.galaxy_band = {request.universe.galaxy_band!r} is not one of {band_names}")
@@ -57,12 +53,12 @@ def check_band(request: Request) -> None:
 
 def _check_first_rows(files: Sequence[Path], columns: mapping.Columns) -> None:
     listed_files, _ = ingest.list_files(files, columns)
-    # Columns, units and the values of the first rows.
+    # Check the columns, the units and the values of the first rows.
     next(mapping.read(listed_files[:1], columns), None)
 
 
 def star_files(choice: Stars) -> dict[str, Any]:
-    """What the user's files hold, wherever they lie."""
+    """Return the facts that identify the user's files of stars by content, independent of their paths."""
     facts: dict[str, Any] = {}
     if choice.tycho2:
         checksums = bright_stars.sha256(choice.tycho2)
@@ -82,9 +78,21 @@ def star_files(choice: Stars) -> dict[str, Any]:
 
 
 def star_model(limit: float, choice: Stars, files: Json) -> stars.StarModel:
-    """What stars are drawn from.
+    """Return the model from which the stars are drawn.
 
-    limit : faintest H (Vega);  files : as of `star_files`, whose contents the files must still have
+    Parameters
+    ----------
+    limit : float
+        Faintest H magnitude (Vega).
+    choice : Stars
+        Section `stars` of the request.
+    files : dict
+        Facts from `star_files`, with which the files must still agree.
+
+    Returns
+    -------
+    stars.StarModel
+        The model.
     """
     catalogue = bright = None
     if choice.catalogue:

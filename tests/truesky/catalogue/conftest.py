@@ -53,11 +53,11 @@ def box():
 
 @pytest.fixture(scope="session")
 def cells(universe):
-    """What has been drawn of the universe in this run of tests."""
+    """Cache of the cells that are drawn in this run of the tests."""
     return population.CellCache(universe.population)
 
 
-# Cells of a sky without structure, 1.7 deg2: a few degrees of a survey would be needed to tell as much.
+# Cells of a sky without structure, 1.7 deg2. A survey would need a few degrees for the same precision.
 FLAT_CELLS = 32
 
 
@@ -69,7 +69,7 @@ def flat_sky():
 # Cached as well, for the fixtures of another folder are others.
 @cache
 def draw_flat_sky():
-    """The galaxies of these cells."""
+    """Draw the galaxies of cells of a sky without structure."""
     return mean_sky.rows(mean_sky.without_clustering(made()), 0, FLAT_CELLS)
 
 
@@ -80,13 +80,13 @@ def drawn():
 
 @cache
 def draw_sky():
-    """Five blocks of four cells spread over the sky (1.05 deg2): rows, columns by name, magnitudes by band."""
+    """Draw five blocks of four cells spread over the sky (1.05 deg2): rows, columns by name, magnitudes by band."""
     universe, library = made(), templates.galaxy_library()
     cells, dust = population.CellCache(universe.population), dust_map.load(SEED)
     places = [4 * block + i for block in range(25, 3 << 16, (3 << 16) // 5) for i in range(4)]
     rows = pa.concat_tables([galaxies.draw(cell, universe, cells, dust) for cell in places])
     halos = pa.concat_tables([galaxies.halo_table(cell, universe.population, cells) for cell in places])
-    # Galaxies of the light-cone; those beyond redshift 6 have tests of their own.
+    # Keep the galaxies of the light-cone; objects beyond redshift 6 have separate tests.
     every, rows = rows, rows.filter(pa.array(rows["kind"].to_numpy() < 2))
     columns = {name: rows[name].to_numpy() for name in rows.column_names if not rows[name].null_count}
     z = columns["z_true"].astype(float)

@@ -1,4 +1,4 @@
-"""Synthetic catalogues in the forms of external ones: a few hundred galaxies each, no real data in them."""
+"""Synthetic catalogues in external formats: a few hundred galaxies each, without real data."""
 
 import numpy as np
 import pyarrow as pa
@@ -12,7 +12,7 @@ RA, DEC = 53.1, -27.8
 
 
 def columns(number=300, seed=3):
-    """Values by our key."""
+    """Return values by our keys."""
     rng = np.random.default_rng(seed)
     z = rng.uniform(0.05, 2.2, number)
     return {
@@ -65,7 +65,7 @@ def _component(rng, number):
 
 
 def theirs(form, values):
-    """(their main columns, those of the file beside): the mapping of a format, backwards."""
+    """Apply the mapping of a format backwards; return the columns of the main file and of the companion file."""
     tables = {}, {}
     for key, entry in mapping.formats()[form]["columns"].items():
         entry = {"column": entry} if isinstance(entry, str) else entry
@@ -83,7 +83,7 @@ def theirs(form, values):
 
 
 def write(folder, form, values=None):
-    """A file of a format (with what stands beside it) that says that it is synthetic."""
+    """Write a file of a format (with its companion file) that is marked as synthetic."""
     main, beside = theirs(form, columns() if values is None else values)
     about = {"comment": "synthetic fixture: no real galaxies"}
     if form == "euclid":

@@ -24,7 +24,7 @@ DUST = '[ingest.dust]\nfile = "theirs.fits"\ncolumn = "EBV"\n'
 
 
 def refused(folder, text, capsys):
-    """What a job says of a request."""
+    """Return the error message of a job for a request."""
     path, lake = requests.written(folder, text, requests.FIELD.format(0.1)), folder / "lake"
     assert submitted_job.main(build_galaxies.JOB, ["--lake", str(lake), "--request", str(path)]) in (1, 2)
     assert not list(lake.glob("*/v-*"))
@@ -91,10 +91,10 @@ def test_a_band_that_is_not_there(tmp_path, capsys):
 def test_a_map_in_the_wrong_ordering(tmp_path, capsys):
     test_dust_map.written_map(tmp_path / "theirs.fits", test_dust_map.synthetic_map(), ORDERING="NESTED")
     found = refused(tmp_path, DUST, capsys)
-    assert "theirs.fits: column EBV: ORDERING is said to be NESTED" in found
+    assert "theirs.fits: column EBV: ORDERING is NESTED in the header or request" in found
 
 
-def test_a_map_with_a_pixel_that_is_no_dust(tmp_path, capsys):
+def test_a_map_with_an_invalid_pixel(tmp_path, capsys):
     values = test_dust_map.synthetic_map()
     values[41] = np.nan
     test_dust_map.written_map(tmp_path / "theirs.fits", values)

@@ -1,4 +1,4 @@
-"""The job: files of about as many stars, whose rows do not depend on how they are cut."""
+"""The job makes files with similar numbers of stars, and the rows do not depend on the division into files."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def made(lake, **keys):
 
 @pytest.fixture(scope="module")
 def versions(tmp_path_factory):
-    """The same sky cut in three ways."""
+    """Build the same sky with three divisions into files."""
     cuts = (1_000_000, 6200, 1)
     return [made(tmp_path_factory.mktemp("lake"), stars={"rows_a_file": rows}) for rows in cuts]
 
@@ -91,11 +91,11 @@ def test_fluxes_lie_beside_their_stars(versions):
         preconditions.refuse_uncovered(mixed, {*cells, 0})
 
 
-def test_what_cannot_be_drawn_is_refused_before_anything_is_made(lake, tmp_path, capsys):
+def test_crowded_areas_are_refused_before_any_work(lake, tmp_path, capsys):
     plane = {"cone": {"ra": 266.4, "dec": -28.9, "radius": 0.1}}
     with pytest.raises(BadInput, match=r"within 5 deg of the Galactic plane"):
         build_stars.steps(lake, wanted(area=plane))
-    with pytest.raises(BadInput, match=r"ask for a brighter stars\.plane_limit"):
+    with pytest.raises(BadInput, match=r"set a brighter stars\.plane_limit"):
         build_stars.steps(lake, wanted(area=plane, stars={"plane_limit": 26.0}))
     path = requests.written(tmp_path, area="cone = { ra = 266.4, dec = -28.9, radius = 0.1 }")
     assert submitted_job.main(build_stars.JOB, ["--lake", str(tmp_path / "l"), "--request", str(path)]) == 2
@@ -103,8 +103,8 @@ def test_what_cannot_be_drawn_is_refused_before_anything_is_made(lake, tmp_path,
     assert not (tmp_path / "l").exists()
 
 
-def test_the_plane_to_a_limit_of_its_own(lake):
-    """On both sides of b = 5 deg, away from the bulge."""
+def test_the_plane_has_a_separate_limit(lake):
+    """Both sides of b = 5 deg, away from the bulge."""
     ra, dec = (float(x) for x in sky.equatorial(60.0, 5.0))
     version = made(lake, area={"cone": {"ra": ra, "dec": dec, "radius": 0.2}}, stars={"plane_limit": 12.0})
     rows = version.rows(["ra", "dec", "mag_h", "a_v"])

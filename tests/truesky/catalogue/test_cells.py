@@ -33,7 +33,7 @@ def test_every_cell_lies_in_one_file_of_the_lowest_order_that_can_hold_it(genera
 
 
 def test_files_are_those_that_hats_would_plan(rng):
-    """A sky whose plane is crowded; hats puts each cell of the highest order into a file of its own making."""
+    """A sky with a crowded plane. hats puts each cell of the highest order into a separate file."""
     # It takes seconds to load, in each process of tests.
     from hats.pixel_math.partition_stats import generate_alignment
 

@@ -83,7 +83,7 @@ def test_extinction_grows_with_distance(total, distance, times, b):
 
 
 def synthetic_map(nside=64, frame="G"):
-    """E(B-V) that grows towards (l, b) = (40, 30) deg; made up."""
+    """Return a synthetic E(B-V) that increases towards (l, b) = (40, 30) deg."""
     lon, lat = hp.pix2ang(nside, np.arange(hp.nside2npix(nside)), lonlat=True)
     if frame == "C":
         lon, lat = sky.galactic(lon, lat)
@@ -103,7 +103,7 @@ def written_map(path, values, nest=False, coord="G", **cards):
 
 @pytest.mark.parametrize("nest", [False, True])
 @pytest.mark.parametrize("coord", ["G", "C"])
-def test_a_map_of_others_is_read_in_its_ordering_and_coordinates(tmp_path, nest, coord):
+def test_an_external_map_is_read_in_its_ordering_and_coordinates(tmp_path, nest, coord):
     values = synthetic_map(frame=coord)
     given = written_map(tmp_path / "map.fits", hp.reorder(values, r2n=True) if nest else values, nest, coord)
     ra, dec = sky.equatorial(np.array([40.0, 60.0, 200.0]), np.array([30.0, 40.0, -70.0]))
@@ -122,24 +122,24 @@ def test_a_fine_map_is_averaged(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("cards", "more", "said"),
     [
-        ({"ORDERING": "NESTED"}, {}, "smooth in RING only"),
+        ({"ORDERING": "NESTED"}, {}, "smooth only as RING"),
         ({"ORDERING": "ROUND"}, {}, "ORDERING is 'ROUND'"),
         ({"ORDERING": None}, {}, "no ORDERING"),
         ({"COORDSYS": None}, {}, "no COORDSYS"),
         ({"COORDSYS": "E"}, {}, "COORDSYS is 'E'"),
-        ({}, {"ordering": "NESTED"}, "ORDERING is 'RING', ingest.dust.ordering says 'NESTED'"),
-        ({"NSIDE": 32}, {}, "NSIDE is 32"),
+        ({}, {"ordering": "NESTED"}, "ORDERING is 'RING', but ingest.dust.ordering is 'NESTED'"),
+        ({"NSIDE": 32}, {}, "header says NSIDE = 32"),
         ({}, {"column": "TAU"}, "no column TAU"),
     ],
 )
-def test_a_map_that_is_not_what_it_says(tmp_path, cards, more, said):
+def test_a_map_with_a_wrong_header(tmp_path, cards, more, said):
     given = written_map(tmp_path / "map.fits", synthetic_map(), **cards)
     with pytest.raises(BadInput, match=said):
         dust_map.read(dataclasses.replace(given, **more))
 
 
 @pytest.mark.parametrize("value", [np.nan, -1.6375e30, -0.1, 500.0])
-def test_a_pixel_that_is_no_dust_is_named(tmp_path, value):
+def test_an_invalid_pixel_is_named(tmp_path, value):
     values = synthetic_map()
     values[1234] = value
     with pytest.raises(BadInput, match=r"map\.fits: column EBV of row 1235 is"):

@@ -1,4 +1,4 @@
-"""Tables of the only sources that there are: what they say is in the catalogue, what is wrong in them is named."""
+"""Tables that list all sources of a request: the catalogue contains their values, and errors name their rows."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def asked(folder, more='only = "table"', galaxies=TWO, stars=STAR, extra="", rad
 
 
 def made(folder, *args, **keys):
-    """Tables `galaxies` and `stars` of a request."""
+    """Return tables `galaxies` and `stars` of a request."""
     wanted, lake = asked(folder, *args, **keys), folder / "lake"
     lake.mkdir(exist_ok=True)
     for module in (build_galaxies, build_stars):
@@ -70,7 +70,7 @@ def test_the_tables_are_the_catalogue(tmp_path):
     assert stars == pytest.approx([18.0], abs=1e-4)
 
 
-def test_keys_of_an_experiment_act_on_them(tmp_path):
+def test_lensing_and_rotation_apply_to_given_galaxies(tmp_path):
     keys = "[universe]\nlensing = { g1 = 0.0, g2 = 0.1 }\nrotation = 90.0"
     rows, points = made(tmp_path, stars=None, extra=keys)
     assert rows.sort_by("origin_id")["position_angle"].to_pylist() == [120.0, 50.0]
@@ -97,9 +97,9 @@ BAD = [
     ({"galaxies": TWO.replace("24.5", "")}, r"galaxies.csv: mag of row 2 is nan"),
     ({"galaxies": TWO.replace("24.5", "faint")}, r"galaxies.csv: .*faint"),
     ({"galaxies": TWO.replace("-27.81", "-97.81")}, r"galaxies.csv: dec of row 2 is -97.81"),
-    ({"galaxies": TWO.replace("53.11", "63.11")}, r"galaxies.csv: ra, dec of row 2 are not in the request's area"),
+    ({"galaxies": TWO.replace("53.11", "63.11")}, r"galaxies.csv: ra, dec of row 2 must be in the request's area"),
     ({"galaxies": TWO.replace("-0.02", "-0.95")}, r"galaxies.csv: kappa, gamma1, gamma2 of row 2 are near a caustic"),
-    ({"galaxies": TWO.replace("gamma1", "shear")}, r"galaxies.csv: column shear is none of ra, dec, mag"),
+    ({"galaxies": TWO.replace("gamma1", "shear")}, r"galaxies.csv: unknown column shear, must be one of ra, dec, mag"),
     ({"galaxies": TWO.replace("gamma1", "mag")}, r"galaxies.csv: has column mag more than once"),
     (
         {"galaxies": TWO.replace("gamma1", "ext_law")},
@@ -107,10 +107,10 @@ BAD = [
     ),
     ({"galaxies": TWO.replace("gamma1", "ext_law").replace("-0.02", "2")}, "ext_law of row 1 is not a whole number"),
     ({"galaxies": "ra,dec\n53.1,-27.8\n"}, r"galaxies.csv: column mag is missing"),
-    ({"galaxies": "ra,dec,mag\n"}, r"galaxies.csv: holds no source"),
+    ({"galaxies": "ra,dec,mag\n"}, r"galaxies.csv: the table has no rows"),
     ({"galaxies": ""}, r"galaxies.csv: .*mpty"),
     ({"stars": STAR.replace("4000", "4")}, r"stars.csv: teff of row 1 is 4"),
-    ({"more": 'only = "grid"\nspacing = 20.0'}, r"galaxies.csv: column ra is none of mag"),
+    ({"more": 'only = "grid"\nspacing = 20.0'}, r"galaxies.csv: unknown column ra, must be one of mag"),
     ({"more": 'only = "grid"'}, r"sources.spacing is missing"),
     ({"more": 'only = "table"\nspacing = 20.0'}, r"sources.spacing wants only"),
     ({"more": 'only = "some"'}, r"sources.only = 'some'"),
@@ -140,6 +140,6 @@ def test_a_table_that_changes_while_it_is_read_is_refused(tmp_path):
 
 def test_a_grid_of_too_many_places_is_refused(tmp_path):
     with pytest.raises(
-        BadInput, match=r"sources.spacing = 0.01: the square about the area has more than 4000000 places"
+        BadInput, match=r"sources.spacing = 0.01: the grid around the area must have at most 4000000 positions"
     ):
         made(tmp_path, 'only = "grid"\nspacing = 0.01', galaxies="mag\n20\n", stars=None)

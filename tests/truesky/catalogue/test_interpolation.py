@@ -19,7 +19,7 @@ def test_linear_interpolation_between_its_nodes_is_numpys(values):
 
 
 @given(st.lists(st.floats(-5.0, 15.0), min_size=1, max_size=20))
-def test_a_line_goes_on_beyond_the_nodes(values):
+def test_extrapolation_is_linear(values):
     values = np.array(values)
     index, weight = bracket(NODES, values, extrapolated=True)
     assert NODES[index] * (1.0 - weight) + NODES[index + 1] * weight == pytest.approx(values, rel=1e-12, abs=1e-12)

@@ -28,5 +28,5 @@ def test_a_table_that_is_not_there_is_named():
 def test_a_table_without_source_is_refused(tmp_path, monkeypatch):
     (tmp_path / "bare.toml").write_text("[size]\nlargest = 1.0\n")
     monkeypatch.setattr(parameters, "_FOLDER", tmp_path)
-    with pytest.raises(BadInput, match=r"bare.toml: table \[size\] states no source"):
+    with pytest.raises(BadInput, match=r"bare.toml: table \[size\] must have a key source"):
         parameters.section("bare.toml", "size")

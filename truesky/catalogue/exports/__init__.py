@@ -1,1 +1,1 @@
-"""Catalogues in the forms of others."""
+"""Exports of the catalogues in formats of other programs."""

@@ -1,9 +1,8 @@
-"""A reference catalogue as SCAMP reads it: FITS_LDAC, columns under the names that its ASTREF*_KEYS have by default.
+"""Reference catalogue for SCAMP in FITS_LDAC format, with the default column names of SCAMP's ASTREF*_KEYS.
 
-write   rows under the names of Gaia's archive -> a file
-
-A star without a proper motion has the motion 0 with an error of 100 mas/yr: nearly no star so faint moves as far, and
-whoever carries it to another epoch does not take its place for known. An error of 0 would say that it stands still.
+A star without a measured proper motion gets a proper motion of 0 with an error of 100 mas/yr. Hardly any star that
+faint moves faster, and the error keeps a program from trusting the position at another epoch. An error of 0 would mean
+that the star is known not to move.
 """
 
 from __future__ import annotations
@@ -19,15 +18,20 @@ from lake_schema.fits import ldac
 
 _MAG_OVER_FLUX = 2.5 / np.log(10.0)
 _DEG = 1.0 / 3.6e6
-# Error of a proper motion that is not known, mas/yr.
+# Error of an unknown proper motion, mas/yr.
 _UNKNOWN_MOTION = 100.0
 
 
 def write(path: Path, rows: pa.Table) -> None:
-    """Replaced in one rename.
+    """Write a reference catalogue, which replaces the file atomically.
 
-    rows : columns source_id, ref_epoch, ra, dec (deg) and their errors (mas), pmra, pmdec and theirs (mas/yr),
-           phot_g_mean_mag (Vega), phot_g_mean_flux_over_error
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    rows : Table
+        Columns source_id, ref_epoch, ra and dec (deg) with errors (mas), pmra and pmdec with errors (mas/yr),
+        phot_g_mean_mag (Vega) and phot_g_mean_flux_over_error.
     """
     ldac.write(path, _columns(rows))
 
@@ -43,7 +47,7 @@ def _columns(rows: pa.Table) -> list[ldac.ColumnData]:
         ("Y_WORLD", "D", "deg", values("dec")),
         ("ERRA_WORLD", "E", "deg", np.maximum(east, north)),
         ("ERRB_WORLD", "E", "deg", np.minimum(east, north)),
-        # From the axis of right ascension.
+        # Angle from the axis of right ascension.
         ("ERRTHETA_WORLD", "E", "deg", np.where(east >= north, 0.0, 90.0)),
         ("PMALPHA_J2000", "E", "mas/yr", values("pmra")),
         ("PMDELTA_J2000", "E", "mas/yr", values("pmdec")),

@@ -1,10 +1,10 @@
-"""Galaxies and stars of a lake as LSST DESC skyCatalogs 2 (schema 1.3.0) opens them.
+"""Galaxies and stars of a lake in the format of LSST DESC skyCatalogs 2 (schema 1.3.0).
 
-write    galaxy_N.parquet, galaxy_flux_N.parquet, pointsource_N.parquet, pointsource_flux_N.parquet for each Nside-32
-         pixel N (ring) of the place that is observed, seds/ with the spectra of the stars, and skyCatalog.yaml
+`write` makes galaxy_N.parquet, galaxy_flux_N.parquet, pointsource_N.parquet and pointsource_flux_N.parquet for each
+Nside-32 pixel N (ring) of the observed positions, the folder seds/ with the spectra of the stars, and skyCatalog.yaml.
 
-Components of a galaxy are bulge and disk, whose spectra add up to the galaxy's; there are no knots. The reader computes
-fluxes from the spectra, and takes those of the flux files where it is asked for an LSST band that they have.
+The components of a galaxy are a bulge and a disk, whose spectra add up to the galaxy's spectrum; there are no knots.
+skyCatalogs computes fluxes from the spectra, except in the LSST bands that the flux files contain.
 """
 
 from __future__ import annotations
@@ -28,38 +28,55 @@ from truesky.catalogue.exports import stellar_spectra, tophat
 from truesky.fluxes import bulges, cosmology, inputs, passbands
 from truesky.fluxes.spectra.extinction import MILKY_WAY_R_V
 
-# Of the pixels: Nside 32.
+# HEALPix order of the pixels: Nside 32.
 ORDER = 5
-# Rows of a row group, of which the reader takes one at a time.
+# Rows per row group; skyCatalogs reads one row group at a time.
 _ROW_GROUP_SIZE = 20_000
-# What GalSim draws has a size, arcsec.
+# Smallest half-light radius, arcsec, because GalSim cannot draw a size of 0.
 _MIN_SIZE = 1e-3
 _Maker = Callable[[pa.Table], pa.Table]
 
 
 @dataclass(frozen=True, slots=True)
 class _Catalogue:
-    """A table of the lake beside its fluxes, row by row."""
+    """A table of the lake and the table of its fluxes, which has the same rows."""
 
     rows: read.Version
     fluxes: read.Version
     bands: list[str] = field(default_factory=list)
 
     def read_partition(self, name: str) -> pa.Table:
-        """Rows of a part, with the columns f_nu_<band> behind them."""
+        """Return the rows of a partition, with the columns f_nu_<band> appended."""
         rows = self.rows.rows(partitions=[name])
         flux_rows = self.fluxes.rows(["id", *(f"f_nu_{band}" for band in self.bands)], [name])
         if not flux_rows["id"].equals(rows["id"]):
-            raise BadInput(f"table {self.fluxes.table}: {name} does not hold the rows of table {self.rows.table}")
+            raise BadInput(f"table {self.fluxes.table}: {name} must have the same rows as table {self.rows.table}")
         for band in self.bands:
             rows = rows.append_column(f"f_nu_{band}", flux_rows[f"f_nu_{band}"])
         return rows
 
 
 def write(lake: Path, folder: Path, request: str | None = None) -> list[Path]:
-    """Write the set, each file replaced in one rename, the document last; returns the files.
+    """Write the set of files; each file is replaced atomically, skyCatalog.yaml last.
 
-    Errors: BadInput where fluxes are missing, or those of other rows
+    Parameters
+    ----------
+    lake : Path
+        Folder of the lake.
+    folder : Path
+        Folder to write to; it is created if it does not exist.
+    request : str, optional
+        Name of the request to export, if the lake contains several.
+
+    Returns
+    -------
+    list of Path
+        Files written.
+
+    Raises
+    ------
+    BadInput
+        If the lake has no galaxies, or if fluxes are missing or belong to other rows.
     """
     catalogues = {kind: _catalogue(lake, kind, request) for kind in ("galaxy", "star") if _has(lake, kind, request)}
     if "galaxy" not in catalogues:
@@ -112,7 +129,7 @@ def _catalogue(lake: Path, kind: str, request: str | None) -> _Catalogue:
 
 
 def _by_pixel(catalogue: _Catalogue) -> Iterator[tuple[int, pa.Table]]:
-    """(nested pixel, its rows) of every pixel that has some."""
+    """Yield (nested pixel, its rows) for every pixel that has rows."""
     for partitions in _group_by_pixel(catalogue.rows.partitions):
         rows = pa.concat_tables([catalogue.read_partition(partition) for partition in partitions])
         pixels = sky.parent(rows["_healpix_29"].to_numpy(), sky.MAX_ORDER, ORDER)
@@ -121,7 +138,7 @@ def _by_pixel(catalogue: _Catalogue) -> Iterator[tuple[int, pa.Table]]:
 
 
 def _group_by_pixel(partitions: Iterable[str]) -> list[list[str]]:
-    """Parts that lie in one pixel, or alone where they are larger."""
+    """Group the partitions that are in the same pixel; a partition larger than a pixel is a separate group."""
     groups: dict[tuple[int, int], list[str]] = {}
     for partition in partitions:
         order, cell = layout.cell_of_file(partition)
@@ -146,10 +163,12 @@ def _galaxy_rows(lake: Path, catalogue: _Catalogue) -> tuple[_Maker, _Maker]:
 
 
 def _shapes(galaxies: pa.Table) -> dict[str, Any]:
-    """Columns of galaxies but for their spectra.
+    """Return the columns of galaxies except for their spectra.
 
-    Sizes are half-light radii; shears are in GalSim's frame, whose x axis points west. Ellipticities are
-    (a - b) / (a + b) along north and north-east: the reader turns them by 90 degrees.
+    Notes
+    -----
+    Sizes are half-light radii. Shears are in GalSim's frame, whose x axis points west. Ellipticities are
+    (a - b) / (a + b) along north and north-east, because skyCatalogs rotates them by 90 degrees.
     """
     c: dict[str, Any] = {
         name: galaxies[name].to_numpy() for name in galaxies.column_names if not galaxies[name].null_count
@@ -203,7 +222,7 @@ def _star_rows(lake: Path, catalogue: _Catalogue) -> tuple[_Maker, _Maker]:
 
 
 def _fluxes(identifier: str, bands: list[str]) -> _Maker:
-    """Photons per second and cm2 through the whole system, magnified and behind the dust on the way."""
+    """Photons per second and cm2 through the whole system, with magnification and extinction."""
     width = {band: passbands.log_width(passbands.load(band)) for band in bands}
 
     def rows(sources: pa.Table) -> pa.Table:
@@ -263,7 +282,7 @@ def _object_type(kind: str, stem: str) -> dict[str, Any]:
 
 
 def _parquet(path: Path, rows: pa.Table, maker: _Maker) -> Path:
-    """A file whose row groups are those of the file beside it, made one at a time."""
+    """Write a file with the same row groups as its companion file, one row group at a time."""
 
     def fill(temporary: Path) -> None:
         first = maker(rows.slice(0, _ROW_GROUP_SIZE))

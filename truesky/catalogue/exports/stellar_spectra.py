@@ -1,8 +1,7 @@
-"""Spectra of stars as skyCatalogs reads them: a text file a template, and the magnitude that each star scales it to.
+"""Spectra of stars for skyCatalogs: one text file per template, and the magnitude that scales it to each star.
 
-write       seds/star_K.txt, a line each 1 nm: wavelength nm, f_lambda
-file_of     its path below the folder that SIMS_SED_LIBRARY_DIR names
-magnorm     AB magnitude of each star at 500 nm, before extinction
+The files are seds/star_K.txt below the folder in the environment variable SIMS_SED_LIBRARY_DIR. Each line contains a
+wavelength in nm (in steps of 1 nm) and f_lambda.
 """
 
 from __future__ import annotations
@@ -20,19 +19,34 @@ from truesky.fluxes.calibration import star_scale
 from truesky.fluxes.libraries.templates import Library
 from truesky.fluxes.sources import stars_from_table
 
-# Samples of a template, 1 A apart, that make one of the file; where its level is taken, A.
+# Samples of a template (1 A apart) per sample of the file, and the wavelength at which templates are normalised, A.
 _SAMPLES_PER_BIN, _LEVEL_WAVELENGTH = 10, 5000.0
-# Of a template's highest sample, the least that a sample is.
+# Lower limit of all samples, relative to the highest sample of the template.
 _MIN_RELATIVE_FLUX = 1e-12
 
 
 def relative_path(sed: int) -> str:
-    """The path of a template's file."""
+    """Return the path of a template's file, relative to the library folder."""
     return f"seds/star_{sed:03d}.txt"
 
 
 def write(folder: Path, library: Library, templates: Sequence[int]) -> list[Path]:
-    """Write some templates of a library, each replaced in one rename; returns the files."""
+    """Write templates of a library; each file is replaced atomically.
+
+    Parameters
+    ----------
+    folder : Path
+        Library folder; seds/ is created in it.
+    library : Library
+        Templates.
+    templates : sequence of int
+        Indices of the templates to write.
+
+    Returns
+    -------
+    list of Path
+        Files written.
+    """
     wavelength, flux = _rebin(library)
     (folder / "seds").mkdir(exist_ok=True)
     written = []
@@ -46,7 +60,7 @@ def write(folder: Path, library: Library, templates: Sequence[int]) -> list[Path
 
 
 def magnorm(stars: pa.Table, library: Library) -> Float:
-    """float64[n] mag of rows of the table `stars`."""
+    """Return the AB magnitude at 500 nm, before extinction, of each row of table `stars`."""
     rows = stars_from_table(stars, library)
     wavelength, flux = _rebin(library)
     level = flux[:, int(np.searchsorted(wavelength, _LEVEL_WAVELENGTH))]
@@ -55,16 +69,16 @@ def magnorm(stars: pa.Table, library: Library) -> Float:
 
 
 def _rebin(library: Library) -> tuple[Float, Float]:
-    """(A; f_lambda[template]) every 10 A, the mean of the samples about each."""
+    """Return (A; f_lambda[template]) every 10 A, averaged over the samples around each wavelength."""
     half = _SAMPLES_PER_BIN // 2
     start = int((_LEVEL_WAVELENGTH - library.wavelength[0] - half) % _SAMPLES_PER_BIN)
     count = (library.flux.shape[1] - start - 1) // _SAMPLES_PER_BIN
-    # The two samples at the ends of a stretch belong half to its neighbours.
+    # The samples at both ends of a bin count half, because they also belong to the next bin.
     weights = np.full(_SAMPLES_PER_BIN + 1, 1.0 / _SAMPLES_PER_BIN)
     weights[[0, -1]] *= 0.5
     flux = np.zeros((len(library), count))
     for k, weight in enumerate(weights):
         flux += weight * library.flux[:, start + k : start + k + _SAMPLES_PER_BIN * count : _SAMPLES_PER_BIN]
-    # A template that is dark where its level is taken has one all the same.
+    # A template without flux at the reference wavelength still needs a positive level there.
     flux = np.maximum(flux, _MIN_RELATIVE_FLUX * flux.max(axis=1, keepdims=True))
     return library.wavelength[start + half :: _SAMPLES_PER_BIN][:count], flux

@@ -1,12 +1,9 @@
-"""Spectra of galaxies as skyCatalogs holds them: the luminosity in each of a row of rest-frame bins.
+"""Spectra of galaxies for skyCatalogs: luminosities in rest-frame wavelength bins.
 
-edges          of the bins: equal in the logarithm between breaks and windows about the emission lines
-luminosities   rows of `galaxies` -> L_nu of each bin
-templates_in_bins   of a library, behind no dust
-
-The reader makes f_lambda constant in each bin, dims it by its luminosity distance, redshifts it, and puts the Milky
-Way's dust before it. A bin holds the photons of the spectrum inside it, so a band that is smooth over a bin sees
-what it would see of the spectrum itself.
+Bins are equal in the logarithm of wavelength between spectral breaks and windows around the emission lines.
+skyCatalogs makes f_lambda constant in each bin, dims it by the luminosity distance, redshifts it, and applies the
+Milky Way's dust. A bin contains the photons of the spectrum inside it. A band whose response is smooth over a bin
+therefore gets the same flux as from the full spectrum.
 """
 
 from __future__ import annotations
@@ -33,31 +30,32 @@ from truesky.fluxes.spectra.continuum import (
 )
 from truesky.numerics import matrices
 
-# Of the first and last bin, A: the ultraviolet of galaxies at z = 6, the infrared of near ones.
+# Limits of the first and last bin, A: ultraviolet of galaxies at z = 6 to infrared of nearby galaxies.
 FIRST_EDGE, LAST_EDGE = 450.5, 24499.5
-# Of a bin, in ln(wavelength); half a window about a line, a fraction of its wavelength: 4 sigma of 300 km/s.
+# Width of a bin in ln(wavelength), and half the width of a line window relative to its wavelength (4 sigma of 300
+# km/s).
 _STEP, _WINDOW = 0.02, 0.004
-# Where spectra break, A: the Lyman limit, the lines of its series, redward of which hydrogen on the way absorbs less,
-# Lyman alpha with the red half of its line, narrow or wide, the Balmer limit.
+# Wavelengths of spectral breaks, A: the Lyman limit; the lines of the Lyman series, because intergalactic hydrogen
+# absorbs less redward of each of them; Lyman alpha with its red wing, narrow or wide; the Balmer limit.
 _LYMAN_SERIES = (917.5, 919.5, 920.5, 923.5, 926.5, 930.5, 937.5, 949.5, 972.5, 1025.5)
 _RED_OF_ALPHA = (1216.5, 1217.5, 1219.5, 1222.5, 1226.5, 1231.5, 1236.5, 1241.5, 1246.5, 1251.5, 1260.5)
 _BREAKS = tuple((at, at) for at in (912.0, *_LYMAN_SERIES, 1215.5, *_RED_OF_ALPHA, 3646.0))
-# L_nu is in units of this, W/Hz: GCR Catalogs, SCHEMA.md.
+# Unit of L_nu, W/Hz. Source: GCR Catalogs, SCHEMA.md.
 TOPHAT_W_HZ = 4.4659e13
 _MPC_CM = 3.085677581491367e24
 _ERG_W = 1e7
-# Nearer than this no luminosity distance is worth the name.
+# Smallest redshift at which a luminosity distance is meaningful.
 MIN_REDSHIFT = 1e-5
-# Rows whose spectra are made at a time: 25 MB an array.
+# Number of rows per block; each array of a block has 25 MB.
 _BLOCK = 128
-# Of Fitzpatrick et al. 2019, A.
+# Range and step of the law of Fitzpatrick et al. 2019, A.
 _F19_RANGE, _F19_STEP = (1150.0, 33333.0), 5.0
 _LYMAN_ALPHA = 1215.67
 
 
 @lru_cache(maxsize=1)
 def edges() -> Float:
-    """float64[n + 1] A, half-way between the samples of the templates."""
+    """Return the edges of the n bins, float64, shape (n + 1,), in A, halfway between the samples of the templates."""
     lowest, highest = (1.0 + sign * _WINDOW for sign in (-1.0, 1.0))
     line_windows = [(line.vacuum * lowest, line.vacuum * highest) for line in lines.line_list()]
     windows: list[list[float]] = []
@@ -75,10 +73,24 @@ def edges() -> Float:
 
 
 def luminosities(galaxies: pa.Table, library: Library) -> Float:
-    """L_nu of the light of rows of `galaxies`, float64[n, bins] in 4.4659e13 W/Hz, before magnification.
+    """Return L_nu of galaxies in each bin, before magnification.
 
-    galaxies : of any kind;  library : of the kinds central, satellite and strong lens
-    The Milky Way's law is the reader's (Fitzpatrick et al. 2019): what ours has more at a bin's wavelength is in here.
+    Parameters
+    ----------
+    galaxies : Table
+        Rows of table `galaxies`, of any kind.
+    library : Library
+        Templates of the kinds central, satellite and strong lens.
+
+    Returns
+    -------
+    float array, shape (n, bins)
+        L_nu in units of TOPHAT_W_HZ (4.4659e13 W/Hz).
+
+    Notes
+    -----
+    skyCatalogs applies the extinction law of Fitzpatrick et al. 2019. The result includes the difference between our
+    law and this law at the wavelength of each bin.
     """
     out = np.empty((galaxies.num_rows, len(edges()) - 1))
     for start in range(0, galaxies.num_rows, _BLOCK):
@@ -96,10 +108,10 @@ def luminosities(galaxies: pa.Table, library: Library) -> Float:
 
 
 def _galaxies(rows: Galaxies, library: Library) -> Float:
-    """f_lambda as observed, before magnification and the Milky Way, in each bin: float64[n, bins] erg s-1 cm-2 A-1."""
+    """Observed f_lambda in each bin before magnification and the Milky Way, shape (n, bins), erg s-1 cm-2 A-1."""
     reference, dust = passbands.load(REFERENCE_BAND), dust_curves(library)
     amplitude = amplitudes(rows.mix, reference, library, dust)
-    # Of order 1 whatever the units, so that single precision does not underflow.
+    # Normalise to order 1, so that single precision does not underflow.
     amplitude /= amplitude.sum(0)
     spectra, dust_in_bins = _bin_library(library)
     total = np.zeros((len(rows), len(edges()) - 1))
@@ -117,18 +129,18 @@ def _galaxies(rows: Galaxies, library: Library) -> Float:
 
 
 def templates_in_bins(library: Library) -> Float:
-    """f_lambda of each template in each bin, float64[template, bins]."""
+    """Return f_lambda of each template in each bin, float64, shape (templates, bins)."""
     return _bin_library(library)[0]
 
 
 @lru_cache(maxsize=2)
 def _bin_library(library: Library) -> tuple[Float, Float]:
-    """Templates and their laws of dust in bins: dust is smooth over one, so its mean is what it does."""
+    """Templates and extinction curves in bins; a curve is smooth over a bin, so its mean is sufficient."""
     return bin_spectra(library.flux, library.wavelength), bin_spectra(dust_curves(library), library.wavelength)
 
 
 def _high_redshift(galaxies: pa.Table) -> Float:
-    """The same of quasars and of galaxies beyond z = 6."""
+    """Observed f_lambda in each bin of quasars and of galaxies beyond z = 6, otherwise as in `_galaxies`."""
     kind, z, mag, sed = (column(galaxies, name) for name in ("kind", "z_obs", "mag_r01", "sed_1"))
     out = np.empty((len(z), len(edges()) - 1))
     for code in high_redshift.MAGNITUDE_WAVELENGTH:
@@ -147,16 +159,26 @@ def _high_redshift(galaxies: pa.Table) -> Float:
 
 @lru_cache(maxsize=2)
 def _templates(kind: int) -> tuple[Library, Float]:
-    """The library of a kind beyond the galaxies', and its spectra in bins."""
+    """Library of quasars or of galaxies beyond z = 6, and its spectra in bins."""
     make_library = high_redshift.quasar_library if kind == high_redshift.QUASAR else high_redshift.high_redshift_library
     library = make_library()
     return library, bin_spectra(library.flux, library.wavelength)
 
 
 def bin_spectra(spectra: Float32, wavelength: Float) -> Float:
-    """f_lambda that gives each bin the photons of the spectra in it: float64[n, bins].
+    """Average spectra over the bins so that the number of photons in each bin is kept.
 
-    spectra : [n, m] f_lambda at wavelength[m], whole A in steps of 1
+    Parameters
+    ----------
+    spectra : float32 array, shape (n, m)
+        f_lambda.
+    wavelength : float array, shape (m,)
+        Integer wavelengths in steps of 1 A.
+
+    Returns
+    -------
+    float array, shape (n, bins)
+        f_lambda.
     """
     starts = np.floor(edges() + 0.5 - wavelength[0]).astype(np.int64)
     inside, at = slice(starts[0], starts[-1]), starts[:-1] - starts[0]
@@ -165,9 +187,17 @@ def bin_spectra(spectra: Float32, wavelength: Float) -> Float:
 
 
 def _line_light(fluxes: Float) -> Float:
-    """f_lambda[n, bins] of lines whose photons all fall into the bin of their wavelength, rest frame.
+    """f_lambda of the lines, all of whose photons are in the bin of their rest-frame wavelength.
 
-    fluxes : float64[n, lines] erg s-1 cm-2
+    Parameters
+    ----------
+    fluxes : float array, shape (n, lines)
+        Line fluxes, erg s-1 cm-2.
+
+    Returns
+    -------
+    float array, shape (n, bins)
+        f_lambda.
     """
     vacuum = np.array([line.vacuum for line in lines.line_list()])
     bins = np.searchsorted(edges(), vacuum) - 1
@@ -179,12 +209,12 @@ def _line_light(fluxes: Float) -> Float:
 
 
 def _intergalactic_transmission(z: Float) -> Float:
-    """Mean transmission of the intergalactic medium in each bin: float64[n, bins]."""
+    """Mean transmission of the intergalactic medium in each bin, shape (n, bins)."""
     wavelength = np.arange(1.0, np.ceil(_LYMAN_ALPHA * (1.0 + z.max())) + 2.0)
     transmissions = intergalactic.transmission(wavelength, z)
     out = np.empty((len(z), len(edges()) - 1))
     for i, transmission in enumerate(transmissions):
-        # Beyond the series nothing absorbs.
+        # There is no absorption redward of the Lyman series.
         cumulative = np.append(0.0, np.cumsum(transmission))
         observed_edges = edges() * (1.0 + z[i])
         integral = np.interp(observed_edges, np.append(wavelength, wavelength[-1] + 1.0) - 0.5, cumulative)
@@ -194,7 +224,7 @@ def _intergalactic_transmission(z: Float) -> Float:
 
 
 def _extinction_excess(z: Float) -> Float:
-    """A(lambda) / A(V) of ours less the reader's at each bin's observed wavelength: float64[n, bins]."""
+    """Our A(lambda) / A(V) minus the value of skyCatalogs at the observed wavelength of each bin, shape (n, bins)."""
     wavelength = _bin_centres() * (1.0 + z)[:, None]
     grid, difference = _law_difference()
     return np.interp(wavelength, grid, difference)
@@ -202,8 +232,8 @@ def _extinction_excess(z: Float) -> Float:
 
 @lru_cache(maxsize=1)
 def _law_difference() -> tuple[Float, Float]:
-    """(A; A(lambda) / A(V) of ours less Fitzpatrick et al. 2019), R_V = 3.1, where that law is defined."""
-    # Slow to import.
+    """Return wavelengths (A), and our A(lambda) / A(V) minus Fitzpatrick et al. 2019 with R_V = 3.1, in its range."""
+    # Import here, because these packages are slow to import.
     import astropy.units as u
     from dust_extinction.parameter_averages import F19
 
@@ -213,7 +243,7 @@ def _law_difference() -> tuple[Float, Float]:
 
 
 def _to_l_nu(z_obs: Float, z_true: Float) -> Float:
-    """What turns f_lambda as observed (erg s-1 cm-2 A-1) into L_nu of a bin: float64[n, bins]."""
+    """Factors that convert observed f_lambda (erg s-1 cm-2 A-1) into L_nu of a bin, shape (n, bins)."""
     low, high = edges()[:-1], edges()[1:]
     width = (high - low) / (LIGHT_ANGSTROM_S * (1.0 / low - 1.0 / high))
     distance = cosmology.luminosity_distance(np.maximum(z_true, MIN_REDSHIFT)) / cosmology.HUBBLE * _MPC_CM
@@ -222,6 +252,6 @@ def _to_l_nu(z_obs: Float, z_true: Float) -> Float:
 
 
 def _bin_centres() -> Float:
-    """Mean wavelength of each bin's photons, A."""
+    """Mean wavelength of the photons in each bin of constant f_lambda, A."""
     low, high = edges()[:-1], edges()[1:]
     return 2.0 / 3.0 * (high**3 - low**3) / (high**2 - low**2)

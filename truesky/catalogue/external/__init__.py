@@ -1,1 +1,1 @@
-"""External catalogues."""
+"""Readers of the user's catalogues."""

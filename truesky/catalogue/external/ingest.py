@@ -1,8 +1,6 @@
-"""Galaxies of a finished catalogue: read once, checked, and laid out by order-5 cell for the workers.
+"""Read and check the galaxies of a user's catalogue once, and store them by order-5 cell for the workers.
 
-files    what a request names, as a list of files, and the sha256 that stand for them
-split    one pass over all files: every value checked, no identifier twice; pieces in the cache
-rows     what is there of a generation cell
+One pass over all files checks every value, and that no identifier occurs twice. The rows are stored in the cache.
 """
 
 from __future__ import annotations
@@ -33,21 +31,30 @@ from truesky.numerics import cache
 from truesky.numerics.cache import cache_dir, content_key
 from truesky.numerics.code_fingerprints import code_key
 
-# Rows that are held before they are written to the pieces of their cells.
+# Number of rows in memory before they are written to the files of their cells.
 _MAX_BUFFERED_ROWS = 2_000_000
-# Identifiers are compared in so many lots, each of which fits into memory.
+# Number of groups in which identifiers are compared; each group fits into memory.
 _LOT_COUNT = 64
 _ID_ENTRY = np.dtype([("id", np.int64), ("file", np.int32), ("row", np.int64)])
 _SUMMARY_FILE = "about.json"
-# Columns of positions, the observed ones last.
+# Columns of positions; the observed positions are last.
 _POSITION_COLUMNS = (("ra", "dec"), ("ra_lensed", "dec_lensed"))
 
 
 @dataclass(frozen=True, slots=True)
 class Split:
-    """A catalogue laid out by cell.
+    """A catalogue that is stored by cell.
 
-    folder : of the pieces;  sums : their CRC-32 by name;  rows : of all files;  z_max, ebv_max : the largest
+    Attributes
+    ----------
+    folder : Path
+        Folder of the pieces.
+    checksums : mapping of str to int
+        CRC-32 of each piece by name.
+    rows : int
+        Number of rows of all files.
+    z_max, ebv_max : float
+        Largest redshift, and largest E(B-V) in mag.
     """
 
     folder: Path
@@ -58,22 +65,22 @@ class Split:
 
 
 def files_with_checksums(paths: Sequence[Path], columns: Columns) -> tuple[list[Path], list[str]]:
-    """(files in the order in which they are named, sha256 of each and of what stands beside it)."""
+    """Return the catalogue files in the order of the request, and the SHA-256 of each file and companion file."""
     files, all_files = list_files(paths, columns)
     return files, [file_sha256(file) for file in all_files]
 
 
 def list_files(paths: Sequence[Path], columns: Columns) -> tuple[list[Path], list[Path]]:
-    """(files in the order in which they are named, the same with what stands beside them)."""
+    """Return the catalogue files in the order of the request, and the same list followed by the companion files."""
     files = [file for path in paths for file in external_rows.find_files(path)]
     if columns.companion_prefixes:
-        # A folder of such a set holds the other files, and tables of other things, as well.
+        # The folder also contains the companion files and unrelated tables.
         other_prefix = columns.companion_prefixes[1]
         files = [
             f for f in files if f.name.startswith(columns.companion_prefixes[0]) and not f.name.startswith(other_prefix)
         ]
         if not files:
-            raise BadInput(f"{paths[0]}: no file whose name begins with {columns.companion_prefixes[0]}")
+            raise BadInput(f"{paths[0]}: must contain a file whose name begins with {columns.companion_prefixes[0]}")
     all_files = files + [
         mapping.companion_file(file, columns.companion_prefixes) for file in files if columns.companion_prefixes
     ]
@@ -83,9 +90,26 @@ def list_files(paths: Sequence[Path], columns: Columns) -> tuple[list[Path], lis
 
 
 def split_by_cell(files: Sequence[Path], sha256: Sequence[str], columns: Columns) -> Split:
-    """The pieces of a catalogue, from the cache or made now.
+    """Return a catalogue stored by cell, from the cache or made now.
 
-    Errors: BadInput or Damaged names file, column and row of what cannot be used
+    Parameters
+    ----------
+    files : sequence of Path
+        Files of the catalogue.
+    sha256 : sequence of str
+        SHA-256 of all files, which identify the cached copy.
+    columns : Columns
+        Mapping of the columns.
+
+    Returns
+    -------
+    Split
+        The stored catalogue.
+
+    Raises
+    ------
+    BadInput, Damaged
+        If a value cannot be used; the message names the file, the column and the row.
     """
     columns_json = json.dumps(
         [sorted((key, repr(field)) for key, field in columns.fields.items()), columns.companion_prefixes]
@@ -107,7 +131,7 @@ def split_by_cell(files: Sequence[Path], sha256: Sequence[str], columns: Columns
             shutil.rmtree(temporary, ignore_errors=True)
         checksums = _read_checksums(folder)
     if checksums is None:
-        raise BadInput(f"cache {folder}: what was just written cannot be read")
+        raise BadInput(f"cache {folder}: the files written by this process cannot be read")
     return Split(folder, checksums, **json.loads((folder / _SUMMARY_FILE).read_text()))
 
 
@@ -120,9 +144,24 @@ def _read_checksums(folder: Path) -> dict[str, int] | None:
 
 
 def rows_of_cell(split: Split, cell: int) -> dict[str, Array]:
-    """Values by key of a generation cell's galaxies, with `index` (order-29), sorted by it, then by origin_id.
+    """Return the galaxies of a generation cell.
 
-    Errors : Damaged where a piece is not what was written; they are made again by whoever next asks for the split
+    Parameters
+    ----------
+    split : Split
+        The stored catalogue.
+    cell : int
+        Nested index of an order-8 cell.
+
+    Returns
+    -------
+    dict of str to array, shape (n,)
+        Values by key, with `index` (the order-29 cell), sorted by index, then by origin_id.
+
+    Raises
+    ------
+    Damaged
+        If a piece has changed on disk. The cached copy is deleted, and the next call of `split_by_cell` makes it again.
     """
     prefix = f"{cell >> 2 * (GENERATION_ORDER - FILE_ORDER)}/"
     pieces = [split.folder / name for name in sorted(split.checksums) if name.startswith(prefix)]
@@ -131,8 +170,8 @@ def rows_of_cell(split: Split, cell: int) -> dict[str, Array]:
     for piece in pieces:
         if not cache.is_intact(piece, split.checksums[piece.relative_to(split.folder).as_posix()]):
             cache.discard(split.folder, f"{piece.name} is not what was written")
-            raise Damaged(f"{piece} is not what was written; run again to have it made again")
-        # Sorted by index: only what the cell wants is copied.
+            raise Damaged(f"{piece} has changed on disk and was deleted; run again to rebuild it")
+        # Pieces are sorted by index, so only the rows of the cell are copied.
         table = feather.read_table(piece, memory_map=True)
         index = table["index"].to_numpy()
         tables.append(table.slice(*_offset_and_length(np.searchsorted(index, [first, last]))))
@@ -162,7 +201,7 @@ def _publish(temporary: Path, folder: Path) -> None:
         except OSError as error:
             if error.errno != errno.ENOTEMPTY:
                 raise
-        # Another process was as fast, or an older one died before it was done; then what is there is removed.
+        # Another process has published the folder, or has left an incomplete one, which _read_checksums deletes.
         if _read_checksums(folder) is not None:
             return None
 
@@ -190,14 +229,14 @@ def _write_pieces(folder: Path, files: Sequence[Path], columns: Columns) -> dict
 
 
 def _write_cells(folder: Path, pieces: Sequence[Rows], piece_number: int) -> None:
-    """Rows of every cell, that in which they are seen -> a piece of its own, sorted by index."""
+    """Write the rows of every cell to a new piece, sorted by index."""
     if not sum(len(piece.values["ra"]) for piece in pieces):
         return
     values = {name: np.concatenate([piece.values[name] for piece in pieces]) for name in pieces[0].values}
     for ra, dec in _POSITION_COLUMNS:
         if ra in values:
             values[ra], values[dec] = sky.check_positions(values[ra], values[dec])
-            # By where it is seen, where the catalogue says so.
+            # If the catalogue has observed positions, they determine the cell.
             values["index"] = sky.healpix_29(values[ra], values[dec])
     order = np.argsort(values["index"], kind="stable")
     cells = values["index"][order] >> 2 * (sky.MAX_ORDER - FILE_ORDER)
@@ -209,14 +248,14 @@ def _write_cells(folder: Path, pieces: Sequence[Rows], piece_number: int) -> Non
 
 
 class _IdentifierStore:
-    """Identifiers with their file and row, in lots on disc: a catalogue has more than memory holds."""
+    """Identifiers with their file and row, in groups on disk, because they may not fit into memory."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         folder.mkdir()
 
     def add(self, file: int, piece: Rows) -> None:
-        """Remember the identifiers of some rows."""
+        """Store the identifiers of rows."""
         identifiers = piece.values["origin_id"]
         entries = np.empty(identifiers.size, _ID_ENTRY)
         entries["id"], entries["file"], entries["row"] = identifiers, file, piece.first + np.arange(identifiers.size)
@@ -226,7 +265,7 @@ class _IdentifierStore:
                 stream.write(entries[lot == lot_number].tobytes())
 
     def refuse_duplicates(self, files: Sequence[Path], column: str) -> None:
-        """Raise BadInput where one stands twice; the lots are removed."""
+        """Raise BadInput if an identifier occurs twice; then delete the groups."""
         for path in sorted(self.folder.iterdir()):
             entries = np.sort(np.fromfile(path, _ID_ENTRY), order=("id", "file", "row"))
             duplicates = np.flatnonzero(entries["id"][1:] == entries["id"][:-1])
@@ -236,7 +275,7 @@ class _IdentifierStore:
                     f"row {entry['row']} of {files[entry['file']]}" for entry in (second, first)
                 )
                 raise BadInput(
-                    f"{files[second['file']]}: column {column}: {second['id']} stands in {second_place} and in "
+                    f"{files[second['file']]}: column {column}: {second['id']} is in {second_place} and in "
                     f"{first_place}"
                 )
         shutil.rmtree(self.folder)

@@ -1,9 +1,7 @@
-"""Whose column is which: from a user's table to keys that we know, by a mapping that is data.
+"""Map the columns of a user's table to keys of this package, with mappings from a TOML file and from the request.
 
-formats     the mappings that are shipped (ingest_formats.toml)
-galaxies    a shipped mapping with a request's own entries over it, checked
-halos, training     the same for halos and training tables, which have no shipped one
-read        the rows of files by key, checked: a wrong value is refused with its file, column and row
+The mappings in ingest_formats.toml are the shipped formats. Entries of the request override them. Halos and training
+tables have no shipped format. Each value is checked; an error names the file, the column and the row.
 """
 
 from __future__ import annotations
@@ -34,7 +32,7 @@ _FIELD_KEYS = (
 )  # fmt: skip
 _FORMAT_KEYS = ("source", "columns", "band", "beside", "seen_over_v", "lines_magnified")
 _SED = ("sed_1", "frac_1", "ext_law_1", "ebv_1", "sed_2", "frac_2", "ext_law_2", "ebv_2")
-# Computed by us, or another key's affair.
+# Keys that are computed, or that other keys determine.
 _NOT_MAPPED = ("id", "halo_id", "_healpix_29", "ra_true", "dec_true")
 GALAXY_BOUNDS: Bounds = {
     **{c.name: (c.lo, c.hi) for c in GALAXIES.columns if c.lo is not None and c.hi is not None},
@@ -76,7 +74,7 @@ _INTEGERS = ("kind", "ext_law", "ext_law_1", "ext_law_2", "sed_1", "sed_2", "sta
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """One entry of a mapping (ingest_formats.toml says what it means)."""
+    """Entry of a mapping; ingest_formats.toml explains the keys."""
 
     column: str = ""
     plus: str = ""
@@ -92,13 +90,31 @@ class Field:
     beside: bool = False
 
     def titles(self) -> list[str]:
-        """Columns of the file that the field is made of."""
+        """Return the columns of the file from which the field is computed."""
         return [title for title in (self.column, self.plus, self.minus, self.over, self.kpc_at) if title]
 
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """A whole mapping: fields by key; band, seen_over_v, beside, lines_magnified : as in ingest_formats.toml."""
+    """A complete mapping.
+
+    Attributes
+    ----------
+    fields : mapping of str to Field
+        Fields by key.
+    bounds : mapping of str to (float, float)
+        Lowest and highest valid value by key.
+    nullable : tuple of str
+        Keys whose values may be missing.
+    band : str
+        Passband of `mag`; "" without one.
+    companion_prefixes : tuple of str
+        Prefix of the names of the files, and of their companion files; empty without companion files.
+    seen_over_v : float or None
+        A(band) / A(V), if `mag` is an observed magnitude with magnification and extinction; None otherwise.
+    lines_magnified : bool
+        True if line fluxes include magnification.
+    """
 
     fields: Mapping[str, Field]
     bounds: Bounds
@@ -109,14 +125,14 @@ class Columns:
     lines_magnified: bool = False
 
     def titles(self, in_companion: bool) -> list[str]:
-        """Columns of the file that are read; beside : of the file beside it."""
+        """Return the columns to read from a file, or from its companion file."""
         titles = [title for field in self.fields.values() if field.beside is in_companion for title in field.titles()]
         return list(dict.fromkeys(titles))
 
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Checked rows of one file: values by key; first : number of the first row in the file."""
+    """Checked rows of one file by key; `first` is the number of the first row in the file."""
 
     file: Path
     first: int
@@ -124,20 +140,35 @@ class Rows:
 
 
 def formats() -> dict[str, dict[str, Any]]:
-    """Name -> what ingest_formats.toml says of it."""
+    """Return the content of ingest_formats.toml by name of the format."""
     return _formats(_FILE.read_text(encoding="utf-8"))
 
 
 @cache
 def _formats(text: str) -> dict[str, dict[str, Any]]:
-    """The formats in the text of the file."""
+    """Parse the text of ingest_formats.toml."""
     return user_files.parse_toml(text)
 
 
 def galaxy_columns(name: str, overrides: Mapping[str, str]) -> Columns:
-    """The mapping of a format ("" = none), the request's entries (JSON) over it.
+    """Return the mapping of a catalogue of galaxies.
 
-    Errors: BadInput names the key
+    Parameters
+    ----------
+    name : str
+        Shipped format, "" for none.
+    overrides : mapping of str to str
+        Entries of the request as JSON, which override the format.
+
+    Returns
+    -------
+    Columns
+        The mapping.
+
+    Raises
+    ------
+    BadInput
+        If an entry is wrong or missing; the message names the key.
     """
     all_formats = formats()
     if name and name not in all_formats:
@@ -153,29 +184,29 @@ def galaxy_columns(name: str, overrides: Mapping[str, str]) -> Columns:
         present = [key for key in group if key in fields]
         if present and len(present) < len(group):
             missing = next(key for key in group if key not in fields)
-            raise BadInput(f"ingest.galaxies.columns: {present[0]} wants {missing} beside it")
+            raise BadInput(f"ingest.galaxies.columns: {present[0]} requires {missing}")
     if "mag" in fields and not settings.get("band"):
-        raise BadInput("ingest.galaxies.columns: mag wants band beside it")
+        raise BadInput("ingest.galaxies.columns: mag requires band")
     companion_prefixes, seen_over_v = tuple(settings.get("beside", ())), settings.get("seen_over_v")
     lines = bool(settings.get("lines_magnified", False))
     return Columns(fields, GALAXY_BOUNDS, NULLABLE, settings.get("band", ""), companion_prefixes, seen_over_v, lines)
 
 
 def drop_lensed_positions(columns: Columns) -> Columns:
-    """The same mapping without the observed positions."""
+    """Return the mapping without the observed positions."""
     fields = {key: field for key, field in columns.fields.items() if not key.endswith("_lensed")}
     return replace(columns, fields=fields)
 
 
 def halo_columns(entries: Mapping[str, str]) -> Columns:
-    """The mapping of a request's halos."""
+    """Return the mapping of a request's catalogue of halos, with entries as JSON."""
     fields = _fields({key: json.loads(text) for key, text in entries.items()}, HALO_BOUNDS, "ingest.halos.columns")
     _require(fields, "ingest.halos.columns", ("ra",), ("dec",), ("z_true",), ("log_mass",))
     return Columns(fields, HALO_BOUNDS)
 
 
 def training_columns(entries: Mapping[str, str]) -> Columns:
-    """The mapping of a request's training table; each of its keys is needed."""
+    """Return the mapping of a request's training table, with entries as JSON; all its keys are required."""
     parsed = {key: json.loads(text) for key, text in entries.items()}
     fields = _fields(parsed, TRAINING_BOUNDS, "ingest.training.columns")
     _require(fields, "ingest.training.columns", *((key,) for key in TRAINING_BOUNDS))
@@ -183,7 +214,7 @@ def training_columns(entries: Mapping[str, str]) -> Columns:
 
 
 def read(files: Sequence[Path], columns: Columns) -> Iterator[Rows]:
-    """The rows of files, one after another; whole numbers as int64, everything else as float64."""
+    """Read and check the rows of files; integers become int64, other values float64."""
     identifier_columns = [columns.fields[key].column for key in IDENTIFIER_KEYS if key in columns.fields]
     for file in files:
         pieces = external_rows.read_batches(file, columns.titles(in_companion=False), identifier_columns)
@@ -193,9 +224,9 @@ def read(files: Sequence[Path], columns: Columns) -> Iterator[Rows]:
 
 
 def companion_file(file: Path, prefixes: Sequence[str]) -> Path:
-    """The file with a row's other columns."""
+    """Return the path of the file with the other columns of the same rows."""
     if not file.name.startswith(prefixes[0]):
-        raise BadInput(f"{file}: its name does not begin with {prefixes[0]}")
+        raise BadInput(f"{file}: the name must begin with {prefixes[0]}")
     return file.with_name(prefixes[1] + file.name.removeprefix(prefixes[0]))
 
 
@@ -209,7 +240,7 @@ def _fields(table: Mapping[str, Any], bounds: Bounds, path: str) -> dict[str, Fi
         if key not in legal:
             raise BadInput(f"{path}.{key} is not one of {', '.join(dict.fromkeys(legal))}")
         if entry in ("", {}):
-            # An entry of the shipped mapping that this catalogue lacks.
+            # An empty entry removes a column of the format that this catalogue does not have.
             continue
         fields[key] = _field({"column": entry} if isinstance(entry, str) else entry, f"{path}.{key}")
     return fields
@@ -217,7 +248,7 @@ def _fields(table: Mapping[str, Any], bounds: Bounds, path: str) -> dict[str, Fi
 
 def _field(entry: Any, path: str) -> Field:
     if not isinstance(entry, dict):
-        raise BadInput(f"{path} wants a column's name or a table, got {entry!r}"[:300])
+        raise BadInput(f"{path} must be the name of a column or a table, got {entry!r}"[:300])
     for name, value in entry.items():
         if name not in _FIELD_KEYS:
             raise BadInput(f"{path}.{name} is not one of {', '.join(_FIELD_KEYS)}")
@@ -226,10 +257,10 @@ def _field(entry: Any, path: str) -> Field:
         if not isinstance(value, (int, float) if expected_type is float else expected_type) or (
             expected_type is float and value != value
         ):
-            raise BadInput(f"{path}.{name} wants {expected_type.__name__}, got {value!r}"[:300])
+            raise BadInput(f"{path}.{name} must be a {expected_type.__name__}, got {value!r}"[:300])
     field = Field(**entry)
     if bool(field.column) == (field.value is not None):
-        raise BadInput(f"{path} wants column or value, one of them")
+        raise BadInput(f"{path} must have either column or value")
     if field.unit:
         _unit(field.unit, path)
     return field
@@ -238,20 +269,20 @@ def _field(entry: Any, path: str) -> Field:
 def _require(fields: Mapping[str, Field], path: str, *groups: tuple[str, ...]) -> None:
     for alternatives in groups:
         if not any(key in fields for key in alternatives):
-            raise BadInput(f"{path} wants {' or '.join(alternatives)}")
+            raise BadInput(f"{path} must have {' or '.join(alternatives)}")
 
 
 def _unit(text: str, where: str) -> Any:
-    # Slow to import, and needed for external catalogues only.
+    # Import here, because astropy is slow to import and only needed for external catalogues.
     from astropy import units
     from astropy.cosmology.units import littleh
 
     try:
-        # h is a unit of astropy's, but only where it is asked for.
+        # Enable h as a unit only here.
         with units.add_enabled_units([littleh]):
             return units.Unit(text.replace("Msun", "solMass").replace("/h", " / littleh"))
     except ValueError:
-        raise BadInput(f"{where}: unit {text!r} is not one that astropy knows") from None
+        raise BadInput(f"{where}: unit {text!r} must be a unit of astropy") from None
 
 
 def _check_units(piece: RowBatch, columns: Columns) -> None:
@@ -261,7 +292,7 @@ def _check_units(piece: RowBatch, columns: Columns) -> None:
             continue
         where = f"{piece.file}: column {field.column}"
         if _unit(file_unit, where) != _unit(field.unit, where):
-            raise BadInput(f"{where} ({key}) is in {file_unit!r}, the mapping says {field.unit!r}")
+            raise BadInput(f"{where} ({key}) has unit {file_unit!r}, but the mapping has {field.unit!r}")
 
 
 # ------------------------------------------------------------------------------------------------ values
@@ -271,7 +302,7 @@ def _checked_values(piece: RowBatch, columns: Columns) -> dict[str, Array]:
     rows = len(next(iter(piece.columns.values())))
     by_key = {key: _value(key, field, piece.columns, rows) for key, field in columns.fields.items()}
     for k in "12":
-        # What a component without light says of its spectrum means nothing.
+        # The spectrum of a component without light has no meaning and may be invalid.
         if f"frac_{k}" in by_key:
             dark = by_key[f"frac_{k}"] == 0.0
             for name in (f"sed_{k}", f"ext_law_{k}", f"ebv_{k}"):
@@ -305,7 +336,7 @@ def _value(key: str, field: Field, columns: Mapping[str, Array], rows: int) -> A
 
 
 def _kpc_per_arcsec(z: Array) -> Array:
-    """NaN, which is refused, where a length has no angle."""
+    """Scale in kpc per arcsec; NaN, which is refused later, at redshifts without a valid scale."""
     valid = (z > 0.0) & (z <= cosmology.Z_MAX)
     return np.where(valid, cosmology.kpc_per_arcsec(np.where(valid, z, 1.0)), np.nan)
 
@@ -322,14 +353,14 @@ def _check_bounds(piece: RowBatch, key: str, columns: Columns, values: Array) ->
     if bad.any():
         row = int(bad.argmax())
         where = f"{piece.file}: column {' and '.join(columns.fields[key].titles()) or key} ({key})"
-        allowed = f"in [{lo:g}, {hi:g}]" if key not in IDENTIFIER_KEYS else "a whole number"
-        raise BadInput(f"{where} of row {piece.first_row + row} is {values[row]:g}, wanted {allowed}")
+        allowed = f"in [{lo:g}, {hi:g}]" if key not in IDENTIFIER_KEYS else "an integer"
+        raise BadInput(f"{where} of row {piece.first_row + row} is {values[row]:g}, must be {allowed}")
     if slack:
         np.clip(values, lo, hi, out=values)
 
 
 def _with_companion(file: Path, pieces: Iterator[RowBatch], columns: Columns) -> Iterator[RowBatch]:
-    """Pieces with the columns of the file beside theirs; the identifiers of both are compared, row by row."""
+    """Yield batches with the columns of the companion file; the identifiers of both files must agree row by row."""
     companion = companion_file(file, columns.companion_prefixes)
     name = columns.fields["origin_id"].column
     titles = [name, *columns.titles(in_companion=True)]
@@ -341,7 +372,7 @@ def _with_companion(file: Path, pieces: Iterator[RowBatch], columns: Columns) ->
             next_piece = next(stream, None)
             if next_piece is None:
                 row = piece.first_row + len(buffered[name])
-                raise BadInput(f"{companion}: ends before row {row} of {file}, column {name}")
+                raise BadInput(f"{companion}: column {name} ends before row {row} of {file}")
             buffered = (
                 {title: np.concatenate([buffered[title], next_piece.columns[title]]) for title in titles}
                 if len(buffered[name])
@@ -352,5 +383,5 @@ def _with_companion(file: Path, pieces: Iterator[RowBatch], columns: Columns) ->
         differ = companion_rows[name] != piece.columns[name]
         if differ.any():
             row = piece.first_row + int(differ.argmax())
-            raise BadInput(f"{companion}: column {name} of row {row} is not that of the same row of {file.name}")
+            raise BadInput(f"{companion}: column {name} of row {row} must equal the same row of {file.name}")
         yield RowBatch(file, piece.first_row, {**companion_rows, **piece.columns}, piece.units)

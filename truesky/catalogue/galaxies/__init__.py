@@ -1,1 +1,1 @@
-"""What a galaxy looks like."""
+"""Properties of galaxies: colours, spectra, masses, emission lines, shapes and lensing."""

@@ -1,13 +1,17 @@
-"""Intrinsic alignments: which way galaxies point before anything lenses them.
+"""Intrinsic alignments: orientations of galaxies before lensing.
 
-model            the numbers, and the tide of the box
-mean             the mean ellipticity that the places of galaxies ask for
-position_angles  drawn about it: axis ratios stay as they are
+Position angles are drawn around a mean ellipticity that depends on the place of a galaxy; axis ratios do not change.
+Ellipticities are complex, e_1 + i e_2 = |e| exp(2 i phi), where |e| = (a - b) / (a + b) and phi is measured from east
+to north.
 
-Ellipticities are complex, e_1 + i e_2 = |e| exp(2 i phi), (a - b) / (a + b) in size, phi from east to north.
-Error: linear alignment with the tide of matter on the box's cells; satellites point to their central without scatter of
-       the mean
-Ref: Hirata & Seljak 2004, PhRvD 70, 063526
+Notes
+-----
+Central galaxies follow the linear alignment model with the tide of the matter in the cells of the box. Satellites point
+to their central galaxy, with a mean ellipticity without scatter.
+
+References
+----------
+Hirata & Seljak 2004, PhRvD 70, 063526
 """
 
 from __future__ import annotations
@@ -24,13 +28,13 @@ from truesky.catalogue.matter.density_box import Box
 from truesky.catalogue.matter.lightcone import Replicas
 from truesky.fluxes import cosmology
 
-# Steps that solve y + a sin 2y = x to the last bits for a < 1/2.
+# Newton steps that solve y + a sin 2y = x to floating-point precision for a < 1/2.
 _STEPS = 12
 
 
 @dataclass(frozen=True, slots=True)
 class Constants:
-    """How strongly galaxies are aligned (alignments.toml)."""
+    """Parameters of the alignments (alignments.toml)."""
 
     amplitude: float
     slope: float
@@ -48,7 +52,21 @@ class Constants:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignments:
-    """times : what every mean ellipticity is multiplied by;  tides : float32[n^3] each, as of density_box.tides."""
+    """Alignment model of a universe.
+
+    Attributes
+    ----------
+    numbers : Constants
+        Parameters of the file.
+    strength : float
+        Factor by which each mean ellipticity is multiplied.
+    box : Box
+        Matter in a box.
+    replicas : Replicas
+        Rotation of each replica of the box.
+    tides : tuple of float32 array
+        Tidal field, same as `density_box.tides`.
+    """
 
     numbers: Constants
     strength: float
@@ -58,9 +76,21 @@ class Alignments:
 
 
 def model(box: Box, replicas: Replicas, strength: float) -> Alignments | None:
-    """The alignments of the embedded universe; None where they are multiplied by 0.
+    """Return the alignments of the embedded universe.
 
-    box : of matter;  turned : how each replica of it is turned;  times : of the request
+    Parameters
+    ----------
+    box : Box
+        Matter in a box.
+    replicas : Replicas
+        Rotation of each replica of the box.
+    strength : float
+        Factor of the request by which each mean ellipticity is multiplied.
+
+    Returns
+    -------
+    Alignments or None
+        The model; None if `strength` is 0.
     """
     if not strength:
         return None
@@ -69,10 +99,21 @@ def model(box: Box, replicas: Replicas, strength: float) -> Alignments | None:
 
 
 def tide(alignments: Alignments, ra: Float, dec: Float, chi: Float) -> Complex:
-    """T_11 - T_22 + 2 i T_12 of the linear density today, complex[n], axis 1 east and 2 north.
+    """Return the tidal field of the linear density today at positions in the light-cone.
 
-    ra, dec : float[n] deg, true;  chi : float[n] Mpc/h
-    own     : box and its tides
+    Parameters
+    ----------
+    alignments : Alignments
+        The model.
+    ra, dec : float array, shape (n,)
+        True positions, deg.
+    chi : float array, shape (n,)
+        Comoving distance, Mpc/h.
+
+    Returns
+    -------
+    complex array, shape (n,)
+        T_11 - T_22 + 2 i T_12; axis 1 points east, axis 2 north.
     """
     lon, lat = np.radians(ra), np.radians(dec)
     zeros = np.zeros_like(lon)
@@ -80,7 +121,7 @@ def tide(alignments: Alignments, ra: Float, dec: Float, chi: Float) -> Complex:
     east = np.stack([-np.sin(lon), np.cos(lon), zeros], 1)
     north = np.stack([-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)], 1)
     cell, _ = lightcone.box_cells(alignments.box, alignments.replicas, direction, chi)
-    # In front of a replica, what is seen of it is the axes alone.
+    # Rotate the axes of each position into the frame of its replica.
     (e_x, e_y, e_z), (n_x, n_y, n_z) = (
         lightcone.box_cells(alignments.box, alignments.replicas, axis, chi)[1].T for axis in (east, north)
     )
@@ -99,10 +140,25 @@ def tide(alignments: Alignments, ra: Float, dec: Float, chi: Float) -> Complex:
 
 
 def central_ellipticity(alignments: Alignments, ra: Float, dec: Float, chi: Float, m_r: Float, red: Bool) -> Complex:
-    """Mean ellipticity[n] that the tide gives; in linear theory it does not change with time.
+    """Return the mean ellipticity of central galaxies in the tidal field.
 
-    ra, dec : float[n] deg, true;  chi : float[n] Mpc/h;  m_r : float[n] mag;  red : bool[n]
-    own     : numbers and tides
+    Parameters
+    ----------
+    alignments : Alignments
+        The model.
+    ra, dec : float array, shape (n,)
+        True positions, deg.
+    chi : float array, shape (n,)
+        Comoving distance, Mpc/h.
+    m_r : float array, shape (n,)
+        M_r, mag.
+    red : bool array, shape (n,)
+        True for galaxies on the red sequence.
+
+    Returns
+    -------
+    complex array, shape (n,)
+        Mean ellipticity. It does not change with time in linear theory.
     """
     numbers = alignments.numbers
     amplitude = numbers.amplitude * 10.0 ** (-0.4 * numbers.slope * (m_r - numbers.magnitude))
@@ -111,11 +167,23 @@ def central_ellipticity(alignments: Alignments, ra: Float, dec: Float, chi: Floa
 
 
 def satellite_ellipticity(alignments: Alignments, direction: Float, distance: Float, red: Bool) -> Complex:
-    """Mean ellipticity[n] along the line to the central.
+    """Return the mean ellipticity of satellites, along the line to their central galaxy.
 
-    towards  : float[n] rad, direction of the central from east to north;  red : bool[n]
-    distance : float[n] from it in projection, in units of R_200m
-    own      : numbers
+    Parameters
+    ----------
+    alignments : Alignments
+        The model.
+    direction : float array, shape (n,)
+        Direction of the central galaxy, rad, from east to north.
+    distance : float array, shape (n,)
+        Projected distance from the central galaxy in units of R_200m.
+    red : bool array, shape (n,)
+        True for galaxies on the red sequence.
+
+    Returns
+    -------
+    complex array, shape (n,)
+        Mean ellipticity.
     """
     numbers = alignments.numbers
     size = np.maximum(numbers.inner - numbers.outer * distance, 0.0)
@@ -124,11 +192,32 @@ def satellite_ellipticity(alignments: Alignments, direction: Float, distance: Fl
 
 
 def position_angles(alignments: Alignments | None, uniform: Float, mean: Complex, red: Bool) -> Float:
-    """Position angle[n] of the major axis, north through east, deg in [0, 180).
+    """Draw position angles around the mean ellipticities.
 
-    p(phi) ~ 1 + 2 a cos 2(phi - phi_0), by inversion, with a = |mean| over the mean ellipticity of galaxies.
-    own     : numbers; None = all directions alike
-    uniform : float[n] in (0, 1);  mean : complex[n];  red : bool[n]
+    Parameters
+    ----------
+    alignments : Alignments or None
+        The model; None for isotropic directions.
+    uniform : float array, shape (n,)
+        Uniform random numbers in (0, 1).
+    mean : complex array, shape (n,)
+        Mean ellipticities.
+    red : bool array, shape (n,)
+        True for galaxies on the red sequence.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Position angle of the major axis, deg in [0, 180), from north through east.
+
+    Notes
+    -----
+    The distribution of the direction phi (from east to north) is::
+
+        p(phi) ~ 1 + 2 a cos 2(phi - phi_0)
+
+    with a = |mean| / (mean ellipticity of galaxies, red or blue), limited to `max_modulation`. It is sampled by
+    inversion.
     """
     if alignments is None:
         return 180.0 * uniform
@@ -140,14 +229,26 @@ def position_angles(alignments: Alignments | None, uniform: Float, mean: Complex
     for _ in range(_STEPS):
         y -= (y + a * np.sin(2.0 * y) - phase) / (1.0 + 2.0 * a * np.cos(2.0 * y))
     phi = 0.5 * np.angle(mean) + y
-    # From north, through east; whoever is not aligned is as without alignments.
+    # Convert to an angle from north through east. Galaxies without alignment get the same angle as without a model.
     return np.where(a > 0.0, np.mod(90.0 - np.degrees(phi), 180.0), 180.0 * uniform)
 
 
 def direction_to_cells(ra: Float, dec: Float, target: Int) -> tuple[Float, Float]:
-    """(direction[n] from east to north, separation[n]) rad, of places of order-29 cells as seen from others.
+    """Return direction and separation of order-29 cells as seen from positions.
 
-    ra, dec : float[n] deg;  to : int[n]
+    Parameters
+    ----------
+    ra, dec : float array, shape (n,)
+        Positions, deg.
+    target : int array, shape (n,)
+        Nested indices of order-29 cells.
+
+    Returns
+    -------
+    direction : float array, shape (n,)
+        Direction from east to north, rad.
+    separation : float array, shape (n,)
+        Separation, rad.
     """
     lon, lat = (np.radians(angle) for angle in sky.positions_of_indices(target))
     origin_lon, origin_lat = np.radians(ra), np.radians(dec)

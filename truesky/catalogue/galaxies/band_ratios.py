@@ -1,18 +1,15 @@
-"""How bright a template is in a passband at redshift z, dust included, against its own rest-frame 0.1r flux.
+"""Brightness of a dusty template in a passband at redshift z, relative to its rest-frame 0.1r flux.
+
+The apparent magnitude in band b follows from the ratio of the two fluxes::
 
     m_b = M_r + DM(z) - 2.5 log10(ratio)        (M_r = M(0.1r) - 5 log10 h, DM for H0 = 100)
 
-build       the table of ln(ratio) on redshift, law, template and E(B-V)
-load        the same, from the cache where it is there
-ln_ratio    read it for one component of an SED
-offset      m_b - M_r - DM(z) of two-component SEDs
-brightest   the smallest offset that any SED has, against redshift
-invert      the SED that has a colour: two neighbouring templates and their shares;  colours : 0.1(g - r) of SEDs
-between     the SED of a real template index;  columns : an SED as columns of table `galaxies`
+A small table of ln(ratio) by redshift, extinction law, template and E(B-V) serves only the selection of galaxies in one
+band and the reference magnitude. Fluxes are not computed from it.
 
-A small table for the catalogue's own needs: selection in one band, and the reference magnitude. Fluxes are
-not computed from it.
-Ref: Hogg et al. 2002, arXiv:astro-ph/0210394
+References
+----------
+Hogg et al. 2002, arXiv:astro-ph/0210394
 """
 
 from __future__ import annotations
@@ -31,15 +28,16 @@ from truesky.numerics.cache import cached_arrays, content_key
 from truesky.numerics.code_fingerprints import code_key
 
 REFERENCE_BAND = "sdss_r01"
-# Uniform steps of ln(1 + z), and numbers of Chebyshev-Lobatto nodes of E(B-V): the fewest whose error is below that,
-# mag, halfway between them at so many redshifts. The errors stated below hold with these.
+# Uniform step of ln(1 + z).
 _STEP = 0.005
+# Possible numbers of Chebyshev-Lobatto nodes of E(B-V). The smallest one is used whose error halfway between the nodes
+# is below _EBV_ERROR (mag) at _REDSHIFTS redshifts. The errors stated below hold for these values.
 _EBV_NODES, _EBV_ERROR, _REDSHIFTS = (5, 9, 17, 33), 2e-4, 8
 
 
 @dataclass(frozen=True, slots=True)
 class Sed:
-    """Two-component spectra of n galaxies: columns sed_k, frac_k, ext_law_k, ebv_k of table `galaxies`."""
+    """Two-component spectra of n galaxies: columns sed_k, frac_k, ext_law_k and ebv_k of table `galaxies`."""
 
     template_1: Int
     frac_1: Float
@@ -49,10 +47,7 @@ class Sed:
     ebv: Float
 
     def select(self, keep: npt.NDArray[np.generic]) -> Sed:
-        """The galaxies that are kept.
-
-        keep : bool or int[m] rows
-        """
+        """Return the galaxies of a bool mask or of row numbers."""
         return Sed(
             self.template_1[keep],
             self.frac_1[keep],
@@ -65,9 +60,16 @@ class Sed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BandRatios:
-    """ln(f_nu in the band at z / f_nu in 0.1r at rest) of dusty templates.
+    """Table of ln(f_nu in the band at z / f_nu in 0.1r at rest) of dusty templates.
 
-    ebv : [e] mag nodes; values : float32[z, 4, template, e], laws 1 .. 4, uniform in ln(1 + z) from 0
+    Attributes
+    ----------
+    band : str
+        Name of the passband.
+    ebv : float array, shape (e,)
+        Nodes of E(B-V), mag.
+    values : float32 array, shape (z, 4, templates, e)
+        ln(ratio) of the extinction laws 1 to 4. The redshift nodes are uniform in ln(1 + z) and start at 0.
     """
 
     band: str
@@ -76,11 +78,28 @@ class BandRatios:
 
 
 def build(library: Library, band: str, z_max: float, ebv_max: float) -> BandRatios:
-    """The table of one passband, 0 <= z <= z_max, 0 <= E(B-V) <= ebv_max (0.5 s for z_max = 2.3).
+    """Compute the table of one passband (0.5 s for z_max = 2.3).
 
-    library : templates;  band : name of the passband;  z_max, ebv_max : where the table ends
-    Error: `ln_ratio` within 0.0005 mag where the template has light
-           (tests/truesky/catalogue/galaxies/test_band_ratios.py)
+    Parameters
+    ----------
+    library : Library
+        Templates.
+    band : str
+        Name of the passband.
+    z_max : float
+        Largest redshift; the table starts at 0.
+    ebv_max : float
+        Largest E(B-V), mag; the table starts at 0.
+
+    Returns
+    -------
+    BandRatios
+        The table.
+
+    Notes
+    -----
+    The error of `ln_ratio` is below 0.0005 mag for templates with flux in the band
+    (tests/truesky/catalogue/galaxies/test_band_ratios.py).
     """
     ebv = _nodes(library, band, z_max, ebv_max)
     steps = int(np.ceil(np.log1p(z_max) / _STEP)) + 1
@@ -89,7 +108,7 @@ def build(library: Library, band: str, z_max: float, ebv_max: float) -> BandRati
 
 
 def _nodes(library: Library, band: str, z_max: float, ebv_max: float) -> Float:
-    """E(B-V)[e]: more where dust takes much away, in blue bands and behind much of it."""
+    """Nodes of E(B-V): more in blue bands and for large E(B-V), because dust absorbs more."""
     z = np.expm1(np.linspace(0.0, np.log1p(z_max), _REDSHIFTS))
     for count in _EBV_NODES:
         finer = 0.5 * ebv_max * (1.0 - np.cos(np.pi * np.arange(2 * count - 1) / (2 * count - 2)))
@@ -103,7 +122,7 @@ def _nodes(library: Library, band: str, z_max: float, ebv_max: float) -> Float:
 
 
 def _ln_ratios(library: Library, band: str, redshifts: Float, ebv: Float) -> Float:
-    """[z, 4, template, e]"""
+    """ln(ratio), shape (z, 4, templates, e)."""
     dust = dust_transmission(library, ebv)
     spectra = library.flux.astype(np.float64).T
     reference = _band_flux(dust, spectra, band_weights(library, REFERENCE_BAND, 0.0))
@@ -116,9 +135,23 @@ def _ln_ratios(library: Library, band: str, redshifts: Float, ebv: Float) -> Flo
 
 
 def load(library: Library, band: str, z_max: float, ebv_max: float) -> BandRatios:
-    """`build`, kept in the cache under everything that it depends on.
+    """Return the same table as `build`, from the cache or made now.
 
-    library, band, z_max, ebv_max : as of `build`
+    Parameters
+    ----------
+    library : Library
+        Templates.
+    band : str
+        Name of the passband.
+    z_max : float
+        Largest redshift.
+    ebv_max : float
+        Largest E(B-V), mag.
+
+    Returns
+    -------
+    BandRatios
+        The table; the cache key contains everything that it depends on.
     """
     curves = [passbands.load(name) for name in (band, REFERENCE_BAND)]
     responses = [array for curve in curves for array in (curve.wavelength, curve.response)]
@@ -134,17 +167,30 @@ def load(library: Library, band: str, z_max: float, ebv_max: float) -> BandRatio
 
 
 def dust_transmission(library: Library, ebv: Float) -> Float:
-    """Transmission of laws 1 .. 4 at each E(B-V), [4, e, lambda] on the library's wavelengths.
-
-    ebv : float[e] mag
-    """
+    """Return the transmission of laws 1 to 4 at each E(B-V) (mag), shape (4, e, wavelengths of the library)."""
     k = extinction.laws(library.wavelength)[1:]
     return np.asarray(extinction.transmission(k[:, None, :], ebv[None, :, None]), float)
 
 
 def band_weights(library: Library, band: str, z: float) -> Float:
-    """Weights[lambda] with which rest-frame f_lambda sums to the observed, band-averaged f_nu.
+    """Return the weights with which rest-frame f_lambda sums to the observed, band-averaged f_nu.
 
+    Parameters
+    ----------
+    library : Library
+        Templates.
+    band : str
+        Name of the passband.
+    z : float
+        Redshift.
+
+    Returns
+    -------
+    float array, shape (wavelengths,)
+        Weights on the wavelengths of the library.
+
+    Notes
+    -----
     The observed spectrum is f_lambda(lambda / (1 + z)) / (1 + z).
     """
     curve = passbands.load(band)
@@ -159,19 +205,34 @@ def band_weights(library: Library, band: str, z: float) -> Float:
 
 
 def _band_flux(dust: Float, spectra: Float, weights: Float) -> Float:
-    """[4, e, template]"""
+    """Flux in a band, shape (4, e, templates)."""
     used = np.flatnonzero(weights)
     cut = slice(used[0], used[-1] + 1)
     return np.asarray(matrices.matmul(dust[:, :, cut] * weights[cut], spectra[cut]))
 
 
 def ln_ratio(table: BandRatios, z: Float, template: Int, law: Int, ebv: Float) -> Float:
-    """ln(ratio)[n], linear in ln(1 + z), polynomial in E(B-V); law 0 has no dust.
+    """Interpolate ln(ratio) linearly in ln(1 + z) and by a polynomial in E(B-V).
 
-    z, ebv : float[n] redshift, E(B-V) mag;  template, law : int[n]
-    table  : of `build`
+    Parameters
+    ----------
+    table : BandRatios
+        The table.
+    z : float array, shape (n,)
+        Redshift.
+    template : int array, shape (n,)
+        Index of the template.
+    law : int array, shape (n,)
+        Extinction law, 0 to 4; 0 means no dust.
+    ebv : float array, shape (n,)
+        E(B-V), mag.
+
+    Returns
+    -------
+    float array, shape (n,)
+        ln(ratio).
     """
-    # Compiled code is imported where it is wanted.
+    # Import here, because compiled code is slow to import.
     from truesky.catalogue.galaxies import ratio_sums
 
     redshift, dust = np.ascontiguousarray(z, np.float64), np.ascontiguousarray(ebv, np.float64)
@@ -182,10 +243,7 @@ def ln_ratio(table: BandRatios, z: Float, template: Int, law: Int, ebv: Float) -
 
 
 def ebv_weights(nodes: Float, ebv: Float) -> Float:
-    """Lagrange weights [n, e] of the nodes at E(B-V)[n].
-
-    nodes : float[e] mag;  ebv : float[n] mag
-    """
+    """Return the Lagrange weights of the nodes (mag) at each E(B-V) (mag), shape (n, e)."""
     weights = np.ones((ebv.size, nodes.size))
     for i, node in enumerate(nodes):
         for j, other in enumerate(nodes):
@@ -195,9 +253,21 @@ def ebv_weights(nodes: Float, ebv: Float) -> Float:
 
 
 def offset(table: BandRatios, z: Float, sed: Sed) -> Float:
-    """m_b - M_r - DM(z) [n] mag of two-component spectra.
+    """Return m_b - M_r - DM(z) of two-component spectra.
 
-    z : float[n];  sed : n spectra
+    Parameters
+    ----------
+    table : BandRatios
+        The table of band b.
+    z : float array, shape (n,)
+        Redshift.
+    sed : Sed
+        Spectra of the n galaxies.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Offset, mag.
     """
     ratio_1 = np.exp(ln_ratio(table, z, sed.template_1, sed.law, sed.ebv))
     ratio_2 = np.exp(ln_ratio(table, z, sed.template_2, sed.law, sed.ebv))
@@ -205,18 +275,35 @@ def offset(table: BandRatios, z: Float, sed: Sed) -> Float:
 
 
 def brightest_offset(table: BandRatios) -> tuple[Float, Float]:
-    """Redshifts[m], and the smallest m_b - M_r - DM[m] of any template, law and E(B-V) there."""
+    """Return redshifts, and the smallest m_b - M_r - DM of any template, law and E(B-V) at each of them, mag."""
     z = np.expm1(_STEP * np.arange(table.values.shape[0]))
     highest = table.values.astype(np.float64).max(axis=(1, 2, 3))
     return z, -2.5 / np.log(10.0) * highest
 
 
 def sed_of_colour(table: BandRatios, colour: Float, law: Int, ebv: Float) -> Sed:
-    """The spectra that have the wanted colours; the end of the library where dust leaves none that has.
+    """Return spectra that have the given colours.
 
-    colour : float[n] 0.1(g - r) mag;  law : int[n];  ebv : float[n] mag
-    table : of 0.1g at z = 0. Mixing templates i and i - 1 with shares 1 - f and f of the 0.1r flux mixes
-            their 0.1g / 0.1r ratios with the same shares, so the inversion is exact.
+    Parameters
+    ----------
+    table : BandRatios
+        The table of 0.1g at z = 0.
+    colour : float array, shape (n,)
+        0.1(g - r), mag.
+    law : int array, shape (n,)
+        Extinction law.
+    ebv : float array, shape (n,)
+        E(B-V), mag.
+
+    Returns
+    -------
+    Sed
+        Spectra. If no spectrum behind this dust has the colour, the end of the library.
+
+    Notes
+    -----
+    A mixture of templates i and i - 1 with fractions 1 - f and f of the 0.1r flux mixes their 0.1g / 0.1r ratios with
+    the same fractions, so the inversion is exact.
     """
     weights = ebv_weights(table.ebv, np.where(law > 0, ebv, 0.0))
     by_law = table.values[0].astype(np.float64)[np.maximum(law, 1) - 1]
@@ -231,10 +318,25 @@ def sed_of_colour(table: BandRatios, colour: Float, law: Int, ebv: Float) -> Sed
 
 
 def sed_of_index(index: Float, law: Int, ebv: Float) -> Sed:
-    """Of real template indices t[n] >= 0: i = max(ceil(t), 1) and i - 1, with shares 1 - f and f = i - t.
+    """Return the spectra of real template indices.
 
-    index : float[n];  law : int[n];  ebv : float[n] mag
-    Ref: Serrano et al. 2024, appendix B
+    Parameters
+    ----------
+    index : float array, shape (n,)
+        Index t >= 0.
+    law : int array, shape (n,)
+        Extinction law.
+    ebv : float array, shape (n,)
+        E(B-V), mag.
+
+    Returns
+    -------
+    Sed
+        Mixture of templates i = max(ceil(t), 1) and i - 1 with fractions 1 - f and f = i - t.
+
+    References
+    ----------
+    Serrano et al. 2024, appendix B
     """
     upper = np.maximum(np.ceil(index), 1.0).astype(np.int64)
     share = np.asarray(upper - index, np.float64)
@@ -242,10 +344,7 @@ def sed_of_index(index: Float, law: Int, ebv: Float) -> Sed:
 
 
 def columns(sed: Sed) -> dict[str, npt.NDArray[np.generic]]:
-    """Spectra as columns of table `galaxies`: both components behind the same dust.
-
-    returns : [n] each
-    """
+    """Return spectra as columns of table `galaxies`; both components have the same dust."""
     return {
         "sed_1": sed.template_1,
         "frac_1": sed.frac_1,
@@ -259,5 +358,5 @@ def columns(sed: Sed) -> dict[str, npt.NDArray[np.generic]]:
 
 
 def colours(table: BandRatios, sed: Sed) -> Float:
-    """0.1(g - r)[n] of two-component spectra; table : of 0.1g at z = 0."""
+    """Return 0.1(g - r) of two-component spectra in mag, from the table of 0.1g at z = 0."""
     return offset(table, np.zeros(sed.ebv.size), sed)

@@ -1,17 +1,12 @@
-"""Emission lines: H alpha from the star formation rate, matched to the observed counts; the others by ratios.
+"""Emission lines: H alpha from the star formation rate, matched to observed counts; other lines from line ratios.
 
-model            the numbers and the stored table of the matching
-raw_halpha       log L of H alpha as the star formation rate gives it, behind the dust of the gas
-matched          the same, as many per redshift as are observed: a stored monotone table
-metallicity      of the gas, from stellar mass and star formation rate
-fluxes           observed fluxes of the catalogued lines
-added            mean f_nu of the lines in a band;  brightened : magnitudes with it
-expected_counts  galaxies per deg2 above an H alpha flux (Pozzetti et al. 2016, model 3)
+The matching table (halpha_matching.csv) is made by scripts/match_halpha.py from a sample without clustering. All ratios
+use one metallicity scale, because mixing two scales changes [O III] / H beta by an order of magnitude. The parameters
+are in emission_lines.toml.
 
-The table (halpha_matching.csv) is made by scripts/match_halpha.py from a sample without structure. All ratios are of
-one scale of metallicity: mixing two puts [O III] / H beta off by an order of magnitude.
-Ref: Kennicutt & Evans 2012; Garn & Best 2010; Curti et al. 2020; Pozzetti et al. 2016, A&A 590, A3; the numbers are
-in emission_lines.toml.
+References
+----------
+Kennicutt & Evans 2012; Garn & Best 2010; Curti et al. 2020; Pozzetti et al. 2016, A&A 590, A3
 """
 
 from __future__ import annotations
@@ -33,7 +28,7 @@ from truesky.randomness.per_source import AnyGenerator
 
 _FILE = "emission_lines.toml"
 MATCHING = Path(__file__).with_name("halpha_matching.csv")
-# Normal deviates of a galaxy: dust, H alpha, metallicity, N2, R3, R2, S2, [S III], He I.
+# Normal deviates per galaxy: dust, H alpha, metallicity, N2, R3, R2, S2, [S III], He I.
 _DEVIATES = 9
 _CM_PER_MPC = 3.0856775814913673e24
 _L_NODES = np.linspace(38.0, 45.0, 1401)
@@ -42,7 +37,7 @@ _Z_NODES = 400
 
 @dataclass(frozen=True, slots=True)
 class Halpha:
-    """emission_lines.toml, [halpha]."""
+    """Parameters of H alpha (emission_lines.toml, [halpha])."""
 
     per_sfr: float
     scatter: float
@@ -51,7 +46,7 @@ class Halpha:
 
 @dataclass(frozen=True, slots=True)
 class Gas:
-    """emission_lines.toml, [gas]."""
+    """Parameters of the gas dust (emission_lines.toml, [gas])."""
 
     pivot: float
     limits: tuple[float, float]
@@ -62,7 +57,7 @@ class Gas:
 
 @dataclass(frozen=True, slots=True)
 class Metals:
-    """emission_lines.toml, [metals]."""
+    """Parameters of the metallicity (emission_lines.toml, [metals])."""
 
     highest: float
     turn: float
@@ -76,7 +71,7 @@ class Metals:
 
 @dataclass(frozen=True, slots=True)
 class Ratios:
-    """emission_lines.toml, [ratios]."""
+    """Parameters of the line ratios (emission_lines.toml, [ratios])."""
 
     n2: tuple[float, ...]
     n2_scatter: float
@@ -93,7 +88,7 @@ class Ratios:
 
 @dataclass(frozen=True, slots=True)
 class OtherLines:
-    """emission_lines.toml, [others]."""
+    """Parameters of [S III] and He I (emission_lines.toml, [others])."""
 
     siii: float
     siii_scatter: float
@@ -105,7 +100,7 @@ class OtherLines:
 
 @dataclass(frozen=True, slots=True)
 class Pozzetti:
-    """emission_lines.toml, [pozzetti]."""
+    """Parameters of the observed luminosity function (emission_lines.toml, [pozzetti])."""
 
     alpha: float
     delta: float
@@ -120,11 +115,24 @@ class Pozzetti:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LineModel:
-    """What lines are drawn from.
+    """Model of the emission lines.
 
-    hydrogen : of each line over H beta, without dust
-    dust     : k of each column over that of H alpha
-    z : [r], log_l : [c], shift : [r, c] dex that the matching adds to log L
+    Attributes
+    ----------
+    halpha, gas, metals, ratios : Halpha, Gas, Metals, Ratios
+        Parameters of the file.
+    hydrogen : dict of str to float
+        Ratio of each hydrogen line to H beta, without dust.
+    other_lines : OtherLines
+        Parameters of [S III] and He I.
+    dust : dict of str to float
+        Extinction coefficient k of each column relative to H alpha.
+    z : float array, shape (r,)
+        Redshift nodes of the matching.
+    log_l : float array, shape (c,)
+        Nodes of log10 L, erg/s.
+    shift : float array, shape (r, c)
+        Shift that the matching adds to log10 L, dex.
     """
 
     halpha: Halpha
@@ -140,15 +148,27 @@ class LineModel:
 
 
 def model(matching: Path = MATCHING) -> LineModel:
-    """The lines of the embedded universe."""
+    """Return the emission lines of the embedded universe."""
     table = np.loadtxt(matching, delimiter=",")
     return model_from_table(table[1:, 0], table[0, 1:], table[1:, 1:])
 
 
 def model_from_table(z: Float, log_l: Float, shift: Float) -> LineModel:
-    """The lines with a table of one's own; a shift of nothing leaves H alpha as it is drawn.
+    """Return emission lines with a given matching table; shifts of 0 leave H alpha as drawn.
 
-    z : float[r];  log_l : float[l] log10 erg/s;  shift : float[r, l] dex
+    Parameters
+    ----------
+    z : float array, shape (r,)
+        Redshift nodes.
+    log_l : float array, shape (c,)
+        Nodes of log10 L, erg/s.
+    shift : float array, shape (r, c)
+        Shift of log10 L, dex.
+
+    Returns
+    -------
+    LineModel
+        The model.
     """
     primaries = {line.column: line.vacuum for line in reversed(lines.line_list())}
     k = extinction.laws(np.array(list(primaries.values())))[extinction.CALZETTI]
@@ -168,29 +188,76 @@ def model_from_table(z: Float, log_l: Float, shift: Float) -> LineModel:
 
 
 def halpha_attenuation(gas: Gas, log_mass: Float, normal: Float) -> Float:
-    """A(H alpha)[n] mag of the gas.
+    """Return the attenuation A(H alpha) of the gas.
 
-    gas : constants;  log_mass : float[n] log10 Msun;  normal : float[n] normal deviates
-    Ref: Garn & Best 2010, eq. 6
+    Parameters
+    ----------
+    gas : Gas
+        Parameters.
+    log_mass : float array, shape (n,)
+        log10 of the stellar mass, Msun.
+    normal : float array, shape (n,)
+        Normal deviates.
+
+    Returns
+    -------
+    float array, shape (n,)
+        A(H alpha), mag.
+
+    References
+    ----------
+    Garn & Best 2010, eq. 6
     """
     mean = np.polynomial.polynomial.polyval(np.clip(log_mass - gas.pivot, *gas.limits), gas.polynomial)
     return np.asarray(np.maximum(mean, gas.min_attenuation) * np.exp(gas.scatter * normal))
 
 
 def raw_halpha(law: Halpha, log_sfr: Float, a_halpha: Float, normal: Float) -> Float:
-    """log10 of the observed H alpha luminosity[n], erg/s.
+    """Return the observed H alpha luminosity that follows from the star formation rate, before matching.
 
-    log_sfr : float[n] log10 Msun/yr, Kroupa;  dimmed : float[n] A(H alpha) mag
-    law     : constants of the calibration;  normal : float[n] normal deviates
-    Ref: Kennicutt & Evans 2012
+    Parameters
+    ----------
+    law : Halpha
+        Parameters.
+    log_sfr : float array, shape (n,)
+        log10 of the star formation rate, Msun/yr (Kroupa).
+    a_halpha : float array, shape (n,)
+        A(H alpha), mag.
+    normal : float array, shape (n,)
+        Normal deviates.
+
+    Returns
+    -------
+    float array, shape (n,)
+        log10 L, erg/s, behind the dust of the gas.
+
+    References
+    ----------
+    Kennicutt & Evans 2012
     """
     return np.asarray(log_sfr + law.per_sfr + law.scatter * normal - 0.4 * a_halpha)
 
 
 def match_abundance(line_model: LineModel, z: Float, log_l: Float) -> Float:
-    """log10 L[n] with the observed abundance; bilinear in z and log L, held at the table's edges.
+    """Shift H alpha luminosities so that their abundance at each redshift agrees with observations.
 
-    z : float[n];  log_l : float[n] log10 erg/s
+    Parameters
+    ----------
+    line_model : LineModel
+        The model with the matching table.
+    z : float array, shape (n,)
+        Redshift.
+    log_l : float array, shape (n,)
+        log10 L, erg/s.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Shifted log10 L, erg/s.
+
+    Notes
+    -----
+    The shift is bilinear in z and log10 L, and constant beyond the edges of the table.
     """
     row, part = bracket(line_model.z, z)
     column, share = bracket(line_model.log_l, log_l)
@@ -200,21 +267,50 @@ def match_abundance(line_model: LineModel, z: Float, log_l: Float) -> Float:
 
 
 def has_lines(law: Halpha, log_sfr: Float, red: Bool) -> Bool:
-    """Whether a galaxy has lines, bool[n].
+    """Return True for galaxies that have emission lines.
 
-    law : constants;  log_sfr : float[n] log10 Msun/yr;  red : bool[n] on the red sequence
+    Parameters
+    ----------
+    law : Halpha
+        Parameters.
+    log_sfr : float array, shape (n,)
+        log10 of the star formation rate, Msun/yr.
+    red : bool array, shape (n,)
+        True for galaxies on the red sequence.
+
+    Returns
+    -------
+    bool array, shape (n,)
+        False for red galaxies below the star formation rate `red_sfr`.
     """
     return np.asarray(~(red & (log_sfr < np.log10(law.red_sfr))))
 
 
 def metallicity(law: Metals, log_mass: Float, log_sfr: Float, normal: Float) -> Float:
-    """12 + log(O/H) [n] of the gas.
+    """Return the metallicity of the gas.
 
-    log_mass, log_sfr : float[n] log10 Msun, log10 Msun/yr;  law : constants;  normal : float[n] normal deviates
-    Ref: Curti et al. 2020, eqs. 2 and 5
+    Parameters
+    ----------
+    law : Metals
+        Parameters.
+    log_mass : float array, shape (n,)
+        log10 of the stellar mass, Msun.
+    log_sfr : float array, shape (n,)
+        log10 of the star formation rate, Msun/yr.
+    normal : float array, shape (n,)
+        Normal deviates.
+
+    Returns
+    -------
+    float array, shape (n,)
+        12 + log(O/H).
+
+    References
+    ----------
+    Curti et al. 2020, eqs. 2 and 5
     """
     below = law.sharpness * (law.mass + law.mass_sfr * log_sfr - log_mass)
-    # log10(1 + 10^x) without overflow.
+    # Compute log10(1 + 10^x) without overflow.
     fall = np.logaddexp(0.0, np.log(10.0) * below) / np.log(10.0)
     return np.asarray(np.clip(law.highest - law.turn * fall + law.scatter * normal, *law.limits))
 
@@ -222,11 +318,27 @@ def metallicity(law: Metals, log_mass: Float, log_sfr: Float, normal: Float) -> 
 def fluxes(
     line_model: LineModel, z: Float, log_mass: Float, log_sfr: Float, red: Bool, rng: AnyGenerator
 ) -> dict[str, Float]:
-    """Flux[n] of the primary component of each line, erg s-1 cm-2, before magnification and the Milky Way.
+    """Draw the flux of the primary component of each line.
 
-    z : float[n] true redshift;  log_mass, log_sfr : float[n] log10 Msun, log10 Msun/yr (Chabrier, Kroupa)
-    red : bool[n] on the red sequence;  rng : of dust, luminosities and ratios
-    own : constants and matching;  returns : by column of table `galaxies`
+    Parameters
+    ----------
+    line_model : LineModel
+        The model.
+    z : float array, shape (n,)
+        True redshift.
+    log_mass : float array, shape (n,)
+        log10 of the stellar mass, Msun (Chabrier).
+    log_sfr : float array, shape (n,)
+        log10 of the star formation rate, Msun/yr (Kroupa).
+    red : bool array, shape (n,)
+        True for galaxies on the red sequence.
+    rng : AnyGenerator
+        Random numbers of dust, luminosities and ratios.
+
+    Returns
+    -------
+    dict of str to float array, shape (n,)
+        Flux by column of table `galaxies`, erg s-1 cm-2, before magnification and the Milky Way's dust.
     """
     normals = np.stack([rng.standard_normal(z.size) for _ in range(_DEVIATES)])
     a_halpha = halpha_attenuation(line_model.gas, log_mass, normals[0])
@@ -241,14 +353,26 @@ def fluxes(
 
 
 def mean_line_flux(band: Passband, z_obs: Float, fluxes: Mapping[str, Float]) -> Float:
-    """f_nu[n] erg s-1 cm-2 Hz-1, averaged over the band, of all lines.
+    """Return the band-averaged f_nu of all lines.
 
-    band : that they are seen through;  z_obs : float[n];  fluxes : float[n] erg s-1 cm-2 by column of table `galaxies`
+    Parameters
+    ----------
+    band : Passband
+        Passband.
+    z_obs : float array, shape (n,)
+        Observed redshift.
+    fluxes : mapping of str to float array, shape (n,)
+        Flux by column of table `galaxies`, erg s-1 cm-2.
+
+    Returns
+    -------
+    float array, shape (n,)
+        f_nu, erg s-1 cm-2 Hz-1.
     """
     weights = np.pad(passbands.weights(band), 1)
     total = np.zeros(z_obs.size)
     for line in lines.line_list():
-        # The flux of a line falls into bins of 1 A; beyond the band there is none.
+        # The flux of a line is in bins of 1 A. Lines beyond the band add nothing.
         at = line.vacuum * (1.0 + z_obs) - band.wavelength[0] + 1.0
         place = np.clip(at, 0.0, weights.size - 1.0)
         below = np.minimum(place.astype(np.int64), weights.size - 2)
@@ -258,18 +382,28 @@ def mean_line_flux(band: Passband, z_obs: Float, fluxes: Mapping[str, Float]) ->
 
 
 def magnitude_with_light(magnitude: Float, light: Float) -> Float:
-    """AB magnitudes[n] of sources with more light.
-
-    magnitude : float[n] AB, without it;  light : float[n] f_nu, erg s-1 cm-2 Hz-1
-    """
+    """Return the AB magnitude of sources (AB mag) after adding light (f_nu, erg s-1 cm-2 Hz-1)."""
     return np.asarray(magnitude - 2.5 * np.log10(1.0 + light * 10.0 ** (0.4 * (magnitude + AB_CGS))))
 
 
 def expected_counts(flux: Float, z_min: float, z_max: float) -> Float:
-    """Galaxies[n] per deg2 above H alpha fluxes[n], erg s-1 cm-2, between two redshifts.
+    """Return the number of galaxies above H alpha fluxes between two redshifts.
 
-    flux : float[n] erg s-1 cm-2
-    Ref: Pozzetti et al. 2016, A&A 590, A3, model 3, in the cosmology of that paper
+    Parameters
+    ----------
+    flux : float array, shape (n,)
+        H alpha flux, erg s-1 cm-2.
+    z_min, z_max : float
+        Redshift limits.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Number per deg2.
+
+    References
+    ----------
+    Pozzetti et al. 2016, A&A 590, A3, model 3, in the cosmology of that paper
     """
     law = Pozzetti(**parameters.section(_FILE, "pozzetti"))
     z = np.linspace(z_min, z_max, _Z_NODES)
@@ -286,7 +420,7 @@ def expected_counts(flux: Float, z_min: float, z_max: float) -> Float:
 
 
 def _density_above(law: Pozzetti, z: Float, log_l: Float) -> Float:
-    """n(> L)[n], Mpc^-3."""
+    """Density n(> L) of each luminosity, Mpc^-3."""
     fitted = np.maximum(z, law.z_fit)
     log_star = law.l_inf + (1.5 / (1.0 + fitted)) ** law.beta * (law.l_half - law.l_inf)
     log_y = _L_NODES - 42.0
@@ -298,7 +432,7 @@ def _density_above(law: Pozzetti, z: Float, log_l: Float) -> Float:
 
 
 def _luminosities(line_model: LineModel, z: Float, halpha: Float, excess: Float, normals: Float) -> dict[str, Float]:
-    """log10 of the intrinsic luminosities[n] by column; excess : 12 + log(O/H) less the Sun's."""
+    """log10 of the intrinsic luminosities by column, for `excess` = 12 + log(O/H) minus the Sun's value."""
     ratios, other_lines = line_model.ratios, line_model.other_lines
     n2, r3, r2, s2 = (_ratio(numbers, excess) for numbers in (ratios.n2, ratios.r3, ratios.r2, ratios.s2))
     hbeta = halpha - np.log10(line_model.hydrogen["halpha"])
@@ -310,7 +444,7 @@ def _luminosities(line_model: LineModel, z: Float, halpha: Float, excess: Float,
     return {
         **{f"flux_{line}": hbeta + np.log10(ratio) for line, ratio in line_model.hydrogen.items()},
         "flux_hbeta": hbeta,
-        # The catalogue holds one line of each pair: half of the doublets of equal lines, the stronger of the others.
+        # The catalogue contains one line per pair: half of doublets with equal lines, otherwise the stronger line.
         "flux_oii": hbeta + r2 + np.log10(0.5),
         "flux_oiii": hbeta + r3,
         "flux_nii": halpha + n2 + ratios.n2_scatter * normals[0],

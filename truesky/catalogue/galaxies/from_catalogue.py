@@ -1,12 +1,11 @@
-"""Galaxies of a finished catalogue as rows of table `galaxies`: what it lacks is drawn as for our own.
+"""Galaxies of a user's catalogue as rows of table `galaxies`; missing properties are drawn like those of our galaxies.
 
-model    the tables that this takes
-draw     rows of one generation cell
+Columns of the catalogue are not changed, except the lensing and the position angles if the request changes them.
+Without lensing columns, galaxies are observed at their true positions and have no shear.
 
-What the catalogue holds stays as it is, but for the lensing and the position angles where a request changes them.
-Without magnification a galaxy is seen where it is, and its shear is nothing.
-A galaxy's id counts the catalogue's halos of its generation cell (without any, its galaxies), in the order of
-position: a halo whose galaxies lie in two cells has two numbers. origin_id is the catalogue's own.
+A galaxy's id contains the number of its halo in the generation cell (without halos, the number of the galaxy), in the
+order of position. A halo whose galaxies are in two cells therefore has two numbers. The identifier of the catalogue is
+in `origin_id`.
 """
 
 from __future__ import annotations
@@ -38,15 +37,26 @@ from truesky.randomness.rng import stream
 
 CatalogueColumns = Mapping[str, Array]
 
-# Of a galaxy whose mapping says nothing of dust: as far as tables of E(B-V) reach at the least.
+# Smallest upper end of the E(B-V) tables, mag; used if the mapping has no dust.
 _LEAST_EBV = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class IngestModel:
-    """What missing columns are drawn from; `seen` : the band of the mapping's `mag`, None where it has none.
+    """Model from which missing columns are drawn.
 
-    lens : in place of the catalogue's lensing, None = the catalogue's;  rotation : as of GalaxyModel
+    Attributes
+    ----------
+    columns : Columns
+        Mapping of the catalogue.
+    lens : Shear or None
+        Lensing that replaces the catalogue's lensing; None to use that of the catalogue.
+    rotation : float
+        Angle that is added to each position angle before lensing, deg.
+    templates : int
+        Number of templates in the library.
+    observed_band : BandRatios or None
+        Table of the band of the mapping's `mag`; None if the mapping has no `mag`.
     """
 
     seed: int
@@ -68,11 +78,27 @@ class IngestModel:
 def model(
     seed: int, columns: Columns, split_catalogue: Split, lens: Shear | None = None, rotation: float = 0.0
 ) -> IngestModel:
-    """Tables as far as the catalogue reaches in redshift and E(B-V); lens, rotation : as of IngestModel.
+    """Make the model of a catalogue, with tables for its range of redshift and E(B-V).
 
-    seed : of the request;  columns : of the mapping;  given : the catalogue, laid out by cell
+    Parameters
+    ----------
+    seed : int
+        Seed of the request.
+    columns : Columns
+        Mapping of the catalogue.
+    split_catalogue : Split
+        The catalogue stored by cell.
+    lens : Shear, optional
+        Lensing that replaces the catalogue's lensing.
+    rotation : float
+        Angle that is added to each position angle before lensing, deg.
+
+    Returns
+    -------
+    IngestModel
+        The model.
     """
-    # In steps, so that similar catalogues share their tables.
+    # Round up to steps of 0.1, so that similar catalogues share their tables.
     dustiest, z_max = (
         float(np.ceil(10.0 * x) / 10.0) for x in (max(_LEAST_EBV, split_catalogue.ebv_max), split_catalogue.z_max + 0.1)
     )
@@ -97,11 +123,23 @@ def model(
 
 
 def draw(cell: int, catalogue: CatalogueColumns, universe: IngestModel, dust: Float32) -> pa.Table:
-    """Table `galaxies` of one order-8 cell; given : truesky.catalogue.external.ingest.rows.
+    """Return table `galaxies` of one generation cell.
 
-    dust : float32[pixel] map of A(V), mag (truesky.catalogue.dust_map)
-    cell     : nested index at order 8
-    universe : what completes the catalogue's columns
+    Parameters
+    ----------
+    cell : int
+        Nested index of an order-8 cell.
+    catalogue : mapping of str to array, shape (n,)
+        Rows of the cell, from `truesky.catalogue.external.ingest.rows_of_cell`.
+    universe : IngestModel
+        Model of the missing columns.
+    dust : float32 array, shape (pixels,)
+        Map of A(V), mag (truesky.catalogue.dust_map).
+
+    Returns
+    -------
+    Table
+        Rows of table `galaxies`.
     """
     if not catalogue or not catalogue["index"].size:
         return GALAXIES.empty()
@@ -170,7 +208,7 @@ def _first_column(catalogue: CatalogueColumns, *names: str) -> Float:
 
 
 def _value_or_computed(catalogue: CatalogueColumns, name: str, computed: Float) -> Float:
-    """The catalogue's value, the computed one where it has none."""
+    """Return the catalogue's value, or the computed value if it is missing."""
     return np.where(np.isnan(catalogue[name]), computed, catalogue[name]) if name in catalogue else computed
 
 
@@ -189,7 +227,7 @@ def _mask_missing(name: str, values: Array) -> Any:
 
 
 def _identity(catalogue: CatalogueColumns, cell: int, kind: Int) -> dict[str, Int]:
-    """Halos are numbered by their first galaxy; a halo's central is member 0, its satellites follow."""
+    """Number halos by their first galaxy; the central galaxy is member 0, and its satellites follow."""
     n = catalogue["index"].size
     host = catalogue["halo"] if "halo" in catalogue else np.arange(n)
     _, first, host_row = np.unique(host, return_index=True, return_inverse=True)
@@ -199,7 +237,7 @@ def _identity(catalogue: CatalogueColumns, cell: int, kind: Int) -> dict[str, In
     begins = np.searchsorted(host_row[order], np.arange(first.size))
     rank = np.empty(n, np.int64)
     rank[order] = np.arange(n) - begins[host_row[order]]
-    # Halos without a central here begin with member 1, and so does nobody else's.
+    # Number the members from 1 if the halo has no central galaxy in this cell.
     lacks_central = np.ones(first.size, bool)
     lacks_central[host_row[kind != SATELLITE]] = False
     source = ids.source_id(kind, cell, number[host_row], rank + lacks_central[host_row])
@@ -217,7 +255,7 @@ def _lensing(catalogue: CatalogueColumns, n: int) -> dict[str, Array]:
 def _intrinsic_mag(
     catalogue: CatalogueColumns, universe: IngestModel, lens: Mapping[str, Array], a_v: Float
 ) -> Float | None:
-    """`mag` before magnification and the Milky Way."""
+    """Return `mag` before magnification and the Milky Way's extinction."""
     if "mag" not in catalogue:
         return None
     over_v = universe.columns.seen_over_v
@@ -227,7 +265,7 @@ def _intrinsic_mag(
 
 
 def _inverse_magnification(lens: Mapping[str, Array]) -> Float:
-    """1 / magnification[n]; of galaxies nearer to a caustic, which go into quarantine, that at its edge."""
+    """1 / magnification, limited to its value at the edge of the caustic region; galaxies beyond it are quarantined."""
     determinant = sources.determinant(*(lens[name] for name in ("kappa", "gamma1", "gamma2")))
     return np.asarray(np.maximum(np.abs(determinant), lensing.settings().caustic))
 
@@ -235,9 +273,9 @@ def _inverse_magnification(lens: Mapping[str, Array]) -> Float:
 def _light(
     catalogue: CatalogueColumns, universe: IngestModel, z: Float, kind: Int, intrinsic_mag: Float | None, rng: Any
 ) -> tuple[Float, Colour, Sed, Int, Float]:
-    """M_r, colours, spectra, and law and E(B-V) of the second component."""
+    """Return M_r, colours, spectra, and extinction law and E(B-V) of the second component."""
     m_r = catalogue.get("abs_mag_r01")
-    # Without an absolute magnitude, colours are drawn for that of a flat spectrum.
+    # Without an absolute magnitude, draw colours for the absolute magnitude of a flat spectrum.
     apparent = catalogue.get("mag_r01", intrinsic_mag)
     guess = m_r if m_r is not None else np.asarray(apparent) - cosmology.distance_modulus(z) - 2.5 * np.log10(1.0 + z)
     fraction = sequences.red_fraction(universe.colours.fraction, guess, z, kind)
@@ -278,7 +316,7 @@ def _spectra(catalogue: CatalogueColumns, count: int) -> Sed:
         sed = Sed(*(catalogue[name] for name in ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")))
     highest = max(int(sed.template_1.max()), int(sed.template_2.max()))
     if highest >= count:
-        raise BadInput(f"ingest.galaxies: a galaxy has template {highest}, the library holds 0 .. {count - 1}")
+        raise BadInput(f"ingest.galaxies: a galaxy has template {highest}, must be from 0 to {count - 1}")
     return sed
 
 
@@ -293,7 +331,7 @@ def _shapes(
     bulge, disc = morphology.component_radii(shapes, radius, fraction, ratio, sersic)
     disc_ratio = morphology.disc_axis_ratio(shapes, n, rng)
     if "inclination" in catalogue:
-        # q^2 = cos^2 i + h^2 sin^2 i: what table `galaxies` means by an inclination.
+        # Table `galaxies` defines the inclination by q^2 = cos^2 i + h^2 sin^2 i.
         inclined = np.radians(catalogue["inclination"])
         disc_ratio = np.hypot(np.cos(inclined), shapes.scale_height * np.sin(inclined))
     disc_ratio = catalogue.get("disk_axis_ratio", disc_ratio)
@@ -307,7 +345,7 @@ def _shapes(
         "inclination": catalogue.get("inclination", morphology.inclination(disc_ratio, shapes.scale_height)),
         "position_angle": sky.wrap_position_angle(catalogue.get("position_angle", morphology.position_angle(n, rng))),
     }
-    # A catalogue's own fraction stands for every band, unless it has a colour as well.
+    # The bulge fraction of a catalogue applies to all bands, unless the catalogue also has a bulge colour.
     colour = np.full(n, np.nan) if "bulge_fraction" in catalogue else morphology.bulge_colour(shapes.bulge, n, rng)
     columns["bulge_color"] = catalogue.get("bulge_color", colour)
     return {name: np.asarray(values, np.float64) for name, values in columns.items()}

@@ -1,10 +1,8 @@
-"""Galaxies of one generation cell: table `galaxies`, a pure function of (seed, cell, model); and its halos.
+"""Galaxies and halos of one generation cell; table `galaxies` is a pure function of (seed, cell, model).
 
-model        every table that the draws need, made once
-draw         members of halos -> colours, dust, spectra, masses, lines -> selection -> shapes, lensing
-halo_table   table `halos` of the same cell;  halo_limits : from which mass on all are in it
-
-Numbers are keyed by galaxy and step, so that a new column leaves the others as they are, and so does a deeper request.
+The members of halos get colours, dust, spectra, masses and lines; galaxies brighter than the limit are selected and get
+shapes and lensing. Random numbers depend on the galaxy and on the step. A new column or a deeper request therefore does
+not change existing values.
 """
 
 from __future__ import annotations
@@ -53,21 +51,54 @@ from truesky.fluxes.passbands import Passband
 from truesky.randomness.per_source import PerSourceGenerator
 from truesky.request.schema import Universe
 
-# Candidates are drawn this much deeper than the brightest SED needs, mag: emission lines brighten them, but for one
-# galaxy in 10^4 by no more (tests).  Of candidates, those are given lines whose continuum is so near to the limit.
+# Candidates are drawn deeper than the brightest SED requires by _CANDIDATE_MARGIN, mag. Emission lines brighten all but
+# one galaxy in 10^4 by less than this (tests). Lines are computed only for candidates whose continuum is at most
+# _LINE_MARGIN fainter than the limit.
 _CANDIDATE_MARGIN, _LINE_MARGIN = 0.25, 0.75
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GalaxyModel:
-    """Everything that galaxies are drawn from; a few MB, made once by `model`.
+    """Model from which galaxies are drawn; a few MB, made once by `model`.
 
-    limit     : faintest magnitude, AB, before the Milky Way's dust and intergalactic hydrogen, with emission lines
-    band      : the limit's;  rotation : deg, added to every position angle, before lensing
-    selection : the limit's band against redshift; reference : 0.1r against redshift; colour : 0.1g at rest
-    ends : of the templates' colours;  halo_shares : what halos make red
-    training  : observed galaxies whose spectra ours have, None = spectra that have the colours
-    alignments : with the matter about galaxies, None = none
+    Attributes
+    ----------
+    limit : float
+        Faintest AB magnitude, before the Milky Way's dust and intergalactic hydrogen, with emission lines.
+    band : Passband
+        Passband of the limit.
+    population : Population
+        Halos and their members.
+    lens : Lens
+        Lensing by the box, or a uniform shear.
+    rotation : float
+        Angle that is added to each position angle before lensing, deg.
+    alignments : Alignments or None
+        Intrinsic alignments; None without alignments.
+    luminosities : Schechter
+        Luminosity function.
+    colours, colour_limits : Colours, ColourLimits
+        Distributions of the colours, and their limits from the templates.
+    halo_shares : quenching.Shares
+        Fractions of galaxies that halos quench.
+    selection : BandRatios
+        Table of the limit's band by redshift.
+    reference : BandRatios
+        Table of 0.1r by redshift.
+    colour : BandRatios
+        Table of 0.1g at rest.
+    shapes : Shapes
+        Distributions of sizes and shapes.
+    masses : stellar_mass.MassToLight
+        Mass-to-light ratios.
+    star_formation : stellar_mass.StarFormation
+        Star formation rates.
+    lines : LineModel
+        Emission lines.
+    distant : tuple of Kind
+        Quasars and galaxies beyond the light-cone.
+    training : Training or None
+        Observed galaxies whose spectra are used; None to choose spectra by colour.
     """
 
     limit: float
@@ -93,7 +124,23 @@ class GalaxyModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SelectedGalaxies:
-    """Selected galaxies, [n]: rows of members, z, M_r, as of `apparent`, colours that the spectra have, spectra."""
+    """Selected galaxies.
+
+    Attributes
+    ----------
+    row : int array, shape (n,)
+        Row of the member.
+    z : float array, shape (n,)
+        Redshift.
+    m_r : float array, shape (n,)
+        M_r, mag.
+    magnitude : float array, shape (n,)
+        Magnitude of the continuum, from `apparent_magnitude`.
+    colour : Colour
+        Colours of the spectra.
+    sed : Sed
+        Spectra.
+    """
 
     row: Int
     z: Float
@@ -103,7 +150,7 @@ class SelectedGalaxies:
     sed: Sed
 
     def select(self, keep: Bool) -> SelectedGalaxies:
-        """The galaxies that are kept: keep : bool[n]."""
+        """Return the galaxies of a bool mask, shape (n,)."""
         rows = self.row[keep], self.z[keep], self.m_r[keep], self.magnitude[keep]
         return SelectedGalaxies(*rows, self.colour.select(keep), self.sed.select(keep))
 
@@ -111,13 +158,29 @@ class SelectedGalaxies:
 def model(
     seed: int, requested: Universe, light_cone: LightCone | None = None, training: Training | None = None
 ) -> GalaxyModel:
-    """The embedded universe of a seed: its galaxies brighter than a limit in a band, and with z < z_max.
+    """Return the model of the galaxies of a seed that are brighter than the limit and at z < z_max.
 
-    light_cone, training : external tables of halos and of observed galaxies, in place of ours
-    Halos and galaxies of a nearer or shallower universe are those of a deeper one, bit by bit: whatever is drawn from
-    is the same for all, and numbers are keyed by what is drawn.
-    1 s, and with an empty cache as long as the box and its lensing take (density_box.load, lensing.load).
-    seed                   : of the request;  wanted : section `universe` of the request
+    Parameters
+    ----------
+    seed : int
+        Seed of the request.
+    requested : Universe
+        Section `universe` of the request.
+    light_cone : LightCone, optional
+        The user's halos, which replace the drawn halos.
+    training : Training, optional
+        The user's observed galaxies, whose spectra are used.
+
+    Returns
+    -------
+    GalaxyModel
+        The model.
+
+    Notes
+    -----
+    The halos and galaxies of a nearer or shallower universe also exist in a deeper one, because both draw from the same
+    distributions with the same random numbers. The model takes 1 s to make. With an empty cache, the box and its
+    lensing take longer (density_box.load, lensing.load).
     """
     library, colours = templates.galaxy_library(), sequences.model()
     selection = _selection(requested, training)
@@ -154,9 +217,23 @@ def model(
 def halos_and_galaxies(
     seed: int, requested: Universe, light_cone: LightCone | None = None, training: Training | None = None
 ) -> Population:
-    """The population that a limit can be asked of: halos with their galaxies, before these have colours.
+    """Return the halos and their members, before these have colours.
 
-    seed, wanted, light_cone, training : as of `model`
+    Parameters
+    ----------
+    seed : int
+        Seed of the request.
+    requested : Universe
+        Section `universe` of the request.
+    light_cone : LightCone, optional
+        The user's halos, which replace the drawn halos.
+    training : Training, optional
+        The user's observed galaxies, whose spectra are used.
+
+    Returns
+    -------
+    Population
+        The population, complete to the magnitude limit.
     """
     nodes, brightest = band_ratios.brightest_offset(_selection(requested, training))
 
@@ -171,7 +248,7 @@ def halos_and_galaxies(
 
 @cache
 def _inverse() -> Inverse:
-    """The luminosities of number densities, the same for every request: 0.2 s."""
+    """Return the luminosities of number densities, which are the same for every request (0.2 s)."""
     return luminosity_function.inverse(luminosity_function.schechter(), matching.Z_LAST)
 
 
@@ -187,10 +264,23 @@ def _selection(requested: Universe, training: Training | None) -> BandRatios:
 
 
 def draw(cell: int, universe: GalaxyModel, cells: CellCache, dust: Float32) -> pa.Table:
-    """Rows of table `galaxies` that are truly in one order-8 cell, sorted by _healpix_29 of where they are seen.
+    """Draw the galaxies whose true positions are in one order-8 cell.
 
-    cells : what has been drawn of the universe's population
-    dust  : float32[pixel] mag, map of the Milky Way's A(V) (truesky.catalogue.dust_map)
+    Parameters
+    ----------
+    cell : int
+        Nested index of the order-8 cell.
+    universe : GalaxyModel
+        The model.
+    cells : CellCache
+        Cache of the drawn halos and members.
+    dust : float32 array, shape (pixels,)
+        Map of the Milky Way's A(V), mag (truesky.catalogue.dust_map).
+
+    Returns
+    -------
+    Table
+        Rows of table `galaxies`, sorted by _healpix_29 of the observed positions.
     """
     lens = halo_lensing.lens_of_cell(universe.lens, cells, cell)
     return draw_members(cell, universe, population.members(cells, cell), lens, dust)
@@ -204,11 +294,27 @@ def draw_members(
     dust: Float32,
     position_filter: PositionFilter | None = None,
 ) -> pa.Table:
-    """Those of them that are bright enough, and quasars and galaxies beyond the light-cone.
+    """Draw the properties of members of a cell, and its quasars and galaxies beyond the light-cone.
 
-    members : of the cell, or some of them;  lens : of the cell
-    near    : which true places the second are wanted at, None = all
-    cell, universe, dust : as of `draw`
+    Parameters
+    ----------
+    cell : int
+        Nested index of the order-8 cell.
+    universe : GalaxyModel
+        The model.
+    members : Members
+        Members of the cell, or a selection of them.
+    lens : Lens or Neighbourhood
+        Lensing in the cell.
+    dust : float32 array, shape (pixels,)
+        Map of the Milky Way's A(V), mag.
+    position_filter : callable, optional
+        Function that selects true positions of quasars and of galaxies beyond the light-cone; None selects all.
+
+    Returns
+    -------
+    Table
+        Rows of table `galaxies` brighter than the limit, sorted by _healpix_29 of the observed positions.
     """
     seed = universe.population.seed
     drawn, physical = _bright(
@@ -230,7 +336,22 @@ def draw_members(
 
 
 def halo_table(cell: int, universe: Population, cells: CellCache) -> pa.Table:
-    """Table `halos` of one order-8 cell, sorted by _healpix_29."""
+    """Return table `halos` of one order-8 cell, sorted by _healpix_29.
+
+    Parameters
+    ----------
+    cell : int
+        Nested index of the order-8 cell.
+    universe : Population
+        The population.
+    cells : CellCache
+        Cache of the drawn halos.
+
+    Returns
+    -------
+    Table
+        Rows of table `halos`.
+    """
     hosts = population.halos_of(cells, cell)
     ra, dec = sky.positions_of_indices(hosts.index)
     z = universe.halos.distances.redshift(hosts.chi)
@@ -249,7 +370,7 @@ def halo_table(cell: int, universe: Population, cells: CellCache) -> pa.Table:
 
 
 def halo_limits(universe: Population) -> pa.Table:
-    """Table `halo_limits`, from the nearest halos to the request's end."""
+    """Return table `halo_limits`, from the nearest halos to the largest distance of the request."""
     chi = universe.halos.steps.middle
     chi = np.append(chi[chi < universe.halos.max_distance], universe.halos.max_distance)
     return HALO_LIMITS.build(
@@ -263,10 +384,27 @@ def halo_limits(universe: Population) -> pa.Table:
 def select(
     universe: GalaxyModel, z: Float, m_r: Float, colour: Colour, sed: Sed, deeper: float = 0.0
 ) -> SelectedGalaxies:
-    """The galaxies whose continuum is brighter than the limit, with their realised colours.
+    """Select the galaxies whose continuum is brighter than the limit, and compute the colours of their spectra.
 
-    z, m_r : float[n] redshift, M_r mag;  colour, sed : of n galaxies, their colours as drawn and spectra
-    universe : whose limit and passband hold;  deeper : mag, beyond the limit
+    Parameters
+    ----------
+    universe : GalaxyModel
+        The model with limit and passband.
+    z : float array, shape (n,)
+        Redshift.
+    m_r : float array, shape (n,)
+        M_r, mag.
+    colour : Colour
+        Drawn colours.
+    sed : Sed
+        Spectra.
+    deeper : float
+        Margin beyond the limit, mag.
+
+    Returns
+    -------
+    SelectedGalaxies
+        The selected galaxies.
     """
     magnitude = apparent_magnitude(universe, z, m_r, sed)
     row = np.flatnonzero(magnitude < universe.limit + deeper)
@@ -278,7 +416,7 @@ def select(
 def _bright(
     universe: GalaxyModel, members: Members, drawn: SelectedGalaxies
 ) -> tuple[SelectedGalaxies, dict[str, Float]]:
-    """Those that are brighter than the limit with their lines; their masses, star formation rates and line fluxes."""
+    """Select galaxies brighter than the limit with emission lines; return also masses, rates and line fluxes."""
     seed, source_ids, colour = universe.population.seed, members.id[drawn.row], drawn.colour
     log_mass = stellar_mass.log_stellar_mass(universe.masses, drawn.m_r, colour.colour, drawn.z)
     main = stellar_mass.main_sequence(universe.star_formation, log_mass, drawn.z)
@@ -293,17 +431,33 @@ def _bright(
 
 
 def apparent_magnitude(universe: GalaxyModel, z: Float, m_r: Float, sed: Sed) -> Float:
-    """Magnitude[n] of the continuum in the limit's band, AB, unmagnified, before hydrogen and dust on the way to us.
+    """Return the magnitude of the continuum in the limit's band.
 
-    z, m_r : float[n] redshift, M_r mag;  sed : n spectra
-    universe : whose passband holds
-    Error: < 0.001 mag (tests/truesky/catalogue/galaxies/test_band_ratios.py)
+    Parameters
+    ----------
+    universe : GalaxyModel
+        The model with the passband.
+    z : float array, shape (n,)
+        Redshift.
+    m_r : float array, shape (n,)
+        M_r, mag.
+    sed : Sed
+        Spectra of the n galaxies.
+
+    Returns
+    -------
+    float array, shape (n,)
+        AB magnitude before magnification, intergalactic hydrogen and the Milky Way's dust.
+
+    Notes
+    -----
+    The error is below 0.001 mag (tests/truesky/catalogue/galaxies/test_band_ratios.py).
     """
     return m_r + cosmology.distance_modulus(z) + band_ratios.offset(universe.selection, z, sed)
 
 
 def _draw_candidates(seed: int, universe: GalaxyModel, members: Members) -> tuple[Float, Float, Colour, Sed]:
-    """Candidates of a cell: z, M_r, colours, spectra."""
+    """Draw the candidates of a cell: z, M_r, colours, spectra."""
     z, colours, colour_limits = members.z, universe.colours, universe.colour_limits
     m_r = universe.population.halos.matching.magnitude(z, members.proxy)
     satellites = quenching.satellite_share(universe.halo_shares, members)
@@ -374,7 +528,7 @@ def _shape_columns(
 
 
 def _mean_ellipticities(universe: GalaxyModel, members: Members, drawn: SelectedGalaxies) -> Complex:
-    """Mean ellipticities that the places of galaxies ask for."""
+    """Return the mean ellipticities that the alignments predict."""
     mean, alignment_model = np.zeros(drawn.row.size, complex), universe.alignments
     if alignment_model is None:
         return mean

@@ -1,15 +1,17 @@
-"""Lensing by halos, besides that by the matter of the box: what `galaxies` has of both.
+"""Lensing by halos in addition to the matter of the box, as used in table `galaxies`.
 
-around   the halos that reach into one generation cell
-columns  observed positions, convergence and shear of sources of that cell
-images   convergence, shear and deflection by halos, where the images are
+Notes
+-----
+The matter of the box deflects the light of a halo as well as the light of sources behind it, by 20 to 40 arcsec less.
+Distances between halos and sources are therefore measured between the positions at which the box alone shows them. From
+there, one Newton step of theta = beta + alpha(theta) leads to the image, and the lensing is summed again at the image.
 
-Matter of the box bends the light of a halo as well as that of what lies behind it, by 20" to 40" less: distances
-between the two are taken between the directions in which the box alone shows them. From there one Newton step leads to
-where the halos show the source, theta = beta + alpha(theta), and everything is summed again there.
-Error: 0.5" of the lens equation for 99 % of the sources (tests); what halos do to each other's light, about kappa^2, is
-       left out
-Ref: Bartelmann & Schneider 2001, Phys. Rep. 340, 291, sections 3.1 and 4.3
+The lens equation is solved to 0.5 arcsec for 99 % of the sources (tests). Terms of about kappa^2, in which halos lens
+the light of other halos, are left out.
+
+References
+----------
+Bartelmann & Schneider 2001, Phys. Rep. 340, 291, sections 3.1 and 4.3
 """
 
 from __future__ import annotations
@@ -32,27 +34,41 @@ from truesky.catalogue.halos.lens_halos import Settings
 from truesky.catalogue.halos.population import CellCache, Population
 from truesky.fluxes import cosmology, sources
 
-# Sources of a cell of this order have the same halos to look through.
+# Sources in one cell of this order use the same list of halos.
 _SOURCE_ORDER = 11
-# Rows of what is kept of halos: direction (3), those of halo_lensing_sums from the distance on, log10 of the mass.
+# Rows of the cached table of halos: direction (3), the rows of halo_lensing_sums from the distance on, log10 of the
+# mass.
 _CHI, _CIRCLE, _MASS = 3, 7, 9
-# Cells of halos that are kept: a cell's neighbourhood and that of the cells about it.
+# Number of cached cells with halos: the neighbourhood of a cell and of its neighbours.
 _MAX_CACHED_CELLS = 1024
-# How far all other halos but the strongest bend light together, rad.
+# Upper limit of the deflection by all halos except the strongest, rad.
 _OTHER_DEFLECTION = float(np.radians(45.0 / 3600.0))
-# The grid goes this far beyond a cell, rad: no source is shown farther from where it is.
+# The grid extends beyond the cell by this angle, rad; no source is deflected farther.
 _GRID_MARGIN = np.radians(7.0 / 60.0)
-# (order, cell) -> rad.
+# Function of (order, cell) that returns a distance in rad.
 MinDistance = Callable[[int, int], float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Neighbourhood:
-    """What lenses the sources of one cell: the box, and halos in the tangent plane of the cell's centre.
+    """Matter that lenses the sources of one cell: the box, and halos in the tangent plane of the cell's centre.
 
-    frame  : [3, 3] east, north and direction of the centre;  halos : [8, h] as halo_lensing_sums wants them
-    planes : [p] 1 / distance, h/Mpc;  smooth : [p, side, side, 5], what halos do to nodes of a grid in the plane
-    farthest : how far halos bend light at most, rad
+    Attributes
+    ----------
+    box : Planes
+        Lensing maps of the box.
+    settings : Settings
+        Settings of the halo lensing.
+    frame : float array, shape (3, 3)
+        East, north and direction of the centre.
+    halos : float array, shape (8, h)
+        Halos in the form of halo_lensing_sums.
+    planes : float array, shape (p,)
+        Inverse distances, h/Mpc.
+    smooth : float array, shape (p, side, side, 5)
+        Smooth part of the halo lensing at the nodes of a grid in the plane.
+    max_deflection : float
+        Largest deflection by halos, rad.
     """
 
     box: Planes
@@ -67,12 +83,24 @@ class Neighbourhood:
 def lens_of_cell(
     lens: Lens, cells: CellCache, cell: int, min_distance: MinDistance | None = None
 ) -> Lens | Neighbourhood:
-    """The halos that reach into a generation cell, by distance, those of one distance by mass and identifier.
+    """Collect the halos that lens sources in a generation cell.
 
-    lens  : the maps; where there is one shear for all, it stays so
-    cells : what has been drawn of the universe's population: what halos do is kept there
-    cell  : nested index at order 8
-    away  : how far the sources that matter are at least from a cell of an order, rad; None: all of the cell's matter
+    Parameters
+    ----------
+    lens : Lens
+        Maps of the box; a uniform shear is returned unchanged.
+    cells : CellCache
+        Cache of the drawn halos, in which the lensing of halos is also cached.
+    cell : int
+        Nested index of the order-8 cell.
+    min_distance : callable, optional
+        Lower limit of the distance of the relevant sources from a cell (order, cell), rad; None to use all halos of the
+        cell.
+
+    Returns
+    -------
+    Lens or Neighbourhood
+        Halos sorted by distance, then by mass and identifier, with the maps of the box.
     """
     if not isinstance(lens, Planes):
         return lens
@@ -84,7 +112,7 @@ def lens_of_cell(
     halo_cells = halo_cells if min_distance is None else _select_reaching(settings, halo_cells, min_distance)
     parts = [_cached_lenses(settings, lens, cells, *place) for place in halo_cells]
     halos, identifiers = np.concatenate([part[0] for part in parts], 1), np.concatenate([part[1] for part in parts])
-    # A chord is no longer than its arc.
+    # A chord is never longer than its arc, so this comparison selects enough halos.
     squared_chord = np.sum((halos[:3] - frame[2][:, None]) ** 2, 0)
     reaching = squared_chord <= (np.maximum(halos[_CHI + 2], halos[_CIRCLE]) + np.radians(radius)) ** 2
     halos, identifiers = halos[:, reaching], identifiers[reaching]
@@ -94,10 +122,21 @@ def lens_of_cell(
 
 
 def columns(lens: Lens | Neighbourhood, ra: Float, dec: Float, chi: Float) -> dict[str, Array]:
-    """Observed and true positions, and lensing, of sources as columns of table `galaxies`.
+    """Return positions and lensing of sources as columns of table `galaxies`.
 
-    ra, dec : float[n] deg, true;  chi : float[n] Mpc/h
-    lens    : halos and maps, maps alone, or one shear for all
+    Parameters
+    ----------
+    lens : Lens or Neighbourhood
+        Halos and maps, maps alone, or a uniform shear.
+    ra, dec : float array, shape (n,)
+        True positions, deg.
+    chi : float array, shape (n,)
+        Comoving distance, Mpc/h.
+
+    Returns
+    -------
+    dict of str to array, shape (n,)
+        Observed and true positions, convergence and shear.
     """
     if not isinstance(lens, Neighbourhood):
         return lensing.columns(lens, ra, dec, chi)
@@ -111,11 +150,22 @@ def columns(lens: Lens | Neighbourhood, ra: Float, dec: Float, chi: Float) -> di
 
 
 def lensing_at_images(lens: Neighbourhood, ra: Float, dec: Float, chi: Float) -> Float:
-    """[5, n] kappa, gamma1, gamma2, deflection east, north (rad) by halos, at the images of sources.
+    """Return the lensing by halos at the images of sources.
 
-    Of each source alone, whichever others it comes with.
-    ra, dec : float[n] deg, as the box alone shows the sources;  chi : float[n] Mpc/h
-    lens    : of the cell that the sources are in, before anything bends their light
+    Parameters
+    ----------
+    lens : Neighbourhood
+        Halos that lens the cell with the true positions of the sources.
+    ra, dec : float array, shape (n,)
+        Positions at which the box alone shows the sources, deg.
+    chi : float array, shape (n,)
+        Comoving distance, Mpc/h.
+
+    Returns
+    -------
+    float array, shape (5, n)
+        kappa, gamma1, gamma2, deflection to the east and north (rad). The result of a source does not depend on the
+        other sources.
     """
     cell = sky.cell_at(ra, dec, _SOURCE_ORDER)
     row = np.lexsort((-chi, cell))
@@ -132,12 +182,13 @@ def lensing_at_images(lens: Neighbourhood, ra: Float, dec: Float, chi: Float) ->
 
 
 def _refuse_large_deflection(lens: Neighbourhood, deflection: Float) -> None:
-    """Refuse what would be seen in a cell that does not look for it."""
+    """Raise BadInput for a deflection that could move a source into a cell that does not search for it."""
     largest = float(np.hypot(*deflection).max(initial=0.0))
     if largest > lens.max_deflection:
         largest_arcsec, allowed_arcsec = (np.degrees(angle) * 3600.0 for angle in (largest, lens.max_deflection))
         raise BadInput(
-            f"table galaxies: halos deflect light by {largest_arcsec:.0f} arcsec, {allowed_arcsec:.0f} are allowed for"
+            f"table galaxies: halos deflect light by {largest_arcsec:.0f} arcsec, "
+            f"at most {allowed_arcsec:.0f} are allowed"
         )
 
 
@@ -147,7 +198,7 @@ def _refuse_large_deflection(lens: Neighbourhood, deflection: Float) -> None:
 def _cells_with_halos(
     settings: Settings, cell: int, centre: tuple[float, float], radius: float
 ) -> list[tuple[int, int, float]]:
-    """(order, cell, least mass) of cells whose halos may reach into the generation cell, of some heavy ones only."""
+    """Return (order, cell, lowest mass) of cells whose halos may lens the generation cell."""
     close_cells = set(sky.cells_in_cone(*centre, radius + settings.wide / 60.0, GENERATION_ORDER).tolist())
     cells_in_reach = sky.cells_in_cone(*centre, radius + settings.reach / 60.0, GENERATION_ORDER).tolist()
     selected = [
@@ -166,7 +217,7 @@ def _cells_with_halos(
 def _select_reaching(
     settings: Settings, candidates: list[tuple[int, int, float]], min_distance: MinDistance
 ) -> list[tuple[int, int, float]]:
-    """Those of `_near` whose halos may reach nodes about the sources."""
+    """Select the cells of `_cells_with_halos` whose halos may reach grid nodes around the sources."""
     margin = np.radians((settings.strip + 2.0 * settings.step) / 60.0)
     wide, selected = np.radians(settings.wide / 60.0), []
     for order, cell, min_mass in candidates:
@@ -180,7 +231,7 @@ def _select_reaching(
 def _cached_lenses(
     settings: Settings, box: Planes, cells: CellCache, order: int, cell: int, min_mass: float
 ) -> tuple[Float, Int]:
-    """([10, h], identifiers[h]) of halos above a mass that a cell of a level draws, where the box shows them."""
+    """Return (table, shape (10, h); identifiers) of halos above a mass in a cell, where the box alone shows them."""
     cache, key, full_key = cells.lenses, (order, cell, min_mass), (order, cell, settings.lowest)
     if key not in cache:
         max_distance = (
@@ -202,7 +253,7 @@ def _cached_lenses(
 
 
 def _lens_table(settings: Settings, box: Planes, population: Population, hosts: Halos, order: int) -> tuple[Float, Int]:
-    """What `_lenses` has of halos of a level."""
+    """Return the table and identifiers of `_cached_lenses` for given halos."""
     ra, dec = sky.positions_of_indices(hosts.index)
     deflection = lensing.interpolate(box, ra, dec, hosts.chi)[3:]
     direction = _frames(*lensing.displace(ra, dec, *deflection))[:, 2]
@@ -212,8 +263,8 @@ def _lens_table(settings: Settings, box: Planes, population: Population, hosts: 
 
 
 def _max_deflection(halos: Float) -> float:
-    """The strongest of the halos bends light by its own, infinitely far behind it; all others together by less."""
-    # Its compiler takes a second to import.
+    """Upper limit of the deflection: the strongest halo with sources at infinity, plus a limit for all other halos."""
+    # Import here, because compiling takes a second.
     from truesky.catalogue.halos import halo_lensing_sums as sums
 
     amplitude, size = halos[sums.AMPLITUDE], halos[sums.SIZE]
@@ -225,7 +276,7 @@ def _max_deflection(halos: Float) -> float:
 
 @lru_cache
 def _max_enclosed_ratio() -> tuple[Float, Float]:
-    """Concentrations, and the most that is enclosed, over the radius, both in units of the halo's own."""
+    """Return (concentrations; largest enclosed mass / radius, both in units of the halo's values)."""
     from truesky.catalogue.halos import projected_nfw
 
     nodes, shares = np.geomspace(1.0, 100.0, 25), np.linspace(0.02, 0.99, 98)
@@ -236,8 +287,8 @@ def _max_enclosed_ratio() -> tuple[Float, Float]:
 
 
 def _grid(settings: Settings, halos: Float) -> tuple[Float, Float]:
-    """(planes[p], smooth[p, side, side, 5]) of the halos that reach into a cell."""
-    # Its compiler takes a second to import.
+    """Return (planes[p]; smooth[p, side, side, 5]) of the halos that reach into a cell."""
+    # Import here, because compiling takes a second.
     from truesky.catalogue.halos import halo_lensing_sums as sums
 
     step = np.radians(settings.step / 60.0)
@@ -257,7 +308,7 @@ def _grid(settings: Settings, halos: Float) -> tuple[Float, Float]:
 
 
 def _sum_halos(lens: Neighbourhood, place: Float, inverse_distance: Float, cell: Int) -> Float:
-    """[5, n] in the tangent plane; sources by cell, in each the farthest first."""
+    """Lensing in the tangent plane, shape (5, n); sources must be sorted by cell, then by decreasing distance."""
     from truesky.catalogue.halos import halo_lensing_sums as sums
 
     first = np.append(np.unique(cell, return_index=True)[1], cell.size)
@@ -268,7 +319,7 @@ def _sum_halos(lens: Neighbourhood, place: Float, inverse_distance: Float, cell:
 
 
 def _rows_to_repeat(settings: Settings, terms: Float) -> Int:
-    """Rows of what is summed again where its image is: neither hardly lensed nor near a caustic."""
+    """Rows that are summed again at their images: neither weakly lensed nor close to a caustic."""
     kappa, gamma1, gamma2 = terms[:3]
     strong = np.abs(kappa) + np.hypot(gamma1, gamma2) > settings.repeat_threshold
     weak = sources.determinant(kappa, gamma1, gamma2) >= settings.least_determinant
@@ -276,7 +327,7 @@ def _rows_to_repeat(settings: Settings, terms: Float) -> Int:
 
 
 def _newton_step(terms: Float) -> Float:
-    """[2, n] rad, the step from theta = beta to the root of theta - alpha(theta) - beta."""
+    """Step from theta = beta to the root of theta - alpha(theta) - beta, shape (2, n), rad."""
     kappa, gamma1, gamma2, east, north = terms
     x = (1.0 - kappa + gamma1) * east + gamma2 * north
     y = gamma2 * east + (1.0 - kappa - gamma1) * north
@@ -284,7 +335,7 @@ def _newton_step(terms: Float) -> Float:
 
 
 def _frames(ra: Float, dec: Float) -> Float:
-    """[n, 3, 3] east, north and direction of places; ra, dec deg."""
+    """East, north and direction of positions in deg, shape (n, 3, 3)."""
     lon, lat = np.radians(ra), np.radians(dec)
     sin, cos, up, flat = np.sin(lon), np.cos(lon), np.sin(lat), np.cos(lat)
     rows = (-sin, cos, np.zeros_like(lon)), (-up * cos, -up * sin, flat), (flat * cos, flat * sin, up)
@@ -292,13 +343,13 @@ def _frames(ra: Float, dec: Float) -> Float:
 
 
 def _stereographic(frame: Float, direction: Float) -> Float:
-    """[2, n] rad, of directions [n, 3] about the centre of a frame: shapes stay as they are."""
+    """Project directions (n, 3) stereographically (conformally) around the centre of a frame, shape (2, n), rad."""
     x, y, along = (np.sum(direction * axis, -1) for axis in frame)
     return np.asarray(np.stack([x, y]) * (2.0 / (1.0 + along)))
 
 
 def _rotate_to_sources(terms: Float, frame: Float, frames: Float) -> Float:
-    """From the frame of the plane to the sources' own east and north."""
+    """Rotate from the frame of the plane to east and north at each source."""
     x, y = (np.sum(frames[:, 0] * frame[axis], -1) for axis in range(2))
     length = np.hypot(x, y)
     cos, sin = x / length, y / length

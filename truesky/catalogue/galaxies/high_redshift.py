@@ -1,13 +1,12 @@
-"""Quasars, and galaxies beyond redshift 6: rows of table `galaxies` of kinds 2 and 3.
+"""Quasars and galaxies beyond redshift 6: rows of table `galaxies` of kinds 2 and 3.
 
-model       the luminosity functions, tabulated
-draw        rows of one generation cell
-per_deg2    how many there are
+They are drawn at random positions without clustering. `density_boost` is the ratio of the drawn to the natural number
+density. Each magnitude is drawn separately, so that a shallower request contains the brighter objects of a deeper one.
+The parameters are in high_redshift.toml.
 
-They are drawn at random places: no structure. `density_boost` says how many times more were drawn than there are. Each
-magnitude is drawn by itself, so that a shallower request has the brighter ones of a deeper one.
-Ref: Palanque-Delabrouille et al. 2016; Bouwens et al. 2021, AJ 162, 47; Matsuoka et al. 2018, ApJ 869, 150; the numbers
-are in high_redshift.toml.
+References
+----------
+Palanque-Delabrouille et al. 2016; Bouwens et al. 2021, AJ 162, 47; Matsuoka et al. 2018, ApJ 869, 150
 """
 
 from __future__ import annotations
@@ -43,21 +42,39 @@ from truesky.randomness.rng import stream
 
 _FILE = "high_redshift.toml"
 _STREAM = {HIGH_REDSHIFT: "high_redshift", QUASAR: "quasars"}
-# ra, dec [n] deg -> which of them.
+# Function of ra and dec (deg) that selects positions.
 PositionFilter = Callable[[Float, Float], Bool]
 _Z_STEP, _M_STEP, _M_BRIGHTEST = 0.02, 0.02, -32.0
-# Where the light-cone of galaxies ends and other populations begin, and the brightest magnitude that is drawn.
+# Redshift at which the light-cone of galaxies ends and the other populations begin, and the brightest magnitude drawn.
 _LIGHTCONE_END, _FIRST_MAGNITUDE = 6.0, 10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Kind:
-    """One of the two kinds: numbers of the file, and counts per deg2 of cells of (z, M), by apparent magnitude.
+    """Parameters of a kind of object, and its counts per deg2 in cells of (z, M), by integer apparent magnitude.
 
-    limit : faintest ultraviolet magnitude, AB;  z_end : redshift at which a nearer universe ends (what is beyond
-            z = 6 stays)
-    z : [r] lower edges;  m : [c] lower edges;  first : of the magnitudes
-    cells, counts : of each whole magnitude, int[k] places in [r, c] and float[k] their numbers, cumulative
+    Attributes
+    ----------
+    code : int
+        Kind: HIGH_REDSHIFT or QUASAR.
+    numbers : dict
+        Parameters of the file.
+    boost : float
+        Ratio of the drawn to the natural number density.
+    z : float array, shape (r,)
+        Lower edges of the redshift cells.
+    m : float array, shape (c,)
+        Lower edges of the cells of absolute ultraviolet magnitude.
+    limit : float
+        Faintest ultraviolet AB magnitude.
+    z_end : float
+        Redshift at which the request's universe ends. Objects beyond z = 6 are kept.
+    first : int
+        First integer magnitude.
+    cells : tuple of int array
+        Flat indices into (r, c) of the cells of each integer magnitude.
+    counts : tuple of float array
+        Cumulative counts of these cells.
     """
 
     code: int
@@ -72,7 +89,7 @@ class Kind:
     counts: tuple[Float, ...]
 
     def per_deg2(self, z_min: float = 0.0, z_max: float = np.inf) -> float:
-        """How many there are in nature between two redshifts, deg-2: near, far, of whole steps of the table."""
+        """Return the natural number per deg2 between two redshifts, which should be edges of the redshift cells."""
         number = 0.0
         for cells, counts in zip(self.cells, self.counts, strict=True):
             z, m = (nodes[i] for nodes, i in zip((self.z, self.m), np.divmod(cells, self.m.size), strict=True))
@@ -90,10 +107,21 @@ class Kind:
 def model(
     galaxy_boost: float = 1.0, quasar_boost: float = 1.0, limit: float = 26.0, z_end: float = 6.0
 ) -> tuple[Kind, ...]:
-    """The kinds that are drawn; a boost of 0 leaves one out.
+    """Return the kinds that are drawn; a kind with boost 0 is left out.
 
-    galaxy_boost, quasar_boost : how many times denser than in nature
-    limit : faintest magnitude, AB, at 1500 or 1450 A in the rest frame;  z_end : of the universe's galaxies
+    Parameters
+    ----------
+    galaxy_boost, quasar_boost : float
+        Ratio of the drawn to the natural number density.
+    limit : float
+        Faintest AB magnitude at 1500 A (galaxies) or 1450 A (quasars) in the rest frame.
+    z_end : float
+        Largest redshift of the universe's galaxies.
+
+    Returns
+    -------
+    tuple of Kind
+        The kinds.
     """
     kinds = ((HIGH_REDSHIFT, "galaxies", galaxy_boost), (QUASAR, "quasars", quasar_boost))
     included = ((code, parameters.section(_FILE, name), boost) for code, name, boost in kinds if boost > 0.0)
@@ -108,19 +136,34 @@ def draw(
     dust: Float32,
     position_filter: PositionFilter | None = None,
 ) -> pa.Table:
-    """Rows of one kind that are truly in a generation cell.
+    """Draw the objects of one kind whose true positions are in a generation cell.
 
-    dust : float32[pixel] map of A(V), mag (truesky.catalogue.dust_map)
-    cell   : nested index at order 8;  seed : of the request;  kind : the objects' luminosity function and boost
-    lens   : halos and maps, maps alone, or one shear for all
-    near   : which true places are wanted, None = all
+    Parameters
+    ----------
+    cell : int
+        Nested index of the order-8 cell.
+    seed : int
+        Seed of the request.
+    kind : Kind
+        Luminosity function and boost.
+    lens : Lens or Neighbourhood
+        Halos and maps, maps alone, or a uniform shear.
+    dust : float32 array, shape (pixels,)
+        Map of A(V), mag (truesky.catalogue.dust_map).
+    position_filter : callable, optional
+        Function that selects true positions; None selects all.
+
+    Returns
+    -------
+    Table
+        Rows of table `galaxies`.
     """
     samples = [_draw_magnitude(cell, seed, kind, step) for step in range(len(kind.cells))]
     z, m, ra, dec = (np.concatenate(column) for column in zip(*samples, strict=True))
     selected = (ultraviolet_magnitude(m, z) < kind.limit) & ((z < kind.z_end) | (z >= _LIGHTCONE_END))
     if position_filter is not None:
         selected &= position_filter(ra, dec)
-    # Numbered with those that are left out.
+    # The numbers count all drawn objects, so that they do not depend on the selection.
     numbers = ids.FIRST_NUMBER + np.flatnonzero(selected)
     z, m, ra, dec = z[selected], m[selected], ra[selected], dec[selected]
     source = ids.source_id(np.full(numbers.size, kind.code), cell, numbers)
@@ -150,7 +193,7 @@ def draw(
 
 
 def _draw_magnitude(cell: int, seed: int, kind: Kind, step: int) -> tuple[Float, Float, Float, Float]:
-    """Redshifts[n], M[n], ra[n] and dec[n], deg, of one whole magnitude."""
+    """Redshift, M, ra and dec (deg) of the objects of one integer magnitude."""
     rng, counts = stream(seed, _STREAM[kind.code], cell, kind.first + step), kind.counts[step]
     total = float(counts[-1]) if counts.size else 0.0
     n = int(rng.poisson(kind.boost * total * sky.cell_area(GENERATION_ORDER)))
@@ -162,10 +205,23 @@ def _draw_magnitude(cell: int, seed: int, kind: Kind, step: int) -> tuple[Float,
 
 
 def density(code: int, numbers: dict[str, Any], m: Float, z: Float) -> Float:
-    """dn/dM, Mpc^-3 mag^-1.
+    """Return the luminosity function dn/dM.
 
-    m : float[...] absolute ultraviolet AB mag;  z : float[...]
-    code    : kind of object;  numbers : constants of its luminosity function
+    Parameters
+    ----------
+    code : int
+        Kind: HIGH_REDSHIFT or QUASAR.
+    numbers : dict
+        Parameters of its luminosity function.
+    m : float array
+        Absolute ultraviolet AB magnitude.
+    z : float array
+        Redshift, of the same shape as `m` or broadcastable.
+
+    Returns
+    -------
+    float array
+        dn/dM, Mpc^-3 mag^-1.
     """
     z_offset = z - _LIGHTCONE_END
     if code == QUASAR:
@@ -202,7 +258,7 @@ def _tabulate_kind(code: int, numbers: dict[str, Any], boost: float, limit: floa
     middle_z, middle_m = z[:, None] + 0.5 * _Z_STEP, m[None, :] + 0.5 * _M_STEP
     volume = cosmology.comoving_volume(z, z + _Z_STEP)[:, None] * np.radians(1.0) ** 2 / cosmology.HUBBLE**3
     counts = density(code, numbers, middle_m, middle_z) * volume * _M_STEP
-    # Of a whole magnitude all are drawn, a little more than the limit takes.
+    # Draw all objects of each integer magnitude, slightly beyond the limit.
     mag = np.floor(ultraviolet_magnitude(middle_m, middle_z))
     last = int(np.ceil(limit + 2.0 * _M_STEP))
     cells = tuple(np.flatnonzero(mag == step) for step in range(_FIRST_MAGNITUDE, last))
@@ -211,7 +267,7 @@ def _tabulate_kind(code: int, numbers: dict[str, Any], boost: float, limit: floa
 
 
 def _templates(kind: Kind, m: Float, rng: AnyGenerator) -> Int:
-    """Index of the template: slope, then strength of the lines."""
+    """Index of the template: slope first, then the strength of the lines."""
     if kind.code == QUASAR:
         slope = rng.integers(0, len(QUASAR_OFFSETS), m.size)
         return np.asarray(slope * len(QUASAR_STRENGTHS) + rng.integers(0, len(QUASAR_STRENGTHS), m.size), np.int64)
@@ -225,7 +281,7 @@ def _templates(kind: Kind, m: Float, rng: AnyGenerator) -> Int:
 
 
 def _shapes(kind: Kind, z: Float, m: Float, rng: AnyGenerator) -> dict[str, npt.NDArray[np.generic]]:
-    """One Sersic component: everything is in the bulge."""
+    """Shape of a single Sersic component, which is stored as the bulge."""
     law, n = kind.numbers, z.size
     if kind.code == QUASAR:
         radius, ratio, sersic = np.full(n, law["radius"]), np.ones(n), 1.0

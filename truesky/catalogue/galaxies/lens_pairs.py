@@ -1,4 +1,4 @@
-"""Which galaxies lie behind which lens: the loop over pairs, each of which has numbers of its own."""
+"""Compiled loop over pairs of lenses and sources; each pair has separate random numbers."""
 
 from __future__ import annotations
 
@@ -9,19 +9,36 @@ import numpy as np
 from truesky.numerics.compiling import exact_jit
 from truesky.randomness.compiled_draws import child_key, normal, uniform
 
-# Of a pair: what its numbers are for.
+# Purposes of the random numbers of a pair.
 CHANCE, RADIUS, SHAPE, OFFSET, ANGLE = range(5)
 
 
 @exact_jit
 def find_pairs(lenses: Any, sources: Any, min_z_difference: Any, out: Any) -> int:
-    """Number of pairs that are drawn; where out is long enough they are filled in.
+    """Find the pairs of lenses and sources that are drawn.
 
-    Of a lens those sources are looked at whose place on a circle is in its window, `window` of them all: so many fewer
-    have so much more of a chance.
-    lenses  : key uint64[l], start, window, chance, z float64[l]: place of its window, and the chance of each source
-    sources : key uint64[s], place, z float64[s], by place;  apart : least difference of redshifts
-    out     : lens, source int64[n];  key uint64[n];  float64[n, 4], the second normal, the others uniform
+    Parameters
+    ----------
+    lenses : tuple of array, shape (l,)
+        key (uint64), start, window, chance and z (float64): start and length of a window of places, and the probability
+        of each source to be lensed.
+    sources : tuple of array, shape (s,)
+        key (uint64), place and z (float64), sorted by place, which is in [0, 1).
+    min_z_difference : float
+        Smallest redshift difference between source and lens.
+    out : tuple of array
+        Filled if it is long enough: lens and source (int64[n]), key of the pair (uint64[n]) and random numbers
+        (float64[n, 4]; the second is a normal deviate, the others are uniform).
+
+    Returns
+    -------
+    int
+        Number of pairs, which may be larger than `out`.
+
+    Notes
+    -----
+    A lens is paired only with the sources whose place on a circle is in its window. Their probability is divided by the
+    length of the window, so that the mean number of pairs does not depend on it.
     """
     key, start, window, chance, z = lenses
     source_key, place, z_source = sources

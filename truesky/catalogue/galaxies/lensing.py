@@ -1,18 +1,16 @@
-"""Weak lensing by the box itself: convergence, shear and deflection maps on source planes, and lensed positions.
+"""Weak lensing by the box: maps of convergence, shear and deflection on source planes, and observed positions.
 
-load        the planes of a box, from the cache or made now
-Shear       in their place one and the same shear of all sources, or none
-at          kappa, gamma1, gamma2, deflection of sources: bilinear on the sky, linear in distance between planes
-displaced   true positions -> observed ones
-columns     both, as table `galaxies` has them;  places : the positions of these
-farthest    how far light is bent at most
-turned      galaxies with other position angles, before lensing
+A uniform shear, or none, can replace the maps. gamma1 and gamma2 are in the frame (x, y) = (east, north): gamma1 < 0
+east and west of a mass, and gamma2 < 0 north-east of it. Deflections point away from a mass.
 
-gamma1, gamma2 are in the frame (x, y) = (east, north): east or west of a mass gamma1 < 0, north-east of it
-gamma2 < 0.  Deflections point away from a mass.
-Error: Born approximation; the convergence has the power of linear theory within 10 % up to l = nside for sources at
-       z > 0.4 (tests), none above 1.5 nside
-Ref: Bartelmann & Schneider 2001, Phys. Rep. 340, 291; Hu 2000, PhRvD 62, 043007
+Notes
+-----
+The maps use the Born approximation. The convergence has the power of linear theory within 10 % up to l = nside for
+sources at z > 0.4 (tests), and no power above 1.5 nside.
+
+References
+----------
+Bartelmann & Schneider 2001, Phys. Rep. 340, 291; Hu 2000, PhRvD 62, 043007
 """
 
 from __future__ import annotations
@@ -39,7 +37,7 @@ KAPPA, GAMMA_1, GAMMA_2, EAST, NORTH = range(5)
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """How the maps are made (lensing.toml, [lensing])."""
+    """Settings of the maps (lensing.toml, [lensing])."""
 
     planes: tuple[float, ...]
     far_planes: tuple[float, ...]
@@ -51,9 +49,16 @@ class Settings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Planes:
-    """Lensing of sources at distances chi[p] Mpc/h.
+    """Lensing maps for sources at p comoving distances.
 
-    maps : one float32[12 nside^2, 5] a plane, nested: kappa, gamma1, gamma2, deflection east and north in rad
+    Attributes
+    ----------
+    nside : int
+        Resolution of the maps.
+    chi : float array, shape (p,)
+        Comoving distances, Mpc/h.
+    maps : tuple of float32 array, shape (12 nside^2, 5)
+        One map per plane, nested: kappa, gamma1, gamma2, deflection to the east and north (rad).
     """
 
     nside: int
@@ -63,9 +68,10 @@ class Planes:
 
 @dataclass(frozen=True, slots=True)
 class Shear:
-    """A constant shear without convergence, in place of the box's; kappa = 0, so that gamma is the reduced shear.
+    """Uniform shear without convergence, which replaces the lensing by the box.
 
-    A constant shear has no origin on the sphere: sources are seen where they are.
+    Because kappa = 0, gamma equals the reduced shear. A uniform shear has no origin on the sphere, so sources are
+    observed at their true positions.
     """
 
     g1: float = 0.0
@@ -76,15 +82,35 @@ Lens = Planes | Shear
 
 
 def settings() -> Settings:
-    """The lensing of the embedded universe."""
+    """Return the lensing settings of the embedded universe."""
     return Settings(**parameters.section("lensing.toml", "lensing"))
 
 
 def load(box: Box, nside: int, with_far_planes: bool = False) -> Planes:
-    """The planes of a box; far : also those beyond the galaxies, for sources up to z = 10.
+    """Return the lensing maps of a box, from the cache or made now.
 
-    Made once: 15 s for nside = 256, four times as long for twice the resolution.
-    Errors: BadInput where nside is not a power of two from 16 to 2048
+    Parameters
+    ----------
+    box : Box
+        Matter in a box.
+    nside : int
+        Resolution of the maps, a power of 2 from 16 to 2048.
+    with_far_planes : bool
+        If True, include planes beyond the galaxies, for sources up to z = 10.
+
+    Returns
+    -------
+    Planes
+        The maps.
+
+    Raises
+    ------
+    BadInput
+        If `nside` is not a power of 2 from 16 to 2048.
+
+    Notes
+    -----
+    The maps take 15 s for nside = 256, and four times as long for twice the resolution.
     """
     if nside not in (1 << order for order in range(4, 12)):
         raise BadInput(f"lensing_nside = {nside} is not a power of two from 16 to 2048")
@@ -105,17 +131,28 @@ def load(box: Box, nside: int, with_far_planes: bool = False) -> Planes:
 
 
 def interpolate(planes: Planes, ra: Float, dec: Float, chi: Float) -> Float:
-    """[5, n] kappa, gamma1, gamma2, deflection east, north (rad) of sources at chi[n] Mpc/h.
+    """Interpolate the lensing of sources, bilinearly on the sky and linearly in distance between the planes.
 
-    ra, dec : float[n] deg, true;  chi : float[n] Mpc/h; beyond the last plane the lensing is that plane's
-    planes  : maps of convergence, shear and deflection, by distance of the sources
+    Parameters
+    ----------
+    planes : Planes
+        The maps.
+    ra, dec : float array, shape (n,)
+        True positions, deg.
+    chi : float array, shape (n,)
+        Comoving distance, Mpc/h. Sources beyond the last plane get the values of that plane.
+
+    Returns
+    -------
+    float array, shape (5, n)
+        kappa, gamma1, gamma2, deflection to the east and north (rad).
     """
     pixel, weight = hp.get_interp_weights(planes.nside, ra, dec, nest=True, lonlat=True)
     node, chi = np.concatenate([[0.0], planes.chi]), np.minimum(chi, planes.chi[-1])
     upper = np.clip(np.searchsorted(node, chi, side="right"), 1, planes.chi.size)
     part = (chi - node[upper - 1]) / (node[upper] - node[upper - 1])
     total = np.zeros((5, chi.size))
-    # Nothing is lensed at the observer: the plane below the first is empty.
+    # At the observer there is no lensing, so there is no map below the first plane.
     for plane, share in ((upper - 1, part), (upper - 2, 1.0 - part)):
         for number in np.unique(plane[plane >= 0]).tolist():
             rows = np.flatnonzero(plane == number)
@@ -126,10 +163,21 @@ def interpolate(planes: Planes, ra: Float, dec: Float, chi: Float) -> Float:
 
 
 def columns(lens: Lens, ra: Float, dec: Float, chi: Float) -> dict[str, Array]:
-    """Observed and true positions, and lensing, of sources as columns of table `galaxies`.
+    """Return positions and lensing of sources as columns of table `galaxies`.
 
-    ra, dec : float[n] deg, true;  chi : float[n] Mpc/h
-    lens    : maps, or one shear for all
+    Parameters
+    ----------
+    lens : Lens
+        Maps, or a uniform shear.
+    ra, dec : float array, shape (n,)
+        True positions, deg.
+    chi : float array, shape (n,)
+        Comoving distance, Mpc/h.
+
+    Returns
+    -------
+    dict of str to array, shape (n,)
+        Observed and true positions, convergence and shear.
     """
     if isinstance(lens, Shear):
         gamma = {"gamma1": np.full(ra.size, lens.g1), "gamma2": np.full(ra.size, lens.g2)}
@@ -140,7 +188,7 @@ def columns(lens: Lens, ra: Float, dec: Float, chi: Float) -> dict[str, Array]:
 
 
 def position_columns(observed: tuple[Float, Float], true: tuple[Float, Float]) -> dict[str, Array]:
-    """Columns of positions: seen, true : ra and dec [n], deg."""
+    """Return the columns of positions from observed and true (ra, dec) in deg."""
     return {
         "ra": sky.wrap_angle(observed[0]),
         "dec": observed[1],
@@ -151,10 +199,20 @@ def position_columns(observed: tuple[Float, Float], true: tuple[Float, Float]) -
 
 
 def max_deflection(planes: Planes, order: int, cell: int) -> float:
-    """How far the light of any source in a cell is bent at most, rad.
+    """Return the largest deflection of any source in a cell.
 
-    Between nodes of a map, and between two planes, a deflection is a mean of theirs.
-    order, cell : nested;  planes : maps
+    Parameters
+    ----------
+    planes : Planes
+        The maps.
+    order, cell : int
+        Order and nested index of the cell.
+
+    Returns
+    -------
+    float
+        Largest deflection, rad. Interpolated deflections are means of the values at pixels and planes, so none is
+        larger.
     """
     map_order = int(np.log2(planes.nside))
     coarse = min(order, map_order)
@@ -166,12 +224,12 @@ def max_deflection(planes: Planes, order: int, cell: int) -> float:
     return max(float(np.hypot(*field[pixels.ravel(), EAST:].T).max()) for field in planes.maps)
 
 
-# Where deflections lead.
+# Move positions by deflections.
 displace = sky.offset_positions
 
 
 def rotate_position_angles(rows: pa.Table, angle: float) -> pa.Table:
-    """Rows of table `galaxies` with every position angle increased by `angle` deg: what is lensed, not the lensing."""
+    """Return rows of table `galaxies` with `angle` (deg) added to each position angle; the lensing is not changed."""
     if angle % 180.0 == 0.0:
         return rows
     number = rows.schema.get_field_index("position_angle")
@@ -181,24 +239,49 @@ def rotate_position_angles(rows: pa.Table, angle: float) -> pa.Table:
 
 
 def is_near_caustic(kappa: Float, gamma1: Float, gamma2: Float, caustic: float) -> Bool:
-    """Sources[n] that weak lensing cannot describe: at a caustic, or beyond it.
+    """Return True for sources that weak lensing cannot describe, because they are at a caustic or beyond it.
 
-    kappa, gamma1, gamma2 : float[n];  caustic : least determinant that is described
+    Parameters
+    ----------
+    kappa, gamma1, gamma2 : float array, shape (n,)
+        Convergence and shear.
+    caustic : float
+        Smallest determinant that weak lensing describes.
+
+    Returns
+    -------
+    bool array, shape (n,)
+        True near a caustic.
     """
     return np.asarray((sources.determinant(kappa, gamma1, gamma2) < caustic) | (kappa >= 1.0))
 
 
 def maps_of_convergence(kappa: Float32, nside: int, gain: Float) -> Float32:
-    """Convergence, shear and deflection, float32[12 nside^2, 5] nested, of a map whose kappa_lm are gain[l] as large.
+    """Compute convergence, shear and deflection from a map of the convergence.
 
-    kappa : float32[12 nside^2], nested;  gain : float[l_max + 1]
-    Ref: Hu 2000, eqs. 35 and 36
+    Parameters
+    ----------
+    kappa : float32 array, shape (12 nside^2,)
+        Convergence, nested.
+    nside : int
+        Resolution of the map.
+    gain : float array, shape (l_max + 1,)
+        Factor by which the coefficients kappa_lm are multiplied.
+
+    Returns
+    -------
+    float32 array, shape (12 nside^2, 5)
+        Maps, nested: kappa, gamma1, gamma2, deflection to the east and north (rad).
+
+    References
+    ----------
+    Hu 2000, eqs. 35 and 36
     """
     top = gain.size - 1
     ring_of = hp.nest2ring(nside, np.arange(kappa.size))
     ring = np.empty(kappa.size)
     ring[ring_of] = kappa
-    # Without iterations the quadrature is wrong by 5e-4, a hundredth of what the pixels of the map smooth away.
+    # The error of the quadrature without iterations is 5e-4, a hundredth of the smoothing by the pixels of the map.
     alm = hp.almxfl(hp.map2alm(ring, lmax=top, iter=0), gain)
     ell = np.arange(top + 1)
     inner = np.maximum(ell * (ell + 1.0), 1.0)
@@ -212,7 +295,7 @@ def maps_of_convergence(kappa: Float32, nside: int, gain: Float) -> Float32:
 
 
 def _convergence_maps(box: Box, nside: int, chi: Float, chosen: Settings) -> dict[str, npt.NDArray[np.generic]]:
-    # Its compiler takes a second to import, and is not needed where the planes are in the cache.
+    # Import here, because compiling takes a second and is not needed if the planes are in the cache.
     from truesky.catalogue.matter import convergence
 
     direction = np.stack(hp.pix2vec(nside, np.arange(hp.nside2npix(nside)), nest=True)).astype(np.float32)

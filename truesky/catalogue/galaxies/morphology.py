@@ -1,12 +1,11 @@
-"""Sizes and shapes of galaxies: a Sersic bulge and an inclined exponential disc with one position angle.
+"""Sizes and shapes of galaxies: a Sersic bulge and an inclined exponential disc with the same position angle.
 
-half_light_radius   of the total light, from redshift, stellar mass and type
-bulge_fraction, sersic_index, radius_ratio, bulge_colour   of the bulge
-component_radii     the two half-light radii whose sum of light has the total's
-disc_axis_ratio, bulge_axis_ratio, inclination, position_angle
+All radii are semi-major axes. Galaxies on the red sequence (`red`) follow the relations of early types. The parameters
+and their sources are in morphology.toml.
 
-All radii are semi-major axes. `red` marks galaxies of the red sequence: they take the laws of early types.
-Ref: Serrano et al. 2024, "Bulge and disc model"; the numbers and their sources are in morphology.toml.
+References
+----------
+Serrano et al. 2024, "Bulge and disc model"
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from truesky.randomness.per_source import AnyGenerator
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """Half-light radius against stellar mass (morphology.toml, [size])."""
+    """Relation of half-light radius and stellar mass (morphology.toml, [size])."""
 
     z: tuple[float, ...]
     late_norm: tuple[float, ...]
@@ -44,7 +43,7 @@ class Size:
 
 @dataclass(frozen=True, slots=True)
 class Bulge:
-    """Distributions of the bulge's parameters (morphology.toml, [bulge])."""
+    """Distributions of the bulge parameters (morphology.toml, [bulge])."""
 
     early_a: float
     early_b: float
@@ -71,10 +70,20 @@ class Bulge:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shapes:
-    """Everything that morphology draws from, made once by `shapes`.
+    """Distributions and tables of the morphology, made once by `shapes`.
 
-    disc_e, disc_cdf : [m] ellipticity of discs and its cumulative distribution
-    fraction, ln_ratio, ln_sersic : axes of ln_disc, ln of (disc radius / total radius)
+    Attributes
+    ----------
+    size, bulge : Size, Bulge
+        Parameters of the file.
+    scale_height : float
+        Scale height of discs in units of the scale length.
+    disc_e, disc_cdf : float array, shape (m,)
+        Ellipticity of discs and its cumulative distribution.
+    fraction, ln_ratio, ln_sersic : float array
+        Axes of `ln_disc`: bulge fraction, ln of the ratio of the radii, ln of the Sersic index.
+    ln_disc : float array
+        ln(disc radius / total half-light radius) on a grid of these axes.
     """
 
     size: Size
@@ -90,7 +99,7 @@ class Shapes:
 
 @cache
 def shapes() -> Shapes:
-    """The morphology of the embedded universe: numbers read, tables made (0.2 s), once."""
+    """Return the morphology of the embedded universe; reads the parameters and makes the tables (0.2 s) once."""
     bulge = Bulge(**parameters.section("morphology.toml", "bulge"))
     e, cdf = _disc_distribution(**parameters.section("morphology.toml", "disc"))
     fraction = np.linspace(0.0, 1.0, _FRACTION_NODES)
@@ -110,7 +119,7 @@ def shapes() -> Shapes:
     )
 
 
-# Nodes of the radius table: bulge fraction, ratio of the radii, Sersic index.
+# Number of nodes of the radius table: bulge fraction, ratio of the radii, Sersic index.
 _FRACTION_NODES, _RATIO_NODES, _SERSIC_NODES = 49, 25, 9
 _BISECTIONS = 25
 
@@ -122,12 +131,31 @@ def _log_nodes(limits: tuple[float, float], number: int) -> Float:
 def half_light_radius(
     size: Size, z: Float, log_stellar_mass: Float, red: Bool, kpc_per_arcsec: Float, rng: AnyGenerator
 ) -> Float:
-    """Half-light semi-major axis[n] of the total light, arcsec.
+    """Draw the half-light semi-major axis of the total light.
 
-    z : float[n];  red : bool[n] on the red sequence
-    log_stellar_mass : [n] log10 Msun (h = 0.67); kpc_per_arcsec : [n] proper
-    size : constants of the relation;  rng : of the scatter about it
-    Ref: van der Wel et al. 2014
+    Parameters
+    ----------
+    size : Size
+        Parameters of the relation.
+    z : float array, shape (n,)
+        Redshift.
+    log_stellar_mass : float array, shape (n,)
+        log10 of the stellar mass, Msun (h = 0.67).
+    red : bool array, shape (n,)
+        True for galaxies on the red sequence.
+    kpc_per_arcsec : float array, shape (n,)
+        Proper scale.
+    rng : AnyGenerator
+        Random numbers of the scatter.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Semi-major axis, arcsec.
+
+    References
+    ----------
+    van der Wel et al. 2014
     """
     log_mass = log_stellar_mass - np.log10(size.pivot)
     knee = np.log10(size.knee / size.pivot)
@@ -146,10 +174,23 @@ def _at_redshift(size: Size, values: tuple[float, ...], z: Float) -> Float:
 
 
 def bulge_fraction(bulge: Bulge, log_stellar_mass: Float, red: Bool, rng: AnyGenerator) -> Float:
-    """Flux of the bulge / total, [n] in [0, 1].
+    """Draw the fraction of the flux in the bulge.
 
-    log_stellar_mass : float[n] log10 Msun;  red : bool[n]
-    bulge            : constants of the relation;  rng : of the scatter about it
+    Parameters
+    ----------
+    bulge : Bulge
+        Parameters of the relation.
+    log_stellar_mass : float array, shape (n,)
+        log10 of the stellar mass, Msun.
+    red : bool array, shape (n,)
+        True for galaxies on the red sequence.
+    rng : AnyGenerator
+        Random numbers of the scatter.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Fraction, 0 to 1.
     """
     mean = np.clip(bulge.late_mean + bulge.late_rate * (log_stellar_mass - bulge.late_pivot), *bulge.late_limits)
     a = np.where(red, bulge.early_a, bulge.late_concentration * mean)
@@ -158,51 +199,122 @@ def bulge_fraction(bulge: Bulge, log_stellar_mass: Float, red: Bool, rng: AnyGen
 
 
 def sersic_index(bulge: Bulge, red: Bool, rng: AnyGenerator) -> Float:
-    """Sersic index[n] of the bulge.
+    """Draw the Sersic index of bulges.
 
-    red : bool[n] on the red sequence
+    Parameters
+    ----------
+    bulge : Bulge
+        Parameters of the distribution.
+    red : bool array, shape (n,)
+        True for galaxies on the red sequence.
+    rng : AnyGenerator
+        Random numbers.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Sersic index.
     """
     log_n = np.log10(np.where(red, bulge.early_sersic, bulge.late_sersic))
     return np.clip(10.0 ** (log_n + bulge.sersic_scatter * rng.standard_normal(red.size)), *bulge.sersic_limits)
 
 
 def radius_ratio(bulge: Bulge, red: Bool, rng: AnyGenerator) -> Float:
-    """Half-light radius of the bulge / that of the disc, [n].
+    """Draw the ratio of the half-light radii of bulge and disc.
 
-    red : bool[n] on the red sequence
+    Parameters
+    ----------
+    bulge : Bulge
+        Parameters of the distribution.
+    red : bool array, shape (n,)
+        True for galaxies on the red sequence.
+    rng : AnyGenerator
+        Random numbers.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Bulge radius / disc radius.
     """
     log_ratio = np.where(red, bulge.early_log_ratio, bulge.late_log_ratio)
     return np.clip(10.0 ** (log_ratio + bulge.log_ratio_scatter * rng.standard_normal(red.size)), *bulge.ratio_limits)
 
 
 def bulge_colour(bulge: Bulge, n: int, rng: AnyGenerator) -> Float:
-    """0.1(g - r) of the bulge less that of the disc, [n] mag."""
+    """Draw the colour of the bulge relative to the disc.
+
+    Parameters
+    ----------
+    bulge : Bulge
+        Parameters of the distribution.
+    n : int
+        Number of galaxies.
+    rng : AnyGenerator
+        Random numbers.
+
+    Returns
+    -------
+    float array, shape (n,)
+        0.1(g - r) of the bulge minus the value of the disc, mag.
+    """
     return np.asarray(np.clip(bulge.colour_mean + bulge.colour_scatter * rng.standard_normal(n), *bulge.colour_limits))
 
 
 def component_radii(model: Shapes, radius: Float, fraction: Float, ratio: Float, sersic: Float) -> tuple[Float, Float]:
-    """Half-light radii of bulge[n] and disc[n] whose summed light has the half-light radius `radius`[n].
+    """Return the half-light radii of bulge and disc whose summed light has a given half-light radius.
 
-    radius : float[n] arcsec, or any length, as what is returned
-    fraction : bulge / total; ratio : bulge radius / disc radius; sersic : index of the bulge
-    model    : light of profiles within radii, tabulated
-    Error: the light within `radius` is 0.5 to 0.005 (tests/truesky/catalogue/galaxies/test_morphology.py)
+    Parameters
+    ----------
+    model : Shapes
+        Tables of the radii.
+    radius : float array, shape (n,)
+        Total half-light radius in any unit, which is also the unit of the result.
+    fraction : float array, shape (n,)
+        Fraction of the flux in the bulge.
+    ratio : float array, shape (n,)
+        Bulge radius / disc radius.
+    sersic : float array, shape (n,)
+        Sersic index of the bulge.
+
+    Returns
+    -------
+    bulge, disc : float array, shape (n,)
+        Half-light radii.
+
+    Notes
+    -----
+    The fraction of light within `radius` is 0.5 to 0.005 (tests/truesky/catalogue/galaxies/test_morphology.py).
     """
-    # Slow to import, and not needed where a job is only submitted.
+    # Import here, because scipy.interpolate is slow to import and not needed to submit a job.
     from scipy.interpolate import RegularGridInterpolator
 
     axes = (model.fraction, model.ln_ratio, model.ln_sersic)
-    # The last bit of a logarithm may put a limit just outside: no error, no fill.
+    # Rounding of a logarithm may put a limit slightly outside the table: extrapolate instead of raising an error.
     table = RegularGridInterpolator(axes, model.ln_disc, bounds_error=False, fill_value=None)
     disc = radius * np.exp(table(np.stack([fraction, np.log(ratio), np.log(sersic)], axis=-1)))
     return ratio * disc, disc
 
 
 def light_within(r: npt.ArrayLike, half_light: npt.ArrayLike, sersic: npt.ArrayLike) -> Float:
-    """Fraction of a Sersic profile's light within r.
+    """Return the fraction of the light of a Sersic profile within a radius.
 
-    r, half_light : float[...] of the same unit;  sersic : float[...] index
-    Ref: Graham & Driver 2005, PASA 22, 118
+    Parameters
+    ----------
+    r : float array
+        Radius.
+    half_light : float array
+        Half-light radius in the unit of `r`.
+    sersic : float array
+        Sersic index.
+
+    Returns
+    -------
+    float array
+        Fraction of the light.
+
+    References
+    ----------
+    Graham & Driver 2005, PASA 22, 118
     """
     n = np.asarray(sersic, float)
     return _enclosed_light(np.asarray(r, float) / np.asarray(half_light, float), n, gammaincinv(2.0 * n, 0.5))
@@ -213,11 +325,23 @@ def _enclosed_light(x: Float, n: Float, b: Float) -> Float:
 
 
 def disc_radius(fraction: Float, ratio: Float, sersic: Float) -> Float:
-    """Disc radius / total half-light radius by bisection: what `component_radii` tabulates.
+    """Compute disc radius / total half-light radius by bisection, for the table of `component_radii`.
 
-    fraction, ratio, sersic : float[...] bulge / total, bulge radius / disc radius, index of the bulge
+    Parameters
+    ----------
+    fraction : float array
+        Fraction of the flux in the bulge.
+    ratio : float array
+        Bulge radius / disc radius.
+    sersic : float array
+        Sersic index of the bulge.
+
+    Returns
+    -------
+    float array
+        Disc radius / total half-light radius.
     """
-    # The total's radius lies between those of its parts, so the disc's between 1 and 1 / ratio.
+    # The total radius is between the radii of the components, so the result is between 1 and 1 / ratio.
     low, high = np.minimum(1.0, 1.0 / ratio), np.maximum(1.0, 1.0 / ratio)
     disc_sersic = np.ones(1)
     b_bulge, b_disc = gammaincinv(2.0 * sersic, 0.5), gammaincinv(2.0 * disc_sersic, 0.5)
@@ -230,13 +354,47 @@ def disc_radius(fraction: Float, ratio: Float, sersic: Float) -> Float:
 
 
 def disc_axis_ratio(model: Shapes, n: int, rng: AnyGenerator) -> Float:
-    """Apparent minor / major axis[n] of discs.  Ref: Miller et al. 2013"""
+    """Draw the apparent axis ratio (minor / major) of discs.
+
+    Parameters
+    ----------
+    model : Shapes
+        Distribution of the ellipticity.
+    n : int
+        Number of galaxies.
+    rng : AnyGenerator
+        Random numbers.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Axis ratio.
+
+    References
+    ----------
+    Miller et al. 2013
+    """
     e = np.interp(rng.random(n), model.disc_cdf, model.disc_e)
     return (1.0 - e) / (1.0 + e)
 
 
 def bulge_axis_ratio(bulge: Bulge, n: int, rng: AnyGenerator) -> Float:
-    """Minor / major axis[n] of bulges: a truncated normal, by its inverse."""
+    """Draw the axis ratio (minor / major) of bulges from a truncated normal distribution, by inversion.
+
+    Parameters
+    ----------
+    bulge : Bulge
+        Parameters of the distribution.
+    n : int
+        Number of galaxies.
+    rng : AnyGenerator
+        Random numbers.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Axis ratio.
+    """
     limits = (np.array(bulge.axis_ratio_limits) - bulge.axis_ratio_mean) / bulge.axis_ratio_scatter
     low, high = ndtr(limits)
     q = bulge.axis_ratio_mean + bulge.axis_ratio_scatter * ndtri(low + (high - low) * rng.random(n))
@@ -244,12 +402,20 @@ def bulge_axis_ratio(bulge: Bulge, n: int, rng: AnyGenerator) -> Float:
 
 
 def inclination(axis_ratio: npt.ArrayLike, scale_height: float) -> Float:
-    """Inclination[n] of discs, deg: sin^2 i = (1 - q^2) / (1 - h^2); 90 where it looks thinner than it is.
+    """Return the inclination of discs (deg) from axis ratio q and scale height h in units of the scale length.
 
-    The printed arcsine is not a number for q < h and loses half its digits near 90 deg; this form does
-    neither.
-    axis_ratio : float[n];  scale_height : h, of the disc's scale length
-    Ref: Serrano et al. 2024, "Bulge and disc model"
+    Notes
+    -----
+    The inclination follows from::
+
+        sin^2 i = (1 - q^2) / (1 - h^2)
+
+    and is 90 deg if q < h. The published form with an arcsine is not defined for q < h and loses half its digits near
+    90 deg; the form used here avoids both.
+
+    References
+    ----------
+    Serrano et al. 2024, "Bulge and disc model"
     """
     q = np.asarray(axis_ratio, float)
     across = np.sqrt(np.maximum((1.0 - q) * (1.0 + q), 0.0))
@@ -258,7 +424,7 @@ def inclination(axis_ratio: npt.ArrayLike, scale_height: float) -> Float:
 
 
 def position_angle(n: int, rng: AnyGenerator) -> Float:
-    """Position angle[n] of the major axis, deg in [0, 180)."""
+    """Draw uniform position angles of the major axis, deg in [0, 180)."""
     return 180.0 * rng.random(n)
 
 

@@ -1,10 +1,11 @@
-"""Spectra by the nearest of many observed galaxies, in colour, luminosity and redshift: an external training table.
+"""Spectra from the nearest of many observed galaxies in colour, luminosity and redshift: the user's training table.
 
-load     the galaxies of a request's files, checked, from the cache or read now
-assign   the spectrum of the nearest one, scattered
+The distance is the sum of the differences in 0.1(g - r), M_r and z, each divided by its unit (sed_assignment.toml,
+[nearest]).
 
-Near is by the sum of the differences in 0.1(g - r), M_r and z, each in its own unit (sed_assignment.toml, [nearest]).
-Ref: Serrano et al. 2024, "Spectral energy distributions"
+References
+----------
+Serrano et al. 2024, "Spectral energy distributions"
 """
 
 from __future__ import annotations
@@ -38,9 +39,16 @@ _KEYS = ("color_gr_01", "abs_mag_r01", "z_true", "sed", "ext_law", "ebv")
 
 @dataclass(frozen=True, slots=True)
 class Nearness:
-    """What counts as near, and how much is added (sed_assignment.toml, [nearest]).
+    """Units of distance, and scatter (sed_assignment.toml, [nearest]).
 
-    units : of 0.1(g - r), M_r and z;  index, ebv : scatter of the template's index and of E(B-V)
+    Attributes
+    ----------
+    units : tuple of float
+        Units of 0.1(g - r), M_r and z.
+    index : float
+        Scatter of the template's index.
+    ebv : float
+        Scatter of E(B-V), mag.
     """
 
     units: tuple[float, float, float]
@@ -50,9 +58,22 @@ class Nearness:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Training:
-    """n observed galaxies.
+    """Training table of n observed galaxies.
 
-    tree : of their 0.1(g - r), M_r and z in the units of `law`;  sed : real index of the template;  last : of templates
+    Attributes
+    ----------
+    law : Nearness
+        Units and scatter.
+    tree : KDTree
+        Tree of 0.1(g - r), M_r and z in the units of `law`.
+    sed : float array, shape (n,)
+        Real index of the template.
+    ext_law : int array, shape (n,)
+        Extinction law.
+    ebv : float array, shape (n,)
+        E(B-V), mag.
+    last : int
+        Index of the last template of the library.
     """
 
     law: Nearness
@@ -64,14 +85,31 @@ class Training:
 
     @property
     def dustiest(self) -> float:
-        """The largest E(B-V)."""
+        """Return the largest E(B-V), mag."""
         return float(self.ebv.max())
 
 
 def load(files: Sequence[Path], sha256: Sequence[str], columns: Columns) -> Training:
-    """The training table of files.
+    """Return the training table of files, from the cache or read now.
 
-    Errors: BadInput or Damaged names file, column and row of what cannot be used
+    Parameters
+    ----------
+    files : sequence of Path
+        Files of the table.
+    sha256 : sequence of str
+        SHA-256 of the files, which identify the cached copy.
+    columns : Columns
+        Mapping of the columns.
+
+    Returns
+    -------
+    Training
+        The table.
+
+    Raises
+    ------
+    BadInput, Damaged
+        If a value cannot be used; the message names the file, the column and the row.
     """
     columns_json = json.dumps(sorted((key, repr(field)) for key, field in columns.fields.items()))
     last = templates.galaxy_library().flux.shape[0] - 1
@@ -80,11 +118,8 @@ def load(files: Sequence[Path], sha256: Sequence[str], columns: Columns) -> Trai
 
 
 def build_training(values: dict[str, Array], last: int) -> Training:
-    """Of columns by our key.
-
-    values : float[t] each: colour 0.1(g - r) mag, m_r mag, z, sed, ext_law, ebv mag;  last : template of the library
-    """
-    # Slow to import, and seldom needed.
+    """Return a training table from columns: color_gr_01 and abs_mag_r01 (mag), z_true, sed, ext_law, ebv (mag)."""
+    # Import here, because scipy.spatial is slow to import and rarely needed.
     from scipy.spatial import KDTree
 
     law = Nearness(**parameters.section("sed_assignment.toml", "nearest"))
@@ -93,15 +128,30 @@ def build_training(values: dict[str, Array], last: int) -> Training:
 
 
 def assign(training: Training, colour: Float, m_r: Float, z: Float, rng: AnyGenerator) -> Sed:
-    """Spectra[n] of galaxies of 0.1(g - r), M_r and z.
+    """Return a spectrum for each galaxy: the spectrum of the nearest training galaxy, with scatter.
 
-    colour, m_r, z : float[n] 0.1(g - r) mag, M_r mag, redshift
-    given          : observed galaxies with their spectra;  rng : of the scatter
+    Parameters
+    ----------
+    training : Training
+        The training table.
+    colour : float array, shape (n,)
+        0.1(g - r), mag.
+    m_r : float array, shape (n,)
+        M_r, mag.
+    z : float array, shape (n,)
+        Redshift.
+    rng : AnyGenerator
+        Random numbers of the scatter.
+
+    Returns
+    -------
+    Sed
+        Spectra.
     """
     law, n = training.law, colour.size
     _, nearest = training.tree.query(_scale(law, colour, m_r, z), p=1)
     index = np.clip(training.sed[nearest] + law.index * rng.standard_normal(n), 0.0, training.last)
-    # Without a law there is no dust to scatter.
+    # Do not add scatter to galaxies without an extinction law, because they have no dust.
     dusty = training.ext_law[nearest] > 0
     ebv = np.clip(training.ebv[nearest] + law.ebv * rng.standard_normal(n), 0.0, training.dustiest)
     return band_ratios.sed_of_index(index, training.ext_law[nearest], np.where(dusty, ebv, 0.0))
@@ -120,5 +170,5 @@ def _read(files: Sequence[Path], columns: Columns, last: int) -> dict[str, Array
             where = f"{piece.file}: column {columns.fields['sed'].column} (sed) of row {piece.first + row}"
             raise BadInput(f"{where} is {piece.values['sed'][row]:g}, the library's last template is {last}")
     if not sum(len(piece.values["sed"]) for piece in pieces):
-        raise BadInput(f"{files[0]}: holds no galaxy")
+        raise BadInput(f"{files[0]}: the table has no rows")
     return {name: np.concatenate([piece.values[name] for piece in pieces]) for name in _KEYS}

@@ -1,12 +1,11 @@
-"""Galaxies by where they are seen: those of generation cells, whichever cells they are truly in.
+"""Galaxies whose observed positions are in requested generation cells.
 
-draw   table `galaxies` of some generation cells
+All galaxies with true positions in the requested cells are drawn, and galaxies observed elsewhere are removed. In the
+surrounding cells only a strip is searched, as wide as the largest deflection there. Candidates that the box moves close
+enough are followed through the halos; those observed inside get colours, lines and shapes.
 
-What is truly in the cells is drawn whole, and what is seen elsewhere is left out. Of the cells about them only a strip
-is looked at, as wide as light is bent there. Of its candidates those that the box shows near enough are followed
-through the halos, and those that are seen inside get colours, lines and shapes. A galaxy is drawn from its true cell
-alone, so that it is the same whoever asks, and is seen in one place: none is lost or there twice, whichever files are
-made.
+A galaxy depends only on the cell with its true position, so that it is the same in every request. It is observed at one
+position, so that it is in exactly one file.
 """
 
 from __future__ import annotations
@@ -31,18 +30,15 @@ from truesky.catalogue.galaxies.lensing import Planes
 from truesky.catalogue.halos import halos, population
 from truesky.catalogue.halos.population import CellCache
 
-# Distances are told of cells of this order, 26" wide: finer ones would cost more than they spare.
+# Order of the cells for which distances are computed (26 arcsec wide); finer cells would cost more time than they save.
 _BORDER_ORDER = 13
-# Largest deflection by halos that is allowed for, rad: twice that of a halo of 10^15.5 Msun/h.
+# Largest deflection by halos that is supported, rad: twice the deflection of a halo of 10^15.5 Msun/h.
 _MAX_HALO_DEFLECTION = float(np.radians(2.5 / 60.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _RequestedCells:
-    """Generation cells, ascending, and directions of small cells along their borders.
-
-    known : distances told, by (order, cell)
-    """
+    """Sorted generation cells, a tree of small cells along their borders, and known distances by (order, cell)."""
 
     cells: Int
     border: cKDTree
@@ -55,24 +51,24 @@ class _RequestedCells:
         return cls(cells, cKDTree(_directions(np.concatenate([*borders, np.zeros(0, np.int64)]))))
 
     def contains(self, index: Int) -> Bool:
-        """[n] Which order-29 places lie inside."""
+        """Return True for order-29 cells inside the requested cells."""
         return np.isin(sky.parent(index, sky.MAX_ORDER, GENERATION_ORDER), self.cells)
 
     def min_distances(self, small_cells: Int, max_distance: float = np.inf) -> Float:
-        """[n] No more than the distances, rad, of what lies in small cells from here; infinite beyond `most`."""
-        # Both small cells are as wide as that; a chord is no longer than its arc.
+        """Return lower limits of the distances of small cells in rad, infinite beyond `max_distance`."""
+        # Allow for the sizes of both small cells; a chord is never longer than its arc.
         slack = 2.0 * np.radians(sky.cell_radius(_BORDER_ORDER))
         distances, _ = self.border.query(_directions(small_cells), distance_upper_bound=max_distance + slack)
         inside = np.isin(sky.parent(small_cells, _BORDER_ORDER, GENERATION_ORDER), self.cells)
         return np.where(inside, 0.0, distances - slack)
 
     def is_near(self, ra: Float, dec: Float, angle: float) -> Bool:
-        """[n] Whichever places lie within an angle, rad, and some farther ones; ra, dec deg."""
+        """Return True for all positions (deg) within an angle (rad), and for some farther ones."""
         small_cells, inverse = np.unique(sky.cell_at(ra, dec, _BORDER_ORDER), return_inverse=True)
         return np.asarray((self.min_distances(small_cells, angle) <= angle)[inverse])
 
     def min_distance(self, order: int, cell: int) -> float:
-        """No more than the distance, rad, of a nested cell from here, and hardly less; order <= 8."""
+        """Return a tight lower limit of the distance of a nested cell of order <= 8 in rad."""
         if (order, cell) not in self.distances:
             fine = order + _BORDER_ORDER - GENERATION_ORDER
             distances, _ = self.border.query(_directions(sky.border_cells(order, cell, fine), fine))
@@ -82,7 +78,7 @@ class _RequestedCells:
         return self.distances[order, cell]
 
     def nearest(self, cell: int) -> int:
-        """Of the cells, that whose centre is nearest to a cell that touches one of them."""
+        """Among the requested cells that touch `cell`, return the one with the nearest centre."""
         neighbours = np.intersect1d(_adjacent_cells(cell), self.cells)
         separations = sky.separation(
             *sky.cell_centre(GENERATION_ORDER, cell), *sky.cell_centres(GENERATION_ORDER, neighbours)
@@ -96,7 +92,7 @@ def _directions(cells: Int, order: int = _BORDER_ORDER) -> Float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _SkyModel:
-    """What galaxies are drawn from (of `draw`)."""
+    """Arguments of `draw` from which galaxies are drawn."""
 
     universe: GalaxyModel
     cells: CellCache
@@ -104,12 +100,28 @@ class _SkyModel:
 
 
 def draw(requested: Sequence[int], universe: GalaxyModel, cells: CellCache, dust: Float32) -> pa.Table:
-    """Table `galaxies` of generation cells, sorted by _healpix_29.
+    """Return table `galaxies` of generation cells, selected by observed position.
 
-    wanted : nested indices at order 8
-    cells  : what has been drawn of the universe's population
-    dust   : float32[pixel] mag, map of the Milky Way's A(V) (truesky.catalogue.dust_map)
-    Errors : BadInput where light is deflected farther than is allowed for
+    Parameters
+    ----------
+    requested : sequence of int
+        Nested indices of order-8 cells.
+    universe : GalaxyModel
+        The model.
+    cells : CellCache
+        Cache of the drawn halos and members.
+    dust : float32 array, shape (pixels,)
+        Map of the Milky Way's A(V), mag (truesky.catalogue.dust_map).
+
+    Returns
+    -------
+    Table
+        Rows of table `galaxies`, sorted by _healpix_29.
+
+    Raises
+    ------
+    BadInput
+        If light is deflected farther than supported.
     """
     region = _RequestedCells.from_cells(requested)
     tables = [GALAXIES.empty()]
@@ -117,7 +129,7 @@ def draw(requested: Sequence[int], universe: GalaxyModel, cells: CellCache, dust
     for cell in region.cells.tolist():
         tables.append(_rows_inside(region, galaxies.draw(cell, universe, cells, dust)))
         if isinstance(universe.lens, Planes):
-            # While their neighbours are still kept.
+            # Draw adjacent cells now, while their neighbours are cached.
             for other in _adjacent_cells(cell):
                 if other not in done and region.nearest(other) == cell:
                     done.add(other)
@@ -128,7 +140,7 @@ def draw(requested: Sequence[int], universe: GalaxyModel, cells: CellCache, dust
         else set()
     )
     while outer_cells:
-        # Nothing comes from so far, but where cells are narrow or light is bent most.
+        # Galaxies come from farther away only if cells are narrow or deflections are large.
         done |= outer_cells
         reaching = [
             cell
@@ -141,7 +153,7 @@ def draw(requested: Sequence[int], universe: GalaxyModel, cells: CellCache, dust
 
 
 def _adjacent_cells(cell: int) -> list[int]:
-    """The generation cells that touch one."""
+    """Generation cells that touch a cell."""
     neighbours: list[int] = sky.margin_cells(GENERATION_ORDER, cell, GENERATION_ORDER).tolist()
     return neighbours
 
@@ -151,14 +163,14 @@ def _rows_inside(region: _RequestedCells, rows: pa.Table) -> pa.Table:
 
 
 def _max_deflection(sky_model: _SkyModel, cell: int) -> float:
-    """How far light of a cell is bent at most, rad."""
+    """Largest deflection of light from a cell, rad."""
     planes = sky_model.universe.lens
     assert isinstance(planes, Planes)
     return lensing.max_deflection(planes, GENERATION_ORDER, cell) + _MAX_HALO_DEFLECTION
 
 
 def _from_outside(cell: int, region: _RequestedCells, sky_model: _SkyModel) -> pa.Table:
-    """Galaxies of a cell outside that may be seen inside."""
+    """Galaxies with true positions in an outer cell that may be observed in the requested cells."""
     universe, cells = sky_model.universe, sky_model.cells
     max_deflection = _max_deflection(sky_model, cell)
     lens = halo_lensing.lens_of_cell(
@@ -171,10 +183,10 @@ def _from_outside(cell: int, region: _RequestedCells, sky_model: _SkyModel) -> p
         )
         raise BadInput(
             f"table galaxies: halos may deflect light by {deflection_arcsec:.0f} arcsec, "
-            f"{allowed_arcsec:.0f} are allowed for"
+            f"at most {allowed_arcsec:.0f} are allowed"
         )
     max_deflection += lens.max_deflection - _MAX_HALO_DEFLECTION
-    # Satellites of others land too far away.
+    # Satellites of more distant halos are too far away.
     members = population.members(
         cells, cell, lambda *place: region.min_distance(*place) <= max_deflection + halos.reach(place[0])
     )

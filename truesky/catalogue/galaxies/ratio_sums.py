@@ -1,4 +1,4 @@
-"""The loop of band_ratios.ln_ratio: a table read at a redshift, and a polynomial through its nodes of E(B-V)."""
+"""Compiled loop of band_ratios.ln_ratio: interpolation in redshift, and a polynomial through the nodes of E(B-V)."""
 
 from __future__ import annotations
 
@@ -11,13 +11,29 @@ from truesky.numerics.compiling import exact_jit
 
 @exact_jit
 def ln_ratios(values: Any, step: Any, nodes: Any, z: Any, template: Any, law: Any, ebv: Any, out: Any) -> None:
-    """Fills out, float64[n], linear in ln(1 + z), polynomial in E(B-V); law 0 has no dust.
+    """Fill `out` with ln(ratio), linear in ln(1 + z) and polynomial in E(B-V).
 
-    values : float32[z, 4, template, e];  step : of ln(1 + z);  nodes : float64[e], the first 0
-    z, ebv : float64[n];  template, law : int64[n]
+    Parameters
+    ----------
+    values : float32 array, shape (z, 4, templates, e)
+        Values of the table.
+    step : float
+        Step of ln(1 + z).
+    nodes : float array, shape (e,)
+        Nodes of E(B-V), mag; the first is 0.
+    z : float array, shape (n,)
+        Redshift.
+    template : int array, shape (n,)
+        Index of the template.
+    law : int array, shape (n,)
+        Extinction law; 0 means no dust.
+    ebv : float array, shape (n,)
+        E(B-V), mag.
+    out : float array, shape (n,)
+        Result.
     """
     count = nodes.size
-    # Of Lagrange's polynomials: what they are divided by.
+    # Inverse denominators of the Lagrange polynomials.
     scale = np.ones(count)
     for i in range(count):
         for j in range(count):
@@ -32,7 +48,7 @@ def ln_ratios(values: Any, step: Any, nodes: Any, z: Any, template: Any, law: An
         if law[k] == 0 or ebv[k] == nodes[0]:
             out[k] = (1.0 - part) * low[0] + part * high[0]
             continue
-        # The product of all differences but one: those before it times those after it.
+        # The product of all differences except the i-th is the product before it times the product after it.
         upper_product = 1.0
         for i in range(count - 1, -1, -1):
             upper_products[i] = upper_product

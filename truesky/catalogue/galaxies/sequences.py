@@ -1,12 +1,11 @@
-"""Colours and dust of galaxies: red and blue sequences of 0.1(g - r), and dusty galaxies between them.
+"""Colours and dust of galaxies: red and blue sequences of 0.1(g - r), and dusty (green) galaxies between them.
 
-red_fraction       how many are red, against luminosity and redshift
-limits             of the colours that the templates have
-draw, known        sequence and colour;  dust : E(B-V) and extinction law
+Colours and E(B-V) are drawn from truncated distributions by inversion, so that galaxies do not pile up at the limits.
+The parameters and their sources are in sed_assignment.toml.
 
-Colours and E(B-V) come from truncated distributions, through their inverse: no two galaxies share a value where a
-distribution ends.
-Ref: Skibba & Sheth 2009, Ilbert et al. 2009; the numbers and their sources are in sed_assignment.toml.
+References
+----------
+Skibba & Sheth 2009, Ilbert et al. 2009
 """
 
 from __future__ import annotations
@@ -26,18 +25,18 @@ from truesky.randomness.per_source import AnyGenerator
 
 _FILE = "sed_assignment.toml"
 BLUE, GREEN, RED = 0, 1, 2
-# The sequences are written in M_r + 20.
+# The sequences are functions of M_r - _PIVOT.
 _PIVOT = -20.0
-# Galaxies of other catalogues are no further from a sequence, in its scatter.
+# Limit of the distance of a catalogued galaxy from its sequence, in units of the scatter.
 _MAX_DEVIATE = 3.0
-# Nodes of E(B-V) at which the bluest template's colour is known, and of the Gamma distribution in units of its
-# mean / shape, denser towards 0: 1e-4 of a value.
+# Number of nodes of E(B-V) for the colour of the bluest template, and nodes of the Gamma distribution in units of its
+# mean / shape, denser towards 0 (relative error 1e-4).
 _EBV_NODES, _GAMMA_NODES = 65, 60.0 * np.linspace(0.0, 1.0, 8001) ** 3
 
 
 @dataclass(frozen=True, slots=True)
 class RedFraction:
-    """Share of the red sequence (sed_assignment.toml, [red_fraction])."""
+    """Fraction of galaxies on the red sequence (sed_assignment.toml, [red_fraction])."""
 
     blue: float
     blue_rate: float
@@ -71,7 +70,7 @@ class Green:
 
 @dataclass(frozen=True, slots=True)
 class ColourSequence:
-    """Mean colours and scatters (sed_assignment.toml, [sequence])."""
+    """Mean colours and scatters of the sequences (sed_assignment.toml, [sequence])."""
 
     red: float
     red_rate: float
@@ -115,7 +114,7 @@ class Dust:
 
 @dataclass(frozen=True, slots=True)
 class Colours:
-    """Everything that colours and dust are drawn from, made once by `model`."""
+    """Distributions of colours and dust, made once by `model`."""
 
     fraction: RedFraction
     green: Green
@@ -125,10 +124,16 @@ class Colours:
 
 @dataclass(frozen=True, slots=True)
 class ColourLimits:
-    """Of the colours that the templates have.
+    """Range of the colours of the templates.
 
-    bluest, reddest : 0.1(g - r) mag, without dust
-    ebv : [e] mag;  behind : [law, e] 0.1(g - r) of the bluest template behind so much dust
+    Attributes
+    ----------
+    bluest, reddest : float
+        0.1(g - r) without dust, mag.
+    ebv : float array, shape (e,)
+        Nodes of E(B-V), mag.
+    bluest_dusty : float array, shape (laws, e)
+        0.1(g - r) of the bluest template behind this E(B-V), mag.
     """
 
     bluest: float
@@ -139,7 +144,17 @@ class ColourLimits:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Colour:
-    """n galaxies: sequence (BLUE, GREEN, RED), 0.1(g - r) mag, and its normal deviate on the sequence."""
+    """Colours of n galaxies.
+
+    Attributes
+    ----------
+    sequence : int array, shape (n,)
+        BLUE, GREEN or RED.
+    colour : float array, shape (n,)
+        0.1(g - r), mag.
+    deviate : float array, shape (n,)
+        Normal deviate of the colour on its sequence.
+    """
 
     sequence: Int
     colour: Float
@@ -147,16 +162,16 @@ class Colour:
 
     @property
     def red(self) -> Bool:
-        """bool[n]"""
+        """Return True for galaxies on the red sequence, shape (n,)."""
         return np.asarray(self.sequence == RED)
 
     def select(self, keep: npt.NDArray[np.generic]) -> Colour:
-        """The galaxies that are kept: keep : bool or int[m] rows."""
+        """Return the galaxies of a bool mask or of row numbers."""
         return Colour(self.sequence[keep], self.colour[keep], self.deviate[keep])
 
 
 def model() -> Colours:
-    """The colours of the embedded universe."""
+    """Return the colours of the embedded universe."""
     return Colours(
         RedFraction(**parameters.section(_FILE, "red_fraction")),
         Green(**parameters.section(_FILE, "green")),
@@ -166,10 +181,7 @@ def model() -> Colours:
 
 
 def colour_limits(table: BandRatios, dust: Dust) -> ColourLimits:
-    """Of the colours of a library.
-
-    table : of 0.1g at z = 0;  dust : how much of it there may be
-    """
+    """Return the range of colours of a library, from its table of 0.1g at z = 0 and the dust model."""
     ebv = np.linspace(0.0, dust.highest, _EBV_NODES)
     ln_ratio = table.values[0].astype(np.float64)
     bare = -2.5 / np.log(10.0) * ln_ratio[0, :, 0]
@@ -178,12 +190,27 @@ def colour_limits(table: BandRatios, dust: Dust) -> ColourLimits:
 
 
 def red_fraction(law: RedFraction, m_r: Float, z: Float, satellite: Float | Int) -> Float:
-    """Share[n] of galaxies on the red sequence.
+    """Return the fraction of galaxies on the red sequence.
 
-    m_r, z : float[n] M_r mag, redshift
-    satellite : [n] 0 central, 1 satellite; or how many of the galaxies of this luminosity are
-    law   : constants of the relation
-    Ref: Skibba & Sheth 2009
+    Parameters
+    ----------
+    law : RedFraction
+        Parameters of the relation.
+    m_r : float array, shape (n,)
+        M_r, mag.
+    z : float array, shape (n,)
+        Redshift.
+    satellite : float or int array, shape (n,)
+        0 for central galaxies and 1 for satellites, or the fraction of satellites at this luminosity.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Fraction, 0 to 1.
+
+    References
+    ----------
+    Skibba & Sheth 2009
     """
     bright = np.clip(1.0 - (law.blue + law.blue_rate * (m_r - _PIVOT)), *law.limits)
     times = law.times[0] + (law.times[1] - law.times[0]) * satellite
@@ -193,9 +220,23 @@ def red_fraction(law: RedFraction, m_r: Float, z: Float, satellite: Float | Int)
 
 
 def green_share(law: Green, fraction: RedFraction, m_r: Float, z: Float) -> Float:
-    """Share[n] of green galaxies among those that are not red.
+    """Return the fraction of green galaxies among galaxies that are not red.
 
-    m_r, z : float[n] M_r mag, redshift;  law, fraction : constants
+    Parameters
+    ----------
+    law : Green
+        Parameters of the green galaxies.
+    fraction : RedFraction
+        Parameters of the red fraction.
+    m_r : float array, shape (n,)
+        M_r, mag.
+    z : float array, shape (n,)
+        Redshift.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Fraction, 0 to 1.
     """
     bright = np.clip(1.0 - (fraction.blue + fraction.blue_rate * (m_r - _PIVOT)), *fraction.limits)
     old = bright * np.clip(law.z_norm - law.z_rate * z, law.z_floor, 1.0) * _dwarf_factor(fraction, m_r)
@@ -206,13 +247,30 @@ def green_share(law: Green, fraction: RedFraction, m_r: Float, z: Float) -> Floa
 
 
 def draw(colours: Colours, limits: ColourLimits, m_r: Float, z: Float, odds: Float, rng: AnyGenerator) -> Colour:
-    """Sequence and colour of galaxies.
+    """Draw sequence and colour of galaxies.
 
-    m_r, z : float[n] M_r mag, redshift;  odds : float[n] of being red
-    own    : the sequences;  ends : of the templates' colours;  rng : of the sequence, then of the place on it
+    Parameters
+    ----------
+    colours : Colours
+        Distributions.
+    limits : ColourLimits
+        Range of the colours of the templates.
+    m_r : float array, shape (n,)
+        M_r, mag.
+    z : float array, shape (n,)
+        Redshift.
+    odds : float array, shape (n,)
+        Probability of a galaxy to be red.
+    rng : AnyGenerator
+        Random numbers of the sequence, then of the colour on it.
+
+    Returns
+    -------
+    Colour
+        Sequence and colour.
     """
     law, chosen, uniform = colours.sequence, rng.random(z.size), _open_uniform(rng, z.size)
-    # Of what is not red, the first part is green: one number says both.
+    # One random number decides between red, green and blue.
     green = odds + (1.0 - odds) * green_share(colours.green, colours.fraction, m_r, z)
     sequence = np.where(chosen < odds, RED, np.where(chosen < green, GREEN, BLUE))
     mean, scatter = _mean_and_scatter(colours, m_r, z, sequence)
@@ -224,9 +282,25 @@ def draw(colours: Colours, limits: ColourLimits, m_r: Float, z: Float, odds: Flo
 
 
 def place_on_sequence(colours: Colours, m_r: Float, z: Float, colour: Float, red: Bool) -> Colour:
-    """Galaxies whose colours are given, with their places on the sequences.
+    """Return the deviates of given colours on the red and blue sequences.
 
-    m_r, z : float[n] M_r mag, redshift;  colour : float[n] 0.1(g - r) mag;  red : bool[n];  own : the sequences
+    Parameters
+    ----------
+    colours : Colours
+        Distributions.
+    m_r : float array, shape (n,)
+        M_r, mag.
+    z : float array, shape (n,)
+        Redshift.
+    colour : float array, shape (n,)
+        0.1(g - r), mag.
+    red : bool array, shape (n,)
+        True for galaxies on the red sequence; the others are on the blue sequence.
+
+    Returns
+    -------
+    Colour
+        The colours with their sequence and deviates.
     """
     sequence = np.where(red, RED, BLUE)
     mean, scatter = _mean_and_scatter(colours, m_r, z, sequence)
@@ -234,7 +308,7 @@ def place_on_sequence(colours: Colours, m_r: Float, z: Float, colour: Float, red
 
 
 def _mean_and_scatter(colours: Colours, m_r: Float, z: Float, sequence: Int) -> tuple[Float, Float]:
-    """Mean and scatter[n] of 0.1(g - r) of each galaxy's sequence."""
+    """Mean and scatter of 0.1(g - r) on the sequence of each galaxy."""
     law, x = colours.sequence, m_r - _PIVOT
     red_mean = law.red + law.red_rate * x - law.red_z_rate * z
     blue_mean = np.clip(law.blue + law.blue_rate * x, *law.blue_limits)
@@ -250,15 +324,25 @@ def _mean_and_scatter(colours: Colours, m_r: Float, z: Float, sequence: Int) -> 
 
 
 def truncated_normal(low: Float, high: Float, uniform: Float) -> Float:
-    """Normal deviates[n] between two limits, in the tail that keeps its digits.
+    """Convert uniform numbers to normal deviates between two limits.
 
-    low, high : float[n];  uniform : float[n] in (0, 1), of which the deviates are a growing function
+    Parameters
+    ----------
+    low, high : float array, shape (n,)
+        Limits.
+    uniform : float array, shape (n,)
+        Numbers in (0, 1); the deviates increase with them.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Deviates. They are computed in the tail that keeps their precision.
     """
     mirrored = low > 0.0
     a, b = np.where(mirrored, -high, low), np.where(mirrored, -low, high)
     below, above = ndtr(a), ndtr(b)
     u = np.where(mirrored, 1.0 - uniform, uniform)
-    # Both limits 30 standard deviations away leave nothing between: the nearer one.
+    # If both limits are 30 standard deviations away, the result is the nearer limit.
     deviate = ndtri(np.clip(below + u * (above - below), 1e-300, 1.0 - 1e-16))
     return np.asarray(np.where(mirrored, -deviate, deviate))
 
@@ -266,11 +350,33 @@ def truncated_normal(low: Float, high: Float, uniform: Float) -> Float:
 def draw_dust(
     colours: Colours, limits: ColourLimits, m_r: Float, z: Float, colour: Colour, rng: AnyGenerator
 ) -> tuple[Int, Float]:
-    """(extinction law[n], E(B-V)[n] mag); red galaxies have no dust.
+    """Draw extinction law and E(B-V) of galaxies; red galaxies have no dust.
 
-    m_r, z : float[n] mag, redshift;  found : their colours;  rng : of E(B-V), then of the law
-    own    : laws and the distribution of E(B-V);  ends : of the templates' colours
-    Ref: Ilbert et al. 2009
+    Parameters
+    ----------
+    colours : Colours
+        Extinction laws and the distribution of E(B-V).
+    limits : ColourLimits
+        Range of the colours of the templates.
+    m_r : float array, shape (n,)
+        M_r, mag.
+    z : float array, shape (n,)
+        Redshift.
+    colour : Colour
+        Sequence and colour of the galaxies.
+    rng : AnyGenerator
+        Random numbers of E(B-V), then of the law.
+
+    Returns
+    -------
+    law : int array, shape (n,)
+        Extinction law, 0 without dust.
+    ebv : float array, shape (n,)
+        E(B-V), mag.
+
+    References
+    ----------
+    Ilbert et al. 2009
     """
     law = colours.dust
     amount, odds = rng.random(z.size), np.cumsum(law.calzetti_odds)
@@ -281,7 +387,7 @@ def draw_dust(
     mean = np.clip(law.mean + law.mean_rate * (m_r - law.pivot), *law.mean_limits)
     mean = mean * (1.0 - law.far_z_rate * np.clip(z - law.far_z, 0.0, law.far_z_range))
     scale = np.where(green, colours.green.ebv, mean) / law.shape
-    # No more than leaves the bluest template as blue as the galaxy.
+    # Limit E(B-V) so that the bluest template behind the dust is still as blue as the galaxy.
     max_ebv = np.empty(m_r.size)
     for code in range(1, LAW_COUNT):
         selected = np.flatnonzero(curve == code)
@@ -294,7 +400,7 @@ def draw_dust(
 
 
 def _open_uniform(rng: AnyGenerator, n: int) -> Float:
-    """Uniform in (0, 1), [n]: numpy's own may be 0."""
+    """Uniform numbers in (0, 1), shape (n,); numpy's generator may return 0."""
     return np.maximum(rng.random(n), 2.0**-54)
 
 

@@ -1,12 +1,11 @@
 """Stellar masses and star formation rates of galaxies.
 
-log_stellar_mass    from luminosity, colour and redshift
-main_sequence       the median rate of galaxies that form stars, from mass and redshift
-log_sfr             drawn about it, by sequence and colour
+Luminosities are physical here: M = M_r + 5 log10 h with h = 0.67. Masses and rates are for the initial mass functions
+of Chabrier 2003 and Kroupa 2001, which give the same values. The parameters are in stellar_mass.toml.
 
-Luminosities are physical here: M = M_r + 5 log10 h, h = 0.67. Masses and rates are of the initial mass functions of
-Chabrier 2003 and Kroupa 2001, which give the same ones.
-Ref: Davidzon et al. 2017, Leja et al. 2020, Popesso et al. 2023; the numbers are in stellar_mass.toml.
+References
+----------
+Davidzon et al. 2017, Leja et al. 2020, Popesso et al. 2023
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ _FILE = "stellar_mass.toml"
 
 @dataclass(frozen=True, slots=True)
 class MassToLight:
-    """Colour to mass-to-light ratio (stellar_mass.toml, [mass_to_light])."""
+    """Relation of colour and mass-to-light ratio (stellar_mass.toml, [mass_to_light])."""
 
     sun: float
     intercept: float
@@ -41,7 +40,7 @@ class MassToLight:
 
 @dataclass(frozen=True, slots=True)
 class StarFormation:
-    """The main sequence, and the galaxies about and below it (stellar_mass.toml, [star_formation])."""
+    """Main sequence of star formation, and the scatter around and below it (stellar_mass.toml, [star_formation])."""
 
     sequence: float
     sequence_t: float
@@ -61,20 +60,37 @@ class StarFormation:
 
 
 def mass_to_light() -> MassToLight:
-    """The mass-to-light ratios of the embedded universe."""
+    """Return the mass-to-light ratios of the embedded universe."""
     return MassToLight(**parameters.section(_FILE, "mass_to_light"))
 
 
 def star_formation() -> StarFormation:
-    """The star formation rates of the embedded universe."""
+    """Return the star formation rates of the embedded universe."""
     return StarFormation(**parameters.section(_FILE, "star_formation"))
 
 
 def log_stellar_mass(law: MassToLight, m_r: Float, colour: Float, z: Float) -> Float:
-    """log10 of the stellar mass[n] / Msun, Chabrier.
+    """Return the stellar mass from luminosity, colour and redshift.
 
-    m_r : float[n] M_r mag;  colour : float[n] 0.1(g - r) mag;  z : float[n];  law : constants
-    Ref: Bell et al. 2003, appendix 2
+    Parameters
+    ----------
+    law : MassToLight
+        Parameters.
+    m_r : float array, shape (n,)
+        M_r, mag.
+    colour : float array, shape (n,)
+        0.1(g - r), mag.
+    z : float array, shape (n,)
+        Redshift.
+
+    Returns
+    -------
+    float array, shape (n,)
+        log10 of the stellar mass, Msun (Chabrier).
+
+    References
+    ----------
+    Bell et al. 2003, appendix 2
     """
     g_r = np.clip(colour - law.to_rest, *law.limits)
     log_1pz = np.log10(1.0 + np.minimum(z, law.z_last))
@@ -84,10 +100,25 @@ def log_stellar_mass(law: MassToLight, m_r: Float, colour: Float, z: Float) -> F
 
 
 def main_sequence(law: StarFormation, log_mass: Float, z: Float) -> Float:
-    """log10 of the median star formation rate[n] / (Msun/yr) of star-forming galaxies.
+    """Return the median star formation rate of star-forming galaxies.
 
-    log_mass : float[n] log10 Msun;  z : float[n];  law : constants
-    Ref: Popesso et al. 2023, eq. 10
+    Parameters
+    ----------
+    law : StarFormation
+        Parameters.
+    log_mass : float array, shape (n,)
+        log10 of the stellar mass, Msun.
+    z : float array, shape (n,)
+        Redshift.
+
+    Returns
+    -------
+    float array, shape (n,)
+        log10 of the star formation rate, Msun/yr.
+
+    References
+    ----------
+    Popesso et al. 2023, eq. 10
     """
     age = cosmology.age(z, law.omega_m, law.hubble)
     below = law.bend * (law.bend_mass - law.bend_mass_t * age - log_mass)
@@ -96,10 +127,25 @@ def main_sequence(law: StarFormation, log_mass: Float, z: Float) -> Float:
 
 
 def log_sfr(law: StarFormation, main: Float, sequence: Int, deviate: Float, rng: AnyGenerator) -> Float:
-    """log10 of the star formation rate[n] / (Msun/yr), Kroupa: bluer galaxies of the blue sequence form more.
+    """Draw star formation rates; bluer galaxies on the blue sequence form more stars.
 
-    main     : float[n] of `main_sequence`;  sequence : int[n];  deviate : float[n] of the colour on it
-    law      : constants;  rng : of the scatter
+    Parameters
+    ----------
+    law : StarFormation
+        Parameters.
+    main : float array, shape (n,)
+        Median rate, from `main_sequence`.
+    sequence : int array, shape (n,)
+        Sequence: BLUE, GREEN or RED.
+    deviate : float array, shape (n,)
+        Normal deviate of the colour on its sequence.
+    rng : AnyGenerator
+        Random numbers of the scatter.
+
+    Returns
+    -------
+    float array, shape (n,)
+        log10 of the star formation rate, Msun/yr (Kroupa).
     """
     normal = rng.standard_normal(main.size)
     blue = law.blue_scatter * (law.blue_own * normal - law.blue_colour * deviate)

@@ -1,18 +1,17 @@
-"""Strong lenses: singular isothermal ellipsoids (SIE), and pictures of what lies behind them by inverse ray shooting.
+"""Strong lenses: singular isothermal ellipsoids (SIE), and images of the sources behind them by inverse ray shooting.
 
-draw            table `strong_lenses` from galaxies of one cell
-deflection      of an SIE
-shoot           the picture of an exponential disc behind it
-image_positions where a point behind it is seen: roots of one equation in one angle, no rays
+All galaxies redder than the blue sequence are lenses. At 0.1 < z < 0.7 the fourth moment of their dispersions, which
+determines the total cross-section, agrees with Choi et al. 2007 within 15 %. With the detection criteria of Collett
+2015, the number is 10.2 +- 1.1 deg-2 for sources with I_E < 26 and z < 2.3 (14.9 +- 1.3 in total), compared to 11.3 of
+Collett 2015. Central galaxies of halos above 10^12.7 Msun/h are only a fifth of the lenses: most lenses are galaxies of
+smaller halos.
 
-Lenses are all galaxies redder than the blue sequence: at 0.1 < z < 0.7 their dispersions have the fourth moment, which
-is what cross-sections add up to, of Choi et al. 2007 within 15 %. Their number is that of Collett 2015 by his criteria
-of detection: 10.2 +- 1.1 deg-2 of I_E < 26 and z < 2.3 behind them, against 11.3 (14.9 +- 1.3 in all). Centrals of
-halos above 10^12.7 Msun/h alone would be a fifth of it: most lenses are galaxies of smaller halos.
+Coordinates are in arcsec east and north of the lens on the tangent plane. The images contain only the smooth lens; weak
+lensing by matter in front of and behind the lens is left out.
 
-Coordinates are arcsec east and north of the lens on the tangent plane. The pictures are of the smooth lens alone; the
-weak lensing of what lies in front and behind is left out.
-Ref: Kormann, Schneider & Bartelmann 1994, A&A 284, 285
+References
+----------
+Kormann, Schneider & Bartelmann 1994, A&A 284, 285
 """
 
 from __future__ import annotations
@@ -43,19 +42,19 @@ COLUMNS = (
 )  # fmt: skip
 STRONG_LENS = 4
 _FILE = "strong_lenses.toml"
-# Share of the least magnification that one ray a pixel is sure to find.
+# Fraction of the smallest magnification below which a first image with one ray per pixel excludes a system.
 _QUICK_SHARE = 0.7
-# Of the exponential disc: half of its light is inside r = b h.
+# Half of the light of an exponential disc with scale length h is inside r = _B h.
 _B = 1.6783469900166605
-# Angles in which sign changes are looked for: images closer than this merge at a caustic.
+# Number of angles in the search for sign changes; images closer than one step are merging at a caustic.
 _ANGLE_COUNT = 4096
-# Share of the sources that a lens is paired with; all of them where the boost makes the chance of each larger.
+# Fraction of the sources with which a lens is paired; all sources if the boost makes their probability larger.
 _WINDOW = 1.0 / 64.0
 
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """An SIE: Einstein radius, arcsec; minor / major axis; position angle of the major axis, deg."""
+    """SIE with Einstein radius (arcsec), axis ratio (minor / major) and position angle of the major axis (deg)."""
 
     radius: float
     axis_ratio: float
@@ -64,7 +63,19 @@ class Lens:
 
 @dataclass(frozen=True, slots=True)
 class Disc:
-    """An exponential disc of flux 1 at (east, north): half-light semi-major axis, arcsec; axis ratio; deg."""
+    """Exponential disc of flux 1 at (east, north).
+
+    Attributes
+    ----------
+    east, north : float
+        Position relative to the lens, arcsec.
+    radius : float
+        Half-light semi-major axis, arcsec.
+    axis_ratio : float
+        Minor / major axis.
+    angle : float
+        Position angle of the major axis, deg.
+    """
 
     east: float
     north: float
@@ -75,7 +86,7 @@ class Disc:
 
 @dataclass(frozen=True, slots=True)
 class Laws:
-    """Which galaxies are lenses, and what of (strong_lenses.toml, [lenses])."""
+    """Selection and properties of lenses (strong_lenses.toml, [lenses])."""
 
     reddest_blue: float
     sigma_star: float
@@ -90,7 +101,21 @@ class Laws:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pair:
-    """Rows of lens and source; dispersion, km/s; Einstein radius, arcsec; key and numbers of the pair's own."""
+    """A lens and a source behind it.
+
+    Attributes
+    ----------
+    lens, source : int
+        Rows of the galaxies.
+    sigma : float
+        Velocity dispersion, km/s.
+    radius : float
+        Einstein radius, arcsec.
+    key : int
+        Key of the pair's random numbers.
+    numbers : float array, shape (4,)
+        Random numbers of the pair.
+    """
 
     lens: int
     source: int
@@ -102,7 +127,7 @@ class Pair:
 
 @dataclass(frozen=True, slots=True)
 class Stamps:
-    """How pictures are taken (strong_lenses.toml, [stamp])."""
+    """Settings of the images (strong_lenses.toml, [stamp])."""
 
     pixel_scale: float
     sides: tuple[int, int]
@@ -111,22 +136,38 @@ class Stamps:
 
 
 def laws() -> Laws:
-    """The lenses of the embedded universe."""
+    """Return the lens selection of the embedded universe."""
     return Laws(**parameters.section(_FILE, "lenses"))
 
 
 def stamps() -> Stamps:
-    """How their pictures are taken."""
+    """Return the image settings of the embedded universe."""
     return Stamps(**parameters.section(_FILE, "stamp"))
 
 
 def draw(cell: int, galaxies: pa.Table, seed: int, boost: float) -> pa.Table:
-    """Table `strong_lenses` of one order-8 cell.
+    """Draw table `strong_lenses` of one order-8 cell.
 
-    galaxies : the cell's rows of table `galaxies`, COLUMNS
-    boost    : how many times denser than in nature; a source lies as probably within an Einstein radius of a lens as
-               anywhere else on as much sky
-    cell     : nested index at order 8;  seed : of the request
+    Parameters
+    ----------
+    cell : int
+        Nested index of the order-8 cell.
+    galaxies : Table
+        Rows of table `galaxies` in the cell, with COLUMNS.
+    seed : int
+        Seed of the request.
+    boost : float
+        Ratio of the drawn to the natural number density.
+
+    Returns
+    -------
+    Table
+        Rows of table `strong_lenses`.
+
+    Notes
+    -----
+    The position of a source is independent of lenses: it is as likely within an Einstein radius of a lens as in any
+    other area of the same size.
     """
     law, stamp_settings = laws(), stamps()
     columns = {name: galaxies[name].to_numpy() for name in COLUMNS}
@@ -134,7 +175,7 @@ def draw(cell: int, galaxies: pa.Table, seed: int, boost: float) -> pa.Table:
     for pair in _pairs(law, columns, boost, sky.cell_area(GENERATION_ORDER) * 3600.0**2, seed):
         system = _system(law, columns, pair)
         side = _side(stamp_settings, *system)
-        # A glance with few rays tells most of those that are too faint.
+        # A first image with few rays excludes most systems that are too faint.
         if (
             shoot_rays(*system, replace(stamp_settings, samples=(1, 1)), side).sum()
             < _QUICK_SHARE * law.least_magnification
@@ -148,24 +189,47 @@ def draw(cell: int, galaxies: pa.Table, seed: int, boost: float) -> pa.Table:
 
 
 def einstein_radius(sigma: npt.ArrayLike, z_lens: npt.ArrayLike, z_source: npt.ArrayLike) -> Float:
-    """Arcsec, of dispersions in km/s: 4 pi (sigma / c)^2 D_ls / D_s in a flat space; 0 where the source is in front.
+    """Return the Einstein radius in a flat space.
 
-    sigma : float[n] km/s;  z_lens, z_source : float[n]
+    Parameters
+    ----------
+    sigma : float array, shape (n,)
+        Velocity dispersion, km/s.
+    z_lens, z_source : float array, shape (n,)
+        Redshifts.
+
+    Returns
+    -------
+    float array, shape (n,)
+        4 pi (sigma / c)^2 D_ls / D_s in arcsec; 0 if the source is in front of the lens.
     """
     ratio = 1.0 - cosmology.comoving_distance(z_lens) / cosmology.comoving_distance(z_source)
     return _max_einstein_radius(sigma) * np.maximum(ratio, 0.0)
 
 
 def _max_einstein_radius(sigma: npt.ArrayLike) -> Float:
-    """Of sources infinitely far behind."""
+    """Einstein radius for sources at infinity, arcsec."""
     return np.asarray(np.degrees(4.0 * np.pi * (np.asarray(sigma, float) / LIGHT_KM_S) ** 2) * 3600.0)
 
 
 def deflection(lens: Lens, east: Float, north: Float) -> tuple[Float, Float]:
-    """Deflection (east, north) of rays, arcsec: they come from (east, north) minus this.
+    """Return the deflection of rays by an SIE.
 
-    east, north : float[...] arcsec from the lens
-    Ref: eqs. 27a, 27b
+    Parameters
+    ----------
+    lens : Lens
+        The lens.
+    east, north : float array
+        Position of the rays relative to the lens, arcsec.
+
+    Returns
+    -------
+    east, north : float array
+        Deflection, arcsec. A ray comes from its position minus the deflection.
+
+    References
+    ----------
+    Kormann et al. 1994, eqs. 27a, 27b
     """
     along, across = _to_axes(lens.angle, east, north)
     q = lens.axis_ratio
@@ -180,19 +244,44 @@ def deflection(lens: Lens, east: Float, north: Float) -> tuple[Float, Float]:
 
 
 def magnification(lens: Lens, east: Float, north: Float) -> Float:
-    """Of a point seen at (east, north), negative where it is mirrored: 1 / (1 - 2 kappa).
+    """Return the magnification of a point image.
 
-    east, north : float[...] arcsec from the lens
+    Parameters
+    ----------
+    lens : Lens
+        The lens.
+    east, north : float array
+        Position of the image relative to the lens, arcsec.
+
+    Returns
+    -------
+    float array
+        1 / (1 - 2 kappa), negative for mirrored images.
     """
     along, across = _to_axes(lens.angle, east, north)
     return np.asarray(1.0 / (1.0 - lens.radius * np.sqrt(lens.axis_ratio) / np.hypot(lens.axis_ratio * along, across)))
 
 
 def image_positions(lens: Lens, east: float, north: float) -> Float:
-    """[n, 2] where a point source is seen, (east, north) arcsec.
+    """Find the images of a point source.
 
-    The deflection of an SIE depends on the direction alone: an image in direction phi is at distance
-    r = (beta + alpha(phi)) . e(phi) > 0, where (beta + alpha(phi)) x e(phi) = 0.
+    Parameters
+    ----------
+    lens : Lens
+        The lens.
+    east, north : float
+        Position of the source relative to the lens, arcsec.
+
+    Returns
+    -------
+    float array, shape (n, 2)
+        Positions of the images (east, north), arcsec.
+
+    Notes
+    -----
+    The deflection of an SIE depends only on the direction. An image in direction phi is at distance::
+
+        r = (beta + alpha(phi)) . e(phi) > 0,    where (beta + alpha(phi)) x e(phi) = 0
     """
 
     def across(phi: npt.ArrayLike) -> Any:
@@ -200,7 +289,7 @@ def image_positions(lens: Lens, east: float, north: float) -> Float:
         x, y = deflection(lens, np.asarray(e), np.asarray(n))
         return (east + x) * n - (north + y) * e
 
-    # An odd start: no image is expected exactly there.
+    # Start at an arbitrary angle, so that no image is exactly at a node.
     phi = 0.1234567 + np.linspace(0.0, 2.0 * np.pi, _ANGLE_COUNT + 1)
     values = across(phi)
     images = []
@@ -215,11 +304,27 @@ def image_positions(lens: Lens, east: float, north: float) -> Float:
 
 
 def shoot_rays(lens: Lens, source: Disc, stamp_settings: Stamps, side: int) -> Float32:
-    """Picture [side, side] of a source of flux 1, south to north and west to east; its sum is the magnification.
+    """Compute the image of a source of flux 1 by inverse ray shooting.
 
-    lens  : what deflects;  source : an exponential disc behind it
-    shape : samples and pixel scale of pictures;  side : of this one, pixels
-    Error: 1 % of the magnification (tests), for sources larger than a quarter of a pixel
+    Parameters
+    ----------
+    lens : Lens
+        The lens.
+    source : Disc
+        Exponential disc behind the lens.
+    stamp_settings : Stamps
+        Samples and pixel scale.
+    side : int
+        Side of the image, pixels.
+
+    Returns
+    -------
+    float32 array, shape (side, side)
+        Image from south to north and west to east; its sum is the magnification.
+
+    Notes
+    -----
+    The error of the magnification is 1 % (tests) for sources larger than a quarter of a pixel.
     """
     samples = np.ceil(
         stamp_settings.samples_a_radius * stamp_settings.pixel_scale / (source.radius * source.axis_ratio)
@@ -241,9 +346,9 @@ def shoot_rays(lens: Lens, source: Disc, stamp_settings: Stamps, side: int) -> F
 
 
 def _pairs(law: Laws, columns: dict[str, Array], boost: float, area: float, seed: int) -> list[Pair]:
-    """What is drawn of lenses and the sources behind them; area : of the cell, arcsec2.
+    """Draw pairs of lenses and sources in a cell with an area in arcsec2.
 
-    A pair is drawn or not whichever others there are, so that a deeper catalogue has the same lenses, and more.
+    Each pair is drawn independently of all others, so that a deeper catalogue contains the same lenses and more.
     """
     is_galaxy = columns["kind"] < 2
     lens = np.flatnonzero(is_galaxy & (columns["color_gr_01"] > law.reddest_blue) & (columns["z_true"] > 0.02))
@@ -251,7 +356,7 @@ def _pairs(law: Laws, columns: dict[str, Array], boost: float, area: float, seed
     m_star, _, _ = luminosity_function.schechter().parameters_at(z_lens)
     brighter = m_star - columns["abs_mag_r01"][lens]
     sigma = law.sigma_star * 10.0 ** (0.1 * brighter + law.scatter * rng.standard_normal())
-    # However far its source, a lens has no larger radius.
+    # Einstein radius for a source at infinity, an upper limit for each lens.
     max_radius = _max_einstein_radius(sigma)
     chance = boost * np.pi * max_radius**2 / area
     window = np.where(chance < _WINDOW, _WINDOW, 1.0)
@@ -285,7 +390,7 @@ def _allocate(count: int) -> tuple[Int, Int, npt.NDArray[np.uint64], Float]:
 
 
 def _system(law: Laws, columns: dict[str, Array], pair: Pair) -> tuple[Lens, Disc]:
-    """Mass follows light in angle; the source lies anywhere within the Einstein radius."""
+    """Return lens and source of a pair: mass follows light in angle, and the source is within the Einstein radius."""
     _, shape_deviate, area_fraction, angle_fraction = pair.numbers.tolist()
     q = float(np.clip(law.axis_ratio + law.axis_ratio_scatter * shape_deviate, *law.axis_ratio_limits))
     offset, phi = pair.radius * np.sqrt(area_fraction), 2.0 * np.pi * angle_fraction
@@ -296,7 +401,7 @@ def _system(law: Laws, columns: dict[str, Array], pair: Pair) -> tuple[Lens, Dis
 
 
 def _side(stamp_settings: Stamps, lens: Lens, source: Disc) -> int:
-    """Twice the Einstein radius and several radii of the source fit in, as far as stamps go."""
+    """Side of the image in pixels: twice the Einstein radius and several radii of the source fit, within limits."""
     reach = 2.0 * lens.radius / np.sqrt(lens.axis_ratio) + 4.0 * source.radius
     return int(np.clip(2 * np.ceil(reach / stamp_settings.pixel_scale), *stamp_settings.sides))
 
@@ -339,7 +444,7 @@ def _table(cell: int, columns: dict[str, Array], rows: list[Any], boost: float) 
 
 
 def _to_axes(angle: float, east: Float, north: Float) -> tuple[Float, Float]:
-    """(along the major axis, across it)."""
+    """Components along and across the major axis."""
     sin, cos = np.sin(np.radians(angle)), np.cos(np.radians(angle))
     return east * sin + north * cos, east * cos - north * sin
 

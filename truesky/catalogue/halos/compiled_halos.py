@@ -1,4 +1,4 @@
-"""The loops of halos.draw and satellites.draw: every number is keyed by the block, the halo and the member it is of."""
+"""Compiled loops of halos.draw and satellites.draw; the random numbers depend on the block, the halo and the member."""
 
 from __future__ import annotations
 
@@ -9,14 +9,29 @@ import numpy as np
 from truesky.numerics.compiling import exact_jit
 from truesky.randomness.compiled_draws import child_key, normal, poisson, uniform
 
-# What a halo's and a satellite's numbers are for: the number of the key that follows theirs.
+# Numbers of the child keys for each property of a halo and of a satellite.
 VOXEL, DISTANCE, MASS, PLACE, SCATTER = range(5)
 STEP, RADIUS, HEIGHT, AZIMUTH, KICK, SUB_SCATTER = range(6)
 
 
 @exact_jit
 def cut_normal(key: Any, number: Any, cut: Any) -> Any:
-    """A standard normal number of at most `cut` standard deviations: the first that is."""
+    """Draw a standard normal number that is at most `cut` standard deviations from 0, by rejection.
+
+    Parameters
+    ----------
+    key : uint64
+        Key of the random numbers.
+    number : int
+        Number of the first child key; each rejection adds 64.
+    cut : float
+        Limit, standard deviations.
+
+    Returns
+    -------
+    float
+        The number.
+    """
     while True:
         deviate = normal(child_key(key, number))
         if abs(deviate) <= cut:
@@ -26,11 +41,31 @@ def cut_normal(key: Any, number: Any, cut: Any) -> Any:
 
 @exact_jit
 def draw_counts(key: Any, first: Any, steps: Any, used: Any, ln_number: Any, amplitude: Any, field: Any, g: Any) -> Any:
-    """int64[s, bins] halos of each block.
+    """Draw the number of halos of each block (step and mass bin) in a cell.
 
-    key : of the cell;  first : int64[s + 1] first voxel of each step;  steps : int64[s] numbers of the steps
-    used : bool[s, bins], whether a block is drawn;  ln_number : [s, bins] ln of the mean in a voxel without structure
-    amplitude, field : [s, bins];  g : float32[v, fields]
+    Parameters
+    ----------
+    key : uint64
+        Key of the cell.
+    first : int array, shape (s + 1,)
+        First voxel of each step.
+    steps : int array, shape (s,)
+        Numbers of the steps.
+    used : bool array, shape (s, bins)
+        True for blocks that are drawn.
+    ln_number : float array, shape (s, bins)
+        ln of the mean number per voxel without structure.
+    amplitude : float array, shape (s, bins)
+        Amplitude of the field.
+    field : int array, shape (s, bins)
+        Column of the field in `g`.
+    g : float32 array, shape (v, fields)
+        Gaussian fields in the voxels.
+
+    Returns
+    -------
+    int array, shape (s, bins)
+        Number of halos.
     """
     halo_counts = np.zeros(used.shape, np.int64)
     bins = used.shape[1]
@@ -57,13 +92,29 @@ def fill_halos(
     limits: Any,
     out: Any,
 ) -> int:
-    """Fills out with the halos of each block, number[s, bins] of them but for those that are not wanted; how many.
+    """Draw the halos of each block and fill `out` with those above the limits.
 
-    key, first, steps, ln_number, amplitude, field, g : as of `counts`
-    wanted : upper edges [bins] of mass; host, central [s], log10 of mass and proxy: either is enough; the scatter
-             of proxies, dex, and where it is cut, standard deviations
-    out : voxel, step (row), bin, number in the block; place (uint64 random bits)
-          float64[n, 3] uniform in volume, uniform in mass, scatter
+    Parameters
+    ----------
+    key : uint64
+        Key of the cell.
+    first, steps : int array
+        First voxel of each step and numbers of the steps, as in `draw_counts`.
+    number : int array, shape (s, bins)
+        Number of halos of each block.
+    ln_number, amplitude, field, g : array
+        Same as in `draw_counts`.
+    limits : tuple
+        Upper edges of the mass bins (bins,); lower limits of log10 mass and of log10 proxy mass (s,), of which one must
+        be reached; scatter of the proxy mass in dex, and its cut in standard deviations.
+    out : tuple of array
+        voxel, row of the step, bin, number in the block (int64[n]); random bits of the place (uint64[n]); random
+        numbers (float64[n, 3]: uniform in volume, uniform in mass, scatter).
+
+    Returns
+    -------
+    int
+        Number of halos in `out`.
     """
     voxel, row, column, rank, place, drawn = out
     upper_edge, host_limit, central_limit, scatter, cut = limits
@@ -98,9 +149,16 @@ def fill_halos(
 
 @exact_jit
 def count_before(block: Any, cell: Any, out: Any) -> None:
-    """Fills out, int64[n], with how many halos of the same block and cell come before each.
+    """Fill `out` with the number of earlier halos of the same block and cell.
 
-    block, cell : int64[n], blocks one after another
+    Parameters
+    ----------
+    block : int array, shape (n,)
+        Block of each halo; equal values are consecutive.
+    cell : int array, shape (n,)
+        Cell of each halo.
+    out : int array, shape (n,)
+        Result.
     """
     begin = 0
     for i in range(block.size):
@@ -116,12 +174,35 @@ def count_before(block: Any, cell: Any, out: Any) -> None:
 def fill_satellites(
     keys: Any, log_mass: Any, limit: Any, min_ratio: Any, ratio: Any, scatter: Any, depth: Any, out: Any
 ) -> int:
-    """Number of satellites that reach the limit of their host; where out is long enough they are filled in.
+    """Draw the satellites of hosts and fill `out` if it is long enough.
 
-    Sub-masses m fall: M / m is a Poisson process of rate 1 / ratio that begins at `least`.
-    keys : uint64[h];  log_mass, limit, ratio : float64[h] of hosts, of the scattered sub-mass, and the host's
-    least, scatter, depth : as in halos.toml
-    out  : host, member int64[n];  proxy float64[n];  float64[n, 4] uniform in enclosed mass, height, angle; normal
+    Parameters
+    ----------
+    keys : uint64 array, shape (h,)
+        Keys of the hosts.
+    log_mass : float array, shape (h,)
+        log10 of the mass of the hosts.
+    limit : float array, shape (h,)
+        Lower limit of log10 of the scattered sub-mass.
+    min_ratio : float
+        Smallest ratio of host mass and sub-mass (min_mass_ratio in halos.toml).
+    ratio : float array, shape (h,)
+        Mean step of the mass ratio from one satellite to the next.
+    scatter, depth : float
+        Scatter and its limit, dex (halos.toml).
+    out : tuple of array
+        host and member (int64[n]), proxy (float64[n]) and random numbers (float64[n, 4]: uniform in enclosed mass,
+        height and angle; a normal deviate).
+
+    Returns
+    -------
+    int
+        Number of satellites that reach the limit of their host.
+
+    Notes
+    -----
+    Satellites are drawn in the order of decreasing sub-mass m. The mass ratio M / m is a Poisson process of rate
+    1 / `ratio` that begins at `min_ratio`.
     """
     host, member, proxy, drawn = out
     at = 0

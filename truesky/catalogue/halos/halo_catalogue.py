@@ -1,10 +1,7 @@
-"""A halo light-cone of a simulation in place of ours.
+"""The user's halo light-cone, for example of a simulation, which replaces the drawn halos.
 
-load   the halos of a request's files, checked, from the cache or read now
-draw   those of one cell and level, with the scatter that decides which galaxies they hold
-
-Masses are M_200m in Msun/h. Galaxies and their abundance stay those of our own universe. These halos lens as ours do;
-the structure in the lensing maps is not theirs.
+Masses are M_200m in Msun/h. The galaxies and their abundance remain those of the embedded universe. The user's halos
+also lens, but the lensing maps do not contain the structure around them.
 """
 
 from __future__ import annotations
@@ -34,9 +31,18 @@ from truesky.randomness.per_source import PerSourceGenerator
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LightCone:
-    """n halos, sorted by index.
+    """Halos sorted by index.
 
-    index : order-29 cell;  chi : Mpc/h;  log_mass : log10 M_200m / (Msun/h);  velocity : km/s, receding
+    Attributes
+    ----------
+    index : int array, shape (n,)
+        Order-29 cell.
+    chi : float array, shape (n,)
+        Comoving distance, Mpc/h.
+    log_mass : float array, shape (n,)
+        log10 M_200m / (Msun/h).
+    velocity : float array, shape (n,)
+        Line-of-sight velocity, km/s, positive if receding.
     """
 
     index: Int
@@ -46,9 +52,26 @@ class LightCone:
 
 
 def load(files: Sequence[Path], sha256: Sequence[str], columns: Columns) -> LightCone:
-    """The halos of files; all of them are held in memory once, and mapped from the cache afterwards.
+    """Read and check the halos of files, or map them from the cache.
 
-    Errors: BadInput or Damaged names file, column and row of what cannot be used
+    Parameters
+    ----------
+    files : sequence of Path
+        Files of the halos.
+    sha256 : sequence of str
+        SHA-256 of the files, which identify the cached copy.
+    columns : Columns
+        Mapping of the columns.
+
+    Returns
+    -------
+    LightCone
+        The halos. The first call holds all of them in memory.
+
+    Raises
+    ------
+    BadInput, Damaged
+        If a value cannot be used; the message names the file, the column and the row.
     """
     columns_json = json.dumps(sorted((key, repr(field)) for key, field in columns.fields.items()))
     arrays = cached_arrays(
@@ -58,15 +81,30 @@ def load(files: Sequence[Path], sha256: Sequence[str], columns: Columns) -> Ligh
 
 
 def draw(model: HaloModel, masses: Masses, cone: LightCone, seed: int, order: int, cell: int) -> Halos:
-    """The halos of one level in a nested cell of its order; kept are those that halos.draw would keep.
+    """Return the halos of one level in a cell, with the same selection as halos.draw.
 
-    model, masses : of our own halos: levels and limits, and tables of masses
-    cone          : the external halos;  seed : of the request;  order, cell : of the nested cell
+    Parameters
+    ----------
+    model : HaloModel
+        Levels and limits.
+    masses : Masses
+        Tables of halos by mass.
+    cone : LightCone
+        The user's halos.
+    seed : int
+        Seed of the request, for the scatter of the proxy masses.
+    order, cell : int
+        Order and nested index of the cell.
+
+    Returns
+    -------
+    Halos
+        The halos.
     """
     rows = slice(*np.searchsorted(cone.index, sky.cell_range(order, cell)))
     index, velocity = cone.index[rows], cone.velocity[rows]
     chi, log_mass = cone.chi[rows], cone.log_mass[rows]
-    # Numbered in their generation cells as the file has them, whatever is kept.
+    # Number all halos of a generation cell in the order of the file, so that numbers do not depend on the selection.
     generation_cell = index >> 2 * (sky.MAX_ORDER - GENERATION_ORDER)
     identifiers = ids.source_id(
         0, generation_cell, np.arange(generation_cell.size) - np.searchsorted(generation_cell, generation_cell)
@@ -85,7 +123,7 @@ def draw(model: HaloModel, masses: Masses, cone: LightCone, seed: int, order: in
 def _read(files: Sequence[Path], columns: Columns) -> dict[str, Array]:
     pieces = list(mapping.read(files, columns))
     if not sum(len(piece.values["ra"]) for piece in pieces):
-        raise BadInput(f"{files[0]}: holds no halo")
+        raise BadInput(f"{files[0]}: the table has no rows")
     values = {name: np.concatenate([piece.values[name] for piece in pieces]) for name in pieces[0].values}
     ra, dec = sky.check_positions(values["ra"], values["dec"])
     index, z = sky.healpix_29(ra, dec), values["z_true"]

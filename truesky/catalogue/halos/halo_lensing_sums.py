@@ -1,13 +1,9 @@
-"""Convergence, shear and deflection by halos: compiled sums.
+"""Compiled sums of the convergence, shear and deflection by halos.
 
-add_halos   to sources, the part of each halo that ends near it
-add_smooth  to nodes of a grid, the rest of it
-add_nodes   to sources, what lies between nodes
-
-Tables of halos have rows X .. CONCENTRATION: place in the plane of the sources, distance in Mpc/h (rising), amplitude,
-and angles in rad. Sources have places [2, n] in the same plane, rad, and near[n] = 1 / distance, h/Mpc. Sums are
-[5, n]: kappa, gamma1, gamma2, deflection along x and y. What a halo does to a source depends on these two alone, and
-halos are added in the order that they come in.
+A table of halos has the rows X to CONCENTRATION: position in the plane of the sources (rad), distance (Mpc/h,
+ascending), amplitude, angles (rad) and concentration. Sources have positions (2, n) in the same plane (rad) and inverse
+distances 1 / chi (h/Mpc). Sums have shape (5, n): kappa, gamma1, gamma2, deflection along x and y (rad). The lensing of
+a source by a halo depends only on these two, and halos are added in the order of the table.
 """
 
 from __future__ import annotations
@@ -20,19 +16,29 @@ from truesky.numerics.compiling import exact_jit
 
 X, Y, CHI, AMPLITUDE, SIZE, CLOSE, WIDE, CONCENTRATION = range(8)
 _profile, _total = projected_nfw.profile, projected_nfw.total
-# Closer to a centre than this, in units of theta_200, everything is as here: behind it are shear and deflection 0.
+# Inner radius in units of theta_200. Closer to the centre, values are frozen at this radius, except that shear and
+# deflection are 0 at the centre.
 _CENTRE = 1e-6
-# Reaches are compared with distances that are rounded.
+# Margin for rounding errors in the comparison of distances.
 _ROUNDING_ERROR = 1e-9
 
 
 @exact_jit
 def add_halos(place: Float, inverse_distance: Float, first: Int, halo: Float, out: Float) -> None:
-    """Add to out[5, n] what each halo does to the sources behind it, with its mass taken away again within theta_s.
+    """Add the short-range lensing of halos to sources behind them, with masses compensated within theta_s.
 
-    place, near, out : sources, piece by piece of the plane, in each the farthest first
-    first            : [pieces + 1] row of the first source of each piece
-    halo             : [8, h]
+    Parameters
+    ----------
+    place : float array, shape (2, n)
+        Positions of the sources, rad, sorted by piece of the plane, then by decreasing distance.
+    inverse_distance : float array, shape (n,)
+        Inverse distances of the sources, h/Mpc.
+    first : int array, shape (pieces + 1,)
+        Row of the first source of each piece.
+    halo : float array, shape (8, h)
+        Table of halos.
+    out : float array, shape (5, n)
+        Sums, to which the lensing is added.
     """
     for piece in range(first.size - 1):
         start, stop = first[piece], first[piece + 1]
@@ -61,7 +67,7 @@ def add_halos(place: Float, inverse_distance: Float, first: Int, halo: Float, ou
 
 @exact_jit
 def _add_point(x: Float, y: Float, inverse: Float, halo: Float, out: Float) -> None:
-    """A point of the halo's mass, whose mass is taken away again within theta_s: nothing is left beyond."""
+    """Add a point with the halo's mass, compensated within theta_s, so that there is no lensing beyond."""
     kappa, gamma1, gamma2, along_x, along_y = out[0], out[1], out[2], out[3], out[4]
     at_x, at_y, chi, amplitude = halo[X], halo[Y], halo[CHI], halo[AMPLITUDE]
     min_square, inverse_close = (_CENTRE * halo[SIZE]) ** 2, 1.0 / halo[CLOSE] ** 2
@@ -85,7 +91,7 @@ def _add_point(x: Float, y: Float, inverse: Float, halo: Float, out: Float) -> N
 
 @exact_jit
 def _add_inside(x: Float, y: Float, inverse: Float, halo: Float, out: Float) -> None:
-    """What the halo's profile is more than the point of its mass, inside R_200m."""
+    """Add the difference between the halo's profile and a point of its mass, inside R_200m."""
     size, concentration = halo[SIZE], halo[CONCENTRATION]
     min_square, max_square = (_CENTRE * size) ** 2, size * size
     total_mass = _total(concentration)
@@ -110,9 +116,18 @@ def _add_inside(x: Float, y: Float, inverse: Float, halo: Float, out: Float) -> 
 
 @exact_jit
 def add_smooth(place: Float, inverse_distance: Float, halo: Float, out: Float) -> None:
-    """Add to out[5, n] what halos do with their mass within theta_s and taken away again within theta_c.
+    """Add the long-range lensing of halos: their mass spread within theta_s, and compensated within theta_c.
 
-    place, near, out : nodes, the farthest first;  halo : [8, h]
+    Parameters
+    ----------
+    place : float array, shape (2, n)
+        Positions of the nodes, rad, sorted by decreasing distance.
+    inverse_distance : float array, shape (n,)
+        Inverse distances of the nodes, h/Mpc.
+    halo : float array, shape (8, h)
+        Table of halos.
+    out : float array, shape (5, n)
+        Sums, to which the lensing is added.
     """
     for h in range(halo.shape[1]):
         behind_count = inverse_distance.size
@@ -140,11 +155,26 @@ def add_smooth(place: Float, inverse_distance: Float, halo: Float, out: Float) -
 
 @exact_jit
 def add_nodes(place: Float, inverse_distance: Float, planes: Float, step: float, table: Float, out: Float) -> None:
-    """Add to out[5, n] the table's values at sources: cubic on the grid, linear in 1 / distance between planes.
+    """Add values of a table to sources: cubic on the grid, linear in inverse distance between planes.
 
-    place, near : of sources;  planes : [p] 1 / distance, rising from 0;  step : rad between nodes
-    table  : [p, side, side, 5] at nodes of a square about the origin; sources outside have what its border has
-    Ref: Keys 1981, IEEE Trans. Acoust. Speech Signal Process. 29, 1153
+    Parameters
+    ----------
+    place : float array, shape (2, n)
+        Positions of the sources, rad.
+    inverse_distance : float array, shape (n,)
+        Inverse distances of the sources, h/Mpc.
+    planes : float array, shape (p,)
+        Inverse distances of the planes, h/Mpc, ascending from 0.
+    step : float
+        Node spacing, rad.
+    table : float array, shape (p, side, side, 5)
+        Values at the nodes of a square around the origin; sources outside get the values of its border.
+    out : float array, shape (5, n)
+        Sums, to which the values are added.
+
+    References
+    ----------
+    Keys 1981, IEEE Trans. Acoust. Speech Signal Process. 29, 1153
     """
     side = table.shape[1]
     across, along = np.empty(4), np.empty(4)
@@ -164,7 +194,7 @@ def add_nodes(place: Float, inverse_distance: Float, planes: Float, step: float,
 
 @exact_jit
 def _node(at: float, step: float, side: int, weight: Float) -> int:
-    """The first of four nodes about a place, and their weights."""
+    """Return the first of the four nodes around a position, and fill in their weights."""
     where = min(max(at / step + 0.5 * (side - 1), 1.0), side - 2.000001)
     node = int(where)
     t = where - node

@@ -1,16 +1,16 @@
 """Halos of the embedded universe: abundance, bias, and draws in the voxels of a cell of the sky.
 
-model       every table that the draws need
-draw        halos of one cell of one level
-levels      which cells draw a halo, by the angle that its radius spans
+A halo belongs to one of three levels, depending on the angle of its radius. Halos of a level are drawn by cells of its
+order, so that the satellites of a halo are in its cell or in the neighbouring cells. Nearby and massive halos, which
+span degrees, are drawn by large cells.
 
-A halo belongs to one of three levels, by the angle that its radius spans.  Halos of a level are drawn by the cells
-of its order, so that the satellites of a halo end in its cell or in one of the cells about it: near and massive
-halos, which span degrees, by wide cells.
+A block is a cell, a step along the line of sight and a mass bin. The number of halos in a block and all their
+properties depend only on the block, so that a deeper or farther request contains the same halos and more. The
+parameters are in halos.toml.
 
-Halos are drawn by blocks: a cell, a step along the line of sight and a bin of mass. The number of a block and all that
-its halos are is keyed by the block, so that a deeper or farther request draws the same halos and more of them.
-Ref: Tinker et al. 2008, 2010; the numbers are in halos.toml.
+References
+----------
+Tinker et al. 2008, 2010
 """
 
 from __future__ import annotations
@@ -36,19 +36,42 @@ from truesky.fluxes import cosmology
 from truesky.randomness import per_source
 
 LEVELS = (GENERATION_ORDER, 5, 2)
-# Any two cells of an order that do not touch are further apart than this, in units of the side of a cell.
+# Lower limit of the distance between cells of an order that do not touch, in units of the side of a cell.
 _CELL_SEPARATION = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HaloModel:
-    """What halos are drawn from: tables that are the same for every request, and the limits of one.
+    """Tables from which halos are drawn: some are the same for every request, others are its limits.
 
-    line    : radial steps;  log_mass : [bins + 1] edges
-    number  : [s, bins] comoving (Mpc/h)^-3 in a bin;  ratio : [s, bins] ln of the density at its edges, low / high
-    x       : [s, bins] bias times growth;  field, amplitude : int[s, bins] which smoothed field, and how much of it
-    level   : int[s, bins] order of the cells that a halo of this bin is drawn by, -1 = wider than any
-    limit   : [s] log10 of the proxy mass of the faintest galaxy;  far : Mpc/h, where the request ends
+    Attributes
+    ----------
+    box : Box
+        Matter in a box.
+    replicas : Replicas
+        Rotation of each replica of the box.
+    distances : Distances
+        Table of redshifts.
+    steps : Steps
+        Steps along the line of sight.
+    log_mass : float array, shape (bins + 1,)
+        Edges of the mass bins, log10 Msun/h.
+    number : float array, shape (s, bins)
+        Comoving number density in a bin, (Mpc/h)^-3.
+    ratio : float array, shape (s, bins)
+        ln of the ratio of the densities at the lower and upper edge of the bin.
+    x : float array, shape (s, bins)
+        Bias times growth.
+    field, amplitude : array, shape (s, bins)
+        Number of the smoothed field, and its amplitude.
+    level : int array, shape (s, bins)
+        Order of the cells that draw the halos of a block; -1 if they are larger than any level.
+    limit : float array, shape (s,)
+        log10 of the proxy mass of the faintest galaxy, Msun/h.
+    max_distance : float
+        Largest distance of the request, Mpc/h.
+    matching : Matching
+        Luminosities by proxy mass.
     """
 
     box: Box
@@ -67,9 +90,9 @@ class HaloModel:
     matching: Matching
 
     def mass_limit(self, chi: Float) -> Float:
-        """log10 of the proxy mass[n] of the faintest galaxy at chi[n]."""
+        """Return log10 of the proxy mass of the faintest galaxy at comoving distances (Mpc/h)."""
         middle, last = self.steps.middle, self.limit.size - 2
-        # Steps are all as deep as a cell of the box, but for the first.
+        # Each step except the first is as deep as a cell of the box.
         row = np.clip(((chi - middle[1]) / self.box.model.cell).astype(np.int64) + 1, 1, last)
         row = np.where(chi < middle[1], 0, row)
         part = np.clip((chi - middle[row]) / (middle[row + 1] - middle[row]), 0.0, 1.0)
@@ -77,30 +100,44 @@ class HaloModel:
 
     @property
     def host_offset(self) -> float:
-        """Every halo above `mass_limit` plus this, dex, is drawn: it may have a satellite, which may be seen."""
+        """Return the offset from `mass_limit` in dex; all halos above it are drawn, because of their satellites."""
         return float(np.log10(self.matching.occupation.min_mass_ratio)) - self.matching.occupation.depth
 
     @property
     def min_mass_limit(self) -> Float:
-        """Least `mass_limit`[s] anywhere in a step; infinite beyond the request's end.
+        """Return the smallest `mass_limit` in and next to each step, infinite beyond the end of the request.
 
-        Galaxies end at `far`, their hosts one step behind it.
+        Galaxies end at `max_distance`, their hosts one step behind it.
         """
         padded = np.pad(self.limit, 1, constant_values=np.inf)
         lowest = np.minimum(np.minimum(padded[:-2], padded[2:]), self.limit)
         return np.where(self.steps.edge[:-1] < self.max_distance + self.box.model.cell, lowest, np.inf)
 
     def blocks_above(self, min_log_mass: Float) -> Bool:
-        """Blocks, [s, bins], that hold halos of at least log10 mass least[s] and have a level."""
+        """Return True for blocks (s, bins) that have a level and contain halos above a log10 mass limit (s,)."""
         return np.asarray((self.level >= 0) & (self.log_mass[None, 1:] >= min_log_mass[:, None]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Halos:
-    """n halos, sorted by index.
+    """Halos sorted by index.
 
-    index : order-29 cell;  chi : Mpc/h;  velocity : km/s, receding;  log_mass : log10 M_200m / (Msun/h)
-    proxy : log_mass with the scatter that its central has;  id : its identifier;  bits : of a member of it
+    Attributes
+    ----------
+    index : int array, shape (n,)
+        Order-29 cell.
+    chi : float array, shape (n,)
+        Comoving distance, Mpc/h.
+    log_mass : float array, shape (n,)
+        log10 M_200m / (Msun/h).
+    proxy : float array, shape (n,)
+        log10 mass with the scatter of its central galaxy.
+    velocity : float array, shape (n,)
+        Line-of-sight velocity, km/s, positive if receding.
+    id : int array, shape (n,)
+        Identifier.
+    bits : int array, shape (n,)
+        Number of bits for the members in identifiers.
     """
 
     index: Int
@@ -112,18 +149,37 @@ class Halos:
     bits: Int
 
     def select(self, keep: npt.NDArray[np.generic]) -> Halos:
-        """The halos that are kept: keep : bool or int[m] rows."""
+        """Return the halos of a bool mask or of row numbers."""
         return Halos(*(getattr(self, name)[keep] for name in self.__slots__))
 
 
 def model(
     box: Box, volume: Volume, masses: Masses, matching: Matching, faintest: Callable[[Float], Float]
 ) -> HaloModel:
-    """Tables of halos, and the limits of a request.
+    """Return the tables of halos, and the limits of a request.
 
-    faintest : z[n] -> the faintest M_r[n] that is wanted there
-    box              : of matter;  space : redshifts of the request
-    masses, matching : tables of halos by mass, and of luminosities by mass
+    Parameters
+    ----------
+    box : Box
+        Matter in a box.
+    volume : Volume
+        Redshift range of the request.
+    masses : Masses
+        Tables of halos by mass.
+    matching : Matching
+        Luminosities by mass.
+    faintest : callable
+        Function that returns the faintest requested M_r at each redshift.
+
+    Returns
+    -------
+    HaloModel
+        The model.
+
+    Raises
+    ------
+    BadInput
+        If there are more blocks than identifiers can number.
     """
     steps, distances = _radial_steps(box.model.cell, float(cosmology.comoving_distance(volume.z_min)))
     law = parameters.section("halos.toml", "mass_function")
@@ -131,10 +187,10 @@ def model(
     edge = law["lowest"] + law["bin"] * np.arange(bins + 1)
     if steps.z.size * bins > ids.BLOCK_COUNT:
         raise BadInput(
-            f"{steps.z.size} steps of {bins} bins of mass are more blocks than identifiers have: {ids.BLOCK_COUNT}"
+            f"{steps.z.size} steps times {bins} mass bins must not exceed {ids.BLOCK_COUNT}, the limit of identifiers"
         )
     at_edge = np.exp(masses.interpolate(masses.ln_density, steps.z, edge))
-    # Where nothing is left of the mass function, the logarithm of what is left has no meaning.
+    # At the end of the mass function the densities underflow, and their ratio has no meaning.
     ratio = np.maximum(np.log(np.maximum(at_edge[:, :-1], 1e-300) / np.maximum(at_edge[:, 1:], 1e-300)), 1e-6)
     number = law["bin"] * (at_edge[:, :-1] - at_edge[:, 1:]) / ratio
     x = masses.interpolate(masses.bias, steps.z, edge[:-1] + 0.5 * law["bin"])
@@ -159,30 +215,43 @@ def model(
 
 
 def _radial_steps(cell: float, start: float) -> tuple[Steps, Distances]:
-    """Steps of `cell` Mpc/h from `near` to a step behind the tables' last redshift, and the distances of these."""
+    """Steps of one cell from `start` to one step behind the last redshift of the tables, and a table of redshifts."""
     last = (np.ceil(float(cosmology.comoving_distance(Z_LAST)) / cell) + 1.0) * cell
     table = lightcone.distance_table(float(cosmology.redshift(last)) + 1e-6)
     return lightcone.radial_steps(cell, start, float(last), table), table
 
 
 def reach(order: int) -> float:
-    """Angle, rad, that certainly does not lead from a cell beyond the cells about it."""
+    """Return an angle (rad) that never leads from a cell beyond its neighbours."""
     return float(_CELL_SEPARATION * np.radians(np.sqrt(sky.cell_area(order))))
 
 
 def draw(halos: HaloModel, seed: int, order: int, cell: int, min_log_mass: Float | None = None) -> Halos:
-    """Halos of one level in a nested cell of its order, a Poisson sample of the biased field.
+    """Draw the halos of one level in a cell: a Poisson sample of the biased field.
 
-    halos : tables of `model`;  seed : of the request;  order, cell : of the nested cell
-    least : [s] log10 of the mass from which on all halos are wanted, infinite where none are, whatever the limit;
-            None = those that may hold galaxies of the request: a satellite, or a central above `mass_limit`
+    Parameters
+    ----------
+    halos : HaloModel
+        Tables from `model`.
+    seed : int
+        Seed of the request.
+    order, cell : int
+        Order and nested index of the cell.
+    min_log_mass : float array, shape (s,), optional
+        log10 of the mass above which all halos are returned, infinite for steps without halos. None for the halos that
+        may contain galaxies of the request: a satellite, or a central galaxy above `mass_limit`.
+
+    Returns
+    -------
+    Halos
+        The halos.
     """
     occupation, lowest = halos.matching.occupation, halos.min_mass_limit
     used = halos.blocks_above(lowest - occupation.depth if min_log_mass is None else min_log_mass) & (
         halos.level == order
     )
     voxels = lightcone.voxels(halos.box, halos.replicas, halos.steps, order, cell, used.any(1))
-    # Either is enough; of wide cells all halos are numbered.
+    # Either threshold must be reached. All halos of the larger cells must be drawn, because they are numbered below.
     thresholds = (lowest + halos.host_offset, lowest) if min_log_mass is None else (min_log_mass, min_log_mass)
     thresholds = thresholds if order == GENERATION_ORDER else (np.full(lowest.size, -np.inf), lowest)
     voxel, column, rank, place, numbers = _draw_blocks(
@@ -190,7 +259,7 @@ def draw(halos: HaloModel, seed: int, order: int, cell: int, min_log_mass: Float
     )
     step = voxels.step[voxel]
     fall, width = halos.ratio[step, column], halos.log_mass[1] - halos.log_mass[0]
-    # Inside a bin dn/dlogM falls exponentially.
+    # dn/dlogM decreases exponentially within a bin.
     log_mass = halos.log_mass[column] - width * np.log1p(numbers[:, 1] * np.expm1(-fall)) / fall
     proxy = log_mass + occupation.scatter * numbers[:, 2]
     inner, outer = halos.steps.edge[step], halos.steps.edge[step + 1]
@@ -210,10 +279,7 @@ def draw(halos: HaloModel, seed: int, order: int, cell: int, min_log_mass: Float
 
 
 def levels(angle: Float) -> Int:
-    """Order of the cells that draw a halo whose radius spans this angle, rad; -1 where it spans more than any.
-
-    wide : float[...] rad
-    """
+    """Return the order of the cells that draw halos with these angular radii (rad), -1 if no level is large enough."""
     level = np.full(angle.shape, -1)
     for order in sorted(LEVELS):
         level[angle < reach(order)] = order
@@ -223,10 +289,7 @@ def levels(angle: Float) -> Int:
 def _draw_blocks(
     halos: HaloModel, used: Bool, voxels: Voxels, thresholds: tuple[Float, Float], key: int
 ) -> tuple[Int, Int, Int, npt.NDArray[np.uint64], Float]:
-    """(voxel[n], mass bin[n], number in the block[n], random bits[n], [n, 3] numbers) of halos, block after block.
-
-    wanted : [s] log10 of mass and proxy of which either is enough
-    """
+    """Return (voxel, mass bin, number in the block, random bits, random numbers (n, 3)) of halos, sorted by block."""
     steps, first = np.unique(voxels.step, return_index=True)
     first = np.append(first, voxels.step.size)
     amplitude, field = halos.amplitude[steps], halos.field[steps]
@@ -250,7 +313,7 @@ def _draw_blocks(
 
 
 def _identifiers(halos: HaloModel, step: Int, column: Int, index: Int, number: Int | None) -> tuple[Int, Int]:
-    """(identifiers[n], bits of a member[n]) of halos; of wide cells they have no number yet, and are all of a block."""
+    """Return (identifiers, member bits) of halos; halos of larger cells are numbered here in their generation cells."""
     block, cell = step * (halos.log_mass.size - 1) + column, index >> 2 * (sky.MAX_ORDER - GENERATION_ORDER)
     if number is None:
         number = np.empty(block.size, np.int64)

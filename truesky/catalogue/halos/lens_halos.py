@@ -1,10 +1,8 @@
-"""Halos that lens: all above one mass, whatever the limit of a request and its redshifts.
+"""Halos that lens: all halos above a fixed mass, independent of the limit and the redshifts of a request.
 
-draw      those of one cell of one level
-sizes     what they do to light: amplitude, radius, and the circles within which their mass is taken away again
-farthest  how far they reach
-
-Error: spherical, cut at R_200m; halos below the threshold do not lens, and none does beyond its redshift
+Notes
+-----
+Halos are spherical and end at R_200m. Halos below the mass threshold or beyond a maximum redshift do not lens.
 """
 
 from __future__ import annotations
@@ -25,7 +23,7 @@ from truesky.fluxes import cosmology
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Which halos lens, and how far (lens_halos.toml; angles arcmin, planes redshifts)."""
+    """Selection and ranges of the lensing halos (lens_halos.toml; angles in arcmin, planes are redshifts)."""
 
     lowest: float
     z_max: float
@@ -44,32 +42,45 @@ class Settings:
 
     @property
     def max_distance(self) -> float:
-        """Mpc/h, to which halos lens."""
+        """Return the largest distance of lensing halos, Mpc/h."""
         return float(cosmology.comoving_distance(self.z_max))
 
     @property
     def wide_distance(self) -> float:
-        """Mpc/h, beyond which no halo's theta_c is larger than `wide`."""
+        """Return the distance beyond which no theta_c is larger than `wide`, Mpc/h."""
         return float(self.span / np.radians(self.wide / 60.0))
 
 
 def settings() -> Settings:
-    """The halos that lens in the embedded universe."""
+    """Return the settings of the embedded universe."""
     return Settings(**parameters.section("lens_halos.toml", "lenses"))
 
 
 def draw(population: Population, min_log_mass: float, max_distance: float, order: int, cell: int) -> Halos:
-    """Halos of one level in a nested cell of its order, down to a mass; they are among those of a deep request.
+    """Return the lensing halos of one level in a cell, which are a subset of the halos of a deep request.
 
-    population  : whose halos they are;  least : log10 M_200m / (Msun/h);  far : Mpc/h
-    order, cell : of the nested cell
+    Parameters
+    ----------
+    population : Population
+        Halos and their model.
+    min_log_mass : float
+        Lower limit of log10 M_200m / (Msun/h).
+    max_distance : float
+        Largest distance, Mpc/h.
+    order, cell : int
+        Order and nested index of the cell.
+
+    Returns
+    -------
+    Halos
+        The halos.
     """
     model = population.halos
     if population.light_cone is None:
         limits = np.where(model.steps.edge[:-1] < max_distance, min_log_mass, np.inf)
         drawn = halos.draw(model, population.seed, order, cell, limits)
     else:
-        # Of halos whose central would be seen.
+        # Select by the limits of lensing instead of the limits of galaxies.
         deep = replace(model, limit=np.full(model.limit.shape, min_log_mass), max_distance=max_distance)
         cone, seed = population.light_cone, population.seed
         drawn = halo_catalogue.draw(deep, population.masses, cone, seed, order, cell)
@@ -77,14 +88,38 @@ def draw(population: Population, min_log_mass: float, max_distance: float, order
 
 
 def sizes(masses: Masses, chosen: Settings, order: int, z: Float, chi: Float, log_mass: Float) -> Float:
-    """[5, n] amplitude, theta_200, theta_s, theta_c and concentration of halos; angles in rad.
+    """Return the lensing strength and the angles of halos.
 
-    kappa of a halo is the amplitude times 1 - chi / chi_source times a function of angles, which has the mean
-    1 / theta^2 inside theta where all of the mass is.
-    masses : of halos by mass;  chosen : how far they lens;  order : of their level
-    z, chi, log_mass : [n] redshift, distance in Mpc/h, log10 M_200m / (Msun/h)
+    Parameters
+    ----------
+    masses : Masses
+        Tables of halos by mass.
+    chosen : Settings
+        Ranges of the lensing.
+    order : int
+        Order of the level.
+    z : float array, shape (n,)
+        Redshift.
+    chi : float array, shape (n,)
+        Comoving distance, Mpc/h.
+    log_mass : float array, shape (n,)
+        log10 M_200m / (Msun/h).
+
+    Returns
+    -------
+    float array, shape (5, n)
+        Amplitude; theta_200, theta_s and theta_c in rad; concentration.
+
+    Notes
+    -----
+    The convergence of a halo is the amplitude times 1 - chi / chi_source times a function of angle. The mean of this
+    function inside theta is 1 / theta^2 if the circle contains the whole mass.
+
+    theta_200 is the angle of R_200m. Halos are summed for each source within theta_s; the rest of their lensing is
+    smooth. The mass of a halo is compensated by an equal negative mass within theta_c, so that the mean density does
+    not change and there is no lensing beyond.
     """
-    # c^2 / (4 pi G), Msun / Mpc, of the matter that the box has.
+    # c^2 / (4 pi G) in Msun / Mpc, from the critical density of `masses`.
     bending = masses.shape.critical_density * cosmology.HUBBLE_DISTANCE**2 / 1.5
     amplitude = 10.0**log_mass * (1.0 + z) / (np.pi * chi * bending)
     radius = masses.radius(log_mass) / chi
@@ -100,7 +135,7 @@ def sizes(masses: Masses, chosen: Settings, order: int, z: Float, chi: Float, lo
 
 
 def max_circle(chosen: Settings, order: int) -> float:
-    """Largest theta_c, rad, of a level: what the cells about one hold."""
+    """Return the largest theta_c of a level (rad), limited by the neighbouring cells that are searched."""
     if order == GENERATION_ORDER:
         return float(np.radians(chosen.reach / 60.0))
     return float(halos.reach(order) - np.radians(chosen.strip / 60.0))

@@ -1,10 +1,11 @@
-"""The evolving luminosity function of galaxies, and its inverse.
+"""Evolving luminosity function of galaxies, and its inverse.
 
-number_density      n(< M, z), closed form
-inverse, magnitude  the table that turns n(< M, z) back into M
+Absolute magnitudes are M_r = M(0.1r) - 5 log10 h, volumes are comoving (Mpc/h)^3. The parameters and their sources are
+in luminosity_function.toml.
 
-Absolute magnitudes are M_r = M(0.1r) - 5 log10 h, volumes comoving (Mpc/h)^3.
-Ref: Schechter 1976, ApJ 203, 297; the numbers and their sources are in luminosity_function.toml.
+References
+----------
+Schechter 1976, ApJ 203, 297
 """
 
 from __future__ import annotations
@@ -21,10 +22,10 @@ from truesky.catalogue import parameters
 from truesky.catalogue.interpolation import bracket
 
 _LN10_04 = 0.4 * np.log(10.0)
-# Beyond this redshift the universe has a population of its own (Serrano et al. 2024, "Galaxy catalogues").
+# Redshift beyond which a separate population begins (Serrano et al. 2024, "Galaxy catalogues").
 _Z_MAX_LIMIT = 6.0
 
-# Resolution of the tables: chosen so that the stated errors hold.
+# Resolution of the tables, chosen to keep the stated errors.
 _SMALLEST_A = 1e-5
 _ONE_STEP = -0.95
 _A_NODES, _A_MARGIN = 384, 0.01
@@ -33,7 +34,7 @@ _LN_X_RANGE, _X_NODES, _X_STEP = (-20.0, 6.4), 3001, 5
 
 @dataclass(frozen=True, slots=True)
 class Schechter:
-    """A Schechter function whose parameters vary with redshift (luminosity_function.toml, [schechter])."""
+    """Schechter function whose parameters depend on redshift (luminosity_function.toml, [schechter])."""
 
     z_anchor: float
     m_star: float
@@ -50,7 +51,7 @@ class Schechter:
     far_alpha: tuple[float, ...]
 
     def parameters_at(self, z: npt.ArrayLike) -> tuple[Float, Float, Float]:
-        """z[n] -> M*[n] mag, phi*[n] (Mpc/h)^-3, alpha[n]."""
+        """Return M* (mag), phi* ((Mpc/h)^-3) and alpha at each redshift."""
         redshift = np.asarray(z, float)
         z_offset = redshift - self.z_anchor
         m_star = self.m_star + self.m_star_rate * self.m_star_scale * np.expm1(-z_offset / self.m_star_scale)
@@ -68,7 +69,7 @@ class Schechter:
 
 @dataclass(frozen=True, slots=True)
 class Volume:
-    """The redshifts that are filled, and the faintest M_r drawn (luminosity_function.toml, [volume])."""
+    """Redshift range, and the faintest M_r that is drawn (luminosity_function.toml, [volume])."""
 
     z_min: float
     z_max: float
@@ -77,9 +78,18 @@ class Volume:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inverse:
-    """The luminosity of a number density: ln x of Gamma(a, x) = g, x = L/L*, a = alpha + 1.
+    """Table of the luminosity at a number density: ln x for Gamma(a, x) = g, with x = L/L* and a = alpha + 1.
 
-    a : [k], uniform; ln_g : [m], ascending; ln_x : [k, m]
+    Attributes
+    ----------
+    schechter : Schechter
+        The luminosity function.
+    a : float array, shape (k,)
+        Uniform nodes of a.
+    ln_g : float array, shape (m,)
+        Nodes of ln g in ascending order.
+    ln_x : float array, shape (k, m)
+        ln x.
     """
 
     schechter: Schechter
@@ -89,14 +99,14 @@ class Inverse:
 
 
 def schechter() -> Schechter:
-    """The luminosity function of the embedded universe."""
+    """Return the luminosity function of the embedded universe."""
     return Schechter(**parameters.section("luminosity_function.toml", "schechter"))
 
 
 def volume(z_max: float | None = None) -> Volume:
-    """The redshift range of the embedded universe, or one with another far end.
+    """Return the redshift range of the embedded universe, with another upper end if `z_max` is given.
 
-    Errors: OutOfRange for z_max outside (z_min, 6]
+    Raises OutOfRange if z_max is outside (z_min, 6].
     """
     numbers = parameters.section("luminosity_function.toml", "volume")
     if z_max is not None:
@@ -107,10 +117,25 @@ def volume(z_max: float | None = None) -> Volume:
 
 
 def density(lf: Schechter, m: npt.ArrayLike, z: npt.ArrayLike) -> Float:
-    """dn/dM at M, z, (Mpc/h)^-3 mag^-1.
+    """Return the luminosity function dn/dM.
 
-    m : float[n] M_r mag;  z : float[n]
-    Ref: Schechter 1976
+    Parameters
+    ----------
+    lf : Schechter
+        Parameters.
+    m : float array, shape (n,)
+        M_r, mag.
+    z : float array, shape (n,)
+        Redshift.
+
+    Returns
+    -------
+    float array, shape (n,)
+        dn/dM, (Mpc/h)^-3 mag^-1.
+
+    References
+    ----------
+    Schechter 1976
     """
     m_star, phi_star, alpha = lf.parameters_at(z)
     ln_x = -_LN10_04 * (np.asarray(m, float) - m_star)
@@ -118,9 +143,21 @@ def density(lf: Schechter, m: npt.ArrayLike, z: npt.ArrayLike) -> Float:
 
 
 def number_density(lf: Schechter, m: npt.ArrayLike, z: npt.ArrayLike) -> Float:
-    """n(< M, z): galaxies brighter than M, (Mpc/h)^-3, phi* Gamma(alpha + 1, L/L*).
+    """Return the number density of galaxies brighter than M.
 
-    m : float[n] M_r mag;  z : float[n]
+    Parameters
+    ----------
+    lf : Schechter
+        Parameters.
+    m : float array, shape (n,)
+        M_r, mag.
+    z : float array, shape (n,)
+        Redshift.
+
+    Returns
+    -------
+    float array, shape (n,)
+        n(< M, z) = phi* Gamma(alpha + 1, L/L*), (Mpc/h)^-3.
     """
     m_star, phi_star, alpha = lf.parameters_at(z)
     x = np.exp(-_LN10_04 * (np.asarray(m, float) - m_star))
@@ -128,20 +165,24 @@ def number_density(lf: Schechter, m: npt.ArrayLike, z: npt.ArrayLike) -> Float:
 
 
 def upper_gamma(a: npt.ArrayLike, x: npt.ArrayLike) -> Float:
-    """Gamma(a, x) for a > -2 and x > 0; scipy's own needs a > 0.
+    """Return the upper incomplete Gamma function Gamma(a, x) for a > -2 and x > 0; scipy requires a > 0.
 
-    a, x : float[...]
-    Error: relative 1e-9 where |a|, |a + 1| > 1e-2 and x < 300 (a > -0.9) or x < 30, 1e-4 where |a|, |a + 1| < 1e-5
-           (tests/truesky/catalogue/halos/test_luminosity_function.py)
-    Ref: Abramowitz & Stegun 1972, 6.5.22: Gamma(a, x) = [Gamma(a + 1, x) - x^a e^-x] / a
+    Notes
+    -----
+    The relative error is 1e-9 if |a| and |a + 1| > 1e-2 and x < 300 (a > -0.9) or x < 30. It is 1e-4 if |a| or
+    |a + 1| < 1e-5 (tests/truesky/catalogue/halos/test_luminosity_function.py).
+
+    References
+    ----------
+    Abramowitz & Stegun 1972, 6.5.22: Gamma(a, x) = [Gamma(a + 1, x) - x^a e^-x] / a
     """
     order, at = np.asarray(a, float), np.asarray(x, float)
     if order.size and order.min() <= -2.0:
         raise OutOfRange("a", float(order.min()), -2.0, "infinity")
-    # At a = 0 and -1 the recurrence divides zero by zero; so small a step moves Gamma by less than 1e-4.
+    # The recurrence divides zero by zero at a = 0 and -1. Moving a by this small step changes Gamma by less than 1e-4.
     order = np.where(np.abs(order) < _SMALLEST_A, _SMALLEST_A, order)
     order = np.where(np.abs(order + 1.0) < _SMALLEST_A, _SMALLEST_A - 1.0, order)
-    # Each step up loses digits at large x: two only where one would not do.
+    # Each step of the recurrence loses digits at large x: use two steps only if one is not enough.
     second = order < _ONE_STEP
     start = np.where(second, order + 2.0, order + 1.0)
     above = gamma(start) * gammaincc(start, at)
@@ -151,23 +192,38 @@ def upper_gamma(a: npt.ArrayLike, x: npt.ArrayLike) -> Float:
 
 
 def inverse(lf: Schechter, z_max: float = _Z_MAX_LIMIT) -> Inverse:
-    """The table that `magnitude` reads: ln(L/L*) where Gamma(a, L/L*) = g."""
+    """Return the table for `magnitude`: ln(L/L*) as a function of a and of g = Gamma(a, L/L*)."""
     alpha = lf.parameters_at(np.linspace(0.0, z_max, _A_NODES))[2]
     a = np.linspace(alpha.min(), alpha.max() + _A_MARGIN, _A_NODES) + 1.0
     ln_x = np.linspace(*_LN_X_RANGE, _X_NODES)
     with np.errstate(divide="ignore"):
         ln_g = np.log(upper_gamma(a[:, None], np.exp(ln_x)[None, :]))
-    # The nodes are those of the steepest function: they span what all the others reach.
+    # Use the nodes of the steepest function, which cover the range of all others.
     nodes = ln_g[0, ::-_X_STEP][np.isfinite(ln_g[0, ::-_X_STEP])]
     rows = [np.interp(nodes, row[::-1], ln_x[::-1]) for row in ln_g]
     return Inverse(lf, a, nodes, np.stack(rows))
 
 
 def magnitude(table: Inverse, number: npt.ArrayLike, z: npt.ArrayLike) -> Float:
-    """M[n] such that n(< M, z) = number[n] (Mpc/h)^-3.
+    """Return the magnitude at which the number density of brighter galaxies has a given value.
 
-    number : float[n] comoving (Mpc/h)^-3;  z : float[n]
-    Error: < 0.003 mag over 1e-12 .. 1 (Mpc/h)^-3 (tests/truesky/catalogue/halos/test_luminosity_function.py)
+    Parameters
+    ----------
+    table : Inverse
+        Table from `inverse`.
+    number : float array, shape (n,)
+        Comoving number density, (Mpc/h)^-3.
+    z : float array, shape (n,)
+        Redshift.
+
+    Returns
+    -------
+    float array, shape (n,)
+        M_r such that n(< M_r, z) = number.
+
+    Notes
+    -----
+    The error is below 0.003 mag for 1e-12 to 1 (Mpc/h)^-3 (tests/truesky/catalogue/halos/test_luminosity_function.py).
     """
     m_star, phi_star, alpha = table.schechter.parameters_at(z)
     row, above_row = bracket(table.a, alpha + 1.0)

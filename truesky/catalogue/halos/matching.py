@@ -1,11 +1,13 @@
-"""Which galaxy a halo or sub-halo holds: masses matched to luminosities by their abundance.
+"""Assign galaxy luminosities to halos and sub-halos by abundance matching.
 
-masses      abundance, bias, concentration and size of halos
-matching    M_r of a proxy mass: n_tot(> m', z) = n(< M_r, z), so that the luminosity function comes out exactly
+The proxy mass m' of a central galaxy is the mass of its halo, that of a satellite is its sub-mass, both with a
+log-normal scatter. M_r follows from n_tot(> m', z) = n(< M_r, z), so that the luminosity function is reproduced
+exactly. n_tot counts centrals and satellites after the scatter; a deconvolution is not necessary. Parameters: see
+halos.toml.
 
-The proxy mass m' of a central is its halo's mass, that of a satellite its sub-mass, both with a log-normal scatter;
-n_tot counts centrals and satellites after the scatter, so nothing has to be deconvolved.
-Ref: Carretero et al. 2015, MNRAS 447, 646; the numbers are in halos.toml.
+References
+----------
+Carretero et al. 2015, MNRAS 447, 646
 """
 
 from __future__ import annotations
@@ -23,14 +25,14 @@ from truesky.catalogue.matter import linear_theory
 from truesky.fluxes import cosmology
 from truesky.numerics import matrices
 
-# Tables reach beyond redshift 6, uniform in ln(1 + z), and 0.02 dex.
+# Redshift range of the tables (beyond 6), uniform in ln(1 + z); masses in steps of 0.02 dex.
 Z_LAST, _Z_NODES = 6.1, 69
 _LOG_MASS = np.linspace(8.0, 16.4, 421)
 
 
 @dataclass(frozen=True, slots=True)
 class Occupation:
-    """Satellites of a halo (halos.toml, [occupation])."""
+    """Satellites of halos (halos.toml, [occupation])."""
 
     min_mass_ratio: float
     ratio: float
@@ -42,10 +44,7 @@ class Occupation:
     concentration: float
 
     def ratio_at(self, z: Float) -> Float:
-        """Of the halo's mass to a sub-mass, by which the mean number of satellites above that rises by one, [n].
-
-        z : float[n] of the halo
-        """
+        """Return the increase of M / m (halo mass / sub-mass) per additional satellite on average, at redshifts z."""
         stretch = (1.0 + self.z_pivot) / (1.0 + np.minimum(z, self.z_last))
         return np.asarray(self.ratio * stretch**self.ratio_z)
 
@@ -63,10 +62,22 @@ class HaloShape:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Masses:
-    """Tables of halos on redshift (uniform in ln(1 + z)) and mass (uniform in the logarithm).
+    """Tables of halos by redshift (uniform in ln(1 + z)) and mass (uniform in the logarithm).
 
-    log_mass : [m];  ln_density : [z, m] ln dn/dlog10 M, comoving (Mpc/h)^-3;  bias : [z, m];
-    concentration : [coarse z, m] c_200m
+    Attributes
+    ----------
+    log_mass : float array, shape (m,)
+        log10 M_200m / (Msun/h).
+    z : float array, shape (z,)
+        Redshift nodes.
+    ln_density : float array, shape (z, m)
+        ln of dn/dlog10 M, comoving (Mpc/h)^-3.
+    bias : float array, shape (z, m)
+        Halo bias.
+    concentration : float array, shape (coarse z, m)
+        Concentration c_200m.
+    shape : HaloShape
+        Sizes and velocities.
     """
 
     log_mass: Float
@@ -77,9 +88,21 @@ class Masses:
     shape: HaloShape
 
     def interpolate(self, table: Float, z: Float, log_mass: Float) -> Float:
-        """[len(z), len(log_mass)], linear in ln(1 + z) and log10 M.
+        """Interpolate a table linearly in ln(1 + z) and log10 M on a grid.
 
-        table : float[z nodes, masses];  z : float[a];  log_mass : float[b] log10 Msun/h
+        Parameters
+        ----------
+        table : float array, shape (z nodes, masses)
+            Table.
+        z : float array, shape (a,)
+            Redshift.
+        log_mass : float array, shape (b,)
+            log10 mass, Msun/h.
+
+        Returns
+        -------
+        float array, shape (a, b)
+            Values.
         """
         row, part = _redshift_node(z, table.shape[0])
         column, share = _mass_node(log_mass, self.log_mass)
@@ -87,25 +110,35 @@ class Masses:
         return np.asarray(along[row] * (1.0 - part)[:, None] + along[row + 1] * part[:, None])
 
     def interpolate_pairs(self, table: Float, z: Float, log_mass: Float) -> Float:
-        """[n] of pairs (z[n], log_mass[n]).
+        """Interpolate a table linearly in ln(1 + z) and log10 M at pairs of values.
 
-        table : float[z nodes, masses];  z, log_mass : float[n] redshift, log10 Msun/h
+        Parameters
+        ----------
+        table : float array, shape (z nodes, masses)
+            Table.
+        z : float array, shape (n,)
+            Redshift.
+        log_mass : float array, shape (n,)
+            log10 mass, Msun/h.
+
+        Returns
+        -------
+        float array, shape (n,)
+            Values.
         """
         return _interpolate_pairs(table, self.log_mass, z, log_mass)
 
     def radius(self, log_mass: Float) -> Float:
-        """R_200m[n], comoving Mpc/h.
-
-        log_mass : float[n] log10 Msun/h
-        """
+        """Return R_200m in comoving Mpc/h, from log10 of the mass in Msun/h."""
         density = self.shape.overdensity * cosmology.OMEGA_M * self.shape.critical_density
         return np.asarray(np.cbrt(3.0 * 10.0**log_mass / (4.0 * np.pi * density)))
 
     def dispersion(self, log_mass: Float, z: Float) -> Float:
-        """One-dimensional velocity dispersion[n] of satellites, km/s.
+        """Return the one-dimensional velocity dispersion of satellites in km/s, from log10 mass (Msun/h) and redshift.
 
-        log_mass : float[n] log10 Msun/h;  z : float[n]
-        Ref: Evrard et al. 2008
+        References
+        ----------
+        Evrard et al. 2008
         """
         mass = self.shape.critical * cosmology.expansion_rate(z) * 10.0 ** (log_mass - 15.0)
         return np.asarray(self.shape.sigma_15 * mass**self.shape.slope)
@@ -113,31 +146,35 @@ class Masses:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matching:
-    """m_r : [z, m] M_r of proxy masses log_mass[m], z uniform in ln(1 + z)."""
+    """M_r of proxy masses.
+
+    Attributes
+    ----------
+    log_mass : float array, shape (m,)
+        log10 of the proxy mass, Msun/h.
+    m_r : float array, shape (z, m)
+        M_r in mag, with z uniform in ln(1 + z).
+    occupation : Occupation
+        Satellites of halos.
+    """
 
     log_mass: Float
     m_r: Float
     occupation: Occupation
 
     def magnitude(self, z: Float, proxy: Float) -> Float:
-        """M_r[n] of log10 proxy masses[n].
-
-        z : float[n];  proxy : float[n] log10 Msun/h
-        """
+        """Return M_r of redshifts and log10 proxy masses (Msun/h)."""
         return _interpolate_pairs(self.m_r, self.log_mass, z, proxy)
 
     def proxy_mass(self, z: Float, m_r: Float) -> Float:
-        """log10 of the proxy mass[n] of galaxies of M_r[n].
-
-        z : float[n];  m_r : float[n] mag
-        """
+        """Return log10 of the proxy mass (Msun/h) of redshifts and M_r (mag)."""
         row, part = _redshift_node(z, self.m_r.shape[0])
         curves = self.m_r[row] * (1.0 - part)[:, None] + self.m_r[row + 1] * part[:, None]
         return np.array([np.interp(-m, -curve, self.log_mass) for m, curve in zip(m_r, curves, strict=True)])
 
 
 def masses() -> Masses:
-    """The halos of the embedded universe, 0 <= z <= 6.1."""
+    """Return the halo tables of the embedded universe, 0 <= z <= 6.1."""
     z = np.expm1(np.linspace(0.0, np.log1p(Z_LAST), _Z_NODES))
     tables = linear_theory.halo_tables(_LOG_MASS, z)
     shape = HaloShape(**parameters.section("halos.toml", "halo"))
@@ -146,23 +183,23 @@ def masses() -> Masses:
 
 
 def match_luminosities(halos: Masses, luminosities: Inverse) -> Matching:
-    """M_r of every proxy mass and redshift."""
+    """Return M_r of every proxy mass and redshift."""
     occupation = Occupation(**parameters.section("halos.toml", "occupation"))
     rows = [
         luminosity_function.magnitude(luminosities, number, np.full(number.size, z))
         for z, number in zip(halos.z, proxy_density(halos, occupation), strict=True)
     ]
-    # Where nothing is left of the mass function the magnitudes stay at the brightest.
+    # Keep the brightest magnitude at the end of the mass function, where the density is 0.
     return Matching(halos.log_mass, np.minimum.accumulate(np.array(rows), axis=1), occupation)
 
 
 def proxy_density(halos: Masses, occupation: Occupation) -> Float:
-    """n_tot(> m'), [z, m] comoving (Mpc/h)^-3: centrals and satellites, scattered."""
+    """Return n_tot(> m'), comoving (Mpc/h)^-3, shape (z, m): centrals and satellites with scatter."""
     step = halos.log_mass[1] - halos.log_mass[0]
     number = np.exp(halos.ln_density) * step
     satellites = matrices.matmul(number, satellites_above(halos.log_mass, occupation).T)
     satellites *= satellite_evolution(halos.z, occupation)[:, None]
-    # Of the cumulative count of satellites, what lies in each interval.
+    # Difference of the cumulative number of satellites in each mass interval.
     inside = number + np.concatenate([satellites[:, :-1] - satellites[:, 1:], satellites[:, -1:]], axis=1)
     smooth = scatter_masses(inside, step, occupation)
     above = np.cumsum(smooth[:, ::-1], axis=1)[:, ::-1]
@@ -170,9 +207,21 @@ def proxy_density(halos: Masses, occupation: Occupation) -> Float:
 
 
 def scatter_masses(number: Float, step: float, occupation: Occupation) -> Float:
-    """[z, m] in bins of the proxy mass, of numbers in bins of the mass.
+    """Convolve numbers per mass bin with the scatter of the proxy mass.
 
-    number : float[z, m];  step : width of a bin, dex;  occupation : of which the scatter is
+    Parameters
+    ----------
+    number : float array, shape (z, m)
+        Number per mass bin.
+    step : float
+        Width of a bin, dex.
+    occupation : Occupation
+        Scatter and its limit.
+
+    Returns
+    -------
+    float array, shape (z, m)
+        Number per bin of the proxy mass.
     """
     half = round(occupation.depth / step)
     kernel = np.exp(-0.5 * (np.arange(-half, half + 1) * step / occupation.scatter) ** 2)
@@ -183,19 +232,16 @@ def scatter_masses(number: Float, step: float, occupation: Occupation) -> Float:
 
 
 def satellites_above(log_mass: Float, occupation: Occupation) -> Float:
-    """Mean number of satellites above m[i] in a halo of mass M[j] at z = z_pivot, [i, j].
+    """Return the mean number of satellites above mass m[i] in a halo of mass M[j] at z = z_pivot, shape (m, m).
 
-    log_mass : float[m] log10 Msun/h, of halos and of sub-masses
+    `log_mass` contains log10 of both masses, Msun/h.
     """
     over = 10.0 ** (log_mass[None, :] - log_mass[:, None])
     return np.asarray(np.maximum(over - occupation.min_mass_ratio, 0.0) / occupation.ratio)
 
 
 def satellite_evolution(z: Float, occupation: Occupation) -> Float:
-    """How many times more satellites a halo has than one at z = z_pivot, [n].
-
-    z : float[n]
-    """
+    """Return the number of satellites of a halo at each redshift, relative to z = z_pivot."""
     return np.asarray(occupation.ratio / occupation.ratio_at(z))
 
 

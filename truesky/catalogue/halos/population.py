@@ -1,12 +1,8 @@
-"""Who lives in a generation cell: the centrals of its halos, and the satellites that fall into it.
+"""Members of a generation cell: central galaxies of its halos, and satellites whose positions are inside it.
 
-model       halos, their galaxies' luminosities, and the box they come from
-Cells       what has been drawn of a universe so far: neighbours share it
-members     halos and candidate galaxies of one generation cell
-
-Galaxies belong to the cell of their own true position. Halos of the cells about it are drawn as well, and of their
-satellites those that land inside are kept: none is lost and none is there twice. What a cell holds depends on the
-seed and the cell only, never on which other cells are drawn; a nearer or shallower request has fewer of the same.
+A galaxy belongs to the cell of its true position. The halos of neighbouring cells are drawn as well, and their
+satellites inside the cell are kept, so that every satellite is in exactly one cell. The content of a cell depends only
+on the seed and the cell. A nearer or shallower request has a subset of it.
 """
 
 from __future__ import annotations
@@ -31,13 +27,13 @@ from truesky.catalogue.halos.satellites import Satellites
 from truesky.catalogue.matter import density_box
 
 CENTRAL, SATELLITE = 0, 1
-# Drawn cells that are kept: a block of cells and its rim are at most so many.
+# Number of cached cells, enough for a block of cells and its neighbours.
 _MAX_CACHED_CELLS = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Population:
-    """Everything that halos and luminosities are drawn from; light_cone : halos that take the place of ours."""
+    """Model of halos and luminosities; `light_cone` are the user's halos, which replace the drawn ones."""
 
     seed: int
     halos: HaloModel
@@ -47,10 +43,32 @@ class Population:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Members:
-    """Halos of a cell, and candidate galaxies: centrals, then satellites by host, sorted by index.
+    """Halos of a cell, and its candidate galaxies sorted by index.
 
-    halo_id, host_mass, host_index : of each galaxy's halo, log10 M_200m / (Msun/h);  index : order-29 cell
-    ra, dec : deg;  radius : from the halo's centre / R_200m, 0 of centrals
+    Attributes
+    ----------
+    halos : Halos
+        Halos of the cell.
+    id, halo_id : int array, shape (n,)
+        Identifiers of the galaxy and of its halo.
+    kind : int array, shape (n,)
+        CENTRAL or SATELLITE.
+    index : int array, shape (n,)
+        Order-29 cell.
+    ra, dec : float array, shape (n,)
+        True position, deg.
+    chi : float array, shape (n,)
+        Comoving distance, Mpc/h.
+    z, z_obs : float array, shape (n,)
+        Redshift without and with the peculiar velocity.
+    proxy : float array, shape (n,)
+        log10 of the proxy mass, Msun/h.
+    host_mass : float array, shape (n,)
+        log10 M_200m / (Msun/h) of the halo.
+    host_index : int array, shape (n,)
+        Order-29 cell of the halo.
+    radius : float array, shape (n,)
+        Distance from the centre of the halo in units of R_200m, 0 for central galaxies.
     """
 
     halos: Halos
@@ -69,16 +87,23 @@ class Members:
     radius: Float
 
     def select(self, keep: Bool) -> Members:
-        """The same halos, and the galaxies that are kept: keep : bool[n]."""
+        """Return the same halos with the galaxies of a bool mask, shape (n,)."""
         columns = (getattr(self, name)[keep] for name in self.__slots__ if name != "halos")
         return Members(self.halos, *columns)
 
 
 @dataclass(slots=True, eq=False)
 class CellCache:
-    """Cells of one population that have been drawn: (order, cell) -> halos and all their satellites.
+    """Cache of drawn cells of a population, which neighbouring cells share.
 
-    lenses : what halos of (order, cell) above a mass do to light
+    Attributes
+    ----------
+    population : Population
+        The population.
+    drawn : OrderedDict
+        Halos and all their satellites by (order, cell).
+    lenses : OrderedDict
+        Lensing of the halos by (order, cell, lowest mass).
     """
 
     population: Population
@@ -86,7 +111,7 @@ class CellCache:
     lenses: OrderedDict[tuple[int, int, float], tuple[Float, Int]] = field(default_factory=OrderedDict)
 
     def halos_and_satellites(self, order: int, cell: int) -> tuple[Halos, Satellites]:
-        """Halos drawn by a cell of a level, and their satellites, wherever these are."""
+        """Return the halos that a cell of a level draws, and all their satellites, which may be in other cells."""
         place = (order, cell)
         if place not in self.drawn:
             population = self.population
@@ -111,12 +136,27 @@ def model(
     faintest: Callable[[Float], Float],
     light_cone: LightCone | None = None,
 ) -> Population:
-    """The population of a seed.
+    """Return the population of a seed.
 
-    faintest   : z[n] -> faintest M_r[n] that is wanted; the volume's own limit holds as well
-    light_cone : halos that take the place of ours
-    seed, box_cells : of the box of matter, and its cells a side;  space : redshifts, and the faintest M_r
-    luminosities    : inverse of the luminosity function
+    Parameters
+    ----------
+    seed : int
+        Seed of the box of matter.
+    box_cells : int
+        Cells per side of the box.
+    volume : Volume
+        Redshift range, and the faintest M_r.
+    luminosities : Inverse
+        Inverse of the luminosity function.
+    faintest : callable
+        Function that returns the faintest requested M_r at each redshift; the limit of `volume` also applies.
+    light_cone : LightCone, optional
+        The user's halos, which replace the drawn ones.
+
+    Returns
+    -------
+    Population
+        The population.
     """
     masses = matching.masses()
     matched = matching.match_luminosities(masses, luminosities)
@@ -130,10 +170,7 @@ def model(
 
 
 def halos_of(cells: CellCache, cell: int) -> Halos:
-    """Halos of the request that lie in a generation cell, sorted by position.
-
-    cells : what has been drawn;  cell : nested index at order 8
-    """
+    """Return the halos of the request in a generation cell (nested index at order 8), sorted by position."""
     selected, max_distance = [], cells.population.halos.max_distance
     for order in LEVELS:
         hosts, _ = cells.halos_and_satellites(order, cell >> 2 * (GENERATION_ORDER - order))
@@ -145,10 +182,21 @@ def halos_of(cells: CellCache, cell: int) -> Halos:
 
 
 def members(cells: CellCache, cell: int, is_requested: Callable[[int, int], bool] | None = None) -> Members:
-    """Halos and candidate galaxies of one generation cell.
+    """Return the halos and candidate galaxies of one generation cell.
 
-    cells  : what has been drawn;  cell : nested index at order 8
-    wanted : (order, cell) of what draws halos -> are their satellites wanted? None = all
+    Parameters
+    ----------
+    cells : CellCache
+        Cache of drawn cells.
+    cell : int
+        Nested index of the order-8 cell.
+    is_requested : callable, optional
+        Function of (order, cell) that returns True if satellites of halos in that cell are needed; None for all cells.
+
+    Returns
+    -------
+    Members
+        Halos and galaxies.
     """
     cell_halos = halos_of(cells, cell)
     bright = cell_halos.select(cell_halos.proxy >= cells.population.halos.mass_limit(cell_halos.chi))
@@ -181,10 +229,7 @@ def members(cells: CellCache, cell: int, is_requested: Callable[[int, int], bool
 
 
 def observed_redshift(z: Float, velocity: Float) -> Float:
-    """[n] of sources that recede with a peculiar velocity, km/s.
-
-    z : float[n] true redshift;  velocity : float[n] km/s
-    """
+    """Return the observed redshift from the true redshift and the peculiar velocity (km/s, positive if receding)."""
     return np.asarray((1.0 + z) * (1.0 + velocity / LIGHT_KM_S) - 1.0)
 
 
@@ -194,7 +239,7 @@ def _cells_around(order: int, cell: int) -> list[int]:
 
 
 def _satellites_inside(cells: CellCache, order: int, host_cell: int, cell: int) -> tuple[npt.NDArray[np.generic], ...]:
-    """Satellites of one cell's halos that lie in the generation cell: the columns of `members`."""
+    """Columns of `members` for the satellites of one cell's halos that are in the generation cell."""
     hosts, candidates = cells.halos_and_satellites(order, host_cell)
     model = cells.population.halos
     candidates = candidates.select(
@@ -213,7 +258,7 @@ def _satellites_inside(cells: CellCache, order: int, host_cell: int, cell: int) 
 
 
 def _may_be_inside(candidates: Satellites, cell: int) -> Bool:
-    """Satellites that may lie in the cell: no further from its centre than its corners."""
+    """True for satellites that may be in the cell: not farther from its centre than its corners."""
     ra, dec = sky.cell_centre(GENERATION_ORDER, cell)
     radius = sky.cell_radius(GENERATION_ORDER)
     return np.asarray(sky.separation(candidates.ra, candidates.dec, ra, dec) <= 1.001 * radius)

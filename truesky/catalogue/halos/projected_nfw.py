@@ -1,12 +1,16 @@
-"""Halos with the profile of Navarro, Frenk & White, cut at R_200m and seen in projection.
+"""Projected profile of halos with the profile of Navarro, Frenk & White, cut at R_200m.
 
-surface   what their convergence follows
-enclosed  the mass inside a circle
+x = r / r_s is the projected radius in scale radii and c is the concentration; the profile ends at x = c. The usual
+formulae have separate cases for x < 1 and x > 1 and lose precision close to x = 1. The form used here is valid for
+both; its variable v changes sign at r_s.
 
-x = r / r_s is the projected radius in scale radii, c the concentration; both end at x = c. The usual forms have cases
-for x < 1 and x > 1, and lose all digits between them: here one form holds, whose v changes its sign at r_s.
-Error: 1e-7 of F, 1e-6 of m for x >= 1e-8 and 1 <= c <= 60 (tests)
-Ref: Takada & Jain 2003, MNRAS 340, 580 (projected profile) and 344, 857 (shear)
+Notes
+-----
+The error is 1e-7 of F and 1e-6 of m for x >= 1e-8 and 1 <= c <= 60 (tests).
+
+References
+----------
+Takada & Jain 2003, MNRAS 340, 580 (projected profile) and 344, 857 (shear)
 """
 
 from __future__ import annotations
@@ -15,24 +19,24 @@ import numpy as np
 
 from truesky.numerics.compiling import exact_jit
 
-# Closer to the centre than this the first terms are enough, x^2 ln x.
+# Below this x, the first terms x^2 ln x are sufficient.
 _CENTRE = 1e-4
-# |v| up to which the series of so many terms is taken: 0.04^9 / 21 of Psi.
+# The series with this number of terms is used up to this |v|; its error is 0.04^9 / 21 of Psi.
 _SERIES_LIMIT, _SERIES_TERMS = 0.04, 9
 
 
 @exact_jit
 def total(c: float) -> float:
-    """m(c) = M / (4 pi rho_s r_s^3)."""
+    """Return m(c) = M / (4 pi rho_s r_s^3) of a concentration."""
     mass: float = np.log1p(c) - c / (1.0 + c)
     return mass
 
 
 @exact_jit
 def profile(x: float, c: float) -> tuple[float, float]:
-    """(F, m) at 0 < x < c: Sigma = 2 rho_s r_s F, and 4 pi rho_s r_s^3 m inside the circle.
+    """Return surface density and enclosed mass at projected radius x of a halo with concentration c, 0 < x < c.
 
-    x : projected radius in scale radii;  c : concentration
+    The results are F with Sigma = 2 rho_s r_s F, and m with the mass 4 pi rho_s r_s^3 m inside the circle.
     """
     if x < _CENTRE:
         centre = np.log(2.0 / x) + np.log(c / (1.0 + c)) - c / (1.0 + c)
@@ -47,7 +51,7 @@ def profile(x: float, c: float) -> tuple[float, float]:
     else:
         root = np.sqrt(abs(v))
         if v > 0.0:
-            # 1 - v, without the difference.
+            # 1 - v in a form without loss of precision.
             rest = 2.0 * x * (1.0 + c) / ((1.0 + x) * (c + x))
             phi = (np.log1p(root) - 0.5 * np.log(rest)) / root
         else:

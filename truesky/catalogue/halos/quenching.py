@@ -1,12 +1,7 @@
-"""Red galaxies by halo: centrals of groups, and satellites by their halo's mass and their distance from its centre.
+"""Quenching by halos: red central galaxies of groups, and red satellites by halo mass and distance from the centre.
 
-model, shares      what halos quench, and what the average galaxy of a luminosity owes to its halo: a table
-satellite_share    how many of the galaxies of a luminosity are satellites
-odds               the probability of being red of galaxies in their halos
-
-Halos change who is red, not how many: at every luminosity and redshift the mean is the share of the red sequence,
-wherever halos alone do not quench more than that.
-Ref: the numbers are in halos.toml, [quenching].
+Halos change which galaxies are red, but not their number. At every luminosity and redshift the mean equals the fraction
+of red galaxies, unless halos alone quench more galaxies than that. The parameters are in halos.toml, [quenching].
 """
 
 from __future__ import annotations
@@ -22,15 +17,15 @@ from truesky.catalogue.halos.matching import Masses, Occupation
 from truesky.catalogue.halos.population import SATELLITE, Members
 from truesky.numerics import matrices
 
-# Shares of satellites are written in log10 M - 13.
+# Pivot of log10 M for the quenched fraction of satellites.
 _PIVOT = 13.0
-# Of the mean radius of satellites, in concentration and enclosed mass.
+# Nodes of the mean radius of satellites, in concentration and enclosed mass.
 _CONCENTRATIONS, _ENCLOSED = np.geomspace(1.0, 60.0, 40), np.asarray((np.arange(500) + 0.5) / 500.0, np.float64)
 
 
 @dataclass(frozen=True, slots=True)
 class Quenching:
-    """What halos make red (halos.toml, [quenching])."""
+    """Parameters of quenching by halos (halos.toml, [quenching])."""
 
     central: float
     central_mass: float
@@ -48,10 +43,18 @@ class Quenching:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shares:
-    """Of galaxies by redshift and proxy mass (the nodes of `Masses`), [z, m].
+    """Averages of galaxies by redshift and proxy mass (the nodes of `Masses`).
 
-    law : what halos quench
-    satellites : how many are satellites;  quenched : mean of what halos make red of what is not red anyway
+    Attributes
+    ----------
+    law : Quenching
+        Parameters.
+    masses : Masses
+        Tables of halos.
+    satellites : float array, shape (z, m)
+        Fraction of satellites.
+    quenched : float array, shape (z, m)
+        Mean fraction that halos quench, of galaxies that are not red for other reasons.
     """
 
     law: Quenching
@@ -61,14 +64,26 @@ class Shares:
 
 
 def model() -> Quenching:
-    """What the halos of the embedded universe quench."""
+    """Return the quenching parameters of the embedded universe."""
     return Quenching(**parameters.section("halos.toml", "quenching"))
 
 
 def shares(law: Quenching, masses: Masses, occupation: Occupation) -> Shares:
-    """The averages over halos and their satellites, scattered as the proxy masses are.
+    """Compute the averages over halos and their satellites, with the scatter of the proxy masses.
 
-    law : what halos quench;  masses, occupation : tables of halos and their satellites
+    Parameters
+    ----------
+    law : Quenching
+        Parameters.
+    masses : Masses
+        Tables of halos.
+    occupation : Occupation
+        Satellites of halos.
+
+    Returns
+    -------
+    Shares
+        The averages.
     """
     step = float(masses.log_mass[1] - masses.log_mass[0])
     centrals = np.exp(masses.ln_density) * step
@@ -87,23 +102,32 @@ def shares(law: Quenching, masses: Masses, occupation: Occupation) -> Shares:
         evolution * matrices.matmul(centrals * of_satellite, inside.T),
     )
     central, satellite, red_central, red_satellite = (matching.scatter_masses(n, step, occupation) for n in numbers)
-    # Beyond the mass function's end there is nothing to average.
+    # Avoid a division by zero beyond the end of the mass function.
     total = np.maximum(central + satellite, 1e-30)
     return Shares(law, masses, satellite / total, (red_central + red_satellite) / total)
 
 
 def satellite_share(average: Shares, members: Members) -> Float:
-    """Of all galaxies of each galaxy's luminosity, [n]: how many are satellites.
-
-    average : of `shares`;  members : n galaxies
-    """
+    """Return the fraction of satellites among all galaxies of the same luminosity and redshift as each member."""
     return average.masses.interpolate_pairs(average.satellites, members.z, members.proxy)
 
 
 def odds(average: Shares, members: Members, share: Float) -> Float:
-    """Probability[n] of being red.
+    """Return the probability of each galaxy to be red.
 
-    average : of `shares`;  members : n galaxies in their halos;  share : float[n] of their luminosity that are red
+    Parameters
+    ----------
+    average : Shares
+        Averages from `shares`.
+    members : Members
+        Galaxies in their halos.
+    share : float array, shape (n,)
+        Red fraction of galaxies of the same luminosity.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Probability.
     """
     z, halo = members.z, members.host_mass
     mean = average.masses.interpolate_pairs(average.quenched, z, members.proxy)
@@ -113,18 +137,44 @@ def odds(average: Shares, members: Members, share: Float) -> Float:
 
 
 def quenched_central(law: Quenching, z: Float, log_mass: Float) -> Float:
-    """Share[...] of the centrals of halos that the halo makes red, of those that are not red anyway.
+    """Return the fraction of otherwise blue central galaxies that their halo quenches.
 
-    z, log_mass : float[...] redshift, log10 M_200m / (Msun/h);  law : constants
+    Parameters
+    ----------
+    law : Quenching
+        Parameters.
+    z : float array
+        Redshift.
+    log_mass : float array
+        log10 M_200m / (Msun/h) of the halo.
+
+    Returns
+    -------
+    float array
+        Fraction, 0 to 1.
     """
     x = (log_mass - (law.central_mass + law.central_z * z)) / law.central_width
     return np.asarray(np.minimum(law.central / (1.0 + np.exp(-np.clip(x, -100.0, 100.0))), law.highest))
 
 
 def quenched_satellite(law: Quenching, z: Float, log_mass: Float, radius: Float) -> Float:
-    """The same of satellites.
+    """Return the fraction of otherwise blue satellites that their halo quenches.
 
-    radius : float[...] distance from the halo's centre / R_200m;  law, z, log_mass : as of `quenched_central`
+    Parameters
+    ----------
+    law : Quenching
+        Parameters.
+    z : float array
+        Redshift.
+    log_mass : float array
+        log10 M_200m / (Msun/h) of the halo.
+    radius : float array
+        Distance from the centre of the halo in units of R_200m.
+
+    Returns
+    -------
+    float array
+        Fraction, 0 to 1.
     """
     max_share = np.clip(law.satellite + law.satellite_rate * (log_mass - _PIVOT), *law.satellite_limits)
     inside = law.inner - law.outer * np.minimum(law.projection * radius, 1.0)
@@ -132,16 +182,27 @@ def quenched_satellite(law: Quenching, z: Float, log_mass: Float, radius: Float)
 
 
 def red_odds(share: Float, quenched: Float | float = 0.0, mean: Float | float = 0.0) -> Float:
-    """Probability[n] of being red in a halo; its mean over a luminosity's galaxies is `share`, unless `mean` is more.
+    """Return the probability to be red of galaxies in halos.
 
-    share    : float[n] of all galaxies of the luminosity that are red
-    quenched : float[n] what the galaxy's halo quenches of what is not yet red;  mean : float[n] over all such galaxies
+    Parameters
+    ----------
+    share : float array, shape (n,)
+        Red fraction of all galaxies of the same luminosity.
+    quenched : float or float array, shape (n,)
+        Fraction that the galaxy's halo quenches, of galaxies that are not yet red.
+    mean : float or float array, shape (n,)
+        Mean of `quenched` over all galaxies of the same luminosity.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Probability; its mean over the galaxies of a luminosity is `share`, unless `mean` is larger.
     """
     red_before = np.clip((share - mean) / (1.0 - np.asarray(mean)), 0.0, 1.0)
     return np.asarray(red_before + quenched * (1.0 - red_before))
 
 
 def _mean_radius(concentration: Float) -> Float:
-    """Of satellites of halos of a concentration, [n] / R_200m."""
+    """Mean radius of satellites in units of R_200m, for each concentration."""
     grid = [satellites.nfw_radius(np.full(_ENCLOSED.size, float(c)), _ENCLOSED).mean() for c in _CONCENTRATIONS]
     return np.asarray(np.interp(np.log(np.clip(concentration, 1.0, 60.0)), np.log(_CONCENTRATIONS), grid))

@@ -1,10 +1,11 @@
-"""Satellite galaxies: how many a halo has, of which sub-mass, where, and how fast.
+"""Satellite galaxies of halos: number, sub-mass, position and velocity.
 
-draw        satellites of halos, a Poisson sample with an NFW profile
-nfw_radius  that holds a share of the mass
+Satellites are a Poisson sample with an NFW profile. Halos are isotropic, spherical and end at R_200m. The parameters
+are in halos.toml.
 
-Error: isotropic, spherical halos that are cut at R_200m
-Ref: Navarro, Frenk & White 1997, ApJ 490, 493; Evrard et al. 2008; the numbers are in halos.toml
+References
+----------
+Navarro, Frenk & White 1997, ApJ 490, 493; Evrard et al. 2008
 """
 
 from __future__ import annotations
@@ -22,18 +23,31 @@ from truesky.catalogue.halos.matching import Masses
 from truesky.catalogue.interpolation import bracket
 from truesky.randomness import per_source
 
-# Nodes of the inverse of the NFW mass profile, in concentration and in enclosed mass: 1e-3 of a radius.
+# Nodes of the inverse NFW mass profile in concentration and enclosed mass; the error of a radius is 1e-3.
 _C_NODES, _U_NODES = np.geomspace(1.0, 60.0, 40), np.linspace(0.0, 1.0, 256)
 _X_NODES = np.linspace(0.0, 1.0, 2001) ** 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Satellites:
-    """n satellites, by host.
+    """Satellites sorted by host.
 
-    host : int[n] row of the host;  member : int[n] from 1, by falling sub-mass
-    proxy : log10 of the scattered sub-mass;  ra, dec : deg;  chi : Mpc/h;  velocity : km/s, receding, with the host's
-    radius : from the host's centre / R_200m
+    Attributes
+    ----------
+    host : int array, shape (n,)
+        Row of the host.
+    member : int array, shape (n,)
+        Number from 1, in the order of decreasing sub-mass.
+    proxy : float array, shape (n,)
+        log10 of the scattered sub-mass, Msun/h.
+    ra, dec : float array, shape (n,)
+        Position, deg.
+    chi : float array, shape (n,)
+        Comoving distance, Mpc/h.
+    velocity : float array, shape (n,)
+        Line-of-sight velocity including that of the host, km/s, positive if receding.
+    radius : float array, shape (n,)
+        Distance from the centre of the host in units of R_200m.
     """
 
     host: Int
@@ -46,15 +60,33 @@ class Satellites:
     radius: Float
 
     def select(self, keep: npt.NDArray[np.generic]) -> Satellites:
-        """The satellites that are kept: keep : bool or int[m] rows."""
+        """Return the satellites of a bool mask or of row numbers."""
         return Satellites(*(getattr(self, name)[keep] for name in self.__slots__))
 
 
 def draw(halos: HaloModel, masses: Masses, hosts: Halos, seed: int) -> Satellites:
-    """The satellites of hosts that reach the limit of their distance.
+    """Draw the satellites of hosts that reach the mass limit at their distance.
 
-    A host's satellites are drawn by falling sub-mass, each with numbers of its own: a deeper request goes on with them.
-    halos, masses : tables of halos, and by mass;  hosts : n halos;  seed : of the request
+    Parameters
+    ----------
+    halos : HaloModel
+        Tables of halos.
+    masses : Masses
+        Tables of halos by mass.
+    hosts : Halos
+        The hosts.
+    seed : int
+        Seed of the request.
+
+    Returns
+    -------
+    Satellites
+        The satellites.
+
+    Notes
+    -----
+    The satellites of a host are drawn in the order of decreasing sub-mass, each with separate random numbers, so that a
+    deeper request only appends satellites.
     """
     occupation, limit, z = halos.matching.occupation, halos.mass_limit(hosts.chi), halos.distances.redshift(hosts.chi)
     ratio = occupation.ratio_at(z)
@@ -86,16 +118,12 @@ def _allocate(count: int) -> tuple[Int, Int, Float, Float]:
 
 
 def nfw_radius(concentration: Float, enclosed: Float) -> Float:
-    """Radius / R_200m[n] that holds a share of the mass inside R_200m.
-
-    concentration : float[n] c_200m;  enclosed : float[n] of the mass, 0 .. 1
-    Error: 1e-3
-    """
+    """Return the radius in units of R_200m that encloses a fraction (0 to 1) of the mass inside R_200m (error 1e-3)."""
     row, part = bracket(np.log(_C_NODES), np.log(concentration), extrapolated=True)
     step = np.asarray(enclosed) * (_U_NODES.size - 1)
     column = np.clip(step.astype(np.int64), 0, _U_NODES.size - 2)
     share = step - column
-    # The square of the radius is nearly linear in the enclosed mass at the centre.
+    # Interpolate the square of the radius, which is almost linear in the enclosed mass at the centre.
     low = _SQUARES[row, column] * (1.0 - share) + _SQUARES[row, column + 1] * share
     high = _SQUARES[row + 1, column] * (1.0 - share) + _SQUARES[row + 1, column + 1] * share
     return np.asarray(np.sqrt(low * (1.0 - part) + high * part))
@@ -110,7 +138,7 @@ def _squares() -> Float:
 def _offsets(
     masses: Masses, concentration_factor: float, log_mass: Float, z: Float, host: Int, numbers: Float
 ) -> Float:
-    """Offsets from the hosts' centres, [n, 3] comoving Mpc/h."""
+    """Offsets from the centres of the hosts, shape (n, 3), comoving Mpc/h."""
     c = concentration_factor * masses.interpolate_pairs(masses.concentration, z, log_mass)
     radius = masses.radius(log_mass)[host] * nfw_radius(np.clip(c, 1.0, 60.0)[host], numbers[:, 0])
     height, azimuth = 2.0 * numbers[:, 1] - 1.0, 2.0 * np.pi * numbers[:, 2]

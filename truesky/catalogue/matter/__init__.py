@@ -1,1 +1,1 @@
-"""Linear theory, the box of matter, its light-cone and its lensing maps."""
+"""Linear theory, the box of matter, its light-cone and the convergence."""

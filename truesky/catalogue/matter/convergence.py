@@ -1,11 +1,13 @@
-"""The convergence of the box's matter on source planes: sums along straight lines of sight.
+"""Convergence of the box's matter on source planes, summed along straight lines of sight.
 
-convergence    kappa of sources at several distances
-transfer       what its multipoles are multiplied by to have the power of linear theory
+Notes
+-----
+This is the Born approximation. Matter is constant within the cells of the box, or within cubes of several cells if a
+pixel is that wide. This removes power at the scales of cells. `transfer` restores the power, but not the structure.
 
-Error: Born approximation; matter is constant within the cells of the box, or within as many of them as a pixel is
-       wide, which takes power away at the scales of cells; the transfer gives it back, not the structure
-Ref: Bartelmann & Schneider 2001, Phys. Rep. 340, 291, eq. 6.16 ff.
+References
+----------
+Bartelmann & Schneider 2001, Phys. Rep. 340, 291, eq. 6.16 ff.
 """
 
 from __future__ import annotations
@@ -25,27 +27,40 @@ from truesky.fluxes import cosmology
 from truesky.numerics import matrices
 from truesky.numerics.compiling import exact_jit
 
-# Tables reach this redshift, however near the last plane is: it leaves the nearer ones as they are.
+# Redshift limit of the tables. It does not depend on the last plane, so that nearer planes do not change with it.
 _Z_LAST = 12.0
 _GAIN_NODES, _ELL_NODES, _K_BINS, _K_NODES = 9, 60, 24, 48
-# The window is averaged over so many directions, with images on so many sides, up to this many times the highest k.
+# Number of directions for the average of the window, number of images per side, and the range of its nodes in units of
+# the highest k.
 _DIRECTIONS, _IMAGES, _WINDOWS = 48, 2, 8.0
-# Where more power than this is missing, in amplitude, it stays so: sources at z < 0.3.
+# Upper limit of the transfer in amplitude; more power is missing only for sources at z < 0.3.
 _MAX_TRANSFER = 2.0
-# Pixels whose sums are taken together: few enough that the cells of the box they share stay in the processor's cache.
+# Number of pixels per patch: few enough that the cells of the box that they share stay in the processor's cache.
 _PATCH_SIZE = 1024
-# Patches that a thread takes at a time.
+# Number of patches per task of a thread.
 _PATCHES_PER_CALL = 48
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layers:
-    """Layers of matter, near to far; arrays [s].
+    """Layers of matter from near to far.
 
-    middle, factor : Mpc/h, and cells of the box a side that matter is averaged over
-    stretch        : number of the stretch of one growth;  growth : D that its matter is averaged at
-    now, gain      : D here, and what delta is multiplied by to have the power of linear theory
-    weight         : of linear delta / D in the convergence, without the distances of the sources
+    Attributes
+    ----------
+    middle : float array, shape (s,)
+        Distance of the middle, Mpc/h.
+    factor : int array, shape (s,)
+        Number of box cells per side over which matter is averaged.
+    stretch : int array, shape (s,)
+        Number of the stretch; matter within a stretch uses the same growth.
+    growth : float array, shape (s,)
+        Growth D for which the matter is averaged.
+    growth_here : float array, shape (s,)
+        Growth D at the layer.
+    gain : float array, shape (s,)
+        Factor that gives delta the power of linear theory.
+    weight : float array, shape (s,)
+        Weight of linear delta / D in the convergence, without the factors of the source distance.
     """
 
     middle: Float
@@ -57,23 +72,43 @@ class Layers:
     weight: Float
 
     def select(self, cut: slice) -> Layers:
-        """The layers of a cut."""
+        """Return the layers of a slice."""
         return Layers(*(getattr(self, field.name)[cut] for field in fields(self)))
 
 
 def convergence(box: Box, direction: Float32, width: float, chi: Float, coarsest: int, stretch: float) -> Float32:
-    """kappa[p, n] of sources at chi[p] Mpc/h, ascending, in n directions.
+    """Compute the convergence of sources at several distances.
 
-    kappa = 3/2 Om (H0 / c)^2 int dchi' chi' (chi - chi') / chi (1 + z') delta
-    direction : float32[3, n] unit vectors, neighbours close to each other, n a multiple of 1024
-    width     : of a pixel, rad
-    coarsest  : most cells a side that matter is averaged over;  stretch : Mpc/h in which its growth is linear
-    box       : of matter
+    Parameters
+    ----------
+    box : Box
+        Matter in a box.
+    direction : float32 array, shape (3, n)
+        Unit vectors, with neighbours close to each other; n is a multiple of 1024.
+    width : float
+        Width of a pixel, rad.
+    chi : float array, shape (p,)
+        Comoving distances of the sources, Mpc/h, ascending.
+    coarsest : int
+        Largest number of cells per side over which matter is averaged.
+    stretch : float
+        Depth in Mpc/h within which the growth is linear.
+
+    Returns
+    -------
+    float32 array, shape (p, n)
+        Convergence.
+
+    Notes
+    -----
+    The convergence is::
+
+        kappa = 3/2 Om (H0 / c)^2 int dchi' chi' (chi - chi') / chi (1 + z') delta
     """
     direction = np.ascontiguousarray(direction.reshape(3, -1, _PATCH_SIZE).swapaxes(0, 1))
     replicas = lightcone.draw_replicas(box, float(chi[-1]))
     slabs = layers(box, width, float(chi[-1]), coarsest, stretch)
-    # kappa(chi) = first - second / chi: two sums serve every plane.
+    # Because kappa(chi) = first - second / chi, two sums are enough for all planes.
     sums = np.zeros((len(direction), 2, _PATCH_SIZE), np.float32)
     planes = np.empty((chi.size, len(direction), _PATCH_SIZE), np.float32)
     done = 0
@@ -88,9 +123,25 @@ def convergence(box: Box, direction: Float32, width: float, chi: Float, coarsest
 
 
 def layers(box: Box, width: float, max_distance: float, coarsest: int, stretch: float) -> Layers:
-    """Layers out to `far` Mpc/h, as thick as the cells that a pixel of `width` rad is averaged over.
+    """Return layers as thick as the cubes of cells over which a pixel is averaged.
 
-    box : of matter;  coarsest, stretch : as of `convergence`
+    Parameters
+    ----------
+    box : Box
+        Matter in a box.
+    width : float
+        Width of a pixel, rad.
+    max_distance : float
+        Distance of the last layer, Mpc/h.
+    coarsest : int
+        Largest number of cells per side over which matter is averaged.
+    stretch : float
+        Depth in Mpc/h within which the growth is linear.
+
+    Returns
+    -------
+    Layers
+        The layers.
     """
     middle, factor, at = [], [], 0.0
     while at < max_distance:
@@ -111,12 +162,32 @@ def layers(box: Box, width: float, max_distance: float, coarsest: int, stretch: 
 
 
 def transfer(box: Box, width: float, chi: Float, l_max: int, coarsest: int, stretch: float) -> Float:
-    """sqrt(C_l of linear theory / C_l of the box), [p, l_max + 1], at most 2; arguments as of `convergence`.
+    """Return the factor that gives the multipoles of the convergence the power of linear theory.
 
-    Both by Limber's approximation, which holds for the ratio where it matters: it is 1 for small l.
-    chi : float[p] Mpc/h, ascending
-    box, width, coarsest, stretch : as of `convergence`;  l_max : highest multipole
-    Error: 5 % in power for l < nside and z > 0.4 (tests)
+    Parameters
+    ----------
+    box : Box
+        Matter in a box.
+    width : float
+        Width of a pixel, rad.
+    chi : float array, shape (p,)
+        Comoving distances of the sources, Mpc/h, ascending.
+    l_max : int
+        Highest multipole.
+    coarsest : int
+        Largest number of cells per side over which matter is averaged.
+    stretch : float
+        Depth in Mpc/h within which the growth is linear.
+
+    Returns
+    -------
+    float array, shape (p, l_max + 1)
+        sqrt(C_l of linear theory / C_l of the box), at most 2.
+
+    Notes
+    -----
+    Both power spectra use Limber's approximation. It is accurate enough for the ratio, which is 1 for small l. The
+    error of the power is 5 % for l < nside and z > 0.4 (tests).
     """
     slabs = layers(box, width, float(chi[-1]), coarsest, stretch)
     ell = np.unique(np.concatenate([np.arange(32), np.geomspace(32, l_max, _ELL_NODES).astype(int)]))
@@ -133,7 +204,7 @@ def transfer(box: Box, width: float, chi: Float, l_max: int, coarsest: int, stre
 
 
 def _sampled_power_ratio(model: BoxModel, slabs: Layers, k: Float) -> Float:
-    """Power of the matter that lines of sight meet / linear power, [l, s]."""
+    """Power of the matter along lines of sight / linear power, shape (l, s)."""
     growths = np.linspace(float(slabs.growth_here.min()), 1.0, _GAIN_NODES)
     edges = np.linspace(0.0, np.pi / model.cell, _K_BINS + 1)
     at, share = density_box.linear_share(model, growths, edges)
@@ -149,11 +220,25 @@ def _sampled_power_ratio(model: BoxModel, slabs: Layers, k: Float) -> Float:
 
 
 def window(cell: float, factor: int, k: Float) -> Float:
-    """Power[k] of matter that is averaged over, and constant within, cubes of factor^3 cells / linear power.
+    """Return the power of matter that is averaged over cubes of cells and constant within them / linear power.
 
-    Modes up to the highest of the cells' lattice, and the images of them that constant cubes make; averaged over
-    directions.
-    cell : Mpc/h;  factor : cells a side;  k : float[n] h/Mpc
+    Parameters
+    ----------
+    cell : float
+        Side of a cell, Mpc/h.
+    factor : int
+        Number of cells per side of a cube.
+    k : float array, shape (n,)
+        Wave number, h/Mpc.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Ratio of the powers, averaged over directions.
+
+    Notes
+    -----
+    The power contains modes up to the highest of the lattice of cells, and their images, which constant cubes produce.
     """
     wide = cell * factor
     number = np.arange(_DIRECTIONS) + 0.5
@@ -179,10 +264,23 @@ def window(cell: float, factor: int, k: Float) -> Float:
 
 
 def average_density(box: Box, growth: float, factor: int, pool: ThreadPoolExecutor) -> Float32:
-    """Matter overdensity at a growth, in cubes of factor^3 cells: float32[(n / factor)^3].
+    """Return the matter overdensity in cubes of cells.
 
-    box  : of n^3 cells;  growth : of linear density, 1 today;  factor : cells a side that are averaged
-    pool : threads that share the slabs
+    Parameters
+    ----------
+    box : Box
+        Matter in a box of n^3 cells.
+    growth : float
+        Growth of the linear density, 1 today.
+    factor : int
+        Number of cells per side of a cube.
+    pool : ThreadPoolExecutor
+        Threads that share the work.
+
+    Returns
+    -------
+    float32 array, shape (n / factor, n / factor, n / factor)
+        Overdensity.
     """
     n = box.n // factor
     mean = np.empty((n, n, n), np.float32)
@@ -200,7 +298,7 @@ def average_density(box: Box, growth: float, factor: int, pool: ThreadPoolExecut
 
 
 def _group_layers(slabs: Layers, plane: Int) -> Iterator[slice]:
-    """Stretches of layers that share their matter and the planes behind them."""
+    """Yield slices of layers that share their matter and the planes behind them."""
     same = zip(slabs.stretch.tolist(), slabs.factor.tolist(), plane.tolist(), strict=True)
     at = 0
     for _, group in groupby(same):
@@ -212,7 +310,7 @@ def _group_layers(slabs: Layers, plane: Int) -> Iterator[slice]:
 def _add_group(
     box: Box, replicas: lightcone.Replicas, slabs: Layers, direction: Float32, sums: Float32, pool: ThreadPoolExecutor
 ) -> None:
-    """Add layers of one growth and factor to both sums."""
+    """Add layers of the same growth and factor to both sums."""
     factor = int(slabs.factor[0])
     delta = average_density(box, float(slabs.growth[0]), factor, pool).ravel()
     shell = (slabs.middle // box.length).astype(np.int64)
@@ -240,10 +338,29 @@ def add_layers(
     weights: Float32,
     sums: Float32,
 ) -> None:
-    """sums[:, k, p] += sum over layers s of weights[k, s] delta(cell that direction[:, :, p] meets in layer s).
+    """Add the weighted matter along lines of sight to the sums.
 
-    direction : [patch, 3, p];  sums : [patch, 2, p];  delta : [n^3], periodic
-    axes, scale, shift : [s, 3], place in units of the box = direction[axes] scale + shift
+    Parameters
+    ----------
+    direction : float32 array, shape (patches, 3, p)
+        Unit vectors.
+    delta : float32 array, shape (n^3,)
+        Overdensity of the periodic box.
+    n : int
+        Number of cubes per side of the box.
+    axes : int array, shape (s, 3)
+        Axes of the direction in the frame of the box.
+    scale, shift : float32 array, shape (s, 3)
+        Position in units of the box = direction[axes] scale + shift.
+    weights : float32 array, shape (2, s)
+        Weights of the layers in both sums.
+    sums : float32 array, shape (patches, 2, p)
+        Sums, changed in place.
+
+    Notes
+    -----
+    For both k, sums[:, k, p] increases by the sum over layers s of weights[k, s] delta(cell of line of sight p in layer
+    s).
     """
     pixels = direction.shape[2]
     index = np.empty(pixels, np.int64)
@@ -262,7 +379,8 @@ def add_layers(
                 y = along_y[p] * scale_y + shift_y
                 z = along_z[p] * scale_z + shift_z
                 x, y, z = x - np.floor(x), y - np.floor(y), z - np.floor(z)
-                # In single precision a little less than 0 is 1 above the integer below it: the last cell, none after.
+                # In single precision, x - floor(x) can be exactly 1 if x is slightly below 0: limit the index to the
+                # last cell.
                 i, j, k = min(int(x * n), n - 1), min(int(y * n), n - 1), min(int(z * n), n - 1)
                 index[p] = (i * n + j) * n + k
             first_weight, second_weight = weights[0, s], weights[1, s]

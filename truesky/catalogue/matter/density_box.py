@@ -1,18 +1,19 @@
-"""The matter of the embedded universe: one periodic log-normal box with its linear velocities.
+"""Matter of the embedded universe: one periodic log-normal box with its linear velocities.
 
-    1 + delta(x, z) = exp(D(z) g(x) - D(z)^2 var(g) / 2)          g Gaussian, D growth, D(0) = 1
-    n_halo(x, z) ~ exp(A g_R - A^2 var(g_R) / 2)                  g_R smoothed; R and A chosen by b D
-    v(x, z) = a H f D u(x)                                        u from the linear density that g stands for
+The fields are, with the Gaussian field g and the growth D (D(0) = 1)::
 
-load            the box of a seed, every field mapped from the cache
-growth          D(z);  growth_rate  f(z)
-linear_power    P(k) at z = 0
-overdensity     delta of cells;  velocity_factor  a H f D
-biased          R and A of halos
+    1 + delta(x, z) = exp(D(z) g(x) - D(z)^2 var(g) / 2)
+    n_halo(x, z) ~ exp(A g_R - A^2 var(g_R) / 2)                  g_R smoothed; R and A depend on b D
+    v(x, z) = a H f D u(x)                                        u from the linear density of g
 
-Error: the log-normal field has the power of linear theory, 5 % at 0.02 < k < 0.2 h/Mpc (tests); no halo exclusion,
-       nothing below the cell of 4 Mpc/h.
-Ref: Coles & Jones 1991, MNRAS 248, 1; Eisenstein & Hu 1998, ApJ 496, 605
+Notes
+-----
+The log-normal field has the power of linear theory within 5 % at 0.02 < k < 0.2 h/Mpc (tests). There is no halo
+exclusion and no structure below the cell size of 4 Mpc/h.
+
+References
+----------
+Coles & Jones 1991, MNRAS 248, 1; Eisenstein & Hu 1998, ApJ 496, 605
 """
 
 from __future__ import annotations
@@ -37,18 +38,18 @@ from truesky.numerics.code_fingerprints import code_key
 from truesky.randomness.rng import stream
 
 _FILE = "density_box.toml"
-# Interpolation nodes of P(k), in ln k over what a box can hold: 1e-5 relative.
+# Number of interpolation nodes of P(k), in ln k over the modes of a box; the relative error is 1e-5.
 _K_NODES = 2000
-# The gain is the same for all boxes; a small one is enough: 0.5 %.
+# Cells per side of the box in which the gain is computed. It is the same for all boxes, and its error is 0.5 %.
 _GAIN_CELLS = 96
 _BIAS_NODES = 10
-# More threads do not make the transforms of a box any faster.
+# More threads do not make the Fourier transforms of a box faster.
 _MAX_WORKERS = 8
 
 
 @dataclass(frozen=True, slots=True)
 class BoxModel:
-    """The numbers of the box (density_box.toml, [box])."""
+    """Parameters of the box (density_box.toml, [box])."""
 
     cell: float
     smoothing: tuple[float, ...]
@@ -65,8 +66,20 @@ class BoxModel:
 class Box:
     """Fields of a periodic cube of n^3 cells.
 
-    smoothed : float32[n^3] each, g smoothed with model.smoothing[i];  variance : their variances
-    velocity : float32[n^3] each, u_x, u_y, u_z Mpc/h, so that v = velocity_factor(z) u
+    Attributes
+    ----------
+    model : BoxModel
+        Parameters.
+    n : int
+        Cells per side.
+    seed : int
+        Seed of the fields.
+    smoothed : tuple of float32 array, shape (n, n, n)
+        g smoothed with each length in model.smoothing.
+    variance : float array
+        Variance of each smoothed field.
+    velocity : tuple of float32 array, shape (n, n, n)
+        u_x, u_y, u_z in Mpc/h, with v = velocity_factor(z) u.
     """
 
     model: BoxModel
@@ -78,22 +91,23 @@ class Box:
 
     @property
     def length(self) -> float:
-        """Side of the cube, Mpc/h."""
+        """Return the side of the cube, Mpc/h."""
         return self.n * self.model.cell
 
 
 def box_model() -> BoxModel:
-    """The box of the embedded universe."""
+    """Return the parameters of the embedded universe's box."""
     return BoxModel(**parameters.section(_FILE, "box"))
 
 
 def load(seed: int, n: int) -> Box:
-    """The box of a seed with n cells a side, from the cache or made now.
+    """Return the box of a seed with n cells per side, from the cache or made now.
 
-    Nine fields, made and stored one at a time: 10 s for n = 256, with 0.4 GB of memory.
+    The nine fields are made and stored one at a time; 10 s and 0.4 GB of memory for n = 256. Raises BadInput if n is
+    not an even number of at least 2.
     """
     if n < 2 or n % 2:
-        raise BadInput(f"a box wants an even number of cells a side, got {n}")
+        raise BadInput(f"a box must have an even number of cells per side, got {n}")
     model = box_model()
     numbers = [value for field in fields(model) for value in np.atleast_1d(getattr(model, field.name))]
     key = content_key(code_key(__name__), seed, n, *map(float, numbers))
@@ -110,10 +124,11 @@ def load(seed: int, n: int) -> Box:
 
 
 def tides(box: Box) -> tuple[Float32, ...]:
-    """Traceless tide of the linear density today, float32[n^3] each: xx, yy, xy, xz, yz; zz is -xx - yy.
+    """Return the traceless tidal field of the linear density today, from the cache or made now (5 s for n = 256).
 
-    T_ij = (d_i d_j / nabla^2 - delta_ij / 3) delta, from the cache or made now: 5 s for n = 256.
-    box : of matter
+    The fields are xx, yy, xy, xz and yz, float32, shape (n, n, n) each; zz is -xx - yy. They are::
+
+        T_ij = (d_i d_j / nabla^2 - delta_ij / 3) delta
     """
     key = content_key(code_key(__name__), box.seed, box.n, box.model.cell)
     g, tide_fields = box.smoothed[0], []
@@ -125,48 +140,53 @@ def tides(box: Box) -> tuple[Float32, ...]:
 
 
 def growth(z: npt.ArrayLike) -> Float:
-    """Linear growth D(z) of the flat universe with a cosmological constant, D(0) = 1.
+    """Return the linear growth D(z) of the flat universe with a cosmological constant, D(0) = 1.
 
-    z : float[n]
-    Ref: Carroll, Press & Turner 1992, ARA&A 30, 499 (its hypergeometric form)
+    References
+    ----------
+    Carroll, Press & Turner 1992, ARA&A 30, 499 (its hypergeometric form)
     """
     a = 1.0 / (1.0 + np.asarray(z, float))
     return np.asarray(a * _growth_integral(a) / _growth_integral(np.ones(())))
 
 
 def growth_rate(z: npt.ArrayLike, index: float) -> Float:
-    """f = dlnD / dlna = Omega_m(z)^index.
-
-    z : float[n];  index : of Omega_m(z)
-    Error: 0.3 %
-    """
+    """Return the growth rate f = dlnD / dlna = Omega_m(z)^index (error 0.3 %)."""
     a = 1.0 + np.asarray(z, float)
     return np.asarray((cosmology.OMEGA_M * a**3 / cosmology.expansion_rate(z) ** 2) ** index)
 
 
 def velocity_factor(model: BoxModel, z: npt.ArrayLike) -> Float:
-    """a H f D, km/s per Mpc/h.
-
-    z : float[n]
-    """
+    """Return a H f D at each redshift, km/s per Mpc/h."""
     rate = 100.0 * cosmology.expansion_rate(z) / (1.0 + np.asarray(z, float))
     return np.asarray(rate * growth_rate(z, model.growth_index) * growth(z))
 
 
 def overdensity(box: Box, index: Int, growths: npt.ArrayLike) -> Float:
-    """Matter overdensity delta[n] in cells of the box, at growth D[n].
+    """Return the matter overdensity in cells of the box.
 
-    index : int[n] flat cell;  growths : float[n]
+    Parameters
+    ----------
+    box : Box
+        Matter in a box.
+    index : int array, shape (n,)
+        Flat index of the cells.
+    growths : float array, shape (n,)
+        Growth D.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Overdensity delta.
     """
     d = np.asarray(growths, float)
     return np.asarray(np.expm1(d * box.smoothed[0].ravel()[index] - 0.5 * d**2 * box.variance[0]))
 
 
 def matter_gain(model: BoxModel, growths: Float) -> Float:
-    """What delta has to be multiplied by, [n], to have the power of linear theory at growth D[n] too; 1 at D = 1.
+    """Return the factor that gives delta the power of linear theory at each growth D; it is 1 at D = 1.
 
-    (1 + xi)^(D^2) - 1 is smaller than D^2 xi where xi is large, which takes 10 % of the power at z = 1.
-    growths : float[n]
+    (1 + xi)^(D^2) - 1 is smaller than D^2 xi at large xi. Without this factor, 10 % of the power is missing at z = 1.
     """
     low, high = model.gain_band
     _, share = linear_share(model, growths, np.array([low, high]))
@@ -174,12 +194,12 @@ def matter_gain(model: BoxModel, growths: Float) -> Float:
 
 
 def biased_field(model: BoxModel, x: Float) -> tuple[Int, Float]:
-    """The field that halos of x = b D follow, and its amplitude A, each of x's shape.
+    """Return the smoothed field that halos with x = b D follow, and its amplitude A.
 
-    Halos drawn in voxels from exp(A g_R) have the power x^2 P_linear(z = 0) in the band of the model; A = x would be
-    wrong by up to a half.
-    x : float[...]
-    Error: bias within 10 % at 0.02 < k < 0.25 h/Mpc for 0.7 < x < 6 (tests)
+    Notes
+    -----
+    Halos drawn in voxels from exp(A g_R) have the power x^2 P_linear(z = 0) in the band of the model. A = x would be
+    wrong by up to a factor of 1.5. The bias is within 10 % at 0.02 < k < 0.25 h/Mpc for 0.7 < x < 6 (tests).
     """
     names = [float(value) for name in astuple(model) for value in np.atleast_1d(name)]
     key = content_key(code_key(__name__), *names)
@@ -193,9 +213,23 @@ def biased_field(model: BoxModel, x: Float) -> tuple[Int, Float]:
 
 
 def linear_share(model: BoxModel, growths: Float, edges: Float) -> tuple[Float, Float]:
-    """Power of delta at growth D[n] / that of linear theory, [n, bins], and the k[bins] between edges, h/Mpc.
+    """Return the power of delta relative to linear theory.
 
-    growths : float[n];  edges : float[bins + 1] h/Mpc
+    Parameters
+    ----------
+    model : BoxModel
+        Parameters of the box.
+    growths : float array, shape (n,)
+        Growth D.
+    edges : float array, shape (bins + 1,)
+        Edges of the bins of k, h/Mpc.
+
+    Returns
+    -------
+    k : float array, shape (bins,)
+        Mean k of the modes of each bin, h/Mpc.
+    ratio : float array, shape (n, bins)
+        Power of delta / (D^2 linear power).
     """
     n, cell = _GAIN_CELLS, model.cell
     power = _power_on_modes(n, cell)
@@ -212,10 +246,7 @@ def linear_share(model: BoxModel, growths: Float, edges: Float) -> tuple[Float, 
 
 
 def linear_power(k: npt.ArrayLike) -> Float:
-    """P(k) at z = 0, (Mpc/h)^3; k h/Mpc.
-
-    k : float[n] h/Mpc
-    """
+    """Return the linear power P(k) at z = 0 in (Mpc/h)^3, for k in h/Mpc."""
     return linear_theory.power(np.asarray(k, float))
 
 
@@ -223,11 +254,11 @@ def linear_power(k: npt.ArrayLike) -> Float:
 
 
 def _bias_table(model: BoxModel) -> dict[str, Float]:
-    """Bias[i, m] at z = 0 that amplitudes[i, m] of the i-th range of x give, voxels and all."""
+    """Bias at z = 0 of amplitudes in each range of x, shape (ranges, m), with the effect of voxels."""
     n, cell = _GAIN_CELLS, model.cell
     power, k_squared = _power_on_modes(n, cell), _k_squared(n, cell)
     band = (k_squared > model.bias_band[0] ** 2) & (k_squared < model.bias_band[1] ** 2)
-    # Each ln k counts the same, so that the many modes of small scales do not decide alone.
+    # Give each ln k the same weight, so that the many modes on small scales do not dominate.
     weight = k_squared[band].astype(float) ** -1.5 / power[band]
     linear_sum, damped_weight = np.sum(weight * power[band]), weight * np.exp(-(model.bias_hold**2) * k_squared[band])
     log_power, edge = _log_power(n, cell), (0.0, *model.bias_edges, model.bias_most)
@@ -252,10 +283,10 @@ def _cached_field(key: str, name: str, make: Callable[[], npt.NDArray[np.generic
 
 
 def _gaussian(seed: int, n: int, cell: float) -> Float32:
-    """The Gaussian field g whose exponential has the linear power at z = 0."""
+    """Gaussian field g whose exponential has the linear power at z = 0."""
     noise = np.empty((n, n, n), np.float32)
     for x in range(n):
-        # A plane at a time: the numbers in double precision are never all in memory.
+        # Draw one plane at a time, so that the double-precision numbers are never all in memory.
         noise[x] = stream(seed, "box", x).standard_normal((n, n), np.float32)
     modes = fft.rfftn(noise, overwrite_x=True)
     del noise
@@ -264,7 +295,7 @@ def _gaussian(seed: int, n: int, cell: float) -> Float32:
 
 
 def _log_power(n: int, cell: float) -> Float32:
-    """Power of g on the modes of the box: that of ln(1 + xi), (Mpc/h)^3."""
+    """Power of g on the modes of the box in (Mpc/h)^3: the transform of the correlation function ln(1 + xi)."""
     power = _power_on_modes(n, cell)
     correlation = fft.irfftn(power, (n, n, n), overwrite_x=True) / np.float32(cell**3)
     transformed = fft.rfftn(np.log1p(correlation), overwrite_x=True).real * np.float32(cell**3)
@@ -273,7 +304,7 @@ def _log_power(n: int, cell: float) -> Float32:
 
 
 def _power_on_modes(n: int, cell: float) -> Float32:
-    """Linear P on the modes of the box, 0 at k = 0."""
+    """Linear power on the modes of the box, 0 at k = 0."""
     k = np.sqrt(_k_squared(n, cell))
     largest = np.sqrt(3.0) * np.pi / cell
     ln_k = np.linspace(np.log(np.pi / (n * cell)), np.log(1.01 * largest), _K_NODES)
@@ -291,14 +322,14 @@ def _smooth(g: Float32, cell: float, radius: float) -> Float32:
 
 
 def _displacement(g: Float32, cell: float, axis: int) -> Float32:
-    """u of one axis, Mpc/h: i k / k^2 times the linear density."""
+    """Field u along one axis in Mpc/h: i k / k^2 times the linear density."""
     modes, k_squared = _linear_modes(g, cell)
     modes *= (1j * _k_signed(g.shape[0], cell, axis) / k_squared).astype(np.complex64)
     return _to_real(modes, g.shape[0])
 
 
 def _tide(g: Float32, cell: float, axis_1: int, axis_2: int) -> Float32:
-    """k_i k_j / k^2 times the linear density, less a third of this where i = j."""
+    """k_i k_j / k^2 times the linear density, minus a third of the density if i = j."""
     modes, k_squared = _linear_modes(g, cell)
     n = g.shape[0]
     product = _k_signed(n, cell, axis_1) * _k_signed(n, cell, axis_2) / k_squared
@@ -307,7 +338,7 @@ def _tide(g: Float32, cell: float, axis_1: int, axis_2: int) -> Float32:
 
 
 def _linear_modes(g: Float32, cell: float) -> tuple[Complex64, Float32]:
-    """Modes of the linear density, whose phases are those of g, and their k^2, 1 where k = 0."""
+    """Modes of the linear density, which have the phases of g, and their k^2 (1 at k = 0)."""
     n = g.shape[0]
     modes = fft.rfftn(g)
     log_power = _log_power(n, cell)
@@ -319,7 +350,7 @@ def _linear_modes(g: Float32, cell: float) -> tuple[Complex64, Float32]:
 
 
 def _k_signed(n: int, cell: float, axis: int) -> Float:
-    """k of an axis, 0 at the highest frequency, whose sign is not known."""
+    """k of an axis; 0 at the highest frequency, because its sign is undefined."""
     k = _k_axes(n, cell)[axis].copy()
     k[np.abs(k) > 0.999 * np.pi / cell] = 0.0
     return k

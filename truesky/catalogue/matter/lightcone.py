@@ -1,11 +1,8 @@
-"""The box along the line of sight: replicas, and the voxels of a cell of the sky.
+"""Light-cone through replicas of the box, and the voxels of a cell of the sky.
 
-replicas        how each spherical shell, one box side deep, is turned, mirrored and shifted, so that structure
-                does not repeat along a line of sight; structure breaks only where chi is a multiple of the side
-box_cells       sky direction and distance -> cell of the box, and the direction as the box sees it
-steps, voxels   the volume of a HEALPix cell in pieces of about 4 Mpc/h
-
-Comoving Mpc/h; the observer sits at a place of the box that the seed chooses.
+Each spherical shell, as deep as the side of the box, contains a rotated, mirrored and shifted replica, so that
+structure does not repeat along a line of sight. Structure is discontinuous only where chi is a multiple of the side.
+The seed determines the position of the observer in the box. Distances are comoving, in Mpc/h.
 """
 
 from __future__ import annotations
@@ -22,17 +19,24 @@ from truesky.catalogue.matter.density_box import Box
 from truesky.fluxes import cosmology
 from truesky.randomness.rng import stream
 
-# Side of a HEALPix cell in units of 1 / nside, rad, and how much wider than a cell of the box a voxel may be.
+# Side of a HEALPix cell in units of 1 / nside (rad), and largest width of a voxel in units of a cell of the box.
 _SIDE, _WIDEST = 1.023, 1.2
-# Of the table of redshifts, Mpc/h.
+# Step of the table of redshifts, Mpc/h.
 _CHI_STEP = 0.25
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Replicas:
-    """Shell j holds box position sign[j] x[axes[j]] + shift[j] at sky position x, Mpc/h.
+    """Rotation and shift of the box in each shell: the box position of x is sign[j] x[axes[j]] + shift[j] in shell j.
 
-    axes : int[shell, 3];  sign, shift : [shell, 3]
+    Attributes
+    ----------
+    axes : int array, shape (shells, 3)
+        Permutation of the axes.
+    sign : float array, shape (shells, 3)
+        1 or -1 for each axis.
+    shift : float array, shape (shells, 3)
+        Shift, Mpc/h.
     """
 
     axes: Int
@@ -42,9 +46,14 @@ class Replicas:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Steps:
-    """Radial steps from one chi to another; no step straddles a multiple of the box's cell.
+    """Radial steps; no step contains a multiple of the box's cell size inside.
 
-    edge : [s + 1] Mpc/h;  z : [s] at the middle
+    Attributes
+    ----------
+    edge : float array, shape (s + 1,)
+        Edges, Mpc/h.
+    z : float array, shape (s,)
+        Redshift at the middle of each step.
     """
 
     edge: Float
@@ -52,21 +61,29 @@ class Steps:
 
     @property
     def middle(self) -> Float:
-        """float[s] Mpc/h."""
+        """Return the middle of each step, Mpc/h."""
         return 0.5 * (self.edge[1:] + self.edge[:-1])
 
     @property
     def volume(self) -> Float:
-        """float[s] (Mpc/h)^3 a steradian."""
+        """Return the volume of each step in (Mpc/h)^3 per steradian."""
         return np.asarray((self.edge[1:] ** 3 - self.edge[:-1] ** 3) / 3.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Voxels:
-    """Pieces of a cell's volume.
+    """Pieces of the volume of a cell of the sky.
 
-    step : int[v];  order, cell : int[v] nested HEALPix cell that bounds it;  box : int[v] flat cell of the box
-    velocity : [v] u towards growing distance, Mpc/h (times velocity_factor: km/s)
+    Attributes
+    ----------
+    step : int array, shape (v,)
+        Radial step.
+    order, cell : int array, shape (v,)
+        Order and nested index of the HEALPix cell that bounds the voxel.
+    box : int array, shape (v,)
+        Flat cell of the box.
+    velocity : float array, shape (v,)
+        u along the line of sight, positive if receding, Mpc/h; times velocity_factor it is in km/s.
     """
 
     step: Int
@@ -78,13 +95,13 @@ class Voxels:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Distances:
-    """Redshift against comoving distance, tabulated at uniform chi from 0: z(chi) within 1e-8."""
+    """Table of redshifts at uniform comoving distances from 0; z(chi) is accurate to 1e-8."""
 
     chi: Float
     z: Float
 
     def redshift(self, chi: npt.ArrayLike) -> Float:
-        """Redshift[n] of chi : float[n] Mpc/h, within the table."""
+        """Return the redshift of comoving distances in Mpc/h, which must be inside the table."""
         at = np.asarray(chi, float) / _CHI_STEP
         node = np.minimum(at.astype(np.int64), self.z.size - 2)
         low = self.z[node]
@@ -92,19 +109,19 @@ class Distances:
 
 
 def distance_table(z_max: float) -> Distances:
-    """The table out to z_max, or a step of it further."""
+    """Return the table of redshifts out to z_max or up to one step farther."""
     steps = int(np.ceil(float(cosmology.comoving_distance(z_max)) / _CHI_STEP))
     chi = np.asarray(_CHI_STEP * np.arange(steps + 1), float)
     return Distances(chi, cosmology.redshift(chi))
 
 
 def draw_replicas(box: Box, chi_max: float) -> Replicas:
-    """Replicas out to chi_max, from the box's seed; the nearest is not turned."""
+    """Return the replicas out to chi_max (Mpc/h) from the box's seed; the nearest replica is not rotated."""
     turns = [(axes, sign) for axes in permutations(range(3)) for sign in product((1.0, -1.0), repeat=3)]
     shells = int(chi_max // box.length) + 1
     chosen, shifts = [], []
     for shell in range(shells):
-        # Each shell has a stream of its own: a deeper light-cone leaves the nearer shells as they were.
+        # Each shell has a separate random stream, so that a deeper light-cone does not change the nearer shells.
         rng = stream(box.seed, "replica", shell)
         chosen.append(turns[int(rng.integers(len(turns)))] if shell else turns[0])
         shifts.append(box.length * rng.random(3))
@@ -113,10 +130,25 @@ def draw_replicas(box: Box, chi_max: float) -> Replicas:
 
 
 def box_cells(box: Box, replicas: Replicas, direction: Float, chi: Float) -> tuple[Int, Float]:
-    """(flat cell of the box[n], direction in the box's frame [n, 3]).
+    """Return the cell of the box, and the direction in the frame of the box, at positions of the light-cone.
 
-    direction : [n, 3] unit vectors;  chi : [n] Mpc/h
-    box       : of matter;  turned : how each replica of it is turned
+    Parameters
+    ----------
+    box : Box
+        Matter in a box.
+    replicas : Replicas
+        Rotation of each replica.
+    direction : float array, shape (n, 3)
+        Unit vectors.
+    chi : float or float array, shape (n,)
+        Comoving distance, Mpc/h.
+
+    Returns
+    -------
+    cell : int array, shape (n,)
+        Flat cell of the box.
+    direction : float array, shape (n, 3)
+        Unit vectors in the frame of the box.
     """
     shell = np.broadcast_to(np.asarray(chi // box.length, np.int64), direction.shape[:1])
     box_direction = replicas.sign[shell] * np.take_along_axis(direction, replicas.axes[shell], 1)
@@ -126,9 +158,21 @@ def box_cells(box: Box, replicas: Replicas, direction: Float, chi: Float) -> tup
 
 
 def radial_steps(cell: float, start: float, end: float, table: Distances) -> Steps:
-    """Steps of `cell` Mpc/h from near to far.
+    """Return radial steps with edges at multiples of the cell size.
 
-    cell : side of the box's cells;  near, far : Mpc/h;  table : of distances
+    Parameters
+    ----------
+    cell : float
+        Side of the box's cells, Mpc/h.
+    start, end : float
+        First and last edge, Mpc/h.
+    table : Distances
+        Table of redshifts.
+
+    Returns
+    -------
+    Steps
+        The steps.
     """
     inner = np.arange(np.floor(start / cell) + 1, np.ceil(end / cell)) * cell
     edge = np.concatenate([[start], inner, [end]])
@@ -136,10 +180,25 @@ def radial_steps(cell: float, start: float, end: float, table: Distances) -> Ste
 
 
 def voxels(box: Box, replicas: Replicas, steps: Steps, order: int, cell: int, used: Bool) -> Voxels:
-    """Voxels of a nested cell, in the steps that are used (bool[s]).
+    """Return the voxels of a cell of the sky, about 4 Mpc/h wide.
 
-    order, cell : of the nested cell;  used : bool[s]
-    box, turned : of matter, and how each replica of it is turned;  line : steps along the line of sight
+    Parameters
+    ----------
+    box : Box
+        Matter in a box.
+    replicas : Replicas
+        Rotation of each replica.
+    steps : Steps
+        Steps along the line of sight.
+    order, cell : int
+        Order and nested index of the cell.
+    used : bool array, shape (s,)
+        True for the steps to divide.
+
+    Returns
+    -------
+    Voxels
+        The voxels, sorted by the order of their HEALPix cells, then by step.
     """
     min_order = np.ceil(np.log2(np.maximum(_SIDE * steps.middle / (_WIDEST * box.model.cell), 1.0)))
     orders = np.maximum(min_order.astype(np.int64), order)

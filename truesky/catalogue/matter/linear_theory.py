@@ -1,12 +1,11 @@
-"""Linear power, halo abundance, halo bias and concentrations of the embedded universe, from colossus.
+"""Linear power, halo abundance, halo bias and concentrations of the embedded universe, computed with colossus.
 
-Colossus keeps no files here: its persistent storage is off, everything made from it lies in our own cache.
+Colossus writes no files: its persistent storage is off, and the results are in the cache of this package.
 
-power           P(k) at z = 0
-halo_tables     dn/dlog10 M and b on redshift and mass, from the cache or made now
-
-Ref: Eisenstein & Hu 1998; Tinker et al. 2008, ApJ 688, 709; Tinker et al. 2010, ApJ 724, 878;
-     Diemer & Joyce 2019, ApJ 871, 168; Diemer 2018, ApJS 239, 35 (colossus)
+References
+----------
+Eisenstein & Hu 1998; Tinker et al. 2008, ApJ 688, 709; Tinker et al. 2010, ApJ 724, 878; Diemer & Joyce 2019, ApJ 871,
+168; Diemer 2018, ApJS 239, 35 (colossus)
 """
 
 from __future__ import annotations
@@ -23,25 +22,20 @@ from truesky.numerics.code_fingerprints import code_key
 
 MASS_DEFINITION = "200m"
 _POWER, _MASS_FUNCTION, _BIAS, _CONCENTRATION = "eisenstein98", "tinker08", "tinker10", "diemer19"
-# Concentrations are slow to make (0.1 s a redshift and mass): at fewer redshifts, and every so many masses.
+# Concentrations are slow to compute (0.1 s per redshift and mass): use 10 redshifts and every 20th mass.
 _Z_COARSE, _COARSE = 10, 20
 
 
 def power(k: Float) -> Float:
-    """P(k)[n] at z = 0, (Mpc/h)^3; k h/Mpc.
-
-    k : float[n] h/Mpc
-    """
+    """Return the linear power P(k) at z = 0 in (Mpc/h)^3, for k in h/Mpc."""
     return np.asarray(_power_cosmology().matterPowerSpectrum(k, 0.0, model=_POWER), float)
 
 
 def halo_tables(log_mass: Float, z: Float) -> dict[str, Float]:
-    """Tables of halos of M_200m, log_mass[m] log10 Msun/h.
+    """Return tables of halos by redshift and log10 M_200m (Msun/h), from the cache or made now.
 
-    log_mass : float[m] log10 Msun/h;  z : float[z]
-    density       : [len(z), m] dn/dlog10 M, comoving (Mpc/h)^-3
-    bias          : [len(z), m]
-    concentration : [_Z_COARSE, m] c_200m, at redshifts uniform in ln(1 + z) over the same range
+    The tables are dn/dlog10 M in comoving (Mpc/h)^-3 (`density`, shape (z, m)), `bias` (z, m), and `concentration`
+    c_200m at 10 redshifts that are uniform in ln(1 + z) over the same range (10, m).
     """
     numbers = (cosmology.OMEGA_M, cosmology.OMEGA_B, cosmology.HUBBLE, cosmology.SIGMA_8)
     key = content_key(code_key(__name__), *numbers, cosmology.SPECTRAL_INDEX, log_mass, z)
@@ -64,12 +58,12 @@ def _halo_tables(log_mass: Float, z: Float) -> dict[str, Float]:
 
 @cache
 def _power_cosmology() -> Any:
-    """The cosmology of `power`: each new one integrates its normalisation and makes its table of k again."""
+    """Return the cosmology of `power`; cached, because a new one computes its normalisation and table of k again."""
     return _set_cosmology()
 
 
 def _set_cosmology() -> Any:
-    """The cosmology of colossus, which is told to keep its files in our cache and to write none."""
+    """Set the cosmology of colossus, with its files disabled and its folder in our cache."""
     from colossus import settings
     from colossus.cosmology import cosmology as colossus
 

@@ -1,1 +1,1 @@
-"""The Milky Way's stars."""
+"""Stars of the Milky Way, and Gaia's measurements of them."""

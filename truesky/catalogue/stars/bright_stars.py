@@ -1,10 +1,10 @@
-"""The brightest stars as they are: Tycho-2, which replaces the model's brighter than the hand-over, V = 11.
+"""Bright stars of Tycho-2, which replace the model's stars brighter than the hand-over magnitude, V = 11.
 
-load       the catalogue's own file, with its first supplement, or a FITS form of it -> stars by generation cell
-of_cell    those of one cell
-columns    what the table `stars` holds of them
+The files are tyc2.dat and its first supplement, or FITS versions of them.
 
-Ref: Hog et al. 2000 (Tycho-2, CDS I/259)
+References
+----------
+Hog et al. 2000 (Tycho-2, CDS I/259)
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from truesky.fluxes.libraries.stellar import StellarTypes
 from truesky.numerics.cache import cached_arrays, content_key
 from truesky.numerics.code_fingerprints import code_key
 
-# Fields between the bars of a record: how many there are, mean position, observed position, B_T, V_T.
+# Fields between the bars of a record: their number, mean position, observed position, B_T, V_T.
 _FIELDS = {"tyc2.dat": (32, (2, 3), (24, 25), 17, 19), "suppl_1.dat": (18, (2, 3), (2, 3), 11, 13)}
-# Titles of a FITS form, in the same order.
+# Column names of FITS versions, in the same order.
 _TITLES = (
     (("RAmdeg", "mRAdeg"), ("DEmdeg", "mDEdeg")),
     (("RAdeg", "RA(ICRS)", "RA_ICRS_", "RA"), ("DEdeg", "DE(ICRS)", "DE_ICRS_", "DE")),
@@ -44,10 +44,20 @@ _KIND, _LONGEST_LINE = "catalogue of stars", 1000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BrightStars:
-    """n stars brighter than the hand-over, by cell and position.
+    """Stars brighter than the hand-over, sorted by cell and position.
 
-    index : order-29; ra, dec : deg, J2000; mag_v : Johnson; color_bv : B - V
-    read, without_color, without_magnitude : records of the files, and how many of them lack what
+    Attributes
+    ----------
+    hand_over : float
+        V magnitude of the hand-over.
+    index : int array, shape (n,)
+        Order-29 cell.
+    ra, dec : float array, shape (n,)
+        J2000 position, deg.
+    mag_v, color_bv : float array, shape (n,)
+        Johnson V and B - V, mag.
+    record_count, without_color, without_magnitude : int
+        Number of records of the files, and number of those without a colour and without any magnitude.
     """
 
     hand_over: float
@@ -62,15 +72,14 @@ class BrightStars:
 
 
 def sha256(files: tuple[Path, ...]) -> list[str]:
-    """What the files hold, for the key of what is made from them."""
+    """Return the SHA-256 of the files, for the key of the results."""
     return [file_sha256(user_files.check_file(file, _KIND, "stars.tycho2")) for file in files]
 
 
 def load(files: tuple[Path, ...], checksums: list[str]) -> BrightStars:
-    """Stars brighter than the hand-over of tyc2.dat and suppl_1.dat, or of FITS forms of them, read once.
+    """Return the stars brighter than the hand-over, from the cache or read now.
 
-    sums   : sha256 of each
-    Errors : BadInput names the file and the record
+    `checksums` is the SHA-256 of each file. Raises BadInput with the file and the record.
     """
     key = content_key(code_key(__name__), *checksums)
     arrays = cached_arrays("tycho2", key, lambda: _read(files))
@@ -80,13 +89,28 @@ def load(files: tuple[Path, ...], checksums: list[str]) -> BrightStars:
 
 
 def rows_of_cell(stars: BrightStars, cell: int) -> slice:
-    """The stars of an order-8 cell."""
+    """Return the rows of an order-8 cell."""
     first, last = np.searchsorted(stars.index, sky.cell_range(GENERATION_ORDER, cell))
     return slice(int(first), int(last))
 
 
 def columns(stars: BrightStars, rows: slice, types: StellarTypes) -> dict[str, Any]:
-    """Template, magnitude and temperature by B - V; what Tycho-2 does not know is masked."""
+    """Return columns of table `stars`: template, magnitude and temperature by B - V; unknown columns are masked.
+
+    Parameters
+    ----------
+    stars : BrightStars
+        The stars.
+    rows : slice
+        Rows of the stars.
+    types : StellarTypes
+        Stellar types of the library.
+
+    Returns
+    -------
+    dict of str to array, shape (n,)
+        Columns.
+    """
     nearest = np.abs(types.color_bv - stars.color_bv[rows, None]).argmin(1)
     blank = masked_column(nearest.size)
     return {
@@ -101,7 +125,7 @@ def columns(stars: BrightStars, rows: slice, types: StellarTypes) -> dict[str, A
 
 
 def masked_column(n: int) -> np.ma.MaskedArray[Any, Any]:
-    """A column of which nothing is known."""
+    """Return a column of n unknown values."""
     return np.ma.MaskedArray(np.zeros(n, np.int64), mask=True)
 
 
@@ -132,7 +156,7 @@ def _read(files: tuple[Path, ...]) -> dict[str, Array]:
 
 
 def _records(file: Path) -> tuple[Float, Float, Float]:
-    """Positions [2, n], B_T and V_T [n], NaN where blank; the observed position where there is no mean one."""
+    """Positions (2, n), B_T and V_T (NaN if blank); the observed position is used if there is no mean position."""
     values = _read_fits(file) if file.suffix.lower() in (".fits", ".fit", ".fz") else _read_text(file)
     mean, observed = np.stack(values[:2]), np.stack(values[2:4])
     place = np.where(np.isfinite(mean), mean, observed)
@@ -140,7 +164,9 @@ def _records(file: Path) -> tuple[Float, Float, Float]:
     if bad.any():
         record = int(bad.argmax())
         where = f"{place[0, record]:g}, {place[1, record]:g}"
-        raise BadInput(f"{file}: record {record + 1} lies at {where}: not on the sky ({bad.sum()} like it)")
+        raise BadInput(
+            f"{file}: record {record + 1} lies at {where}, which is not on the sky ({bad.sum()} bad records)"
+        )
     return place, values[4], values[5]
 
 
@@ -148,12 +174,12 @@ def _read_text(file: Path) -> list[Float]:
     with user_files.open_file(file, _KIND) as stream:
         line = stream.readline(_LONGEST_LINE)
     if len(line) == _LONGEST_LINE:
-        # Room would be made for every field that it has.
-        raise BadInput(f"{file}: the first record has {_LONGEST_LINE} characters or more")
+        # The CSV reader would allocate memory for every field of this line.
+        raise BadInput(f"{file}: the first record has {_LONGEST_LINE} characters or more, must have fewer")
     count = line.count(b"|") + 1
     layouts = [layout for layout in _FIELDS.values() if layout[0] == count]
     if not layouts:
-        raise BadInput(f"{file}: records of {count} fields, wanted 32 (tyc2.dat) or 18 (suppl_1.dat) between bars")
+        raise BadInput(f"{file}: records have {count} fields between bars, must have 32 (tyc2.dat) or 18 (suppl_1.dat)")
     _, mean, observed, bt, vt = layouts[0]
     names = [f"f{k}" for k in (*mean, *observed, bt, vt)]
     unique_names = list(dict.fromkeys(names))
@@ -176,7 +202,7 @@ def _parse_floats(file: Path, texts: pa.ChunkedArray) -> Float:
     if pc.any(invalid).as_py():
         record = pc.index(invalid, True).as_py()
         text = repr(trimmed[record].as_py())[:40]
-        raise BadInput(f"{file}: record {record + 1}: {text} is no number ({pc.sum(invalid).as_py()} like it)")
+        raise BadInput(f"{file}: record {record + 1}: {text} is not a number ({pc.sum(invalid).as_py()} bad records)")
     return np.asarray(pc.cast(pc.if_else(blank, None, trimmed), pa.float64()).to_numpy(), float)
 
 

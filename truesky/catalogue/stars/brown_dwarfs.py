@@ -1,11 +1,6 @@
-"""L and T dwarfs: numbers along a line of sight and draws of them, by the templates of
-truesky.fluxes.libraries.brown_dwarfs.
+"""L and T dwarfs: expected numbers along lines of sight, and draws of them.
 
-brown_dwarfs   densities and magnitudes of the templates
-numbers        dwarfs of many cells
-draw           Poisson sample
-
-Ref: the numbers and their sources are in milky_way.toml.
+The templates are from truesky.fluxes.libraries.brown_dwarfs. The parameters and their sources are in milky_way.toml.
 """
 
 from __future__ import annotations
@@ -28,12 +23,26 @@ _FILE = "milky_way.toml"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BrownDwarfs:
-    """Everything that they are drawn from.
+    """Model from which L and T dwarfs are drawn.
 
-    law         : of density; log_g : of cm s-2; metallicity : mean and scatter of [M/H]
-    boost       : how many times denser than in nature
-    first       : index of the first template in the stellar library
-    local       : [365] pc^-3 at the Sun, before the boost; teff : [365] K; m_h : [365] mag, Vega
+    Attributes
+    ----------
+    law : Exponential
+        Density law.
+    log_g : float
+        log10 of the surface gravity, cm s-2.
+    metallicity : tuple of float
+        Mean and scatter of [M/H].
+    boost : float
+        Ratio of the drawn to the natural number density.
+    first_template : int
+        Index of the first template in the stellar library.
+    local_density : float array, shape (365,)
+        Natural number density at the Sun for each template, pc^-3.
+    teff : float array, shape (365,)
+        Temperature, K.
+    m_h : float array, shape (365,)
+        Absolute H magnitude (Vega).
     """
 
     law: Exponential
@@ -48,14 +57,14 @@ class BrownDwarfs:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sample:
-    """n dwarfs: template[n] among the 365, distance[n] pc."""
+    """Dwarfs with a template (0 to 364) and a distance in pc, shape (n,) each."""
 
     template: Int
     distance: Float
 
 
 def brown_dwarfs(boost: float) -> BrownDwarfs:
-    """The L and T dwarfs of the embedded universe; each realisation of a subtype is as frequent as the others."""
+    """Return the L and T dwarfs of the embedded universe; all templates of a subtype have the same density."""
     numbers = parameters.section(_FILE, "brown_dwarfs")
     templates = spectra.templates()
     share = 1.0 / np.bincount(templates.subtype)
@@ -77,10 +86,25 @@ def brown_dwarfs(boost: float) -> BrownDwarfs:
 def expected_counts(
     dwarfs: BrownDwarfs, galaxy: MilkyWay, lon: Float, lat: Float, area: float, h_limit: Float
 ) -> Float:
-    """Dwarfs[n] of cells before their dust; arguments as milky_way.numbers.
+    """Return the expected number of dwarfs in cells, before extinction.
 
-    lon, lat : float[n] deg, Galactic;  area : deg2;  h_limit : float[n] mag, Vega
-    dwarfs, galaxy : densities and magnitudes by type, and the components of the Milky Way
+    Parameters
+    ----------
+    dwarfs : BrownDwarfs
+        The dwarfs.
+    galaxy : MilkyWay
+        The Milky Way.
+    lon, lat : float array, shape (n,)
+        Galactic coordinates of the cells' centres, deg.
+    area : float
+        Area of a cell, deg2.
+    h_limit : float array, shape (n,)
+        Faintest H magnitude (Vega).
+
+    Returns
+    -------
+    float array, shape (n,)
+        Expected number.
     """
     total = np.zeros(lon.size)
     for limit in np.unique(h_limit):
@@ -96,10 +120,27 @@ def expected_counts(
 def draw(
     dwarfs: BrownDwarfs, galaxy: MilkyWay, lon: float, lat: float, area: float, h_limit: float, rng: np.random.Generator
 ) -> Sample:
-    """Poisson sample of the dwarfs of a cell that are brighter than the limit but for their dust.
+    """Draw a Poisson sample of the dwarfs in a cell that are brighter than the limit before extinction.
 
-    lon, lat : Galactic, of the cell's centre, deg; area : deg2
-    dwarfs, galaxy : as of `numbers`;  h_limit : mag, Vega;  rng : random numbers
+    Parameters
+    ----------
+    dwarfs : BrownDwarfs
+        The dwarfs.
+    galaxy : MilkyWay
+        The Milky Way.
+    lon, lat : float
+        Galactic coordinates of the cell's centre, deg.
+    area : float
+        Area of the cell, deg2.
+    h_limit : float
+        Faintest H magnitude (Vega).
+    rng : Generator
+        Random numbers.
+
+    Returns
+    -------
+    Sample
+        The dwarfs.
     """
     r, z, _ = milky_way.cylindrical(galaxy, lon, lat, milky_way.shell_distances(galaxy))
     per_shell = dwarfs.boost * density(dwarfs.law, galaxy.sun, r, z) * milky_way.shell_volumes(galaxy, area)
@@ -109,5 +150,5 @@ def draw(
 
 
 def _is_bright_enough(dwarfs: BrownDwarfs, galaxy: MilkyWay, h_limit: float) -> Bool:
-    """[365, s] whether a template is brighter than the limit at the near edge of a shell."""
+    """True if a template is brighter than the limit at the near edge of a shell, shape (365, s)."""
     return np.asarray(dwarfs.m_h[:, None] + 5.0 * np.log10(galaxy.distance[:-1]) - 5.0 < h_limit)

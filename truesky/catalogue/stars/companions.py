@@ -1,10 +1,10 @@
-"""Binaries: which stars have a companion, of which mass, and how far from them.
+"""Binaries: the fraction of stars with a companion, and the masses and separations of companions.
 
-expected   companions to expect beside stretches of isochrones, by bin of M_H
-draw       those of drawn stars: same age and metallicity, a mass of their own
-separation projected, AU
+A companion has the age and the metallicity of its primary. The parameters and their sources are in milky_way.toml.
 
-Ref: Duchene & Kraus 2013; the numbers and their sources are in milky_way.toml.
+References
+----------
+Duchene & Kraus 2013
 """
 
 from __future__ import annotations
@@ -20,16 +20,30 @@ from truesky.catalogue import parameters
 from truesky.catalogue.stars.stellar_populations import Pieces, Tracks
 
 _FILE = "milky_way.toml"
-# Mass ratios by which the companions of a stretch are counted.
+# Quantiles of the mass ratio for the expected number of companions.
 _RATIOS = (np.arange(16) + 0.5) / 16
 _DAY_PER_YEAR = 365.25
-# Tracks lie behind one another on a line of log mass, so far apart.
+# Offset of log mass from one track to the next, so that one sorted array contains all tracks.
 _TRACK_SPACING = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Companions:
-    """n companions: primary among the stars that were given, mass Msun at birth, m_h mag, teff K, log_g cm s-2."""
+    """Companions of stars.
+
+    Attributes
+    ----------
+    primary : int array, shape (n,)
+        Index of the primary among the given stars.
+    mass : float array, shape (n,)
+        Mass at birth, Msun.
+    m_h : float array, shape (n,)
+        Absolute H magnitude (Vega).
+    teff : float array, shape (n,)
+        Temperature, K.
+    log_g : float array, shape (n,)
+        log10 of the surface gravity, cm s-2.
+    """
 
     primary: Int
     mass: Float
@@ -39,7 +53,22 @@ class Companions:
 
 
 def expected_density(tracks: Tracks, pieces: Pieces, m_h: Float) -> Float:
-    """Companions pc^-3 [b] in bins of M_H with edges[b + 1], of primaries on stretches of isochrones."""
+    """Return the expected density of companions to the stars on stretches of isochrones.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        Isochrones.
+    pieces : Pieces
+        Stretches of the isochrones.
+    m_h : float array, shape (b + 1,)
+        Edges of the bins of M_H.
+
+    Returns
+    -------
+    float array, shape (b,)
+        Companions per bin, pc^-3.
+    """
     law = _law()
     log_mass = pieces.log_mass.mean(0)
     number = pieces.number * _binary_fraction(law, log_mass) / _RATIOS.size
@@ -53,10 +82,23 @@ def expected_density(tracks: Tracks, pieces: Pieces, m_h: Float) -> Float:
 
 
 def draw(tracks: Tracks, track: Int, mass: Float, rng: np.random.Generator) -> Companions:
-    """Companions of stars; lighter than stars there are none.
+    """Draw companions of stars; a companion lighter than the lightest star is left out.
 
-    tracks : isochrones;  track : int[n] which of them is a star's, -1 = it has no companion
-    mass   : float[n] Msun at birth;  rng : random numbers
+    Parameters
+    ----------
+    tracks : Tracks
+        Isochrones.
+    track : int array, shape (n,)
+        Index of each star's isochrone, -1 for stars without companions.
+    mass : float array, shape (n,)
+        Mass at birth, Msun.
+    rng : Generator
+        Random numbers.
+
+    Returns
+    -------
+    Companions
+        The companions.
     """
     law = _law()
     chance, ratio = rng.random((2, track.size))
@@ -71,15 +113,25 @@ def draw(tracks: Tracks, track: Int, mass: Float, rng: np.random.Generator) -> C
 
 
 def projected_offsets(primary: Float, companion: Float, rng: np.random.Generator) -> tuple[Float, Float]:
-    """Offsets of companions east and north of their primaries, AU: semi-major axes seen from random directions.
+    """Draw offsets of companions from their primaries: semi-major axes in random directions.
 
-    primary, companion : float[n] Msun
+    Parameters
+    ----------
+    primary, companion : float array, shape (n,)
+        Masses, Msun.
+    rng : Generator
+        Random numbers.
+
+    Returns
+    -------
+    east, north : float array, shape (n,)
+        Offsets, AU.
     """
     law = _law()
     n = primary.size
     deviate, cosine, angle = rng.standard_normal(n), rng.uniform(-1.0, 1.0, n), rng.uniform(0.0, 2.0 * np.pi, n)
     years = 10.0 ** (law["log_period"] + law["log_period_scatter"] * deviate) / _DAY_PER_YEAR
-    # Kepler's third law, in AU, years and solar masses.
+    # Kepler's third law in AU, years and solar masses.
     of_sun = np.cbrt((primary + companion) * years**2)
     of_dwarf = 10.0 ** (law["log_axis_dwarf"] + law["log_axis_dwarf_scatter"] * deviate)
     axis = np.minimum(np.where(primary < law["dwarf_below"], of_dwarf, of_sun), law["widest"])
@@ -97,13 +149,13 @@ def _binary_fraction(law: dict[str, Any], log_mass: Float) -> Float:
 
 
 def _mass_ratio(law: dict[str, Any], log_mass: Float, chance: Float) -> Float:
-    """Mass ratio[n] in (0, 1], of a power law, by the part of all ratios that are smaller."""
+    """Mass ratio in (0, 1] with a power-law distribution, from its quantile."""
     slope = np.interp(log_mass, np.log10(law["mass"]), law["ratio_slope"])
     return np.asarray(np.maximum(chance, 1e-12) ** (1.0 / (1.0 + slope)))
 
 
 def _main_sequence_values(tracks: Tracks, track: Int, log_mass: Float) -> tuple[Float, Float, Float]:
-    """M_H, log Teff, log g of stars of masses on the main sequences of tracks; heavier than these: at their ends."""
+    """M_H, log Teff and log g of masses on the main sequences of tracks; heavier stars have the values at the end."""
     last = tracks.evolved
     track_offset = _TRACK_SPACING * np.arange(tracks.age.size)[:, None]
     line = (tracks.log_mass[:, :last] + track_offset).ravel()

@@ -1,12 +1,10 @@
-"""Density laws of the Milky Way's components, each relative to its own density at the Sun.
+"""Density laws of the Milky Way's components, relative to the density at the Sun.
 
-Exponential, PowerLaw                     Juric et al. 2008
-Aged, Young, Parabolic, CoredPowerLaw     Robin et al. 2003, the Besancon model: bins of age of the thin disc, the
-                                          thick disc, the spheroid
-Bar                                       Robin et al. 2012: the bulge, relative to its own density at the centre
-density                                   any of them
+Exponential and PowerLaw are from Juric et al. 2008. OldDisc, YoungDisc, Parabolic and CoredPowerLaw are from Robin et
+al. 2003, the Besancon model: thin disc by age, thick disc and spheroid. Bar is the bulge of Robin et al. 2012, relative
+to the density at the centre.
 
-Lengths are in pc; R, azimuth, z are Galactocentric and cylindrical. The numbers are in milky_way.toml.
+Lengths are in pc; R, azimuth and z are Galactocentric cylindrical coordinates. The parameters are in milky_way.toml.
 """
 
 from __future__ import annotations
@@ -21,7 +19,7 @@ from lake_schema.arrays import Float
 
 @dataclass(frozen=True, slots=True)
 class Sun:
-    """The Sun's distance from the centre and height above the plane."""
+    """Distance of the Sun from the Galactic centre, and height above the plane, pc."""
 
     radius: float
     height: float
@@ -29,7 +27,7 @@ class Sun:
 
 @dataclass(frozen=True, slots=True)
 class Exponential:
-    """exp(-R / length - |z| / height)"""
+    """Density exp(-R / length - |z| / height)."""
 
     length: float
     height: float
@@ -37,7 +35,7 @@ class Exponential:
 
 @dataclass(frozen=True, slots=True)
 class PowerLaw:
-    """(R^2 + (z / flattening)^2 + core^2)^(slope / 2)"""
+    """Density (R^2 + (z / flattening)^2 + core^2)^(slope / 2)."""
 
     flattening: float
     slope: float
@@ -46,7 +44,7 @@ class PowerLaw:
 
 @dataclass(frozen=True, slots=True)
 class OldDisc:
-    """exp(-sqrt(1/4 + a^2 / outer^2)) - exp(-sqrt(1/4 + a^2 / inner^2)), a^2 = R^2 + (z / flattening)^2"""
+    """Density exp(-sqrt(1/4 + a^2 / outer^2)) - exp(-sqrt(1/4 + a^2 / inner^2)), a^2 = R^2 + (z / flattening)^2."""
 
     flattening: float
     outer: float
@@ -55,7 +53,7 @@ class OldDisc:
 
 @dataclass(frozen=True, slots=True)
 class YoungDisc:
-    """exp(-a^2 / outer^2) - exp(-a^2 / inner^2), a as in Aged"""
+    """Density exp(-a^2 / outer^2) - exp(-a^2 / inner^2), with a as in OldDisc."""
 
     flattening: float
     outer: float
@@ -64,7 +62,7 @@ class YoungDisc:
 
 @dataclass(frozen=True, slots=True)
 class Parabolic:
-    """exp(-R / length); in z a parabola to the height `joint`, from there an exponential, smoothly."""
+    """Density exp(-R / length) times a parabola in z up to the height `joint`, with a smooth exponential beyond."""
 
     length: float
     height: float
@@ -73,7 +71,7 @@ class Parabolic:
 
 @dataclass(frozen=True, slots=True)
 class CoredPowerLaw:
-    """max(a, core)^slope, a as in Aged"""
+    """Density max(a, core)^slope, with a as in OldDisc."""
 
     flattening: float
     slope: float
@@ -82,8 +80,14 @@ class CoredPowerLaw:
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """sech^2(s), s^parallel = [(x / length)^perpendicular + (y / width)^perpendicular]^(parallel / perpendicular)
-    + (z / height)^parallel, x along the bar, whose near end lies `angle` deg from the Sun, towards positive longitudes.
+    """Density sech^2(s) of a bar, whose near end is `angle` deg from the Sun's direction, towards positive longitudes.
+
+    Notes
+    -----
+    With x along the bar and y across it::
+
+        s^parallel = [(x / length)^perpendicular + (y / width)^perpendicular]^(parallel / perpendicular)
+                     + (z / height)^parallel
     """
 
     angle: float
@@ -98,17 +102,29 @@ Law = Bar | Exponential | PowerLaw | OldDisc | YoungDisc | Parabolic | CoredPowe
 
 
 def density(law: Law, sun: Sun, radius: npt.ArrayLike, height: npt.ArrayLike, azimuth: npt.ArrayLike = 0.0) -> Float:
-    """Density at R, z (broadcast) relative to the one at the Sun, a bar's to that at the centre; never negative.
+    """Return the density relative to the density at the Sun (for a bar, at the centre).
 
-    radius, height : float[...] pc, galactocentric
-    azimuth : float[...] rad from the Sun's direction, positive where Galactic longitudes are; for bars alone
-    law : of the component;  sun : where the Sun is
+    Parameters
+    ----------
+    law : Law
+        Density law of a component.
+    sun : Sun
+        Position of the Sun.
+    radius, height : float array
+        Galactocentric R and z, pc, broadcast against each other.
+    azimuth : float array
+        Angle from the Sun's direction, rad, positive towards positive Galactic longitudes; only bars use it.
+
+    Returns
+    -------
+    float array
+        Relative density, never negative.
     """
     r, z = np.asarray(radius, float), np.asarray(height, float)
     if isinstance(law, Bar):
         return _bar_density(law, r, z, np.asarray(azimuth, float))
     at_sun = _log_density(law, np.asarray(sun.radius), np.asarray(sun.height))
-    # A difference of logarithms: far out the densities themselves are not numbers any more.
+    # Subtract logarithms, because the densities underflow far from the centre.
     return np.asarray(np.exp(_log_density(law, r, z) - at_sun))
 
 
@@ -147,7 +163,7 @@ def _a2(flattening: float, r: Float, z: Float) -> Float:
 
 
 def _log_difference(small: Float, large: Float) -> Float:
-    """log(exp(-near) - exp(-far)), far >= near; -inf in the hole at the centre."""
+    """log(exp(-small) - exp(-large)) for large >= small; -inf in the hole at the centre."""
     with np.errstate(divide="ignore"):
         return np.asarray(-small + np.log(-np.expm1(small - large)))
 

@@ -1,11 +1,8 @@
-"""Stars of an external model, such as an output of the Besancon model, instead of ours.
+"""Stars of a user's catalogue, such as an output of the Besancon model, which replace the drawn stars.
 
-load       a text or FITS table whose columns the request names -> stars by generation cell
-numbers, of_cell    of cells
-KEYS       what can be named, with its unit
-
-A text table is one of blank-separated or comma-separated fields under a line that holds the titles; lines before it,
-and after the first one that has another number of fields, are not part of it.
+A catalogue is a text or FITS table; the request names its columns. A text table has fields separated by blanks or
+commas below a line with the column names. Lines before this line are ignored. The table ends at the first line with
+another number of fields.
 """
 
 from __future__ import annotations
@@ -31,58 +28,75 @@ from truesky.catalogue import parameters
 from truesky.numerics.cache import cached_arrays, content_key
 from truesky.numerics.code_fingerprints import code_key
 
-# Key -> lowest and highest legal value.  Of keys with a bar between them one is enough.
+# Lowest and highest valid value by key. The groups of alternatives in _REQUIRED_KEYS each require one key.
 KEYS = {
     "ra": (-360.0, 360.0), "dec": (-90.0, 90.0),  # deg, ICRS
     "l": (-360.0, 360.0), "b": (-90.0, 90.0),  # deg, Galactic
     "mag_h": (-10.0, 40.0),  # 2MASS H, Vega, before extinction
-    "mag_h_seen": (-10.0, 60.0),  # the same with the extinction a_v
+    "mag_h_seen": (-10.0, 60.0),  # with the extinction a_v
     "teff": (300.0, 1e5),  # K
     "log_teff": (2.4, 5.0),
     "distance": (0.0, 1e6),  # pc
     "distance_kpc": (0.0, 1e3),
     "log_g": (-1.0, 10.0),
     "metallicity": (-5.0, 1.5),  # [M/H]
-    "a_v": (0.0, 40.0),  # mag, R_V = 3.1; by default our own dust
-    "age_class": (1.0, 10.0),  # the Besancon model's: 1-7 thin disc, 8 thick disc, 9 spheroid, 10 bulge
-    "luminosity_class": (1.0, 7.0),  # its own: 1-3 giants, 4 5 7 main sequence, 6 white dwarfs
+    "a_v": (0.0, 40.0),  # mag, R_V = 3.1; by default from our dust map
+    "age_class": (1.0, 10.0),  # Besancon model: 1-7 thin disc, 8 thick disc, 9 spheroid, 10 bulge
+    "luminosity_class": (1.0, 7.0),  # Besancon model: 1-3 giants, 4 5 7 main sequence, 6 white dwarfs
 }  # fmt: skip
 _REQUIRED_KEYS = (("ra", "l"), ("dec", "b"), ("mag_h", "mag_h_seen"), ("teff", "log_teff"))
 _COMPONENT = np.array([0] * 8 + [1, 2, 5])
 _STAGE = np.array([0, 1, 1, 1, 0, 0, 2, 0])
 _LONGEST_LINE = 100_000
-# Lines before that of the titles: what a model of the Galaxy was run with.
+# Largest number of lines before the column names; models write their settings there.
 _MAX_HEADER_LINES = 10_000
 KIND = "catalogue of stars"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarCatalogue:
-    """n stars by cell and position: index (order-29), and the values by key (deg, mag, K, pc) that the file has."""
+    """Stars sorted by cell and position: order-29 index, and values by key (deg, mag, K, pc) that the file contains."""
 
     index: Int
     values: Mapping[str, Array]
 
 
 def check_columns(columns: Mapping[str, str]) -> None:
-    """Refuse a mapping of our keys to titles that does not say enough."""
+    """Raise BadInput if a mapping of our keys to column names is not complete."""
     for key in columns:
         if key not in KEYS:
             raise BadInput(f"stars.catalogue.columns.{key} is not one of {', '.join(KEYS)}")
     for alternatives in _REQUIRED_KEYS:
         if sum(key in columns for key in alternatives) != 1:
-            raise BadInput(f"stars.catalogue.columns wants one of {' and '.join(alternatives)}")
+            raise BadInput(f"stars.catalogue.columns must have one of {' and '.join(alternatives)}")
     if ("ra" in columns) != ("dec" in columns):
-        raise BadInput("stars.catalogue.columns wants ra and dec, or l and b")
+        raise BadInput("stars.catalogue.columns must have ra and dec, or l and b")
     if "mag_h_seen" in columns and "a_v" not in columns:
-        raise BadInput("stars.catalogue.columns: mag_h_seen wants a_v beside it")
+        raise BadInput("stars.catalogue.columns: mag_h_seen requires a_v")
 
 
 def load(file: Path, sha256: str, columns: Mapping[str, str]) -> StarCatalogue:
-    """The stars of a file; from the cache or read now.
+    """Return the stars of a file, from the cache or read now.
 
-    columns : key -> title in the file
-    Errors  : BadInput names the file, the column and the first row of what is missing or out of bounds, and how many
+    Parameters
+    ----------
+    file : Path
+        File of the catalogue.
+    sha256 : str
+        SHA-256 of the file.
+    columns : mapping of str to str
+        Column name in the file by key.
+
+    Returns
+    -------
+    StarCatalogue
+        The stars.
+
+    Raises
+    ------
+    BadInput
+        If a value is missing or out of bounds. The message names the file, the column and the first such row, and gives
+        their number.
     """
     key = content_key(code_key(__name__), sha256, canonical(dict(columns)))
     arrays = cached_arrays("star_catalogue", key, lambda: _read(file, columns))
@@ -90,20 +104,14 @@ def load(file: Path, sha256: str, columns: Mapping[str, str]) -> StarCatalogue:
 
 
 def star_counts(stars: StarCatalogue, cells: npt.ArrayLike) -> Float:
-    """Stars[n] of order-8 cells.
-
-    cells : int[n] nested
-    """
+    """Return the number of stars in order-8 cells (nested indices)."""
     edges = np.stack([np.asarray(cells, np.int64), np.asarray(cells, np.int64) + 1])
     first, last = np.searchsorted(stars.index, edges << 2 * (sky.MAX_ORDER - GENERATION_ORDER))
     return np.asarray(last - first, float)
 
 
 def stars_of_cell(stars: StarCatalogue, cell: int) -> dict[str, Array]:
-    """The values of an order-8 cell's stars, with `index`.
-
-    returns : [n] each, in the units of `load`
-    """
+    """Return the values of the stars in an order-8 cell by key, in the units of `load`, with `index`."""
     rows = slice(*np.searchsorted(stars.index, sky.cell_range(GENERATION_ORDER, cell)))
     return {"index": stars.index[rows], **{name: values[rows] for name, values in stars.values.items()}}
 
@@ -157,9 +165,9 @@ def _read_text(file: Path, titles: list[str]) -> Mapping[str, Float]:
             [],
         )
         if not head:
-            raise BadInput(f"{file}: none of the first {_MAX_HEADER_LINES} lines holds the titles {', '.join(titles)}")
+            raise BadInput(f"{file}: none of the first {_MAX_HEADER_LINES} lines has the columns {', '.join(titles)}")
         if duplicates := [title for title in titles if head.count(title) > 1]:
-            raise BadInput(f"{file}: the title {duplicates[0]} stands twice in its line")
+            raise BadInput(f"{file}: the column name {duplicates[0]} must not occur twice")
         values = {title: array("d") for title in titles}
         for line in lines:
             fields = _split_line(line)
@@ -178,4 +186,4 @@ def _parse_number(file: Path, title: str, text: str, row: int) -> float:
     try:
         return float(text)
     except ValueError:
-        raise BadInput(f"{file}: {title} of row {row} is {text[:40]!r}, no number") from None
+        raise BadInput(f"{file}: {title} of row {row} is {text[:40]!r}, not a number") from None

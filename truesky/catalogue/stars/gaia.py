@@ -1,13 +1,12 @@
-"""The stars as Gaia's second data release would list them: table `gaia`, row by row a function of (seed, star).
+"""Measurements of the stars by Gaia's second data release: each row of table `gaia` is a function of (seed, star).
 
-observe    stars and their fluxes in BANDS -> what Gaia measures
-astrometric_errors, proper_motion_errors, photometric_errors, completeness   at a magnitude
-mean_flux  of a magnitude as measured
-ab_minus_vega   of BANDS
+Random numbers depend on the star, so that its measurement is the same in every file. Errors are not correlated. The
+true positions and proper motions are from table `stars`, which has the epoch of DR2. The parameters and their sources
+are in gaia.toml.
 
-Random numbers are keyed by the star, so that it is measured alike in whichever file it lies; errors are not correlated.
-Positions and proper motions are those of table `stars`, which has DR2's epoch.
-Ref: Gaia Collaboration, Brown et al. 2018; the numbers and their sources are in gaia.toml.
+References
+----------
+Gaia Collaboration, Brown et al. 2018
 """
 
 from __future__ import annotations
@@ -32,15 +31,27 @@ FLUX_COLUMNS = [f"f_nu_{band}" for band in BANDS]
 _FILE = "gaia.toml"
 _MAS = 1.0 / 3.6e6
 _MAG_OVER_FLUX = 2.5 / np.log(10.0)
-# Of a star's random numbers.
+# Numbers of the random numbers of a star.
 _RA, _DEC, _PARALLAX, _G, _BP, _RP, _LISTED, _PMRA, _PMDEC, _RUWE = range(10)
 _COUNT = _RUWE + 1
 
 
 def observe(stars: pa.Table, fluxes: pa.Table, seed: int) -> pa.Table:
-    """Table `gaia` of stars, sorted by where they are measured.
+    """Draw Gaia's measurements of stars.
 
-    stars, fluxes : columns STAR_COLUMNS, FLUX_COLUMNS, row by row
+    Parameters
+    ----------
+    stars : Table
+        Rows of table `stars` with STAR_COLUMNS.
+    fluxes : Table
+        Fluxes of the same rows with FLUX_COLUMNS.
+    seed : int
+        Seed of the request.
+
+    Returns
+    -------
+    Table
+        Rows of table `gaia`, sorted by the cell of the measured position. Stars that Gaia misses have no row.
     """
     ids = stars["id"].to_numpy()
     chance = uniforms(ids, _COUNT, seed, "gaia")
@@ -59,24 +70,18 @@ def observe(stars: pa.Table, fluxes: pa.Table, seed: int) -> pa.Table:
 
 
 def ab_minus_vega() -> tuple[float, ...]:
-    """AB - Vega magnitude in each of BANDS, as Gaia defines them; 0.04 mag from what Vega's spectrum gives."""
+    """Return AB - Vega magnitude in each of BANDS as defined by Gaia, 0.04 mag from the values of Vega's spectrum."""
     return tuple(parameters.section(_FILE, "zero_points")["ab_minus_vega"])
 
 
 def completeness(g: npt.ArrayLike) -> Float:
-    """Part of the stars[n] of a magnitude G (Vega) that is listed.
-
-    g : float[n] mag, Vega
-    """
+    """Return the fraction of stars of each G magnitude (Vega) that is in the catalogue."""
     law = parameters.section(_FILE, "completeness")
     return np.asarray(0.5 * erfc((np.asarray(g, float) - law["half"]) / (np.sqrt(2.0) * law["width"])))
 
 
 def astrometric_errors(g: npt.ArrayLike) -> tuple[Float, Float, Float]:
-    """Standard errors[n] of right ascension times cos(dec), declination and parallax, mas, at G (Vega).
-
-    g : float[n] mag, Vega
-    """
+    """Return the standard errors of right ascension times cos(dec), declination and parallax (mas) at each G (Vega)."""
     law = parameters.section(_FILE, "astrometry")
     z = 10.0 ** (0.4 * (np.maximum(np.asarray(g, float), law["bright"]) - 15.0))
     parallax = 1e-3 * law["scale"] * np.sqrt(law["c0"] + law["c1"] * z + law["c2"] * z**2)
@@ -85,22 +90,19 @@ def astrometric_errors(g: npt.ArrayLike) -> tuple[Float, Float, Float]:
 
 
 def proper_motion_errors(g: npt.ArrayLike) -> tuple[Float, Float]:
-    """Standard errors[n] of the proper motions in right ascension times cos(dec) and declination, mas/yr, at G (Vega).
-
-    g : float[n] mag, Vega
-    """
+    """Return the standard errors of pmra (times cos(dec)) and pmdec, mas/yr, at each G magnitude (Vega)."""
     law, (_, _, parallax) = parameters.section(_FILE, "proper_motion"), astrometric_errors(g)
     return law["ra"] * parallax, law["dec"] * parallax
 
 
 def mean_flux(mag: npt.ArrayLike, band: int) -> Float:
-    """Electrons per second of magnitudes[n] (Vega) in G, BP or RP, by number in BANDS."""
+    """Return the flux in electrons per second of magnitudes (Vega) in a band, given by its number in BANDS."""
     zero = parameters.section(_FILE, "flux_zero_points")["vega"][band]
     return np.asarray(10.0 ** (0.4 * (zero - np.asarray(mag, float))))
 
 
 def photometric_errors(mag: npt.ArrayLike, kind: str) -> Float:
-    """Standard error[n], mag, at a magnitude (Vega) in its own band; kind: "g", or "xp" for BP and RP."""
+    """Return the standard errors (mag) at magnitudes (Vega) of the same band; `kind` is "g", or "xp" for BP and RP."""
     law = parameters.section(_FILE, "photometry")
     nodes, error = np.array(law[kind]), np.log(law[f"{kind}_error"])
     slope = np.diff(error) / np.diff(nodes)
@@ -129,7 +131,7 @@ def _astrometry(stars: pa.Table, g: Float, noise: Float) -> dict[str, Any]:
 
 
 def _motion(stars: pa.Table, g: Float, noise: Float) -> dict[str, Any]:
-    """Of stars that have none nothing is known."""
+    """Return proper motions and their errors, masked for stars without them."""
     true = [np.asarray(pc.fill_null(stars[name], np.nan).to_numpy(), float) for name in ("pm_ra", "pm_dec")]
     errors, columns = proper_motion_errors(g), {}
     for name, value, error, deviate in zip(("pmra", "pmdec"), true, errors, noise[_PMRA : _PMDEC + 1], strict=True):
@@ -144,7 +146,7 @@ def _ruwe(chance: Float) -> Float:
 
 
 def _photometry(short: str, true_ab: Float, vega: float, kind: str, noise: Float) -> dict[str, Any]:
-    """The flux is what has a normal error: a faint star's may come out negative, and has no magnitude then."""
+    """Return the columns of a band. The flux has a normal error; if it is negative, the magnitude is masked."""
     error = photometric_errors(true_ab - vega, kind) / _MAG_OVER_FLUX
     flux = 1.0 + error * noise
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -1,12 +1,8 @@
-"""Isochrones: mass, luminosity and temperature along evolutionary phases, as a fit to published ones.
+"""Isochrones: mass, luminosity and temperature along evolutionary phases, from a fit to published isochrones.
 
-isochrones    those of given ages and metallicities, at the same points of evolution
-FIXED         initial masses of the first points, Msun;  AGES  log10 of the ages, yr, at the fit's knots
-UPPER, PHASES fractions of the upper main sequence, and the equivalent evolutionary points after it
-
-Of each point log L, log Teff, and of those from the end of the main sequence on the initial mass, are quartics in [M/H]
-whose coefficients are linear in log age between knots (isochrones.csv, where sources and residuals stand; made by
-scripts/fit_isochrones.py).
+log L and log Teff of each point, and the initial mass of points from the end of the main sequence on, are quartic
+polynomials in [M/H] whose coefficients are linear in log age between knots. The coefficients, their sources and the
+residuals are in isochrones.csv, which is made by scripts/fit_isochrones.py.
 """
 
 from __future__ import annotations
@@ -22,19 +18,20 @@ import numpy.typing as npt
 from lake_schema.arrays import Float, Int
 
 TABLE = Path(__file__).with_name("isochrones.csv")
-# Main sequence: these masses, and from the last of them fractions of the logarithm up to the mass that leaves it.
+# Points of the main sequence: fixed initial masses (Msun), then fractions of the logarithm from the last of them up to
+# the turn-off mass.
 FIXED_MASSES = (0.5, 0.6)
 UPPER_FRACTIONS = (0.2, 0.4, 0.55, 0.68, 0.78, 0.86, 0.91, 0.94, 0.96, 0.98, 1.0)
-# Ends of the main sequence (454), of the red giant branch (605), start and end of core helium burning (631, 707), the
-# first thermal pulse (808), and points between.  Ref: Dotter 2016, ApJS 222, 8, Table 2
+# Equivalent evolutionary points (Dotter 2016, ApJS 222, 8, Table 2): ends of the main sequence (454) and of the red
+# giant branch (605), start and end of core helium burning (631, 707), the first thermal pulse (808), and between.
 PHASES = (
     454, 462, 470, 480, 490, 500, 510, 522, 535, 550, 565, 580, 592, 600, 605, 631, 650, 670, 690, 707, 730, 760, 790,
     808,
 )  # fmt: skip
-# After which point nothing is found before the next: the helium flash.
+# Point before the helium flash; there are no stars between it and the next point.
 FLASH = PHASES.index(605)
 AGES = (7.8, 8.2, 8.5, 8.75, 8.9, 9.0, 9.1, 9.2, 9.4, 9.6, 9.8, 10.0, 10.2)
-# Younger than 1 Gyr, the fit reaches down to the second of these.
+# Ends of the fit in [M/H]; below 1 Gyr, the lower end is the second value.
 METALLICITIES = (-2.5, -0.75, 0.5)
 _YOUNG = 9.0
 DEGREE = 4
@@ -44,12 +41,26 @@ _SUN_TEFF, _SUN_LOG_G = 5772.0, 4.438
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Isochrones:
-    """k isochrones at p points, from the lightest mass on; ages Gyr, [M/H].
+    """Isochrones in the order of increasing initial mass.
 
-    age, metallicity : [k];  mass : [k, p] initial, Msun, ascending
-    log_l, log_teff, log_g : [k, p] Lsun, K, cm s-2
+    Attributes
+    ----------
+    age : float array, shape (k,)
+        Age, Gyr.
+    metallicity : float array, shape (k,)
+        [M/H].
+    mass : float array, shape (k, p)
+        Initial mass, Msun, ascending.
+    log_l : float array, shape (k, p)
+        log10 L / Lsun.
+    log_teff : float array, shape (k, p)
+        log10 Teff / K.
+    log_g : float array, shape (k, p)
+        log10 of the surface gravity, cm s-2.
 
-    Error: log g is that of the initial mass; a tenth of it is lost on the red giant branch
+    Notes
+    -----
+    log_g uses the initial mass, but a tenth of it is lost on the red giant branch.
     """
 
     age: Float
@@ -61,13 +72,16 @@ class Isochrones:
 
     @property
     def main_sequence(self) -> int:
-        """Number of points on the main sequence."""
+        """Return the number of points on the main sequence."""
         return len(FIXED_MASSES) + len(UPPER_FRACTIONS)
 
 
 @lru_cache(maxsize=1)
 def coefficients() -> dict[str, Float]:
-    """[point, age, power of [M/H]] of quantities `log_l`, `log_teff`, `mass`; NaN where the mass is known."""
+    """Return the coefficients of `log_l`, `log_teff` and `mass`, shape (points, ages, powers of [M/H]).
+
+    Coefficients of `mass` are NaN for points with a known mass.
+    """
     with TABLE.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
     names = ("log_l", "log_teff", "mass")
@@ -79,12 +93,12 @@ def coefficients() -> dict[str, Float]:
 
 
 def point_count() -> int:
-    """Of an isochrone."""
+    """Return the number of points of an isochrone."""
     return len(FIXED_MASSES) + len(UPPER_FRACTIONS) + len(PHASES) - 1
 
 
 def isochrones(age: npt.ArrayLike, metallicity: npt.ArrayLike) -> Isochrones:
-    """Of ages[k] Gyr and metallicities[k]; both are taken to the nearest ends of the fit."""
+    """Return the isochrones of ages (Gyr) and metallicities, which are limited to the range of the fit."""
     ages, requested_metallicity = np.asarray(age, float), np.asarray(metallicity, float)
     log_age = np.log10(ages) + 9.0
     metals = np.clip(requested_metallicity, min_metallicity(log_age), METALLICITIES[-1])
@@ -96,8 +110,10 @@ def isochrones(age: npt.ArrayLike, metallicity: npt.ArrayLike) -> Isochrones:
 
 
 def initial_masses(fitted: Float) -> Float:
-    """Initial masses [k, p], Msun, from what is fitted of them: log10 of the one that leaves the main sequence, and
-    of its multiples by which the masses of later points differ from the points before.
+    """Return initial masses (Msun), shape (k, p), from the fitted quantities.
+
+    The fit gives log10 of the turn-off mass, and for each later point log10 of its difference from the previous point
+    in units of the turn-off mass.
     """
     first = len(FIXED_MASSES) + len(UPPER_FRACTIONS) - 1
     turnoff_mass = 10.0 ** fitted[:, first]
@@ -111,12 +127,12 @@ def initial_masses(fitted: Float) -> Float:
 
 
 def min_metallicity(log_age: Float) -> Float:
-    """[M/H] down to which the fit reaches at log10 of ages, yr."""
+    """Return the lowest [M/H] of the fit at log10 of ages in yr."""
     return np.where(log_age < _YOUNG, METALLICITIES[1], METALLICITIES[0])
 
 
 def bracket_age(log_age: Float) -> tuple[Int, Float]:
-    """(knot before, share of the one after) of log10 of ages, yr."""
+    """Return the knot before each log10 of an age in yr, and the weight of the knot after it."""
     at = np.clip(log_age, AGES[0], AGES[-1])
     lower_knot = np.clip(np.searchsorted(AGES, at, side="right") - 1, 0, len(AGES) - 2)
     low, high = np.array(AGES)[lower_knot], np.array(AGES)[lower_knot + 1]

@@ -1,12 +1,13 @@
-"""Velocities of the Milky Way's stars, drawn from the ellipsoid of each population and age.
+"""Velocities of the Milky Way's stars, drawn from the velocity ellipsoid of each population and age.
 
-velocities   proper motions, mas/yr, and radial velocities, km/s, of stars at their places and distances
-ellipsoid    which of the ellipsoids is a star's
+A star moves with the mean rotation of its population around the Galactic centre. A normal deviate along each axis of
+the ellipsoid is added, and the motion of the Sun is subtracted. The ellipsoids point to the centre. Ellipsoids of discs
+are larger closer to the centre, where the lag of discs is also larger. The parameters and their sources are in
+kinematics.toml.
 
-Every star moves with its population's mean rotation about the Galactic centre, plus a normal deviate along each axis of
-the ellipsoid, as seen from the moving Sun. The ellipsoids point to the centre; those of discs are larger nearer to it,
-and lag behind the more.
-Ref: Robin et al. 2003, Section 2.2.5; the numbers and their sources are in kinematics.toml.
+References
+----------
+Robin et al. 2003, Section 2.2.5
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from truesky.catalogue import parameters
 from truesky.numerics.compiling import exact_jit
 
 _FILE = "kinematics.toml"
-# One AU a year, km/s: what 1 mas/yr is at 1 kpc (IAU 2012 astronomical unit, Julian year).
+# One AU per year in km/s, the velocity of 1 mas/yr at 1 kpc (IAU 2012 astronomical unit, Julian year).
 _KM_S = 4.740470463533349
 _THIN = 0
 
@@ -30,12 +31,27 @@ _THIN = 0
 def velocities(
     ra: Float, dec: Float, distance: Float, component: Int, age: Float, deviates: Float
 ) -> tuple[Float, Float, Float]:
-    """(mu_ra cos(dec), mu_dec, v_r), float64[n] mas/yr, mas/yr, km/s; NaN where the distance is.
+    """Return proper motions and radial velocities of stars.
 
-    ra, dec   : float64[n] deg, ICRS
-    distance  : float64[n] pc, > 0
-    component : int[n] population, as in table `stars`;  age : float64[n] Gyr, NaN = unknown
-    deviates  : float64[3, n] standard normal
+    Parameters
+    ----------
+    ra, dec : float array, shape (n,)
+        ICRS position, deg.
+    distance : float array, shape (n,)
+        Distance, pc, > 0.
+    component : int array, shape (n,)
+        Population, with the codes of table `stars`.
+    age : float array, shape (n,)
+        Age, Gyr, NaN if unknown.
+    deviates : float array, shape (3, n)
+        Standard normal deviates.
+
+    Returns
+    -------
+    pm_ra, pm_dec : float array, shape (n,)
+        mu_ra cos(dec) and mu_dec, mas/yr; NaN if the distance is NaN.
+    radial_velocity : float array, shape (n,)
+        Radial velocity, km/s; NaN if the distance is NaN.
     """
     table, motion, _, gradient = _numbers()
     out = np.empty((3, ra.size))
@@ -47,7 +63,7 @@ def velocities(
 
 
 def ellipsoid_index(component: Int, age: Float) -> Int:
-    """Column[n] of the table: of the thin disc by age, the others behind, in the order of their codes."""
+    """Return the column of each star's ellipsoid: thin disc by age (Gyr), then components by code."""
     edges = _numbers()[2]
     with np.errstate(invalid="ignore"):
         by_age = np.clip(np.searchsorted(edges, age, side="right") - 1, 0, edges.size - 2)
@@ -55,13 +71,13 @@ def ellipsoid_index(component: Int, age: Float) -> Int:
 
 
 def sun_motion() -> Float:
-    """[3] km/s beside the circular velocity: towards the centre, along the rotation, towards the pole."""
+    """Return the Sun's peculiar velocity (km/s) towards the centre, along the rotation and towards the pole."""
     return _numbers()[1][:3]
 
 
 @lru_cache(maxsize=1)
 def _numbers() -> tuple[Float, Float, Float, float]:
-    """Table [6, ellipsoid]; the Sun's motion, radius and circular velocity; edges of ages; gradient, pc^-1."""
+    """Table (6, ellipsoids); the Sun's motion, radius and circular velocity; edges of ages; gradient, pc^-1."""
     law, sun = parameters.section(_FILE, "ellipsoids"), parameters.section(_FILE, "sun")
     names = ("towards_centre", "along_rotation", "towards_pole", "lag", "grows", "turns_from")
     motion = np.array([*sun["motion"], sun["radius"], sun["circular"]], float)
@@ -73,17 +89,17 @@ def _velocities(
     ra: Float, dec: Float, distance: Float, ellipsoids: Int, deviates: Float, table: Float, motion: Float, turn: Float,
     gradient: float, out: Float,
 ) -> None:  # fmt: skip
-    """Fills out[3, n]; table [6, ellipsoid], motion (U, V, W, R, V_c), turn [3, 3] equatorial to Galactic."""
+    """Fill out (3, n); table (6, ellipsoids), motion (U, V, W, R, V_c), turn (3, 3) from equatorial to Galactic."""
     axis = np.empty((3, 3))
     for i in range(ra.size):
         a, d, distance_pc = math.radians(ra[i]), math.radians(dec[i]), distance[i]
         sin_a, cos_a, sin_d, cos_d = math.sin(a), math.cos(a), math.sin(d), math.cos(d)
-        # East, north, outwards; along the Sun's axes to the centre, the rotation, the pole.
+        # East, north and outward directions in the Sun's axes: to the centre, along the rotation, to the pole.
         for k in range(3):
             axis[0, k] = -turn[k, 0] * sin_a + turn[k, 1] * cos_a
             axis[1, k] = (-turn[k, 0] * cos_a - turn[k, 1] * sin_a) * sin_d + turn[k, 2] * cos_d
             axis[2, k] = (turn[k, 0] * cos_a + turn[k, 1] * sin_a) * cos_d + turn[k, 2] * sin_d
-        # From the centre to the star: what turns the axes at the Sun into those at the star.
+        # Position relative to the centre, which rotates the axes at the Sun into the axes at the star.
         x, y = distance_pc * axis[2, 0] - motion[3], distance_pc * axis[2, 1]
         radius = max(math.sqrt(x * x + y * y), 1.0)
         w = ellipsoids[i]

@@ -1,12 +1,7 @@
-"""The Milky Way's stars: how many there are along a line of sight, and draws of them.
+"""Stars of the Milky Way: expected numbers along lines of sight, and draws of them.
 
-milky_way       the components, by one of the models MODELS, and their stars
-numbers         stars of many cells
-expected        stars of a cell in every (component, shell of distance, bin of M_H)
-draw            Poisson sample of it
-
-A component's stars are stretches of isochrones, of its ages and metallicities, and white dwarfs.  The numbers and their
-sources are in milky_way.toml.
+The stars of a component are on stretches of isochrones of its ages and metallicities, or are white dwarfs. The
+parameters and their sources are in milky_way.toml.
 """
 
 from __future__ import annotations
@@ -40,16 +35,25 @@ MODELS = ("juric", "besancon")
 THIN, THICK, HALO, BULGE = 0, 1, 2, 5
 _FILE = "milky_way.toml"
 _SR_PER_DEG2 = np.radians(1.0) ** 2
-# So that the shells of all of them take 20 MB.
+# Number of cells per batch; its shells take 20 MB.
 _CELLS_AT_A_TIME = 1024
 
 
 @dataclass(frozen=True, slots=True)
 class Component:
-    """A law of density and its stars.
+    """Density law and stars of a component.
 
-    share      : in the systems below a solar mass at the Sun; of the bulge, at the centre, in units of all of these
-    code       : THIN, THICK, HALO or BULGE;  population : ages and metallicities
+    Attributes
+    ----------
+    law : Law
+        Density law.
+    share : float
+        Fraction of the systems below a solar mass at the Sun. For the bulge, the density at its centre in units of the
+        total density at the Sun.
+    code : int
+        THIN, THICK, HALO or BULGE.
+    population : Population
+        Ages and metallicities.
     """
 
     law: Law
@@ -60,15 +64,34 @@ class Component:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MilkyWay:
-    """Everything that stars are drawn from, made once by `milky_way`.
+    """Tables from which stars are drawn, made once by `milky_way`.
 
-    tracks     : isochrones of all components;  component_width : [k] of each one's cell in [M/H]
-    limits     : of [M/H]
-    distance   : [s + 1] pc, edges of the shells; m_h : [b + 1] mag, edges of the bins
-    pieces     : stretches of isochrones, those of each component by bin
-    first      : [c, b + 1] which of them are in a bin;  below : [n + 1] pc^-3, numbers of those before
-    local      : [c, b] pc^-3 where the law of density is 1: single stars and primaries
-    companions : [c, b] pc^-3 the same of companions
+    Attributes
+    ----------
+    sun : Sun
+        Position of the Sun.
+    components : tuple of Component
+        Components.
+    tracks : Tracks
+        k isochrones of all components.
+    width : float array, shape (k,)
+        Width of the cell in [M/H] of each isochrone.
+    limits : tuple of float
+        Limits of [M/H].
+    distance : float array, shape (s + 1,)
+        Edges of the shells, pc.
+    m_h : float array, shape (b + 1,)
+        Edges of the bins of M_H, mag.
+    pieces : Pieces
+        n stretches of isochrones, sorted by component, then by bin.
+    first : int array, shape (c, b + 1)
+        First stretch of each bin.
+    cumulative : float array, shape (n + 1,)
+        Cumulative density of the stretches, pc^-3.
+    local : float array, shape (c, b)
+        Density of single stars and primaries for a density law of 1, pc^-3.
+    companions : float array, shape (c, b)
+        Density of companions for a density law of 1, pc^-3.
     """
 
     sun: Sun
@@ -87,10 +110,30 @@ class MilkyWay:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sample:
-    """n stars: component THIN, .., stage stellar_populations.DWARF, .., track among the isochrones (-1 = none).
+    """Drawn stars.
 
-    distance pc, m_h mag (Vega), mass Msun at birth (NaN of white dwarfs), teff K, log_g cm s-2, metallicity [M/H], age
-    Gyr (NaN of white dwarfs)
+    Attributes
+    ----------
+    component : int array, shape (n,)
+        THIN, THICK, HALO or BULGE.
+    stage : int array, shape (n,)
+        Stage of stellar_populations, for example DWARF.
+    track : int array, shape (n,)
+        Index of the isochrone, -1 for white dwarfs.
+    distance : float array, shape (n,)
+        Distance, pc.
+    m_h : float array, shape (n,)
+        Absolute H magnitude (Vega).
+    mass : float array, shape (n,)
+        Mass at birth, Msun, NaN for white dwarfs.
+    teff : float array, shape (n,)
+        Temperature, K.
+    log_g : float array, shape (n,)
+        log10 of the surface gravity, cm s-2.
+    metallicity : float array, shape (n,)
+        [M/H].
+    age : float array, shape (n,)
+        Age, Gyr, NaN for white dwarfs.
     """
 
     component: Int
@@ -107,7 +150,7 @@ class Sample:
 
 @cache
 def milky_way(model: str = "juric") -> MilkyWay:
-    """The Milky Way of the embedded universe: numbers read, tables made (0.2 s), once."""
+    """Return the Milky Way of one of MODELS; reads the parameters and makes the tables (0.2 s) once."""
     sampling = parameters.section(_FILE, "sampling")
     sun, components = _juric() if model == "juric" else _besancon()
     masses = MassFunction(**parameters.section(_FILE, "mass_function"))
@@ -116,7 +159,7 @@ def milky_way(model: str = "juric") -> MilkyWay:
     m_h = sampling["brightest"] + sampling["bin_mag"] * np.arange(sampling["bins"] + 1)
     owner = np.repeat(np.arange(len(components)), [c.population.age.size for c in components])
     pieces = stellar_populations.build_pieces(tracks, population_cells.share, masses, m_h)
-    # As many systems live below a solar mass as are counted near the Sun.
+    # Scale to the observed density of systems below a solar mass near the Sun.
     piece_owner = owner[pieces.track]
     share = np.array([component.share for component in components])
     living = np.bincount(
@@ -171,7 +214,7 @@ def _populations(model: str) -> dict[str, Any]:
 
 
 def _thin(numbers: dict[str, Any], bins: slice) -> Population:
-    """Born at a constant rate over some of the bins of age."""
+    """Population with a constant birth rate over a slice of the age bins."""
     law = parameters.section(_FILE, "metallicity")
     edges, parts = np.array(law["thin_age"]), np.array(law["thin_parts"])
     ages, shares, bin_of_age = [], [], []
@@ -185,14 +228,14 @@ def _thin(numbers: dict[str, Any], bins: slice) -> Population:
 
 
 def _single_age(numbers: dict[str, Any], name: str) -> Population:
-    """Of one age."""
+    """Population of a single age."""
     law = parameters.section(_FILE, "metallicity")
     age, mean, scatter = (np.array([numbers[f"{name}_{quantity}"]]) for quantity in ("age", "metallicity", "scatter"))
     return stellar_populations.build_population(age, np.ones(1), mean, scatter, law["old_cells"])
 
 
 def _bulge() -> Component:
-    """Ref: Robin et al. 2012"""
+    """Bulge of Robin et al. 2012."""
     number: dict[str, Any] = parameters.section(_FILE, "bulge")
     masses = MassFunction(**parameters.section(_FILE, "mass_function"))
     share = number["central_density"] * number["systems_per_mass"] / masses.local
@@ -201,7 +244,7 @@ def _bulge() -> Component:
 
 
 def _juric() -> tuple[Sun, tuple[Component, ...]]:
-    """Ref: Juric et al. 2008"""
+    """Components of Juric et al. 2008."""
     number: dict[str, Any] = parameters.section(_FILE, "juric")
     born = _populations("juric")
     thin = Exponential(number["thin_length"], number["thin_height"])
@@ -219,7 +262,7 @@ def _juric() -> tuple[Sun, tuple[Component, ...]]:
 
 
 def _besancon() -> tuple[Sun, tuple[Component, ...]]:
-    """Ref: Robin et al. 2003"""
+    """Components of Robin et al. 2003."""
     number: dict[str, Any] = parameters.section(_FILE, "besancon")
     born = _populations("besancon")
     flattening = number["thin_flattening"]
@@ -241,10 +284,23 @@ def _besancon() -> tuple[Sun, tuple[Component, ...]]:
 def cylindrical(
     galaxy: MilkyWay, lon: npt.ArrayLike, lat: npt.ArrayLike, distance: Float
 ) -> tuple[Float, Float, Float]:
-    """Galactocentric R, z pc, azimuth rad at heliocentric distances along Galactic (l, b) deg, all of them broadcast.
+    """Return Galactocentric cylindrical coordinates of positions along lines of sight.
 
-    lon, lat : float[...] deg;  distance : float[...] pc
-    galaxy   : where the Sun is in it
+    Parameters
+    ----------
+    galaxy : MilkyWay
+        The Milky Way with the position of the Sun.
+    lon, lat : float array
+        Galactic coordinates, deg.
+    distance : float array
+        Heliocentric distance, pc; broadcast against `lon` and `lat`.
+
+    Returns
+    -------
+    radius, height : float array
+        R and z, pc.
+    azimuth : float array
+        Azimuth, rad.
     """
     l_rad, b_rad = np.radians(lon), np.radians(lat)
     across = distance * np.cos(b_rad)
@@ -253,10 +309,23 @@ def cylindrical(
 
 
 def expected_counts(galaxy: MilkyWay, lon: Float, lat: Float, area: float, h_limit: Float) -> Float:
-    """Stars[n] of cells before their dust: the sum of `expected` of each, and of their companions.
+    """Return the expected number of stars and companions in cells, before extinction.
 
-    lon, lat : [n] Galactic, of the cells' centres, deg; area : of one of them, deg2; h_limit : [n]
-    galaxy   : components, their populations and laws
+    Parameters
+    ----------
+    galaxy : MilkyWay
+        The Milky Way.
+    lon, lat : float array, shape (n,)
+        Galactic coordinates of the cells' centres, deg.
+    area : float
+        Area of a cell, deg2.
+    h_limit : float array, shape (n,)
+        Faintest H magnitude (Vega).
+
+    Returns
+    -------
+    float array, shape (n,)
+        Expected number.
     """
     total, local = np.zeros(lon.size), galaxy.local + galaxy.companions
     for limit in np.unique(h_limit):
@@ -272,10 +341,23 @@ def expected_counts(galaxy: MilkyWay, lon: Float, lat: Float, area: float, h_lim
 
 
 def expected_per_bin(galaxy: MilkyWay, lon: float, lat: float, area: float, h_limit: float) -> Float:
-    """Single stars and primaries of a cell in every (component, shell, bin), [c, s, b]; 0 where all are too faint.
+    """Return the expected number of single stars and primaries in a cell by component, shell and bin of M_H.
 
-    lon, lat : Galactic, of the cell's centre, deg; area : deg2
-    galaxy   : components, their populations and laws;  h_limit : mag, Vega
+    Parameters
+    ----------
+    galaxy : MilkyWay
+        The Milky Way.
+    lon, lat : float
+        Galactic coordinates of the cell's centre, deg.
+    area : float
+        Area of the cell, deg2.
+    h_limit : float
+        Faintest H magnitude (Vega).
+
+    Returns
+    -------
+    float array, shape (c, s, b)
+        Expected number, 0 if all stars are too faint.
     """
     r, z, azimuth = cylindrical(galaxy, lon, lat, shell_distances(galaxy))
     relative = np.stack([density(component.law, galaxy.sun, r, z, azimuth) for component in galaxy.components])
@@ -284,34 +366,46 @@ def expected_per_bin(galaxy: MilkyWay, lon: float, lat: float, area: float, h_li
 
 
 def shell_distances(galaxy: MilkyWay) -> Float:
-    """Where in a shell its density is taken, [s] pc."""
+    """Return the distance at which the density of each shell is computed, pc."""
     return np.asarray(np.sqrt(galaxy.distance[:-1] * galaxy.distance[1:]))
 
 
 def shell_volumes(galaxy: MilkyWay, area: float) -> Float:
-    """Of the shells within an area, deg2, [s] pc^3."""
+    """Return the volume of the shells within an area (deg2), pc^3."""
     inner, outer = galaxy.distance[:-1], galaxy.distance[1:]
     return np.asarray(area * _SR_PER_DEG2 * (outer - inner) * (outer**2 + outer * inner + inner**2) / 3.0)
 
 
 def _may_be_visible(galaxy: MilkyWay, h_limit: float) -> Bool:
-    """[s, b] whether a star of the bin may be brighter than the limit in the shell."""
+    """True if a star of the bin may be brighter than the limit in the shell, shape (s, b)."""
     return np.asarray(galaxy.m_h[None, :-1] + 5.0 * np.log10(galaxy.distance[:-1, None]) - 5.0 < h_limit)
 
 
 def draw(galaxy: MilkyWay, mean: Float, rng: np.random.Generator, labels: np.random.Generator) -> Sample:
-    """Poisson sample of `expected` numbers; uniform in volume within a shell, on its stretch of an isochrone.
+    """Draw a Poisson sample of the expected stars, uniform in volume within a shell and along stretches of isochrones.
 
-    galaxy, rng : what is drawn from, of numbers, distances and magnitudes
-    mean        : float[c, s, b]
-    labels      : of metallicities within their cells
+    Parameters
+    ----------
+    galaxy : MilkyWay
+        The Milky Way.
+    mean : float array, shape (c, s, b)
+        Expected numbers, from `expected_per_bin`.
+    rng : Generator
+        Random numbers of counts, distances and magnitudes.
+    labels : Generator
+        Random numbers of metallicities within their cells.
+
+    Returns
+    -------
+    Sample
+        The stars.
     """
     drawn = _draw_boxes(mean, rng)
     owner, shell, m_bin = np.unravel_index(drawn, mean.shape)
     distance = _draw_distance(galaxy, shell, rng)
     first, last = galaxy.cumulative[galaxy.first[owner, m_bin]], galaxy.cumulative[galaxy.first[owner, m_bin + 1]]
     piece = np.searchsorted(galaxy.cumulative, first + (last - first) * rng.random(drawn.size), side="right") - 1
-    # The product may round up to the end itself.
+    # The product may round up to the end of the interval.
     piece = np.clip(piece, galaxy.first[owner, m_bin], galaxy.first[owner, m_bin + 1] - 1)
     pieces, along = galaxy.pieces, rng.random(drawn.size)
 
@@ -338,21 +432,35 @@ def draw(galaxy: MilkyWay, mean: Float, rng: np.random.Generator, labels: np.ran
 
 
 def draw_in_shells(galaxy: MilkyWay, mean: Float, rng: np.random.Generator) -> tuple[Int, Float]:
-    """Poisson sample of expected numbers [k, s] of k kinds: kind[n], distance[n] pc, uniform in volume in a shell.
+    """Draw a Poisson sample of several kinds of object, uniform in volume within a shell.
 
-    mean : float[k, s]
+    Parameters
+    ----------
+    galaxy : MilkyWay
+        The Milky Way with the shells.
+    mean : float array, shape (k, s)
+        Expected number of each kind in each shell.
+    rng : Generator
+        Random numbers.
+
+    Returns
+    -------
+    kind : int array, shape (n,)
+        Kind of each object.
+    distance : float array, shape (n,)
+        Distance, pc.
     """
     kind, shell = np.unravel_index(_draw_boxes(mean, rng), mean.shape)
     return np.asarray(kind), _draw_distance(galaxy, shell, rng)
 
 
 def _draw_boxes(mean: Float, rng: np.random.Generator) -> Int:
-    """Flat index[n] of the box that each of a Poisson number of draws falls into."""
+    """Draw a Poisson number of objects and return the flat index of the box of each."""
     boxes = np.flatnonzero(mean)
     cumulative = np.cumsum(mean.ravel()[boxes])
     total = float(cumulative[-1]) if boxes.size else 0.0
     n = int(rng.poisson(total))
-    # The product may round up to the total itself.
+    # The product may round up to the total.
     return boxes[np.minimum(np.searchsorted(cumulative, rng.random(n) * total, side="right"), max(boxes.size - 1, 0))]
 
 

@@ -1,11 +1,8 @@
-"""Stars of one generation cell: table `stars`, a pure function of (seed, cell, model).
+"""Stars of one generation cell; table `stars` is a pure function of (seed, cell, model).
 
-model    the Milky Way or a catalogue of stars, L and T dwarfs, Tycho-2, the dust, the stellar library
-numbers  how many stars to expect, without drawing them: what can not be drawn is refused
-draw     numbers by distance and luminosity -> places -> dust on the way -> labels, spectra -> selection
-
-Four lots make a cell: the model's stars, their companions, L and T dwarfs, and, where it is given, Tycho-2 instead of
-the model's bright stars.
+A cell contains up to four groups of stars: the model's stars (or a user's catalogue), their companions, L and T dwarfs,
+and Tycho-2 stars, which replace the model's bright stars if Tycho-2 is given. Numbers by distance and luminosity are
+drawn first, then positions, extinction, labels and spectra; then stars within the magnitude limits are selected.
 """
 
 from __future__ import annotations
@@ -37,34 +34,57 @@ from truesky.fluxes.libraries.stellar import StellarTypes
 from truesky.fluxes.libraries.vega import vega_magnitude
 from truesky.randomness.rng import stream
 
-# A lot of stars of a cell: values by column, without identifiers.
+# A group of stars of a cell: values by column, without identifiers.
 Lot = dict[str, Any]
-# Galactic l, b of a cell's centre, its area, deg2, and the faintest H.
+# Galactic l and b of a cell's centre (deg), its area (deg2), and the faintest H.
 CellView = tuple[float, float, float, float]
 
 STAR = 5
 BRIGHT, BROWN = 3, 4
 _BROWN_DWARF = 3
-# A generation cell is drawn whole: 2e6 stars take 1.6 GB, and fewer than the 22 bits of an id can number.
+# Largest number of stars per generation cell, which is always drawn completely: 2e6 stars take 1.6 GB, and fit into the
+# 22 bits of an identifier.
 _MAX_STARS = 2e6
-# Nearer to the Galactic plane than so many deg, and before the bulge (|l|, |b|), cells have a limit of their own.
+# Limit of |b| for the plane, and of |l| and |b| for the bulge (deg). A separate magnitude limit applies inside
+# them.
 PLANE, BULGE = 5.0, (20.0, 10.0)
-# One AU, seen from a pc, deg.
+# One AU at a distance of one pc, deg.
 _AU_PC = 1.0 / 3600.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarModel:
-    """Everything that stars are drawn from, made once by `model`.
+    """Model from which stars are drawn, made once by `model`.
 
-    limit, plane_limit : faintest H, Vega, with the Milky Way's extinction; of cells with their centre nearer to the
-                         plane than PLANE, or inside BULGE; None = not to be drawn
-    brightest  : brighter H are left out
-    galaxy     : whose stars are drawn, unless there is a
-    catalogue  : of other stars
-    brown      : L and T dwarfs, None = none; bright : Tycho-2, None = the model's own bright stars
-    h_over_v   : A(H) / A(V); types : of the stellar library's first templates; models : index of its first model
-    v_minus_h  : [template] of the types and the models
+    Attributes
+    ----------
+    limit : float
+        Faintest H (Vega), including the Milky Way's extinction.
+    plane_limit : float or None
+        Faintest H of cells whose centre is closer to the plane than PLANE or inside BULGE; None if these cells are
+        refused.
+    brightest : float
+        Stars with a brighter H are left out.
+    galaxy : MilkyWay
+        Milky Way whose stars are drawn if there is no catalogue.
+    catalogue : StarCatalogue or None
+        The user's catalogue, which replaces the drawn stars.
+    brown_dwarfs : BrownDwarfs or None
+        L and T dwarfs; None without them.
+    bright : BrightStars or None
+        Tycho-2; None to keep the model's bright stars.
+    layer : Layer
+        Dust layer.
+    sin_b_min : float
+        Lower limit of |sin b| in the dust map.
+    h_over_v : float
+        A(H) / A(V).
+    types : StellarTypes
+        Stellar types of the library's first templates.
+    models : int
+        Index of the library's first model.
+    v_minus_h : float array
+        V - H of the types and the models, mag.
     """
 
     limit: float
@@ -91,12 +111,29 @@ def model(
     bright: BrightStars | None = None,
     brightest: float = -math.inf,
 ) -> StarModel:
-    """The embedded universe's stars with brightest <= H < limit (0.2 s).
+    """Return the model of the embedded universe's stars with brightest <= H < limit (0.2 s).
 
-    density           : one of milky_way.MODELS
-    brown_dwarf_boost : how many times denser than in nature L and T dwarfs are, 0 = not at all
-    limit, plane_limit : faintest H, mag, Vega, plane_limit in the Galactic plane; None: cells there are refused
-    catalogue, bright  : external stars in place of the drawn ones, and of those that are bright
+    Parameters
+    ----------
+    limit : float
+        Faintest H (Vega).
+    plane_limit : float, optional
+        Faintest H in the Galactic plane and the bulge; None to refuse these cells.
+    density : str
+        Model of the Milky Way, one of milky_way.MODELS.
+    brown_dwarf_boost : float
+        Ratio of the drawn to the natural density of L and T dwarfs; 0 for none.
+    catalogue : StarCatalogue, optional
+        The user's catalogue, which replaces the drawn stars.
+    bright : BrightStars, optional
+        Tycho-2 stars, which replace the bright drawn stars.
+    brightest : float
+        Brightest H (Vega).
+
+    Returns
+    -------
+    StarModel
+        The model.
     """
     types, vega = stellar.types(), [vega_magnitude(passbands.load(band)) for band in ("bessell_v", STAR_BAND)]
     return StarModel(
@@ -117,10 +154,9 @@ def model(
 
 
 def expected_counts(cells: npt.ArrayLike, universe: StarModel) -> Float:
-    """Stars to expect in order-8 cells, before their dust, float64[n] (20 us a cell).
+    """Return the expected number of stars in order-8 cells (nested indices), before extinction (20 us per cell).
 
-    cells : int[n] nested
-    Errors: BadInput where stars are not to be drawn, or are too many
+    Raises BadInput if a cell is not to be drawn, or if it has too many stars.
     """
     lon, lat = _centres(cells)
     limit = _limits(lon, lat, universe)
@@ -135,45 +171,65 @@ def expected_counts(cells: npt.ArrayLike, universe: StarModel) -> Float:
         worst = int(counts.argmax())
         key = "stars.plane_limit" if _is_crowded(lon[worst], lat[worst]) else "universe.star_limit"
         raise BadInput(
-            f"{np.sum(counts > _MAX_STARS)} of the area's cells hold more than {_MAX_STARS:.3g} stars, the one at l = "
-            f"{lon[worst]:.1f}, b = {lat[worst]:.1f} {counts[worst]:.3g} to H = {limit[worst]:g}: ask for a brighter "
-            f"{key}, or leave them out"
+            f"{np.sum(counts > _MAX_STARS)} of the area's cells contain more than {_MAX_STARS:.3g} stars; the cell at "
+            f"l = {lon[worst]:.1f}, b = {lat[worst]:.1f} has {counts[worst]:.3g} to H = {limit[worst]:g}: set a "
+            f"brighter {key}, or move the area"
         )
     return counts
 
 
 def _centres(cells: npt.ArrayLike) -> tuple[Float, Float]:
-    """Galactic l[n], b[n] deg of order-8 cells."""
+    """Galactic l and b (deg) of order-8 cells."""
     return sky.galactic(*sky.cell_centres(GENERATION_ORDER, cells))
 
 
 def _is_crowded(lon: npt.ArrayLike, lat: npt.ArrayLike) -> Bool:
-    """Is a cell near the Galactic plane, or before the bulge?"""
+    """True for positions near the Galactic plane or towards the bulge."""
     in_bulge_longitude = np.abs((np.asarray(lon) + 180.0) % 360.0 - 180.0) < BULGE[0]
     return np.asarray((np.abs(lat) < PLANE) | (in_bulge_longitude & (np.abs(lat) < BULGE[1])))
 
 
 def _limits(lon: Float, lat: Float, universe: StarModel) -> Float:
-    """Faintest H[n] of cells at Galactic coordinates."""
+    """Faintest H of cells at Galactic coordinates."""
     in_plane = _is_crowded(lon, lat)
     if not in_plane.any():
         return np.full(lat.size, universe.limit)
     if universe.plane_limit is None:
         raise BadInput(
             f"{in_plane.sum()} of the area's cells lie within {PLANE:g} deg of the Galactic plane or {BULGE[1]:g} deg "
-            "of the bulge, where stars are too many: move the area, or say with stars.plane_limit to which H they are "
-            "to be drawn there"
+            "of the bulge, where there are too many stars: move the area, or set stars.plane_limit to the faintest H "
+            "of these cells"
         )
     return np.where(in_plane, universe.plane_limit, universe.limit)
 
 
 def draw(cell: int, seed: int, universe: StarModel, dust: Float32) -> pa.Table:
-    """Table `stars` of one order-8 cell, sorted by _healpix_29.
+    """Draw table `stars` of one order-8 cell.
 
-    dust : float32[pixel] mag, map of the Milky Way's A(V) to infinity (truesky.catalogue.dust_map)
-    cell : nested index at order 8;  seed : of the request;  universe : of `model`
-    Errors: BadInput as `numbers`
-    Error: the density is that of the cell's centre: 2 % at its edges at |b| = 20 deg
+    Parameters
+    ----------
+    cell : int
+        Nested index of the order-8 cell.
+    seed : int
+        Seed of the request.
+    universe : StarModel
+        The model.
+    dust : float32 array, shape (pixels,)
+        Map of the Milky Way's A(V) to infinity, mag (truesky.catalogue.dust_map).
+
+    Returns
+    -------
+    Table
+        Rows of table `stars`, sorted by _healpix_29.
+
+    Raises
+    ------
+    BadInput
+        If the cell is near the Galactic plane and the model has no limit for it.
+
+    Notes
+    -----
+    The density of the cell's centre is used; the error at its edges is 2 % at |b| = 20 deg.
     """
     lon, lat = _centres([cell])
     limit = float(_limits(lon, lat, universe)[0])
@@ -200,7 +256,7 @@ def draw(cell: int, seed: int, universe: StarModel, dust: Float32) -> pa.Table:
 
 
 def _draw_model_stars(cell: int, seed: int, universe: StarModel, dust: Float32, where: CellView) -> list[Lot]:
-    """Stars of the Milky Way's model, and their companions."""
+    """Draw stars of the Milky Way's model, and their companions."""
     galaxy = universe.galaxy
     rngs = (stream(seed, f"stars.{quantity}", cell) for quantity in ("luminosity", "metallicity"))
     stars = milky_way.draw(galaxy, milky_way.expected_per_bin(galaxy, *where), *rngs)
@@ -245,7 +301,7 @@ def _draw_model_stars(cell: int, seed: int, universe: StarModel, dust: Float32, 
 def _spectrum_columns(
     universe: StarModel, m_h: Float, distance: Float, teff: Float, log_g: Float, metallicity: Float
 ) -> Lot:
-    """Magnitudes, labels and what the spectra are mixed of; white dwarfs take the dwarfs of their temperature."""
+    """Magnitudes, labels and mixture of spectra; white dwarfs use the dwarfs of their temperature."""
     mixture = model_stars.mixture(universe.types, universe.models, teff, log_g, metallicity)
     lot: Lot = {
         "sed": mixture.sed[0],
@@ -255,7 +311,7 @@ def _spectrum_columns(
         "log_g": log_g,
     }
     for k in range(1, model_stars.MIXTURE_SIZE):
-        # As they are stored: a crowded cell is large.
+        # Use the types of the table, because a crowded cell takes much memory.
         lot |= {f"sed_{k + 1}": mixture.sed[k].astype(np.int16), f"frac_{k + 1}": mixture.frac[k].astype(np.float32)}
     return lot
 
@@ -268,7 +324,7 @@ def _motion_columns(place: Lot, component: Int, age: Float, deviates: Float) -> 
 
 
 def _companion_positions(cell: int, place: Lot, primary: Int, offset: tuple[Float, Float]) -> Lot:
-    """Where companions are: on the other side of their star where they would leave the cell, else on it."""
+    """Positions of companions; one that would leave the cell is mirrored at its star, or put on the star."""
     ra, dec, index = (place[name][primary].copy() for name in ("ra", "dec", "_healpix_29"))
     east, north = (np.radians(_AU_PC * axis / place["distance"][primary]) for axis in offset)
     remaining = np.arange(primary.size)
@@ -290,7 +346,7 @@ def _companion_positions(cell: int, place: Lot, primary: Int, offset: tuple[Floa
 def _draw_brown_dwarfs(
     cell: int, seed: int, universe: StarModel, dwarfs: BrownDwarfs, dust: Float32, where: CellView
 ) -> Lot:
-    """L and T dwarfs."""
+    """Draw L and T dwarfs."""
     dwarf_sample = brown_dwarfs.draw(dwarfs, universe.galaxy, *where, stream(seed, "brown_dwarfs.number", cell))
     n = dwarf_sample.template.size
     m_h = dwarfs.m_h[dwarf_sample.template]
@@ -313,14 +369,14 @@ def _draw_brown_dwarfs(
 
 
 def _draw_positions(cell: int, universe: StarModel, dust: Float32, distance: Float, rng: np.random.Generator) -> Lot:
-    """Places uniform in a cell, ascending, and the dust on the way."""
+    """Draw uniform positions in a cell, sorted by index, with the extinction on the line of sight."""
     index, ra, dec = sky.random_in_cell(GENERATION_ORDER, cell, distance.size, rng)
     a_v = _extinction(universe, distance, dust, ra, dec)
     return {"_healpix_29": index, "ra": ra, "dec": dec, "distance": distance, "a_v": a_v}
 
 
 def _stars_of_catalogue(cell: int, seed: int, catalogue: StarCatalogue, universe: StarModel, dust: Float32) -> Lot:
-    """Stars of an external catalogue; what it does not say is null, dust and velocities are ours."""
+    """Return stars of the user's catalogue; missing values are null, missing dust and velocities are computed."""
     values = from_catalogue.stars_of_cell(catalogue, cell)
     n = len(values["ra"])
     unknown = bright_stars.masked_column(n)
@@ -349,7 +405,7 @@ def _stars_of_catalogue(cell: int, seed: int, catalogue: StarCatalogue, universe
 
 
 def _tycho_stars(cell: int, bright: BrightStars, types: StellarTypes) -> Lot:
-    """Stars of Tycho-2, as they are seen: no extinction is put before them."""
+    """Return stars of Tycho-2 as observed, without additional extinction."""
     rows = bright_stars.rows_of_cell(bright, cell)
     columns = bright_stars.columns(bright, rows, types)
     n = len(columns["sed"])
@@ -365,7 +421,7 @@ def _tycho_stars(cell: int, bright: BrightStars, types: StellarTypes) -> Lot:
 
 
 def _is_selected(universe: StarModel, lot: Mapping[str, Any], limit: float) -> Bool:
-    """[n] brighter than the limit, not too bright, and not where Tycho-2 has the stars."""
+    """True for stars within the magnitude limits that Tycho-2 does not replace."""
     mag = lot["mag_h"] + universe.h_over_v * lot["a_v"]
     is_visible = (mag < limit) & (mag >= universe.brightest)
     if universe.bright is None:
@@ -374,11 +430,11 @@ def _is_selected(universe: StarModel, lot: Mapping[str, Any], limit: float) -> B
 
 
 def mag_v(universe: StarModel, lot: Mapping[str, Any]) -> Float:
-    """V[n] as observed, Vega; of L and T dwarfs fainter than can be seen."""
+    """Return the observed V magnitude (Vega), infinite for L and T dwarfs."""
     n, dwarfs = universe.types.teff.size, universe.v_minus_h
     light = np.zeros(universe.models + dwarfs.size - n)
     light[:n], light[universe.models :] = 10.0 ** (0.4 * dwarfs[:n]), 10.0 ** (0.4 * dwarfs[n:])
-    # Light in H for as much in V; of L and T dwarfs there is none in V.
+    # Ratio of H to V light; L and T dwarfs have no light in V.
     light[n : universe.models] = np.inf
     light_v = _main_fraction(lot) * light[lot["sed"]]
     for k in range(2, model_stars.MIXTURE_SIZE + 1):
@@ -388,7 +444,7 @@ def mag_v(universe: StarModel, lot: Mapping[str, Any]) -> Float:
 
 
 def _main_fraction(lot: Mapping[str, Any]) -> Float:
-    """Share of the template of each star's largest share."""
+    """Fraction of the first template of each star."""
     other_fractions = [
         lot[name] for name in (f"frac_{k}" for k in range(2, model_stars.MIXTURE_SIZE + 1)) if name in lot
     ]
@@ -400,10 +456,7 @@ def _distance_modulus(distance: Float) -> Float:
 
 
 def nearest_template(library: Float, teff: Float) -> Int:
-    """Index[n] of the library's star of nearest ln(Teff); library : [template] K in any order.
-
-    teff : float[n] K
-    """
+    """Return the index of the library's star with the nearest ln(Teff); `library` (K) is in any order."""
     order = np.argsort(library)
     between = 0.5 * np.log(library[order][1:] * library[order][:-1])
     return np.asarray(order[np.searchsorted(between, np.log(teff))], np.int64)

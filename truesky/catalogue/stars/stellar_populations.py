@@ -1,15 +1,13 @@
-"""Which stars there are: masses and ages to luminosities, temperatures, gravities, and their numbers.
+"""Stellar populations: luminosities, temperatures, gravities and numbers of stars by mass and age.
 
-Population     ages and metallicities of a component
-Pieces         short stretches of isochrones and of the cooling sequence of white dwarfs, each inside a bin of M_H
-Tracks         the isochrones' main sequences, for companions
-tracks, pieces_of, white_dwarfs   made of populations
-white_dwarfs_below                cumulative luminosity function of white dwarfs
+Stars above 0.7 Msun are on isochrones. Stars below 0.5 Msun are on the mean sequence of nearby dwarfs; metal-poor ones
+are hotter by the difference of the isochrones at 0.5 Msun. The two are blended in between. Types later than M9 are a
+separate population, the brown dwarfs. Magnitudes are 2MASS H in the Vega system. The parameters and their sources are
+in milky_way.toml.
 
-Above 0.7 Msun stars lie on isochrones, below 0.5 Msun on the mean sequence of nearby dwarfs, where metal-poor ones are
-hotter by as much as isochrones have them at 0.5 Msun; in between the two go over into one another. Types later than M9
-are brown dwarfs, a population of their own. Magnitudes are 2MASS H, Vega.
-Ref: Kroupa 2001 (masses), Pecaut & Mamajek 2013 (nearby dwarfs); numbers and their sources are in milky_way.toml.
+References
+----------
+Kroupa 2001 (masses), Pecaut & Mamajek 2013 (nearby dwarfs)
 """
 
 from __future__ import annotations
@@ -28,21 +26,21 @@ from truesky.fluxes.libraries.vega import vega_magnitude
 
 DWARF, GIANT, WHITE_DWARF, BROWN_DWARF, SUBGIANT = range(5)
 _FILE = "milky_way.toml"
-# Of the cooling sequence.
+# Number of nodes of the cooling sequence.
 _STEPS = 500
 # Nominal values of the Sun (IAU 2015).
 _SUN_TEFF, _SUN_M_BOL = 5772.0, 4.74
-# Masses, Msun, between which nearby dwarfs go over into isochrones.
+# Masses (Msun) between which the sequence of nearby dwarfs and the isochrones are blended.
 _NEARBY_MASS, _MODEL_MASS = 0.5, 0.7
-# An evolved star is a subgiant as long as log g is larger.
+# Evolved stars with a larger log g are subgiants, the others giants.
 _GIANT_LOG_G = 3.5
-# Cells of a normal distribution of metallicity reach to so many standard deviations.
+# Range of the normal distribution of metallicity, standard deviations.
 _REACH = 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class MassFunction:
-    """Broken power law of stellar systems as they are born (milky_way.toml, [mass_function])."""
+    """Broken power law of stellar systems at birth (milky_way.toml, [mass_function])."""
 
     lightest: float
     reference: float
@@ -65,9 +63,18 @@ class WhiteDwarfs:
 
 @dataclass(frozen=True, slots=True)
 class Population:
-    """k cells of age and metallicity of a component.
+    """Cells of age and metallicity of a component.
 
-    age, metallicity : [k] Gyr, [M/H];  width : [k] of the cell in [M/H];  share : [k] of the systems born, sum 1
+    Attributes
+    ----------
+    age : float array, shape (k,)
+        Age, Gyr.
+    metallicity : float array, shape (k,)
+        [M/H].
+    width : float array, shape (k,)
+        Width of the cell in [M/H].
+    share : float array, shape (k,)
+        Fraction of the systems at birth; the sum is 1.
     """
 
     age: Float
@@ -78,10 +85,24 @@ class Population:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracks:
-    """k isochrones of q points by ascending initial mass.
+    """Isochrones with points in the order of increasing initial mass.
 
-    age, metallicity : [k] Gyr, [M/H];  evolved : first point after the main sequence
-    log_mass, log_teff, log_g, m_h : [k, q] log10 Msun, log10 K, cm s-2, mag
+    Attributes
+    ----------
+    age : float array, shape (k,)
+        Age, Gyr.
+    metallicity : float array, shape (k,)
+        [M/H].
+    evolved : int
+        First point after the main sequence.
+    log_mass : float array, shape (k, q)
+        log10 of the initial mass, Msun.
+    log_teff : float array, shape (k, q)
+        log10 Teff / K.
+    log_g : float array, shape (k, q)
+        log10 of the surface gravity, cm s-2.
+    m_h : float array, shape (k, q)
+        Absolute H magnitude (Vega).
     """
 
     age: Float
@@ -95,10 +116,20 @@ class Tracks:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pieces:
-    """n stretches, along which log mass, log Teff, log g and M_H are linear; [2, n] at both ends.
+    """Stretches of isochrones and of white dwarf sequences within bins of M_H; values are linear along them.
 
-    track  : [n] index of the isochrone, -1 of white dwarfs;  stage : [n] DWARF, ..;  bin : [n] of M_H
-    number : [n] pc^-3
+    Attributes
+    ----------
+    track : int array, shape (n,)
+        Index of the isochrone, -1 for white dwarfs.
+    stage : int array, shape (n,)
+        DWARF, GIANT, WHITE_DWARF or SUBGIANT.
+    bin : int array, shape (n,)
+        Bin of M_H.
+    number : float array, shape (n,)
+        Number density, pc^-3.
+    log_mass, log_teff, log_g, m_h : float array, shape (2, n)
+        Values at both ends, in the units of `Tracks`.
     """
 
     track: Int
@@ -111,19 +142,33 @@ class Pieces:
     m_h: Float
 
     def take(self, chosen: Int | Bool) -> Pieces:
+        """Return the stretches of a bool mask or of indices."""
         return Pieces(*(getattr(self, field.name)[..., chosen] for field in fields(self)))
 
 
 def concatenate(parts: list[Pieces]) -> Pieces:
-    """All of them, one after another."""
+    """Concatenate lists of stretches."""
     return Pieces(*(np.concatenate([getattr(part, f.name) for part in parts], -1) for f in fields(Pieces)))
 
 
 def build_population(ages: Float, shares: Float, mean: Float, scatter: Float, cells: int) -> Population:
-    """Ages[a] Gyr with their shares, and about each mean[a] of [M/H] a normal law, cut at 3 sigma, in cells.
+    """Divide a population into cells of age and metallicity.
 
-    ages, shares   : float[a] Gyr, and of the systems born;  cells : of each age
-    mean, scatter  : float[a] of [M/H]
+    Parameters
+    ----------
+    ages : float array, shape (a,)
+        Ages, Gyr.
+    shares : float array, shape (a,)
+        Fraction of the systems at birth.
+    mean, scatter : float array, shape (a,)
+        Mean and scatter of the normal distribution of [M/H], which is cut at 3 standard deviations.
+    cells : int
+        Number of cells per age.
+
+    Returns
+    -------
+    Population
+        The cells.
     """
     edges = np.linspace(-_REACH, _REACH, cells + 1)
     middle, step = 0.5 * (edges[1:] + edges[:-1]), edges[1] - edges[0]
@@ -134,7 +179,7 @@ def build_population(ages: Float, shares: Float, mean: Float, scatter: Float, ce
 
 
 def build_tracks(age: Float, metallicity: Float) -> Tracks:
-    """Of ages[k] Gyr and metallicities[k]."""
+    """Return the isochrones of ages (Gyr) and metallicities, extended to low masses by nearby dwarfs."""
     model, types = isochrones.isochrones(age, metallicity), stellar.types()
     solar = isochrones.isochrones(age, np.zeros(age.size))
     nearby = _nearby_dwarfs(types)
@@ -142,7 +187,7 @@ def build_tracks(age: Float, metallicity: Float) -> Tracks:
     quantities = (nearby.log_mass, nearby.log_teff, nearby.log_g, nearby.m_h)
     low = [np.tile(values[0, is_low_mass], (age.size, 1)) for values in quantities]
     log_mass = np.log10(model.mass)
-    # What is known of nearby dwarfs at the isochrones' masses, and its share.
+    # Weight and values of the nearby dwarfs at the masses of the isochrones.
     nearby_weight = np.clip((_MODEL_MASS - model.mass) / (_MODEL_MASS - _NEARBY_MASS), 0.0, 1.0)
     hotter = (model.log_teff - solar.log_teff)[:, :1]
     nearby_values = [
@@ -167,10 +212,10 @@ def build_tracks(age: Float, metallicity: Float) -> Tracks:
 
 
 def _nearby_dwarfs(types: stellar.StellarTypes) -> Tracks:
-    """The mean dwarf sequence.  Ref: Pecaut & Mamajek 2013, Table 5 and its updates."""
+    """Mean dwarf sequence of Pecaut & Mamajek 2013, Table 5 and its updates."""
     order = np.argsort(-types.abs_mag_h)
     log_mass = np.log10(types.mass[order])
-    # Types of nearly equal mass are not in order: half-way between the two monotone envelopes.
+    # Types of almost equal mass are not in order: use the mean of the two monotone envelopes.
     up = np.maximum.accumulate(log_mass)
     down = np.minimum.accumulate(log_mass[::-1])[::-1]
     mass = 0.5 * (up + down) + 1e-9 * np.arange(order.size)
@@ -179,10 +224,23 @@ def _nearby_dwarfs(types: stellar.StellarTypes) -> Tracks:
 
 
 def build_pieces(tracks: Tracks, share: Float, masses: MassFunction, m_h: Float) -> Pieces:
-    """Stretches of isochrones, with the systems of a mass function whose integral below `reference` is 1 if all live.
+    """Divide isochrones into stretches within bins of M_H.
 
-    found : k isochrones;  share : [k] of the systems that each has
-    masses : the mass function;  m_h : [b + 1] edges of the bins, ascending
+    Parameters
+    ----------
+    tracks : Tracks
+        k isochrones.
+    share : float array, shape (k,)
+        Fraction of the systems of each isochrone.
+    masses : MassFunction
+        Mass function, normalised to an integral of 1 below `reference` if all systems are still alive.
+    m_h : float array, shape (b + 1,)
+        Edges of the bins, ascending.
+
+    Returns
+    -------
+    Pieces
+        The stretches.
     """
     born = _power_law(masses, np.maximum(10.0**tracks.log_mass, masses.lightest))
     number = np.diff(born, axis=1) / _power_law(masses, np.asarray(masses.reference)) * share[:, None]
@@ -199,7 +257,7 @@ def build_pieces(tracks: Tracks, share: Float, masses: MassFunction, m_h: Float)
 
 
 def _in_bins(pieces: Pieces, edges: Float) -> Pieces:
-    """The stretches cut at the edges of the bins; what lies outside of all is left out."""
+    """Cut stretches at the edges of the bins, and remove everything outside the bins."""
     step, first = edges[1] - edges[0], edges[0]
     place = (pieces.m_h - first) / step
     low, high = place.min(0), place.max(0)
@@ -208,7 +266,7 @@ def _in_bins(pieces: Pieces, edges: Float) -> Pieces:
     piece_index = np.repeat(np.arange(start.size), count)
     bin_index = start[piece_index] + np.arange(piece_index.size) - np.repeat(np.cumsum(count) - count, count)
     span = np.maximum(high - low, 1e-12)[piece_index]
-    # Along the stretch, from its fainter or brighter end.
+    # Fraction along the stretch, from its fainter or brighter end.
     part = np.clip((np.stack([bin_index, bin_index + 1]) - low[piece_index]) / span, 0.0, 1.0)
     part[:, count[piece_index] == 1] = np.array([0.0, 1.0])[:, None]
     falling = place[0, piece_index] > place[1, piece_index]
@@ -228,7 +286,7 @@ def _in_bins(pieces: Pieces, edges: Float) -> Pieces:
 
 
 def white_dwarf_pieces(m_h: Float) -> Pieces:
-    """Cooling white dwarfs of one radius, in bins of M_H with these edges[b + 1]."""
+    """Return cooling white dwarfs of one radius in bins of M_H with given edges."""
     numbers = WhiteDwarfs(**parameters.section(_FILE, "white_dwarfs"))
     m_bol, at = _white_dwarf_magnitudes(numbers)
     number = np.diff(cumulative_white_dwarfs(numbers, m_h))
@@ -241,7 +299,7 @@ def white_dwarf_pieces(m_h: Float) -> Pieces:
 
 
 def _white_dwarf_magnitudes(numbers: WhiteDwarfs) -> tuple[Float, Float]:
-    """M_bol and M_H, both ascending."""
+    """M_bol and M_H, both in ascending order."""
     m_bol = np.linspace(numbers.brightest, numbers.faintest, _STEPS)
     types = stellar.types()
     correction = np.interp(-_white_dwarf_teff(numbers, m_bol), -types.teff, types.bolometric_h)
@@ -250,12 +308,12 @@ def _white_dwarf_magnitudes(numbers: WhiteDwarfs) -> tuple[Float, Float]:
 
 
 def _white_dwarf_teff(numbers: WhiteDwarfs, m_bol: Float) -> Float:
-    """Stefan and Boltzmann's law, K."""
+    """Temperature in K from the Stefan-Boltzmann law."""
     return np.asarray(_SUN_TEFF * 10.0 ** (-0.1 * (m_bol - _SUN_M_BOL)) / np.sqrt(numbers.radius))
 
 
 def _power_law(masses: MassFunction, m: Float) -> Float:
-    """Integral of the mass function below m[n] Msun, not normalised.  Ref: Kroupa 2001"""
+    """Integral of the mass function of Kroupa 2001 below each mass (Msun), not normalised."""
     edges = (masses.lightest, *masses.breaks, np.inf)
     total, height = np.zeros(m.shape), 1.0
     for i, slope in enumerate(masses.slopes):
@@ -267,10 +325,7 @@ def _power_law(masses: MassFunction, m: Float) -> Float:
 
 
 def cumulative_white_dwarfs(numbers: WhiteDwarfs, m_h: Float) -> Float:
-    """White dwarfs pc^-3 at the Sun brighter than M_H.
-
-    m_h : float[n] mag, Vega
-    """
+    """Return the number of white dwarfs per pc^3 at the Sun that are brighter than each M_H (Vega)."""
     m_bol, at = _white_dwarf_magnitudes(numbers)
     rise = numbers.slope * np.log(10.0)
     share = np.expm1(rise * (m_bol - m_bol[0])) / np.expm1(rise * (m_bol[-1] - m_bol[0]))

@@ -24,7 +24,7 @@ DRAWN = 12, 15
 
 
 def bands():
-    """LSST's passbands without what is below a thousandth of their peak, which the package leaves out of its own."""
+    """Return the LSST passbands without responses below a thousandth of the peak, which skyCatalogs also leaves out."""
     found = []
     for name in BANDS:
         band = passbands.load(name)
@@ -35,7 +35,7 @@ def bands():
 
 
 def galaxies(n=40, seed=4):
-    """Rows by file: of four kinds, with lines of up to 100 A of continuum, sheared, behind dust."""
+    """Return rows by file: galaxies of four kinds, with lines of up to 100 A of continuum, sheared and behind dust."""
     rng = np.random.default_rng(seed)
     _, ra, dec = sky.random_in_cell(5, CELL, n, rng)
     kind = rng.choice([0, 1, 2, 3], n, p=[0.5, 0.4, 0.05, 0.05])
@@ -91,7 +91,7 @@ def galaxies(n=40, seed=4):
 
 
 def _to_be_drawn(values, rows):
-    """One that is long and not lensed, two that are round and sheared; their light ends soon."""
+    """Return one long galaxy without lensing and two round, sheared ones; their profiles are short."""
     values["bulge_fraction"][rows], values["bulge_sersic_index"][rows] = 0.3, 1.0
     values["bulge_half_light_radius"][rows], values["disk_half_light_radius"][rows] = 0.3, 0.5
     values["bulge_color"][rows] = 0.0
@@ -101,7 +101,7 @@ def _to_be_drawn(values, rows):
 
 
 def stars(n=30, seed=5):
-    """Rows of one cell: any template, behind up to 0.3 mag of dust."""
+    """Return stars of one cell with any template, behind up to 0.3 mag of dust."""
     rng = np.random.default_rng(seed)
     index, ra, dec = sky.random_in_cell(5, CELL, n, rng)
     order = np.argsort(index)
@@ -121,7 +121,7 @@ def stars(n=30, seed=5):
 
 
 def published(lake, table, parts, facts):
-    """Publish rows by file; returns the version's key."""
+    """Publish rows by file and return the key of the version."""
     plan = Plan(table, facts, tuple(Task(name, {"name": name}) for name in parts))
     publish.make_version(lake, plan, lambda root, facts: Output(parts[facts["name"]]))
     return plan.key

@@ -1,6 +1,8 @@
-"""What the package skyCatalogs finds in a written set, as JSON: run by a Python that has it, in the set's folder.
+"""Print the content of an exported set as read by the package skyCatalogs, as JSON.
 
-python open_skycatalogs.py RA DEC RADIUS_ARCSEC DRAWN_ID ...
+Run this script with a Python that has skyCatalogs, in the folder of the set:
+
+    python open_skycatalogs.py RA DEC RADIUS_ARCSEC DRAWN_ID ...
 """
 
 import json
@@ -16,7 +18,7 @@ SCALE, SIZE, BAND = 0.05, 301, "y"
 
 
 def drawn(thing, band):
-    """Its image of one second through a square centimetre: flux, and the angle of its major axis from x, deg."""
+    """Draw an image of one second through 1 cm2; return the flux, and the angle of the major axis from x in deg."""
     spectra = thing.get_observer_sed_components()
     image = galsim.ImageD(SIZE, SIZE, scale=SCALE)
     for name, profile in thing.get_gsobject_components().items():

@@ -7,7 +7,7 @@ from astropy.io import fits
 from truesky.catalogue.exports import ldac
 
 
-def test_a_star_without_a_proper_motion_is_not_known_to_stand_still(tmp_path):
+def test_unknown_proper_motion_has_a_large_error(tmp_path):
     known = {
         "source_id": 7, "ref_epoch": 2015.5, "ra": 10.0, "dec": -5.0, "ra_error": 0.2, "dec_error": 0.1,
         "pmra": 3.0, "pmra_error": 0.3, "pmdec": -4.0, "pmdec_error": 0.4,

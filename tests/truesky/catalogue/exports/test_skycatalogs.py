@@ -1,4 +1,4 @@
-"""The set opens in the real package, in an environment of its own; without it, the files hold what it asks for."""
+"""The package skyCatalogs opens exported sets in a separate environment; without it, the files are complete."""
 
 import json
 import os
@@ -20,7 +20,7 @@ from truesky.fluxes import cosmology, passbands
 from truesky.fluxes.libraries import templates
 
 PACKAGE = "skyCatalogs==2.5.0"
-# What of its dependencies the reading of galaxies and stars imports.
+# Dependencies of the package that are necessary to read galaxies and stars.
 NEEDED = ("astropy", "dust_extinction", "galsim", "h5py", "healpy", "lsst-sphgeom", "pandas", "pyarrow", "pyyaml")
 
 
@@ -31,7 +31,7 @@ def written(lake, tmp_path_factory):
 
 
 def counts(lake, table):
-    """Photons per second and cm2 in each band by id: float64[6]."""
+    """Photons per second and cm2 in each band by id, shape (6,)."""
     rows = read.version(lake, f"{table}_fluxes").rows()
     widths = [passbands.log_width(passbands.load(band)) for band in BANDS]
     # f_nu / h, microjansky to erg.
@@ -40,7 +40,7 @@ def counts(lake, table):
 
 
 def seen(band, edges, f_lambda, a_v):
-    """Photons of spectra constant between edges (A), behind the reader's dust, through a passband."""
+    """Return the photons of spectra that are constant between edges (A), with skyCatalogs' dust, through a passband."""
     import astropy.units as u
     from dust_extinction.parameter_averages import F19
 
@@ -56,7 +56,7 @@ def seen(band, edges, f_lambda, a_v):
 # ------------------------------------------------------------------------------------------------ without the package
 
 
-def test_the_document_says_what_is_there_and_nothing_of_this_machine(written):
+def test_the_yaml_file_lists_all_files_without_local_paths(written):
     folder, files = written
     text = (folder / "skyCatalog.yaml").read_text()
     about = yaml.safe_load(text)
@@ -98,7 +98,7 @@ def test_columns_of_galaxies_and_of_their_components(lake, written):
 
 
 def _shares(total, low, high):
-    """The bulge's light over all of it, between two wavelengths at rest, A."""
+    """Return the fraction of the light of a bulge between two rest-frame wavelengths (A)."""
     inside = (tophat.edges()[:-1] >= low) & (tophat.edges()[1:] <= high)
     bulge, disc = (each[:, inside].sum(axis=1) for each in total)
     return bulge / (bulge + disc)
@@ -129,9 +129,9 @@ def test_a_galaxy_is_in_the_file_of_the_pixel_where_it_is_seen(lake, written):
 
 
 def test_the_spectra_give_the_lake_s_fluxes(lake, written):
-    """As the reader makes them of the files, by formulas of its own: to 1 %, most to 0.1 %.
+    """Fluxes computed from the files with independent formulas agree within 1 %, most of them within 0.1 %.
 
-    Between the lines of hydrogen on the way spectra change within a bin: there to 5 %.
+    Spectra between hydrogen absorption lines change within a bin; the tolerance there is 5 %.
     """
     folder, _ = written
     about = yaml.safe_load((folder / "skyCatalog.yaml").read_text())["object_types"]["galaxy"]
@@ -198,7 +198,7 @@ def test_a_dark_template_has_a_level():
 
 @pytest.fixture(scope="module")
 def reader(tmp_path_factory):
-    """A Python with the package and what it needs to read, in an environment of its own."""
+    """Create an environment with a Python, the package and its dependencies for reading."""
     if given := os.environ.get("TRUESKY_SKYCATALOGS_PYTHON"):
         return Path(given)
     folder = tmp_path_factory.mktemp("environment")
@@ -210,7 +210,7 @@ def reader(tmp_path_factory):
 
 
 def throughputs(folder):
-    """Stands for the data that the package has its users download: the lake's passbands."""
+    """Replace the data that users of the package download by the passbands of the lake."""
     baseline = folder / "throughputs" / "baseline"
     baseline.mkdir(parents=True)
     (baseline / "version_info").write_text("made up\n")

@@ -1,4 +1,4 @@
-"""External catalogues become table `galaxies`; what is wrong in them is named by file, column and row."""
+"""External catalogues become table `galaxies`; errors name the file, the column and the row."""
 
 import numpy as np
 import pyarrow as pa
@@ -26,7 +26,7 @@ FORMATS = ("flagship1", "flagship2", "euclid", "skycatalogs")
 
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path, monkeypatch):
-    """What is laid out by cell is removed with the test; the tables of the models stay where they are."""
+    """Remove the stored catalogue after the test, but keep the tables of the models."""
     from truesky.catalogue.external import ingest
 
     monkeypatch.setattr(ingest, "cache_dir", lambda: tmp_path / "cache")
@@ -37,12 +37,12 @@ PLACES = {"ra": "ra_true", "dec": "dec_true", "ra_lensed": "ra", "dec_lensed": "
 
 
 def asked(folder, file, more):
-    """The path of a request for the galaxies of one file."""
+    """Return the path of a request for the galaxies of one file."""
     return requests.written(folder, f'[ingest.galaxies]\nfiles = ["{file}"]\n{more}\n', requests.FIELD.format(0.3))
 
 
 def build(folder, file, more):
-    """The published table of one file."""
+    """Return the published table of one file."""
     wanted, lake = parse(asked(folder, file, more)), folder / "lake"
     lake.mkdir(exist_ok=True)
     for step in build_galaxies.steps(lake, wanted):
@@ -69,8 +69,8 @@ def test_a_catalogue_comes_through(tmp_path, form):
         assert by_origin(rows, seen.get(key, key)) == pytest.approx(values[key][order], rel=2e-6, abs=2e-7), key
 
 
-def test_a_request_that_lenses_anew_has_galaxies_where_they_are(tmp_path):
-    """In the files, too; by the catalogue's own lensing they lie where they are seen."""
+def test_a_request_with_another_lensing_uses_true_positions(tmp_path):
+    """The files also use true positions; with the catalogue's lensing they use observed positions."""
     values = synthetic.columns()
     file, order = synthetic.write(tmp_path, "flagship2", values), np.argsort(values["origin_id"])
     own = build(tmp_path, file, 'format = "flagship2"')
@@ -104,8 +104,8 @@ def test_identifiers_name_halos(tmp_path):
     assert len(set(zip(theirs, cell, strict=True))) == len(set(halo.tolist()))
 
 
-def test_seen_magnitudes_are_taken_back_to_before_dust_and_lens(tmp_path):
-    """An independent way there: LSST r of the rows' spectra, their own dust and magnification, gives `mag` again."""
+def test_observed_magnitudes_are_corrected_for_dust_and_lensing(tmp_path):
+    """Independent check: LSST r of the rows' spectra with their dust and magnification equals `mag`."""
     from truesky.catalogue.galaxies import band_ratios
     from truesky.fluxes.libraries import templates
 
@@ -123,7 +123,7 @@ def test_seen_magnitudes_are_taken_back_to_before_dust_and_lens(tmp_path):
 
 
 def test_a_request_replaces_the_lensing_and_turns_the_galaxies(tmp_path):
-    """Of magnitudes as observed the catalogue's own magnification is taken off."""
+    """The magnification of the catalogue is removed from observed magnitudes."""
     file = synthetic.write(tmp_path, "skycatalogs", synthetic.columns())
     own = build(tmp_path, file, 'format = "skycatalogs"')
     more = 'format = "skycatalogs"\n[universe]\nlensing = { g1 = 0.02, g2 = -0.01 }\nrotation = 90'
@@ -138,7 +138,7 @@ def test_a_request_replaces_the_lensing_and_turns_the_galaxies(tmp_path):
 
 
 def test_galaxies_at_a_caustic_are_kept_apart_and_counted(tmp_path):
-    """The table `galaxies` is whole without them; what they are is in the table `quarantine`."""
+    """These galaxies are in the table `quarantine` and not in the table `galaxies`."""
     values = synthetic.columns()
     values["kappa"][:4], values["gamma1"][:4], values["gamma2"][:4] = (0.9, 1.0, 1.5, 0.3), (0.0, 0.0, 0.1, 0.69), 0.0
     rows = build(tmp_path, synthetic.write(tmp_path, "skycatalogs", values), 'format = "skycatalogs"')
@@ -212,7 +212,7 @@ def test_an_identifier_twice_is_named(tmp_path):
     values = synthetic.columns()
     values = broken(values, "origin_id", 200, values["origin_id"][3])
     path = synthetic.write(tmp_path, "flagship2", values)
-    with pytest.raises(BadInput, match=r"column unique_gal_id: \d+ stands in row 201 of .* and in row 4 of"):
+    with pytest.raises(BadInput, match=r"column unique_gal_id: \d+ is in row 201 of .* and in row 4 of"):
         build(tmp_path, path, 'format = "flagship2"')
 
 
@@ -249,7 +249,7 @@ def test_a_unit_that_the_file_itself_denies(tmp_path):
     table = pq.read_table(path)
     field = table.schema.field("ra_gal").with_metadata({"unit": "rad"})
     pq.write_table(table.set_column(table.schema.get_field_index("ra_gal"), field, table["ra_gal"]), path)
-    with pytest.raises(BadInput, match=r"column ra_gal \(ra\) is in 'rad', the mapping says 'deg'"):
+    with pytest.raises(BadInput, match=r"column ra_gal \(ra\) has unit 'rad', but the mapping has 'deg'"):
         build(tmp_path, path, 'format = "flagship2"')
 
 
@@ -258,9 +258,9 @@ def test_a_unit_that_the_file_itself_denies(tmp_path):
     [
         ('format = "flagship3"', "flagship3"),
         ('format = "flagship2"\ncolumns = { colour = "x" }', "columns.colour"),
-        ('columns = { ra = "ra" }', "wants dec"),
+        ('columns = { ra = "ra" }', "must have dec"),
         ('format = "flagship2"\ncolumns = { ra = { column = "ra", times = 2.0 } }', "columns.ra.times"),
-        ('format = "flagship2"\ncolumns = { gamma2 = "" }', "kappa wants gamma2"),
+        ('format = "flagship2"\ncolumns = { gamma2 = "" }', "kappa requires gamma2"),
     ],
 )
 def test_a_mapping_that_does_not_fit(tmp_path, more, said):
@@ -318,7 +318,7 @@ def test_a_wrong_value_of_a_mock_is_named(tmp_path, name, value, said):
 
 def test_another_unit_of_a_mock_is_named(tmp_path):
     path = opencosmo.write(tmp_path / "mock.hdf5", opencosmo.columns(), units={**opencosmo.UNITS, "r50_disk_2d": "Mpc"})
-    with pytest.raises(BadInput, match=r"r50_disk_2d \(disk_half_light_radius\) is in 'Mpc', the mapping says 'kpc'"):
+    with pytest.raises(BadInput, match=r"r50_disk_2d .* has unit 'Mpc', but the mapping has 'kpc'"):
         build(tmp_path, path, 'format = "opencosmo"')
 
 

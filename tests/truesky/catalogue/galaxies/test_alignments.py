@@ -1,4 +1,4 @@
-"""Intrinsic alignments: as strong as they are wanted, towards matter, and nothing else changes."""
+"""Intrinsic alignments have the requested strength, point to matter, and change nothing else."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ def own(universe):
 
 
 def ellipticity(rows):
-    """Light-weighted |e| of bulge and disc, with the position angle, from east to north."""
+    """Return the light-weighted ellipticity of bulge and disc, with the position angle from east to north."""
     bulge, disc, share, angle = (
         rows[name].to_numpy().astype(float)
         for name in ("bulge_axis_ratio", "disk_axis_ratio", "bulge_fraction", "position_angle")
@@ -32,8 +32,8 @@ def ellipticity(rows):
 
 
 @given(size=st.floats(0.0, 0.09), angle=st.floats(-3.1, 3.1))
-def test_the_mean_that_is_drawn_is_the_mean_that_is_wanted(own, size, angle):
-    """Of a uniform sequence of numbers: no noise, and so the law itself."""
+def test_the_drawn_mean_equals_the_requested_mean(own, size, angle):
+    """A uniform sequence of numbers has no noise, so the law is tested directly."""
     n = 2000
     uniform, mean, red = (np.arange(n) + 0.5) / n, np.full(n, size * np.exp(1j * angle)), np.ones(n, bool)
     position = alignments.position_angles(own, uniform, mean, red)
@@ -42,14 +42,14 @@ def test_the_mean_that_is_drawn_is_the_mean_that_is_wanted(own, size, angle):
     assert np.all((position >= 0) & (position < 180))
 
 
-def test_without_a_mean_or_alignments_all_directions_are_alike(own, rng):
+def test_directions_are_uniform_without_a_mean_or_alignments(own, rng):
     uniform, none, red = rng.random(100), np.zeros(100, complex), np.ones(100, bool)
     for numbers in (own, None):
         assert np.array_equal(alignments.position_angles(numbers, uniform, none, red), 180.0 * uniform)
 
 
 def test_the_tide_is_that_of_the_linear_density(box):
-    """Of the variance s^2 of the density, <T_xx^2> = 4 s^2 / 45 and <T_xy^2> = s^2 / 15, but for a cube's corners."""
+    """For density variance s^2, <T_xx^2> = 4 s^2 / 45 and <T_xy^2> = s^2 / 15, except for the corners of a cube."""
     xx, yy, *mixed = density_box.tides(box)
     modes, _ = density_box._linear_modes(box.smoothed[0], box.model.cell)
     density = density_box._to_real(modes, box.n)
@@ -60,7 +60,7 @@ def test_the_tide_is_that_of_the_linear_density(box):
 
 
 def test_galaxies_point_to_matter(universe, own, rng):
-    """Along the direction that they point to, the density on both sides is higher than across it, in every replica."""
+    """In every replica, the density is higher along the major axis of galaxies than across it."""
     box, turned = universe.population.halos.box, universe.population.halos.replicas
     index, ra, dec = sky.random_in_cell(0, 5, 40_000, rng)
     chi = rng.uniform(100, 3000, index.size)
@@ -94,7 +94,7 @@ def test_blue_galaxies_do_not_follow_and_amplitudes_multiply(universe, own, rng)
 
 
 def test_satellites_point_to_their_central(own):
-    """North-east of it, at the pole's side, and across the first meridian."""
+    """Tested north-east of the central galaxy, beyond the pole, and across the first meridian."""
     ra, dec = np.array([10.1, 0.01, 200.0]), np.array([60.05, 0.0, -89.9])
     to = sky.healpix_29(np.array([10.0, 359.99, 200.0]), np.array([60.0, 0.0, -89.8]))
     towards, apart = alignments.direction_to_cells(ra, dec, to)
@@ -105,7 +105,7 @@ def test_satellites_point_to_their_central(own):
 
 
 def drawn_and_wanted(universe, cells, dust, monkeypatch, places):
-    """(drawn over wanted, its error) of red galaxies in cells, with alignments that are twice as strong."""
+    """Return (drawn / requested alignment, its error) of red galaxies in cells, with alignments twice as strong."""
     strong, wanted, inner = replace(universe.alignments, times=2.0), [], galaxies._mean_ellipticities
 
     def recorded(own, members, drawn):
@@ -125,14 +125,14 @@ def drawn_and_wanted(universe, cells, dust, monkeypatch, places):
     return ratio, np.sqrt(np.mean(np.abs(e[used]) ** 2) / 2 / weight[used].sum())
 
 
-def test_as_strong_in_the_catalogue_as_wanted(universe, cells, dust, monkeypatch):
+def test_strength_in_the_catalogue_is_as_requested(universe, cells, dust, monkeypatch):
     ratio, error = drawn_and_wanted(universe, cells, dust, monkeypatch, range(CELL, CELL + 4))
     assert error < 0.12
     assert ratio == pytest.approx(1.0, abs=3 * error)
 
 
 @pytest.mark.nightly
-def test_as_strong_in_a_large_catalogue_as_wanted(universe, dust, monkeypatch):
+def test_strength_in_a_large_catalogue_is_as_requested(universe, dust, monkeypatch):
     first = CELL // 64 * 64
     cells = population.CellCache(universe.population)
     ratio, error = drawn_and_wanted(universe, cells, dust, monkeypatch, range(first, first + 128))

@@ -28,8 +28,8 @@ def clean(table, template, z):
     return MAG * float(band_ratios.ln_ratio(table, *at)[0])
 
 
-# K-corrections and m_IE - M_r - DM at z = 0.1, 0.5, 1, 2: calculated once with a code of its own, from the four
-# observed spectra with the lines left in.
+# K-corrections and m_IE - M_r - DM at z = 0.1, 0.5, 1, 2, computed once with an independent program from the four
+# observed spectra including their lines.
 K_CORRECTIONS = {
     "sdss_r01": {0: (0.16, 1.60, 3.29, 5.06), 13: (0.005, 0.54, 1.17, 1.12), 25: (-0.14, -0.42, -0.75, -1.31)},
     "euclid_vis": {0: (-0.43, 0.07, 1.15, 3.63), 13: (-0.27, -0.17, 0.29, 0.91), 25: (-0.15, -0.46, -0.73, -1.25)},
@@ -38,7 +38,7 @@ K_CORRECTIONS = {
 
 @pytest.fixture(scope="module")
 def with_lines():
-    """The library whose observed spectra keep their weak lines."""
+    """Return the library whose observed spectra keep their weak lines."""
     wavelength = rest_grid.rest_grid()
     flux = templates.galaxy_spectra(wavelength, bridge_width=-1.0)[[0, 13, 25]].astype(np.float32)
     return templates.Library(wavelength, flux, ("0", "13", "25"))
@@ -53,7 +53,7 @@ def test_k_corrections(with_lines, band):
 
 @pytest.mark.parametrize("band", K_CORRECTIONS)
 def test_k_corrections_without_lines(library, band):
-    """Of the library itself: bridging [O III], which 0.1r sees, makes the blue ones 0.02 fainter there at rest."""
+    """Library without lines: removing [O III], which is in 0.1r, makes blue templates 0.02 mag fainter there."""
     table = band_ratios.load(library, band, 2.3, 0.5)
     for template, published in K_CORRECTIONS[band].items():
         k = [clean(table, template, z) for z in (0.1, 0.5, 1.0, 2.0)]

@@ -35,7 +35,7 @@ def test_the_matching_is_monotone():
 
 
 def fluxes(n, z, log_mass, rng, lines=PLAIN, log_sfr=None):
-    """Of galaxies of the main sequence."""
+    """Draw line fluxes of galaxies on the main sequence."""
     at, mass = np.full(n, z), np.full(n, log_mass)
     rate = stellar_mass.main_sequence(stellar_mass.star_formation(), mass, at) if log_sfr is None else log_sfr
     return emission_lines.fluxes(lines, at, mass, rate + np.zeros(n), np.zeros(n, bool), rng)
@@ -52,7 +52,7 @@ def test_oxygen_over_hydrogen_by_mass(rng, z, log_mass, observed):
 
 
 def test_nearby_galaxies_lie_on_the_mass_metallicity_relation():
-    """That of Curti et al. 2020, eq. 2, at the usual star formation rates."""
+    """The relation of Curti et al. 2020, eq. 2, at the usual star formation rates."""
     law, mass = PLAIN.metals, np.array([9.5, 10.0, 10.5])
     usual = 8.793 - 0.28 / 1.2 * np.log10(1.0 + 10.0 ** (-1.2 * (mass - 10.02)))
     rate = np.array([-0.3, 0.0, 0.3])
@@ -73,7 +73,7 @@ def test_nitrogen_and_oxygen_lie_on_the_sequence_of_star_forming_galaxies(rng):
 
 
 def test_hydrogen_is_case_b_behind_the_dust_of_the_gas(rng):
-    """All ratios to H beta tell the same A(H alpha), by Calzetti's law; massive galaxies have more of it."""
+    """All ratios to H beta give the same A(H alpha) with Calzetti's law; it is larger for massive galaxies."""
     clear = replace(PLAIN, gas=replace(PLAIN.gas, polynomial=(0.0,), min_attenuation=0.0))
     found = fluxes(100, 1.0, 10.0, rng, clear)
     for line, ratio in PLAIN.hydrogen.items():
@@ -137,7 +137,7 @@ def test_added_light_is_that_of_the_spectrum(band, rng):
     assert found.sum() / expected.sum() == pytest.approx(1.0, abs=0.01)
 
 
-def test_no_light_brightens_nothing_and_as_much_again_by_three_quarters():
+def test_magnitudes_with_no_light_and_with_doubled_light():
     flux = 10.0 ** (-0.4 * (np.array([20.0, 26.0]) + AB_CGS))
     assert emission_lines.magnitude_with_light(np.array([20.0, 26.0]), np.zeros(2)).tolist() == [20.0, 26.0]
     assert emission_lines.magnitude_with_light(np.array([20.0, 26.0]), flux) == pytest.approx(

@@ -33,7 +33,7 @@ def cell(universe, cells, dust):
 
 
 def test_counts_to_the_limits_of_the_survey(drawn):
-    """Of a sky with structure: 30 an arcmin2 with I_E < 24.5, median z 0.87 (Serrano et al. 2024)."""
+    """Sky with structure: 30 per arcmin2 with I_E < 24.5, median z 0.87 (Serrano et al. 2024)."""
     vis = drawn.mags["euclid_vis"]
     area = drawn.area * ARCMIN2_PER_DEG2
     bright = vis < 24.5
@@ -54,7 +54,7 @@ def test_slope_of_the_counts(drawn):
 
 
 def test_there_is_no_hole_in_redshift(drawn):
-    """Of I_E < 26, an arcmin2 and unit redshift, as a separate program has them; nothing ends or jumps below z = 6."""
+    """Counts per arcmin2 and unit redshift for I_E < 26, from an independent program; no gap or step below z = 6."""
     expected = {1.9: 22.1, 2.2: 18.2, 2.5: 15.8, 2.8: 12.5}
     area = drawn.area * ARCMIN2_PER_DEG2
     for z, number in expected.items():
@@ -75,7 +75,7 @@ def expected_number(lf, near, far, faintest, area):
 
 
 def richness(universe, places, near, far, log_mass):
-    """Density that the box has in these cells for halos of a mass, against its mean: what structure does to counts."""
+    """Return the halo density in these cells relative to the mean: the effect of structure on counts."""
     model = universe.population.halos
     steps = (model.steps.z > near) & (model.steps.z < far)
     column = np.searchsorted(model.log_mass, log_mass) - 1
@@ -95,7 +95,7 @@ def richness(universe, places, near, far, log_mass):
     [(0.1, 0.08, 0.2, 11.4, 0.15), (0.5, 0.05, 0.3, 11.4, 0.10), (1.0, 0.1, 1.5, 12.0, 0.10)],
 )
 def test_the_luminosity_function_comes_out_of_the_catalogue(drawn, universe, z, half, reddest, mass, within):
-    """Counted where the reddest spectrum (I_E - M_r - DM) beats the limit, and as rich as the box is there."""
+    """Counted where even the reddest spectrum is brighter than the limit, relative to the richness of the box."""
     near, far = z - half, z + half
     faintest = min(26.0 - float(cosmology.distance_modulus(far)) - reddest, -16.0)
     found = np.sum((drawn.z > near) & (drawn.z < far) & (drawn.m_r < faintest))
@@ -144,7 +144,7 @@ def test_rows_are_sorted_inside_their_cell(cell):
 
 
 def test_galaxies_name_halos_of_the_table(drawn):
-    """The halo of a central is there; that of a satellite as well, unless it lies in a cell that was not drawn."""
+    """The table contains the halo of each central galaxy, and of each satellite unless its cell was not drawn."""
     columns = drawn.columns
     central, halos = columns["kind"] == 0, drawn.halos["id"].to_numpy()
     assert np.array_equal(columns["halo_id"][central], columns["id"][central])
@@ -158,7 +158,7 @@ def test_galaxies_name_halos_of_the_table(drawn):
 
 @pytest.mark.nightly
 def test_satellite_fraction():
-    """Zehavi et al. 2011: 0.21 with M_r < -20 nearby; in 10 deg2, for a cluster moves that of a few cells."""
+    """Zehavi et al. 2011: 0.21 with M_r < -20 nearby; 10 deg2, because a cluster changes the fraction of few cells."""
     universe = galaxies.halos_and_galaxies(SEED, Universe(galaxy_limit=22.0, z_max=0.35, **SMALL))
     cells, bright = population.CellCache(universe), []
     for cell in range(25, 12 << 16, (12 << 16) // 200):
@@ -184,7 +184,7 @@ def test_positions_are_lensed(drawn):
 
 
 def test_a_cell_is_the_same_alone_or_among_others(dust, monkeypatch):
-    """In another process, in a file between other cells: every byte."""
+    """A cell has identical bytes in another process, and in a file between other cells."""
     universe = galaxies.model(SEED, Universe(galaxy_limit=22.5, **SMALL))
     other = pickle.loads(pickle.dumps(universe))
     monkeypatch.setattr(build_galaxies, "_universe", lambda facts, own: other)
@@ -228,7 +228,7 @@ def test_the_apparent_reference_magnitude_is_near_the_seen_ones(drawn):
 def test_an_empty_cell_is_an_empty_table(dust):
     shallow = galaxies.model(SEED, Universe(galaxy_limit=10.0, **SMALL, **NEARBY))
     rows = galaxies.draw(0, shallow, population.CellCache(shallow.population), dust)
-    # High-redshift galaxies and quasars have limits of their own.
+    # High-redshift galaxies and quasars have separate limits.
     assert (rows["z_true"].to_numpy() < 6).sum() < 5
     assert rows.schema.equals(GALAXIES.arrow_schema())
     assert validate.find_violations(rows, GALAXIES) == []
@@ -236,7 +236,7 @@ def test_an_empty_cell_is_an_empty_table(dust):
 
 @pytest.mark.parametrize(("band", "limit"), [("euclid_h", 21.5), ("lsst_g", 23.0)])
 def test_a_limit_in_another_band(drawn, dust, band, limit):
-    """As many as a deeper catalogue has there, none fainter, and of fewer halos."""
+    """The number equals that of a deeper catalogue, no galaxy is fainter, and fewer halos are drawn."""
     there = galaxies.model(SEED, Universe(galaxy_limit=limit, galaxy_band=band, **SMALL, **NEARBY))
     cells = population.CellCache(there.population)
     places = drawn.places[:2]
@@ -259,7 +259,7 @@ def test_a_limit_in_another_band(drawn, dust, band, limit):
 
 
 def test_a_shallow_limit_needs_little_of_the_volume():
-    """Halos a steradian that are drawn, by distance."""
+    """Number of drawn halos per steradian, by distance."""
     wanted = (Universe(galaxy_limit=limit, **SMALL) for limit in (18.0, 26.0))
     near, deep = (galaxies.halos_and_galaxies(SEED, one).halos for one in wanted)
     number = [np.sum(m.blocks_above(m.min_mass_limit - 0.6) * m.number, 1) * m.steps.volume for m in (near, deep)]

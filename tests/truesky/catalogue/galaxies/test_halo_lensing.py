@@ -1,4 +1,4 @@
-"""Halos in the lensing of galaxies: where, how strongly, and always the same."""
+"""Halos in the lensing of galaxies: position, strength and reproducibility."""
 
 from dataclasses import replace
 
@@ -29,7 +29,7 @@ def near(universe, cells):
 
 @pytest.fixture(scope="module")
 def behind(rng_of_module):
-    """Sources of one cell: places, and distances."""
+    """Return positions and distances of sources in one cell."""
     _, ra, dec = sky.random_in_cell(GENERATION_ORDER, CELL, 4000, rng_of_module)
     return ra, dec, rng_of_module.uniform(300, 3500, 4000)
 
@@ -40,7 +40,7 @@ def rng_of_module():
 
 
 def lone(box, ra, dec, chi=800.0, amplitude=3e-9, size=2 * ARCMIN):
-    """The lensing of one halo where there is no other matter."""
+    """Return the lensing of one halo without other matter."""
     chosen = lens_halos.settings()
     halo = np.array([0, 0, chi, amplitude, size, max(size, 10 * ARCMIN), max(size, 25 * ARCMIN), 6.0])[:, None]
     empty = replace(box, maps=tuple(np.zeros_like(one) for one in box.maps))
@@ -50,7 +50,7 @@ def lone(box, ra, dec, chi=800.0, amplitude=3e-9, size=2 * ARCMIN):
 
 @pytest.mark.parametrize(("ra", "dec"), [(40.0, 20.0), (0.0, -1.0), (359.9999, 60.0), (123.0, 89.5), (10.0, -89.9)])
 def test_shear_is_tangential_and_sources_are_pushed_away(universe, ra, dec):
-    """As everywhere in the table: gamma1 < 0 east and west of a mass, gamma2 < 0 north-east of it, at any place."""
+    """Signs as in the table: gamma1 < 0 east and west of a mass, gamma2 < 0 north-east of it, at any position."""
     halo, angle = lone(universe.lens, ra, dec), np.arange(16) * np.pi / 8
     east, north = 5 * ARCMIN * np.sin(angle), 5 * ARCMIN * np.cos(angle)
     places = lensing.displace(np.full(16, ra), np.full(16, dec), east, north)
@@ -70,7 +70,7 @@ def test_shear_is_tangential_and_sources_are_pushed_away(universe, ra, dec):
 
 
 def test_convergence_and_shear_are_those_at_the_image(universe, rng):
-    """theta = beta + alpha(theta), with convergence and shear of theta: one Newton step, beside a rich cluster."""
+    """theta = beta + alpha(theta) with convergence and shear at theta: one Newton step close to a rich cluster."""
     halo = lone(universe.lens, 40.0, 20.0, amplitude=3e-8)
     angle, radius = 2 * np.pi * rng.random(300), ARCMIN * rng.uniform(0.7, 10, 300)
     beta = lensing.displace(np.full(300, 40.0), np.full(300, 20.0), radius * np.sin(angle), radius * np.cos(angle))
@@ -101,7 +101,7 @@ def test_a_galaxy_behind_a_centre_is_finite_or_set_apart(universe):
 
 
 def test_the_lens_equation_holds(near, behind):
-    """theta - alpha(theta) = beta of the sources of a cell, within 0.5" of 99 % of them: what is moved by up to 30"."""
+    """theta - alpha(theta) = beta within 0.5" for 99 % of the sources of a cell, which move by up to 30"."""
     ra, dec, chi = behind
     found = halo_lensing.lensing_at_images(near, ra, dec, chi)
     once = replace(near, settings=replace(near.settings, again=np.inf))
@@ -111,7 +111,7 @@ def test_the_lens_equation_holds(near, behind):
     assert np.percentile(3600 * sky.separation(*theta, ra, dec), 99) > 5.0
 
 
-def test_sources_are_the_same_in_any_company(near, behind):
+def test_lensing_of_a_source_does_not_depend_on_other_sources(near, behind):
     whole = halo_lensing.lensing_at_images(near, *behind)
     assert np.abs(whole[0]).max() > 0.05
     rng = np.random.default_rng(1)
@@ -121,7 +121,7 @@ def test_sources_are_the_same_in_any_company(near, behind):
 
 
 @pytest.mark.parametrize("changed", [{"galaxy_limit": 20.0}, {"galaxy_limit": 23.0, "z_max": 1.0}, {"z_max": 3.0}])
-def test_lensing_does_not_know_the_limit_of_a_request(universe, near, changed):
+def test_lensing_does_not_depend_on_the_limit_of_a_request(universe, near, changed):
     """The same halos, and so the same lensing of the same galaxies, bit by bit."""
     other = galaxies.halos_and_galaxies(SEED, Universe(**SMALL, **changed))
     found = halo_lensing.lens_of_cell(universe.lens, CellCache(other), CELL)
@@ -131,7 +131,7 @@ def test_lensing_does_not_know_the_limit_of_a_request(universe, near, changed):
 
 
 def test_halos_of_the_catalogue_are_those_that_lens(universe, cells):
-    """Those of the table above the threshold, each once, in its place and with its mass."""
+    """Every halo of the table above the threshold lenses exactly once, with its position and mass."""
     rows = galaxies.halo_table(CELL, universe.population, cells)
     chosen = lens_halos.settings()
     complete = universe.population.halos.mass_limit(np.array([CHI]))[0] < chosen.lowest
@@ -140,13 +140,13 @@ def test_halos_of_the_catalogue_are_those_that_lens(universe, cells):
     assert complete
     assert 300 < heavy.sum() <= own.id.size + 3
     wide = np.isin(rows["id"].to_numpy()[heavy], own.id)
-    # Those that span minutes of arc are drawn by larger cells.
+    # Halos that span arc minutes are drawn by larger cells.
     assert wide.mean() > 0.98
     assert np.isin(own.id[own.chi < 0.999 * CHI], rows["id"].to_numpy()).all()
 
 
 def test_no_halo_is_missed_that_reaches_a_cell(universe, near, monkeypatch):
-    """With all cells drawn twice as far, the same halos."""
+    """The halos are the same if cells are drawn to twice the distance."""
     chosen = lens_halos.settings()
     every = halo_lensing._cells_with_halos
 
@@ -181,7 +181,7 @@ def test_the_table_of_galaxies_has_the_lensing_of_halos(universe, cells, dust, m
 
 
 def test_no_cell_misses_a_monster(universe):
-    """10^15.5 Msun/h at z = 0.05: what it does spans degrees, and ends where its mass is made up for."""
+    """A halo of 10^15.5 Msun/h at z = 0.05: its lensing spans degrees, and ends where its mass is compensated."""
     ra, dec = 217.0, 33.0
     index, chi = sky.healpix_29([ra], [dec]), cosmology.comoving_distance(np.array([0.05]))
     cone = LightCone(index, chi, np.array([15.5]), np.zeros(1))
@@ -200,7 +200,7 @@ def test_no_cell_misses_a_monster(universe):
 
 
 def test_what_is_right_behind_a_cluster_is_set_apart(universe):
-    """A galaxy exactly behind the centre of a halo of 10^15 Msun/h at z = 0.3 is one for the quarantine."""
+    """A galaxy exactly behind the centre of a halo of 10^15 Msun/h at z = 0.3 belongs in the quarantine."""
     index, chi = sky.healpix_29([217.0], [33.0]), cosmology.comoving_distance(np.array([0.3]))
     cells = CellCache(replace(universe.population, light_cone=LightCone(index, chi, np.array([15.0]), np.zeros(1))))
     empty = replace(universe.lens, maps=tuple(np.zeros_like(one) for one in universe.lens.maps))
@@ -216,7 +216,7 @@ def test_what_is_right_behind_a_cluster_is_set_apart(universe):
 
 
 def profile(theta, halo):
-    """Tangential shear[n] at theta rad about halos[8, n] alone, cut at R_200m."""
+    """Return the tangential shear at theta (rad) around halos (8, n) without other matter, cut at R_200m."""
     _, _, chi, amplitude, size, _, _, c = halo
     out = np.empty(theta.size)
     for i, x in enumerate(theta / size):
@@ -230,7 +230,7 @@ def profile(theta, halo):
 
 
 def stacked(universe, places, least, number):
-    """(tangential, cross shear, halos alone) by ring, and halos, of sources at z = 1 as they are seen."""
+    """Return (tangential shear, cross shear, shear of halos alone) by ring, and the halos, for sources at z = 1."""
     edges, kept = np.array([0.5, 1.0, 2.0, 4.0]), []
     rng, drawn = np.random.default_rng(3), CellCache(universe.population)
     for place in places:
@@ -258,7 +258,7 @@ def stacked(universe, places, least, number):
 
 
 def test_stacked_shear_about_massive_halos(universe):
-    """Of what is seen about where halos are seen: their profile, and no cross shear; the sky is small."""
+    """Observed sources around observed halos show the halo profile and no cross shear; the sky is small."""
     first = CELL // 16 * 16
     tangential, across, expected, number = stacked(universe, range(first, first + 16), 13.3, 10_000)
     assert number > 30

@@ -24,7 +24,7 @@ from truesky.validation import theory
 pytestmark = pytest.mark.nightly
 
 NSIDE, CHI, ARCMIN = 1024, float(cosmology.comoving_distance(1.0)), np.radians(1 / 60)
-# One cell of order 2, 215 deg2, with so many sources in each of its generation cells: 3 an arcmin2.
+# One cell of order 2 (215 deg2) with this number of sources in each generation cell: 3 per arcmin2.
 FIRST, CELLS, SOURCES = 40 << 12, 1 << 12, 560
 RINGS = np.array([0.5, 1.0, 2.0, 4.0, 7.0, 10.0])
 # About 1.3', 2.6', ..., 88'.
@@ -34,7 +34,7 @@ PIXEL = 0.5
 
 @pytest.fixture(scope="module")
 def sample():
-    """Sources: frames, shear by the box and by halos, kappa; halos above 10^13.2: rows as they are kept."""
+    """Return sources (frames, shear by the box and by halos, kappa) and halos above 10^13.2."""
     near, drawn = replace(lensing.settings(), planes=(0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1.0), far_planes=()), []
     chosen, rng = replace(lens_halos.settings(), z_max=1.0), np.random.default_rng(1)
     with pytest.MonkeyPatch.context() as patch:
@@ -64,7 +64,7 @@ def sample():
 
 
 def magnification(sample):
-    """Of each source; 0 at a caustic."""
+    """Return the magnification of each source, 0 at a caustic."""
     shear = sample.by_box + sample.by_halos
     determinant = sources.determinant(sample.kappa, shear.real, shear.imag)
     good = (determinant > 0.05) & (sample.kappa < 1)
@@ -72,7 +72,7 @@ def magnification(sample):
 
 
 def test_mean_convergence_and_its_least(sample):
-    """Where places count alike, those of images, the mean is 0; and no line of sight is emptier than empty."""
+    """The mean over image positions is 0, and no line of sight is below the convergence of empty space."""
     weight = magnification(sample)
     patch = np.arange(weight.size) * 64 // weight.size
     mean = np.bincount(patch, sample.kappa * weight) / np.bincount(patch, weight)
@@ -85,7 +85,7 @@ def test_mean_convergence_and_its_least(sample):
 
 
 def with_neighbours(theta, z, log_mass):
-    """Mean tangential shear[n] of the linear matter about halos, at theta rad."""
+    """Return the mean tangential shear of the linear matter around halos at theta (rad)."""
     ell, chi = np.geomspace(5, 1e5, 3000), float(cosmology.comoving_distance(z))
     bias = matching.masses().interpolate_pairs(matching.masses().bias, np.array([z]), np.array([log_mass]))[0]
     power = density_box.linear_power((ell + 0.5) / chi) * float(density_box.growth(z)) ** 2
@@ -96,7 +96,7 @@ def with_neighbours(theta, z, log_mass):
 
 @pytest.mark.parametrize(("low", "high"), [(13.4, 13.6), (13.75, 14.25), (14.25, 15.0)])
 def test_shear_about_halos(sample, low, high):
-    """As seen, about where the box shows halos at 0.2 < z < 0.6: 10 % to 4', 30 % to 10'; no cross shear."""
+    """Shear around the box images of halos at 0.2 < z < 0.6: 10 % to 4 arcmin, 30 % to 10 arcmin; no cross shear."""
     near, far = (float(cosmology.comoving_distance(z)) for z in (0.2, 0.6))
     halos, mass = sample.halos, sample.halos[9]
     halos = halos[:, (halos[3] > near) & (halos[3] < far) & (mass > low) & (mass < high)]
@@ -124,7 +124,7 @@ def test_shear_about_halos(sample, low, high):
 
 
 def correlations(place, gamma, weight):
-    """xi+, xi- of shear at places [2, n] arcmin of a plane: pair by pair up to 3.7', of pixels beyond."""
+    """Return xi+ and xi- of the shear at positions (2, n) in arcmin: by pairs up to 3.7 arcmin, from pixels beyond."""
     pairs, (plus, minus) = pixelised(place, gamma, weight)
     count, near, gamma = np.zeros(2), np.zeros((2, 2)), gamma * weight
     for cut in np.array_split(np.arange(gamma.size), 64):
@@ -172,10 +172,10 @@ def expected(ell, c_l):
 
 
 def test_correlations_of_shear_are_those_of_non_linear_theory(sample):
-    """As a screen has them, whose places count alike: sources are weighted by their magnification.
+    """Image positions have equal weights in theory, so sources are weighted by their magnification.
 
-    xi+ within 15 % from 2' to 120' (20 % below), xi- within 15 % from 15' (25 % below); the variance of the box is
-    replaced by its theory. On 215 deg2 clusters make an error of 3 % at 5' to 10'.
+    xi+ agrees within 15 % from 2' to 120' (20 % below), xi- within 15 % from 15' (25 % below). The variance of the box
+    is replaced by its theoretical value. Clusters cause an error of 3 % at 5' to 10' in 215 deg2.
     """
     centre = sample.frame[:, 2].mean(0)
     lon, lat = np.degrees([np.arctan2(centre[1], centre[0]), np.arctan2(centre[2], np.hypot(*centre[:2]))])

@@ -17,7 +17,7 @@ COUNTS = {19.0: 7.4, 20.0: 32.0, 21.0: 87.0, 22.0: 178.0, 22.5: 240.0, 23.0: 316
 
 
 def quasars(pivot, limits):
-    """Deg-2 brighter than magnitudes at a wavelength, A, for f_nu ~ nu^-0.5."""
+    """Return the number per deg2 brighter than magnitudes at a wavelength (A), for f_nu ~ nu^-0.5."""
     numbers = high_redshift.parameters.section("high_redshift.toml", "quasars")
     z, m = np.arange(0.31, 6.0, 0.02), np.arange(-31.99, -15.0, 0.02)
     volume = cosmology.comoving_volume(z - 0.01, z + 0.01) * np.radians(1.0) ** 2 / 0.67**3
@@ -59,7 +59,7 @@ def test_a_shallower_or_nearer_request_is_part_of_a_deeper_one(universe, dust, l
         assert 0 < some.num_rows < whole.num_rows or limit < 24.0
 
 
-def test_a_boost_is_written_beside_its_rows(universe, dust):
+def test_rows_contain_the_boost(universe, dust):
     """Sample of one cell of each kind; significance 6e-7 of its number (5 standard errors)."""
     for code, kind in (
         (HIGH_REDSHIFT, high_redshift.model(8.0, 0.0)[0]),
@@ -88,7 +88,7 @@ def test_fluxes_can_be_computed(universe, dust):
     rows = high_redshift.draw(77, 5, GALAXIES_BEYOND, universe.lens, dust)
     flux = spectra.fluxes(rows, [passbands.load("lsst_g"), passbands.load("euclid_h")])
     assert np.all(flux[:, 1] > 0)
-    # Nothing below Lyman alpha, but for what the filter leaks.
+    # No flux below Lyman alpha, except through the leaks of the filter.
     assert np.all(flux[:, 0] < 1e-3 * flux[:, 1])
     assert np.median(23.9 - 2.5 * np.log10(flux[:, 1])) == pytest.approx(25.6, abs=0.5)
 

@@ -80,7 +80,7 @@ def test_displacements_are_great_circles(dec, rng):
 
 @pytest.mark.parametrize("dec", [-90.0, 0.0, 90.0])
 def test_right_ascensions_are_below_360(dec):
-    """True and observed ones, of what lies on the meridian of 0 and is moved over it, by as little as can be."""
+    """True and observed right ascensions of positions that move across the meridian of 0 by tiny steps."""
     ra = np.array([0.0, -0.0, -1e-300, -1e-16, 360.0, np.nextafter(360.0, 0.0), 720.0])
     for east in (-1e-3, -1e-18, 0.0, 1e-18, 1e-3):
         seen = lensing.displace(ra, np.full(ra.size, dec), np.full(ra.size, east), np.zeros(ra.size))

@@ -138,7 +138,7 @@ def test_inclination_keeps_its_digits_where_a_disc_is_nearly_round():
 
 
 def test_bulges_are_redder_than_discs_as_near_galaxies_are(rng):
-    """0.1 - 0.3 mag in g - r, remembered of decompositions of near galaxies."""
+    """0.1 - 0.3 mag in g - r, from memory of bulge-disc decompositions of nearby galaxies."""
     colour = morphology.bulge_colour(SHAPES.bulge, 20_000, rng)
     assert 0.1 < np.mean(colour) < 0.3
     assert np.mean(colour > 0.0) > 0.9

@@ -1,4 +1,4 @@
-"""Spectra of the nearest observed galaxy: against a search through all of them, and through a whole draw."""
+"""Spectra of the nearest observed galaxy, tested against a brute-force search and in a complete draw."""
 
 import dataclasses
 
@@ -76,7 +76,7 @@ def test_the_scatter_is_as_stated_and_stays_in_the_library(given, rng):
 
 
 def test_galaxies_are_drawn_with_these_spectra(universe, dust, given):
-    """Those that a training table decides on are in the library, in the table's bounds, and of the usual number."""
+    """Spectra from a training table are in the library and in the table's bounds; the number of galaxies is usual."""
     there = dataclasses.replace(universe, training=given)
     rows = galaxies.draw(303_117, there, population.CellCache(there.population), dust)
     assert validate.find_violations(rows, GALAXIES) == []
@@ -118,7 +118,7 @@ def test_dustier_galaxies_are_searched_for_as_deep_as_they_can_be_seen(given):
     assert np.any(deep.halos.limit < usual.halos.limit - 0.01)
 
 
-def test_a_template_that_the_library_has_not(tmp_path, monkeypatch):
+def test_an_unknown_template_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(nearest_sed, "cached_arrays", lambda name, key, make: make())
     values = observed(20)
     values["sed"][4] = 30.5
@@ -127,5 +127,5 @@ def test_a_template_that_the_library_has_not(tmp_path, monkeypatch):
     columns = mapping.training_columns({key: f'"{key}"' for key in KEYS})
     with pytest.raises(BadInput, match=r"synthetic\.parquet: column sed \(sed\) of row 5 is 30\.5, the library's last"):
         nearest_sed.load([path], ["x"], columns)
-    with pytest.raises(BadInput, match=r"ingest\.training\.columns wants ebv"):
+    with pytest.raises(BadInput, match=r"ingest\.training\.columns must have ebv"):
         mapping.training_columns({key: f'"{key}"' for key in KEYS[:-1]})

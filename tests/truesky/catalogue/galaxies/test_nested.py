@@ -1,4 +1,4 @@
-"""A shallower or nearer request is a part of a deeper one: all rows to its limits, the same bit by bit."""
+"""A shallower or nearer request is a subset of a deeper one: all rows within its limits, with identical bits."""
 
 from functools import cache
 
@@ -27,19 +27,19 @@ def model(limit, z_max, seed=SEED):
 
 @cache
 def tables(limit, z_max, cell, seed=SEED):
-    """Galaxies of all kinds, and halos: drawn once for all tests, of which none changes them."""
+    """Draw galaxies of all kinds and halos once for all tests, which do not change them."""
     universe, cells = model(limit, z_max, seed)
     dust = dust_map.load(SEED)
     return galaxies.draw(cell, universe, cells, dust), galaxies.halo_table(cell, universe.population, cells)
 
 
 def of(rows, wanted):
-    """The rows of these identifiers, in the order of the table."""
+    """Return the rows with these identifiers in the order of the table."""
     return rows.filter(pa.array(np.isin(rows["id"].to_numpy(), wanted["id"].to_numpy())))
 
 
 def magnitude(universe, rows):
-    """In the limit's band."""
+    """Return the magnitude in the band of the limit."""
     z, m_r = (rows[name].to_numpy().astype(float) for name in ("z_true", "abs_mag_r01"))
     names = ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")
     continuum = galaxies.apparent_magnitude(
@@ -91,7 +91,7 @@ def test_a_shallower_and_a_nearer_request_are_parts_of_a_deeper_one():
 
 
 def test_nothing_is_missing_at_the_limit():
-    """Galaxies that lines alone lift above it are there: all that a limit 1 mag deeper has, but for one in 10^4."""
+    """Galaxies that only their lines lift above the limit are present, except one in 10^4."""
     found = (tables(limit, 2.3, CELLS[0])[0] for limit in (23.0, 24.0))
     few, many = (rows.filter(pc.less(rows["kind"], 2)) for rows in found)
     universe, _ = model(23.0, 2.3)
@@ -128,7 +128,7 @@ def test_the_deepest_and_farthest_request_holds_a_usual_one():
 
 
 def test_hosts_behind_the_end_of_a_request_have_their_satellites_before_it():
-    """Those of the step behind it, which a farther request draws anyway."""
+    """Satellites of hosts in the step behind the end, which a farther request always draws."""
     (near, of_near), (_, of_far) = ((one.population, cells) for one, cells in (model(23.0, 0.3), model(23.0, 0.6)))
     for cell in range(303_104, 303_120):
         a, b = population.members(of_near, cell), population.members(of_far, cell)

@@ -1,4 +1,4 @@
-"""Galaxies lie in the cells in which they are seen: none is lost at a border, and none is there twice."""
+"""Galaxies are in the cells of their observed positions: none is lost or duplicated at a border."""
 
 import numpy as np
 import pyarrow as pa
@@ -50,7 +50,7 @@ def seen_in(rows, cells):
 
 
 def crossing(rows):
-    """How many are seen in another cell than that which they are truly in."""
+    """Return the number of galaxies that are observed in another cell than that with their true position."""
     seen, true = (sky.cell_at(rows[ra].to_numpy(), rows[dec].to_numpy(), ORDER) for ra, dec in NAMES)
     return int(np.sum(seen != true))
 
@@ -61,15 +61,15 @@ NAMES = ("ra", "dec"), ("ra_true", "dec_true")
 @pytest.mark.parametrize(
     "place", [pytest.param(place, marks=[] if place in SOME else [pytest.mark.nightly]) for place in PLACES]
 )
-def test_a_cell_holds_what_is_seen_in_it_wherever_it_truly_is(place, shallow, population, dust):
-    """Against the whole of the cell and of all about it, every one drawn where it truly is: the same bytes."""
+def test_a_cell_contains_all_galaxies_observed_in_it(place, shallow, population, dust):
+    """The bytes equal those of a complete draw of the cell and all its neighbours by true position."""
     cell = cell_at(place)
     every = pa.concat_tables([galaxies.draw(c, shallow, population, dust) for c in (cell, *around(cell))])
     found = observed_cells.draw([cell], shallow, population, dust)
     assert len(found) > 200
     wanted = seen_in(every, [cell])
     assert found.sort_by("id").equals(wanted.sort_by("id"))
-    # Some come in, and some go out.
+    # Some galaxies cross the border in each direction.
     assert crossing(found) > 0
     own = galaxies.draw(cell, shallow, population, dust)
     assert len(seen_in(own, [cell])) < len(own)
@@ -78,7 +78,7 @@ def test_a_cell_holds_what_is_seen_in_it_wherever_it_truly_is(place, shallow, po
 
 
 def test_files_made_apart_hold_every_galaxy_once(shallow, population, dust):
-    """On both sides of a border of files, each in one order of drawing, alone and together."""
+    """Both sides of a border between files, drawn in different orders, separately and together."""
     first = cell_at(PLACES[3])
     second = next(cell for cell in around(first) if cell >> 6 != first >> 6)
     apart = [observed_cells.draw([cell], shallow, CellCache(shallow.population), dust) for cell in (second, first)]
@@ -116,7 +116,7 @@ def test_light_that_is_bent_too_far_is_refused(shallow, population, dust, monkey
 
 @given(st.floats(0, 360, exclude_max=True), st.floats(-90, 90), st.integers(0, 999), st.sampled_from([8, 5]))
 def test_the_bound_on_the_deflection_of_the_box_holds(universe, ra, dec, seed, order):
-    """Of whatever source in the cell, at any distance."""
+    """The bound is valid for any source in the cell at any distance."""
     cell = int(sky.cell_at([ra], [dec], order)[0])
     rng = np.random.default_rng(seed)
     _, lon, lat = sky.random_in_cell(order, cell, 50, rng)
@@ -125,8 +125,8 @@ def test_the_bound_on_the_deflection_of_the_box_holds(universe, ra, dec, seed, o
 
 
 @given(st.integers(0, (12 << 16) - 1), st.floats(1e-5, 2e-3), st.integers(0, 999))
-def test_what_is_near_is_found_and_what_is_far_is_not(cell, angle, seed):
-    """Distances from a cell, against those of places on its border."""
+def test_distances_from_requested_cells(cell, angle, seed):
+    """Distances from a cell agree with distances from points on its border."""
     own = observed_cells._RequestedCells.from_cells([cell])
     edge = sky.cell_corners(ORDER, [cell])[0]
     rng = np.random.default_rng(seed)

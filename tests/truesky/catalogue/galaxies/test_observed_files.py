@@ -1,4 +1,4 @@
-"""Files of galaxies by where they are seen: a run that is killed goes on, and makes what an undisturbed one makes."""
+"""Files of galaxies by observed position: an interrupted run resumes and gives the same result."""
 
 import os
 import signal
@@ -22,7 +22,7 @@ def galaxies_of(root):
 
 
 def killed_at(root, number):
-    """A run that is killed while it draws the galaxies of its n-th file."""
+    """Run a build that is killed while it draws the galaxies of its n-th file."""
     step, begun = galaxies_of(root), []
 
     def work(lake, facts):
@@ -36,7 +36,7 @@ def killed_at(root, number):
 
 
 def made(root):
-    """How many files a run draws, and what the version is."""
+    """Return the number of files that a run draws, and the key of the version."""
     step, begun = galaxies_of(root), []
 
     def work(lake, facts):
@@ -50,7 +50,7 @@ def made(root):
 
 @pytest.mark.nightly
 def test_a_run_that_is_killed_goes_on_with_the_same_galaxies(tmp_path):
-    """Where four files meet, each of which draws what lies about it: every galaxy is in one of them."""
+    """Four files that meet at a corner and draw each other's surroundings: every galaxy is in exactly one of them."""
     drawn, wanted, version = made(tmp_path / "whole")
     assert drawn == 4
     for number in (1, 3):

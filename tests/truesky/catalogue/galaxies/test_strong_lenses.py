@@ -72,7 +72,7 @@ def test_the_deflection_diverges_as_the_convergence():
     [(Lens(1.2, 0.7, 30.0), 0.02, 0.03), (Lens(1.5, 0.6, 120.0), 0.5, 0.1), (Lens(0.9, 0.8, 0.0), -0.2, 0.4)],
 )
 def test_rays_end_at_the_analytic_images(lens, east, north):
-    """A small source: one spot an image, where it must be, with the flux of its magnification."""
+    """A small source has one spot per image, at the expected position and with the flux of its magnification."""
     picture = strong_lenses.shoot_rays(lens, Disc(east, north, 0.02, 1.0, 0.0), STAMPS, SIDE)
     found = strong_lenses.image_positions(lens, east, north)
     mu = np.abs(strong_lenses.magnification(lens, found[:, 0], found[:, 1]))
@@ -94,7 +94,7 @@ def test_finer_rays_do_not_change_the_picture():
     assert np.abs(coarse - fine).sum() < 5e-3 * fine.sum()
 
 
-def test_far_away_from_the_lens_nothing_is_magnified():
+def test_magnification_is_1_far_from_the_lens():
     weak = strong_lenses.shoot_rays(Lens(1e-3, 0.8, 0.0), Disc(0.4, 0.3, 0.3, 0.5, 30.0), STAMPS, SIDE)
     assert weak.sum() == pytest.approx(1.0, abs=3e-3)
     middle = ndimage.center_of_mass(weak)
@@ -109,7 +109,7 @@ def test_einstein_radius_of_a_massive_galaxy():
 
 @pytest.fixture(scope="module")
 def systems(drawn):
-    """Many times as many as there are, in the cells that were drawn."""
+    """Draw many more lenses than in nature in the cells that were drawn."""
     index = drawn.rows["_healpix_29"].to_numpy() >> 2 * (sky.MAX_ORDER - 8)
     found = [
         strong_lenses.draw(cell, drawn.rows.filter(pa.array(index == cell)), SEED, BOOST) for cell in drawn.places[:8]
@@ -135,7 +135,7 @@ def test_dispersions_are_those_of_nearby_galaxies(flat_sky):
 
 
 def signal_to_noise(stamp, mag):
-    """Of arcs over the best choice of pixels, as Collett 2015 observes with Euclid."""
+    """Return the signal-to-noise ratio of arcs over the best choice of pixels, as Collett 2015 does for Euclid."""
     side = int(np.sqrt(len(stamp)))
     picture = np.reshape(stamp, (side // 2, 2, side // 2, 2)).sum((1, 3))
     picture = ndimage.gaussian_filter(picture, 0.18 / 2.3548 / 0.1)

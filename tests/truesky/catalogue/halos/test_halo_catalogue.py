@@ -1,4 +1,4 @@
-"""An external halo light-cone in place of ours: a synthetic one, and what is refused."""
+"""The user's halo light-cone replaces the drawn halos: a synthetic one, and refused ones."""
 
 import numpy as np
 import pyarrow as pa
@@ -35,7 +35,7 @@ def own_cache(tmp_path, monkeypatch):
 
 
 def synthetic(number=2000):
-    """Made up: massive halos spread over one generation cell and its surroundings."""
+    """Return synthetic massive halos in one generation cell and its surroundings."""
     rng = np.random.default_rng(8)
     _, ra, dec = sky.random_in_cell(6, CELL >> 4, number, rng)
     z = rng.uniform(0.1, 1.5, number)
@@ -84,7 +84,7 @@ def test_galaxies_live_in_them_and_none_is_lost_between_cells(tmp_path):
     own, host = (np.concatenate([getattr(part, name) for part in parts]) for name in ("id", "halo_id"))
     known = np.concatenate([part.halos.id for part in parts])
     assert np.unique(own).size == own.size > known.size
-    # Of halos of the file there are none outside these cells.
+    # There are no halos of the file outside these cells.
     assert np.isin(host, known).all()
 
 
@@ -98,7 +98,7 @@ def broken(key, row, value):
     ("values", "said"),
     [
         (broken("ra", 4, np.nan), r"column ra \(ra\) of row 5 is nan"),
-        (broken("mass", 9, 1e13 / 1e10), r"column mass \(log_mass\) of row 10 is 3, wanted in \[8, 16.5\]"),
+        (broken("mass", 9, 1e13 / 1e10), r"column mass \(log_mass\) of row 10 is 3, must be in \[8, 16.5\]"),
         (broken("z", 0, -0.1), r"column z \(z_true\) of row 1 is -0.1"),
         (broken("halo_id", 7, synthetic(100)["halo_id"][2]), r"column halo_id of row 8 is \d+, as in row 3 of"),
         ({name: v for name, v in synthetic(100).items() if name != "mass"}, "has no column mass; it has halo_id"),
@@ -113,12 +113,12 @@ def test_a_file_in_other_units(tmp_path):
     table = Table(synthetic(100))
     table["mass"].unit = "kg"
     table.write(tmp_path / "synthetic.fits")
-    with pytest.raises(BadInput, match=r"column mass \(log_mass\) is in 'kg', the mapping says 'Msun/h'"):
+    with pytest.raises(BadInput, match=r"column mass \(log_mass\) has unit 'kg', but the mapping has 'Msun/h'"):
         loaded(tmp_path / "synthetic.fits")
-    # A logarithm where the mass itself is wanted.
+    # The column contains a logarithm instead of the mass.
     values = synthetic(100)
     values["mass"] = np.log10(values["mass"])
-    with pytest.raises(BadInput, match=r"column mass \(log_mass\) of row 1 is 1\.\d+, wanted"):
+    with pytest.raises(BadInput, match=r"column mass \(log_mass\) of row 1 is 1\.\d+, must be"):
         loaded(write(tmp_path / "logarithm.parquet", values))
 
 

@@ -1,4 +1,4 @@
-"""The compiled sums against the same written as formulas, one halo and one source at a time."""
+"""The compiled sums agree with independent formulas for one halo and one source at a time."""
 
 from itertools import pairwise
 
@@ -30,7 +30,7 @@ def summed(x, y, near, halo, add=None):
 
 
 def one(x, y, near, halo, circle=sums.CLOSE):
-    """Takada & Jain's profile less the kernel that makes up for it."""
+    """Return the profile of Takada & Jain minus its compensating kernel."""
     size, c, wide = halo[sums.SIZE], halo[sums.CONCENTRATION], halo[circle]
     dx, dy = x - halo[sums.X], y - halo[sums.Y]
     strength = halo[sums.AMPLITUDE] * max(1 - halo[sums.CHI] * near, 0.0)
@@ -51,7 +51,7 @@ def one(x, y, near, halo, circle=sums.CLOSE):
 
 @pytest.fixture
 def sky(rng):
-    """Sources and halos of a piece of the sky."""
+    """Return sources and halos in a piece of the sky."""
     x, y = ARCMIN * rng.uniform(-1.5, 1.5, (2, 40))
     near = np.sort(1 / rng.uniform(300, 3000, 40))
     halo = halos(*(ARCMIN * rng.uniform(-15, 15, (2, 60))), np.sort(rng.uniform(200, 2500, 60)))
@@ -67,7 +67,7 @@ def test_sums_are_those_of_the_formulas(sky):
 
 
 def test_the_smooth_part_is_the_rest(sky):
-    """Of halos that are made up for within theta_c, what is left of those that are within theta_s."""
+    """The smooth part is the lensing compensated within theta_c minus the lensing compensated within theta_s."""
     sources, halo = sky
     rest = summed(*sources, halo, sums.add_smooth)
     wanted = [sum(one(*source, column, sums.WIDE) for column in halo.T) for source in zip(*sources, strict=True)]
@@ -76,8 +76,8 @@ def test_the_smooth_part_is_the_rest(sky):
 
 
 @pytest.mark.parametrize("circle", [sums.CLOSE, sums.WIDE])
-def test_a_halo_and_what_makes_up_for_it_have_no_mass(circle):
-    """Within 1e-6 of its own; and beyond there is neither convergence nor shear nor deflection."""
+def test_a_compensated_halo_has_no_total_mass(circle):
+    """The total is 0 within 1e-6 of the halo's mass; there is no convergence, shear or deflection beyond."""
     halo = halos(0, 0)
     end = halo[circle, 0]
     halo[sums.CLOSE] = end
@@ -102,7 +102,7 @@ def test_behind_a_centre_everything_is_finite():
 
 
 @pytest.mark.parametrize("add", [None, sums.add_smooth])
-def test_what_is_in_front_is_not_lensed(add):
+def test_sources_in_front_are_not_lensed(add):
     near = np.array([0.5, 1.0, 1.0 + 1e-12, 2.0]) / CHI
     found = summed(np.full(4, ARCMIN), np.zeros(4), near, halos(0, 0), add)
     assert found[0, 0] > 5e-4
@@ -110,7 +110,7 @@ def test_what_is_in_front_is_not_lensed(add):
 
 
 def test_a_source_alone_is_the_same_as_with_others(rng):
-    """Bit by bit: halos that reach the others only leave no trace."""
+    """The bits are identical: halos that only reach other sources have no effect."""
     x, y = ARCMIN * rng.uniform(-1.5, 1.5, (2, 50))
     near = np.sort(1 / rng.uniform(300, 3000, 50))
     halo = halos(*(ARCMIN * rng.uniform(-25, 25, (2, 300))), np.sort(rng.uniform(200, 2500, 300)))
@@ -131,8 +131,8 @@ def test_convergence_and_shear_are_derivatives_of_the_deflection():
             assert (xx, xy, yx, yy) == pytest.approx(expected, rel=1e-4, abs=1e-8)
 
 
-def test_between_nodes_a_smooth_field_is_what_it_is(rng):
-    """A cubic in the plane, linear in 1 / distance; nearer than the nearest plane there is nothing."""
+def test_a_smooth_field_is_interpolated_exactly(rng):
+    """A cubic in the plane that is linear in inverse distance; there is no lensing nearer than the nearest plane."""
     side, step, planes = 9, 0.5, np.array([0.0, 0.3, 1.0])
     at = step * (np.arange(side) - (side - 1) / 2)
     y, x = np.meshgrid(at, at, indexing="ij")

@@ -1,4 +1,4 @@
-"""Halos: mass function, completeness and bias, and the cells that they lie in."""
+"""Halos: mass function, completeness and bias, and their cells."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ def model(universe):
 
 @pytest.mark.parametrize("order", halos.LEVELS)
 def test_a_reach_never_leads_beyond_the_cells_about(order, rng):
-    """Cells everywhere, positions at random inside them, steps in any direction."""
+    """Cells everywhere on the sky, random positions inside them, and steps in any direction."""
     for cell in rng.integers(0, 12 << 2 * order, 30).tolist():
         _, ra, dec = sky.random_in_cell(order, cell, 300, rng)
         angle, length = 2 * np.pi * rng.random(300), np.degrees(halos.reach(order))
@@ -33,7 +33,7 @@ def test_a_reach_never_leads_beyond_the_cells_about(order, rng):
 
 
 def test_every_halo_has_one_level(model):
-    """Each mass bin above the limit is drawn by one order; less than one halo of the sky is too wide for all."""
+    """Each mass bin above the limit is drawn by one order; less than one halo of the sky is larger than any level."""
     wanted = model.log_mass[None, 1:] >= (model.lowest - model.matching.occupation.depth)[:, None]
     left_out = wanted & (model.level == -1)
     expected = np.sum(np.where(left_out, model.number, 0.0) * model.steps.volume[:, None]) * 4 * np.pi
@@ -58,7 +58,7 @@ def test_halos_lie_in_their_cell(model, order):
 
 @pytest.mark.parametrize("order", halos.LEVELS)
 def test_halos_above_a_mass_are_the_same_to_any_limit(model, order):
-    """What is drawn for lensing, whatever the request asks of its galaxies."""
+    """Halos for lensing do not depend on the request's limit for galaxies."""
     least = np.where(model.steps.z < 1.5, 12.0, np.inf)
     every, few = halos.draw(model, SEED, order, 70, least), halos.draw(model, SEED, order, 70)
     shallow = dataclasses.replace(model, limit=model.limit + 1.0, far=2000.0)
@@ -74,8 +74,8 @@ def test_halos_above_a_mass_are_the_same_to_any_limit(model, order):
         assert getattr(kept, name).tobytes() == getattr(both, name)[complete].tobytes()
 
 
-def test_the_fullest_block_has_room_for_its_numbers(model):
-    """Means of blocks at the densest place of the box, against what identifiers hold: for any limit and redshift.
+def test_identifiers_can_number_the_fullest_block(model):
+    """Mean numbers in blocks at the densest place of the box fit into identifiers, for any limit and redshift.
 
     Significance 1e-9 for one block (6 standard errors): the sample is every block of the sky.
     """

@@ -1,4 +1,4 @@
-"""Nothing is lost and nothing is there twice at any edge, and a cell does not depend on what else is drawn."""
+"""Satellites are not lost or duplicated at any edge, and a cell does not depend on the other drawn cells."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from lake_schema import ids, sky
 from truesky.catalogue.halos import halos, population, satellites
 from truesky.catalogue.halos.population import CellCache
 
-# A block of four cells at an edge of an order-5 cell and of a base cell, and what lies about it.
+# A block of four cells at an edge of an order-5 cell and of a base cell.
 BLOCK = [4 * ((3 << 16) // 4 - 1) + i for i in range(4)]
 
 
@@ -18,7 +18,7 @@ def block(universe):
 
 
 def falling_in(universe, block):
-    """Identifiers of all satellites of all halos near, wherever they fall: of those that fall into the block."""
+    """Return the identifiers of all satellites of nearby halos that are inside the block."""
     drawn = CellCache(universe.population)
     found_in = []
     for order in halos.LEVELS:
@@ -52,7 +52,7 @@ def test_satellites_are_neither_lost_nor_doubled(universe, block):
 @pytest.mark.parametrize(
     ("ra", "dec"), [((45, 135, 225, 315), 89.9), ((45, 135, 225, 315), -89.9), ((359.9, 0, 0.1), 0.1)]
 )
-def test_nor_at_a_pole_or_across_the_first_meridian(universe, ra, dec):
+def test_satellites_at_a_pole_and_across_the_first_meridian(universe, ra, dec):
     places = sorted({int(cell) for cell in sky.cell_at(np.array(ra, float), np.full(len(ra), dec), 8)})
     drawn = CellCache(universe.population)
     found = satellites_of([population.members(drawn, cell) for cell in places])
@@ -60,7 +60,7 @@ def test_nor_at_a_pole_or_across_the_first_meridian(universe, ra, dec):
     assert np.array_equal(found, falling_in(universe, places))
 
 
-def test_some_satellites_live_next_door(block):
+def test_some_satellites_are_in_neighbouring_cells(block):
     for cell, members in block.items():
         home = (members.id >> 40) & ((1 << 20) - 1)
         assert np.all(home[members.kind == 0] == cell)
@@ -73,7 +73,7 @@ def test_members_lie_in_their_cell_sorted(block):
         assert np.all(members.index >> 2 * (29 - 8) == cell)
         assert np.all(np.diff(members.index) >= 0)
         assert np.array_equal(sky.healpix_29(members.ra, members.dec), members.index)
-        # What tells a galaxy from its halo is its kind and its member.
+        # The identifiers of a galaxy and its halo differ in kind and member.
         own = members.id & ((1 << 60) - 1)
         member = own - members.halo_id
         assert np.all(member[members.kind == 0] == 0)

@@ -1,4 +1,4 @@
-"""Closed forms against integrals along the line of sight."""
+"""Closed forms agree with integrals along the line of sight."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ def surface(x, c):
 
 
 def enclosed(x, c):
-    """Of each shell of radius r = x exp(w^2) what the cylinder holds, and all of what is nearer than x."""
+    """Mass in the cylinder: the fraction of each shell of radius r = x exp(w^2) inside it, plus all mass inside x."""
 
     def shell(w):
         r, q = x * np.exp(w * w), np.exp(-2 * w * w)
@@ -52,7 +52,7 @@ def test_no_seam_at_the_centre(x):
 
 
 @pytest.mark.parametrize("c", [1.0, 1.5, 10.0, 60.0])
-def test_all_of_the_mass_is_inside_and_nothing_is_seen_at_the_edge(c):
+def test_enclosed_mass_is_total_and_surface_density_is_0_at_the_edge(c):
     near_edge, mass = projected_nfw.profile(c * (1 - 1e-12), c)
     assert mass == pytest.approx(projected_nfw.total(c), rel=1e-9)
     assert abs(near_edge) < 1e-5

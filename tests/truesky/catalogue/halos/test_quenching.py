@@ -46,7 +46,7 @@ def test_satellites_of_a_luminosity(m_r, fraction):
 
 
 def test_centrals_of_clusters_are_red():
-    """Four in five or more at any z < 1.2; those of halos like the Milky Way's seldom."""
+    """Four in five or more at any z < 1.2; central galaxies of halos like the Milky Way's are rarely red."""
     for z in (0.2, 0.6, 1.0):
         cluster, milky_way = odds(members(z, np.array([13.8, 12.0])))
         assert cluster > 0.8

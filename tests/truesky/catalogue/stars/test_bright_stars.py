@@ -100,11 +100,11 @@ def test_the_fits_form_says_the_same(tmp_path):
 @pytest.mark.parametrize(
     ("records", "words"),
     [
-        ([MEAN, record(bt=" 9.x00")], "record 2: '9.x00' is no number .1 like it"),
+        ([MEAN, record(bt=" 9.x00")], "record 2: '9.x00' is not a number .1 bad record"),
         ([MEAN, record(dec=" 92.23184345")], "record 2 lies at 2.3175, 92.2318"),
-        ([record(vt="   nan")], "record 1: 'nan' is no number"),
+        ([record(vt="   nan")], "record 1: 'nan' is not a number"),
         ([MEAN, MEAN[:100]], "Expected 32 columns"),
-        (["a,b,c"], "records of 1 fields, wanted 32"),
+        (["a,b,c"], "records have 1 fields between bars, must have 32"),
         ([MEAN + " " * 1000 + "|" * 5000], "the first record has 1000 characters or more"),
     ],
 )

@@ -21,7 +21,7 @@ TYPES = spectra.templates()
 def test_counts(b, rng):
     """L and T dwarfs over 100 deg2 along one line of sight.
 
-    Sample of all of them; significance 3e-3 for the largest number (3 standard errors), or 20 %.
+    Sample of the total number; significance 3e-3 for the largest number (3 standard errors), or 20 %.
     """
     found = brown_dwarfs.draw(DWARFS, GALAXY, 90.0, float(b), 100.0, 30.0, rng)
     m_j = TYPES.abs_mag_j[found.template] + 5 * np.log10(found.distance) - 5
@@ -33,7 +33,7 @@ def test_counts(b, rng):
 
 
 def test_numbers_are_those_that_are_drawn(rng):
-    """Sample of 50 deg2, and of ten times as many; significance 6e-7 (5 standard errors)."""
+    """Samples of 50 deg2 and of 500 deg2; significance 6e-7 (5 standard errors)."""
     place = (90.0, 40.0, 50.0, 24.0)
     expected = brown_dwarfs.expected_counts(
         DWARFS, GALAXY, *(np.array([v]) for v in place[:2]), 50.0, np.array([24.0])
@@ -51,7 +51,7 @@ def test_all_templates_take_part(rng):
     assert np.bincount(found.template, minlength=365).min() > 0
 
 
-def test_templates_have_the_colours_that_are_said():
+def test_templates_have_the_stated_colours():
     """J - H of the spectra themselves."""
     library = templates.stellar_library()
     assert library.names[DWARFS.first_template : DWARFS.first_template + 365] == spectra.template_names()
@@ -64,7 +64,7 @@ def test_templates_have_the_colours_that_are_said():
     assert mags[0] - mags[1] == pytest.approx(TYPES.abs_mag_j - TYPES.abs_mag_h, abs=2e-3)
 
 
-def test_a_boost_is_written_beside_each_dwarf_and_changes_no_other_star(dust):
+def test_rows_contain_the_boost_and_other_stars_do_not_change(dust):
     cell = 402_512
     plain, boosted, none = (
         stars.draw(cell, SEED, stars.model(22.0, brown_dwarf_boost=boost), dust) for boost in (1.0, 50.0, 0.0)

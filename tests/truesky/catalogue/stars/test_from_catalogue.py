@@ -1,4 +1,4 @@
-"""Stars of another model instead of ours: a Besancon output, its columns named in the request."""
+"""Stars of another model replace the drawn stars: a Besancon output whose columns the request names."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ COLUMNS = {
     "age_class": "Age",
     "luminosity_class": "CL",
 }
-# What the model's server writes: a preamble, titles, stars, and words at the end.
+# Output of the model's server: a preamble, column names, stars, and text at the end.
 BESANCON = """ Simulation of a field
  l =  283.7 b = 37.9
   Dist    Mv  CL Typ   LTef  logg Age   H       J-H  [Fe/H]    l         b        Av
@@ -65,7 +65,7 @@ def test_a_besancon_output(tmp_path):
     assert np.all(np.diff(found.index) >= 0)
 
 
-def test_commas_and_fits_say_the_same(tmp_path):
+def test_comma_separated_and_fits_tables_give_the_same_stars(tmp_path):
     rows = [line.split() for line in BESANCON.splitlines()[2:-1]]
     text = loaded(written(tmp_path / "field.resu"))
     commas = loaded(written(tmp_path / "field.csv", "\n".join(", ".join(row) for row in rows)))
@@ -83,10 +83,10 @@ def test_commas_and_fits_say_the_same(tmp_path):
     [
         (("3.763", "9.999"), r"LTef \(log_teff\) of row 1 is 9.999, not in \[2.4, 5\] \(1 of 4 rows like it\)"),
         (("12.005", "nan   "), r"H \(mag_h_seen\) of row 1 is nan"),
-        (("18.020", "18.x20"), r"H of row 2 is '18.x20', no number"),
-        (("  Dist ", "  Far  "), "lines holds the titles"),
-        (("  Dist ", "\n" * 10_000 + "  Dist "), "none of the first 10000 lines holds the titles"),
-        (("  Mv ", " Av "), "the title Av stands twice"),
+        (("18.020", "18.x20"), r"H of row 2 is '18.x20', not a number"),
+        (("  Dist ", "  Far  "), "lines has the columns"),
+        (("  Dist ", "\n" * 10_000 + "  Dist "), "none of the first 10000 lines has the columns"),
+        (("  Mv ", " Av "), "the column name Av must not occur twice"),
     ],
 )
 def test_bad_tables_are_named(tmp_path, change, words):
@@ -99,10 +99,10 @@ def test_bad_tables_are_named(tmp_path, change, words):
     ("columns", "words"),
     [
         ({**COLUMNS, "colour": "J-H"}, "columns.colour is not one of ra, dec"),
-        ({k: v for k, v in COLUMNS.items() if k != "l"}, "wants one of ra and l"),
-        ({**COLUMNS, "ra": "ra"}, "wants one of ra and l"),
-        ({k: v for k, v in COLUMNS.items() if k != "a_v"}, "mag_h_seen wants a_v"),
-        ({**{k: v for k, v in COLUMNS.items() if k != "l"}, "ra": "l"}, "wants ra and dec, or l and b"),
+        ({k: v for k, v in COLUMNS.items() if k != "l"}, "must have one of ra and l"),
+        ({**COLUMNS, "ra": "ra"}, "must have one of ra and l"),
+        ({k: v for k, v in COLUMNS.items() if k != "a_v"}, "mag_h_seen requires a_v"),
+        ({**{k: v for k, v in COLUMNS.items() if k != "l"}, "ra": "l"}, "must have ra and dec, or l and b"),
     ],
 )
 def test_bad_mappings_are_named(columns, words):
@@ -132,7 +132,7 @@ def test_they_become_the_table(lake, tmp_path):
     assert build_stars.steps(lake, asked(other))[0].plan.key != version.key
 
 
-def test_what_a_table_does_not_say_is_null_and_dust_is_ours(tmp_path, dust):
+def test_missing_columns_are_null_and_dust_is_computed(tmp_path, dust):
     columns = {"ra": "l", "dec": "b", "mag_h": "H", "teff": "T"}
     path = written(tmp_path / "few.txt", "l b H T\n53.1 -27.8 20.0 5000\n53.2 -27.9 21.0 4000\n")
     universe = stars.model(26.0, brown_dwarf_boost=0.0, catalogue=loaded(path, columns))

@@ -1,4 +1,4 @@
-"""What Gaia lists of the stars: the published errors, the same star alike wherever it lies, no star lost at an edge."""
+"""Gaia's measurements: published errors, the same result for a star in any file, no star lost at an edge."""
 
 import numpy as np
 import pyarrow as pa
@@ -66,7 +66,7 @@ def test_errors_of_parallax(g, published):
 @pytest.mark.parametrize(
     ("g", "parallax_mas", "g_mag"), [(15.0, 0.037, 8.5e-4), (17.0, 0.098, 2e-3), (20.0, 0.765, 0.01)]
 )
-def test_what_is_measured_has_the_errors_that_are_said(g, parallax_mas, g_mag):
+def test_measurements_have_the_stated_errors(g, parallax_mas, g_mag):
     """Sample of 20,000 stars; significance 6e-7 of means (5 standard errors); errors within 5 %."""
     n = 20_000
     stars, flux = stars_of(np.full(n, g))
@@ -124,7 +124,7 @@ def test_a_star_without_a_distance_has_no_parallax():
 
 
 @given(st.sets(st.integers(0, 199), min_size=1), st.integers(0, 5))
-def test_a_star_is_measured_alike_among_any_others(chosen, seed):
+def test_a_measurement_does_not_depend_on_other_stars(chosen, seed):
     stars, flux = stars_of(np.linspace(10.0, 21.5, 200))
     whole = gaia.observe(stars, flux, seed)
     rows = pa.array(sorted(chosen))
@@ -143,7 +143,7 @@ def test_near_a_pole_positions_stay_on_the_sky():
 
 # ------------------------------------------------------------------------------------------------ the job
 
-# Two cells meet here, and every star is within 2 mas of their edge, at G = 21, where the error is as large.
+# Two cells meet here. Every star is within 2 mas of their edge at G = 21, where the error has this size.
 EDGE = 1607, 1608
 BANDS = list(gaia.BANDS)
 
@@ -200,7 +200,7 @@ def built(lake):
     return read.version(lake, "gaia")
 
 
-def test_the_job_lists_every_star_once_though_many_are_measured_in_another_cell(lake):
+def test_stars_measured_in_another_cell_are_listed_once(lake):
     index = filled(lake)
     version = built(lake)
     rows = version.rows()
@@ -243,7 +243,7 @@ def test_files_under_gaia_s_own_names(lake, tmp_path, capsys):
     assert not (tmp_path / "g.csv").exists()
 
 
-def test_what_it_must_have_is_named(lake):
+def test_missing_inputs_are_named(lake):
     with pytest.raises(BadInput, match="no table stars"):
         build_gaia.steps(lake, asked())
     filled(lake)
@@ -263,7 +263,7 @@ def test_what_it_must_have_is_named(lake):
 
 
 def test_proper_motions_change_no_other_column():
-    """Each quantity has random numbers of its own, so stars without proper motions are listed alike."""
+    """Each quantity has separate random numbers, so that stars without proper motions are measured in the same way."""
     stars, flux = stars_of(np.linspace(10.0, 21.5, 200))
     listed = gaia.observe(stars, flux, 7)
     moved = pa.array(np.linspace(-900.0, 900.0, 200, dtype=np.float32))
@@ -280,7 +280,7 @@ def test_proper_motions_change_no_other_column():
 
 @pytest.mark.parametrize(("g", "published"), [(15.0, 0.06), (17.0, 0.2), (20.0, 1.2)])
 def test_errors_of_proper_motions(g, published):
-    """mas/yr, Lindegren et al. 2018, and errors that are those said and correlated with nothing.
+    """mas/yr, Lindegren et al. 2018; measurements have the stated errors, not correlated with other quantities.
 
     Sample of 20,000 stars; significance 6e-7 of correlations (5 standard errors).
     """
@@ -325,7 +325,7 @@ def test_names_of_dr3_in_its_order_and_fluxes_that_are_the_magnitudes(lake, tmp_
         assert flux[known] / table[f"phot_{band}_mean_flux_error"][known] == pytest.approx(over, rel=1e-5)
 
 
-def test_carried_to_another_epoch_stars_are_where_astropy_carries_them(lake, tmp_path):
+def test_positions_at_another_epoch_agree_with_astropy(lake, tmp_path):
     filled(lake)
     rows = built(lake).rows()
     export_gaia.export(lake, tmp_path / "moved.fits", epoch=2027.5)

@@ -1,4 +1,4 @@
-"""Velocities: as astropy turns the same velocities, with the populations' dispersions, and Oort's rotation."""
+"""Velocities agree with astropy's rotations, the populations' dispersions, and Oort's constants."""
 
 import numpy as np
 import pytest
@@ -48,8 +48,8 @@ def test_towards_the_pole_and_the_centre_the_ellipsoid_is_seen(component, age):
     assert (km_s * inwards).mean() == pytest.approx(SUN["motion"][0], abs=0.04 * ELLIPSOIDS["towards_centre"][k])
 
 
-def test_the_disc_turns_as_oort_s_constants_say():
-    """Of a flat curve A = -B = V / 2 R: 14.6 km/s/kpc, 15.3 and -11.9 observed (Bovy 2017)."""
+def test_the_disc_rotates_with_oort_s_constants():
+    """A flat rotation curve has A = -B = V / 2 R: 14.6 km/s/kpc; 15.3 and -11.9 are observed (Bovy 2017)."""
     lon = np.arange(0.0, 360.0, 5.0)
     n, far = lon.size, 50.0
     none, thin = np.zeros((3, n)), np.zeros(n, int)

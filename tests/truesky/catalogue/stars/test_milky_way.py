@@ -1,4 +1,4 @@
-"""Star counts of the Milky Way against independent sums, and the labels of what is drawn."""
+"""Star counts of the Milky Way against independent sums, and the labels of drawn stars."""
 
 import dataclasses
 
@@ -47,7 +47,7 @@ def mean_counts(b):
 
 @pytest.mark.parametrize("b", COUNTS)
 def test_star_counts(b):
-    """Counts of the same laws, summed once by a code of its own from other isochrones, without white dwarfs (5 %)."""
+    """Counts of the same laws, summed once by an independent program from other isochrones, no white dwarfs (5 %)."""
     found = mean_counts(b)
     assert found == pytest.approx(COUNTS[b], rel=0.13)
     assert np.all(found > COUNTS[b])
@@ -66,7 +66,7 @@ def test_numbers_are_the_sum_of_what_is_expected(galaxy, lon, lat, limit):
 
 @given(GALAXIES, st.floats(0.0, 360.0), st.floats(20.0, 60.0), st.floats(0.1, 10.0), st.floats(5.0, 30.0))
 def test_there_are_fewer_stars_away_from_the_plane(galaxy, lon, lat, step, limit):
-    """Not so about the poles, which are nearer to the Galactic centre than the anticentre's side of them."""
+    """This does not hold around the poles, which are closer to the Galactic centre than the anticentre side of them."""
     near, far = mw.expected_counts(galaxy, np.array([lon] * 2), np.array([lat, lat + step]), 1.0, np.array([limit] * 2))
     assert 0.0 < far < near < np.inf
 
@@ -106,7 +106,7 @@ def test_nothing_expected_nothing_drawn(rng):
 
 
 def test_labels(rng):
-    """The thin disc of every age, the others of one; metallicities as the populations are said to have."""
+    """The thin disc has every age, other components have one age; metallicities follow the populations' parameters."""
     sample = mw.draw(GALAXY, mw.expected_per_bin(GALAXY, 90.0, 60.0, 10.0, 24.0), rng, rng)
     born = sample.stage != WHITE_DWARF
     for code, mean, scatter in ((mw.THIN, -0.10, 0.2), (mw.THICK, -0.60, 0.3), (mw.HALO, -1.50, 0.4)):
@@ -124,7 +124,7 @@ def test_labels(rng):
 
 
 def test_the_halo_turns_off_where_it_is_observed(rng):
-    """Its hottest main-sequence stars have 6400 to 6700 K; dwarfs of 0.2 Msun are hotter than those of the disc."""
+    """The hottest main-sequence stars have 6400 to 6700 K; dwarfs of 0.2 Msun are hotter than dwarfs of the disc."""
     sample = mw.draw(GALAXY, mw.expected_per_bin(GALAXY, 90.0, 80.0, 200.0, 20.0), rng, rng)
     halo = (sample.component == mw.HALO) & (sample.stage == 0)
     assert np.quantile(sample.teff[halo], 0.98) == pytest.approx(6500, abs=200)
@@ -152,10 +152,10 @@ def test_white_dwarfs_are_few():
     assert 0.005 < np.mean(sample.stage == WHITE_DWARF) < 0.05
 
 
-def test_the_bulge_where_it_is_looked_at():
-    """Msun deg^-2, of 1.5e10 in all (../milky_way.toml): 4.8e7 at (1, -4), 1.5e7 at (0, -6), 1.6e6 at (10, -10).
+def test_the_mass_of_the_bulge_along_lines_of_sight():
+    """Msun deg^-2, of 1.5e10 in total (../milky_way.toml): 4.8e7 at (1, -4), 1.5e7 at (0, -6), 1.6e6 at (10, -10).
 
-    Sums of the same law by a code of its own; there are more on the side of the bar's near end.
+    Sums of the same law by an independent program; there are more stars on the side of the bar's near end.
     """
     own = GALAXY.pieces
     weight = np.where(own.stage == WHITE_DWARF, 0.6, 10.0 ** own.log_mass.mean(0)) * own.number

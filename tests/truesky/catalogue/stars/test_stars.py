@@ -118,7 +118,7 @@ def test_stars_are_what_their_templates_are(cell):
     assert np.quantile(np.abs(off), 0.99) < 0.003
 
 
-def test_companions_are_beside_their_stars(cell):
+def test_companions_are_close_to_their_stars(cell):
     rows = {name: cell[name].to_numpy(zero_copy_only=False) for name in cell.column_names}
     second = np.flatnonzero(cell["companion_of"].is_valid().to_numpy())
     place = {int(one): k for k, one in enumerate(rows["id"])}
@@ -136,7 +136,7 @@ def test_companions_are_beside_their_stars(cell):
 
 
 def test_stars_move_as_their_populations_do(cell):
-    """km/s: of the discs and of the halo, whose stars are slow behind the Sun."""
+    """Mean velocities (km/s) of discs and halo; halo stars lag behind the Sun."""
     across = 4.74e-3 * np.hypot(cell["pm_ra"].to_numpy(), cell["pm_dec"].to_numpy()) * cell["distance"].to_numpy()
     component = cell["component"].to_numpy()
     speeds = [np.median(across[component == code]) for code in (0, 1, 2)]
@@ -145,7 +145,7 @@ def test_stars_move_as_their_populations_do(cell):
     assert 90 < cell["radial_velocity"].to_numpy()[component == 2].std() < 140
 
 
-def test_before_the_bulge_there_are_more_stars(dust):
+def test_there_are_more_stars_towards_the_bulge(dust):
     """H < 17 at l = 0, b = -8, where every seventh giant of the bulge is seen; and none at l = 180."""
     universe = stars.model(26.0, plane_limit=17.0)
     rows = stars.draw(galactic_cell(0.0, -8.0), SEED, universe, 0 * dust)
@@ -178,7 +178,7 @@ def test_the_plane_is_refused_or_has_its_own_limit():
     assert [bool(stars._is_crowded(*at)) for at in ((0.0, 10.5), (21.0, 6.0), (340.5, -9.5))] == [False, False, True]
     with pytest.raises(BadInput, match=r"1 of the area's cells lie within 5 deg .* stars\.plane_limit"):
         stars.expected_counts([high, low], UNIVERSE)
-    with pytest.raises(BadInput, match=r"1 of the area's cells hold more than .* brighter stars\.plane_limit"):
+    with pytest.raises(BadInput, match=r"1 of the area's cells contain more than .* brighter stars\.plane_limit"):
         stars.expected_counts([high, low], stars.model(26.0, plane_limit=26.0))
     high_alone = stars.expected_counts([high], UNIVERSE)
     both = stars.expected_counts([high, low], stars.model(26.0, plane_limit=18.0))

@@ -87,7 +87,7 @@ def test_pieces_are_the_mass_function_cut_at_the_bins(tracks):
         heaviest = 10 ** tracks.log_mass[k, -1]
         lightest = 10 ** tracks.log_mass[k, 0]
         wanted = systems_between(lightest, heaviest) * share[k]
-        # But for the helium flash, and what is brighter or fainter than all bins.
+        # Except for the helium flash, and for stars outside all bins.
         assert own == pytest.approx(wanted, rel=0.003)
     low, high = EDGES[found.bin], EDGES[found.bin + 1]
     assert np.all(found.m_h > low - 1e-9)
