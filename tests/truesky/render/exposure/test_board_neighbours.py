@@ -51,7 +51,7 @@ def rendered(camera, others, mission=MISSION, detector=None, own=((), ())):
     light = fluxes(points, band, 3e6 / (10 ** (0.4 * (27.0 - 23.9)) * SECONDS))
     tables = none, fluxes(none, band, []), points, light
     shown = detector or small(camera, name, SIDE)
-    return fields.rendered(exposed(camera), shown, tables, mission, SURVEY, forced=QUIET, beside=others, truth=())
+    return fields.rendered(exposed(camera), shown, tables, mission, SURVEY, forced=QUIET, neighbours=others, truth=())
 
 
 @cache

@@ -88,7 +88,7 @@ def rendered(distance, flux=1e6, drawn=None, found=True, **shape):
             Catalogue(body, cells, wanted), Catalogue(light, cells, wanted), task, [], [BAND], FARTHER, least
         )
     tables = body, light, nothing, fluxes(nothing, BAND, 1.0)
-    return fields.rendered(exposed, DETECTOR, tables, MISSION, SURVEY, complete=MARGIN + complete)
+    return fields.rendered(exposed, DETECTOR, tables, MISSION, SURVEY, complete_margin_arcsec=MARGIN + complete)
 
 
 def test_a_large_bright_source_fades_across_the_margin_and_never_vanishes():
