@@ -141,7 +141,7 @@ class Scene:
     chromatic_light : float32 array, shape (2, ny, nx), optional
         Light of the sources with each photon weighted by f1 and by f2, see `chromatic_response`.
     chromatic_electrons : float
-        Largest change of a pixel by `chromatic_response` in electrons.
+        Largest change of a pixel by the colours of sources, see `chromatic_response`, in electrons rms.
     sky_change : float array, shape (gy, gx), optional
         Change of the sky by a grism in electrons, on an even grid over the detector.
     neighbour_charge : NeighbourCharge, optional
