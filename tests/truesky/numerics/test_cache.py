@@ -146,7 +146,7 @@ def test_a_changed_bit_is_made_again_and_said(caplog, monkeypatch, step):
                 assert set(found["a"].tolist()) == set(found["b"].tolist()) == {2.0}, f"bit {bit} of {path}"
                 (line,) = (record.getMessage() for record in caplog.records)
                 assert str(path.parent) in line
-                assert line.endswith(": made again")
+                assert line.endswith(": computed again")
                 assert "\n" not in line
             else:
                 # White space of the list.

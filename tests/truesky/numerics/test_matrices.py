@@ -57,7 +57,7 @@ def test_stacks_of_small_matrices():
 
 
 def test_factors_that_do_not_fit_are_refused():
-    with pytest.raises(ValueError, match="do not fit"):
+    with pytest.raises(ValueError, match="do not match"):
         matrices.matmul(np.ones((2, 3)), np.ones((2, 3)))
 
 

@@ -90,5 +90,5 @@ def test_poisson(mean):
 
 
 def test_another_number_of_sources_is_refused():
-    with pytest.raises(ValueError, match="3 numbers are wanted of 2 sources"):
+    with pytest.raises(ValueError, match="size must be the number of sources, 2, got 3"):
         PerSourceGenerator(np.arange(2), 1).random(3)

@@ -194,7 +194,9 @@ def test_a_part_that_kills_its_worker_is_found_in_few_runs(monkeypatch):
     parts = [Task(f"{i:03}", {}) for i in range(1000)]
     results = submitted_job._spark_map(dict, parts, "toy", verbose=True)
     assert [result["part"] for result in results] == [part.name for part in parts]
-    assert [result for result in results if "error" in result] == [{"part": "700", "error": "its worker died"}]
+    assert [result for result in results if "error" in result] == [
+        {"part": "700", "error": "its worker ended unexpectedly"}
+    ]
     assert len(runs) <= 2 * 10 + 1
 
 
