@@ -113,7 +113,7 @@ def test_what_overlaps_is_what_models_show():
 def test_what_is_not_there_is_refused():
     tables, row, _ = crowd()
     variant = Variant(MISSION, DRAFT, {})
-    with pytest.raises(BadInput, match="exposure 1, detector DET22: no light of source 7 is drawn there"):
+    with pytest.raises(BadInput, match="exposure 1, detector DET22: source 7 has no light on the detector"):
         next(
             single_source_spectra.draw_sources(
                 Aim.from_exposure(fields.exposure(**row), STRIP), Rows(*tables), variant, 1, [7]

@@ -32,10 +32,12 @@ def apply_readout(
         Mean number of tracks on the pixels of one quadrant, 0 to 1e8.
     quantiles : float array, shape (n, 3)
         Same as in `cosmic_rays.draw_tracks`.
-    rows, columns : int
-        Rows and columns of a quadrant that are pixels.
+    rows : int
+        Rows of a quadrant that are pixels.
     prescan : int
         Columns before the pixels.
+    columns : int
+        Columns of a quadrant that are pixels.
     silicon : Traps or None
         Traps along the columns. None to ignore charge transfer inefficiency.
     rng : numpy.random.Generator
