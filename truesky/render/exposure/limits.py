@@ -28,8 +28,7 @@ def refuse_too_large(aim: Aim, light: Light) -> None:
     required = base + cost.memory(sources.electrons[on_detector], sizes[on_detector], detector.nx, detector.ny, picture)
     if required > available:
         raise BadInput(
-            f"{where} take {required / 1e9:.1f} GB, a task may use {available / 1e9:.2g}: "
-            "leave out faint sources"
+            f"{where} take {required / 1e9:.1f} GB, a task may use {available / 1e9:.2g}: leave out faint sources"
         )
     seconds = cost.seconds(sources, sizes, light.psf, detector.nx, detector.ny)
     if seconds > _MAX_SECONDS:

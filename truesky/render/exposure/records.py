@@ -30,7 +30,7 @@ class Rows:
     galaxy_fluxes, star_fluxes : Table
         Fluxes f_nu of the same rows in the band, in microjansky.
     lenses : Table, optional
-        Rows of `strong_lenses` (lensed_arcs.ARC_COLUMNS), whose sources are among the galaxies. None without strong lenses.
+        Rows of `strong_lenses` (lensed_arcs.ARC_COLUMNS), whose sources are among the galaxies. None without lenses.
     bodies : callable, optional
         Function that returns the moving bodies of a day (ephemerides.Bodies.of_day). By default the embedded
         population.
