@@ -34,8 +34,12 @@ def apply(frame: Frame, expected: float, quantiles: Frame, rng: np.random.Genera
     ----------
     frame : float array, shape (ny, nx)
         Electrons.
-    expected, quantiles, rng
+    expected : float
+        Mean number of tracks, 0 to 1e8.
+    quantiles : float array, shape (q, 3)
         Same as in `draw_tracks`.
+    rng : numpy.random.Generator
+        Random numbers of the tracks.
 
     Returns
     -------
@@ -124,8 +128,10 @@ def draw_events(count: int, ny: int, nx: int, quantiles: Frame, rng: np.random.G
         Number of tracks.
     ny, nx : int
         Rows and columns in which they start.
-    quantiles, rng
+    quantiles : float array, shape (q, 3)
         Same as in `draw_tracks`.
+    rng : numpy.random.Generator
+        Random numbers of the tracks.
 
     Returns
     -------

@@ -139,7 +139,7 @@ class PersistenceModel:
 
         Parameters
         ----------
-        delay, seconds, earlier_seconds
+        delay, seconds, earlier_seconds : float
             Same as in `released_charge`.
 
         Returns

@@ -39,8 +39,14 @@ def apply(
     ----------
     frame : float array, shape (ny, nx)
         Electrons.
-    rms, dead, dark_columns, dust, segments, rng
+    rms, dead, dark_columns : float
         Same as in `response`.
+    dust : (float, float, float)
+        Same as in `response`.
+    segments : sequence of (int, int, bool)
+        Same as in `response`.
+    rng : numpy.random.Generator
+        Random numbers of the detector, the same in every exposure.
 
     Returns
     -------

@@ -187,8 +187,14 @@ def duration(kind: str, seconds: float, section: str, mission: MissionConfigurat
 
     Parameters
     ----------
-    kind, seconds, section, mission
-        Same as in `find_mode`, which also lists the errors.
+    kind : {"photometric", "spectroscopic"}
+        Ramp of the mission.
+    seconds : float
+        Exposure time in seconds.
+    section : str
+        Section of the camera in the mission database, such as "nisp".
+    mission : MissionConfiguration
+        Mission database.
 
     Returns
     -------

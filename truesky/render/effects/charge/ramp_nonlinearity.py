@@ -55,8 +55,10 @@ def apply_signal(frame: Frame, mean: float, spread: float, rng: np.random.Genera
     ----------
     frame : float array, shape (2, ny, nx)
         Signal in electrons, and chi^2 of the ramp fit.
-    mean, spread, rng
+    mean, spread : float
         Same as in `apply`.
+    rng : numpy.random.Generator
+        Random numbers of the detector, the same in every exposure.
 
     Returns
     -------
