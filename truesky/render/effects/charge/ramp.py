@@ -200,6 +200,11 @@ def duration(kind: str, seconds: float, section: str, mission: MissionConfigurat
     -------
     float
         Time in seconds.
+
+    Raises
+    ------
+    BadInput
+        If `find_mode` finds no readout mode.
     """
     mode = find_mode(kind, seconds, section, mission)
     return seconds * mode.frames / mode.integration_frames
