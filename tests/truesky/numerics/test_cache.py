@@ -68,7 +68,7 @@ def test_key_is_of_the_content_not_of_the_memory_layout():
 
 
 @pytest.mark.parametrize("part", [None, True, {"a": 1}, np.array([object()])])
-def test_keys_refuse_what_has_no_canonical_bytes(part):
+def test_keys_refuse_unsupported_types(part):
     with pytest.raises(BadInput):
         cache.content_key(part)
 
@@ -129,8 +129,8 @@ def made_again(key, value):
 
 
 @pytest.mark.parametrize("step", [1009, pytest.param(7, marks=pytest.mark.nightly)])
-def test_a_changed_bit_is_made_again_and_said(caplog, monkeypatch, step):
-    """Of the arrays, their headers, and the list of their checksums."""
+def test_files_with_a_changed_bit_are_computed_again_with_a_warning(caplog, monkeypatch, step):
+    """Bits change in the arrays, in their headers, and in the list of checksums."""
     monkeypatch.setattr(os, "fsync", lambda descriptor: None)
     key, files = "4" * 64, 0
     made_again(key, 1.0)

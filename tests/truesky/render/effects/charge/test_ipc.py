@@ -48,7 +48,7 @@ def test_even_light_stays_as_it_is():
     np.testing.assert_array_equal(ipc.apply(frame, SIDE, DIAGONAL, RNG), frame)
 
 
-def test_what_cannot_be():
+def test_impossible_parameters_are_refused():
     with pytest.raises(OutOfRange, match="side"):
         ipc.apply(np.zeros((2, 2)), -1e-3, 0.0, RNG)
     with pytest.raises(BadInput, match="seen by others"):
