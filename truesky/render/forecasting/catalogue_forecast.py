@@ -63,9 +63,12 @@ def for_request(request: Request, factor: float = 1.0) -> list[Line]:
     """Forecast the jobs that draw catalogues for a request.
 
     External catalogues are left out, because their number of rows is not known. For sources of the user the rows are
-    counted. `factor` is the CPU time of the machine relative to the machine of the channels' costs. Tested over an area
-    that was not used to derive the costs, errors are 3 % for rows, 2 % for bytes, and 5 % (galaxies) to 30 % (fluxes)
-    for seconds, if the cache contains the results that each machine computes only once.
+    counted. `factor` is the CPU time of the machine relative to the machine of the channels' costs.
+
+    Notes
+    -----
+    Over an area that was not used to derive the costs, errors are 3 % for rows and 2 % for bytes. Errors of seconds are
+    5 % (galaxies) to 30 % (fluxes) if the cache contains the results that each machine computes only once.
     """
     cells = request.area.cells()
     rows = _drawn_rows(request, cells) if request.sources is None else _given_rows(request.sources, request.area)

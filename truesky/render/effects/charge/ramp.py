@@ -2,8 +2,8 @@
 
 A ramp has n_g groups of r reads, with d dropped frames between two groups: r n_g + d (n_g - 1) frames after the reset.
 The signal of a pixel is measured from the n = n_g - 1 differences D_i of successive groups; a group G_i is the mean
-charge of its r reads. If the counts of all frames are Poisson with f expected electrons per frame, an electron that
-arrives in the j-th frame of a group has the weight (r - j + 1) / r in that group, and::
+charge of its r reads. The counts of all frames are Poisson with f expected electrons per frame. An electron that
+arrives in the j-th frame of a group has the weight (r - j + 1) / r in that group. Therefore::
 
     mean D_i            = f (r + d)
     var D_i         a   = f (r + d) (1 + alpha),      alpha = (1 - r^2) / (3 r (r + d))
