@@ -274,7 +274,7 @@ def test_exposures_with_different_ramps_leave_persistence_in_one_another():
 
 
 def test_an_earlier_flat_had_its_own_lamp():
-    """The settings of the earlier frame determine its lamp, not those of the later frame; it is twice as bright here."""
+    """The settings of the earlier frame determine its lamp; here it is twice as bright as in the later frame."""
     flat = earlier(134.0, [], [], [], kind="flat", lamp=5)
     bright = EVEN.with_overrides({"nisp.flat.signal": (6e4, "electron")})
     found = [np.median(left(replace(flat, mission=mission))) for mission in (EVEN, bright)]
