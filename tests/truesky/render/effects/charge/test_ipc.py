@@ -51,5 +51,5 @@ def test_even_light_stays_as_it_is():
 def test_impossible_parameters_are_refused():
     with pytest.raises(OutOfRange, match="side"):
         ipc.apply(np.zeros((2, 2)), -1e-3, 0.0, RNG)
-    with pytest.raises(BadInput, match="seen by others"):
+    with pytest.raises(BadInput, match="neighbours get"):
         ipc.apply(np.zeros((2, 2)), 0.1, 0.1, RNG)
