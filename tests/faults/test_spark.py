@@ -68,7 +68,7 @@ def wanted(tmp_path_factory):
     [
         ("raise-1", "1.parquet: ValueError: row 17: no such template"),
         # Four workers die, one after the other; tests/truesky/running/test_submitted_job.py has a short version.
-        pytest.param("die-1", "1.parquet: its worker died", marks=pytest.mark.nightly),
+        pytest.param("die-1", "1.parquet: its worker ended unexpectedly", marks=pytest.mark.nightly),
     ],
 )
 def test_a_part_that_fails_is_named_and_the_rest_is_kept(run, lake, wanted, harm, words):

@@ -1,1 +1,1 @@
-"""Arithmetic that gives the same bits on every machine, compiled functions, and the cache of computed arrays."""
+"""Arithmetic with the same bits on every machine, compiled functions, and a disc cache of computed arrays."""

@@ -1,14 +1,6 @@
-"""Arrays that are costly to make and the same for every run: kept on disc, keyed by what they were made from.
+"""Store arrays that are expensive to compute on disc, keyed by the inputs of the computation.
 
-A process compares a file with its checksum before it first maps it; what differs is made again, and said so.
-
-cache_dir        where they lie
-temporary        an empty one
-machine_code_dir where compiled functions lie
-content_key      the key: sha256 of everything that goes into the making
-cached_arrays    load, or make and load
-seal, sealed     what lists a folder's files, with the checksum of each
-is_whole         is a file what it was when it was sealed?
+A process checks the checksum of a file before it first maps it. A damaged file is computed again, with a warning.
 """
 
 from __future__ import annotations
@@ -33,13 +25,16 @@ from lake_schema.store import blocks, layout, manifest
 from lake_schema.store.provenance import digest, machine
 
 _CHECKSUM_FILE, _ARRAY = "sums.json", ".npy"
-# Another process may remove what it found damaged at the moment when this one has made it again.
+# Another process may remove a damaged folder just after this one has replaced it.
 _TRIES = 3
 _KEY_LENGTH = 32
 
 
 def cache_dir() -> Path:
-    """$TRUESKY_CACHE, else $XDG_CACHE_HOME/truesky, else ~/.cache/truesky; it need not exist yet."""
+    """Return the folder of the cache: $TRUESKY_CACHE, else $XDG_CACHE_HOME/truesky, else ~/.cache/truesky.
+
+    The folder may not exist yet.
+    """
     if custom := os.environ.get("TRUESKY_CACHE"):
         return user_files.expand_path(custom)
     if home := os.environ.get("XDG_CACHE_HOME"):
@@ -49,7 +44,7 @@ def cache_dir() -> Path:
 
 @contextlib.contextmanager
 def use_temporary_dir() -> Iterator[None]:
-    """An empty cache meanwhile, which is removed afterwards."""
+    """Use an empty cache in this context, and remove it afterwards."""
     previous = os.environ.get("TRUESKY_CACHE")
     with tempfile.TemporaryDirectory(prefix="truesky-") as folder:
         os.environ["TRUESKY_CACHE"] = folder
@@ -62,9 +57,9 @@ def use_temporary_dir() -> Iterator[None]:
 
 
 def machine_code_dir() -> Path:
-    """Of numba: a folder a version of the sources, in $NUMBA_CACHE_DIR or the cache."""
+    """Return the folder for machine code of numba, in $NUMBA_CACHE_DIR or the cache, named by a key of the sources."""
     folder, key = Path(os.environ.get("NUMBA_CACHE_DIR") or cache_dir() / "numba"), sources_key()[:16]
-    # A process begun by another finds the folder named already.
+    # In a child process $NUMBA_CACHE_DIR may contain the key already.
     return folder if folder.name == key else folder / key
 
 
@@ -79,7 +74,10 @@ def sources_key(root: Path = Path(__file__).parents[1]) -> str:
 
 
 def content_key(*parts: bytes | str | int | float | Array) -> str:
-    """sha256 (hex) of the parts, each with its type, shape and length: ("ab", "c") and ("a", "bc") differ."""
+    """Return the sha256 (hex) of the parts, each with its type, shape and length: ("ab", "c") and ("a", "bc") differ.
+
+    Raises BadInput for parts of other types than bytes, str, int, float and arrays without objects.
+    """
     digest = hashlib.sha256()
     for part in parts:
         label, content = _canonical(part)
@@ -91,7 +89,7 @@ def content_key(*parts: bytes | str | int | float | Array) -> str:
 def _canonical(part: object) -> tuple[str, bytes]:
     if isinstance(part, np.ndarray):
         if part.dtype.hasobject:
-            raise BadInput("an array of Python objects has no content key")
+            raise BadInput("content keys do not support arrays of Python objects")
         return f"array {part.dtype.str} {part.shape}", np.ascontiguousarray(part).tobytes()
     if isinstance(part, bytes):
         return "bytes", part
@@ -99,16 +97,33 @@ def _canonical(part: object) -> tuple[str, bytes]:
         return "str", part.encode()
     if isinstance(part, (int, float)) and not isinstance(part, bool):
         return type(part).__name__, repr(part).encode()
-    raise BadInput(f"a content key is made of bytes, strings, numbers and arrays, not {type(part).__name__}")
+    raise BadInput(f"content keys support bytes, strings, numbers and arrays, got {type(part).__name__}")
 
 
 def cached_arrays(name: str, key: str, make: Callable[[], Mapping[str, Array]]) -> dict[str, Array]:
-    """The arrays that `make()` returns, made once per key and afterwards mapped from disc, read-only.
+    """Return arrays from the cache, or compute and store them.
 
-    name : legible beginning of the folder's name;  key : from content_key
-    make : called only if nothing usable is stored; of processes that race, all use what the first published
+    Parameters
+    ----------
+    name : str
+        Legible beginning of the folder's name.
+    key : str
+        Result of `content_key`.
+    make : callable
+        Function that computes the arrays by name. It is called only if the cache has no intact files for the key. If
+        several processes compute them at the same time, all use the arrays that were published first.
+
+    Returns
+    -------
+    dict of str to array
+        Arrays that are mapped from disc, read-only.
+
+    Raises
+    ------
+    BadInput
+        If the stored arrays cannot be read after several attempts.
     """
-    # A folder that machines of several kinds share keeps each kind's: what is kept changes no result.
+    # If different kinds of machine share the cache, each kind has separate files: their last bits may differ.
     machine_key = content_key(key, machine())[:_KEY_LENGTH]
     folder = cache_dir() / f"{layout.check_name(name)}-{machine_key}"
     arrays: Mapping[str, Array] | None = None
@@ -118,7 +133,7 @@ def cached_arrays(name: str, key: str, make: Callable[[], Mapping[str, Array]]) 
             return stored
         arrays = make() if arrays is None else arrays
         _publish(arrays, folder)
-    raise BadInput(f"cache {folder}: what was just written cannot be read")
+    raise BadInput(f"cache {folder}: files that were just written cannot be read")
 
 
 def _load(folder: Path) -> dict[str, Array] | None:
@@ -126,18 +141,18 @@ def _load(folder: Path) -> dict[str, Array] | None:
     if checksums is None:
         return None
     if broken := [name for name, crc in checksums.items() if not is_intact(folder / name, crc)]:
-        discard(folder, f"{broken[0]} is not what was written")
+        discard(folder, f"{broken[0]} is damaged")
         return None
     try:
         return {name.removesuffix(_ARRAY): _map(folder / name) for name in checksums}
     except (ValueError, EOFError, FileNotFoundError) as error:
-        # Removed meanwhile by another process.
+        # Another process may have removed the folder in the meantime.
         discard(folder, str(error))
         return None
 
 
 def store_checksums(folder: Path, names: Iterable[str]) -> None:
-    """Write the checksums of a folder's files beside them, everything synced."""
+    """Write the checksums of a folder's files into the folder, and sync the files and folders."""
     checksums = {}
     for name in names:
         manifest.sync(folder / name)
@@ -148,16 +163,19 @@ def store_checksums(folder: Path, names: Iterable[str]) -> None:
 
 
 def stored_checksums(folder: Path) -> dict[str, int] | None:
-    """Name -> CRC-32 of the files that were sealed; None where nothing usable is stored, what there was is removed."""
+    """Return the CRC-32 of each file of a folder by name, or None without an intact list.
+
+    A folder with a missing or damaged list is removed.
+    """
     if not folder.exists():
-        # Looked for before its seal: another process may publish the whole of it at any time.
+        # This is checked before the list is read, because another process may publish the whole folder at any time.
         return None
     try:
         stored = json.loads((folder / _CHECKSUM_FILE).read_bytes())
         checksums: dict[str, int] = stored["sums"]
         if digest(checksums) == stored["digest"]:
             return checksums
-        reason = f"{_CHECKSUM_FILE} is not what was written"
+        reason = f"{_CHECKSUM_FILE} is damaged"
     except (ValueError, LookupError, TypeError, FileNotFoundError, RecursionError) as error:
         reason = str(error)
     discard(folder, reason)
@@ -165,7 +183,7 @@ def stored_checksums(folder: Path) -> dict[str, int] | None:
 
 
 def is_intact(path: Path, crc: int) -> bool:
-    """Is the file what it was when it was sealed?  Compared once a process, and again where the file has changed."""
+    """Return True if a file has the given CRC-32. It is compared once per process, and again if the file changes."""
     try:
         status = path.stat()
         return _crc32(path, status.st_ino, status.st_size, status.st_mtime_ns) == crc
@@ -179,15 +197,15 @@ def _crc32(path: Path, *file_state: int) -> int:
 
 
 def discard(folder: Path, reason: str) -> None:
-    """Remove a folder, and say so."""
-    logging.getLogger(__name__).warning("cache %s: %s: made again", folder, " ".join(reason.split()))
+    """Remove a folder and log a warning with the reason."""
+    logging.getLogger(__name__).warning("cache %s: %s: computed again", folder, " ".join(reason.split()))
     _remove(folder)
 
 
 def _remove(folder: Path) -> None:
     if not folder.exists():
         return
-    # In one rename, so that nobody meets half of it.
+    # Rename first, so that no other process finds half a folder.
     trash = Path(tempfile.mkdtemp(prefix=".gone-", dir=folder.parent))
     with contextlib.suppress(OSError):
         folder.rename(trash / folder.name)
@@ -196,14 +214,14 @@ def _remove(folder: Path) -> None:
 
 def _map(file: Path) -> Array:
     mapped: Array = np.load(file, mmap_mode="r", allow_pickle=False)
-    # A plain view: numpy.memmap is slower to index.
+    # Return a plain view because numpy.memmap is slower to index.
     return np.asarray(mapped)
 
 
 def _publish(arrays: Mapping[str, Array], folder: Path) -> None:
-    """Write the arrays beside `folder` and rename once; who comes second discards its own copy."""
+    """Write the arrays next to `folder` and rename once. If another process was faster, discard this copy."""
     if not arrays:
-        raise BadInput(f"cache {folder.name}: nothing to store")
+        raise BadInput(f"cache {folder.name}: the computation returned no arrays")
     folder.parent.mkdir(parents=True, exist_ok=True)
     staged = Path(tempfile.mkdtemp(prefix=".making-", dir=folder.parent))
     try:

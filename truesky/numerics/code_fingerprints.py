@@ -1,4 +1,4 @@
-"""Fingerprints of code: keys of caches change if code that may have shaped the contents changes, or a table of numbers.
+"""Compute fingerprints of code, so that keys of caches change if code or tables change that may affect the contents.
 
 Docstrings, comments and blank lines do not change a fingerprint.
 """
@@ -15,13 +15,13 @@ from truesky.numerics.code_text import code_text
 
 _ROOT = Path(__file__).resolve().parents[2]
 _ENDINGS = (".csv", ".toml")
-# What checks, stores, transports or names arrays and shapes none: its changes leave them as they are.
+# Modules that check, store, transport or name arrays but do not compute them.
 _IRRELEVANT = (
     "truesky.numerics.cache", "truesky.numerics.code_fingerprints", "truesky.request", "lake_schema.arrays",
     "lake_schema.columns", "lake_schema.errors", "lake_schema.mission", "lake_schema.store", "lake_schema.tables",
 )  # fmt: skip
 
-# Numbers in one of these packages that do shape arrays.
+# Modules in these packages whose numbers do affect arrays.
 _RELEVANT = ("truesky.request.accuracy",)
 
 

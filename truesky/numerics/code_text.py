@@ -39,13 +39,13 @@ def code_text(source: str, tree: ast.Module | None = None) -> str:
         lines[first : last + 1] = [lines[first][:start] + lines[last][end:]] + [b""] * (last - first)
     # Lines whose end, and lines whose beginning, is part of a string.
     open_end = {number for first, _, last, _ in strings for number in range(first, last)}
-    kept = []
+    code_lines = []
     for number, whole in enumerate(lines):
         line = _without_comment(number, whole, strings)
         line = line if number in open_end else line.rstrip()
         if line or number in open_end or number - 1 in open_end:
-            kept.append(line.decode())
-    return "\n".join(kept)
+            code_lines.append(line.decode())
+    return "\n".join(code_lines)
 
 
 def _span(node: ast.AST) -> tuple[int, int, int, int]:
@@ -70,8 +70,8 @@ def _without_comment(number: int, line: bytes, strings: list[tuple[int, int, int
     """Cut a line at the first # outside all strings; `strings` are sorted spans, which may contain others."""
     start = line.find(b"#")
     while start >= 0:
-        before = strings[: bisect.bisect_right(strings, (number, start + 1))]
-        if not any((first, begin) <= (number, start) < (last, end) for first, begin, last, end in before):
+        candidates = strings[: bisect.bisect_right(strings, (number, start + 1))]
+        if not any((first, begin) <= (number, start) < (last, end) for first, begin, last, end in candidates):
             return line[:start]
         start = line.find(b"#", start + 1)
     return line

@@ -1,4 +1,4 @@
-"""The loops of sums.product: two orders of going through matrices, one order of adding."""
+"""Loops of `matrices.matmul`: two orders of access to the matrices, with the same order of summation."""
 
 from __future__ import annotations
 
@@ -8,13 +8,23 @@ import numpy as np
 
 from truesky.numerics.compiling import exact_jit
 
-# Columns that stay in the processor's nearest memory while they are added to.
+# Number of columns that stay in the cache of the processor during the summation.
 _BLOCK = 512
 
 
 @exact_jit
 def multiply_rows(matrix_a: Any, matrix_b: Any, out: Any) -> None:
-    """Fills out, float64[n, m], with left [n, k] @ right [k, m], four rows of `right` at a time."""
+    """Fill `out` with matrix_a @ matrix_b, with four rows of `matrix_b` at a time.
+
+    Parameters
+    ----------
+    matrix_a : float array, shape (n, k)
+        First factor.
+    matrix_b : float array, shape (k, m)
+        Second factor.
+    out : float64 array, shape (n, m)
+        Result.
+    """
     n, count = matrix_a.shape
     m = matrix_b.shape[1]
     for first in range(0, m, _BLOCK):
@@ -41,7 +51,17 @@ def multiply_rows(matrix_a: Any, matrix_b: Any, out: Any) -> None:
 
 @exact_jit
 def multiply_transposed(matrix_a: Any, matrix_b: Any, out: Any) -> None:
-    """Fills out, float64[n, m], with left [n, k] @ right [m, k] transposed, eight rows of `left` side by side."""
+    """Fill `out` with matrix_a @ matrix_b.T, with eight rows of `matrix_a` at a time.
+
+    Parameters
+    ----------
+    matrix_a : float array, shape (n, k)
+        First factor.
+    matrix_b : float array, shape (m, k)
+        Second factor, transposed.
+    out : float64 array, shape (n, m)
+        Result.
+    """
     n, m = len(matrix_a), len(matrix_b)
     for i in range(0, n - 7, 8):
         a, b, c, d = matrix_a[i], matrix_a[i + 1], matrix_a[i + 2], matrix_a[i + 3]

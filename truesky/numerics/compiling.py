@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 from lake_schema import instruction_set
 from truesky.numerics import cache
 
-# numba reads these when it is imported, and processes begun from here have them.
+# numba reads these variables when it is imported. Child processes inherit them.
 instruction_set.limit_numba()
 _MACHINE_CODE = cache.machine_code_dir()
 os.environ["NUMBA_CACHE_DIR"] = str(_MACHINE_CODE)
@@ -24,16 +24,17 @@ from numba.core.caching import UserProvidedCacheLocator  # noqa: E402
 Function = TypeVar("Function", bound=Callable[..., Any])
 _PACKAGE = Path(__file__).parents[1]
 _CONFIG: Any = numba.config
-# The others are for functions of users, and for machines on which the cache cannot be written. The options below decide
-# about the machine code, so this file is part of its key, too: it names truesky.numerics.compiling.
+# The other locators are for functions of users, and for machines on which the cache cannot be written. The options
+# below affect the machine code, so that this file must be part of its key, too: it names truesky.numerics.compiling.
 _LOCATORS = f"{__name__}.PackageCacheLocator,UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator"
 
 
 class PackageCacheLocator(UserProvidedCacheLocator):
     """Name the machine code of a module by the module's place in the package.
 
-    numba names it by the absolute path of the file, so that each clone and each environment would compile anew. The
-    cache folder is named by the contents of all compiled modules, so the files of one folder belong to equal sources.
+    By default numba names it by the absolute path of the file, so that each clone and each environment would compile
+    again. The cache folder is named by the contents of all compiled modules, so that the files of one folder belong to
+    the same sources.
     """
 
     def __init__(self, py_func: Callable[..., Any], py_file: str) -> None:
@@ -70,17 +71,17 @@ def _compile(function: Function, **options: Any) -> Function:
 
 
 def jit(function: Function) -> Function:
-    """The function, compiled when it is first called."""
-    # Sums may be taken in any order, which makes them twice as fast; NaN and infinity keep their meaning.  In which
-    # order depends on what a function is compiled into: always into its caller, or a process that compiles would round
-    # otherwise than one that finds the caller in the cache.
+    """Compile a function for speed when it is first called: sums may be computed in any order."""
+    # Sums in any order are twice as fast; NaN and infinity remain valid. The order depends on the function into which
+    # a function is inlined. Always inline it: otherwise a process that compiles would round differently from a process
+    # that finds the caller in the cache.
     fast = {"reassoc", "contract", "nsz"}
     return _compile(function, fastmath=fast, forceinline=True)
 
 
 def exact_jit(function: Function) -> Function:
-    """The function, compiled with every operation rounded as it is written: the same bits on any processor.
+    """Compile a function so that every operation is rounded as written: the same bits on any processor.
 
-    It lets other threads run beside it.
+    The function releases the GIL, so that other threads run at the same time.
     """
     return _compile(function, nogil=True)

@@ -1,11 +1,7 @@
-"""Products and solutions whose last bit is the same everywhere: no BLAS, which adds as threads and processor have it.
+"""Products and solutions of matrices with the same bits on every machine.
 
-product         of matrices: every sum runs upwards, each product and each sum rounded to float64 as it is made
-inverse         of 2 x 2 matrices;  determinant : theirs
-least_squares   by Householder's reflections
-gauss_legendre  nodes and weights of quadrature
-
-What numpy does element by element, sums along an axis, or by einsum without `optimize` needs none of them.
+BLAS is not used because its order of summation depends on threads and processor. Element-wise operations of numpy, sums
+along an axis, and einsum without `optimize` are reproducible and need no replacement.
 """
 
 from __future__ import annotations
@@ -19,24 +15,24 @@ import numpy.typing as npt
 
 from lake_schema.arrays import Array, Float
 
-# Up to so many terms a sum is made of whole arrays, without compiled code; but for matrices of so many numbers.
+# Sums of at most _FEW_TERMS terms use array operations of numpy, unless the result has _LARGE_SIZE elements or more.
 _FEW_TERMS, _LARGE_SIZE = 8, 1 << 18
-# Columns from which on it is faster to add rows of the second factor than to follow rows of the first.
+# From this number of columns it is faster to add rows of the second factor than to follow rows of the first.
 _WIDE_COLUMNS = 16
 
 
 def matmul(a: npt.ArrayLike, b: npt.ArrayLike) -> Any:
-    """float64[..., n, m]: what `one @ other` is, up to rounding.
+    """Return the product a @ b of matrices or vectors as float64.
 
-    one   : [..., n, k] or [k], float32 or float64
-    other : [k, m] or [k]; of few terms also [..., k, m]
-    Error : k 2^-53 of the sum of the terms' sizes
+    `a` has the shape (..., n, k) or (k,), `b` the shape (k, m) or (k,). With 8 terms k or fewer, `b` may also have the
+    shape (..., k, m). Sums run in ascending order of k, with each product and each sum rounded to float64. The error is
+    k 2^-53 times the sum of the terms' absolute values. Raises ValueError if the shapes do not match.
     """
     matrix_a, matrix_b = np.asarray(a), np.asarray(b)
     a_is_vector, b_is_vector = matrix_a.ndim == 1, matrix_b.ndim == 1
     matrix_a, matrix_b = (matrix_a[None] if a_is_vector else matrix_a), (matrix_b[:, None] if b_is_vector else matrix_b)
     if matrix_a.shape[-1] != matrix_b.shape[-2]:
-        raise ValueError(f"shapes {matrix_a.shape} and {matrix_b.shape} do not fit")
+        raise ValueError(f"shapes {matrix_a.shape} and {matrix_b.shape} do not match: numbers of terms must be equal")
     is_large = matrix_a.ndim == matrix_b.ndim == 2 and len(matrix_a) * matrix_b.shape[1] >= _LARGE_SIZE
     if matrix_a.shape[-1] <= _FEW_TERMS and not is_large:
         out = _multiply_arrays(matrix_a, matrix_b)
@@ -58,7 +54,7 @@ def _multiply_arrays(matrix_a: Array, matrix_b: Array) -> Float:
 
 
 def _multiply_compiled(matrix_a: Array, matrix_b: Array) -> Float:
-    # Compiled code is imported where it is wanted.
+    # Import compiled code only if it is needed, because importing numba takes time.
     from truesky.numerics import compiled_products
 
     out = np.empty((len(matrix_a), matrix_b.shape[1]))
@@ -72,7 +68,7 @@ def _multiply_compiled(matrix_a: Array, matrix_b: Array) -> Float:
 
 
 def inverse(matrix: npt.ArrayLike) -> Float:
-    """[..., 2, 2] -> [..., 2, 2]."""
+    """Return the inverses of 2 x 2 matrices, shape (..., 2, 2)."""
     m = np.asarray(matrix, float)
     a, b, c, d = m[..., 0, 0], m[..., 0, 1], m[..., 1, 0], m[..., 1, 1]
     adjugate = np.stack([np.stack([d, -b], axis=-1), np.stack([-c, a], axis=-1)], axis=-2)
@@ -80,16 +76,19 @@ def inverse(matrix: npt.ArrayLike) -> Float:
 
 
 def determinant(matrix: npt.ArrayLike) -> Float:
-    """[..., 2, 2] -> [...]."""
+    """Return the determinants of 2 x 2 matrices, shape (..., 2, 2) -> (...)."""
     m = np.asarray(matrix, float)
     return np.asarray(m[..., 0, 0] * m[..., 1, 1] - m[..., 0, 1] * m[..., 1, 0])
 
 
 def least_squares(basis: Float, values: Float) -> Float:
-    """The x [n] or [n, m] that makes basis @ x nearest to the values.
+    """Return the solution x, shape (n,) or (n, m), that minimises |basis @ x - values|, by Householder reflections.
 
-    basis : [k, n] of n independent columns, k >= n;  values : [k] or [k, m]
-    Ref   : Golub & Van Loan 2013, Matrix Computations, section 5.3.2
+    `basis` has the shape (k, n) with n linearly independent columns and k >= n; `values` has the shape (k,) or (k, m).
+
+    References
+    ----------
+    Golub & Van Loan 2013, Matrix Computations, section 5.3.2.
     """
     upper, rhs = np.array(basis, float), np.array(values, float)
     n = upper.shape[1]
@@ -108,9 +107,9 @@ def least_squares(basis: Float, values: Float) -> Float:
 
 @lru_cache(maxsize=8)
 def gauss_legendre(count: int) -> tuple[Float, Float]:
-    """Nodes, ascending, and weights of Gauss's quadrature on [-1, 1], [count] each: read-only.
+    """Return nodes and weights of Gauss-Legendre quadrature on [-1, 1], with an error of 1e-15.
 
-    Error : 1e-15
+    The arrays have the shape (count,), are read-only, and the nodes ascend.
     """
     nodes, weights = np.empty((2, count))
     for i in range((count + 1) // 2):
@@ -127,7 +126,7 @@ def gauss_legendre(count: int) -> tuple[Float, Float]:
 
 
 def _legendre(count: int, x: float) -> tuple[float, float]:
-    """P_count and its derivative."""
+    """Return the Legendre polynomial P_count and its derivative at x."""
     previous, current = 1.0, x
     for k in range(2, count + 1):
         previous, current = current, ((2 * k - 1) * x * current - (k - 1) * previous) / k

@@ -1,11 +1,11 @@
-"""Random numbers from keys, compiled: a key is a word of 64 bits, and the same key gives the same number anywhere.
+"""Draw random numbers from 64-bit keys in compiled code: the same key gives the same number everywhere.
 
-following     the key of what is drawn next: a step of SplitMix64
-uniform       in (0, 1);  normal : by the inverse of the cumulative distribution;  exponential, poisson, gamma
-uniforms, normals, gammas   of many keys
+A key is a uint64. `child_key`, a step of SplitMix64, derives further keys from it.
 
-Ref: Steele, Lea & Flood 2014 (SplitMix64); Wichura 1988, Applied Statistics 37, 477 (AS 241); Marsaglia & Tsang 2000,
-     ACM TOMS 26, 363
+References
+----------
+Steele, Lea & Flood 2014 (SplitMix64). Wichura 1988, Applied Statistics 37, 477 (AS 241). Marsaglia & Tsang 2000, ACM
+TOMS 26, 363.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ import numpy as np
 from truesky.numerics.compiling import exact_jit
 from truesky.randomness.rng import GOLDEN, mix_bits
 
-# Rational approximations of AS 241, PPND16, lowest power first: in the middle, in the tails, and far out.
+# Coefficients of AS 241, PPND16, lowest power first: numerator and denominator in the middle, the tails and the far
+# tails.
 _MIDDLE = (
     (
         3.3871328727963666080e0, 1.3314166789178437745e2, 1.9715909503065514427e3, 1.3731693765509461125e4,
@@ -48,7 +49,7 @@ _FAR_TAIL = (
         7.86869131145613259100e-4, 1.84631831751005468180e-5, 1.42151175831644588870e-7, 2.04426310338993978564e-15,
     ),
 )  # fmt: skip
-# exp(-mean) is still a normal number here: larger means are sums of several.
+# Largest mean for which exp(-mean) is a normal floating-point number. Counts of larger means are sums of several.
 _LARGEST_MEAN = 600.0
 _S12 = np.uint64(12)
 
@@ -57,19 +58,19 @@ _mix_bits = exact_jit(mix_bits)
 
 @exact_jit
 def child_key(key: Any, number: Any) -> Any:
-    """The key of one of the things that belong to a key; number : int, from 0."""
+    """Derive the key of child `number` (an int from 0) of `key`."""
     return _mix_bits(key + (np.uint64(number) + np.uint64(1)) * GOLDEN)
 
 
 @exact_jit
 def uniform(key: Any) -> Any:
-    """52 bits and a half: neither 0 nor, rounded, 1."""
+    """Return a uniform number (k + 1/2) 2^-52 with an integer k, which is never rounded to 0 or 1."""
     return (np.float64(key >> _S12) + 0.5) * 2.0**-52
 
 
 @exact_jit
 def normal(key: Any) -> Any:
-    """Standard normal.  Error: 1e-15 relative, of the inverse of `uniform`"""
+    """Return a standard normal deviate by inverting the cumulative distribution, with a relative error of 1e-15."""
     u = uniform(key)
     q = u - 0.5
     if abs(q) <= 0.425:
@@ -90,7 +91,7 @@ def _ratio(coefficients: Any, x: Any) -> Any:
 
 @exact_jit
 def poisson(key: Any, mean: Any) -> Any:
-    """A Poisson number, by inversion."""
+    """Return a Poisson number with the given mean, by inversion."""
     pieces = int(mean / _LARGEST_MEAN) + 1
     part_mean = mean / pieces
     total = 0
@@ -98,7 +99,7 @@ def poisson(key: Any, mean: Any) -> Any:
         u = uniform(child_key(key, piece))
         probability = np.exp(-part_mean)
         cumulative, count = probability, 0
-        # The sum stops growing before it is 1 where u is so near to it that no number has this probability.
+        # If u is very close to 1, the sum stops growing before it reaches u: stop when the probability underflows.
         while u > cumulative and probability > 0.0:
             count += 1
             probability *= part_mean / count
@@ -109,7 +110,7 @@ def poisson(key: Any, mean: Any) -> Any:
 
 @exact_jit
 def gamma(key: Any, shape: Any) -> Any:
-    """Standard gamma of a shape > 0, by as many trials as it takes; Marsaglia & Tsang 2000."""
+    """Return a standard gamma deviate with shape > 0, by the rejection method of Marsaglia & Tsang 2000."""
     d = (shape if shape >= 1.0 else shape + 1.0) - 1.0 / 3.0
     c = 1.0 / np.sqrt(9.0 * d)
     trial = 1
@@ -124,16 +125,33 @@ def gamma(key: Any, shape: Any) -> Any:
 
 @exact_jit
 def uniforms(keys: Any, number: Any, out: Any) -> None:
-    """Fills out, float64[n], with the uniform of each key's `number`-th following; keys : uint64[n]."""
+    """Fill `out` with a uniform number of child `number` of each key.
+
+    Parameters
+    ----------
+    keys : uint64 array, shape (n,)
+        Key of each source.
+    number : int
+        Index of the child key, from 0.
+    out : float64 array, shape (n,)
+        Result.
+    """
     for i in range(keys.size):
         out[i] = uniform(child_key(keys[i], number))
 
 
 @exact_jit
 def normals(keys: Any, number: Any, out: Any) -> None:
-    """The same of normal numbers.
+    """Fill `out` with a standard normal deviate of child `number` of each key.
 
-    keys : uint64[n];  number : int;  out : float64[n]
+    Parameters
+    ----------
+    keys : uint64 array, shape (n,)
+        Key of each source.
+    number : int
+        Index of the child key, from 0.
+    out : float64 array, shape (n,)
+        Result.
     """
     for i in range(keys.size):
         out[i] = normal(child_key(keys[i], number))
@@ -141,9 +159,18 @@ def normals(keys: Any, number: Any, out: Any) -> None:
 
 @exact_jit
 def gammas(keys: Any, number: Any, shapes: Any, out: Any) -> None:
-    """The same of gamma numbers; shapes : float64[n].
+    """Fill `out` with a standard gamma deviate of child `number` of each key.
 
-    keys : uint64[n];  number : int;  out : float64[n]
+    Parameters
+    ----------
+    keys : uint64 array, shape (n,)
+        Key of each source.
+    number : int
+        Index of the child key, from 0.
+    shapes : float64 array, shape (n,)
+        Shape parameter of each source, more than 0.
+    out : float64 array, shape (n,)
+        Result.
     """
     for i in range(keys.size):
         out[i] = gamma(child_key(keys[i], number), shapes[i])

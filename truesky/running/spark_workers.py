@@ -1,10 +1,10 @@
-"""The process from which Spark forks its Python workers on this machine.
+"""Run the process from which Spark forks its Python workers on this machine.
 
 Spark runs python -m truesky.running.spark_workers pyspark.worker.
 
-It is PySpark's own. Java drops a worker that has been idle for a minute; the worker writes to a closed socket, which
-in the Unix domain is an error at once, and would print a traceback. Here it ends without a word, as it does where any
-other pipe or socket that it writes to is closed.
+The process is PySpark's daemon with another handler of SIGPIPE. Java drops a worker that has been idle for a minute.
+The worker then writes to a closed socket. In the Unix domain this is an error at once, which would print a traceback.
+With the default handler the worker ends silently, as with any other closed pipe or socket.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""From a command line to published tables: the only file, with session.py, that knows Spark.
+"""Run a job from its command line to published tables.
 
-A job is a function (lake, request) -> steps; a step is a plan (what to make of what) and the function that makes one
-part of it.  Spark carries names and facts of the parts out, and what their receipts say back; rows go straight from the
-kernel to a file.
+A job is a function (lake, request) -> steps. A step is a plan (tasks and their inputs) and the function that runs one
+task. Spark transports only names and facts of tasks, and their receipts; rows are written directly to files. Only this
+module and session.py use Spark.
 """
 
 from __future__ import annotations
@@ -50,9 +50,18 @@ if TYPE_CHECKING:
 class Step:
     """One table of a job.
 
-    on_driver : the work is too small to be worth a trip to the workers
-    unit      : what a part is, for the progress bar
-    after     : told the version when it is published
+    Attributes
+    ----------
+    plan : Plan
+        Table, facts and tasks.
+    run_task : callable
+        Function that runs one task and returns its receipt.
+    on_driver : bool
+        True to run the tasks in the driver, if they are too small for workers.
+    unit : str
+        Name of a task in the progress bar.
+    on_published : callable, optional
+        Function that is called with the published version.
     """
 
     plan: Plan
@@ -64,11 +73,23 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A job: its name, what it does (the text of --help), and its steps for a lake and a request.
+    """One command that makes tables.
 
-    options : lists of the request, such as bands, that its command line may give instead, each with its text of help
-    numbers : the same of whole numbers
-    dry_run : what is done in place of the steps where only a forecast is asked for; None = there is none
+    Attributes
+    ----------
+    name : str
+        Name of the command.
+    doc : str
+        Text of its --help.
+    steps : callable
+        Function (lake, request) -> steps.
+    list_options : tuple of (str, str)
+        Names and help texts of options that replace lists of the request, such as bands.
+    integer_options : tuple of (str, str)
+        Names and help texts of options that replace integers of the request.
+    dry_run : callable, optional
+        Function (lake, request) -> steps to run with --dry-run, which prints a forecast. By default the job has no such
+        option.
     """
 
     name: str
@@ -79,21 +100,24 @@ class Job:
     dry_run: Callable[[Path, Request], Sequence[Step]] | None = None
 
 
-# What comes back of a part.
+# Fields of a receipt that a worker sends to the driver.
 _RESULT_FIELDS = (
     "part", "rows", "bytes", "seconds", "cpu_s", "peak_gb", "machine", "attempt", "error", "traceback"
 )  # fmt: skip
 
 
-# What the C library calls an encoding of ASCII alone.
+# Names of ASCII encodings in C libraries.
 _ASCII = ("ANSI_X3.4-1968", "US-ASCII", "646")
-# Set where Java started Python.
+# This variable is set if Java started Python.
 _GATEWAY = "PYSPARK_GATEWAY_PORT"
 _RESUME_HINT = "a second run continues where this one ended"
 
 
 def main(job: Job, argv: Sequence[str] | None = None) -> int:
-    """Run a job from its command line; returns the exit status: 0, 1 a part failed, 2 bad input, 130/143 stopped."""
+    """Run a job from its command line and return the exit status.
+
+    The status is 0 for success, 1 if a task failed, 2 for bad input, and 130 or 143 after a signal.
+    """
     options = _options(job, argv)
 
     def run_job() -> int:
@@ -107,9 +131,22 @@ def main(job: Job, argv: Sequence[str] | None = None) -> int:
 
 
 def run(job: Job, root: Path, request: Request, verbose: bool = False) -> None:
-    """Make and publish every table of a job that is not there yet; raises what `publish.make` raises.
+    """Make and publish every table of a job that does not exist yet.
 
-    job     : its steps;  root : folder of the lake;  request : checked;  verbose : whether progress is shown
+    Parameters
+    ----------
+    job : Job
+        Job with its steps.
+    root : Path
+        Folder of the lake.
+    request : Request
+        Checked request.
+    verbose : bool, optional
+        True to print tracebacks and messages of Spark.
+
+    Notes
+    -----
+    Errors of `publish.make_version` are raised unchanged.
     """
     if difference := instruction_set.check():
         command.print_error(job.name, difference, 0)
@@ -121,12 +158,12 @@ def run(job: Job, root: Path, request: Request, verbose: bool = False) -> None:
     metrics = {"prepare_s": time.time() - started, "prepare_cpu_s": time.process_time() - cpu}
     for step in steps:
         _run_step(job, step, root, request, verbose, metrics)
-        # Once a job.
+        # Only the first step records these metrics.
         metrics = {}
 
 
 def common_facts(request: Request, *sections: str) -> dict[str, Any]:
-    """What every plan of a request holds: the named parts of the request, and the code."""
+    """Return facts that the plans of a request have in common: the named sections of the request, and the code."""
     return {"request": request.facts(*sections), "code": code_version()}
 
 
@@ -137,7 +174,7 @@ def _options(job: Job, argv: Sequence[str] | None) -> argparse.Namespace:
         epilog=f"truesky {__version__}",
         formatter_class=argparse.RawTextHelpFormatter,
     )
-    parser.add_argument("--lake", required=True, help="folder of the lake (made where it is not there)")
+    parser.add_argument("--lake", required=True, help="folder of the lake (created if it does not exist)")
     parser.add_argument("--request", required=True, type=Path, help="simulation request, a TOML file")
     for name, text in job.list_options:
         parser.add_argument(f"--{name}", nargs="+", help=text)
@@ -145,23 +182,23 @@ def _options(job: Job, argv: Sequence[str] | None) -> argparse.Namespace:
         parser.add_argument(f"--{name}", type=int, metavar="N", help=text)
     if job.dry_run is not None:
         parser.add_argument("--dry-run", action="store_true", help="print the forecast, write nothing")
-    parser.add_argument("-v", "--verbose", action="store_true", help="tracebacks and Spark's own messages")
+    parser.add_argument("-v", "--verbose", action="store_true", help="print tracebacks and messages of Spark")
     return parser.parse_args(argv)
 
 
 def _refuse_mangled(*paths: str) -> None:
-    """Refuse paths that lost letters on their way here, rather than make a lake of another name.
+    """Raise BadInput for paths that lost letters on their way here, so that no lake with a wrong name is made.
 
-    Where the locale is of ASCII alone Java hands a question mark on for any other letter, and nobody can tell it from
-    one that was typed: spark-submit is two processes, the first ends and took the letters with it. Python, started
-    without Java, keeps each byte of such a letter as a surrogate.
+    In an ASCII locale, Java passes a question mark for any other letter, which cannot be distinguished from a typed
+    one: spark-submit runs two processes, and the first one has already lost the letters. Python without Java keeps each
+    byte of such a letter as a surrogate.
     """
     if locale.nl_langinfo(locale.CODESET) in _ASCII:
         lost_letter = re.compile("[?]" if _GATEWAY in os.environ else "[\ud800-\udfff]")
         for path in paths:
             if lost_letter.search(path):
                 raise BadInput(
-                    f"{user_files.format_path(path)}: this locale has no letters but ASCII: export LC_ALL=C.UTF-8"
+                    f"{user_files.format_path(path)}: this locale supports only ASCII letters: export LC_ALL=C.UTF-8"
                 )
 
 
@@ -177,7 +214,7 @@ def _request(job: Job, options: argparse.Namespace) -> Request:
 
 @contextmanager
 def _exit_on_signal(job: Job) -> Iterator[None]:
-    """Ctrl-C and SIGTERM end the process at once: whatever it was doing, the lake is whole and the next run goes on."""
+    """End the process at once after Ctrl-C or SIGTERM: the lake is always consistent, and the next run continues."""
 
     def stop(signum: int, frame: FrameType | None) -> None:
         if (running := sys.modules.get("truesky.running.session")) is not None:
@@ -192,11 +229,11 @@ def _exit_on_signal(job: Job) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-# ------------------------------------------------------------------------------------------------ one step
+# ------------------------------------------------------------------------------------------------ steps
 
 
 def _run_step(job: Job, step: Step, root: Path, request: Request, verbose: bool, metrics: Json) -> None:
-    """took : what else the first line of the run's log says"""
+    """Run the tasks of a step and publish its table; `metrics` are additional facts for the first line of the log."""
     plan, started = step.plan, time.time()
     log = _RunLog(root, job, step, request, metrics)
     results: list[Json] = []
@@ -243,9 +280,9 @@ def _print_summary(version: read.Version, tasks_run: int, seconds: float, existe
 
 
 class _RunLog:
-    """LAKE/runs/<id>.jsonl: a line at the start, one a part, one at the end.
+    """Log of a run in LAKE/runs/<id>.jsonl, with one line at the start, one per task, and one at the end.
 
-    A run goes on where it cannot be written.
+    If the log cannot be written, the run continues without it.
     """
 
     def __init__(self, root: Path, job: Job, step: Step, request: Request, extra_facts: Json) -> None:
@@ -277,7 +314,7 @@ class _RunLog:
 
 @contextmanager
 def _progress_bar(root: Path, plan: Plan, unit: str) -> Iterator[None]:
-    """A progress bar that counts receipts, so that it is right after a resume and under any scheduler."""
+    """Show a progress bar that counts receipts, so that it is correct after a resume and with any scheduler."""
     folder = stage.receipts_folder(layout.stage_folder(root, plan.table.name, plan.key))
 
     def count() -> int:
@@ -295,7 +332,7 @@ def _progress_bar(root: Path, plan: Plan, unit: str) -> Iterator[None]:
                 started = time.perf_counter()
                 bar.update(count() - bar.n)
                 bar.refresh()
-                # Where there are 100,000 receipts a look takes long, and others work on the file system.
+                # Counting 100,000 receipts takes long and loads the file system: wait longer between counts.
                 wait = max(0.25, 20.0 * (time.perf_counter() - started))
 
         thread = threading.Thread(target=update_bar, daemon=True)
@@ -312,13 +349,13 @@ def _progress_bar(root: Path, plan: Plan, unit: str) -> Iterator[None]:
 
 
 def _spark_map(function: Callable[[Task], Json], tasks: Sequence[Task], name: str, verbose: bool) -> Iterable[Json]:
-    """Map over parts, one Spark task each; a part that kills its worker is found by running what is left in halves."""
+    """Run each task of the plan as a Spark task; find a task that kills its worker by running the rest in halves."""
     from py4j.protocol import Py4JError
     from pyspark.errors import PySparkException
 
     from truesky.running.session import get_session, is_alive
 
-    # Whatever fails is reported by us, in one line.
+    # Failures are reported in one line instead of by log messages of Spark.
     quietly = contextlib.nullcontext if verbose else _silence_logging
     try:
         with quietly():
@@ -334,13 +371,13 @@ def _spark_map(function: Callable[[Task], Json], tasks: Sequence[Task], name: st
         if not is_alive(spark):
             raise LakeError(f"Spark has ended; {_RESUME_HINT}") from None
         if len(tasks) == 1:
-            return [{"part": tasks[0].name, "error": "its worker died"}]
+            return [{"part": tasks[0].name, "error": "its worker ended unexpectedly"}]
     half = len(tasks) // 2
     return [r for half_tasks in (tasks[:half], tasks[half:]) for r in _spark_map(function, half_tasks, name, verbose)]
 
 
 def has_session() -> bool:
-    """Return True if this process has an active Spark session already."""
+    """Return True if this process already has an active Spark session."""
     if "pyspark" not in sys.modules:
         return False
     from pyspark.sql import SparkSession
@@ -350,7 +387,7 @@ def has_session() -> bool:
 
 @contextmanager
 def _silence_logging() -> Iterator[None]:
-    """No log lines of libraries: the bridge to Java writes a traceback for every call that is interrupted."""
+    """Disable logging: the bridge to Java logs a traceback for every interrupted call."""
     previous_level = logging.root.manager.disable
     logging.disable(logging.CRITICAL)
     try:
@@ -379,20 +416,20 @@ def _collect(spark: SparkSession, function: Callable[[Task], Json], tasks: Seque
             }
         _freeze_garbage()
 
-    # A task is told its own part alone: what all of them are told is unpickled by each.
+    # Each Spark task gets only one task: data in the closure would be unpickled by every one of them.
     results: list[Json] = spark.sparkContext.parallelize(tasks, len(tasks)).mapPartitions(run).collect()
     return results
 
 
 @cache
 def _freeze_garbage() -> None:
-    """Once a worker, after its first task: Spark collects garbage after each, which takes 22 ms with all modules."""
+    """Freeze objects once per worker: otherwise the garbage collection after each Spark task takes 22 ms."""
     gc.collect()
     gc.freeze()
 
 
 def _max_attempts(spark: SparkSession) -> int:
-    """How often Spark runs a failing task: F of local[N,F], 1 of local[N], spark.task.maxFailures of a cluster."""
+    """Return how often Spark runs a failing task: F for local[N,F], 1 for local[N], else spark.task.maxFailures."""
     master = str(spark.sparkContext.master)
     local = re.fullmatch(r"local(?:\[[^,\]]+(?:,\s*(\d+))?\])?", master)
     if local:

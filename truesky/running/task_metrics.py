@@ -1,4 +1,4 @@
-"""What a part took, beside its receipt: seconds, those of the processor, its largest memory; bytes of its files."""
+"""Measure the time, memory and output size of tasks."""
 
 from __future__ import annotations
 
@@ -11,12 +11,15 @@ from typing import Any
 
 from lake_schema.store.plan import Json, Task
 
-# Linux: a 5 written here makes the process's largest memory start again from what it holds now.
+# On Linux, writing 5 to this file resets the peak memory of the process to its current memory.
 _CLEAR, _RESET, _STATUS = Path("/proc/self/clear_refs"), "5", Path("/proc/self/status")
 
 
 class WithMetrics:
-    """A part's function with the clocks and the memory beside its receipt; crosses to the workers."""
+    """Wrap a task function so that its receipt also records time, peak memory and output size.
+
+    Instances can be pickled and sent to Spark workers.
+    """
 
     def __init__(self, run_task: Callable[[Task], Json]) -> None:
         self.run_task = run_task
@@ -36,7 +39,7 @@ class WithMetrics:
 
 
 def reset_peak_memory() -> None:
-    """Begin to measure the peak anew, where the system can."""
+    """Reset the record of peak memory, if the operating system supports it."""
     try:
         _CLEAR.write_text(_RESET)
     except OSError:
@@ -44,11 +47,14 @@ def reset_peak_memory() -> None:
 
 
 def peak_memory_gb() -> float:
-    """Largest resident memory since `forget_peak`, GB; of the process's life where the system cannot begin anew."""
+    """Return the peak resident memory in GB since the last reset.
+
+    If resetting is not supported, the peak is since the start of the process.
+    """
     try:
         line = next(line for line in _STATUS.read_text().splitlines() if line.startswith("VmHWM:"))
         return int(line.split()[1]) * 1024 / 1e9
     except (OSError, StopIteration, ValueError):
-        # In kilobytes on Linux, in bytes on macOS.
+        # The value is in kilobytes on Linux and in bytes on macOS.
         unit = 1 if sys.platform == "darwin" else 1024
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9

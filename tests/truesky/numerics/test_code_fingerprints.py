@@ -1,4 +1,4 @@
-"""What is cached is made anew when any of the code that shapes it changes."""
+"""Cached arrays are computed again if any code that affects them changes."""
 
 import ast
 import importlib
@@ -73,7 +73,7 @@ DATA = {path.name: path for path in (ROOT / "truesky").rglob("*") if path.suffix
 
 @pytest.mark.parametrize("name", KEYED)
 def test_a_byte_of_any_table_changes_the_key(name, monkeypatch):
-    """Of every table that the source of a listed module names, in whatever way."""
+    """This includes every table that the source of a listed module names, whole or by its suffix."""
     real, key = code_fingerprints._content, code_fingerprints.code_key.__wrapped__
     before, found = key(name), set(code_fingerprints.data_files(name))
     for other in code_fingerprints.required_modules(name):
@@ -89,7 +89,7 @@ def test_a_byte_of_any_table_changes_the_key(name, monkeypatch):
 
 
 def test_every_table_is_found_by_its_name():
-    """No two have the same; and the code names each of them whole, but for those that it only follows."""
+    """Names of tables are unique, and the code names each one whole, unless it has the name of its module."""
     paths = [path for path in (ROOT / "truesky").rglob("*") if path.suffix in (".csv", ".toml")]
     assert len(paths) == len(DATA)
     named = {file for name in SOURCES for file in code_fingerprints._named_files(name.removesuffix(".__init__"))}
@@ -125,7 +125,7 @@ print(json.dumps(sorted(found)))
 
 @pytest.mark.parametrize("more", [[], pytest.param(["stars"], marks=pytest.mark.nightly)], ids=["galaxies", "stars"])
 def test_tables_that_are_opened_are_in_the_key(tmp_path, more):
-    """Those of galaxies; the spectra of stars take 9 s more."""
+    """The test reads the tables of galaxies; the nightly test also those of stars, which takes 9 s more."""
     told = subprocess.run(
         [sys.executable, "-c", OPENING, *more], cwd=ROOT, env={**os.environ, "TRUESKY_CACHE": str(tmp_path)},
         capture_output=True, text=True, check=True,
@@ -138,9 +138,9 @@ def test_tables_that_are_opened_are_in_the_key(tmp_path, more):
         assert file in code_fingerprints.data_files(module), (module, file)
 
 
-# Of the modules that are said to shape no array, what those that shape arrays may use besides exceptions, types of
-# arrays and declared tables: what keeps or digests things; records of what a user asks for and of the mission, whose
-# values are keyed, and names.
+# Names from irrelevant modules that other modules may use, in addition to exceptions, types of arrays and declared
+# tables: functions that store or hash data, records of the request and of the mission (whose values are in the keys),
+# and names.
 KEEPING = {
     "truesky.numerics.cache.cache_dir", "truesky.numerics.cache.cached_arrays", "truesky.numerics.cache.content_key",
     "truesky.numerics.code_fingerprints.code_key", "lake_schema.store.layout", "lake_schema.store.read",
@@ -165,7 +165,7 @@ def is_harmless(name):
     return name == "truesky.numerics.cache" or (isinstance(value, type) and issubclass(value, LakeError))
 
 
-def test_what_is_said_to_shape_no_array_is_used_for_nothing_else():
+def test_irrelevant_modules_provide_only_allowed_names():
     used = set()
     for module in {other for name in KEYED for other in code_fingerprints.required_modules(name)}:
         for node in ast.walk(ast.parse(code_fingerprints._source(module))):
@@ -183,7 +183,7 @@ def test_what_is_said_to_shape_no_array_is_used_for_nothing_else():
     assert {name for name in left_out if not is_harmless(name)} == set()
 
 
-def test_whoever_caches_arrays_puts_code_into_the_key():
+def test_every_module_that_caches_arrays_puts_code_into_the_key():
     caching = {name for name, path in SOURCES.items() if calls(path, "cached_arrays")}
     assert {"truesky.render.psf.euclid", "truesky.render.sources.sersic", "truesky.fluxes.passbands"} <= caching
     assert caching <= set(KEYED)
@@ -194,6 +194,6 @@ def test_no_key_is_of_a_single_file():
         assert [ast.unparse(call) for call in calls(path, "read_bytes") if "__file__" in ast.unparse(call)] == [], name
 
 
-def test_a_module_that_is_not_there_is_named():
+def test_the_error_names_a_missing_module():
     with pytest.raises(ImportError, match=r"no module truesky\.nothing"):
         code_fingerprints.required_modules("truesky.nothing")

@@ -1,4 +1,4 @@
-"""What is compiled gives the same bytes, whether a process compiles it or finds it in the cache."""
+"""Compiled functions give the same bytes, whether a process compiles them or finds them in the cache."""
 
 import ast
 import os
@@ -24,7 +24,7 @@ print(hashlib.sha256(moved.tobytes()).hexdigest(), held.hex())
 
 
 def test_machine_code_is_kept_in_the_cache(tmp_path):
-    """Beside the sources it would be looked up by its own file alone, whatever is compiled into it."""
+    """Next to the sources its key would be the function's file only, not the files that are compiled into it."""
     environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
     code = "from truesky.numerics import cache, compiling; import numba; "
     code += "print(cache.machine_code_dir(), numba.config.CACHE_DIR)"
@@ -82,7 +82,7 @@ def test_two_copies_of_the_package_share_their_machine_code(tmp_path):
 
 
 def test_machine_code_is_of_the_sources_as_they_are(tmp_path):
-    """Also of those that are compiled into others."""
+    """Functions are also compiled again if functions that are compiled into them change."""
     assert cache.machine_code_dir().name == cache.sources_key()[:16]
     (tmp_path / "effects").mkdir()
     inner, plain = tmp_path / "effects" / "pixel_random.py", tmp_path / "units.py"
@@ -113,14 +113,14 @@ def test_constants_of_kernels_are_in_the_key_of_the_machine_code():
 
 
 def _imports(tree):
-    """Yield the name of each import from our packages, and the package or module it comes from."""
+    """Yield the name of each import from our packages, and its package or module."""
     for node in tree.body:
         if isinstance(node, ast.ImportFrom) and node.module.split(".")[0] in ("truesky", "lake_schema"):
             yield from ((alias.name, node.module) for alias in node.names)
 
 
 def _names_in_kernels(tree):
-    """Return the names that compiled functions use, and those in the module-level assignments of such names."""
+    """Return the names that compiled functions use, and the names in module-level assignments of such names."""
     kernels = [
         node
         for node in tree.body

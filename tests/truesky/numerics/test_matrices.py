@@ -23,7 +23,7 @@ def slow(one, other):
 )
 def test_a_product_has_the_bits_of_its_definition(n, k, m, kinds, seed):
     rng = np.random.default_rng(seed)
-    # Of all sizes, so that another order shows.
+    # Numbers have very different sizes, so that another order of summation changes the result.
     one = (rng.normal(size=(n, k)) * 10.0 ** rng.uniform(-8, 8, (n, k))).astype(kinds[0])
     other = (rng.normal(size=(k, m)) * 10.0 ** rng.uniform(-8, 8, (k, m))).astype(kinds[1])
     wanted = slow(one, other)
@@ -56,8 +56,8 @@ def test_stacks_of_small_matrices():
     assert matrices.inverse(one) == pytest.approx(np.linalg.inv(one), rel=1e-11, abs=0.0)
 
 
-def test_factors_that_do_not_fit_are_refused():
-    with pytest.raises(ValueError, match="do not fit"):
+def test_factors_with_different_numbers_of_terms_are_refused():
+    with pytest.raises(ValueError, match="do not match"):
         matrices.matmul(np.ones((2, 3)), np.ones((2, 3)))
 
 

@@ -39,7 +39,7 @@ def test_a_source_has_its_own_numbers_among_any_others(found, kind):
     first = drawn(whole, kind, ids.size)
     assert np.array_equal(drawn(other, kind), first[:0:-1])
     drawn(cut, kind)
-    # Those that are left go on where they are, as if the others were still there.
+    # The remaining sources continue with their next numbers, as if the others were still present.
     assert np.array_equal(drawn(cut.select(ids > ids[0]), kind), drawn(whole, kind)[1:])
 
 
@@ -90,5 +90,5 @@ def test_poisson(mean):
 
 
 def test_another_number_of_sources_is_refused():
-    with pytest.raises(ValueError, match="3 numbers are wanted of 2 sources"):
+    with pytest.raises(ValueError, match="size must be the number of sources, 2, got 3"):
         PerSourceGenerator(np.arange(2), 1).random(3)

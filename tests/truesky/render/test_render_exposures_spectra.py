@@ -225,7 +225,7 @@ def test_python_draws_the_same_models(rendered):
         assert abs(y - NY / 2) < 2.0
         with pytest.raises(truesky.BadInput, match="no detector DET22 of exposure 99"):
             lake.models(99, "DET22")
-        with pytest.raises(truesky.BadInput, match="no light of source 12 is drawn there"):
+        with pytest.raises(truesky.BadInput, match="source 12 has no light on the detector"):
             lake.models(3, "DET22", [12])
 
 
@@ -238,7 +238,7 @@ def drawn_first(root):
 @pytest.mark.parametrize(
     ("replaced", "message"),
     [
-        ({"--sources": "12"}, "exposure 3, detector DET22: no light of source 12 is drawn there"),
+        ({"--sources": "12"}, "exposure 3, detector DET22: source 12 has no light on the detector"),
         ({"--exposure": "99"}, "table products has no detector DET22 of exposure 99"),
         ({"--exposure": "6"}, "exposure 6: NISP-S dark is no image of spectra"),
         ({"--out": "models.txt"}, "the ending is not one of .fits"),

@@ -12,7 +12,7 @@ import pytest
 
 from truesky.running import memory_reuse
 
-# More than the 32 MB up to which the library may learn to keep memory by itself.
+# More than 32 MB, the limit to which the library may adapt its threshold for keeping memory.
 SIZE = 64 << 20
 
 
@@ -48,7 +48,7 @@ def counts():
 
 
 COUNTS = counts()
-# Told by the system, not by what is tested: a `heap` that no longer finds the library fails here.
+# The condition uses the platform instead of the tested module, so that tests fail if it no longer finds the library.
 on_gnu = pytest.mark.skipif(
     platform.libc_ver()[0] != "glibc" or COUNTS is None,
     reason="only GNU's C library, from 2.33 on, says where memory is; that others are left alone is tested below",
@@ -56,7 +56,7 @@ on_gnu = pytest.mark.skipif(
 
 
 def alone(test):
-    """The test in a process of its own: in a heap that others left, even a large array may find room."""
+    """Run a test in a separate process: in a used heap, even a large array may find free memory."""
 
     @functools.wraps(test)
     def in_a_process():
@@ -76,10 +76,10 @@ def heap_and_mapped():
 
 
 def resident():
-    """Bytes of this process that are in memory.
+    """Return the bytes of this process that are in memory.
 
-    The heap's size would not do for what is given back: one small block that is left at its end keeps it as long as
-    it was, though no page before that block is in memory any more.
+    The size of the heap is not sufficient: one small block at its end keeps it long, even if no page before that block
+    is in memory any more.
     """
     with open("/proc/self/statm") as file:
         return int(file.read().split()[1]) * mmap.PAGESIZE
@@ -124,7 +124,7 @@ def test_it_is_given_back():
         assert COUNTS().fordblks >= SIZE
         assert resident() >= before + SIZE * 7 // 8
     assert resident() < before + SIZE // 8
-    # As the library is used to: the next array is asked for, and given back.
+    # The library has its usual behaviour again: the next array is requested from the system, and returned.
     array = np.ones(SIZE, np.uint8)
     assert heap_and_mapped()[1] >= mapped + SIZE
     del array

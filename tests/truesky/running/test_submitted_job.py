@@ -126,7 +126,7 @@ def test_help_tells_what_the_job_does_and_the_version(capsys):
     ("options", "words"),
     [(["--request", "none.toml"], "no such file"), (["--lake", "s3://bucket"], "POSIX")],
 )
-def test_a_wrong_call_ends_with_2(lake, request_file, capsys, options, words):
+def test_the_exit_status_of_wrong_arguments_is_2(lake, request_file, capsys, options, words):
     arguments = ["--lake", str(lake), "--request", str(request_file), *options]
     assert submitted_job.main(job_of(plain_work), arguments) == 2
     assert words in capsys.readouterr().err
@@ -166,7 +166,7 @@ def test_what_is_already_there_needs_no_log(run, lake, capsys):
     assert "no log of this run" in err
 
 
-def test_a_java_that_dies_while_it_starts_is_one_line(lake, request_file, capsys, monkeypatch):
+def test_the_error_is_one_line_if_java_ends_during_its_start(lake, request_file, capsys, monkeypatch):
     def dead(name):
         raise Py4JNetworkError("Answer from Java side is empty\nTraceback ...")
 
@@ -179,7 +179,7 @@ def test_a_java_that_dies_while_it_starts_is_one_line(lake, request_file, capsys
 
 
 def test_a_part_that_kills_its_worker_is_found_in_few_runs(monkeypatch):
-    """Of a thousand parts all but the poisoned one are made, in runs of many parts each."""
+    """One of a thousand tasks kills its worker; all others are made, in runs of many tasks each."""
     runs = []
 
     def collect(spark, function, parts):
@@ -194,7 +194,9 @@ def test_a_part_that_kills_its_worker_is_found_in_few_runs(monkeypatch):
     parts = [Task(f"{i:03}", {}) for i in range(1000)]
     results = submitted_job._spark_map(dict, parts, "toy", verbose=True)
     assert [result["part"] for result in results] == [part.name for part in parts]
-    assert [result for result in results if "error" in result] == [{"part": "700", "error": "its worker died"}]
+    assert [result for result in results if "error" in result] == [
+        {"part": "700", "error": "its worker ended unexpectedly"}
+    ]
     assert len(runs) <= 2 * 10 + 1
 
 

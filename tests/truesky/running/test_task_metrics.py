@@ -1,4 +1,4 @@
-"""The memory of a part is its own, not that of what ran before it in the process."""
+"""Peak memory is that of the task, not of earlier work in the same process."""
 
 import numpy as np
 import pytest

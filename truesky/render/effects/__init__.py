@@ -1,1 +1,1 @@
-"""What a detector and its electronics do to light, one effect a file."""
+"""Effects of a detector and its electronics on light and charge, one effect per file."""

@@ -1,4 +1,4 @@
-"""What an effect is, what it may know of an exposure, and the loop that applies a channel's effects."""
+"""Define a detector effect, and apply the effects of a channel in their order."""
 
 from __future__ import annotations
 
@@ -17,15 +17,30 @@ from truesky.render.effects.scene import NOTICEABLE, STACK_SIZE, Frame, Scene
 class Effect:
     """One physical effect.
 
-    apply        : (frame, *parameters, rng) -> frame; never writes its argument
-    parameters   : scene -> the numbers that `apply` wants
-    contribution : scene -> its largest change of a pixel, electrons; rms, of what is random
-    repeated     : scene -> the part of it that a mean over frames or pixels keeps, electrons; None = all of it
-    optional     : False where the frame is no product without it
-    fixed        : a pattern of the detector itself: its random numbers are the same in every exposure
-    shared       : one thing for all detectors of an exposure: its random numbers are the same on each
-    numbers      : the effect whose random numbers it takes, "" = its own
-    cost         : seconds a million pixels take on one core (benchmarks/effects.py); a channel has none of 0
+    Attributes
+    ----------
+    name : str
+        Name of the effect, unique in a channel.
+    apply : callable
+        Function (frame, *parameters, rng) -> new frame. It does not modify its arguments.
+    parameters : callable
+        Function scene -> tuple of the parameters of `apply`.
+    contribution : callable
+        Function scene -> largest change of a pixel in electrons; standard deviation for random changes.
+    optional : bool
+        False if frames cannot be made without the effect.
+    fixed : bool
+        True for a pattern of the detector: its random numbers are the same in every exposure.
+    shared : bool
+        True if the effect is common to all detectors: its random numbers are the same on every detector.
+    random_stream : str
+        Name of another effect whose random numbers this one uses. By default the effect has separate random numbers.
+    cost : float
+        CPU seconds per million pixels on one core, measured by benchmarks/effects.py. It is more than 0 for every
+        effect of a channel.
+    systematic : callable, optional
+        Function scene -> part of the contribution that remains in a mean over frames or pixels, in electrons. By
+        default the whole contribution remains.
     """
 
     name: str
@@ -40,32 +55,49 @@ class Effect:
     systematic: Callable[[Scene], float] | None = None
 
     def margin(self, scene: Scene) -> float:
-        """Contribution over what would be noticed, in a pixel or in a mean: above 1 the effect is needed."""
+        """Return the contribution relative to the noticeable change of a pixel or mean: above 1 it is needed."""
         change = float(self.contribution(scene))
         systematic = change if self.systematic is None else float(self.systematic(scene))
         change = max(change, math.sqrt(STACK_SIZE) * systematic)
         noise = NOTICEABLE * scene.pixel_noise
-        # Without any noise everything is noticed.
+        # Without noise every change is noticeable.
         return change / noise if noise > 0.0 else math.inf if change > 0.0 else 0.0
 
     def is_needed(self, scene: Scene) -> bool:
-        """Whether the scene needs it, or no frame can do without it, whatever a request forces."""
+        """Return True if the scene needs the effect, whatever the request forces."""
         return not self.optional or self.margin(scene) > 1.0
 
     def is_applied(self, scene: Scene) -> bool:
-        """Whether it is applied to the scene: as its request forces it, else as the scene needs it."""
+        """Return True if the effect is applied: as the request forces it, otherwise if the scene needs it."""
         return scene.forced.get(self.name, self.is_needed(scene))
 
 
 def zero_contribution(scene: Scene) -> float:
-    """Of a contribution what a mean keeps, where it is noise."""
+    """Return 0: the systematic contribution of pure noise, which averages out."""
     return 0.0
 
 
 def map_pixels(kernel: Callable[..., None], frame: Frame, *arguments: Any) -> Frame:
-    """A new frame of the same shape, in which a compiled kernel(before [n], after [n], *numbers) has set each pixel.
+    """Apply a compiled function to the pixels of a frame.
 
-    numbers : each for the frame, or [q] for its q amplifiers, which are then set one by one: frame [q, ..]
+    Parameters
+    ----------
+    kernel : callable
+        Compiled function (pixels, out_pixels, *arguments) that fills `out_pixels`. Both arrays are float64, shape (n,).
+    frame : float array, shape (ny, nx) or (q, ...)
+        Input frame. The first axis counts amplifiers if an argument has one value per amplifier.
+    *arguments : float, uint64 or array, shape (q,)
+        Further arguments of `kernel`: one value for the frame, or one value for each of its q amplifiers.
+
+    Returns
+    -------
+    float array, shape of `frame`
+        New frame.
+
+    Raises
+    ------
+    BadInput
+        If arguments have values for another number of amplifiers than the frame has.
     """
     out = np.empty(frame.shape)
     pixels, out_pixels = np.ascontiguousarray(frame, dtype=float).reshape(-1), out.reshape(-1)
@@ -74,7 +106,7 @@ def map_pixels(kernel: Callable[..., None], frame: Frame, *arguments: Any) -> Fr
         kernel(pixels, out_pixels, *arguments)
         return out
     if frame.shape[0] != n_amplifiers:
-        raise BadInput(f"numbers of {n_amplifiers} amplifiers for a frame of {frame.shape[0]}")
+        raise BadInput(f"parameters have values for {n_amplifiers} amplifiers, but the frame has {frame.shape[0]}")
     for number, (amplifier_pixels, amplifier_out) in enumerate(
         zip(np.split(pixels, n_amplifiers), np.split(out_pixels, n_amplifiers), strict=True)
     ):
@@ -84,7 +116,19 @@ def map_pixels(kernel: Callable[..., None], frame: Frame, *arguments: Any) -> Fr
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """Whether an effect was applied, why, and by which margin."""
+    """Decision on an effect.
+
+    Attributes
+    ----------
+    name : str
+        Name of the effect.
+    applied : bool
+        True if the effect is applied.
+    forced : bool
+        True if the request switches it on or off.
+    margin : float
+        Contribution relative to the noticeable change, see `Effect.margin`.
+    """
 
     name: str
     applied: bool
@@ -93,13 +137,17 @@ class Decision:
 
 
 def decide(effects: Sequence[Effect], scene: Scene) -> tuple[Decision, ...]:
-    """What a scene needs, and what is forced on or off in it (effects of other channels do nothing)."""
+    """Decide which effects to apply: all that the scene needs or its request forces on.
+
+    Names of effects of other channels in `scene.forced` are ignored. Raises BadInput if the request switches off an
+    effect that is not optional.
+    """
     for effect in effects:
         if not effect.optional and not effect.is_applied(scene):
             raise BadInput(f"effect {effect.name} cannot be switched off")
     decisions = []
     for effect in effects:
-        # Once: some contributions take as long as the effect itself.
+        # The margin is computed only once, because some contributions take as long as the effect.
         margin = effect.margin(scene)
         applied = scene.forced.get(effect.name, not effect.optional or margin > 1.0)
         decisions.append(Decision(effect.name, applied, effect.name in scene.forced, margin))
@@ -113,11 +161,28 @@ def apply_all(
     stream: Callable[[Effect], np.random.Generator],
     callback: Callable[[str, Frame, Frame], None] | None = None,
 ) -> tuple[Frame, tuple[Decision, ...]]:
-    """Apply a channel's effects in their order.
+    """Apply the effects of a channel in their order.
 
-    stream : effect -> its own generator, so that switching one effect off leaves the draws of the others as they were
-    watch  : sees the name of an effect that is applied, and the frame before and after it
-    frame  : [ny, nx];  effects : in the order of the channel;  scene : what their parameters are taken from
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Input frame.
+    effects : sequence of Effect
+        Effects in the order of the channel.
+    scene : Scene
+        Exposure from which the parameters of the effects are taken.
+    stream : callable
+        Function effect -> random generator. Each effect has a separate generator, so that switching one effect off does
+        not change the random numbers of the others.
+    callback : callable, optional
+        Function (name, previous frame, new frame), called after each applied effect.
+
+    Returns
+    -------
+    frame : float array
+        Frame after all applied effects.
+    decisions : tuple of Decision
+        One decision per effect.
     """
     decisions = decide(effects, scene)
     for effect, decision in zip(effects, decisions, strict=True):
@@ -125,6 +190,6 @@ def apply_all(
             previous, frame = frame, effect.apply(frame, *effect.parameters(scene), rng=stream(effect))
             if callback is not None:
                 callback(effect.name, previous, frame)
-            # Frames are large: the next effect needs one.
+            # Free the memory of the previous frame before the next effect allocates one.
             del previous
     return frame, decisions

@@ -1,4 +1,4 @@
-"""What an effect may know of an exposure of one detector."""
+"""Properties of one detector's exposure that detector effects depend on."""
 
 from __future__ import annotations
 
@@ -19,20 +19,42 @@ from truesky.request.accuracy import SURVEY, Accuracy
 
 Frame = Float
 
-# An effect is needed where its largest contribution exceeds this part of a pixel's noise; and what comes back in every
-# frame, or in every pixel, where it exceeds this part of the noise that is left in the mean of so many: 32 x 32 pixels
-# of the sky, or of one in a stack of 1024 frames.
+# An effect is applied if its largest contribution to a pixel exceeds NOTICEABLE times the pixel's noise. A contribution
+# that repeats in every frame or every pixel does not average out: it is compared with the noise of the mean of
+# STACK_SIZE values, such as 32 x 32 pixels of sky or one pixel in 1024 frames.
 NOTICEABLE, STACK_SIZE = 0.1, 1024
-
 
 # Boltzmann's constant, eV / K (CODATA 2018).
 _BOLTZMANN = 8.617333e-5
 
 
 def dark_current_scaling(temperature: float, reference: float, band_gap: float) -> float:
-    """Dark current over that at the reference temperature, K; band gap in eV.
+    """Dark current relative to the reference temperature.
 
-    Ref : Janesick 2001, Scientific Charge-Coupled Devices: T^1.5 exp(-Eg / 2 k T)
+    Parameters
+    ----------
+    temperature, reference : float
+        Temperature of the detector and reference temperature in kelvin, 50 to 400.
+    band_gap : float
+        Band gap in eV.
+
+    Returns
+    -------
+    float
+        Ratio of the dark currents.
+
+    Raises
+    ------
+    OutOfRange
+        If a temperature is outside its limits.
+
+    Notes
+    -----
+    The dark current is proportional to T^1.5 exp(-E_g / (2 k T)) [1]_.
+
+    References
+    ----------
+    .. [1] Janesick 2001, Scientific Charge-Coupled Devices.
     """
     for value in (temperature, reference):
         if not 50.0 <= value <= 400.0:
@@ -43,10 +65,14 @@ def dark_current_scaling(temperature: float, reference: float, band_gap: float) 
 
 @dataclass(frozen=True, slots=True)
 class Lights:
-    """Bright sources on a detector and around it, as points.
+    """Bright sources on and around a detector, as points.
 
-    column, row : float64[n] 0-based pixel position, also outside the frame
-    electrons   : float64[n] expected in the exposure
+    Attributes
+    ----------
+    column, row : float64 array, shape (n,)
+        Pixel position, 0-based, also outside the frame.
+    electrons : float64 array, shape (n,)
+        Expected electrons in the exposure.
     """
 
     column: Frame = field(default_factory=lambda: np.zeros(0))
@@ -54,7 +80,7 @@ class Lights:
     electrons: Frame = field(default_factory=lambda: np.zeros(0))
 
     def concatenate(self, other: Lights) -> Lights:
-        """These, then those."""
+        """Return the sources of `self` followed by those in `other`."""
         return Lights(
             np.append(self.column, other.column),
             np.append(self.row, other.row),
@@ -64,10 +90,14 @@ class Lights:
 
 @dataclass(frozen=True, slots=True)
 class NeighbourCharge:
-    """What other detectors hold while one is read.
+    """Charge on other detectors that are read out at the same time, for crosstalk between detectors.
 
-    pixel     : int64[n] of the parts of the detector in readout order, counted on; each once
-    electrons : float64[n]
+    Attributes
+    ----------
+    pixel : int64 array, shape (n,)
+        Pixel index in readout order, counted through all amplifiers of the detector. Values are unique.
+    electrons : float64 array, shape (n,)
+        Charge read at the same time as this pixel.
     """
 
     pixel: Int
@@ -76,25 +106,50 @@ class NeighbourCharge:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """What effects may know of an exposure of one detector.
+    """Exposure of one detector.
 
-    section        : prefix of the detector's parameters, "vis" or "ext.lsstcam"
-    sky_rate       : electrons per second in a pixel
-    peak_electrons : brightest pixel of the expected image: of the sources, with a lamp's light or injected charge
-    track_electrons : brightest likely pixel of cosmic rays' tracks, where there are some
-    detector       : where it lies in the focal plane; None: at its centre
-    lights         : sources of scattered light: ghosts, straylight
-    lamp           : the LED of a flat, from 1
-    forced         : effect name -> on or off, instead of what the scene needs
-    band           : the exposure's passband, None = the embedded one
-    ramp           : which of the mission's ramps the detector is read up, "photometric" or "spectroscopic"; "" = it is
-                     read once
-    remembered     : [ny, nx] e- that earlier exposures leave in this one; None = nothing
-    tints          : float32[2, ny, nx] of `chromatic_response`: sources of which pixels see the colour; None = of none
-    spread_sky     : [gy, gx] e- that a grism changes of the sky, at places evenly over the detector; None = nothing
-    tint_electrons : the most that this changes in a pixel, e- rms
-    seeing         : FWHM, arcsec, of a ground camera's exposure;  zero_point : AB magnitude of 1 e-/s
-    elsewhere      : charge of the detectors that are read with this one; None = none that is noticed
+    Attributes
+    ----------
+    mission : MissionConfiguration
+        Mission database, with the overrides of the request.
+    section : str
+        Prefix of the detector's parameters in the mission database, such as "vis" or "ext.lsstcam".
+    exposure_time_s : float
+        Exposure time in seconds.
+    sky_rate : float
+        Sky background in electrons per second per pixel.
+    peak_electrons : float
+        Brightest pixel of the expected image: sources, the light of a lamp or injected charge, without sky.
+    detector : Detector, optional
+        Position in the focal plane. None for a detector at the centre.
+    lights : Lights
+        Sources of scattered light (ghosts, stray light).
+    lamp : int
+        Number of a flat's LED, from 1.
+    accuracy : Accuracy
+        Errors that the request accepts.
+    forced : mapping of str to bool
+        Effects to switch on or off, by name. All others are applied if the scene needs them.
+    band : Passband, optional
+        Passband of the exposure. None for the passband included in the package.
+    track_electrons : float
+        Brightest pixel that cosmic rays are likely to produce, 0 without cosmic rays.
+    ramp : str
+        Readout mode of an infrared detector, "photometric" or "spectroscopic". Empty if the detector is read once.
+    persistence_charge : float array, shape (ny, nx), optional
+        Electrons that earlier exposures release in this one.
+    chromatic_light : float32 array, shape (2, ny, nx), optional
+        Light of the sources with each photon weighted by f1 and by f2, see `chromatic_response`.
+    chromatic_electrons : float
+        Largest change of a pixel by the colours of sources, see `chromatic_response`, in electrons rms.
+    sky_change : float array, shape (gy, gx), optional
+        Change of the sky by a grism in electrons, on an even grid over the detector.
+    neighbour_charge : NeighbourCharge, optional
+        Charge on detectors that are read with this one. None if it is negligible.
+    seeing : float
+        FWHM of the seeing in arcsec, for ground cameras.
+    zero_point : float
+        AB magnitude that gives 1 electron per second, for ground cameras.
     """
 
     mission: MissionConfiguration
@@ -119,11 +174,22 @@ class Scene:
     zero_point: float = 0.0
 
     def value(self, key: str, unit: str) -> float:
-        """A parameter of the detector."""
+        """Return a parameter of the detector in the given unit."""
         return self.mission.value(f"{self.section}.{key}", unit, DetectorPlace(self._detector_name))
 
     def amplifier_values(self, key: str, unit: str) -> float | Float:
-        """A parameter of its amplifiers: float64[q] in the order in which they are read; one number where all agree."""
+        """Values of a parameter for the amplifiers of the detector.
+
+        Parameters
+        ----------
+        key, unit : str
+            Name of the parameter without its section, and unit.
+
+        Returns
+        -------
+        float, or float64 array, shape (q,)
+            Values in readout order, or one number if all amplifiers have the same value.
+        """
         if self.detector is not None and self.layout is not None:
             return amplifiers.values(key, unit, self.detector, self.mission, self.layout)
         values = self.mission.amplifier_values(f"{self.section}.{key}", unit, self._detector_name)
@@ -131,12 +197,12 @@ class Scene:
 
     @property
     def layout(self) -> Layout | None:
-        """Its amplifiers, of a ground camera's detector; None: it is read in quadrants, or as one frame."""
+        """Amplifiers of a ground camera's detector. None if the detector is read in quadrants or as one frame."""
         return None if self.detector is None else amplifiers.layout(self.detector, self.mission)
 
     @property
     def column_segments(self) -> tuple[tuple[int, int, bool], ...]:
-        """Pieces of its columns: first row, the one past the last, whether their charge leaves upwards."""
+        """Segments of every column: first row, last row + 1, and True if the serial register is above the segment."""
         if self.layout is not None:
             return self.layout.column_segments
         lower, upper = self.unread_rows
@@ -148,42 +214,46 @@ class Scene:
 
     @property
     def nx(self) -> int:
-        """Columns of its detector; without one, of the mission's."""
+        """Number of columns."""
         return self.detector.nx if self.detector is not None else int(self.value("fpa.nx", "pix"))
 
     @property
     def ny(self) -> int:
-        """Rows, likewise."""
+        """Number of rows."""
         return self.detector.ny if self.detector is not None else int(self.value("fpa.ny", "pix"))
 
     @property
     def injection_rows(self) -> int:
-        """Rows between the halves, that are not read."""
+        """Number of rows between the two halves of the detector. They are not read."""
         return self.detector.injection_rows if self.detector is not None else 0
 
     @property
     def half_rows(self) -> int:
-        """Rows that are read through one register, of two."""
+        """Number of rows that are read through each of the two registers."""
         return (self.ny - self.injection_rows) // 2
 
     @property
     def unread_rows(self) -> tuple[int, int]:
-        """The first row between the halves, and the first of the upper half."""
+        """Range of the rows between the two halves: first row, and first row of the upper half."""
         return self.half_rows, self.half_rows + self.injection_rows
 
     @property
     def sky_electrons(self) -> float:
+        """Sky background in electrons per pixel."""
         return self.sky_rate * self.exposure_time_s
 
     @property
     def brightest_electrons(self) -> float:
-        """Of a pixel, whatever has brought them: what is read is squeezed and left behind alike."""
+        """Electrons in the brightest pixel, from sources or cosmic rays, and sky.
+
+        Nonlinearity and charge transfer depend on the total charge, whatever its origin.
+        """
         return max(self.peak_electrons, self.track_electrons) + self.sky_electrons
 
     @property
     def dark_current_scaling(self) -> float:
-        """Thermal electrons over those at the temperature that they are given at."""
-        # Ground cameras are given at the temperature they are run at.
+        """Dark current relative to its value in the mission database."""
+        # The values of ground cameras are for their operating temperature.
         if f"{self.section}.detector_temperature" not in self.mission:
             return 1.0
         temperatures = self.value("detector_temperature", "K"), self.value("dark_reference_temperature", "K")
@@ -191,27 +261,31 @@ class Scene:
 
     @property
     def dark_rate(self) -> float:
-        """Dark current at the detector's temperature, e-/s in a pixel."""
+        """Dark current at the detector's temperature in electrons per second per pixel."""
         return self.value("dark_current", "electron / (s pix)") * self.dark_current_scaling
 
     @property
     def dark_electrons(self) -> float:
+        """Dark current in electrons per pixel."""
         return self.dark_rate * self.exposure_time_s
 
     @property
     def pixel_noise(self) -> float:
-        """Electrons rms of a pixel without a source: sky, dark current, reading."""
-        # In the mean over the detector.
+        """Noise of a pixel without sources in electrons rms: sky, dark current and read noise."""
+        # Mean over the detector.
         dispersed = 0.0 if self.sky_change is None else float(self.sky_change.mean())
         return float(np.sqrt(max(self.sky_electrons + dispersed, 0.0) + self.dark_electrons + self.reading_noise**2))
 
     @property
     def reading_noise(self) -> float:
-        """Electrons rms that reading adds to a pixel; of a ramp, to its signal.
+        """Read noise of a pixel in electrons rms; for a ramp, of its signal.
 
-        Error : of a ramp, that of the difference of its last group and its first: 4 % below the estimator's
+        Notes
+        -----
+        For a ramp this is the noise of the difference between the last and the first group, 4 % below the noise of the
+        estimator that is used.
         """
-        # Of the quietest amplifier: what is noticed there matters.
+        # The quietest amplifier decides whether an effect is noticeable.
         read_noise = float(np.min(self.amplifier_values("read_noise", "electron")))
         if not self.ramp:
             return read_noise

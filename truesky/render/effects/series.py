@@ -1,6 +1,6 @@
-"""The exponential function near 0 by its series, without a branch, so that loops over pixels work on several at a time.
+"""Compute the exponential function near 0 by its series.
 
-small_expm1   exp(x) - 1 for |x| < SMALL;  small_exp   exp(x) for |x| < SMALL_EXP
+The functions have no branches, so that the compiler vectorises loops over pixels.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ SMALL, SMALL_EXP = 0.25, 1.2
 
 @jit
 def small_expm1(x: Any) -> Any:
-    """exp(x) - 1 by its series, to 1e-14 for |x| < SMALL."""
+    """Return exp(x) - 1 by its series, with an error of 1e-14 for |x| < SMALL."""
     out = 1.0 + x * (1.0 / 11.0)
     out = 1.0 + x * (1.0 / 10.0) * out
     out = 1.0 + x * (1.0 / 9.0) * out
@@ -30,7 +30,7 @@ def small_expm1(x: Any) -> Any:
 
 @jit
 def small_exp(x: Any) -> Any:
-    """exp(x) by the fourth power of the series of a quarter of it, to 1e-12 for |x| < SMALL_EXP."""
+    """Return exp(x) as the fourth power of the series of exp(x / 4), with an error of 1e-12 for |x| < SMALL_EXP."""
     x = 0.25 * x
     out = 1.0 + x * (1.0 / 10.0)
     out = 1.0 + x * (1.0 / 9.0) * out

@@ -1,1 +1,1 @@
-"""One detector of one exposure, from catalogue rows to raw image."""
+"""Render one detector of one exposure, from catalogue rows to the raw image."""

@@ -1,13 +1,9 @@
-"""What the detectors that share a board with one hold while it is read: their bright stars, drawn from the catalogue.
+"""Bright stars on detectors that share a readout board with this one, for crosstalk between detectors.
 
-No detector needs the image of another: what it sees of them is a function of the plan and the catalogue alone.
-Error : stars alone are drawn, in the colour of flat f_nu, through the PSF of the detector that sees them, without
-        spikes beyond its planes, noise and cosmic rays; nothing but the full well changes their charge
+No detector needs the image of another: its crosstalk depends only on the plan and the catalogue.
 
-neighbours   the other detectors of a board
-may_show     whether the brightest of their pixels would be noticed
-stars        of the catalogue, those that are bright enough;  circle : where they are
-charge       what they bring, in the order in which all are read
+Only stars are drawn, with the colour of flat f_nu and with the PSF of the detector that receives the crosstalk. Not
+included: spikes beyond the planes of the PSF, noise and cosmic rays. Only the full well changes their charge.
 """
 
 from __future__ import annotations
@@ -38,14 +34,29 @@ from truesky.render.sources.galaxy_shapes import shapes
 from truesky.render.sources.source_list import Sources
 
 _EFFECT = detector_crosstalk.EFFECT
-# Of a point's light in its brightest pixel, at the most.
+# Upper limit on the fraction of a point's flux in its brightest pixel.
 _PEAK_FRACTION = 0.3
-# Of what would be noticed, what is left out of their images in a pixel.
+# Electrons of a pixel that are neglected in images of the stars, relative to the noticeable electrons.
 _NEGLECTED = 0.05
 
 
 def other_detectors(camera: str, name: str, mission: MissionConfiguration) -> tuple[Detector, ...]:
-    """The detectors that are read with one: of the camera's order so many are on a board."""
+    """Return the other detectors on the readout board of a detector.
+
+    Parameters
+    ----------
+    camera : str
+        Camera.
+    name : str
+        Name of the detector.
+    mission : MissionConfiguration
+        Mission database. Its parameter `fpa.board` is the number of successive detectors per board, by default 1.
+
+    Returns
+    -------
+    tuple of Detector
+        Other detectors on the board.
+    """
     all_detectors = detectors.detectors(camera, mission)
     key = f"{all_detectors[0].section}.fpa.board"
     board_size = int(mission.value(key)) if key in mission else 1
@@ -54,7 +65,7 @@ def other_detectors(camera: str, name: str, mission: MissionConfiguration) -> tu
 
 
 def is_noticeable(aim: Aim, variant: Variant) -> bool:
-    """Whether a full pixel of another detector would be noticed; or the effect is forced on."""
+    """Return True if a full pixel of another detector is noticeable in this one, or if the effect is forced on."""
     if _EFFECT not in aim.effects or not aim.sees_sky:
         return False
     scene = scene_factory.from_aim(aim, variant)
@@ -65,17 +76,29 @@ def is_noticeable(aim: Aim, variant: Variant) -> bool:
 
 
 def detector_circle(exposure: ExposureRow, detector: Detector) -> dict[str, float]:
-    """ra, dec, radius (deg) about a detector, as of a task."""
+    """Return the circle around a detector: ra, dec and radius in degrees, as in the table `tasks`."""
     wcs = astrometry.wcs(detector, exposure.ra, exposure.dec, exposure.position_angle)
     ra, dec = astrometry.centre(detector, wcs)
-    # Optics may show it a little more of the sky.
+    # With distortion, the detector may cover slightly more of the sky.
     return {"ra": ra, "dec": dec, "radius": 1.05 * detector.half_diagonal / 3600.0}
 
 
 def bright_stars(inputs: Mapping[str, read.Version], aim: Aim, variant: Variant) -> tuple[NeighbourDetector, ...]:
-    """Of each other detector of the board the stars that may be noticed.
+    """Read the stars on other detectors of the board that may be noticeable.
 
-    inputs : versions of the tables that are read;  aim, variant : of the detector that sees them
+    Parameters
+    ----------
+    inputs : mapping of str to Version
+        Versions of the tables `stars` and `star_fluxes`.
+    aim : Aim
+        Exposure and detector that receives the crosstalk.
+    variant : Variant
+        Mission, accuracy and forced effects of this detector.
+
+    Returns
+    -------
+    tuple of NeighbourDetector
+        Other detectors of the board with their stars; empty if crosstalk is not noticeable.
     """
     exposure = aim.exposure
     if not is_noticeable(aim, variant):
@@ -95,15 +118,30 @@ def bright_stars(inputs: Mapping[str, read.Version], aim: Aim, variant: Variant)
 
 
 def _noticeable_electrons(scene: Scene) -> float:
-    """Electrons in a pixel of another detector that are noticed."""
+    """Return the electrons in a pixel of another detector that are noticeable in this one."""
     return NOTICEABLE * scene.pixel_noise / abs(detector_crosstalk.coefficient(scene))
 
 
 def with_neighbour_charge(light: Light, aim: Aim, rows: Rows, variant: Variant, seed: int) -> Light:
-    """The light, whose scene has what the others bring.
+    """Add the charge of the other detectors to the scene of a light.
 
-    light : of the detector;  aim : the exposure and detector;  rows : with the stars of the other detectors
-    variant : mission, accuracy and the effects that are forced on or off;  seed : of the request
+    Parameters
+    ----------
+    light : Light
+        Light on the detector.
+    aim : Aim
+        Exposure and detector.
+    rows : Rows
+        Catalogue rows, with the stars of the other detectors.
+    variant : Variant
+        Mission, accuracy and forced effects.
+    seed : int
+        Seed of the request.
+
+    Returns
+    -------
+    Light
+        The light with the new scene.
     """
     if not rows.neighbours or light.psf is None:
         return light
@@ -113,9 +151,17 @@ def with_neighbour_charge(light: Light, aim: Aim, rows: Rows, variant: Variant, 
 
 
 def neighbour_charge(light: Light, aim: Aim, rows: Rows, variant: Variant, seed: int) -> NeighbourCharge | None:
-    """Of all the other detectors, in the order in which the detector's own pixels are read; None: nothing.
+    """Charge of all other detectors of the board, in the order in which this detector's pixels are read.
 
-    light, aim, rows, variant, seed : as of `with_charge`
+    Parameters
+    ----------
+    light, aim, rows, variant, seed : Light, Aim, Rows, Variant, int
+        Same as in `with_neighbour_charge`.
+
+    Returns
+    -------
+    NeighbourCharge or None
+        Charge by pixel. None if there is no charge.
     """
     assert light.psf is not None
     scene, psf = light.scene, replace(light.psf, edges=None)
@@ -135,7 +181,7 @@ def neighbour_charge(light: Light, aim: Aim, rows: Rows, variant: Variant, seed:
         frame = stamps.draw(sources, sizes, psf, neighbour_aim.detector.nx, neighbour_aim.detector.ny)
         planes = split_amplifiers(_bled_electrons(frame, neighbour_scene), neighbour_scene)
         pixel_indices = np.argwhere(planes > _NEGLECTED * min_electrons)
-        # A detector of another kind has others.
+        # A detector of another kind may have pixels that this detector does not have.
         pixel_indices = pixel_indices[(pixel_indices < shape).all(axis=1)]
         pixels.append(np.asarray(np.ravel_multi_index(tuple(pixel_indices.T), shape), np.int64))
         electrons.append(planes[tuple(pixel_indices.T)])
@@ -148,14 +194,14 @@ def neighbour_charge(light: Light, aim: Aim, rows: Rows, variant: Variant, seed:
 
 
 def _bled_electrons(frame: Frame, scene: Scene) -> Frame:
-    """Whole electrons that the pixels hold."""
+    """Return whole electrons per pixel after bleeding."""
     return bleeding.apply(np.maximum(np.floor(frame), 0.0), bleeding.full_well(scene), scene.column_segments)
 
 
 def _select_stars(
     neighbour_aim: Aim, neighbour: NeighbourDetector, rows: Rows, psf: Psf, min_electrons: float
 ) -> Sources:
-    """The stars of another detector that have so many electrons in a pixel, where they are on it."""
+    """Return the stars that are on another detector and have more than `min_electrons` in a pixel."""
     exposure, detector = neighbour_aim.exposure, neighbour_aim.detector
     middle = exposure.mjd + 0.5 * exposure.exposure_time_s / 86400.0
     moved = catalogue_rows.apply_proper_motion(neighbour.stars, middle)

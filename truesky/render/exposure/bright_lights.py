@@ -1,4 +1,4 @@
-"""Bright sources on and around a detector, which make ghosts and scattered light; long trails as points."""
+"""Select bright sources on and around a detector that cause ghosts and scattered light."""
 
 from __future__ import annotations
 
@@ -11,17 +11,26 @@ from truesky.render.camera import astrometry
 from truesky.render.effects.scene import Lights
 from truesky.render.sources.source_list import Sources
 
-# Electrons of a source that may shine where it is not.
+# Electrons above which ghosts and scattered light of a source are considered.
 _MIN_ELECTRONS = 1e6
-# Pixels of a trail whose scattered light is that of a point.
+# Length of a piece of a trail in pixels, whose scattered light is computed as that of a point.
 _PIECE = 32.0
 
 
 def catalogue_lights(galaxies: tuple[pa.Table, Float], stars: tuple[pa.Table, Float], wcs: WCS) -> Lights:
-    """Bright sources on the detector and around it, as far as rows were given.
+    """Select bright catalogue sources on the detector and around it.
 
-    galaxies, stars : rows, and expected electrons of each
-    system          : world coordinates of the detector
+    Parameters
+    ----------
+    galaxies, stars : (Table, float array)
+        Catalogue rows, and expected electrons of each.
+    wcs : WCS
+        World coordinates of the detector.
+
+    Returns
+    -------
+    Lights
+        Bright sources, as far as the rows reach, by ascending identifier.
     """
     columns = []
     for rows, electrons in (galaxies, stars):
@@ -35,12 +44,15 @@ def catalogue_lights(galaxies: tuple[pa.Table, Float], stars: tuple[pa.Table, Fl
 
 
 def trail_lights(bodies: Sources) -> Lights:
-    """Bright bodies as points along their trails, close to each other beside the extent of scattered light."""
+    """Return bright moving bodies as points along their trails.
+
+    The distance of the points is small compared with the extent of scattered light.
+    """
     bright = np.flatnonzero(bodies.electrons > _MIN_ELECTRONS)
     pieces = np.ceil(bodies.trail_length[bright] / _PIECE).astype(np.int64) + 1
     body, first = np.repeat(bright, pieces), np.repeat(np.cumsum(pieces) - pieces, pieces)
     count = np.repeat(pieces, pieces)
-    # Of the trail, from its middle.
+    # Position relative to the middle of the trail, as a fraction of its length.
     place = (np.arange(len(body)) - first + 0.5) / count - 0.5
     trail = np.zeros((len(bodies), 2)) if bodies.trail is None else bodies.trail
     along = place[:, None] * trail[body]

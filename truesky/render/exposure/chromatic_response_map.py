@@ -1,8 +1,4 @@
-"""The light of sources by colour, for pixels that do not see all colours alike.
-
-with_tints          a scene with it
-with_spread_tints   the same of light that a grism spreads out, of which each column has its own colour
-"""
+"""Compute the light of sources weighted by colour, for detectors with a chromatic response."""
 
 from __future__ import annotations
 
@@ -21,17 +17,32 @@ from truesky.render.exposure import visible_sources
 from truesky.render.exposure.visible_sources import Light
 from truesky.render.psf.model import Psf, reduce_colours
 
-# Colours of the PSF that they are drawn through, in the detector's centre; and the light that may be aliased in them,
-# and left out, as parts of a source: what they change is a part in a hundred of it.
+# Number of colours of the PSF at the detector's centre, and fraction of a source's light that may be aliased or left
+# out in its stamp. The change of a pixel is only a hundredth of the light.
 _COLOURS, _PART = 4, 1e-2
 
 
 def with_chromatic_light(scene: Scene, aim: Aim, light: Light) -> Scene:
-    """The scene with the light of those sources whose colour changes a pixel by what is noticed.
+    """Add the light of sources whose colour changes a pixel noticeably to a scene.
 
-    scene : with what is drawn;  aim : the exposure and detector;  light : what shines onto it
-    Error : of what they change in a pixel, 3 %: the PSF is that of the detector's centre. Where an accuracy wants a PSF
-            of one colour those of the sources are not known: they change nothing
+    Parameters
+    ----------
+    scene : Scene
+        Scene with the brightest pixel of the drawn sources.
+    aim : Aim
+        Exposure and detector.
+    light : Light
+        Light on the detector.
+
+    Returns
+    -------
+    Scene
+        Scene with `chromatic_light` and `chromatic_electrons`.
+
+    Notes
+    -----
+    The error is 3 % of the change of a pixel, because the PSF at the detector's centre is used. If the accuracy uses a
+    PSF of one colour, the colours of sources are not known and change nothing.
     """
     sources, psf = light.sources, light.psf
     if _is_inactive(scene, aim) or psf is None or sources.photons is None or not len(sources):
@@ -51,7 +62,7 @@ def with_chromatic_light(scene: Scene, aim: Aim, light: Light) -> Scene:
     settings = replace(settings_for(scene.accuracy), edge=NOTICEABLE, aliased=_PART, floor=_PART)
     noise = scene.pixel_noise
     sizes = stamp_sizes.stamp_sizes(change / peak_fraction, chosen.shape, chosen.shapes, psf, noise, settings)
-    # A picture and a trail are as wide as they are.
+    # Stamps of pictures and trails cannot be smaller.
     is_extended = (chosen.trail_length > 0.0) | (
         np.zeros(len(chosen), bool) if chosen.picture is None else chosen.picture >= 0
     )
@@ -69,11 +80,29 @@ def with_chromatic_light(scene: Scene, aim: Aim, light: Light) -> Scene:
 def with_dispersed_light(
     scene: Scene, aim: Aim, light: Light, tally: dispersing.Tally, planes_cache: dispersing.PlanesCache
 ) -> Scene:
-    """The scene with the spectra of those sources of which a column's colour changes a pixel by what is noticed.
+    """Add the spectra of sources for which the colour of a column changes a pixel noticeably to a scene.
 
-    scene : with what is drawn;  aim : the exposure and detector;  light : dispersed;  tally : of all that was drawn
-    known : what drawings of them share
-    Error : of each source, a tenth of a pixel's noise beyond the stamps
+    Parameters
+    ----------
+    scene : Scene
+        Scene with the brightest pixel of the drawn sources.
+    aim : Aim
+        Exposure and detector.
+    light : Light
+        Dispersed light on the detector.
+    tally : Tally
+        Light of each source that was drawn.
+    planes_cache : dict
+        Images of the PSF that several drawings share.
+
+    Returns
+    -------
+    Scene
+        Scene with `chromatic_light` and `chromatic_electrons`.
+
+    Notes
+    -----
+    The light that is left out of the stamps of a source is at most a tenth of a pixel's noise.
     """
     dispersed, psf = light.dispersed, light.psf
     if _is_inactive(scene, aim) or psf is None or dispersed is None or not len(light.sources):
@@ -85,11 +114,11 @@ def with_dispersed_light(
     if not len(indices):
         return scene
     chosen, shape = light.sources.take(indices), (aim.detector.ny, aim.detector.nx)
-    # What is left out is what changes by less than is noticed.
+    # Only light whose colour changes a pixel by less than is noticeable is left out.
     settings = replace(dispersed.settings, edge=0.5 * NOTICEABLE / largest, faint=0.5 * NOTICEABLE / largest)
 
     def draw(weight: Float) -> Frame:
-        """The light, each photon times its weight [w]."""
+        """Return the light with each photon multiplied by a weight, shape (w,)."""
         orders = tuple(replace(order, response=order.response * weight) for order in dispersed.orders)
         weighted_spectra = dispersing.DispersedSources(lambda rows: dispersed.spectra(indices[rows]), orders, settings)
         return dispersing.draw(chosen, weighted_spectra, psf, shape, scene.pixel_noise, None, None, planes_cache)
@@ -99,13 +128,13 @@ def with_dispersed_light(
 
 
 def _is_inactive(scene: Scene, aim: Aim) -> bool:
-    """Whether the effect is not of this channel or image, or switched off."""
+    """Return True if this channel or image has no chromatic response, or if it is switched off."""
     effect = aim.channel.chromatic_effect
     return effect is None or effect not in aim.effects or not scene.forced.get(effect.name, True)
 
 
 def _peak_fraction(psf: Psf, *, of_rows: bool = False) -> float:
-    """The most of a point's light that is in a pixel, or in a row, of any colour."""
+    """Return the largest fraction of a point's light in one pixel, or in one row, in any colour."""
     if psf.planes is None:
         return 1.0
     images, samples = psf.planes.images, psf.planes.samples
@@ -116,7 +145,7 @@ def _peak_fraction(psf: Psf, *, of_rows: bool = False) -> float:
 
 
 def _central_psf(psf: Psf) -> Psf:
-    """The PSF of the detector's centre, of few colours, as far as its planes go."""
+    """Return the PSF at the detector's centre with few colours and without spikes beyond its planes."""
     if psf.planes is None:
         return psf
     planes = replace(psf.planes, drift=psf.planes.drift[:0], powers=())

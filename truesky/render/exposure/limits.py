@@ -1,4 +1,4 @@
-"""A scene that does not fit into a task's memory or time is refused before it is drawn."""
+"""Refuse scenes that need more memory or time than a task may use, before they are drawn."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from truesky.render.drawing import cost
 from truesky.render.exposure import visible_sources
 from truesky.render.exposure.visible_sources import Light
 
-# Memory of a task, bytes: what an executor's core may count on; where a forecast says more, as much.
+# Memory of a task in bytes, which each core of an executor can use. If the forecast is higher, it is the limit.
 _MAX_BYTES = 2e9
-# And its drawing's time, CPU s: a scene that takes longer is a mistake.
+# CPU seconds to draw the sources of a task. Scenes that take longer are mistakes.
 _MAX_SECONDS = 6 * 3600.0
 
 
 def refuse_too_large(aim: Aim, light: Light) -> None:
-    """Before anything is drawn: a task must fit into its memory, and end."""
-    # Spectra are held a few at a time, whatever the scene.
+    """Raise BadInput if the drawing of the sources would exceed the memory or time of a task."""
+    # Memory for spectra is limited, because only a few are in memory at the same time.
     if light.psf is None or light.dispersed is not None:
         return
     exposure, detector, sources, sizes = aim.exposure, aim.detector, light.sources, light.sizes
@@ -28,12 +28,11 @@ def refuse_too_large(aim: Aim, light: Light) -> None:
     required = base + cost.memory(sources.electrons[on_detector], sizes[on_detector], detector.nx, detector.ny, picture)
     if required > available:
         raise BadInput(
-            f"{where} take {required / 1e9:.1f} GB, a task has {available / 1e9:.2g}: "
-            "ask for fainter sources to be left out"
+            f"{where} take {required / 1e9:.1f} GB, a task may use {available / 1e9:.2g}: leave out faint sources"
         )
     seconds = cost.seconds(sources, sizes, light.psf, detector.nx, detector.ny)
     if seconds > _MAX_SECONDS:
         raise BadInput(
-            f"{where} take {seconds / 3600:.1f} h, a task has {_MAX_SECONDS / 3600:g}: "
-            "ask for less accuracy, or for fainter sources to be left out"
+            f"{where} take {seconds / 3600:.1f} h, a task may use {_MAX_SECONDS / 3600:g}: "
+            "choose a lower accuracy, or leave out faint sources"
         )

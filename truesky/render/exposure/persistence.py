@@ -1,17 +1,13 @@
-"""What earlier exposures of a detector left in it: each is drawn again from the catalogue, without noise.
+"""Compute the persistence of a detector: the charge that earlier exposures release in this one.
 
-No exposure needs the image of another, so that they are rendered in any order: what is left is a function of the
-planned exposures and the catalogue alone.  Of an earlier exposure are drawn the stars and galaxies that leave
-something, its sky and its lamp, through a grism as they were; of one that nothing renders its mean sky alone counts.
-Error : cosmic rays, moving bodies and lensed arcs of earlier exposures are not drawn again.  A pixel that a hit gave
-        2300 e- lacks 10 e- of what it leaves after 134 s.  Of a spectrum a source that is too faint to be drawn again
-        counts as flat: a line that has more than `_LEAST` electrons of its own is missed with it
+Each earlier exposure is drawn again from the catalogue without noise. No exposure needs the image of another, so that
+they can be rendered in any order: persistence depends only on the planned exposures and the catalogue. An earlier
+exposure is drawn with its sky, its lamp, and the stars and galaxies that leave noticeable charge, dispersed if it had a
+grism. An exposure of a channel that is not rendered contributes only its mean sky.
 
-earlier_of        the tasks before a task;  remembers   whether there are any
-window            how long before, days
-is_drawn          whether an earlier exposure's sources count
-brightest_column  of a source, part of its light;  least_flux   f_nu of the faintest source that is drawn again
-remembered        what they left
+Cosmic rays, moving bodies and lensed arcs of earlier exposures are not drawn. For example, a pixel with a hit of 2300
+electrons lacks 10 electrons of persistence after 134 s. In spectra, the limit for drawing a source assumes a flat
+spectrum: fainter sources are omitted even if a line has more than `_MIN_ELECTRONS`.
 """
 
 from __future__ import annotations
@@ -44,22 +40,23 @@ from truesky.render.psf.model import Psf
 from truesky.render.sources import solar_system
 
 _DAY_S = 86400.0
-# Of a date, s: more than its rounding.
+# Tolerance of dates in seconds, more than their rounding.
 _TIME_TOLERANCE_S = 1e-3
-# Images of which nothing of the sky is on a detector.
+# Types of images without light of the sky.
 _STARLESS = ("bias", "dark", "flat", "charge_injection", "persistence")
-# Electrons of the faintest source that is drawn again so many seconds later, and of a pixel's light that stamps leave
-# out; more where more time has passed.  A star of so many leaves 0.8 e- in a pixel; of two exposures of the demo's sky
-# before one, 1.2 e- are missed in a pixel at the most.
+# Electrons of the faintest source that is drawn, electrons of a pixel that stamps may leave out, and the delay in
+# seconds for which these limits hold; they grow with the delay. A star at the limit leaves 0.8 electrons in a pixel.
+# For two earlier exposures of the demo's sky, at most 1.2 electrons of a pixel are missing.
 _MIN_ELECTRONS, _NEGLECTED_ELECTRONS, _REFERENCE_S = 400.0, 300.0, 134.0
-# Of a point's light in an image, in its brightest column: a column of a spectrum that has as much leaves as much.
+# Fraction of a point source's flux in its brightest column of an image. A column of a spectrum with the same flux
+# leaves the same charge.
 _COLUMN_FRACTION = 0.5
-# Of the brightest column that counts, what stamps of spectra leave out in a row at their edge.
+# Electrons that stamps of spectra may leave out in a row at their edge, relative to the lowest relevant column.
 _EDGE_FRACTION = 0.1
-# Electrons that light brings to some pixel at least, to be worth a look: ten leave 0.05.
+# Electrons of its brightest pixel below which an effect is neglected: ten electrons leave 0.05.
 _MIN_LIGHT = 10.0
 
-# Name of the random numbers of what each pixel's traps have of their own.
+# Name of the random stream for the variation of traps from pixel to pixel.
 _VARIATION_STREAM = "persistence_pixels"
 
 Task = Mapping[str, Any]
@@ -70,11 +67,30 @@ def previous_tasks(
     exposures: Mapping[int, ExposureRow],
     mission_of: Callable[[str | None], MissionConfiguration],
 ) -> dict[tuple[int, str], list[Task]]:
-    """(exposure, detector) of each task -> tasks of the same detector that left something in it, in order of time.
+    """Find the earlier exposures that leave persistence in each task.
 
-    exposures  : by their number;  mission_of : an exposure's settings -> its mission database
-    Error      : of exposures that differ in their noise alone the first counts
-    Errors     : BadInput where a detector is exposed before an exposure of it has ended
+    Parameters
+    ----------
+    tasks : iterable of mapping
+        Rows of the table `tasks`.
+    exposures : mapping of int to ExposureRow
+        Exposures by number.
+    mission_of : callable
+        Function that returns the mission database for the settings of an exposure.
+
+    Returns
+    -------
+    dict of (int, str) to list of mapping
+        For the exposure and detector of each task, earlier tasks of the same detector in order of time.
+
+    Raises
+    ------
+    BadInput
+        If an exposure of a detector begins before the previous one has ended.
+
+    Notes
+    -----
+    If several exposures differ only in their noise, the first one counts.
     """
     by_detector: dict[tuple[Any, ...], list[Task]] = defaultdict(list)
     cameras = {row.camera for row in exposures.values() if has_persistence(row)}
@@ -103,9 +119,9 @@ def previous_tasks(
 def _check_no_overlap(
     rows: Sequence[ExposureRow], detector: str, mission_of: Callable[[str | None], MissionConfiguration]
 ) -> None:
-    """Refuse exposures of a detector, in order of time, of which one begins before another has ended.
+    """Raise BadInput if an exposure of a detector (in order of time) begins before the previous one has ended.
 
-    Such as begin at once are alternatives of one another.
+    Exposures that begin at the same time are alternatives.
     """
     for previous, current in pairwise(rows):
         channel, seconds = registry.CHANNELS.get(previous.channel), previous.exposure_time_s
@@ -120,39 +136,39 @@ def _check_no_overlap(
 
 
 def has_persistence(exposure: ExposureRow) -> bool:
-    """Whether a detector of the exposure has something left of those before."""
+    """Return True if detectors of an exposure show persistence of earlier exposures."""
     channel = registry.CHANNELS.get(exposure.channel)
     return channel is not None and channel.persistence_effect is not None
 
 
 def window_days(camera: str, mission: MissionConfiguration) -> float:
-    """How long before an exposure others count, days."""
+    """Return the time in days before an exposure in which other exposures leave persistence."""
     return mission.value(f"{camera}.persistence.window", "d")
 
 
 def is_drawn(previous: ExposureRow) -> bool:
-    """Whether an earlier exposure is drawn again; else its mean sky counts."""
+    """Return True if an earlier exposure can be drawn; otherwise only its mean sky counts."""
     return registry.find_effects_or_none(previous.channel, previous.image_type) is not None
 
 
 def delay(exposure: ExposureRow, previous: ExposureRow) -> float:
-    """Seconds from the start of an exposure to that of a later one; BadInput where it is not later."""
+    """Return the seconds from the start of `previous` to the start of `exposure`.
+
+    Raises BadInput if `previous` does not begin first.
+    """
     seconds = (exposure.mjd - previous.mjd) * _DAY_S
     if not seconds > 0.0:
-        raise BadInput(f"exposure {previous.exposure_id} begins no earlier than exposure {exposure.exposure_id}")
+        raise BadInput(f"exposure {previous.exposure_id} must begin before exposure {exposure.exposure_id}")
     return seconds
 
 
 def brightest_column_fraction(aim: Aim, mission: MissionConfiguration) -> float:
-    """Part of a point's light in its brightest column: of all orders' where a grism spreads it out, of flat f_nu.
-
-    aim : the exposure and detector;  mission : the mission database
-    """
+    """Return the largest fraction of a point's light in one column, in any order of a grism, for flat f_nu."""
     dispersion, band = aim.channel.dispersion, aim.band
     if dispersion is None or not aim.sees_sky:
         return _COLUMN_FRACTION
     detected, largest = band.response / band.wavelength, 0.0
-    # An error of the wheel turns orders and leaves their length.
+    # Use seed 0: a position error of the wheel rotates orders, but does not change their lengths.
     for trace in dispersion.traces(aim.exposure, aim.detector, mission, 0):
         throughput = dispersion.throughput(aim.exposure, trace.order, band.wavelength, aim.detector, mission)
         middle = trace.polynomials((aim.detector.nx - 1) / 2, (aim.detector.ny - 1) / 2)
@@ -164,9 +180,19 @@ def brightest_column_fraction(aim: Aim, mission: MissionConfiguration) -> float:
 
 
 def min_flux(exposure: ExposureRow, previous: ExposureRow, column: float = _COLUMN_FRACTION) -> float:
-    """f_nu of the faintest source that is drawn again, microjansky; infinite where none shone.
+    """Flux of the faintest source of an earlier exposure that is drawn for its persistence.
 
-    exposure, before : the later and the earlier;  column : `brightest_column` of the earlier
+    Parameters
+    ----------
+    exposure, previous : ExposureRow
+        Later and earlier exposure.
+    column : float, optional
+        Result of `brightest_column_fraction` for the earlier exposure.
+
+    Returns
+    -------
+    float
+        f_nu in microjansky; infinite if no sources were visible.
     """
     if not registry.CHANNELS[previous.channel].sees_sky(previous.image_type):
         return float("inf")
@@ -175,16 +201,30 @@ def min_flux(exposure: ExposureRow, previous: ExposureRow, column: float = _COLU
 
 
 def _age_factor(exposure: ExposureRow, previous: ExposureRow) -> float:
+    """Return the delay relative to the reference delay of the limits."""
     return delay(exposure, previous) / _REFERENCE_S
 
 
 def total_charge(
     aim: Aim, previous_exposures: Sequence[PreviousExposure | PreviousSky], variant: Variant, seed: int
 ) -> Frame | None:
-    """[ny, nx] electrons that earlier exposures leave in one; None = nothing.
+    """Charge that earlier exposures release in one exposure.
 
-    aim     : the exposure and detector;  earlier : of the same detector
-    variant : mission, accuracy and the effects that are forced on or off;  seed : of the request
+    Parameters
+    ----------
+    aim : Aim
+        Exposure and detector.
+    previous_exposures : sequence of PreviousExposure or PreviousSky
+        Earlier exposures of the same detector.
+    variant : Variant
+        Mission, accuracy and forced effects.
+    seed : int
+        Seed of the request.
+
+    Returns
+    -------
+    float array, shape (ny, nx), or None
+        Electrons. None if the channel has no persistence or there are no earlier exposures.
     """
     if aim.channel.persistence_effect is None or not previous_exposures:
         return None
@@ -200,10 +240,10 @@ def total_charge(
 
 
 def _draw_charge(previous: PreviousExposure | PreviousSky, variant: Variant, age_factor: float, seed: int) -> Frame:
-    """Expected electrons of its light: sources that leave something, sky and lamp [ny, nx]; or of a mean pixel [].
+    """Return the expected electrons of an earlier exposure: per pixel, or one number for the mean sky.
 
-    Counted over its exposure time, as its signal is, of which the traps' parameters are told: what comes before a
-    ramp's first group fills traps, too, and is not counted apart.
+    The electrons are counted over the exposure time of the signal, for which the parameters of traps are defined.
+    Charge before the first group of a ramp also fills traps, but is not counted separately.
     """
     if isinstance(previous, PreviousSky):
         shines = previous.exposure.image_type not in _STARLESS
@@ -218,19 +258,19 @@ def _draw_charge(previous: PreviousExposure | PreviousSky, variant: Variant, age
     for effect in aim.effects:
         if effect is aim.channel.persistence_effect:
             break
-        # What each pixel makes of the light is no part of it.
+        # Fixed patterns of the detector are not part of the light.
         if not effect.fixed and effect.is_applied(scene) and effect.contribution(scene) > _MIN_LIGHT:
             frame = effect.apply(frame, *effect.parameters(scene), rng=np.random.default_rng(0))
     return frame
 
 
 def _draw_spectra(aim: Aim, rows: Rows, scene: Scene, age_factor: float, seed: int) -> Frame:
-    """Orders of the sources that leave something; with the colours and lines that they have."""
+    """Draw the spectra of sources that leave noticeable charge, with their colours and lines."""
     light = visible_spectra(aim, replace(rows, bodies=solar_system.empty_population), scene, seed)
     assert light.dispersed is not None
     assert light.psf is not None
     min_electrons = _MIN_ELECTRONS * _COLUMN_FRACTION * age_factor
-    # With a noise of one these are electrons.
+    # The limits are in electrons because the noise passed to `draw` is 1.
     settings = replace(light.dispersed.settings, faint=min_electrons, edge=_EDGE_FRACTION * min_electrons)
     dispersed = replace(light.dispersed, settings=settings)
     return dispersing.draw(light.sources, dispersed, light.psf, (aim.detector.ny, aim.detector.nx), 1.0)
@@ -244,8 +284,8 @@ def _draw_sources(aim: Aim, rows: Rows, scene: Scene, age_factor: float) -> Fram
     if not aim.sees_sky or not len(galaxies) + len(stars):
         return np.zeros((detector.ny, detector.nx))
     noise = _NEGLECTED_ELECTRONS * age_factor
-    # Of one place of the PSF the brightest pixels would be wrong by 5 %, and what they leave by 3 e-; of one colour
-    # by 2 %, and 1.5 e-.
+    # With the PSF of one position the brightest pixels would have an error of 5 %, and their persistence of 3
+    # electrons. With one colour the errors would be 2 % and 1.5 electrons.
     settings = replace(settings_for(scene.accuracy), colours=2)
     brightest = max(galaxies.max(initial=0.0), stars.max(initial=0.0))
     psf = _simplify_psf(visible_sources.exposure_psf(aim, scene, settings), brightest)
@@ -255,7 +295,7 @@ def _draw_sources(aim: Aim, rows: Rows, scene: Scene, age_factor: float) -> Fram
 
 
 def _simplify_psf(psf: Psf, brightest: float) -> Psf:
-    """Without the change across the detector of its change with colour; beyond the planes only what is noticed."""
+    """Return the PSF with the same colour dependence at all positions, and without spikes if they are negligible."""
     planes = psf.planes
     if planes is None:
         return psf

@@ -1,4 +1,4 @@
-"""What one detector is rendered from."""
+"""Inputs for the rendering of one detector."""
 
 from __future__ import annotations
 
@@ -21,19 +21,34 @@ from truesky.request.accuracy import Accuracy
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Catalogue rows that may touch the detector.
+    """Catalogue rows and other data that affect one detector.
 
-    galaxies, stars : of GALAXY_COLUMNS, STAR_COLUMNS of visible_sources.py
-    galaxy_fluxes, star_fluxes : row by row their f_nu in the band, microjansky
-    lenses     : of `strong_lenses` (lensed_arcs.ARC_COLUMNS), whose sources are among the galaxies; None: there is none
-    bodies     : a day's moving bodies (ephemerides.Bodies.of_day); None = the embedded population
-    library    : what the galaxies' sed_1 and sed_2 count;  stellar : what the stars' sed does; None = the embedded ones
-    complete   : how far beyond the detector the rows have every source, arcsec
-    earlier    : exposures that left something in the detector
-    discs      : what structure large discs have; None = they are smooth
-    stamps     : what galaxies are drawn as in place of their profiles; None = there are none
-    bulges     : [n] part of the galaxies' light that is in the bulge, the same in all bands; None = as the rows say
-    beside     : bright stars of the detectors that are read with this one
+    Attributes
+    ----------
+    galaxies, stars : Table
+        Rows with GALAXY_COLUMNS and STAR_COLUMNS of visible_sources.py.
+    galaxy_fluxes, star_fluxes : Table
+        Fluxes f_nu of the same rows in the band, in microjansky.
+    lenses : Table, optional
+        Rows of `strong_lenses` (lensed_arcs.ARC_COLUMNS), whose sources are among the galaxies. None without lenses.
+    bodies : callable, optional
+        Function that returns the moving bodies of a day (ephemerides.Bodies.of_day). By default the embedded
+        population.
+    galaxy_library, stellar_library : Library, optional
+        Libraries with the spectra to which `sed_1` and `sed_2` of galaxies, and `sed` of stars, refer. By default the
+        embedded ones.
+    complete_margin_arcsec : float
+        Distance beyond the detector up to which the rows contain every source, in arcsec.
+    previous_exposures : tuple of PreviousExposure or PreviousSky
+        Exposures that leave persistence in the detector.
+    discs : DiscStructure, optional
+        Structure of large discs. By default they are smooth.
+    stamps : GalaxyStamps, optional
+        Images that replace the profiles of galaxies. None to draw profiles only.
+    bulge_fractions : float array, shape (n,), optional
+        Fraction of each galaxy's light in its bulge, the same in all bands. By default as in the rows.
+    neighbours : tuple of NeighbourDetector
+        Bright stars of detectors on the same readout board.
     """
 
     galaxies: pa.Table
@@ -54,7 +69,7 @@ class Rows:
 
 @dataclass(frozen=True, slots=True)
 class NeighbourDetector:
-    """Another detector of the same exposure; stars : on it;  fluxes : row by row theirs."""
+    """Another detector of the same exposure, with stars on it and the fluxes of the same rows."""
 
     detector: Detector
     stars: pa.Table
@@ -63,7 +78,10 @@ class NeighbourDetector:
 
 @dataclass(frozen=True, slots=True)
 class PreviousExposure:
-    """An exposure of the same detector before; rows : of its bright sources;  mission : None = as the later one's."""
+    """Earlier exposure of the same detector, with its bright sources.
+
+    Without `mission`, it has the mission database of the later exposure.
+    """
 
     aim: Aim
     rows: Rows
@@ -76,14 +94,14 @@ class PreviousExposure:
 
 @dataclass(frozen=True, slots=True)
 class PreviousSky:
-    """An exposure of the same detector before that nothing renders: of what shone there the sky alone is known."""
+    """Earlier exposure of the same detector in a channel that is not rendered: only its mean sky is known."""
 
     exposure: ExposureRow
 
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """What one request of an exploration is rendered with; forced : effect name -> on or off."""
+    """Mission, accuracy and forced effects (name -> on or off) of one variant of a request."""
 
     mission: MissionConfiguration
     accuracy: Accuracy

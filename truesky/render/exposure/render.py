@@ -1,7 +1,4 @@
-"""One detector of one exposure: catalogue rows in, a raw image and its noise-free truth out.
-
-render          the whole of it
-"""
+"""Render one detector of one exposure: from catalogue rows to a raw image and its noise-free truth."""
 
 from __future__ import annotations
 
@@ -37,7 +34,7 @@ from truesky.render.exposure.visible_sources import Light, visible_light
 from truesky.render.exposure.visible_spectra import visible_spectra
 from truesky.render.sources.source_list import Sources
 
-# Code of a star in an identifier.
+# Code of stars in identifiers.
 _STAR = 5
 
 
@@ -52,11 +49,27 @@ def render(
 ) -> RenderedDetector:
     """Render one detector.
 
-    truth    : maps that are wanted besides the noise-free one, of lake_schema.tables.products.CONTENTS
-    progress : called now and then with the number of sources drawn
-    noise_seed : of what differs between exposures, None = the seed
-    aim      : the exposure and detector;  rows : catalogue rows that it may see
-    variant  : mission, accuracy, and the effects that are forced on or off;  seed : of the request
+    Parameters
+    ----------
+    aim : Aim
+        Exposure and detector.
+    rows : Rows
+        Catalogue rows that may have light on the detector.
+    variant : Variant
+        Mission, accuracy and forced effects.
+    seed : int
+        Seed of the request.
+    truth : sequence of str, optional
+        Truth maps to make in addition to the noise-free one, from lake_schema.tables.products.CONTENTS.
+    progress : callable, optional
+        Function that is called from time to time with the number of sources drawn.
+    noise_seed : int, optional
+        Seed of random numbers that differ between exposures, by default `seed`.
+
+    Returns
+    -------
+    RenderedDetector
+        Raw image, truth maps and drawn sources.
     """
     scene = replace(
         scene_factory.from_aim(aim, variant),
@@ -75,12 +88,22 @@ def render(
 
 @dataclass(frozen=True, slots=True)
 class _DrawnLight:
-    """What was drawn.
+    """Result of drawing the sources.
 
-    sources, sizes, electrons : those with light of their stamps on pixels that are read, and what of it fell there
-    maps  : truth by its name
-    scene : with the brightest pixel
-    spectra : columns of the table `rendered_spectra`; None: nothing is dispersed
+    Attributes
+    ----------
+    sources : Sources
+        Sources that have light of their stamps on pixels that are read.
+    sizes : int array, shape (n,)
+        Sides of their stamps in pixels.
+    electrons : float array, shape (n,)
+        Electrons of each stamp on these pixels.
+    maps : dict of str to array
+        Truth maps by name.
+    scene : Scene
+        Scene with the brightest pixel.
+    spectra : dict, optional
+        Columns of the table `rendered_spectra`. None without a grism.
     """
 
     sources: Sources
@@ -94,7 +117,10 @@ class _DrawnLight:
 def _draw_images(
     aim: Aim, light: Light, truth: Sequence[str], progress: Callable[[int], None] | None
 ) -> tuple[_DrawnLight, list[Frame]]:
-    """(what was drawn, [expected electrons of the sources alone]): handed over, to be freed as early as can be."""
+    """Draw images of sources. Return the drawn light and a list with one frame of expected electrons.
+
+    The list lets the caller remove the frame, so that its memory is freed as early as possible.
+    """
     sources, sizes, scene, detector = light.sources, light.sizes, light.scene, aim.detector
     if light.psf is None:
         empty = np.zeros((detector.ny, detector.nx))
@@ -117,7 +143,7 @@ def _draw_images(
         stars, neglected = sources.take(is_star), light.neglected[is_star]
         star_light = stamps.draw(stars, sizes[is_star], light.psf, detector.nx, detector.ny, None, neglected)
         maps["stars"] = star_light.astype(np.float32)
-    # What sends in no more than faint wings is drawn, not listed.
+    # Sources of which only faint wings are on the detector are drawn, but not listed.
     piece_electrons = sources.electrons / stamp_sizes.piece_count(sources.trail_length)
     is_listed = (drawn_electrons > 0.0) | stamp_sizes.has_far_light(
         piece_electrons, sizes, sources.shape, sources.picture, light.psf
@@ -127,7 +153,7 @@ def _draw_images(
 
 
 def _draw_spectra(aim: Aim, rows: Rows, light: Light, truth: Sequence[str]) -> tuple[_DrawnLight, list[Frame]]:
-    """The same of sources whose light a grism spreads out; what is listed has light of some order on the detector."""
+    """Draw spectra as in `_draw_images`. Listed sources have light of some order on the detector."""
     assert light.dispersed is not None
     assert light.psf is not None
     sources, dispersed, psf, noise = light.sources, light.dispersed, light.psf, light.scene.pixel_noise
@@ -162,7 +188,7 @@ def _apply_effects(
     frame: list[Frame],
     seeds_and_truth: tuple[int, int | None, Sequence[str]],
 ) -> RenderedDetector:
-    """The frame, taken from its list, after all effects of the channel; asked : seeds and truth maps."""
+    """Apply all effects of the channel to the frame, which is removed from its list, and read it out."""
     exposure, detector, (seed, noise_seed, truth) = aim.exposure, aim.detector, seeds_and_truth
     scene = scene_factory.with_non_source_light(drawn.scene, aim.channel, aim.effects)
 

@@ -1,7 +1,4 @@
-"""A rendered detector before it is files.
-
-numbers_of      whose random numbers an effect takes
-"""
+"""Hold the products of one rendered detector before they are written to files."""
 
 from __future__ import annotations
 
@@ -25,17 +22,45 @@ from truesky.request.accuracy import Accuracy
 
 @dataclass(frozen=True, slots=True)
 class RenderedDetector:
-    """One detector's products before they are files.
+    """Products of one detector.
 
-    readout    : the arrays of its file
-    maps       : truth [ny, nx] by its name: noise_free, and what was asked for besides
-    sources    : what was drawn, ascending id: those with light of their stamps on pixels that are read, and stars whose
-                 spikes may be noticed
-    sizes      : int[n] sides of their stamps;  drawn : float64[n] electrons of each stamp on the detector
-    zero_point : AB magnitude of one electron per second
-    complete   : how far beyond the detector every source was known that may reach it, arcsec
-    noise_seed : of the noise, None = the seed
-    spectra    : columns of the table `rendered_spectra`; None where nothing is dispersed
+    Attributes
+    ----------
+    exposure : ExposureRow
+        Row of the exposure.
+    detector : Detector
+        Detector.
+    wcs : WCS
+        World coordinates of the detector.
+    psf : Psf or None
+        PSF of the detector. None without light of the sky.
+    readout : Readout
+        Arrays of the detector's file.
+    maps : mapping of str to array
+        Truth maps (ny, nx) by name: noise_free and the requested maps.
+    sources : Sources
+        Drawn sources by ascending identifier, with light of their stamps on pixels that are read; also stars whose
+        spikes may be noticeable.
+    sizes : int array, shape (n,)
+        Sides of their stamps in pixels.
+    drawn_electrons : float64 array, shape (n,)
+        Electrons of each stamp on the detector.
+    zero_point : float
+        AB magnitude of one electron per second.
+    scene : Scene
+        Scene with the brightest pixel.
+    decisions : tuple of Decision
+        Decisions on effects.
+    accuracy : Accuracy
+        Accuracy of the request.
+    seed : int
+        Seed of the request.
+    complete_margin_arcsec : float
+        Distance beyond the detector up to which all sources were known, in arcsec.
+    noise_seed : int, optional
+        Seed of the noise, by default `seed`.
+    spectra : mapping, optional
+        Columns of the table `rendered_spectra`. None without a grism.
     """
 
     exposure: ExposureRow
@@ -58,28 +83,47 @@ class RenderedDetector:
 
     @property
     def raw(self) -> Array:
-        """The arrays as they are read, with pre- and overscan, in readout order."""
+        """Pixel values in readout order, with prescan and overscan."""
         return self.readout.raw
 
     @property
     def science(self) -> Array:
-        """[ny, nx] the pixels alone, in the detector's own axes, as they are read."""
+        """Pixel values in detector axes without prescan and overscan, shape (ny, nx)."""
         return self.readout.pixels
 
     @property
     def noise_free(self) -> Float32:
-        """float32[ny, nx] expected electrons of the sources alone."""
+        """Expected electrons of the sources alone, float32[ny, nx]."""
         return self.maps["noise_free"]
 
 
 def random_identity(
     effect: Effect, exposure: ExposureRow, detector: str, seed: int, noise_seed: int | None = None
 ) -> tuple[int | str, ...]:
-    """The identity of an effect's random numbers: nobody else's, but where it follows another's pattern.
+    """Identity of the random numbers of an effect.
 
-    A detector's own patterns are in every exposure, and of the seed whatever the noise is of.
-    noise_seed : of the noise, None = the seed
-    effect, exposure, detector, seed : what is applied, in which exposure, to which detector, of which request
+    Parameters
+    ----------
+    effect : Effect
+        Effect.
+    exposure : ExposureRow
+        Exposure.
+    detector : str
+        Name of the detector.
+    seed : int
+        Seed of the request.
+    noise_seed : int, optional
+        Seed of the noise, by default `seed`.
+
+    Returns
+    -------
+    tuple of int or str
+        Identity for `rng.stream`. It is unique except for effects that share a stream, see `Effect.random_stream`.
+
+    Notes
+    -----
+    Fixed patterns of a detector are the same in every exposure, and depend on `seed` even if the noise has another
+    seed.
     """
     scope = exposure.camera if effect.fixed else image_types.identity(exposure)
     effect_seed = seed if effect.fixed or noise_seed is None else noise_seed

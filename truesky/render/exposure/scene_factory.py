@@ -1,4 +1,4 @@
-"""The scene of an exposure: what its effects may know of it."""
+"""Create the scene of an exposure, on which its effects depend."""
 
 from __future__ import annotations
 
@@ -19,7 +19,26 @@ from truesky.request.accuracy import Accuracy
 
 
 def with_non_source_light(scene: Scene, channel: Channel, effects: Sequence[Effect]) -> Scene:
-    """A lamp's light and injected charge are moved and squeezed like a star's, and so are tracks of cosmic rays."""
+    """Add the light of lamps, injected charge and cosmic rays to the brightest pixels of a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+        Scene with the brightest pixel of the sources.
+    channel : Channel
+        Channel of the exposure.
+    effects : sequence of Effect
+        Effects of the image.
+
+    Returns
+    -------
+    Scene
+        Scene with higher `peak_electrons`, and with `track_electrons` if cosmic rays are applied.
+
+    Notes
+    -----
+    Nonlinearity and charge transfer depend on this charge as they do on the charge of stars.
+    """
     lamps = [
         effect for effect in effects if effect in channel.non_source_effects and scene.forced.get(effect.name, True)
     ]
@@ -34,11 +53,27 @@ def with_non_source_light(scene: Scene, channel: Channel, effects: Sequence[Effe
 def from_exposure(
     exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, accuracy: Accuracy
 ) -> Scene:
-    """Before anything is drawn.
+    """Create a scene before anything is drawn.
 
-    exposure : its row;  detector : of its camera
-    mission  : the mission database;  accuracy : of the request
-    Errors   : BadInput for an exposure time that is too short for the channel's ramp
+    Parameters
+    ----------
+    exposure : ExposureRow
+        Row of the exposure.
+    detector : Detector
+        Detector of its camera.
+    mission : MissionConfiguration
+        Mission database.
+    accuracy : Accuracy
+        Accuracy of the request.
+
+    Returns
+    -------
+    Scene
+        Scene with a brightest pixel of 0.
+
+    Notes
+    -----
+    BadInput is raised by `ramp.find_mode` if the exposure time does not fit the channel's ramp.
     """
     channel = registry.CHANNELS.get(exposure.channel)
     scene = Scene(
@@ -52,12 +87,12 @@ def from_exposure(
 
 
 def from_aim(aim: Aim, variant: Variant) -> Scene:
-    """The same, with what is forced and the passband."""
+    """Create a scene before anything is drawn, with the passband and forced effects."""
     scene = from_exposure(aim.exposure, aim.detector, variant.mission, variant.accuracy)
     return replace(scene, band=aim.band, forced=variant.forced)
 
 
 def with_peak_electrons(scene: Scene, frame: Frame) -> Scene:
-    """The scene with the brightest pixel of a frame that is read."""
+    """Return the scene with the brightest pixel of a frame among the pixels that are read."""
     halves = frame[: scene.unread_rows[0]], frame[scene.unread_rows[1] :]
     return replace(scene, peak_electrons=max(float(half.max(initial=0.0)) for half in halves))

@@ -1,7 +1,4 @@
-"""The light of one source alone on a detector, spread out by a grism: what all others are to be told from.
-
-spectra    of some sources, each by itself
-"""
+"""Draw the dispersed light of single sources on a detector, without all other sources."""
 
 from __future__ import annotations
 
@@ -23,9 +20,16 @@ from truesky.render.exposure.visible_spectra import visible_spectra
 
 @dataclass(frozen=True, slots=True)
 class SourceSpectrum:
-    """A source's light.
+    """Dispersed light of a source.
 
-    orders : order -> expected electrons float64[ny, nx];  frame : their sum
+    Attributes
+    ----------
+    id : int
+        Identifier of the source.
+    frame : float64 array, shape (ny, nx)
+        Expected electrons, the sum of all orders.
+    orders : dict of int to float64 array, shape (ny, nx)
+        Expected electrons of each order.
     """
 
     id: int
@@ -41,7 +45,7 @@ def draw_sources(
     Parameters
     ----------
     aim, rows, variant, seed : Aim, Rows, Variant, int
-        As for `render`.
+        Same as in `render`.
     ids : sequence of int, optional
         Identifiers of the sources. The default is all sources that may have light on the detector.
 
@@ -53,7 +57,7 @@ def draw_sources(
     Raises
     ------
     BadInput
-        At the call, if the image is not dispersed or a source is not among them.
+        Immediately, if the image has no spectra or a source has no light there.
     """
     exposure = aim.exposure
     if aim.channel.dispersion is None or not aim.sees_sky:
@@ -69,7 +73,7 @@ def draw_sources(
     chosen = list(index_of_id) if ids is None else list(ids)
     if missing := [number for number in chosen if number not in index_of_id]:
         where = f"exposure {exposure.exposure_id}, detector {aim.detector.name}"
-        raise BadInput(f"{where}: no light of source {missing[0]} is drawn there")
+        raise BadInput(f"{where}: source {missing[0]} has no light on the detector")
     shape, source_spectra = (aim.detector.ny, aim.detector.nx), dispersed.spectra
     planes_cache: draw.PlanesCache = {}
     noise = light.scene.pixel_noise

@@ -1,14 +1,11 @@
-"""The diffuse sky through a grism, at places of a detector.
+"""Compute the diffuse sky through a grism on a grid over the detector.
 
-A pixel at (x, y) sees by order m light of wavelength lambda from the undispersed place (x - X_m, y - Y_m), so that
+A pixel at (x, y) receives light of wavelength lambda by order m from the undispersed position (x - X_m, y - Y_m)::
 
     B(x, y) = sum_m int S(lambda) T_m(lambda) V(x - X_m, y - Y_m) dlambda + thermal light
 
-S zodiacal light through the passband, T_m the orders' throughputs, V what a grism that is turned lets through
-within the field stop, and 0 beyond it.  Thermal light is taken as even, and of no other orders.
-
-spread_sky   what this changes of the background of the passband
-with_sky     a scene that knows it
+S is zodiacal light through the passband and T_m the throughput of an order. V is the vignetting of a tilted grism
+within the field stop, and 0 beyond it. Thermal light is assumed to be uniform and to have no other orders.
 """
 
 from __future__ import annotations
@@ -25,17 +22,31 @@ from truesky.render.channels.aim import Aim
 from truesky.render.effects.scene import Frame, Scene
 from truesky.render.sky import diffuse_light
 
-# Pixels between places, and A between wavelengths: 16 pixels of the second order.
+# Grid spacing in pixels, and wavelength step in Angstrom, which is 16 pixels of the second order.
 _CELL, _STEP = 64, 100
 
 
 def sky_change(scene: Scene, aim: Aim, seed: int) -> Frame | None:
-    """[gy, gx] e- that the orders change of an even sky, at places of a detector evenly from corner to corner.
+    """Change of a uniform sky by the orders of a grism, on an even grid from corner to corner of a detector.
 
-    None where no grism is in the beam, or no sky is seen.
-    scene : before anything is drawn;  aim : the exposure and detector;  seed : of the request
-    Error : the field's gradients of the traces are taken at the light's place, not at the source's: 1 % of the trace's
-            length, where it matters at the field stop alone
+    Parameters
+    ----------
+    scene : Scene
+        Scene before anything is drawn.
+    aim : Aim
+        Exposure and detector.
+    seed : int
+        Seed of the request.
+
+    Returns
+    -------
+    float array, shape (gy, gx), or None
+        Electrons. None if there is no grism in the beam, or no light of the sky.
+
+    Notes
+    -----
+    Traces are evaluated at the position of the light instead of the source. The error is 1 % of the length of a trace,
+    which matters only at the field stop.
     """
     dispersion, detector, mission = aim.channel.dispersion, aim.detector, scene.mission
     if dispersion is None or not aim.sees_sky or not scene.sky_rate > 0.0:
@@ -58,22 +69,30 @@ def sky_change(scene: Scene, aim: Aim, seed: int) -> Frame | None:
 
 
 def with_sky_change(scene: Scene, aim: Aim, seed: int) -> Scene:
-    """The scene, with what a grism in the beam changes of its sky.
+    """Return a scene with the change of its sky by a grism in the beam.
 
-    scene, aim, seed : as of `spread_sky`
+    Parameters
+    ----------
+    scene, aim, seed : Scene, Aim, int
+        Same as in `sky_change`.
+
+    Returns
+    -------
+    Scene
+        Scene with `sky_change`.
     """
     return replace(scene, sky_change=sky_change(scene, aim, seed))
 
 
 def _offset(trace: Trace, column: Float, row: Float, wavelength: float) -> tuple[Float, Float]:
-    """[..] columns and rows by which a wavelength is moved at places [..]."""
+    """Return the displacement in columns and rows of light with a wavelength, for arrays of positions."""
     t = (wavelength - trace.first) / (trace.last - trace.first)
     x, y = (np.asarray(np.polynomial.polynomial.polyval(t, part)) for part in (trace.x, trace.y))
     return x[0] + x[1] * column + x[2] * row, y[0] + y[1] * column + y[2] * row
 
 
 def _is_in_field_stop(column: Float, row: Float, detector: Detector, mission: MissionConfiguration) -> Bool:
-    """[..] Places that the field stop does not hide."""
+    """Return a mask of the positions that are not hidden by the field stop."""
     turn = np.radians(detector.rotation)
     u = (column - (detector.nx - 1) / 2) * detector.pixel_scale
     v = (row - (detector.ny - 1) / 2) * detector.pixel_scale

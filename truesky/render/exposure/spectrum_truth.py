@@ -1,9 +1,4 @@
-"""Truth of spectra: where each source's orders lie on a detector, what of them overlaps, how well lines are seen.
-
-traced     rows of it
-overlaps   which traces lie beside which
-lines_of   emission lines of galaxies in a first order
-"""
+"""Compute truth of spectra: traces of each source's orders, their overlaps, and the visibility of emission lines."""
 
 from __future__ import annotations
 
@@ -27,11 +22,11 @@ from truesky.render.exposure.records import Rows
 from truesky.render.exposure.visible_sources import Light
 from truesky.render.sources import colours, galaxy_shapes
 
-# Pixels of a trace that are compared at a time; places along a trace between which it is taken as straight; the widest
-# a trace is taken to be, half, pixels.
+# Length in pixels of the bins in which traces are compared; number of points of a trace, between which it is straight;
+# upper limit on the half width of a trace in pixels.
 _BIN, _PLACES, _WIDEST = 8, 33, 20.0
-# Electrons a column of a trace that counts as a contaminant, of a pixel's noise.  In an extraction that is as long as
-# wide, such as of a resolution element, it then brings at least as much light as there is noise: a bias of one sigma.
+# Electrons per column above which a trace counts as a contaminant, in units of a pixel's noise. In an extraction that
+# is as long as wide, such as a resolution element, its light then equals the noise: a bias of one sigma.
 MIN_CONTAMINATION = 1.0
 
 Columns = dict[str, Any]
@@ -41,10 +36,18 @@ Columns = dict[str, Any]
 class TracePaths:
     """Traces of n orders of sources on a detector.
 
-    source : int[n] which;  order : int[n]
-    along  : [n] polynomials: columns of t^i;  across : rows
-    half   : float64[n] half of their widths, pixels
-    level  : float64[n] electrons a column on the detector, in the mean
+    Attributes
+    ----------
+    source : int array, shape (n,)
+        Index of the source.
+    order : int array, shape (n,)
+        Order of the grism.
+    along, across : list of float array, length n
+        Polynomial coefficients of the column and of the row in t, from 0 to 1 along the trace.
+    half : float64 array, shape (n,)
+        Half widths in pixels.
+    level : float64 array, shape (n,)
+        Mean electrons per column on the detector.
     """
 
     source: Int
@@ -56,15 +59,30 @@ class TracePaths:
 
 
 def truth_columns(light: Light, tally: Tally, aim: Aim, rows: Rows, scene: Scene) -> Columns:
-    """Columns of the table `rendered_spectra`, but for exposure and detector, one row an order with light there.
+    """Columns of the table `rendered_spectra`: one row per order of a source with light on the detector.
 
-    light : what shines onto the detector;  tally : what each source brought to it
-    aim, rows, scene : the exposure and detector, the catalogue rows, and what effects know
+    Parameters
+    ----------
+    light : Light
+        Dispersed light on the detector.
+    tally : Tally
+        Light of each source that was drawn.
+    aim : Aim
+        Exposure and detector.
+    rows : Rows
+        Catalogue rows.
+    scene : Scene
+        Scene of the exposure.
+
+    Returns
+    -------
+    dict of str to array
+        Columns by name, without exposure and detector.
     """
     assert light.dispersed is not None
     sources, orders = light.sources, light.dispersed.orders
     numbers = np.array([order.trace.order for order in orders])
-    # Ascending identifier, ascending order.
+    # Sort by identifier, then by order.
     by_order = np.argsort(numbers)
     source, at = np.nonzero(tally.electrons[:, by_order] > 0.0)
     order_index = by_order[at]
@@ -120,14 +138,31 @@ def _find_paths(light: Light, tally: Tally, source: Int, order_index: Int, aim: 
     return TracePaths(source, order, along, across, np.minimum(half, _WIDEST)[source], level)
 
 
-# ---------------------------------------------------------------------------------------------- what overlaps
+# ---------------------------------------------------------------------------------------------- overlaps
 
 
 def find_overlaps(paths: TracePaths, nx: int, min_level: float) -> tuple[Float, list[Int]]:
-    """(float64[n] part of each first order beside which others lie, their sources), 0 and none of other orders.
+    """Find first orders that are overlapped by traces of other sources.
 
-    paths : traces on a detector of nx columns;  least : electrons a column of a trace that counts
-    Error : in steps of 8 pixels of the trace's length
+    Parameters
+    ----------
+    paths : TracePaths
+        Traces on a detector.
+    nx : int
+        Columns of the detector.
+    min_level : float
+        Electrons per column above which a trace counts as a contaminant.
+
+    Returns
+    -------
+    covered : float64 array, shape (n,)
+        Fraction of the length of each first order that others overlap; 0 for other orders.
+    sources : list of int array, length n
+        Indices of the overlapping sources; empty for other orders.
+
+    Notes
+    -----
+    The fraction is counted in bins of 8 pixels of the trace's length.
     """
     path, at, row = _bins(paths, nx)
     order = np.argsort(at, kind="stable")
@@ -140,7 +175,7 @@ def find_overlaps(paths: TracePaths, nx: int, min_level: float) -> tuple[Float, 
         is_overlapped = np.zeros(len(covered), bool)
         is_overlapped[target] = True
         covered += is_overlapped
-        # Most pairs go on from bin to bin: a pair is held where it begins.
+        # Most pairs continue from bin to bin: store a pair only in its first bin.
         pairs = np.unique(target * sources + paths.source[other])
         new_pairs.append(np.setdiff1d(pairs, previous_pairs, assume_unique=True))
         previous_pairs = pairs
@@ -151,7 +186,7 @@ def find_overlaps(paths: TracePaths, nx: int, min_level: float) -> tuple[Float, 
 
 
 def _find_neighbours(paths: TracePaths, path: Int, row: Float, min_level: float) -> tuple[Int, Int]:
-    """(first orders, traces of other sources beside them) of those that pass one bin at rows."""
+    """Return pairs of a first order and a trace of another source that touches it, in one bin of columns."""
     bright = np.flatnonzero(paths.level[path] >= min_level)
     bright = bright[np.argsort(row[bright], kind="stable")]
     first = np.flatnonzero(paths.order[path] == 1)
@@ -169,7 +204,7 @@ def _find_neighbours(paths: TracePaths, path: Int, row: Float, min_level: float)
 
 
 def _bins(paths: TracePaths, nx: int) -> tuple[Int, Int, Float]:
-    """(path, bin of 8 columns, row there) of all traces on the detector."""
+    """Return (path, bin of 8 columns, row in the bin) for all traces on the detector."""
     t = np.linspace(0.0, 1.0, _PLACES)
     column, row = (
         np.polynomial.polynomial.polyval(t, _stack_coefficients(part).T) for part in (paths.along, paths.across)
@@ -188,7 +223,7 @@ def _bins(paths: TracePaths, nx: int) -> tuple[Int, Int, Float]:
 
 
 def _stack_coefficients(polynomials: list[Float]) -> Float:
-    """[n, i] coefficients of polynomials, those that one does not have 0."""
+    """Return the coefficients of polynomials as an array, shape (n, i), padded with 0."""
     out = np.zeros((len(polynomials), max((len(coefficients) for coefficients in polynomials), default=1)))
     for row, coefficients in zip(out, polynomials, strict=True):
         row[: len(coefficients)] = coefficients
@@ -199,10 +234,27 @@ def _stack_coefficients(polynomials: list[Float]) -> Float:
 
 
 def emission_line_columns(light: Light, source: Int, paths: TracePaths, aim: Aim, rows: Rows, scene: Scene) -> Columns:
-    """Columns of emission lines on the detector, of first orders of galaxies whose lines are known.
+    """Columns of emission lines on the detector, for first orders of galaxies whose lines are known.
 
-    light, source, paths : sources, and those of the traces;  aim, rows, scene : as of `traced`
-    Error : of the signal-to-noise ratio 20 %: a galaxy is taken as a Gaussian
+    Parameters
+    ----------
+    light : Light
+        Dispersed light on the detector.
+    source : int array, shape (n,)
+        Index of the source of each trace.
+    paths : TracePaths
+        Traces on the detector.
+    aim, rows, scene : Aim, Rows, Scene
+        Same as in `truth_columns`.
+
+    Returns
+    -------
+    dict of str to list of float array
+        Columns `line_wavelength` (vacuum, Angstrom), `line_expected` (electrons) and `line_snr`.
+
+    Notes
+    -----
+    The error of the signal-to-noise ratio is 20 %, because the image of a galaxy is taken as a Gaussian.
     """
     assert light.dispersed is not None
     names = ("line_wavelength", "line_expected", "line_snr")
@@ -219,7 +271,7 @@ def emission_line_columns(light: Light, source: Int, paths: TracePaths, aim: Aim
     curve = extinction.milky_way(wavelength.ravel()).reshape(wavelength.shape)
     dimmed = galaxies.magnification[:, None] * extinction.transmission(curve, galaxies.a_v[:, None])
     response = np.interp(wavelength, aim.band.wavelength, aim.band.response, left=0.0, right=0.0)
-    # Square centimetres times seconds, by the exposure's own zero point, as all that is drawn.
+    # Area times time in cm2 s, derived from the zero point of the exposure as for all drawn light.
     area = aim.electrons_per_microjansky / units.electron_rate(1.0, 1.0, passbands.log_width(aim.band))
     electrons = galaxies.lines * dimmed * response * area * wavelength / (units.PLANCK_ERG_S * units.LIGHT_ANGSTROM_S)
     electrons *= light.let_through[source[at]][:, None]
@@ -237,7 +289,7 @@ def emission_line_columns(light: Light, source: Int, paths: TracePaths, aim: Aim
 
 
 def _is_on_detector(trace: Trace, path: tuple[Float, Float], wavelength: Float, aim: Aim) -> Bool:
-    """[n] Whether the middle of a line falls onto a pixel; path : columns and rows, polynomials of t."""
+    """Return True for lines whose centre is on a pixel; `path` contains the polynomials of column and row in t."""
     t = (wavelength - trace.first) / (trace.last - trace.first)
     column, row = (np.polynomial.polynomial.polyval(t, part) for part in path)
     in_columns = (column > -0.5) & (column < aim.detector.nx - 0.5)
@@ -245,7 +297,7 @@ def _is_on_detector(trace: Trace, path: tuple[Float, Float], wavelength: Float, 
 
 
 def _has_lines(light: Light, source: Int, paths: TracePaths, rows: Rows) -> Bool:
-    """[n] First orders of galaxies; pictures of lenses are not told apart by their lines."""
+    """Return a mask of the first orders of galaxies with lines. Images of lensed sources have no line columns."""
     if not len(rows.galaxies) or not set(colours.GALAXY_COLUMNS) <= set(rows.galaxies.column_names):
         return np.zeros(len(source), bool)
     galaxy_kinds = (
@@ -257,13 +309,17 @@ def _has_lines(light: Light, source: Int, paths: TracePaths, rows: Rows) -> Bool
 
 
 def _image_area(light: Light, source: Int) -> Float:
-    """[n] pixels: one over the sum of the squares of a source's image, of unit sum; those of Gaussians add up."""
+    """Return the noise area of images in pixels: the inverse sum of squares of an image with unit sum.
+
+    The areas of Gaussians add up.
+    """
     assert light.psf is not None
     assert light.psf.planes is not None
     planes, scale = light.psf.planes, light.psf.pixel_scale
     radius = galaxy_shapes.half_light(light.sources.shapes.take(light.sources.shape[source])) / scale
-    # In a pixel that is anywhere.
+    # Mean over all positions of the source within a pixel.
     pixel = uniform_filter(planes.images.mean(axis=0, dtype=float), planes.samples) * planes.samples**2
     point = planes.samples**2 / float((pixel**2).sum())
-    # A Gaussian with the second moments of an exponential disc, whose scale length is the half-light radius over 1.678.
+    # Use a Gaussian with the second moments of an exponential disc, whose scale length is the half-light radius /
+    # 1.678.
     return np.asarray(point + 12.0 * np.pi * (radius / 1.678) ** 2)

@@ -1,10 +1,10 @@
-"""Stars and nebulae that calibrate: what exposures of these types are of, at five places of every detector at once.
+"""Add calibration stars and nebulae to the catalogue rows of an exposure, at five positions on every detector.
 
-The star of a check of stray light is one alone, beside the field.
+The star of a stray-light check is a single one outside the field.
 
-with_standards   catalogue rows, and the standard's among them
-
-Ref : Euclid Collaboration: Serrano et al. 2024 (the stars, how bright they are, five places)
+References
+----------
+Euclid Collaboration: Serrano et al. 2024 (stars, their magnitudes, and the five positions).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from truesky.render.camera import astrometry, pointing
 from truesky.render.channels.aim import Aim
 from truesky.render.exposure.records import Rows
 
-# Parameter of the mission that says how bright they are, and the band of that magnitude, "" = the exposure's.
+# Mission parameter with the magnitude for each image type, and its band ("" for the band of the exposure).
 _BRIGHTNESS = {
     "standard_star": ("survey.calibration.standard_magnitude", "euclid_y"),
     "planetary_nebula": ("survey.calibration.standard_magnitude", "euclid_y"),
@@ -37,32 +37,49 @@ _BRIGHTNESS = {
     "stray_light": ("survey.stray_light.magnitude", ""),
 }
 _OUTSIDE = "stray_light"
-# Assumed: in parts of the detector's sides; of a detector whose middle rows are not read, none in the middle.
+# Positions (assumed) as fractions of the detector's sides. If middle rows are not read, no star is in the middle.
 _PLACES = ((0.25, 0.25), (0.75, 0.25), (0.5, 0.5), (0.25, 0.75), (0.75, 0.75))
 _PLACES_OF_HALVES = ((0.25, 0.25), (0.75, 0.25), (0.4, 0.4), (0.25, 0.75), (0.75, 0.75))
-# Of an identifier: stars, of which catalogues have no members; and the order whose cells number 22 bits in one of it.
+# Parts of identifiers: the code of stars, a member number that catalogue stars do not have, and the HEALPix order that
+# has 2^22 cells per generation cell.
 _STAR, _MEMBER, _FINE = 5, 1, GENERATION_ORDER + 11
 
 
 def with_standards(rows: Rows, aim: Aim, mission: MissionConfiguration) -> Rows:
-    """Rows that a detector may see; in an exposure of a calibration star with five of it, or with the one beside it.
+    """Add five copies of an exposure's calibration star, or the single star outside the field, to its catalogue rows.
 
-    rows : of the catalogues;  aim : the exposure and detector;  mission : the mission database
-    Errors : BadInput for a target that is no standard star
+    Parameters
+    ----------
+    rows : Rows
+        Catalogue rows.
+    aim : Aim
+        Exposure and detector.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    Rows
+        Rows with the stars. Exposures of other types have unchanged rows.
+
+    Raises
+    ------
+    BadInput
+        If the target is not a standard star.
     """
     if aim.exposure.image_type not in _BRIGHTNESS:
         return rows
     target = aim.exposure.target
     if target not in standards.NAMES:
         raise BadInput(
-            f"exposure {aim.exposure.exposure_id}: target {target!r} is none of {', '.join(standards.NAMES)}"
+            f"exposure {aim.exposure.exposure_id}: target must be one of {', '.join(standards.NAMES)}, got {target!r}"
         )
     ra, dec = star_positions(aim, mission)
     cell = sky.cell_at(ra, dec, GENERATION_ORDER)
     number = sky.cell_at(ra, dec, _FINE) - (cell << 2 * (_FINE - GENERATION_ORDER))
     ids = source_id(_STAR, cell, number, _MEMBER)
     library = templates.stellar_library()
-    # A user's own library has the same standards.
+    # Libraries of users contain the same standards.
     sed = library.names.index(target)
     magnitude, magnitude_band = brightness(aim.exposure, mission)
     band_flux, reference_flux = (
@@ -70,7 +87,7 @@ def with_standards(rows: Rows, aim: Aim, mission: MissionConfiguration) -> Rows:
         for band in (aim.band, aim.band if magnitude_band == aim.exposure.band else passbands.load(magnitude_band))
     )
     f_nu = 10.0 ** (0.4 * (units.AB_UJY - magnitude)) * band_flux / reference_flux
-    # Of the spectrum the shape alone is taken: its H matters not.
+    # The value of `mag_h` is irrelevant, because only the shape of the spectrum is used.
     star = {"id": ids, "ra": ra, "dec": dec, "sed": sed, "mag_h": magnitude, "a_v": 0.0}
     return replace(
         rows,
@@ -80,16 +97,16 @@ def with_standards(rows: Rows, aim: Aim, mission: MissionConfiguration) -> Rows:
 
 
 def brightness(exposure: ExposureRow, mission: MissionConfiguration) -> tuple[float, str]:
-    """AB magnitude of what an exposure of one of these types is of, and the band that it is in."""
+    """Return the AB magnitude of the calibration source of an exposure, and the band of this magnitude."""
     key, band = _BRIGHTNESS[exposure.image_type]
     return mission.value(key, "mag"), band or exposure.band
 
 
 def star_positions(aim: Aim, mission: MissionConfiguration) -> tuple[Float, Float]:
-    """Where they are: ra [n], dec [n], deg; mission : the mission database."""
+    """Return right ascension and declination of the calibration stars in degrees, each of shape (n,)."""
     exposure, nx, ny = aim.exposure, aim.detector.nx, aim.detector.ny
     if exposure.image_type == _OUTSIDE:
-        # On the tangent plane, which stretches the angle.
+        # Distances on the tangent plane are the tangents of angles.
         offset_arcsec = np.tan(mission.value("survey.stray_light.distance", "rad")) / pointing.ARCSEC
         return pointing.sky_of_plane([0.0], [offset_arcsec], exposure.ra, exposure.dec, exposure.position_angle)
     x, y = np.array(_PLACES_OF_HALVES if aim.detector.injection_rows else _PLACES).T
@@ -97,7 +114,7 @@ def star_positions(aim: Aim, mission: MissionConfiguration) -> tuple[Float, Floa
 
 
 def _append_rows(table: pa.Table, values: Mapping[str, Any]) -> pa.Table:
-    """A table with one more row a place; its columns without a value are null there."""
+    """Return the table with one more row per identifier; columns without a value are null."""
     n = len(values["id"])
     columns = [
         pa.array(np.broadcast_to(values[field.name], n)).cast(field.type) if field.name in values

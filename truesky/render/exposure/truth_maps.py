@@ -1,9 +1,4 @@
-"""Truth of what is in an image besides the sources: the diffuse sky, cosmic rays, ghosts, what is full.
-
-made       which of the maps that are wanted an image has
-watch      what is called for every effect that is applied
-complete   adds the maps of effects that were not needed, and what the converter could not hold
-"""
+"""Record truth maps of an image: diffuse sky, cosmic rays, ghosts, saturated pixels and others."""
 
 from __future__ import annotations
 
@@ -20,20 +15,20 @@ from truesky.render.effects.scene import Frame, Scene
 
 Maps = dict[str, Array]
 
-# Of each order of a grism its own light.
+# Map with the light of each order of a grism.
 ORDER_MAPS = {1: "order_1", 0: "order_0", 2: "order_2", -1: "order_m1"}
-# Bytes a pixel of each map's file.
+# Bytes per pixel in the file of each map.
 BYTES_PER_PIXEL = {
     "noise_free": 4, "stars": 4, "sky": 4, "cosmic_rays": 4, "ghosts": 4, "persistence": 4, "satellites": 4,
     "saturation": 1, "traps": 4, "dipoles": 4,
-    # Four groups of a photometric ramp.
+    # The number is for the four groups of a photometric ramp.
     "ramp": 8, **dict.fromkeys(ORDER_MAPS.values(), 4),
 }  # fmt: skip
-# Beyond what they hold a pixel is not told.
+# Effects that limit pixel values: pixels at the limit are saturated.
 _CONVERTERS = ("adc", "signal_adc")
-# Of an image that a grism is in the beam of.
+# Effect that is present if a grism is in the beam.
 _GRISM = "dispersed_sky"
-# What adds to a map of the same name as an effect, or of another.
+# Map to which each effect contributes.
 _MAP_OF_EFFECT = {
     "ghosts": "ghosts", "filter_ghosts": "ghosts", "background": "sky", "dispersed_sky": "sky", "pixel_area": "sky",
     "straylight": "sky", "fringes": "sky", "satellite_trails": "satellites",
@@ -43,9 +38,21 @@ _MAP_OF_EFFECT = {
 
 
 def available_maps(truth: Sequence[str], effects: Sequence[str] | None, sees_sky: bool) -> list[str]:
-    """Those of the wanted maps that an image has.
+    """Select the requested maps that an image has.
 
-    effects : names of its channel's, None = not known: all maps;  looks : whether sources shine on it
+    Parameters
+    ----------
+    truth : sequence of str
+        Requested maps.
+    effects : sequence of str or None
+        Names of the channel's effects. None if they are not known: all maps are then available.
+    sees_sky : bool
+        True if sources have light on the image.
+
+    Returns
+    -------
+    list of str
+        Available maps in the order of `truth`.
     """
     available = {_MAP_OF_EFFECT[name] for name in effects or () if name in _MAP_OF_EFFECT}
     available |= {"noise_free", "saturation"} | ({"stars"} if sees_sky else set())
@@ -59,10 +66,23 @@ def available_maps(truth: Sequence[str], effects: Sequence[str] | None, sees_sky
 def map_recorder(
     maps: Maps, scene: Scene, truth: Sequence[str], mode: ReadoutMode
 ) -> Callable[[str, Frame, Frame], None]:
-    """Fills in the truth that effects add to the frame.
+    """Create a callback for `apply_all` that records the truth of each applied effect.
 
-    maps  : by name, filled in;  scene : what is rendered;  truth : the maps that are wanted
-    mode  : how the detector is read
+    Parameters
+    ----------
+    maps : dict of str to array
+        Maps by name, to which the callback adds.
+    scene : Scene
+        Scene of the exposure.
+    truth : sequence of str
+        Requested maps.
+    mode : ReadoutMode
+        Readout of the detector.
+
+    Returns
+    -------
+    callable
+        Function (name of the effect, frame before, frame after).
     """
 
     def record(name: str, frame_before: Frame, frame_after: Frame) -> None:
@@ -86,7 +106,7 @@ def map_recorder(
         if name == "macc" and "ramp" in truth:
             maps["ramp"] = adc.convert_groups(frame_before, scene)
         if name in ("cosmic_rays", "readout_cosmic_rays") and "cosmic_rays" in truth:
-            # Traps may have held some of it back: to the electron.
+            # Traps may have captured a fraction of an electron: round the difference.
             maps["cosmic_rays"] = np.rint(mode.assemble(frame_after - frame_before, scene)).astype(np.int32) + maps.get(
                 "cosmic_rays", 0
             )
@@ -97,12 +117,26 @@ def map_recorder(
 def complete(
     maps: Maps, raw: Array, effects: Sequence[Effect], scene: Scene, truth: Sequence[str], mode: ReadoutMode
 ) -> None:
-    """Adds maps of effects that were not needed, and pixels that the converter could not hold.
+    """Add maps of effects that were not needed, and mark pixels above the converter's range as saturated.
 
-    Nothing is where no pixel is, between the halves of a detector.
-    maps  : what there is so far;  raw : ADU;  effects : of the channel
-    scene : what was rendered;  truth : maps that are wanted
-    mode  : how the detector is read
+    Parameters
+    ----------
+    maps : dict of str to array
+        Recorded maps, which are changed in place.
+    raw : array
+        Pixel values in ADU.
+    effects : sequence of Effect
+        Effects of the channel.
+    scene : Scene
+        Scene of the exposure.
+    truth : sequence of str
+        Requested maps.
+    mode : ReadoutMode
+        Readout of the detector.
+
+    Notes
+    -----
+    Maps are 0 in rows and pixels that are not read.
     """
     shape = maps["noise_free"].shape
     requested = available_maps(truth, [effect.name for effect in effects], False)

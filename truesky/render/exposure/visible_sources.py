@@ -1,9 +1,4 @@
-"""The catalogue rows that shine onto a detector, as sources to be drawn.
-
-flux_limits     fluxes above which sources outside the detector are read
-sources_of      the rows that shine onto the detector, as what is drawn
-Listed, listed  all rows, as what may be drawn
-"""
+"""Select the catalogue rows that have light on a detector, as sources to draw."""
 
 from __future__ import annotations
 
@@ -45,28 +40,41 @@ from truesky.render.sources import (
 )
 from truesky.render.sources.source_list import Sources
 
-# What is read of the catalogues; fluxes are read besides.
+# Columns of the catalogues that are read. Fluxes are read separately.
 SHAPE_COLUMNS = ("id", "kind", "ra", "dec", *galaxy_shapes.COLUMNS)
 GALAXY_COLUMNS = tuple(dict.fromkeys((*SHAPE_COLUMNS, galaxy_stamps.COLUMN, *colours.GALAXY_COLUMNS, *bulges.COLUMNS)))
 STAR_COLUMNS = ("id", "ra", "dec", "pm_ra", "pm_dec", *colours.STAR_COLUMNS)
-# Of a source: more would leave the frame's integers to a tenth of an electron (fourier.units_of).
+# Upper limit on the electrons of a source: more would exceed the integer frame, whose unit is a tenth of an electron.
 _MAX_ELECTRONS = 1e17
-# Light of a spectrum that may be noticed, of a pixel's noise: all in one line it has a signal-to-noise ratio of 0.7.
+# Light of a spectrum above which it may be noticeable, in units of a pixel's noise. If all of its light is in one line,
+# the signal-to-noise ratio is 0.7.
 MIN_SPECTRUM_NOISE = 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """What shines onto a detector.
+    """Light on a detector.
 
-    sources, sizes : and int[n] sides of their stamps
-    neglected : float64[n] Fourier samples that may be left out
-    psf       : None in the dark
-    scene     : with bright sources on and about the detector
-    decisions : of effects that act while sources are drawn
-    dispersed : what a grism makes of the sources; None: there is none
-    of        : int[n] whose spectrum each has: the row, counted from the galaxies on to the stars; -1 = the Sun's
-    let_through : float64[n] part of its light that the grism lets through
+    Attributes
+    ----------
+    sources : Sources
+        Sources to draw.
+    sizes : int array, shape (n,)
+        Sides of their stamps in pixels.
+    neglected : float64 array, shape (n,)
+        Size of Fourier samples that may be left out.
+    psf : Psf or None
+        PSF. None if the image has no light of the sky.
+    scene : Scene
+        Scene with bright sources on and around the detector.
+    decisions : tuple of Decision
+        Decisions on effects that act while sources are drawn.
+    dispersed : DispersedSources, optional
+        Dispersion of the sources. None without a grism.
+    spectrum_rows : int array, shape (n,)
+        Row of each source's spectrum, counted through the galaxies and then the stars; -1 for the Sun's spectrum.
+    let_through : float64 array, shape (n,)
+        Fraction of each source's light that the grism transmits.
     """
 
     sources: Sources
@@ -82,10 +90,24 @@ class Light:
 
 @dataclass(frozen=True, slots=True)
 class CandidateSources:
-    """Galaxies, stars and arcs, [n] each; form : of all galaxies, those that are drawn as pictures among them.
+    """Galaxies, stars and arcs that may be drawn.
 
-    electrons : expected;  shape, picture : as of Sources
-    of        : whose spectrum each has, counted from the galaxies on to the stars
+    Attributes
+    ----------
+    ids : int64 array, shape (n,)
+        Identifiers.
+    ra, dec : float array, shape (n,)
+        Position in degrees.
+    electrons : float array, shape (n,)
+        Expected electrons.
+    shape, picture : int64 array, shape (n,)
+        Same as in `Sources`.
+    spectrum_rows : int64 array, shape (n,)
+        Row of each source's spectrum, counted through the galaxies and then the stars.
+    form : Shapes
+        Shapes of all galaxies, also of galaxies that are drawn as pictures.
+    pictures : tuple of Picture
+        Pictures of galaxies and arcs.
     """
 
     ids: Int
@@ -100,9 +122,10 @@ class CandidateSources:
 
 
 def list_candidates(rows: Rows, electrons: tuple[Float, Float]) -> CandidateSources:
-    """All rows, as what may be drawn; electrons : expected of each of the galaxies, and of the stars.
+    """Combine all rows into sources that may be drawn.
 
-    Errors : BadInput where a source is given twice, or shines too brightly
+    `electrons` are the expected electrons of the galaxies and of the stars. Raises BadInput if an identifier occurs
+    twice or a number of electrons is outside its limits.
     """
     catalogue, points = rows.galaxies, rows.stars
     form, n, stars = galaxy_shapes.shapes(catalogue), len(catalogue), len(points)
@@ -118,7 +141,7 @@ def list_candidates(rows: Rows, electrons: tuple[Float, Float]) -> CandidateSour
         light,
         np.concatenate([np.where(stamp < 0, np.arange(n), -1), np.full(stars + len(arcs.ids), -1)]).astype(np.int64),
         np.concatenate([stamp, np.full(stars, -1), len(stamps) + np.arange(len(arcs.ids))]).astype(np.int64),
-        # Arcs have the colour of what they are an image of.
+        # Arcs have the spectrum of their source.
         np.concatenate([np.arange(n + stars), arcs.source]).astype(np.int64),
         form,
         (*stamps, *arcs.pictures),
@@ -126,10 +149,23 @@ def list_candidates(rows: Rows, electrons: tuple[Float, Float]) -> CandidateSour
 
 
 def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
-    """All that shines onto a detector, or nothing where it does not see the sky.
+    """Select all light on a detector; there is none if the image type has no light of the sky.
 
-    aim   : the exposure and detector;  rows : catalogue rows that it may see
-    scene : before anything is drawn;  seed : of the request
+    Parameters
+    ----------
+    aim : Aim
+        Exposure and detector.
+    rows : Rows
+        Catalogue rows that may have light on the detector.
+    scene : Scene
+        Scene before anything is drawn.
+    seed : int
+        Seed of the request.
+
+    Returns
+    -------
+    Light
+        Sources, PSF and scene.
     """
     if not aim.sees_sky:
         return Light(_no_sources(rows.galaxies), np.zeros(0, np.int64), np.zeros(0), None, scene)
@@ -155,13 +191,26 @@ def visible_light(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
 
 
 def rows_at_exposure(rows: Rows, aim: Aim, mission: MissionConfiguration) -> Rows:
-    """Rows as an exposure sees them.
+    """Adapt catalogue rows to an exposure.
 
-    Bulges have their share of the light in its band, stars are where they are in its middle, and the standard star's
-    is there if it is of one.
+    Parameters
+    ----------
+    rows : Rows
+        Catalogue rows.
+    aim : Aim
+        Exposure and detector.
+    mission : MissionConfiguration
+        Mission database.
 
-    rows : of the catalogues;  aim : the exposure and detector;  mission : the mission database
-    Errors : BadInput for a target that is no standard star
+    Returns
+    -------
+    Rows
+        Rows with the bulge fractions of the exposure's band, with the positions of stars in the middle of the exposure,
+        and with the standard star of the exposure if it has one.
+
+    Notes
+    -----
+    BadInput is raised by `with_standards` if the target of a calibration is not a standard star.
     """
     middle = aim.exposure.mjd + 0.5 * aim.exposure.exposure_time_s / 86400.0
     galaxies = bulges.with_fractions_in_band(rows.galaxies, aim.band, rows.galaxy_library or templates.galaxy_library())
@@ -173,7 +222,22 @@ def rows_at_exposure(rows: Rows, aim: Aim, mission: MissionConfiguration) -> Row
 
 
 def exposure_psf(aim: Aim, scene: Scene, settings: Settings) -> Psf:
-    """The exposure's own, or its channel's; of as many places and colours as the settings say."""
+    """Return the PSF from the exposure's file, or the PSF of its channel.
+
+    Parameters
+    ----------
+    aim : Aim
+        Exposure and detector.
+    scene : Scene
+        Scene of the exposure.
+    settings : Settings
+        Settings with the numbers of positions and colours.
+
+    Returns
+    -------
+    Psf
+        PSF of the detector.
+    """
     if aim.exposure.psf:
         psf = from_file.read(from_file.path_for_detector(aim.exposure.psf, aim.detector.name), aim.detector, aim.band)
     else:
@@ -182,7 +246,7 @@ def exposure_psf(aim: Aim, scene: Scene, settings: Settings) -> Psf:
 
 
 def _with_intra_pixel(aim: Aim, scene: Scene, psf: Psf, electrons: Float) -> tuple[Psf, tuple[Decision, ...]]:
-    """(PSF with the effect that acts while sources are drawn, decision); electrons : of what is on the frame."""
+    """Return the PSF with the intra-pixel response, and the decision; `electrons` are for sources on the frame."""
     effect = aim.channel.transfer_effect
     if effect is None:
         return psf, ()
@@ -204,17 +268,17 @@ def _no_sources(galaxies: pa.Table) -> Sources:
 
 @dataclass(frozen=True, slots=True)
 class FluxLimits:
-    """Fluxes above which a source outside the detector is read from the catalogue, microjansky; infinite: none is.
+    """Fluxes in microjansky above which sources outside the detector are read; infinite to read none.
 
     Attributes
     ----------
-    least : float
+    min_flux : float
         Faintest source that reaches the detector from beyond its selection margin. Each fainter source leaves out less
         than the settings' `edge` of a pixel's noise.
     spikes : float
-        Faintest star whose spikes are noticed from farther out.
+        Faintest star whose spikes are noticeable from farther out.
     far_galaxy : float
-        Faintest galaxy that is noticed from farther out.
+        Faintest galaxy that is noticeable from farther out.
     """
 
     min_flux: float = np.inf
@@ -239,7 +303,7 @@ def flux_limits(exposure: ExposureRow, detector: Detector, band: Passband, varia
     Returns
     -------
     FluxLimits
-        The limits. All are infinite if no source is seen: in the dark, or in an exposure of 0 s.
+        The limits. All are infinite without light of sources: in dark images, or in an exposure of 0 s.
     """
     time, channel = exposure.exposure_time_s, registry.CHANNELS[exposure.channel]
     if time == 0.0 or not channel.sees_sky(exposure.image_type):
@@ -260,7 +324,10 @@ def flux_limits(exposure: ExposureRow, detector: Detector, band: Passband, varia
 def _spike_electrons(
     exposure: ExposureRow, detector: Detector, band: Passband, mission: MissionConfiguration, noise: float
 ) -> float:
-    """Electrons of the faintest star whose spikes are noticed from beyond the reach of stamps; or infinite."""
+    """Return the electrons of the faintest star whose spikes are noticeable from beyond the reach of stamps.
+
+    The number is infinite if the PSF has no spikes.
+    """
     pupil_of = registry.CHANNELS[exposure.channel].diffraction_edges
     if pupil_of is None or exposure.psf:
         return np.inf
@@ -274,11 +341,29 @@ def _spike_electrons(
 def select_sources(
     rows: Rows, electrons: tuple[Float, Float], aim: Aim, psf: Psf, noise: float, settings: Settings
 ) -> tuple[Sources, Int]:
-    """Everything that shines onto the detector, with its stamp or beyond it, ascending id, and the stamps' sides.
+    """Select everything with light on the detector, within stamps or beyond them.
 
-    electrons : expected of each of the galaxies, and of the stars;  noise : of a pixel, e-
-    rows : catalogue rows that the detector may see;  aim : the exposure and detector
-    psf  : of the detector;  settings : of the accuracy
+    Parameters
+    ----------
+    rows : Rows
+        Catalogue rows that may have light on the detector.
+    electrons : (float array, float array)
+        Expected electrons of the galaxies and of the stars.
+    aim : Aim
+        Exposure and detector.
+    psf : Psf
+        PSF of the detector.
+    noise : float
+        Noise of a pixel in electrons.
+    settings : Settings
+        Settings of the accuracy.
+
+    Returns
+    -------
+    sources : Sources
+        Sources by ascending identifier.
+    sizes : int array, shape (n,)
+        Sides of their stamps in pixels.
     """
     detector, wcs, candidates = aim.detector, aim.wcs, list_candidates(rows, electrons)
     light, shape, picture, form = candidates.electrons, candidates.shape, candidates.picture, candidates.form
@@ -319,19 +404,19 @@ def select_sources(
 
 
 def _with_catalogue_bulges(form: galaxy_shapes.Shapes, rows: Rows) -> galaxy_shapes.Shapes:
-    """Galaxies with what they have of bulges in the catalogue: what they look like is not another thing in a band."""
+    """Return the shapes with bulge fractions of the catalogue, so that structure is the same in all bands."""
     return form if rows.bulge_fractions is None else replace(form, bulge_fraction=rows.bulge_fractions)
 
 
 def _spike_reach(electrons: Float, detector: Detector, psf: Psf, noise: float) -> Float:
-    """[n] arcsec as far as which points' spikes are noticed."""
+    """Return the distance in arcsec up to which spikes of point sources are noticeable."""
     if psf.edges is None:
         return np.zeros(len(electrons))
     return spikes.reach(psf.edges, electrons, NOTICEABLE * noise) * detector.pixel_scale
 
 
 def _outskirt_reach(electrons: Float, form: galaxy_shapes.Shapes, detector: Detector, noise: float) -> Float:
-    """[n] arcsec as far as which galaxies are noticed that may be from beyond what else is read, 0 of others."""
+    """Return the distance in arcsec up to which galaxies are noticeable; 0 if it is within the reach of stamps."""
     out, min_reach = np.zeros(len(electrons)), stamp_sizes.reach(detector.pixel_scale)
     bright = np.flatnonzero(electrons > outskirts.min_noticeable_electrons(min_reach, detector.pixel_scale, noise))
     out[bright] = outskirts.reach(electrons[bright], form.take(bright), detector.pixel_scale, noise, min_reach)
@@ -341,7 +426,7 @@ def _outskirt_reach(electrons: Float, form: galaxy_shapes.Shapes, detector: Dete
 def _arcs(
     lenses: pa.Table | None, galaxies: pa.Table, electrons: Float, form: galaxy_shapes.Shapes
 ) -> lensed_arcs.Arcs:
-    """Those of strong lenses: their pictures magnify what the galaxy shines by itself."""
+    """Return the arcs of strong lenses, which magnify the unlensed light of their galaxies."""
     rows = STRONG_LENSES.empty().select(lensed_arcs.ARC_COLUMNS) if lenses is None else lenses
     return lensed_arcs.arcs(rows, galaxies["id"].to_numpy(), electrons / form.magnification)
 
@@ -349,7 +434,10 @@ def _arcs(
 def _with_moving(
     fixed: tuple[Sources, Int], aim: Aim, rows: Rows, scene: Scene, psf: Psf, settings: Settings, seed: int
 ) -> tuple[Sources, Int, Lights]:
-    """The sources with those that move, whose identifiers are the largest; and bright ones around, as far as read."""
+    """Add moving bodies, which have the largest identifiers.
+
+    Return sources, sizes of stamps, and bright bodies on and around the frame.
+    """
     (sources, sizes), detector = fixed, aim.detector
     reach = (detector.half_diagonal + stamp_sizes.reach(detector.pixel_scale)) / 3600.0
     bodies = solar_system.trailed_sources(aim, scene.mission, seed, reach, sources.shapes, rows.bodies)
@@ -373,12 +461,26 @@ def _with_moving(
 
 
 def touches_detector(sources: Sources, sizes: Int, detector: Detector) -> Bool:
-    """Sources with a stamp on the detector."""
+    """Return a mask of the sources whose stamps overlap the detector.
+
+    Parameters
+    ----------
+    sources : Sources
+        Sources.
+    sizes : int array, shape (n,)
+        Sides of their stamps in pixels.
+    detector : Detector
+        Detector.
+
+    Returns
+    -------
+    bool array, shape (n,)
+    """
     return selection.overlaps_frame(sources.column, sources.row, sizes + sources.trail_length, detector.nx, detector.ny)
 
 
 def _photon_fractions(spectrum_rows: Int, rows: Rows, band: Passband) -> Float:
-    """Photon fractions of the rows that are drawn; `kept` counts on from the galaxies to the stars."""
+    """Return the photon fractions in sub-bands, for rows that count through the galaxies and then the stars."""
     of_galaxy = spectrum_rows < len(rows.galaxies)
     out = np.empty((len(spectrum_rows), sub_bands.N_SUB_BANDS))
     out[of_galaxy] = colours.galaxies(rows.galaxies.take(spectrum_rows[of_galaxy]), band, rows.galaxy_library)
@@ -389,17 +491,38 @@ def _photon_fractions(spectrum_rows: Int, rows: Rows, band: Passband) -> Float:
 
 
 def _check_sources(ids: Int, electrons: Float) -> None:
-    if len(np.unique(ids)) != len(ids):
-        raise BadInput("a source is given twice")
+    unique, counts = np.unique(ids, return_counts=True)
+    if len(unique) != len(ids):
+        raise BadInput(f"source {unique[np.argmax(counts > 1)]} occurs more than once, identifiers must be unique")
     bad = ~((electrons >= 0) & (electrons <= _MAX_ELECTRONS))
     if bad.any():
-        raise BadInput(f"source {ids[np.argmax(bad)]}: {electrons[np.argmax(bad)]} electrons, outside 0 .. 1e17")
+        raise BadInput(f"source {ids[np.argmax(bad)]}: electrons must be 0 to 1e17, got {electrons[np.argmax(bad)]}")
 
 
 def row_fluxes(rows: pa.Table, fluxes: pa.Table, column: str) -> Float:
-    """float64[n] f_nu of catalogue rows, microjansky; BadInput where the flux table is not of the same rows."""
+    """Fluxes of catalogue rows in one band.
+
+    Parameters
+    ----------
+    rows : Table
+        Catalogue rows.
+    fluxes : Table
+        Fluxes of the same rows.
+    column : str
+        Column with the fluxes.
+
+    Returns
+    -------
+    float64 array, shape (n,)
+        f_nu in microjansky.
+
+    Raises
+    ------
+    BadInput
+        If the flux table lacks the column or has other rows.
+    """
     if column not in fluxes.column_names:
-        raise BadInput(f"the flux table has no column {column}")
+        raise BadInput(f"the flux table has no column {column}; it has {', '.join(fluxes.column_names)}")
     if len(rows) != len(fluxes) or not np.array_equal(rows["id"].to_numpy(), fluxes["id"].to_numpy()):
-        raise BadInput("the flux table is not of the same rows as its catalogue")
+        raise BadInput("the flux table must have the same rows as its catalogue, in the same order")
     return np.asarray(fluxes[column].to_numpy(), float)

@@ -1,12 +1,7 @@
-"""The catalogue rows whose spectra lie on a detector, as sources to be spread out.
+"""Select the catalogue rows whose spectra have light on a detector, as sources to disperse.
 
-An order puts a source's light far from its undispersed image: what is read is told by where that must lie for some of
-its light to be on the detector, a rectangle for each order.
-
-visible_spectra   all that shines onto a detector
-orders            by which a grism puts it there
-beyond            how far beyond a detector sources lie whose light is on it
-bands             whose fluxes tell which sources are drawn
+An order displaces a source's light far from its undispersed image. Rows are therefore selected by the undispersed
+positions from which an order sends light onto the detector: a rectangle for each order.
 """
 
 from __future__ import annotations
@@ -40,23 +35,41 @@ from truesky.render.sky.diffuse_light import solar_irradiance
 from truesky.render.sources import selection, solar_system, spectra
 from truesky.render.sources.source_list import Sources
 
-# Pixels beside a detector from which a spectrum still sends light in: of any source, and of a bright one, e-.
+# Distances in pixels from which the wing of a spectrum has light on the detector: for any source, and for sources with
+# more than _BRIGHT electrons.
 _WING, _FAR_WING, _BRIGHT = 64.0, 256.0, 1e6
-# Of the optics' scale across the field, which sources are looked for a little farther for.
+# Factor on distances for variations of the plate scale over the field.
 _DISTORTION = 1.02
 _HALPHA = "flux_halpha"
 
 
 def visible_spectra(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
-    """All sources whose light a grism puts onto a detector that sees the sky.
+    """Select all sources whose dispersed light is on a detector.
 
-    aim    : the exposure and detector;  rows : catalogue rows that it may see
-    scene  : before anything is drawn;  seed : of the request
-    Errors : BadInput for a PSF of the user's
+    Parameters
+    ----------
+    aim : Aim
+        Exposure and detector.
+    rows : Rows
+        Catalogue rows that may have light on the detector.
+    scene : Scene
+        Scene before anything is drawn.
+    seed : int
+        Seed of the request.
+
+    Returns
+    -------
+    Light
+        Sources with their dispersion.
+
+    Raises
+    ------
+    BadInput
+        If the exposure has a PSF file.
     """
     exposure, mission, band, dispersion = aim.exposure, scene.mission, aim.band, _dispersion_of(aim)
     if exposure.psf:
-        raise BadInput(f"exposure {exposure.exposure_id}: psf: spectra are drawn through the camera's own PSF alone")
+        raise BadInput(f"exposure {exposure.exposure_id}: psf: spectra do not support PSF files, got {exposure.psf}")
     rows, settings = visible_sources.rows_at_exposure(rows, aim, mission), draw.settings_for(scene.accuracy)
     grism_orders = make_orders(aim, mission, seed)
     order_traces = tuple(order.trace for order in grism_orders)
@@ -84,9 +97,21 @@ def visible_spectra(aim: Aim, rows: Rows, scene: Scene, seed: int) -> Light:
 
 
 def make_orders(aim: Aim, mission: MissionConfiguration, seed: int) -> tuple[Order, ...]:
-    """Of the grism: what each detects of f_lambda on the scale of `sources.spectra`, A.
+    """Create the orders of a grism, with their responses to f_lambda at the wavelengths of `sources.spectra`.
 
-    aim : the exposure and detector;  mission : the exposure's;  seed : of the request
+    Parameters
+    ----------
+    aim : Aim
+        Exposure and detector.
+    mission : MissionConfiguration
+        Mission database of the exposure.
+    seed : int
+        Seed of the request.
+
+    Returns
+    -------
+    tuple of Order
+        Orders with their traces.
     """
     dispersion, band, exposure = _dispersion_of(aim), aim.band, aim.exposure
     grism_orders = []
@@ -99,10 +124,25 @@ def make_orders(aim: Aim, mission: MissionConfiguration, seed: int) -> tuple[Ord
 def margin_arcsec(
     exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, band: Passband, seed: int
 ) -> float:
-    """How far beyond a detector's circle sources lie whose light of some order is on it, arcsec; 0 without a grism.
+    """Distance beyond a detector's circle up to which sources have dispersed light on it.
 
-    exposure, detector, mission, band : its row, the detector, the mission database and the passband
-    seed : of the request
+    Parameters
+    ----------
+    exposure : ExposureRow
+        Row of the exposure.
+    detector : Detector
+        Detector.
+    mission : MissionConfiguration
+        Mission database.
+    band : Passband
+        Passband of the exposure.
+    seed : int
+        Seed of the request.
+
+    Returns
+    -------
+    float
+        Distance in arcsec, 0 without a grism.
     """
     channel = registry.CHANNELS[exposure.channel]
     if channel.dispersion is None or not channel.sees_sky(exposure.image_type):
@@ -112,10 +152,7 @@ def margin_arcsec(
 
 
 def flux_bands(exposure: ExposureRow, columns: Sequence[str]) -> list[str]:
-    """An exposure's own, and that in which sources are chosen where its fluxes are known.
-
-    exposure : its row;  known : columns of the table of fluxes
-    """
+    """Return the exposure's band, and the selection band of sources if the flux table has a column for it."""
     dispersion = registry.CHANNELS[exposure.channel].dispersion
     selection_band = (
         [] if dispersion is None or f"f_nu_{dispersion.selection_band}" not in columns else [dispersion.selection_band]
@@ -129,20 +166,20 @@ def _dispersion_of(aim: Aim) -> Dispersion:
 
 
 def _rectangles(order_traces: tuple[Trace, ...], detector: Detector, band: Passband) -> Float:
-    """float64[orders, 4] pixels: left, right, low, high of undispersed images."""
+    """Return the rectangles of undispersed positions in pixels, float64[orders, 4]: left, right, low, high."""
     ends = float(band.wavelength[0]), float(band.wavelength[-1])
     return np.array([traces.source_rectangle(trace, detector.nx, detector.ny, ends) for trace in order_traces])
 
 
 def _radius(boxes: Float, detector: Detector) -> float:
-    """arcsec from a detector's centre that holds the rectangles."""
+    """Return the radius in arcsec of a circle around the detector's centre that contains the rectangles."""
     across = np.abs(boxes[:, :2] - (detector.nx - 1) / 2).max(axis=1)
     up = np.abs(boxes[:, 2:] - (detector.ny - 1) / 2).max(axis=1)
     return float(np.hypot(across + _FAR_WING, up + _FAR_WING).max()) * detector.pixel_scale * _DISTORTION
 
 
 def _select_sources(aim: Aim, rows: Rows, scene: Scene, boxes: Float, seed: int) -> tuple[Sources, Int]:
-    """(sources in the rectangles, ascending id, those that move behind; whose spectrum each has)."""
+    """Return sources in the rectangles and the rows of their spectra: ascending identifier, then moving bodies."""
     detector, wcs, column = aim.detector, aim.wcs, f"f_nu_{aim.exposure.band}"
     pairs = ((rows.galaxies, rows.galaxy_fluxes), (rows.stars, rows.star_fluxes))
     factor = electron_rate(aim.exposure) * scene.exposure_time_s
@@ -182,9 +219,9 @@ def _select_sources(aim: Aim, rows: Rows, scene: Scene, boxes: Float, seed: int)
 
 
 def _is_selected(candidates: CandidateSources, rows: Rows, aim: Aim, scene: Scene) -> Bool:
-    """[n] What may be noticed; or what Serrano et al. 2024 drew, where the mission says so.
+    """Return a mask of noticeable sources, or the selection of Serrano et al. 2024 if the mission database requests it.
 
-    Error : where the fluxes in the band that these were chosen in are not known, those in the exposure's own band tell
+    If fluxes in the band of that selection are missing, fluxes in the exposure's band are used.
     """
     if scene.value("spectra.selection", "") < 0.5:
         return np.asarray(candidates.electrons > MIN_SPECTRUM_NOISE * scene.pixel_noise)
@@ -194,7 +231,7 @@ def _is_selected(candidates: CandidateSources, rows: Rows, aim: Aim, scene: Scen
         column = f"f_nu_{aim.exposure.band}"
     band_column = f"f_nu_{aim.exposure.band}"
     f_nu, band_f_nu = (np.concatenate([table[name].to_numpy() for table in tables]) for name in (column, band_column))
-    # A standard star has no fluxes but in the exposure's band.
+    # A standard star has fluxes only in the exposure's band.
     f_nu = np.where(np.isnan(f_nu), band_f_nu, f_nu)
     bright = f_nu >= 10.0 ** (0.4 * (units.AB_UJY - scene.value("spectra.faintest", "mag")))
     if _HALPHA in rows.galaxies.column_names:
@@ -203,7 +240,10 @@ def _is_selected(candidates: CandidateSources, rows: Rows, aim: Aim, scene: Scen
 
 
 def _halpha_flux(rows: Rows) -> Float:
-    """[galaxies] erg s-1 cm-2 of H alpha as it is observed: magnified, behind the Milky Way's dust; 0 of no line."""
+    """Return the observed H alpha flux per galaxy in erg s-1 cm-2, with magnification and Galactic dust.
+
+    The flux is 0 for galaxies without the line.
+    """
     flux = np.nan_to_num(rows.galaxies[_HALPHA].to_numpy(zero_copy_only=False).astype(float))
     (with_line,) = np.nonzero(flux > 0.0)
     shining = rows.galaxies.take(with_line)
@@ -218,7 +258,7 @@ def _halpha_flux(rows: Rows) -> Float:
 
 
 def _is_inside(x: Float, y: Float, electrons: Float, length: Float, boxes: Float) -> Bool:
-    """[n] Undispersed images of which some order sends light onto the detector."""
+    """Return a mask of undispersed positions from which some order sends light onto the detector."""
     wing = np.where(electrons > _BRIGHT, _FAR_WING, _WING) + length / 2
     is_inside = np.zeros(len(x), bool)
     for x_min, x_max, y_min, y_max in boxes:

@@ -1,1 +1,1 @@
-"""What a request will cost before anything of it is made: rows, seconds, bytes, and how fast this machine is."""
+"""Forecast the cost of a request before it runs: rows, seconds, bytes, and the speed of this machine."""

@@ -1,8 +1,4 @@
-"""What a request's detectors took, beside their forecast: CPU, memory, bytes, core-hours a square degree.
-
-rows     a line a channel, camera and image type, one a channel, one of all
-text     the table that a person reads
-"""
+"""Compare the actual costs of a request's detectors with the forecast: CPU time, memory, bytes, core-hours per deg2."""
 
 from __future__ import annotations
 
@@ -23,13 +19,14 @@ from truesky.render.camera import footprints
 from truesky.render.planning import exposure_chunks
 from truesky.render.products import run_log
 
-# Cells of the sky that are counted where their centre is seen, 0.2 arcmin2: of a detector's area right to 2 %.
+# HEALPix order of the cells (0.2 arcmin2) that are counted if a footprint contains their centre. The error of a
+# detector's area is 2 %.
 _ORDER = 13
 _ALL = "all"
-# Image types that survey the sky: others are taken where it is bright or dense.
+# Image types of surveys. Other exposures are of bright or dense fields.
 _SURVEY_TYPES = ("science", "deep")
 _TASK_COLUMNS = ("exposure_id", "detector", "channel", "seconds", "bytes", "ra", "dec", "radius", "s_region")
-# Channel, camera, image type.
+# Channel, camera and image type.
 _Kind = tuple[str, str, str]
 
 
@@ -37,12 +34,22 @@ _Kind = tuple[str, str, str]
 class Line:
     """One kind of exposure.
 
-    planned, made, measured : detectors; of which the lake has images; of which a log says what they took
-    cpu_s, forecast_s       : of those that were measured
-    peak_gb                 : largest memory of a process that made one
-    gb, forecast_gb         : of those that are made
-    deg2                    : of the sky that those see that are measured, each place once; 0 = none is of a survey
-    core_hours_deg2         : of these, as often as each place is seen; of sums the sum; 0 = none is of a survey
+    Attributes
+    ----------
+    channel, camera, image_type : str
+        Kind of exposure; "all" for camera or channel in sums.
+    planned, rendered, measured : int
+        Detectors in the plan, detectors with images in the lake, and detectors whose cost is in a log.
+    cpu_s, forecast_s : float
+        Actual and forecast CPU seconds of measured detectors.
+    peak_gb : float
+        Peak memory of a process in GB.
+    gb, forecast_gb : float
+        Actual and forecast size of rendered detectors in GB.
+    deg2 : float
+        Area of the sky in measured detectors of survey exposures, each place counted once. 0 without such exposures.
+    core_hours_deg2 : float
+        Core-hours per square degree of this area, with all its exposures; in sums, the sum. 0 without survey exposures.
     """
 
     channel: str
@@ -61,9 +68,21 @@ class Line:
 
 
 def summarise(root: Path, request: str | None = None, factor: float = 1.0) -> list[Line]:
-    """Of a request's images, or of the lake's only ones.
+    """Summarise the costs of a request's images.
 
-    factor : CPU s of this machine over those of the forecast
+    Parameters
+    ----------
+    root : Path
+        Folder of the lake.
+    request : str, optional
+        Name of the request. By default the only one of the lake.
+    factor : float, optional
+        CPU seconds of this machine relative to the machine of the forecast.
+
+    Returns
+    -------
+    list of Line
+        One line per channel, camera and image type, then one per channel, and one for everything.
     """
     products = read.version(root, "products", request=request)
     input_versions = products.manifest["facts"]["inputs"]
@@ -80,7 +99,7 @@ def summarise(root: Path, request: str | None = None, factor: float = 1.0) -> li
     }
     exposure_columns = exposures.rows(("exposure_id", "camera", "image_type"))
     tasks_of_kind: dict[_Kind, list[dict[str, Any]]] = defaultdict(list)
-    # Of a large plan a small part may be made: of the others it counts how many there are.
+    # Read only rows of rendered exposures, because a plan may be large. Others are only counted.
     exposure_ids = {number for number, _ in rendered}
     exposure_rows = {
         row["exposure_id"]: row
@@ -105,7 +124,7 @@ def _kind(row: Mapping[str, Any]) -> _Kind:
 
 
 def _planned_counts(tasks: read.Version, exposures: pa.Table) -> dict[_Kind, int]:
-    """How many detectors of each kind are planned."""
+    """Return the number of planned detectors of each kind."""
     counts: Counter[_Kind] = Counter()
     for table in exposure_chunks.rows_by_partition(tasks, ("exposure_id", "channel")):
         sums = table.join(exposures, "exposure_id").group_by(["channel", "camera", "image_type"])
@@ -144,7 +163,7 @@ def _sum(name: str, lines: Sequence[Line]) -> Line:
 
 
 def _covered_area(tasks: Sequence[dict[str, Any]]) -> float:
-    """Area, deg2, that footprints cover together."""
+    """Return the area in deg2 that footprints cover together."""
     footprint_rows = [{name: task[name] for name in ("ra", "dec", "radius", "s_region")} for task in tasks]
     if not footprint_rows:
         return 0.0
@@ -156,7 +175,7 @@ def _covered_area(tasks: Sequence[dict[str, Any]]) -> float:
 
 
 def _task_metrics(root: Path, key: str) -> dict[str, Mapping[str, Any]]:
-    """Of each part of a version of `products` that a run made, what its log says; the last run of several."""
+    """Return the metrics in the logs for each task of a version of `products`; later runs replace earlier ones."""
     metrics: dict[str, Mapping[str, Any]] = {}
     for path in run_log.logs_of_products(root):
         with contextlib.suppress(LakeError, OSError):
@@ -169,7 +188,7 @@ def _task_metrics(root: Path, key: str) -> dict[str, Mapping[str, Any]]:
 
 
 def format_table(lines: Sequence[Line]) -> Iterator[str]:
-    """The lines as a table; a dash where there is nothing to say."""
+    """Yield the lines of a text table, with a dash for missing values."""
     yield (
         f"{'channel':8} {'camera':9} {'image type':17} {'detectors':>9} {'of':>6} {'measured':>8} {'CPU s':>9} "
         f"{'forecast':>9} {'peak GB':>8} {'GB':>8} {'forecast':>8} {'deg2':>7} {'core-h/deg2':>11}"

@@ -1,9 +1,4 @@
-"""What catalogues and their fluxes will cost, before they are drawn: rows, CPU seconds and bytes from area and depth.
-
-of_request   a line a job, for the area and depth of a request
-of_lake      the same for the catalogues that a lake holds
-text         the table that a person reads
-"""
+"""Forecast the rows, CPU seconds and bytes of catalogues and their fluxes from area and depth."""
 
 from __future__ import annotations
 
@@ -29,9 +24,9 @@ from truesky.request.area import Area
 from truesky.request.files import SOURCES_KIND, UserSources
 from truesky.request.schema import MissionChoice, Request, Universe
 
-# Lowest order of a file of stars, as of jobs/catalogue/build_stars.py.
+# Lowest HEALPix order of a file of stars, see truesky/catalogue/build_stars.py.
 _LOWEST_STAR_ORDER = 3
-# Workers that begin a job: those of spark-defaults.conf.
+# Number of workers of a job, as in spark-defaults.conf.
 WORKERS = 2
 _TABLES_OF_JOB = {
     "build_galaxies": ("halos", "galaxies"),
@@ -44,7 +39,19 @@ _TABLES = ("halos", "galaxies", "stars", *_CATALOGUE_OF_FLUXES)
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One job: rows of its tables, CPU seconds, GB written."""
+    """Forecast of one job.
+
+    Attributes
+    ----------
+    job : str
+        Name of the job.
+    rows : float
+        Rows of its tables.
+    seconds : float
+        CPU seconds.
+    gb : float
+        Size of its files in GB.
+    """
 
     job: str
     rows: float
@@ -53,11 +60,15 @@ class Line:
 
 
 def for_request(request: Request, factor: float = 1.0) -> list[Line]:
-    """The jobs that draw; what an external catalogue holds is not known, and left out; of given sources their number.
+    """Forecast the jobs that draw catalogues for a request.
 
-    factor : CPU s of the machine that is asked about over those of the channels' costs
-    Error  : over an area that no number was chosen on, of rows 3 %, of bytes 2 %, of seconds 5 % (galaxies) to 30 %
-             (fluxes), where the cache holds what is computed once a machine
+    External catalogues are left out, because their number of rows is not known. For sources of the user the rows are
+    counted. `factor` is the CPU time of the machine relative to the machine of the channels' costs.
+
+    Notes
+    -----
+    Over an area that was not used to derive the costs, errors are 3 % for rows and 2 % for bytes. Errors of seconds are
+    5 % (galaxies) to 30 % (fluxes) if the cache contains the results that each machine computes only once.
     """
     cells = request.area.cells()
     rows = _drawn_rows(request, cells) if request.sources is None else _given_rows(request.sources, request.area)
@@ -70,11 +81,9 @@ def for_request(request: Request, factor: float = 1.0) -> list[Line]:
 
 
 def for_lake(lake: Folder, factor: float = 1.0) -> list[Line]:
-    """The jobs whose tables a lake holds, by what their manifests say of area and depth.
+    """Forecast the jobs whose tables a lake contains, from area and depth in their manifests.
 
-    Versions of several requests add up; one that requests share is made once.
-
-    factor : as of `of_request`
+    Versions of several requests add up; a version that requests share is counted once. `factor` is as in `for_request`.
     """
     line_of_job: dict[str, Line] = {}
     counted: set[tuple[str, str]] = set()
@@ -108,7 +117,7 @@ def _forecast_versions(versions: Mapping[str, read.Version], factor: float, new_
 
 
 def format_table(lines: Sequence[Line]) -> Iterator[str]:
-    """The forecast as lines of text."""
+    """Yield the forecast as lines of a text table."""
     yield f"{'job':16} {'rows':>15} {'core-hours':>11} {'GB':>10}"
     for line in lines:
         yield f"{line.job:16} {line.rows:15,.0f} {line.seconds / 3600.0:11,.3f} {line.gb:10,.3f}"
@@ -126,7 +135,7 @@ def _find_version(lake: Folder, table: str, request: str | None) -> read.Version
 
 
 def _drawn_rows(request: Request, cells: Sequence[int]) -> dict[str, float]:
-    """Rows of each catalogue that is drawn."""
+    """Return the number of rows of each catalogue that is drawn."""
     rows = {} if request.ingest.galaxies else _galaxy_counts(request.universe.galaxy_limit, len(cells))
     if request.stars.catalogue is None:
         mission, universe, brightest = mission_of(request.mission), request.universe, request.stars.bright_limit
@@ -137,7 +146,7 @@ def _drawn_rows(request: Request, cells: Sequence[int]) -> dict[str, float]:
 
 
 def _given_rows(sources: UserSources, area: Area) -> dict[str, float]:
-    """Rows of the tables, or on a grid as many as the circle about the area has places for."""
+    """Return the rows of the user's tables; for a grid, the number of grid points in the circle around the area."""
     files = {"galaxies": sources.galaxies, "stars": sources.stars}
     rows = {name: float(_count_rows(file)) for name, file in files.items() if file is not None}
     if sources.spacing:
@@ -154,10 +163,10 @@ def _count_rows(file: Path) -> int:
 
 
 def _galaxy_counts(limit: float, cells: int) -> dict[str, float]:
-    """Halos and galaxies that are drawn in so many generation cells."""
+    """Return the expected numbers of halos and galaxies in a number of generation cells."""
     table, area = _costs()["drawn"], cells * sky.cell_area(GENERATION_ORDER)
     limits = np.array(table["limits"])
-    # Beyond the limits, as between the two that are nearest.
+    # Outside the tabulated limits, extrapolate from the nearest two.
     i = int(np.clip(np.searchsorted(limits, limit) - 1, 0, limits.size - 2))
     s = (limit - limits[i]) / (limits[i + 1] - limits[i])
     logs = {name: np.log(table[name]) for name in ("halos", "galaxies")}
@@ -165,7 +174,7 @@ def _galaxy_counts(limit: float, cells: int) -> dict[str, float]:
 
 
 def _star_count(densities: Densities, cells: Sequence[int]) -> float:
-    """Stars of generation cells, by the published counts."""
+    """Return the number of stars in generation cells from published counts."""
     if not cells:
         return 0.0
     return float(densities.at(*sky.cell_centres(GENERATION_ORDER, cells))[1].sum() * sky.cell_area(GENERATION_ORDER))
@@ -178,7 +187,7 @@ def _make_lines(
     factor: float,
     new_tables: Collection[str] = _TABLES,
 ) -> list[Line]:
-    """A line a job; made : the tables that it makes, of others the rows count alone where they are its input."""
+    """Return one line per job, for the tables in `new_tables`."""
     lines = []
     for job, tables in _TABLES_OF_JOB.items():
         seconds = size = row_count = 0.0

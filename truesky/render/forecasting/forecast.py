@@ -1,9 +1,4 @@
-"""What a plan will cost, before anything is rendered.
-
-rows     a line a channel, survey and image type, one a channel, one in all: exposures, detectors, core-hours, storage
-of_parts the same of a plan in parts
-text     the table that a person reads
-"""
+"""Summarise the forecast cost of a plan before anything is rendered: exposures, detectors, core-hours and storage."""
 
 from __future__ import annotations
 
@@ -16,14 +11,28 @@ import pyarrow as pa
 
 from truesky.render.forecasting.speed import Speed
 
-# Columns of `tasks` that a forecast adds up; what stands for all surveys of a channel.
+# Columns of `tasks` that a forecast adds up, and the name for all surveys of a channel.
 SUMMED_COLUMNS = ("sources", "seconds", "bytes", "memory")
 _ALL = "all"
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One kind of exposure."""
+    """Forecast for one kind of exposure.
+
+    Attributes
+    ----------
+    channel, survey, image_type : str
+        Kind of exposure; "all" in sums.
+    exposures, detectors, sources : int
+        Numbers of exposures, detectors and sources.
+    core_hours : float
+        CPU time in hours.
+    gigabytes : float
+        Size of the products in GB.
+    memory_gb : float
+        Peak memory of a task in GB.
+    """
 
     channel: str
     survey: str
@@ -37,9 +46,21 @@ class Line:
 
 
 def summarise(exposures: pa.Table, tasks: pa.Table, factor: float = 1.0) -> list[Line]:
-    """Sums by channel, survey and image type, in that order; by channel; of everything.
+    """Sum up a plan.
 
-    factor : CPU s of the machine that is asked about over those of `tasks` (speed.of_machine)
+    Parameters
+    ----------
+    exposures : Table
+        Rows of the table `exposures`.
+    tasks : Table
+        Rows of the table `tasks`.
+    factor : float, optional
+        CPU seconds of the machine relative to the machine of the forecast, see `speed.estimate_speed`.
+
+    Returns
+    -------
+    list of Line
+        One line per channel, survey and image type, in this order; then one per channel; then one for everything.
     """
     exposure_columns = exposures.select(["exposure_id", "survey", "image_type"])
     joined = tasks.select(["exposure_id", "detector", "channel", *SUMMED_COLUMNS]).join(exposure_columns, "exposure_id")
@@ -58,7 +79,7 @@ def summarise(exposures: pa.Table, tasks: pa.Table, factor: float = 1.0) -> list
 
 
 def summarise_chunks(chunks: Iterable[tuple[pa.Table, pa.Table]], factor: float = 1.0) -> list[Line]:
-    """As `rows`, of a plan of which a part comes after the other: exposures, and the tasks of these."""
+    """Sum up a plan as in `summarise`, from successive chunks of exposures and their tasks."""
     return _add_totals([line for chunk in chunks for line in summarise(*chunk, factor) if line.survey != _ALL])
 
 
@@ -101,7 +122,7 @@ def _line(row: dict[str, Any], factor: float) -> Line:
 
 
 def format_table(lines: list[Line], speed: Speed) -> Iterator[str]:
-    """The forecast as lines of text; the last says whose core-hours they are."""
+    """Yield the forecast as lines of a text table; the last line names the machine of the core-hours."""
     yield (
         f"{'channel':8} {'survey':12} {'image type':17} {'exposures':>10} {'detectors':>10} {'sources':>14} "
         f"{'core-hours':>11} {'GB':>10} {'peak GB':>8}"
@@ -111,4 +132,4 @@ def format_table(lines: list[Line], speed: Speed) -> Iterator[str]:
             f"{line.channel:8} {line.survey:12} {line.image_type:17} {line.exposures:10,} {line.detectors:10,} "
             f"{line.sources:14,} {line.core_hours:11,.2f} {line.gigabytes:10,.2f} {line.memory_gb:8.2f}"
         )
-    yield f"core-hours are of this machine, {speed.source}: {speed.factor:.2f} of those of the channels' costs"
+    yield f"core-hours are for this machine, {speed.source}: {speed.factor:.2f} of the channels' costs"

@@ -1,7 +1,6 @@
-"""How fast this machine is against that of the channels' costs: the factor of a forecast's seconds.
+"""Estimate the speed of this machine relative to the machine of the channels' costs.
 
-Speed        the factor, and what it was learnt from
-of_machine   from the detectors that the lake holds, else from a calibration of a second, kept in the cache
+The result is a factor on the seconds of a forecast.
 """
 
 from __future__ import annotations
@@ -27,37 +26,50 @@ from truesky.numerics import cache
 from truesky.numerics.code_fingerprints import code_key
 from truesky.render.products import run_log
 
-# CPU s of a pass of `calibration` on the machine of the channels' costs: found on another (AMD EPYC, znver5), which
-# takes 0.13 s for it, and for detectors 0.4 to 0.57 of what they say.
+# CPU seconds of `run_calibration` on the machine of the channels' costs. It was derived on another machine (AMD EPYC,
+# znver5), which takes 0.13 s, and 0.4 to 0.57 of the costs for detectors.
 REFERENCE_S = 0.28
-# Detectors that are enough to learn from: the first of each process compiles and computes what the others find.
+# Lowest number of detectors for an estimate. The first one of each process takes longer: it compiles functions and
+# fills the cache.
 _MIN_DETECTORS = 3
 _REPEATS, _SIDE, _STAMPS, _NUMBERS = 5, 128, 192, 2_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class Speed:
-    """CPU s here over those of the forecast's machine; what it was learnt from, a clause."""
+    """Speed of this machine.
+
+    Attributes
+    ----------
+    factor : float
+        CPU seconds on this machine relative to the machine of the forecast.
+    source : str
+        Origin of the factor, a clause.
+    """
 
     factor: float
     source: str
 
 
 def estimate_speed(lake: Folder) -> Speed:
-    """Of the machine that this process runs on.
+    """Estimate the speed of the machine of this process.
 
-    Error : of the calibration, 30 % of a detector's seconds
+    The factor is the median over the detectors that the lake contains. With too few detectors, it comes from a
+    calibration of one second, which is stored in the cache; its error is 30 % of a detector's seconds.
     """
     ratios = list(_speed_ratios(lake))
     if len(ratios) >= _MIN_DETECTORS:
-        return Speed(float(np.median(ratios)), f"learnt from {len(ratios)} detectors that this lake holds")
+        return Speed(float(np.median(ratios)), f"estimated from {len(ratios)} detectors in this lake")
     key = cache.content_key(code_key(__name__), machine())
     stored = cache.cached_arrays("calibration", key, lambda: {"seconds": run_calibration()})
-    return Speed(float(stored["seconds"].min()) / REFERENCE_S, "from a calibration of a second")
+    return Speed(float(stored["seconds"].min()) / REFERENCE_S, "from a calibration of one second")
 
 
 def run_calibration() -> Float:
-    """CPU s [repeats] of what detectors are made of: transforms of stamps, exponentials, random numbers, a sort."""
+    """Return the CPU seconds of a set of typical operations, per repeat.
+
+    The operations are transforms of stamps, exponentials, random numbers and a sort.
+    """
     rng = np.random.default_rng(1)
     waves = (rng.normal(size=(_STAMPS, _SIDE, _SIDE // 2 + 1)) + 0j).astype(np.complex64)
     light, seconds = rng.uniform(0.0, 100.0, _NUMBERS), np.empty(_REPEATS)
@@ -71,14 +83,14 @@ def run_calibration() -> Float:
 
 
 def _speed_ratios(lake: Folder) -> Iterator[float]:
-    """CPU s over the forecast's of every detector of the current products that a machine of this kind rendered."""
+    """Yield the CPU time relative to the forecast, for each current detector that this kind of machine rendered."""
     try:
         version = read.latest_version(lake, "products")
         facts_of_task = {task["name"]: task["facts"] for task in version.manifest["parts"]}
         exposure_ids = {facts["exposure_id"] for facts in facts_of_task.values()}
         planned = read.version(lake, "tasks", version.manifest["facts"]["inputs"]["tasks"])
         rendered = pc.field("exposure_id").isin(pa.array([*exposure_ids], pa.int64()))
-        # A part after the other: a plan may be larger than memory.
+        # Read one partition after the other, because a plan may be larger than memory.
         task_tables = (
             planned.rows(("exposure_id", "detector", "seconds"), [partition], rendered)
             for partition in planned.partitions
@@ -103,7 +115,7 @@ def _speed_ratios(lake: Folder) -> Iterator[float]:
 
 
 def _log_lines(lake: Folder, key: str) -> Iterator[dict[str, Any]]:
-    """What was written of the parts of a version of `products`; a log that cannot be read teaches nothing."""
+    """Yield the log lines for tasks of a version of `products`. Logs that cannot be read are skipped."""
     for path in run_log.logs_of_products(lake):
         with contextlib.suppress(LakeError, OSError):
             first, *task_lines = run_log.lines(path) or [{}]

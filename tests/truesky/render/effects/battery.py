@@ -1,4 +1,4 @@
-"""Every effect, as it acts on a small frame, as it does nothing, and what it promises."""
+"""Calls of every effect on a small frame, with parameters that act and that do nothing, and the properties to test."""
 
 from dataclasses import dataclass
 
@@ -31,16 +31,31 @@ PAIRS = np.full((4, 4), 1e-4) - 1e-4 * np.eye(4)
 
 @dataclass(frozen=True)
 class Case:
-    """How an effect is called.
+    """Call of an effect.
 
-    name      : of the effect, and after a colon what this case of it is
-    on, off   : apply(frame, *on, rng=) acts; apply(frame, *off, rng=) does nothing (None: it cannot)
-    planes    : [4, ny, nx] is what it wants, not [ny, nx]
-    reshapes  : what it returns has another shape;  dtype : and what type
-    linear    : apply(a x) = a apply(x)
-    zero      : nothing comes of nothing
-    conserves : the sum stays
-    whole     : whole electrons stay whole
+    Attributes
+    ----------
+    name : str
+        Name of the effect, and a label of the case after a colon.
+    on, off : tuple or callable
+        Parameters with which the effect acts, and with which it does nothing (None if it always acts). A callable gets
+        the shape of the frame.
+    planes : bool
+        True if frames have the shape (4, ny, nx) instead of (ny, nx).
+    linear : bool
+        True if apply(a x) = a apply(x).
+    zero : bool
+        True if a frame of zeros remains zero.
+    conserves : bool
+        True if the sum is conserved.
+    whole : bool
+        True if whole electrons stay whole.
+    positive : bool
+        True if the result is not negative.
+    reshapes : bool
+        True if the result has another shape.
+    dtype : type
+        Type of the result.
     """
 
     name: str
@@ -201,9 +216,9 @@ _CASES = (
     Case("signal_adc", (1.92, 1024.0, 65535.0), None, planes=True, zero=False, reshapes=True),
 )
 CASES = {case.name: case for case in _CASES}
-# What cuts frames into parts.
+# Effects that split frames.
 CUT = ("quadrants", "amplifiers")
-# The sides of frames that a case can be asked for: quadrants want even ones.
+# Shapes of frames. Quadrants require even sides.
 SHAPES = ((4, 6), (1, 1), (1, 9), (9, 1), (12, 10))
 
 
@@ -218,7 +233,7 @@ def shapes_of(name):
 
 
 def frame_of(case, shape, values):
-    """values [4 * ny * nx] -> a frame as the case wants it."""
+    """Return a frame with the shape of the case, from values of shape (4 * ny * nx,)."""
     ny, nx = shape
     values = np.asarray(values, float)
     return values[: 4 * ny * nx].reshape(4, ny, nx) if case.planes else values[: ny * nx].reshape(ny, nx)

@@ -1,4 +1,4 @@
-"""What every effect owes: off it does nothing, it writes no argument, loses no number, and keeps its promises."""
+"""Every effect does nothing when off, does not change its arguments, keeps numbers finite, and has its properties."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def electrons(seed, empty, decades):
     return np.floor(10 ** (decades * rng.random(MOST))) * (rng.random(MOST) >= empty)
 
 
-# Drawn by numpy: hypothesis takes a second for a frame of its own.
+# Frames are drawn by numpy because hypothesis takes a second to draw one.
 ELECTRONS = st.builds(
     electrons, st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.5, 0.95]), st.sampled_from([0.5, 2.5, 8.0])
 )

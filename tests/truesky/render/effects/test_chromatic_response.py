@@ -43,7 +43,7 @@ def drawn_maps(shape=(400, 300), slope=SLOPE, curvature=CURVATURE, seed=3):
 def test_maps_have_the_mission_s_rms():
     found = drawn_maps((1020, 1020))
     assert found.std(axis=(1, 2)) == pytest.approx([SLOPE, CURVATURE], rel=0.2)
-    # Half of the variance is smooth: that of means over 20 x 20 pixels.
+    # Half of the variance is smooth: it is the variance of means over 20 x 20 pixels.
     smooth = found.reshape(2, 51, 20, 51, 20).mean(axis=(2, 4))
     assert smooth.var(axis=(1, 2)) == pytest.approx(0.5 * np.array([SLOPE, CURVATURE]) ** 2, rel=0.5)
     assert np.corrcoef(found[0].ravel(), found[1].ravel())[0, 1] == pytest.approx(0.0, abs=0.25)
@@ -66,7 +66,7 @@ def test_there_are_forty_wavelengths_over_the_range():
 
 @given(st.lists(st.floats(0.01, 1.0), min_size=N_SUB_BANDS, max_size=N_SUB_BANDS))
 def test_colours_are_means_of_the_components(weights):
-    """And flat f_nu is where they are told from."""
+    """Colours are relative to flat f_nu."""
     shares = np.array([weights]) / np.sum(weights)
     own = chromatic_response.source_colours(shares, TABLE)
     assert np.abs(own).max() <= np.abs(TABLE).max()
@@ -111,7 +111,7 @@ def field():
 
 
 def slowly(some, response, draw):
-    """Every part of the band drawn by itself, times what pixels see of it."""
+    """Draw every sub-band separately, and multiply it by the response of the pixels."""
     each = 0.0
     for part in range(N_SUB_BANDS):
         alone = np.zeros((len(some), N_SUB_BANDS))
@@ -132,7 +132,7 @@ def test_three_drawings_are_one_for_each_wavelength(field):
     # Told from what all light of the band meets.
     change = np.abs(each - light * (1.0 + response[0] * EVEN[0] + response[1] * EVEN[1]))
     np.testing.assert_allclose(found, each, atol=1e-3 * change.max())
-    # The colours of whole sources are not all of it: blue light is in the middle of the PSF.
+    # The colours of whole sources are not sufficient, because blue light is concentrated in the core of the PSF.
     own = chromatic_response.source_colours(some.photons, TABLE)
     whole = sum(response[k] * (draw(some.electrons * (own[:, k] + 1.0)) + (EVEN[k] - 1.0) * light) for k in (0, 1))
     assert np.abs(light + whole - each).max() > 0.02 * change.max()
@@ -154,7 +154,7 @@ def test_ordinary_sources_do_not_need_it():
 # ------------------------------------------------------------------------------------------------ in an exposure
 
 
-def test_an_exposure_draws_again_what_is_noticed():
+def test_an_exposure_draws_noticeable_colours_again():
     """A few of its sources, on small stamps; pixel by pixel within a tenth of the noise of all of them drawn slowly."""
     side = 256
     small_one = fields.small("nisp", "DET22", side)
@@ -187,7 +187,7 @@ def test_an_exposure_draws_again_what_is_noticed():
     assert np.abs(change / noise).max() > 0.8
     assert wrong < NOTICEABLE
     assert np.abs(fast - change).max() < 0.03 * np.abs(change).max()
-    # The most that is told is about the most that there is, of maps with 5 sigma.
+    # The predicted largest change is close to the actual one, for maps with 5 sigma.
     assert found.chromatic_electrons < 5 * np.abs(change).max() < 25 * found.chromatic_electrons
     assert (
         chromatic_response_map.with_chromatic_light(
@@ -198,7 +198,7 @@ def test_an_exposure_draws_again_what_is_noticed():
 
 
 def test_a_flat_has_the_colour_of_its_lamp():
-    """An LED at the band's edge: its frame without noise is another than of pixels that see all colours alike."""
+    """With an LED at the band's edge, the response of pixels to its colour changes the noise-free frame."""
     quiet = dict.fromkeys(
         ("ramp_cosmic_rays", "drift", "group_noise", "dark_map", "pixel_response", "ramp_nonlinearity", "ipc"), False
     )
@@ -215,7 +215,7 @@ def test_a_flat_has_the_colour_of_its_lamp():
     own = own + EVEN
     expected = own[0] * maps[0] + own[1] * maps[1]
     change = after / before - 1.0
-    # Noise is drawn anew where the light differs, by half a part in a hundred of itself; and rounding.
+    # The noise differs by half a per cent of itself if the light differs, and values are rounded.
     assert np.corrcoef(change.ravel(), expected.ravel())[0, 1] > 0.95
     assert (change * expected).sum() / (expected**2).sum() == pytest.approx(1.0, abs=0.05)
     assert {d.name: d.applied for d in infrared.rendered(kind="flat", lamp=2, band="euclid_y", sky=0.0).decisions}[
@@ -227,7 +227,7 @@ def test_a_flat_has_the_colour_of_its_lamp():
 
 
 BRIGHT = {"nisp.flat.signal": (9e4, "electron")}
-# What hides the response of pixels.
+# Effects that would hide the response of pixels.
 NOISY = dict.fromkeys(
     ("ramp_cosmic_rays", "drift", "group_noise", "dark_map", "output_gain", "ramp_nonlinearity", "ipc"), False
 )
@@ -268,7 +268,7 @@ def test_flats_of_two_bands_differ_by_the_response_to_their_light():
 
 
 def test_a_flat_of_the_band_flattens_the_sky():
-    """What pixels make of the sky's light and of a lamp's is the same but for the colours of the two."""
+    """The response to the sky and to a lamp is the same except for the difference of their colours."""
     strong = resolve(overrides={"nisp.response.slope": (0.1, "")})
     level = 9e4 / infrared.TIME
     sky = infrared.electrons(infrared.rendered(sky=level, band="euclid_y", mission=strong, forced=NOISY))
@@ -315,7 +315,7 @@ def test_pixels_that_see_nothing_are_dark():
 
 
 def test_the_sky_has_the_colour_of_its_light():
-    """Of the Sun, bluer than flat f_nu in H; of a warm telescope redder."""
+    """Sunlight is bluer than flat f_nu in H; light of a warm telescope is redder."""
     h = passbands.load("euclid_h")
     warm = resolve(overrides={"nisp.thermal.telescope_temperature": (170.0, "K")})
     for band, mission, red in ((h, MISSION, False), (h, warm, True)):

@@ -15,7 +15,7 @@ from truesky.request import schema
 
 SCENE = Scene(resolve(), "vis", 560.0, 0.25, 1e4)
 NAMES = ["background", "poisson", "dark_current", "bleeding", "read_noise", "adc"]
-# Of a detector that is read as one frame.
+# Effects of a detector that is read as one frame.
 SOME = tuple(effect for effect in ground.SKY if effect.name in NAMES)
 
 
@@ -24,7 +24,7 @@ def run(effects, frame, scene=SCENE, forced=None, seed=1):
     return apply_all(frame, effects, scene, lambda effect: stream(seed, 7, "3-4", effect.name))
 
 
-# What each chain names comes in this order, where a channel has it.
+# The effects of each chain have this order in every channel that has them.
 ORDER = (
     # Light falls on pixels, is counted once, and is charge from then on.
     (
@@ -93,7 +93,7 @@ def test_every_effect_has_its_place():
 
 
 def test_a_request_may_name_every_effect():
-    """Of every channel, those that act while sources are drawn among them; and no other."""
+    """Effects of every channel may be named, also those that act while sources are drawn; other names may not."""
     channels = registry.CHANNELS.values()
     found = [effect for channel in channels for effects in channel.effects.values() for effect in effects]
     found += [channel.transfer_effect for channel in channels if channel.transfer_effect is not None]
@@ -155,14 +155,14 @@ def test_a_contribution_is_computed_once_for_a_decision():
         assert decision.applied
 
 
-def test_strange_or_impossible_wishes_are_refused():
+def test_unknown_effects_and_effects_that_cannot_be_off_are_refused():
     # Of another channel.
     assert len(decide(SOME, replace(SCENE, forced={"ghosts": True}))) == len(SOME)
     with pytest.raises(BadInput, match="adc"):
         decide(SOME, replace(SCENE, forced={"adc": False}))
 
 
-def test_without_noise_all_is_noticed():
+def test_without_noise_every_change_is_noticeable():
     """A bias of an amplifier without noise."""
     silent = resolve(overrides={"vis.read_noise": (0.0, "electron")})
     bias = Scene(silent, "vis", 0.0, 0.0, 0.0)
@@ -175,7 +175,7 @@ def test_without_noise_all_is_noticed():
 def test_margins_tell_the_ratio():
     (dark,) = (e for e in ground.SKY if e.name == "dark_current")
     d = SCENE.dark_electrons
-    # Of a mean of 1024 frames, which keeps the mean and little of the noise.
+    # The margin is for a mean of 1024 frames, which keeps the mean and reduces the noise.
     assert dark.margin(SCENE) == pytest.approx(32.0 * d / (0.1 * SCENE.pixel_noise))
     (counted,) = (e for e in ground.SKY if e.name == "poisson")
     counts = np.sqrt(SCENE.peak_electrons + SCENE.sky_electrons)

@@ -163,7 +163,7 @@ def test_columns_take_the_same_charge_in_every_exposure():
 
 @pytest.mark.parametrize("electrons", [0.0, 1e-3, 0.31, 1.999, 2.0, 9.0])
 def test_few_dark_electrons_are_counted_as_many_are(electrons):
-    """In runs of pixels: what each counts by itself."""
+    """Few electrons are drawn for blocks of pixels, with the same counts as for single pixels."""
     counts = dark_current.apply(np.full((37, 41), 5.0), electrons, np.random.default_rng(7))
     np.testing.assert_array_equal(counts - 5.0, poisson.apply(np.full((37, 41), electrons), np.random.default_rng(7)))
 
@@ -183,7 +183,7 @@ def test_dark_current_follows_the_detector_s_temperature():
 
 
 def test_hot_pixels_freeze_with_the_dark_current():
-    """They are as thermal: at each temperature the same part of what they have at the reference."""
+    """They are thermal: their electrons scale with temperature as the dark current does."""
     reference, warmer = (
         Scene(resolve(overrides={"vis.detector_temperature": (kelvin, "K")}), "vis", 560.0, 0.25, 0.0)
         for kelvin in (SCENE.mission.value("vis.dark_reference_temperature", "K"), 170.0)

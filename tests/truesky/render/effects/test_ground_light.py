@@ -34,7 +34,7 @@ def added(seed=1, side=1024, amplitude=0.01, period=60.0, electrons=1e4):
 
 
 def test_fringes_are_of_the_sky_alone():
-    """What they add depends neither on the sources nor on anything but the sky's light."""
+    """They depend only on the light of the sky, not on the sources."""
     stars_ = 1e5 * np.random.default_rng(2).random((1024, 1024))
     once = fringes.apply(stars_, 1e4, 0.01, 60.0, np.random.default_rng(1)) - stars_
     np.testing.assert_allclose(once, added(), atol=1e-9)
@@ -78,7 +78,7 @@ def test_a_trail_has_all_its_light(blur):
     profile = satellite_trails.profile(blur)
     whole = (2.0 * profile[1:].sum() + profile[0]) / 8.0
     assert whole == pytest.approx(1.0, abs=2e-3)
-    # Of a ring out of focus the middle is darker than its sides.
+    # A ring out of focus is darker in the middle than at its sides.
     assert (profile.argmax() > 0) == (blur.outer > blur.seeing)
 
 
@@ -91,7 +91,7 @@ def line(name, seed=3, camera="lsstcam", mission=CROSSED):
 
 
 def places(image, system):
-    """Right ascension and declination of what is brightest in rows apart from each other."""
+    """Return right ascension and declination of the brightest pixels in widely separated rows."""
     rows = np.arange(50, image.shape[0] - 50, 200)
     columns = image[rows].argmax(axis=1)
     # Not where a trail has left the detector.
@@ -107,7 +107,7 @@ def test_a_trail_goes_on_in_the_next_detector():
     ra, dec = np.radians(np.hstack(seen))
     there = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
     assert len(there) > 10
-    # The plane through the observer that is nearest to all of them.
+    # Distances from the plane through the observer that fits all points best.
     off = there @ np.linalg.svd(there)[2][-1]
     assert np.degrees(np.abs(off).max()) * 3600.0 < 2.0 * 0.2
 
@@ -125,11 +125,11 @@ def test_a_trail_is_as_bright_as_the_satellite():
     table = some.electrons * satellite_trails.profile(blur)
     satellite_trails._add_trail(flat, np.array([-10.0, 500.0]), np.array([150.0, 250.0]), table)
     slope = 100.0 / 510.0
-    # Of each column what a line has that runs as obliquely.
+    # Light per column of a line with this slope.
     assert flat[:, 200].sum() == pytest.approx(wanted * np.sqrt(1.0 + slope**2), rel=2e-3)
 
 
-def test_nobody_has_satellites_who_has_not_asked_for_them():
+def test_there_are_no_satellites_by_default():
     one = scene()
     assert satellite_trails.EFFECT.contribution(one) == 0.0
     assert not satellite_trails.EFFECT.is_needed(one)

@@ -1,4 +1,4 @@
-"""What the optics add and take: ghosts, straylight, illumination, shutter, lamp, the pixel's own response."""
+"""Effects of the optics: ghosts, stray light, illumination, shutter, lamp, and the response of pixels."""
 
 from dataclasses import replace
 
@@ -117,7 +117,7 @@ def test_the_offset_is_the_focal_plane_s(name):
     np.testing.assert_allclose(to_plane @ offset, (0.0, 750.0), atol=1e-9)
 
 
-def test_what_no_ghost_shows_is_left_out():
+def test_stars_without_a_noticeable_ghost_are_left_out():
     """On either side of the threshold the ghost, as a whole, is 0.1 of the noise under it."""
     noise = scene().pixel_noise
     edge = NOTICEABLE * noise * np.sqrt(np.pi) * 56 / 1e-6
@@ -141,7 +141,7 @@ def infrared(lights):
 
 @pytest.mark.parametrize(("effect", "radius", "offset"), [(ghosts.EFFECT, 19.0, 250.0), (ghosts.FILTER, 30.0, -60.0)])
 def test_ghosts_of_plates_before_the_infrared_detectors(effect, radius, offset):
-    """Of a star of 10 mag in Y some five times the noise, of one of 14 mag nothing."""
+    """The ghost of a star of 10 mag in Y is some five times the noise; a star of 14 mag has none."""
     for magnitude, shown in ((MISSION.value("nisp.ghost.star_limit", "mag"), True), (14.5, False)):
         star = light(150, 130, 10 ** (0.4 * (25.0 - magnitude)) * 87.24)
         for one in infrared(star):
@@ -235,7 +235,7 @@ def test_a_pixel_of_a_ground_camera_too(camera):
     area = np.abs(np.linalg.det(astrometry.jacobian(system, column, row))) / d.pixel_scale**2
     found = np.diag(pixel_area.area_change(u[column], v[row], stretch))
     np.testing.assert_allclose(found, area - 1.0, atol=1e-4)
-    # It is what the sky lacks there.
+    # Pixels near the corner receive less light of the sky.
     assert found.max() < -2e-3
     assert pixel_area.EFFECT.is_needed(one)
 
@@ -328,7 +328,7 @@ def test_a_map_of_other_size_is_refused():
 
 
 def halves(ny):
-    """Of columns with a register at both ends."""
+    """Return the segments of columns with a register at both ends."""
     return (0, ny // 2, False), (ny // 2, ny, True)
 
 
@@ -365,13 +365,13 @@ def test_the_response_of_pixels():
 
 
 def test_dust_casts_shadows():
-    """As many as stated, each as deep and, in the mean, as wide."""
+    """Shadows have the stated number, depth and mean width."""
     grains, radius, depth = 2e-4, 2.0, 0.3
     dust = (grains, radius, depth)
     dusty = pixel_response.response((1000, 900), 0.0, 0.0, 0.0, dust, halves(1000), np.random.default_rng(4))
     # Two may lie on each other.
     assert (1 - depth) ** 2 * 0.99 < dusty.min() < 1 - 0.95 * depth
-    # Light that is missing: of a Gaussian 2 pi size^2, whose mean is twice the square of the mean size.
+    # A Gaussian shadow lacks 2 pi size^2 of the light; the mean of size^2 is twice the square of the mean size.
     missing = grains * dusty.size * depth * 2 * np.pi * 2 * radius**2
     assert (1 - dusty).sum() == pytest.approx(missing, rel=0.25)
     # The other defects are where they are without.
@@ -445,7 +445,7 @@ def test_open_shutter_draws_a_trail():
     assert (out[14:, 2] == 0).all()
     share, halves, response = readout_trail.EFFECT.parameters(scene())
     assert share == pytest.approx(72 / 2086 / 560.53)
-    # What traps see of a row: the time that it stays.
+    # Compare with the dwell time of traps: the time that a row stays in a pixel.
     assert share * 560.53 == pytest.approx(scene().value("cti.dwell_time", "s"), rel=0.03)
     assert halves == 2
     assert response == pixel_response.EFFECT.parameters(scene())
@@ -456,7 +456,7 @@ def test_open_shutter_draws_a_trail():
 
 
 def test_light_of_a_trail_is_seen_by_the_pixels_that_it_falls_on():
-    """Row by row: each has seen its own light, and on its way the light of those before it, each by its own pixel."""
+    """Each row collects its light, and then light of the rows that it passes, with the response of their pixels."""
     # Old pixels, some dead.
     worn = resolve(overrides={"vis.prnu": (0.2, ""), "vis.dead_pixels": (0.05, "")})
     ny, nx = 40, 30
@@ -478,6 +478,6 @@ def test_light_of_a_trail_is_seen_by_the_pixels_that_it_falls_on():
         passed = range(r) if r < ny // 2 else range(r + 1, ny)
         expected[r] += sum((share * frame[p] * seen[p] for p in passed), np.zeros(nx)) * (seen[r] > 0)
     np.testing.assert_allclose(found, expected, rtol=1e-12)
-    # Without a response all are alike, whatever the numbers.
+    # Without a response all pixels are equal, whatever the random numbers.
     alike, _ = apply_all(frame, both, replace(one, forced={"readout_trail": True, "pixel_response": False}), stream)
     np.testing.assert_array_equal(alike, readout_trail.apply(frame, share, 2))

@@ -1,4 +1,4 @@
-"""Random numbers per pixel: the laws that they promise, to their tails; and that each pixel's are its own."""
+"""Random numbers per pixel: their distributions up to the tails, and the independence of pixels."""
 
 from pathlib import Path
 
@@ -12,10 +12,10 @@ from truesky.randomness import rng
 from truesky.render.effects import pixel_random
 from truesky.render.effects.readout import read_noise
 
-# Pixels: a correlation of 4.4e-3 is found at a significance of 7e-6, by night one of half as much.
+# Numbers of pixels: a correlation of 4.4e-3 is found at a significance of 7e-6; by the nightly test, one of 2.2e-3.
 COUNTS = [pytest.param(1 << 20, id="short"), pytest.param(1 << 22, id="long", marks=pytest.mark.nightly)]
 KEY = pixel_random.draw_key(np.random.default_rng(5))
-# One in a thousand good generators would be refused.
+# Lowest p-value: one in a thousand good generators would be refused.
 LEAST = 1e-3
 
 
@@ -33,7 +33,7 @@ def rolled(key, pixels, again):
 
 @jit
 def far_out(key, count, least):
-    """Those of many normal deviates that are this far from 0."""
+    """Return the normal deviates whose absolute value exceeds `least`."""
     found, n = np.empty(count // 1000), 0
     for i in range(count):
         deviate = pixel_random.normal(pixel_random.pixel_bits(key, i))
@@ -57,7 +57,7 @@ def test_words_are_those_of_splitmix():
     ]  # fmt: skip
 
 
-def test_machine_code_is_made_anew_when_the_mixer_changes(tmp_path):
+def test_code_is_compiled_again_if_the_mixer_changes(tmp_path):
     """It stands in a file that compiles nothing itself."""
     copy = tmp_path / "rng.py"
     copy.write_text(Path(rng.__file__).read_text())

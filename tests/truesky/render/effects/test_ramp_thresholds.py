@@ -14,7 +14,7 @@ from truesky.render.effects.effect import apply_all
 from truesky.render.effects.scene import NOTICEABLE, STACK_SIZE, Scene
 
 MISSION, N = resolve(), 128
-# What has another value in every frame.
+# Effects with different values in every frame.
 RANDOM = ("group_noise", "drift")
 
 
@@ -57,7 +57,7 @@ def signal(one, name, applied):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_what_is_left_out_is_not_noticed(name):
+def test_effects_that_are_left_out_are_not_noticeable(name):
     effect, needed = EFFECTS[name], []
     for size in np.geomspace(1e-5, 1e4, 10):
         one = CASES[name](size)
@@ -67,7 +67,7 @@ def test_what_is_left_out_is_not_noticed(name):
         change = signal(one, name, True) - signal(one, name, False)
         assert np.sqrt(np.mean(change**2)) < NOTICEABLE * one.pixel_noise
         assert np.abs(change).max() < one.pixel_noise
-        # A mean of so many frames or pixels is not biased by a tenth of the noise that it has left.
+        # The bias of a mean of STACK_SIZE frames or pixels is less than a tenth of its noise.
         chance = 5.0 * change.std() / N if name in RANDOM else 0.0
         assert abs(change.mean()) < NOTICEABLE * one.pixel_noise / np.sqrt(STACK_SIZE) + chance
     assert sorted(needed) == needed
@@ -90,7 +90,7 @@ def test_hot_pixels_and_hits_are_read_as_any_light(name):
 
 
 @pytest.mark.parametrize("name", ALWAYS)
-def test_what_is_always_there(name):
+def test_effects_that_are_always_applied(name):
     assert EFFECTS[name].is_needed(scene(sky=0.0, peak=0.0))
 
 

@@ -36,14 +36,14 @@ def scene(sky=0.25, peak=1e4, lights=None, **values):
 
 
 def ground(sky=10.0, peak=1e4, **values):
-    """A detector of DECam, likewise."""
+    """Return the scene of a DECam detector."""
     keys = {f"ext.decam.{key.replace('__', '.')}": value for key, value in values.items()}
     mission = resolve(overrides={key: (value, MISSION.parameter(key).unit) for key, value in keys.items()})
     return Scene(mission, "ext.decam", 90.0, sky, peak, detectors.detector("decam", "S29", MISSION))
 
 
 def crossed():
-    """The same, of a field with ten trails."""
+    """Return the scene of a DECam detector in a field with ten satellite trails."""
     rate = {"survey.satellites.rate": (0.05, "1 / (deg s)")}
     return replace(ground(), mission=MISSION.with_overrides(rate), seeing=0.9)
 
@@ -90,7 +90,7 @@ CASES = {
     "ghosts": lambda x: scene(lights=star(1e8 * x)),
     "straylight": lambda x: scene(lights=star(1e9 * x)),
 }
-# What has another value in every frame; and dark current, which has a mean, too.
+# Effects with different values in every frame. Dark current also has a mean.
 RANDOM = ("poisson", "read_noise", "injection_noise", "dark_current")
 QUADRANTS = (
     "parallel_cti",
@@ -105,7 +105,7 @@ QUADRANTS = (
 
 
 def frame(name, one):
-    """Sky and a star of the scene's peak, as the effect wants it."""
+    """Return a frame for the effect, with sky and a star of the scene's peak."""
     y, x = np.mgrid[:NY, :NX]
     light = one.sky_electrons + one.peak_electrons * np.exp(-((x - 4) ** 2 + (y - 2000) ** 2) / (2 * 0.7**2))
     if name == "crosstalk":
@@ -127,7 +127,7 @@ def test_no_effect_is_left_out_here():
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_what_is_left_out_is_not_noticed(name):
+def test_effects_that_are_left_out_are_not_noticeable(name):
     """Sample of eight columns; for random effects, a significance of 6e-7 of their mean (5 standard errors)."""
     effect = EFFECTS[name]
     needed = []
@@ -147,7 +147,7 @@ def test_what_is_left_out_is_not_noticed(name):
         change = effect.apply(before, *parameters, rng=np.random.default_rng(1)) - before
         assert np.sqrt(np.mean(change**2)) < NOTICEABLE * one.pixel_noise
         assert np.abs(change).max() < one.pixel_noise
-        # A mean of so many frames or pixels is not biased by a tenth of the noise that it has left.
+        # The bias of a mean of STACK_SIZE frames or pixels is less than a tenth of its noise.
         left = NOTICEABLE * one.pixel_noise / np.sqrt(STACK_SIZE)
         chance = 5.0 * change.std() / np.sqrt(change.size) if name in RANDOM else 0.0
         assert abs(change.mean()) < left + chance
@@ -186,7 +186,7 @@ def test_a_pixel_s_own_response_is_left_out_of_faint_stars():
 
 
 @pytest.mark.parametrize("mag", [pytest.param(14.0, marks=pytest.mark.nightly), 20.0, 24.0, 27.0])
-def test_all_that_a_scene_does_without_is_not_noticed_together(mag):
+def test_all_effects_that_are_left_out_are_not_noticeable_together(mag):
     """Stars so faint that little is needed, or so bright that next to everything is.
 
     Sample of 256 x 256 pixels; significance 6e-7 of the mean (5 standard errors).

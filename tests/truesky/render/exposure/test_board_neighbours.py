@@ -74,7 +74,7 @@ def test_the_coefficient_is_recovered(camera):
     mission, places, light = stronger(camera), [(60.3, 40.8), (200.0, 180.0)], [3e6, 4e6]
     other = beside(camera, places, light)
     one, empty = (rendered(camera, some, mission) for some in ((other,), ()))
-    # The other detector by itself.
+    # Render the other detector alone.
     ra, dec = (other.stars[axis].to_numpy() for axis in ("ra", "dec"))
     none, band = galaxies([], []), PAIRS[camera][2]
     own = fields.rendered(
@@ -116,7 +116,7 @@ def test_faint_stars_are_not_drawn():
     [
         ("decam", 10.0, {}, True),
         ("decam", 10.0, {"detector_crosstalk": False}, False),
-        # A full pixel is lost in the noise of so bright a sky.
+        # With this bright sky, the crosstalk of a full pixel is below the noise.
         ("decam", 1e5, {}, False),
         ("decam", 1e5, {"detector_crosstalk": True}, True),
         ("vis", 0.2, {}, True),
@@ -126,7 +126,7 @@ def test_catalogues_are_read_only_where_a_full_pixel_would_be_noticed(camera, sk
     aim = Aim.from_exposure(fields.exposure(**exposed(camera, sky)), small(camera, PAIRS[camera][0], SIDE))
     variant = Variant(MISSION, SURVEY, forced)
     assert board_neighbours.is_noticeable(aim, variant) is shows
-    # Else no table is looked at.
+    # Otherwise no table is read.
     assert shows or board_neighbours.bright_stars({}, aim, variant) == ()
 
 
@@ -146,7 +146,7 @@ def test_boards_are_where_they_are():
 
 
 def test_a_product_is_of_the_stars_on_its_board():
-    """A file that changes two detectors away: of stars, not of galaxies."""
+    """Change a file two detectors away: the product depends on files of stars, not of galaxies."""
     exposed = fields.exposure(exposure_id=1, camera="lsstcam", channel="EXT", band="lsst_u", psf="")
     own, other = (detectors.detector("lsstcam", name, MISSION) for name in ("R22_S10", "R22_S12"))
     task = {**board_neighbours.detector_circle(exposed, own), "exposure_id": 1, "detector": own.name, "cells": 1}

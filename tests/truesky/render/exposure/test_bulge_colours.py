@@ -19,7 +19,7 @@ from truesky.request.accuracy import SURVEY
 
 SIDE, ELECTRONS = 160, 1e6
 BANDS = ("euclid_vis", "euclid_y", "euclid_h")
-# What the renderer reads of a spectrum: between Scd and Im, without dust, at z = 0.15.
+# Columns that the renderer reads for a spectrum: between Scd and Im, without dust, at z = 0.15.
 SPECTRUM = {"kind": 0, "z_obs": 0.15, "sed_1": 14, "sed_2": 15, "frac_1": 0.5, "frac_2": 0.5}
 
 

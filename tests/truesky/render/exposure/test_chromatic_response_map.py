@@ -1,4 +1,4 @@
-"""Spectra as pixels see them, each column in its own colour: held against every part of the band drawn by itself."""
+"""Spectra with a different response to the colour of each column, compared with drawings of every part of the band."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ MISSION = resolve(
         "nisp.response.curvature": (CURVATURE, ""),
     }
 )
-# Stars with a first order on the strip, one of a zeroth, and those that nobody notices.
+# Stars with a first order on the strip, one with a zeroth order, and stars that are not noticeable.
 MAGS = np.array([15.0, 17.0, 19.0, 15.0, 23.0, 24.0])
 X, Y = np.array([-120.0, 40.0, -60.0, 900.0, 20.0, -30.0]), np.array([30.0, 60.0, 75.0, 48.0, 20.0, 85.0])
 
@@ -43,9 +43,9 @@ def lit(mags=MAGS, x=X, y=Y, mission=MISSION):
 
 
 def slowly(scene, aim, light, step=300.0):
-    """[2, ny, nx] Light times f1, and f2: a part of the band after the other, far into the wings of all sources.
+    """Draw the light times f1 and f2, shape (2, ny, nx), part by part of the band, far into the wings of all sources.
 
-    Of a part the weight rises from one wavelength to the next, and falls again: between them f is a line.
+    The weight of a part rises from one wavelength to the next and falls again, so that f is linear between them.
     """
     orders, shape = light.dispersed.orders, (STRIP.ny, STRIP.nx)
     wavelength = orders[0].wavelength
@@ -71,7 +71,7 @@ def test_pixels_see_the_colour_of_every_column():
     assert np.abs(slow / noise).max() > 1.0
     assert np.abs((fast - slow) / noise).max() < NOTICEABLE
     assert np.abs(fast - slow).max() < 0.03 * np.abs(slow).max()
-    # The most that is told is about the most that there is, of maps with 5 sigma.
+    # The predicted largest change is close to the actual one, for maps with 5 sigma.
     assert found.chromatic_electrons < 5 * np.abs(slow).max() < 25 * found.chromatic_electrons
 
 

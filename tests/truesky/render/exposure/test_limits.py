@@ -15,7 +15,7 @@ from truesky.render.planning import detector_costs
 
 
 def refused(camera, count, monkeypatch):
-    """Whether so many sources on a detector, one of them as large as any, are too many."""
+    """Return True if this number of sources, one of them with the largest stamp, is too large for a detector."""
     monkeypatch.setattr(cost, "seconds", lambda *scene: 0.0)
     detector, rng = detectors.detectors(camera, resolve())[0], np.random.default_rng(1)
     sizes = np.full(count, 64)

@@ -1,4 +1,4 @@
-"""What earlier exposures leave: which of them, how much, and the same in whatever order exposures are rendered."""
+"""Persistence: which earlier exposures count, and how much charge they leave, in any order of rendering."""
 
 from dataclasses import replace
 
@@ -23,13 +23,13 @@ SECOND = 1.0 / 86400.0
 EXPLORED = '{"nisp.gain": [1.0, "electron / adu"]}'
 # Without bodies that move.
 STRIP = spectroscopic.strip()
-# In which all pixels are alike, but for the number of their traps.
+# Missions in which pixels differ only in the number of their traps.
 ALIKE = dict.fromkeys((f"nisp.persistence.{name}_spread" for name in ("p2", "time_power")), (0.0, ""))
 EVEN, QUIET = MISSION.with_overrides(ALIKE), spectroscopic.MISSION.with_overrides(ALIKE)
 
 
 def earlier(before, mags, x, y, **columns):
-    """An exposure so many seconds before, with its stars."""
+    """Return an exposure `before` seconds earlier, with its stars."""
     row = infrared.exposed(DETECTOR, mjd=infrared.MJD - before * SECOND, number=9, **columns)
     return PreviousExposure(
         Aim.from_exposure(fields.exposure(**row), DETECTOR), Rows(*infrared.tables(DETECTOR, row, mags, x, y))
@@ -52,17 +52,17 @@ def test_the_formula():
     assert TRAPS.released_charge(np.array([1e9]), 100.0, 87.24) == TRAPS.released_charge(
         np.array([1.3e5]), 100.0, 87.24
     )
-    # Twice as long: not twice as much, since it fades meanwhile.
+    # Twice the time gives less than twice the charge, because the release slows down.
     longer = (274.48**0.1 - 100**0.1) / (187.24**0.1 - 100**0.1)
     assert 1.6 < longer < 1.7
     assert TRAPS.released_charge(np.array([8e4]), 100.0, 2 * 87.24) == pytest.approx(longer * 235.6, rel=0.01)
-    # What is held for longer fills more traps.
+    # Charge that is held for longer fills more traps.
     assert TRAPS.released_charge(np.array([8e4]), 100.0, 87.24, 10 * 87.24) == pytest.approx(10**0.2 * 235.6, rel=0.01)
     with pytest.raises(OutOfRange, match="delay"):
         TRAPS.released_charge(np.array([1.0]), 0.0, 87.24)
 
 
-def test_nothing_is_left_by_nothing():
+def test_zero_charge_leaves_no_persistence():
     assert left() is None
 
 
@@ -83,8 +83,8 @@ def test_no_pixel_held_more_than_its_full_well(mag):
     assert left(earlier(3600.0, [mag], [40.0], [50.0])).max() == pytest.approx(least, rel=1e-6)
 
 
-def test_faint_sources_leave_nothing_that_is_missed():
-    """All sources drawn as in an image of their own, against the bright ones alone: 1.5 e- in any pixel."""
+def test_persistence_of_faint_sources_is_negligible():
+    """Compare all sources, drawn as in an image, with the bright ones alone: less than 1.5 electrons in any pixel."""
     rng = np.random.default_rng(1)
     count = 150
     x, y = rng.uniform(0, 96, (2, count))
@@ -110,7 +110,7 @@ def test_a_flat_leaves_its_light_a_dark_nothing():
 
 
 def spectrum_before(before, mags, x, y):
-    """Spectra so many seconds before an image of the same strip: (now, earlier, what they were as an image)."""
+    """Return an image, spectra `before` seconds earlier on the same strip, and the image of their noise-free light."""
     columns = {"mjd": infrared.MJD - before * SECOND, "number": 9, "sky": 1.09}
     row = spectroscopic.exposed(STRIP, **columns)
     now = Aim.from_exposure(fields.exposure(**infrared.exposed(STRIP)), STRIP)
@@ -142,14 +142,14 @@ def test_traces_leave_what_whole_spectra_leave(before):
 
 
 def test_the_brightest_column_of_a_point():
-    """Half of an image; of a grism that of order 0, in ten columns, or a five-hundredth part of the first."""
+    """An image has half of the light in a column; a grism has order 0 over ten columns, or 1 / 500 of order 1."""
     _, earlier, _ = spectrum_before(700.0, np.array([15.0, 23.0]), np.array([300.0, 300.0]), np.array([40.0, 60.0]))
     assert 1.0 / 512 < persistence.brightest_column_fraction(earlier.aim, QUIET) < 0.02
     image = Aim.from_exposure(fields.exposure(**infrared.exposed(DETECTOR)), DETECTOR)
     assert persistence.brightest_column_fraction(image, MISSION) == 0.5
 
 
-def test_the_sky_of_what_nothing_renders_leaves_something():
+def test_the_sky_of_channels_that_are_not_rendered_leaves_charge():
     """1.6 e- of 600 e- in 550 s 400 s before, all over; a dark's nothing."""
     row = infrared.exposed(DETECTOR, mjd=infrared.MJD - 400 * SECOND, number=9, seconds=550.0, sky=1.09)
     spectrum = fields.exposure(**{**row, "channel": "NISP-S", "band": "nisp_red"})
@@ -216,7 +216,7 @@ def test_a_detector_has_one_exposure_at_a_time():
 
 
 def test_which_exposures_count():
-    """Of the same detector, camera and settings, within two hours, also spectra; of realisations the first."""
+    """First realisations of the same detector, camera and settings within two hours count, also spectra."""
     nominal = fields.exposure(**infrared.exposed(DETECTOR))
 
     def row(number, hours, **more):
@@ -232,7 +232,7 @@ def test_which_exposures_count():
     numbers = {key: [task["exposure_id"] for task in some] for key, some in found.items()}
     assert numbers[6, "DET22"] == numbers[7, "DET22"] == [2, 4]
     assert numbers[8, "DET22"] == [2, 4, 6]
-    # Spectra remember, too.
+    # Spectra also show persistence.
     assert numbers[4, "DET22"] == [2]
     assert numbers[1, "DET22"] == []
     assert numbers[9, "DET23"] == []
@@ -249,7 +249,7 @@ def test_pixels_have_their_own():
     )
     ratio = [mine / all_alike for mine, all_alike in zip(own, usual, strict=True)]
     assert np.median(ratio[0]) == pytest.approx(1.0, abs=0.01)
-    # What is left after fifty times the time: 50^(0.05 z).
+    # After fifty times the delay, the ratio of a pixel is 50^(0.05 z).
     fell = np.log(ratio[1] / ratio[0]) / np.log(50.0)
     assert np.std(fell) == pytest.approx(0.05, rel=0.05)
     # At the reference time, about, p2 alone: 20 % more of it bring 1 - exp(-I / p2) down by less.
@@ -259,8 +259,8 @@ def test_pixels_have_their_own():
     np.testing.assert_array_equal(own[1], left(earlier(6700.0, [], [], [], **flat), mission=MISSION))
 
 
-def test_exposures_of_a_sequence_with_ramps_of_their_own_remember_one_another():
-    """What is explored tells variants of a sequence apart; what an exposure is taken with does not."""
+def test_exposures_with_different_ramps_leave_persistence_in_one_another():
+    """Explored parameters separate the variants of a sequence; parameters of single exposures do not."""
     nominal = fields.exposure(**infrared.exposed(DETECTOR))
     flat, ramp = '{"own:nisp.flat.signal": [6e4, "electron"]}', '{"own:nisp.macc.photometric.groups": [8, ""]}'
     explored = '{"nisp.flat.signal": [6e4, "electron"]}'
@@ -274,7 +274,7 @@ def test_exposures_of_a_sequence_with_ramps_of_their_own_remember_one_another():
 
 
 def test_an_earlier_flat_had_its_own_lamp():
-    """Twice as bright: of the frame before its own settings hold, not those of the frame that it is seen in."""
+    """The settings of the earlier frame determine its lamp; here it is twice as bright as in the later frame."""
     flat = earlier(134.0, [], [], [], kind="flat", lamp=5)
     bright = EVEN.with_overrides({"nisp.flat.signal": (6e4, "electron")})
     found = [np.median(left(replace(flat, mission=mission))) for mission in (EVEN, bright)]

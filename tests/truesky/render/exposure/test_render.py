@@ -99,7 +99,7 @@ def test_published_zero_points_are_those_of_throughput_and_area(section, band, t
 
 
 def test_every_throughput_is_the_one_of_the_fluxes():
-    """One curve a band: the model that the database names is what the flux tables are integrated over."""
+    """Each band has one curve: flux tables are integrated over the passband that the mission database names."""
     with (files("truesky.fluxes") / "passbands.csv").open() as stream:
         used = {row["name"]: row["source"] for row in csv.DictReader(stream)}
     named = {m.key.split(".")[-2]: m.file for m in MISSION.models if m.key.endswith(".throughput")}
@@ -195,7 +195,7 @@ def test_the_image_is_the_truth_with_the_predicted_noise(channel):
     assert np.nanstd(pull) == pytest.approx(1.0, abs=5 / SIDE)
 
 
-def test_switching_one_effect_off_changes_nobody_else_s_numbers():
+def test_switching_one_effect_off_keeps_the_random_numbers_of_others():
     """Without cosmic rays, pixels that none hit are the same, bit by bit."""
     base = render("VIS", forced={"crosstalk": False}, truth=("cosmic_rays",))
     hit = base.maps["cosmic_rays"] > 0
@@ -207,8 +207,8 @@ def test_switching_one_effect_off_changes_nobody_else_s_numbers():
 
 
 GHOSTS_STAR = 5.0
-# What shows that an effect is in the first image of a detector and not in the second: on both are a saturated star, in
-# column 60, a faint one, and the ghost of one that lies beside the detector.
+# Conditions that show that an effect is in the first image of a detector and not in the second. Both contain a
+# saturated star in column 60, a faint star, and the ghost of a star next to the detector.
 SHOWS = {
     "ghosts": lambda on, off: change(on, off).sum() == pytest.approx(ghost_of(GHOSTS_STAR), rel=0.05),
     # Charge is held back, and let go of later, or not before the last row is read.
@@ -249,7 +249,7 @@ def test_each_effect_can_be_forced_on_and_off(name):
 
 @pytest.mark.parametrize("kind", ["bias", "dark", "flat", "charge_injection", "self_calibration"])
 def test_image_types(kind):
-    """What each is for: a level, few electrons, the lamp, filled rows, a sky."""
+    """Each type has its content: a level, few electrons, the lamp, filled rows, or the sky."""
     truth = ("cosmic_rays", "saturation", "sky", "stars")
     one = render("VIS", kind=kind, truth=truth)
     looks, names = kind in ("flat", "self_calibration"), [d.name for d in one.decisions]
@@ -259,7 +259,7 @@ def test_image_types(kind):
         # With the starlight that strays, where that is noticed.
         stray = any(d.applied for d in one.decisions if d.name == "straylight") * one.scene.lights.electrons.sum()
         assert one.maps["sky"].min() >= one.scene.sky_electrons * (1 - 5e-3)
-        # And by as much as a pixel sees more of the sky than at the boresight.
+        # A pixel may cover a larger area of the sky than at the boresight.
         assert one.maps["sky"].max() <= one.scene.sky_electrons * (1 + 5e-3) + stray
     applied = {d.name for d in one.decisions if d.applied}
     found = calibrated.electrons(one.raw, one.scene, 1, applied - {"pixel_response"})
@@ -308,7 +308,7 @@ def test_the_seed_changes_the_noise_alone():
 
 @pytest.mark.parametrize("changed", [{"noise_seed": 5}, {"exposed": {"realisation": 2}}], ids=["seed", "realisation"])
 def test_the_same_sky_with_other_noise(changed):
-    """Sources and what is the detector's own stay; every pixel's noise is another, and independent.
+    """Sources and fixed patterns of the detector stay; the noise of every pixel is different and independent.
 
     Sample of all dark pixels; significance 6e-5 of their correlation (4 standard errors).
     """
@@ -365,8 +365,8 @@ def test_rows_that_are_not_read_count_for_nothing():
     assert one.scene.peak_electrons == pytest.approx(float(one.noise_free.max()), rel=1e-6)
 
 
-def test_what_sends_in_no_more_than_wings_is_not_listed():
-    """A galaxy whose stamp lies beside the detector: its light is there, it is not among what was drawn."""
+def test_sources_with_only_wings_on_the_detector_are_not_listed():
+    """A galaxy whose stamp is next to the detector has light in the image, but is not listed as drawn."""
     _, exposed, _, points = field("VIS")
     detector = small("vis", "3-4", SIDE)
     system = astrometry.wcs(detector, exposed["ra"], exposed["dec"], exposed["position_angle"])
@@ -391,11 +391,11 @@ def test_draft_is_close_to_survey():
     assert np.abs(fine.noise_free - coarse.noise_free).max() < DRAFT.background * fine.scene.pixel_noise * 2
 
 
-def test_a_scene_that_a_task_has_no_memory_for_is_refused(monkeypatch):
+def test_a_scene_that_needs_too_much_memory_is_refused(monkeypatch):
     """Before anything is drawn; in one line."""
     monkeypatch.setattr(stamps, "draw", None)
     monkeypatch.setattr(cost, "memory", lambda *scene: (2.2 - vis.CHANNEL.cost.base_gb) * 1e9)
-    with pytest.raises(BadInput, match=r"exposure 3, detector 3-4: \d+ sources take 2\.2 GB, a task has 2"):
+    with pytest.raises(BadInput, match=r"exposure 3, detector 3-4: \d+ sources take 2\.2 GB, a task may use 2"):
         render("VIS")
 
 
@@ -403,7 +403,7 @@ def test_a_scene_that_would_not_end_is_refused(monkeypatch):
     monkeypatch.setattr(stamps, "draw", None)
     monkeypatch.setattr(cost, "seconds", lambda *scene: 9e4)
     with pytest.raises(
-        BadInput, match=r"exposure 3, detector 3-4: \d+ sources take 25\.0 h, a task has 6: ask for less"
+        BadInput, match=r"exposure 3, detector 3-4: \d+ sources take 25\.0 h, a task may use 6: choose a lower accuracy"
     ):
         render("VIS")
 
@@ -415,13 +415,13 @@ def test_bad_tables_are_refused():
     def attempt(*tables, exposed=exposed):
         return fields.rendered(exposed, small("vis", "3-4", 32), tables, MISSION, SURVEY)
 
-    with pytest.raises(BadInput, match="not of the same rows"):
+    with pytest.raises(BadInput, match="must have the same rows"):
         attempt(body, good[1].slice(1), points, good[3])
     with pytest.raises(BadInput, match="f_nu_euclid_vis"):
         attempt(body, fluxes(body, "lsst_r", 1.0), points, good[3])
     with pytest.raises(BadInput, match="electrons"):
         attempt(body, fluxes(body, "euclid_vis", float("nan")), points, good[3])
-    with pytest.raises(BadInput, match="twice"):
+    with pytest.raises(BadInput, match="occurs more than once"):
         attempt(*(pa.concat_tables([t, t]) for t in good))
     with pytest.raises(BadInput, match="NISP"):
         attempt(*good, exposed={**exposed, "channel": "NISP"})
@@ -437,7 +437,7 @@ def test_the_passband_is_the_one_of_the_fluxes():
 
 
 def test_a_lamp_s_light_is_moved_and_squeezed_like_a_star_s():
-    """A flat of 20 000 electrons is as crooked as a star of as many, though nothing shines on it from the sky."""
+    """A flat of 20 000 electrons has the same nonlinearity and charge transfer as a star, without light of the sky."""
     body, points = (table.slice(0, 0) for table in field("VIS")[2:])
     # As many rows as there are: of fewer traps less is seen than the accuracy allows to leave out.
     tall = replace(detectors.detector("vis", "3-4", MISSION), nx=16)

@@ -22,9 +22,9 @@ BIN = 8
 
 @cache
 def crowd():
-    """(catalogue rows, columns of the exposure, rendered): stars whose first and other orders lie across a strip.
+    """Return catalogue rows, columns of the exposure, and its rendering: stars whose orders overlap on a strip.
 
-    The last lies a row beside another.
+    The last star is a row next to another.
     """
     rng = np.random.default_rng(8)
     x = np.concatenate(
@@ -59,7 +59,7 @@ def test_sources_alone_add_up_to_the_image_and_to_its_orders():
 
 
 def test_sources_share_the_planes_of_the_psf(monkeypatch):
-    """Those that one source's stamps need are not made again for the next."""
+    """Planes for the stamps of one source are used again for the next."""
     tables, row, _ = crowd()
     made, planes = [], images.planes
     monkeypatch.setattr(images, "planes", lambda psf, sampling: made.append(sampling) or planes(psf, sampling))
@@ -84,7 +84,7 @@ def rows_of(image, least):
 
 
 def test_what_overlaps_is_what_models_show():
-    """Contaminants of first orders, and how much of them: by where the light of each order of each source is drawn."""
+    """Contaminants and overlapped fractions of first orders agree with the drawn light of each order and source."""
     _, _, found = crowd()
     least, wide = spectrum_truth.MIN_CONTAMINATION * found.scene.pixel_noise, found.psf.fwhm / found.psf.pixel_scale
     seen = {
@@ -110,10 +110,10 @@ def test_what_overlaps_is_what_models_show():
     assert any(0.1 < row["overlapped"] < 0.9 for row in firsts)
 
 
-def test_what_is_not_there_is_refused():
+def test_sources_without_light_and_images_without_spectra_are_refused():
     tables, row, _ = crowd()
     variant = Variant(MISSION, DRAFT, {})
-    with pytest.raises(BadInput, match="exposure 1, detector DET22: no light of source 7 is drawn there"):
+    with pytest.raises(BadInput, match="exposure 1, detector DET22: source 7 has no light on the detector"):
         next(
             single_source_spectra.draw_sources(
                 Aim.from_exposure(fields.exposure(**row), STRIP), Rows(*tables), variant, 1, [7]

@@ -45,7 +45,7 @@ def exact(scene, aim, column, row):
 
 @pytest.mark.parametrize(("name", "angle"), [("DET22", 0.0), ("DET14", 0.0), ("DET41", 0.0), ("DET14", -4.0)])
 def test_it_is_the_sum_over_orders_of_what_the_field_stop_lets_through(name, angle):
-    """Wavelengths 100 A apart: 2 % of what the second order brings."""
+    """Wavelength steps of 100 A have an error of 2 % of the second order's light."""
     scene, aim, found = seen(name, angle=angle)
     for i, j in ((0, 0), (0, -1), (16, 16), (-1, 0), (-1, -1)):
         column, row = (np.linspace(0.0, 2039.0, n)[k] for n, k in ((found.shape[1], j), (found.shape[0], i)))
@@ -61,7 +61,7 @@ def test_in_the_middle_other_orders_add_a_few_percent_and_at_the_edge_they_are_g
 
 @pytest.mark.parametrize("name", ["DET14", "DET44", "DET11", "DET41"])
 def test_a_turned_grism_vignettes_the_sky_as_sources(name):
-    """Of the pixels of a corner detector: less sky there than with the grism straight, where sources are dimmed."""
+    """A corner detector receives less sky than with the grism straight, by the fraction by which sources are dimmed."""
     (scene, _, straight), (_, turned, tilted) = seen(name), seen(name, angle=-4.0)
     x, y = np.meshgrid(*(np.linspace(0.0, 2039.0, n) for n in straight.shape[::-1]))
     left = turned.channel.dispersion.vignetting(turned.exposure, turned.detector, x.ravel(), y.ravel(), MISSION)

@@ -68,7 +68,7 @@ def test_who_overlaps_whom():
     one, other, alone, beside = pair().sources.ids.tolist()
     assert found[one, 1]["contaminants"] == [other]
     assert found[other, 1]["contaminants"] == [one]
-    # 60 of some 500 columns are its own.
+    # 60 of some 500 columns are not overlapped.
     assert 0.8 < found[one, 1]["overlapped"] < 0.95
     assert found[alone, 1]["overlapped"] == 0.0
     assert found[beside, 2]["overlapped"] is None
@@ -136,14 +136,14 @@ def test_a_neighbour_counts_that_brings_as_much_to_a_column_as_a_pixel_s_noise(t
     assert beside[one] == ([other] if counts else [])
 
 
-def test_nothing_shines():
+def test_without_sources_there_are_no_rows():
     found = spectroscopic.rendered(detector=strip())
     assert truth_table.spectra(found).num_rows == 0
     assert truth_table.spectra(spectroscopic.rendered(kind="dark", sky=0.0)) is None
 
 
 def test_arcs_are_as_wide_as_their_pictures():
-    """A galaxy and, five rows beside it, its image by a lens: four arcs 1.5" from the lens."""
+    """A galaxy and, five rows away, its image by a lens: four arcs 1.5" from the lens."""
     row, x, y = spectroscopic.exposed(strip()), np.array([300.0]), np.array([48.0])
     found = infrared.tables(strip(), row, 19.0, x, y, {"disk_half_light_radius": 0.1})
     seen = Aim.from_exposure(fields.exposure(**row), strip()).wcs
@@ -188,7 +188,7 @@ def test_a_line_beyond_the_detector_is_not_seen(x, there):
 
 
 def test_lines_are_of_the_exposure_s_own_zero_point():
-    """Twice as many electrons of a source, and of its lines."""
+    """Twice the zero-point flux doubles the electrons of a source and of its lines."""
     nominal = infrared.exposed(strip(), band="nisp_red")["zero_point"]
     one, two = (
         next(row for row in rows(with_line(2e-16, zero_point=nominal + more)) if row["order"] == 1)
@@ -211,6 +211,6 @@ def test_a_line_has_its_electrons_and_is_seen_as_well_as_is_required():
     # Some of its light is outside the box.
     assert 0.93 < image.sum() / row["line_expected"][at] < 1.0
     assert 2.0 * row["line_snr"][at] > 3.5
-    # Of a matched filter on the line's own image, sky and reading for noise.
+    # Compare with a matched filter on the image of the line, with noise of sky and readout.
     continuum = without.noise_free[box] + seen.scene.pixel_noise**2
     assert row["line_snr"][at] == pytest.approx(np.sqrt((image**2 / (continuum + image)).sum()), rel=0.15)

@@ -1,4 +1,4 @@
-"""Standard stars: five of them on every detector, as bright as the mission says, of their own colours."""
+"""Standard stars: five on every detector, with magnitudes of the mission database and colours of their spectra."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def rendered(target, band="euclid_y", mags=(), x=(), y=()):
 
 
 def f_nu(target, band):
-    """Of the spectrum, on any scale, by photons counted wavelength by wavelength."""
+    """Return the mean f_nu of a spectrum in a band in arbitrary units, from photons counted per wavelength."""
     library, curve = templates.stellar_library(), passbands.load(band)
     flux = np.interp(curve.wavelength, library.wavelength, library.flux[library.names.index(target)])
     return (flux * curve.response * curve.wavelength).sum() / (curve.response / curve.wavelength).sum()
@@ -87,7 +87,7 @@ def test_they_are_where_and_as_bright_as_the_mission_says(target):
 
 def test_other_images_have_none_and_other_targets_are_refused():
     assert len(infrared.rendered([20.0], [40.0], [40.0], DETECTOR).sources) == 1
-    with pytest.raises(BadInput, match="exposure 1: target 'Sirius' is none of Vega, white dwarf DA"):
+    with pytest.raises(BadInput, match="exposure 1: target must be one of Vega, white dwarf DA"):
         rendered("Sirius")
 
 

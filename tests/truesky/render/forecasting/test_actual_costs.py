@@ -1,4 +1,4 @@
-"""What detectors took, beside their forecast: by kind, and by the sky that they see."""
+"""Actual costs of detectors and their forecast, by kind of exposure and per area of the sky."""
 
 import json
 
@@ -13,7 +13,7 @@ from lake_schema.tables.tasks import TASKS
 from tests.universe import rows_of
 from truesky.render.forecasting import actual_costs
 
-# Exposure, its channel and image type; detectors of 0.2 x 0.2 deg: two beside each other, seen twice, and a bias.
+# Exposure, channel and image type. Detectors have 0.2 x 0.2 deg: two adjacent ones, each exposed twice, and a bias.
 FRAMES = ((0, "VIS", "science"), (1, "VIS", "science"), (2, "VIS", "bias"), (3, "EXT", "science"))
 PLACES = {"a": 10.0, "b": 10.2}
 

@@ -148,7 +148,7 @@ def test_an_external_catalogue_is_not_forecast(tmp_path):
 
 
 def test_given_sources_are_as_many_as_their_tables_say(tmp_path):
-    """Neither the drawn depth of the sky nor halos: of a scene of a few rows hardly anything is written."""
+    """Neither the depth of the sky nor halos count: a scene with a few rows has very small files."""
     (tmp_path / "g.csv").write_text("ra,dec,mag\n53,-28,20\n53,-28.01,21\n")
     (tmp_path / "s.csv").write_text("mag\n18\n")
     wanted = request((53.0, -28.0, 0.3), 24.0, 22.0, ["euclid_vis"])

@@ -1,4 +1,4 @@
-"""How fast this machine is: learnt from the lake where it can be, else from a calibration, which is kept."""
+"""Speed of this machine: estimated from the lake if possible, else by a calibration, which is stored."""
 
 import json
 
@@ -57,21 +57,21 @@ def log(lake, key, factors, **about):
     )
 
 
-def test_the_lake_is_learnt_from(lake, rendered):
+def test_the_speed_is_estimated_from_the_lake(lake, rendered):
     log(lake, rendered, [2.0, 0.5, 0.4, 0.3])
     found = speed.estimate_speed(lake)
     assert found.factor == pytest.approx(0.45)
     assert "4 detectors" in found.source
 
 
-def test_what_says_nothing_of_this_machine_is_left_out(lake, rendered):
+def test_log_lines_of_other_machines_are_ignored(lake, rendered):
     log(lake, rendered, [9.0] * 4, machine="another")
     log(lake, "of another version", [9.0] * 4)
     log(lake, rendered, [9.0] * 4, error="it failed")
     assert "calibration" in speed.estimate_speed(lake).source
 
 
-def test_a_log_that_is_damaged_teaches_nothing(lake, rendered):
+def test_damaged_logs_are_ignored(lake, rendered):
     """Nor does it keep others from it; the archive names it."""
     log(lake, rendered, [9.0] * 4)
     (path,) = layout.runs_folder(lake).iterdir()
@@ -89,7 +89,7 @@ def test_a_calibration_is_made_once(lake, monkeypatch):
     assert speed.estimate_speed(lake) == first
 
 
-def test_a_measured_part_is_what_is_looked_for():
-    """What the log is read for is what is written into it."""
+def test_log_lines_contain_the_fields_that_are_read():
+    """Log lines of tasks contain the fields that `speed` reads."""
     took = WithMetrics(lambda part: {"part": part.name, "machine": machine()})(Task("a", {}))
     assert {"cpu_s", "machine", "part"} <= took.keys()

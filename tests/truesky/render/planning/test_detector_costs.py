@@ -141,7 +141,7 @@ def test_a_dry_run_prints_the_forecast_and_writes_nothing(tmp_path, capsys):
     assert [line.split()[0] for line in catalogues] == ["job", "build_galaxies", "build_stars", "compute_fluxes"]
     assert lines[0].startswith("channel")
     assert lines[-2].split()[:2] == ["all", "all"]
-    assert lines[-1].startswith("core-hours are of this machine, from a calibration")
+    assert lines[-1].startswith("core-hours are for this machine, from a calibration")
     assert not lake.exists()
 
 

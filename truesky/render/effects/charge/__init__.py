@@ -1,1 +1,1 @@
-"""What happens to charge in the pixels."""
+"""Detector effects that add, move or remove charge in the pixels."""

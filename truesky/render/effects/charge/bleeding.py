@@ -1,12 +1,8 @@
-"""Full well and bleeding: what a pixel cannot hold flows along its column, half each way, until it finds room.
+"""Full well and bleeding: charge above the full well flows along its column, half in each direction.
 
-A column is one piece, or one of each amplifier that it passes. A piece ends at its serial register, where charge is
-lost, and at the other end, where a stop turns it back: in VIS the rows of charge injection, in cameras that are read at
-both ends the middle.
-
-apply, EFFECT    the effect
-bleed            the same, with the charge that was lost
-saturated        the pixels that are full
+A column consists of one segment, or of one segment per amplifier. At one end of a segment is its serial register, where
+charge is lost. At the other end charge is turned back: by the charge-injection rows in VIS, and by the middle of the
+column in cameras that are read at both ends.
 """
 
 from __future__ import annotations
@@ -22,26 +18,56 @@ from truesky.numerics.compiling import jit
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
 
+# Segments of every column: first row, last row + 1, and True if the serial register is above the segment.
 Segments = Sequence[tuple[int, int, bool]]
 
 
 def apply(frame: Frame, capacity: float, segments: Segments, rng: np.random.Generator | None = None) -> Frame:
-    """frame [ny, nx] whole e- -> no pixel above `capacity`.
+    """Limit every pixel to the full well and move the excess along its column.
 
-    capacity : of a pixel, e-;  rng : not used
-    runs     : as of `bleed`
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Whole electrons, 0 or more.
+    capacity : float
+        Full well in electrons, 1 or more.
+    segments : sequence of (int, int, bool)
+        Same as in `bleed`.
+    rng : numpy.random.Generator, optional
+        Not used.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Whole electrons.
     """
     return bleed(frame, capacity, segments)[0]
 
 
 def bleed(frame: Frame, capacity: float, segments: Segments) -> tuple[Frame, float]:
-    """The frame after bleeding, and the electrons that left through the serial registers.
+    """Let charge above the full well bleed, and count the charge that leaves the detector.
 
-    frame    : float64[ny, nx] e- >= 0
-    runs     : pieces of a column: first row, the one past the last, whether the register lies above; rows in none of
-               them stay as they are
-    capacity : of a pixel, e-
-    Error    : 0: what was in is in the frame or lost; whole electrons stay whole
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Electrons, 0 or more.
+    capacity : float
+        Full well in electrons, 1 or more.
+    segments : sequence of (int, int, bool)
+        Segments of every column: first row, last row + 1, and True if the serial register is above the segment.
+        Rows outside all segments are unchanged.
+
+    Returns
+    -------
+    frame : float array, shape (ny, nx)
+        Electrons after bleeding. Whole electrons stay whole.
+    lost : float
+        Electrons that left through the serial registers. Frame and lost charge add up to the input exactly.
+
+    Raises
+    ------
+    OutOfRange
+        If `capacity` is less than 1 or a segment is outside the frame.
     """
     if not 1.0 <= capacity < np.inf:
         raise OutOfRange("full well", capacity, 1.0, np.inf)
@@ -63,7 +89,7 @@ def bleed(frame: Frame, capacity: float, segments: Segments) -> tuple[Frame, flo
 
 @jit
 def _bleed_segment(segment: Any, columns: Any, full: float) -> float:
-    """One piece of columns, its serial register below row 0, in place; returns what left it."""
+    """Bleed one segment in place, with its serial register below row 0. Return the electrons lost."""
     n = segment.shape[0]
     down = np.empty(n)
     lost = 0.0
@@ -71,7 +97,7 @@ def _bleed_segment(segment: Any, columns: Any, full: float) -> float:
         carried = 0.0
         for y in range(n):
             charge = segment[y, x]
-            # Of its own excess half goes each way; what comes from below goes on upwards.
+            # A pixel's excess splits evenly. Charge arriving from below continues upwards.
             excess = max(charge - full, 0.0)
             upwards = np.ceil(0.5 * excess)
             down[y] = excess - upwards
@@ -79,7 +105,7 @@ def _bleed_segment(segment: Any, columns: Any, full: float) -> float:
             over = max(charge - full, 0.0)
             segment[y, x] = charge - over
             carried = over + upwards
-        # The stop at the far end turns it back.
+        # The far end turns the remaining upward flow back.
         for y in range(n - 1, -1, -1):
             charge = segment[y, x] + carried
             over = max(charge - full, 0.0)
@@ -90,17 +116,29 @@ def _bleed_segment(segment: Any, columns: Any, full: float) -> float:
 
 
 def saturated_pixels(frame: Frame, capacity: float) -> Bool:
-    """Pixels [ny, nx] that hold all they can."""
+    """Return a mask of the pixels at full well.
+
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Electrons.
+    capacity : float
+        Full well in electrons.
+
+    Returns
+    -------
+    bool array, shape (ny, nx)
+    """
     return np.asarray(frame >= np.floor(capacity))
 
 
 def full_well(scene: Scene) -> float:
-    """Electrons."""
+    """Return the full well of the scene's detector in electrons."""
     return scene.value("full_well", "electron")
 
 
 def _contribution(scene: Scene) -> float:
-    """What the brightest pixel has too many."""
+    """Return the electrons above full well in the brightest pixel."""
     return max(scene.brightest_electrons - full_well(scene), 0.0)
 
 

@@ -1,13 +1,16 @@
-"""Brighter-fatter: electrons that lie in a pixel repel those that come, so that its borders move in.
+"""Brighter-fatter effect: charge in a pixel repels charge that arrives later, so that pixel borders move.
 
-A border is displaced by what lies around it, in proportion; the charge that would have crossed the strip goes to the
-other side. Charge only changes places. Displacements grow while the exposure lasts: on average they are half the final.
+The displacement of a border is proportional to the charge around it. Charge in the strip between the old and the new
+border changes pixels; the total is conserved. Displacements grow during the exposure, so on average they are half the
+final ones.
 
-The rows of charge injection between the halves hold none: what falls there is drained. So the halves do not feel each
-other, and the last row of each loses a strip to them that is the wider the fuller it is: of a flat of 1e5 e- 1 %.
-Beyond its outer borders a detector is taken to go on as it is there.
+In VIS, the charge-injection rows between the two halves are drained and hold no charge. The halves therefore do not
+affect each other, and the last row of each half loses a strip whose width grows with its charge: 1 % of a flat with
+1e5 electrons per pixel. Outside the detector the charge of its outermost pixels is assumed to continue.
 
-Ref : Antilogus et al. 2014; Guyonnet et al. 2015
+References
+----------
+Antilogus et al. 2014, JINST 9, C03048; Guyonnet et al. 2015, A&A 575, A41
 """
 
 from __future__ import annotations
@@ -22,39 +25,59 @@ from truesky.render.effects import pixel_random
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
 
-# Pixels to each side that a border feels.
+# Pixels on each side of a border whose charge displaces it.
 REACH = 2
-# Pixels of a row that are looked at together.
+# Pixels per block of a row. Blocks without enough charge are skipped.
 _BLOCK = 64
-# Of R^2 of a VIS star: it grows by so many times the shift for each electron of its brightest pixel. A Gaussian of 0.7
-# pixels rms, 2e5 electrons high, grows by 1.0 (mean of 50); the rest is safety.
+# Relative growth of a VIS star's size R^2, per unit of `shift` and per electron in its peak pixel. A Gaussian with an
+# rms of 0.7 pixels and a peak of 2e5 electrons gives 1.0 (mean of 50 realisations); the rest is a safety margin.
 _R2_GROWTH = 1.25
-# Of a pixel's charge, the part that can leave it over one border: strips are thin.
+# Largest fraction of a pixel's charge that can cross one border. The model holds for narrow strips only.
 MAX_CROSSING = 0.2
 
 
 def apply(
     frame: Frame, shift: float, softening: float, capacity: float, threshold: float, gap: int, rng: np.random.Generator
 ) -> Frame:
-    """frame [ny, nx] whole e- >= 0 -> whole e- >= 0, the same sum.
+    """Move charge between neighbouring pixels in proportion to the charge around their common border.
 
-    shift     : pixels that one electron displaces each border of its own pixel
-    softening : pixels, depth of the charge below the borders: how fast the displacement falls off
-    capacity  : e-; what a pixel cannot hold does not repel either
-    dim       : e-; borders about which no pixel holds as much are left as they are
-    between   : rows between the halves, whose charge is drained
-    rng       : random numbers of the whole electrons that cross a border
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Whole electrons, 0 or more.
+    shift : float
+        Displacement, in pixels, of each border of a pixel by one electron in that pixel, 0 to 1e-4.
+    softening : float
+        Depth of the stored charge below the borders in pixels, 0 to 100. See `kernel`.
+    capacity : float
+        Full well in electrons, 1 to 1e9. Charge above it does not repel.
+    threshold : float
+        A border is not moved if all pixels around it hold fewer electrons than this.
+    gap : int
+        Number of drained rows between the two halves of the detector.
+    rng : numpy.random.Generator
+        Random numbers for rounding to whole electrons.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Whole electrons with the same sum.
+
+    Raises
+    ------
+    OutOfRange
+        If a parameter is outside its limits.
     """
     for name, value, low, high in (
         ("brighter-fatter shift", shift, 0.0, 1e-4), ("full well", capacity, 1.0, 1e9),
-        ("brighter-fatter dim", threshold, 0.0, np.inf),
+        ("brighter-fatter threshold", threshold, 0.0, np.inf),
     ):  # fmt: skip
         if not low <= value <= high:
             raise OutOfRange(name, value, low, high)
     out = np.array(frame, dtype=float, order="C")
     if shift == 0.0 or out.size == 0 or out.max() <= 0.0:
         return out
-    # In single precision: whole electrons below 2^24 are exact, and what crosses to 1e-7 of it.
+    # Single precision is exact for whole electrons below 2^24, and its error of the moved charge is 1e-7.
     charge = np.empty((out.shape[0] + 2 * REACH, out.shape[1] + 2 * REACH), np.float32)
     np.minimum(out, capacity, out=charge[REACH:-REACH, REACH:-REACH], casting="same_kind")
     for padded in (charge, charge.T):
@@ -62,7 +85,7 @@ def apply(
     gap_start = (len(out) - gap) // 2
     charge[REACH + gap_start : REACH + gap_start + gap] = 0.0
     weights = kernel(shift, softening).astype(np.float32)
-    # Of each run of pixels, and none after the last.
+    # Highest charge in each block. The extra last column stays 0: it is read as the neighbour of the last block.
     block_max = np.zeros((len(charge), -(-charge.shape[1] // _BLOCK) + 1), np.float32)
     _find_block_max(charge.view(np.int32), block_max.view(np.int32))
     for vertical in (False, True):
@@ -71,9 +94,32 @@ def apply(
 
 
 def kernel(shift: float, softening: float) -> Frame:
-    """Displacement of a border by one electron: [2 REACH + 1, REACH] by distance along the border and across it.
+    """Displacement of a border by one electron in each pixel around it.
 
-    The field of a charge at a depth: d / (d^2 + along^2 + softening^2)^(3/2), d = 1/2, 3/2 ..
+    Parameters
+    ----------
+    shift : float
+        Displacement, in pixels, by one electron in the adjacent pixel.
+    softening : float
+        Depth of the charge below the border in pixels, 0 to 100.
+
+    Returns
+    -------
+    float array, shape (2 REACH + 1, REACH)
+        Displacement in pixels by distance along the border (rows, -REACH to REACH) and across it (columns).
+
+    Raises
+    ------
+    OutOfRange
+        If `softening` is outside its limits.
+
+    Notes
+    -----
+    The displacement follows the field of a point charge below the surface::
+
+        a(d, l) = shift * f(d, l) / f(1/2, 0),    f(d, l) = d / (d^2 + l^2 + softening^2)^(3/2)
+
+    with the distance d = 1/2, 3/2, ... across the border and l = 0, 1, ... along it, in pixels.
     """
     if not 0.0 <= softening <= 100.0:
         raise OutOfRange("brighter-fatter softening", softening, 0.0, 100.0)
@@ -83,34 +129,38 @@ def kernel(shift: float, softening: float) -> Frame:
 
 
 def variance_slope(shift: float, softening: float) -> float:
-    """Variance of a flat field: mean (1 - curvature mean), to first order.  Own charge, four borders."""
+    """Relative loss of variance in a flat field, per electron of its mean.
+
+    Parameters
+    ----------
+    shift, softening : float
+        Same as in `kernel`.
+
+    Returns
+    -------
+    float
+        The value c (1/electron) in variance = mean (1 - c mean), to first order in the mean. Only the charge of the
+        pixel itself and its four borders contribute.
+    """
     return 4.0 * float(kernel(shift, softening)[REACH, 0])
 
 
 @jit
 def _move_charge(
-    charge: Any,
-    block_max: Any,
-    out: Any,
-    weights: Any,
-    key: Any,
-    vertical: bool,
-    threshold: float,
-    gap_start: int,
+    charge: Any, block_max: Any, out: Any, weights: Any, key: Any, vertical: bool, threshold: float, gap_start: int,
     gap: int,
-) -> None:
-    """Moves charge over the borders between neighbours in a row (or, `down`, in a column), in place.
+) -> None:  # fmt: skip
+    """Move charge across the borders between neighbours in a row (or in a column, if `vertical`) in place.
 
-    held : the charge that repels, with a margin of REACH pixels, and most [row, run] of it
-    dim  : nothing crosses where all of it is less
-    drained, between : first of the rows that hold nothing, and how many they are
+    `charge` is the repelling charge with a margin of REACH pixels on each side. The rows from `gap_start` to
+    `gap_start + gap` are drained.
     """
     ny, nx = out.shape
     n_rows, n_columns = (ny - 1, nx) if vertical else (ny, nx - 1)
     displacements = np.empty(_BLOCK, np.float32)
     for r in range(n_rows):
         for block in range((n_columns + _BLOCK - 1) // _BLOCK):
-            # A border feels the margin, too: it lies in the next run.
+            # Borders near the end of a block also depend on pixels of the next one.
             if block_max[r : r + 2 * REACH + 1 + vertical, block : block + 2].max() < threshold:
                 continue
             first = block * _BLOCK
@@ -120,16 +170,16 @@ def _move_charge(
                 charge[r + REACH, first + REACH :],
                 charge[r + REACH + vertical, first + REACH + 1 - vertical :],
             )
-            # The strip lies in the row that holds charge.
+            # Next to the drained rows, the strip lies in the row that holds charge.
             if vertical and gap and r + 1 == gap_start:
                 side_2 = side_1
             if vertical and gap and r + 1 == gap_start + gap:
                 side_1 = side_2
             giver, taker = out[r, first:], out[r + vertical, first + 1 - vertical :]
             for c in range(len(displacement)):
-                # The border moves towards the fuller side, on average by half: what falls into the strip changes sides.
+                # Mean charge of both pixels (1/2) times the mean displacement during the exposure (1/2).
                 strip = np.float32(0.25) * displacement[c] * (side_1[c] + side_2[c])
-                # What crosses is a whole number of electrons, right in the mean.
+                # Stochastic rounding: whole electrons, correct on average.
                 moved = np.floor(strip + pixel_random.uniform(pixel_random.pixel_bits(key, r * nx + first + c)))
                 limit = np.floor(MAX_CROSSING * (giver[c] if moved > 0.0 else taker[c]))
                 moved = min(max(moved, -limit), limit)
@@ -139,7 +189,10 @@ def _move_charge(
 
 @jit
 def _find_block_max(bits: Any, block_max: Any) -> None:
-    """Of each run of pixels of each row; by their bits, which are in the order of the numbers >= 0 they stand for."""
+    """Find the maximum of each block of pixels in each row.
+
+    Floats are compared by their bits as integers, which preserves the order of non-negative numbers and is faster.
+    """
     for r in range(len(bits)):
         for block in range(block_max.shape[1] - 1):
             pixels, highest = bits[r, block * _BLOCK : (block + 1) * _BLOCK], np.int32(0)
@@ -150,11 +203,11 @@ def _find_block_max(bits: Any, block_max: Any) -> None:
 
 @jit
 def _compute_displacement(charge: Any, weights: Any, vertical: bool, r: int, first: int, displacement: Any) -> None:
-    """Of the borders of a row from a pixel on."""
+    """Fill `displacement` with the final displacements of the borders in row `r` from column `first`."""
     displacement[:] = np.float32(0.0)
     for i in range(2 * REACH + 1):
         for j in range(REACH):
-            # Pixels j from the border on this side, and on the other.
+            # Pixels at distance j + 1/2 on the near and the far side of the border.
             if vertical:
                 side_1, side_2 = charge[r + REACH - j, first + i :], charge[r + REACH + 1 + j, first + i :]
             else:
@@ -166,7 +219,8 @@ def _compute_displacement(charge: Any, weights: Any, vertical: bool, r: int, fir
 
 def _parameters(scene: Scene) -> tuple[float, float, float, float, int]:
     shift, softening = scene.value("bfe.shift", "pix / electron"), scene.value("bfe.softening", "pix")
-    # Over a border between pixels of n e- at most sum(kernel) n x 2 n / 4 cross; a pixel has four.
+    # Among pixels with n electrons each, at most sum(kernel) n x 2 n / 4 electrons cross a border; a pixel has four.
+    # The threshold keeps this below the accepted background noise, and the growth of a star below the accepted error.
     max_noise = scene.accuracy.background * scene.pixel_noise / 4.0
     threshold = min(
         np.sqrt(2.0 * max_noise / max(float(kernel(shift, softening).sum()), 1e-30)),
@@ -178,7 +232,7 @@ def _parameters(scene: Scene) -> tuple[float, float, float, float, int]:
 def _contribution(scene: Scene) -> float:
     shift, _, capacity, *_ = _parameters(scene)
     peak = min(scene.peak_electrons, capacity) + scene.sky_electrons
-    # Four borders, half the final displacement, two thirds of the light at a border: 1.2 of this for a VIS star.
+    # Four borders, half the final displacement and two thirds of the peak at a border give 1.2 for a VIS star.
     return 1.5 * shift * peak**2
 
 

@@ -1,8 +1,4 @@
-"""Charge injection: blocks of rows filled electronically, to see how traps take charge and give it back.
-
-apply, EFFECT        the charge: each column takes its own share, the same in every exposure
-apply_noise, NOISE   what differs from row to row and from exposure to exposure
-"""
+"""Charge injection: blocks of rows filled electronically, to measure how traps capture and release charge."""
 
 from __future__ import annotations
 
@@ -15,10 +11,32 @@ from truesky.render.effects.scene import Frame, Scene
 
 
 def apply(frame: Frame, level: float, rows_on: int, rows_off: int, spread: float, rng: np.random.Generator) -> Frame:
-    """frame [ny, nx] e- -> plus whole electrons in every block of `on` rows after `off` rows, from both registers.
+    """Add whole electrons to the injected rows.
 
-    level : e-;  spread : rms between columns, of the level
-    rng   : random numbers of the columns
+    Starting at each of the two serial registers, `rows_off` empty rows and `rows_on` injected rows alternate.
+
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Electrons.
+    level : float
+        Mean injected electrons per pixel, 0 to 1e9.
+    rows_on, rows_off : int
+        Rows per injected block (1 or more), and empty rows before each block (0 or more).
+    spread : float
+        Standard deviation between columns as a fraction of `level`.
+    rng : numpy.random.Generator
+        Random numbers of the columns, the same in every exposure.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Electrons including the injected charge.
+
+    Raises
+    ------
+    OutOfRange
+        If a parameter is outside its limits.
     """
     for name, value in (("charge injection", level), ("injection spread", spread)):
         if not 0.0 <= value <= 1e9:
@@ -30,10 +48,28 @@ def apply(frame: Frame, level: float, rows_on: int, rows_off: int, spread: float
 
 
 def apply_noise(frame: Frame, rows_on: int, rows_off: int, noise: float, rng: np.random.Generator) -> Frame:
-    """frame [ny, nx] e- >= 0 -> less or more by whole electrons in those rows, never below 0.
+    """Add the noise of the injected charge.
 
-    noise : rms of a pixel, e-
-    on, off : rows of a block, and before it;  rng : random numbers of the pixels
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Electrons, 0 or more.
+    rows_on, rows_off : int
+        Same as in `apply`.
+    noise : float
+        Standard deviation in electrons per pixel, 0 to 1e9.
+    rng : numpy.random.Generator
+        Random numbers of the pixels.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Electrons. The changes are whole electrons; no pixel falls below 0.
+
+    Raises
+    ------
+    OutOfRange
+        If a parameter is outside its limits.
     """
     if not 0.0 <= noise <= 1e9:
         raise OutOfRange("injection noise", noise, 0.0, 1e9)
@@ -43,11 +79,10 @@ def apply_noise(frame: Frame, rows_on: int, rows_off: int, noise: float, rng: np
 
 
 def _injected_rows(ny: int, rows_on: int, rows_off: int) -> npt.NDArray[np.intp]:
-    """Those that are filled."""
     for name, count, lowest in (("injected rows", rows_on, 1), ("rows between injections", rows_off, 0)):
         if not lowest <= count <= 1_000_000:
             raise OutOfRange(name, count, lowest, 1_000_000)
-    # Rows from the register that reads them.
+    # Rows from the nearer serial register.
     distance = np.minimum(np.arange(ny), ny - 1 - np.arange(ny))
     return np.flatnonzero(distance % (rows_on + rows_off) >= rows_off)
 
@@ -61,7 +96,7 @@ def _block_rows(scene: Scene) -> tuple[int, int]:
 
 
 def _noise(scene: Scene) -> float:
-    """Nothing varies where nothing is injected."""
+    """Return the noise in electrons, 0 if nothing is injected."""
     return scene.value("injection.noise", "electron") * (EFFECT.is_applied(scene) and _parameters(scene)[0] > 0.0)
 
 

@@ -1,13 +1,9 @@
-"""Cosmic rays: straight tracks, a pixel thin, that deposit charge along their length.
+"""Cosmic rays: straight tracks one pixel wide that deposit charge along their length.
 
-Those of the integration hit the pixels that collect light. Those of the readout hit a detector whose rows are on their
-way: they are placed in readout coordinates (row 0 is read first), where later rows have been exposed for longer. Their
-charge is shifted from where it hit, past the traps from there on: they come when all else has passed the traps, with a
-trail of their own.
-
-apply, EFFECT            in the integration, on the detector
-tracks                   their charge alone: the truth map
-brightest                what they may bring to a pixel
+Cosmic rays during the integration hit the pixels that collect light. Cosmic rays during the readout hit a detector
+whose rows are being shifted. They are placed in readout coordinates (row 0 is read first), in which later rows are
+exposed for longer. Their charge passes only the traps between the point of impact and the register, after all other
+charge has passed them, and has a separate trail.
 """
 
 from __future__ import annotations
@@ -23,18 +19,32 @@ from truesky.render.effects.effect import Effect, zero_contribution
 from truesky.render.effects.scene import Frame, Scene
 
 _SQUARE_CM = 1e-8
-# Quantiles of a track's length (pixels) and charge (electrons).
+# Mission table with quantiles of a track's length (pixels) and charge (electrons).
 _TRACKS = "env.cosmic_rays.vis_tracks"
-# Length of a vertical track, pixels.
+# Length of a perpendicular track in pixels. It must not be 0, because lengths are interpolated in their logarithm.
 _SHORTEST = 1e-2
-# Expected tracks that nobody waits for.
+# Expected number of tracks below which the effect is treated as absent.
 _NEGLIGIBLE = 1e-3
 
 
 def apply(frame: Frame, expected: float, quantiles: Frame, rng: np.random.Generator) -> Frame:
-    """frame [ny, nx] e- -> plus the charge of Poisson(expected) tracks.
+    """Add the charge of cosmic rays.
 
-    quantiles : as of `tracks`;  rng : random numbers of the tracks
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Electrons.
+    expected : float
+        Mean number of tracks, 0 to 1e8.
+    quantiles : float array, shape (q, 3)
+        Same as in `draw_tracks`.
+    rng : numpy.random.Generator
+        Random numbers of the tracks.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Electrons including cosmic rays.
     """
     out = np.array(frame, dtype=float, order="C")
     _add_tracks(out, expected, quantiles, rng)
@@ -42,12 +52,34 @@ def apply(frame: Frame, expected: float, quantiles: Frame, rng: np.random.Genera
 
 
 def draw_tracks(shape: tuple[int, ...], expected: float, quantiles: Frame, rng: np.random.Generator) -> Frame:
-    """Charge of cosmic rays [ny, nx], whole e-; `expected` of them in the mean.
+    """Draw an image of cosmic rays alone.
 
-    quantiles : [q, 3] probability, length (pixels) and charge (e-) that so many are below; their logarithms are linear
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and columns.
+    expected : float
+        Mean number of tracks, 0 to 1e8. The number drawn is Poisson.
+    quantiles : float array, shape (q, 3)
+        Cumulative probability, length in pixels and charge in electrons. Between rows, the logarithms of length and
+        charge are interpolated linearly.
+    rng : numpy.random.Generator
+        Random numbers of the tracks.
 
-    A track that leaves at one edge enters at the other, as its neighbours' tracks do: the density is even.
-    shape     : ny, nx;  rng : random numbers of the tracks
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Whole electrons.
+
+    Raises
+    ------
+    OutOfRange
+        If `expected` is outside its limits.
+
+    Notes
+    -----
+    A track that leaves the image at one edge enters at the opposite edge. This replaces tracks that start outside the
+    detector, so that the density of tracks is uniform.
     """
     out = np.zeros(shape)
     _add_tracks(out, expected, quantiles, rng)
@@ -64,10 +96,16 @@ def _add_tracks(out: Frame, expected: float, quantiles: Frame, rng: np.random.Ge
 
 @jit
 def add_charge(frame: Any, row: Any, column: Any, charge: Any) -> None:
-    """What leaves at one edge enters at the other.
+    """Add charge to pixels of a frame in place. Coordinates wrap around at the edges.
 
-    frame       : [ny, nx] e-, to which it is added
-    row, column : int[n] pixels, which may lie outside;  charge : [n] e- in each of them
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Electrons.
+    row, column : int array, shape (n,)
+        Pixel positions, also outside the frame.
+    charge : float array, shape (n,)
+        Electrons to add to each pixel.
     """
     ny, nx = frame.shape
     for i in range(len(charge)):
@@ -75,17 +113,40 @@ def add_charge(frame: Any, row: Any, column: Any, charge: Any) -> None:
 
 
 def draw_event_count(expected: float, rng: np.random.Generator) -> int:
+    """Draw the Poisson number of cosmic rays for a mean of 0 to 1e8."""
     if not 0.0 <= expected <= 1e8:
         raise OutOfRange("cosmic rays", expected, 0.0, 1e8)
     return int(rng.poisson(expected))
 
 
 def draw_events(count: int, ny: int, nx: int, quantiles: Frame, rng: np.random.Generator) -> tuple[Any, ...]:
-    """Start (x, y), direction, length in pixels, whole electrons.
+    """Draw start, direction, length and charge of tracks.
 
-    Length and charge have the same rank, as in Niemi 2015: who crosses more silicon leaves more.
-    count : tracks;  nx, ny : pixels that they start in
-    quantiles, rng : as of `tracks`
+    Parameters
+    ----------
+    count : int
+        Number of tracks.
+    ny, nx : int
+        Rows and columns in which they start.
+    quantiles : float array, shape (q, 3)
+        Same as in `draw_tracks`.
+    rng : numpy.random.Generator
+        Random numbers of the tracks.
+
+    Returns
+    -------
+    x, y : float array, shape (count,)
+        Start in pixels.
+    cosine, sine : float array, shape (count,)
+        Direction.
+    length : float array, shape (count,)
+        Projected length in pixels.
+    electrons : float array, shape (count,)
+        Charge, whole electrons.
+
+    Notes
+    -----
+    Length and charge have the same rank, as in Niemi 2015: a longer path through the silicon leaves more charge.
     """
     chance, length, charge = quantiles.T
     angle = 2.0 * np.pi * rng.random(count)
@@ -96,11 +157,26 @@ def draw_events(count: int, ny: int, nx: int, quantiles: Frame, rng: np.random.G
 
 @jit
 def pixels_of_events(events: tuple[Any, ...]) -> Any:
-    """Event, column, row and charge, e-, of every pixel that tracks cross; columns and rows on an endless detector."""
+    """Trace tracks through the pixel grid.
+
+    Parameters
+    ----------
+    events : tuple of float arrays, shape (count,)
+        Result of `draw_events`.
+
+    Returns
+    -------
+    event : int array, shape (n,)
+        Index of the track, for every pixel that a track crosses.
+    column, row : int array, shape (n,)
+        Position of the pixel on an unbounded grid.
+    charge : float array, shape (n,)
+        Charge left in the pixel, whole electrons.
+    """
     x, y, cosine, sine, length, electrons = events
     size = 0
     for i in range(len(x)):
-        # A track enters a column or a row at a time.
+        # Upper limit: at each step a track enters the next column or the next row.
         size += int(length[i] * (abs(cosine[i]) + abs(sine[i]))) + 4
     event, columns, rows = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size, np.int64)
     charge, n = np.empty(size), 0
@@ -113,7 +189,7 @@ def pixels_of_events(events: tuple[Any, ...]) -> Any:
         previous = 0.0
         while True:
             along = min(min(next_x, next_y), length[i])
-            # Differences of rounded sums: whole electrons, none too many.
+            # Differences of the rounded cumulative charge are whole electrons and add up to the track's total.
             cumulative = np.rint(electrons[i] * along / length[i])
             event[n], columns[n], rows[n], charge[n] = i, column, row, cumulative - previous
             n += 1
@@ -130,7 +206,20 @@ def pixels_of_events(events: tuple[Any, ...]) -> Any:
 
 
 def event_rate(scene: Scene, pixels: float) -> float:
-    """Tracks a second on so many pixels: of the site, where a camera has its own rate, else of space."""
+    """Cosmic rays per second on an area of the detector.
+
+    Parameters
+    ----------
+    scene : Scene
+        The exposure. A ground camera has the rate of its site; for space the flux is part of the environment.
+    pixels : float
+        Size of the area in pixels.
+
+    Returns
+    -------
+    float
+        Tracks per second.
+    """
     if f"{scene.section}.cosmic_rays.rate" in scene.mission and scene.detector is not None:
         nx, ny = amplifiers.full_size(scene.detector, scene.mission)
         return scene.value("cosmic_rays.rate", "1 / s") * pixels / (nx * ny)
@@ -139,7 +228,7 @@ def event_rate(scene: Scene, pixels: float) -> float:
 
 
 def track_quantiles(scene: Scene) -> Frame:
-    """Of `tracks`; where a camera has the rate of its site: of muons in its silicon."""
+    """Return the quantiles for `draw_tracks`: muons for a ground camera, else the table in the mission database."""
     if f"{scene.section}.cosmic_rays.rate" in scene.mission:
         deposit = scene.mission.value("env.cosmic_rays.silicon_deposit", "electron / um")
         return muon_quantiles(
@@ -149,10 +238,24 @@ def track_quantiles(scene: Scene) -> Frame:
 
 
 def muon_quantiles(thickness: float, pixel: float, deposit: float) -> Frame:
-    """Quantiles of tracks straight through a horizontal detector: intensity cos^2, flux cos^3 of the zenith angle.
+    """Quantiles of muon tracks through a horizontal detector.
 
-    thickness, pixel : um;  deposit : e-/um along the track
-    Error            : no fluctuations of the energy loss, no electrons of natural radioactivity, whatever the pointing
+    Parameters
+    ----------
+    thickness, pixel : float
+        Thickness of the silicon and size of a pixel in micrometres.
+    deposit : float
+        Charge per path length in electrons per micrometre.
+
+    Returns
+    -------
+    float array, shape (55, 3)
+        Same as `quantiles` in `draw_tracks`.
+
+    Notes
+    -----
+    The intensity is proportional to cos^2 of the zenith angle, and the flux through the detector to cos^3. Not
+    modelled: fluctuations of the energy loss, electrons from radioactivity, and the tilt of the detector.
     """
     cumulative = np.append(np.linspace(0.0, 0.98, 50), [0.99, 0.999, 0.9999, 1.0 - 1e-6])
     cosine = (1.0 - cumulative) ** 0.25
@@ -166,13 +269,16 @@ def _expected_events(scene: Scene) -> float:
 
 
 def brightest_pixel(scene: Scene) -> float:
-    """Electrons in the brightest pixel of a track that is likely: all of it, or what a length of one pixel gets."""
+    """Return the highest charge in electrons that a track is likely to leave in one pixel.
+
+    This is all of its charge if the track is shorter than a pixel, else the charge per pixel of length.
+    """
     _, length, charge = track_quantiles(scene).T
     return float((charge / np.maximum(length, 1.0)).max())
 
 
 def median_pixel(scene: Scene, expected: float) -> float:
-    """The median track's charge in a pixel, where there is one."""
+    """Return the charge per pixel of the median track in electrons, 0 if `expected` tracks are negligible."""
     _, length, charge = track_quantiles(scene).T
     middle = len(length) // 2
     return float(charge[middle] / length[middle]) * (expected > _NEGLIGIBLE)

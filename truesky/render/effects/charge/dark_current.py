@@ -1,4 +1,4 @@
-"""Dark current: thermal electrons, counted; and hot pixels, that have many."""
+"""Dark current: counted thermal electrons in every pixel, and hot pixels with many more."""
 
 from __future__ import annotations
 
@@ -14,14 +14,34 @@ from truesky.render.effects.charge import poisson
 from truesky.render.effects.effect import Effect, map_pixels
 from truesky.render.effects.scene import Frame, Scene
 
-# Electrons of a hot pixel in a warm detector: many times what any well holds, so that more makes no difference.
+# Upper limit on the mean electrons of a hot pixel in a warm detector. It exceeds every full well by far.
 _MAX_HOT_ELECTRONS = 1e11
-# Means below this are counted in runs of so many pixels, to counts of which a pixel has no more with this certainty.
+# Means below _BLOCKWISE_BELOW are drawn for _BLOCK pixels together, up to the cumulative probability _CERTAIN.
 _BLOCKWISE_BELOW, _BLOCK, _CERTAIN = 2.0, 512, 1.0 - 2e-16
 
 
 def apply(frame: Frame, electrons: float, rng: np.random.Generator) -> Frame:
-    """frame [ny, nx] e- -> frame + Poisson(electrons) in every pixel."""
+    """Add a Poisson count of dark electrons to every pixel.
+
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Electrons.
+    electrons : float
+        Expected dark electrons per pixel, 0 or more.
+    rng : numpy.random.Generator
+        Source of the key from which each pixel derives its own random number.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Electrons including dark current.
+
+    Raises
+    ------
+    OutOfRange
+        If `electrons` is negative or infinite.
+    """
     if not 0.0 <= electrons < np.inf:
         raise OutOfRange("dark electrons", electrons, 0.0, np.inf)
     return map_pixels(_add_counts, frame, electrons, pixel_random.draw_key(rng))
@@ -34,7 +54,8 @@ def _add_counts(frame: Any, out: Any, mean: float, key: Any) -> None:
         for i in range(len(frame)):
             out[i] = frame[i] + poisson.draw_count(mean, p_zero, pixel_random.pixel_bits(key, i))
         return
-    # Few electrons: of each count, all pixels of a run together.
+    # For small means it is faster to treat one count at a time for a whole block: each pixel whose uniform number
+    # exceeds P(<= count) gets one more electron.
     u = np.empty(_BLOCK)
     for first in range(0, len(frame), _BLOCK):
         block, block_before = out[first : first + _BLOCK], frame[first : first + _BLOCK]
@@ -50,14 +71,35 @@ def _add_counts(frame: Any, out: Any, mean: float, key: Any) -> None:
 
 
 def apply_hot(frame: Frame, fraction: float, electrons: float, rng: np.random.Generator) -> Frame:
-    """frame [ny, nx] e- -> plus whole electrons in hot pixels.
+    """Add whole electrons to hot pixels.
 
-    fraction  : of the pixels;  electrons : mean of a hot pixel, exponentially distributed
-    rng       : random numbers of the detector's pixels
-    Error     : the count of a hot pixel has no noise of its own from exposure to exposure
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Electrons.
+    fraction : float
+        Fraction of hot pixels, 0 to 1.
+    electrons : float
+        Mean electrons of a hot pixel, 0 to 1e12. The distribution is exponential.
+    rng : numpy.random.Generator
+        Random numbers of the detector, the same in every exposure.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Electrons including hot pixels.
+
+    Raises
+    ------
+    OutOfRange
+        If a parameter is outside its limits.
+
+    Notes
+    -----
+    The electrons of a hot pixel are the same in every exposure of the same length: their shot noise is not modelled.
     """
     if not 0.0 <= fraction <= 1.0:
-        raise OutOfRange("hot pixels", fraction, 0.0, 1.0)
+        raise OutOfRange("fraction of hot pixels", fraction, 0.0, 1.0)
     if not 0.0 <= electrons < 1e12:
         raise OutOfRange("hot electrons", electrons, 0.0, 1e12)
     out = np.array(frame, dtype=float)
@@ -73,7 +115,7 @@ def _hot_parameters(scene: Scene) -> tuple[float, float]:
 
 
 def _contribution(scene: Scene) -> float:
-    """Of what it adds: its mean, and its own shot noise."""
+    """Return the root mean square of the added electrons: their mean and shot noise together."""
     return float(np.sqrt(scene.dark_electrons * (1.0 + scene.dark_electrons)))
 
 

@@ -1,6 +1,6 @@
-"""Dark current as it is expected of each pixel: it differs from pixel to pixel, and hot pixels have many times as much.
+"""Expected dark current of each pixel, with pixel-to-pixel variation and hot pixels.
 
-What is expected here is counted up the ramp, with the light.
+This effect is for detectors read up the ramp: it adds to the expected light, and the ramp then draws the counts.
 """
 
 from __future__ import annotations
@@ -15,27 +15,47 @@ from truesky.render.effects import pixel_random
 from truesky.render.effects.effect import Effect, map_pixels
 from truesky.render.effects.scene import Frame, Scene
 
-# A hot pixel of a warm detector: more would make no difference to any well.
+# Upper limit on the mean electrons of a hot pixel in a warm detector. It exceeds every full well by far.
 _MAX_HOT_ELECTRONS = 1e11
 
 
 def apply(
     frame: Frame, electrons: float, spread: float, hot_fraction: float, hot_electrons: float, rng: np.random.Generator
 ) -> Frame:
-    """Expected e- [ny, nx] -> plus the dark current's.
+    """Add the expected dark current.
 
-    frame         : expected e-
-    electrons     : mean of all pixels but the hot ones;  spread : rms of its natural logarithm from pixel to pixel
-    hot           : fraction of the pixels;  hot_electrons : mean of what they have more, exponentially distributed
-    rng           : random numbers of the detector's pixels
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Expected electrons.
+    electrons : float
+        Mean dark current of normal pixels in electrons, 0 to 1e12.
+    spread : float
+        Standard deviation of its natural logarithm from pixel to pixel, 0 to 3.
+    hot_fraction : float
+        Fraction of hot pixels, 0 to 1.
+    hot_electrons : float
+        Mean additional electrons of a hot pixel, 0 to 1e12. The distribution is exponential.
+    rng : numpy.random.Generator
+        Random numbers of the detector, the same in every exposure.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Expected electrons including dark current.
+
+    Raises
+    ------
+    OutOfRange
+        If a parameter is outside its limits.
     """
     for name, value, highest in (
         ("dark electrons", electrons, 1e12), ("spread of the dark current", spread, 3.0),
-        ("hot pixels", hot_fraction, 1.0), ("hot electrons", hot_electrons, 1e12),
+        ("fraction of hot pixels", hot_fraction, 1.0), ("hot electrons", hot_electrons, 1e12),
     ):  # fmt: skip
         if not 0.0 <= value <= highest:
             raise OutOfRange(name, value, 0.0, highest)
-    # The mean of exp(s z) is exp(s^2 / 2).
+    # exp(s z) of a standard normal z has the mean exp(s^2 / 2): divide by it to keep the mean at `electrons`.
     out = map_pixels(_add_dark, frame, electrons * np.exp(-0.5 * spread**2), spread, pixel_random.draw_key(rng))
     count = int(rng.binomial(out.size, hot_fraction))
     hot_pixels = rng.integers(0, max(out.size, 1), count)

@@ -1,20 +1,17 @@
-"""Persistence: charge that traps caught in earlier exposures comes out in this one.
+"""Persistence: traps filled in earlier exposures release their charge during this one.
 
-Of I electrons in a pixel of an exposure that began dt earlier and lasted T
+A pixel that collected I electrons in an exposure of length T, which began a time dt earlier, releases::
 
     I_p = (p0 + 1e-5 p1 I) (1 - exp(-I / p2)) (T / T0)^soak (dt / t0)^power
 
-come in an exposure of the nominal length T0, as a current: they are counted up the ramp, with the light.  In a longer
-one come more, as many as the same fall brings by its end.  What several exposures left adds up.  p0, p1, p2 and the
-power are each pixel's own: p0 and p1 are of the number of its traps and go together.
+electrons in an exposure of the nominal length T0. They are released as a current and are counted up the ramp together
+with the light. A longer exposure receives the integral of the same power law. Contributions of several earlier
+exposures add up. Every pixel has its own p0, p1, p2 and power; p0 and p1 are proportional to its number of traps.
 
-Traps           of a detector: .left of the charge of one exposure
-Pixels, pixels  what each pixel has of its own besides the number of its traps
-apply, EFFECT   a pixel has its own number of traps
-
-Ref : Serrano et al. 2024 (the form, and that p_i are of the pixel, the time between exposures and the length of the
-      first); Long, Baggett & MacKenty 2013, WFC3 Instrument Science Reports (fall as a power of time; longer exposures
-      fill more traps)
+References
+----------
+Serrano et al. 2024: equation, and its dependence on pixel, delay and length of the earlier exposure.
+Long, Baggett & MacKenty 2013, WFC3 Instrument Science Reports: power law in time; longer exposures fill more traps.
 """
 
 from __future__ import annotations
@@ -33,19 +30,28 @@ from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
 from truesky.render.effects.series import SMALL, SMALL_EXP, small_exp, small_expm1
 
-# Of a pixel's second number: other bits than of its first, of which the ziggurat may take more.
+# Decorrelates a pixel's second random number from its first, of which the ziggurat method may use more than one word.
 _SECOND_STREAM = np.uint64(0x5851F42D4C957F2D)
 
 
 @dataclass(frozen=True, slots=True)
 class PersistenceModel:
-    """Of a detector.
+    """Persistence of a detector. The module docstring defines the symbols.
 
-    p0, p1, p2      : e-, no unit, e-, of the formula
-    power           : of time, at most 0;  reference : t0, s
-    length          : T0, s
-    full_well       : e-: no pixel held more
-    soak            : power of the time that the charge was held
+    Attributes
+    ----------
+    p0, p1, p2 : float
+        Parameters of the equation: electrons, dimensionless, electrons.
+    power : float
+        Exponent of the delay, at most 0.
+    reference : float
+        Reference delay t0 in seconds.
+    nominal_length : float
+        Nominal exposure length T0 in seconds.
+    full_well : float
+        Full well in electrons: the highest charge that fills traps.
+    soak : float
+        Exponent of the length of the earlier exposure.
     """
 
     p0: float
@@ -59,7 +65,7 @@ class PersistenceModel:
 
     @classmethod
     def from_scene(cls, scene: Scene) -> PersistenceModel:
-        """Of the mission database."""
+        """Read the parameters of the scene's detector from the mission database."""
 
         def value(name: str, unit: str) -> float:
             return scene.value(f"persistence.{name}", unit)
@@ -78,12 +84,34 @@ class PersistenceModel:
         earlier_seconds: float | None = None,
         variation: PixelVariation | None = None,
     ) -> Frame:
-        """Of charge [..] e- what comes `delay` s later in an exposure of `seconds` s, e-.
+        """Charge that one earlier exposure releases during a later one.
 
-        charge, delay, seconds : of the earlier exposure, from start to start, of the later one
-        lasted : s of the earlier exposure, None = the nominal length
-        own    : of each pixel; None = all are as the usual one
-        Error  : how much more comes in a longer exposure is of the usual pixel's power of time
+        Parameters
+        ----------
+        charge : float array
+            Electrons collected in the earlier exposure.
+        delay : float
+            Time from the start of the earlier exposure to the start of the later one in seconds, more than 0.
+        seconds : float
+            Length of the later exposure in seconds.
+        earlier_seconds : float, optional
+            Length of the earlier exposure in seconds, by default the nominal length.
+        variation : PixelVariation, optional
+            Variation from pixel to pixel. By default all pixels behave like the median pixel.
+
+        Returns
+        -------
+        float array, shape of `charge` (of the detector, with `variation`)
+            Electrons released during the later exposure.
+
+        Raises
+        ------
+        OutOfRange
+            If `delay` is not positive.
+
+        Notes
+        -----
+        The charge released in an exposure longer than nominal is computed with the power law of the median pixel.
         """
         filling = np.clip(charge, 0.0, self.full_well)
         scale = self.time_scaling(delay, seconds, earlier_seconds)
@@ -99,7 +127,7 @@ class PersistenceModel:
                 released.reshape(-1),
             )
             return released
-        # Most pixels have the sky alone, all the same.
+        # Most pixels hold only sky, all with the same charge: evaluate the exponential once for them.
         lowest = filling.min(initial=self.full_well)
         above = filling > lowest
         released = np.full(filling.shape, self._charge_at_reference(lowest) * scale)
@@ -107,7 +135,23 @@ class PersistenceModel:
         return released
 
     def time_scaling(self, delay: float, seconds: float, earlier_seconds: float | None = None) -> float:
-        """What times do to what is left, over the reference time and nominal lengths; as of `left`."""
+        """Released charge relative to the reference delay and nominal lengths.
+
+        Parameters
+        ----------
+        delay, seconds, earlier_seconds : float
+            Same as in `released_charge`.
+
+        Returns
+        -------
+        float
+            Factor to multiply the charge for a delay t0 and lengths T0 by.
+
+        Raises
+        ------
+        OutOfRange
+            If `delay` is not positive.
+        """
         if not delay > 0.0:
             raise OutOfRange("delay of persistence", delay, 0.0, np.inf)
         return float(
@@ -117,11 +161,11 @@ class PersistenceModel:
         )
 
     def _soak_factor(self, earlier_seconds: float | None) -> float:
-        """Traps that are filled in an exposure of `lasted` s, over those in one of the nominal length."""
+        """Return the traps filled in an exposure relative to one of nominal length: (T / T0)^soak."""
         return 1.0 if earlier_seconds is None else float((earlier_seconds / self.nominal_length) ** self.soak)
 
     def _length_factor(self, delay: float, seconds: float) -> float:
-        """What comes from a delay on in so many seconds, over what comes in the nominal length."""
+        """Return the charge released in `seconds` relative to the nominal length: the ratio of integrals of t^power."""
         logs, power = (np.log1p(time / delay) for time in (seconds, self.nominal_length)), 1.0 + self.power
         charge, nominal = (x if power == 0.0 else np.expm1(power * x) / power for x in logs)
         return float(charge / nominal)
@@ -132,9 +176,14 @@ class PersistenceModel:
 
 @dataclass(frozen=True, slots=True)
 class PixelVariation:
-    """Of each pixel of a detector, float32[ny, nx].
+    """Variation of persistence from pixel to pixel.
 
-    p2 : over the usual one;  power : what its power of time is more
+    Attributes
+    ----------
+    p2 : float32 array, shape (ny, nx)
+        p2 of each pixel relative to the median.
+    power : float32 array, shape (ny, nx)
+        Difference of each pixel's exponent of the delay from the median.
     """
 
     p2: Float32
@@ -144,10 +193,28 @@ class PixelVariation:
 def draw_variation(
     shape: tuple[int, int], p2_spread: float, power_spread: float, rng: np.random.Generator
 ) -> PixelVariation | None:
-    """What each pixel has of its own, normally distributed; None = nothing.
+    """Draw the variation of persistence from normal distributions.
 
-    shape : ny, nx;  p2_spread : rms as a fraction, no pixel has less than a tenth of the usual p2
-    power_spread : rms;  rng : random numbers of the detector's pixels
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and columns of the detector.
+    p2_spread : float
+        Relative standard deviation of p2, 0 to 1. Values below 0.1 of the median are set to 0.1.
+    power_spread : float
+        Standard deviation of the exponent of the delay, 0 to 1.
+    rng : numpy.random.Generator
+        Random numbers of the detector, the same in every exposure.
+
+    Returns
+    -------
+    PixelVariation or None
+        None if both standard deviations are 0.
+
+    Raises
+    ------
+    OutOfRange
+        If a standard deviation is outside its limits.
     """
     for name, value in (("p2", p2_spread), ("time power", power_spread)):
         if not 0.0 <= value <= 1.0:
@@ -160,7 +227,7 @@ def draw_variation(
 
 
 def variation_of_scene(scene: Scene, rng: np.random.Generator) -> PixelVariation | None:
-    """Of a detector by the mission database; rng : as of `pixels`."""
+    """Draw the variation of the scene's detector, with standard deviations from the mission database."""
     p2, power = (scene.value(f"persistence.{name}_spread", "") for name in ("p2", "time_power"))
     return draw_variation((scene.ny, scene.nx), p2, power, rng)
 
@@ -178,10 +245,11 @@ def _release(filling: Any, p2: Any, power: Any, constants: Any, out: Any) -> Non
     offset, slope, median_p2, scale, log_time, max_power = constants
     inverse = 1.0 / median_p2
     for i in range(len(filling)):
-        # Nothing that is left becomes more with time.
+        # Limit the exponent so that released charge never grows with time.
         growth = small_exp(min(power[i], max_power) * log_time)
         out[i] = (offset + slope * filling[i]) * -small_expm1(-filling[i] * inverse / p2[i]) * scale * growth
-    # Most pixels are faint: a branch above would cost more than the few that are done twice.
+    # Replace pixels outside the range of the series. A branch in the first loop would prevent its vectorisation, which
+    # costs more than computing a few pixels twice.
     for i in range(len(filling)):
         x, time = filling[i] * inverse / p2[i], min(power[i], max_power) * log_time
         if x > SMALL or abs(time) > SMALL_EXP:
@@ -189,11 +257,30 @@ def _release(filling: Any, p2: Any, power: Any, constants: Any, out: Any) -> Non
 
 
 def apply(frame: Frame, released: Frame | None, spread: float, rng: np.random.Generator) -> Frame:
-    """Expected e- [ny, nx] -> plus what earlier exposures left.
+    """Add the charge released from earlier exposures.
 
-    frame      : expected e-
-    remembered : [ny, nx] e- of a usual pixel; None = nothing;  spread : rms of a pixel's own share, which is never < 0
-    rng        : random numbers of the detector's pixels
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Expected electrons.
+    released : float array, shape (ny, nx), or None
+        Electrons that pixels with the median number of traps release. None if there are no earlier exposures.
+    spread : float
+        Relative standard deviation of the number of traps from pixel to pixel, 0 to 10. Negative numbers become 0.
+    rng : numpy.random.Generator
+        Random numbers of the detector, the same in every exposure.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Expected electrons including persistence.
+
+    Raises
+    ------
+    OutOfRange
+        If `spread` is outside its limits.
+    BadInput
+        If the shapes of `frame` and `released` differ.
     """
     if not 0.0 <= spread <= 10.0:
         raise OutOfRange("spread of persistence", spread, 0.0, 10.0)
@@ -201,7 +288,7 @@ def apply(frame: Frame, released: Frame | None, spread: float, rng: np.random.Ge
     if released is None:
         return out
     if released.shape != frame.shape:
-        raise BadInput(f"persistence of {released.shape} pixels for a frame of {frame.shape}")
+        raise BadInput(f"persistence has the shape {released.shape}, the frame {frame.shape}: they must be equal")
     charge = np.ascontiguousarray(released, dtype=float)
     _add_released(out.reshape(-1), charge.reshape(-1), spread, pixel_random.draw_key(rng))
     return out

@@ -1,13 +1,12 @@
-"""Displaced borders of pixels: electric fields along a thick detector carry charge into its neighbours.
+"""Displaced pixel borders: lateral electric fields in a thick detector move charge into neighbouring pixels.
 
-Charge that crosses a border lies in a strip beside it: of the light in the strip, interpolated between the pixels. So
-one pass moves sources, changes their shapes and makes the pattern of a flat, and loses no charge.
+The charge that crosses a border is the light in the strip between the nominal and the displaced border, interpolated
+between the pixels. One pass therefore moves sources, changes their shapes and produces the pattern in a flat field,
+and it conserves charge.
 
-apply_rings, RINGS   tree rings: the doping of the wafer varies with the distance from its axis
-apply_edges, EDGES   the last pixels before the detector's edges
-displacement         of tree rings, by distance from the wafer's axis
-
-Ref : Plazas, Bernstein & Sheldon 2014 (DECam)
+References
+----------
+Plazas, Bernstein & Sheldon 2014 (DECam), PASP 126, 750
 """
 
 from __future__ import annotations
@@ -22,30 +21,52 @@ from truesky.numerics.compiling import jit
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
 
-# Pixels between entries of the table of displacements.
+# Sampling of the table of radial displacements in pixels.
 _STEP = 0.25
-# Of a pixel's charge, the part that can leave it over one border: strips are thin.
+# Largest fraction of a pixel's charge that can cross one border. The model holds for narrow strips only.
 _MAX_CROSSING = 0.2
-# Lengths of the falling off beyond which an edge is not felt.
+# Distance from an edge, in scale lengths, beyond which its displacement is set to 0.
 _EDGE_RANGE = 8.0
-# Of a displacement, the change of a star's pixel over the star's brightest: the steepest slope of a Gaussian of one
-# pixel rms is 0.6 of its peak a pixel.
+# Change of a pixel relative to a star's peak, per pixel of displacement: the steepest slope of a Gaussian with an rms
+# of one pixel.
 _MAX_SLOPE = 0.6
 
 
 def apply_rings(
     frame: Frame, amplitude: float, inner: float, outer: float, centre: float, rng: np.random.Generator
 ) -> Frame:
-    """frame [ny, nx] expected e- -> the same sum, with tree rings.
+    """Displace charge by tree rings.
 
-    amplitude    : of the flat, relative;  inner, outer : periods of the nearest and of the farthest rings, pixels
-    frame        : without noise
-    centre       : pixels from the detector's middle to the wafer's axis, along columns and along rows, either way
-    rng          : random numbers of the detector: on which side the axis lies, and the phase
-    Error        : of displacements up to 0.05 pixels 1e-4 pixels in a centroid, 6e-4 in second moments
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Expected electrons, without noise.
+    amplitude : float
+        Relative amplitude of the rings in a flat field, 0 to 0.1.
+    inner, outer : float
+        Period in pixels at the point of the detector nearest to the wafer's axis and farthest from it, 2 to 1e5.
+    centre : float
+        Distance in pixels from the detector's centre to the wafer's axis, along rows and along columns. The signs are
+        random.
+    rng : numpy.random.Generator
+        Random numbers of the detector (position of the axis, phase of the rings), the same in every exposure.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Expected electrons with the same sum.
+
+    Raises
+    ------
+    OutOfRange
+        If a parameter is outside its limits.
+
+    Notes
+    -----
+    For displacements up to 0.05 pixels, the error is 1e-4 pixels in centroids and 6e-4 in second moments.
     """
     if not 0.0 <= amplitude <= 0.1:
-        raise OutOfRange("tree rings", amplitude, 0.0, 0.1)
+        raise OutOfRange("amplitude of tree rings", amplitude, 0.0, 0.1)
     side, phase = np.sign(rng.random(2) - 0.5), 2.0 * np.pi * rng.random()
     ny, nx = frame.shape
     axis = (nx - 1) / 2 + side[0] * centre, (ny - 1) / 2 + side[1] * centre
@@ -57,7 +78,20 @@ def apply_rings(
 
 
 def distance_range(nx: int, ny: int, axis: tuple[float, float]) -> tuple[float, float]:
-    """Of the nearest and of the farthest place of a detector from the wafer's axis, pixels."""
+    """Smallest and largest distance between a detector and the wafer's axis.
+
+    Parameters
+    ----------
+    nx, ny : int
+        Columns and rows.
+    axis : (float, float)
+        Column and row of the wafer's axis in pixels.
+
+    Returns
+    -------
+    r_min, r_max : float
+        Distances in pixels.
+    """
     sides = list(zip((nx, ny), axis, strict=True))
     r_min = [max(-0.5 - at, at - n + 0.5, 0.0) for n, at in sides]
     r_max = [max(abs(at + 0.5), abs(n - 0.5 - at)) for n, at in sides]
@@ -67,11 +101,33 @@ def distance_range(nx: int, ny: int, axis: tuple[float, float]) -> tuple[float, 
 def radial_displacement(
     amplitude: float, periods: tuple[float, float], phase: float, r_min: float, r_max: float
 ) -> Frame:
-    """Pixels outwards that charge is carried at distances near, near + _STEP .. far from the axis.
+    """Radial displacement of charge by tree rings.
 
-    A flat changes by minus its divergence: amplitude times a wave whose period goes from the first to the second.
-    amplitude : of the flat;  periods : pixels, at `near` and at `far`;  phase : at `near`
-    near, far : pixels
+    Parameters
+    ----------
+    amplitude : float
+        Relative amplitude of the rings in a flat field.
+    periods : (float, float)
+        Periods in pixels at `r_min` and `r_max`, 2 to 1e5; linear between them.
+    phase : float
+        Phase at `r_min` in radians.
+    r_min, r_max : float
+        Distances from the wafer's axis in pixels.
+
+    Returns
+    -------
+    float array
+        Outward displacement in pixels at the distances r_min, r_min + 0.25, ... up to at least r_max.
+
+    Raises
+    ------
+    OutOfRange
+        If a period is outside its limits.
+
+    Notes
+    -----
+    A flat field changes by minus the divergence of the displacement. A wave of amplitude A and period P in the flat
+    therefore belongs to a displacement of amplitude A P / (2 pi).
     """
     for period in periods:
         if not 2.0 <= period <= 1e5:
@@ -83,14 +139,33 @@ def radial_displacement(
 
 
 def apply_edges(frame: Frame, shift: float, length: float, rng: np.random.Generator | None = None) -> Frame:
-    """frame [ny, nx] expected e- -> the same sum, charge carried towards the edges (from them, where it is negative).
+    """Displace charge towards the edges of the detector, or away from them if `shift` is negative.
 
-    shift  : pixels, at the edge;  length : over which it falls off by e, pixels;  rng : not used
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Expected electrons.
+    shift : float
+        Displacement at the edge in pixels, -0.5 to 0.5.
+    length : float
+        Distance in pixels over which the displacement falls by a factor of e, 0.01 to 1000.
+    rng : numpy.random.Generator, optional
+        Not used.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Expected electrons with the same sum.
+
+    Raises
+    ------
+    OutOfRange
+        If a parameter is outside its limits.
     """
     if not -0.5 <= shift <= 0.5:
         raise OutOfRange("displacement at the edge", shift, -0.5, 0.5)
     if not 1e-2 <= length <= 1e3:
-        raise OutOfRange("length of the edge", length, 1e-2, 1e3)
+        raise OutOfRange("scale length of the edge displacement", length, 1e-2, 1e3)
     out = np.array(frame, dtype=float, order="C")
     columns, rows = (_edge_displacement(n, shift, length) for n in frame.shape[::-1])
     _cross_borders(np.ascontiguousarray(frame, dtype=float), np.zeros(2), 0.0, (0.0, 0.0), columns, rows, out)
@@ -98,7 +173,7 @@ def apply_edges(frame: Frame, shift: float, length: float, rng: np.random.Genera
 
 
 def _edge_displacement(n: int, shift: float, length: float) -> Frame:
-    """[n] displacement at the borders behind pixels 0 .. n - 1."""
+    """Return the displacement at the upper border of each of n pixels along an axis."""
     border = np.arange(n) + 0.5
     to_start, to_end = border + 0.5, n - 0.5 - border
     displacement = shift * (np.exp(-to_end / length) - np.exp(-to_start / length))
@@ -107,10 +182,10 @@ def _edge_displacement(n: int, shift: float, length: float) -> Frame:
 
 @jit
 def _cross_borders(frame: Any, table: Any, r_min: float, axis: Any, columns: Any, rows: Any, out: Any) -> None:
-    """Adds to `out` what crosses the borders of `frame`.
+    """Add the charge that crosses the borders of `frame` to `out`.
 
-    table : displacement away from the axis;  near : its first distance
-    columns, rows : besides, at the borders behind each column and each row
+    `table` contains radial displacements from the distance `r_min`; `columns` and `rows` contain additional
+    displacements at the upper border of each column and row.
     """
     ny, nx = frame.shape
     rings = table.min() != table.max()
@@ -135,7 +210,7 @@ def _cross_borders(frame: Any, table: Any, r_min: float, axis: Any, columns: Any
 
 @jit
 def _component(table: Any, r_min: float, along: float, across: float) -> Any:
-    """Component along the first direction of the displacement away from the axis."""
+    """Return the component in direction `along` of the radial displacement at (along, across) from the axis."""
     distance = math.sqrt(along * along + across * across)
     position = (distance - r_min) / _STEP
     i = min(max(int(position), 0), len(table) - 2)
@@ -145,15 +220,20 @@ def _component(table: Any, r_min: float, along: float, across: float) -> Any:
 
 @jit
 def _strip_charge(d: float, q0: float, q1: float, q2: float, q3: float, inside: bool) -> float:
-    """Charge that a displacement by d pixels carries from `here` over the border to `there`; less, where d < 0."""
+    """Return the charge that moves across the border between q1 and q2, displaced by d pixels; negative if d is.
+
+    q0 to q3 are the charges of four successive pixels. At the edge of the detector (`inside` is False) q0 and q3 are
+    not used.
+    """
+    # Value at the border, interpolated from four pixels (from two at the edges of the detector).
     level = (7.0 * (q1 + q2) - q0 - q3) / 12.0 if inside else 0.5 * (q1 + q2)
     moved = d * (level - 0.5 * d * (q2 - q1))
-    # Beside a sharp peak the interpolation overshoots.
+    # The interpolation overshoots next to a sharp peak.
     return min(max(moved, -_MAX_CROSSING * max(q2, 0.0)), _MAX_CROSSING * max(q1, 0.0))
 
 
 def _value_or_zero(scene: Scene, key: str, unit: str) -> float:
-    """0 of a camera that does not have it."""
+    """Return a parameter of the detector, or 0 for cameras without it."""
     return scene.value(key, unit) if f"{scene.section}.{key}" in scene.mission else 0.0
 
 

@@ -1,4 +1,4 @@
-"""Pixel response: each pixel's own sensitivity (PRNU), dead pixels, dark columns, dust that lies on the detector."""
+"""Pixel response: sensitivity variations (PRNU), dead pixels, dark columns, and dust on the detector."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from truesky.render.effects import pixel_random
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
 
+# Segments of every column: first row, last row + 1, and True if the serial register is above the segment.
 Segments = Sequence[tuple[int, int, bool]]
-# Of `response`, without shape and random numbers.
+# Arguments of `response` from `rms` to `segments`.
 Parameters = tuple[float, float, float, tuple[float, float, float], Segments]
 
-# What a dead pixel still sees, at most.
+# Highest sensitivity of a dead pixel.
 _MAX_DEAD = 0.5
-# Standard deviations of a grain's shadow that are drawn.
+# Radius in standard deviations to which a dust shadow is drawn.
 _SHADOW_RANGE = 4.0
 
 
@@ -32,9 +33,25 @@ def apply(
     segments: Segments,
     rng: np.random.Generator,
 ) -> Frame:
-    """frame [ny, nx] e- -> times `response`.
+    """Multiply a frame by the pixel response.
 
-    rms, dead, dark_columns, dust, runs, rng : as of `response`
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Electrons.
+    rms, dead, dark_columns : float
+        Same as in `response`.
+    dust : (float, float, float)
+        Same as in `response`.
+    segments : sequence of (int, int, bool)
+        Same as in `response`.
+    rng : numpy.random.Generator
+        Random numbers of the detector, the same in every exposure.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Electrons.
     """
     out = response(frame.shape, rms, dead, dark_columns, dust, segments, rng)
     out *= frame
@@ -50,18 +67,41 @@ def response(
     segments: Segments,
     rng: np.random.Generator,
 ) -> Frame:
-    """Sensitivity of every pixel, mean 1 but for the defects, never below 0.
+    """Relative sensitivity of every pixel.
 
-    rms : between pixels;  dead : fraction of pixels that see little
-    dark_columns : mean number of columns that see nothing from some row on, away from their register
-    dust : grains a pixel; mean rms of their shadows, pixels, exponentially distributed; what a shadow's middle lacks
-    runs : pieces of a column: first row, the one past the last, whether the register lies above
-    shape : ny, nx;  rng : random numbers of the detector's pixels
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and columns.
+    rms : float
+        Standard deviation of the sensitivity between pixels, 0 to 1.
+    dead : float
+        Fraction of dead pixels, 0 to 1. Their sensitivity is uniform between 0 and 0.5.
+    dark_columns : float
+        Mean number of dark columns, 0 to 1e4. A dark column has a defect in a random row; pixels on the far side of
+        the defect, as seen from the serial register, have no signal.
+    dust : (float, float, float)
+        Dust grains per pixel, 0 to 0.1; mean radius (Gaussian sigma) of their shadows in pixels, 0 to 1000,
+        exponentially distributed; and fraction of light absorbed at the centre of a shadow, 0 to 1.
+    segments : sequence of (int, int, bool)
+        Segments of every column: first row, last row + 1, and True if the serial register is above the segment.
+    rng : numpy.random.Generator
+        Random numbers of the detector, the same in every exposure.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Sensitivity, 0 or more. The mean is 1 apart from defects and dust.
+
+    Raises
+    ------
+    OutOfRange
+        If a parameter is outside its limits.
     """
     grains, radius, depth = dust
     for name, value, highest in (
-        ("pixel response rms", rms, 1.0), ("dead pixels", dead, 1.0), ("dark columns", dark_columns, 1e4),
-        ("dust", grains, 0.1), ("dust radius", radius, 1e3), ("dust depth", depth, 1.0),
+        ("pixel response rms", rms, 1.0), ("fraction of dead pixels", dead, 1.0), ("dark columns", dark_columns, 1e4),
+        ("dust grains per pixel", grains, 0.1), ("dust radius", radius, 1e3), ("dust depth", depth, 1.0),
     ):  # fmt: skip
         if not 0.0 <= value <= highest:
             raise OutOfRange(name, value, 0.0, highest)
@@ -73,7 +113,7 @@ def response(
     out[..., rows, columns] = _MAX_DEAD * rng.random(count)
     for _ in range(int(rng.poisson(dark_columns)) if nx else 0):
         row, column = int(rng.integers(0, ny)), int(rng.integers(0, nx))
-        # Charge from beyond the defect does not come past it to its register.
+        # Charge from beyond the defect cannot pass it on its way to the serial register.
         for first, past, register_above in segments:
             if first <= row < past:
                 out[..., slice(first, row + 1) if register_above else slice(row, past), column] = 0.0
@@ -85,7 +125,7 @@ def response(
 
 
 def _multiply_shadow(out: Frame, y: float, x: float, sigma: float, depth: float) -> None:
-    """Multiplies by a grain's shadow, which is soft."""
+    """Multiply by the Gaussian shadow of a dust grain, in place."""
     if sigma == 0.0:
         return
     (rows, up), (columns, across) = (
@@ -103,17 +143,17 @@ def _draw_sensitivity(out: Any, rms: float, key: Any) -> None:
 
 
 def parameters(scene: Scene) -> Parameters:
-    """Of `response`."""
+    """Return the arguments of `response` from `rms` to `segments` for a scene."""
     dust = scene.value("dust", ""), scene.value("dust_radius", "pix"), scene.value("dust_depth", "")
-    rms, dead, columns = (scene.value(key, "") for key in ("prnu", "dead_pixels", "dark_columns"))
-    return rms, dead, columns, dust, scene.column_segments
+    rms, dead, dark_columns = (scene.value(key, "") for key in ("prnu", "dead_pixels", "dark_columns"))
+    return rms, dead, dark_columns, dust, scene.column_segments
 
 
 def _contribution(scene: Scene) -> float:
-    rms, dead, columns, (grains, *_, depth), _ = parameters(scene)
+    rms, dead, dark_columns, (grains, *_, depth), _ = parameters(scene)
     brightest = scene.peak_electrons + scene.sky_electrons
     shadow = depth * (grains > 0)
-    return max(rms * brightest, scene.sky_electrons * max(float(dead > 0 or columns > 0), shadow))
+    return max(rms * brightest, scene.sky_electrons * max(float(dead > 0 or dark_columns > 0), shadow))
 
 
 EFFECT = Effect("pixel_response", apply, parameters, _contribution, fixed=True, cost=1.2e-2)

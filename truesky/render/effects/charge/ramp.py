@@ -1,42 +1,42 @@
-"""Up the ramp: an infrared detector is read without being emptied, and its charge is averaged in groups of reads.
+"""Up-the-ramp readout: an infrared detector is read without being reset, and groups of reads are averaged.
 
-A ramp has n_g groups of r reads with d dropped frames between two groups, r n_g + d (n_g - 1) frames after the reset.
-The charge after frame k is N_k; a group is the mean of its r values, and what is measured of a pixel are the
-n = n_g - 1 differences D_i of neighbouring groups.  Where f electrons a frame are expected and each frame's count is
-Poisson, a photon of the j-th frame of a group weighs (r - j + 1) / r in that group's mean, so that
+A ramp has n_g groups of r reads, with d dropped frames between two groups: r n_g + d (n_g - 1) frames after the reset.
+The signal of a pixel is measured from the n = n_g - 1 differences D_i of successive groups; a group G_i is the mean
+charge of its r reads. The counts of all frames are Poisson with f expected electrons per frame. An electron that
+arrives in the j-th frame of a group has the weight (r - j + 1) / r in that group. Therefore::
 
-    mean D_i          = f (r + d)
-    var D_i       a   = f (r + d) (1 + alpha),      alpha = (1 - r^2) / (3 r (r + d))
-    cov D_i D_i+1 b   = f (r^2 - 1) / (6 r),        all others 0
-    var G_1       v   = f (r + 1) (2 r + 1) / (6 r), cov G_1 D_1 = b
+    mean D_i            = f (r + d)
+    var D_i         a   = f (r + d) (1 + alpha),      alpha = (1 - r^2) / (3 r (r + d))
+    cov(D_i, D_i+1) b   = f (r^2 - 1) / (6 r),        all others 0
+    var G_1         v   = f (r + 1) (2 r + 1) / (6 r), cov(G_1, D_1) = b
 
-A first-order moving average has these moments: with c0, c1 = (sqrt(a + 2 b) +- sqrt(a - 2 b)) / 2,
+Drawing a count for every frame is slow. A first-order moving average has the same moments: with
+c0, c1 = (sqrt(a + 2 b) +- sqrt(a - 2 b)) / 2 and standard normal e_i::
 
-    D_i = mean + c1 e_i + c0 e_i-1,    G_1 = f (r + 1) / 2 + c1 e_0 + sqrt(v - c1^2) e,
+    D_i = mean + c1 e_i + c0 e_i-1,    G_1 = f (r + 1) / 2 + c1 e_0 + sqrt(v - c1^2) e.
 
-e standard normal: n + 2 numbers instead of a count a frame (c0^2 > v: e_0 must have the smaller coefficient in G_1).
-Poisson's third moments are put into the sum T of the differences.  With h_k the weight of a photon of frame k in D_i,
-H = sum_i h and g = sum_i h^2 - H^2 / n, T and the sum of squares SS = sum (D - mean D)^2 have the joint cumulants
-K3 f = f sum H^3 and C = f sum H g; SS has the variance V_G of normal deviates and f C4 = f sum g^2 more.  With
-V_S = V_G + f C4 and z = T / sqrt(V_T)
+It needs n + 2 random numbers. (e_0 must have the smaller coefficient in G_1, because c0^2 > v.)
 
-    T -> T sqrt(1 - C^2 V_G / (V_T V_S^2)) + C / V_S (SS - E SS) + K3 f (z^2 - 1) / (6 V_T)
+The third moments of the Poisson distribution are added to the sum T of the differences. Let h_k be the weight of an
+electron of frame k in D_i, H = sum_i h and g = sum_i h^2 - H^2 / n. T and the sum of squares SS = sum (D - mean D)^2
+have the joint cumulants K3 f = f sum H^3 and C = f sum H g, and var SS = V_S = V_G + f C4 with C4 = sum g^2, where V_G
+is the variance for normal deviates. The transformation::
+
+    T -> T sqrt(1 - C^2 V_G / (V_T V_S^2)) + C / V_S (SS - E SS) + K3 f (z^2 - 1) / (6 V_T),    z = T / sqrt(V_T)
 
     V_T = n a + 2 (n - 1) b,    E SS = n a - V_T / n
     V_G = 2 (n a^2 + 2 (n - 1) b^2 - 2 / n ((n - 2) (a + 2 b)^2 + 2 (a + b)^2) + V_T^2 / n^2)
 
-keeps the variance of T; of the covariance C it gives V_G / V_S, which falls below 0.9 where a pixel has fewer than some
-ten electrons and its noise is that of its reads.
+preserves the variance of T. It reproduces the fraction V_G / V_S of the covariance C. The fraction is below 0.9 only
+for pixels with fewer than about ten electrons, in which read noise dominates.
 
-Where a pixel is not linear in its counts (a cosmic ray, saturation, so much charge that the non-linearity of its noise
-shows) every frame is drawn.  Full well and non-linearity act on the charge of a frame, before groups are averaged.
+Every frame is drawn for pixels in which the charge is not linear in the counts: with a cosmic ray, near full well, or
+with enough charge for the nonlinearity to change the noise. Full well and nonlinearity act on the charge of each frame,
+before groups are averaged.
 
-apply, EFFECT   expected light -> charge of the groups
-Mode, mode_of, mode_for   how a ramp is read;  elapsed : how long it takes
-planes          a frame with room for what a ramp wants to know besides light
-full_signal     what is measured of a pixel that is full at the end
-
-Ref : Kubik et al. 2016, PASP 128, 104504 (groups, alpha); the moments above are those of sums of independent counts
+References
+----------
+Kubik et al. 2016, PASP 128, 104504 (groups, alpha). All other moments follow from independent counts.
 """
 
 from __future__ import annotations
@@ -58,22 +58,29 @@ from truesky.render.effects.charge import poisson
 from truesky.render.effects.effect import Effect, zero_contribution
 from truesky.render.effects.scene import Frame, Scene
 
-# Electrons at a ramp's end above which the noise of a pixel is not linear in its charge, and every frame is drawn:
-# there 2 b N, the change of the noise, is 0.4 %.
+# Electrons at the end of a ramp above which every frame is drawn. There the nonlinearity changes the noise by
+# 2 b N = 0.4 %.
 LINEAR_BELOW = 3000.0
-# By what part a frame's time may differ from the mission's, so that a ramp takes an exposure time.
+# Largest relative difference between the frame time that gives the requested exposure time and that of the mission.
 FRAME_TOLERANCE = 0.02
-# Of a number of drops: exposure times that differ by less are the same.
+# Difference in the number of drops below which an exposure time counts as nominal.
 _DROPS_TOLERANCE = 1e-6
-# Groups, reads or drops of a ramp.
+# Limit on the number of groups, of reads per group and of drops.
 _MAX_COUNT = 1000
 
 
 @dataclass(frozen=True, slots=True)
 class Mode:
-    """How a ramp is read: MACC(groups, reads, drops).
+    """Readout of a ramp, MACC(groups, reads, drops) (multi-accumulation).
 
-    groups : averaged groups, at least 2;  reads : frames in a group;  drops : frames between two groups
+    Attributes
+    ----------
+    groups : int
+        Number of averaged groups, 2 to 1000.
+    reads : int
+        Frames per group, 1 to 1000.
+    drops : int
+        Dropped frames between two groups, 0 to 1000.
     """
 
     groups: int
@@ -85,41 +92,41 @@ class Mode:
             if not lowest <= getattr(self, name) <= _MAX_COUNT:
                 raise OutOfRange(f"{name} of a ramp", getattr(self, name), lowest, _MAX_COUNT)
         if self.frames > MAX_FRAMES:
-            raise BadInput(f"{self}: {self.frames} frames are more than {MAX_FRAMES}")
+            raise BadInput(f"{self} has {self.frames} frames, more than {MAX_FRAMES}")
 
     def __str__(self) -> str:
         return f"MACC({self.groups},{self.reads},{self.drops})"
 
     @property
     def differences(self) -> int:
-        """Of neighbouring groups."""
+        """Number of differences of successive groups."""
         return self.groups - 1
 
     @property
     def frames(self) -> int:
-        """From the reset to the last read."""
+        """Number of frames from the reset to the last read."""
         return ramps.frame_count(self.groups, self.reads, self.drops)
 
     @property
     def integration_frames(self) -> int:
-        """Frames between the first group and the last: the exposure time of the signal."""
+        """Number of frames from the first group to the last, the integration time of the signal."""
         return self.differences * (self.reads + self.drops)
 
     @property
     def alpha(self) -> float:
-        """Of the variance of a difference, (1 + alpha) times its mean count."""
+        """Relative excess of the variance of a difference of groups over its mean count, 0 or negative."""
         return (1.0 - self.reads**2) / (3.0 * self.reads * (self.reads + self.drops))
 
     def weights(self) -> Float:
-        """float64[differences, frames]: what an electron that comes in a frame adds to each difference of groups."""
+        """Weight of an electron of each frame in each difference of groups, shape (differences, frames)."""
         frame = np.arange(self.frames)
         first = np.arange(self.groups)[:, None] * (self.reads + self.drops)
-        # Reads of a group that see it: those from its own frame on.
+        # An electron is present in the reads of a group from its own frame on.
         in_group = np.clip(first + self.reads - frame[None, :], 0, self.reads) / self.reads
         return np.diff(in_group, axis=0)
 
     def third_moments(self) -> tuple[float, float, float]:
-        """(K3, C / f, C4) of the module's head."""
+        """Return the cumulants (K3, C / f, C4) of the module docstring."""
         h = self.weights()
         total = h.sum(axis=0)
         g = (h**2).sum(axis=0) - total**2 / self.differences
@@ -127,17 +134,33 @@ class Mode:
 
 
 def mode_of_scene(scene: Scene) -> Mode:
-    """That of the scene's ramp, with as many drops as its exposure time wants; errors as of `mode_for`."""
+    """Return the readout mode of a scene, see `find_mode`."""
     return find_mode(scene.ramp, scene.exposure_time_s, scene.section, scene.mission)
 
 
 def find_mode(kind: str, seconds: float, section: str, mission: MissionConfiguration) -> Mode:
-    """How an exposure of a length is read: the mission's mode, with as many drops as it takes.
+    """Readout mode for an exposure time: the mission's mode with the number of drops adjusted.
 
-    kind    : "photometric" or "spectroscopic";  seconds : exposure time
-    section : of the camera, "nisp";  mission : the mission database
-    Errors  : BadInput where the reads alone take longer, the frames are too many, or no number of drops takes about as
-              long
+    Parameters
+    ----------
+    kind : {"photometric", "spectroscopic"}
+        Ramp of the mission.
+    seconds : float
+        Exposure time in seconds.
+    section : str
+        Section of the camera in the mission database, such as "nisp".
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    Mode
+
+    Raises
+    ------
+    BadInput
+        If the reads alone take longer, there would be too many frames, or the best number of drops needs a frame time
+        that differs from the mission's by more than `FRAME_TOLERANCE`.
     """
     key = f"{section}.macc.{kind}"
     groups, reads, drops = (int(mission.value(f"{key}.{name}")) for name in ("groups", "reads", "drops"))
@@ -149,7 +172,7 @@ def find_mode(kind: str, seconds: float, section: str, mission: MissionConfigura
         shortest = frame_s * nominal.differences * reads
         raise BadInput(f"exposure time {seconds:g} s: {nominal} takes {shortest:.4g} s without any drops")
     if round(best_drops) > _MAX_COUNT:
-        raise BadInput(f"exposure time {seconds:g} s: {nominal} takes {best_drops:.4g} drops, more than {_MAX_COUNT}")
+        raise BadInput(f"exposure time {seconds:g} s: {nominal} needs {best_drops:.4g} drops, more than {_MAX_COUNT}")
     mode = Mode(groups, reads, round(best_drops))
     if abs(seconds / (frame_s * mode.integration_frames) - 1.0) > FRAME_TOLERANCE:
         raise BadInput(
@@ -160,21 +183,53 @@ def find_mode(kind: str, seconds: float, section: str, mission: MissionConfigura
 
 
 def duration(kind: str, seconds: float, section: str, mission: MissionConfiguration) -> float:
-    """Seconds from the reset to the last read of an exposure of a length; errors as of `mode_for`.
+    """Time from the reset to the last read of an exposure.
 
-    kind, seconds, section, mission : of `mode_for`
+    Parameters
+    ----------
+    kind : {"photometric", "spectroscopic"}
+        Ramp of the mission.
+    seconds : float
+        Exposure time in seconds.
+    section : str
+        Section of the camera in the mission database, such as "nisp".
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    float
+        Time in seconds.
+
+    Raises
+    ------
+    BadInput
+        If `find_mode` finds no readout mode.
     """
     mode = find_mode(kind, seconds, section, mission)
     return seconds * mode.frames / mode.integration_frames
 
 
 def frame_time(scene: Scene) -> float:
-    """Seconds from frame to frame: the mission's, where the exposure time is a multiple of it, else near it."""
+    """Return the frame time in seconds: the mission's, adjusted by up to `FRAME_TOLERANCE` to the exposure time."""
     return scene.exposure_time_s / mode_of_scene(scene).integration_frames
 
 
 def with_planes(frame: Frame, count: int) -> Frame:
-    """A new float32[count, ny, nx] of `apply`: what the frame has, and zeros."""
+    """Extend an input of `apply` to a number of planes.
+
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx) or (n, ny, nx)
+        Input of `apply`, with at most `count` planes.
+    count : int
+        Number of planes.
+
+    Returns
+    -------
+    float32 array, shape (count, ny, nx)
+        A copy of `frame`, followed by planes of zeros.
+    """
     out = np.empty((count, *frame.shape[-2:]), np.float32)
     planes = frame.reshape(-1, *frame.shape[-2:])
     out[: len(planes)], out[len(planes) :] = planes, 0.0
@@ -182,19 +237,43 @@ def with_planes(frame: Frame, count: int) -> Frame:
 
 
 def signal_at_full_well(scene: Scene, charge_b: float = 0.0, signal_b: float = 0.0) -> float:
-    """Electrons that are measured in the integration time of a pixel that is full at the ramp's end.
+    """Signal of a pixel that reaches full well at the end of the ramp.
 
-    of_charge, of_signal : b of N (1 - b N), what is seen of N electrons in a frame, and of those of the signal, 1/e-
+    Parameters
+    ----------
+    scene : Scene
+        The exposure.
+    charge_b, signal_b : float
+        Coefficient b of the nonlinearity N (1 - b N) in 1/electron, of the charge of a frame and of the signal.
+
+    Returns
+    -------
+    float
+        Electrons measured in the integration time.
     """
     mode, full = mode_of_scene(scene), scene.value("full_well", "electron")
     signal = full * (1.0 - charge_b * full) * mode.integration_frames / mode.frames
-    # Of more than 1 / 2 b is seen what is seen of these.
+    # N (1 - b N) has its maximum at 1 / (2 b). Larger signals are set to it.
     signal = min(signal, 0.5 / signal_b) if signal_b > 0.0 else signal
     return signal * (1.0 - signal_b * signal)
 
 
 def full_pixels(frame: Frame, mode: Mode, full_well: float) -> Bool:
-    """[ny, nx] pixels of a frame of `apply` that are expected to be full at the ramp's end."""
+    """Mask of the pixels that are expected to reach full well by the end of the ramp.
+
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx) or (n, ny, nx)
+        Input of `apply`.
+    mode : Mode
+        Readout of the ramp.
+    full_well : float
+        Full well in electrons.
+
+    Returns
+    -------
+    bool array, shape (ny, nx)
+    """
     light, charge = (frame[0], frame[1]) if frame.ndim == 3 else (frame, 0.0)
     return np.asarray(light * (mode.frames / mode.integration_frames) + charge >= full_well)
 
@@ -207,15 +286,32 @@ def apply(
     *,
     rng: np.random.Generator,
 ) -> Frame:
-    """Expected light -> charge of the groups, float32[groups, ny, nx] e-.
+    """Draw the charge of the groups of a ramp.
 
-    frame        : [ny, nx] e- expected in the mode's integration time; or [3, ny, nx], with the charge that cosmic rays
-                   leave in a pixel, e-, and the moment of it as a fraction of the ramp, 0 <= moment < 1; or
-                   [4, ny, nx], with b of N (1 - b N), what is seen of N electrons, 1/e-
-    full_well    : e- that a pixel holds, no more
-    Error        : all of it in single precision, 6e-8
-    linear_below : e- at the ramp's end up to which the linear law is used; 0 = every frame of every pixel is drawn
-    mode, rng    : how the ramp is read; random numbers
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx), (3, ny, nx) or (4, ny, nx)
+        Plane 0: electrons expected in the integration time. Planes 1 and 2: charge of cosmic rays in electrons, and
+        the time at which it arrives as a fraction of the ramp, 0 <= time < 1. Plane 3: coefficient b of the
+        nonlinearity N (1 - b N) in 1/electron.
+    mode : Mode
+        Readout of the ramp.
+    full_well : float
+        Highest charge of a pixel in electrons, 0 to 1e9.
+    linear_below : float, optional
+        Electrons at the end of the ramp up to which the moving average is used. With 0, every frame is drawn.
+    rng : numpy.random.Generator
+        Source of the keys from which each pixel derives its random numbers.
+
+    Returns
+    -------
+    float32 array, shape (groups, ny, nx)
+        Electrons.
+
+    Raises
+    ------
+    OutOfRange
+        If `full_well` is outside its limits.
     """
     if not 0.0 < full_well < 1e9:
         raise OutOfRange("full well", full_well, 0.0, 1e9)
@@ -254,7 +350,7 @@ def _draw_ramps(
     frames = groups * reads + (groups - 1) * drops
     e, group = np.empty(groups + 1), np.empty(groups)
     size = len(light)
-    # Mean of k^2 over the reads of each group: the non-linearity of a mean ramp.
+    # Mean of k^2 over the reads of each group, for the nonlinearity of a ramp with constant flux.
     squares = np.empty(groups)
     for i in range(groups):
         squares[i] = 0.0
@@ -280,7 +376,7 @@ def _draw_ramps(
 
 @jit
 def _draw_groups(f: float, shape: Any, cumulants: Any, e: Any, group: Any) -> None:
-    """Groups of a pixel from groups + 1 normal deviates e: the linear law of the module's head."""
+    """Compute the groups of a pixel from `groups` + 1 normal deviates e, with the moving average (module docstring)."""
     groups, reads, drops = shape
     n = groups - 1
     r = float(reads)
@@ -288,7 +384,7 @@ def _draw_groups(f: float, shape: Any, cumulants: Any, e: Any, group: Any) -> No
     b = f * (r * r - 1.0) / (6.0 * r)
     v = f * (r + 1.0) * (2.0 * r + 1.0) / (6.0 * r)
     high, low = math.sqrt(a + 2.0 * b), math.sqrt(max(a - 2.0 * b, 0.0))
-    # Of two numbers whose product is b the smaller by a division: high - low cancels where b is small.
+    # c1 = (high - low) / 2 would lose its digits for small b. The product of c0 and c1 is b.
     c0 = 0.5 * (high + low)
     c1 = b / c0 if c0 > 0.0 else 0.0
     total, square = 0.0, 0.0
@@ -308,7 +404,7 @@ def _draw_groups(f: float, shape: Any, cumulants: Any, e: Any, group: Any) -> No
             v_s = v_g + f * c4
             mixed = k_mixed * f
             fraction = mixed / v_t * (v_g / v_s) * (mixed / v_s)
-            # sqrt(1 - part) - 1, without the difference.
+            # sqrt(1 - fraction) - 1, without cancellation.
             shift += total * (-fraction / (1.0 + math.sqrt(1.0 - fraction)))
             shift += mixed / v_s * (square - (n * a - v_t / n))
     group[0] = 0.5 * f * (r + 1.0) + c1 * e[0] + math.sqrt(max(v - c1 * c1, 0.0)) * e[groups]
@@ -320,7 +416,7 @@ def _draw_groups(f: float, shape: Any, cumulants: Any, e: Any, group: Any) -> No
 def _draw_frames(
     f: float, hit: float, hit_frame: int, shape: Any, full_well: float, b: float, key: Any, pixel: int, group: Any
 ) -> None:
-    """Groups of a pixel, a count a frame."""
+    """Compute the groups of a pixel by drawing the count of every frame."""
     groups, reads, drops = shape
     frames = groups * reads + (groups - 1) * drops
     p_zero = math.exp(-f) if f < poisson._EXACT_BELOW else 0.0

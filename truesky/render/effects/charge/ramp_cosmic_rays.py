@@ -1,7 +1,7 @@
-"""Cosmic rays in a thin layer that is read without being emptied: each leaves its charge at one moment of the ramp.
+"""Cosmic rays in a thin infrared detector: each particle leaves its charge at one moment of the ramp.
 
-Directions are isotropic: of tracks through a layer of thickness T, l^2 / (l^2 + T^2) are shorter than l when seen from
-above.  A particle leaves its charge in proportion to its path sqrt(l^2 + T^2), with a scatter of its own.
+Directions are isotropic. In a layer of thickness T, the fraction l^2 / (l^2 + T^2) of the tracks has a projected
+length below l. A particle leaves charge in proportion to its path length sqrt(l^2 + T^2), with log-normal scatter.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from truesky.render.effects.charge import cosmic_rays, ramp
 from truesky.render.effects.effect import Effect, zero_contribution
 from truesky.render.effects.scene import Frame, Scene
 
-# Expected hits that nobody waits for.
+# Expected number of hits below which the effect is treated as absent.
 _NEGLIGIBLE = 1e-3
 _SQUARE_CM = 1e-8
 
@@ -21,13 +21,37 @@ _SQUARE_CM = 1e-8
 def apply(
     frame: Frame, expected: float, thickness: float, electrons: float, scatter: float, rng: np.random.Generator
 ) -> Frame:
-    """Expected light [ny, nx] e- -> [3, ny, nx] of ramp.apply, with the charge of hits and their moments.
+    """Add the planes of cosmic-ray charge and arrival time to the input of `ramp.apply`.
 
-    frame     : expected e-
-    expected  : mean number of particles in the ramp;  thickness : of the layer, pixels
-    electrons : median that a particle leaves on a path of one pixel;  scatter : rms of its decimal logarithm
-    Error     : a pixel that two particles hit has all of their charge at the moment of the second
-    rng       : random numbers of the hits
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Expected electrons.
+    expected : float
+        Mean number of particles during the ramp, 0 to 1e8.
+    thickness : float
+        Thickness of the layer in pixels, 0 to 1000.
+    electrons : float
+        Median charge in electrons that a particle leaves per pixel of path length, 0 to 1e8.
+    scatter : float
+        Standard deviation of the decimal logarithm of the charge, 0 to 3.
+    rng : numpy.random.Generator
+        Random numbers of the hits.
+
+    Returns
+    -------
+    float32 array, shape (3, ny, nx)
+        Input of `ramp.apply`: light, charge of the hits in electrons, and their arrival time as a fraction of the
+        ramp. Without any hit, a copy of `frame`, shape (ny, nx).
+
+    Raises
+    ------
+    OutOfRange
+        If a parameter is outside its limits.
+
+    Notes
+    -----
+    If two particles hit the same pixel, all of their charge arrives with the second.
     """
     for name, value, highest in (
         ("thickness", thickness, 1e3), ("charge of a path", electrons, 1e8), ("scatter of the charge", scatter, 3.0)
@@ -40,12 +64,12 @@ def apply(
     out = ramp.with_planes(frame, 3)
     ny, nx = frame.shape
     angle, x, y = 2.0 * np.pi * rng.random(count), nx * rng.random(count), ny * rng.random(count)
-    # In (0, 1]: the part of the tracks that are longer.
+    # `longer` in (0, 1] is the fraction of tracks that are longer.
     longer, logarithm = 1.0 - rng.random(count), rng.normal(0.0, scatter, count)
     length = np.minimum(thickness * np.sqrt((1.0 - longer) / longer), float(nx + ny))
     charge = np.rint(electrons * np.hypot(length, thickness) * 10.0**logarithm)
     moment = rng.random(count)
-    # A track of no length at all has one pixel, too.
+    # A track of length 0 still crosses one pixel.
     events = (x, y, np.cos(angle), np.sin(angle), np.maximum(length, 1e-9), charge)
     event, columns, rows, pixel_charge = cosmic_rays.pixels_of_events(events)
     cosmic_rays.add_charge(out[1], rows, columns, pixel_charge)
@@ -54,8 +78,8 @@ def apply(
 
 
 def _parameters(scene: Scene) -> tuple[float, float, float, float]:
-    """Of the whole ramp, from its reset."""
     pixel = scene.value("fpa.pixel_size", "um / pix")
+    # Particles count during the whole ramp, from the reset to the last read.
     seconds = ramp.mode_of_scene(scene).frames * ramp.frame_time(scene)
     area = scene.nx * scene.ny * pixel**2 * _SQUARE_CM
     rate = scene.mission.value("env.cosmic_rays.flux", "cm-2 s-1") * area
@@ -65,7 +89,7 @@ def _parameters(scene: Scene) -> tuple[float, float, float, float]:
 
 
 def _contribution(scene: Scene) -> float:
-    """Of the usual particle, straight through."""
+    """Return the charge of a median particle that crosses the layer perpendicularly."""
     expected, thickness, electrons, _ = _parameters(scene)
     return electrons * thickness * (expected > _NEGLIGIBLE)
 

@@ -1,11 +1,8 @@
-"""Non-linearity of a pixel's capacity: of N electrons N (1 - b N) are seen, b its own.
+"""Nonlinearity of a pixel's capacitance: N electrons are read as N (1 - b N), with a different b for each pixel.
 
-It acts on the charge that a pixel holds, frame by frame up the ramp; or, as Serrano et al. 2024 have it, on the signal
-that is estimated of the ramp: the mission's parameter nonlinearity_of_signal, 0 or 1, says which.  The two differ:
-charge counts over all frames of a ramp, the signal over those between its first group and its last.
-
-apply, EFFECT          on the ramp
-apply_signal, SIGNAL   on the signal, with the same b
+The effect acts either on the charge of every frame of a ramp or, as in Serrano et al. 2024, on the signal estimated
+from the ramp. The mission parameter `nonlinearity_of_signal` (0 or 1) selects one. They differ because charge is
+counted from the reset, but the signal only from the first to the last group.
 """
 
 from __future__ import annotations
@@ -23,10 +20,28 @@ from truesky.render.effects.scene import Frame, Scene
 
 
 def apply(frame: Frame, mean: float, spread: float, rng: np.random.Generator) -> Frame:
-    """Frame [ny, nx] or [3, ny, nx] of ramp.apply -> [4, ny, nx], with b of every pixel, 1/e-.
+    """Add the plane of nonlinearity coefficients to the input of `ramp.apply`.
 
-    frame : of ramp.apply;  mean : of b, 1/e-;  spread : of b from pixel to pixel, as a fraction
-    rng   : random numbers of the detector's pixels
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx) or (3, ny, nx)
+        Input of `ramp.apply` without coefficients.
+    mean : float
+        Mean of b in 1/electron, 0 to 1e-3.
+    spread : float
+        Standard deviation of b from pixel to pixel as a fraction of `mean`, 0 to 10.
+    rng : numpy.random.Generator
+        Random numbers of the detector, the same in every exposure.
+
+    Returns
+    -------
+    float32 array, shape (4, ny, nx)
+        Input of `ramp.apply` with b in the last plane.
+
+    Raises
+    ------
+    OutOfRange
+        If `mean` or `spread` is outside its limits.
     """
     out = ramp.with_planes(frame, 4)
     _draw_coefficients(out[3].reshape(-1), *_check_parameters(mean, spread), pixel_random.draw_key(rng))
@@ -34,11 +49,30 @@ def apply(frame: Frame, mean: float, spread: float, rng: np.random.Generator) ->
 
 
 def apply_signal(frame: Frame, mean: float, spread: float, rng: np.random.Generator) -> Frame:
-    """[2, ny, nx] signal of a ramp, e-, and its chi^2 -> with what is seen of the signal.
+    """Apply the nonlinearity to the signal of a ramp.
 
-    frame             : signal and chi^2
-    mean, spread, rng : as of `apply`
-    Error             : of more than 1 / 2 b electrons is seen what is seen of these, as the most
+    Parameters
+    ----------
+    frame : float array, shape (2, ny, nx)
+        Signal in electrons, and chi^2 of the ramp fit.
+    mean, spread : float
+        Same as in `apply`.
+    rng : numpy.random.Generator
+        Random numbers of the detector, the same in every exposure.
+
+    Returns
+    -------
+    float array, shape (2, ny, nx)
+        Measured signal in electrons, and the unchanged chi^2.
+
+    Raises
+    ------
+    OutOfRange
+        If `mean` or `spread` is outside its limits.
+
+    Notes
+    -----
+    N (1 - b N) has its maximum at N = 1 / (2 b). Larger signals are set to this maximum.
     """
     out = np.array(frame, dtype=float, order="C")
     _bend_signal(out[0].reshape(-1), *_check_parameters(mean, spread), pixel_random.draw_key(rng))
@@ -79,7 +113,7 @@ def _acts_on_signal(scene: Scene) -> bool:
 
 
 def _change_at_full_well(scene: Scene) -> float:
-    """Of a full pixel: a hot pixel or a cosmic ray may fill any, also where nothing shines."""
+    """Return the change of a full pixel: a hot pixel or a cosmic ray can fill any pixel, even without light."""
     return _parameters(scene)[0] * scene.value("full_well", "electron") ** 2
 
 

@@ -1,1 +1,1 @@
-"""What happens to light before it is charge."""
+"""Effects of the optics and of the pixels' response on light before it becomes charge."""

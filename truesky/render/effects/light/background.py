@@ -1,4 +1,4 @@
-"""The diffuse sky: the same expected electrons in every pixel."""
+"""Add the diffuse sky: the same expected electrons in every pixel."""
 
 from __future__ import annotations
 
@@ -10,7 +10,27 @@ from truesky.render.effects.scene import Frame
 
 
 def apply(frame: Frame, electrons: float, rng: np.random.Generator | None = None) -> Frame:
-    """frame [ny, nx] e- -> frame + electrons."""
+    """Add a constant to a frame.
+
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Expected electrons.
+    electrons : float
+        Expected electrons of the sky per pixel, 0 or more.
+    rng : numpy.random.Generator, optional
+        Not used.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Expected electrons including sky.
+
+    Raises
+    ------
+    OutOfRange
+        If `electrons` is negative or infinite.
+    """
     if not 0.0 <= electrons < np.inf:
         raise OutOfRange("sky electrons", electrons, 0.0, np.inf)
     return frame + electrons

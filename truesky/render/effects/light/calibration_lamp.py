@@ -1,7 +1,7 @@
-"""Flats: the calibration unit shines with one of its LEDs; what it lights is far from even.
+"""Light of flats: one LED of the calibration unit, or the lamp of a dome, illuminates the detector unevenly.
 
-Each has its own wavelengths: of as much light the band detects more or less. A dome has one
-lamp, as bright in all bands.
+LEDs have different wavelengths, so that a band detects different fractions of their photons. A dome has one lamp, which
+has the same signal in all bands.
 """
 
 from __future__ import annotations
@@ -21,14 +21,35 @@ from truesky.render.effects.effect import Effect
 from truesky.render.effects.light import illumination
 from truesky.render.effects.scene import Frame, Scene
 
-# Standard deviations in a full width at half maximum.
+# Full width at half maximum of a Gaussian in standard deviations.
 _FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
 
 
 def apply(frame: Frame, level: float, columns: Frame, rows: Frame, rng: np.random.Generator | None = None) -> Frame:
-    """frame [ny, nx] expected e- -> plus level (1 + columns [nx] + rows [ny]).
+    """Add the light of a lamp.
 
-    level : expected e-;  rng : not used
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Expected electrons.
+    level : float
+        Expected electrons of the lamp where its pattern is 1, 0 to 1e9.
+    columns : float array, shape (nx,)
+        Term of the pattern that depends on the column.
+    rows : float array, shape (ny,)
+        Term of the pattern that depends on the row. The pattern is 1 + columns + rows.
+    rng : numpy.random.Generator, optional
+        Not used.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Expected electrons including the lamp.
+
+    Raises
+    ------
+    OutOfRange
+        If `level` is outside its limits.
     """
     if not 0.0 <= level <= 1e9:
         raise OutOfRange("lamp", level, 0.0, 1e9)
@@ -36,9 +57,28 @@ def apply(frame: Frame, level: float, columns: Frame, rows: Frame, rng: np.rando
 
 
 def pattern(scene: Scene, led: int, nx: int, ny: int) -> tuple[Frame, Frame]:
-    """What an LED lights: a paraboloid, and a slope whose direction is the LED's place on the unit.
+    """Illumination by an LED: a paraboloid and a slope whose direction depends on the LED's position in the unit.
 
-    scene : with the parameters of the unit;  led : its number;  nx, ny : pixels of the detector
+    Parameters
+    ----------
+    scene : Scene
+        The exposure, with the parameters of the calibration unit.
+    led : int
+        Number of the LED, from 1.
+    nx, ny : int
+        Columns and rows of the detector.
+
+    Returns
+    -------
+    columns : float array, shape (nx,)
+        Term of the pattern that depends on the column.
+    rows : float array, shape (ny,)
+        Term of the pattern that depends on the row. The pattern is 1 + columns + rows.
+
+    Raises
+    ------
+    OutOfRange
+        If the camera has no LED with this number.
     """
     leds = lamps.count(scene.section)
     if not 1 <= led <= leds:
@@ -50,18 +90,38 @@ def pattern(scene: Scene, led: int, nx: int, ny: int) -> tuple[Frame, Frame]:
 
 
 def efficiency_of_scene(scene: Scene, led: int) -> float:
-    """What the scene's band detects of an LED's photons, as `seen_in`."""
+    """Return the efficiency of an LED in the band of the scene, see `led_efficiency`."""
     band = scene.band or passbands.load(LAMPS[scene.section][1][0])
     return led_efficiency(band, led, scene.section, scene.mission)
 
 
 def led_efficiency(band: Passband, led: int, section: str, mission: MissionConfiguration) -> float:
-    """What a band detects of an LED's photons, over what the embedded bands would where they see best; no unit.
+    """Fraction of an LED's photons that a band detects, relative to the highest response of the embedded bands.
 
-    led     : its number, from 1;  band : passband
-    section : of the camera, "vis" or "nisp";  mission : the mission database
-    Error   : the LED's spectrum is taken as a Gaussian of its central wavelength and width
-    Errors  : OutOfRange for a number that no LED has
+    Parameters
+    ----------
+    band : Passband
+        Passband.
+    led : int
+        Number of the LED, from 1.
+    section : str
+        Camera in the mission database, "vis" or "nisp".
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    float
+        Relative efficiency, dimensionless.
+
+    Raises
+    ------
+    OutOfRange
+        If the camera has no LED with this number.
+
+    Notes
+    -----
+    The spectrum of an LED is a Gaussian with its central wavelength and width.
     """
     width = _width(section, mission)
     detected = float(np.sum(detected_photons(band, led, section, mission)) / (width * np.sqrt(2.0 * np.pi)))
@@ -70,14 +130,33 @@ def led_efficiency(band: Passband, led: int, section: str, mission: MissionConfi
 
 @cache
 def _best_response(section: str) -> float:
-    """The largest response of the embedded bands of a camera."""
+    """Return the highest response of the embedded bands of a camera."""
     return max(float(passbands.load(name).response.max()) for name in LAMPS[section][1])
 
 
 def detected_photons(band: Passband, led: int, section: str, mission: MissionConfiguration) -> Float:
-    """float64[n] what a band detects of an LED's photons, at its wavelengths 1 A apart, on any scale; as `seen_in`.
+    """Relative number of an LED's photons that a band detects, by wavelength.
 
-    band, led, section, mission : of `seen_in`
+    Parameters
+    ----------
+    band : Passband
+        Passband.
+    led : int
+        Number of the LED, from 1.
+    section : str
+        Camera in the mission database, "vis" or "nisp".
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    float64 array, shape (n,)
+        Detected photons at the wavelengths of `band` (steps of 1 Angstrom), in arbitrary units.
+
+    Raises
+    ------
+    OutOfRange
+        If the camera has no LED with this number.
     """
     leds, _ = LAMPS[section]
     if not 1 <= led <= leds:
@@ -87,7 +166,7 @@ def detected_photons(band: Passband, led: int, section: str, mission: MissionCon
 
 
 def _width(section: str, mission: MissionConfiguration) -> float:
-    """Standard deviation, A."""
+    """Standard deviation of an LED's spectrum in Angstrom."""
     return float(10.0 * mission.value(f"{section}.flat.led_width", "nm") / _FWHM)
 
 

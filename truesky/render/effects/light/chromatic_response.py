@@ -1,25 +1,18 @@
-"""Chromatic response: how a pixel's quantum efficiency departs, with the wavelength, from that of all pixels.
+"""Chromatic response: the wavelength dependence of the quantum efficiency differs from pixel to pixel.
 
-The efficiency of pixel p is that of the passband times
+The efficiency of pixel p is that of the passband multiplied by::
 
     1 + s_p f1(lambda) + c_p f2(lambda)
 
-beside its grey part, which is `pixel_response`; never less than 0.  The mission database has f1, a slope, and f2, a
-curvature, by wavelength; s and c are maps of the detector, each the sum of a smooth map and of one from pixel to pixel.
-Light whose photons have the shares w in wavelengths meets sum w f.  That of flat f_nu meets the means of f over the
-band: all light in a band sees this difference of the pixels, and a flat of another band has another.  What a light
-meets besides is F, its sum w f less these means. Sources are drawn three times: as they are, and with each photon times
-f1, and times f2, less the means.
+and at least 0. The grey part of the response is in `pixel_response`. The mission database contains f1, a slope, and f2,
+a curvature, as functions of wavelength. The maps s and c of a detector are each the sum of a smooth map and a map with
+independent pixels.
 
-What F changes by less than is noticed in its source's brightest pixel is not drawn again.
-
-EFFECT, LAMP   the light of the sky and its sources, and of a lamp, as the pixels see it
-maps       s and c of a detector
-means      f1 and f2 over a band
-table      f1 and f2 in the parts of a band;  spectrum : at every wavelength
-colours    F1 and F2 of lights;  of_lines : of light at given wavelengths
-tints      the light of sources, each photon times f1, and times f2
-changes    the most that the colour of each source changes
+Light whose photons have the fractions w in wavelengths has the response sum w f. For light with flat f_nu this is the
+mean of f over the band. It is common to all light in the band and differs from band to band, also in flats. The
+additional response of a light is its colour F, sum w f minus this mean. Sources are drawn three times: normally, and
+with each photon multiplied by f1 and by f2, minus their means. A source is not drawn again if its colour changes its
+brightest pixel by less than is noticeable.
 """
 
 from __future__ import annotations
@@ -44,10 +37,10 @@ from truesky.render.effects.scene import Frame, Scene
 from truesky.render.psf.sub_bands import sub_bands
 from truesky.render.sky import diffuse_light
 
-# Nodes of a smooth map along a side of the detector; between them it is bilinear.
+# Nodes of a smooth map along each side of the detector. The map is bilinear between them.
 _NODES = 9
-# By what part of the rms of f over a band the light in a PSF's middle, and in its wings, differs in colour from all of
-# it: measured of NISP's, 0.07 to 0.1.
+# Difference in colour between the core or wings of a PSF and its total light, as a fraction of the rms of f over a
+# band. The PSFs of NISP have 0.07 to 0.1.
 _PSF_COLOUR = 0.1
 
 
@@ -59,11 +52,25 @@ def apply(
     curvature: float,
     rng: np.random.Generator,
 ) -> Frame:
-    """frame [ny, nx] expected e- -> as the pixels see it.
+    """Apply the chromatic response to a frame.
 
-    lit  : [2, ny, nx] e- of the frame's light, each photon of it times f1, and times f2, told from their means
-    even : [2] these means, as of `means`
-    slope, curvature, rng : as of `maps`
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Expected electrons.
+    chromatic_light : float array, shape (2, ny, nx)
+        Light of the frame in electrons, with each photon multiplied by f1 and by f2, minus their means over the band.
+    mean_components : float array, shape (2,)
+        Means of f1 and f2 over the band, see `band_means`.
+    slope, curvature : float
+        Same as in `draw_maps`.
+    rng : numpy.random.Generator
+        Random numbers of the detector, the same in every exposure.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Expected electrons, 0 or more.
     """
     out = np.array(frame, float)
     up, across = _node_positions(out.shape)
@@ -81,10 +88,21 @@ def apply(
 
 
 def draw_maps(shape: tuple[int, int], slope: float, curvature: float, rng: np.random.Generator) -> Frame:
-    """float64[2, ny, nx]: s and c of every pixel, normally distributed; half of their variance is of the smooth map.
+    """Draw the maps s and c of a detector from normal distributions; the smooth map has half of their variance.
 
-    shape : ny, nx;  slope, curvature : rms of s and c
-    rng   : random numbers of the detector's pixels
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and columns.
+    slope, curvature : float
+        Standard deviations of s and c, 0 to 0.5.
+    rng : numpy.random.Generator
+        Random numbers of the detector, the same in every exposure.
+
+    Returns
+    -------
+    float64 array, shape (2, ny, nx)
+        The maps s and c.
     """
     out = np.zeros((2, *shape))
     up, across = _node_positions(shape)
@@ -94,27 +112,27 @@ def draw_maps(shape: tuple[int, int], slope: float, curvature: float, rng: np.ra
 
 
 def _draw_patterns(slope: float, curvature: float, rng: np.random.Generator) -> list[tuple[int, Float, float, Any]]:
-    """(0 or 1, nodes of its smooth map, rms, key of the random numbers of its pixels) of s, and of c."""
+    """Return (index, nodes of the smooth map, standard deviation, key of random numbers) for s (0) and c (1)."""
     patterns = []
     for component, (name, value) in enumerate((("slope", slope), ("curvature", curvature))):
         if not 0.0 <= value <= 0.5:
             raise OutOfRange(f"chromatic response, {name}", value, 0.0, 0.5)
         nodes = rng.standard_normal((_NODES, _NODES))
-        # To the mean and the rms that are asked for, of so few numbers.
+        # The sample is small: scale it to a mean of exactly 0 and a standard deviation of exactly 1.
         nodes = (nodes - nodes.mean()) / nodes.std()
         patterns.append((component, nodes, value * float(np.sqrt(0.5)), pixel_random.draw_key(rng)))
     return patterns
 
 
 def _node_positions(shape: tuple[int, ...]) -> tuple[Float, Float]:
-    """Of each row and of each column its place among the nodes."""
+    """Return the positions of rows and of columns in units of nodes."""
     up, across = (np.linspace(0.0, _NODES - 1.0, max(n, 2))[:n] for n in shape)
     return up, across
 
 
 @jit
 def _add_pattern(out: Any, light: Any, nodes: Any, up: Any, across: Any, rms: float, key: Any) -> None:
-    """Adds light times the map."""
+    """Add light times the map to `out`."""
     ny, nx = out.shape
     for y in range(ny):
         j = min(int(up[y]), len(nodes) - 2)
@@ -124,38 +142,76 @@ def _add_pattern(out: Any, light: Any, nodes: Any, up: Any, across: Any, rms: fl
             u = across[x] - i
             low = (1.0 - u) * nodes[j, i] + u * nodes[j, i + 1]
             high = (1.0 - u) * nodes[j + 1, i] + u * nodes[j + 1, i + 1]
-            # Of numbers between nodes the variance is 4/9 of that at the nodes, in both directions together.
+            # Bilinear interpolation reduces the mean variance to 4/9 of the variance at the nodes.
             smooth = 1.5 * ((1.0 - v) * low + v * high)
             out[y, x] += light[y, x] * rms * (smooth + pixel_random.normal(pixel_random.pixel_bits(key, y * nx + x)))
 
 
 def _components_in_sub_bands(section: str, band: Passband, mission: MissionConfiguration) -> Float:
-    """float64[PARTS, 2]: f1 and f2 in the parts of a band."""
+    """Return f1 and f2 in the sub-bands of a band, float64[n, 2]."""
     parts = sub_bands(band)
     return np.array([_mean(section, part.wavelength, part.response / part.wavelength, mission) for part in parts])
 
 
 def band_means(section: str, band: Passband, mission: MissionConfiguration) -> Float:
-    """float64[2]: f1 and f2 that light of flat f_nu meets in a band.
+    """Means of f1 and f2 over a band, for light with flat f_nu.
 
-    section, mission : of the camera in the mission database;  band : a passband
+    Parameters
+    ----------
+    section : str
+        Section of the camera in the mission database.
+    band : Passband
+        Passband.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    float64 array, shape (2,)
+        Means of f1 and f2.
     """
     return np.asarray(np.mean(_components_in_sub_bands(section, band, mission), axis=0))
 
 
 def sub_band_components(section: str, band: Passband, mission: MissionConfiguration) -> Float:
-    """float64[PARTS, 2]: f1 and f2 in the parts of a band, told from their means over it.
+    """Mean f1 and f2 in each sub-band of a band, minus their means over the band.
 
-    section, mission : of the camera in the mission database;  band : a passband
+    Parameters
+    ----------
+    section : str
+        Section of the camera in the mission database.
+    band : Passband
+        Passband.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    float64 array, shape (n, 2)
+        f1 and f2 of each sub-band.
     """
     components = _components_in_sub_bands(section, band, mission)
     return np.asarray(components - np.mean(components, axis=0))
 
 
 def component_spectra(section: str, wavelength: Float, band: Passband, mission: MissionConfiguration) -> Float:
-    """float64[w, 2]: f1 and f2 told from their means over a band.
+    """Values of f1 and f2 at wavelengths, minus their means over a band.
 
-    wavelength : [w] A;  section, mission : of the camera in the mission database;  band : a passband
+    Parameters
+    ----------
+    section : str
+        Section of the camera in the mission database.
+    wavelength : float array, shape (w,)
+        Wavelengths in Angstrom.
+    band : Passband
+        Passband.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    float64 array, shape (w, 2)
+        f1 and f2 at each wavelength.
     """
     nodes, *components = np.array(mission.numbers(f"{section}.response.components")).T
     values = np.stack([np.interp(1e-4 * wavelength, nodes, f) for f in components], axis=1)
@@ -165,10 +221,25 @@ def component_spectra(section: str, wavelength: Float, band: Passband, mission: 
 def colour_of_lines(
     section: str, band: Passband, wavelength: Float, photons: Float, mission: MissionConfiguration
 ) -> Float:
-    """float64[2]: F1 and F2 of light of which a band detects `photons` [n] at wavelengths [n] A, as of `colours`.
+    """Colours F1 and F2 of light at given wavelengths.
 
-    section, mission    : of the camera in the mission database;  band : a passband
-    wavelength, photons : of the light
+    Parameters
+    ----------
+    section : str
+        Section of the camera in the mission database.
+    band : Passband
+        Passband.
+    wavelength : float array, shape (n,)
+        Wavelengths of the light in Angstrom.
+    photons : float array, shape (n,)
+        Photons that the band detects at each wavelength, in arbitrary units.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    float64 array, shape (2,)
+        F1 and F2, minus the means of f1 and f2 over the band.
     """
     return np.asarray(_mean(section, wavelength, photons, mission) - band_means(section, band, mission))
 
@@ -179,9 +250,10 @@ def _mean(section: str, wavelength: Float, photons: Float, mission: MissionConfi
 
 
 def source_colours(shares: Float, components: Float) -> Float:
-    """float64[n, 2]: F1 and F2 of lights.
+    """Return the colours F1 and F2 of sources, float64[n, 2].
 
-    shares : [n, PARTS] of their photons in the parts of a band;  components : of `table`
+    `shares` [n, sub-bands] are the fractions of their photons in each sub-band, and `components` is the result of
+    `sub_band_components`.
     """
     return np.asarray(matrices.matmul(shares, components))
 
@@ -189,17 +261,33 @@ def source_colours(shares: Float, components: Float) -> Float:
 def weighted_light(
     electrons: Float, shares: Float, components: Float, draw: Callable[[Float, Float], Frame]
 ) -> Float32:
-    """float32[2, ny, nx]: the light of sources, each photon of it times f1, and times f2.
+    """Draw the light of sources with each photon multiplied by f1 and by f2.
 
-    Blue light is concentrated in the middle of the PSF: what two colours change of a pixel is not the colour of the
-    source alone.
-    electrons : [n] of each;  shares, components : as of `colours`
-    draw      : (electrons, 0 or more, and shares of the sources) -> [ny, nx] their light
+    Parameters
+    ----------
+    electrons : float array, shape (n,)
+        Electrons of each source.
+    shares : float array, shape (n, sub-bands)
+        Fractions of the photons in each sub-band.
+    components : float array, shape (sub-bands, 2)
+        Result of `sub_band_components`.
+    draw : callable
+        Function (electrons, shares) -> image of the sources, shape (ny, nx). The electrons must be 0 or more.
+
+    Returns
+    -------
+    float32 array, shape (2, ny, nx)
+        Weighted light in electrons.
+
+    Notes
+    -----
+    Blue light is concentrated in the core of the PSF. The change of a pixel therefore depends on the shape of the PSF
+    and not only on the colour of the source.
     """
     drawn = draw(electrons, shares)
     out = np.empty((2, *drawn.shape), np.float32)
     for k in (0, 1):
-        # No part has less than no light.
+        # Subtract the lowest weight so that no sub-band has negative light.
         lowest = float(components[:, k].min())
         weighted = shares * (components[:, k] - lowest)
         weight = weighted.sum(axis=1)
@@ -209,30 +297,43 @@ def weighted_light(
 
 
 def colour_changes(peak: Float, colours: Float, components: Float, strength: tuple[float, float]) -> Float:
-    """[n] the most that the colour of each source changes in a pixel, e- rms.
+    """Largest change of a pixel by the colour of each source.
 
-    peak : [n] e- in the brightest pixel of each;  own, components : of `colours` and `table`
-    strength : slope and curvature, rms of the maps
+    Parameters
+    ----------
+    peak : float array, shape (n,)
+        Electrons in the brightest pixel of each source.
+    colours : float array, shape (n, 2)
+        Result of `source_colours`.
+    components : float array, shape (sub-bands, 2)
+        Result of `sub_band_components`.
+    strength : (float, float)
+        Standard deviations of the maps s and c.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Change in electrons rms.
     """
     largest = np.abs(colours) + _PSF_COLOUR * components.std(axis=0)
     return np.asarray(peak * np.hypot(*(largest * np.array(strength)).T))
 
 
 def map_strength(scene: Scene) -> tuple[float, float]:
-    """rms of s and of c."""
+    """Return the standard deviations of s and c."""
     return scene.value("response.slope", ""), scene.value("response.curvature", "")
 
 
 def band_of_scene(scene: Scene) -> Passband:
-    """The exposure's passband; without one, the first of the camera's."""
+    """Return the passband of the exposure, or the first of the camera if the exposure has none."""
     return scene.band or passbands.load(LAMPS[scene.section][1][0])
 
 
-# ---------------------------------------------------------------------------------------------- the sky, and a lamp
+# ------------------------------------------------------------------------------------------------------ sky and lamp
 
 
 def _colour_of_light(scene: Scene, photons: Float) -> Float:
-    """F1 and F2 of light of which the band detects photons [n] by wavelength; 0 where it detects none."""
+    """Return F1 and F2 of light with these detected photons by wavelength, or 0 without photons."""
     band = band_of_scene(scene)
     if not photons.sum() > 0.0:
         return np.zeros(2)
@@ -240,7 +341,10 @@ def _colour_of_light(scene: Scene, photons: Float) -> Float:
 
 
 def _sky_colour(scene: Scene) -> Float:
-    """e- of the sky times F1, and F2.  Error: of its light all but the thermal is taken as the Sun's."""
+    """Return the electrons of the sky multiplied by F1 and F2.
+
+    All light except thermal emission is assumed to have the colour of the Sun.
+    """
     if not scene.sky_rate > 0.0:
         return np.zeros(2)
     photons = diffuse_light.photons(scene.section, scene.sky_rate, band_of_scene(scene), scene.mission)
@@ -252,7 +356,7 @@ def _band_means_of_scene(scene: Scene) -> Float:
 
 
 def _change_rms(scene: Scene, light: Float) -> float:
-    """e- rms that the maps change of light [2], e- times f1, and f2."""
+    """Return the change by the maps in electrons rms, from light in electrons multiplied by f1 and f2."""
     return float(np.hypot(*(np.array(map_strength(scene)) * light)))
 
 
@@ -272,12 +376,12 @@ def _contribution(scene: Scene) -> float:
 
 
 def _sky_change(scene: Scene) -> float:
-    """What a source changes is not there again in the next dither."""
+    """Return the change of the sky in electrons rms; changes of sources average out between dithers."""
     return _change_rms(scene, _sky_colour(scene) + scene.sky_electrons * _band_means_of_scene(scene))
 
 
 def _lamp_colour(scene: Scene) -> Float:
-    """e- of a lamp, where it shines straight, times F1, and F2."""
+    """Return the electrons of a lamp multiplied by F1 and F2, where its pattern is 1."""
     band = band_of_scene(scene)
     level = calibration_lamp.EFFECT.contribution(scene)
     return level * _colour_of_light(
@@ -301,7 +405,7 @@ def _lamp_change(scene: Scene) -> float:
     )
 
 
-# Most of the cost of the first is for the light that is drawn again.
+# Most of the cost of `EFFECT` is for sources that are drawn again.
 EFFECT = Effect("chromatic_response", apply, _parameters, _contribution, fixed=True, systematic=_sky_change, cost=5e-2)
 LAMP = Effect(
     "lamp_response", apply, _lamp_parameters, _lamp_change, fixed=True, random_stream=EFFECT.name, cost=1.5e-2

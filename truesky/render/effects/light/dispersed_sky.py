@@ -1,8 +1,8 @@
-"""The diffuse sky through a grism: what its orders change of the even background that the passband gives.
+"""Diffuse sky through a grism: the change by its orders relative to the uniform background of the passband.
 
-A pixel sees light of each wavelength from another place of the sky, by each order; on an even sky that is as if nothing
-were spread out, but for the light that other orders than the first add, and for places beyond the field stop, which
-send none.
+A pixel receives light of each wavelength from a different point of the sky, by each order. For a uniform sky the result
+is the undispersed background, with two differences: other orders than the first add light, and points outside the field
+stop contribute none.
 """
 
 from __future__ import annotations
@@ -15,14 +15,31 @@ from truesky.render.effects.scene import Frame, Scene
 
 
 def apply(frame: Frame, nodes: Frame | None, rng: np.random.Generator | None = None) -> Frame:
-    """frame [ny, nx] e- -> plus what the nodes have, linearly between them.
+    """Add values at nodes, interpolated linearly between them.
 
-    nodes : [gy, gx] e- at places evenly over the frame, its corners among them; None = nothing;  rng : not used
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Expected electrons.
+    nodes : float array, shape (gy, gx), or None
+        Electrons on an even grid over the frame that includes its corners. None to add nothing.
+    rng : numpy.random.Generator, optional
+        Not used.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Expected electrons including the change of the sky.
+
+    Raises
+    ------
+    BadInput
+        If the grid has fewer than two nodes along a side or values that are not finite.
     """
     if nodes is None:
         return np.array(frame, dtype=float)
     if min(nodes.shape) < 2 or not np.isfinite(nodes).all():
-        raise BadInput(f"a dispersed sky of {nodes.shape} places, or one that is not finite")
+        raise BadInput(f"dispersed sky must have finite values on 2 x 2 nodes or more, got the shape {nodes.shape}")
     ny, nx = frame.shape
     x_fraction, x_node = _node_fractions(nodes.shape[1], nx)
     across = nodes[:, x_node] * (1.0 - x_fraction) + nodes[:, x_node + 1] * x_fraction
@@ -34,7 +51,7 @@ def apply(frame: Frame, nodes: Frame | None, rng: np.random.Generator | None = N
 
 
 def _node_fractions(nodes: int, pixels: int) -> tuple[Frame, np.ndarray[tuple[int], np.dtype[np.int64]]]:
-    """(part of the way to the next node, the node before) of each pixel."""
+    """Return (fraction of the distance to the next node, index of the previous node) for each pixel."""
     position = np.linspace(0.0, nodes - 1.0, pixels)
     node = np.minimum(position.astype(np.int64), nodes - 2)
     return position - node, node

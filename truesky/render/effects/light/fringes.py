@@ -1,8 +1,8 @@
-"""Fringes: red light of the sky's lines interferes with itself between the faces of a detector.
+"""Fringes: red emission lines of the sky interfere between the two faces of a detector.
 
-The silicon's thickness varies by some wavelengths over a detector, and fringes follow lines of equal thickness. A few
-lines of hydroxyl are in a band: where their fringes coincide the contrast is large, elsewhere small. Sources, whose
-light is of all wavelengths, have none.
+The thickness of the silicon varies by several wavelengths over a detector, and fringes follow lines of equal thickness.
+A band contains a few lines of hydroxyl. The contrast is high where their fringes coincide and low elsewhere. Sources
+have no fringes because their light has a continuous spectrum.
 """
 
 from __future__ import annotations
@@ -19,22 +19,44 @@ from truesky.numerics.compiling import jit
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
 
-# Wave numbers of lines over their mean, and their light: four groups of lines, as in z and y (assumed).
+# Relative wave numbers and intensities of four groups of lines, as in the z and y bands (assumed).
 _LINES = ((0.965, 0.2), (0.99, 0.35), (1.0, 0.25), (1.03, 0.2))
-# Wavelengths in the way through the detector and back, and the changes of thickness over it by their number of half
-# waves along each side, of which the longer are the larger.
+# Number of wavelengths in the path through the detector and back. The thickness varies with up to _MODES half waves
+# along each side, whose amplitudes fall with this exponent of the number.
 _ORDERS, _MODES, _STEEPNESS = 120.0, 4, 1.5
-# Pixels between places at which the thickness is told, and steps of a cycle in the table.
+# Node spacing of the thickness map in pixels, and samples per fringe cycle in the lookup table.
 _NODE_SPACING, _STEPS_PER_CYCLE = 8, 64
 
 
 def apply(frame: Frame, electrons: float, amplitude: float, period: float, rng: np.random.Generator) -> Frame:
-    """frame [ny, nx] e- -> plus electrons times a fixed pattern of the detector.
+    """Add fringes of the sky: a fixed pattern of the detector.
 
-    electrons : of the sky in a pixel
-    amplitude : of the sky, where the fringes are strongest;  period : mean distance of two fringes, pixels
-    rng       : random numbers of the detector
-    Error     : 1e-3 of the amplitude, of the table and of the thickness between its places
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Expected electrons.
+    electrons : float
+        Electrons of the sky per pixel.
+    amplitude : float
+        Amplitude of the strongest fringes as a fraction of the sky, 0 to 1.
+    period : float
+        Mean distance of fringes in pixels, 4 to 1e5.
+    rng : numpy.random.Generator
+        Random numbers of the detector, the same in every exposure.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Expected electrons including fringes.
+
+    Raises
+    ------
+    OutOfRange
+        If `amplitude` or `period` is outside its limits.
+
+    Notes
+    -----
+    The lookup table and the interpolation of the thickness have an error of 1e-3 of the amplitude.
     """
     if not 0.0 <= amplitude <= 1.0:
         raise OutOfRange("fringes", amplitude, 0.0, 1.0)
@@ -52,19 +74,31 @@ def apply(frame: Frame, electrons: float, amplitude: float, period: float, rng: 
 
 
 def contrast(cycles: Float) -> Float:
-    """In [-1, 1] where light of the mean wave number is so many cycles behind."""
+    """Return the contrast of fringes, -1 to 1, for a path difference in cycles of the mean wave number."""
     waves, light = np.array(_LINES).T
     terms = np.cos(2.0 * np.pi * np.multiply.outer(cycles, waves)) * (light / light.sum())
     return np.asarray(terms.sum(axis=1))
 
 
 def phase(nx: int, ny: int, period: float, rng: np.random.Generator) -> Float:
-    """[n, m] cycles at places `_NODES` pixels apart, from pixel 0 on: smooth, of the given mean distance of cycles.
+    """Draw a smooth map of the path difference in cycles.
 
-    nx, ny : pixels;  period : pixels;  rng : random numbers of the detector
+    Parameters
+    ----------
+    nx, ny : int
+        Columns and rows of the detector.
+    period : float
+        Mean distance of cycles in pixels.
+    rng : numpy.random.Generator
+        Random numbers of the detector, the same in every exposure.
+
+    Returns
+    -------
+    float array, shape (n, m)
+        Cycles at nodes that are `_NODE_SPACING` pixels apart, from pixel 0.
     """
     across, up = (np.arange((n - 1) // _NODE_SPACING + 2) * float(_NODE_SPACING) for n in (nx, ny))
-    # Over the longer side, so that fringes are as wide in both directions.
+    # The longer side sets the scale of both directions, so that fringes are isotropic.
     side = float(max(nx, ny, 4 * _NODE_SPACING))
     number = np.arange(_MODES + 1)
     strength = rng.standard_normal((_MODES + 1, _MODES + 1)) / (1.0 + np.hypot.outer(number, number)) ** _STEEPNESS
@@ -81,7 +115,7 @@ def phase(nx: int, ny: int, period: float, rng: np.random.Generator) -> Float:
 
 @jit
 def _add_fringes(frame: Any, nodes: Any, table: Any, first: float) -> None:
-    """Adds the table at the phase of each pixel, bilinear between the nodes."""
+    """Add the lookup table at the phase of each pixel, which is bilinear between the nodes."""
     ny, nx = frame.shape
     line = np.empty(nodes.shape[1])
     for r in range(ny):
@@ -96,7 +130,10 @@ def _add_fringes(frame: Any, nodes: Any, table: Any, first: float) -> None:
 
 
 def parameters(scene: Scene) -> tuple[float, float, float]:
-    """Nothing in a band of which the mission database has no amplitude, or where the band is not known."""
+    """Return the electrons of the sky, and amplitude and period of the fringes.
+
+    The amplitude is 0 if the mission database has none for the band, or if the band is not known.
+    """
     key = "" if scene.band is None else f"{scene.section}.{scene.band.name}.fringes"
     amplitude = scene.mission.value(key) if key in scene.mission else 0.0
     return scene.sky_electrons, amplitude, scene.value("fringe_period", "pix") if amplitude else 1e3

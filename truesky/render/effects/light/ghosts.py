@@ -1,9 +1,7 @@
-"""Ghosts: light that is reflected twice in a plate makes a defocused image of the pupil beside each bright star.
+"""Ghosts: light that is reflected twice in a plate forms a defocused image of the pupil near each bright star.
 
-An annulus with the gaps of the three arms that hold the secondary mirror; of even surface brightness.
-
-EFFECT    of the dichroic
-FILTER    of the filter
+A ghost is an annulus of uniform surface brightness, with gaps for the three arms that hold the secondary mirror.
+`EFFECT` are ghosts of the dichroic, `FILTER` ghosts of the filter.
 """
 
 from __future__ import annotations
@@ -18,16 +16,23 @@ from truesky.numerics.compiling import jit
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import NOTICEABLE, Frame, Lights, Scene
 
-# Samples across a pixel of the border, for pixels that are cut.
+# Samples along each side of a pixel, for pixels at the border.
 _SUBSAMPLES = 4
 
 
 class Pupil(NamedTuple):
-    """The image of the pupil, pixels.
+    """Image of the pupil in pixels.
 
-    radius : of the outer edge;  hole : the inner radius over the outer
-    arms   : of each its middle's column and row from the centre, its angle from x to y (degrees), half its length
-    width  : of all arms
+    Attributes
+    ----------
+    radius : float
+        Outer radius, 0.5 to 1e4.
+    hole : float
+        Inner radius relative to the outer radius, 0 to 0.99.
+    arms : tuple of (float, float, float, float)
+        For each arm: column and row of its middle relative to the centre, angle from x to y in degrees, half length.
+    width : float
+        Width of all arms, 0 to `radius`.
     """
 
     radius: float
@@ -40,10 +45,32 @@ def apply(
     frame: Frame, lights: Lights, ratio: float, offset: tuple[float, float], pupil: Pupil,
     rng: np.random.Generator | None = None,
 ) -> Frame:  # fmt: skip
-    """frame [ny, nx] e- -> plus the ghost of every light, also of those outside the frame.
+    """Add the ghost of every light, also of lights outside the frame.
 
-    ratio : light of a ghost over its star's;  offset : (columns, rows) from star to ghost
-    lights : positions and electrons of stars;  pupil : shape of a ghost;  rng : not used
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Expected electrons.
+    lights : Lights
+        Positions and electrons of stars.
+    ratio : float
+        Flux of a ghost relative to its star, 0 to 1.
+    offset : (float, float)
+        Columns and rows from a star to its ghost.
+    pupil : Pupil
+        Shape of a ghost.
+    rng : numpy.random.Generator, optional
+        Not used.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Expected electrons including ghosts.
+
+    Raises
+    ------
+    OutOfRange
+        If `ratio` or a value of `pupil` is outside its limits.
     """
     radius, hole, arms, width = pupil
     for name, value, lowest, highest in (
@@ -63,7 +90,7 @@ def apply(
 
 @jit
 def _pupil_image(radius: float, hole: float, arms: Any, width: float) -> Any:
-    """What of each pixel is lit: [n, n], n odd, its middle the centre."""
+    """Return the illuminated fraction of each pixel, shape (n, n) with n odd and the centre in the middle pixel."""
     half = int(np.ceil(radius)) + 1
     stamp = np.zeros((2 * half + 1, 2 * half + 1))
     for r in range(2 * half + 1):
@@ -85,7 +112,7 @@ def _pupil_image(radius: float, hole: float, arms: Any, width: float) -> Any:
 
 @jit
 def _add_stamps(frame: Any, column: Any, row: Any, electrons: Any, stamp: Any) -> None:
-    """Adds stamps, shifted by parts of a pixel: shares of four pixels each."""
+    """Add shifted stamps with bilinear interpolation."""
     ny, nx = frame.shape
     half = len(stamp) // 2
     for i in range(len(column)):
@@ -105,9 +132,10 @@ def _add_stamps(frame: Any, column: Any, row: Any, electrons: Any, stamp: Any) -
 
 
 def parameters(scene: Scene, plate: str = "ghost") -> tuple[Any, ...]:
-    """Of the mission database; the offset is along the focal plane's y axis, and the arms are the pupil's.
+    """Return the parameters of `apply` from the mission database, for ghosts of a plate.
 
-    plate : whose ghosts, a prefix of their parameters
+    `plate` is the prefix of their parameters. The offset is along the y axis of the focal plane, and the arms are those
+    of the telescope's pupil.
     """
     rotation = scene.detector.rotation if scene.detector is not None else 0.0
     cosine, sine = float(np.cos(np.radians(rotation))), float(np.sin(np.radians(rotation)))
@@ -121,7 +149,7 @@ def parameters(scene: Scene, plate: str = "ghost") -> tuple[Any, ...]:
     scale = radius / aperture
     reach = scale * pupil_value("spider_half_length", "mm")
     places = [[scale * pupil_value(f"spider{number}.{axis}", "mm") for axis in "xy"] for number in (1, 2, 3)]
-    # From the focal plane's axes to the detector's.
+    # Rotate from the axes of the focal plane to the axes of the detector.
     arms = tuple(
         (x * cosine + y * sine, y * cosine - x * sine, pupil_value(f"spider{number}.angle", "deg") - rotation, reach)
         for number, (x, y) in enumerate(places, start=1)
@@ -137,7 +165,22 @@ def parameters(scene: Scene, plate: str = "ghost") -> tuple[Any, ...]:
 
 
 def noticeable_lights(scene: Scene, ratio: float, plate: str = "ghost") -> Lights:
-    """The lights whose ghost, taken as a whole, is not lost in the noise of the pixels it covers."""
+    """Lights whose ghost as a whole exceeds the noise of its pixels.
+
+    Parameters
+    ----------
+    scene : Scene
+        The exposure.
+    ratio : float
+        Flux of a ghost relative to its star.
+    plate : str, optional
+        Prefix of the parameters of ghosts.
+
+    Returns
+    -------
+    Lights
+        Selected lights.
+    """
     area = np.pi * scene.value(f"{plate}.radius_out", "pix") ** 2
     lights = scene.lights
     bright = ratio * lights.electrons > NOTICEABLE * scene.pixel_noise * np.sqrt(area)
@@ -145,14 +188,14 @@ def noticeable_lights(scene: Scene, ratio: float, plate: str = "ghost") -> Light
 
 
 def _contribution(scene: Scene, plate: str = "ghost") -> float:
-    """In a pixel, times the root of the pixels that share it: a ghost is one thing."""
+    """Return the electrons per pixel times the square root of the number of pixels: a ghost is noticed as a whole."""
     ratio, radius = scene.value(f"{plate}.flux_ratio", ""), scene.value(f"{plate}.radius_out", "pix")
     brightest = float(scene.lights.electrons.max(initial=0.0))
     return ratio * brightest / float(np.sqrt(np.pi) * radius)
 
 
 def _mean_contribution(scene: Scene, plate: str = "ghost") -> float:
-    """In a pixel: a mean over as many as share it is what it is judged by already."""
+    """Return the electrons per pixel. `_contribution` already includes the mean over the pixels of a ghost."""
     return _contribution(scene, plate) / float(np.sqrt(np.pi) * scene.value(f"{plate}.radius_out", "pix"))
 
 

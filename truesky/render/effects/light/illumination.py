@@ -1,10 +1,7 @@
-"""Illumination: how much light the optics bring to each place of the focal plane, and for how long.
+"""Illumination of the focal plane by the optics (vignetting), and differences of the exposure time by the shutter.
 
-Every map here is 1 + f(column) + g(row): a paraboloid and a slope across the focal plane, in whatever way a detector is
-turned.
-
-pattern     such a map for one detector
-EFFECT      vignetting; SHUTTER: its blades open over one side of the focal plane first, and close over the other
+Every map is 1 + f(column) + g(row): a paraboloid and a slope across the focal plane, for any rotation of the detector.
+The blades of the shutter open on one side of the focal plane first, and close on the other side first.
 """
 
 from __future__ import annotations
@@ -18,12 +15,33 @@ from truesky.render.effects.scene import Frame, Scene
 
 
 def apply(frame: Frame, columns: Frame, rows: Frame, rng: np.random.Generator | None = None) -> Frame:
-    """frame [ny, nx] e- -> times 1 + columns [nx] + rows [ny].
+    """Multiply a frame by 1 + columns + rows.
 
-    rng : not used
+    Parameters
+    ----------
+    frame : float array, shape (..., ny, nx)
+        Expected electrons.
+    columns : float array, shape (nx,)
+        Term that depends on the column.
+    rows : float array, shape (ny,)
+        Term that depends on the row.
+    rng : numpy.random.Generator, optional
+        Not used.
+
+    Returns
+    -------
+    float array, shape of `frame`
+        Expected electrons.
+
+    Raises
+    ------
+    BadInput
+        If the shapes do not match.
+    OutOfRange
+        If the illumination is negative or infinite.
     """
     if frame.shape[-2:] != (len(rows), len(columns)):
-        raise BadInput(f"an illumination of {len(rows)} x {len(columns)} pixels for a frame of {frame.shape[-2:]}")
+        raise BadInput(f"illumination has the shape {(len(rows), len(columns))}, must be {frame.shape[-2:]}")
     if frame.size and not (1.0 + columns.min() + rows.min() >= 0.0 and columns.max() + rows.max() < np.inf):
         raise OutOfRange("illumination", 1.0 + float(columns.min() + rows.min()), 0.0, np.inf)
     out = np.asarray(columns + rows[:, None])
@@ -32,10 +50,25 @@ def apply(frame: Frame, columns: Frame, rows: Frame, rng: np.random.Generator | 
 
 
 def pattern(scene: Scene, nx: int, ny: int, bowl: float, slope: tuple[float, float]) -> tuple[Frame, Frame]:
-    """(columns [nx], rows [ny]) of 1 - bowl r^2 + slope . (x, y); x, y, r = 1 at the edges and corners of the field.
+    """Map 1 - bowl r^2 + slope . (x, y) on a detector, as terms of columns and rows.
 
-    scene       : with the detector's place in the field;  nx, ny : its pixels
-    bowl, slope : fractions at the corners and edges of the field
+    Parameters
+    ----------
+    scene : Scene
+        The exposure, with the position of the detector in the field.
+    nx, ny : int
+        Columns and rows of the detector.
+    bowl : float
+        Loss at the corners of the field as a fraction. The radius r is 1 at the corners.
+    slope : (float, float)
+        Changes at the edges of the field as fractions. The coordinates x and y are 1 at the edges.
+
+    Returns
+    -------
+    columns : float array, shape (nx,)
+        Term that depends on the column.
+    rows : float array, shape (ny,)
+        Term that depends on the row. The map is 1 + columns + rows.
     """
     half_x, half_y = _half_sides(scene)
     corner = float(np.hypot(half_x, half_y))
@@ -46,7 +79,7 @@ def pattern(scene: Scene, nx: int, ny: int, bowl: float, slope: tuple[float, flo
     along, up = scale * (np.arange(nx) - (nx - 1) / 2), scale * (np.arange(ny) - (ny - 1) / 2)
     cosine, sine = np.cos(turn), np.sin(turn)
     sx, sy = slope[0] / half_x, slope[1] / half_y
-    # |c + R d|^2 = |c|^2 + 2 c . R d + |d|^2: no product of column and row.
+    # |c + R d|^2 = |c|^2 + 2 c . R d + |d|^2 contains no product of column and row.
     columns = -bowl * (2 * along * (x0 * cosine + y0 * sine) + along**2) / corner**2
     rows = -bowl * (2 * up * (y0 * cosine - x0 * sine) + up**2) / corner**2
     columns += along * (sx * cosine + sy * sine)
@@ -55,7 +88,7 @@ def pattern(scene: Scene, nx: int, ny: int, bowl: float, slope: tuple[float, flo
 
 
 def _half_sides(scene: Scene) -> tuple[float, float]:
-    """Half the focal plane's sides, arcsec."""
+    """Half the sides of the focal plane in arcsec."""
     detectors = camera_detectors.detectors(scene.section.rpartition(".")[2], scene.mission)
     scale, nx, ny = detectors[0].pixel_scale, detectors[0].nx, detectors[0].ny
     return (
@@ -73,7 +106,7 @@ def _shutter_pattern(scene: Scene) -> tuple[Frame, Frame]:
 
 
 def _shutter_excess(scene: Scene) -> float:
-    """At the side of the focal plane, of the exposure time: the blades take as long whatever that is."""
+    """Relative excess of the exposure time at the edge of the focal plane, for a fixed speed of the blades."""
     time = scene.exposure_time_s
     return float(np.clip(scene.value("shutter_map", "s") / time, -1.0, 1.0)) if time > 0.0 else 0.0
 

@@ -1,10 +1,8 @@
-"""Intra-pixel response: a pixel's centre sees more than its corners, so that sources look a little sharper.
+"""Intra-pixel response: the centre of a pixel is more sensitive than its corners, so that sources are slightly sharper.
 
-Response 1 - a (u^2 + v^2) over the pixel, u and v from -1 to 1; its mean belongs to the quantum efficiency. It is part
-of the pixel's transfer function, with which sources are drawn: once pixels are summed it is too late (a filter on the
-finished image mends no more than half of it).
-
-apply    the pixel's transfer function with the response
+The response is 1 - a (u^2 + v^2) over the pixel, with u and v from -1 to 1. Its mean is part of the quantum efficiency.
+The response belongs to the pixel's transfer function, with which sources are drawn: it cannot be applied after light is
+summed in pixels. A filter on the final image would correct at most half of it.
 """
 
 from __future__ import annotations
@@ -16,15 +14,29 @@ from lake_schema.errors import OutOfRange
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
 
-# Below this the closed form loses digits to its own cancellation; the series of four terms has 1e-12 there.
+# Below this phase the closed form loses digits by cancellation; the series of four terms has an error of 1e-12 there.
 _SMALL = 0.15
 
 
 def apply(x: npt.ArrayLike, y: npt.ArrayLike, strength: float) -> Frame:
-    """Transfer function of the pixel, 1 at 0.
+    """Transfer function of a pixel, normalised to 1 at 0.
 
-    x, y     : [..] cycles a pixel along columns and rows
-    strength : a; 0 = sinc x sinc y
+    Parameters
+    ----------
+    x, y : float array
+        Spatial frequencies along columns and rows in cycles per pixel.
+    strength : float
+        Parameter a of the response, 0 to 0.5. With 0 the result is sinc x sinc y.
+
+    Returns
+    -------
+    float array
+        Transfer function, in the common shape of `x` and `y`.
+
+    Raises
+    ------
+    OutOfRange
+        If `strength` is outside its limits.
     """
     if not 0.0 <= strength <= 0.5:
         raise OutOfRange("intra-pixel strength", strength, 0.0, 0.5)
@@ -35,7 +47,7 @@ def apply(x: npt.ArrayLike, y: npt.ArrayLike, strength: float) -> Frame:
 
 
 def _second_moment(x: Frame) -> Frame:
-    """Mean of u^2 cos(pi x u) over -1 .. 1."""
+    """Return the mean of u^2 cos(pi x u) for u from -1 to 1."""
     phase = np.pi * np.abs(x)
     q = np.where(phase < _SMALL, 1.0, phase)
     closed = np.sin(q) / q + 2.0 * np.cos(q) / q**2 - 2.0 * np.sin(q) / q**3
@@ -50,7 +62,7 @@ def _strength(scene: Scene) -> float:
     return scene.value("intra_pixel_response", "")
 
 
-# Of a VIS star's brightest pixel: this times a.
+# Relative change of the brightest pixel of a VIS star per unit of a.
 _CHANGE = 0.07
 EFFECT = Effect(
     "intra_pixel",

@@ -1,7 +1,7 @@
-"""Area of the sky that a pixel sees: where the optics distort, more of the diffuse sky, or less.
+"""Area of the sky per pixel: distortion changes the light of the diffuse sky in a pixel.
 
-And a tangent plane is larger than the sky. Sources keep their light wherever they lie: theirs is drawn through the same
-Jacobian.
+The projection on a tangent plane also changes the area. Sources keep their flux at any position, because their images
+are drawn through the same Jacobian.
 """
 
 from __future__ import annotations
@@ -16,17 +16,35 @@ from truesky.render.camera.pointing import ARCSEC
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
 
-# Pixels between places at which the largest change is looked for: it is a smooth polynomial.
+# Pixels between samples for the largest change, which is a smooth polynomial.
 _SAMPLE_STEP = 64
 
 
 def apply(
     frame: Frame, electrons: float, u: Frame, v: Frame, stretch: Frame, rng: np.random.Generator | None = None
 ) -> Frame:
-    """frame [ny, nx] e- -> plus electrons times `change`: what a pixel of the boresight's area has of the sky.
+    """Add the difference of the sky by the area of pixels.
 
-    electrons     : of the sky in a pixel at the boresight;  rng : not used
-    u, v, stretch : as of `change`
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Expected electrons with the sky of a pixel at the boresight.
+    electrons : float
+        Electrons of the sky in a pixel at the boresight, 0 or more.
+    u, v, stretch : float array
+        Same as in `area_change`.
+    rng : numpy.random.Generator, optional
+        Not used.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Expected electrons.
+
+    Raises
+    ------
+    OutOfRange
+        If `electrons` is negative or infinite.
     """
     if not 0.0 <= electrons < np.inf:
         raise OutOfRange("sky electrons", electrons, 0.0, np.inf)
@@ -36,17 +54,32 @@ def apply(
 
 
 def area_change(u: Frame, v: Frame, stretch: Frame) -> Frame:
-    """[ny, nx] a pixel's area over that at the boresight, less 1.
+    """Area of each pixel relative to a pixel at the boresight, minus 1.
 
-    u [nx], v [ny] : pixels from the boresight;  stretch : coefficients of u^p v^q
-    Error          : 1e-4, of what distortion and projection do to each other
+    Parameters
+    ----------
+    u : float array, shape (nx,)
+        Columns relative to the boresight in pixels.
+    v : float array, shape (ny,)
+        Rows relative to the boresight in pixels.
+    stretch : float array, shape (p, q)
+        Coefficients of u^p v^q.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Relative change of the area.
+
+    Notes
+    -----
+    The error is 1e-4, because the product of distortion and projection is neglected.
     """
     across, along = (polynomial.polyvander(at, n - 1) for at, n in zip((u, v), stretch.shape, strict=True))
     return np.asarray(matrices.matmul(along, matrices.matmul(stretch.T, across.T)))
 
 
 def parameters(scene: Scene) -> tuple[float, Frame, Frame, Frame]:
-    """Nothing changes without a detector."""
+    """Return the parameters of `apply`. Without a detector, the area of pixels does not change."""
     d = scene.detector
     if d is None:
         return scene.sky_electrons, np.zeros(scene.nx), np.zeros(scene.ny), np.zeros((1, 1))
@@ -57,7 +90,7 @@ def parameters(scene: Scene) -> tuple[float, Frame, Frame, Frame]:
     stretch = np.zeros((3, 3))
     if d.distortion_terms:
         stretch = distortion.area_change(d.distortion_terms, matrix)
-    # Of the sky a tangent plane has (1 + r^2)^(-3/2).
+    # An area on the tangent plane covers (1 + r^2)^(-3/2) of this area on the sky.
     flat = -1.5 * (d.pixel_scale * ARCSEC) ** 2
     stretch[2, 0] += flat
     stretch[0, 2] += flat

@@ -1,7 +1,7 @@
-"""Trails of satellites: straight lines over the field, as wide as the seeing and as the pupil, which is out of focus.
+"""Satellite trails: straight lines over the field, blurred by the seeing and by the defocused pupil.
 
-How many cross a field is a parameter, by default none. All detectors of an exposure have the same ones, each the piece
-that crosses it.
+The rate of satellites is a parameter, by default 0. All detectors of an exposure have the same satellites, and each
+receives the piece of a trail that crosses it.
 """
 
 from __future__ import annotations
@@ -20,26 +20,32 @@ from truesky.render.camera.detectors import Detector
 from truesky.render.effects.effect import Effect, zero_contribution
 from truesky.render.effects.scene import Frame, Scene
 
-# Pixels between places of a trail: between them it is straight.
+# Pixels between points of a trail. The trail is straight between them.
 _STEP = 64.0
-# Radii of the field that a trail goes on: optics may show a little more of the sky.
+# Length of a trail beyond the field, in radii of the field: distortion may show slightly more of the sky.
 _TRAIL_EXTENT = 1.1
-# Half diagonals of a detector that it may see to each side.
+# Half diagonals of a detector that it may cover to each side with distortion.
 _DETECTOR_EXTENT = 1.3
-# A trail's profile: steps of a pixel, and widths of the seeing that it is followed to.
+# Samples per pixel of a trail's profile, and its extent in widths of the seeing.
 _SUBSAMPLES, _SEEING_RANGE = 8, 8.0
-# Magnitudes fainter or brighter than the mean are so many standard deviations off at the most.
+# Limit on the difference between magnitudes of satellites and their mean, in standard deviations.
 _MAX_SIGMA = 3.0
-# Wings of a trail: those of a Moffat profile of this exponent.
+# Exponent of the Moffat profile of the seeing.
 _BETA = 3.0
 _ARCSEC = np.pi / 180.0 / 3600.0
 
 
 class Satellites(NamedTuple):
-    """Those of a field.
+    """Satellites of a field.
 
-    number    : mean, of those that cross the circle about the field in the exposure
-    electrons : of the mean one in a pixel's length of its trail;  spread : mag rms
+    Attributes
+    ----------
+    number : float
+        Mean number of satellites that cross the circle around the field during the exposure, 0 to 1e4.
+    electrons : float
+        Electrons of a mean satellite per pixel of trail length.
+    spread : float
+        Standard deviation of the magnitudes.
     """
 
     number: float
@@ -48,7 +54,15 @@ class Satellites(NamedTuple):
 
 
 class Blur(NamedTuple):
-    """seeing : FWHM, pixels;  outer, inner : radii of the defocused pupil, pixels."""
+    """Blur of a trail.
+
+    Attributes
+    ----------
+    seeing : float
+        FWHM of the seeing in pixels.
+    outer, inner : float
+        Radii of the defocused pupil in pixels.
+    """
 
     seeing: float
     outer: float
@@ -58,13 +72,37 @@ class Blur(NamedTuple):
 def apply(
     frame: Frame, satellites: Satellites, blur: Blur, detector: Detector | None, radius: float, rng: np.random.Generator
 ) -> Frame:
-    """frame [ny, nx] e- -> plus the trails that cross it.
+    """Add the trails that cross a frame.
 
-    some     : satellites;  blur : of their trails
-    detector : whose frame it is; None: one in the middle of the field, of pixels of 1 arcsec
-    radius   : of the circle about the field, arcsec
-    rng      : random numbers of the exposure, the same for all its detectors
-    Error    : of a profile that is told at eighths of a pixel, 1e-3 of its height; satellites neither tumble nor flare
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Expected electrons.
+    satellites : Satellites
+        Number and brightness of satellites.
+    blur : Blur
+        Blur of their trails.
+    detector : Detector or None
+        Detector of the frame. None for a detector in the middle of the field with pixels of 1 arcsec.
+    radius : float
+        Radius of the circle around the field in arcsec.
+    rng : numpy.random.Generator
+        Random numbers of the exposure, the same for all its detectors.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Expected electrons including trails.
+
+    Raises
+    ------
+    OutOfRange
+        If the number of satellites is outside its limits.
+
+    Notes
+    -----
+    The profile is sampled at eighths of a pixel, with an error of 1e-3 of its height. Not modelled: satellites that
+    tumble or flare.
     """
     if not 0.0 <= satellites.number < 1e4:
         raise OutOfRange("satellites of an exposure", satellites.number, 0.0, 1e4)
@@ -85,11 +123,14 @@ def apply(
 
 
 def _may_touch(direction: float, offset: float, detector: Detector | None, width: float) -> bool:
-    """Whether a trail may touch a detector; turn, miss : as of `_path`;  width : pixels beside it."""
+    """Return False if a trail cannot touch a detector.
+
+    `direction` and `offset` are as in `_path`; `width` is the half width of a trail in pixels.
+    """
     if detector is None:
         return True
     x, y = (float(place) for place in distortion.distort(detector.x, detector.y, detector.distortion_terms))
-    # Optics may show a detector more of the sky than its pixels say.
+    # With distortion, a detector may show more of the sky than the size of its pixels implies.
     reach = _DETECTOR_EXTENT * detector.half_diagonal + detector.pixel_scale * width
     return bool(abs(np.cos(direction) * y - np.sin(direction) * x - offset) < reach)
 
@@ -97,14 +138,15 @@ def _may_touch(direction: float, offset: float, detector: Detector | None, width
 def _path(
     direction: float, offset: float, radius: float, detector: Detector | None, shape: tuple[int, ...]
 ) -> tuple[Float, Float]:
-    """Columns and rows of places of a trail over the whole field.
+    """Return the columns and rows of points of a trail over the whole field.
 
-    turn : rad, of its direction;  miss : arcsec, its nearest to the boresight;  radius : arcsec, of the field
+    `direction` is in radians. `offset`, the smallest distance to the boresight, and `radius`, the radius of the
+    field, are in arcsec.
     """
     scale = 1.0 if detector is None else detector.pixel_scale
     reach = float(np.sqrt((_TRAIL_EXTENT * radius) ** 2 - offset**2))
     at = np.arange(-reach, reach + _STEP * scale, _STEP * scale)
-    # On the tangent plane, where great circles are straight.
+    # Great circles are straight on the tangent plane.
     u, v = (
         (offset * f + at * g) / scale
         for f, g in ((-np.sin(direction), np.cos(direction)), (np.cos(direction), np.sin(direction)))
@@ -120,15 +162,16 @@ def _path(
 
 
 def profile(blur: Blur) -> Float:
-    """[n] of a line's light in a pixel at n / `_FINE` pixels from it; all pixels across it have 1.
+    """Return the light per pixel at distances of n / `_SUBSAMPLES` pixels from a trail, with a sum of 1 across it.
 
-    The seeing's Moffat profile seen along a line, spread over the chords of the ring of the pupil and over a pixel.
+    The profile is the Moffat profile of the seeing integrated along the trail, convolved with the chords of the ring of
+    the pupil and with a pixel.
     """
     reach = blur.outer + _SEEING_RANGE * blur.seeing + 2.0
     x = np.arange(-int(reach * _SUBSAMPLES), int(reach * _SUBSAMPLES) + 1) / _SUBSAMPLES
     core = 0.5 * blur.seeing / np.sqrt(2.0 ** (1.0 / _BETA) - 1.0)
     seeing = (1.0 + (x / core) ** 2) ** (0.5 - _BETA)
-    # Area of the ring on one side of a line at x, of whose steps chords are means.
+    # Mean chord of the ring in each step: differences of its area on one side of a line at x.
     edges = np.append(x - 0.5 / _SUBSAMPLES, x[-1] + 0.5 / _SUBSAMPLES)
     ring = np.diff(_area_left_of(edges, blur.outer))
     if blur.inner > 0.0:
@@ -138,13 +181,13 @@ def profile(blur: Blur) -> Float:
     for part in (seeing, ring, pixel):
         centred = np.zeros(4 * len(x))
         centred[: half + 1], centred[-half:] = part[half:], part[:half]
-        # All are even: their transforms are real.
+        # All three functions are even, so that their transforms are real.
         transform *= scipy.fft.rfft(centred / part.sum()).real
     return np.asarray(np.maximum(scipy.fft.irfft(transform, 4 * len(x))[: half + 1] * _SUBSAMPLES, 0.0))
 
 
 def _area_left_of(x: Float, radius: float) -> Float:
-    """Area of a disc left of a line, less half of it; a step of one without a radius."""
+    """Area of a disc to the left of a line at x, minus half its area; a step of height 1 for a radius of 0."""
     if radius <= 0.0:
         return np.where(x > 0.0, 1.0, 0.0)
     t = np.clip(x / radius, -1.0, 1.0)
@@ -153,7 +196,7 @@ def _area_left_of(x: Float, radius: float) -> Float:
 
 @jit
 def _add_trail(frame: Any, along: Any, across: Any, table: Any) -> None:
-    """Adds a line whose second coordinate is a function of its first, which ascends; `table` : its profile."""
+    """Add a trail with the profile `table`. Its second coordinate is a function of its first, which ascends."""
     ny, nx = frame.shape
     k = 0
     for c in range(max(0, int(np.ceil(along[0]))), min(nx, int(along[-1]) + 1)):
@@ -161,7 +204,7 @@ def _add_trail(frame: Any, along: Any, across: Any, table: Any) -> None:
             k += 1
         slope = (across[k + 1] - across[k]) / (along[k + 1] - along[k])
         middle = across[k] + slope * (c - along[k])
-        # From a pixel of this column to the line.
+        # Ratio of the distance from the line to the difference in the second coordinate.
         shorter = 1.0 / np.sqrt(1.0 + slope * slope)
         reach = (len(table) - 2) / (_SUBSAMPLES * shorter)
         for r in range(max(0, int(np.ceil(middle - reach))), min(ny, int(np.floor(middle + reach)) + 1)):
@@ -172,7 +215,7 @@ def _add_trail(frame: Any, along: Any, across: Any, table: Any) -> None:
 
 
 def parameters(scene: Scene) -> tuple[Satellites, Blur, Detector | None, float]:
-    """None where the mission database has no rate, which is the default."""
+    """Return the parameters of `apply`, without satellites if the rate is 0 in the mission database (the default)."""
     mission, d = scene.mission, scene.detector
     rate = mission.value("survey.satellites.rate", "1 / (deg s)")
     if rate == 0.0 or d is None:
@@ -180,7 +223,7 @@ def parameters(scene: Scene) -> tuple[Satellites, Blur, Detector | None, float]:
     all_detectors = camera_detectors.detectors(scene.section.rpartition(".")[2], mission)
     radius = max(float(np.hypot(detector.x, detector.y)) + detector.half_diagonal for detector in all_detectors)
     magnitude, spread = (mission.value(f"survey.satellites.{key}", "mag") for key in ("magnitude", "magnitude_spread"))
-    # A pixel's length is crossed in so many seconds.
+    # Time in which a satellite crosses the length of a pixel.
     seconds = d.pixel_scale / mission.value("survey.satellites.speed", "arcsec / s")
     electrons = 10.0 ** (0.4 * (scene.zero_point - magnitude)) * seconds
     outer = 0.5 * scene.value("aperture_diameter", "m") / mission.value("survey.satellites.distance", "m") / _ARCSEC
@@ -191,14 +234,14 @@ def parameters(scene: Scene) -> tuple[Satellites, Blur, Detector | None, float]:
 
 
 def _contribution(scene: Scene) -> float:
-    """Of the brightest likely one."""
+    """Return the electrons in the brightest pixel of the brightest satellite that is drawn."""
     satellites, blur, *_ = parameters(scene)
     if satellites.number == 0.0:
         return 0.0
     return float(satellites.electrons * 10.0 ** (0.4 * _MAX_SIGMA * satellites.spread) * profile(blur).max())
 
 
-# The next exposure has others.
+# Trails average out: the next exposure has different satellites.
 EFFECT = Effect(
     "satellite_trails", apply, parameters, _contribution, shared=True, cost=3e-3, systematic=zero_contribution
 )

@@ -1,6 +1,8 @@
-"""In-field straylight: a wide faint halo about every bright star.
+"""In-field stray light: a wide faint halo around every bright star.
 
-I(r) = F f / (2 pi s^2) (1 + (r / s)^2)^(-3/2), F the star's light, f the halo's part of it, s its scale
+For a star with the flux F, the fraction f in the halo and the scale s of the halo::
+
+    I(r) = F f / (2 pi s^2) (1 + (r / s)^2)^(-3/2)
 """
 
 from __future__ import annotations
@@ -14,16 +16,36 @@ from truesky.numerics.compiling import jit
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import NOTICEABLE, Frame, Lights, Scene
 
-# The halo is drawn at nodes this part of its scale apart and interpolated linearly: 2e-3 of it.
+# Spacing of nodes in units of the scale. Linear interpolation between nodes has a relative error of 2e-3.
 _NODE_SPACING = 1.0 / 16.0
 _MAX_STEP = 256
 
 
 def apply(frame: Frame, lights: Lights, fraction: float, scale: float, rng: np.random.Generator | None = None) -> Frame:
-    """frame [ny, nx] e- -> plus the halos of all lights, also of those outside.
+    """Add the halos of all lights, also of lights outside the frame.
 
-    fraction : of a light in its halo;  scale : pixels
-    lights   : positions and electrons of stars;  rng : not used
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Expected electrons.
+    lights : Lights
+        Positions and electrons of stars.
+    fraction : float
+        Fraction of a star's flux in its halo, 0 to 1.
+    scale : float
+        Scale of the halo in pixels, 1 to 1e6.
+    rng : numpy.random.Generator, optional
+        Not used.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Expected electrons including halos.
+
+    Raises
+    ------
+    OutOfRange
+        If `fraction` or `scale` is outside its limits.
     """
     if not 0.0 <= fraction <= 1.0:
         raise OutOfRange("straylight fraction", fraction, 0.0, 1.0)
@@ -67,7 +89,7 @@ def _interpolate(frame: Any, nodes: Any, step: int) -> None:
 
 
 def _halo_parameters(scene: Scene) -> tuple[float, float]:
-    """Fraction, scale in pixels."""
+    """Return the fraction of the flux in a halo, and its scale in pixels."""
     pixel_scale = scene.value("fpa.pixel_scale", "arcsec / pix")
     return scene.value("halo.fraction", ""), scene.value("halo.radius", "arcsec") / pixel_scale
 
@@ -75,7 +97,7 @@ def _halo_parameters(scene: Scene) -> tuple[float, float]:
 def _parameters(scene: Scene) -> tuple[Any, ...]:
     fraction, scale = _halo_parameters(scene)
     lights = scene.lights
-    # A thousand halos that are each below a thousandth of what would be noticed are left out.
+    # Omit halos whose peak is below a thousandth of the noticeable change: even a thousand of them are not noticeable.
     height = fraction * lights.electrons / (2.0 * np.pi * scale**2)
     bright = height > 1e-3 * NOTICEABLE * scene.pixel_noise
     return Lights(lights.column[bright], lights.row[bright], lights.electrons[bright]), fraction, scale

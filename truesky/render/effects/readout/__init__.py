@@ -1,1 +1,1 @@
-"""What happens on the way to the converter and in it."""
+"""Effects of charge transfer, amplifiers and analogue-to-digital converters."""

@@ -1,7 +1,4 @@
-"""Analogue-to-digital conversion: gain, bias, rounding, the converter's range.
-
-as_stored   what the converter gives, in as many bits as a file has for it
-"""
+"""Convert electrons to digital numbers: gain, bias, rounding and range of the converter."""
 
 from __future__ import annotations
 
@@ -23,10 +20,30 @@ def apply(
     largest: float | Float,
     rng: np.random.Generator | None = None,
 ) -> Frame:
-    """Electrons [ny, nx] -> ADU, whole numbers in [0, largest].
+    """Convert electrons to ADU.
 
-    gain : electrons per ADU;  bias : ADU;  each may be [q] of the amplifiers of a frame [q, ny, nx]
-    frame : e-;  largest : ADU that the converter can give;  rng : not used
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx), or (q, ny, nx) for q amplifiers
+        Electrons.
+    gain : float or array, shape (q,)
+        Electrons per ADU, more than 0.
+    bias : float or array, shape (q,)
+        Bias level in ADU.
+    largest : float or array, shape (q,)
+        Highest output of the converter in ADU.
+    rng : numpy.random.Generator, optional
+        Not used.
+
+    Returns
+    -------
+    float array, shape of `frame`
+        Whole ADU, 0 to `largest`.
+
+    Raises
+    ------
+    OutOfRange
+        If a gain is not positive and finite.
     """
     if not (np.min(gain) > 0.0 and np.max(gain) < np.inf):
         raise OutOfRange("gain", gain, 0.0, np.inf)
@@ -36,9 +53,21 @@ def apply(
 def apply_signal(
     frame: Frame, gain: float, bias: float, largest: float, rng: np.random.Generator | None = None
 ) -> Frame:
-    """[2, ny, nx] signal of a ramp, e-, and its chi^2 -> the signal in ADU, and chi^2 as it is.
+    """Convert the signal of a ramp to ADU and leave its chi^2 unchanged.
 
-    frame : signal and chi^2;  gain, bias, largest, rng : as of `apply`
+    Parameters
+    ----------
+    frame : float array, shape (2, ny, nx)
+        Signal in electrons, and chi^2 of the ramp fit.
+    gain, bias, largest : float
+        Same as in `apply`.
+    rng : numpy.random.Generator, optional
+        Not used.
+
+    Returns
+    -------
+    float array, shape (2, ny, nx)
+        Signal in whole ADU, and chi^2.
     """
     return np.stack([apply(frame[0], gain, bias, largest), frame[1]])
 
@@ -55,18 +84,18 @@ def _parameters(scene: Scene) -> tuple[float | Float, float | Float, float | Flo
 
 
 def pixel_type(scene: Scene) -> type[np.uint16] | type[np.int32]:
-    """Of a file: 16 bits without a sign; 32 where a converter has more than 16."""
+    """Return the integer type of pixels in a file: uint16, or int32 if a converter has more than 16 bits."""
     largest = float(np.max(scene.amplifier_values("adc_max", "adu")))
     return np.uint16 if largest <= np.iinfo(np.uint16).max else np.int32
 
 
 def to_file_type(numbers: Frame, scene: Scene) -> Array:
-    """Whole ADU, as `apply` gives them -> the same in the type of a file."""
+    """Convert whole ADU, as returned by `apply`, to the integer type of a file."""
     return numbers.astype(pixel_type(scene))
 
 
 def convert_groups(groups: Frame, scene: Scene) -> Array:
-    """Groups of a ramp [groups, ny, nx] e- -> ADU."""
+    """Convert the groups of a ramp, shape (groups, ny, nx), from electrons to ADU in the integer type of a file."""
     numbers = _parameters(scene)
     return np.stack([to_file_type(apply(group, *numbers), scene) for group in groups])
 

@@ -1,4 +1,4 @@
-"""Structure of the bias: each amplifier's own offset, a settling of the first columns, stripes of columns."""
+"""Add the structure of the bias: amplifier offsets, settling in the first columns, and column stripes."""
 
 from __future__ import annotations
 
@@ -15,10 +15,21 @@ Number = float | Float
 def apply(
     frame: Frame, offset: Number, settling: Number, length: Number, stripes: Number, rng: np.random.Generator
 ) -> Frame:
-    """quadrants [q, ny, nx] e- in readout order -> plus `structure`, the same in every row.
+    """Add the bias pattern to every row.
 
-    frame, rng                        : e-, and random numbers of the detector
-    offset, settling, length, stripes : as of `structure`
+    Parameters
+    ----------
+    frame : float array, shape (q, ny, nx)
+        Electrons of each quadrant or amplifier in readout order.
+    offset, settling, length, stripes : float or array, shape (q,)
+        Same as in `structure`.
+    rng : numpy.random.Generator
+        Random numbers of the detector, the same in every exposure.
+
+    Returns
+    -------
+    float array, shape of `frame`
+        Electrons including the bias pattern.
     """
     shape = frame.reshape(-1, *frame.shape[-2:]).shape
     pattern = structure(shape[0], shape[2], offset, settling, length, stripes, rng)
@@ -28,11 +39,34 @@ def apply(
 def structure(
     quadrants: int, nx: int, offset: Number, settling: Number, length: Number, stripes: Number, rng: np.random.Generator
 ) -> Frame:
-    """The pattern [quadrants, nx], e-; each number may be [quadrants].
+    """Draw the bias pattern of every amplifier.
 
-    offset : rms between amplifiers, e-;  settling : of the first column, e-, falling off over `length` columns
-    stripes : rms between columns, e-
-    quadrants, nx : amplifiers, and columns of each;  rng : random numbers of the detector
+    Parameters
+    ----------
+    quadrants : int
+        Number of amplifiers.
+    nx : int
+        Columns per amplifier.
+    offset : float or array, shape (quadrants,)
+        Standard deviation of the offsets of amplifiers in electrons, 0 or more.
+    settling : float or array, shape (quadrants,)
+        Offset of the first column in electrons.
+    length : float or array, shape (quadrants,)
+        Number of columns in which the settling offset falls by a factor of e, 1e-3 or more.
+    stripes : float or array, shape (quadrants,)
+        Standard deviation between columns in electrons, 0 or more.
+    rng : numpy.random.Generator
+        Random numbers of the detector, the same in every exposure.
+
+    Returns
+    -------
+    float array, shape (quadrants, nx)
+        Electrons to add to each column.
+
+    Raises
+    ------
+    OutOfRange
+        If `offset`, `stripes` or `length` is outside its limits.
     """
     for name, value, lowest in (
         ("bias offset", offset, 0.0), ("bias stripes", stripes, 0.0), ("bias settling length", length, 1e-3)

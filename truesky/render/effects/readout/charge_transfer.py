@@ -1,8 +1,8 @@
-"""Charge transfer inefficiency: traps in the silicon hold charge back while it is shifted to the output.
+"""Charge transfer inefficiency: traps in the silicon capture and release charge while it is shifted to the output.
 
-PARALLEL    down the columns, row by row, into the serial register
-SERIAL      along the register, pixel by pixel, into the amplifier
-PARALLEL_LOSS, SERIAL_LOSS   the same of cameras of which no more is known than the part that each transfer loses
+Charge moves down the columns into the serial register (parallel), and along the register to the amplifier (serial).
+For detectors with known traps, `PARALLEL` and `SERIAL` follow the charge of the traps. For cameras of which only the
+loss per transfer is known, `PARALLEL_LOSS` and `SERIAL_LOSS` defer this fraction of each packet.
 """
 
 from __future__ import annotations
@@ -20,16 +20,17 @@ from truesky.render.effects.readout.traps import Sweeps, Traps
 from truesky.render.effects.scene import NOTICEABLE, Frame, Scene
 from truesky.request.accuracy import DRAFT, Accuracy
 
-# Of a packet in a transfer, more than any detector that is in use.
+# Highest fraction of a packet that a transfer may lose. All detectors in use lose less.
 _MAX_LOSS = 1e-3
-# Species of the mission database.
+# Number of trap species in the mission database.
 _SPECIES = 3
-# Traps passed that stand for the end of the mission: one in each of 2066 pixels.
+# Number of traps on the longest path at the end of the mission: one in each of 2066 pixels.
 _END_OF_LIFE = 2066.0
-# What they then do to a source at the far end: of its flux, its position (pixels), its ellipticity; and the error of
-# that, with the power of the damage that it grows with: from levels of traps, from one sweep, from Heun's rule and from
-# four steps of it (as measured against arCTIc by the tests; levels against small steps).
+# At the end of the mission, changes of a source at the far end: relative flux, position in pixels, and ellipticity.
 _FLUX, _SHIFT, _SHAPE = 0.05, 0.036, 0.01
+# Error of these changes at the end of the mission as a fraction, exponent of the damage that it grows with, and method:
+# trap levels, one sweep, Heun's method, and four steps of Heun's method. Tests measure the errors with arCTIc as the
+# reference, and with small steps as the reference for trap levels.
 _SWEEPS = (
     (0.75, 1, Sweeps(1, 1, 9)),
     (0.016, 2, Sweeps(1, 1)),
@@ -41,10 +42,25 @@ _SWEEPS = (
 def apply_parallel(
     frame: Frame, silicon: Traps, sweeps: Sweeps, rows: int, rng: np.random.Generator | None = None
 ) -> Frame:
-    """quadrants [.., ny, nx] e- in readout order, `rows` of them pixels, the rest overscan.
+    """Shift charge down the columns, over traps.
 
-    frame  : the quadrants;  lattice : traps along the columns
-    sweeps : how closely charge is followed;  rng : not used
+    Parameters
+    ----------
+    frame : float array, shape (..., ny, nx)
+        Electrons of each quadrant in readout order.
+    silicon : Traps
+        Traps along the columns.
+    sweeps : Sweeps
+        Method to follow the charge.
+    rows : int
+        Number of rows that are pixels; the others are overscan.
+    rng : numpy.random.Generator, optional
+        Not used.
+
+    Returns
+    -------
+    float array, shape of `frame`
+        Electrons in the packets after the transfer.
     """
     return traps.shift_charge(frame, silicon, sweeps, -2, min(rows, frame.shape[-2]))[0]
 
@@ -52,26 +68,41 @@ def apply_parallel(
 def apply_serial(
     frame: Frame, silicon: Traps, sweeps: Sweeps, columns: int, rng: np.random.Generator | None = None
 ) -> Frame:
-    """quadrants [.., ny, nx] e- in readout order, `columns` of them register pixels, the rest overscan.
+    """Shift charge along the serial register, over traps.
 
-    frame  : the quadrants;  lattice : traps of the serial register
-    sweeps : how closely charge is followed;  rng : not used
+    Parameters
+    ----------
+    frame : float array, shape (..., ny, nx)
+        Electrons of each quadrant in readout order.
+    silicon : Traps
+        Traps of the serial register.
+    sweeps : Sweeps
+        Method to follow the charge.
+    columns : int
+        Number of columns that are pixels of the register; the others are overscan.
+    rng : numpy.random.Generator, optional
+        Not used.
+
+    Returns
+    -------
+    float array, shape of `frame`
+        Electrons in the packets after the transfer.
     """
     return traps.shift_charge(frame, silicon, sweeps, -1, min(columns, frame.shape[-1]))[0]
 
 
 def choose_sweeps(accuracy: Accuracy, traps_passed: float) -> Sweeps:
-    """How closely charge is followed past so many traps: as little as the errors of sources allow.
+    """Choose the fastest method whose error in sources is accepted, for a number of traps on the longest path.
 
-    Losses grow with the traps, and so does the error: what is left out is the next order in them.
+    The loss grows with the number of traps, and so does the error: it is of the next order in the number of traps.
     """
     return _best_sweeps(accuracy, traps_passed)[1]
 
 
 def source_errors(scene: Scene, name: str) -> dict[str, float]:
-    """What following charge no closer than that leaves in a source at the far end; nothing for another effect's name.
+    """Return the errors that the chosen method leaves in a source at the far end, or {} for other effects' names.
 
-    returns : by number of an accuracy: fraction of its flux, reduced shear, pixels
+    The keys are names of accuracies: "flux" (fraction), "shape" (reduced shear) and "position" (pixels).
     """
     if name == PARALLEL.name:
         direction, transfers = "parallel", scene.half_rows
@@ -84,7 +115,7 @@ def source_errors(scene: Scene, name: str) -> dict[str, float]:
 
 
 def _best_sweeps(accuracy: Accuracy, traps_passed: float) -> tuple[float, Sweeps]:
-    """(of the damage, what is wrong; how charge is followed)."""
+    """Return the error as a fraction of the damage at the end of the mission, and the method."""
     damage = traps_passed / _END_OF_LIFE
     allowed = min(accuracy.flux / _FLUX, accuracy.position / _SHIFT, accuracy.shape / _SHAPE)
     candidates = [(error * damage**power, sweeps) for error, power, sweeps in _SWEEPS]
@@ -92,7 +123,10 @@ def _best_sweeps(accuracy: Accuracy, traps_passed: float) -> tuple[float, Sweeps
 
 
 def silicon_traps(scene: Scene, direction: str) -> Traps:
-    """The traps of a direction, "parallel" or "serial": damage since the launch times those of the mission's end."""
+    """Return the traps of a direction, "parallel" or "serial".
+
+    Densities are those at the end of the mission times the damage since launch.
+    """
     damage = scene.value("cti.age", "")
     if direction == "serial":
         damage *= scene.value("cti.serial_ratio", "")
@@ -107,16 +141,56 @@ def silicon_traps(scene: Scene, direction: str) -> Traps:
 
 
 def apply_parallel_loss(frame: Frame, loss: float, rng: np.random.Generator | None = None) -> Frame:
-    """Parts [.., ny, nx] e- in readout order, each transfer of which leaves the part `loss` to the next packet.
+    """Defer a fraction of each packet to the next one, at each transfer down the columns.
 
-    frame : e-, charge that is left in the last packets is not read;  rng : not used
-    Error : 2e-8 of a packet: what is left behind more than twice comes with the second one behind it
+    Parameters
+    ----------
+    frame : float array, shape (..., ny, nx)
+        Electrons of each amplifier in readout order.
+    loss : float
+        Fraction of a packet that each transfer leaves to the next packet, 0 to 1e-3.
+    rng : numpy.random.Generator, optional
+        Not used.
+
+    Returns
+    -------
+    float array, shape of `frame`
+        Electrons after the transfer. Charge left behind the last packets is not read.
+
+    Raises
+    ------
+    OutOfRange
+        If `loss` is outside its limits.
+
+    Notes
+    -----
+    Charge that is deferred more than twice is added to the second packet behind. The error is 2e-8 of a packet.
     """
     return _defer_charge(frame, loss, along=False)
 
 
 def apply_serial_loss(frame: Frame, loss: float, rng: np.random.Generator | None = None) -> Frame:
-    """The same along the register; frame, loss, rng : as of `apply_parallel_loss`."""
+    """Defer a fraction of each packet to the next one, at each transfer along the register.
+
+    Parameters
+    ----------
+    frame : float array, shape (..., ny, nx)
+        Electrons of each amplifier in readout order.
+    loss : float
+        Same as in `apply_parallel_loss`.
+    rng : numpy.random.Generator, optional
+        Not used.
+
+    Returns
+    -------
+    float array, shape of `frame`
+        Electrons after the transfer.
+
+    Raises
+    ------
+    OutOfRange
+        If `loss` is outside its limits.
+    """
     return _defer_charge(frame, loss, along=True)
 
 
@@ -135,7 +209,10 @@ def _defer_charge(frame: Frame, loss: float, along: bool) -> Frame:
 
 @jit
 def _defer_packets(frame: Any, staying: Any, to_next: Any, to_second: Any, along: bool, out: Any) -> None:
-    """Of the packet at each place what stays in it, what comes with the next, and with the second behind it."""
+    """Fill `out` with the charge of each packet.
+
+    `staying`, `to_next` and `to_second` are the fractions that remain in a packet and that join the next two.
+    """
     for q in range(len(frame)):
         for r in range(frame.shape[1]):
             row_in, row_out = frame[q, r], out[q, r]
@@ -153,7 +230,7 @@ def _transfer_loss(scene: Scene, direction: str) -> float:
 
 
 def _max_deferred(scene: Scene, direction: str) -> float:
-    """Electrons that the brightest packet leaves behind on the longest way."""
+    """Electrons that the brightest packet leaves behind on the longest path."""
     if scene.layout is None:
         return 0.0
     layout = scene.layout
@@ -167,22 +244,22 @@ def _register_columns(scene: Scene) -> int:
 
 
 def _max_loss(scene: Scene, direction: str, transfers: int) -> float:
-    """Electrons that the brightest packet loses on the longest way, if all traps it reaches are empty.
+    """Electrons that the brightest packet loses on the longest path if all traps that it reaches are empty.
 
-    Where sources change by less than the accuracy allows, that tells the margin.
+    The value is reduced if sources change by less than the accepted errors: the ratio then gives the margin.
     """
     lost, excess = _loss_and_excess(scene, direction, transfers)
     return lost if excess > 1.0 else min(lost, excess * NOTICEABLE * scene.pixel_noise)
 
 
 def _systematic_loss(scene: Scene, direction: str, transfers: int) -> float:
-    """The same of a mean of frames, which keeps all; what the accuracy allows is allowed in the mean, too."""
+    """Loss in a mean of frames: the whole loss, or 0 if sources change by less than the accepted errors."""
     lost, excess = _loss_and_excess(scene, direction, transfers)
     return lost if excess > 1.0 else 0.0
 
 
 def _loss_and_excess(scene: Scene, direction: str, transfers: int) -> tuple[float, float]:
-    """Electrons, and what that does to sources over what the accuracy allows."""
+    """Lost electrons, and the change of sources relative to the accepted errors."""
     silicon = silicon_traps(scene, direction)
     traps_passed = transfers * sum(silicon.density)
     return traps_passed * float(silicon.volume(scene.brightest_electrons)), _accuracy_excess(
@@ -191,7 +268,10 @@ def _loss_and_excess(scene: Scene, direction: str, transfers: int) -> tuple[floa
 
 
 def _accuracy_excess(accuracy: Accuracy, traps_passed: float) -> float:
-    """What so many traps do to a source, over what is allowed; a quicklook leaves out nothing that a draft has."""
+    """Change of a source by traps relative to the accepted errors, which are at most those of a draft.
+
+    A quicklook therefore omits no effect that a draft includes.
+    """
     flux, shift, shape = (
         min(accuracy.flux, DRAFT.flux), min(accuracy.position, DRAFT.position), min(accuracy.shape, DRAFT.shape)
     )  # fmt: skip
@@ -199,7 +279,7 @@ def _accuracy_excess(accuracy: Accuracy, traps_passed: float) -> float:
 
 
 def _scene_before_readout(scene: Scene) -> Scene:
-    """What lies in the pixels when they are moved: in no time no track has hit them."""
+    """Scene at the start of the readout: no cosmic ray has hit the pixels if the exposure time is 0."""
     return scene if scene.exposure_time_s > 0.0 else replace(scene, track_electrons=0.0)
 
 

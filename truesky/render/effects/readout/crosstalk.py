@@ -1,8 +1,4 @@
-"""Crosstalk: a detector's amplifiers read at the same time, and each sees a little of the others.
-
-apply       parts of a detector -> each with its share of the others
-removed     its inverse: what a calibration does
-"""
+"""Crosstalk between amplifiers of a detector: they are read at the same time, and each signal appears in the others."""
 
 from __future__ import annotations
 
@@ -16,21 +12,40 @@ from truesky.render.camera import amplifiers
 from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
 
-# Of the coupling between neighbours (assumed).
+# Coupling across the diagonal as a fraction of the coupling between neighbours (assumed).
 _DIAGONAL = 0.5
 _BLOCK = 1024
-# Each time what is left is smaller by the sum of an amplifier's coefficients: a hundredth at most.
+# Each iteration multiplies the error by the sum of an amplifier's coefficients, which is 0.01 or less.
 _ITERATIONS = 3
 
 
 def apply(frame: Frame, coefficients: Frame, rng: np.random.Generator | None = None) -> Frame:
-    """Parts [q, ny, nx] in readout order -> each plus its share of the others, all at once.
+    """Add to each amplifier a share of the signals of all others.
 
-    coefficients : [q, q] of signal from the second index into the first, 0 on the diagonal
+    Parameters
+    ----------
+    frame : float array, shape (q, ny, nx)
+        Electrons of each amplifier in readout order.
+    coefficients : float array, shape (q, q)
+        Share of the signal of the second index that appears in the first, -1 to 1; 0 on the diagonal.
+    rng : numpy.random.Generator, optional
+        Not used.
+
+    Returns
+    -------
+    float array, shape (q, ny, nx)
+        Electrons including crosstalk.
+
+    Raises
+    ------
+    BadInput
+        If the number of coefficients does not match the number of amplifiers.
+    OutOfRange
+        If a coefficient is outside its limits.
     """
     count = len(frame)
     if coefficients.shape != (count, count):
-        raise BadInput(f"crosstalk of {coefficients.shape} coefficients for {count} amplifiers")
+        raise BadInput(f"crosstalk coefficients have the shape {coefficients.shape}, must be {(count, count)}")
     if not np.all(np.abs(coefficients) <= 1.0):
         raise OutOfRange("crosstalk", float(np.abs(coefficients).max()), 0.0, 1.0)
     flat = np.ascontiguousarray(frame, dtype=float).reshape(count, -1)
@@ -40,10 +55,9 @@ def apply(frame: Frame, coefficients: Frame, rng: np.random.Generator | None = N
 
 
 def remove(frame: Frame, coefficients: Frame) -> Frame:
-    """Parts [q, ny, nx] as `apply` left them -> as they were.
+    """Remove crosstalk from frames: the inverse of `apply`, for calibration.
 
-    coefficients : of `apply`
-    Error        : the fourth power of the sum of an amplifier's coefficients: 1e-8 of the light of the others
+    The relative error is the fourth power of the sum of an amplifier's coefficients: 1e-8 of the light of the others.
     """
     out = apply(frame, -coefficients)
     for _ in range(_ITERATIONS - 1):
@@ -53,7 +67,7 @@ def remove(frame: Frame, coefficients: Frame) -> Frame:
 
 @jit
 def _mix(frame: Any, coefficients: Any, out: Any) -> None:
-    # As many pixels at a time as the processor has near at hand.
+    # Blocks of pixels are small enough for the cache of the processor.
     for start in range(0, frame.shape[1], _BLOCK):
         for victim in range(len(frame)):
             line = out[victim, start : start + _BLOCK]
@@ -66,7 +80,11 @@ def _mix(frame: Any, coefficients: Any, out: Any) -> None:
 
 
 def coefficients(scene: Scene) -> Frame:
-    """Of quadrants: the mission's for neighbours along a side, half of it across the diagonal; else of each pair."""
+    """Return the crosstalk coefficients of a scene's detector, shape (q, q).
+
+    Detectors that are read in quadrants have the mission's value for neighbours, and half of it across the diagonal.
+    Ground cameras have coefficients for each pair of amplifiers.
+    """
     if scene.layout is not None and scene.detector is not None:
         largest = scene.value("crosstalk_max", "")
         return amplifiers.crosstalk_couplings(scene.value("crosstalk", ""), largest, scene.detector, scene.layout)

@@ -1,6 +1,6 @@
-"""Crosstalk between detectors that are read by one board: each sees a little of the others' bright stars.
+"""Crosstalk between detectors that share a readout board: faint copies of the other detectors' bright stars appear.
 
-Amplifiers of the same number see each other, pixel by pixel in the order in which they are read.
+Amplifiers with the same number are coupled, pixel by pixel in readout order.
 """
 
 from __future__ import annotations
@@ -15,23 +15,40 @@ from truesky.render.effects.scene import Frame, NeighbourCharge, Scene
 def apply(
     frame: Frame, neighbour_charge: NeighbourCharge | None, coefficient: float, rng: np.random.Generator | None = None
 ) -> Frame:
-    """Parts [q, ny, nx] in readout order -> each plus its share of what the other detectors' have.
+    """Add the crosstalk from detectors on the same board.
 
-    frame       : of the detector's amplifiers
-    elsewhere   : charge of the other detectors, None = none that is noticed;  rng : not used
-    coefficient : of signal of one into another
+    Parameters
+    ----------
+    frame : float array, shape (q, ny, nx)
+        Electrons of each amplifier in readout order.
+    neighbour_charge : NeighbourCharge or None
+        Charge of the other detectors. None if it is negligible.
+    coefficient : float
+        Share of the signal of one detector that appears in another, -1 to 1.
+    rng : numpy.random.Generator, optional
+        Not used.
+
+    Returns
+    -------
+    float array, shape (q, ny, nx)
+        Electrons including crosstalk.
+
+    Raises
+    ------
+    OutOfRange
+        If `coefficient` is outside its limits.
     """
     if not abs(coefficient) <= 1.0:
         raise OutOfRange("crosstalk between detectors", coefficient, -1.0, 1.0)
     out = np.array(frame, dtype=float, order="C")
     if neighbour_charge is not None:
-        # No pixel is in it twice.
+        # The assignment is correct because indices of pixels are unique.
         out.reshape(-1)[neighbour_charge.pixel] += coefficient * neighbour_charge.electrons
     return out
 
 
 def coefficient(scene: Scene) -> float:
-    """Of the mission database; 0 of a camera that has none."""
+    """Return the coefficient from the mission database, or 0 for cameras without it."""
     key = f"{scene.section}.crosstalk_detectors"
     return scene.mission.value(key) if key in scene.mission else 0.0
 
@@ -41,7 +58,7 @@ def _contribution(scene: Scene) -> float:
     return abs(coefficient(scene)) * brightest
 
 
-# An image of a star is a small part of what means are taken of, and lies elsewhere in the next exposure.
+# The contribution averages out: a copy of a star covers few pixels, and different ones in the next exposure.
 EFFECT = Effect(
     "detector_crosstalk",
     apply,

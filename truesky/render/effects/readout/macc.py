@@ -1,19 +1,21 @@
-"""The signal of a ramp as it is computed on board, and how well the ramp fits it.
+"""Estimate the signal of a ramp, and the quality of the fit, as the on-board software does.
 
-With D_i (e-) the n differences of the groups' means plus beta, A = 1 + alpha, M = mean D_i^2 and m = mean D_i, the
-most likely signal is Q = n (x - beta) with x^2 + A x = M: in Kubik et al. x = A / 2 (sqrt(1 + 4 M / A^2) - 1), a
-difference of near-equal numbers where M is small, here its other form
+Let D_i (electrons) be the n differences of successive group means plus beta, A = 1 + alpha, M = mean D_i^2 and
+m = mean D_i. The most likely signal is Q = n (x - beta) with x^2 + A x = M. Kubik et al. give
+x = A / 2 (sqrt(1 + 4 M / A^2) - 1), a difference of nearly equal numbers for small M. This module uses the equivalent::
 
     x = 2 M / (A + hypot(A, 2 sqrt(M)))
     beta = 2 s^2 / (r A)
 
-(s the noise of one read, r reads a group: at zero signal the ramp's differences then fit their own noise).  What does
-not fit is chi^2 = 2 n (sqrt(M) - m) / A, again without the difference: with SS = sum (D_i - m)^2 it is
+with the noise s of one read and r reads per group. With this beta, the differences of a ramp without signal fit the
+model with read noise alone. The fit has chi^2 = 2 n (sqrt(M) - m) / A. With SS = sum (D_i - m)^2, the equivalent form
+without cancellation is::
 
-    chi^2 = 2 / A * SS / (sqrt(M) + m)       where m >= 0
+    chi^2 = 2 / A * SS / (sqrt(M) + m)       if m >= 0
 
-Ref : Kubik et al. 2016, PASP 128, 104504, eqs. 15 to 26; Euclid Data Product Description Document (chi^2 without
-      n_g - 2)
+References
+----------
+Kubik et al. 2016, PASP 128, 104504, eqs. 15 to 26. Euclid Data Product Description Document (chi^2 without n_g - 2).
 """
 
 from __future__ import annotations
@@ -31,16 +33,37 @@ from truesky.render.effects.scene import Frame, Scene
 
 
 def beta(mode: Mode, read_noise: float) -> float:
-    """What the estimator adds to each difference, e-; read_noise : of one read, e-."""
+    """Return the constant that the estimator adds to each difference, in electrons, from the noise of one read."""
     return 2.0 * read_noise**2 / (mode.reads * (1.0 + mode.alpha))
 
 
 def apply(frame: Frame, mode: Mode, read_noise: float, rng: np.random.Generator) -> Frame:
-    """Charge of the groups [groups, ny, nx] e- -> float64[2, ny, nx]: signal Q, e- in the integration; chi^2.
+    """Estimate the signal and chi^2 of each pixel.
 
-    frame, mode : the groups, and how they were read;  rng : not used
-    read_noise : e- of one read that the estimator expects
-    Error      : Q is low by 0.1 to 0.5 e-, the estimator's own bias; two groups have no chi^2, 0
+    Parameters
+    ----------
+    frame : float array, shape (groups, ny, nx)
+        Charge of the groups in electrons.
+    mode : Mode
+        Readout of the ramp.
+    read_noise : float
+        Noise of one read in electrons that the estimator assumes, 0 to 1e5.
+    rng : numpy.random.Generator
+        Not used.
+
+    Returns
+    -------
+    float64 array, shape (2, ny, nx)
+        Signal Q in electrons during the integration time, and chi^2 (0 for a ramp of two groups).
+
+    Raises
+    ------
+    OutOfRange
+        If `read_noise` is outside its limits.
+
+    Notes
+    -----
+    The estimator is biased: Q is 0.1 to 0.5 electrons too low.
     """
     if not 0.0 <= read_noise < 1e5:
         raise OutOfRange("read noise", read_noise, 0.0, 1e5)
@@ -63,7 +86,7 @@ def _estimate(groups: Any, out: Any, beta: float, a: float) -> None:
         for i in range(n):
             scatter += (float(groups[i + 1, p]) - float(groups[i, p]) + beta - mean) ** 2
         root = math.sqrt(square / n)
-        # Of charge that a pixel can hold: what hypot guards against does not happen.
+        # The charge of a pixel is far too small for the overflow that hypot prevents.
         x = 2.0 * (square / n) / (a + math.sqrt(a * a + 4.0 * (square / n)))
         out[0, p] = n * (x - beta)
         if mean >= 0.0:

@@ -1,9 +1,8 @@
-"""Non-linearity of the output amplifier: its gain falls towards saturation, and for the first electrons.
+"""Nonlinearity of the output amplifier: its gain falls towards saturation, and for the first electrons.
 
-measured = s - b n0 (1 - exp(-s / n0)),  s = n / (1 + a n / saturation)
+For n electrons, with the parameters a (`high`), b (`low`) and n0 (`knee`)::
 
-apply         electrons -> what the amplifier gives, in electrons
-linearised    its inverse: what a calibration does
+    measured = s - b n0 (1 - exp(-s / n0)),    s = n / (1 + a n / saturation)
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from truesky.render.effects.effect import Effect, map_pixels
 from truesky.render.effects.scene import Frame, Scene
 from truesky.render.effects.series import SMALL, small_expm1
 
-# Newton's rule doubles the digits; the function is smooth and its slope between 1 - b and 1.
+# Newton's method doubles the number of correct digits. The function is smooth with slopes between 1 - b and 1.
 _ITERATIONS = 6
 
 
@@ -29,10 +28,32 @@ Number = float | Float
 def apply(
     frame: Frame, high: Number, saturation: Number, low: Number, knee: Number, rng: np.random.Generator | None = None
 ) -> Frame:
-    """frame [..] e- >= 0 -> e-, monotonic; each number may be [q] of the amplifiers of a frame [q, ..].
+    """Apply the nonlinearity of the amplifiers.
 
-    high : a, what is missing at `saturation` e-;  low : b, what is missing of the first electrons;  knee : n0, e-
-    rng  : not used
+    Parameters
+    ----------
+    frame : float array, any shape, or (q, ...) for q amplifiers
+        Electrons. Negative values are unchanged.
+    high : float or array, shape (q,)
+        Parameter a: relative loss of signal at `saturation`, 0 to 10.
+    saturation : float or array, shape (q,)
+        Saturation of the amplifier in electrons, 1 to 1e9.
+    low : float or array, shape (q,)
+        Parameter b: missing fraction of the first electrons, 0 to 0.99.
+    knee : float or array, shape (q,)
+        Scale n0 of the loss of the first electrons, in electrons, 1e-3 to 1e9.
+    rng : numpy.random.Generator, optional
+        Not used.
+
+    Returns
+    -------
+    float array, shape of `frame`
+        Output of the amplifier in electrons. It increases monotonically with the input.
+
+    Raises
+    ------
+    OutOfRange
+        If a parameter is outside its limits.
     """
     _check_parameters(high, saturation, low, knee)
     return map_pixels(_respond, frame, high / saturation, low * knee, 1.0 / knee)
@@ -40,11 +61,12 @@ def apply(
 
 @jit
 def _respond(light: Any, signal: Any, high: float, low: float, inverse: float) -> None:
-    """high : per electron, low : electrons, inverse : of the knee."""
+    """Fill `signal`. `high` is per electron, `low` in electrons, and `inverse` is 1 / knee."""
     for i in range(len(light)):
         response = max(light[i], 0.0) / (1.0 + high * max(light[i], 0.0))
         signal[i] = min(light[i], 0.0) + response + low * small_expm1(-response * inverse)
-    # Most pixels are faint: a branch above would cost more than the few that are done twice.
+    # Replace pixels outside the range of the series. A branch in the first loop would prevent its vectorisation, which
+    # costs more than computing a few pixels twice.
     for i in range(len(light)):
         if light[i] * inverse > SMALL:
             response = light[i] / (1.0 + high * light[i])
@@ -52,9 +74,24 @@ def _respond(light: Any, signal: Any, high: float, low: float, inverse: float) -
 
 
 def linearise(measured: Frame, high: Number, saturation: Number, low: Number, knee: Number) -> Frame:
-    """The electrons that `apply` made into `measured`; beyond what it can give: infinite.
+    """Invert `apply`, for calibration.
 
-    measured : e-;  high, saturation, low, knee : as of `apply`
+    Parameters
+    ----------
+    measured : float array, any shape, or (q, ...) for q amplifiers
+        Output of the amplifier in electrons.
+    high, saturation, low, knee : float or array, shape (q,)
+        Same as in `apply`.
+
+    Returns
+    -------
+    float array, shape of `measured`
+        Electrons before the amplifier; infinite for values above the highest possible output.
+
+    Raises
+    ------
+    OutOfRange
+        If a parameter is outside its limits.
     """
     _check_parameters(high, saturation, low, knee)
     high, saturation, low, knee = (
@@ -83,7 +120,7 @@ def _check_parameters(high: Number, saturation: Number, low: Number, knee: Numbe
 
 
 def parameters(scene: Scene) -> tuple[Number, Number, Number, Number]:
-    """high, saturation, low, knee: the converter's range is the amplifier's."""
+    """Return high, saturation, low and knee of a scene. The amplifier saturates at the end of the converter's range."""
     saturation = scene.amplifier_values("adc_max", "adu") * scene.amplifier_values("gain", "electron / adu")
     return (
         scene.amplifier_values("nonlinearity.high", ""),

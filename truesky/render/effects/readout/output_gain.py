@@ -1,9 +1,11 @@
-"""The outputs of a detector have gains of their own: of as much charge some columns read a little more.
+"""Gain differences between the outputs of a detector.
 
-Signals are computed, and headers tell the gain, of all outputs together: what is left are stripes of neighbouring
-columns, in flats as in images.
+Signals and headers use one gain for all outputs. The differences remain as stripes of neighbouring columns, in flats
+and images.
 
-Ref : Kubik et al. 2025, NISP detectors on ground (gains within 1 %)
+References
+----------
+Kubik et al. 2025, NISP detectors on ground (gains within 1 %).
 """
 
 from __future__ import annotations
@@ -17,9 +19,26 @@ from truesky.render.effects.scene import Frame, Scene
 
 
 def apply(frame: Frame, spread: float, rng: np.random.Generator) -> Frame:
-    """Planes [.., ny, nx] e- -> as the outputs of their columns read them.
+    """Multiply the columns of each output by its relative gain.
 
-    frame : the planes;  spread : between the lowest gain and the highest, as a fraction;  rng : numbers of the outputs
+    Parameters
+    ----------
+    frame : float array, shape (..., ny, nx)
+        Electrons.
+    spread : float
+        Difference between the lowest and the highest possible gain as a fraction, 0 to 1. Gains are uniform in between.
+    rng : numpy.random.Generator
+        Random numbers of the outputs, the same in every exposure.
+
+    Returns
+    -------
+    float array, shape of `frame`
+        Electrons as they are read.
+
+    Raises
+    ------
+    OutOfRange
+        If `spread` is outside its limits.
     """
     if not 0.0 <= spread <= 1.0:
         raise OutOfRange("spread of the outputs' gains", spread, 0.0, 1.0)
@@ -33,7 +52,7 @@ def _parameters(scene: Scene) -> tuple[float]:
 
 
 def _contribution(scene: Scene) -> float:
-    """Of a full pixel: a hot pixel or a cosmic ray may fill any, also where nothing shines."""
+    """Change of a full pixel: a hot pixel or a cosmic ray can fill any pixel, even without light."""
     return 0.5 * _parameters(scene)[0] * scene.value("full_well", "electron")
 
 

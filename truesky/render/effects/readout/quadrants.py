@@ -1,17 +1,11 @@
-"""Quadrants: a detector is read through its four corners, each with its own pre- and overscan.
+"""Split a detector into quadrants or amplifiers in readout order, with prescan and overscan.
 
-Between the halves of a detector lie rows of charge injection. They are not read: what of light or cosmic rays falls
-there ends here.
+A detector is read through its four corners. Between its halves are rows for charge injection. They are not read: light
+and cosmic rays that fall there are lost.
 
-Readout order: [E, F, G, H][row, column], where [0, 0] is read first. E lies upper left, F upper right, G lower right,
-H lower left (Euclid Data Product Description Document, LE1 VIS). Columns: prescan, pixels, overscan; rows: pixels,
-overscan.
-
-apply, EFFECT    detector -> quadrants in readout order, no charge outside the pixels
-AMPLIFIERS       the same of a ground camera's detector, whose amplifiers its table lays out
-placed           one quadrant in readout order -> as it lies on the detector, and back
-sections         which of its pixels are the detector's, which tell the bias
-assembled        quadrants -> detector, without pre- and overscan
+Readout order is [E, F, G, H][row, column], where [0, 0] is read first. E is the upper left quadrant, F the upper right,
+G the lower right and H the lower left (Euclid Data Product Description Document, LE1 VIS). Columns are prescan, pixels,
+overscan; rows are pixels, overscan. Amplifiers of a ground camera follow the table of the detector.
 """
 
 from __future__ import annotations
@@ -28,7 +22,7 @@ from truesky.render.effects.effect import Effect
 from truesky.render.effects.scene import Frame, Scene
 
 NAMES = "EFGH"
-# Whether a quadrant lies in the upper half, in the right half.
+# True for quadrants in the upper half, and in the right half.
 _UPPER, _RIGHT = (True, True, False, False), (False, True, True, False)
 
 Number = TypeVar("Number", bound=np.generic)
@@ -42,10 +36,32 @@ def apply(
     injection_rows: int = 0,
     rng: np.random.Generator | None = None,
 ) -> Frame:
-    """frame [ny, nx] e- -> quadrants [4, (ny - middle) / 2 + rows, prescan + nx / 2 + overscan] e-.
+    """Split a detector into four quadrants in readout order.
 
-    prescan, overscan, rows : columns before and after the pixels, and rows after them;  rng : not used
-    middle                  : rows between the halves, which have no pixels
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Electrons.
+    prescan, overscan : int
+        Columns before and after the pixels, 0 to 4096.
+    rows : int
+        Overscan rows after the pixels, 0 to 4096.
+    injection_rows : int, optional
+        Rows between the halves of the detector, which are not read, 0 to 4096. The number must be even.
+    rng : numpy.random.Generator, optional
+        Not used.
+
+    Returns
+    -------
+    float array, shape (4, (ny - injection_rows) / 2 + rows, prescan + nx / 2 + overscan)
+        Electrons; 0 in prescan and overscan.
+
+    Raises
+    ------
+    OutOfRange
+        If a number of rows or columns is outside its limits.
+    BadInput
+        If `ny`, `nx` or `injection_rows` is odd, or if `injection_rows` is more than `ny`.
     """
     for name, value in (
         ("prescan", prescan),
@@ -68,17 +84,28 @@ def apply(
 
 
 def to_detector_axes(quadrant: npt.NDArray[Number], number: int) -> npt.NDArray[Number]:
-    """A quadrant [ny, nx] in readout order -> in the detector's own axes; applied twice it is itself."""
+    """Flip a quadrant (ny, nx) from readout order to the axes of the detector, or back."""
     return quadrant[:: -1 if _UPPER[number] else 1, :: -1 if _RIGHT[number] else 1]
 
 
 def pixel_offset(
     number: int, shape: tuple[int, ...], prescan: int, overscan: int, rows: int, injection_rows: int = 0
 ) -> tuple[int, int]:
-    """What is added to a detector's (column, row) to find it in a quadrant [ny, nx] as it is `placed`.
+    """Offset between pixel positions on the detector and in a quadrant in detector axes.
 
-    number : of the quadrant;  shape : ny, nx of it
-    prescan, overscan, rows, middle : as of `apply`
+    Parameters
+    ----------
+    number : int
+        Index of the quadrant, 0 to 3 for E, F, G, H.
+    shape : (int, int)
+        Rows and columns of the quadrant, with prescan and overscan.
+    prescan, overscan, rows, injection_rows : int
+        Same as in `apply`.
+
+    Returns
+    -------
+    column, row : int
+        Offset to add to a position on the detector.
     """
     ny, nx = shape
     across = overscan - (nx - prescan - overscan) if _RIGHT[number] else prescan
@@ -88,12 +115,26 @@ def pixel_offset(
 def sections(
     number: int, shape: tuple[int, ...], prescan: int, overscan: int, rows: int, injection_rows: int = 0
 ) -> Sections:
-    """Of a quadrant [ny, nx] as it is `placed`: the bias from the last half of its overscan.
+    """Image sections of a quadrant in detector axes.
 
-    Charge that traps gave back is in the first half.
+    Parameters
+    ----------
+    number : int
+        Index of the quadrant, 0 to 3 for E, F, G, H.
+    shape : (int, int)
+        Rows and columns of the quadrant, with prescan and overscan.
+    prescan, overscan, rows, injection_rows : int
+        Same as in `apply`.
 
-    number : of the quadrant;  shape : ny, nx of it
-    prescan, overscan, rows, middle : as of `apply`
+    Returns
+    -------
+    Sections
+        Sections of the pixels, of their place on the detector, and of the bias (None without overscan).
+
+    Notes
+    -----
+    The bias is measured in the second half of the overscan columns, because the first half contains charge released
+    from traps.
     """
     (ny, nx), (across, up) = shape, pixel_offset(number, shape, prescan, overscan, rows, injection_rows)
     x, y = overscan if _RIGHT[number] else prescan, rows if _UPPER[number] else 0
@@ -106,10 +147,19 @@ def sections(
 def assemble(
     quadrants: npt.NDArray[Number], prescan: int, overscan: int, rows: int, injection_rows: int = 0
 ) -> npt.NDArray[Number]:
-    """Quadrants [4, ..] in readout order -> detector [ny, nx], pre- and overscan cut off, 0 in the rows between.
+    """Combine quadrants in readout order into a detector.
 
-    quadrants                       : of `apply`
-    prescan, overscan, rows, middle : as of `apply`
+    Parameters
+    ----------
+    quadrants : array, shape (4, ny, nx)
+        Result of `apply`.
+    prescan, overscan, rows, injection_rows : int
+        Same as in `apply`.
+
+    Returns
+    -------
+    array, shape (ny, nx)
+        Detector without prescan and overscan; 0 in the rows between the halves.
     """
     pixels = [
         to_detector_axes(q[: q.shape[0] - rows, prescan : q.shape[1] - overscan], i) for i, q in enumerate(quadrants)
@@ -120,7 +170,7 @@ def assemble(
 
 
 def overscan_sizes(scene: Scene) -> tuple[int, int, int, int]:
-    """prescan, overscan, overscan rows, rows between the halves."""
+    """Return the numbers of prescan columns, overscan columns, overscan rows, and rows between the halves."""
     prescan, overscan, rows = (
         int(scene.value(f"fpa.{key}", "pix")) for key in ("prescan", "overscan", "parallel_overscan")
     )
@@ -128,16 +178,28 @@ def overscan_sizes(scene: Scene) -> tuple[int, int, int, int]:
 
 
 def apply_amplifiers(frame: Frame, layout: Layout, rng: np.random.Generator | None = None) -> Frame:
-    """frame [ny, nx] e- -> [q, rows, columns] e- in readout order, with pre- and overscan; what is not read is lost.
+    """Split a detector into amplifiers (q, rows, columns) in readout order, with prescan and overscan.
 
-    own : the detector's amplifiers;  rng : not used
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Electrons.
+    layout : Layout
+        Amplifiers of the detector.
+    rng : numpy.random.Generator, optional
+        Not used.
+
+    Returns
+    -------
+    float array, shape (q, rows, columns)
+        Electrons. Pixels that are not read are lost.
     """
     return layout.split(frame)
 
 
 def _layout(scene: Scene) -> tuple[Layout]:
     if scene.layout is None:
-        raise BadInput(f"{scene.section}: a detector without a table of its amplifiers is not read through them")
+        raise BadInput(f"{scene.section}: the detector must have a table of its amplifiers")
     return (scene.layout,)
 
 

@@ -1,16 +1,15 @@
-"""Noise of a ramp's reads: each group's mean of r reads has the noise s / sqrt(r) of its own, and the outputs drift.
+"""Noise of the reads of a ramp: white read noise, 1/f drift of the outputs, and reset levels.
 
-A detector has 32 outputs, each of which reads its columns row by row.  What is left of their slow drift after the
-reference pixels were subtracted is noise of spectrum 1 / f along the order in which an output reads its pixels.  It is
-given by the width that it adds to the signal of a ramp and taken as linear in time over the ramp: a part in n of it
-goes to each of the n differences of groups, and none to their scatter.
+A group is the mean of r reads with the noise s each, so that its read noise is s / sqrt(r). A detector has 32 outputs,
+each of which reads its columns row by row. Reference pixels correct slow drifts of an output; the rest is noise with a
+1/f spectrum in readout order. The mission gives the width that this noise adds to the signal of a ramp. It is taken as
+linear in time over the ramp: each of the n differences of groups gets 1 / n of it, so that it does not increase their
+scatter. The level to which each pixel is reset is the same in all groups, so that the signal does not contain it.
 
-apply, EFFECT        noise of the reads
-apply_drift, DRIFT   1 / f noise of the outputs
-apply_reset, RESET   the level that each pixel was reset to: the same in all groups, so that the signal has none of it
-
-Ref : Kubik et al. 2025, NISP detectors on ground (7 and 9 e- of the estimated signal); Moseley et al. 2010, Proc. SPIE
-      7742, 77421B (1 / f of these outputs)
+References
+----------
+Kubik et al. 2025, NISP detectors on ground (7 and 9 electrons in the estimated signal). Moseley et al. 2010, Proc. SPIE
+7742, 77421B (1/f noise of these outputs).
 """
 
 from __future__ import annotations
@@ -29,19 +28,38 @@ from truesky.render.effects.effect import Effect, zero_contribution
 from truesky.render.effects.scene import Frame, Scene
 
 OUTPUTS = 32
-# Rows in which reference pixels follow a drift (assumed): what is slower was subtracted.
+# Number of rows in which reference pixels follow a drift (assumed). Slower drifts are subtracted.
 _REFERENCE_ROWS = 64
 
 
 def edges(columns: int) -> Int:
-    """int[33]: the first column of each output, and the end of the last."""
+    """Return the first column of each output, and the number of columns: an int array of 33 values."""
     return np.linspace(0, columns, OUTPUTS + 1).astype(int)
 
 
 def apply(frame: Frame, sigma: float, reads: int, rng: np.random.Generator) -> Frame:
-    """Groups [groups, ny, nx] e- -> with the noise of the mean of `reads` reads of sigma e- each.
+    """Add the read noise of the groups.
 
-    frame : the groups;  rng : random numbers
+    Parameters
+    ----------
+    frame : float array, shape (groups, ny, nx)
+        Electrons.
+    sigma : float
+        Noise of one read in electrons, 0 to 1e5.
+    reads : int
+        Reads per group.
+    rng : numpy.random.Generator
+        Source of the key from which each pixel derives its random numbers.
+
+    Returns
+    -------
+    float array, shape of `frame`
+        Electrons including noise.
+
+    Raises
+    ------
+    OutOfRange
+        If `sigma` is outside its limits.
     """
     if not 0.0 <= sigma < 1e5:
         raise OutOfRange("read noise", sigma, 0.0, 1e5)
@@ -57,11 +75,31 @@ def _add(frame: Any, out: Any, sigma: float, key: Any) -> None:
 
 
 def apply_drift(frame: Frame, width: float, rng: np.random.Generator) -> Frame:
-    """Groups [groups, ny, nx] e- -> with 1 / f noise of `width` e- rms in the last group above the first.
+    """Add 1/f noise of the outputs, which grows linearly from the first group to the last.
 
-    The columns are those of the outputs, neighbours together; their number need not be a multiple of 32.
-    Error : the mission's width is what was measured of a signal beyond the noise of its reads, all of it taken as 1 / f
-            noise; a ramp of other groups or another length has as much of it
+    Parameters
+    ----------
+    frame : float array, shape (groups, ny, nx)
+        Electrons. Each output reads neighbouring columns; their number need not be a multiple of 32.
+    width : float
+        Standard deviation of the difference between the last and the first group in electrons, 0 to 1e5.
+    rng : numpy.random.Generator
+        Random numbers of the drift.
+
+    Returns
+    -------
+    float array, shape of `frame`
+        Electrons including noise.
+
+    Raises
+    ------
+    OutOfRange
+        If `width` is outside its limits.
+
+    Notes
+    -----
+    The mission's width is the measured noise of a signal in excess of the noise of its reads. It is attributed to 1/f
+    noise. Ramps with other groups or of another length have the same width.
     """
     if not 0.0 <= width < 1e5:
         raise OutOfRange("1/f noise", width, 0.0, 1e5)
@@ -82,7 +120,27 @@ def _add_drift(group: Any, drift: Any, width: float, out: Any) -> None:
 
 
 def apply_reset(frame: Frame, sigma: float, rng: np.random.Generator) -> Frame:
-    """Groups [groups, ny, nx] e- -> above the level of each pixel's reset, of sigma e- rms."""
+    """Add the reset level of each pixel, the same in all groups.
+
+    Parameters
+    ----------
+    frame : float array, shape (groups, ny, nx)
+        Electrons.
+    sigma : float
+        Standard deviation in electrons, 0 to 1e6.
+    rng : numpy.random.Generator
+        Source of the key from which each pixel derives its random number.
+
+    Returns
+    -------
+    float array, shape of `frame`
+        Electrons above the zero level.
+
+    Raises
+    ------
+    OutOfRange
+        If `sigma` is outside its limits.
+    """
     if not 0.0 <= sigma < 1e6:
         raise OutOfRange("reset noise", sigma, 0.0, 1e6)
     out = np.empty_like(frame)
@@ -100,13 +158,13 @@ def _add_levels(groups: Any, out: Any, sigma: float, key: Any) -> None:
 
 
 def _one_over_f(count: int, rng: np.random.Generator, slowest: int = 1) -> Frame:
-    """float32[count] of spectrum 1 / f from `slowest` cycles a stream on, of rms 1 over the ensemble; its mean is 0."""
+    """Draw 1/f noise with mean 0 and ensemble rms 1, without frequencies below `slowest` cycles per stream."""
     size = scipy.fft.next_fast_len(max(count, 2), real=True)
     frequency = np.arange(size // 2 + 1)
     amplitude = np.zeros(len(frequency), np.float32)
     slowest = min(slowest, size // 2)
     amplitude[slowest:] = 1.0 / np.sqrt(frequency[slowest:])
-    # Of a real stream all but the last frequency of an even size stand for two.
+    # In the spectrum of a real stream each frequency represents two, except 0 and the last one of an even size.
     shares = np.where((frequency == size / 2) | (frequency == 0), 1.0, 2.0)
     amplitude /= np.sqrt((shares * amplitude**2).sum())
     parts = rng.standard_normal((2, len(frequency)), np.float32) * np.sqrt(np.float32(0.5))
@@ -129,7 +187,7 @@ def _reset(scene: Scene) -> float:
 
 
 def _difference_noise(scene: Scene) -> float:
-    """Of the difference of two groups."""
+    """Read noise of the difference of two groups, in electrons."""
     sigma, reads = _read_parameters(scene)
     return sigma * float(np.sqrt(2.0 / reads))
 

@@ -1,4 +1,4 @@
-"""Read noise: the output amplifier adds a Gaussian to every pixel."""
+"""Read noise: the output amplifier adds Gaussian noise to every pixel."""
 
 from __future__ import annotations
 
@@ -15,10 +15,30 @@ from truesky.render.effects.scene import Frame, Scene
 
 
 def apply(frame: Frame, sigma: float | Float, rng: np.random.Generator) -> Frame:
-    """frame [ny, nx] e- -> frame + N(0, sigma) e-; sigma : may be [q] of the amplifiers of a frame [q, ny, nx]."""
+    """Add Gaussian read noise.
+
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx), or (q, ny, nx) for q amplifiers
+        Electrons.
+    sigma : float or array, shape (q,)
+        Standard deviation in electrons, 0 or more.
+    rng : numpy.random.Generator
+        Source of the key from which each pixel derives its random number.
+
+    Returns
+    -------
+    float array, shape of `frame`
+        Electrons including read noise.
+
+    Raises
+    ------
+    OutOfRange
+        If `sigma` is negative or infinite.
+    """
     if not (np.min(sigma) >= 0.0 and np.max(sigma) < np.inf):
         raise OutOfRange("read noise", sigma, 0.0, np.inf)
-    # The number of an amplifier's first pixel in the frame.
+    # Index of the first pixel of each amplifier in the frame.
     first = np.arange(len(frame)) * frame[0].size if np.ndim(sigma) else 0
     return map_pixels(_add, frame, sigma, pixel_random.draw_key(rng), first)
 

@@ -1,7 +1,4 @@
-"""Cosmic rays that arrive while the detector is read: their charge is registered at later rows.
-
-apply_readout, READOUT   in the readout, on quadrants
-"""
+"""Cosmic rays that arrive during the readout: their charge appears in later rows."""
 
 from __future__ import annotations
 
@@ -17,7 +14,7 @@ from truesky.render.effects.readout import charge_transfer
 from truesky.render.effects.readout.traps import Traps
 from truesky.render.effects.scene import Frame, Scene
 
-# Electrons in traps that are not followed further.
+# Trapped electrons below which a trail is not followed further.
 _NEGLIGIBLE = 1e-3
 
 
@@ -25,12 +22,31 @@ def apply_readout(
     frame: Frame, expected: float, quantiles: Frame, rows: int, prescan: int, columns: int, silicon: Traps | None,
     rng: np.random.Generator,
 ) -> Frame:  # fmt: skip
-    """quadrants [q, ny, nx] e- in readout order -> plus the tracks that hit while they were read.
+    """Add tracks that arrive while the quadrants are read.
 
-    expected : tracks on one quadrant's rows x columns pixels;  prescan : first column that is a pixel
-    silicon  : what is on the way down the columns, None: nothing
-    frame     : the quadrants;  rows, columns : of a quadrant's pixels
-    quantiles : as of cosmic_rays.tracks;  rng : random numbers of the tracks
+    Parameters
+    ----------
+    frame : float array, shape (q, ny, nx)
+        Electrons of each quadrant in readout order.
+    expected : float
+        Mean number of tracks on the pixels of one quadrant, 0 to 1e8.
+    quantiles : float array, shape (n, 3)
+        Same as in `cosmic_rays.draw_tracks`.
+    rows : int
+        Rows of a quadrant that are pixels.
+    prescan : int
+        Columns before the pixels.
+    columns : int
+        Columns of a quadrant that are pixels.
+    silicon : Traps or None
+        Traps along the columns. None to ignore charge transfer inefficiency.
+    rng : numpy.random.Generator
+        Random numbers of the tracks.
+
+    Returns
+    -------
+    float array, shape of `frame`
+        Electrons including the tracks.
     """
     out = np.array(frame, dtype=float)
     for quadrant in out.reshape(-1, *frame.shape[-2:]):
@@ -41,7 +57,7 @@ def apply_readout(
         event, column, row, charge = cosmic_rays.pixels_of_events(
             cosmic_rays.draw_events(count, rows, columns, quantiles, rng)
         )
-        # Rows read before the hit: the pixel's charge is read that much later.
+        # Rows that were read before the hit. The charge is read with a packet that is this many rows later.
         rows_read = rng.integers(0, quadrant.shape[0], count)
         column, row = column % part.shape[1], row % rows
         packet = row + rows_read[event]
@@ -51,9 +67,10 @@ def apply_readout(
 
 
 def _deposit(quadrant: Frame, column: Int, packet: Int, row: Int, charge: Frame, silicon: Traps | None) -> None:
-    """Adds charge to packets that lie in a row when it hits, in place, less what traps hold back, plus its trail.
+    """Add charge, less the part that traps capture, and its trail in place, to packets in the rows of the hits.
 
-    Error : a tenth of what traps do: each knows only how many of its species the hits before have filled
+    The error is a tenth of the effect of traps, because only the number of traps that earlier hits have filled is
+    known.
     """
     if silicon is None:
         cosmic_rays.add_charge(quadrant, packet, column, charge)
@@ -62,7 +79,7 @@ def _deposit(quadrant: Frame, column: Int, packet: Int, row: Int, charge: Frame,
     column, packet, row = (x[order] for x in (column, packet, row))
     charge = charge[order]
     existing = quadrant[packet, column]
-    # Traps that a hit reaches above the packet that it finds: from its row down.
+    # Traps that the added charge reaches and the existing packet does not, from the row of the hit down.
     reached = (row + 1) * (silicon.volume(existing + charge) - silicon.volume(existing))
     released = -np.expm1(-1.0 / np.array(silicon.release))
     _add_trails(quadrant, column, packet, charge, reached, np.array(silicon.density), released)
@@ -72,7 +89,7 @@ def _deposit(quadrant: Frame, column: Int, packet: Int, row: Int, charge: Frame,
 def _add_trails(
     quadrant: Any, column: Any, packet: Any, charge: Any, reached: Any, density: Any, released: Any
 ) -> None:
-    """Column by column, each in the order of its packets."""
+    """Add charge and trails column by column, in the order of packets."""
     trapped = np.zeros(len(density))
     for i in range(len(column)):
         if i == 0 or column[i] != column[i - 1]:

@@ -1,8 +1,8 @@
-"""Readout trail, or frame-transfer smear: the shutter is open, and a row collects light wherever it is shifted over.
+"""Readout trail (frame-transfer smear): with an open shutter, rows collect light while they are shifted.
 
-Runs on expected electrons: what falls in there is counted like all light, and seen by the pixel that it falls on. The
-lamp is out while rows move. As the response of the pixel where a row began comes once, after all light has, it is
-divided out here. Rows beyond a dark column's defect lose their trail with the rest.
+The effect acts on expected electrons: the light of the trail is counted like all other light, with the sensitivity of
+the pixel on which it falls. The lamp is off during the readout. The pixel response is applied later, once for the pixel
+in which a row began; it is therefore divided out here. Rows beyond the defect of a dark column lose their trail, too.
 """
 
 from __future__ import annotations
@@ -25,13 +25,30 @@ def apply(
     response: pixel_response.Parameters | None = None,
     rng: np.random.Generator | None = None,
 ) -> Frame:
-    """frame [ny, nx] expected e- -> plus what is collected on the way to the register.
+    """Add the light that rows collect on their way to the register.
 
-    share    : time over one row, of the exposure time
-    halves   : 2 = the upper half is read at its last row, 1 = all through row 0
-    response : of pixel_response.response, which comes later and with whose random numbers this one comes; None: all
-               pixels are alike
-    rng      : random numbers of that response; None: all pixels are alike
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Expected electrons.
+    share : float
+        Time that a row spends over one pixel as a fraction of the exposure time, 0 to 1e6.
+    halves : int
+        2 if the upper half is read through the last row, 1 if all rows are read through row 0.
+    response : tuple, optional
+        Parameters of `pixel_response.response`, which is applied later. By default all pixels have the same response.
+    rng : numpy.random.Generator, optional
+        Random numbers of the pixel response. By default all pixels have the same response.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Expected electrons including the trail.
+
+    Raises
+    ------
+    OutOfRange
+        If `share` or `halves` is outside its limits.
     """
     if not 0.0 <= share <= 1e6:
         raise OutOfRange("readout trail", share, 0.0, 1e6)
@@ -51,7 +68,7 @@ def apply(
 
 @jit
 def _add_trail(light: Any, sensitivity: Any, share: float, out: Any) -> None:
-    """Fills `out`: a row passes over those that are read before it, the first of all is row 0."""
+    """Fill `out`. A row passes over the rows that are read before it; row 0 is read first."""
     collected = np.zeros(light.shape[1])
     for r in range(len(light)):
         for c in range(light.shape[1]):
@@ -62,7 +79,7 @@ def _add_trail(light: Any, sensitivity: Any, share: float, out: Any) -> None:
 
 
 def _parameters(scene: Scene) -> tuple[float, int, pixel_response.Parameters | None]:
-    # A row takes as long whatever part of a detector is looked at.
+    # The time per row is the same if only a part of the detector is simulated.
     rows = scene.value("fpa.ny", "pix") / 2 + scene.value("fpa.parallel_overscan", "pix")
     share = scene.value("readout_time", "s") / rows / max(scene.exposure_time_s, 1e-3)
     return share, 2, pixel_response.parameters(scene) if pixel_response.EFFECT.is_applied(scene) else None

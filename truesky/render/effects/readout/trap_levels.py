@@ -1,8 +1,9 @@
-"""Charge traps, followed roughly: all lines at once, with the traps of a pixel in a few levels of height.
+"""Follow charge traps with a coarse and fast method, for detectors with little damage.
 
-As traps.py does it in one sweep, but in place of the watermarks that clouds leave a level only knows how full it is:
-a cloud that ends within one fills that part of all its traps. Most levels lie where most packets end. A tenth of the
-time, and an error in proportion to the damage: for young detectors.
+All lines are followed at once, with the traps of a pixel in a few levels of height. The method equals one sweep of
+`traps`, but each level stores only its filled fraction instead of watermarks: a cloud that ends within a level fills
+the same fraction of all its traps. Most levels are near the heights at which most packets end. The method takes a tenth
+of the time, with an error proportional to the damage.
 """
 
 from __future__ import annotations
@@ -14,25 +15,37 @@ import numpy as np
 from lake_schema.arrays import Float
 from truesky.numerics.compiling import jit
 
-# Packets that are looked at to place the levels; between these quantiles of them lie a third of the levels.
+# Number of packets that are sampled to place the levels. A third of the levels lies between these quantiles.
 _SAMPLE, _USUAL = 100_000, (0.002, 0.99)
-# Levels below those.
+# Number of levels below the lower quantile.
 _LEVELS_BELOW = 2
-# Electrons above the notch that are no level of their own: the last of a trail fades to below single precision.
+# Lowest electrons above the notch at which a level may end: the end of a trail fades below single precision.
 _MIN_THICKNESS = 1e-6
-# With fewer there are no levels where most packets do not end.
+# With fewer levels, heights at which few packets end would have no level.
 MIN_LEVELS = 6
-# Lines that are followed together.
+# Number of lines that are followed together.
 _BLOCK = 256
-# Pixels that are always full: numbers that fade to below single precision take the processor a hundred times longer.
+# Lowest number of full pixels. It prevents denormal numbers, with which the processor is a hundred times slower.
 _MIN_FULL = np.float32(1e-30)
 
 
 def level_ends(frame: Float, notch: float, count: int) -> Float:
-    """Ends of levels, electrons, ascending from the notch to the fullest packet of a frame, at least 1 e- above it.
+    """Place levels between the notch and the fullest packet of a frame.
 
-    count   : of the levels
-    returns : [count + 1], or fewer where ends would coincide, as in a frame of one brightness, or of none above it
+    Parameters
+    ----------
+    frame : float array, any shape
+        Electrons.
+    notch : float
+        Electrons that meet no trap.
+    count : int
+        Number of levels.
+
+    Returns
+    -------
+    float array, shape (count + 1,) or shorter
+        Ends of the levels in electrons, ascending from `notch` to the fullest packet, at least `notch` + 1. The array
+        is shorter if ends coincide, as in a uniform frame or a frame without packets above the notch.
     """
     flat = frame.reshape(-1)
     sample = flat[:: max(len(flat) // _SAMPLE, 1)]
@@ -52,12 +65,27 @@ def level_ends(frame: Float, notch: float, count: int) -> Float:
 def shift(
     plane: Float, axis: int, pixels: int, density: Float, released: Float, ends: Float, volume: Float
 ) -> float:  # fmt: skip
-    """Lines plane[:, k] (axis -2) or plane[k, :] (axis -1), in place, over the traps of `pixels` pixels.
+    """Shift the lines of a plane over traps, in place.
 
-    ends, volume : electrons and parts of a pixel's volume at the levels' ends
-    plane             : [n, m] e-
-    density, released : [species] traps a pixel, and the part of the full ones that is released in a step
-    returns      : what is still trapped
+    Parameters
+    ----------
+    plane : float array, shape (n, m)
+        Electrons. Lines are plane[:, k] for axis -2, and plane[k, :] for axis -1.
+    axis : int
+        Axis of the transfer, -2 or -1.
+    pixels : int
+        Number of pixels of a line.
+    density : float array, shape (species,)
+        Traps per pixel.
+    released : float array, shape (species,)
+        Fraction of the full traps that release their electron per transfer.
+    ends, volume : float array, shape (levels + 1,)
+        Ends of the levels in electrons and as a fraction of a pixel's volume.
+
+    Returns
+    -------
+    float
+        Electrons that are still trapped at the end.
     """
     is_present = density > 0.0
     silicon = pixels, density[is_present], released[is_present], ends, volume
@@ -73,11 +101,11 @@ def shift(
 
 @jit
 def _follow(packets: Float, pixels: int, density: Float, released: Float, ends: Float, volume: Float) -> float:
-    """Lines packets[:, k]."""
+    """Shift the lines packets[:, k] in place, and return the electrons that are still trapped."""
     n, total = packets.shape
     gain, captured = np.empty(_BLOCK), np.empty(_BLOCK)
     cloud, filled = np.empty(_BLOCK, np.float32), np.empty(_BLOCK, np.float32)
-    # Traps that are full: of each level in pixels, of all in electrons.
+    # Full traps of each level as a number of pixels, and of all levels in electrons.
     full, held_charge = np.empty((len(density), len(ends) - 1, _BLOCK), np.float32), np.empty((len(density), _BLOCK))
     trapped = 0.0
     for first in range(0, total, _BLOCK):
@@ -102,7 +130,7 @@ def _follow(packets: Float, pixels: int, density: Float, released: Float, ends: 
                     slope, thick = np.float32(1.0 / (ends[k + 1] - ends[k])), np.float32(volume[k + 1] - volume[k])
                     _fill(cloud[:m], full[s, k], filled, np.float32(ends[k]), slope, thick, passed, retained)
                 for c in range(m):
-                    # Never more than the packet has.
+                    # A packet cannot lose more electrons than it contains.
                     new = min(density[s] * filled[c], line[c] + gain[c] - captured[c])
                     captured[c] += new
                     species_charge[c] += new
@@ -114,7 +142,7 @@ def _follow(packets: Float, pixels: int, density: Float, released: Float, ends: 
 
 @jit
 def _fill(cloud: Any, full: Any, filled: Any, start: Any, slope: Any, thick: Any, passed: Any, retained: Any) -> None:
-    """One level of one species: the packets `cloud`, what is full of it, in pixels, and what they fill, in volumes."""
+    """Fill one level of one species: update its full pixels, and add the filled volume of each packet to `filled`."""
     zero, unity = np.float32(0.0), np.float32(1.0)
     for c in range(len(cloud)):
         reached = min(max((cloud[c] - start) * slope, zero), unity)

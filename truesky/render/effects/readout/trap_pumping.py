@@ -1,21 +1,20 @@
-"""Trap pumping: charge is moved to and fro over the traps, each of which carries some of it to a neighbour: a dipole.
+"""Trap pumping: charge is shuffled over the traps, and each pumped trap moves charge to a neighbour, forming a dipole.
 
-In a cycle a packet leaves an electrode and comes back, and a phase takes as long as the others. A trap that captures an
-electron may release it a phase later, when the next packet is nearer; of N cycles
+In each cycle a packet leaves an electrode and comes back; all phases take the same time. A trap that captures an
+electron may release it one phase later, when the next packet is nearer. In N cycles a trap moves::
 
     I = N P (exp(-t / tau) - exp(-2 t / tau))
 
-electrons are moved, t the phase, tau the time scale of the release, P the probability of capture. Traps are those of
-charge transfer: as many of each species, at any height of the volume that a cloud fills. Each lies where its detector
-has it, in every exposure; older detectors have those of younger ones and more.
+electrons, with the phase time t, the release time tau and the capture probability P. They are the traps of charge
+transfer: the same density of each species, at uniformly distributed heights of the volume that a cloud fills. Positions
+are fixed for a detector. With age, traps are added to the existing ones.
 
-apply, EFFECT    the frame, pumped
-moved            electrons of a trap;  trap_map : which pixels have traps of which species
-duration         of a frame
+Not modelled: the shot noise of capture and release (less than the square root of I), and the decrease of dipoles while
+they empty a pixel. A pixel gives no more charge than it has.
 
-Ref   : Hall et al. 2014, IEEE TNS 61, 1826; Murray et al. 2012, SPIE 8453; Skottfelt et al. 2017, JINST 12, C12033
-Error : the shot noise of capture and release, less than the root of I, is left out, and that dipoles shrink as
-        they empty a pixel: it gives no more than it has
+References
+----------
+Hall et al. 2014, IEEE TNS 61, 1826. Murray et al. 2012, SPIE 8453. Skottfelt et al. 2017, JINST 12, C12033.
 """
 
 from __future__ import annotations
@@ -34,21 +33,30 @@ from truesky.render.effects.readout import charge_transfer
 from truesky.render.effects.readout.traps import Traps
 from truesky.render.effects.scene import Frame, Scene
 
-# Phases of a cycle: over four electrodes, one pair after the other, to the next pixel's and back.
+# Phases of a cycle: over the four electrodes, pair by pair, to the next pixel and back.
 _PHASES = 6
-# Traps that are drawn at a time.
+# Number of traps that are drawn at a time.
 _CHUNK_SIZE = 1 << 19
-# Of a pixel's number in the truth map: traps of a species, those of the next one above.
+# Base of the numbers in the truth map: one digit per species.
 _PER_SPECIES = 256
 
 
 @dataclass(frozen=True, slots=True)
 class Pumping:
-    """How charge is shuffled.
+    """Shuffling of charge.
 
-    shuffles   : cycles;  phase : s
-    efficiency : part of the traps that lie where the cycle pumps them, half of them up, half down
-    capture    : its probability;  dwell : s of a transfer, the unit of the traps' release times
+    Attributes
+    ----------
+    shuffles : int
+        Number of cycles.
+    phase : float
+        Time of a phase in seconds.
+    efficiency : float
+        Fraction of the traps at positions that the cycle pumps, 0 to 1. Half of them pump up, half down.
+    capture : float
+        Probability of capture, 0 to 1.
+    dwell : float
+        Time of a transfer in seconds, the unit of the traps' release times.
     """
 
     shuffles: int
@@ -61,11 +69,31 @@ class Pumping:
 def apply(
     frame: Frame, silicon: Traps, pumping: Pumping, segments: Sequence[tuple[int, int, bool]], rng: np.random.Generator
 ) -> Frame:
-    """frame [ny, nx] e- >= 0 -> the same charge, whole electrons of it moved to the next row or the one before.
+    """Move charge between neighbouring rows by trap pumping.
 
-    lattice : traps along the columns;  pumping : how charge is shuffled
-    runs    : pieces of the columns, between which no charge is moved: first row, the one past the last, whatever else
-    rng     : random numbers of the traps' places
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Electrons, 0 or more.
+    silicon : Traps
+        Traps along the columns.
+    pumping : Pumping
+        Shuffling of charge.
+    segments : sequence of (int, int, bool)
+        Segments of every column: first row, last row + 1, and a value that is not used. No charge moves between
+        segments.
+    rng : numpy.random.Generator
+        Random numbers of the positions of traps, the same in every exposure.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Electrons with the same sum. Whole electrons move.
+
+    Raises
+    ------
+    OutOfRange
+        If a value of `pumping` is outside its limits.
     """
     for name, value, highest in (
         ("shuffles", pumping.shuffles, 1e9), ("pumping efficiency", pumping.efficiency, 1.0),
@@ -74,7 +102,7 @@ def apply(
         if not 0.0 <= value <= highest:
             raise OutOfRange(name, value, 0.0, highest)
     charge = np.asarray(frame, dtype=float)
-    # For each row where a packet may not go: from the last of a piece up, from the first down.
+    # Rows from which charge may move up (not from the last row of a segment) and down (not from the first).
     up, down = np.zeros((2, len(charge)), bool)
     for first, end, _ in segments:
         up[first : end - 1], down[first + 1 : end] = True, True
@@ -96,15 +124,27 @@ def apply(
 
 
 def moved_electrons(tau: float, pumping: Pumping) -> float:
-    """Electrons that a trap moves; tau : its release time, in transfers."""
+    """Return the electrons that a pumped trap moves; `tau` is its release time in transfers."""
     x = pumping.phase / (tau * pumping.dwell)
-    # exp(-x) - exp(-2 x) without the difference of almost equal numbers.
+    # This is exp(-x) - exp(-2 x) without cancellation.
     return float(-pumping.shuffles * pumping.capture * np.exp(-x) * np.expm1(-x))
 
 
 @dataclass(frozen=True, slots=True)
 class _TrapChunk:
-    """Traps [n]: number of the species, place, height in parts of the volume, and where between the electrodes."""
+    """Traps as arrays of shape (n,).
+
+    Attributes
+    ----------
+    species : int array
+        Index of the species.
+    row, column : int array
+        Pixel.
+    height : float array
+        Height as a fraction of the pixel's volume, 0 to 1.
+    electrode : float array
+        Position between the electrodes, 0 to 1.
+    """
 
     species: Int
     row: Int
@@ -113,16 +153,16 @@ class _TrapChunk:
     electrode: Float
 
     def upward(self, pumping: Pumping) -> Bool:
-        """Those that move charge to the next row."""
+        """Return a mask of the traps that move charge to the next row."""
         return np.asarray(self.electrode < 0.5 * pumping.efficiency)
 
     def downward(self, pumping: Pumping) -> Bool:
-        """Those that move it to the one before."""
+        """Return a mask of the traps that move charge to the previous row."""
         return np.asarray(self.electrode > 1.0 - 0.5 * pumping.efficiency)
 
 
 def _draw_traps(shape: tuple[int, ...], density: Sequence[float], rng: np.random.Generator) -> Iterator[_TrapChunk]:
-    """The traps of a detector, some at a time, in the order in which they came to be."""
+    """Yield the traps of a detector in chunks, in the order in which damage creates them."""
     (ny, nx), total = shape, float(sum(density))
     shares = np.cumsum(density) / total if total > 0.0 else np.ones(len(density))
     remaining = int(stats.poisson.ppf(rng.random(), total * ny * nx)) if total > 0.0 and ny * nx > 0 else 0
@@ -134,9 +174,9 @@ def _draw_traps(shape: tuple[int, ...], density: Sequence[float], rng: np.random
 
 
 def trap_map(scene: Scene, rng: np.random.Generator) -> Int32:
-    """int32[ny, nx]: traps of the first species in a pixel, plus 256 times those of the second, 65536 of the third.
+    """Return the traps per pixel, int32[ny, nx]: species 1 plus 256 x species 2 plus 65536 x species 3.
 
-    scene : of the exposure;  rng : the numbers that EFFECT has
+    `rng` must be the generator that `EFFECT` uses for the same scene.
     """
     silicon = charge_transfer.silicon_traps(scene, "parallel")
     out = np.zeros((scene.ny, scene.nx), np.int32)
@@ -146,9 +186,21 @@ def trap_map(scene: Scene, rng: np.random.Generator) -> Int32:
 
 
 def duration(phase: float, section: str, mission: MissionConfiguration) -> float:
-    """Seconds that pumping takes.
+    """Time that pumping takes.
 
-    phase : s;  section : of the mission database, of the camera;  mission : the mission database
+    Parameters
+    ----------
+    phase : float
+        Time of a phase in seconds.
+    section : str
+        Section of the camera in the mission database.
+    mission : MissionConfiguration
+        Mission database.
+
+    Returns
+    -------
+    float
+        Time in seconds.
     """
     return mission.value(f"{section}.pumping.shuffles") * _PHASES * phase
 

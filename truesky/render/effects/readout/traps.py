@@ -1,29 +1,31 @@
-"""Charge traps that a line of pixels is shifted over: who captures, who releases, what is left behind.
+"""Follow the capture and release of charge by traps while lines of pixels are shifted to the output.
 
-Model: a cloud of n electrons fills the fraction V(n) of a pixel's volume and at once every trap in it; each trap
-gives its electron back with its species' time scale, into whichever packet lies there then.
+In the model, a cloud of n electrons fills the fraction V(n) of a pixel's volume and at once every trap in it. Each trap
+releases its electron with the time scale of its species, into the packet that is there at that time.
 
-A line is n packets; packet i is shifted over the pixels i, i - 1 .. 0. Taken one pixel at a time this is exact and
-slow. Here many pixels are taken together: all see the same packets, so one stack of watermarks (the heights up to which
-clouds have filled traps, and when) serves them all, and every species.
+A line has n packets; packet i is shifted over the pixels i, i - 1, ..., 0. Shifting one pixel at a time is exact and
+slow. Here many pixels are treated together: they meet the same packets, so that one stack of watermarks serves all of
+them and all species. A watermark is a height up to which a cloud has filled traps, with the time of the filling.
 
-Let m pixels see packet i, of n electrons, and let species s have rho_s traps in a pixel, of time scale tau_s in
-transfers. At height z of the volume the m pixels were last filled by packet j(z), when there were m(z) of them: pixel i
-joins empty when packet i arrives. Of the traps in dz, rho_s m(z) exp(-(i - j(z)) / tau_s) are full, H_s in all.
-One transfer on,
+Let m pixels meet packet i with n electrons. Let species s have rho_s traps per pixel and the time scale tau_s in
+transfers. At height z of the volume the pixels were last filled by packet j(z), when there were m(z) of them: pixel i
+joins empty when packet i arrives. Of the traps in dz, rho_s m(z) exp(-(i - j(z)) / tau_s) are full, H_s in total. In
+one transfer::
 
-    released   G = sum_s rho_s H_s (1 - exp(-1 / tau_s)), each pixel its share of it;
-    reached    V(n + G / m);
-    captured   C = integral from 0 to V of sum_s rho_s (m - m(z) exp(-(i - j(z)) / tau_s)) dz, at most n + G;
-    left over  n + G - C, and m(z) = m, j(z) = i below V.
+    released   G = sum_s rho_s H_s (1 - exp(-1 / tau_s)), shared equally by the pixels
+    reached    V(n + G / m)
+    captured   C = integral from 0 to V of sum_s rho_s (m - m(z) exp(-(i - j(z)) / tau_s)) dz, at most n + G
+    remaining  n + G - C, and m(z) = m, j(z) = i below V
 
-Both m(z) and j(z) are steps, the lower the newer, so that a packet looks at those below V alone and replaces them by
-one: the cost of a line is that of its packets, not of packets times pixels. What is left out is that packets change
-on their way: the second order in the losses. Heun's rule brings it in, with the change c of a sweep,
-n' = n + (c(n) + c(n + c(n))) / 2, and further steps along the line make it as small as wanted. Each electron is counted
-once, captured or not: charge is conserved.
+Both m(z) and j(z) are step functions with newer steps at lower heights. A packet therefore uses only the steps below V
+and replaces them by one: the cost of a line is proportional to its packets, not to packets times pixels. The method
+neglects that packets change on their way, which is of second order in the losses. Heun's method includes it: with the
+change c of a sweep, n' = n + (c(n) + c(n + c(n))) / 2. Several steps along the line reduce the error further. Each
+electron is counted once, captured or not, so that charge is conserved.
 
-Ref : Massey et al. 2014 (volume and watermarks), Massey et al. 2010
+References
+----------
+Massey et al. 2014 (volume and watermarks). Massey et al. 2010.
 """
 
 from __future__ import annotations
@@ -39,23 +41,32 @@ from lake_schema.errors import BadInput, OutOfRange
 from truesky.numerics.compiling import jit
 from truesky.render.effects.readout import trap_levels
 
-# Lines that are copied together where a line's packets do not lie next to each other in memory.
+# Number of lines that are copied together if the packets of a line are not contiguous in memory.
 _BLOCK = 64
-# Species are followed together, in one register; those that are missing have no traps.
+# Number of species that are followed together. Missing species have no traps.
 _SPECIES = 3
-# Of a packet, what it may be wrong by where the height of its cloud is told: 0.6 of it in V.
+# Relative gain of a packet that is neglected in the height of its cloud. The relative error of V is 0.6 of this.
 _MAX_GAIN = 1e-4
-# V(n) is tabulated: 2^6 linear segments of an octave of n, and octaves below the full well.
+# V(n) is tabulated with 2^6 linear segments per octave of n, and this number of octaves below the full well.
 _SEGMENT_BITS, _OCTAVES = 6, 60
 
 
 @dataclass(frozen=True, slots=True)
 class Traps:
-    """The traps of one direction of transfer.
+    """Traps of one direction of transfer.
 
-    density   : traps of each species in a pixel;  release : their time scales, in transfers
-    full_well : electrons that fill the pixel's volume;  notch : electrons that meet no trap
-    power     : of V = ((n - notch) / (full_well - notch))^power
+    Attributes
+    ----------
+    density : tuple of float
+        Traps per pixel of each species, 0 to 1e6.
+    release : tuple of float
+        Release time of each species in transfers, 1e-6 to 1e9.
+    full_well : float
+        Electrons that fill the pixel's volume, 1 to 1e9.
+    notch : float
+        Electrons that meet no trap, 0 to 1e8, less than `full_well`.
+    power : float
+        Exponent of V = ((n - notch) / (full_well - notch))^power, 1e-3 to 10.
     """
 
     density: tuple[float, ...]
@@ -67,7 +78,7 @@ class Traps:
     def __post_init__(self) -> None:
         if len(self.density) != len(self.release) or not 1 <= len(self.density) <= _SPECIES:
             raise BadInput(
-                f"traps: {len(self.density)} densities, {len(self.release)} release times, wanted are 1 to {_SPECIES}"
+                f"traps: {len(self.density)} densities, {len(self.release)} release times, must be 1 to {_SPECIES}"
             )
         for name, values, lo, hi in (
             ("trap density", self.density, 0.0, 1e6),
@@ -83,16 +94,24 @@ class Traps:
             raise OutOfRange("trap notch", self.notch, 0.0, self.full_well)
 
     def volume(self, electrons: npt.ArrayLike) -> Float:
-        """Fraction of a pixel's traps that a cloud reaches."""
+        """Return the fraction of a pixel's traps that clouds of the given electrons reach."""
         part = (np.asarray(electrons, float) - self.notch) / (self.full_well - self.notch)
         return np.asarray(np.clip(part, 0.0, 1.0) ** self.power)
 
 
 @dataclass(frozen=True, slots=True)
 class Sweeps:
-    """How a line is followed: steps along it, and sweeps a step (1: packets as they were; 2: Heun's rule).
+    """Method to follow a line.
 
-    levels : 0, or into how many levels the traps of a pixel are put instead of watermarks, in one sweep of one step
+    Attributes
+    ----------
+    steps : int
+        Number of steps along the line, 1 to 10,000.
+    order : int
+        Sweeps per step: 1 neglects the change of packets, 2 is Heun's method.
+    levels : int
+        Number of levels for the traps of a pixel, 6 to 1000, which replace watermarks; they allow one sweep of one step
+        only. 0 to use watermarks.
     """
 
     steps: int
@@ -103,7 +122,7 @@ class Sweeps:
         if self.levels and not trap_levels.MIN_LEVELS <= self.levels <= 1000:
             raise OutOfRange("levels of traps", self.levels, trap_levels.MIN_LEVELS, 1000)
         if self.levels and (self.steps, self.order) != (1, 1):
-            raise BadInput(f"{self.levels} levels of traps take one sweep of one step")
+            raise BadInput(f"{self.levels} levels of traps require steps = 1 and order = 1")
         if not 1 <= self.steps <= 10_000:
             raise OutOfRange("steps of a transfer", self.steps, 1, 10_000)
         if self.order not in (1, 2):
@@ -113,12 +132,32 @@ class Sweeps:
 def shift_charge(
     frame: Float, traps: Traps, sweeps: Sweeps, axis: int, pixels: int | None = None
 ) -> tuple[Float, float]:
-    """Read out lines of packets over traps.
+    """Shift lines of packets over traps to the output.
 
-    frame  : float64[.., ny, nx] electrons >= 0; the output lies at index 0 of `axis` (-2: rows, -1: columns)
-    pixels : how many packets of a line start in a pixel; those after (overscan) follow through all of them
-    traps  : their density and release times;  sweeps : how closely charge is followed
-    returns: frame, and the electrons still trapped when the last packet has passed
+    Parameters
+    ----------
+    frame : float64 array, shape (..., ny, nx)
+        Electrons, 0 or more. The output is at index 0 of `axis`.
+    traps : Traps
+        Traps of this direction.
+    sweeps : Sweeps
+        Method to follow the charge.
+    axis : int
+        Axis of the transfer: -2 along columns, -1 along rows.
+    pixels : int, optional
+        Number of packets of a line that start in a pixel, by default all. Later packets (overscan) pass all pixels.
+
+    Returns
+    -------
+    frame : float array, shape (..., ny, nx)
+        Electrons after the transfer.
+    trapped : float
+        Electrons that are still trapped after the last packet.
+
+    Raises
+    ------
+    OutOfRange
+        If `axis` or `pixels` is outside its limits.
     """
     if axis not in (-1, -2):
         raise OutOfRange("axis of transfer", axis, -2, -1)
@@ -131,9 +170,9 @@ def shift_charge(
         return out, 0.0
     missing = _SPECIES - len(traps.density)
     density, release = np.array(traps.density + (0.0,) * missing), np.array(traps.release + (1.0,) * missing)
-    # What a species' traps in a pixel that were filled so many transfers ago still hold.
+    # Electrons in the traps of one pixel, by the number of transfers since they were filled, and by species.
     occupancy = density * np.exp(-np.arange(n + 1)[:, None] / release)
-    # 1 - exp(-1 / tau) without the difference of almost equal numbers.
+    # This is 1 - exp(-1 / tau) without cancellation.
     released = -np.expm1(-1.0 / release)
     edges = np.rint(np.linspace(physical, 0, min(sweeps.steps, max(physical, 1)) + 1)).astype(np.int64)
     volumes = _volume_table(traps)
@@ -145,7 +184,7 @@ def shift_charge(
         elif axis == -1:
             trapped += _shift_lines(plane, density, occupancy, released, *volumes, edges, sweeps.order)
         else:
-            # Some columns at a time: their packets lie far apart in memory.
+            # Columns are copied in blocks because their packets are far apart in memory.
             lines = np.empty((_BLOCK, n))
             for start in range(0, plane.shape[1], _BLOCK):
                 block = lines[: plane.shape[1] - start]
@@ -156,10 +195,10 @@ def shift_charge(
 
 
 def _volume_table(traps: Traps) -> tuple[Float, float, float]:
-    """V at the ends of the segments of (n - notch) / (full_well - notch), from 2^-_OCTAVES to 1; notch; 1 / range."""
+    """V at the ends of the segments of (n - notch) / (full_well - notch) from 2^-_OCTAVES to 1; notch; 1 / range."""
     octave = np.arange(_OCTAVES)[:, None] - _OCTAVES
     part = np.ldexp(1.0 + np.arange(1 << _SEGMENT_BITS) / (1 << _SEGMENT_BITS), octave).ravel()
-    # Twice the last: a full well is the start of a segment, too.
+    # The last value is repeated because the full well is also the start of a segment.
     return np.concatenate([part, [1.0, 1.0]]) ** traps.power, traps.notch, 1.0 / (traps.full_well - traps.notch)
 
 
@@ -175,7 +214,7 @@ def _shift_lines(
     edges: Any,
     order: int,
 ) -> float:
-    """Every line lines[k, :], in place; returns what is still trapped."""
+    """Shift every line lines[k, :] in place, and return the electrons that are still trapped."""
     n = lines.shape[1]
     first, second = np.empty(n), np.empty(n)
     counts, inverse, reached, part = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
@@ -258,18 +297,18 @@ def _sweep(
     filled_at: Any,
     part: Float,
 ) -> float:
-    """Fills `change` with what pixels from `low` on do to the packets; returns what they hold at the end.
+    """Fill `change` with the effect of pixels from `low` on, and return the electrons trapped at the end.
 
-    seen, inverse       : how many of them see each packet, and 1 over that
-    reached             : V of each packet as it comes
-    height, full, since : the stack of watermarks, lowest last: up to which height, how many pixels, from which row
+    `counts` and `inverse` are the number of these pixels that each packet passes, and its inverse; `reached` is V of
+    each packet at the start. `height`, `full` and `filled_at` are the stack of watermarks, lowest last: height, number
+    of pixels, and packet that filled them.
     """
-    # Species by species, in registers: an array would be read and written at every packet.
+    # Species are separate variables: an array would be read and written at every packet.
     d0, d1, d2 = density[0], density[1], density[2]
     r0, r1, r2 = released[0], released[1], released[2]
     h0, h1, h2 = 0.0, 0.0, 0.0
     total, held_charge = d0 + d1 + d2, 0.0
-    # The lowest watermark in registers, too. Below all no pixel is full: that of a cloud that nothing reaches.
+    # The lowest watermark is in variables, too. The first one means that no pixel is full at any height.
     th, tf, ti = np.inf, 0.0, 0
     depth = -1
     for i in range(min(low, len(line))):
@@ -279,8 +318,8 @@ def _sweep(
         h0, h1, h2 = h0 - h0 * r0, h1 - h1 * r1, h2 - h2 * r2
         remaining = h0 + h1 + h2
         gain = held_charge - remaining
-        # What a pixel gives back makes a cloud hardly larger: where it does not, which watermarks a cloud reaches is
-        # known before what the traps hold, and the processor need not wait for that.
+        # Released charge usually makes a cloud hardly larger. The reached height is then known before the released
+        # charge, and the processor need not wait for it.
         if gain * inverse[i] > _MAX_GAIN * line[i]:
             top = _volume(line[i] + gain * inverse[i], volumes, notch, scale, part, part.view(np.int64))
         if top <= 0.0:
@@ -306,7 +345,7 @@ def _sweep(
                 emptied, age = (top - bottom) * full[depth], i - filled_at[depth]
                 e0, e1, e2 = _add_occupied(e0, e1, e2, emptied, occupancy, age)
         else:
-            # Never more than the packet has: the cloud then ends lower.
+            # A packet cannot lose more electrons than it contains: its cloud ends lower.
             depth += 1
             height[depth], full[depth], filled_at[depth] = th, tf, ti
             top, depth, e0, e1, e2 = _fill_partly(
@@ -328,7 +367,7 @@ def _sweep(
 def _add_occupied(
     e0: float, e1: float, e2: float, emptied: float, occupancy: Float, age: int
 ) -> tuple[float, float, float]:
-    """Of each species what pixels held that a cloud has filled again: plus so many, last filled so long ago."""
+    """Add the electrons per species in a refilled volume `emptied`, last filled `age` transfers ago."""
     return e0 + emptied * occupancy[age, 0], e1 + emptied * occupancy[age, 1], e2 + emptied * occupancy[age, 2]
 
 
@@ -344,9 +383,10 @@ def _fill_partly(
     full: Float,
     filled_at: Any,
 ) -> tuple[float, int, float, float, float]:
-    """What a packet takes that may have less than its cloud would reach: where it ends, the stack's depth, the rest.
+    """Fill traps with a packet that has fewer electrons than its cloud could fill.
 
-    empty : electrons that all traps hold;  most : electrons of the packet
+    `available` is the charge of the packet and `empty` the capacity of all traps, in electrons. Return the height at
+    which the cloud ends, the depth of the stack, and the electrons per species that were in the refilled traps.
     """
     e0, e1, e2, captured, bottom = 0.0, 0.0, 0.0, 0.0, 0.0
     while bottom < top:
@@ -370,7 +410,7 @@ def _fill_partly(
 def _volumes_of_line(
     line: Any, volumes: Float, notch: float, scale: float, part: Float, bits: Any, reached: Float
 ) -> None:
-    """V of every packet of a line, as `_volume`;  part, bits : scratch, numbers and their binary form."""
+    """Compute V of every packet of a line as in `_volume`; `part` and `bits` are scratch."""
     for i in range(len(line)):
         part[i] = min(max((line[i] - notch) * scale, 0.0), 1.0)
     for i in range(len(line)):
@@ -383,9 +423,10 @@ def _volumes_of_line(
 
 @jit
 def _volume(electrons: float, volumes: Float, notch: float, scale: float, part: Float, bits: Any) -> float:
-    """V from its table: linear between the segments' ends (1e-4 of V), and none below the last octave.
+    """Interpolate V in its table: linear in each segment (relative error 1e-4), and 0 below the last octave.
 
-    part, bits : scratch, one number and its binary form: exponent and first bits of the mantissa tell the segment
+    `part` and `bits` are scratch: one number and its binary form. Its exponent and the first bits of its mantissa give
+    the segment.
     """
     part[0] = min(max((electrons - notch) * scale, 0.0), 1.0)
     at = (bits[0] >> (52 - _SEGMENT_BITS)) - ((1023 - _OCTAVES) << _SEGMENT_BITS)

@@ -15,7 +15,7 @@ FULL = 1000.0
 
 
 def runs(ny, halves, between=0):
-    """Of columns with a register at row 0, or at both ends."""
+    """Return the segments of columns with a register at row 0, or at both ends."""
     middle = (ny - between + 1) // 2
     return [(0, ny, False)] if halves == 1 else [(0, middle, False), (middle + between, ny, True)]
 
@@ -124,7 +124,7 @@ STOPS = {"decam": 1, "hsc": 1, "megacam": 1, "lsstcam": 2, "jpcam": 2, "gpc1": 8
 
 @pytest.mark.parametrize("camera", STOPS)
 def test_ground_cameras_stop_it_where_their_columns_end(camera):
-    """A star far too bright for its column fills the piece that it is in, and no other; all charge is accounted for."""
+    """A star far too bright for its column fills its segment and no other; all charge is accounted for."""
     one = detectors.detectors(camera, MISSION)[0]
     scene = Scene(MISSION, one.section, 90.0, 10.0, 1e9, one)
     capacity, pieces = bleeding.EFFECT.parameters(scene)

@@ -48,7 +48,7 @@ def test_variance_of_a_flat_falls_as_predicted():
     assert out.sum() == flat.sum()
     lost = 1 - out.var() / flat.var()
     assert lost == pytest.approx(brighter_fatter.variance_slope(SHIFT, SOFT) * level, rel=0.1)
-    # What a pixel loses of its fluctuation its neighbours get.
+    # The neighbours of a pixel get the part of its fluctuation that it loses.
     rest = out - out.mean()
     assert (rest[:, 1:] * rest[:, :-1]).mean() > 0.0015 * level
     assert (rest[1:] * rest[:-1]).mean() > 0.0015 * level
@@ -73,7 +73,7 @@ def test_kernel_falls_off():
     np.testing.assert_array_equal(weights, weights[::-1])
 
 
-def test_what_no_pixel_holds_does_not_repel():
+def test_charge_above_full_well_does_not_repel():
     image = star(1e9)
     out = brighter_fatter.apply(image, SHIFT, SOFT, FULL, 0.0, 0, np.random.default_rng(1))
     assert out.min() >= 0
@@ -116,7 +116,7 @@ def test_rows_of_charge_injection_hold_nothing_that_repels():
     assert np.abs((through(flat, 0) - flat).mean(axis=1)).max() < error
 
 
-def test_what_is_not_noticed_is_left_out():
+def test_negligible_charge_does_not_move():
     """Faint pixels stay as they are; about a bright star the same electrons cross as if all were followed."""
     light = np.random.default_rng(3).poisson(140.0, (300, 400)).astype(float)
     light[100:125, 200:225] += star(1.5e5)
@@ -135,8 +135,8 @@ def test_what_is_not_noticed_is_left_out():
 
 
 @pytest.mark.parametrize("preset", ["draft", "survey", "reference"])
-def test_what_is_left_out_is_within_the_accuracy(preset):
-    """Of a star just too dim to be followed: its size; and what would cross the borders of its pixels."""
+def test_the_threshold_is_within_the_accuracy(preset):
+    """Errors of a star just below the threshold: its size, and charge that would cross the borders of its pixels."""
     wanted = accuracy.preset(preset)
     scene = Scene(resolve(), "vis", 560.53, 0.25, 1e4, accuracy=wanted)
     shift, softening, full, dim, _ = brighter_fatter.EFFECT.parameters(scene)
@@ -168,7 +168,7 @@ def test_a_pixel_never_gives_more_than_it_can_spare():
     out = brighter_fatter.apply(frame, 1e-4, SOFT, FULL, 0.0, 0, np.random.default_rng(1))
     assert out.min() >= 0
     assert out.sum() == frame.sum()
-    # One border after the other, each of what is left.
+    # Charge crosses one border after the other, each time a fraction of the remaining charge.
     assert out[4, 4] == pytest.approx(1e5 * (1 - brighter_fatter.MAX_CROSSING) ** 4, abs=4)
     assert out[4, 3] == brighter_fatter.MAX_CROSSING * 1e5
 

@@ -117,7 +117,7 @@ def test_a_readout_hit_passes_the_traps_from_its_row_on(rows, charges):
     packet = np.array(rows) + before
     column = np.zeros(len(rows), int)
     readout_cosmic_rays._deposit(found, column, packet, np.array(rows), np.array(charges), silicon)
-    # What traps do to the hit: its loss and its trail; far from nothing, and far from what all rows would do.
+    # Effect of traps on the hit: its loss and its trail. It differs from no effect, and from the effect of all rows.
     hit = np.zeros(140)
     hit[packet] = charges
     true, ours = wanted - without - hit, found[:, 0] - without - hit
@@ -139,7 +139,7 @@ def test_too_many_are_refused():
 
 
 def test_muons_come_at_the_site_s_rate_through_the_silicon_s_thickness():
-    """LSSTCam: 0.2 a second and detector; of cos^2 through a plane: 1 - cos^4 of the zenith angle is uniform."""
+    """LSSTCam has 0.2 per second and detector. For an intensity cos^2, 1 - cos^4 of the zenith angle is uniform."""
     lsst = detectors.detector("lsstcam", "R22_S11", MISSION)
     scene = Scene(MISSION, "ext.lsstcam", 30.0, 30.0, 1e4, lsst)
     expected, quantiles = cosmic_rays.EFFECT.parameters(scene)
@@ -157,7 +157,7 @@ def test_muons_come_at_the_site_s_rate_through_the_silicon_s_thickness():
 
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_muons_go_with_area_and_height(camera):
-    """LSSTCam's 0.2 a second on 16.4 cm2; above 3000 m half as many again."""
+    """LSSTCam has 0.2 per second on 16.4 cm2; above 3000 m the rate is 1.5 times as high."""
     key, one = f"ext.{camera}", detectors.detectors(camera, MISSION)[0]
     area = one.nx * one.ny * MISSION.value(f"{key}.fpa.pixel_size", "cm / pix") ** 2
     high = 1.5 if MISSION.value(f"{key}.site.height", "m") > 3000.0 else 1.0

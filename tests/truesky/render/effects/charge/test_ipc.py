@@ -48,8 +48,8 @@ def test_even_light_stays_as_it_is():
     np.testing.assert_array_equal(ipc.apply(frame, SIDE, DIAGONAL, RNG), frame)
 
 
-def test_what_cannot_be():
+def test_impossible_parameters_are_refused():
     with pytest.raises(OutOfRange, match="side"):
         ipc.apply(np.zeros((2, 2)), -1e-3, 0.0, RNG)
-    with pytest.raises(BadInput, match="seen by others"):
+    with pytest.raises(BadInput, match="neighbours get"):
         ipc.apply(np.zeros((2, 2)), 0.1, 0.1, RNG)

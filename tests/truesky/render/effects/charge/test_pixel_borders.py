@@ -8,10 +8,10 @@ from tests.truesky.render.fields import moments
 from truesky.render.effects.charge import pixel_borders
 
 PERIOD, PIXELS = 30.0, 0.05
-# Of the flat, that displaces by so many pixels.
+# Amplitude of the flat that belongs to a displacement of PIXELS.
 AMPLITUDE = 2.0 * np.pi * PIXELS / PERIOD
 SIDE = 96
-# Of a source, side of a pixel over that of the finer ones that stand for it.
+# Number of fine pixels along the side of a pixel, in which sources are computed.
 FINE = 8
 
 
@@ -40,7 +40,7 @@ def carried(x, y, sigma, move):
 
 
 def shared(at):
-    """Of a piece 1 / FINE wide about a place: the first pixel that it lies on, and the part of it that does."""
+    """Return the first pixel that a piece of width 1 / FINE at a position overlaps, and the overlapping fraction."""
     first = np.floor(at - 0.5 / FINE + 0.5).astype(int)
     return first, np.clip((first + 0.5 - at) * FINE + 0.5, 0.0, 1.0)
 
@@ -104,7 +104,7 @@ def test_charge_stays_and_nothing_is_negative():
 def test_the_last_pixels_are_brighter_or_fainter(shift):
     flat = pixel_borders.apply_edges(np.full((60, 80), 100.0), shift, 4.0)
     level = flat[30, :8] / 100.0 - 1.0
-    # What enters less what leaves: the first border is the detector's own.
+    # Charge that enters minus charge that leaves. No charge crosses the outer border of the detector.
     at = np.exp(-np.arange(0, 9) / 4.0)
     at[0] = 0.0
     np.testing.assert_allclose(level[1:], shift * (at[2:] - at[1:-1]), atol=1e-3)

@@ -1,4 +1,4 @@
-"""Ramps: the law of the groups against a count a frame, drawn with numpy; hits, full well and non-linearity."""
+"""Ramps: the law of the groups against counts of every frame drawn with numpy; hits, full well and nonlinearity."""
 
 import numpy as np
 import pytest
@@ -13,9 +13,9 @@ FRAME_TIME, READ_NOISE = 1.454, 13.0
 
 
 def every_frame(mode, per_frame, count, rng, charge=0.0, moment=0.0, bend=0.0, full=130_000.0):
-    """Groups [groups, count] of a count a frame, by its definition.
+    """Draw groups (groups, count) by their definition: a count per frame.
 
-    charge, moment : of a cosmic ray in each pixel;  bend, full : of its well
+    `charge` and `moment` are of a cosmic ray in each pixel. `bend` is b of the nonlinearity, and `full` the full well.
     """
     held = np.cumsum(rng.poisson(per_frame, (count, mode.frames)).astype(np.float32), axis=1)
     hit = np.arange(mode.frames) >= np.floor(np.reshape(moment, (-1, 1)) * mode.frames)
@@ -74,7 +74,7 @@ SOME = [
 
 @pytest.mark.parametrize(("mode", "rate"), SOME, ids=lambda x: str(x))
 def test_law_of_signal_and_quality(mode, rate):
-    """Of a short sample, the standard error of whose width is 0.5 %."""
+    """The sample is short: the standard error of the width is 0.5 %."""
     hold_together(mode, rate, 30_000, 60_000, 0.015)
 
 
@@ -117,7 +117,7 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("mode", [PHOTOMETRIC, SPECTROSCOPIC], ids=str)
 def test_law_of_pixels_that_are_not_linear(mode, case):
-    """With the noise of their light: signal and quality against a count a frame.
+    """Signal and quality, with photon noise, against counts of every frame.
 
     Two samples of 4000 pixels; significance 1 % of the law, 7e-6 of the mean (4.5 standard errors).
     """
@@ -203,7 +203,7 @@ def test_extremes():
 
 
 @pytest.mark.parametrize("numbers", [(1, 16, 4), (4, 0, 4), (4, 16, -1), (1001, 1, 0), (4, 16, 2000)])
-def test_modes_that_cannot_be(numbers):
+def test_impossible_modes_are_refused(numbers):
     with pytest.raises(OutOfRange, match="of a ramp"):
         ramp.Mode(*numbers)
     with pytest.raises(BadInput, match="more than 4000"):

@@ -1,4 +1,4 @@
-"""Amplifiers with numbers of their own: each acts as if all of the detector had them."""
+"""Amplifiers with different parameters: each acts as if the whole detector had its parameters."""
 
 import numpy as np
 import pytest

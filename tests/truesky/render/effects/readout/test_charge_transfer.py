@@ -60,7 +60,7 @@ def every_transfer(line, silicon, pixels, hits=(), levels=10_000):
 
 @pytest.mark.parametrize(("preset", "limit"), [("draft", 0.02), ("survey", 0.002), ("reference", 0.002)])
 @pytest.mark.parametrize("name", ["clean", "hit"])
-def test_as_arctic_does_it(name, preset, limit):
+def test_agrees_with_arctic(name, preset, limit):
     image, wanted, _ = reference(name)
     sweeps = charge_transfer.choose_sweeps(accuracy.preset(preset), PIXELS)
     found, _ = traps.shift_charge(image, ISRAEL, sweeps, -2, PIXELS)
@@ -100,7 +100,7 @@ def test_each_galaxy_is_changed_as_by_arctic(name):
     assert np.median(theirs[:, 1]) > 0.005
 
 
-def test_as_one_transfer_after_the_other():
+def test_agrees_with_single_transfers():
     """Forty rows, so strong that the second order shows, against the definition."""
     rng = np.random.default_rng(3)
     line = rng.poisson(200.0, 40).astype(float)
@@ -276,8 +276,8 @@ def clocked(column, loss, rows):
 
 
 @pytest.mark.parametrize("loss", [1e-6, 1e-4])
-def test_a_part_lost_in_every_transfer(loss):
-    """Against every transfer for itself, along columns and along rows: to the cube of what is lost."""
+def test_constant_loss_agrees_with_single_transfers(loss):
+    """Compare with single transfers, along columns and along rows: errors are of third order in the loss."""
     rng = np.random.default_rng(1)
     columns = np.zeros((2, 60, 3))
     columns[:, :50] = 10.0 ** rng.uniform(1, 5, (2, 50, 3))
@@ -286,7 +286,7 @@ def test_a_part_lost_in_every_transfer(loss):
     np.testing.assert_allclose(out, expected, rtol=0, atol=(60 * loss) ** 3 * 1e5)
     along = charge_transfer.apply_serial_loss(columns.transpose(0, 2, 1), loss)
     np.testing.assert_array_equal(along, out.transpose(0, 2, 1))
-    # What is behind the last pixel is a part of it, and all is still there.
+    # The packet behind the last pixel contains a fraction of its charge, and the total is conserved.
     assert out[:, 50].sum() == pytest.approx(50 * loss * columns[:, 49].sum(), rel=60 * loss)
     assert out.sum() == pytest.approx(columns.sum(), rel=1e-12)
 

@@ -46,7 +46,7 @@ def test_without_noise_nothing_changes():
 
 
 def test_each_output_has_a_gain_of_its_own():
-    """One for all of its columns, within the spread, the mean near 1; of the numbers of the detector."""
+    """All columns of an output have one gain, within the spread and with a mean near 1; it is fixed for a detector."""
     charge = np.full((2, 3, 2040), 1000.0, np.float32)
     seen = output_gain.apply(charge, 0.01, np.random.default_rng(1))
     assert (seen == seen[0, 0]).all()

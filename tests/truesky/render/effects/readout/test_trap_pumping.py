@@ -45,7 +45,7 @@ def test_a_trap_moves_what_cycles_one_by_one_do(tau, phase):
 
 
 def test_a_trap_is_a_dipole_along_its_column():
-    """Of as many electrons as it moves, to the row above or below."""
+    """The dipole contains the electrons that the trap moves, to the row above or below."""
     change = pumped(traps(0.0, 0.0, 1e-3), 0.1) - LEVEL
     row, column = np.nonzero(change > 0)
     assert 5 < len(row) < 60
@@ -58,9 +58,10 @@ def test_a_trap_is_a_dipole_along_its_column():
 
 
 def dipoles(frames):
-    """Of frames at several phase times [n, ny, nx]: amplitude [n, k] of pairs of rows of opposite change, found in all.
+    """Find dipoles in frames (n, ny, nx) at several phase times, and return their amplitudes (n, k).
 
-    What an observer does: half the difference of neighbours, where one is as much brighter as the other is fainter.
+    As an observer would, take half the difference of neighbouring rows if one is as much brighter as the other is
+    fainter.
     """
     change = frames - np.median(frames, axis=2, keepdims=True)
     pairs = 0.5 * (change[:, 1:] - change[:, :-1])
@@ -107,7 +108,7 @@ def test_more_charge_reaches_more_traps():
 
 
 def test_traps_stay_and_more_come():
-    """In all exposures of a detector the same, and those of a young one in an old one, too.
+    """Traps are the same in all exposures of a detector, and traps of a young detector are also in the old one.
 
     Sample of one detector; significance 6e-5 of each species' number (4 standard errors).
     """
