@@ -92,7 +92,7 @@ def test_every_table_is_found_by_its_name():
     """Names of tables are unique, and the code names each one whole, unless it has the name of its module."""
     paths = [path for path in (ROOT / "truesky").rglob("*") if path.suffix in (".csv", ".toml")]
     assert len(paths) == len(DATA)
-    named = {file for name in SOURCES for file in code_fingerprints._named_files(name.removesuffix(".__init__"))}
+    named = {file for name in SOURCES for file in code_fingerprints._scan(name.removesuffix(".__init__"))[1]}
     assert {path.name for path in set(paths) - named} == {"psf_positions.csv", "psf_positions_nisp.csv"}
 
 

@@ -87,7 +87,10 @@ def by_request(found):
 
 def test_requests_that_share_everything_count_once(two):
     page, _ = two
-    assert [(one.request, one.names) for one in page.server.lake.observed_requests] == [("a", ("a",)), ("b", ("b", "c"))]
+    assert [(one.request, one.names) for one in page.server.lake.observed_requests] == [
+        ("a", ("a",)),
+        ("b", ("b", "c")),
+    ]
     (galaxies,) = page.server.lake.request_tables("galaxies")
     assert (galaxies.request, galaxies.names) == (None, ("a", "b", "c"))
     assert page.server.lake.request_tables("stars") == []

@@ -114,7 +114,7 @@ def test_a_ground_camera_s_header_is_where_sources_are_drawn(d, tmp_path):
     there = SkyCoord(*theirs.all_pix2world(column, row, 0), unit="deg")
     assert there.separation(SkyCoord(lon, lat, unit="deg")).to_value("mas")[here].max() < 1e-2
     # Without the distortion they would lie arcseconds off.
-    flat = pixel_of_sky(wcs(replace(d, bending=()), ra, dec, angle), lon, lat)
+    flat = pixel_of_sky(wcs(replace(d, distortion_terms=()), ra, dec, angle), lon, lat)
     assert np.hypot(flat[0] - column, flat[1] - row)[here].min() * d.pixel_scale > 2.0
 
 

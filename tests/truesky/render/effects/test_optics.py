@@ -241,7 +241,7 @@ def test_a_pixel_of_a_ground_camera_too(camera):
 
 
 def test_without_distortion_only_the_projection_is_left():
-    straight = replace(scene(), detector=replace(scene().detector, bending=()))
+    straight = replace(scene(), detector=replace(scene().detector, distortion_terms=()))
     assert 0.0 < pixel_area.EFFECT.contribution(straight) < 2e-4 * straight.sky_electrons
     assert pixel_area.EFFECT.contribution(replace(straight, detector=None)) == 0.0
 

@@ -26,7 +26,7 @@ def refused(camera, count, monkeypatch):
         electrons=np.full(count, 1e4),
         picture=None,
         trail=None,
-        length=np.zeros(count),
+        trail_length=np.zeros(count),
     )
     aim = SimpleNamespace(channel=CHANNELS["EXT"], detector=detector, exposure=SimpleNamespace(exposure_id=1))
     try:

@@ -38,7 +38,7 @@ def exact(scene, aim, column, row):
         sign = -1.0 if own.upside_down else 1.0
         across = own.x + sign * 0.3 * (column - x - 1019.5)
         up = own.y + sign * 0.3 * (row - y - 1019.5)
-        light *= aim.channel.dispersion.vignetted(aim.exposure, own, column - x, row - y, MISSION)
+        light *= aim.channel.dispersion.vignetting(aim.exposure, own, column - x, row - y, MISSION)
         total += light[(np.abs(across) <= 0.395 * 3600) & (np.abs(up) <= 0.58 * 3600)].sum()
     return total * scene.exposure_time_s
 

@@ -165,7 +165,7 @@ def test_scamp_recovers_the_place_of_four_dithered_frames(tmp_path):
     tools.tool("source-extractor")
     one = small("decam", "N4", 1024)
     bent = tools.farthest("decam").distortion_terms
-    one = replace(one, bending=one.distortion_terms or bent)
+    one = replace(one, distortion_terms=one.distortion_terms or bent)
     middle = astrometry.wcs(one, *POINTED)
     spread = np.random.default_rng(5)
     stars = astrometry.sky_of_pixel(middle, *spread.uniform(-200.0, 1224.0, (2, 70)))
