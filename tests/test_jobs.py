@@ -120,10 +120,10 @@ def test_the_same_request_gives_the_same_bytes_under_any_master(tmp_path):
     script.write_text(f"""
 import sys
 sys.path[0] = {str(ROOT)!r}
-from truesky.running import shell
+from truesky.running import submitted_job
 from truesky.catalogue import build_galaxies, build_stars
 from truesky.fluxes import compute_fluxes
-sys.exit(max(shell.main(m.JOB, sys.argv[1:]) for m in (build_galaxies, build_stars, compute_fluxes)))
+sys.exit(max(submitted_job.main(m.JOB, sys.argv[1:]) for m in (build_galaxies, build_stars, compute_fluxes)))
 """)
     manifests = []
     for master in ("local[1]", "local[2,4]"):

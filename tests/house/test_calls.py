@@ -89,7 +89,7 @@ def test_what_is_called_is_there(path):
     [
         "from truesky.randomness import nothing",
         "from truesky.randomness import rng\nrng.nothing",
-        "from truesky.randomness import rng\nrng.name_of(seed=1)",
+        "from truesky.randomness import rng\nrng.key_hex(seed=1)",
         "from truesky.randomness.rng import stream\nstream(1, nothing=2, seed=3)",
         "from lake_schema.store import nothing",
     ],

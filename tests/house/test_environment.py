@@ -275,8 +275,8 @@ import os, sys
 sys.path[0] = sys.argv[1]
 import psutil
 import pyarrow as pa
-from truesky.running.session import session
-spark = session("listening")
+from truesky.running.session import get_session
+spark = get_session("listening")
 
 def pythons(batches):
     for batch in batches:

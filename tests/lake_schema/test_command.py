@@ -41,7 +41,7 @@ def main(code):
         raise SystemExit(2)
     return int(code)
 
-command.leave(main, sys.argv[2])
+command.exit_with_status(main, sys.argv[2])
 """
 
 

@@ -24,7 +24,7 @@ _STOPPED = """
 import sys
 from pathlib import Path
 from truesky.commands import submit
-submit._environment = lambda: Path(sys.argv[1])
+submit._spark_environment = lambda: Path(sys.argv[1])
 from {module} import main
 sys.exit(main(sys.argv[2:]))
 """
@@ -38,9 +38,9 @@ def started(job, *rest):
     print(job.pid, flush=True)
     os.kill(os.getpid(), signal.SIGTERM)
 subprocess.Popen._execute_child = started
-signal.signal(signal.SIGTERM, submit._stop)
+signal.signal(signal.SIGTERM, submit._raise_interrupt)
 try:
-    submit._call(["sleep", "600"])
+    submit._run_program(["sleep", "600"])
 except KeyboardInterrupt as stopped:
     sys.exit(int(stopped.args[0]))
 """

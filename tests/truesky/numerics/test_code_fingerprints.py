@@ -116,7 +116,7 @@ from truesky.fluxes.spectra import intergalactic, lines
 from truesky.fluxes.tables import build_tables
 library = templates.galaxy_library()
 build_tables.library_key(library)
-passbands.load("lsst_r"), stellar.fingerprint(), lines.line_list(), intergalactic.series(), from_files.formats()
+passbands.load("lsst_r"), stellar.fingerprint(), lines.line_list(), intergalactic.lyman_series(), from_files.formats()
 if sys.argv[1:]:
     templates.stellar_library()
 print(json.dumps(sorted(found)))

@@ -16,9 +16,9 @@ from truesky.numerics import cache, compiling
 SCRIPT = """
 import hashlib
 import numpy as np
-from truesky.render.effects.readout.traps import Sweeps, Traps, shifted
+from truesky.render.effects.readout.traps import Sweeps, Traps, shift_charge
 frame = np.random.default_rng(1).poisson(100, (2000, 300)).astype(float)
-moved, held = shifted(frame, Traps((0.02, 0.03, 0.95), (0.8, 3.5, 20.0), 2e5, 0.0, 0.58), Sweeps(1, 2), -2)
+moved, held = shift_charge(frame, Traps((0.02, 0.03, 0.95), (0.8, 3.5, 20.0), 2e5, 0.0, 0.58), Sweeps(1, 2), -2)
 print(hashlib.sha256(moved.tobytes()).hexdigest(), held.hex())
 """
 
