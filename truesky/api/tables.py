@@ -107,7 +107,7 @@ class LakeTables:
         BadInput
             If the query is not a single SELECT over tables of the lake, or exceeds the limits of time or memory.
         Damaged
-            If a file that the query reads is not as it was written.
+            If the content of a file that the query reads has changed since it was written.
         """
         return self._explorer.sql(query, into, **parameters)
 

@@ -31,6 +31,6 @@ def test_nothing_is_written_over(tmp_path, capsys):
     (own := tmp_path / "requests" / "demo.toml").parent.mkdir()
     own.write_text("mine")
     assert truesky.main(["examples", str(tmp_path)]) == 2
-    assert "demo.toml is there already" in capsys.readouterr().err
+    assert "demo.toml exists already" in capsys.readouterr().err
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == [own]
     assert own.read_text() == "mine"

@@ -99,9 +99,9 @@ def test_modules_are_their_own(capsys, tmp_path):
 def test_what_is_no_command_is_refused(capsys):
     assert truesky.main(["rendr"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("truesky: rendr is no command of truesky: build, check,")
+    assert line.startswith("truesky: rendr is not a command; use one of build, check,")
     assert truesky.main(["--local", "render", "--", "--master", "local"]) == 2
-    assert "no spark-submit is called" in capsys.readouterr().err
+    assert "--local does not call spark-submit" in capsys.readouterr().err
     for words in ([], ["--help"], ["--version"]):
         assert truesky.main(words) == 0
         assert f"truesky {__version__}" in capsys.readouterr().out

@@ -114,7 +114,7 @@ def test_the_forecast_is_of_all_requests(lake):
 
 def test_a_lake_without_logs_and_a_damaged_log_are_refused(lake, capsys):
     assert report.main([str(lake)]) == 2
-    assert "no run has left a log" in capsys.readouterr().err
+    assert "has no log of a run" in capsys.readouterr().err
     log(lake, "1-x-1", {"job": "draw"}, part("a", rows="ten"), {"status": "done"})
     with pytest.raises(Damaged, match="line 2 is not what a run writes"):
         report.job_totals(lake)
