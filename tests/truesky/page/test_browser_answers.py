@@ -44,9 +44,9 @@ def test_of_two_pins_the_later_is_shown(tab, page):
 def test_a_refused_truth_is_asked_for_again(tab):
     tab.keyboard.press("4")
     until(tab, f"document.getElementById('image-one').childElementCount === 3 && {HELD}.images?.zoom > 0")
-    replaced(tab, "truth/0", 0, "ask again later")
+    replaced(tab, "truth/0", 0, "try again later")
     tab.check("#image-truth")
-    until(tab, f"{SAID}.includes('ask again later')")
+    until(tab, f"{SAID}.includes('try again later')")
     tab.uncheck("#image-truth")
     tab.check("#image-truth")
     until(tab, "document.getElementById('image-legend').textContent.includes('sources')")
@@ -186,7 +186,7 @@ def test_of_very_many_exposures_those_in_view_are_shown(browser, sky, monkeypatc
     with tab_of(browser, sky, refused="/exposures") as tab:
         until(tab, f"{STATES}.includes('observed')")
         tab.select_option("#sky-footprints", "exposures")
-        until(tab, f"{STATES} === 'exposuresmore than 1 exposures are here: look at a part'")
+        until(tab, f"{STATES} === 'exposuresmore than 1 exposures are in view: use a smaller field'")
         tab.fill("#sky-go", f"{CENTRE[0]} {CENTRE[1]}")
         tab.press("#sky-go", "Enter")
         tab.locator("#sky-canvas").focus()

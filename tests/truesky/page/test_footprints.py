@@ -96,7 +96,7 @@ def test_exposures_of_a_part(planned):
 def test_too_many_exposures_are_refused(planned, monkeypatch):
     monkeypatch.setattr(sky_maps, "MAX_EXPOSURES", 2)
     status, _, body = planned.of_lake("exposures")
-    assert (status, b"look at a part" in body) == (400, True)
+    assert (status, b"use a smaller field" in body) == (400, True)
     assert len(planned.json("exposures?ra=10.5&dec=0.5&radius=0.1")) == 2
 
 

@@ -26,7 +26,7 @@ def test_a_pool_refuses_beyond_its_bound_and_takes_others_when_done():
         pool = ThreadPool(2, 3)
         asked = [asyncio.create_task(pool.run(go.wait)) for _ in range(5)]
         await asyncio.sleep(0)
-        with pytest.raises(Busy, match="3 questions are waiting"):
+        with pytest.raises(Busy, match="3 requests are waiting"):
             await pool.run(go.wait)
         # One of those that wait goes away: its place is free.
         asked[4].cancel()
