@@ -26,7 +26,7 @@ _NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the server; return 0 when it is stopped, 1 if the lake is damaged or the port is in use, 2 for bad options."""
+    """Run the server. Return 0 when it is stopped, 1 if the lake is damaged or the port in use, 2 for bad options."""
     options = _options(argv)
     return command.run("page", lambda: _serve(options))
 

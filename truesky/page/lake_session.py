@@ -103,7 +103,7 @@ class ProcessPool:
         except LakeError:
             raise
         except BaseException:
-            # The user left in the middle of an answer. Replace the process, so that the next user gets no rest of it.
+            # The user left in the middle of an answer. Replace the process: the next user must not get the rest.
             process.stop()
             self._processes.discard(process)
             process = self._start_process()
@@ -125,7 +125,7 @@ class ProcessPool:
             await asyncio.gather(*(asyncio.to_thread(process.ask, "SELECT 1", {}) for process in processes))
 
     def close(self) -> None:
-        """Stop all processes, those in use when their users are done. Waiting queries raise Closed."""
+        """Stop idle processes now and busy processes when their queries end. Waiting queries raise Closed."""
         self._is_closed = True
         for _ in range(self._free.qsize()):
             process = self._free.get_nowait()
@@ -287,7 +287,7 @@ class LakeSession:
         return self.versions[table]
 
     def request_tables(self, *tables: str) -> list[RequestTables]:
-        """Return the tables of each request that has any of these tables. Requests with identical versions count once."""
+        """Return the tables of each request that has any of these tables. Requests with equal versions count once."""
         request_versions: dict[str, dict[str, read.Version]] = {}
         for name, version in sorted(self.versions.items()):
             request, _, table = name.rpartition(".")

@@ -153,7 +153,7 @@ def _exposure_and_detector(row: Mapping[str, Any]) -> tuple[int, str]:
 
 
 def picture(lake: LakeSession, number: int) -> Picture:
-    """Return the image with this number; raise BadInput if there is none."""
+    """Return the image with this number; raise BadInput if it does not exist."""
     images = pictures(lake)
     if not 0 <= number < len(images):
         raise BadInput(f"the lake has no image {number}; it has {len(images)}")

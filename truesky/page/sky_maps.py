@@ -27,8 +27,8 @@ _TASK_COLUMNS = (*_CIRCLE_COLUMNS, "s_region")
 MAX_CELLS, MAX_SOURCES = 200_000, 20_000
 _MAX_ORDER = 16
 MAX_EXPOSURES = 20_000
-# If a plan has more than LARGE_PLAN detectors, only detectors in view are read: those of at most MAX_LOOKED_UP exposures
-# whose boresights lie within MAX_CAMERA_RADIUS degrees of the edge of the view.
+# If a plan has more than LARGE_PLAN detectors, only detectors near the view are read. Their exposures, at most
+# MAX_LOOKED_UP, have boresights within MAX_CAMERA_RADIUS degrees of the edge of the view.
 LARGE_PLAN, MAX_LOOKED_UP, MAX_CAMERA_RADIUS = 200_000, 1_000, 2.0
 Json = dict[str, Any]
 # Columns by which the sources in a field are ordered; the first one that the table has is used. Sources come in
@@ -295,7 +295,7 @@ def regions(lake: LakeSession) -> list[Json]:
     list of dict
         One entry per detector and exposure: `request` (None if the lake has only one), `exposure_id`, `detector`,
         `channel`, `band`, `polygon` (corners in degrees), `state` ("planned", "observed" or "failed"), `images`
-        (numbers) and `contents` (content of each image). Of a large plan only exposures with images are listed.
+        (numbers) and `contents` (content of each image). A large plan is listed only for exposures with images.
     """
     failures = _failure_messages(lake)
     return [_current_region(place, region, failures) for place, region in _known_regions(lake).items()]
@@ -309,7 +309,7 @@ _DetectorKey = tuple[str | None, int, str]
 def _known_regions(lake: LakeSession) -> Mapping[_DetectorKey, Json]:
     """Footprints of planned and rendered detectors, which do not change while the lake is open.
 
-    Of a large plan only exposures with images are included.
+    A large plan is included only for exposures with images.
     """
     from truesky.page import pictures
 

@@ -169,7 +169,9 @@ def test_the_patient_are_not_refused():
     asyncio.run(run())
 
 
-@pytest.mark.parametrize(("bounds", "words"), [((50, 1000), "the result has more"), ((1000, 150), "results of jobs")])
+@pytest.mark.parametrize(
+    ("bounds", "words"), [((50, 1000), "the result is larger"), ((1000, 150), "all results are larger")]
+)
 def test_results_have_a_bound(monkeypatch, bounds, words):
     monkeypatch.setattr(queries, "MAX_RESULT_BYTES", bounds[0])
     monkeypatch.setattr(queries, "MAX_TOTAL_BYTES", bounds[1])
