@@ -1,4 +1,4 @@
-// The page: which view is shown, what the address holds, the theme, the keys.
+// The page: views, address, theme and keyboard.
 
 import * as api from "/static/api.js";
 import * as image from "/static/image.js";
@@ -12,7 +12,7 @@ const VIEWS = { sky, plots, sql, images: image, runs };
 const $ = (id) => document.getElementById(id);
 let shown = null, writing = 0, last = "";
 
-/** Show a view; `state` is what the address holds of it. */
+/** Show a view; `state` is its state from the address. */
 export async function show(name, state) {
   const view = VIEWS[name] ?? sky;
   shown = name in VIEWS ? name : "sky";
@@ -29,7 +29,7 @@ export async function show(name, state) {
   remember();
 }
 
-/** Put the view into the address, a moment after its last change. */
+/** Store the view in the address, shortly after its last change. */
 export function remember() {
   clearTimeout(writing);
   writing = setTimeout(() => {

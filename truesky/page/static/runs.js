@@ -1,4 +1,4 @@
-// What was done for the lake: jobs beside their forecasts, tasks, failures, the mission, and where each image is from.
+// Runs of the lake: jobs with forecasts, tasks, failures, changed mission parameters, and the provenance of each image.
 
 import * as api from "/static/api.js";
 
