@@ -76,7 +76,7 @@ def test_of_many_rows_every_brush_counts_a_sample_first(browser, page, monkeypat
 
 def test_a_map_as_points(tab, shown):
     ranges = "[...document.querySelectorAll('#plot-grid figure.map .range')].map((one) => one.textContent)"
-    until(tab, f"{ranges}[0].includes('a bin')")
+    until(tab, f"{ranges}[0].includes('per bin')")
     before = tab.locator("#plot-grid figure.map canvas").first.screenshot()
     tab.locator("#plot-grid figure.map button", has_text="points").first.click()
     text = until(tab, f"{ranges}[0].includes('points') && {ranges}[0]").replace("\N{NARROW NO-BREAK SPACE}", "")

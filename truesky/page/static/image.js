@@ -103,7 +103,7 @@ function toSky() {
 export async function show() {
   if (!prepare()) return;
   list ??= await api.get("images");
-  if (!list.length) return api.say("The lake holds no images.");
+  if (!list.length) return api.say("The lake has no images.");
   if (!$("image-one").childElementCount) {
     const name = (one) => `${api.of(one)}${one.exposure_id} ${one.channel} ${one.band} ${one.detector}: ${one.content.replace("_", " ")}`;
     $("image-one").append(...list.map((one) => api.h("option", { value: one.number }, name(one))));
@@ -120,7 +120,7 @@ export async function show() {
 
 async function open(number) {
   if (!opened.has(number)) {
-    $("image-place").textContent = "The tiles of this image are being made, once.";
+    $("image-place").textContent = "Making the tiles of this image, which is done once.";
     const about = await api.get(`image/${number}`).finally(() => ($("image-place").textContent = ""));
     opened.set(number, { ...about, plate: new Plate(about.grid) });
   }

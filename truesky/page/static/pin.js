@@ -22,7 +22,7 @@ export async function pin(id) {
   const panel = $("pin");
   drawings = [];
   panel.replaceChildren(api.h("h2", {}, `${source.kind} ${source.id}`));
-  if (source.request) panel.append(api.h("p", { class: "quiet" }, `As request ${source.request} has it.`));
+  if (source.request) panel.append(api.h("p", { class: "quiet" }, `Values of request ${source.request}.`));
   if (source.place) panel.append(api.h("p", { class: "quiet" }, api.place(...source.place)));
   // If several requests have this table, use the table of the request that is shown.
   const table = Object.keys(source.tables)[0] ?? "rendered_truth", { request } = source.tables[table] ? source : source.drawn[0];
@@ -75,7 +75,7 @@ async function cutouts(panel, own) {
     canvas.getContext("2d").putImageData(stretched(up ? pixels : pixels.reverse(), SIDE, SIDE), 0, 0);
     panel.append(api.h("figure", {}, canvas, api.h("figcaption", { class: "quiet" }, `${api.of(about)}${about.band} ${about.content.replace("_", " ")}`)));
   }
-  if (!panel.childElementCount) panel.append(api.h("p", { class: "quiet" }, "No image holds its place."));
+  if (!panel.childElementCount) panel.append(api.h("p", { class: "quiet" }, "No image contains its position."));
 }
 
 /** Format the name of a line: halpha, nii_2 -> Hα, [N II]. */
@@ -88,7 +88,7 @@ function named(name) {
 function drawSpectrum(panel, found) {
   const canvas = api.h("canvas", { class: "spectrum", role: "img", tabindex: 0 });
   const data = api.h("div", { class: "data", hidden: true });
-  panel.replaceChildren(api.h("h3", {}, "Spectrum as it arrives"), canvas, api.h("button", { onclick: () => (data.hidden = !data.hidden) }, "Bands and lines as a table"), data);
+  panel.replaceChildren(api.h("h3", {}, "Observed spectrum"), canvas, api.h("button", { onclick: () => (data.hidden = !data.hidden) }, "Bands and lines as a table"), data);
   data.append(api.table([{ name: "band", text: 1 }, { name: "pivot", unit: "nm" }, { name: "f_nu", unit: "µJy" }, { name: "AB", unit: "mag" }], found.bands.map((b) =>
     [b.name, b.wavelength / 10, b.f_nu, b.f_nu > 0 ? +(23.9 - 2.5 * Math.log10(b.f_nu)).toFixed(3) : null])));
   if (found.lines.length) data.append(api.table([{ name: "line", text: 1 }, { name: "wavelength", unit: "nm" }], found.lines.map((l) => [named(l.name), (l.wavelength / 10).toFixed(1)])));

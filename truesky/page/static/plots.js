@@ -224,7 +224,7 @@ function figure(chart) {
     built = false;
     show();
   } }, chart.axes.length > 1 ? `log ${"xy"[k]}` : "log"));
-  const points = chart.axes.length > 1 ? api.h("button", { "aria-pressed": String(Boolean(chart.points)), title: "The rows themselves, as points", onclick: (event) => {
+  const points = chart.axes.length > 1 ? api.h("button", { "aria-pressed": String(Boolean(chart.points)), title: "Rows as points", onclick: (event) => {
     chart.points = !chart.points;
     event.target.setAttribute("aria-pressed", String(chart.points));
     ask();
@@ -272,7 +272,7 @@ function asTable(chart) {
   const rows = [];
   chart.counts.forEach((count, k) => count && rows.push([at(x, Math.floor(k / size)), at(y, k % size), count * scale]));
   return api.table([{ name: label(chart.axes[0]) }, { name: label(chart.axes[1]) }, { name: "number" }], rows.sort((a, b) => b[2] - a[2]).slice(0, MOST_ROWS),
-    api.cut(Math.min(rows.length, MOST_ROWS), rows.length, "bins that hold rows, the fullest first"));
+    api.cut(Math.min(rows.length, MOST_ROWS), rows.length, "bins with rows, the fullest first"));
 }
 
 function drawAll() {
@@ -285,7 +285,7 @@ function draw(chart) {
   const sum = chart.counts.reduce((a, b) => a + b, 0), scale = chart.part;
   const error = scale > 1 ? ` ± ${api.number(Math.round(Math.sqrt(sum) * scale))}` : "";
   const points = chart.points && chart.places ? `${api.number(chart.places.length / 2)} points${chart.placesPart * scale > 1 ? `, a sample: 1 row in ${chart.placesPart * scale}` : ""}` : "";
-  const most = chart.axes.length > 1 && !points ? `colours from none to ${api.number(chart.counts.reduce((a, b) => Math.max(a, b), 0) * scale)} a bin, logarithmic` : "";
+  const most = chart.axes.length > 1 && !points ? `colours from 0 to ${api.number(chart.counts.reduce((a, b) => Math.max(a, b), 0) * scale)} per bin, logarithmic` : "";
   chart.range.textContent = [`${api.number(sum * scale)}${error} rows`, ...leftOut(chart), most, points, shown].filter(Boolean).join("; ");
   tabulate(chart);
   chart.canvas.setAttribute("aria-label", `${label(chart.axes[0])}${chart.axes[1] ? ` and ${label(chart.axes[1])}` : ""}: ${chart.range.textContent}`);

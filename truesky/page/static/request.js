@@ -17,11 +17,11 @@ async function requestOf(place, radius, regions) {
   for (const one of regions) detectors.set(name(one), [...(detectors.get(name(one)) ?? []), one]);
   const asked = [...detectors.values()].map((own) => own[0]).sort((a, b) => api.of(a).localeCompare(api.of(b)) || a.exposure_id - b.exposure_id);
   const rows = await exposures(asked.slice(0, MOST)), science = rows.filter((row) => row.image_type === "science");
-  const lines = [`# The field at RA ${place[0].toFixed(6)}, Dec ${place[1].toFixed(6)} deg, as it is seen on the page of ${api.lake.lake.replace(/[^\x20-\x7e]/g, "?")}.`,
-    'name = "field"', "seed = 1   # of the universe: that of the lake's own request draws the same sources", "",
+  const lines = [`# Field at RA ${place[0].toFixed(6)}, Dec ${place[1].toFixed(6)} deg, from the page of ${api.lake.lake.replace(/[^\x20-\x7e]/g, "?")}.`,
+    'name = "field"', "seed = 1   # seed of the universe; the seed of the lake's request gives the same sources", "",
     "[area]", `cone = { ra = ${place[0].toFixed(7)}, dec = ${place[1].toFixed(7)}, radius = ${decimal(Math.min(180, Math.max(1e-3, radius)))} }`];
-  if (asked.length > MOST) lines.push("", `# Of ${asked.length} exposures that see it the first ${MOST}.`);
-  if (science.length < rows.length) lines.push("", `# ${rows.length - science.length} of its exposures are of calibrations: an [[observation]] asks for these.`);
+  if (asked.length > MOST) lines.push("", `# The first ${MOST} of ${asked.length} exposures that cover the field.`);
+  if (science.length < rows.length) lines.push("", `# ${rows.length - science.length} of its exposures are calibrations, which require an [[observation]].`);
   // If several requests have planned the same exposure, include it once.
   const pointings = science.map((row) => pointing(row, detectors.get(name(row)).map((one) => one.detector).sort()).join("\n"));
   for (const text of new Set(pointings)) lines.push("", text);

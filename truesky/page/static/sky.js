@@ -207,7 +207,7 @@ export function redraw() {
 
 function legend() {
   if (isCoverage()) return `${shownTable.slice(12) || "all bands"}: planned exposures`;
-  const missing = cells?.head.missing ? `, ${api.number(cells.head.missing)} rows without one left out` : "";
+  const missing = cells?.head.missing ? `, ${api.number(cells.head.missing)} rows without a value omitted` : "";
   return value ? `${shownTable}: mean of ${value}${missing}` : `${shownTable}: number / deg²`;
 }
 
@@ -219,7 +219,7 @@ function caption() {
     return `${dots.by ? `the ${firstOf(dots)} ${api.number(here)} by ${dots.by}` : `the first ${api.number(here)}`} of ${all === null ? "more" : api.number(all)} sources`;
   }
   const outside = isCoverage() ? 0 : cells.beyond;
-  return outside ? `beyond the ends of the colours: ${api.number(outside)} of ${api.number(cells.density.length)} cells` : "";
+  return outside ? `beyond the colour scale: ${api.number(outside)} of ${api.number(cells.density.length)} cells` : "";
 }
 
 function drawOver(turn) {
@@ -313,7 +313,7 @@ async function pinAt(place) {
 function openAt(place, isSaid = false, unit = null) {
   const inside = place ? imagesAt(place) : [];
   if (!inside.length) {
-    if (isSaid) api.say("No image holds the centre of the view.");
+    if (isSaid) api.say("No image contains the centre of the view.");
     return false;
   }
   goTo(inside[0].images[0], place, unit);
@@ -339,7 +339,7 @@ function query() {
 
 function go() {
   const place = placeOf($("sky-go").value);
-  if (!place) return api.say("Go to: wanted RA and Dec, in degrees or as 03:32:28.1 -27:48:29", true);
+  if (!place) return api.say("Go to: enter RA and Dec in degrees or as 03:32:28.1 -27:48:29", true);
   Object.assign(view, { ra: place[0], dec: place[1], height: Math.min(view.height, 0.3) });
   went();
 }
@@ -368,7 +368,7 @@ export function key(event) {
   else if (event.key === "-") zoom(1 / 0.7);
   else if (event.key === "0") whole(true);
   else if (event.key === "o" || event.key === "O") openAt([view.ra, view.dec], true);
-  else if (event.key === "Enter" && isHere) view.height < SINGLE ? pinAt([view.ra, view.dec]) : api.say(`Sources can be pinned where the view is below ${SINGLE} deg.`);
+  else if (event.key === "Enter" && isHere) view.height < SINGLE ? pinAt([view.ra, view.dec]) : api.say(`Sources can be pinned if the height of the view is below ${SINGLE} deg.`);
   else return;
   event.preventDefault();
   $("sky-place").textContent = api.place(view.ra, view.dec);

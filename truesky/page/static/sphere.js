@@ -42,7 +42,7 @@ export function placeOf(text) {
   return numbers.length === 2 && Math.abs(numbers[1]) <= 90 ? [((numbers[0] % 360) + 360) % 360, numbers[1]] : null;
 }
 
-/** The circle (deg) around the mean of positions [ra, dec, ra, dec ...] that contains all of them. */
+/** The circle (deg) around the mean of positions [ra, dec, ra, dec ...] that contains all these positions. */
 export function circleAround(corners) {
   const places = [];
   for (let k = 0; k < corners.length; k += 2) places.push(vector(corners[k], corners[k + 1]));

@@ -61,7 +61,7 @@ async function run() {
     return;
   }
   $("sql-state").className = "quiet";
-  const more = ran.more ? `the first ${ran.rows.length} rows; a download has all` : `${ran.rows.length} rows`;
+  const more = ran.more ? `the first ${ran.rows.length} rows; a download contains all` : `${ran.rows.length} rows`;
   $("sql-state").textContent = `${more}, ${(ran.seconds * 1000).toFixed(0)} ms`;
   const columns = ran.columns.map((c) => ({ ...c, text: c.type === "string" }));
   $("sql-result").replaceChildren(api.table(columns, ran.rows.map((row) => row.map((value) => Array.isArray(value) ? `[${value.length} values]` : value))));
