@@ -56,6 +56,7 @@ class Job:
 
     @property
     def has_ended(self) -> bool:
+        """True if the job is completed, failed or aborted."""
         return self.phase in _END_PHASES
 
 
