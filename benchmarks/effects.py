@@ -1,7 +1,7 @@
 """Measure the effects of VIS: time, margin and change of pixels, and the change of magnitude, size and ellipticity.
 
-The pixels are those of a full detector with an artificial sky of points and squares. Each effect acts on the result of
-the effects before it. Magnitude, size and ellipticity are measured on a standard set of stars and galaxies.
+The scene is a full detector with an artificial sky of points and squares. Each effect acts on the result of the
+effects before it. Magnitude, size and ellipticity are measured on a standard set of stars and galaxies.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def measure_effects(side: int | None, repeats: int) -> dict[str, float]:
     assembled = quadrants.assemble(frame, *quadrants.overscan_sizes(scene))
     out["all_s"] = sum(value for key, value in out.items() if key.endswith("_s"))
     out["mean_adu"] = float(assembled.mean())
-    # Effects of other image types: those of flats act on the light, those of pumping images on an empty frame.
+    # Effects of other image types: effects of flats act on the light, effects of pumping images on an empty frame.
     light_alone = draw_light(detector.ny, detector.nx)
     for effect in vis.FLAT:
         if effect not in vis.SKY:

@@ -147,7 +147,7 @@ def make_references(sources: Sources, num_pairs: int, maxk_threshold: float = 0.
 
 
 def _truth(source: Sources, psf: model.Psf, maxk_threshold: float) -> Float | None:
-    """True image: of a galaxy by galsim, of a star by the Fourier series of its PSF."""
+    """True image of a galaxy (by galsim) or of a star (by the Fourier series of its PSF)."""
     if source.shape[0] < 0:
         return references.image_by_series(source, psf, errors.COMPARED_SIDE)
     return references.reference_image(source, psf, errors.COMPARED_SIDE, maxk_threshold)
@@ -176,7 +176,7 @@ def compare(
     simplified : list of Reference
         The galaxies to draw: the simplified ones, or the same.
     approximation : Approximation, optional
-        The approximation. The default is none.
+        The approximation. By default there is no approximation.
 
     Returns
     -------
@@ -228,7 +228,7 @@ def measure_settings(
     Returns
     -------
     dict
-        Errors by name, those of the test sample with the suffix `_held`.
+        Errors by name; keys of the test sample end in `_held`.
     """
     row: Row = {}
     for kind, sample_part in (("", chosen_sample), ("_held", test_sample)):
@@ -320,7 +320,7 @@ def _seconds(
 def time_settings(settings_list: Sequence[Settings], repeats: int) -> dict[Settings, float]:
     """Return the CPU time (s) of the scene by settings.
 
-    All settings are drawn in turn, so that other load on the machine affects all of them.
+    All settings are drawn in turn, so that other load on the machine affects them equally.
     """
     scene, out = scenes.sources(VIS, _SCENE_SEED), dict.fromkeys(settings_list, np.inf)
     for _ in range(repeats):
