@@ -24,9 +24,7 @@ QUIET_LOAD = 0.5
 
 
 def task_ms(root: Path, request: Request) -> float:
-    """Return the CPU time (ms) of a task in a worker without rendering and reading sources; the largest of all channels
-    counts.
-    """
+    """Return the CPU time (ms) of a task in a worker without rendering and reading sources (largest value)."""
     facts = _first_task_per_detector(root, request)
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         return 1e3 * max(pool.map(_time_outside_render, [root] * len(facts), facts))

@@ -146,6 +146,7 @@ _INTEGER_COLUMNS = ("positions", "nearest", "megabytes")
 
 
 def draw_star(psf_at: Callable[[tuple[float, float]], Float], rng: np.random.Generator) -> Star:
+    """Draw a star at a random position with random colours."""
     place = rng.uniform(-1, 1, 2).tolist()
     photons = scenes.colours(1, rng)[0]
     return Star((place[0], place[1]), photons / photons.sum(), psf_at((place[0], place[1])))

@@ -180,6 +180,7 @@ def run(quick: bool, repeats: int) -> dict[str, float]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
+    """Run the benchmark and print the figures."""
     options = report.options("catalogue", __doc__ or "", argv)
     report.print_and_write("catalogue", 1, run(options.quick, 1), NOTES, options.json)
     return 0

@@ -64,6 +64,7 @@ def cosmic_rays(rng: np.random.Generator) -> np.ndarray:
 
 
 def main(file: Path) -> None:
+    """Write the reference images to a file, if arcticpy is installed."""
     try:
         import arcticpy
     except ImportError:

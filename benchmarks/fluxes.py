@@ -332,6 +332,7 @@ def _best_cpu_time(work: Callable[[], object], repeats: int) -> float:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
+    """Run the benchmark and print the figures."""
     parser = argparse.ArgumentParser(prog="benchmarks.fluxes", description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="few objects, for tests")
     parser.add_argument("--json", type=Path, metavar="FILE")

@@ -202,6 +202,7 @@ NOTES = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
+    """Run the benchmark and print the figures."""
     options = report.options("stars", __doc__ or "", argv)
     report.print_and_write("stars", 1, run(options.quick), NOTES, options.json)
     return 0

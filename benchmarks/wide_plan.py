@@ -64,6 +64,11 @@ def measure_planner(folder: Path, fields: int, cores: int) -> dict[str, float]:
     -------
     dict of str to float
         `plan_s`, `tasks`, `parts` and peak memory in GB.
+
+    Raises
+    ------
+    SystemExit
+        If the job fails.
     """
     request, lake = folder / "wide.toml", folder / "lake"
     request.write_text(REQUEST.format(fields=fields))
