@@ -25,7 +25,7 @@ UNIT = 0.001
 
 
 def galaxies(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return an image [ROWS, COLUMNS] in whole electrons, and row, column, electrons and scale length of its galaxies."""
+    """Return an image [ROWS, COLUMNS] in whole electrons, and row, column, electrons and scale length of galaxies."""
     pixels = ROWS - OVERSCAN
     y, x = np.mgrid[:ROWS, :COLUMNS].astype(float)
     expected = np.full((ROWS, COLUMNS), SKY)

@@ -107,7 +107,7 @@ class Outcome:
     repeated: int
 
     def efficiency(self, cores: int, seconds: float) -> float:
-        """Return the core-seconds of all tasks (on machines of normal speed) / core-seconds of the site during the run."""
+        """Return core-seconds of all tasks (on machines of normal speed) / core-seconds of the site during the run."""
         return seconds / (cores * self.makespan)
 
 
