@@ -1,6 +1,6 @@
-"""What others leave out to be fast (Serrano et al. 2024, sections 4 and 6.2), done to our own drawing.
+"""Approximations that other programs use to be fast (Serrano et al. 2024, sections 4 and 6.2), in our drawing code.
 
-Each takes effect on the galaxies it was meant for; all else is drawn as it is.
+Each approximation is applied only to the galaxies that it was made for.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from truesky.render.psf import model
 from truesky.render.sources import galaxy_shapes
 from truesky.render.sources.source_list import Sources
 
-# The paper's: folding threshold; half-light radii below which galaxies are exponential, above which they are sampled
-# down, arcsec. The magnitude that a galaxy is fainter than to have one component is VIS's limit there; ours has half
-# of the scene beyond it.
+# Values of the paper: folding threshold; half-light radii (arcsec) below which galaxies are exponential and above which
+# they are drawn at lower resolution. Fainter galaxies than FAINT have one component: in the paper this is the limit of
+# VIS; here half of the scene is fainter.
 FOLDING, TINY, HUGE, FAINT = 5e-3, 0.01, 10.0, 24.5
 
 
@@ -41,11 +41,26 @@ def _stamp_sizes(sources: Sources, psf: model.Psf, scene: Scene, settings: Setti
 
 @dataclass(frozen=True)
 class Approximation:
-    """Galaxies that it concerns, and what it does to them, to their PSF, to their stamps, to their image.
+    """An approximation: the galaxies that it applies to, and its changes of galaxies, PSF, stamp sizes and image.
 
-    concerned : a sample of them: (scene, seed, number) -> Sources
-    numbers   : of galaxies that errors are measured of, of pairs, and that are timed: 0 = all of the scene
-    timed     : what is timed, where the image is not drawn as the approximation would
+    Attributes
+    ----------
+    name : str
+        Name of the approximation.
+    select_galaxies : callable
+        Function that draws a sample of the galaxies: (scene, seed, number) -> Sources.
+    simplify : callable
+        Function that simplifies galaxies.
+    simplify_psf : callable
+        Function that simplifies the PSF.
+    sizes : callable
+        Function that returns the sizes of the stamps.
+    process_image : callable
+        Function that changes the image.
+    sample_sizes : tuple of int
+        Numbers of galaxies to measure errors, of pairs for shear, and of galaxies to time (0 for the whole scene).
+    timed_as : Approximation or None
+        Approximation that is timed instead, if drawing does not take the time that the approximation would.
     """
 
     name: str
@@ -60,7 +75,26 @@ class Approximation:
     def draw(
         self, sources: Sources, psf: model.Psf, scene: Scene, settings: Settings, side: int | None = None
     ) -> Float:
-        """Sources that are simplified, through a PSF that is."""
+        """Draw simplified sources with a simplified PSF.
+
+        Parameters
+        ----------
+        sources : Sources
+            The simplified sources.
+        psf : Psf
+            The simplified PSF.
+        scene : Scene
+            The scene.
+        settings : Settings
+            Settings of drawing.
+        side : int, optional
+            Side of the image in pixels. The default is the frame of the scene.
+
+        Returns
+        -------
+        float array, shape (ny, nx)
+            Expected electrons.
+        """
         neglected = stamp_sizes.neglected_flux(sources.electrons, scene.noise, settings)
         nx, ny = (scene.nx, scene.ny) if side is None else (side, side)
         sizes = self.sizes(sources, psf, scene, settings)
@@ -68,7 +102,7 @@ class Approximation:
 
 
 def _folding_sizes(sources: Sources, psf: model.Psf, scene: Scene, settings: Settings) -> Int:
-    """Stamps as wide as galsim's folding_threshold asks for: all but that of the light."""
+    """Sizes of stamps that contain all light but the folding threshold, as in galsim."""
     shapes = sources.shapes.take(sources.shape)
     stretch = np.sqrt(shapes.magnification)
     radius = np.zeros(len(shapes))
@@ -91,7 +125,7 @@ def _round_index(sources: Sources) -> Sources:
 
 
 def _to_exponential(sources: Sources) -> Sources:
-    """Discs of the same half-light radius; those that had a bulge alone are seen as round as it was."""
+    """Replace galaxies by discs of the same half-light radius; a pure bulge keeps its axis ratio."""
     shapes = sources.shapes
     fraction = shapes.bulge_fraction
     radius = fraction * shapes.bulge_radius + (1 - fraction) * shapes.disk_radius
@@ -104,7 +138,7 @@ def _to_exponential(sources: Sources) -> Sources:
 
 
 def _faint_galaxies(scene: Scene, seed: int, n: int) -> Sources:
-    """Bulge and disc, beyond the limit."""
+    """Galaxies with bulge and disc that are fainter than FAINT."""
     sources = scenes.sources(scene, seed, galaxies=40 * n, stars=0)
     fraction = sources.shapes.bulge_fraction
     is_faint_composite = (fraction > 0) & (fraction < 1) & (scenes.magnitudes(sources, scene) > FAINT)
@@ -125,7 +159,7 @@ def _tiny_galaxies(scene: Scene, seed: int, n: int) -> Sources:
 
 
 def _huge_galaxies(scene: Scene, seed: int, n: int) -> Sources:
-    """The steep ones, which the paper had no memory for."""
+    """Large galaxies with steep profiles, for which the code of the paper had not enough memory."""
     sources = _galaxies_of_size(scene, seed, n, 1.2 * HUGE, 17.0)
     index, radius = np.linspace(2.5, 6.0, n), np.full(n, 1.2 * HUGE)
     shapes = replace(sources.shapes, bulge_radius=radius, sersic_index=index, bulge_fraction=np.ones(n))
@@ -133,7 +167,7 @@ def _huge_galaxies(scene: Scene, seed: int, n: int) -> Sources:
 
 
 def _resample(image: Float) -> Float:
-    """Pixels twice as wide, and a biquadratic interpolation between them."""
+    """Rebin to pixels of twice the side, and interpolate back by biquadratic splines."""
     ny, nx = image.shape
     coarse = image.reshape(ny // 2, 2, nx // 2, 2).sum(axis=(1, 3))
     return np.asarray(zoom(coarse, 2, order=2, mode="nearest", grid_mode=True)) / 4
@@ -145,7 +179,10 @@ def _half_sizes(sources: Sources, psf: model.Psf, scene: Scene, settings: Settin
 
 
 def _upsample_copy(image: Float) -> Float:
-    """What `_down_and_up` takes besides the drawing, of an image of half the side."""
+    """Spend the time of the interpolation in `_resample`, and return the image unchanged.
+
+    The image is drawn with stamps of half the side, so that the sum is the time of drawing at lower resolution.
+    """
     zoom(image[: len(image) // 2, : len(image) // 2], 2, order=2, mode="nearest", grid_mode=True)
     return image
 
@@ -155,7 +192,7 @@ def _remove_colours(sources: Sources) -> Sources:
 
 
 def _mean_colour_psf(psf: model.Psf) -> model.Psf:
-    """One plane for all colours; its drift across the detector stays."""
+    """Replace the planes of all wavelengths by their mean; the variation across the detector stays."""
     planes = psf.planes
     assert planes is not None
     achromatic = [i for i, power in enumerate(planes.powers) if power[2] == 0]
@@ -166,7 +203,7 @@ def _mean_colour_psf(psf: model.Psf) -> model.Psf:
 
 
 def _central_psf(psf: model.Psf) -> model.Psf:
-    """The detector's centre everywhere."""
+    """Use the PSF at the centre of the detector everywhere."""
     planes = psf.planes
     assert planes is not None
     return replace(psf, planes=replace(planes, drift=planes.drift[:0], powers=()))

@@ -1,4 +1,4 @@
-"""The page in a browser with a clock: when its first sky is shown, how soon a move of a brush is."""
+"""Time the page in a browser: the first sky map, and moves of a brush."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any
 
 CHROMIUM = os.environ.get("TRUESKY_CHROMIUM") or shutil.which("chromium")
 _TIMEOUT, _PAUSE = 120.0, 3.0
-# A move of the brush of the first chart: ms until the other charts show other numbers, and until a frame with them.
+# Move the brush of the first chart; return ms until the other charts show other numbers, and until the next frame.
 _MOVE = """async ([kind, facts]) => {
   const [canvas] = document.querySelectorAll('#plot-grid canvas'), box = canvas.getBoundingClientRect();
   const text = () => [...document.querySelectorAll('#plot-grid .range')].slice(1).map((one) => one.textContent).join();
@@ -30,7 +30,7 @@ _MOVE = """async ([kind, facts]) => {
 
 
 def missing_requirement() -> str:
-    """What there is not, "" where there is a browser."""
+    """Return a message about the missing software, or "" if a browser can be used."""
     if importlib.util.find_spec("playwright") is None:
         return "playwright is not installed (make .venv/installed-test)"
     return "" if CHROMIUM else "there is no chromium (Debian: apt install chromium)"
@@ -55,7 +55,7 @@ def _wait_until(tab: Any, expression: str) -> None:
 
 
 def time_first_sky(command: Sequence[str]) -> float:
-    """s from a command that serves a lake to the legend of its sky."""
+    """Return the time (s) from the start of a server to the legend of its sky map."""
     with _open_tab() as tab:
         started = time.perf_counter()
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
@@ -69,9 +69,19 @@ def time_first_sky(command: Sequence[str]) -> float:
 
 
 def time_brushes(address: str, times: int) -> dict[str, float]:
-    """Moves of a brush over four histograms and a map: held, and counted anew.
+    """Time moves of a brush over four histograms and a map: while it is held, and with requests to the server.
 
-    address : of a page over a lake whose table `trial` has columns x_0 to x_3;  times : how many moves
+    Parameters
+    ----------
+    address : str
+        Address of a page over a lake whose table `trial` has columns x_0 to x_3.
+    times : int
+        Number of moves.
+
+    Returns
+    -------
+    dict of str to float
+        Times in milliseconds.
     """
     with _open_tab() as tab:
         tab.goto(address)
@@ -81,14 +91,14 @@ def time_brushes(address: str, times: int) -> dict[str, float]:
         tab.press("#plot-source", "Enter")
         tab.evaluate("() => document.getElementById('plot-source').dispatchEvent(new Event('change'))")
         _wait_until(tab, "document.getElementById('plot-state').textContent.includes('rows')")
-        # To and fro: beyond the end of an axis nothing changes.
+        # Move back and forth, because a brush at the end of an axis cannot move.
         keys = ["ArrowRight" if k % 16 < 8 else "ArrowLeft" for k in range(times)]
         key_times = [tab.evaluate(_MOVE, ["key", {"key": key}]) for key in keys][1:]
         box = tab.locator("#plot-grid canvas").first.bounding_box()
         tab.mouse.move(box["x"] + 0.3 * box["width"], box["y"] + 0.5 * box["height"])
         tab.mouse.down()
         tab.mouse.move(box["x"] + 0.35 * box["width"], box["y"] + 0.5 * box["height"])
-        # The counts for every place of the brush.
+        # Wait for the counts of all positions of the brush.
         time.sleep(_PAUSE)
         drag_times = [tab.evaluate(_MOVE, ["drag", {"place": 0.4 + 0.5 * k / times}]) for k in range(times)]
         tab.mouse.up()

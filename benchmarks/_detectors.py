@@ -1,4 +1,4 @@
-"""What benchmarks of a camera's detectors share: a lake, a detector's task, what it takes; an exposure by the job."""
+"""Functions for benchmarks of single detectors: make a lake, plan a detector, measure its rendering, time a job."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from truesky.request.schema import Request
 from truesky.running.task_metrics import peak_memory_gb, reset_peak_memory
 
 ROOT = Path(__file__).resolve().parents[1]
-# As far from an exposure's centre as sources of one of its detectors may lie, deg.
+# Radius (deg) around the centre of an exposure that contains all sources on its detectors.
 FIELD_RADIUS = 0.62
 
 
 def make_lake(folder: Path, request: Request) -> Path:
-    """Catalogues and fluxes of a request."""
+    """Make a lake with the catalogues and fluxes of a request, and return its folder."""
     root = layout.resolve_lake(folder / "lake")
     for module in (build_galaxies, build_stars, compute_fluxes):
         for step in module.steps(root, request):
@@ -37,7 +37,7 @@ def make_lake(folder: Path, request: Request) -> Path:
 
 
 def request_head(quick: bool) -> str:
-    """The demo's request as far as its first pointing, as text; of a brighter universe where it must be quick."""
+    """Return the demo request up to its first pointing, as text; `quick` selects only bright sources."""
     text = (ROOT / "requests" / "demo.toml").read_text(encoding="utf-8").split("[[pointing]]")[0]
     if quick:
         text = text.replace("galaxy_limit = 26.0", "galaxy_limit = 19.0").replace(
@@ -47,7 +47,22 @@ def request_head(quick: bool) -> str:
 
 
 def plan_detector(root: Path, request: Request, number: int = 0) -> Json:
-    """Plans the request; facts of a detector's task, by its number among those of the plan."""
+    """Plan a request and select one detector.
+
+    Parameters
+    ----------
+    root : Path
+        Folder of the lake.
+    request : Request
+        The request.
+    number : int, optional
+        Index of the detector in the plan of images.
+
+    Returns
+    -------
+    dict
+        Facts of the task that renders the detector.
+    """
     for step in plan_exposures.steps(root, request):
         publish.make_version(root, step.plan, step.run_task)
     step = render_exposures.steps(root, request)[0]
@@ -55,7 +70,24 @@ def plan_detector(root: Path, request: Request, number: int = 0) -> Json:
 
 
 def measure_render(root: Path, facts: Json, folder: Path) -> tuple[float, float]:
-    """CPU s and largest memory, GB, from reading the sources to the last byte written."""
+    """Render a detector, from reading the sources to writing the files.
+
+    Parameters
+    ----------
+    root : Path
+        Folder of the lake.
+    facts : dict
+        Facts of the task.
+    folder : Path
+        Folder for the files.
+
+    Returns
+    -------
+    seconds : float
+        CPU time in seconds.
+    peak : float
+        Peak memory in GB.
+    """
     reset_peak_memory()
     started = time.process_time()
     output = render_exposures.render_task(root, facts)
@@ -67,9 +99,25 @@ def measure_render(root: Path, facts: Json, folder: Path) -> tuple[float, float]
 
 
 def time_cold_and_warm(root: Path, facts: Json, folder: Path, planes: str, repeats: int) -> dict[str, float]:
-    """`cold_s`, `warm_s` and `peak_gb` of a detector: without the PSF's planes in the cache, and with them.
+    """Time the rendering of a detector without and with the planes of the PSF in the cache.
 
-    planes : pattern of their folders in the cache
+    Parameters
+    ----------
+    root : Path
+        Folder of the lake.
+    facts : dict
+        Facts of the task.
+    folder : Path
+        Folder for the files.
+    planes : str
+        Pattern of the folders of the planes in the cache.
+    repeats : int
+        Number of repeats; the shortest time counts.
+
+    Returns
+    -------
+    dict of str to float
+        `cold_s` and `warm_s` (CPU time in seconds), and `peak_gb` (peak memory in GB).
     """
     out = {"peak_gb": 0.0}
     for state in ("cold", "warm"):
@@ -85,7 +133,7 @@ def time_cold_and_warm(root: Path, facts: Json, folder: Path, planes: str, repea
 
 
 def remove_planes(pattern: str) -> None:
-    """Empties the cache of PSF planes, whose folders match a pattern."""
+    """Delete the PSF planes in the cache whose folders match a pattern."""
     for folder in cache.cache_dir().glob(pattern):
         for file in folder.iterdir():
             file.unlink()
@@ -93,7 +141,22 @@ def remove_planes(pattern: str) -> None:
 
 
 def add_cpu_time(function: Callable[..., Any], name: str, seconds: dict[str, float]) -> Callable[..., Any]:
-    """The function, which adds its CPU seconds to those of a name."""
+    """Wrap a function so that it adds its CPU time.
+
+    Parameters
+    ----------
+    function : callable
+        The function.
+    name : str
+        Key of the sum.
+    seconds : dict of str to float
+        CPU times in seconds, to which the wrapper adds.
+
+    Returns
+    -------
+    callable
+        The wrapped function.
+    """
 
     def call_timed(*arguments: Any, **options: Any) -> Any:
         started = time.process_time()
@@ -108,9 +171,21 @@ def add_cpu_time(function: Callable[..., Any], name: str, seconds: dict[str, flo
 def effect_seconds(
     effects: Mapping[str, tuple[Effect, ...]], untimed_effects: tuple[object, ...], render: Callable[[], object]
 ) -> dict[str, float]:
-    """CPU s of each effect of a science image in one rendering.
+    """Measure the CPU time of each effect of a science image in one rendering.
 
-    effects : of a channel, by image type;  own : those that a channel is known by: they stay as they are
+    Parameters
+    ----------
+    effects : mapping of str to tuple of Effect
+        Effects of a channel by image type.
+    untimed_effects : tuple of object
+        Effects that are not measured, because the channel identifies them by their object.
+    render : callable
+        Function that renders the image.
+
+    Returns
+    -------
+    dict of str to float
+        CPU time in seconds by `effect_<name>_s`.
     """
     seconds: dict[str, float] = defaultdict(float)
     science_effects = effects["science"]
@@ -127,7 +202,7 @@ def effect_seconds(
 
 
 def time_job(folder: Path, text: str) -> float:
-    """Wall s of the Spark job that renders a request on 2 cores."""
+    """Return the wall time (s) of the Spark job that renders a request, given as text, on 2 cores."""
     file = folder / "exposure.toml"
     file.write_text(text, encoding="utf-8")
     request = parse(file)

@@ -1,7 +1,8 @@
-"""What the settings of dispersing cost and how wrong they are: of one sample they were chosen on, and of another.
+"""Measure time and errors of the settings for drawing spectra, for the sample used to choose them and for another one.
 
-Galaxies and stars in an order of the red grism, continuum and a line, one by one, against the slow way: every sample of
-the trace in rows and with a PSF of its own, on large, fine stamps through a PSF of more wavelengths.
+Galaxies and stars are drawn one by one in an order of the red grism, with continuum and one line. The truth is a slow
+method: each sample of the trace has separate rows and a separate PSF, on large and finely sampled stamps, with a PSF of
+more wavelengths.
 """
 
 from __future__ import annotations
@@ -25,18 +26,19 @@ from truesky.render.psf import euclid
 from truesky.render.psf.model import Psf
 from truesky.render.sources.source_list import Sources
 
-# Electrons a pixel, of the sky of an exposure through the red grism.
+# Noise of the sky in an exposure with the red grism, electrons per pixel.
 NOISE = 28.0
-# The largest of each, and by which the table is ordered.
+# Kinds of errors; the table contains the largest of each.
 ERROR_NAMES = ("background", "flux", "position")
-# Sources of a sample, their seeds; those that are timed.
+# Number of sources to choose the settings and to test them, with seeds; number of sources to time, with seed.
 NUM_CHOSEN, NUM_TEST, _SEEDS, _NUM_TIMED, _TIMED_SEED = 18, 36, (41, 42), 400, 43
-# All of their light is in one order and one row of tilts, deg.
+# Tilts of the grism (deg) of the sources in turn. All light of a source is in the first order.
 _TILTS = (0.0, 4.0, -4.0)
-# H_E of the brightest and of the faintest, electrons of magnitude 0: zero point 25.3 and 549 s.
+# Brightest and faintest H_E, and electrons of magnitude 0 for a zero point of 25.3 and 549.6 s.
 _BRIGHT, _FAINT, _ZERO = 17.0, 23.0, 549.6 * 10 ** (0.4 * 25.3)
 _TRUTH = Settings(edge=1e-5, faint=0.0, min_size=80, along=4, across=4, block=0.0, nodes=5, positions=9)
-# Pixels of the frame, and where the undispersed image lies; half the box about a line; sigma of its weight.
+# Shape of the frame and position of the undispersed image; half sides of the box around a line; sigma of the weight of
+# its centroid. All in pixels.
 _SHAPE, _PLACE, _BOX, _SIGMA = (128, 720), (270.0, 60.0), (8, 4), 2.0
 _TABLE_HEADER = """\
 # Settings of drawing spectra. allowed: the error of a pixel, of its noise, that they are for.
@@ -53,7 +55,7 @@ _TABLE_HEADER = """\
 
 @dataclass(frozen=True)
 class SampleSource:
-    """A source alone, its tilt, its continuum and line, and where the line lies, pixels."""
+    """A single source, the tilt of the grism (deg), its continuum and line, and the position of the line (pixels)."""
 
     source: Sources
     tilt: float
@@ -63,7 +65,7 @@ class SampleSource:
 
 
 def first_orders(tilt: float) -> tuple[Order, ...]:
-    """The first order of the red grism."""
+    """Return the first order of the red grism for a tilt in degrees."""
     mission, band = resolve(), passbands.load("nisp_red")
     first = next(t for t in traces.traces("RGS000", tilt, _detector(), mission) if t.order == 1)
     return (Order(first, int(band.wavelength[0]), band.response * band.wavelength),)
@@ -74,14 +76,14 @@ def _detector() -> detectors.Detector:
 
 
 def settings_psf(settings: Settings) -> Psf:
-    """At the settings' wavelengths and places."""
+    """Return the PSF at the wavelengths and positions of the settings."""
     trace = first_orders(0.0)[0].trace
     nodes = images.nodes(trace.first, trace.last, settings.nodes)
     return euclid.nisp_psf_at(_detector(), nodes, resolve(), settings.positions)
 
 
 def sample_sources(seed: int, count: int) -> list[SampleSource]:
-    """Two galaxies to a star, evenly in magnitude."""
+    """Draw a sample of two galaxies per star, uniform in magnitude."""
     rng = np.random.default_rng(seed)
     stars = count // 3
     sources = scenes.sources(NISP, seed, galaxies=count - stars, stars=stars)
@@ -106,7 +108,22 @@ def sample_sources(seed: int, count: int) -> list[SampleSource]:
 
 
 def draw_images(sample_source: SampleSource, settings: Settings, psf: Psf) -> tuple[Float, Float]:
-    """(all of its light, its line alone) on a frame."""
+    """Draw a source.
+
+    Parameters
+    ----------
+    sample_source : SampleSource
+        The source.
+    settings : Settings
+        Settings of drawing spectra.
+    psf : Psf
+        PSF at the wavelengths and positions of the settings.
+
+    Returns
+    -------
+    total, line : float array
+        Expected electrons of the whole spectrum, and of its line alone.
+    """
     spectra = sample_source.continuum + sample_source.line, sample_source.line
     dispersions = (
         DispersedSources(lambda _, spectrum=spectrum: spectrum, first_orders(sample_source.tilt), settings)
@@ -119,7 +136,24 @@ def draw_images(sample_source: SampleSource, settings: Settings, psf: Psf) -> tu
 def errors(
     drawn: tuple[Float, Float], truth: tuple[Float, Float], sample_source: SampleSource
 ) -> tuple[float, float, float]:
-    """(largest of a pixel, of its own noise; of the line's flux in a box, relative; of its place, pixels)."""
+    """Return the errors of a drawn source.
+
+    Parameters
+    ----------
+    drawn, truth : tuple of float array
+        Images of `draw_images`.
+    sample_source : SampleSource
+        The source.
+
+    Returns
+    -------
+    background : float
+        Largest error of a pixel, in units of its noise.
+    flux : float
+        Relative error of the flux of the line in a box.
+    position : float
+        Error of the position of the line, in pixels.
+    """
     background = np.abs(drawn[0] - truth[0]) / np.sqrt(NOISE**2 + np.maximum(truth[0], 0.0))
     measured, expected = (_flux_and_centroid(image, *sample_source.place) for image in (drawn[1], truth[1]))
     return (
@@ -130,7 +164,7 @@ def errors(
 
 
 def _flux_and_centroid(image: Float, column: float, row: float) -> tuple[float, float, float]:
-    """Flux in a box, and the centroid under a Gaussian weight about the line."""
+    """Flux in a box around a line, and its centroid with a Gaussian weight."""
     first_column, first_row = round(column) - _BOX[0], round(row) - _BOX[1]
     box = image[first_row : first_row + 2 * _BOX[1] + 1, first_column : first_column + 2 * _BOX[0] + 1]
     y, x = np.indices(box.shape)
@@ -141,7 +175,7 @@ def _flux_and_centroid(image: Float, column: float, row: float) -> tuple[float, 
 
 
 def seconds(settings: Settings, repeats: int) -> float:
-    """CPU s of the first orders of 7,400 sources on a detector, one in ten of them a star."""
+    """Return the CPU time (s) to draw the first orders of 7,400 sources on a detector, 10 % of them stars."""
     rng, psf = np.random.default_rng(_TIMED_SEED), settings_psf(settings)
     sources = scenes.sources(NISP, _TIMED_SEED, galaxies=_NUM_TIMED - _NUM_TIMED // 10, stars=_NUM_TIMED // 10)
     low, high = 10 ** (0.3 * _BRIGHT), 10 ** (0.3 * _FAINT)
@@ -158,7 +192,7 @@ def seconds(settings: Settings, repeats: int) -> float:
         half = time.process_time()
         draw.draw(sources, dispersed, psf, (NISP.ny, NISP.nx), NOISE)
         half_seconds, all_seconds = min(half_seconds, half - started), min(all_seconds, time.process_time() - half)
-    # What is the same for any number of sources is the detector's once.
+    # Extrapolate by the time per source; the time that does not depend on the number of sources counts once.
     each = (all_seconds - half_seconds) / (len(sources) - len(sources) // 2)
     return all_seconds + each * (7400 - len(sources))
 
@@ -166,7 +200,23 @@ def seconds(settings: Settings, repeats: int) -> float:
 def measure_settings(
     tiers: Iterable[Settings], repeats: int, num_chosen: int = NUM_CHOSEN, num_test: int = NUM_TEST
 ) -> list[dict[str, float]]:
-    """Of each: the largest errors of the sources it was chosen on and (_held) of the others; seconds."""
+    """Measure errors and time of several settings.
+
+    Parameters
+    ----------
+    tiers : iterable of Settings
+        The settings.
+    repeats : int
+        Number of repeats of each time.
+    num_chosen, num_test : int, optional
+        Number of sources of the sample used to choose the settings, and of the test sample.
+
+    Returns
+    -------
+    list of dict
+        For each of the settings the largest errors for the first sample, for the test sample (keys that end in
+        `_held`), and `seconds`.
+    """
     samples = {
         end: sample_sources(seed, n) for end, seed, n in zip(("", "_held"), _SEEDS, (num_chosen, num_test), strict=True)
     }
@@ -189,7 +239,7 @@ def measure_settings(
 
 
 def settings_table(repeats: int = 2) -> str:
-    """The table of settings that is in use, with what it is now measured to be."""
+    """Return the table of the current settings with newly measured errors and times, as text."""
     current_rows = draw.read_settings()
     setting_names = [name for name in current_rows[0] if name == "allowed" or name in Settings.__slots__]
     names = [*setting_names, *(f"{name}{end}" for end in ("", "_held") for name in ERROR_NAMES), "seconds"]

@@ -1,4 +1,4 @@
-"""Errors of drawn galaxies: against galsim at its tightest, and of their response to shear."""
+"""Errors of drawn galaxies compared with galsim at its tightest parameters, and errors of their response to shear."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from truesky.render.sources import galaxy_shapes
 from truesky.render.sources.source_list import Sources
 
 Result = TypeVar("Found")
-# galsim asks for more than any machine has where a bulge is steep: bytes of address space.
+# Limit of the address space in bytes. Without it galsim would use all memory of the machine for steep bulges.
 MEMORY = 4 << 30
-# Of the weight under which moments are taken, arcsec; radius of the aperture, arcsec.
+# Sigma of the Gaussian weight for moments, and radius of the aperture, in arcsec.
 WEIGHT_SIGMA, APERTURE_RADIUS = 0.75, 1.0
-# Of 90-degree pairs: the shear whose response is measured.
+# Shear that is applied to 90-degree pairs to measure their response.
 SHEAR = 0.02
 # Side of the frames that are compared, pixels.
 COMPARED_SIDE = 256
 NAMES = ("aperture_mag", "centroid_mas", "r2", "ellipticity", "pixel_sigma")
-# No approximation but the stamp, and that the largest.
+# The only approximation is a finite stamp, of the largest size.
 FULL_SETTINGS = Settings(edge=1e-7, aliased=1e-9, floor=0.0, min_size_arcsec=51.2, positions=9)
 
 
 def run_with_memory_limit(work: Callable[..., Result], *args: Any) -> Result:
-    """work(*args) in a process of its own whose memory is limited; what it is given is shared, not copied."""
+    """Run work(*args) in a forked process with limited memory and return its result; arguments are not copied."""
     context = get_context("fork")
     ours, theirs = context.Pipe(duplex=False)
     process = context.Process(target=_send_result, args=(theirs, work, args))
@@ -60,7 +60,22 @@ def _limit_memory() -> None:
 
 
 def measure_image(image: Float, scale: float, x: float, y: float) -> Float:
-    """Aperture flux; centroid in arcsec; R2 in arcsec2; e1, e2, under a Gaussian weight about the true place."""
+    """Measure aperture flux and weighted moments of an image.
+
+    Parameters
+    ----------
+    image : float array, shape (ny, nx)
+        The image.
+    scale : float
+        Pixel scale in arcsec.
+    x, y : float
+        True position in pixels, the centre of the Gaussian weight.
+
+    Returns
+    -------
+    float array, shape (6,)
+        Aperture flux, centroid (x, y) in arcsec, R2 in arcsec2, e1, e2.
+    """
     rows, columns = np.mgrid[: image.shape[0], : image.shape[1]]
     dx, dy = (columns - x) * scale, (rows - y) * scale
     r2 = dx**2 + dy**2
@@ -73,7 +88,22 @@ def measure_image(image: Float, scale: float, x: float, y: float) -> Float:
 
 
 def errors(image: Float, truth: Float, scene: Scene, source: Sources) -> Float:
-    """NAMES: aperture mag, centroid mas, dR2 / R2, ellipticity, largest pixel in sigma."""
+    """Return the errors of an image of one source.
+
+    Parameters
+    ----------
+    image, truth : float array, shape (ny, nx)
+        The image and the true image.
+    scene : Scene
+        The scene.
+    source : Sources
+        The source.
+
+    Returns
+    -------
+    float array, shape (5,)
+        By NAMES: aperture magnitude, centroid (mas), dR2 / R2, ellipticity, largest error of a pixel in sigma.
+    """
     position = float(source.column[0]), float(source.row[0])
     ours, theirs = measure_image(image, scene.scale, *position), measure_image(truth, scene.scale, *position)
     return np.array(
@@ -88,7 +118,28 @@ def errors(image: Float, truth: Float, scene: Scene, source: Sources) -> Float:
 
 
 def against_galsim(scene: Scene, tiers: Mapping[str, Settings], seed: int, n: int) -> tuple[dict[str, Float], Int, int]:
-    """(errors [m, 5] of each of the settings, magnitude bins [m], galaxies that galsim refused)."""
+    """Compare galaxies drawn with several settings with galsim.
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene.
+    tiers : mapping of str to Settings
+        Settings by name.
+    seed : int
+        Seed of the sample.
+    n : int
+        Number of galaxies.
+
+    Returns
+    -------
+    errors : dict of str to float array, shape (m, 5)
+        Errors by name of the settings.
+    bins : int array, shape (m,)
+        Magnitude bins.
+    refused : int
+        Number of galaxies that galsim cannot draw.
+    """
     sources, full_psf = scenes.sample(scene, seed, n), scenes.scene_psf(scene)
     out: dict[str, list[Float]] = {name: [] for name in tiers}
     bins, refused = [], 0
@@ -112,9 +163,32 @@ def against_galsim(scene: Scene, tiers: Mapping[str, Settings], seed: int, n: in
 def shear_response(
     scene: Scene, tiers: Mapping[str, Settings], seed: int, n: int, g: float = SHEAR
 ) -> tuple[dict[str, Float], Sources]:
-    """Errors (m, c) [n, 2] of each of the settings and the galaxies: 90-degree pairs under +-g, noise-free.
+    """Measure the bias of the response to shear by noise-free 90-degree pairs.
 
-    The truth is the same galaxy through the same PSF on the largest stamp (FULL); |m| <= 1e-5 of galsim's.
+    Parameters
+    ----------
+    scene : Scene
+        The scene.
+    tiers : mapping of str to Settings
+        Settings by name.
+    seed : int
+        Seed of the sample.
+    n : int
+        Number of galaxies.
+    g : float, optional
+        Shear, applied with both signs.
+
+    Returns
+    -------
+    biases : dict of str to float array, shape (n, 2)
+        Bias (m, c) by name of the settings.
+    sources : Sources
+        The galaxies.
+
+    Notes
+    -----
+    The truth is the same galaxy with the same PSF on the largest stamp (FULL_SETTINGS). Compared with galsim this
+    truth has |m| <= 1e-5.
     """
     sources, full_psf = scenes.sample(scene, seed, n), scenes.scene_psf(scene)
     out: dict[str, list[tuple[float, float]]] = {name: [] for name in tiers}
@@ -130,15 +204,43 @@ def shear_response(
 
 
 def make_drawer(psf: model.Psf, scene: Scene, settings: Settings) -> Callable[[Sources], Float]:
-    """A way to draw a galaxy: ours, on a frame of twice COMPARED."""
+    """Return a function that draws a galaxy.
+
+    Parameters
+    ----------
+    psf : Psf
+        PSF of the galaxy.
+    scene : Scene
+        The scene.
+    settings : Settings
+        Settings of drawing.
+
+    Returns
+    -------
+    callable
+        Function of a source that returns its image, on a frame of side 2 COMPARED_SIDE.
+    """
     return lambda source: scenes.draw_sources(source, psf, scene, settings, 2 * COMPARED_SIDE)
 
 
 def response(draw: Callable[[Sources], Float], source: Sources, scale: float, g: float = SHEAR) -> Float:
-    """(de1 / dg1, de2 / dg2, mean e1, mean e2) of a galaxy and the same turned by 90 degrees, under +-g.
+    """Measure the response to shear of a galaxy and the same galaxy rotated by 90 degrees.
 
-    draw  : any way to draw a galaxy, free of noise
-    one   : where it stands on the drawing, and its shapes, whose own shear gives way;  scale : arcsec a pixel
+    Parameters
+    ----------
+    draw : callable
+        Function that draws a galaxy without noise.
+    source : Sources
+        The galaxy with its position on the image. Its shear is replaced.
+    scale : float
+        Pixel scale in arcsec.
+    g : float, optional
+        Shear, applied with both signs.
+
+    Returns
+    -------
+    float array, shape (4,)
+        de1 / dg1, de2 / dg2, mean e1, mean e2.
     """
     slopes, means = np.zeros(2), np.zeros(2)
     for turn in (0.0, np.pi / 2):
@@ -155,13 +257,28 @@ def response(draw: Callable[[Sources], Float], source: Sources, scale: float, g:
 
 
 def bias(measured: Float, truth: Float) -> tuple[float, float]:
-    """(m, c) of a response against the true one: of the two components the worse, with its sign."""
+    """Return the bias (m, c) of a response relative to the true one: the larger of two components, with its sign."""
     m, c = measured[:2] / truth[:2] - 1, measured[2:] - truth[2:]
     return float(m[np.argmax(np.abs(m))]), float(c[np.argmax(np.abs(c))])
 
 
 def worst_by_group(biases: Float, sources: Sources, scene: Scene) -> dict[str, tuple[int, float, float]]:
-    """Largest |m| and |c| of biases [n, 2], with the number of galaxies: by magnitude, size and index of the bulge."""
+    """Return the largest biases in bins of magnitude, size and index of the bulge.
+
+    Parameters
+    ----------
+    biases : float array, shape (n, 2)
+        Bias (m, c) of each galaxy.
+    sources : Sources
+        The galaxies.
+    scene : Scene
+        The scene.
+
+    Returns
+    -------
+    dict of str to (int, float, float)
+        Number of galaxies, largest |m| and largest |c| by name of the bin.
+    """
     shapes = sources.shapes.take(sources.shape)
     size, index = galaxy_shapes.half_light(shapes), np.where(shapes.bulge_fraction > 0, shapes.sersic_index, 1.0)
     groups = (
@@ -180,14 +297,14 @@ def worst_by_group(biases: Float, sources: Sources, scene: Scene) -> dict[str, t
 
 
 def figures(error_values: Float) -> dict[str, float]:
-    """rms and worst of errors [n, 5]."""
+    """Return the rms and the largest of errors [n, 5] by name."""
     rms, worst = np.sqrt((error_values**2).mean(axis=0)), error_values.max(axis=0)
     named = zip(NAMES, rms, worst, strict=True)
     return {key: float(value) for name, a, b in named for key, value in ((f"{name}_rms", a), (f"{name}_worst", b))}
 
 
 def figures_by_bin(error_values: Float, bins: Int) -> dict[str, float]:
-    """`figures` of each magnitude bin: their keys end in the bin's bright edge."""
+    """Return `figures` of each magnitude bin; the keys end in the bright edge of the bin."""
     return {
         f"{key}_m{BINS[b]:.0f}": value
         for b in np.unique(bins)
@@ -196,7 +313,17 @@ def figures_by_bin(error_values: Float, bins: Int) -> dict[str, float]:
 
 
 def print_table(title: str, error_values: Float, bins: Int) -> None:
-    """Prints rms / worst of errors by magnitude bin."""
+    """Print rms and largest errors by magnitude bin.
+
+    Parameters
+    ----------
+    title : str
+        Title of the table.
+    error_values : float array, shape (n, 5)
+        The errors.
+    bins : int array, shape (n,)
+        Magnitude bins.
+    """
     print(f"{title:24}" + "".join(f"{name:>20}" for name in NAMES))
     rows = [(f"m {BINS[b]:.0f}-{BINS[b + 1]:.0f}", error_values[bins == b]) for b in range(len(BINS) - 1)]
     for label, bin_errors in [*rows, ("all", error_values)]:

@@ -1,4 +1,4 @@
-"""What surrounds a detector's physics: CPU of a task beside its render, and of a run that no second core can share."""
+"""Measure overheads: CPU time of a task outside its rendering, and the serial CPU time of a run."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from truesky.request.schema import Request
 from truesky.running import submitted_job
 from truesky.running.session import get_session
 
-# Load average below which a machine of two cores is quiet.
+# A machine of two cores is idle if the load average is below this value.
 QUIET_LOAD = 0.5
 
 
 def task_ms(root: Path, request: Request) -> float:
-    """CPU ms of a task beside its render and the reading of its sources, the largest of the channels'; in a worker."""
+    """Return the CPU time (ms) of a task in a worker without rendering and reading sources (largest value)."""
     facts = _first_task_per_detector(root, request)
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         return 1e3 * max(pool.map(_time_outside_render, [root] * len(facts), facts))
 
 
 def compile_all(root: Path, request: Request) -> None:
-    """Render once what is compiled or computed once a machine, in a process that leaves its memory when it ends."""
+    """Render all tasks once in another process, so that everything compiled or computed once per machine is cached."""
     _warm_up(root, _task_facts(root, request))
 
 
@@ -46,12 +46,12 @@ def _task_facts(root: Path, request: Request) -> list[Json]:
 
 
 def _first_task_per_detector(root: Path, request: Request) -> Sequence[Json]:
-    """One task of each detector."""
+    """Facts of one task of each detector."""
     return list({facts["detector"]: facts for facts in _task_facts(root, request)}.values())
 
 
 def _time_outside_render(root: Path, facts: Json) -> float:
-    """CPU s of a task whose render takes none, nor the reading of its sources, which has a figure of its own."""
+    """CPU time (s) of a task, with rendering and reading of sources replaced by results in memory."""
     renders: list[rendered_detector.RenderedDetector] = []
     original_render = render.render
     _run_with_render(lambda *a, **k: renders.append(original_render(*a, **k)) or renders[0], root, facts)  # type: ignore[func-returns-value]
@@ -87,9 +87,10 @@ def _time_task(root: Path, facts: Json) -> float:
 
 
 def cpu_shares(root: Path, request: Request) -> dict[str, float]:
-    """Of a render job's CPU what its driver takes, Python and Java, after Java has started; what two cores make of it.
+    """Return the share of the driver (Python and Java, after its start) in the CPU time of a render job.
 
-    Java's part in the tasks counts as the driver's. Where the machine is quiet, by the clock, too.
+    The speed-up by two cores follows from this share. The time of Java within tasks counts as time of the driver. If
+    the machine is idle, the speed-up is also measured by wall time.
     """
     _warm_up(root, _first_task_per_detector(root, request))
     spark = get_session("benchmark of production")
@@ -112,13 +113,28 @@ def cpu_shares(root: Path, request: Request) -> dict[str, float]:
 
 
 def _cpu(pid: int) -> float:
-    """CPU s of a process so far."""
+    """CPU time (s) of a process until now."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def wall_clock_speedup(root: Path, request: Request, tasks: int = 16) -> dict[str, float]:
-    """So many detectors one after another, over the same two at a time; both in workers that are warm."""
+    """Measure the speed-up by two cores in warm workers.
+
+    Parameters
+    ----------
+    root : Path
+        Folder of the lake.
+    request : Request
+        The request.
+    tasks : int, optional
+        Number of detectors to render.
+
+    Returns
+    -------
+    dict of str to float
+        `wall_2_cores` (wall time with one core / with two) and `two_cores_cpu` (CPU time with two cores / with one).
+    """
     facts = [_first_task_per_detector(root, request)[-1]] * tasks
     seconds, cpu = {}, {}
     for cores in (1, 2):

@@ -1,4 +1,4 @@
-"""What others take for the same galaxies: galsim, object by object, UFig's photons; SkyPy's catalogues."""
+"""Time other programs on the same galaxies: galsim (object by object), UFig (photons), and SkyPy (catalogues)."""
 
 from __future__ import annotations
 
@@ -18,15 +18,28 @@ from truesky.render.psf import model
 from truesky.render.sources import galaxy_shapes
 from truesky.render.sources.source_list import Sources
 
-# Side of a PSF's image for galsim, samples: 10".
+# Side of the image of a PSF for galsim, in samples (10").
 _SIDE = 301
 
 
 def galsim_seconds(scene: Scene, each: int, seed: int = 3) -> tuple[float, float]:
-    """CPU s of a detector's galaxies, from `each` galaxies a magnitude bin, at galsim's default parameters.
+    """Return the CPU time of galsim with its default parameters for the galaxies of a detector.
 
-    returns : with a PSF of its own for each galaxy (its image summed to its colour and place); with one PSF for all,
-              the index rounded to 0.1, and every index drawn once before
+    Parameters
+    ----------
+    scene : Scene
+        The scene.
+    each : int
+        Number of galaxies per magnitude bin that are drawn; the times are scaled to all galaxies.
+    seed : int, optional
+        Seed of the sample.
+
+    Returns
+    -------
+    default : float
+        Time in seconds if each galaxy has a separate PSF for its colour and position.
+    cached : float
+        Time in seconds with one PSF for all galaxies, Sersic indices rounded to 0.1, and every index drawn before.
     """
     sources, full_psf = scenes.sample(scene, seed, each * (len(BINS) - 1)), scenes.scene_psf(scene)
     bins = scenes.magnitude_bins(sources, scene)
@@ -52,7 +65,7 @@ def galsim_seconds(scene: Scene, each: int, seed: int = 3) -> tuple[float, float
 
 
 def _psf_image(psf: model.Psf, weights: Float) -> galsim.GSObject:
-    """The PSF in pixels."""
+    """Weighted sum of the planes of a PSF as a galsim object, in pixels."""
     assert psf.planes is not None
     image = transfer.image_of(psf.planes, weights)
     middle = slice((len(image) - _SIDE) // 2, (len(image) + _SIDE) // 2)
@@ -68,7 +81,22 @@ def _draw(sources: Sources, i: int, psf: galsim.GSObject, index: float) -> None:
 
 
 def galsim_image(source: Sources, psf: model.Psf, side: int) -> Float:
-    """The only source by galsim's defaults, on a stamp that galsim chooses, on a frame [side, side]."""
+    """Draw a single source by galsim with default parameters, on a stamp whose size galsim chooses.
+
+    Parameters
+    ----------
+    source : Sources
+        The source.
+    psf : Psf
+        PSF of this source.
+    side : int
+        Side of the image in pixels.
+
+    Returns
+    -------
+    float array, shape (side, side)
+        Expected electrons.
+    """
     assert psf.planes is not None
     body = galsim.JacobianWCS(*source.jacobian[0].ravel()).toImage(
         galaxy_shapes.profile(source.shapes, int(source.shape[0]), 1e-6)
@@ -82,13 +110,16 @@ def galsim_image(source: Sources, psf: model.Psf, side: int) -> Float:
 
 
 def ufig_seconds(scene: Scene) -> float:
-    """CPU s of UFig's photons of all galaxies (bulge and disc an entry each, a grey Moffat); NaN if not installed."""
+    """Return the CPU time (s) of UFig to draw the photons of all galaxies, or NaN if it is not installed.
+
+    Bulge and disc are separate entries, and the PSF is a grey Moffat profile.
+    """
     try:
         from ufig import rendering_util
         from ufig.plugins.gamma_interpolation_table import load_intrinsicTable
         from ufig.plugins.render_galaxies_flexion import integrate_image
     except ImportError:
-        print("UFig is not installed (pip install ufig): not compared")
+        print("UFig is not installed (pip install ufig) and is not compared")
         return float("nan")
     sources = scenes.sources(scene, 1, stars=0)
     shape, n = sources.shapes, len(sources)
@@ -133,19 +164,33 @@ def ufig_seconds(scene: Scene) -> float:
     return best
 
 
-# Of blue galaxies (Herbel et al. 2017): what k-correct's five templates are mixed by at z = 0 and 1, and their weights.
+# Blue galaxies (Herbel et al. 2017): coefficients of the five templates of k-correct at z = 0 and 1, and their weights.
 _TEMPLATE_MIX = (
     [2.079, 3.524, 1.917, 1.992, 2.536], [2.265, 3.862, 1.921, 1.685, 2.480], [3.47e9, 3.31e6, 2.13e9, 1.64e10, 1.01e9],
 )  # fmt: skip
-# Beyond, the templates end before I_E does.
+# At higher redshifts the templates do not cover I_E.
 _MAX_REDSHIFT = 3.9
 
 
 def skypy_photometry(area: float, seed: int) -> float:
-    """SkyPy: galaxies a CPU second with positions and magnitudes in I_E, Y and H, to 26 in the reference band; z < 3.9.
+    """Return the galaxies per CPU second of SkyPy, with positions and magnitudes in I_E, Y and H, at z < 3.9.
 
-    area : deg2;  seed : of numpy's old generator, which it draws from
-    Errors : BadInput where it is not installed
+    Parameters
+    ----------
+    area : float
+        Area in deg2.
+    seed : int
+        Seed of the legacy random generator of NumPy, which SkyPy uses.
+
+    Returns
+    -------
+    float
+        Galaxies to magnitude 26 in the reference band per second.
+
+    Raises
+    ------
+    BadInput
+        If SkyPy is not installed.
     """
     try:
         from astropy.cosmology import FlatLambdaCDM
@@ -153,7 +198,7 @@ def skypy_photometry(area: float, seed: int) -> float:
         from skypy.galaxies import schechter_lf
         from skypy.galaxies.spectrum import dirichlet_coefficients, kcorrect
     except ImportError as error:
-        raise BadInput(f"the peer is missing: {error} (pip install skypy)") from None
+        raise BadInput(f"SkyPy is required for the comparison: {error} (pip install skypy)") from None
     np.random.seed(seed)  # noqa: NPY002
     ours, z = FlatLambdaCDM(67.0, 0.319), np.linspace(0.002, _MAX_REDSHIFT, 400)
     m_star, phi_star, alpha = luminosity_function.schechter().parameters_at(z)

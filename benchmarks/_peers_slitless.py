@@ -1,4 +1,4 @@
-"""What slitlessutils makes of the same sources and the same grism: light along the traces, and the time of each."""
+"""Compare slitlessutils with truesky for the same sources and grism: light along the traces, and CPU time."""
 
 from __future__ import annotations
 
@@ -24,22 +24,35 @@ from truesky.render.psf.model import Psf
 from truesky.render.sources.source_list import Sources
 from truesky.request.accuracy import SURVEY
 
-# Names the Python of an environment with slitlessutils, which wants an older numpy than this one's.
+# Environment variable with the path of a Python that has slitlessutils, which requires an older NumPy.
 PYTHON_VARIABLE = "TRUESKY_SLITLESSUTILS"
 _INSTALL_HINT = "python3.11 -m venv PEERS; PEERS/bin/pip install slitlessutils==1.0.0 'numpy<2.4'"
 _PEER_SCRIPT = Path(__file__).with_name("_slitlessutils.py")
-# Wavelengths a pixel, as its modules take by default; pixels of a stretch that fluxes are compared in; noise, e-.
+# Wavelengths per pixel (default of slitlessutils), length of the intervals for fluxes (pixels), and noise (electrons).
 _SUBSAMPLES, _INTERVAL, _NOISE = 5, 64, 28.0
 _SHAPE, _SIDE = (2040, 2040), 40
-# Times that the same sources are drawn for the time of one.
+# Number of copies of the sources to time, so that the fixed cost of a detector is shared.
 _NUM_COPIES = 25
 
 
 def slitlessutils_figures(count: int = 2, seed: int = 7) -> dict[str, float]:
-    """CPU s a spectrum of ours and of slitlessutils', and by how much light differs in stretches of a first order.
+    """Compare CPU time per spectrum, and light in intervals of the first order.
 
-    count, seed : stars and galaxies, half of each, on DET23 in the red grism
-    Errors      : SystemExit where there is no slitlessutils
+    Parameters
+    ----------
+    count : int, optional
+        Number of sources, half of them stars and half galaxies, on DET23 in the red grism.
+    seed : int, optional
+        Seed of the sources.
+
+    Returns
+    -------
+    dict of str to float
+        Times in seconds, their ratio, and the largest relative difference of light.
+
+    Notes
+    -----
+    Raises SystemExit if slitlessutils is not available.
     """
     python = _python()
     order, psf = _grism()
@@ -62,26 +75,26 @@ def slitlessutils_figures(count: int = 2, seed: int = 7) -> dict[str, float]:
 def _python() -> str:
     python = os.environ.get(PYTHON_VARIABLE, "")
     if not python or subprocess.run([python, "-c", "import pypolyclip"], check=False, capture_output=True).returncode:
-        raise SystemExit(f"no slitlessutils: {PYTHON_VARIABLE} must name a Python that has it ({_INSTALL_HINT})")
+        raise SystemExit(f"{PYTHON_VARIABLE} must be the path of a Python with slitlessutils ({_INSTALL_HINT})")
     return python
 
 
 def _grism() -> tuple[Order, Psf]:
-    """The red grism's first order, and the PSF through it."""
+    """Return the first order of the red grism, and the PSF in it."""
     mission, band = resolve(), passbands.load("nisp_red")
     nisp_detector = detector("nisp", "DET23", mission)
     trace = next(
         candidate for candidate in traces.traces("RGS000", 0.0, nisp_detector, mission) if candidate.order == 1
     )
     part = (band.wavelength >= trace.first) & (band.wavelength <= trace.last)
-    # Electrons for each erg s-1 cm-2 A-1: of a scale that its limit of sensitivity, 1e10, is small beside.
+    # Electrons per erg s-1 cm-2 A-1, scaled to be large compared with the limit of sensitivity of slitlessutils, 1e10.
     response = (band.response * band.wavelength)[part] * 1e12
     nodes = images.nodes(trace.first, trace.last, 3)
     return Order(trace, int(band.wavelength[part][0]), response), euclid.nisp_psf_at(nisp_detector, nodes, mission, 4)
 
 
 def _sources(count: int, seed: int) -> Sources:
-    """Apart from each other, with their first orders on the detector."""
+    """Return sources that do not overlap and whose first orders lie on the detector."""
     sources = scenes.sources(scenes.NISP, seed, galaxies=40, stars=count - count // 2)
     small = np.flatnonzero(scenes.magnitudes(sources, scenes.NISP)[:40] > 21.0)[: count // 2]
     sources = sources.take(np.concatenate([small, 40 + np.arange(count - count // 2)]))
@@ -91,7 +104,7 @@ def _sources(count: int, seed: int) -> Sources:
 
 
 def _spectrum(order: Order) -> Float:
-    """float64[w] f_lambda with two lines, of 20,000 electrons of the order."""
+    """Return f_lambda with two lines, normalised to 20,000 electrons in the order."""
     waves = order.wavelength
     flux = (waves / 15000.0) ** -1.5
     for centre in (13500.0, 16600.0):
@@ -100,9 +113,13 @@ def _spectrum(order: Order) -> Float:
 
 
 def _time_drawing(sources: Sources, order: Order, psf: Psf, spectrum: Float) -> tuple[Float, float]:
-    """(frame, CPU s of it): of a detector's many, whose PSF's transform and frame are shared; the best of two."""
+    """Draw the sources and return the frame and its CPU time (s).
+
+    Many copies are timed, as on a full detector, so that the transform of the PSF and the frame are shared. The shorter
+    of two times counts.
+    """
     source_spectrum, best = spectrum.astype(np.float32), np.inf
-    # Stamps as wide as the images that the others are given.
+    # Use stamps of the same size as the images for slitlessutils.
     settings = replace(draw.settings_for(SURVEY), min_size=_SIDE)
     dispersed = DispersedSources(lambda which: np.tile(source_spectrum, (len(which), 1)), (order,), settings)
     frame = draw.draw(sources, dispersed, psf, _SHAPE, _NOISE)
@@ -115,13 +132,13 @@ def _time_drawing(sources: Sources, order: Order, psf: Psf, spectrum: Float) -> 
 
 
 def _peer_inputs(sources: Sources, order: Order, psf: Psf, spectrum: Float) -> tuple[Float, Float, Float, Float]:
-    """(images through the PSF [n, side, side], their corners, wavelengths, f_lambda [n, v]) for the others."""
+    """Return the inputs of slitlessutils: images with PSF [n, side, side], corners, wavelengths, f_lambda [n, v]."""
     constant_trace = replace(order.trace, x=np.zeros((2, 3)), y=np.zeros((2, 3)))
     undispersed_order = Order(constant_trace, order.first, order.response / float((spectrum * order.response).sum()))
     source_spectrum, stamps, corners = spectrum.astype(np.float32), [], []
     for i in range(len(sources)):
         source = sources.take(np.array([i]))
-        # The frame is no larger: its PSF is that of where the source lies, to a part in a thousand.
+        # A small frame is sufficient: its PSF equals the PSF at the position of the source to 0.1 %.
         corner = np.floor([source.column[0], source.row[0]]).astype(int) - _SIDE // 2
         shifted = replace(source, column=source.column - corner[0], row=source.row - corner[1])
         settings = replace(draw.settings_for(SURVEY), min_size=_SIDE, edge=1e-9, faint=0.0)
@@ -132,7 +149,7 @@ def _peer_inputs(sources: Sources, order: Order, psf: Psf, spectrum: Float) -> t
         corners.append(corner)
     step = (order.trace.last - order.trace.first) / 512.0 / _SUBSAMPLES
     waves = np.arange(order.trace.first + 0.5 * step, order.trace.last, step)
-    # The mean of each step: lines are as bright.
+    # Average f_lambda over each step, so that the lines keep their flux.
     edges = np.concatenate([[0.0], np.cumsum(spectrum)])
     at = [np.interp(waves + side * step - order.first + 0.5, np.arange(len(edges)), edges) for side in (-0.5, 0.5)]
     flux = (at[1] - at[0]) / step
@@ -149,7 +166,7 @@ def _run_peer(
         [python, str(_PEER_SCRIPT), str(configuration), str(input_file), str(output_file)],
         check=True,
         env=environment,
-        # It writes a log where it is started.
+        # slitlessutils writes a log into the current folder.
         cwd=folder,
         capture_output=True,
     )
@@ -158,7 +175,7 @@ def _run_peer(
 
 
 def _differences(sources: Sources, order: Order, ours: Float, theirs: Float) -> Float:
-    """[n, stretches] of light within half a stamp of each trace, of ours."""
+    """Return the relative differences of light [n, intervals] within half a stamp of each trace."""
     differences = []
     for column, row in zip(sources.column.tolist(), sources.row.tolist(), strict=True):
         x, y = order.trace.offsets(column, row, np.array([order.trace.first, order.trace.last]))

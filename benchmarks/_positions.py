@@ -1,6 +1,7 @@
-"""Positions of the PSF on a detector of VIS or NISP: what their number costs, and what error it leaves in a star.
+"""Measure time and errors of the PSF by the number of its positions on a detector of VIS or NISP.
 
-Polynomials through a few positions, as images are drawn, and the nearest of a grid, as it is usual.
+Two methods are compared: polynomials through a few positions, which the renderer uses, and the nearest position of a
+grid, which other programs use.
 """
 
 from __future__ import annotations
@@ -21,16 +22,17 @@ from truesky.numerics import cache
 from truesky.render.camera import detectors
 from truesky.render.psf import euclid, model, sub_bands
 
-# Stars that the errors are of, by a seed of their own.
+# Number of stars to measure the errors, with a separate seed.
 NUM_STARS, _SEED = 24, 5
-# Stars that others' errors are quoted of.
+# Number of stars of the test sample in benchmarks/trade.py.
 NUM_TEST_STARS = 48
-# R2 of a point over that of the smallest galaxies whose shear is measured, 1.25 times as large: a PSF that is wider by
-# a fraction makes the response to shear smaller by so much of it (Paulin-Henriksson et al. 2008; Laureijs et al. 2011).
+# R2 of a point source / R2 of the smallest galaxies whose shear is measured, which are larger by 1.25. A relative
+# error of the PSF's R2, multiplied by this ratio, is the relative error of the response to shear (Paulin-Henriksson et
+# al. 2008; Laureijs et al. 2011).
 R2_RATIO = 1.25**-2
-# Grids that the nearest position is taken of: positions along a side.
+# Numbers of positions along a side of the grids for the nearest position.
 _NEAREST = (1, 2, 3, 4, 6, 10, 15, 20, 30, 40)
-# Of NISP fewer, and where its table is.
+# The same for NISP, and the file of its table.
 _NISP_NEAREST = (1, 2, 3, 4, 6, 10)
 _FILE = Path(model.__file__).parents[1] / "drawing" / "psf_positions_nisp.csv"
 _COLUMNS = (
@@ -48,7 +50,7 @@ colours the
 
 @dataclass(frozen=True)
 class Star:
-    """Its place in half sides from the centre, the shares of its light in the wavelengths, its PSF."""
+    """A star: position (in half sides from the centre), fractions of its light by wavelength, true PSF."""
 
     place: tuple[float, float]
     shares: Float
@@ -56,7 +58,11 @@ class Star:
 
 
 def make_optics(scene: Scene = VIS) -> Callable[[tuple[float, float]], Float]:
-    """The PSF at a place, computed: (x, y) in half sides -> [wavelengths, t, t], in the detector's axes."""
+    """Return a function that computes the PSF at a position.
+
+    Its argument is (x, y) in half sides from the centre of the detector. It returns an array [wavelengths, t, t] along
+    the axes of the detector.
+    """
     mission, sampled = resolve(), _SAMPLINGS[scene.name]
     detector = detectors.detector(scene.name, scenes.SPACE[scene.name][0], mission)
     waves = scenes.scene_psf(scene, 1).planes.wavelength  # type: ignore[union-attr]
@@ -79,7 +85,22 @@ def make_optics(scene: Scene = VIS) -> Callable[[tuple[float, float]], Float]:
 def measure_positions(
     num_stars: int, nearest: tuple[int, ...] = _NEAREST, scene: Scene = VIS
 ) -> list[dict[str, float]]:
-    """A row a way and number of positions: keys as _COLUMNS."""
+    """Measure the errors for both methods and all numbers of positions.
+
+    Parameters
+    ----------
+    num_stars : int
+        Number of stars.
+    nearest : tuple of int, optional
+        Numbers of positions along a side of the grids.
+    scene : Scene, optional
+        The scene, of VIS or NISP.
+
+    Returns
+    -------
+    list of dict
+        One row per method and number of positions; the keys are in _COLUMNS.
+    """
     psf_at, rng = make_optics(scene), np.random.default_rng(_SEED)
     psf_at((0.0, 0.0))
     start = time.process_time()
@@ -101,7 +122,7 @@ def measure_positions(
                 for sample_star in star_sample
             ]
         )
-        # The wings are the centre's everywhere: a position has the core alone.
+        # Each position stores only the core of the PSF, because the wings of the centre are used everywhere.
         planes = side**2 * len(psf.wavelength)
         megabytes = (planes * centre[0].size * psf.images.itemsize + psf.images.nbytes) / 1e6
         out.append(_table_row(side**2, True, error_values, out[0]["seconds"] + planes * plane_s, megabytes))
@@ -109,7 +130,7 @@ def measure_positions(
 
 
 def table_text(table_rows: list[dict[str, float]], scene: Scene = VIS) -> str:
-    """The table of positions."""
+    """Return the table of positions as text."""
     header = _TABLE_HEADER.format(camera=scene.name.upper(), writer=_WRITERS[scene.name])
     lines = [
         ",".join(f"{row[name]:.2g}" if name not in _INTEGER_COLUMNS else f"{row[name]:.0f}" for name in row)
@@ -118,21 +139,37 @@ def table_text(table_rows: list[dict[str, float]], scene: Scene = VIS) -> str:
     return "\n".join([header + _COLUMNS, *lines]) + "\n"
 
 
-# How each is sampled, and which command writes its table.
+# Sampling of the PSF of each camera, and the command that writes its table.
 _SAMPLINGS = {"vis": euclid.VIS, "nisp": euclid.NISP}
 _WRITERS = {"vis": "python -m benchmarks.trade\n# --positions", "nisp": "python -m benchmarks._positions"}
 _INTEGER_COLUMNS = ("positions", "nearest", "megabytes")
 
 
 def draw_star(psf_at: Callable[[tuple[float, float]], Float], rng: np.random.Generator) -> Star:
+    """Draw a star at a random position with random colours."""
     place = rng.uniform(-1, 1, 2).tolist()
     photons = scenes.colours(1, rng)[0]
     return Star((place[0], place[1]), photons / photons.sum(), psf_at((place[0], place[1])))
 
 
 def star_errors(planes: Float, star: Star, scene: Scene = VIS) -> tuple[float, float, float, float]:
-    """Of a star: |dF / F| in 1", the position's error in pixels, |dR2 / R2| and the ellipticity's error."""
-    # Neighbouring sub-bands may have one plane.
+    """Return the errors of a star.
+
+    Parameters
+    ----------
+    planes : float array, shape (wavelengths, t, t)
+        PSF to test.
+    star : Star
+        The star with its true PSF.
+    scene : Scene, optional
+        The scene.
+
+    Returns
+    -------
+    tuple of float
+        |dF / F| in 1", error of the position in pixels, |dR2 / R2|, and error of the ellipticity.
+    """
+    # Neighbouring sub-bands may share a plane.
     shares = star.shares.reshape(len(planes), -1).sum(axis=1)
     measured = _moments(np.tensordot(shares, planes, 1), scene)
     truth = _moments(np.tensordot(star.shares, star.truth, 1), scene)
@@ -148,7 +185,22 @@ def star_errors(planes: Float, star: Star, scene: Scene = VIS) -> tuple[float, f
 def largest_errors(
     seed: int, n: int, psf_variants: Sequence[tuple[int, int]]
 ) -> dict[tuple[int, int], dict[str, float]]:
-    """By (positions, colours) of a PSF, the largest errors of n stars: flux, shape, position of an accuracy."""
+    """Return the largest errors of several variants of the PSF.
+
+    Parameters
+    ----------
+    seed : int
+        Seed of the stars.
+    n : int
+        Number of stars.
+    psf_variants : sequence of (int, int)
+        Numbers of positions and of colours of each variant.
+
+    Returns
+    -------
+    dict of (int, int) to dict
+        Largest errors `flux`, `shape` and `position` (in the units of an accuracy) by variant.
+    """
     psf_at, rng = make_optics(), np.random.default_rng(seed)
     centre, star_sample = psf_at((0.0, 0.0)), [draw_star(psf_at, rng) for _ in range(n)]
     out = {}
@@ -169,7 +221,7 @@ def _moments(image: Float, scene: Scene) -> Float:
 
 
 def drift(psf: model.Planes, star: Star) -> Float:
-    """What the polynomials add to the centre's planes: [wavelengths, t, t]."""
+    """Return the sum of polynomials that is added to the planes of the centre at a star: [wavelengths, t, t]."""
     out = []
     for wavelength in psf.wavelength:
         redder = wavelength - psf.wavelength.mean()
@@ -184,7 +236,7 @@ def _nearest_position(grid_centres: Float, place: tuple[float, float]) -> tuple[
 
 
 def _compute_planes(positions: int, scene: Scene) -> tuple[float, model.Planes]:
-    """CPU s to compute the planes, and they."""
+    """Return the CPU time (s) to compute the planes, and the planes."""
     with cache.use_temporary_dir():
         start = time.process_time()
         planes = scenes.scene_psf(scene, positions).planes

@@ -1,4 +1,4 @@
-"""galsim's own drawing at its tightest thresholds, kept in the cache: slow, and the same every time."""
+"""Reference images drawn by galsim with its tightest thresholds. They are slow to make and are stored in the cache."""
 
 from __future__ import annotations
 
@@ -14,18 +14,32 @@ from truesky.render.psf import model
 from truesky.render.sources import galaxy_shapes
 from truesky.render.sources.source_list import Sources
 
-# Thresholds of folding and of the largest frequency.
+# Thresholds of folding and of the largest frequency (folding_threshold and maxk_threshold of galsim).
 ACCURACY = 1e-4
 
 
 def reference_image(
     source: Sources, psf: model.Psf, side: int, maxk_threshold: float = ACCURACY, folding_threshold: float = ACCURACY
 ) -> Float | None:
-    """The only source, through a PSF that is its own, on a frame [side, side]; None where memory does not suffice.
+    """Draw a single source by galsim.
 
-    highest, folding : thresholds of the largest frequency, and of what folds
+    Parameters
+    ----------
+    source : Sources
+        The source.
+    psf : Psf
+        PSF of this source.
+    side : int
+        Side of the image in pixels.
+    maxk_threshold, folding_threshold : float, optional
+        Thresholds of galsim for the largest frequency and for folding.
+
+    Returns
+    -------
+    float array, shape (side, side), or None
+        Expected electrons; None if the memory is not sufficient.
     """
-    # A point has no form.
+    # A point source has no shape.
     shapes = source.shapes.take(source.shape[source.shape >= 0])
     source_values = [
         source.column,
@@ -57,11 +71,28 @@ def reference_image(
 
 
 def image_by_series(source: Sources, psf: model.Psf, side: int) -> Float:
-    """The same through planes, all but their Fourier series between samples: moved, averaged over pixels, sampled.
+    """Draw a single source by the Fourier series of its PSF: shifted, averaged over pixels and sampled.
 
-    A galaxy's own transform is galsim's, at its tightest. galsim knows a PSF between its samples by Lanczos' kernel of
-    31 of these, ten pixels away from which it is wrong by 6e-7 of the flux: a sigma of a star of 15 mag, and 4e-5 of
-    its R2. A galaxy that is not small beside the frame folds: for those `image` is the better one.
+    Parameters
+    ----------
+    source : Sources
+        The source.
+    psf : Psf
+        PSF of this source, with planes.
+    side : int
+        Side of the image in pixels.
+
+    Returns
+    -------
+    float array, shape (side, side)
+        Expected electrons.
+
+    Notes
+    -----
+    galsim gives the transform of a galaxy, with its tightest thresholds. `reference_image` uses galsim also for the
+    PSF, which it interpolates between samples by a Lanczos kernel of 31 samples. Ten pixels from a star this leaves an
+    error of 6e-7 of its flux, which is 1 sigma for a star of 15 mag and 4e-5 of its R2. A galaxy that is not small
+    compared with the frame folds here; `reference_image` is better for such galaxies.
     """
     assert psf.planes is not None
     plane, samples = psf.planes.images[0].astype(float), psf.planes.samples

@@ -1,7 +1,7 @@
-"""Scenes that drawing is measured on: galaxies and stars of a VIS and of an LSST detector.
+"""Scenes to measure drawing: galaxies and stars on a VIS, NISP or LSST detector.
 
-4,701 galaxies (m 17 - 26, dN/dm ~ 10^0.3m) and 300 stars on a VIS detector, each with its own colour and place;
-18,223 galaxies and 1,160 stars on an LSST detector.
+The VIS scene has 4,701 galaxies (magnitudes 17 to 26, dN/dm ~ 10^(0.3 m)) and 300 stars, each with its own colour and
+position. The LSST scene has 18,223 galaxies and 1,160 stars.
 """
 
 from __future__ import annotations
@@ -20,19 +20,37 @@ from truesky.render.psf import euclid, ground, model, sub_bands
 from truesky.render.sources.galaxy_shapes import Shapes
 from truesky.render.sources.source_list import Sources
 
-# Edges of the magnitude bins that errors are told by.
+# Edges of the magnitude bins of errors.
 BINS = (17.0, 20.0, 22.0, 23.0, 24.0, 25.0, 26.0)
 # Edges of the layers of magnitude of a stratified sample.
 LAYERS = (14.5, 16.0, 18.0, 20.0, 22.0, 24.0, 26.0)
-# Of the LSST scene: FWHM in arcsec; of peers that have nothing but a Moffat profile, its exponent.
+# FWHM of the seeing of the LSST scene in arcsec, and exponent of the Moffat profile for programs that require one.
 SEEING, BETA = 0.7, 3.0
-# Its air, at an airmass of 1.2.
+# Atmosphere of the LSST scene at an airmass of 1.2.
 _AIR = ground.Air(SEEING, (0.01, 0.005), slope=-0.3, tan_zenith_distance=0.66, zenith=0.5, height=2663.0)
 
 
 @dataclass(frozen=True)
 class Scene:
-    """nx, ny, pixel scale in arcsec, exposure in s, magnitude of 1 e-/s, noise in e-, numbers of galaxies and stars."""
+    """A detector with its number of sources.
+
+    Attributes
+    ----------
+    name : str
+        Name of the scene.
+    nx, ny : int
+        Number of pixels.
+    scale : float
+        Pixel scale in arcsec.
+    exposure : float
+        Exposure time in seconds.
+    zero_point : float
+        Magnitude of a source of 1 electron per second.
+    noise : float
+        Noise of a sky pixel in electrons.
+    galaxies, stars : int
+        Numbers of sources.
+    """
 
     name: str
     nx: int
@@ -46,15 +64,30 @@ class Scene:
 
 
 VIS = Scene("vis", 4096, 4132, 0.1, 565.0, 25.7, 12.45, 4701, 300)
-# One signal of a photometric ramp in Y.
+# One signal frame of a photometric ramp in Y.
 NISP = Scene("nisp", 2040, 2040, 0.3, 87.24, 25.0, 12.0, 4701, 300)
-# Of cameras in space: what its PSF is of.
+# Detector, passband and function of the PSF of cameras in space.
 SPACE = {"vis": ("3-4", "euclid_vis", euclid.vis_psf), "nisp": ("DET23", "euclid_y", euclid.nisp_psf)}
 LSST = Scene("lsst", 4096, 4004, 0.2, 30.0, 28.17, 38.3, 18223, 1160)
 
 
 def scene_psf(scene: Scene, positions: int = 9, colours: int = sub_bands.N_SUB_BANDS) -> model.Psf:
-    """The scene's PSF."""
+    """Return the PSF of a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene.
+    positions : int, optional
+        Number of positions on the detector at which the PSF is computed.
+    colours : int, optional
+        Number of wavelengths.
+
+    Returns
+    -------
+    Psf
+        The PSF.
+    """
     mission = resolve()
     if scene.name == "lsst":
         detector = detectors.detector("lsstcam", "R22_S11", mission)
@@ -67,7 +100,22 @@ def scene_psf(scene: Scene, positions: int = 9, colours: int = sub_bands.N_SUB_B
 
 
 def sources(scene: Scene, seed: int, galaxies: int | None = None, stars: int | None = None) -> Sources:
-    """Galaxies, then stars, drawn from the scene's counts."""
+    """Draw galaxies and then stars from the counts of a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene.
+    seed : int
+        Seed of the random numbers.
+    galaxies, stars : int, optional
+        Numbers of sources. The default is the numbers of the scene.
+
+    Returns
+    -------
+    Sources
+        The sources.
+    """
     rng = np.random.default_rng(seed)
     n, m = galaxies if galaxies is not None else scene.galaxies, stars if stars is not None else scene.stars
     mag = np.concatenate([_magnitudes(rng, 17.0, 26.0, 0.3, n), _magnitudes(rng, 14.0, 25.5, 0.15, m)])
@@ -102,7 +150,7 @@ def sources(scene: Scene, seed: int, galaxies: int | None = None, stars: int | N
 
 
 def colours(n: int, rng: np.random.Generator) -> Float:
-    """Photons in each of the PSF's wavelengths, [n, PARTS]: power laws."""
+    """Return the relative numbers of photons of n sources in the sub-bands of the PSF, by power laws."""
     waves = np.linspace(-0.25, 0.25, sub_bands.N_SUB_BANDS)
     return np.asarray(np.exp(np.outer(rng.normal(0.5, 1.5, n), waves)))
 
@@ -113,17 +161,32 @@ def _magnitudes(rng: np.random.Generator, bright: float, faint: float, slope: fl
 
 
 def magnitudes(source_list: Sources, scene: Scene) -> Float:
-    """AB magnitudes of the sources."""
+    """Return the AB magnitudes of sources."""
     return np.asarray(scene.zero_point - 2.5 * np.log10(source_list.electrons / scene.exposure))
 
 
 def magnitude_bins(source_list: Sources, scene: Scene) -> Int:
-    """Magnitude bin of each source."""
+    """Return the index of the magnitude bin of each source."""
     return np.clip(np.searchsorted(BINS, magnitudes(source_list, scene)) - 1, 0, len(BINS) - 2)
 
 
 def sample(scene: Scene, seed: int, n: int) -> Sources:
-    """n galaxies, as many in every magnitude bin."""
+    """Draw a sample of n galaxies, with equal numbers in all magnitude bins.
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene.
+    seed : int
+        Seed of the random numbers.
+    n : int
+        Number of galaxies, rounded up to a multiple of the number of bins.
+
+    Returns
+    -------
+    Sources
+        The galaxies.
+    """
     candidates = sources(scene, seed, galaxies=max(60 * n, 3000), stars=0)
     bins, rng = magnitude_bins(candidates, scene), np.random.default_rng(seed)
     each = -(-n // (len(BINS) - 1))
@@ -132,13 +195,28 @@ def sample(scene: Scene, seed: int, n: int) -> Sources:
 
 
 def stratified_sample(scene: Scene, seed: int, each: int) -> Sources:
-    """Galaxies and stars, `each` of either in every one of LAYERS: what is bright, or faint, is among them."""
+    """Draw a sample with equal numbers of galaxies and stars in each layer of magnitude, from bright to faint.
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene.
+    seed : int
+        Seed of the random numbers.
+    each : int
+        Number of galaxies, and of stars, per layer.
+
+    Returns
+    -------
+    Sources
+        The sources.
+    """
     layers, n = len(LAYERS) - 1, each * (len(LAYERS) - 1)
     candidates, rng = sources(scene, seed, galaxies=n, stars=n), np.random.default_rng([seed, 1])
     low, high = np.array(LAYERS[:-1]), np.array(LAYERS[1:])
     layer = np.tile(np.arange(layers), 2 * each)
     mag = low[layer] + (high - low)[layer] * rng.random(2 * n)
-    # The size goes with the magnitude.
+    # Scale the sizes by the change of magnitude, because fainter galaxies are smaller.
     size = 10 ** (-0.14 * (mag - magnitudes(candidates, scene)))[:n]
     shapes = candidates.shapes
     shapes = replace(shapes, bulge_radius=shapes.bulge_radius * size, disk_radius=shapes.disk_radius * size)
@@ -148,7 +226,26 @@ def stratified_sample(scene: Scene, seed: int, each: int) -> Sources:
 def draw_sources(
     source_list: Sources, psf: model.Psf, scene: Scene, settings: Settings, side: int | None = None
 ) -> Float:
-    """The whole of drawing, as for an exposure; `side`: on a small frame instead of the scene's."""
+    """Draw sources as in an exposure.
+
+    Parameters
+    ----------
+    source_list : Sources
+        The sources.
+    psf : Psf
+        The PSF.
+    scene : Scene
+        The scene.
+    settings : Settings
+        Settings of drawing.
+    side : int, optional
+        Side of the image in pixels. The default is the frame of the scene.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Expected electrons.
+    """
     sizes = stamp_sizes.stamp_sizes(
         source_list.electrons, source_list.shape, source_list.shapes, psf, scene.noise, settings
     )
@@ -158,7 +255,22 @@ def draw_sources(
 
 
 def psf_of_source(psf: model.Psf, source_list: Sources, i: int) -> model.Psf:
-    """The PSF of source i everywhere on a frame, and nothing beyond its planes."""
+    """Return a PSF that is the same everywhere, equal to the PSF of source i and limited to its planes.
+
+    Parameters
+    ----------
+    psf : Psf
+        PSF of the detector.
+    source_list : Sources
+        The sources.
+    i : int
+        Index of the source.
+
+    Returns
+    -------
+    Psf
+        PSF of this source.
+    """
     planes = psf.planes
     if planes is None:
         return psf
@@ -171,7 +283,22 @@ def psf_of_source(psf: model.Psf, source_list: Sources, i: int) -> model.Psf:
 
 
 def centred_source(source_list: Sources, i: int, side: int) -> Sources:
-    """Source i alone, its middle pixel on the middle of a frame; of `own`'s PSF."""
+    """Return source i, shifted by whole pixels to the middle of a frame, without colours.
+
+    Parameters
+    ----------
+    source_list : Sources
+        The sources.
+    i : int
+        Index of the source.
+    side : int
+        Side of the frame in pixels.
+
+    Returns
+    -------
+    Sources
+        The source, to be drawn with the PSF of `psf_of_source`.
+    """
     source = source_list.take(np.array([i]))
     shift = [side // 2 - np.rint(position) for position in (source.column, source.row)]
     return replace(source, column=source.column + shift[0], row=source.row + shift[1], photons=None)

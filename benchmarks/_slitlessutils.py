@@ -1,10 +1,10 @@
-"""Spectra of images as slitlessutils disperses them, in a Python that has it: `_peers_slitless` starts this.
+"""Disperse images by slitlessutils. `_peers_slitless` runs this script with a Python that has slitlessutils.
 
-python benchmarks/_slitlessutils.py CONFIGURATION INPUT OUTPUT
+Usage: python benchmarks/_slitlessutils.py CONFIGURATION INPUT OUTPUT
 
-Its own classes read grismconf's files, invert the trace, clip each pixel of an image that is seen through the PSF at
-each wavelength against the detector's, and weigh with the sensitivity: the loop of its modules `tabulate` and
-`simulate`, without the files of an instrument that these would download.
+Classes of slitlessutils read the files of grismconf, invert the trace, clip each pixel of an image (convolved with the
+PSF) at each wavelength against the pixels of the detector, and multiply by the sensitivity. This is the loop of its
+modules `tabulate` and `simulate`, without the instrument files that these would download.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 
 
 def _no_network(*_args: object, **_options: object) -> None:
-    raise OSError("no network: a package asks for news of its own")
+    raise OSError("network access is disabled: slitlessutils checks for new versions of its files")
 
 
 def _detector(configuration: Path, shape: tuple[int, int]) -> object:
@@ -35,11 +35,21 @@ def _detector(configuration: Path, shape: tuple[int, int]) -> object:
 
 
 def main(configuration: Path, input_file: Path, output_file: Path) -> None:
-    """Reads image, corner, wavelength and f_lambda; writes the frame, and CPU s."""
+    """Disperse the images of a file.
+
+    Parameters
+    ----------
+    configuration : Path
+        Configuration of the grism in the format of grismconf.
+    input_file : Path
+        File with images, their corners, wavelengths, f_lambda, and the shape of the frame.
+    output_file : Path
+        File for the frame and the CPU time (s).
+    """
     urllib.request.urlopen = _no_network  # type: ignore[assignment]
     with np.load(input_file) as read:
         images, corners, waves, spectra, shape = (read[n] for n in ("images", "corners", "waves", "spectra", "shape"))
-    # A made fixture of reference files, empty: none of an instrument is wanted.
+    # Provide an empty set of reference files, because no instrument files are needed.
     fixture = Path.home() / ".slitlessutils" / "1.0.0"
     fixture.mkdir(parents=True, exist_ok=True)
     (fixture / "version.json").write_text('{"version": "1.0.0", "date": "1970-01-01"}')
@@ -49,7 +59,7 @@ def main(configuration: Path, input_file: Path, output_file: Path) -> None:
     for image, (first_column, first_row), spectrum in zip(images, corners, spectra, strict=True):
         detected = order.sensitivity(waves) * spectrum * step
         for row, column in np.argwhere(image > 1e-6 * image.sum()).tolist():
-            # Corners of a pixel, whose places count from 1.
+            # Corners of a pixel; slitlessutils counts positions from 1.
             x = first_column + column + 1 + np.array([-0.5, -0.5, 0.5, 0.5])
             y = first_row + row + 1 + np.array([-0.5, 0.5, 0.5, -0.5])
             to_x, to_y, wave, area = detector.drizzle(x, y, "+1", waves)  # type: ignore[attr-defined]

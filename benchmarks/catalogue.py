@@ -1,10 +1,10 @@
-"""How fast the universe is drawn: python -m benchmarks.catalogue [--quick] [--json FILE].
+"""Measure the speed of the galaxy catalogue: python -m benchmarks.catalogue [--quick] [--json FILE].
 
-One order-5 cell (3.4 deg2) to I_E < 26 at the settings that a request has by default, halos and galaxies, drawn and
-written as Parquet as the job does it: CPU seconds of one core; the box and its lensing are in the cache.  The job
-itself, submitted to Spark with one and with two cores, for a circle where four cells meet.  The peer is SkyPy:
-positions and magnitudes in three bands of galaxies to the same limit, theirs by a Schechter function at random places,
-ours by halos and satellites in the box.  Without it the benchmark ends with an error.
+The halos and galaxies of one order-5 cell (3.4 deg2) to I_E < 26 are drawn with default settings and written as
+Parquet, as in the job. Times are CPU seconds of one core, with the box and its lensing in the cache. The job itself is
+timed with Spark on one and two cores, for a circle where four cells meet. The comparison with SkyPy uses positions and
+magnitudes in three bands of galaxies to the same limit: SkyPy draws a Schechter function at random positions, truesky
+uses halos and satellites in the box. Without SkyPy the benchmark ends with an error.
 """
 
 from __future__ import annotations
@@ -41,33 +41,48 @@ from truesky.running.task_metrics import peak_memory_gb, reset_peak_memory
 ROOT = Path(__file__).resolve().parents[1]
 SEED = 7
 CELL = 9000
-# Serrano et al. 2024: galaxies of the simulated survey.
+# Number of galaxies in the simulated survey of Serrano et al. 2024.
 SURVEY_GALAXIES = 922e6
-# Four order-5 cells meet here, and share such a circle evenly.
+# Centre (deg) and radii (deg) of a circle where four order-5 cells meet, so that they share it evenly.
 CENTRE, RADIUS, QUICK_RADIUS = (53.4375, -27.279613), 0.75, 0.05
 NOTES = {
     "cell_rows": "galaxies of an order-5 cell to I_E < 26",
     "cell_s": "CPU, both tables, drawn and written (target 45)",
-    "cell_halo_s": "of that the halos",
-    "cell_peak_gb": "resident (target 1.5)",
-    "speedup_2_cores": "wall of the submitted job, local[1] / local[2] (target 1.8); a busy machine has no two cores",
-    "serial_share": "of local[1] that is no task's, without the start of Java",
-    "speedup_from_shares": "what that share leaves of two free cores",
-    "photometry_per_s_core": "galaxies to I_E < 26 with positions and magnitudes in I_E, Y and H",
-    "skypy_photometry_per_s_core": "SkyPy, the same: Schechter function, k-correct's templates, random places",
-    "photometry_vs_skypy": "ours / SkyPy's, the same area at once: it integrates bands at 1000 redshifts, once for all",
-    "projected_core_hours_922m": "the simulated survey (target 12)",
+    "cell_halo_s": "part of cell_s for halos",
+    "cell_peak_gb": "peak resident memory (target 1.5)",
+    "speedup_2_cores": "wall time of the job, local[1] / local[2] (target 1.8; only valid on an idle machine)",
+    "serial_share": "share of local[1] outside tasks, without the start of Java",
+    "speedup_from_shares": "speed-up by two free cores that follows from this share",
+    "photometry_per_s_core": "galaxies to I_E < 26 with positions and magnitudes in I_E, Y and H per CPU second",
+    "skypy_photometry_per_s_core": "the same for SkyPy: Schechter function, templates of k-correct, random positions",
+    "photometry_vs_skypy": "ours / SkyPy for the same area; SkyPy integrates bands at 1000 redshifts once",
+    "projected_core_hours_922m": "core-hours of the simulated survey with 922 million galaxies (target 12)",
 }
 
 
 def universe_settings(quick: bool) -> dict[str, object]:
-    """What a request says of its universe where it says nothing."""
+    """Return the default settings of the universe in a request; `quick` makes box and lensing maps smaller."""
     small = {"box_cells": 192, "lensing_nside": 64} if quick else {}
     return {"seed": SEED, **asdict(Universe()), **small}
 
 
 def make_cell(cell: int, count: int, settings: dict[str, object]) -> dict[str, float]:
-    """Both tables of the first `count` generation cells of an order-5 cell, as a task makes them."""
+    """Draw and write halos and galaxies as a task does.
+
+    Parameters
+    ----------
+    cell : int
+        Number of the order-5 cell.
+    count : int
+        Number of its generation cells to draw.
+    settings : dict
+        Settings of the universe.
+
+    Returns
+    -------
+    dict of str to float
+        The figures.
+    """
     task_facts = {**settings, "generation_cells": list(range(cell << 6, (cell << 6) + count))}
     build_galaxies._universe(task_facts, None)
     reset_peak_memory()
@@ -91,7 +106,10 @@ def make_cell(cell: int, count: int, settings: dict[str, object]) -> dict[str, f
 
 
 def time_job(cores: int, quick: bool) -> tuple[float, float]:
-    """Wall seconds of table `galaxies` under local[cores], Java and its workers running already, and of its tasks."""
+    """Return the wall time (s) of the table `galaxies` with Spark on this number of cores, and the sum of its tasks.
+
+    The start of Java and of the workers is not included.
+    """
     ra, dec = CENTRE
     settings = universe_settings(quick)
     with tempfile.TemporaryDirectory() as folder:
@@ -106,7 +124,7 @@ def time_job(cores: int, quick: bool) -> tuple[float, float]:
         lake = Path(folder) / "lake"
         command = [spark, "--master", f"local[{cores}]", job, "--lake", lake, "--request", request]
         subprocess.run([str(word) for word in command], check=True, capture_output=True, text=True)
-        # Halos were made first, by the same workers.
+        # The same workers have made the halos before, so they are warm.
         (log,) = layout.runs_folder(layout.resolve_lake(lake)).glob("*-galaxies-*.jsonl")
         lines = [json.loads(line) for line in log.read_text().splitlines()]
     tasks = sum(line["seconds"] for line in lines if "part" in line)
@@ -114,7 +132,7 @@ def time_job(cores: int, quick: bool) -> tuple[float, float]:
 
 
 def two_core_speedup(quick: bool, repeats: int) -> dict[str, float]:
-    """The job with one core and with two, each the fastest of several turns taken alternately."""
+    """Compare the job on one and on two cores; each time is the shortest of several alternating runs."""
     turns = [(time_job(1, quick), time_job(2, quick)) for _ in range(repeats)]
     single_core_s, tasks = min(single_core for single_core, _ in turns)
     double_core_s = min(double_core for _, double_core in turns)[0]
@@ -127,7 +145,7 @@ def two_core_speedup(quick: bool, repeats: int) -> dict[str, float]:
 
 
 def photometry(count: int, settings: dict[str, object]) -> float:
-    """Ours: galaxies a second with halo, position, velocity, redshift, spectrum and magnitudes in three bands."""
+    """Return galaxies per CPU second with halo, position, velocity, redshift, spectrum and magnitudes in 3 bands."""
     universe = build_galaxies._universe(settings, None)
     drawn = population.CellCache(universe.population)
     library, dustiest = templates.galaxy_library(), float(universe.selection.ebv[-1])
@@ -145,7 +163,7 @@ def photometry(count: int, settings: dict[str, object]) -> float:
 
 
 def run(quick: bool, repeats: int) -> dict[str, float]:
-    """All figures."""
+    """Return all figures."""
     settings, count = universe_settings(quick), 4 if quick else 64
     turns = [make_cell(CELL, count, settings) for _ in range(repeats)]
     figures = {"generation_cells": count, **min(turns, key=lambda turn: turn["cell_s"])}
@@ -162,6 +180,7 @@ def run(quick: bool, repeats: int) -> dict[str, float]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
+    """Run the benchmark and print the figures."""
     options = report.options("catalogue", __doc__ or "", argv)
     report.print_and_write("catalogue", 1, run(options.quick, 1), NOTES, options.json)
     return 0

@@ -1,10 +1,11 @@
-"""Reference images of charge transfer inefficiency, made by arCTIc: what the tests hold ours against.
+"""Make reference images of charge transfer inefficiency by arCTIc for the tests.
 
-    python benchmarks/cti_reference.py [FILE]
+Usage: python benchmarks/cti_reference.py [FILE]
 
-Wants an environment of its own: arcticpy 2.6 needs numpy < 2 and the GNU Scientific Library. Every transfer is followed
-(express = 0), traps are empty when the first packet comes. Images: galaxies on a sky of 130 electrons, without and with
-cosmic rays; 2086 rows, 2066 of them pixels. Losses are kept in thousandths of an electron.
+The script requires a separate environment: arcticpy 2.6 needs NumPy < 2 and the GNU Scientific Library. Every transfer
+is simulated (express = 0), and the traps are empty at the first packet. The images have galaxies on a sky of 130
+electrons, without and with cosmic rays, and 2086 rows, 2066 of them pixels. Losses are stored in units of 0.001
+electrons.
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ FILE = (
     Path(__file__).resolve().parents[1] / "tests" / "truesky" / "render" / "effects" / "readout" / "cti_reference.npz"
 )
 ROWS, OVERSCAN, COLUMNS, SKY = 2086, 20, 32, 130.0
-# Israel et al. 2015, end of the mission; well of the arCTIc examples for Euclid.
+# Traps at the end of the mission (Israel et al. 2015); full well and its power from the arCTIc examples for Euclid.
 DENSITY, RELEASE, FULL_WELL, POWER = (0.02, 0.03, 0.95), (0.8, 3.5, 20.0), 2e5, 0.58
 UNIT = 0.001
 
 
 def galaxies(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """An image [ROWS, COLUMNS] of whole electrons, and (row, column, electrons, scale length) of its galaxies."""
+    """Return an image [ROWS, COLUMNS] in whole electrons, and row, column, electrons and scale length of galaxies."""
     pixels = ROWS - OVERSCAN
     y, x = np.mgrid[:ROWS, :COLUMNS].astype(float)
     expected = np.full((ROWS, COLUMNS), SKY)
@@ -45,7 +46,7 @@ def galaxies(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 
 def cosmic_rays(rng: np.random.Generator) -> np.ndarray:
-    """Short tracks, 2 % of the pixels, [ROWS, COLUMNS]."""
+    """Return an image [ROWS, COLUMNS] of short tracks, which cover 2 % of the pixels."""
     pixels = ROWS - OVERSCAN
     hits = np.zeros((ROWS, COLUMNS), np.int32)
     while (hits > 0).mean() < 0.02:
@@ -63,10 +64,11 @@ def cosmic_rays(rng: np.random.Generator) -> np.ndarray:
 
 
 def main(file: Path) -> None:
+    """Write the reference images to a file, if arcticpy is installed."""
     try:
         import arcticpy
     except ImportError:
-        print("cti_reference: left out, this environment has no arcticpy")
+        print("cti_reference: skipped, because arcticpy is not installed")
         return
     rng = np.random.default_rng(11)
     image, table = galaxies(rng)
@@ -85,7 +87,7 @@ def main(file: Path) -> None:
         )
         change = np.rint((out - frame) / UNIT)
         if np.abs(change).max() > np.iinfo(np.int32).max:
-            raise SystemExit(f"{name}: losses of {np.abs(change).max() * UNIT:.0f} electrons do not fit")
+            raise SystemExit(f"{name}: losses of {np.abs(change).max() * UNIT:.0f} electrons exceed 32-bit integers")
         arrays[name] = change.astype(np.int32)
         print(f"{name}: rms of the change {np.sqrt(((out - frame) ** 2).mean()):.2f} electrons")
     np.savez_compressed(file, **arrays)

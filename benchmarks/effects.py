@@ -1,7 +1,7 @@
-"""Effects of VIS: what each costs, what it changes, and whether a nominal scene asks for it.
+"""Measure the effects of VIS: time, margin and change of pixels, and the change of magnitude, size and ellipticity.
 
-One full detector with a made-up sky of points and squares; each effect acts on what those before it left. And the same
-with a standard set of sources: what each effect does to their magnitude, size and ellipticity.
+The scene is a full detector with an artificial sky of points and squares. Each effect acts on the result of the
+effects before it. Magnitude, size and ellipticity are measured on a standard set of stars and galaxies.
 """
 
 from __future__ import annotations
@@ -31,18 +31,19 @@ from truesky.render.psf import euclid, model, sub_bands
 from truesky.render.sources.galaxy_shapes import Shapes
 from truesky.render.sources.source_list import Sources
 
-# Sources of the scene, and the brightest light, electrons.
+# Numbers of squares and of points in the scene, and electrons of the brightest source.
 _SOURCES, _STARS, _LIGHT = 30_000, 200, 1e9
 _EXPOSURE, _SKY, _ZERO_POINT = 560.53, 0.25, 25.93
-# The standard set: magnitudes, half-light radius (of an exponential disc), arcsec; pixels apart, and of a stamp.
+# Standard set: magnitudes of stars and galaxies, half-light radius of the exponential disc (arcsec); spacing and
+# side of a stamp (pixels).
 _STAR, _GALAXY, _RADIUS = 19.0, 22.5, 0.3
 _SPACING, _STAMP = 64, 64
-# Radius that fluxes are measured in, arcsec.
+# Radius of the aperture in arcsec.
 APERTURE = 1.3
 
 
 def draw_light(ny: int, nx: int) -> Frame:
-    """Expected electrons of points and of squares of seven pixels."""
+    """Return a frame of expected electrons with points and squares of 7 x 7 pixels."""
     rng = np.random.default_rng(1)
     frame = np.zeros((ny, nx))
     share = ny * nx / (_scenes.VIS.nx * _scenes.VIS.ny)
@@ -55,14 +56,17 @@ def draw_light(ny: int, nx: int) -> Frame:
 
 
 def measure_effects(side: int | None, repeats: int) -> dict[str, float]:
-    """Of each effect: CPU s of a detector, margin, rms and largest change of a pixel over its noise."""
+    """Measure each effect: CPU time (s) per detector, margin, rms and largest change of a pixel in units of its noise.
+
+    `side` is the side of the detector in pixels (None for its real size); the shortest time of `repeats` counts.
+    """
     mission = resolve()
     detector = detectors.detector("vis", "3-4", mission)
     if side is not None:
         detector = type(detector)("3-4", "vis", side, side, detector.x, detector.y, 0.0, detector.pixel_scale)
     frame = draw_light(detector.ny, detector.nx)
     scene = Scene(mission, "vis", _EXPOSURE, _SKY, float(frame.max()), detector)
-    # The light is where its ghost falls into the middle.
+    # Place the bright source so that its ghost falls into the middle of the detector.
     _, _, across, *_ = ghosts.parameters(scene)
     place = (0.5 * n - shift for n, shift in zip((detector.nx, detector.ny), across, strict=True))
     lights = Lights(*(np.array([at]) for at in (*place, _LIGHT)))
@@ -73,7 +77,7 @@ def measure_effects(side: int | None, repeats: int) -> dict[str, float]:
     assembled = quadrants.assemble(frame, *quadrants.overscan_sizes(scene))
     out["all_s"] = sum(value for key, value in out.items() if key.endswith("_s"))
     out["mean_adu"] = float(assembled.mean())
-    # What other images have besides, each on the light, or on nothing where none falls.
+    # Effects of other image types: effects of flats act on the light, effects of pumping images on an empty frame.
     light_alone = draw_light(detector.ny, detector.nx)
     for effect in vis.FLAT:
         if effect not in vis.SKY:
@@ -86,7 +90,7 @@ def measure_effects(side: int | None, repeats: int) -> dict[str, float]:
 
 
 def _measure_effect(effect: Effect, frame: Frame, scene: Scene, repeats: int, out: dict[str, float]) -> Frame:
-    """Adds an effect's figures to `out`; what it leaves."""
+    """Apply an effect, add its figures to `out`, and return the new frame."""
     parameters = effect.parameters(scene)
     result = effect.apply(frame, *parameters, rng=stream(1, effect.name))
     apply_effect = partial(effect.apply, frame, *parameters, rng=stream(1, effect.name))
@@ -98,13 +102,13 @@ def _measure_effect(effect: Effect, frame: Frame, scene: Scene, repeats: int, ou
 
 
 def _add_change(name: str, change: Frame, scene: Scene, out: dict[str, float]) -> None:
-    """rms and largest change of a pixel, of its noise."""
+    """Add the rms and largest change of a pixel, in units of its noise, to `out`."""
     out[f"{name}_rms_sigma"] = float(np.sqrt(np.mean(change**2))) / scene.pixel_noise
     out[f"{name}_largest_sigma"] = float(np.abs(change).max()) / scene.pixel_noise
 
 
 def standard_sources(detector: Detector, spacing: int) -> Sources:
-    """The standard set, in turns on a lattice: stars of _STAR, round exponential galaxies of _GALAXY and _RADIUS."""
+    """Return the standard set on a lattice with this spacing (pixels): stars and round exponential galaxies in turn."""
     rng = np.random.default_rng(2)
     middle = [np.arange(spacing / 2, n - spacing / 2 + 1, spacing) for n in (detector.nx, detector.ny)]
     column, row = (axis.ravel() for axis in np.meshgrid(*middle))
@@ -121,7 +125,24 @@ def standard_sources(detector: Detector, spacing: int) -> Sources:
 
 
 def measure_shapes(frame: Frame, sources: Sources, radius: float = APERTURE, scale: float = 0.1) -> Frame:
-    """Of each source: flux within `radius` arcsec above its surroundings, R^2, e1, e2 under a Gaussian of 0.75"."""
+    """Measure flux, size and ellipticity of each source.
+
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        The image.
+    sources : Sources
+        The sources.
+    radius : float, optional
+        Radius of the aperture, in arcsec.
+    scale : float, optional
+        Pixel scale in arcsec.
+
+    Returns
+    -------
+    float array, shape (n, 4)
+        Flux in the aperture above the surroundings, and R^2 (arcsec2), e1 and e2 with a Gaussian weight of 0.75".
+    """
     half, out = round(2.0 * radius / scale), []
     for x, y in zip(sources.column, sources.row, strict=True):
         x0, y0 = max(round(x) - half, 0), max(round(y) - half, 0)
@@ -129,7 +150,7 @@ def measure_shapes(frame: Frame, sources: Sources, radius: float = APERTURE, sca
         rows, columns = np.mgrid[: cutout.shape[0], : cutout.shape[1]]
         dx, dy = (columns - (x - x0)) * scale, (rows - (y - y0)) * scale
         distance = np.hypot(dx, dy)
-        # The mean: a median of counts is a whole number.
+        # Use the mean for the surroundings, because a median of counts is a whole number.
         cutout = cutout - cutout[distance > 1.5 * radius].mean()
         weighted = cutout * np.exp(-0.5 * (distance / 0.75) ** 2)
         xx, yy, xy = ((weighted * a).sum() / weighted.sum() for a in (dx * dx, dy * dy, dx * dy))
@@ -138,11 +159,25 @@ def measure_shapes(frame: Frame, sources: Sources, radius: float = APERTURE, sca
 
 
 def effect_changes(scene: Scene, sources: Sources, frame: Frame, radius: float = APERTURE) -> dict[str, Frame]:
-    """What each effect that leaves electrons does to each source: magnitude, dR^2 / R^2, de1, de2, [n, 4].
+    """Measure the change of each source by each effect that leaves a frame of electrons.
 
-    Cosmic rays hit some sources and not others: they are left out.
+    Cosmic rays are omitted, because they hit only some sources.
 
-    frame : [ny, nx] expected e- of the sources
+    Parameters
+    ----------
+    scene : Scene
+        The scene.
+    sources : Sources
+        The sources.
+    frame : float array, shape (ny, nx)
+        Expected electrons of the sources.
+    radius : float, optional
+        Radius of the aperture, in arcsec.
+
+    Returns
+    -------
+    dict of str to float array, shape (n, 4)
+        Changes of magnitude, dR^2 / R^2, de1 and de2 by name of the effect.
     """
     out: dict[str, Frame] = {}
     sizes = quadrants.overscan_sizes(scene)
@@ -158,7 +193,7 @@ def effect_changes(scene: Scene, sources: Sources, frame: Frame, radius: float =
 
 
 def median_changes(side: int | None, repeats: int) -> dict[str, float]:
-    """Medians over the standard set of what each effect changes; shear is half an ellipticity."""
+    """Return the median changes of the standard set by each effect; shear is half of the change of ellipticity."""
     mission = resolve()
     detector = detectors.detector("vis", "3-4", mission)
     detector = detector if side is None else replace(detector, nx=side, ny=side)
@@ -180,7 +215,7 @@ def median_changes(side: int | None, repeats: int) -> dict[str, float]:
 def _measure_drawing(
     sources: Sources, psf: model.Psf, light: Frame, scene: Scene, repeats: int, out: dict[str, float]
 ) -> Frame:  # fmt: skip
-    """Adds the figures of what is part of drawing: what that takes more with it; what it does to sources, [n, 4]."""
+    """Measure the effect that is part of drawing: add its extra time and changes to `out`; return changes [n, 4]."""
     (strength,) = vis.TRANSFER_EFFECT.parameters(scene)
     sizes, (ny, nx) = np.full(len(sources), _STAMP), light.shape
     draw_with, draw_without = (
@@ -190,7 +225,7 @@ def _measure_drawing(
     extra_s = report.best_time(draw_with, repeats, time.process_time) - report.best_time(
         draw_without, repeats, time.process_time
     )
-    # Less than two drawings differ by chance.
+    # The difference may be negative if it is smaller than the scatter of the times.
     out[f"{vis.TRANSFER_EFFECT.name}_s"] = max(extra_s, 0.0)
     out[f"{vis.TRANSFER_EFFECT.name}_margin"] = vis.TRANSFER_EFFECT.margin(scene)
     drawn = draw_with()
@@ -199,13 +234,13 @@ def _measure_drawing(
 
 
 def _shape_differences(previous_shapes: Frame, new_shapes: Frame) -> Frame:
-    """Of `forms`: magnitude, dR^2 / R^2, de1, de2."""
+    """Differences of results of `measure_shapes`: magnitude, dR^2 / R^2, de1, de2."""
     ratio = new_shapes[:, :2] / previous_shapes[:, :2]
     return np.column_stack([-2.5 * np.log10(ratio[:, 0]), ratio[:, 1] - 1, new_shapes[:, 2:] - previous_shapes[:, 2:]])
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measures and prints everything."""
+    """Run the benchmark and print the figures."""
     options = report.options("effects", __doc__ or "", argv)
     side = 512 if options.quick else None
     repeats = 1 if options.quick else 3

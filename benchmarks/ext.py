@@ -1,7 +1,8 @@
-"""A ground camera's detector with everything: CPU seconds from the catalogue to the file, and memory; all of LSSTCam.
+"""Measure a detector of each ground camera with all effects: CPU time from catalogue to file, memory, and forecast.
 
-One process, one thread, one field without the Moon. Each time is of a process that has rendered before, as a worker
-has. Everything: every effect of a science image is forced on. What the forecast says is compared with it.
+The benchmark uses one process and one thread, and a field without the Moon. The process has rendered before, like a
+worker. All effects of a science image are forced on. The forecast is compared with the measurements. An option also
+times an exposure of LSSTCam by Spark.
 """
 
 from __future__ import annotations
@@ -27,15 +28,15 @@ from truesky.request.from_toml import parse
 from truesky.request.schema import Effects, Request
 
 RESULTS = ROOT / "benchmarks" / "results" / "ext.json"
-# As far from the field's centre as sources of JPCam's detectors may lie, and of LSSTCam's all; of one in haste; deg.
+# Radii (deg) of areas that contain all sources on a detector of JPCam and on all of LSSTCam; radius for --quick.
 _FIELD_RADIUS, _LSST_RADIUS, _QUICK_RADIUS = 0.47, 2.1, 0.2
-# Faintest galaxies and stars, and those of one in haste.
+# Magnitude limits of galaxies and stars; the same for --quick.
 _DEEP, _BRIGHT = (26.0, 26.0), (20.0, 16.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """A detector near the axis, and a date, MJD, when the field is high in a dark night."""
+    """A camera with a passband, a detector near the axis, and a date (MJD) when the field is high in a dark night."""
 
     name: str
     band: str
@@ -44,7 +45,7 @@ class Camera:
 
 
 LSST = Camera("lsstcam", "lsst_r", "R22_S11", 61088.2)
-# By the name of their figures; JPCam's is the largest. HSC's and Pan-STARRS' bands have fringes.
+# Cameras by the prefix of their figures. JPCam has the largest detector. The bands of HSC and Pan-STARRS have fringes.
 CAMERAS = {
     "lsst": LSST,
     "decam": Camera("decam", "des_r", "S4", 61088.2),
@@ -55,14 +56,14 @@ CAMERAS = {
 }
 _LARGEST = "jpcam"
 _NOTES = {
-    "lsst_survey_s": "CPU, catalogue to FITS, everything on (target 5)",
-    "lsst_draft_s": "the same at draft accuracy, its own choice of effects",
-    "lsst_sources": "galaxies and stars drawn on it",
+    "lsst_survey_s": "CPU, catalogue to FITS, all effects (target 5)",
+    "lsst_draft_s": "the same at draft accuracy with the effects that it selects",
+    "lsst_sources": "number of galaxies and stars that are drawn",
     "decam_survey_s": "as lsst_survey_s (target 3)",
     "jpcam_survey_s": "as lsst_survey_s, 85 million pixels (target 25)",
-    "jpcam_peak_gb": "largest memory of the process (target 4)",
-    "seconds_error": "of the forecast against CPU s, the worst of all cameras (target 0.3)",
-    "memory_error": "against the peak of a worker (target 0.3)",
+    "jpcam_peak_gb": "peak memory of the process (target 4)",
+    "seconds_error": "largest relative error of the forecast CPU time of all cameras (target 0.3)",
+    "memory_error": "the same for the peak memory (target 0.3)",
     "lsst_exposure_s": "wall, 189 detectors at draft accuracy by the Spark job on 2 cores (target 720)",
 }
 
@@ -70,9 +71,23 @@ _NOTES = {
 def request_text(
     cameras: Sequence[Camera], radius: float, limits: tuple[float, float] = _DEEP, whole_cameras: bool = False
 ) -> str:
-    """A field that all sites see, with a detector of each camera; or whole cameras, at draft accuracy.
+    """Return a request for a field that all sites see, with a detector of each camera.
 
-    radius : deg, of the area;  limits : magnitudes of the faintest galaxies and stars
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        The cameras.
+    radius : float
+        Radius of the area in degrees.
+    limits : tuple of float, optional
+        Magnitude limits of galaxies and stars.
+    whole_cameras : bool, optional
+        Render all detectors, at draft accuracy.
+
+    Returns
+    -------
+    str
+        The request as TOML.
     """
     text = f"""name = "ext"
 seed = 20240401
@@ -104,12 +119,27 @@ mjd = {camera.mjd!r}
 
 
 def with_all_effects(request: Request) -> Request:
-    """With every effect of a science image forced on."""
+    """Force all effects of a science image on."""
     return replace(request, effects=Effects(on=tuple(effect.name for effect in ground.SKY if effect.optional)))
 
 
 def measure_detectors(folder: Path, quick: bool, repeats: int) -> dict[str, float]:
-    """All figures of single detectors, each camera's of a process of its own, which holds nothing of the others."""
+    """Return all figures of single detectors; each camera runs in a new process, so that memory is measured correctly.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder for the lake and the files.
+    quick : bool
+        Use a small field with bright sources, without JPCam.
+    repeats : int
+        Number of repeats.
+
+    Returns
+    -------
+    dict of str to float
+        The figures.
+    """
     file, out = folder / "detectors.toml", dict[str, float]()
     cameras = {name: camera for name, camera in CAMERAS.items() if not (quick and name == _LARGEST)}
     field, limits = (_QUICK_RADIUS, _BRIGHT) if quick else (_FIELD_RADIUS, _DEEP)
@@ -126,9 +156,9 @@ def measure_detectors(folder: Path, quick: bool, repeats: int) -> dict[str, floa
 
 
 def _camera_figures(name: str, root: Path, camera_request: Request, repeats: int) -> dict[str, float]:
-    """Of a camera's detector; one : the request of it alone."""
+    """Return the figures of one camera; `camera_request` contains only its pointing."""
     folder, full_task = root.parent, plan_detector(root, with_all_effects(camera_request))
-    # Compiles, and fills the caches.
+    # Compile, and fill the caches.
     sources = render_exposures.render_task(root, full_task).rows["sources"][0].as_py()
     measurements = [measure_render(root, full_task, folder) for _ in range(repeats)]
     (forecast,) = read.version(root, "tasks").rows().to_pylist()
@@ -148,17 +178,17 @@ def _camera_figures(name: str, root: Path, camera_request: Request, repeats: int
 
 
 def time_exposure(folder: Path, limits: tuple[float, float]) -> Mapping[str, float]:
-    """Wall s of the Spark job that renders all 189 detectors of LSSTCam; limits : as of `request`."""
+    """Return the wall time (s) of the Spark job for all 189 detectors of LSSTCam; `limits` as in `request_text`."""
     return {
         "lsst_exposure_s": one_detector.time_job(folder, request_text([LSST], _LSST_RADIUS, limits, whole_cameras=True))
     }
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measures and prints everything."""
+    """Run the benchmark and print the figures."""
     extra_parser = argparse.ArgumentParser(add_help=False)
-    extra_parser.add_argument("--exposure", action="store_true", help="also a whole exposure by the Spark job")
-    extra_parser.add_argument("--repeats", type=int, default=2, help="of every time, the best of which counts")
+    extra_parser.add_argument("--exposure", action="store_true", help="also time an exposure by the Spark job")
+    extra_parser.add_argument("--repeats", type=int, default=2, help="repeats; the shortest time counts")
     extra_options, other_arguments = extra_parser.parse_known_args(argv)
     options = report.options("ext", __doc__ or "", other_arguments)
     repeats = 1 if options.quick else extra_options.repeats

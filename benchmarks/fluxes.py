@@ -1,10 +1,9 @@
-"""How fast and how right the band fluxes are: python -m benchmarks.fluxes [--quick] [--json FILE] [--measure FILE].
+"""Measure speed and accuracy of band fluxes: python -m benchmarks.fluxes [--quick] [--json FILE] [--measure FILE].
 
---measure  writes the errors of all settings in all bands, truesky/fluxes/tables/flux_errors.csv, from which the job
-chooses
-
-Galaxies in two components with their lines, over the whole of the parameter space that the tables cover, in the 22
-bands of Serrano et al. 2024; the truth is direct integration in steps of 1 A, in the same run. CPU seconds of one core.
+The sample consists of galaxies of two components with emission lines over the whole parameter space of the tables, in
+the 22 bands of Serrano et al. 2024. The truth is direct integration in steps of 1 A in the same run. Times are CPU
+seconds of one core. Option --measure writes the errors of all settings in all bands
+(truesky/fluxes/tables/flux_errors.csv), from which the job chooses its settings.
 """
 
 from __future__ import annotations
@@ -43,17 +42,17 @@ BANDS = (
     "hsc_z",
 )  # fmt: skip
 
-# The settings are chosen on one sample and judged on another.
+# Different samples are used to choose the settings, to test them, and to measure the speed.
 _SEED_CHOICE, _SEED_TEST, _SEED_SPEED = 1, 2, 3
 _SAMPLE, _SPEED_SAMPLE = 20_000, 200_000
 _QUICK = 500
 _MAG = 2.5 / np.log(10.0)
-# speclite's maggies are relative to 3631 Jy.
+# Zero point of the maggies of speclite: 3631 Jy in microjansky.
 _AB_UJY = 3631e6
 
 
 def sample(n: int, seed: int) -> pa.Table:
-    """n random rows of `galaxies`, uniform over all that the tables cover."""
+    """Return n random rows of the table `galaxies`, uniform over the parameter space of the flux tables."""
     rng = np.random.default_rng(seed)
     frac = rng.uniform(0.0, 1.0, n)
     z = rng.uniform(build_tables.Z_FIRST + 0.001, build_tables.Z_LAST - 0.01, n)
@@ -84,7 +83,17 @@ def sample(n: int, seed: int) -> pa.Table:
 
 
 def measure(file: Path, n: int = _SAMPLE, bands: Sequence[str] = ()) -> None:
-    """Write the error of every candidate setting in every passband."""
+    """Write the error of every candidate setting in every passband.
+
+    Parameters
+    ----------
+    file : Path
+        CSV file to write.
+    n : int, optional
+        Number of galaxies.
+    bands : sequence of str, optional
+        Names of the passbands. The default is all passbands.
+    """
     library = templates.galaxy_library()
     rows = galaxies_from_table(sample(n, _SEED_CHOICE), library)
     with file.open("w", newline="", encoding="utf-8") as stream:
@@ -103,7 +112,24 @@ def measure(file: Path, n: int = _SAMPLE, bands: Sequence[str] = ()) -> None:
 
 
 def accuracy_of(rows: Galaxies, truth: Float, library: Library, accuracy: Accuracy) -> Float:
-    """Errors, mag, float64[n, 22], of what the job chooses for an accuracy."""
+    """Return the errors of the settings that the job chooses for an accuracy.
+
+    Parameters
+    ----------
+    rows : Galaxies
+        The galaxies.
+    truth : float array, shape (n, 22)
+        True fluxes.
+    library : Library
+        Library of galaxy spectra.
+    accuracy : Accuracy
+        Allowed errors.
+
+    Returns
+    -------
+    float array, shape (n, 22)
+        Errors in magnitudes.
+    """
     f_nu, _ = _interpolate(rows, library, accuracy)
     return np.asarray(-_MAG * np.log(f_nu / truth))
 
@@ -112,13 +138,13 @@ def _interpolate(rows: Galaxies, library: Library, accuracy: Accuracy) -> tuple[
     curves = [passbands.load(name) for name in BANDS]
     settings = [choice.setting for choice in choose(BANDS, accuracy)]
     if missing := [name for name, setting in zip(BANDS, settings, strict=True) if setting is None]:
-        raise SystemExit(f"no table is fine enough for {', '.join(missing)}")
+        raise SystemExit(f"no setting of the flux tables reaches the accuracy in {', '.join(missing)}")
     grid = flux_tables.open_grid(curves, [setting for setting in settings if setting], library)
     return flux_tables.galaxy_fluxes(rows, grid), grid
 
 
 def speclite_difference(n: int, library: Library) -> float:
-    """Largest difference, mag, between our photometry and speclite's of the same spectra."""
+    """Return the largest difference (mag) between the fluxes of truesky and of speclite for the same spectra."""
     import astropy.units as u
     from speclite.filters import load_filter
 
@@ -142,7 +168,7 @@ def speclite_difference(n: int, library: Library) -> float:
 
 
 def job_speed(n: int) -> float:
-    """Galaxies a second of a core, from Parquet to published Parquet, 22 bands, without Spark."""
+    """Return the galaxies per CPU second of the job for 22 bands, from file to published file, without Spark."""
     from lake_schema import ids, sky
     from lake_schema.store import layout, plan, publish
     from lake_schema.tables.galaxies import GALAXIES
@@ -178,12 +204,12 @@ def job_speed(n: int) -> float:
 
 
 def stars(n: int) -> dict[str, float]:
-    """Speed and error of the stars."""
+    """Return speed and error of the fluxes of n stars."""
     from truesky.fluxes.sources import Stars
 
     library = templates.stellar_library()
     rng = np.random.default_rng(_SEED_TEST)
-    # As most stars are: of four templates each.
+    # Most stars are mixtures of four templates.
     rows = Stars(
         rng.integers(0, len(library), (4, n)), rng.dirichlet(np.ones(4), n).T, rng.uniform(5.0, 26.0, n),
         rng.uniform(0.0, build_tables.STAR_A_V_LAST, n),
@@ -195,7 +221,22 @@ def stars(n: int) -> dict[str, float]:
 
 
 def error_curve(rows: Galaxies, truth: Float, library: Library) -> dict[str, list[float]]:
-    """Error against time of each setting, all bands alike: what the notebook draws."""
+    """Return error and time of each setting, used for all bands, for the figure in the notebook.
+
+    Parameters
+    ----------
+    rows : Galaxies
+        The galaxies.
+    truth : float array, shape (n, 22)
+        True fluxes.
+    library : Library
+        Library of galaxy spectra.
+
+    Returns
+    -------
+    dict of str to list of float
+        One value per setting: CPU time per galaxy (us), rms and largest error (mag), and size of a table (MB).
+    """
     curves = [passbands.load(name) for name in BANDS]
     names = ("curve_us", "curve_rms_mag", "curve_max_mag", "curve_mb")
     out: dict[str, list[float]] = {name: [] for name in names}
@@ -212,13 +253,13 @@ def error_curve(rows: Galaxies, truth: Float, library: Library) -> dict[str, lis
 
 
 def run(quick: bool) -> dict[str, Any]:
-    """All figures."""
+    """Return all figures."""
     library = templates.galaxy_library()
     n = _QUICK if quick else _SAMPLE
     curves = [passbands.load(name) for name in BANDS]
     rows = galaxies_from_table(sample(n, _SEED_TEST), library)
     integrated: list[Float] = []
-    # What is compiled is read in before the clock starts.
+    # Load the compiled code before the clock starts.
     integration.galaxy_fluxes(rows.select(np.arange(2)), curves, library)
     integration_s = _best_cpu_time(lambda: integrated.append(integration.galaxy_fluxes(rows, curves, library)), 1)
     truth = integrated[0]
@@ -253,7 +294,7 @@ def run(quick: bool) -> dict[str, Any]:
 
 
 def _build_seconds(library: Library, quick: bool) -> float:
-    """Making the tables of the 22 bands (two, if in haste), in an empty cache."""
+    """CPU time (s) to make the tables of the 22 bands (2 bands if `quick`) with an empty cache."""
     bands = BANDS[:2] if quick else BANDS
     curves = [passbands.load(name) for name in bands]
     settings = [setting for choice in choose(bands, SURVEY) if (setting := choice.setting) is not None]
@@ -269,7 +310,7 @@ def _build_seconds(library: Library, quick: bool) -> float:
 
 
 def _full_spectrum_seconds(n: int, library: Library) -> float:
-    """Seconds a galaxy by the whole spectrum, 600 .. 24000 A, as it reaches space and ground."""
+    """CPU time (s) per galaxy to integrate its whole spectrum, 600 to 24000 A, in vacuum and in air."""
     table, curves = sample(n, _SEED_TEST), [passbands.load(name) for name in BANDS]
 
     def work() -> None:
@@ -286,11 +327,12 @@ def _rms(error: Float) -> float:
 
 
 def _best_cpu_time(work: Callable[[], object], repeats: int) -> float:
-    """Least CPU seconds of a few repeats."""
+    """Shortest CPU time (s) of several repeats."""
     return best_time(work, repeats, time.process_time)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
+    """Run the benchmark and print the figures."""
     parser = argparse.ArgumentParser(prog="benchmarks.fluxes", description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="few objects, for tests")
     parser.add_argument("--json", type=Path, metavar="FILE")

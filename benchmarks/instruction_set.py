@@ -1,4 +1,4 @@
-"""CPU time with the common instruction set over the time with all instructions of this CPU.
+"""Compare the CPU time with the common instruction set and with all instructions of this CPU.
 
 Two processes per subject, one with TRUESKY_CPU=portable and one with TRUESKY_CPU=native, do the same work in turn, so
 that a change of the machine's speed affects both. Each does the work once before it is measured. On a CPU without
@@ -19,7 +19,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-# Before numpy is imported.
+# Set this before NumPy is imported.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import lake_schema  # noqa: F401
@@ -36,7 +36,7 @@ _NOTES = {
 }
 
 
-# A subject imports what it needs, since a process for another subject would load it for seconds.
+# Each subject imports its modules itself, because loading the modules of all subjects would take seconds.
 def _vis(folder: Path, quick: bool) -> Callable[[], Any]:
     from benchmarks import _detectors, vis
 
@@ -91,7 +91,7 @@ def serve(subject: str, quick: bool) -> None:
 
 
 def compare(subject: str, repeats: int, quick: bool) -> dict[str, float]:
-    """Ratio of the CPU times, and the median time with each setting, in seconds.
+    """Return the ratio of the CPU times, and the median time with each setting in seconds.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Measure the subjects and print the ratios."""
     extra_parser = argparse.ArgumentParser(add_help=False)
     extra_parser.add_argument("--subjects", nargs="+", choices=SUBJECTS, default=list(SUBJECTS))
-    extra_parser.add_argument("--repeats", type=int, default=7, help="of each measurement")
+    extra_parser.add_argument("--repeats", type=int, default=7, help="repeats of each measurement")
     extra_parser.add_argument("--serve", choices=SUBJECTS, help=argparse.SUPPRESS)
     extra_options, other_arguments = extra_parser.parse_known_args(argv)
     options = report.options("instruction_set", __doc__ or "", other_arguments)

@@ -1,7 +1,7 @@
-"""How fast the lake is, each figure with its peer beside it: python -m benchmarks.lake [--quick] [--json FILE].
+"""Measure the speed of the lake and compare with other programs: python -m benchmarks.lake [--quick] [--json FILE].
 
-A catalogue of 50 random columns in 20 cells of 250,000 rows; the peers are Spark's and pyarrow's own Parquet writers,
-lsdb, a scan of everything, and the same query on files that nobody verifies.
+The catalogue has 50 random columns in 20 cells of 250,000 rows. It is compared with the Parquet writers of Spark and
+pyarrow, with lsdb, with a scan of all rows, and with the same query on files that are not verified.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from lake_schema.store.stage import write_partition
 from lake_schema.tables.common import DEC, HEALPIX_29, ID, RA
 from truesky.explore.explorer import Explorer
 
-# Nested neighbours of order 5: about the Chandra Deep Field South.
+# Consecutive nested cells of order 5, around the Chandra Deep Field South.
 FIRST_CELL, CELLS, ROWS = 8976, 20, 250_000
 QUICK_CELLS, QUICK_ROWS = 3, 20_000
 CONE_ARCSEC, CONE_COLUMNS = 60.0, ("id", "ra", "dec", "x_0", "x_1")
@@ -51,33 +51,33 @@ TRIAL = Table(
         *(Column(f"kind_{i}", "int32", codes=KIND_CODES, doc="random code", lo=0, hi=4) for i in range(3)),
         *(Column(f"x_{i}", "float32", doc="random number", lo=0.0, hi=1.0) for i in range(40)),
     ),
-    "50 columns of random values, 228 bytes a row as they are, which compress worse than anything real.",
+    "50 columns of random values, 228 bytes per row before compression, which compress worse than real data.",
     order=5,
 )
 
 NOTES = {
     "write_rows_per_s_core": "rows validated, written, hashed, synced, with the receipt",
     "write_parquet_rows_per_s": "the Parquet file alone",
-    "write_vs_spark_writer": "times the rows/s of Spark's own writer, one core, from memory",
-    "write_vs_pyarrow_defaults": "times the rows/s of pyarrow's default settings",
+    "write_vs_spark_writer": "speed / speed of Spark's writer, one core, from memory",
+    "write_vs_pyarrow_defaults": "speed / speed of pyarrow with default settings",
     "bytes_per_row": "in the file",
-    "bytes_per_row_defaults": "pyarrow's default settings",
+    "bytes_per_row_defaults": "in a file of pyarrow with default settings",
     "finish_s": "metadata, margin, skymap, manifest and rename of the whole catalogue",
-    "cone_ms": '60" cone, 5 columns, warm, as lake_schema.store.read gives it',
+    "cone_ms": '60" cone, 5 columns, by lake_schema.store.read, warm',
     "cone_cold_ms": "the same, a version just opened",
-    "cone_vs_lsdb": "times faster than lsdb's cone_search",
-    "cone_vs_scan": "times faster than a scan of all positions",
+    "cone_vs_lsdb": "time of lsdb's cone_search / ours",
+    "cone_vs_scan": "time of a scan of all positions / ours",
     "heatmap_s": "100 x 100 bins of two columns of all rows, by the explorer",
-    "heatmap_vs_unverified": "its time / DuckDB's own read_parquet, which verifies nothing",
-    "verify_mb_per_s": "sha256 of every file, order of every cell",
+    "heatmap_vs_unverified": "time / time of DuckDB's read_parquet, which verifies nothing",
+    "verify_mb_per_s": "sha256 of every file, order of rows in every cell",
     "read_mb_per_s": "all columns of a cell into memory, checksums verified (bytes of the file)",
-    "read_vs_unverified": "its time / pyarrow's without checksums",
+    "read_vs_unverified": "time / time of pyarrow without checksums",
     "session_start_s": "a Spark session in a new process",
 }
 
 
 def random_rows(cell: int, n: int) -> pa.Table:
-    """Random rows of a cell."""
+    """Return n random rows in a cell of order 5."""
     rng = np.random.default_rng([1, cell])
     index, ra, dec = sky.random_in_cell(5, cell, n, rng)
     ids = np.int64(cell) << 46 | np.arange(n)
@@ -89,12 +89,12 @@ def random_rows(cell: int, n: int) -> pa.Table:
 
 
 def make_cell(root: Path, facts: Json) -> Output:
-    """One cell."""
+    """Make the rows of one cell; the task function of the catalogue."""
     return Output(random_rows(facts["cell"], facts["rows"]))
 
 
 def catalogue_plan(cells: int, rows: int) -> Plan:
-    """The catalogue."""
+    """Return the plan of a catalogue of this number of cells, with this number of rows in each."""
     numbers = range(FIRST_CELL, FIRST_CELL + cells)
     return Plan(
         TRIAL, {}, tuple(Task(layout.cell_file(5, cell), {"cell": cell, "rows": rows}, rows) for cell in numbers)
@@ -102,7 +102,22 @@ def catalogue_plan(cells: int, rows: int) -> Plan:
 
 
 def time_writing(folder: Path, rows: pa.Table, repeats: int) -> dict[str, float]:
-    """One cell written by us and by others, one core each."""
+    """Time the writing of one cell by truesky, pyarrow and Spark, each on one core.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder for the files.
+    rows : pyarrow.Table
+        Rows of the cell.
+    repeats : int
+        Number of repeats; the shortest time counts.
+
+    Returns
+    -------
+    dict of str to float
+        The figures.
+    """
     part = Task(layout.cell_file(5, FIRST_CELL), {})
     ours, plain = folder / "ours.parquet", folder / "plain.parquet"
     pa.set_cpu_count(1)
@@ -122,7 +137,7 @@ def time_writing(folder: Path, rows: pa.Table, repeats: int) -> dict[str, float]
 
 
 def _time_spark_writer(folder: Path, file: Path, repeats: int) -> float:
-    """s of Spark's own writer on the same rows, held in its memory, in one task."""
+    """Wall time (s) of Spark's writer for the same rows, which are in its memory, in one task."""
     from truesky.running.session import get_session
 
     frame = get_session("benchmarks.lake").read.parquet(str(file)).coalesce(1).cache()
@@ -131,7 +146,7 @@ def _time_spark_writer(folder: Path, file: Path, repeats: int) -> float:
 
 
 def time_cones(version: read.Version, repeats: int) -> dict[str, float]:
-    """Small circles at random places of the catalogue."""
+    """Time searches in small circles at random positions of the catalogue."""
     import lsdb
 
     centres = np.random.default_rng(2).permutation(version.rows(["ra", "dec"], version.partitions[:2]).to_pandas())[
@@ -172,7 +187,7 @@ def _scan_cone(version: read.Version, ra: float, dec: float, radius: float, colu
 
 
 def time_heatmap(version: read.Version, repeats: int) -> dict[str, float]:
-    """A heat map of all rows."""
+    """Time a heat map of all rows."""
     import duckdb
 
     files = [str(version.partition_path(part)) for part in version.partitions]
@@ -190,7 +205,7 @@ def time_heatmap(version: read.Version, repeats: int) -> dict[str, float]:
 
 
 def time_verification(version: read.Version, repeats: int) -> dict[str, float]:
-    """Bytes a second through the checks."""
+    """Measure the speed of verification and of verified reading."""
     size = sum(entry["bytes"] for entry in version.manifest["files"]) / 1e6
     deep = report.best_time(lambda: read.find_faults(version, deep=True), repeats)
     part = version.partitions[0]
@@ -210,14 +225,14 @@ _SESSION = (
 
 
 def time_session_start(repeats: int) -> dict[str, float]:
-    """The first seconds of a job."""
+    """Time the start of a Spark session in a new process."""
     command = [sys.executable, "-c", _SESSION]
     done = [subprocess.run(command, capture_output=True, text=True, check=True).stdout for _ in range(min(repeats, 3))]
     return {"session_start_s": min(float(text) for text in done)}
 
 
 def run(quick: bool, folder: Path) -> tuple[int, dict[str, float]]:
-    """All figures."""
+    """Return the number of repeats and all figures."""
     cells, rows, repeats = (QUICK_CELLS, QUICK_ROWS, 1) if quick else (CELLS, ROWS, 5)
     figures = time_writing(folder, random_rows(FIRST_CELL, rows), repeats)
     pa.set_cpu_count(os.cpu_count() or 1)
@@ -239,7 +254,7 @@ def run(quick: bool, folder: Path) -> tuple[int, dict[str, float]]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Print the table; exit status 0."""
+    """Run the benchmark and print the figures."""
     chosen = report.options("lake", __doc__ or "", argv)
     folder = Path(tempfile.mkdtemp(prefix="truesky-benchmark-"))
     try:

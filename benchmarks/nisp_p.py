@@ -1,7 +1,8 @@
-"""A NISP-P detector with everything: CPU seconds from the catalogue to the file, and memory; an exposure of 16.
+"""Measure a NISP-P detector with all effects: CPU time from catalogue to file, and memory.
 
-One process, one thread, the demo's field in H. Each time is of a process that has rendered before, as a worker has;
-"cold" is without the PSF's planes in the cache, "warm" with them.
+The benchmark uses one process and one thread, and the field of the demo in H. The process has rendered before, like a
+worker. "cold" is without the planes of the PSF in the cache, "warm" with them. An option also times an exposure of 16
+detectors by Spark.
 """
 
 from __future__ import annotations
@@ -26,18 +27,33 @@ RESULTS = ROOT / "benchmarks" / "results" / "nisp_p.json"
 _PLANES = "nisp*_psf-*"
 _RAMP = nisp_p.SKY[nisp_p.SKY.index(nisp_p.persistence.EFFECT) + 1 :]
 _NOTES = {
-    "survey_cold_s": "CPU, catalogue to FITS, everything on, PSF planes computed (target 5)",
+    "survey_cold_s": "CPU, catalogue to FITS, all effects, PSF planes computed (target 5)",
     "survey_warm_s": "the same, PSF planes from the cache (target 2.5)",
-    "draft_s": "the same at draft accuracy, its own choice of effects (target 1)",
-    "ramp_s": "CPU, of survey_warm_s, of the effects from cosmic rays to the converter",
-    "peak_gb": "largest memory of the process (target 1.2)",
-    "third_s": "as survey_warm_s, of the third exposure of a dither: with what two others left",
+    "draft_s": "the same at draft accuracy with the effects that it selects (target 1)",
+    "ramp_s": "part of survey_warm_s: effects from cosmic rays to the converter",
+    "peak_gb": "peak memory of the process (target 1.2)",
+    "third_s": "as survey_warm_s, third exposure of a dither with persistence of the first two",
     "exposure_s": "wall, 16 detectors by the Spark job on 2 cores (target 30)",
 }
 
 
 def request_text(quick: bool, detectors: str = 'detectors = ["DET22"]', exposures: int = 1) -> str:
-    """The demo's field with one of NISP's detectors, in H; or the third of three exposures 134 s apart."""
+    """Return a request for the field of the demo with NISP.
+
+    Parameters
+    ----------
+    quick : bool
+        Use a universe with bright sources only.
+    detectors : str, optional
+        Line of the request that selects detectors; empty for all detectors.
+    exposures : int, optional
+        Number of exposures, 134 s apart. The last one is in H.
+
+    Returns
+    -------
+    str
+        The request as TOML.
+    """
     text = one_detector.request_head(quick).split("[products]")[0]
     for number, band in enumerate(("h", "j", "y")[:exposures][::-1]):
         text += f"""
@@ -55,23 +71,38 @@ mjd = {60905.0 + number * 134.0 / 86400.0!r}
 
 
 def with_all_effects(request: Request) -> Request:
-    """With every effect of a science image forced on, but the non-linearity of the signal: that of the ramp is."""
+    """Force all effects of a science image on, with the non-linearity of the ramp in place of that of the signal."""
     names = [effect.name for effect in nisp_p.SKY if effect.optional and effect.name != "signal_nonlinearity"]
     return replace(request, effects=Effects(on=tuple(names)))
 
 
 def measure_detector(folder: Path, quick: bool, repeats: int) -> dict[str, float]:
-    """All of a detector's figures."""
+    """Return all figures of a detector.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder for the lake and the files.
+    quick : bool
+        Use a universe with bright sources only.
+    repeats : int
+        Number of repeats.
+
+    Returns
+    -------
+    dict of str to float
+        The figures.
+    """
     file = folder / "three.toml"
     file.write_text(request_text(quick, exposures=3), encoding="utf-8")
     three_exposures = parse(file)
     last_exposure = replace(three_exposures, pointings=three_exposures.pointings[-1:])
     root = one_detector.make_lake(folder, three_exposures)
     full_task = plan_detector(root, with_all_effects(last_exposure))
-    measure_render(root, full_task, folder)  # Compiles, and fills the other caches.
+    measure_render(root, full_task, folder)  # Compile, and fill the other caches.
     out = one_detector.time_cold_and_warm(root, full_task, folder, _PLANES, repeats)
     out |= {f"survey_{state}_s": out.pop(f"{state}_s") for state in ("cold", "warm")}
-    # By which the channel is known for what it is.
+    # The channel identifies these effects by their object, so they must not be replaced.
     channel_effects = nisp_p.CHANNEL.persistence_effect, nisp_p.CHANNEL.chromatic_effect
     effects = one_detector.effect_seconds(
         nisp_p.EFFECTS, channel_effects, lambda: measure_render(root, full_task, folder)
@@ -85,16 +116,16 @@ def measure_detector(folder: Path, quick: bool, repeats: int) -> dict[str, float
 
 
 def time_exposure(folder: Path, quick: bool) -> Mapping[str, float]:
-    """Wall s of the Spark job that renders all 16 detectors of an exposure; quick: two of a bright universe."""
+    """Return the wall time (s) of the Spark job for all 16 detectors of an exposure, or for two if `quick`."""
     text = request_text(quick, 'detectors = ["DET22", "DET23"]' if quick else "")
     return {"exposure_s": one_detector.time_job(folder, text.replace("radius = 0.2", f"radius = {FIELD_RADIUS}"))}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measures and prints everything."""
+    """Run the benchmark and print the figures."""
     extra_parser = argparse.ArgumentParser(add_help=False)
-    extra_parser.add_argument("--exposure", action="store_true", help="also a whole exposure by the Spark job")
-    extra_parser.add_argument("--repeats", type=int, default=2, help="of every time, the best of which counts")
+    extra_parser.add_argument("--exposure", action="store_true", help="also time an exposure by the Spark job")
+    extra_parser.add_argument("--repeats", type=int, default=2, help="repeats; the shortest time counts")
     extra_options, other_arguments = extra_parser.parse_known_args(argv)
     options = report.options("nisp_p", __doc__ or "", other_arguments)
     repeats = 1 if options.quick else extra_options.repeats

@@ -1,8 +1,8 @@
-"""A NISP-S detector with everything: CPU seconds from the catalogue to the file, and memory; four dithers of 16.
+"""Measure a NISP-S detector with all effects: CPU time from catalogue to file, and memory; and exposures by Spark.
 
-One process, one thread, the demo's field through RGS000: every source down to H_E = 23 or with H alpha of 1e-16, in all
-orders. Each time is of a process that has rendered before, as a worker has; "cold" is without the PSF's planes in the
-cache, "warm" with them.
+The benchmark uses one process and one thread. The image is the field of the demo with grism RGS000: all sources to
+H_E = 23 or with an H alpha flux of 1e-16, in all orders. The process has rendered before, like a worker. "cold" is
+without the planes of the PSF in the cache, "warm" with them.
 """
 
 from __future__ import annotations
@@ -36,35 +36,50 @@ from truesky.request.schema import Effects, Request
 RESULTS = ROOT / "benchmarks" / "results" / "nisp_s.json"
 # Folders of the PSF's planes in the cache.
 _PLANES = "nisp*_psf-*"
-# Where the exposure points for DET22 to lie in the middle of the demo's area, deg.
+# Pointing (deg) for which DET22 lies in the middle of the area of the demo.
 _RA, _DEC = 53.0135, -27.907
 _RAMP = nisp_s.SKY[nisp_s.SKY.index(nisp_s.persistence.EFFECT) + 1 :]
-# Sources that galsim draws, and pixels of its stamps.
+# Number of sources that galsim draws, and side of its stamps in pixels.
 _NUM_GALSIM, _STAMP = 8, 32
 _NOTES = {
-    "survey_cold_s": "CPU, catalogue to FITS, everything on, PSF planes computed",
+    "survey_cold_s": "CPU, catalogue to FITS, all effects, PSF planes computed",
     "survey_warm_s": "the same, PSF planes from the cache (target 12 on a Xeon of 2.5 GHz)",
-    "draft_s": "the same at draft accuracy, its own choice of effects (target 5)",
-    "reference_s": "the same at reference accuracy, everything on (target 40)",
-    "draw_s": "CPU, of survey_warm_s, of drawing all spectra once, with",
-    "spectra_s": "the spectra themselves (target 1.5)",
-    "colours_s": "CPU, of survey_warm_s, of drawing the bright ones again by what pixels see of their colours",
-    "sources": "whose spectra are drawn",
-    "ramp_s": "CPU, of survey_warm_s, of the effects from cosmic rays to the converter",
-    "peak_gb": "largest memory of the process, survey (target 2)",
-    "exposure_s": "wall, an exposure of 16 detectors by the Spark job on 2 cores (target of four 480)",
-    "spectrum_s": "CPU, a first order of a star or a small galaxy, as slitlessutils is given them",
+    "draft_s": "the same at draft accuracy with the effects that it selects (target 5)",
+    "reference_s": "the same at reference accuracy with all effects (target 40)",
+    "draw_s": "part of survey_warm_s: drawing all spectra once, including",
+    "spectra_s": "the computation of the spectra (target 1.5)",
+    "colours_s": "part of survey_warm_s: drawing bright sources again for the response of pixels to colours",
+    "sources": "number of sources whose spectra are drawn",
+    "ramp_s": "part of survey_warm_s: effects from cosmic rays to the converter",
+    "peak_gb": "peak memory of the process at survey accuracy (target 2)",
+    "exposure_s": "wall, an exposure of 16 detectors by the Spark job on 2 cores (target 480 for four exposures)",
+    "spectrum_s": "CPU, first order of a star or a small galaxy in the comparison with slitlessutils",
     "slitlessutils_spectrum_s": "CPU, the same by slitlessutils",
-    "against_slitlessutils": "times that it takes of ours",
-    "slitlessutils_flux": "largest difference of light in stretches of 64 pixels, relative (target 0.01)",
-    "against_galsim": "times that galsim takes, a first order pixel by pixel, of ours with all orders",
+    "against_slitlessutils": "time of slitlessutils / ours",
+    "slitlessutils_flux": "largest relative difference of light in intervals of 64 pixels (target 0.01)",
+    "against_galsim": "time of galsim for a first order, pixel by pixel / ours for all orders",
 }
 
 
 def request_text(
     quick: bool, detectors: str = 'detectors = ["DET22"]', place: tuple[float, float] = (_RA, _DEC)
 ) -> str:
-    """The demo's field through the red grism, chosen as in Serrano et al. 2024."""
+    """Return a request for the field of the demo with the red grism; spectra are selected as in Serrano et al. 2024.
+
+    Parameters
+    ----------
+    quick : bool
+        Use a universe with bright sources only.
+    detectors : str, optional
+        Line of the request that selects detectors.
+    place : tuple of float, optional
+        RA and Dec of the pointing in degrees.
+
+    Returns
+    -------
+    str
+        The request as TOML.
+    """
     return f"""{one_detector.request_head(quick)}
 [mission.overrides]
 "nisp.spectra.selection" = {{ value = 1.0, unit = "" }}
@@ -84,16 +99,16 @@ mjd = 60905.0
 
 
 def with_all_effects(request: Request) -> Request:
-    """With every effect of a science image forced on, but the non-linearity of the signal: that of the ramp is."""
+    """Force all effects of a science image on, with the non-linearity of the ramp in place of that of the signal."""
     names = [effect.name for effect in nisp_s.SKY if effect.optional and effect.name != "signal_nonlinearity"]
     return replace(request, effects=Effects(on=tuple(names)))
 
 
 @contextmanager
 def record_drawing(seconds: dict[str, float], drawn: list[tuple[Any, ...]]) -> Iterator[None]:
-    """Adds up the CPU seconds of drawing and of spectra, and keeps what is drawn, while it is open.
+    """Add the CPU time of drawing and of spectra to `seconds`, and the arguments of drawing to `drawn`.
 
-    Of one rendering: all sources are drawn first, and then some of them by their colours.
+    A rendering draws all sources first, and then some of them again for their colours.
     """
     original_draw, original_of_rows = draw.draw, spectra.spectrum_function
 
@@ -114,7 +129,7 @@ def record_drawing(seconds: dict[str, float], drawn: list[tuple[Any, ...]]) -> I
 
 
 def galsim_seconds(drawn: tuple[Any, ...]) -> float:
-    """CPU s of a first order of one source by galsim: a stamp a pixel of the trace, one PSF for all of it; a mean."""
+    """Return the mean CPU time (s) of galsim for a first order: one stamp per pixel of the trace, and one PSF."""
     sources, dispersed, psf = drawn[:3]
     (first,) = (order.trace for order in dispersed.orders if order.trace.order == 1)
     indices = np.linspace(0, len(sources) - 1, _NUM_GALSIM).astype(int)
@@ -141,7 +156,22 @@ def galsim_seconds(drawn: tuple[Any, ...]) -> float:
 
 
 def measure_stages(root: Path, full_task: Json, folder: Path) -> dict[str, float]:
-    """Of one rendering: what drawing, spectra and effects take, and galsim for as many sources."""
+    """Measure the stages of one rendering, and compare with galsim for the same number of sources.
+
+    Parameters
+    ----------
+    root : Path
+        Folder of the lake.
+    full_task : dict
+        Facts of the task.
+    folder : Path
+        Folder for the files.
+
+    Returns
+    -------
+    dict of str to float
+        The figures.
+    """
     seconds: dict[str, float] = defaultdict(float)
     drawn: list[tuple[Any, ...]] = []
     with record_drawing(seconds, drawn):
@@ -161,13 +191,28 @@ def measure_stages(root: Path, full_task: Json, folder: Path) -> dict[str, float
 
 
 def measure_detector(folder: Path, quick: bool, repeats: int) -> dict[str, float]:
-    """All of a detector's figures."""
+    """Return all figures of a detector.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder for the lake and the files.
+    quick : bool
+        Use a universe with bright sources only.
+    repeats : int
+        Number of repeats.
+
+    Returns
+    -------
+    dict of str to float
+        The figures.
+    """
     file = folder / "one.toml"
     file.write_text(request_text(quick), encoding="utf-8")
     request = parse(file)
     root = one_detector.make_lake(folder, request)
     full_task = plan_detector(root, with_all_effects(request))
-    measure_render(root, full_task, folder)  # Compiles, and fills the other caches.
+    measure_render(root, full_task, folder)  # Compile, and fill the other caches.
     out = one_detector.time_cold_and_warm(root, full_task, folder, _PLANES, repeats)
     out |= {f"survey_{state}_s": out.pop(f"{state}_s") for state in ("cold", "warm")}
     out |= measure_stages(root, full_task, folder)
@@ -178,22 +223,24 @@ def measure_detector(folder: Path, quick: bool, repeats: int) -> dict[str, float
 
 
 def time_exposure(folder: Path, quick: bool) -> dict[str, float]:
-    """Wall s of the Spark job that renders all 16 detectors of an exposure; quick: two of a bright universe."""
+    """Return the wall time (s) of the Spark job for all 16 detectors of an exposure, or for two if `quick`."""
     text = request_text(quick, 'detectors = ["DET22", "DET23"]' if quick else "", (53.117, -27.808))
     return {"exposure_s": one_detector.time_job(folder, text.replace("radius = 0.2", f"radius = {FIELD_RADIUS}"))}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measures and prints everything."""
+    """Run the benchmark and print the figures."""
     extra_parser = argparse.ArgumentParser(add_help=False)
-    extra_parser.add_argument("--exposure", action="store_true", help="also a whole exposure by the Spark job")
+    extra_parser.add_argument("--exposure", action="store_true", help="also time an exposure by the Spark job")
     extra_parser.add_argument(
-        "--peer", action="store_true", help="also slitlessutils, of the Python that its variable names"
+        "--peer",
+        action="store_true",
+        help=f"also time slitlessutils, see ${_peers_slitless.PYTHON_VARIABLE}",
     )
     extra_parser.add_argument(
-        "--settings", action="store_true", help="the table of settings of drawing alone, measured anew"
+        "--settings", action="store_true", help="only measure the settings of drawing again and write their table"
     )
-    extra_parser.add_argument("--repeats", type=int, default=2, help="of every time, the best of which counts")
+    extra_parser.add_argument("--repeats", type=int, default=2, help="repeats; the shortest time counts")
     extra_options, other_arguments = extra_parser.parse_known_args(argv)
     options = report.options("nisp_s", __doc__ or "", other_arguments)
     repeats = 1 if options.quick else extra_options.repeats

@@ -1,8 +1,8 @@
-"""How fast the page over a lake answers: python -m benchmarks.page [--quick] [--json FILE].
+"""Measure the response times of the page: python -m benchmarks.page [--quick] [--json FILE].
 
-Charts are answered as the page answers them, over made columns that it keeps; the server is asked over HTTP, over a
-made lake of 1 M rows and an image, and over one of 10 M rows of which nothing is kept; a browser moves brushes over the
-first, where one is installed (extra `test`, and chromium).
+Charts are counted over random columns in the cache. Requests over HTTP go to a server with an artificial lake of 1 M
+rows and an image, and to one with 10 M rows and an empty cache. If a browser is installed (extra `test`, and chromium),
+it moves brushes over the first lake.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ TOKEN = "a-token-of-the-benchmark"
 SPAN = (-3.0, 3.0)
 CHARTS = [*(Chart((k,), (SPAN,), (120,)) for k in range(4)), Chart((0, 1), (SPAN, SPAN), (96, 96))]
 LIMITS = {0: (-1.0, 1.0), 1: (-0.5, 2.0), 2: (-2.0, 0.5)}
-# The same as the page asks for them.
+# The same charts as a request of the page.
 QUESTION: dict[str, Any] = {
     "charts": [{"axes": c.columns, "bins": c.bins, "spans": c.spans} for c in CHARTS],
     "limits": [[axis, *limit] for axis, limit in LIMITS.items()],
@@ -60,43 +60,43 @@ QUESTION: dict[str, Any] = {
 CUBE = [Chart((0, k), (SPAN, SPAN), (256, 120), frozenset({0, k})) for k in range(1, 4)]
 
 NOTES = {
-    "count_1m_ms": "four histograms and a map of 1 M rows, each under the others' brushes, median",
-    "count_vs_duckdb": "times less CPU than DuckDB's, one query a chart, of 1 M rows in memory",
-    "brush_50m_cpu_ms": "the answer to a move of a brush: four histograms and a map of 50 M kept rows, CPU",
-    "held_50m_cpu_s": "what is looked for once in these columns, spans and missing values, CPU",
-    "first_100m_ms": "the answer of one row in 64 of 100 M, once they are kept, which is shown at a move, median",
-    "whole_100m_cpu_s": "the answer of all 100 M kept rows, CPU",
-    "whole_1e9_cpu_s_extrapolated": "ten times that: of 1e9 rows, NOT measured",
-    "first_1e9_ms_extrapolated": "ten times first_100m_ms: one row in 64 of 1e9, NOT measured",
-    "fill_1m_s": "the first answer of four columns of 1 M rows of a lake, of which nothing is kept",
-    "fill_sample_10m_s": "the first answer of one row in 64 of 10 M, of which nothing is kept",
-    "fill_sample_1e8_s_extrapolated": "ten times that: of 1e8 rows, NOT measured",
-    "cone_10m_ms": "36 arcsec by ADQL's CONTAINS among 10 M rows, over TAP, median",
-    "cone_scan_10m_ms": "the same by separation(), which reads all of them, median",
-    "cube_ms": "a move of a held brush over 1 M rows, in the browser, to the numbers it shows, median",
-    "cube_server_ms": "counts of three charts for each of 256 places of a held brush, 1 M rows, one thread",
-    "brush_1m_ms": "a move of a brush that is counted anew over 1 M rows, in the browser, to its frame, median",
-    "brush_1m_95_ms": "the same, of 95 % of the moves",
-    "first_sky_s": "from the command to densities in the files' cells",
-    "first_sky_browser_s": "the same to its first frame, in a browser that is started beside",
+    "count_1m_ms": "four histograms and a map of 1 M rows, each filtered by the brushes of the others, median",
+    "count_vs_duckdb": "CPU time of DuckDB (one query per chart, 1 M rows in memory) / ours",
+    "brush_50m_cpu_ms": "move of a brush: four histograms and a map of 50 M cached rows, CPU",
+    "held_50m_cpu_s": "ranges and missing values of these columns, which are determined once, CPU",
+    "first_100m_ms": "first result of a move: one row in 64 of 100 M, cached, median",
+    "whole_100m_cpu_s": "all 100 M cached rows, CPU",
+    "whole_1e9_cpu_s_extrapolated": "1e9 rows: ten times whole_100m_cpu_s, NOT measured",
+    "first_1e9_ms_extrapolated": "one row in 64 of 1e9: ten times first_100m_ms, NOT measured",
+    "fill_1m_s": "first request for four columns of 1 M rows of a lake, empty cache",
+    "fill_sample_10m_s": "first request for one row in 64 of 10 M, empty cache",
+    "fill_sample_1e8_s_extrapolated": "1e8 rows: ten times fill_sample_10m_s, NOT measured",
+    "cone_10m_ms": "circle of 36 arcsec by ADQL CONTAINS in 10 M rows, over TAP, median",
+    "cone_scan_10m_ms": "the same by separation(), which reads all rows, median",
+    "cube_ms": "move of a held brush over 1 M rows in the browser until other numbers are shown, median",
+    "cube_server_ms": "counts of three charts for each of 256 positions of a held brush, 1 M rows, one thread",
+    "brush_1m_ms": "move of a brush over 1 M rows with a request to the server, in the browser until drawn, median",
+    "brush_1m_95_ms": "the same, 95 % quantile",
+    "first_sky_s": "from the start of the command to densities in the cells of the files",
+    "first_sky_browser_s": "the same until the map is drawn in a browser that runs already",
     "select_1_ms": "SELECT 1 over HTTP, median",
-    "sky_ms": "densities in the files' cells, median",
-    "tile_ms": "a tile of 512 x 512 pixels of a kept image, median over its tiles",
-    "first_tile_ms": "the first tile of a 4096 x 4096 image, whose tiles are then kept",
-    "server_gb": "memory of the server, without its processes of queries",
-    "download_mb": "what server and processes took more at most while 10 M rows went out, of any kind of file",
+    "sky_ms": "densities in the cells of the files, median",
+    "tile_ms": "tile of 512 x 512 pixels of a cached image, median over its tiles",
+    "first_tile_ms": "first tile of a 4096 x 4096 image, which caches all tiles",
+    "server_gb": "memory of the server without its query processes",
+    "download_mb": "additional peak memory of server and processes during a download of 10 M rows in any format",
     **{f"download_{form}_mb_per_s": f"10 M rows as {form}" for form in FORMATS},
 }
 
 
 def random_columns(rows: int) -> list[np.ndarray]:
-    """Made columns, normal."""
+    """Return four columns of normally distributed random numbers."""
     rng = np.random.default_rng(1)
     return [rng.standard_normal(rows, np.float32) for _ in range(4)]
 
 
 def count_with_duckdb(columns: Sequence[np.ndarray]) -> None:
-    """The same counts, a query a chart."""
+    """Count the same charts by DuckDB, one query per chart."""
     with duckdb.connect() as session:
         session.register("t", pa.table({f"c{k}": column for k, column in enumerate(columns)}))
         lo, hi = SPAN
@@ -113,7 +113,20 @@ def count_with_duckdb(columns: Sequence[np.ndarray]) -> None:
 
 
 def time_counting(rows: int, many_rows: int, max_rows: int, repeats: int) -> dict[str, float]:
-    """Charts over kept columns."""
+    """Measure the counting of charts over cached columns.
+
+    Parameters
+    ----------
+    rows, many_rows, max_rows : int
+        Numbers of rows of the three sizes of tables, in ascending order.
+    repeats : int
+        Number of repeats.
+
+    Returns
+    -------
+    dict of str to float
+        The figures.
+    """
     few_columns = random_columns(rows)
     count_rows(few_columns, CHARTS, LIMITS)
     ours = report.best_time(lambda: count_rows(few_columns, CHARTS, LIMITS), repeats, time.process_time)
@@ -134,7 +147,7 @@ def time_counting(rows: int, many_rows: int, max_rows: int, repeats: int) -> dic
     figures["brush_50m_cpu_ms"] = 1e3 * report.best_time(
         make_answer(inspect_columns(many_columns)), repeats, time.process_time
     )
-    # Rows that are shown first are kept as columns of their own.
+    # The page caches the sample that it shows first as separate columns.
     sample = inspect_columns([column[::SUBSAMPLING].copy() for column in all_columns])
     figures["first_100m_ms"] = 1e3 * median_seconds(make_answer(sample, SUBSAMPLING), 5 * repeats)
     figures["whole_100m_cpu_s"] = report.best_time(
@@ -146,7 +159,7 @@ def time_counting(rows: int, many_rows: int, max_rows: int, repeats: int) -> dic
 
 
 def median_seconds(ask: Callable[[], Any], times: int) -> float:
-    """Median time, s."""
+    """Return the median wall time (s) of several calls."""
     seconds = []
     for _ in range(times):
         started = time.perf_counter()
@@ -156,21 +169,61 @@ def median_seconds(ask: Callable[[], Any], times: int) -> float:
 
 
 class PageClient:
-    """A connection to the page."""
+    """HTTP connection to the page with its cookie."""
 
     def __init__(self, port: int) -> None:
         self.connection, self.cookie = http.client.HTTPConnection("127.0.0.1", port), f"truesky-{port}={TOKEN}"
 
     def send(self, method: str, path: str, body: str | None = None) -> http.client.HTTPResponse:
+        """Send a request.
+
+        Parameters
+        ----------
+        method, path : str
+            Method and path of the request.
+        body : str, optional
+            Body of the request.
+
+        Returns
+        -------
+        http.client.HTTPResponse
+            The response.
+        """
         self.connection.request(method, path, body, {"Cookie": self.cookie})
         return self.connection.getresponse()
 
     def milliseconds(self, times: int, method: str, path: str, body: str | None = None) -> float:
+        """Return the median time of several equal requests.
+
+        Parameters
+        ----------
+        times : int
+            Number of requests.
+        method, path : str
+            Method and path of the request.
+        body : str, optional
+            Body of the request.
+
+        Returns
+        -------
+        float
+            Time in milliseconds.
+        """
         return 1e3 * median_seconds(lambda: self.send(method, path, body).read(), times)
 
 
 def make_lake(lake: Path, rows: int, side: int) -> None:
-    """A catalogue of cells of at most 1 M rows, and an image."""
+    """Make a lake with a catalogue in cells of at most 1 M rows, and an image.
+
+    Parameters
+    ----------
+    lake : Path
+        Folder of the lake.
+    rows : int
+        Number of rows of the catalogue.
+    side : int
+        Side of the image in pixels.
+    """
     lake.mkdir()
     cells = max(CELLS, rows // ROWS)
     publish.make_version(lake, catalogue_plan(cells, rows // cells), make_cell)
@@ -191,7 +244,24 @@ def make_lake(lake: Path, rows: int, side: int) -> None:
 
 
 def measure_server(lake: Path, rows: int, downloaded: int, side: int, repeats: int) -> dict[str, float]:
-    """A server over a made lake: asked over HTTP, and in a browser."""
+    """Measure a server over HTTP and in a browser.
+
+    Parameters
+    ----------
+    lake : Path
+        Folder of the lake to make.
+    rows, downloaded : int
+        Numbers of rows of the catalogue and of the downloads.
+    side : int
+        Side of the image in pixels.
+    repeats : int
+        Number of repeats.
+
+    Returns
+    -------
+    dict of str to float
+        The figures.
+    """
     make_lake(lake, rows, side)
     started = time.perf_counter()
     command = [sys.executable, "-m", "truesky.page", str(lake), "--no-open", "--token", TOKEN]
@@ -208,10 +278,10 @@ def measure_server(lake: Path, rows: int, downloaded: int, side: int, repeats: i
             figures["fill_1m_s"] = first_answer_seconds(client, f"/api/{key}", 1)
             figures["server_gb"] = psutil.Process(server.pid).memory_info().rss / 1e9
             if missing := _browser.missing_requirement():
-                print(f"page: no figures of the browser: {missing}")
+                print(f"page: the browser is not measured: {missing}")
             else:
                 figures |= _browser.time_brushes(address, 20 * repeats)
-            # A connection that was idle meanwhile has been closed.
+            # Use a new connection, because the server has closed the first one, which was idle.
             figures |= measure_downloads(PageClient(port), f"/api/{key}", server.pid, downloaded)
         finally:
             server.terminate()
@@ -221,7 +291,22 @@ def measure_server(lake: Path, rows: int, downloaded: int, side: int, repeats: i
 
 
 def first_answer_seconds(client: PageClient, lake: str, part: int) -> float:
-    """s of the first answer of four columns of a lake of which nothing is kept."""
+    """Return the wall time of the first request for four columns, with an empty cache.
+
+    Parameters
+    ----------
+    client : PageClient
+        Connection to the page.
+    lake : str
+        Path of the lake's addresses on the server.
+    part : int
+        1 for all rows, or SUBSAMPLING for a sample.
+
+    Returns
+    -------
+    float
+        Time in seconds.
+    """
     question = {**QUESTION, "source": "trial", "axes": ["ra", "dec", "x_0", "x_1"], "limits": [], "part": part}
     question["charts"] = [{**chart, "spans": None} for chart in QUESTION["charts"]]
     started = time.perf_counter()
@@ -232,7 +317,22 @@ def first_answer_seconds(client: PageClient, lake: str, part: int) -> float:
 
 
 def measure_large_lake(lake: Path, rows: int, repeats: int) -> dict[str, float]:
-    """A lake of many rows: the first answer of a sample, and a cone among them."""
+    """Measure a lake of many rows: the first request for a sample, and searches in a circle.
+
+    Parameters
+    ----------
+    lake : Path
+        Folder of the lake to make.
+    rows : int
+        Number of rows.
+    repeats : int
+        Number of repeats.
+
+    Returns
+    -------
+    dict of str to float
+        The figures.
+    """
     make_lake(lake, rows, QUICK_SIDE)
     command = [sys.executable, "-m", "truesky.page", str(lake), "--no-open", "--token", TOKEN]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
@@ -263,7 +363,24 @@ def measure_large_lake(lake: Path, rows: int, repeats: int) -> dict[str, float]:
 
 
 def time_requests(client: PageClient, lake: str, side: int, times: int) -> dict[str, float]:
-    """What the page asks all the time."""
+    """Time the frequent requests of the page.
+
+    Parameters
+    ----------
+    client : PageClient
+        Connection to the page.
+    lake : str
+        Path of the lake's addresses on the server.
+    side : int
+        Side of the image in pixels.
+    times : int
+        Number of requests of each kind.
+
+    Returns
+    -------
+    dict of str to float
+        Median times in milliseconds.
+    """
     client.send("POST", f"{lake}/sql", '{"sql": "SELECT 1"}').read()
     clock = time.perf_counter()
     client.send("GET", f"{lake}/tile/0/0/0/0").read()
@@ -278,7 +395,24 @@ def time_requests(client: PageClient, lake: str, side: int, times: int) -> dict[
 
 
 def measure_downloads(client: PageClient, lake: str, server: int, rows: int) -> dict[str, float]:
-    """Large results, read as they come; memory of the server and of its processes."""
+    """Measure the speed of large downloads, and the additional memory of the server and its processes.
+
+    Parameters
+    ----------
+    client : PageClient
+        Connection to the page.
+    lake : str
+        Path of the lake's addresses on the server.
+    server : int
+        Identifier of the process of the server.
+    rows : int
+        Number of rows to download.
+
+    Returns
+    -------
+    dict of str to float
+        Speeds in MB/s by format, and memory in MB.
+    """
     sql = quote(f"SELECT range AS id, range * 1.5 AS x, (range % 1000)::FLOAT AS y FROM range({rows})")
     figures, added_mb = {}, 0.0
     for form in FORMATS:
@@ -292,13 +426,13 @@ def measure_downloads(client: PageClient, lake: str, server: int, rows: int) -> 
 
 
 def process_memory(pid: int) -> int:
-    """Bytes of a process and those that it started."""
+    """Return the memory (bytes) of a process and all its descendants."""
     process = psutil.Process(pid)
     return sum(family_member.memory_info().rss for family_member in (process, *process.children(recursive=True)))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit status 0."""
+    """Run the benchmark and print the figures."""
     options = report.options("page", __doc__ or "", argv)
     rows, many_rows, max_rows = (
         (QUICK_ROWS, QUICK_MANY_ROWS, QUICK_MAX_ROWS) if options.quick else (ROWS, MANY_ROWS, MAX_ROWS)
@@ -307,7 +441,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     repeats = 1 if options.quick else 3
     figures = time_counting(rows, many_rows, max_rows, repeats)
     with tempfile.TemporaryDirectory() as folder:
-        # Nothing that is kept is found.
+        # Start with an empty cache.
         os.environ["TRUESKY_CACHE"] = f"{folder}/cache"
         figures |= measure_server(Path(folder) / "lake", rows, downloaded, side, repeats)
         figures |= measure_large_lake(

@@ -1,7 +1,7 @@
-"""Planning: seconds of a plan, errors of the forecast.
+"""Measure the time of planning and the errors of the forecast.
 
-Detectors of VIS and LSST are rendered as a job renders them, of three skies: the demo's, one of few sources and one of
-many stars. What they take are the costs in truesky/render/channels.
+Detectors of VIS and LSST are rendered as in a job, for three skies: the sky of the demo, one with few sources and one
+with many stars. The costs in truesky/render/channels come from this benchmark.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from truesky.request.schema import Request
 from truesky.running.task_metrics import peak_memory_gb, reset_peak_memory
 
 ROOT = Path(__file__).resolve().parents[1]
-# Rows of a crowded cell, and those of its columns that a detector reads.
+# Number of rows of a crowded cell, and number of columns that a detector reads.
 CELL_ROWS, CELL_COLUMNS = 1_200_000, len(visible_sources.GALAXY_COLUMNS)
-# What is changed of the demo: its sky is high above the Milky Way, with sources to I_E = 26.
+# Changes of the demo request, whose sky is far from the Galactic plane and has sources to I_E = 26.
 SKIES: dict[str, dict[str, Any]] = {
     "field": {},
     "sparse": {
@@ -49,20 +49,20 @@ SKIES: dict[str, dict[str, Any]] = {
         "products": {"truth": []},
     },
 }
-# VIS frames without a sky, and one with a lamp.
+# Types of VIS calibration frames: without a sky, and with a lamp.
 CALIBRATIONS = ("bias", "dark", "flat")
 _NOTES = {
-    "plan_s": "wall, 331 fields x 4 dithers, every detector of VIS and NISP (target 60)",
-    "plan_tasks": "their number",
-    "source_read_s": "wall, a detector's sources from a cell of 1.2 million rows (target 0.3)",
-    "seconds_error": "of the forecast against CPU s, the worst of all skies and channels (target 0.3)",
-    "memory_error": "against the peak of a worker (target 0.3)",
-    "bytes_error": "against the files (target 0.3)",
+    "plan_s": "wall, 331 fields x 4 dithers, all detectors of VIS and NISP (target 60)",
+    "plan_tasks": "number of these detectors",
+    "source_read_s": "wall, sources of a detector from a cell of 1.2 million rows (target 0.3)",
+    "seconds_error": "largest relative error of the forecast CPU time for all skies and channels (target 0.3)",
+    "memory_error": "the same for the peak memory of a worker (target 0.3)",
+    "bytes_error": "the same for the size of the files (target 0.3)",
 }
 
 
 def sky_request(sky_name: str, quick: bool) -> Request:
-    """The demo's request over one of the skies; of fewer sources where it must be quick."""
+    """Return the request of the demo with one of the SKIES; `quick` selects only bright sources."""
     table, change = tomllib.loads((ROOT / "requests" / "demo.toml").read_text()), SKIES[sky_name]
     table["pointing"] = [{**pointing, **change.get("pointing", {})} for pointing in table["pointing"][quick:]]
     table |= {key: value for key, value in change.items() if key in ("area", "products")}
@@ -76,7 +76,26 @@ def sky_request(sky_name: str, quick: bool) -> Request:
 
 
 def make_lake(folder: Path, sky_name: str, quick: bool, given_request: Request | None = None) -> tuple[Path, Request]:
-    """A lake with catalogues, fluxes and plan; own : a request to take in place of that of the sky."""
+    """Make a lake with catalogues, fluxes and plan.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder for the lake.
+    sky_name : str
+        Name of one of the SKIES.
+    quick : bool
+        Use a universe with bright sources only.
+    given_request : Request, optional
+        Use this request instead of the request of the sky.
+
+    Returns
+    -------
+    root : Path
+        Folder of the lake.
+    lake_request : Request
+        The request.
+    """
     root, lake_request = layout.resolve_lake(folder / sky_name), given_request or sky_request(sky_name, quick)
     for module in (build_galaxies, build_stars, compute_fluxes, plan_exposures):
         for step in module.steps(root, lake_request):
@@ -85,7 +104,7 @@ def make_lake(folder: Path, sky_name: str, quick: bool, given_request: Request |
 
 
 def time_planning(folder: Path, quick: bool) -> dict[str, float]:
-    """Seconds of the plan of the wide survey's fields."""
+    """Time the plan of the fields of the wide survey."""
     survey_request = parse(ROOT / "requests" / "sc8_main.toml")
     block = replace(survey_request.observations[0], fields=20 if quick else 331)
     survey_request = replace(survey_request, observations=(block,))
@@ -96,7 +115,22 @@ def time_planning(folder: Path, quick: bool) -> dict[str, float]:
 
 
 def measure_rendering(root: Path, lake_request: Request, name: str) -> dict[str, float]:
-    """What each detector takes, written and hashed, and by how much the forecast was wrong."""
+    """Render all detectors of a lake, and compare their costs with the forecast.
+
+    Parameters
+    ----------
+    root : Path
+        Folder of the lake.
+    lake_request : Request
+        Its request.
+    name : str
+        Prefix of the keys of the figures.
+
+    Returns
+    -------
+    dict of str to float
+        CPU time (s), peak memory (GB) and size (MB) by channel and image type, and relative errors of the forecast.
+    """
     step = render_exposures.steps(root, lake_request)[0]
     factor = speed.estimate_speed(root).factor
     out: dict[str, float] = {}
@@ -125,7 +159,7 @@ def measure_rendering(root: Path, lake_request: Request, name: str) -> dict[str,
 
 
 def _measure_task(function: Callable[[Task], Json], part: Task) -> tuple[Json, float, float]:
-    """What a worker says of a part: its receipt, CPU s, peak GB."""
+    """Run a task in a worker and return its receipt, CPU time (s) and peak memory (GB)."""
     reset_peak_memory()
     started = time.process_time()
     result = function(part)
@@ -133,14 +167,14 @@ def _measure_task(function: Callable[[Task], Json], part: Task) -> tuple[Json, f
 
 
 def time_reading(folder: Path, quick: bool) -> dict[str, float]:
-    """s, wall and CPU, to read a detector's generation cells from one file."""
+    """Return wall and CPU time (s) to read the generation cells of a detector from one file."""
     rows = 100_000 if quick else CELL_ROWS
     root = layout.resolve_lake(folder / "crowded")
     publish.make_version(root, bulk.catalogue_plan(1, rows), bulk.make_cell)
     version = read.version(root, bulk.TRIAL.name)
     names = [name for name in version.schema.names if not name.startswith("_")][:CELL_COLUMNS]
     place = version.rows(["ra", "dec"]).slice(rows // 2, 1).to_pylist()[0]
-    # A VIS detector and its margin.
+    # The circle contains a VIS detector and its margin.
     cells = sky.cells_in_cone(place["ra"], place["dec"], 0.1, GENERATION_ORDER).tolist()
     clocks = {"source_read_s": time.perf_counter, "source_read_cpu_s": time.process_time}
     return {
@@ -150,7 +184,7 @@ def time_reading(folder: Path, quick: bool) -> dict[str, float]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measures and prints everything."""
+    """Run the benchmark and print the figures."""
     options = report.options("planner", __doc__ or "", argv)
     quick = options.quick
     with tempfile.TemporaryDirectory() as name:

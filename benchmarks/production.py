@@ -1,8 +1,8 @@
-"""A production of the eighth science challenge: core-hours by channel and a square degree, and what surrounds them.
+"""Forecast a production for Euclid's eighth science challenge: core-hours by channel, per square degree, and overheads.
 
-The costs are those of the forecast, measured channel by channel on an Intel Xeon of 2.5 GHz (truesky/render/channels,
-python -m benchmarks.planner). Of each camera and band a dozen exposures, evenly spaced in the plan, are priced detector
-by detector, and stand for all.
+The costs are the costs of the forecast, measured for each channel on an Intel Xeon of 2.5 GHz (truesky/render/channels,
+python -m benchmarks.planner). For each camera and band, the cost of all exposures follows from all detectors of a dozen
+exposures that are evenly spaced in the plan.
 """
 
 from __future__ import annotations
@@ -25,30 +25,30 @@ from truesky.validation.lake.suite import inventory, running
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "production.json"
-# Exposures of a kind that are priced; sky of the main run, deg2 (Serrano et al. 2024).
+# Number of exposures of each kind whose cost is computed; area of the main run in deg2 (Serrano et al. 2024).
 _SAMPLE, AREA = 12, 165.0
 _EUCLID = ("VIS", "NISP-P", "NISP-S")
 _NOTES = {
-    "core_hours_deg2": "main run, all channels, survey accuracy, every effect (target 6; the paper 2433)",
-    "core_hours_deg2_euclid": "its three channels of Euclid (target 1.5)",
-    "main_core_hours": "over 165 deg2",
-    "deep_core_hours": "30 observations",
-    "pilot_core_hours": "with its calibrations",
-    "overhead_ms": "CPU of a task outside of its physics, the sum of the next three (target 30)",
-    "task_ms": "beyond its render and reading its sources, of the dearest detector; best of 15, in a warm worker",
-    "hand_out_ms": "wall, of an empty part through Spark with its Python workers",
-    "publish_ms": "CPU: its receipt read, its files listed in the manifest; of 2,000",
-    "speedup_2_cores": "what its serial share leaves of two cores (target 1.95)",
-    "serial_share": "of the CPU of a render of 16 detectors, after Java has started (target 0.025)",
-    "wall_2_cores": "16 detectors by the clock; said by a quiet machine alone",
-    "two_cores_cpu": "CPU of the same work on two cores over that on one",
-    "validation_s": "wall, two processes: all checks of a field's images and of its catalogues (target 120)",
-    "validation_detectors": "of VIS, NISP-P and NISP-S that were looked at",
+    "core_hours_deg2": "main run, all channels, survey accuracy, all effects (target 6; the paper 2433)",
+    "core_hours_deg2_euclid": "the three channels of Euclid (target 1.5)",
+    "main_core_hours": "main run over 165 deg2",
+    "deep_core_hours": "deep run of 30 observations",
+    "pilot_core_hours": "pilot run with its calibrations",
+    "overhead_ms": "CPU of a task outside rendering, the sum of the next three (target 30)",
+    "task_ms": "without rendering and reading sources, most expensive detector; best of 15, in a warm worker",
+    "hand_out_ms": "wall, dispatch of an empty task by Spark with Python workers",
+    "publish_ms": "CPU, reading the receipt and listing the files in the manifest; mean of 2,000",
+    "speedup_2_cores": "speed-up by two cores that follows from the serial share (target 1.95)",
+    "serial_share": "serial share of CPU time for 16 detectors, after the start of Java (target 0.025)",
+    "wall_2_cores": "speed-up by two cores for 16 detectors, wall time; only on an idle machine",
+    "two_cores_cpu": "CPU time of the same work on two cores / on one core",
+    "validation_s": "wall, two processes: all checks of images and catalogues of a field (target 120)",
+    "validation_detectors": "number of checked detectors of VIS, NISP-P and NISP-S",
 }
 
 
 def core_hours(name: str, sample: int = _SAMPLE) -> tuple[dict[str, float], dict[str, int]]:
-    """Of a shipped request by channel, of the ground by camera; and the exposures."""
+    """Return core-hours and numbers of exposures of a request in requests/, by channel of Euclid or ground camera."""
     request = parse(ROOT / "requests" / f"{name}.toml")
     mission = mission_of(request.mission)
     exposures_by_kind, plan = defaultdict(list), survey.exposures(request, mission)
@@ -89,7 +89,7 @@ def core_hours(name: str, sample: int = _SAMPLE) -> tuple[dict[str, float], dict
 
 
 def forecast_core_hours(quick: bool) -> dict[str, float]:
-    """Of the three productions; quick: of the deep field alone."""
+    """Return the core-hours of the three productions, or only of the deep field if `quick`."""
     out: dict[str, float] = {}
     for run in ("deep",) if quick else ("pilot", "deep", "main"):
         hours, counts = core_hours(f"sc8_{run}", 2 if quick else _SAMPLE)
@@ -105,9 +105,9 @@ def forecast_core_hours(quick: bool) -> dict[str, float]:
 
 
 def overhead(quick: bool) -> dict[str, float]:
-    """What a task and a run take besides their physics."""
+    """Measure the overhead of tasks and runs outside rendering."""
     with tempfile.TemporaryDirectory() as name:
-        # Detectors that have next to nothing on them, and those of the demo, eight times.
+        # Use detectors with almost no sources to measure a task, and eight copies of the demo for shares of CPU time.
         empty_request = replace(
             planner.sky_request("field", quick), universe=planner.sky_request("field", True).universe, observations=()
         )
@@ -130,7 +130,7 @@ def overhead(quick: bool) -> dict[str, float]:
 
 
 def time_validation(lake: Path) -> dict[str, float]:
-    """Seconds that the checks of a rendered field of Euclid take."""
+    """Time the checks of a rendered field of Euclid."""
     contents = inventory.read_contents(lake)
     shots = tuple(
         shot
@@ -143,8 +143,8 @@ def time_validation(lake: Path) -> dict[str, float]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Forecasts and prints."""
-    lake_help = "of a field of Euclid that is rendered, such as `make pilot` makes: its validation is timed"
+    """Run the benchmark and print the figures."""
+    lake_help = "also time the validation of this lake with a rendered field of Euclid, for example of `make pilot`"
     options = report.options("production", __doc__ or "", argv, lake=lake_help)
     figures = overhead(options.quick) | forecast_core_hours(options.quick)
     if options.lake is not None:

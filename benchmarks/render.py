@@ -1,6 +1,7 @@
-"""Drawing: seconds of a detector's sources, what others take for them, and the errors against galsim.
+"""Measure the drawing of sources: time per detector, comparison with other programs, and errors against galsim.
 
-Errors are of galaxies that no setting was chosen on, of the accuracy "survey" where a key names no other.
+The errors are measured on galaxies that were not used to choose the settings. They are for accuracy "survey" unless the
+key of a figure names another accuracy.
 """
 
 from __future__ import annotations
@@ -23,26 +24,27 @@ from truesky.render.drawing.settings import Settings, settings_for
 from truesky.render.psf import model
 from truesky.request import accuracy
 
-# Galaxies whose errors are quoted, by a seed of their own, of them sheared in pairs; galsim's, a magnitude bin.
+# Number of galaxies whose errors are measured, with a separate seed; fraction of them that is sheared in pairs; number
+# of galaxies per magnitude bin that galsim draws.
 NUM_TEST, PAIR_FRACTION, NUM_PEER = 204, 0.25, 8
 REPEATS = 2
 _SEED = 16
 _NOTES = {
-    "vis_survey_s": "CPU, every source of a VIS detector, each with its own chromatic PSF (target 4.2)",
-    "vis_draft_s": "(target 1.5)",
-    "vis_quicklook_s": "half of a draft's at most",
-    "lsst_survey_s": "(target 2.2)",
-    "psf_planes_cold_s": "the optics of a detector at 9 places and 8 wavelengths",
+    "vis_survey_s": "CPU, all sources of a VIS detector, each with its own chromatic PSF (target 4.2)",
+    "vis_draft_s": "the same at draft accuracy (target 1.5)",
+    "vis_quicklook_s": "the same at quicklook accuracy (target: at most half of draft)",
+    "lsst_survey_s": "CPU, all sources of an LSST detector (target 2.2)",
+    "psf_planes_cold_s": "CPU, PSF of a detector at 9 positions and 8 wavelengths",
     "psf_planes_warm_s": "the same from the cache",
-    "vis_vs_galsim_default": "galaxies; galsim with a PSF for each (target 60)",
-    "vis_vs_galsim_cached": "galaxies; galsim with one PSF, ours with its own for each (target 10)",
-    "vis_shared_vs_galsim_cached": "galaxies; both with one PSF (target 20)",
-    "vis_vs_ufig": "galaxies; UFig's photons through one grey Moffat",
-    "lsst_vs_ufig": "(target 2)",
-    "aperture_mag_rms": '1" aperture (target 1e-4)',
+    "vis_vs_galsim_default": "time of galsim / ours, galaxies; galsim with a separate PSF for each (target 60)",
+    "vis_vs_galsim_cached": "time of galsim with one PSF / ours with a separate PSF for each galaxy (target 10)",
+    "vis_shared_vs_galsim_cached": "time of galsim / ours, galaxies; both with one PSF (target 20)",
+    "vis_vs_ufig": "time of UFig's photons through one grey Moffat / ours, galaxies",
+    "lsst_vs_ufig": "the same for an LSST detector (target 2)",
+    "aperture_mag_rms": 'error in a 1" aperture (target 1e-4)',
     "aperture_mag_worst": "(target 1e-3)",
     "centroid_mas_rms": "(target 0.002)",
-    "r2_rms": "(target 1e-4), through the same PSF: how well that is known, truesky/render/drawing/psf_positions.csv",
+    "r2_rms": "with the same PSF (target 1e-4); errors of the PSF: truesky/render/drawing/psf_positions.csv",
     "r2_worst": "(target 1e-3)",
     "ellipticity_rms": "(target 2e-5)",
     "ellipticity_worst": "(target 1e-4)",
@@ -53,12 +55,31 @@ _NOTES = {
 
 
 def seconds(scene: Scene, settings: Settings, repeats: int, stars: bool = True, shared: bool = False) -> float:
-    """CPU s of all sources, or of the galaxies alone; `shared`: one PSF for all."""
+    """Return the CPU time to draw a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene.
+    settings : Settings
+        Settings of drawing.
+    repeats : int
+        Number of repeats; the shortest time counts.
+    stars : bool, optional
+        Draw stars as well as galaxies.
+    shared : bool, optional
+        Use one PSF for all sources.
+
+    Returns
+    -------
+    float
+        CPU time in seconds.
+    """
     sources, psf = scenes.sources(scene, 1, stars=None if stars else 0), _psf(scene, settings)
     if shared and psf.planes is not None:
         psf = scenes.psf_of_source(psf, sources, 0)
         sources = replace(sources, photons=None)
-    # The brightest are drawn in double precision, which is compiled on its own.
+    # Draw some of the brightest sources first: they use double precision, which is compiled separately.
     is_bright = sources.electrons >= np.sort(sources.electrons)[-3]
     scenes.draw_sources(sources.take(is_bright | (np.arange(len(sources)) % 500 == 0)), psf, scene, settings)
     return report.best_time(lambda: scenes.draw_sources(sources, psf, scene, settings), repeats, time.process_time)
@@ -69,7 +90,7 @@ def _psf(scene: Scene, settings: Settings) -> model.Psf:
 
 
 def psf_plane_seconds() -> tuple[float, float]:
-    """CPU s of a detector's PSF: its optics computed, and from the cache."""
+    """Return the CPU time (s) of the PSF of a detector: computed, and read from the cache."""
     out = []
     with cache.use_temporary_dir():
         for _ in range(2):
@@ -80,7 +101,7 @@ def psf_plane_seconds() -> tuple[float, float]:
 
 
 def times(quick: bool, repeats: int) -> dict[str, float]:
-    """All seconds, and the ratios of those that one run measured."""
+    """Return all times (s), and the ratios of times measured in the same run."""
     tiers = {name: settings_for(target) for name, target in accuracy.PRESETS.items()}
     out = {}
     for scene in (VIS, LSST):
@@ -106,7 +127,7 @@ def times(quick: bool, repeats: int) -> dict[str, float]:
 
 
 def accuracies(quick: bool, galaxies: int) -> dict[str, float]:
-    """All errors: of survey by their plain names, of others by scene and accuracy."""
+    """Return all errors: those at survey accuracy by their names, others with scene and accuracy as prefix."""
     num_galaxies, pairs = (6, 2) if quick else (galaxies, max(round(PAIR_FRACTION * galaxies), 1))
     names = ("survey",) if quick else ("quicklook", "draft", "survey", "reference")
     tiers = {name: settings_for(accuracy.preset(name)) for name in names}
@@ -115,7 +136,7 @@ def accuracies(quick: bool, galaxies: int) -> dict[str, float]:
         galsim_errors, bins, refused = errors.run_with_memory_limit(
             errors.against_galsim, scene, tiers, _SEED, num_galaxies
         )
-        print(f"{scene.name}: {len(bins)} galaxies against galsim, which refused {refused}; rms/worst")
+        print(f"{scene.name}: {len(bins)} galaxies compared with galsim, which failed for {refused} more; rms/worst")
         response, sheared_galaxies = errors.shear_response(scene, tiers, _SEED + 1, pairs)
         for name in names:
             errors.print_table(f"{scene.name} {name}", galsim_errors[name], bins)
@@ -138,10 +159,10 @@ def accuracies(quick: bool, galaxies: int) -> dict[str, float]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measures and prints everything."""
+    """Run the benchmark and print the figures."""
     extra_parser = argparse.ArgumentParser(add_help=False)
-    extra_parser.add_argument("--galaxies", type=int, default=NUM_TEST, help="galaxies that are held against galsim")
-    extra_parser.add_argument("--repeats", type=int, default=REPEATS, help="of every time, the best of which counts")
+    extra_parser.add_argument("--galaxies", type=int, default=NUM_TEST, help="galaxies to compare with galsim")
+    extra_parser.add_argument("--repeats", type=int, default=REPEATS, help="repeats; the shortest time counts")
     extra_options, other_arguments = extra_parser.parse_known_args(argv)
     options = report.options("render", __doc__ or "", other_arguments)
     repeats = 1 if options.quick else extra_options.repeats

@@ -1,8 +1,8 @@
-"""The main run of the eighth science challenge on 100 to 10,000 cores: its makespan, and what of ours breaks first.
+"""Simulate the main run of Euclid's eighth science challenge on 100 to 10,000 cores: makespan and bottlenecks.
 
-The tasks are those of requests/sc8_main.toml with their forecast seconds. What surrounds them is measured here: how
-fast Spark hands tasks out, what a part takes of the driver's memory, and how long it takes to publish tiny parts. From
-these a discrete-event simulation lays the tasks on cores of which some are slow and some die.
+The tasks and their forecast times follow from requests/sc8_main.toml. The benchmark measures the rate at which Spark
+dispatches tasks, the memory of the driver per task, and the time to publish tiny partitions. A discrete-event
+simulation then distributes the tasks to cores, some of which are slow or fail.
 """
 
 from __future__ import annotations
@@ -36,36 +36,48 @@ from truesky.running.submitted_job import _collect
 
 ROOT = Path(__file__).resolve().parents[1]
 CORES = (100, 300, 1000, 3000, 10_000)
-# Cores of a machine; of which share of machines each is how much slower, of few machines one; hours from death to death
-# of one, and until it is back.  One in fifty at half speed and a death in a thousand hours are worse than sites tell.
+# Cores per machine; fraction of slow machines (at least one machine), and their slowdown; mean time between failures of
+# a machine and its repair time, in hours. These values are more pessimistic than computing sites report.
 CORES_PER_MACHINE, SLOW_FRACTION, SLOWDOWN, MEAN_LIFE_H, REPAIR_H = 32, 0.02, 2.0, 1000.0, 0.2
-# Scatter of a detector's seconds about their forecast (natural logarithm), and s of a task beside its render.
+# Scatter of the actual time of a task around its forecast (natural logarithm), and overhead of a task in seconds.
 SCATTER, OVERHEAD_S = 0.25, 0.03
-# Files of a part as it is written: rows, image, head, truth, and its receipt; each is made, renamed and synced.
+# Number of files that a task creates, renames and syncs: rows, image, header, truth and receipt.
 FILES_PER_TASK = 5
 _NOTES = {
-    "tasks": "detectors of the main run, as planned",
-    "core_hours": "forecast, on the machine that costs were measured on",
-    "longest_s": "the longest task: no makespan is shorter",
-    "spark_tasks_per_s": "empty parts through the jobs' own map, local mode: each a task of Spark with a Python worker",
-    "java_tasks_per_s": "empty tasks of Java alone: the pace at which the driver hands out",
-    "java_kb_a_part": "the driver's Java, of a part, after the job",
-    "python_kb_a_part": "the driver's Python: the task's row and the part, while a job is prepared",
-    "publish_ms_a_part": "wall: receipts read, files listed, manifest written, receipts removed",
-    "publish_cpu_ms_a_part": "CPU of it",
-    "manifest_kb_a_part": "of the published version",
-    "manifest_load_ms_a_part": "CPU, once a process",
-    "manifest_held_kb_a_part": "memory of a process that has read it",
-    "manifest_peak_kb_a_part": "and while it reads",
+    "tasks": "planned detectors of the main run",
+    "core_hours": "forecast, on the machine where the costs were measured",
+    "longest_s": "forecast of the longest task, a lower limit of the makespan",
+    "spark_tasks_per_s": "empty tasks per second in local mode, with a Python worker",
+    "java_tasks_per_s": "empty tasks per second without Python: the rate at which the driver dispatches",
+    "java_kb_a_part": "memory of the driver's Java per task, after the job",
+    "python_kb_a_part": "memory of the driver's Python per task, while a job is prepared",
+    "publish_ms_a_part": "wall time per partition to read receipts, list files, write the manifest, remove receipts",
+    "publish_cpu_ms_a_part": "the same, CPU",
+    "manifest_kb_a_part": "size of the manifest per partition",
+    "manifest_load_ms_a_part": "CPU time per partition to load the manifest, once per process",
+    "manifest_held_kb_a_part": "memory per partition of the loaded manifest",
+    "manifest_peak_kb_a_part": "peak memory per partition while it is loaded",
 }
 
 
-# ------------------------------------------------------------------------------------------------ simulated
+# ------------------------------------------------------------------------------------------------ simulation
 
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """So many cores on machines, what a second of the driver hands out, and whether machines are slow or die."""
+    """A computing site.
+
+    Attributes
+    ----------
+    cores : int
+        Number of cores.
+    handed_out_per_s : float
+        Number of tasks that the driver dispatches per second.
+    slow_fraction : float
+        Fraction of machines that are slow.
+    mean_life_h : float
+        Mean time between failures of a machine in hours; infinity for no failures.
+    """
 
     cores: int
     handed_out_per_s: float
@@ -75,7 +87,19 @@ class Site:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """makespan : s;  busy : core-s of tasks that ended, of those that were lost;  again : tasks that ran twice"""
+    """Result of a simulation.
+
+    Attributes
+    ----------
+    makespan : float
+        Time from the first start to the last end of a task, in seconds.
+    busy : float
+        Core-seconds of completed tasks.
+    lost : float
+        Core-seconds of tasks that failures interrupted.
+    repeated : int
+        Number of interrupted tasks.
+    """
 
     makespan: float
     busy: float
@@ -83,20 +107,32 @@ class Outcome:
     repeated: int
 
     def efficiency(self, cores: int, seconds: float) -> float:
-        """Core-s of the tasks on machines that are not slow, over those that passed."""
+        """Return core-seconds of all tasks (on machines of normal speed) / core-seconds of the site during the run."""
         return seconds / (cores * self.makespan)
 
 
 def simulate(seconds: Float, site: Site, rng: np.random.Generator) -> Outcome:
-    """Tasks in their order, each on the core that is free first; what a machine's death interrupts is begun again.
+    """Simulate a run: each task runs on the core that is free first; tasks on a failing machine start again.
 
-    seconds : [n] of one core, in the order that they are handed out
+    Parameters
+    ----------
+    seconds : float array, shape (n,)
+        Times of the tasks on one core in seconds, in the order in which they are dispatched.
+    site : Site
+        The computing site.
+    rng : Generator
+        Random numbers for slow machines and failures.
+
+    Returns
+    -------
+    Outcome
+        Makespan and losses.
     """
     machines = -(-site.cores // CORES_PER_MACHINE)
     slow = np.isin(np.arange(machines), rng.permutation(machines)[: math.ceil(site.slow_fraction * machines)])
     death_time = rng.exponential(site.mean_life_h * 3600.0, machines)
     if np.isfinite(site.mean_life_h):
-        # However short a run is, one machine dies in its midst.
+        # Let one machine fail in the middle of the run, however short the run is.
         death_time[rng.integers(machines)] = 0.5 * seconds.sum() / site.cores
     free = [(0.0, core) for core in range(site.cores)]
     waiting = iter(range(len(seconds)))
@@ -116,7 +152,7 @@ def simulate(seconds: Float, site: Site, rng: np.random.Generator) -> Outcome:
         machine = core // CORES_PER_MACHINE
         duration = seconds[task] * (SLOWDOWN if slow[machine] else 1.0)
         while death_time[machine] < driver:
-            # It died while nothing ran on it.
+            # The machine failed while it was idle.
             death_time[machine] += rng.exponential(site.mean_life_h * 3600.0)
         if death_time[machine] < driver + duration:
             repeated += 1
@@ -131,7 +167,7 @@ def simulate(seconds: Float, site: Site, rng: np.random.Generator) -> Outcome:
 
 
 def task_orders(seconds: Float, exposures: Int) -> dict[str, Int]:
-    """Orders in which tasks may be handed out, by name: ours, as they are observed, the shortest first."""
+    """Return orders of tasks by name: longest first (as the jobs run), as observed, shortest first."""
     return {
         "longest": np.argsort(-seconds, kind="stable"),
         "observed": np.argsort(exposures, kind="stable"),
@@ -140,7 +176,25 @@ def task_orders(seconds: Float, exposures: Int) -> dict[str, Int]:
 
 
 def makespans(seconds: Float, exposures: Int, rate: float, cores: Sequence[int]) -> dict[str, float]:
-    """Of each number of cores and order: hours, efficiency; of ours also on machines that neither die nor are slow."""
+    """Simulate all numbers of cores and all orders of tasks.
+
+    Parameters
+    ----------
+    seconds : float array, shape (n,)
+        Forecast times of the tasks in seconds.
+    exposures : int array, shape (n,)
+        Numbers of their exposures.
+    rate : float
+        Number of tasks that the driver dispatches per second.
+    cores : sequence of int
+        Numbers of cores.
+
+    Returns
+    -------
+    dict of str to float
+        Hours and efficiency by number of cores and order. The order of the jobs is also simulated on a site without
+        slow machines and failures.
+    """
     actual_seconds = seconds * np.random.default_rng(1).lognormal(-0.5 * SCATTER**2, SCATTER, len(seconds)) + OVERHEAD_S
     figures = {}
     for num_cores in cores:
@@ -161,11 +215,11 @@ def makespans(seconds: Float, exposures: Int, rate: float, cores: Sequence[int])
     return figures
 
 
-# ------------------------------------------------------------------------------------------------ measured
+# ------------------------------------------------------------------------------------------------ measurements
 
 
 def planned_tasks(quick: bool) -> tuple[Float, Int, dict[str, float]]:
-    """Seconds and exposures of the main run's tasks; figures of the plan, and of what it takes in the driver."""
+    """Return forecast times (s) and exposures of the tasks of the main run, and figures of the plan."""
     request = parse(ROOT / "requests" / "sc8_main.toml")
     if quick:
         short_observations = tuple(
@@ -202,7 +256,7 @@ def _make_part(task: Json) -> Task:
 
 
 def time_dispatch(num_tasks: int) -> dict[str, float]:
-    """How many empty tasks a second pass, and what they leave in the driver's Java; in local mode."""
+    """Measure the rate of empty tasks in local mode, and the memory that they leave in the driver's Java."""
     spark = get_session("benchmark of the scheduler")
     java = spark.sparkContext._jvm
     task_list = [
@@ -233,7 +287,7 @@ def time_dispatch(num_tasks: int) -> dict[str, float]:
 
 
 def time_publishing(folder: Path, num_partitions: int) -> dict[str, float]:
-    """What it takes to publish so many parts whose files and receipts are there: tiny files, everything else real."""
+    """Measure the publication of `num_partitions` partitions whose tiny files and receipts exist already."""
     root = layout.resolve_lake(folder / f"lake-{num_partitions}")
     partitions = tuple(_make_part({"exposure_id": i // 36, "detector": f"{i % 36}"}) for i in range(num_partitions))
     plan = Plan(PRODUCTS, {"request": {"name": "tiny"}}, partitions)
@@ -284,7 +338,7 @@ _SHA256_OF_X = "2d711642b726b04401627ca9fbac32f5c8530fb1903cc4db02258717921a4881
 
 
 def draw_picture(figures: Json, file: Path) -> None:
-    """Hours and efficiency against cores, of the orders; file : PNG or JPEG."""
+    """Plot hours and efficiency against the number of cores for each order into a PNG or JPEG file."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -319,7 +373,7 @@ def draw_picture(figures: Json, file: Path) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measures, simulates and prints everything."""
+    """Run measurements and simulations, and print the figures."""
     options = report.options("scheduler", __doc__ or "", argv, picture=True)
     seconds, exposures, figures = planned_tasks(options.quick)
     figures |= time_dispatch(200 if options.quick else 4000)

@@ -1,9 +1,10 @@
-"""How fast the Milky Way is drawn, and is it the right one: python -m benchmarks.stars [--quick] [--json FILE].
+"""Measure speed and accuracy of the star catalogue: python -m benchmarks.stars [--quick] [--json FILE].
 
-stars_per_s_core   from the plan to the published table, CPU seconds of one core; with fluxes: in ten bands as well
-cell_peak_gb       the most crowded cell beside the plane and the bulge, drawn to H < 26, in a process of its own
-counts_*           the largest difference of star counts from those of the same laws, summed once by other code
-against_*          the real sky: published counts in the same band
+stars_per_s_core   stars per CPU second of one core, from the plan to the published table
+with_fluxes_...    the same with fluxes in ten bands
+cell_peak_gb       peak memory of a separate process that draws the most crowded cell outside the plane and the bulge
+counts_*           largest difference of star counts from sums of the same laws by independent code
+against_*          ratio to published counts of the real sky in the same band
 """
 
 from __future__ import annotations
@@ -36,14 +37,20 @@ from truesky.request.from_toml import from_table
 from truesky.validation.model import star_counts
 
 BANDS = [f"euclid_{b}" for b in ("vis", "y", "j", "h")] + [f"lsst_{b}" for b in "ugrizy"]
-# Stars to H < 26 at |b| > 20 deg by the same laws.
+# Number of stars with H < 26 at |b| > 20 deg by the same laws.
 SKY_20 = 2.65e9
 
 
 def pole_counts(v: float) -> float:
-    """Published stars deg-2 at the Galactic pole brighter than V.
+    """Return the published number of stars per deg2 at the Galactic pole brighter than V.
 
-    Error: 15 % (its authors); a factor of 2 low at V = 11.  Ref: Bahcall & Soneira 1980, eq. B1
+    Notes
+    -----
+    The error is 15 % according to the authors. At V = 11 the formula is a factor of 2 too low.
+
+    References
+    ----------
+    Bahcall & Soneira 1980, eq. B1
     """
     disc = 925.0 * 10.0 ** (0.035 * (v - 15.75)) / (1.0 + 10.0 ** (-0.132 * (v - 15.75))) ** 3
     spheroid = 1050.0 * 10.0 ** (0.087 * (v - 17.5)) / (1.0 + 10.0 ** (-0.18 * (v - 17.5))) ** 2.5
@@ -51,22 +58,22 @@ def pole_counts(v: float) -> float:
 
 
 def count_far_from_plane(step: int) -> float:
-    """Stars to expect to H < 26 at |b| > 20 deg, from every step-th cell."""
+    """Return the expected number of stars with H < 26 at |b| > 20 deg, from every `step`-th cell."""
     cells = np.arange(0, 12 << 2 * GENERATION_ORDER, step)
     _, b = sky.galactic(*sky.cell_centres(GENERATION_ORDER, cells))
     universe = stars.model()
-    # The published number is of systems.
+    # The published number counts systems, not components.
     single_stars = replace(universe.galaxy, companions=0.0 * universe.galaxy.companions)
     return float(stars.expected_counts(cells[np.abs(b) > 20.0], replace(universe, galaxy=single_stars)).sum() * step)
 
 
 def brighter_than_11(step: int, dust: Float32) -> float:
-    """Stars of the whole sky to expect with V < 11, behind the dust, from every step-th cell of order 4."""
+    """Return the expected number of stars with V < 11 on the sky, with dust, from every `step`-th cell of order 4."""
     return star_counts.count_whole_sky(stars.model(), 11.0, dust, step)
 
 
 def pole_figures(cells: int, dust: Float32) -> dict[str, float]:
-    """Stars deg-2 at both poles to V = 20 and G = 20 from the flux table, against published counts in the same band."""
+    """Count stars at both Galactic poles to V = 20 and G = 20 by their fluxes, and compare with published counts."""
     universe, library = stars.model(24.0), templates.stellar_library()
     zero_points = {"bessell_v": vega_magnitude(passbands.load("bessell_v")), "gaia_g": gaia.ab_minus_vega()[0]}
     drawn = star_counts.cells_at_latitude(90.0, cells, south=True)
@@ -78,7 +85,7 @@ def pole_figures(cells: int, dust: Float32) -> dict[str, float]:
             magnitudes[band].append(units.mag_of_f_nu(fluxes[f"f_nu_{band}"].to_numpy().astype(float)) - offset)
     v, g = (np.concatenate(magnitudes[band]) for band in zero_points)
     area = len(drawn) * star_counts.AREA
-    # The published counts in G: in bins of V, the part of our stars that is brighter than G = 20.
+    # Convert the published counts to G: weight bins of V by the fraction of our stars that is brighter than G = 20.
     edges = np.arange(8.0, 24.1, 0.5)
     bright_counts, _ = np.histogram(v[g < 20.0], edges)
     all_counts, _ = np.histogram(v, edges)
@@ -92,11 +99,11 @@ def pole_figures(cells: int, dust: Float32) -> dict[str, float]:
 
 
 def speed(radius: float) -> dict[str, float]:
-    """CPU seconds of the two jobs at b = 30 deg, without Spark."""
+    """Measure the two jobs for a circle of this radius (deg) at b = 30 deg, without Spark."""
     ra, dec = (float(x) for x in sky.equatorial(90.0, 30.0))
     table = {"name": "benchmark", "seed": star_counts.SEED, "area": {"cone": {"ra": ra, "dec": dec, "radius": radius}}}
     request = from_table({**table, "fluxes": {"bands": BANDS}})
-    # Libraries and machine code are made once, whatever is asked for.
+    # Make libraries and machine code before the clock starts, because they are made only once.
     curves = [passbands.load(band) for band in BANDS]
     libraries = templates.galaxy_library(), templates.stellar_library()
     band_fluxes.prepare(curves, [None] * len(curves), *libraries, request.accuracy)
@@ -131,7 +138,10 @@ print(rows, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6)
 
 
 def draw_crowded_cell(limit: float) -> int:
-    """Draw and publish the most crowded cell that is drawn without a limit of its own; returns its rows."""
+    """Draw and publish the most crowded cell outside the plane and the bulge, and return its number of rows.
+
+    The plane and the bulge have brighter limits.
+    """
     cells = np.arange(12 << 2 * GENERATION_ORDER)
     lon, lat = sky.galactic(*sky.cell_centres(GENERATION_ORDER, cells))
     before_bulge = np.abs((lon + 180.0) % 360.0 - 180.0) < stars.BULGE[0]
@@ -150,7 +160,7 @@ def draw_crowded_cell(limit: float) -> int:
 
 
 def crowded_cell_memory(limit: float) -> tuple[float, float]:
-    """Rows and peak memory, GB, of `crowded` in a process of its own."""
+    """Return rows and peak memory (GB) of `draw_crowded_cell` in a separate process."""
     root = Path(__file__).resolve().parents[1]
     done = subprocess.run(
         [sys.executable, "-c", _CROWDED, str(limit)], capture_output=True, text=True, check=True, cwd=root
@@ -160,7 +170,7 @@ def crowded_cell_memory(limit: float) -> tuple[float, float]:
 
 
 def run(quick: bool) -> dict[str, float]:
-    """All figures."""
+    """Return all figures."""
     dust = dust_map.load(star_counts.SEED)
     figures = speed(0.1 if quick else 1.0)
     figures["cell_rows"], figures["cell_peak_gb"] = crowded_cell_memory(16.0 if quick else 26.0)
@@ -181,17 +191,18 @@ def run(quick: bool) -> dict[str, float]:
 
 
 NOTES = {
-    "stars_per_s_core": "drawn and published; CPU seconds",
-    "with_fluxes_per_s_core": "and their fluxes in ten bands",
-    "cell_peak_gb": "the most crowded cell beside the plane and the bulge",
-    "sky_b20_off": "stars to H < 26 at |b| > 20 deg, against 2.65e9",
-    "sky_v11": "V < 11 on the whole sky; in reality 1e6",
-    "against_pole_v20": "against Bahcall & Soneira 1980, good to 15 %",
+    "stars_per_s_core": "stars drawn and published per CPU second",
+    "with_fluxes_per_s_core": "the same with fluxes in ten bands",
+    "cell_peak_gb": "peak memory of the most crowded cell outside the plane and the bulge",
+    "sky_b20_off": "stars with H < 26 at |b| > 20 deg, relative difference from 2.65e9",
+    "sky_v11": "stars with V < 11 on the whole sky; the real number is 1e6",
+    "against_pole_v20": "ratio to Bahcall & Soneira 1980, whose error is 15 %",
     "against_pole_g20": "the same in G",
 }
 
 
 def main(argv: Sequence[str] | None = None) -> int:
+    """Run the benchmark and print the figures."""
     options = report.options("stars", __doc__ or "", argv)
     report.print_and_write("stars", 1, run(options.quick), NOTES, options.json)
     return 0

@@ -1,9 +1,10 @@
-"""Speed for accuracy in drawing: the settings walked one process a point, and what others leave out.
+"""Measure time against accuracy of drawing, for a sequence of settings and for approximations of other programs.
 
-Settings are chosen on a sample of sources, against the same on the largest stamps in double precision; their errors are
-quoted of other sources, against galsim at its tightest: galaxies and stars, as many in every layer of magnitude. What
-galsim's default makes of these galaxies, and how far galsim's own parameters move it at its tightest, stands beside.
-Errors of approximations are against our own drawing at its best. The scene is VIS's.
+The settings are chosen on one sample of sources; the truth is a drawing on the largest stamps in double precision.
+Their errors are then measured on other sources, with equal numbers of galaxies and stars in each layer of magnitude;
+the truth is galsim with its tightest parameters. The benchmark also measures galsim with default parameters on these
+galaxies, and the change of galsim's images if one of the tight parameters is looser. Errors of approximations are
+relative to our most accurate drawing. The scene is a VIS detector. Each point is measured in a separate process.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from truesky.render.psf import model
 from truesky.render.sources.source_list import Sources
 
 Row = dict[str, str | float]
-# From quicklook to reference; then the survey's with one setting changed at a time.
+# Settings from quicklook to reference accuracy; then single changes of the settings for survey accuracy.
 _CHAIN = (
     Settings(0.5, 1e-2, 1e-1, 2.4, 1, 2),
     Settings(0.25, 4e-3, 3e-2, 4.0, 4, 4),
@@ -54,21 +55,21 @@ _CHANGED = (
     ("min_size_arcsec", 3.2),
     ("colours", 4),
 )
-# Of each layer of magnitude as many galaxies and stars: that the settings are chosen on, that the errors are quoted of;
-# of each, galaxies that are sheared in pairs. Galaxies that approximations are measured on, and their pairs.
+# Numbers of galaxies and of stars per layer of magnitude, to choose the settings and to test them; number of galaxies
+# in each sample that are sheared in pairs. Number of galaxies to measure approximations, and of their pairs.
 _NUM_CHOSEN, _NUM_TEST, _NUM_SHEARED, _NUM_QUOTED, _NUM_PAIRS = 3, 4, 12, 24, 18
 _CHOSEN_SEED, _TEST_SEED, _QUOTED_SEED, _SCENE_SEED = 12, 34, 21, 1
-# Seeds of the stars that the error of the PSF is of.
+# Seeds of the stars that measure the error of the PSF.
 _PSF_SEEDS = (5, 6)
-# Threshold of galsim's largest frequency: at 1e-4 its middles of bright discs are 3e-3 of the noise wrong.
+# Threshold of the largest frequency in galsim. With 1e-4 the centres of bright discs are wrong by 3e-3 of the noise.
 _MAXK_THRESHOLD = 1e-5
-# Galaxies fainter than this are small beside the frame.
+# Galaxies fainter than this are small compared with the frame.
 _SMALL = 20.0
-# galsim at its tightest but for one parameter each.
+# Names of cases with one looser parameter of galsim: threshold of folding, threshold of the largest frequency.
 _LOOSER_THRESHOLDS = (("folding 1e-3", 1e-3, _MAXK_THRESHOLD), ("largest frequency 1e-4", references.ACCURACY, 1e-4))
-# No approximation but the stamp, and that large; in double precision, as nothing may be left out.
+# The only approximation of the truth is a finite, large stamp. It is drawn in double precision.
 _TRUTH = Settings(edge=1e-6, aliased=1e-8, floor=0.0, min_size_arcsec=25.6, positions=9)
-# Magnitudes of a relative error.
+# Magnitudes per relative error of flux.
 _MAG = 1.0857362
 _NUMBERS = ("flux", "shape", "position", "background")
 _SETTINGS = f"""\
@@ -88,7 +89,7 @@ edge,aliased,floor,least,positions,colours,{",".join(_NUMBERS)},{",".join(f"{nam
 
 @dataclass(frozen=True)
 class Reference:
-    """One of a sample: itself, on frames that it is in the middle of, and its PSF; its image and response to shear."""
+    """A source of a sample in the middle of a frame, its PSF, its true image, and its response to shear if measured."""
 
     sources: Sources
     psf: model.Psf
@@ -97,11 +98,27 @@ class Reference:
 
     @property
     def is_star(self) -> bool:
+        """True if the source is a star."""
         return bool(self.sources.shape[0] < 0)
 
 
 def make_references(sources: Sources, num_pairs: int, maxk_threshold: float = 0.0) -> list[Reference]:
-    """Sources with the truth about them, the first galaxies' response too; highest : galsim's, if that is the truth."""
+    """Draw the true images of sources.
+
+    Parameters
+    ----------
+    sources : Sources
+        The sources.
+    num_pairs : int
+        Number of galaxies whose response to shear is measured.
+    maxk_threshold : float, optional
+        Threshold of galsim for the largest frequency. 0 uses our drawing on the largest stamps as truth.
+
+    Returns
+    -------
+    list of Reference
+        The sources in random order.
+    """
     full_psf, out = scenes.scene_psf(VIS), []
     order = np.random.default_rng(_CHOSEN_SEED).permutation(len(sources))
     for i in order:
@@ -130,7 +147,7 @@ def make_references(sources: Sources, num_pairs: int, maxk_threshold: float = 0.
 
 
 def _truth(source: Sources, psf: model.Psf, maxk_threshold: float) -> Float | None:
-    """Of a galaxy galsim's; a point has no profile that it would be needed for."""
+    """True image of a galaxy (by galsim) or of a star (by the Fourier series of its PSF)."""
     if source.shape[0] < 0:
         return references.image_by_series(source, psf, errors.COMPARED_SIDE)
     return references.reference_image(source, psf, errors.COMPARED_SIDE, maxk_threshold)
@@ -148,7 +165,26 @@ def compare(
     simplified: list[Reference],
     approximation: Approximation = NO_APPROXIMATION,
 ) -> tuple[Float, Float]:
-    """(errors [n, 5], m and c [pairs, 2]) of galaxies; others : the same as they are approximated, or themselves."""
+    """Measure the errors of galaxies that are drawn with an approximation.
+
+    Parameters
+    ----------
+    settings : Settings
+        Settings of drawing.
+    galaxies : list of Reference
+        The galaxies with their true images.
+    simplified : list of Reference
+        The galaxies to draw: the simplified ones, or the same.
+    approximation : Approximation, optional
+        The approximation. By default there is no approximation.
+
+    Returns
+    -------
+    errors : float array, shape (n, 5)
+        Errors by the names in `_errors.NAMES`.
+    bias : float array, shape (pairs, 2)
+        Bias (m, c) of the response to shear.
+    """
     error_values, bias = [], []
     for galaxy, simplified_galaxy in zip(galaxies, simplified, strict=True):
         image = approximation.draw(
@@ -177,9 +213,22 @@ def measure_settings(
     test_sample: list[Reference],
     psf_errors: Mapping[str, dict[str, float]],
 ) -> Row:
-    """Errors of settings: of the sources that they are chosen on, and of others.
+    """Measure the errors of settings for the sample used to choose them, and for the test sample.
 
-    psf_errors : "" and "_held": the largest errors of the PSF's own positions and colours
+    Parameters
+    ----------
+    settings : Settings
+        The settings.
+    chosen_sample, test_sample : list of Reference
+        The two samples.
+    psf_errors : mapping of str to dict
+        Largest errors from the finite numbers of positions and colours of the PSF, for "" (first sample) and "_held"
+        (test sample).
+
+    Returns
+    -------
+    dict
+        Errors by name; keys of the test sample end in `_held`.
     """
     row: Row = {}
     for kind, sample_part in (("", chosen_sample), ("_held", test_sample)):
@@ -195,7 +244,7 @@ def measure_settings(
 
 
 def _largest_errors(error_values: Float, bias: Float, is_star: Bool) -> dict[str, float]:
-    """Errors in the terms of an accuracy; found [n, 5] and bias [pairs, 2] of `compared`."""
+    """Largest errors by the names of an accuracy, from the errors [n, 5] and bias [pairs, 2] of `compare`."""
     worst = error_values.max(axis=0)
     return {
         "flux": float(np.expm1(worst[0] / _MAG)),
@@ -210,7 +259,24 @@ def _largest_errors(error_values: Float, bias: Float, is_star: Bool) -> dict[str
 def measure_approximation(
     approximation: Approximation, settings: Settings, repeats: int, quoted: list[Reference]
 ) -> Row:
-    """What an approximation buys and costs: seconds of its galaxies with and without, and errors."""
+    """Measure the times with and without an approximation, and its errors.
+
+    Parameters
+    ----------
+    approximation : Approximation
+        The approximation.
+    settings : Settings
+        Settings of drawing.
+    repeats : int
+        Number of repeats of each time.
+    quoted : list of Reference
+        Sample for approximations that apply to all galaxies.
+
+    Returns
+    -------
+    dict
+        `seconds_before` and `seconds` (CPU time without and with the approximation), and errors.
+    """
     n, pairs, num_timed = approximation.sample_sizes
     sources, full_psf = scenes.sources(VIS, _SCENE_SEED, stars=0), scenes.scene_psf(VIS)
     if num_timed:
@@ -223,7 +289,7 @@ def measure_approximation(
         quoted if approximation.select_galaxies is NO_APPROXIMATION.select_galaxies else make_references(sources, pairs)
     )
     simplified = [_simplify_galaxy(galaxy, sources, simple_psf, approximation) for galaxy in galaxies]
-    # Nothing but the approximation is wrong: the stamps are large, unless they are what is approximated.
+    # Use large stamps, so that the approximation is the only error, unless it approximates the sizes of stamps.
     settings_used = _TRUTH if approximation.sizes is NO_APPROXIMATION.sizes else settings
     return {**row, **_summary(*compare(settings_used, galaxies, simplified, approximation))}
 
@@ -231,7 +297,7 @@ def measure_approximation(
 def _simplify_galaxy(
     galaxy: Reference, sources: Sources, simple_psf: model.Psf, approximation: Approximation
 ) -> Reference:
-    """A galaxy of `some` as it is approximated; `less`: the detector's PSF as it is."""
+    """Simplify a galaxy of `sources`; `simple_psf` is the simplified PSF of the detector."""
     source = replace(approximation.simplify(galaxy.sources), photons=None)
     if approximation.simplify_psf is NO_APPROXIMATION.simplify_psf:
         return replace(galaxy, sources=source)
@@ -244,15 +310,18 @@ def _simplify_galaxy(
 def _seconds(
     sources: Sources, psf: model.Psf, settings: Settings, repeats: int, approximation: Approximation = NO_APPROXIMATION
 ) -> float:
-    """CPU s of sources on the scene's frame."""
-    # The brightest are drawn in double precision, which is compiled on its own.
+    """CPU time (s) to draw sources on the frame of the scene."""
+    # Draw some of the brightest sources first: they use double precision, which is compiled separately.
     is_bright = sources.electrons >= np.sort(sources.electrons)[-3:].min()
     approximation.draw(sources.take(is_bright | (np.arange(len(sources)) % 500 == 0)), psf, VIS, settings)
     return report.best_time(lambda: approximation.draw(sources, psf, VIS, settings), repeats, time.process_time)
 
 
 def time_settings(settings_list: Sequence[Settings], repeats: int) -> dict[Settings, float]:
-    """CPU s of the scene's sources by settings, each drawn in turn: what else the machine does is shared by all."""
+    """Return the CPU time (s) of the scene by settings.
+
+    All settings are drawn in turn, so that other load on the machine affects them equally.
+    """
     scene, out = scenes.sources(VIS, _SCENE_SEED), dict.fromkeys(settings_list, np.inf)
     for _ in range(repeats):
         for each in settings_list:
@@ -262,7 +331,7 @@ def time_settings(settings_list: Sequence[Settings], repeats: int) -> dict[Setti
 
 
 def measure_galsim(test_sample: list[Reference], num_per_bin: int) -> Row:
-    """galsim's default: seconds of the scene's galaxies, errors of the same galaxies as ours against the same truth."""
+    """Return time and errors of galsim with default parameters, for the galaxies and the truth that our errors use."""
     default, _ = peers.galsim_seconds(VIS, num_per_bin)
     galaxies = [reference for reference in test_sample if not reference.is_star]
     error_values = [
@@ -273,7 +342,7 @@ def measure_galsim(test_sample: list[Reference], num_per_bin: int) -> Row:
 
 
 def compare_oracles(test_sample: list[Reference]) -> Iterator[Row]:
-    """How far galsim's tightest is to be trusted: others that should be as good, against it, of the same galaxies."""
+    """Yield the differences between galsim with its tightest parameters and methods that should be as accurate."""
     galaxies = [reference for reference in test_sample if not reference.is_star]
     draw_functions: dict[str, Callable[[Reference], Float | None]] = {
         "ours, the largest stamps": lambda g: scenes.draw_sources(g.sources, g.psf, VIS, _TRUTH, errors.COMPARED_SIDE)
@@ -287,7 +356,7 @@ def compare_oracles(test_sample: list[Reference]) -> Iterator[Row]:
         images = [(draw_galaxy(reference), reference) for reference in galaxies]
         error_values = [errors.errors(image, g.image, VIS, g.sources) for image, g in images if image is not None]
         yield {"kind": "oracle", "name": name, **errors.figures(np.array(error_values)), "galaxies": len(error_values)}
-    # Of those that are small beside the frame, ours against the better of both.
+    # For galaxies that are small compared with the frame the Fourier series is the better truth.
     faint = [reference for reference in galaxies if float(scenes.magnitudes(reference.sources, VIS)[0]) > _SMALL]
     error_values = [
         errors.errors(draw_functions["ours, the largest stamps"](g), _draw_by_series(g), VIS, g.sources) for g in faint
@@ -306,7 +375,7 @@ def _draw_with_thresholds(reference: Reference, folding_threshold: float, maxk_t
 
 
 def measure_all(quick: bool, repeats: int) -> Iterator[Row]:
-    """A row a point, each in a process of its own."""
+    """Yield one row per point, each measured in a separate process."""
     chain = [_CHAIN[0], _CHAIN[_SURVEY]] if quick else _CHAIN
     changed = [] if quick else [Settings(**{**asdict(_CHAIN[_SURVEY]), name: value}) for name, value in _CHANGED]
     num_chosen, num_test, pairs = (1, 1, 2) if quick else (_NUM_CHOSEN, _NUM_TEST, _NUM_SHEARED)
@@ -356,7 +425,7 @@ def _format_row(row: Row) -> str:
 
 
 def write(rows: list[Row], file: Path) -> None:
-    """trade.csv: a column for every key, empty where a row has none."""
+    """Write the rows as CSV, with a column for every key; a field is empty if a row does not have the key."""
     names = list(dict.fromkeys(key for row in rows for key in row))
     with file.open("w", newline="", encoding="utf-8") as out:
         writer = csv.DictWriter(out, names, lineterminator="\n")
@@ -365,7 +434,7 @@ def write(rows: list[Row], file: Path) -> None:
 
 
 def settings_table(rows: list[Row]) -> str:
-    """The table that truesky.request.accuracy reads, of the rows of trade.csv."""
+    """Return the table of settings that truesky.request.accuracy reads, from the rows of trade.csv."""
     names = _SETTINGS.splitlines()[-1].split(",")
     setting_rows = [row for row in rows if row["kind"] == "settings"]
     lines = [",".join(f"{float(row[name]):.4g}" for name in names) for row in setting_rows]
@@ -373,7 +442,7 @@ def settings_table(rows: list[Row]) -> str:
 
 
 def draw_figure(rows: list[Row], file: Path) -> None:
-    """Seconds against the errors of flux, shape and position."""
+    """Plot time against the errors of flux, size, ellipticity and position."""
     from matplotlib.figure import Figure
 
     labels = {"aperture_mag_rms": 'flux in 1", mag', "r2_rms": "R², relative", "ellipticity_rms": "ellipticity"}
@@ -390,17 +459,17 @@ def draw_figure(rows: list[Row], file: Path) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Walks, prints and writes what is asked for."""
+    """Run the benchmark, print the figures and write the requested files."""
     extra_parser = argparse.ArgumentParser(add_help=False)
     extra_parser.add_argument("--csv", type=Path, metavar="FILE", help="write the points to this file")
-    extra_parser.add_argument("--figure", type=Path, metavar="FILE", help="draw seconds against errors")
+    extra_parser.add_argument("--figure", type=Path, metavar="FILE", help="plot time against errors")
     extra_parser.add_argument(
-        "--settings", type=Path, metavar="FILE", help="write the table that settings are chosen from"
+        "--settings", type=Path, metavar="FILE", help="write the table from which settings are chosen"
     )
     extra_parser.add_argument(
-        "--positions", type=Path, metavar="FILE", help="write the table of positions of the PSF alone"
+        "--positions", type=Path, metavar="FILE", help="write only the table of positions of the PSF"
     )
-    extra_parser.add_argument("--repeats", type=int, default=3, help="of every time, the best of which counts")
+    extra_parser.add_argument("--repeats", type=int, default=3, help="repeats; the shortest time counts")
     extra_options, other_arguments = extra_parser.parse_known_args(argv)
     options = report.options("trade", __doc__ or "", other_arguments)
     if extra_options.positions:
@@ -413,7 +482,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for row in measure_all(options.quick, repeats):
         rows.append(row)
         print(_format_row(row), flush=True)
-        # After every point: the walk is long.
+        # Write after every point, because the benchmark takes long.
         if extra_options.csv:
             write(rows, extra_options.csv)
     if extra_options.figure:

@@ -1,7 +1,8 @@
-"""A VIS detector with everything: seconds from the catalogue to the file, of each stage, and memory; an exposure of 36.
+"""Measure a VIS detector with all effects: CPU time from catalogue to file and of each stage, and memory.
 
-One process, one thread, the demo's field. Each time is of a process that has rendered before, as a worker has; "cold"
-is without the PSF's planes in the cache, "warm" with them. Everything: every effect of a science image is forced on.
+The benchmark uses one process and one thread, and the field of the demo. The process has rendered before, like a
+worker. "cold" is without the planes of the PSF in the cache, "warm" with them. All effects of a science image are
+forced on. An option also times an exposure of 36 detectors by Spark.
 """
 
 from __future__ import annotations
@@ -31,26 +32,26 @@ RESULTS = ROOT / "benchmarks" / "results" / "vis.json"
 _PRESETS = ("draft", "survey", "quicklook", "reference")
 # Folders of the PSF's planes in the cache.
 _PLANES = "vis_psf-*"
-# Which take what effects they ask for themselves, and all of them besides.
+# Accuracies that are measured with the effects that they select, and also with all effects.
 _FAST_PRESETS = ("quicklook", "draft")
-# Takes as long as all others together, and no other time depends on it.
+# This accuracy takes as long as all others together, so it is measured once.
 _SLOW_PRESET = "reference"
 _NOTES = {
-    "survey_cold_s": "CPU, catalogue to FITS, everything on, PSF planes computed (target 15)",
+    "survey_cold_s": "CPU, catalogue to FITS, all effects, PSF planes computed (target 15)",
     "survey_warm_s": "the same, PSF planes from the cache",
-    "draft_warm_s": "the same at draft accuracy, its own choice of effects (target 4)",
-    "draft_full_s": "the same with everything on",
-    "quicklook_warm_s": "at quicklook accuracy, its own choice of effects",
-    "quicklook_full_s": "the same with everything on, as draft_full_s",
-    "reference_cold_s": "at reference accuracy, everything on (target 60)",
-    "survey_needed_s": "warm, with the effects that the scene asks for",
-    "survey_cold_peak_gb": "largest memory of the process (target 2)",
+    "draft_warm_s": "the same at draft accuracy with the effects that it selects (target 4)",
+    "draft_full_s": "the same with all effects",
+    "quicklook_warm_s": "at quicklook accuracy with the effects that it selects",
+    "quicklook_full_s": "the same with all effects",
+    "reference_cold_s": "at reference accuracy with all effects (target 60)",
+    "survey_needed_s": "warm, with the effects that the scene needs",
+    "survey_cold_peak_gb": "peak memory of the process (target 2)",
     "exposure_s": "wall, 36 detectors by the Spark job on 2 cores (target 360)",
 }
 
 
 def demo_request(quick: bool) -> Request:
-    """The demo's VIS detector; of a brighter universe where it must be quick."""
+    """Return the request of the demo with its VIS detector; `quick` selects only bright sources."""
     parsed = parse(ROOT / "requests" / "demo.toml")
     parsed = replace(parsed, pointings=parsed.pointings[:1], bands=parsed.bands[:1], truth=())
     if quick:
@@ -60,14 +61,14 @@ def demo_request(quick: bool) -> Request:
 
 
 def with_all_effects(request: Request) -> Request:
-    """With every effect of a science image forced on."""
+    """Force all effects of a science image on."""
     names = [effect.name for effect in (vis.TRANSFER_EFFECT, *vis.SKY) if effect.optional]
     return replace(request, effects=Effects(on=tuple(names)))
 
 
 @contextmanager
 def record_stages(seconds: dict[str, float]) -> Iterator[None]:
-    """Adds up the CPU seconds of a render's stages and effects while it is open."""
+    """Add the CPU time of stages and effects of renderings within the context to `seconds`."""
     functions: tuple[tuple[Any, str, str], ...] = (
         (catalogue_rows, "read_sources", "read"),
         (visible_sources, "exposure_psf", "psf"),
@@ -89,11 +90,26 @@ def record_stages(seconds: dict[str, float]) -> Iterator[None]:
 
 
 def measure_detectors(folder: Path, quick: bool, repeats: int) -> dict[str, float]:
-    """All of a detector's figures."""
+    """Return all figures of a detector.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder for the lake and the files.
+    quick : bool
+        Use a universe with bright sources only.
+    repeats : int
+        Number of repeats.
+
+    Returns
+    -------
+    dict of str to float
+        The figures.
+    """
     request = demo_request(quick)
     root, out = make_lake(folder, request), {}
     full_task = plan_detector(root, with_all_effects(request))
-    measure_render(root, full_task, folder)  # Compiles, and fills the other caches.
+    measure_render(root, full_task, folder)  # Compile, and fill the other caches.
     for name in _PRESETS[:2] if quick else _PRESETS:
         variant = replace(request, accuracy=preset(name))
         facts = plan_detector(root, variant if name in _FAST_PRESETS else with_all_effects(variant))
@@ -109,7 +125,7 @@ def measure_detectors(folder: Path, quick: bool, repeats: int) -> dict[str, floa
         if name in _FAST_PRESETS:
             out[f"{name}_full_s"] = measure_render(root, plan_detector(root, with_all_effects(variant)), folder)[0]
         if name == "survey":
-            # With its planes still in the cache.
+            # The planes of the PSF are still in the cache.
             out["survey_needed_s"] = measure_render(root, plan_detector(root, request), folder)[0]
             stage_seconds: dict[str, float] = defaultdict(float)
             with record_stages(stage_seconds):
@@ -119,7 +135,7 @@ def measure_detectors(folder: Path, quick: bool, repeats: int) -> dict[str, floa
 
 
 def time_exposure(folder: Path, quick: bool) -> Mapping[str, float]:
-    """Wall s of the Spark job that renders all 36 detectors of an exposure; quick: two of a bright universe."""
+    """Return the wall time (s) of the Spark job for all 36 detectors of an exposure, or for two if `quick`."""
     block = (ROOT / "requests" / "demo.toml").read_text(encoding="utf-8").split("[[pointing]]")[1]
     pointing = "\n".join(line for line in block.splitlines() if not line.startswith(("centre_on", "detectors")))
     if quick:
@@ -129,12 +145,12 @@ def time_exposure(folder: Path, quick: bool) -> Mapping[str, float]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measures and prints everything."""
+    """Run the benchmark and print the figures."""
     extra_parser = argparse.ArgumentParser(add_help=False)
-    extra_parser.add_argument("--exposure", action="store_true", help="also a whole exposure by the Spark job")
-    extra_parser.add_argument("--only-exposure", action="store_true", help="the exposure alone")
+    extra_parser.add_argument("--exposure", action="store_true", help="also time an exposure by the Spark job")
+    extra_parser.add_argument("--only-exposure", action="store_true", help="time only the exposure")
     extra_parser.add_argument(
-        "--repeats", type=int, default=2, help="of every time, the best of which counts; reference: 1"
+        "--repeats", type=int, default=2, help="repeats (1 at reference accuracy); the shortest time counts"
     )
     extra_options, other_arguments = extra_parser.parse_known_args(argv)
     options = report.options("vis", __doc__ or "", other_arguments)

@@ -1,7 +1,7 @@
-"""A plan of the whole wide survey through spark-submit: its time, and what driver and workers hold at most.
+"""Plan the whole wide survey with spark-submit, and measure the time and the peak memory of driver and workers.
 
-Two caps about the Galactic poles, 34,000 fields with every exposure of Euclid's: 16 million detectors. Then the plan is
-read as its readers read it, and the memory of that measured, too.
+The survey consists of two caps around the Galactic poles: 34,000 fields with all exposures of Euclid, 16 million
+detectors. The benchmark then measures the memory of functions that read the plan.
 """
 
 from __future__ import annotations
@@ -38,18 +38,38 @@ channels = ["VIS", "NISP-P", "NISP-S"]
 fields = {fields}
 """
 _NOTES = {
-    "plan_s": "wall, with the start of Java (target 600 on two cores of a quiet machine)",
-    "driver_gb": "Python and Java of the driver, the largest of both together (target 2)",
-    "driver_python_gb": "of it Python alone",
-    "worker_gb": "the largest of a worker",
-    "forecast_gb": "what reading the whole plan for the forecast adds to a process",
-    "chosen_gb": "what choosing a detector of a thousand exposures adds",
+    "plan_s": "wall time with the start of Java (target 600 on two cores of an idle machine)",
+    "driver_gb": "peak memory of the driver, Python and Java together (target 2)",
+    "driver_python_gb": "peak memory of its Python process",
+    "worker_gb": "peak memory of a worker",
+    "forecast_gb": "memory to read the whole plan for the forecast",
+    "chosen_gb": "memory to select one detector of a thousand exposures",
 }
 _POLL_S = 0.5
 
 
 def measure_planner(folder: Path, fields: int, cores: int) -> dict[str, float]:
-    """The job, its clock, and the memory of its processes, looked at twice a second."""
+    """Run the planning job, and measure its wall time and the memory of its processes twice per second.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder for the request and the lake.
+    fields : int
+        Number of fields.
+    cores : int
+        Number of cores.
+
+    Returns
+    -------
+    dict of str to float
+        `plan_s`, `tasks`, `parts` and peak memory in GB.
+
+    Raises
+    ------
+    SystemExit
+        If the job fails.
+    """
     request, lake = folder / "wide.toml", folder / "lake"
     request.write_text(REQUEST.format(fields=fields))
     submit = shutil.which("spark-submit", path=str(Path(sys.executable).parent)) or "spark-submit"
@@ -74,7 +94,7 @@ def measure_planner(folder: Path, fields: int, cores: int) -> dict[str, float]:
 
 
 def _process_memory(pid: int) -> dict[str, float]:
-    """GB of the driver's Python and Java together, of its Python, of the largest worker."""
+    """Memory (GB) of the driver (Python and Java), of its Python process alone, and of the largest worker."""
     java = python = worker = 0.0
     for process_id in _process_tree(pid):
         try:
@@ -94,7 +114,7 @@ def _process_memory(pid: int) -> dict[str, float]:
 
 
 def _process_tree(pid: int) -> list[int]:
-    """The process and those that it started."""
+    """Identifiers of a process and all its descendants."""
     parents = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -108,7 +128,7 @@ def _process_tree(pid: int) -> list[int]:
 
 
 def added_memory(reader: Callable[[Path], None], lake: Path) -> float:
-    """GB that a reader adds to a process of its own."""
+    """Return the memory (GB) that a reader adds to this process. Call it in a new process."""
     reset_peak_memory()
     initial = peak_memory_gb()
     reader(lake)
@@ -116,13 +136,13 @@ def added_memory(reader: Callable[[Path], None], lake: Path) -> float:
 
 
 def sum_plan(lake: Path) -> None:
-    """Add up the whole plan."""
+    """Read the whole plan and sum its costs, as the forecast does."""
     speed.estimate_speed(lake)
     plan_exposures._print_published(lake, read.version(lake, "tasks"))
 
 
 def choose_detectors(lake: Path) -> None:
-    """Choose one detector of each of the last thousand exposures that have it."""
+    """Select one detector of each of the last thousand exposures that have it."""
     versions = {name: read.version(lake, name) for name in ("exposures", "tasks")}
     request = parse(lake.parent / "wide.toml")
     last = versions["exposures"].num_rows
@@ -131,7 +151,7 @@ def choose_detectors(lake: Path) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measures and prints."""
+    """Run the benchmark and print the figures."""
     options = report.options("wide_plan", __doc__ or "", argv)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -1,6 +1,7 @@
-"""The universe over hundreds of square degrees, to a bright limit: what a few cells hide in their own structure.
+"""Compare the universe over hundreds of square degrees with its model, down to a bright limit.
 
-halos and volume-limited galaxies of blocks of order-4 cells -> mass function, luminosity function, w(theta)
+The mass function, the luminosity function and the angular correlation w(theta) of halos and volume-limited galaxies
+are measured in blocks of order-4 cells, because structure dominates the statistics of a few small cells.
 """
 
 from __future__ import annotations
@@ -32,9 +33,16 @@ _MAX_MULTIPOLE = 8000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SkySample:
-    """What was drawn: one entry a halo, one a galaxy.
+    """Halos and galaxies of several blocks.
 
-    halos : z, log_mass, order-29 index;  galaxies : z, M_r, log_mass of the host, order-29 index
+    Attributes
+    ----------
+    blocks : list of int
+        HEALPix cells of order BLOCK_ORDER.
+    halos : tuple of array
+        Redshift, log_mass and order-29 index of each halo.
+    galaxies : tuple of array
+        Redshift, M_r, log_mass of the host halo and order-29 index of each galaxy.
     """
 
     blocks: list[int]
@@ -43,11 +51,12 @@ class SkySample:
 
     @property
     def area(self) -> float:
+        """Area of the blocks in deg2."""
         return len(self.blocks) * sky.cell_area(BLOCK_ORDER)
 
 
 def draw_sky(universe: Population, count: int) -> SkySample:
-    """`count` blocks spread over the sky."""
+    """Draw the halos and galaxies of `count` blocks spread over the sky."""
     num_blocks = 12 << 2 * BLOCK_ORDER
     blocks = np.linspace(0.04 * num_blocks, 0.97 * num_blocks, count).astype(int).tolist()
     columns: list[list[npt.NDArray[np.generic]]] = [[] for _ in range(7)]
@@ -80,7 +89,7 @@ def draw_sky(universe: Population, count: int) -> SkySample:
 
 
 def mass_function(universe: Population, sky_sample: SkySample) -> dict[str, float]:
-    """Found / expected halos above a mass that is complete."""
+    """Return the ratio of drawn to expected halos in bins of redshift, above a complete mass."""
     model, figures = universe.halos, {}
     z, mass, _ = sky_sample.halos
     for z_min, z_max, min_log_mass in (
@@ -98,7 +107,7 @@ def mass_function(universe: Population, sky_sample: SkySample) -> dict[str, floa
 
 
 def luminosity_ratios(universe: Population, sky_sample: SkySample) -> dict[str, float]:
-    """Found / expected galaxies brighter than what the limit reaches in any colour."""
+    """Return the ratio of drawn to expected galaxies, down to a magnitude where all colours are complete."""
     law, figures = luminosity_function.schechter(), {}
     z, m, _, _ = sky_sample.galaxies
     for z_centre, half_width in ((0.1, 0.07), (0.5, 0.1), (0.8, 0.15), (1.0, 0.2)):
@@ -115,9 +124,9 @@ def luminosity_ratios(universe: Population, sky_sample: SkySample) -> dict[str, 
 
 
 def correlation(universe: Population, sky_sample: SkySample) -> dict[str, float]:
-    """w(theta) of halos and of galaxies at 0.4 < z < 0.8 / Limber's, with the halos' linear bias.
+    """Compare w(theta) of halos and galaxies at 0.4 < z < 0.8 with Limber's equation and the linear bias of halos.
 
-    Densities are measured against the mean of the model, not of the blocks: there is no integral constraint.
+    Densities are relative to the mean of the model, not of the blocks, so there is no integral constraint.
     """
     model, figures = universe.halos, {}
     z, mass, index = sky_sample.halos
@@ -138,7 +147,7 @@ def correlation(universe: Population, sky_sample: SkySample) -> dict[str, float]
     mean = float(np.sum(density * model.steps.volume[steps])) * np.radians(1.0) ** 2 * sky_sample.area
     column = np.clip(np.searchsorted(model.log_mass, host[selected]) - 1, 0, model.x.shape[1] - 1)
     step = np.clip(np.searchsorted(model.steps.z, z[selected]), 0, model.steps.z.size - 1)
-    # Smooth in z: a line through the mean bias of the galaxies.
+    # Fit a line to the bias of the galaxies, because it varies smoothly with z.
     slope, level = np.polyfit(z[selected], model.x[step, column], 1)
     bias_growth = level + slope * model.steps.z[steps]
     return figures | _compare_to_limber(
@@ -160,7 +169,7 @@ def _compare_to_limber(
 
 
 def _angular_correlation(blocks: Sequence[int], index: Int, mean: float) -> tuple[Float, Float]:
-    """w in bins of EDGES from pairs of pixels, and its error from the scatter of the blocks."""
+    """Measure w in bins of EDGES from pairs of pixels, and its error from the scatter between blocks."""
     pixels = 4 ** (PIXEL_ORDER - BLOCK_ORDER)
     pixel = index >> 2 * (sky.MAX_ORDER - PIXEL_ORDER)
     each = np.empty((2, len(blocks), EDGES.size - 1))
@@ -180,7 +189,10 @@ def _angular_correlation(blocks: Sequence[int], index: Int, mean: float) -> tupl
 
 
 def _limber_correlation(chi: Float, density: Float, bias_growth: Float) -> Float:
-    """w of the pixels' counts, the mean over each bin.  density : [s] comoving;  growing : [s] bias times growth"""
+    """Expected w of counts in pixels, averaged over each bin, by Limber's equation.
+
+    `density` is the comoving density and `bias_growth` bias times growth, both at the distances `chi`.
+    """
     weight = density * chi**2
     weight = weight / np.trapezoid(weight, chi)
     ell = np.geomspace(1.0, _MAX_MULTIPOLE, 500)
@@ -204,7 +216,7 @@ def _select_bins(model: halos.HaloModel, z_min: float, z_max: float, min_log_mas
 
 
 def _faintest_magnitude(universe: Population, z_min: float, z_max: float) -> float:
-    """M_r to which galaxies between two redshifts are complete: above the mass limit's magnitude, all are drawn."""
+    """Magnitude M_r to which galaxies between two redshifts are complete, given the mass limit of halos."""
     model = universe.halos
     steps = (model.steps.z > z_min) & (model.steps.z < z_max)
     limits = model.matching.magnitude(model.steps.z[steps], model.limit[steps])
@@ -212,5 +224,5 @@ def _faintest_magnitude(universe: Population, z_min: float, z_max: float) -> flo
 
 
 def drawn_from(seed: int, box_cells: int) -> Population:
-    """The population that is drawn."""
+    """Return the population of halos and galaxies for a seed and a box of this number of cells."""
     return galaxies.halos_and_galaxies(seed, Universe(galaxy_limit=LIMIT, box_cells=box_cells))

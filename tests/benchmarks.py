@@ -1,4 +1,4 @@
-"""Benchmarks as a user runs them: in a process of their own, whose memory is theirs alone."""
+"""Run benchmarks as a user does: in a separate process, so that its memory is measured correctly."""
 
 import subprocess
 import sys
@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def run(name, *options):
-    """`python -m benchmarks.<name>` with these options; its exit status must be 0."""
+    """Run `python -m benchmarks.<name>` with options; its exit status must be 0."""
     command = [sys.executable, "-m", f"benchmarks.{name}", *map(str, options)]
     done = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,4 @@
-"""The benchmark of the ground cameras in haste; and a whole exposure of LSSTCam."""
+"""The benchmark of the ground cameras with --quick, and a whole exposure of LSSTCam."""
 
 import json
 
@@ -10,7 +10,7 @@ from truesky.request.from_toml import parse
 
 
 def test_a_field_that_all_sites_see(tmp_path):
-    """Requests that are right; what is asked for of a detector is everything."""
+    """The requests are valid, and all effects of a detector are requested."""
     file = tmp_path / "ext.toml"
     file.write_text(benchmark.request_text(tuple(benchmark.CAMERAS.values()), 0.2))
     wanted = parse(file)
@@ -30,7 +30,7 @@ def test_the_figures(tmp_path):
     figures = json.loads(file.read_text())
     assert {"lsst_survey_s", "lsst_draft_s", "decam_survey_s", "lsst_peak_gb", "effect_bleeding_s"} <= set(figures)
     assert {"gpc1_s_error", "memory_error"} <= set(figures)
-    # However few the sources: what its effects take is in it.
+    # The time of the effects is included, however few the sources are.
     assert 0.2 < figures["lsst_survey_s"] < 15.0
     assert 0.3 < figures["lsst_peak_gb"] < 2.0
 
@@ -38,7 +38,7 @@ def test_the_figures(tmp_path):
 @pytest.mark.spark
 @pytest.mark.nightly
 def test_a_whole_exposure_of_lsstcam(tmp_path):
-    """189 sensors, planned and rendered at draft accuracy on 2 cores: 12 minutes are asked for.
+    """189 sensors are planned and rendered at draft accuracy on 2 cores. The target is 12 minutes.
 
     Of the processor, whatever else it does.
     """

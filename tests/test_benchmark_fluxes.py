@@ -1,4 +1,4 @@
-"""The benchmark in haste: its figures, on a thousandth of its objects; accuracy holds whatever the machine."""
+"""The benchmark of fluxes with --quick: figures of few objects. The accuracy does not depend on the machine."""
 
 import json
 import shutil
@@ -28,7 +28,7 @@ def figures(tmp_path_factory):
     return json.loads(file.read_text())
 
 
-def test_the_keys_are_there(figures):
+def test_all_figures_are_present(figures):
     assert set(KEYS) <= set(figures)
     assert {"name", "commit", "machine", "repeats"} <= set(figures)
     assert figures["name"] == "fluxes"
@@ -43,7 +43,7 @@ def test_the_accuracy_holds_on_galaxies_that_were_not_used_to_choose(figures):
 
 
 def test_speclite_agrees(figures):
-    # Synthetic photometry by independent code, of the same spectra.
+    # speclite is independent code for synthetic photometry of the same spectra.
     assert 0.0 < figures["oracle_mag_max"] <= 1e-4
 
 
@@ -63,7 +63,7 @@ def results(tmp_path, monkeypatch):
 
 
 def check(printed, written):
-    """Nothing but what the benchmark wrote: another number in its file is another number in the notebook."""
+    """The notebook shows the numbers of the benchmark: changed numbers in the files appear in it."""
     assert "galaxies_per_s_core          1.234e+05" in printed
     assert "vis_survey_s                 12.34" in printed
     assert f"{written['speedup_vs_integration']:.4g}" in printed
@@ -71,7 +71,7 @@ def check(printed, written):
 
 
 def test_the_notebook_shows_what_was_measured(results, capsys):
-    """Its cells that tell the two files, here."""
+    """Run the cells that read the two files."""
     cells = [cell.source for cell in nbformat.read(NOTEBOOK, as_version=4).cells if cell.cell_type == "code"]
     plt.switch_backend("Agg")
     names, before = {}, set(plt.get_fignums())

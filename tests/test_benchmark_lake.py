@@ -1,4 +1,4 @@
-"""The benchmark of the lake in haste: the figures are there, and the bytes, which no load can spoil, are few."""
+"""The benchmark of the lake with --quick: all figures are present, and files are small."""
 
 import json
 
@@ -24,7 +24,7 @@ def test_the_figures(tmp_path):
 
 
 def test_a_row_is_smaller_than_with_defaults(tmp_path):
-    """Bytes depend on no other load: the goal is 170 for these 50 columns."""
+    """The size does not depend on the load of the machine. The target is 170 bytes for these 50 columns."""
     import pyarrow.parquet as pq
 
     from lake_schema.store import parquet

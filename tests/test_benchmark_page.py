@@ -1,4 +1,4 @@
-"""The benchmark of the page in haste: the figures are there."""
+"""The benchmark of the page with --quick: all figures are present."""
 
 import json
 
@@ -18,6 +18,6 @@ def test_the_figures(tmp_path):
     )
     assert set(benchmark.NOTES) - browsers <= set(figures)
     assert all(figures[key] >= 0 for key in set(benchmark.NOTES) - browsers)
-    # What no load spoils: memory.
+    # Memory does not depend on the load of the machine.
     assert figures["server_gb"] < 0.5
     assert figures["download_mb"] < 300

@@ -1,4 +1,4 @@
-"""The forecast of a production: of a few exposures as of all of them."""
+"""The forecast of a production from a few exposures agrees with the forecast from all."""
 
 import pytest
 
@@ -6,8 +6,8 @@ from benchmarks import production as benchmark
 from tests.truesky.validation.lake.suite import lakes
 
 
-def test_a_few_exposures_stand_for_all():
-    """Each field of the deep one is like the others: to a few hundredths what all of them take."""
+def test_a_few_exposures_represent_all():
+    """The fields of the deep run are similar, so a few give the costs of all within a few per cent."""
     few, counts = benchmark.core_hours("sc8_deep", 2)
     assert counts == {"VIS": 120, "NISP-P": 360, "NISP-S": 120}
     some, _ = benchmark.core_hours("sc8_deep", 6)

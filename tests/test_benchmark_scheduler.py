@@ -1,4 +1,4 @@
-"""The simulated scheduler against what can be counted by hand."""
+"""The simulated scheduler agrees with cases that can be counted by hand."""
 
 import math
 
@@ -29,20 +29,20 @@ def test_a_long_task_that_comes_last_is_waited_for():
     assert ran(seconds[::-1], 10).makespan == pytest.approx(50.0)
 
 
-def test_the_driver_hands_out_one_task_after_the_other():
+def test_the_driver_dispatches_one_task_after_another():
     found = ran(np.full(1000, 1.0), 10_000, rate=100.0)
     assert found.makespan == pytest.approx(1000 / 100.0 + 1.0)
 
 
-def test_one_machine_of_four_is_slow_where_few_are():
+def test_at_least_one_machine_is_slow():
     found = ran(np.full(40_000, 1.0), 4 * CORES_PER_MACHINE, slow=0.02)
     per_core = 40_000 / (CORES_PER_MACHINE * (3.0 + 1.0 / SLOWDOWN))
     assert found.makespan == pytest.approx(per_core, rel=0.01)
 
 
-def test_what_a_death_interrupts_is_done_again():
+def test_interrupted_tasks_run_again():
     found = ran(np.full(4 * CORES_PER_MACHINE, 100.0), 4 * CORES_PER_MACHINE, lives_h=1e9)
-    # In the midst of the only tasks: others take them up when they are through with their own.
+    # The failure comes in the middle of the tasks. Other machines take them when their tasks are done.
     assert (found.repeated, found.lost) == (CORES_PER_MACHINE, pytest.approx(50.0 * CORES_PER_MACHINE))
     assert found.makespan == pytest.approx(200.0)
     assert REPAIR_H * 3600.0 > 100.0

@@ -1,4 +1,4 @@
-"""The price of accuracy: what others leave out, done to our drawing, is measured; settings are what was measured."""
+"""The benchmark of time against accuracy: approximations are measured, and the table of settings is up to date."""
 
 import csv
 from pathlib import Path
@@ -29,10 +29,10 @@ def test_the_settings_are_those_that_were_measured():
     assert trade.settings_table(rows()) == Path(accuracy.__file__).with_name("accuracy.csv").read_text()
 
 
-def test_what_the_sources_were_held_against_is_told():
-    """The oracle's own error stands beside; galsim's default is held against the same images as ours.
+def test_errors_of_the_truth_are_measured():
+    """The error of the truth is measured, and galsim's default is compared with the same images as ours.
 
-    What parts us from galsim at its tightest is how it knows the PSF between its samples: without that we agree.
+    We differ from galsim with tight parameters only by its interpolation of the PSF between samples.
     """
     told = {row["name"]: row for row in rows() if row["kind"] == "oracle"}
     assert "ours, the largest stamps" in told
@@ -52,7 +52,7 @@ def test_a_stratified_sample_has_bright_and_faint_galaxies_and_stars():
     for of in (star, ~star):
         counts, _ = np.histogram(magnitudes[of], scenes.LAYERS)
         assert (counts == 2).all()
-    # Not the same as another seed's.
+    # Another seed gives other sources.
     assert not np.isin(magnitudes, scenes.magnitudes(scenes.stratified_sample(VIS, 4, 2), VIS)).any()
 
 
@@ -62,7 +62,7 @@ def test_every_approximation_was_measured():
 
 @pytest.mark.parametrize("name", list(BY_NAME))
 def test_an_approximation_keeps_what_it_should(name):
-    """Sources, places and light stay; the galaxies are those it is meant for."""
+    """Sources, positions and light do not change, and the approximation applies to the selected galaxies."""
     approximation = BY_NAME[name]
     some = approximation.select_galaxies(VIS, 3, 6)
     simple = approximation.simplify(some)
@@ -82,7 +82,7 @@ def test_an_approximation_keeps_what_it_should(name):
 
 
 def test_stamps_of_a_folding_threshold_hold_all_but_that():
-    """Of a point, against the PSF itself: the rest lies beyond half the stamp."""
+    """The fraction of the PSF outside the stamp is below the folding threshold."""
     some, psf = scenes.sample(VIS, 3, 6), scenes.scene_psf(VIS, 1)
     settings = settings_for(SURVEY)
     sizes = BY_NAME["folding threshold 0.5 %"].sizes(some, psf, VIS, settings)
@@ -91,7 +91,7 @@ def test_stamps_of_a_folding_threshold_hold_all_but_that():
 
 
 def test_sampling_down_and_up_keeps_a_plane():
-    """A biquadratic interpolation is exact where light changes evenly."""
+    """A biquadratic interpolation is exact if the light varies linearly."""
     y, x = np.mgrid[:32, :32]
     plane = 5.0 + 0.3 * x - 0.1 * y
     found = BY_NAME["sampled down and up"].process_image(plane)
@@ -99,7 +99,7 @@ def test_sampling_down_and_up_keeps_a_plane():
 
 
 @pytest.mark.nightly
-def test_the_walk_in_haste(tmp_path):
+def test_the_quick_benchmark(tmp_path):
     run("trade", "--quick", "--csv", tmp_path / "t.csv", "--figure", tmp_path / "t.png")
     assert (tmp_path / "t.png").stat().st_size > 10_000
     with (tmp_path / "t.csv").open() as file:

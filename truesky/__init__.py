@@ -1,12 +1,10 @@
-"""A mock sky, from dark-matter haloes to raw detector images.
+"""Simulate the Euclid sky, from dark-matter haloes to raw detector images.
 
-open        read the tables and images of a lake
-run         compute everything that a request asks for
-check       report what is wrong with a request
-accuracies  what each named accuracy allows, reaches and costs
-plots       draw what `Lake.hist`, `Lake.heatmap` and `Lake.skymap` count
-Lake, Image, Request             results of `open`, of `Lake.image` and of `check`
-LakeError, BadInput, Damaged     errors; the first is the base class of the others
+`check` validates a request and returns a `Request`; `run` computes its catalogues, fluxes, plan and images and stores
+them in a lake. `open` opens a lake for reading and returns a `Lake`, whose method `image` returns an `Image`.
+`accuracies` lists the errors and costs of the named accuracies. The module `plots` draws the results of `Lake.hist`,
+`Lake.heatmap` and `Lake.skymap`. All errors derive from `LakeError`: `BadInput` for invalid input, `Damaged` for files
+whose content has changed.
 """
 
 from __future__ import annotations
@@ -30,7 +28,7 @@ __all__ = [
     "plots", "run",
 ]  # fmt: skip
 
-# Loaded when they are first used: together they take seconds to import.
+# Import these on first use, because together they take seconds.
 _LAZY_IMPORTS: dict[str, tuple[str, str | None]] = {
     "Image": ("lake_schema.fits.images", "Image"),
     "Lake": ("truesky.api.lake", "Lake"),

@@ -51,7 +51,7 @@ def docstring_lines(node):
 
 def lines_of_code(text):
     """Return the number of lines of a file outside docstrings."""
-    documented = (ast.Module, ast.ClassDef, ast.FunctionDef)
+    documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
     docstrings = (docstring_lines(node) for node in ast.walk(ast.parse(text)) if isinstance(node, documented))
     return len(text.splitlines()) - sum(docstrings)
 

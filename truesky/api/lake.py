@@ -26,8 +26,8 @@ _MAX_INT64 = 2**63 - 1
 class Lake(LakeTables):
     """A lake, opened for reading.
 
-    All methods see the tables as they were when the lake was opened, whatever is published later. Use a `with` block,
-    or call `close`, to end the process that answers queries.
+    All methods use the tables as they were when the lake was opened, even if newer versions are published later. Use a
+    `with` block, or call `close`, to end the process that answers queries.
 
     Several threads may use the same lake. One process answers its queries one after the other, so open the lake once
     per thread to run queries at the same time. `close` also ends queries that other threads are waiting for; these
@@ -115,7 +115,7 @@ class Lake(LakeTables):
         Returns
         -------
         list of Image
-            One per extension of the FITS file, the first with the header that holds for all. `data` is None if an
+            One per extension of the FITS file. The first has the header that applies to all. `data` is None if an
             extension has no array.
         """
         return images.read_images(self._explorer._version("products").sidecar_path(path))
@@ -140,7 +140,7 @@ class Lake(LakeTables):
         cards = read_back.header(self._explorer._version("products").sidecar_path(path))
         header = {keyword: value for keyword, value, _ in cards}
         with warnings.catch_warnings():
-            # astropy reports that it understands the date.
+            # astropy warns even if it only normalises the date.
             warnings.simplefilter("ignore", FITSFixedWarning)
             return WCS(header)
 
@@ -171,8 +171,8 @@ class Lake(LakeTables):
         Raises
         ------
         BadInput
-            At the call, if there is no such image, it is not dispersed, or the spectrum of a source cannot reach the
-            detector.
+            If there is no such image, it is not dispersed, or the spectrum of a source cannot reach the detector. The
+            error is raised by the call, before the first source is drawn.
         """
         from truesky.render import models
 

@@ -43,7 +43,7 @@ def check(request: str | Path | Mapping[str, Any]) -> Request:
     Raises
     ------
     BadInput
-        If any job would refuse the request. The message names the key and what is allowed.
+        If any job would refuse the request. The message names the key and the allowed values.
 
     Examples
     --------
@@ -68,7 +68,7 @@ def run(
     lenses: bool = False,
     gaia: bool = False,
 ) -> Lake:
-    """Compute everything that a request asks for: catalogues, fluxes, the plan of the exposures, images.
+    """Run all jobs of a request: catalogues, fluxes, the plan of the exposures and images.
 
     The jobs share one Spark session: the active one of this process, else a local session. Tables that the lake
     already has are kept, so a second call continues where an interrupted one ended.
@@ -121,15 +121,15 @@ def run(
 
 
 def accuracies() -> pd.DataFrame:
-    """List what each named accuracy allows, reaches and costs in the drawing of sources.
+    """List the allowed errors, the measured errors and the cost of drawing sources for each named accuracy.
 
     Returns
     -------
     pandas.DataFrame
-        One row per name, such as ``survey``: the largest errors that it allows of a source's ``flux`` (relative),
-        ``shape`` (reduced shear) and ``position`` (pixels), and of the ``background`` (noise of a pixel of the sky);
-        the errors that were measured, with the ending ``_reached``; ``seconds`` of CPU time for all sources of a VIS
-        detector; and the settings of drawing that are used.
+        One row per name, such as ``survey``. The columns are the largest allowed errors of a source's ``flux``
+        (relative), ``shape`` (reduced shear) and ``position`` (pixels), and of the ``background`` (in units of the
+        noise of a sky pixel); the measured errors, with the suffix ``_reached``; ``seconds`` of CPU time to draw all
+        sources of a VIS detector; and the settings that are used for drawing.
     """
     rows = {}
     for name, allowed in accuracy.PRESETS.items():
@@ -147,7 +147,7 @@ def _parse_request(request: str | Path | Mapping[str, Any]) -> Request:
 
 
 def _to_toml_value(value: Any) -> Any:
-    """A value of a dictionary as a TOML file would give it."""
+    """Convert a value of a dictionary to the type that a TOML file would give."""
     if isinstance(value, Mapping):
         return {key: _to_toml_value(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):

@@ -107,7 +107,7 @@ class LakeTables:
         BadInput
             If the query is not a single SELECT over tables of the lake, or exceeds the limits of time or memory.
         Damaged
-            If a file that the query reads is not as it was written.
+            If the content of a file that the query reads has changed since it was written.
         """
         return self._explorer.sql(query, into, **parameters)
 
@@ -153,7 +153,7 @@ class LakeTables:
             One SELECT, as for `sql`.
         path : str or Path
             File to write; ``~`` is the home folder. Its ending selects the format: ``.csv``, ``.parquet``, ``.fits``
-            or ``.vot``. Units and UCDs are written where the format has them.
+            or ``.vot``. Units and UCDs are written if the format supports them.
         **parameters
             Values of the parameters of the query.
 
@@ -180,7 +180,7 @@ class LakeTables:
         Parameters
         ----------
         table : str
-            Name of a table, or what may follow FROM, such as ``galaxies JOIN galaxy_fluxes USING (id)``.
+            Name of a table, or the text of a FROM clause, such as ``galaxies JOIN galaxy_fluxes USING (id)``.
         x : str
             SQL expression of the table's columns.
         bins : int, optional
@@ -188,7 +188,7 @@ class LakeTables:
         span : tuple of float, optional
             Lower edge of the first bin and upper edge of the last. The default is the range of the values.
         where : str, optional
-            SQL condition of the rows that count.
+            SQL condition that selects rows.
         weight : str, optional
             SQL expression that is summed instead of 1. Rows without a value count as 0.
 
@@ -196,7 +196,7 @@ class LakeTables:
         -------
         counts : ndarray of float64, shape (bins,)
         edges : ndarray of float64, shape (bins + 1,)
-            As ``truesky.plots.hist`` takes them.
+            Arguments for ``truesky.plots.hist``.
         """
         return self._explorer.hist(table, x, bins, span, where, weight)
 
@@ -215,7 +215,7 @@ class LakeTables:
         Parameters
         ----------
         table : str
-            Name of a table, or what may follow FROM.
+            Name of a table, or the text of a FROM clause.
         x, y : str
             SQL expressions of the table's columns.
         bins : tuple of int, optional
@@ -223,7 +223,7 @@ class LakeTables:
         span : tuple of tuple of float, optional
             Ranges of x and y. The default is the ranges of the values.
         where : str, optional
-            SQL condition of the rows that count.
+            SQL condition that selects rows.
         weight : str, optional
             SQL expression that is summed instead of 1. Rows without a value count as 0.
 
@@ -232,7 +232,7 @@ class LakeTables:
         counts : ndarray of float64, shape (y bins, x bins)
         x_edges : ndarray of float64, shape (x bins + 1,)
         y_edges : ndarray of float64, shape (y bins + 1,)
-            As ``truesky.plots.heatmap`` takes them.
+            Arguments for ``truesky.plots.heatmap``.
         """
         return self._explorer.heatmap(table, x, y, bins, span, where, weight)
 
@@ -248,16 +248,16 @@ class LakeTables:
         order : int, optional
             Order of the cells; nside is 2**order.
         where : str, optional
-            SQL condition of the rows that count.
+            SQL condition that selects rows.
         weight : str, optional
             SQL expression that is summed instead of 1. Rows without a value count as 0.
 
         Returns
         -------
         cells : ndarray of int64, shape (n,)
-            Cells that hold any row, ascending.
+            Cells that contain rows, ascending.
         counts : ndarray of float64, shape (n,)
-            As ``truesky.plots.skymap`` takes them, together with the order if it is not 8.
+            Arguments for ``truesky.plots.skymap``, together with the order if it is not 8.
         """
         return self._explorer.skymap(table, order, where, weight)
 

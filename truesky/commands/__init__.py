@@ -1,1 +1,1 @@
-"""The command `truesky`: each of its words is one of the modules that python -m and spark-submit run."""
+"""The command `truesky`. Each subcommand runs a module that python -m or spark-submit can also run."""

@@ -1,21 +1,23 @@
-"""truesky COMMAND ...: every command is a job or a module of truesky, with the options that it has itself.
+"""truesky COMMAND ...: simulate the Euclid sky, and read, check and reduce the results.
 
-    truesky run REQUEST --lake LAKE         all that a request needs, then a table and pictures
-    truesky check REQUEST                   whether a request is valid and all of it can be rendered
+    truesky run REQUEST --lake LAKE         run all jobs of a request, then print a table and draw pictures
+    truesky check REQUEST                   check that a request is valid and can be rendered
     truesky build | fluxes | lenses | gaia | plan | render  --lake LAKE --request REQUEST
-                                            one job: catalogues, fluxes, strong lenses, Gaia's view, plan, images
-    truesky page LAKE                       the lake in the browser, and a TAP service for other tools
-    truesky sql QUERY --lake LAKE           a SELECT over the lake's tables
-    truesky list | verify | gc | describe LAKE      what is there, whether it is whole, what no longer serves
-    truesky push LAKE s3://BUCKET/PREFIX    puts a lake on object storage, from where it can be read
-    truesky masters | reduce | stack        master frames, calibrated images and their sources, stacks of dithers
-    truesky report LAKE                     what the runs took, beside the forecast
-    truesky validate --lake LAKE            what the lake holds against what it should, a table and a report
-    truesky mission ...                     the mission database
-    truesky examples FOLDER                 copies requests and notebooks
+                                            run one job: catalogues, fluxes, strong lenses, Gaia stars, plan, images
+    truesky page LAKE                       show a lake in the browser, with a TAP service for other tools
+    truesky sql QUERY --lake LAKE           run a SELECT over the tables of a lake
+    truesky list | verify | gc | describe LAKE
+                                            list the tables, check the files, delete unused versions, show columns
+    truesky push LAKE s3://BUCKET/PREFIX    copy a lake to object storage, where it can be read
+    truesky masters | reduce | stack        make master frames, calibrated images with their sources, stacks of dithers
+    truesky report LAKE                     compare time, memory and size of all runs with the forecast
+    truesky validate --lake LAKE            compare the products with their expected values: a table and a report
+    truesky mission ...                     show and change the mission database
+    truesky examples FOLDER                 copy example requests and notebooks
 
-Jobs run under spark-submit; what follows a -- goes to it (truesky render ... -- --master spark://HEAD:7077), and
-`truesky --local COMMAND ...` runs them in this Python's own session.
+Each command has its own options: truesky COMMAND --help. Jobs run under spark-submit. Options after -- are passed to
+spark-submit (truesky render ... -- --master spark://HEAD:7077). `truesky --local COMMAND ...` runs the jobs in this
+Python process instead.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ from typing import NoReturn
 from lake_schema import __version__, command
 from truesky.commands import submit
 
-# Command -> the modules of its jobs, one after another.
+# Modules of the jobs of each command, in the order in which they run.
 JOBS = {
     "build": ("truesky.catalogue.build_galaxies", "truesky.catalogue.build_stars"),
     "fluxes": ("truesky.fluxes.compute_fluxes",),
@@ -37,7 +39,7 @@ JOBS = {
     "plan": ("truesky.commands.plan",),
     "render": ("truesky.render.render_exposures",),
 }
-# Command -> the module whose `main` it is, and whether that module wants the command's word, too.
+# Module whose `main` runs each command, and True if `main` requires the command's name as first argument.
 MODULES = {
     "check": ("truesky.commands.check", False),
     "sql": ("truesky.explore.__main__", False),
@@ -55,34 +57,34 @@ MODULES = {
     "page": ("truesky.page.__main__", False),
     "examples": ("truesky.commands.examples", False),
 }
-# Command -> the extra of the package that it requires.
+# Optional dependencies (extras of the package) that a command requires.
 EXTRAS = {"masters": "reduction", "page": "page", "push": "s3", "reduce": "reduction", "stack": "reduction"}
 EXTRAS |= {"validate": "reduction"}
-# What a job answers without Spark.
+# With one of these options a job does not use Spark.
 _OPTIONS_WITHOUT_SPARK = {"-h", "--help", "--dry-run"}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit status: the job's or module's own; 2 where there is no such command."""
+    """Run a command and return its exit status, or 2 if there is no such command."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     is_local = arguments[:1] == ["--local"]
     command_name, *rest = arguments[is_local:] or ["--help"]
     if command_name in ("-h", "--help", "--version"):
         text = f"truesky {__version__}" if command_name == "--version" else f"{__doc__}\ntruesky {__version__}"
-        # Whoever reads it may close the pipe after the first lines.
+        # The reader of a pipe may close it after the first lines, which command.run handles.
         return command.run("truesky", lambda: print(text) or 0)
     if command_name in MODULES:
         return _module_command(command_name, rest)
     if command_name not in JOBS and command_name != "run":
         command_names = ", ".join(sorted({"run", *JOBS, *MODULES}))
         return command.print_error(
-            "truesky", f"{command_name} is no command of truesky: {command_names}; truesky --help says more", 2
+            "truesky", f"{command_name} is not a command; use one of {command_names}, or see truesky --help", 2
         )
     separator = rest.index("--") if "--" in rest else len(rest)
     job_arguments, spark_options = rest[:separator], rest[separator + 1 :]
     if is_local and spark_options:
         return command.print_error(
-            "truesky", f"--local: no spark-submit is called that could take {spark_options[0]}", 2
+            "truesky", f"--local does not call spark-submit, so its option {spark_options[0]} is not allowed", 2
         )
     return _run_jobs(
         command_name, job_arguments, spark_options, is_local or not _OPTIONS_WITHOUT_SPARK.isdisjoint(job_arguments)
@@ -90,7 +92,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _module_command(command_name: str, arguments: Sequence[str]) -> int:
-    """Run a command that is a module; returns its exit status, or 2 if an optional package is missing."""
+    """Run the command of a module and return its exit status, or 2 if an optional package is missing."""
     module, takes_command_name = MODULES[command_name]
     try:
         status: int = import_module(module).main([command_name, *arguments] if takes_command_name else arguments)
@@ -119,8 +121,8 @@ def _run_jobs(command_name: str, job_arguments: Sequence[str], spark_options: Se
 def _run_in_order(
     start: Callable[[str, Sequence[str]], int], modules: Sequence[str], job_arguments: Sequence[str]
 ) -> int:
-    """Status of the first job that fails."""
-    # The request may be given without its option, as `truesky run` and `truesky check` take it.
+    """Run the jobs in order and return the exit status of the first that fails, else 0."""
+    # Accept the request as first argument without --request, as `truesky run` and `truesky check` do.
     job_arguments = (
         ["--request", *job_arguments] if job_arguments and not job_arguments[0].startswith("-") else job_arguments
     )
@@ -128,7 +130,7 @@ def _run_in_order(
 
 
 def entry() -> NoReturn:
-    """`truesky`, as it is installed."""
+    """Entry point of the installed command `truesky`."""
     command.exit_with_status(main)
 
 

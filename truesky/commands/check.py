@@ -1,4 +1,7 @@
-"""truesky check REQUEST [--plan]: report whether any job would refuse a request, or --plan, whether planning would."""
+"""Check a request as completely as the jobs do: truesky check REQUEST [--plan].
+
+With --plan only the checks of planning are made.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ from truesky.request.schema import Request
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """0 and a line where the request is good, 2 and the key that is not; --plan : it is to be planned alone."""
+    """Check a request; return 0 and print a summary if it is valid, else return 2 and print the wrong key."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     plan_only = arguments[1:] == ["--plan"]
     if len(arguments) != 1 + plan_only or arguments[0].startswith("--"):
@@ -46,8 +49,13 @@ def check_request(request: Request, plan_only: bool = False) -> None:
         The parsed request.
     plan_only : bool, optional
         Check the plan only, not the catalogues.
+
+    Raises
+    ------
+    BadInput
+        If a job would refuse the request. The message names the key.
     """
-    # What reads files and plans takes seconds to import: only a request whose keys are good is worth them.
+    # These modules take seconds to import, so import them only after the keys of the request are found valid.
     from truesky.commands import plan
     from truesky.render.plan_exposures import Planner
 

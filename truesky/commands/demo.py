@@ -1,6 +1,6 @@
-"""A whole field on one machine: `truesky run` of the demo's request, with the lake and the pictures in one folder.
+"""Simulate a small field on one machine: `truesky run` of the demo request, with lake and pictures in one folder.
 
-python -m truesky.commands.demo [--request requests/demo.toml] [--out out/demo]
+Usage: python -m truesky.commands.demo [--request requests/demo.toml] [--out out/demo]
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from truesky.request.from_toml import parse
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the jobs; the exit status is 0, or that of the first job that fails; 130/143 stopped."""
+    """Run the demo and return the exit status: 0, or that of the first job that fails, or 130/143 after a signal."""
     parser = argparse.ArgumentParser(
         prog="python -m truesky.commands.demo",
-        description="Simulate a field: five jobs, a table, pictures.",
+        description="Simulate a small field: run five jobs, print a table and draw pictures.",
         epilog=f"truesky {__version__}",
     )
     parser.add_argument("--request", type=Path, default=examples.request_file("demo"), help="simulation request")

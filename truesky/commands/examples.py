@@ -1,4 +1,4 @@
-"""truesky examples FOLDER: copies the requests and notebooks that truesky comes with."""
+"""Copy the example requests and notebooks of truesky into a folder: truesky examples FOLDER."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from pathlib import Path
 from lake_schema import __version__, command, user_files
 from lake_schema.errors import BadInput
 
-# Folder -> the ending of what is copied of it.
+# Folders with examples, and the suffix of the files to copy.
 SUFFIXES = {"requests": ".toml", "notebooks": ".ipynb"}
-# What measures truesky against other programs, and so wants a clone.
+# Notebooks that compare truesky with other programs. They require a clone of the repository.
 _CLONE_ONLY = ("02_speed_for_accuracy.ipynb",)
 
 
 def example_files() -> list[Path]:
-    """What there is to be copied."""
+    """Return the example files that can be copied."""
     paths = [path for name, suffix in SUFFIXES.items() for path in sorted(_folder(name).glob(f"*{suffix}"))]
     return [path for path in paths if path.name not in _CLONE_ONLY]
 
 
 def request_file(name: str) -> Path:
-    """A request that truesky comes with."""
+    """Return the path of an example request by its name, such as "demo"."""
     return _folder("requests") / f"{name}.toml"
 
 
@@ -34,15 +34,28 @@ def _folder(name: str) -> Path:
 
 
 def copy_examples(folder: Path) -> list[Path]:
-    """Copies all of them; returns what was written.
+    """Copy all examples into a folder.
 
-    Errors : BadInput where one of them is there already, and nothing is copied
+    Parameters
+    ----------
+    folder : Path
+        Target folder. It is created if it does not exist.
+
+    Returns
+    -------
+    list of Path
+        The files that were written.
+
+    Raises
+    ------
+    BadInput
+        If one of the files exists already. Nothing is copied then.
     """
     source_by_target = {
         user_files.check_folder(folder) / path.parent.name / path.name: path for path in example_files()
     }
     if existing := [path for path in source_by_target if path.exists()]:
-        raise BadInput(f"{user_files.format_path(existing[0])} is there already: name another folder")
+        raise BadInput(f"{user_files.format_path(existing[0])} exists already: use another folder")
     for target, path in source_by_target.items():
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(path, target)
@@ -50,9 +63,9 @@ def copy_examples(folder: Path) -> list[Path]:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Exit status: 0 copied, 2 something is there already."""
+    """Run the command and return its exit status: 0, or 2 if a file exists already."""
     parser = argparse.ArgumentParser(prog="truesky examples", description=__doc__, epilog=f"truesky {__version__}")
-    parser.add_argument("folder", type=Path, help="made where it is not there")
+    parser.add_argument("folder", type=Path, help="target folder (created if it does not exist)")
     options = parser.parse_args(argv)
 
     def copy_and_list() -> int:

@@ -1,4 +1,4 @@
-"""Check a whole request, catalogues and plan, and forecast its cost: the job `plan_exposures` with its --dry-run."""
+"""Check catalogues and plan of a request and forecast its cost: the job `plan_exposures` with a full --dry-run."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from truesky.running.submitted_job import Step
 
 
 def check(request: Request, lake: Path | None = None) -> PlanRows:
-    """Refuse whatever the jobs of a request would refuse, before any of them runs.
+    """Plan a request and raise BadInput if any of its jobs would refuse it.
 
     Parameters
     ----------
     request : Request
         The request.
     lake : Path, optional
-        Lake whose catalogues say how dense the sky is.
+        Lake whose catalogues give the density of sources. Without it, the count models of the mission are used.
 
     Returns
     -------
@@ -43,19 +43,19 @@ def check(request: Request, lake: Path | None = None) -> PlanRows:
 
 
 def checked_chunks(request: Request, lake: Path | None = None) -> Iterator[PlanRows]:
-    """Check a request as `check` does, and return one part of the plan after the other.
+    """Check a request as `check` does, but yield the plan in chunks.
 
     Parameters
     ----------
     request : Request
         The request.
     lake : Path, optional
-        Lake whose catalogues say how dense the sky is.
+        Lake whose catalogues give the density of sources, as in `check`.
 
     Yields
     ------
     tuple of pyarrow.Table
-        Rows of the tables `exposures` and `tasks` of a part. All checks are done when the last part has come.
+        Rows of the tables `exposures` and `tasks` of a chunk. The checks are complete after the last chunk.
 
     Raises
     ------
@@ -63,7 +63,7 @@ def checked_chunks(request: Request, lake: Path | None = None) -> Iterator[PlanR
         If a job would refuse the request.
     """
     check_rendered(request)
-    # A mistake in a pointing or an observation is named first.
+    # Report a mistake in a pointing or an observation before one in the catalogues.
     chunks = Planner.from_request(lake, request).tables()
     first_chunk = next(chunks)
     check_catalogues(request)
@@ -89,7 +89,7 @@ def check_catalogues(request: Request) -> None:
 
 
 def dry_run(lake: Path, request: Request) -> Sequence[Step]:
-    """Print the forecast of the plan and of the catalogues, for a request that no job would refuse."""
+    """Check a request, then print the forecasts of its images and of its catalogues; there are no steps to run."""
     plan_exposures.print_forecast(lake, request, checked_chunks(request, lake))
     print()
     for line in catalogue_forecast.format_table(

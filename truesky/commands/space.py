@@ -1,7 +1,4 @@
-"""Whether there is room for what a request makes: its forecast against what is free on the lake's disc.
-
-check    refuse where there is not
-"""
+"""Compare the forecast size of a request's tables and images with the free space on the disc of the lake."""
 
 from __future__ import annotations
 
@@ -28,10 +25,30 @@ _GB = 1e9
 
 
 def check(root: Path, request: Request, plan: tuple[pa.Table, pa.Table] | None) -> tuple[float, float]:
-    """Refuses a run whose forecast is larger than what is free; what it will take from the lake is taken off.
+    """Raise BadInput if the free space is smaller than the forecast of a run.
 
-    plan    : rows of the tables `exposures` and `tasks`, None = nothing is rendered
-    returns : GB that will be written, GB that are free
+    Tables and images of the lake that the run can reuse are subtracted from the forecast.
+
+    Parameters
+    ----------
+    root : Path
+        Folder of the lake. It need not exist.
+    request : Request
+        The request, with the selection of detectors to render.
+    plan : tuple of pyarrow.Table or None
+        Rows of the tables `exposures` and `tasks`; None if nothing is rendered.
+
+    Returns
+    -------
+    required_gb : float
+        Size of the files that will be written, in GB.
+    free_gb : float
+        Free space on the disc, in GB.
+
+    Raises
+    ------
+    BadInput
+        If the free space is too small. The message gives the forecast of each job.
     """
     forecast_bytes = {line.job: line.gb * _GB for line in catalogue_forecast.for_request(request)}
     if plan is not None:
@@ -42,35 +59,35 @@ def check(root: Path, request: Request, plan: tuple[pa.Table, pa.Table] | None) 
     if total > free:
         parts = ", ".join(f"{name} {size / _GB:.2f}" for name, size in forecast_bytes.items())
         raise BadInput(
-            f"lake {root}: {free / _GB:.2f} GB are free, the forecast is {total / _GB:.2f} GB ({parts}): make room, or "
-            "ask for a part of it (--detectors, --limit)"
+            f"lake {root}: {free / _GB:.2f} GB are free, the forecast is {total / _GB:.2f} GB ({parts}): free some "
+            "space, or render fewer detectors (--detectors, --limit)"
         )
     return total / _GB, free / _GB
 
 
 def _reusable_bytes(root: Path, request: Request, plan: tuple[pa.Table, pa.Table] | None) -> float:
-    """Bytes that are forecast and will not be written: of the request's tables that stay as they are.
+    """Size in bytes of the tables and images in the forecast that the run will reuse.
 
-    Of catalogues that are in the making nothing is known, and nothing is taken off.
+    Catalogues that another run is still writing count as 0.
     """
     size = 0.0
     with contextlib.suppress(LakeError):
         for folder in _reusable_versions(root, request):
             size += _folder_bytes(folder)
-        # No image is kept of catalogues that are not.
+        # Images can be reused only if the catalogues are reused, too.
         if plan is not None:
             size += _reusable_image_bytes(root, request, *plan)
     return size
 
 
 def _reusable_versions(root: Path, request: Request) -> Iterator[Path]:
-    """Versions of the catalogues and their fluxes; LakeError at the first that the request would make anew."""
+    """Yield the reusable versions of the catalogues and fluxes; raise LakeError at the first one that is outdated."""
     for kind, table in compute_fluxes.CATALOGUES:
         version = read.input_version(root, table, request.name)
         universe.check_catalogues([version], request)
         cells = {cell for part in version.manifest["parts"] for cell in part["facts"]["generation_cells"]}
         if version.manifest["facts"].get("code") != code_version() or cells != set(request.area.cells()):
-            raise BadInput(f"table {table} is not that of the request")
+            raise BadInput(f"table {table} was not made by this code for the area of the request")
         yield layout.version_folder(root, table, version.key)
         plan = compute_fluxes.flux_step(kind, root, request).plan
         yield layout.version_folder(root, plan.table.name, read.version(root, plan.table.name, plan.key).key)
@@ -79,8 +96,8 @@ def _reusable_versions(root: Path, request: Request) -> Iterator[Path]:
 
 
 def _reusable_image_bytes(root: Path, request: Request, exposures: pa.Table, tasks: pa.Table) -> float:
-    """Bytes of the images that are asked for and need not be rendered."""
-    # Importing the renderer takes seconds, which a lake without images need not wait for.
+    """Size in bytes of the requested images that need not be rendered."""
+    # Importing the renderer takes seconds, so import it only if there are images.
     from truesky.render import product_plan
     from truesky.render.planning.exposure_chunks import RenderSelection
     from truesky.render.products import exposure_files
@@ -112,11 +129,11 @@ def _reusable_image_bytes(root: Path, request: Request, exposures: pa.Table, tas
 
 
 def _reusable_output_bytes(root: Path, request: Request, plan: Plan, parts: Sequence[Task]) -> float:
-    """Bytes of a plan's parts that need not be made."""
+    """Size in bytes of those tasks of a plan that need not run."""
     table = plan.table.name
     reusable = reuse.reusable_tasks(root, table, request.name)
     reusable_names = {part.name for part in parts if reusable.get(part.name) == part.facts[reuse.PRODUCT]}
-    # A stage has what was taken as well as what was rendered.
+    # The folder of an interrupted run contains reused files as well as new ones, so do not add both sizes.
     return max(
         _folder_bytes(layout.stage_folder(root, table, plan.key)),
         _published_bytes(root, request, table, reusable_names) if reusable_names else 0.0,

@@ -1,9 +1,4 @@
-"""How a job is started: by this environment's spark-submit, or in a session of this Python.
-
-submit     spark-submit of one of our files
-in_here    the same job in this process
-stopping   what a signal does to a command that starts jobs
-"""
+"""Start jobs: with the spark-submit of this environment, or in a Spark session of this process."""
 
 from __future__ import annotations
 
@@ -23,13 +18,13 @@ from lake_schema.errors import BadInput
 from truesky.commands import prepare_spark
 from truesky.numerics import cache
 
-# The file that spark-submit runs, whichever the job.
+# spark-submit runs this file for every job.
 _JOB_SCRIPT = Path(__file__).resolve().parents[1] / "running" / "spark_entry.py"
 _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def submit(module: str, arguments: Sequence[str], options: Sequence[str] = ()) -> int:
-    """Run a job by this environment's spark-submit.
+    """Run a job with the spark-submit of this environment.
 
     Parameters
     ----------
@@ -37,7 +32,7 @@ def submit(module: str, arguments: Sequence[str], options: Sequence[str] = ()) -
         Name of the module that has the job as `JOB`.
     arguments : sequence of str
         Command line of the job.
-    options : sequence of str
+    options : sequence of str, optional
         Options of spark-submit, such as --master.
 
     Returns
@@ -51,7 +46,7 @@ def submit(module: str, arguments: Sequence[str], options: Sequence[str] = ()) -
 
 
 def run_in_process(module: str, arguments: Sequence[str]) -> int:
-    """Run the same job without spark-submit: a session begins when a step has work for Spark workers."""
+    """Run a job in this process and return its exit status. A session starts only if a step needs Spark workers."""
     from truesky.running import submitted_job
 
     use_environment()
@@ -59,14 +54,14 @@ def run_in_process(module: str, arguments: Sequence[str]) -> int:
 
 
 def use_environment() -> None:
-    """Let a Spark session of this process use the settings that spark-submit would use."""
+    """Set environment variables so that a Spark session of this process uses the settings of spark-submit."""
     folder, spark = _spark_environment(), find_spec("pyspark")
     if spark is not None and spark.origin is not None:
         os.environ |= {"SPARK_CONF_DIR": str(folder / "spark-conf"), "SPARK_HOME": str(Path(spark.origin).parent)}
 
 
 def _spark_environment() -> Path:
-    """The folder that holds Spark's settings: .venv as `make` prepared it, else one of the cache, prepared now."""
+    """Return the folder with the Spark settings: .venv if `make` prepared it, else a folder of the cache."""
     environment = Path(sys.prefix)
     if (environment / "spark-conf" / "spark-env.sh").is_file() and (environment / "java" / "bin" / "java").is_file():
         return environment
@@ -85,8 +80,8 @@ def _spark_environment() -> Path:
 
 
 def _run_program(command: Sequence[str]) -> int:
-    """Exit status of a program; it is stopped where we are."""
-    # A signal that arrives while the job is started is answered when there is a job to stop.
+    """Run a program and return its exit status; stop it if this process is interrupted."""
+    # A signal that arrives while the program starts is handled once there is a process to stop.
     early_signals: list[int] = []
     handlers = {number: signal.signal(number, lambda n, _: early_signals.append(n)) for number in _STOP_SIGNALS}
     with subprocess.Popen(command) as job:
@@ -103,7 +98,7 @@ def _run_program(command: Sequence[str]) -> int:
 
 @contextmanager
 def stop_on_signal(name: str) -> Iterator[None]:
-    """Ctrl-C and SIGTERM stop the job that runs, and end the command `name` with 130 or 143 and one line."""
+    """Let Ctrl-C and SIGTERM stop the running job and end the command `name` with status 130 or 143 and a message."""
     previous_handlers = {number: signal.signal(number, _raise_interrupt) for number in _STOP_SIGNALS}
     try:
         yield

@@ -1,10 +1,6 @@
-"""A page over a lake in the browser, and a TAP service for other tools: python -m truesky.page --lake LAKE.
+"""Web page that shows a lake in the browser, and a TAP service for other tools.
 
-gate        who may ask
-opened      a lake as it is shown, and the processes that answer
-server      which address is answered by what
-answers, charts, sky_maps, pictures, sources, runs, downloads       what the page asks
-tap         what other tools ask
-
-The files of the page itself lie in static/: modules of JavaScript that the browser runs as they are.
+Start it with `python -m truesky.page --lake LAKE`. Module `server` maps addresses to handlers, `access_control` refuses
+requests without a valid token, and `lake_session` holds the open lake with its query processes. The folder static/
+contains the HTML, CSS and JavaScript of the page, which the browser runs without a build step.
 """

@@ -20,13 +20,13 @@ from truesky.page.server import Server
 
 _GIGABYTE = 1e9
 _LOCAL_NAMES, _ALL_INTERFACES = ("127.0.0.1", "localhost"), ("", "0.0.0.0")
-# What an address and a cookie hold as it is.
+# Allowed tokens contain only characters that need no escaping in addresses and cookies.
 _TOKEN = re.compile(r"[A-Za-z0-9_.~-]{16,256}")
 _NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit status: 0 stopped, 1 the lake is damaged or the port is taken, 2 the call is wrong."""
+    """Run the server. Return 0 when it is stopped, 1 if the lake is damaged or the port in use, 2 for bad options."""
     options = _options(argv)
     return command.run("page", lambda: _serve(options))
 
@@ -34,16 +34,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _serve(options: argparse.Namespace) -> int:
     root, host_names = layout.open_lake(_lake_folder(options), options.endpoint_url), _host_names(options)
     if options.token is None and host_names != _LOCAL_NAMES:
-        raise BadInput(f"--host {options.host}: others can reach it, so a --token of your own is wanted")
+        raise BadInput(f"--host {options.host}: other machines can reach the server, so --token is required")
     if options.token is not None and not _TOKEN.fullmatch(options.token):
-        raise BadInput("--token: wanted 16 to 256 letters, digits or any of - _ . ~")
+        raise BadInput("--token must have 16 to 256 characters: letters, digits or any of - _ . ~")
     if not 0 <= options.port < 65536:
-        raise BadInput(f"--port {options.port}: wanted 0 to 65535")
+        raise BadInput(f"--port {options.port} is outside [0, 65535]")
 
     def open_lake() -> LakeSession:
         return LakeSession(root, options.name, options.memory * _GIGABYTE, options.timeout)
 
-    # Taken before anything is said of it: port 0 is any that is free.
+    # Open the socket before the address is printed, because port 0 selects a free port.
     server_socket = socket.create_server((options.host, options.port))
     port = int(server_socket.getsockname()[1])
     access = AccessRules(host_names, port, options.token or new_token())
@@ -59,14 +59,17 @@ def _serve(options: argparse.Namespace) -> int:
 
 def _lake_folder(options: argparse.Namespace) -> str:
     if (options.lake is None) == (options.folder is None):
-        raise BadInput("wanted the folder of one lake: LAKE, or --lake LAKE")
+        raise BadInput("exactly one lake must be given: LAKE or --lake LAKE")
     return str(options.folder if options.lake is None else options.lake)
 
 
 def _host_names(options: argparse.Namespace) -> tuple[str, ...]:
-    """By which it may be called, that which is printed first: a name of another's may lead to this machine, too."""
+    """Allowed host names of the server; the first one is printed.
+
+    Other names are refused, because another site can let its name resolve to this machine (DNS rebinding).
+    """
     if invalid_name := next((name for name in options.called if not _NAME.fullmatch(name)), None):
-        raise BadInput(f"--called {invalid_name[:80]!r} is no name or address of a machine")
+        raise BadInput(f"--called {invalid_name[:80]!r} is not a host name or address")
     other_names = tuple(name.lower() for name in options.called)
     if options.host in _ALL_INTERFACES:
         if not other_names:
@@ -79,29 +82,33 @@ def _host_names(options: argparse.Namespace) -> tuple[str, ...]:
 def _options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m truesky.page",
-        description="Show a lake in the browser, and serve its tables by TAP, until stopped with Ctrl-C.",
+        description="Show a lake in the browser and serve its tables by TAP. Stop with Ctrl-C.",
         epilog=f"truesky {__version__}",
     )
     parser.add_argument("folder", nargs="?", metavar="LAKE", help="folder of the lake, or s3://BUCKET/PREFIX")
-    parser.add_argument("--lake", help="the same")
-    parser.add_argument("--endpoint-url", help="of the object storage (default: $AWS_ENDPOINT_URL, else Amazon S3)")
-    parser.add_argument("--name", help="of the request whose tables are meant, where the lake has several")
-    parser.add_argument("--port", type=int, default=0, help="port to listen on (default: any that is free)")
+    parser.add_argument("--lake", help="the same as LAKE")
+    parser.add_argument("--endpoint-url", help="object storage (default: $AWS_ENDPOINT_URL, else Amazon S3)")
+    parser.add_argument("--name", help="show only the tables of the request with this name")
+    parser.add_argument("--port", type=int, default=0, help="port to listen on (default: a free port)")
     parser.add_argument(
-        "--host", default="127.0.0.1", help="address to listen on (default 127.0.0.1: this machine alone)"
+        "--host", default="127.0.0.1", help="address to listen on (default 127.0.0.1: this machine only)"
     )
     parser.add_argument(
         "--called",
         action="append",
         default=[],
         metavar="NAME",
-        help="name or address by which others reach this machine (with --host 0.0.0.0; may be given several times)",
+        help="host name or address that other machines use (required with --host 0.0.0.0; can be repeated)",
     )
-    parser.add_argument("--token", help="that the address holds, 16 characters or more (default: a new one)")
+    parser.add_argument("--token", help="token in the printed address, 16 characters or more (default: a random one)")
     parser.add_argument("--no-open", dest="open", action="store_false", help="do not open a browser")
     limit = MEMORY / _GIGABYTE
-    parser.add_argument("--memory", type=float, default=limit, help=f"GB that a query may take (default {limit:g})")
-    parser.add_argument("--timeout", type=float, default=TIMEOUT, help=f"s that a query may take (default {TIMEOUT:g})")
+    parser.add_argument(
+        "--memory", type=float, default=limit, help=f"memory limit of a query in GB (default {limit:g})"
+    )
+    parser.add_argument(
+        "--timeout", type=float, default=TIMEOUT, help=f"time limit of a query in s (default {TIMEOUT:g})"
+    )
     return parser.parse_args(argv)
 
 

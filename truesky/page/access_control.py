@@ -1,7 +1,7 @@
-"""Who may ask: this machine's own browser with the token, tools with the other token, and nobody through another site.
+"""Refuse requests that lack the token of the page or of the TAP service, or that another web site caused.
 
-A web page that the user looks at elsewhere can make the browser send requests to this machine: what it may not know is
-the token, what it cannot choose are the headers Host, Origin and Sec-Fetch-Site.
+A web page of another site can make the user's browser send requests to this machine. It does not know the token, and
+it cannot set the headers Host, Origin and Sec-Fetch-Site.
 """
 
 from __future__ import annotations
@@ -32,16 +32,24 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
 def new_token() -> str:
-    """192 random bits."""
+    """Return a URL-safe token of 192 random bits."""
     return secrets.token_urlsafe(_TOKEN_BYTES)
 
 
 @dataclass(frozen=True, slots=True)
 class AccessRules:
-    """The rules for one address.
+    """Rules of access to one server.
 
-    hosts     : names by which it may be called, without the port
-    token     : of the page; tap_token : of the TAP service, which stands in its address since tools send no cookies
+    Attributes
+    ----------
+    hosts : tuple of str
+        Allowed host names or addresses of the server, without the port.
+    port : int
+        Port of the server.
+    token : str
+        Token of the page. The browser sends it once in the address, then as a cookie.
+    tap_token : str
+        Token of the TAP service. It is part of the address, because TAP clients send no cookies.
     """
 
     hosts: tuple[str, ...]
@@ -51,35 +59,36 @@ class AccessRules:
 
     @property
     def cookie(self) -> str:
-        """Named by the port: two lakes may be open side by side."""
+        """Name of the cookie. It contains the port, so that several servers on this machine do not share cookies."""
         return f"truesky-{self.port}"
 
     @property
     def origins(self) -> set[str]:
+        """Allowed values of the header Origin."""
         return {f"http://{host}:{self.port}" for host in self.hosts}
 
     def refusal(self, request: web.Request) -> tuple[int, str] | None:
-        """Status and reason where a request is not answered."""
+        """Return status and reason if the request must be refused, else None."""
         if request.headers.get("Host") not in {f"{host}:{self.port}" for host in self.hosts}:
-            return 403, "this is not the address that truesky listens on"
+            return 403, "truesky does not listen on this address"
         if request.headers.get("Origin", next(iter(self.origins))) not in self.origins:
-            return 403, "another site may not ask"
+            return 403, "requests from other sites are refused"
         is_entry = request.method == "GET" and request.path == "/"
         if not is_entry and request.headers.get("Sec-Fetch-Site") in ("cross-site", "same-site"):
-            return 403, "another site may not ask"
+            return 403, "requests from other sites are refused"
         if request.path.startswith(TAP_PATH):
             presented_token = request.path.removeprefix(TAP_PATH).partition("/")[0]
-            # Whoever does not know the address is told that there is none.
+            # A wrong token gets the same answer as an address that does not exist.
             return None if _tokens_match(presented_token, self.tap_token) else (404, "there is nothing here")
         if is_entry and "token" in request.query:
-            return None if _tokens_match(request.query["token"], self.token) else (401, "the token is another")
+            return None if _tokens_match(request.query["token"], self.token) else (401, "the token is wrong")
         if not _tokens_match(request.cookies.get(self.cookie, ""), self.token):
             return 401, "open the address that truesky printed"
         return None
 
     @web.middleware
     async def middleware(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Refuse, or let answer."""
+        """Refuse a request, set the cookie, or pass the request to its handler."""
         refusal = self.refusal(request)
         if refusal is not None:
             status, reason = refusal
@@ -96,7 +105,7 @@ class AccessRules:
 
 
 async def add_security_headers(request: web.Request, response: web.StreamResponse) -> None:
-    """Give an answer, just before it is sent, the headers that confine the page."""
+    """Add headers that restrict what the page may load and do. aiohttp calls this just before it sends a response."""
     response.headers.update(_SECURITY_HEADERS)
 
 

@@ -1,4 +1,4 @@
-"""What the page asks of tables: which there are, rows of a query."""
+"""Answers to the page about tables: list of tables and columns, first rows of a query."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from truesky.explore import votables
 from truesky.page.lake_session import LakeSession
 
 MAX_ROWS, MAX_BYTES = 500, 8 << 20
-# Integers that a number of JavaScript holds.
+# Integers up to this value are exact in JavaScript.
 _MAX_SAFE_INTEGER = 1 << 53
 Json = dict[str, Any]
 
 
 def describe_lake(lake: LakeSession) -> Json:
-    """The tables and their columns, with unit, UCD, bounds and sentence."""
+    """Return a description of the lake: its tables, and their columns with unit, UCD, limits and meaning."""
     tables = [
         {
             "name": name,
@@ -51,7 +51,7 @@ def describe_lake(lake: LakeSession) -> Json:
 
 
 def is_catalogue(version: read.Version) -> bool:
-    """Whether its rows have positions on the sky."""
+    """Return True if the rows of a table have positions on the sky."""
     return "_healpix_29" in version.schema.names
 
 
@@ -68,13 +68,28 @@ def _describe_column(field: pa.Field) -> Json:
 
 
 async def run_query(lake: LakeSession, request_body: Json) -> Json:
-    """The first rows of a query, with units; `more` says that there are others.
+    """Run a query and return its first rows with units.
 
-    question : sql
+    Parameters
+    ----------
+    lake : LakeSession
+        The open lake.
+    request_body : dict
+        The query, under key `sql`.
+
+    Returns
+    -------
+    dict
+        `columns`, `rows` (at most MAX_ROWS), `more` (True if the result has more rows) and `seconds` (wall time).
+
+    Raises
+    ------
+    BadInput
+        If `sql` is not a string, or the query is refused.
     """
     text = request_body.get("sql")
     if not isinstance(text, str):
-        raise BadInput("sql: wanted a text")
+        raise BadInput("sql must be a string")
     started = time.monotonic()
 
     async with lake.user_queries.process() as process:
@@ -98,7 +113,7 @@ async def run_query(lake: LakeSession, request_body: Json) -> Json:
 
 
 def to_json_value(value: object) -> Any:
-    """A value as JSON can hold it without loss: integers beyond 2^53 as text, NaN and infinities as text."""
+    """Convert a value to JSON without loss: integers beyond 2^53, NaN and infinities become strings."""
     if isinstance(value, bool) or value is None or isinstance(value, str):
         return value
     if isinstance(value, int):
@@ -113,13 +128,26 @@ def to_json_value(value: object) -> Any:
 
 
 def json_response(content: object) -> web.Response:
-    """JSON."""
+    """Return a JSON response."""
     return web.Response(text=json.dumps(content, allow_nan=False), content_type="application/json")
 
 
 def pack(header: Json, *arrays: Array) -> bytes:
-    """4 bytes: length of the head, which is JSON; the head; the arrays as they are, little-endian."""
+    """Pack a JSON header and arrays into bytes.
+
+    Parameters
+    ----------
+    header : dict
+        The header.
+    *arrays : array
+        Arrays of a little-endian type.
+
+    Returns
+    -------
+    bytes
+        The length of the header (4 bytes, little-endian), the header as JSON, then the bytes of the arrays.
+    """
     header_bytes = json.dumps(header).encode()
-    # What follows begins at a multiple of four bytes.
+    # JavaScript requires that the arrays start at a multiple of four bytes.
     header_bytes += b" " * (-len(header_bytes) % 4)
     return b"".join([struct.pack("<I", len(header_bytes)), header_bytes, *(array.tobytes() for array in arrays)])

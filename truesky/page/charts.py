@@ -1,4 +1,4 @@
-"""Charts that filter each other: counts of all of them in one pass over kept columns."""
+"""Counts for linked charts: a selection in one chart filters all others. One pass over cached columns fills all."""
 
 from __future__ import annotations
 
@@ -13,27 +13,44 @@ from truesky.explore.counting import Chart, ChartColumns
 from truesky.page.answers import pack
 from truesky.page.lake_session import LakeSession
 
-# Rows a core that are counted at every move; of more a part is counted first.
+# Rows per core that are counted at every move of a selection. In larger tables, one row in SUBSAMPLING is counted
+# first.
 ROWS_PER_CORE = 25_000_000
 SUBSAMPLING = 64
 _MAX_AXES, _MAX_CHARTS, MAX_POINTS = 16, 16, 20_000
-# Selections whose columns stay mapped.
+# Number of selections whose columns stay memory-mapped.
 _MAX_CACHED = 4
-# That one thread counts as soon as several would.
+# One thread counts this number of rows as fast as several threads.
 _SINGLE_THREAD_ROWS = 1_000_000
 Json = dict[str, Any]
 
 
 async def count_rows(lake: LakeSession, question: Json) -> bytes:
-    """4 bytes: length of the head; the head, JSON; then the counts of every chart, uint32, first axis slowest; then of
-    every chart that wants them points, float32 [n, axes].
+    """Count the rows of a table in the bins of several linked charts.
 
-    Of the head: `spans` and `missing` are of each axis, the span that holds nearly all of its values and the rows that
-    have none; of each chart `outside` rows lie beyond its spans, within the limits.
+    Parameters
+    ----------
+    lake : LakeSession
+        The open lake.
+    question : dict
+        `source` : table, or the text that follows FROM. `where` : SQL condition. `axes` : list of SQL expressions.
+        `charts` : list of dictionaries with `axes` (indices into the axes), `bins` (numbers of bins), `spans` (ranges,
+        or null for the default), and optionally `own` (axes whose limits do not apply to this chart) and `points`
+        (largest number of sample points to return). `limits` : list of [axis, lowest, highest] that filter the rows.
+        `part` : 1 for all rows, SUBSAMPLING for one row in SUBSAMPLING, or null for the default.
 
-    question : source, where; axes, each an expression; charts, each with axes (numbers), bins, spans (or null) and,
-               if need be, own (numbers of axes whose limits do not hold in it) and points (how many at most); limits,
-               [axis, lowest, highest] each; part, one row in so many, or null
+    Returns
+    -------
+    bytes
+        The length of the header (4 bytes), the header (JSON), the counts of every chart (uint32, first axis slowest),
+        and the points of every chart that requests them (float32 [n, axes]). The header has `rows`, `part`, `spans`
+        (for each axis the range of nearly all values), `missing` (rows without a value, for each axis) and `charts`.
+        For each chart, `outside` is the number of rows within the limits but outside the spans.
+
+    Raises
+    ------
+    BadInput
+        If the question is invalid or an expression is refused.
     """
     source, where = str(question.get("source", "")), str(question.get("where") or "true")
     axes = [str(axis) for axis in _required_list(question, "axes", _MAX_AXES)]
@@ -53,7 +70,7 @@ async def count_rows(lake: LakeSession, question: Json) -> bytes:
                 return counting.inspect_columns(loaded)
 
             cached_columns = await asyncio.to_thread(load_columns)
-        # Compared with their checksums once, not at every move of a brush.
+        # Cache the columns, so that their checksums are verified once and not at every move of a selection.
         while len(lake.cached_columns) >= _MAX_CACHED:
             lake.cached_columns.pop(next(iter(lake.cached_columns)))
         lake.cached_columns[(selection, *axes)] = cached_columns
@@ -63,12 +80,12 @@ async def count_rows(lake: LakeSession, question: Json) -> bytes:
 def _required_list(question: Json, name: str, max_length: int) -> list[Any]:
     items = question.get(name)
     if not isinstance(items, list) or not 0 < len(items) <= max_length:
-        raise BadInput(f"charts: wanted a list of 1 to {max_length} {name}")
+        raise BadInput(f"charts: {name} must be a list of 1 to {max_length} entries")
     return items
 
 
 def _key_columns(lake: LakeSession, source: str) -> tuple[str, ...]:
-    """What tells the rows of a table apart; of anything else than a table nothing."""
+    """Columns that identify a row of a table; empty if the source is not a table."""
     source = source.replace('"', "")
     if source not in lake.versions:
         return ()
@@ -86,10 +103,28 @@ def _choose_subsampling(lake: LakeSession, source: str, key_columns: tuple[str, 
 
 
 def pack_counts(cached_columns: ChartColumns, question: Json, subsampling: int, threads: int) -> bytes:
-    """The answer of `counts`, of columns that are kept.
+    """Count the rows of cached columns and pack the answer of `count_rows`.
 
-    question : as of `counts`, of which source and axes are in
-    held : of the axes, in their order;  part : one row in so many, of which they are;  threads : for many rows
+    Parameters
+    ----------
+    cached_columns : ChartColumns
+        Columns of the axes, in their order.
+    question : dict
+        The question, see `count_rows`.
+    subsampling : int
+        The columns contain one row in `subsampling`.
+    threads : int
+        Number of threads for many rows.
+
+    Returns
+    -------
+    bytes
+        Header, counts and points, see `count_rows`.
+
+    Raises
+    ------
+    BadInput
+        If the question is invalid.
     """
     columns = cached_columns.columns
     try:

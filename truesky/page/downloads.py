@@ -1,4 +1,4 @@
-"""Results as files, piece by piece."""
+"""Send query results as files, in chunks."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ CONTENT_TYPES = {
     "fits": "application/fits",
 }
 _CHUNK_SIZE = 1 << 20
-# s that a reader may take for so many bytes: one who takes nothing must not keep a process for ever.
+# A client must read _WRITE_SIZE bytes within STALL_TIMEOUT seconds, so that a stalled client frees its process.
 STALL_TIMEOUT, _WRITE_SIZE = 60.0, 1 << 18
 
 
 async def export(lake: LakeSession, request: web.Request) -> web.StreamResponse:
-    """The result of the query `sql` as a file of `format`."""
+    """Send the result of the query in parameter `sql` as a file in the format of parameter `format`."""
     form, text = request.query.get("format", "csv"), request.query.get("sql", "")
     if form not in CONTENT_TYPES:
         raise BadInput(f"format = {form[:40]!r} is not one of {', '.join(CONTENT_TYPES)}")
@@ -36,7 +36,7 @@ async def export(lake: LakeSession, request: web.Request) -> web.StreamResponse:
 
 
 def read_chunks(path: Path) -> Iterator[bytes]:
-    """A file piece by piece."""
+    """Yield the content of a file in chunks of 1 MiB."""
     with path.open("rb") as file:
         while chunk := file.read(_CHUNK_SIZE):
             yield chunk
@@ -45,10 +45,30 @@ def read_chunks(path: Path) -> Iterator[bytes]:
 async def send_stream(
     request: web.Request, stream: AsyncIterator[bytes], content_type: str, file_name: str | None
 ) -> web.StreamResponse:
-    """Send a stream; its first piece is made before the status, so that a refusal is one.
+    """Send a stream of bytes.
 
-    stream : the pieces;  kind : content type;  name : of the file that it is to become, None = shown
-    Errors : ConnectionError where the reader is gone, or takes nothing
+    The first piece is computed before the status is sent, so that an error in the query gives an error status.
+
+    Parameters
+    ----------
+    request : aiohttp.web.Request
+        The request to answer.
+    stream : asynchronous iterator of bytes
+        Content of the response in pieces.
+    content_type : str
+        Content type of the response.
+    file_name : str or None
+        Name under which the browser saves the response; None to show it in the browser.
+
+    Returns
+    -------
+    aiohttp.web.StreamResponse
+        The response, sent completely or aborted after an error in the stream.
+
+    Raises
+    ------
+    ConnectionError
+        If the client has closed the connection or does not read.
     """
     first = await anext(stream, b"")
     response = web.StreamResponse(headers={"Content-Type": content_type})
@@ -60,7 +80,7 @@ async def send_stream(
         async for piece in stream:
             await _write_piece(request, response, piece)
     except LakeError:
-        # Never a whole answer of half the rows: the connection ends without its last chunk.
+        # Abort without the last chunk, so that the client does not take a part of the rows for the whole result.
         if request.transport is not None:
             request.transport.abort()
         return response
@@ -69,7 +89,7 @@ async def send_stream(
 
 
 async def _write_piece(request: web.Request, response: web.StreamResponse, piece: bytes) -> None:
-    """Write a piece, as fast as it is read.  Errors: ConnectionError where that is not done for long"""
+    """Write a piece as fast as the client reads it; raise ConnectionError if the client does not read in time."""
     view = memoryview(piece)
     for first in range(0, len(view), _WRITE_SIZE):
         try:
@@ -77,4 +97,4 @@ async def _write_piece(request: web.Request, response: web.StreamResponse, piece
         except TimeoutError:
             if request.transport is not None:
                 request.transport.abort()
-            raise ConnectionAbortedError(f"nothing was read for {STALL_TIMEOUT:g} s") from None
+            raise ConnectionAbortedError(f"the client read nothing for {STALL_TIMEOUT:g} s") from None

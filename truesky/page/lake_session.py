@@ -1,7 +1,7 @@
-"""A lake as it is shown: its tables as they were when it was opened, and the processes that answer questions of them.
+"""A lake that the page shows: its tables as they were when it was opened, and the processes that answer queries.
 
-Whatever is kept of it goes by its key. A lake that is published anew is said to be changed, and shown as it was until
-it is opened again; nothing of the one is mixed with the other.
+The key of the versions of its tables identifies an open lake. If new versions are published, the page reports that the
+lake has changed, but shows the old versions until the user opens the lake again.
 """
 
 from __future__ import annotations
@@ -27,33 +27,38 @@ from truesky.explore.explorer import Explorer
 from truesky.explore.process import MEMORY, TIMEOUT, Process
 
 if TYPE_CHECKING:
-    # Compiled, and slow to load.
+    # This module loads compiled code, which is slow.
     from truesky.explore.counting import ChartColumns
 
-# Questions that wait for a process; those beyond are refused.
+# Largest number of queries that wait for a process; further queries are refused.
 MAX_WAITING = 8
-# Threads that answer from files and tables: of tiles and sources, which are asked for by the dozen and come soon, and
-# of the rest, which may take s; and how many questions may wait for each.
+# Number of threads for short, frequent requests (tiles, sources), and for requests that may take seconds; largest
+# number of requests that wait for each of the two pools.
 PIXEL_THREADS, TABLE_THREADS, MAX_QUEUED = 4, 2, 64
 _KEY_LENGTH = 16
-# What is planned and rendered: rows of it go by the number of an exposure, which every request counts for itself.
+# Tables of plans and images. Their exposure numbers are unique only within one request.
 _EXPOSURE_TABLES = ("exposures", "tasks", "products")
 Item = TypeVar("Item")
 Arguments = ParamSpec("Arguments")
 
 
 class Busy(LakeError):
-    """Too many questions wait already."""
+    """Too many requests are waiting."""
 
 
 class Closed(Busy):
-    """The lake has been opened anew while a question waited."""
+    """The lake was opened again while a request waited."""
 
 
 class ProcessPool:
-    """Processes that answer questions, each one at a time.
+    """Pool of processes, each of which answers one query at a time.
 
-    make : a process;  number : how many
+    Parameters
+    ----------
+    start_process : callable
+        Function that returns a new process.
+    number : int
+        Number of processes.
     """
 
     def __init__(self, start_process: Callable[[], Process], number: int) -> None:
@@ -65,14 +70,28 @@ class ProcessPool:
 
     @asynccontextmanager
     async def process(self, is_patient: bool = False) -> AsyncIterator[Process]:
-        """A process that is free; where its user is cancelled another takes its place.
+        """Lend a free process. If its user is cancelled, a new process replaces it.
 
-        is_patient : waits however many wait, and is none of those who wait
-        Errors     : Busy where too many wait; Closed
+        Parameters
+        ----------
+        is_patient : bool, optional
+            Wait even if MAX_WAITING queries are waiting, and do not count as one of them.
+
+        Yields
+        ------
+        Process
+            The process.
+
+        Raises
+        ------
+        Busy
+            If too many queries are waiting.
+        Closed
+            If the pool has been closed.
         """
         self._refuse_closed()
         if self._free.empty() and self._num_waiting >= MAX_WAITING and not is_patient:
-            raise Busy(f"{MAX_WAITING} questions are waiting: ask again later")
+            raise Busy(f"{MAX_WAITING} queries are waiting: try again later")
         self._num_waiting += not is_patient
         try:
             process = await self._free.get()
@@ -84,7 +103,7 @@ class ProcessPool:
         except LakeError:
             raise
         except BaseException:
-            # Its user went away in the midst of an answer: whoever asks next must meet nothing of that.
+            # The user left in the middle of an answer. Replace the process: the next user must not get the rest.
             process.stop()
             self._processes.discard(process)
             process = self._start_process()
@@ -97,16 +116,16 @@ class ProcessPool:
 
     def _refuse_closed(self) -> None:
         if self._is_closed:
-            raise Closed("the lake has been opened anew")
+            raise Closed("the lake has been opened again")
 
     async def warm(self) -> None:
-        """Start them all."""
+        """Start all processes."""
         async with AsyncExitStack() as stack:
             processes = [await stack.enter_async_context(self.process()) for _ in range(len(self._processes))]
             await asyncio.gather(*(asyncio.to_thread(process.ask, "SELECT 1", {}) for process in processes))
 
     def close(self) -> None:
-        """End them, those that are in use when their users are done; nobody else is given one."""
+        """Stop idle processes now and busy processes when their queries end. Waiting queries raise Closed."""
         self._is_closed = True
         for _ in range(self._free.qsize()):
             process = self._free.get_nowait()
@@ -115,9 +134,14 @@ class ProcessPool:
 
 
 class ThreadPool:
-    """Threads that answer questions, and a bound of how many wait for one.
+    """Pool of threads with a limited queue.
 
-    threads : that answer at a time;  most : questions that may wait beside
+    Parameters
+    ----------
+    threads : int
+        Number of threads.
+    max_queued : int, optional
+        Largest number of requests that wait for a thread.
     """
 
     def __init__(self, threads: int, max_queued: int = MAX_QUEUED) -> None:
@@ -127,32 +151,55 @@ class ThreadPool:
     async def run(
         self, function: Callable[Arguments, Item], *arguments: Arguments.args, **keywords: Arguments.kwargs
     ) -> Item:
-        """What a function returns, without holding up anything else; one who goes away leaves the line.
+        """Run a function in a thread and return its result. A cancelled caller leaves the queue.
 
-        Errors : Busy where too many wait; Closed; those of the function
+        Parameters
+        ----------
+        function : callable
+            The function.
+        *arguments, **keywords
+            Its arguments.
+
+        Returns
+        -------
+        object
+            Result of the function.
+
+        Raises
+        ------
+        Busy
+            If too many requests are waiting.
+        Closed
+            If the pool has been closed.
         """
         if not self._slots.acquire(blocking=False):
-            raise Busy(f"{self._max_queued} questions are waiting: ask again later")
+            raise Busy(f"{self._max_queued} requests are waiting: try again later")
         try:
             future = self._threads.submit(function, *arguments, **keywords)
         except RuntimeError:
             self._slots.release()
-            raise Closed("the lake has been opened anew") from None
-        # Also where nobody waits any more: the thread is in use until it is done.
+            raise Closed("the lake has been opened again") from None
+        # Free the slot only when the thread is done, even if the caller has been cancelled.
         future.add_done_callback(lambda _: self._slots.release())
         return await asyncio.wrap_future(future)
 
     def close(self) -> None:
-        """Take no other question; those that wait are answered."""
+        """Accept no further requests; waiting requests are still answered."""
         self._threads.shutdown(wait=False)
 
 
 @dataclass(frozen=True, slots=True)
 class RequestTables:
-    """The tables of one request, and those that no request has to itself.
+    """The tables of one request, including the tables that all requests share.
 
-    request  : its name, None where the lake has no other; of several that share these tables the first
-    names    : of all of them, none in a lake without names;  versions : by table
+    Attributes
+    ----------
+    request : str or None
+        Name of the request; the first name if several requests share these tables; None if no other request has tables.
+    names : tuple of str
+        Names of all requests that share these tables; empty in a lake without named requests.
+    versions : mapping of str to Version
+        Versions by name of the table.
     """
 
     request: str | None
@@ -162,9 +209,21 @@ class RequestTables:
     def rows(
         self, table: str, columns: Sequence[str] | None = None, exposures: Collection[int] | None = None
     ) -> list[dict[str, Any]]:
-        """Rows of a table, none where it is not there.
+        """Read rows of a table.
 
-        columns : names, None = all;  exposures : only those of these, by number, None = all
+        Parameters
+        ----------
+        table : str
+            Name of the table.
+        columns : sequence of str, optional
+            Names of the columns. The default is all columns.
+        exposures : collection of int, optional
+            Read only rows of exposures with these numbers. The default is all rows.
+
+        Returns
+        -------
+        list of dict
+            One dictionary per row; empty if the request has no such table.
         """
         version = self.versions.get(table)
         numbers = None if exposures is None else pa.array([*exposures], pa.int64())
@@ -172,17 +231,29 @@ class RequestTables:
         return [] if version is None else version.rows(columns, where=where).to_pylist()
 
     def iterate_rows(self, table: str, columns: Sequence[str]) -> Iterator[pa.Table]:
-        """The same, a part after the other: a plan may be larger than memory."""
+        """Yield the rows of a table partition by partition, because a plan may be larger than the memory."""
         version = self.versions.get(table)
         return iter(()) if version is None else (version.rows(columns, [part]) for part in version.partitions)
 
 
 class LakeSession:
-    """One opened lake.
+    """An open lake with its processes and threads.
 
-    root    : of the lake;  request : whose tables, where the lake has those of several
-    memory  : bytes that each process may take;  timeout : s that a question may take
-    key     : of the versions of its tables
+    Parameters
+    ----------
+    root : Folder
+        Folder of the lake.
+    request : str, optional
+        Name of the request whose tables are shown. The default is all requests.
+    memory : float, optional
+        Memory limit of each process, in bytes.
+    timeout : float, optional
+        Time limit of a query, in seconds.
+
+    Attributes
+    ----------
+    key : str
+        Key of the versions of all tables; it changes if a table changes.
     """
 
     def __init__(
@@ -191,31 +262,32 @@ class LakeSession:
         self.explorer = Explorer(root, memory, timeout, request)
         self.root, self.request, self.timeout = self.explorer.root, request, timeout
         self.key = digest({name: version.key for name, version in self.explorer.versions.items()})[:_KEY_LENGTH]
-        # What a user asks may take minutes: it holds up neither the other nor what the page itself asks.
+        # A query of the user may take minutes. Separate processes keep it from delaying the queries of the page.
         self.user_queries = ProcessPool(self.explorer.process, 2)
         self.page_queries = ProcessPool(self.explorer.process, 1)
         self.pixel_pool, self.table_pool = ThreadPool(PIXEL_THREADS), ThreadPool(TABLE_THREADS)
         self.threads = min(os.cpu_count() or 1, 8)
-        # Kept columns that are mapped, by selection and expressions.
+        # Memory-mapped columns of charts, by selection and expressions of the axes.
         self.cached_columns: dict[tuple[Hashable, ...], ChartColumns] = {}
 
     @property
     def versions(self) -> Mapping[str, read.Version]:
+        """Versions of all tables by name, with and without the name of the request."""
         return self.explorer.versions
 
     @property
     def listed_versions(self) -> Mapping[str, read.Version]:
-        """Every table once: by its own name where that is clear."""
+        """Versions by listed name: the name of the table, and REQUEST.TABLE if the versions of requests differ."""
         return {name: version for name, version in sorted(self.versions.items()) if self.explorer.is_listed(name)}
 
     def find_version(self, table: str) -> read.Version:
-        """A table of the lake.  Errors: BadInput where there is none."""
+        """Return the version of a table; raise BadInput if the lake has no such table."""
         if table not in self.versions:
             raise BadInput(f"the lake has no table {table}")
         return self.versions[table]
 
     def request_tables(self, *tables: str) -> list[RequestTables]:
-        """Each request that has one of these tables; those that have the same versions of all of them count once."""
+        """Return the tables of each request that has any of these tables. Requests with equal versions count once."""
         request_versions: dict[str, dict[str, read.Version]] = {}
         for name, version in sorted(self.versions.items()):
             request, _, table = name.rpartition(".")
@@ -241,28 +313,28 @@ class LakeSession:
 
     @cached_property
     def observed_requests(self) -> list[RequestTables]:
-        """Requests that have planned or rendered something; what goes by the number of an exposure is of one."""
+        """Tables of the requests that have a plan or images. Exposure numbers are unique within each of them."""
         return self.request_tables(*_EXPOSURE_TABLES)
 
     def is_changed(self) -> bool:
-        """Whether a table has been published since it was opened, or has come or gone."""
+        """Return True if a table was added, removed or published again since the lake was opened."""
         try:
             return _table_keys(Explorer(self.root, request=self.request)) != _table_keys(self.explorer)
         except LakeError:
             return True
 
     async def run_query(self, text: str, parameters: Mapping[str, object] | None = None) -> pa.Table:
-        """The answer to a question of the page's own."""
+        """Run a query of the page and return its result."""
         async with self.page_queries.process() as process:
             return await asyncio.to_thread(process.ask, text, dict(parameters or {}), self.timeout)
 
     async def warm(self) -> None:
-        """Start the processes, those first that the page itself asks: the first question of each would wait for it."""
+        """Start the processes now, because the first query of each would wait for it; first those of the page."""
         for pool in (self.page_queries, self.user_queries):
             await pool.warm()
 
     def close(self) -> None:
-        """End its processes; what is being answered is answered to its end, of the lake as it was."""
+        """Stop the processes. Running queries finish with the versions of this lake."""
         self.user_queries.close()
         self.page_queries.close()
         self.pixel_pool.close()
@@ -271,12 +343,12 @@ class LakeSession:
 
 
 def _table_keys(explorer: Explorer) -> tuple[dict[str, str], set[str]]:
-    """The keys of its tables, and the names of those that cannot be opened."""
+    """Return the keys of the tables by name, and the names of the tables that cannot be opened."""
     return {name: version.key for name, version in explorer.versions.items()}, {*explorer.damaged}
 
 
 async def iterate_in_thread(batches: Iterator[Item]) -> AsyncIterator[Item]:
-    """What an iterator that waits gives, without holding up anything else."""
+    """Yield the items of a blocking iterator, computed in a thread so that the event loop is not blocked."""
     sentinel = object()
     while (piece := await asyncio.to_thread(next, batches, sentinel)) is not sentinel:
         yield piece  # type: ignore[misc]

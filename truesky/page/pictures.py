@@ -1,4 +1,4 @@
-"""Images of a lake: pyramids of tiles, their places on the sky, the sources in them."""
+"""Images of a lake for the page: pyramids of tiles, sky coordinates, and the sources on each image."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from truesky.render.products import pyramids, read_back
 from truesky.render.products.pyramids import TILE
 from truesky.render.products.sidecar_files import truth_file
 
-# Nodes along each side at which the place on the sky is given; between them it is interpolated.
+# Number of grid nodes along each side of an image. Sky coordinates are given at nodes and interpolated between them.
 _GRID_NODES = 33
 MAX_SOURCES = 4000
 Json = dict[str, Any]
@@ -33,11 +33,18 @@ Json = dict[str, Any]
 
 @dataclass(frozen=True)
 class Picture:
-    """A file of the table `products`.
+    """An image file of the table `products`.
 
-    version : of the table;  row : of the file
-    hits    : the file of its cosmic rays' truth, where there is one
-    own     : the tables of the request that has it
+    Attributes
+    ----------
+    version : Version
+        Version of the table `products`.
+    row : mapping
+        Row of the file in the table.
+    cosmic_ray_file : str or None
+        Path of the image of cosmic rays of the same detector and exposure, if there is one.
+    request_tables : RequestTables
+        Tables of the request that the image belongs to.
     """
 
     version: read.Version
@@ -47,16 +54,19 @@ class Picture:
 
     @property
     def detector_key(self) -> tuple[str | None, int, str]:
-        """Request, exposure and detector, which tell it from those of any other place and time."""
+        """Request, number of the exposure, and detector; together they identify one read-out of a detector."""
         return self.request_tables.request, self.row["exposure_id"], self.row["detector"]
 
     @cached_property
     def can_remove_cosmic_rays(self) -> bool:
-        """Whether its cosmic rays can be taken away."""
+        """True if the cosmic rays of the image can be subtracted."""
         return self.row["content"] == "science" and self.cosmic_ray_file is not None
 
     def levels(self, without_cosmic_rays: bool = False) -> list[Array]:
-        """Its pixels, and each time the means of 2 x 2 of them, until one tile holds all: float32 [ny, nx], mapped."""
+        """Return the image pyramid: the pixels, then repeated means of 2 x 2 pixels until one tile holds the image.
+
+        Each level is a memory-mapped float32 array [ny, nx].
+        """
         return self._cleaned_levels if without_cosmic_rays and self.can_remove_cosmic_rays else self._original_levels
 
     @cached_property
@@ -68,7 +78,7 @@ class Picture:
         return self._make_levels(str(self.cosmic_ray_file))
 
     def _make_levels(self, cosmic_ray_file: str) -> list[Array]:
-        """Compared with their checksums, which takes as long as reading all of them: once for all tiles."""
+        """Make or map the pyramid. The files are verified by checksum, which reads them completely, so do it once."""
         checksums = (
             self.version.file_sha256(self.row["path"]),
             self.version.file_sha256(cosmic_ray_file) if cosmic_ray_file else "",
@@ -80,18 +90,35 @@ class Picture:
 
     @cached_property
     def header_cards(self) -> tuple[tuple[str, Any, str], ...]:
-        """Its header."""
+        """FITS header of the image as (keyword, value, comment)."""
         return read_back.frame(self.version.sidecar_path(self.row["path"])).cards
 
     @cached_property
     def wcs(self) -> WCS:
-        """Its world coordinates, which stand in the header of every file of a detector."""
+        """World coordinate system from the header of the image."""
         return astrometry.from_cards(self.header_cards)
 
     def tile(self, level: int, row: int, column: int, without_cosmic_rays: bool = False) -> Array:
-        """float32 [<= 512, <= 512] electrons.
+        """Return one tile of the pyramid.
 
-        level : of the pyramid;  row, column : of the tile there;  mended : without cosmic rays
+        Parameters
+        ----------
+        level : int
+            Level of the pyramid; 0 is the full resolution.
+        row, column : int
+            Indices of the tile in this level.
+        without_cosmic_rays : bool, optional
+            Subtract cosmic rays if their image exists.
+
+        Returns
+        -------
+        float32 array
+            Pixels in electrons, at most 512 x 512.
+
+        Raises
+        ------
+        BadInput
+            If the image has no such level or tile.
         """
         levels = self.levels(without_cosmic_rays)
         if not 0 <= level < len(levels):
@@ -104,7 +131,7 @@ class Picture:
 
 @lru_cache(maxsize=4)
 def pictures(lake: LakeSession) -> list[Picture]:
-    """Every file of the products, in the order of their table: a file goes by its number here, never by its path."""
+    """Return all image files in the order of the tables `products`. The page refers to a file by its index here."""
     images = []
     for request_tables in lake.observed_requests:
         rows = request_tables.rows("products")
@@ -126,7 +153,7 @@ def _exposure_and_detector(row: Mapping[str, Any]) -> tuple[int, str]:
 
 
 def picture(lake: LakeSession, number: int) -> Picture:
-    """One of them.  Errors: BadInput where the lake has none of that number"""
+    """Return the image with this number; raise BadInput if it does not exist."""
     images = pictures(lake)
     if not 0 <= number < len(images):
         raise BadInput(f"the lake has no image {number}; it has {len(images)}")
@@ -134,7 +161,7 @@ def picture(lake: LakeSession, number: int) -> Picture:
 
 
 def list_images(lake: LakeSession) -> list[Json]:
-    """All of them, as a menu wants them."""
+    """Return one description per image for the menu of the page."""
     return [
         {
             "number": number,
@@ -147,7 +174,7 @@ def list_images(lake: LakeSession) -> list[Json]:
 
 
 def describe_image(lake: LakeSession, number: int) -> Json:
-    """Shape, levels, sky and noise for a first stretch, and places on the sky at nodes of a grid."""
+    """Return the shape and levels of an image, sky and noise for its initial stretch, and a grid of sky coordinates."""
     image = picture(lake, number)
     levels = image.levels()
     ny, nx = levels[0].shape
@@ -171,9 +198,10 @@ def describe_image(lake: LakeSession, number: int) -> Json:
 
 
 def _grid(wcs: WCS, nx: int, ny: int) -> Json:
-    """Tangent-plane coordinates (east, north) deg about the image's centre, at nodes: x[n], y[n], xi[n, n], eta[n, n].
+    """Return tangent-plane coordinates (deg, east and north of the image centre) at nodes of a grid of pixels.
 
-    In the tangent plane a distortion is smooth, and RA has no seam.
+    The keys are `ra`, `dec` (centre), `x`, `y` (pixels of the nodes, [n]), `xi` and `eta` (coordinates, [n, n]).
+    Tangent-plane coordinates are smooth and, unlike RA, do not jump at 360 degrees.
     """
     x, y = np.linspace(-0.5, nx - 0.5, _GRID_NODES), np.linspace(-0.5, ny - 0.5, _GRID_NODES)
     (ra0,), (dec0,) = astrometry.sky_of_pixel(wcs, [(nx - 1) / 2], [(ny - 1) / 2])
@@ -185,9 +213,19 @@ def _grid(wcs: WCS, nx: int, ny: int) -> Json:
 
 
 def to_tangent_plane(ra: Float, dec: Float, ra0: float, dec0: float) -> tuple[Float, Float]:
-    """Places on a tangent plane: east and north of where it touches, deg.
+    """Project positions onto a tangent plane.
 
-    ra, dec : [n] deg;  ra0, dec0 : where it touches the sphere, deg
+    Parameters
+    ----------
+    ra, dec : float array, shape (n,)
+        Positions in degrees.
+    ra0, dec0 : float
+        Point where the plane touches the sphere, in degrees.
+
+    Returns
+    -------
+    east, north : float array, shape (n,)
+        Coordinates in the plane relative to this point, in degrees.
     """
     a, d, d0 = np.radians(ra - ra0), np.radians(dec), np.radians(dec0)
     depth = np.sin(d0) * np.sin(d) + np.cos(d0) * np.cos(d) * np.cos(a)
@@ -196,9 +234,22 @@ def to_tangent_plane(ra: Float, dec: Float, ra0: float, dec0: float) -> tuple[Fl
 
 
 def bright_sources(lake: LakeSession, number: int, max_sources: int = MAX_SOURCES) -> Json:
-    """The brightest sources of an image: pixel, electrons, kind and identifier.
+    """Return the brightest sources of an image.
 
-    number : of the image;  most : so many at most
+    Parameters
+    ----------
+    lake : LakeSession
+        The open lake.
+    number : int
+        Number of the image.
+    max_sources : int, optional
+        Largest number of sources.
+
+    Returns
+    -------
+    dict
+        `total` (number of sources on the image) and lists with one value per source: `id`, pixel `x` and `y`, electrons
+        `expected` and `drawn`, and `kind`. The brightest source comes first.
     """
     image = picture(lake, number)
     exposure, detector = image.row["exposure_id"], image.row["detector"]
@@ -213,7 +264,7 @@ def bright_sources(lake: LakeSession, number: int, max_sources: int = MAX_SOURCE
     }
 
 
-# What the kind in an identifier stands for.
+# Names of the kinds of sources, by the code in their identifiers.
 KIND_NAMES = {int(code): name for code, name in GALAXIES.column("kind").codes} | {5: "star", 6: "moving body"}
 
 
@@ -222,7 +273,7 @@ def _kind_names(rows: pa.Table) -> list[str]:
 
 
 def failed_detectors(lake: LakeSession, request_tables: RequestTables) -> list[Json]:
-    """Detectors of a request whose last attempt failed, none where no run has left a log."""
+    """Return rows of the detectors of a request whose last attempt failed; empty if there is no log of a run."""
     try:
         return [row for name in request_tables.names or [None] for row in archive.failures(lake.root, name).to_pylist()]
     except LakeError:
@@ -230,18 +281,31 @@ def failed_detectors(lake: LakeSession, request_tables: RequestTables) -> list[J
 
 
 def is_north_up(lake: LakeSession, number: int) -> bool:
-    """Whether declination grows with the rows of an image."""
+    """Return True if declination increases with the row number of an image."""
     image = picture(lake, number)
     _, dec = astrometry.sky_of_pixel(image.wcs, [0.0, 0.0], [0.0, 1.0])
     return bool(dec[1] > dec[0])
 
 
 def images_at(lake: LakeSession, ra: float, dec: float) -> list[tuple[int, float, float]]:
-    """Images that hold a place: number, column and row, 0 = centre of the first pixel."""
+    """Find the images that contain a position.
+
+    Parameters
+    ----------
+    lake : LakeSession
+        The open lake.
+    ra, dec : float
+        Position in degrees.
+
+    Returns
+    -------
+    list of (int, float, float)
+        Number of the image, column and row of the position; 0 is the centre of the first pixel.
+    """
     images = pictures(lake)
     regions = pa.table({"number": range(len(images)), "s_region": [str(image.row["s_region"]) for image in images]})
     matches = []
-    # Only what may hold it is opened.
+    # Open only images whose footprint contains the position.
     for number in archive.rows_at_place(regions, ra, dec)["number"].to_pylist() if images else []:
         image = images[number]
         (x,), (y,) = astrometry.pixel_of_sky(image.system, [ra], [dec])

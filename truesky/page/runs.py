@@ -1,4 +1,8 @@
-"""What was done for a lake: tasks, seconds and GB beside forecasts, failures, the mission, where an image is from."""
+"""Answers to the page about the runs of a lake.
+
+They contain the cost of the jobs with its forecast, the progress and failures of rendering, the changed parameters of
+the mission, and the provenance of an image.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +27,7 @@ Json = dict[str, Any]
 
 
 def runs(lake: LakeSession) -> Json:
-    """Jobs with their forecasts, tasks done of all, failures, and what of the mission is not as truesky has it."""
+    """Return the jobs with their forecasts, the numbers of finished tasks, failures and changed mission parameters."""
     result: Json = {"jobs": [], "tasks": [], "failures": [], "mission": []}
     try:
         result["jobs"] = [
@@ -53,7 +57,7 @@ def runs(lake: LakeSession) -> Json:
 
 
 def _remaining_work(request_tables: RequestTables, done: set[tuple[int, str]]) -> tuple[int, float]:
-    """Detectors that are planned and not done: how many, and their seconds."""
+    """Return the number of planned detectors that are not rendered yet, and the forecast of their CPU time (s)."""
     begun = pa.array([*{exposure for exposure, _ in done}], pa.int64())
     number, seconds = 0, 0.0
     for rows in request_tables.iterate_rows("tasks", ["exposure_id", "detector", "seconds"]):
@@ -67,7 +71,7 @@ def _remaining_work(request_tables: RequestTables, done: set[tuple[int, str]]) -
 
 
 def _overridden_parameters(version: read.Version) -> list[Json]:
-    """Parameters that a request gave another value than they have in the mission database of this truesky."""
+    """Mission parameters that a request has changed, with their values in the mission database of this version."""
     rows = version.rows(["name", "value", "unit", "overridden"]).to_pylist()
     defaults = resolve()
     return [
@@ -79,9 +83,19 @@ def _overridden_parameters(version: read.Version) -> list[Json]:
 
 
 def provenance(lake: LakeSession, number: int) -> Json:
-    """A tree: the image, the version of the table that it is of, what that was made of, and so on.
+    """Return the provenance of an image as a tree: image, version of its table, versions of the inputs, and so on.
 
-    number : of the image
+    Parameters
+    ----------
+    lake : LakeSession
+        The open lake.
+    number : int
+        Number of the image in `pictures.pictures`.
+
+    Returns
+    -------
+    dict
+        A node with `name`, `about` (a description) and `from` (list of nodes).
     """
     image = pictures.picture(lake, number)
     return {

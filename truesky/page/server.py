@@ -1,6 +1,6 @@
-"""Which address is answered by what.
+"""HTTP server of the page: maps addresses to handlers.
 
-What answers is imported when first asked, or when the first sky has been shown: it takes longer to load than that.
+The modules of the handlers take long to import. They are imported on first use, or after the first sky map was sent.
 """
 
 from __future__ import annotations
@@ -24,15 +24,20 @@ from truesky.page.tap import service
 
 _STATIC = Path(__file__).with_name("static")
 _TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
-# s that the first sky may take: then the processes are started all the same.
+# Start the query processes after the first sky map, but at the latest after this time (s).
 _FIRST_SKY_TIMEOUT = 3.0
 LakeHandler = Callable[[LakeSession, web.Request], Awaitable[web.StreamResponse]]
 
 
 class Server:
-    """The page over one lake, which can be opened again.
+    """Server of the page and of TAP for one lake, which can be opened again while the server runs.
 
-    open_lake : opens it
+    Parameters
+    ----------
+    open_lake : callable
+        Function that opens the lake and returns a LakeSession.
+    access : AccessRules
+        Rules of access.
     """
 
     def __init__(self, open_lake: Callable[[], LakeSession], access: AccessRules) -> None:
@@ -41,7 +46,7 @@ class Server:
         self._opening, self._first_sky_shown = asyncio.Lock(), asyncio.Event()
 
     def application(self) -> web.Application:
-        """What aiohttp runs."""
+        """Return the aiohttp application with all routes."""
         app = web.Application(middlewares=[self.access.middleware, _errors_to_json], client_max_size=MAX_BODY_BYTES)
         app.on_response_prepare.append(add_security_headers)
         app.on_startup.append(self._start_warm_up)
@@ -59,7 +64,7 @@ class Server:
         self._warm_up_task = asyncio.create_task(self._warm_up())
 
     async def _warm_up(self) -> None:
-        """Start the processes when the first sky has been told: beside it they would make it late."""
+        """Start the query processes after the first sky map is sent, because starting them earlier would delay it."""
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(self._first_sky_shown.wait(), _FIRST_SKY_TIMEOUT)
         await asyncio.to_thread(_import_handlers)
@@ -72,7 +77,7 @@ class Server:
         self.lake.close()
 
     async def _file(self, request: web.Request) -> web.StreamResponse:
-        """A file of the page: those that lie in its folder, no path."""
+        """Send a file of the page. Only files in the folder static/ are found; a name with a path is refused."""
         name = request.match_info.get("name", "index.html")
         files = {path.name: path for path in _STATIC.iterdir() if path.suffix in _TYPES}
         if name not in files:
@@ -86,9 +91,9 @@ class Server:
         return answers.json_response({**answers.describe_lake(lake), "is_changed": is_changed, "tap": tap_address})
 
     async def _reopen_lake(self, request: web.Request) -> web.StreamResponse:
-        """Show the lake as it is now; whatever was made of it as it was is refused from here on."""
+        """Open the lake again if it has changed. Requests with the key of the previous lake are refused from now on."""
         async with self._opening:
-            # Of two who ask at once the second finds it done.
+            # If two requests come at the same time, the second finds an unchanged lake.
             if await self.lake.table_pool.run(self.lake.is_changed):
                 previous, self.lake = self.lake, await self.lake.table_pool.run(self._open_lake)
                 previous.close()
@@ -98,7 +103,7 @@ class Server:
         async def respond(request: web.Request) -> web.StreamResponse:
             lake = self.lake
             if request.match_info["key"] != lake.key:
-                return web.json_response({"error": "the lake has been opened anew", "key": lake.key}, status=409)
+                return web.json_response({"error": "the lake has been opened again", "key": lake.key}, status=409)
             response = await handler(lake, request)
             if handler is _partition_density:
                 self._first_sky_shown.set()
@@ -108,7 +113,7 @@ class Server:
 
 
 def _import_handlers() -> None:
-    """What answers, before it is asked."""
+    """Import the modules of the handlers before their first request."""
     from truesky.page import charts, pictures, runs, sources  # noqa: F401
     from truesky.page.tap import images  # noqa: F401
 
@@ -117,7 +122,7 @@ def _import_handlers() -> None:
 async def _errors_to_json(
     request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
 ) -> web.StreamResponse:
-    """What is refused is said in one line, with a status that tells whose fault it is."""
+    """Turn errors into JSON responses: 409 lake opened again, 429 busy, 400 bad input, 500 damaged lake or disc."""
     try:
         return await handler(request)
     except Closed as error:
@@ -130,23 +135,23 @@ async def _errors_to_json(
         return web.json_response({"error": str(error) or type(error).__name__}, status=500)
 
 
-# ------------------------------------------------------------------------------------------------ of one lake
+# ------------------------------------------------------------------------------------------------ handlers
 
 
 async def _read_json(request: web.Request) -> dict[str, Any]:
     try:
         content = json.loads(await request.text())
     except (ValueError, RecursionError):
-        raise BadInput("the question is no JSON") from None
+        raise BadInput("the body of the request is not JSON") from None
     if not isinstance(content, dict):
-        raise BadInput("the question is no JSON object")
+        raise BadInput("the body of the request is not a JSON object")
     return content
 
 
 def _integer_parameter(request: web.Request, name: str) -> int:
     text = request.match_info.get(name) or request.query.get(name, "")
     if not (text.isascii() and text.isdigit() and len(text) < 10):
-        raise BadInput(f"{name}: wanted a whole number")
+        raise BadInput(f"{name} must be a whole number with at most 9 digits")
     return int(text)
 
 
@@ -154,16 +159,16 @@ def _float_parameters(request: web.Request, *names: str) -> Float:
     try:
         numbers = np.array([float(request.query[name]) for name in names])
     except (KeyError, ValueError):
-        raise BadInput(f"wanted numbers: {', '.join(names)}") from None
+        raise BadInput(f"{', '.join(names)} must be numbers") from None
     if not np.isfinite(numbers).all():
-        raise BadInput(f"wanted finite numbers: {', '.join(names)}")
+        raise BadInput(f"{', '.join(names)} must be finite numbers")
     return numbers
 
 
 def _view_parameter(request: web.Request) -> Float:
     view = _float_parameters(request, "ra", "dec", "radius")
     if not (-90.0 <= view[1] <= 90.0 and 0.0 < view[2] <= 180.0):
-        raise BadInput("dec, radius: outside the sky")
+        raise BadInput("dec must be in [-90, 90] and radius in (0, 180]")
     return view
 
 
@@ -250,9 +255,21 @@ async def _nearest(lake: LakeSession, request: web.Request) -> web.StreamRespons
 
 
 def _json_handler(function: Callable[..., Any], *names: str, is_small: bool = False) -> LakeHandler:
-    """An answer of JSON: the function of the lake and of parts of the address, made beside everything else.
+    """Make a handler that runs a function in a thread and sends its result as JSON.
 
-    is_small : asked for by the dozen, as tiles are
+    Parameters
+    ----------
+    function : callable
+        Function of the lake and of the named parts of the address.
+    *names : str
+        Names of these parts.
+    is_small : bool, optional
+        Use the threads for short, frequent requests.
+
+    Returns
+    -------
+    LakeHandler
+        The handler.
     """
 
     async def respond(lake: LakeSession, request: web.Request) -> web.StreamResponse:

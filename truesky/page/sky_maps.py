@@ -1,6 +1,6 @@
-"""The sky of a lake: densities in HEALPix cells, sources of a small field, footprints of what is planned or done.
+"""Sky maps of a lake: densities in HEALPix cells, sources in a small field, footprints of exposures and detectors.
 
-What is of the renderer is imported where it is used: the first sky is shown before that is loaded.
+Functions import the modules of the renderer only when they need them, so that the first map is shown early.
 """
 
 from __future__ import annotations
@@ -27,17 +27,35 @@ _TASK_COLUMNS = (*_CIRCLE_COLUMNS, "s_region")
 MAX_CELLS, MAX_SOURCES = 200_000, 20_000
 _MAX_ORDER = 16
 MAX_EXPOSURES = 20_000
-# Of a plan of more detectors those are looked up that are shown: of so many exposures, whose boresights lie so many deg
-# at most from the edge of what is in view.
+# If a plan has more than LARGE_PLAN detectors, only detectors near the view are read. Their exposures, at most
+# MAX_LOOKED_UP, have boresights within MAX_CAMERA_RADIUS degrees of the edge of the view.
 LARGE_PLAN, MAX_LOOKED_UP, MAX_CAMERA_RADIUS = 200_000, 1_000, 2.0
 Json = dict[str, Any]
-# Of the sources of a field: what is shown beside the place, where a table has it, and which come first: the smallest
-# numbers of a magnitude, the largest of a mass.
+# Columns by which the sources in a field are ordered; the first one that the table has is used. Sources come in
+# ascending order (1, magnitudes) or descending order (-1, masses).
 _SORT_COLUMNS = (("mag_r01", 1), ("mag_h", 1), ("phot_g_mean_mag", 1), ("log_mass", -1))
 
 
 def partition_density(lake: LakeSession, table: str) -> bytes:
-    """Densities in the files' own cells, from the manifest: no row is read."""
+    """Return the mean density of a catalogue in the cell of each of its files. Only the manifest is read.
+
+    Parameters
+    ----------
+    lake : LakeSession
+        The open lake.
+    table : str
+        Name of a catalogue.
+
+    Returns
+    -------
+    bytes
+        Packed cells as in `density`, in sources per deg2. The header has `cells` and `rows`.
+
+    Raises
+    ------
+    BadInput
+        If the lake has no such table, or the table has no positions.
+    """
     version = lake.find_version(table)
     if not is_catalogue(version):
         raise BadInput(f"table {table} has no positions")
@@ -52,18 +70,42 @@ def partition_density(lake: LakeSession, table: str) -> bytes:
 async def density(
     lake: LakeSession, table: str, order: int, where: str, view: Float | None, value: str | None = None
 ) -> bytes:
-    """4 bytes: length of the head; the head, JSON; float32 corners [n, 4, 2] deg; float32 number per deg2 [n].
+    """Return the density of a catalogue, or the mean of an expression, in HEALPix cells.
 
-    order : of the cells;  where : SQL condition of the rows that count;  view : ra, dec, radius deg; None: everything
-    table : of the rows;  value : SQL whose mean over the rows of a cell is told instead of their number; rows that
-            have no finite one are `missing` of the head, not of the mean
+    Parameters
+    ----------
+    lake : LakeSession
+        The open lake.
+    table : str
+        Name of a catalogue.
+    order : int
+        HEALPix order of the cells, 0 to 16.
+    where : str
+        SQL condition that selects rows.
+    view : float array or None
+        RA, Dec and radius of the field in degrees; None for the whole sky.
+    value : str, optional
+        SQL expression whose mean per cell is returned instead of the density.
+
+    Returns
+    -------
+    bytes
+        The length of the header (4 bytes), the header (JSON), the corners of the cells in degrees (float32
+        [n, 4, 2]), and the number of rows per deg2 or the mean (float32 [n]). The header has `cells`, `order`, `rows`
+        and `missing`, the number of rows without a finite value, which do not enter the mean.
+
+    Raises
+    ------
+    BadInput
+        If the order is outside its limits, the table has no positions, an expression is refused, or more than
+        MAX_CELLS cells contain rows.
     """
     if not 0 <= order <= _MAX_ORDER:
         raise BadInput(f"order = {order} is outside [0, {_MAX_ORDER}]")
     shift = 2 * (sky.MAX_ORDER - order)
     aggregate = "count(*)::DOUBLE AS told, 0 AS lost"
     if value is not None:
-        # One NaN would make a NaN of the mean of its cell.
+        # A single NaN would turn the mean of its cell into NaN.
         number = f"TRY_CAST(({value}\n) AS DOUBLE)"
         finite = f"FILTER (isfinite({number}))"
         aggregate = f"avg({number}) {finite} AS told, count(*) - count(*) {finite} AS lost"
@@ -82,10 +124,29 @@ def _sum(column: pa.ChunkedArray) -> int:
 
 
 def coverage(lake: LakeSession, order: int, view: Float | None, band: str | None) -> bytes:
-    """The same with how many of the planned exposures see the centre of each cell.
+    """Return the number of planned exposures that cover the centre of each HEALPix cell.
 
-    lake : whose plan;  order : of the cells
-    view : ra, dec, radius deg; None: everything;  band : of the exposures, None = all
+    Parameters
+    ----------
+    lake : LakeSession
+        The open lake.
+    order : int
+        HEALPix order of the cells, 0 to 16.
+    view : float array or None
+        RA, Dec and radius of the field in degrees; None for the whole sky.
+    band : str or None
+        Passband of the exposures; None for all.
+
+    Returns
+    -------
+    bytes
+        Packed cells as in `density`, with the number of exposures. The header has `cells`, `order` and `rows`, the
+        number of planned detectors.
+
+    Raises
+    ------
+    BadInput
+        If the order is outside its limits, or more than MAX_CELLS cells are covered.
     """
     from truesky.render.camera import footprints
 
@@ -111,9 +172,9 @@ def coverage(lake: LakeSession, order: int, view: Float | None, band: str | None
 
 
 def _planned_tasks(lake: LakeSession, band: str | None, columns: Sequence[str]) -> Iterator[pa.Table]:
-    """What is planned in a band, None = in all, a part of a plan after the other.
+    """Yield the planned tasks of a band (None for all bands), partition by partition.
 
-    What several requests have of one version counts once.
+    A plan that several requests share is read once.
     """
     for request_tables in {
         request_tables.versions["tasks"].key: request_tables
@@ -129,7 +190,7 @@ def _planned_tasks(lake: LakeSession, band: str | None, columns: Sequence[str]) 
 
 
 def bands(lake: LakeSession) -> list[str]:
-    """Passbands in which exposures are planned."""
+    """Return the sorted names of the passbands of all planned exposures."""
     tables = (
         rows
         for request_tables in lake.observed_requests
@@ -140,7 +201,7 @@ def bands(lake: LakeSession) -> list[str]:
 
 def _refuse_many_cells(cells: int) -> None:
     if cells > MAX_CELLS:
-        raise BadInput(f"more than {MAX_CELLS:,} cells hold something: look at a part, or at larger cells")
+        raise BadInput(f"more than {MAX_CELLS:,} cells contain rows: use a smaller field or larger cells")
 
 
 def _corners(order: int, cells: Int) -> Float:
@@ -148,11 +209,30 @@ def _corners(order: int, cells: Int) -> Float:
 
 
 async def sources_in_view(lake: LakeSession, table: str, view: Float, where: str) -> Json:
-    """Rows of a catalogue in a field: places, identifiers, a magnitude, a kind; of `total` the brightest `most`.
+    """Return the brightest (or most massive) sources of a catalogue in a field.
 
-    view : ra, dec, radius deg;  where : SQL condition
+    Parameters
+    ----------
+    lake : LakeSession
+        The open lake.
+    table : str
+        Name of a catalogue.
+    view : float array
+        RA, Dec and radius of the field in degrees.
+    where : str
+        SQL condition that selects rows.
 
-    `by` is the column of the magnitude, which a mass may stand for; `sense` 1 where small numbers come first, else -1.
+    Returns
+    -------
+    dict
+        Lists with one value per source: `ra`, `dec` (deg), `id` (string), `mag` and `kind`. `by` is the name of the
+        column in `mag`, a magnitude or a mass, or None; `sense` is 1 if sources are in ascending order of it, -1 if in
+        descending order. `total` is the number of sources in the field, `most` the largest number that is returned.
+
+    Raises
+    ------
+    BadInput
+        If the lake has no such table, the table has no positions, or the condition is refused.
     """
     version = lake.find_version(table)
     names = version.schema.names
@@ -189,7 +269,7 @@ def _catalogue_name(lake: LakeSession, table: str) -> str:
 
 
 def _view_condition(view: Float | None) -> str:
-    """The condition that a row lies in cells that the view touches: files and row groups outside are not read."""
+    """SQL condition that a row lies in a cell that touches the view, so that DuckDB can skip files and row groups."""
     if view is None:
         return "true"
     return adql.cone_condition("_healpix_29", *(float(number) for number in view))
@@ -203,23 +283,33 @@ def _pack_cells(corners: Float, density: Float, header: Json) -> bytes:
 
 
 def regions(lake: LakeSession) -> list[Json]:
-    """Footprints of detectors: what was planned, what is done, what failed; images by number, each with its content.
+    """Return the footprint of each planned or rendered detector, with its state and its images.
 
-    Each has the request whose exposure it is of, None where the lake has no other.
+    Parameters
+    ----------
+    lake : LakeSession
+        The open lake.
+
+    Returns
+    -------
+    list of dict
+        One entry per detector and exposure: `request` (None if the lake has only one), `exposure_id`, `detector`,
+        `channel`, `band`, `polygon` (corners in degrees), `state` ("planned", "observed" or "failed"), `images`
+        (numbers) and `contents` (content of each image). A large plan is listed only for exposures with images.
     """
     failures = _failure_messages(lake)
     return [_current_region(place, region, failures) for place, region in _known_regions(lake).items()]
 
 
-# A request, one of its exposures, and a detector: by these a footprint is found.
+# Key of a footprint: request, number of the exposure, detector.
 _DetectorKey = tuple[str | None, int, str]
 
 
 @lru_cache(maxsize=4)
 def _known_regions(lake: LakeSession) -> Mapping[_DetectorKey, Json]:
-    """What was planned, of a large plan with exposures of which something is done; and what is done.
+    """Footprints of planned and rendered detectors, which do not change while the lake is open.
 
-    That does not change while the lake is open.
+    A large plan is included only for exposures with images.
     """
     from truesky.page import pictures
 
@@ -247,7 +337,7 @@ def _is_large(request_tables: RequestTables) -> bool:
 def _planned_regions(
     request_tables: RequestTables, exposure_ids: Collection[int] | None = None
 ) -> dict[_DetectorKey, Json]:
-    """Detectors of a request's exposures, None = of all of them."""
+    """Footprints of the planned detectors of some exposures of a request; None for all exposures."""
     band_by_exposure = {
         row["exposure_id"]: row["band"]
         for row in request_tables.rows("exposures", ("exposure_id", "band"), exposure_ids)
@@ -268,7 +358,7 @@ def _planned_regions(
 
 
 def _regions_in_view(lake: LakeSession, view: Float | None) -> dict[_DetectorKey, Json]:
-    """Of large plans the detectors that may be in view.  Errors: BadInput where they are too many"""
+    """Footprints of detectors of large plans that may be in view; raise BadInput if there are too many."""
     regions_by_key: dict[_DetectorKey, Json] = {}
     for request_tables in filter(_is_large, lake.observed_requests):
         exposures = request_tables.versions["exposures"].rows(("exposure_id", "ra", "dec"))
@@ -284,11 +374,11 @@ def _regions_in_view(lake: LakeSession, view: Float | None) -> dict[_DetectorKey
 
 def _refuse_many_exposures(exposures: int, max_exposures: int) -> None:
     if exposures > max_exposures:
-        raise BadInput(f"more than {max_exposures:,} exposures are here: look at a part")
+        raise BadInput(f"more than {max_exposures:,} exposures are in view: use a smaller field")
 
 
 def _failure_messages(lake: LakeSession) -> dict[tuple[str | None, str], str]:
-    """Why a part of a request's images could not be made: runs of other processes may say so at any time."""
+    """Error messages of failed tasks by request and task. They are read each time, because runs may be in progress."""
     from truesky.page import pictures
 
     return {
@@ -312,16 +402,32 @@ def _detector_region(request_tables: RequestTables, row: Mapping[str, Any]) -> J
 
 
 def exposure_footprints(lake: LakeSession, view: Float | None = None) -> list[Json]:
-    """Footprints of exposures, each the convex hull of its detectors: how many of these are done, and how many failed.
+    """Return the footprints of exposures, each the convex hull of its detectors.
 
-    view   : ra, dec, radius deg, None = all;  returns: of each exposure its state, what it is, and `outline`, polygons
-    Errors : BadInput where they are more than are shown
+    Parameters
+    ----------
+    lake : LakeSession
+        The open lake.
+    view : float array, optional
+        RA, Dec and radius of the field in degrees. The default is the whole sky.
+
+    Returns
+    -------
+    list of dict
+        One entry per exposure: `request`, columns of the table `exposures`, `state` ("planned", "partly", "observed" or
+        "failed"), the numbers of detectors that are `done`, that `failed` and of `all`, and `outline` (list of
+        polygons, corners in degrees).
+
+    Raises
+    ------
+    BadInput
+        If more than MAX_EXPOSURES exposures are in view.
     """
     regions_by_key, (descriptions, detector_keys, circles) = _known_regions(lake), _cached_outlines(lake)
     if added_regions := _regions_in_view(lake, view):
         regions_by_key = {**added_regions, **regions_by_key}
         descriptions, detector_keys, circles = _outline_exposures(lake, regions_by_key)
-    # A circle about all corners meets the one in view.
+    # Select exposures whose circumscribed circle overlaps the circle in view.
     in_view = np.full(len(descriptions), True)
     if view is not None:
         in_view = sky.separation(circles[:, 0], circles[:, 1], view[0], view[1]) <= circles[:, 2] + view[2]
@@ -358,7 +464,10 @@ def _cached_outlines(lake: LakeSession) -> tuple[list[Json], list[list[_Detector
 def _outline_exposures(
     lake: LakeSession, regions_by_key: Mapping[_DetectorKey, Json]
 ) -> tuple[list[Json], list[list[_DetectorKey]], Float]:
-    """Of every exposure what it is, its detectors, and a circle about their corners: ra, dec, radius deg [n, 3]."""
+    """Return for each exposure its description, its detectors, and a circle around their corners.
+
+    The circles are an array [n, 3]: RA, Dec and radius in degrees.
+    """
     detectors = dict[tuple[str | None, int], list[_DetectorKey]]()
     for detector_key in regions_by_key:
         detectors.setdefault(detector_key[:2], []).append(detector_key)
@@ -396,15 +505,15 @@ def _state(done: int, failed: int, number: int) -> str:
 
 
 def _mean_position(corners: Float) -> tuple[float, float]:
-    """ra, dec of the mean of unit vectors, deg."""
+    """RA and Dec (deg) of the mean of the unit vectors of the corners."""
     x, y, z = sky.unit_vectors(corners[:, 0], corners[:, 1]).mean(0)
     return float(np.degrees(np.arctan2(y, x)) % 360.0), float(np.degrees(np.arctan2(z, np.hypot(x, y))))
 
 
 def _convex_hull(corners: Float) -> Float:
-    """Those of the places [n, 2] deg that no great circle cuts off, counter-clockwise with north up and east left.
+    """Return the corners [n, 2] (deg) of the convex hull on the sphere, counter-clockwise with north up and east left.
 
-    In the tangent plane of their middle great circles are straight lines. Of places on one line its ends are left.
+    In a tangent plane great circles are straight lines. If all corners lie on one line, its two ends are returned.
     """
     from scipy.spatial import ConvexHull, QhullError
 
@@ -412,7 +521,7 @@ def _convex_hull(corners: Float) -> Float:
 
     plane = np.stack(pictures.to_tangent_plane(corners[:, 0], corners[:, 1], *_mean_position(corners)), axis=1)
     try:
-        # East is to the left of north.
+        # East is to the left of north, so reverse the order of the plane.
         hull: Float = corners[ConvexHull(plane).vertices[::-1]]
     except QhullError:
         hull = corners[np.lexsort((plane[:, 1], plane[:, 0]))[[-1, 0]]]

@@ -1,4 +1,4 @@
-"""One source: its rows, its spectrum as it is observed, where it was drawn and dispersed, and small pictures of it."""
+"""Answers to the page about one source: its rows, its observed spectrum, its images and traces, and cutouts."""
 
 from __future__ import annotations
 
@@ -21,18 +21,35 @@ from truesky.page.answers import pack, to_json_value
 from truesky.page.lake_session import LakeSession, RequestTables
 
 _TABLES_BY_KIND = {**{kind: ("galaxies", "galaxy_fluxes") for kind in range(5)}, 5: ("stars", "star_fluxes")}
-# A spectrum is shown at so many wavelengths.
+# Approximate number of wavelengths at which a spectrum is shown.
 _SPECTRUM_SAMPLES = 2400
 _CUTOUT_SIDE = 64
-# Rows on each side of a trace that are shown of it, pixels; places along it at most.
+# Rows on each side of a trace in a strip (pixels), and largest number of columns along the trace.
 _STRIP_HALF_WIDTH, _MAX_STRIP_LENGTH = 12, 4096
 Json = dict[str, Any]
 
 
 def describe_source(lake: LakeSession, identifier_text: str) -> Json:
-    """Its kind, its rows by table with units, and where it was drawn.
+    """Describe a source: its kind, its rows with units, and the detectors on which it was drawn or dispersed.
 
-    text : identifier, decimal
+    Parameters
+    ----------
+    lake : LakeSession
+        The open lake.
+    identifier_text : str
+        Identifier of the source as a decimal number.
+
+    Returns
+    -------
+    dict
+        `id`, `kind`, `request`, `tables` (columns of its row by table), `drawn` (rows of `rendered_truth`), `spectra`
+        (rows of `rendered_spectra` with lines) and, if it is in a catalogue, `place` (RA and Dec in degrees) and
+        `images` (images that contain this position).
+
+    Raises
+    ------
+    BadInput
+        If the identifier is invalid, or the lake has no such source.
     """
     identifier = _parse_identifier(identifier_text)
     kind = int(ids.kind_from_id(np.array([identifier]))[0])
@@ -71,15 +88,15 @@ def describe_source(lake: LakeSession, identifier_text: str) -> Json:
 
 
 def _matching_rows(request_tables: RequestTables, table: str, condition: ds.Expression) -> list[Json]:
-    """Those rows of a table of a request that a filter lets through."""
+    """Rows of a table of a request that meet a condition; empty if the request has no such table."""
     version = request_tables.versions.get(table)
     return [] if version is None else version.rows(where=condition).to_pylist()
 
 
 def _redshift(request_tables: RequestTables, identifier: int, rows: Mapping[str, pa.Table]) -> float:
-    """Of a galaxy as a request has it, whose universe may be another; 0 where none has its row.
+    """Redshift of a galaxy in the catalogue of a request, else in `rows`; 0 if it is in neither.
 
-    rows : by table, of whichever request has the source
+    Requests may have different universes, so `rows`, which may belong to another request, are the second choice.
     """
     version = request_tables.versions.get("galaxies")
     row = rows.get("galaxies") if version is None else _source_rows(version, identifier)
@@ -87,10 +104,7 @@ def _redshift(request_tables: RequestTables, identifier: int, rows: Mapping[str,
 
 
 def _describe_trace(lake: LakeSession, request_tables: RequestTables, row: Json, z: float) -> Json:
-    """A row of `rendered_spectra`: the images that hold it, and its lines by name.
-
-    own : the tables of the request that has it;  z : redshift of the source
-    """
+    """Describe a row of `rendered_spectra`: the images that contain the trace, and its lines by name."""
     detector_key = request_tables.request, row["exposure_id"], row["detector"]
     images = pictures.pictures(lake)
     numbers = [k for k, image in enumerate(images) if image.detector_key == detector_key]
@@ -123,11 +137,11 @@ def _parse_identifier(text: str) -> int:
 
 
 def _source_rows(version: read.Version, identifier: int) -> pa.Table:
-    """The row of a source: of the files only those about its cell are read, unless it lies far from its halo."""
+    """Read the row of a source. Only files around its cell are read, unless it lies far from its halo."""
     cell = identifier >> ids.BLOCK_BITS & ((1 << 2 * ids.GENERATION_ORDER + 4) - 1)
     for order in (ids.GENERATION_ORDER, ids.FILE_ORDER):
         parent_cell = int(sky.parent(cell, ids.GENERATION_ORDER, order))
-        # What is lensed across a cell's edge lies in a neighbour.
+        # Lensing may have moved the source into a neighbouring cell.
         rows = version.rows_in_cells([parent_cell, *sky.margin_cells(order, parent_cell, order).tolist()], order)
         rows = rows.filter(pc.equal(rows["id"], identifier))
         if rows.num_rows:
@@ -136,10 +150,7 @@ def _source_rows(version: read.Version, identifier: int) -> pa.Table:
 
 
 def _find_source(lake: LakeSession, identifier: int, kind: int) -> tuple[dict[str, pa.Table], RequestTables | None]:
-    """The rows of a source by table, all of one request: of that which has most of them, of several the first.
-
-    kind : of the source
-    """
+    """Return the rows of a source by table, from the first request that has the largest number of its tables."""
     best: tuple[dict[str, pa.Table], RequestTables | None] = {}, None
     tables = _TABLES_BY_KIND.get(kind, ())
     for request_tables in lake.request_tables(*tables):
@@ -168,10 +179,20 @@ def _describe_columns(rows: pa.Table) -> list[Json]:
 
 
 def spectrum(lake: LakeSession, identifier_text: str) -> Json:
-    """f_lambda as it arrives, its lines, and the passbands of the lake with the fluxes through them.
+    """Return the observed spectrum of a source, its lines, and its fluxes in the passbands of the lake.
 
-    text    : identifier, decimal
-    returns : wavelengths in angstrom, f_lambda in erg s-1 cm-2 A-1, f_nu in microjansky; or `said`, why there is none
+    Parameters
+    ----------
+    lake : LakeSession
+        The open lake.
+    identifier_text : str
+        Identifier of the source as a decimal number.
+
+    Returns
+    -------
+    dict
+        `wavelength` (angstrom), `f_lambda` (erg s-1 cm-2 A-1), `lines`, `bands` with fluxes `f_nu` in microjansky,
+        and `z` for galaxies. If there is no spectrum, only `said`, a message with the reason.
     """
     try:
         return _spectrum(lake, identifier_text)
@@ -183,7 +204,7 @@ def _spectrum(lake: LakeSession, identifier_text: str) -> Json:
     identifier = _parse_identifier(identifier_text)
     kind = int(ids.kind_from_id(np.array([identifier]))[0])
     if kind not in (0, 1, 4, 5):
-        raise BadInput(f"no spectrum is made of a {pictures.KIND_NAMES.get(kind, kind)}")
+        raise BadInput(f"a source of kind {pictures.KIND_NAMES.get(kind, kind)} has no spectrum")
     rows, request_tables = _find_source(lake, identifier, kind)
     for name in _TABLES_BY_KIND[kind]:
         if request_tables is None or name not in rows:
@@ -204,7 +225,7 @@ def _spectrum(lake: LakeSession, identifier_text: str) -> Json:
         )
     step = max(len(wavelength) // _SPECTRUM_SAMPLES, 1)
     size = len(wavelength) // step * step
-    # Means, so that no line falls between two samples.
+    # Average over each step instead of sampling, so that no line is lost between two samples.
     result: Json = {
         "wavelength": np.round(wavelength[:size].reshape(-1, step).mean(axis=1), 2).tolist(),
         "f_lambda": [float(f"{value:.5g}") for value in flux_density[:size].reshape(-1, step).mean(axis=1)],
@@ -222,7 +243,7 @@ def _spectrum(lake: LakeSession, identifier_text: str) -> Json:
 
 
 def _band_fluxes(request_tables: RequestTables, row: pa.Table) -> list[Json]:
-    """Passbands, of the request whose fluxes are shown, with the fluxes through them."""
+    """Passbands of a request with the fluxes of a source in them."""
     fluxes = {name: row[name][0].as_py() for name in row.column_names if name.startswith("f_nu_")}
     return [
         {
@@ -237,13 +258,30 @@ def _band_fluxes(request_tables: RequestTables, row: pa.Table) -> list[Json]:
 
 
 def cutout(lake: LakeSession, number: int, x: float, y: float) -> bytes:
-    """float32 [64, 64] pixels about a place of an image, NaN beyond its edge.
+    """Return 64 x 64 pixels around a position on an image, without cosmic rays if possible.
 
-    lake, number : of the image;  x, y : column and row, 0 = centre of the first pixel
+    Parameters
+    ----------
+    lake : LakeSession
+        The open lake.
+    number : int
+        Number of the image.
+    x, y : float
+        Column and row of the position; 0 is the centre of the first pixel.
+
+    Returns
+    -------
+    bytes
+        Pixels as float32 [64, 64], NaN outside the image.
+
+    Raises
+    ------
+    BadInput
+        If there is no such image, or the position is not finite or beyond 1e6 pixels.
     """
     image = pictures.picture(lake, number).levels(without_cosmic_rays=True)[0]
     if not (np.isfinite([x, y]).all() and abs(x) < 1e6 and abs(y) < 1e6):
-        raise BadInput("x, y: wanted pixels")
+        raise BadInput("x, y must be finite and below 1e6 pixels")
     out = np.full((_CUTOUT_SIDE, _CUTOUT_SIDE), np.nan, np.float32)
     column, row = round(x) - _CUTOUT_SIDE // 2, round(y) - _CUTOUT_SIDE // 2
     first_row, first_column = max(row, 0), max(column, 0)
@@ -256,11 +294,30 @@ def cutout(lake: LakeSession, number: int, x: float, y: float) -> bytes:
 
 
 def trace_strip(lake: LakeSession, number: int, identifier_text: str, order: int) -> bytes:
-    """Pixels along the trace of a source's order: 4 bytes, the length of the head; the head, JSON; float32 [rows, n].
+    """Return the pixels along the trace of a source's spectrum, straightened into a strip.
 
-    lake, number : of the image;  text : identifier of the source, decimal;  order : of the grism
-    The head has rows and columns, and the wavelengths of the first and the last column, angstrom. Each value is that
-    of the pixel nearest to the place, NaN beyond the image; rows go across the trace, its own in the middle.
+    Parameters
+    ----------
+    lake : LakeSession
+        The open lake.
+    number : int
+        Number of the image.
+    identifier_text : str
+        Identifier of the source as a decimal number.
+    order : int
+        Order of the grism.
+
+    Returns
+    -------
+    bytes
+        The length of the header (4 bytes), the header (JSON) and the pixels (float32 [rows, columns]). The header has
+        `rows`, `columns`, and `first` and `last`, the wavelengths of the first and last column in angstrom. Rows run
+        across the trace, which is in the middle. Each value is the nearest pixel of the image, or NaN outside it.
+
+    Raises
+    ------
+    BadInput
+        If there is no such image, or it has no spectrum of this source in this order.
     """
     image = pictures.picture(lake, number)
     trace_key = {"exposure_id": image.row["exposure_id"], "detector": image.row["detector"], "order": order}
@@ -287,9 +344,21 @@ def trace_strip(lake: LakeSession, number: int, identifier_text: str, order: int
 
 
 def nearest_source(lake: LakeSession, ra: float, dec: float, radius: float) -> Json:
-    """The source of the catalogues that is nearest to a place, of those within a radius.
+    """Find the galaxy or star that is nearest to a position.
 
-    lake : whose catalogues;  ra, dec, radius : deg
+    Parameters
+    ----------
+    lake : LakeSession
+        The open lake.
+    ra, dec : float
+        Position in degrees.
+    radius : float
+        Search radius in degrees.
+
+    Returns
+    -------
+    dict
+        `id` and `separation` (degrees); empty if there is no source within the radius.
     """
     best: Json = {}
     for table in ("galaxies", "stars"):

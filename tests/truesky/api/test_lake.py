@@ -1,4 +1,4 @@
-"""A lake opened from Python: tables, queries and what is refused; images and truth in tests/test_field.py."""
+"""A lake opened from Python: tables, queries and errors. Images and truth are tested in tests/test_field.py."""
 
 import os
 import subprocess
@@ -100,13 +100,13 @@ def test_the_result_of_a_query_is_written(opened, tmp_path):
         (lambda lake: lake.table("plain", [3]), r"columns = \[3\] is not a name or a list of names"),
     ],
 )
-def test_what_a_lake_has_not_is_named(opened, ask, said):
+def test_missing_tables_and_images_are_named(opened, ask, said):
     with pytest.raises(truesky.BadInput, match=said):
         ask(opened)
 
 
-def test_models_are_of_the_lake_as_it_was_opened(lake, monkeypatch):
-    """Its address and the version of its images are handed on, and what is wrong is refused at the call."""
+def test_models_use_the_versions_of_the_open_lake(lake, monkeypatch):
+    """Folder and version of the images are passed on, and wrong arguments are refused at the call."""
     rows, calls = Output(rows_of(PRODUCTS, 12)), []
 
     def published(seed):
@@ -142,14 +142,14 @@ def test_all_names_of_the_interface_are_there():
 
 
 def test_importing_truesky_is_quick():
-    """It loads no numerical library before one is needed."""
+    """The import loads no numerical library."""
     code = "import sys, truesky; print(sorted({'numpy', 'pyarrow', 'pandas', 'numba', 'scipy'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
 
 
 def test_another_package_called_jobs_does_not_matter(tmp_path):
-    """Users may call a package as the folder of our scripts, in the current folder and in $PYTHONPATH."""
+    """Users may have a package `jobs`, like the folder of our scripts, in the current folder or in $PYTHONPATH."""
     (tmp_path / "jobs").mkdir()
     (tmp_path / "jobs" / "__init__.py").write_text("raise SystemExit('the other package')")
     path = requests.written(tmp_path)

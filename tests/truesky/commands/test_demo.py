@@ -1,4 +1,4 @@
-"""The demo's own part: what it refuses.  What it runs, and how, is `truesky run`'s."""
+"""Errors and help of the demo. The jobs are tested with `truesky run`."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What truesky comes with: all of it is copied, and nothing of the user's is written over."""
+"""Examples of truesky: all are copied, and no file of the user is overwritten."""
 
 import json
 from pathlib import Path
@@ -19,18 +19,18 @@ def test_requests_and_notebooks_are_copied(tmp_path, capsys):
     assert sorted(capsys.readouterr().out.split()) == sorted(str(out / name) for name in written)
 
 
-def test_what_wants_a_clone_is_left_out():
-    """Those notebooks that read what is not in the packages, and no other."""
+def test_notebooks_that_require_a_clone_are_not_copied():
+    """Exactly the notebooks that read files outside the package are not copied."""
     notebooks = (ROOT / "notebooks").glob("*.ipynb")
     cells = {path.name: "".join(map(str, json.loads(path.read_text())["cells"])) for path in notebooks}
     wanting = {name for name, text in cells.items() if "../benchmarks/" in text or "../truesky/render/" in text}
     assert {path.name for path in examples.example_files() if path.suffix == ".ipynb"} == set(cells) - wanting
 
 
-def test_nothing_is_written_over(tmp_path, capsys):
+def test_existing_files_are_not_overwritten(tmp_path, capsys):
     (own := tmp_path / "requests" / "demo.toml").parent.mkdir()
     own.write_text("mine")
     assert truesky.main(["examples", str(tmp_path)]) == 2
-    assert "demo.toml is there already" in capsys.readouterr().err
+    assert "demo.toml exists already" in capsys.readouterr().err
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == [own]
     assert own.read_text() == "mine"

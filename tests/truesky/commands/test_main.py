@@ -1,4 +1,4 @@
-"""The command: which job or module a word is, what is handed on, and what is refused."""
+"""The command `truesky`: its jobs and modules, the arguments that it passes on, and its errors."""
 
 import os
 import re
@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 @pytest.fixture
 def called(monkeypatch):
-    """What spark-submit would be given; every job but the second succeeds."""
+    """Arguments that spark-submit would get; every job except the second succeeds."""
     calls = []
 
     def call(command):
@@ -32,7 +32,7 @@ def called(monkeypatch):
     return calls
 
 
-def test_every_job_has_a_word():
+def test_every_job_has_a_command():
     scripts = [path.read_text(encoding="utf-8") for path in ROOT.glob("jobs/*/*.py")]
     modules = {re.search(r"^from (\S+) import JOB$", script, re.MULTILINE)[1] for script in scripts}
     assert {module for modules in truesky.JOBS.values() for module in modules} == modules
@@ -77,7 +77,7 @@ def test_a_job_in_this_process_says_and_returns_the_same(tmp_path, capsys, calle
     assert called == []
 
 
-def test_help_and_forecasts_want_no_spark(capsys, called, tmp_path):
+def test_help_and_forecasts_need_no_spark(capsys, called, tmp_path):
     with pytest.raises(SystemExit, match="0"):
         truesky.main(["render", "--help"])
     assert "--detectors" in capsys.readouterr().out
@@ -87,7 +87,7 @@ def test_help_and_forecasts_want_no_spark(capsys, called, tmp_path):
     assert called == []
 
 
-def test_modules_are_their_own(capsys, tmp_path):
+def test_commands_run_their_modules(capsys, tmp_path):
     assert truesky.main(["check", str(ROOT / "requests" / "demo.toml")]) == 0
     assert capsys.readouterr().out.startswith("demo: good")
     assert truesky.main(["mission", "diff", "CBE,BLT,DES,REQ,SIM", "CBE,BLT,DES,REQ,SIM"]) == 0
@@ -96,12 +96,12 @@ def test_modules_are_their_own(capsys, tmp_path):
         assert capsys.readouterr().err.startswith(start)
 
 
-def test_what_is_no_command_is_refused(capsys):
+def test_unknown_commands_are_refused(capsys):
     assert truesky.main(["rendr"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("truesky: rendr is no command of truesky: build, check,")
+    assert line.startswith("truesky: rendr is not a command; use one of build, check,")
     assert truesky.main(["--local", "render", "--", "--master", "local"]) == 2
-    assert "no spark-submit is called" in capsys.readouterr().err
+    assert "--local does not call spark-submit" in capsys.readouterr().err
     for words in ([], ["--help"], ["--version"]):
         assert truesky.main(words) == 0
         assert f"truesky {__version__}" in capsys.readouterr().out
@@ -119,7 +119,7 @@ def test_a_missing_optional_package_is_named_with_its_remedy(word, extra, monkey
     )
 
 
-def test_a_module_of_ours_that_is_missing_is_no_matter_of_extras(monkeypatch):
+def test_a_missing_module_of_truesky_is_not_reported_as_an_extra(monkeypatch):
     def missing(module):
         raise ModuleNotFoundError("No module named 'truesky.nothing'", name="truesky.nothing")
 

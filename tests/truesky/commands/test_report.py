@@ -1,4 +1,4 @@
-"""The report of a lake's runs: what is summed, what is not known, what is refused."""
+"""The report of the runs of a lake: sums, unknown values, errors."""
 
 import json
 
@@ -46,13 +46,13 @@ def test_runs_add_up(lake):
 
 
 def test_a_run_makes_several_tables(lake):
-    """A log each; the number of its process ends their names, and may come again."""
+    """Each table has a log, whose name ends in the number of the process. This number may repeat."""
     for name in ("1-x-7", "2-y-7", "3-x-8", "4-x-7"):
         log(lake, name, {"job": "draw", "table": name[2]}, part("a", rows=1), {"seconds": 1.0, "status": "done"})
     assert (report.job_totals(lake)[0].runs, report.job_totals(lake)[0].parts) == (3, 4)
 
 
-def test_what_is_not_known_is_said(lake, capsys):
+def test_unknown_values_are_marked(lake, capsys):
     log(lake, "1-x-1", {"job": "draw"}, part("a", rows=10), {"seconds": 5.0, "status": "done"})
     assert report.main([str(lake)]) == 0
     head, line, total = capsys.readouterr().out.splitlines()
@@ -63,8 +63,8 @@ def test_what_is_not_known_is_said(lake, capsys):
     assert (first["job"], first["rows"], first["gb"], first["forecast_s"]) == ("draw", 10, None, None)
 
 
-def test_what_a_job_writes_is_read(tmp_path):
-    """By the shell that writes the logs: every part, its bytes, and what came before the first."""
+def test_the_log_of_a_job_is_read(tmp_path):
+    """The log of a real job has every task, its size, and the time before the first task."""
     root, request = tmp_path / "lake", requests.written(tmp_path)
     plan = plain_plan(1, parts=3)
     job = Job("toy", "", lambda lake, request: [Step(plan, plain_work, on_driver=True)])
@@ -87,7 +87,7 @@ def test_what_a_job_writes_is_read(tmp_path):
 
 
 def rendered(lake, name, detectors):
-    """A lake's products of some detectors of exposure 0, (name, digest of what shapes it) each, and their tasks."""
+    """Publish products and tasks for some detectors of exposure 0, each with (name, digest of its facts)."""
     n = len(detectors)
     columns = {key: rows_of(TASKS, n)[key] for key in TASKS.names}
     columns |= {"exposure_id": [0] * n, "detector": [detector for detector, _ in detectors]}
@@ -100,7 +100,7 @@ def rendered(lake, name, detectors):
 
 
 def test_the_forecast_is_of_all_requests(lake):
-    """A detector that is the same in two of them is made once."""
+    """A detector that two requests share is rendered once."""
     log(lake, "1-products-1", {"job": "render_exposures"}, part("a", rows=1), {"seconds": 5.0, "status": "done"})
     rendered(lake, "a", [("3-4", "x"), ("3-5", "y")])
     line, _ = report.job_totals(lake)
@@ -114,7 +114,7 @@ def test_the_forecast_is_of_all_requests(lake):
 
 def test_a_lake_without_logs_and_a_damaged_log_are_refused(lake, capsys):
     assert report.main([str(lake)]) == 2
-    assert "no run has left a log" in capsys.readouterr().err
+    assert "has no log of a run" in capsys.readouterr().err
     log(lake, "1-x-1", {"job": "draw"}, part("a", rows="ten"), {"status": "done"})
     with pytest.raises(Damaged, match="line 2 is not what a run writes"):
         report.job_totals(lake)

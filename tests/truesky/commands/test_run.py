@@ -1,4 +1,4 @@
-"""A whole run: which jobs a request needs, what is refused before the first of them, what it ends with."""
+"""A whole run: the jobs of a request, errors before the first job, and the output at the end."""
 
 import re
 from collections import namedtuple
@@ -44,7 +44,7 @@ def test_the_jobs_of_a_request(tmp_path):
         (["--pictures", str(DEMO)], "demo.toml"),
     ],
 )
-def test_what_cannot_be_done_is_refused_before_the_first_job(tmp_path, capsys, words, said):
+def test_invalid_runs_are_refused_before_the_first_job(tmp_path, capsys, words, said):
     lake = tmp_path / "lake"
     assert run.main([str(DEMO), "--lake", str(lake), *words], pytest.fail) == 2
     (line,) = capsys.readouterr().err.splitlines()
@@ -53,7 +53,7 @@ def test_what_cannot_be_done_is_refused_before_the_first_job(tmp_path, capsys, w
     assert not lake.exists()
 
 
-def test_a_disc_without_room_is_refused_before_the_first_job(tmp_path, capsys, monkeypatch):
+def test_a_full_disc_is_refused_before_the_first_job(tmp_path, capsys, monkeypatch):
     asked = []
     monkeypatch.setattr(space.shutil, "disk_usage", lambda path: asked.append(path) or Disc(1e12, 1e12 - 4e8, 4e8))
     lake, words = tmp_path / "not" / "there", ["--pictures", str(tmp_path / "pictures")]
@@ -65,8 +65,8 @@ def test_a_disc_without_room_is_refused_before_the_first_job(tmp_path, capsys, m
     assert run.main([str(DEMO), "--lake", str(lake), "--detectors", "R22_S11"], lambda *job: 5) == 5
 
 
-def test_what_an_earlier_run_of_the_name_left_is_no_room(lake, monkeypatch):
-    """A version that the request would not make, whatever its name, makes none of its forecast true."""
+def test_tables_of_another_request_with_this_name_are_not_reused(lake, monkeypatch):
+    """Tables with the name of the request but from other settings do not reduce the forecast."""
     request, free = parse(DEMO), 2e8
     monkeypatch.setattr(space.shutil, "disk_usage", lambda path: Disc(1e12, 1e12 - free, free))
     folder = layout.stage_folder(lake, "products", "c" * 16)
@@ -115,8 +115,8 @@ def test_a_run_ends_with_the_first_job_that_fails(tmp_path, capsys, monkeypatch,
     assert others == ["", "build_galaxies ...", "build_stars ..."]
 
 
-def test_what_a_later_job_would_refuse_is_refused_first(tmp_path, capsys):
-    """An area without the detectors' sky, which the last job would find out."""
+def test_mistakes_for_later_jobs_are_refused_first(tmp_path, capsys):
+    """An area that does not contain the detectors would be found only by the last job."""
     path = tmp_path / "small.toml"
     path.write_text(DEMO.read_text().replace("radius = 0.2", "radius = 0.001"))
     assert run.main([str(path), "--lake", str(tmp_path / "lake")], pytest.fail) == 2

@@ -1,4 +1,4 @@
-"""How jobs are started: with which Spark, and what becomes of them when the command is stopped."""
+"""The start of jobs: the choice of Spark, and signals that stop the command."""
 
 import os
 import signal
@@ -87,8 +87,8 @@ def test_a_job_is_stopped_by_a_signal_that_arrives_while_it_starts():
     assert (done.returncode, left) == (signal.SIGTERM, False)
 
 
-def test_an_environment_that_nobody_prepared_is_prepared_in_the_cache(tmp_path, monkeypatch):
-    """As that of a wheel: with this Python, whatever the variables of Spark say."""
+def test_an_unprepared_environment_is_prepared_in_the_cache(tmp_path, monkeypatch):
+    """The environment of a wheel uses this Python, whatever the environment variables of Spark are."""
     monkeypatch.setattr(sys, "prefix", str(tmp_path / "venv"))
     monkeypatch.setenv("TRUESKY_CACHE", str(tmp_path / "cache"))
     folder = submit._spark_environment()
@@ -103,7 +103,7 @@ def test_an_environment_that_nobody_prepared_is_prepared_in_the_cache(tmp_path, 
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
 
 
-def test_what_spark_cannot_be_started_with_is_refused(tmp_path, monkeypatch):
+def test_missing_requirements_of_spark_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "prefix", str(tmp_path / "venv"))
     monkeypatch.setenv("TRUESKY_CACHE", str(tmp_path / "a cache"))
     with pytest.raises(BadInput, match="a folder with a space in its name"):

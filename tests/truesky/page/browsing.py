@@ -1,4 +1,4 @@
-"""What tests of the page do in a browser."""
+"""Functions for tests of the page in a browser."""
 
 import io
 import json
@@ -11,7 +11,7 @@ from matplotlib.image import imread
 
 
 def at(view):
-    """The address of a view, so that no other is drawn first."""
+    """Address of a view, so that the default view is not drawn first."""
     return "/#" + quote(json.dumps({"view": view}))
 
 
@@ -21,7 +21,7 @@ HELD = "JSON.parse(decodeURIComponent(location.hash.slice(1)))"
 
 
 def until(tab, expression, seconds=30.0):
-    """Wait without eval, which the page's policy refuses."""
+    """Wait for an expression without eval, which the security policy of the page forbids."""
     end = time.monotonic() + seconds
     while True:
         # A page that is being loaded says nothing, but an error of the browser's.
@@ -69,13 +69,13 @@ def tab_of(browser, page, address="/", refused=None, **context):
 
 
 def canvas_colours(tab, selector):
-    """How many colours a picture of an element has."""
+    """Number of colours in a screenshot of an element."""
     pixels = imread(io.BytesIO(tab.locator(selector).first.screenshot()), format="png")[..., :3]
     return len(np.unique(pixels.reshape(-1, 3), axis=0))
 
 
 def drag(tab, selector, first, last):
-    """Drag over a canvas, from and to parts of its width."""
+    """Drag over a canvas between two fractions of its width."""
     box = tab.locator(selector).first.bounding_box()
     y = box["y"] + 0.4 * box["height"]
     tab.mouse.move(box["x"] + first * box["width"], y)
@@ -86,12 +86,12 @@ def drag(tab, selector, first, last):
 
 
 def plain(text):
-    """A text whose numbers have no gaps between thousands."""
+    """Text with numbers without separators of thousands."""
     return text.replace("\N{NARROW NO-BREAK SPACE}", "")
 
 
 def copied(tab, selector):
-    """What a button puts into the clipboard."""
+    """Text that a button copies to the clipboard."""
     tab.evaluate("navigator.clipboard.writeText('')")
     tab.click(selector)
     return until(tab, "navigator.clipboard.readText()")

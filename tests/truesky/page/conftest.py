@@ -1,4 +1,4 @@
-"""A small lake with two images of stars, and a page over it on a port of its own."""
+"""A small lake with two images of stars, and a page over it on a free port."""
 
 import asyncio
 import contextlib
@@ -40,7 +40,7 @@ TOKEN = "a-token-of-the-tests"
 
 
 def system():
-    """Of both images: north is down, as detectors may be mounted."""
+    """FITS header of both images: north is down, because a detector may be mounted like this."""
     from astropy.wcs import WCS
 
     made = WCS(naxis=2)
@@ -56,7 +56,7 @@ def system():
 
 
 def star_rows():
-    """Stars of which most lie on the images."""
+    """Stars; most of them lie on the images."""
     rng = np.random.default_rng(5)
     rows = rows_of(STARS, STARS_N, seed=5)
     x, y = rng.uniform(0, NX, STARS_N), rng.uniform(0, NY, STARS_N)
@@ -137,7 +137,7 @@ def square(ra, dec, half):
 
 
 def planned(root):
-    """Two exposures: the first with the detector of the images and another, the second with one, not yet observed."""
+    """Two exposures: the first has the detector of the images and another one; the second is only planned."""
     published(root)
     (ra, dec), rows = CENTRE, rows_of(EXPOSURES, 2)
     own = {name: rows[name] for name in EXPOSURES.names} | {
@@ -160,7 +160,7 @@ def planned(root):
 
 @dataclass
 class Page:
-    """A server that runs beside the tests."""
+    """A server that runs in a thread."""
 
     gate: AccessRules
     server: Server
@@ -204,7 +204,7 @@ class Page:
 
 @contextlib.contextmanager
 def serving(root):
-    """A page over a lake, until the end of the block."""
+    """Serve a lake within the context."""
     listening = socket.create_server(("127.0.0.1", 0))
     gate = AccessRules(("127.0.0.1", "localhost"), listening.getsockname()[1], TOKEN)
     server = Server(lambda: LakeSession(root, memory=1e9, timeout=30.0), gate)
@@ -254,7 +254,7 @@ def asked(page, **question):
 
 @pytest.fixture(scope="package")
 def shown(tmp_path_factory):
-    """A lake as it is shown."""
+    """The lake that the page shows."""
     root = tmp_path_factory.mktemp("page") / "lake"
     root.mkdir()
     published(root)
@@ -279,7 +279,7 @@ def page_of_a_plan(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def browser():
-    """A chromium of the system's."""
+    """The chromium of the system."""
     from playwright import sync_api as playwright
 
     chromium = os.environ.get("TRUESKY_CHROMIUM") or shutil.which("chromium")

@@ -1,4 +1,4 @@
-"""Every rule of who may ask, by requests that break it."""
+"""Requests that break each rule of access are refused."""
 
 import asyncio
 import base64
@@ -22,7 +22,7 @@ def test_the_page_answers_its_own_browser(page):
 @pytest.mark.parametrize("host", ["evil.example", "127.0.0.1", "127.0.0.1:1", "localhost.evil.example:{port}", ""])
 @pytest.mark.parametrize("path", ["/", "/api/lake", "/static/app.js"])
 def test_another_host_is_refused(page, host, path):
-    """A name of another's that leads to this machine (DNS rebinding)."""
+    """A foreign host name that resolves to this machine (DNS rebinding)."""
     assert page.ask(path, Host=host.replace("{port}", str(page.gate.port)))[0] == 403
 
 
@@ -36,7 +36,7 @@ def test_another_site_is_refused(page, origin):
 
 
 @pytest.mark.parametrize("site", ["cross-site", "same-site"])
-def test_only_the_front_door_is_entered_from_elsewhere(page, site):
+def test_other_sites_may_only_open_the_start_page(page, site):
     assert page.ask(f"/?token={page.gate.token}", cookie="", Sec_Fetch_Site=site)[0] == 303
     for path in ("/api/lake", "/static/app.js", f"/api/{page.server.lake.key}/export?sql=SELECT+1"):
         assert page.ask(path, Sec_Fetch_Site=site)[0] == 403
@@ -44,7 +44,7 @@ def test_only_the_front_door_is_entered_from_elsewhere(page, site):
 
 @pytest.mark.parametrize("cookie", ["", "truesky-{port}=", "truesky-{port}=wrong", "truesky-1={token}", "a=\udc80"])
 @pytest.mark.parametrize("path", ["/", "/static/app.js", "/static/style.css", "/api/lake", "/api/x/sql", "/nothing"])
-def test_nothing_without_the_token(page, cookie, path):
+def test_requests_without_the_token_are_refused(page, cookie, path):
     given = cookie.replace("{port}", str(page.gate.port)).replace("{token}", page.gate.token)
     status, _, body = page.ask(path, cookie=given.encode("utf-8", "surrogateescape").decode("latin-1"))
     assert status == 401
@@ -74,7 +74,7 @@ MARKUP = (
 
 @pytest.mark.parametrize("file", STATIC, ids=lambda file: file.name)
 def test_text_never_becomes_markup_and_nothing_is_loaded_from_elsewhere(file):
-    """Of the page's own files: no way to make markup or code of a text, no address of another host, no inline code."""
+    """Files of the page never turn text into markup or code, and have no foreign addresses and no inline code."""
     text = file.read_text(encoding="utf-8")
     assert re.findall(MARKUP, text) == []
     assert re.findall(r"(?:https?:)?//[\w.-]+\.\w{2,}", text.replace("// ", "")) == []
@@ -92,7 +92,7 @@ def test_tap_has_another_token(page):
     "path", ["/", "/api/lake", "/static/app.js", "/nothing", "/api/x/regions", "/tap/x/sync", "/static/..%2fgate.py"]
 )
 @pytest.mark.parametrize("cookie", [None, ""])
-def test_every_answer_confines_the_page(page, path, cookie):
+def test_every_response_has_security_headers(page, path, cookie):
     _, headers, _ = page.ask(path, cookie=cookie)
     policy = dict(rule.strip().split(" ", 1) for rule in headers["Content-Security-Policy"].split(";"))
     assert policy["default-src"] == "'none'"
@@ -103,7 +103,7 @@ def test_every_answer_confines_the_page(page, path, cookie):
     assert {name: headers[name] for name in expected} == expected
 
 
-def test_downloads_are_confined_too(page):
+def test_downloads_have_security_headers(page):
     status, headers, _ = page.of_lake("export?format=csv&sql=SELECT+1+AS+a")
     assert status == 200
     assert headers["Content-Security-Policy"].startswith("default-src 'none'")
@@ -114,7 +114,7 @@ def test_downloads_are_confined_too(page):
     "name",
     ["..%2fgate.py", "%2e%2e/gate.py", "../gate.py", "....//gate.py", "index.html%00", "%2fetc%2fpasswd", ".", ""],
 )
-def test_files_are_those_of_the_page(page, name):
+def test_only_files_of_the_page_are_served(page, name):
     status, _, body = page.ask(f"/static/{name}")
     assert status == 404
     assert b"hmac" not in body
@@ -125,7 +125,7 @@ def test_files_are_those_of_the_page(page, name):
     "cutout/0?x=nan&y=1", "source/x", "source/9999999999999999999", "sky/..%2fx/parts", "sky/nothing/parts",
     "provenance/7",
 ])  # fmt: skip
-def test_what_is_not_there_is_refused(page, path):
+def test_unknown_addresses_are_refused(page, path):
     status, _, body = page.of_lake(path)
     assert status == 400
     assert len(json.loads(body)["error"]) < 500
@@ -139,7 +139,7 @@ def test_a_large_body_is_refused(page):
 
 
 @pytest.mark.parametrize("body", [b"", b"{", b"[]", b"1", b'{"sql": 3}', b"[" * 100_000, b"\xff"])
-def test_no_question_is_refused(page, body):
+def test_bodies_that_are_not_json_objects_are_refused(page, body):
     assert page.of_lake("sql", method="POST", body=body)[0] == 400
 
 
@@ -153,8 +153,8 @@ def test_another_key_is_refused(page):
     assert (status, json.loads(body)["key"]) == (409, page.server.lake.key)
 
 
-def test_a_queue_has_an_end(page):
-    """Two questions at work, so many that wait, and the next is refused at once."""
+def test_queries_beyond_the_queue_are_refused(page):
+    """Two queries run, MAX_WAITING queries wait, and the next one is refused at once."""
     lane = page.server.lake.user_queries
 
     async def fill():
@@ -180,7 +180,7 @@ def test_a_queue_has_an_end(page):
         status, _, body = page.of_lake("sql", method="POST", body=b'{"sql": "SELECT 1"}')
         assert status == 429
         assert "waiting" in json.loads(body)["error"]
-        # What the page asks of itself is not held up.
+        # Queries of the page itself do not wait.
         assert page.of_lake("tile/0/0/0/0")[0] == 200
         question = {"source": "plain", "axes": ["value"], "charts": [{"axes": [0], "bins": [4]}]}
         assert page.of_lake("charts", method="POST", body=json.dumps(question).encode())[0] == 200
@@ -214,7 +214,7 @@ CHARTS = {"source": "galaxies", "axes": ["z_obs"], "charts": [{"axes": [0], "bin
         {"limits": [[0, 1]]},
     ],
 )
-def test_expressions_of_charts_pass_the_guard(page, change):
+def test_forbidden_expressions_of_charts_are_refused(page, change):
     status, _, body = page.of_lake("charts", method="POST", body=json.dumps({**CHARTS, **change}).encode())
     assert status == 400, body
     assert "root:" not in body.decode()
@@ -223,6 +223,6 @@ def test_expressions_of_charts_pass_the_guard(page, change):
 @pytest.mark.parametrize(
     "where", ["true) OR (SELECT count(*) FROM read_text('/etc/passwd')) > (0", "1; SELECT 1", "getenv('X')"]
 )
-def test_conditions_of_the_sky_pass_the_guard(page, where):
+def test_forbidden_conditions_of_the_sky_are_refused(page, where):
     assert page.of_lake(f"sky/galaxies/density?order=8&where={quote(where)}")[0] == 400
     assert page.of_lake(f"sky/galaxies/sources?ra=1&dec=1&radius=1&where={quote(where)}")[0] == 400

@@ -1,4 +1,4 @@
-"""What the page is told equals what the lake holds."""
+"""Answers to the page agree with the content of the lake."""
 
 import json
 from urllib.parse import quote
@@ -40,7 +40,7 @@ def test_rows_of_a_query(page, shown):
     assert [column["unit"] for column in found["columns"]] == ["", "deg"]
 
 
-def test_values_that_json_lacks(page):
+def test_values_that_json_cannot_represent(page):
     body = json.dumps(
         {"sql": "SELECT 'nan'::FLOAT a, 'inf'::DOUBLE b, NULL c, [1, NULL] d, true e, 9007199254740993 f"}
     )
@@ -49,7 +49,7 @@ def test_values_that_json_lacks(page):
     ]
 
 
-def test_counts_are_those_of_the_rows(page, shown):
+def test_counts_agree_with_the_rows(page, shown):
     rows = read.version(shown, "galaxies").rows(["z_obs", "mag_r01", "flux_halpha"])
     z, mag = (rows[name].to_numpy() for name in ("z_obs", "mag_r01"))
     head, (one, both) = asked(
@@ -79,9 +79,9 @@ def rows_by_sql(page, text):
 
 
 def test_counts_of_identifiers_and_missing_values_are_duckdbs(page):
-    """64-bit identifiers, NULL, values on the edges of bins, infinite ones: every row is where DuckDB has it.
+    """64-bit identifiers, NULL, values on edges of bins and infinite values are in the bins where DuckDB counts them.
 
-    DuckDB counts in whole numbers, the page in numbers of 32 bits, of what is left of identifiers beyond these.
+    DuckDB counts with integers; the page uses 32-bit floats of the remainder of large identifiers.
     """
     odd = "CASE kind WHEN 0 THEN 'inf'::FLOAT WHEN 1 THEN 'nan'::FLOAT WHEN 2 THEN NULL ELSE z_obs END"
     source = f"(SELECT id, round(z_obs * 8)::BIGINT AS eighths, {odd} AS odd FROM galaxies) AS rows"
@@ -112,8 +112,8 @@ def test_counts_of_identifiers_and_missing_values_are_duckdbs(page):
     assert one[0]["rows"] == 1
 
 
-def test_what_a_chart_leaves_out_is_said(page, shown):
-    """Beyond the span, of which the rest is told; and rows without a value, of every axis."""
+def test_rows_outside_a_chart_are_counted(page, shown):
+    """Rows outside the span of a chart, and rows without a value for each axis."""
     rows = read.version(shown, "galaxies").rows(["id", "z_obs", "mag_r01"])
     identifiers, z, mag = (rows[name].to_numpy() for name in ("id", "z_obs", "mag_r01"))
     # A few lie far from all others.
@@ -136,8 +136,8 @@ def test_what_a_chart_leaves_out_is_said(page, shown):
     assert head["charts"][1]["outside"] == (~inside & (z >= 1)).sum() > 0
 
 
-def test_what_is_told_of_columns_is_looked_for_once(page, monkeypatch):
-    """Not at every move of a brush: of many rows that takes as long as counting them."""
+def test_columns_are_inspected_once(page, monkeypatch):
+    """Inspecting many rows takes as long as counting them, so it is not repeated at every move of a brush."""
     question = {"source": "galaxies", "axes": ["z_obs * 2.5"], "charts": [{"axes": [0], "bins": [5]}]}
     first, _ = asked(page, **question)
 
@@ -149,7 +149,7 @@ def test_what_is_told_of_columns_is_looked_for_once(page, monkeypatch):
     assert asked(page, **question)[0] == first
 
 
-def test_points_are_rows_that_count(page, shown):
+def test_points_are_counted_rows(page, shown):
     rows = read.version(shown, "galaxies").rows(["z_obs", "mag_r01"])
     z, mag = (rows[name].to_numpy().astype(np.float32) for name in ("z_obs", "mag_r01"))
     span = [[0.0, 5.0], [0.0, 40.0]]
@@ -204,7 +204,7 @@ def test_sources_of_a_field(page, shown, monkeypatch):
     assert (len(found["id"]), found["total"], found["most"]) == (2, inside.sum(), 2)
 
 
-def test_of_halos_the_most_massive_come_first(tmp_path, monkeypatch):
+def test_the_most_massive_halos_come_first(tmp_path, monkeypatch):
     root, rows = tmp_path / "lake", rows_of(HALOS, 300, seed=2)
     root.mkdir()
     part = Task(layout.cell_file(5, 1607), {})
@@ -226,7 +226,7 @@ def test_the_mean_of_an_expression(page, shown):
     assert page.of_lake("sky/galaxies/density?order=5&value=1)%20FROM%20stars%20--")[0] == 400
 
 
-def test_a_mean_is_of_the_rows_that_have_a_number(page, shown):
+def test_a_mean_ignores_rows_without_a_value(page, shown):
     odd = "CASE WHEN z_obs < 1 THEN 'nan'::DOUBLE WHEN z_obs < 1.5 THEN 'inf' WHEN z_obs < 2 THEN NULL ELSE z_obs END"
     _, _, body = page.of_lake(f"sky/galaxies/density?order=5&value={quote(odd)}")
     head, rest = unpacked(body)
@@ -241,7 +241,7 @@ def test_a_mean_is_of_the_rows_that_have_a_number(page, shown):
 # ------------------------------------------------------------------------------------------------ images
 
 
-def test_tiles_are_the_pixels(page):
+def test_tiles_contain_the_pixels_of_the_image(page):
     about = page.json("image/1")
     assert (about["nx"], about["ny"], about["levels"]) == (NX, NY, [[700, 600], [350, 300]])
     pixels = np.zeros((NY, NX), np.float32)
@@ -269,8 +269,8 @@ def test_tiles_are_the_pixels(page):
     assert truth["kind"][0] == "star"
 
 
-def test_what_is_kept_is_compared_with_its_checksums_once(page, monkeypatch):
-    """Not at every tile, nor at every move of a brush: that takes as long as reading all of it."""
+def test_checksums_of_cached_data_are_verified_once(page, monkeypatch):
+    """Verification reads all data, so it is not repeated at every tile or move of a brush."""
     charts_ = {"axes": [0], "bins": [5], "spans": [[0.0, 5.0]]}
     question = {"source": "galaxies", "axes": ["z_obs * 1.5"], "charts": [charts_]}
     first = asked(page, **question)[1][0].tolist(), page.of_lake("tile/0/0/0/0")[2]
@@ -295,7 +295,7 @@ def test_cosmic_rays_on_and_off(page):
 
 
 def test_the_grid_gives_the_sky(page):
-    """What the browser makes of the nodes, here in Python, against the header."""
+    """The interpolation of the browser between nodes, repeated in Python, agrees with the header."""
     grid = page.json("image/0")["grid"]
     rng = np.random.default_rng(0)
     x, y = rng.uniform(0, NX - 1, 50), rng.uniform(0, NY - 1, 50)

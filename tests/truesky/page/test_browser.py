@@ -15,7 +15,7 @@ from tests.universe import plain_plan, plain_work
 
 
 def until_colours(tab, selector, fewest, seconds=30.0):
-    """Wait until a picture of an element has more colours."""
+    """Wait until a screenshot of an element has more colours."""
     end = time.monotonic() + seconds
     while canvas_colours(tab, selector) <= fewest:
         assert time.monotonic() < end, selector
@@ -57,7 +57,7 @@ def test_the_first_sky_waits_for_no_other_question(tab):
     assert times["parts"] == min(times.values())
 
 
-def test_a_lake_that_is_published_anew_is_announced(browser, shown, tmp_path):
+def test_a_new_version_of_the_lake_is_announced(browser, shown, tmp_path):
     root = shutil.copytree(shown, tmp_path / "lake", symlinks=True)
     with serving(root) as page, tab_of(browser, page, at("sql")) as tab:
         assert tab.locator("#changed").is_hidden()
@@ -73,7 +73,7 @@ def test_a_lake_that_is_published_anew_is_announced(browser, shown, tmp_path):
         assert page.server.lake.key in tab.inner_text("#version")
 
 
-def test_a_tab_is_told_of_what_another_has_opened(browser, shown, tmp_path):
+def test_a_tab_is_notified_if_another_tab_opens_a_new_version(browser, shown, tmp_path):
     root = shutil.copytree(shown, tmp_path / "lake", symlinks=True)
     with serving(root) as page, tab_of(browser, page, at("sql")) as tab, tab_of(browser, page, at("sql")) as other:
         old = page.server.lake.key
@@ -125,7 +125,7 @@ CONTRAST = """() => {
 
 @pytest.fixture(scope="module")
 def any_view(browser, page):
-    """A tab for tests that leave nothing but another view and another theme."""
+    """A tab for tests that change only the view and the theme."""
     with tab_of(browser, page, at("sql")) as opened:
         yield opened
 
@@ -182,7 +182,7 @@ def test_every_control_has_a_name_and_text_can_be_read_where_it_stands(any_view,
 
 @pytest.mark.nightly
 def test_everything_is_reached_by_keys(tab):
-    """Tab leads to every control of a view, and what has the focus can be seen."""
+    """The key Tab reaches every control of a view, and the control with the focus is visible."""
     for view in VIEWS:
         tab.click(f"#tab-{view}")
         time.sleep(0.8)
@@ -204,7 +204,7 @@ def test_everything_is_reached_by_keys(tab):
 
 
 @pytest.mark.nightly
-def test_nothing_moves_where_that_is_asked_for(browser, page):
+def test_animations_stop_if_reduced_motion_is_preferred(browser, page):
     with tab_of(browser, page, reduced_motion="reduce") as tab:
         tab.keyboard.press("4")
         until(tab, "document.getElementById('image-one').childElementCount === 3")

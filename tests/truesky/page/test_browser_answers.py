@@ -32,7 +32,7 @@ def replaced(tab, part, delay=0, error=None, times=1):
     tab.evaluate(REPLACED, [part, delay, error, times])
 
 
-def test_of_two_pins_the_later_is_shown(tab, page):
+def test_the_later_of_two_pinned_sources_is_shown(tab, page):
     first, second = page.json("truth/0")["id"][:2]
     replaced(tab, f"source/{first}", 700)
     both = f"import('/static/pin.js').then(({{ pin }}) => Promise.all([pin('{first}'), pin('{second}')]).then(() => 1))"
@@ -41,19 +41,19 @@ def test_of_two_pins_the_later_is_shown(tab, page):
     assert tab.evaluate("import('/static/pin.js').then(({ pinned }) => pinned().id)") == second
 
 
-def test_a_refused_truth_is_asked_for_again(tab):
+def test_refused_true_sources_are_requested_again(tab):
     tab.keyboard.press("4")
     until(tab, f"document.getElementById('image-one').childElementCount === 3 && {HELD}.images?.zoom > 0")
-    replaced(tab, "truth/0", 0, "ask again later")
+    replaced(tab, "truth/0", 0, "try again later")
     tab.check("#image-truth")
-    until(tab, f"{SAID}.includes('ask again later')")
+    until(tab, f"{SAID}.includes('try again later')")
     tab.uncheck("#image-truth")
     tab.check("#image-truth")
     until(tab, "document.getElementById('image-legend').textContent.includes('sources')")
 
 
-def test_the_same_source_on_another_image_is_told_anew(tab):
-    """Of one that is shown twice, as two images blink, each has its own numbers."""
+def test_a_source_is_described_again_on_another_image(tab):
+    """A source on two images that blink has different numbers on each."""
     told = tab.evaluate("""async () => {
       const truth = await import('/static/truth.js'), real = window.fetch;
       window.fetch = async (address, options) => {
@@ -74,8 +74,8 @@ def test_the_same_source_on_another_image_is_told_anew(tab):
     assert [text.split()[0] for text in told] == ["8", "9"]
 
 
-def test_no_texture_is_left_behind(tab):
-    """Of tiles that come when others have taken their places."""
+def test_textures_of_late_tiles_are_deleted(tab):
+    """Tiles may arrive after other tiles have replaced them in the cache."""
     made, kept, textures = tab.evaluate("""async () => {
       const { Tiles } = await import('/static/tiles.js'), gl = new Proxy({ textures: 0 }, { get: (own, name) => {
         if (name === "textures") return own.textures;
@@ -96,7 +96,7 @@ def test_no_texture_is_left_behind(tab):
     assert kept == textures < 150
 
 
-def test_refusals_are_said(tab):
+def test_refusals_are_shown(tab):
     replaced(tab, "/api/reopen", 0, "the lake is busy")
     tab.evaluate("document.getElementById('reopen').click()")
     until(tab, f"{SAID}.includes('the lake is busy')")
@@ -110,7 +110,7 @@ def test_refusals_are_said(tab):
     until(tab, "document.querySelector('#runs-content details').textContent.includes('version')")
 
 
-def test_a_source_of_the_sky_that_is_refused_is_said(tab, page):
+def test_a_refused_source_of_the_sky_is_shown(tab, page):
     truth = page.json("truth/0")
     place = page.json(f"source/{truth['id'][0]}")["place"]
     tab.keyboard.press("1")
@@ -123,7 +123,7 @@ def test_a_source_of_the_sky_that_is_refused_is_said(tab, page):
     until(tab, f"{SAID}.includes('no place in the queue')")
 
 
-def test_a_brush_that_is_taken_away_sticks_to_nothing(tab):
+def test_a_removed_brush_selects_nothing(tab):
     tab.keyboard.press("2")
     until(tab, "[...document.querySelectorAll('#plot-grid .range')].every((one) => one.textContent.includes('rows'))")
     canvas = "document.querySelector('#plot-grid canvas')"
@@ -181,12 +181,12 @@ def test_the_first_sources_are_the_largest(tab):
     assert (name, bright > faint > 0) == ("brightest", True)
 
 
-def test_of_very_many_exposures_those_in_view_are_shown(browser, sky, monkeypatch):
+def test_only_exposures_in_view_are_shown_if_there_are_many(browser, sky, monkeypatch):
     monkeypatch.setattr(sky_maps, "MAX_EXPOSURES", 1)
     with tab_of(browser, sky, refused="/exposures") as tab:
         until(tab, f"{STATES}.includes('observed')")
         tab.select_option("#sky-footprints", "exposures")
-        until(tab, f"{STATES} === 'exposuresmore than 1 exposures are here: look at a part'")
+        until(tab, f"{STATES} === 'exposuresmore than 1 exposures are in view: use a smaller field'")
         tab.fill("#sky-go", f"{CENTRE[0]} {CENTRE[1]}")
         tab.press("#sky-go", "Enter")
         tab.locator("#sky-canvas").focus()
@@ -206,7 +206,7 @@ TRACES = """async ([identifier, number]) => {
 }"""
 
 
-def test_traces_and_requests_are_of_the_request_of_an_image(browser, two):  # noqa: F811
+def test_traces_and_copied_requests_belong_to_the_request_of_the_image(browser, two):  # noqa: F811
     page, identifier = two
     with tab_of(browser, page, at("images"), **CLIPBOARD) as tab:
         for number, (*_, first, _) in enumerate(REQUESTS.values()):
@@ -235,7 +235,7 @@ def test_traces_and_requests_are_of_the_request_of_an_image(browser, two):  # no
         assert [(one.band, one.ra, one.mjd) for one in request.pointings] == [("nisp_blue", far, 61001.0)]
 
 
-def test_names_of_footprints_at_one_place_stand_below_each_other(browser, two):  # noqa: F811
+def test_names_of_footprints_at_one_position_do_not_overlap(browser, two):  # noqa: F811
     page, _ = two
     with tab_of(browser, page) as tab:
         until(tab, f"{STATES}.includes('observed')")

@@ -1,4 +1,4 @@
-"""Images in a browser: pixels, places, true sources, one that is pinned."""
+"""Images in a browser: pixels, positions, true sources, a pinned source."""
 
 import time
 
@@ -45,7 +45,7 @@ def test_a_source_through_the_grism(browser, tmp_path):
 
 
 def peaks(tab, page, number, most):
-    """How many of the brightest stars that stand alone have the largest value of 3 x 3 pixels under the cursor."""
+    """Number of bright isolated stars whose pixel under the cursor is the largest of 3 x 3 pixels."""
     until(tab, "document.getElementById('image-one').childElementCount === 3")
     tab.select_option("#image-one", str(number))
     time.sleep(1.5)
@@ -69,12 +69,12 @@ def peaks(tab, page, number, most):
     return len(inside)
 
 
-def test_the_truth_is_where_pixels_peak_on_the_screen(tab, page):
+def test_true_sources_are_drawn_at_peaks_of_pixels(tab, page):
     assert peaks(tab, page, 1, 8) == 8
 
 
 @pytest.mark.nightly
-def test_the_truth_of_all_is_where_pixels_peak_on_the_screen(tab, page):
+def test_all_true_sources_are_drawn_at_peaks_of_pixels(tab, page):
     assert peaks(tab, page, 1, 200) > 80
 
 
@@ -104,13 +104,13 @@ def test_an_image_its_places_and_a_pinned_source(tab, page):
 
 
 def opened(tab):
-    """Images are shown; the zoom at which all of the first is seen."""
+    """Show the images and return the zoom at which the whole first image is visible."""
     until(tab, f"document.getElementById('image-one').childElementCount === 3 && {HELD}.images?.zoom > 0")
     box = tab.locator("#image-canvas").bounding_box()
     return box, 0.98 * min(box["width"] / 700, box["height"] / 600)
 
 
-def test_of_very_many_true_sources_the_marked_ones_are_counted(tab, page, monkeypatch):
+def test_the_number_of_marked_sources_is_shown_if_there_are_many(tab, page, monkeypatch):
     total = page.json("truth/0")["total"]
     monkeypatch.setattr(pictures.bright_sources, "__defaults__", (40,))
     opened(tab)
@@ -118,7 +118,7 @@ def test_of_very_many_true_sources_the_marked_ones_are_counted(tab, page, monkey
     until(tab, f"document.getElementById('image-legend').textContent.includes('the brightest 40 of {total}')")
 
 
-def test_what_is_told_of_a_source_stays_while_the_cursor_does(tab, page):
+def test_the_description_of_a_source_stays_with_the_cursor(tab, page):
     box, zoom = opened(tab)
     tab.check("#image-truth")
     until(tab, "document.getElementById('image-legend').textContent.includes('sources')")
@@ -133,7 +133,7 @@ def test_what_is_told_of_a_source_stays_while_the_cursor_does(tab, page):
     assert "mag_h" in tab.evaluate(tip)
 
 
-def test_keys_tell_pixels_and_pin(tab, page):
+def test_keys_announce_pixels_and_pin_sources(tab, page):
     opened(tab)
     tab.check("#image-truth")
     until(tab, "document.getElementById('image-legend').textContent.includes('sources')")

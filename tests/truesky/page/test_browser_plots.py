@@ -36,7 +36,7 @@ def test_brushes_filter_the_other_charts(tab, shown):
     until(tab, f"{ranges}[1] !== {whole[1]!r}")
 
 
-def test_a_held_brush_asks_nothing(tab):
+def test_a_held_brush_sends_no_requests(tab):
     until(tab, "document.getElementById('plot-state').textContent.includes('rows')")
     asked, answered = [], []
     tab.on("request", lambda request: asked.append(request.url))
@@ -58,7 +58,7 @@ def test_a_held_brush_asks_nothing(tab):
     mouse.up()
 
 
-def test_of_many_rows_every_brush_counts_a_sample_first(browser, page, monkeypatch):
+def test_a_sample_is_counted_first_if_there_are_many_rows(browser, page, monkeypatch):
     monkeypatch.setattr(charts, "ROWS_PER_CORE", 10)
     with tab_of(browser, page, at(VIEW)) as tab:
         asked = []
@@ -76,7 +76,7 @@ def test_of_many_rows_every_brush_counts_a_sample_first(browser, page, monkeypat
 
 def test_a_map_as_points(tab, shown):
     ranges = "[...document.querySelectorAll('#plot-grid figure.map .range')].map((one) => one.textContent)"
-    until(tab, f"{ranges}[0].includes('a bin')")
+    until(tab, f"{ranges}[0].includes('per bin')")
     before = tab.locator("#plot-grid figure.map canvas").first.screenshot()
     tab.locator("#plot-grid figure.map button", has_text="points").first.click()
     text = until(tab, f"{ranges}[0].includes('points') && {ranges}[0]").replace("\N{NARROW NO-BREAK SPACE}", "")
@@ -87,7 +87,7 @@ def test_a_map_as_points(tab, shown):
 
 
 def test_charts_are_tables_too(tab):
-    """The same numbers: of the sky, of a histogram, of a map, of a spectrum's bands."""
+    """Tables of the sky, of a histogram, of a map and of the bands of a spectrum contain the numbers of the charts."""
     tab.keyboard.press("1")
     until(tab, "document.getElementById('sky-legend').textContent.includes('deg')")
     tab.click("#sky-to-table")
@@ -117,7 +117,7 @@ def test_a_table_that_is_open_follows_its_chart(tab):
     until(tab, f"{shown} === Number({RANGES}[1].replaceAll('\u202f', '').split(' rows')[0])")
 
 
-def test_what_no_bin_holds_is_said_of_every_axis(tab, shown):
+def test_rows_outside_all_bins_are_counted_for_every_axis(tab, shown):
     galaxies = read.version(shown, "galaxies").rows(["z_obs", "mag_r01"])
     z = galaxies["z_obs"].to_numpy()
     bound = float(np.median(z))
@@ -134,7 +134,7 @@ def test_what_no_bin_holds_is_said_of_every_axis(tab, shown):
     assert "without" not in text
 
 
-def test_readers_are_told_once_when_keys_have_moved_a_brush(tab):
+def test_screen_readers_announce_a_moved_brush_once(tab):
     until(tab, f"{RANGES}.every((text) => text.includes('rows'))")
     assert tab.locator("#plots [aria-live], #plots [role=status]").count() == 0
     tab.locator("#plot-grid canvas").first.focus()

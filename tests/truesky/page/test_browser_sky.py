@@ -67,7 +67,7 @@ def test_from_the_sky_to_a_pixel_and_back(browser, sky):
         assert (there["ra"], there["dec"]) == pytest.approx(aimed, abs=2 * PIXEL)
 
 
-def test_keys_tell_the_place_pin_and_open(browser, sky):
+def test_keys_announce_the_position_pin_and_open(browser, sky):
     with tab_of(browser, sky) as tab:
         truth = sky.json("truth/0")
         star = next(k for k in range(20) if 100 < truth["x"][k] < 600 and 100 < truth["y"][k] < 500)
@@ -87,7 +87,7 @@ def test_keys_tell_the_place_pin_and_open(browser, sky):
         until(tab, f"{HELD}.view === 'images'")
 
 
-def test_a_table_that_is_open_says_what_is_shown(browser, sky):
+def test_an_open_table_follows_the_map(browser, sky):
     with tab_of(browser, sky) as tab:
         until(tab, f"{LEGEND}.includes('deg')")
         tab.click("#sky-to-table")
@@ -98,7 +98,7 @@ def test_a_table_that_is_open_says_what_is_shown(browser, sky):
         assert heads[:2] == ["id", "RA deg"]
 
 
-def test_what_is_left_out_is_said(browser, sky, monkeypatch):
+def test_captions_count_omitted_sources_and_cells(browser, sky, monkeypatch):
     with tab_of(browser, sky) as tab:
         tab.select_option("#sky-table", "stars")
         gone_to(tab)
@@ -111,7 +111,7 @@ def test_what_is_left_out_is_said(browser, sky, monkeypatch):
         assert f"the brightest 100 by mag_h of {whole} sources" in plain(tab.evaluate(caption))
 
 
-def test_a_request_for_what_is_shown(browser, sky):
+def test_the_copied_request_covers_the_view(browser, sky):
     with tab_of(browser, sky, **CLIPBOARD) as tab:
         gone_to(tab)
         until(tab, f"{STATES}.includes('observed')")

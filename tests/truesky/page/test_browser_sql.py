@@ -1,4 +1,4 @@
-"""Queries in a browser: what they answer, to the last digit, and what is refused."""
+"""Queries in a browser: results with all digits, and refusals."""
 
 from tests.truesky.page.browsing import at, tab_of, until
 
@@ -62,7 +62,7 @@ def test_a_download_that_is_refused_says_why(browser, page):
             assert file.read().split() == ['"seven"', "7"]
 
 
-def test_a_large_download_goes_past_the_page(browser, page):
+def test_the_browser_takes_over_a_large_download(browser, page):
     with tab_of(browser, page, at(VIEW), accept_downloads=True) as tab:
         until(tab, "document.querySelectorAll('#sql-result td').length > 0")
         tab.fill("#sql-text", "SELECT repeat('0123456789', 100) AS x FROM range(40000)")
@@ -72,7 +72,7 @@ def test_a_large_download_goes_past_the_page(browser, page):
         assert begun.value.path().stat().st_size > 40_000_000
 
 
-def test_of_overlapping_queries_the_last_is_shown(tab):
+def test_the_last_of_overlapping_queries_is_shown(tab):
     until(tab, "document.querySelectorAll('#sql-result td').length > 0")
     tab.fill("#sql-text", "SELECT sum(a.range * b.range) AS slow FROM range(40000) a, range(10000) b")
     tab.click("#sql-run")

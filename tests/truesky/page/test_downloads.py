@@ -1,4 +1,4 @@
-"""The same rows come back from every kind of file, or none do."""
+"""Downloads in every format contain the same rows, or fail completely."""
 
 import csv
 import http.client
@@ -22,7 +22,7 @@ QUERY = """SELECT id, ra, z_obs, CASE WHEN id % 3 > 0 THEN flux_halpha END AS fl
            FROM galaxies ORDER BY id LIMIT 700"""
 
 
-def test_the_same_rows_in_all_four(page, shown):
+def test_all_formats_contain_the_same_rows(page, shown):
     files = {}
     for form in ("csv", "parquet", "vot", "fits"):
         status, _, files[form] = page.of_lake(f"export?format={form}&sql={quote(QUERY)}")
@@ -67,15 +67,15 @@ def test_the_same_rows_in_all_four(page, shown):
 @pytest.mark.parametrize(
     "sql", ["SELECT nothing FROM galaxies", "SELECT 1 AS a, 2 AS a", "SELECT * FROM '/etc/passwd'"]
 )
-def test_an_error_is_no_file(page, form, sql):
+def test_an_error_gives_no_file(page, form, sql):
     status, headers, body = page.of_lake(f"export?format={form}&sql={quote(sql)}")
     assert status == 400
     assert "Content-Disposition" not in headers
     assert json.loads(body)["error"]
 
 
-def test_an_error_in_the_midst_is_no_whole_file(page):
-    """The first pieces have been sent when a late row fails: the connection ends without its end."""
+def test_a_late_error_aborts_the_download(page):
+    """If a row fails after the first pieces were sent, the connection ends without the last chunk."""
     sql = "SELECT CASE WHEN range = 980000 THEN error('no') ELSE range END AS a FROM range(1000000)"
     with pytest.raises((http.client.IncompleteRead, ConnectionError)):
         page.of_lake(f"export?format=csv&sql={quote(sql)}")
@@ -90,7 +90,7 @@ def test_an_error_in_the_midst_is_no_whole_file(page):
         "SELECT CASE WHEN range = 7 THEN repeat('x', 1000000) ELSE 'y' END AS a FROM range(1000)",
     ],
 )
-def test_a_file_that_is_made_on_disc_has_a_bound_of_bytes(page, sql, monkeypatch):
+def test_temporary_files_have_a_limited_size(page, sql, monkeypatch):
     monkeypatch.setattr(results, "MAX_FITS_BYTES", 1 << 25)
     status, _, body = page.of_lake(f"export?format=fits&sql={quote(sql)}")
     assert status == 400
@@ -98,7 +98,7 @@ def test_a_file_that_is_made_on_disc_has_a_bound_of_bytes(page, sql, monkeypatch
 
 
 def test_fits_of_more_rows_than_fit_into_memory(page):
-    """Of three million the header tells the number, and the last is there."""
+    """The header of a file of three million rows has their number, and the last row is complete."""
     sql = "SELECT range AS id, range * 0.5 AS x, 'n' || range AS name FROM range(3000000)"
     status, headers, body = page.of_lake(f"export?format=fits&sql={quote(sql)}")
     assert (status, headers["Content-Type"]) == (200, "application/fits")
@@ -110,7 +110,7 @@ def test_fits_of_more_rows_than_fit_into_memory(page):
 
 
 def test_pieces_of_wide_rows_are_small(page):
-    """However wide they are: a table of a thousand rows of a megabyte is never held as a whole."""
+    """A table of a thousand rows of one megabyte is never in memory as a whole."""
     process = page.server.lake.explorer.process()
     try:
         sizes = [batch.nbytes for batch in process.batches("SELECT repeat('x', 1000000) AS a FROM range(50)")]

@@ -1,4 +1,4 @@
-"""Footprints of exposures and detectors, and how many of them see a place."""
+"""Footprints of exposures and detectors, and the number of exposures that cover a position."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def square(ra, dec):
 
 @pytest.fixture(scope="module")
 def planned(tmp_path_factory):
-    """Exposure 1 of one detector, 2 of three side by side about RA 0, of which one is done; two of them twice."""
+    """Exposures of one, two and three detectors; the third lies around RA 0, and its middle detector is rendered."""
     corners = [(10, 0), (10, 0), (11, 0), (359, -40), (0, -40), (0, -39)]
     columns = {name: rows_of(TASKS, 6)[name] for name in TASKS.names}
     columns |= {"exposure_id": [1, 2, 2, 3, 3, 3], "radius": [0.8] * 6, "detector": ["a", "a", "b", "a", "b", "c"]}
@@ -96,12 +96,12 @@ def test_exposures_of_a_part(planned):
 def test_too_many_exposures_are_refused(planned, monkeypatch):
     monkeypatch.setattr(sky_maps, "MAX_EXPOSURES", 2)
     status, _, body = planned.of_lake("exposures")
-    assert (status, b"look at a part" in body) == (400, True)
+    assert (status, b"use a smaller field" in body) == (400, True)
     assert len(planned.json("exposures?ra=10.5&dec=0.5&radius=0.1")) == 2
 
 
 def test_coverage(planned):
-    """Two detectors side by side, one of them twice: how often each cell is seen."""
+    """Each cell counts the exposures of two adjacent detectors, one of which is exposed twice."""
     assert planned.json("bands") == ["i", "r"]
     here = "&ra=11&dec=0.5&radius=2"
     area = {}
@@ -132,7 +132,7 @@ def test_coverage(planned):
     ],
 )
 def test_hulls(corners, wanted):
-    """Also of places on one line; the parallel at -80 deg is bent, so that what lies on it to the south is a corner."""
+    """Corners may lie on one line. The parallel at -80 deg is curved, so its points can be corners of the hull."""
     hull = sky_maps._convex_hull(np.array(corners, float))
     assert {tuple(corner) for corner in hull} >= set(wanted)
     assert (10.5, 0.5) not in {tuple(corner) for corner in hull}

@@ -1,4 +1,4 @@
-"""The command: what it prints, and what it refuses in one line."""
+"""The command: its output, and errors in one line."""
 
 import http.client
 import signal
@@ -22,16 +22,16 @@ ROOT = Path(__file__).resolve().parents[3]
             ["--host", "0.0.0.0", "--token", "0123456789abcdef"],
             "--host 0.0.0.0 accepts connections from other machines: give --called NAME, the name or address that they",
         ),
-        (["--host", "0.0.0.0", "--called", "here.example"], "a --token of your own is wanted"),
-        (["--called", "here.example"], "a --token of your own is wanted"),
-        (["--host", "0.0.0.0", "--called", "a b"], "'a b' is no name"),
-        (["--host", "192.0.2.1"], "a --token of your own is wanted"),
-        (["--token", "short"], "wanted 16 to 256"),
-        (["--token", "0123456789abcde"], "wanted 16 to 256"),
-        (["--token", "0123456789abcdef;"], "wanted 16 to 256"),
-        (["--token", ""], "wanted 16 to 256"),
-        (["--lake", "another"], "the folder of one lake"),
-        (["--port", "70000"], "--port 70000: wanted 0 to 65535"),
+        (["--host", "0.0.0.0", "--called", "here.example"], "so --token is required"),
+        (["--called", "here.example"], "so --token is required"),
+        (["--host", "0.0.0.0", "--called", "a b"], "'a b' is not a host name"),
+        (["--host", "192.0.2.1"], "so --token is required"),
+        (["--token", "short"], "--token must have 16 to 256"),
+        (["--token", "0123456789abcde"], "--token must have 16 to 256"),
+        (["--token", "0123456789abcdef;"], "--token must have 16 to 256"),
+        (["--token", ""], "--token must have 16 to 256"),
+        (["--lake", "another"], "exactly one lake must be given"),
+        (["--port", "70000"], "--port 70000 is outside [0, 65535]"),
         (["--timeout", "-1"], "timeout = -1.0 is outside"),
         (["--name", "nobody"], "has no request nobody"),
     ],
@@ -55,11 +55,11 @@ def test_a_port_that_is_taken(page, shown, capsys):
 
 def test_no_lake(capsys):
     assert main(["--no-open"]) == 2
-    assert "the folder of one lake" in capsys.readouterr().err
+    assert "exactly one lake must be given" in capsys.readouterr().err
 
 
-def test_others_are_let_in_by_the_name_that_is_said(shown):
-    """At every address of this machine: by a name that was given, or from this machine itself; by no other."""
+def test_other_machines_may_only_use_the_given_name(shown):
+    """A server on all interfaces answers under the given name and under names of this machine, and under no other."""
     command = [sys.executable, "-m", "truesky.page", "--lake", str(shown), "--no-open", "--host", "0.0.0.0"]
     command += ["--called", "Sky.example", "--called", "192.0.2.7", "--token", "a-token-of-the-tests"]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as server:
@@ -93,7 +93,7 @@ def test_it_answers_until_it_is_stopped(shown):
 
 
 def test_the_first_sky_waits_for_nothing_that_draws_images():
-    """Of the libraries that take longer to load than the page none is loaded before it listens."""
+    """Libraries that take long to load are not loaded before the server listens."""
     slow = ("astropy", "galsim", "healpy", "matplotlib", "numba", "scipy")
     text = f"import sys, truesky.page.__main__; print([name for name in {slow} if name in sys.modules])"
     done = subprocess.run(

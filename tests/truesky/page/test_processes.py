@@ -1,4 +1,4 @@
-"""Processes that end, questions that are given up, and lakes that are published anew."""
+"""Processes that end, queries that are cancelled, and lakes with new versions."""
 
 import asyncio
 import http.client
@@ -27,7 +27,7 @@ from truesky.page.tap.queries import Jobs
 
 
 def killed(lane):
-    """Kill the processes of a lane, as the system does where memory is short."""
+    """Kill the processes of a pool, as the system does if memory is short."""
     found = [process._worker.process for process in lane._processes if process._worker is not None]
     for worker in found:
         os.kill(worker.pid, signal.SIGKILL)
@@ -54,7 +54,7 @@ def test_a_killed_process_is_replaced(page):
 
 
 def test_a_process_is_stopped_while_it_ends():
-    """Another thread forgets the worker between two looks at it."""
+    """Another thread removes the worker between two accesses to it."""
     killed = []
 
     class Worker:
@@ -81,8 +81,8 @@ def test_a_process_is_stopped_while_it_ends():
     assert len(killed) == 1
 
 
-def test_who_asked_a_killed_process_is_told(page):
-    """In the midst of a question: one line, and the next question is answered."""
+def test_a_query_fails_if_its_process_is_killed(page):
+    """A query whose process is killed gets an error in one line, and the next query is answered."""
     until(page.server._warm_up_task.done)
     body = json.dumps({"sql": "SELECT count(*) FROM range(100000000000) a, range(100) b"}).encode()
     told = []
@@ -97,7 +97,7 @@ def test_who_asked_a_killed_process_is_told(page):
     assert page.json("sql", method="POST", body=b'{"sql": "SELECT 1 AS a"}')["rows"] == [[1]]
 
 
-def test_who_goes_away_stops_the_query(page):
+def test_a_client_that_disconnects_stops_its_query(page):
     body = json.dumps({"sql": "SELECT count(*) FROM range(100000000000) a, range(100) b"}).encode()
     lane = page.server.lake.user_queries
     until(lambda: page.server._warm_up_task.done() and lane._free.qsize() == 2)
@@ -110,7 +110,7 @@ def test_who_goes_away_stops_the_query(page):
     assert page.json("sql", method="POST", body=b'{"sql": "SELECT 1 AS a"}')["rows"] == [[1]]
 
 
-def test_a_lake_that_is_published_anew_is_announced(shown, tmp_path):
+def test_a_new_version_of_a_table_is_announced(shown, tmp_path):
     root = shutil.copytree(shown, tmp_path / "lake", symlinks=True)
     with serving(root) as page:
         old = page.server.lake.key
@@ -128,7 +128,7 @@ def test_a_lake_that_is_published_anew_is_announced(shown, tmp_path):
         assert page.json("sql", method="POST", body=sums)["rows"] == [[120.0]]
 
 
-def test_a_table_that_is_new_is_announced(tmp_path):
+def test_a_new_table_is_announced(tmp_path):
     root = tmp_path / "lake"
     root.mkdir()
     publish.make_version(root, plain_plan(), plain_work)
@@ -139,8 +139,8 @@ def test_a_table_that_is_new_is_announced(tmp_path):
         assert json.loads(page.ask("/api/lake")[2])["is_changed"] is True
 
 
-def test_a_lake_is_opened_anew_beside_what_is_being_answered(tmp_path):
-    """A download ends with all of its rows, though two ask at once to open the lake anew; nothing is left open."""
+def test_a_lake_is_opened_again_during_a_download(tmp_path):
+    """A download completes while two requests open the lake again at the same time, and no lake stays open."""
     root = tmp_path / "lake"
     root.mkdir()
     publish.make_version(root, plain_plan(), plain_work)
@@ -169,7 +169,7 @@ def test_a_lake_is_opened_anew_beside_what_is_being_answered(tmp_path):
             time.sleep(0.05)
 
 
-def test_a_lane_that_is_closed_gives_no_process():
+def test_a_closed_pool_lends_no_process():
     async def run():
         lane = ProcessPool(lambda: Process(Path(), []), 1)
         async with lane.process():
@@ -188,7 +188,7 @@ def test_a_lane_that_is_closed_gives_no_process():
 
 
 def test_a_lake_of_two_requests(tmp_path):
-    """Tables that both have go by the names of both."""
+    """Tables that both requests have are listed with the names of both."""
     root = tmp_path / "lake"
     root.mkdir()
     for name, seed in (("a", 1), ("my-b", 2)):
@@ -228,7 +228,7 @@ def test_a_lake_of_two_requests(tmp_path):
         ({"limits": 7}, "limits|iterable"),
     ],
 )
-def test_charts_that_are_none(page, question, words):
+def test_invalid_charts_are_refused(page, question, words):
     usual = {"source": "galaxies", "axes": ["z_obs"], "charts": [{"axes": [0], "bins": [3]}]}
     status, _, body = page.of_lake("charts", method="POST", body=json.dumps({**usual, **question}).encode())
     assert status == 400
@@ -236,7 +236,7 @@ def test_charts_that_are_none(page, question, words):
 
 
 @pytest.mark.parametrize("value", ["TIMESTAMP '20000-01-01'", "'infinity'::TIMESTAMP", "'infinity'::DATE"])
-def test_moments_that_python_lacks(page, value):
+def test_times_outside_the_range_of_python(page, value):
     question = json.dumps({"sql": f"SELECT {value} AS moment"}).encode()
     status, _, body = page.of_lake("sql", method="POST", body=question)
     assert status == 400

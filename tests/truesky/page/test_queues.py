@@ -1,4 +1,4 @@
-"""Who waits for what, how many may, and what becomes of those beyond."""
+"""Queues of requests: their limits, and the refusal of further requests."""
 
 import asyncio
 import io
@@ -26,9 +26,9 @@ def test_a_pool_refuses_beyond_its_bound_and_takes_others_when_done():
         pool = ThreadPool(2, 3)
         asked = [asyncio.create_task(pool.run(go.wait)) for _ in range(5)]
         await asyncio.sleep(0)
-        with pytest.raises(Busy, match="3 questions are waiting"):
+        with pytest.raises(Busy, match="3 requests are waiting"):
             await pool.run(go.wait)
-        # One of those that wait goes away: its place is free.
+        # If a waiting request is cancelled, its slot is free.
         asked[4].cancel()
         await asyncio.gather(asked[4], return_exceptions=True)
         sixth = asyncio.create_task(pool.run(go.wait))
@@ -69,7 +69,7 @@ def test_a_thread_whose_user_has_gone_is_in_use_until_it_is_done():
 
 
 def test_tiles_are_refused_beyond_the_queue_and_hold_up_nothing_else(page, monkeypatch):
-    """All threads of tiles at work, the line full: 429, while maps of the sky are made."""
+    """If all threads for tiles are busy and their queue is full, tiles get status 429, but sky maps are answered."""
     go, started = threading.Event(), []
     real = pictures.picture
     monkeypatch.setattr(pictures, "picture", lambda *given: started.append(1) or (go.wait(30.0) and real(*given)))
@@ -99,7 +99,7 @@ def test_tiles_are_refused_beyond_the_queue_and_hold_up_nothing_else(page, monke
     assert page.of_lake("tile/0/0/0/0")[0] == 200
 
 
-def test_the_rest_has_a_queue_of_its_own(page, monkeypatch):
+def test_tiles_and_other_requests_have_separate_queues(page, monkeypatch):
     go = threading.Event()
     monkeypatch.setattr(sky_maps, "coverage", lambda *given: go.wait(30.0) and b"")
     asking = [threading.Thread(target=page.of_lake, args=("coverage?order=5",), daemon=True) for _ in range(4)]
@@ -150,7 +150,7 @@ def test_jobs_beyond_those_that_run_are_queued():
     asyncio.run(run())
 
 
-def test_the_patient_are_not_refused():
+def test_patient_queries_are_not_refused():
     async def run():
         lane = ProcessPool(lambda: Process(Path(), []), 1)
 
@@ -169,7 +169,9 @@ def test_the_patient_are_not_refused():
     asyncio.run(run())
 
 
-@pytest.mark.parametrize(("bounds", "words"), [((50, 1000), "the result has more"), ((1000, 150), "results of jobs")])
+@pytest.mark.parametrize(
+    ("bounds", "words"), [((50, 1000), "the result is larger"), ((1000, 150), "all results are larger")]
+)
 def test_results_have_a_bound(monkeypatch, bounds, words):
     monkeypatch.setattr(queries, "MAX_RESULT_BYTES", bounds[0])
     monkeypatch.setattr(queries, "MAX_TOTAL_BYTES", bounds[1])
@@ -201,8 +203,8 @@ def test_results_have_a_bound(monkeypatch, bounds, words):
     asyncio.run(run())
 
 
-def test_of_a_job_that_is_aborted_nothing_stays():
-    """Neither its file nor its bytes among those of all jobs."""
+def test_an_aborted_job_leaves_nothing():
+    """The file is deleted, and its size no longer counts for the total."""
     waiting = asyncio.Event()
 
     @asynccontextmanager
@@ -260,8 +262,8 @@ def test_others_are_answered_while_a_result_is_written(monkeypatch):
     asyncio.run(run())
 
 
-def test_who_takes_nothing_loses_the_process(page, monkeypatch):
-    """A reader that stands still is let go, and others are answered by as many processes as before."""
+def test_a_client_that_does_not_read_loses_its_process(page, monkeypatch):
+    """A stalled client is disconnected, and its process is free for others."""
     monkeypatch.setattr(downloads, "STALL_TIMEOUT", 0.5)
     lane = page.server.lake.user_queries
     ended = time.monotonic() + 30.0

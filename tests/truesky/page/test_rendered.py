@@ -1,4 +1,4 @@
-"""Images as they are rendered: the truth lies where the light is."""
+"""Rendered images: true positions agree with the light in the images."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ truth = ["noise_free"]
 
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory):
-    """A lake with a VIS detector and one through the grism, of the same stars."""
+    """A lake with a VIS detector and a grism detector with the same stars."""
     folder, rng = tmp_path_factory.mktemp("rendered"), np.random.default_rng(11)
     x, y = rng.uniform(-0.48, 0.48, (2, COUNT)) * SIDE * 0.1 / 3600.0
     ra, dec, mags = 53.117 + x / np.cos(np.radians(-27.808)), -27.808 + y, rng.uniform(15.0, 22.0, COUNT)
@@ -57,7 +57,7 @@ def rendered(tmp_path_factory):
 
 
 def peak(image, x, y):
-    """Where the light peaks near a place: of a parabola through the brightest pixel's neighbours, in magnitudes."""
+    """Peak near a position, by a parabola through the magnitudes of the brightest pixel and its neighbours."""
     column, row = round(x), round(y)
     near = image[row - 2 : row + 3, column - 2 : column + 3].astype(float)
     r, c = np.unravel_index(near.argmax(), near.shape)
@@ -72,7 +72,7 @@ def peak(image, x, y):
 
 @pytest.mark.nightly
 def test_the_brightest_stars_are_where_the_truth_says(rendered):
-    """In the noise-free image: saturation, trails of charge and noise move the peaks of a raw one."""
+    """Use the noise-free image, because saturation, charge trails and noise shift the peaks of a raw image."""
     lake = LakeSession(rendered, memory=1e9)
     try:
         (number,) = (

@@ -1,4 +1,4 @@
-"""A lake of two requests: each counts its exposures for itself, and nothing of the one is shown as the other's."""
+"""A lake of two requests, whose exposure numbers are independent and must not be mixed up."""
 
 import json
 
@@ -56,7 +56,7 @@ def planned(root, name):
 
 @pytest.fixture(scope="module")
 def two(tmp_path_factory):
-    """Exposure 8 of the first could not be made; a third request shares what the second has."""
+    """Exposure 8 of the first request failed; a third request shares the tables of the second."""
     root = tmp_path_factory.mktemp("two") / "lake"
     root.mkdir()
     for seconds, name in enumerate(("a", "b", "c"), start=1):
@@ -96,7 +96,7 @@ def test_requests_that_share_everything_count_once(two):
     assert page.server.lake.request_tables("stars") == []
 
 
-def test_of_one_request_nothing_says_which(two):
+def test_one_request_is_not_named(two):
     page, _ = two
     lake = LakeSession(page.server.lake.root, "b")
     try:
@@ -106,7 +106,7 @@ def test_of_one_request_nothing_says_which(two):
         lake.close()
 
 
-def test_what_was_made_before_there_were_names_is_of_every_request(tmp_path):
+def test_tables_without_a_request_belong_to_every_request(tmp_path):
     root = tmp_path / "lake"
     root.mkdir()
     test_traces.published(root)

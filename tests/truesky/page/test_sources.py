@@ -1,4 +1,4 @@
-"""A source in a lake whose requests have tables of their own."""
+"""A source in a lake whose requests have different tables."""
 
 import json
 
@@ -17,7 +17,7 @@ NUMBER = 60
 
 
 def test_spectra_of_a_lake_of_two_requests(tmp_path, monkeypatch):
-    """The spectrum is that of the request which has the source, of what its fluxes were made of."""
+    """The spectrum comes from the request that has the source, and from the libraries of its fluxes."""
     root, part, declared = tmp_path / "lake", Task(layout.cell_file(5, 1607), {}), fluxes("galaxy", ["euclid_vis"])
     root.mkdir()
     for seed, name in ((3, "a"), (4, "b")):
@@ -48,7 +48,7 @@ def test_spectra_of_a_lake_of_two_requests(tmp_path, monkeypatch):
         assert "has no source 1 " in json.dumps(page.json("spectrum/1"))
 
 
-def test_the_place_of_a_source_is_of_the_version_that_has_it(tmp_path):
+def test_the_position_comes_from_the_request_that_has_the_source(tmp_path):
     root, part = tmp_path / "lake", Task(layout.cell_file(5, 1607), {})
     root.mkdir()
     rows = {name: rows_of(GALAXIES, number, seed=3) for name, number in (("a", NUMBER), ("b", NUMBER + 20))}

@@ -1,4 +1,4 @@
-"""The TAP service as pyvo, astropy and, where it is installed, stilts' taplint use it."""
+"""The TAP service with pyvo, astropy and, if it is installed, taplint of stilts."""
 
 import csv
 import io
@@ -68,7 +68,7 @@ def test_a_job_that_fails_says_why(service):
 
 
 def test_a_job_can_be_aborted(service, page):
-    """Its process is given up: as many as before are free, though the query itself would take days."""
+    """The process of an aborted job is replaced, although its query would take days."""
     assert service.search("SELECT 1 AS a")["a"].tolist() == [1]
     lane = page.server.tap._lake_processes.process_pool
     free = len(lane._processes)
@@ -87,7 +87,7 @@ def test_a_job_can_be_aborted(service, page):
 
 
 def test_a_cone_reads_cells_of_the_circle(service, shown, monkeypatch):
-    """The same rows with and without the ranges of cells, whatever the circle's size."""
+    """Circles of all sizes give the same rows with and without the ranges of cells."""
     rows, asked = read.version(shown, "stars").rows(["id", "ra", "dec"]), []
     real = adql.to_sql
     monkeypatch.setattr(adql, "to_sql", lambda *given: asked.append(real(*given)) or asked[-1])
@@ -143,7 +143,7 @@ def test_images_are_found_by_place(service, shown):
 @pytest.mark.parametrize(("query", "most", "rows"), [
     ("SELECT id FROM galaxies", 7, 7), ("SELECT TOP 7 id FROM galaxies", 7, 7),
 ])  # fmt: skip
-def test_too_many_rows_are_said(service, query, most, rows):
+def test_too_many_rows_are_reported(service, query, most, rows):
     found = service.search(query, maxrec=most)
     assert len(found) == rows
     assert found.query_status == ("OK" if "TOP" in query else "OVERFLOW")
@@ -159,7 +159,7 @@ def test_too_many_rows_are_said(service, query, most, rows):
         ("SELECT TOP 1 id FROM stars UNION SELECT id FROM galaxies", "TOP in a part of UNION"),
     ],
 )
-def test_errors_are_said_in_a_votable(service, query, words):
+def test_errors_are_reported_in_a_votable(service, query, words):
     with pytest.raises(pyvo.DALQueryError, match=words):
         service.search(query)
 
@@ -186,7 +186,7 @@ def test_other_formats_and_uploads(page):
         assert (status, b'value="ERROR"' in body) == (400, True)
 
 
-def test_what_is_not_there(page):
+def test_unknown_addresses(page):
     for path, status in (
         ("nothing", 404), ("async/nothing", 404), ("async/nothing/phase", 404), ("file/x/0", 404),
         (f"file/{page.server.lake.key}/x", 404), (f"file/{page.server.lake.key}/99", 404),

@@ -1,4 +1,4 @@
-"""A source through a grism: its traces as the lake has them, and the pixels along them."""
+"""A source through a grism: its traces in the lake, and the pixels along them."""
 
 import json
 
@@ -24,7 +24,7 @@ LEVEL, LINE = 50.0, 900.0
 
 
 def galaxy():
-    """A galaxy whose H-alpha is seen, and the wavelength at which it is."""
+    """A galaxy with an observed H-alpha line, and the wavelength of the line."""
     rows = rows_of(GALAXIES, 20, seed=4)
     z = rows["z_obs"].to_numpy()
     halpha = next(line.vacuum for line in lines.line_list() if line.name == "halpha")
@@ -33,7 +33,7 @@ def galaxy():
 
 
 def spectrum_image(wavelength):
-    """A bright band along the trace of a pixel's width, its line brighter."""
+    """A bright band of one pixel's width along the trace, with a brighter line."""
     out = np.full((NY, NX), 1.0)
     t = np.linspace(0.0, 1.0, 20_000)
     x, y = (np.rint(np.polynomial.polynomial.polyval(t, part)).astype(int) for part in (TRACE_X, TRACE_Y))
@@ -127,7 +127,7 @@ def test_pixels_along_a_trace(grism):
 
 @pytest.mark.parametrize("path", ["trace/0/{}?order=2", "trace/0/{}", "trace/1/{}?order=1", "trace/0/5?order=1",
                                   "trace/0/x?order=1", "trace/0/{}?order=nan"])  # fmt: skip
-def test_what_has_no_trace(grism, path):
+def test_sources_without_a_trace_are_refused(grism, path):
     page, own, _ = grism
     status, _, body = page.of_lake(path.format(own))
     assert status == 400
@@ -135,7 +135,7 @@ def test_what_has_no_trace(grism, path):
 
 
 def test_beyond_the_image_there_is_nothing(tmp_path):
-    """A trace that leaves the detector: NaN there."""
+    """Pixels of a trace outside the detector are NaN."""
     root = tmp_path / "lake"
     root.mkdir()
     own, _ = published(root, [500.0, 500.0, 0.0])

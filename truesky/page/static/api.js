@@ -1,8 +1,8 @@
-// Questions to the server, each of the lake as it was opened; and small helpers of the page.
+// Requests to the server, all for the key of the open lake, and small helpers of the page.
 
 export const lake = { key: "", tables: [], tap: "", limits: {} };
 
-/** Say something in the corner; what went wrong stays longer. */
+/** Show a message in the corner; error messages stay longer. */
 export function say(text, bad = false) {
   const line = document.getElementById("said").appendChild(document.createElement("p"));
   line.textContent = text;
@@ -16,14 +16,14 @@ async function answered(address, options) {
   let said = answer.statusText;
   try {
     said = (await answer.json()).error;
-  } catch { /* no JSON: the status says it */ }
+  } catch { /* the body is not JSON: use the status text */ }
   if (answer.status === 409) document.getElementById("changed").hidden = false;
   throw new Error(said);
 }
 
 const address = (path) => `/api/${lake.key}/${path}`;
 
-/** Learn what the lake holds. What is shown belongs to the key that was learnt first: of another only the news is told. */
+/** Read the description of the lake. The page keeps the key of the first description; if the key has changed, it only shows a notice. */
 export async function open(again = false) {
   const answer = again ? await answered("/api/reopen", { method: "POST" }) : await answered("/api/lake");
   const told = await answer.json();
@@ -49,7 +49,7 @@ export async function post(path, question, signal) {
   return answer.headers.get("Content-Type").startsWith("application/json") ? answer.json() : answer.arrayBuffer();
 }
 
-/** The head of a binary answer, and where its numbers begin. */
+/** The header of a binary response, and the offset of the data behind it. */
 export function headed(buffer) {
   const length = new DataView(buffer).getUint32(0, true);
   return [JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length))), 4 + length];
@@ -59,7 +59,7 @@ export function downloadAddress(format, sql) {
   return `${address("export")}?${new URLSearchParams({ format, sql })}`;
 }
 
-/** The pieces of an answer of at most so many bytes; null of a larger one, which is given up.  Errors: a refusal, in words */
+/** The chunks of a response of at most `most` bytes, or null if it is larger. Throws an error with the server's message. */
 export async function begun(address, most, signal) {
   const reader = (await answered(address, { signal })).body.getReader(), pieces = [];
   for (let size = 0; ; ) {
@@ -71,7 +71,7 @@ export async function begun(address, most, signal) {
   }
 }
 
-/** An element: h("td", {class: "text"}, "x", child). Texts become text, never markup. */
+/** Create an element: h("td", {class: "text"}, "x", child). Strings become text, never markup. */
 export function h(tag, facts = {}, ...children) {
   const made = document.createElement(tag);
   for (const [name, value] of Object.entries(facts)) {
@@ -82,21 +82,21 @@ export function h(tag, facts = {}, ...children) {
   return made;
 }
 
-/** A number as people read it. */
+/** Format a number for display. */
 export function number(value, digits = 5) {
   if (value === null || value === undefined) return "";
   if (typeof value !== "number") return String(value);
   if ((Number.isInteger(value) || Math.abs(value) >= 1e5) && Math.abs(value) < 1e12) return Math.round(+value.toPrecision(Math.max(digits, Number.isInteger(value) ? 15 : 3))).toLocaleString("en-US").replace(/,/g, "\u202f");
-  // An identifier is a whole number too: what JSON holds exactly is shown to its last digit.
+  // Show integers that are exact in JSON with all digits, because identifiers are integers too.
   if (Number.isSafeInteger(value)) return String(value);
   const size = Math.abs(value);
   return size !== 0 && (size >= 1e12 || size < 1e-3) ? (+value.toPrecision(digits)).toExponential() : String(+value.toPrecision(digits));
 }
 
-/** An angle of a place on the sky, deg, to better than 0.001 arcsec. */
+/** Format an angle in degrees with a resolution better than 0.001 arcsec. */
 export const degrees = (value) => value.toFixed(7);
 
-/** Right ascension and declination, sexagesimal beside degrees, to better than 0.01 arcsec. */
+/** Format RA and Dec, sexagesimal and in degrees, with a resolution better than 0.01 arcsec. */
 export function place(ra, dec) {
   const two = (x) => String(Math.floor(x)).padStart(2, "0");
   const split = (value, last, most) => {
@@ -108,20 +108,20 @@ export function place(ra, dec) {
   return `${hours.join(":")} ${dec < 0 ? "\u2212" : "+"}${angles.join(":")}   ${(+turned.toFixed(6) % 360).toFixed(6)} ${dec.toFixed(6)} deg`;
 }
 
-/** Tell those who do not see it what has come of their keys, when nothing has changed for a moment; `text` may be a function. */
+/** Announce the result of a key press to screen readers after a short pause without changes; `text` may be a function. */
 export function tell(text) {
   clearTimeout(telling);
   telling = setTimeout(() => (document.getElementById("told").textContent = typeof text === "string" ? text : text()), 700);
 }
 let telling = 0;
 
-/** What a table leaves out: "the first 500 of 12 288 cells"; nothing where it has all. */
+/** Describe what a table omits, for example "500 of 12 288 cells"; null if it is complete. */
 export const cut = (shown, all, what) => (shown < all ? `${number(shown)} of ${number(all)} ${what}` : null);
 
-/** A table's name in a query: what is no plain word of SQL stands in quotes. */
+/** The name of a table in a query, in quotes if it is not a plain SQL identifier. */
 export const sqlName = (name) => name.split(".").map((part) => (/^[a-z_][a-z0-9_]*$/.test(part) ? part : `"${part}"`)).join(".");
 
-/** A query as Python. */
+/** A query as Python code. */
 export const python = (sql) => `from truesky.explore.explorer import Explorer\n\nwith Explorer(${JSON.stringify(lake.lake)}) as lake:\n    rows = lake.sql(${JSON.stringify(sql)}, into="astropy")\n`;
 
 export async function copy(text, what) {
@@ -141,16 +141,16 @@ export function table(columns, rows, caption) {
   return h("table", {}, caption ? h("caption", {}, caption) : null, h("thead", {}, head), h("tbody", {}, ...body));
 }
 
-/** A table of what is of requests, which stand first where the lake has several; `row`: the cells of one. */
+/** A table of items that belong to requests, with a column of the request if there are several; `row` returns the cells of an item. */
 export function requested(ones, columns, row) {
   const several = ones.some((one) => one.request);
   return several ? table([{ name: "request", text: 1 }, ...columns], ones.map((one) => [one.request, ...row(one)])) : table(columns, ones.map(row));
 }
 
-/** Before the name of what is of a request: its name, where the lake has several. */
+/** Prefix for the label of an item: the name of its request if the lake has several. */
 export const of = (one) => (one.request ? `${one.request}: ` : "");
 
-/** Run the newest question; while one is under way only the last of the others waits. */
+/** Run only the latest call: while one is running, only the last of the following calls waits. */
 export function newest(ask) {
   let busy = false, waiting = null;
   return async function run(...given) {
@@ -174,7 +174,7 @@ export function newest(ask) {
   };
 }
 
-/** Make a canvas as fine as the screen; returns its size in the page's pixels. */
+/** Match the resolution of a canvas to the screen; return its size in CSS pixels and the ratio. */
 export function fit(canvas) {
   const ratio = window.devicePixelRatio || 1, box = canvas.getBoundingClientRect();
   const width = Math.max(1, Math.round(box.width * ratio)), height = Math.max(1, Math.round(box.height * ratio));
@@ -185,7 +185,7 @@ export function fit(canvas) {
   return [box.width, box.height, ratio];
 }
 
-/** Ticks at round numbers. */
+/** Tick marks at round numbers. */
 export function ticks(low, high, about) {
   const step0 = (high - low) / Math.max(about, 1), power = 10 ** Math.floor(Math.log10(step0));
   const step = power * [1, 2, 5, 10].find((m) => m * power >= step0 * 0.999), out = [];

@@ -1,4 +1,4 @@
-// The page: which view is shown, what the address holds, the theme, the keys.
+// The page: views, address, theme and keyboard.
 
 import * as api from "/static/api.js";
 import * as image from "/static/image.js";
@@ -12,7 +12,7 @@ const VIEWS = { sky, plots, sql, images: image, runs };
 const $ = (id) => document.getElementById(id);
 let shown = null, writing = 0, last = "";
 
-/** Show a view; `state` is what the address holds of it. */
+/** Show a view; `state` is its state from the address. */
 export async function show(name, state) {
   const view = VIEWS[name] ?? sky;
   shown = name in VIEWS ? name : "sky";
@@ -29,7 +29,7 @@ export async function show(name, state) {
   remember();
 }
 
-/** Put the view into the address, a moment after its last change. */
+/** Store the view in the address, shortly after its last change. */
 export function remember() {
   clearTimeout(writing);
   writing = setTimeout(() => {
@@ -50,7 +50,7 @@ function held() {
 
 async function restore() {
   const was = held();
-  if (was.lake && was.lake !== api.lake.key) api.say("The address is of another version of this lake: it is shown as it is now.");
+  if (was.lake && was.lake !== api.lake.key) api.say("The address belongs to another version of this lake. The page shows the present version.");
   theme(was.theme === "light" ? "light" : "dark");
   for (const [name, view] of Object.entries(VIEWS)) if (was[name] && view.restore) view.restore(was[name]);
   await show(was.view ?? "sky", was[was.view]);
@@ -73,7 +73,7 @@ function keys(event) {
 async function start() {
   await api.open();
   $("lake-name").textContent = api.lake.lake;
-  $("version").textContent = `truesky ${api.lake.version}, lake ${api.lake.key}. An answer on the page has at most ${api.lake.limits.rows_shown} rows, a query ${api.lake.limits.seconds} s.`;
+  $("version").textContent = `truesky ${api.lake.version}, lake ${api.lake.key}. The page shows at most ${api.lake.limits.rows_shown} rows of a query; a query may take ${api.lake.limits.seconds} s.`;
   $("tap-address").textContent = "";
   $("tap-address").append(api.h("button", { onclick: () => api.copy(api.lake.tap, "Address of the TAP service") }, "Copy TAP address"));
   for (const [name, why] of Object.entries(api.lake.damaged)) api.say(`${name}: ${why}`, true);

@@ -1,4 +1,4 @@
-// HEALPix cells of the sky in colours, drawn by the graphics processor.
+// HEALPix cells of the sky in colours, drawn by WebGL.
 
 import * as api from "/static/api.js";
 import { lutTexture, program } from "/static/colour.js";
@@ -13,7 +13,7 @@ void main() {
 }`;
 const FRAGMENT = `in float level; uniform sampler2D colours; uniform float alpha; out vec4 colour;
 void main() { colour = vec4(texture(colours, vec2(level, 0.5)).rgb, 1.0) * alpha; }`;
-// Colours begin and end at these parts of the cells.
+// The colour scale covers the cells between these quantiles.
 const FIRST = 0.01, LAST = 0.995;
 
 export class Cells {
@@ -25,7 +25,7 @@ export class Cells {
     lutTexture(this.gl, map, this.colours);
   }
 
-  /** Take an answer of the server; `kind`: a "number" has logarithmic colours, a "mean" linear ones, a "depth" those from 0. */
+  /** Load a response of the server; `kind`: "number" for logarithmic colours, "mean" for linear ones, "depth" for linear ones from 0. */
   filled(buffer, kind) {
     const { gl } = this, [head, at] = api.headed(buffer), corners = new Float32Array(buffer, at, head.cells * 8);
     const density = new Float32Array(buffer, at + head.cells * 32, head.cells), data = new Float32Array(head.cells * 24);
@@ -38,7 +38,7 @@ export class Cells {
     if (range[0] >= range[1]) range = linear ? [range[0] - 0.5, range[1] + 0.5] : [range[0] / 2, range[1] * 1.01];
     gl.bindBuffer(gl.ARRAY_BUFFER, this.buffer);
     gl.bufferData(gl.ARRAY_BUFFER, data, gl.STATIC_DRAW);
-    // Rows a square degree, of the cells that have any.
+    // Number of rows per square degree in cells that are not empty.
     const rows = (head.rows * 12 * 4 ** (head.order ?? 5)) / (41253 * Math.max(1, density.length));
     return { head, density, corners, count: head.cells * 6, linear, range, rows, beyond: sorted.filter((d) => d < range[0] || d > range[1]).length };
   }

@@ -1,11 +1,11 @@
-// One chart: a histogram, a map of numbers or points, its axes, its brush.
+// One chart: a histogram, a map of counts or of points, with axes and brush.
 
 import * as api from "/static/api.js";
 import { ink, lut } from "/static/colour.js";
 
 export const LEFT = 52, BOTTOM = 36, TOP = 8, RIGHT = 10;
 
-/** Draw a chart; `label` names an axis, `scale` is how many rows a counted one stands for. */
+/** Draw a chart; `label` returns the name of an axis, `scale` is the number of rows per counted row. */
 export function draw(chart, label, scale) {
   const [width, height, ratio] = api.fit(chart.canvas), context = chart.canvas.getContext("2d");
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
@@ -22,7 +22,7 @@ export function draw(chart, label, scale) {
 }
 
 function drawBars(chart, f, scale) {
-  // Both may be samples, each of its own part of the rows.
+  // Both may be samples with different fractions of the rows.
   const behind = chart.whole ? Float64Array.from(chart.whole, (count) => (count * chart.wholePart) / scale) : chart.counts, most = Math.max(...behind, 1);
   const step = (f.x1 - f.x0) / chart.counts.length, y = (n) => f.y0 - ((f.y0 - f.y1) * n) / most;
   for (const [counts, colour] of [[behind, ink("bar-off")], [chart.counts, ink("bar")]]) {
@@ -39,7 +39,7 @@ function drawMap(chart, f) {
     for (let j = 0; j < size; j++) {
       const n = chart.counts[i * size + j];
       if (!n) continue;
-      // On a light ground the fullest bins are the darkest.
+      // On a light background the fullest bins are the darkest.
       const share = Math.log1p(n) / top, c = 4 * Math.round(isLight ? 215 * (1 - share) : 40 + 215 * share), at = 4 * ((size - 1 - j) * size + i);
       image.data.set(colours.subarray(c, c + 4), at);
     }
@@ -50,7 +50,7 @@ function drawMap(chart, f) {
   f.context.drawImage(small, f.x0, f.y1, f.x1 - f.x0, f.y0 - f.y1);
 }
 
-/** The rows themselves: the more there are, the fainter each. */
+/** Draw single rows as points, fainter if there are more. */
 function drawPoints(chart, f) {
   const place = places(chart, f), n = chart.places.length / 2, size = n > 2000 ? 1.5 : n > 200 ? 2 : 3;
   f.context.fillStyle = ink("bar");
@@ -87,7 +87,7 @@ function drawAxes(chart, f, label, ySpan, yLabel) {
   c.restore();
 }
 
-/** (value, axis) -> place on the canvas. */
+/** (value, axis) -> position on the canvas. */
 const places = (chart, f) => (value, k) => {
   const [lo, hi] = chart.spans[k], share = (value - lo) / (hi - lo);
   return k ? f.y0 - share * (f.y0 - f.y1) : f.x0 + share * (f.x1 - f.x0);

@@ -1,4 +1,4 @@
-// Perceptual colour maps, 64 colours each (cividis, magma, viridis: of matplotlib, CC0), and the colours of the theme.
+// Perceptual colour maps of 64 colours each (cividis, magma and viridis from matplotlib, CC0), and the colours of the theme.
 
 const MAPS = {
   cividis: "00224e00255400285b002b62002e6a0030700533711235701a386f213b6e273e6e2d416d32436d36466c3b496c3f4c6c444f6c48526c4c556c50576c545a6d575d6d5b606e5e636f62656f656870696b716c6e727071737374757777767a7a787e7d788280798683798a86788e8978928c78958f779992779d9576a19975a59c74a99f73ada272b1a570b6a96fbaac6dbfb06bc3b369c7b767ccba64d0be62d4c15fd9c55cddc858e1cc55e6d051ead34cefd748f3db42f8df3cfde334fee838",
@@ -24,12 +24,12 @@ export function lut(name) {
   return out;
 }
 
-/** A colour of the theme, by its name in style.css. */
+/** A colour of the theme by its name in style.css. */
 export function ink(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 }
 
-/** A bar of a map with the numbers at its ends. */
+/** A colour bar with numbers at its ends. */
 export function bar(name, low, high, title) {
   const canvas = document.createElement("canvas");
   canvas.width = 256;
@@ -44,7 +44,7 @@ export function bar(name, low, high, title) {
   return [words, canvas, ends];
 }
 
-/** Pixels [height][width], the first row at the bottom, from their sky to their brightest: asinh, gray. */
+/** Draw pixels [height][width], first row at the bottom, in grey with an asinh stretch from the sky level to the brightest pixel. */
 export function stretched(pixels, width, height) {
   const sorted = pixels.filter(Number.isFinite).sort(), at = (share) => sorted[Math.floor(share * (sorted.length - 1))] ?? 0;
   const sky = at(0.5), noise = Math.max(sky - at(0.16), 1e-6 * Math.abs(at(1)), 1e-9), top = Math.max(at(0.9995), sky + 8 * noise);
@@ -59,7 +59,7 @@ export function stretched(pixels, width, height) {
   return image;
 }
 
-/** A shader program. */
+/** Compile a shader program. */
 export function program(gl, vertex, fragment) {
   const made = gl.createProgram();
   for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
@@ -74,7 +74,7 @@ export function program(gl, vertex, fragment) {
   return made;
 }
 
-/** The texture of a colour map. */
+/** Create or update the texture of a colour map. */
 export function lutTexture(gl, name, old) {
   const texture = old ?? gl.createTexture();
   gl.bindTexture(gl.TEXTURE_2D, texture);

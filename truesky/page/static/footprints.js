@@ -1,4 +1,4 @@
-// Footprints on the sky by their state: of exposures, of tasks (a detector of an exposure each), of products.
+// Footprints on the sky with their state: exposures, tasks (one detector of an exposure each) or products.
 
 import * as api from "/static/api.js";
 import { ink } from "/static/colour.js";
@@ -7,15 +7,15 @@ import { frame, project, vector } from "/static/sphere.js";
 
 const $ = (id) => document.getElementById(id);
 export const KINDS = ["exposures", "tasks", "products", "nothing"];
-// Colour and dashes: no state is told by its colour alone.
+// Colour and dashes: states can be distinguished without colour.
 const STATES = { planned: ["quiet", [5, 4]], partly: ["accent", [10, 3, 2, 3]], observed: ["second", []], failed: ["bad", [2, 3]] };
-// Names are written below this height of the view, deg, where no more footprints than this are seen.
+// Names are written if the height of the view (deg) is below NAMED and at most MOST_NAMED footprints are in view.
 const NAMED = 3, MOST_NAMED = 80;
-// Of a name, pixels of the screen.
+// Line spacing of names in pixels.
 const LINE = 14;
 const known = {};
 
-/** Ask for what a kind needs, once; of exposures what is in view, a circle { ra, dec, radius } deg, where all are too many; a promise. */
+/** Load footprints once; if there are too many exposures, load those within the circle `near` = { ra, dec, radius } in deg. Returns a promise. */
 export function load(kind, near) {
   if (kind === "nothing") return Promise.resolve();
   if (kind === "exposures") return exposures(near);
@@ -26,11 +26,11 @@ export function load(kind, near) {
   return known.regions;
 }
 
-/** All of them at first; where these are refused, those about the view: `of` is the circle that has been asked for. */
+/** Load all exposures; if the server refuses because they are too many, load those near the view. `of` is the loaded circle. */
 async function exposures(near) {
   const has = known.exposures, isFirst = !has;
   if (has?.of && away(has.of, near) + near.radius <= has.of.radius) return has.under;
-  // Somewhat more than is seen: not every step asks anew.
+  // Load somewhat more than the view, so that not every move needs a request.
   const of = isFirst ? { ...near, radius: Infinity } : { ...near, radius: Math.min(180, 1.5 * near.radius) };
   const mine = (known.exposures = { of, rows: has?.rows ?? [], said: has?.said });
   mine.under = api.get(isFirst ? "exposures" : `exposures?${new URLSearchParams(of)}`).then((found) => Object.assign(mine, { rows: found, said: "" }), (error) => {
@@ -40,13 +40,13 @@ async function exposures(near) {
   return mine.under;
 }
 
-/** Distance of two places, deg. */
+/** Angular distance of two positions in deg. */
 function away(one, other) {
   const a = vector(one.ra, one.dec), b = vector(other.ra, other.dec);
   return (2 * Math.asin(Math.min(1, Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]) / 2)) * 180) / Math.PI;
 }
 
-/** [{state, polygons, name}] of a kind, as far as they are here. */
+/** [{state, polygons, name}] of a kind that are loaded. */
 function shown(kind) {
   if (kind === "exposures") return (known.exposures?.rows ?? []).map((one) => ({ ...one, polygons: one.outline,
     name: `${api.of(one)}${one.band ?? one.channel} exposure ${one.exposure_id}, ${one.done} of ${one.all} detectors${one.failed ? `, ${one.failed} failed` : ""}` }));
@@ -56,12 +56,12 @@ function shown(kind) {
     name: `${api.of(one)}${one.band ?? one.channel} ${one.detector}: ${one.contents?.map((content) => content.replace("_", " ")).join(", ") ?? one.images.length}` })) : [];
 }
 
-/** Those with images that hold a place, of the finest kind. */
+/** Detectors with images that contain a position. */
 export function imagesAt(place) {
   return (known.regions?.rows ?? []).filter((one) => one.images.length && contains(one.polygon, place));
 }
 
-/** Detectors and exposures whose footprints have a corner in a circle, or hold its centre. */
+/** Detectors and exposures whose footprints have a corner in a circle or contain its centre. */
 export function within(place, radius) {
   const turn = frame(...place);
   const near = (corner) => {
@@ -80,7 +80,7 @@ function contains(polygon, [ra, dec]) {
   return sides.every((s) => s >= 0) || sides.every((s) => s <= 0);
 }
 
-/** Draw those of a kind; `at`: RA, Dec -> screen. */
+/** Draw the footprints of a kind; `at`: RA, Dec -> screen. */
 export function drawFootprints(c, kind, view, at, [width, height]) {
   const seen = [];
   for (const one of shown(kind)) {
@@ -92,7 +92,7 @@ export function drawFootprints(c, kind, view, at, [width, height]) {
   }
   for (const [one, points] of seen) {
     const [ink_, dashes] = STATES[one.state];
-    // On a ground of the page's colour: cells may have any.
+    // Draw a line in the colour of the page below, because cells may have any colour.
     for (const [colour, wide] of [["paper", 4], [ink_, 1.6]]) {
       c.strokeStyle = ink(colour);
       c.lineWidth = wide;
@@ -106,7 +106,7 @@ export function drawFootprints(c, kind, view, at, [width, height]) {
   for (const [one, points] of seen) {
     const [x, first] = points.find(Boolean);
     let y = first;
-    // What several requests see at one place is named line by line.
+    // If names of several requests fall on the same place, write them below each other.
     while (taken.some(([u, v]) => Math.abs(u - x) < LINE && Math.abs(v - y) < LINE)) y += LINE;
     taken.push([x, y]);
     write(c, one, [x, y]);
@@ -123,7 +123,7 @@ function write(c, one, [x, y]) {
   c.fillText(one.name, x + 4, y - 5);
 }
 
-/** What the lines mean, with how many there are of each state. */
+/** Legend of the lines with the number of footprints in each state. */
 export function legend(kind) {
   const all = shown(kind), said = kind === "exposures" && known.exposures?.said, rows = said ? [api.h("div", {}, said)] : [];
   for (const state of Object.keys(STATES)) {

@@ -1,8 +1,8 @@
-// Lines on the sky.
+// Coordinate grid on the sky.
 
 import { ink } from "/static/colour.js";
 
-/** A line through points, broken where there is none. */
+/** Draw a line through points; a missing point interrupts it. */
 export function line(c, points) {
   c.beginPath();
   let on = false;
@@ -14,7 +14,7 @@ export function line(c, points) {
   c.stroke();
 }
 
-/** Meridians and parallels at round degrees with their numbers; `at`: RA, Dec -> screen. */
+/** Draw meridians and parallels at round degrees with labels; `at`: RA, Dec -> screen. */
 export function graticule(c, view, at, [width, height]) {
   const step = [30, 10, 5, 2, 1, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001, 0.0005].find((s) => s <= view.height / 3.5) ?? 0.0005;
   const near = Math.min(89.9, view.dec > 0 ? view.dec : -view.dec), wide = Math.min(180, (view.height * Math.max(1, width / height)) / Math.cos((near * Math.PI) / 180));

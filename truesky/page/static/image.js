@@ -1,4 +1,4 @@
-// Images: tiles of every product, stretched and coloured by the graphics processor; the truth on them.
+// Images: tiles of every product, stretched and coloured by WebGL, with true sources.
 
 import * as api from "/static/api.js";
 import { NAMES, bar, lutTexture, program } from "/static/colour.js";
@@ -28,7 +28,7 @@ void main() {
   colour = isnan(v) ? vec4(0.25, 0.0, 0.25, 1.0) : texture(colours, vec2(clamp(t, 0.0, 1.0), 0.5));
 }`;
 const STRETCHES = ["asinh", "linear", "log", "sqrt"];
-// Sigmas at which asinh turns from linear to logarithmic; milliseconds of a blink.
+// Level in sigmas at which asinh turns from linear to logarithmic; duration of a blink in ms.
 const KNEE = 4, BLINK_MS = 750;
 const view = { one: -1, two: -1, x: 0, y: 0, zoom: 0 }, opened = new Map();
 let page, list = null, gl, drawing, quad, colours, other = false, blinking = null, wanted = null, asked = false, isByKeys = false, cursor = null, tiles;
@@ -76,7 +76,7 @@ export function start(given) {
   } });
 }
 
-/** The graphics processor's part, made when the first image is shown; false where there is none. */
+/** Set up WebGL when the first image is shown; return false if it is not available. */
 function prepare() {
   if (gl !== undefined) return Boolean(gl);
   gl = $("image-canvas").getContext("webgl2");
@@ -90,12 +90,12 @@ function prepare() {
   return true;
 }
 
-/** Show an image at a place of the sky, deg; `unit`: pixels of the screen a degree. */
+/** Show an image at a position on the sky in deg; `unit` is the number of screen pixels per degree. */
 export function goTo(number, place, unit = null) {
   wanted = { number, place, unit };
 }
 
-/** The sky at the centre of the view, as large as it is here. */
+/** Show the sky at the centre of the view with the same scale. */
 function toSky() {
   if (opened.has(view.one)) page.toSky(opened.get(view.one).plate.sky(view.x, view.y), view.zoom / scaleOf(opened.get(view.one)));
 }
@@ -103,7 +103,7 @@ function toSky() {
 export async function show() {
   if (!prepare()) return;
   list ??= await api.get("images");
-  if (!list.length) return api.say("The lake holds no images.");
+  if (!list.length) return api.say("The lake has no images.");
   if (!$("image-one").childElementCount) {
     const name = (one) => `${api.of(one)}${one.exposure_id} ${one.channel} ${one.band} ${one.detector}: ${one.content.replace("_", " ")}`;
     $("image-one").append(...list.map((one) => api.h("option", { value: one.number }, name(one))));
@@ -120,14 +120,14 @@ export async function show() {
 
 async function open(number) {
   if (!opened.has(number)) {
-    $("image-place").textContent = "The tiles of this image are being made, once.";
+    $("image-place").textContent = "Making the tiles of this image, which is done once.";
     const about = await api.get(`image/${number}`).finally(() => ($("image-place").textContent = ""));
     opened.set(number, { ...about, plate: new Plate(about.grid) });
   }
   return opened.get(number);
 }
 
-/** Show another image; the place on the sky stays where both have it. */
+/** Show another image; keep the position on the sky if both images contain it. */
 async function choose(number, place = null, same = false, unit = null) {
   const before = opened.get(view.one), sky = place ?? (before && !same ? before.plate.sky(view.x, view.y) : null);
   const now = await open(Math.max(0, number));
@@ -155,7 +155,7 @@ function whole(image = opened.get(view.one)) {
 
 // ---------------------------------------------------------------------------------------------- drawing
 
-/** [a, b, c, d, e, f]: x' = a x + b y + c, y' = d x + e y + f, from an image's pixels to those of the first. */
+/** [a, b, c, d, e, f] of x' = a x + b y + c, y' = d x + e y + f, which map pixels of an image to pixels of the first image. */
 function toFirst(image) {
   const first = opened.get(view.one);
   if (image === first) return [1, 0, 0, 0, 1, 0];
@@ -165,7 +165,7 @@ function toFirst(image) {
   return [a, b, o[0] - a * at[0] - b * at[1], d, e, o[1] - d * at[0] - e * at[1]];
 }
 
-/** 1, or -1 where the first image has south at its top: it is then shown turned by 180 deg, as detectors are mounted. */
+/** 1, or -1 if the first image has south at the top. The view is then turned by 180 deg, because such detectors are mounted upside down. */
 function turn() {
   const { plate, nx, ny } = opened.get(view.one);
   return plate.plane(nx / 2, ny / 2 + 1)[1] >= plate.plane(nx / 2, ny / 2)[1] ? 1 : -1;
@@ -180,7 +180,7 @@ export function redraw() {
     asked = false;
     paint();
     marks();
-    // Tiles that have come, another image: what lies under the cursor may be another value.
+    // Update the value under the cursor, because new tiles or another image may be shown.
     if (isByKeys) told(atCentre(), middle());
     else if (cursor) told(pixelOn(...cursor, $("image-canvas").getBoundingClientRect()), cursor);
     page.remember();
@@ -210,7 +210,7 @@ function paint() {
   const corner = gl.getAttribLocation(drawing, "corner");
   gl.enableVertexAttribArray(corner);
   gl.vertexAttribPointer(corner, 2, gl.FLOAT, false, 0, 0);
-  // The coarsest level lies below: until finer tiles are there, it is seen.
+  // Draw the coarsest level first. It is visible until finer tiles have arrived.
   const best = Math.max(0, Math.min(image.levels.length - 1, Math.floor(Math.log2(1 / (view.zoom * Math.hypot(a, d) * (devicePixelRatio || 1))))));
   for (const level of new Set([image.levels.length - 1, best])) drawLevel(image, level, [width, height], [a, b, c, d, e, f], uniform("box"));
 }
@@ -235,7 +235,7 @@ function drawLevel(image, level, [width, height], [a, b, c, d, e, f], box) {
   }
 }
 
-/** What lies on the image: true sources, the pinned one, a compass, a scale. */
+/** Draw the overlay: true sources, the pinned source, a compass and a scale bar. */
 function marks() {
   const canvas = $("image-marks"), [width, height, ratio] = api.fit(canvas), c = canvas.getContext("2d"), image = current();
   c.setTransform(ratio, 0, 0, ratio, 0, 0);
@@ -264,13 +264,13 @@ function marks() {
 
 // ---------------------------------------------------------------------------------------------- moves
 
-/** Column and row, of the image that is seen, under the cursor. */
+/** Column and row under the cursor in the visible image. */
 function pixelAt(event) {
   const box = $("image-canvas").getBoundingClientRect();
   return pixelOn(event.clientX - box.left, event.clientY - box.top, box);
 }
 
-/** The same at a place of the canvas. */
+/** Column and row at a position on the canvas. */
 function pixelOn(left, top, box) {
   const image = current(), [a, b, c, d, e, f] = toFirst(image), det = a * e - b * d;
   const scale = view.zoom * turn();
@@ -291,7 +291,7 @@ function moved(event) {
   told(pixelAt(event), cursor);
 }
 
-/** What is at a pixel, told at a place of the screen: where it is, its value, its source. */
+/** Show position, value and source of a pixel in a box at the position `at` on the screen. */
 function told([x, y], at) {
   const image = current();
   $("image-place").textContent = x > -0.5 && y > -0.5 && x < image.nx - 0.5 && y < image.ny - 0.5
@@ -299,12 +299,12 @@ function told([x, y], at) {
   tip(image, [x, y], 10 / view.zoom, at);
 }
 
-/** The pixel, of the image that is seen, at the centre. */
+/** Pixel of the visible image at the centre of the view. */
 const atCentre = () => pixelOn(...middle(), $("image-canvas").getBoundingClientRect());
 
 const middle = () => [$("image-canvas").clientWidth / 2, $("image-canvas").clientHeight / 2];
 
-/** The same of the centre, for those who move by keys. */
+/** Show and announce position, value and source at the centre, for users of the keyboard. */
 function toldAtCentre() {
   told(atCentre(), middle());
   api.tell([$("image-place").textContent, $("image-tip").hidden ? "" : $("image-tip").textContent].join("\n"));
@@ -332,7 +332,7 @@ async function pinAt(x, y) {
   let id = null, least = 1;
   try {
     const near = await truthOf(image);
-    // Of sources side by side the brighter one is meant: the distance counts in radii of its mark.
+    // If several sources are near, prefer bright ones: measure distances in radii of their marks.
     near.x.forEach((sx, k) => {
       const away = (Math.hypot(sx - x, near.y[k] - y) * view.zoom) / (6 + 2 * radiusOf(near.expected[k]));
       if (away < least) [id, least] = [near.id[k], away];
@@ -355,7 +355,7 @@ function blink() {
     redraw();
   }, BLINK_MS);
   if (matchMedia("(prefers-reduced-motion: reduce)").matches) {
-    // Nothing moves by itself: each press shows the other.
+    // Blink only on key presses if the user prefers reduced motion.
     clearInterval(blinking);
     blinking = null;
     other = !other;
@@ -366,7 +366,7 @@ function blink() {
 
 export function key(event) {
   if (!opened.has(view.one)) return;
-  // With Shift pixel by pixel.
+  // With Shift move by one pixel.
   const step = (event.shiftKey ? 1 : 80 / view.zoom) * turn(), move = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, step], ArrowDown: [0, -step] }[event.key];
   const isHere = event.target === $("image-canvas") || event.target === document.body;
   if (move) [view.x, view.y] = [view.x + move[0], view.y + move[1]];

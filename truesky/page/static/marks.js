@@ -1,11 +1,11 @@
-// What is drawn over the sky and over an image: marks of sources, a compass, a scale.
+// Overlays of the sky and of images: marks of sources, a compass, a scale bar.
 
-/** Of the mark of a source of so many electrons, pixels of the screen. */
+/** Radius of the mark of a source in pixels of the screen, by its electrons. */
 export const radiusOf = (electrons) => Math.min(28, 3 + 1.6 * Math.log10(1 + Math.max(0, electrons)));
 
 export const colourOf = (kind) => ({ star: "#9fd3ff", QSO: "#d9a7ff", "strong lens": "#9be0a8", "moving body": "#ff9a8d" })[kind] ?? "#ffd27d";
 
-/** The place that keys speak of: the centre. */
+/** Mark the centre of the view, which keyboard commands refer to. */
 export function cross(c, [x, y], colour) {
   c.strokeStyle = colour;
   c.lineWidth = 1;
@@ -17,13 +17,13 @@ export function cross(c, [x, y], colour) {
   c.stroke();
 }
 
-/** Size of a pixel of an image, deg. */
+/** Size of an image pixel in deg. */
 export function scaleOf(image) {
   const a = image.plate.plane(image.nx / 2, image.ny / 2), b = image.plate.plane(image.nx / 2 + 1, image.ny / 2);
   return Math.hypot(a[0] - b[0], a[1] - b[1]);
 }
 
-/** North and east as they are at the centre of the view, and a bar of a round angle; `at`: pixels -> screen. */
+/** Draw north and east at the centre of the view, and a scale bar of a round angle; `at`: pixels -> screen. */
 export function compass(c, image, view, at, [width, height]) {
   const x = view.x, y = view.y, [a0, d0] = image.plate.sky(x, y), pixel = scaleOf(image) * 3600, o = at(x, y);
   c.font = "12px DejaVu Sans, sans-serif";
@@ -45,10 +45,10 @@ export function compass(c, image, view, at, [width, height]) {
   c.fillText(nice >= 60 ? `${nice / 60}′` : `${nice}″`, width - 110 - long / 2, height - 28);
 }
 
-/** Which sources of a field come first: of a magnitude those of small numbers, of a mass those of large ones. */
+/** Describe the order of sources: smallest magnitudes first, or largest masses first. */
 export const firstOf = (dots) => (dots.sense < 0 ? "most massive" : "brightest");
 
-/** Sources of a field, the first ones large; `at`: RA, Dec -> screen. */
+/** Draw the sources of a field, the first ones larger; `at`: RA, Dec -> screen. */
 export function drawDots(c, dots, at, colour) {
   const mags = dots.mag.map((mag) => mag && mag * dots.sense), told = mags.filter((mag) => mag !== null);
   const faint = told.reduce((a, b) => Math.max(a, b), -Infinity), bright = told.reduce((a, b) => Math.min(a, b), faint - 1);

@@ -1,4 +1,4 @@
-// One source: its rows, its spectrum with lines and passbands, its pictures, and where it was drawn.
+// One source: its rows, its spectrum with lines and passbands, its cutouts, and the images that contain it.
 
 import * as api from "/static/api.js";
 import { ink, stretched } from "/static/colour.js";
@@ -15,16 +15,16 @@ use({ line: named });
 export const onPin = (listener) => listeners.push(listener);
 
 export async function pin(id) {
-  // Of two that are under way the later one is shown, whichever is answered first.
+  // If two requests are running, show the later one, whichever is answered first.
   const mine = ++pins, found = await api.get(`source/${id}`);
   if (mine !== pins) return;
   source = found;
   const panel = $("pin");
   drawings = [];
   panel.replaceChildren(api.h("h2", {}, `${source.kind} ${source.id}`));
-  if (source.request) panel.append(api.h("p", { class: "quiet" }, `As request ${source.request} has it.`));
+  if (source.request) panel.append(api.h("p", { class: "quiet" }, `Values of request ${source.request}.`));
   if (source.place) panel.append(api.h("p", { class: "quiet" }, api.place(...source.place)));
-  // Of a table that several requests have to themselves that of the request is meant.
+  // If several requests have this table, use the table of the request that is shown.
   const table = Object.keys(source.tables)[0] ?? "rendered_truth", { request } = source.tables[table] ? source : source.drawn[0];
   const from = api.sqlName(request ? `${request}.${table}` : table);
   panel.append(api.h("div", { class: "bar" },
@@ -51,7 +51,7 @@ export async function pin(id) {
   dispersed(grism, own, () => own === source, drawings).catch(failed);
 }
 
-/** Draw again what has the colours of the theme, or the size of the page; what is not seen has no size. */
+/** Draw again after a change of theme or page size; hidden elements have no size. */
 export const redraw = () => $("pin").checkVisibility() && drawings.forEach((draw) => draw());
 
 function facts(rows, isWhole = false) {
@@ -67,7 +67,7 @@ async function cutouts(panel, own) {
   const list = await api.get("images");
   for (const { number, x, y, is_north_up: up } of own.images ?? []) {
     const about = list[number];
-    // Through a grism nothing lies where it is.
+    // Skip dispersed images, in which a source does not appear at its position.
     if (!["science", "noise_free"].includes(about.content) || about.channel === "NISP-S") continue;
     const pixels = new Float32Array(await api.bytes(`cutout/${number}?${new URLSearchParams({ x, y })}`));
     if (own !== source) return;
@@ -75,20 +75,20 @@ async function cutouts(panel, own) {
     canvas.getContext("2d").putImageData(stretched(up ? pixels : pixels.reverse(), SIDE, SIDE), 0, 0);
     panel.append(api.h("figure", {}, canvas, api.h("figcaption", { class: "quiet" }, `${api.of(about)}${about.band} ${about.content.replace("_", " ")}`)));
   }
-  if (!panel.childElementCount) panel.append(api.h("p", { class: "quiet" }, "No image holds its place."));
+  if (!panel.childElementCount) panel.append(api.h("p", { class: "quiet" }, "No image contains its position."));
 }
 
-/** A line as it is written: halpha, nii_2 -> Hα, [N II]. */
+/** Format the name of a line: halpha, nii_2 -> Hα, [N II]. */
 function named(name) {
   return { halpha: "Hα", hbeta: "Hβ", hgamma: "Hγ", hdelta: "Hδ", paalpha: "Paα", pabeta: "Paβ", pagamma: "Paγ", padelta: "Paδ", oii: "[O II]", oiii: "[O III]",
     nii: "[N II]", sii: "[S II]", siii: "[S III]", hei: "He I" }[name.split("_")[0]] ?? name;
 }
 
-/** f_lambda against wavelength, the passbands below it, its lines above. */
+/** Plot f_lambda against wavelength with passbands and lines. */
 function drawSpectrum(panel, found) {
   const canvas = api.h("canvas", { class: "spectrum", role: "img", tabindex: 0 });
   const data = api.h("div", { class: "data", hidden: true });
-  panel.replaceChildren(api.h("h3", {}, "Spectrum as it arrives"), canvas, api.h("button", { onclick: () => (data.hidden = !data.hidden) }, "Bands and lines as a table"), data);
+  panel.replaceChildren(api.h("h3", {}, "Observed spectrum"), canvas, api.h("button", { onclick: () => (data.hidden = !data.hidden) }, "Bands and lines as a table"), data);
   data.append(api.table([{ name: "band", text: 1 }, { name: "pivot", unit: "nm" }, { name: "f_nu", unit: "µJy" }, { name: "AB", unit: "mag" }], found.bands.map((b) =>
     [b.name, b.wavelength / 10, b.f_nu, b.f_nu > 0 ? +(23.9 - 2.5 * Math.log10(b.f_nu)).toFixed(3) : null])));
   if (found.lines.length) data.append(api.table([{ name: "line", text: 1 }, { name: "wavelength", unit: "nm" }], found.lines.map((l) => [named(l.name), (l.wavelength / 10).toFixed(1)])));
@@ -99,7 +99,7 @@ function drawSpectrum(panel, found) {
   drawCurve(canvas, found);
 }
 
-/** Where the axis of a spectrum ends, so that one line does not flatten the rest, and how high it reaches. */
+/** Upper end of the axis of a spectrum, so that one line does not flatten the rest; and the maximum of the spectrum. */
 function ceiling(found) {
   const sorted = [...found.f_lambda].sort((a, b) => a - b), most = sorted.at(-1);
   return { top: Math.min(most, 3 * sorted[Math.floor(0.99 * sorted.length)]) * 1.05 || 1, most };
@@ -119,7 +119,7 @@ function drawCurve(canvas, found) {
     const a = x(band.wavelength - band.width / 2), b = x(band.wavelength + band.width / 2);
     c.fillRect(a, y1, b - a, y0 - y1);
     c.fillStyle = ink("second");
-    // f_nu of microjansky to f_lambda of erg s-1 cm-2 A-1.
+    // Convert f_nu in microjansky to f_lambda in erg s-1 cm-2 A-1.
     const f = (band.f_nu * 1e-29 * 2.99792458e18) / band.wavelength ** 2;
     c.beginPath();
     c.arc((a + b) / 2, y(f), 3, 0, 7);
@@ -136,7 +136,7 @@ function drawCurve(canvas, found) {
   found.wavelength.forEach((l, k) => k >= begin && (k > begin ? c.lineTo(x(l), y(found.f_lambda[k])) : c.moveTo(x(l), y(found.f_lambda[k]))));
   c.stroke();
   c.fillStyle = c.strokeStyle = ink("quiet");
-  // Of lines that lie close the one that is named first in the table has the room.
+  // Label only the first of lines that are close to each other.
   const taken = [];
   for (const line of found.lines) {
     const at = x(line.wavelength);

@@ -1,5 +1,5 @@
-// Histograms and maps whose brushes filter each other: every move is counted anew, in one pass for all charts; while a
-// brush is held, the others are counted once for each of its pixels, and a move only adds up.
+// Linked histograms and maps: the brush of a chart selects rows for all other charts. A move counts all charts in one
+// pass. While a brush is held, the other charts are counted once per bin of the brush, and moves only add these counts.
 
 import * as api from "/static/api.js";
 import { BOTTOM, LEFT, RIGHT, TOP, draw as drawChart } from "/static/chart.js";
@@ -8,11 +8,11 @@ import { columnsOf, sources, suggested } from "/static/suggestions.js";
 const $ = (id) => document.getElementById(id);
 const BINS = 120, MAP_BINS = 96, CUBE_BINS = 256, CUBE_MAP_BINS = 32;
 const MOST_POINTS = 20000;
-// Of all charts of a question together.
+// Largest number of bins of all charts in one request.
 const MOST_CELLS = 8e6;
-// The whole is counted when no brush has moved for so long, ms.
+// All rows are counted if no brush has moved for this time (ms).
 const IDLE = 400;
-// A table of a map has so many rows; it is filled anew when its chart has been still for so long, ms.
+// Largest number of rows of the table of a map, and the time (ms) without changes after which it is updated.
 const MOST_ROWS = 500, STILL = 120;
 // charts: {axes: [{expression, log}], spans, brush: [[lo, hi], ...] | null, points, counts, whole, places, element ...}
 let page, source = "", where = "", charts = [], part = null, head = null, cube = null, drag = null, idle = 0;
@@ -37,7 +37,7 @@ export function start(given) {
   $("plot-sql").addEventListener("click", () => api.copy(query(), "SQL"));
 }
 
-/** Show charts of other rows: `lists` has the expressions of each chart's axes. */
+/** Show charts of other rows; `lists` contains the expressions of the axes of each chart. */
 export function usePlot(rows, lists) {
   source = rows;
   where = "";
@@ -76,9 +76,9 @@ function add() {
   show();
 }
 
-// ---------------------------------------------------------------------------------------------- questions
+// ---------------------------------------------------------------------------------------------- requests
 
-/** All different axes, in the order in which charts name them. */
+/** All different axes in the order of the charts. */
 function axes() {
   return [...new Set(charts.flatMap((chart) => chart.axes.map(sqlOf)))];
 }
@@ -95,7 +95,7 @@ function limits(except = null) {
   return [...found].map(([at, [lo, hi]]) => [at, lo, hi]);
 }
 
-/** Axes whose limits do not hold in a chart: those that it alone limits. */
+/** Axes whose limits do not apply to a chart, because only its brush sets them. */
 function own(chart) {
   const names = axes(), of = (one) => (one.brush ? one.axes.map((axis) => names.indexOf(sqlOf(axis))) : []);
   const others = charts.filter((one) => one !== chart).flatMap(of);
@@ -120,7 +120,7 @@ const ask = api.newest(async () => {
     const about = head.charts[k], size = about.bins.reduce((a, b) => a * b);
     chart.counts = new Uint32Array(buffer, at, size);
     chart.spans = about.spans;
-    // Of each axis: a row may lack one of them only.
+    // Count missing values per axis, because a row may lack only one of them.
     chart.missing = chart.axes.map((axis) => head.missing[names.indexOf(sqlOf(axis))]);
     chart.outside = about.outside;
     chart.part = head.part;
@@ -136,7 +136,7 @@ const ask = api.newest(async () => {
   drawAll();
   tell(performance.now() - started);
   clearTimeout(idle);
-  // The whole follows the sample.
+  // Count all rows after the sample.
   if (head.part > 1) idle = setTimeout(() => {
     if (drag) return;
     part = 1;
@@ -145,7 +145,7 @@ const ask = api.newest(async () => {
   page.remember();
 });
 
-/** Count after a move: of many rows a sample, which the whole follows when nothing moves any more. */
+/** Count after a move: first a sample if there are many rows, then all rows when nothing moves. */
 function sampled() {
   clearTimeout(idle);
   part = null;
@@ -158,7 +158,7 @@ function tell(ms) {
   $("plot-state").textContent = `${api.number(head.rows)} rows;${sample} counted and drawn in ${ms.toFixed(0)} ms; ${brushed}.`;
 }
 
-/** While a brush is held: counts of the other charts for each of its bins. */
+/** While a brush is held, load the counts of the other charts for each of its bins. */
 async function hold(chart) {
   cube = null;
   const names = axes(), axis = names.indexOf(sqlOf(chart.axes[0])), others = charts.filter((one) => one !== chart);
@@ -184,7 +184,7 @@ async function hold(chart) {
   }) };
 }
 
-/** The other charts under the held brush, from the cube: no question is asked. */
+/** Update the other charts from these counts without a request to the server. */
 function moveHeld() {
   const [[lo, hi]] = cube.chart.brush, [[low, high]] = cube.chart.spans;
   const bin = (x) => Math.min(CUBE_BINS, Math.max(0, Math.round(((x - low) / (high - low)) * CUBE_BINS)));
@@ -194,7 +194,7 @@ function moveHeld() {
     for (let i = 0; i < inner; i++) out[i] = sums[b * inner + i] - sums[a * inner + i];
     one.counts = out;
     one.part = cube.part;
-    // The cube does not hold these: they follow with the next count.
+    // These counts have no points and no outside rows; the next request brings them.
     one.outside = 0;
     one.places = null;
   }
@@ -224,7 +224,7 @@ function figure(chart) {
     built = false;
     show();
   } }, chart.axes.length > 1 ? `log ${"xy"[k]}` : "log"));
-  const points = chart.axes.length > 1 ? api.h("button", { "aria-pressed": String(Boolean(chart.points)), title: "The rows themselves, as points", onclick: (event) => {
+  const points = chart.axes.length > 1 ? api.h("button", { "aria-pressed": String(Boolean(chart.points)), title: "Rows as points", onclick: (event) => {
     chart.points = !chart.points;
     event.target.setAttribute("aria-pressed", String(chart.points));
     ask();
@@ -248,13 +248,13 @@ function figure(chart) {
   return api.h("figure", { class: chart.axes.length > 1 ? "map" : null }, caption, canvas, range, data);
 }
 
-/** What no bin holds: rows beyond the ends of the axes, which leave out the ends of a distribution, and rows without a value. */
+/** Rows in no bin: beyond the ends of the axes, which omit the tails of a distribution, or without a value. */
 function leftOut(chart) {
   const ends = chart.outside ? `${api.number(chart.outside * chart.part)} beyond the ends of the ${chart.axes.length > 1 ? "axes" : "axis"}` : "";
   return [ends, ...chart.axes.map((axis, k) => (chart.missing[k] ? `${api.number(chart.missing[k] * head.part)} of all rows without ${facts(axis.expression).name}` : ""))];
 }
 
-/** A table that is open says what its chart does; while a brush moves it waits until that is still. */
+/** Update the table of a chart if it is open, but not while a brush moves. */
 function tabulate(chart) {
   if (chart.data.hidden) return;
   clearTimeout(chart.waiting);
@@ -272,7 +272,7 @@ function asTable(chart) {
   const rows = [];
   chart.counts.forEach((count, k) => count && rows.push([at(x, Math.floor(k / size)), at(y, k % size), count * scale]));
   return api.table([{ name: label(chart.axes[0]) }, { name: label(chart.axes[1]) }, { name: "number" }], rows.sort((a, b) => b[2] - a[2]).slice(0, MOST_ROWS),
-    api.cut(Math.min(rows.length, MOST_ROWS), rows.length, "bins that hold rows, the fullest first"));
+    api.cut(Math.min(rows.length, MOST_ROWS), rows.length, "bins with rows, the fullest first"));
 }
 
 function drawAll() {
@@ -285,7 +285,7 @@ function draw(chart) {
   const sum = chart.counts.reduce((a, b) => a + b, 0), scale = chart.part;
   const error = scale > 1 ? ` ± ${api.number(Math.round(Math.sqrt(sum) * scale))}` : "";
   const points = chart.points && chart.places ? `${api.number(chart.places.length / 2)} points${chart.placesPart * scale > 1 ? `, a sample: 1 row in ${chart.placesPart * scale}` : ""}` : "";
-  const most = chart.axes.length > 1 && !points ? `colours from none to ${api.number(chart.counts.reduce((a, b) => Math.max(a, b), 0) * scale)} a bin, logarithmic` : "";
+  const most = chart.axes.length > 1 && !points ? `colours from 0 to ${api.number(chart.counts.reduce((a, b) => Math.max(a, b), 0) * scale)} per bin, logarithmic` : "";
   chart.range.textContent = [`${api.number(sum * scale)}${error} rows`, ...leftOut(chart), most, points, shown].filter(Boolean).join("; ");
   tabulate(chart);
   chart.canvas.setAttribute("aria-label", `${label(chart.axes[0])}${chart.axes[1] ? ` and ${label(chart.axes[1])}` : ""}: ${chart.range.textContent}`);
@@ -326,7 +326,7 @@ function release() {
   sampled();
 }
 
-/** A brush by keys: arrows move it by a fiftieth of the axis, with Shift they widen or narrow it. */
+/** Move a brush by arrow keys in steps of 1/50 of the axis; with Shift change its width. */
 function nudge(chart, event) {
   const step = { ArrowRight: [0, 1], ArrowLeft: [0, -1], ArrowUp: [1, 1], ArrowDown: [1, -1] }[event.key];
   if (event.key === "Escape") chart.brush = null;

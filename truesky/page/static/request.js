@@ -1,4 +1,4 @@
-// A request file for what is looked at: its field, and the exposures that see it.
+// A request file for the visible field and the exposures that cover it.
 
 import * as api from "/static/api.js";
 import { imagesAt, load, within } from "/static/footprints.js";
@@ -8,21 +8,21 @@ const MOST = 40;
 const FACTS = ["exposure_id", "channel", "camera", "band", "image_type", "ra", "dec", "position_angle", "mjd", "exposure_time_s", "grism_angle"];
 
 /**
- * The text of a request.  place: [ra, dec] deg;  radius: deg, of the field;
- * regions: of detectors that see it, each with request, exposure_id and detector
+ * The text of a request for a field at `place` = [ra, dec] deg with a `radius` in deg.
+ * `regions` are the detectors that cover it, each with request, exposure_id and detector.
  */
 async function requestOf(place, radius, regions) {
-  // Every request counts its exposures for itself.
+  // Exposure numbers are unique only within a request.
   const detectors = new Map(), name = (one) => `${api.of(one)}${one.exposure_id}`;
   for (const one of regions) detectors.set(name(one), [...(detectors.get(name(one)) ?? []), one]);
   const asked = [...detectors.values()].map((own) => own[0]).sort((a, b) => api.of(a).localeCompare(api.of(b)) || a.exposure_id - b.exposure_id);
   const rows = await exposures(asked.slice(0, MOST)), science = rows.filter((row) => row.image_type === "science");
-  const lines = [`# The field at RA ${place[0].toFixed(6)}, Dec ${place[1].toFixed(6)} deg, as it is seen on the page of ${api.lake.lake.replace(/[^\x20-\x7e]/g, "?")}.`,
-    'name = "field"', "seed = 1   # of the universe: that of the lake's own request draws the same sources", "",
+  const lines = [`# Field at RA ${place[0].toFixed(6)}, Dec ${place[1].toFixed(6)} deg, from the page of ${api.lake.lake.replace(/[^\x20-\x7e]/g, "?")}.`,
+    'name = "field"', "seed = 1   # seed of the universe; the seed of the lake's request gives the same sources", "",
     "[area]", `cone = { ra = ${place[0].toFixed(7)}, dec = ${place[1].toFixed(7)}, radius = ${decimal(Math.min(180, Math.max(1e-3, radius)))} }`];
-  if (asked.length > MOST) lines.push("", `# Of ${asked.length} exposures that see it the first ${MOST}.`);
-  if (science.length < rows.length) lines.push("", `# ${rows.length - science.length} of its exposures are of calibrations: an [[observation]] asks for these.`);
-  // What several requests have planned alike is asked for once.
+  if (asked.length > MOST) lines.push("", `# The first ${MOST} of ${asked.length} exposures that cover the field.`);
+  if (science.length < rows.length) lines.push("", `# ${rows.length - science.length} of its exposures are calibrations, which require an [[observation]].`);
+  // If several requests have planned the same exposure, include it once.
   const pointings = science.map((row) => pointing(row, detectors.get(name(row)).map((one) => one.detector).sort()).join("\n"));
   for (const text of new Set(pointings)) lines.push("", text);
   return `${lines.join("\n")}\n`;
@@ -37,17 +37,17 @@ async function copied(make) {
   }
 }
 
-/** For a field of a radius, deg, about a place. */
+/** Request for a field with a radius (deg) around a position. */
 export const copyFieldRequest = (place, radius) => copied(() => requestOf(place, radius, within(place, radius)));
 
-/** For the exposure of an image, of its detector and the field that this sees. */
+/** Request for the exposure of an image: its detector and the field that the detector covers. */
 export const copyImageRequest = (image) => copied(() => {
   const { nx, ny, plate, row } = image, place = plate.sky((nx - 1) / 2, (ny - 1) / 2);
   const own = imagesAt(place).filter((one) => one.request === image.request && one.exposure_id === row.exposure_id && one.detector === row.detector);
   return requestOf(place, 0.5 * Math.hypot(nx, ny) * scaleOf(image), own);
 });
 
-/** Rows of the table of exposures as objects, each with its request; none where the lake has no such table. */
+/** Rows of the table of exposures as objects, each with its request; empty if the lake has no such table. */
 async function exposures(asked) {
   const tables = api.lake.tables.filter((table) => table.name.split(".").pop() === "exposures"), found = [];
   for (const request of new Set(asked.map((one) => one.request))) {
@@ -68,5 +68,5 @@ function pointing(row, detectors) {
   return [...lines, `detectors = [${detectors.map((name) => JSON.stringify(name)).join(", ")}]`];
 }
 
-/** A number as TOML writes one that is not whole. */
+/** Format a non-integer number for TOML. */
 const decimal = (value) => (Number.isInteger(value) ? value.toFixed(1) : String(value));

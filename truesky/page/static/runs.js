@@ -1,4 +1,4 @@
-// What was done for the lake: jobs beside their forecasts, tasks, failures, the mission, and where each image is from.
+// Runs of the lake: jobs with forecasts, tasks, failures, changed mission parameters, and the provenance of each image.
 
 import * as api from "/static/api.js";
 
@@ -9,7 +9,7 @@ export async function show() {
   else parts.push(jobs(found.jobs));
   for (const task of found.tasks) {
     parts.push(api.h("h2", {}, `${api.of(task)}Images`), api.h("p", {}, api.h("progress", { max: task.all, value: task.done, "aria-label": "detectors done" }),
-      ` ${task.done} of ${task.all} detectors done`, task.done < task.all ? `, ${api.number(task.seconds_left, 3)} s of one core to come` : ""));
+      ` ${task.done} of ${task.all} detectors done`, task.done < task.all ? `, ${api.number(task.seconds_left, 3)} s of CPU time remaining` : ""));
   }
   const lost = Object.entries(api.lake.damaged);
   if (lost.length) parts.push(api.h("h2", {}, "Tables that cannot be read"), api.table([{ name: "table", text: 1 }, { name: "why", text: 1 }], lost));
@@ -18,7 +18,7 @@ export async function show() {
     (f) => [f.part, f.error, f.attempt, f.run]) : api.h("p", { class: "quiet" }, "None."));
   parts.push(api.h("h2", {}, "Mission values that differ from the default"), found.mission.length ? api.requested(found.mission,
     [{ name: "name", text: 1 }, { name: "value" }, { name: "default" }, { name: "unit", text: 1 }],
-    (m) => [m.name, m.value, m.usual, m.unit]) : api.h("p", { class: "quiet" }, "None: all are as truesky has them."));
+    (m) => [m.name, m.value, m.usual, m.unit]) : api.h("p", { class: "quiet" }, "None: all have their default values."));
   parts.push(api.h("h2", {}, "Where images are from"));
   for (const image of images) {
     const details = api.h("details", { class: "tree" }, api.h("summary", {}, `${api.of(image)}${image.path.split("/").pop()}`));

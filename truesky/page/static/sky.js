@@ -1,4 +1,4 @@
-// The sky: densities in HEALPix cells, sources of small fields, footprints of what is planned and observed.
+// The sky: densities in HEALPix cells, sources of small fields, footprints of planned and observed exposures.
 
 import * as api from "/static/api.js";
 import { Cells } from "/static/cells.js";
@@ -12,9 +12,9 @@ import { copyFieldRequest } from "/static/request.js";
 import { circleAround, frame, placeOf, project, unproject } from "/static/sphere.js";
 
 const $ = (id) => document.getElementById(id);
-// Below this height of the view, deg, sources are shown one by one.
+// Single sources are shown if the height of the view (deg) is smaller than this.
 const SINGLE = 0.35, ROWS_A_CELL = 50, MOST_ROWS = 500;
-// Who comes nearer than this, deg, sees the pixels of an image where there is one.
+// The view changes to an image, if there is one, at a height (deg) smaller than this.
 const PIXELS = 0.01;
 const view = { ra: 0, dec: 0, height: 180 };
 let page, density, overlay, cells = null, dots = null, isByKeys = false, isMoved = false, shownTable = "", where = "", value = "", held = "";
@@ -61,7 +61,7 @@ export function start(given) {
   canvas.addEventListener("dblclick", (event) => openAt(placeAt(event)));
 }
 
-/** The graphics processor's part, made while the first answers are under way; false where there is none. */
+/** Set up WebGL while the first responses are loading; return false if it is not available. */
 function prepare() {
   if (density !== undefined) return Boolean(density);
   const gl = $("sky-canvas").getContext("webgl2", { antialias: true });
@@ -80,7 +80,7 @@ async function footprints() {
   redraw();
 }
 
-/** Bands of planned exposures, whose depth can be shown. */
+/** Add the bands of planned exposures, whose depth can be shown. */
 async function depths() {
   if ($("sky-table").querySelector("optgroup")) return;
   const group = $("sky-table").appendChild(api.h("optgroup", { label: "planned exposures", hidden: true }));
@@ -91,7 +91,7 @@ async function depths() {
   $("sky-table").value = shownTable;
 }
 
-/** Other rows: of another table all are shown, under another condition the view stays. */
+/** Show other rows: the whole of another table, or the same view with another condition. */
 function again(table, condition) {
   const isOther = table !== shownTable;
   shownTable = table;
@@ -103,7 +103,7 @@ function again(table, condition) {
 
 export async function show() {
   if (density === null) return;
-  // The first question is under way while the shaders are compiled.
+  // The first request runs while the shaders are compiled.
   const loading = cells ? null : load(view.height >= 180);
   if (!prepare()) return;
   if (cells) {
@@ -113,9 +113,9 @@ export async function show() {
   await loading;
 }
 
-/** What lies on the sky is asked for when there is a sky: the first picture waits for nothing else. */
+/** Load footprints and bands after the first map, so that they do not delay it. */
 function beside() {
-  // Images lie on the tasks' footprints, whichever are shown.
+  // Images are found by the footprints of tasks, whatever footprints are shown.
   loadFootprints("tasks").catch(() => {});
   footprints();
   depths();
@@ -130,7 +130,7 @@ function addressOf(words) {
 
 const use = (buffer) => (cells = density.filled(buffer, isCoverage() ? "depth" : value ? "mean" : "number"));
 
-/** First the files' own cells, which cost nothing; then what suits the view. */
+/** Show the cells of the files first, which cost no query, then cells that suit the view. */
 async function load(all) {
   if (!shownTable) return;
   isMoved = false;
@@ -152,19 +152,19 @@ async function load(all) {
     beside();
   }
   await finer();
-  // The cells of files are wider than what is in them.
+  // Adapt the view again, because the cells of files are larger than the area of their rows.
   if (all && !isMoved) whole(true);
 }
 
 function order() {
   const size = (view.height / Math.max(1, $("sky-canvas").clientHeight)) * 5;
   if (isCoverage()) return Math.max(3, Math.min(13, Math.round(Math.log2(58.6 / size))));
-  // Cells of some pixels, and of some rows: smaller ones would show nothing but their Poisson noise.
+  // Choose cells of several pixels and several rows; smaller cells would only show Poisson noise.
   const filled = 0.5 * Math.log2((41253 * (cells?.rows ?? 1e4)) / (12 * ROWS_A_CELL));
   return Math.max(3, Math.min(14, Math.round(Math.log2(58.6 / size)), Math.floor(filled)));
 }
 
-/** A circle about the view, with something beside it: 1.5 times as wide. */
+/** A circle around the view, 1.5 times as wide. */
 const near = () => ({ ra: view.ra, dec: view.dec, radius: Math.min(180, 1.5 * radius()) });
 
 const finer = api.newest(async () => {
@@ -182,7 +182,7 @@ const finer = api.newest(async () => {
   redraw();
 });
 
-/** Show everything that the table has. */
+/** Show the whole area of the table. */
 function whole(load_) {
   if (!cells?.head.cells) return;
   const { ra, dec, radius: far } = circleAround(cells.corners);
@@ -207,11 +207,11 @@ export function redraw() {
 
 function legend() {
   if (isCoverage()) return `${shownTable.slice(12) || "all bands"}: planned exposures`;
-  const missing = cells?.head.missing ? `, ${api.number(cells.head.missing)} rows without one left out` : "";
+  const missing = cells?.head.missing ? `, ${api.number(cells.head.missing)} rows without a value omitted` : "";
   return value ? `${shownTable}: mean of ${value}${missing}` : `${shownTable}: number / deg²`;
 }
 
-/** What is left out: colours end at the 1 % of cells that are emptiest, the 0.5 % that are fullest; of very many sources the brightest are shown. */
+/** Describe what is omitted: cells below the 1 % or above the 99.5 % quantile are beyond the colour scale; only the brightest of many sources are shown. */
 function caption() {
   if (dots) {
     const here = dots.ra.length, most = dots.most ?? 20000, all = dots.total ?? (here < most ? here : null);
@@ -219,7 +219,7 @@ function caption() {
     return `${dots.by ? `the ${firstOf(dots)} ${api.number(here)} by ${dots.by}` : `the first ${api.number(here)}`} of ${all === null ? "more" : api.number(all)} sources`;
   }
   const outside = isCoverage() ? 0 : cells.beyond;
-  return outside ? `beyond the ends of the colours: ${api.number(outside)} of ${api.number(cells.density.length)} cells` : "";
+  return outside ? `beyond the colour scale: ${api.number(outside)} of ${api.number(cells.density.length)} cells` : "";
 }
 
 function drawOver(turn) {
@@ -258,7 +258,7 @@ function moved(event) {
   pan((event.movementX / $("sky-canvas").clientHeight) * view.height, (event.movementY / $("sky-canvas").clientHeight) * view.height);
 }
 
-/** Who has moved while a table was on its way is not brought back to the whole of it. */
+/** Remember that the user has moved, so that a table that arrives later does not reset the view. */
 function went() {
   isMoved = true;
   redraw();
@@ -281,7 +281,7 @@ function zoomed(event) {
 function zoom(by, about, event) {
   view.height = Math.min(180, Math.max(2e-4, view.height * by));
   if (about && event) {
-    // The place under the cursor stays there.
+    // Keep the position under the cursor.
     const now = placeAt(event);
     if (now) {
       view.ra = (view.ra + about[0] - now[0] + 720) % 360;
@@ -309,11 +309,11 @@ async function pinAt(place) {
   }
 }
 
-/** The image of a footprint, at that place; true where there is one. */
+/** Open the image of a footprint at a position; return true if there is one. */
 function openAt(place, isSaid = false, unit = null) {
   const inside = place ? imagesAt(place) : [];
   if (!inside.length) {
-    if (isSaid) api.say("No image holds the centre of the view.");
+    if (isSaid) api.say("No image contains the centre of the view.");
     return false;
   }
   goTo(inside[0].images[0], place, unit);
@@ -321,7 +321,7 @@ function openAt(place, isSaid = false, unit = null) {
   return true;
 }
 
-/** The place of an image, as large as it is there; `unit`: pixels of the screen a degree. */
+/** Show a position of an image with the same scale; `unit` is the number of screen pixels per degree. */
 export function goToPlace([ra, dec], unit) {
   Object.assign(view, { ra, dec, height: Math.min(180, Math.max(2 * PIXELS, $("image-canvas").clientHeight / unit)) });
   page.show("sky").then(finer);
@@ -329,7 +329,7 @@ export function goToPlace([ra, dec], unit) {
 
 const radius = () => 0.5 * Math.hypot(view.height, (view.height * $("sky-canvas").clientWidth) / Math.max(1, $("sky-canvas").clientHeight));
 
-/** Rows of what is seen. */
+/** Open the query editor with a query for the rows in view. */
 function query() {
   const near = `separation(ra, dec, ${view.ra.toFixed(7)}, ${view.dec.toFixed(7)}) <= ${Math.min(180, radius()).toPrecision(6)}`;
   const tasks = api.lake.tables.filter((table) => table.name.split(".").pop() === "tasks").map((table) => `SELECT * FROM ${api.sqlName(table.name)}`);
@@ -339,12 +339,12 @@ function query() {
 
 function go() {
   const place = placeOf($("sky-go").value);
-  if (!place) return api.say("Go to: wanted RA and Dec, in degrees or as 03:32:28.1 -27:48:29", true);
+  if (!place) return api.say("Go to: enter RA and Dec in degrees or as 03:32:28.1 -27:48:29", true);
   Object.assign(view, { ra: place[0], dec: place[1], height: Math.min(view.height, 0.3) });
   went();
 }
 
-/** The same numbers, as long as the table is open. */
+/** Show the numbers of the map as a table, if it is open. */
 function asTable() {
   const data = $("sky-data");
   if (data.hidden || !cells) return;
@@ -368,7 +368,7 @@ export function key(event) {
   else if (event.key === "-") zoom(1 / 0.7);
   else if (event.key === "0") whole(true);
   else if (event.key === "o" || event.key === "O") openAt([view.ra, view.dec], true);
-  else if (event.key === "Enter" && isHere) view.height < SINGLE ? pinAt([view.ra, view.dec]) : api.say(`Sources can be pinned where the view is below ${SINGLE} deg.`);
+  else if (event.key === "Enter" && isHere) view.height < SINGLE ? pinAt([view.ra, view.dec]) : api.say(`Sources can be pinned if the height of the view is below ${SINGLE} deg.`);
   else return;
   event.preventDefault();
   $("sky-place").textContent = api.place(view.ra, view.dec);

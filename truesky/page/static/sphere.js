@@ -1,8 +1,8 @@
-// Places on the sphere: the equal-area projection of the map, and the tangent planes of images.
+// Positions on the sphere: the equal-area projection of the map, and the tangent planes of images.
 
 export const RAD = Math.PI / 180;
 
-/** Turns unit vectors so that a centre comes to [0, 0, 1], east to the left of the map: rows east, north, out. */
+/** Matrix that rotates unit vectors so that a centre becomes [0, 0, 1]; its rows point east, north and outwards. */
 export function frame(ra, dec) {
   const a = ra * RAD, d = dec * RAD;
   return [-Math.sin(a), Math.cos(a), 0, -Math.sin(d) * Math.cos(a), -Math.sin(d) * Math.sin(a), Math.cos(d),
@@ -14,7 +14,7 @@ export function vector(ra, dec) {
   return [Math.cos(d) * Math.cos(a), Math.cos(d) * Math.sin(a), Math.sin(d)];
 }
 
-/** Map coordinates, deg near the centre, of a place; null behind the sphere's edge. */
+/** Map coordinates (deg near the centre) of a position; null beyond the edge of the sphere. */
 export function project(turn, ra, dec) {
   const v = vector(ra, dec), x = turn[0] * v[0] + turn[1] * v[1] + turn[2] * v[2];
   const y = turn[3] * v[0] + turn[4] * v[1] + turn[5] * v[2], z = turn[6] * v[0] + turn[7] * v[1] + turn[8] * v[2];
@@ -23,7 +23,7 @@ export function project(turn, ra, dec) {
   return [-x * scale, y * scale];
 }
 
-/** The place of map coordinates; null outside the sky. */
+/** Position of map coordinates; null outside the sky. */
 export function unproject(turn, mapX, mapY) {
   const x = -mapX * RAD, y = mapY * RAD, r2 = x * x + y * y;
   if (r2 > 4) return null;
@@ -32,7 +32,7 @@ export function unproject(turn, mapX, mapY) {
   return [((Math.atan2(v[1], v[0]) / RAD) + 360) % 360, Math.asin(Math.max(-1, Math.min(1, v[2]))) / RAD];
 }
 
-/** RA, Dec deg of a text, in degrees or sexagesimal; null of any other. */
+/** RA and Dec (deg) of a text in degrees or sexagesimal; null for any other text. */
 export function placeOf(text) {
   const numbers = text.match(/[-+−]?\d+(\.\d+)?/g)?.map((t) => Number(t.replace("−", "-"))) ?? [];
   if (numbers.length === 6 && /:/.test(text)) {
@@ -42,7 +42,7 @@ export function placeOf(text) {
   return numbers.length === 2 && Math.abs(numbers[1]) <= 90 ? [((numbers[0] % 360) + 360) % 360, numbers[1]] : null;
 }
 
-/** The circle, deg, about the middle of places [ra, dec, ra, dec ...] that holds them all. */
+/** The circle (deg) around the mean of positions [ra, dec, ra, dec ...] that contains all these positions. */
 export function circleAround(corners) {
   const places = [];
   for (let k = 0; k < corners.length; k += 2) places.push(vector(corners[k], corners[k + 1]));
@@ -51,7 +51,7 @@ export function circleAround(corners) {
   return { ra: (Math.atan2(mean[1], mean[0]) / RAD + 360) % 360, dec: Math.asin(mean[2]) / RAD, radius: Math.acos(Math.max(-1, least)) / RAD };
 }
 
-/** Pixel <-> sky of an image, from the nodes of its grid. */
+/** Conversion between pixels and sky of an image, from the nodes of its grid. */
 export class Plate {
   constructor(grid) {
     Object.assign(this, grid);
@@ -60,7 +60,7 @@ export class Plate {
     this.turn = frame(grid.ra, grid.dec);
   }
 
-  /** Tangent-plane coordinates, deg, of a pixel; beyond the edge continued. */
+  /** Tangent-plane coordinates (deg) of a pixel, extrapolated beyond the edge. */
   plane(x, y) {
     const u = (x - this.x[0]) / this.step[0], v = (y - this.y[0]) / this.step[1];
     const i = Math.max(0, Math.min(this.n - 2, Math.floor(u))), j = Math.max(0, Math.min(this.n - 2, Math.floor(v)));

@@ -1,10 +1,10 @@
-// A query, with the names it can use beside it; its result as a table, as a plot, as a file.
+// A query editor with a list of names, and the result as table, plot or file.
 
 import * as api from "/static/api.js";
 import { usePlot } from "/static/plots.js";
 
 const $ = (id) => document.getElementById(id);
-// Bytes of a download that are kept here before it is known to be large.
+// Bytes of a download that are collected before the browser takes over a large one.
 const MOST_HELD = 32e6;
 let page, ran = null, runs = 0;
 
@@ -47,7 +47,7 @@ function insert(name) {
 }
 
 async function run() {
-  // Of queries that overlap the last one is shown, whichever is answered first.
+  // If queries overlap, show the last one, whichever is answered first.
   const mine = ++runs;
   $("sql-state").textContent = "…";
   try {
@@ -61,14 +61,14 @@ async function run() {
     return;
   }
   $("sql-state").className = "quiet";
-  const more = ran.more ? `the first ${ran.rows.length} rows; a download has all` : `${ran.rows.length} rows`;
+  const more = ran.more ? `the first ${ran.rows.length} rows; a download contains all` : `${ran.rows.length} rows`;
   $("sql-state").textContent = `${more}, ${(ran.seconds * 1000).toFixed(0)} ms`;
   const columns = ran.columns.map((c) => ({ ...c, text: c.type === "string" }));
   $("sql-result").replaceChildren(api.table(columns, ran.rows.map((row) => row.map((value) => Array.isArray(value) ? `[${value.length} values]` : value))));
   page.remember();
 }
 
-/** The first two columns of numbers, one against the other. */
+/** Plot the first two columns of numbers against each other. */
 async function plot() {
   if (!ran) await run();
   const numbers = (ran?.columns ?? []).filter((c) => /int|float|double/.test(c.type) && c.name !== "id").map((c) => `"${c.name}"`);
@@ -78,7 +78,7 @@ async function plot() {
   page.show("plots");
 }
 
-/** A refusal is said here; a small answer becomes a file as it is, of a large one the browser takes what comes. */
+/** Save a small response as a file and show errors; let the browser download a large one. */
 async function download(format) {
   const address = api.downloadAddress(format, $("sql-text").value), stop = new AbortController();
   $("sql-state").className = "quiet";

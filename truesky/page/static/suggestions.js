@@ -1,15 +1,15 @@
-// What there is to plot: sources of rows, their columns, and charts to begin with.
+// Suggestions for plots: tables and joins, their columns, and first charts.
 
 import * as api from "/static/api.js";
 
-/** Tables, and those that belong together joined. */
+/** Tables, and joins of related tables. */
 export function sources() {
   const names = api.lake.tables.map((table) => table.name);
   const joined = [["galaxies", "galaxy_fluxes"], ["stars", "star_fluxes"]].filter((pair) => pair.every((name) => names.includes(name)));
   return [...names.map(api.sqlName), ...joined.map(([a, b]) => `${a} JOIN ${b} USING (id)`)];
 }
 
-/** Expressions of the axes of each chart to begin with. */
+/** Expressions of the axes of the first charts. */
 export function suggested(rows) {
   if (rows.startsWith("galaxies")) {
     const flux = rows.includes("galaxy_fluxes") ? columnsOf(rows).find((c) => c.name.startsWith("f_nu_")) : null;
@@ -20,7 +20,7 @@ export function suggested(rows) {
   return [...numbers.slice(0, 4).map((name) => [name]), ...(numbers.length > 1 ? [numbers.slice(0, 2)] : [])];
 }
 
-/** Columns of all the tables that a source of rows names. */
+/** Columns of all tables in a FROM clause. */
 export function columnsOf(rows) {
   return api.lake.tables.filter((table) => new RegExp(`(^|[^\\w.])${table.name}($|[^\\w])`).test(rows.replaceAll('"', ""))).flatMap((table) => table.columns);
 }

@@ -1,17 +1,17 @@
-// Tiles of images, kept on the graphics processor, the oldest let go.
+// Cache of image tiles as WebGL textures; the tile that was not used for longest is deleted first.
 
 import * as api from "/static/api.js";
 
-// 1 MB each.
+// Largest number of tiles, each 1 MB.
 const MOST = 120;
 
 export class Tiles {
-  /** redraw: called when one has come. */
+  /** redraw: called when a tile has arrived. */
   constructor(gl, redraw) {
     Object.assign(this, { gl, redraw, kept: new Map() });
   }
 
-  /** A tile, whose texture may still be under way. */
+  /** A tile, whose texture may still be loading. */
   get(image, level, row, column, mended) {
     const name = [image.number, mended, level, row, column].join("/"), known = this.kept.get(name);
     if (known) {
@@ -24,7 +24,7 @@ export class Tiles {
     const made = { width, height, texture: null, data: null };
     this.kept.set(name, made);
     api.bytes(`tile/${image.number}/${level}/${row}/${column}${mended ? "?mended=1" : ""}`).then((buffer) => {
-      // One that has been let go meanwhile would have a texture that nobody deletes.
+      // Ignore a tile that was deleted while it was loading, because nothing would delete its texture.
       if (this.kept.get(name) === made) this.fill(made, buffer);
     }, (error) => {
       if (this.kept.get(name) === made) this.kept.delete(name);
@@ -49,7 +49,7 @@ export class Tiles {
     this.redraw();
   }
 
-  /** The value of a pixel, of the finest level that is here; null where none is. */
+  /** Value of a pixel in the finest loaded level; null if no level is loaded. */
   value(image, x, y, mended) {
     for (let level = 0; level < image.levels.length; level++) {
       const u = Math.floor(x / 2 ** level), v = Math.floor(y / 2 ** level);

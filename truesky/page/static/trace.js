@@ -1,4 +1,4 @@
-// A source through a grism: where its orders lie on a detector, and the pixels along one, straightened.
+// A source through a grism: the positions of its orders on a detector, and the straightened pixels of an order.
 
 import * as api from "/static/api.js";
 import { ink, stretched } from "/static/colour.js";
@@ -6,15 +6,15 @@ import { ink, stretched } from "/static/colour.js";
 const PLACES = 48, COLOUR = "#9be0a8";
 const said = { line: (name) => name, show: null };
 
-/** How lines are written, and what shows a pixel of an image: (number, x, y) => ... */
+/** Set functions of other modules: names of lines, and the display of an image (number, x, y). */
 export const use = (given) => Object.assign(said, given);
 
 const poly = (c, t) => c.reduceRight((sum, a) => sum * t + a, 0);
 const nm = (angstrom) => String(+(angstrom / 10).toFixed(1));
-/** t of a wavelength, which is linear in it. */
+/** Path parameter t of a wavelength; it is linear in the wavelength. */
 const at = (trace, wavelength) => (wavelength - trace.wavelength_first) / (trace.wavelength_last - trace.wavelength_first);
 
-/** The orders of a source on the image that is shown, its lines beside the first; `place`: pixels -> screen. */
+/** Draw the orders of a source on the visible image, with lines along the first order; `place`: pixels -> screen. */
 export function drawTraces(c, source, image, place) {
   const { request, row: { exposure_id: exposure, detector } } = image;
   c.font = "12px DejaVu Sans, sans-serif";
@@ -24,7 +24,7 @@ export function drawTraces(c, source, image, place) {
     const on = (t) => place(poly(trace.trace_x, t), poly(trace.trace_y, t));
     c.lineWidth = trace.order === 1 ? 1.5 : 1;
     c.setLineDash(trace.order === 1 ? [] : [4, 4]);
-    // Two lines, above and below, so that the spectrum between them is seen.
+    // Draw a line above and a line below, so that the spectrum between them stays visible.
     for (const side of [-7, 7]) {
       c.beginPath();
       for (let k = 0; k <= PLACES; k++) {
@@ -45,20 +45,20 @@ export function drawTraces(c, source, image, place) {
   }
 }
 
-/** In the panel of a source: each first order as pixels, and a table of all orders and of their lines. */
+/** Fill the panel of a source: pixels of each first order, and a table of all orders and their lines. */
 export async function dispersed(panel, source, isStill, drawings) {
-  if (!source.spectra.length) return panel.append(api.h("p", { class: "quiet" }, "No image through a grism holds it."));
+  if (!source.spectra.length) return panel.append(api.h("p", { class: "quiet" }, "No grism image contains it."));
   for (const trace of source.spectra.filter((one) => one.order === 1 && one.images.science !== undefined)) {
     const number = trace.images.science, middle = [poly(trace.trace_x, 0.5), poly(trace.trace_y, 0.5)];
     const canvas = api.h("canvas", { class: "strip", role: "img" }), scale = api.h("canvas", { class: "scale", "aria-hidden": "true" });
     const name = `${api.of(trace)}${trace.channel} ${trace.band}, exposure ${trace.exposure_id}, ${trace.detector}`;
-    const overlap = trace.contaminants.length ? `, ${api.number(100 * trace.overlapped, 3)} % of it beside ${trace.contaminants.length} other sources` : ", beside no other source";
+    const overlap = trace.contaminants.length ? `, ${api.number(100 * trace.overlapped, 3)} % of it overlaps ${trace.contaminants.length} other sources` : ", no overlap with other sources";
     panel.append(api.h("figure", {}, api.h("figcaption", {}, api.h("span", { class: "grow" }, name),
       api.h("button", { onclick: () => said.show?.(number, ...middle) }, "Show in the image")), canvas, scale,
       api.h("div", { class: "range" }, `${api.number(trace.expected, 4)} electrons expected, ${api.number(trace.drawn, 4)} on the detector${overlap}`)));
     const buffer = await api.bytes(`trace/${number}/${source.id}?order=1`), [head, from] = api.headed(buffer);
     if (!isStill()) return;
-    // Short wavelengths at the left, whichever way the grism stands.
+    // Short wavelengths are on the left for every orientation of the grism.
     Object.assign(canvas, { width: head.columns, height: head.rows });
     canvas.getContext("2d").putImageData(stretched(new Float32Array(buffer, from), head.columns, head.rows), 0, 0);
     drawings.push(() => drawScale(scale, trace));
@@ -68,7 +68,7 @@ export async function dispersed(panel, source, isStill, drawings) {
   panel.append(api.h("details", {}, api.h("summary", {}, `${source.spectra.length} orders as a table`), orders(source.spectra), lines(source.spectra)));
 }
 
-/** Wavelengths below the pixels, lines among them. */
+/** Draw the scale of wavelengths below the pixels, with lines. */
 function drawScale(canvas, trace) {
   const [width, height, ratio] = api.fit(canvas), c = canvas.getContext("2d");
   c.setTransform(ratio, 0, 0, ratio, 0, 0);

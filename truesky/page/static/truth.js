@@ -1,16 +1,16 @@
-// True sources on an image: asked for once an image, marked, and told of under the cursor.
+// True sources on an image: loaded once per image, marked, and described under the cursor.
 
 import * as api from "/static/api.js";
 import { colourOf, radiusOf } from "/static/marks.js";
 
 const $ = (id) => document.getElementById(id);
 const TOLD = ["z_obs", "mag_r01", "log_stellar_mass", "disk_half_light_radius", "mag_h", "teff"];
-// Pixels of the screen that what is told of a source may take.
+// Largest height of the box that describes a source, in pixels of the screen.
 const TALLEST = 150;
 const truths = new Map();
 let hovered = null;
 
-/** The sources of an image; while they are under way null, and `come` is called when they are there. */
+/** The sources of an image; null while they are loading, then `come` is called. */
 export function sourcesOf(image, come) {
   if (!truths.has(image.number)) {
     truths.set(image.number, null);
@@ -18,7 +18,7 @@ export function sourcesOf(image, come) {
       truths.set(image.number, found);
       come();
     }, (error) => {
-      // Whoever asks again may be answered.
+      // Allow another attempt after an error.
       truths.delete(image.number);
       api.say(error.message, true);
     });
@@ -26,13 +26,13 @@ export function sourcesOf(image, come) {
   return truths.get(image.number);
 }
 
-/** The same, waited for. */
+/** The sources of an image as a promise. */
 export async function asked(image) {
   if (!truths.get(image.number)) truths.set(image.number, await api.get(`truth/${image.number}`));
   return truths.get(image.number);
 }
 
-/** How many of all are marked: of very many the brightest. */
+/** Number of marked sources; only the brightest are marked if there are many. */
 export const caption = (truth) => truth.id.length < truth.total
   ? `true sources: the brightest ${api.number(truth.id.length)} of ${api.number(truth.total)}` : `${api.number(truth.id.length)} true sources`;
 
@@ -48,7 +48,7 @@ export function drawSources(c, truth, at, [width, height]) {
   });
 }
 
-/** What is true of the source at a pixel, at a place [x, y] of the screen; `reach`: pixels. */
+/** Show the source near a pixel in a box at [x, y] of the screen; `reach` is the largest distance in image pixels. */
 export function tip(image, pixel, reach, [left, top]) {
   const near = $("image-truth").checked && truths.get(image.number);
   let best = -1, least = reach;
@@ -60,7 +60,7 @@ export function tip(image, pixel, reach, [left, top]) {
   if (best < 0) return (hovered = null);
   $("image-tip").style.left = `${Math.min(left + 14, $("image-canvas").clientWidth - 240)}px`;
   $("image-tip").style.top = `${Math.max(0, Math.min(top + 14, $("image-canvas").clientHeight - TALLEST))}px`;
-  // Of the same source what has come stays.
+  // Keep the text if the source is the same.
   if (hovered?.id === near.id[best] && hovered.number === image.number) return;
   const mine = (hovered = { id: near.id[best], number: image.number });
   const text = `${near.kind[best]} ${mine.id}\n${api.number(near.expected[best])} electrons expected, ${api.number(near.drawn[best])} drawn`;

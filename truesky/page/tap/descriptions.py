@@ -1,6 +1,8 @@
-"""What a TAP service says of itself: capabilities, tables, availability; and of a question that waits.
+"""XML documents of a TAP service: capabilities, tables, availability, and descriptions of jobs.
 
-Ref: IVOA Recommendations VOSI 1.1, VODataService 1.1, TAPRegExt 1.0, UWS 1.1
+References
+----------
+IVOA Recommendations VOSI 1.1, VODataService 1.1, TAPRegExt 1.0, UWS 1.1
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ _ADQL_GEO = "ivo://ivoa.net/std/TAPRegExt#features-adqlgeo"
 
 
 def availability(up_since: datetime) -> str:
-    """That it answers."""
+    """Return the VOSI document that the service is available since a time (UTC)."""
     return (
         f'{_XML_HEADER}<vosi:availability xmlns:vosi="http://www.ivoa.net/xml/VOSIAvailability/v1.0">'
         f"<vosi:available>true</vosi:available><vosi:upSince>{format_time(up_since)}</vosi:upSince></vosi:availability>\n"
@@ -31,10 +33,23 @@ def availability(up_since: datetime) -> str:
 
 
 def capabilities(address: str, max_rows: int, default_rows: int, seconds: float) -> str:
-    """What it can do, and where.
+    """Return the VOSI document of the capabilities and addresses of the service.
 
-    address : of the service;  seconds : that a query may take
-    most_rows, usual_rows : of an answer at most, and where nobody says
+    Parameters
+    ----------
+    address : str
+        Address of the service.
+    max_rows : int
+        Largest number of rows of an answer.
+    default_rows : int
+        Largest number of rows if a query has no MAXREC.
+    seconds : float
+        Time limit of a query in seconds.
+
+    Returns
+    -------
+    str
+        The XML document.
     """
     vosi = "".join(
         f'<capability standardID="ivo://ivoa.net/std/VOSI#{name}"><interface xsi:type="vs:ParamHTTP" role="std">'
@@ -55,7 +70,7 @@ def capabilities(address: str, max_rows: int, default_rows: int, seconds: float)
         f'<dataModel ivo-id="ivo://ivoa.net/std/ObsCore#core-1.1">ObsCore-1.1</dataModel>'
         f'<language><name>ADQL</name><version ivo-id="ivo://ivoa.net/std/ADQL#v2.0">2.0</version>'
         f'<version ivo-id="ivo://ivoa.net/std/ADQL#v2.1">2.1</version>'
-        f"<description>Run by DuckDB: its own functions can be called, too.</description>"
+        f"<description>DuckDB runs the queries. They may also call its functions.</description>"
         f'<languageFeatures type="{_ADQL_GEO}">{features}</languageFeatures></language>\n'
         f"{formats}<retentionPeriod><default>86400</default></retentionPeriod>"
         f"<executionDuration><default>{seconds:.0f}</default><hard>{seconds:.0f}</hard></executionDuration>"
@@ -65,7 +80,7 @@ def capabilities(address: str, max_rows: int, default_rows: int, seconds: float)
 
 
 def describe_tables(entries: Iterable[TableEntry]) -> str:
-    """The tables with their columns and keys."""
+    """Return the VOSI document of the tables, their columns and foreign keys."""
     by_schema: dict[str, list[TableEntry]] = {}
     for table in entries:
         by_schema.setdefault(table.schema, []).append(table)
@@ -119,10 +134,23 @@ _UWS = 'xmlns:uws="http://www.ivoa.net/xml/UWS/v1.0" xmlns:xlink="http://www.w3.
 
 
 def describe_job(facts: Mapping[str, object], parameters: Mapping[str, str], result: str | None, error: str) -> str:
-    """A job of UWS.
+    """Return the UWS document of a job.
 
-    facts  : by UWS's names, None where there is none yet;  parameters : as they were given
-    result : address of the result, None = none yet;  error : "" = none
+    Parameters
+    ----------
+    facts : mapping of str to object
+        Properties by their UWS names; None if a property has no value yet.
+    parameters : mapping of str to str
+        Parameters of the job.
+    result : str or None
+        Address of the result; None if there is no result yet.
+    error : str
+        Error message, or "".
+
+    Returns
+    -------
+    str
+        The XML document.
     """
     return (
         f'{_XML_HEADER}<uws:job {_UWS} version="1.1">\n{_job_elements(facts)}{describe_parameters(parameters, False)}'
@@ -131,7 +159,7 @@ def describe_job(facts: Mapping[str, object], parameters: Mapping[str, str], res
 
 
 def describe_parameters(parameters: Mapping[str, str], is_document: bool = True) -> str:
-    """The parameters of a job, as a document or as a part of one."""
+    """Return the parameters of a job as a document, or as an element of one."""
     rows = "".join(
         f"<uws:parameter id={quoteattr(name)}>{escape(value)}</uws:parameter>" for name, value in parameters.items()
     )
@@ -139,13 +167,13 @@ def describe_parameters(parameters: Mapping[str, str], is_document: bool = True)
 
 
 def describe_results(result: str | None, is_document: bool = True) -> str:
-    """The results of a job, as a document or as a part of one."""
+    """Return the results of a job as a document, or as an element of one."""
     row = f'<uws:result id="result" xlink:type="simple" xlink:href={quoteattr(result)}/>' if result else ""
     return _wrap_element("results", row, is_document)
 
 
 def list_jobs(rows: Iterable[tuple[str, str, str, datetime]]) -> str:
-    """A list of jobs: identifier, address, phase, creation time of each."""
+    """Return the UWS document of a list of jobs: (identifier, address, phase, creation time)."""
     references = "".join(
         f'<uws:jobref id={quoteattr(name)} xlink:type="simple" xlink:href={quoteattr(address)}>'
         f"<uws:phase>{phase}</uws:phase><uws:creationTime>{format_time(creation_time)}</uws:creationTime></uws:jobref>\n"
@@ -178,5 +206,5 @@ def _error_element(error: str) -> str:
 
 
 def format_time(time: datetime) -> str:
-    """ISO 8601, ms, UTC."""
+    """Format a UTC time by ISO 8601 with milliseconds."""
     return time.strftime("%Y-%m-%dT%H:%M:%S.%f")[:-3] + "Z"

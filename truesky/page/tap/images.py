@@ -1,4 +1,4 @@
-"""The images of a lake as files: where they are, and how ObsCore describes them."""
+"""Describe the images of a lake by ObsCore, and find their files."""
 
 from __future__ import annotations
 
@@ -15,14 +15,24 @@ from truesky.page.lake_session import LakeSession, RequestTables
 from truesky.page.pictures import pictures
 from truesky.page.tap.tables import obscore_row
 
-# A passband's response at its ends, of its largest.
+# The ends of a passband are where its response falls below this fraction of its maximum.
 _MIN_RESPONSE = 0.01
 
 
 def obscore_rows(lake: LakeSession, address: str) -> list[dict[str, Any]]:
-    """Rows of ivoa.obscore.
+    """Return one row of the table ivoa.obscore per image.
 
-    address : of the service from which the files can be had
+    Parameters
+    ----------
+    lake : LakeSession
+        The open lake.
+    address : str
+        Address of the TAP service, which also serves the files.
+
+    Returns
+    -------
+    list of dict
+        The rows.
     """
     tables_by_request = {request_tables.request: request_tables for request_tables in lake.observed_requests}
     images = pictures(lake)
@@ -59,7 +69,7 @@ def _diameter(ra: float, dec: float, corners: Float) -> float:
 
 
 def _wavelength_ranges(request_tables: RequestTables) -> dict[str, tuple[float, float]]:
-    """Passband -> shortest and longest wavelength, angstrom."""
+    """Shortest and longest wavelength (angstrom) by passband."""
     wavelength_ranges = {}
     for row in request_tables.rows("passbands", ["name", "first_wavelength", "wavelength_step", "response"]):
         response = np.array(row["response"])
@@ -72,7 +82,7 @@ def _wavelength_ranges(request_tables: RequestTables) -> dict[str, tuple[float, 
 
 
 def find_file(lake: LakeSession, number: int) -> Path:
-    """A FITS file, compared with its sha256.  Errors: BadInput where the lake has none of that number"""
+    """Return the path of an image after its sha256 is verified; raise BadInput if there is no such image."""
     images = pictures(lake)
     if not 0 <= number < len(images):
         raise BadInput(f"the lake has no image {number}; it has {len(images)}")

@@ -1,6 +1,8 @@
-"""Questions of other tools that wait for their answer: jobs of UWS, with a result that is kept for a day.
+"""Asynchronous queries: UWS jobs whose results are kept for a day.
 
-Ref: IVOA Recommendation UWS 1.1
+References
+----------
+IVOA Recommendation UWS 1.1
 """
 
 from __future__ import annotations
@@ -17,17 +19,20 @@ from pathlib import Path
 from lake_schema.errors import BadInput, LakeError
 
 MAX_JOBS, PARALLEL_JOBS = 64, 2
-# Of the result of a job, and of those of all jobs together.
+# Largest size of the result of one job, and of the results of all jobs.
 MAX_RESULT_BYTES, MAX_TOTAL_BYTES = 4 << 30, 16 << 30
 RETENTION = timedelta(days=1)
 _END_PHASES = ("COMPLETED", "ERROR", "ABORTED")
-# (parameters, s that it may take) -> content type and pieces of the answer
+# Function that runs a query: (parameters, time limit in s) -> content type and pieces of the result.
 RunQuery = Callable[[dict[str, str], float], AbstractAsyncContextManager[tuple[str, AsyncIterator[bytes]]]]
 
 
 @dataclass(slots=True)
 class Job:
-    """A question, and what becomes of it; `size` are the bytes of its result."""
+    """An asynchronous query, its state by UWS, and the size of its result.
+
+    `parameters` are the parameters of TAP, `max_seconds` is the time limit, and `name` is the identifier in addresses.
+    """
 
     parameters: dict[str, str]
     max_seconds: float
@@ -44,20 +49,24 @@ class Job:
     phase_changed: asyncio.Event = field(default_factory=asyncio.Event)
 
     def set_phase(self, phase: str) -> None:
-        """And tell whoever waits for it."""
+        """Set the phase and wake all requests that wait for a change of it."""
         self.phase = phase
         self.phase_changed.set()
         self.phase_changed = asyncio.Event()
 
     @property
     def has_ended(self) -> bool:
+        """True if the job is completed, failed or aborted."""
         return self.phase in _END_PHASES
 
 
 class Jobs:
-    """All of them; results lie in a folder that goes with the service.
+    """All jobs of a service. Results are stored in a temporary folder, which is removed when the service ends.
 
-    run : answers a question
+    Parameters
+    ----------
+    run_query : RunQuery
+        Function that runs a query.
     """
 
     def __init__(self, run_query: RunQuery) -> None:
@@ -67,37 +76,37 @@ class Jobs:
         self._slots = asyncio.Semaphore(PARALLEL_JOBS)
 
     def all(self) -> list[Job]:
-        """Those that are not past their day, oldest first."""
+        """Remove expired jobs and return the others, oldest first."""
         now = datetime.now(UTC)
         for name in [name for name, job in self._jobs.items() if job.destruction_time <= now]:
             self.remove(name)
         return list(self._jobs.values())
 
     def add(self, parameters: dict[str, str], max_seconds: float) -> Job:
-        """A new one, which waits to be started.  Errors: BadInput where there are too many"""
+        """Add a job, which `start` will run; raise BadInput if there are too many jobs."""
         if len(self.all()) >= MAX_JOBS:
-            raise BadInput(f"{MAX_JOBS} jobs are kept: delete some")
+            raise BadInput(f"there are {MAX_JOBS} jobs already: delete some")
         job = Job(parameters, max_seconds)
         self._jobs[job.name] = job
         return job
 
     def get(self, name: str) -> Job | None:
-        """The job of a name, None where there is none."""
+        """Return the job with this identifier, or None if it does not exist."""
         self.all()
         return self._jobs.get(name)
 
     def file(self, job: Job) -> Path:
-        """Where its result is."""
+        """Return the path of the result of a job."""
         return Path(self._folder.name) / job.name
 
     def start(self, job: Job) -> None:
-        """Run it, unless it has been."""
+        """Run a job if it has not been started yet."""
         if job.phase == "PENDING":
             job.set_phase("QUEUED")
             job.task = asyncio.create_task(self._run_job(job))
 
     def abort(self, job: Job) -> None:
-        """End it, unless it has ended."""
+        """Stop a job if it has not ended yet."""
         if not job.has_ended:
             if job.task is not None:
                 job.task.cancel()
@@ -105,13 +114,13 @@ class Jobs:
             job.set_phase("ABORTED")
 
     def remove(self, name: str) -> None:
-        """End and forget it."""
+        """Stop a job and delete it with its result."""
         if (job := self._jobs.pop(name, None)) is not None:
             self.abort(job)
             self.file(job).unlink(missing_ok=True)
 
     async def close(self) -> None:
-        """Forget all."""
+        """Stop and delete all jobs."""
         tasks = [job.task for job in self._jobs.values() if job.task is not None]
         for name in list(self._jobs):
             self.remove(name)
@@ -120,20 +129,20 @@ class Jobs:
 
     async def _run_job(self, job: Job) -> None:
         try:
-            # Queued until there is a place, and a process that answers.
+            # The job stays queued until a slot and a process are free.
             async with self._slots, self._run_query(job.parameters, job.max_seconds) as (content_type, pieces):
                 job.start_time = datetime.now(UTC)
                 job.set_phase("EXECUTING")
                 await self._write_result(job, pieces)
                 job.content_type = content_type
         except asyncio.CancelledError:
-            # What has been written of an answer that nobody will have counts against the others no more.
+            # Delete the partial result, so that it does not count towards the size of all results.
             self._remove_result(job)
             raise
         except (LakeError, OSError) as error:
             job.error = str(error) or type(error).__name__
         except Exception as error:
-            # Whatever it is: a job that has ended must not be waited for.
+            # Catch any error, because a client would wait forever for a job without an end.
             job.error = f"{type(error).__name__}: {error}"
         if job.error:
             self._remove_result(job)
@@ -141,18 +150,18 @@ class Jobs:
         job.set_phase("ERROR" if job.error else "COMPLETED")
 
     def _remove_result(self, job: Job) -> None:
-        """What has been written of its result."""
+        """Delete the result, complete or not."""
         self.file(job).unlink(missing_ok=True)
         job.result_bytes = 0
 
     async def _write_result(self, job: Job, pieces: AsyncIterator[bytes]) -> None:
-        """Write the result of a job into its file.  Errors: BadInput where it is too large"""
+        """Write the result of a job into its file; raise BadInput if it is too large."""
         with self.file(job).open("wb") as file:
             async for piece in pieces:
-                # A piece may be as large as the whole result: others are answered while it is written.
+                # A piece may be as large as the whole result, so write it in a thread to keep the server responsive.
                 await asyncio.to_thread(file.write, piece)
                 job.result_bytes += len(piece)
                 if job.result_bytes > MAX_RESULT_BYTES:
-                    raise BadInput(f"the result has more than {MAX_RESULT_BYTES / 1e9:.3g} GB: ask for less")
+                    raise BadInput(f"the result is larger than {MAX_RESULT_BYTES / 1e9:.3g} GB: select fewer rows")
                 if sum(stored_job.result_bytes for stored_job in self._jobs.values()) > MAX_TOTAL_BYTES:
-                    raise BadInput(f"results of jobs have more than {MAX_TOTAL_BYTES / 1e9:.3g} GB: delete some")
+                    raise BadInput(f"all results are larger than {MAX_TOTAL_BYTES / 1e9:.3g} GB: delete some jobs")

@@ -1,8 +1,10 @@
-"""A TAP service over the lake: what TOPCAT, Aladin, pyvo and astroquery ask.
+"""TAP service of a lake for tools such as TOPCAT, Aladin, pyvo and astroquery.
 
-Tools send no cookies: a token, another than the page's, stands in its address.
+These tools send no cookies, so the address of the service contains a token, which differs from the token of the page.
 
-Ref: IVOA Recommendations TAP 1.1, DALI 1.1, VOSI 1.1
+References
+----------
+IVOA Recommendations TAP 1.1, DALI 1.1, VOSI 1.1
 """
 
 from __future__ import annotations
@@ -41,9 +43,7 @@ _FORMATS = {
 
 @dataclass(slots=True)
 class _LakeProcesses:
-    """The processes that answer for one opened lake, the folder of the tables that they have beside its own, and those
-    of its tables that have positions.
-    """
+    """Query processes of one open lake, the folder of the additional tables, and the names of tables with positions."""
 
     lake: LakeSession
     process_pool: ProcessPool
@@ -56,7 +56,13 @@ class _LakeProcesses:
 
 
 class Service:
-    """TAP of whichever lake is open."""
+    """TAP service of the lake that is currently open.
+
+    Parameters
+    ----------
+    access : AccessRules
+        Rules of access of the server.
+    """
 
     def __init__(self, access: AccessRules) -> None:
         self._access, self._up_since = access, datetime.now(UTC)
@@ -66,9 +72,16 @@ class Service:
         self.jobs = Jobs(self.run_query)
 
     def add_routes(self, router: web.UrlDispatcher, path: str, lake: Callable[[], LakeSession]) -> None:
-        """Answer below a path.
+        """Add the routes of the service.
 
-        lake : the lake that is open
+        Parameters
+        ----------
+        router : aiohttp.web.UrlDispatcher
+            Router of the application.
+        path : str
+            Path of the service.
+        lake : callable
+            Function that returns the open lake.
         """
         self._current_lake = lake
         for method in ("GET", "POST"):
@@ -82,25 +95,45 @@ class Service:
         ).add(router, path, self._errors_to_votable)
 
     async def close(self) -> None:
-        """End jobs and processes."""
+        """Stop all jobs and processes."""
         await self.jobs.close()
         if self._lake_processes is not None:
             self._lake_processes.close()
 
     def service_address(self, request: web.Request) -> str:
-        """Of the service, absolute."""
+        """Return the absolute address of the service."""
         return f"http://{request.headers['Host']}/tap/{self._access.tap_token}"
 
-    # -------------------------------------------------------------------------------------------- questions
+    # -------------------------------------------------------------------------------------------- queries
 
     @asynccontextmanager
     async def run_query(
         self, parameters: dict[str, str], seconds: float, is_patient: bool = True
     ) -> AsyncIterator[tuple[str, AsyncIterator[bytes]]]:
-        """Content type and pieces of the answer to a question.
+        """Run a query and provide its result.
 
-        parameters : of TAP;  seconds : that it may take;  is_patient : as of `Lane.process`
-        Errors     : BadInput, Damaged, Busy
+        Parameters
+        ----------
+        parameters : dict of str
+            Parameters of TAP, such as QUERY and MAXREC.
+        seconds : float
+            Time limit in seconds; the limit of the lake applies, too.
+        is_patient : bool, optional
+            Wait for a process even if many queries are waiting, see `ProcessPool.process`.
+
+        Yields
+        ------
+        content_type : str
+            Content type of the result.
+        pieces : asynchronous iterator of bytes
+            The result. Its errors are BadInput and Damaged.
+
+        Raises
+        ------
+        BadInput
+            If a parameter is invalid.
+        Busy
+            If too many queries are waiting.
         """
         self.check_parameters(parameters)
         content_type, suffix = _output_format(parameters)
@@ -116,7 +149,7 @@ class Service:
             yield content_type, iterate_in_thread(data)
 
     def check_parameters(self, parameters: dict[str, str]) -> None:
-        """Refuse what is no question of ours."""
+        """Raise BadInput if the parameters are not a query that this service can run."""
         if parameters.get("REQUEST", "doQuery") != "doQuery":
             raise BadInput(f"REQUEST = {parameters['REQUEST'][:40]} is not doQuery")
         language = parameters.get("LANG", "")
@@ -125,7 +158,7 @@ class Service:
         if not parameters.get("QUERY", "").strip():
             raise BadInput("QUERY is missing")
         if "UPLOAD" in parameters:
-            raise BadInput("UPLOAD: this service takes no tables")
+            raise BadInput("UPLOAD is not supported by this service")
         _output_format(parameters)
         _max_rows(parameters)
 
@@ -141,7 +174,7 @@ class Service:
                 address = f"http://{self._access.hosts[0]}:{self._access.port}/tap/{self._access.tap_token}"
                 rows = await asyncio.to_thread(images.obscore_rows, lake, address)
                 table_files = await asyncio.to_thread(write_tables, lake.listed_versions, rows, Path(folder.name))
-                # One more than jobs take: they never hold up who waits for an answer.
+                # One process more than parallel jobs, so that jobs never block synchronous queries.
                 process_pool = ProcessPool(lambda: lake.explorer.process(table_files), PARALLEL_JOBS + 1)
                 catalogues = {name.lower() for name, version in lake.versions.items() if is_catalogue(version)}
                 self._lake_processes = _LakeProcesses(lake, process_pool, folder, catalogues)
@@ -152,7 +185,7 @@ class Service:
     def _errors_to_votable(
         self, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
     ) -> Callable[[web.Request], Awaitable[web.StreamResponse]]:
-        """What is refused is said in a VOTable."""
+        """Wrap a handler: errors become VOTables with status 503 (busy), 400 (bad input) or 500."""
 
         async def respond(request: web.Request) -> web.StreamResponse:
             try:
@@ -183,7 +216,7 @@ class Service:
         )
 
     async def _image(self, request: web.Request) -> web.StreamResponse:
-        """A FITS file of the products, by its number in the lake of a key."""
+        """Send the FITS file of an image by its number, if the key in the address is the key of the open lake."""
         from truesky.page import pictures
         from truesky.page.tap import images
 
@@ -199,7 +232,7 @@ class Service:
 
 
 def _output_format(parameters: dict[str, str]) -> tuple[str, str]:
-    """Content type, and the ending of such a file."""
+    """Content type and file suffix of the requested format."""
     format_name = parameters.get("RESPONSEFORMAT") or parameters.get("FORMAT") or "votable"
     if (output_format := _FORMATS.get(format_name.lower().replace(" ", ""))) is None:
         raise BadInput(f"RESPONSEFORMAT = {format_name[:60]!r} is not one of {', '.join(_FORMATS)}")

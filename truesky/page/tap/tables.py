@@ -1,8 +1,8 @@
-"""Tables that a TAP service has beside the lake's own: what there is to ask (TAP_SCHEMA), the images (ivoa.obscore).
+"""Tables that a TAP service adds to the tables of the lake: TAP_SCHEMA and ivoa.obscore (images).
 
-written     them all as Arrow files that a process of queries reads
-
-Ref: IVOA Recommendations TAP 1.1, section 4; ObsCore 1.1, table 1 and appendix B
+References
+----------
+IVOA Recommendations TAP 1.1, section 4; ObsCore 1.1, table 1 and appendix B
 """
 
 from __future__ import annotations
@@ -33,37 +33,37 @@ _S, _I = pa.string(), pa.int32()
 _SCHEMAS: dict[str, tuple[str, pa.Schema]] = {
     "tap_schema.schemas": ("The schemas.", pa.schema([
         _f("schema_name", _S, "meta.id", "name of the schema"), _f("utype", _S, "", "utype"),
-        _f("description", _S, "", "what it holds"), _f("schema_index", _I, "", "order in which it is listed"),
+        _f("description", _S, "", "description of the schema"), _f("schema_index", _I, "", "order in lists"),
     ])),
     "tap_schema.tables": ("The tables.", pa.schema([
-        _f("schema_name", _S, "", "schema that it is in"), _f("table_name", _S, "", "name, as it stands in a query"),
+        _f("schema_name", _S, "", "schema of the table"), _f("table_name", _S, "", "name to use in a query"),
         _f("table_type", _S, "", "table or view"), _f("utype", _S, "", "utype"),
-        _f("description", _S, "", "what it holds"), _f("table_index", _I, "", "order in which it is listed"),
+        _f("description", _S, "", "description of the table"), _f("table_index", _I, "", "order in lists"),
     ])),
     "tap_schema.columns": ("The columns.", pa.schema([
-        _f("table_name", _S, "", "table that it is in"), _f("column_name", _S, "", "name, as it stands in a query"),
-        _f("datatype", _S, "", "type, of VOTable"), _f("arraysize", _S, "", "shape, of VOTable"),
-        _f("xtype", _S, "", "what a text stands for"), _f("size", _I, "", "length, not used any more"),
+        _f("table_name", _S, "", "table of the column"), _f("column_name", _S, "", "name to use in a query"),
+        _f("datatype", _S, "", "type in a VOTable"), _f("arraysize", _S, "", "shape in a VOTable"),
+        _f("xtype", _S, "", "extended type of a string"), _f("size", _I, "", "length, deprecated"),
         _f("description", _S, "", "meaning"), _f("utype", _S, "", "utype"), _f("unit", _S, "", "unit"),
-        _f("ucd", _S, "", "UCD"), _f("indexed", _I, "", "1 where rows are found fast by it"),
-        _f("principal", _I, "", "1 where it is among the most important"),
-        _f("std", _I, "", "1 where a standard defines it"),
-        _f("column_index", _I, "", "order in which it is listed"),
+        _f("ucd", _S, "", "UCD"), _f("indexed", _I, "", "1 if conditions on the column are fast"),
+        _f("principal", _I, "", "1 if the column is among the most important"),
+        _f("std", _I, "", "1 if a standard defines the column"),
+        _f("column_index", _I, "", "order in lists"),
     ])),
     "tap_schema.keys": ("The foreign keys.", pa.schema([
-        _f("key_id", _S, "", "identifier of the key"), _f("from_table", _S, "", "table that it is in"),
-        _f("target_table", _S, "", "table that it leads to"), _f("description", _S, "", "meaning"),
+        _f("key_id", _S, "", "identifier of the key"), _f("from_table", _S, "", "table with the key"),
+        _f("target_table", _S, "", "table that the key refers to"), _f("description", _S, "", "meaning"),
         _f("utype", _S, "", "utype"),
     ])),
     "tap_schema.key_columns": ("The columns of the foreign keys.", pa.schema([
-        _f("key_id", _S, "", "identifier of the key"), _f("from_column", _S, "", "column that leads"),
-        _f("target_column", _S, "", "column that it leads to"),
+        _f("key_id", _S, "", "identifier of the key"), _f("from_column", _S, "", "column with the key"),
+        _f("target_column", _S, "", "column that the key refers to"),
     ])),
 }  # fmt: skip
 
 
 def _obscore_schema() -> pa.Schema:
-    """The columns of ivoa.obscore, from the table beside this module: ObsCore 1.1, table 1, and two of our own."""
+    """Read the columns of ivoa.obscore from obscore.csv: the columns of ObsCore 1.1, table 1, and two more."""
     with Path(__file__).with_name("obscore.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     metadata_keys = ("unit", "ucd", "utype", "xtype", "description")
@@ -84,10 +84,7 @@ _SCHEMAS["ivoa.obscore"] = ("The images, as ObsCore describes observations.", _o
 
 @dataclass(frozen=True, slots=True)
 class TableEntry:
-    """A table as TAP_SCHEMA and VOSI list it.
-
-    name : as it stands in a query
-    """
+    """A table as TAP_SCHEMA and VOSI list it; `name` is the name to use in a query, quoted if necessary."""
 
     schema: str
     name: str
@@ -97,7 +94,7 @@ class TableEntry:
 
 
 def list_tables(versions: Mapping[str, read.Version]) -> list[TableEntry]:
-    """All tables, those of the lake first."""
+    """Return all tables; tables of the lake come first."""
     lake_tables = [
         TableEntry(
             name.rpartition(".")[0] or LAKE, ".".join(map(column_name, name.split("."))),
@@ -123,13 +120,13 @@ _RESERVED = {
 
 
 def column_name(name: str) -> str:
-    """A name as it stands in ADQL: one that is not plain, or a word of the language, in quotes."""
+    """Return a name for ADQL, in quotes if it has special characters or is a reserved word."""
     plain = name.isascii() and name.replace("_", "a").isalnum() and name[0].isalpha()
     return name if plain and name.lower() not in _RESERVED else f'"{name}"'
 
 
 def describe_columns(table: TableEntry) -> Iterator[Json]:
-    """The columns of a table as TAP_SCHEMA.columns has them."""
+    """Yield the columns of a table as rows of TAP_SCHEMA.columns."""
     for number, field in enumerate(table.fields, start=1):
         metadata = field_facts(field)
         datatype_name, size = datatype(field.type)
@@ -144,7 +141,7 @@ def describe_columns(table: TableEntry) -> Iterator[Json]:
         }  # fmt: skip
 
 
-# Of TAP_SCHEMA's own tables: key, table, column, table that it leads to, column.
+# Foreign keys of the tables of TAP_SCHEMA: key, table, column, target table, target column.
 FOREIGN_KEYS = (
     ("tables_schema", "tap_schema.tables", "schema_name", "tap_schema.schemas", "schema_name"),
     ("columns_table", "tap_schema.columns", "table_name", "tap_schema.tables", "table_name"),
@@ -154,15 +151,27 @@ FOREIGN_KEYS = (
 )
 SCHEMA_DESCRIPTIONS = {
     LAKE: "Tables that all requests of the lake share.",
-    "tap_schema": "What there is to ask.",
+    "tap_schema": "Descriptions of all schemas, tables and columns.",
     "ivoa": "Tables of the Virtual Observatory.",
 }
 
 
 def write_tables(versions: Mapping[str, read.Version], images: list[Json], folder: Path) -> list[str]:
-    """NAME=@FILE of every table, as a process of queries wants them.
+    """Write TAP_SCHEMA and ivoa.obscore as Arrow files for the query processes.
 
-    versions : of the lake's tables;  images : rows of ivoa.obscore;  folder : where the files go
+    Parameters
+    ----------
+    versions : mapping of str to Version
+        Versions of the tables of the lake.
+    images : list of dict
+        Rows of ivoa.obscore.
+    folder : Path
+        Folder for the files.
+
+    Returns
+    -------
+    list of str
+        NAME=@FILE for every table, as `Explorer.process` requires.
     """
     tables = list_tables(versions)
     names = list(dict.fromkeys(table.schema for table in tables))
@@ -201,11 +210,24 @@ def write_tables(versions: Mapping[str, read.Version], images: list[Json], folde
 
 
 def obscore_row(number: int, row: Mapping[str, Any], exposure: Mapping[str, Any], file: Mapping[str, Any]) -> Json:
-    """An image as a row of ivoa.obscore.
+    """Return the row of ivoa.obscore of an image.
 
-    number   : by which it can be had;  row : of `products`;  exposure : its row of `exposures`, {} where there is none
-    file     : url, kbyte, nx, ny, fov (deg), wavelengths (shortest and longest, angstrom, or None), version; exposure,
-               by which it is told from all others
+    Parameters
+    ----------
+    number : int
+        Number of the image.
+    row : mapping
+        Row of the table `products`.
+    exposure : mapping
+        Row of the table `exposures`, or {} if there is no such row.
+    file : mapping
+        Facts of the file: `url`, `kbyte`, `nx`, `ny`, `fov` (diameter, deg), `wavelengths` (shortest and longest in
+        angstrom, or None), `version`, and `exposure`, an identifier that is unique in the lake.
+
+    Returns
+    -------
+    dict
+        Values by column. Wavelengths are in metres.
     """
     start, seconds = exposure.get("mjd"), exposure.get("exposure_time_s")
     wavelengths = file["wavelengths"] or (None, None)

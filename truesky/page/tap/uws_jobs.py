@@ -1,6 +1,8 @@
-"""Addresses of the jobs of a TAP service, as UWS wants them.
+"""Addresses of the asynchronous jobs of a TAP service, as UWS defines them.
 
-Ref: IVOA Recommendation UWS 1.1, section 2
+References
+----------
+IVOA Recommendation UWS 1.1, section 2
 """
 
 from __future__ import annotations
@@ -25,20 +27,29 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
 async def read_parameters(request: web.Request) -> dict[str, str]:
-    """What a tool asks with, in the address or as a form; names in capitals.  Errors: BadInput for a file"""
+    """Read the parameters of a request from its address and form, with upper-case names; raise BadInput for a file."""
     values = {name.upper(): value for name, value in request.query.items()}
     if request.method == "POST":
         for name, value in (await request.post()).items():
             if not isinstance(value, str):
-                raise BadInput(f"{name[:40]}: this service takes no files")
+                raise BadInput(f"{name[:40]} must be a string: uploads are not supported")
             values[name.upper()] = value
     return values
 
 
 class Routes:
-    """Handlers of the addresses below async.
+    """Handlers of the addresses below /async.
 
-    address : of the service, for a request;  check : refuses a question;  seconds : that a question may take
+    Parameters
+    ----------
+    jobs : Jobs
+        The jobs.
+    address : callable
+        Function that returns the address of the service for a request.
+    check : callable
+        Function that raises BadInput if parameters are not a valid query.
+    max_seconds : callable
+        Function that returns the time limit of a query in seconds.
     """
 
     def __init__(
@@ -51,7 +62,17 @@ class Routes:
         self._jobs, self._address, self._check, self._max_seconds = jobs, address, check, max_seconds
 
     def add(self, router: web.UrlDispatcher, path: str, wrap: Callable[[Handler], Handler]) -> None:
-        """Answer below a path; `told` says what is refused."""
+        """Add the routes.
+
+        Parameters
+        ----------
+        router : aiohttp.web.UrlDispatcher
+            Router of the application.
+        path : str
+            Path of the service.
+        wrap : callable
+            Function that wraps a handler so that its errors become responses.
+        """
         router.add_get(f"{path}/async", wrap(self._list))
         router.add_post(f"{path}/async", wrap(self._create))
         router.add_get(f"{path}/async/{{job}}", wrap(self._describe_job))
@@ -68,7 +89,7 @@ class Routes:
         return job
 
     def _redirect(self, request: web.Request, job: Job | None = None) -> web.Response:
-        """Lead to a job, or to their list; tools want absolute addresses."""
+        """Redirect to a job or to the list of jobs. Clients require an absolute address."""
         location = f"{self._address(request)}/async" + (f"/{job.name}" if job else "")
         return web.Response(status=303, headers={"Location": location})
 
@@ -108,7 +129,7 @@ class Routes:
         return self._redirect(request)
 
     async def _change(self, request: web.Request) -> web.StreamResponse:
-        """Start, abort or delete a job, or change a parameter of one that waits."""
+        """Start, abort or delete a job, or change the parameters of a job that has not been started."""
         job, values = self._find_job(request), await read_parameters(request)
         if values.get("ACTION") == "DELETE":
             return await self._delete(request)
@@ -156,7 +177,7 @@ class Routes:
 
 
 async def _wait_for_change(job: Job, request: web.Request) -> None:
-    """WAIT=s: answer only when the phase changes, or the job has ended."""
+    """Handle WAIT=seconds: return when the phase changes, the job has ended, or the time is over."""
     wait = request.query.get("WAIT")
     if wait is None or job.has_ended or request.query.get("PHASE", job.phase) != job.phase:
         return
@@ -171,7 +192,7 @@ async def _wait_for_change(job: Job, request: web.Request) -> None:
 
 
 def _parse_seconds(text: str, max_seconds: float) -> float:
-    """Whole seconds, 0 = as many as possible."""
+    """Parse a whole number of seconds, at most `max_seconds`; 0 means `max_seconds`."""
     if not (text.isascii() and text.isdigit() and len(text) < 10):
         raise BadInput(f"{text[:40]!r} is not a number of seconds")
     return min(float(text) or max_seconds, max_seconds)
@@ -181,5 +202,5 @@ def _parse_time(text: str) -> datetime:
     try:
         time = datetime.fromisoformat(text)
     except ValueError:
-        raise BadInput(f"{text[:40]!r} is not a moment, ISO 8601") from None
+        raise BadInput(f"{text[:40]!r} is not a date and time in ISO 8601") from None
     return time if time.tzinfo else time.replace(tzinfo=UTC)
