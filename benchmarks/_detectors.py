@@ -32,7 +32,7 @@ def make_lake(folder: Path, request: Request) -> Path:
     root = layout.resolve_lake(folder / "lake")
     for module in (build_galaxies, build_stars, compute_fluxes):
         for step in module.steps(root, request):
-            publish.make_version(root, step.plan, step.work)
+            publish.make_version(root, step.plan, step.run_task)
     return root
 
 

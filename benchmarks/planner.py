@@ -99,7 +99,7 @@ def make_lake(folder: Path, sky_name: str, quick: bool, given_request: Request |
     root, lake_request = layout.resolve_lake(folder / sky_name), given_request or sky_request(sky_name, quick)
     for module in (build_galaxies, build_stars, compute_fluxes, plan_exposures):
         for step in module.steps(root, lake_request):
-            publish.make_version(root, step.plan, step.work)
+            publish.make_version(root, step.plan, step.run_task)
     return root, lake_request
 
 

@@ -83,7 +83,7 @@ _SETTINGS = f"""\
 # Fourier series of their PSF, pairs against the largest stamps. To each, as the root of the sum of squares, the PSF's
 # own error of {positions.NUM_STARS} and of {positions.NUM_TEST_STARS} stars of other places, their colours of eight
 # sub-bands. CPU seconds of a VIS detector's sources, on {{machine}}.
-edge,aliased,floor,least,positions,colours,{",".join(_NUMBERS)},{",".join(f"{name}_held" for name in _NUMBERS)},seconds
+edge,aliased,floor,min_size_arcsec,positions,colours,{",".join(_NUMBERS)},{",".join(f"{name}_held" for name in _NUMBERS)},seconds
 """
 
 

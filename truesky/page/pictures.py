@@ -308,7 +308,7 @@ def images_at(lake: LakeSession, ra: float, dec: float) -> list[tuple[int, float
     # Open only images whose footprint contains the position.
     for number in archive.rows_at_place(regions, ra, dec)["number"].to_pylist() if images else []:
         image = images[number]
-        (x,), (y,) = astrometry.pixel_of_sky(image.system, [ra], [dec])
+        (x,), (y,) = astrometry.pixel_of_sky(image.wcs, [ra], [dec])
         ny, nx = image.levels()[0].shape
         if -0.5 <= x <= nx - 0.5 and -0.5 <= y <= ny - 0.5:
             matches.append((number, float(x), float(y)))

@@ -40,7 +40,7 @@ def settings_for(requested: Accuracy) -> Settings:
 def from_row(row: Mapping[str, float]) -> Settings:
     """Settings of a row of the measured table."""
     integers = {name: int(row[name]) for name in ("positions", "colours")}
-    return Settings(row["edge"], row["aliased"], row["floor"], row["least"], **integers)
+    return Settings(row["edge"], row["aliased"], row["floor"], row["min_size_arcsec"], **integers)
 
 
 def seconds_for(requested: Accuracy) -> float:
