@@ -83,7 +83,7 @@ def test_other_cameras_have_no_such_band(tmp_path, block, keys, words):
 
 
 def test_a_response_that_is_no_fraction_is_refused(lake, tmp_path):
-    with pytest.raises(BadInput, match=r"fluxes\.passbands\.mine: responds with 50: a pointing wants the fraction"):
+    with pytest.raises(BadInput, match=r"fluxes\.passbands\.mine: response must be the fraction of photons detected"):
         plan_exposures.plan(lake, asked(tmp_path, response=100.0 * RESPONSE))
 
 

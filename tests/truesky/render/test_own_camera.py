@@ -203,7 +203,9 @@ def test_a_band_without_a_curve_is_one_of_ours(lake, tmp_path):
     unknown = written(
         tmp_path, REQUEST.replace('band = "narrow"', 'band = "odd"'), bands=BANDS.replace("sdss_r", "odd")
     )
-    with pytest.raises(BadInput, match="band odd: truesky has no passband of this name, and no curve is given for it"):
+    with pytest.raises(
+        BadInput, match="band odd: truesky has no passband of this name, and the request has no curve for it"
+    ):
         plan_exposures.steps(lake, parse(unknown))
 
 
@@ -213,7 +215,7 @@ def test_a_band_without_a_curve_is_one_of_ours(lake, tmp_path):
         ("des_r", None, "truesky has a passband des_r: choose another name for this curve"),
         ("narrow", "# nothing\n\n", r".*narrow\.dat: has no rows"),
         ("narrow", "6000 0\n6100 -1\n", r".*narrow\.dat: row 2 is negative"),
-        ("narrow", "6000 0\n6100 50\n6200 50\n", r"responds with 50: a pointing wants the fraction"),
+        ("narrow", "6000 0\n6100 50\n6200 50\n", r"response must be the fraction of photons detected"),
     ],
 )
 def test_a_curve_with_a_mistake_is_named_with_its_table(lake, tmp_path, band, curve, words):

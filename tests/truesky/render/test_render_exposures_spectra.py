@@ -296,9 +296,9 @@ def test_the_fluxes_that_sources_are_chosen_by_are_computed(rendered, folder):
 @pytest.mark.parametrize(
     ("replaced", "message"),
     [
-        (("grism_angle = 184.0", "grism_angle = 90.0"), r"pointing\[1\]\.grism_angle = 90 deg turns RGS000, RGS180"),
+        (("grism_angle = 184.0", "grism_angle = 90.0"), r"pointing\[1\]\.grism_angle = 90 deg tilts RGS000, RGS180"),
         (("grism_angle = -4.0", "grism_angle = nan"), r"pointing\[2\]\.grism_angle"),
-        ((BLUE, PHOTOMETRIC), r"pointing\[4\]\.grism_angle: no grism of nisp is in the beam in euclid_h"),
+        ((BLUE, PHOTOMETRIC), r"pointing\[4\]\.grism_angle: must not be set in euclid_h"),
     ],
 )
 def test_angles_that_no_grism_has_are_one_line_and_nothing_is_written(tmp_path, lake, replaced, message):

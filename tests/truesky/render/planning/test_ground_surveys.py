@@ -110,7 +110,7 @@ def test_dates_by_day_are_named():
     where = EarthLocation.from_geodetic(-70.7494, -30.2446, 2663.0)
     when = Time(60500.68, format="mjd")
     high = get_sun(when).transform_to(AltAz(obstime=when, location=where)).alt.deg
-    assert line.startswith("EXT: 1 of 2 exposures of the sky are dated when the Sun is above -12 deg")
+    assert line.startswith("EXT: 1 of 2 exposures of the sky have dates when the Sun is above -12 deg")
     assert float(re.search(r"the Sun at ([+-]\d+) deg", line)[1]) == pytest.approx(high, abs=0.8)
     assert "\n" not in line
 

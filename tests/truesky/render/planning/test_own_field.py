@@ -70,7 +70,7 @@ def offsets(ra, dec, ra0, dec0):
 @pytest.mark.parametrize(("ra", "dec"), PLACES)
 def test_the_area_that_is_named_would_do(ra, dec):
     block = {"channels": ["VIS"], "ra": ra, "dec": dec}
-    with pytest.raises(BadInput, match="this would do") as refused:
+    with pytest.raises(BadInput, match="this area is large enough") as refused:
         plan.check(made(block, ((ra + 180.0) % 360.0, -dec / 2, 0.1)))
     area = tomllib.loads(re.search(r"\[area\] (.*)", str(refused.value))[1])
     plan.check(from_table({**BASE, "area": area, "observation": [block]}))
@@ -81,7 +81,7 @@ def test_the_area_that_is_named_would_do(ra, dec):
 def test_fields_far_from_one_another_are_named_one_by_one():
     blocks = [{"channels": ["VIS"], "ra": ra, "dec": -45.0} for ra in (10.0, 60.0)]
     elsewhere = {"cone": {"ra": 0.0, "dec": 0.0, "radius": 1.0}}
-    with pytest.raises(BadInput, match="this would do") as refused:
+    with pytest.raises(BadInput, match="this area is large enough") as refused:
         plan.check(from_table({**BASE, "area": elsewhere, "observation": blocks}))
     area = tomllib.loads(re.search(r"\[area\] (.*)", str(refused.value))[1])
     assert np.array(area["patches"]) == pytest.approx(np.array([[10, -45, 0.65], [60, -45, 0.65]]), abs=0.15)
