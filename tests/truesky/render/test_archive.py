@@ -77,7 +77,7 @@ def test_the_last_line_of_a_log_may_be_cut(lake):
 )  # fmt: skip
 def test_any_other_line_that_is_damaged_is_named(lake, capsys, line):
     path = logged(lake, LINE, line, LINE)
-    with pytest.raises(Damaged, match=rf"{path.name} line 2 is not what a run writes"):
+    with pytest.raises(Damaged, match=rf"{path.name} line 2 is not a valid log line"):
         archive.failures(lake)
     assert archive.main(["--lake", str(lake), "--failures"]) == 1
     assert capsys.readouterr().err.count("\n") == 1

@@ -76,7 +76,7 @@ def test_a_plan_is_mapped_from_the_lake(lake, capsys):
     assert coverage.main(["--lake", str(lake), "--out", str(picture)]) == 0
     said = capsys.readouterr().out.splitlines()
     assert said[-1] == str(picture)
-    assert said[-2].startswith("VIS     euclid_vis        4 exposures   of the interior >= 1: ")
+    assert said[-2].startswith("VIS     euclid_vis        4 exposures   fraction of the interior >= 1: ")
     assert picture.read_bytes().startswith(b"\x89PNG")
     exposures, tasks = (read.version(lake, name) for name in ("exposures", "tasks"))
     assert coverage.area_of(exposures) == wanted.area

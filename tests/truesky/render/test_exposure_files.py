@@ -192,7 +192,7 @@ def test_files_are_no_part_of_what_detectors_are(lake, request_file):
     assert steps[0].plan.key == read.version(lake, "products").key
     assert archive.exposures(lake).num_rows == 2
     make(lake, render_exposures.steps(lake, replace(request, noise_seed=9)))
-    with pytest.raises(BadInput, match="exposure_files is of other images"):
+    with pytest.raises(BadInput, match="exposure_files has outdated images"):
         archive.exposures(lake)
 
 

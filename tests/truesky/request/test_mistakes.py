@@ -45,7 +45,7 @@ MISTAKES = {
     "a Julian date": (pointed("60905.0", "2460905.5"), "pointing[0].mjd = 2460905.5 is outside"),
     "no date": (pointed("mjd = 60905.0\n", ""), "pointing[0].mjd is missing"),
     "towards the Sun": (pointed("60905.0", "60950.0"), "next allowed: MJD 61042.8 (2026-01-02) to"),
-    "an area too small": (pointed("0.2 }", "0.01 }"), "this area is large enough: [area] cone = { ra = 53.117, dec = -27.808,"),
+    "an area too small": (pointed("0.2 }", "0.01 }"), "[area] cone = { ra = 53.117, dec = -27.808,"),
     "an area elsewhere": (
         pointed("cone = { ra = 53.117", "cone = { ra = 10.0"), "1 of 1 detector positions see sky outside",
     ),

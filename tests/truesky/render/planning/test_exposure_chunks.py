@@ -78,7 +78,7 @@ def test_what_makes_a_part_crosses_to_a_worker(request_):
     own = planner(request_, 200)
     other = pickle.loads(pickle.dumps(own))
     piece = own.layout.chunks[3]
-    exposures = other.rows_of_exposures(other.layout.pieces[3])
+    exposures = other.rows_of_exposures(other.layout.chunks[3])
     assert exposures.equals(own.rows_of_exposures(piece))
     assert other.rows_of_tasks(piece, exposures).equals(own.rows_of_tasks(piece, exposures))
 
