@@ -35,7 +35,7 @@ def models(
 
     Parameters
     ----------
-    root : Path or Place
+    root : Folder
         The lake.
     version : Version
         Version of the table `products` that has the image.

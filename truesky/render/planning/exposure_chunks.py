@@ -159,7 +159,7 @@ class Layout:
         ]
 
     def exposures_near_in_time(self, chunk: Chunk, days_before: float) -> Iterator[Exposure]:
-        """Generate exposures that begin during a chunk or up to `days_before` days earlier; a few others may follow."""
+        """Generate exposures that begin during a chunk or up to `days_before` days earlier, and possibly others."""
         for block in self.blocks:
             for exposure_range in block.ranges_between_dates(chunk.start_mjd - days_before, chunk.end_mjd, len(block)):
                 yield from (exposure for exposure, _ in block.exposures(*exposure_range))

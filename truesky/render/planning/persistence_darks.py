@@ -87,7 +87,7 @@ def _mission_delays(dark_duration: float, max_delay: float, mission: MissionConf
         if (not delays or seconds >= delays[-1] + dark_duration) and seconds <= max_delay:
             delays.append(seconds)
     if not delays:
-        raise BadInput(f"delays_s: nisp.persistence.window allows {max_delay:g} s, the mission has no delay below")
+        raise BadInput(f"delays_s: no delay of the mission is at most {max_delay:g} s (nisp.persistence.window)")
     return delays
 
 
