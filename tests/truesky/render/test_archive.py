@@ -44,7 +44,7 @@ def test_values_of_all_types_become_json():
 
 @pytest.mark.parametrize(
     ("sql", "words"),
-    [("SELECT 1 AS a, 2 AS a", "same name"), ("SELECT TIMESTAMP '290000-01-01' AS t", "no form in JSON")],
+    [("SELECT 1 AS a, 2 AS a", "same name"), ("SELECT TIMESTAMP '290000-01-01' AS t", "cannot be written as JSON")],
 )
 def test_results_without_a_json_form_are_refused(sql, words):
     with pytest.raises(BadInput, match=words):

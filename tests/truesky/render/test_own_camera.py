@@ -77,7 +77,7 @@ def rendered(tmp_path_factory):
     lake.mkdir()
     for module in (build_galaxies, build_stars, compute_fluxes, plan_exposures, render_exposures):
         for step in module.steps(lake, wanted):
-            publish.make_version(lake, step.plan, step.work)
+            publish.make_version(lake, step.plan, step.run_task)
     return lake
 
 
