@@ -1,4 +1,4 @@
-"""Pages of the documentation site that are made from the code: keys, parameters, effects, accuracy, interfaces."""
+"""Write the pages of the documentation site that are made from the code: keys, parameters, effects, accuracy, API."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from truesky.render.effects.scene import Frame, Lights, NeighbourCharge, Scene
 from truesky.render.exposure import sky_through_grism
 from truesky.request import accuracy, from_toml, observations, schema, toml_values
 
-# What readers of a lake import.
+# Modules that users import.
 API = (
     "truesky.api.lake",
     "truesky.api.tables",
@@ -40,11 +40,11 @@ API = (
     "truesky.explore.explorer",
     "truesky.render.products.read_back",
 )
-# Side of the frame that effects are shown on, pixels.
+# Side of the frame on which effects are shown, pixels.
 _SIDE = 320
 
 
-# A request with one of each list, of which the parser asks every key.
+# A request with an entry in each list, so that the parser reads every key.
 _SAMPLE_REQUEST = {
     "name": "x",
     "seed": 1,
@@ -52,7 +52,7 @@ _SAMPLE_REQUEST = {
     "pointing": [{"channel": "VIS", "band": "euclid_vis", "ra": 0.0, "dec": 0.0, "mjd": 61000.0}],
     "observation": [{"channels": ["VIS"]}],
 }
-# Functions that read one value: what they want.
+# Functions that read a value, and the type of the value.
 _VALUE_KINDS = {
     "number": "number",
     "optional_number": "number",
@@ -65,7 +65,7 @@ _VALUE_KINDS = {
 
 
 def request_page() -> str:
-    """Every key: the head of the parser, and a table of what it asks for while it reads."""
+    """Return the page of the request keys: the docstring of the parser, and a table of the keys that it reads."""
     head = inspect.cleandoc(from_toml.__doc__ or "")
     lines = ["# Keys of a request", "", "```text", head, "```", "", "## Values, bounds, defaults", ""]
     lines += ["| key | is a | from, to, or one of | default |", "|---|---|---|---|"]
@@ -78,7 +78,7 @@ def request_page() -> str:
 
 
 def _request_keys() -> dict[str, tuple[str, str, str]]:
-    """Of each key that is one value: its kind, its bounds or legal values, its default."""
+    """Return the type, the limits or allowed values, and the default of each key with a single value."""
     keys: dict[str, tuple[str, str, str]] = {}
 
     def record_keys(name: str, reader: Callable[..., object]) -> Callable[..., object]:
@@ -92,7 +92,7 @@ def _request_keys() -> dict[str, tuple[str, str, str]]:
             if "lo" in bound and "hi" in bound:
                 bounds = f"{bound['lo']:g} to {bound['hi']:g}"
             default = bound.get("default")
-            # NaN stands for a number that is not there.
+            # NaN marks a number without default.
             default_text = "" if default is None or default != default else f"`{json.dumps(default)}`"
             keys[path] = (_VALUE_KINDS[name], bounds, default_text)
             return reader(*positional, **keywords)
@@ -111,11 +111,11 @@ def _request_keys() -> dict[str, tuple[str, str, str]]:
 
 
 def mission_page(mission: MissionConfiguration) -> str:
-    """Every parameter that the default ladder chooses."""
+    """Return the page of all parameters in the default ladder."""
     lines = [
         "# The mission database",
         "",
-        "What the default ladder of statuses chooses; a request replaces values under `[mission.overrides]`.",
+        "Values that the default ladder of statuses selects. A request replaces values in `[mission.overrides]`.",
     ]
     section = ""
     for record in mission.parameters:
@@ -129,7 +129,10 @@ def mission_page(mission: MissionConfiguration) -> str:
 
 
 def effects_page(into: Path, mission: MissionConfiguration) -> str:
-    """Every effect of every channel: what its module says, the parameters that it asks for, what it does to a frame."""
+    """Return the page of all effects: docstring of the module, parameters, and the change of a small frame.
+
+    `into` is the folder of the site; the figures are written to its folder `effects`.
+    """
     names = {"VIS": "science", "NISP-P": "science", "NISP-S": "science", "EXT": "science"}
     channels = {name: channel.effects for name, channel in registry.CHANNELS.items()}
     order: dict[str, Effect] = {}
@@ -142,9 +145,9 @@ def effects_page(into: Path, mission: MissionConfiguration) -> str:
     lines = [
         "# Effects",
         "",
-        "In the order of physics. An image has what its scene needs: an effect whose largest change",
+        "Effects are listed in physical order. An effect is left out of an image if its largest change",
     ]
-    lines += ["of a pixel is less than a tenth of its noise is left out, unless a request forces it.", ""]
+    lines += ["of a pixel is less than a tenth of the pixel's noise, unless the request forces it.", ""]
     for channel, kind in names.items():
         listed = ", ".join(f"[{e.name}](#{e.name})" for e in channels[channel][kind])
         lines += [f"**{channel}, {kind}:** {listed}", ""]
@@ -159,13 +162,13 @@ def effects_page(into: Path, mission: MissionConfiguration) -> str:
             lines += [f"| `{k}` | {mission.value(k):g} | {mission.parameter(k).unit} |" for k in parameters[name]]
             lines.append("")
         if name in figures:
-            lines += [f"![What {name} does to a frame](effects/{name}.png)", ""]
-        lines += ["In: " + ", ".join(users[name]) + ".", ""]
+            lines += [f"![Frame before and after {name}](effects/{name}.png)", ""]
+        lines += ["Used in: " + ", ".join(users[name]) + ".", ""]
     return "\n".join(lines)
 
 
 def _scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
-    """A small VIS detector with points, squares of light and a bright star whose ghost falls onto it."""
+    """Return a small VIS detector with points, squares of light, and a bright star whose ghost falls on it."""
     detector = detectors.detector("vis", "3-4", mission)
     small = type(detector)("3-4", "vis", _SIDE, _SIDE, detector.x, detector.y, 0.0, detector.pixel_scale)
     frame = scene_of_effects.draw_light(_SIDE, _SIDE)
@@ -175,7 +178,7 @@ def _scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
 
 
 def _effect_parameters(effects: list[Effect], mission: MissionConfiguration) -> dict[str, list[str]]:
-    """The scalar parameters that each effect asks the mission for."""
+    """Return the keys of the mission parameters that each effect reads."""
     _, scene = _scene(mission)
     (_, infrared), (_, ground_scene) = _infrared_scene(mission), _ground_scene(mission)
     parameters, read_value = {}, MissionConfiguration.value
@@ -196,7 +199,7 @@ def _effect_parameters(effects: list[Effect], mission: MissionConfiguration) -> 
 
 
 def _figures(into: Path, mission: MissionConfiguration) -> set[str]:
-    """A figure an effect of a VIS image: the frame before it, after it, and the difference."""
+    """Draw each effect: the frame before, the frame after, and the difference. Return the names of the effects."""
     frame, scene = _scene(mission)
     folder = into / "effects"
     folder.mkdir()
@@ -205,7 +208,7 @@ def _figures(into: Path, mission: MissionConfiguration) -> set[str]:
     for effect in dict.fromkeys((*vis.SKY, *vis.FLAT, *vis.PUMPING)):
         input_frame = frame if effect in vis.SKY else light
         output_frame = effect.apply(input_frame, *effect.parameters(scene), rng=stream(1, effect.name))
-        # Some need more than a small frame to show.
+        # Some effects have no visible influence on a small frame.
         if input_frame.shape != output_frame.shape or np.ptp(output_frame - input_frame) > 0.0:
             _draw_figure(
                 folder / f"{effect.name}.png",
@@ -234,7 +237,7 @@ def _figures(into: Path, mission: MissionConfiguration) -> set[str]:
 
 
 def _ground_scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
-    """The corner of a detector of LSSTCam with points and squares of light, satellites, and a star on another."""
+    """Return a small LSSTCam detector with points, squares of light, satellites, and a star on another detector."""
     small = replace(detectors.detector("lsstcam", "R22_S11", mission), nx=_SIDE, ny=_SIDE)
     frame = scene_of_effects.draw_light(_SIDE, _SIDE)
     crossed = mission.with_overrides({"survey.satellites.rate": (3.0, "1 / (deg s)")})
@@ -250,7 +253,7 @@ def _ground_scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
 
 
 def _infrared_scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
-    """A small NISP detector with points and squares of light, what an earlier one left, and a ghost of the filter."""
+    """Return a small NISP detector with points, squares of light, persistence, and a ghost of the filter."""
     detector = detectors.detector("nisp", "DET22", mission)
     small = type(detector)("DET22", "nisp", _SIDE, _SIDE, detector.x, detector.y, 0.0, detector.pixel_scale)
     frame = scene_of_effects.draw_light(_SIDE, _SIDE)
@@ -272,7 +275,7 @@ def _infrared_scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
 
 
 def _spectral_scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
-    """A small NISP detector where light of the zeroth order comes from the field stop's edge."""
+    """Return a small NISP detector that receives zeroth-order light from the edge of the field stop."""
     frame, scene = _infrared_scene(mission)
     assert scene.detector is not None
     exposure = ExposureRow(
@@ -291,7 +294,7 @@ def _spectral_scene(mission: MissionConfiguration) -> tuple[Frame, Scene]:
 
 
 def _ramp_image(frame: Frame, name: str) -> Frame:
-    """As one image: of groups what the last has more than the first; else light, or what an effect sets beside it."""
+    """Return one image: the last group minus the first one, or another plane if the effect changes only that."""
     if frame.ndim == 2:
         return frame
     if frame.dtype == np.float32:
@@ -300,7 +303,7 @@ def _ramp_image(frame: Frame, name: str) -> Frame:
 
 
 def _assemble_quadrants(frame: Frame) -> Frame:
-    """As one image, the quadrants where they lie, with their pre- and overscan."""
+    """Return one image with the quadrants at their positions, including prescan and overscan."""
     if frame.ndim == 2:
         return frame
     placed = [quadrants.to_detector_axes(frame[i], i) for i in range(4)]
@@ -330,7 +333,7 @@ def _draw_figure(path: Path, input_frame: Frame, output_frame: Frame, name: str)
 
 
 def accuracy_page(into: Path) -> str:
-    """What an error costs in time: the rows of the measured table that accuracies are looked up in, and the presets."""
+    """Return the page of accuracy and computing time: the measured settings, and the presets."""
     rows = sorted(accuracy.rows(), key=lambda row: row["seconds"])
     titles = {
         "flux": "flux, relative",
@@ -353,9 +356,9 @@ def accuracy_page(into: Path) -> str:
     lines = [
         "# Error and time",
         "",
-        "`accuracy` in a request names one of these, or the largest errors that are allowed.",
+        "`accuracy` in a request is the name of a preset, or a table of the largest allowed errors.",
     ]
-    lines += ["Each row is a setting of drawing; errors are of sources that no setting was chosen on.", ""]
+    lines += ["Each row is a setting of the drawing. Its errors are measured on sources of an independent sample.", ""]
     lines += ["![Largest errors and CPU seconds of the settings](accuracy.png)", ""]
     lines += ["| accuracy | allows: " + " | allows: ".join(titles.values()) + " | reached | CPU s |", "|---" * 7 + "|"]
     for preset, allowed_errors in accuracy.PRESETS.items():
@@ -365,12 +368,13 @@ def accuracy_page(into: Path) -> str:
         lines.append(f"| {preset} | {allowed} | {reached} | {row['seconds']:.2f} |")
     lines += [
         "",
-        "[Speed for accuracy](tutorials/02_speed_for_accuracy.md) has the same for fluxes and for each effect.",
+        "[Speed for accuracy](tutorials/02_speed_for_accuracy.md) shows the same for fluxes and for each effect.",
     ]
     return "\n".join(lines) + "\n"
 
 
 def api_page() -> str:
+    """Return the page of the Python interface."""
     lines = ["# Python interface", ""]
     for module in API:
         lines += [f"## {module}", "", "```{eval-rst}", f".. automodule:: {module}", "```", ""]

@@ -2,10 +2,10 @@
 
     python scripts/fit_isochrones.py ISOCHRONES [--test OTHER ...] [--out FILE]
 
-ISOCHRONES is a Parquet or CSV file with a row a point: metallicity ([M/H]), log_age (log10 yr), eep (equivalent
-evolutionary point in the count of Dotter 2016), initial_mass (Msun), log_teff (K), log_l (Lsun).  The isochrones of
-MIST (https://waps.cfa.harvard.edu/MIST) have these columns under names of their own.  OTHER has the same columns but
-eep, and its hottest stars are compared with ours.
+ISOCHRONES is a Parquet or CSV file with one row per point and the columns metallicity ([M/H]), log_age (log10 yr), eep
+(equivalent evolutionary point, numbered as in Dotter 2016), initial_mass (Msun), log_teff (K) and log_l (Lsun). The
+isochrones of MIST (https://waps.cfa.harvard.edu/MIST) have these columns under other names. OTHER has the same columns
+without eep; its hottest stars are compared with the fit.
 """
 
 from __future__ import annotations
@@ -30,18 +30,32 @@ SOURCE = """# Fit to MIST isochrones, v/v_crit = 0.4: Choi et al. 2016, ApJ 823,
 # A row is a point of evolution at a knot of log age; columns are coefficients of powers 0 .. 4 of [M/H]:
 # log10 L / Lsun, log10 Teff / K; mass: log10 of the mass that leaves the main sequence, Msun, then log10 of the
 # differences of initial mass between points, in units of it."""
-# Least difference of two masses, of the one that leaves the main sequence: less is the tables' rounding.
+# Smallest difference of two initial masses, relative to the turn-off mass. Smaller ones are rounding errors of the
+# tables.
 _MIN_MASS_DIFFERENCE = 1e-5
 
 
 def read(path: Path) -> dict[str, Float]:
-    """The columns of NAMES that the table has."""
+    """Return the columns of NAMES that the table has."""
     table = pyarrow.parquet.read_table(path) if path.suffix == ".parquet" else pyarrow.csv.read_csv(path)
     return {name: table[name].to_numpy().astype(float) for name in NAMES if name in table.column_names}
 
 
 def sample_isochrones(table: dict[str, Float]) -> tuple[Float, Float, dict[str, Float]]:
-    """Ages, metallicities [k], and at the points of the fit log_l, log_teff, and mass as `model.masses` reads it."""
+    """Sample the isochrones at the points of the fit.
+
+    Parameters
+    ----------
+    table : dict of str to float array
+        Columns of the table.
+
+    Returns
+    -------
+    age, metallicity : float array, shape (k,)
+        log10 age in yr, and [M/H], of each isochrone.
+    samples : dict of str to float array, shape (k, points)
+        log_l, log_teff, and mass in the form that `model.masses` reads.
+    """
     age = table["log_age"]
     inside = (age > model.AGES[0] - 1e-6) & (age < model.AGES[-1] + 1e-6)
     inside &= (table["metallicity"] >= model.min_metallicity(age)) & (table["metallicity"] <= model.METALLICITIES[-1])
@@ -70,7 +84,20 @@ def sample_isochrones(table: dict[str, Float]) -> tuple[Float, Float, dict[str, 
 
 
 def fit_coefficients(age: Float, metallicity: Float, values: Float) -> Float:
-    """[point, knot, power] by least squares."""
+    """Fit values at the points of the isochrones by least squares.
+
+    Parameters
+    ----------
+    age, metallicity : float array, shape (k,)
+        log10 age in yr, and [M/H], of each isochrone.
+    values : float array, shape (k, points)
+        Values to fit.
+
+    Returns
+    -------
+    float array, shape (points, knots, powers)
+        Coefficients of the powers of [M/H] at each knot of log age.
+    """
     knot, weight = model.bracket_age(age)
     shares = np.zeros((age.size, len(model.AGES)))
     shares[np.arange(age.size), knot] = 1.0 - weight
@@ -82,7 +109,17 @@ def fit_coefficients(age: Float, metallicity: Float, values: Float) -> Float:
 
 
 def write(path: Path, coefficients: dict[str, Float], comments: list[str]) -> None:
-    """The table, with its sources and what was said of its errors before it."""
+    """Write the table.
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    coefficients : dict of str to float array, shape (points, knots, powers)
+        Coefficients by column name.
+    comments : list of str
+        Lines about the errors of the fit, written below the sources.
+    """
     powers = range(model.DEGREE + 1)
     lines = [SOURCE, *(f"# {line}" for line in comments)]
     lines.append(",".join(["point", "log_age", *(f"{name}_{k}" for name in coefficients for k in powers)]))
@@ -99,7 +136,20 @@ def write(path: Path, coefficients: dict[str, Float], comments: list[str]) -> No
 
 
 def residuals(age: Float, metallicity: Float, samples: dict[str, Float]) -> list[str]:
-    """Sentences: rms and largest differences of what the table gives from what it is a fit to, by phase and age."""
+    """Describe the rms and the largest differences between the fit and the isochrones, by phase and age.
+
+    Parameters
+    ----------
+    age, metallicity : float array, shape (k,)
+        log10 age in yr, and [M/H], of each isochrone.
+    samples : dict of str to float array, shape (k, points)
+        Samples of the isochrones.
+
+    Returns
+    -------
+    list of str
+        One sentence per range of age and phase.
+    """
     fit = model.isochrones(10.0 ** (age - 9.0), metallicity)
     main, comments = fit.main_sequence, []
     phases = {"main sequence": slice(0, main), "to the tip of the giant branch": slice(main, main + model.FLASH),
@@ -117,7 +167,7 @@ def residuals(age: Float, metallicity: Float, samples: dict[str, Float]) -> list
 
 
 def compare_hottest(path: Path) -> list[str]:
-    """The hottest point of old isochrones beside the one of another table."""
+    """Compare the hottest points of old isochrones in the fit and in another table; return one line per isochrone."""
     table, comments = read(path), []
     for age, metals in ((12.5, -2.0), (12.5, -1.5), (10.0, -1.0), (10.0, -0.5), (5.0, 0.0)):
         ages = np.unique(table["log_age"])
@@ -135,6 +185,7 @@ def compare_hottest(path: Path) -> list[str]:
 
 
 def main() -> int:
+    """Run the command and return its exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("isochrones", type=Path)
     parser.add_argument("--test", type=Path, nargs="*", default=[])

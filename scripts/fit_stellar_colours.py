@@ -3,8 +3,8 @@
     python scripts/fit_stellar_colours.py GRID [--out FILE]
 
 GRID is a table of mean surface fluxes f_lambda (erg s-1 cm-2 um-1) of model atmospheres in the bands of TITLES, by
-Teff, log g and [Fe/H]: model_grid_CK04.dat of astroARIADNE (https://github.com/jvines/astroARIADNE, MIT licence) is
-one.  The models' logarithms of fluxes are linear between the grid's own nodes.
+Teff, log g and [Fe/H]. One such table is model_grid_CK04.dat of astroARIADNE (https://github.com/jvines/astroARIADNE,
+MIT licence). Logarithms of fluxes are interpolated linearly between the nodes of the grid.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from lake_schema.units import LIGHT_ANGSTROM_S
 from truesky.fluxes import passbands
 from truesky.fluxes.libraries import model_stars
 
-# Title in the grid of each band of model_stars.BANDS.
+# Column title in the grid for each band of model_stars.BANDS.
 TITLES = {
     "sdss_u": "SDSS_u", "sdss_g": "SDSS_g", "bessell_v": "GROUND_JOHNSON_V", "sdss_r": "SDSS_r", "sdss_i": "SDSS_i",
     "sdss_z": "SDSS_z", "twomass_j": "2MASS_J", "twomass_h": "2MASS_H", "twomass_ks": "2MASS_Ks",
@@ -35,14 +35,14 @@ SOURCE = """# Model atmospheres of Castelli & Kurucz 2003 (IAU Symp. 210, A20; C
 # https://github.com/jvines/astroARIADNE/blob/master/LICENSE.
 # Made by scripts/fit_stellar_colours.py.  Bands: AB magnitude less that in bessell_v; bolometric_h: M_bol - M_H
 # (AB)."""
-# IAU 2015: luminosity of M_bol = 0, erg/s; Stefan and Boltzmann's constant, cgs; 10 pc, cm.
+# Luminosity for M_bol = 0 (IAU 2015), erg/s; Stefan-Boltzmann constant, cgs; 10 pc, cm.
 _L0, _SIGMA, _TEN_PC = 3.0128e35, 5.670374419e-5, 3.0856775814913673e19
 _AB = 48.6
 _ANGSTROM_PER_UM = 1e4
 
 
 def read(path: Path) -> tuple[tuple[Float, Float, Float], Float]:
-    """Axes (Teff, log g, [Fe/H]) of the grid, and ln f_nu [teff, log_g, metallicity, band]; NaN where it is empty."""
+    """Return the axes (Teff, log g, [Fe/H]) and ln f_nu [teff, log_g, metallicity, band], with NaN in empty nodes."""
     with path.open(encoding="utf-8") as file:
         titles = file.readline().lstrip("#").split()
     table = np.loadtxt(path)
@@ -57,6 +57,7 @@ def read(path: Path) -> tuple[tuple[Float, Float, Float], Float]:
 
 
 def main() -> int:
+    """Run the command and return its exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("grid", type=Path)
     parser.add_argument("--out", type=Path, default=model_stars.TABLE)
@@ -73,10 +74,10 @@ def main() -> int:
             for z in model_stars.METALLICITY:
                 mags = -2.5 / np.log(10.0) * look_up((np.log(t), g, z))
                 if not np.isfinite(mags).all():
-                    raise SystemExit(f"{options.grid}: no model of {t:.0f} K, log g {g}, [M/H] {z}")
+                    raise SystemExit(f"{options.grid}: the grid has no model with {t:.0f} K, log g {g}, [M/H] {z}")
                 v = mags[bands.index("bessell_v")]
                 colors = [f"{m - v:.4f}" for b, m in zip(bands, mags, strict=True) if b != "bessell_v"]
-                # Of a star of any radius.
+                # The result does not depend on the radius of the star.
                 m_bol = -2.5 * np.log10(4.0 * np.pi * _TEN_PC**2 * _SIGMA * t**4 / _L0)
                 bolometric = m_bol - (mags[bands.index("twomass_h")] - _AB)
                 lines.append(",".join([f"{t:.2f}", f"{g:g}", f"{z:g}", f"{bolometric:.4f}", *colors]))

@@ -1,9 +1,9 @@
-"""Write the documentation site: the pages of docs/, the notebooks with their figures, references made from the code.
+"""Write the documentation site: the pages of docs/, the notebooks, and references made from the code.
 
     python -m scripts.make_docs [--out out/site] [--notebooks]
 
---notebooks runs them (on the lake that `make demo` leaves in out/demo), and takes pictures of the page over that lake;
-without it they are shown as they are kept, without figures. Nothing is downloaded.
+With --notebooks, the notebooks are run on the lake that `make demo` leaves in out/demo, and pictures of the page over
+that lake are taken. Otherwise the notebooks are shown as stored, without figures. Nothing is downloaded.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from lake_schema.mission.configuration import resolve
 from scripts import docs_references, page_pictures, structure_picture
 
 ROOT = Path(__file__).resolve().parents[1]
-# Chapters of the site: title, pages.  Those of docs/ that none names tell how to do something.
+# Chapters of the site: title and pages. Pages of docs/ that no chapter names are how-to pages.
 CHAPTERS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("Tutorials", ("notebooks",)),
     ("How to", ("others",)),
@@ -52,12 +52,12 @@ _NOTEBOOK = re.compile(r"\]\((?:\.\./)*notebooks/([^)]*)\.ipynb\)")
 
 
 def notebooks(into: Path, run: bool) -> list[str]:
-    """Pages made of the notebooks; their names."""
+    """Write the notebooks as pages and return the names of the pages; `run` executes them first."""
     pages = []
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
         notebook = nbformat.read(path, as_version=4)
         if run:
-            # Those that look at a field look at that of `make demo`, which it has rendered; others make their own.
+            # Notebooks about a field use the lake of `make demo`; the others make a lake.
             makes_own_lake = path.stem.endswith(("shear", "slitless"))
             demo = {} if makes_own_lake else {"TRUESKY_REQUEST": str(_DEMO), "TRUESKY_LAKE": str(_DEMO_LAKE)}
             client = NotebookClient(notebook, timeout=1800, resources={"metadata": {"path": str(path.parent)}})
@@ -77,7 +77,7 @@ def notebooks(into: Path, run: bool) -> list[str]:
 
 
 def pages(into: Path, run: bool) -> None:
-    """Write all pages."""
+    """Write all pages to a folder; `run` executes the notebooks."""
     shutil.copytree(ROOT / "docs", into, dirs_exist_ok=True)
     mission = resolve()
     generated = {
@@ -97,7 +97,7 @@ def pages(into: Path, run: bool) -> None:
     listed = {"notebooks": tutorials, "others": sorted({path.name for path in into.glob("*.md")} - named)}
     for path in into.glob("*.md"):
         text = _NOTEBOOK.sub(r"](tutorials/\1.md)", path.read_text(encoding="utf-8"))
-        # A file of the clone is named; the site does not hold it.
+        # Links to files that the site does not contain become names.
         path.write_text(_FILE.sub(r"`\1`", text).replace("](docs/", "]("), encoding="utf-8")
     with (into / "index.md").open("a", encoding="utf-8") as home:
         for title, names in CHAPTERS:
@@ -106,7 +106,7 @@ def pages(into: Path, run: bool) -> None:
 
 
 def _with_pictures(into: Path) -> None:
-    """Spiral galaxies; the page over a lake as a browser shows it, where there is one."""
+    """Add pictures of spiral galaxies and, if a browser is available, of the page over a lake."""
     structure_picture.write(into / "structure.jpg")
     if why := page_pictures.missing_requirement():
         print(f"docs: no pictures of the page: {why}")
@@ -117,7 +117,7 @@ def _with_pictures(into: Path) -> None:
 
 
 def build(source: Path, out: Path) -> int:
-    """The site of a folder of pages; 0 without errors and warnings."""
+    """Build the site from a folder of pages. Return 0 if there are no errors and no warnings."""
     configuration = {
         "project": "truesky",
         "extensions": ["myst_parser", "sphinx.ext.autodoc"],
@@ -135,15 +135,16 @@ def build(source: Path, out: Path) -> int:
 
 
 def _show_verbatim(*event: Any) -> None:
-    """A docstring is shown as it is written."""
+    """Show a docstring exactly as it is written."""
     lines = event[-1]
     lines[1:] = ["", "::", "", *("    " + line for line in lines[1:]), ""] if any(lines[1:]) else []
 
 
 def main() -> None:
+    """Run the command."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "site")
-    parser.add_argument("--notebooks", action="store_true", help="run the notebooks, for their figures")
+    parser.add_argument("--notebooks", action="store_true", help="run the notebooks to make their figures")
     options = parser.parse_args()
     matplotlib.use("Agg")
     with tempfile.TemporaryDirectory() as folder:
@@ -151,7 +152,7 @@ def main() -> None:
         source.mkdir()
         pages(source, options.notebooks)
         if build(source, options.out):
-            raise SystemExit("truesky: the site has errors, above")
+            raise SystemExit("truesky: the site has errors, listed above")
     print(options.out / "index.html")
 
 

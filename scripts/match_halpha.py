@@ -1,9 +1,10 @@
-"""Make truesky/catalogue/galaxies/halpha_matching.csv: which H alpha luminosity a star formation rate's stands for.
+"""Make truesky/catalogue/galaxies/halpha_matching.csv, which corrects H alpha luminosities from star formation rates.
 
     python scripts/match_halpha.py [--cells 120]
 
-A sample without structure (every halo where the mean says) is drawn once; per redshift, its cumulative counts of raw
-luminosities are matched to those of Pozzetti et al. 2016, model 3.  The table is monotone and the same for every seed.
+A sample without clustering (every halo has the mean properties) is drawn once. At each redshift, its cumulative counts
+of uncorrected luminosities are matched to model 3 of Pozzetti et al. 2016. The table is monotone and the same for every
+seed.
 """
 
 from __future__ import annotations
@@ -31,13 +32,16 @@ from truesky.validation.model import mean_sky
 SEED, UNIVERSE = 2016, Universe(galaxy_limit=26.0, z_max=6.0, lensing=(0.0, 0.0), box_cells=192)
 EDGES = np.concatenate([[0.03, 0.2], np.arange(0.3, 3.01, 0.1), [3.3, 3.7, 4.2, 5.0, 6.0]])
 LOG_L = np.linspace(39.0, 43.6, 47)
-# A luminosity that fewer have takes the shift of the last that enough have.
+# Luminosities exceeded by fewer galaxies than this take the shift of the highest luminosity with enough of them.
 ENOUGH = 15
 CM_PER_MPC = 3.0856775814913673e24
 
 
 def sample(cells: int) -> tuple[np.ndarray, np.ndarray]:
-    """(z, raw log L) of galaxies with I_E < WANTED.galaxy_limit in so many cells' area."""
+    """Return redshifts and uncorrected log L (erg/s) of galaxies brighter than the limit of UNIVERSE in some cells.
+
+    `cells` is the number of cells of the sample.
+    """
     lines = emission_lines.model_from_table(np.array([0.0, 9.0]), np.array([0.0, 99.0]), np.zeros((2, 2)))
     universe = replace(mean_sky.without_clustering(galaxies.model(SEED, UNIVERSE)), lines=lines)
     rows = mean_sky.rows(universe, 0, cells)
@@ -48,7 +52,22 @@ def sample(cells: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def shifts(z: np.ndarray, raw: np.ndarray, area: float) -> np.ndarray:
-    """What is to be added to log L, [z bin, node]."""
+    """Return the correction of log L in dex.
+
+    Parameters
+    ----------
+    z : float array, shape (n,)
+        Redshifts.
+    raw : float array, shape (n,)
+        Uncorrected log10 L in erg/s.
+    area : float
+        Area of the sample in square degrees.
+
+    Returns
+    -------
+    float array, shape (redshift bins, nodes)
+        Corrections at the luminosities LOG_L.
+    """
     rows = []
     for z_low, z_high in pairwise(EDGES):
         middle = 0.5 * (z_low + z_high)
@@ -57,7 +76,7 @@ def shifts(z: np.ndarray, raw: np.ndarray, area: float) -> np.ndarray:
         log_luminosity = np.linspace(38.0, 45.0, 281)
         counts = emission_lines.expected_counts(10.0**log_luminosity / (4 * np.pi * distance**2), z_low, z_high) * area
         above = luminosities.size - np.searchsorted(luminosities, LOG_L)
-        # Counts fall with luminosity: interpolate their logarithms backwards.
+        # Counts decrease with luminosity, so that their negative logarithms increase as interpolation requires.
         matched = np.interp(-np.log(np.maximum(above, 1)), -np.log(np.maximum(counts, 1e-9)), log_luminosity)
         shift = matched - LOG_L
         last = int(np.flatnonzero(above >= ENOUGH)[-1])
@@ -69,6 +88,7 @@ def shifts(z: np.ndarray, raw: np.ndarray, area: float) -> np.ndarray:
 
 
 def main() -> None:
+    """Run the command."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cells", type=int, default=120, help="generation cells to draw (0.052 deg2 each)")
     cells = parser.parse_args().cells

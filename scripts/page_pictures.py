@@ -1,6 +1,8 @@
-"""Pictures of the page over the lake of `make demo`, for the documentation: python -m scripts.page_pictures FOLDER.
+"""Take pictures of the page over the lake of `make demo` for the documentation.
 
-They are taken in a chromium of the system's, driven by playwright (extra `test`); without these there are none.
+    python -m scripts.page_pictures FOLDER
+
+The system's Chromium takes the pictures, driven by Playwright (extra `test`). Both must be installed.
 """
 
 from __future__ import annotations
@@ -23,17 +25,17 @@ _TOKEN, _SIZE, _LONGEST = "a-token-of-the-pictures", {"width": 1400, "height": 8
 
 
 def missing_requirement() -> str:
-    """What there is not, "" where pictures can be taken."""
+    """Return a message about a missing requirement, or "" if pictures can be taken."""
     if importlib.util.find_spec("playwright") is None:
         return "playwright is not installed (make .venv/installed-test)"
     if CHROMIUM is None:
-        return "there is no chromium (Debian: apt install chromium)"
-    return "" if LAKE.is_dir() else f"there is no {LAKE} (make demo)"
+        return "Chromium is not installed (Debian: apt install chromium)"
+    return "" if LAKE.is_dir() else f"{LAKE} does not exist (make demo)"
 
 
 @contextmanager
 def serve_page(lake: Path) -> Iterator[str]:
-    """Address of a page over a lake, while the block lasts."""
+    """Serve the page over a lake while the block runs, and yield its address."""
     command = [sys.executable, "-m", "truesky.page", str(lake), "--no-open", "--token", _TOKEN]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as server:
         try:
@@ -44,7 +46,7 @@ def serve_page(lake: Path) -> Iterator[str]:
 
 
 def wait_until(tab: Any, expression: str) -> Any:
-    """Wait until JavaScript says something that is true; a page that refuses eval can be waited for only so."""
+    """Wait until a JavaScript expression is true and return its value. It polls because the page forbids eval."""
     end = time.monotonic() + _LONGEST
     while not (value := tab.evaluate(expression)):
         if time.monotonic() > end:
@@ -78,7 +80,7 @@ def _images(tab: Any) -> None:
     tab.check("#image-truth")
     time.sleep(4.0)
     box = tab.locator("#image-canvas").bounding_box()
-    # A bright star, and a galaxy beside it.
+    # A bright star with a galaxy next to it.
     x, y = box["x"] + 0.755 * box["width"], box["y"] + 0.823 * box["height"]
     tab.mouse.move(x, y)
     for _ in range(8):
@@ -107,7 +109,7 @@ VIEWS: tuple[tuple[str, str, Callable[[Any], None]], ...] = (
 
 
 def pictures(into: Path) -> list[tuple[str, str]]:
-    """Take them; returns file names and captions.  Errors: RuntimeError where the page has an error"""
+    """Take the pictures and return their file names and captions. Raises RuntimeError if the page has errors."""
     from playwright.sync_api import sync_playwright
 
     files = []
@@ -136,6 +138,7 @@ def pictures(into: Path) -> list[tuple[str, str]]:
 
 
 def main() -> None:
+    """Run the command."""
     if why := missing_requirement():
         raise SystemExit(f"truesky: {why}")
     folder = Path(sys.argv[1])

@@ -1,9 +1,9 @@
-"""Write requirements/*.txt: every package at one version, with the sha256 of each of its files; needs `uv`.
+"""Write requirements/*.txt: one version of every package, with the sha256 of each of its files. Requires `uv`.
 
     python scripts/pin_packages.py [--upgrade]
 
-Versions stay as they are unless asked for newer ones. A package has one version in all of the lists except
-oldest.txt, which has the lowest versions of the packages that pyproject.toml names.
+Versions are unchanged without --upgrade. A package has one version in all lists except oldest.txt, which has the lowest
+versions of the packages that pyproject.toml names.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ Pins = dict[str, list[str]]
 
 
 def read(text: str) -> Pins:
-    """The lines of each package, by name."""
+    """Return the lines of each package by name."""
     pins: Pins = {}
     for line in text.splitlines():
         if match := re.match(r"([\w.-]+)==", line):
             name = match[1]
             if name in pins:
-                raise SystemExit(f"{name} has two versions, on machines or Pythons of different kinds: bound it")
+                raise SystemExit(f"{name} has two versions for different platforms: set a limit in pyproject.toml")
             pins[name] = []
         if line and line[0] not in "#-":
             pins[name].append(line)
@@ -51,27 +51,27 @@ def read(text: str) -> Pins:
 
 
 def versions(pins: Pins) -> list[str]:
-    """name==version of each package."""
+    """Return name==version of each package."""
     return [lines[0].split()[0] for lines in pins.values()]
 
 
 def resolve_versions(requirement_files: Sequence[Path], *options: str) -> str:
-    """Text that uv prints for lists and for pyproject.toml."""
+    """Return the text that uv prints for requirement files and pyproject.toml."""
     command = ["uv", "pip", "compile", *map(str, requirement_files), "--generate-hashes", "--universal"]
     command += ["--python-version", "3.11.7", "--quiet", "--no-annotate", "--no-header", *options]
     return subprocess.run(command, check=True, capture_output=True, text=True).stdout
 
 
 def compile_pins(requirement_files: Sequence[Path], constraints: Path, *options: str) -> Pins:
-    """What uv makes of lists and of pyproject.toml, at the versions of `known` where it has them."""
+    """Resolve requirement files with uv, restricted to the versions in `constraints`."""
     return read(resolve_versions(requirement_files, "--constraint", str(constraints), *options))
 
 
 def oldest(project: Path, folder: Path, all_pins: Pins, previous: Pins) -> Pins:
-    """The lowest versions of the packages that pyproject.toml names, with the tests' packages and all dependencies.
+    """Return the lowest versions of the packages that pyproject.toml names, with test packages and all dependencies.
 
-    Dependencies have the versions of `before`, or else of `every`, if they fit. The lowest numba, for example, needs an
-    older llvmlite.
+    Dependencies have the versions of `previous`, or else of `all_pins`, if they are compatible. The lowest numba, for
+    example, needs an older llvmlite.
     """
     table = tomllib.loads(project.read_text())["project"]
     lines = [*table["dependencies"], *(line for extra in IMPORTED for line in table["optional-dependencies"][extra])]
@@ -79,7 +79,7 @@ def oldest(project: Path, folder: Path, all_pins: Pins, previous: Pins) -> Pins:
     tools, written = folder / "tools.in", folder / "oldest.txt"
     pinned = {name: pin.partition("==")[2] for name, pin in zip(all_pins, versions(all_pins), strict=True)}
     tools.write_text("\n".join(f"{name}=={pinned[name.partition('[')[0]]}" for name in TESTED_WITH))
-    # uv prefers the versions in the file that it is going to write.
+    # uv prefers the versions that the output file already contains.
     rest = {name: lines for name, lines in (all_pins | previous).items() if name not in named}
     written.write_text("\n".join(versions(rest)))
     extras = [word for extra in IMPORTED for word in ("--extra", extra)]
@@ -88,8 +88,9 @@ def oldest(project: Path, folder: Path, all_pins: Pins, previous: Pins) -> Pins:
 
 
 def main() -> None:
+    """Run the command."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--upgrade", action="store_true", help="the newest versions that pyproject.toml admits")
+    parser.add_argument("--upgrade", action="store_true", help="use the newest versions that pyproject.toml allows")
     upgrade = parser.parse_args().upgrade
     files = {name: FOLDER / f"{name}.txt" for name in DESCRIPTIONS}
     current = {name: read(file.read_text()) for name, file in files.items() if file.exists()}
@@ -99,14 +100,14 @@ def main() -> None:
         builders.write_text("\n".join(BUILDERS))
         previous = current.pop("oldest", {})
         constraints.write_text("" if upgrade else "\n".join(pin for pins in current.values() for pin in versions(pins)))
-        # All together decide the versions, once; each list then takes its own of them.
+        # One resolution of all packages decides the versions; each list then takes its part.
         all_pins = compile_pins([project, builders], constraints, "--all-extras")
         constraints.write_text("\n".join(versions(all_pins)))
         run = compile_pins([project], constraints, "--extra", "page", "--extra", "reduction")
         lists = {"run": run, "build": compile_pins([builders], constraints)}
         for extra in ("test", "bench", "s3"):
             extra_pins = compile_pins([project], constraints, "--extra", extra)
-            # What run.txt has for some machines alone may here be wanted on all.
+            # A package that run.txt restricts to some machines may be required on all of them here.
             lists[extra] = {name: lines for name, lines in extra_pins.items() if lines != lists["run"].get(name)}
         lists["java"] = {JAVA: lists["test"].pop(JAVA)}
         lists["oldest"] = oldest(project, Path(name), all_pins, {} if upgrade else previous)

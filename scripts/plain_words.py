@@ -33,7 +33,7 @@ PATHS = (
     "truesky", "lake_schema", "jobs", "scripts", "benchmarks", "docs", "README.md", "CONTRIBUTING.md", "CHANGELOG.md",
     "SECURITY.md",
 )  # fmt: skip
-# Only longer files have a rate of their own.
+# Only files with at least this number of words have a rate.
 LONG_FILE = 200
 MESSAGE = "message"
 HELP_ARGUMENTS = ("help", "description", "epilog")
@@ -144,7 +144,7 @@ def _constant_text(node: ast.AST) -> str:
 
 
 def _comments(source: str) -> Iterator[Text]:
-    """Yield blocks of comments on consecutive lines; instructions for tools are no prose."""
+    """Yield blocks of comments on consecutive lines, without instructions for tools."""
     block, first = list[str](), 0
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         text = token.string.lstrip("#").strip()
@@ -244,14 +244,14 @@ class Report:
 
     def file_rates(self) -> dict[str, float]:
         """Return places per 1,000 words of each long file."""
-        found = Counter(hit.path for hit in self.hits if hit.rule != "names")
+        hit_counts = Counter(hit.path for hit in self.hits if hit.rule != "names")
         totals = {path: words.total() for path, words in self.words.items()}
-        return {path: 1000.0 * found[path] / total for path, total in totals.items() if total >= LONG_FILE}
+        return {path: 1000.0 * hit_counts[path] / total for path, total in totals.items() if total >= LONG_FILE}
 
     def counts(self) -> dict[str, int]:
         """Return the number of places, vague names among them, of each file that has any."""
-        found = Counter(hit.path for hit in self.hits)
-        return {path: found[path] for path in sorted(found)}
+        hit_counts = Counter(hit.path for hit in self.hits)
+        return {path: hit_counts[path] for path in sorted(hit_counts)}
 
 
 def read_files(paths: list[Path], settings: Settings) -> Report:
@@ -273,9 +273,10 @@ def read_files(paths: list[Path], settings: Settings) -> Report:
 
 def print_report(report: Report, settings: Settings, rows: int = 10) -> None:
     """Print the rates, the number of places of each rule, and the files with the highest rates."""
-    found, words = Counter(hit.rule for hit in report.hits), sum(c.total() for c in report.words.values())
+    hit_counts, words = Counter(hit.rule for hit in report.hits), sum(c.total() for c in report.words.values())
     for rule in settings.rules:
-        print(f"{found[rule.name]:6d} {1000.0 * found[rule.name] / max(words, 1):6.2f}  {rule.name}: {rule.problem}")
+        rate = 1000.0 * hit_counts[rule.name] / max(words, 1)
+        print(f"{hit_counts[rule.name]:6d} {rate:6.2f}  {rule.name}: {rule.problem}")
     by_file = report.file_rates()
     for path in sorted(by_file, key=lambda name: -by_file[name])[:rows]:
         print(f"{by_file[path]:13.1f}  {path}")

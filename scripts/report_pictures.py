@@ -1,6 +1,8 @@
-"""Figures of a report of `truesky validate`, side by side: python -m scripts.report_pictures REPORT [FILE].
+"""Join figures of a report of `truesky validate` in one picture, for docs/pilot.md.
 
-Those of VIS, NISP-P and the galaxies that docs/pilot.md shows. FILE : JPEG, else docs/pilot_validation.jpg.
+    python -m scripts.report_pictures REPORT [FILE]
+
+The picture has figures of VIS, NISP-P and the galaxies. FILE is a JPEG, by default docs/pilot_validation.jpg.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from pathlib import Path
 from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[1]
-# How their captions begin, in rows of two; pixels that each is wide, and between rows.
+# Beginnings of the captions, in rows of two; width of a figure and gap between rows, pixels.
 CAPTIONS = (
     "VIS: positions", "VIS: magnitudes", "VIS: noise", "VIS: sources that are found",
     "NISP-P: positions", "NISP-P: magnitudes", "galaxies: counts", "galaxies: how they cluster",
@@ -26,13 +28,13 @@ _FIGURE = re.compile(r"<img alt='[^']*' src='data:image/png;base64,([^']+)'><fig
 
 
 def figures(report: str) -> dict[str, Image.Image]:
-    """Caption -> picture of a report's HTML."""
+    """Return the figures in the HTML of a report, by caption."""
     matches = _FIGURE.findall(report)
     return {unescape(text): Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB") for data, text in matches}
 
 
 def side_by_side(pictures: Sequence[Image.Image]) -> Image.Image:
-    """In rows of two, as wide as each other."""
+    """Join figures in rows of two, scaled to the same width."""
     scaled = [
         picture.resize((_WIDE, round(picture.height * _WIDE / picture.width)), Image.Resampling.LANCZOS)
         for picture in pictures
@@ -48,9 +50,9 @@ def side_by_side(pictures: Sequence[Image.Image]) -> Image.Image:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Exit status: 0, 2 where there is no report, or where it lacks one of the figures."""
+    """Run the command. The exit status is 0, or 2 if there is no report or it lacks one of the figures."""
     if not argv or not Path(argv[0]).is_file():
-        print(f"{' '.join(argv) or 'report_pictures'}: no report of truesky validate", file=sys.stderr)
+        print(f"{' '.join(argv) or 'report_pictures'}: not a report of truesky validate", file=sys.stderr)
         return 2
     report_figures = figures(Path(argv[0]).read_text(encoding="utf-8"))
     chosen = [
@@ -59,7 +61,7 @@ def main(argv: Sequence[str]) -> int:
     pictures = [picture for picture in chosen if picture is not None]
     if len(pictures) < len(CAPTIONS):
         lacking = ", ".join(name for name, picture in zip(CAPTIONS, chosen, strict=True) if picture is None)
-        print(f"{argv[0]}: no figure of {lacking}", file=sys.stderr)
+        print(f"{argv[0]}: the report has no figure {lacking}", file=sys.stderr)
         return 2
     target = Path(argv[1]) if len(argv) > 1 else ROOT / "docs" / "pilot_validation.jpg"
     side_by_side(pictures).save(target, quality=82, optimize=True)

@@ -1,6 +1,9 @@
-"""A picture of spiral discs, smooth and with arms and knots: python -m scripts.structure_picture [FILE].
+"""Draw a picture of spiral galaxies, with smooth discs and with arms and knots.
 
-They are drawn through VIS's PSF on a corner of a detector, without noise.
+    python -m scripts.structure_picture [FILE]
+
+The galaxies are drawn with the PSF of VIS on a corner of a detector, without noise. FILE is a JPEG, by default
+docs/structure.jpg.
 """
 
 from __future__ import annotations
@@ -28,7 +31,8 @@ from truesky.request.accuracy import SURVEY
 from truesky.request.structure import Arms
 
 ROOT = Path(__file__).resolve().parents[1]
-# Side of a panel, pixels; electrons of a galaxy, of a pixel's noise, and of the softest and the brightest grey.
+# Side of a panel, pixels; electrons per galaxy; noise per pixel, electrons; softening and white level of the grey
+# scale, electrons.
 _SIDE, _LIGHT, _NOISE, _SOFT, _WHITE = 160, 2e5, 12.0, 8.0, 1000.0
 _GALAXIES = {
     "bulge_half_light_radius": [0.5, 0.6, 0.3, 0.4], "disk_half_light_radius": [2.2, 2.4, 1.5, 2.6],
@@ -39,7 +43,7 @@ _GALAXIES = {
 
 
 def draw(discs: DiscStructure | None) -> Float:
-    """Electrons of the four galaxies side by side."""
+    """Return the four galaxies side by side in electrons; `discs` None means smooth discs."""
     mission = resolve()
     detector = replace(detectors.detector("vis", "3-4", mission), nx=4 * _SIDE, ny=_SIDE)
     system = astrometry.wcs(detector, *boresight_for(detector, 53.1, -27.8, 0.0))
@@ -55,7 +59,7 @@ def draw(discs: DiscStructure | None) -> Float:
 
 
 def write(path: Path) -> None:
-    """The picture, a JPEG."""
+    """Write the picture as JPEG."""
     panels = np.concatenate([draw(None)[::-1], draw(DiscStructure(Arms(), 1))[::-1]])
     grey = np.arcsinh(np.maximum(panels, 0.0) / _SOFT) / np.arcsinh(_WHITE / _SOFT)
     enlarged = np.minimum(grey, 1.0).repeat(2, axis=0).repeat(2, axis=1)

@@ -52,9 +52,9 @@ def small(name):
         # Fields and calibrations lie where they lay.
         if "ra" not in block:
             block.setdefault("area", table["area"])
-    with pytest.raises(BadInput, match="this would do") as refused:
+    with pytest.raises(BadInput, match="this area is large enough") as refused:
         plan.check(from_table({**table, "area": {"cone": {"ra": 0.0, "dec": -60.0, "radius": 0.0}}}))
-    table["area"] = tomllib.loads(re.search(r"this would do: \[area\] (.*)", str(refused.value))[1])
+    table["area"] = tomllib.loads(re.search(r"this area is large enough: \[area\] (.*)", str(refused.value))[1])
     return table
 
 

@@ -1,4 +1,4 @@
-"""Build the table `gaia` of a lake's stars.
+"""Build the table `gaia` from the stars of a lake.
 
 spark-submit jobs/catalogue/build_gaia.py --lake LAKE --request REQUEST
 """

@@ -1,4 +1,4 @@
-"""Build tables `halos`, `halo_limits`, `galaxies` and `quarantine` of a request.
+"""Build the tables `halos`, `halo_limits`, `galaxies` and `quarantine` of a request.
 
 spark-submit jobs/catalogue/build_galaxies.py --lake LAKE --request REQUEST
 """

@@ -1,4 +1,4 @@
-"""Build table `strong_lenses` of a lake's galaxies, with pictures of the arcs.
+"""Build the table `strong_lenses` and the images of the arcs of a request.
 
 spark-submit jobs/catalogue/build_strong_lenses.py --lake LAKE --request REQUEST
 """

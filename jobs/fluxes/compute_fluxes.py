@@ -1,4 +1,4 @@
-"""Band fluxes of every source of a lake, and the tables of what they were made with.
+"""Compute the band fluxes of all sources of a lake, and store the passbands and templates used.
 
 spark-submit jobs/fluxes/compute_fluxes.py --lake LAKE --request REQUEST
 """

@@ -34,8 +34,10 @@ def test_its_pages(tmp_path, monkeypatch):
     effects = (tmp_path / "effects.md").read_text()
     assert [name for name in EFFECTS if f" {name}\n" not in effects] == []
     # Those that need more than a small frame, or another camera, are described alone.
-    assert all((tmp_path / name).is_file() for name in re.findall(r"!\[What \w+ does[^]]*\]\(([^)]*)\)", effects))
-    assert len(re.findall(r"!\[What \w+ does", effects)) >= len(EFFECTS) - 4
+    assert all(
+        (tmp_path / name).is_file() for name in re.findall(r"!\[Frame before and after \w+\]\(([^)]*)\)", effects)
+    )
+    assert len(re.findall(r"!\[Frame before and after ", effects)) >= len(EFFECTS) - 4
 
 
 @pytest.mark.nightly
@@ -54,6 +56,6 @@ def test_the_site(tmp_path):
     effects = (site / "effects.html").read_text()
     assert all(f">{name}<" in effects for name in EFFECTS)
     # Those that need more than a small frame, or another camera, are described alone.
-    assert len(re.findall(r'<img alt="What \w+ does', effects)) >= len(EFFECTS) - 4
+    assert len(re.findall(r'<img alt="Frame before and after \w+', effects)) >= len(EFFECTS) - 4
     loaded = re.findall(r'<(?:script|link|img)[^>]*(?:src|href)="(https?://[^"]*)"', home + effects)
     assert loaded == []

@@ -1,16 +1,11 @@
-"""The archive of a lake's images: what there is, of what, made when, with what, and what could not be made.
+"""List the images of a lake and the failed detectors, and render a published product again.
 
     python -m truesky.render.archive --lake LAKE [--name REQUEST] [--at RA DEC] [--sql "select .. from products"]
                                   [--failures | --exposures]
     python -m truesky.render.archive --lake LAKE --again PATH --out FILE.fits [--version KEY]
 
-products    the published products, each with its sha256, seconds and peak memory
-exposures   the files of whole exposures, likewise
-failures    detectors that a run could not render
-covering    those products whose footprint holds a place
-again       renders one of them anew, from the tables and the mission that it was made from
-
-A product's bytes depend on what it was made of alone; how long that took is in the logs of the runs.
+Products are listed with sha256, size, seconds and peak memory. The bytes of a product depend only on its inputs. Time
+and memory come from the logs of the runs.
 """
 
 from __future__ import annotations
@@ -35,7 +30,7 @@ from truesky.explore.process import Process
 from truesky.numerics import matrices
 from truesky.render.products import run_log
 
-# Bytes and s that a query of the archive may take.
+# Memory (bytes) and time (s) that a query of the archive may use.
 _MEMORY, _TIMEOUT = 1e9, 60.0
 _FAILURES = pa.schema(
     [
@@ -50,9 +45,9 @@ _FAILURES = pa.schema(
 
 
 def products(root: Path, request: str | None = None) -> pa.Table:
-    """Rows of the table `products` with sha256, bytes, seconds (s) and peak_gb (GB), null where no log says so.
+    """Return the rows of `products` with sha256, bytes, seconds, and peak_gb (GB). Values without a log entry are null.
 
-    request : whose products, where a lake has those of several
+    `request` selects the products if the lake has several requests.
     """
     version = read.version(root, "products", request=request)
     files = {entry["path"]: entry for entry in version.manifest["files"]}
@@ -68,14 +63,13 @@ def products(root: Path, request: str | None = None) -> pa.Table:
 
 
 def exposures(root: Path, request: str | None = None) -> pa.Table:
-    """Rows of the table `exposure_files` with sha256 and bytes.
+    """Return the rows of `exposure_files` with sha256 and bytes; `request` selects them if the lake has several.
 
-    request : whose files, where a lake has those of several
-    Errors  : BadInput where there are none, or none of the detectors' present images
+    Raises BadInput if the table does not exist or was made from an older version of `products`.
     """
     version, images = (read.version(root, name, request=request) for name in ("exposure_files", "products"))
     if version.manifest["facts"]["products"] != images.key:
-        raise BadInput('table exposure_files is of other images: run render_exposures with files = "exposure"')
+        raise BadInput('table exposure_files has outdated images: run render_exposures with files = "exposure"')
     rows, files = version.rows(), {entry["path"]: entry for entry in version.manifest["files"]}
     file_values = [[files[path][key] for path in rows["path"].to_pylist()] for key in ("sha256", "bytes")]
     return rows.append_column("sha256", pa.array(file_values[0], pa.string())).append_column(
@@ -84,9 +78,9 @@ def exposures(root: Path, request: str | None = None) -> pa.Table:
 
 
 def failures(root: Folder, request: str | None = None) -> pa.Table:
-    """Detectors whose last attempt failed: error, attempt, seconds, peak_gb (GB), and the run.
+    """Return the detectors whose last attempt failed: error, attempt, seconds, peak_gb (GB), and name of the run.
 
-    request : whose detectors, None = of all requests
+    `request` None means the detectors of all requests.
     """
     last = {(line["request"], line["part"]): line for line in _log_entries(root, request)}
     failed = [last[key] for key in sorted(last) if "error" in last[key]]
@@ -94,20 +88,33 @@ def failures(root: Folder, request: str | None = None) -> pa.Table:
 
 
 def rows_at_place(rows: pa.Table, ra: float, dec: float) -> pa.Table:
-    """Those of the products whose footprint (STC-S polygon of four corners) holds a place, its edge included."""
+    """Return the rows whose footprint contains a position (deg), including its edge.
+
+    Parameters
+    ----------
+    rows : pyarrow.Table
+        Products; `s_region` is an STC-S polygon with four corners.
+    ra, dec : float
+        ICRS position in degrees.
+
+    Returns
+    -------
+    pyarrow.Table
+        The selected rows.
+    """
     if not rows.num_rows:
         return rows
     corners = np.array([region.split()[2:] for region in rows["s_region"].to_pylist()], float).reshape(-1, 4, 2)
     edges = sky.unit_vectors(corners[..., 0], corners[..., 1])
     place = sky.unit_vectors(ra, dec)
-    # A place is inside where it is on one side of the great circles through all edges, and not at the antipode.
+    # A position is inside if it lies on the same side of the great circles through all edges, and not at the antipode.
     side = matrices.matmul(np.cross(edges, np.roll(edges, -1, axis=1)), place)
     inside = (side >= 0).all(axis=1) | (side <= 0).all(axis=1)
     return rows.filter(pa.array(inside & (matrices.matmul(edges.sum(axis=1), place) > 0)))
 
 
 def _log_entries(root: Folder, request: str | None = None) -> Iterator[dict[str, Any]]:
-    """What the runs' logs say of parts of `products`, oldest first, each with its run; of a request, or of all."""
+    """Yield the log lines of tasks of `products`, oldest first, with run and request; None means all requests."""
     for path in run_log.logs_of_products(root):
         lines = run_log.lines(path)
         request_name = next((str(line["request"]) for line in lines if "request" in line), "")
@@ -116,10 +123,28 @@ def _log_entries(root: Folder, request: str | None = None) -> Iterator[dict[str,
 
 
 def search(rows: pa.Table, sql: str, memory: float = _MEMORY, timeout: float = _TIMEOUT) -> pa.Table:
-    """The answer to a query of the rows, which it calls `products`; it reaches no file.
+    """Query the rows as the table `products`. The query cannot access files.
 
-    memory : bytes that the query may take;  timeout : s
-    rows   : of table `products`;  sql : one SELECT
+    Parameters
+    ----------
+    rows : pyarrow.Table
+        Rows of the table `products`.
+    sql : str
+        A SELECT statement.
+    memory : float
+        Memory in bytes that the query may use.
+    timeout : float
+        Time in seconds that the query may take.
+
+    Returns
+    -------
+    pyarrow.Table
+        The result.
+
+    Raises
+    ------
+    BadInput
+        If the query is invalid or exceeds its memory or time.
     """
     with tempfile.TemporaryDirectory(prefix="truesky-") as folder:
         file = Path(folder) / "products.arrow"
@@ -134,21 +159,40 @@ def search(rows: pa.Table, sql: str, memory: float = _MEMORY, timeout: float = _
 
 
 def _objects(rows: pa.Table) -> list[str]:
-    """The rows as JSON; what JSON has no form for, such as a date or a decimal, as text."""
+    """Return the rows as JSON. Values without a JSON form, such as dates and decimals, become strings."""
     if len(set(rows.column_names)) != rows.num_columns:
         raise BadInput("--sql: two columns of the result have the same name; give one of them another with AS")
     try:
         return [json.dumps(row, default=str, allow_nan=False) for row in rows.to_pylist()]
     except (ValueError, OverflowError, TypeError, pa.ArrowException) as error:
-        raise BadInput(f"--sql: the result has no form in JSON: {' '.join(str(error).split())[:300]}") from None
+        raise BadInput(f"--sql: the result cannot be written as JSON: {' '.join(str(error).split())[:300]}") from None
 
 
 def render_again(root: Path, product: str, out: Path, key: str | None = None, request: str | None = None) -> str:
-    """Render a product into a file of its own; returns what is to be said of it, empty where its bytes are the same.
+    """Render a published product again into a new file.
 
-    product : its path in the table;  key : of the version of `products` that has it, None = that of the request
-    root    : folder of the lake;  out : the file;  request : whose products, where a lake has those of several
-    Errors  : BadInput where there is no such product, or where a table that it was made from has been removed
+    Parameters
+    ----------
+    root : Path
+        Root of the lake.
+    product : str
+        Path of the product in the table.
+    out : Path
+        File to write.
+    key : str, optional
+        Key of the version of `products` that contains it; None means the current version.
+    request : str, optional
+        Name of the request; required if the lake has several.
+
+    Returns
+    -------
+    str
+        A message that describes the difference, or "" if the bytes are identical.
+
+    Raises
+    ------
+    BadInput
+        If there is no such product, or a table that it was made from has been removed.
     """
     from truesky.render import render_exposures
 
@@ -160,39 +204,39 @@ def render_again(root: Path, product: str, out: Path, key: str | None = None, re
     (part,) = (part for part in version.manifest["parts"] if detector_facts.items() <= part["facts"].items())
     facts = version.manifest["facts"]
     render_exposures.render_task(root, {**facts, **part["facts"]}).files[product](out)
-    # Refused where it is no longer what was published.
+    # Raises an error if the published file has changed.
     version.sidecar_path(product)
     if file_sha256(out) == version.file_sha256(product):
         return ""
-    code = "" if facts["code"] == code_version() else ": it was made by another version of the code"
+    code = "" if facts["code"] == code_version() else ": the versions of the code differ"
     return f"{out} differs from {product}{code}"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Prints the products, one JSON object a line; those of a place or of a query where one is given.
+    """Print the products, one JSON object per line, optionally limited to a position or a query.
 
-    Exit status: 0, 1 a product came out otherwise when it was rendered again or the lake is damaged, 2 the call is
-    wrong.
+    The exit status is 0, 1 if a product rendered again differs or the lake is damaged, or 2 if the arguments are
+    invalid.
     """
     parser = argparse.ArgumentParser(
         prog="python -m truesky.render.archive", description=(__doc__ or "").splitlines()[0]
     )
     parser.add_argument("--lake", required=True, help="folder of the lake")
-    parser.add_argument("--name", help="of the request whose products are meant, where the lake has several")
-    parser.add_argument("--at", nargs=2, type=float, metavar=("RA", "DEC"), help="only what holds this place, deg")
-    parser.add_argument("--sql", help="a query of the table products")
-    parser.add_argument("--failures", action="store_true", help="what could not be made, in place of the products")
-    parser.add_argument("--exposures", action="store_true", help="files of whole exposures, in place of the detectors'")
-    parser.add_argument("--again", metavar="PATH", help="render this product again, as it was made")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="where to; wanted with --again")
-    parser.add_argument("--version", metavar="KEY", help="of an older version of the table products")
+    parser.add_argument("--name", help="name of the request, required if the lake has several")
+    parser.add_argument("--at", nargs=2, type=float, metavar=("RA", "DEC"), help="only products at this position, deg")
+    parser.add_argument("--sql", help="SELECT statement on the table products")
+    parser.add_argument("--failures", action="store_true", help="list detectors that failed instead of products")
+    parser.add_argument("--exposures", action="store_true", help="list files of whole exposures instead of detectors")
+    parser.add_argument("--again", metavar="PATH", help="render this product again from its original inputs")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="output file, required with --again")
+    parser.add_argument("--version", metavar="KEY", help="key of an older version of the table products")
     options = parser.parse_args(argv)
     if (options.failures or options.exposures) and options.at is not None:
-        parser.error("failures and whole exposures have no place")
+        parser.error("--at cannot be combined with --failures or --exposures")
     if options.failures and options.exposures:
-        parser.error("--failures and --exposures exclude each other")
+        parser.error("--failures and --exposures cannot be combined")
     if (options.again is None) != (options.out is None):
-        parser.error("--again and --out belong together")
+        parser.error("--again and --out must be given together")
     return command.run("archive", lambda: _answer(options))
 
 

@@ -1,9 +1,8 @@
-"""How often each place of the sky is looked at: measured, and as a map.
+"""Measure and map how many exposures observe each position of the sky.
 
     python -m truesky.render.coverage --lake LAKE [--name REQUEST] --out coverage.png
 
-depths     of the lake's plan, each band over its area
-picture    the same as maps
+The plan of a request is sufficient; no images are needed.
 """
 
 from __future__ import annotations
@@ -29,19 +28,29 @@ from truesky.request.area import Area
 
 _EXPOSURE_COLUMNS = ("exposure_id", "channel", "band", "image_type", "exposure_time_s", "ra", "dec")
 _TASK_COLUMNS = ("exposure_id", "ra", "dec", "radius", "s_region")
-# Places along a side of a map; the widest map, and how far inside an area its edge is no longer felt, deg.
+# Pixels along a side of a map; largest width of a map, deg; distance from the edge of the area to its interior, deg.
 _SIDE, _WIDEST, _INSIDE = 500, 60.0, 0.5
-# Colours of a map, besides that of what nothing sees; more exposures than all but a few places have share the last.
+# Number of colours in a map, fraction of positions with the highest counts that share the last colour, and the colour
+# of positions that are not observed.
 _COLOURS, _TAIL_FRACTION, _UNSEEN_COLOUR = 8, 0.01, "#efece6"
 
 
 @dataclass(frozen=True, slots=True)
 class Depth:
-    """How often a band's exposures see the places of a map.
+    """Number of exposures of a band at the positions of a map.
 
-    seen      : int[side, side], x to the west, y to the north;  extent : half a side, deg
-    interior  : places more than 0.5 deg inside the request's area, or nearly so where it is small
-    exposures : number of the band's
+    Attributes
+    ----------
+    channel, band : str
+        Names of the channel and of the band.
+    exposures : int
+        Number of exposures of the band.
+    counts : int array, shape (side, side)
+        Number of exposures at each position; x points west, y north.
+    interior : bool array, shape (side, side)
+        Positions more than 0.5 deg inside the area of the request, or half of the largest depth if the area is small.
+    extent : float
+        Half the width of the map in degrees.
     """
 
     channel: str
@@ -52,19 +61,41 @@ class Depth:
     extent: float
 
     def share(self, min_exposures: int) -> float:
-        """Part of the interior that at least so many exposures see."""
+        """Return the fraction of the interior that at least `min_exposures` exposures observe."""
         return float((self.counts[self.interior] >= min_exposures).mean()) if self.interior.any() else 0.0
 
 
 def depths(exposures: pa.Table, tasks: Callable[[], Iterable[pa.Table]], area: Area, side: int = _SIDE) -> list[Depth]:
-    """Of every channel and band that looks at the sky, long exposures alone.
+    """Count the exposures at each position, for every channel and band that observes the sky.
 
-    exposures : rows of the table;  tasks : rows of that table, a part after the other, whenever it is called
-    area : of the request, where its interior lies;  side : pixels of the map
+    Parameters
+    ----------
+    exposures : pyarrow.Table
+        Rows of the table `exposures`.
+    tasks : callable
+        Returns the rows of the table `tasks`, one table per partition; called twice.
+    area : Area
+        Area of the request, which defines the interior.
+    side : int
+        Pixels along each side of the map.
+
+    Returns
+    -------
+    list of Depth
+        One map per channel and band.
+
+    Raises
+    ------
+    BadInput
+        If there are no exposures of the sky, or they are too far apart for a map.
+
+    Notes
+    -----
+    Exposures up to half as long as the longest one of a band are not counted.
     """
     sky_exposures = exposures.filter(pc.is_in(exposures["image_type"], pa.array(SKY_TYPES)))
     if not sky_exposures.num_rows:
-        raise BadInput("table exposures has none of the sky")
+        raise BadInput("table exposures has no exposures of the sky")
     ra0, dec0 = _centre(sky_exposures)
     max_distance = float(
         np.max(sky.separation(sky_exposures["ra"].to_numpy(), sky_exposures["dec"].to_numpy(), ra0, dec0))
@@ -72,7 +103,7 @@ def depths(exposures: pa.Table, tasks: Callable[[], Iterable[pa.Table]], area: A
     _refuse_wide(max_distance)
     extent = max_distance + max(_reach(task_rows, sky_exposures) for task_rows in tasks())
     _refuse_wide(extent)
-    # Square on the tangent plane; x to the west.
+    # The map is square on the tangent plane, with x to the west.
     grid = np.tan(np.radians(extent)) * np.degrees(1.0) * 3600.0 * np.linspace(-1.0, 1.0, side)
     x, y = np.meshgrid(grid, grid)
     ra, dec = (a.ravel() for a in pointing.sky_of_plane(x, y, ra0, dec0, 0.0))
@@ -95,11 +126,11 @@ def depths(exposures: pa.Table, tasks: Callable[[], Iterable[pa.Table]], area: A
 
 def _refuse_wide(extent: float) -> None:
     if 2.0 * extent > _WIDEST:
-        raise BadInput(f"the exposures lie {2 * extent:.0f} deg apart: a map shows {_WIDEST:g} deg at most")
+        raise BadInput(f"the exposures extend over {2 * extent:.0f} deg, a map over at most {_WIDEST:g} deg")
 
 
 def _long_exposures(exposures: pa.Table, channel: str, band: str) -> pa.Array:
-    """Numbers of a band's long exposures."""
+    """Return the numbers of the long exposures of a band."""
     band_exposures = exposures.filter(
         pc.and_(pc.equal(exposures["channel"], channel), pc.equal(exposures["band"], band))
     )
@@ -113,7 +144,7 @@ def _centre(exposures: pa.Table) -> tuple[float, float]:
 
 
 def _reach(tasks: pa.Table, exposures: pa.Table) -> float:
-    """How far from their boresights the tasks of some exposures look, deg; 0 where there are none of them."""
+    """Return the largest distance (deg) from the boresight that tasks of the exposures observe; 0 without tasks."""
     indices = pc.index_in(tasks["exposure_id"], exposures["exposure_id"].combine_chunks()).combine_chunks()
     matched_tasks, indices = tasks.filter(pc.is_valid(indices)), indices.drop_null()
     ra, dec = (exposures[name].take(indices).to_numpy() for name in ("ra", "dec"))
@@ -125,13 +156,13 @@ def _reach(tasks: pa.Table, exposures: pa.Table) -> float:
 
 
 def summary_line(depth: Depth) -> str:
-    """What a person reads of a band."""
+    """Return one line that summarises the depth of a band."""
     shares = ", ".join(f">= {n}: {depth.share(n):.3f}" for n in range(1, 5))
-    return f"{depth.channel:7} {depth.band:12} {depth.exposures:6,} exposures   of the interior {shares}"
+    return f"{depth.channel:7} {depth.band:12} {depth.exposures:6,} exposures   fraction of the interior {shares}"
 
 
 def draw_maps(depth_maps: Sequence[Depth], path: Path) -> None:
-    """A map a band, north up, east to the left: how many exposures see each place; the interior outlined."""
+    """Draw one map per band, north up and east to the left, with the interior outlined."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.colors import BoundaryNorm
@@ -148,7 +179,7 @@ def draw_maps(depth_maps: Sequence[Depth], path: Path) -> None:
         step = -(-max_count // _COLOURS)
         bounds = 0.5 + step * np.arange(-(-max_count // step) + 1)
         half = depth.extent
-        # x of the map runs to the west.
+        # The x axis of the map points west.
         map_image = axes.imshow(
             np.minimum(depth.counts, max_count), origin="lower", extent=(half, -half, -half, half), cmap=colours,
             interpolation="nearest", norm=BoundaryNorm(bounds, colours.N),
@@ -171,7 +202,7 @@ def draw_maps(depth_maps: Sequence[Depth], path: Path) -> None:
 
 
 def area_of(version: read.Version) -> Area:
-    """The area of the request that a plan was made for."""
+    """Return the area of the request that a plan was made for."""
     facts = version.manifest["facts"]["request"]["area"]
     box = facts["box"]
     return Area(
@@ -185,12 +216,12 @@ def area_of(version: read.Version) -> Area:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Prints a line a band and draws the maps."""
+    """Print a line per band and draw the maps."""
     parser = argparse.ArgumentParser(
         prog="python -m truesky.render.coverage", description=(__doc__ or "").splitlines()[0]
     )
     parser.add_argument("--lake", required=True, help="folder of the lake, with a plan")
-    parser.add_argument("--name", help="of the request whose plan is meant, where the lake has several")
+    parser.add_argument("--name", help="name of the request, required if the lake has several")
     parser.add_argument("--out", type=Path, help="PNG of the maps")
     options = parser.parse_args(argv)
     return command.run("coverage", lambda: _write_maps(options.lake, options.name, options.out))

@@ -1,8 +1,4 @@
-"""Rows of the lake that a detector is rendered from.
-
-aimed       a detector of an exposure, and its variant of the request
-prepared    the same with the catalogue rows that it may see, and earlier exposures of the detector
-"""
+"""Read the rows of the lake that are needed to render a detector."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -36,7 +32,10 @@ from truesky.request.structure import Arms, Stamps
 
 
 def load_aim(lake: Folder, facts: Json) -> tuple[Aim, Variant, MissionConfiguration]:
-    """A detector as it looks at the sky, its exposure's variant, and the request's mission; facts : of `prepared`."""
+    """Return a detector with its exposure, the variant of the exposure, and the mission of the request.
+
+    `load_inputs` describes `facts`.
+    """
     request = facts["request"]
     forced = dict.fromkeys(request["effects"]["on"], True) | dict.fromkeys(request["effects"]["off"], False)
     inputs = {
@@ -54,10 +53,28 @@ def load_aim(lake: Folder, facts: Json) -> tuple[Aim, Variant, MissionConfigurat
 
 
 def load_inputs(lake: Folder, facts: Json) -> tuple[Aim, Rows, Variant]:
-    """What a detector is rendered from.
+    """Read the inputs of a detector.
 
-    facts  : of the plan and of its part: exposure_id, detector
-    Errors : BadInput where a file of the user's has changed since the plan was made
+    Parameters
+    ----------
+    lake : Folder
+        The lake.
+    facts : dict
+        Facts of the plan and of its partition, such as exposure_id and detector.
+
+    Returns
+    -------
+    aim : Aim
+        The detector with its exposure.
+    rows : Rows
+        Catalogue rows that may contribute light, and earlier exposures of the detector.
+    variant : Variant
+        Mission, accuracy and effects of the exposure.
+
+    Raises
+    ------
+    BadInput
+        If a user file has changed since the plan was made.
     """
     request, (aim, variant, mission) = facts["request"], load_aim(lake, facts)
     exposed, inputs = aim.exposure, {name: read.version(lake, name, key) for name, key in facts["inputs"].items()}
@@ -84,7 +101,10 @@ def load_inputs(lake: Folder, facts: Json) -> tuple[Aim, Rows, Variant]:
 
 
 def _with_structure(rows: Rows, request: Json, files: Mapping[str, str]) -> Rows:
-    """The rows, and what galaxies have beside their profiles; files : sha256 of a library, by file."""
+    """Return the rows with the structure that galaxies have in addition to their profiles.
+
+    `files` contains the sha256 of the library of galaxy images by path.
+    """
     structure, seed = request.get("structure", {}), request["seed"]
     if "arms" in structure:
         rows = replace(rows, discs=DiscStructure(Arms(**structure["arms"]), seed))
@@ -103,7 +123,7 @@ def _read_rows(
     previous_exposures: tuple[PreviousExposure | PreviousSky, ...],
     seed: int,
 ) -> Rows:
-    """The sources of a detector, from its own cells and, where they shine so far, from those about."""
+    """Read the sources of a detector, from its own cells and from neighbouring cells if their light reaches it."""
     exposed, detector, band = aim.exposure, aim.detector, aim.band
     margin = aim.channel.margin(detector.section, variant.mission)
     spread = visible_spectra.margin_arcsec(exposed, detector, variant.mission, band, seed)
@@ -151,12 +171,12 @@ def find_previous_exposures(
 
     Parameters
     ----------
-    lake : Path or Place
+    lake : Folder
         The lake.
     inputs : mapping of str to Version
-        Versions of the tables that the images are made of.
+        Versions of the tables that the images are made from.
     exposed : ExposureRow
-        Exposure whose detector it is.
+        Exposure of the detector.
     task : dict
         Row of the table `tasks`.
     mission : MissionConfiguration
@@ -166,8 +186,8 @@ def find_previous_exposures(
 
     Returns
     -------
-    tuple of Earlier or EarlierSky
-        The exposures with their bright sources, or with the level of their sky alone if nothing renders them.
+    tuple of PreviousExposure or PreviousSky
+        The exposures with their bright sources, or only with their sky level if they have no simulator.
     """
     if registry.CHANNELS[exposed.channel].persistence_effect is None:
         return ()
@@ -199,7 +219,7 @@ def _load_bright_sources(
     mission_of: Callable[[str | None], MissionConfiguration],
     seed: int,
 ) -> list[PreviousExposure]:
-    """With the sources of each that leave something; drawn : earlier exposures and the tasks of the same detector."""
+    """Read the sources that leave persistence; `pairs` are earlier exposures with their tasks of the same detector."""
     if not pairs:
         return []
     fluxes = inputs["galaxy_fluxes"].manifest["facts"]
@@ -211,7 +231,7 @@ def _load_bright_sources(
         min_flux = persistence.min_flux(exposed, previous, persistence.brightest_column_fraction(aim, mission))
         spectral_reach = visible_spectra.margin_arcsec(previous, detector, mission, aim.band, seed)
         extra_reach = max(spectral_reach - aim.channel.margin(detector.section, mission), 0.0)
-        # In images their colours are taken as flat.
+        # In images, the spectra of these sources are assumed to be flat.
         is_dispersed = aim.channel.dispersion is not None
         shapes = visible_sources.GALAXY_COLUMNS if is_dispersed else visible_sources.SHAPE_COLUMNS
         galaxies.append(catalogue_rows.BrightQuery(task, shapes, previous.band, min_flux, extra_reach))

@@ -1,14 +1,10 @@
-"""Traces and sensitivities of grisms as configurations that extraction software reads (grismconf, slitlessutils).
+"""Write the traces and sensitivities of the grisms as configuration files for grismconf and slitlessutils.
 
     python -m truesky.render.grisms --out FOLDER [--lake LAKE --exposure N [--name REQUEST]] [--detectors DET11 ..]
 
-FOLDER/RGS000_DET11.conf, with a table of the sensitivity of each of its orders beside it, for every grism and detector:
-of the mission database, without the error of the grism wheel.  Of an exposure of a lake
-(FOLDER/RGS000_000012_DET11.conf) they are those that its spectra were drawn with.
-
-nominal      a detector in an exposure through a grism, of a mission
-of_exposure  the detectors of a rendered exposure
-orders       what they detect, in electrons a second
+The command writes FOLDER/RGS000_DET11.conf for every grism and detector, and next to it a table with the sensitivity of
+each order. The values come from the mission database, without an error of the grism wheel. For an exposure of a lake
+(FOLDER/RGS000_000012_DET11.conf), they are the values with which its spectra were drawn.
 """
 
 from __future__ import annotations
@@ -34,19 +30,44 @@ from truesky.render.planning import planned_exposures
 
 
 def nominal_aim(grism: str, detector: str, mission: MissionConfiguration) -> Aim:
-    """A detector as it looks through a grism that is not turned; BadInput for one that the camera does not have.
+    """Return a detector that observes through an untilted grism.
 
-    grism, detector : names;  mission : whose wheel's error is left to whoever asks for the orders
+    Parameters
+    ----------
+    grism, detector : str
+        Names.
+    mission : MissionConfiguration
+        The mission database. Its error of the grism wheel applies to the orders unless it is 0.
+
+    Returns
+    -------
+    Aim
+        The detector with a nominal exposure. A detector that the camera does not have raises BadInput.
     """
     row = planned_exposures.untilted_exposure(grism, mission)
     return Aim.from_exposure(row, detectors.detector(row.camera, detector, mission))
 
 
 def orders(aim: Aim, mission: MissionConfiguration, seed: int) -> tuple[Order, ...]:
-    """Of a grism: electrons a second in 1 A for each erg s-1 cm-2 A-1 at the pupil, as its spectra are drawn.
+    """Return the orders of a grism as its spectra are drawn.
 
-    aim : the exposure and detector;  mission : the exposure's;  seed : of the request
-    What a turned grism takes of the light of sources at the field's edge is not in it.
+    Parameters
+    ----------
+    aim : Aim
+        Exposure and detector.
+    mission : MissionConfiguration
+        Mission database of the exposure.
+    seed : int
+        Seed of the request.
+
+    Returns
+    -------
+    tuple of Order
+        Traces, and responses in electrons per second and A for a flux density of 1 erg s-1 cm-2 A-1 at the pupil.
+
+    Notes
+    -----
+    The light that a tilted grism vignettes at the edge of the field is not included.
     """
     rate_per_flux = electron_rate(aim.exposure) / (UJY_CGS * LIGHT_ANGSTROM_S * passbands.log_width(aim.band))
     trace_orders = visible_spectra.make_orders(aim, mission, seed)
@@ -56,10 +77,32 @@ def orders(aim: Aim, mission: MissionConfiguration, seed: int) -> tuple[Order, .
 def aims_of_exposure(
     root: Path, exposure: int, request: str | None = None
 ) -> Iterator[tuple[str, Aim, MissionConfiguration, int]]:
-    """(detector, its aim, the exposure's mission, the request's seed) of every detector that was rendered.
+    """Yield every rendered detector of an exposure.
 
-    root : folder of the lake;  exposure : its number;  request : whose, where a lake has those of several
-    Errors : BadInput where there is no such exposure, or it is none of spectra
+    Parameters
+    ----------
+    root : Path
+        Root of the lake.
+    exposure : int
+        Number of the exposure.
+    request : str, optional
+        Name of the request; required if the lake has several.
+
+    Yields
+    ------
+    detector : str
+        Name of the detector.
+    aim : Aim
+        The detector with its exposure.
+    mission : MissionConfiguration
+        Mission database of the exposure.
+    seed : int
+        Seed of the request.
+
+    Raises
+    ------
+    BadInput
+        If there is no such exposure, or it has no spectra.
     """
     version = read.version(root, "products", request=request)
     parts = [part["facts"] for part in version.manifest["parts"] if part["facts"]["exposure_id"] == exposure]
@@ -75,7 +118,7 @@ def aims_of_exposure(
 
 
 def _configurations(options: argparse.Namespace) -> Iterator[tuple[str, Aim, MissionConfiguration, int]]:
-    """(name of a configuration, its aim, mission values and seed)."""
+    """Yield name, aim, mission and seed of each configuration."""
     if options.lake:
         for name, aim, mission, seed in aims_of_exposure(
             layout.resolve_lake(options.lake), options.exposure, options.name
@@ -91,26 +134,26 @@ def _configurations(options: argparse.Namespace) -> Iterator[tuple[str, Aim, Mis
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Prints how many configurations it wrote."""
+    """Write the configurations and print their number."""
     parser = argparse.ArgumentParser(
         prog="python -m truesky.render.grisms", description=(__doc__ or "").splitlines()[0]
     )
-    parser.add_argument("--out", type=Path, required=True, help="folder to write to (made where it is not there)")
+    parser.add_argument("--out", type=Path, required=True, help="folder to write to; it is created if needed")
     parser.add_argument("--lake", help="folder of a lake with rendered spectra")
     parser.add_argument("--exposure", type=int, help="number of the exposure in the lake")
-    parser.add_argument("--name", help="of the request whose images are meant, where the lake has several")
-    parser.add_argument("--detectors", nargs="+", metavar="NAME", help="these alone")
+    parser.add_argument("--name", help="name of the request, required if the lake has several")
+    parser.add_argument("--detectors", nargs="+", metavar="NAME", help="only these detectors")
     options = parser.parse_args(argv)
     return command.run("grisms", lambda: _write_configurations(options))
 
 
 def _write_configurations(options: argparse.Namespace) -> int:
     if bool(options.lake) != (options.exposure is not None):
-        raise BadInput("--lake and --exposure are given together, or neither")
+        raise BadInput("--lake and --exposure must be given together")
     if options.name and not options.lake:
-        raise BadInput("--name is of a request of a lake: --lake is missing")
+        raise BadInput("--name requires --lake")
     folder = user_files.check_folder(options.out)
-    # All of it is known to be right before the first file.
+    # All configurations are checked before the first file is written.
     configurations = list(_configurations(options))
     missing = set(options.detectors or ()) - {aim.detector.name for _, aim, _, _ in configurations}
     if missing:

@@ -1,15 +1,12 @@
-"""Expected light of single sources in a published image of spectra: to test how well they are told from one another.
+"""Draw single sources of a published image of spectra, for example to test deblending.
 
     python -m truesky.render.models --lake LAKE [--name REQUEST] --exposure N --detector NAME --sources ID ..
                                  [--orders] --out FILE.fits
 
-Each source is drawn as it was in the image, by itself.  The file has an extension a source, SRC_ID, cut to the pixels
-that have light; its first pixel is at (X0, Y0) of the detector, 0-based.  With --orders it has one for each order.
-The sum of all sources is the image's truth map `noise_free` to the rounding of float32 in files, 1e-7; the float64
-frames of `models` add up exactly to the float64 noise-free frame.
-
-models    of an image of a lake
-frame     an extension as a whole frame
+Each source is drawn separately and exactly as in the image, without noise. The file has one extension per source,
+SRC_ID, or one per order with --orders. Extensions are cut to the pixels with light; the first pixel has the 0-based
+coordinates (X0, Y0) on the detector. The sum of all sources equals the truth map `noise_free` to the rounding of
+float32, 1e-7. The float64 frames of `models` add up exactly to the float64 noise-free frame.
 """
 
 from __future__ import annotations
@@ -38,7 +35,7 @@ def models(
 
     Parameters
     ----------
-    root : Path or Place
+    root : Folder
         The lake.
     version : Version
         Version of the table `products` that has the image.
@@ -67,7 +64,7 @@ def models(
 
 
 def frame(image: Image, shape: tuple[int, int]) -> Float:
-    """float64[ny, nx] electrons of an extension; shape : ny, nx of the detector."""
+    """Return an extension as a float64 frame of the detector in electrons; `shape` is (ny, nx)."""
     out, cards = np.zeros(shape), {key: value for key, value, _ in image.cards}
     if image.data is not None:
         (height, width), first_column, first_row = image.data.shape, int(cards["X0"]), int(cards["Y0"])
@@ -76,7 +73,7 @@ def frame(image: Image, shape: tuple[int, int]) -> Float:
 
 
 def _extension(number: int, order: int | None, light: Float) -> Image:
-    """Cut to what is not dark, one pixel at least."""
+    """Return the light of a source, cut to the pixels that are not 0 (at least one)."""
     rows, columns = (np.flatnonzero((light != 0.0).any(axis=axis)) for axis in (1, 0))
     first_row, end_row = (rows[0], rows[-1] + 1) if len(rows) else (0, 1)
     first_column, end_column = (columns[0], columns[-1] + 1) if len(columns) else (0, 1)
@@ -92,17 +89,17 @@ def _extension(number: int, order: int | None, light: Float) -> Image:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Prints a line a source: its electrons on the detector."""
+    """Write the sources and print the electrons of each source on the detector."""
     parser = argparse.ArgumentParser(
         prog="python -m truesky.render.models", description=(__doc__ or "").splitlines()[0]
     )
     parser.add_argument("--lake", required=True, help="folder or address of the lake, with rendered images of spectra")
-    parser.add_argument("--name", help="of the request whose images are meant, where the lake has several")
+    parser.add_argument("--name", help="name of the request, required if the lake has several")
     parser.add_argument("--exposure", type=int, required=True, help="number of the exposure")
     parser.add_argument("--detector", required=True, help="name of the detector")
-    parser.add_argument("--sources", type=int, nargs="+", required=True, metavar="ID", help="identifiers")
-    parser.add_argument("--orders", action="store_true", help="an extension for each order of each source")
-    parser.add_argument("--out", type=Path, required=True, help="FITS file")
+    parser.add_argument("--sources", type=int, nargs="+", required=True, metavar="ID", help="source identifiers")
+    parser.add_argument("--orders", action="store_true", help="write an extension for each order of each source")
+    parser.add_argument("--out", type=Path, required=True, help="FITS file to write")
     options = parser.parse_args(argv)
     return command.run("models", lambda: _write_models(options))
 

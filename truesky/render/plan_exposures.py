@@ -32,15 +32,24 @@ from truesky.running.submitted_job import Job, Step, common_facts
 
 # Rows of `exposures` and of `tasks`.
 PlanRows = tuple[pa.Table, pa.Table]
-# Fact of the plan of `tasks`: keys of what they were made of.
+# Fact of the plan of `tasks`: keys of the tables that it is made from.
 _MADE_OF = "made_of"
 
 
 @dataclass(frozen=True, slots=True)
 class Planner:
-    """What makes the parts of a request's plan, on the driver or on a worker.
+    """Make the chunks of a request's plan, on the driver or on a worker.
 
-    lake : whose catalogues say how dense the sky is, if it has them
+    Attributes
+    ----------
+    lake : Path or None
+        Lake whose catalogues give the source densities, if it has them.
+    request : Request
+        The request.
+    mission : MissionConfiguration
+        Mission configuration of the request.
+    layout : Layout
+        The exposures of the request, in chunks.
     """
 
     lake: Path | None
@@ -50,9 +59,9 @@ class Planner:
 
     @classmethod
     def from_request(cls, lake: Path | None, request: Request) -> Planner:
-        """Errors : BadInput for whatever is wrong with pointings, observations and PSFs."""
+        """Lay out a request. Raises BadInput for invalid pointings, observations or PSFs."""
         if not request.pointings and not request.observations:
-            raise BadInput(f"request {request.name}: pointing and observation are missing: there is nothing to plan")
+            raise BadInput(f"request {request.name}: nothing to plan, it must have a pointing or an observation")
         mission = mission_of(request.mission)
         checks.check(mission)
         plan_layout = Layout.from_request(request, mission)
@@ -60,21 +69,21 @@ class Planner:
         return cls(lake, request, mission, plan_layout)
 
     def exposures(self, lake: Path, facts: Json) -> Output:
-        """A part of the table `exposures`; facts : its own."""
+        """Make a partition of the table `exposures` from its facts."""
         return Output(self.rows_of_exposures(self.layout.find_chunk(facts)))
 
     def tasks(self, lake: Path, facts: Json) -> Output:
-        """A part of the table `tasks`; facts : its own, and the key of `exposures`."""
+        """Make a partition of the table `tasks` from its facts, which contain the key of `exposures`."""
         exposures = read.version(lake, EXPOSURES.name, facts[_MADE_OF][EXPOSURES.name])
         chunk = self.layout.find_chunk(facts)
         return Output(self.rows_of_tasks(chunk, exposures.rows(partitions=[facts["part"]])))
 
     def rows_of_exposures(self, chunk: Chunk) -> pa.Table:
-        """Rows of the table `exposures` of a part of the layout."""
+        """Return the rows of the table `exposures` of a chunk."""
         return self.layout.exposures(chunk, user_filters(self.request)[0], self.request.seed)
 
     def rows_of_tasks(self, chunk: Chunk, exposures: pa.Table) -> pa.Table:
-        """Rows of the table `tasks` of a part of the layout; exposures : its rows."""
+        """Return the rows of the table `tasks` of a chunk, given its rows of `exposures`."""
         request = self.request
         densities = source_counts.Densities(
             self.mission, request.universe, [] if self.lake is None else _catalogues(self.lake, request)
@@ -89,34 +98,34 @@ class Planner:
         return tasks.add_persistence_cost(rows, exposures, nearby_exposures, self.mission)
 
     def tables(self) -> Iterator[PlanRows]:
-        """Rows of `exposures` and `tasks`, a part after the other."""
+        """Yield the rows of `exposures` and `tasks`, chunk by chunk."""
         for chunk in self.layout.chunks:
             exposures = self.rows_of_exposures(chunk)
             yield exposures, self.rows_of_tasks(chunk, exposures)
 
 
 def plan(lake: Path | None, request: Request) -> tuple[MissionConfiguration, pa.Table, pa.Table]:
-    """The mission configuration, and rows of the tables `exposures` and `tasks`; lake : with catalogues, if any."""
+    """Return the mission configuration, and the rows of `exposures` and `tasks`. `lake` may provide catalogues."""
     planner = Planner.from_request(lake, request)
     return planner.mission, *concatenate(planner.tables())
 
 
 def concatenate(parts: Iterable[PlanRows]) -> PlanRows:
-    """Rows of a whole plan from those of its parts; tasks are sorted, the longest first."""
+    """Concatenate the rows of chunks to a whole plan; tasks are sorted, longest first."""
     exposures, rows = zip(*parts, strict=True)
     return pa.concat_tables(exposures).combine_chunks(), tasks.sort_by_cost(pa.concat_tables(rows))
 
 
 def _catalogues(lake: Path, request: Request) -> list[read.Version]:
-    """The catalogues of the request, if it has them all."""
+    """Return the catalogues of the request, or [] if one is missing."""
     has_all = all(layout.current_link(lake, name).exists() for name in universe.CATALOGUES)
     return [read.input_version(lake, name, request.name) for name in universe.CATALOGUES] if has_all else []
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
-    """The mission configuration, the exposures, and a task for each of their detectors; prints the forecast.
+    """Return the steps that make the mission table, the exposures and their tasks; the last one prints the forecast.
 
-    A plan of one part is made on the driver, a larger one by the workers.
+    The driver makes a plan of a single chunk; workers make larger plans.
     """
     universe.check_catalogues(_catalogues(lake, request), request)
     planner = Planner.from_request(lake, request)
@@ -134,7 +143,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
     parts = planner.layout.parts()
     on_driver = len(parts) == 1
     exposures = Plan(EXPOSURES, facts, parts)
-    # What they cost depends on more than which they are.
+    # The cost depends on more facts than the exposures do.
     catalogue_keys = {v.table: v.key for v in _catalogues(lake, request)}
     costs = {**facts, "counts": catalogue_keys, "rendered": request.facts("accuracy", "effects", "files", "readout")}
     costs[_MADE_OF] = {EXPOSURES.name: exposures.key}
@@ -155,7 +164,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
 
 
 def _print_published(lake: Path, version: read.Version) -> None:
-    """The forecast of published tasks."""
+    """Print the forecast of published tasks."""
     exposures = read.version(lake, EXPOSURES.name, version.manifest["facts"][_MADE_OF][EXPOSURES.name])
     columns = ["exposure_id", "survey", "image_type"], ["exposure_id", "detector", "channel", *forecast.SUMMED_COLUMNS]
     _print_forecast(
@@ -164,7 +173,17 @@ def _print_published(lake: Path, version: read.Version) -> None:
 
 
 def print_forecast(lake: Path, request: Request, parts: Iterable[PlanRows]) -> None:
-    """Print the forecast of a plan that is not published; parts : rows of `exposures` and `tasks`."""
+    """Print the forecast of a plan that is not published.
+
+    Parameters
+    ----------
+    lake : Path
+        The lake.
+    request : Request
+        The request.
+    parts : iterable of (pyarrow.Table, pyarrow.Table)
+        Rows of `exposures` and `tasks` of each chunk.
+    """
     universe.check_catalogues(_catalogues(lake, request), request)
     _print_forecast(lake, parts)
     _warn_daylight(Planner.from_request(lake, request))

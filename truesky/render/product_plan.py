@@ -1,8 +1,4 @@
-"""The plan of a request's images: which detectors are rendered now, and which keep the images that they have.
-
-RenderInputs   the versions of tables, the mission and the exposures that the images depend on, resolved once
-products       the plan of the table `products`
-"""
+"""Plan the images of a request: the detectors to render now, and the detectors whose images are still valid."""
 
 from __future__ import annotations
 
@@ -49,15 +45,15 @@ class RenderInputs:
     mission : MissionConfiguration
         Mission configuration of the request.
     versions : mapping of str to Version
-        Versions of the tables that are read, by name.
-    published : mapping of str to str
-        Key of each product that the request has already, by the name of its part.
+        Versions of the input tables, by table name.
+    published_keys : mapping of str to str
+        Key of each product that the request already has, by name of its partition.
     selection : RenderSelection
-        Exposures, tasks that are asked for, and tasks whose images may be kept.
+        Exposures, requested tasks, and tasks whose images may be reused.
     exposures : pyarrow.Table
-        Rows of `selection.exposures`, and of earlier exposures that left something in their detectors.
-    earlier : mapping of (int, str) to list
-        Tasks of these earlier exposures, by exposure and detector.
+        Rows of `selection.exposures`, and of earlier exposures that left charge in their detectors.
+    previous_tasks : mapping of (int, str) to list
+        Tasks of these earlier exposures, by (exposure number, detector name).
     """
 
     request: Request
@@ -131,7 +127,7 @@ class RenderInputs:
         return cls(request, mission, versions, published, selection, *exposures_and_tasks)
 
     def with_previous_tasks(self, tasks: Sequence[Json]) -> list[Json]:
-        """Tasks, and earlier tasks of the same detectors whose sources are drawn again."""
+        """Return the tasks, and earlier tasks of the same detectors whose sources are drawn again."""
         if not self.previous_tasks:
             return list(tasks)
         rows = map(ExposureRow.from_row, self.exposures.to_pylist())
@@ -144,7 +140,7 @@ class RenderInputs:
         return [*tasks, *(previous_task for previous_task in previous_tasks if previous_task["exposure_id"] in drawn)]
 
     def requested_or_reusable(self, requested: Set[str]) -> list[Json]:
-        """Tasks whose parts are asked for, and those with images whose PSFs can still be read, in their order."""
+        """Return the tasks that are requested or have reusable images whose PSF files exist, in order."""
         columns = (self.exposures[name].to_pylist() for name in ("exposure_id", "psf"))
         psfs = dict(zip(*columns, strict=True))
 
@@ -161,14 +157,14 @@ class RenderInputs:
 
 
 def _versions(lake: Path, request: Request) -> dict[str, read.Version]:
-    """Versions of the tables that the images are made of, by name."""
+    """Return the versions of the input tables, by name."""
     inputs = {name: read.input_version(lake, name, request.name) for name in INPUTS}
     lenses = _lenses(lake, request, inputs["galaxies"])
     return inputs if lenses is None else {**inputs, LENSES: lenses}
 
 
 def _lenses(lake: Path, request: Request, galaxies: read.Version) -> read.Version | None:
-    """The strong lenses, if there are some; those of another request only where they lie in the same galaxies."""
+    """Return the strong lenses, or None; lenses of another request must be placed in the same galaxies."""
     if layout.current_key(lake, LENSES) is None:
         return None
     version, request_key = (
@@ -190,8 +186,7 @@ def products(inputs: RenderInputs) -> Plan:
     Returns
     -------
     Plan
-        A part for each detector that is asked for, and for each whose image is kept: it was rendered as it would be
-        now.
+        A task for each requested detector, and for each rendered detector whose inputs have not changed.
     """
     facts, exposures = _facts(inputs), inputs.exposures
     requested = {part_name(task) for task in inputs.selection.requested}
@@ -214,7 +209,7 @@ def products(inputs: RenderInputs) -> Plan:
 
 
 def _facts(inputs: RenderInputs) -> Json:
-    """Facts of the plan: all that its images share."""
+    """Return the facts of the plan that all images share."""
     request = inputs.request
     facts: dict[str, Any] = {
         "request": request.facts("seed", "noise_seed", "accuracy", "mission", "effects", "truth", *IMAGE_OPTIONS),
@@ -223,7 +218,7 @@ def _facts(inputs: RenderInputs) -> Json:
         "inputs": {name: version.key for name, version in inputs.versions.items()},
     }
     if request.sources is not None:
-        # Sources of the tables are the only ones: no bodies move.
+        # The tables contain all sources, so that no moving bodies are added.
         facts["request"]["bodies"] = "none"
     facts["request"].update(structure.facts(request.structure))
     if request.bodies is not None:

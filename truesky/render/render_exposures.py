@@ -24,10 +24,9 @@ from truesky.running.submitted_job import Job, Step
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
-    """One part a detector of an exposure, the longest first; then what was drawn on each, and files of whole exposures.
+    """Return the steps that render each detector, longest first, then collect truth tables and write exposure files.
 
-    Detectors that are not asked for, and that the request's present version has as they would be rendered now, stay:
-    a part is added to what there is.
+    Detectors that are not requested are kept if the current version has images with unchanged inputs.
     """
     inputs = RenderInputs.from_request(lake, request)
     _refuse_uncovered(inputs)
@@ -59,7 +58,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
 
 
 def _refuse_uncovered(inputs: RenderInputs) -> None:
-    """The detectors that are asked for must lie where the catalogues were drawn."""
+    """Raise BadInput if requested detectors lie outside the area of the catalogues."""
     tasks = inputs.with_previous_tasks(inputs.selection.requested)
     task_by_place = {tuple(task[k] for k in ("ra", "dec", "radius")): task for task in tasks if task["cells"]}
     for name in ("galaxies", "stars"):
@@ -71,7 +70,7 @@ def _refuse_uncovered(inputs: RenderInputs) -> None:
 
 
 def _dispersed_exposures(exposures: pa.Table) -> set[int]:
-    """Exposures whose sources are spread out by a grism."""
+    """Return the numbers of the exposures of the sky through a grism."""
     numbers = set()
     for row in map(ExposureRow.from_row, exposures.to_pylist()):
         channel = registry.CHANNELS.get(row.channel)
@@ -81,7 +80,7 @@ def _dispersed_exposures(exposures: pa.Table) -> set[int]:
 
 
 def render_task(lake: Path, facts: Json) -> Output:
-    """One detector: its sources from its own cells, its image, its files."""
+    """Render one detector: read its sources, make its image, and return its rows and the writers of its files."""
     request = facts["request"]
     with memory_reuse.retain_freed_memory():
         aim, source_rows, variant = detector_inputs.load_inputs(lake, facts)
@@ -103,12 +102,12 @@ def render_task(lake: Path, facts: Json) -> Output:
 
 
 def read_truth(lake: Path, facts: Json) -> Output:
-    """What was drawn on one detector, from beside its images."""
+    """Read the truth table that is stored with the images of one detector."""
     return _read_sidecar(lake, facts, truth_file)
 
 
 def read_spectra(lake: Path, facts: Json) -> Output:
-    """Where spectra lie on one detector, likewise."""
+    """Read the table of spectra that is stored with the images of one detector."""
     return _read_sidecar(lake, facts, spectra_file)
 
 
@@ -122,6 +121,6 @@ JOB = Job(
     "render_exposures",
     "Render every planned detector to FITS.",
     steps,
-    list_options=(("detectors", "only these of every exposure"),),
-    integer_options=(("limit", "only the first so many of them, by exposure and detector"),),
+    list_options=(("detectors", "only these detectors of each exposure"),),
+    integer_options=(("limit", "only this number of detectors, the first by exposure and name"),),
 )

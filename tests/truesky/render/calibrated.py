@@ -1,4 +1,4 @@
-"""A perfect calibrator: it knows each detector's patterns, and undoes them."""
+"""Ideal calibration of images with the true patterns of each detector."""
 
 import numpy as np
 
@@ -9,9 +9,9 @@ from truesky.render.effects.readout import bias_structure, crosstalk, nonlineari
 
 
 def electrons(raw, scene, seed, applied):
-    """Raw ADU ([ny, nx], or quadrants) -> e- [ny, nx] as they were counted, sky and dark current included.
+    """Convert raw ADU ([ny, nx], or quadrants) to electrons [ny, nx], sky and dark current included.
 
-    applied : names of the effects that are in the image
+    `applied` contains the names of the effects in the image.
     """
     gain = np.reshape(scene.amplifier_values("gain", "electron / adu"), (-1, 1, 1))
     found = (raw.astype(float) - scene.value("bias", "adu")) * gain
@@ -23,7 +23,7 @@ def electrons(raw, scene, seed, applied):
         parameters = bias_structure.EFFECT.parameters(scene)
         found -= bias_structure.structure(len(raw), raw.shape[2], *parameters, fixed(bias_structure.EFFECT))[:, None]
     if "crosstalk" in applied:
-        # To first order in the coefficients: 1e-8.
+        # First order in the coefficients; the error is 1e-8.
         found = 2.0 * found - crosstalk.apply(found, *crosstalk.EFFECT.parameters(scene))
     if "nonlinearity" in applied:
         found = nonlinearity.linearise(found, *nonlinearity.EFFECT.parameters(scene))
@@ -37,7 +37,7 @@ def camera_of(scene):
 
 
 def flat(scene, seed, applied):
-    """What of the light each pixel counts, 1 in the mean; nothing where it is blind."""
+    """Return the relative sensitivity of each pixel (mean 1), NaN for blind pixels."""
     out = np.ones((scene.detector.ny, scene.detector.nx))
     for effect in (illumination.EFFECT, illumination.SHUTTER):
         if effect.name in applied:
@@ -50,7 +50,7 @@ def flat(scene, seed, applied):
 
 
 def without_hits(electrons, hits, reach=40):
-    """NaN where a cosmic ray is, and in the rows after it that its trail is in."""
+    """Set cosmic rays, and the rows after them with their trails, to NaN."""
     bad = hits > 0
     upper = len(bad) // 2
     for half in (bad[:upper], bad[upper:][::-1]):

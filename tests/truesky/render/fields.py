@@ -1,4 +1,4 @@
-"""Small made-up fields for the renderer's tests: a corner of a detector, and sources laid on it."""
+"""Small synthetic fields for tests of the renderer: part of a detector with sources."""
 
 from dataclasses import replace
 from functools import cache
@@ -24,13 +24,13 @@ MISSION = resolve()
 
 @cache
 def small(camera, name, n=160):
-    """A detector cut down to n x n pixels about its centre, as if they were all of one half."""
+    """Return a detector cut to n x n pixels about its centre, all of which belong to one half."""
     return replace(detectors.detector(camera, name, MISSION), nx=n, ny=n, injection_rows=0)
 
 
 @cache
 def psf_of(camera, name="3-4"):
-    """A narrow round PSF for VIS (the optics have their own tests), the seeing disc for LSSTCam."""
+    """Return a narrow round PSF for VIS (other tests cover the optics), or the seeing disc for LSSTCam."""
     detector = small(camera, "R22_S11" if camera == "lsstcam" else name)
     if camera == "vis":
         return seeing.moffat_psf(0.16, 3.5, detector.pixel_scale)
@@ -52,7 +52,7 @@ DEFAULTS = {
 
 
 def galaxies(ra, dec, **columns):
-    """Rows of what the renderer reads; scalars are repeated."""
+    """Return rows of galaxies with the columns that the renderer reads; scalars are repeated."""
     ra, dec = np.atleast_1d(ra).astype(float), np.atleast_1d(dec).astype(float)
     n = len(ra)
     table = {"id": source_id(0, 411_000, np.arange(n)), "ra": ra, "dec": dec}
@@ -72,7 +72,7 @@ def fluxes(table, band, value):
 
 
 def one_source(detector, system, electrons=1e5, column=None, row=None, **shape):
-    """A single galaxy (or, without a shape, a point) as what is drawn."""
+    """Return a single galaxy, or a point if it has no shape, ready to draw."""
     column = np.array([(detector.nx - 1) / 2 if column is None else column])
     row = np.array([(detector.ny - 1) / 2 if row is None else row])
     jacobian = astrometry.jacobian(system, column, row)
@@ -82,7 +82,7 @@ def one_source(detector, system, electrons=1e5, column=None, row=None, **shape):
 
 
 def moments(image):
-    """Centroid (column, row) and second moments ((xx, xy), (xy, yy)) of an image, pixels."""
+    """Return the centroid (column, row) and second moments ((xx, xy), (xy, yy)) of an image in pixels."""
     total = image.sum()
     y, x = np.mgrid[: image.shape[0], : image.shape[1]]
     centre = np.array([(image * x).sum(), (image * y).sum()]) / total
@@ -106,7 +106,10 @@ def rendered(
     way="raw",
     **rows,
 ):
-    """One detector; exposed : columns of its exposure;  tables : galaxies, their fluxes, stars, theirs."""
+    """Render one detector; `tables` contains galaxies, their fluxes, stars, and their fluxes.
+
+    `exposed` contains columns of the exposure.
+    """
     variant = Variant(mission, accuracy, forced or {})
     return render.render(
         Aim.from_exposure(exposure(**exposed), detector, passband, readout_name=way),
@@ -120,7 +123,7 @@ def rendered(
 
 
 def exposure(**known):
-    """A row of the table `exposures`, of which some columns matter."""
+    """Return a row of the table `exposures`; only some columns matter."""
     nominal = {
         "exposure_id": 1, "channel": "VIS", "camera": "vis", "band": "euclid_vis", "image_type": "science",
         "ra": 0.0, "dec": 0.0, "position_angle": 0.0, "mjd": 60905.0, "exposure_time_s": 100.0,
@@ -130,5 +133,5 @@ def exposure(**known):
 
 
 def aimed(detector, system, band, exposed=MappingProxyType({}), channel=vis.CHANNEL):
-    """A detector that looks somewhere, in an exposure of which no more is known."""
+    """Return a detector with a pointing in a default exposure."""
     return Aim(exposure(**exposed), detector, system, band, channel, channel.effects["science"])

@@ -1,4 +1,4 @@
-"""Nominal exposures of a part of a NISP detector, with what a test lays on its pixels."""
+"""Nominal exposures of part of a NISP detector with given sources."""
 
 from functools import cache
 
@@ -22,7 +22,7 @@ _PSF = euclid.nisp_psf
 
 @cache
 def psf_of(detector, band):
-    """The detector's PSF, for all of its exposures."""
+    """Return the PSF of the detector, shared by all of its exposures."""
     return _PSF(detector, passbands.load(band), MISSION, 1)
 
 
@@ -30,7 +30,7 @@ def exposed(
     detector, kind="science", band="euclid_h", seconds=TIME, sky=SKY, number=1, mjd=MJD, mission=MISSION, lamp=None,
     **more,
 ):  # fmt: skip
-    """Columns of an exposure that a detector sees a field at high latitude in."""
+    """Return columns of an exposure of a field at high ecliptic latitude."""
     ra, dec, angle = boresight_for(detector, 53.1, -27.8, 12.0)
     return {
         "exposure_id": number, "channel": "NISP-P", "camera": "nisp", "band": band, "image_type": kind, "ra": ra,
@@ -40,7 +40,7 @@ def exposed(
 
 
 def tables(detector, columns, mags, x, y, body=None):
-    """Rows and fluxes of stars (or galaxies: `body`, their columns) of AB magnitudes `mags` at pixels x, y."""
+    """Return rows and fluxes of stars (or galaxies with columns `body`) of AB magnitudes `mags` at pixels x, y."""
     system = Aim.from_exposure(fields.exposure(**columns), detector).wcs
     where = astrometry.sky_of_pixel(system, np.atleast_1d(x).astype(float), np.atleast_1d(y).astype(float))
     bodies, points = galaxies(*where, **(body or {})), stars(*where)
@@ -56,7 +56,7 @@ def rendered(
     mags=(), x=(), y=(), detector=None, body=None, forced=None, truth=(), mission=MISSION, accuracy=SURVEY,
     earlier=(), **columns,
 ):  # fmt: skip
-    """A detector of 96 x 96 pixels, or another; columns : of `exposed`."""
+    """Render a detector, by default of 96 x 96 pixels; `columns` are those of `exposed`."""
     detector = detector or small("nisp", "DET22", 96)
     row = exposed(detector, mission=mission, **columns)
     with pytest.MonkeyPatch.context() as patch:
@@ -66,6 +66,6 @@ def rendered(
 
 
 def electrons(one):
-    """float64[ny, nx] of the signal."""
+    """Return the signal in electrons as float64[ny, nx]."""
     gain, bias = (one.scene.mission.value(f"nisp.{key}") for key in ("gain", "bias"))
     return (one.science - bias) * gain

@@ -1,4 +1,4 @@
-"""Nominal exposures of a VIS detector, or of a part of one, with what a test lays on its pixels."""
+"""Nominal exposures of a VIS detector, or part of one, with given sources."""
 
 from functools import cache
 
@@ -17,24 +17,24 @@ from truesky.request.accuracy import SURVEY
 TIME = MISSION.value("vis.exposure_time", "s")
 SKY, SEED = 0.25, 1
 COSMIC_RAYS = ("cosmic_rays", "readout_cosmic_rays")
-# What moves charge, or squeezes it: all that calibration does not undo.
+# Effects that move or compress charge, which calibration does not correct.
 CHARGE = ("parallel_cti", "serial_cti", "brighter_fatter")
 
 
 def off(*names):
-    """A request's wish: effects that are off."""
+    """Return the request option that forces effects off."""
     return dict.fromkeys(names, False)
 
 
 @cache
 def psf_of(detector):
-    """The detector's PSF, for all of its exposures."""
+    """Return the PSF of the detector, shared by all of its exposures."""
     return euclid.vis_psf(detector, passbands.load("euclid_vis"), MISSION)
 
 
 @cache
 def pointing(detector):
-    """Where the telescope looks so that the detector sees a field at high latitude; turned a little."""
+    """Return the boresight and a small rotation for which the detector observes a field at high ecliptic latitude."""
     return boresight_for(detector, 53.1, -27.8, 12.0)
 
 
@@ -42,9 +42,9 @@ def rendered(
     detector, mags, x, y, body=None, mission=MISSION, forced=None, accuracy=SURVEY, seconds=TIME, sky=SKY,
     kind="science", number=1, truth=(), asteroids=None,
 ):  # fmt: skip
-    """Stars (or galaxies: `body`, their columns) of AB magnitudes `mags` at pixels x, y.
+    """Render stars (or galaxies with columns `body`) of AB magnitudes `mags` at pixels x, y.
 
-    number : of the exposure: its noise; the detector stays the same
+    `number` is the exposure number, which changes the noise but not the detector.
     """
     ra, dec, angle = pointing(detector)
     exposed = {
@@ -69,7 +69,7 @@ def rendered(
 
 
 def lattice(side, pitch, seed=1):
-    """x, y of places a pitch apart, each at its own fraction of a pixel."""
+    """Return x, y of positions on a regular grid, each with a different subpixel phase."""
     rng = np.random.default_rng(seed)
     middle = np.arange(pitch / 2, side, pitch)
     x, y = (axis.ravel() for axis in np.meshgrid(middle, middle))

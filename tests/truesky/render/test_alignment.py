@@ -1,4 +1,4 @@
-"""From the catalogue's lensing to pixels: around a massive halo galaxies lie along circles, on any detector."""
+"""Lensing from the catalogue to the pixels: galaxies around a massive halo are aligned tangentially on any detector."""
 
 import healpy as hp
 import numpy as np
@@ -22,7 +22,7 @@ BEARINGS = np.arange(0.0, 360.0, 45.0) + 11.0
 
 @pytest.fixture(scope="module")
 def shears():
-    """(gamma1, gamma2) that the catalogue has beside a round halo, at bearings north through east."""
+    """Return (gamma1, gamma2) of the catalogue near a round halo, at position angles from north through east."""
     ra, dec = hp.pix2ang(NSIDE, np.arange(12 * NSIDE**2), nest=True, lonlat=True)
     kappa = 0.3 * np.exp(-0.5 * (sky.separation(ra, dec, RA, DEC) / WIDTH) ** 2)
     fields = lensing.maps_of_convergence(kappa.astype(np.float32), NSIDE, np.ones(2 * NSIDE + 1))
@@ -32,7 +32,7 @@ def shears():
 
 
 def offset(arcsec, bearing):
-    """Places at a distance and bearings of the halo."""
+    """Return positions at a distance and position angles from the halo."""
     distance, angle, dec = np.radians(arcsec / 3600), np.radians(bearing), np.radians(DEC)
     lat = np.arcsin(np.sin(dec) * np.cos(distance) + np.cos(dec) * np.sin(distance) * np.cos(angle))
     lon = np.arctan2(np.sin(angle) * np.sin(distance) * np.cos(dec), np.cos(distance) - np.sin(dec) * np.sin(lat))

@@ -1,4 +1,4 @@
-"""Questions to the archive: bounded, answered in JSON, and whatever is wrong is one line."""
+"""Queries of the archive: limits of time and memory, JSON output, and one-line errors."""
 
 import json
 import time
@@ -23,16 +23,16 @@ LINE = {"job": "render_exposures", "table": "products", "part": "a", "seconds": 
         ("SELECT nothing FROM products", "nothing"),
     ],
 )
-def test_what_is_no_question_or_has_no_end_is_refused(sql, words):
+def test_invalid_and_endless_queries_are_refused(sql, words):
     started = time.monotonic()
     with pytest.raises(BadInput, match=f"^--sql: SQL: .*({words})") as caught:
         archive.search(ROWS, sql, 512e6, 15.0)
-    # It may be a busy machine; without a bound it takes hours.
+    # The machine may be busy; without a limit the query takes hours.
     assert time.monotonic() - started < 120.0
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_every_value_has_a_form():
+def test_values_of_all_types_become_json():
     sql = """SELECT path, seconds, 1.25 AS share, 2::HUGEINT AS many, DATE '2024-02-03' AS day, 'x'::BLOB AS blob,
              [1.5, 2.25]::DECIMAL(4, 2)[] AS list, {'a': 1.5} AS struct, INTERVAL 3 DAY AS span, true AS flag
              FROM products ORDER BY path"""
@@ -44,9 +44,9 @@ def test_every_value_has_a_form():
 
 @pytest.mark.parametrize(
     ("sql", "words"),
-    [("SELECT 1 AS a, 2 AS a", "same name"), ("SELECT TIMESTAMP '290000-01-01' AS t", "no form in JSON")],
+    [("SELECT 1 AS a, 2 AS a", "same name"), ("SELECT TIMESTAMP '290000-01-01' AS t", "cannot be written as JSON")],
 )
-def test_what_has_none_is_refused(sql, words):
+def test_results_without_a_json_form_are_refused(sql, words):
     with pytest.raises(BadInput, match=words):
         archive._objects(archive.search(ROWS, sql))
 
@@ -58,7 +58,7 @@ def logged(lake, *lines):
     return path
 
 
-def test_the_last_line_of_a_log_may_be_cut(lake):
+def test_an_incomplete_last_line_of_a_log_is_ignored(lake):
     failed = {**LINE, "error": "no"}
     for number, cut in enumerate((b'{"part": "b', b"\0\0\0", b"\xff", b"[" * 100_000, b"3", b'{"part": 3}')):
         root = lake / str(number)
@@ -75,9 +75,9 @@ def test_the_last_line_of_a_log_may_be_cut(lake):
         {**LINE, "seconds": -(2**63)},
     ],
 )  # fmt: skip
-def test_any_other_line_that_is_damaged_is_named(lake, capsys, line):
+def test_errors_name_other_damaged_lines(lake, capsys, line):
     path = logged(lake, LINE, line, LINE)
-    with pytest.raises(Damaged, match=rf"{path.name} line 2 is not what a run writes"):
+    with pytest.raises(Damaged, match=rf"{path.name} line 2 is not a valid log line"):
         archive.failures(lake)
     assert archive.main(["--lake", str(lake), "--failures"]) == 1
     assert capsys.readouterr().err.count("\n") == 1

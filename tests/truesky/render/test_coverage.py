@@ -1,4 +1,4 @@
-"""What the survey sees how often, and that every place of a detector counts once."""
+"""Depth maps of a survey; each position of a detector counts once."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from truesky.request.from_toml import from_table
 
 @pytest.mark.parametrize("distortion", [0.0, 0.01])
 def test_a_footprint_ends_where_the_detector_does(distortion):
-    """To the pixel; where the optics distort, sides are bent, and a footprint's are straight: to three."""
+    """Accurate to one pixel, or to three with distortion, since the sides of a footprint are straight."""
     mission = resolve(overrides={"vis.fpa.distortion": (distortion, "")})
     exposure = planned_exposures.Exposure(
         "VIS", "vis", "euclid_vis", "science", 10.0, 85.0, 33.0, 60905.0, 560.0, "x", sky=0.2
@@ -43,7 +43,7 @@ def test_a_footprint_ends_where_the_detector_does(distortion):
 
 @pytest.fixture(scope="module")
 def dithers(tmp_path_factory):
-    """Channel -> how often random places in the interior of a request are seen in one band."""
+    """Return, by channel, how often random positions in the interior of a request are observed in one band."""
     area = {"cone": {"ra": 150.0, "dec": 20.0, "radius": 1.4}}
     block = {"channels": ["VIS", "NISP-P"], "short": False, "flat": False}
     wanted = from_table({"name": "x", "seed": 7, "area": area, "observation": [block]})
@@ -66,7 +66,7 @@ def test_the_interior_is_seen_three_times(dithers, channel, least):
 
 
 def test_a_plan_is_mapped_from_the_lake(lake, capsys):
-    """One field of four dithers: its middle is seen four times, but for the gaps; the map shows what was measured."""
+    """With four dithers, the centre is observed four times except in gaps; the map shows the measured values."""
     area = {"cone": {"ra": 150.0, "dec": 20.0, "radius": 0.5}}
     block = {"channels": ["VIS"], "fields": 1}
     wanted = from_table({"name": "x", "seed": 7, "area": area, "observation": [block]})
@@ -76,16 +76,16 @@ def test_a_plan_is_mapped_from_the_lake(lake, capsys):
     assert coverage.main(["--lake", str(lake), "--out", str(picture)]) == 0
     said = capsys.readouterr().out.splitlines()
     assert said[-1] == str(picture)
-    assert said[-2].startswith("VIS     euclid_vis        4 exposures   of the interior >= 1: ")
+    assert said[-2].startswith("VIS     euclid_vis        4 exposures   fraction of the interior >= 1: ")
     assert picture.read_bytes().startswith(b"\x89PNG")
     exposures, tasks = (read.version(lake, name) for name in ("exposures", "tasks"))
     assert coverage.area_of(exposures) == wanted.area
     (depth,) = coverage.depths(exposures.rows(), lambda: [tasks.rows()], wanted.area, side=120)
     assert depth.counts.max() == 4
-    # The short exposure and the flat are no dithers; outside the field there is nothing.
+    # The short exposure and the flat are not counted; outside the field the depth is 0.
     assert (depth.counts[0] == 0).all()
     middle = depth.counts[50:70, 50:70]
-    # Half of it in the gap between detectors once; hardly a place twice, and none four times.
+    # Half of the positions are in the gap between detectors once, few twice, and none four times.
     assert 0.3 < (middle == 4).mean() < 0.7
     assert (middle >= 3).mean() > 0.9
     assert (middle >= 1).all()

@@ -1,4 +1,4 @@
-"""An exposure of DECam in one file, by the jobs: CCDs in the order of their numbers, with what DECam says of each."""
+"""A DECam exposure in one file, made by the jobs: CCDs in the order of their numbers, with DECam's keywords."""
 
 import shutil
 from concurrent.futures import ThreadPoolExecutor
@@ -24,7 +24,7 @@ from truesky.render.products import head_files, read_back
 from truesky.request.from_toml import parse
 
 SIDE, PLACE = 64, (53.117, -27.808)
-# Their names are in another order.
+# Their names have another order.
 NUMBERS = {"S29": 1, "S25": 4}
 TEXT = """
 accuracy = "draft"
@@ -54,7 +54,7 @@ def lake(tmp_path_factory):
     def smaller(*args):
         return tuple(replace(d, nx=SIDE, ny=SIDE) for d in listed(*args))
 
-    # The last is bright, and in the middle of a CCD that is read with the first.
+    # The last star is bright, and at the centre of a CCD that shares electronics with the first.
     other = detectors.detector("decam", "S30", MISSION)
     ra, dec, angle = boresight_for(detectors.detector("decam", "S29", MISSION), *PLACE, 0.0)
     ra, dec = astrometry.centre(other, astrometry.wcs(other, ra, dec, angle))
@@ -106,8 +106,8 @@ def test_the_ccds_are_in_the_order_of_their_numbers(lake, whole):
         assert gaps[0] != gaps[1]
 
 
-def test_it_knows_where_it_looks_only_from_beside(lake, whole):
-    """The same error in all CCDs; the text beside it has them in the order of the file."""
+def test_only_the_head_file_has_the_true_pointing(lake, whole):
+    """All CCDs have the same pointing error; the head file has the true WCS of the CCDs in file order."""
     path = whole[1]
     heads = path.with_suffix(".head").read_text("ascii").split("END\n")[:-1]
     exposure = read.version(lake, "exposures").rows().to_pylist()[0]
@@ -121,11 +121,11 @@ def test_it_knows_where_it_looks_only_from_beside(lake, whole):
             off.append(seen[0].separation(seen[1]).arcsec[0])
             assert unit.header["CSYER1"] == pytest.approx(3.0 / 3600.0)
     assert 0.5 < min(off) <= max(off) < 20.0
-    # Rotated by half an arcminute, neighbours differ by a tenth of an arcsecond.
+    # With a rotation of half an arcminute, neighbours differ by 0.1 arcsec.
     assert np.ptp(off) < 0.5
 
 
-def test_ccdproc_reduces_it_by_its_header(whole):
+def test_ccdproc_reduces_the_file_by_its_header(whole):
     found = list(tools.reduced(whole[1]))
     assert len(found) == 4
     for text, image in found:
@@ -136,8 +136,8 @@ def test_ccdproc_reduces_it_by_its_header(whole):
     assert np.ptp(levels) < 0.05 * np.mean(levels)
 
 
-def test_amplifiers_apart_are_extensions_of_their_ccds(lake, whole, tmp_path):
-    """Asked for by the request; the pixels are the same."""
+def test_separate_amplifiers_are_extensions(lake, whole, tmp_path):
+    """If the request sets it, each amplifier is an extension; the pixels are the same."""
     root = layout.resolve_lake(shutil.copytree(lake, tmp_path / "lake", symlinks=True))
     make(root, render_exposures.steps(root, replace(parse(lake.parent / "r.toml"), readout="amplifiers")))
     version = read.version(root, "exposure_files")
@@ -157,7 +157,7 @@ def images_shape(text):
     return rows.stop - rows.start, columns.stop - columns.start
 
 
-def test_what_is_read_back_has_the_true_place(lake):
+def test_read_back_has_the_true_wcs(lake):
     products = read.version(lake, "products")
     exposure = read.version(lake, "exposures").rows().to_pylist()[0]
     for row in products.rows().to_pylist():
@@ -166,8 +166,8 @@ def test_what_is_read_back_has_the_true_place(lake):
         assert products.sidecar_path(head_files.head_path(row["path"])).is_file()
 
 
-def test_what_ccds_see_of_each_other_is_the_same_whoever_is_rendered_with_whom(lake, tmp_path):
-    """One after another, two at a time the other way about, and alone."""
+def test_crosstalk_is_independent_of_the_order_of_rendering(lake, tmp_path):
+    """Render the CCDs one after another, two at a time in reverse order, and alone."""
     wanted = parse(lake.parent / "r.toml")
     (pointing,) = wanted.pointings
     wanted = replace(wanted, files="detector", pointings=(replace(pointing, detectors=("S29", "S30")),))

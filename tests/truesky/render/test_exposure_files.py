@@ -1,4 +1,4 @@
-"""Files of whole exposures, by the jobs: of quadrants, and of signal and quality."""
+"""Files of whole exposures, made by the jobs: quadrants of VIS, signal and quality of NISP."""
 
 import os
 import shutil
@@ -79,7 +79,7 @@ def lake(whole, tmp_path):
 
 
 def opened(root):
-    """Row and images of each exposure, by channel."""
+    """Return row and images of each exposure, by channel."""
     version = read.version(root, "exposure_files")
     return {row["channel"]: (row, version.sidecar_path(row["path"])) for row in version.rows().to_pylist()}
 
@@ -109,10 +109,10 @@ def test_an_exposure_has_the_arrays_of_its_detectors(whole, channel, arrays):
         np.testing.assert_array_equal(unit.data, before.data)
         own = {key: value for key, value, _ in unit.cards}
         assert own["DETECTOR"] == name
-        # Nothing that was said of it is lost, or said otherwise.
+        # Every header value is kept unchanged.
         said = {key: value for key, value, _ in (*files[name][0].cards, *before.cards)}
         assert {key: {**about, **own}[key] for key in said} == said
-        # What tools look for in each array stands there, though it is of all.
+        # Keywords that tools need are in each array, although they apply to the whole file.
         assert {"INHERIT", "EXPTIME", "FILTER", "MJD-OBS", "DATASEC", "CCDSEC", "DETSEC"} <= set(own)
         assert ("GAIN" in {key for key, *_ in before.cards}) == (number != 1 or channel == "VIS")
     heads = (
@@ -128,7 +128,7 @@ def test_an_exposure_has_the_arrays_of_its_detectors(whole, channel, arrays):
 
 
 def _killed(root, request):
-    """Join in a process that is killed while it writes the second file."""
+    """Join files in a process that is killed while it writes the second one."""
     step = render_exposures.steps(root, request)[-1]
 
     def work(lake, facts):
@@ -168,8 +168,8 @@ def test_the_same_bytes_in_any_order_and_after_a_kill(lake, whole, request_file)
     assert read.find_faults(read.version(lake, "exposure_files"), deep=True) == []
 
 
-def test_of_some_detectors_a_file_has_those_and_says_so(lake, request_file, tmp_path):
-    """And all, once the others are there: what is there is used again."""
+def test_a_file_of_some_detectors_has_their_number(lake, request_file, tmp_path):
+    """A later run adds the other detectors and reuses existing images."""
     request = parse(request_file)
     for name in ("products", "rendered_truth", "exposure_files"):
         shutil.rmtree(layout.table_folder(lake, name))
@@ -184,19 +184,19 @@ def test_of_some_detectors_a_file_has_those_and_says_so(lake, request_file, tmp_
     assert {row["detectors"] for row, _ in opened(lake).values()} == {2}
 
 
-def test_files_are_no_part_of_what_detectors_are(lake, request_file):
-    """Without them no image is made again; files of other images are named."""
+def test_exposure_files_do_not_change_product_keys(lake, request_file):
+    """Without exposure files no image is rendered again; exposure files of outdated images are refused."""
     request = replace(parse(request_file), files="detector")
     steps = render_exposures.steps(lake, request)
     assert [step.plan.table.name for step in steps] == ["products", "rendered_truth"]
     assert steps[0].plan.key == read.version(lake, "products").key
     assert archive.exposures(lake).num_rows == 2
     make(lake, render_exposures.steps(lake, replace(request, noise_seed=9)))
-    with pytest.raises(BadInput, match="exposure_files is of other images"):
+    with pytest.raises(BadInput, match="exposure_files has outdated images"):
         archive.exposures(lake)
 
 
-def test_the_archive_lists_them(whole, capsys):
+def test_the_archive_lists_exposure_files(whole, capsys):
     version = read.version(whole, "exposure_files")
     for row in archive.exposures(whole).to_pylist():
         path = version.sidecar_path(row["path"])
@@ -205,8 +205,8 @@ def test_the_archive_lists_them(whole, capsys):
     assert capsys.readouterr().out == '{"n": 4}\n'
 
 
-def test_forecasts_count_them(whole, request_file):
-    """A second time each science image; and none of those that are there."""
+def test_forecasts_include_exposure_files(whole, request_file):
+    """Each science image counts twice, but existing images do not count."""
     request = parse(request_file)
     both, one = (plan_exposures.plan(whole, replace(request, files=files)) for files in ("exposure", "detector"))
     more = np.subtract(

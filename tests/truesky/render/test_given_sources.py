@@ -1,4 +1,4 @@
-"""A scene of given sources, from the table to the pixels, against GalSim's drawing of the same table."""
+"""A scene of given sources from the table to the pixels, compared with GalSim drawing the same table."""
 
 import galsim
 import galsim.des
@@ -73,13 +73,13 @@ def images(rendered):
     version = read.version(rendered, "products")
     files = {row["content"]: version.sidecar_path(row["path"]) for row in version.rows().to_pylist()}
     opened = {content: fits.getdata(file, header=True) for content, file in files.items()}
-    # Of the raw file its pixels, in electrons.
+    # Pixels of the raw file in electrons.
     opened["science"] = read_back.electrons(files["science"]).data, opened["science"][1]
     return {content: (header, data.astype(float)) for content, (data, header) in opened.items()}
 
 
 def disc_and_bulge():
-    """GalSim's world frame is (west, north): position angles begin at its v axis, and gamma2 has the other sign."""
+    """Draw with GalSim in the frame (west, north): position angles begin at its v axis, gamma2 changes sign."""
     height, ratio, fraction = 0.1, GALAXY["disk_axis_ratio"], GALAXY["bulge_fraction"]
     inclination = np.arccos(np.sqrt((ratio**2 - height**2) / (1.0 - height**2))) * galsim.radians
     disc = galsim.InclinedExponential(
@@ -94,8 +94,8 @@ def disc_and_bulge():
 
 
 @pytest.mark.parametrize(("row", "body"), [(GALAXY, disc_and_bulge()), (STAR, None)], ids=["galaxy", "star"])
-def test_a_source_is_what_galsim_draws_of_its_row(images, row, body):
-    """Place, flux with magnification, profile, shear and orientation, through the seeing and the pixel."""
+def test_sources_agree_with_galsim(images, row, body):
+    """Position, magnified flux, profile, shear and orientation agree after seeing and pixel integration."""
     header, data = images["noise_free"]
     wcs = galsim.AstropyWCS(header=header)
     # FITS counts pixels from 1.
@@ -112,7 +112,7 @@ def test_a_source_is_what_galsim_draws_of_its_row(images, row, body):
     assert found.sum() == pytest.approx(image.array.sum(), rel=2e-3)
 
 
-def test_the_psf_lies_beside_the_image(rendered):
+def test_the_psf_is_stored_with_the_image(rendered):
     version = read.version(rendered, "products")
     (row,) = (row for row in version.rows().to_pylist() if row["content"] == "science")
     image = version.sidecar_path(row["path"])
@@ -122,8 +122,8 @@ def test_the_psf_lies_beside_the_image(rendered):
         assert found * 0.2000587 == pytest.approx(units[-1].header["PSFFWHM"], rel=0.01)
 
 
-def test_a_frame_has_its_psf_and_the_place_of_its_pixels(rendered, images):
-    """Of the detector's first pixel, not of the file's."""
+def test_a_frame_has_psf_and_wcs(rendered, images):
+    """The position is that of the detector's first pixel, not of the file's."""
     ((frame,),) = frames.from_lake(rendered).values()
     assert frame.psf is not None
     assert frame.psf.name == frame.path.name.replace("_science.fits", ".psf")
@@ -131,7 +131,7 @@ def test_a_frame_has_its_psf_and_the_place_of_its_pixels(rendered, images):
     assert [frame.card(key) for key in ("CRPIX1", "CRPIX2")] == pytest.approx([header["CRPIX1"], header["CRPIX2"]])
 
 
-def test_nothing_else_is_in_the_image(rendered, images):
+def test_the_image_has_no_other_sources(rendered, images):
     assert len(read.version(rendered, "rendered_truth").rows()) == 2
     (_, truth), (header, science) = images["noise_free"], images["science"]
     assert header["NMOVING"] == 0

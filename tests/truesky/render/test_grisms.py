@@ -1,4 +1,4 @@
-"""Configurations of grisms that a user asks for: read by grismconf, in the units of what is drawn."""
+"""Configuration files of grisms: grismconf reads them, and they have the units of the rendered spectra."""
 
 import grismconf
 import numpy as np
@@ -38,10 +38,10 @@ def test_every_grism_has_a_configuration_with_its_traces_and_sensitivities(folde
             np.testing.assert_allclose(read.DISPY(order, 300.0, 1700.0, t), y, rtol=0.0, atol=1e-6)
 
 
-def test_a_line_has_its_flux_times_the_sensitivity_of_electrons_a_second(folder):
-    """Of two galaxies on a strip on which no other order of them lies, without what shines beyond it.
+def test_electrons_of_a_line_are_flux_times_sensitivity(folder):
+    """Two galaxies on a strip without overlap of their other orders; background light is subtracted.
 
-    Lines so bright that it does not matter that a stamp without them holds 2 % less of the continuum.
+    The lines are so bright that the continuum hardly matters: a stamp without lines contains 2 % less of it.
     """
     lines = Lines(np.array([14000.0, 16500.0]), np.array([3e-14, 2e-14]), np.array([0.1, 0.1]))
     path = spectral_lines.trace(strip(), "RGS000", 0.0)
@@ -55,8 +55,8 @@ def test_a_line_has_its_flux_times_the_sensitivity_of_electrons_a_second(folder)
         assert counts == pytest.approx(wanted, rel=0.01)
 
 
-def test_the_sensitivity_is_that_of_the_zero_point():
-    """A source of flat f_nu gives what the exposure's magnitude of one electron a second says, in all wavelengths."""
+def test_sensitivity_agrees_with_the_zero_point():
+    """A source with constant f_nu, summed over wavelength, agrees with the zero point of the exposure."""
     aim = grisms.nominal_aim("RGS000", "DET22", MISSION)
     order = next(one for one in grisms.orders(aim, MISSION, 0) if one.trace.order == 1)
     f_nu = 10.0 ** (-0.4 * (aim.exposure.zero_point + 48.6))
@@ -77,7 +77,7 @@ def test_the_sensitivity_is_that_of_the_zero_point():
         (["--name", "a"], "--lake is missing"),
     ],
 )
-def test_what_there_is_not_is_one_line_and_no_file(tmp_path, capsys, more, message):
+def test_errors_are_one_line_and_no_file_is_written(tmp_path, capsys, more, message):
     assert grisms.main(["--out", str(tmp_path / "new"), *more]) == 2
     said = capsys.readouterr().err
     assert message in said

@@ -1,6 +1,6 @@
-"""Notebooks that render: a field of small detectors, the shear of known galaxies, spectra; they show what they say.
+"""Notebooks that render images: small detectors, the shear of known galaxies, and spectra; their claims hold.
 
-That they use the public interface alone is tested every day, in tests/house/test_public_interface.py.
+tests/house/test_public_interface.py checks daily that they use only the public interface.
 """
 
 import re
@@ -15,7 +15,7 @@ from truesky.request.accuracy import PRESETS
 
 ROOT = Path(__file__).resolve().parents[3]
 NOTEBOOKS = ROOT / "notebooks"
-# The detectors of the focal plane cut to a tenth of their area, two of them.
+# Two detectors, cut to a tenth of their area.
 SMALL = """
 name = "small"
 seed = 7
@@ -43,7 +43,7 @@ mjd = 60905.0
 [products]
 truth = []
 """
-# Two of NISP's, as small, and a dark.
+# Two NISP detectors of the same size, and a dark.
 INFRARED = (
     SMALL.replace("vis.fpa.nx", "nisp.fpa.nx").replace("vis.fpa.ny", "nisp.fpa.ny").replace("130", "60")
     .replace('"vis.ghost.offset_y" = { value = 250', '"nisp.ghost.offset_y" = { value = 100')
@@ -58,7 +58,7 @@ detectors = ["DET22"]
 """
 )  # fmt: skip
 
-# The shipped field of spectra, its detector cut to a strip; without VIS, faint stars and some of the faint galaxies.
+# The shipped field of spectra, with the detector cut to a strip; without VIS, faint stars and some faint galaxies.
 SPECTRA = (NOTEBOOKS.parent / "requests" / "slitless.toml").read_text()
 STRIP = re.sub(r"# Twice.*?\n\n", "", SPECTRA, flags=re.DOTALL)
 for usual, small in (
@@ -72,12 +72,12 @@ for usual, small in (
 
 
 def printed(outputs):
-    """What cells print."""
+    """Return what the cells print."""
     return "".join(output.text for output in outputs if output.output_type == "stream" and output.name == "stdout")
 
 
 def run(monkeypatch, name, **environment):
-    """The outputs of a notebook's cells."""
+    """Return the outputs of a notebook's cells."""
     environment |= {"MPLBACKEND": "module://matplotlib_inline.backend_inline", "PYTHONPATH": ROOT}
     for key, value in environment.items():
         monkeypatch.setenv(key, str(value))
@@ -89,8 +89,8 @@ def run(monkeypatch, name, **environment):
 
 
 @pytest.mark.nightly
-def test_the_shear_of_known_galaxies_is_measured_as_in_galsim_s_images(tmp_path, monkeypatch):
-    """The renderer's own m and c, less GalSim's, are within what each accuracy allows."""
+def test_shear_of_known_galaxies_agrees_with_galsim(tmp_path, monkeypatch):
+    """The renderer's m and c minus GalSim's are within the limits of each accuracy."""
     outputs = run(monkeypatch, "04_measure_shear", TRUESKY_LAKE=tmp_path / "shear")
     assert sum("image/png" in output.get("data", {}) for output in outputs) == 1
     text = printed(outputs)
@@ -100,7 +100,7 @@ def test_the_shear_of_known_galaxies_is_measured_as_in_galsim_s_images(tmp_path,
     for name, biases in found.items():
         assert np.abs(biases).max() < PRESETS[name].shape
     (m,) = (float(line.split()[3]) for line in text.splitlines() if line.startswith("GalSim "))
-    # Re-Gaussianisation is no better than some per cent; without the pairs it would be far off.
+    # Re-Gaussianisation is accurate to a few per cent; without pairs the result would be far off.
     assert -0.05 < m < 0.01
 
 
@@ -125,8 +125,8 @@ def test_every_cell_runs(tmp_path, monkeypatch, request_text):
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("whole", [False, True], ids=["strip", "detector"])
-def test_redshifts_and_fluxes_of_lines_are_those_of_the_catalogue(tmp_path, monkeypatch, whole):
-    """Of the shipped field those that are claimed; in a strip of it every cell runs."""
+def test_redshifts_and_line_fluxes_agree_with_the_catalogue(tmp_path, monkeypatch, whole):
+    """The claims hold for the shipped field; every cell also runs for a strip of it."""
     (tmp_path / "spectra.toml").write_text(SPECTRA if whole else STRIP)
     outputs = run(
         monkeypatch,

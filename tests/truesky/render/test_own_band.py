@@ -1,4 +1,4 @@
-"""Exposures in a passband of the request's own: VIS can be pointed in it, no other camera."""
+"""Exposures in a user passband, which only VIS can observe in."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from truesky.request.from_toml import parse
 
 MISSION = mission.mission_of(schema.MissionChoice())
 WAVELENGTH = np.arange(5000.0, 9501.0, 10.0)
-# A filter within VIS, synthetic.
+# A synthetic filter within the band of VIS.
 RESPONSE = 0.5 * np.exp(-0.5 * ((WAVELENGTH - 6500.0) / 400.0) ** 2)
 OWN = f"""
 accuracy = "draft"
@@ -45,7 +45,7 @@ def asked(folder, keys=POINTING, block="pointing", response=RESPONSE):
     return parse(requests.written(folder, f"{OWN}[[{block}]]\n{keys}\n", requests.FIELD.format(0.3), seed=5))
 
 
-def test_it_is_planned_with_its_own_zero_point_and_sky(lake, tmp_path):
+def test_zero_point_and_sky_of_a_user_band(lake, tmp_path):
     _, exposures, rows = plan_exposures.plan(lake, asked(tmp_path))
     (row,) = exposures.to_pylist()
     assert (row["band"], rows["detector"].to_pylist()) == ("mine", ["3-4"])
@@ -53,12 +53,12 @@ def test_it_is_planned_with_its_own_zero_point_and_sky(lake, tmp_path):
     assert row["zero_point"] == pytest.approx(units.zero_point(9926.0, width), abs=1e-3)
     wide = planned_exposures.zero_point_of("vis", "euclid_vis", MISSION)
     assert row["zero_point"] < wide
-    # The sky is redder than the filter, fainter than in all of VIS, brighter than the band's scattered light alone.
+    # The sky is redder than the filter, fainter than in the whole VIS band, and brighter than only the scattered light.
     scattered = MISSION.value("vis.scattered_light", "electron / (s pix)") * 10 ** (0.4 * (row["zero_point"] - wide))
     assert scattered < row["sky"] < 0.5 * 0.24
 
 
-def test_another_content_of_its_file_is_another_plan(lake, tmp_path):
+def test_the_plan_depends_on_the_content_of_the_file(lake, tmp_path):
     keys = [
         plan_exposures.steps(lake, asked(tmp_path, response=scale * RESPONSE))[1].plan.key for scale in (1.0, 1.0, 0.9)
     ]
@@ -77,13 +77,13 @@ def test_another_content_of_its_file_is_another_plan(lake, tmp_path):
         ("observation", SURVEY, r"observation\[0\]\.bands: mine is your own passband: no survey observes in it"),
     ],
 )
-def test_other_cameras_have_no_such_band(tmp_path, block, keys, words):
+def test_only_vis_observes_in_a_user_band(tmp_path, block, keys, words):
     with pytest.raises(BadInput, match=words):
         asked(tmp_path, keys, block)
 
 
-def test_a_response_that_is_no_fraction_is_refused(lake, tmp_path):
-    with pytest.raises(BadInput, match=r"fluxes\.passbands\.mine: responds with 50: a pointing wants the fraction"):
+def test_a_response_above_1_is_refused(lake, tmp_path):
+    with pytest.raises(BadInput, match=r"fluxes\.passbands\.mine: response must be the fraction of photons detected"):
         plan_exposures.plan(lake, asked(tmp_path, response=100.0 * RESPONSE))
 
 
@@ -102,7 +102,7 @@ def test_from_the_request_to_its_image(lake, tmp_path):
         publish.make_version(lake, step.plan, step.run_task)
     rows = read.version(lake, "products").rows().to_pylist()
     assert {row["band"] for row in rows} == {"mine"}
-    # A filter that is not the one of the fluxes is noticed.
+    # A filter that differs from that of the fluxes is an error.
     changed = asked(tmp_path, response=0.9 * RESPONSE)
     for step in plan_exposures.steps(lake, changed):
         publish.make_version(lake, step.plan, step.run_task)

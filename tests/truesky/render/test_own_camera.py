@@ -58,7 +58,7 @@ truth = ["noise_free"]
 
 
 def written(folder, request=REQUEST, **tables):
-    """Write a request and the folder of its camera, which has DECam's numbers unless a table is given."""
+    """Write a request and the folder of its camera, with DECam's values unless tables are given."""
     if not (folder / "mini").exists():
         camera_template.write_like("decam", folder / "mini")
     wavelength = np.arange(6000.0, 6801.0, 10.0)
@@ -88,7 +88,7 @@ def files(rendered):
     return {(row["content"], row["detector"]): version.sidecar_path(row["path"]) for row in rows}
 
 
-def test_all_its_detectors_are_rendered_with_their_overscan(files):
+def test_all_detectors_are_rendered_with_overscan(files):
     assert set(files) == {(content, name) for content in ("science", "noise_free") for name in ("left", "right")}
     raw, header = fits.getdata(files["science", "right"], header=True)
     assert raw.shape == (260 + 8, 300 + 2 * (4 + 16))
@@ -99,7 +99,7 @@ def test_a_star_has_the_electrons_of_the_zero_point_where_the_header_says(render
     noise_free, header = fits.getdata(files["noise_free", "right"], header=True)
     fluxes = read.version(rendered, "star_fluxes").rows(["f_nu_narrow"])["f_nu_narrow"].to_numpy()
     assert len(fluxes) == 1
-    # Its colour is that of a star: the flux in the own band differs a little from that of lsst_r.
+    # The source has the colour of a star: its flux in the user's band differs slightly from that in lsst_r.
     assert -2.5 * np.log10(fluxes[0]) + 23.9 == pytest.approx(MAGNITUDE, abs=0.3)
     expected = fluxes[0] * 10 ** (0.4 * (header["ZEROPNT"] - 23.9)) * SECONDS
     assert noise_free.sum() == pytest.approx(expected, rel=0.01)
@@ -107,33 +107,33 @@ def test_a_star_has_the_electrons_of_the_zero_point_where_the_header_says(render
     rows, columns = np.indices(noise_free.shape)
     centre = [(noise_free * axis).sum() / noise_free.sum() for axis in (columns, rows)]
     assert centre == pytest.approx([float(x), float(y)], abs=0.1)
-    # Extinction of 0.1 mag at the airmass of the exposure, which the zero point is given for at 1.2.
+    # Extinction is 0.1 mag per airmass; the zero point applies at airmass 1.2.
     assert header["ZEROPNT"] == pytest.approx(ZERO_POINT - 0.1 * (header["AIRMASS"] - 1.2), abs=2e-3)
 
 
-def test_its_pixels_are_read_with_the_gain_and_the_sky_of_the_folder(files):
+def test_gain_and_sky_are_those_of_the_folder(files):
     frame = products.electrons(files["science", "left"])
     with fits.open(files["science", "left"]) as units:
         header = units[-1].header
-    # The parameters have a spread of the gains of 0.05 rms, and their distribution ends at 3 rms.
+    # The gains have a spread of 0.05 rms, and their distribution ends at 3 rms.
     assert [header[f"GAIN{n}"] for n in (1, 2)] == pytest.approx([GAIN, GAIN], abs=3 * 0.05)
     scale = 3600.0 * np.sqrt(abs(np.linalg.det(WCS(header).pixel_scale_matrix)))
     sky = 10 ** (0.4 * (ZERO_POINT - 21.0)) * scale**2 * SECONDS
-    # The sky of the night, about the level of a dark one.
+    # The night sky is close to the level of a dark one.
     assert np.median(frame.data) == pytest.approx(sky, rel=0.5)
 
 
-def test_the_lake_holds_all_of_the_camera(rendered):
+def test_the_lake_contains_the_camera(rendered):
     mission = read_back(read.version(rendered, "mission"))
     assert [row["detector"] for row in mission.rows("ext.mini.layout")] == ["left", "right"]
     assert mission.value("ext.mini.narrow.zero_point") == ZERO_POINT
     names = read.version(rendered, "star_fluxes").schema.names
-    # Bands of the camera in which nothing is observed have no fluxes.
+    # Bands without exposures have no fluxes.
     assert "f_nu_narrow" in names
     assert "f_nu_sdss_r" not in names
 
 
-def test_another_content_of_the_folder_is_another_plan(lake, tmp_path):
+def test_the_plan_depends_on_the_content_of_the_folder(lake, tmp_path):
     def keys():
         return [step.plan.key for step in plan_exposures.steps(lake, parse(written(tmp_path)))]
 
@@ -157,7 +157,7 @@ def test_another_content_of_the_folder_is_another_plan(lake, tmp_path):
         ({"bands": BANDS.replace("25.3", "99")}, r"mission\.cameras\[0\]: .*bands\.csv line 2: .*narrow\.zero_point"),
     ],
 )  # fmt: skip
-def test_a_folder_with_a_mistake_is_refused_before_anything_is_written(tmp_path, tables, words):
+def test_an_invalid_folder_is_refused_before_anything_is_written(tmp_path, tables, words):
     with pytest.raises(BadInput, match=words) as refused:
         parse(written(tmp_path, **tables))
     assert "\n" not in str(refused.value)
@@ -173,7 +173,7 @@ def test_a_folder_with_a_mistake_is_refused_before_anything_is_written(tmp_path,
         ('cameras = ["mini"]', 'cameras = ["loop"]', r"mission\.cameras\[0\]: .*loop: no such folder"),
     ],
 )
-def test_a_request_that_names_no_folder_is_refused(tmp_path, old, new, words):
+def test_a_camera_without_folder_is_refused(tmp_path, old, new, words):
     (tmp_path / "loop").symlink_to("loop")
     with pytest.raises(BadInput, match=words):
         parse(written(tmp_path, REQUEST.replace(old, new)))
@@ -191,19 +191,21 @@ def test_a_request_that_names_no_folder_is_refused(tmp_path, old, new, words):
         ('centre_on = "right"', 'centre_on = "top"', r"pointing\[0\]\.centre_on: camera mini has no detector 'top'"),
     ],
 )
-def test_a_pointing_that_the_camera_cannot_take_is_refused(lake, tmp_path, old, new, words):
+def test_invalid_pointings_of_the_camera_are_refused(lake, tmp_path, old, new, words):
     with pytest.raises(BadInput, match=words):
         plan_exposures.steps(lake, parse(written(tmp_path, REQUEST.replace(old, new))))
 
 
-def test_a_band_without_a_curve_is_one_of_ours(lake, tmp_path):
+def test_a_band_without_a_curve_must_be_embedded(lake, tmp_path):
     request = parse(written(tmp_path, REQUEST.replace('band = "narrow"', 'band = "sdss_r"')))
     assert request.bands == ("sdss_r",)
     plan_exposures.steps(lake, request)
     unknown = written(
         tmp_path, REQUEST.replace('band = "narrow"', 'band = "odd"'), bands=BANDS.replace("sdss_r", "odd")
     )
-    with pytest.raises(BadInput, match="band odd: truesky has no passband of this name, and no curve is given for it"):
+    with pytest.raises(
+        BadInput, match="band odd: truesky has no passband of this name, and the request has no curve for it"
+    ):
         plan_exposures.steps(lake, parse(unknown))
 
 
@@ -213,10 +215,10 @@ def test_a_band_without_a_curve_is_one_of_ours(lake, tmp_path):
         ("des_r", None, "truesky has a passband des_r: choose another name for this curve"),
         ("narrow", "# nothing\n\n", r".*narrow\.dat: has no rows"),
         ("narrow", "6000 0\n6100 -1\n", r".*narrow\.dat: row 2 is negative"),
-        ("narrow", "6000 0\n6100 50\n6200 50\n", r"responds with 50: a pointing wants the fraction"),
+        ("narrow", "6000 0\n6100 50\n6200 50\n", r"response must be the fraction of photons detected"),
     ],
 )
-def test_a_curve_with_a_mistake_is_named_with_its_table(lake, tmp_path, band, curve, words):
+def test_errors_of_a_curve_name_its_table(lake, tmp_path, band, curve, words):
     path = written(tmp_path, REQUEST.replace("narrow", band), bands=BANDS.replace("narrow,", f"{band},"))
     if curve is not None:
         (tmp_path / "mini" / "narrow.dat").write_text(curve)

@@ -1,4 +1,4 @@
-"""The render job on small detectors: what is made, what is made again, and what is not."""
+"""The render job on small detectors: products that are made, reused or refused."""
 
 import copy
 import json
@@ -40,7 +40,7 @@ from truesky.render.sources import catalogue_rows
 from truesky.request.from_toml import from_table
 from truesky.running import submitted_job
 
-# Eight amplifiers side by side.
+# Eight amplifiers next to one another.
 SIDE = 304
 SMALL = f"""
 accuracy = "draft"
@@ -64,7 +64,7 @@ REQUEST = tomllib.loads(requests.text(SMALL, requests.FIELD.format(0.03), seed=7
 
 @contextmanager
 def small_detectors():
-    """Detectors of LSSTCam cut down to their middles, close together."""
+    """Detectors of LSSTCam cut to their centres, close together."""
     listed = detectors._read_layout
 
     def smaller(section, mission):
@@ -120,7 +120,7 @@ def make(root, request, *modules, spy=lambda work: work):
 
 
 def render(root, request, fail=()):
-    """What was rendered anew: (exposure, detector), and how often."""
+    """Render and count the calls for each (exposure, detector)."""
     made = Counter()
 
     def spy(work):
@@ -151,7 +151,7 @@ WORK = render_exposures.render_task
 BOTH = Counter({(1, "R22_S11"): 1, (1, "R22_S12"): 1})
 
 
-def test_every_planned_detector_has_its_products_and_every_source_its_row(rendered):
+def test_products_of_every_detector_and_rows_of_every_source(rendered):
     tasks, products, truth = (read.version(rendered, name).rows() for name in ("tasks", "products", "rendered_truth"))
     for content in ("science", "noise_free"):
         rows = products.filter(pc.field("content") == content)
@@ -165,7 +165,7 @@ def test_every_planned_detector_has_its_products_and_every_source_its_row(render
         assert (np.diff(ids) > 0).all()
         with fits.open(version.sidecar_path(row["path"])) as file:
             electrons, system = file[0].data.astype(float), WCS(file[0].header)
-        # The image is the sum of the stamps and of wings that are fainter than the noise: with the aureole, 4 %.
+        # The image is the sum of the stamps and of wings fainter than the noise: 4 % with the aureole.
         assert onto.sum() <= electrons.sum() * (1 + 1e-5)
         assert onto.sum() > 0.94 * electrons.sum()
         assert (onto <= expected * 1.001).all()
@@ -181,8 +181,8 @@ def test_every_planned_detector_has_its_products_and_every_source_its_row(render
         np.testing.assert_allclose(own, np.stack([x, y], 1), atol=1e-6)
 
 
-def test_a_cone_about_an_image_of_a_galaxy_finds_it_in_the_catalogue_and_among_its_fluxes(rendered):
-    """Through the header of the file alone: a cross-match of its sources has all of them in common."""
+def test_a_cone_search_finds_a_galaxy_of_an_image(rendered):
+    """With the header of the file alone; a cross-match contains all sources of the image."""
     products, truth = (read.version(rendered, name) for name in ("products", "rendered_truth"))
     catalogues = [read.version(rendered, name) for name in ("galaxies", "galaxy_fluxes")]
     matched = 0
@@ -201,7 +201,7 @@ def test_a_cone_about_an_image_of_a_galaxy_finds_it_in_the_catalogue_and_among_i
     assert 3600.0 * np.median(moved) > 10.0
 
 
-def test_a_detector_alone_is_what_it_is_among_others(lake, rendered):
+def test_a_detector_rendered_alone_has_the_same_bytes(lake, rendered):
     among = images(rendered)
     alone = {**REQUEST["pointing"][0], "detectors": ["R22_S12"]}
     assert render(lake, wanted(pointing=[alone])) == Counter({(1, "R22_S12"): 1})
@@ -210,7 +210,7 @@ def test_a_detector_alone_is_what_it_is_among_others(lake, rendered):
     assert all(among[path] == data for path, data in one.items())
 
 
-def test_a_bad_detector_is_a_row_and_not_the_end_of_the_run(lake, monkeypatch, tmp_path, capsys):
+def test_a_failed_detector_does_not_end_the_run(lake, monkeypatch, tmp_path, capsys):
     def here(function, parts, *options):
         return map(function, parts)
 
@@ -237,7 +237,7 @@ def test_a_bad_detector_is_a_row_and_not_the_end_of_the_run(lake, monkeypatch, t
     assert failed["seconds"] >= 0
     assert 0 < failed["peak_gb"] < 100
     assert len(stage.missing_tasks(layout.stage_folder(lake, "products", step.plan.key), step.plan)) == 1
-    # Only what failed is made by the next run, and is then no failure any more.
+    # The next run makes only failed detectors, which are then no longer listed as failures.
     made = []
     monkeypatch.setattr(render_exposures, "render_task", lambda root, facts: made.append(facts) or WORK(root, facts))
     submitted_job.run(render_exposures.JOB, lake, wanted())
@@ -254,7 +254,7 @@ def _check_archive(lake, capsys):
         assert row["seconds"] > 0.01
         assert 0 < row["peak_gb"] < 100
         assert row["path"] in archive.rows_at_place(rows, row["ra"], row["dec"])["path"].to_pylist()
-        # Corners of the footprint are its own; half a degree away there is nothing, nor on the other side of the sky.
+        # Corners of the footprint belong to it; positions half a degree away, or at the antipode, do not.
         ra, dec = map(float, row["s_region"].split()[2:4])
         edge = row["ra"] + (ra - row["ra"]) * 0.999, row["dec"] + (dec - row["dec"]) * 0.999
         assert row["path"] in archive.rows_at_place(rows, *edge)["path"].to_pylist()
@@ -271,8 +271,8 @@ def _check_archive(lake, capsys):
         assert capsys.readouterr().err.startswith("archive: --sql: ")
 
 
-def test_a_source_beyond_the_reach_of_any_stamp_changes_no_byte(lake, rendered):
-    """The same lake without the sources 8 minutes of arc and more from the detectors, in the cells that they read."""
+def test_distant_sources_do_not_change_the_image(lake, rendered):
+    """The same lake without sources 8 arcmin or more from the detectors, in the cells that they read."""
     for name in ("galaxies", "stars"):
         version = read.version(lake, name)
         table, whole = tables.find_table(name, version.schema.names), version.manifest
@@ -286,7 +286,7 @@ def test_a_source_beyond_the_reach_of_any_stamp_changes_no_byte(lake, rendered):
         publish.make_version(lake, Plan(table, {**whole["facts"], "without": "the far ones"}, parts), near)
         assert 20 < read.version(lake, name).num_rows < 0.95 * version.num_rows
     make(lake, wanted(), compute_fluxes)
-    # Their files are others, so they are rendered, to the same bytes.
+    # Their files differ, so that the detectors are rendered again, to the same bytes.
     assert render(lake, wanted()) == BOTH
     assert images(lake) == images(rendered)
     drawn = [read.version(root, "rendered_truth").rows() for root in (lake, rendered)]
@@ -313,7 +313,7 @@ def _killed(root, request):
         publish.make_version(root, step.plan, work)
 
 
-def test_a_run_that_is_killed_half_way_ends_with_the_same_bytes(lake, rendered):
+def test_an_interrupted_run_ends_with_the_same_bytes(lake, rendered):
     make(lake, wanted(), plan_exposures)
     child = CONTEXT.Process(target=_killed, args=(lake, wanted()))
     child.start()
@@ -321,7 +321,7 @@ def test_a_run_that_is_killed_half_way_ends_with_the_same_bytes(lake, rendered):
     assert child.exitcode == -signal.SIGKILL
     assert layout.current_key(lake, "products") is None
     assert list(layout.table_folder(lake, "products").glob(".stage-*/**/.*tmp*"))
-    # What was done before is not done again.
+    # Finished work is not repeated.
     (made,) = render(lake, wanted()).items()
     assert made[1] == 1
     assert images(lake) == images(rendered)
@@ -342,7 +342,7 @@ def test_a_staged_image_that_changed_is_rendered_again(lake, rendered):
     assert images(lake) == images(rendered)
 
 
-def test_what_an_older_version_holds_is_not_rendered_again(rendered):
+def test_images_of_an_older_version_are_reused(rendered):
     lake = rendered
     first = images(lake)
     assert render(lake, wanted(pointings=2)) == Counter({(2, "R22_S11"): 1, (2, "R22_S12"): 1})
@@ -353,25 +353,25 @@ def test_what_an_older_version_holds_is_not_rendered_again(rendered):
     assert read.version(lake, "rendered_truth").num_rows == sum(
         row["sources"] for row in read.version(lake, "products").rows().to_pylist() if row["content"] == "science"
     )
-    # The older version may go: what was taken from it stays.
+    # The older version can be removed; reused files remain.
     garbage.collect(lake, "products", delete=True)
     assert images(lake) == both
 
 
 def named(root, request, *modules):
-    """As `make`, for the request's name."""
+    """Make the tables like `make`, for the name of the request."""
     for module in modules:
         for step in module.steps(root, request):
             publish.make_version(root, step.plan, step.run_task, name=request.name)
 
 
 def planned_parts(root, request):
-    """Of images and of what was drawn: the parts that the next version would have."""
+    """Return the tasks of the next version, for images and truth tables."""
     return [sorted(part.name for part in step.plan.tasks) for step in render_exposures.steps(root, request)]
 
 
-def test_a_part_is_added_to_what_the_request_has(rendered):
-    """Of a part that is asked for later nothing is lost; what has changed since does not stay."""
+def test_new_products_are_added_to_existing_ones(rendered):
+    """Products requested later are added to the existing ones; products with changed inputs are dropped."""
     lake, whole = rendered, wanted()
     named(lake, whole, plan_exposures, render_exposures)
     before, key = images(lake), request_links.linked_key(lake, whole.name, "products")
@@ -382,11 +382,11 @@ def test_a_part_is_added_to_what_the_request_has(rendered):
     assert images(lake) == before
     one = ["000001-r22_s12.parquet"]
     both = ["000001-r22_s11.parquet", *one]
-    # A later exposure of the plan: the first one's images stay beside it.
+    # A later exposure of the plan is added to the images of the first one.
     named(lake, two := wanted(pointings=2), plan_exposures)
     assert planned_parts(lake, replace(two, limit=1)) == [both, both]
     assert planned_parts(lake, replace(two, limit=3)) == [[*both, "000002-r22_s11.parquet"]] * 2
-    # Of another noise they are other images; and another request has none of them.
+    # Another noise seed gives other images; another request has none of them.
     named(lake, other := replace(whole, noise_seed=8), plan_exposures)
     assert planned_parts(lake, replace(other, detectors=("R22_S12",))) == [one, one]
     named(lake, other := replace(whole, name="y"), plan_exposures)
@@ -398,10 +398,10 @@ def size_of(root, *tables):
     return sum(path.stat().st_size for folder in folders for path in folder.rglob("*") if path.is_file())
 
 
-def test_what_is_used_again_needs_no_room(rendered):
-    """Catalogues that stay, and those images whose product keys stay; of another request nothing."""
+def test_reused_files_need_no_disk_space(rendered):
+    """Reused catalogues and images with unchanged product keys need no space; those of other requests do not count."""
     lake, whole, files = rendered, wanted(), read.version(rendered, "products").manifest["files"]
-    # As a job leaves the lake: the version belongs to the request.
+    # The version belongs to the request, as after a job.
     request_links.link_version(lake, whole.name, "products", str(layout.current_key(lake, "products")))
     catalogues = size_of(lake, "halos", "galaxies", "galaxy_fluxes", "stars", "star_fluxes")
     products = sum(entry["bytes"] for entry in files)
@@ -419,7 +419,7 @@ def test_what_is_used_again_needs_no_room(rendered):
     assert there(replace(whole, seed=8)) == 0
 
 
-def test_a_damaged_image_of_an_older_version_is_not_taken(rendered):
+def test_a_damaged_image_is_not_reused(rendered):
     lake = rendered
     image = min(layout.current_link(lake, "products").resolve().glob("images/*/*R22_S12*science.fits"))
     data = bytearray(image.read_bytes())
@@ -430,13 +430,13 @@ def test_a_damaged_image_of_an_older_version_is_not_taken(rendered):
 
 
 def keys(root, request, plan=False):
-    """Part -> product key, as a run would have it, after another plan or with the one that is there."""
+    """Return the product key of each partition, as in a run with a new plan or the existing one."""
     if plan:
         make(root, request, plan_exposures)
     return {part.name: part.facts["product"] for part in render_exposures.steps(root, request)[0].plan.tasks}
 
 
-def test_a_key_changes_with_everything_that_shapes_a_product(rendered, monkeypatch, tmp_path):
+def test_product_keys_depend_on_all_inputs(rendered, monkeypatch, tmp_path):
     there = read.version(rendered, "products").manifest["parts"]
     assert keys(rendered, wanted()) == {part["name"]: part["facts"]["product"] for part in there}
     found = [keys(rendered, wanted(**some)) for some in ({}, {"effects": {"off": ["poisson"]}}, {"accuracy": "survey"})]
@@ -458,11 +458,11 @@ def test_a_key_changes_with_everything_that_shapes_a_product(rendered, monkeypat
     with pytest.raises(BadInput, match=r"psf.fits: has changed since the rendering began"):
         render_exposures.render_task(rendered, {**step.plan.facts, **step.plan.tasks[0].facts})
     assert all(len({some[part] for some in found}) == len(found) for part in found[0])
-    # What else is asked for is no part of it.
+    # Other options do not change the key.
     assert found[0].items() < keys(rendered, wanted(pointings=2), plan=True).items()
 
 
-def test_another_mission_makes_everything_again(rendered):
+def test_another_mission_changes_all_keys(rendered):
     before = images(rendered)
     noise = {"ext.lsstcam.read_noise": {"value": 7.0, "unit": "electron"}}
     assert render(rendered, wanted(mission={"overrides": noise})) == BOTH
@@ -471,7 +471,7 @@ def test_another_mission_makes_everything_again(rendered):
 
 
 def two_lenses(cell, galaxies, seed, boost):
-    """Instead of shooting rays: the two of a cell's galaxies that are nearest to where the detectors look."""
+    """Replace ray shooting: use the two galaxies of a cell that are closest to the pointing."""
     away = sky.separation(*(galaxies[name].to_numpy() for name in ("ra", "dec")), 53.117, -27.808)
     rows = galaxies.take(np.argsort(away)[:2])
     rest = {c.name: np.ones(2, int if c.type.startswith("int") else float) for c in STRONG_LENSES.columns}
@@ -495,7 +495,7 @@ def test_strong_lenses_of_the_lake_are_drawn(rendered, monkeypatch):
     assert render(lake, crowded) == BOTH
     drawn = read.version(lake, "rendered_truth").rows(where=pc.field("method") == truth_table.PICTURE)
     assert len(drawn) > 0
-    # In an exposure of no time nothing shows: neither galaxies are read nor what lenses make of them.
+    # An exposure of 0 s has no light: neither galaxies nor lensed images are read.
     for least, shows in ((0.0, True), (np.inf, False)):
         tasks = read.version(lake, "tasks").rows().to_pylist()
         found = sum(catalogue_rows.read_lenses(version, task, 0.1, 0.0, least).num_rows for task in tasks)
@@ -505,7 +505,7 @@ def test_strong_lenses_of_the_lake_are_drawn(rendered, monkeypatch):
     for detector in set(drawn["detector"].to_pylist()):
         assert sum(f"_{detector}_" in path for path in changed) == 2
     ahead = preconditions.refuse_other_plan
-    # Of other galaxies they are not drawn.
+    # Lenses of other galaxies are not drawn.
     facts = {**version.manifest["facts"], "galaxies": "0" * 64}
     other = replace(version, manifest={**version.manifest, "facts": facts})
     monkeypatch.setattr(
@@ -520,16 +520,16 @@ def test_strong_lenses_of_the_lake_are_drawn(rendered, monkeypatch):
 ARMS = {"arms": {"least_radius": 0.3}}
 
 
-def test_images_are_another_version_where_discs_have_arms(rendered):
-    """Where they are not asked for, nothing is made anew."""
+def test_arms_of_discs_change_the_version(rendered):
+    """Without arms in the request, nothing is made again."""
     before = keys(rendered, wanted())
     assert keys(rendered, wanted(structure={"arms": False})) == before
     assert all(keys(rendered, wanted(structure=ARMS))[part] != key for part, key in before.items())
 
 
 @pytest.mark.nightly
-def test_discs_have_arms_where_they_are_asked_for(rendered, lake):
-    """In any process the same."""
+def test_arms_are_drawn_if_requested(rendered, lake):
+    """The result is the same in any process."""
     plain = images(rendered)
     assert render(rendered, wanted(structure=ARMS)) == BOTH
     found, truth = images(rendered), read.version(rendered, "rendered_truth").rows()
@@ -541,7 +541,7 @@ def test_discs_have_arms_where_they_are_asked_for(rendered, lake):
 
 
 def test_galaxies_of_a_library_are_drawn(rendered, tmp_path):
-    """The sha256 of its file is in the key of an image, and stands for it while it is rendered."""
+    """The sha256 of the library is part of the key, and is checked while an image is rendered."""
     before, path = keys(rendered, wanted()), tmp_path / "library.fits"
     y, x = np.mgrid[:32, :32] - 15.5
     fits.writeto(path, np.array([np.exp(-np.hypot(x, q * y) / 3.0) for q in (1.0, 2.0)], np.float32))
@@ -560,7 +560,7 @@ def test_galaxies_of_a_library_are_drawn(rendered, tmp_path):
         render_exposures.render_task(rendered, {**step.plan.facts, **step.plan.tasks[0].facts})
 
 
-def test_a_product_is_rebuilt_from_its_own_manifest(rendered, tmp_path):
+def test_a_product_is_rendered_again_from_its_manifest(rendered, tmp_path):
     version = read.version(rendered, "products")
     rebuilt = 0
     for part in version.manifest["parts"]:
@@ -572,7 +572,7 @@ def test_a_product_is_rebuilt_from_its_own_manifest(rendered, tmp_path):
     assert rebuilt == 4
 
 
-def test_an_old_product_is_rendered_again_with_the_mission_that_it_had(rendered, tmp_path, capsys):
+def test_an_old_product_is_rendered_again_with_its_mission(rendered, tmp_path, capsys):
     old = read.version(rendered, "products")
     before = images(rendered)
     noise = {"ext.lsstcam.read_noise": {"value": 7.0, "unit": "electron"}}
@@ -586,13 +586,13 @@ def test_an_old_product_is_rendered_again_with_the_mission_that_it_had(rendered,
     assert (tmp_path / "again.fits").read_bytes() == images(rendered)[path]
     assert archive.main([*command[:3], "images/no.fits", *command[4:]]) == 2
     assert "has no product images/no.fits" in capsys.readouterr().err
-    # The tables that it was made from have gone.
+    # The tables that it was made from have been removed.
     garbage.collect(rendered, "mission", delete=True)
     assert archive.main([*command, "--version", old.key]) == 2
     assert "no table mission of version" in capsys.readouterr().err
 
 
-def test_an_exploration_is_rendered_with_what_each_of_its_requests_asks(lake):
+def test_variants_are_rendered_with_their_parameters(lake):
     explore = {"ext.lsstcam.read_noise": {"values": [5.0, 50.0], "unit": "electron"}, "effects.poisson": [True, False]}
     one = {**REQUEST["pointing"][0], "detectors": ["R22_S11"]}
     assert sum(render(lake, wanted(pointing=[one], explore=explore)).values()) == 4
@@ -610,7 +610,7 @@ def test_an_exploration_is_rendered_with_what_each_of_its_requests_asks(lake):
         assert states["poisson"].startswith(" on" if asked["effects.poisson"] else " off (forced)")
 
 
-def test_truth_maps_are_those_that_were_asked_for_and_that_a_channel_has(lake):
+def test_requested_truth_maps_of_each_channel(lake):
     everything = ["noise_free", "stars", "sky", "cosmic_rays", "ghosts", "saturation"]
     request = wanted(products={"truth": everything})
     render(lake, request)
@@ -630,7 +630,7 @@ def test_truth_maps_are_those_that_were_asked_for_and_that_a_channel_has(lake):
         assert task["bytes"] == pytest.approx(measured, rel=0.05)
 
 
-def test_what_the_catalogue_does_not_hold_is_refused_before_anything_is_rendered(lake):
+def test_missing_cells_are_refused_before_rendering(lake):
     far = {**REQUEST["pointing"][0], "dec": -29.0}
     request = wanted(pointing=[far])
     make(lake, request, plan_exposures)
@@ -663,8 +663,8 @@ def images_of(lake, name):
     return {path.relative_to(folder).as_posix() for path in folder.glob("images/*/*.fits")}
 
 
-def test_requests_lie_side_by_side(lake, tmp_path, capsys):
-    """Two plans of one universe: neither's images are taken for the other's, and gc takes from neither."""
+def test_requests_with_the_same_universe(lake, tmp_path, capsys):
+    """Two plans of one universe: their images are kept apart, and garbage collection keeps both."""
     found = {}
     for name, mjd in (("a", 60905.25), ("b", 60906.25)):
         request = replace(wanted(), name=name)
@@ -684,7 +684,7 @@ def test_requests_lie_side_by_side(lake, tmp_path, capsys):
     path = found["a"][0]["path"]
     assert archive.main(["--lake", str(lake), "--name", "a", "--again", path, "--out", str(tmp_path / "x.fits")]) == 0
     assert f"equals {path}" in capsys.readouterr().out
-    # A plan anew of the same name frees what that name had before, and nothing else.
+    # A new plan of the same name releases only the old products of that name.
     for step in plan_exposures.steps(lake, replace(wanted(), name="b")):
         publish.make_version(lake, step.plan, step.run_task, name="b")
     assert {path.parent.name for path in garbage.collect(lake)} <= {"exposures", "tasks"}

@@ -1,4 +1,4 @@
-"""Every kind of image that VIS takes, by the jobs: from one request and its catalogues to files in the lake."""
+"""All image types of VIS, made by the jobs from a request and its catalogues."""
 
 import tomllib
 from collections import Counter, defaultdict
@@ -26,7 +26,7 @@ from truesky.running import submitted_job
 MODULES = (build_galaxies, build_stars, compute_fluxes, plan_exposures, render_exposures)
 BLOCK = {"channels": ["VIS"], "detectors": ["3-4"]}
 SHORT = 89.52
-# Electrons above the bias in half of the pixels: the least and the most.
+# Range of the median, in electrons above the bias.
 KINDS = {
     "science": (100, 250), "bias": (-4, 4), "dark": (-4, 4), "flat": (11_000, 21_000), "charge_injection": (-4, 4),
     "self_calibration": (100, 250),
@@ -36,7 +36,7 @@ DARK = ("bias", "dark", "charge_injection")
 
 
 def wanted():
-    """A visit with its short exposure and closing flat, and one frame of each kind of calibration."""
+    """Return a request for a visit with short exposure and closing flat, and one frame of each calibration type."""
     blocks = [{**BLOCK, "fields": 1, "dither": "none"}]
     for kind in list(KINDS)[1:]:
         blocks.append({**BLOCK, "image_type": kind, "exposures": 1})
@@ -50,7 +50,7 @@ def wanted():
 
 @contextmanager
 def small_detectors(side=256):
-    """Detectors of VIS cut down to their middles, two halves and what is between them."""
+    """Detectors of VIS cut to their centres: two halves and the gap."""
     mounted = detectors._apply_metrology
 
     def smaller(*args):
@@ -63,7 +63,7 @@ def small_detectors(side=256):
 
 
 def check(lake, rows, columns):
-    """Every frame that was asked for, of its kind, and of the quadrants' size."""
+    """Check that every requested frame has its type and the size of the quadrants."""
     exposures = exposures_of(lake)
     products = read.version(lake, "products")
     science = [row for row in products.rows().to_pylist() if row["content"] == "science"]
@@ -89,7 +89,7 @@ def check(lake, rows, columns):
 
 
 def one_body_each(lake, file, mag):
-    """A table with one body a day in the middle of each frame that sees the sky."""
+    """Return a table with one moving body per day at the centre of each frame of the sky."""
     rows = [row for row in exposures_of(lake).values() if row["image_type"] not in DARK]
     tasks = {row["exposure_id"]: row for row in read.version(lake, "tasks").rows().to_pylist()}
     lines = ["mjd,lon,lat,east,north,mag,name"]
@@ -105,7 +105,7 @@ def exposures_of(lake):
 
 
 def moving_of(lake):
-    """Kind of image -> how many bodies are drawn on its frames."""
+    """Return the number of bodies drawn, by image type."""
     exposures, found = exposures_of(lake), defaultdict(set)
     drawn = read.version(lake, "rendered_truth").rows(["exposure_id", "id"])
     count = Counter(drawn["exposure_id"].to_numpy()[kind_from_id(drawn["id"].to_numpy()) == solar_system.KIND].tolist())
@@ -115,7 +115,7 @@ def moving_of(lake):
 
 
 def check_bodies(lake, request):
-    """The table's are drawn, on what sees the sky; nothing else asks what is in it."""
+    """The bodies of the table are drawn on frames of the sky; other frames do not depend on the table."""
     seen = moving_of(lake)
     for kind in KINDS:
         assert (min(seen[kind]) > 0) == (max(seen[kind]) > 0) == (kind not in DARK)

@@ -1,4 +1,4 @@
-"""Every kind of image that NISP-P takes, by the jobs: a star of AB 0, what it leaves for an hour, and calibrations."""
+"""All image types of NISP-P, made by the jobs: a star of AB 0, its persistence for an hour, and calibrations."""
 
 import numpy as np
 import pytest
@@ -65,7 +65,7 @@ exposures = 1
 bands = ["euclid_j"]
 mjd = {MJD + 40 * HOUR}
 """
-# Image type, band, seconds, (groups, reads, drops), lamp; of every exposure the least and the most of the median, e-.
+# Image type, band, seconds, (groups, reads, drops), lamp, and range of the median in e-.
 _NOMINAL = 60 * FRAME, (4, 16, 4)
 KINDS = [
     ("science", "euclid_h", *_NOMINAL, None, (60, 1e5)),
@@ -84,7 +84,7 @@ def wanted(folder, more="", replaced=("", "")):
 
 
 def opened(root, content):
-    """Exposure -> the file's path, of a content."""
+    """Return the path of a file by exposure, for one content."""
     version = read.version(root, "products")
     return {
         row["exposure_id"]: version.sidecar_path(row["path"])
@@ -104,15 +104,15 @@ def check(root):
             assert header["EXPTIME"] == pytest.approx(seconds)
             assert [unit.name for unit in units[1:]] == ["DET22.SCI", "DET22.CHI2"][: 1 + (mode[0] > 2)]
         assert least < np.median(read_back.electrons(files[number]).data) < most
-    # Truth that each of them has.
+    # Truth maps of each exposure.
     assert (
         set(opened(root, "saturation")) == set(opened(root, "persistence")) == set(opened(root, "ramp")) == set(files)
     )
-    check_what_is_left(root, files)
+    check_persistence(root, files)
 
 
-def check_what_is_left(root, files):
-    """A pixel that was full gives 12 e- an hour later, in the dark, where the star was; nothing after ten hours."""
+def check_persistence(root, files):
+    """A saturated pixel releases 12 e- an hour later in the dark, at the position of the star; none after ten hours."""
     left = {number: fits.getdata(path) for number, path in opened(root, "persistence").items()}
     full = fits.getdata(opened(root, "saturation")[1]) == 1
     assert full.sum() > 100
@@ -151,7 +151,7 @@ def test_by_spark_whole_detectors(spark, tmp_path):
         (("exposure_time_s = 600.0", "exposure_time_s = 30.0"), r"observation\[1\]: exposure time 30 s"),
     ],
 )
-def test_bad_ramps_are_one_line_and_nothing_is_written(tmp_path, lake, replaced, message):
+def test_invalid_ramps_are_refused_in_one_line(tmp_path, lake, replaced, message):
     with pytest.raises(BadInput, match=message) as caught:
         made(lake, wanted(tmp_path, replaced=replaced), (plan_exposures,))
     assert "\n" not in str(caught.value)

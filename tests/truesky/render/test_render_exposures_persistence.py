@@ -1,4 +1,4 @@
-"""Darks after a bright flat, by the jobs: what traps do comes out of the files alone."""
+"""Darks after a bright flat, made by the jobs: persistence can be measured from the files alone."""
 
 from itertools import pairwise
 
@@ -30,7 +30,7 @@ delays_s = [100, 300, 1200, 7000]
 
 
 def frames(root):
-    """Of each raw file (image type, lamp's level, start in s, exposure time in s, electrons), in order of time."""
+    """Return (image type, lamp level, start in s, exposure time in s, electrons) of each raw file, in order of time."""
     version, found = read.version(root, "products"), []
     for row in version.rows().to_pylist():
         if row["content"] == "science":
@@ -43,7 +43,7 @@ def frames(root):
     return sorted(found, key=lambda one: one[2])
 
 
-def test_the_decay_and_each_pixel_s_traps_come_out_of_the_files(lake, tmp_path):
+def test_decay_and_trap_numbers_are_measured_from_the_files(lake, tmp_path):
     (tmp_path / "stars.csv").write_text("ra,dec,mag\n53.117,-27.808,18.0\n")
     wanted = parse(requests.written(tmp_path, REQUEST, requests.FIELD.format(0.7), seed=3))
     with small_detectors(128):
@@ -55,17 +55,17 @@ def test_the_decay_and_each_pixel_s_traps_come_out_of_the_files(lake, tmp_path):
         ends = flat[2] + flat[3]
         np.testing.assert_allclose([one[2] - ends for one in darks], [100, 300, 1200, 7000], atol=1.0)
     assert bright[0][1] / faint[0][1] == 10.0
-    # What is left falls as a power of the time since the flat began; the dark current is 1.7 e-.
+    # Persistence decreases as a power of the time since the flat began; the dark current is 1.7 e-.
     since = np.array([one[2] - bright[0][2] for one in bright[1:]])
     left = np.array([np.mean(np.clip(one[4], -50.0, 400.0)) for one in bright[1:]]) - 1.7
     slope, level = np.polyfit(np.log(since[:3] / 100.0), np.log(left[:3]), 1)
     assert abs(slope + 0.9) < 0.06
     assert abs(np.exp(level) / 1.0 - usual(np.median(bright[0][4]))) < 0.1 * usual(np.median(bright[0][4]))
     assert 1.0 < left[3] < 6.0
-    # A fainter flat leaves less, by the formula.
+    # A fainter flat leaves less, as the formula predicts.
     less = np.mean(np.clip(faint[1][4], -50.0, 400.0)) - 1.7
     assert abs(less / left[0] - usual(np.median(faint[0][4])) / usual(np.median(bright[0][4]))) < 0.05
-    # A pixel that has more of it has more in every dark: its own number of traps, 0.3 rms.
+    # A pixel with more persistence has more in every dark: its number of traps varies by 0.3 rms.
     own = [one[4] - np.median(one[4]) for one in bright[1:4]]
     for before, after in pairwise(own):
         good = (np.abs(before) < 300.0) & (np.abs(after) < 300.0)
@@ -77,5 +77,5 @@ def test_the_decay_and_each_pixel_s_traps_come_out_of_the_files(lake, tmp_path):
 
 
 def usual(charge):
-    """e- that a charge leaves 100 s later, by the printed formula and the mission's numbers."""
+    """Return the electrons released after 100 s, by the published formula with the values of the mission."""
     return (120.0 + 1e-5 * 150.0 * charge) * (1.0 - np.exp(-charge / 2e4))

@@ -1,4 +1,4 @@
-"""Every kind of image that NISP-S takes, by the jobs: four settings of the red grisms, the blue one, calibrations."""
+"""All image types of NISP-S, made by the jobs: four settings of the red grisms, the blue grism, and calibrations."""
 
 import re
 from pathlib import Path
@@ -77,7 +77,7 @@ KINDS = [
 
 BLUE = '"NISP-S"\ncamera = "nisp"\nband = "nisp_blue"'
 PHOTOMETRIC = '"NISP-P"\ncamera = "nisp"\nband = "euclid_h"\ngrism_angle = 0.0'
-# 265 pixels beside the detector, on either side.
+# 265 pixels from the detector, on both sides.
 BESIDE = "53.1721,-27.808,16.0\n53.0619,-27.808,16.5\n"
 
 
@@ -105,7 +105,7 @@ def rendered(folder):
 
 
 def opened(root, content):
-    """Exposure -> the file's path, of a content."""
+    """Return the path of a file by exposure, for one content."""
     version = read.version(root, "products")
     return {
         row["exposure_id"]: version.sidecar_path(row["path"])
@@ -128,7 +128,7 @@ def check(root):
         least, most = {"dark": (-2, 30), "flat": (1e4, 6e4)}.get(kind, (200, 2000))
         assert least < median < most
         assert (stars.sum() > 1e4) == (kind not in ("dark", "flat"))
-    # No order of the star has light in the dark, nor of what shines on a screen.
+    # The dark and the flat have no light of the orders of the star.
     assert set(opened(root, "order_1")) == set(files) - {6, 7}
     spectra = read.version(root, "rendered_spectra").rows().to_pylist()
     assert {row["exposure_id"] for row in spectra} == set(files) - {6, 7}
@@ -138,8 +138,8 @@ def test_each_kind_is_planned_rendered_and_published(rendered):
     check(rendered)
 
 
-def test_grisms_at_opposite_angles_disperse_to_opposite_sides_and_tilts_along_rows(rendered):
-    """The trace's direction on the detector is the angle that was asked for, less the wheel's 0.1 deg."""
+def test_directions_of_the_traces_of_all_grism_angles(rendered):
+    """The direction of the trace on the detector is the requested angle minus the 0.1 deg of the wheel."""
     rows = read.version(rendered, "rendered_spectra").rows().to_pylist()
     brightest = {}
     for row in rows:
@@ -151,14 +151,14 @@ def test_grisms_at_opposite_angles_disperse_to_opposite_sides_and_tilts_along_ro
         along, across = row["x_last"] - row["x_first"], row["y_last"] - row["y_first"]
         found[number] = np.degrees(np.arctan2(across, along))
         assert np.hypot(along, across) == pytest.approx(500.0, abs=40.0)
-    # A row of detectors may be upside down: angles are told from that of the first.
+    # A row of detectors may be mounted upside down; angles are relative to the first row.
     for number, angle in enumerate(ANGLES, start=1):
         apart = (found[number] - found[1] - angle + 180.0) % 360.0 - 180.0
         assert apart == pytest.approx(0.0, abs=0.7)
 
 
 @pytest.mark.nightly
-def test_by_spark_the_same_bytes(spark, rendered, tmp_path):
+def test_spark_gives_the_same_bytes(spark, rendered, tmp_path):
     root = layout.resolve_lake(tmp_path / "lake")
     for module in MODULES:
         submitted_job.run(module.JOB, root, wanted(tmp_path))
@@ -167,8 +167,8 @@ def test_by_spark_the_same_bytes(spark, rendered, tmp_path):
         assert read.find_faults(read.version(root, name), deep=True) == []
 
 
-def test_sources_farther_away_than_images_are_read_have_a_first_order_on_the_detector(rendered):
-    """Of two that lie 265 px beside it, the one from which the grism disperses towards it."""
+def test_first_orders_of_sources_far_outside_the_detector(rendered):
+    """Of two sources 265 px from the detector, only the one that the grism disperses towards it."""
     fluxes = read.version(rendered, "star_fluxes").rows(["id", "f_nu_euclid_h"]).to_pylist()
     mags = {row["id"]: round(23.9 - 2.5 * np.log10(row["f_nu_euclid_h"]), 1) for row in fluxes}
     rows = read.version(rendered, "rendered_spectra").rows().to_pylist()
@@ -177,7 +177,7 @@ def test_sources_farther_away_than_images_are_read_have_a_first_order_on_the_det
         firsts = {mags[row["id"]]: row["drawn"] for row in rows if (row["exposure_id"], row["order"]) == (number, 1)}
         light = {mag: firsts.get(mag, 0.0) for mag in (16.0, 16.5)}
         towards.append(max(light, key=light.get))
-        # Of the other no more than the wings of its nearest light.
+        # The other source contributes only the wings of its closest light.
         assert light[towards[-1]] > 1000.0 > 20.0 * min(light.values())
     assert towards in ([16.0, 16.5] * 2, [16.5, 16.0] * 2)
 
@@ -209,7 +209,7 @@ def test_a_lake_on_object_storage_has_the_same_models(rendered, bucket):
 
 
 def test_python_draws_the_same_models(rendered):
-    """Each source's brightest pixels lie where the WCS and its trace say."""
+    """The brightest pixels of each source lie at the position predicted by the WCS and its trace."""
     version = read.version(rendered, "products")
     (bright,) = models.models(rendered, version, 3, "DET22", [drawn_first(rendered)])
     with truesky.open(rendered) as lake:
@@ -230,7 +230,7 @@ def test_python_draws_the_same_models(rendered):
 
 
 def drawn_first(root):
-    """The identifier of a source that has a first order on exposure 3."""
+    """Return the identifier of a source with a first order on exposure 3."""
     spectra = read.version(root, "rendered_spectra").rows(where=pc.field("exposure_id") == 3)
     return spectra.filter(pc.field("order") == 1)["id"][0].as_py()
 
@@ -244,7 +244,7 @@ def drawn_first(root):
         ({"--out": "models.txt"}, "the ending is not one of .fits"),
     ],
 )
-def test_models_that_there_are_not_are_one_line_and_no_file(rendered, tmp_path, capsys, replaced, message):
+def test_invalid_models_are_refused_in_one_line(rendered, tmp_path, capsys, replaced, message):
     options = {"--lake": rendered, "--exposure": 3, "--detector": "DET22", "--sources": 1, "--out": "models.fits"}
     options |= replaced
     options["--out"] = tmp_path / options["--out"]
@@ -255,8 +255,8 @@ def test_models_that_there_are_not_are_one_line_and_no_file(rendered, tmp_path, 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_grisms_of_an_exposure_are_as_its_spectra_were_drawn(rendered, tmp_path, capsys):
-    """Traces and the wheel's error; what has no spectra is one line and no file."""
+def test_grism_files_of_an_exposure_agree_with_its_spectra(rendered, tmp_path, capsys):
+    """Traces and the wheel error agree; exposures without spectra give a one-line error and no file."""
     arguments = ["--lake", str(rendered), "--out", str(tmp_path / "new"), "--exposure"]
     for number, message in ((99, "no exposure 99"), (6, "exposure 6: NISP-S dark is no image of spectra")):
         assert grisms.main([*arguments, str(number)]) == 2
@@ -275,8 +275,8 @@ def test_grisms_of_an_exposure_are_as_its_spectra_were_drawn(rendered, tmp_path,
             assert ends == pytest.approx([row[f"{axis}_first"], row[f"{axis}_last"]], abs=0.01)
 
 
-def test_masters_are_made_of_its_dark_and_flat(rendered, folder, capsys):
-    """Of the ramp that spectra are read with; the lake stays as it was."""
+def test_masters_from_dark_and_flat(rendered, folder, capsys):
+    """They have the ramp of the spectra; the lake does not change."""
     before = sorted(path for path in rendered.rglob("*") if path.is_file())
     assert masters.main(["--lake", str(rendered), "--out", str(folder / "masters")]) == 0
     dark, flat = (line.split(": ") for line in capsys.readouterr().out.strip().splitlines())
@@ -287,8 +287,8 @@ def test_masters_are_made_of_its_dark_and_flat(rendered, folder, capsys):
     assert sorted(path for path in rendered.rglob("*") if path.is_file()) == before
 
 
-def test_the_fluxes_that_sources_are_chosen_by_are_computed(rendered, folder):
-    """In H, though no exposure is taken in it."""
+def test_fluxes_for_source_selection_are_computed(rendered, folder):
+    """Fluxes in H are computed although no exposure is taken in H."""
     assert wanted(folder).bands == ("nisp_red", "nisp_blue", "euclid_h")
     assert "f_nu_euclid_h" in read.version(rendered, "star_fluxes").schema.names
 
@@ -296,19 +296,19 @@ def test_the_fluxes_that_sources_are_chosen_by_are_computed(rendered, folder):
 @pytest.mark.parametrize(
     ("replaced", "message"),
     [
-        (("grism_angle = 184.0", "grism_angle = 90.0"), r"pointing\[1\]\.grism_angle = 90 deg turns RGS000, RGS180"),
+        (("grism_angle = 184.0", "grism_angle = 90.0"), r"pointing\[1\]\.grism_angle = 90 deg tilts RGS000, RGS180"),
         (("grism_angle = -4.0", "grism_angle = nan"), r"pointing\[2\]\.grism_angle"),
-        ((BLUE, PHOTOMETRIC), r"pointing\[4\]\.grism_angle: no grism of nisp is in the beam in euclid_h"),
+        ((BLUE, PHOTOMETRIC), r"pointing\[4\]\.grism_angle: must not be set in euclid_h"),
     ],
 )
-def test_angles_that_no_grism_has_are_one_line_and_nothing_is_written(tmp_path, lake, replaced, message):
+def test_invalid_grism_angles_are_refused_in_one_line(tmp_path, lake, replaced, message):
     with pytest.raises(BadInput, match=message) as caught:
         made(lake, wanted(tmp_path, replaced=replaced), (plan_exposures,))
     assert "\n" not in str(caught.value)
     assert list(lake.rglob("*.parquet")) == []
 
 
-def test_a_table_of_pointings_names_the_grism_by_its_angle(tmp_path):
+def test_a_table_of_pointings_selects_grisms_by_angle(tmp_path):
     (tmp_path / "some.csv").write_text("ra,dec,mjd,band,grism_angle\n53.117,-27.808,60905.0,nisp_red,184\n")
     block = '[[observation]]\nchannels = ["NISP-S"]\npointings = "some.csv"\n'
     request = parse(requests.written(tmp_path, block, requests.FIELD.format(1.0)))

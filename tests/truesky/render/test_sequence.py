@@ -1,4 +1,4 @@
-"""A sequence of exposures whose detectors remember those before: by the job, in any order, whatever is asked for."""
+"""A sequence of exposures with persistence, rendered by the job in any order and selection."""
 
 import os
 import shutil
@@ -25,10 +25,10 @@ from truesky.request.from_toml import parse
 from truesky.running import submitted_job
 
 SIDE, COUNT = 256, 120
-# Where the telescope looked first, and then.
+# First and second pointing of the telescope.
 FIELDS = (57.5, -27.808), (53.117, -27.808)
 SECOND = 1.0 / 86400.0
-# Channel, band, field, seconds before the last.  More than two hours before nothing counts.
+# Channel, band, field, seconds before the last exposure. Exposures more than two hours earlier do not matter.
 SEQUENCE = [
     ("NISP-P", "euclid_y", 0, 9000.0), ("NISP-S", "nisp_red", 1, 900.0), ("NISP-P", "euclid_y", 0, 268.0),
     ("NISP-P", "euclid_j", 1, 134.0), ("NISP-P", "euclid_h", 1, 0.0),
@@ -68,7 +68,7 @@ def pointings(sequence):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A request's folder: stars of AB 13 to 24 in both fields."""
+    """Folder of a request: stars of AB 13 to 24 in both fields."""
     folder, rng = tmp_path_factory.mktemp("sequence"), np.random.default_rng(3)
     lines = ["ra,dec,mag"]
     for ra, dec in FIELDS:
@@ -86,7 +86,7 @@ def wanted(folder, sequence=SEQUENCE):
 
 @pytest.fixture(scope="module")
 def planned(folder):
-    """A lake with everything but images."""
+    """A lake with everything except images."""
     root, request = layout.resolve_lake(folder / "lake"), wanted(folder)
     for module in (build_galaxies, build_stars, compute_fluxes, plan_exposures):
         for step in module.steps(root, request):
@@ -100,7 +100,7 @@ def backwards(function, parts):
 
 @pytest.fixture(scope="module")
 def whole(planned, folder):
-    """With all of them, the last first."""
+    """A lake with all images, the last exposure rendered first."""
     root = layout.resolve_lake(shutil.copytree(planned, folder / "whole", symlinks=True))
     for step in render_exposures.steps(root, wanted(folder)):
         publish.make_version(root, step.plan, step.run_task, backwards)
@@ -113,7 +113,7 @@ def lake(planned, tmp_path):
 
 
 def _killed(root, request):
-    """Render in a process that is killed while it writes an image of the last exposure but one."""
+    """Render in a process that is killed while it writes an image of the penultimate exposure."""
     step = render_exposures.steps(root, request)[0]
 
     def work(lake, facts):
@@ -149,7 +149,7 @@ def parts(root, request):
     return step, {part.facts["exposure_id"]: part for part in step.plan.tasks}
 
 
-def test_the_last_alone_is_what_it_is_after_the_others(lake, whole, folder):
+def test_the_last_exposure_rendered_alone_has_the_same_bytes(lake, whole, folder):
     step, found = parts(lake, wanted(folder))
     publish.make_version(lake, replace(step.plan, parts=(found[5],)), step.run_task)
     alone, among = (read.version(root, "products") for root in (lake, whole))
@@ -163,7 +163,7 @@ def keys(root, request):
 
 
 def changed(lake, folder, sequence):
-    """Exposures whose products another sequence makes others."""
+    """Return the exposures whose products change with another sequence."""
     before, request = keys(lake, wanted(folder)), wanted(folder, sequence)
     for step in plan_exposures.steps(lake, request):
         publish.make_version(lake, step.plan, step.run_task)
@@ -172,16 +172,16 @@ def changed(lake, folder, sequence):
 
 
 @pytest.mark.parametrize("number", range(1, len(SEQUENCE) + 1))
-def test_products_change_with_exposures_before_them(lake, folder, number):
-    """And with no others."""
+def test_products_depend_on_earlier_exposures(lake, folder, number):
+    """Products depend on earlier exposures and on no others."""
     channel, band, field, before = SEQUENCE[number - 1]
     other = [*SEQUENCE[: number - 1], (channel, band, field, before + 20.0), *SEQUENCE[number:]]
     later = {one for one, some in BEFORE.items() if number in some}
     assert changed(lake, folder, other) == later | {number}
 
 
-def test_products_change_with_the_catalogue_about_exposures_before_them(lake, folder, monkeypatch):
-    """Where the first and the third looked; then where the others did."""
+def test_products_depend_on_the_catalogue_of_earlier_exposures(lake, folder, monkeypatch):
+    """First change the catalogue at the pointing of exposures 1 and 3, then at that of the others."""
     request = wanted(folder)
     before = keys(lake, request)
     stars = read.version(lake, "stars").manifest["parts"]
@@ -207,8 +207,8 @@ def test_products_change_with_the_catalogue_about_exposures_before_them(lake, fo
     assert {number for number in before if before[number] != after[number]} == {2, 3, 4, 5}
 
 
-def test_what_is_left_is_what_whole_images_leave(whole, folder):
-    """Of everything that each earlier image expects, spectra among them: to 1.5 e- in any pixel."""
+def test_persistence_agrees_with_complete_earlier_images(whole, folder):
+    """Compare with all expected light of each earlier image, including spectra: 1.5 e- in any pixel."""
     resolved = RenderInputs.from_request(whole, wanted(folder))
     inputs, mission = resolved.versions, resolved.mission
     exposures = {row.exposure_id: row for row in map(ExposureRow.from_row, inputs["exposures"].rows().to_pylist())}
@@ -235,6 +235,6 @@ def test_what_is_left_is_what_whole_images_leave(whole, folder):
         expected += traps.released_charge(light, *times, own)
     assert expected.max() > 100.0
     assert np.abs(found - expected).max() < 1.5
-    # Its own share of each pixel is in the image.
+    # The image contains the variation of each pixel.
     shown = images.read_images(files[5, "persistence"])[0].data
     assert shown.mean() == pytest.approx(found.mean(), rel=0.05)

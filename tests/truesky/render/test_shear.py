@@ -1,4 +1,4 @@
-"""The response to shear, which weak lensing is measured by: 90-degree pairs under +-0.02, noise-free."""
+"""Response of measured shapes to shear, from noise-free 90-degree pairs with shear +-0.02."""
 
 from dataclasses import replace
 from functools import cache
@@ -16,7 +16,7 @@ from truesky.render.sources.source_list import Sources
 from truesky.request.accuracy import DRAFT, SURVEY
 
 BOUNDS = {"survey": (SURVEY, 1e-4, 1e-5), "draft": (DRAFT, 1e-3, 1e-3)}
-# Half-light radius, arcsec, and index: a disc, a bulge in a disc, a steep bulge.
+# Half-light radius, arcsec, and Sersic index: a disc, a bulge in a disc, a steep bulge.
 KINDS = {
     "disc": {"disk_half_light_radius": 0.3, "inclination": 55.0},
     "small disc": {"disk_half_light_radius": 0.1, "inclination": 20.0},
@@ -43,7 +43,7 @@ def psf_in(scene):
 def truth(scene, kind, magnitude):
     one = galaxy(scene, kind, magnitude)
     found = errors.response(errors.make_drawer(psf_in(scene), scene, errors.FULL_SETTINGS), one, scene.scale)
-    # The weight of the moments halves what shear does; nothing more is wrong with it.
+    # The weight function of the moments halves the response to shear; there is no other bias.
     assert 0.2 < found[:2].min() <= found[:2].max() < 2.0
     return found
 
@@ -56,7 +56,7 @@ def biases(scene, kind, magnitude, settings) -> tuple[float, float]:
 
 
 def some_more(*cases):
-    """The steepest and the faintest always, the rest at night."""
+    """The steepest and the faintest galaxies always, the others nightly."""
     for kind in KINDS:
         for magnitude in (20.0, 22.0, 24.5):
             yield pytest.param(kind, magnitude, marks=() if (kind, magnitude) in cases else pytest.mark.nightly)
@@ -74,7 +74,7 @@ def test_response_to_shear(tier, kind, magnitude):
 @pytest.mark.nightly
 @pytest.mark.parametrize("tier", BOUNDS)
 @pytest.mark.parametrize("scene", [VIS, LSST], ids=lambda scene: scene.name)
-def test_response_of_many_galaxies_through_their_own_psf(scene, tier):
+def test_response_of_many_galaxies_with_separate_psfs(scene, tier):
     accuracy, most_m, most_c = BOUNDS[tier]
     found, some = errors.shear_response(scene, {tier: settings_for(accuracy)}, 92, 24)
     kinds = errors.worst_by_group(found[tier], some, scene)
@@ -82,16 +82,16 @@ def test_response_of_many_galaxies_through_their_own_psf(scene, tier):
         assert (m <= most_m, c <= most_c) == (True, True), (kind, m, c)
 
 
-def test_a_drawing_that_loses_wings_is_caught():
-    """The measure itself: stamps too small by half bias the response."""
+def test_small_stamps_bias_the_response():
+    """Test the measurement itself: stamps of half the size bias the response."""
     small = replace(settings_for(DRAFT), edge=1.0, aliased=1.0, min_size=1.6)
     assert abs(biases(VIS, "bulge", 20.0, small)[0]) > 1e-3
 
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("kind", ["disc", "both"])
-def test_galsim_responds_alike(kind):
-    """The truth itself, against galsim's own drawing."""
+def test_galsim_has_the_same_response(kind):
+    """Test the reference itself with images drawn by GalSim."""
 
     def by_galsim(one):
         return reference.draw_reference(one, 0, psf_in(VIS), 2 * errors.COMPARED_SIDE)

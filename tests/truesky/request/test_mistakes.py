@@ -45,9 +45,9 @@ MISTAKES = {
     "a Julian date": (pointed("60905.0", "2460905.5"), "pointing[0].mjd = 2460905.5 is outside"),
     "no date": (pointed("mjd = 60905.0\n", ""), "pointing[0].mjd is missing"),
     "towards the Sun": (pointed("60905.0", "60950.0"), "next allowed: MJD 61042.8 (2026-01-02) to"),
-    "an area too small": (pointed("0.2 }", "0.01 }"), "this would do: [area] cone = { ra = 53.117, dec = -27.808,"),
+    "an area too small": (pointed("0.2 }", "0.01 }"), "[area] cone = { ra = 53.117, dec = -27.808,"),
     "an area elsewhere": (
-        pointed("cone = { ra = 53.117", "cone = { ra = 10.0"), "1 of 1 places of detectors see sky outside",
+        pointed("cone = { ra = 53.117", "cone = { ra = 10.0"), "1 of 1 detector positions see sky outside",
     ),
     "in the Galactic plane": (
         HEAD + AREA.replace("53.117", "266.4").replace("-27.808", "-28.9") + CENTRE, "stars.plane_limit",
@@ -107,10 +107,10 @@ MISTAKES = {
     "a field towards the Sun": (OWN + "mjd = 60950.0\n", "observation[0]: mjd: 126."),
     "no survey": (GROUND.replace('survey = "des"\n', ""), "observation[0].survey"),
     "Euclid and the ground together": (OWN.replace('"VIS"', '"VIS", "EXT"'), "EXT stands alone"),
-    "no number of frames": (OWN + 'image_type = "bias"\n', "wants exposures"),
+    "no number of frames": (OWN + 'image_type = "bias"\n', "requires exposures"),
     "a calibration of another channel": (OWN + 'image_type = "standard_star"\n', "observation[0].image_type"),
     "fields that see more than the area": (
-        HEAD + AREA + '[[observation]]\nchannels = ["VIS"]\nfields = 1\n', "this would do: [area] cone",
+        HEAD + AREA + '[[observation]]\nchannels = ["VIS"]\nfields = 1\n', "this area is large enough: [area] cone",
     ),
     "dithers of a ground survey": (EXT + "dither = [[0, 0], [9, 9]]\n", "[0].dither is not for a ground survey's"),
     "fields of a ground survey": (EXT + "fields = 2\n", "observation[0].fields is not for a ground survey's pattern"),
@@ -130,7 +130,7 @@ TABLES = {
     "another channel's line": ("ra,dec,channel\n53.1,-27.8,EXT\n", "line 2: channel = 'EXT' is none of"),
     "another camera's band": ("ra,dec,band\n53.1,-27.8,lsst_r\n", "line 2: camera vis has no band 'lsst_r'"),
     "a line towards the Sun": ("ra,dec,mjd\n53.1,-27.8,60950\n", "pointings: 126."),
-    "a line beyond the area": ("ra,dec,mjd\n63.1,-27.8,60905\n", "this would do: [area] cone"),
+    "a line beyond the area": ("ra,dec,mjd\n63.1,-27.8,60905\n", "this area is large enough: [area] cone"),
     "a line's detector": ("ra,dec,detectors\n53.1,-27.8,9-9\n", "no detector '9-9'"),
 }
 CASES = {name: (text, "", words) for name, (text, words) in MISTAKES.items()}

@@ -1,1 +1,1 @@
-"""What is observed when, by what, and what it will cost."""
+"""Plan the exposures of a request: what is observed, when, with which detectors, and at what cost."""

@@ -1,9 +1,8 @@
-"""Calibration exposures: bias, dark, flat, injected charge, and what the sky is looked at for besides surveys.
+"""Plan calibration exposures: bias, dark, flat, charge injection, and observations of calibration targets on the sky.
 
-exposures   what an observation block of one of these types asks for
-TARGETS     what an image type is of
-
-Ref : Serrano et al. 2024, section 5.1 and the table of the pilot phase's products
+References
+----------
+Serrano et al. 2024, section 5.1 and the table of the pilot phase's products
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from truesky.render.sky.solar_aspect import check_aspect, next_allowed, position
 from truesky.request.observations import Observation
 
 _DAY_S = 86400.0
-# What an image type is of (two standard stars: Serrano et al. 2024).
+# Targets of an image type (two standard stars: Serrano et al. 2024).
 TARGETS = {
     "standard_star": ("Vega", "white dwarf DA"),
     "planetary_nebula": ("planetary nebula",),
@@ -34,22 +33,38 @@ TARGETS = {
     "stray_light": ("Vega",),
     "white_dwarf": ("white dwarf DA",),
 }
-# Of an image type what every one of its exposures may be asked for: key of the request, of the mission, and unit.
+# Parameters of a target that a request may set: attribute of the request, key of the mission, unit.
 _TARGET_PARAMETERS = (("magnitude", "magnitude", "mag"), ("distance_deg", "distance", "deg"))
-# Frames of trap pumping that the mission lists.
+# Number of trap pumping frames in the mission database.
 _PHASE_TIMES = 4
-# From the end of a frame to the start of the next, s: the slowest of the read-outs.
+# Time from the end of an exposure to the start of the next, s; the slowest read-out determines it.
 _PAUSE = 90.0
 
 
 def exposures(
     block: Observation, camera: str, centre: tuple[float, float], mission: MissionConfiguration, seed: int, start: float
 ) -> Iterator[Exposure]:
-    """Exposures of each channel of a calibration block, one after another.
+    """Generate the exposures of each channel of a calibration block, one after another.
 
-    camera : of the ground survey, where the channel is EXT
-    centre : ra, dec deg of the block's own field or of the request's area
-    block  : of the request;  mission : the mission database;  seed : of the request;  start : MJD
+    Parameters
+    ----------
+    block : Observation
+        Observation block of the request.
+    camera : str
+        Camera of the ground survey, used for channel EXT.
+    centre : tuple of float
+        ICRS ra and dec (deg) of the field of the block, or of the area of the request.
+    mission : MissionConfiguration
+        The mission database.
+    seed : int
+        Seed of the request.
+    start : float
+        Earliest MJD.
+
+    Yields
+    ------
+    Exposure
+        One exposure with its date.
     """
     channels = [registry.CHANNELS[channel] for channel in block.channels]
     bright_sky = block.image_type == "persistence" and block.bright == "sky"
@@ -73,7 +88,7 @@ def exposures(
             continue
         for frame in _frames(template, block, mission, seed):
             yield replace(frame, mjd=now)
-            # A ramp is read out meanwhile, and longer where it has few groups.
+            # A ramp is read out during the exposure. With few groups it takes longer than the exposure time.
             now += max(frame.exposure_time_s + _PAUSE, elapsed_time(frame, mission)) / _DAY_S
 
 
@@ -95,7 +110,7 @@ def _frames(template: Exposure, block: Observation, mission: MissionConfiguratio
     elif template.image_type == "trap_pumping":
         yield from _pumping_frames(band_exposures[0], block, mission)
     elif not block.exposures:
-        raise BadInput(f"an observation of image_type {template.image_type} wants exposures = how many frames")
+        raise BadInput(f"image_type {template.image_type} requires exposures, the number of frames")
     elif template.image_type == "flat" and template.camera in LAMPS:
         frames_by_lamp = lit_flats.by_lamp(band_exposures, block, mission)
         for i in range(block.exposures):
@@ -109,7 +124,7 @@ def _frames(template: Exposure, block: Observation, mission: MissionConfiguratio
 
 
 def _pumping_frames(frame: Exposure, block: Observation, mission: MissionConfiguration) -> Iterator[Exposure]:
-    """Frames without rows between the injected ones; charge has time to gather while it is pumped."""
+    """Generate frames in which all rows are injected; charge accumulates while it is pumped."""
     section = image_types.section(frame.camera)
     mission_times = [mission.value(f"{section}.pumping.phase_time_{i + 1}", "s") for i in range(_PHASE_TIMES)]
     for phase in block.phase_times_s or mission_times:
@@ -122,7 +137,7 @@ def _pumping_frames(frame: Exposure, block: Observation, mission: MissionConfigu
 def _defocused_frames(
     band_exposures: Sequence[Exposure], block: Observation, mission: MissionConfiguration, seed: int
 ) -> Iterator[Exposure]:
-    """At each place all wavefronts, one after the other."""
+    """Generate exposures with each wavefront in turn at each position."""
     nominal = mission.value("survey.defocus.wavefront", "nm")
     for frame in _dithered_frames(band_exposures, block, mission, seed):
         key = f"{image_types.section(frame.camera)}.psf.defocus"
@@ -131,7 +146,7 @@ def _defocused_frames(
 
 
 def _with_target_parameters(frame: Exposure, block: Observation) -> Exposure:
-    """With what the block asks of its target instead of what the mission says."""
+    """Return the exposure with the target parameters of the block, which replace those of the mission."""
     values = ((getattr(block, attribute), key, unit) for attribute, key, unit in _TARGET_PARAMETERS)
     parameters = tuple(
         (f"survey.{block.image_type}.{key}", value, unit) for value, key, unit in values if value is not None
@@ -152,7 +167,7 @@ def _seconds(template: Exposure, band: str, block: Observation, mission: Mission
 
 def _bands(template: Exposure, block: Observation, mission: MissionConfiguration) -> tuple[str, ...]:
     if template.channel == "NISP-P":
-        # A dark needs no filter; the closing position is that of the last, or of those that are named.
+        # A dark needs no filter. Its closed position of the wheel follows the last filter, or the bands that are named.
         return FILTERS[-1:] if template.image_type == "dark" and not block.bands else FILTERS
     if template.channel == "NISP-S":
         return (RED,)
@@ -164,9 +179,9 @@ def _bands(template: Exposure, block: Observation, mission: MissionConfiguration
 def _target_frames(
     band_exposures: Sequence[Exposure], block: Observation, mission: MissionConfiguration, seed: int
 ) -> Iterator[Exposure]:
-    """Each target in each band, or in each setting of the grisms, dithered."""
+    """Generate dithered exposures of each target in each band, or at each grism angle."""
     kind, channel = band_exposures[0].image_type, band_exposures[0].channel
-    # A nebula is seen in every setting, a star in one a dither.
+    # A nebula is observed at all grism angles, a star at one angle per dither.
     settings = N_GRISM_ANGLES if kind == "planetary_nebula" else 1
     for target in TARGETS[kind]:
         for setting in range(settings):
@@ -179,7 +194,7 @@ def _target_frames(
 def _dithered_frames(
     band_exposures: Sequence[Exposure], block: Observation, mission: MissionConfiguration, seed: int
 ) -> Iterator[Exposure]:
-    """All bands at each place of the pattern."""
+    """Generate exposures in all bands at each position of the dither pattern."""
     kind, channel = band_exposures[0].image_type, band_exposures[0].channel
     steps = offsets("S", mission, seed, kind, channel)
     for i in range(block.exposures or int(mission.value(f"survey.{kind}.dithers"))):
@@ -193,7 +208,7 @@ def _through_grism(frame: Exposure, number: int, mission: MissionConfiguration) 
 
 
 def _random_offsets(camera: str, dithers: int, mission: MissionConfiguration, seed: int) -> Float:
-    """[dithers, 2] arcsec: uniform within half a detector and its gap, both ways."""
+    """Return offsets in arcsec, shape (dithers, 2), uniform within half a detector and its gap in both directions."""
     fpa = {key: mission.value(f"{camera}.fpa.{key}") for key in ("nx", "ny", "pixel_scale", "gap_x", "gap_y")}
     half = [0.5 * (fpa[f"n{axis}"] * fpa["pixel_scale"] + fpa[f"gap_{axis}"]) for axis in "xy"]
     return rng.stream(seed, "self_calibration", camera).uniform(-1.0, 1.0, (dithers, 2)) * half

@@ -1,8 +1,4 @@
-"""What a detector costs: seconds of a core, memory and bytes, from numbers that benchmarks/planner.py measures.
-
-Files        what is written of a detector
-price        what every detector of a kind of exposure costs
-"""
+"""Estimate the cost of a detector in CPU time, memory and bytes, from numbers measured by benchmarks/planner.py."""
 
 from __future__ import annotations
 
@@ -19,9 +15,9 @@ from truesky.render.effects.effect import Effect
 from truesky.render.exposure import truth_maps
 from truesky.request.accuracy import SURVEY, Accuracy
 
-# A FITS header and its padding, one an image; s a byte of a truth map, to write and hash it.
+# Bytes of a FITS header with its padding, per image; seconds per byte to write and hash a truth map.
 _HEADER_BYTES, _MAP_S = 8640, 2.5e-9
-# s a pixel of a map, for each effect that fills it in; and of the stars' own frame, on which they are drawn again.
+# Seconds per pixel of a truth map for each effect in it, and for the frame on which stars are drawn again.
 _FILLED_S = {
     "sky": {"background": 1e-8, "pixel_area": 4e-8, "straylight": 4e-8, "fringes": 2.5e-8},
     "satellites": {"satellite_trails": 2.5e-8},
@@ -30,17 +26,22 @@ _FILLED_S = {
     "saturation": {"bleeding": 1e-8},
 }
 _STARS_S = 2e-8
-# Of a pixel that has 32 bits, more than of one that has 16.
+# Additional bytes per pixel with 32 bits, compared with 16 bits.
 _WIDE_BYTES = 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class OutputFiles:
-    """What is written of it.
+    """Files that are written for a detector.
 
-    whole   : whether its exposure has a file, too
-    readout : how its own is wanted (truesky.request.schema.READOUTS)
-    wide    : whether its converters have more than 16 bits, of which a file has 32
+    Attributes
+    ----------
+    has_exposure_file : bool
+        True if a file with all detectors of the exposure is written, too.
+    readout : str
+        Form of the detector image (`truesky.request.schema.READOUTS`).
+    has_32_bits : bool
+        True if the analogue-to-digital converters have more than 16 bits, so that files store 32 bits.
     """
 
     has_exposure_file: bool = False
@@ -53,9 +54,9 @@ _DETECTOR_FILES = OutputFiles()
 
 @dataclass(frozen=True, slots=True)
 class CostModel:
-    """What a detector of so many pixels and sources takes: something to start with, and something for each of them.
+    """Cost of a detector: a fixed cost plus a cost per pixel and per source.
 
-    Of many detectors where pixels and sources are arrays [n].
+    The methods also accept arrays of pixels and sources, shape (n), for n detectors.
     """
 
     start_s: float
@@ -69,15 +70,28 @@ class CostModel:
     read_bytes: float
 
     def seconds(self, pixels: Int | int, galaxies: Float | float, stars: Float | float) -> Any:
-        """Of one core."""
+        """Return the time on one core in seconds.
+
+        Parameters
+        ----------
+        pixels : int or int array
+            Number of pixels of the detector.
+        galaxies, stars : float or float array
+            Number of sources on the detector.
+
+        Returns
+        -------
+        float or float array
+            Time in seconds.
+        """
         return self.start_s + pixels * self.pixel_s + galaxies * self.galaxy_s + stars * self.star_s
 
     def memory(self, pixels: Int | int) -> Any:
-        """GB at the peak."""
+        """Return the peak memory in GB."""
         return self.start_gb + pixels * self.pixel_gb
 
     def bytes(self, pixels: Int | int, read_pixels: Int | int) -> Any:
-        """Of the image and its truth maps; read : pixels of the image, with those beside the detector's own."""
+        """Return the bytes of the image and its truth maps; `read_pixels` includes prescan and overscan pixels."""
         return self.start_bytes + np.rint(pixels * self.pixel_bytes + read_pixels * self.read_bytes).astype(np.int64)
 
 
@@ -89,18 +103,37 @@ def cost_model(
     truth: Sequence[str] = (),
     files: OutputFiles = _DETECTOR_FILES,
 ) -> CostModel:
-    """What detectors of one kind of exposure cost.
+    """Return the cost model of the detectors of one kind of exposure.
 
-    looks   : whether the sky is drawn;  effects : that are applied; None = nothing renders the channel yet
-    truth   : maps that are wanted;  files : what is written besides
-    channel : its name;  accuracy : of the request
-    Error   : 30 % where the sources are as those that it was measured with
+    Parameters
+    ----------
+    channel : str
+        Name of the channel.
+    sees_sky : bool
+        True if sources and sky are drawn.
+    effects : sequence of Effect or None
+        Applied effects; None if the channel has no simulator.
+    accuracy : Accuracy
+        Accuracy of the request.
+    truth : sequence of str
+        Requested truth maps.
+    files : OutputFiles
+        Other files that are written.
+
+    Returns
+    -------
+    CostModel
+        The cost per detector.
+
+    Notes
+    -----
+    The error is 30 % for sources like those of the measurement.
     """
     channel_cost, applied = registry.CHANNELS[channel].cost, effects or ()
     maps = truth_maps.available_maps(truth, None if effects is None else [e.name for e in effects], sees_sky)
     accuracy_factor = settings.seconds_for(accuracy) / settings.seconds_for(SURVEY)
     map_bytes = sum(truth_maps.BYTES_PER_PIXEL[name] for name in maps)
-    # An exposure's file has the science image a second time.
+    # The exposure file contains the science image a second time.
     images = 2 if files.has_exposure_file else 1
     written_bytes = registry.CHANNELS[channel].with_readout(files.readout).readout.file_bytes_per_pixel
     effect_names = [effect.name for effect in applied]

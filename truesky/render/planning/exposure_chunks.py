@@ -1,14 +1,7 @@
-"""A plan in parts: which exposures each holds, so that it is made by itself, wherever that is.
+"""Divide a plan into chunks of exposures that can be made independently of one another.
 
-Where a plan is cut depends on the request alone, and so do the numbers of its exposures, which are counted, not laid
-out.
-
-Layout       what a request takes, cut into parts
-holding      names of the parts of a published plan that hold some exposures
-rows         rows of some exposures of a published plan, of whose parts no others are opened
-each         rows of a published plan, a part after the other
-chosen       what of a published plan is to be rendered, or is already
-before       what left something in the detectors of some of it
+Chunk limits and exposure numbers depend only on the request. The numbers follow from counts, so that no other chunk has
+to be laid out.
 """
 
 from __future__ import annotations
@@ -35,18 +28,18 @@ from truesky.render.planning.survey import ExposureBlock, ExposureWithMission
 from truesky.render.planning.tasks import TaskSelection, sort_by_cost
 from truesky.request.schema import Request
 
-# So many detectors take seconds and 200 MB; a plan that has no more is one part.
+# Making this number of tasks takes seconds and 200 MB. A smaller plan is a single chunk.
 MAX_TASKS_PER_CHUNK = 100_000
 _SINGLE_FILE = "all.parquet"
-# Facts of a part: its first and last exposure; MJD before which none of them begins, and after which none does.
+# Keys of a chunk's facts: its first and last exposure number, and its date range as MJD.
 _NUMBERS, _DATES = "exposures", "mjd"
-# Columns of `tasks` that say what is rendered, and when.
+# Columns of `tasks` that a render job needs.
 _TASK_COLUMNS = ("exposure_id", "detector", "channel", "ra", "dec", "radius", "cells", "seconds")
 
 
 @dataclass(frozen=True, slots=True)
 class ExposureRange:
-    """Exposures of a stretch, from the first to before the last."""
+    """Range of exposures of a block: `first` is included, `last` is excluded."""
 
     block: int
     first: int
@@ -55,11 +48,18 @@ class ExposureRange:
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """One part of a plan.
+    """One chunk of a plan.
 
-    first  : number of its first exposure
-    runs   : its exposures;  before : those of earlier parts that may differ from them in their noise alone
-    since, until : MJD before which none of them begins, and after which none does
+    Attributes
+    ----------
+    first : int
+        Number of its first exposure.
+    ranges : tuple of ExposureRange
+        Its exposures.
+    previous : tuple of ExposureRange
+        Exposures of earlier chunks that may differ from these only in their noise.
+    start_mjd, end_mjd : float
+        All exposures begin within this range of MJD.
     """
 
     first: int
@@ -74,7 +74,7 @@ class Chunk:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """What a request takes, cut into parts; it goes to whoever makes one of them."""
+    """All exposures of a request, divided into chunks. The job sends it to each worker that makes a chunk."""
 
     blocks: tuple[ExposureBlock, ...]
     chunks: tuple[Chunk, ...]
@@ -83,12 +83,27 @@ class Layout:
     def from_request(
         cls, request: Request, mission: MissionConfiguration, max_tasks: int = MAX_TASKS_PER_CHUNK
     ) -> Layout:
-        """The layout of a request; most : detectors of a part, unless a field has more.  Errors: as survey.stretches"""
+        """Lay out the exposures of a request.
+
+        Parameters
+        ----------
+        request : Request
+            The request.
+        mission : MissionConfiguration
+            The mission database.
+        max_tasks : int
+            Largest number of detectors per chunk. A chunk with a single field may have more.
+
+        Returns
+        -------
+        Layout
+            Blocks and chunks. `survey.exposure_blocks` lists the errors.
+        """
         blocks = survey.exposure_blocks(request, mission)
         return cls(tuple(blocks), tuple(_chunks(blocks, max_tasks)))
 
     def parts(self) -> tuple[Task, ...]:
-        """The parts of a table of the plan."""
+        """Return the partitions of a table of the plan, one per chunk."""
         if len(self.chunks) == 1:
             return (Task(_SINGLE_FILE, {}),)
         return tuple(
@@ -100,13 +115,28 @@ class Layout:
         )
 
     def find_chunk(self, facts: Json) -> Chunk:
-        """The piece of a part, by its facts."""
+        """Return the chunk of a partition from the facts of the partition."""
         if _NUMBERS not in facts:
             return self.chunks[0]
         return next(chunk for chunk in self.chunks if chunk.first == facts[_NUMBERS][0])
 
     def exposures(self, chunk: Chunk, user_passbands: Mapping[str, Passband], seed: int) -> pa.Table:
-        """Rows of the table `exposures`; own, seed : as planned_exposures.table has them."""
+        """Return the rows of the table `exposures` of a chunk.
+
+        Parameters
+        ----------
+        chunk : Chunk
+            A chunk of this layout.
+        user_passbands : mapping of str to Passband
+            Passbands by name, in addition to the embedded ones.
+        seed : int
+            Seed of the request.
+
+        Returns
+        -------
+        pyarrow.Table
+            One row per exposure.
+        """
         planned = list(self._exposures_in(chunk.ranges))
         previous = (exposure for exposure, _ in self._exposures_in(chunk.previous))
         return planned_exposures.table(
@@ -119,7 +149,7 @@ class Layout:
         )
 
     def requested_detectors(self, chunk: Chunk) -> list[tuple[str, ...]]:
-        """The detectors that are wanted of each exposure of a part, () = all."""
+        """Return the names of the requested detectors of each exposure of a chunk; () means all detectors."""
         return [
             names
             for exposure_range in chunk.ranges
@@ -129,13 +159,13 @@ class Layout:
         ]
 
     def exposures_near_in_time(self, chunk: Chunk, days_before: float) -> Iterator[Exposure]:
-        """Exposures that begin while those of a part do, or up to so many days before, and some others."""
+        """Generate exposures that begin during a chunk or up to `days_before` days earlier, and possibly others."""
         for block in self.blocks:
             for exposure_range in block.ranges_between_dates(chunk.start_mjd - days_before, chunk.end_mjd, len(block)):
                 yield from (exposure for exposure, _ in block.exposures(*exposure_range))
 
     def representative_exposures(self) -> Iterator[ExposureWithMission]:
-        """An exposure of every kind there is: of fields those of the first."""
+        """Generate at least one exposure of each kind; the first field of a survey represents all its fields."""
         return chain.from_iterable(
             block.exposures(0, len(block.base_exposures) * block.repetitions) for block in self.blocks
         )
@@ -167,7 +197,7 @@ def _nonempty_range(number: int, start: int, end: int) -> list[ExposureRange]:
 
 
 def _units(block: ExposureBlock) -> Iterator[tuple[int, int]]:
-    """After each unit of a stretch: how many exposures have been taken; detectors of the unit."""
+    """Yield, after each unit of a block, the number of exposures so far and the number of detectors in the unit."""
     camera_sizes = {camera: len(detectors.detectors(camera, mission)) for camera, mission in _cameras(block)}
     tasks = [
         len(dict.fromkeys(exposure.detectors)) or camera_sizes[exposure.camera] for exposure in block.base_exposures
@@ -202,9 +232,21 @@ def _make_chunk(blocks: list[ExposureBlock], first: int, ranges: list[ExposureRa
 def partition_names(
     version: Version, numbers: Iterable[int] = (), dates: tuple[float, float] | None = None
 ) -> list[str]:
-    """Names of the parts of a published `exposures` or `tasks` that hold some exposures, or some of a time.
+    """Return the names of the partitions of a plan that may contain given exposures or overlap a range of dates.
 
-    numbers : of exposures;  dates : MJD from and to
+    Parameters
+    ----------
+    version : Version
+        Version of the table `exposures` or `tasks`.
+    numbers : iterable of int
+        Exposure numbers.
+    dates : tuple of float, optional
+        First and last MJD.
+
+    Returns
+    -------
+    list of str
+        Names of the partitions. Partitions without a range of exposures are always included.
     """
     sorted_numbers, names = np.unique(np.fromiter(numbers, np.int64)), []
     for part in version.manifest["parts"]:
@@ -227,16 +269,46 @@ def rows(
     where: ds.Expression | None = None,
     columns: Sequence[str] | None = None,
 ) -> pa.Table:
-    """Rows of the parts of a published `exposures` or `tasks` that hold some exposures, or some of a time.
+    """Return rows of the partitions that may contain given exposures or overlap a range of dates.
 
-    version : of the table;  numbers : of exposures;  dates : MJD from and to;  where : an Arrow filter, None = all
-    columns : names, None = all
+    Parameters
+    ----------
+    version : Version
+        Version of the table `exposures` or `tasks`.
+    numbers : iterable of int
+        Exposure numbers.
+    dates : tuple of float, optional
+        First and last MJD.
+    where : pyarrow.dataset.Expression, optional
+        Filter of the rows; None selects all rows.
+    columns : sequence of str, optional
+        Names of columns; None selects all columns.
+
+    Returns
+    -------
+    pyarrow.Table
+        The selected rows.
     """
     return version.rows(columns, partition_names(version, numbers, dates), where)
 
 
 def rows_of_exposures(version: Version, numbers: Collection[int], columns: Sequence[str] | None = None) -> pa.Table:
-    """Rows of some exposures of a published `exposures` or `tasks`, and no others; columns : names, None = all."""
+    """Return the rows of given exposures only.
+
+    Parameters
+    ----------
+    version : Version
+        Version of the table `exposures` or `tasks`.
+    numbers : collection of int
+        Exposure numbers.
+    columns : sequence of str, optional
+        Names of columns; None selects all columns.
+
+    Returns
+    -------
+    pyarrow.Table
+        The selected rows.
+    """
     return rows(version, numbers, where=_exposure_filter(numbers), columns=columns)
 
 
@@ -247,7 +319,22 @@ def _exposure_filter(numbers: Collection[int]) -> ds.Expression:
 def rows_by_partition(
     version: Version, columns: Sequence[str] | None = None, where: ds.Expression | None = None
 ) -> Iterator[pa.Table]:
-    """Rows of a published `exposures` or `tasks`, a part after the other: of a plan however large one is in memory."""
+    """Generate the rows of a plan partition by partition, so that a large plan is never in memory as a whole.
+
+    Parameters
+    ----------
+    version : Version
+        Version of the table `exposures` or `tasks`.
+    columns : sequence of str, optional
+        Names of columns; None selects all columns.
+    where : pyarrow.dataset.Expression, optional
+        Filter of the rows; None selects all rows.
+
+    Returns
+    -------
+    iterator of pyarrow.Table
+        One table per partition.
+    """
     return (version.rows(columns, [part], where) for part in version.partitions)
 
 
@@ -256,12 +343,18 @@ def rows_by_partition(
 
 @dataclass(frozen=True, slots=True)
 class RenderSelection:
-    """What of a published plan a run has to do with, and no more: a plan may be larger than memory.
+    """Rows of a published plan that a run needs; the whole plan may be larger than memory.
 
-    exposures : rows of those that hold its detectors
-    tasks     : of the detectors that are asked for, and of the exposures that the request has images of; longest first
-    asked     : of those that are asked for
-    planned   : how many detectors that can be rendered each of its exposures has
+    Attributes
+    ----------
+    exposures : pyarrow.Table
+        Exposures of the tasks below.
+    tasks : sequence of dict
+        Requested tasks, and all tasks of exposures that the request has already rendered; longest first.
+    requested : sequence of dict
+        Requested tasks only.
+    detector_counts : mapping of int to int
+        Number of detectors that can be rendered, by exposure number.
     """
 
     exposures: pa.Table
@@ -273,11 +366,26 @@ class RenderSelection:
 def select_for_rendering(
     exposures: Version, tasks: Version, request: Request, rendered: Collection[int]
 ) -> RenderSelection:
-    """What is to be rendered of a plan, and what of it there may be already.
+    """Select the tasks to render, and the tasks that may already be rendered.
 
-    exposures, planned : versions of the tables `exposures` and `tasks`
-    held   : exposures that the request has images of
-    Errors : BadInput where no exposure has a simulator, or the request asks for what is not planned
+    Parameters
+    ----------
+    exposures, tasks : Version
+        Versions of these tables.
+    request : Request
+        The request; may restrict detectors or their number.
+    rendered : collection of int
+        Exposures of which the request already has images.
+
+    Returns
+    -------
+    RenderSelection
+        The selected rows.
+
+    Raises
+    ------
+    BadInput
+        If no exposure has a simulator, or the request names a detector that is not planned.
     """
     renderable = preconditions.renderable_exposures(exposures.rows(["exposure_id", "channel", "image_type"]))
     task_selection, rendered_partitions, rendered_numbers = (
@@ -320,7 +428,7 @@ def select_for_rendering(
 
 
 def _merge_tasks(requested: list[Json], rendered: list[Json]) -> list[Json]:
-    """Tasks and others, each once, longest first."""
+    """Return the requested and the rendered tasks without duplicates, longest first."""
     requested_keys = {(task["exposure_id"], task["detector"]) for task in requested}
     additional = [task for task in rendered if (task["exposure_id"], task["detector"]) not in requested_keys]
     if not additional:
@@ -334,11 +442,25 @@ def with_previous_exposures(
     tasks: Iterable[Json],
     mission_for: Callable[[str | None], MissionConfiguration],
 ) -> tuple[pa.Table, dict[tuple[int, str], list[Json]]]:
-    """What left something in the detectors of some tasks, also of exposures that nothing renders.
+    """Find earlier exposures that leave persistence in the detectors of some tasks, even if they are not rendered.
 
-    inputs  : versions of the tables `exposures` and `tasks`;  own : an exposure's settings -> its mission database
-    exposures, some : rows of the tables
-    returns : rows of these exposures and of those before them; tasks before each, by exposure and detector
+    Parameters
+    ----------
+    inputs : mapping of str to Version
+        Versions of the tables `exposures` and `tasks`.
+    exposures : pyarrow.Table
+        Rows of the table `exposures`.
+    tasks : iterable of dict
+        Rows of the table `tasks`.
+    mission_for : callable
+        Returns the mission database for the settings of an exposure.
+
+    Returns
+    -------
+    exposures : pyarrow.Table
+        The given rows and the rows of the earlier exposures.
+    previous_tasks : dict
+        Earlier tasks of the same detector, by (exposure number, detector name).
     """
     affected = [row for row in map(ExposureRow.from_row, exposures.to_pylist()) if persistence.has_persistence(row)]
     if not affected:

@@ -1,10 +1,8 @@
-"""Ground surveys: pointings from each survey's rule, or from a user's table.
+"""Plan the exposures of ground surveys, from the pattern of each survey or from a table of pointings.
 
-exposures    of one survey over an area
-read         a table of pointings, CSV
-by_day       what of a plan is dated when it is not night, as a line
-
-Ref : Serrano et al. 2024, appendix on the survey files of the eighth science challenge
+References
+----------
+Serrano et al. 2024, appendix on the survey files of the eighth science challenge
 """
 
 from __future__ import annotations
@@ -31,25 +29,43 @@ from truesky.request.observations import Observation
 from truesky.request.pointing_tables import Row
 
 _DAY_S, _OVERHEAD_S = 86400.0, 30.0
-# Nautical twilight: the Sun brightens the sky while it is higher, deg.
+# Nautical twilight: the Sun brightens the sky above this altitude, deg.
 _NIGHT_SUN_ALTITUDE = -12.0
 
 
 def camera_of(survey: str, mission: MissionConfiguration) -> str:
-    """The camera of a survey."""
+    """Return the camera of a ground survey."""
     return _rules(survey, mission)[0]["camera"]
 
 
 def exposures(
     block: Observation, area: Area, mission: MissionConfiguration, seed: int, start: float
 ) -> Iterator[Exposure]:
-    """The exposures of a survey over an area: as many as are asked for, else one layer; or of a field of its own.
+    """Generate the exposures of a ground survey over an area or at a position given by the user.
 
-    Bands that the survey takes together are taken at the same places. They follow one another from the start on;
-    without a date of the block's, each when its field is next up at night. The telescope misses its place by the
-    survey's error.
-    block   : of the request, with its survey and bands;  area : of the request
-    mission : the mission database;  seed : of the request;  start : MJD
+    Parameters
+    ----------
+    block : Observation
+        Observation block of the request, with its survey and bands.
+    area : Area
+        Area of the request.
+    mission : MissionConfiguration
+        The mission database.
+    seed : int
+        Seed of the request.
+    start : float
+        MJD of the first exposure.
+
+    Yields
+    ------
+    Exposure
+        `block.exposures` exposures if the block sets a number, otherwise one layer of the pattern.
+
+    Notes
+    -----
+    Bands that the survey observes together share their pointings. The exposures follow one another from `start`. If the
+    block has no date, each exposure waits until its field is next visible at night. The pointings have random errors
+    with the standard deviation given by the survey.
     """
     now = start
     rules = _rules(block.survey, mission)
@@ -67,7 +83,7 @@ def exposures(
             else _user_field_pointings(block)
         )
         for i, (ra, dec) in enumerate(places):
-            # Where the survey shares its exposures among bands, they take turns.
+            # If the survey divides its exposures among bands, the bands take turns.
             all_bands = rule["shared"] == "0" or (block.field_centre is not None and not block.exposures)
             selected_bands = bands if all_bands else (bands[i % len(bands)],)
             for band in selected_bands:
@@ -92,13 +108,13 @@ def exposures(
 
 
 def _seconds(rule: Mapping[str, str], band: str, mission: MissionConfiguration) -> float:
-    """Exposure time of a survey in a band: the band's own, where the camera has one."""
+    """Return the exposure time in seconds: the value of the band if the camera defines one, or else of the survey."""
     key = f"{image_types.section(rule['camera'])}.{band}.exposure_time"
     return mission.value(key, "s") if key in mission else float(rule["exposure_time_s"])
 
 
 def _with_pointing_error(place: tuple[float, float], error: float, rng: np.random.Generator) -> tuple[float, float]:
-    """Where a telescope points that misses a place by an error, arcsec rms of each coordinate; as it is without one."""
+    """Return a position (deg) with a Gaussian error of `error` arcsec rms in each coordinate."""
     if error == 0.0:
         return place
     east, north = error * rng.standard_normal(2)
@@ -113,7 +129,7 @@ def _rules(survey: str, mission: MissionConfiguration) -> list[Mapping[str, str]
 def _pattern_pointings(
     rule: Mapping[str, str], block: Observation, area: Area, mission: MissionConfiguration, seed: int
 ) -> list[tuple[float, float]]:
-    """Pointings of a pattern, in passes over the area, those nearest to it kept."""
+    """Return the pointings of the survey's pattern over the area; if a number is requested, those deepest inside."""
     detectors = camera_detectors.detectors(rule["camera"], mission)
     x, y = pointing.outline(detectors)
     half = [0.5 * float(axis.max() - axis.min()) / 3600.0 for axis in (x, y)]
@@ -121,7 +137,7 @@ def _pattern_pointings(
     if rule["pattern"] == "chips":
         return _chip_pointings(detectors, half, block.exposures, area, margin)
     count = block.exposures
-    # As large a step as the filled part of a round field allows: neighbours just touch.
+    # The largest step at which neighbouring round fields just touch, as a fraction of the field.
     filled = 0.9
     passes = max(int(rule["passes"]), 1)
     if not count:
@@ -142,7 +158,7 @@ def _pattern_pointings(
 
 
 def _user_field_pointings(block: Observation) -> list[tuple[float, float]]:
-    """The place of an observation's own with its dithers, as often as exposures are asked for, else once each."""
+    """Return the position of a user field with its dithers, repeated cyclically if more exposures are requested."""
     assert block.field_centre is not None
     steps = np.zeros((1, 2)) if isinstance(block.dither, str) else np.array(block.dither)
     ra, dec = pointing.sky_of_plane(steps[:, 0], steps[:, 1], *block.field_centre, block.position_angle or 0.0)
@@ -153,7 +169,7 @@ def _user_field_pointings(block: Observation) -> list[tuple[float, float]]:
 def _pattern_pass(
     area: Area, half: list[float], step: float, margin: float, number: int, seed: int, survey: str
 ) -> list[tuple[float, float]]:
-    """One pass: rows of declination, each row equally spaced, the whole shifted at random from pass to pass."""
+    """Return one pass of the pattern: rows of constant declination, equally spaced, shifted at random for each pass."""
     ra0, dec0, radius = area.bounding_circle()
     reach = radius + margin
     step_x, step_y = 2 * half[0] * step, 2 * half[1] * step
@@ -177,7 +193,7 @@ def _pattern_pass(
 def _chip_pointings(
     detectors: tuple[Detector, ...], half: list[float], count: int, area: Area, margin: float
 ) -> list[tuple[float, float]]:
-    """Each pointing as often as there are detectors, shifted so that every one of them sees its centre."""
+    """Return pointings that place each centre on every detector in turn."""
     centres = _pattern_pass(area, half, 1.0, margin, 0, 0, "chips")
     n_centres = int(np.ceil(count / len(detectors))) if count else len(centres)
     lo, hi = 0.02, 20.0
@@ -198,7 +214,7 @@ def _chip_pointings(
 
 
 def daylight_warning(exposures: Iterable[Exposure], mission: MissionConfiguration) -> str:
-    """A line about ground exposures of the sky that are dated by day or in twilight, empty where there are none."""
+    """Return one line that warns of ground exposures dated by day or in twilight, or "" without such exposures."""
     daytime, count = [], 0
     sites: dict[str, Site] = {}
     for exposure in exposures:
@@ -215,19 +231,36 @@ def daylight_warning(exposures: Iterable[Exposure], mission: MissionConfiguratio
         return ""
     altitude, exposure = max(daytime, key=lambda entry: entry[0])
     summary = (
-        f"{len(daytime)} of {count} exposures of the sky are dated when the Sun is above {_NIGHT_SUN_ALTITUDE:g} deg"
+        f"{len(daytime)} of {count} exposures of the sky have dates when the Sun is above {_NIGHT_SUN_ALTITUDE:g} deg"
     )
     example = f"{exposure.camera} on MJD {exposure.mjd:.3f}, the Sun at {altitude:+.0f} deg"
-    return f"EXT: {summary} ({example}): their sky has no light of the Sun; without a date a survey observes at night"
+    return f"EXT: {summary} ({example}): sunlight is not simulated; omit the date to observe at night"
 
 
 # ------------------------------------------------------------------------------------------------ tables
 
 
 def read(path: Path, block: Observation, mission: MissionConfiguration) -> list[Exposure]:
-    """Exposures of a table of pointings (truesky.request.pointing_tables), with what its rows leave to the mission.
+    """Read the exposures of a table of pointings; values that a row leaves empty come from the block or the mission.
 
-    Errors : BadInput names the file, the line and the column
+    Parameters
+    ----------
+    path : Path
+        CSV table of pointings (`truesky.request.pointing_tables`).
+    block : Observation
+        Observation block of the request that names the table.
+    mission : MissionConfiguration
+        The mission database.
+
+    Returns
+    -------
+    list of Exposure
+        One exposure per row.
+
+    Raises
+    ------
+    BadInput
+        If a row is invalid; the message names the file, the line and the column.
     """
     rows = pointing_tables.read(path, block.channels, block.image_type)
     return [_exposure_of_row(row, number, block, mission) for number, row in enumerate(rows, start=1)]

@@ -1,9 +1,8 @@
-"""The observing sequence of a field: dithers, and in each of them VIS with NISP-S, then the filters.
+"""Lay out the observing sequence of a field: VIS with NISP-S, then the NISP filters, at each dither.
 
-offsets     where the dithers of a pattern point, with the errors of the steps
-sequence    the exposures of one visit of a field
-
-Ref : Serrano et al. 2024, section 3.2 and the figure of the observing sequence
+References
+----------
+Serrano et al. 2024, section 3.2 and the figure of the observing sequence
 """
 
 from __future__ import annotations
@@ -24,23 +23,37 @@ from truesky.render.planning.reference_survey import Field
 from truesky.request.observations import Observation
 
 _DAY_S = 86400.0
-# The filters in the order they come after the grism, and the passband of each grism.
+# Filters in the order in which they follow the grism, and the passband of each grism.
 FILTERS = ("euclid_j", "euclid_h", "euclid_y")
 RED, BLUE = "nisp_red", "nisp_blue"
-# Angles at which spectra run in turn: survey.grism_angle_1 and so on.
+# Number of grism angles, used in turn: survey.grism_angle_1 and so on.
 N_GRISM_ANGLES = 4
 
 
 def offsets(pattern: str, mission: MissionConfiguration, seed: int, *key: int | str) -> Float:
-    """[dithers, 2] arcsec along the focal plane's x and y from the field's own pointing.
+    """Return the offsets of the dithers from the pointing of the field.
 
-    pattern : "S", "J" or "none";  key : what the errors of the steps are drawn for
+    Parameters
+    ----------
+    pattern : str
+        "S", "J" or "none".
+    mission : MissionConfiguration
+        The mission database.
+    seed : int
+        Seed of the request.
+    *key : int or str
+        Identify the random numbers of the pointing errors.
+
+    Returns
+    -------
+    float array, shape (n_dithers, 2)
+        Offsets in arcsec along the x and y axes of the focal plane, including the accumulated errors of the steps.
     """
     if pattern == "none":
         return np.zeros((1, 2))
     names = ["dither_1", "dither_2", "dither_3", "dither_4" if pattern == "S" else "dither_j_4"]
     planned = np.array([[mission.value(f"survey.{name}.{axis}", "arcsec") for axis in "xy"] for name in names])
-    # Three sigma of each step; the first pointing is where it was asked for.
+    # The mission gives the error of each step as 3 sigma. The first pointing has no error.
     sigma = mission.value("svm.aocs.pointing_error", "arcsec") / 3.0
     errors = rng.stream(seed, "dithers", *key).normal(0.0, sigma, planned.shape)
     errors[0] = 0.0
@@ -50,19 +63,34 @@ def offsets(pattern: str, mission: MissionConfiguration, seed: int, *key: int | 
 def visit_exposures(
     field: Field, block: Observation, survey: str, mission: MissionConfiguration, seed: int
 ) -> Iterator[Exposure]:
-    """The exposures of one visit of a field, in the order they begin.
+    """Generate the exposures of one visit of a field, in the order in which they begin.
 
-    field   : where, and when it is visited;  block : of the request;  survey : name that exposures have
-    mission : the mission database;  seed : of the request
+    Parameters
+    ----------
+    field : Field
+        Position and time of the visit.
+    block : Observation
+        Observation block of the request.
+    survey : str
+        Survey name stored with the exposures.
+    mission : MissionConfiguration
+        The mission database.
+    seed : int
+        Seed of the request.
+
+    Yields
+    ------
+    Exposure
+        One exposure of VIS, NISP-S or NISP-P.
     """
     if isinstance(block.dither, str):
-        # Fields of the user's own have no number: their places tell them apart.
+        # Fields at positions given by the user have no number; their position identifies the random numbers instead.
         place = () if block.field_centre is None else tuple(angle.hex() for angle in block.field_centre)
         steps = offsets(block.dither, mission, seed, survey, field.number, field.visit, *place)
-        # The pattern is laid about the field's centre.
+        # The pattern is centred on the field.
         steps = steps - steps.mean(axis=0)
     else:
-        # Of the user's own: taken as they are.
+        # Offsets given by the user are used without change.
         steps = np.array(block.dither)
     ra, dec = pointing.sky_of_plane(steps[:, 0], steps[:, 1], field.ra, field.dec, field.position_angle)
     length = _dither_time(mission)
@@ -73,14 +101,14 @@ def visit_exposures(
 
 
 def _dither_time(mission: MissionConfiguration) -> float:
-    """Seconds from the start of a dither to the end of its last filter."""
+    """Return the seconds from the start of a dither to the end of its last filter."""
     spectrum, photometry = (_commanded_seconds(kind, mission) for kind in ("spectroscopic", "photometric"))
     settle, to_filter, wheel = _move_times(mission)
     return settle + spectrum + to_filter + len(FILTERS) * photometry + (len(FILTERS) - 1) * wheel
 
 
 def _commanded_seconds(kind: str, mission: MissionConfiguration) -> float:
-    """Seconds that NISP is commanded to take; more where its ramps take longer."""
+    """Return the commanded duration of a NISP exposure in seconds, or that of its ramp if the ramp takes longer."""
     seconds = exposure_time("NISP-S" if kind == "spectroscopic" else "NISP-P", "nisp", "", mission)
     return max(mission.value(f"nisp.commanded_time_{kind}", "s"), ramp.duration(kind, seconds, "nisp", mission))
 
@@ -95,7 +123,7 @@ def _move_times(mission: MissionConfiguration) -> tuple[float, float, float]:
 
 @dataclass(frozen=True, slots=True)
 class _Dither:
-    """One dither: where it points (deg), when it starts (MJD), its number from 1."""
+    """One dither of a visit: pointing in degrees, start as MJD, and dither number from 1."""
 
     block: Observation
     field: Field
@@ -107,8 +135,9 @@ class _Dither:
     dither: int
 
     def exposures(self, is_last: bool) -> Iterator[Exposure]:
+        """Generate the exposures of the dither; the last dither also has the closing VIS flat."""
         block, mission = self.block, self.mission
-        # A block may name some of the filters; VIS has but one.
+        # A block may select some of the NISP filters. VIS has only one.
         bands = set(block.bands) & set(FILTERS) or set(FILTERS)
         settle, to_filter, wheel = _move_times(mission)
         if "VIS" in block.channels:
@@ -121,12 +150,12 @@ class _Dither:
             if "NISP-P" in block.channels and band in bands:
                 yield self._exposure("NISP-P", band, begin + i * step)
         if "VIS" in block.channels and block.short and self.dither == 1:
-            # Beside the last filter (Serrano et al. 2024: in the first dither only).
+            # The short exposure is taken during the last filter of the first dither (Serrano et al. 2024).
             seconds = mission.value("vis.exposure_time_short", "s")
             yield self._exposure("VIS", "euclid_vis", begin + (len(FILTERS) - 1) * step, seconds)
         if "VIS" in block.channels and block.flat and is_last:
             seconds = mission.value("vis.exposure_time_flat", "s")
-            # One LED after the other, from field to field and from visit to visit.
+            # The LED changes from field to field and from visit to visit.
             lamp = (self.field.number + self.field.visit) % LEDS + 1
             flat = self._exposure("VIS", "euclid_vis", _dither_time(mission), seconds)
             yield replace(flat, image_type="flat", lamp=lamp)
@@ -139,7 +168,7 @@ class _Dither:
         return through_grism(self._exposure("NISP-S", RED, delay), angle, self.mission, f"survey.grism_angle_{number}")
 
     def _exposure(self, channel: str, band: str, delay: float, seconds: float | None = None) -> Exposure:
-        """One that begins `after` seconds of the dither's start;  seconds : it takes, None = the mission's."""
+        """Return an exposure that begins `delay` s after the dither starts; `seconds` None means the nominal time."""
         camera = "vis" if channel == "VIS" else "nisp"
         nominal = exposure_time(channel, camera, band, self.mission)
         return Exposure(

@@ -1,8 +1,4 @@
-"""Bright exposures of NISP, each with darks after it that show what it left in the detectors.
-
-exposures   what an observation block of the image type persistence asks for
-forgotten   when nothing is seen any more of what an exposure leaves
-"""
+"""Plan bright NISP exposures, each followed by darks that measure its persistence."""
 
 from __future__ import annotations
 
@@ -22,11 +18,28 @@ _DAY_S = 86400.0
 
 
 def exposures(template: Exposure, block: Observation, mission: MissionConfiguration, now: float) -> Iterator[Exposure]:
-    """Each bright exposure, then its darks; the next when it is forgotten.
+    """Generate each bright exposure and its darks; the next bright exposure waits until the persistence has faded.
 
-    first   : where they point;  now : MJD of the first of them
-    block   : of the request;  mission : the mission database
-    Errors  : BadInput for darks that begin before another has ended, or so late that nothing is looked for any more
+    Parameters
+    ----------
+    template : Exposure
+        Exposure with the pointing and the channel.
+    block : Observation
+        Observation block of the request.
+    mission : MissionConfiguration
+        The mission database.
+    now : float
+        MJD of the first bright exposure.
+
+    Yields
+    ------
+    Exposure
+        A bright exposure or a dark.
+
+    Raises
+    ------
+    BadInput
+        If darks overlap, or if one begins so late that persistence is no longer simulated.
     """
     band = FILTERS[-1] if template.channel == "NISP-P" else RED
     nominal = exposure_time(template.channel, template.camera, band, mission)
@@ -47,42 +60,42 @@ def exposures(template: Exposure, block: Observation, mission: MissionConfigurat
 
 
 def persistence_end_mjd(exposure: Exposure, mission: MissionConfiguration) -> float:
-    """MJD from which nothing is seen of what an exposure leaves in NISP's detectors; mission : the mission database."""
+    """Return the MJD from which the persistence of an exposure is no longer simulated."""
     window = mission.value(f"{exposure.camera}.persistence.window", "d")
     return exposure.mjd + elapsed_time(exposure, mission) / _DAY_S + window
 
 
 def _check_delays(delays: Sequence[float], dark_duration: float, max_delay: float) -> Sequence[float]:
-    """The block's in their order; busy : s that a dark takes;  longest : s that are looked back from one's start."""
+    """Return the sorted delays (s); a dark takes `dark_duration` s and begins at most after `max_delay` s."""
     delays = sorted(delays)
     for delay, next_delay in pairwise(delays):
         if next_delay < delay + dark_duration:
             raise BadInput(
-                f"delays_s: a dark at {next_delay:g} s begins before that at {delay:g} s, "
-                f"of {dark_duration:.1f} s, ends"
+                f"delays_s: the dark at {next_delay:g} s begins before the dark at {delay:g} s ends; "
+                f"a dark takes {dark_duration:.1f} s"
             )
     if delays[-1] > max_delay:
-        raise BadInput(f"delays_s: {delays[-1]:g} s is more than nisp.persistence.window looks back, {max_delay:g} s")
+        raise BadInput(f"delays_s: {delays[-1]:g} s is too late, nisp.persistence.window allows {max_delay:g} s")
     return delays
 
 
 def _mission_delays(dark_duration: float, max_delay: float, mission: MissionConfiguration) -> Sequence[float]:
-    """Of the mission's those that such darks can be taken at; busy, longest, mission : as of `_checked`."""
+    """Return the delays (s) of the mission at which darks of `dark_duration` s fit, up to `max_delay` s."""
     delays: list[float] = []
     names = takewhile(mission.__contains__, (f"nisp.persistence.delay_{i}" for i in count(1)))
     for seconds in (mission.value(name, "s") for name in names):
         if (not delays or seconds >= delays[-1] + dark_duration) and seconds <= max_delay:
             delays.append(seconds)
     if not delays:
-        raise BadInput(f"delays_s: of the mission's none is within the {max_delay:g} s that are looked back")
+        raise BadInput(f"delays_s: no delay of the mission is at most {max_delay:g} s (nisp.persistence.window)")
     return delays
 
 
 def _bright_exposures(template: Exposure, block: Observation, mission: MissionConfiguration) -> Iterator[Exposure]:
-    """Flats of the block's lamps at its intensities, or a field of stars in each band."""
+    """Generate flats with the lamps and intensities of the block, or a star field in each band."""
     is_sky, channel = block.bright == "sky", template.channel
     if is_sky and (block.lamps or block.intensities):
-        raise BadInput(f"{'lamps' if block.lamps else 'intensities'}: bright = 'sky' has no lamp")
+        raise BadInput(f"{'lamps' if block.lamps else 'intensities'} must not be set if bright = 'sky'")
     if not is_sky:
         kind = "flat"
     else:

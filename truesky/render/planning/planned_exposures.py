@@ -1,10 +1,4 @@
-"""One exposure as the planner lays it out, before it is a row of the table `exposures`.
-
-Exposure       what, where and when
-through_grism  with the grism whose spectra run at an angle
-unturned       through a grism as it is without a tilt
-table          exposures -> rows, with the sky, zero point and seeing of each
-"""
+"""Describe planned exposures, and convert them to rows of the table `exposures` with sky, zero point and seeing."""
 
 from __future__ import annotations
 
@@ -34,21 +28,41 @@ from truesky.render.sky.diffuse_light import SkyBand, sky_rate
 from truesky.render.sky.night_sky import Night
 from truesky.request.observations import Observation
 
-# Grisms by the passband that they are used in.
+# Grisms by the passband in which they are used.
 GRISMS: Mapping[str, tuple[str, ...]] = {"nisp_red": ("RGS000", "RGS180"), "nisp_blue": ("BGS000",)}
 _DARK_TYPES = ("bias", "dark", "charge_injection", "trap_pumping", "persistence")
-# Columns that are counted here.
+# Columns that `table` computes.
 _COMPUTED_COLUMNS = ("exposure_id", "realisation", "airmass", "zenith")
 
 
 @dataclass(frozen=True, slots=True)
 class Exposure:
-    """What, where and when.
+    """A planned exposure: channel, position, time and settings.
 
-    ra, dec, position_angle : deg, boresight and the focal plane's y axis, north through east
-    detectors               : names, () = all of the camera
-    sky, seeing, zero_point : electrons a second and pixel, arcsec, mag; None = the mission's
-    parameters              : (key, value, unit) of the mission database that it is taken with instead of the request's
+    Attributes
+    ----------
+    ra, dec : float
+        ICRS position of the boresight in degrees.
+    position_angle : float
+        Angle of the y axis of the focal plane in degrees, from north through east.
+    mjd : float
+        Start of the exposure.
+    exposure_time_s : float
+        Effective exposure time in seconds.
+    grism_angle : float, optional
+        Angle in degrees at which spectra run in the focal plane.
+    detectors : tuple of str
+        Names of the detectors; () means all detectors of the camera.
+    sky : float, optional
+        Sky background in electrons per second and pixel; None means the value of the mission.
+    seeing : float, optional
+        Seeing in arcsec; None means the value of the mission.
+    zero_point : float, optional
+        AB magnitude of one electron per second; None means the value of the mission.
+    settings : str, optional
+        JSON table of the parameters that replace those of the request.
+    parameters : tuple of (str, float, str)
+        Key, value and unit of parameters that replace those of the mission database for this exposure.
     """
 
     channel: str
@@ -78,7 +92,25 @@ class Exposure:
 
 
 def bands_of(channel: str, camera: str, mission: MissionConfiguration) -> tuple[str, ...]:
-    """Passbands that a camera has; BadInput where the channel has no such camera."""
+    """Return the passbands of a camera.
+
+    Parameters
+    ----------
+    channel, camera : str
+        Names of the channel and of the camera.
+    mission : MissionConfiguration
+        The mission database.
+
+    Returns
+    -------
+    tuple of str
+        Names of the passbands.
+
+    Raises
+    ------
+    BadInput
+        If the channel has no such camera.
+    """
     bands = registry.CHANNELS[channel].bands(camera, mission)
     if not bands:
         raise BadInput(f"channel {channel} has no camera {camera!r}")
@@ -86,30 +118,58 @@ def bands_of(channel: str, camera: str, mission: MissionConfiguration) -> tuple[
 
 
 def through_grism(exposure: Exposure, angle: float | None, mission: MissionConfiguration, where: str = "") -> Exposure:
-    """An exposure with the grism of its band whose spectra run nearest to an angle; as it is without a grism.
+    """Select the grism of the band whose spectra run closest to an angle; bands without a grism are unchanged.
 
-    angle : in the focal plane, deg, None = as the grism's own;  mission : the mission database
-    where : named in the refusal
-    Errors : BadInput for an angle without a grism, or one that no grism of the band is turned to
+    Parameters
+    ----------
+    exposure : Exposure
+        The exposure.
+    angle : float or None
+        Angle of the spectra in the focal plane in degrees; None means 0.
+    mission : MissionConfiguration
+        The mission database.
+    where : str
+        Key of the request, for the message.
+
+    Returns
+    -------
+    Exposure
+        The exposure with `grism` and `grism_angle`.
+
+    Raises
+    ------
+    BadInput
+        If the band has no grism but an angle is given, or if all grisms would be tilted by more than
+        `grism_wheel.MAX_TILT`.
     """
     grisms = GRISMS.get(exposure.band, ())
     if not grisms:
         if angle is not None:
-            raise BadInput(f"{where}: no grism of {exposure.camera} is in the beam in {exposure.band}")
+            raise BadInput(f"{where}: must not be set in {exposure.band}, for which {exposure.camera} has no grism")
         return exposure
     angle, section = angle or 0.0, image_types.section(exposure.camera)
     tilts = [abs(grism_wheel.tilt(grism, angle, section, mission)) for grism in grisms]
     nearest = int(np.argmin(tilts))
     if tilts[nearest] > grism_wheel.MAX_TILT:
         names = ", ".join(grisms)
-        raise BadInput(f"{where} = {angle:g} deg turns {names} by more than {grism_wheel.MAX_TILT:g} deg")
+        raise BadInput(f"{where} = {angle:g} deg tilts {names} by more than {grism_wheel.MAX_TILT:g} deg")
     return replace(exposure, grism=grisms[nearest], grism_angle=angle)
 
 
 def exposure_time(channel: str, camera: str, band: str, mission: MissionConfiguration) -> float:
-    """Effective exposure time of a nominal exposure, s: of a ramp, from its first to its last group.
+    """Return the nominal effective exposure time; for a ramp, the time from its first to its last group.
 
-    channel, camera, band : names;  mission : the mission database
+    Parameters
+    ----------
+    channel, camera, band : str
+        Names.
+    mission : MissionConfiguration
+        The mission database.
+
+    Returns
+    -------
+    float
+        Time in seconds.
     """
     if camera == "nisp":
         kind = f"nisp.macc.{_ramp_name(channel)}"
@@ -120,17 +180,30 @@ def exposure_time(channel: str, camera: str, band: str, mission: MissionConfigur
 
 
 def elapsed_time(exposure: Exposure, mission: MissionConfiguration) -> float:
-    """Seconds from the start of an exposure until its detectors may be exposed again: of a ramp, to its last read."""
+    """Return the seconds until the detectors may be exposed again; a ramp lasts until its last read."""
     if exposure.camera != "nisp":
         return exposure.exposure_time_s
     return ramp.duration(_ramp_name(exposure.channel), exposure.exposure_time_s, exposure.camera, mission)
 
 
 def check_ramp(channel: str, camera: str, seconds: float, mission: MissionConfiguration, where: str = "") -> None:
-    """Refuse an exposure time that the camera cannot be read up a ramp in.
+    """Check that the camera has a ramp with the exposure time.
 
-    channel, camera : names;  seconds : exposure time
-    mission : the mission database;  where : named in the refusal
+    Parameters
+    ----------
+    channel, camera : str
+        Names of the channel and of the camera; only the ramps of NISP are checked.
+    seconds : float
+        Exposure time in seconds.
+    mission : MissionConfiguration
+        The mission database.
+    where : str
+        Key of the request, for the message.
+
+    Raises
+    ------
+    BadInput
+        If no ramp takes this time.
     """
     if camera == "nisp":
         try:
@@ -140,9 +213,9 @@ def check_ramp(channel: str, camera: str, seconds: float, mission: MissionConfig
 
 
 def check_macc(block: Observation, mission: MissionConfiguration) -> None:
-    """Refuse an observation that asks for a ramp, and for an exposure time that this ramp does not take.
+    """Raise BadInput if the ramp of a block does not take the exposure time of the block.
 
-    block : of the request;  mission : with the block's ramp
+    `mission` must contain the ramp of the block.
     """
     if not block.macc or block.exposure_time_s is None:
         return
@@ -154,12 +227,12 @@ def check_macc(block: Observation, mission: MissionConfiguration) -> None:
 
 
 def channel_of_macc(block: Observation) -> str:
-    """Of a block of both channels of NISP its ramp is the photometer's."""
+    """Return the channel that the ramp of a block applies to: NISP-P if the block has it, otherwise NISP-S."""
     return "NISP-P" if "NISP-P" in block.channels else "NISP-S"
 
 
 def ramp_overrides(block: Observation) -> dict[str, tuple[float, str]]:
-    """What a block's ramp changes of the mission: key -> (value, unit)."""
+    """Return the parameters that the ramp of a block replaces: value and unit by key."""
     key = f"nisp.macc.{_ramp_name(channel_of_macc(block))}"
     return {f"{key}.{part}": (n, "") for part, n in zip(("groups", "reads", "drops"), block.macc, strict=False)}
 
@@ -176,12 +249,27 @@ def table(
     first: int = 1,
     previous: Iterable[Exposure] = (),
 ) -> pa.Table:
-    """Rows of the table `exposures`, numbered in their order.
+    """Make the rows of the table `exposures`, numbered in the order given.
 
-    missions : the configuration of each;  own : passbands by name besides the embedded ones
-    seed     : of the request: of ground cameras the seeing is drawn
-    first    : number of the first
-    before   : earlier exposures, of which some may differ from these in their noise alone
+    Parameters
+    ----------
+    exposures : sequence of Exposure
+        Planned exposures.
+    missions : sequence of MissionConfiguration
+        Mission database of each exposure.
+    user_passbands : mapping of str to Passband, optional
+        Passbands by name, in addition to the embedded ones.
+    seed : int
+        Seed of the request, used to draw the seeing of ground cameras.
+    first : int
+        Number of the first exposure.
+    previous : iterable of Exposure
+        Earlier exposures, some of which may differ from these only in their noise. They are counted in `realisation`.
+
+    Returns
+    -------
+    pyarrow.Table
+        One row per exposure.
     """
     if not exposures:
         return EXPOSURES.empty()
@@ -199,7 +287,7 @@ def table(
 
 
 def _realisation_key(e: Exposure) -> tuple[Any, ...]:
-    """What two exposures have in common whose random numbers would be the same, of one request of an exploration."""
+    """Return the key of an exposure; exposures with the same key would have the same random numbers."""
     angle = _wrap_angle(e.position_angle)
     return e.settings, e.camera, e.band, e.ra % 360.0, e.dec, angle, e.mjd, e.grism, e.grism_angle
 
@@ -210,7 +298,7 @@ def _wrap_angle(angle: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _Band:
-    """What all exposures of a channel and camera in a band have in common."""
+    """Properties shared by all exposures of a channel and camera in a band."""
 
     zero_point: float
     sky: SkyBand
@@ -272,7 +360,7 @@ def _row(number: int, e: Exposure, band: _Band, mission: MissionConfiguration, s
 
 
 def _seeing(e: Exposure, band: _Band, seed: int) -> float:
-    """Drawn from the survey's log-normal distribution, between three standard deviations; 0 in space."""
+    """Draw the seeing (arcsec) from the log-normal distribution of the survey, limited to 3 sigma. It is 0 in space."""
     if band.scatter == 0.0:
         return band.seeing
     where = (e.camera, e.band, *(value.hex() for value in (e.ra, e.dec, e.mjd)))
@@ -281,9 +369,9 @@ def _seeing(e: Exposure, band: _Band, seed: int) -> float:
 
 
 def untilted_exposure(grism: str, mission: MissionConfiguration) -> ExposureRow:
-    """An exposure of a second through a grism that is not turned, at nothing in particular.
+    """Return a one-second exposure at (0, 0) deg through a grism that is not tilted.
 
-    grism : one of GRISMS;  mission : the mission database
+    Parameters are the name of a grism in GRISMS and the mission database.
     """
     camera, band = "nisp", next(band for band, names in GRISMS.items() if grism in names)
     return ExposureRow(
@@ -293,10 +381,23 @@ def untilted_exposure(grism: str, mission: MissionConfiguration) -> ExposureRow:
 
 
 def zero_point_of(prefix: str, band: str, mission: MissionConfiguration, curve: Passband | None = None) -> float:
-    """AB magnitude of one electron a second: of ground cameras as published, of Euclid's from throughput and area.
+    """Return the AB magnitude of one electron per second.
 
-    curve : the passband, None = the embedded one
-    prefix : of the camera's keys in the mission database;  band : name;  mission : the mission database
+    Parameters
+    ----------
+    prefix : str
+        Prefix of the camera's keys in the mission database.
+    band : str
+        Name of the band.
+    mission : MissionConfiguration
+        The mission database.
+    curve : Passband, optional
+        The passband; None means the embedded one.
+
+    Returns
+    -------
+    float
+        Zero point in magnitudes: the published one for ground cameras, otherwise from throughput and collecting area.
     """
     if f"{prefix}.{band}.zero_point" in mission:
         return mission.value(f"{prefix}.{band}.zero_point", "mag")

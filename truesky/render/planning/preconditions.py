@@ -1,4 +1,4 @@
-"""What is refused before anything is rendered: another plan, another universe, an area that was not drawn."""
+"""Check before rendering that plan, catalogues and fluxes match the request, and that the area is large enough."""
 
 from collections.abc import Mapping
 
@@ -22,14 +22,29 @@ from truesky.request import universe
 from truesky.request.area import Area
 from truesky.request.schema import Request
 
-# Detectors within so many deg of one another are named one circle; as many circles as a message has room for.
+# Detectors within _LINK deg of one another share one circle; a message lists at most _MAX_PATCHES circles.
 _LINK, _MAX_PATCHES = 5.0, 12
 
 INPUTS = ("mission", "exposures", "tasks", "galaxies", "galaxy_fluxes", "stars", "star_fluxes")
 
 
 def refuse_other_plan(inputs: Mapping[str, read.Version], request: Request, mission: MissionConfiguration) -> None:
-    """What lies in the lake must have been made for this request and its mission, and the tables from one another."""
+    """Check that the plan and the tables were made for this request and its mission, and from one another.
+
+    Parameters
+    ----------
+    inputs : mapping of str to Version
+        Versions of the tables, by table name.
+    request : Request
+        The request.
+    mission : MissionConfiguration
+        The mission database of the request.
+
+    Raises
+    ------
+    BadInput
+        If a table belongs to another request, or was made from another version of its input.
+    """
     universe.check_catalogues([inputs[name] for name in universe.CATALOGUES], request)
     facts = {name: version.manifest["facts"] for name, version in inputs.items()}
     filters = user_filters(request)[1]
@@ -50,23 +65,26 @@ def refuse_other_plan(inputs: Mapping[str, read.Version], request: Request, miss
 
 
 def require_renderable_tasks(exposures: pa.Table, tasks: pa.Table) -> pa.Table:
-    """Those of the tasks whose exposures are of a kind that has a simulator; BadInput where none is."""
+    """Return the tasks whose exposures have a simulator. Raises BadInput if no exposure has one."""
     renderable_exposures(exposures)
     return renderable_tasks(exposures, tasks)
 
 
 def renderable_exposures(exposures: pa.Table) -> pa.Array | None:
-    """Numbers of the exposures that are of a kind that has a simulator, None = all are; BadInput where none is."""
+    """Return the numbers of the exposures that have a simulator, or None if all have one.
+
+    Raises BadInput if no exposure has one.
+    """
     has_simulator = _simulator_flags(exposures)
     if not any(has_simulator.values()):
         raise BadInput(
-            f"no simulator renders {', '.join(map(' '.join, has_simulator))} yet: nothing to render is planned"
+            f"no simulator renders {', '.join(map(' '.join, has_simulator))} yet, and the plan has no other exposures"
         )
     return _renderable_numbers(exposures, has_simulator)
 
 
 def renderable_tasks(exposures: pa.Table, tasks: pa.Table) -> pa.Table:
-    """As `rendered`, none where none is."""
+    """Return the tasks whose exposures have a simulator; the table may be empty."""
     numbers = _renderable_numbers(exposures, _simulator_flags(exposures))
     return tasks if numbers is None else tasks.filter(pc.is_in(tasks["exposure_id"], numbers))
 
@@ -91,11 +109,11 @@ def _simulator_flags(exposures: pa.Table) -> dict[tuple[str, str], bool]:
 
 
 def refuse_uncovered(catalogue: read.Version, cells: set[int]) -> None:
-    """The detectors must lie where the catalogue was drawn."""
+    """Raise BadInput if the catalogue does not cover all cells that the detectors observe."""
     if missing := sorted(cells - catalogue_rows.drawn_cells(catalogue)):
         examples = ", ".join(map(str, missing[:3])) + (", ..." if len(missing) > 3 else "")
-        missing_cells = f"{len(missing)} order-{GENERATION_ORDER} cells that the detectors see ({examples})"
-        remedy = f"run build_{catalogue.table} over an area that holds all detectors, then compute_fluxes"
+        missing_cells = f"{len(missing)} order-{GENERATION_ORDER} cells that the detectors observe ({examples})"
+        remedy = f"run build_{catalogue.table} over an area that contains all detectors, then compute_fluxes"
         raise BadInput(f"table {catalogue.table} lacks {missing_cells}: {remedy}")
 
 
@@ -103,9 +121,9 @@ def refuse_uncovered(catalogue: read.Version, cells: set[int]) -> None:
 
 
 def refuse_small_area(area: Area, tasks: pa.Table) -> None:
-    """All that the tasks' detectors see must lie in the area that catalogues are drawn in.
+    """Raise BadInput if detectors of the tasks see sky outside the area of the catalogues.
 
-    The message names an area that would do.
+    The message contains an area that is large enough.
     """
     sees_sky = pc.greater(pc.list_value_length(tasks["cells"]), 0)
     sky_tasks = tasks.filter(sees_sky)
@@ -122,16 +140,17 @@ def refuse_small_area(area: Area, tasks: pa.Table) -> None:
         pa.array((sky_tasks["ra"].to_numpy() == ra[outside][0]) & (sky_tasks["dec"].to_numpy() == dec[outside][0]))
     )
     raise BadInput(
-        f"area: {outside.sum()} of {outside.size} places of detectors see sky outside it, such as "
+        f"area: {outside.sum()} of {outside.size} detector positions see sky outside it, for example "
         f"{first['channel'][0]} {first['detector'][0]} at ra {ra[outside][0]:.3f}, dec {dec[outside][0]:.3f}; "
-        f"this would do: [area] {_sufficient_area(ra, dec, radius)}"
+        f"this area is large enough: [area] {_sufficient_area(ra, dec, radius)}"
     )
 
 
 def _is_covered(area: Area, ra: Float, dec: Float, radius: Float) -> Bool:
-    """[n] Whether all order-8 cells in which sources of these circles may lie belong to the area."""
+    """Return for each circle, shape (n), True if the area has all generation cells that may contain its sources."""
     area_cells = set(area.cells())
-    # Well inside there is nothing to count; of a box the distance to its edge is no lower bound.
+    # Cells need not be counted well inside the area. For a box, the depth is no lower limit of the distance to the
+    # edge.
     covered = area.depth(ra, dec) > radius + FARTHEST_MOVED if area.box is None else np.zeros(len(ra), bool)
     for i in np.flatnonzero(~covered):
         place = {"ra": ra[i], "dec": dec[i], "radius": radius[i]}
@@ -140,21 +159,21 @@ def _is_covered(area: Area, ra: Float, dec: Float, radius: Float) -> Bool:
 
 
 def _sufficient_area(ra: Float, dec: Float, radius: Float) -> str:
-    """A circle that holds all circles; several where they lie far from one another."""
+    """Return an area that contains all circles, as TOML: one circle, or several if the circles are far apart."""
     link, groups = _LINK, _groups(ra, dec, _LINK)
     while len(groups) > _MAX_PATCHES:
         link *= 2.0
         groups = _groups(ra, dec, link)
     circles = [_enclosing_circle(ra[group], dec[group], radius[group]) for group in groups]
     enclosing = _enclosing_circle(ra, dec, radius)
-    # Circles that overlap are worth no list of them.
+    # A list is pointless if its circles cover more sky than the single circle.
     if sum(size**2 for *_, size in circles) >= enclosing[2] ** 2:
         return "cone = {{ ra = {:g}, dec = {:g}, radius = {:g} }}".format(*enclosing)
     return f"patches = [{', '.join('[{:g}, {:g}, {:g}]'.format(*circle) for circle in circles)}]"
 
 
 def _groups(ra: Float, dec: Float, link: float) -> list[Int]:
-    """Places that lie within `link` deg of the first of each group."""
+    """Group positions that lie within `link` deg of the first position of each group."""
     remaining, groups = np.arange(len(ra)), []
     while len(remaining):
         in_group = sky.separation(ra[remaining], dec[remaining], ra[remaining[0]], dec[remaining[0]]) <= link
@@ -164,13 +183,16 @@ def _groups(ra: Float, dec: Float, link: float) -> list[Int]:
 
 
 def _enclosing_circle(ra: Float, dec: Float, radius: Float) -> tuple[float, float, float]:
-    """ra, dec, radius of a circle whose cells hold what is seen from within the circles; rounded to 0.001, 0.01 deg."""
+    """Return ra, dec and radius (deg) of a circle whose cells contain all sources of the circles.
+
+    The position is rounded to 0.001 deg, the radius up to 0.01 deg.
+    """
     x, y, z = pointing.basis(ra, dec)[2].mean(axis=1)
     lon = round(float(np.degrees(np.arctan2(y, x))) % 360.0, 3) % 360.0
     lat = round(float(np.degrees(np.arctan2(z, np.hypot(x, y)))), 3)
     reach = float((sky.separation(ra, dec, lon, lat) + radius).max()) + FARTHEST_MOVED
     circle_radius = min(np.ceil(100.0 * reach) / 100.0, 180.0)
-    # Covers hold cells that a circle only nearly touches.
+    # The cells of a circle may extend beyond it, so that the circle has to grow until its own cells include them.
     while circle_radius < 180.0 and not _is_covered(Area(ra=lon, dec=lat, radius=circle_radius), ra, dec, radius).all():
         circle_radius = min(round(circle_radius + 0.01, 2), 180.0)
     return lon, lat, float(circle_radius)

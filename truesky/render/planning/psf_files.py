@@ -1,7 +1,4 @@
-"""The user's PSF files are checked when exposures are planned.
-
-check       those of planned exposures
-"""
+"""Check the user's PSF files while exposures are planned."""
 
 from __future__ import annotations
 
@@ -22,11 +19,15 @@ def check(
     user_passbands: Mapping[str, Passband],
     request_psfs: Sequence[tuple[str, str]] = (),
 ) -> None:
-    """Refuse exposures whose detectors have no PSF that can be read.
-
-    exposures : of every kind there is, each with the mission that it is planned with
-    own       : passbands besides the embedded ones
-    given     : band and file of each PSF that the request draws an exposure's from
+    """Check that the PSF of each detector of the exposures can be read; `psf.from_file.read` raises the errors.
+    Parameters
+    ----------
+    exposures : iterable of (Exposure, MissionConfiguration)
+        Exposures of each kind, with the mission that each is planned with.
+    user_passbands : mapping of str to Passband
+        Passbands by name, in addition to the embedded ones.
+    request_psfs : sequence of (str, str)
+        Band and PSF file, for each file of the request.
     """
     checked: set[tuple[str, str, Path]] = set()
     for exposure, mission in exposures:

@@ -1,10 +1,8 @@
-"""The fields of the reference survey: a fixed lattice in ecliptic coordinates, and when the Sun lets each be seen.
+"""Place the fields of the reference survey on a fixed ecliptic lattice, and date them within the Sun constraints.
 
-wide      fields of the wide survey over an area, each with its date and position angle
-deep      fields of a deep survey: a raster in the tangent plane, turned with the Sun from visit to visit
-own       visits of a field of the user's
-
-Ref : Scaramella et al. 2022; Serrano et al. 2024, section 3.2
+References
+----------
+Scaramella et al. 2022; Serrano et al. 2024, section 3.2
 """
 
 from __future__ import annotations
@@ -25,15 +23,15 @@ from truesky.render.sky.diffuse_light import sun_longitude
 from truesky.render.sky.solar_aspect import next_allowed, position_angle
 from truesky.request.area import Area
 
-# Half the diagonal of the field of view, deg: fields whose centre is nearer to an area than this may see it.
+# Half the diagonal of the field of view, deg. A field may observe an area if its centre is nearer than this.
 _REACH = 0.52
-# The Sun's largest daily motion, deg; how many half-years are looked through for a free date.
+# Largest daily motion of the Sun, deg; number of half-years that are searched for a free date.
 _SUN_RATE, _MAX_SEASONS = 1.02, 40
 
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """One visit of a field: number in its survey, ICRS deg, MJD of its start."""
+    """One visit of a field: number in its survey, visit number, ICRS position and position angle (deg), start (MJD)."""
 
     number: int
     visit: int
@@ -47,14 +45,33 @@ class Field:
 
 
 def lattice(area: Area, mission: MissionConfiguration, count: int = 0) -> tuple[Int, Float, Float]:
-    """Numbers, ra, dec of the wide survey's fields that may see an area; of `count` > 0, those deepest inside.
+    """Return the fields of the wide survey that may observe an area.
 
-    The lattice does not depend on the area: rows of ecliptic latitude, equally spaced in longitude.
+    Parameters
+    ----------
+    area : Area
+        Area on the sky.
+    mission : MissionConfiguration
+        The mission database.
+    count : int
+        Number of fields, those deepest inside the area; 0 means all.
+
+    Returns
+    -------
+    number : int array, shape (n,)
+        Field numbers from 1.
+    ra, dec : float array, shape (n,)
+        ICRS positions in degrees.
+
+    Notes
+    -----
+    The lattice does not depend on the area. It consists of rows of constant ecliptic latitude, equally spaced in
+    longitude.
     """
     step_x, step_y = (mission.value(f"survey.step_{axis}", "deg") for axis in "xy")
     rows = int(np.ceil(180.0 / step_y))
     latitude = -90.0 + 180.0 * (np.arange(rows) + 0.5) / rows
-    # A row must hold together at its longer edge.
+    # The fields of a row must be contiguous at its longer edge.
     widest = np.cos(np.radians(np.maximum(np.abs(latitude) - 90.0 / rows, 0.0)))
     counts = np.ceil(360.0 * widest / step_x).astype(np.int64)
     number = np.arange(counts.sum())
@@ -63,7 +80,7 @@ def lattice(area: Area, mission: MissionConfiguration, count: int = 0) -> tuple[
     ra, dec = equatorial(360.0 * (column + 0.5) / counts[row], latitude[row])
     depth = area.depth(ra, dec)
     if area.patches and count:
-        # The same share of each patch, whatever its size.
+        # Depth is relative to the radius of each patch, so that patches of all sizes are treated equally.
         depth = np.max(
             [1.0 - sky.separation(ra, dec, x, y) / max(radius, 1e-9) for x, y, radius in area.patches], axis=0
         )
@@ -72,11 +89,25 @@ def lattice(area: Area, mission: MissionConfiguration, count: int = 0) -> tuple[
 
 
 def wide(area: Area, mission: MissionConfiguration, start: float, count: int = 0, visits: int = 1) -> list[Field]:
-    """Fields of the wide survey over an area, in the order they are observed.
+    """Return the fields of the wide survey over an area, in the order in which they are observed.
 
-    start : MJD before which nothing is observed
-    area  : of the request;  mission : the mission database
-    count : fields, those deepest in the area, 0 = all that see it;  visits : of each field
+    Parameters
+    ----------
+    area : Area
+        Area of the request.
+    mission : MissionConfiguration
+        The mission database.
+    start : float
+        Earliest MJD.
+    count : int
+        Number of fields, those deepest in the area; 0 means all fields that may observe it.
+    visits : int
+        Number of visits of each field.
+
+    Returns
+    -------
+    list of Field
+        Visits in order of time.
     """
     number, ra, dec = lattice(area, mission, count)
     lon, lat = ecliptic(ra, dec)
@@ -91,10 +122,10 @@ def wide(area: Area, mission: MissionConfiguration, start: float, count: int = 0
 def _dates(
     lon: Float, lat: Float, start: float, mission: MissionConfiguration, visits: int
 ) -> Iterator[tuple[int, int, float]]:
-    """(field, visit, MJD): each visit in a season of its own, whoever's season ends first goes first."""
+    """Yield (field index, visit index, MJD): one visit per season; the season that ends first has priority."""
     days_before, days_after = _windows(lat, mission)
     slot = mission.value("svm.field_time", "d")
-    # A field is at right angles to the Sun twice a year; seasons are counted from the first that is not over.
+    # A field is 90 deg from the Sun twice a year. Seasons are counted from the first one that has not ended.
     waiting: list[tuple[float, float, int, int, int]] = []
     for i in range(len(lon)):
         season = _season(float(lon[i]), start, 0)
@@ -117,7 +148,7 @@ def _dates(
             now += slot
         if not done or visit + 1 < visits:
             if season_number >= _MAX_SEASONS:
-                raise BadInput(f"{len(lon)} fields of {visits} visits do not fit into {_MAX_SEASONS // 2} years")
+                raise BadInput(f"{len(lon)} fields with {visits} visits do not fit into {_MAX_SEASONS // 2} years")
             middle = _season(float(lon[i]), start, season_number + 1)
             entry = (
                 middle - float(days_before[i]),
@@ -130,10 +161,10 @@ def _dates(
 
 
 def _windows(lat: Float, mission: MissionConfiguration) -> tuple[Float, Float]:
-    """Days before and after the right angle to the Sun within which a field may be seen."""
+    """Return the days before and after quadrature on which a field at ecliptic latitude `lat` (deg) is observable."""
     lowest, highest = (mission.value(f"svm.solar_aspect_{end}", "deg") for end in ("min", "max"))
     beta = np.radians(np.abs(lat))
-    # cos(aspect) = cos(beta) cos(longitude from the Sun); the smaller of the two sides serves both seasons.
+    # cos(aspect) = cos(beta) cos(longitude from the Sun). The smaller of the two sides is used for both seasons.
     aspect = [
         np.degrees(np.arcsin(np.minimum(abs(np.cos(np.radians(limit))) / np.maximum(np.cos(beta), 1e-9), 1.0)))
         for limit in (lowest, highest)
@@ -141,12 +172,13 @@ def _windows(lat: Float, mission: MissionConfiguration) -> tuple[Float, Float]:
     roll = mission.value("survey.roll_tolerance", "deg") / np.maximum(np.sin(beta), 1e-6)
     days = np.minimum(np.minimum(*aspect), roll) / _SUN_RATE
     slot = mission.value("svm.field_time", "d")
-    # Near the pole a field's turn is faster than its slot: it is then seen at the right angle itself.
+    # Near the pole, the allowed position angle changes faster than a slot. The field is then observed at quadrature
+    # itself.
     return np.maximum(days, slot), np.maximum(days, 2 * slot)
 
 
 def _season(lon: float, start: float, number: int) -> float:
-    """MJD of the number-th time after `start` at which the Sun is 90 deg from an ecliptic longitude."""
+    """Return the MJD of passage `number` (from 0) of the Sun, after `start`, at 90 deg from the ecliptic longitude."""
     half_turns = 0.5 * 365.2422 * number
     remaining_angle = (lon - 90.0 - sun_longitude(start)) % 180.0
     date = start + remaining_angle / 360.0 * 365.2422 + half_turns
@@ -160,11 +192,24 @@ def _season(lon: float, start: float, number: int) -> float:
 
 
 def deep(area: Area, mission: MissionConfiguration, start: float, visits: int, count: int = 0) -> list[Field]:
-    """Visits of a deep field, in the order they are observed: a raster about the area's centre, turned at each visit.
+    """Return the visits of a deep field: a raster about the area's centre, rotated at each visit to follow the Sun.
+    Parameters
+    ----------
+    area : Area
+        Area of the field.
+    mission : MissionConfiguration
+        The mission database.
+    start : float
+        Earliest MJD.
+    visits : int
+        Number of visits.
+    count : int
+        Number of raster fields, those deepest in the area; 0 means all that may observe it.
 
-    count : fields of the raster, those deepest in the area, 0 = all that may see it
-    area  : of the request;  mission : the mission database
-    start : MJD before which nothing is observed;  visits : of the field
+    Returns
+    -------
+    list of Field
+        Visits in order of time.
     """
     ra0, dec0, _ = area.bounding_circle()
     lon, lat = (float(x) for x in ecliptic(ra0, dec0))
@@ -187,10 +232,10 @@ def _visit_dates(lon: float, lat: float, start: float, visits: int, mission: Mis
     sun = np.array([sun_longitude(float(day)) for day in days])
     cosine = np.cos(np.radians(lat)) * np.cos(np.radians(lon - sun))
     aspect = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-    # Two degrees from the limits: the fields of a raster lie around its centre.
+    # A margin of two degrees is kept because the raster fields lie around the centre.
     open_days = days[(aspect >= lowest + 2.0) & (aspect <= highest - 2.0)]
     if open_days.size < visits:
-        raise BadInput(f"a deep field at ecliptic latitude {lat:.1f} is seen on {open_days.size} days, not {visits}")
+        raise BadInput(f"a deep field at ecliptic latitude {lat:.1f} is visible on {open_days.size} days, not {visits}")
     chosen = open_days[(np.arange(visits) * open_days.size) // visits]
     return [float(day) for day in chosen]
 
@@ -208,16 +253,31 @@ def _raster(
     return [(float(ra[i]), float(dec[i])) for i in inside]
 
 
-# ------------------------------------------------------------------------------------------------ a field of one's own
+# ------------------------------------------------------------------------------------------------ user fields
 
 
 def user_field_visits(
     place: tuple[float, float], mission: MissionConfiguration, start: float, visits: int, angle: float | None = None
 ) -> list[Field]:
-    """Visits of a field, one after another, each at the first date that the Sun allows.
+    """Return successive visits of a field, each at the first date that the Sun allows.
 
-    place   : ra, dec deg;  mission : the mission database;  start : MJD, the earliest
-    visits  : how many;  angle : position angle, deg, None = as the Sun asks at each visit
+    Parameters
+    ----------
+    place : tuple of float
+        ICRS ra and dec in degrees.
+    mission : MissionConfiguration
+        The mission database.
+    start : float
+        Earliest MJD.
+    visits : int
+        Number of visits.
+    angle : float, optional
+        Position angle in degrees; None means the angle that the Sun requires at each visit.
+
+    Returns
+    -------
+    list of Field
+        Visits in order of time.
     """
     fields: list[Field] = []
     now = start

@@ -1,7 +1,4 @@
-"""Sources to be expected in a direction, from published counts.
-
-Densities  how many sources there are where: of the lake's catalogues, or of the mission's count models
-"""
+"""Predict the density of galaxies and stars at a position, from published catalogues or from count models."""
 
 from __future__ import annotations
 
@@ -22,10 +19,20 @@ from truesky.request.schema import Universe
 
 
 class Densities:
-    """Sources a square degree at a place.
+    """Density of galaxies and stars on the sky.
 
-    catalogues : published galaxies and stars, both or none
-    Error: without them a limit in another band than I_E is taken for one in I_E
+    Parameters
+    ----------
+    mission : MissionConfiguration
+        The mission database; provides the count models `survey.galaxy_counts` and `survey.star_counts`.
+    universe : Universe
+        Section of the request; its magnitude limits select the counts.
+    catalogues : sequence of Version, optional
+        Published versions of `galaxies` and `stars`: both, or none.
+
+    Notes
+    -----
+    Without catalogues, the galaxy limit is taken as a limit in I_E even if it applies to another band.
     """
 
     def __init__(self, mission: MissionConfiguration, universe: Universe, catalogues: Sequence[Version] = ()) -> None:
@@ -33,14 +40,17 @@ class Densities:
         counts = np.array(mission.numbers("survey.galaxy_counts"))
         self.galaxies = float(np.exp(np.interp(universe.galaxy_limit, counts[:, 0], np.log(counts[:, 1]))))
         stars = np.array(mission.numbers("survey.star_counts"))
-        # Columns: l, b, then counts to H = 8, 10, .., 26.
+        # Columns: Galactic l and b, then counts to H = 8, 10, .., 26.
         limits = 8.0 + 2.0 * np.arange(stars.shape[1] - 2)
         at_limit = [np.interp(universe.star_limit, limits, np.log(row)) for row in stars[:, 2:]]
         self.lon, self.lat = np.unique(stars[:, 0]), np.unique(stars[:, 1])
         self.stars = np.reshape(at_limit, (self.lon.size, self.lat.size))
 
     def at(self, ra: Float, dec: Float) -> Float:
-        """[2, n] deg-2, galaxies and stars; of the published catalogues where they reach, else of the count models."""
+        """Return the densities of galaxies and stars, shape (2, n), per square degree, at ICRS positions in degrees.
+
+        Densities come from the published catalogues where they cover the position, otherwise from the count models.
+        """
         model = self._model(ra, dec)
         if not self.published:
             return model
@@ -49,6 +59,7 @@ class Densities:
         return np.where(np.isfinite(published).all(axis=0), published, model)
 
     def _model(self, ra: Float, dec: Float) -> Float:
+        """Return densities from the count models: star counts are interpolated bilinearly in (l, b)."""
         lon, lat = sky.galactic(ra, dec)
         wrapped_lon = (lon + 180.0) % 360.0 - 180.0
         i = np.clip(np.searchsorted(self.lon, wrapped_lon, "right") - 1, 0, self.lon.size - 2)
@@ -61,13 +72,13 @@ class Densities:
 
 
 def _catalogue_density(version: Version) -> dict[int, float]:
-    """Density of each generation cell that a catalogue covers: that of its file."""
+    """Return the density (deg-2) in each generation cell that a catalogue covers: the mean of the file of the cell."""
     density: dict[int, float] = {}
     for part in version.manifest["parts"]:
         cells = part["facts"]["generation_cells"]
         order, file = layout.cell_of_file(part["name"])
         if any(cell >> 2 * (GENERATION_ORDER - order) != file for cell in cells):
-            raise BadInput(f"table {version.table}: part {part['name']} names cells of another file")
+            raise BadInput(f"table {version.table}: part {part['name']} lists cells that are not in its file")
         mean = version.partition_rows(part["name"]) / (len(cells) * sky.cell_area(GENERATION_ORDER))
         density.update(dict.fromkeys(cells, mean))
     return density

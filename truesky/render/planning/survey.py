@@ -1,7 +1,7 @@
-"""From a request to its exposures, in the order they are taken.
+"""Lay out the exposures of a request in the order in which they are taken.
 
-stretches    pointings and observation blocks -> stretches of exposures, once for each variant of an exploration
-exposures    all of them
+Pointings and observation blocks of the request become blocks of exposures. If the request explores parameters, each
+variant has its own set of blocks.
 """
 
 from __future__ import annotations
@@ -41,25 +41,36 @@ from truesky.request.observations import Observation, Pointing
 from truesky.request.schema import Request
 
 _DEEP = ("edf_north", "edf_south", "edf_fornax")
-# Image types that are laid out as calibrations are.
+# Image types that `calibration_frames` lays out.
 _CALIBRATION = tuple(code for code in pointing_tables.IMAGE_TYPES if code not in ("science", "deep"))
-# Days: more than the rounding of a date, less than any exposure.
+# Tolerance of dates in days: larger than their rounding, shorter than any exposure.
 _DATE_TOLERANCE = 1e-7
 
 
 ExposureWithMission = tuple[Exposure, MissionConfiguration]
-# Whether it is of NISP; parameters of an exposure's own.
+# True for NISP, and the parameters that an exposure overrides.
 _SettingsKey = tuple[bool, tuple[tuple[str, float, str], ...]]
 
 
 @dataclass(frozen=True, slots=True)
 class ExposureBlock:
-    """Exposures that follow one another: laid out one by one, or fields whose exposures are laid out when wanted.
+    """Consecutive exposures: laid out one by one, or Euclid fields whose exposures are laid out on demand.
 
-    taken          : of pointings, calibrations, ground surveys; of fields those of the first, which stand for all
-    fields, lay    : of Euclid's surveys, in the order of time, and what lays the exposures of one out
-    times          : each is taken, one after another
-    settled        : what exposures are planned with: whether of NISP, and parameters of their own
+    Attributes
+    ----------
+    request : Request
+        The request.
+    base_exposures : tuple of Exposure
+        All exposures without their repetitions. Of Euclid fields, only those of the first field, which represents the
+        others.
+    repetitions : int
+        Number of times that each exposure is taken in succession.
+    resolved_settings : mapping
+        Settings and mission by (True for NISP, parameters of the exposure).
+    fields : tuple of Field
+        Fields of a Euclid survey, in order of time.
+    make_exposures : callable, optional
+        Lays out the exposures of a field; None if the block has no fields.
     """
 
     request: Request
@@ -71,14 +82,14 @@ class ExposureBlock:
 
     @property
     def unit(self) -> int:
-        """Exposures that are laid out at once: of a field."""
+        """Number of exposures that are laid out together: all of a field, or the repetitions of an exposure."""
         return self.repetitions * (len(self.base_exposures) if self.make_exposures is not None else 1)
 
     def __len__(self) -> int:
         return self.unit * (len(self.fields) if self.make_exposures is not None else len(self.base_exposures))
 
     def exposures(self, first: int = 0, last: int | None = None) -> Iterator[ExposureWithMission]:
-        """The exposures from the first to before the last, each with the mission that it is planned with."""
+        """Generate the exposures with indices `first` to `last - 1`, each with its mission; `last` None means all."""
         last = len(self) if last is None else last
         start, end = first // self.unit, -(-last // self.unit)
         base = (
@@ -91,7 +102,7 @@ class ExposureBlock:
         return islice(repeated, first - start * self.unit, last - start * self.unit)
 
     def settings_for(self, exposure: Exposure) -> _ResolvedSettings:
-        """What one of the exposures is planned with."""
+        """Return the settings and the mission of one of the exposures."""
         return self.resolved_settings[exposure.camera == "nisp", exposure.parameters]
 
     def _with_mission(self, exposure: Exposure) -> ExposureWithMission:
@@ -102,22 +113,35 @@ class ExposureBlock:
         return replace(exposure, settings=resolved.settings, psf=psf), resolved.mission
 
     def requested_detectors(self, first: int, last: int) -> list[tuple[str, ...]]:
-        """The detectors that are wanted of each of these exposures, () = all."""
+        """Return the requested detectors of exposures with indices `first` to `last - 1`; () means all detectors."""
         detector_names = [exposure.detectors for exposure in self.base_exposures]
         return [detector_names[i // self.repetitions % len(detector_names)] for i in range(first, last)]
 
     def date_range(self, first: int, last: int) -> tuple[float, float]:
-        """MJD before which none of these exposures begins, and after which none does."""
+        """Return the earliest and latest MJD at which the exposures with indices `first` to `last - 1` may begin."""
         start, end = first // self.unit, -(-last // self.unit)
         if self.make_exposures is None:
             start_mjds = [exposure.mjd for exposure in self.base_exposures[start:end]]
             return min(start_mjds), max(start_mjds)
         duration = max(exposure.mjd for exposure in self.base_exposures) - self.fields[0].mjd
-        # A little more than the rounding of a date.
+        # The tolerance is larger than the rounding of a date.
         return self.fields[start].mjd - _DATE_TOLERANCE, self.fields[end - 1].mjd + duration + _DATE_TOLERANCE
 
     def ranges_between_dates(self, start_mjd: float, end_mjd: float, end_number: int) -> list[tuple[int, int]]:
-        """Runs of exposures, up to before a number, among which are all that begin between two dates."""
+        """Find the exposures that begin between two dates.
+
+        Parameters
+        ----------
+        start_mjd, end_mjd : float
+            First and last MJD.
+        end_number : int
+            Only exposures with smaller indices are considered.
+
+        Returns
+        -------
+        list of (int, int)
+            Ranges of indices, the last excluded. Ranges of fields may contain some other exposures.
+        """
         if self.make_exposures is None:
             indices = [i for i, exposure in enumerate(self.base_exposures) if start_mjd <= exposure.mjd <= end_mjd]
             ranges = [(i * self.unit, (i + 1) * self.unit) for i in indices]
@@ -130,7 +154,10 @@ class ExposureBlock:
 
 
 def exposure_blocks(request: Request, mission: MissionConfiguration) -> list[ExposureBlock]:
-    """The exposures of a request, in the order they are numbered; BadInput names the pointing or observation."""
+    """Return the blocks of exposures of a request, in the order in which they are numbered.
+
+    Raises BadInput, with the name of the pointing or observation, if an exposure cannot be taken.
+    """
     blocks: list[ExposureBlock] = []
     for values in request.variants():
         blocks += _blocks_of_variant(request, values, _ResolvedSettings.from_values(values, request, mission))
@@ -142,12 +169,12 @@ def exposure_blocks(request: Request, mission: MissionConfiguration) -> list[Exp
 
 
 def exposures(request: Request, mission: MissionConfiguration) -> list[ExposureWithMission]:
-    """Every exposure of a request with the mission it is planned with; BadInput names the pointing or observation."""
+    """Return all exposures of a request, each with its mission. Raises BadInput like `exposure_blocks`."""
     return [planned_exposure for block in exposure_blocks(request, mission) for planned_exposure in block.exposures()]
 
 
 def _user_psf(exposure: Exposure, request: Request) -> str | None:
-    """The request's file for the band; of several one is drawn for each exposure."""
+    """Return the request's PSF file for the band of an exposure, drawn at random if there are several."""
     files = [file for band, file in request.psfs if band == exposure.band]
     if len(files) < 2:
         return files[0] if files else None
@@ -157,7 +184,7 @@ def _user_psf(exposure: Exposure, request: Request) -> str | None:
 
 @dataclass(frozen=True, slots=True)
 class _ResolvedSettings:
-    """Values of a variant as the column `settings` has them, and the mission with them."""
+    """Value of the column `settings` for a variant, and the mission with these settings."""
 
     settings: str | None
     mission: MissionConfiguration
@@ -173,16 +200,16 @@ class _ResolvedSettings:
 def _blocks_of_variant(
     request: Request, values: Mapping[str, Any], shared: _ResolvedSettings
 ) -> Iterator[ExposureBlock]:
-    """What is taken, with what it is planned with: of NISP, with its block's own ramp.
+    """Generate the blocks of one variant; NISP exposures also have the ramp of their observation.
 
-    Of both channels of NISP, of which one has this ramp.
+    If an observation uses both NISP channels, `channel_of_macc` selects the channel that its ramp applies to.
     """
     for i, pointing in enumerate(request.pointings):
         pointed_exposure = _exposure_of_pointing(pointing, f"pointing[{i}]", request, shared.mission)
         yield ExposureBlock(
             request, (pointed_exposure,), pointing.realisations, {(True, ()): shared, (False, ()): shared}
         )
-    # Of blocks that have no date NISP's begin when those before have ended, and what they left is gone.
+    # NISP exposures of blocks without a date begin when the earlier blocks have ended and their persistence has faded.
     nisp_free_mjd = shared.mission.value("svm.launch", "d")
     for i, block in enumerate(request.observations):
         where = f"observation[{i}]"
@@ -194,7 +221,7 @@ def _blocks_of_variant(
         )
         scheduled = _schedule_block(block, request, block_settings.mission, where, nisp_free_mjd)
         if not scheduled.base_exposures:
-            raise BadInput(f"{where} asks for no exposure")
+            raise BadInput(f"{where} has no exposures")
         settings_by_key: dict[_SettingsKey, _ResolvedSettings] = {(True, ()): block_settings, (False, ()): shared}
         for exposure in scheduled.base_exposures:
             of_nisp = exposure.camera == "nisp"
@@ -249,10 +276,23 @@ def _exposure_of_pointing(pointing: Pointing, where: str, request: Request, miss
 
 
 def check_detectors(camera: str, names: tuple[str, ...], mission: MissionConfiguration, where: str) -> None:
-    """Refuse detectors that a camera does not have.
+    """Raise BadInput if a camera does not have one of the detectors.
 
-    camera, names : of the camera, and of the detectors
-    mission       : the mission database;  where : named in the refusal
+    Parameters
+    ----------
+    camera : str
+        Name of the camera.
+    names : tuple of str
+        Names of the detectors.
+    mission : MissionConfiguration
+        The mission database.
+    where : str
+        Key of the request, for the message.
+
+    Raises
+    ------
+    BadInput
+        If the camera has no detector of one of these names.
     """
     available = {detector.name for detector in detectors.detectors(camera, mission)} if names else set()
     unknown = [name for name in names if name not in available]
@@ -261,27 +301,27 @@ def check_detectors(camera: str, names: tuple[str, ...], mission: MissionConfigu
 
 
 def _is_undated(block: Observation) -> bool:
-    """Whether the survey says when a block is observed."""
+    """Return True if the survey determines when a block is observed."""
     return block.mjd is None and not block.pointings
 
 
 @dataclass(frozen=True, slots=True)
 class _ScheduledBlock:
-    """What a block asks for, as a Stretch has it."""
+    """Exposures of an observation, with the same attributes as `ExposureBlock`."""
 
     base_exposures: tuple[Exposure, ...]
     fields: tuple[reference_survey.Field, ...] = ()
     make_exposures: Callable[[reference_survey.Field], Iterable[Exposure]] | None = None
 
     def last_exposures(self) -> Iterable[Exposure]:
-        """Exposures among which is the last that each channel takes."""
+        """Return exposures that include the last one of each channel."""
         return self.base_exposures if self.make_exposures is None else self.make_exposures(self.fields[-1])
 
 
 def _schedule_block(
     block: Observation, request: Request, mission: MissionConfiguration, where: str, nisp_free_mjd: float
 ) -> _ScheduledBlock:
-    """free : MJD from which NISP may observe."""
+    """Lay out an observation and check its exposures; NISP is available from `nisp_free_mjd`."""
     area = block.area or request.area
     start = mission.value("svm.launch", "d") if block.mjd is None else block.mjd
     if _is_undated(block) and {"NISP-P", "NISP-S"} & {*block.channels}:
@@ -289,7 +329,7 @@ def _schedule_block(
     try:
         check_macc(block, mission)
         scheduled = _schedule_exposures(block, area, request.seed, start, mission)
-        # Of fields the first of either grism stands for all.
+        # For fields, the first visit with each grism represents all visits.
         first_visits = (
             ()
             if scheduled.make_exposures is None
@@ -307,7 +347,7 @@ def _schedule_block(
 
 
 def _first_visits(fields: Sequence[reference_survey.Field]) -> Iterator[reference_survey.Field]:
-    """The first visit of an odd and the first of an even number."""
+    """Yield the first even and the first odd visit: the blue grism is used in even visits."""
     for odd in (0, 1):
         yield from islice((field for field in fields if field.visit % 2 == odd), 1)
 
@@ -349,7 +389,7 @@ def _fields(
 
 
 def deep_area(prefix: str, mission: MissionConfiguration) -> Area:
-    """A deep field: its corners where they are published, else a circle of its area."""
+    """Return the area of a deep field: its published corners, or a circle with its published area."""
     if f"{prefix}.corners" in mission:
         return Area(vertices=tuple((float(ra), float(dec)) for ra, dec in mission.numbers(f"{prefix}.corners")))
     cap = np.arccos(1.0 - mission.value(f"{prefix}.area", "rad2") / (2.0 * np.pi))

@@ -1,10 +1,6 @@
-"""From exposures to render tasks: one a detector, with its cells and what it will cost.
+"""Make the table `tasks`: one row per detector of each exposure, with its sky cells and its cost.
 
-table      rows of the table `tasks`, longest first
-remembering  the same, with what earlier exposures left in the detectors;  remembered  how long before those are
-in_order   those of several parts
-part       those of them that are to be rendered now
-Narrowed   the same of tasks that come a part after the other
+A render job selects its tasks from this table.
 """
 
 from __future__ import annotations
@@ -41,7 +37,7 @@ from truesky.request.accuracy import SURVEY, Accuracy
 from truesky.request.schema import Request
 
 _DETECTOR_FILES = OutputFiles()
-# Pointings whose detectors' cells are found at once: within so many deg of the first, and as many.
+# Cells are searched for groups of up to _MAX_GROUP pointings within _GROUP_RADIUS deg of the first.
 _GROUP_RADIUS, _MAX_GROUP = 0.5, 16
 _POLYGON = "POLYGON ICRS " + " ".join(["%.7f"] * 8)
 
@@ -58,12 +54,31 @@ def table(
     forced: Mapping[str, bool] | None = None,
     files: OutputFiles = _DETECTOR_FILES,
 ) -> pa.Table:
-    """Rows of the table `tasks`.
+    """Make the rows of the table `tasks`, longest first.
 
-    exposures  : rows of the table `exposures`;  detectors : of each exposure, () = all of its camera
-    truth      : truth maps that are wanted;  files : what is written besides
-    forced     : effects that the request forces on or off
-    mission    : the mission database;  densities : of galaxies and stars;  accuracy : of the request
+    Parameters
+    ----------
+    exposures : pyarrow.Table
+        Rows of the table `exposures`.
+    detectors : sequence of tuple of str
+        Requested detectors of each exposure; () means all detectors of its camera.
+    mission : MissionConfiguration
+        The mission database.
+    densities : Densities
+        Densities of galaxies and stars.
+    truth : sequence of str
+        Requested truth maps.
+    accuracy : Accuracy
+        Accuracy of the request.
+    forced : mapping of str to bool, optional
+        Effects that the request forces on or off.
+    files : OutputFiles
+        Other files that are written.
+
+    Returns
+    -------
+    pyarrow.Table
+        One row per detector.
     """
     pairs = set(zip(exposures["camera"].to_pylist(), exposures["channel"].to_pylist(), strict=True))
     cameras = {pair: _Camera(*pair, mission) for pair in pairs}
@@ -85,7 +100,7 @@ def table(
 
 
 def _cameras_with_persistence(exposures: pa.Table) -> set[str]:
-    """Cameras of the exposures whose detectors have something left of those before."""
+    """Return the cameras of the exposures whose detectors have persistence of earlier exposures."""
     camera_channels = zip(exposures["camera"].to_pylist(), exposures["channel"].to_pylist(), strict=True)
     return {
         camera
@@ -95,7 +110,7 @@ def _cameras_with_persistence(exposures: pa.Table) -> set[str]:
 
 
 def persistence_days(exposures: pa.Table, mission: MissionConfiguration) -> float:
-    """How long before one of the exposures another leaves something in its detectors, days; 0 where none does."""
+    """Return the number of days for which persistence of an exposure is simulated, or 0 without persistence."""
     return max(
         (persistence.window_days(camera, mission) for camera in _cameras_with_persistence(exposures)), default=0.0
     )
@@ -104,22 +119,38 @@ def persistence_days(exposures: pa.Table, mission: MissionConfiguration) -> floa
 def add_persistence_cost(
     rows: pa.Table, exposures: pa.Table, candidates: Iterable[Exposure], mission: MissionConfiguration
 ) -> pa.Table:
-    """Rows of `tasks` with the time that it takes to draw anew what earlier exposures left in the detectors.
+    """Add the time needed to draw earlier exposures again for their persistence.
 
-    exposures : rows of the table `exposures`, of the tasks;  mission : the mission database
-    plan      : exposures that begin while these do, or before them as long as some are remembered
-    Error     : as if each exposure were of all detectors
+    Parameters
+    ----------
+    rows : pyarrow.Table
+        Rows of the table `tasks`.
+    exposures : pyarrow.Table
+        Rows of the table `exposures` of these tasks.
+    candidates : iterable of Exposure
+        Exposures that begin during these or up to `persistence_days` earlier.
+    mission : MissionConfiguration
+        The mission database.
+
+    Returns
+    -------
+    pyarrow.Table
+        The rows with the new column `seconds`, longest first.
+
+    Notes
+    -----
+    Each earlier exposure is counted as if it used all detectors.
     """
     if not (cameras := _cameras_with_persistence(exposures)):
         return rows
     redraw_cost: dict[str, dict[float, float]] = {camera: {} for camera in cameras}
     for candidate in candidates:
         channel = registry.CHANNELS[candidate.channel]
-        # Of those that begin at once one has been.
+        # Exposures that begin at the same time count once.
         if candidate.camera in cameras and channel.sees_sky(candidate.image_type):
             redraw_cost[candidate.camera][candidate.mjd] = channel.cost.redraw_s
     extra_seconds = {}
-    # Whole microseconds: sums of a part are those of the whole.
+    # With integer microseconds, the sums of a chunk and of the whole plan agree.
     for camera, cost_by_mjd in redraw_cost.items():
         days = persistence.window_days(camera, mission)
         start_mjds = np.array(sorted(cost_by_mjd))
@@ -135,12 +166,12 @@ def add_persistence_cost(
 
 
 def _pointing_key(row: ExposureRow, cameras: Mapping[tuple[str, str], _Camera]) -> tuple[Any, ...]:
-    """What exposures have in common whose detectors look at the same places."""
+    """Return the key of an exposure; the detectors of exposures with the same key observe the same positions."""
     return row.camera, cameras[row.camera, row.channel].margin, row.ra, row.dec, row.position_angle
 
 
 def sort_by_cost(tasks: pa.Table) -> pa.Table:
-    """Rows of several parts, longest first; of one part they are already."""
+    """Sort rows from several partitions, longest first; a single partition is already sorted."""
     return tasks.combine_chunks() if tasks["exposure_id"].num_chunks < 2 else _longest_first(tasks)
 
 
@@ -150,9 +181,9 @@ def _longest_first(tasks: pa.Table) -> pa.Table:
 
 
 def select_requested(tasks: pa.Table, request: Request) -> list[dict[str, Any]]:
-    """Rows of the request's detectors, the first so many of them by exposure and name where it has a limit.
+    """Return the rows of the requested detectors, limited to the first `request.limit` by exposure and detector name.
 
-    Errors : BadInput where no exposure has a detector of that name, or the limit leaves none
+    Raises BadInput if no exposure has a detector that the request names, or if the limit is below 1.
     """
     selection = TaskSelection(request)
     rows: list[dict[str, Any]] = selection.select(tasks).to_pylist()
@@ -161,29 +192,29 @@ def select_requested(tasks: pa.Table, request: Request) -> list[dict[str, Any]]:
 
 
 class TaskSelection:
-    """What is wanted of tasks that come a part after the other, in the order of their exposures.
+    """Select the requested tasks from partitions that arrive in the order of their exposures.
 
-    Errors : BadInput where the request's limit leaves none
+    Raises BadInput if the limit of the request is below 1.
     """
 
     def __init__(self, request: Request) -> None:
         if request.limit is not None and request.limit < 1:
-            raise BadInput(f"limit = {request.limit} leaves no detector")
+            raise BadInput(f"limit = {request.limit} must be at least 1")
         self.request, self._remaining = request, request.limit
         self._planned_names: set[str] = set()
 
     @property
     def is_restricted(self) -> bool:
-        """Whether anything may be left out."""
+        """True if the request may exclude tasks."""
         return bool(self.request.detectors) or self.request.limit is not None
 
     @property
     def is_done(self) -> bool:
-        """Whether nothing is wanted of what comes yet."""
+        """True if no remaining task is requested."""
         return self._remaining == 0 and {*self.request.detectors} <= self._planned_names
 
     def select(self, tasks: pa.Table) -> pa.Table:
-        """Rows of the request's detectors, as long as there are not too many."""
+        """Return the rows of the requested detectors, up to the limit of the request."""
         if self.request.detectors:
             self._planned_names |= {*tasks["detector"].unique().to_pylist()}
             tasks = tasks.filter(pc.is_in(tasks["detector"], pa.array(self.request.detectors, pa.string())))
@@ -194,7 +225,7 @@ class TaskSelection:
         return tasks
 
     def refuse_unknown(self) -> None:
-        """BadInput where none of the tasks had a detector that the request names."""
+        """Raise BadInput if no task had one of the requested detectors."""
         if unknown := sorted({*self.request.detectors} - self._planned_names):
             plan_name = f"the plan of request {self.request.name}"
             examples = ", ".join(sorted(self._planned_names)[:4])
@@ -203,7 +234,7 @@ class TaskSelection:
 
 @dataclass(frozen=True, slots=True)
 class _Places:
-    """Where the detectors of a camera look that points somewhere; first : number of the first of them in a plan."""
+    """Positions of the detectors of a camera at one pointing; `first` is the index of the first one in the plan."""
 
     first: int
     names: list[str]
@@ -217,7 +248,7 @@ class _Places:
 
 @dataclass(frozen=True, slots=True)
 class _ExposureTasks:
-    """The detectors of an exposure that are wanted: where they look, by number, and what each will cost."""
+    """Requested detectors of an exposure: number of each position and cost of each detector."""
 
     exposure_id: int
     channel: str
@@ -250,7 +281,7 @@ class _ExposureTasks:
 
 
 def _rows(planned: Sequence[_ExposureTasks], places: Sequence[_Places]) -> pa.Table:
-    """The detectors of all exposures, longest first."""
+    """Return the rows of all exposures, longest first."""
     if not planned:
         return TASKS.empty()
     numbers = np.array([item.exposure_id for item in planned], np.int64)
@@ -285,20 +316,23 @@ def _rows(planned: Sequence[_ExposureTasks], places: Sequence[_Places]) -> pa.Ta
 
 
 def _ranks(names: npt.NDArray[np.object_]) -> Int:
-    """Of each name its place in the alphabet."""
+    """Return the alphabetical rank of each name."""
     return np.unique(names.astype(str), return_inverse=True)[1]
 
 
 def _cell_lists(cells: Sequence[Int]) -> tuple[pa.ListArray, int]:
-    """Lists of cells, and the number of one more that is empty."""
+    """Return lists of cells followed by an empty list, and the index of the empty list."""
     ends = np.cumsum([0, *map(len, cells), 0], dtype=np.int32)
     return pa.ListArray.from_arrays(ends, np.concatenate([*cells, np.empty(0, np.int64)])), len(cells)
 
 
 class _Camera:
-    """Detectors of a camera, and what of them does not depend on the pointing.
+    """Detectors of a camera and their properties that do not depend on the pointing.
 
-    margin : arcsec beyond a detector, as far as the channel reads all sources
+    Attributes
+    ----------
+    margin : float
+        Distance in arcsec beyond a detector up to which the channel reads all sources.
     """
 
     def __init__(self, camera: str, channel: str, mission: MissionConfiguration) -> None:
@@ -307,7 +341,7 @@ class _Camera:
         self.index = {name: i for i, name in enumerate(self.names)}
         self.x, self.y = pointing.outline(self.detectors)
         self.margin = registry.CHANNELS[channel].margin(self.detectors[0].section, mission)
-        # On the tangent plane, where a detector that the optics distort is larger than it is.
+        # On the tangent plane, distortion can make a detector larger than its nominal size.
         corner = np.hypot(self.x[:, 1:] - self.x[:, :1], self.y[:, 1:] - self.y[:, :1]).max(axis=1)
         reach = np.array([max(d.half_diagonal, c) for d, c in zip(self.detectors, corner, strict=True)])
         self.radius = (reach + self.margin) / 3600.0
@@ -319,10 +353,10 @@ class _Camera:
 
 
 def _places(camera_by_pointing: Mapping[tuple[Any, ...], _Camera], densities: Densities) -> Iterator[_Places]:
-    """Where the detectors look of each camera that points somewhere."""
+    """Yield the positions of the detectors for each pointing."""
     first, waiting = 0, list(camera_by_pointing.items())
     while waiting:
-        # The dithers of a field: their detectors share most of their cells.
+        # The detectors of neighbouring dithers share most of their cells.
         _, _, ra, dec, _ = waiting[0][0]
         close_flags = (float(sky.separation(ra, dec, *place[2:4])) < _GROUP_RADIUS for place, _ in waiting[:_MAX_GROUP])
         n_close = sum(1 for _ in takewhile(bool, close_flags))
@@ -351,9 +385,9 @@ def _places(camera_by_pointing: Mapping[tuple[Any, ...], _Camera], densities: De
 
 
 def _cost_of_exposure(row: ExposureRow, variant: Variant, truth: Sequence[str], files: OutputFiles) -> CostModel:
-    """Of the detectors of an exposure.
+    """Return the cost model of the detectors of an exposure.
 
-    Somewhere on a detector there is light enough for every effect; of a frame without a sky the scene is known.
+    An exposure of the sky is assumed to have enough light for every effect. The scene of other frames is known.
     """
     channel, kind = row.channel, row.image_type
     sees_sky = kind in registry.CHANNELS[channel].sky_types

@@ -1,9 +1,4 @@
-"""The values that a request explores: one variant of the mission, accuracy and effects each.
-
-variant      what a variant changes: mission, accuracy, effects
-missions     settings of exposures -> the mission of each
-own          parameters of an exposure of its own, as a part of its settings
-"""
+"""Apply explored parameters: each variant of a request has its own mission, accuracy and effects."""
 
 from __future__ import annotations
 
@@ -22,11 +17,28 @@ from truesky.request.schema import Request
 def variant(
     settings: str | None, mission: MissionConfiguration, accuracy: Accuracy, forced: Mapping[str, bool]
 ) -> Variant:
-    """The mission, accuracy and forced effects of an exposure, from its `settings`."""
+    """Return the mission, accuracy and forced effects of an exposure.
+
+    Parameters
+    ----------
+    settings : str or None
+        Column `settings` of the exposure: a JSON table of the changed parameters, or None.
+    mission : MissionConfiguration
+        Mission database of the request.
+    accuracy : Accuracy
+        Accuracy of the request.
+    forced : mapping of str to bool
+        Effects that the request forces on or off.
+
+    Returns
+    -------
+    Variant
+        Mission, accuracy and effects with the settings applied.
+    """
     values: dict[str, Any] = json.loads(settings) if settings else {}
     parameters = {k: (v[0], v[1]) for k, v in values.items() if k != "accuracy" and not k.startswith("effects.")}
     explored = {k: v for k, v in parameters.items() if not k.startswith(EXPOSURE_ONLY_PREFIX)}
-    # What an exposure is taken with goes before what is explored.
+    # Parameters set for a single exposure take precedence over explored parameters.
     overrides = {
         **explored,
         **{
@@ -42,15 +54,15 @@ def variant(
 
 
 def mission_lookup(mission: MissionConfiguration) -> Callable[[str | None], MissionConfiguration]:
-    """An exposure's settings -> its mission; mission : of the request."""
+    """Return a cached function from the settings of an exposure to its mission, based on the mission of the request."""
     return cache(lambda settings: variant(settings, mission, SURVEY, {}).mission)
 
 
 def exposure_overrides(parameters: Mapping[str, tuple[float, str]]) -> dict[str, tuple[float, str]]:
-    """Parameters that an exposure is taken with instead of the request's, as its settings have them."""
+    """Return parameters that an exposure overrides, with the keys that the column `settings` uses for them."""
     return {f"{EXPOSURE_ONLY_PREFIX}{key}": value for key, value in parameters.items()}
 
 
 def forced_effects(request: Request) -> dict[str, bool]:
-    """Effect -> on or off, of a request."""
+    """Return the effects that a request forces on (True) or off (False)."""
     return {**dict.fromkeys(request.effects.on, True), **dict.fromkeys(request.effects.off, False)}

@@ -1,1 +1,1 @@
-"""A rendered detector as files, and back."""
+"""Write a rendered detector to files, and read it back."""

@@ -1,7 +1,4 @@
-"""What headers of calibration frames tell of how they were taken.
-
-cards   of an image type: the parameters that tell its exposures from one another
-"""
+"""Make the header cards that distinguish calibration exposures of the same image type."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ _INJECTED = ("charge_injection", "trap_pumping")
 
 
 def cards(exposure: ExposureRow, scene: Scene) -> tuple[Card, ...]:
-    """Cards of an exposure besides its lamp and its target, () where its type has no parameters; scene : of it."""
+    """Return the cards of the parameters of an image type, or () if it has none; without lamp and target name."""
     kind = exposure.image_type
     type_cards: tuple[Card, ...] = ()
     if kind in _INJECTED:

@@ -1,8 +1,8 @@
-"""What a survey's own pipeline looks for in a raw header of its camera, in that camera's words.
+"""Make the header cards that the pipeline of a ground survey expects in raw images of its camera.
 
-cards   of a rendered detector
-
-Ref : NOAO Data Handbook 2.2 (DECam); LSE-400 (LSSTCam: header service)
+References
+----------
+NOAO Data Handbook 2.2 (DECam); LSE-400 (LSSTCam: header service)
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from truesky.render.camera.amplifiers import Amplifier
 from truesky.render.exposure.rendered_detector import RenderedDetector
 from truesky.render.products import headers
 
-# What an observer of DECam calls an image type.
+# DECam's names of the image types.
 _OBSTYPES = {"science": "object", "deep": "object", "flat": "dome flat", "dark": "dark", "bias": "zero"}
 
 
 def cards(rendered: RenderedDetector) -> tuple[Card, ...]:
-    """Cards of a science file, beside those that all cameras have; none of a camera whose words nobody has told."""
+    """Return the additional cards of a science file, or () for cameras without camera-specific keywords."""
     make_cards = _CARDS_BY_CAMERA.get(rendered.exposure.camera)
     return make_cards(rendered) if make_cards else ()
 
 
 def _decam(rendered: RenderedDetector) -> tuple[Card, ...]:
-    """Of a CCD, and of its amplifiers A and B, whose letters end the keywords."""
+    """Return the cards of a CCD and of its amplifiers A and B, whose letters end the keywords."""
     exposure = rendered.exposure
     return (
         ("OBSTYPE", _OBSTYPES[exposure.image_type], "type of observation"),
@@ -43,7 +43,7 @@ def _decam(rendered: RenderedDetector) -> tuple[Card, ...]:
 
 
 def _lsstcam(rendered: RenderedDetector) -> tuple[Card, ...]:
-    """Of a sensor; the rotator turns the camera against the sky, the angle that a table of pointings gives."""
+    """Return the cards of a sensor; ROTPA is the position angle of the exposure, since the rotator turns the camera."""
     exposure, (raft, sensor) = rendered.exposure, rendered.detector.name.split("_")
     seconds = exposure.exposure_time_s
     return (
@@ -68,7 +68,7 @@ def _lsstcam(rendered: RenderedDetector) -> tuple[Card, ...]:
 
 
 def _file_name(rendered: RenderedDetector) -> tuple[Card, ...]:
-    """As imSim 0.6 calls such files; of one array with pre- and overscan it has none."""
+    """Return the file name that imSim 0.6 uses; it has no name for one array with prescan and overscan."""
     exposure, arrays = rendered.exposure, rendered.readout.extensions
     kind = "eimage" if arrays[0].unit == "electron" else "amp" if len(arrays) > 1 else ""
     if not kind:
@@ -85,13 +85,13 @@ _CARDS_BY_CAMERA: Mapping[str, Callable[[RenderedDetector], tuple[Card, ...]]] =
 
 
 def _detector_number(rendered: RenderedDetector) -> int:
-    """Place of a detector in its camera's layout, from 0."""
+    """Return the index of a detector in the layout of its camera, from 0."""
     all_detectors = detectors.detectors(rendered.exposure.camera, rendered.scene.mission)
     return [detector.name for detector in all_detectors].index(rendered.detector.name)
 
 
 def _amplifier_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
-    """Sections and numbers of each amplifier of one array, those that the readout's own cards do not have."""
+    """Return sections and values of each amplifier in one array, as far as the readout has no cards for them."""
     layout, arrays = rendered.scene.layout, rendered.readout.extensions
     if layout is None or len(arrays) > 1 or arrays[0].unit != "adu":
         return ()
@@ -123,7 +123,7 @@ _NUMBERS = (
 
 
 def _readout_section(amplifier: Amplifier) -> str:
-    """Its pixels in the order in which they are read."""
+    """Return the section of an amplifier's pixels in the order in which they are read."""
     (x, y), pixels = (axis + 1 for axis in (amplifier.pixels.x, amplifier.pixels.y)), amplifier.pixels
     columns, rows = (x, x + pixels.nx - 1), (y, y + pixels.ny - 1)
     columns = columns[::-1] if amplifier.read_right else columns

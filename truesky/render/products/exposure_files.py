@@ -1,8 +1,4 @@
-"""Science images of an exposure's detectors -> one file of the exposure: a header, and every array of each detector.
-
-plan   the plan of the table `exposure_files`: one part an exposure
-work   makes one of them, from files of a version of the table `products`
-"""
+"""Join the science images of an exposure's detectors in one file: a primary header and the arrays of each detector."""
 
 from __future__ import annotations
 
@@ -27,7 +23,7 @@ from truesky.render.planning.exposure_chunks import rows as planned_rows
 from truesky.render.products import head_files, headers
 from truesky.render.products.keys import part_name
 
-# Keywords of detectors' headers that are the exposure's.
+# Keywords of detector headers that apply to the whole exposure.
 _EXPOSURE_KEYWORDS = (
     "TELESCOP", "INSTRUME", "OBJECT", "RA", "DEC", "AIRMASS", "DETSIZE", "CHANNEL", "FILTER", "IMAGETYP", "LAMP",
     "TARGET", "EXPOSURE", "EXPTIME", "DATE-OBS", "MJD-OBS", "TIMESYS", "SEEING", "ZEROPNT", "SEED", "NOISSEED",
@@ -40,9 +36,19 @@ _EXPOSURE_KEYWORDS = (
 
 
 def plan(products: Plan, detector_counts: Mapping[int, int]) -> Plan:
-    """One part an exposure, of the detectors that the products' plan has of it, by name.
+    """Plan the table `exposure_files`: one task per exposure, with the detectors that `products` contains.
 
-    products : the plan of the detectors' files;  planned : how many are planned of each exposure
+    Parameters
+    ----------
+    products : Plan
+        Plan of the table `products`.
+    detector_counts : mapping of int to int
+        Number of planned detectors by exposure number.
+
+    Returns
+    -------
+    Plan
+        The plan.
     """
     keys_by_exposure: dict[int, dict[str, str]] = defaultdict(dict)
     for part in products.tasks:
@@ -57,10 +63,10 @@ def plan(products: Plan, detector_counts: Mapping[int, int]) -> Plan:
 
 
 def make_exposure_file(lake: Path, facts: Json) -> Output:
-    """One exposure's file, from those of its detectors."""
+    """Make the file of one exposure from the files of its detectors. Raises Damaged if `products` lacks one of them."""
     products = read.version(lake, "products", facts["products"])
     in_exposure = pc.field("exposure_id") == facts["exposure_id"]
-    # Of 100,000 files only its own are opened.
+    # Open only the partitions of this exposure; there may be 100,000.
     part_names = {part_name({"exposure_id": facts["exposure_id"], "detector": name}) for name in facts["detectors"]}
     partitions = [name for name in products.partitions if name in part_names]
     science_rows = products.rows(partitions=partitions, where=in_exposure & (pc.field("content") == "science"))
@@ -92,7 +98,7 @@ def make_exposure_file(lake: Path, facts: Json) -> Output:
 
 
 def _sort_detectors(lake: Path, products: read.Version, camera: str, names: Sequence[str]) -> list[str]:
-    """Detectors as the camera's layout numbers them."""
+    """Return the detectors in the order of the camera's layout."""
     mission = read_back(read.version(lake, "mission", products.manifest["facts"]["inputs"]["mission"]))
     return [detector.name for detector in detectors.detectors(camera, mission) if detector.name in names]
 

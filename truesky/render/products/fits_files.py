@@ -1,9 +1,7 @@
-"""A rendered detector -> FITS files and rows of the table `products`.
+"""Write a rendered detector to FITS files, and make its rows of the table `products`.
 
-A detector whose readout is one array is a file of one image; of several, each is an extension, behind a header that
-holds for all of them.
-
-products   rows, and a writer for each file; beside each image its place on the sky, for tools (head_files.py)
+A detector that is read out as one array is a file with one image. Several arrays are extensions of a file, whose
+primary header applies to each of them.
 """
 
 from __future__ import annotations
@@ -27,11 +25,25 @@ Writer = Callable[[Path], None]
 def products(
     rendered: RenderedDetector, truth: Sequence[str] = ("noise_free",), rice: bool = False, wcs: str | None = None
 ) -> tuple[pa.Table, dict[str, Writer]]:
-    """Rows of `products` and, by path, what writes each file; beside each image its head file.
+    """Return the rows of `products` and a writer for each file. Each image also has a head file (`head_files`).
 
-    rendered : a detector
-    truth : truth maps that are wanted beside the science image;  rice : images of whole numbers are packed
-    wcs   : how headers tell the optics' distortion, one of tpv.CONVENTIONS; None = as the instrument's pipeline
+    Parameters
+    ----------
+    rendered : RenderedDetector
+        The detector.
+    truth : sequence of str
+        Requested truth maps.
+    rice : bool
+        True to compress integer images with Rice.
+    wcs : str, optional
+        Convention for the optical distortion, one of `tpv.CONVENTIONS`; None means that of the instrument's pipeline.
+
+    Returns
+    -------
+    rows : pyarrow.Table
+        Rows of the table `products`, one per image.
+    writers : dict of str to callable
+        Function that writes each file, by path relative to the version.
     """
     images = {"science": _science_images(rendered)}
     for content in truth:
@@ -79,12 +91,12 @@ def _write(units: Sequence[Image], rice: bool, path: Path) -> None:
 
 
 def _science_images(rendered: RenderedDetector) -> list[Image]:
-    """The image; or a header that holds for all, and an extension for each array of the readout."""
+    """Return the image, or a primary header and an extension for each array of the readout."""
     readout = rendered.readout
     cards = (*headers.science_cards(rendered), *camera_cards.cards(rendered), *readout.cards)
     if [extension.name for extension in readout.extensions] == [""]:
         (array,) = readout.extensions
-        # Its own stand for the detector's: its WCS counts what lies around the pixels, too.
+        # Cards of the array replace those of the detector: its WCS also counts the pixels of prescan and overscan.
         array_cards = (*array.cards, *headers.section_cards(rendered, array))
         array_keywords = {keyword for keyword, *_ in array_cards}
         return [Image(array.data, (*(card for card in cards if card[0] not in array_keywords), *array_cards))]

@@ -1,14 +1,11 @@
-"""Where a file's images are on the sky, as text for source-extractor, SCAMP and SWarp, which pass over SIP.
+"""Write the WCS of a file's images as text for SExtractor, SCAMP and SWarp, which do not support SIP.
 
-They read it where it lies beside the image under the image's name, with the ending .head: cards of each image in turn,
-in place of those in the file.
+These tools read a file with the name of the image and the ending .head next to it. It contains the cards of each image
+in turn, which replace those in the image. The distortion is written as TPV.
 
-beside     path of an image -> path of its text
-text       images of a file -> cards, the distortion as TPV
-write      the same into a file
-first      such a file -> cards of its first image
-
-Ref : SCAMP and SWarp, "external headers"
+References
+----------
+SCAMP and SWarp, "external headers"
 """
 
 from __future__ import annotations
@@ -20,27 +17,27 @@ from lake_schema.fits import images
 from lake_schema.fits.images import Card, Image
 from truesky.render.camera import tpv
 
-# Of a header, what stands in such a text: the WCS.
+# WCS keywords that a head file contains.
 _WCS_KEYWORDS = ("RADESYS", "CTYPE", "CUNIT", "CRVAL", "CRPIX", "CD", "PV")
 
 
 def head_path(path: str) -> str:
-    """Path of an image -> of what lies beside it."""
+    """Return the path of the head file of an image."""
     return str(PurePosixPath(path).with_suffix(".head"))
 
 
 def text(units: Sequence[Image]) -> str:
-    """Cards of each image of two axes, in the order of the file; "" where none has a place on the sky."""
+    """Return the cards of each two-dimensional image in file order, or "" if no image has a WCS."""
     return "".join(_image_text(unit) for unit in units if unit.data is not None and unit.data.ndim == 2)
 
 
 def write(texts: Iterable[str], path: Path) -> None:
-    """Texts of one file's images, one after the other."""
+    """Write the texts of a file's images one after another."""
     path.write_text("".join(texts), encoding="ascii")
 
 
 def first_cards(path: Path) -> tuple[Card, ...]:
-    """Of an image's file, what the text beside it says of its first image; nothing where there is none."""
+    """Return the WCS cards of the first image from the head file of an image, or () if there is no head file."""
     head_file = path.with_suffix(".head")
     if not head_file.is_file():
         return ()
@@ -50,7 +47,7 @@ def first_cards(path: Path) -> tuple[Card, ...]:
 
 
 def is_wcs(keyword: str) -> bool:
-    """Whether a card is of the WCS."""
+    """Return True if a keyword belongs to the WCS."""
     return keyword.rstrip("0123456789_") in _WCS_KEYWORDS
 
 
@@ -58,5 +55,5 @@ def _image_text(unit: Image) -> str:
     cards = [card for card in tpv.from_sip(unit.cards) if is_wcs(card[0])]
     if not cards:
         return ""
-    # J2000 is as near to ICRS as these tools tell.
+    # These tools have no ICRS; J2000 is the closest system.
     return f"{images.cards_to_text([('EQUINOX', 2000.0, 'mean equinox'), *cards])}END\n"

@@ -1,4 +1,4 @@
-"""FITS headers of the science image and of the truth maps."""
+"""Make the FITS headers of the science image and of the truth maps."""
 
 from __future__ import annotations
 
@@ -24,30 +24,30 @@ from truesky.render.exposure.rendered_detector import RenderedDetector, random_i
 from truesky.render.products import calibration_cards
 from truesky.request import accuracy
 
-# Of an amplifier's offset, a column's stripe and a reading: what next to no pixel is below.
+# Sigma of the noise below which almost no saturated pixel is read.
 _NOISE_SIGMAS = 5.0
-# Effects that bring dark current.
+# Effects that add dark current.
 _DARK_EFFECTS = {"dark_current", "dark_map"}
-# What tools look for in the header of each array: few follow INHERIT to the header that holds for all.
+# Keywords repeated in the header of each array. Few tools apply INHERIT to read them from the primary header.
 _REPEATED_KEYWORDS = ("EXPTIME", "FILTER", "DATE-OBS", "MJD-OBS", "TIMESYS")
-# Likewise of arrays of what amplifiers read.
+# Keywords also repeated in arrays that are read by amplifiers.
 _READOUT_KEYWORDS = ("GAIN", "RDNOISE", "RDNDRAWN", "SATURATE")
 PER_ARRAY_KEYWORDS = (*_REPEATED_KEYWORDS, *_READOUT_KEYWORDS, "BUNIT")
-# Of electrons that have not been read.
+# Cards of images in electrons, which are not read out.
 _UNREAD_CARDS: tuple[Card, ...] = (
     ("GAIN", 1.0, "[electron/electron] of the pixels"),
     ("RDNOISE", 0.0, "[electron] rms read noise"),
     ("RDNDRAWN", 0.0, "[electron] the same, as it was drawn"),
     ("BIAS", 0.0, "[electron] bias level"),
 )
-# Of each number of an accuracy: the end of its keywords, and what it is of.
+# For each component of an accuracy: end of its keywords, and its description.
 _ERRORS = {
     "flux": ("FLUX", "fraction of a source's flux"),
     "shape": ("SHAPE", "reduced-shear component"),
     "position": ("POS", "[pix]"),
     "background": ("BACK", "fraction of a sky pixel's noise"),
 }
-# Of the readout and of amplifiers, what holds for groups; they have no border of reference pixels.
+# Keywords of the readout and of amplifiers that apply to groups, which have no border of reference pixels.
 _RAMP_KEYWORDS = {"READMODE", "NG", "NR", "ND", "FRTIME", "ELAPTIME"}
 _GROUP_KEYWORDS = {"GAIN", "FRNOISE", "BIAS"}
 _GROUP_AXIS: tuple[Card, ...] = (
@@ -61,7 +61,7 @@ _MJD_ZERO = datetime(1858, 11, 17)
 
 
 def science_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
-    """Header of the science image: what an astronomer needs to calibrate it, and what made it."""
+    """Return the header of the science image: calibration data, and the settings of the simulation."""
     scene = rendered.scene
     applied = {decision.name for decision in rendered.decisions if decision.applied}
     return (
@@ -80,7 +80,10 @@ def science_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
 
 
 def _shared_amplifier_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
-    """What amplifiers share; of those that are in one array, their mean, and the lowest of levels."""
+    """Return the values shared by all amplifiers.
+
+    If one array has several amplifiers, these are the mean values and the lowest saturation level.
+    """
     if rendered.readout.unit == "electron":
         return (
             *_UNREAD_CARDS,
@@ -95,14 +98,26 @@ def _shared_amplifier_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
 
 
 def unit_cards(unit: str | None) -> tuple[Card, ...]:
-    """Of arrays of one unit; none where they have none, or each its own."""
+    """Return the card of the pixel unit, or no card if the arrays have no unit or different units."""
     return (("BUNIT", unit, "unit of the pixels"),) if unit else ()
 
 
 def array_cards(rendered: RenderedDetector, extension: Extension, common: Sequence[Card]) -> tuple[Card, ...]:
-    """Header of one of several arrays.
+    """Return the header of one of several arrays.
 
-    common : cards of the header that holds for all of them
+    Parameters
+    ----------
+    rendered : RenderedDetector
+        The detector.
+    extension : Extension
+        The array.
+    common : sequence of Card
+        Cards of the primary header.
+
+    Returns
+    -------
+    tuple of Card
+        The cards.
     """
     repeated = (*_REPEATED_KEYWORDS, *(_READOUT_KEYWORDS if extension.unit == "adu" else ()))
     return (
@@ -116,7 +131,7 @@ def array_cards(rendered: RenderedDetector, extension: Extension, common: Sequen
 
 
 def section_cards(rendered: RenderedDetector, extension: Extension) -> tuple[Card, ...]:
-    """Which of an array's pixels are the detector's, and where these are on the detector and in the mosaic."""
+    """Return the sections with the detector's pixels: in the array, on the detector, and in the mosaic."""
     array_sections = extension.sections
     if array_sections is None:
         return ()
@@ -132,9 +147,9 @@ def section_cards(rendered: RenderedDetector, extension: Extension) -> tuple[Car
 
 
 def amplifier_cards(rendered: RenderedDetector, number: int | None) -> tuple[Card, ...]:
-    """Of an amplifier's array: what differs from one amplifier to the other, and is not in the common header.
+    """Return the values of an amplifier that are not in the primary header because they differ between amplifiers.
 
-    number : of the amplifier; None = the array is of several
+    `number` is the amplifier of the array. It is None for an array of several amplifiers, which has no such cards.
     """
     if number is None:
         return ()
@@ -147,7 +162,10 @@ def _mosaic_size(rendered: RenderedDetector) -> str:
 
 
 def amplifier_values(rendered: RenderedDetector) -> tuple[tuple[str, float | Float, str], ...]:
-    """What differs from one amplifier to the other: keyword, value or values [q], comment."""
+    """Return (keyword, value, comment) of the values that may differ between amplifiers.
+
+    A value is a single number, or an array of shape (n_amplifiers,).
+    """
     scene = rendered.scene
     saturated = "[adu] lowest level of a saturated pixel"
     if scene.ramp:
@@ -161,9 +179,9 @@ def amplifier_values(rendered: RenderedDetector) -> tuple[tuple[str, float | Flo
 
 
 def _read_noise(rendered: RenderedDetector) -> tuple[tuple[str, float | Float, str], ...]:
-    """Of the image; and of one read, where the image is the signal of a ramp: the detector's, and what was drawn of it.
+    """Return the read noise of the image, and the read noise that was drawn.
 
-    An image whose other noise hides it is drawn without.
+    An image of a ramp's signal also has the noise of a single read. Read noise is not drawn if other noise hides it.
     """
     scene = rendered.scene
     applied = {decision.name for decision in rendered.decisions if decision.applied}
@@ -200,13 +218,16 @@ _TRUTH_UNITS = {
 
 
 def truth_cards(rendered: RenderedDetector, content: str) -> tuple[Card, ...]:
-    """Header of a truth map: what one thing adds to the exposure, before the rest of the detector."""
+    """Return the header of a truth map: the contribution of one component before the remaining detector effects."""
     map_cards = _group_cards(rendered) if content == "ramp" else _common_cards(rendered)
     return (*map_cards, ("BUNIT", *_TRUTH_UNITS[content]))
 
 
 def _group_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
-    """Of the groups as they are read: common cards with an axis of groups, how they were read, and electrons of ADU."""
+    """Return the header of the groups of a ramp.
+
+    It has the common cards with a third axis for the groups, the readout mode, and the values of the amplifiers.
+    """
     out: list[Card] = []
     for card in _common_cards(rendered):
         out += _GROUP_AXIS if card[0] == "WCSAXES" else [card]
@@ -268,9 +289,9 @@ def _lamp_cards(lamp: int, rendered: RenderedDetector) -> tuple[Card, ...]:
 
 
 def _accuracy_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
-    """ACC*: errors that were allowed; ERR*: as measured, of drawing and of charge transfer where that is applied.
+    """Return the allowed errors (ACC*) and the expected errors (ERR*) of drawing and, if applied, of charge transfer.
 
-    Independent causes: the root of the sum of their squares.
+    The causes are independent, so that errors are added in quadrature.
     """
     causes = [] if rendered.psf is None else [asdict(accuracy.expected_errors(rendered.accuracy))]
     applied = [decision.name for decision in rendered.decisions if decision.applied]
@@ -284,23 +305,26 @@ def _accuracy_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
 
 
 def _object_name(exposure: ExposureRow) -> str:
-    """A calibration source, or the survey and its field."""
+    """Return the calibration target, or the survey and its field."""
     if exposure.target:
         return exposure.target
     return exposure.survey if exposure.field is None else f"{exposure.survey} {exposure.field}"
 
 
 def _iso_date(mjd: float) -> str:
-    """ISO 8601, milliseconds."""
+    """Return the date as ISO 8601 with milliseconds."""
     return (_MJD_ZERO + timedelta(days=mjd)).isoformat(timespec="milliseconds")
 
 
 def _saturation(rendered: RenderedDetector) -> float | Float:
-    """What a full pixel reads at least: of its charge, what transfer and amplifier leave, below all noise; or [q]."""
+    """Return the lowest level (ADU) of a saturated pixel, one value or one per amplifier.
+
+    Transfer losses and nonlinearity reduce the charge of a full pixel; `_NOISE_SIGMAS` sigma of noise are subtracted.
+    """
     full = rendered.scene.value("full_well", "electron")
     scene = replace(rendered.scene, peak_electrons=full)
     applied = {decision.name for decision in rendered.decisions if decision.applied}
-    # The first of a column, or a row, finds all traps empty.
+    # The first pixel of a column or row finds all traps empty and loses most.
     losses = (
         charge_transfer.PARALLEL, charge_transfer.SERIAL, charge_transfer.PARALLEL_LOSS, charge_transfer.SERIAL_LOSS
     )  # fmt: skip
@@ -325,7 +349,10 @@ def _saturation(rendered: RenderedDetector) -> float | Float:
 
 
 def _effect_cards(rendered: RenderedDetector) -> tuple[Card, ...]:
-    """EFFECTn = name, whether it was applied, and its contribution over what would be noticed (margin); EFKEYn seed."""
+    """Return EFFECTn and EFKEYn: name, state and margin of each effect, and the key of its random numbers.
+
+    The margin is the contribution of the effect over the smallest noticeable one.
+    """
     cards: list[Card] = []
     exposed = rendered.exposure
     where = f"exposure {exposed.exposure_id}"

@@ -1,4 +1,4 @@
-"""The key of each product: a digest of everything that shapes it; and the name of its part."""
+"""Compute the key of each product, a digest of all its inputs, and the name of its partition."""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -37,12 +37,27 @@ def product_keys(
     mission: MissionConfiguration,
     previous_tasks: Mapping[tuple[int, str], Sequence[Json]] = MappingProxyType({}),
 ) -> list[str]:
-    """Of each task, the digest of everything that shapes its products, and of nothing else.
+    """Return the key of each task's products, a digest of all inputs that determine them and of nothing else.
 
-    facts : of the plan: request, mission, code
-    exposures : rows of the table;  tasks : rows of the table, to be rendered
-    inputs    : versions of the tables that are read, by name;  mission : the mission database
-    earlier   : tasks that left something in a detector, by exposure and detector
+    Parameters
+    ----------
+    facts : dict
+        Facts of the plan: request, mission, code, and checksums of user files.
+    exposures : pyarrow.Table
+        Rows of the table `exposures`.
+    tasks : sequence of dict
+        Rows of the table `tasks` to render.
+    inputs : mapping of str to Version
+        Versions of the input tables, by table name.
+    mission : MissionConfiguration
+        The mission database.
+    previous_tasks : mapping
+        Tasks that leave persistence in a detector, by (exposure number, detector name).
+
+    Returns
+    -------
+    list of str
+        One key per task.
     """
     flux_facts = inputs["galaxy_fluxes"].manifest["facts"]
     shared = {key: facts[key] for key in ("request", "mission", "code")}
@@ -61,7 +76,7 @@ def product_keys(
         reaches = {name: reach for name in files}
         reaches["galaxies"] = max(FARTHEST, reach)
         channel = registry.CHANNELS[exposure.channel]
-        # Of the sources stars alone have spikes; a grism puts any source's light far from it.
+        # Only stars have diffraction spikes; a grism displaces the light of every source.
         if channel.diffraction_edges is not None or channel.dispersion is not None:
             reaches["stars"] = max(FARTHEST, reach)
         if channel.dispersion is not None:
@@ -96,21 +111,21 @@ def product_keys(
 
 
 def part_name(task: Json) -> str:
-    """Name of the part of `products` that a task makes."""
+    """Return the name of the partition of `products` that a task makes."""
     return f"{task['exposure_id']:06d}-{task['detector'].lower()}.parquet"
 
 
 def exposures_of(names: Iterable[str]) -> set[int]:
-    """Numbers of the exposures of some parts of `products`."""
+    """Return the exposure numbers of partitions of `products`."""
     return {int(number) for name in names if (number := name.partition("-")[0]).isdigit()}
 
 
 def _neighbour_files(
     stars: tuple[float, Mapping[int, list[tuple[str, ...]]]], mission: MissionConfiguration
 ) -> NeighbourFiles:
-    """What an image shows of the stars of detectors that are read with its own: the files that hold them.
+    """Return a function that lists the star files which affect an image through crosstalk between detectors.
 
-    stars : how far they move, deg, and their files by cell;  mission : the mission database
+    `stars` contains the largest deflection of a star (deg) and the checksums of the files by cell.
     """
     boards: dict[tuple[str, str, str | None], tuple[Detector, ...]] = {}
 
@@ -132,7 +147,7 @@ def _neighbour_files(
 
 
 def _user_file_checksums(facts: Json, exposure: ExposureRow, detector: str) -> Json:
-    """sha256 of the user's files that an image is made of."""
+    """Return the sha256 of the user's files that an image is made from."""
     files = {}
     if psf := exposure.psf:
         files["psf"] = facts["psf"][str(from_file.path_for_detector(psf, detector))]
@@ -144,7 +159,7 @@ def _user_file_checksums(facts: Json, exposure: ExposureRow, detector: str) -> J
 
 
 def psf_files(exposures: pa.Table, tasks: Sequence[Json]) -> dict[str, str]:
-    """sha256 of the PSFs that the tasks' exposures name, by file."""
+    """Return the sha256 of the PSF files that the tasks' exposures use, by path."""
     psf_by_exposure = dict(zip(exposures["exposure_id"].to_pylist(), exposures["psf"].to_pylist(), strict=True))
     pairs = {(psf_by_exposure[task["exposure_id"]], task["detector"]) for task in tasks}
     files = [from_file.path_for_detector(psf, detector) for psf, detector in pairs if psf]
@@ -152,7 +167,7 @@ def psf_files(exposures: pa.Table, tasks: Sequence[Json]) -> dict[str, str]:
 
 
 def ephemeris_files(file: Path, exposures: pa.Table) -> dict[str, str]:
-    """sha256 of the user's moving bodies, by file; refused before anything is rendered where they cannot be read."""
+    """Return the sha256 of the user's table of moving bodies, by path. Raises an error if the table is invalid."""
     sha256 = file_sha256(user_files.check_file(file, "table of bodies", "solar_system.bodies"))
     rows = map(ExposureRow.from_row, exposures.to_pylist())
     dates = [row.mjd for row in rows if registry.CHANNELS[row.channel].sees_bodies(row.image_type)]
@@ -161,14 +176,14 @@ def ephemeris_files(file: Path, exposures: pa.Table) -> dict[str, str]:
 
 
 def stamp_files(file: Path) -> dict[str, str]:
-    """sha256 of the user's library of galaxies, by file; refused before anything is rendered where it is none."""
+    """Return the sha256 of the user's library of galaxy images, by path. Raises an error if the library is invalid."""
     sha256 = file_sha256(user_files.check_file(file, galaxy_stamps.KIND, "structure.stamps.file"))
     galaxy_stamps.read(file, sha256)
     return {str(file): sha256}
 
 
 def _files_of_cells(*tables: read.Version) -> Mapping[int, list[tuple[str, ...]]]:
-    """Generation cell -> sha256 of the files that hold it, of each of the tables."""
+    """Return the sha256 of the files that contain each generation cell, one per table."""
     files_by_cell: dict[int, list[tuple[str, ...]]] = defaultdict(list)
     for part in tables[0].manifest["parts"]:
         checksums = tuple(table.partition_sha256(part["name"]) for table in tables)

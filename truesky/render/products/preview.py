@@ -1,8 +1,6 @@
-"""Pictures of rendered images: asinh stretch, the brightest sources labelled, scale bar, compass, close-ups.
+"""Draw preview pictures of rendered images: asinh stretch, labels of bright sources, scale bar, compass and close-ups.
 
-picture     one image -> a PNG
-previews    science images of a lake -> PNGs, without the cosmic rays whose truth the lake has
-shown       which of them, where they are many
+Cosmic rays are removed from the pictures if the lake has their truth maps.
 """
 
 from __future__ import annotations
@@ -25,26 +23,38 @@ from truesky.render.products import preview_labels, read_back
 from truesky.render.products.preview_labels import CLOSE_UP_ARCSEC, CLOSE_UP_SHAPE, CLOSE_UPS, LABELS, Label
 
 _INCHES, _DPI = (13.2, 9.6), 100
-# Largest side of the overview, pixels; close-ups are shown at full resolution.  Labels a kind.
+# Largest side of the overview in pixels. Close-ups have full resolution.
 _OVERVIEW = 1000
-# Room that a label takes, of the image's width and height.
+# Space for a label, as fractions of the width and height of the image.
 _LABEL_SIZE = (0.14, 0.035)
-# Pixels on each side that mend a cosmic ray.
+# Pixels on each side whose median replaces a cosmic ray.
 _MEND_RADIUS = 2
-# Pixels that tell sky and noise of a whole image.
+# Step between the pixels that are used to measure sky and noise of a whole image.
 _STRIDE = 8
-# Black this many sigma below the sky; the stretch turns from linear to logarithmic at _KNEE sigma; white at
-# _WHITE.
+# Sigma relative to the sky: black at _BLACK; linear up to _KNEE, logarithmic above; white at _WHITE.
 _BLACK, _KNEE, _WHITE = -1.5, 4.0, 400.0
 _INK, _PAPER, _GALAXY, _STAR = "#e8e6df", "#0b0d12", "#ffd27d", "#9fd3ff"
 _SCALE_BARS = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600)
 
 
 def previews(root: Path, out: Path, max_images: int | None = None, request: str | None = None) -> list[Path]:
-    """A PNG beside each other in `out` for the science images of a request, or of the lake; returns their paths.
+    """Draw a PNG file in `out` for each science image of a request.
 
-    root : of the lake;  most : so many of them, as `shown` chooses, None = all
-    request : its name, where the lake has several
+    Parameters
+    ----------
+    root : Path
+        Root of the lake.
+    out : Path
+        Folder of the PNG files.
+    max_images : int, optional
+        Number of images, chosen by `select_images`; None means all.
+    request : str, optional
+        Name of the request; required if the lake has several.
+
+    Returns
+    -------
+    list of Path
+        The PNG files.
     """
     version = read.version(root, "products", request=request)
     input_keys = version.manifest["facts"]["inputs"]
@@ -62,7 +72,7 @@ def previews(root: Path, out: Path, max_images: int | None = None, request: str 
 
 
 def select_images(rows: Sequence[dict[str, Any]], max_images: int | None) -> list[dict[str, Any]]:
-    """So many rows of `products`, in their order: one of every channel and band before a second one of any."""
+    """Select at most `max_images` rows of `products`, in order: each channel and band once before any is repeated."""
     counts: Counter[tuple[str, str]] = Counter()
     order = []
     for i, row in enumerate(rows):
@@ -77,14 +87,14 @@ def _detector_key(row: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def repair_cosmic_rays(image: Float, hit_pixels: Bool) -> Float:
-    """Pixels that cosmic rays hit take the median of those around them that none did."""
+    """Replace pixels hit by cosmic rays with the median of the neighbouring pixels that were not hit."""
     rows, columns = np.nonzero(hit_pixels)
     masked = np.where(hit_pixels, np.nan, image)
     step = np.arange(-_MEND_RADIUS, _MEND_RADIUS + 1)
     r = np.clip(rows[:, None, None] + step[:, None], 0, image.shape[0] - 1)
     c = np.clip(columns[:, None, None] + step, 0, image.shape[1] - 1)
     neighbours = np.sort(masked[r, c].reshape(len(rows), step.size**2), axis=1)
-    # Sorted, what is missing comes last.
+    # NaN values are last after sorting.
     count = np.isfinite(neighbours).sum(axis=1)
     median = neighbours[np.arange(len(rows)), np.maximum(count - 1, 0) // 2]
     out = image.copy()
@@ -98,10 +108,18 @@ def repair_cosmic_rays(image: Float, hit_pixels: Bool) -> Float:
 def picture(path: Path, image: Array, cards: Sequence[Card], names: Sequence[Label]) -> None:
     """Draw one image.
 
-    image : [ny, nx] electrons or ADU;  cards : its header;  names : sources, brightest first
-    path  : of the PNG
+    Parameters
+    ----------
+    path : Path
+        PNG file to write.
+    image : array, shape (ny, nx)
+        Pixels in electrons or ADU.
+    cards : sequence of Card
+        FITS header of the image.
+    names : sequence of Label
+        Sources to label, brightest first.
     """
-    # A canvas of its own: no window system, and no state shared with a caller's figures.
+    # A separate canvas needs no window system and shares no state with the figures of the caller.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -150,7 +168,7 @@ def _show_image(axes: Any, image: Float, block: int, shape: tuple[int, ...], ups
 
 
 def _frame(axes: Any, x: tuple[float, float], y: tuple[float, float], upside_down: bool) -> None:
-    """North up: a detector that is mounted upside down is shown turned by 180 deg."""
+    """Set the limits of the axes. A detector that is mounted upside down is rotated by 180 deg, so that north is up."""
     axes.set_xlim(x[::-1] if upside_down else x)
     axes.set_ylim(y[::-1] if upside_down else y)
     axes.set_anchor("W")
@@ -162,14 +180,14 @@ def _frame(axes: Any, x: tuple[float, float], y: tuple[float, float], upside_dow
 
 
 def _sky_and_noise(image: Array) -> tuple[float, float]:
-    """Sky and noise, from the median and the pixels below it."""
+    """Return sky level and noise, from the median and the pixels below it."""
     level = float(np.median(image))
     below = image[image < level] - level
     return level, float(np.sqrt(np.mean(below**2))) if below.size else 1.0
 
 
 def _stretch(image: Array, level: float, noise: float) -> Float:
-    """Electrons or ADU -> 0 .. 1 by asinh."""
+    """Scale electrons or ADU to 0 .. 1 with an asinh stretch."""
     signal = np.clip((image - level) / noise, _BLACK, _WHITE)
     lo, hi = np.arcsinh(_BLACK / _KNEE), np.arcsinh(_WHITE / _KNEE)
     return np.asarray((np.arcsinh(signal / _KNEE) - lo) / (hi - lo))
@@ -183,7 +201,7 @@ def _annotate(axes: Any, names: Sequence[Label], shape: tuple[int, ...], upside_
         if upside_down:
             across, up = 1 - across, 1 - up
         if up < 0.12 and not 0.25 < across < 0.85:
-            # Scale bar and compass stand there.
+            # The scale bar and the compass are here.
             continue
         colour = _GALAXY if label.kind == "galaxy" else _STAR
         circle = Circle(
@@ -203,14 +221,14 @@ def _annotate(axes: Any, names: Sequence[Label], shape: tuple[int, ...], upside_
 
 
 def _outline() -> list[Any]:
-    """A dark edge, so that text is legible on a bright star."""
+    """Return a dark outline that makes text legible on a bright star."""
     from matplotlib import patheffects
 
     return [patheffects.withStroke(linewidth=2.0, foreground=_PAPER)]
 
 
 def _scale_bar(axes: Any, pixel_scale: float, shape: tuple[int, ...], longest: float) -> None:
-    """In axes coordinates, lower left."""
+    """Draw a scale bar in the lower left corner, at most `longest` pixels long."""
     arcsec = max((bar for bar in _SCALE_BARS if bar <= longest * pixel_scale), default=_SCALE_BARS[0])
     width = arcsec / pixel_scale / shape[1]
     axes.plot([0.03, 0.03 + width], [0.035, 0.035], color=_INK, linewidth=2.2, transform=axes.transAxes)
@@ -220,12 +238,12 @@ def _scale_bar(axes: Any, pixel_scale: float, shape: tuple[int, ...], longest: f
 
 
 def _compass(axes: Any, system: WCS, shape: tuple[int, ...]) -> None:
-    """North and east as they are at the centre, lower right."""
+    """Draw the directions of north and east at the image centre in the lower right corner."""
     x, y = (shape[1] - 1) / 2, (shape[0] - 1) / 2
     inverse = matrices.inverse(astrometry.jacobian(system, [x], [y])[0])
     flip = np.array([1 if lim[0] < lim[1] else -1 for lim in (axes.get_xlim(), axes.get_ylim())])
     origin = np.array([0.93, 0.05])
-    # u points west.
+    # The u axis points west.
     for name, world in (("N", (0.0, 1.0)), ("E", (-1.0, 0.0))):
         step = matrices.matmul(inverse, np.array(world)) * flip
         step = step / np.hypot(*step) * 0.055

@@ -1,4 +1,4 @@
-"""What is labelled in a preview, and which sources are shown enlarged."""
+"""Select the sources that a preview labels and the sources that it enlarges."""
 
 from __future__ import annotations
 
@@ -19,16 +19,24 @@ from lake_schema.store import read
 from truesky.render.camera import astrometry
 
 LABELS, CLOSE_UPS = 8, 3
-# Height, and width / height.
+# Height of a close-up in arcsec, and its width / height.
 CLOSE_UP_ARCSEC, CLOSE_UP_SHAPE = 14.0, 1.145
 
 
 @dataclass(frozen=True, slots=True)
 class Label:
-    """A source worth a name.
+    """Label of a source.
 
-    column, row : 0-based pixel position
-    kind        : "galaxy" or "star"
+    Attributes
+    ----------
+    column, row : float
+        Pixel position, from 0.
+    kind : str
+        "galaxy" or "star".
+    mag : float
+        AB magnitude in the band of the image.
+    text : str
+        Text of the label: magnitude, and redshift of a galaxy.
     """
 
     column: float
@@ -39,10 +47,23 @@ class Label:
 
 
 def labels(root: Path, product: dict[str, Any], image: images.Image, input_keys: Mapping[str, str]) -> list[Label]:
-    """The brightest sources inside a product's frame, brightest first.
+    """Return the labels of the brightest sources inside an image, brightest first.
 
-    root    : of the lake;  product, image : a row of `products`, and what its file holds
-    made_of : table -> key of the versions that the product was made of
+    Parameters
+    ----------
+    root : Path
+        Root of the lake.
+    product : dict
+        Row of the table `products`.
+    image : Image
+        Pixels and header of the image.
+    input_keys : mapping of str to str
+        Key of the version of each table that the product was made from.
+
+    Returns
+    -------
+    list of Label
+        The labels.
     """
     system = astrometry.from_cards(image.cards)
     ny, nx = np.asarray(image.data).shape
@@ -77,9 +98,21 @@ def _labels_of(kind: str, rows: pa.Table, flux: Float, system: WCS, shape: tuple
 
 
 def without_overlaps(names: Sequence[Label], width: float, height: float, max_per_kind: int) -> list[Label]:
-    """Labels that do not cover each other, brightest first, at most so many of a kind; wide and high in pixels.
+    """Select labels that do not overlap.
 
-    names : where they are to point, brightest first;  most : of a kind
+    Parameters
+    ----------
+    names : sequence of Label
+        Labels, brightest first.
+    width, height : float
+        Size of a label in pixels.
+    max_per_kind : int
+        Largest number of labels of a kind.
+
+    Returns
+    -------
+    list of Label
+        The selected labels, brightest first.
     """
     accepted: list[Label] = []
     for label in names:
@@ -90,7 +123,22 @@ def without_overlaps(names: Sequence[Label], width: float, height: float, max_pe
 
 
 def close_ups(names: Sequence[Label], shape: tuple[int, ...], pixel_scale: float) -> list[Label]:
-    """The brightest galaxies that lie well inside the frame."""
+    """Select the brightest galaxies that lie well inside the image.
+
+    Parameters
+    ----------
+    names : sequence of Label
+        Labels, brightest first.
+    shape : tuple of int
+        Number of rows and columns of the image.
+    pixel_scale : float
+        Pixel scale in arcsec.
+
+    Returns
+    -------
+    list of Label
+        At most CLOSE_UPS labels.
+    """
     half = CLOSE_UP_ARCSEC / pixel_scale / 2
     inside = [
         x for x in names if x.kind == "galaxy" and half < x.column < shape[1] - half and half < x.row < shape[0] - half

@@ -1,7 +1,4 @@
-"""Pyramids of an image: its pixels, and each time the means of 2 x 2 of them, until one tile holds all.
-
-levels  from the cache, or made now
-"""
+"""Make image pyramids for display: each level averages 2 x 2 pixels of the previous one, down to a single tile."""
 
 from __future__ import annotations
 
@@ -18,11 +15,23 @@ TILE = 512
 
 
 def levels(path: Path, has_unit: bool, hits: Path | None, contents: tuple[str, str]) -> list[Array]:
-    """float32 [ny, nx] of each level, the finest first; mapped from disc.
+    """Return the levels of the pyramid, from the cache if it has them.
 
-    path     : of the image;  has_unit : whether it has electrons, else it is taken as it stands
-    hits     : truth of its cosmic rays, where it is wanted without them
-    contents : sha256 of the image, and of the truth or ""
+    Parameters
+    ----------
+    path : Path
+        The image file.
+    has_unit : bool
+        True to convert the image to electrons, False to use the pixels as stored.
+    hits : Path or None
+        Truth map of the cosmic rays to remove, or None to keep them.
+    contents : tuple of str
+        sha256 of the image, and of the truth map or "".
+
+    Returns
+    -------
+    list of float32 array, shape (ny, nx)
+        Levels, the finest first, mapped from disk.
     """
     key = cache.content_key(code_key(__name__), *contents, TILE)
     arrays = cache.cached_arrays("pyramid", key, lambda: _build_levels(path, has_unit, hits))
@@ -41,7 +50,7 @@ def _build_levels(path: Path, has_unit: bool, hits: Path | None) -> dict[str, Ar
 
 
 def _halve(image: Array) -> Array:
-    """Means of 2 x 2 pixels; of an odd last row or column those that are there."""
+    """Return the means of 2 x 2 pixels; an odd last row or column is repeated."""
     ny, nx = image.shape
     padded = np.pad(image, ((0, ny % 2), (0, nx % 2)), mode="edge")
     mean: Array = padded.reshape(padded.shape[0] // 2, 2, padded.shape[1] // 2, 2).mean(axis=(1, 3), dtype=np.float32)

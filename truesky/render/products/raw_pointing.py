@@ -1,9 +1,6 @@
-"""Where a raw frame says that it looks: a telescope knows its place and its angle no better than to some arcseconds.
+"""Add a pointing error to the headers of raw images, since telescopes know their pointing only to some arcseconds.
 
-Beside the frame its head file has the true solution, as has all else that is said of an exposure.
-
-believed   (right ascension, declination, position angle) of an exposure in its raw headers
-cards      a header with these in place of the true ones
+The head file next to the image has the true solution, and so have all tables.
 """
 
 from __future__ import annotations
@@ -19,7 +16,7 @@ from truesky.render.camera import astrometry, pointing
 from truesky.render.camera.detectors import Detector
 from truesky.render.channels import image_types
 
-# Of a header whose place is not the true one, its error (FITS, paper I).
+# Keywords of the WCS error in a header without the true pointing (FITS, paper I).
 ERRORS = ("CSYER1", "CSYER2")
 _TEXT = "[deg] rms error of CRVAL; true: .head"
 
@@ -27,11 +24,28 @@ _TEXT = "[deg] rms error of CRVAL; true: .head"
 def commanded_pointing(
     exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, seed: int
 ) -> tuple[float, float, float]:
-    """Boresight and position angle as all raw headers of an exposure have them, deg; the true ones without an error.
+    """Return the boresight and position angle that all raw headers of an exposure have.
 
-    Offset and rotation are normal, of the camera's rms errors, and the same for exposures that differ in their noise.
+    Parameters
+    ----------
+    exposure : ExposureRow
+        Row of the table `exposures`.
+    detector : Detector
+        A detector of the camera.
+    mission : MissionConfiguration
+        The mission database.
+    seed : int
+        Seed of the request.
 
-    exposure : its row;  detector : of its camera;  mission : the mission database;  seed : of the request
+    Returns
+    -------
+    ra, dec, position_angle : float
+        Angles in degrees; the true ones if the camera has no error.
+
+    Notes
+    -----
+    Offset and rotation are drawn from normal distributions with the rms errors of the camera. They are the same for
+    exposures that differ only in their noise.
     """
     true = exposure.ra, exposure.dec, exposure.position_angle
     offset, rotation = _rms_errors(detector, mission)
@@ -39,7 +53,7 @@ def commanded_pointing(
         return true
     draws = rng.stream(seed, "exposures.header", image_types.identity(replace(exposure, realisation=None)))
     x, y, turn = (float(normal) for normal in draws.standard_normal(3))
-    # As if what is at (x, y) of the field were in its middle: right at the poles, too.
+    # Treat the position (x, y) of the field as its centre. This is correct at the poles, too.
     shifted_detector = replace(detector, x=offset * x, y=offset * y, distortion_terms=())
     ra, dec, angle = pointing.boresight_for(shifted_detector, true[0], true[1], true[2] + rotation * turn / 3600.0)
     return ra, dec, angle
@@ -48,10 +62,25 @@ def commanded_pointing(
 def cards(
     header: Sequence[Card], exposure: ExposureRow, detector: Detector, mission: MissionConfiguration, seed: int
 ) -> tuple[Card, ...]:
-    """A header of a raw frame: its boresight and its linear terms are the believed ones, the distortion is the true.
+    """Return the header of a raw image: boresight and linear terms have the pointing error, the distortion is true.
 
-    header : with the true system, the distortion as SIP
-    exposure, detector, mission, seed : of `believed`
+    Parameters
+    ----------
+    header : sequence of Card
+        Header with the true WCS and the distortion as SIP.
+    exposure : ExposureRow
+        Row of the table `exposures`.
+    detector : Detector
+        The detector.
+    mission : MissionConfiguration
+        The mission database.
+    seed : int
+        Seed of the request.
+
+    Returns
+    -------
+    tuple of Card
+        The header with the pointing error and its rms, or the given header if the camera has no error.
     """
     offset, rotation = _rms_errors(detector, mission)
     if offset == rotation == 0.0:
@@ -72,12 +101,12 @@ def cards(
 
 
 def _depends_on_pointing(keyword: str) -> bool:
-    """Of a system, what another boresight changes: pixels and their distortion are the detector's."""
+    """Return True if a WCS keyword depends on the boresight. Pixels and distortion depend only on the detector."""
     return keyword.startswith(("CRVAL", "CD"))
 
 
 def _rms_errors(detector: Detector, mission: MissionConfiguration) -> tuple[float, float]:
-    """arcsec rms of each coordinate, and of the position angle; of spacecraft nothing is known of one."""
+    """Return the rms errors (arcsec) of each coordinate and of the position angle; 0 if the database has no value."""
     keys = (f"{detector.section}.header.{name}" for name in ("offset", "rotation"))
     offset, rotation = (mission.value(key, "arcsec") if key in mission else 0.0 for key in keys)
     return offset, rotation

@@ -1,10 +1,4 @@
-"""A file of a detector -> pixels.
-
-placed     cards of a file's first header, with its true place on the sky
-frame      a science file or a truth map -> the detector's pixels in one piece, as stored
-electrons  the same in electrons, the bias of a science file subtracted
-header     cards of the header that holds for the whole
-"""
+"""Read the pixels and the header of a detector from its files."""
 
 from __future__ import annotations
 
@@ -22,12 +16,12 @@ from truesky.render.channels import registry
 from truesky.render.channels.readout import ReadoutMode
 from truesky.render.products import head_files, raw_pointing
 
-# Where in an array the detector's pixels are, if there is more in it.
+# Keyword of the section with the pixels of the detector, if the array also contains prescan or overscan.
 _DATA = "DATASEC"
 
 
 def frame(path: Path) -> images.Image:
-    """A file's pixels [ny, nx], of a science file without pre- and overscan, with the header of the whole."""
+    """Return the pixels, shape (ny, nx), as stored, without prescan and overscan, and the header of the detector."""
     read = images.read_images(path)
     if read[0].data is not None and _DATA not in _header(read):
         return images.Image(read[0].data, with_true_wcs(path, read[0].cards))
@@ -35,28 +29,28 @@ def frame(path: Path) -> images.Image:
 
 
 def header(path: Path) -> tuple[images.Card, ...]:
-    """Cards of a file's first header, with the place on the sky of the detector's pixels."""
+    """Return the cards of the primary header, with the WCS of the pixels of the detector."""
     return _trim_header(with_true_wcs(path, images.read_images(path)[0].cards))
 
 
 def electrons(path: Path) -> images.Image:
-    """A file's pixels [ny, nx], float64 e-: of a science file above the level of each amplifier.
+    """Return the pixels, shape (ny, nx), in electrons as float64; the bias of a science file is subtracted.
 
-    Errors : BadInput for a map of what has no electrons, such as of saturated pixels
+    Raises BadInput for a map without unit, such as that of saturated pixels.
     """
     read = images.read_images(path)
     unit = _header(read).get("BUNIT")
     if unit == "electron":
         return images.Image(np.asarray(read[0].data, float), with_true_wcs(path, read[0].cards))
     if unit == "":
-        raise BadInput(f"{path}: its pixels have no unit: they are not electrons")
+        raise BadInput(f"{path}: the pixels must have a unit to convert them to electrons, but BUNIT is empty")
     return images.Image(
         _readout_mode(path, read).read_electrons(read), _trim_header(with_true_wcs(path, read[0].cards))
     )
 
 
 def with_true_wcs(path: Path, cards: Sequence[images.Card]) -> tuple[images.Card, ...]:
-    """Cards of a raw file's header; where that is not sure of its place, with the true one, from its head file."""
+    """Return the cards of a header; the true WCS of the head file replaces the WCS of a raw header."""
     if all(key not in raw_pointing.ERRORS for key, *_ in cards):
         return tuple(cards)
     true = {card[0]: card for card in head_files.first_cards(path) if not card[0].startswith("CRPIX")}
@@ -72,7 +66,7 @@ def with_true_wcs(path: Path, cards: Sequence[images.Card]) -> tuple[images.Card
 
 
 def _trim_header(cards: Sequence[images.Card]) -> tuple[images.Card, ...]:
-    """Header of the pixels alone: their WCS counts from the first of them."""
+    """Return the header of the pixels without prescan and overscan; CRPIX counts from the first of these pixels."""
     section = next((str(value) for key, value, _ in cards if key == _DATA), None)
     if section is None:
         return tuple(cards)
@@ -88,7 +82,7 @@ def _trim_header(cards: Sequence[images.Card]) -> tuple[images.Card, ...]:
 def _readout_mode(path: Path, read: Sequence[images.Image]) -> ReadoutMode:
     name = str(_header(read).get("CHANNEL"))
     if name not in registry.CHANNELS:
-        raise BadInput(f"{path}: CHANNEL {name!r} is not one of {', '.join(registry.CHANNELS)}")
+        raise BadInput(f"{path}: CHANNEL must be one of {', '.join(registry.CHANNELS)}, got {name!r}")
     return registry.CHANNELS[name].readout
 
 

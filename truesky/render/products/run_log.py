@@ -1,9 +1,4 @@
-"""What the logs of runs say of the parts that they made.
-
-of_lake         the logs of all runs, oldest first
-of_products     those of runs that made the table `products`
-lines           one of them: an object for its start, one a part, one for its end
-"""
+"""Read the log files of runs: one JSON object per line for the start, for each task, and for the end of a run."""
 
 from __future__ import annotations
 
@@ -18,7 +13,7 @@ from lake_schema.store import layout
 from lake_schema.store.object_storage.s3 import Folder, ObjectPath
 
 Json = dict[str, Any]
-# What a line says: of a run, of a part.
+# Types of the fields of a line, for a run and for a task.
 _FIELD_TYPES: dict[str, tuple[type, ...]] = {
     "job": (str,), "status": (str,), "prepare_s": (float, int), "prepare_cpu_s": (float, int),
     "part": (str,), "error": (str,), "attempt": (int,), "seconds": (float, int), "cpu_s": (float, int),
@@ -28,19 +23,22 @@ _MAX_VALUE = 1e15
 
 
 def logs_of_lake(root: Folder) -> list[Path]:
-    """The files, in the order of their runs; none of a lake on object storage: they stay where the jobs ran."""
+    """Return the log files of all runs, oldest first.
+
+    The list is empty for a lake on object storage, whose logs stay on the machines that ran the jobs.
+    """
     return [] if isinstance(root, ObjectPath) else sorted(layout.runs_folder(root).glob("*.jsonl"))
 
 
 def logs_of_products(root: Folder) -> list[Path]:
-    """The same of table `products`."""
+    """Return the log files of the runs that made the table `products`, oldest first."""
     return [path for path in logs_of_lake(root) if fnmatch(path.name, "*-products-*.jsonl")]
 
 
 def lines(path: Path) -> list[dict[str, Any]]:
-    """The lines of a log; the last one of a run that was killed may be anything, and is left out then.
+    """Return the lines of a log; an incomplete last line of a killed run is omitted.
 
-    Errors : Damaged names the line that no run writes
+    Raises Damaged, with the line number, if another line is invalid.
     """
     with user_files.open_file(path, "run log") as stream:
         texts = stream.read().split(b"\n")
@@ -50,12 +48,12 @@ def lines(path: Path) -> list[dict[str, Any]]:
             entries.append(_check_line(json.loads(text)))
         except (ValueError, RecursionError, TypeError):
             if any(texts[number:]):
-                raise Damaged(f"{user_files.format_path(path)} line {number} is not what a run writes") from None
+                raise Damaged(f"{user_files.format_path(path)} line {number} is not a valid log line") from None
     return entries
 
 
 def _check_line(line: Any) -> dict[str, Any]:
-    """The line; TypeError where it is not one that a run writes."""
+    """Return the line. Raises TypeError if a run would not write it."""
     if not isinstance(line, dict):
         raise TypeError
     for name, types in _FIELD_TYPES.items():

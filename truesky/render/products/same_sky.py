@@ -1,10 +1,8 @@
-"""One patch of the sky as several cameras see it, north up; and in colour.
+"""Draw one patch of sky as several cameras observe it, with north up, and as a colour image.
 
-draw      pictures of the patch that most cameras of a lake share
-patch     a lake's images of one place -> pixels of one grid, camera by camera
-colours   three bands of it -> an image in colour
-
-Ref : Serrano et al. 2024, the figure of the pilot phase's field; Lupton et al. 2004 (colours)
+References
+----------
+Serrano et al. 2024, the figure of the pilot phase's field; Lupton et al. 2004 (colours)
 """
 
 from __future__ import annotations
@@ -25,19 +23,19 @@ from truesky.render.camera import astrometry, footprints, pointing
 from truesky.render.planning.exposure_chunks import rows_of_exposures
 from truesky.render.products import read_back
 
-# Side of a patch, arcsec, and pixels of a picture of it; that of the colours is larger.
+# Side of a patch in arcsec; pixels of a picture, and of the larger colour picture.
 SIDE, _PIXELS, _COLOUR_PIXELS = 100.0, 440, 1000
-# Of each camera the band is shown whose wavelength is nearest to this, A: the longest that silicon sees.
+# Each camera is shown in the band closest to this wavelength in A, the longest that silicon detects.
 _WAVELENGTH = 9000.0
-# Places that are tried for a patch, along a side of a detector.
+# Number of trial positions of a patch along the side of a detector.
 _GRID_SIZE = 9
-# Red, green, blue: the first of these that the lake has.
+# Red, green, blue: the first set of which the lake has all bands.
 _COLOURS = (("euclid_h", "euclid_y", "euclid_vis"), ("lsst_i", "lsst_r", "lsst_g"), ("des_i", "des_r", "des_g"))
-# Shown from black to white: sigma below the sky, where logarithmic begins, sigma above.
+# Black (sigma below the sky), start of the logarithmic range, and white (sigma above the sky).
 _BLACK, _KNEE, _WHITE = -1.5, 4.0, 150.0
-# From the median of a normal distribution to its quartile, in sigma.
+# Distance from the median of a normal distribution to its quartile, in sigma.
 _QUARTILE = 0.6745
-# Of the colours: the softening of their stretch, and sigma that are half of white.
+# Colour picture: softening of the stretch, and signal in sigma that is shown at half of white.
 _SOFTENING, _STRETCH = 8.0, 12.0
 _INK, _PAPER = "#e8e6df", "#0b0d12"
 _COLUMNS, _INCHES, _DPI = 3, (13.2, 9.35), 100
@@ -46,9 +44,21 @@ Row = dict[str, Any]
 
 
 def draw(root: Path, out: Path, request: str | None = None) -> list[Path]:
-    """`same_sky.png` where more than two cameras share a patch, `colour.png` where three bands do; their paths.
+    """Draw `same_sky.png` if more than two cameras share a patch, and `colour.png` if three bands do.
 
-    root : of the lake;  out : folder;  request : its name, where the lake has several
+    Parameters
+    ----------
+    root : Path
+        Root of the lake.
+    out : Path
+        Folder of the PNG files.
+    request : str, optional
+        Name of the request; required if the lake has several.
+
+    Returns
+    -------
+    list of Path
+        The PNG files.
     """
     rows = _rows(root, request)
     order = [channel for channel, _ in CHANNELS]
@@ -75,14 +85,28 @@ def draw(root: Path, out: Path, request: str | None = None) -> list[Path]:
 
 
 def patch(file: Path, place: tuple[float, float], pixels: int, order: int) -> Float:
-    """[pixels, pixels] electrons of a patch about a place, east to the left; nan where the image has none.
+    """Return the pixels of a patch of side SIDE about a position, with north up and east to the left.
 
-    file  : an image;  place : ra, dec deg;  order : of the interpolation, 0 = the pixel that lies there
+    Parameters
+    ----------
+    file : Path
+        An image file.
+    place : tuple of float
+        ICRS ra and dec in degrees.
+    pixels : int
+        Pixels along each side of the patch.
+    order : int
+        Order of the spline interpolation; 0 takes the nearest pixel.
+
+    Returns
+    -------
+    float array, shape (pixels, pixels)
+        Electrons; NaN outside the image.
     """
     image = read_back.electrons(file)
     data = np.asarray(image.data, float)
     step = SIDE * ((np.arange(pixels) + 0.5) / pixels - 0.5)
-    # x points west in a plane without rotation, as u does.
+    # The x axis points west in a plane without rotation, like u.
     across, up = np.meshgrid(step, step)
     ra, dec = pointing.sky_of_plane(across.ravel(), up.ravel(), *place, 0.0)
     column, row = astrometry.pixel_of_sky(astrometry.from_cards(image.cards), ra, dec)
@@ -91,7 +115,18 @@ def patch(file: Path, place: tuple[float, float], pixels: int, order: int) -> Fl
 
 
 def colours(red: Float, green: Float, blue: Float) -> Array:
-    """[ny, nx] fluxes above the sky, each in sigma of its own -> uint8[ny, nx, 3]."""
+    """Combine three images into a colour picture.
+
+    Parameters
+    ----------
+    red, green, blue : float array, shape (ny, nx)
+        Fluxes above the sky in units of the noise of each image.
+
+    Returns
+    -------
+    uint8 array, shape (ny, nx, 3)
+        RGB values.
+    """
     from astropy.visualization import make_lupton_rgb
 
     layers = [np.nan_to_num(layer) for layer in (red, green, blue)]
@@ -99,7 +134,7 @@ def colours(red: Float, green: Float, blue: Float) -> Array:
 
 
 def _rows(root: Path, request: str | None) -> list[Row]:
-    """Science images of the sky with their footprints and exposures."""
+    """Return the science images of the sky with their footprints and exposures."""
     version = read.version(root, "products", request=request)
     inputs = version.manifest["facts"]["inputs"]
     product_rows = version.rows()
@@ -118,7 +153,7 @@ def _rows(root: Path, request: str | None) -> list[Row]:
 
 
 def _wavelength_offset(row: Row) -> float:
-    """A between its band and the one that is shown of each camera."""
+    """Return the distance (A) between the wavelength of a band and _WAVELENGTH."""
     return abs(passbands.pivot_wavelength(passbands.load(row["band"])) - _WAVELENGTH)
 
 
@@ -127,7 +162,10 @@ def _camera(row: Row) -> tuple[str, str]:
 
 
 def _best_place(rows: Sequence[Row], cameras: Sequence[tuple[str, str]]) -> tuple[float, float]:
-    """The place whose patch most cameras see whole: of a grid over the detectors of the camera with the fewest."""
+    """Return the position whose patch most cameras observe completely.
+
+    Candidates lie on a grid over each detector of the camera with the fewest images.
+    """
     rows_by_camera = {camera: [row for row in rows if _camera(row) == camera] for camera in cameras}
     fewest = rows_by_camera[min(cameras, key=lambda camera: (len(rows_by_camera[camera]), camera))]
     step = np.linspace(-1.0, 1.0, _GRID_SIZE) * 3600.0 * max(row["radius"] for row in fewest) / np.sqrt(2.0)
@@ -136,21 +174,21 @@ def _best_place(rows: Sequence[Row], cameras: Sequence[tuple[str, str]]) -> tupl
     ra, dec = (np.concatenate([place[i] for place in candidates]) for i in (0, 1))
     corners = _corners(ra, dec)
     n_cameras = np.sum([_contains_patch(rows_by_camera[camera], corners) for camera in cameras], axis=0)
-    # Of several the one nearest to a detector's middle.
+    # Ties are resolved by the distance from the centre of the detector.
     distance = np.tile(np.hypot(across, up), len(fewest))
     best = int(np.lexsort((distance, -n_cameras))[0])
     return float(ra[best]), float(dec[best])
 
 
 def _corners(ra: Float, dec: Float) -> Float:
-    """[n, 4, 2] ra, dec deg of the patches about places."""
+    """Return the corners (ra, dec in deg), shape (n, 4, 2), of patches about positions."""
     half = 0.5 * SIDE
     x, y = np.array([-half, half, -half, half]), np.array([-half, -half, half, half])
     return np.array([np.transpose(pointing.sky_of_plane(x, y, a, d, 0.0)) for a, d in zip(ra, dec, strict=True)])
 
 
 def _contains_patch(rows: Sequence[Row], corners: Float) -> Int:
-    """[n] 1 where one of the images has the whole patch of these corners, else 0."""
+    """Return for each patch, shape (n), 1 if one of the images contains it completely, otherwise 0."""
     flat = corners.reshape(-1, 2)
     contained = np.zeros(len(corners), bool)
     for row in rows:
@@ -159,7 +197,7 @@ def _contains_patch(rows: Sequence[Row], corners: Float) -> Int:
 
 
 def _rows_with_patch(place: tuple[float, float], rows: Sequence[Row]) -> list[Row]:
-    """The images that have the patch about a place whole."""
+    """Return the images that contain the patch about a position completely."""
     corners = _corners(np.array([place[0]]), np.array([place[1]]))
     return [row for row in rows if _contains_patch([row], corners)[0]]
 
@@ -169,7 +207,10 @@ def _footprint(row: Row) -> pa.Table:
 
 
 def _sky_and_noise(image: Float) -> tuple[float, float]:
-    """Sky and noise, from the median and the quartile below it: gaps between cells and cosmic rays are few."""
+    """Return sky and noise, from the median and the lower quartile.
+
+    Few pixels lie in gaps between detectors or are hit by cosmic rays.
+    """
     finite = image[np.isfinite(image)]
     low, level = np.quantile(finite, (0.25, 0.5))
     return float(level), max(float(level - low) / _QUARTILE, 1e-12)
@@ -199,16 +240,16 @@ def _draw_panels(path: Path, panels: Sequence[tuple[Row, Float]], place: tuple[f
 
 
 def _draw_colours(path: Path, bands: Mapping[str, Sequence[Row]], place: tuple[float, float]) -> Path:
-    """The median of each band's exposures, in which no cosmic ray is left where there are three or more."""
+    """Draw the median of each band's exposures; with three or more, it is free of cosmic rays."""
     from matplotlib.image import imsave
 
     layers = []
     for rows in bands.values():
-        # To the flux of an AB magnitude, the same in all bands.
+        # Scale to the flux of an AB magnitude, equal in all bands.
         scale = [10.0 ** (-0.4 * row["zero_point"]) / row["exposure_time_s"] for row in rows]
         patches = [patch(row["file"], place, _COLOUR_PIXELS, order=1) for row in rows]
         above = np.sort([s * (p - _sky_and_noise(p)[0]) for s, p in zip(scale, patches, strict=True)], axis=0)
-        # Of two the lower.
+        # For two exposures, take the lower value.
         layers.append(above[(len(above) - 1) // 2])
     picture = colours(*(layer / _sky_and_noise(layer)[1] for layer in layers))
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,8 +1,4 @@
-"""What was drawn on a detector, as rows of the tables `rendered_truth` and `rendered_spectra`.
-
-truth      rows of the table `rendered_truth`
-spectra    rows of the table `rendered_spectra`
-"""
+"""Make the rows of the tables `rendered_truth` and `rendered_spectra` of a detector."""
 
 from __future__ import annotations
 
@@ -21,7 +17,7 @@ POINT, PROFILE, PICTURE, TRAIL = 0, 1, 2, 3
 
 
 def truth(rendered: RenderedDetector) -> pa.Table:
-    """One row a source that was drawn, ascending id."""
+    """Return one row of `rendered_truth` per drawn source, sorted by id."""
     sources, n, (psf_x, psf_y) = rendered.sources, len(rendered.sources), _centroids(rendered)
     trail = np.zeros((n, 2)) if sources.trail is None else sources.trail
     return RENDERED_TRUTH.build(
@@ -45,7 +41,7 @@ def truth(rendered: RenderedDetector) -> pa.Table:
 
 
 def _centroids(rendered: RenderedDetector) -> tuple[Float | None, Float | None]:
-    """Of a point of each source's colour, from its place, pixels; None where light is spread out."""
+    """Return the PSF centroid of each source's colour, pixels from its position; None without PSF or with spectra."""
     sources, psf = rendered.sources, rendered.psf
     if psf is None or rendered.spectra is not None:
         return None, None
@@ -53,7 +49,7 @@ def _centroids(rendered: RenderedDetector) -> tuple[Float | None, Float | None]:
 
 
 def _magnitudes(rendered: RenderedDetector) -> Float:
-    """By the zero point and the exposure time of the header; null where nothing is expected."""
+    """Return the magnitudes for zero point and exposure time of the header; masked if no electrons are expected."""
     electrons = rendered.sources.electrons
     shines = electrons > 0.0
     rate = np.where(shines, electrons, 1.0) / rendered.scene.exposure_time_s
@@ -61,7 +57,7 @@ def _magnitudes(rendered: RenderedDetector) -> Float:
 
 
 def spectra(rendered: RenderedDetector) -> pa.Table | None:
-    """One row a source and order with light on the detector; None where nothing is dispersed."""
+    """Return one row of `rendered_spectra` per source and order with light on the detector, or None without a grism."""
     if rendered.spectra is None:
         return None
     n = len(rendered.spectra["id"])

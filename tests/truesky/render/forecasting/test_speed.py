@@ -78,7 +78,7 @@ def test_damaged_logs_are_ignored(lake, rendered):
     path.write_text(path.read_text().replace('"2.parquet"', "2"))
     log(lake, rendered, [2.0, 0.5, 0.4, 0.3])
     assert "4 detectors" in speed.estimate_speed(lake).source
-    with pytest.raises(Damaged, match=f"{path.name} line 3 is not what a run writes"):
+    with pytest.raises(Damaged, match=f"{path.name} line 3 is not a valid log line"):
         archive.failures(lake)
 
 

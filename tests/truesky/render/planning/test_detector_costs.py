@@ -1,4 +1,4 @@
-"""The forecast: what makes a detector dearer, how it adds up, and that nothing is written to give it."""
+"""Forecast of a plan: costs of a detector, their sums, and a dry run that writes nothing."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ PIXELS = 4096 * 4132
 SKY = registry.CHANNELS["VIS"].effects["science"]
 
 
-def test_more_is_dearer():
+def test_cost_increases_with_pixels_and_sources():
     base = detector_costs.cost_model("VIS", True, SKY)
     assert base.seconds(PIXELS, 1000, 0) < base.seconds(PIXELS, 2000, 0) < base.seconds(2 * PIXELS, 2000, 100)
     tiers = [
@@ -32,13 +32,13 @@ def test_more_is_dearer():
     assert base.seconds(PIXELS, 0, 0) - fewer.seconds(PIXELS, 0, 0) == pytest.approx(
         sum(effect.cost for effect in SKY[-5:]) * PIXELS / 1e6
     )
-    # A bias frame has neither sky nor light.
+    # A bias frame has no sky and no light.
     bias = detector_costs.cost_model("VIS", False, registry.CHANNELS["VIS"].effects["bias"])
     assert bias.seconds(PIXELS, 5000, 10) == bias.seconds(PIXELS, 0, 0) < 0.7 * base.seconds(PIXELS, 0, 0)
 
 
-def test_electrons_have_more_bytes_and_no_pixels_beside_the_detectors():
-    """As their files: of 2.3 million pixels 2.1 million are the detector's."""
+def test_images_in_electrons_have_more_bytes_and_no_overscan():
+    """Compare with the files: of 2.3 million pixels read out, 2.1 million belong to the detector."""
     raw, read = 2_100_000, 2_300_000
     effects = registry.CHANNELS["EXT"].effects["science"]
     for whole, times in ((False, 1), (True, 2)):
@@ -50,7 +50,7 @@ def test_electrons_have_more_bytes_and_no_pixels_beside_the_detectors():
             for way in READOUTS
         }
         assert sizes == {"raw": 2 * times * read, "amplifiers": 2 * times * read, "electrons": 4 * times * raw}
-    # Of converters of more than 16 bits.
+    # Converters with more than 16 bits.
     few, wide = (
         detector_costs.cost_model("EXT", True, effects, files=detector_costs.OutputFiles(has_32_bits=wide))
         for wide in (False, True)
@@ -58,7 +58,7 @@ def test_electrons_have_more_bytes_and_no_pixels_beside_the_detectors():
     assert wide.bytes(raw, read) - few.bytes(raw, read) == 2 * read
 
 
-def test_each_map_has_its_place_on_the_disc():
+def test_each_truth_map_adds_its_bytes():
     sizes = {}
     for channel, kind, looks in (("VIS", "science", True), ("EXT", "science", True), ("VIS", "bias", False)):
         effects = registry.CHANNELS[channel].effects[kind]
@@ -67,18 +67,18 @@ def test_each_map_has_its_place_on_the_disc():
             for maps in ((), tuple(truth_maps.BYTES_PER_PIXEL))
         ]
         sizes[channel, kind] = round((own[1] - own[0]) / PIXELS, 2)
-    # All of them; no ghosts; no light at all.
+    # All maps; without ghosts; without any light.
     assert sizes == {("VIS", "science"): 21.0, ("EXT", "science"): 21.0, ("VIS", "bias"): 9.0}
 
 
-def test_each_map_costs_what_fills_it_in():
-    """CPU s of all maps of a detector of few sources, seen on a machine whose calibration gives 0.45."""
+def test_time_of_truth_maps_depends_on_effects():
+    """CPU seconds of all maps of a detector with few sources, measured on a machine with calibration 0.45."""
     seen = {"VIS": 2.4, "EXT": 1.4}
     for channel, seconds in seen.items():
         effects = registry.CHANNELS[channel].effects["science"]
         none, every = (
             detector_costs.cost_model(channel, True, effects, SURVEY, maps).seconds(PIXELS, 300, 30)
-            # Seen without the ground's cosmic rays.
+            # Measured without cosmic rays on the ground.
             for maps in (
                 (),
                 tuple(name for name in truth_maps.BYTES_PER_PIXEL if channel == "VIS" or name != "cosmic_rays"),
@@ -90,12 +90,12 @@ def test_each_map_costs_what_fills_it_in():
         for name in ("noise_free", "cosmic_rays")
     )
     assert hits > light
-    # The stars are drawn again.
+    # Stars are drawn a second time for their map.
     again = [detector_costs.cost_model("VIS", True, SKY, SURVEY, maps).star_s for maps in ((), ("stars",))]
     assert again[1] == 2 * again[0]
 
 
-def test_what_a_request_asks_is_in_its_forecast(tmp_path):
+def test_forecast_depends_on_options_of_the_request(tmp_path):
     pointing = [{**VIS, "detectors": ["3-4"]}]
     off = {"off": ["parallel_cti", "serial_cti"]}
     explore = {"accuracy": ["draft", "reference"], "effects.cosmic_rays": [True, False]}

@@ -1,4 +1,4 @@
-"""A plan in parts: each is made by itself, and together they are the plan."""
+"""Plans in chunks: each chunk is made separately, and together they equal the whole plan."""
 
 import pickle
 from dataclasses import replace
@@ -16,8 +16,8 @@ from truesky.render.planning import exposure_chunks, survey, tasks
 from truesky.render.planning.mission import mission_of
 from truesky.request.from_toml import from_table
 
-# Two blocks of the same fields and dates, of which exposures differ in their noise alone; a pointing taken five times;
-# frames without a sky; a camera on the ground.
+# Two blocks with the same fields and dates, some of whose exposures differ only in their noise; a pointing with five
+# realisations; frames without sky; a ground camera.
 BLOCK = {"channels": ["VIS", "NISP-P"], "fields": 3, "mjd": 60400.0}
 WANTED = {
     "name": "parts",
@@ -40,7 +40,7 @@ def request_():
 
 @pytest.fixture(scope="module")
 def whole(request_):
-    """Rows of `exposures` and `tasks` of the plan as one part."""
+    """Rows of `exposures` and `tasks` of the plan as a single chunk."""
     return plan_exposures.plan(None, request_)[1:]
 
 
@@ -51,21 +51,21 @@ def planner(request_, most):
 
 
 @pytest.mark.parametrize("most", [1, 100, 700, 9000])
-def test_parts_of_any_size_are_together_the_plan(request_, whole, most):
+def test_chunks_of_any_size_together_equal_the_plan(request_, whole, most):
     own = planner(request_, most)
     assert (len(own.layout.chunks) > 1) == (most < 9000)
     tables = list(own.tables())
-    # Exposures that stand in other parts are counted, too.
+    # Exposures in other chunks are counted, too.
     assert pa.concat_tables([exposures for exposures, _ in tables]).equals(whole[0])
     assert max(whole[0]["realisation"].to_pylist()) == 5
-    # A part is no larger than wanted, unless a field is.
+    # A chunk exceeds the limit only if a single field does.
     largest = max(rows.num_rows for _, rows in tables)
     assert largest <= max(most, 4 * (36 + 3 * 16 + 2 * 36) * 2)
     together = tasks.sort_by_cost(pa.concat_tables([rows for _, rows in tables]))
     assert together.equals(whole[1])
 
 
-def test_realisations_go_on_where_an_earlier_part_has_the_same_exposure(request_, whole):
+def test_realisation_numbers_continue_from_earlier_chunks(request_, whole):
     rows = whole[0].to_pylist()
     alike = [row for row in rows if row["survey"] == "wide" and row["image_type"] == "science"]
     first = {(row["camera"], row["band"], row["mjd"], row["exposure_time_s"]): [] for row in alike}
@@ -74,16 +74,16 @@ def test_realisations_go_on_where_an_earlier_part_has_the_same_exposure(request_
     assert set(map(tuple, first.values())) == {(1, 2, 3)}
 
 
-def test_what_makes_a_part_crosses_to_a_worker(request_):
+def test_planner_can_be_pickled(request_):
     own = planner(request_, 200)
     other = pickle.loads(pickle.dumps(own))
     piece = own.layout.chunks[3]
-    exposures = other.rows_of_exposures(other.layout.pieces[3])
+    exposures = other.rows_of_exposures(other.layout.chunks[3])
     assert exposures.equals(own.rows_of_exposures(piece))
     assert other.rows_of_tasks(piece, exposures).equals(own.rows_of_tasks(piece, exposures))
 
 
-def test_parts_say_which_exposures_they_hold_and_when_they_begin(request_, whole):
+def test_facts_of_partitions_contain_exposures_and_dates(request_, whole):
     own = planner(request_, 200)
     dates = dict(zip(whole[0]["exposure_id"].to_pylist(), whole[0]["mjd"].to_pylist(), strict=True))
     named = own.layout.parts()
@@ -105,9 +105,7 @@ def published(root, request_, monkeypatch, mapper, most=200):
     return {name: read.version(root, name) for name in ("exposures", "tasks")}
 
 
-def test_whichever_part_is_made_first_and_after_whatever_death_the_bytes_are_the_same(
-    request_, whole, tmp_path, monkeypatch
-):
+def test_bytes_depend_neither_on_order_nor_on_interruptions(request_, whole, tmp_path, monkeypatch):
     one = published(layout.resolve_lake(tmp_path / "one"), request_, monkeypatch, map)
     assert len(one["tasks"].partitions) > 5
 
@@ -124,7 +122,7 @@ def test_whichever_part_is_made_first_and_after_whatever_death_the_bytes_are_the
         assert version.fingerprint == two[name].fingerprint
         assert read.find_faults(two[name], deep=True) == []
     assert tasks.sort_by_cost(one["tasks"].rows()).equals(whole[1])
-    # Of a large plan a reader opens what it needs.
+    # A reader opens only the partitions that it needs.
     numbers = [1, 2, whole[0].num_rows]
     holders = exposure_chunks.partition_names(one["tasks"], numbers)
     assert holders == [one["tasks"].partitions[0], one["tasks"].partitions[-1]]
@@ -135,8 +133,8 @@ def test_whichever_part_is_made_first_and_after_whatever_death_the_bytes_are_the
     assert {*(np.flatnonzero((began >= near[0]) & (began <= near[1])) + 1)} <= {*found}
 
 
-def test_fields_are_checked_before_any_is_laid_out(request_, monkeypatch):
-    """Of 100,000 exposures no more are made to say that they are good than of one field and its twin."""
+def test_checks_lay_out_only_representative_fields(request_, monkeypatch):
+    """For 100,000 exposures, only one field per grism is laid out to check them."""
     made, lay = [], survey.visit_exposures
     monkeypatch.setattr(survey, "visit_exposures", lambda field, **rest: made.append(field) or lay(field, **rest))
     wide = replace(request_, pointings=(), observations=(replace(request_.observations[0], fields=40),))

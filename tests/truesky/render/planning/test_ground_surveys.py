@@ -1,4 +1,4 @@
-"""Ground surveys by their rules; tables of pointings: a line is taken as it stands, or refused by its number."""
+"""Exposures of ground surveys, and tables of pointings; errors name the line of the table."""
 
 import re
 from dataclasses import replace
@@ -36,7 +36,7 @@ def test_a_line_is_an_exposure(tmp_path):
     assert (plain.exposure_time_s, plain.image_type, plain.detectors) == (77.0, "science", ("R22_S11",))
     assert (plain.sky, plain.seeing, plain.zero_point, plain.psf) == (None, None, None, None)
     assert (full.exposure_time_s, full.sky, full.seeing, full.zero_point) == (30.0, 12.5, 0.61, 28.1)
-    # Found from the table's folder.
+    # Relative paths start at the folder of the table.
     assert (full.psf, full.detectors, full.image_type) == (str(tmp_path / "psf.fits"), ("R22_S11", "R22_S12"), "deep")
     assert (plain.field, full.field, full.survey) == (1, 2, "lsst")
 
@@ -60,7 +60,7 @@ def test_a_line_is_an_exposure(tmp_path):
         (f"{HEAD}{',ra' * 7000}\n{ROW}\n", "one of more than 20000 characters"),
     ],
 )
-def test_what_is_wrong_is_refused_by_its_line(tmp_path, text, words):
+def test_errors_name_the_line(tmp_path, text, words):
     with pytest.raises(BadInput, match=r"pointings\.csv") as caught:
         read(tmp_path, text)
     assert words in str(caught.value)
@@ -74,12 +74,12 @@ def survey_of(name, number, seed=3, **changes):
 
 
 @pytest.mark.parametrize(("name", "error"), [("des", 3.0), ("lsst", 0.0), ("cfis", 0.0)])
-def test_a_survey_observes_at_night_and_misses_by_its_error(name, error):
+def test_surveys_observe_at_night_with_pointing_errors(name, error):
     found = survey_of(name, 30)
     table = planned_exposures.table(found, [MISSION] * len(found))
     assert max(table["airmass"].to_pylist()) <= 2.0
     assert (np.diff([one.mjd for one in found]) > 0).all()
-    # In bands that are taken together the places differ by the telescope's errors alone.
+    # The pointings of bands that are observed together differ only by the pointing errors.
     if name == "des":
         first, second = (np.array([(e.ra, e.dec) for e in found if e.band == band]) for band in ("des_g", "des_r"))
         apart = 3600.0 * (first - second) * np.stack([np.cos(np.radians(first[:, 1])), np.ones(len(first))], axis=1)
@@ -90,7 +90,7 @@ def test_a_survey_observes_at_night_and_misses_by_its_error(name, error):
 
 
 @pytest.mark.parametrize(("name", "camera", "band"), [("lsst", "lsstcam", "lsst_y"), ("whigs", "hsc", "hsc_g")])
-def test_bands_that_the_challenge_has_not_are_planned_as_the_others(name, camera, band):
+def test_bands_outside_the_challenge_can_be_planned(name, camera, band):
     found = survey_of(name, 5, bands=(band,))
     assert {(one.camera, one.band) for one in found} == {(camera, band)}
     assert len(found) == 5
@@ -99,24 +99,24 @@ def test_bands_that_the_challenge_has_not_are_planned_as_the_others(name, camera
     assert min(table["sky"].to_pylist()) > 0.0
 
 
-def test_dates_by_day_are_named():
-    """The Sun's altitude as astropy has it."""
+def test_warning_about_dates_in_daylight():
+    """Compare the Sun's altitude with astropy."""
     none = survey_of("lsst", 4, bands=("lsst_r",))
     assert ground_surveys.daylight_warning(none, MISSION) == ""
-    # 11:30 of local time.
+    # 11:30 local time.
     dated = [replace(one, mjd=60500.68 if i else one.mjd) for i, one in enumerate(none[:2])]
     dated.append(replace(dated[1], image_type="flat"))
     line = ground_surveys.daylight_warning(dated, MISSION)
     where = EarthLocation.from_geodetic(-70.7494, -30.2446, 2663.0)
     when = Time(60500.68, format="mjd")
     high = get_sun(when).transform_to(AltAz(obstime=when, location=where)).alt.deg
-    assert line.startswith("EXT: 1 of 2 exposures of the sky are dated when the Sun is above -12 deg")
+    assert line.startswith("EXT: 1 of 2 exposures of the sky have dates when the Sun is above -12 deg")
     assert float(re.search(r"the Sun at ([+-]\d+) deg", line)[1]) == pytest.approx(high, abs=0.8)
     assert "\n" not in line
 
 
 def test_seeing_is_drawn_for_each_exposure():
-    """Log-normal about the survey's median; the same for the same exposure in whatever order and company."""
+    """Log-normal about the survey's median; the same for the same exposure, whatever the other exposures are."""
     found = survey_of("lsst", 300)
     found = [one for one in found if one.band == "lsst_r"]
     seeing = np.array(planned_exposures.table(found, [MISSION] * len(found), seed=5)["seeing"])
@@ -137,7 +137,7 @@ def test_seeing_is_drawn_for_each_exposure():
 
 
 def test_a_row_without_a_date_is_observed_at_night(tmp_path):
-    """A field beside the Sun at the date that counts begin with: zodiacal light would be 20 times a dark sky."""
+    """The field is near the Sun on the first date, where zodiacal light would be 20 times a dark sky."""
     (bare,) = read(tmp_path, "channel,camera,band,ra,dec\nEXT,lsstcam,lsst_r,100.0,20.0\n")
     site = ground_surveys.Site.from_mission("ext.lsstcam", MISSION)
     assert site.altitude(bare.ra, bare.dec, bare.mjd) > 29.0
@@ -145,8 +145,8 @@ def test_a_row_without_a_date_is_observed_at_night(tmp_path):
     assert 32.95 < row["sky"] < 150.0
 
 
-def test_a_survey_exposes_each_band_as_long_as_it_does(tmp_path):
-    """CFIS: 80 s in u and 200 s in r, whether its pattern is laid out or a table of pointings is given."""
+def test_exposure_times_of_the_bands_of_a_survey(tmp_path):
+    """CFIS: 80 s in u and 200 s in r, both for its pattern and for a table of pointings."""
     seconds = {one.band: one.exposure_time_s for one in survey_of("cfis", 4)}
     assert seconds == {"cfis_u": 80.0, "cfis_r": 200.0}
     assert {one.exposure_time_s for one in survey_of("cfis", 4, exposure_time_s=60.0)} == {60.0}

@@ -1,4 +1,4 @@
-"""What NISP-P is asked for: flats by lamps in bands that see them, ramps of a block's own, and what is refused."""
+"""Planned NISP exposures: flats by lamp and band, ramps set by a block, persistence darks, and errors."""
 
 import copy
 from collections import Counter
@@ -34,8 +34,8 @@ def flats(**more):
     return Counter((e.lamp, e.band) for e, _ in exposures({**FLAT, **more}))
 
 
-def test_a_lamp_shines_in_bands_that_see_it():
-    """All lamps as often as one another; 1190 nm, where Y and J overlap, in both."""
+def test_flats_are_in_bands_in_which_a_lamp_is_visible():
+    """All lamps are used equally often; the 1190 nm lamp is in both Y and J, which overlap there."""
     assert flats(exposures=10) == {
         (1, "euclid_y"): 2, (2, "euclid_j"): 1, (2, "euclid_y"): 1, (3, "euclid_j"): 2, (4, "euclid_h"): 2,
         (5, "euclid_h"): 2,
@@ -46,8 +46,8 @@ def test_a_lamp_shines_in_bands_that_see_it():
         assert calibration_lamp.led_efficiency(passbands.load(band), lamp, "nisp", MISSION) > 0.05
 
 
-def test_lamps_that_cannot_be_lit():
-    with pytest.raises(BadInput, match=r"observation\[0\]: lamps: 5 does not shine in euclid_y"):
+def test_invalid_lamps_are_refused():
+    with pytest.raises(BadInput, match=r"observation\[0\]: lamps: 5 is not visible in euclid_y"):
         flats(exposures=1, bands=["euclid_y"], lamps=[5])
     for lamps, message in (
         ([6], "6 is not a whole number from 1 to 5"),
@@ -60,12 +60,12 @@ def test_lamps_that_cannot_be_lit():
         exposures({"channels": ["NISP-P"], "image_type": "dark", "exposures": 1, "lamps": [1]})
 
 
-def test_requests_know_how_many_lamps_there_are():
+def test_number_of_lamps_agrees_with_requests():
     assert {"VIS": LAMPS["vis"][0], "NISP-P": LAMPS["nisp"][0], "NISP-S": LAMPS["nisp"][0]} == observations.LAMPS
 
 
 def test_calibrations_without_a_date_follow_one_another():
-    """A dark taken while a flat is would show what that leaves in the detector."""
+    """A dark taken during a flat would contain the persistence of the flat."""
     found = exposures(
         {**FLAT, "exposures": 3}, {"channels": ["NISP-P"], "image_type": "dark", "exposures": 2},
         {"channels": ["VIS"], "image_type": "dark", "exposures": 1},
@@ -82,8 +82,8 @@ def test_calibrations_without_a_date_follow_one_another():
     assert sky[0].mjd >= 60200.0 + hours
 
 
-def test_no_two_undated_blocks_expose_nisp_at_once():
-    """Fields and calibrations in whatever order: each begins when what is before it has ended, and is forgotten."""
+def test_undated_blocks_never_expose_nisp_at_the_same_time():
+    """In any order, each block begins when the earlier one has ended and its persistence has faded."""
     field = {"channels": ["NISP-P"], "ra": 53.117, "dec": -27.808, "dither": "none"}
     sky = {"channels": ["NISP-P"], "image_type": "self_calibration", "exposures": 2}
     dark = {"channels": ["NISP-P"], "image_type": "dark", "exposures": 2}
@@ -97,13 +97,13 @@ def test_no_two_undated_blocks_expose_nisp_at_once():
             own = [e for e, _ in upto[len(before) :]]
             assert min(e.mjd for e in own) >= ends
             ends = max(e.mjd + e.exposure_time_s / 86400 for e in own) + hours
-    # VIS has no such memory.
+    # VIS has no persistence.
     dates = [e.mjd for e, _ in exposures({**field, "channels": ["VIS"]}, {**field, "channels": ["VIS"]})]
     assert dates[: len(dates) // 2] == dates[len(dates) // 2 :]
 
 
 def test_exposures_of_long_ramps_follow_one_another():
-    """Ramps that take longer to read than to integrate; spectra's numbers in filters."""
+    """Ramps whose reading takes longer than their integration; ramps of spectra used in filters."""
     dark = {"channels": ["NISP-P"], "image_type": "dark", "exposures": 3}
     fields = {"channels": ["NISP-P"], "fields": 1, "dither": "none"}
     for block, macc in ((dark, [2, 1000, 0]), (fields, [15, 16, 11])):
@@ -114,8 +114,8 @@ def test_exposures_of_long_ramps_follow_one_another():
             assert now.mjd - before.mjd > frames * MISSION.value("nisp.frame_time", "s") / 86400 - 1e-9
 
 
-def test_spectra_of_a_block_with_a_ramp_leave_what_they_leave():
-    """The same settings: a block's own exposures are in one another's past."""
+def test_spectra_with_a_ramp_leave_persistence_in_their_block():
+    """With the same settings, exposures of a block leave persistence in later ones."""
     fields = {"channels": ["NISP-P", "NISP-S"], "fields": 1, "dither": "none", "macc": [4, 16, 5]}
     found = [e for e, _ in exposures(fields)]
     assert {e.channel for e in found} == {"NISP-P", "NISP-S"}
@@ -125,7 +125,7 @@ def test_spectra_of_a_block_with_a_ramp_leave_what_they_leave():
 
 
 @pytest.mark.parametrize(("macc", "seconds"), [([4, 16, 4], 200.0), ([2, 1, 0], 2.0)])
-def test_a_ramp_and_another_exposure_time_are_refused(macc, seconds):
+def test_a_ramp_with_a_different_exposure_time_is_refused(macc, seconds):
     block = {"channels": ["NISP-P"], "image_type": "dark", "exposures": 1, "macc": macc}
     with pytest.raises(BadInput, match=r"observation\[0\]: macc = .* takes .* s, not exposure_time_s"):
         exposures({**block, "exposure_time_s": seconds})
@@ -135,7 +135,7 @@ def test_a_ramp_and_another_exposure_time_are_refused(macc, seconds):
 
 
 def test_an_exposure_time_between_two_ramps_is_refused():
-    """98.1 s are 67.5 frames in three differences of 16 reads: 22 or 23 frames each are 2 % off."""
+    """98.1 s are 67.5 frames in three differences of 16 reads; with 22 or 23 frames each, the time is 2 % off."""
     with pytest.raises(BadInput, match=r"exposure time 98\.1 s: MACC\(4,16,6\) takes 95\.96 s, .* more than 2%"):
         exposures({**FLAT, "exposures": 1, "exposure_time_s": 98.1})
 
@@ -144,7 +144,7 @@ def test_an_exposure_time_between_two_ramps_is_refused():
     ("key", "value", "unit"),
     [("nisp.frame_time", 0.0, "s"), ("nisp.ipc.side", 0.11, ""), ("nisp.ipc.diagonal", 0.2, "")],
 )
-def test_numbers_that_no_ramp_can_be_drawn_with_are_refused_with_the_request(key, value, unit):
+def test_invalid_ramp_parameters_are_refused_with_the_request(key, value, unit):
     overrides = {key: {"value": value, "unit": unit}}
     with pytest.raises(BadInput, match=key):
         from_table({**BASE, "pointing": [POINTING], "mission": {"overrides": overrides}})
@@ -156,8 +156,8 @@ def test_too_much_capacitance_is_refused_with_the_request():
         from_table({**BASE, "pointing": [POINTING], "mission": {"overrides": overrides}})
 
 
-def test_a_block_has_its_own_ramp():
-    """So long are its exposures; VIS, beside it, and other blocks know nothing of it."""
+def test_a_ramp_applies_to_its_block_only():
+    """The ramp sets the exposure times of the block, but not of VIS or of other blocks."""
     dark = {"channels": ["NISP-P"], "image_type": "dark", "exposures": 1}
     fields = {"channels": ["VIS", "NISP-P"], "fields": 1, "dither": "none", "short": False, "flat": False}
     found = exposures({**dark, "macc": [15, 16, 11]}, dark, {**fields, "macc": [2, 1, 0]})
@@ -194,12 +194,12 @@ MACC = r"observation\[0\]\.macc"
         ([100, 30, 30], rf"{MACC} = \[100, 30, 30\] has 5970 frames, more than 4000"),
     ],
 )
-def test_ramps_that_cannot_be_asked_for(macc, message):
+def test_invalid_ramps_are_refused(macc, message):
     with pytest.raises(BadInput, match=message):
         exposures({**FLAT, "exposures": 1, "macc": macc})
 
 
-def test_only_nisp_has_a_ramp_of_a_request():
+def test_a_ramp_requires_nisp():
     with pytest.raises(BadInput, match="macc is not for VIS: used by NISP-P, NISP-S"):
         exposures({"channels": ["VIS"], "image_type": "dark", "exposures": 1, "macc": [4, 16, 4]})
 
@@ -212,8 +212,8 @@ def test_only_nisp_has_a_ramp_of_a_request():
         {"ra": 53.117, "dec": -27.808, "dither": "none"},
     ],
 )  # fmt: skip
-def test_a_block_of_spectra_has_its_own_ramp(block):
-    """Of spectra alone: so long are they; NISP-P's ramp is the mission's."""
+def test_a_ramp_of_a_block_of_spectra(block):
+    """In a block of spectra, the ramp applies to NISP-S, while NISP-P keeps the ramp of the mission."""
     found = exposures({"channels": ["NISP-S"], "macc": [8, 16, 11], **block})
     seconds = 7 * 27 * MISSION.value("nisp.frame_time", "s")
     for exposure, mission in found:
@@ -224,7 +224,7 @@ def test_a_block_of_spectra_has_its_own_ramp(block):
 
 
 def test_flats_at_intensities():
-    """As many frames of each; the lamp's level is the exposure's own."""
+    """Each intensity has the same number of frames and sets the level of the lamp for its exposures."""
     found = exposures({**FLAT, "exposures": 2, "lamps": [3, 5], "intensities": [0.1, 1.0, 2.5]})
     level = MISSION.value("nisp.flat.signal")
     assert [(e.lamp, mission.value("nisp.flat.signal") / level) for e, mission in found] == [
@@ -233,7 +233,7 @@ def test_flats_at_intensities():
     assert [e.settings is None for e, _ in found] == [False, True, False] * 2
     of_vis = exposures({"channels": ["VIS"], "image_type": "flat", "exposures": 1, "intensities": [0.5]})
     assert of_vis[0][1].value("vis.flat.signal") == 0.5 * MISSION.value("vis.flat.signal")
-    # What is explored is each variant's; a lamp's intensity is over that.
+    # Each variant has its explored value, which the intensity of a lamp multiplies.
     explored = {"nisp.flat.signal": {"values": [1e4, 2e4], "unit": "electron"}}
     two = exposures({**FLAT, "exposures": 1, "lamps": [3], "intensities": [3.0]}, explore=explored)
     assert [mission.value("nisp.flat.signal") for _, mission in two] == [3e4, 6e4]
@@ -249,7 +249,7 @@ REMEMBERED = {"channels": ["NISP-P"], "image_type": "persistence"}
 
 
 def test_darks_after_a_bright_exposure():
-    """From 100 s to two hours after its end; the next bright one when it is forgotten, and so the next channel."""
+    """From 100 s to two hours after its end; the next bright exposure and channel wait until persistence has faded."""
     found = [e for e, _ in exposures({**REMEMBERED, "channels": ["NISP-P", "NISP-S"], "exposures": 2, "lamps": [3]})]
     window, at = MISSION.value("nisp.persistence.window", "d"), 0
     for size in (8, 8, 5, 5):
@@ -258,7 +258,7 @@ def test_darks_after_a_bright_exposure():
         ends = bright.mjd + elapsed_time(bright, MISSION) / 86400.0
         after = [round((dark.mjd - ends) * 86400.0) for dark in darks]
         listed = [100, 300, 600, 1200, 2400, 4800, 7000]
-        # Ramps of spectra take 573 s.
+        # Ramps of NISP-S take 573 s.
         assert after == (listed if bright.channel == "NISP-P" else [100, 1200, 2400, 4800])
         assert (bright.image_type, bright.lamp) == ("flat", 3)
         assert {(dark.image_type, dark.lamp, dark.channel) for dark in darks} == {("persistence", None, bright.channel)}
@@ -269,21 +269,21 @@ def test_darks_after_a_bright_exposure():
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        ({"delays_s": [100.0, 150.0]}, r"delays_s: a dark at 150 s begins before that at 100 s, of 110\.5 s, ends"),
-        ({"delays_s": [7200.0]}, "delays_s: 7200 s is more than nisp.persistence.window looks back"),
-        ({"bright": "sky", "lamps": [3]}, "lamps: bright = 'sky' has no lamp"),
+        ({"delays_s": [100.0, 150.0]}, r"delays_s: the dark at 150 s begins before the dark at 100 s ends"),
+        ({"delays_s": [7200.0]}, "delays_s: 7200 s is too late, nisp.persistence.window allows"),
+        ({"bright": "sky", "lamps": [3]}, "lamps must not be set if bright = 'sky'"),
         ({"bright": "moon"}, "bright"),
         ({"image_type": "dark", "exposures": 1, "delays_s": [100.0]}, "delays_s is not for dark: used by persistence"),
         ({"channels": ["VIS"]}, "image_type = 'persistence' is none of VIS's"),
     ],
 )
-def test_darks_that_cannot_be_asked_for(more, message):
+def test_invalid_persistence_darks_are_refused(more, message):
     with pytest.raises(BadInput, match=message):
         exposures({**REMEMBERED, **more})
 
 
-def test_a_field_of_stars_may_be_what_is_bright():
-    """In its image, or through the grism."""
+def test_a_star_field_as_bright_exposure():
+    """Star fields as images, or through the grism."""
     sky = {**REMEMBERED, "bright": "sky", "delays_s": [300.0]}
     photometry = [e for e, _ in exposures({**sky, "exposures": 2, "bands": ["euclid_h"]})]
     assert [e.image_type for e in photometry] == ["self_calibration", "persistence"] * 2
@@ -293,8 +293,8 @@ def test_a_field_of_stars_may_be_what_is_bright():
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0, -4.0, 3.5])
-def test_the_mission_s_ramp_is_of_whole_numbers(value):
-    """A request that overrides it, or explores it, is refused before anything is made."""
+def test_numbers_of_the_missions_ramp_must_be_integers(value):
+    """A request that overrides or explores the ramp with other numbers is refused before anything is made."""
     key = "nisp.macc.photometric.groups"
     for sections in (
         {"mission": {"overrides": {key: {"value": value, "unit": ""}}}},
@@ -311,7 +311,7 @@ def test_a_ramp_of_too_many_frames_is_refused_with_the_request():
 
 
 @pytest.mark.parametrize(("seconds", "message"), [(20.0, "takes 69.79 s without any drops"), (1e5, "more than 1000")])
-def test_an_exposure_time_that_no_ramp_has_is_refused_by_name(tmp_path, seconds, message):
+def test_an_exposure_time_without_a_ramp_is_refused(tmp_path, seconds, message):
     one = from_table({**BASE, "pointing": [{**POINTING, "exposure_time_s": seconds}]})
     with pytest.raises(BadInput, match=rf"pointing\[0\]: exposure time .*{message}"):
         plan(tmp_path, one)
@@ -320,7 +320,7 @@ def test_an_exposure_time_that_no_ramp_has_is_refused_by_name(tmp_path, seconds,
 
 
 def test_darks_are_in_bands_that_the_block_names():
-    """Fluxes are computed in no others."""
+    """Fluxes are computed only in these bands."""
     dark = {"channels": ["NISP-P"], "image_type": "dark", "exposures": 2}
     assert [e.band for e, _ in exposures(dark)] == ["euclid_y", "euclid_y"]
     assert [e.band for e, _ in exposures({**dark, "bands": ["euclid_h"]})] == ["euclid_h", "euclid_h"]

@@ -1,4 +1,4 @@
-"""Fields of a user's own: wherever they lie, detectors see what was asked for, and the area that is named holds it."""
+"""User fields: the pointing is as requested, and the area in the error message is large enough."""
 
 import re
 import tomllib
@@ -28,25 +28,25 @@ PLACES = [(0.0, 35.0), (359.9999, -35.0), (10.0, 90.0), (200.0, -90.0), (123.0, 
 
 
 def one_visit(ra, dec, angle):
-    """Rows of `exposures` and `tasks` of a field of one exposure."""
+    """Rows of `exposures` and `tasks` of a field with one exposure."""
     block = {"channels": ["VIS"], "ra": ra, "dec": dec, "position_angle": angle, "dither": "none"}
     return plan_exposures.plan(None, made({**block, "flat": False, "short": False}))[1:]
 
 
 @cache
 def upright(ra, dec):
-    """Rows of `tasks` of a field that is not turned, for all of its angles."""
+    """Rows of `tasks` of a field with position angle 0, the reference for all angles."""
     return one_visit(ra, dec, 0.0)[1]
 
 
 @pytest.mark.parametrize(("ra", "dec"), PLACES)
 @pytest.mark.parametrize("angle", [0.0, 359.999, -180.0])
-def test_a_field_is_centred_where_it_was_asked_for(ra, dec, angle):
+def test_a_field_is_centred_on_the_requested_position(ra, dec, angle):
     exposures, rows = one_visit(ra, dec, angle)
     (row,) = exposures.to_pylist()
     assert float(sky.separation(row["ra"], row["dec"], ra, dec)) < 1e-9
     assert (row["position_angle"] - angle + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=1e-9)
-    # The detectors lie around the centre, and the y axis has its angle there: the field turns with it.
+    # The detectors surround the centre, and the y axis has the requested angle.
     east, north = offsets(rows["ra"].to_numpy(), rows["dec"].to_numpy(), row["ra"], dec)
     assert np.abs([east.mean(), north.mean()]).max() < 0.02
     other = upright(ra, dec)
@@ -58,7 +58,7 @@ def test_a_field_is_centred_where_it_was_asked_for(ra, dec, angle):
 
 
 def offsets(ra, dec, ra0, dec0):
-    """deg, east and north on the tangent plane."""
+    """Offsets in deg, east and north on the tangent plane."""
     a, d, d0 = np.radians(ra - ra0), np.radians(dec), np.radians(dec0)
     out = np.sin(d) * np.sin(d0) + np.cos(d) * np.cos(d0) * np.cos(a)
     return (
@@ -68,26 +68,26 @@ def offsets(ra, dec, ra0, dec0):
 
 
 @pytest.mark.parametrize(("ra", "dec"), PLACES)
-def test_the_area_that_is_named_would_do(ra, dec):
+def test_area_in_the_error_message_is_large_enough(ra, dec):
     block = {"channels": ["VIS"], "ra": ra, "dec": dec}
-    with pytest.raises(BadInput, match="this would do") as refused:
+    with pytest.raises(BadInput, match="this area is large enough") as refused:
         plan.check(made(block, ((ra + 180.0) % 360.0, -dec / 2, 0.1)))
     area = tomllib.loads(re.search(r"\[area\] (.*)", str(refused.value))[1])
     plan.check(from_table({**BASE, "area": area, "observation": [block]}))
-    # Not much more than the field of view.
+    # The area is not much larger than the field of view.
     assert area["cone"]["radius"] < 0.8
 
 
-def test_fields_far_from_one_another_are_named_one_by_one():
+def test_distant_fields_give_several_circles():
     blocks = [{"channels": ["VIS"], "ra": ra, "dec": -45.0} for ra in (10.0, 60.0)]
     elsewhere = {"cone": {"ra": 0.0, "dec": 0.0, "radius": 1.0}}
-    with pytest.raises(BadInput, match="this would do") as refused:
+    with pytest.raises(BadInput, match="this area is large enough") as refused:
         plan.check(from_table({**BASE, "area": elsewhere, "observation": blocks}))
     area = tomllib.loads(re.search(r"\[area\] (.*)", str(refused.value))[1])
     assert np.array(area["patches"]) == pytest.approx(np.array([[10, -45, 0.65], [60, -45, 0.65]]), abs=0.15)
 
 
-def test_offsets_are_taken_as_they_are():
+def test_user_offsets_are_not_changed():
     block = {"channels": ["VIS"], "ra": 150.0, "dec": 0.0, "position_angle": 90.0, "short": False, "flat": False}
     _, exposures, _ = plan_exposures.plan(None, made({**block, "dither": [[0, 0], [36.0, 0.0], [0.0, 72.0]]}))
     east, north = offsets(exposures["ra"].to_numpy(), exposures["dec"].to_numpy(), 150.0, 0.0)
@@ -96,7 +96,7 @@ def test_offsets_are_taken_as_they_are():
     np.testing.assert_allclose(3600 * north, [0, 36, 0], atol=1e-3)
 
 
-def test_a_field_without_a_date_is_observed_when_the_sun_allows_and_so_is_each_visit():
+def test_visits_without_a_date_satisfy_the_sun_constraint():
     _, exposures, _ = plan_exposures.plan(None, made({"channels": ["VIS"], "ra": 150.0, "dec": 0.0, "visits": 3}))
     assert set(exposures["visit"].to_pylist()) == {1, 2, 3}
     starts = [min(r["mjd"] for r in exposures.to_pylist() if r["visit"] == v) for v in (1, 2, 3)]

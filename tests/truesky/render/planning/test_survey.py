@@ -1,4 +1,4 @@
-"""From requests to exposures and tasks that miss nothing."""
+"""Exposures and tasks planned from requests, compared with published numbers of the surveys."""
 
 import copy
 import tomllib
@@ -47,7 +47,7 @@ def planned(tmp_path, **sections):
     return exposures, rows
 
 
-def test_the_demo_s_two_detectors_look_at_the_same_place(tmp_path):
+def test_both_detectors_of_the_demo_have_the_same_centre(tmp_path):
     _, exposures, rows = plan(tmp_path, parse(DEMO))
     for task in rows.to_pylist():
         assert float(sky.separation(task["ra"], task["dec"], 53.117, -27.808)) < 1e-9
@@ -56,27 +56,27 @@ def test_the_demo_s_two_detectors_look_at_the_same_place(tmp_path):
     assert exposures["seeing"].to_pylist() == [0.0, pytest.approx(0.73, rel=0.8)]
     space, ground = exposures.to_pylist()
     assert (space["airmass"], space["zenith"]) == (None, None)
-    # Of a dark zenith 32.95 and 28.36.
+    # A dark zenith has 32.95 e-/s/pix; the zero point at airmass 1 is 28.36.
     assert 32.95 < ground["sky"] < 200.0
     assert (space["zero_point"], ground["zero_point"]) == pytest.approx(
         (25.93, 28.36 - 0.126 * (ground["airmass"] - 1.0)), abs=0.01
     )
     assert exposures["survey"].to_pylist() == ["demo", "demo"]
-    # Fewer sources, but each through a PSF of its own colour: it takes longer, and comes first.
+    # The ground detector has fewer sources, but a separate PSF for each colour: it takes longer and comes first.
     assert rows["detector"].to_pylist() == ["3-4", "R22_S11"]
     assert (np.diff(rows["seconds"].to_numpy()) < 0).all()
-    # Four quadrants with pre- and overscan, and two truth maps: the files' bytes.
+    # Bytes of the files: four quadrants with prescan and overscan, and two truth maps.
     assert rows["bytes"].to_pylist()[0] == pytest.approx(35_536_320 + 2 * 67_772_160, rel=1e-3)
 
 
-def test_all_detectors_where_none_is_named(tmp_path):
+def test_all_detectors_by_default(tmp_path):
     exposures, rows = planned(tmp_path, pointing=[{**VIS, "position_angle": 30.0}])
     assert len(rows) == 36
     assert exposures["position_angle"][0].as_py() == 30.0
 
 
 @given(st.floats(0, 360, exclude_max=True), st.floats(-90, 90), st.floats(-360, 360))
-def test_cells_hold_everything_that_a_detector_sees(ra, dec, angle):
+def test_cells_contain_all_that_a_detector_observes(ra, dec, angle):
     exposure = planned_exposures.Exposure(
         "VIS", "vis", "euclid_vis", "science", ra, dec, angle, 60905.0, 560.0, "x", sky=0.2
     )
@@ -88,13 +88,13 @@ def test_cells_hold_everything_that_a_detector_sees(ra, dec, angle):
     detector = camera_detectors.detector("vis", "1-6", MISSION)
     system = astrometry.wcs(detector, *(exposed[k] for k in ("ra", "dec", "position_angle")))
     rng = np.random.default_rng(1)
-    # The margin of a minute of arc, on either axis of the frame.
+    # A margin of one arcmin around the frame.
     margin = 400
     x, y = rng.uniform(-margin, detector.nx + margin, 200), rng.uniform(-margin, detector.ny + margin, 200)
     seen = astrometry.sky_of_pixel(system, x, y)
     assert (sky.separation(task["ra"], task["dec"], *seen) <= task["radius"]).all()
     assert set(sky.cell_at(*seen, 8)) <= set(task["cells"])
-    # Footprints of all detectors at once are those of each one's own projection.
+    # Footprints computed together agree with the projection of a single detector.
     corners = np.array(task["s_region"].split()[2:], float).reshape(4, 2)
     own = astrometry.corners(detector, system)
     assert sky.separation(corners[:, 0], corners[:, 1], own[:, 0], own[:, 1]).max() < 2e-7
@@ -137,7 +137,7 @@ def test_the_sequence_of_a_field(tmp_path):
     assert [r["exposure_time_s"] for r in vis] == [560.53, 89.52, 560.53, 560.53, 560.53, 10.0]
     assert [r["image_type"] for r in vis] == ["science"] * 5 + ["flat"]
     assert [r["dither"] for r in vis] == [1, 1, 2, 3, 4, 4]
-    # The LEDs take turns in the closing flats, from field to field.
+    # The LED of the closing flat changes from field to field.
     more, _ = planned(tmp_path, observation=[{**block, "fields": 24}])
     flats = [r for r in more.to_pylist() if r["image_type"] == "flat"]
     assert {r["lamp"] for r in flats} == {1, 2, 3, 4, 5, 6}
@@ -151,7 +151,7 @@ def test_the_sequence_of_a_field(tmp_path):
     assert [r["mjd"] for r in spectra] == [r["mjd"] for r in vis if r["exposure_time_s"] == 560.53]
 
 
-def test_dithers_step_as_they_should(tmp_path):
+def test_steps_of_the_dithers(tmp_path):
     exposures, _ = planned(tmp_path, observation=[{"channels": ["NISP-S"], "fields": 25}])
     by_field = {}
     for row in exposures.to_pylist():
@@ -164,7 +164,7 @@ def test_dithers_step_as_they_should(tmp_path):
         steps.append(np.diff(np.stack([x, y]), axis=1))
     steps = np.array(steps)
     np.testing.assert_allclose(steps.mean(axis=0), [[50, 0, 50], [100, 100, 100]], atol=3 * 11 / 3 / 5)
-    # A random error of 11 arcsec at three sigma after each step.
+    # The random error of each step is 11 arcsec at three sigma.
     assert steps.std(axis=0).mean() == pytest.approx(11 / 3, rel=0.2)
 
 
@@ -176,14 +176,14 @@ def test_patterns_of_dithers(tmp_path):
     assert none["dither"].to_pylist() == [1, 1]
 
 
-def test_fields_cover_their_area_and_look_away_from_the_sun(tmp_path):
+def test_fields_cover_the_area_within_the_sun_constraint(tmp_path):
     found = reference_survey.wide(made().area, MISSION, 60200.0)
     assert len({field.number for field in found}) == len(found)
     for field in found:
         assert 87 <= solar_aspect.solar_aspect(field.ra, field.dec, field.mjd) <= 110
         assert field.mjd >= 60200.0
     assert (np.diff([field.mjd for field in found]) >= MISSION.value("svm.field_time", "d") - 1e-9).all()
-    # Any place of the area lies in the field of view of some field.
+    # Every position of the area lies in the field of view of some field.
     rng = np.random.default_rng(3)
     ra, dec = 150 + 0.5 * rng.uniform(-1, 1, 300), 20 + 0.45 * rng.uniform(-1, 1, 300)
     inside = np.zeros(ra.size, bool)
@@ -202,7 +202,7 @@ def test_the_lattice_does_not_depend_on_the_area():
     assert all(where[n] == (a, d) for n, a, d in zip(*small, strict=True))
 
 
-def test_deep_fields_are_visited_again(tmp_path):
+def test_visits_of_deep_fields(tmp_path):
     block = {"channels": ["NISP-S"], "survey": "deep", "image_type": "deep", "fields": 3, "visits": 4, "blue": True}
     pole = {"cone": {"ra": 269.7, "dec": 66.0, "radius": 0.6}}
     exposures, _ = planned(tmp_path, area=pole, observation=[block])
@@ -230,7 +230,7 @@ def test_the_deep_fields_have_their_published_areas(name, area):
 # ------------------------------------------------------------------------------------------------ exploration
 
 
-def test_an_exploration_is_the_product_of_requests(tmp_path):
+def test_an_exploration_has_all_combinations(tmp_path):
     explore = {"vis.read_noise": {"values": [4.0, 5.0, 6.0], "unit": "electron"}, "accuracy": ["draft", "survey"]}
     pointing = [{**VIS, "detectors": ["3-4"]}]
     exposures, rows = planned(tmp_path, pointing=pointing, explore=explore)
@@ -238,14 +238,14 @@ def test_an_exploration_is_the_product_of_requests(tmp_path):
     own = [variants.variant(s, MISSION, accuracy.SURVEY, {}) for s in exposures["settings"].to_pylist()]
     assert sorted({v.mission.value("vis.read_noise") for v in own}) == [4.0, 5.0, 6.0]
     assert {v.accuracy.flux for v in own} == {5e-3, 1e-3}
-    # Each variant has the same noise but for what it changes.
+    # The variants have the same noise except where parameters change it.
     assert len({image_types.identity(ExposureRow.from_row(row)) for row in exposures.to_pylist()}) == 1
     forced = variants.variant('{"effects.bleeding": false}', MISSION, accuracy.SURVEY, {"bleeding": True}).forced
     assert forced == {"bleeding": False}
 
 
-def test_exposures_alike_are_numbered(tmp_path):
-    """Of the same camera, band, place, angle and time; each request of an exploration begins anew."""
+def test_realisations_are_numbered(tmp_path):
+    """Exposures with the same camera, band, position, angle and time are numbered, separately in each variant."""
     twice, other = {**VIS, "realisations": 2}, {**VIS, "mjd": 60906.0}
     explored = {"effects.poisson": [True, False]}
     exposures, rows = planned(tmp_path, pointing=[twice, other, {**VIS, "detectors": ["3-4"]}], explore=explored)
@@ -253,7 +253,7 @@ def test_exposures_alike_are_numbered(tmp_path):
     identities = [image_types.identity(ExposureRow.from_row(row)) for row in exposures.to_pylist()]
     assert len(set(identities)) == 4
     assert identities[:4] == identities[4:]
-    # The first is what it is alone, also in lakes that have not numbered it.
+    # The first realisation has the same noise as an exposure without a number.
     (alone,) = planned(tmp_path, pointing=[VIS])[0].to_pylist()
     row = ExposureRow.from_row({**alone, "realisation": None})
     assert (
@@ -264,11 +264,11 @@ def test_exposures_alike_are_numbered(tmp_path):
     assert len(rows) == 2 * (36 * 3 + 1)
     block = {"channels": ["VIS"], "image_type": "bias", "exposures": 2, "realisations": 3}
     found, _ = planned(tmp_path, observation=[block, {**block, "image_type": "dark", "realisations": 1}])
-    # The first bias and the first dark would have the same read noise.
+    # Otherwise the first bias and the first dark would have the same read noise.
     assert found["realisation"].to_pylist() == [1, 2, 3, 1, 2, 3, 4, 1]
 
 
-def test_a_pointing_in_front_changes_nobody_else_s_noise(tmp_path):
+def test_an_additional_pointing_does_not_change_other_noise(tmp_path):
     first, second = {**VIS, "detectors": ["1-1"]}, {**VIS, "mjd": 60906.0, "detectors": ["1-1"]}
     alone, _ = planned(tmp_path, pointing=[second])
     both, _ = planned(tmp_path, pointing=[first, second])
@@ -281,7 +281,7 @@ def test_a_pointing_in_front_changes_nobody_else_s_noise(tmp_path):
 
 
 def layers(exposures, ra, dec):
-    """[n] How many exposures of a camera see each place, gaps between its detectors left out."""
+    """Number of exposures of a camera, shape [n], that observe each position; gaps between detectors are ignored."""
     assert {e.position_angle for e in exposures} == {0.0}
     east, north, out = basis(*np.array([(e.ra, e.dec) for e in exposures]).T)
     places = basis(ra, dec)[2]
@@ -298,8 +298,8 @@ def layers(exposures, ra, dec):
     return np.bincount(which, (inside[0] & inside[1]).sum(axis=1), len(ra))
 
 
-def test_ground_surveys_see_the_main_run_as_often_as_theirs_did():
-    """Serrano et al. 2024, their table of exposures and layers."""
+def test_numbers_of_layers_of_ground_surveys():
+    """Compare with the table of exposures and layers of Serrano et al. 2024."""
     wanted = parse(DEMO.with_name("sc8_main.toml"))
     rules = [rule for rule in MISSION.rows("survey.external") if int(rule["exposures"])]
     assert len(wanted.observations) == 1 + len(rules)
@@ -322,8 +322,8 @@ def test_ground_surveys_see_the_main_run_as_often_as_theirs_did():
 # ------------------------------------------------------------------------------------------------ pilot phase
 
 
-def test_the_pilot_phase_counts_exactly():
-    """Serrano et al. 2024, the table of the pilot phase's products."""
+def test_exposure_counts_of_the_pilot_phase():
+    """Compare with the table of the pilot phase's products in Serrano et al. 2024."""
     own = [e for e, _ in survey.exposures(parse(DEMO.with_name("sc8_pilot.toml")), MISSION)]
     count = Counter((e.channel, e.survey, e.image_type) for e in own)
     ground = {"des": 76, "lsst": 65, "cfis": 14, "jedis": 23, "ps1": 40, "wishes": 7}
@@ -355,8 +355,8 @@ def test_the_pilot_phase_counts_exactly():
 
 
 @pytest.mark.parametrize(("name", "fields"), [("sc8_main", 331), ("sc8_deep", 3 * 10)])
-def test_the_main_and_the_deep_run_count_by_their_fields(name, fields):
-    """Serrano et al. 2024, their tables; of the main run's three bands they print 3948."""
+def test_exposure_counts_of_the_main_and_deep_runs(name, fields):
+    """Compare with the tables of Serrano et al. 2024, which have 3948 for the three bands of the main run."""
     wanted = parse(DEMO.with_name(f"{name}.toml"))
     own = survey.exposures(replace(wanted, observations=wanted.observations[:1]), MISSION)
     count = Counter(e.channel for e, _ in own)
@@ -364,7 +364,7 @@ def test_the_main_and_the_deep_run_count_by_their_fields(name, fields):
     assert len({(e.field, e.visit) for e, _ in own}) == fields
 
 
-def test_other_requests_are_good():
+def test_other_requests_can_be_planned():
     files = sorted(DEMO.parent.glob("*.toml"))
     assert DEMO in files
     for path in files:

@@ -1,4 +1,4 @@
-"""Which of a plan's detectors are rendered now."""
+"""Selection of the tasks to render, and the cost of persistence."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +17,7 @@ DEMO = Path(__file__).parents[4] / "requests" / "demo.toml"
 
 @pytest.fixture(scope="module")
 def plan(tmp_path_factory):
-    """Three detectors of two exposures."""
+    """Plan with three detectors of two exposures."""
     pointings = [{**VIS, "detectors": ["3-4", "1-1", "6-6"], "ra": ra} for ra in (53.0, 54.0)]
     return planned(tmp_path_factory.mktemp("plan"), pointing=pointings)[1]
 
@@ -28,12 +28,12 @@ def places(plan, **wanted):
     ]
 
 
-def test_all_of_a_plan_unless_a_part_is_asked_for(plan):
+def test_all_tasks_unless_detectors_or_a_limit_are_given(plan):
     whole = places(plan)
     assert len(whole) == 6
     assert whole == [(row["exposure_id"], row["detector"]) for row in plan.to_pylist()]
     assert places(plan, detectors=("6-6",)) == [place for place in whole if place[1] == "6-6"]
-    # The first by exposure and name, wherever they stand in the plan, and in its order.
+    # The first tasks by exposure and detector name, in the order of the plan.
     assert sorted(places(plan, limit=2)) == sorted(whole)[:2]
     assert sorted(places(plan, limit=4)) == sorted(whole)[:4]
     assert places(plan, limit=4) == [place for place in whole if place in sorted(whole)[:4]]
@@ -44,13 +44,13 @@ def test_all_of_a_plan_unless_a_part_is_asked_for(plan):
 @pytest.mark.parametrize(
     ("wanted", "said"), [({"detectors": ("3-4", "7-7")}, "7-7 is not in the plan"), ({"limit": 0}, "limit = 0")]
 )
-def test_what_is_not_in_a_plan_is_refused(plan, wanted, said):
+def test_unplanned_detectors_are_refused(plan, wanted, said):
     with pytest.raises(BadInput, match=said):
         places(plan, **wanted)
 
 
-def test_what_earlier_exposures_left_is_drawn_again_and_takes_its_time(tmp_path, monkeypatch):
-    """Of NISP each image of the sky in the window before; of VIS none, nor of frames without a sky."""
+def test_redrawing_for_persistence_adds_time(tmp_path, monkeypatch):
+    """NISP redraws images of the sky in the persistence window, but not frames without sky; VIS redraws nothing."""
     blocks = [
         {"channels": ["VIS", "NISP-P", "NISP-S"], "fields": 1, "mjd": 60400.0, "short": False, "flat": False},
         {"channels": ["NISP-P"], "image_type": "dark", "exposures": 2},

@@ -1,4 +1,4 @@
-"""Headers in a camera's own words: of DECam, by the sections that its pipeline cuts a raw frame with."""
+"""Camera-specific headers: the sections that DECam's pipeline uses to trim a raw frame."""
 
 import re
 
@@ -11,12 +11,12 @@ from tests.truesky.render.products import test_tools as tools
 from truesky.render.camera.detectors import detectors
 from truesky.render.products import camera_cards
 
-# Of the numbers that DECam's CCDs are known by.
+# Some of the numbers of DECam's CCDs.
 NUMBERS = {"S29": 1, "S25": 4, "S1": 25, "S4": 28, "S7": 31, "N1": 32, "N4": 35, "N30": 61, "N31": 62}
 
 
 def ends(text):
-    """First and last column, and row, of a section, in the order in which it has them."""
+    """First and last column and row of a section, in the order in which it lists them."""
     x0, x1, y0, y1 = map(int, re.fullmatch(r"\[(\d+):(\d+),(\d+):(\d+)\]", text).groups())
     return (x0, x1), (y0, y1)
 
@@ -39,7 +39,7 @@ def test_a_ccd_has_its_number_and_its_name(decam):
 
 
 def test_sections_of_both_amplifiers_cover_the_frame(decam):
-    """Each pixel of it is of one part of one amplifier, but for the corners of the overscans."""
+    """Each pixel belongs to one section of one amplifier, except for the corners of the overscans."""
     one, header, pixels = decam
     seen = np.zeros(pixels.shape, int)
     for letter in "AB":
@@ -54,7 +54,7 @@ def test_sections_of_both_amplifiers_cover_the_frame(decam):
     for letter in "AB":
         assert data[tools.window(header[f"DATASEC{letter}"])].all()
         assert not data[tools.window(header[f"POSTSEC{letter}"])].any()
-    # No light is in what is no pixel.
+    # Pixels outside the detector have no light.
     sky = np.median(pixels[tools.window(header["DATASECA"])])
     for letter in "AB":
         level = np.median(pixels[tools.window(header[f"BIASSEC{letter}"])])
@@ -78,7 +78,7 @@ def test_amplifiers_are_read_from_their_own_sides(decam):
     assert rows[0] < rows[1]
 
 
-def test_numbers_are_each_amplifiers(decam):
+def test_values_of_each_amplifier(decam):
     one, header, _ = decam
     for key, unit, name in (("gain", "electron / adu", "GAIN"), ("read_noise", "electron", "RDNOISE")):
         values = np.broadcast_to(one.scene.amplifier_values(key, unit), 2)
@@ -88,5 +88,5 @@ def test_numbers_are_each_amplifiers(decam):
     assert 30_000.0 < header["SATURATE"] < 65_535.0
 
 
-def test_a_camera_of_which_nobody_has_told_has_none():
+def test_other_cameras_have_no_such_cards():
     assert camera_cards.cards(tools.stars_on("jpcam", 0.05)) == ()

@@ -1,4 +1,4 @@
-"""Products: files that stand alone, and rows that say what they are."""
+"""FITS files of a detector and their rows of `products`."""
 
 from dataclasses import asdict, replace
 
@@ -46,7 +46,7 @@ def test_rows_are_as_declared(rendered, written):
         assert row["mission"] == rendered.scene.mission.fingerprint
 
 
-def test_truth_is_written_where_it_is_wanted(rendered):
+def test_requested_truth_maps_are_written(rendered):
     rows, writers = fits_files.products(rendered, truth=())
     assert rows["content"].to_pylist() == ["science"]
     (path,) = rows["path"].to_pylist()
@@ -55,15 +55,15 @@ def test_truth_is_written_where_it_is_wanted(rendered):
 
 @pytest.mark.parametrize("content", [name for name, _ in CONTENTS if name != "science"])
 def test_the_unit_of_a_truth_map_fits_its_card(rendered, content):
-    """A comment that is too long for a card is refused when the file is written."""
+    """Comments that are too long for a card are refused when the file is written."""
     keyword, unit, comment = headers.truth_cards(rendered, content)[-1]
     assert keyword == "BUNIT"
     assert unit in ("electron", "adu", "")
     assert len(f"{keyword:8}= {unit!r:20} / {comment}") <= 80
 
 
-def test_beside_an_image_lies_where_it_is_on_the_sky(rendered, written):
-    """Of each of its arrays, in their order, in the form that tools read: the same place as in the file."""
+def test_head_file_has_the_wcs_of_the_image(rendered, written):
+    """The head file has the same WCS as each array of the file, in file order and in the convention of the tools."""
     folder, rows = written
     assert rows.num_rows == 2
     for path in rows["path"].to_pylist():
@@ -81,14 +81,14 @@ def test_beside_an_image_lies_where_it_is_on_the_sky(rendered, written):
             np.testing.assert_allclose(theirs, ours, atol=1e-10)
 
 
-def test_images_without_a_place_have_nothing_beside(rendered):
+def test_images_without_wcs_have_no_head_file(rendered):
     assert head_files.text([images.Image(np.zeros((4, 4), np.uint8), (("EXPTIME", 1.0, ""),))]) == ""
     cube = images.Image(np.zeros((2, 4, 4), np.uint8), astrometry.cards(rendered.wcs))
     assert head_files.text([images.Image(None, astrometry.cards(rendered.wcs)), cube]) == ""
 
 
 @pytest.mark.parametrize("convention", ["sip", "tpv"])
-def test_usually_the_distortion_is_as_the_pipeline_reads_it(rendered, monkeypatch, convention, tmp_path):
+def test_default_convention_of_the_distortion(rendered, monkeypatch, convention, tmp_path):
     known = observatories.for_camera("vis")
     assert known.convention == "sip"
     monkeypatch.setitem(observatories._OBSERVATORIES, "vis", replace(known, convention=convention))
@@ -98,8 +98,8 @@ def test_usually_the_distortion_is_as_the_pipeline_reads_it(rendered, monkeypatc
         assert astropy_fits.getheader(tmp_path / "one.fits", number)["CTYPE1"].endswith(convention.upper())
 
 
-def test_headers_may_tell_the_distortion_as_tpv(rendered, tmp_path):
-    """Of every image with a place on the sky, which stays where it is."""
+def test_headers_with_tpv_have_the_same_wcs(rendered, tmp_path):
+    """The WCS of every image is the same in both conventions."""
     rows, writers = fits_files.products(rendered, ("noise_free",), wcs="tpv")
     d = rendered.detector
     for number, path in enumerate(rows["path"].to_pylist()):
@@ -127,7 +127,7 @@ def test_the_header_calibrates_the_image(rendered, written):
     header = astropy_fits.getheader(folder / rows["path"][0].as_py())
     electrons = read_back.electrons(folder / rows["path"][0].as_py()).data
     diffuse = (header["SKYRATE"] + header["DARKRATE"]) * header["EXPTIME"]
-    # What is left: the first columns settle, and the amplifier's response is not linear.
+    # Remaining differences: the first columns settle, and the response of the amplifier is not linear.
     assert np.median(electrons - rendered.noise_free) - diffuse == pytest.approx(0.0, abs=2.0)
     for key, value in (
         ("BUNIT", "adu"),
@@ -144,8 +144,8 @@ def test_the_header_calibrates_the_image(rendered, written):
     assert "dark_current: on" in header[f"EFFECT{names.index('dark_current') + 1}"]
 
 
-def test_the_header_tells_what_was_allowed_and_what_was_reached(rendered, written):
-    """All four numbers, of drawing and of charge transfer."""
+def test_header_has_allowed_and_expected_errors(rendered, written):
+    """All four errors, of drawing and of charge transfer."""
     folder, rows = written
     header = astropy_fits.getheader(folder / rows["path"][0].as_py())
     applied = [decision.name for decision in rendered.decisions if decision.applied]
@@ -160,8 +160,8 @@ def test_the_header_tells_what_was_allowed_and_what_was_reached(rendered, writte
 
 
 @pytest.mark.parametrize("preset", accuracy.PRESETS)
-def test_drawing_and_charge_transfer_together_are_within_what_is_allowed(preset):
-    """On a whole detector at its age, with both directions of transfer."""
+def test_total_error_is_within_the_allowed_error(preset):
+    """On a whole detector at the end of the mission, with both directions of transfer."""
     wanted = accuracy.PRESETS[preset]
     mission = resolve()
     scene = Scene(mission, "vis", 560.0, 0.25, 1e5, detectors.detector("vis", "3-4", mission), accuracy=wanted)
@@ -173,8 +173,8 @@ def test_drawing_and_charge_transfer_together_are_within_what_is_allowed(preset)
 
 
 @pytest.mark.parametrize("forced", [{}, nominal.off("nonlinearity"), {"parallel_cti": True, "serial_cti": True}])
-def test_what_reads_no_less_than_saturate_is_full(tmp_path, forced):
-    """A star of 8 mag: all of its full pixels, and of those that are not, next to none."""
+def test_pixels_above_saturate_are_saturated(tmp_path, forced):
+    """A star of 8 mag: all saturated pixels, and almost no others, are at or above SATURATE."""
     one = nominal.rendered(small("vis", "3-4", 256), [8.0], [100.3], [90.2], forced=forced, truth=("saturation",))
     rows, writers = fits_files.products(one, ("saturation",))
     path = rows["path"][0].as_py()
@@ -186,11 +186,11 @@ def test_what_reads_no_less_than_saturate_is_full(tmp_path, forced):
     assert full.sum() > 2000
     assert np.all(found.data[full] >= level)
     assert np.sum(found.data[~full] >= level) < 0.02 * full.sum()
-    # The lowest of them is not far above.
+    # The lowest saturated pixel is not far above the level.
     assert found.data[full].min() - level < 0.01 * level
 
 
-def test_quadrants_are_extensions_with_their_own_place_on_the_sky(rendered, written):
+def test_quadrants_are_extensions_with_separate_wcs(rendered, written):
     folder, rows = written
     with astropy_fits.open(folder / rows["path"][0].as_py(), checksum=True) as units:
         assert [unit.name for unit in units[1:]] == ["3-4.E", "3-4.F", "3-4.G", "3-4.H"]
@@ -202,8 +202,8 @@ def test_quadrants_are_extensions_with_their_own_place_on_the_sky(rendered, writ
             assert unit.data[round(float(y)), round(float(x))] == rendered.science[at[1], at[0]]
 
 
-def test_the_halves_of_a_detector_lie_apart_on_the_sky(tmp_path):
-    """A star in each half, and one between them: in its quadrant where the header says, and nowhere."""
+def test_gap_between_the_halves_of_a_detector(tmp_path):
+    """A star in each half is in its quadrant at the position of the header; a star in the gap is nowhere."""
     detector = replace(small("vis", "3-4", 260), middle=4)
     quiet = nominal.off(*nominal.COSMIC_RAYS, *nominal.CHARGE)
     one = nominal.rendered(

@@ -1,4 +1,4 @@
-"""Headers: what tools look for, in every array, and true."""
+"""Headers have the keywords that tools need in every array, with correct values."""
 
 import re
 
@@ -41,14 +41,14 @@ def science(one, tmp_path, **options):
 
 
 def window(text):
-    """A section as slices of an array."""
+    """Return a section as slices of an array."""
     x0, x1, y0, y1 = (int(n) for n in re.fullmatch(r"\[(\d+):(\d+),(\d+):(\d+)\]", text).groups())
     return slice(y0 - 1, y1), slice(x0 - 1, x1)
 
 
 @pytest.mark.parametrize("rice", [False, True])
 @pytest.mark.parametrize("channel", ["VIS", "EXT"])
-def test_every_array_has_what_tools_look_for(channel, rice, tmp_path):
+def test_every_array_has_the_keywords_that_tools_need(channel, rice, tmp_path):
     one = render(channel, exposed={"airmass": None if channel == "VIS" else 1.2})
     with science(one, tmp_path, rice=rice) as units:
         arrays = [unit.header for unit in units if unit.header["NAXIS"]]
@@ -66,8 +66,8 @@ def test_every_array_has_what_tools_look_for(channel, rice, tmp_path):
         assert first.get("AIRMASS") == one.exposure.airmass
 
 
-def test_sections_of_quadrants_put_the_detector_together(tmp_path):
-    """And none of its pixels is taken for the bias."""
+def test_sections_of_quadrants_form_the_detector(tmp_path):
+    """The sections do not include pixels of the bias."""
     one = render("VIS")
     found = np.zeros_like(one.science)
     with science(one, tmp_path) as units:
@@ -94,8 +94,8 @@ def test_times_of_lsst_are_tai(tmp_path):
     assert start.mjd - one.exposure.mjd > 30.0 / 86400.0
 
 
-def test_read_noise_is_the_detectors_though_it_was_not_drawn(tmp_path):
-    """As where a request forbids it."""
+def test_rdnoise_is_given_if_read_noise_is_not_drawn(tmp_path):
+    """For example if the request forces the effect off."""
     for forced, drawn in (({}, 1.0), (nominal.off("read_noise"), 0.0)):
         one = render("EXT", forced=forced, exposed={"sky": 0.0})
         of_detector = np.mean(one.scene.amplifier_values("read_noise", "electron"))
@@ -104,8 +104,8 @@ def test_read_noise_is_the_detectors_though_it_was_not_drawn(tmp_path):
             assert units[0].header["RDNDRAWN"] == pytest.approx(drawn * of_detector, abs=1e-9)
 
 
-def test_where_a_bright_sky_hides_the_read_noise(tmp_path):
-    """HSC in z: the effect switches itself off, the detector has it all the same."""
+def test_rdnoise_under_a_bright_sky(tmp_path):
+    """HSC in z: read noise is not drawn, but RDNOISE has the value of the detector."""
     detector = small("hsc", detectors.detectors("hsc", MISSION)[50].name, 128)
     none = fields.galaxies([], []), fields.stars([], [])
     exposed = {"channel": "EXT", "camera": "hsc", "band": "hsc_z", "exposure_time_s": 200.0, "sky": 34.0, "seeing": 0.7}

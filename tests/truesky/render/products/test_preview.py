@@ -1,4 +1,4 @@
-"""Pictures: that they are drawn, with what they should show, the right way up."""
+"""Preview pictures show the image with its labels, north up."""
 
 import numpy as np
 import pytest
@@ -21,14 +21,14 @@ def test_a_picture_is_drawn(channel, tmp_path):
     preview.picture(path, one.science, headers.science_cards(one), names)
     pixels = imread(path)
     assert pixels.shape == (960, 1320, 4)
-    # Not all dark, not all white, and the overview has structure.
+    # The picture is neither black nor white, and the overview has structure.
     assert 0.02 < pixels[..., :3].mean() < 0.6
     assert pixels[100:900, 50:900, :3].std() > 0.05
     preview.picture(tmp_path / "b.png", one.science, headers.science_cards(one), names)
     assert (tmp_path / "b.png").read_bytes() == path.read_bytes()
 
 
-def test_without_sources_there_is_still_a_picture(tmp_path):
+def test_a_picture_without_sources(tmp_path):
     one = render("VIS", flux=0.0)
     preview.picture(tmp_path / "a.png", one.science, headers.science_cards(one), [])
     assert (tmp_path / "a.png").stat().st_size > 10_000
@@ -55,15 +55,15 @@ def test_shrinking_keeps_the_mean():
     assert small.mean() == pytest.approx(image[:40, :30].mean())
 
 
-def test_labels_stand_apart():
+def test_labels_do_not_overlap():
     names = [Label(float(x), 0.0, "star", float(x), "") for x in range(10)]
     assert [n.column for n in preview_labels.without_overlaps(names, 2.5, 1.0, 4)] == [0.0, 3.0, 6.0, 9.0]
-    # The brightest keeps its name, whatever its kind, and does not use up another kind's.
+    # The brightest source keeps its label, whatever its kind, and does not count for the other kind.
     galaxy = Label(0.0, 0.5, "galaxy", 9.0, "")
     assert preview_labels.without_overlaps([galaxy, *names], 2.5, 1.0, 2) == [galaxy, names[3], names[6]]
 
 
-def test_cosmic_rays_are_mended_from_around_them():
+def test_cosmic_rays_are_replaced_by_neighbouring_pixels():
     image = np.add.outer(np.arange(40.0), np.zeros(30))
     hit = np.zeros(image.shape, bool)
     hit[20, 3:25] = hit[0, 0] = True
@@ -75,7 +75,7 @@ def test_cosmic_rays_are_mended_from_around_them():
     np.testing.assert_array_equal(everything, spoiled)
 
 
-def test_of_many_images_each_kind_is_shown_first():
+def test_selection_shows_each_channel_and_band_first():
     kinds = [("VIS", "v")] * 4 + [("EXT", "r"), ("EXT", "g"), ("EXT", "r")]
     rows = [{"channel": channel, "band": band, "number": i} for i, (channel, band) in enumerate(kinds)]
 

@@ -1,4 +1,4 @@
-"""Raw frames whose headers are not sure of their place: what is wrong, how it is found, and who has the truth."""
+"""Pointing errors in raw headers: their size, their recovery, and the files with the true WCS."""
 
 import re
 import subprocess
@@ -32,7 +32,7 @@ def believed(place, number=None, camera="decam", seed=SEED, own=MISSION):
 
 
 def apart(one, other):
-    """East and north of one boresight as seen from the other, and its turn, arcsec."""
+    """East and north offset, and rotation, between two boresights, arcsec."""
     here, there = (SkyCoord(*place[:2], unit="deg") for place in (one, other))
     east, north = here.spherical_offsets_to(there)
     turned = there.position_angle(here).deg - here.position_angle(there).deg - 180.0
@@ -40,20 +40,20 @@ def apart(one, other):
     return east.arcsec, north.arcsec, 3600.0 * turn
 
 
-def test_errors_are_of_the_missions_size():
+def test_rms_errors_are_those_of_the_mission():
     found = np.array([apart((ra, -30.0, 5.0), believed((ra, -30.0, 5.0))) for ra in np.linspace(0.0, 90.0, 150)])
     np.testing.assert_allclose(found.std(axis=0), (3.0, 3.0, 30.0), rtol=0.2)
     assert (np.abs(found.mean(axis=0)) < 0.3 * found.std(axis=0)).all()
 
 
-def test_they_are_of_the_pointing_and_of_the_seed():
-    """Not of the noise, and not of the detector."""
+def test_errors_depend_on_pointing_and_seed():
+    """The errors do not depend on the noise or on the detector."""
     assert believed(POINTED) == believed(POINTED, 2)
     assert believed(POINTED) != believed(POINTED, seed=2)
     assert believed(POINTED) != believed((53.1, -27.8, 13.0))
 
 
-def test_a_camera_without_errors_says_where_it_looks():
+def test_a_camera_without_errors_has_the_true_pointing():
     assert believed(POINTED, camera="lsstcam") == POINTED
     own = MISSION.with_overrides({"ext.lsstcam.header.offset": (5.0, "arcsec")})
     east, north, turn = apart(POINTED, believed(POINTED, camera="lsstcam", own=own))
@@ -62,8 +62,8 @@ def test_a_camera_without_errors_says_where_it_looks():
 
 
 @given(dec=st.floats(-90.0, 90.0), ra=st.floats(0.0, 359.0))
-def test_they_are_as_small_at_the_poles(dec, ra):
-    """What each pixel sees moves by a few sigma at most, wherever meridians meet."""
+def test_errors_are_not_larger_at_the_poles(dec, ra):
+    """At the poles, too, the position of each pixel moves by a few sigma at most."""
     one = detector("decam", "N4", MISSION)
     exposed = fields.exposure(channel="EXT", camera="decam", band="des_r", ra=ra, dec=dec)
     systems = [
@@ -87,7 +87,7 @@ def chips(tmp_path_factory):
 
 
 def test_a_linear_fit_finds_offset_and_rotation(chips):
-    """From what is detected in both; what is left is below 15 mas."""
+    """Fit sources detected in both files; residuals are below 15 mas."""
     told, true = [], []
     for field in chips:
         ((header, pixels),) = tools.arrays(field.path)
@@ -106,23 +106,23 @@ def test_a_linear_fit_finds_offset_and_rotation(chips):
     (u, v), (x, y) = (
         np.concatenate([system.all_world2pix(c.ra.deg, c.dec.deg, 0) for c in some], axis=1) for some in (told, true)
     )
-    # What the true positions are of those in the headers: shift, and a linear map.
+    # Shift and linear map from the positions in the headers to the true positions.
     terms = np.stack([np.ones_like(u), u, v], axis=1)
     (fit_x, *_), (fit_y, *_) = (np.linalg.lstsq(terms, axis, rcond=None) for axis in (x, y))
     left = np.stack([x - terms @ fit_x, y - terms @ fit_y])
     assert 1e3 * left.std() < 15.0
     east, north, turn = apart(POINTED, place)
-    # The believed boresight looks at the true one.
+    # The commanded boresight maps to the true one.
     at = np.array([1.0, east, north])
     np.testing.assert_allclose((at @ fit_x, at @ fit_y), (0.0, 0.0), atol=0.05)
     assert np.hypot(east, north) > 1.0
-    # North through east: as seen from inside the sky turns the other way round.
+    # The angle increases from north through east, so that the rotation has the opposite sign in the tangent plane.
     measured = np.degrees(0.5 * (fit_x[2] - fit_y[1])) * 3600.0
     assert measured == pytest.approx(-turn, abs=1.0)
     assert abs(turn) > 3.0
 
 
-def test_the_truth_is_beside_it_and_in_what_is_read_back(chips):
+def test_head_file_and_read_back_have_the_true_wcs(chips):
     for field in chips:
         ((header, _),) = tools.arrays(field.path)
         (true,) = tools.said(field.path)
@@ -143,8 +143,8 @@ def test_the_truth_is_beside_it_and_in_what_is_read_back(chips):
 
 
 @pytest.mark.parametrize("way", ["amplifiers", "electrons"])
-def test_other_forms_of_a_frame_know_no_more(way, tmp_path):
-    """In each of their headers; what is read back has the truth."""
+def test_all_forms_of_a_raw_frame_have_the_error(way, tmp_path):
+    """All forms of a raw frame have the error in their headers; read_back returns the true WCS."""
     one = tools.stars_on("decam", 0.05, small("decam", "N31", tools.SIDE), POINTED, MISSION, way=way)
     path = tools.put(one, tmp_path).path
     with tools.fits.open(path) as units:
@@ -159,8 +159,8 @@ def test_other_forms_of_a_frame_know_no_more(way, tmp_path):
         np.testing.assert_allclose(astrometry.from_cards(cards).wcs.crpix, one.wcs.wcs.crpix, rtol=1e-12)
 
 
-def test_scamp_recovers_the_place_of_four_dithered_frames(tmp_path):
-    """From the headers as they are, and a catalogue of the stars."""
+def test_scamp_recovers_the_pointing_of_four_dithered_frames(tmp_path):
+    """SCAMP starts from the raw headers and a catalogue of the stars."""
     command = tools.tool("scamp")
     tools.tool("source-extractor")
     one = small("decam", "N4", 1024)
@@ -177,7 +177,7 @@ def test_scamp_recovers_the_place_of_four_dithered_frames(tmp_path):
         field = tools.put(
             tools.stars_on("decam", 0.05, one, (place.ra.deg, place.dec.deg, POINTED[2]), MISSION, stars), folder
         )
-        # What source-extractor would take in place of the header.
+        # SExtractor would use the head file instead of the header.
         field.path.with_suffix(".head").rename(folder / "true")
         found = tools.extracted(field.path, "FITS_LDAC")
         found.rename(tmp_path / f"{number}.cat")
@@ -202,7 +202,7 @@ def test_scamp_recovers_the_place_of_four_dithered_frames(tmp_path):
 
 
 def off_stars(field, header):
-    """mas rms along each axis of where a header has the stars."""
+    """rms offset in mas along each axis of the stars' positions in a header."""
     data = tools.window(tools.arrays(field.path)[0][0]["DATASEC"])
     x, y = (
         axis + data[1 - i].start

@@ -1,4 +1,4 @@
-"""The same sky by several cameras: what lies where, whatever a detector's scale and turn."""
+"""Pictures of the same sky by several cameras with different pixel scales and position angles."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ from truesky.render.camera import astrometry, detectors
 from truesky.render.products import same_sky
 
 MISSION = resolve()
-# Camera, detector, channel, band, position angle: of pixels of 0.1, 0.3, 0.2 arcsec.
+# Camera, detector, channel, band, position angle; the pixels have 0.1, 0.3 and 0.2 arcsec.
 CAMERAS = (
     ("vis", "3-4", "VIS", "euclid_vis", 25.0),
     ("nisp", "DET22", "NISP-P", "euclid_y", 25.0),
@@ -21,25 +21,25 @@ CAMERAS = (
     ("lsstcam", "R22_S11", "EXT", "lsst_z", 0.0),
 )
 PLACE = 150.0, 2.0
-# Of three stars from the place, to the east and to the north, arcsec; their electrons.
+# Offsets of three stars to the east and north, arcsec, and their electrons.
 STARS = ((0.0, 0.0, 4e4), (30.0, 0.0, 3e4), (0.0, 40.0, 2e4))
 
 
 def _middle(detector):
-    """Of a detector as much as holds the patch, wherever the place lies in it."""
+    """Return the part of a detector that contains the patch, wherever the position lies in the patch."""
     side = round((same_sky.SIDE + 60.0) / detector.pixel_scale)
     return replace(detector, nx=side, ny=side, middle=0)
 
 
 @pytest.fixture(scope="module")
 def rows(tmp_path_factory):
-    """An image of each camera with the stars on it, whose place lies a few arcsec from its middle."""
+    """Return an image of each camera with the stars; the position lies a few arcsec from its centre."""
     folder, found = tmp_path_factory.mktemp("images"), []
     rng = np.random.default_rng(5)
     for number, (camera, name, channel, band, angle) in enumerate(CAMERAS):
         detector = _middle(detectors.detector(camera, name, MISSION))
         about = astrometry.wcs(detector, *PLACE, angle)
-        # The boresight that brings the detector's middle near the place.
+        # The boresight that places the centre of the detector near the position.
         ra, dec = astrometry.centre(detector, about)
         boresight = 2 * PLACE[0] - ra, 2 * PLACE[1] - dec
         system = astrometry.wcs(detector, *boresight, angle)
@@ -74,29 +74,29 @@ def test_north_is_up_and_east_is_left(rows, number):
         y, x = np.mgrid[-12:13, -12:13]
         bright = near > 100.0
         assert bright.any()
-        # To the pixel of the coarsest camera, and to the rounding of the star's own.
+        # Tolerances: the pixel of the coarsest camera and the rounding of the star's position.
         assert abs(x[bright].mean()) * scale < 0.35
         assert abs(y[bright].mean()) * scale < 0.35
 
 
-def test_pictures_of_the_patch_that_all_see(rows, tmp_path, monkeypatch):
+def test_pictures_of_the_shared_patch(rows, tmp_path, monkeypatch):
     monkeypatch.setattr(same_sky, "_rows", lambda root, request: rows)
     panels, colour = same_sky.draw(tmp_path, tmp_path / "out")
     assert (panels.name, colour.name) == ("same_sky.png", "colour.png")
     assert imread(panels).std() > 0.1
     drawn = imread(colour)
     assert drawn.shape[:2] == (1000, 1000)
-    # Sky is dark, and as bright stars as there are some.
+    # The sky is dark, and the number of bright stars is correct.
     assert np.median(drawn[..., :3]) < 0.3
     assert drawn[..., :3].max() > 0.9
 
 
-def test_a_lake_of_two_cameras_has_no_such_picture(rows, tmp_path, monkeypatch):
+def test_two_cameras_are_not_enough_for_a_picture(rows, tmp_path, monkeypatch):
     monkeypatch.setattr(same_sky, "_rows", lambda root, request: rows[:3])
     assert same_sky.draw(tmp_path, tmp_path / "out") == []
     assert not (tmp_path / "out").exists()
 
 
-def test_what_an_image_does_not_have_is_missing(rows):
+def test_patch_outside_an_image_is_nan(rows):
     beyond = PLACE[0] + 0.5 * (rows[0]["radius"] + 0.1), PLACE[1]
     assert np.isnan(same_sky.patch(rows[0]["file"], beyond, 50, order=1)).any()

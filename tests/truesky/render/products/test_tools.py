@@ -1,7 +1,7 @@
-"""Images as the field's own tools read them: places on the sky, verification, reduction by the header alone.
+"""Images processed by standard tools: positions on the sky, verification, and reduction with the header alone.
 
-Tools that are not installed are skipped by name (Debian: apt install source-extractor scamp swarp); what they do is
-also done by sep and astropy, which are always there.
+Tests of tools that are not installed are skipped by name (Debian: apt install source-extractor scamp swarp). sep and
+astropy, which are always available, do the same checks.
 """
 
 import re
@@ -27,26 +27,26 @@ from truesky.render.channels import registry
 from truesky.render.products import fits_files, truth_table
 from truesky.request.accuracy import SURVEY
 
-# Of quadrants each has four stars.
+# Each quadrant has four stars.
 SIDE, STARS = 512, 16
 BANDS = {
     "decam": "des_r", "lsstcam": "lsst_r", "megacam": "cfis_r", "jpcam": "jedis_g", "gpc1": "ps1_i", "hsc": "hsc_z",
 }  # fmt: skip
-# Of a ground camera's effects: what of light and noise moves no charge.
+# Effects of a ground camera that change light and noise but do not move charge.
 SEEN = ("background", "poisson", "read_noise")
 COLUMNS = ("ALPHAWIN_J2000", "DELTAWIN_J2000", "XWIN_IMAGE", "YWIN_IMAGE", "FLUX_AUTO", "FLUXERR_AUTO", "FLAGS")
 COLUMNS += ("ERRAWIN_IMAGE", "ERRBWIN_IMAGE", "ERRTHETAWIN_IMAGE", "FLUX_RADIUS", "MAG_AUTO")
 
 
 def tool(name, where="Debian: apt install source-extractor scamp swarp"):
-    """Its command; the test is skipped where it is not installed."""
+    """Return the command of a tool; the test is skipped if it is not installed."""
     command = shutil.which(name)
     if command is None:
         pytest.skip(f"{name} is not installed ({where})")
     return command
 
 
-# Raw headers that are sure of their place.
+# Raw headers without pointing error.
 SURE = MISSION.with_overrides(
     {f"ext.{camera}.header.{error}": (0.0, "arcsec") for camera in CAMERAS for error in ("offset", "rotation")}
 )
@@ -54,7 +54,7 @@ SURE = MISSION.with_overrides(
 
 @dataclass(frozen=True)
 class Field:
-    """A file of bright stars, its head beside it, and where their light is on the sky."""
+    """File with bright stars, its head file, and the positions of the stars on the sky."""
 
     path: object
     stars: SkyCoord
@@ -62,18 +62,19 @@ class Field:
 
 
 def farthest(camera):
-    """The detector of a camera that is farthest from the boresight, cut down: distortion is the largest."""
+    """Return the detector farthest from the boresight, where the distortion is largest, cut to a small size."""
     name = max(detectors(camera, MISSION), key=lambda d: np.hypot(d.x, d.y)).name
     return small(camera, name, SIDE)
 
 
 def stars_on(camera, sky, detector=None, pointed=None, mission=SURE, at=None, way="raw"):
-    """One detector with stars of a signal-to-noise ratio of 600; sky : of a ground camera, e-/s/pix.
+    """Return a detector with stars of signal-to-noise ratio 600.
 
-    pointed : ra, dec, position angle of the boresight;  at : ra, dec of the stars, None = apart
+    `sky` is that of a ground camera, e-/s/pix; `pointed` is ra, dec and position angle of the boresight; `at` is ra,
+    dec of the stars, None = spread out.
     """
     detector = detector or farthest(camera)
-    # In the middle of amplifiers, however many there are.
+    # Stars at the centres of the amplifiers.
     x, y = (axis + SIDE / 32 for axis in nominal.lattice(SIDE, SIDE / 4))
     if camera == "vis":
         quiet = nominal.off(*nominal.COSMIC_RAYS, *nominal.CHARGE)
@@ -81,7 +82,7 @@ def stars_on(camera, sky, detector=None, pointed=None, mission=SURE, at=None, wa
     ra, dec, angle = pointed or boresight_for(detector, 53.1, -27.8, 12.0)
     where = at or astrometry.sky_of_pixel(astrometry.wcs(detector, ra, dec, angle), x, y)
     band, none, points = BANDS[camera], fields.galaxies([], []), fields.stars(*where)
-    # Four hundred thousand electrons of each.
+    # Each star has 400,000 electrons.
     f_nu = 10 ** (-0.4 * (25.93 - 2.5 * np.log10(4e5 / 100.0) - 23.9))
     exposed = {
         "channel": "EXT", "camera": camera, "band": band, "ra": ra, "dec": dec, "position_angle": angle, "seeing": 1.0,
@@ -94,12 +95,12 @@ def stars_on(camera, sky, detector=None, pointed=None, mission=SURE, at=None, wa
 
 
 def written(camera, folder, sky=0.05):
-    """A dark sky: raw frames have no steps from it to the overscan."""
+    """Write the image with a dark sky, so that raw frames have no step at the overscan."""
     return put(stars_on(camera, sky), folder)
 
 
 def put(one, folder):
-    """Into a folder, with the text beside it."""
+    """Write the files and the head file to a folder."""
     camera = one.exposure.camera
     rows, writers = fits_files.products(one, ())
     path = folder / f"{camera}_science.fits"
@@ -122,13 +123,13 @@ def vis(tmp_path_factory):
 
 
 def arrays(path):
-    """(header, pixels) of each."""
+    """Return (header, pixels) of each array."""
     with fits.open(path) as units:
         return [(unit.header, np.array(unit.data, float)) for unit in units if unit.data is not None]
 
 
 def off(field, ra, dec):
-    """mas rms along each axis of what was found where a star is; all of them are found."""
+    """Return the rms offset in mas along each axis between detections and stars; all stars must be found."""
     found = SkyCoord(ra, dec, unit="deg")
     nearest, distance, _ = field.stars.match_to_catalog_sky(found)
     assert distance.to_value("arcsec").max() < 0.5
@@ -142,7 +143,7 @@ def window(text):
 
 
 def measured(pixels):
-    """x, y of what shines, from 0, by windowed centroids."""
+    """Return x, y of detected sources, from 0, by windowed centroids."""
     pixels = np.ascontiguousarray(pixels - np.median(pixels))
     found = sep.extract(pixels, 30.0 * 1.48 * np.median(np.abs(pixels)), minarea=5)
     radius, _ = sep.flux_radius(pixels, found["x"], found["y"], np.full(len(found), 15.0), 0.5, subpix=5)
@@ -151,13 +152,13 @@ def measured(pixels):
 
 
 def said(path):
-    """Headers of the head file beside an image."""
+    """Return the headers in the head file of an image."""
     *blocks, _ = path.with_suffix(".head").read_text().split("END\n")
     return [fits.Header.fromstring(block, sep="\n") for block in blocks]
 
 
-def test_stars_are_where_the_headers_have_them(field):
-    """Of the file, and of the text beside it, as astropy reads them."""
+def test_stars_are_at_the_positions_of_the_headers(field):
+    """Read the header and the head file with astropy."""
     convention = observatories.for_camera(field.one.exposure.camera).convention
     of_file = [header for header, _ in arrays(field.path)]
     for headers, form in ((of_file, convention), (said(field.path), "tpv")):
@@ -171,7 +172,7 @@ def test_stars_are_where_the_headers_have_them(field):
 
 
 def extracted(path, kind="FITS_1.0"):
-    """A catalogue by source-extractor, beside the file."""
+    """Return a SExtractor catalogue of a file."""
     command, folder = tool("source-extractor"), path.parent
     (folder / "columns.param").write_text("\n".join(COLUMNS) + "\n")
     out = path.with_suffix(".cat")
@@ -183,7 +184,7 @@ def extracted(path, kind="FITS_1.0"):
     return out
 
 
-def test_source_extractor_finds_them_there(field):
+def test_source_extractor_finds_the_stars(field):
     with fits.open(extracted(field.path)) as tables:
         rows = [table.data for table in tables[1:]]
         places = [np.concatenate([row[key] for row in rows]) for key in COLUMNS[:2]]
@@ -191,7 +192,7 @@ def test_source_extractor_finds_them_there(field):
 
 
 def test_source_extractor_reads_the_saturation_and_the_gain(vis):
-    """As it asks for them: no star is taken for full, and errors of fluxes are those of so many electrons."""
+    """No star is flagged as saturated, and flux errors agree with the number of electrons."""
     with fits.open(extracted(vis.path)) as tables:
         row = np.concatenate([np.array(table.data) for table in tables[1:]])
     bright = row[row["FLUX_AUTO"] > 1e4]
@@ -201,7 +202,7 @@ def test_source_extractor_reads_the_saturation_and_the_gain(vis):
     assert bright["FLUX_AUTO"] / bright["FLUXERR_AUTO"] == pytest.approx(np.sqrt(electrons), rel=0.1)
 
 
-def test_swarp_puts_them_there(vis):
+def test_swarp_resamples_the_stars_to_their_positions(vis):
     command, folder = tool("SWarp"), vis.path.parent / "swarp"
     folder.mkdir()
     subprocess.run(
@@ -218,7 +219,7 @@ def test_swarp_puts_them_there(vis):
 
 
 def reference(path, stars):
-    """A catalogue of stars as SCAMP reads it."""
+    """Write a catalogue of stars in the format of SCAMP."""
     ones = np.ones(len(stars))
     columns = {
         "X_WORLD": ("1D", "deg", stars.ra.deg), "Y_WORLD": ("1D", "deg", stars.dec.deg),
@@ -233,8 +234,8 @@ def reference(path, stars):
     fits.HDUList([*units, fits.BinTableHDU.from_columns(table, name="LDAC_OBJECTS")]).writeto(path)
 
 
-def test_scamp_has_nothing_to_correct(vis):
-    """With the text beside the image, and without a fit: what it says the stars are off."""
+def test_scamp_finds_no_offsets(vis):
+    """Offsets that SCAMP reports with the head file and without a fit."""
     command, folder = tool("scamp"), vis.path.parent
     catalogue = extracted(vis.path, "FITS_LDAC")
     reference(folder / "reference.cat", vis.stars)
@@ -253,7 +254,7 @@ def test_scamp_has_nothing_to_correct(vis):
     assert 1e3 * max(float(across), float(up)) < 5.0
 
 
-def test_files_are_as_the_standard_wants_them(field):
+def test_files_follow_the_fits_standard(field):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with fits.open(field.path, checksum=True) as units:
@@ -262,7 +263,7 @@ def test_files_are_as_the_standard_wants_them(field):
         assert all(len(str(card)) == 80 for card in header.cards)
 
 
-def test_fitsverify_says_nothing(field):
+def test_fitsverify_finds_no_problems(field):
     done = subprocess.run(
         [tool("fitsverify", "HEASARC"), "-q", str(field.path)], capture_output=True, text=True, timeout=120
     )
@@ -271,7 +272,7 @@ def test_fitsverify_says_nothing(field):
 
 
 def reduced(path):
-    """(where on the detector, image in e-) of each amplifier of a raw file, by its header, as ccdproc makes them."""
+    """Return (section of the detector, image in e-) of each amplifier of a raw file, reduced with ccdproc."""
     ccdproc = pytest.importorskip("ccdproc", reason="ccdproc is not installed (extra test)")
     from astropy import units as u
 
@@ -286,7 +287,7 @@ def reduced(path):
                 level = raw.subtract(header["BIAS"] * u.adu, handle_meta="first_found")
             trimmed = ccdproc.trim_image(level, fits_section=header["TRIMSEC"])
             yield header["CCDSEC"], ccdproc.gain_correct(trimmed, header["GAIN"] * u.electron / u.adu)
-        # Of a ground camera all amplifiers are in one array.
+        # All amplifiers of a ground camera are in one array.
         for n in range(1, header.get("NAMPS", 0) + 1):
             pixels, bias = (ccdproc.trim_image(raw, fits_section=header[f"{key}{n}"]) for key in ("DSEC", "BSEC"))
             level = ccdproc.subtract_overscan(pixels, overscan=bias, overscan_axis=1, median=True)
@@ -295,7 +296,7 @@ def reduced(path):
 
 @pytest.mark.parametrize("camera", ["vis", "decam", "lsstcam"])
 def test_ccdproc_reduces_a_raw_frame_by_its_header(camera, tmp_path):
-    """To electrons, on the pixels of the detector; the WCS goes with them."""
+    """The result is in electrons on the pixels of the detector, and keeps the WCS."""
     field = written(camera, tmp_path, sky=5.0)
     found, one = np.zeros(field.one.science.shape), field.one
     for text, image in reduced(field.path):
@@ -306,7 +307,7 @@ def test_ccdproc_reduces_a_raw_frame_by_its_header(camera, tmp_path):
         assert (x[0], y[0]) == pytest.approx((7.0, 3.0), abs=1e-4)
     sky = (one.scene.sky_rate + one.scene.dark_rate) * one.scene.exposure_time_s
     left = found - np.asarray(one.noise_free, float)
-    # Of VIS the amplifiers' response is not linear.
+    # The amplifiers of VIS are not linear.
     assert np.median(left) == pytest.approx(sky, rel=0.02)
     noise = np.hypot(np.sqrt(sky), np.mean(one.scene.amplifier_values("read_noise", "electron")))
     assert 1.4826 * np.median(np.abs(left - np.median(left))) == pytest.approx(noise, rel=0.1)
