@@ -57,8 +57,8 @@ def build(**changes):
 def test_build_refuses_by_name():
     for changes, words in (
         ({"speed": [1, 2]}, "no column speed"),
-        ({"id": np.array([1.5, 2.5])}, "column id wants int64"),
-        ({"ra": ["a", "b"]}, "column ra wants float64"),
+        ({"id": np.array([1.5, 2.5])}, "column id must be int64"),
+        ({"ra": ["a", "b"]}, "column ra must be float64"),
         ({"flux": [None, 1.0]}, "column flux has 1 missing"),
     ):
         with pytest.raises(BadInput, match=words):
@@ -76,7 +76,7 @@ def test_masked_values_become_null_only_where_declared():
 
 def test_small_integers_do_not_wrap():
     table = Table("t", 1, (Column("k", "int8"),), "t", key=("k",))
-    with pytest.raises(BadInput, match="does not fit int8"):
+    with pytest.raises(BadInput, match="outside the range of int8"):
         table.build({"k": np.array([300])})
 
 
