@@ -157,6 +157,11 @@ class Table:
         columns : mapping of str to array, shape (n,)
             Values by column name. Nullable columns may be left out.
 
+        Returns
+        -------
+        pyarrow.Table
+            Table with n rows.
+
         Raises
         ------
         BadInput

@@ -46,6 +46,11 @@ def table_header(table: Table, text_lengths: tuple[tuple[str, int], ...] = ()) -
         Declaration of the table.
     text_lengths : tuple of (str, int), optional
         Largest number of characters of each text column.
+
+    Returns
+    -------
+    str
+        The VOTable.
     """
     root = ElementTree.Element("VOTABLE", {"version": "1.4", "xmlns": _NAMESPACE})
     table_element = ElementTree.SubElement(ElementTree.SubElement(root, "RESOURCE"), "TABLE", {"name": table.name})

@@ -59,6 +59,9 @@ def id_of_kinds(first: int, last: int) -> Column:
 
 
 def density_boost_column(sources: str) -> Column:
-    """Return the column `density_boost`; `sources` is the subject and verb of its description, such as "this kind was"."""
+    """Return the column `density_boost`.
+
+    `sources` is the subject and verb of its description, such as "this kind was".
+    """
     doc = f"how many times denser than in nature {sources} drawn; weight by its inverse"
     return Column("density_boost", "float32", ucd="stat.weight", doc=doc, lo=1e-3, hi=1e6)

@@ -172,7 +172,7 @@ def test_a_missing_file_or_column_is_named(folder, file):
     with pytest.raises(BadInput, match=rf"my_camera/{file}: has no rows$"):
         camera_folder.read(folder)
     (folder / file).write_text(text.replace(header, header + ",colour"))
-    with pytest.raises(BadInput, match=rf"my_camera/{file}: unknown column 'colour', the columns are"):
+    with pytest.raises(BadInput, match=rf"my_camera/{file}: unknown column 'colour', the columns must be"):
         camera_folder.read(folder)
     (folder / file).write_text(text.replace(header, header + "," + header.partition(",")[0]))
     with pytest.raises(BadInput, match=rf"my_camera/{file}: a column is given twice$"):
@@ -194,7 +194,7 @@ def test_a_missing_file_or_column_is_named(folder, file):
         ("layout.csv", "ccd00,megacam,2048", "ccd00,megacam,99.5", r"layout\.csv line \d+: nx = 99.5 is not a whole"),
         ("layout.csv", "ccd00,megacam,2048", "ccd00,megacam,1024", r"layout\.csv line \d+: .* megacam differ in size"),
         ("layout.csv", "ccd01", "ccd00", r"layout\.csv line \d+: ccd00 is given twice"),
-        ("layout.csv", "ccd01", "C/1", r"layout\.csv line \d+: detector = 'C/1': a name has letters"),
+        ("layout.csv", "ccd01", "C/1", r"layout\.csv line \d+: detector = 'C/1': a name must have letters"),
         ("layout.csv", "ccd01,megacam", "ccd01,other", r"amplifiers\.csv: detectors of type other have no"),
         ("amplifiers.csv", "megacam,A,0,0", "megacam,A,2,0", r"amplifiers\.csv line \d+: overlaps amplifier A"),
         (
@@ -232,8 +232,8 @@ def test_a_missing_file_or_column_is_named(folder, file):
             r"bands\.csv line \d+: .*missing.dat: no such file",
         ),
         ("bands.csv", "cfis_r,,", "cfis_r,layout.csv,", r"bands\.csv line \d+: medium is missing"),
-        ("bands.csv", "cfis_r,,", "cfis_r,layout.csv,water", r"bands\.csv line \d+: medium = 'water' is not air or"),
-        ("bands.csv", "cfis_r,,", "cfis r,,", r"bands\.csv line \d+: band = 'cfis r': a name has letters"),
+        ("bands.csv", "cfis_r,,", "cfis_r,layout.csv,water", r"bands\.csv line \d+: medium = 'water' is neither air"),
+        ("bands.csv", "cfis_r,,", "cfis r,,", r"bands\.csv line \d+: band = 'cfis r': a name must have letters"),
         ("bands.csv", "cfis_r,,,", "cfis_r,,,nan", r"bands\.csv line \d+: zero_point = 'nan\S*' is not a number"),
         ("wavefront.csv", "4,0,0,60", "4,0,0,inf", r"wavefront\.csv line \d+: coefficient_nm = inf is not finite"),
     ],
@@ -282,7 +282,7 @@ def test_detectors_that_overlap_with_a_larger_pixel_are_a_fault_of_the_configura
 @pytest.mark.parametrize("name", ["decam", "vis", "My Camera", "9", "x" * 41])
 def test_a_name_that_a_camera_may_not_have_is_refused(folder, name):
     folder.rename(folder.with_name(name))
-    with pytest.raises(BadInput, match=r"truesky has a camera|a camera has the name of its folder"):
+    with pytest.raises(BadInput, match=r"truesky already has a camera|the folder's name is the camera's name"):
         camera_folder.read(folder.with_name(name))
 
 
@@ -290,7 +290,7 @@ def test_the_command_writes_a_folder_and_never_over_another(tmp_path, capsys):
     assert commands.main(["camera", str(tmp_path / "mine"), "--like", "decam"]) == 0
     assert len(capsys.readouterr().out.splitlines()) == 5
     assert commands.main(["camera", str(tmp_path / "mine"), "--like", "decam"]) == 2
-    assert capsys.readouterr().err.endswith("mine: is there already\n")
+    assert capsys.readouterr().err.endswith("mine: already exists\n")
     assert commands.main(["camera", str(tmp_path / "No Name"), "--like", "decam"]) == 2
     assert not (tmp_path / "No Name").exists()
 
@@ -305,6 +305,6 @@ def test_a_path_that_the_system_does_not_take_is_refused(tmp_path, monkeypatch, 
         assert commands.main(["camera", name, "--like", "decam"]) == 2
         said = capsys.readouterr().err
         assert len(said.splitlines()) == 1
-        assert said.endswith(("is there already\n", "File name too long\n"))
+        assert said.endswith(("already exists\n", "File name too long\n"))
     assert commands.main(["camera", "loop/mine", "--like", "decam"]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1

@@ -82,7 +82,7 @@ def test_a_ladder_chooses_models_too():
 
 
 def test_a_name_is_a_value_or_a_model():
-    with pytest.raises(BadInput, match=r"vis\.gain is a value and a model"):
+    with pytest.raises(BadInput, match=r"vis\.gain is both a value and a model"):
         resolve(models=(Model("vis.gain", "CBE", "x.csv", "0" * 64, source="x"),))
     with pytest.raises(BadInput, match="given twice"):
         resolve(models=(ZODI, ZODI))

@@ -123,7 +123,7 @@ def test_statuses_and_sections_are_those_that_are_known():
     [
         (b"a.b,CBE,1,m,1,,assumed,\xff", "codec"),
         (b"a.b,CBE,1,m,1,,assumed," + b"x" * 2000, "line 2: a text is too long"),
-        (b'a.b,CBE,1,m,1,,assumed,"x\ny"', "line 3: a text is too long, or of several lines"),
+        (b'a.b,CBE,1,m,1,,assumed,"x\ny"', "line 3: a text is too long or spans several lines"),
         (b"a.b,CBE,1,m,1,,assumed,x,y", "line 2: a text is too long"),
         (b"a.b,CBE,1,m,1,,assumed," + b"x" * 200_000, "field larger than"),
     ],
