@@ -85,7 +85,25 @@ class Row:
         return value
 
     def number(self, column: str, low: float = -math.inf, high: float = math.inf) -> float:
-        """Return the finite number of a column; raise BadInput for any other text or outside the bounds."""
+        """Return the finite number of a column.
+
+        Parameters
+        ----------
+        column : str
+            Name of the column.
+        low, high : float, optional
+            Smallest and largest number that is allowed.
+
+        Returns
+        -------
+        float
+            The number.
+
+        Raises
+        ------
+        BadInput
+            If the text is blank or is not a finite number within the bounds. The message names the file and the line.
+        """
         text = self.text(column)
         try:
             value = float(text)

@@ -175,7 +175,7 @@ class VerifiedFile(io.RawIOBase):
         return Damaged(self.fault)
 
     def _read_range(self, first: int, last: int) -> bytes:
-        """Read a range of bytes; the file is opened for each call, because a lake has more files than a process may open."""
+        """Read a range of bytes. The file is opened for each call, because a process can only keep some files open."""
         if isinstance(self.path, ObjectPath):
             return self._read_object_range(self.path, first, last)
         try:
@@ -197,7 +197,7 @@ class VerifiedFile(io.RawIOBase):
         return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
     def _read_object_range(self, place: ObjectPath, first: int, last: int) -> bytes:
-        """Read a range of bytes of an object; its size is compared at each call, on a handle that is opened again after `forget`."""
+        """Read a range of bytes of an object; the object is opened once, and again after `forget`."""
         try:
             if self._object is None:
                 self._object = place.open()

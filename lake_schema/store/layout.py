@@ -50,8 +50,8 @@ def is_name(text: object) -> bool:
 def resolve_lake(text: str | Path) -> Path:
     """Return the absolute path of a lake's folder, which need not exist yet.
 
-    file:///a/b is accepted for /a/b, as Spark's users write it. Addresses of object storage are refused, because publishing
-    requires renames.
+    file:///a/b is accepted for /a/b, as Spark's users write it. Addresses of object storage are refused, because
+    publishing requires renames.
     """
     if local := _FILE_URL.fullmatch(str(text)):
         text = unquote(local[1])
@@ -78,7 +78,7 @@ def resolve_lake(text: str | Path) -> Path:
 
 
 def open_lake(text: str | Folder, endpoint: str | None = None) -> Folder:
-    """Return the root of a lake for reading: a folder, or a location on object storage to which a lake was pushed.
+    """Return the root of a lake for reading: a folder, or a location on object storage.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def open_lake(text: str | Folder, endpoint: str | None = None) -> Folder:
     Returns
     -------
     Path or ObjectPath
-        The root. Reading it shows if there is a lake.
+        The root. It is not checked that a lake exists there.
 
     Raises
     ------
@@ -182,7 +182,7 @@ def request_link(root: Below, request: str, table_name: str) -> Below:
 
 
 def table_names(root: Folder) -> list[str]:
-    """Return the sorted names of all tables that have been published, including tables whose version has been removed."""
+    """Return the sorted names of all tables that have been published, even if the version has been removed since."""
     reserved = {_NAMES, _RUNS}
     folders = [p for p in root.iterdir() if is_name(p.name) and p.name not in reserved] if root.is_dir() else []
     return sorted(
@@ -191,7 +191,9 @@ def table_names(root: Folder) -> list[str]:
 
 
 def current_key(root: Folder, table_name: str) -> str | None:
-    """Return the key of the version that was published last, or None if there is none; the version may be missing.
+    """Return the key of the version that was published last, or None if there is none.
+
+    The version itself may be missing.
 
     Raises
     ------

@@ -30,6 +30,11 @@ def hold(path: Path, message: str, timeout: float = 0.0) -> Iterator[None]:
     timeout : float, optional
         Time to wait for another holder, in s.
 
+    Yields
+    ------
+    None
+        While the lock is held.
+
     Raises
     ------
     Superseded
@@ -61,7 +66,7 @@ def is_held(path: Path) -> bool:
 
 
 def _try_lock(path: Path, descriptor: int) -> bool:
-    """Lock the open file, and return True if that succeeds and the file still has this name: holders remove their lock files."""
+    """Lock the open file; return True if that succeeds and the file still has this name (holders remove lock files)."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         return path.stat().st_ino == os.fstat(descriptor).st_ino

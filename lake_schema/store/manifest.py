@@ -66,9 +66,9 @@ class Manifest(dict[str, Any]):
 
 
 def file_state(path: Path) -> tuple[int, int, int, int]:
-    """Return inode, size in bytes, and times of modification and change in ns.
+    """Return inode, size in bytes, and times of modification and change in ns of a file.
 
-    While these are unchanged, a file need not be read again.
+    While they are equal, the file is unchanged and need not be read again.
     """
     status = path.stat()
     return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
@@ -76,7 +76,7 @@ def file_state(path: Path) -> tuple[int, int, int, int]:
 
 @lru_cache(maxsize=16)
 def _read_once(path: Path, *state: int) -> Manifest:
-    """Return a cached manifest while its file is unchanged: manifests may be large, and tasks of a process share them."""
+    """Return a cached manifest while its file is unchanged; manifests may be large, and tasks share them."""
     return _read_manifest(path)
 
 
@@ -285,7 +285,10 @@ def write_json(path: Path, value: Json) -> None:
 
 
 def temporary_path(path: Path) -> Path:
-    """Return a temporary path in the folder of `path`; it is random, because processes of two machines may have equal numbers."""
+    """Return a temporary path in the folder of `path`.
+
+    Its name is random, because processes on two machines may have the same number.
+    """
     return path.with_name(f".{uuid4().hex[:12]}.tmp.{path.name}")
 
 

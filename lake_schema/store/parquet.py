@@ -48,8 +48,8 @@ def write(path: Path, rows: pa.Table, table: Table) -> None:
 def file_checksums(path: Path) -> dict[str, Any]:
     """Return size, sha256 and blocks of a Parquet file that was just written.
 
-    A block contains the pages of one column of a row group with their headers, or several small such pieces. The last block
-    contains the page index and the footer.
+    A block contains the pages of one column of a row group with their headers, or several small such pieces. The last
+    block contains the page index and the footer.
     """
     metadata = pq.read_metadata(path)
     starts, end = [], 4  # the magic number

@@ -1,4 +1,4 @@
-"""Plans of versions: a table, all facts that determine its contents, and its tasks. The hash of a plan names the version."""
+"""Plans of versions: a table, the facts that determine its contents, and its tasks. A plan's hash names the version."""
 
 from __future__ import annotations
 

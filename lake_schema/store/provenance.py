@@ -36,7 +36,7 @@ _LIBRARIES = (
 
 
 def canonical(value: Any) -> bytes:
-    """Return JSON with sorted keys and no spaces, so that equal values give equal bytes; NaN and infinities are refused."""
+    """Return JSON with sorted keys and no spaces: equal values give equal bytes, and NaN and infinities are refused."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=True).encode()
 
 
@@ -52,7 +52,7 @@ def file_sha256(path: Folder) -> str:
 
 
 def code_version(root: Path = _ROOT) -> str:
-    """Return a fingerprint of all source and data files of lake_schema and truesky, and of the versions of libraries."""
+    """Return a fingerprint of all source and data files of lake_schema and truesky, and of the libraries' versions."""
     files = sorted(
         path
         for package in _PACKAGES
@@ -76,7 +76,7 @@ def machine() -> str:
 
 
 def git_commit(root: Path = _ROOT) -> str:
-    """Return the git commit of the checkout, or "unknown" outside a checkout; it is recorded, but never part of a key."""
+    """Return the git commit of the checkout, or "unknown" outside one; it is recorded, but never part of a key."""
     try:
         process = subprocess.run(
             ["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, timeout=10, check=True

@@ -11,7 +11,7 @@ If a run is killed::
 
     at this point                                readers see               the next run makes
     before the first receipt                     the last version          everything
-    between receipts                             the last version          partitions without a receipt or with a wrong sha256
+    between receipts                             the last version          what lacks a receipt or differs from it
     after the last receipt, before the rename    the last version          the metadata and the rename
     after the rename, before the request's link  the last version          both links
     between the two links                        the new one by request    `current`
@@ -85,8 +85,8 @@ def make_version(
         Function like map: takes (function, tasks) and returns results in any order. Results are only used to report
         failures; receipts decide which tasks are done.
     base : str or None, optional
-        Key of the version that this one replaces. By default ("") it is the version that exists at the call: the request's
-        version if `name` is given, else the current one.
+        Key of the version that this one replaces. By default ("") it is the version that exists at the call: that of
+        the request if `name` is given, else the current one.
     name : str, optional
         Name of the request for which the version is made. The request is then also linked to the inputs of the plan.
 
@@ -172,7 +172,7 @@ def _run_tasks(root: Path, plan: Plan, task_function: TaskFunction, mapper: Mapp
 
 
 def _candidate_versions(root: Path, table: str, name: str | None) -> list[Path]:
-    """Return versions that may contain reusable partitions: the request's version, the current one, other requests' versions."""
+    """Return versions that may contain reusable partitions: of the request, the current one, of other requests."""
     keys = [
         _replaced_key(root, table, name),
         current_key(root, table),
@@ -183,7 +183,7 @@ def _candidate_versions(root: Path, table: str, name: str | None) -> list[Path]:
 
 
 def _finish_stage(stage: Path, plan: Plan, task_receipts: Sequence[Json]) -> None:
-    """Write metadata and manifest into a stage, given the receipts of its tasks; only the rename is left after this."""
+    """Write metadata and manifest into a stage, given the receipts of its tasks; then only the rename is left."""
     refuse_duplicates(stage, plan, task_receipts)
     entries = {f["path"]: f for receipt in task_receipts for f in receipt["files"]}
     _remove_unlisted(stage, set(entries))

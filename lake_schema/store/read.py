@@ -66,7 +66,7 @@ class Version:
 
     @property
     def fingerprint(self) -> str:
-        """sha256 (hexadecimal) of the sha256 of all files: it depends on the contents of the version, not on its inputs."""
+        """sha256 (hexadecimal) of the sha256 of all files: it depends on the version's contents, not on its inputs."""
         return digest({entry["path"]: entry["sha256"] for entry in self.manifest["files"]})
 
     @property
@@ -113,7 +113,7 @@ class Version:
         return manifest.check_contents(self.folder, self._file_entry(relative))
 
     def sidecar_folder(self, relative: str) -> Path:
-        """Return a folder with further files of the version; on object storage, the files are copied to a temporary folder.
+        """Return a folder with further files of the version; on object storage, they are copied to a temporary folder.
 
         Raises
         ------
@@ -158,7 +158,7 @@ class Version:
 
     @contextmanager
     def _errors_as_damaged(self) -> Iterator[None]:
-        """Turn errors of Arrow into Damaged; they occur for files that Arrow cannot decode although they match the manifest."""
+        """Turn errors of Arrow into Damaged; they occur if it cannot decode a file that matches the manifest."""
         try:
             yield
         except (OSError, pa.ArrowInvalid) as error:
@@ -218,7 +218,7 @@ class Version:
                 raise BadInput(f"table {self.table} has no column {name}")
 
     def rows_in_cells(self, cells: Sequence[int], order: int, columns: Sequence[str] | None = None) -> pa.Table:
-        """Return the rows of a catalogue in HEALPix cells; only files and row groups that may contain such rows are read.
+        """Return the rows of a catalogue in HEALPix cells; only matching files and row groups are read.
 
         Parameters
         ----------
@@ -288,7 +288,7 @@ class Version:
         return rows if columns is None else rows.select(list(columns))
 
     def position_columns(self, on: str = "observed") -> tuple[str, str]:
-        """Return the columns of ra and dec of a catalogue's observed or true positions; they are equal in a table without lensing.
+        """Return the columns of ra and dec of observed or true positions; both are equal in a table without lensing.
 
         Raises
         ------
@@ -362,8 +362,8 @@ def version(root: Folder, name: str, key: str | None = None, request: str | None
     Raises
     ------
     BadInput
-        If the lake has no such table, version or request, or if requests have different versions and neither a key nor a
-        request is given.
+        If the lake has no such table, version or request, or if requests have different versions and neither a key nor
+        a request is given.
     Damaged
         If the manifest is missing, broken or belongs to another version.
     VersionMismatch

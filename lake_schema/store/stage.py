@@ -55,8 +55,13 @@ def run_task(root: Path, key: str, table: Table, facts: Json, task_function: Tas
     Returns
     -------
     mapping
-        The receipt, or after a failure {"part", "error", "traceback", "final"}, in which "final" is True if the same input
-        will fail again.
+        The receipt, or after a failure {"part", "error", "traceback", "final"}, in which "final" is True if the same
+        input will fail again.
+
+    Raises
+    ------
+    Superseded
+        Only internally: all exceptions are returned as failures.
     """
     stage = layout.stage_folder(root, table.name, key)
     if is_done(stage, task):

@@ -292,7 +292,7 @@ def test_a_manifest_without_the_blocks_of_a_table_is_refused(lake):
     about = dict(manifest.load(folder, "plain"))
     files = [{key: value for key, value in entry.items() if key != "blocks"} for entry in about["files"]]
     manifest.write(folder, {**about, "files": files})
-    with pytest.raises(Damaged, match=r"manifest\.json is not a manifest of this form"):
+    with pytest.raises(Damaged, match=r"manifest\.json is not a valid manifest"):
         read.version(lake, "plain")
 
 

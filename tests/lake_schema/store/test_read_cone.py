@@ -142,7 +142,7 @@ def test_what_is_not_lensed_is_where_it_is_seen(lake):
 def test_a_version_that_does_not_know_its_deflection(catalogues):
     _, _, version = catalogues[0]
     facts = {k: v for k, v in version.manifest.items() if k != "deflection_deg"}
-    with pytest.raises(BadInput, match="how far positions are lensed"):
+    with pytest.raises(BadInput, match="has no largest deflection"):
         read.Version(version.folder, facts, version.schema).cone(0.0, 0.0, 1.0, on="true")
 
 

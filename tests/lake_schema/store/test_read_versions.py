@@ -29,7 +29,7 @@ BAD = {
     "another type": (with_columns(PLAIN.columns[0], replace(PLAIN.columns[1], type="float32")), "column value is"),
     "another unit": (
         with_columns(PLAIN.columns[0], replace(PLAIN.columns[1], unit="deg")),
-        "column value has unit '', wanted 'deg'",
+        "column value has unit '', but must have 'deg'",
     ),
     "a column less": (with_columns(PLAIN.columns[0]), "column value is not declared"),
 }
@@ -38,15 +38,15 @@ BAD = {
 @pytest.mark.parametrize("name", BAD)
 def test_other_columns_are_refused_by_name(plain, name):
     table, words = BAD[name]
-    with pytest.raises(VersionMismatch, match=f"^table plain: {words}.*: another truesky wrote it$"):
+    with pytest.raises(VersionMismatch, match=f"^table plain: {words}.*: written by another version of truesky$"):
         read.with_declared_schema(plain, table)
 
 
 @pytest.mark.parametrize(("was", "now"), [(3, 1), (1, 2)])
 def test_another_version_is_refused_naming_both(lake, was, now):
     publish.make_version(lake, replace(plain_plan(), table=replace(PLAIN, version=was)), plain_work)
-    who = "another version of truesky wrote it"
-    line = f"table plain: {who}: its declaration is of version {was}, this truesky reads version {now}"
+    who = "written by another version of truesky"
+    line = f"table plain: {who}: it has version {was} of the declaration, but this truesky reads version {now}"
     with pytest.raises(VersionMismatch, match=f"^{line}$"):
         read.with_declared_schema(read.version(lake, "plain"), replace(PLAIN, version=now))
 

@@ -38,7 +38,7 @@ def test_each_request_has_its_own(two):
 
 def test_without_a_name_nobody_guesses(two):
     assert read.version(two, "toy").key == toy_plan().key
-    with pytest.raises(BadInput, match=r"requests a, b have versions of their own of table plain: name one"):
+    with pytest.raises(BadInput, match=r"requests a, b have different versions of table plain: name one"):
         read.version(two, "plain")
     assert read.version(two, "plain", plain_plan(1).key).key == plain_plan(1).key
 

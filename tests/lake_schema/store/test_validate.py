@@ -56,7 +56,7 @@ def test_a_wrong_type_unit_or_nullability(table):
         assert field.name == column.name
         other = pa.float64() if field.type != pa.float64() else pa.float32()
         zeros = pa.array([0, 0, 0], other)
-        refused(rows.set_column(place, field.with_type(other), zeros), table, column.name, "wanted")
+        refused(rows.set_column(place, field.with_type(other), zeros), table, column.name, "but must be")
         metadata = {**field.metadata, b"unit": b"furlong"}
         refused(
             rows.set_column(place, field.with_metadata(metadata), rows.column(place)), table, column.name, "furlong"

@@ -135,7 +135,7 @@ def render(root, request, fail=()):
 
     make(root, request, plan_exposures)
     if fail:
-        with pytest.raises(TasksFailed, match=r"1 of 2 parts failed: .*ValueError: no light"):
+        with pytest.raises(TasksFailed, match=r"1 of 2 tasks failed: .*ValueError: no light"):
             make(root, request, render_exposures, spy=spy)
     else:
         make(root, request, render_exposures, spy=spy)
@@ -226,7 +226,7 @@ def test_a_bad_detector_is_a_row_and_not_the_end_of_the_run(lake, monkeypatch, t
             "render_task",
             lambda root, facts: (bad if facts["detector"] == "R22_S11" else WORK)(root, facts),
         )
-        with pytest.raises(TasksFailed, match=rf"1 of 2 parts failed: {part}: ValueError: no light"):
+        with pytest.raises(TasksFailed, match=rf"1 of 2 tasks failed: {part}: ValueError: no light"):
             submitted_job.run(render_exposures.JOB, lake, wanted())
     assert layout.current_key(lake, "products") is None
     # Planned = made + failed.
@@ -680,7 +680,7 @@ def test_requests_lie_side_by_side(lake, tmp_path, capsys):
     assert garbage.collect(lake, delete=True) == []
     assert [archive.products(lake, name).to_pylist() for name in "ab"] == [found["a"], found["b"]]
     assert archive.main(["--lake", str(lake)]) == 2
-    assert "requests a, b have versions of their own of table products" in capsys.readouterr().err
+    assert "requests a, b have different versions of table products" in capsys.readouterr().err
     path = found["a"][0]["path"]
     assert archive.main(["--lake", str(lake), "--name", "a", "--again", path, "--out", str(tmp_path / "x.fits")]) == 0
     assert f"equals {path}" in capsys.readouterr().out

@@ -29,7 +29,7 @@ def test_an_endpoint_is_what_is_asked_for_or_named_or_in_the_environment(monkeyp
     assert s3.parse_address(named, "http://option").service == "http://option"
     assert s3.parse_address("s3://sky/a").key("galaxies", "x") == "a/galaxies/x"
     assert s3.parse_address("s3://sky").key("galaxies", "x") == "galaxies/x"
-    with pytest.raises(BadInput, match="an endpoint does not go with it"):
+    with pytest.raises(BadInput, match="it cannot have an endpoint"):
         layout.open_lake("/lake", "http://option")
 
 
