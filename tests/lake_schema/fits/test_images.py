@@ -322,8 +322,8 @@ def test_numbers_of_others_are_read_in_batches(tmp_path, rows):
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("absent", "has no column absent; it has number, id"), ("name", "wanted a number a row"),
-     ("pair", "wanted a number a row"), ("list", "column list holds lists")],
+    [("absent", "has no column absent; it has number, id"), ("name", "must be one number per row"),
+     ("pair", "must be one number per row"), ("list", "column list holds lists")],
 )  # fmt: skip
 def test_what_is_no_number_a_row_is_refused(tmp_path, name, words):
     path = somebodys(tmp_path / "a.fits")
@@ -339,7 +339,7 @@ def test_a_map_is_read_in_the_order_of_its_file(tmp_path):
         assert values.dtype == np.float64
         assert values.tolist() == wanted
         assert header["ORDERING"] == "NESTED"
-    for name, words in (("absent", "no column absent"), ("name", "numbers of a map"), ("list", "holds lists")):
+    for name, words in (("absent", "no column absent"), ("name", "but must have at most"), ("list", "holds lists")):
         with pytest.raises(BadInput, match=words):
             external.read_map(path, name)
     astropy_fits.PrimaryHDU(np.ones((2, 2))).writeto(tmp_path / "image.fits")

@@ -85,7 +85,7 @@ def test_cubes_and_one_file_alone(tmp_path):
 
 def test_nothing_and_a_file_cut_short_leave_no_file(tmp_path):
     path = tmp_path / "all.fits"
-    with pytest.raises(BadInput, match="nothing to join"):
+    with pytest.raises(BadInput, match="no files to join"):
         joined.join(path, [], SHARED, ())
     files = written(tmp_path, [of_extensions(0), of_extensions(1)])
     with files[1][1].open("r+b") as stream:
