@@ -71,7 +71,7 @@ def test_what_is_of_another_form_is_refused(data):
     ("place", "words"),
     [
         ("s3://{}/nothing", "no lake was pushed there"),
-        ("s3://no-such-bucket/lake", "the bucket is another"),
+        ("s3://no-such-bucket/lake", "the bucket is wrong"),
         ("s3://sky/lake?endpoint_override=http://127.0.0.1:9", "http://127.0.0.1:9 does not answer"),
     ],
 )
