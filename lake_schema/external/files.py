@@ -128,7 +128,7 @@ def _refuse_large_footer(path: Path) -> None:
         )
 
 
-# ----------------------------------------------------------------------------------------- in a process of its own
+# ----------------------------------------------------------------------------------------- in the separate process
 
 
 def main(argv: Sequence[str], sender: Callable[[Path, Sequence[str], Sequence[str], IO[bytes]], None]) -> int:

@@ -37,7 +37,7 @@ def read_batches(path: Path, columns: Sequence[str]) -> Iterator[pa.RecordBatch]
     yield from files.read_in_subprocess(__name__, path, columns)
 
 
-# ----------------------------------------------------------------------------------------- in a process of its own
+# ----------------------------------------------------------------------------------------- in the separate process
 
 
 def send_batches(path: Path, columns: Sequence[str], text_columns: Sequence[str], out: IO[bytes]) -> None:

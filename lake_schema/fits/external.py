@@ -100,7 +100,7 @@ def read_batches(
 
 
 def read_table(path: Path, kind: str) -> Any:
-    """Return the first table of a file as an astropy QTable with units; errors are those of `read_numbers`."""
+    """Return the first table of a file as an astropy QTable with units; it raises the errors of `read_numbers`."""
     # This import is slow and seldom needed.
     from astropy.table import QTable
 
@@ -179,8 +179,8 @@ def read_map(path: Path, column: str) -> tuple[Float, dict[str, Any]]:
         _refuse_lists(path, columns_by_name[column])
         values = hdu.data[column]
         if values.dtype.kind not in "fiu" or not values.size <= _MAX_PIXELS:
-            found = f"{values.size} values of {values.dtype}"
-            raise BadInput(f"{path}: column {column} has {found}, but must have at most {_MAX_PIXELS} numbers")
+            contents = f"{values.size} values of {values.dtype}"
+            raise BadInput(f"{path}: column {column} has {contents}, but must have at most {_MAX_PIXELS} numbers")
         return np.asarray(values, np.float64).ravel(), dict(hdu.header.items())
 
 

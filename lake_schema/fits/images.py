@@ -63,7 +63,7 @@ def cards_to_text(cards: Sequence[Card]) -> str:
 
 @lru_cache(maxsize=4096, typed=True)
 def _card_line(keyword: str, value: Any, comment: str, value_text: str) -> str:
-    """Return a card as a line; cards are cached, because the images of a file share most of them.
+    """Return a card as a line; cards are cached, because the images of a file share most cards.
 
     `value_text` distinguishes values that compare equal, such as 0.0 and -0.0.
     """

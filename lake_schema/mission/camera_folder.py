@@ -127,7 +127,7 @@ def read(folder: Path) -> Camera:
     pixel = next(p for p in parameters if p.key == f"{prefix}fpa.pixel_size")
     layout = camera_tables.read_layout(folder, convert(pixel.value, pixel.unit, "mm / pix", pixel.key))
     tables = {LAYOUT: layout, AMPLIFIERS: camera_tables.read_amplifiers(folder, layout)}
-    # The parameters are those of the first amplifier; the table gives the ratios of the other amplifiers to it.
+    # The parameters describe the first amplifier; the table gives the ratios of the other amplifiers to it.
     first_amplifier = tables[AMPLIFIERS][0]
     parameters += [
         _make_parameter(

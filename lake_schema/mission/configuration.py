@@ -26,18 +26,18 @@ Chosen = TypeVar("Chosen", Parameter, Model)
 class MissionConfiguration:
     """Chosen records of the mission database, sorted by name, with the overrides of a request.
 
-    A value for one detector or amplifier has a name of its own (see `lake_schema.mission.detector_overrides`).
+    A value for one detector or amplifier has a separate name (see `lake_schema.mission.detector_overrides`).
 
     Attributes
     ----------
     parameters : tuple of Parameter
-        One record per name.
+        Chosen values, one per name.
     ladder : tuple of str
         Statuses in order of preference.
     overridden : tuple of str
-        Names whose value a request replaced.
+        Names of values from the request.
     models : tuple of Model
-        One model per name.
+        Chosen models, one per name.
     folder : Path or None
         Folder with the files of the models, or None if the package contains them.
     contents : tuple of (str, bytes)
@@ -224,7 +224,7 @@ def resolve(
     models : iterable of Model, optional
         Models in any order; by default those of the package if `records` is None, else none.
     cameras : iterable of Camera, optional
-        Cameras of a user, in addition to those of the records.
+        Cameras of a user, in addition to the cameras of the records.
 
     Returns
     -------

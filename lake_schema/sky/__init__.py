@@ -148,7 +148,7 @@ def cell_corners(order: int, cells: npt.ArrayLike) -> Float:
 
 
 def _even_bits(bits: Int) -> Int:
-    """Return the number that consists of bits 0, 2, 4 ... of a number."""
+    """Return the number that consists of every second bit of a number, from bit 0."""
     packed = bits & 0x5555555555555555
     for shift, mask in (
         (1, 0x3333333333333333), (2, 0x0F0F0F0F0F0F0F0F), (4, 0x00FF00FF00FF00FF), (8, 0x0000FFFF0000FFFF),
@@ -252,7 +252,7 @@ def cells_in_cones(ra: npt.ArrayLike, dec: npt.ArrayLike, radius: npt.ArrayLike,
 
     Notes
     -----
-    The function is fast if the circles lie close together, such as those of the detectors of a camera.
+    The function is fast if the circles lie close together, such as the circles around the detectors of a camera.
     """
     lon, lat = check_positions(ra, dec)
     radii, fine = np.asarray(radius, float), min(order + 3, MAX_ORDER)

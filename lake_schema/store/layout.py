@@ -191,7 +191,7 @@ def table_names(root: Folder) -> list[str]:
 
 
 def current_key(root: Folder, table_name: str) -> str | None:
-    """Return the key of the version that was published last, or None if there is none.
+    """Return the key of the version that was published last, or None if nothing has been published.
 
     The version itself may be missing.
 
@@ -204,7 +204,7 @@ def current_key(root: Folder, table_name: str) -> str | None:
 
 
 def linked_key(link: Folder, table_name: str) -> str | None:
-    """Return the key of the version to which a link leads, or None if there is no link.
+    """Return the key of the version to which a link leads, or None if the link does not exist.
 
     Parameters
     ----------

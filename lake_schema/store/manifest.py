@@ -202,7 +202,7 @@ def faults(folder: Folder, facts: Json, deep: bool = False) -> list[str]:
     Returns
     -------
     list of str
-        One sentence per fault, empty if there is none.
+        One sentence per fault, empty for a sound version.
     """
     entries = facts["files"]
     names = {entry["path"] for entry in entries}

@@ -85,8 +85,8 @@ def make_version(
         Function like map: takes (function, tasks) and returns results in any order. Results are only used to report
         failures; receipts decide which tasks are done.
     base : str or None, optional
-        Key of the version that this one replaces. By default ("") it is the version that exists at the call: that of
-        the request if `name` is given, else the current one.
+        Key of the version that this one replaces. By default ("") it is the version that exists at the call: the
+        version of the request if `name` is given, else the current one.
     name : str, optional
         Name of the request for which the version is made. The request is then also linked to the inputs of the plan.
 
@@ -172,7 +172,7 @@ def _run_tasks(root: Path, plan: Plan, task_function: TaskFunction, mapper: Mapp
 
 
 def _candidate_versions(root: Path, table: str, name: str | None) -> list[Path]:
-    """Return versions that may contain reusable partitions: of the request, the current one, of other requests."""
+    """Return versions that may contain reusable partitions: the request's, the current one, and other requests'."""
     keys = [
         _replaced_key(root, table, name),
         current_key(root, table),

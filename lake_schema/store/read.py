@@ -392,14 +392,19 @@ def input_version(root: Folder, name: str, request: str) -> Version:
     Returns
     -------
     Version
-        The version. Errors are those of `version`.
+        The version.
+
+    Raises
+    ------
+    BadInput, Damaged, VersionMismatch
+        As in `version`.
     """
     request_key = request_links.linked_key(root, request, name)
     return latest_version(root, name) if request_key is None else version(root, name, request=request)
 
 
 def latest_version(root: Folder, name: str) -> Version:
-    """Return the version that was published last, of any request; errors are those of `version`."""
+    """Return the version that was published last, of any request; it raises the errors of `version`."""
     current_key = layout.current_key(root, name)
     if current_key is None:
         raise BadInput(f"lake {root} has no table {name}")
@@ -488,7 +493,7 @@ def table_names(root: Folder) -> list[str]:
 
 
 def find_faults(published: Version, deep: bool = False) -> list[str]:
-    """Return the faults of a version as sentences, empty if there is none.
+    """Return the faults of a version as sentences, empty for a sound version.
 
     If `deep`, the sha256 of every file is compared, and each cell is checked to contain only its own rows, sorted.
     """

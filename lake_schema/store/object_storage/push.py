@@ -248,8 +248,8 @@ def push(root: Path, address: Address, only: Sequence[str] = (), threads: int = 
     address : Address
         Address of the lake on object storage.
     only : sequence of str, optional
-        Tables to push; other tables on object storage stay. By default, all tables are pushed, and the published versions
-        become those of this lake.
+        Tables to push; other tables on object storage stay. By default, all tables are pushed, and the published
+        versions become the versions of this lake.
     threads : int, optional
         Number of objects that are sent at the same time.
 
