@@ -1,7 +1,7 @@
-"""Inspect and clean up a lake, print the reference of all tables, or query the mission database.
+"""Inspect and clean up a lake: python -m lake_schema list|verify|gc|describe LAKE [TABLE].
 
-``list|verify|gc|describe LAKE [TABLE]`` work on a lake. ``tables`` prints the reference page of all tables. ``mission
-list [PATTERN]`` prints the mission database, and ``mission diff A [B]`` compares two of its configurations.
+`tables` prints the reference page of all tables. `mission list [PATTERN]` prints the mission database, and `mission
+diff A [B]` compares two of its configurations.
 """
 
 from __future__ import annotations

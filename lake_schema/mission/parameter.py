@@ -118,7 +118,7 @@ def record_identity(record: MissionRecord) -> Identity:
 
 @cache
 def parse_unit(text: str, where: str = "mission") -> u.UnitBase:
-    """Return the astropy unit of a unit string; raise BadInput, which begins with `where`, if the string is not a unit."""
+    """Return the astropy unit of a unit string; raise BadInput, which begins with `where`, for any other string."""
     try:
         unit = u.Unit(text)
     except (ValueError, TypeError):

@@ -217,7 +217,7 @@ class ObjectStore:
 
     @cached_property
     def links(self) -> dict[str, str]:
-        """Links of the lake and their targets; raise BadInput if there is no such lake or the service is unreachable."""
+        """Links of the lake and their targets; raise BadInput if there is no such lake or service."""
         name = f"{self.address.plain}/{CURRENT}"
         try:
             return parse_published(self.read_object(CURRENT), name).links()
@@ -270,8 +270,8 @@ def _table_of_link(link: str) -> str:
 class ObjectPath:
     """A lake on object storage (no parts), or a name in it: a link, a folder of links, or an object.
 
-    It has the methods of pathlib.Path that readers use. Links and their targets come from `current` as it was when the
-    lake was first read.
+    It has the methods of pathlib.Path that readers use. Links and their targets come from `current` at the time of
+    the first read.
     """
 
     store: ObjectStore = field(repr=False, compare=False)
