@@ -227,7 +227,7 @@ def stream_to_fits(
     record_type = np.dtype([(f"f{number}", scan.dtype) for number, scan in enumerate(scans)])
     if max_bytes is not None and rows * record_type.itemsize > max_bytes:
         raise BadInput(
-            f"a FITS file of the result would exceed {max_bytes / 1e9:.3g} GB: ask for less, or another format"
+            f"a FITS file of the result has more than {max_bytes / 1e9:.3g} GB: ask for less, or another format"
         )
     with tempfile.TemporaryFile() as lists:
         # The header contains the size of the values of lists, which follow the rows, so it is written again at the end.

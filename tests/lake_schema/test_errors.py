@@ -1,4 +1,4 @@
-"""Refusals: one line that anybody can print, however long and strange what it names."""
+"""Error messages are one printable line, even if they name something long or strange."""
 
 import pickle
 

@@ -1,4 +1,4 @@
-"""What `list` says of a lake."""
+"""Output of the command `list`."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""The commands that look after a lake: what they print and how they end."""
+"""Output and exit status of the commands that inspect and clean up a lake."""
 
 import errno
 import os

@@ -1,4 +1,4 @@
-"""HDF5 in OpenCosmo's layout: read as it is, a piece at a time, or refused in one line that names file and dataset."""
+"""HDF5 files in OpenCosmo's layout are read correctly in bounded pieces, or refused in one line."""
 
 import h5py
 import numpy as np

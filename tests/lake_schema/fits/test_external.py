@@ -1,4 +1,4 @@
-"""External FITS files: whatever is wrong in one is a sentence, soon, and in little memory."""
+"""Faulty FITS files of other programs are refused in one line, quickly and with little memory."""
 
 import gzip
 import resource
@@ -18,7 +18,7 @@ READERS = {
     "read_map": lambda path: external.read_map(path, "a"),
     "read_planes": lambda path: external.read_planes(path, "a"),
 }
-# What has no bound takes minutes; a slow machine's imports take seconds.
+# Reading without limits takes minutes; imports on a slow machine take seconds.
 MOST_SECONDS, MOST_BYTES = 30.0, 512 << 20
 
 
@@ -38,7 +38,7 @@ def good(tmp_path):
 
 
 def card(name, value):
-    """The same file with a card of its table changed."""
+    """Return the same file with a changed card of its table."""
 
     def change(data):
         start = data.index(f"{name:8}= ".encode(), 2880)
@@ -92,7 +92,7 @@ UNSEEN = [BROKEN[name] for name in ("no title", "a title that is a number", "a f
 def test_what_is_broken_is_refused_in_a_line(good, name, change):
     good.write_bytes(change(good.read_bytes()))
     before, started = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10, time.process_time()
-    # What one of them does not look at may be wrong.
+    # A reader need not notice faults in parts of a file that it does not use.
     said = f"{good}: a line" if change in UNSEEN else ""
     try:
         READERS[name](good)

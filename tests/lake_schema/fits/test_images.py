@@ -1,4 +1,4 @@
-"""FITS: the bytes, the checksums, and what a damaged or hostile file meets."""
+"""FITS files: bytes, checksums, and the refusal of damaged or hostile files."""
 
 import numpy as np
 import pytest
@@ -51,7 +51,7 @@ def test_the_same_input_gives_the_same_bytes(tmp_path):
 @settings(max_examples=12)
 @given(st.sampled_from(TYPES).flatmap(lambda t: hnp.arrays(t, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9))))
 def test_what_is_packed_is_read_as_it_was(tmp_path_factory, data):
-    """In the first place of a file and in another, whole numbers or not."""
+    """Images are compressed as the first or another unit of a file, with integers or floats."""
     path = tmp_path_factory.mktemp("fits") / "a.fits"
     for images in ([Image(data, CARDS), Image(data, name="COPY")], [Image(None, CARDS),
                    Image(data, CARDS, "COPY")]):  # fmt: skip
@@ -77,7 +77,7 @@ def test_tiles_are_sixteen_rows_or_what_is_left_of_an_image(tmp_path, shape):
 
 
 def test_cards_that_are_equal_are_written_each_as_it_is():
-    """0.0 and -0.0, 1, 1.0 and True are equal to Python: none stands in for another."""
+    """In Python, 0.0 equals -0.0, and 1 equals 1.0 and True; each must be written as given."""
     values = (0.0, -0.0, 1, 1.0, True, "1", -0.0, True, 1.0, 1, 0.0)
     lines = cards_to_text([("A", value, "") for value in values]).splitlines()
     assert lines == [str(astropy_fits.Card("A", value, "")).rstrip() for value in values]
@@ -90,7 +90,7 @@ def test_packed_images_are_small_sound_and_the_same_every_time(tmp_path):
         write_images(tmp_path / name, [Image(noise, CARDS, "1-1.E")], rice=True)
     good = (tmp_path / "a").read_bytes()
     assert good == (tmp_path / "b").read_bytes()
-    # 3.5 bits a pixel is what such noise holds; and headers.
+    # This noise contains 3.5 bits per pixel; the rest are headers.
     assert len(good) < 0.35 * noise.nbytes + 6 * 2880
     with astropy_fits.open(tmp_path / "a", checksum=True, disable_image_compression=True) as units:
         units.verify("exception")
@@ -134,7 +134,7 @@ def test_a_changed_byte_is_noticed(tmp_path):
     path = tmp_path / "a.fits"
     write_images(path, [Image(science(), CARDS)])
     good = path.read_bytes()
-    # In the data, and in a card's value.
+    # Change a byte of the data, and a byte of a card's value.
     for place in (2880 + 100, good.index(b"560.53") + 1):
         path.write_bytes(good[:place] + bytes([good[place] ^ 1]) + good[place + 1 :])
         with pytest.raises(Damaged, match=r"a\.fits"):
@@ -232,7 +232,7 @@ def test_tables_with_texts_gaps_and_lists(tmp_path):
 
 
 def exported(path, table, **columns):
-    """The table as an independent reader sees it, and its raw bytes."""
+    """Return the table as an independent reader reads it, and its raw bytes."""
     tables.table_to_fits(path, table.build({"id": np.arange(3), **columns}), table)
     with astropy_fits.open(path, character_as_bytes=True) as units:
         raw = np.array(units[1].data.view(np.ndarray))
@@ -288,7 +288,7 @@ def test_units_are_spelled_as_fits_wants():
 
 
 def somebodys(path):
-    """An external table: whole numbers, one of them none, numbers, a flag, texts, and lists of two lengths."""
+    """Write a table of another program: integers (one missing), floats, booleans, texts, and lists of two lengths."""
     columns = [
         astropy_fits.Column("number", "J", null=-9, array=np.array([3, -9, 5])),
         astropy_fits.Column("id", "K", array=np.array([2**60, 2, 3])),
@@ -332,7 +332,7 @@ def test_what_is_no_number_a_row_is_refused(tmp_path, name, words):
 
 
 def test_a_map_is_read_in_the_order_of_its_file(tmp_path):
-    """A pixel a row, or many; of a table only."""
+    """A row of a map has one pixel or many."""
     path = somebodys(tmp_path / "a.fits")
     for name, wanted in (("id", [2**60, 2, 3]), ("pair", [0, 1, 2, 3, 4, 5])):
         values, header = external.read_map(path, name)

@@ -1,4 +1,4 @@
-"""Files of images joined into one: every array as it was, and what is common said once."""
+"""Files of images are joined into one: all arrays are unchanged, and common cards are stored once."""
 
 import numpy as np
 import pytest
@@ -64,7 +64,7 @@ def test_every_array_is_as_it_was(tmp_path, make, rice):
 
 
 def test_what_differs_is_said_of_each_array(tmp_path):
-    """Its own card comes before that of its file's first header."""
+    """A card of an array takes precedence over a card of its file's first header."""
     files, path = written(tmp_path, [of_extensions(0), of_extensions(1, 3.0)]), tmp_path / "all.fits"
     joined.join(path, files, SHARED, ())
     first, *found = images.read_images(path)
@@ -109,7 +109,7 @@ def test_one_file_at_a_time_is_in_memory(tmp_path):
 
 @pytest.mark.parametrize("rice", [False, True])
 def test_arrays_named_alike_are_told_apart(tmp_path, rice):
-    """As amplifiers, of which each detector has the same."""
+    """For example, all detectors have amplifiers of the same names."""
     units = [Image(None, (("CAMERA", "x", ""),)), *(Image(array(i, np.uint16), (), f"C0{i}") for i in range(2))]
     joined.join(tmp_path / "all.fits", written(tmp_path, [units, units], rice), SHARED, ())
     names = [unit.name for unit in images.read_images(tmp_path / "all.fits")[1:]]

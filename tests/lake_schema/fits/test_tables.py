@@ -1,4 +1,4 @@
-"""A binary table of any number of rows holds what one that is made in memory does."""
+"""A binary table that is written in batches equals one that is written from memory."""
 
 import io
 

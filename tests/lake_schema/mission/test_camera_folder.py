@@ -1,4 +1,4 @@
-"""Folders of cameras: they are read, and mistakes are refused with the file and the line."""
+"""Folders of cameras are read, and mistakes are refused with file and line."""
 
 import csv
 
@@ -42,7 +42,7 @@ def test_a_folder_that_is_written_has_all_numbers_of_the_known_camera(tmp_path, 
             assert float(own[key]) == pytest.approx(ratio * KNOWN.value(f"ext.{known}.{key}"), rel=1e-6)
     for parameter in KNOWN.parameters:
         name = parameter.key.removeprefix(f"ext.{known}.")
-        # A folder has no exposure times of bands, and the level of the sky as a magnitude.
+        # A folder has no exposure times of bands, and it gives the sky level as a magnitude.
         if name != parameter.key and not name.endswith((".sky", "_r.exposure_time", "_u.exposure_time")):
             assert mission.value(f"ext.copied.{name}", parameter.unit) == parameter.value, name
 
@@ -80,7 +80,7 @@ def test_without_a_wavefront_the_telescope_has_that_of_the_others(folder):
 
 
 def write_again(file, change):
-    """Write a table with other rows: `change` gets all rows, the header first, and returns those to be written."""
+    """Write a table with other rows; `change` gets all rows (the header first) and returns the new ones."""
     lines = [line for line in file.read_text().splitlines() if not line.startswith("#")]
     with file.open("w", newline="") as stream:
         csv.writer(stream).writerows(change(list(csv.reader(lines))))

@@ -1,4 +1,4 @@
-"""Records of the mission database: what is read, and what is refused."""
+"""Records of the mission database are read, and wrong ones are refused."""
 
 import re
 
@@ -62,19 +62,19 @@ def test_every_record_of_the_package_names_a_publication():
 
 
 def test_published_statuses_are_all_there():
-    """The ladder has something to choose from."""
+    """The ladder must have several statuses to choose from."""
     found = {(r.key, r.status): r.value for r in read_all_parameters()}
     assert {s for k, s in found if k == "vis.read_noise"} == {"REQ", "DES", "CBE", "SIM"}
     assert found["vis.gain", "CBE"] == 3.48
     assert found["vis.gain", "REQ"] == 3.1
-    # A current best estimate keeps its requirement.
+    # A current best estimate meets the requirement.
     for quantity in ("read_noise", "dark_current"):
         best = found.get((f"vis.{quantity}", "CBE"), found.get((f"vis.{quantity}", "BLT")))
         assert best <= found[f"vis.{quantity}", "REQ"]
 
 
 def test_no_zero_point_of_euclid_is_stored():
-    """It follows from throughput and area: a second number could disagree. Ground surveys publish theirs."""
+    """It follows from throughput and area, so a second number could disagree. Ground surveys publish theirs."""
     stored = [record.key for record in read_all_parameters() if "zp" in record.key or "zero_point" in record.key]
     assert {key.split(".")[0] for key in stored} == {"ext"}
 
@@ -104,7 +104,7 @@ def test_a_unit_without_a_finite_factor_is_refused(unit, words):
 def test_the_zodiacal_table_is_the_published_one():
     table = {row[0]: row[1:] for row in resolve().numbers("env.zodi.map")}
     assert len(table) == 19
-    # Ecliptic poles, quadrature and anti-solar point of Leinert et al. 1998, Table 17.
+    # Leinert et al. 1998, Table 17: ecliptic poles, quadrature and anti-solar point.
     assert {row[-1] for row in table.values()} == {77.0}
     assert table[90.0][0] == 259.0
     assert table[180.0][0] == 230.0

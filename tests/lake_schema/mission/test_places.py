@@ -1,4 +1,4 @@
-"""Values of a detector or an amplifier: the narrowest holds, and what has no such place is refused by name."""
+"""Values of a detector or an amplifier: the most specific one is used, and impossible places are refused by name."""
 
 import json
 
@@ -51,7 +51,7 @@ def test_the_narrowest_holds(given, detector):
     )
     found = mission.amplifier_values("vis.gain", GAIN, detector)
     assert (found * 4 if len(found) == 1 else found) == wanted
-    # A detector's own, whatever one of its amplifiers has.
+    # The value of a detector does not depend on the values of its amplifiers.
     assert mission.value("vis.gain", place=DetectorPlace(detector)) == given.get(f"@{detector}", given.get("", 3.48))
     assert mission.value("vis.gain", "electron / adu") == given.get("", 3.48)
     assert (mission.fingerprint == MISSION.fingerprint) == ({**given, "": 3.48} == {"": given.get("", 3.48)})
@@ -124,7 +124,7 @@ def test_the_list_has_every_name_with_its_bounds():
         assert entries[name].by == "amplifier"
     assert entries["vis.gain@3-4.E"].status == "SIM"
     assert (entries["vis.dark_current"].by, entries["vis.exposure_time"].by) == ("detector", "")
-    # In the parameter's own unit, whatever the bound's.
+    # Bounds are converted to the unit of the parameter.
     lo, hi = entries["svm.launch"].bounds or (0.0, 1e9)
     assert lo <= mission.value("svm.launch") <= hi
     for entry in entries.values():

@@ -1,4 +1,4 @@
-"""A configuration goes into the lake and comes back; two of them are told apart."""
+"""A configuration is written to a lake and read back, and two configurations are compared."""
 
 import hashlib
 import json
@@ -38,10 +38,10 @@ def test_it_comes_back_as_it_went(tmp_path, configuration):
     assert back.fingerprint == configuration.fingerprint
     assert list(differences(back, configuration)) == []
     assert read.find_faults(version, deep=True) == []
-    # Its own copies of the files serve where the package's have changed.
+    # The copies in the lake are used if the package's files have changed.
     for m in configuration.models:
         assert (back.folder / m.sha256).is_file()
-    # What was read back can be published again, to the same rows.
+    # A configuration that was read back can be published again with the same rows.
     assert published.to_table(back).equals(published.to_table(configuration))
 
 
@@ -64,7 +64,7 @@ def test_records_that_the_package_no_longer_has_come_back_too(tmp_path):
 
 
 def test_it_is_read_once_as_long_as_its_file_stays(tmp_path):
-    """A second reader gets the same; one of a file that has been changed or is gone is refused as the first would."""
+    """A second reader gets the cached configuration; a changed or missing file is refused by every reader."""
     version = put(tmp_path, resolve())
     assert published.read_back(read.version(tmp_path, "mission")) is published.read_back(version)
     file = version.folder / "dataset" / "all.parquet"
@@ -108,7 +108,7 @@ def test_names_that_only_one_has():
     some = MissionConfiguration((Parameter("a.b", "CBE", 1.0, "s", source="x"),))
     assert list(differences(some, MissionConfiguration(()))) == ["a.b: 1.0 s (CBE) -> absent"]
     assert list(differences(MissionConfiguration(()), some)) == ["a.b: absent -> 1.0 s (CBE)"]
-    # Another source or status of the same value acts alike.
+    # Source and status of a value have no effect.
     other = MissionConfiguration((Parameter("a.b", "BLT", 1.0, "s", source="y"),))
     assert list(differences(some, other)) == []
 

@@ -1,4 +1,4 @@
-"""What gc may remove: nothing that a name links to, nor what that was made of, however far back."""
+"""gc removes no version that a name links to, nor a version from which such a version was made, even indirectly."""
 
 import fcntl
 import tempfile
@@ -23,7 +23,7 @@ def plan_of(table, number, inputs=()):
     return Plan(replace(PLAIN, name=table), facts, (Task("0.parquet", {"part": 0}),))
 
 
-# (table, request or none, which of the versions before it it was made of)
+# (table, request or None, indices of the earlier versions from which it was made)
 PUBLISHED = st.tuples(
     st.sampled_from(TABLES), st.sampled_from(["a", "b", None]), st.lists(st.integers(0, 9), max_size=2)
 )
@@ -46,7 +46,7 @@ def test_nothing_that_is_reached_from_a_name_is_removed(published, chosen):
             pinned[table, None] = this
             if request:
                 pinned[table, request] = this
-                # Of two versions of one table that it was made of the first by its key is the request's.
+                # If it was made from two versions of a table, the request is linked to the one with the lower key.
                 for one in sorted(one for one in inputs if one[0] != table):
                     pinned.setdefault((one[0], request), one)
         reached, waiting = set(), list(pinned.values())
@@ -113,7 +113,7 @@ def test_a_stage_in_use_is_neither_said_nor_removed(lake):
 
 
 def test_nobody_waits_while_manifests_are_read(lake, monkeypatch):
-    """A lake of many versions takes longer to read than a run that publishes waits."""
+    """Reading the manifests of many versions takes longer than the time limit of a run that publishes."""
     for seed in (1, 2):
         publish.make_version(lake, plain_plan(seed), plain_work, name="a")
     load, held = manifest.load, []
@@ -149,7 +149,7 @@ def test_who_asks_for_a_lock_is_in_nobodys_way(lake):
     lock = layout.table_folder(lake, "plain") / f".lock-{plan.key}"
     lock.parent.mkdir()
     with lock.open("a") as stream:
-        # What is_held does, for longer than it does.
+        # This does the same as is_held, but longer.
         fcntl.flock(stream.fileno(), fcntl.LOCK_EX)
         timer = threading.Timer(0.2, fcntl.flock, (stream.fileno(), fcntl.LOCK_UN))
         timer.start()

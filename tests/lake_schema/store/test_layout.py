@@ -1,4 +1,4 @@
-"""Names: nothing that could leave the lake gets through."""
+"""Names that could lead out of the lake are refused."""
 
 import pytest
 from hypothesis import given

@@ -1,4 +1,4 @@
-"""Publishing: what is made is whole, repeatable and refused when it is not what it should be."""
+"""Published versions are complete and repeatable, and wrong ones are refused."""
 
 import json
 import os
@@ -191,7 +191,7 @@ def test_copies_of_a_task_that_are_late_change_nothing(lake, monkeypatch):
     path, first = stage / data_path(TOY, part.name), []
 
     def slow(root, facts):
-        # Another copy ends while this one renders.
+        # Another copy of the task ends while this one renders.
         run_task(root, plan.key, TOY, plan.facts, toy_work, part)
         first.append(path.stat().st_ino)
         return toy_work(root, facts)
@@ -217,7 +217,7 @@ def test_copies_of_a_task_that_are_late_change_nothing(lake, monkeypatch):
 
 
 def test_what_is_done_needs_no_lock(lake, monkeypatch):
-    """A lake that cannot be written is no reason to fail where nothing is left to do."""
+    """A lake that is not writable is no reason to fail if there is nothing to do."""
     folder = publish.make_version(lake, toy_plan(), toy_work)
     monkeypatch.delattr(locks, "hold")
     assert publish.make_version(lake, toy_plan(), None) == folder

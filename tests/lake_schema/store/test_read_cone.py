@@ -1,4 +1,4 @@
-"""Selections on the sky: by observed and by true position, across the edges of cells of one or several orders."""
+"""Selections on the sky by observed and by true position, across edges of cells of one or several orders."""
 
 import healpy as hp
 import numpy as np
@@ -22,13 +22,13 @@ LENSED = Table(
     "A toy catalogue with lensed positions.",
     order=5,
 )
-# Where the cells 1607, 1610 and their neighbours meet, and a corner at a pole, and one on RA = 0.
+# Common corners of cells 1607, 1610 and their neighbours, a corner at a pole, and one on RA = 0.
 CORNERS = [hp.vec2ang(hp.boundaries(32, cell, nest=True)[:, 0], lonlat=True) for cell in (1607, 1023, 5461)]
 N, SPREAD, DEFLECTION = 4000, 0.05, 8 / 3600
 
 
 def sources(corner, seed=1):
-    """Random sources about a corner of cells, each moved by up to 8 arcsec."""
+    """Return random sources around a corner of cells, each deflected by up to 8 arcsec."""
     rng = np.random.default_rng(seed)
     centre = hp.ang2vec(*corner, lonlat=True).reshape(3)
     true = centre + np.radians(SPREAD) * rng.normal(size=(N, 3))
@@ -47,7 +47,7 @@ def sources(corner, seed=1):
 
 
 def published(root, rows, orders=(5,)):
-    """The rows as a catalogue, one file a cell; with several orders, every cell of order 5 takes the next of them."""
+    """Publish rows as a catalogue with one file per cell; with several orders, cells of order 5 get them in turn."""
     index = rows["_healpix_29"].to_numpy()
     parts = []
     for n, cell in enumerate(np.unique(index >> 48).tolist()):
@@ -91,7 +91,7 @@ def test_no_source_is_lost_at_an_edge(catalogues, data, on):
 
 
 def test_lensing_moves_sources_over_the_edge(catalogues):
-    """The padding matters: without it, sources whose observed cell is not touched would be lost."""
+    """Without the padded radius, sources whose observed cells are not touched would be lost."""
     lost = 0
     for _, rows, version in catalogues:
         assert 0.3 * DEFLECTION < version.deflection() <= DEFLECTION
@@ -172,7 +172,7 @@ def test_the_margin_of_each_cell_is_what_lies_about_it(catalogues):
 
 
 def test_a_cross_match_loses_no_pair_across_cells_of_other_orders(catalogues, tmp_path):
-    """Every source has a twin 0.5" to the north, in files cut in another way."""
+    """Every source has a twin 0.5" to the north, in files with cells of other orders."""
     _, rows, version = catalogues[0]
     columns = {name: rows[name].to_numpy() for name in rows.column_names}
     columns["dec"] = columns["dec"] + 0.5 / 3600

@@ -1,4 +1,4 @@
-"""A table whose declaration is another than this one's is refused by name, with what differs."""
+"""Tables with another declaration are refused by name, with the difference."""
 
 from dataclasses import replace
 
@@ -52,7 +52,7 @@ def test_another_version_is_refused_naming_both(lake, was, now):
 
 
 def test_a_table_is_compared_with_its_declaration_without_being_asked(lake, monkeypatch):
-    """`read.version` itself looks the table up."""
+    """`read.version` itself looks up the declaration."""
     plan = Plan(GALAXIES, {}, (Task(layout.cell_file(5, 1607), {}),))
     publish.make_version(lake, plan, lambda root, facts: Output(rows_of(GALAXIES, 12)))
     monkeypatch.setattr("lake_schema.tables.galaxies.GALAXIES", replace(GALAXIES, columns=GALAXIES.columns[:-1]))
@@ -61,7 +61,7 @@ def test_a_table_is_compared_with_its_declaration_without_being_asked(lake, monk
 
 
 def test_a_unit_is_refused_after_the_right_one_was_read(plain):
-    """Of the same columns and types: what a process has read before does not stand in for it."""
+    """A cached schema with the same columns and types must not hide another unit."""
     assert read.with_declared_schema(plain, PLAIN).schema.names == plain.schema.names
     own = plain.schema.field(0)
     other = plain.schema.set(0, own.with_metadata({**(own.metadata or {}), b"unit": b"furlong"}))

@@ -1,4 +1,4 @@
-"""Requests side by side in one lake: each has its own versions, and nobody takes one for another's."""
+"""Several requests in one lake have separate versions, which are never confused."""
 
 import os
 import shutil
@@ -16,7 +16,7 @@ from tests.universe import PLAIN, plain_plan, plain_work, toy_plan, toy_work
 
 @pytest.fixture
 def two(lake):
-    """Requests a and b, each with a table of its own and one that they share."""
+    """Publish tables of requests a and b: a separate one for each, and one that they share."""
     for name, seed in (("a", 1), ("b", 2)):
         publish.make_version(lake, toy_plan(), toy_work, name=name)
         publish.make_version(lake, plain_plan(seed), plain_work, name=name)
@@ -24,7 +24,7 @@ def two(lake):
 
 
 def made_from(*keys):
-    """A plan of a table that names what it is made of."""
+    """Return a plan of a table whose facts name its inputs."""
     return Plan(replace(PLAIN, name="derived"), {"seed": 1, "inputs": list(keys)}, plain_plan().tasks)
 
 
@@ -68,7 +68,7 @@ def test_a_request_of_one_lake_keeps_the_paths_that_users_hold(lake):
 
 
 def test_requests_do_not_supersede_each_other(lake):
-    """One publishes while the other still works; a second run of the first is told."""
+    """One request publishes while the other is running; a second run of the first request is refused."""
 
     def work(root, facts):
         if facts["part"] == 0:
@@ -85,7 +85,7 @@ def test_what_a_table_is_made_of_belongs_to_the_request_too(lake):
     publish.make_version(lake, plain_plan(1), plain_work, name="a")
 
     def work(root, facts):
-        # Before the first part: nobody removes an input under a job that runs.
+        # The inputs are linked before the first task, so that gc does not remove them while the job runs.
         assert request_links.linked_key(lake, "b", "plain") == plain_plan(1).key
         return plain_work(root, facts)
 

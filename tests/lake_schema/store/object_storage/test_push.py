@@ -1,4 +1,4 @@
-"""A lake on object storage: all of it or what was there before, whoever is killed, damages or comes in between."""
+"""Readers of a lake on object storage see a complete old or new state, even if pushes or objects fail."""
 
 import os
 import random
@@ -27,7 +27,7 @@ def place(bucket):
 
 @pytest.fixture
 def filled(lake):
-    """A catalogue and a plain table."""
+    """Lake with a catalogue and a plain table."""
     publish.make_version(lake, toy_plan(cells=CELLS), toy_work)
     publish.make_version(lake, plain_plan(1), plain_work, name="first")
     return lake
@@ -42,7 +42,7 @@ def opened(place):
 
 
 def seed(place):
-    """Which version of the plain table readers see, every row of it."""
+    """Return which version of the plain table readers see, after checking all its rows."""
     values = set(read.version(opened(place), "plain").rows()["value"].to_pylist())
     assert len(values) == 1
     return values.pop()
@@ -76,7 +76,7 @@ def test_what_is_there_is_not_sent_again(filled, place, bucket):
     pushed(filled, place)
     bucket[0].recorder.asked.clear()
     assert {one.sent for one in pushed(filled, place)} == {0}
-    # The one that must be refused.
+    # This push must be refused.
     assert [path.rpartition("/")[2] for path in bucket[0].recorder.sent()] == ["manifest.json"]
     publish.make_version(filled, plain_plan(2), plain_work)
     told = {(one.table, one.key): one.sent for one in pushed(filled, place)}
@@ -132,7 +132,7 @@ def test_a_push_that_ends_anywhere_is_completed_by_the_next(filled, place, bucke
             assert seed(place) == 1.0
             assert read.table_names(opened(place)) == ["plain"]
     service.recorder.answer = None
-    # The first runs ended before anything was there, and each went farther than the one before.
+    # The first runs end before anything is published, and each run continues the one before.
     assert 2 < most < 20
     assert seed(place) == 2.0
     assert read.find_faults(read.version(opened(place), "toy"), deep=True) == []
@@ -230,7 +230,7 @@ def test_a_service_without_conditions_is_refused(filled, place, bucket):
     bucket[0].recorder.answer = lambda environ: environ.pop("HTTP_IF_NONE_MATCH", None) and None
     with pytest.raises(BadInput, match="ignores conditions of puts"):
         pushed(filled, place)
-    # It is found out before all of the lake has been sent.
+    # This is detected before the whole lake has been sent.
     assert {name.split("/")[2] for name in bucket[0].names(bucket[1])} == {"plain"}
 
 
@@ -245,7 +245,7 @@ def test_a_large_file_goes_in_parts(place, tmp_path, monkeypatch, bucket):
     there.send(one)
     assert there.has_object(one)
     assert bucket[0].data(bucket[1], "lakes/one/large") == data
-    # Amazon ends the sum of an object that came in parts with their number.
+    # Amazon appends the number of parts to the checksum of an object that was sent in parts.
     head, sums = there._client.head_object, []
 
     def as_amazon(**asked):
@@ -271,7 +271,7 @@ def test_a_version_that_is_not_whole_is_not_pushed(filled, place, bucket):
     with pytest.raises(Damaged, match=r"1\.parquet has other bytes"):
         pushed(filled, place)
     file.write_bytes(data)
-    # What is no table is compared when it is sent.
+    # Files that are not tables are compared when they are sent.
     beside = layout.current_link(filled, "toy").resolve() / "toy" / "hats.properties"
     beside.write_bytes(beside.read_bytes().replace(b"toy", b"TOY"))
     with pytest.raises(Damaged, match=r"hats\.properties has other contents than the manifest says"):

@@ -1,4 +1,4 @@
-"""Where a lake on object storage lies, and how it is refused where none is."""
+"""Addresses of lakes on object storage, and errors if there is no lake."""
 
 import time
 
