@@ -36,7 +36,7 @@ def test_tables_are_found_by_name():
     assert tables.find_table("nothing") is None
 
 
-def test_a_row_of_exposures_has_a_field_a_column():
+def test_a_row_of_exposures_has_a_field_per_column():
     """The attributes have the order and the types of the columns; nullable ones may be None."""
     types = {"int64": int, "int32": int, "float64": float, "string": str}
     declared = {c.name: types[c.type] | None if c.nullable else types[c.type] for c in EXPOSURES.columns}
@@ -131,7 +131,7 @@ def test_the_mission_with_what_a_run_chose():
         assert [row["value"] for row in used if row["overridden"]] == [7.5] * given
 
 
-def test_they_can_be_published_and_asked(lake):
+def test_all_tables_can_be_published_and_queried(lake):
     for table, rows in (
         (templates.TEMPLATES, templates.rows(libraries(), origins())),
         (mission.MISSION, published.to_table(resolve())),

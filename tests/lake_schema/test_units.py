@@ -80,6 +80,6 @@ def test_electron_rate_counts_photons():
 
 
 @pytest.mark.parametrize(("area", "width"), [(0.0, 1.0), (1.0, 0.0), (-1.0, 1.0), (np.nan, 1.0), (1.0, np.inf)])
-def test_electron_rate_refuses_what_collects_nothing(area, width):
+def test_electron_rate_refuses_impossible_areas_and_widths(area, width):
     with pytest.raises(OutOfRange):
         units.electron_rate(1.0, area, width)

@@ -92,7 +92,7 @@ def linked(file):
         (changed(lambda file: file["header/file"].attrs.update(data_type="halo_properties")), "holds halo_properties"),
     ],
 )
-def test_what_is_wrong_is_refused_in_one_line(tmp_path, work, said):
+def test_faulty_files_are_refused_in_one_line(tmp_path, work, said):
     path = opencosmo.write(tmp_path / "wrong.hdf5", opencosmo.columns())
     work(path)
     with pytest.raises(BadInput, match=said) as caught:

@@ -30,7 +30,7 @@ def science(ny=30, nx=40):
 
 
 @given(st.sampled_from(TYPES).flatmap(lambda t: hnp.arrays(t, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9))))
-def test_what_is_written_is_read(tmp_path_factory, data):
+def test_written_images_are_read_unchanged(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("fits") / "a.fits"
     write_images(path, [Image(data, CARDS), Image(data, name="COPY")])
     first, second = read_images(path)
@@ -50,7 +50,7 @@ def test_the_same_input_gives_the_same_bytes(tmp_path):
 
 @settings(max_examples=12)
 @given(st.sampled_from(TYPES).flatmap(lambda t: hnp.arrays(t, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9))))
-def test_what_is_packed_is_read_as_it_was(tmp_path_factory, data):
+def test_compressed_images_are_read_unchanged(tmp_path_factory, data):
     """Images are compressed as the first or another unit of a file, with integers or floats."""
     path = tmp_path_factory.mktemp("fits") / "a.fits"
     for images in ([Image(data, CARDS), Image(data, name="COPY")], [Image(None, CARDS),
@@ -111,7 +111,7 @@ def test_a_changed_byte_of_a_packed_image_is_noticed(tmp_path, where):
         read_images(path)
 
 
-def test_what_would_be_too_large_unpacked_is_refused(tmp_path):
+def test_images_too_large_when_decompressed_are_refused(tmp_path):
     path = tmp_path / "a.fits"
     write_images(path, [Image(np.zeros((300, 300), np.uint16))], rice=True)
     with pytest.raises(BadInput, match="more than 100000 bytes"):
@@ -154,7 +154,7 @@ def test_a_file_without_checksums_is_refused(tmp_path):
         read_images(path)
 
 
-def test_size_is_judged_from_the_header(tmp_path):
+def test_size_is_checked_from_the_header(tmp_path):
     path = tmp_path / "a.fits"
     write_images(path, [Image(science())])
     with pytest.raises(BadInput, match="more than 1000 bytes"):
@@ -184,7 +184,7 @@ def test_a_card_that_fits_cannot_hold_is_refused(tmp_path, card):
 
 
 @pytest.mark.parametrize("data", [np.zeros(3), np.zeros((2, 2), complex), np.zeros((1, 2, 2, 2)), np.array([["a"]])])
-def test_what_is_no_image_is_refused(tmp_path, data):
+def test_arrays_that_are_not_images_are_refused(tmp_path, data):
     with pytest.raises(BadInput, match="image"):
         write_images(tmp_path / "a.fits", [Image(data)])
     with pytest.raises(BadInput, match="at least one"):
@@ -240,7 +240,7 @@ def exported(path, table, **columns):
 
 
 @pytest.mark.parametrize("kind", ["int8", "int16", "int32", "int64"])
-def test_what_is_missing_is_told_from_every_number(tmp_path, kind):
+def test_null_differs_from_every_number(tmp_path, kind):
     table = Table("t", 1, (Column("id", "int64"), Column("x", kind, lo=0, nullable=True)), "t")
     limits = np.iinfo(kind)
     for values in ([limits.min, limits.max, 0], [-1, -(2**15) % limits.max, 5], [limits.min, limits.min + 1, 7]):
@@ -250,7 +250,7 @@ def test_what_is_missing_is_told_from_every_number(tmp_path, kind):
         assert found["x"][:2].tolist() == values[:2]
 
 
-def test_a_column_of_all_numbers_has_none_for_what_is_missing():
+def test_a_column_with_all_values_has_none_left_for_null():
     with pytest.raises(ValueError, match="every number of int8"):
         tables._lowest_unused_value(np.arange(-128, 128).astype(np.int8))
     assert tables._lowest_unused_value(np.array([], np.int16)) == -(2**15)
@@ -281,7 +281,7 @@ def test_a_name_that_fits_cannot_hold_is_refused(tmp_path, name):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_units_are_spelled_as_fits_wants():
+def test_units_have_the_spelling_of_fits():
     assert tables.fits_unit("GB") == "Gbyte"
     assert tables.fits_unit("erg s-1 cm-2") == "erg s-1 cm-2"
     assert tables.fits_unit("electron pix-1 s-1") == "electron pix-1 s-1"
@@ -305,7 +305,7 @@ def somebodys(path):
 
 
 @pytest.mark.parametrize("rows", [1, 2, 3, 100])
-def test_numbers_of_others_are_read_in_batches(tmp_path, rows):
+def test_external_columns_are_read_in_batches(tmp_path, rows):
     path = somebodys(tmp_path / "a.fits")
     names = ("number", "id", "flux", "good")
     batches = list(external.read_batches(path, names, ("name", "absent"), rows))
@@ -325,7 +325,7 @@ def test_numbers_of_others_are_read_in_batches(tmp_path, rows):
     [("absent", "has no column absent; it has number, id"), ("name", "must be one number per row"),
      ("pair", "must be one number per row"), ("list", "column list holds lists")],
 )  # fmt: skip
-def test_what_is_no_number_a_row_is_refused(tmp_path, name, words):
+def test_columns_without_one_number_per_row_are_refused(tmp_path, name, words):
     path = somebodys(tmp_path / "a.fits")
     with pytest.raises(BadInput, match=words):
         list(external.read_batches(path, [name]))

@@ -63,7 +63,7 @@ def test_every_array_is_as_it_was(tmp_path, make, rice):
     assert again.read_bytes() == path.read_bytes()
 
 
-def test_what_differs_is_said_of_each_array(tmp_path):
+def test_differing_cards_are_stored_with_each_array(tmp_path):
     """A card of an array takes precedence over a card of its file's first header."""
     files, path = written(tmp_path, [of_extensions(0), of_extensions(1, 3.0)]), tmp_path / "all.fits"
     joined.join(path, files, SHARED, ())
@@ -108,7 +108,7 @@ def test_one_file_at_a_time_is_in_memory(tmp_path):
 
 
 @pytest.mark.parametrize("rice", [False, True])
-def test_arrays_named_alike_are_told_apart(tmp_path, rice):
+def test_arrays_with_equal_names_get_different_names(tmp_path, rice):
     """For example, all detectors have amplifiers of the same names."""
     units = [Image(None, (("CAMERA", "x", ""),)), *(Image(array(i, np.uint16), (), f"C0{i}") for i in range(2))]
     joined.join(tmp_path / "all.fits", written(tmp_path, [units, units], rice), SHARED, ())

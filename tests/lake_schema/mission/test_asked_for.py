@@ -57,7 +57,7 @@ def names_in_code():
     return strings, re.compile("|".join(f"(?:{pattern})" for pattern in sorted(formatted)))
 
 
-def test_every_row_is_asked_for():
+def test_code_uses_every_row():
     """tests/truesky/render/channels/test_ground_parameters.py checks the rows of ground cameras."""
     strings, formatted = names_in_code()
 

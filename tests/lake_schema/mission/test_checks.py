@@ -157,7 +157,7 @@ def test_a_first_order_spectrum_is_512_pixels_long():
         assert (float(rows[0]["last_nm"]) - float(rows[0]["first_nm"])) / length == pytest.approx(1.34, rel=1e-6)
 
 
-def test_what_the_table_of_traces_says_is_no_value_beside_it():
+def test_the_table_of_traces_has_no_redundant_values():
     """The polynomials determine ends and dispersion of a grism, so separate values would have no effect."""
     grisms = {row["grism"].lower() for row in MISSION.rows("nisp.traces")}
     beside = {

@@ -96,7 +96,7 @@ def test_the_fingerprint_follows_the_files():
     assert resolve(models=(*models, replace(ZODI, source="elsewhere"))).fingerprint == base.fingerprint
 
 
-def test_a_table_is_read_once_and_nobody_changes_it():
+def test_a_table_is_cached_and_immutable():
     """The effects of one detector use the table of amplifiers some hundred times."""
     data = read_content(next(m for m in read_models() if m.key == "ext.gpc1.amplifiers"))
     assert parse_rows(data) is parse_rows(data)

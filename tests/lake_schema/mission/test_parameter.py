@@ -19,7 +19,7 @@ def write(folder, *lines):
     return path
 
 
-def test_a_record_is_read_with_all_it_says(tmp_path):
+def test_a_record_is_read_with_all_fields(tmp_path):
     (record,) = read(write(tmp_path, 'a.gain,CBE,3.48,electron / adu,2,60000.5,published,"Somebody, 2024"'))
     assert record == Parameter("a.gain", "CBE", 3.48, "electron / adu", 2, 60000.5, "published", "Somebody, 2024")
 
@@ -128,7 +128,7 @@ def test_statuses_and_sections_are_those_that_are_known():
         (b"a.b,CBE,1,m,1,,assumed," + b"x" * 200_000, "field larger than"),
     ],
 )
-def test_a_text_that_is_none_is_named(tmp_path, line, words):
+def test_an_unreadable_text_is_refused_by_name(tmp_path, line, words):
     path = tmp_path / "vis.csv"
     path.write_bytes(b"key,status,value,unit,version,valid_from,confidence,source\n" + line + b"\n")
     with pytest.raises(BadInput, match=rf"^vis.csv.*{words}"):

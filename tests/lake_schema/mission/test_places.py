@@ -40,7 +40,7 @@ def test_each_pattern_is_of_some_parameter(pattern):
     given=st.dictionaries(st.sampled_from(["", "@3-4", ".E", ".G", "@3-4.E", "@1-1.F"]), st.floats(1.0, 9.0)),
     detector=st.sampled_from(["", "3-4", "1-1", "6-6"]),
 )
-def test_the_narrowest_holds(given, detector):
+def test_the_most_specific_value_is_used(given, detector):
     mission = resolve(overrides={f"vis.gain{where}": (value, GAIN) for where, value in given.items()})
     wanted = tuple(
         next(
@@ -96,7 +96,7 @@ def test_each_camera_has_its_detectors():
         ("ext.decam.gain@3-4", "ext.decam has no detector '3-4', only 62"),
     ],
 )
-def test_a_place_that_is_not_there_is_refused_by_name(name, words):
+def test_a_missing_place_is_refused_by_name(name, words):
     key = detector_overrides.split_name(name, MISSION)[0]
     unit = MISSION.parameter(key).unit if key in [record.key for record in read_all_parameters()] else ""
     with pytest.raises(BadInput, match=words) as error:

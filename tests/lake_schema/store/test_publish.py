@@ -17,7 +17,7 @@ def sums(lake):
     return {f["path"]: f["sha256"] for f in read.version(lake, "toy").manifest["files"]}
 
 
-def test_what_is_published_can_be_read(lake):
+def test_published_rows_can_be_read(lake):
     folder = publish.make_version(lake, toy_plan(), toy_work)
     version = read.version(lake, "toy")
     assert version.folder == folder
@@ -47,7 +47,7 @@ def test_a_second_run_makes_nothing(lake):
     publish.make_version(lake, toy_plan(), never)
 
 
-def test_what_failed_is_listed_and_the_rest_is_kept(lake):
+def test_failed_tasks_are_listed_and_the_rest_is_kept(lake):
     made = []
 
     def work(root, facts):
@@ -65,7 +65,7 @@ def test_what_failed_is_listed_and_the_rest_is_kept(lake):
     assert read.find_faults(read.version(lake, "toy"), deep=True) == []
 
 
-def test_a_silent_worker_is_found_out(lake):
+def test_a_worker_without_a_receipt_is_detected(lake):
     with pytest.raises(TasksFailed, match="ended without a receipt"):
         publish.make_version(lake, toy_plan(), toy_work, mapper=lambda f, parts: [])
 
@@ -86,7 +86,7 @@ def test_wrong_rows_are_never_published(lake, wrong):
         publish.make_version(lake, toy_plan(), work)
 
 
-def test_whatever_goes_into_a_plan_changes_its_key():
+def test_every_fact_of_a_plan_changes_its_key():
     plan = toy_plan()
     others = [
         toy_plan(seed=2),
@@ -139,7 +139,7 @@ def test_a_version_that_was_overtaken_is_not_published(lake):
     assert read.version(lake, "toy").key == toy_plan(2).key
 
 
-def test_two_runs_of_one_plan_do_not_meet(lake, monkeypatch):
+def test_a_second_run_of_a_running_plan_is_refused(lake, monkeypatch):
     monkeypatch.setattr(locks, "SHORT_TIMEOUT", 0.1)
 
     def work(root, facts):
@@ -216,7 +216,7 @@ def test_copies_of_a_task_that_are_late_change_nothing(lake, monkeypatch):
     assert publish.make_version(lake, plan, toy_work) == folder
 
 
-def test_what_is_done_needs_no_lock(lake, monkeypatch):
+def test_a_finished_version_needs_no_lock(lake, monkeypatch):
     """A lake that is not writable is no reason to fail if there is nothing to do."""
     folder = publish.make_version(lake, toy_plan(), toy_work)
     monkeypatch.delattr(locks, "hold")
@@ -233,7 +233,7 @@ def test_a_current_version_that_is_gone_can_be_made_again(lake):
     assert read.find_faults(read.version(lake, "toy"), deep=True) == []
 
 
-def test_two_versions_that_changed_names_are_found_out(lake):
+def test_two_exchanged_versions_are_detected(lake):
     first, second = (publish.make_version(lake, toy_plan(seed), toy_work) for seed in (1, 2))
     other = first.with_name("other")
     first.rename(other)
@@ -247,7 +247,7 @@ def test_two_versions_that_changed_names_are_found_out(lake):
             publish.make_version(lake, toy_plan(seed), toy_work)
 
 
-def test_a_link_to_another_table_is_found_out(lake):
+def test_a_link_to_another_table_is_detected(lake):
     folder = publish.make_version(lake, toy_plan(), toy_work)
     publish.make_version(lake, plain_plan(), plain_work)
     link = layout.current_link(lake, "plain")

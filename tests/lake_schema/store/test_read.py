@@ -45,7 +45,7 @@ def test_units_come_back_with_the_rows(toy):
     assert toy.schema.field("flux").metadata[b"unit"] == b"uJy"
 
 
-def test_a_table_that_is_not_there(lake):
+def test_a_missing_table(lake):
     with pytest.raises(BadInput, match="no table galaxies"):
         read.version(lake, "galaxies")
     with pytest.raises(BadInput, match="name"):

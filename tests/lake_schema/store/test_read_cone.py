@@ -112,7 +112,7 @@ def test_all_columns_and_the_whole_sky(catalogues):
     assert version.cone(float(CORNERS[0][0][0]), -float(CORNERS[0][1][0]), 0.001).num_rows == 0
 
 
-def test_what_a_cone_refuses(lake, catalogues):
+def test_wrong_arguments_of_a_cone_are_refused(lake, catalogues):
     _, _, version = catalogues[0]
     for arguments, words in (
         ((0.0, 91.0, 1.0), "dec"),
@@ -130,7 +130,7 @@ def test_what_a_cone_refuses(lake, catalogues):
             version.cone(*arguments)
 
 
-def test_what_is_not_lensed_is_where_it_is_seen(lake):
+def test_without_lensing_both_positions_are_equal(lake):
     publish.make_version(lake, toy_plan(), toy_work)
     version = read.version(lake, "toy")
     ra, dec = sky.cell_centre(5, 1607)
@@ -139,7 +139,7 @@ def test_what_is_not_lensed_is_where_it_is_seen(lake):
     assert found[1].equals(found[0])
 
 
-def test_a_version_that_does_not_know_its_deflection(catalogues):
+def test_a_version_without_deflection_is_refused(catalogues):
     _, _, version = catalogues[0]
     facts = {k: v for k, v in version.manifest.items() if k != "deflection_deg"}
     with pytest.raises(BadInput, match="has no largest deflection"):
@@ -158,7 +158,7 @@ def test_other_readers_open_mixed_orders(catalogues):
     assert len(found) > 20
 
 
-def test_the_margin_of_each_cell_is_what_lies_about_it(catalogues):
+def test_the_margin_of_each_cell_surrounds_it(catalogues):
     for _, rows, version in catalogues:
         fine = rows["_healpix_29"].to_numpy() >> 32
         for part in version.parts:

@@ -51,7 +51,7 @@ def test_another_version_is_refused_naming_both(lake, was, now):
         read.with_declared_schema(read.version(lake, "plain"), replace(PLAIN, version=now))
 
 
-def test_a_table_is_compared_with_its_declaration_without_being_asked(lake, monkeypatch):
+def test_reading_compares_a_table_with_its_declaration(lake, monkeypatch):
     """`read.version` itself looks up the declaration."""
     plan = Plan(GALAXIES, {}, (Task(layout.cell_file(5, 1607), {}),))
     publish.make_version(lake, plan, lambda root, facts: Output(rows_of(GALAXIES, 12)))

@@ -67,7 +67,7 @@ def test_a_wrong_type_unit_or_nullability(table):
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @each_table
-def test_a_number_that_is_none(table, bad):
+def test_nan_and_infinity_are_refused(table, bad):
     for column in table.columns:
         if column.is_float or column.type.startswith("list<float"):
             refused(changed(three_rows(table), column, bad), table, column.name, "row 1")
@@ -194,7 +194,7 @@ def mutations(table, rows, column):
 
 
 @given(tables_and_rows(), st.data())
-def test_what_is_declared_passes_and_any_one_mutation_is_refused(example, data):
+def test_declared_rows_pass_and_every_mutation_is_refused(example, data):
     table, rows = example
     assert validate.find_violations(rows, table) == []
     column = data.draw(st.sampled_from(table.columns))

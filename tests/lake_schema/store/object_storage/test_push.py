@@ -48,7 +48,7 @@ def seed(place):
     return values.pop()
 
 
-def test_what_was_pushed_is_read_as_it_is_in_the_folder(filled, place):
+def test_a_pushed_lake_is_read_like_its_folder(filled, place):
     told = pushed(filled, place)
     assert [one.table for one in told] == ["plain", "toy"]
     assert all(one.sent == one.objects and one.sent_size == one.size for one in told)
@@ -72,7 +72,7 @@ def test_what_was_pushed_is_read_as_it_is_in_the_folder(filled, place):
     )
 
 
-def test_what_is_there_is_not_sent_again(filled, place, bucket):
+def test_existing_objects_are_not_sent_again(filled, place, bucket):
     pushed(filled, place)
     bucket[0].recorder.asked.clear()
     assert {one.sent for one in pushed(filled, place)} == {0}
@@ -86,7 +86,7 @@ def test_what_is_there_is_not_sent_again(filled, place, bucket):
         read.version(opened(place), "plain", request="second")
 
 
-def test_a_reader_stays_with_what_it_opened(filled, place):
+def test_an_open_reader_keeps_its_versions(filled, place):
     pushed(filled, place)
     before = opened(place)
     first = read.version(before, "plain")
@@ -138,7 +138,7 @@ def test_a_push_that_ends_anywhere_is_completed_by_the_next(filled, place, bucke
     assert read.find_faults(read.version(opened(place), "toy"), deep=True) == []
 
 
-def test_of_two_who_push_the_second_is_refused(filled, tmp_path, place):
+def test_the_second_of_two_simultaneous_pushes_is_refused(filled, tmp_path, place):
     pushed(filled, place)
     publish.make_version(filled, plain_plan(2), plain_work, name="first")
     other = tmp_path / "other"
@@ -291,7 +291,7 @@ def told(capsys, *arguments):
     return status, said.err or said.out
 
 
-def test_the_command_says_what_it_did(filled, place, capsys):
+def test_the_command_reports_its_work(filled, place, capsys):
     status, said = told(capsys, filled, place)
     assert status == 0
     assert said.splitlines()[-1] == f"{place} is published"
@@ -311,7 +311,7 @@ def test_the_command_says_what_it_did(filled, place, capsys):
         ("lake", "must be s3://BUCKET/PREFIX"),
     ],
 )
-def test_a_place_that_cannot_be_is_refused_in_one_line(filled, bucket, capsys, there, words):
+def test_a_wrong_address_is_refused_in_one_line(filled, bucket, capsys, there, words):
     began = time.monotonic()
     status, said = told(capsys, filled, there)
     assert status == 2
@@ -319,7 +319,7 @@ def test_a_place_that_cannot_be_is_refused_in_one_line(filled, bucket, capsys, t
     assert time.monotonic() - began < 20
 
 
-def test_what_is_no_lake_is_refused(tmp_path, place, capsys):
+def test_folders_that_are_not_lakes_are_refused(tmp_path, place, capsys):
     (tmp_path / "empty").mkdir()
     for lake, words in (
         (tmp_path / "empty", "holds no table"),
