@@ -71,10 +71,12 @@ class Column:
 
     @property
     def arrow_type(self) -> pa.DataType:
+        """Arrow type of the values."""
         return _TYPES[self.type]
 
     @property
     def is_float(self) -> bool:
+        """True for float32 and float64."""
         return self.type.startswith("float")
 
     def metadata(self) -> dict[str, str]:
@@ -91,6 +93,7 @@ class Column:
         return facts
 
     def field(self) -> pa.Field:
+        """Return the Arrow field, with the metadata."""
         return pa.field(self.name, self.arrow_type, self.nullable, self.metadata())
 
 
@@ -131,6 +134,7 @@ class Table:
 
     @property
     def names(self) -> list[str]:
+        """Names of the columns."""
         return [column.name for column in self.columns]
 
     @property
@@ -139,6 +143,7 @@ class Table:
         return self.order is not None
 
     def column(self, name: str) -> Column:
+        """Return a column by name; raise BadInput if it does not exist."""
         for column in self.columns:
             if column.name == name:
                 return column

@@ -138,6 +138,7 @@ class VerifiedFile(io.RawIOBase):
         return self._position
 
     def read(self, size: int | None = -1) -> bytes:
+        """Return up to `size` bytes from the current position, after verifying their blocks."""
         first, length = self._position, int(self._entry["bytes"])
         last = length if size is None or size < 0 else min(first + size, length)
         if last <= first:

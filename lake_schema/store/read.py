@@ -57,6 +57,7 @@ class Version:
 
     @property
     def table(self) -> str:
+        """Name of the table."""
         return str(self.manifest["table"])
 
     @property
@@ -71,10 +72,12 @@ class Version:
 
     @property
     def num_rows(self) -> int:
+        """Number of rows."""
         return int(self.manifest["rows"])
 
     @property
     def partitions(self) -> list[str]:
+        """Names of the partitions in the order of the plan."""
         return [str(entry["name"]) for entry in self.manifest["parts"]]
 
     def partition_path(self, partition: str) -> Path:

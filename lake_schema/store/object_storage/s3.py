@@ -67,6 +67,7 @@ class Address:
 
     @property
     def plain(self) -> str:
+        """The address without endpoint and region."""
         return f"s3://{self.bucket}/{self.prefix}".rstrip("/")
 
     @property
@@ -205,6 +206,7 @@ class ObjectStore:
 
     @cached_property
     def files(self) -> Any:
+        """File system of pyarrow."""
         from pyarrow import fs
 
         options: dict[str, Any] = {"endpoint_override": self.address.service} if self.address.service else {}
@@ -243,6 +245,7 @@ class ObjectStore:
 
     @cached_property
     def copies(self) -> tempfile.TemporaryDirectory[str]:
+        """Temporary folder for copies of objects."""
         return tempfile.TemporaryDirectory(prefix="truesky-objects-")
 
     def object_path(self, *parts: str) -> str:
@@ -286,14 +289,17 @@ class ObjectPath:
 
     @property
     def name(self) -> str:
+        """Last part of the path, "" for a lake."""
         return self.parts[-1] if self.parts else ""
 
     @property
     def parent(self) -> ObjectPath:
+        """Path without its last part."""
         return ObjectPath(self.store, self.parts[:-1])
 
     @property
     def relative(self) -> str:
+        """Path from the root of the lake."""
         return "/".join(self.parts)
 
     def reopen(self) -> ObjectPath:
