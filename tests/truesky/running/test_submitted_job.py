@@ -101,7 +101,7 @@ def test_a_failure_is_one_line_and_its_traceback_is_in_the_log(run, lake, capsys
     assert 'raise ValueError("row 17")' in failed["traceback"]
     assert log[-1]["ended"]
     assert log[-1]["status"] == "failed"
-    assert log[-1]["error"].startswith("PartsFailed: table plain: 1 of 3 tasks failed")
+    assert log[-1]["error"].startswith("TasksFailed: table plain: 1 of 3 tasks failed")
     assert "in make" in log[-1]["traceback"]
     assert run(plain_work) == 0
     assert [line["part"] for line in logs(lake)[1] if "part" in line] == ["1.parquet"]
