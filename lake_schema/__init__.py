@@ -1,4 +1,4 @@
-"""What is declared: tables, columns, units, the sky, the mission database, and how the lake keeps them."""
+"""Declarations of the lake's tables, sky geometry and mission database, and the code that stores and reads lakes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from lake_schema import instruction_set
 
-# Before anything imports numpy.
+# The limit has no effect once numpy is imported.
 instruction_set.limit()
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ __all__ = ["layout", "read"]
 
 
 def __getattr__(name: str) -> Any:
-    """`from lake_schema import layout, read`, wherever they lie; loaded when they are asked for."""
+    """Import `layout` and `read` from `lake_schema.store` when they are first used."""
     if name in __all__:
         return import_module(f"lake_schema.store.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,5 +1,7 @@
-"""Look after a lake: python -m lake_schema list|verify|gc|describe LAKE [TABLE]; `tables` prints the reference page;
-`mission list [PATTERN]` prints the mission database, `mission diff A [B]` compares two configurations of it.
+"""Inspect and clean up a lake: python -m lake_schema list|verify|gc|describe LAKE [TABLE].
+
+`tables` prints the reference page of all tables. `mission list [PATTERN]` prints the mission database, and `mission
+diff A [B]` compares two of its configurations.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from lake_schema.store.object_storage.s3 import Folder
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit status: 0 all well, 1 something is wrong with the lake, 2 the call is wrong."""
+    """Run the command and return its exit status: 0 success, 1 a fault of the lake, 2 a wrong call."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments[:1] == ["mission"]:
         from lake_schema.mission import commands as mission
@@ -30,14 +32,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         subparser.add_argument("lake", help="folder of the lake" + ("" if name == "gc" else ", or s3://BUCKET/PREFIX"))
         if name != "gc":
             subparser.add_argument(
-                "--endpoint-url", help="of the object storage (default: $AWS_ENDPOINT_URL, else Amazon S3)"
+                "--endpoint-url", help="URL of the object storage (default: $AWS_ENDPOINT_URL, else Amazon S3)"
             )
-        subparser.add_argument("table", nargs="?", help="one table (default: all of them)")
+        subparser.add_argument("table", nargs="?", help="one table (default: all tables)")
         if name in ("verify", "describe"):
-            subparser.add_argument("--name", help="only what belongs to this request (default: all of them)")
-    subparsers["list"].add_argument("--json", action="store_true", help="one JSON list instead of columns")
+            subparser.add_argument("--name", help="only versions of this request (default: all requests)")
+    subparsers["list"].add_argument("--json", action="store_true", help="print a JSON list instead of columns")
     subparsers["verify"].add_argument("--deep", action="store_true", help="read every byte and compare its sha256")
-    subparsers["gc"].add_argument("--delete", action="store_true", help="remove what is said; without it nothing is")
+    subparsers["gc"].add_argument(
+        "--delete", action="store_true", help="remove the listed folders (default: list only)"
+    )
     commands.add_parser("tables")
     options = parser.parse_args(arguments)
     if options.command == "tables":
@@ -61,12 +65,12 @@ def _run_command(options: argparse.Namespace) -> int:
         versions = _versions_of_table(root, name, request)
         return max(int(_verify(v, options.deep) if options.command == "verify" else _describe(v)) for v in versions)
 
-    # What is wrong with one table is said, and the others are looked at all the same.
+    # A fault of one table is reported, and the other tables are still inspected.
     return max(command.run("lake_schema", lambda name=name: inspect_table(name)) for name in selected)  # type: ignore[misc]
 
 
 def _versions_of_table(root: Folder, name: str, request: str | None) -> list[read.Version]:
-    """The current version of a table and those of its requests, or the one of a request."""
+    """Return the current version of a table and the versions of its requests, or only the version of one request."""
     if request:
         return [read.version(root, name, request=request)]
     current, keys_by_request = layout.current_key(root, name), request_links.keys_by_request(root, name)

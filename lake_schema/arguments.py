@@ -1,9 +1,4 @@
-"""Arguments of functions that users call, each refused by its name.
-
-number     a number within its bounds
-whole      a whole number within its bounds;  wholes : several
-names      one name or several
-"""
+"""Check arguments of functions that users call; an error message names the argument."""
 
 from __future__ import annotations
 
@@ -22,7 +17,7 @@ def check_number(name: str, value: object, lo: float = -math.inf, hi: float = ma
     name : str
         Name of the argument, for the message.
     value : object
-        What the user gave.
+        Value that the user gave.
     lo, hi : float, optional
         Smallest and largest number that is allowed.
 
@@ -34,10 +29,12 @@ def check_number(name: str, value: object, lo: float = -math.inf, hi: float = ma
     Raises
     ------
     BadInput
-        If it is not a number, is NaN or lies outside its bounds.
+        If it is not a number.
+    OutOfRange
+        If it is NaN or lies outside its bounds.
     """
     try:
-        # A text is no number, even if it could be read as one.
+        # The comparison refuses a text, even if float() could read it.
         is_within, converted = bool(lo <= value <= hi), float(value)  # type: ignore[operator, arg-type]
     except (TypeError, ValueError, OverflowError):
         raise BadInput(f"{name} = {value!r} is not a number") from None
@@ -54,7 +51,7 @@ def check_integer(name: str, value: object, lo: int, hi: int) -> int:
     name : str
         Name of the argument, for the message.
     value : object
-        What the user gave, such as an int or an integer of numpy.
+        Value that the user gave, such as an int or a NumPy integer.
     lo, hi : int
         Smallest and largest number that is allowed.
 
@@ -66,7 +63,9 @@ def check_integer(name: str, value: object, lo: int, hi: int) -> int:
     Raises
     ------
     BadInput
-        If it is not a whole number or lies outside its bounds.
+        If it is not a whole number.
+    OutOfRange
+        If it lies outside its bounds.
     """
     try:
         converted = operator.index(value)  # type: ignore[arg-type]
@@ -78,14 +77,26 @@ def check_integer(name: str, value: object, lo: int, hi: int) -> int:
 
 
 def check_integers(name: str, value: Iterable[object], lo: int, hi: int) -> list[int]:
-    """Return whole numbers as a list of int.
+    """Return whole numbers as a list of int if they lie within their bounds.
 
-    name, lo, hi : as for `whole`;  value : the numbers
+    Parameters
+    ----------
+    name : str
+        Name of the argument, for the message.
+    value : iterable
+        Values that the user gave.
+    lo, hi : int
+        Smallest and largest number that is allowed.
+
+    Returns
+    -------
+    list of int
+        The numbers.
 
     Raises
     ------
     BadInput
-        If it is not a sequence, or an element is refused by `whole`.
+        If `value` is not a list, or if `check_integer` refuses an element.
     """
     if not isinstance(value, Iterable):
         raise BadInput(f"{name} = {value!r} is not a list of whole numbers")
@@ -98,7 +109,7 @@ def check_names(name: str, value: str | Sequence[str]) -> tuple[str, ...]:
     Raises
     ------
     BadInput
-        If it is neither a text nor a sequence of texts.
+        If the value is neither a text nor a sequence of texts.
     """
     if isinstance(value, str):
         return (value,)

@@ -1,4 +1,4 @@
-"""Names of array types, and numpy's values as Python's."""
+"""Short names of array types, and the conversion of NumPy values to Python values."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ Array = npt.NDArray[Any]
 
 
 def as_python(value: object) -> Any:
-    """Convert a numpy scalar to a number, text or boolean of Python, and an array to a list.
+    """Convert a NumPy scalar to a Python number, text or boolean, and an array to a list.
 
     Raises
     ------
     TypeError
-        If it is neither, or holds other values.
+        If the value is neither a scalar nor an array, or has another type, such as a date.
     """
-    # Dates would become numbers.
+    # tolist() turns some dates into numbers, so only these kinds are allowed.
     if isinstance(value, np.generic | np.ndarray) and value.dtype.kind in "biufU":
         return value.tolist()
     raise TypeError(f"{value!r} is of type {type(value).__name__}")

@@ -1,9 +1,6 @@
-"""How a command ends: bad input in one line and exit status 2, a damaged lake or a disc that refuses in one line and 1.
+"""Run commands with a defined end: one line per error on stderr and a defined exit status.
 
-status    run a command's body and return its exit status
-leave     run a command and end the process with its exit status
-limit_resource  bound the memory or CPU time of this process
-say       a line on stderr
+The exit status is 2 for wrong input and 1 for a damaged lake or an error of the operating system.
 """
 
 from __future__ import annotations
@@ -21,19 +18,29 @@ from lake_schema.errors import BadInput, LakeError, one_line
 
 
 def run(name: str, body: Callable[[], int]) -> int:
-    """What `body` returns; 2 where it refuses what it was given, 1 where the lake or the machine is at fault.
+    """Run the body of a command and return its exit status.
 
-    name : of the command, as it is to be named in the line
+    Parameters
+    ----------
+    name : str
+        Name of the command, for the error message.
+    body : callable
+        Function without arguments that returns an exit status.
+
+    Returns
+    -------
+    int
+        The value that `body` returns, 2 if it raises BadInput, 1 if the lake is damaged or the operating system fails.
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
-        # Not every terminal has the letters of every name.
+        # Some terminals cannot show all characters of a name.
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
         code = body()
         sys.stdout.flush()
         return code
     except BrokenPipeError:
-        # Who reads has seen enough, and Python would complain again at its end.
+        # The reader has closed the pipe; without this, Python would report the error again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except BadInput as error:
@@ -43,16 +50,29 @@ def run(name: str, body: Callable[[], int]) -> int:
 
 
 def exit_with_status(main: Callable[..., int], *arguments: object) -> NoReturn:
-    """Run `main(*arguments)` and end the process with what it returns.
+    """Run `main(*arguments)` and end the process with the exit status that it returns.
 
-    Nobody waits for Arrow's threads: one that still closes a file of ours once Python is being taken down finds no
-    interpreter and aborts the process (apache/arrow#34314), after all the work was done. An error that `main`
-    raises ends the process as any other.
+    Parameters
+    ----------
+    main : callable
+        Function that returns an exit status. If it raises an error, the process ends with that error as usual.
+    *arguments : object
+        Arguments of `main`.
+
+    Raises
+    ------
+    SystemExit
+        If `main` raises one with a text, which Python prints.
+
+    Notes
+    -----
+    The process ends without waiting for Arrow's threads. A thread that closes a Python file while the interpreter shuts
+    down aborts the process (apache/arrow#34314), although all work is done.
     """
     try:
         code = main(*arguments)
     except SystemExit as stop:
-        # The parser of arguments; a text is one that Python prints itself.
+        # argparse exits with a number; Python itself prints a text.
         if not isinstance(stop.code, int):
             raise
         code = stop.code
@@ -64,23 +84,40 @@ def exit_with_status(main: Callable[..., int], *arguments: object) -> NoReturn:
 
 
 def limit_resource(name: str, limit: int) -> None:
-    """Limit a resource of this process, where the operating system can.
-
-    macOS has no limit of a process's memory: there a hostile file or query is bounded by the system alone.
+    """Limit a resource of this process, if the operating system can.
 
     Parameters
     ----------
     name : str
-        A name of the module `resource`, such as "RLIMIT_AS".
+        Name of a limit in the module `resource`, such as "RLIMIT_AS".
     limit : int
-        Bytes, or seconds of CPU time.
+        Limit in bytes, or in seconds of CPU time.
+
+    Notes
+    -----
+    macOS cannot limit the memory of a process, so only the system bounds a hostile file or query there.
     """
     with contextlib.suppress(OSError, ValueError, AttributeError):
         resource.setrlimit(getattr(resource, name), (limit, limit))
 
 
 def print_error(name: str, error: object, code: int) -> int:
-    """Print one line, never longer than anybody reads, and return the exit status."""
+    """Print one line to stderr and return the exit status.
+
+    Parameters
+    ----------
+    name : str
+        Name of the command.
+    error : object
+        Error or text; it is shortened to one line.
+    code : int
+        Exit status.
+
+    Returns
+    -------
+    int
+        The exit status `code`.
+    """
     with contextlib.suppress(BrokenPipeError):
         print(f"{name}: {one_line(error).strip() or type(error).__name__}", file=sys.stderr, flush=True)
     return code

@@ -1,13 +1,13 @@
-"""The errors of truesky: every refusal of input is one of these, with one line that names what is wrong and where."""
+"""Exceptions of truesky. The text of each is one line that names the problem and its place."""
 
 from __future__ import annotations
 
-# Characters of a refusal: it names what is wrong and where, it does not repeat what it was given.
+# Maximum length of a message in characters: it names the problem and its place, and does not repeat all input.
 _MAX_LENGTH = 1000
 
 
 def one_line(message: object) -> str:
-    """A text as messages give it: one line of printable characters, of a long one its begin and its end."""
+    """Return a text as one line of printable characters; a long text is shortened in the middle."""
     text = str(message)
     if not text.isprintable():
         text = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in " ".join(text.split()))
@@ -16,39 +16,49 @@ def one_line(message: object) -> str:
 
 
 class LakeError(Exception):
-    """Root of everything that truesky refuses; its text is one line of at most 1000 characters, whatever it names."""
+    """Base class of all errors that truesky raises; its text is one line of at most 1000 characters."""
 
     def __init__(self, message: object = "") -> None:
         super().__init__(one_line(message))
 
 
 class BadInput(LakeError):
-    """A request, a file or a table that cannot be used; the text names the key, file, column or row."""
+    """A request, file or table cannot be used; the text names the key, file, column or row."""
 
 
 class OutOfRange(BadInput):
-    """A number outside its declared bounds."""
+    """A number is outside its allowed range.
+
+    Parameters
+    ----------
+    name : str
+        Name of the quantity.
+    value : object
+        Its value.
+    lo, hi : object
+        Smallest and largest value that is allowed.
+    """
 
     def __init__(self, name: str, value: object, lo: object, hi: object) -> None:
         super().__init__(f"{name} = {value} is outside [{lo}, {hi}]")
         self._arguments = name, value, lo, hi
 
     def __reduce__(self) -> tuple[type[OutOfRange], tuple[object, ...]]:
-        # An exception comes back from another process by the arguments that it was made with.
+        # Pickling an exception needs the arguments of its constructor, not its text.
         return OutOfRange, self._arguments
 
 
 class Damaged(LakeError):
-    """A published file that is not what its manifest says; the text names the file."""
+    """A published file differs from its manifest; the text names the file."""
 
 
 class Superseded(LakeError):
-    """Another run published or holds the table that this one meant to publish."""
+    """Another run has published or locked the table that this run was going to publish."""
 
 
 class VersionMismatch(LakeError):
-    """A table written with another version of its declaration, and no way to read it safely."""
+    """A table was written with another version of its declaration and cannot be read safely."""
 
 
 class TasksFailed(LakeError):
-    """Some parts of a table could not be made; the text lists them, the others are staged and kept."""
+    """Some tasks of a table failed; the text lists them. The output of the other tasks is staged and kept."""

@@ -1,14 +1,22 @@
-"""Source identifiers: int64 that carry the kind, the order-8 cell, the parent halo and the member.
+"""Build and read source identifiers: 64-bit integers made of the source's kind, sky cell, halo and member.
 
-id = kind (3 bits) << 60 | order-8 cell, nested (20) << 40 | which one in its cell (40)
+All identifiers begin with the kind and the nested HEALPix cell of order 8::
 
-Of halos that are drawn, and of the galaxies in them (member 0 is the central), the last 40 bits are
-    block (17) << 23 | number of the halo in its block and cell << bits of a member | member
-where a block is a step along the line of sight and a bin of mass: an identifier does not depend on which other halos
-are drawn. Massive halos are few and have many members: more bits are a member's in them (`member_bits`).
-Of most other sources these bits are
-    running number (22) << 18 | member (18)
-and of strong lenses bits of a number of their own.
+    id = kind (3 bits) << 60 | order-8 cell (20 bits) << 40 | number within the cell (40 bits)
+
+For drawn halos and the galaxies in them, the last 40 bits are::
+
+    block (17 bits) << 23 | number of the halo in its block and cell << member bits | member
+
+A block is a step along the line of sight and a bin of halo mass, so an identifier does not depend on which other halos
+are drawn. Member 0 is the central galaxy. Massive halos are rare and have many members, so they use more member bits
+(`member_bits`).
+
+For most other sources, the last 40 bits are::
+
+    running number (22 bits) << 18 | member (18 bits)
+
+For strong lenses, they are 40 random bits (`hashed_id`).
 """
 
 from __future__ import annotations
@@ -23,23 +31,40 @@ GENERATION_ORDER = 8
 FILE_ORDER = 5
 _NUMBER_BITS = 22
 MEMBER_BITS = 18
-# Identifiers that differ above these bits stand for another kind or another generation cell.
+# Identifiers that differ above these bits belong to different kinds or generation cells.
 BLOCK_BITS = MEMBER_BITS + _NUMBER_BITS
-# Number and member of drawn halos share so many bits.  Blocks end where the running numbers of other kinds begin.
+# The number and the member of a drawn halo share these bits. Blocks end below the running numbers of other kinds.
 _NUMBER_AND_MEMBER_BITS = 23
 BLOCK_COUNT = 7 << 14
 FIRST_NUMBER = BLOCK_COUNT << _NUMBER_AND_MEMBER_BITS >> MEMBER_BITS
-# Bits of a member of halos of at least this log10 mass, Msun/h: four times what they have above 10^9.1 are identified,
-# and the densest block of the sky has room for its halos (tests/truesky/catalogue/halos/test_halos.py).
+# Lowest log10 halo mass (Msun/h) and number of member bits. They suffice for four times the expected number of members
+# above 10^9.1 Msun/h, and for the halos of the densest block of the sky (tests/truesky/catalogue/halos/test_halos.py).
 _MEMBER_BITS_BY_MASS = ((0.0, 7), (11.5, 10), (12.5, 13), (13.5, 17), (14.5, 18), (15.0, 20))
 
 
 def source_id(kind: npt.ArrayLike, cell: npt.ArrayLike, number: npt.ArrayLike, member: npt.ArrayLike = 0) -> Int:
-    """Identifiers of sources that are numbered in their cell.
+    """Build the identifiers of sources that are numbered within their cell.
 
-    kind : int[n]; cell : int or int[n], order-8 nested cell that the halo lies in
-    number : int[n] running number of the halo in the cell; member : int[n]
-    returns int64[n].  Errors: BadInput where a number needs more bits than it has
+    Parameters
+    ----------
+    kind : int or int array, shape (n,)
+        Kind code, 0 to 7.
+    cell : int or int array, shape (n,)
+        Nested cell of order 8 that contains the halo.
+    number : int array, shape (n,)
+        Running number of the halo in the cell, below 2^22.
+    member : int or int array, shape (n,), optional
+        Number of the member in the halo, below 2^18.
+
+    Returns
+    -------
+    int64 array, shape (n,)
+        Identifiers.
+
+    Raises
+    ------
+    BadInput
+        If a value is negative or needs more bits than it has.
     """
     kinds, numbers, members = (np.asarray(x, np.int64) for x in (kind, number, member))
     _check_range("kind", kinds, 8)
@@ -49,22 +74,47 @@ def source_id(kind: npt.ArrayLike, cell: npt.ArrayLike, number: npt.ArrayLike, m
 
 
 def member_bits(log_mass: npt.ArrayLike) -> Int:
-    """Bits[n] of a member of drawn halos: which 2^bits - 1 satellites have identifiers.
+    """Return the number of member bits of drawn halos; `bits` bits identify 2^bits - 1 satellites.
 
-    log_mass : float[n] log10 Msun/h, the lower edge of the halo's bin
+    Parameters
+    ----------
+    log_mass : float array, shape (n,)
+        Lower edge of the halo's mass bin, log10 of the mass in Msun/h.
+
+    Returns
+    -------
+    int64 array, shape (n,)
+        Number of bits, 7 to 20.
     """
     edges, bits = (np.array(column) for column in zip(*_MEMBER_BITS_BY_MASS, strict=True))
-    # Edges of bins are multiples that are rounded.
+    # The edges of the bins are rounded multiples of the bin width.
     place = np.searchsorted(edges, np.asarray(log_mass, float) + 1e-6, side="right") - 1
     return np.asarray(bits[place], np.int64)
 
 
 def drawn_halo_id(cell: npt.ArrayLike, block: Int, number: Int, bits: Int) -> Int:
-    """Identifiers[n] of halos that are drawn by blocks.
+    """Build the identifiers of halos that are drawn in blocks.
 
-    cell  : int or int[n], order-8 nested cell that the halo lies in;  block : int64[n]
-    number : int64[n] of the halo among those of its block in this cell;  bits : int64[n] as of `member_bits`
-    Errors: BadInput where a number needs more bits than it has
+    Parameters
+    ----------
+    cell : int or int array, shape (n,)
+        Nested cell of order 8 that contains the halo.
+    block : int64 array, shape (n,)
+        Number of the block: a step along the line of sight and a bin of mass.
+    number : int64 array, shape (n,)
+        Number of the halo among the halos of its block in this cell.
+    bits : int64 array, shape (n,)
+        Number of member bits, from `member_bits`.
+
+    Returns
+    -------
+    int64 array, shape (n,)
+        Identifiers of the central galaxies (kind 0, member 0).
+
+    Raises
+    ------
+    BadInput
+        If a value is negative or needs more bits than it has.
     """
     _check_range("block", block, BLOCK_COUNT)
     _check_range("number in its block", number, 1 << _NUMBER_AND_MEMBER_BITS - bits)
@@ -72,31 +122,63 @@ def drawn_halo_id(cell: npt.ArrayLike, block: Int, number: Int, bits: Int) -> In
 
 
 def satellite_id(halo: Int, member: Int, bits: npt.ArrayLike = MEMBER_BITS) -> Int:
-    """Identifiers[n] of satellites: kind 1.
+    """Build the identifiers of satellite galaxies, which have kind 1.
 
-    halo : int64[n] identifiers of their halos;  member : int64[n] from 1;  bits : of a member
-    Errors: BadInput where a member needs more bits than it has
+    Parameters
+    ----------
+    halo : int64 array, shape (n,)
+        Identifiers of their halos.
+    member : int64 array, shape (n,)
+        Number of the satellite in its halo, from 1.
+    bits : int or int array, optional
+        Number of member bits of the halos.
+
+    Returns
+    -------
+    int64 array, shape (n,)
+        Identifiers.
+
+    Raises
+    ------
+    BadInput
+        If a member is negative or needs more bits than it has.
     """
     _check_range("member", member, 1 << np.asarray(bits, np.int64))
     return np.asarray(np.int64(1) << 60 | halo | member)
 
 
 def hashed_id(kind: int, cell: int, words: npt.NDArray[np.uint64]) -> Int:
-    """Identifiers[n] of rare sources that have no number, of 40 bits of a word of their own.
+    """Build the identifiers of rare sources that have no number, from 40 bits of a random word.
 
-    kind, cell : of all;  words : uint64[n], random: of a thousand in a cell two are the same once in two million cells
+    Parameters
+    ----------
+    kind : int
+        Kind code of all sources.
+    cell : int
+        Nested cell of order 8 that contains all sources.
+    words : uint64 array, shape (n,)
+        Random words, one per source.
+
+    Returns
+    -------
+    int64 array, shape (n,)
+        Identifiers.
+
+    Notes
+    -----
+    Among a thousand sources in a cell, two have the same identifier in one of two million cells.
     """
     hashed_bits = np.asarray(words, np.uint64) & np.uint64((1 << BLOCK_BITS) - 1)
     return np.asarray(np.int64(kind) << 60 | _shifted_cell(cell) | hashed_bits.astype(np.int64))
 
 
 def halo_from_id(ids: Int) -> Int:
-    """int64[n] -> identifier of the halo of each source that is numbered in its cell: kind and member bits cleared."""
+    """Return the halo identifier of each source that is numbered in its cell, by clearing the kind and member bits."""
     return ids & np.int64((1 << 60) - 1) & ~np.int64((1 << MEMBER_BITS) - 1)
 
 
 def kind_from_id(ids: Int) -> Int:
-    """int64[n] -> kind code of each source."""
+    """Return the kind code of each source."""
     return ids >> 60
 
 

@@ -1,8 +1,4 @@
-"""What a lake holds: every version of every table, with the requests that it belongs to and what it was made of.
-
-rows    a mapping a version, for whoever wants it as JSON
-text    the same in aligned columns
-"""
+"""List the versions of all tables of a lake, with the requests that use them and their inputs."""
 
 from __future__ import annotations
 
@@ -16,18 +12,31 @@ from lake_schema.store.object_storage.s3 import MANIFEST, Folder
 
 _HEADINGS = ("names", "table", "version", "current", "published", "rows", "bytes", "made of")
 _RIGHT_ALIGNED = {"rows", "bytes"}
-# Digits of a key that tell versions apart on a page.
+# Digits of a key that are shown; they suffice to distinguish the versions of a lake.
 _KEY_DIGITS = 8
 
 
 def rows(root: Folder) -> list[dict[str, Any]]:
-    """Versions by table, and in a table by date.
+    """Return one mapping per version, sorted by table and then by date.
 
-    names     : of the requests that it belongs to
-    current   : whether it was published last
-    published : UTC, ISO 8601; bytes : of its files, those that it shares with others among them
-    made_of   : table -> keys of the versions that it was made of
-    error     : why it cannot be read, where it cannot
+    Returns
+    -------
+    list of dict
+        Keys of each mapping:
+
+        - ``table``, ``version``: name of the table and key of the version
+        - ``names``: names of the requests that use the version
+        - ``current``: True if the version was published last
+        - ``published``: time of publication, UTC, ISO 8601
+        - ``rows``: number of rows
+        - ``bytes``: total size of its files, including files that it shares with other versions
+        - ``made_of``: keys of the versions from which it was made, by table
+        - ``error``: reason why the version cannot be read, only if it cannot
+
+    Raises
+    ------
+    BadInput
+        If the lake has no table.
     """
     if not (table_names := garbage.table_names(root)):
         raise BadInput(f"lake {root} holds no table")
@@ -72,7 +81,7 @@ def _input_keys(root: Folder, facts: Mapping[str, Any], table_names: Sequence[st
 
 
 def format_table(version_rows: Sequence[Mapping[str, Any]]) -> str:
-    """Rows in aligned columns, a head above them."""
+    """Format the mappings of `rows` as aligned columns with a heading."""
     lines = [_HEADINGS, *(_format_cells(row) for row in version_rows)]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     aligned_right = [head in _RIGHT_ALIGNED for head in _HEADINGS]

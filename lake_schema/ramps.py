@@ -1,14 +1,31 @@
-"""How many frames a ramp has, and may have.
+"""Count the frames of a MACC (multiple accumulated sampling) ramp of the near-infrared detectors.
 
-Ref : Euclid Collaboration: Serrano et al. 2024 (MACC: multiple accumulated groups)
+References
+----------
+Euclid Collaboration: Serrano et al. 2024 (MACC: multiple accumulated groups)
 """
 
 from __future__ import annotations
 
-# Of a ramp: more are not drawn.
+# Largest number of frames in a ramp that is simulated.
 MAX_FRAMES = 4000
 
 
 def frame_count(groups: int, reads: int, drops: int) -> int:
-    """Of groups of reads, with drops between two groups: from the reset to the last read."""
+    """Return the number of frames from the reset to the last read of a ramp.
+
+    Parameters
+    ----------
+    groups : int
+        Number of groups.
+    reads : int
+        Frames that are read in each group.
+    drops : int
+        Frames that are dropped between two groups.
+
+    Returns
+    -------
+    int
+        groups * reads + (groups - 1) * drops.
+    """
     return groups * reads + (groups - 1) * drops

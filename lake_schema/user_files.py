@@ -1,17 +1,7 @@
-"""Files and folders that a user names: the one place that opens them, and the one reader of TOML.
+"""Open, check and write files that a user names, and parse TOML.
 
-checked     a file of a kind, ready for a library that opens it by itself
-opened      the same, as a stream of bytes
-text        its text
-toml        its tables
-target      where a result may be written;  folder : where several may
-staged      a file that takes its place in one rename
-expanded    a path as it was typed
-reachable   refuses a path that the system does not take
-shown       a path as messages name it
-
-Only a regular file is opened: a pipe would never answer, a device never end. Every kind has a largest size.
-Every refusal is a BadInput of one line that names the file.
+Only regular files are opened: a pipe might never answer, and a device might never end. Each kind of file has a largest
+size. All errors are BadInput with one line that names the file.
 """
 
 from __future__ import annotations
@@ -28,7 +18,7 @@ from typing import IO, Any
 from lake_schema.errors import BadInput
 
 _MB, _GB = 1 << 20, 1 << 30
-# Largest file of each kind, bytes. Catalogues are read in pieces; of the others all that is of use is held.
+# Largest size of each kind of file in bytes. Catalogues are read in pieces, all other files into memory.
 MAX_BYTES = {
     "request": _MB,
     "table of pointings": 64 * _MB,
@@ -49,9 +39,10 @@ MAX_BYTES = {
     "manifest": 4 * _GB,
 }
 _MAX_SHOWN_LENGTH, _MAX_PATH_LENGTH = 200, 4096
-# Parts of a dotted key, depth of brackets, characters of a number or bare key: far more than anything of ours has.
+# Limits of a TOML text: parts of a dotted key, nested brackets, characters of a number or bare key. Requests stay far
+# below them.
 _MAX_KEY_PARTS, _MAX_DEPTH, _MAX_WORD_LENGTH = 16, 16, 200
-# Strings and comments are passed over whole, as tomllib does; whatever is wrong with them it says itself.
+# Strings and comments are skipped as a whole; tomllib reports their errors.
 _TOKEN = re.compile(
     r'"""(?:[^"\\]++|\\.|"(?!"")|""(?!"))*+"{3,5}'
     r"|'''(?:[^']++|'(?!'')|''(?!'))*+'{3,5}"
@@ -63,32 +54,49 @@ _TOKEN = re.compile(
 
 
 def expand_path(text: str | Path, folder: Path | None = None) -> Path:
-    """A path as it was typed, ~ replaced, found from a folder."""
+    """Return the path for a text that a user typed: ~ is expanded, and a relative path starts at `folder` if given."""
     if not isinstance(text, str | Path):
         raise BadInput(f"{format_path(repr(text))} is not a path")
     if len(str(text)) > _MAX_PATH_LENGTH:
-        # Following its links, were there any, takes a square of the time.
+        # Resolving the links of a path takes time proportional to the square of its length.
         raise BadInput(f"{format_path(text)}: File name too long")
     try:
         path = Path(text).expanduser()
     except RuntimeError:
-        raise BadInput(f"{format_path(text)}: there is no such user") from None
+        raise BadInput(f"{format_path(text)}: no such user") from None
     except ValueError as error:
         raise BadInput(f"{format_path(text)}: {error}") from None
     return path if folder is None else folder / path
 
 
 def format_path(path: str | Path) -> str:
-    """A path as messages name it: one line, never long."""
+    """Return a path as messages show it: one line of printable characters, shortened in the middle if it is long."""
     name = str(path)
     printable = name if name.isprintable() else ascii(name)[1:-1]
     return printable if len(printable) <= _MAX_SHOWN_LENGTH else f"{printable[:80]}...{printable[-80:]}"
 
 
 def check_file(path: Path, kind: str, key: str = "") -> Path:
-    """The path of a regular file that can be read and is not larger than its kind may be.
+    """Check that a path is a readable regular file within the size limit of its kind, and return it.
 
-    key : of the request, to be named in the message
+    Parameters
+    ----------
+    path : Path
+        Path of the file.
+    kind : str
+        Kind of file, a key of `MAX_BYTES`.
+    key : str, optional
+        Key of the request that names the file, for the message.
+
+    Returns
+    -------
+    Path
+        The same path.
+
+    Raises
+    ------
+    BadInput
+        If the file does not exist, is not a regular file, cannot be read or is too large.
     """
     try:
         os.close(_open_descriptor(path, kind))
@@ -99,14 +107,14 @@ def check_file(path: Path, kind: str, key: str = "") -> Path:
 
 @contextmanager
 def open_file(path: Path, kind: str) -> Iterator[IO[bytes]]:
-    """Such a file as a stream of bytes."""
+    """Open a regular file that is within the size limit of its kind, as a stream of bytes."""
     with os.fdopen(_open_descriptor(path, kind), "rb") as stream:
         yield stream
 
 
 def _open_descriptor(path: Path, kind: str) -> int:
     try:
-        # Looked at before it is opened, which some devices act upon; and again, for it may be another by then.
+        # Opening some devices has effects, so the type is checked before; it is checked again because it may change.
         _check_regular_file(path, kind, os.stat(path))
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     except (FileNotFoundError, NotADirectoryError):
@@ -114,7 +122,7 @@ def _open_descriptor(path: Path, kind: str) -> int:
     except OSError as error:
         raise BadInput(f"{format_path(path)}: {error.strerror}") from None
     except ValueError as error:
-        # A NUL, or a character that the file system cannot hold.
+        # The path contains a NUL character, or a character that the file system does not support.
         raise BadInput(f"{format_path(path)}: {error}") from None
     try:
         _check_regular_file(path, kind, os.fstat(descriptor))
@@ -126,10 +134,10 @@ def _open_descriptor(path: Path, kind: str) -> int:
 
 def _check_regular_file(path: Path, kind: str, status: os.stat_result) -> None:
     if not stat.S_ISREG(status.st_mode):
-        file_type = next((word for word, test in _FILE_TYPES if test(status.st_mode)), "no regular file")
-        raise BadInput(f"{format_path(path)}: is {file_type}, wanted a file: a {kind}")
+        file_type = next((word for word, test in _FILE_TYPES if test(status.st_mode)), "not a regular file")
+        raise BadInput(f"{format_path(path)}: is {file_type}, but must be a file: a {kind}")
     if status.st_size > MAX_BYTES[kind]:
-        raise BadInput(f"{format_path(path)}: is larger than {MAX_BYTES[kind]} bytes, the most of a {kind}")
+        raise BadInput(f"{format_path(path)}: is larger than {MAX_BYTES[kind]} bytes, the limit for a {kind}")
 
 
 _FILE_TYPES = (
@@ -142,12 +150,12 @@ _FILE_TYPES = (
 
 
 def read_text(path: Path, kind: str) -> str:
-    """The text of a file, UTF-8, without the byte order mark that Excel and Notepad write."""
+    """Return the text of a UTF-8 file, without the byte order mark that Excel and Notepad write."""
     with open_file(path, kind) as stream:
-        # No more than was there when it was looked at: a file can grow.
+        # The file may have grown since its size was checked.
         data = stream.read(MAX_BYTES[kind] + 1)
     if len(data) > MAX_BYTES[kind]:
-        raise BadInput(f"{format_path(path)}: is larger than {MAX_BYTES[kind]} bytes, the most of a {kind}")
+        raise BadInput(f"{format_path(path)}: is larger than {MAX_BYTES[kind]} bytes, the limit for a {kind}")
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -156,50 +164,50 @@ def read_text(path: Path, kind: str) -> str:
 
 @contextmanager
 def check_reachable(path: Path) -> Iterator[None]:
-    """Refuse a path that the system does not take; a path that is not there yet is accepted."""
+    """Turn errors of the operating system about a path into BadInput; a path that does not exist yet is accepted."""
     try:
         yield
         os.lstat(path)
     except FileNotFoundError:
         pass
     except (OSError, RuntimeError, ValueError) as error:
-        # Python below 3.13 reports a loop of links as a RuntimeError.
+        # Python before 3.13 reports a loop of links as a RuntimeError.
         raise BadInput(f"{format_path(path)}: {getattr(error, 'strerror', None) or error}") from None
 
 
 def check_target(path: Path, endings: Sequence[str] = ()) -> Path:
-    """A path at which a file can be written: of one of the endings, in a folder that is there."""
+    """Check that a file with one of the endings can be written to an existing folder, and return its path."""
     if endings and path.suffix.lower() not in endings:
         raise BadInput(f"{format_path(path)}: the ending is not one of {', '.join(endings)}")
     with check_reachable(path):
         if not path.parent.is_dir():
-            raise BadInput(f"{format_path(path)}: its folder is not there")
+            raise BadInput(f"{format_path(path)}: its folder does not exist")
         if os.path.lexists(path) and not path.is_file():
-            raise BadInput(f"{format_path(path)}: is there, and is no file")
+            raise BadInput(f"{format_path(path)}: exists and is not a file")
         _refuse_unwritable(path, path.parent)
     return path
 
 
 def check_folder(path: Path) -> Path:
-    """A path at which a folder is, or can be made."""
+    """Check that a path is a writable folder, or that a folder can be created there, and return the path."""
     with check_reachable(path):
         if os.path.lexists(path) and not path.is_dir():
-            raise BadInput(f"{format_path(path)}: is there, and is no folder")
+            raise BadInput(f"{format_path(path)}: exists and is not a folder")
         nearest = next(candidate for candidate in (path, *path.absolute().parents) if os.path.lexists(candidate))
         if not nearest.is_dir():
-            raise BadInput(f"{format_path(path)}: {format_path(nearest)} is no folder")
+            raise BadInput(f"{format_path(path)}: {format_path(nearest)} is not a folder")
         _refuse_unwritable(path, nearest)
     return path
 
 
 def _refuse_unwritable(path: Path, folder: Path) -> None:
     if not os.access(folder, os.W_OK | os.X_OK):
-        raise BadInput(f"{format_path(path)}: its folder cannot be written to")
+        raise BadInput(f"{format_path(path)}: its folder is not writable")
 
 
 @contextmanager
 def replace_atomically(path: Path) -> Iterator[Path]:
-    """A temporary name beside a file: what is written to it replaces the file in one rename, or is removed."""
+    """Yield a temporary path in the same folder; what is written there replaces `path` in one rename, or is removed."""
     temporary = path.with_name(f".{os.getpid()}.tmp.{path.name}")
     try:
         yield temporary
@@ -212,18 +220,21 @@ def replace_atomically(path: Path) -> Iterator[Path]:
 
 
 def read_toml(path: Path, kind: str) -> dict[str, Any]:
-    """The tables of a TOML file."""
+    """Read a TOML file into a dict."""
     try:
         return parse_toml(read_text(path, kind).replace("\r\n", "\n"))
     except ValueError as error:
-        # Of tomllib, and of a date that no calendar has.
+        # tomllib raises ValueError for a syntax error and for an invalid date.
         raise BadInput(f"{format_path(path)}: {' '.join(str(error).split())}") from None
 
 
 def parse_toml(source: str) -> dict[str, Any]:
-    """The tables of a TOML text.
+    """Parse a TOML text into a dict.
 
-    Errors : ValueError where it is none, or has what the parser needs a square of the time for, or no end of depth
+    Raises
+    ------
+    ValueError
+        If the text is not TOML, or has long keys or deep nesting, on which the parser takes quadratic time or recurses.
     """
     _refuse_deep(source)
     return tomllib.loads(source)
@@ -237,15 +248,15 @@ def _refuse_deep(source: str) -> None:
         if first == ".":
             dots += 1
             if dots >= _MAX_KEY_PARTS:
-                raise ValueError(f"a key or number of more than {_MAX_KEY_PARTS} parts (at line {line})")
+                raise ValueError(f"a key or number has more than {_MAX_KEY_PARTS} parts (at line {line})")
         elif first in "[{":
             depth, dots = depth + 1, 0
             if depth > _MAX_DEPTH:
-                raise ValueError(f"more than {_MAX_DEPTH} brackets within one another (at line {line})")
+                raise ValueError(f"more than {_MAX_DEPTH} nested brackets (at line {line})")
         elif first in "]}":
             depth, dots = depth - 1, 0
         elif first in ",=\n#":
             dots = 0
         elif len(token) > _MAX_WORD_LENGTH and first not in "\"' \t\r":
-            raise ValueError(f"a number or key of more than {_MAX_WORD_LENGTH} characters (at line {line})")
+            raise ValueError(f"a number or key has more than {_MAX_WORD_LENGTH} characters (at line {line})")
         line += token.count("\n")

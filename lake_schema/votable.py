@@ -1,9 +1,12 @@
-"""Units and UCDs for clients that do not know Arrow's metadata: a VOTable header in a Parquet file's footer.
+"""Describe the columns of Parquet files by a VOTable header in the footer, for clients that do not read Arrow metadata.
 
-The convention is VOParquet's, as the archives of Rubin and of IRSA write it and astropy (`Table.read(file,
-format="parquet.votable")`), TOPCAT and hats read it: a VOTable without data, its fields those of the file.
+The header is a VOTable without data whose fields are the columns of the file, with unit and UCD. It follows the
+VOParquet convention. The archives of Rubin and IRSA write it, and astropy (`Table.read(file,
+format="parquet.votable")`), TOPCAT and hats read it.
 
-Ref: IVOA Note "VOParquet", 1.0
+References
+----------
+IVOA Note "VOParquet", 1.0
 """
 
 from __future__ import annotations
@@ -26,18 +29,28 @@ _TYPES = {
 
 
 def footer_metadata(rows: pa.Table, table: Table) -> dict[str, str]:
-    """What is added to the footer of a file that holds these rows of a table."""
+    """Return the VOTable entries for the footer of a Parquet file that contains these rows of a table."""
     texts = [column.name for column in table.columns if column.type == "string"]
-    # A text of unknown length is an object to astropy's VOTables, and none to its Parquet files.
+    # astropy's VOTable reader takes a text of unknown length for an object, but its Parquet reader does not.
     text_lengths = tuple((name, pc.max(pc.utf8_length(rows[name])).as_py() or 1) for name in texts)
     return {VERSION: "1.0", CONTENT: table_header(table, text_lengths)}
 
 
 @lru_cache(maxsize=64)
 def table_header(table: Table, text_lengths: tuple[tuple[str, int], ...] = ()) -> str:
-    """The table's columns as a VOTable without data, XML.
+    """Return the columns of a table as a VOTable without data, in XML.
 
-    longest : (column, most characters) of the texts
+    Parameters
+    ----------
+    table : Table
+        Declaration of the table.
+    text_lengths : tuple of (str, int), optional
+        Largest number of characters of each text column.
+
+    Returns
+    -------
+    str
+        The VOTable.
     """
     root = ElementTree.Element("VOTABLE", {"version": "1.4", "xmlns": _NAMESPACE})
     table_element = ElementTree.SubElement(ElementTree.SubElement(root, "RESOURCE"), "TABLE", {"name": table.name})

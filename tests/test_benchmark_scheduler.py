@@ -9,7 +9,7 @@ from benchmarks import scheduler
 from benchmarks.scheduler import CORES_PER_MACHINE, REPAIR_H, SLOWDOWN, Site, simulate
 
 AT_ONCE = 1e12
-SOUND = {"slow": 0.0, "lives_h": math.inf}
+SOUND = {"slow_fraction": 0.0, "mean_life_h": math.inf}
 
 
 def ran(seconds, cores, rate=AT_ONCE, **site):
@@ -35,13 +35,13 @@ def test_the_driver_dispatches_one_task_after_another():
 
 
 def test_at_least_one_machine_is_slow():
-    found = ran(np.full(40_000, 1.0), 4 * CORES_PER_MACHINE, slow=0.02)
+    found = ran(np.full(40_000, 1.0), 4 * CORES_PER_MACHINE, slow_fraction=0.02)
     per_core = 40_000 / (CORES_PER_MACHINE * (3.0 + 1.0 / SLOWDOWN))
     assert found.makespan == pytest.approx(per_core, rel=0.01)
 
 
 def test_interrupted_tasks_run_again():
-    found = ran(np.full(4 * CORES_PER_MACHINE, 100.0), 4 * CORES_PER_MACHINE, lives_h=1e9)
+    found = ran(np.full(4 * CORES_PER_MACHINE, 100.0), 4 * CORES_PER_MACHINE, mean_life_h=1e9)
     # The failure comes in the middle of the tasks. Other machines take them when their tasks are done.
     assert (found.repeated, found.lost) == (CORES_PER_MACHINE, pytest.approx(50.0 * CORES_PER_MACHINE))
     assert found.makespan == pytest.approx(200.0)

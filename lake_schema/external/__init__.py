@@ -1,1 +1,1 @@
-"""External files and tables."""
+"""Reading of tables from files of other programs."""

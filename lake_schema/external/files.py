@@ -1,10 +1,11 @@
-"""Parquet files of other programs: nothing in them is believed, everything is bounded before and while it is read.
+"""Read Parquet files of other programs in a separate process, with limits on everything.
 
-batches     the rows of some flat columns, a bounded piece at a time
+A file can be made so that its reader crashes. Therefore a process with little memory and time reads it and sends plain
+Arrow batches::
 
-A file can be made so that its reader crashes, so it is read by a process of its own, which has little memory and time
-and hands over plain Arrow batches: python -m lake_schema.external.files FILE NEEDED COLUMN ... >stream
-(so many columns are needed, the others are sent where they are there)
+    python -m lake_schema.external.files FILE NUMBER COLUMN ... >stream
+
+The first NUMBER columns are required; the other ones are sent if they exist.
 """
 
 from __future__ import annotations
@@ -25,16 +26,16 @@ from lake_schema import command, user_files
 from lake_schema.errors import BadInput
 
 _MAGIC = b"PAR1"
-# A footer larger than this describes no table of ours; columns and row groups are bounded by the length of any list in
-# it, and with them how deep columns can nest.
+# Largest footer in bytes, and largest length of a list in it. The latter limits the numbers of columns and row groups,
+# and the nesting of columns.
 _MAX_FOOTER_BYTES = 32 << 20
 _MAX_ENTRIES = 5000
-# What one row group may hold, uncompressed; the largest that is written here is a tenth of it.
+# Largest uncompressed size of a row group in bytes; row groups that truesky writes have at most a tenth of it.
 _MAX_GROUP_BYTES = 256 << 20
-# Of a column in a batch: as a dictionary, and where each row has a text of its own, 64 bytes each.
+# Size limits (bytes) of a text column per batch: dictionary-encoded, and plain (64 bytes per row).
 _MAX_DICTIONARY_BYTES, _MAX_TEXT_BYTES = 1 << 20, 4 << 20
 _ROWS_PER_BATCH = 65_536
-# Of the reading process: address space; CPU time at the least, and bytes of the file for each second more.
+# Limits of the reading process: address space in bytes, minimum of CPU time in s, and file size per additional second.
 _MAX_MEMORY = 3 << 29
 _MIN_SECONDS, _BYTES_PER_SECOND = 10, 10_000_000
 _REFUSED_STATUS = 2
@@ -42,11 +43,26 @@ _ROOT = Path(__file__).resolve().parents[2]
 
 
 def read_batches(path: Path, columns: Sequence[str], text_columns: Sequence[str] = ()) -> Iterator[pa.RecordBatch]:
-    """Rows of some columns of a file, in its order; texts come as dictionaries, so that a repeated one is held once.
+    """Yield the rows of some columns of a file in its order, with dictionary-encoded texts to save memory.
 
-    columns : names of flat columns of numbers, booleans or texts
-    texts   : more of them, sent as they are, each left out where the file has none
-    Errors  : BadInput, one line, where the file is not Parquet, is damaged, or asks for more than is reasonable
+    Parameters
+    ----------
+    path : Path
+        The file.
+    columns : sequence of str
+        Names of flat columns of numbers, booleans or texts.
+    text_columns : sequence of str, optional
+        Further columns, which are sent without dictionaries; columns that do not exist are left out.
+
+    Yields
+    ------
+    pyarrow.RecordBatch
+        Rows.
+
+    Raises
+    ------
+    BadInput
+        If the file is not Parquet, is damaged, or exceeds the limits.
     """
     _refuse_large_footer(path)
     yield from read_in_subprocess(__name__, path, columns, text_columns)
@@ -55,11 +71,23 @@ def read_batches(path: Path, columns: Sequence[str], text_columns: Sequence[str]
 def read_in_subprocess(
     module: str, path: Path, columns: Sequence[str], text_columns: Sequence[str] = ()
 ) -> Iterator[pa.RecordBatch]:
-    """The batches that a module sends, run by a process of its own.
+    """Yield the batches that a module sends from a separate process.
 
-    module  : name of one that calls `main` with its reader
-    path    : of the file
-    columns : names of those that are needed;  texts : of those that are sent where they are there
+    Parameters
+    ----------
+    module : str
+        Name of a module that calls `main` with its reader.
+    path : Path
+        The file.
+    columns : sequence of str
+        Names of required columns.
+    text_columns : sequence of str, optional
+        Names of columns that are sent if they exist.
+
+    Yields
+    ------
+    pyarrow.RecordBatch
+        Rows.
     """
     command = [sys.executable, "-m", module, str(path.resolve()), str(len(columns)), *columns, *text_columns]
     environment = {**os.environ, "ARROW_DEFAULT_MEMORY_POOL": "system"}
@@ -76,13 +104,13 @@ def _receive_batches(path: Path, reader: subprocess.Popen[bytes]) -> Iterator[pa
         with pa.ipc.open_stream(reader.stdout) as stream:
             yield from stream
     except (OSError, pa.ArrowException):
-        # It ended early, and says why.
+        # The process ended early; its stderr contains the reason.
         pass
     _, stderr = reader.communicate()
     if reader.returncode == _REFUSED_STATUS:
         raise BadInput(stderr.decode(errors="replace").strip())
     if reader.returncode:
-        raise BadInput(f"{path}: its reader died of it, status {reader.returncode}")
+        raise BadInput(f"{path}: the process that read it failed with status {reader.returncode}")
 
 
 def _refuse_large_footer(path: Path) -> None:
@@ -94,16 +122,19 @@ def _refuse_large_footer(path: Path) -> None:
     if size < 12 or first != _MAGIC or last != _MAGIC:
         raise BadInput(f"{path}: is not a Parquet file")
     if not 0 < length <= min(size - 12, _MAX_FOOTER_BYTES):
-        raise BadInput(f"{path}: its footer says {length} bytes, of {size} and at most {_MAX_FOOTER_BYTES}")
+        raise BadInput(
+            f"{path}: its footer has a length of {length} bytes, which must fit in {size} and be at most "
+            f"{_MAX_FOOTER_BYTES}"
+        )
 
 
-# ----------------------------------------------------------------------------------------- in a process of its own
+# ----------------------------------------------------------------------------------------- in the separate process
 
 
 def main(argv: Sequence[str], sender: Callable[[Path, Sequence[str], Sequence[str], IO[bytes]], None]) -> int:
-    """Write the batches of a file to stdout as an Arrow stream; a refusal goes to stderr.
+    """Write the batches of a file to stdout as an Arrow stream, or an error to stderr, and return the exit status.
 
-    argv : FILE NEEDED COLUMN ...;  sender : what writes them
+    `argv` is FILE NUMBER COLUMN ..., and `sender` is the function that writes the batches.
     """
     path, required_count, columns = Path(argv[0]), int(argv[1]), list(argv[2:])
     seconds = _MIN_SECONDS + path.stat().st_size // _BYTES_PER_SECOND
@@ -121,11 +152,23 @@ def main(argv: Sequence[str], sender: Callable[[Path, Sequence[str], Sequence[st
 
 
 def send_batches(path: Path, required: Sequence[str], text_columns: Sequence[str], out: IO[bytes]) -> None:
-    """Write the batches of a file as an Arrow stream; BadInput, whatever Arrow's reader trips over.
+    """Write the batches of a file as an Arrow stream.
 
-    path   : a Parquet file of another program
-    needed : columns that have to be there;  texts : columns that are left out where they are not
-    out    : where the stream goes
+    Parameters
+    ----------
+    path : Path
+        A Parquet file of another program.
+    required : sequence of str
+        Columns that must exist.
+    text_columns : sequence of str
+        Columns that are left out if they do not exist.
+    out : binary file
+        File for the stream.
+
+    Raises
+    ------
+    BadInput
+        If the file exceeds the limits, or Arrow cannot read it.
     """
     try:
         with _open_file(path, required, text_columns) as (file, columns):
@@ -143,7 +186,7 @@ def _send(path: Path, file: pq.ParquetFile, columns: list[str], out: IO[bytes]) 
         stream = stream or pa.ipc.new_stream(out, batch.schema)
         stream.write_batch(_check_text_size(path, batch))
     if rows != file.metadata.num_rows:
-        raise BadInput(f"{path}: holds {rows} rows and says {file.metadata.num_rows}")
+        raise BadInput(f"{path}: holds {rows} rows, but its footer promises {file.metadata.num_rows}")
     if stream is not None:
         stream.close()
 
@@ -152,7 +195,7 @@ def _send(path: Path, file: pq.ParquetFile, columns: list[str], out: IO[bytes]) 
 def _open_file(
     path: Path, required: Sequence[str], text_columns: Sequence[str]
 ) -> Iterator[tuple[pq.ParquetFile, list[str]]]:
-    """The file, and the columns that are to be read."""
+    """Yield the file and the names of the columns to read."""
     limits: dict[str, Any] = {
         "thrift_container_size_limit": _MAX_ENTRIES,
         "thrift_string_size_limit": _MAX_FOOTER_BYTES,
@@ -168,7 +211,22 @@ def _open_file(
 
 
 def check_column_names(path: Path, names: Sequence[str], columns: Sequence[str]) -> None:
-    """Refuse a file in which columns are not there, or one twice; BadInput names all that are missing."""
+    """Raise BadInput if columns are missing from a file or occur more than once; the message lists all missing columns.
+
+    Parameters
+    ----------
+    path : Path
+        The file, for the message.
+    names : sequence of str
+        Names of the columns of the file.
+    columns : sequence of str
+        Names of the required columns.
+
+    Raises
+    ------
+    BadInput
+        If a column is missing or not unique.
+    """
     count = Counter(names)
     if missing := [column for column in dict.fromkeys(columns) if not count[column]]:
         has = " ".join(", ".join(names).split())[:300]
@@ -185,14 +243,14 @@ def _check_columns(path: Path, file: pq.ParquetFile, names: Sequence[str], colum
     for column in columns:
         kind = file.schema_arrow.field(column).type
         if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind) or _is_text(kind)):
-            raise BadInput(f"{path}: column {column} is {kind}, wanted numbers, booleans or texts")
+            raise BadInput(f"{path}: column {column} is {kind}, but must have numbers, booleans or texts")
         if schema.column(indices[column]).max_repetition_level:
             raise BadInput(f"{path}: column {column} is a list")
     for number in range(metadata.num_row_groups):
         group = metadata.row_group(number)
         size = sum(group.column(indices[column]).total_uncompressed_size for column in columns)
         if not 0 <= size <= _MAX_GROUP_BYTES or not 0 <= group.num_rows <= _MAX_GROUP_BYTES:
-            raise BadInput(f"{path}: row group {number} says {group.num_rows} rows of {size} bytes: too large")
+            raise BadInput(f"{path}: row group {number} has {group.num_rows} rows of {size} bytes: too large")
 
 
 def _is_text(kind: pa.DataType) -> bool:

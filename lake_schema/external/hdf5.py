@@ -1,12 +1,10 @@
-"""HDF5 files of other programs in OpenCosmo's layout: nothing in them is believed, a bounded piece is read at a time.
+"""Read HDF5 files of other programs in OpenCosmo's layout, in a separate process and with limits on everything.
 
-batches     the rows of some columns
+A column is a dataset with one axis in a group `data`; its attribute `unit` gives the unit. The group is either at the
+top, or in one group per slice of a light-cone; slices are read in the order of their names. If a group `header/file`
+gives a type of data, it must be galaxies. As for Parquet, a process with little memory and time reads the file::
 
-A column is a dataset of one axis in a group `data`, its unit in the attribute `unit`. The group stands alone, or in a
-group of each slice of a light-cone; slices follow one another by name. What the group `header/file` says of the type,
-where there is one, must be galaxies. As Parquet, the file is read by a process of its own, which has little memory and
-time:
-python -m lake_schema.external.hdf5 FILE NEEDED COLUMN ... >stream
+    python -m lake_schema.external.hdf5 FILE NUMBER COLUMN ... >stream
 """
 
 from __future__ import annotations
@@ -24,26 +22,42 @@ from lake_schema.external import files
 MAGIC = b"\x89HDF\r\n\x1a\n"
 _TYPES = ("diffsky_fits", "synthetic_galaxies")
 _ROWS_PER_BATCH = 65_536
-# Groups of a file, slices among them; characters of a unit; bytes of a chunk, unpacked.
+# Largest number of groups of a file (including slices), of characters of a unit, and of bytes of an unpacked chunk.
 _MAX_GROUPS, _MAX_UNIT_LENGTH, _MAX_CHUNK_BYTES = 4096, 64, 64 << 20
 
 
 def read_batches(path: Path, columns: Sequence[str]) -> Iterator[pa.RecordBatch]:
-    """Rows of some columns of numbers, in the order of the file; the unit of each in its field's metadata.
+    """Yield the rows of some columns of numbers in the order of the file; the metadata of a field contain its unit.
 
-    Errors : BadInput, one line, where the file is damaged, has no rows, or asks for more than is reasonable; it names
-             the dataset where one is wrong
+    Raises
+    ------
+    BadInput
+        If the file is damaged, has no rows or exceeds the limits. The message names a faulty dataset.
     """
     yield from files.read_in_subprocess(__name__, path, columns)
 
 
-# ----------------------------------------------------------------------------------------- in a process of its own
+# ----------------------------------------------------------------------------------------- in the separate process
 
 
 def send_batches(path: Path, columns: Sequence[str], text_columns: Sequence[str], out: IO[bytes]) -> None:
-    """Write the batches of a file as an Arrow stream; BadInput, whatever the library trips over.
+    """Write the batches of a file as an Arrow stream.
 
-    path : of the file;  columns : wanted, of numbers;  texts : none, as other forms have them;  out : open to write
+    Parameters
+    ----------
+    path : Path
+        An HDF5 file of another program.
+    columns : sequence of str
+        Names of columns of numbers.
+    text_columns : sequence of str
+        Not used; `files.main` requires this parameter.
+    out : binary file
+        File for the stream.
+
+    Raises
+    ------
+    BadInput
+        If the file exceeds the limits, or h5py cannot read it.
     """
     import h5py
 
@@ -60,11 +74,11 @@ def send_batches(path: Path, columns: Sequence[str], text_columns: Sequence[str]
 
 
 def _data_groups(path: Path, file: Any) -> list[Any]:
-    """The groups `data` of a file, and what its headers say."""
+    """Return the groups `data` of a file, after checking the types of data in its headers."""
     import h5py
 
     if len(file) > _MAX_GROUPS:
-        raise BadInput(f"{path}: has {len(file)} groups: too many")
+        raise BadInput(f"{path}: has {len(file)} groups: too many, at most {_MAX_GROUPS} are allowed")
     names = [name for name in sorted(file, key=_numeric_sort_key) if name not in ("data", "index")]
     slice_groups = [file, *(_hard_linked_item(path, file, name) for name in names)]
     data_groups = []
@@ -74,7 +88,7 @@ def _data_groups(path: Path, file: Any) -> list[Any]:
         if "header" in group and "file" in group["header"]:
             kind = _decode_text(group["header"]["file"].attrs.get("data_type", _TYPES[0]))
             if kind not in _TYPES:
-                raise BadInput(f"{path}: {group.name} holds {kind[:40]}, wanted {' or '.join(_TYPES)}")
+                raise BadInput(f"{path}: {group.name} holds {kind[:40]}, but must hold {' or '.join(_TYPES)}")
         if "data" in group and isinstance(data_group := _hard_linked_item(path, group, "data"), h5py.Group):
             data_groups.append(data_group)
     if not data_groups:
@@ -87,11 +101,11 @@ def _numeric_sort_key(name: str) -> tuple[int, str]:
 
 
 def _hard_linked_item(path: Path, group: Any, name: str) -> Any:
-    """What a file itself holds, not what it leads to."""
+    """Return an item that is stored in the file itself; links to other places are refused."""
     import h5py
 
     if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-        raise BadInput(f"{path}: {group.name}/{name} leads elsewhere".replace("//", "/"))
+        raise BadInput(f"{path}: {group.name}/{name} must not be a link".replace("//", "/"))
     return group[name]
 
 
@@ -100,18 +114,18 @@ def _column_datasets(path: Path, group: Any, columns: Sequence[str]) -> list[Any
 
     column_names = list(group)
     if len(column_names) > _MAX_GROUPS:
-        raise BadInput(f"{path}: {group.name} has {len(column_names)} columns: too many")
+        raise BadInput(f"{path}: {group.name} has {len(column_names)} columns: too many, at most {_MAX_GROUPS}")
     files.check_column_names(path, column_names, columns)
     datasets = [_hard_linked_item(path, group, name) for name in columns]
     for column in datasets:
         if not isinstance(column, h5py.Dataset) or len(column.shape or ()) != 1 or column.dtype.kind not in "fiub":
-            raise BadInput(f"{path}: dataset {column.name} is no column of numbers")
+            raise BadInput(f"{path}: dataset {column.name} is not a column of numbers")
         if column.is_virtual or column.external:
-            raise BadInput(f"{path}: dataset {column.name} leads elsewhere")
+            raise BadInput(f"{path}: dataset {column.name} must be stored in the file itself")
         if column.chunks and column.chunks[0] * column.dtype.itemsize > _MAX_CHUNK_BYTES:
             raise BadInput(f"{path}: dataset {column.name} has chunks of {column.chunks[0]} rows: too large")
         if len(column) != len(datasets[0]):
-            lengths = f"has {len(column)} rows, {datasets[0].name} {len(datasets[0])}"
+            lengths = f"has {len(column)} rows, but {datasets[0].name} has {len(datasets[0])}"
             raise BadInput(f"{path}: dataset {column.name} {lengths}")
     return datasets
 

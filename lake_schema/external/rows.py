@@ -1,13 +1,7 @@
-"""Tables of numbers from other programs, whatever their form: a bounded piece at a time, in the order of the files.
+"""Read tables of numbers of other programs in bounded batches: Parquet, FITS, CSV and HDF5.
 
-files    a path -> the files that it stands for: itself, or the Parquet or else HDF5 files of a folder
-titles   of a CSV file
-pieces   the rows of some columns of a Parquet, FITS, CSV or HDF5 file
-within   a column whose values have to lie between bounds
-
-Parquet is read by a process of its own (lake_schema.external.files), FITS and CSV in pieces. What a file is, its
-ending says,
-or where that says nothing its first bytes.
+Parquet and HDF5 files are read in a separate process, FITS and CSV files in pieces. The ending of a file determines its
+format, or its first bytes if the ending is unknown.
 """
 
 from __future__ import annotations
@@ -31,7 +25,7 @@ from lake_schema.external import hdf5
 from lake_schema.fits import external
 
 _BLOCK_BYTES, _HEADER_BYTES = 8 << 20, 1 << 16
-# Of a name, characters; of a CSV file.
+# Largest number of characters of a text, and of columns of a CSV file.
 _MAX_TEXT_LENGTH, _MAX_COLUMNS = 64, 4096
 _CSV, _FITS, _PARQUET, _HDF5 = (".csv",), (".fits", ".fit"), (".parquet", ".parq"), (".hdf5", ".h5")
 _ENDINGS = (*_PARQUET, *_FITS, *_CSV, *_HDF5)
@@ -41,9 +35,16 @@ _ENDINGS = (*_PARQUET, *_FITS, *_CSV, *_HDF5)
 class RowBatch:
     """Rows of one file.
 
-    first   : number of the first row in the file, from 1
-    columns : title -> numbers[n], NaN where a float is missing; texts[n] (object), "" where one is missing
-    units   : title -> what the file itself says of its unit, where it says anything
+    Attributes
+    ----------
+    file : Path
+        The file.
+    first_row : int
+        Number of the first row in the file, from 1.
+    columns : mapping of str to array, shape (n,)
+        Values by title: numbers, NaN for missing floats; or texts (type object), "" for missing ones.
+    units : mapping of str to str
+        Units that the file gives, by title.
     """
 
     file: Path
@@ -53,14 +54,20 @@ class RowBatch:
 
 
 def find_files(path: Path) -> list[Path]:
-    """Errors: BadInput where there is no such file, or none in the folder, or its ending tells nothing"""
+    """Return the files for a path: the file itself, or the Parquet files, else the HDF5 files, of a folder.
+
+    Raises
+    ------
+    BadInput
+        If there is no such file, the folder contains no such files, or the ending is unknown.
+    """
     if _is_folder(path):
         paths = _files_of_folder(path)
         if not paths:
             raise BadInput(f"{path}: no Parquet or HDF5 file in this folder")
         return paths
     if path.suffix.lower() not in _ENDINGS:
-        raise BadInput(f"{user_files.format_path(path)}: the ending is none of {', '.join(_ENDINGS)}")
+        raise BadInput(f"{user_files.format_path(path)}: the ending is not one of {', '.join(_ENDINGS)}")
     return [check_format(path)]
 
 
@@ -72,9 +79,9 @@ def _is_folder(path: Path) -> bool:
 
 
 def check_format(file: Path, kind: str = "catalogue") -> Path:
-    """The path of a file whose first bytes are those of its format: a first look, before all of it is read.
+    """Return the path of a file if its first bytes fit its format; this quick check precedes reading it.
 
-    kind : of file, as user_files has it
+    `kind` is a key of `user_files.MAX_BYTES`.
     """
     form = _endings_of_format(file, kind)
     with user_files.open_file(file, kind) as stream:
@@ -91,10 +98,12 @@ def check_format(file: Path, kind: str = "catalogue") -> Path:
 
 
 def _refuse_wide(file: Path, start: bytes) -> None:
-    """Arrow makes room for every column that a file has, 4 kB each and more, whichever are asked for."""
+    """Refuse a CSV file with too many columns; Arrow allocates at least 4 kB for each column, even if unread."""
     header_line = (start.splitlines() or [b""])[0]
     if len(header_line) == _HEADER_BYTES or header_line.count(b",") >= _MAX_COLUMNS:
-        raise BadInput(f"{user_files.format_path(file)}: has more than {_MAX_COLUMNS} columns, or titles of any length")
+        raise BadInput(
+            f"{user_files.format_path(file)}: has more than {_MAX_COLUMNS} columns, or titles that are too long"
+        )
 
 
 def read_batches(
@@ -104,12 +113,31 @@ def read_batches(
     text_columns: Sequence[str] = (),
     kind: str = "catalogue",
 ) -> Iterator[RowBatch]:
-    """The rows of one file.
+    """Yield the rows of one file in batches.
 
-    kind   : of file, as user_files has it
-    whole  : columns of whole numbers, where an empty place is refused: no float holds 64 bits
-    texts  : more columns, of texts or of whole numbers as texts, each left out where the file has none
-    Errors : BadInput or Damaged, one line: the file, and the column and row where one is wrong
+    Parameters
+    ----------
+    file : Path
+        The file.
+    columns : sequence of str
+        Columns of numbers.
+    integer_columns : sequence of str, optional
+        Those of `columns` with integers, in which missing values are refused, because float64 cannot store 64-bit
+        integers.
+    text_columns : sequence of str, optional
+        Further columns with texts, or with integers that become texts; columns that do not exist are left out.
+    kind : str, optional
+        Kind of file, a key of `user_files.MAX_BYTES`.
+
+    Yields
+    ------
+    RowBatch
+        Rows.
+
+    Raises
+    ------
+    BadInput, Damaged
+        If the file cannot be read. The message names the file, and a faulty column and row.
     """
     first_row = 1
     endings = _endings_of_format(check_format(file, kind), kind)
@@ -142,12 +170,12 @@ def read_batches(
 
 
 def csv_column_names(file: Path, kind: str = "catalogue") -> list[str]:
-    """The titles of a CSV file's columns; BadInput where one stands twice."""
+    """Return the titles of a CSV file's columns; raise BadInput if one occurs twice."""
     try:
         with user_files.open_file(check_format(file, kind), kind) as stream, csv.open_csv(stream) as table:
             names = list(table.schema.names)
     except UnicodeDecodeError:
-        raise BadInput(f"{file}: is no CSV in UTF-8") from None
+        raise BadInput(f"{file}: is not CSV in UTF-8") from None
     except (pa.ArrowException, OSError) as error:
         raise BadInput(f"{file}: {' '.join(str(error).split())[:300]}") from None
     external_files.check_column_names(file, names, names)
@@ -155,7 +183,29 @@ def csv_column_names(file: Path, kind: str = "catalogue") -> list[str]:
 
 
 def check_bounds(file: Path, column: str, values: Array, bounds: tuple[float, float]) -> Array:
-    """The values of all rows of a file, as they are; BadInput names the column and the first row out of bounds."""
+    """Return the values of a column unchanged if all are within bounds.
+
+    Parameters
+    ----------
+    file : Path
+        The file, for the message.
+    column : str
+        Name of the column, for the message.
+    values : array, shape (n,)
+        Values of all rows of the file.
+    bounds : tuple of (float, float)
+        Smallest and largest value that is allowed.
+
+    Returns
+    -------
+    array, shape (n,)
+        The same values.
+
+    Raises
+    ------
+    BadInput
+        If a value is out of bounds or NaN. The message names the first such row.
+    """
     low, high = bounds
     outside = ~((values >= low) & (values <= high))
     if outside.any():
@@ -166,7 +216,10 @@ def check_bounds(file: Path, column: str, values: Array, bounds: tuple[float, fl
 
 
 def _files_of_folder(folder: Path) -> list[Path]:
-    """A collection of HATS catalogues names the one with the rows; only its dataset holds rows once each."""
+    """Return the Parquet files, else the HDF5 files, of a folder.
+
+    For a collection of HATS catalogues, only the dataset of the primary catalogue is used. It contains each row once.
+    """
     properties = folder / "collection.properties"
     if properties.is_file():
         lines = (line.partition("=") for line in user_files.read_text(properties, "request").splitlines())
@@ -184,7 +237,7 @@ def _unit(field: pa.Field) -> str:
 
 
 def _endings_of_format(file: Path, kind: str) -> tuple[str, ...]:
-    """Its endings."""
+    """Return the endings of the format of a file."""
     for endings in (_PARQUET, _FITS, _CSV, _HDF5):
         if file.suffix.lower() in endings:
             return endings
@@ -218,7 +271,7 @@ def _csv_batches(
         with csv.open_csv(file, read_options=read_options, convert_options=convert_options) as stream:
             yield from stream
     except UnicodeDecodeError:
-        raise BadInput(f"{file}: is no CSV in UTF-8") from None
+        raise BadInput(f"{file}: is not CSV in UTF-8") from None
     except (pa.ArrowException, OSError) as error:
         raise BadInput(f"{file}: {' '.join(str(error).split())[:300]}") from None
 
@@ -226,7 +279,7 @@ def _csv_batches(
 def _to_numbers(file: Path, first_row: int, name: str, values: pa.Array, integer_columns: Sequence[str]) -> Array:
     where = f"{file}: column {name}"
     if pa.types.is_dictionary(values.type) or pa.types.is_string(values.type):
-        raise BadInput(f"{where} holds texts, wanted numbers")
+        raise BadInput(f"{where} holds texts, but must hold numbers")
     if pa.types.is_boolean(values.type):
         values = values.cast(pa.int8())
     if values.null_count and (name in integer_columns or not pa.types.is_floating(values.type)):
@@ -239,7 +292,7 @@ def _to_numbers(file: Path, first_row: int, name: str, values: pa.Array, integer
 def _to_texts(file: Path, first_row: int, name: str, values: pa.Array) -> Array:
     kind = values.type.value_type if pa.types.is_dictionary(values.type) else values.type
     if not (pa.types.is_integer(kind) or pa.types.is_string(kind) or pa.types.is_large_string(kind)):
-        raise BadInput(f"{file}: column {name} holds {kind}, wanted texts or whole numbers")
+        raise BadInput(f"{file}: column {name} holds {kind}, but must hold texts or whole numbers")
     texts = pc.fill_null(pc.utf8_trim_whitespace(values.cast(pa.string())), "")
     long = pc.greater(pc.utf8_length(texts), _MAX_TEXT_LENGTH)
     if (row := pc.index(long, True).as_py()) >= 0:

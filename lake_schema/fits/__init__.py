@@ -1,1 +1,1 @@
-"""The files that know FITS."""
+"""Reading and writing of FITS files."""

@@ -1,11 +1,4 @@
-"""External FITS files, read with bounds: columns of numbers, HEALPix maps, cubes of planes.
-
-read_numbers    an external binary table -> its columns of numbers
-number_batches  the same, some columns and a bounded piece at a time
-read_table      the same as an astropy table
-read_map        an external HEALPix map -> its pixels and header
-read_planes     an external image of two or three axes -> its samples and header
-"""
+"""Read FITS files of users and other programs, with limits on their size: tables, HEALPix maps and planes of images."""
 
 from __future__ import annotations
 
@@ -28,22 +21,24 @@ from lake_schema.arrays import Array, Float
 from lake_schema.errors import BadInput, LakeError
 
 _ROWS_PER_BATCH = 65_536
-# Of a file that is packed as a whole; of a map, pixels; of planes, samples.
+# Largest number of bytes of an unpacked gzip file, of pixels of a map, and of samples of planes.
 _MAX_UNPACKED_BYTES, _MAX_PIXELS, _MAX_SAMPLES = 512 << 20, 12 << 24, 64 << 20
-# How a file is built, and how much of it there may be: axes of a unit, units, bytes of a header.
+# Sizes of blocks and cards in bytes, and limits: axes of a unit, units of a file, bytes of a header.
 _BLOCK, _CARD = 2880, 80
 _MAX_AXES, _MAX_HDUS, _MAX_HEADER_BYTES = 9, 1000, 64 * _BLOCK
 _MAX_COLUMNS = 999
 _SIZE_CARD = re.compile(rb"(?:HIERARCH +)?(BITPIX|NAXIS\d{0,3}|PCOUNT|GCOUNT|TFIELDS) *= *([+-]?\d+)")
-# Of a column of texts, bytes.
+# Largest width of a column of texts, in bytes.
 _MAX_TEXT_BYTES = 256
 
 
 def read_numbers(path: Path, kind: str) -> dict[str, Float]:
-    """Columns of numbers of a file's first table, title -> float64[n]; NaN where TNULL says that there is none.
+    """Return the numeric columns of a file's first table as float64 arrays by title; TNULL becomes NaN.
 
-    kind   : of file, as user_files has it
-    Errors : BadInput for a file that is cut short or is none, and where there is no table
+    Raises
+    ------
+    BadInput
+        If the file is cut short or is not FITS, or has no table.
     """
     with _open_hdus(path, kind) as hdus:
         return _number_columns(_first_table(path, hdus))
@@ -56,11 +51,32 @@ def read_batches(
     rows_per_batch: int = _ROWS_PER_BATCH,
     kind: str = "catalogue",
 ) -> Iterator[tuple[dict[str, Array], dict[str, str]]]:
-    """Columns of numbers of a file's first table: (title -> numbers[n], whole numbers as they are; title -> TUNIT).
+    """Yield the rows of some columns of a file's first table in batches.
 
-    texts  : more columns, of texts or whole numbers; left out where there are none
-    path   : the file;  rows : of a batch;  kind : of user_files, whose largest size holds
-    Errors : BadInput for a file that is cut short or is none, and names a column that is missing or no number
+    Parameters
+    ----------
+    path : Path
+        The file.
+    columns : sequence of str
+        Columns of numbers.
+    text_columns : sequence of str, optional
+        Columns of texts or whole numbers; columns that do not exist are left out.
+    rows_per_batch : int, optional
+        Number of rows in a batch.
+    kind : str, optional
+        Kind of file, a key of `user_files.MAX_BYTES`, which limits its size.
+
+    Yields
+    ------
+    arrays : dict of str to array, shape (n,)
+        Values by column; integers keep their type unless some are missing.
+    units : dict of str to str
+        Units (TUNIT) by column, if the file gives them.
+
+    Raises
+    ------
+    BadInput
+        If the file is cut short or is not FITS, or a column is missing or not numeric.
     """
     with _open_hdus(path, kind) as hdus:
         hdu = _first_table(path, hdus)
@@ -84,8 +100,8 @@ def read_batches(
 
 
 def read_table(path: Path, kind: str) -> Any:
-    """An external file's first table as an astropy QTable, units and all; errors as of read_numbers."""
-    # Slow to import, and seldom needed.
+    """Return the first table of a file as an astropy QTable with units; it raises the errors of `read_numbers`."""
+    # This import is slow and seldom needed.
     from astropy.table import QTable
 
     with _open_hdus(path, kind) as hdus:
@@ -98,23 +114,23 @@ def read_table(path: Path, kind: str) -> Any:
 def _refuse_no_numbers(path: Path, hdu: Any, columns_by_name: Mapping[str, Any], name: str) -> None:
     _refuse_lists(path, columns_by_name[name])
     if hdu.data[name].dtype.kind not in "fiub" or hdu.data[name].ndim != 1:
-        raise BadInput(f"{path}: column {name} is {hdu.data[name].dtype}, wanted a number a row")
+        raise BadInput(f"{path}: column {name} is {hdu.data[name].dtype}, but must be one number per row")
 
 
 def _refuse_lists(path: Path, column: Any) -> None:
-    # Of variable length: each row says where its values are, and what it says is only known when it is read.
+    # Rows of variable length contain offsets, which cannot be checked before they are read.
     if any(letter in str(column.format) for letter in "PQ"):
         raise BadInput(f"{path}: column {column.name} holds lists")
 
 
 def _text_column(path: Path, hdu: Any, name: str) -> Array:
-    """A column of texts as it is stored, bytes, or of whole numbers; astropy would decode all rows at once."""
+    """Return a column as stored bytes, or as integers; astropy would decode the texts of all rows at once."""
     stored = hdu.data.view(np.ndarray)[name]
     if stored.dtype.kind in "iu":
         stored = hdu.data[name]
     if stored.dtype.kind not in "iuS" or stored.ndim != 1 or stored.dtype.itemsize > _MAX_TEXT_BYTES:
         raise BadInput(
-            f"{path}: column {name} is {stored.dtype}, wanted a text of at most {_MAX_TEXT_BYTES} bytes a row"
+            f"{path}: column {name} is {stored.dtype}, but must be a text of at most {_MAX_TEXT_BYTES} bytes per row"
         )
     return np.asarray(stored)
 
@@ -134,9 +150,26 @@ def _native_numbers(values: Any, null: int | None) -> Array:
 
 
 def read_map(path: Path, column: str) -> tuple[Float, dict[str, Any]]:
-    """A column of a HEALPix map, float64[pixels] in its file's order, and the cards of its header.
+    """Return a column of a HEALPix map.
 
-    Errors : BadInput for a file that is cut short or is none, and where there is no table or column
+    Parameters
+    ----------
+    path : Path
+        The file.
+    column : str
+        Name of the column.
+
+    Returns
+    -------
+    values : float64 array, shape (n,)
+        Values of the pixels in the order of the file.
+    cards : dict
+        Cards of its header.
+
+    Raises
+    ------
+    BadInput
+        If the file is cut short or is not FITS, or has no table or no such column.
     """
     with _open_hdus(path, "map of dust") as hdus:
         hdu = _first_table(path, hdus)
@@ -146,19 +179,38 @@ def read_map(path: Path, column: str) -> tuple[Float, dict[str, Any]]:
         _refuse_lists(path, columns_by_name[column])
         values = hdu.data[column]
         if values.dtype.kind not in "fiu" or not values.size <= _MAX_PIXELS:
-            raise BadInput(f"{path}: column {column} is {values.size} of {values.dtype}, wanted numbers of a map")
+            contents = f"{values.size} values of {values.dtype}"
+            raise BadInput(f"{path}: column {column} has {contents}, but must have at most {_MAX_PIXELS} numbers")
         return np.asarray(values, np.float64).ravel(), dict(hdu.header.items())
 
 
 def read_planes(
     path: Path, column: str, kind: str = "PSF", max_samples: int = _MAX_SAMPLES
 ) -> tuple[Float, dict[str, Any]]:
-    """An external file's planes, float64[ny, nx] or [n, ny, nx], with the cards of their header.
+    """Return the planes of a file: its first image with two or three axes, or an array in the first row of a table.
 
-    The first image of two or three axes, or the array that the first row of a table has in `column`.
+    Parameters
+    ----------
+    path : Path
+        The file.
+    column : str
+        Column of the table that contains the array.
+    kind : str, optional
+        Kind of file, a key of `user_files.MAX_BYTES`, which limits its size.
+    max_samples : int, optional
+        Largest number of samples.
 
-    path   : the file;  kind : of user_files;  most : numbers that one holds
-    Errors : BadInput for a file that is cut short or is none, and where it holds neither, or packed images
+    Returns
+    -------
+    planes : float64 array, shape (ny, nx) or (n, ny, nx)
+        The planes.
+    cards : dict
+        Cards of their header.
+
+    Raises
+    ------
+    BadInput
+        If the file is cut short or is not FITS, has no planes or too many samples, or contains compressed images only.
     """
     with _open_hdus(path, kind) as hdus:
         for hdu in hdus:
@@ -171,7 +223,7 @@ def read_planes(
                 planes = hdu.data
             if planes is not None and np.ndim(planes) in (2, 3) and planes.size and planes.dtype.kind in "fiu":
                 if planes.size > max_samples:
-                    raise BadInput(f"{path}: holds {planes.size} samples, a {kind} has at most {max_samples}")
+                    raise BadInput(f"{path}: holds {planes.size} samples, but a {kind} may have at most {max_samples}")
                 return np.array(planes, np.float64), dict(hdu.header.items())
     raise BadInput(f"{path}: holds no image of two or three axes and no table with a column {column}")
 
@@ -193,19 +245,19 @@ def _number_columns(hdu: Any) -> dict[str, Float]:
 
 @contextmanager
 def _open_hdus(path: Path, kind: str) -> Iterator[fits.HDUList]:
-    """An external file, plain or packed by gzip, its headers looked through before astropy is given it.
+    """Open a FITS file, plain or packed by gzip, after its headers have been checked.
 
-    Errors : BadInput, whatever it is that astropy trips over: what its readers raise has no end
+    All errors of astropy become BadInput, because its readers raise many types of exceptions for damaged files.
     """
     with user_files.open_file(path, kind) as stream:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("error", AstropyUserWarning)
-                # Titles such as "RA(ICRS)" are usual.
+                # Titles such as "RA(ICRS)" are common.
                 warnings.simplefilter("ignore", fits.verify.VerifyWarning)
                 unpacked = _unpack(path, stream)
                 _check_headers(path, unpacked)
-                # What an image is packed in is a table then, and is not unpacked: that code trusts what it is given.
+                # Compressed images appear as tables and are not decompressed, because that code trusts its input.
                 with fits.open(unpacked, memmap=unpacked is stream, disable_image_compression=True) as hdus:
                     yield hdus
         except LakeError:
@@ -219,7 +271,7 @@ def _first_table(path: Path, hdus: fits.HDUList) -> Any:
     for hdu in hdus:
         if isinstance(hdu, fits.BinTableHDU):
             if not hdu.header["NAXIS1"]:
-                raise BadInput(f"{path}: the rows of its table have no bytes")
+                raise BadInput(f"{path}: the rows of its table are empty")
             return hdu
     raise BadInput(f"{path}: holds no table")
 
@@ -230,7 +282,7 @@ def _unpack(path: Path, stream: IO[bytes]) -> IO[bytes]:
     if start == b"SIMPLE":
         return stream
     if not start.startswith(b"\x1f\x8b"):
-        raise BadInput(f"{user_files.format_path(path)}: is no FITS file")
+        raise BadInput(f"{user_files.format_path(path)}: is not a FITS file")
     with gzip.open(stream) as packed:
         data = packed.read(_MAX_UNPACKED_BYTES + 1)
     if len(data) > _MAX_UNPACKED_BYTES:
@@ -239,7 +291,7 @@ def _unpack(path: Path, stream: IO[bytes]) -> IO[bytes]:
 
 
 def _check_headers(path: Path, stream: IO[bytes]) -> None:
-    """Refuse headers without end, and data that are not there: they would be mapped beyond the end of the file."""
+    """Refuse headers without an end and data that exceed the file, which would be mapped beyond its end."""
     name, size, hdu_start = user_files.format_path(path), stream.seek(0, io.SEEK_END), 0
     for _ in range(_MAX_HDUS):
         stream.seek(hdu_start)
@@ -251,24 +303,25 @@ def _check_headers(path: Path, stream: IO[bytes]) -> None:
             if card := _SIZE_CARD.match(header, start, start + _CARD):
                 size_cards.setdefault(card[1], int(card[2]))
         if not 0 <= size_cards.get(b"TFIELDS", 0) <= _MAX_COLUMNS:
-            raise BadInput(f"{name}: has {size_cards[b'TFIELDS']} columns")
+            raise BadInput(f"{name}: has {size_cards[b'TFIELDS']} columns, but must have 0 to {_MAX_COLUMNS}")
         if not 0 <= (count := size_cards.get(b"NAXIS", 0)) <= _MAX_AXES:
-            raise BadInput(f"{name}: has {count} axes")
+            raise BadInput(f"{name}: has {count} axes, but must have 0 to {_MAX_AXES}")
         axes = [size_cards.get(b"NAXIS%d" % i, 0) for i in range(1, count + 1)]
         if min([*axes, 0]) < 0:
-            raise BadInput(f"{name}: axes of {axes} pixels")
+            raise BadInput(f"{name}: has axes of {axes} pixels, which must not be negative")
         value_count = math.prod(axes) + size_cards.get(b"PCOUNT", 0) if axes else 0
         length = value_count * size_cards.get(b"GCOUNT", 1) * abs(size_cards.get(b"BITPIX", 8)) // 8
         if length < 0 or hdu_start + len(header) + length > size:
-            raise BadInput(f"{name}: is cut short, {hdu_start + len(header) + length} bytes promised, {size} there")
+            end = hdu_start + len(header) + length
+            raise BadInput(f"{name}: is cut short: its headers promise {end} bytes, but it has {size}")
         hdu_start += len(header) + -(-length // _BLOCK) * _BLOCK
     else:
-        raise BadInput(f"{name}: has more than {_MAX_HDUS} units")
+        raise BadInput(f"{name}: has more than {_MAX_HDUS} header-data units")
     stream.seek(0)
 
 
 def _header(name: str, stream: IO[bytes]) -> bytes:
-    """The blocks of a header; nothing where the file has ended."""
+    """Return the blocks of a header, b"" at the end of the file."""
     header = b""
     while len(header) < _MAX_HEADER_BYTES:
         block = stream.read(_BLOCK)

@@ -1,10 +1,4 @@
-"""FITS images: written and read with their checksums.
-
-Image           an image with its header cards
-write_images    images -> one file: checksums, the same bytes for the same input; whole numbers packed where wanted
-text_of         header cards as lines of text;  cards_of_text : and back
-read_images     a file -> images; checksums are demanded and verified, sizes checked before data
-"""
+"""Write and read FITS images with checksums; equal input gives equal bytes."""
 
 from __future__ import annotations
 
@@ -25,7 +19,7 @@ from lake_schema.errors import BadInput, Damaged
 from lake_schema.fits import write
 from lake_schema.fits.write import MAX_BYTES
 
-# Rows of an image that are packed together: of one at a time astropy takes twice as long to write, thrice to read.
+# Rows of an image per compressed tile. With single rows, astropy takes twice as long to write and three times to read.
 _ROWS_PER_TILE = 16
 Card = tuple[str, str | int | float | bool, str]
 STRUCTURE = {
@@ -47,8 +41,14 @@ STRUCTURE |= {"BZERO", "BSCALE", "EXTNAME", "CHECKSUM", "DATASUM"}
 class Image:
     """One header-data unit.
 
-    data  : [ny, nx] or [n, ny, nx] uint8, int16, uint16, int32, float32 or float64; None = a header alone
-    cards : (keyword, value, comment), in order, structural keywords left out
+    Attributes
+    ----------
+    data : array, shape (ny, nx) or (n, ny, nx), or None
+        uint8, int16, uint16, int32, float32 or float64; None for a header without data.
+    cards : tuple of (str, str or int or float or bool, str)
+        Keyword, value and comment of each card in order, without structural keywords.
+    name : str
+        Name of the extension (EXTNAME), "" for none.
     """
 
     data: Array | None
@@ -57,29 +57,44 @@ class Image:
 
 
 def cards_to_text(cards: Sequence[Card]) -> str:
-    """Header cards as lines of text."""
+    """Return header cards as lines of text."""
     return "".join(_card_line(*card, repr(card[1])) for card in cards)
 
 
 @lru_cache(maxsize=4096, typed=True)
 def _card_line(keyword: str, value: Any, comment: str, value_text: str) -> str:
-    """A card, whose images of a file have most in common; written : of the value, as 0.0 and -0.0 are equal."""
+    """Return a card as a line; cards are cached, because the images of a file share most cards.
+
+    `value_text` distinguishes values that compare equal, such as 0.0 and -0.0.
+    """
     return f"{str(fits.Card(keyword, value, comment)).rstrip()}\n"
 
 
 def cards_from_text(lines: str) -> tuple[Card, ...]:
-    """What `text_of` wrote -> header cards."""
+    """Return the header cards that `cards_to_text` wrote."""
     return tuple((card.keyword, card.value, card.comment) for card in map(fits.Card.fromstring, lines.splitlines()))
 
 
 def write_images(path: Path, images: Sequence[Image], rice: bool = False) -> None:
-    """Write a file of images, the first as the primary one; replaces `path` in one rename.
+    """Write images to one file, which replaces `path` in one rename.
 
-    rice : whole numbers are packed, some rows together, without loss (FITS standard 4.0, section 10: RICE_1). A packed
-           image is an extension: before a first one that has pixels there is then a primary unit without any
+    Parameters
+    ----------
+    path : Path
+        The file.
+    images : sequence of Image
+        At least one image. The first one becomes the primary unit.
+    rice : bool, optional
+        True to compress integer images without loss (RICE_1 of FITS standard 4.0, section 10), in tiles of some rows. A
+        compressed image must be an extension, so a primary unit without pixels precedes a compressed first image.
+
+    Raises
+    ------
+    BadInput
+        If there are no images, or an image or a card cannot be stored in FITS.
     """
     if not images:
-        raise BadInput(f"{path}: a FITS file wants at least one image")
+        raise BadInput(f"{path}: a FITS file must have at least one image")
     make_hdu = [_compressed_hdu if rice and _has_integers(image) else image_hdu for image in images]
     if make_hdu[0] is _compressed_hdu:
         first, remaining = [fits.PrimaryHDU()], zip(make_hdu, images, strict=True)
@@ -89,17 +104,34 @@ def write_images(path: Path, images: Sequence[Image], rice: bool = False) -> Non
 
 
 def read_images(path: Path, max_bytes: int = MAX_BYTES) -> list[Image]:
-    """Read every image of a file that `write_images` wrote.
+    """Read all images of a file from `write_images`, and verify CHECKSUM and DATASUM of each unit.
 
-    What is checked is what the file says of itself, CHECKSUM and DATASUM of each unit: any one changed byte is found,
-    bytes that changed places may not be. Of a file of a lake, Version.file compares the sha256.
+    Parameters
+    ----------
+    path : Path
+        The file.
+    max_bytes : int, optional
+        Largest size of the data according to the headers.
 
-    most_bytes : refuse a file whose headers promise more data
-    Errors     : Damaged for a bad or missing checksum and for a file that is cut short; BadInput for one too
-                 large
+    Returns
+    -------
+    list of Image
+        The images.
+
+    Raises
+    ------
+    Damaged
+        If a checksum is wrong or missing, or the file is cut short.
+    BadInput
+        If the file is too large.
+
+    Notes
+    -----
+    The checksums detect any single changed byte, but may miss exchanged bytes. For a file of a lake,
+    `Version.sidecar_path` compares the sha256.
     """
     with write.errors_as_damaged(path):
-        # Of the arithmetic of astropy's unpacking.
+        # Turn RuntimeWarnings from astropy's rescaling of the data into errors.
         warnings.simplefilter("error", RuntimeWarning)
         with fits.open(path, memmap=False, lazy_load_hdus=True, disable_image_compression=True) as hdus:
             write.check_size(path, hdus, max_bytes)
@@ -118,11 +150,13 @@ def read_images(path: Path, max_bytes: int = MAX_BYTES) -> list[Image]:
 
 
 def primary_hdu(image: Image) -> fits.PrimaryHDU:
+    """Return an image as a primary unit of astropy."""
     hdu = fits.PrimaryHDU(data=None if image.data is None else _check_array(image.data))
     return _add_cards(hdu, image)
 
 
 def image_hdu(image: Image) -> fits.ImageHDU:
+    """Return an image as an image extension of astropy."""
     return _add_cards(fits.ImageHDU(data=None if image.data is None else _check_array(image.data)), image)
 
 
@@ -130,10 +164,10 @@ def _compressed_hdu(image: Image) -> fits.BinTableHDU:
     data = _check_array(np.asarray(image.data))
     tile = (*(1 for _ in data.shape[:-2]), min(_ROWS_PER_TILE, data.shape[-2]), data.shape[-1])
     hdu = _add_cards(fits.CompImageHDU(data=data, compression_type="RICE_1", tile_shape=tile), image)
-    # Taken as the table that it is stored as, whose bytes the checksums are of.
+    # The checksums apply to the table in which the image is stored, so the unit is returned as that table.
     stream = io.BytesIO()
     fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(stream)
-    # Left open: its rows are copied from there when it is written.
+    # The file stays open, because the rows are copied from it when the unit is written.
     return fits.open(io.BytesIO(stream.getvalue()), disable_image_compression=True)[1]
 
 
@@ -142,7 +176,7 @@ def _has_integers(image: Image) -> bool:
 
 
 def _is_empty_primary(hdu: Any) -> bool:
-    """Whether a primary unit stands there only because a file must begin with one."""
+    """Return True if a primary unit exists only because a file must begin with one."""
     return hdu.header["NAXIS"] == 0 and all(card.keyword in STRUCTURE for card in hdu.header.cards)
 
 
@@ -154,7 +188,7 @@ def _add_cards(hdu: Any, image: Image) -> Any:
             with warnings.catch_warnings():
                 warnings.simplefilter("error", AstropyUserWarning)
                 card = fits.Card(keyword, value, comment)
-                # A card is judged when it is formatted; astropy would cut a long comment and go on.
+                # Formatting checks the card. Without the error, astropy would cut a long comment and continue.
                 str(card)
         except (ValueError, AstropyUserWarning) as error:
             raise BadInput(f"FITS card {keyword}: {' '.join(str(error).split())}") from None
@@ -166,11 +200,12 @@ def _add_cards(hdu: Any, image: Image) -> Any:
 
 def _check_array(data: Array) -> Array:
     if data.ndim not in (2, 3) or data.dtype.kind not in "fiu" or data.dtype.itemsize > 8:
-        raise BadInput(f"a FITS image wants numbers in two or three dimensions, got {data.dtype}{list(data.shape)}")
+        raise BadInput(f"a FITS image must be numbers in 2 or 3 dimensions, got {data.dtype}{list(data.shape)}")
     return np.ascontiguousarray(data)
 
 
 def image_from_hdu(hdu: Any) -> Image:
+    """Return a unit of astropy as an Image, with data in native byte order."""
     data = None if hdu.data is None else np.asarray(hdu.data)
     if data is not None:
         data = data.astype(data.dtype.newbyteorder("="), copy=False)

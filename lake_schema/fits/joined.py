@@ -1,7 +1,4 @@
-"""Several files of images -> one, whose header says what they have in common.
-
-join   files of `write_images` -> one file; their arrays as they are
-"""
+"""Join FITS files of images to one file whose first header contains the cards that they have in common."""
 
 from __future__ import annotations
 
@@ -15,7 +12,7 @@ from lake_schema.errors import BadInput
 from lake_schema.fits import images, write
 from lake_schema.fits.images import STRUCTURE, Card, Image
 
-# What astropy calls a packed image that has no name.
+# Names that astropy gives to images without a name.
 _DEFAULT_NAMES = ("", "COMPRESSED_IMAGE")
 
 _INHERIT: tuple[Card, ...] = (("INHERIT", True, "the first header of the file holds, too"),)
@@ -28,17 +25,33 @@ def join(
     extra_cards: Sequence[Card],
     kept_keywords: Sequence[str] = (),
 ) -> None:
-    """Write a file of all the files' arrays, one file after the other; replaces `path` in one rename.
+    """Write the arrays of several files to one file, which replaces `path` in one rename.
 
-    path   : of the file, which begins with a header alone
-    files  : each with a name, with which those of its arrays begin;  shared : keywords that are of all files
-    more   : cards of the first header, after the shared ones
-    in_each : keywords that arrays which have them keep, though they are shared
-    Cards of a file that are not shared, or differ, go to each of its arrays, unless that has its own. Of the arrays
-    one file's at a time are in memory.
+    Parameters
+    ----------
+    path : Path
+        The file. It begins with a header without data.
+    files : sequence of (str, Path)
+        Names and paths of files from `write_images`. The names of a file's arrays begin with its name.
+    shared_keywords : sequence of str
+        Keywords of the cards that move to the first header if they are equal in all files.
+    extra_cards : sequence of Card
+        Cards of the first header, after the shared ones.
+    kept_keywords : sequence of str, optional
+        Shared keywords that arrays keep in their headers as well.
+
+    Raises
+    ------
+    BadInput
+        If there are no files.
+
+    Notes
+    -----
+    Cards of a file's first header that are not shared, or differ, are copied to each of its arrays, unless the array
+    has such a card. Only the arrays of one file are in memory at a time.
     """
     if not files:
-        raise BadInput(f"{path}: there is nothing to join")
+        raise BadInput(f"{path}: there are no files to join")
     first_cards = [_first_cards(file) for _, file in files]
     common = [
         card
@@ -78,7 +91,7 @@ def _image_extension(hdu: Any, name: str, common_keywords: set[str], kept_keywor
 def _compressed_extension(
     hdu: Any, name: str, common_keywords: set[str], kept_keywords: set[str], first_hdu: Any
 ) -> Any:
-    """The table that it is stored as: its rows are not touched."""
+    """Return the table in which a compressed image is stored, with new cards; its rows are not changed."""
     for key in (common_keywords - kept_keywords) & set(hdu.header):
         del hdu.header[key]
     for card in (*_INHERIT * ("INHERIT" not in hdu.header), *_cards_except(first_hdu, {*common_keywords, *hdu.header})):
@@ -88,7 +101,7 @@ def _compressed_extension(
 
 
 def _extension_name(array_name: str, file_name: str) -> str:
-    """Of an array: its file's, and its own where it has one."""
+    """Return the name of an array in the joined file: the name of its file and, if it has one, its own name."""
     return (
         file_name
         if array_name in _DEFAULT_NAMES
@@ -99,7 +112,7 @@ def _extension_name(array_name: str, file_name: str) -> str:
 
 
 def _first_cards(file: Path) -> dict[str, Card]:
-    """Of the header that holds for all of a file: the first that says anything."""
+    """Return the cards of the header that applies to a whole file: the first one with more than structural cards."""
     with write.errors_as_damaged(file), fits.open(file, memmap=False, disable_image_compression=True) as hdus:
         skip_primary = len(hdus) > 1 and write.is_compressed(hdus[1]) and not _cards_except(hdus[0], set())
         return {card[0]: card for card in _cards_except(hdus[int(skip_primary)], set())}

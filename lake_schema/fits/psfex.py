@@ -1,7 +1,4 @@
-"""A PSF model in the form of PSFEx: planes that are multiplied with powers of the place on a detector.
-
-write   planes -> a file
-"""
+"""Write a PSF model in the form of PSFEx: planes that are multiplied by powers of the position on a detector."""
 
 from __future__ import annotations
 
@@ -18,16 +15,31 @@ from lake_schema.fits import write as fits_file
 def write(
     path: Path, planes: Float32, step: float, fwhm: float, centre: tuple[float, float], scale: tuple[float, float]
 ) -> None:
-    """Write a model; replaces `path` in one rename.
+    """Write a model to a file, which is replaced in one rename.
 
-    path   : of the file
-    planes : float32[n, s, s] for the powers 1, x, x^2 .. y, x y .. of a polynomial of some degree;  step : pixels
-             between their samples;  fwhm : of a star, pixels
-    middle, unit : (column, row) of x = y = 0, pixels, the first of which is 1, and what 1 is of
+    Parameters
+    ----------
+    path : Path
+        The file.
+    planes : float32 array, shape (n, s, s)
+        Planes of the powers 1, x, x^2 .. y, x y .. of a polynomial in two coordinates.
+    step : float
+        Distance between samples of a plane, in pixels.
+    fwhm : float
+        FWHM of a star, in pixels.
+    centre : tuple of (float, float)
+        Column and row at which x = y = 0, in pixels; the first pixel is 1.
+    scale : tuple of (float, float)
+        Number of columns and rows that correspond to x = 1 and y = 1.
+
+    Raises
+    ------
+    BadInput
+        If the number of planes does not fit a polynomial in two coordinates.
     """
     degree = round((np.sqrt(8 * len(planes) + 1) - 3) / 2)
     if (degree + 1) * (degree + 2) // 2 != len(planes):
-        raise BadInput(f"{path}: {len(planes)} planes are not those of a polynomial of two coordinates")
+        raise BadInput(f"{path}: {len(planes)} planes do not fit a polynomial in two coordinates")
     side = planes.shape[1]
     column = fits.Column("PSF_MASK", f"{planes.size}E", dim=f"({side}, {side}, {len(planes)})", array=planes[None])
     table = fits.BinTableHDU.from_columns([column], name="PSF_DATA")

@@ -1,9 +1,4 @@
-"""A table with its units as a FITS binary table.
-
-table_to_fits   an Arrow table -> a binary table, units and UCDs from the table's declaration
-stream_to_fits  the same of any number of rows, a batch of them in memory at a time
-fits_unit       a unit as FITS spells it
-"""
+"""Write declared tables with their units and UCDs as FITS binary tables."""
 
 from __future__ import annotations
 
@@ -26,7 +21,7 @@ from lake_schema.columns import Column, Table
 from lake_schema.errors import BadInput
 from lake_schema.fits import write
 
-# What fits into the card of a column's name.
+# Largest number of characters that fit in the card with a column's name.
 _MAX_NAME_LENGTH = 68
 _TABLE_FORMATS = {
     "int64": "K",
@@ -40,11 +35,24 @@ _TABLE_FORMATS = {
 
 
 def table_to_fits(path: Path, table: pa.Table, declared: Table) -> None:
-    """Export rows of a declared table as a binary table extension; lists become arrays of variable length.
+    """Export rows of a declared table as a binary table; lists become arrays of variable length.
 
-    table  : Arrow table with (some of) the declared columns; null becomes NaN, TNULL for integers, the byte 0 for
-             booleans, "" for texts, an empty array for lists
-    Errors : BadInput names a column whose name FITS cannot hold; ValueError or TypeError for such values
+    Parameters
+    ----------
+    path : Path
+        The file, which is replaced in one rename.
+    table : pyarrow.Table
+        Rows with all or some of the declared columns. Null becomes NaN, TNULL for integers, the byte 0 for booleans, ""
+        for texts, and an empty array for lists.
+    declared : Table
+        Declaration of the table.
+
+    Raises
+    ------
+    BadInput
+        If a column has a name that FITS cannot store.
+    ValueError, TypeError
+        If a column has values that FITS cannot store.
     """
     columns = [declared.column(name) for name in table.column_names]
     for column in columns:
@@ -56,7 +64,7 @@ def table_to_fits(path: Path, table: pa.Table, declared: Table) -> None:
     for column in columns:
         if column.type == "bool":
             stored[column.name][table.column(column.name).is_null().to_numpy()] = 0
-            # astropy 7.2 would write its converted copy of the column, in which a missing value is False.
+            # astropy 7.2 would write its converted copy of the column, in which missing values are False.
             hdu.data._converted.pop(column.name, None)
     for number, column in enumerate(columns, start=1):
         if column.ucd:
@@ -82,7 +90,7 @@ def _fits_column(column: Column, values: pa.ChunkedArray) -> fits.Column:
     if values.null_count == 0 or code in "DEL":
         filled = values.fill_null(False if code == "L" else float("nan")) if values.null_count else values
         return fits.Column(column.name, code, array=filled.to_numpy(), **unit_option)
-    # FITS has no signed bytes: they are written as 16 bits.
+    # FITS has no signed bytes, so they are written as 16-bit integers.
     widened = values.cast(pa.int16()) if column.type == "int8" else values
     null_value = _lowest_unused_value(widened.drop_null().to_numpy())
     return fits.Column(
@@ -91,12 +99,12 @@ def _fits_column(column: Column, values: pa.ChunkedArray) -> fits.Column:
 
 
 def _lowest_unused_value(values: Array) -> int:
-    """The lowest number of an integer type that does not occur."""
+    """Return the lowest value of an integer type that does not occur."""
     limits, unique_values = np.iinfo(values.dtype), np.unique(values)
     gaps = np.flatnonzero(unique_values != limits.min + np.arange(unique_values.size))
     lowest = int(limits.min) + int(gaps[0] if gaps.size else unique_values.size)
     if lowest > limits.max:
-        raise ValueError(f"every number of {values.dtype} occurs: none is left for what is missing")
+        raise ValueError(f"every number of {values.dtype} occurs, so none is left to represent null")
     return lowest
 
 
@@ -109,7 +117,7 @@ def _fits_lists(column: Column, values: pa.ChunkedArray, unit_option: dict[str, 
 
 
 def fits_unit(text: str) -> str:
-    """A unit as FITS spells it; one that it does not know, such as the electron, as it is."""
+    """Return a unit in the spelling of FITS; units that FITS does not have, such as the electron, are unchanged."""
     try:
         units.Unit(text, format="fits")
     except ValueError:
@@ -120,18 +128,26 @@ def fits_unit(text: str) -> str:
 
 # ------------------------------------------------------------------------------------------------ any number of rows
 
-# Bytes of rows that are put together at a time, and of a block of a FITS file.
+# Bytes of rows that are formatted at a time, and bytes of a block of a FITS file.
 _CHUNK_BYTES, _BLOCK = 8 << 20, 2880
-# Of the lowest numbers of an integer type those among which one that does not occur is looked for.
+# Number of lowest values of an integer type among which an unused one is searched.
 _SEARCHED_VALUES = 1 << 16
 
 
 @dataclass(slots=True)
 class _ColumnScan:
-    """What must be known of all values of a column before the first is written.
+    """Properties of all values of a column, which must be known before the first row is written.
 
-    widest : bytes of a text, or length of a list;  is_missing : whether one is null
-    lowest : which of the lowest numbers of its type occur
+    Attributes
+    ----------
+    column : Column
+        Declaration of the column.
+    max_width : int
+        Largest number of bytes of a text, or largest length of a list.
+    has_missing : bool
+        True if a value is null.
+    is_used : bool array, shape (_SEARCHED_VALUES,)
+        True for the lowest values of an integer type that occur.
     """
 
     column: Column
@@ -145,7 +161,7 @@ class _ColumnScan:
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Of a value in its row; of a list the length and the place of its values."""
+        """Type of a value in its row; a list has its length and the offset of its values."""
         if self.is_list:
             return np.dtype((">i8", (2,)))
         if self.column.type == "string":
@@ -160,7 +176,7 @@ class _ColumnScan:
 
     @property
     def null_value(self) -> int | None:
-        """What stands for a missing whole number, None where none is missing."""
+        """Integer that represents null, None if no value is missing."""
         if not (self.has_missing and self.dtype.kind == "i" and not self.is_list):
             return None
         if self.is_used.all():
@@ -168,14 +184,14 @@ class _ColumnScan:
         return int(np.iinfo(self.dtype).min) + int(np.argmin(self.is_used))
 
     def scan(self, values: pa.Array) -> None:
-        """At some more values."""
+        """Update the properties with more values."""
         self.has_missing |= values.null_count > 0
         if self.is_list or self.column.type == "string":
             lengths = pc.list_value_length(values) if self.is_list else pc.binary_length(values)
             self.max_width = max(self.max_width, pc.max(lengths).as_py() or 0)
         elif self.dtype.kind == "i":
             present_values = values.drop_null().to_numpy()
-            # Far from the lowest a difference would leave the type.
+            # For larger values, the difference would overflow the type.
             low_values = present_values[present_values < np.iinfo(self.dtype).min + _SEARCHED_VALUES].astype(np.int64)
             self.is_used[low_values - np.iinfo(self.dtype).min] = True
 
@@ -183,11 +199,23 @@ class _ColumnScan:
 def stream_to_fits(
     file: IO[bytes], batches: Callable[[], Iterable[pa.RecordBatch]], declared: Table, max_bytes: int | None = None
 ) -> None:
-    """Write rows as `table_to_fits` does, without checksums; lists have addresses of 64 bits.
+    """Write rows in batches as `table_to_fits` does, but without checksums and with 64-bit addresses of lists.
 
-    file : open for writing;  batches: gives all rows, of the declared types, each time it is called: this is twice
-    most : bytes that the rows may take, None = any number
-    Errors : BadInput names a column that FITS cannot hold, or where they take more
+    Parameters
+    ----------
+    file : binary file
+        File that is open for writing.
+    batches : callable
+        Function that returns all rows, of the declared types, as batches. It is called twice.
+    declared : Table
+        Declaration of the table.
+    max_bytes : int, optional
+        Largest number of bytes of the rows.
+
+    Raises
+    ------
+    BadInput
+        If FITS cannot store a column, or the rows are too large.
     """
     scans, rows = [_ColumnScan(column) for column in declared.columns], 0
     for column in declared.columns:
@@ -199,10 +227,10 @@ def stream_to_fits(
     record_type = np.dtype([(f"f{number}", scan.dtype) for number, scan in enumerate(scans)])
     if max_bytes is not None and rows * record_type.itemsize > max_bytes:
         raise BadInput(
-            f"a FITS file of the result has more than {max_bytes / 1e9:.3g} GB: ask for less, or another kind"
+            f"a FITS file of the result has more than {max_bytes / 1e9:.3g} GB: ask for less, or another format"
         )
     with tempfile.TemporaryFile() as lists:
-        # The header says how long the values of lists are, which lie behind the rows.
+        # The header contains the size of the values of lists, which follow the rows, so it is written again at the end.
         start = file.tell()
         file.write(_header(declared, scans, record_type.itemsize, rows, 0))
         for batch in batches():
@@ -218,7 +246,7 @@ def stream_to_fits(
 
 
 def _header(declared: Table, scans: list[_ColumnScan], width: int, rows: int, list_bytes: int) -> bytes:
-    """A primary unit without pixels, and the header of the table, of a length that its numbers do not change."""
+    """Return an empty primary unit and the header of the table; the length does not depend on the numbers."""
     columns = []
     for scan in scans:
         unit_option = {"unit": fits_unit(scan.column.unit)} if scan.column.unit else {}
@@ -235,7 +263,7 @@ def _header(declared: Table, scans: list[_ColumnScan], width: int, rows: int, li
 
 
 def _records(batch: pa.RecordBatch, scans: list[_ColumnScan], record_type: np.dtype[Any], lists: IO[bytes]) -> bytes:
-    """Some rows as they stand in the file; values of lists go to the end of `lists`."""
+    """Return rows as stored in the file; values of lists are appended to `lists`."""
     out = np.zeros(batch.num_rows, record_type)
     _write_lists(out, [(f"f{k}", scan, batch.column(k)) for k, scan in enumerate(scans) if scan.is_list], lists)
     for name, scan, values in zip(record_type.names or (), scans, batch.columns, strict=True):
@@ -258,7 +286,10 @@ def _records(batch: pa.RecordBatch, scans: list[_ColumnScan], record_type: np.dt
 
 
 def _write_lists(out: Array, columns: list[tuple[str, _ColumnScan, pa.Array]], lists: IO[bytes]) -> None:
-    """Write the values of lists row by row, however many rows come at a time; their lengths and places into `out`."""
+    """Append the values of lists row by row to `lists`, and write their lengths and offsets to `out`.
+
+    The order does not depend on the number of rows in a batch.
+    """
     element_types = [np.dtype(_fits_byte_type(_element_type(scan.column.type))) for _, scan, _ in columns]
     for k, row in enumerate(zip(*(values.to_pylist() for *_, values in columns), strict=True)):
         for (name, scan, _), element_type, value in zip(columns, element_types, row, strict=True):
@@ -275,7 +306,7 @@ def _element_type(list_type: str) -> str:
 
 
 def _fits_byte_type(kind: str) -> str:
-    """FITS has no signed bytes: they are written as 16 bits."""
+    """Return the type in a FITS file; FITS has no signed bytes, so they are written as 16-bit integers."""
     return ">i2" if kind == "int8" else np.dtype(kind).newbyteorder(">").str
 
 

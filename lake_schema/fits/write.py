@@ -1,4 +1,4 @@
-"""Writing a FITS file whole or not at all: staged beside its place, checked, renamed."""
+"""Write FITS files atomically: to a temporary file in the same folder, which replaces the file in one rename."""
 
 from __future__ import annotations
 
@@ -16,16 +16,18 @@ from astropy.utils.exceptions import AstropyUserWarning
 
 from lake_schema.errors import BadInput, Damaged, LakeError
 
-# A header that promises more than this is a mistake or an attack; the largest product is far below.
+# Headers that promise more data are a mistake or an attack; the largest products are much smaller.
 MAX_BYTES = 8 << 30
 _BLOCK = 2880
 
 
 def is_compressed(hdu: Any) -> bool:
+    """Return True if a unit is a table with a compressed image."""
     return bool(hdu.header.get("ZIMAGE", False))
 
 
 def write_atomically(path: Path, hdus: fits.HDUList) -> None:
+    """Write units with checksums to a file, which is replaced in one rename."""
     for hdu in hdus:
         _add_checksums(hdu)
     with _open_atomically(path) as stream:
@@ -33,18 +35,18 @@ def write_atomically(path: Path, hdus: fits.HDUList) -> None:
 
 
 def write_one_by_one(path: Path, hdus: Iterable[Any]) -> None:
-    """As `write_staged`, of units that need not be in memory at the same time; the first is the primary one."""
+    """Write units as `write_atomically` does, but with only one in memory at a time; the first is the primary unit."""
     with _open_atomically(path) as stream:
         for number, hdu in enumerate(hdus):
             _add_checksums(hdu)
             single_file = io.BytesIO()
             _write_hdus(single_file, fits.HDUList([hdu] if number == 0 else [fits.PrimaryHDU(), hdu]), path)
-            # An extension is written behind a primary unit without any pixels, a block long.
+            # An extension is written after an empty primary unit, which is one block long and is removed here.
             stream.write(single_file.getbuffer()[0 if number == 0 else _BLOCK :])
 
 
 def _add_checksums(hdu: Any) -> None:
-    # The comments that astropy would add hold the time of day.
+    # The default comments of astropy contain the time, so equal input would give different bytes.
     hdu.add_datasum(when="checksum of the data")
     hdu.add_checksum(when="checksum of header and data", override_datasum=True)
 
@@ -57,7 +59,7 @@ def _open_atomically(path: Path) -> Iterator[IO[bytes]]:
             yield stream
             stream.flush()
             os.fsync(stream.fileno())
-        # mkstemp makes files private; a product is as readable as anything else that is written here.
+        # mkstemp makes private files, but products get the usual permissions.
         os.chmod(temporary, 0o666 & ~_umask())
         os.replace(temporary, path)
     except BaseException:
@@ -69,7 +71,7 @@ def _write_hdus(stream: IO[bytes], hdus: fits.HDUList, path: Path) -> None:
     try:
         hdus.writeto(stream, output_verify="exception")
     except AttributeError as error:
-        # astropy (to 8.0) trips over its own check of the free space; what it was called for is the context.
+        # astropy (up to 8.0) fails in its check of the free space; the original error is the context of this one.
         raise OSError(f"{path}: {error.__context__}") from None
 
 
@@ -84,7 +86,7 @@ def _umask() -> int:
 
 @contextmanager
 def errors_as_damaged(path: Path) -> Iterator[None]:
-    """Whatever astropy trips over in a file of ours is damage of the file."""
+    """Turn all errors of astropy into Damaged, for files that truesky wrote."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", AstropyUserWarning)
@@ -96,6 +98,24 @@ def errors_as_damaged(path: Path) -> Iterator[None]:
 
 
 def check_size(path: Path, hdus: fits.HDUList, max_bytes: int) -> None:
+    """Compare the size of the data according to the headers with the size of the file and with a limit.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    hdus : HDUList
+        Its units.
+    max_bytes : int
+        Largest number of bytes of the data, stored or decompressed.
+
+    Raises
+    ------
+    BadInput
+        If the data exceed `max_bytes`.
+    Damaged
+        If the file is cut short.
+    """
     stored, unpacked = 0, 0
     for hdu in hdus:
         stored_size = _data_size(path, hdu.header, "") + max(int(hdu.header.get("PCOUNT", 0)), 0)
@@ -104,14 +124,15 @@ def check_size(path: Path, hdus: fits.HDUList, max_bytes: int) -> None:
         if max(stored, unpacked) > max_bytes:
             raise BadInput(f"{path}: holds more than {max_bytes} bytes")
     if stored > path.stat().st_size:
-        raise Damaged(f"{path}: is cut short, {stored} bytes promised, {path.stat().st_size} there")
+        size = path.stat().st_size
+        raise Damaged(f"{path}: is cut short: its headers promise {stored} bytes, but it has {size}")
 
 
 def _data_size(path: Path, header: Any, prefix: str) -> int:
-    """Bytes of a unit's data, or with the prefix Z of what is packed in it."""
+    """Return the bytes of a unit's data; with the prefix Z, of the compressed image in it."""
     axes = [int(header[f"{prefix}NAXIS{i}"]) for i in range(1, int(header[f"{prefix}NAXIS"]) + 1)]
     if any(axis < 0 for axis in axes):
-        raise Damaged(f"{path}: a negative NAXIS")
+        raise Damaged(f"{path}: has a negative NAXIS")
     pixels = 1
     for axis in axes:
         pixels *= axis

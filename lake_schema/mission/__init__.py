@@ -1,1 +1,1 @@
-"""The mission database: every number of the telescopes, cameras and survey, its status and its source."""
+"""The mission database: all numbers of the telescopes, cameras and survey, each with its status and source."""

@@ -1,4 +1,4 @@
-"""Bounds of the mission's parameters, from bounds.csv and counts.csv."""
+"""Bounds of the mission parameters, read from bounds.csv and counts.csv."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ def _read_bounds() -> tuple[tuple[re.Pattern[str], float, float, str], ...]:
 
 @cache
 def bounds_of_parameter(key: str) -> tuple[tuple[float, float, str], ...]:
-    """(lowest, highest, unit) of every bound that a parameter must keep."""
+    """Return all bounds of a parameter as tuples (lowest, highest, unit)."""
     return tuple((lo, hi, unit) for pattern, lo, hi, unit in _read_bounds() if pattern.fullmatch(key))
 
 
 @cache
 def is_count(key: str) -> bool:
-    """Whether a parameter is a count, of which no fraction has a meaning."""
+    """Return True if a parameter is a count and must be a whole number."""
     with (files("lake_schema.mission") / "counts.csv").open(encoding="utf-8") as stream:
         return any(fnmatchcase(key, row["pattern"]) for row in csv.DictReader(stream))
 
 
 def check_bounds(parameter: Parameter, key: str) -> None:
-    """Refuse a parameter outside its bounds.
+    """Raise an error if a parameter is outside its bounds.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def check_bounds(parameter: Parameter, key: str) -> None:
     Raises
     ------
     BadInput
-        If it must be a whole number and is not, or its unit does not fit the bound's.
+        If it must be a whole number and is not, or if its unit does not fit the unit of its bound.
     OutOfRange
         If it is outside its bounds.
     """

@@ -1,15 +1,17 @@
-"""A ground camera that a user describes in a folder of CSV files, beside the cameras of the mission database.
+"""Read a ground camera that a user describes in a folder of CSV files.
+
+The camera is used in addition to the cameras of the mission database. The folder contains::
 
     my_camera/parameters.csv    name, value, unit, source            numbers of the camera
-    my_camera/layout.csv        detector, type, nx, ny, x_mm, y_mm, rotation_deg     where detectors lie
-    my_camera/amplifiers.csv    type, amplifier, x, y, nx, ny, ...   parts of a detector of each type
+    my_camera/layout.csv        detector, type, nx, ny, x_mm, y_mm, rotation_deg     positions of detectors
+    my_camera/amplifiers.csv    type, amplifier, x, y, nx, ny, ...   areas of a detector of each type
     my_camera/bands.csv         band, curve, medium, zero_point, sky_brightness, seeing, extinction, fringes
     my_camera/wavefront.csv     noll, x_power, y_power, coefficient_nm     optional, aberrations of the telescope
 
-The folder's name is the camera's name. Gain, read noise and full well stand in amplifiers.csv alone. Blank values of
-bands.csv: without a curve the band is the passband of truesky of this name, and without fringes it has none. Columns
-may have any order, and lines that begin with ``#`` are comments. ``python -m lake_schema mission camera FOLDER --like
-decam`` writes such a folder with the values of a known camera, to be edited.
+The folder's name is the camera's name. Gain, read noise and full well are given in amplifiers.csv only. Blank values
+in bands.csv: without a curve, the band is truesky's passband of this name; without fringes, the band has no fringes.
+Columns may have any order, and lines that begin with ``#`` are comments. ``python -m lake_schema mission camera FOLDER
+--like decam`` writes such a folder with the values of a known camera, to be edited.
 """
 
 from __future__ import annotations
@@ -55,7 +57,7 @@ class Curve:
         File of the response, the fraction of photons that are detected.
     medium : str
         Medium in which its wavelengths are measured, "air" or "vacuum".
-    place : str
+    location : str
         File and line that name it, for messages.
     """
 
@@ -74,11 +76,11 @@ class Camera:
     name : str
         Name of the folder, and of the camera.
     parameters : tuple of Parameter
-        Numbers of the camera and of its bands, under names that begin with ``ext.<name>.``
+        Numbers of the camera and of its bands, with names that begin with ``ext.<name>.``
     models : tuple of Model
         Layout, amplifiers and wavefront.
     contents : tuple of (str, bytes)
-        Contents of the models' files, by their sha256: the checked tables without comments, columns in their order.
+        sha256 and contents of the models' files: the checked tables without comments, columns in their fixed order.
     curves : tuple of Curve
         Responses of bands that truesky does not have.
     """
@@ -91,7 +93,7 @@ class Camera:
 
     @property
     def sha256(self) -> str:
-        """Checksum of all numbers and files of the camera, without its place on the disc."""
+        """Checksum of all numbers and files of the camera; it does not depend on the location of the folder."""
         lines = [f"{p.key}={p.value.hex()} {p.unit}\n" for p in self.parameters]
         lines += [f"{m.key}={m.sha256}\n" for m in self.models]
         lines += [f"{curve.band} {curve.medium}\n" for curve in self.curves]
@@ -104,13 +106,13 @@ def read(folder: Path) -> Camera:
     Parameters
     ----------
     folder : Path
-        Folder with the files that the head of this module lists.
+        Folder with the files that the docstring of this module lists.
 
     Returns
     -------
     Camera
-        The camera. A request's overrides can still make its detectors overlap
-        (`lake_schema.mission.checks.camera_faults`).
+        The camera. Overrides in a request can still make its detectors overlap, which
+        `lake_schema.mission.checks.camera_faults` finds.
 
     Raises
     ------
@@ -125,7 +127,7 @@ def read(folder: Path) -> Camera:
     pixel = next(p for p in parameters if p.key == f"{prefix}fpa.pixel_size")
     layout = camera_tables.read_layout(folder, convert(pixel.value, pixel.unit, "mm / pix", pixel.key))
     tables = {LAYOUT: layout, AMPLIFIERS: camera_tables.read_amplifiers(folder, layout)}
-    # The other amplifiers differ from the first one by the ratios of their values in the table.
+    # The parameters describe the first amplifier; the table gives the ratios of the other amplifiers to it.
     first_amplifier = tables[AMPLIFIERS][0]
     parameters += [
         _make_parameter(
@@ -133,7 +135,7 @@ def read(folder: Path) -> Camera:
         )
         for key, unit in AMPLIFIER_UNITS.items()
     ]
-    # A link that leads nowhere is a mistake: it is no choice of the default wavefront.
+    # A dangling link counts as present, so it causes an error and does not select the default wavefront.
     if os.path.lexists(folder / WAVEFRONT):
         tables[WAVEFRONT] = camera_tables.read_wavefront(folder)
     models, contents = [], []
@@ -165,19 +167,19 @@ def _camera_name(folder: Path) -> str:
 
 
 def check_name(folder: Path) -> str:
-    """Name of the camera of a folder; BadInput if no camera may have it."""
+    """Return the camera's name, which is the folder's name; raise BadInput if no camera may have this name."""
     with user_files.check_reachable(folder):
         name = folder.resolve().name
     if NAME_PATTERN.fullmatch(name) is None:
-        reason = "a camera has the name of its folder: at most 40 letters a-z, digits and _"
+        reason = "the folder's name is the camera's name: it must have at most 40 letters a-z, digits and _"
         raise BadInput(f"{user_files.format_path(folder)}: {reason}")
     if name in (*CAMERAS, *SPACE_CAMERAS):
-        raise BadInput(f"{user_files.format_path(folder)}: truesky has a camera {name}: choose another name")
+        raise BadInput(f"{user_files.format_path(folder)}: truesky already has a camera {name}: choose another name")
     return name
 
 
 def _make_parameter(location: str, key: str, value: float, unit: str, source: str) -> Parameter:
-    """Make a parameter; BadInput names its place, file and line, if it is outside its bounds."""
+    """Return a parameter after checking its bounds; the error message begins with `location`, its file and line."""
     try:
         parameter = Parameter(key, _STATUS, value, unit, source=source)
         bounds.check_bounds(parameter, key)
@@ -211,7 +213,7 @@ def _read_bands(folder: Path, name: str) -> tuple[list[Parameter], list[Curve]]:
     for row in rows:
         band = row.text("band")
         if NAME_PATTERN.fullmatch(band) is None:
-            raise BadInput(f"{row.location}: band = {band!r}: a name has letters a-z, digits and _")
+            raise BadInput(f"{row.location}: band = {band!r}: a name must have letters a-z, digits and _")
         if band in reserved:
             raise BadInput(f"{row.location}: band = {band!r} is the name of a parameter or table: choose another name")
         units = BAND_UNITS | {key: unit for key, unit in OPTIONAL_BAND_UNITS.items() if row.values[key]}
@@ -227,7 +229,7 @@ def _read_bands(folder: Path, name: str) -> tuple[list[Parameter], list[Curve]]:
 def _read_curve(folder: Path, row: Row) -> Curve:
     file, medium = row.text("curve"), row.text("medium")
     if medium not in ("air", "vacuum"):
-        raise BadInput(f"{row.location}: medium = {medium!r} is not air or vacuum")
+        raise BadInput(f"{row.location}: medium = {medium!r} is neither air nor vacuum")
     if Path(file).is_absolute() or ".." in Path(file).parts:
         raise BadInput(f"{row.location}: curve = {file!r} is outside the camera's folder: give a file in it")
     return Curve(row.text("band"), user_files.check_file(folder / file, "curve", row.location), medium, row.location)
@@ -238,7 +240,10 @@ def _read_curve(folder: Path, row: Row) -> Curve:
 
 @cache
 def units_by_camera() -> Mapping[str, Mapping[str, str]]:
-    """Units by parameter, without the camera's prefix and without those of bands, of each known ground camera."""
+    """Return the units of the parameters of each known ground camera.
+
+    The names of parameters have no prefix of the camera. Parameters of bands and amplifiers are left out.
+    """
     units: dict[str, dict[str, str]] = {camera: {} for camera in CAMERAS}
     bands = {
         p.key.split(".")[2] for p in read_all_parameters() if p.key.startswith("ext.") and p.key.endswith(".zero_point")
@@ -251,10 +256,10 @@ def units_by_camera() -> Mapping[str, Mapping[str, str]]:
 
 
 def parameter_units() -> dict[str, str]:
-    """Units of all parameters that a ground camera may have, by name."""
+    """Return the units of all parameters that a ground camera may have, by name."""
     return {key: unit for units in units_by_camera().values() for key, unit in units.items()}
 
 
 def required_parameters() -> tuple[str, ...]:
-    """Names of the parameters that every ground camera has, sorted."""
+    """Return the sorted names of the parameters that every ground camera must have."""
     return tuple(sorted(set.intersection(*(set(units) for units in units_by_camera().values()))))

@@ -1,4 +1,4 @@
-"""Tables of a camera's folder: columns, rows with their line numbers, and checks of layouts and amplifiers."""
+"""Read the CSV tables of a camera's folder, and check layouts and amplifiers."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ FILE_KIND = "table of a camera"
 NAME_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,39}", re.ASCII)
 _DETECTOR_PATTERN = re.compile(r"\w[\w-]{0,39}", re.ASCII)
 _MAX_PIXELS = 65_536
-# Prescan and overscan of real amplifiers have up to about 100 columns or rows.
+# Real amplifiers have at most about 100 prescan and overscan columns or rows.
 _MAX_SCAN = 512
-# Parameters of a band, with the columns of bands.csv and their units; those of the second list may be blank.
+# Units of the parameters in the columns of bands.csv; optional parameters may be blank.
 BAND_UNITS = {
     "zero_point": "mag",
     "sky_brightness": "mag / arcsec2",
@@ -32,7 +32,7 @@ BAND_UNITS = {
     "extinction": "mag",
 }
 OPTIONAL_BAND_UNITS = {"fringes": ""}
-# Parameters of the amplifiers, with the columns of amplifiers.csv and their units.
+# Units of the parameters in the columns of amplifiers.csv.
 AMPLIFIER_UNITS = {"gain": "electron / adu", "read_noise": "electron", "full_well": "electron"}
 COLUMNS = {
     PARAMETERS: ("name", "value", "unit", "source"),
@@ -68,24 +68,42 @@ class Row:
 
     Attributes
     ----------
-    place : str
+    location : str
         File and line, for messages.
     values : mapping of str to str
-        Texts by column, in the order of `COLUMNS`, without blanks around them. Whole numbers have digits alone.
+        Texts by column, in the order of `COLUMNS`, without blanks around them. Whole numbers consist of digits only.
     """
 
     location: str
     values: Mapping[str, str]
 
     def text(self, column: str) -> str:
-        """Text of a column; BadInput if it is blank."""
+        """Return the text of a column; raise BadInput if it is blank."""
         value = self.values[column]
         if not value:
             raise BadInput(f"{self.location}: {column} is missing")
         return value
 
     def number(self, column: str, low: float = -math.inf, high: float = math.inf) -> float:
-        """Finite number of a column; BadInput for any other text, or outside the bounds."""
+        """Return the finite number of a column.
+
+        Parameters
+        ----------
+        column : str
+            Name of the column.
+        low, high : float, optional
+            Smallest and largest number that is allowed.
+
+        Returns
+        -------
+        float
+            The number.
+
+        Raises
+        ------
+        BadInput
+            If the text is blank or is not a finite number within the bounds. The message names the file and the line.
+        """
         text = self.text(column)
         try:
             value = float(text)
@@ -98,7 +116,7 @@ class Row:
         return value
 
     def integer(self, column: str) -> int:
-        """Whole number of a column of `_WHOLE`; BadInput for any other text, or outside its bounds."""
+        """Return the whole number of a column in `_INTEGER_BOUNDS`; raise BadInput for other texts or out of bounds."""
         value = self.number(column, *_INTEGER_BOUNDS[column])
         if value % 1.0:
             raise BadInput(f"{self.location}: {column} = {value:g} is not a whole number")
@@ -139,10 +157,10 @@ def read_rows(folder: Path, file: str) -> list[Row]:
     except csv.Error as error:
         raise BadInput(f"{path_text}: {error}") from None
     if len(table) != len(numbered):
-        raise BadInput(f"{path_text}: a text goes over several lines")
+        raise BadInput(f"{path_text}: a text spans several lines")
     header = [column.strip() for column in table[0]] if table else []
     if unknown := [column for column in header if column not in expected]:
-        raise BadInput(f"{path_text}: unknown column {unknown[0]!r}, the columns are {', '.join(expected)}")
+        raise BadInput(f"{path_text}: unknown column {unknown[0]!r}, the columns must be {', '.join(expected)}")
     if missing := [column for column in expected if column not in header]:
         raise BadInput(f"{path_text}: column {missing[0]} is missing")
     if len(header) != len(expected):
@@ -153,7 +171,7 @@ def read_rows(folder: Path, file: str) -> list[Row]:
         if len(cells) != len(header):
             raise BadInput(f"{location}: has {len(cells)} values for {len(header)} columns")
         if any(len(value) > _MAX_TEXT_LENGTH or not value.isprintable() for value in cells):
-            raise BadInput(f"{location}: a text is too long or has characters that cannot be printed")
+            raise BadInput(f"{location}: a text is longer than {_MAX_TEXT_LENGTH} or has unprintable characters")
         texts = dict(zip(header, cells, strict=True))
         rows.append(_with_integers(Row(location, {column: texts[column] for column in expected})))
     if not rows:
@@ -162,22 +180,22 @@ def read_rows(folder: Path, file: str) -> list[Row]:
 
 
 def _with_integers(row: Row) -> Row:
-    """Write 300.0 and 3e2 as 300: readers of the mission database take the texts of whole numbers as they are."""
+    """Write 300.0 and 3e2 as 300, because readers of the mission database expect whole numbers in this form."""
     integers = {column: str(row.integer(column)) for column in row.values if column in _INTEGER_BOUNDS}
     return Row(row.location, {**row.values, **integers})
 
 
 def csv_text(rows: Sequence[Row]) -> str:
-    """Write rows as a table for the mission database: columns in their order, no comments, every text in quotes."""
+    """Return rows as a CSV text for the mission database: columns in their order, no comments, every text in quotes."""
     stream = io.StringIO()
-    # A text that begins with # would be a comment without its quotes.
+    # Without quotes, a text that begins with # would be a comment.
     writer = csv.writer(stream, lineterminator="\n", quoting=csv.QUOTE_ALL)
     writer.writerows([list(rows[0].values), *(list(row.values.values()) for row in rows)])
     return stream.getvalue()
 
 
 def refuse_repeated(rows: Sequence[Row], name_of: Callable[[Row], str]) -> None:
-    """Raise BadInput if two rows have one name, which `name_of` returns for a row."""
+    """Raise BadInput if `name_of` returns the same name for two rows."""
     used_names: set[str] = set()
     for row in rows:
         name = name_of(row)
@@ -187,19 +205,19 @@ def refuse_repeated(rows: Sequence[Row], name_of: Callable[[Row], str]) -> None:
 
 
 def read_layout(folder: Path, pixel_mm: float) -> list[Row]:
-    """Read layout.csv.
+    """Read and check layout.csv.
 
     Parameters
     ----------
     folder : Path
         Folder of the camera.
     pixel_mm : float
-        Size of a pixel, mm.
+        Size of a pixel in mm.
 
     Returns
     -------
     list of Row
-        Rows, one for each detector.
+        Rows, one per detector.
 
     Raises
     ------
@@ -210,7 +228,8 @@ def read_layout(folder: Path, pixel_mm: float) -> list[Row]:
     refuse_repeated(rows, lambda row: row.text("detector"))
     for row in rows:
         if _DETECTOR_PATTERN.fullmatch(row.text("detector")) is None:
-            raise BadInput(f"{row.location}: detector = {row.text('detector')!r}: a name has letters, digits, _ and -")
+            name = row.text("detector")
+            raise BadInput(f"{row.location}: detector = {name!r}: a name must have letters, digits, _ and -")
         row.text("type")
         for axis in ("x_mm", "y_mm"):
             row.number(axis, -1e4, 1e4)
@@ -222,14 +241,14 @@ def read_layout(folder: Path, pixel_mm: float) -> list[Row]:
 
 
 def find_overlaps(rows: Sequence[Mapping[str, str]], pixel_mm: float) -> Iterator[tuple[int, int]]:
-    """Find detectors that overlap, as rectangles along the axes of the focal plane.
+    """Yield the pairs of detectors that overlap, as rectangles along the axes of the focal plane.
 
     Parameters
     ----------
     rows : sequence of mapping of str to str
         Rows of a layout.
     pixel_mm : float
-        Size of a pixel, mm.
+        Size of a pixel in mm.
 
     Yields
     ------
@@ -246,7 +265,7 @@ def find_overlaps(rows: Sequence[Mapping[str, str]], pixel_mm: float) -> Iterato
 
 
 def read_amplifiers(folder: Path, detectors: Sequence[Row]) -> list[Row]:
-    """Rows of amplifiers.csv; BadInput if they do not fit the detectors, the rows of layout.csv, or one another."""
+    """Read amplifiers.csv; raise BadInput if amplifiers do not fit each other or the detectors (rows of layout.csv)."""
     rows = read_rows(folder, AMPLIFIERS)
     refuse_repeated(rows, lambda row: f"amplifier {row.text('amplifier')} of {row.text('type')}")
     sizes = {row.text("type"): (row.integer("nx"), row.integer("ny")) for row in detectors}
@@ -264,17 +283,17 @@ def read_amplifiers(folder: Path, detectors: Sequence[Row]) -> list[Row]:
         _check_amplifiers([row for row in rows if row.text("type") == detector_type], size)
     for row in rows:
         if row.number("full_well") != rows[0].number("full_well"):
-            raise BadInput(f"{row.location}: full_well differs from the first amplifier: a camera has one")
+            raise BadInput(f"{row.location}: full_well differs from the first amplifier: a camera has a single value")
     return rows
 
 
 def _check_amplifiers(rows: Sequence[Row], size: tuple[int, int]) -> None:
-    """Refuse amplifiers of a type that lie outside the detector, overlap, or differ in size or overscan."""
+    """Raise BadInput if amplifiers of a type lie outside the detector, overlap, or differ in size or overscan."""
     corners: list[tuple[int, int]] = []
     for row in rows:
         if _DETECTOR_PATTERN.fullmatch(row.text("amplifier")) is None:
             raise BadInput(
-                f"{row.location}: amplifier = {row.text('amplifier')!r}: a name has letters, digits, _ and -"
+                f"{row.location}: amplifier = {row.text('amplifier')!r}: a name must have letters, digits, _ and -"
             )
         row.number("gain", 1e-3, 1e3)
         if not row.number("read_noise", 0.0, 1e4):
@@ -293,7 +312,7 @@ def _check_amplifiers(rows: Sequence[Row], size: tuple[int, int]) -> None:
 
 
 def read_wavefront(folder: Path) -> list[Row]:
-    """Rows of wavefront.csv; BadInput if a number is wrong."""
+    """Read wavefront.csv; raise BadInput if a number is wrong."""
     rows = read_rows(folder, WAVEFRONT)
     for row in rows:
         row.number("coefficient_nm", -1e4, 1e4)

@@ -1,4 +1,4 @@
-"""The folder of a new camera with the numbers of a known one, to be edited."""
+"""Write the folder of a new camera with the numbers of a known one, to be edited."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def write_like(camera: str, folder: Path) -> list[Path]:
     camera : str
         Name of a ground camera of the mission database.
     folder : Path
-        Folder that is made. Its name is the new camera's name.
+        Folder to create. Its name is the new camera's name.
 
     Returns
     -------
@@ -45,12 +45,12 @@ def write_like(camera: str, folder: Path) -> list[Path]:
     Raises
     ------
     BadInput
-        If there is no such camera, or the folder is there already.
+        If there is no such camera, or the folder already exists.
     """
     if camera not in CAMERAS:
-        raise BadInput(f"--like {camera}: is not one of {', '.join(CAMERAS)}")
+        raise BadInput(f"--like {camera} is not one of {', '.join(CAMERAS)}")
     if os.path.lexists(folder):
-        raise BadInput(f"{user_files.format_path(folder)}: is there already")
+        raise BadInput(f"{user_files.format_path(folder)}: already exists")
     check_name(folder)
     mission, prefix = resolve(), f"ext.{camera}."
     units = units_by_camera()[camera]
@@ -71,7 +71,10 @@ def write_like(camera: str, folder: Path) -> list[Path]:
 
 
 def _amplifier_rows(prefix: str, mission: MissionConfiguration) -> list[tuple[str, ...]]:
-    """Rows of amplifiers.csv: the database has the mean of the camera and each amplifier's ratio to the first one."""
+    """Return the rows of amplifiers.csv.
+
+    The database contains the mean value of the camera and the ratio of each amplifier to the first one.
+    """
     rows = mission.rows(f"{prefix}amplifiers")
     mean = {key: mission.value(prefix + key, unit) for key, unit in AMPLIFIER_UNITS.items()}
     ratios = {key: [float(row[key]) / float(rows[0][key]) for row in rows] for key in ("gain", "read_noise")}
@@ -97,7 +100,7 @@ def _band_row(prefix: str, band: str, mission: MissionConfiguration) -> tuple[st
         name = f"{prefix}{band}.{key}"
         values[key] = repr(mission.value(name, unit)) if name in mission else ""
     if not values["sky_brightness"]:
-        # The database has the level of this sky in electrons.
+        # For these bands, the database gives the sky level in electrons.
         scale = mission.value(f"{prefix}fpa.pixel_scale", "arcsec / pix")
         rate = mission.value(f"{prefix}{band}.sky", "electron / (s pix)") / scale**2
         values["sky_brightness"] = f"{float(values['zero_point']) - 2.5 * math.log10(rate):.4f}"

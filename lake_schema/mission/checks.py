@@ -1,10 +1,4 @@
-"""What the records of a mission configuration must keep between one another.
-
-check    raise BadInput with the first fault of a configuration
-faults   all of them, a sentence each
-ramps    those of its ramps
-camera_faults   those of a ground camera
-"""
+"""Check that the records of a mission configuration are consistent."""
 
 from __future__ import annotations
 
@@ -20,22 +14,22 @@ from lake_schema.mission.detector_overrides import split_name
 from lake_schema.mission.parameter import convert, read_all_parameters
 from lake_schema.ramps import MAX_FRAMES, frame_count
 
-# Quantities of which no chosen value may be worse than what is required, and which way worse is.
+# Quantities whose chosen values must not be higher, or lower, than the required values.
 _LOWER = ("*.read_noise", "*.dark_current", "*.prnu", "*.crosstalk", "*.jitter_?", "*.psf.fwhm", "*.ellipticity",
           "*.bad_pixels", "*.readout_time", "*.ee50", "*.ee80")  # fmt: skip
 _HIGHER = ("*.full_well", "*.quantum_efficiency", "*.resolving_power", "*.depth")
-# Throughputs of Pan-STARRS are capture cross sections, m2 (Tonry et al. 2012).
+# Throughputs of Pan-STARRS are capture cross sections in m2 (Tonry et al. 2012), which can exceed 1.
 _CROSS_SECTIONS = ("ext.gpc1.*",)
 
 
 def check(configuration: MissionConfiguration) -> None:
-    """Raise BadInput where the configuration has a fault."""
+    """Raise BadInput with the first fault of a configuration."""
     for fault in faults(configuration):
         raise BadInput(fault)
 
 
 def faults(configuration: MissionConfiguration) -> Iterator[str]:
-    """Sentences, each naming a parameter or model; none where all is well."""
+    """Yield one sentence per fault, which names a parameter or model."""
     yield from _worse_than_required(configuration)
     for camera in configuration.ground_cameras:
         yield from camera_faults(camera, configuration)
@@ -50,7 +44,7 @@ def faults(configuration: MissionConfiguration) -> Iterator[str]:
 
 
 def camera_faults(camera: str, configuration: MissionConfiguration) -> Iterator[str]:
-    """Detectors of a ground camera that overlap, and amplifiers that cannot be read."""
+    """Yield faults of a ground camera: overlapping detectors, and amplifiers with impossible values."""
     yield from _layout_faults(f"ext.{camera}", configuration)
     yield from _amplifier_faults(f"ext.{camera}.amplifiers", configuration)
 
@@ -65,7 +59,7 @@ def _worse_than_required(configuration: MissionConfiguration) -> Iterator[str]:
         sign = 1 if _matches_any(chosen.key, _LOWER) else -1 if _matches_any(chosen.key, _HIGHER) else 0
         if sign * (chosen.value - bound) > 0:
             value = f"{chosen.key} ({chosen.status}) = {chosen.value:g}"
-            yield f"mission parameter {value} is worse than required: {bound:g}"
+            yield f"mission parameter {value} is worse than the required {bound:g}"
 
 
 def _matches_any(key: str, patterns: tuple[str, ...]) -> bool:
@@ -73,7 +67,7 @@ def _matches_any(key: str, patterns: tuple[str, ...]) -> bool:
 
 
 def _layout_faults(section: str, configuration: MissionConfiguration) -> Iterator[str]:
-    """No two detectors nearer than their size, as rectangles along the focal plane's axes."""
+    """Find detectors that overlap, as rectangles along the axes of the focal plane, or are given twice."""
     key = f"{section}.layout"
     rows = configuration.rows(key)
     for first, second in find_overlaps(rows, configuration.value(f"{section}.fpa.pixel_size", "mm / pix")):
@@ -89,7 +83,7 @@ def _gap_faults(section: str, configuration: MissionConfiguration) -> Iterator[s
 
 
 def ramp_faults(configuration: MissionConfiguration) -> Iterator[str]:
-    """Ramps that cannot be drawn: of too many frames, or of pixels of which others see more than half."""
+    """Yield faults of ramps: too many frames, or pixels that share more than half of their charge with neighbours."""
     for kind in ("photometric", "spectroscopic"):
         key = f"nisp.macc.{kind}"
         groups, reads, drops = (int(configuration.value(f"{key}.{part}")) for part in ("groups", "reads", "drops"))
@@ -98,7 +92,7 @@ def ramp_faults(configuration: MissionConfiguration) -> Iterator[str]:
             yield f"mission parameter {key}: MACC({groups},{reads},{drops}) has {count} frames, more than {MAX_FRAMES}"
     coupled_fraction = 4.0 * sum(configuration.value(f"nisp.ipc.{part}") for part in ("side", "diagonal"))
     if coupled_fraction > 0.5:
-        yield f"mission parameter nisp.ipc: {coupled_fraction:g} of a pixel's charge is seen by others, more than 0.5"
+        yield f"mission parameter nisp.ipc: neighbours receive {coupled_fraction:g} of a pixel's charge, more than 0.5"
 
 
 def _amplifier_faults(key: str, configuration: MissionConfiguration) -> Iterator[str]:
@@ -107,7 +101,7 @@ def _amplifier_faults(key: str, configuration: MissionConfiguration) -> Iterator
         if not float(row["gain"]) > 0:
             yield f"{name}: gain = {row['gain']} is not positive"
         if not (float(row["read_noise"]) >= 0 and float(row["full_well"]) > 0):
-            yield f"{name}: read noise and full well must be positive"
+            yield f"{name}: full well must be positive, and read noise must not be negative"
 
 
 def _throughput_faults(key: str, configuration: MissionConfiguration) -> Iterator[str]:
@@ -120,11 +114,14 @@ def _throughput_faults(key: str, configuration: MissionConfiguration) -> Iterato
 
 
 def _read_curve(key: str, configuration: MissionConfiguration) -> np.ndarray:
-    """[n, 2] wavelength and throughput of a file of ours or of speclite's (blank-separated, header line)."""
+    """Return wavelengths and throughputs, shape (n, 2), from a file of this package or of speclite.
+
+    speclite's files have columns separated by blanks, and a header line.
+    """
     rows = configuration.rows(key)
     if next(iter(rows[0])) == "wavelength_nm":
         return np.array([[float(value) for value in row.values()] for row in rows])
-    # Tens of thousands of lines, which `loadtxt` parses three times as fast.
+    # These files have tens of thousands of lines, which `loadtxt` parses three times as fast.
     return np.loadtxt([next(iter(row.values())) for row in rows], usecols=(0, 1), ndmin=2)
 
 

@@ -1,6 +1,6 @@
-"""Look into the mission database: python -m lake_schema mission list [PATTERN] | diff A [B] | camera FOLDER.
+"""Query the mission database: python -m lake_schema mission list [PATTERN] | diff A [B] | camera FOLDER.
 
-A configuration is named by a ladder (CBE,BLT,DES,REQ,SIM), a request file, or LAKE or LAKE@KEY of its table mission.
+A configuration is named by a ladder (CBE,BLT,DES,REQ,SIM), a request file, or a table mission as LAKE or LAKE@KEY.
 """
 
 from __future__ import annotations
@@ -17,29 +17,32 @@ from lake_schema.mission.parameter import CAMERAS
 from lake_schema.tables.mission import LADDER
 
 _DEFAULT_LADDER = ",".join(LADDER)
-_CONFIGURATION_HELP = "a ladder (CBE,BLT,DES,REQ,SIM), a request file, or LAKE or LAKE@KEY of its table mission"
+_CONFIGURATION_HELP = "a ladder (CBE,BLT,DES,REQ,SIM), a request file, or LAKE or LAKE@KEY with a table mission"
 
 
 def main(argv: Sequence[str]) -> int:
-    """Exit status: 2 the call is wrong; of diff as of diff: 0 the same, 1 different."""
-    parser = argparse.ArgumentParser(prog="python -m lake_schema mission", description="Look into the mission database")
+    """Run the command and return its exit status.
+
+    The status is 0 for success and 2 for a wrong call. `diff` returns 1 if the configurations differ.
+    """
+    parser = argparse.ArgumentParser(prog="python -m lake_schema mission", description="Query the mission database.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="list|diff|camera")
     list_parser = commands.add_parser("list", help="names, values, units, bounds, status and source")
     list_parser.add_argument(
-        "pattern", nargs="?", default="*", help="of names, as vis.* or *gain*; without * a part of them"
+        "pattern", nargs="?", default="*", help="pattern of names, such as vis.* or *gain*; without *, a substring"
     )
     list_parser.add_argument(
         "--of", default=_DEFAULT_LADDER, metavar="WHAT", help=f"{_CONFIGURATION_HELP} (default: {_DEFAULT_LADDER})"
     )
-    list_parser.add_argument("--json", action="store_true", help="a list of objects")
-    diff_parser = commands.add_parser("diff", help="what differs between two configurations")
+    list_parser.add_argument("--json", action="store_true", help="print a JSON list of objects")
+    diff_parser = commands.add_parser("diff", help="differences between two configurations")
     diff_parser.add_argument("first", help=_CONFIGURATION_HELP)
     diff_parser.add_argument(
-        "second", nargs="?", default=_DEFAULT_LADDER, help=f"the same (default: {_DEFAULT_LADDER})"
+        "second", nargs="?", default=_DEFAULT_LADDER, help=f"second configuration (default: {_DEFAULT_LADDER})"
     )
     camera_parser = commands.add_parser("camera", help="write the folder of a ground camera, to be edited")
-    camera_parser.add_argument("folder", type=Path, help="folder that is made; its name is the camera's name")
-    camera_parser.add_argument("--like", required=True, choices=CAMERAS, help="camera whose numbers it has at first")
+    camera_parser.add_argument("folder", type=Path, help="folder to create; its name is the camera's name")
+    camera_parser.add_argument("--like", required=True, choices=CAMERAS, help="camera whose numbers are copied")
     options = parser.parse_args(argv)
     run_command = {"list": _list_entries, "diff": _print_differences, "camera": _write_camera}[options.command]
     return command.run("lake_schema", lambda: run_command(options))

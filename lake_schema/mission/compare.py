@@ -1,4 +1,4 @@
-"""What tells two mission configurations apart: python -m lake_schema mission diff A B."""
+"""Compare two mission configurations: python -m lake_schema mission diff A B."""
 
 from __future__ import annotations
 
@@ -16,15 +16,23 @@ from lake_schema.tables.mission import LADDER
 
 
 def compare_configurations(first: str, second: str) -> list[str]:
-    """A line a name that differs.
+    """Return one line per name that differs between two configurations.
 
-    first, second : a ladder ("CBE,BLT,DES,REQ,SIM"), a request file, or a lake, LAKE or LAKE@KEY of its table mission
+    Parameters
+    ----------
+    first, second : str
+        A ladder ("CBE,BLT,DES,REQ,SIM"), a request file, or a lake with a table mission as LAKE or LAKE@KEY.
+
+    Returns
+    -------
+    list of str
+        Lines, empty if the configurations are equal.
     """
     return list(differences(load_configuration(first), load_configuration(second)))
 
 
 def load_configuration(name: str) -> MissionConfiguration:
-    """The configuration that a ladder, a request file or a lake stands for."""
+    """Return the configuration that a ladder, a request file or a lake names."""
     statuses = tuple(name.split(","))
     if all(status in STATUSES for status in statuses):
         return resolve(ladder=statuses)
@@ -35,7 +43,7 @@ def load_configuration(name: str) -> MissionConfiguration:
     try:
         user_files.check_file(Path(name), "request")
     except BadInput as error:
-        raise BadInput(f"{error}: neither a request, nor a ladder of {', '.join(STATUSES)}, nor a lake") from None
+        raise BadInput(f"{error}: neither a request nor a ladder of {', '.join(STATUSES)} nor a lake") from None
     return _configuration_of_request(Path(name))
 
 

@@ -1,10 +1,4 @@
-"""A mission configuration: exactly one value and one model for every name, chosen by a ladder of statuses.
-
-resolve                 records + ladder + overrides -> MissionConfiguration
-MissionConfiguration    .value(key, unit, place), .of_amplifiers(key, unit, detector), .numbers(key), .rows(key),
-                        .fingerprint
-difference              what two configurations do not have in common
-"""
+"""Mission configurations: exactly one value and one model for every name, chosen by a ladder of statuses."""
 
 from __future__ import annotations
 
@@ -30,12 +24,26 @@ Chosen = TypeVar("Chosen", Parameter, Model)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MissionConfiguration:
-    """One record a name, sorted by name; a value of a detector or an amplifier is under a name of its own (places).
+    """Chosen records of the mission database, sorted by name, with the overrides of a request.
 
-    overridden : names whose value a request replaced
-    folder     : where the files of its models lie, if they are not the package's
-    contents   : (sha256, bytes) of models that are neither there nor in the package: those of a user's cameras
-    ground_cameras : names of the cameras with a layout
+    A value for one detector or amplifier has a separate name (see `lake_schema.mission.detector_overrides`).
+
+    Attributes
+    ----------
+    parameters : tuple of Parameter
+        Chosen values, one per name.
+    ladder : tuple of str
+        Statuses in order of preference.
+    overridden : tuple of str
+        Names of values from the request.
+    models : tuple of Model
+        Chosen models, one per name.
+    folder : Path or None
+        Folder with the files of the models, or None if the package contains them.
+    contents : tuple of (str, bytes)
+        sha256 and contents of models that are neither in `folder` nor in the package: models of a user's cameras.
+    ground_cameras : tuple of str
+        Names of the ground cameras with a layout.
     """
 
     parameters: tuple[Parameter, ...]
@@ -69,21 +77,21 @@ class MissionConfiguration:
         object.__setattr__(self, "_digest", hashlib.sha256(everything.encode()).hexdigest())
 
     def __hash__(self) -> int:
-        # With the folder: those of different lakes are unequal, which a comparison finds only after all their records.
+        # The folder is included, because comparing equal configurations of different lakes takes long.
         return hash((self._fingerprint, self.folder))
 
     def __eq__(self, other: object) -> bool:
-        # By a digest: caches compare a configuration with an equal one thousands of times in each exposure.
+        # Comparing digests is fast: caches compare equal configurations thousands of times in each exposure.
         return self._digest == other._digest if isinstance(other, MissionConfiguration) else NotImplemented
 
     def parameter(self, key: str) -> Parameter:
-        """The record chosen for a name; BadInput for an unknown one."""
+        """Return the chosen record of a parameter; raise BadInput if the name is unknown."""
         if key not in self._parameters_by_key:
             raise BadInput(f"the mission database has no parameter {key}")
         return self._parameters_by_key[key]
 
     def model(self, key: str) -> Model:
-        """The model chosen for a name; BadInput for an unknown one."""
+        """Return the chosen record of a model; raise BadInput if the name is unknown."""
         if key not in self._models_by_key:
             raise BadInput(f"the mission database has no model {key}")
         return self._models_by_key[key]
@@ -92,11 +100,31 @@ class MissionConfiguration:
         return key in self._parameters_by_key or key in self._models_by_key
 
     def is_overridden_at(self, key: str, place: DetectorPlace) -> bool:
-        """Whether a detector or an amplifier has a value of its own, beside the camera's."""
+        """Return True if a detector or an amplifier has a value that overrides the camera's value."""
         return any(narrow in self for narrow in detector_overrides.names_at_place(key, place)[:-1])
 
     def value(self, key: str, unit: str | None = None, place: DetectorPlace | None = None) -> float:
-        """The value of a name, in `unit` where one is given, else in its record's own; place : where."""
+        """Return the value of a parameter.
+
+        Parameters
+        ----------
+        key : str
+            Name of the parameter.
+        unit : str, optional
+            Unit of the result; by default the unit of the record.
+        place : DetectorPlace, optional
+            Detector or amplifier whose value is returned; by default the value of the camera.
+
+        Returns
+        -------
+        float
+            The value.
+
+        Raises
+        ------
+        BadInput
+            If the name is unknown or the unit does not fit.
+        """
         record = self.parameter(key)
         if place and key in self._places_by_key:
             record = next(
@@ -109,7 +137,22 @@ class MissionConfiguration:
         return convert(record.value, record.unit, unit, f"mission parameter {key}")
 
     def amplifier_values(self, key: str, unit: str, detector: str) -> tuple[float, ...]:
-        """The value for each amplifier of a detector, in the order in which they are read; one where all have it."""
+        """Return the value of a parameter for each amplifier of a detector.
+
+        Parameters
+        ----------
+        key : str
+            Name of the parameter.
+        unit : str
+            Unit of the result.
+        detector : str
+            Name of the detector.
+
+        Returns
+        -------
+        tuple of float
+            Values in the order in which the amplifiers are read, or a single value if all are equal.
+        """
         if not any(place.amplifier and place.detector in ("", detector) for place in self._places_by_key.get(key, ())):
             return (self.value(key, unit, DetectorPlace(detector)),)
         names = detector_overrides.amplifiers(detector_overrides.camera_prefix(key), self)
@@ -117,22 +160,30 @@ class MissionConfiguration:
         return values if len(set(values)) > 1 else values[:1]
 
     def numbers(self, key: str) -> tuple[tuple[float, ...], ...]:
-        """A model that is a table of numbers: its rows."""
+        """Return the rows of a model that is a table of numbers."""
         return model.parse_numbers(self.content(self.model(key)))
 
     def rows(self, key: str) -> tuple[Mapping[str, str], ...]:
-        """A model that is a table of texts: its rows by column name."""
+        """Return the rows of a model that is a table of texts, as mappings by column name."""
         return model.parse_rows(self.content(self.model(key)))
 
     def content(self, record: Model) -> bytes:
-        """Bytes of a model's file; Damaged if they are not those that the record names."""
+        """Return the bytes of a model's file; raise Damaged if their sha256 differs from the record."""
         user_contents = dict(self.contents)
         return (
             user_contents[record.sha256] if record.sha256 in user_contents else model.read_content(record, self.folder)
         )
 
     def with_overrides(self, overrides: Mapping[str, tuple[float, str]]) -> MissionConfiguration:
-        """The same with other values of some names; BadInput / OutOfRange name the parameter."""
+        """Return a copy in which some values are replaced by (value, unit).
+
+        Raises
+        ------
+        BadInput
+            If a name is unknown, or a value or unit is not allowed. The message names the parameter.
+        OutOfRange
+            If a value is outside its bounds.
+        """
         chosen = dict(self._parameters_by_key)
         for name, (value, unit) in overrides.items():
             chosen[name] = _override_record(self._parameters_by_key, name, value, unit)
@@ -146,7 +197,7 @@ class MissionConfiguration:
 
     @property
     def fingerprint(self) -> str:
-        """sha256 of every name, value, unit and file, hexadecimal: equal for configurations that act alike."""
+        """sha256 (hexadecimal) of all names, values, units and files; equal for equivalent configurations."""
         return self._fingerprint
 
 
@@ -158,15 +209,34 @@ def resolve(
     models: Iterable[Model] | None = None,
     cameras: Iterable[Camera] = (),
 ) -> MissionConfiguration:
-    """Choose one value a name.
+    """Choose one value and one model per name.
 
-    records   : in any order; None = the package's
-    ladder    : statuses, the preferred first; statuses that it does not name are never chosen
-    overrides : name -> (value, unit), replaces what the ladder would choose
-    mjd       : date at which the records must hold; None = the latest
-    models    : in any order; None = the package's where the records are, else none
-    cameras   : a user's own, beside those of the records
-    returns   : configuration.  Errors: BadInput / OutOfRange name the parameter
+    Parameters
+    ----------
+    records : iterable of Parameter, optional
+        Parameters in any order; by default those of the package.
+    ladder : sequence of str, optional
+        Statuses, the preferred one first. Other statuses are never chosen.
+    overrides : mapping of str to (float, str), optional
+        Value and unit by name. They replace the choice of the ladder.
+    mjd : float, optional
+        Date (MJD) at which the records must be valid; by default the latest records are chosen.
+    models : iterable of Model, optional
+        Models in any order; by default those of the package if `records` is None, else none.
+    cameras : iterable of Camera, optional
+        Cameras of a user, in addition to the cameras of the records.
+
+    Returns
+    -------
+    MissionConfiguration
+        The configuration.
+
+    Raises
+    ------
+    BadInput
+        If the ladder is wrong, a record is given twice, or a name has no record of a suitable status and date.
+    OutOfRange
+        If a value is outside its bounds.
     """
     unknown = [status for status in ladder if status not in STATUSES]
     if unknown or not ladder or len(set(ladder)) != len(ladder):
@@ -178,7 +248,7 @@ def resolve(
     parameters = _group_by_key([*(read_all_parameters() if records is None else records), *camera_parameters])
     for key, group in parameters.items():
         for record in group[1:]:
-            # Records of one quantity may differ in unit, never in kind.
+            # The units of the records of one quantity must be convertible into each other.
             convert(1.0, record.unit, group[0].unit, f"mission parameter {key} ({record.status})")
     chosen = {key: _choose_record(key, group, ladder, mjd) for key, group in parameters.items()}
     chosen_models = {
@@ -186,7 +256,7 @@ def resolve(
         for key, group in _group_by_key([*models, *(m for c in cameras for m in c.models)]).items()
     }
     if duplicates := sorted(set(chosen) & set(chosen_models)):
-        raise BadInput(f"mission parameter {duplicates[0]} is a value and a model")
+        raise BadInput(f"mission parameter {duplicates[0]} is both a value and a model")
     for parameter in chosen.values():
         bounds.check_bounds(parameter, parameter.key)
     configuration = MissionConfiguration(
@@ -238,7 +308,7 @@ def _override_record(parameters: Mapping[str, Parameter], name: str, value: floa
 
 
 def differences(first: MissionConfiguration, second: MissionConfiguration) -> Iterator[str]:
-    """A line for each name whose value, unit or file differs, or that only one of them has."""
+    """Yield a line for each name whose value, unit or file differs, or that only one of the configurations has."""
     first_records, second_records = _records_by_key(first), _records_by_key(second)
     for key in sorted(set(first_records) | set(second_records)):
         first_record, second_record = first_records.get(key), second_records.get(key)
@@ -252,7 +322,7 @@ def _records_by_key(configuration: MissionConfiguration) -> dict[str, Parameter 
 
 @dataclass(frozen=True, slots=True)
 class _RecordText:
-    """What a record does, and how it is written."""
+    """A record in two forms: the content that is compared, and the text that is shown."""
 
     content: str
     text: str

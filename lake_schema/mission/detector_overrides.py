@@ -1,16 +1,13 @@
-"""Values of one detector or one amplifier: vis.gain@3-4 (a detector), vis.gain.E (an amplifier of every detector),
-vis.gain@3-4.E (an amplifier of one detector).
+"""Handle values that apply to one detector or one amplifier.
 
-Of several that hold for a place the narrowest is taken: an amplifier's of one detector, then the detector's, then the
-amplifier's of every detector, then the camera's.
+Names of such values are::
 
-Place        a detector, an amplifier, or both
-split        a name -> the parameter's, and the place
-names        the names under which a place's value may stand, the narrowest first
-scope        whether a parameter may differ from amplifier to amplifier, from detector to detector, or not at all
-check        refuse a place that its camera does not have, or at which a parameter has no value of its own
-detectors    names of a camera's detectors
-amplifiers   names of the amplifiers that are read apart
+    vis.gain@3-4      a detector
+    vis.gain.E        an amplifier of every detector
+    vis.gain@3-4.E    an amplifier of one detector
+
+If several values apply, the most specific one is used: the value of an amplifier of one detector, then of the detector,
+then of the amplifier of every detector, then of the camera.
 """
 
 from __future__ import annotations
@@ -26,14 +23,14 @@ from typing import Protocol
 
 from lake_schema.errors import BadInput
 
-# Cameras whose detectors stand in a grid: their names by row and column, from 1 (Euclid Data Product Description
+# Names of detectors of cameras with a regular grid, by row and column from 1 (Euclid Data Product Description
 # Document, LE1 VIS and NISP).
 GRID_NAMES = {"vis": "{row}-{column}", "nisp": "DET{row}{column}"}
 CAMERA, DETECTOR, AMPLIFIER = "", "detector", "amplifier"
 
 
 class MissionValues(Protocol):
-    """What is asked of a mission configuration."""
+    """Methods of a mission configuration that this module uses."""
 
     def value(self, key: str) -> float: ...
     def rows(self, key: str) -> tuple[Mapping[str, str], ...]: ...
@@ -42,7 +39,7 @@ class MissionValues(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class DetectorPlace:
-    """A detector, an amplifier, or both; "" = every one."""
+    """A detector, an amplifier, or both; "" stands for all."""
 
     detector: str = ""
     amplifier: str = ""
@@ -52,12 +49,12 @@ class DetectorPlace:
 
 
 def split_name(name: str, parameter_names: Container[str]) -> tuple[str, DetectorPlace]:
-    """The parameter and the place of a name; known : names of the parameters."""
+    """Return the name of the parameter and the place that a name contains, for a container of known parameter names."""
     key, at, place = name.partition("@")
     if at:
         detector, _, amplifier = place.partition(".")
         return key, DetectorPlace(detector, amplifier)
-    # No parameter's name goes on where another's ends.
+    # No parameter has a name that is another parameter's name plus a suffix.
     parent, _, last = name.rpartition(".")
     if parent in parameter_names:
         return parent, DetectorPlace(amplifier=last)
@@ -65,7 +62,7 @@ def split_name(name: str, parameter_names: Container[str]) -> tuple[str, Detecto
 
 
 def names_at_place(key: str, place: DetectorPlace) -> tuple[str, str, str, str]:
-    """Names of a parameter's values at a place, the narrowest first."""
+    """Return the names under which a parameter's value at a place can be given, the most specific first."""
     detector, amplifier = f"@{place.detector}", f".{place.amplifier}"
     return f"{key}{detector}{amplifier}", f"{key}{detector}", f"{key}{amplifier}", key
 
@@ -78,18 +75,18 @@ def _read_scopes() -> tuple[tuple[re.Pattern[str], str], ...]:
 
 @cache
 def variation_scope(key: str) -> str:
-    """CAMERA, DETECTOR or AMPLIFIER: how far a parameter's values may differ."""
+    """Return how finely the values of a parameter may vary: CAMERA, DETECTOR or AMPLIFIER."""
     return next((by for pattern, by in _read_scopes() if pattern.fullmatch(key)), CAMERA)
 
 
 def check_override(name: str, configuration: MissionValues) -> None:
-    """BadInput names what is wrong with a name at a place."""
+    """Raise BadInput if a parameter cannot be overridden at the place that the name contains."""
     key, place = split_name(name, configuration)
     where, scope = f"mission override {name}", variation_scope(key)
     if ("@" in name and not place.detector) or name.endswith("."):
-        raise BadInput(f"{where}: names no {AMPLIFIER if name.endswith('.') else DETECTOR}")
+        raise BadInput(f"{where}: the name of the {AMPLIFIER if name.endswith('.') else DETECTOR} is missing")
     if scope == CAMERA:
-        raise BadInput(f"{where}: {key} is one value for the whole camera")
+        raise BadInput(f"{where}: {key} must have one value for the whole camera")
     if place.amplifier and scope == DETECTOR:
         raise BadInput(f"{where}: {key} may differ between detectors ({key}@NAME), not between their amplifiers")
     section = camera_prefix(key)
@@ -106,13 +103,13 @@ def _format_names(existing: tuple[str, ...]) -> str:
 
 
 def camera_prefix(key: str) -> str:
-    """The camera's prefix of a parameter's name: vis, nisp, ext.lsstcam."""
+    """Return the camera's prefix of a parameter's name, such as vis, nisp or ext.lsstcam."""
     parts = key.split(".")
     return ".".join(parts[:2] if parts[0] == "ext" else parts[:1])
 
 
 def detectors(section: str, configuration: MissionValues) -> tuple[str, ...]:
-    """Names of a camera's detectors, in their order; none of a section that is no camera."""
+    """Return the names of a camera's detectors in their order, () for a section that is not a camera."""
     if section in GRID_NAMES:
         rows, columns = (int(configuration.value(f"{section}.fpa.{key}")) for key in ("rows", "columns"))
         name = GRID_NAMES[section]
@@ -124,9 +121,9 @@ def detectors(section: str, configuration: MissionValues) -> tuple[str, ...]:
 
 
 def amplifiers(section: str, configuration: MissionValues) -> tuple[str, ...]:
-    """Names of a detector's amplifiers, in the order in which they are read; none where it is read as one frame."""
+    """Return the names of a detector's amplifiers in the order of reading, () if it is read as one frame."""
     key = f"{section}.amplifiers"
     if key not in configuration:
         return ()
-    # Makers' types may have the same names.
+    # Detectors of different types may have amplifiers with the same names.
     return tuple(dict.fromkeys(row["amplifier"] for row in configuration.rows(key)))

@@ -1,8 +1,4 @@
-"""The parameters of the mission database as a list: python -m lake_schema mission list [PATTERN].
-
-listed    a configuration -> entries, one a parameter or model
-aligned   entries -> lines of text, columns below each other
-"""
+"""List the parameters of the mission database: python -m lake_schema mission list [PATTERN]."""
 
 from __future__ import annotations
 
@@ -22,10 +18,26 @@ _HEAD = ("name", "value", "unit", "bounds", "may differ by", "status", "source")
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A parameter: its value, or of a model its file.
+    """A parameter or a model in a list.
 
-    bounds : (lowest, highest) in its unit, None = none are declared;  by : "detector" or "amplifier" where a
-             request may give each a value of its own, else ""
+    Attributes
+    ----------
+    name : str
+        Name.
+    value : float or str
+        Value of a parameter, or file of a model.
+    unit : str
+        Unit of the value.
+    bounds : tuple of (float, float) or None
+        Lowest and highest value in this unit, or None if no bounds are declared.
+    by : str
+        "detector" or "amplifier" if a request may give each a different value, else "".
+    status : str
+        Status of the record.
+    confidence : str
+        Confidence of the record.
+    source : str
+        Source of the record.
     """
 
     name: str
@@ -39,7 +51,25 @@ class Entry:
 
 
 def list_entries(configuration: MissionConfiguration, pattern: str = "*") -> list[Entry]:
-    """By name; pattern : with *, ? and [..] for the whole name, without them a part of it.  BadInput: none matches."""
+    r"""Return the entries whose names match a pattern, sorted by name.
+
+    Parameters
+    ----------
+    configuration : MissionConfiguration
+        The configuration.
+    pattern : str, optional
+        Pattern with \*, ? and [..] for the whole name; a text without them matches names that contain it.
+
+    Returns
+    -------
+    list of Entry
+        At least one entry.
+
+    Raises
+    ------
+    BadInput
+        If no name matches.
+    """
     full_pattern = pattern if any(c in pattern for c in "*?[") else f"*{pattern}*"
     records: list[Parameter | Model] = [*configuration.parameters, *configuration.models]
     matching = [record for record in records if fnmatchcase(record.key.lower(), full_pattern.lower())]
@@ -64,7 +94,7 @@ def _entry(record: Parameter | Model, configuration: MissionConfiguration) -> En
 
 
 def _bounds_in_unit(key: str, unit: str) -> tuple[float, float] | None:
-    """What all bounds of a parameter allow, in its unit."""
+    """Return the range that all bounds of a parameter allow, in a given unit."""
     where = f"mission parameter {key}"
     ends = [
         (convert(lo, bound_unit, unit, where), convert(hi, bound_unit, unit, where))
@@ -74,7 +104,7 @@ def _bounds_in_unit(key: str, unit: str) -> tuple[float, float] | None:
 
 
 def align_columns(entries: Sequence[Entry]) -> Iterator[str]:
-    """A line a parameter below a line of headings; the source comes last, at its length."""
+    """Yield a line of headings and one line per entry, in aligned columns; the source comes last and is not padded."""
     table = [_HEAD, *map(_format_fields, entries)]
     widths = [max(len(row[i]) for row in table) for i in range(len(_HEAD))]
     for row in table:

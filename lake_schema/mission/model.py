@@ -1,10 +1,4 @@
-"""Larger models of the mission database: files named with their sha256.
-
-Model          one record: which file a name stands for, with its status, version, validity and source
-read_models    the records of the package
-content        the bytes of a model's file, refused where they are not those that the record names
-numbers, rows  a model that is a table (CSV): of numbers, or of texts by column
-"""
+"""Models of the mission database that are files, identified by their sha256."""
 
 from __future__ import annotations
 
@@ -31,11 +25,26 @@ _FILE = re.compile(r"\w[\w.-]*|[a-z_]+(\.[a-z_]+)*:\w[\w./-]*", re.ASCII)
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """A model that is a file.
+    """A record of a model that is a file.
 
-    file       : name in the package's folder of models, or `package:path` of a library's own data
-    sha256     : of its bytes, hexadecimal
-    valid_from : MJD from which the record holds, None = always
+    Attributes
+    ----------
+    key : str
+        Name of the model.
+    status : str
+        Status of the record, one of `parameter.STATUSES`.
+    file : str
+        Name in the package's folder of models, or `package:path` for a data file of another library.
+    sha256 : str
+        Checksum of the file, hexadecimal.
+    version : int
+        Version of the record.
+    valid_from : float or None
+        MJD from which the record is valid, None for always.
+    confidence : str
+        Confidence of the record, one of `parameter.CONFIDENCES`.
+    source : str
+        Source of the record.
     """
 
     key: str
@@ -57,12 +66,12 @@ class Model:
 
     @property
     def identity(self) -> Identity:
-        """What no two records may share."""
+        """Key, status, version and date, which no two records may share."""
         return record_identity(self)
 
 
 def read(file: Traversable) -> tuple[Model, ...]:
-    """The records of a CSV file of exactly the columns _COLUMNS."""
+    """Read the records of a CSV file that has exactly the columns `_COLUMNS`."""
 
     def make_model(row: Mapping[str, str], version: int, valid_from: float | None) -> Model:
         file, sha256, confidence = row["file"], row["sha256"], row["confidence"]
@@ -73,16 +82,30 @@ def read(file: Traversable) -> tuple[Model, ...]:
 
 @cache
 def read_models() -> tuple[Model, ...]:
-    """Every model of the package."""
+    """Return all models of the package."""
     return read(files("lake_schema.mission") / "models.csv")
 
 
 def read_content(model: Model, folder: Path | None = None) -> bytes:
-    """The bytes of a model's file.
+    """Return the bytes of a model's file.
 
-    folder : where the files of a published configuration lie, each named by its sha256; looked at where the
-             installed file is another one
-    Errors : Damaged names the model and the sha256 that its file has
+    Parameters
+    ----------
+    model : Model
+        Record of the model.
+    folder : Path, optional
+        Folder of a published configuration, whose files are named by their sha256. It is searched if the installed
+        file differs from the record.
+
+    Returns
+    -------
+    bytes
+        Contents with the sha256 of the record.
+
+    Raises
+    ------
+    Damaged
+        If no such file exists. The message names the model and the sha256 of the installed file.
     """
     data = _read_installed(model.file)
     if data is not None and hashlib.sha256(data).hexdigest() == model.sha256:
@@ -108,14 +131,14 @@ def _read_installed(file: str) -> bytes | None:
 
 @lru_cache(maxsize=256)
 def parse_numbers(data: bytes) -> tuple[tuple[float, ...], ...]:
-    """A table of numbers: header dropped, lines that begin with '#' are comments, a blank entry is NaN."""
+    """Parse a CSV table of numbers without its header; lines that begin with '#' are comments, a blank entry is NaN."""
     table = list(csv.reader(_lines(data)))
     return tuple(tuple(float(entry) if entry else math.nan for entry in row) for row in table[1:])
 
 
 @lru_cache(maxsize=256)
 def parse_rows(data: bytes) -> tuple[Mapping[str, str], ...]:
-    """A table of texts by column name; lines that begin with '#' are comments."""
+    """Parse a CSV table of texts into mappings by column name; lines that begin with '#' are comments."""
     return tuple(MappingProxyType(row) for row in csv.DictReader(_lines(data)))
 
 

@@ -1,9 +1,4 @@
-"""One record of the mission database, and the reader of its files.
-
-Parameter     a value with its status, unit, version, validity and source
-read          one CSV file -> records
-read_all      every section of the package
-"""
+"""Records of the mission database, and the reader of its CSV files."""
 
 from __future__ import annotations
 
@@ -22,20 +17,19 @@ import astropy.units as u
 from lake_schema.errors import BadInput
 from lake_schema.tables import mission as table
 
-# As required, as designed, as built, current best estimate, as simulated (Serrano et al. 2024, the Mission
-# Database).
+# Required, designed, built, current best estimate, simulated (Serrano et al. 2024, the Mission Database).
 STATUSES = tuple(code for code, _ in table.STATUSES)
-# What a value rests on: read in its source, quoted without the source at hand, computed from published
-# values, chosen here.
+# Origin of a value: read in its source, quoted without the source at hand, computed from published values, or chosen
+# for truesky.
 CONFIDENCES = tuple(code for code, _ in table.CONFIDENCES)
-# Ground cameras that truesky knows; a user's folder may add others.
+# Ground cameras of the database; a user's folder can add others.
 CAMERAS = ("decam", "lsstcam", "megacam", "jpcam", "gpc1", "hsc")
-# All other cameras are on the ground.
+# Cameras of Euclid; all other cameras are on the ground.
 SPACE_CAMERAS = ("vis", "nisp")
 SECTIONS = ("environment", "spacecraft", "vis", "nisp", *(f"ext_{camera}" for camera in CAMERAS), "survey")
 _COLUMNS = ("key", "status", "value", "unit", "version", "valid_from", "confidence", "source")
 
-# Of a text in a record, characters.
+# Maximum length of a text in a record, in characters.
 _MAX_LENGTH = 1000
 
 Identity = tuple[str, str, int, float]
@@ -43,7 +37,7 @@ Record = TypeVar("Record")
 
 
 class MissionRecord(Protocol):
-    """What records of values and of files have in common."""
+    """Attributes that records of values and records of files have in common."""
 
     @property
     def key(self) -> str: ...
@@ -63,8 +57,24 @@ class MissionRecord(Protocol):
 class Parameter:
     """One value of one quantity.
 
-    unit       : astropy unit string, "" for a pure number
-    valid_from : MJD from which the record holds, None = always
+    Attributes
+    ----------
+    key : str
+        Name of the quantity.
+    status : str
+        Status of the record, one of `STATUSES`.
+    value : float
+        Finite value.
+    unit : str
+        astropy unit string, "" for a pure number.
+    version : int
+        Version of the record.
+    valid_from : float or None
+        MJD from which the record is valid, None for always.
+    confidence : str
+        Confidence of the record, one of `CONFIDENCES`.
+    source : str
+        Source of the value.
     """
 
     key: str
@@ -85,12 +95,12 @@ class Parameter:
 
     @property
     def identity(self) -> Identity:
-        """What no two records may share."""
+        """Key, status, version and date, which no two records may share."""
         return record_identity(self)
 
 
 def check_record(record: MissionRecord, where: str) -> None:
-    """Refuse a status, confidence, date or source that a record may not have."""
+    """Raise BadInput, with `where` at the start, if status, confidence, date or source of a record are not allowed."""
     if record.status not in STATUSES:
         raise BadInput(f"{where}: status is not one of {', '.join(STATUSES)}")
     if record.confidence not in CONFIDENCES:
@@ -102,13 +112,13 @@ def check_record(record: MissionRecord, where: str) -> None:
 
 
 def record_identity(record: MissionRecord) -> Identity:
-    """Key, status, version and date of a record."""
+    """Return key, status, version and date of a record; the date is -inf if the record is always valid."""
     return record.key, record.status, record.version, -math.inf if record.valid_from is None else record.valid_from
 
 
 @cache
 def parse_unit(text: str, where: str = "mission") -> u.UnitBase:
-    """A unit string -> astropy unit; BadInput names where it stands."""
+    """Return the astropy unit of a unit string; raise BadInput, which begins with `where`, for any other string."""
     try:
         unit = u.Unit(text)
     except (ValueError, TypeError):
@@ -121,7 +131,7 @@ def parse_unit(text: str, where: str = "mission") -> u.UnitBase:
 
 @cache
 def _conversion_factor(unit: str, to: str) -> float | None:
-    """What a value in `unit` is multiplied with to be in `to`, None where they do not fit."""
+    """Return the factor from `unit` to `to`, None if they are not convertible."""
     try:
         factor = float(parse_unit(unit).to(parse_unit(to)))
     except u.UnitsError:
@@ -130,9 +140,28 @@ def _conversion_factor(unit: str, to: str) -> float | None:
 
 
 def convert(value: float, unit: str, to: str, where: str) -> float:
-    """A value in one unit -> in another; BadInput names where they do not fit.
+    """Convert a value from one unit to another.
 
-    value, unit : what is given, and in what;  to : the unit that is wanted;  where : named in the refusal
+    Parameters
+    ----------
+    value : float
+        The value.
+    unit : str
+        Unit of `value`.
+    to : str
+        Unit of the result.
+    where : str
+        Name of the quantity, which begins the error message.
+
+    Returns
+    -------
+    float
+        The value in unit `to`.
+
+    Raises
+    ------
+    BadInput
+        If a unit is unknown or the units are not convertible.
     """
     parse_unit(unit, where)
     parse_unit(to, where)
@@ -143,7 +172,7 @@ def convert(value: float, unit: str, to: str, where: str) -> float:
 
 
 def read(file: Traversable) -> tuple[Parameter, ...]:
-    """The records of a CSV file of exactly the columns _COLUMNS."""
+    """Read the records of a CSV file that has exactly the columns `_COLUMNS`."""
 
     def make_parameter(row: Mapping[str, str], version: int, valid_from: float | None) -> Parameter:
         value = float(row["value"])
@@ -159,14 +188,34 @@ def read_records(
     columns: Sequence[str],
     make_record: Callable[[Mapping[str, str], int, float | None], Record],
 ) -> Iterator[Record]:
-    """Records of a CSV file of exactly these columns: record(row, version, valid_from) of each line."""
+    """Yield the records of a CSV file that has exactly the given columns.
+
+    Parameters
+    ----------
+    file : Traversable
+        The file.
+    columns : sequence of str
+        Expected columns in their order.
+    make_record : callable
+        Function of (row, version, valid_from) that returns a record; `row` maps column names to texts.
+
+    Yields
+    ------
+    Parameter or Model
+        Result of `make_record` for each line.
+
+    Raises
+    ------
+    BadInput
+        If the columns differ, or a line is wrong. The message names the file and the line.
+    """
     try:
         lines = csv.DictReader(io.StringIO(file.read_text(encoding="utf-8"), newline=""))
         if tuple(lines.fieldnames or ()) != tuple(columns):
             raise BadInput(f"{file.name}: columns are not {', '.join(columns)}")
         for row in lines:
             if not all(_is_short_line(value) for value in row.values()):
-                raise BadInput(f"{file.name} line {lines.line_num}: a text is too long, or of several lines")
+                raise BadInput(f"{file.name} line {lines.line_num}: a text is too long or spans several lines")
             valid_from = float(row["valid_from"]) if row["valid_from"] else None
             yield make_record(row, int(row["version"]), valid_from)
     except UnicodeDecodeError as error:
@@ -181,6 +230,6 @@ def _is_short_line(value: object) -> bool:
 
 @cache
 def read_all_parameters() -> tuple[Parameter, ...]:
-    """Every record of the package."""
+    """Return all parameters of the package."""
     folder = files("lake_schema.mission")
     return tuple(record for section in SECTIONS for record in read(folder / f"{section}.csv"))

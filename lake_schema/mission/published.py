@@ -1,8 +1,4 @@
-"""A mission configuration as a lake table, with the files of its models, and back.
-
-output       configuration -> rows of the table `mission` and the files
-read_back    a published version -> the configuration that it holds
-"""
+"""Convert mission configurations to the table `mission` with the files of its models, and back."""
 
 from __future__ import annotations
 
@@ -22,12 +18,12 @@ from lake_schema.store.plan import Output
 from lake_schema.store.read import Version
 from lake_schema.tables.mission import MISSION
 
-# Beside the table's dataset/, each file under its sha256: an old product can be rendered with what it was made from.
+# Folder of the models' files in a version of the table, named by sha256: old products can be rendered again with them.
 _FOLDER = "models"
 
 
 def to_output(configuration: MissionConfiguration) -> Output:
-    """Every record of the database, which of them are chosen, the overridden ones in rows of their own; the files."""
+    """Return the table `mission` of a configuration, with the files of its models."""
     contents = {m.sha256: configuration.content(m) for m in configuration.models}
     return Output(
         to_table(configuration),
@@ -40,11 +36,11 @@ def _write(data: bytes, path: Path) -> None:
 
 
 def to_table(configuration: MissionConfiguration) -> pa.Table:
-    """Rows of the table `mission`."""
+    """Return the rows of the table `mission`: all records of the database, and separate rows for overridden records."""
     records: list[Parameter | Model] = [*configuration.parameters, *configuration.models]
     overridden = [record for record in records if record.key in configuration.overridden]
     package_records: list[Parameter | Model] = [*read_all_parameters(), *read_models()]
-    # A configuration that was read back may hold records that the package no longer has.
+    # A configuration from an older lake may contain records that the package no longer has.
     listed = {*package_records, *overridden}
     removed_records = [record for record in records if record not in listed]
     all_records = [*package_records, *removed_records, *overridden]
@@ -70,23 +66,26 @@ def to_table(configuration: MissionConfiguration) -> pa.Table:
 
 
 def read_back(version: Version) -> MissionConfiguration:
-    """The configuration of a published version of the table `mission`.
+    """Return the configuration that a published version of the table `mission` contains.
 
-    Errors : Damaged where it is not the one that the manifest names
+    Raises
+    ------
+    Damaged
+        If it is not the configuration that the manifest names.
     """
     try:
         files = [version.folder / f"dataset/{part}" for part in version.partitions]
         states = [manifest.file_state(path) for path in files if isinstance(path, Path)]
     except OSError:
-        # What is wrong with it is said by whoever reads it.
+        # Reading the version raises a suitable error.
         return _read_configuration(version)
-    # Copies of files on object storage go with their store.
+    # Copies of files on object storage are cached by their store.
     return _read_cached(version, *states) if len(states) == len(files) else _read_configuration(version)
 
 
 @lru_cache(maxsize=8)
 def _read_cached(version: Version, *states: tuple[int, ...]) -> MissionConfiguration:
-    """As long as its files stay as they are: tasks of a process read the same one."""
+    """Return a cached configuration while its files are unchanged, so that tasks of a process share it."""
     return _read_configuration(version)
 
 

@@ -1,15 +1,7 @@
-"""The sphere: HEALPix cells (nested), cones and polygons, separations, Galactic coordinates.
+"""Geometry of the sky: nested HEALPix cells, cones, boxes and polygons, separations, Galactic coordinates.
 
-healpix_29          sky -> order-29 index
-wrapped             angles in [0, 360)
-cell_of             sky -> cell of an order
-cells_in_cone       cells that a circle touches (never misses one)
-cells_in_cones      those of each of many circles that lie close together
-cells_in_polygon    cells that a spherical polygon touches
-cells_in_box        cells between two meridians and two parallels
-random_in_cell      uniform positions inside one cell, sorted
-displaced           moved along great circles
-unit_vectors        sky -> directions in space
+Angles are in degrees and positions in ICRS unless stated otherwise. Functions that select cells of a region never miss
+a cell.
 """
 
 from __future__ import annotations
@@ -24,24 +16,30 @@ from lake_schema.arrays import Float, Float32, Int
 from lake_schema.errors import BadInput, OutOfRange
 
 MAX_ORDER = 29
-# Of three neighbouring vertices (unit vectors) the triple product at which healpy sees no corner any more.
+# Smallest triple product of three neighbouring vertices (unit vectors) that healpy accepts as a corner.
 _MIN_TRIPLE_PRODUCT = 1e-10
-# Cells of a circle's cover are about this part of its radius wide: finer ones skip few rows more.
+# Ratio of a circle's radius to the width of the cells that cover it; finer cells would skip only a few rows more.
 _CELLS_PER_RADIUS = 4
-# Added to a distance that decides: more than the rounding of any.
+# Safety margin of distances (deg), larger than any rounding error.
 _ROUNDING_DEG = 1e-9
 
 
 @cache
 def _healpy() -> Any:
-    # Its import takes longer than most of what a process does with a lake.
+    # Importing healpy takes longer than most operations on a lake.
     import healpy
 
     return healpy
 
 
 def check_positions(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:
-    """ra, dec [any shape] deg -> the same with ra in [0, 360); refuses NaN, infinities and |dec| > 90 by name."""
+    """Return ra, dec (deg, any shape) with ra wrapped to [0, 360).
+
+    Raises
+    ------
+    OutOfRange
+        If a coordinate is NaN or infinite, or |dec| > 90.
+    """
     ra_deg, dec_deg = np.asarray(ra, float), np.asarray(dec, float)
     if not np.isfinite(ra_deg).all():
         raise OutOfRange("ra", _first(ra_deg[~np.isfinite(ra_deg)]), 0.0, 360.0)
@@ -52,7 +50,7 @@ def check_positions(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float
 
 
 def wrap_angle(angle: npt.ArrayLike) -> Float:
-    """Angles [any shape] deg -> the same in [0, 360)."""
+    """Wrap angles (deg, any shape) to [0, 360)."""
     remainder = np.mod(np.asarray(angle, float), 360.0)
     # A tiny negative angle rounds up to exactly 360.
     angle_deg: Float = np.where(remainder >= 360.0, 0.0, remainder)[()]
@@ -60,9 +58,9 @@ def wrap_angle(angle: npt.ArrayLike) -> Float:
 
 
 def wrap_position_angle(angle: npt.ArrayLike) -> Float32:
-    """Position angles [any shape] deg of axes -> float32, the same in [0, 180)."""
+    """Wrap position angles of axes (deg, any shape) to [0, 180), as float32."""
     remainder = np.mod(np.asarray(angle), 180.0).astype(np.float32)
-    # What lies below 180 by less than float32 tells, as tiny negative angles do, rounds up to it.
+    # Angles just below 180, such as tiny negative angles, can round up to exactly 180 in float32.
     return np.where(remainder >= 180.0, np.float32(0.0), remainder)
 
 
@@ -71,55 +69,77 @@ def _first(values: Float) -> float:
 
 
 def healpix_29(ra: npt.ArrayLike, dec: npt.ArrayLike) -> Int:
-    """ra, dec [n] deg -> int64[n], the nested HEALPix index of order 29 (0.4 mas)."""
+    """Return the nested HEALPix index of order 29 (0.4 mas) of positions ra, dec (deg), int64 array of shape (n,)."""
     return cell_at(ra, dec, MAX_ORDER)
 
 
 def cell_at(ra: npt.ArrayLike, dec: npt.ArrayLike, order: int) -> Int:
-    """ra, dec [n] deg -> int64[n], the nested cell of `order` that holds each position."""
+    """Return the nested cell that contains each position.
+
+    Parameters
+    ----------
+    ra, dec : float array, shape (n,)
+        Positions in deg.
+    order : int
+        HEALPix order of the cells, 0 to 29.
+
+    Returns
+    -------
+    int64 array, shape (n,)
+        Nested cell numbers.
+    """
     ra_deg, dec_deg = check_positions(ra, dec)
     return np.asarray(_healpy().ang2pix(1 << order, ra_deg, dec_deg, nest=True, lonlat=True), np.int64)
 
 
 def cell_area(order: int) -> float:
-    """Area of a cell of `order`, deg2."""
+    """Return the area of a cell of `order` in deg2."""
     return float(np.degrees(np.sqrt(np.pi / 3)) ** 2 / 4**order)
 
 
 def cell_centre(order: int, cell: int) -> tuple[float, float]:
-    """ra, dec of a cell's centre, deg."""
+    """Return ra, dec (deg) of the centre of a nested cell."""
     ra, dec = _healpy().pix2ang(1 << order, cell, nest=True, lonlat=True)
     return float(ra), float(dec)
 
 
 def cell_centres(order: int, cells: npt.ArrayLike) -> tuple[Float, Float]:
-    """ra[n], dec[n] of the centres of cells, deg."""
+    """Return ra, dec (deg, arrays of shape (n,)) of the centres of nested cells."""
     ra, dec = _healpy().pix2ang(1 << order, np.asarray(cells, np.int64), nest=True, lonlat=True)
     return np.asarray(ra, float), np.asarray(dec, float)
 
 
 def cell_corners(order: int, cells: npt.ArrayLike) -> Float:
-    """Corners of cells, [n, 4, 2] ra, dec deg, in order around each: north, west, south, east.
+    """Return the corners of nested cells.
 
-    Written out, so that a page of the sky does not wait for the import of healpy.
+    Returns
+    -------
+    float array, shape (n, 4, 2)
+        ra, dec in deg of the north, west, south and east corner of each cell.
 
-    Ref: Gorski et al. 2005, ApJ 622, 759, eqs. 4-9 and 17-22
+    Notes
+    -----
+    The formulas are written out here so that a page with the sky need not wait for the import of healpy.
+
+    References
+    ----------
+    Gorski et al. 2005, ApJ 622, 759, eqs. 4-9 and 17-22
     """
     nested = np.atleast_1d(np.asarray(cells, np.int64))
     face, within = nested >> (2 * order), nested & ((1 << 2 * order) - 1)
-    # Of the two coordinates in a base cell, of 1 across, those of the corner: they grow to the north-east and -west.
+    # Coordinates of the corners in their base cell, 0 to 1; they increase to the north-east and to the north-west.
     x, y = ((_even_bits(within >> bit)[:, None] + np.array(step)) / (1 << order)
             for bit, step in ((0, (1, 0, 0, 1)), (1, (1, 1, 0, 0))))  # fmt: skip
-    # Rows of base cells from the north, from 2, and their middles in steps of 45 deg.
+    # Row of the base cell, 2 (north) to 4, and right ascension of its centre in units of 45 deg.
     row, column = face // 4 + 2, 2 * (face % 4) + (face // 4 != 1)
     height = row[:, None] - x - y
     polar = (height < 1.0) | (height > 3.0)
-    # Near the poles, how far from one.
+    # Distance from the nearer pole in the polar caps, 1 elsewhere.
     depth = np.where(height < 1.0, height, np.where(height > 3.0, 4.0 - height, 1.0))
     z = np.where(polar, np.sign(2.0 - height) * (1.0 - depth**2 / 3.0), (2.0 - height) * 2.0 / 3.0)
     dec = np.where(
         polar & (depth < 0.5),
-        # Where the sine is nearly one it tells little of the angle.
+        # Near the poles, arcsin(z) loses digits because z is close to 1.
         np.sign(2.0 - height) * (90.0 - 2.0 * np.degrees(np.arcsin(depth / np.sqrt(6.0)))),
         np.degrees(np.arcsin(z)),
     )
@@ -128,7 +148,7 @@ def cell_corners(order: int, cells: npt.ArrayLike) -> Float:
 
 
 def _even_bits(bits: Int) -> Int:
-    """The number that bits 0, 2, 4 ... of a number make."""
+    """Return the number that consists of every second bit of a number, from bit 0."""
     packed = bits & 0x5555555555555555
     for shift, mask in (
         (1, 0x3333333333333333), (2, 0x0F0F0F0F0F0F0F0F), (4, 0x00FF00FF00FF00FF), (8, 0x0000FFFF0000FFFF),
@@ -139,26 +159,57 @@ def _even_bits(bits: Int) -> Int:
 
 
 def cell_range(order: int, cell: int) -> tuple[int, int]:
-    """The half-open range of order-29 indices inside a cell."""
+    """Return the half-open range of order-29 indices inside a cell."""
     shift = 2 * (MAX_ORDER - order)
     return int(cell) << shift, (int(cell) + 1) << shift
 
 
 def parent(cells: npt.ArrayLike, order: int, coarser: int) -> Int:
-    """int[n] nested cells of `order` -> the cells of the `coarser` order that hold them."""
+    """Return the coarser cells that contain nested cells.
+
+    Parameters
+    ----------
+    cells : int array, shape (n,)
+        Nested cells of `order`.
+    order : int
+        HEALPix order of `cells`.
+    coarser : int
+        HEALPix order of the result, at most `order`.
+
+    Returns
+    -------
+    int64 array, shape (n,)
+        Nested cells of order `coarser`.
+    """
     return np.asarray(cells, np.int64) >> (2 * (order - coarser))
 
 
 def cell_radius(order: int) -> float:
-    """Largest distance of a point of any cell of `order` from the cell's centre, deg."""
+    """Return the largest distance (deg) of any point of a cell of `order` from the cell's centre."""
     return float(np.degrees(_healpy().max_pixrad(1 << order)))
 
 
 def cells_in_cone(ra: float, dec: float, radius: float, order: int) -> Int:
-    """Cells of `order` that a circle touches, sorted.
+    """Return the cells that a circle touches, sorted.
 
-    ra, dec, radius : deg, radius in [0, 180]
-    returns         : int64[n]; holds every touched cell, and may hold a neighbour whose edge is just outside
+    Parameters
+    ----------
+    ra, dec : float
+        Centre of the circle in deg.
+    radius : float
+        Radius in deg, 0 to 180.
+    order : int
+        HEALPix order of the cells.
+
+    Returns
+    -------
+    int64 array, shape (n,)
+        All nested cells that the circle touches, and possibly neighbours whose edges are just outside.
+
+    Raises
+    ------
+    OutOfRange
+        If `radius` is outside its limits.
     """
     (ra_deg,), (dec_deg,) = check_positions([ra], [dec])
     if not 0.0 <= radius <= 180.0:
@@ -171,16 +222,37 @@ def cells_in_cone(ra: float, dec: float, radius: float, order: int) -> Int:
 
 
 def cover_order(radius: float) -> int:
-    """Order of cells that suit the cover of a circle of `radius` deg."""
+    """Return the order of cells that suit the cover of a circle of `radius` deg."""
     cell_width = max(radius / _CELLS_PER_RADIUS, 1e-7)
     order = int(np.ceil(np.log2(np.sqrt(cell_area(0)) / cell_width)))
     return min(max(order, 0), MAX_ORDER - 3)
 
 
 def cells_in_cones(ra: npt.ArrayLike, dec: npt.ArrayLike, radius: npt.ArrayLike, order: int) -> list[Int]:
-    """Cells of `order` that each of many circles touches, sorted: as `cells_in_cone`, of all circles at once.
+    """Return the cells that each of many circles touches, sorted, as `cells_in_cone` does for one circle.
 
-    ra, dec, radius : [n] deg; quick where the circles lie close together, such as those of the detectors of a camera
+    Parameters
+    ----------
+    ra, dec : float array, shape (n,)
+        Centres of the circles in deg.
+    radius : float array, shape (n,)
+        Radii in deg, 0 to 180.
+    order : int
+        HEALPix order of the cells.
+
+    Returns
+    -------
+    list of int64 array, length n
+        Nested cells of each circle.
+
+    Raises
+    ------
+    OutOfRange
+        If a radius is outside its limits.
+
+    Notes
+    -----
+    The function is fast if the circles lie close together, such as the circles around the detectors of a camera.
     """
     lon, lat = check_positions(ra, dec)
     radii, fine = np.asarray(radius, float), min(order + 3, MAX_ORDER)
@@ -193,7 +265,7 @@ def cells_in_cones(ra: npt.ArrayLike, dec: npt.ArrayLike, radius: npt.ArrayLike,
     size = cell_radius(order) + _ROUNDING_DEG
     widest = float((separation(lon, lat, lon[0], lat[0]) + radii).max()) + size
     candidates = cells_in_cone(float(lon[0]), float(lat[0]), min(widest, 180.0), order)
-    # Of most cells their middle tells; of the others, whether the middle of a finer cell within them is near enough.
+    # The distance of the centre decides for most cells. For the others, the centres of the finer cells inside decide.
     cell_centres_xyz = _healpy().pix2vec(1 << order, candidates, nest=True)
     cos_distance = sum(centres[:, i, None] * cell_centres_xyz[i] for i in range(3))
     inside_limit = np.where(reach > size, np.cos(np.radians(np.maximum(reach - size, 0.0))), np.inf)
@@ -209,21 +281,35 @@ def cells_in_cones(ra: npt.ArrayLike, dec: npt.ArrayLike, radius: npt.ArrayLike,
 
 
 def _finer_centres(cells: Int, order: int, finer: int) -> Float:
-    """[3, n, m] directions of the middles of the finer cells within each cell."""
+    """Return unit vectors, shape (3, n, m), to the centres of the m finer cells in each of n cells."""
     finer_count = 1 << 2 * (finer - order)
     inside = (np.asarray(cells)[:, None] << 2 * (finer - order)) + np.arange(finer_count)
     return np.array(_healpy().pix2vec(1 << finer, inside, nest=True))
 
 
 def cells_in_polygon(vertices: npt.ArrayLike, order: int) -> Int:
-    """Cells of `order` that a convex spherical polygon touches, sorted.
+    """Return the cells that a convex spherical polygon touches, sorted.
 
-    vertices : [n, 2] ra, dec deg, in order around the polygon, n >= 3
-    returns  : int64[m]; holds every touched cell, and may hold a neighbour whose edge is just outside
+    Parameters
+    ----------
+    vertices : float array, shape (n, 2)
+        ra, dec of the vertices in deg, in order around the polygon, n >= 3.
+    order : int
+        HEALPix order of the cells.
+
+    Returns
+    -------
+    int64 array, shape (m,)
+        All nested cells that the polygon touches, and possibly neighbours whose edges are just outside.
+
+    Raises
+    ------
+    BadInput
+        If the vertices have another shape or the polygon is not convex.
     """
     corners = np.asarray(vertices, float)
     if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
-        raise BadInput(f"a polygon wants at least 3 vertices (ra, dec), got shape {corners.shape}")
+        raise BadInput(f"a polygon must have at least 3 vertices (ra, dec), got shape {corners.shape}")
     ra, dec = check_positions(corners[:, 0], corners[:, 1])
     vectors = _healpy().ang2vec(ra, dec, lonlat=True)
     _refuse_not_convex(vectors)
@@ -240,7 +326,7 @@ def _refuse_not_convex(vectors: Float) -> None:
         raise BadInput(
             f"a polygon must be convex: vertex {corner} lies on the great circle of its neighbours, or on one of them"
         )
-    # Every vertex lies on the same side of every side: the turns alone would let a star with crossing sides through.
+    # All vertices must lie on the same side of each edge. A check of the turns alone would accept a pentagram.
     heights = np.einsum("ij,kj->ik", sides, vectors)
     ends = np.arange(len(vectors))
     heights[ends, ends] = heights[ends, (ends + 1) % len(vectors)] = np.sign(heights[0, 2])
@@ -249,10 +335,21 @@ def _refuse_not_convex(vectors: Float) -> None:
 
 
 def cells_in_box(west: float, east: float, south: float, north: float, order: int) -> Int:
-    """Cells of `order` that a box between two meridians and two parallels touches, sorted.
+    """Return the cells that a box between two meridians and two parallels touches, sorted.
 
-    west, east, south, north : deg; the box runs eastward from west to east (across RA 0 where east < west)
-    returns                  : int64[m]; holds every touched cell, and may hold a neighbour whose edge is just outside
+    Parameters
+    ----------
+    west, east : float
+        Meridians in deg. The box runs eastward from `west` to `east`, across RA 0 if east < west.
+    south, north : float
+        Parallels in deg.
+    order : int
+        HEALPix order of the cells.
+
+    Returns
+    -------
+    int64 array, shape (m,)
+        All nested cells that the box touches, and possibly neighbours whose edges are just outside.
     """
     ra, dec = check_positions([west, east], [south, north])
     fine = min(order + 3, MAX_ORDER)
@@ -262,7 +359,7 @@ def cells_in_box(west: float, east: float, south: float, north: float, order: in
     strip = _healpy().query_strip(1 << fine, np.radians(90.0 - high), np.radians(90.0 - low), inclusive=True)
     fine_cells = _healpy().ring2nest(1 << fine, strip)
     lon, lat = _healpy().pix2ang(1 << fine, fine_cells, nest=True, lonlat=True)
-    # A cell's half-width in right ascension; near a pole it may reach any meridian.
+    # Half-width of a cell in right ascension; a cell near a pole can reach any meridian.
     widest = np.cos(np.radians(np.minimum(np.abs(lat) + reach, 90.0)))
     margin = np.where(widest > np.radians(reach), reach / np.maximum(widest, 1e-9), 360.0)
     eastward = (lon - ra[0] + margin) % 360.0
@@ -272,25 +369,45 @@ def cells_in_box(west: float, east: float, south: float, north: float, order: in
 
 
 def separation(ra1: npt.ArrayLike, dec1: npt.ArrayLike, ra2: npt.ArrayLike, dec2: npt.ArrayLike) -> Float:
-    """Great-circle distance, deg, by the haversine (accurate from 0 to 180 deg); all angles deg, broadcast.
+    """Return the great-circle distance between positions, accurate from 0 to 180 deg (haversine formula).
 
-    ra1, dec1 : of one place;  ra2, dec2 : of the other
+    Parameters
+    ----------
+    ra1, dec1 : float array
+        First positions in deg.
+    ra2, dec2 : float array
+        Second positions in deg; all shapes are broadcast.
+
+    Returns
+    -------
+    float array
+        Distances in deg.
     """
     lon1, lat1, lon2, lat2 = (np.radians(np.asarray(x, float)) for x in (ra1, dec1, ra2, dec2))
     dlon, dlat = np.sin((lon2 - lon1) / 2), np.sin((lat2 - lat1) / 2)
     haversine = dlat**2 + np.cos(lat1) * np.cos(lat2) * dlon**2
-    # The complement keeps its digits near the antipode, where 1 - near has lost them.
+    # Near the antipode, 1 - haversine would lose digits; this form of the complement does not.
     complement = np.sin((lat1 + lat2) / 2) ** 2 + np.cos(lat1) * np.cos(lat2) * np.cos((lon2 - lon1) / 2) ** 2
     return np.asarray(np.degrees(2 * np.arctan2(np.sqrt(haversine), np.sqrt(complement))))
 
 
 def offset_positions(ra: Float, dec: Float, east: Float, north: Float) -> tuple[Float, Float]:
-    """Positions moved along great circles by (east, north) rad; all [n], ra, dec deg.
+    """Move positions along great circles.
 
-    ra, dec : float[n] deg;  east, north : float[n] rad
+    Parameters
+    ----------
+    ra, dec : float array, shape (n,)
+        Positions in deg.
+    east, north : float array, shape (n,)
+        Components of the shift in rad.
+
+    Returns
+    -------
+    ra, dec : float array, shape (n,)
+        Moved positions in deg.
     """
     angle = np.hypot(east, north)
-    # sin(angle) / angle without the division by zero.
+    # sin(angle) / angle, without a division by zero.
     ratio = np.sinc(angle / np.pi)
     lat, lon = np.radians(dec), np.radians(ra)
     forward = np.cos(angle) * np.cos(lat) - ratio * north * np.sin(lat)
@@ -301,9 +418,25 @@ def offset_positions(ra: Float, dec: Float, east: Float, north: Float) -> tuple[
 
 
 def random_in_cell(order: int, cell: int, n: int, rng: np.random.Generator) -> tuple[Int, Float, Float]:
-    """n positions uniform in a cell: (int64[n] order-29 index, ascending; ra[n], dec[n] deg).
+    """Draw positions uniformly in a cell.
 
-    order, cell : of the nested cell;  n : positions;  rng : random numbers
+    Parameters
+    ----------
+    order : int
+        HEALPix order of the cell.
+    cell : int
+        Nested cell number.
+    n : int
+        Number of positions.
+    rng : numpy.random.Generator
+        Source of random numbers.
+
+    Returns
+    -------
+    index : int64 array, shape (n,)
+        HEALPix indices of order 29, ascending.
+    ra, dec : float array, shape (n,)
+        Positions in deg.
     """
     first, _ = cell_range(order, cell)
     index = np.sort(rng.integers(0, 1 << (2 * (MAX_ORDER - order)), n, dtype=np.int64)) | np.int64(first)
@@ -312,39 +445,47 @@ def random_in_cell(order: int, cell: int, n: int, rng: np.random.Generator) -> t
 
 
 def positions_of_indices(index: npt.ArrayLike) -> tuple[Float, Float]:
-    """Order-29 indices [n] -> ra, dec [n] deg of their centres."""
+    """Return ra, dec (deg) of the centres of order-29 HEALPix indices, arrays of shape (n,)."""
     ra, dec = _healpy().pix2ang(1 << MAX_ORDER, np.asarray(index, np.int64), nest=True, lonlat=True)
     return np.asarray(ra, float), np.asarray(dec, float)
 
 
 def unit_vectors(ra: npt.ArrayLike, dec: npt.ArrayLike) -> Float:
-    """[..., 3] unit vectors towards places; ra, dec [...] deg, of one shape."""
+    """Return unit vectors, shape (..., 3), towards positions ra, dec (deg, shape (...))."""
     return np.moveaxis(
         _unit_vector_components(np.radians(np.asarray(ra, float)), np.radians(np.asarray(dec, float))), 0, -1
     )
 
 
 def _unit_vector_components(lon: Float, lat: Float) -> Float:
-    """[3, ...] of [...] rad."""
+    """Return unit vectors, shape (3, ...), towards lon, lat (rad, shape (...))."""
     return np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
 
 
 def galactic(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:
-    """ICRS ra, dec [n] deg -> Galactic l, b [n] deg (matrix of the Hipparcos catalogue, ESA 1997, eq. 1.5.11)."""
+    """Convert ICRS ra, dec (deg) to Galactic l, b (deg).
+
+    References
+    ----------
+    ESA 1997, The Hipparcos and Tycho Catalogues, eq. 1.5.11 (matrix)
+    """
     ra_rad, dec_rad = np.radians(np.asarray(ra, float)), np.radians(np.asarray(dec, float))
     x, y, z = _rotate(TO_GALACTIC, _unit_vector_components(ra_rad, dec_rad))
     return wrap_angle(np.degrees(np.arctan2(y, x))), np.degrees(np.arctan2(z, np.hypot(x, y)))
 
 
 def equatorial(lon: npt.ArrayLike, lat: npt.ArrayLike) -> tuple[Float, Float]:
-    """Galactic l, b [n] deg -> ICRS ra, dec [n] deg; the inverse of `galactic`."""
+    """Convert Galactic l, b (deg) to ICRS ra, dec (deg); the inverse of `galactic`."""
     l_rad, b_rad = np.radians(np.asarray(lon, float)), np.radians(np.asarray(lat, float))
     x, y, z = _rotate(TO_GALACTIC.T, _unit_vector_components(l_rad, b_rad))
     return wrap_angle(np.degrees(np.arctan2(y, x))), np.degrees(np.arctan2(z, np.hypot(x, y)))
 
 
 def _rotate(matrix: Float, vector: Float) -> Float:
-    """[3, 3] by [3, ...], added in the order written: a library's product has other last bits on another processor."""
+    """Multiply a matrix (3, 3) by vectors (3, ...), with a fixed order of sums.
+
+    A library's matrix product can give different last bits on different processors.
+    """
     return np.stack([row[0] * vector[0] + row[1] * vector[1] + row[2] * vector[2] for row in matrix])
 
 
@@ -358,12 +499,27 @@ TO_GALACTIC = np.array(
 
 
 def ring_index(order: int, cell: int) -> int:
-    """Number in the RING ordering of a nested cell."""
+    """Return the number in the RING ordering of a nested cell."""
     return int(_healpy().nest2ring(1 << order, cell))
 
 
 def border_cells(order: int, cell: int, fine: int) -> Int:
-    """int64[n] cells of the finer order inside `cell` that touch its border, sorted."""
+    """Return the finer cells inside a cell that touch its border.
+
+    Parameters
+    ----------
+    order : int
+        HEALPix order of the cell.
+    cell : int
+        Nested cell number.
+    fine : int
+        HEALPix order of the result, at least `order`.
+
+    Returns
+    -------
+    int64 array, shape (n,)
+        Nested cells of order `fine`, sorted.
+    """
     side = 1 << (fine - order)
     x, y = np.meshgrid(np.arange(side), np.arange(side))
     rim = (x == 0) | (y == 0) | (x == side - 1) | (y == side - 1)
@@ -372,7 +528,22 @@ def border_cells(order: int, cell: int, fine: int) -> Int:
 
 
 def margin_cells(order: int, cell: int, fine: int) -> Int:
-    """int64[n] cells of the finer order outside `cell` that touch its border (8 neighbours), sorted: its rim."""
+    """Return the finer cells outside a cell that touch its border, including its corners.
+
+    Parameters
+    ----------
+    order : int
+        HEALPix order of the cell.
+    cell : int
+        Nested cell number.
+    fine : int
+        HEALPix order of the result, at least `order`.
+
+    Returns
+    -------
+    int64 array, shape (n,)
+        Nested cells of order `fine`, sorted.
+    """
     neighbours = _healpy().get_all_neighbours(1 << fine, border_cells(order, cell, fine), nest=True).ravel()
     neighbours = np.unique(neighbours[neighbours >= 0]).astype(np.int64)
     outside: Int = neighbours[parent(neighbours, fine, order) != cell]

@@ -1,8 +1,4 @@
-"""Ecliptic coordinates, and the tiles that the sky is cut into along them.
-
-ecliptic, equatorial     ICRS <-> ecliptic longitude and latitude
-tile_count, tile_corners number of tiles, and where a tile lies
-"""
+"""Convert ecliptic coordinates, and divide the sky into tiles along them."""
 
 from __future__ import annotations
 
@@ -15,19 +11,30 @@ from lake_schema.arrays import Float, Int
 from lake_schema.errors import OutOfRange
 from lake_schema.sky import wrap_angle
 
-# IAU 1976 obliquity at J2000, deg.
+# Obliquity at J2000 in deg (IAU 1976).
 OBLIQUITY = 23.4392911
-# Tiles are about 0.5 deg2, the field of view (Serrano et al. 2024); rows as high as a field's step.
+# Tiles have about the area of the field of view, 0.5 deg2 (Serrano et al. 2024). The height of a row is the step
+# between fields; the width of a tile is in deg.
 _ROW_COUNT, _TILE_WIDTH = 257, 0.714
 
 
 def ecliptic(ra: npt.ArrayLike, dec: npt.ArrayLike) -> tuple[Float, Float]:
-    """ICRS [n] -> ecliptic longitude [0, 360) and latitude [n], deg, J2000.  Error: 0.1 arcsec (frame bias)."""
+    """Convert ICRS ra, dec to ecliptic longitude [0, 360) and latitude of J2000, all in deg.
+
+    Notes
+    -----
+    The error is 0.1 arcsec, because the frame bias is neglected.
+    """
     return _rotate(ra, dec, OBLIQUITY)
 
 
 def equatorial(lon: npt.ArrayLike, lat: npt.ArrayLike) -> tuple[Float, Float]:
-    """Ecliptic longitude and latitude [n], J2000 -> ICRS ra [0, 360), dec [n], deg.  Error: 0.1 arcsec"""
+    """Convert ecliptic longitude and latitude of J2000 to ICRS ra [0, 360) and dec, all in deg.
+
+    Notes
+    -----
+    The error is 0.1 arcsec, because the frame bias is neglected.
+    """
     return _rotate(lon, lat, -OBLIQUITY)
 
 
@@ -43,12 +50,23 @@ def _rotate(lon: npt.ArrayLike, lat: npt.ArrayLike, angle: float) -> tuple[Float
 
 
 def tile_count() -> int:
-    """Number of tiles; they are numbered from 0, rows from the south, eastward in a row."""
+    """Return the number of tiles. They are numbered from 0: rows from south to north, and eastward in a row."""
     return int(_first_tile_of_row()[-1])
 
 
 def tile_corners(tile: int) -> Float:
-    """[4, 2] ICRS ra, dec deg of a tile's corners, in order around it."""
+    """Return the four corners of a tile in order around it.
+
+    Returns
+    -------
+    float array, shape (4, 2)
+        ICRS ra, dec in deg.
+
+    Raises
+    ------
+    OutOfRange
+        If there is no tile of this number.
+    """
     first = _first_tile_of_row()
     if not 0 <= tile < first[-1]:
         raise OutOfRange("tile", tile, 0, int(first[-1]) - 1)
@@ -61,7 +79,7 @@ def tile_corners(tile: int) -> Float:
 
 @cache
 def _first_tile_of_row() -> Int:
-    """Number of the first tile of each row, and of all tiles."""
+    """Return the number of the first tile of each row, and at the end the number of tiles."""
     row_centre = -90.0 + 180.0 * (np.arange(_ROW_COUNT) + 0.5) / _ROW_COUNT
     counts = np.maximum(np.ceil(360.0 * np.cos(np.radians(row_centre)) / _TILE_WIDTH), 3)
     return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)

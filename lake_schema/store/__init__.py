@@ -1,1 +1,1 @@
-"""How the lake keeps tables: staged, published, verified, read."""
+"""Storage of the lake's tables: staging, publishing, verifying and reading versions."""

@@ -1,12 +1,9 @@
-"""Files that are read through their manifest entry: no byte is handed out before it was compared with what was written.
+"""Read files with checksums: every byte is compared with the file's manifest entry before it is returned.
 
-facts    a file's entry: its size, its sha256, and its blocks, each with a checksum
-crc32    checksum of a file as a whole
-Checked  the file, to be read by whatever reads an open file; refuses the first block that is not what was written
-
-A block's checksum is its CRC-32: one flipped bit never passes, nor does a burst of up to 32; of any other change one in
-4e9 does. It costs less than the checksums of Parquet's pages, and unlike them it covers page headers too, and a block
-in the place of another. The sha256 of whole files is what `verify --deep` compares.
+The manifest entry of a file contains its size, its sha256, and its blocks, each with a checksum. The checksum of a
+block is its CRC-32. It detects every single flipped bit and every burst of up to 32 bits, and misses one in 4e9 other
+changes. It takes less time than the checksums of Parquet's pages. Unlike them, it covers page headers and detects
+exchanged blocks. `verify --deep` compares the sha256 of whole files.
 """
 
 from __future__ import annotations
@@ -27,16 +24,27 @@ from lake_schema.errors import Damaged
 from lake_schema.store.object_storage.s3 import Folder, ObjectPath
 from lake_schema.store.plan import Json
 
-# Smaller pieces share a block, larger ones are cut.
+# Pieces below the minimum share a block; pieces above the maximum are divided.
 _MIN_BYTES, _MAX_BYTES = 16 << 10, 8 << 20
 _RECORD = np.dtype([("bytes", "<u4"), ("crc", "<u4")])
 
 
 def file_checksums(path: Path, cuts: Sequence[int]) -> dict[str, Any]:
-    """What the manifest says of a file of which parts are read.
+    """Return the size and the checksums that the manifest records for a file of which parts are read.
 
-    cuts    : ascending, where one may be read without what comes before; the last begins what every reader wants
-    returns : bytes, sha256 (hexadecimal), blocks: base64 of (bytes, CRC-32) of each, as 4-byte integers, low byte first
+    Parameters
+    ----------
+    path : Path
+        The file.
+    cuts : sequence of int
+        Offsets in bytes, ascending, at which reading may start. The last one is the start of the footer, which every
+        reader needs.
+
+    Returns
+    -------
+    dict
+        ``bytes``: size. ``sha256``: hexadecimal. ``blocks``: base64 of the size and the CRC-32 of each block, as 4-byte
+        little-endian integers.
     """
     file_hash, block_checksums, size = hashlib.sha256(), [], path.stat().st_size
     ends = _block_ends(cuts, size)
@@ -50,7 +58,7 @@ def file_checksums(path: Path, cuts: Sequence[int]) -> dict[str, Any]:
 
 
 def crc32(path: Path) -> int:
-    """CRC-32 of a file's bytes, read a piece at a time."""
+    """Return the CRC-32 of a file's contents, which are read in pieces."""
     checksum = 0
     with path.open("rb") as stream:
         while data := stream.read(_MAX_BYTES):
@@ -68,22 +76,39 @@ def _block_ends(cuts: Sequence[int], size: int) -> list[int]:
 
 
 def decode_blocks(entry: Json) -> list[tuple[int, int]]:
-    """(end, CRC-32) of each block of an entry.
+    """Return (end offset, CRC-32) of each block of a manifest entry.
 
-    Errors : KeyError, TypeError or ValueError if they are not the blocks of a file of that size
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        If the entry has no valid blocks for its size.
     """
     blocks = np.frombuffer(base64.b64decode(entry["blocks"], validate=True), _RECORD)
     ends = np.cumsum(blocks["bytes"], dtype=np.int64)
     if not ends.size or ends[-1] != entry["bytes"]:
-        raise ValueError("the blocks are not those of a file of this size")
+        raise ValueError("the blocks do not add up to the size of the file")
     return list(zip(ends.tolist(), blocks["crc"].tolist(), strict=True))
 
 
 class VerifiedFile(io.RawIOBase):
-    """A file of a lake, open for reading; a block is compared once, when something of it is read for the first time.
+    """A file of a lake that is open for reading; each block is verified when it is first read.
 
-    fault  : why it was refused, "" where it was not; for whoever meets the refusal through somebody else's code
-    Errors : Damaged names the file
+    Parameters
+    ----------
+    path : Path or ObjectPath
+        The file.
+    entry : mapping
+        Its entry in the manifest.
+
+    Attributes
+    ----------
+    fault : str
+        Reason why the file was refused, "" if it was not. Use it if another library hides the exception.
+
+    Raises
+    ------
+    Damaged
+        By methods that read, if the contents differ from the manifest. The message names the file.
     """
 
     fault = ""
@@ -95,7 +120,7 @@ class VerifiedFile(io.RawIOBase):
         self._ends, self._checksums = [end for end, _ in blocks], [crc for _, crc in blocks]
         self._verified: set[int] = set()
         self._position = 0
-        # Of an object, which is no open file of this process.
+        # The opened object on object storage; files on disc are opened for each read.
         self._object: Any = None
 
     def readable(self) -> bool:
@@ -113,13 +138,14 @@ class VerifiedFile(io.RawIOBase):
         return self._position
 
     def read(self, size: int | None = -1) -> bytes:
+        """Return up to `size` bytes from the current position, after verifying their blocks."""
         first, length = self._position, int(self._entry["bytes"])
         last = length if size is None or size < 0 else min(first + size, length)
         if last <= first:
             return b""
         numbers = range(bisect_right(self._ends, first), bisect_left(self._ends, last) + 1)
         unverified = [number for number in numbers if number not in self._verified]
-        # Whole blocks, once: what is handed out is what was compared.
+        # Whole blocks are read once, so that the verified bytes are the bytes that are returned.
         start, end = (
             (min(first, self._block_start(unverified[0])), max(last, self._ends[unverified[-1]]))
             if unverified
@@ -132,7 +158,7 @@ class VerifiedFile(io.RawIOBase):
         return data[first - start : last - start]
 
     def forget(self) -> None:
-        """Compare every block again when it is next read: for who keeps a file from question to question."""
+        """Verify every block again when it is next read; call this if a file stays open between queries."""
         self._verified.clear()
         self._object = None
 
@@ -150,7 +176,7 @@ class VerifiedFile(io.RawIOBase):
         return Damaged(self.fault)
 
     def _read_range(self, first: int, last: int) -> bytes:
-        """Opened each time: a lake has more files than a process may hold open."""
+        """Read a range of bytes. The file is opened for each call, because a process can only keep some files open."""
         if isinstance(self.path, ObjectPath):
             return self._read_object_range(self.path, first, last)
         try:
@@ -163,7 +189,7 @@ class VerifiedFile(io.RawIOBase):
             finally:
                 os.close(descriptor)
         except FileNotFoundError:
-            # Removed since, with its whole version.
+            # The whole version has been removed since.
             raise self._damage_error("is missing") from None
         except OSError as error:
             raise self._damage_error(f"cannot be read: {error.strerror}") from None
@@ -172,7 +198,7 @@ class VerifiedFile(io.RawIOBase):
         return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
     def _read_object_range(self, place: ObjectPath, first: int, last: int) -> bytes:
-        """Asked for each time; of which size the object is, once, and again after `forget`."""
+        """Read a range of bytes of an object; the object is opened once, and again after `forget`."""
         try:
             if self._object is None:
                 self._object = place.open()

@@ -1,10 +1,8 @@
-"""What nobody needs any more: versions that no request has and that nothing kept was made of, runs that were given up.
+"""Find and remove versions and stages that are no longer needed.
 
-kept        of each table, the versions that stay
-collect     says what else there is, and removes it where that is wanted
-
-A version stays that is current, that a request's name links to, or that such a one was made of, however far back. A
-folder is renamed before it is emptied: a death in between leaves no half version that looks whole.
+A version is kept if it is current, if a request links to it, or if a kept version was made from it, directly or
+indirectly. All other versions, and the stages of runs that have ended, can be removed. A folder is renamed before it is
+emptied, so that an interrupted removal leaves no incomplete version that looks complete.
 """
 
 from __future__ import annotations
@@ -22,22 +20,35 @@ from lake_schema.store import layout, locks, manifest, request_links
 from lake_schema.store.object_storage.s3 import Folder
 from lake_schema.store.stage import receipts_folder
 
-# What stands in a table's folder by a version's key; and what was on its way out.
+# Names with a version's key in a table's folder, and names of folders that are marked for removal.
 _KEY_PATTERN = re.compile(r"(?:v|\.stage|\.receipts|\.lock)-([0-9a-f]{16})", re.ASCII)
 _MARKED_PATTERN = ".gone*"
 
 
 def table_names(root: Folder) -> list[str]:
-    """Folders of the lake in which something was published or begun, sorted."""
+    """Return the sorted names of the tables that have been published or begun in a lake."""
     return sorted({path.parent.name for path in root.glob("*/.lock*")} | set(layout.table_names(root)))
 
 
 def kept_versions(root: Path, previous: Mapping[str, set[str]] | None = None) -> dict[str, set[str]]:
-    """Table -> keys of the versions that stay.
+    """Return the keys of the versions that are kept, by table.
 
-    root   : of the lake
-    known  : what this said before; only the manifests of other versions are read, and what stayed stays
-    Errors : Damaged where a version that stays is missing or its manifest broken: what it was made of is not known
+    Parameters
+    ----------
+    root : Path
+        Folder of the lake.
+    previous : mapping of str to set of str, optional
+        Earlier result of this function. These versions are kept, and their manifests are not read again.
+
+    Returns
+    -------
+    dict of str to set of str
+        Keys by table.
+
+    Raises
+    ------
+    Damaged
+        If a kept version is missing or its manifest is broken, because its inputs are then unknown.
     """
     links = [
         (name, layout.current_key(root, name), layout.current_link(root, name)) for name in layout.table_names(root)
@@ -68,9 +79,28 @@ def kept_versions(root: Path, previous: Mapping[str, set[str]] | None = None) ->
 
 
 def collect(root: Path, name: str | None = None, delete: bool = False) -> list[Path]:
-    """What is not kept of a table, or of all of them; removed only where `delete` says so.
+    """Return the paths that are not needed, and remove them if requested.
 
-    Errors : BadInput where there is no such table; Damaged, and nothing is removed, where it is not known what is kept
+    Parameters
+    ----------
+    root : Path
+        Folder of the lake.
+    name : str, optional
+        Name of a table; by default all tables.
+    delete : bool, optional
+        True to remove the paths.
+
+    Returns
+    -------
+    list of Path
+        Folders that can be removed, or that were removed.
+
+    Raises
+    ------
+    BadInput
+        If there is no such table.
+    Damaged
+        If it is unknown which versions are needed. Nothing is removed then.
     """
     existing_tables = table_names(root)
     selected = existing_tables if name is None else [layout.table_folder(root, name).name]
@@ -79,10 +109,10 @@ def collect(root: Path, name: str | None = None, delete: bool = False) -> list[P
     kept_keys = kept_versions(root)
     if not delete:
         return [path for table in selected for path in _removable_paths(root, table, kept_keys[table])]
-    # What a death has left must not be in the way of a version that was made again since.
+    # Remains of an interrupted removal must not block a version that has been made again since.
     removed = _delete_marked(root, selected)
     with contextlib.ExitStack() as stack:
-        # Nobody publishes while it is decided: what has been linked since is looked at, and little else.
+        # Nothing can be published while the locks are held. Only links that are new since the first pass are followed.
         for table in existing_tables:
             stack.enter_context(locks.hold_table(layout.table_folder(root, table)))
         kept_keys = kept_versions(root, kept_keys)
@@ -92,7 +122,7 @@ def collect(root: Path, name: str | None = None, delete: bool = False) -> list[P
 
 
 def _delete_marked(root: Path, selected: Iterable[str]) -> list[Path]:
-    """Remove what is on its way out of some tables."""
+    """Delete the folders of some tables that are marked for removal, and return their paths."""
     marked = [path for table in selected for path in sorted(layout.table_folder(root, table).glob(_MARKED_PATTERN))]
     for path in marked:
         shutil.rmtree(path, ignore_errors=True)
@@ -108,7 +138,7 @@ def _removable_paths(root: Path, name: str, kept_keys: set[str]) -> list[Path]:
 
 
 def _mark_for_removal(root: Path, name: str, kept_keys: set[str]) -> Iterator[Path]:
-    """Give what can go another name; stages that a run is working on stay."""
+    """Rename folders that can be removed; stages on which a run is working stay."""
     folder = layout.table_folder(root, name)
     for key in _version_keys(folder):
         lock = folder / f".lock-{key}"

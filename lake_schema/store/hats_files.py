@@ -1,8 +1,12 @@
-"""What makes a folder of cells a HATS collection: metadata, the 10 arcsec margin, the properties.
+"""Write the files that turn a folder of cells into a HATS collection: metadata, margin and properties.
 
-<version>/collection.properties
-<version>/<table>/          hats.properties properties partition_info.csv skymap.fits dataset/{_metadata,...}
-<version>/<table>_margin/   the same for the rows just outside each cell, so that a cross-match loses no pair at an edge
+The files of a version are::
+
+    <version>/collection.properties
+    <version>/<table>/          hats.properties properties partition_info.csv skymap.fits dataset/{_metadata,...}
+    <version>/<table>_margin/   the same for the rows within 10 arcsec outside each cell
+
+With the margin, a cross-match loses no pairs at the edges of cells.
 """
 
 from __future__ import annotations
@@ -21,28 +25,37 @@ from lake_schema.store import layout, parquet
 from lake_schema.store.plan import Json
 
 MARGIN_ARCSEC = 10.0
-# Cells of order 13 are 26" wide: the rim of them about a cell holds everything within 10" of it.
+# Cells of order 13 are 26" wide, so a ring of them around a cell contains all positions within 10" of the cell.
 _MARGIN_ORDER = 13
 _SKYMAP_ORDER = 8
-# Above this many files the merged footers of `_metadata` outgrow their use.
+# With more files, the merged footers in `_metadata` would be too large to be useful.
 _MAX_FILES_IN_METADATA = 1000
-# The properties want a date; a clock's would make equal lakes differ.
+# The properties require a date; the current date would make equal lakes differ.
 _DATE = "2000-01-01T00:00UTC"
 
 Cell = tuple[int, int]  # order, nested cell
 
 
 def border_rows(rows: pa.Table, partition: str) -> pa.Table:
-    """Those rows of a cell that another cell's margin may want: kept beside the receipts until the margins are made."""
+    """Return the rows of a cell that margins of other cells may need; they are stored with the receipts until then."""
     order, cell = layout.cell_of_file(partition)
     fine = sky.parent(rows["_healpix_29"].to_numpy(), sky.MAX_ORDER, _MARGIN_ORDER)
     return rows.filter(pa.array(np.isin(fine, sky.border_cells(order, cell, _MARGIN_ORDER))))
 
 
 def write_metadata(version: Path, table: Table, receipts: Sequence[Json], borders: Path) -> None:
-    """Write the metadata of a catalogue whose cells lie in `version`/<table>/dataset.
+    """Write the metadata of a catalogue whose cells are in `version`/<table>/dataset.
 
-    made : receipts of the cells;  borders : folder of their border rows
+    Parameters
+    ----------
+    version : Path
+        Folder of the version, or of its stage.
+    table : Table
+        Declaration of the table.
+    receipts : sequence of mapping
+        Receipts of the cells.
+    borders : Path
+        Folder with the border rows of the cells.
     """
     cells = [layout.cell_of_file(receipt["part"]) for receipt in receipts]
     root, margin = version / table.name, version / f"{table.name}_margin"
@@ -103,7 +116,7 @@ def _write_catalogue(root: Path, table: Table, cells: list[Cell], rows: int, cou
         facts |= {"catalog_name": table.name, "catalog_type": "object", "skymap_order": _SKYMAP_ORDER}
     provenance = TableProperties.new_provenance_dict(root, builder="truesky")
     provenance["hats_creation_date"] = _DATE
-    # The size on disk would differ by a byte with the length of a path.
+    # The estimated size depends on the length of the path, so equal lakes would differ.
     provenance.pop("hats_estsize", None)
     TableProperties(**facts, **provenance).to_properties_file(root)
 

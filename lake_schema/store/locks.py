@@ -1,4 +1,4 @@
-"""Files that are locked: held by one process at a time, let go of by the kernel when it dies, however it dies."""
+"""Lock files: held by one process at a time, and released by the kernel when the process ends in any way."""
 
 from __future__ import annotations
 
@@ -11,17 +11,34 @@ from pathlib import Path
 
 from lake_schema.errors import Superseded
 
-# A table's own lock is held for a few renames; how long to wait for another holder, and how often to look, s.
+# Time to wait for a table's lock, which is held during a few renames, and interval between attempts, in s.
 TABLE_TIMEOUT, _POLL_INTERVAL = 10.0, 0.02
-# Who asks whether a lock is held, holds it for a moment; how long to wait for that, s.
+# `is_held` holds the lock for a moment. Time to wait for that, in s.
 SHORT_TIMEOUT = 1.0
 
 
 @contextlib.contextmanager
 def hold(path: Path, message: str, timeout: float = 0.0) -> Iterator[None]:
-    """Hold a lock file, or raise Superseded.
+    """Hold a lock file while the context is active.
 
-    patience : how long to wait for another holder, s
+    Parameters
+    ----------
+    path : Path
+        The lock file; it is created if it does not exist.
+    message : str
+        Message of the exception.
+    timeout : float, optional
+        Time to wait for another holder, in s.
+
+    Yields
+    ------
+    None
+        While the lock is held.
+
+    Raises
+    ------
+    Superseded
+        If another process still holds the lock after `timeout`.
     """
     deadline = time.monotonic() + timeout
     while True:
@@ -35,12 +52,12 @@ def hold(path: Path, message: str, timeout: float = 0.0) -> Iterator[None]:
 
 
 def hold_table(folder: Path) -> contextlib.AbstractContextManager[None]:
-    """The lock of a table's folder, under which its versions and links are renamed."""
+    """Hold the lock of a table's folder, which protects renames of its versions and links."""
     return hold(folder / ".lock", f"table {folder.name}: another run is publishing", TABLE_TIMEOUT)
 
 
 def is_held(path: Path) -> bool:
-    """Does somebody hold the lock now?  Writes nothing."""
+    """Return True if a process holds the lock now; nothing is written."""
     try:
         with path.open() as stream:
             return not _try_lock(path, stream.fileno())
@@ -49,7 +66,7 @@ def is_held(path: Path) -> bool:
 
 
 def _try_lock(path: Path, descriptor: int) -> bool:
-    """Lock the open file, if nobody holds it, and if it is still the one of that name: holders remove it."""
+    """Lock the open file; return True if that succeeds and the file still has this name (holders remove lock files)."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         return path.stat().st_ino == os.fstat(descriptor).st_ino

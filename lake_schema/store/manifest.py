@@ -1,10 +1,4 @@
-"""The manifest of a version: its files with bytes and sha256, what they were made from, sealed by its own digest.
-
-write     put a manifest into a version's folder
-load      read one; refused where a byte of it has changed
-state     of a file: whether it is still the one that was read
-faults    is a version what its manifest says?
-"""
+"""Manifests of versions: their files with sizes and sha256, their inputs, and a digest of the manifest itself."""
 
 from __future__ import annotations
 
@@ -27,22 +21,25 @@ from lake_schema.store.object_storage.s3 import MANIFEST, Folder, ObjectPath
 from lake_schema.store.plan import Json
 from lake_schema.store.provenance import canonical, digest, file_sha256
 
-# Types of what every manifest says, and of what it says of each file.
+# Types of the entries of every manifest, and of its entry of each file.
 _FACT_TYPES = {"table": str, "version": int, "key": str, "facts": dict, "parts": list, "rows": int, "files": list}
 _ENTRY_TYPES = {"path": str, "bytes": int, "sha256": str}
 _TEMPORARY = re.compile(r"\.[0-9a-f]{12}\.tmp\.")
 
 
 def write(folder: Path, facts: Json) -> None:
-    """Seal the facts of a version and put them into its folder, synced."""
+    """Write the facts of a version and their digest as its manifest, and sync it to disc."""
     plain = json.loads(canonical(facts))
     write_json(folder / MANIFEST, {**plain, "digest": digest(plain)})
 
 
 def load(folder: Folder, table: str) -> Manifest:
-    """The manifest of a version's folder.
+    """Return the manifest of a version's folder.
 
-    Errors : Damaged where it is missing, cut short, changed, or that of another version or table
+    Raises
+    ------
+    Damaged
+        If the manifest is missing, incomplete, changed, or belongs to another version or table.
     """
     path = folder / MANIFEST
     try:
@@ -50,28 +47,28 @@ def load(folder: Folder, table: str) -> Manifest:
     except (OSError, ValueError, KeyError, AttributeError, RecursionError) as error:
         raise Damaged(f"{path}: {type(error).__name__}: {error}") from None
     if facts["table"] != table or folder.name != f"v-{facts['key']}":
-        raise Damaged(f"{path} is that of table {facts['table']}, version {facts['key']}")
+        raise Damaged(f"{path} belongs to table {facts['table']}, version {facts['key']}")
     return facts
 
 
 class Manifest(dict[str, Any]):
-    """What a manifest says; nobody changes it."""
+    """Contents of a manifest; they must not be changed."""
 
     @cached_property
     def by_path(self) -> dict[str, dict[str, Any]]:
-        """The entry of each file."""
+        """Entries of the files by path."""
         return {entry["path"]: entry for entry in self["files"]}
 
     @cached_property
     def schemas(self) -> dict[tuple[int, ...], pa.Schema]:
-        """That of its first part, by the `state` of the file; whoever reads it puts it there."""
+        """Cache of the schema of the first partition by `file_state` of its file, filled by readers."""
         return {}
 
 
 def file_state(path: Path) -> tuple[int, int, int, int]:
-    """Inode, bytes, times of modification and of change, ns: while they are the same a file need not be read again.
+    """Return inode, size in bytes, and times of modification and change in ns of a file.
 
-    Errors : OSError
+    While they are equal, the file is unchanged and need not be read again.
     """
     status = path.stat()
     return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
@@ -79,7 +76,7 @@ def file_state(path: Path) -> tuple[int, int, int, int]:
 
 @lru_cache(maxsize=16)
 def _read_once(path: Path, *state: int) -> Manifest:
-    """As long as the file stays as it is: tasks of a process read the same ones, and they may be large."""
+    """Return a cached manifest while its file is unchanged; manifests may be large, and tasks share them."""
     return _read_manifest(path)
 
 
@@ -87,9 +84,9 @@ def _read_manifest(path: Folder) -> Manifest:
     facts = json.loads(path.read_bytes())
     seal = facts.pop("digest")
     if digest(facts) != seal:
-        raise Damaged(f"{path} is not what was written: its digest differs")
+        raise Damaged(f"{path} has changed since it was written: its digest differs")
     if not _is_manifest(facts):
-        raise Damaged(f"{path} is not a manifest of this form")
+        raise Damaged(f"{path} is not a valid manifest")
     return Manifest(facts)
 
 
@@ -119,9 +116,9 @@ def _has_types(value: Any, types: dict[str, type]) -> bool:
 
 
 def file_entry(path: Path, relative: str) -> dict[str, Any]:
-    """A file's entry in the manifest: path, bytes, sha256, and of a Parquet file the checksums of its blocks.
+    """Return a file's entry in the manifest: path, size, sha256, and for a Parquet file the checksums of its blocks.
 
-    The blocks cover the file from its first byte to its last, so that whatever part of it is read can be compared.
+    The blocks cover the whole file, so that any part of it can be verified when it is read.
     """
     if relative.endswith(".parquet"):
         return {"path": relative, **parquet.file_checksums(path)}
@@ -129,9 +126,14 @@ def file_entry(path: Path, relative: str) -> dict[str, Any]:
 
 
 def check_size(folder: Folder, entry: Json) -> Folder:
-    """A listed file that has the size that the manifest says; what is in it is not looked at.  Errors: Damaged
+    """Return the path of a listed file after comparing its size with the manifest; the contents are not read.
 
-    Of an object nothing is asked: whoever opens it compares its size.
+    The size of an object on object storage is compared when it is opened.
+
+    Raises
+    ------
+    Damaged
+        If the file is missing or its size differs.
     """
     path: Folder = folder / entry["path"]
     if isinstance(path, ObjectPath):
@@ -142,7 +144,13 @@ def check_size(folder: Folder, entry: Json) -> Folder:
 
 
 def check_contents(folder: Folder, entry: Json) -> Path:
-    """A listed file whose every byte is what was written, by its sha256; of an object a copy.  Errors: Damaged"""
+    """Return the path of a listed file after comparing its sha256; an object on object storage is copied first.
+
+    Raises
+    ------
+    Damaged
+        If the file is missing or its contents differ.
+    """
     path = check_size(folder, entry)
     if isinstance(path, ObjectPath):
         return path.download(entry["sha256"])
@@ -151,7 +159,7 @@ def check_contents(folder: Folder, entry: Json) -> Path:
 
 
 def _check_sha256(path: Folder, entry: Json) -> None:
-    """Read all of a file.  Errors: Damaged"""
+    """Read a whole file, and raise Damaged if its sha256 differs from the manifest."""
     try:
         if file_sha256(path) == entry["sha256"]:
             return
@@ -164,7 +172,7 @@ def _size_fault(path: Path, entry: Json) -> str:
     try:
         return _size_difference(path, entry)
     except FileNotFoundError:
-        # Removed since, with its whole version.
+        # The whole version has been removed since.
         return f"{path} is missing"
     except OSError as error:
         return f"{path} cannot be read: {error.strerror}"
@@ -180,10 +188,21 @@ def _size_difference(path: Path, entry: Json) -> str:
 
 
 def faults(folder: Folder, facts: Json, deep: bool = False) -> list[str]:
-    """What is wrong with a version: a list of sentences, empty where all is well.
+    """Return the faults of a version.
 
-    facts : its manifest
-    deep  : also the sha256 of every file, and that each cell holds only its own rows, sorted
+    Parameters
+    ----------
+    folder : Path or ObjectPath
+        Folder of the version.
+    facts : mapping
+        Its manifest.
+    deep : bool, optional
+        True to compare the sha256 of every file, and to check that each cell contains only its own rows, sorted.
+
+    Returns
+    -------
+    list of str
+        One sentence per fault, empty for a sound version.
     """
     entries = facts["files"]
     names = {entry["path"] for entry in entries}
@@ -192,7 +211,7 @@ def faults(folder: Folder, facts: Json, deep: bool = False) -> list[str]:
     except OSError as error:
         return [f"{folder} cannot be read: {error}"]
     messages = [f"{folder / extra} is not in the manifest" for extra in sorted(sizes.keys() - names - {MANIFEST})]
-    # Hashing lets go of the interpreter: as many files at a time as there are cores.
+    # Hashing releases Python's global lock, so threads use all cores.
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for file_messages in pool.map(
             lambda entry: _file_faults(folder, entry, sizes.get(entry["path"], 0), deep), entries
@@ -200,22 +219,22 @@ def faults(folder: Folder, facts: Json, deep: bool = False) -> list[str]:
             messages += file_messages
     total = sum(entry.get("rows", 0) for entry in entries)
     if total != facts["rows"]:
-        messages.append(f"{folder / MANIFEST}: {facts['rows']} rows in all, {total} in the files")
+        messages.append(f"{folder / MANIFEST}: {facts['rows']} rows in total, but {total} in the files")
     return messages
 
 
 def _file_sizes(folder: Folder) -> Mapping[str, int]:
-    """Of every file below a folder its name and its bytes; of one that is none, 0."""
+    """Return the size in bytes of each file below a folder, by relative path (0 for a symbolic link)."""
     if isinstance(folder, ObjectPath):
         return folder.sizes()
-    # What another copy of a task was writing when the version was renamed is in nobody's way.
+    # Ignore temporary files of a duplicate task that was still writing when the version was published.
     permanent = (path for path in folder.rglob("*") if not is_temporary(path))
     files = [path for path in permanent if path.is_symlink() or not path.is_dir()]
     return {path.relative_to(folder).as_posix(): 0 if path.is_symlink() else path.stat().st_size for path in files}
 
 
 def _file_faults(folder: Folder, entry: Json, size: int, deep: bool) -> list[str]:
-    """What is wrong with a file, of which a listing says the size."""
+    """Return the faults of a file; `size` is its size according to a listing of the folder."""
     path = folder / entry["path"]
     if isinstance(path, ObjectPath) and size != entry["bytes"]:
         return [f"{path} has {size} bytes, the manifest says {entry['bytes']}" if size else f"{path} is missing"]
@@ -225,7 +244,7 @@ def _file_faults(folder: Folder, entry: Json, size: int, deep: bool) -> list[str
             return _row_faults(folder, entry) if "rows" in entry else []
         check_size(folder, entry)
         if PurePosixPath(entry["path"]).suffix == ".parquet":
-            # The footer.
+            # This verifies the footer.
             parquet.read_schema(folder, entry)
     except Damaged as error:
         return [str(error)]
@@ -236,7 +255,7 @@ def _file_faults(folder: Folder, entry: Json, size: int, deep: bool) -> list[str
 
 def _row_faults(folder: Folder, entry: Json) -> list[str]:
     path, schema = folder / entry["path"], parquet.read_schema(folder, entry)
-    # Refuses another number of rows.
+    # This refuses a wrong number of rows.
     rows = parquet.open_dataset(folder, [entry], schema)
     if "_healpix_29" not in schema.names or "Npix=" not in path.name:
         return []
@@ -251,7 +270,7 @@ def _row_faults(folder: Folder, entry: Json) -> list[str]:
 
 
 def write_json(path: Path, value: Json) -> None:
-    """Replace a JSON file in one rename, synced."""
+    """Replace a JSON file in one rename, and sync it to disc."""
     path.parent.mkdir(parents=True, exist_ok=True)
     staged = temporary_path(path)
     try:
@@ -266,19 +285,22 @@ def write_json(path: Path, value: Json) -> None:
 
 
 def temporary_path(path: Path) -> Path:
-    """A name beside a file that nobody else gives to their own: processes of two machines may have one number."""
+    """Return a temporary path in the folder of `path`.
+
+    Its name is random, because processes on two machines may have the same number.
+    """
     return path.with_name(f".{uuid4().hex[:12]}.tmp.{path.name}")
 
 
 def is_temporary(path: Path) -> bool:
-    """Is it a name that `temporary` gives?"""
+    """Return True if a path has a name from `temporary_path`."""
     return _TEMPORARY.match(path.name) is not None
 
 
 def _json_text(value: Json) -> str:
-    """JSON, a line for each value of the outermost object, and for each of its lists' entries.
+    """Return JSON with one line per value of the outermost object and per entry of its lists.
 
-    Spread out any further it would take Python's own encoder, which takes a minute where there are 100,000 parts.
+    Further indentation would require Python's slow encoder, which takes a minute for 100,000 partitions.
     """
     lines = []
     for key in sorted(value):
@@ -296,7 +318,7 @@ def _line(value: Any) -> str:
 
 
 def sync(path: Path) -> None:
-    """Make a file, or the names in a folder, survive a loss of power."""
+    """Sync a file, or the names in a folder, to disc, so that they survive a loss of power."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -1,8 +1,8 @@
-"""Parquet files as the lake writes and reads them: declared encodings, sorted rows, every byte compared when read.
+"""Write and read the Parquet files of a lake, with declared encodings and with checksums of every byte.
 
-A changed byte goes through pyarrow's, Spark's, pandas', DuckDB's and lsdb's own readers as a wrong number. Here a file
-is known by its entry in a manifest or receipt, and read by nothing but `blocks.Checked`: the decoder sees no byte that
-was not compared, be it of a page, of its header, or of the footer that says where pages are.
+Other readers (pyarrow, Spark, pandas, DuckDB, lsdb) return a changed byte as a wrong number. Here a file is read
+through `blocks.VerifiedFile` with its entry in a manifest or receipt. The decoder sees only verified bytes, including
+page headers and the footer.
 """
 
 from __future__ import annotations
@@ -22,22 +22,34 @@ from lake_schema.store import blocks
 from lake_schema.store.object_storage.s3 import Folder
 from lake_schema.store.plan import Json
 
-# Sorted by position, 65,536 rows a group is where small cones are fast and the footer still small (tried: 4k to 262k).
+# With this number of rows per group, small cone searches are fast and the footer is small (tried: 4k to 262k).
 ROWS_PER_GROUP = 65_536
 
 _FORMAT = ds.ParquetFileFormat()
 
 
 def write(path: Path, rows: pa.Table, table: Table) -> None:
-    """One file with the table's encodings, and its columns as a VOTable too; the same rows give the same bytes."""
+    """Write a Parquet file with the table's encodings and a VOTable header; equal rows give equal bytes.
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    rows : pyarrow.Table
+        Rows.
+    table : Table
+        Declaration of the table.
+    """
     with pq.ParquetWriter(path, rows.schema, **table.parquet_options()) as file:
         file.write_table(rows, row_group_size=ROWS_PER_GROUP)
         file.add_key_value_metadata(votable.footer_metadata(rows, table))
 
 
 def file_checksums(path: Path) -> dict[str, Any]:
-    """Size, sha256 and blocks of a file that was just written; a block holds the pages of one column of a row group,
-    with their headers, or of several small ones; the last one holds the page index and the footer.
+    """Return size, sha256 and blocks of a Parquet file that was just written.
+
+    A block contains the pages of one column of a row group with their headers, or several small such pieces. The last
+    block contains the page index and the footer.
     """
     metadata = pq.read_metadata(path)
     starts, end = [], 4  # the magic number
@@ -52,30 +64,48 @@ def file_checksums(path: Path) -> dict[str, Any]:
 class Dataset(ds.FileSystemDataset):  # type: ignore[misc]
     """Files of a lake as an Arrow dataset.
 
-    read_from : its files, in the order of its fragments
+    Attributes
+    ----------
+    verified_files : sequence of VerifiedFile
+        Its files, in the order of its fragments.
     """
 
     verified_files: Sequence[blocks.VerifiedFile] = ()
 
     @property
     def fault(self) -> str:
-        """Why one of the files was refused, "" where none was."""
+        """Reason why one of the files was refused, "" if none was."""
         return next((file.fault for file in self.verified_files if file.fault), "")
 
 
 def open_dataset(folder: Folder, entries: Sequence[Json], schema: pa.Schema) -> Dataset:
-    """Files below a folder as one Arrow dataset, in the order given.
+    """Open files in a folder as one Arrow dataset, in the given order.
 
-    entries : of the manifest
-    Errors  : Damaged names the file that has another footer, or other than the manifest's number of rows; whoever reads
-              the dataset meets it for what comes before the footer
+    Parameters
+    ----------
+    folder : Path or ObjectPath
+        Folder of the version.
+    entries : sequence of mapping
+        Entries of the files in the manifest.
+    schema : pyarrow.Schema
+        Schema of the dataset.
+
+    Returns
+    -------
+    Dataset
+        The dataset. Reading it raises an error if other parts of a file than its footer are damaged.
+
+    Raises
+    ------
+    Damaged
+        If the footer of a file or its number of rows differs from the manifest. The message names the file.
     """
     files = [blocks.VerifiedFile(folder / entry["path"], entry) for entry in entries]
     fragments = [_FORMAT.make_fragment(file) for file in files]
     merged = Dataset(fragments, schema, _FORMAT)
     merged.verified_files = files
     if len(fragments) > 1:
-        # Reads the footers, several at a time.
+        # This reads several footers at a time.
         merged.count_rows()
     for file, fragment, entry in zip(files, fragments, entries, strict=True):
         rows = fragment.metadata.num_rows
@@ -85,12 +115,38 @@ def open_dataset(folder: Folder, entries: Sequence[Json], schema: pa.Schema) -> 
 
 
 def read(folder: Folder, entry: Json, columns: Sequence[str] | None = None) -> pa.Table:
-    """The rows of one file, in the types that it was written with.  Errors: Damaged names the file."""
+    """Read the rows of one file, with the types with which they were written.
+
+    Parameters
+    ----------
+    folder : Path or ObjectPath
+        Folder of the version.
+    entry : mapping
+        Entry of the file in the manifest.
+    columns : sequence of str, optional
+        Names of columns; by default all.
+
+    Returns
+    -------
+    pyarrow.Table
+        The rows.
+
+    Raises
+    ------
+    Damaged
+        If the file differs from the manifest. The message names the file.
+    """
     with blocks.VerifiedFile(folder / entry["path"], entry) as file:
         return pq.read_table(file, columns=None if columns is None else list(columns))
 
 
 def read_schema(folder: Folder, entry: Json) -> pa.Schema:
-    """What columns a file has.  Errors: Damaged names the file."""
+    """Return the schema of a file.
+
+    Raises
+    ------
+    Damaged
+        If the file differs from the manifest. The message names the file.
+    """
     with blocks.VerifiedFile(folder / entry["path"], entry) as file:
         return pq.read_schema(file)

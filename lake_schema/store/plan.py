@@ -1,4 +1,4 @@
-"""What is to be made: a table, everything that goes into it, its parts.  The hash of it all names the version."""
+"""Plans of versions: a table, the facts that determine its contents, and its tasks. A plan's hash names the version."""
 
 from __future__ import annotations
 
@@ -18,11 +18,16 @@ Json = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """One file of a table and what its maker needs to know.
+    """One partition (file) of a table, and the facts that the task function needs to make it.
 
-    name  : file below dataset/ for a plain table, the HATS path for a catalogue's cell
-    facts : JSON values; they go into the plan's key
-    rows  : how many rows it must have, None = whatever its maker finds
+    Attributes
+    ----------
+    name : str
+        Path of the file below dataset/: a plain name, or the HATS path of a catalogue's cell.
+    facts : mapping
+        JSON values, which are part of the plan's key.
+    rows : int or None
+        Number of rows that the partition must have, or None if any number is allowed.
     """
 
     name: str
@@ -34,7 +39,14 @@ class Task:
 class Plan:
     """A version of a table that is to be made.
 
-    facts : JSON values of everything that goes into it (seed, request, inputs' keys, mission, code version)
+    Attributes
+    ----------
+    table : Table
+        Declaration of the table.
+    facts : mapping
+        JSON values of everything that determines the contents: seed, request, keys of inputs, mission, code version.
+    tasks : tuple of Task
+        One task per partition.
     """
 
     table: Table
@@ -43,13 +55,13 @@ class Plan:
 
     def __post_init__(self) -> None:
         if len({task.name for task in self.tasks}) != len(self.tasks):
-            raise BadInput(f"table {self.table.name}: the plan names a part twice")
+            raise BadInput(f"table {self.table.name}: the plan names a partition twice")
         if self.table.is_catalogue and not self.tasks:
             raise BadInput(f"table {self.table.name}: the plan has no cells")
 
     @property
     def key(self) -> str:
-        """16 hexadecimal digits that stand for all of it."""
+        """Key of the version: 16 hexadecimal digits of a hash of the declaration, the facts and the tasks."""
         table = self.table
         schema = [[f.name, str(f.type), f.nullable, _text(f.metadata)] for f in table.arrow_schema()]
         tasks = [[task.name, dict(task.facts), task.rows] for task in self.tasks]
@@ -59,7 +71,15 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class Output:
-    """What a part's maker returns: its rows, and files that belong to them (relative name -> writer of a path)."""
+    """Result of a task function.
+
+    Attributes
+    ----------
+    rows : pyarrow.Table
+        Rows of the partition.
+    files : mapping of str to callable
+        Further files: functions that write a file to a path, by relative name.
+    """
 
     rows: pa.Table
     files: Mapping[str, Callable[[Path], None]] = field(default_factory=dict)
@@ -69,7 +89,7 @@ TaskFunction = Callable[[Path, Json], Output]
 
 
 def data_path(table: Table, partition: str) -> str:
-    """Path of a part's Parquet file in a version."""
+    """Return the path of a partition's Parquet file in a version."""
     return f"{table.name}/dataset/{partition}" if table.is_catalogue else f"dataset/{partition}"
 
 

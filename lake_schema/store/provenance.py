@@ -1,4 +1,4 @@
-"""What made a product: the fingerprint of the code, and the canonical form of whatever else goes into a key."""
+"""Fingerprints of the code and of the environment that made a product, and hashes of JSON values."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from lake_schema.store.object_storage.s3 import Folder
 
 _ROOT = Path(__file__).resolve().parents[2]
 _PACKAGES = ("lake_schema", "truesky")
-# Examples, which a wheel has in the package and a clone has not.
+# Examples, which are in the package in a wheel but not in a clone.
 _EXCLUDED_FOLDERS = {"requests", "notebooks"}
 _SUFFIXES = {".py", ".csv", ".toml"}
-# Libraries whose version can change a byte of a product.
+# Libraries whose version can change the bytes of products.
 _LIBRARIES = (
     "astropy",
     "colossus",
@@ -36,23 +36,23 @@ _LIBRARIES = (
 
 
 def canonical(value: Any) -> bytes:
-    """JSON with sorted keys and no spaces: equal values give equal bytes; NaN and infinities are refused."""
+    """Return JSON with sorted keys and no spaces: equal values give equal bytes, and NaN and infinities are refused."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=True).encode()
 
 
 def digest(value: Any) -> str:
-    """sha256 of the canonical form, hexadecimal."""
+    """Return the sha256 (hexadecimal) of the canonical JSON of a value."""
     return hashlib.sha256(canonical(value)).hexdigest()
 
 
 def file_sha256(path: Folder) -> str:
-    """sha256 of a file's bytes, hexadecimal."""
+    """Return the sha256 (hexadecimal) of a file's contents."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def code_version(root: Path = _ROOT) -> str:
-    """Fingerprint of the code: every source and data file of lake_schema and truesky, and the libraries' versions."""
+    """Return a fingerprint of all source and data files of lake_schema and truesky, and of the libraries' versions."""
     files = sorted(
         path
         for package in _PACKAGES
@@ -66,17 +66,17 @@ def code_version(root: Path = _ROOT) -> str:
 
 
 def libraries() -> Mapping[str, str]:
-    """Python and the libraries that shape the bytes, with their versions."""
+    """Return the versions of Python and of the libraries that affect the bytes of products."""
     return {"python": platform.python_version(), **{name: version(name) for name in _LIBRARIES}}
 
 
 def machine() -> str:
-    """Kind of this machine, as recorded in receipts and manifests; never part of a version's key."""
+    """Return the kind of this machine, as recorded in receipts and manifests; it is never part of a version's key."""
     return instruction_set.kind()
 
 
 def git_commit(root: Path = _ROOT) -> str:
-    """The commit that is checked out, "unknown" outside a checkout; recorded, never part of a key."""
+    """Return the git commit of the checkout, or "unknown" outside one; it is recorded, but never part of a key."""
     try:
         process = subprocess.run(
             ["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, timeout=10, check=True

@@ -1,18 +1,21 @@
-"""How a table gets into the lake: never half, and never mistaken for another.
+"""Make and publish versions of tables, so that readers never see an incomplete version.
 
-plan      what is to be made: table, everything that goes into it, its parts.  Its hash names the version.
-stage     LAKE/<table>/.stage-<key>; a part's file is written under a temporary name, synced, hashed, renamed; its
-          receipt last, in the same way.
-publish   all parts there -> HATS metadata -> manifest -> one rename of the folder -> the link of the request that it is
-          made for and `current` swapped, each by one rename.
+A plan describes a table, everything that determines its contents, and its tasks; its hash names the version.
 
-State after a death at any point             what a reader sees        what the next run does
-before the first receipt                     the last version          everything
-between receipts                             the last version          what has no receipt, or not its sha256
-after the last receipt, before the rename    the last version          the metadata and the rename
-after the rename, before the request's link  the last version          both links
-between the two links                        the request's: the new    `current`
-after both                                   the new version           nothing
+1. Each partition is written to LAKE/<table>/.stage-<key> under a temporary name, synced, hashed and renamed. Its
+   receipt is written last, in the same way.
+2. When all partitions exist, HATS metadata and the manifest are written, and one rename of the folder publishes the
+   version. Then the request's link and the link `current` are replaced, each by one rename.
+
+If a run is killed::
+
+    at this point                                readers see               the next run makes
+    before the first receipt                     the last version          everything
+    between receipts                             the last version          what lacks a receipt or differs from it
+    after the last receipt, before the rename    the last version          the metadata and the rename
+    after the rename, before the request's link  the last version          both links
+    between the two links                        the new one by request    `current`
+    after both                                   the new version           nothing
 """
 
 from __future__ import annotations
@@ -68,16 +71,38 @@ def make_version(
     base: str | None = "",
     name: str | None = None,
 ) -> Path:
-    """Make what is missing of a plan's version and publish it; returns the version's folder.
+    """Make the missing partitions of a plan's version and publish it.
 
-    work   : (lake, facts of the plan and the part) -> its Output; runs wherever `mapper` runs it
-    mapper : like map: (function, parts) -> results in any order.  Results are only reported on; the receipts decide
-    base   : key of the version that this one replaces, "" = whatever is there when the call begins: of the request
-             that is named, else the current one
-    name   : of the request that the version is made for; what it is made of is then that request's as well
-    root   : folder of the lake;  plan : table, facts and parts
-    Errors : PartsFailed lists the parts that could not be made (the others are kept); Superseded where another run
-             holds the same plan, or has published another version since; Damaged where it is there and not whole
+    Parameters
+    ----------
+    root : Path
+        Folder of the lake.
+    plan : Plan
+        Table, facts and tasks.
+    task_function : callable
+        Function of (lake, facts of plan and task) that returns the Output of a task. `mapper` decides where it runs.
+    mapper : callable, optional
+        Function like map: takes (function, tasks) and returns results in any order. Results are only used to report
+        failures; receipts decide which tasks are done.
+    base : str or None, optional
+        Key of the version that this one replaces. By default ("") it is the version that exists at the call: the
+        version of the request if `name` is given, else the current one.
+    name : str, optional
+        Name of the request for which the version is made. The request is then also linked to the inputs of the plan.
+
+    Returns
+    -------
+    Path
+        Folder of the version.
+
+    Raises
+    ------
+    TasksFailed
+        If tasks failed. The output of the other tasks is kept.
+    Superseded
+        If another run is making the same version, or has published another one since this run began.
+    Damaged
+        If the version exists and is damaged.
     """
     table, key = plan.table.name, plan.key
     replaced_key = _replaced_key(root, table, name)
@@ -86,7 +111,7 @@ def make_version(
     folder = layout.table_folder(root, table)
     lock = folder / f".lock-{key}"
     if replaced_key == current_key(root, table) == key and target.exists() and not lock.exists():
-        # Nothing is left to do: said without a lock, also where nothing can be written.
+        # Nothing is left to do. This needs no lock, so it works in a lake that is not writable.
         _refuse_damaged(target, table)
         return target
     folder.mkdir(parents=True, exist_ok=True)
@@ -104,12 +129,12 @@ def make_version(
 
 
 def _replaced_key(root: Path, table: str, name: str | None) -> str | None:
-    """Key of the version that one made for a request, or for none, comes in the place of."""
+    """Return the key of the version that a new version for a request, or for none, would replace."""
     return current_key(root, table) if name is None else request_links.linked_key(root, name, table)
 
 
 def _pin_inputs(root: Path, plan: Plan, name: str) -> None:
-    """What a request's table is made of belongs to the request before it is used, so that nobody removes it."""
+    """Link the request to the inputs of its table before they are used, so that they are not removed meanwhile."""
     keys = set(request_links.version_keys_in(plan.facts))
     for table in set(layout.table_names(root)) - {plan.table.name}:
         for key in sorted(keys):
@@ -122,11 +147,11 @@ def _pin_inputs(root: Path, plan: Plan, name: str) -> None:
 
 def _refuse_damaged(target: Path, name: str) -> None:
     if faults := manifest.faults(target, manifest.load(target, name)):
-        raise Damaged(f"{faults[0]}; remove {target} to have it made again")
+        raise Damaged(f"{faults[0]}; remove {target} to make it again")
 
 
 def _run_tasks(root: Path, plan: Plan, task_function: TaskFunction, mapper: Mapper, name: str | None) -> list[Json]:
-    """Receipts of all parts, in the plan's order."""
+    """Run the missing tasks, and return the receipts of all tasks in the plan's order."""
     table, stage = plan.table, layout.stage_folder(root, plan.table.name, plan.key)
     discard_damaged(stage, plan)
     for version in _candidate_versions(root, table.name, name):
@@ -141,13 +166,13 @@ def _run_tasks(root: Path, plan: Plan, task_function: TaskFunction, mapper: Mapp
     if failed_tasks := [task for task in plan.tasks if task.name not in completed]:
         lines = [f"{task.name}: {failures.get(task.name, 'ended without a receipt')}" for task in failed_tasks]
         raise TasksFailed(
-            f"table {table.name}: {len(failed_tasks)} of {len(plan.tasks)} parts failed: " + "; ".join(lines)
+            f"table {table.name}: {len(failed_tasks)} of {len(plan.tasks)} tasks failed: " + "; ".join(lines)
         )
     return [completed[task.name] for task in plan.tasks]
 
 
 def _candidate_versions(root: Path, table: str, name: str | None) -> list[Path]:
-    """Versions that may hold some of the parts already: the request's own, the last one, those of other requests."""
+    """Return versions that may contain reusable partitions: the request's, the current one, and other requests'."""
     keys = [
         _replaced_key(root, table, name),
         current_key(root, table),
@@ -158,10 +183,7 @@ def _candidate_versions(root: Path, table: str, name: str | None) -> list[Path]:
 
 
 def _finish_stage(stage: Path, plan: Plan, task_receipts: Sequence[Json]) -> None:
-    """Metadata and manifest: after this the stage is the version, all but its name.
-
-    made : receipts of the plan's parts
-    """
+    """Write metadata and manifest into a stage, given the receipts of its tasks; then only the rename is left."""
     refuse_duplicates(stage, plan, task_receipts)
     entries = {f["path"]: f for receipt in task_receipts for f in receipt["files"]}
     _remove_unlisted(stage, set(entries))
@@ -172,12 +194,12 @@ def _finish_stage(stage: Path, plan: Plan, task_receipts: Sequence[Json]) -> Non
     for path in sorted(stage.rglob("*")):
         relative = path.relative_to(stage).as_posix()
         if manifest.is_temporary(path):
-            # Of another copy of a task, which is still running.
+            # Another copy of a task is still running and writes this file.
             continue
         if path.is_file():
             entry = entries.pop(relative, None)
             if entry is None:
-                # What a receipt names was synced before.
+                # Files of receipts were synced before, other files were not.
                 entry = manifest.file_entry(path, relative)
                 sync(path)
             files.append({**entry, **({"rows": rows[relative]} if relative in rows else {})})
@@ -203,7 +225,7 @@ def _finish_stage(stage: Path, plan: Plan, task_receipts: Sequence[Json]) -> Non
                 for task, receipt in zip(plan.tasks, task_receipts, strict=True)
             ],
             "rows": sum(rows.values()),
-            # Whoever reads it can tell which last bits may differ where it is made again.
+            # Readers can see from this if last bits may differ when the version is made again elsewhere.
             "machines": sorted({str(r["machine"]) for r in task_receipts}),
             "files": files,
             **deflections,
@@ -212,7 +234,7 @@ def _finish_stage(stage: Path, plan: Plan, task_receipts: Sequence[Json]) -> Non
 
 
 def _remove_unlisted(stage: Path, listed: set[str]) -> None:
-    """Remove what no receipt names: temporary files of dead tasks, metadata of an interrupted finish."""
+    """Remove files that no receipt lists: temporary files of killed tasks, and metadata of an interrupted run."""
     for path in sorted(stage.rglob("*"), reverse=True):
         if path.is_file() and path.relative_to(stage).as_posix() not in listed:
             path.unlink(missing_ok=True)

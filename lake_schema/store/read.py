@@ -1,11 +1,6 @@
-"""How a published table is read: through its manifest, never a glob, every byte compared before it is decoded.
+"""Read published tables through their manifests; every byte is verified before it is decoded.
 
-version(root, name)     a published version (resolved once: a later publication does not mix in)
-for_request             the one that a request's next table is made of
-Version.dataset, .rows  its files as an Arrow dataset; rows of some columns or parts
-Version.beside, .file   rows of a Parquet file that is not of its table; any other file, such as an image
-Version.margin, .in_cells, .cone  rows just outside a part's cell, in HEALPix cells, in a circle by either position
-verify                  is a version what its manifest says?
+A version is resolved once, so a later publication does not change what is read.
 """
 
 from __future__ import annotations
@@ -31,11 +26,11 @@ from lake_schema.store import layout, manifest, parquet, request_links
 from lake_schema.store.object_storage.s3 import Folder, ObjectPath
 from lake_schema.store.provenance import digest
 
-# Which positions of a catalogue's sources a selection goes by.
+# Positions of a catalogue's sources by which rows can be selected.
 POSITION_KINDS = ("observed", "true")
-# So many stretches of _healpix_29 go into the filter of one file; the rest of its rows are left out after reading.
+# Largest number of ranges of _healpix_29 in the filter of one file; other rows outside the region are removed later.
 _MAX_RANGES = 16
-# Added to a padded radius: more than the rounding of the largest deflection.
+# Safety margin of a padded radius (deg), larger than the rounding error of the largest deflection.
 _ROUNDING_DEG = 1e-9
 
 
@@ -43,7 +38,14 @@ _ROUNDING_DEG = 1e-9
 class Version:
     """One published version of a table.
 
-    schema : of its rows, with units and descriptions in the fields' metadata
+    Attributes
+    ----------
+    folder : Path or ObjectPath
+        Folder of the version.
+    manifest : Manifest
+        Contents of its manifest.
+    schema : pyarrow.Schema
+        Schema of its rows; the metadata of its fields contain units and descriptions.
     """
 
     folder: Folder
@@ -55,37 +57,43 @@ class Version:
 
     @property
     def table(self) -> str:
+        """Name of the table."""
         return str(self.manifest["table"])
 
     @property
     def key(self) -> str:
-        """What stands for this version in the plan of a table made from it."""
+        """Key of the version; plans of tables made from this version contain it."""
         return str(self.manifest["key"])
 
     @property
     def fingerprint(self) -> str:
-        """sha256 over the sha256 of every file, hexadecimal: what the version holds, whatever it was made from."""
+        """sha256 (hexadecimal) of the sha256 of all files: it depends on the version's contents, not on its inputs."""
         return digest({entry["path"]: entry["sha256"] for entry in self.manifest["files"]})
 
     @property
     def num_rows(self) -> int:
+        """Number of rows."""
         return int(self.manifest["rows"])
 
     @property
     def partitions(self) -> list[str]:
+        """Names of the partitions in the order of the plan."""
         return [str(entry["name"]) for entry in self.manifest["parts"]]
 
     def partition_path(self, partition: str) -> Path:
-        """A part's Parquet file for a reader of somebody else's: only its size is compared; or a copy, as of `file`."""
+        """Return the path of a partition's Parquet file for other readers; only its size is compared.
+
+        On object storage, the file is copied and its sha256 is compared.
+        """
         path = manifest.check_size(self.folder, self._partition_entry(partition))
         return path.download(self.partition_sha256(partition)) if isinstance(path, ObjectPath) else path
 
     def partition_sha256(self, partition: str) -> str:
-        """sha256 of a part's Parquet file, as it was published."""
+        """Return the sha256 of a partition's Parquet file when it was published."""
         return str(self._partition_entry(partition)["sha256"])
 
     def partition_rows(self, partition: str) -> int:
-        """Number of rows of a part."""
+        """Return the number of rows of a partition."""
         return int(self._partition_entry(partition)["rows"])
 
     def _partition_entry(self, partition: str) -> dict[str, Any]:
@@ -93,17 +101,28 @@ class Version:
         for prefix in (f"{self.table}/dataset/", "dataset/"):
             if (entry := entries.get(prefix + partition)) is not None:
                 return entry
-        raise BadInput(f"table {self.table}: version {self.key} has no part {partition}")
+        raise BadInput(f"table {self.table}: version {self.key} has no partition {partition}")
 
     def sidecar_path(self, relative: str) -> Path:
-        """Any other file, such as an image; Damaged where its sha256 is not what the manifest says.
+        """Return the path of another file of the version, such as an image, after comparing its sha256.
 
-        Of a lake on object storage it is a copy, in a temporary folder that goes with the process.
+        On object storage, it is copied to a temporary folder that is removed when the process ends.
+
+        Raises
+        ------
+        Damaged
+            If the file differs from the manifest.
         """
         return manifest.check_contents(self.folder, self._file_entry(relative))
 
     def sidecar_folder(self, relative: str) -> Path:
-        """A folder of files beside the table; of a lake on object storage one with copies of them.  Errors: Damaged"""
+        """Return a folder with further files of the version; on object storage, they are copied to a temporary folder.
+
+        Raises
+        ------
+        Damaged
+            If a copied file differs from the manifest.
+        """
         folder = self.folder / relative
         if isinstance(folder, Path):
             return folder
@@ -111,11 +130,11 @@ class Version:
         return folder.gather_copies(copies)
 
     def has_file(self, relative: str) -> bool:
-        """Whether there is such a file."""
+        """Return True if the version contains a file of this relative path."""
         return relative in self._entries_by_path()
 
     def file_sha256(self, relative: str) -> str:
-        """sha256 of such a file, as it was published."""
+        """Return the sha256 of a file when it was published."""
         return str(self._file_entry(relative)["sha256"])
 
     def _file_entry(self, relative: str) -> dict[str, Any]:
@@ -128,7 +147,7 @@ class Version:
         return self.manifest.by_path
 
     def dataset(self, partitions: Iterable[str] | None = None) -> parquet.Dataset:
-        """The version's files (or those parts') as an Arrow dataset that refuses what is not as it was written."""
+        """Return the files of all or some partitions as an Arrow dataset that verifies what it reads."""
         entries = [
             self._partition_entry(partition) for partition in (self.partitions if partitions is None else partitions)
         ]
@@ -142,7 +161,7 @@ class Version:
 
     @contextmanager
     def _errors_as_damaged(self) -> Iterator[None]:
-        """What Arrow cannot read although it is as it was written."""
+        """Turn errors of Arrow into Damaged; they occur if it cannot decode a file that matches the manifest."""
         try:
             yield
         except (OSError, pa.ArrowInvalid) as error:
@@ -154,23 +173,42 @@ class Version:
         partitions: Iterable[str] | None = None,
         where: ds.Expression | None = None,
     ) -> pa.Table:
-        """Rows in file order.
+        """Return rows in the order of the files.
 
-        columns : names, None = all;  parts : names of parts, None = all;  where : an Arrow filter
+        Parameters
+        ----------
+        columns : sequence of str, optional
+            Names of columns; by default all.
+        partitions : iterable of str, optional
+            Names of partitions; by default all.
+        where : pyarrow.dataset.Expression, optional
+            Filter of the rows.
+
+        Returns
+        -------
+        pyarrow.Table
+            The rows.
+
+        Raises
+        ------
+        BadInput
+            If a column or partition does not exist.
+        Damaged
+            If a file differs from the manifest.
         """
         self._check_columns(columns or ())
         with self._errors_as_damaged():
             return self.dataset(partitions).to_table(columns=None if columns is None else list(columns), filter=where)
 
     def read_margin(self, partition: str, columns: Sequence[str] | None = None) -> pa.Table:
-        """Rows of a catalogue beside a part's cell, within 10" of it and a little farther."""
+        """Return the rows of a catalogue outside a partition's cell, up to 10" or slightly more from its edge."""
         self._check_columns(columns or ())
         entry = self._file_entry(f"{self.table}_margin/dataset/{partition}")
         with self._errors_as_damaged():
             return self._open_dataset([entry], self.schema).to_table(columns=None if columns is None else list(columns))
 
     def read_sidecar(self, relative: str) -> pa.Table:
-        """Rows of a Parquet file of the version that is no part of its table."""
+        """Return the rows of a Parquet file of the version that does not belong to its table."""
         entry = self._file_entry(relative)
         manifest.check_size(self.folder, entry)
         with self._errors_as_damaged():
@@ -183,9 +221,21 @@ class Version:
                 raise BadInput(f"table {self.table} has no column {name}")
 
     def rows_in_cells(self, cells: Sequence[int], order: int, columns: Sequence[str] | None = None) -> pa.Table:
-        """Rows of a catalogue inside cells of an order (nested), reading only files and row groups that can hold some.
+        """Return the rows of a catalogue in HEALPix cells; only matching files and row groups are read.
 
-        cells : int[n]
+        Parameters
+        ----------
+        cells : sequence of int
+            Nested cells.
+        order : int
+            HEALPix order of the cells.
+        columns : sequence of str, optional
+            Names of columns; by default all.
+
+        Returns
+        -------
+        pyarrow.Table
+            The rows.
         """
         unique_cells = np.unique(np.asarray(cells, np.int64))
         names = None if columns is None else list(dict.fromkeys([*columns, "_healpix_29"]))
@@ -204,18 +254,34 @@ class Version:
     def cone(
         self, ra: float, dec: float, radius: float, columns: Sequence[str] | None = None, on: str = "observed"
     ) -> pa.Table:
-        """Rows of a catalogue within `radius` of a place, its edge included.
+        """Return the rows of a catalogue within a circle, including its edge.
 
-        ra, dec, radius : deg
-        on              : "observed" or "true", which of a source's positions counts
-        columns         : that are wanted; None: all of them
-        Errors          : BadInput for a place or radius outside its bounds, or a column that is not there
+        Parameters
+        ----------
+        ra, dec : float
+            Centre of the circle in deg.
+        radius : float
+            Radius in deg, 0 to 180.
+        columns : sequence of str, optional
+            Names of columns; by default all.
+        on : str, optional
+            Positions that are compared: "observed" or "true".
+
+        Returns
+        -------
+        pyarrow.Table
+            The rows.
+
+        Raises
+        ------
+        BadInput
+            If a coordinate or the radius is outside its bounds, or a column does not exist.
         """
         radius = arguments.check_number("radius", radius, 0.0, 180.0)
         sky.check_positions(arguments.check_number("ra", ra), arguments.check_number("dec", dec))
         position_names = self.position_columns(on)
         self._check_columns([*position_names, "_healpix_29"])
-        # Files go by observed positions: a source may lie so far beyond the cells of its true one.
+        # Files are sorted by observed positions, so a source can be this far from the cells of its true position.
         padded = radius if position_names == ("ra", "dec") else radius + self.max_deflection() + _ROUNDING_DEG
         order = sky.cover_order(padded)
         names = None if columns is None else list(dict.fromkeys([*columns, *position_names]))
@@ -225,23 +291,26 @@ class Version:
         return rows if columns is None else rows.select(list(columns))
 
     def position_columns(self, on: str = "observed") -> tuple[str, str]:
-        """Columns of ra and dec of a catalogue's observed or true positions: the same ones if nothing lenses it.
+        """Return the columns of ra and dec of observed or true positions; both are equal in a table without lensing.
 
-        on : one of ON;  Errors : BadInput for another
+        Raises
+        ------
+        BadInput
+            If `on` is not one of `POSITION_KINDS`.
         """
         if on not in POSITION_KINDS:
             raise BadInput(f"on = {on!r} is not one of {', '.join(POSITION_KINDS)}")
         return ("ra_true", "dec_true") if on == "true" and "ra_true" in self.schema.names else ("ra", "dec")
 
     def max_deflection(self) -> float:
-        """Largest distance of a lensed from its true position, deg, as it was when the version was published."""
+        """Return the largest distance (deg) between observed and true positions when the version was published."""
         if "deflection_deg" not in self.manifest:
-            raise BadInput(f"table {self.table}: version {self.key} does not say how far positions are lensed")
+            raise BadInput(f"table {self.table}: the manifest of version {self.key} has no largest deflection")
         return float(self.manifest["deflection_deg"])
 
 
 def _cells_in_partition(partition: str, cells: Int, order: int) -> Int:
-    """Those of the cells that a part's cell overlaps."""
+    """Return the cells that overlap a partition's cell."""
     file_order, cell = layout.cell_of_file(partition)
     if file_order <= order:
         inside: Int = cells[sky.parent(cells, order, file_order) == cell]
@@ -251,7 +320,10 @@ def _cells_in_partition(partition: str, cells: Int, order: int) -> Int:
 
 
 def _ranges(cells: Int, order: int) -> list[tuple[int, int]]:
-    """Half-open stretches of order-29 indices that cover sorted cells: at most _MOST_RANGES, widest gaps left out."""
+    """Return half-open ranges of order-29 indices that cover sorted cells.
+
+    At most `_MAX_RANGES` ranges are returned, so only the widest gaps between the cells are left out.
+    """
     gaps = np.diff(cells)
     cuts = np.flatnonzero(gaps > 1)
     if cuts.size >= _MAX_RANGES:
@@ -272,13 +344,33 @@ def _range_filter(ranges: Sequence[tuple[int, int]]) -> ds.Expression:
 
 
 def version(root: Folder, name: str, key: str | None = None, request: str | None = None) -> Version:
-    """A published version of a table: the one of a key, or of a request; without these, the one published last.
+    """Return a published version of a table: by key or by request, else the one published last.
 
-    root : of the lake;  name : of the table
+    Parameters
+    ----------
+    root : Path or ObjectPath
+        Root of the lake.
+    name : str
+        Name of the table.
+    key : str, optional
+        Key of the version.
+    request : str, optional
+        Name of the request whose version is returned.
 
-    Errors : BadInput where the lake has no such table, version or request, or where several requests have versions of
-             their own and none is named; Damaged where its manifest is missing, broken or another's; VersionMismatch
-             where it was written with a declaration that this code cannot read
+    Returns
+    -------
+    Version
+        The version.
+
+    Raises
+    ------
+    BadInput
+        If the lake has no such table, version or request, or if requests have different versions and neither a key nor
+        a request is given.
+    Damaged
+        If the manifest is missing, broken or belongs to another version.
+    VersionMismatch
+        If this code cannot read the declaration with which the version was written.
     """
     selected_key = key or _select_key(root, name, request)
     if selected_key is None:
@@ -287,16 +379,35 @@ def version(root: Folder, name: str, key: str | None = None, request: str | None
 
 
 def input_version(root: Folder, name: str, request: str) -> Version:
-    """What the next table of a request is made of: its own version of a table, else the one that was published last.
+    """Return the version of a table from which a request's next table is made.
 
-    The second is for requests that share a catalogue.  Errors: as `version`
+    This is the request's version, else the version that was published last (for requests that share a catalogue).
+
+    Parameters
+    ----------
+    root : Path or ObjectPath
+        Root of the lake.
+    name : str
+        Name of the table.
+    request : str
+        Name of the request.
+
+    Returns
+    -------
+    Version
+        The version.
+
+    Raises
+    ------
+    BadInput, Damaged, VersionMismatch
+        As in `version`.
     """
     request_key = request_links.linked_key(root, request, name)
     return latest_version(root, name) if request_key is None else version(root, name, request=request)
 
 
 def latest_version(root: Folder, name: str) -> Version:
-    """The version that `current` leads to, whichever request it belongs to.  Errors: as `version`"""
+    """Return the version that was published last, of any request; it raises the errors of `version`."""
     current_key = layout.current_key(root, name)
     if current_key is None:
         raise BadInput(f"lake {root} has no table {name}")
@@ -307,7 +418,7 @@ def _select_key(root: Folder, name: str, request: str | None) -> str | None:
     if request is not None:
         return request_links.linked_key(root, request_links.check_request(root, request), name)
     if len(set((keys_by_request := request_links.keys_by_request(root, name)).values())) > 1:
-        requests = f"requests {', '.join(keys_by_request)} have versions of their own of table {name}"
+        requests = f"requests {', '.join(keys_by_request)} have different versions of table {name}"
         raise BadInput(f"lake {root}: {requests}: name one of them")
     return layout.current_key(root, name)
 
@@ -336,11 +447,14 @@ def _open_version(root: Folder, name: str, key: str, is_requested: bool, link: F
 
 
 def with_declared_schema(published: Version, table: Table) -> Version:
-    """The version with the schema that `table` declares.
+    """Return the version with the schema that `table` declares.
 
-    Errors : VersionMismatch, naming both versions or the first column that differs
+    Raises
+    ------
+    VersionMismatch
+        If the declarations differ. The message names both versions or the first column that differs.
     """
-    # To Arrow schemas are equal whatever their units.
+    # Arrow ignores units when it compares schemas, so they are compared separately.
     units = tuple((column.metadata or {}).get(b"unit", b"") for column in published.schema)
     return replace(
         published, schema=_declared_schema(published.schema, units, int(published.manifest["version"]), table)
@@ -350,13 +464,13 @@ def with_declared_schema(published: Version, table: Table) -> Version:
 @lru_cache(maxsize=64)
 def _declared_schema(stored: pa.Schema, units: tuple[bytes, ...], stored_version: int, table: Table) -> pa.Schema:
     if stored_version != table.version:
-        # Numbers of development versions do not tell which is the later one.
+        # Version numbers during development do not show which one is later.
         raise VersionMismatch(
-            f"table {table.name}: another version of truesky wrote it: "
-            f"its declaration is of version {stored_version}, this truesky reads version {table.version}"
+            f"table {table.name}: written by another version of truesky: "
+            f"it has version {stored_version} of the declaration, but this truesky reads version {table.version}"
         )
     if stored.names and (fault := _difference(stored, table)):
-        raise VersionMismatch(f"table {table.name}: {fault}: another truesky wrote it")
+        raise VersionMismatch(f"table {table.name}: {fault}: written by another version of truesky")
     return table.arrow_schema()
 
 
@@ -369,21 +483,21 @@ def _difference(stored: pa.Schema, table: Table) -> str:
             return f"column {column.name} is missing"
         have, want = stored.field(column.name), column.field()
         if have.type != want.type or (have.nullable and not want.nullable):
-            return f"column {column.name} is {have}, wanted {want}"
+            return f"column {column.name} is {have}, but must be {want}"
         unit = (have.metadata or {}).get(b"unit", b"").decode()
         if unit != column.unit:
-            return f"column {column.name} has unit {unit!r}, wanted {column.unit!r}"
+            return f"column {column.name} has unit {unit!r}, but must have {column.unit!r}"
     return ""
 
 
 def table_names(root: Folder) -> list[str]:
-    """Names of the published tables, those that are damaged among them."""
+    """Return the names of the published tables, including damaged ones."""
     return layout.table_names(root)
 
 
 def find_faults(published: Version, deep: bool = False) -> list[str]:
-    """What is wrong with a version: a list of sentences, empty where all is well.
+    """Return the faults of a version as sentences, empty for a sound version.
 
-    deep : also the sha256 of every file, and that each cell holds only its own rows, sorted
+    If `deep`, the sha256 of every file is compared, and each cell is checked to contain only its own rows, sorted.
     """
     return manifest.faults(published.folder, published.manifest, deep)

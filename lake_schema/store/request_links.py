@@ -1,13 +1,7 @@
-"""Requests side by side in one lake: which version of each table belongs to which of them.
+"""Links from requests to their versions of tables, so that several requests can share a lake.
 
-LAKE/names/<name>/<table> -> ../../<table>/v-<key>
-
-A link is replaced in one rename.  What a name links to, and what that was made of, is never removed.
-
-names       of the requests in a lake
-key_of      of a table, the version that a request has
-holders     of a table, every request that has a version
-keys_in     keys of versions that the facts of a plan name: what it was made of
+The links are LAKE/names/<name>/<table> -> ../../<table>/v-<key>. A link is replaced in one rename. Linked versions and
+the versions from which they were made are never removed.
 """
 
 from __future__ import annotations
@@ -27,42 +21,68 @@ _KEY = re.compile(r"[0-9a-f]{16}", re.ASCII)
 
 
 def request_names(root: Folder) -> list[str]:
-    """Names of the requests that have a table here, sorted."""
+    """Return the sorted names of the requests that have a table in the lake."""
     folder = layout.requests_folder(root)
     return sorted(path.name for path in folder.iterdir() if layout.is_name(path.name)) if folder.is_dir() else []
 
 
 def check_request(root: Folder, name: str) -> str:
-    """The name, if the lake has a request of it; else BadInput lists those that it has."""
+    """Return the name if the lake has such a request, else raise BadInput, which lists the requests of the lake."""
     if layout.check_name(name) not in (existing := request_names(root)):
         raise BadInput(f"lake {root} has no request {name}" + (f"; it has {', '.join(existing)}" if existing else ""))
     return name
 
 
 def tables_of_request(root: Folder, name: str) -> list[str]:
-    """The tables that a request has a version of, sorted."""
+    """Return the sorted names of the tables of which a request has a version."""
     folder = layout.requests_folder(root) / layout.check_name(name)
     return sorted(path.name for path in folder.iterdir() if layout.is_name(path.name)) if folder.is_dir() else []
 
 
 def linked_key(root: Folder, name: str, table: str) -> str | None:
-    """Key of the version that a request has, which may be missing; None where it has none.
+    """Return the key of a request's version of a table, or None if it has none; the version may be missing.
 
-    Errors : Damaged where the link is none, or does not lead to a version of the table
+    Parameters
+    ----------
+    root : Path or ObjectPath
+        Root of the lake.
+    name : str
+        Name of the request.
+    table : str
+        Name of the table.
+
+    Returns
+    -------
+    str or None
+        Key of the version.
+
+    Raises
+    ------
+    Damaged
+        If the file is not a link to a version of the table.
     """
     return layout.linked_key(layout.request_link(root, name, table), table)
 
 
 def keys_by_request(root: Folder, table: str) -> dict[str, str]:
-    """Name of every request that has a version of a table -> its key."""
+    """Return the key of each request's version of a table, by name of the request."""
     keys = {name: linked_key(root, name, table) for name in request_names(root)}
     return {name: key for name, key in keys.items() if key is not None}
 
 
 def link_version(root: Path, name: str, table: str, key: str) -> None:
-    """Give a request a version of a table; the caller holds the table's lock.
+    """Link a request to a version of a table; the caller must hold the table's lock.
 
-    root : of the lake;  name : of the request;  table, key : of the version
+    Parameters
+    ----------
+    root : Path
+        Folder of the lake.
+    name : str
+        Name of the request.
+    table : str
+        Name of the table.
+    key : str
+        Key of the version.
     """
     link = layout.request_link(root, name, table)
     if not link.parent.is_dir():
@@ -73,7 +93,7 @@ def link_version(root: Path, name: str, table: str, key: str) -> None:
 
 
 def replace_link(link: Path, target: str) -> None:
-    """Replace a link in one rename, synced."""
+    """Replace a link in one rename, and sync it to disc."""
     temporary = link.with_name(f".{link.name}.{os.getpid()}.tmp")
     temporary.unlink(missing_ok=True)
     temporary.symlink_to(target)
@@ -82,7 +102,7 @@ def replace_link(link: Path, target: str) -> None:
 
 
 def version_keys_in(facts: Any) -> Iterator[str]:
-    """Every text in a plan's facts that has the form of a version's key, whatever it is called there."""
+    """Yield every text in the facts of a plan that has the form of a version's key, under any name."""
     pending = [facts]
     while pending:
         value = pending.pop()

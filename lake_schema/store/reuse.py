@@ -1,7 +1,7 @@
-"""What an older version already holds is not made twice.
+"""Reuse partitions of older versions instead of making them again.
 
-A part whose facts have a PRODUCT, the digest of everything that shapes its bytes, is taken from a version that has the
-same part of the same product: its files are linked, after their sha256 has been compared.
+If the facts of a task contain `PRODUCT`, the digest of everything that determines its bytes, the partition is taken
+from a version with the same task and digest. Its files are linked after their sha256 has been compared.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ PRODUCT = "product"
 
 
 def manifest_facts(task: Task, receipt: Json) -> Json:
-    """What the manifest says of a part that can be used again: its rows and files."""
+    """Return the entries of the manifest for a reusable partition: rows, files, machine."""
     if PRODUCT not in task.facts:
         return {}
     span = {"span": receipt["span"]} if "span" in receipt else {}
@@ -30,11 +30,21 @@ def manifest_facts(task: Task, receipt: Json) -> Json:
 
 
 def reusable_tasks(root: Path, table: str, request: str) -> Mapping[str, str]:
-    """The parts of a request's present version that can be used again: name -> PRODUCT.
+    """Return the digests (`PRODUCT`) of the reusable partitions of a request's version, by name.
 
-    There are none if the request has no version, or one that cannot be read.
+    Parameters
+    ----------
+    root : Path
+        Folder of the lake.
+    table : str
+        Name of the table.
+    request : str
+        Name of the request.
 
-    root : folder of the lake;  table : its name;  request : its name
+    Returns
+    -------
+    mapping of str to str
+        Digests by name; empty if the request has no version or an unreadable one.
     """
     key = request_links.linked_key(root, request, table)
     if key is None:
@@ -49,10 +59,18 @@ def reusable_tasks(root: Path, table: str, request: str) -> Mapping[str, str]:
 
 
 def link_reusable(stage: Path, version: Path, table: str, tasks: Sequence[Task]) -> None:
-    """Give a stage those of the parts that a version has; what is missing or damaged there is made again.
+    """Link the reusable partitions of a version into a stage; missing and damaged ones are left out and made again.
 
-    stage   : folder of the version that is being made;  version : folder of the version that may have parts of it
-    table   : its name;  parts : of the plan that is being made
+    Parameters
+    ----------
+    stage : Path
+        Folder of the version that is being made.
+    version : Path
+        Folder of the version that may contain reusable partitions.
+    table : str
+        Name of the table.
+    tasks : sequence of Task
+        Tasks that are not done yet.
     """
     if not any(PRODUCT in task.facts for task in tasks):
         return
@@ -75,7 +93,7 @@ def link_reusable(stage: Path, version: Path, table: str, tasks: Sequence[Task])
 
 
 def _intact_entry(folder: Path, entry: Json) -> Json | None:
-    """The entry of a file that is as it was published, None of another."""
+    """Return the entry of a file that is unchanged since it was published, else None."""
     path = str(entry["path"])
     try:
         if file_sha256(folder / path) != str(entry["sha256"]):
@@ -91,9 +109,9 @@ def _link_file(source: Path, target: Path) -> None:
     try:
         os.link(source, temporary)
     except OSError:
-        # A file system without links.
+        # The file system does not support hard links.
         shutil.copyfile(source, temporary)
     os.replace(temporary, target)
-    # Two names of one file: the replacement is then no operation, and leaves the first.
+    # If both names already refer to the same file, os.replace does nothing and the temporary name remains.
     temporary.unlink(missing_ok=True)
     manifest.sync(target.parent)

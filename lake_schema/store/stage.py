@@ -1,7 +1,8 @@
-"""One part of a version: checked, written, hashed, its receipt last.  Everything here runs wherever the map runs it.
+"""Make one partition of a version: run its task, check and write its files, and write its receipt last.
 
-A part is done when its receipt is there and its files have the sizes that it says; where a run begins, their sha256.
-Two copies of a task may run at a time, on machines of one kind, and one of them longer than the run.
+A task is done if its receipt exists and its files have the recorded sizes; at the start of a run, their sha256 are
+compared, too. Two copies of a task may run at the same time, on machines of the same kind, and one of them may outlive
+the run. The functions for one task run on the workers.
 """
 
 from __future__ import annotations
@@ -27,18 +28,40 @@ from lake_schema.store.plan import Json, Output, Plan, Task, TaskFunction, data_
 from lake_schema.store.provenance import file_sha256, machine
 from lake_schema.store.validate import check_rows
 
-# A part whose identifiers spread over more blocks than this has none worth noting (order 3 has 1024 of a kind).
+# Largest number of identifier blocks that a receipt lists (a cell of order 3 has 1024 blocks of each kind).
 _MAX_BLOCKS = 4096
-# Receipts that are looked at at once: what a file system on the network takes is waited for.
+# Number of receipts that are read at the same time, because a network file system has long waiting times.
 _READ_THREADS = 16
 
 
 def run_task(root: Path, key: str, table: Table, facts: Json, task_function: TaskFunction, task: Task) -> Json:
-    """Make and write one part, if it is not done yet; a failure comes back as {"part", "error", "traceback", "final"}.
+    """Make and write one partition, unless it is done.
 
-    final : the same input will fail again
-    root, key   : folder of the lake, key of the version;  table : its declaration;  part : of the plan
-    facts, work : of the plan, and what makes a part's Output of them and the part's own
+    Parameters
+    ----------
+    root : Path
+        Folder of the lake.
+    key : str
+        Key of the version.
+    table : Table
+        Declaration of the table.
+    facts : mapping
+        Facts of the plan.
+    task_function : callable
+        Function of (lake, facts of plan and task) that returns an Output.
+    task : Task
+        The task.
+
+    Returns
+    -------
+    mapping
+        The receipt, or after a failure {"part", "error", "traceback", "final"}, in which "final" is True if the same
+        input will fail again.
+
+    Raises
+    ------
+    Superseded
+        Only internally: all exceptions are returned as failures.
     """
     stage = layout.stage_folder(root, table.name, key)
     if is_done(stage, task):
@@ -47,10 +70,10 @@ def run_task(root: Path, key: str, table: Table, facts: Json, task_function: Tas
         instruction_set.require_limit()
         output = task_function(root, {**facts, **task.facts})
         if is_done(stage, task):
-            # Another copy of this task was faster.
+            # Another copy of this task has finished first.
             return read_receipt(stage, task.name) or {}
         if not stage.is_dir():
-            raise Superseded(f"table {table.name}: version {key} was published before {task.name} was made once more")
+            raise Superseded(f"table {table.name}: version {key} was published before this copy of {task.name} ended")
         return write_partition(stage, table, task, output)
     except Exception as error:
         is_refusal = isinstance(error, LakeError)
@@ -59,17 +82,37 @@ def run_task(root: Path, key: str, table: Table, facts: Json, task_function: Tas
 
 
 def write_partition(stage: Path, table: Table, task: Task, output: Output) -> Json:
-    """Write one part into the stage, its receipt last; returns the receipt.
+    """Write one partition into the stage, with its receipt last.
 
-    stage  : folder of the version that is being made;  table : its declaration
-    part   : of the plan;  output : its rows and further files
-    Errors: BadInput where the rows are not what the table declares or the plan wants; OSError where the disc refuses
+    Parameters
+    ----------
+    stage : Path
+        Folder of the version that is being made.
+    table : Table
+        Declaration of the table.
+    task : Task
+        The task.
+    output : Output
+        Rows and further files.
+
+    Returns
+    -------
+    mapping
+        The receipt.
+
+    Raises
+    ------
+    BadInput
+        If the rows do not fit the declaration or the plan.
+    OSError
+        If a file cannot be written.
     """
     if not isinstance(output, Output):
-        raise BadInput(f"table {table.name}: the maker of {task.name} returned {type(output).__name__}, not an Output")
+        kind = type(output).__name__
+        raise BadInput(f"table {table.name}: the task function of {task.name} must return an Output, got {kind}")
     rows = output.rows
     if task.rows is not None and rows.num_rows != task.rows:
-        raise BadInput(f"table {table.name}: {task.name} has {rows.num_rows} rows, the plan says {task.rows}")
+        raise BadInput(f"table {table.name}: {task.name} must have {task.rows} rows by the plan, got {rows.num_rows}")
     check_rows(rows, table)
     if table.is_catalogue:
         _check_positions(rows, table, task)
@@ -88,7 +131,7 @@ def write_partition(stage: Path, table: Table, task: Task, output: Output) -> Js
 
 
 def write_receipt(stage: Path, receipt: Json) -> None:
-    """Put a part's receipt into its place."""
+    """Write the receipt of a task."""
     manifest.write_json(_receipt_path(stage, receipt["part"]), receipt)
 
 
@@ -104,17 +147,15 @@ def _check_positions(rows: pa.Table, table: Table, task: Task) -> None:
         raise BadInput(f"{where} holds rows of another cell")
     wrong = index != sky.healpix_29(rows["ra"].to_numpy(), rows["dec"].to_numpy())
     if wrong.any():
-        raise BadInput(f"{where}: _healpix_29 of row {wrong.argmax()} is not that of its ra, dec")
+        raise BadInput(f"{where}: _healpix_29 of row {wrong.argmax()} does not match its ra, dec")
     if "kind" in table.names:
         wrong = kind_from_id(rows["id"].to_numpy()) != rows["kind"].to_numpy()
         if wrong.any():
-            raise BadInput(f"{where}: kind of row {wrong.argmax()} is not that of its id")
+            raise BadInput(f"{where}: kind of row {wrong.argmax()} does not match its id")
 
 
 def _summarize_rows(rows: pa.Table, table: Table) -> dict[str, Any]:
-    """What the driver must know of a part's rows: blocks of its identifiers or the span of its keys, the largest
-    deflection.
-    """
+    """Return facts for the receipt: blocks of identifiers or span of keys, and the largest deflection."""
     facts: dict[str, Any] = {}
     if is_numbered(table):
         blocks = np.unique(rows[table.key[0]].to_numpy() >> BLOCK_BITS)
@@ -128,7 +169,7 @@ def _summarize_rows(rows: pa.Table, table: Table) -> dict[str, Any]:
 
 
 def _key_span(rows: pa.Table, table: Table) -> list[list[Any]]:
-    """Lowest and highest value of the key's first columns, as far as they are the same in all rows and one on."""
+    """Return the lowest and highest key of the rows, as the leading columns up to the first one that varies."""
     lowest: list[Any] = []
     highest: list[Any] = []
     for name in table.key if rows.num_rows else ():
@@ -141,7 +182,7 @@ def _key_span(rows: pa.Table, table: Table) -> list[list[Any]]:
 
 
 def is_numbered(table: Table) -> bool:
-    """Is a row identified by one integer?"""
+    """Return True if the key of a table is one int64 column."""
     return len(table.key) == 1 and table.column(table.key[0]).type == "int64"
 
 
@@ -164,7 +205,7 @@ def _write_file(folder: Path, relative: str, writer: Callable[[Path], None]) -> 
 
 
 def receipts_folder(stage: Path) -> Path:
-    """Folder of a stage's receipts, one JSON file a part that is done."""
+    """Return the folder of a stage's receipts, with one JSON file per finished task."""
     return stage.with_name(stage.name.replace(".stage-", ".receipts-"))
 
 
@@ -177,7 +218,7 @@ def _flat_name(partition: str) -> str:
 
 
 def read_receipt(stage: Path, partition: str) -> dict[str, Any] | None:
-    """A part's receipt, None where there is none that can be read."""
+    """Return the receipt of a partition, or None if there is no readable one."""
     try:
         receipt: dict[str, Any] = json.loads(_receipt_path(stage, partition).read_bytes())
     except (FileNotFoundError, ValueError):
@@ -186,7 +227,7 @@ def read_receipt(stage: Path, partition: str) -> dict[str, Any] | None:
 
 
 def is_done(stage: Path, task: Task) -> bool:
-    """Is the part's receipt there, and are its files, at the sizes that it says?"""
+    """Return True if the task's receipt exists and its files have the recorded sizes."""
     receipt = read_receipt(stage, task.name)
     if receipt is None:
         return False
@@ -197,7 +238,7 @@ def is_done(stage: Path, task: Task) -> bool:
 
 
 def completed_receipts(stage: Path, plan: Plan) -> dict[str, Json]:
-    """Receipts of the parts that are done, by name."""
+    """Return the receipts of all finished tasks of a plan, by name."""
     folder = receipts_folder(stage)
     receipt_names = {entry.name for entry in os.scandir(folder)} if folder.is_dir() else set()
     candidates = [task for task in plan.tasks if f"{_flat_name(task.name)}.json" in receipt_names]
@@ -207,13 +248,13 @@ def completed_receipts(stage: Path, plan: Plan) -> dict[str, Json]:
 
 
 def missing_tasks(stage: Path, plan: Plan) -> list[Task]:
-    """Parts of the plan that are not done."""
+    """Return the tasks of a plan that are not done."""
     completed = completed_receipts(stage, plan)
     return [task for task in plan.tasks if task.name not in completed]
 
 
 def discard_damaged(stage: Path, plan: Plan) -> None:
-    """Remove the receipts of parts whose files do not have the sha256 that they say."""
+    """Remove the receipts of tasks whose files do not have the recorded sha256."""
     completed = completed_receipts(stage, plan)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for name, is_intact in zip(completed, pool.map(lambda name: _is_intact(stage, name), completed), strict=True):

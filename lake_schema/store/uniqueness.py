@@ -1,4 +1,4 @@
-"""No identifier twice in a table, whichever files its rows lie in."""
+"""Check that no identifier occurs in two partitions of a table."""
 
 from __future__ import annotations
 
@@ -20,12 +20,28 @@ from lake_schema.store.stage import is_numbered
 
 
 def refuse_duplicates(stage: Path, plan: Plan, receipts: Sequence[Json]) -> None:
-    """Raise BadInput where a key stands in two parts; the rows of one part have been compared before they were written.
+    """Raise BadInput if a key occurs in two partitions; each partition was checked before it was written.
 
-    made : receipts.  Only parts are read that share a block of identifiers, or whose keys' spans overlap
+    Parameters
+    ----------
+    stage : Path
+        Folder of the version that is being made.
+    plan : Plan
+        Its plan.
+    receipts : sequence of mapping
+        Receipts of all tasks.
+
+    Raises
+    ------
+    BadInput
+        If a key occurs twice.
+
+    Notes
+    -----
+    Only partitions that share a block of identifiers, or whose spans of keys overlap, are read.
     """
     table = plan.table
-    # A part's table is the first of its files.
+    # The first file of a receipt is the partition's Parquet file.
     entries = {receipt["files"][0]["path"]: receipt["files"][0] for receipt in receipts}
     if not is_numbered(table):
         for group in _overlapping_groups(receipts):
@@ -41,7 +57,10 @@ def refuse_duplicates(stage: Path, plan: Plan, receipts: Sequence[Json]) -> None
 
 
 def _shared_blocks(receipts: Sequence[Json], paths: Sequence[str]) -> dict[int | None, list[str]]:
-    """Block of identifiers -> the files that hold some of it, where there are two or more; None = all of them."""
+    """Return the files that contain identifiers of a block, by block, for blocks with two or more files.
+
+    If a receipt lists no blocks, the key None stands for all files.
+    """
     if any(receipt["blocks"] is None for receipt in receipts):
         return {None: list(paths)}
     holders: dict[int | None, list[str]] = defaultdict(list)
@@ -64,11 +83,11 @@ def _refuse_shared_ids(
     if same.size:
         source = np.repeat(np.arange(len(files)), [piece.size for piece in pieces])
         first, second = (PurePosixPath(files[source[order[same[0] + i]]]).name for i in (0, 1))
-        raise BadInput(f"{column_label} {all_ids[order[same[0]]]} stands in {first} and in {second}")
+        raise BadInput(f"{column_label} {all_ids[order[same[0]]]} is in {first} and in {second}")
 
 
 def _overlapping_groups(receipts: Sequence[Json]) -> Iterator[list[Json]]:
-    """Receipts whose keys may be one another's, by their spans; of none that nobody shares a key with."""
+    """Yield groups of two or more receipts whose spans of keys overlap."""
     group: list[Json] = []
     highest: list[Any] = []
     for receipt in sorted(
@@ -79,7 +98,7 @@ def _overlapping_groups(receipts: Sequence[Json]) -> Iterator[list[Json]]:
             if len(group) > 1:
                 yield group
             group = []
-        # Of bounds that are equal as far as both go, the shorter holds more.
+        # If one bound is the beginning of the other, the shorter one covers more keys.
         if not group or _is_below(highest, high) or (not _is_below(high, highest) and len(high) < len(highest)):
             highest = high
         group.append(receipt)
@@ -98,5 +117,5 @@ def _refuse_shared_keys(stage: Path, table: Table, entries: Sequence[Json]) -> N
         columns, file_name = parquet.read(stage, entry, table.key), PurePosixPath(entry["path"]).name
         for value in zip(*(columns[k].to_pylist() for k in table.key), strict=True):
             if value in file_by_key:
-                raise BadInput(f"table {table.name}: key {value} stands in {file_by_key[value]} and in {file_name}")
+                raise BadInput(f"table {table.name}: key {value} is in {file_by_key[value]} and in {file_name}")
             file_by_key[value] = file_name

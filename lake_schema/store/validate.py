@@ -1,7 +1,6 @@
-"""Do rows keep what their table declares?  Every task asks before it writes, and a reader can ask again.
+"""Check that rows agree with the declaration of their table.
 
-violations(rows, table)     list of sentences, each naming table, column, what was found and what was wanted
-check(rows, table)          raises BadInput with the first of them
+Every task checks its rows before it writes them, and readers can check them again.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from lake_schema.errors import BadInput
 
 
 def find_violations(rows: pa.Table, table: Table) -> list[str]:
-    """What is wrong with `rows` as `table`: schema first; contents only where the schema is right."""
+    """Return the violations of a declaration as sentences; the contents are checked only if the schema is right."""
     messages = _schema_violations(rows.schema, table)
     if messages:
         return messages
@@ -27,7 +26,7 @@ def find_violations(rows: pa.Table, table: Table) -> list[str]:
 
 
 def check_rows(rows: pa.Table, table: Table) -> None:
-    """Raise BadInput, one line, where `rows` are not what `table` declares."""
+    """Raise BadInput with the first violation if `rows` do not agree with the declaration of `table`."""
     messages = find_violations(rows, table)
     if messages:
         suffix = f" (and {len(messages) - 1} more)" if len(messages) > 1 else ""
@@ -48,11 +47,11 @@ def _schema_violations(schema: pa.Schema, table: Table) -> list[str]:
         field = schema.field(declared_field.name)
         where = f"table {table.name}: column {declared_field.name}"
         if field.type != declared_field.type:
-            messages.append(f"{where} is {field.type}, wanted {declared_field.type}")
+            messages.append(f"{where} is {field.type}, but must be {declared_field.type}")
         elif field.nullable != declared_field.nullable:
-            messages.append(f"{where} is {'' if field.nullable else 'not '}nullable, wanted the opposite")
+            messages.append(f"{where} is {'' if field.nullable else 'not '}nullable, unlike in the declaration")
         elif _unit(field) != _unit(declared_field):
-            messages.append(f"{where} has unit {_unit(field)!r}, wanted {_unit(declared_field)!r}")
+            messages.append(f"{where} has unit {_unit(field)!r}, but must have {_unit(declared_field)!r}")
     return messages
 
 
@@ -79,12 +78,12 @@ def _number_violations(values: pa.ChunkedArray, column: Column, where: str, row_
         strange = pc.invert(pc.is_finite(values))
         if pc.any(strange).as_py():
             place = _first_true(strange)
-            return [f"{where} is {values[place].as_py()} in row {row_of(place)}, wanted a finite number"]
+            return [f"{where} is {values[place].as_py()} in row {row_of(place)}, but must be finite"]
     messages = []
     for bound, compare in ((column.lo, pc.less), (column.hi, pc.greater)):
         if bound is None or len(values) == 0:
             continue
-        # The bound as the column holds it: 0.02 in float32 is a little less than 0.02.
+        # The bound is rounded to the column's type: 0.02 in float32 is slightly less than 0.02.
         scalar = pa.scalar(np.dtype(values.type.to_pandas_dtype()).type(bound), values.type)
         out_of_range = compare(values, scalar)
         if pc.any(out_of_range).as_py():
@@ -113,13 +112,13 @@ def _duplicates(rows: pa.Table, table: Table) -> list[str]:
             return []
         value = int(keys[1:][same][0])
         places = np.flatnonzero(rows[table.key[0]].to_numpy() == value)
-        return [f"table {table.name}: {table.key[0]} {value} stands in rows {places[0]} and {places[1]}"]
+        return [f"table {table.name}: {table.key[0]} {value} is in rows {places[0]} and {places[1]}"]
     if rows.group_by(list(table.key), use_threads=False).aggregate([]).num_rows == rows.num_rows:
         return []
     row_by_key: dict[tuple[object, ...], int] = {}
     for row, key in enumerate(zip(*(rows[k].to_pylist() for k in table.key), strict=True)):
         if key in row_by_key:
-            return [f"table {table.name}: key {key} stands in rows {row_by_key[key]} and {row}"]
+            return [f"table {table.name}: key {key} is in rows {row_by_key[key]} and {row}"]
         row_by_key[key] = row
     return []
 

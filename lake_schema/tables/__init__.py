@@ -1,9 +1,4 @@
-"""The declared tables of the lake, one a file.
-
-declared    all of them
-find        the one of a name
-markdown    the reference page
-"""
+"""Declarations of the tables of a lake."""
 
 from __future__ import annotations
 
@@ -13,7 +8,7 @@ from lake_schema.columns import Table
 
 
 def all_tables(bands: Sequence[str]) -> list[Table]:
-    """Every table of the lake, the flux tables with these bands."""
+    """Return all tables of a lake; the flux tables have these bands."""
     from lake_schema.tables.exposures import EXPOSURES
     from lake_schema.tables.fluxes import fluxes
     from lake_schema.tables.gaia import GAIA
@@ -37,15 +32,24 @@ def all_tables(bands: Sequence[str]) -> list[Table]:
 
 
 def to_markdown() -> str:
-    """The reference page of all tables."""
+    """Return the reference page of all tables in Markdown."""
     head = "# Tables of the lake\n\nWritten by `python -m lake_schema tables`; do not edit.\n"
     return "\n".join([head, *(table.to_markdown() for table in all_tables(["<band>"]))])
 
 
 def find_table(name: str, columns: Sequence[str] = ()) -> Table | None:
-    """The declaration of the table `name`, None where there is none.
+    """Return the declaration of a table, or None if there is no such table.
 
-    columns : names that the table has; a flux table's bands are taken from them
+    Parameters
+    ----------
+    name : str
+        Name of the table.
+    columns : sequence of str, optional
+        Names of the columns of the table. The bands of a flux table are taken from them.
+
+    Returns
+    -------
+    Table or None
     """
     bands = [column.removeprefix("f_nu_") for column in columns if column.startswith("f_nu_")]
     return next((table for table in all_tables(bands) if table.name == name), None)

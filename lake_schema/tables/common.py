@@ -1,4 +1,4 @@
-"""What several tables share: identifiers, positions, origins."""
+"""Columns and types that several tables share: identifiers, positions, origins of files."""
 
 from __future__ import annotations
 
@@ -36,18 +36,32 @@ SKY = (ID, RA, DEC, HEALPIX_29)
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Where a spectrum or a curve is from: names of files with their reference, and their sha256, hexadecimal."""
+    """Origin of a spectrum or a curve.
+
+    Attributes
+    ----------
+    source : str
+        Names of its files, with their reference.
+    sha256 : str
+        Checksum of these files, hexadecimal.
+    """
 
     source: str
     sha256: str
 
 
 def id_of_kinds(first: int, last: int) -> Column:
-    """The column `id` of a table that holds these kinds only, so that no two tables can share an identifier."""
+    """Return the column `id` of a table that contains only kinds `first` to `last`.
+
+    Its bounds ensure that tables of different kinds share no identifiers.
+    """
     return replace(ID, lo=first << 60, hi=(last + 1 << 60) - 1)
 
 
 def density_boost_column(sources: str) -> Column:
-    """The column `density_boost` of a table; `what` was drawn."""
+    """Return the column `density_boost`.
+
+    `sources` is the subject and verb of its description, such as "this kind was".
+    """
     doc = f"how many times denser than in nature {sources} drawn; weight by its inverse"
     return Column("density_boost", "float32", ucd="stat.weight", doc=doc, lo=1e-3, hi=1e6)

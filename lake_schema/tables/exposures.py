@@ -1,4 +1,4 @@
-"""Table `exposures`: what the telescope or camera does, one row an exposure."""
+"""Declaration of the table `exposures`: one row per exposure of the telescope or of a ground camera."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ IMAGE_TYPES = (
     ("stray_light", "sky exposure with a bright star beside the field"),
     ("white_dwarf", "white dwarfs at known places of every detector"),
 )
-# Passbands of Euclid's channels, which requests know by themselves (a test holds them to the planner's).
+# Passbands of Euclid's channels, for the checks of requests. A test compares them with the planner's passbands.
 EUCLID_BANDS: Mapping[str, tuple[str, ...]] = {
     "VIS": ("euclid_vis",),
     "NISP-P": ("euclid_y", "euclid_j", "euclid_h"),
     "NISP-S": ("nisp_red", "nisp_blue"),
 }
-# Of a channel without a slit, the passband in which the sources are chosen that it draws: of these it wants the fluxes.
+# Passband whose fluxes select the sources that a slitless channel draws.
 SELECTION_BANDS: Mapping[str, str] = {"NISP-S": "euclid_h"}
-# What there is a simulator for: channel -> image types. All others can be planned and forecast. A copy, since
-# requests are refused below the renderer (test_checks.py holds it to the registry of channels).
+# Image types that can be rendered, by channel; all others can be planned and forecast. This copies the registry of
+# channels, because requests are checked without importing the renderer. test_checks.py compares the two.
 RENDERED_TYPES: Mapping[str, tuple[str, ...]] = {
     "VIS": (
         "science",
@@ -147,7 +147,7 @@ EXPOSURES = Table(
 
 @dataclass(frozen=True, slots=True)
 class ExposureRow:
-    """A row of the table: one field a column, None where the column is null."""
+    """One row of the table `exposures`, with one attribute per column; None stands for null."""
 
     exposure_id: int
     channel: str
@@ -178,5 +178,5 @@ class ExposureRow:
 
     @classmethod
     def from_row(cls, row: Mapping[str, Any]) -> ExposureRow:
-        """Of a row as Arrow gives it; KeyError where a column is missing."""
+        """Make an instance from a row of an Arrow table; raise KeyError if a column is missing."""
         return cls(**{name: row[name] for name in cls.__slots__})

@@ -1,4 +1,4 @@
-"""Tables `galaxy_fluxes` and `star_fluxes`: band fluxes, row by row beside the catalogue they belong to."""
+"""Declaration of the tables `galaxy_fluxes` and `star_fluxes`: band fluxes in the row order of their catalogues."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ INTEGRATED = Column(
 
 
 def fluxes(kind: str, bands: Sequence[str]) -> Table:
-    """The flux table of `kind` ("galaxy" or "star") with one column a band: f_nu_<band>, microjansky."""
+    """Return the flux table of `kind` ("galaxy" or "star"), with one column f_nu_<band> in microjansky per band."""
     columns = [
         Column(
             f"f_nu_{band}",

@@ -1,6 +1,7 @@
-"""Table `gaia`: the stars as Gaia's second data release would list them, a reference to calibrate by.
+"""Declaration of the table `gaia`: the stars as Gaia DR2 would list them, a reference catalogue for calibration.
 
-EXPORT, EXPORT_DR3   the same under Gaia's own names, for a file of its own, in the order of ours and of DR3
+`EXPORT` and `EXPORT_DR3` declare the same rows under the names of Gaia's archive, for export to files. `EXPORT_DR3`
+also has the column order of DR3.
 """
 
 from __future__ import annotations
@@ -164,10 +165,10 @@ EXPORT = Table(
 
 
 def _make_dr3_table() -> Table:
-    """The columns of DR3's gaia_source that we have, in its order."""
+    """Return the available columns of DR3's gaia_source, in its order."""
     columns_by_name = {column.name: column for column in EXPORT.columns}
     parameter_names = [name for parameter in PARAMETERS for name in (parameter, f"{parameter}_error")]
-    # parallax_over_error and pm stand behind the parallax.
+    # In DR3, parallax_over_error and pm follow the parallax.
     order: list[str | Column] = ["source_id", "ref_epoch", *parameter_names[:6]]
     order += [
         Column(

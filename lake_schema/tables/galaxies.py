@@ -1,9 +1,8 @@
-"""Tables `galaxies`, and `emission_lines`: where its lines are, and how wide.
+"""Declaration of the tables `galaxies` and `emission_lines` (wavelengths and widths of the galaxies' lines).
 
-`galaxies`: the True Universe's galaxies, the ten groups of columns of Serrano et al. 2024, section 4.1.
-
-The SED is held in the two-component form (Flagship 2); one mixed template with one law and one E(B-V) (Flagship 1) is
-the case of equal laws and E(B-V).
+The columns of `galaxies` come in the ten groups of Serrano et al. 2024, section 4.1. The SED has two components, as in
+Flagship 2. Flagship 1 has one mixed template with one extinction law and one E(B-V): the case of two components with
+equal laws and E(B-V).
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from lake_schema.tables.common import (
 
 LAWS = ((0, "none"), (1, "Prevot"), (2, "Calzetti"), (3, "Calzetti + 2175 A bump"), (4, "Calzetti + double bump"))
 
-# Scale height of every disc in scale lengths: what `inclination` makes of an axis ratio, and how a disc is drawn
+# Scale height of every disc in scale lengths. It relates `inclination` to the axis ratio, and discs are drawn with it
 # (Serrano et al. 2024, "Bulge and disc model").
 DISK_SCALE_HEIGHT = 0.1
 
@@ -72,7 +71,7 @@ _IDENTITY = (
         lo=0,
     ),
 )
-# Behind 2, the positions.
+# The position columns (group 2) stand between _IDENTITY and these.
 _OTHER_COLUMNS = (
     # 3 kind
     Column("kind", "int8", ucd="src.class", doc="kind of source", codes=SOURCE_KINDS[:5], lo=0, hi=4),
@@ -237,7 +236,7 @@ _OTHER_COLUMNS = (
         0.0,
         40.0,
     ),
-    # Of another catalogue
+    # Origin in another catalogue or library
     Column(
         "origin_id",
         "int64",
@@ -291,7 +290,19 @@ EMISSION_LINES = Table(
 
 
 class Line(Protocol):
-    """A line: column of the flux, flux relative to it, wavelengths in vacuum and air, A."""
+    """An emission line.
+
+    Attributes
+    ----------
+    name : str
+        Name of the line.
+    column : str
+        Column of the table `galaxies` with the flux of its primary line.
+    ratio : float
+        Flux of the line relative to that column.
+    vacuum, air : float
+        Rest wavelengths in vacuum and in air, in angstrom.
+    """
 
     @property
     def name(self) -> str: ...
@@ -306,9 +317,21 @@ class Line(Protocol):
 
 
 def line_rows(lines: Sequence[Line], width: Mapping[str, float], origins: Sequence[Origin]) -> pa.Table:
-    """Table `emission_lines`.
+    """Build the table `emission_lines`.
 
-    lines : n lines, a row each;  width : numbers of the law of widths by column;  origins : where each is from
+    Parameters
+    ----------
+    lines : sequence of Line, length n
+        Lines, one per row.
+    width : mapping of str to float
+        Coefficients of the law of line widths, by column name.
+    origins : sequence of Origin, length n
+        Origin of each line.
+
+    Returns
+    -------
+    pyarrow.Table
+        Table with n rows.
     """
     return EMISSION_LINES.build(
         {

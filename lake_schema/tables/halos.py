@@ -1,4 +1,4 @@
-"""Tables `halos`, the dark-matter halos that the galaxies of the True Universe live in, and `halo_limits`."""
+"""Declaration of the tables `halos` (dark-matter halos that host galaxies) and `halo_limits` (their completeness)."""
 
 from __future__ import annotations
 

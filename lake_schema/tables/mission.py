@@ -1,4 +1,4 @@
-"""Table `mission`: the Mission Database with every record of every parameter, and which of them a run chose."""
+"""Declaration of the table `mission`: all records of the mission database, with a flag for those that a run used."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ STATUSES = (
     ("CBE", "current best estimate"),
     ("SIM", "as simulated"),
 )
-# Best knowledge first; as simulated only where nothing better exists.
+# Default order of preference: best knowledge first; SIM is used only if nothing better exists.
 LADDER = ("CBE", "BLT", "DES", "REQ", "SIM")
 CONFIDENCES = (
     ("published", "read in its source"),

@@ -1,4 +1,4 @@
-"""Table `passbands`: the photon responses through which fluxes were computed, one row a band."""
+"""Declaration of the table `passbands`: photon responses with which fluxes were computed, one row per band."""
 
 from __future__ import annotations
 
@@ -48,7 +48,19 @@ PASSBANDS = Table(
 
 
 class Passband(Protocol):
-    """A response on a grid of equal steps: wavelength[m] A, response[m]."""
+    """Photon response on a wavelength grid with equal steps.
+
+    Attributes
+    ----------
+    name : str
+        Name of the band.
+    medium : str
+        Medium in which wavelengths are measured, "air" or "vacuum".
+    wavelength : float array, shape (m,)
+        Wavelengths in angstrom.
+    response : float array, shape (m,)
+        Detected electrons per arriving photon.
+    """
 
     @property
     def name(self) -> str: ...
@@ -67,10 +79,25 @@ def rows(
     origins: Sequence[Origin],
     ab_minus_vega: Sequence[float | None],
 ) -> pa.Table:
-    """Table `passbands`.
+    """Build the table `passbands`.
 
-    pivot_wavelengths : [n] A;  log_widths : [n];  origins : where each is from
-    bands             : n passbands, a row each;  ab_minus_vega : [n] mag, None where Vega's spectrum ends
+    Parameters
+    ----------
+    bands : sequence of Passband, length n
+        Passbands, one per row.
+    pivot_wavelengths : float array, shape (n,)
+        Pivot wavelengths in angstrom.
+    log_widths : float array, shape (n,)
+        Integrals of the responses over ln(wavelength).
+    origins : sequence of Origin, length n
+        Origin of each passband.
+    ab_minus_vega : sequence of float or None, length n
+        AB magnitude of Vega in each band, None if Vega's spectrum does not cover the band.
+
+    Returns
+    -------
+    pyarrow.Table
+        Table with n rows.
     """
     return PASSBANDS.build(
         {

@@ -1,4 +1,4 @@
-"""The archive: table `products`, one row a file of a detector; `exposure_files`, one row a file of a whole exposure."""
+"""Declaration of the image archive: tables `products` (files of detectors) and `exposure_files` (whole exposures)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Table `quarantine`: galaxies that weak lensing cannot describe, kept apart from the table `galaxies`."""
+"""Declaration of the table `quarantine`: galaxies that weak lensing cannot describe, separate from `galaxies`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 from lake_schema.columns import Column, Table
 from lake_schema.tables.galaxies import GALAXIES
 
-# What is behind the centre of a massive halo has a convergence of several.
+# A galaxy behind the centre of a massive halo has a convergence of several.
 _BOUNDS = {"kappa": (-1.0, 100.0), "gamma1": (-10.0, 10.0), "gamma2": (-10.0, 10.0)}
 
 

@@ -1,7 +1,8 @@
-"""Tables `rendered_truth`: what was drawn where, one row a source of a detector; `rendered_spectra`: one an order.
+"""Declaration of the true positions and electrons of drawn sources.
 
-Of sources beside it that send in no more than the faint wings beyond their stamps there is none, but of stars whose
-spikes may be noticed.
+The table `rendered_truth` has one row per source of a detector, and `rendered_spectra` one row per spectral order.
+Sources outside a detector have no row if only their faint wings beyond the stamp reach it. Stars with noticeable
+diffraction spikes are an exception.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Table `stars`: the Milky Way's stars (Serrano et al. 2024, section 4.2)."""
+"""Declaration of the table `stars`: stars of the Milky Way (Serrano et al. 2024, section 4.2)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ COMPONENTS = (
 )
 STAGES = ((0, "main sequence"), (1, "giant"), (2, "white dwarf"), (3, "brown dwarf"), (4, "subgiant"))
 
-# Year (Julian) of the positions.
+# Epoch of the positions, Julian year.
 EPOCH = 2015.5
 
 

@@ -1,4 +1,4 @@
-"""Table `strong_lenses`: galaxies that lens another one, each with the picture of its arcs."""
+"""Declaration of the table `strong_lenses`: galaxies that lens another galaxy, each with an image of its arcs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Table `tasks`: what to render, one row a detector of an exposure."""
+"""Declaration of the table `tasks`: detectors to render, one row per detector of an exposure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables `templates`: the spectra that sources are made of, and `extinction_laws`: the dust inside galaxies."""
+"""Declaration of the tables `templates` (spectra of sources) and `extinction_laws` (dust inside galaxies)."""
 
 from __future__ import annotations
 
@@ -48,7 +48,15 @@ TEMPLATES = Table(
 
 
 class Types(Protocol):
-    """What is known of the first stars of a library: float64[n] each."""
+    """Parameters of the first n stars of a library.
+
+    Attributes
+    ----------
+    teff : float64 array, shape (n,)
+        Effective temperatures in K.
+    log_g : float64 array, shape (n,)
+        log10 of the surface gravities in cm s-2.
+    """
 
     @property
     def teff(self) -> Float: ...
@@ -57,7 +65,19 @@ class Types(Protocol):
 
 
 class Library(Protocol):
-    """Spectra on one grid of equal steps: wavelength[m] A, flux[n, m], n names."""
+    """Spectra on a wavelength grid with equal steps.
+
+    Attributes
+    ----------
+    wavelength : float array, shape (m,)
+        Wavelengths in angstrom.
+    flux : float32 array, shape (n, m)
+        Flux densities f_lambda, normalised.
+    names : sequence of str, length n
+        Labels of the spectra.
+    types : Types or None
+        Parameters of its first stars, None for a library without stellar parameters.
+    """
 
     @property
     def wavelength(self) -> Float: ...
@@ -70,7 +90,7 @@ class Library(Protocol):
 
 
 def rows(libraries: Mapping[str, Library], origins: Mapping[str, Sequence[Origin]]) -> pa.Table:
-    """Table `templates` of the libraries, by name ("galaxy", "star"), and where each of their spectra is from."""
+    """Build the table `templates` from libraries by name ("galaxy", "star" ...) and the origins of their spectra."""
     library_tables = (_rows(name, library, origins[name]) for name, library in libraries.items())
     return pa.concat_tables([TEMPLATES.empty(), *library_tables])
 
@@ -96,7 +116,7 @@ def _rows(name: str, library: Library, origins: Sequence[Origin]) -> pa.Table:
 
 
 def _pad_missing(values: Float, n: int) -> Any:
-    """Values of the first rows of n, the others missing."""
+    """Return `n` values, masked beyond the given values."""
     missing = np.arange(n) >= len(values)
     return np.ma.masked_array(np.concatenate([values[:n], np.zeros(max(n - len(values), 0))]), missing)
 
@@ -118,9 +138,21 @@ EXTINCTION_LAWS = Table(
 
 
 def law_rows(wavelength: Float, k: Float32, origins: Sequence[Origin]) -> pa.Table:
-    """Table `extinction_laws`.
+    """Build the table `extinction_laws`.
 
-    wavelength : [m] A, in equal steps;  k : [5, m];  origins : where each is from
+    Parameters
+    ----------
+    wavelength : float array, shape (m,)
+        Wavelengths in angstrom, with equal steps.
+    k : float32 array, shape (n, m)
+        A(lambda) / E(B-V) of each law, in the order of the law codes.
+    origins : sequence of Origin, length n
+        Origin of each law.
+
+    Returns
+    -------
+    pyarrow.Table
+        Table with n rows.
     """
     n = len(k)
     return EXTINCTION_LAWS.build(

@@ -1,4 +1,4 @@
-"""Table `validation`: what was measured of a lake, beside what it should be."""
+"""Declaration of the table `validation`: quantities measured in a lake, with their expected values and verdicts."""
 
 from __future__ import annotations
 

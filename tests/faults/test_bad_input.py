@@ -305,7 +305,7 @@ def test_every_kind_of_file_has_a_size_that_is_named(tmp_path, monkeypatch):
         path.write_bytes(b"x" * size)
         assert user_files.check_file(path, kind) == path
         path.write_bytes(b"x" * (size + 1))
-        with pytest.raises(BadInput, match=f"is larger than {size} bytes, the most of a {kind}"):
+        with pytest.raises(BadInput, match=f"is larger than {size} bytes, the limit for a {kind}"):
             user_files.check_file(path, kind)
 
 

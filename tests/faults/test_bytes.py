@@ -237,7 +237,7 @@ def test_a_column_costs_the_bytes_of_a_column(large, monkeypatch):
         read_bytes.append(last - first)
         return one(self, first, last)
 
-    monkeypatch.setattr(blocks.VerifiedFile, "_bytes", counted)
+    monkeypatch.setattr(blocks.VerifiedFile, "_read_range", counted)
     index = large.rows(["_healpix_29"])["_healpix_29"].to_numpy()
     read_bytes.clear()
     large.rows(["flux"], where=pc.field("_healpix_29") == int(index[5]))
@@ -292,7 +292,7 @@ def test_a_manifest_without_the_blocks_of_a_table_is_refused(lake):
     about = dict(manifest.load(folder, "plain"))
     files = [{key: value for key, value in entry.items() if key != "blocks"} for entry in about["files"]]
     manifest.write(folder, {**about, "files": files})
-    with pytest.raises(Damaged, match=r"manifest\.json is not a manifest of this form"):
+    with pytest.raises(Damaged, match=r"manifest\.json is not a valid manifest"):
         read.version(lake, "plain")
 
 

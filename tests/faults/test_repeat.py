@@ -175,7 +175,10 @@ def fewer(root, facts):
     return Output(plain_work(root, facts).rows.slice(1))
 
 
-@pytest.mark.parametrize(("work", "words"), [(silent, "returned NoneType"), (fewer, "19 rows, the plan says 20")])
+@pytest.mark.parametrize(
+    ("work", "words"),
+    [(silent, "must return an Output, got NoneType"), (fewer, "must have 20 rows by the plan, got 19")],
+)
 def test_a_maker_that_returns_too_little(lake, work, words):
     with pytest.raises(TasksFailed, match=words):
         publish.make_version(lake, plain_plan(), work)
@@ -189,7 +192,7 @@ def test_a_part_that_raises_is_named_and_the_others_are_kept(lake):
             raise ValueError("row 17: no such template")
         return plain_work(root, facts)
 
-    with pytest.raises(TasksFailed, match=r"1 of 3 parts failed: 1\.parquet: ValueError: row 17: no such template"):
+    with pytest.raises(TasksFailed, match=r"1 of 3 tasks failed: 1\.parquet: ValueError: row 17: no such template"):
         publish.make_version(lake, plain_plan(2), work)
     assert promise.current(lake, "plain") == promise.key("plain", 1)
     assert len(list(lake.rglob(".receipts-*/[!.]*.json"))) == 2
@@ -205,7 +208,7 @@ def toy_with_ids(root, facts):
 @pytest.mark.parametrize("number", [7, 7 << 46 | 7])
 def test_an_id_in_two_cells_names_both(lake, number):
     parts = tuple(Task(p.name, {**p.facts, "id": number}) for p in toy_plan().tasks[:2])
-    with pytest.raises(BadInput, match=rf"table toy: id {number} stands in Npix=1607.parquet and in Npix=1608.parquet"):
+    with pytest.raises(BadInput, match=rf"table toy: id {number} is in Npix=1607.parquet and in Npix=1608.parquet"):
         publish.make_version(lake, Plan(TOY, {}, parts), toy_with_ids)
     assert promise.current(lake, "toy") is None
 
@@ -218,7 +221,7 @@ def test_scattered_ids_are_compared_too(lake):
         ids = spread[:2000] if facts["part"] == 0 else spread[1999:]
         return Output(PLAIN.build({"id": ids, "value": np.zeros(ids.size)}))
 
-    with pytest.raises(BadInput, match=rf"id {spread[1999]} stands in 0.parquet and in 1.parquet"):
+    with pytest.raises(BadInput, match=rf"id {spread[1999]} is in 0.parquet and in 1.parquet"):
         publish.make_version(lake, Plan(PLAIN, {}, tuple(Task(f"{i}.parquet", {"part": i}) for i in (0, 1))), work)
 
 
@@ -228,13 +231,13 @@ def test_a_key_of_two_columns_in_two_parts(lake):
     def work(root, facts):
         return Output(table.build({"a": [facts["part"], 5], "b": ["x", "y"]}))
 
-    with pytest.raises(BadInput, match=r"key \(5, 'y'\) stands in 0.parquet and in 1.parquet"):
+    with pytest.raises(BadInput, match=r"key \(5, 'y'\) is in 0.parquet and in 1.parquet"):
         publish.make_version(lake, Plan(table, {}, tuple(Task(f"{i}.parquet", {"part": i}) for i in (0, 1))), work)
 
 
 @pytest.mark.parametrize(
     ("column", "value", "words"),
-    [("_healpix_29", (1607 << 48) + 5, "is not that of its ra, dec"), ("_healpix_29", 1608 << 48, "another cell")],
+    [("_healpix_29", (1607 << 48) + 5, "does not match its ra, dec"), ("_healpix_29", 1608 << 48, "another cell")],
 )
 def test_positions_that_do_not_agree(lake, column, value, words):
     def work(root, facts):

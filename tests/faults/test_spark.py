@@ -75,7 +75,7 @@ def test_a_part_that_fails_is_named_and_the_rest_is_kept(run, lake, wanted, harm
     (lake / harm).touch()
     status, lines = run()
     assert (status, len(lines)) == (1, 1)
-    assert lines[0] == f"poisoned: table plain: 1 of 3 parts failed: {words}"
+    assert lines[0] == f"poisoned: table plain: 1 of 3 tasks failed: {words}"
     assert promise.current(lake, "plain") == promise.key("plain", 1)
     log = [json.loads(line) for line in max(layout.runs_folder(lake).glob("*.jsonl")).read_text().splitlines()]
     (failed,) = [line for line in log if "error" in line and "part" in line]

@@ -1,4 +1,4 @@
-"""Arguments are refused by their names, and numpy's numbers are numbers."""
+"""Wrong arguments are refused by name, and NumPy numbers are accepted."""
 
 import numpy as np
 import pytest

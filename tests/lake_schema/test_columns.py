@@ -1,4 +1,4 @@
-"""Declarations: what they promise about schemas, metadata and values."""
+"""Declarations: schemas, metadata and values of columns."""
 
 import numpy as np
 import pyarrow as pa
@@ -23,7 +23,7 @@ TABLES = all_tables(["euclid_vis", "lsst_r"])
 def test_units_and_ucds_are_standard(table):
     for column in table.columns:
         unit = units.Unit(column.unit, parse_strict="raise")
-        if units.electron not in unit.bases:  # which FITS has no name for
+        if units.electron not in unit.bases:  # FITS has no name for it.
             assert units.Unit(fits_unit(column.unit), format="fits") == unit, column.name
         assert column.doc, column.name
         assert not column.ucd or check_ucd(column.ucd, check_controlled_vocabulary=True), column.name
@@ -57,8 +57,8 @@ def build(**changes):
 def test_build_refuses_by_name():
     for changes, words in (
         ({"speed": [1, 2]}, "no column speed"),
-        ({"id": np.array([1.5, 2.5])}, "column id wants int64"),
-        ({"ra": ["a", "b"]}, "column ra wants float64"),
+        ({"id": np.array([1.5, 2.5])}, "column id must be int64"),
+        ({"ra": ["a", "b"]}, "column ra must be float64"),
         ({"flux": [None, 1.0]}, "column flux has 1 missing"),
     ):
         with pytest.raises(BadInput, match=words):
@@ -76,7 +76,7 @@ def test_masked_values_become_null_only_where_declared():
 
 def test_small_integers_do_not_wrap():
     table = Table("t", 1, (Column("k", "int8"),), "t", key=("k",))
-    with pytest.raises(BadInput, match="does not fit int8"):
+    with pytest.raises(BadInput, match="outside the range of int8"):
         table.build({"k": np.array([300])})
 
 
@@ -88,7 +88,7 @@ def test_a_column_declared_twice_is_refused():
 @given(st.lists(st.floats(width=32, allow_nan=False, allow_infinity=False), min_size=1), st.integers(1, 22))
 def test_rounding_keeps_its_relative_error(values, bits):
     given_values = np.array(values, np.float32)
-    # The largest numbers round up to infinity; subnormal ones have fewer bits to begin with.
+    # The largest numbers round up to infinity, and subnormal numbers have fewer bits.
     normal = (np.abs(given_values) < 1e38) & (np.abs(given_values) > 1e-37)
     rounded = round_mantissa(given_values, bits)
     error = np.abs(rounded.astype(float) - given_values.astype(float))[normal]
@@ -111,7 +111,7 @@ def test_the_fewest_and_the_most_bits_are_legal(bits):
 
 
 def test_columns_are_encoded_by_their_kind(tmp_path):
-    """Bytes of floats apart, differences of whole numbers, dictionaries of what has few values."""
+    """Floats use byte stream split, integers delta encoding, and columns with few values dictionaries."""
     columns = Column("id", "int64"), Column("x", "float32"), Column("kind", "int8", codes=((0, "a"), (1, "b")))
     table = Table("t", 1, (*columns, Column("name", "string"), Column("good", "bool")), "t")
     rows = {"id": np.arange(9), "x": np.ones(9), "kind": np.arange(9) % 2, "name": ["n"] * 9, "good": [True] * 9}

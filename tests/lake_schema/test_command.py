@@ -1,4 +1,4 @@
-"""How a command's process ends."""
+"""The end of a command's process."""
 
 import subprocess
 import sys
@@ -7,7 +7,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-# A scan whose threads still want the interpreter when that is taken down.
+# A scan whose threads still need the interpreter while it shuts down.
 SCANNED = """
 import atexit, io, sys, threading, time
 import pyarrow.dataset as ds

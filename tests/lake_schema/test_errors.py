@@ -1,4 +1,4 @@
-"""Refusals: one line that anybody can print, however long and strange what it names."""
+"""Error messages are one printable line, even if they name something long or strange."""
 
 import pickle
 
@@ -29,7 +29,7 @@ def test_a_short_refusal_says_what_it_was_given(text):
     assert str(errors.BadInput(text)) == text
 
 
-def test_line_breaks_and_what_no_terminal_shows_are_spelt():
+def test_unprintable_characters_are_escaped():
     assert str(errors.BadInput("a\n  b\x1b[0m \ud800")) == r"a b\x1b[0m \ud800"
 
 

@@ -1,4 +1,4 @@
-"""Identifiers: unique, reversible, refused where they would overflow."""
+"""Identifiers are unique and reversible, and overflows are refused."""
 
 import numpy as np
 import pytest
@@ -47,7 +47,7 @@ def test_members_of_drawn_halos_have_their_own_ids(a, b):
         assert 0 <= halo[0] < 1 << 60 <= one[0]
         assert ids.kind_from_id(one) == 1
         assert one[0] >> ids.BLOCK_BITS == 1 << 20 | cell
-        # None of those that are numbered in their cells beyond the blocks.
+        # Identifiers of drawn halos stay below the running numbers of other kinds.
         assert halo[0] & (1 << ids.BLOCK_BITS) - 1 < ids.FIRST_NUMBER << ids.MEMBER_BITS
         made.append((int(one[0]), int(bits)))
     if made[0][1] == made[1][1]:

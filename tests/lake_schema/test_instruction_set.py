@@ -1,4 +1,4 @@
-"""The common instruction set is in effect in every process, and what contradicts it is reported."""
+"""The common instruction set is used in every process, and conflicting settings are reported."""
 
 import os
 import platform
@@ -26,10 +26,10 @@ def clean_environment(**variables):
     return {**kept, **variables}
 
 
-# Several tests ask for the same: a process takes a second.
+# Several tests need the same output, and a process takes a second.
 @cache
 def told(code, **variables):
-    """Lines that a new process prints, with the limit's own variables as given."""
+    """Return the lines that a new process prints, with the given variables of the limit."""
     done = subprocess.run(
         [sys.executable, "-c", code], env=clean_environment(**variables), capture_output=True, text=True, check=False
     )
@@ -42,7 +42,7 @@ def has_level():
 
 @on_x86
 def test_this_process_is_of_the_standard_kind():
-    """The tests themselves run with the limit, or they could not compare published bytes."""
+    """The tests run with the limit; otherwise they could not compare published bytes."""
     from numpy._core._multiarray_umath import __cpu_features__
 
     if not instruction_set.is_portable() or not has_level():
@@ -99,7 +99,7 @@ def test_another_choice_of_the_user_is_respected_and_reported(name, value, word)
 
 @pytest.mark.parametrize("above", [("X86_V3", "X86_V4"), ("AVX512_SKX", "X86_V3")])
 def test_a_limit_without_effect_is_refused(monkeypatch, above):
-    """As where numpy was imported first, or names its groups otherwise than this version does."""
+    """This happens if numpy was imported first, or if its groups have other names than in this version."""
     monkeypatch.setattr(instruction_set, "_has_level", lambda: True)
     monkeypatch.setattr(instruction_set, "_numpy_in_use", lambda: above)
     monkeypatch.delenv("TRUESKY_CPU", raising=False)
@@ -132,7 +132,7 @@ def test_numpy_imported_first_is_refused_on_a_cpu_with_more():
 @on_x86
 @pytest.mark.parametrize("before", ["import numba; numba.njit(lambda x: x)(1)", "import numba"])
 def test_numba_that_was_used_first_is_refused(before):
-    """numba that was only imported first is limited still; so is numba that is imported after truesky."""
+    """If numba was only imported before truesky, or is imported later, it is still limited."""
     if not has_level():
         pytest.skip("this CPU has no AVX2")
     code = f"import os; os.environ.update({LIMITED!r}); {before}\n"
@@ -150,7 +150,7 @@ def test_an_empty_setting_is_the_default():
 
 
 def test_a_worker_without_the_limit_makes_nothing(lake, monkeypatch):
-    """A Spark session of the user's own may have workers that imported numpy before any module of ours."""
+    """Workers of a user's Spark session may have imported numpy before truesky."""
     instruction_set.require_limit.cache_clear()
     monkeypatch.setattr(instruction_set, "_has_level", lambda: True)
     monkeypatch.setattr(instruction_set, "_numpy_in_use", lambda: ("X86_V3", "X86_V4"))
@@ -184,7 +184,7 @@ def test_variables_of_other_processes(monkeypatch):
 
 
 def test_a_cpu_of_another_architecture_is_another_kind(monkeypatch):
-    """It is neither limited nor refused; its name is in the manifest."""
+    """It is neither limited nor refused; the manifest contains its name."""
     monkeypatch.setattr(platform, "machine", lambda: "aarch64")
     monkeypatch.setattr(instruction_set, "numba_target", lambda: ("apple-m1", ""))
     monkeypatch.setattr(instruction_set, "_numpy_in_use", lambda: ("ASIMDHP",))
@@ -200,7 +200,7 @@ def test_a_cpu_of_another_architecture_is_another_kind(monkeypatch):
 @on_x86
 @pytest.mark.parametrize("setting", ["portable", "native"])
 def test_functions_of_numpy_agree_with_slow_references(setting):
-    """Within two units in the last place, whichever instructions compute them."""
+    """Results agree within two units in the last place with any instruction set."""
     code = (
         "import lake_schema, math, numpy as np; x = np.linspace(0.01, 30.0, 4001)\n"
         "for f in ('exp', 'log', 'log10', 'sin', 'cos', 'tanh', 'sqrt'):\n"

@@ -1,4 +1,4 @@
-"""What `list` says of a lake."""
+"""Output of the command `list`."""
 
 import json
 import os
@@ -61,13 +61,13 @@ def test_json_is_the_rows(listed, capsys):
     assert json.loads(capsys.readouterr().out) == [row for row in listing.rows(listed) if row["table"] == "plain"]
 
 
-def test_what_is_damaged_is_a_row_and_ends_with_1(listed, capsys):
+def test_a_damaged_version_is_a_row_and_exit_status_1(listed, capsys):
     (listed / "plain" / f"v-{plain_plan(1).key}" / "manifest.json").write_text("{")
     assert main(["list", str(listed)]) == 1
     assert "manifest.json: JSONDecodeError" in capsys.readouterr().out
 
 
-def test_what_is_not_there_is_a_wrong_call(lake, listed, tmp_path):
+def test_a_missing_table_is_a_wrong_call(lake, listed, tmp_path):
     assert main(["list", str(tmp_path / "empty")]) == 2
     assert main(["list", str(listed), "halos"]) == 2
 

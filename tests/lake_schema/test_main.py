@@ -1,4 +1,4 @@
-"""The commands that look after a lake: what they print and how they end."""
+"""Output and exit status of the commands that inspect and clean up a lake."""
 
 import errno
 import os
@@ -37,7 +37,7 @@ def test_verify_says_sound_and_ends_with_0(filled, capsys):
     assert " 550 rows " in lines[1]
 
 
-def test_verify_finds_what_it_is_told_to_look_for(filled, capsys):
+def test_only_verify_deep_compares_sha256(filled, capsys):
     version = read.version(filled, "toy")
     flip(version.sidecar_path("toy/partition_info.csv"), 5)
     assert main(["verify", str(filled), "toy"]) == 0
@@ -95,7 +95,7 @@ def test_a_copy_that_followed_links_is_damaged_for_everyone(filled, tmp_path, ca
         publish.make_version(tmp_path / "copy", toy_plan(), toy_work)
 
 
-def test_a_disc_that_refuses_is_one_line(filled, capsys, monkeypatch):
+def test_a_failing_disc_is_reported_in_one_line(filled, capsys, monkeypatch):
     def refuse(root, name, delete):
         raise OSError(errno.EROFS, "Read-only file system", str(root))
 
@@ -104,7 +104,7 @@ def test_a_disc_that_refuses_is_one_line(filled, capsys, monkeypatch):
     assert capsys.readouterr().err == f"lake_schema: [Errno 30] Read-only file system: '{filled}'\n"
 
 
-def test_gc_leaves_what_is_not_its_own(filled, capsys):
+def test_gc_leaves_files_of_users(filled, capsys):
     (filled / "plain" / "my-Notes.txt").touch()
     (filled / "plain" / "v-2").mkdir()
     (filled / "runs").mkdir()
@@ -116,7 +116,7 @@ def test_gc_leaves_what_is_not_its_own(filled, capsys):
 
 
 @pytest.mark.parametrize("to", ["gone", "elsewhere"])
-def test_gc_keeps_everything_while_it_does_not_know_what_is_current(filled, capsys, to):
+def test_gc_removes_nothing_if_the_current_version_is_unknown(filled, capsys, to):
     versions = sorted((filled / "plain").glob("v-*"))
     if to == "gone":
         shutil.rmtree(versions.pop(versions.index(layout.version_folder(filled, "plain", plain_plan(2).key))))
@@ -129,13 +129,13 @@ def test_gc_keeps_everything_while_it_does_not_know_what_is_current(filled, caps
 
 
 @pytest.mark.parametrize("arguments", [["tables", "x"], ["tables", "--deep"], ["gc", "x", "--deep"], ["verify"], []])
-def test_an_argument_that_means_nothing_is_refused(arguments, capsys):
+def test_a_meaningless_argument_is_refused(arguments, capsys):
     with pytest.raises(SystemExit, match="2"):
         main(arguments)
     assert "usage" in capsys.readouterr().err
 
 
-def test_gc_removes_what_is_old_and_says_so(filled, capsys):
+def test_gc_removes_old_versions_and_lists_them(filled, capsys):
     old = layout.version_folder(filled, "plain", plain_plan(1).key)
     assert main(["gc", str(filled), "--delete"]) == 0
     assert capsys.readouterr().out == f"removed {old}\n"
@@ -163,7 +163,7 @@ def test_describe_names_every_column_with_its_unit(filled, capsys):
 
 
 @pytest.mark.parametrize("command", ["verify", "gc", "describe"])
-def test_what_is_not_there_is_a_wrong_call(lake, capsys, command):
+def test_a_missing_table_is_a_wrong_call(lake, capsys, command):
     assert main([command, str(lake)]) == 2
     assert main([command, str(lake), "galaxies"]) == 2
     assert main([command, str(lake), "../galaxies"]) == 2

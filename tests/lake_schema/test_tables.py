@@ -1,4 +1,4 @@
-"""The reference page, the declarations by name, and the tables of what the rest was made with."""
+"""The reference page, declarations by name, and the tables that record inputs: mission, templates, passbands."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -25,7 +25,7 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "tables.md"
 
 
 def test_the_reference_page_is_up_to_date(capsys):
-    """If not: python -m lake_schema tables > docs/tables.md"""
+    """If this fails, run: python -m lake_schema tables > docs/tables.md"""
     assert __main__.main(["tables"]) == 0
     assert PAGE.read_text() == capsys.readouterr().out
 
@@ -36,8 +36,8 @@ def test_tables_are_found_by_name():
     assert tables.find_table("nothing") is None
 
 
-def test_a_row_of_exposures_has_a_field_a_column():
-    """In their order, of their types, None where the column may be null."""
+def test_a_row_of_exposures_has_a_field_per_column():
+    """The attributes have the order and the types of the columns; nullable ones may be None."""
     types = {"int64": int, "int32": int, "float64": float, "string": str}
     declared = {c.name: types[c.type] | None if c.nullable else types[c.type] for c in EXPOSURES.columns}
     assert list(get_type_hints(ExposureRow).items()) == list(declared.items())
@@ -131,7 +131,7 @@ def test_the_mission_with_what_a_run_chose():
         assert [row["value"] for row in used if row["overridden"]] == [7.5] * given
 
 
-def test_they_can_be_published_and_asked(lake):
+def test_all_tables_can_be_published_and_queried(lake):
     for table, rows in (
         (templates.TEMPLATES, templates.rows(libraries(), origins())),
         (mission.MISSION, published.to_table(resolve())),

@@ -1,4 +1,4 @@
-"""Magnitudes, flux densities and photons against decimal arithmetic and the definitions."""
+"""Magnitudes, flux densities and electron rates, compared with decimal arithmetic and with definitions."""
 
 from decimal import Decimal, getcontext
 
@@ -14,7 +14,7 @@ getcontext().prec = 50
 
 
 def exact(mag: float) -> Decimal:
-    """10^(-0.4 (m + 48.6)) in microjansky."""
+    """Return 10^(-0.4 (m + 48.6)) in microjansky."""
     return Decimal(10) ** (-(Decimal(mag) + Decimal("48.6")) / Decimal("2.5") + 29)
 
 
@@ -59,7 +59,7 @@ def test_no_flux_is_infinitely_faint():
     assert units.mag_of_f_nu([0.0, 5e-324]).tolist()[0] == np.inf
 
 
-# Below 1e-278 microjansky are less than the smallest number of full precision, in CGS units.
+# Values below 1e-278 microjansky have no full precision in cgs units.
 @given(st.floats(1e-278, 1e300))
 def test_microjansky_and_cgs(flux):
     assert float(units.cgs_of_ujy(flux)) == pytest.approx(flux * 1e-29, rel=5e-16, abs=0.0)
@@ -67,7 +67,7 @@ def test_microjansky_and_cgs(flux):
 
 
 def test_electron_rate_counts_photons():
-    # A flat f_nu source: photons per second between nu and nu + dnu are f_nu A dnu / (h nu).
+    # For constant f_nu, the rate of photons between nu and nu + dnu is f_nu A dnu / (h nu).
     area, blue, red, throughput, f_nu = 9926.0, 5500.0, 9000.0, 0.7, 3.0
     nu = 2.99792458e18 / np.linspace(blue, red, 200_001)
     photons = f_nu * 1e-29 * area * throughput / (6.62607015e-27 * nu)
@@ -80,6 +80,6 @@ def test_electron_rate_counts_photons():
 
 
 @pytest.mark.parametrize(("area", "width"), [(0.0, 1.0), (1.0, 0.0), (-1.0, 1.0), (np.nan, 1.0), (1.0, np.inf)])
-def test_electron_rate_refuses_what_collects_nothing(area, width):
+def test_electron_rate_refuses_impossible_areas_and_widths(area, width):
     with pytest.raises(OutOfRange):
         units.electron_rate(1.0, area, width)

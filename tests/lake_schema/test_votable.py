@@ -1,4 +1,4 @@
-"""What other people's readers are told of a file's columns."""
+"""The VOTable header of Parquet files, as other readers use it."""
 
 import io
 import warnings
@@ -17,7 +17,7 @@ DECLARED = tables.all_tables(["euclid_vis", "lsst_r"])
 
 
 def opened(path):
-    """As a user would; astropy says of some units that the standard wants others, and guesses lengths of texts."""
+    """Open a file as a user does; astropy warns about some units and guesses lengths of texts."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return Table.read(path, format="parquet.votable")
@@ -31,7 +31,7 @@ def test_astropy_sees_units_and_ucds_and_the_same_rows(tmp_path, table):
     assert found.colnames == table.names
     for column in table.columns:
         shown = found[column.name]
-        # VOUnit has an electron of its own.
+        # VOUnit defines a different unit of the name electron.
         assert units.Unit(str(shown.unit or "")) == units.Unit(column.unit)
         assert shown.meta.get("ucd", "") == column.ucd
         assert shown.description == column.doc
@@ -61,6 +61,6 @@ def test_missing_texts_and_no_rows(tmp_path):
 
 
 def test_our_own_schema_is_as_declared(tmp_path):
-    """The header stands in the footer alone: what Arrow makes of a file does not change by it."""
+    """The header is only in the footer and does not change the Arrow schema of a file."""
     parquet.write(tmp_path / "x.parquet", rows_of(PLAIN, 3), PLAIN)
     assert pq.read_schema(tmp_path / "x.parquet").equals(PLAIN.arrow_schema(), check_metadata=True)

@@ -81,7 +81,7 @@ class Session:
         try:
             for name in query.tables:
                 self._open(name)
-                for file in getattr(self._rows[name], "read_from", ()):
+                for file in getattr(self._rows[name], "verified_files", ()):
                     file.forget()
             relation = self._connect().sql(query.text, params=dict(parameters) or None)
             if relation is None:

@@ -1,1 +1,1 @@
-"""Lakes on S3-compatible object storage."""
+"""Lakes on S3-compatible object storage: pushing and reading."""

@@ -1,9 +1,9 @@
-"""Put a lake on object storage: truesky push LAKE s3://BUCKET/PREFIX [--endpoint-url URL] [--only TABLE ...].
+"""Push a lake to object storage: truesky push LAKE s3://BUCKET/PREFIX [--endpoint-url URL] [--only TABLE ...].
 
-Objects of versions never change, so that what is there as it should be is not sent again, and a run that was killed
-goes on where it ended. When every object of every version is there and its checksum compared, one conditional put
-replaces the object `current`: readers see what was published before or what is published now. Of two who push at the
-same time the second is refused. Nothing is removed.
+Objects of versions never change, so existing objects are not sent again, and a run that was killed can be continued.
+After all objects exist and their checksums have been compared, one conditional put replaces the object `current`.
+Readers therefore see either the old or the new set of versions. If two pushes run at the same time, the second one
+fails. Nothing is removed.
 """
 
 from __future__ import annotations
@@ -25,18 +25,34 @@ from lake_schema.store.object_storage import s3
 from lake_schema.store.object_storage.s3 import CURRENT, MANIFEST, Address, PublishedVersions
 from lake_schema.store.provenance import file_sha256
 
-# A put holds at most 5 GB; a larger file goes in parts, each with a checksum of its own.
+# S3 allows 5 GB per put; larger files are sent in parts, each with a checksum.
 _MAX_PUT_BYTES, _PART_BYTES = 1 << 30, 256 << 20
 _CHUNK_BYTES = 8 << 20
 THREADS = 16
-# What services answer where a condition of a put does not hold, or another put is under way.
+# Error codes of services if the condition of a put is not met, or if another put is in progress.
 _REFUSED_CODES = {"PreconditionFailed", "ConditionalRequestConflict", "412", "409"}
 _ABSENT_CODES = {"NoSuchKey", "404", "NotFound"}
 
 
 @dataclass(frozen=True, slots=True)
 class PushReport:
-    """What a push did with a version: objects and bytes in all, objects and bytes that it sent."""
+    """Result of pushing one version.
+
+    Attributes
+    ----------
+    table : str
+        Name of the table.
+    key : str
+        Key of the version.
+    objects : int
+        Number of its objects.
+    size : int
+        Total size in bytes.
+    sent : int
+        Number of objects that were sent.
+    sent_size : int
+        Total size of the objects that were sent, in bytes.
+    """
 
     table: str
     key: str
@@ -48,7 +64,7 @@ class PushReport:
 
 @dataclass(frozen=True, slots=True)
 class _Object:
-    """A file of a version and the object that is to hold it."""
+    """A file of a version and the name of its object."""
 
     path: Path
     name: str
@@ -57,9 +73,14 @@ class _Object:
 
 
 class Bucket:
-    """The objects of one lake, through boto3.
+    """Objects of one lake, accessed through boto3.
 
-    Errors : BadInput where the storage does not answer, has no such bucket, or does not let us in
+    Methods raise BadInput if the service does not answer, the bucket does not exist, or access is denied.
+
+    Parameters
+    ----------
+    address : Address
+        Address of the lake.
     """
 
     def __init__(self, address: Address) -> None:
@@ -67,7 +88,7 @@ class Bucket:
             import boto3
             from botocore.config import Config
         except ImportError:
-            raise BadInput("push wants the package boto3: pip install 'truesky[s3]', or boto3 alone") from None
+            raise BadInput("push requires the package boto3: pip install 'truesky[s3]', or boto3 alone") from None
         self.address = address
         config = Config(
             connect_timeout=s3.CONNECT_TIMEOUT,
@@ -77,7 +98,7 @@ class Bucket:
         )
         options: dict[str, Any] = {"endpoint_url": address.service} if address.service else {}
         with self._errors_as_bad_input():
-            # Where nothing names a region, any serves: a service of one's own has but one, Amazon tells the right one.
+            # Any region works as the default: other services have only one, and Amazon redirects to the right one.
             session = boto3.session.Session()
             region = address.region or session.region_name or "us-east-1"
             self._client = session.client("s3", region_name=region, config=config, **options)
@@ -98,7 +119,13 @@ class Bucket:
             raise BadInput(f"{self.address}: {error}") from None
 
     def read_published(self) -> tuple[PublishedVersions, str | None]:
-        """What is published, and the tag of the object that says so; None where there is none.  Errors: Damaged"""
+        """Return the published versions, and the ETag of the object `current` or None if it does not exist.
+
+        Raises
+        ------
+        Damaged
+            If the object has another form.
+        """
         if (current := self._read_object(CURRENT)) is None:
             return PublishedVersions({}, {}), None
         return s3.parse_published(current[0], f"{self.address.plain}/{CURRENT}"), current[1]
@@ -112,7 +139,7 @@ class Bucket:
                 return None
 
     def has_object(self, item: _Object) -> bool:
-        """Whether an object is there with the bytes of its file, by its checksum or by reading it."""
+        """Return True if an object exists with the contents of its file, by its checksum or else by reading it."""
         from botocore.exceptions import ClientError
 
         object_key = self.address.key(item.name)
@@ -126,11 +153,11 @@ class Bucket:
             if response["ContentLength"] != item.size:
                 return False
             if checksum := response.get("ChecksumSHA256"):
-                # Of one that came in parts it is a sum of their sums, and Amazon says how many behind a hyphen.
+                # For an object sent in parts, this is a checksum of checksums; Amazon appends "-" and their number.
                 checksum_value, in_parts, _ = checksum.partition("-")
                 in_parts = in_parts or "-" in response["ETag"]
                 return bool(checksum_value == (_multipart_checksum(item) if in_parts else _base64(item.sha256)))
-            # Sent by another program, or kept by a service that keeps no such checksums.
+            # The object was sent by another program, or the service stores no checksums.
             file_hash = hashlib.sha256()
             body = self._client.get_object(Bucket=self.address.bucket, Key=object_key)["Body"]
             for piece in body.iter_chunks(_CHUNK_BYTES):
@@ -138,7 +165,7 @@ class Bucket:
             return file_hash.hexdigest() == item.sha256
 
     def send(self, item: _Object) -> None:
-        """Put a file's bytes there, with their checksum."""
+        """Send a file with its checksum."""
         target = {"Bucket": self.address.bucket, "Key": self.address.key(item.name)}
         with self._errors_as_bad_input():
             if item.size <= _MAX_PUT_BYTES:
@@ -160,20 +187,25 @@ class Bucket:
                 raise BadInput(f"{self.address}: {error}") from None
 
     def supports_conditions(self, name: str) -> bool:
-        """Whether the service refuses a put whose condition does not hold.
+        """Return True if the service refuses a put whose condition is not met.
 
-        name : of an object that is there, and stays as it is either way
+        `name` is an existing object; the test does not change its contents.
+
+        Raises
+        ------
+        Damaged
+            If the object does not exist.
         """
         if (existing := self._read_object(name)) is None:
             raise Damaged(f"{self.address.plain}/{name} is missing")
         return not self._put_if(name, existing[0], {"IfNoneMatch": "*"})
 
     def replace_current(self, published: PublishedVersions, tag: str | None) -> bool:
-        """Replace `current` if it still is the one of a tag (None: if there is none); False where it is not."""
+        """Replace `current` if its ETag is still `tag`, or for None if it does not exist; return True on success."""
         condition = {"IfNoneMatch": "*"} if tag is None else {"IfMatch": tag}
         if self._put_if(CURRENT, published.to_bytes(), condition):
             return True
-        # Our own put, if its answer was lost and it was tried again.
+        # If the answer to a successful put was lost, the retry fails although `current` is as requested.
         current = self._read_object(CURRENT)
         return current is not None and current[0] == published.to_bytes()
 
@@ -195,7 +227,7 @@ def _base64(sha256: str) -> str:
 
 
 def _multipart_checksum(item: _Object) -> str:
-    """sha256 over the sha256 of its parts, as S3 keeps it."""
+    """Return the sha256 of the sha256 of all parts, as S3 computes it."""
     combined_hash = hashlib.sha256()
     with item.path.open("rb") as stream:
         while part := stream.read(_PART_BYTES):
@@ -207,13 +239,33 @@ def _multipart_checksum(item: _Object) -> str:
 
 
 def push(root: Path, address: Address, only: Sequence[str] = (), threads: int = THREADS) -> Iterator[PushReport]:
-    """Put the published versions of a lake there, each told when it is; then switch `current`.
+    """Send the published versions of a lake and yield a report for each; then replace `current`.
 
-    root    : folder of the lake;  place : where it goes
-    only    : tables, none = all of them: then the lake there is what this one is, else its other tables stay
-    threads : objects at a time
-    Errors  : BadInput for what cannot be pushed, or where the storage refuses; Damaged names what is not as it was
-              written, here or there; Superseded where another push has ended since this one began
+    Parameters
+    ----------
+    root : Path
+        Folder of the lake.
+    address : Address
+        Address of the lake on object storage.
+    only : sequence of str, optional
+        Tables to push; other tables on object storage stay. By default, all tables are pushed, and the published
+        versions become the versions of this lake.
+    threads : int, optional
+        Number of objects that are sent at the same time.
+
+    Yields
+    ------
+    PushReport
+        Report of a version, when all its objects exist.
+
+    Raises
+    ------
+    BadInput
+        If there is nothing to push, a table does not exist, or the service refuses.
+    Damaged
+        If a file or an object differs from its manifest.
+    Superseded
+        If another push has ended since this one began.
     """
     local_versions = _linked_versions(root, only)
     bucket = Bucket(address)
@@ -225,16 +277,16 @@ def push(root: Path, address: Address, only: Sequence[str] = (), threads: int = 
     }
     for number, (table, key) in enumerate(sorted(versions)):
         report = _push_version(bucket, _objects_of_version(root, table, key), table, key, threads)
-        # As soon as there is an object to ask it with, not when hours of others have been sent.
+        # This test needs an object. It runs after the first version, before other versions are sent for hours.
         if number == 0 and not bucket.supports_conditions(f"{table}/v-{key}/{MANIFEST}"):
-            raise BadInput(f"{address}: the storage takes no conditional puts: two who push could not be told apart")
+            raise BadInput(f"{address}: the storage ignores conditions of puts, so two pushes could mix versions")
         yield report
     if (tag is None or new_versions != remote_versions) and not bucket.replace_current(new_versions, tag):
         raise Superseded(f"{address}: another push has ended since this one began: run again to replace it")
 
 
 def _linked_versions(root: Path, only: Sequence[str]) -> PublishedVersions:
-    """What the links of a lake say, of all tables or of some.  Errors: BadInput"""
+    """Return the published versions of some or all tables; raise BadInput if a table does not exist."""
     if not (table_names := layout.table_names(root)):
         raise BadInput(f"lake {root} holds no table")
     if unknown := sorted(set(only) - set(table_names)):
@@ -250,7 +302,7 @@ def _linked_versions(root: Path, only: Sequence[str]) -> PublishedVersions:
 def _merge_published(
     remote_versions: PublishedVersions, local_versions: PublishedVersions, only: Sequence[str]
 ) -> PublishedVersions:
-    """What is to be published."""
+    """Return the versions that are to be published."""
     if not only:
         return local_versions
     keys_by_request: dict[str, dict[str, str]] = {}
@@ -262,7 +314,7 @@ def _merge_published(
 
 
 def _objects_of_version(root: Path, table: str, key: str) -> list[_Object]:
-    """The files of a version, its manifest last.  Errors: Damaged where it is not what the manifest says"""
+    """Return the files of a version, its manifest last; raise Damaged if they differ from the manifest."""
     folder = layout.version_folder(root, table, key)
     facts = manifest.load(folder, table)
     if faults := manifest.faults(folder, facts):
@@ -280,12 +332,12 @@ def _push_version(bucket: Bucket, objects: Sequence[_Object], table: str, key: s
             raise Damaged(f"{item.path} has other contents than the manifest says")
         bucket.send(item)
         if not bucket.has_object(item):
-            raise Damaged(f"{bucket.address.plain}/{item.name} is not what was sent")
+            raise Damaged(f"{bucket.address.plain}/{item.name} differs from what was sent")
         return 1
 
     with ThreadPoolExecutor(threads) as pool:
         try:
-            # The manifest after all others: where it is, the version is whole.
+            # The manifest is sent last: if it exists, the version is complete.
             is_sent = [*pool.map(upload_if_missing, objects[:-1]), upload_if_missing(objects[-1])]
         except BaseException:
             pool.shutdown(cancel_futures=True)
@@ -298,17 +350,20 @@ def _push_version(bucket: Bucket, objects: Sequence[_Object], table: str, key: s
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit status: 0 pushed, 1 something is wrong with the lake or another push came first, 2 the call is wrong."""
+    """Run the command and return its exit status.
+
+    The status is 0 for success, 1 for a fault of the lake or if another push came first, and 2 for a wrong call.
+    """
     parser = argparse.ArgumentParser(
         prog="python -m lake_schema.store.object_storage.push",
-        description="Put the published versions of a lake on object storage; what is there already is not sent again.",
+        description="Push the published versions of a lake to object storage; existing objects are not sent again.",
         epilog=f"truesky {__version__}",
     )
     parser.add_argument("lake", help="folder of the lake")
-    parser.add_argument("place", metavar="s3://BUCKET/PREFIX", help="where it goes")
-    parser.add_argument("--endpoint-url", help="of the object storage (default: $AWS_ENDPOINT_URL, else Amazon S3)")
-    parser.add_argument("--only", nargs="+", default=[], metavar="TABLE", help="these tables; what else is there stays")
-    parser.add_argument("--threads", type=int, default=THREADS, help=f"objects at a time (default {THREADS})")
+    parser.add_argument("place", metavar="s3://BUCKET/PREFIX", help="address of the lake on object storage")
+    parser.add_argument("--endpoint-url", help="URL of the object storage (default: $AWS_ENDPOINT_URL, else Amazon S3)")
+    parser.add_argument("--only", nargs="+", default=[], metavar="TABLE", help="tables to push; other tables stay")
+    parser.add_argument("--threads", type=int, default=THREADS, help=f"objects at a time (default: {THREADS})")
     options = parser.parse_args(argv)
     return command.run("push", lambda: _run_push(options))
 
@@ -316,7 +371,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run_push(options: argparse.Namespace) -> int:
     root, address = layout.resolve_lake(options.lake), s3.parse_address(options.place, options.endpoint_url)
     if not 1 <= options.threads <= 256:
-        raise BadInput(f"--threads {options.threads}: wanted 1 to 256")
+        raise BadInput(f"--threads {options.threads}: must be 1 to 256")
     for report in push(root, address, options.only, options.threads):
         sent = f"sent {report.sent:6,} {report.sent_size / 1e6:10.1f} MB"
         totals = f"{report.objects:6,} objects {report.size / 1e6:10.1f} MB, {sent}"

@@ -1,13 +1,11 @@
-"""A lake on object storage, as `truesky push` leaves it there, to be read like a folder.
+"""Read a lake on object storage, where `truesky push` has written it, like a folder.
 
-s3://BUCKET/PREFIX/<table>/v-<key>/...      objects of the same names as the files of a lake
-s3://BUCKET/PREFIX/current                  which versions are published: what the links of a folder say, in one object
+The objects of a lake are::
 
-Whoever opens a lake reads `current` once: all that is read afterwards is of the versions that it named then.
+    s3://BUCKET/PREFIX/<table>/v-<key>/...      objects with the names of the files of a lake
+    s3://BUCKET/PREFIX/current                  published versions: the targets of a folder's links, in one object
 
-Address     bucket, prefix and endpoint of s3://BUCKET/PREFIX?endpoint_override=URL
-Published   what the object `current` says
-Place       a lake or a name in it, with those of pathlib's methods that readers call
+`current` is read once when a lake is opened; all later reads refer to the versions that it listed at that time.
 """
 
 from __future__ import annotations
@@ -28,25 +26,34 @@ from urllib.parse import parse_qsl, urlencode, urlsplit
 from lake_schema.errors import BadInput, Damaged
 
 CURRENT, MANIFEST = "current", "manifest.json"
-# s until a connection stands, until an answer comes; how often either is tried.
+# Time limits (s) for a connection and for an answer, and number of attempts.
 CONNECT_TIMEOUT, REQUEST_TIMEOUT, MAX_ATTEMPTS = 5, 60, 3
 _BUCKET = re.compile(r"[a-z0-9][a-z0-9._-]{1,253}[a-z0-9]", re.ASCII)
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}", re.ASCII)
 _KEY = re.compile(r"[0-9a-f]{16}", re.ASCII)
 _ENDPOINT = re.compile(r"https?://[^/?#@\s]+/?", re.ASCII)
 _QUERY_KEYS = {"endpoint_override": "endpoint", "region": "region"}
-# In an address: who asks, and a word with its value.
+# Patterns of an address: the user with the password, and a parameter with its value.
 _USER, _VALUE = re.compile(r"(//)[^/@\s]*@"), re.compile(r"(?<=[?&])([^=&#]*)=[^&#]*")
-# Bytes of an object that are fetched at a time.
+# Bytes of an object that are read at a time.
 _CHUNK_BYTES = 8 << 20
 _NAMES = "names"
 
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """Where a lake lies.
+    """Address of a lake on object storage.
 
-    endpoint : URL of the service, "" = $AWS_ENDPOINT_URL, else Amazon's;  region : "" = as the environment says
+    Attributes
+    ----------
+    bucket : str
+        Name of the bucket.
+    prefix : str
+        Beginning of the names of the lake's objects.
+    endpoint : str
+        URL of the service, or "" for $AWS_ENDPOINT_URL, else Amazon S3.
+    region : str
+        Name of the region, or "" for the region of the environment.
     """
 
     bucket: str
@@ -60,52 +67,67 @@ class Address:
 
     @property
     def plain(self) -> str:
+        """The address without endpoint and region."""
         return f"s3://{self.bucket}/{self.prefix}".rstrip("/")
 
     @property
     def service(self) -> str:
-        """URL of the service where the call or the environment names one, else ""."""
+        """URL of the service from the call or from the environment, "" for Amazon S3."""
         url = self.endpoint or os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL") or ""
         if url and not _ENDPOINT.fullmatch(url):
-            raise BadInput(f"endpoint {remove_secrets(url)}: wanted http://HOST:PORT or https://HOST")
+            raise BadInput(f"endpoint {remove_secrets(url)}: must be http://HOST:PORT or https://HOST")
         return url.rstrip("/")
 
     def key(self, *parts: str) -> str:
-        """Name of an object of the lake in its bucket."""
+        """Return the name of an object of the lake in its bucket."""
         return "/".join(part for part in (self.prefix, *parts) if part)
 
 
 def is_address(text: object) -> bool:
-    """Whether this names a place on object storage."""
+    """Return True if a text is an address of object storage."""
     return str(text).lower().startswith("s3:")
 
 
 def remove_secrets(text: str) -> str:
-    """An address as a message may show it: not what stands before an @, nor values that are no endpoint or region."""
+    """Return an address for a message, with masked user, password, and parameters except endpoint and region."""
     masked = _USER.sub(r"\1..@", text)
     return _VALUE.sub(lambda found: found[0] if found[1] in _QUERY_KEYS else f"{found[1]}=..", masked)[:200]
 
 
 def parse_address(text: str, endpoint: str | None = None) -> Address:
-    """The place that s3://BUCKET/PREFIX names.
+    """Parse an address s3://BUCKET/PREFIX with optional parameters.
 
-    endpoint : URL of the service, in place of what the text or the environment says
-    Errors   : BadInput
+    Parameters
+    ----------
+    text : str
+        The address.
+    endpoint : str, optional
+        URL of the service, which replaces the URL of the address or of the environment.
+
+    Returns
+    -------
+    Address
+        The address.
+
+    Raises
+    ------
+    BadInput
+        If the address or the endpoint is wrong.
     """
     url = urlsplit(text)
     query = dict(parse_qsl(url.query))
     if url.fragment or not text.lower().startswith("s3://") or query.keys() - _QUERY_KEYS.keys():
-        expected = "s3://BUCKET/PREFIX, maybe with ?endpoint_override=URL&region=REGION"
-        raise BadInput(f"lake {remove_secrets(text)}: wanted {expected}")
+        expected = "s3://BUCKET/PREFIX, optionally with ?endpoint_override=URL&region=REGION"
+        raise BadInput(f"lake {remove_secrets(text)}: must be {expected}")
     if "@" in url.netloc:
-        raise BadInput(f"lake {remove_secrets(text)}: credentials do not stand in an address; the environment has them")
+        raise BadInput(f"lake {remove_secrets(text)}: credentials must not be in an address but in the environment")
     if not _BUCKET.fullmatch(url.netloc):
-        raise BadInput(f"lake {remove_secrets(text)}: {url.netloc[:80]!r} is no name of a bucket")
+        raise BadInput(f"lake {remove_secrets(text)}: {url.netloc[:80]!r} is not a valid name of a bucket")
     prefix = url.path.strip("/")
     if not prefix.isprintable() or ({"", ".", ".."} & set(prefix.split("/")) and prefix):
         raise BadInput(f"lake {remove_secrets(text)}: the prefix has an empty part, . or ..")
     parsed = Address(url.netloc, prefix, endpoint or query.get("endpoint_override", ""), query.get("region", ""))
-    # Said before anything is asked of it.
+    # This checks the endpoint before the first request.
     assert parsed.service is not None
     return parsed
 
@@ -115,21 +137,26 @@ def parse_address(text: str, endpoint: str | None = None) -> Address:
 
 @dataclass(frozen=True, slots=True)
 class PublishedVersions:
-    """Keys of the versions that readers see.
+    """Keys of the published versions.
 
-    tables : table -> key of its current version;  names : request -> table -> key of its version
+    Attributes
+    ----------
+    tables : mapping of str to str
+        Key of the current version, by table.
+    names : mapping of str to mapping of str to str
+        Keys of the versions of a request by table, by name of the request.
     """
 
     tables: Mapping[str, str]
     names: Mapping[str, Mapping[str, str]]
 
     def to_bytes(self) -> bytes:
-        """As the object holds it; equal ones have equal bytes."""
+        """Return the contents of the object `current`; equal instances give equal bytes."""
         names = {name: dict(keys_by_table) for name, keys_by_table in self.names.items()}
         return json.dumps({"tables": dict(self.tables), "names": names}, sort_keys=True, indent=1).encode()
 
     def links(self) -> dict[str, str]:
-        """The links that a folder would have, and where they lead."""
+        """Return the links that a folder would have, and their targets."""
         links = {f"{table}/{CURRENT}": f"v-{key}" for table, key in self.tables.items()}
         for name, keys_by_table in self.names.items():
             links |= {f"{_NAMES}/{name}/{table}": f"../../{table}/v-{key}" for table, key in keys_by_table.items()}
@@ -137,7 +164,13 @@ class PublishedVersions:
 
 
 def parse_published(data: bytes, location: str) -> PublishedVersions:
-    """What the object `current` says.  Errors: Damaged where it is of another form"""
+    """Parse the object `current`; `location` is its name for the message.
+
+    Raises
+    ------
+    Damaged
+        If the object has another form.
+    """
     try:
         content = json.loads(data)
         versions = PublishedVersions(
@@ -160,16 +193,20 @@ def parse_published(data: bytes, location: str) -> PublishedVersions:
 
 
 class ObjectStore:
-    """The objects of one lake, through pyarrow: `current` is read once, manifests are kept, copies go with this."""
+    """Objects of one lake, read through pyarrow.
+
+    `current` is read once, small objects are cached, and copies are removed with this instance.
+    """
 
     def __init__(self, address: Address) -> None:
         self.address = address
         self.small_objects: dict[str, bytes] = {}
-        # Of versions, whether they are there.
+        # True or False for versions whose existence is known.
         self.version_exists: dict[str, bool] = {}
 
     @cached_property
     def files(self) -> Any:
+        """File system of pyarrow."""
         from pyarrow import fs
 
         options: dict[str, Any] = {"endpoint_override": self.address.service} if self.address.service else {}
@@ -182,20 +219,20 @@ class ObjectStore:
 
     @cached_property
     def links(self) -> dict[str, str]:
-        """Errors: BadInput where there is no such lake, or nobody answers."""
+        """Links of the lake and their targets; raise BadInput if there is no such lake or service."""
         name = f"{self.address.plain}/{CURRENT}"
         try:
             return parse_published(self.read_object(CURRENT), name).links()
         except FileNotFoundError:
             raise BadInput(
-                f"lake {self.address}: there is no object {name}: no lake was pushed there, or the bucket is another"
+                f"lake {self.address}: there is no object {name}: no lake was pushed there, or the bucket is wrong"
             ) from None
         except OSError as error:
             self._raise_unreadable(error)
 
     @cached_property
     def tables(self) -> dict[str, str]:
-        """Key of every version that is published -> its table."""
+        """Tables of all published versions, by key."""
         return {target.rpartition("v-")[2]: _table_of_link(link) for link, target in self.links.items()}
 
     def _raise_unreadable(self, error: OSError) -> NoReturn:
@@ -203,46 +240,48 @@ class ObjectStore:
         if "NETWORK_CONNECTION" in text or "curlCode" in text:
             service = self.address.service or "Amazon S3"
             raise BadInput(f"lake {self.address}: {service} does not answer: {text}") from None
-        # Credentials come from the environment, a profile, or the machine's own role.
+        # Credentials come from the environment, a profile, or the role of the machine.
         raise BadInput(f"lake {self.address} cannot be read: {text}") from None
 
     @cached_property
     def copies(self) -> tempfile.TemporaryDirectory[str]:
+        """Temporary folder for copies of objects."""
         return tempfile.TemporaryDirectory(prefix="truesky-objects-")
 
     def object_path(self, *parts: str) -> str:
-        """As pyarrow names an object."""
+        """Return the path of an object for pyarrow."""
         return f"{self.address.bucket}/{self.address.key(*parts)}"
 
     def open(self, *parts: str) -> Any:
-        """An object, to be read at any place.  Errors: FileNotFoundError, OSError"""
+        """Open an object for reading at any offset; raise FileNotFoundError or OSError on failure."""
         return self.files.open_input_file(self.object_path(*parts))
 
     def read_object(self, *parts: str) -> bytes:
-        """All bytes of a small object.  Errors: FileNotFoundError, OSError"""
+        """Return the contents of a small object; raise FileNotFoundError or OSError if that fails."""
         with self.open(*parts) as stream:
             data: bytes = stream.read()
             return data
 
 
 def _table_of_link(link: str) -> str:
-    """Of a link, the table whose version it leads to."""
+    """Return the table of the version to which a link leads."""
     *above, table, last = link.split("/")
     return table if last == CURRENT and not above else last
 
 
 @dataclass(frozen=True)
 class ObjectPath:
-    """A lake (no parts) or a name in it: a link, a folder of links, an object.
+    """A lake on object storage (no parts), or a name in it: a link, a folder of links, or an object.
 
-    What a folder of links holds, and where they lead, is what `current` said when the lake was first read.
+    It has the methods of pathlib.Path that readers use. Links and their targets come from `current` at the time of
+    the first read.
     """
 
     store: ObjectStore = field(repr=False, compare=False)
     parts: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        """A lake by its whole address, which opens it again."""
+        """Return the full address of a lake, with which it can be opened again, or the address of an object."""
         return "/".join([self.store.address.plain, *self.parts]) if self.parts else str(self.store.address)
 
     def __truediv__(self, name: str) -> ObjectPath:
@@ -250,35 +289,38 @@ class ObjectPath:
 
     @property
     def name(self) -> str:
+        """Last part of the path, "" for a lake."""
         return self.parts[-1] if self.parts else ""
 
     @property
     def parent(self) -> ObjectPath:
+        """Path without its last part."""
         return ObjectPath(self.store, self.parts[:-1])
 
     @property
     def relative(self) -> str:
+        """Path from the root of the lake."""
         return "/".join(self.parts)
 
     def reopen(self) -> ObjectPath:
-        """The same lake as it is now."""
+        """Return the same path with a store that reads `current` again."""
         return ObjectPath(ObjectStore(self.store.address), self.parts)
 
     def exists(self) -> bool:
-        """Whether there is such an object; for a version's folder whether its manifest is."""
+        """Return True if the object exists. A version's folder exists if its manifest exists."""
         version = self.name.removeprefix("v-")
         if version == self.name:
             return bool(self._file_info().type.name == "File")
         if (table := self.store.tables.get(version)) is not None and table != self.parent.name:
-            # Keys of versions name their tables, too: that of another is not asked for.
+            # The key determines the table, so no request is needed for another table.
             return False
         if version not in self.store.version_exists:
-            # One that was replaced since; what is removed by hand is missed when it is read.
+            # Unpublished versions may still exist. If a published one was removed by hand, reading it fails.
             self.store.version_exists[version] = table is not None or (self / MANIFEST).exists()
         return self.store.version_exists[version]
 
     def stat(self) -> SimpleNamespace:
-        """Bytes of an object and when it was put there, as st_size and st_mtime.  Errors: FileNotFoundError, OSError"""
+        """Return size (bytes) and time of an object as st_size and st_mtime; raise OSError if that fails."""
         info = self._file_info()
         if info.type.name != "File":
             raise FileNotFoundError(f"{self} is missing")
@@ -288,7 +330,7 @@ class ObjectPath:
         return self.store.files.get_file_info(self.store.object_path(*self.parts))
 
     def glob(self, pattern: str) -> Iterator[ObjectPath]:
-        """Names right below this one.  Errors: OSError"""
+        """Return the matching names directly below this one; raise OSError if that fails."""
         from pyarrow import fs
 
         infos = self.store.files.get_file_info(
@@ -298,19 +340,19 @@ class ObjectPath:
         return (self / name for name in names if fnmatch.fnmatchcase(name, pattern))
 
     def readlink(self) -> str:
-        """Errors: FileNotFoundError where there is no such link."""
+        """Return the target of a link; raise FileNotFoundError if there is no such link."""
         if (target := self.store.links.get(self.relative)) is None:
             raise FileNotFoundError(f"{self} is missing")
         return target
 
     def iterdir(self) -> Iterator[ObjectPath]:
-        """Of a folder of links those in it, and folders of such."""
+        """Return the links and the folders of links in this folder of links."""
         depth = len(self.parts)
         inside = {tuple(link.split("/"))[: depth + 1] for link in self._links()}
         return (ObjectPath(self.store, parts) for parts in sorted(inside))
 
     def is_dir(self) -> bool:
-        """Whether it is a folder of links."""
+        """Return True if this is a folder of links."""
         return any(self._links())
 
     def _links(self) -> Iterator[str]:
@@ -318,17 +360,17 @@ class ObjectPath:
         return (link for link in self.store.links if link.startswith(start))
 
     def read_bytes(self) -> bytes:
-        """All bytes of a small object that never changes; they are kept.  Errors: FileNotFoundError, OSError"""
+        """Return the contents of a small object that never changes, and cache them; raise OSError if that fails."""
         if self.relative not in self.store.small_objects:
             self.store.small_objects[self.relative] = self.store.read_object(*self.parts)
         return self.store.small_objects[self.relative]
 
     def open(self, mode: str = "rb") -> Any:
-        """An object, open for reading.  Errors: FileNotFoundError, OSError"""
+        """Open an object for reading; raise FileNotFoundError or OSError if that fails."""
         return self.store.open(*self.parts)
 
     def sizes(self) -> dict[str, int]:
-        """Of every object below this name its name from here on, and its bytes.  Errors: OSError"""
+        """Return the size in bytes of each object below this name, by relative name; raise OSError if that fails."""
         from pyarrow import fs
 
         start = self.store.object_path(*self.parts) + "/"
@@ -337,7 +379,7 @@ class ObjectPath:
         return {info.path.removeprefix(start): info.size for info in infos if info.type == fs.FileType.File}
 
     def gather_copies(self, copies: Iterable[Path]) -> Path:
-        """A folder in which copies lie side by side, which lasts as long as they do."""
+        """Return a folder with links to copies of objects, which exists as long as the copies."""
         target = Path(self.store.copies.name).joinpath(*self.parts)
         target.mkdir(parents=True, exist_ok=True)
         for copy in copies:
@@ -346,10 +388,12 @@ class ObjectPath:
         return target
 
     def download(self, sha256: str) -> Path:
-        """A file with the object's bytes, which lasts as long as the lake is open.
+        """Return a file with a copy of the object, which exists as long as the lake is open.
 
-        sha256 : of the whole object, hexadecimal
-        Errors : Damaged where it is of another, or missing
+        Raises
+        ------
+        Damaged
+            If the object is missing or its sha256 differs from `sha256` (hexadecimal).
         """
         import hashlib
 
@@ -375,6 +419,6 @@ class ObjectPath:
         return target
 
 
-# A lake, or a name in it, for who only reads; and the same for what gives a name below the one that it is given.
+# A lake or a path in it, for readers; and a type variable for functions that return a path of the same type.
 Folder: TypeAlias = Path | ObjectPath
 Below = TypeVar("Below", Path, ObjectPath, Path | ObjectPath)

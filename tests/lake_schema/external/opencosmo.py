@@ -1,4 +1,4 @@
-"""A made-up file in OpenCosmo's layout: header, index and data, or a group of them for each slice of a light-cone."""
+"""Synthetic files in OpenCosmo's layout: header, index and data, or a group of them per slice of a light-cone."""
 
 import h5py
 import numpy as np
@@ -14,7 +14,7 @@ UNITS = {
 
 
 def columns(n=200, seed=3, ra=53.1, dec=-27.8):
-    """Values by their names."""
+    """Return values by name of the column."""
     rng = np.random.default_rng(seed)
     z, disk, bulge = rng.uniform(0.05, 2.0, n), rng.uniform(1.0, 6.0, n), rng.uniform(0.5, 3.0, n)
     return {
@@ -40,7 +40,7 @@ def columns(n=200, seed=3, ra=53.1, dec=-27.8):
 
 
 def write(path, *slices, units=UNITS, kind="diffsky_fits"):
-    """One slice: at the root; several: a group each, by the number of their step."""
+    """Write one slice at the root, or several slices in groups that are named by the number of their step."""
     with h5py.File(path, "w") as file:
         for step, values in enumerate(slices):
             root = file if len(slices) == 1 else file.create_group(str(475 + 12 * step))

@@ -1,4 +1,4 @@
-"""Parquet of other programs: read as it is, or refused in one line, in little time and memory."""
+"""Parquet files of other programs are read correctly or refused in one line, with little time and memory."""
 
 import base64
 import pickle
@@ -15,12 +15,12 @@ from lake_schema.external import files as external_files
 from lake_schema.store import blocks, parquet
 
 GOOD = pa.table({"ra": np.linspace(0, 359, 1000), "name": ["a", "b"] * 500, "flag": [True, False] * 500})
-# The reading process has a limit of its own, in processor time; the machine may be doing other things.
+# Wall time (s) after which a reader hangs. The reading process has a separate limit of CPU time.
 HANGS, MOST_BYTES = 120.0, 512 << 20
 
 
 def read(path, columns=("ra",)):
-    """The rows, within the bounds of time and memory."""
+    """Return the rows; check the limits of time and memory."""
     pool = pa.default_memory_pool()
     before, started = pool.max_memory(), time.perf_counter()
     try:
@@ -135,14 +135,14 @@ def test_a_good_file_is_read_as_it_is(tmp_path):
 
 
 class Trap:
-    """Says so where it is unpickled."""
+    """Object that reports when it is unpickled."""
 
     def __reduce__(self):
         return (pytest.fail, ("a pickle was read",))
 
 
 def test_pickles_are_never_read(tmp_path):
-    """pandas and pyarrow once kept pickles in a schema's metadata; they stay bytes."""
+    """pandas and pyarrow once stored pickles in a schema's metadata; they must stay bytes."""
     bait = pickle.dumps(Trap())
     extension = {"ARROW:extension:name": "arrow.py_extension_type", "ARROW:extension:metadata": bait}
     field = pa.field("ra", pa.float64(), metadata=extension)
@@ -153,7 +153,7 @@ def test_pickles_are_never_read(tmp_path):
 
 
 def test_statistics_are_not_believed(tmp_path):
-    """Whatever a footer says about the extremes of a column, every row is returned."""
+    """Every row is returned, even if the statistics of a column in the footer are wrong."""
     path = tmp_path / "x.parquet"
     write(path, pa.table({"ra": np.arange(1.0, 101.0)}), use_dictionary=False, compression="none")
     data, last, start = (

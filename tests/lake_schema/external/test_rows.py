@@ -1,4 +1,4 @@
-"""Rows of other programs' tables: what is refused before there is room made for it."""
+"""Tables of other programs that are refused before memory is allocated for them."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ def rows(path):
 
 @pytest.mark.parametrize("title", ["c{}", ""])
 def test_a_csv_of_any_number_of_columns_is_refused(tmp_path, title):
-    """Room is made for each, whichever are asked for: some gigabytes for a header of some megabytes."""
+    """Arrow allocates memory for all columns: some gigabytes for a header of some megabytes."""
     path = tmp_path / "x.csv"
     for count in (4000, 5000):
         titles = ",".join(title.format(i) for i in range(count - 1))
@@ -27,5 +27,5 @@ def test_a_csv_of_any_number_of_columns_is_refused(tmp_path, title):
 def test_titles_of_any_length_are_refused(tmp_path):
     path = tmp_path / "x.csv"
     path.write_text("ra," + "x" * 70_000 + "\n1,2\n")
-    with pytest.raises(BadInput, match="titles of any length"):
+    with pytest.raises(BadInput, match="titles that are too long"):
         rows(path)

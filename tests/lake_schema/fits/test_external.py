@@ -1,4 +1,4 @@
-"""External FITS files: whatever is wrong in one is a sentence, soon, and in little memory."""
+"""Faulty FITS files of other programs are refused in one line, quickly and with little memory."""
 
 import gzip
 import resource
@@ -18,7 +18,7 @@ READERS = {
     "read_map": lambda path: external.read_map(path, "a"),
     "read_planes": lambda path: external.read_planes(path, "a"),
 }
-# What has no bound takes minutes; a slow machine's imports take seconds.
+# Reading without limits takes minutes; imports on a slow machine take seconds.
 MOST_SECONDS, MOST_BYTES = 30.0, 512 << 20
 
 
@@ -38,7 +38,7 @@ def good(tmp_path):
 
 
 def card(name, value):
-    """The same file with a card of its table changed."""
+    """Return the same file with a changed card of its table."""
 
     def change(data):
         start = data.index(f"{name:8}= ".encode(), 2880)
@@ -89,10 +89,10 @@ UNSEEN = [BROKEN[name] for name in ("no title", "a title that is a number", "a f
 
 @pytest.mark.parametrize("name", READERS)
 @pytest.mark.parametrize("change", BROKEN.values(), ids=BROKEN)
-def test_what_is_broken_is_refused_in_a_line(good, name, change):
+def test_broken_files_are_refused_in_one_line(good, name, change):
     good.write_bytes(change(good.read_bytes()))
     before, started = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10, time.process_time()
-    # What one of them does not look at may be wrong.
+    # A reader need not notice faults in parts of a file that it does not use.
     said = f"{good}: a line" if change in UNSEEN else ""
     try:
         READERS[name](good)
@@ -114,14 +114,14 @@ def test_lists_are_refused_before_they_are_read(tmp_path, name):
         READERS[name](tmp_path / "x.fits")
 
 
-def test_packed_images_are_not_unpacked(tmp_path):
+def test_compressed_images_are_not_decompressed(tmp_path):
     unit = astropy_fits.CompImageHDU(np.ones((30, 30), np.int16), compression_type="RICE_1")
     astropy_fits.HDUList([astropy_fits.PrimaryHDU(), unit]).writeto(tmp_path / "x.fits")
     with pytest.raises(BadInput, match="holds no image"):
         external.read_planes(tmp_path / "x.fits", "a")
 
 
-def test_good_ones_are_read_plain_or_packed(good):
+def test_good_files_are_read_plain_or_compressed(good):
     for _ in range(2):
         ((numbers, _),) = external.read_batches(good, ["a", "b"], ["name"])
         assert (numbers["b"].tolist(), numbers["name"][3]) == (list(range(48)), "n3")

@@ -1,4 +1,4 @@
-"""FITS: the bytes, the checksums, and what a damaged or hostile file meets."""
+"""FITS files: bytes, checksums, and the refusal of damaged or hostile files."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def science(ny=30, nx=40):
 
 
 @given(st.sampled_from(TYPES).flatmap(lambda t: hnp.arrays(t, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9))))
-def test_what_is_written_is_read(tmp_path_factory, data):
+def test_written_images_are_read_unchanged(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("fits") / "a.fits"
     write_images(path, [Image(data, CARDS), Image(data, name="COPY")])
     first, second = read_images(path)
@@ -50,8 +50,8 @@ def test_the_same_input_gives_the_same_bytes(tmp_path):
 
 @settings(max_examples=12)
 @given(st.sampled_from(TYPES).flatmap(lambda t: hnp.arrays(t, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9))))
-def test_what_is_packed_is_read_as_it_was(tmp_path_factory, data):
-    """In the first place of a file and in another, whole numbers or not."""
+def test_compressed_images_are_read_unchanged(tmp_path_factory, data):
+    """Images are compressed as the first or another unit of a file, with integers or floats."""
     path = tmp_path_factory.mktemp("fits") / "a.fits"
     for images in ([Image(data, CARDS), Image(data, name="COPY")], [Image(None, CARDS),
                    Image(data, CARDS, "COPY")]):  # fmt: skip
@@ -77,7 +77,7 @@ def test_tiles_are_sixteen_rows_or_what_is_left_of_an_image(tmp_path, shape):
 
 
 def test_cards_that_are_equal_are_written_each_as_it_is():
-    """0.0 and -0.0, 1, 1.0 and True are equal to Python: none stands in for another."""
+    """In Python, 0.0 equals -0.0, and 1 equals 1.0 and True; each must be written as given."""
     values = (0.0, -0.0, 1, 1.0, True, "1", -0.0, True, 1.0, 1, 0.0)
     lines = cards_to_text([("A", value, "") for value in values]).splitlines()
     assert lines == [str(astropy_fits.Card("A", value, "")).rstrip() for value in values]
@@ -90,7 +90,7 @@ def test_packed_images_are_small_sound_and_the_same_every_time(tmp_path):
         write_images(tmp_path / name, [Image(noise, CARDS, "1-1.E")], rice=True)
     good = (tmp_path / "a").read_bytes()
     assert good == (tmp_path / "b").read_bytes()
-    # 3.5 bits a pixel is what such noise holds; and headers.
+    # This noise contains 3.5 bits per pixel; the rest are headers.
     assert len(good) < 0.35 * noise.nbytes + 6 * 2880
     with astropy_fits.open(tmp_path / "a", checksum=True, disable_image_compression=True) as units:
         units.verify("exception")
@@ -111,7 +111,7 @@ def test_a_changed_byte_of_a_packed_image_is_noticed(tmp_path, where):
         read_images(path)
 
 
-def test_what_would_be_too_large_unpacked_is_refused(tmp_path):
+def test_images_too_large_when_decompressed_are_refused(tmp_path):
     path = tmp_path / "a.fits"
     write_images(path, [Image(np.zeros((300, 300), np.uint16))], rice=True)
     with pytest.raises(BadInput, match="more than 100000 bytes"):
@@ -134,7 +134,7 @@ def test_a_changed_byte_is_noticed(tmp_path):
     path = tmp_path / "a.fits"
     write_images(path, [Image(science(), CARDS)])
     good = path.read_bytes()
-    # In the data, and in a card's value.
+    # Change a byte of the data, and a byte of a card's value.
     for place in (2880 + 100, good.index(b"560.53") + 1):
         path.write_bytes(good[:place] + bytes([good[place] ^ 1]) + good[place + 1 :])
         with pytest.raises(Damaged, match=r"a\.fits"):
@@ -154,7 +154,7 @@ def test_a_file_without_checksums_is_refused(tmp_path):
         read_images(path)
 
 
-def test_size_is_judged_from_the_header(tmp_path):
+def test_size_is_checked_from_the_header(tmp_path):
     path = tmp_path / "a.fits"
     write_images(path, [Image(science())])
     with pytest.raises(BadInput, match="more than 1000 bytes"):
@@ -184,7 +184,7 @@ def test_a_card_that_fits_cannot_hold_is_refused(tmp_path, card):
 
 
 @pytest.mark.parametrize("data", [np.zeros(3), np.zeros((2, 2), complex), np.zeros((1, 2, 2, 2)), np.array([["a"]])])
-def test_what_is_no_image_is_refused(tmp_path, data):
+def test_arrays_that_are_not_images_are_refused(tmp_path, data):
     with pytest.raises(BadInput, match="image"):
         write_images(tmp_path / "a.fits", [Image(data)])
     with pytest.raises(BadInput, match="at least one"):
@@ -232,7 +232,7 @@ def test_tables_with_texts_gaps_and_lists(tmp_path):
 
 
 def exported(path, table, **columns):
-    """The table as an independent reader sees it, and its raw bytes."""
+    """Return the table as an independent reader reads it, and its raw bytes."""
     tables.table_to_fits(path, table.build({"id": np.arange(3), **columns}), table)
     with astropy_fits.open(path, character_as_bytes=True) as units:
         raw = np.array(units[1].data.view(np.ndarray))
@@ -240,7 +240,7 @@ def exported(path, table, **columns):
 
 
 @pytest.mark.parametrize("kind", ["int8", "int16", "int32", "int64"])
-def test_what_is_missing_is_told_from_every_number(tmp_path, kind):
+def test_null_differs_from_every_number(tmp_path, kind):
     table = Table("t", 1, (Column("id", "int64"), Column("x", kind, lo=0, nullable=True)), "t")
     limits = np.iinfo(kind)
     for values in ([limits.min, limits.max, 0], [-1, -(2**15) % limits.max, 5], [limits.min, limits.min + 1, 7]):
@@ -250,7 +250,7 @@ def test_what_is_missing_is_told_from_every_number(tmp_path, kind):
         assert found["x"][:2].tolist() == values[:2]
 
 
-def test_a_column_of_all_numbers_has_none_for_what_is_missing():
+def test_a_column_with_all_values_has_none_left_for_null():
     with pytest.raises(ValueError, match="every number of int8"):
         tables._lowest_unused_value(np.arange(-128, 128).astype(np.int8))
     assert tables._lowest_unused_value(np.array([], np.int16)) == -(2**15)
@@ -281,14 +281,14 @@ def test_a_name_that_fits_cannot_hold_is_refused(tmp_path, name):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_units_are_spelled_as_fits_wants():
+def test_units_have_the_spelling_of_fits():
     assert tables.fits_unit("GB") == "Gbyte"
     assert tables.fits_unit("erg s-1 cm-2") == "erg s-1 cm-2"
     assert tables.fits_unit("electron pix-1 s-1") == "electron pix-1 s-1"
 
 
 def somebodys(path):
-    """An external table: whole numbers, one of them none, numbers, a flag, texts, and lists of two lengths."""
+    """Write a table of another program: integers (one missing), floats, booleans, texts, and lists of two lengths."""
     columns = [
         astropy_fits.Column("number", "J", null=-9, array=np.array([3, -9, 5])),
         astropy_fits.Column("id", "K", array=np.array([2**60, 2, 3])),
@@ -305,7 +305,7 @@ def somebodys(path):
 
 
 @pytest.mark.parametrize("rows", [1, 2, 3, 100])
-def test_numbers_of_others_are_read_in_batches(tmp_path, rows):
+def test_external_columns_are_read_in_batches(tmp_path, rows):
     path = somebodys(tmp_path / "a.fits")
     names = ("number", "id", "flux", "good")
     batches = list(external.read_batches(path, names, ("name", "absent"), rows))
@@ -322,24 +322,24 @@ def test_numbers_of_others_are_read_in_batches(tmp_path, rows):
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("absent", "has no column absent; it has number, id"), ("name", "wanted a number a row"),
-     ("pair", "wanted a number a row"), ("list", "column list holds lists")],
+    [("absent", "has no column absent; it has number, id"), ("name", "must be one number per row"),
+     ("pair", "must be one number per row"), ("list", "column list holds lists")],
 )  # fmt: skip
-def test_what_is_no_number_a_row_is_refused(tmp_path, name, words):
+def test_columns_without_one_number_per_row_are_refused(tmp_path, name, words):
     path = somebodys(tmp_path / "a.fits")
     with pytest.raises(BadInput, match=words):
         list(external.read_batches(path, [name]))
 
 
 def test_a_map_is_read_in_the_order_of_its_file(tmp_path):
-    """A pixel a row, or many; of a table only."""
+    """A row of a map has one pixel or many."""
     path = somebodys(tmp_path / "a.fits")
     for name, wanted in (("id", [2**60, 2, 3]), ("pair", [0, 1, 2, 3, 4, 5])):
         values, header = external.read_map(path, name)
         assert values.dtype == np.float64
         assert values.tolist() == wanted
         assert header["ORDERING"] == "NESTED"
-    for name, words in (("absent", "no column absent"), ("name", "numbers of a map"), ("list", "holds lists")):
+    for name, words in (("absent", "no column absent"), ("name", "but must have at most"), ("list", "holds lists")):
         with pytest.raises(BadInput, match=words):
             external.read_map(path, name)
     astropy_fits.PrimaryHDU(np.ones((2, 2))).writeto(tmp_path / "image.fits")

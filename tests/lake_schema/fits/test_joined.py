@@ -1,4 +1,4 @@
-"""Files of images joined into one: every array as it was, and what is common said once."""
+"""Files of images are joined into one: all arrays are unchanged, and common cards are stored once."""
 
 import numpy as np
 import pytest
@@ -63,8 +63,8 @@ def test_every_array_is_as_it_was(tmp_path, make, rice):
     assert again.read_bytes() == path.read_bytes()
 
 
-def test_what_differs_is_said_of_each_array(tmp_path):
-    """Its own card comes before that of its file's first header."""
+def test_differing_cards_are_stored_with_each_array(tmp_path):
+    """A card of an array takes precedence over a card of its file's first header."""
     files, path = written(tmp_path, [of_extensions(0), of_extensions(1, 3.0)]), tmp_path / "all.fits"
     joined.join(path, files, SHARED, ())
     first, *found = images.read_images(path)
@@ -85,7 +85,7 @@ def test_cubes_and_one_file_alone(tmp_path):
 
 def test_nothing_and_a_file_cut_short_leave_no_file(tmp_path):
     path = tmp_path / "all.fits"
-    with pytest.raises(BadInput, match="nothing to join"):
+    with pytest.raises(BadInput, match="no files to join"):
         joined.join(path, [], SHARED, ())
     files = written(tmp_path, [of_extensions(0), of_extensions(1)])
     with files[1][1].open("r+b") as stream:
@@ -108,8 +108,8 @@ def test_one_file_at_a_time_is_in_memory(tmp_path):
 
 
 @pytest.mark.parametrize("rice", [False, True])
-def test_arrays_named_alike_are_told_apart(tmp_path, rice):
-    """As amplifiers, of which each detector has the same."""
+def test_arrays_with_equal_names_get_different_names(tmp_path, rice):
+    """For example, all detectors have amplifiers of the same names."""
     units = [Image(None, (("CAMERA", "x", ""),)), *(Image(array(i, np.uint16), (), f"C0{i}") for i in range(2))]
     joined.join(tmp_path / "all.fits", written(tmp_path, [units, units], rice), SHARED, ())
     names = [unit.name for unit in images.read_images(tmp_path / "all.fits")[1:]]

@@ -1,4 +1,4 @@
-"""FITS_LDAC as it is stored."""
+"""Bytes of FITS_LDAC files."""
 
 import warnings
 
@@ -13,7 +13,7 @@ LONG = "long: on, margin " * 8
 
 @pytest.mark.parametrize("cards", [(), (("EXPTIME", 90.0, "[s]"), ("TEXT", LONG, ""), ("NAME", "it's", ""))])
 def test_the_header_of_a_field_is_stored_as_cards(tmp_path, cards):
-    """Of 80 characters, spaces to the last one; checksums are those of what is stored."""
+    """Cards have 80 characters, padded with spaces, and the checksums fit the stored bytes."""
     path = tmp_path / "a.cat"
     ldac.write(path, [("NUMBER", "J", "", np.arange(3)), ("X_IMAGE", "D", "pixel", np.arange(3.0))], cards)
     with warnings.catch_warnings():

@@ -1,4 +1,4 @@
-"""A binary table of any number of rows holds what one that is made in memory does."""
+"""A binary table that is written in batches equals one that is written from memory."""
 
 import io
 
@@ -90,7 +90,7 @@ def test_no_rows():
         (Column("j", "int16", nullable=True), [*range(-(2**15), 2**15), None], "no integer is left"),
     ],
 )
-def test_what_fits_cannot_hold(column, values, words):
+def test_values_that_fits_cannot_store_are_refused(column, values, words):
     declared = Table("made", 1, (column,), "Made.", key=())
     table = pa.table({column.name: values}).cast(declared.arrow_schema())
     if not words:

@@ -1,4 +1,4 @@
-"""No row of the mission database that nothing asks for: who changed it would change nothing."""
+"""Code uses every row of the mission database, so changing a row has an effect."""
 
 import ast
 import csv
@@ -11,7 +11,7 @@ import pytest
 from lake_schema.mission.configuration import resolve
 
 ROOT = Path(__file__).parents[3]
-# Files that are read where they lie; their rows tell from which the catalogues were made.
+# Files that are read directly from the package; their rows record the sources of catalogues.
 READ_IN_PLACE = {"env.calibration.planetary_nebula", "env.calibration.vega", "env.dust.map"}
 
 
@@ -21,7 +21,7 @@ def keys():
 
 
 def named(tree):
-    """Strings of a module that have names."""
+    """Return the strings of a module that are assigned to names."""
     return {
         node.targets[0].id: node.value.value
         for node in ast.walk(tree)
@@ -33,14 +33,14 @@ def named(tree):
 
 
 def literal(part, names):
-    """What a part of a formatted string says; None of one that is computed."""
+    """Return the text of a part of a formatted string, or None if it is computed."""
     if isinstance(part, ast.Constant):
         return part.value
     return names.get(part.value.id) if isinstance(part.value, ast.Name) else None
 
 
 def names_in_code():
-    """(strings, pattern of formatted strings) of all modules, and of tests, which hold images to values."""
+    """Return (strings, pattern of formatted strings) of all modules, and of tests that compare images with values."""
     strings, formatted = set(), set()
     paths = {path for room in ("lake_schema", "truesky", "tests") for path in (ROOT / room).rglob("*.py")}
     for path in paths - {Path(__file__)}:
@@ -51,18 +51,18 @@ def names_in_code():
                 strings.add(node.value)
             elif isinstance(node, ast.JoinedStr):
                 parts = [literal(part, names) for part in node.values]
-                # One that says next to nothing fits every key.
+                # A pattern with hardly any literal text fits every key.
                 if sum(len(re.sub(r"\W", "", part)) for part in parts if part) >= 3:
                     formatted.add("".join("[^.]*" if part is None else re.escape(part) for part in parts))
     return strings, re.compile("|".join(f"(?:{pattern})" for pattern in sorted(formatted)))
 
 
-def test_every_row_is_asked_for():
-    """Those of ground cameras are held by tests/truesky/render/channels/test_ground_parameters.py."""
+def test_code_uses_every_row():
+    """tests/truesky/render/channels/test_ground_parameters.py checks the rows of ground cameras."""
     strings, formatted = names_in_code()
 
     def asked(key):
-        # By its whole name, or within a section.
+        # Code contains the whole name, or the name within a section.
         return any(name in strings or formatted.fullmatch(name) for name in (key, key.split(".", 1)[1]))
 
     own = {key for key in keys() if not key.startswith("ext.")}

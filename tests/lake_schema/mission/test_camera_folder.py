@@ -1,4 +1,4 @@
-"""Folders of cameras: they are read, and mistakes are refused with the file and the line."""
+"""Folders of cameras are read, and mistakes are refused with file and line."""
 
 import csv
 
@@ -42,7 +42,7 @@ def test_a_folder_that_is_written_has_all_numbers_of_the_known_camera(tmp_path, 
             assert float(own[key]) == pytest.approx(ratio * KNOWN.value(f"ext.{known}.{key}"), rel=1e-6)
     for parameter in KNOWN.parameters:
         name = parameter.key.removeprefix(f"ext.{known}.")
-        # A folder has no exposure times of bands, and the level of the sky as a magnitude.
+        # A folder has no exposure times of bands, and it gives the sky level as a magnitude.
         if name != parameter.key and not name.endswith((".sky", "_r.exposure_time", "_u.exposure_time")):
             assert mission.value(f"ext.copied.{name}", parameter.unit) == parameter.value, name
 
@@ -55,7 +55,7 @@ def test_the_level_of_the_sky_is_that_of_the_known_camera(tmp_path):
     assert rate == pytest.approx(KNOWN.value("ext.lsstcam.lsst_r.sky"), rel=1e-4)
 
 
-def test_the_checksum_is_of_what_the_folder_holds_wherever_it_lies(folder, tmp_path):
+def test_the_checksum_does_not_depend_on_the_location(folder, tmp_path):
     first = camera_folder.read(folder)
     other = tmp_path / "elsewhere" / "my_camera"
     other.parent.mkdir()
@@ -73,14 +73,14 @@ def test_the_checksum_is_of_what_the_folder_holds_wherever_it_lies(folder, tmp_p
     assert camera_folder.read(other).sha256 == first.sha256
 
 
-def test_without_a_wavefront_the_telescope_has_that_of_the_others(folder):
+def test_the_default_wavefront_is_used_if_none_is_given(folder):
     (folder / camera_tables.WAVEFRONT).unlink()
     mission = resolve(cameras=[camera_folder.read(folder)])
     assert mission.rows("ext.my_camera.psf.wavefront") == KNOWN.rows("ext.megacam.psf.wavefront")
 
 
 def write_again(file, change):
-    """Write a table with other rows: `change` gets all rows, the header first, and returns those to be written."""
+    """Write a table with other rows; `change` gets all rows (the header first) and returns the new ones."""
     lines = [line for line in file.read_text().splitlines() if not line.startswith("#")]
     with file.open("w", newline="") as stream:
         csv.writer(stream).writerows(change(list(csv.reader(lines))))
@@ -172,7 +172,7 @@ def test_a_missing_file_or_column_is_named(folder, file):
     with pytest.raises(BadInput, match=rf"my_camera/{file}: has no rows$"):
         camera_folder.read(folder)
     (folder / file).write_text(text.replace(header, header + ",colour"))
-    with pytest.raises(BadInput, match=rf"my_camera/{file}: unknown column 'colour', the columns are"):
+    with pytest.raises(BadInput, match=rf"my_camera/{file}: unknown column 'colour', the columns must be"):
         camera_folder.read(folder)
     (folder / file).write_text(text.replace(header, header + "," + header.partition(",")[0]))
     with pytest.raises(BadInput, match=rf"my_camera/{file}: a column is given twice$"):
@@ -194,7 +194,7 @@ def test_a_missing_file_or_column_is_named(folder, file):
         ("layout.csv", "ccd00,megacam,2048", "ccd00,megacam,99.5", r"layout\.csv line \d+: nx = 99.5 is not a whole"),
         ("layout.csv", "ccd00,megacam,2048", "ccd00,megacam,1024", r"layout\.csv line \d+: .* megacam differ in size"),
         ("layout.csv", "ccd01", "ccd00", r"layout\.csv line \d+: ccd00 is given twice"),
-        ("layout.csv", "ccd01", "C/1", r"layout\.csv line \d+: detector = 'C/1': a name has letters"),
+        ("layout.csv", "ccd01", "C/1", r"layout\.csv line \d+: detector = 'C/1': a name must have letters"),
         ("layout.csv", "ccd01,megacam", "ccd01,other", r"amplifiers\.csv: detectors of type other have no"),
         ("amplifiers.csv", "megacam,A,0,0", "megacam,A,2,0", r"amplifiers\.csv line \d+: overlaps amplifier A"),
         (
@@ -232,8 +232,8 @@ def test_a_missing_file_or_column_is_named(folder, file):
             r"bands\.csv line \d+: .*missing.dat: no such file",
         ),
         ("bands.csv", "cfis_r,,", "cfis_r,layout.csv,", r"bands\.csv line \d+: medium is missing"),
-        ("bands.csv", "cfis_r,,", "cfis_r,layout.csv,water", r"bands\.csv line \d+: medium = 'water' is not air or"),
-        ("bands.csv", "cfis_r,,", "cfis r,,", r"bands\.csv line \d+: band = 'cfis r': a name has letters"),
+        ("bands.csv", "cfis_r,,", "cfis_r,layout.csv,water", r"bands\.csv line \d+: medium = 'water' is neither air"),
+        ("bands.csv", "cfis_r,,", "cfis r,,", r"bands\.csv line \d+: band = 'cfis r': a name must have letters"),
         ("bands.csv", "cfis_r,,,", "cfis_r,,,nan", r"bands\.csv line \d+: zero_point = 'nan\S*' is not a number"),
         ("wavefront.csv", "4,0,0,60", "4,0,0,inf", r"wavefront\.csv line \d+: coefficient_nm = inf is not finite"),
     ],
@@ -282,7 +282,7 @@ def test_detectors_that_overlap_with_a_larger_pixel_are_a_fault_of_the_configura
 @pytest.mark.parametrize("name", ["decam", "vis", "My Camera", "9", "x" * 41])
 def test_a_name_that_a_camera_may_not_have_is_refused(folder, name):
     folder.rename(folder.with_name(name))
-    with pytest.raises(BadInput, match=r"truesky has a camera|a camera has the name of its folder"):
+    with pytest.raises(BadInput, match=r"truesky already has a camera|the folder's name is the camera's name"):
         camera_folder.read(folder.with_name(name))
 
 
@@ -290,7 +290,7 @@ def test_the_command_writes_a_folder_and_never_over_another(tmp_path, capsys):
     assert commands.main(["camera", str(tmp_path / "mine"), "--like", "decam"]) == 0
     assert len(capsys.readouterr().out.splitlines()) == 5
     assert commands.main(["camera", str(tmp_path / "mine"), "--like", "decam"]) == 2
-    assert capsys.readouterr().err.endswith("mine: is there already\n")
+    assert capsys.readouterr().err.endswith("mine: already exists\n")
     assert commands.main(["camera", str(tmp_path / "No Name"), "--like", "decam"]) == 2
     assert not (tmp_path / "No Name").exists()
 
@@ -305,6 +305,6 @@ def test_a_path_that_the_system_does_not_take_is_refused(tmp_path, monkeypatch, 
         assert commands.main(["camera", name, "--like", "decam"]) == 2
         said = capsys.readouterr().err
         assert len(said.splitlines()) == 1
-        assert said.endswith(("is there already\n", "File name too long\n"))
+        assert said.endswith(("already exists\n", "File name too long\n"))
     assert commands.main(["camera", "loop/mine", "--like", "decam"]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1

@@ -1,4 +1,4 @@
-"""The package's own configuration keeps what its numbers must keep, and a broken one is refused by name."""
+"""The package's configuration is consistent, and faults are reported by name."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ def test_the_package_has_no_fault(ladder):
 def test_every_value_has_bounds_of_its_kind():
     assert [p.key for p in MISSION.parameters if not bounds_of_parameter(p.key)] == []
     for record in read_all_parameters():
-        # A bound that allows nothing else would be a second source of the number.
+        # A bound that allows a single value would be a second source of that value.
         for lo, hi, _ in bounds_of_parameter(record.key):
             assert lo < hi
 
@@ -32,7 +32,7 @@ def test_every_value_has_bounds_of_its_kind():
 
 
 class Broken(MissionConfiguration):
-    """A configuration of which one model's rows are others."""
+    """Configuration with other rows in one model."""
 
     def rows(self, key):
         found = [dict(row) for row in super().rows(key)]
@@ -99,11 +99,11 @@ def test_worse_than_required_is_a_fault():
         p if p.key != "vis.read_noise" else type(p)(p.key, "CBE", 4.6, "electron", source="x")
         for p in MISSION.parameters
     ]
-    with pytest.raises(BadInput, match=r"vis\.read_noise .*worse than required: 4.5"):
+    with pytest.raises(BadInput, match=r"vis\.read_noise .*worse than the required 4.5"):
         checks.check(MissionConfiguration(tuple(worse), models=MISSION.models))
-    # Of a well, more is better.
+    # A larger full well is better.
     small = [p if p.key != "vis.full_well" else replace(p, value=1.9e5) for p in MISSION.parameters]
-    with pytest.raises(BadInput, match=r"vis\.full_well .*worse than required: 200000"):
+    with pytest.raises(BadInput, match=r"vis\.full_well .*worse than the required 200000"):
         checks.check(MissionConfiguration(tuple(small), models=MISSION.models))
     checks.check(
         MissionConfiguration(
@@ -111,7 +111,7 @@ def test_worse_than_required_is_a_fault():
             models=MISSION.models,
         )
     )
-    # What a request asks for is as simulated, whatever it is.
+    # A value of a request has the status SIM, which may be worse than required.
     checks.check(resolve(overrides={"vis.read_noise": (9.0, "electron")}))
 
 
@@ -127,7 +127,7 @@ def macc(kind):
     [("photometric", 76, 87.2, -0.265625), ("spectroscopic", 394, 549.6, -0.196759)],
 )
 def test_ramps(kind, frames, integration, alpha):
-    """Kubik et al. 2016: frames of a ramp, time between its first and last group, correlation of reads in a group."""
+    """Compare with Kubik et al. 2016: frames of a ramp, time from first to last group, correlation of reads."""
     groups, reads, drops = macc(kind)
     assert groups * reads + (groups - 1) * drops == frames
     frame = MISSION.value("nisp.frame_time", "s")
@@ -145,7 +145,7 @@ def test_a_vis_quadrant_as_it_is_read():
 
 
 def test_a_first_order_spectrum_is_512_pixels_long():
-    """At the dispersion of Serrano et al. 2024."""
+    """The dispersion is from Serrano et al. 2024."""
     for grism in ("RGS000", "RGS180"):
         rows = [
             row
@@ -157,8 +157,8 @@ def test_a_first_order_spectrum_is_512_pixels_long():
         assert (float(rows[0]["last_nm"]) - float(rows[0]["first_nm"])) / length == pytest.approx(1.34, rel=1e-6)
 
 
-def test_what_the_table_of_traces_says_is_no_value_beside_it():
-    """A grism's ends and dispersion are the polynomials': a value of their own would be read by nobody."""
+def test_the_table_of_traces_has_no_redundant_values():
+    """The polynomials determine ends and dispersion of a grism, so separate values would have no effect."""
     grisms = {row["grism"].lower() for row in MISSION.rows("nisp.traces")}
     beside = {
         record.key.split(".")[-1] for record in read_all_parameters() if record.key.split(".")[1] in {*grisms, "grism"}
@@ -167,7 +167,7 @@ def test_what_the_table_of_traces_says_is_no_value_beside_it():
 
 
 def test_the_telescope_s_pupil():
-    """Area of the aperture less stop and spider: 9926 cm2 (GalSim-Euclid-Like); the clear share is 0.8776."""
+    """Area of the aperture less stop and spider: 9926 cm2 (GalSim-Euclid-Like); the clear fraction is 0.8776."""
     radius = MISSION.value("plm.aperture_diameter", "mm") / 2
     side = np.linspace(-radius, radius, 2401)
     x, y = np.meshgrid(0.5 * (side[1:] + side[:-1]), 0.5 * (side[1:] + side[:-1]))
@@ -187,7 +187,7 @@ def test_the_telescope_s_pupil():
 def test_focal_length_and_scale():
     focal = MISSION.value("plm.focal_length", "mm")
     assert focal / MISSION.value("plm.aperture_diameter", "mm") == pytest.approx(MISSION.value("plm.f_ratio"), abs=0.01)
-    # The distortion is of the order of a percent.
+    # The distortion is about one per cent.
     for plate, section in (("vis", "vis"), ("nisp", "nisp")):
         own = MISSION.value(f"{section}.fpa.pixel_scale", "arcsec / pix") / MISSION.value(
             f"{section}.fpa.pixel_size", "mm / pix"
@@ -205,7 +205,7 @@ def places(camera):
 
 
 def farthest(measured, rule):
-    """Largest distance of a measured place from the nearest of a rule, each taken once."""
+    """Return the largest distance of a measured position from the nearest position of a rule, each used once."""
     distance = np.hypot(*(measured[:, None, i] - rule[None, :, i] for i in (0, 1)))
     assert sorted(distance.argmin(axis=1)) == list(range(len(rule)))
     return distance.min(axis=1).max()
@@ -263,5 +263,5 @@ def test_amplifiers_lie_in_their_detector_and_share_no_pixel():
                 assert y + h <= ny
                 frame[y : y + h, x : x + w] += 1
             assert frame.max() == 1
-            # Only GPC1 has streets between its cells.
+            # Only GPC1 has gaps between its cells.
             assert (frame == 1).mean() > (0.95 if camera == "gpc1" else 0.9999)

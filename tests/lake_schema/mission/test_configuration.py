@@ -1,4 +1,4 @@
-"""The ladder of statuses: one value a name, whatever the order of the records."""
+"""The ladder of statuses chooses one value per name, in any order of the records."""
 
 import pickle
 from dataclasses import replace
@@ -40,7 +40,7 @@ def test_as_simulated_is_the_last_resort():
 
 @given(st.randoms(use_true_random=False), st.permutations(STATUSES))
 def test_the_order_of_the_records_does_not_matter(random, ladder):
-    # Some of the records of each kind: every name of a camera, a few statuses of each.
+    # A sample of records: all names of a camera, with a few statuses each.
     records = [record for record in read_all_parameters() if record.key.startswith(("vis.", "svm."))]
     expected = resolve(records, ladder)
     random.shuffle(records)
@@ -77,7 +77,7 @@ def test_the_fingerprint_follows_the_values():
 
 
 def test_configurations_of_different_lakes_are_told_apart_by_their_hashes():
-    """Else each look into a cache compares all of their records."""
+    """With equal hashes, every look-up in a cache would compare all records."""
     base = resolve()
     here, there = (replace(base, folder=Path(name)) for name in ("here", "there"))
     assert len({hash(base), hash(here), hash(there)}) == 3

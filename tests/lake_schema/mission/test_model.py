@@ -1,4 +1,4 @@
-"""Models that are files: named with their sha256, and refused where they are others."""
+"""Models that are files are named with their sha256, and other files are refused."""
 
 import hashlib
 from dataclasses import replace
@@ -25,7 +25,7 @@ def test_another_file_is_refused_with_both_sums(tmp_path):
         read_content(other)
     with pytest.raises(Damaged, match="is missing"):
         read_content(replace(ZODI, file="nothing.csv"))
-    # What was published with an old product is found by its sum, and only if it is whole.
+    # A file that was published with an old product is found by its checksum, if it is undamaged.
     old = b"an older table"
     digest = hashlib.sha256(old).hexdigest()
     (tmp_path / digest).write_bytes(old)
@@ -82,7 +82,7 @@ def test_a_ladder_chooses_models_too():
 
 
 def test_a_name_is_a_value_or_a_model():
-    with pytest.raises(BadInput, match=r"vis\.gain is a value and a model"):
+    with pytest.raises(BadInput, match=r"vis\.gain is both a value and a model"):
         resolve(models=(Model("vis.gain", "CBE", "x.csv", "0" * 64, source="x"),))
     with pytest.raises(BadInput, match="given twice"):
         resolve(models=(ZODI, ZODI))
@@ -96,8 +96,8 @@ def test_the_fingerprint_follows_the_files():
     assert resolve(models=(*models, replace(ZODI, source="elsewhere"))).fingerprint == base.fingerprint
 
 
-def test_a_table_is_read_once_and_nobody_changes_it():
-    """A detector's effects ask for its amplifiers some hundred times."""
+def test_a_table_is_cached_and_immutable():
+    """The effects of one detector use the table of amplifiers some hundred times."""
     data = read_content(next(m for m in read_models() if m.key == "ext.gpc1.amplifiers"))
     assert parse_rows(data) is parse_rows(data)
     with pytest.raises(TypeError):

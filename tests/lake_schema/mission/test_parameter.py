@@ -1,4 +1,4 @@
-"""Records of the mission database: what is read, and what is refused."""
+"""Records of the mission database are read, and wrong ones are refused."""
 
 import re
 
@@ -19,7 +19,7 @@ def write(folder, *lines):
     return path
 
 
-def test_a_record_is_read_with_all_it_says(tmp_path):
+def test_a_record_is_read_with_all_fields(tmp_path):
     (record,) = read(write(tmp_path, 'a.gain,CBE,3.48,electron / adu,2,60000.5,published,"Somebody, 2024"'))
     assert record == Parameter("a.gain", "CBE", 3.48, "electron / adu", 2, 60000.5, "published", "Somebody, 2024")
 
@@ -62,19 +62,19 @@ def test_every_record_of_the_package_names_a_publication():
 
 
 def test_published_statuses_are_all_there():
-    """The ladder has something to choose from."""
+    """The ladder must have several statuses to choose from."""
     found = {(r.key, r.status): r.value for r in read_all_parameters()}
     assert {s for k, s in found if k == "vis.read_noise"} == {"REQ", "DES", "CBE", "SIM"}
     assert found["vis.gain", "CBE"] == 3.48
     assert found["vis.gain", "REQ"] == 3.1
-    # A current best estimate keeps its requirement.
+    # A current best estimate meets the requirement.
     for quantity in ("read_noise", "dark_current"):
         best = found.get((f"vis.{quantity}", "CBE"), found.get((f"vis.{quantity}", "BLT")))
         assert best <= found[f"vis.{quantity}", "REQ"]
 
 
 def test_no_zero_point_of_euclid_is_stored():
-    """It follows from throughput and area: a second number could disagree. Ground surveys publish theirs."""
+    """It follows from throughput and area, so a second number could disagree. Ground surveys publish theirs."""
     stored = [record.key for record in read_all_parameters() if "zp" in record.key or "zero_point" in record.key]
     assert {key.split(".")[0] for key in stored} == {"ext"}
 
@@ -104,7 +104,7 @@ def test_a_unit_without_a_finite_factor_is_refused(unit, words):
 def test_the_zodiacal_table_is_the_published_one():
     table = {row[0]: row[1:] for row in resolve().numbers("env.zodi.map")}
     assert len(table) == 19
-    # Ecliptic poles, quadrature and anti-solar point of Leinert et al. 1998, Table 17.
+    # Leinert et al. 1998, Table 17: ecliptic poles, quadrature and anti-solar point.
     assert {row[-1] for row in table.values()} == {77.0}
     assert table[90.0][0] == 259.0
     assert table[180.0][0] == 230.0
@@ -123,12 +123,12 @@ def test_statuses_and_sections_are_those_that_are_known():
     [
         (b"a.b,CBE,1,m,1,,assumed,\xff", "codec"),
         (b"a.b,CBE,1,m,1,,assumed," + b"x" * 2000, "line 2: a text is too long"),
-        (b'a.b,CBE,1,m,1,,assumed,"x\ny"', "line 3: a text is too long, or of several lines"),
+        (b'a.b,CBE,1,m,1,,assumed,"x\ny"', "line 3: a text is too long or spans several lines"),
         (b"a.b,CBE,1,m,1,,assumed,x,y", "line 2: a text is too long"),
         (b"a.b,CBE,1,m,1,,assumed," + b"x" * 200_000, "field larger than"),
     ],
 )
-def test_a_text_that_is_none_is_named(tmp_path, line, words):
+def test_an_unreadable_text_is_refused_by_name(tmp_path, line, words):
     path = tmp_path / "vis.csv"
     path.write_bytes(b"key,status,value,unit,version,valid_from,confidence,source\n" + line + b"\n")
     with pytest.raises(BadInput, match=rf"^vis.csv.*{words}"):

@@ -1,4 +1,4 @@
-"""Values of a detector or an amplifier: the narrowest holds, and what has no such place is refused by name."""
+"""Values of a detector or an amplifier: the most specific one is used, and impossible places are refused by name."""
 
 import json
 
@@ -40,7 +40,7 @@ def test_each_pattern_is_of_some_parameter(pattern):
     given=st.dictionaries(st.sampled_from(["", "@3-4", ".E", ".G", "@3-4.E", "@1-1.F"]), st.floats(1.0, 9.0)),
     detector=st.sampled_from(["", "3-4", "1-1", "6-6"]),
 )
-def test_the_narrowest_holds(given, detector):
+def test_the_most_specific_value_is_used(given, detector):
     mission = resolve(overrides={f"vis.gain{where}": (value, GAIN) for where, value in given.items()})
     wanted = tuple(
         next(
@@ -51,7 +51,7 @@ def test_the_narrowest_holds(given, detector):
     )
     found = mission.amplifier_values("vis.gain", GAIN, detector)
     assert (found * 4 if len(found) == 1 else found) == wanted
-    # A detector's own, whatever one of its amplifiers has.
+    # The value of a detector does not depend on the values of its amplifiers.
     assert mission.value("vis.gain", place=DetectorPlace(detector)) == given.get(f"@{detector}", given.get("", 3.48))
     assert mission.value("vis.gain", "electron / adu") == given.get("", 3.48)
     assert (mission.fingerprint == MISSION.fingerprint) == ({**given, "": 3.48} == {"": given.get("", 3.48)})
@@ -83,20 +83,20 @@ def test_each_camera_has_its_detectors():
         ("vis.gain.X", "vis has no amplifier 'X', only E, F, G, H"),
         ("vis.gain@3-4.Q", "vis has no amplifier 'Q', only E, F, G, H"),
         ("vis.gain@7-1", "vis has no detector '7-1', only 36 from 1-1 to 6-6"),
-        ("vis.gain@", "names no detector"),
-        ("vis.gain@.E", "names no detector"),
-        ("vis.gain.", "names no amplifier"),
-        ("vis.gain@3-4.", "names no amplifier"),
+        ("vis.gain@", "name of the detector is missing"),
+        ("vis.gain@.E", "name of the detector is missing"),
+        ("vis.gain.", "name of the amplifier is missing"),
+        ("vis.gain@3-4.", "name of the amplifier is missing"),
         ("vis.gains.E", "no such parameter"),
         ("vis.amplifiers.E", "no such parameter"),
         ("vis.cti.age.E", r"may differ between detectors \(vis.cti.age@NAME\), not between their amplifiers"),
-        ("vis.exposure_time@3-4", "vis.exposure_time is one value for the whole camera"),
+        ("vis.exposure_time@3-4", "vis.exposure_time must have one value for the whole camera"),
         ("nisp.gain@DET55", "nisp has no detector 'DET55', only DET11, .*, DET44"),
         ("nisp.gain.E", "not between their amplifiers"),
         ("ext.decam.gain@3-4", "ext.decam has no detector '3-4', only 62"),
     ],
 )
-def test_a_place_that_is_not_there_is_refused_by_name(name, words):
+def test_a_missing_place_is_refused_by_name(name, words):
     key = detector_overrides.split_name(name, MISSION)[0]
     unit = MISSION.parameter(key).unit if key in [record.key for record in read_all_parameters()] else ""
     with pytest.raises(BadInput, match=words) as error:
@@ -124,7 +124,7 @@ def test_the_list_has_every_name_with_its_bounds():
         assert entries[name].by == "amplifier"
     assert entries["vis.gain@3-4.E"].status == "SIM"
     assert (entries["vis.dark_current"].by, entries["vis.exposure_time"].by) == ("detector", "")
-    # In the parameter's own unit, whatever the bound's.
+    # Bounds are converted to the unit of the parameter.
     lo, hi = entries["svm.launch"].bounds or (0.0, 1e9)
     assert lo <= mission.value("svm.launch") <= hi
     for entry in entries.values():

@@ -1,4 +1,4 @@
-"""A configuration goes into the lake and comes back; two of them are told apart."""
+"""A configuration is written to a lake and read back, and two configurations are compared."""
 
 import hashlib
 import json
@@ -29,7 +29,7 @@ PLACED = resolve(overrides={"vis.gain.E": (3.3, "electron / adu"), "vis.gain@3-4
 
 
 @pytest.mark.parametrize("configuration", [resolve(), CHANGED, PLACED])
-def test_it_comes_back_as_it_went(tmp_path, configuration):
+def test_a_configuration_survives_the_round_trip(tmp_path, configuration):
     version = put(tmp_path, configuration)
     back = published.read_back(version)
     assert back == MissionConfiguration(
@@ -38,10 +38,10 @@ def test_it_comes_back_as_it_went(tmp_path, configuration):
     assert back.fingerprint == configuration.fingerprint
     assert list(differences(back, configuration)) == []
     assert read.find_faults(version, deep=True) == []
-    # Its own copies of the files serve where the package's have changed.
+    # The copies in the lake are used if the package's files have changed.
     for m in configuration.models:
         assert (back.folder / m.sha256).is_file()
-    # What was read back can be published again, to the same rows.
+    # A configuration that was read back can be published again with the same rows.
     assert published.to_table(back).equals(published.to_table(configuration))
 
 
@@ -63,8 +63,8 @@ def test_records_that_the_package_no_longer_has_come_back_too(tmp_path):
     assert back.fingerprint == old.fingerprint
 
 
-def test_it_is_read_once_as_long_as_its_file_stays(tmp_path):
-    """A second reader gets the same; one of a file that has been changed or is gone is refused as the first would."""
+def test_a_configuration_is_cached_while_its_file_is_unchanged(tmp_path):
+    """A second reader gets the cached configuration; a changed or missing file is refused by every reader."""
     version = put(tmp_path, resolve())
     assert published.read_back(read.version(tmp_path, "mission")) is published.read_back(version)
     file = version.folder / "dataset" / "all.parquet"
@@ -79,7 +79,7 @@ def test_it_is_read_once_as_long_as_its_file_stays(tmp_path):
         published.read_back(version)
 
 
-def test_one_that_is_not_what_its_manifest_says_is_refused(tmp_path):
+def test_a_configuration_that_differs_from_its_manifest_is_refused(tmp_path):
     with pytest.raises(Damaged, match="is not the configuration 0000"):
         published.read_back(put(tmp_path, resolve(), mission="0" * 64))
 
@@ -104,11 +104,11 @@ def test_differences_are_named_with_both_values(tmp_path, capsys):
     assert __main__.main(["mission", "diff", f"{tmp_path}/lake@{key}", f"{tmp_path}/lake"]) == 0
 
 
-def test_names_that_only_one_has():
+def test_names_in_only_one_configuration_are_listed():
     some = MissionConfiguration((Parameter("a.b", "CBE", 1.0, "s", source="x"),))
     assert list(differences(some, MissionConfiguration(()))) == ["a.b: 1.0 s (CBE) -> absent"]
     assert list(differences(MissionConfiguration(()), some)) == ["a.b: absent -> 1.0 s (CBE)"]
-    # Another source or status of the same value acts alike.
+    # Source and status of a value have no effect.
     other = MissionConfiguration((Parameter("a.b", "BLT", 1.0, "s", source="y"),))
     assert list(differences(some, other)) == []
 
@@ -123,7 +123,7 @@ def test_names_that_only_one_has():
         ("[mission", "request"),
     ],
 )
-def test_what_is_no_configuration_is_refused(tmp_path, capsys, text, words):
+def test_names_of_no_configuration_are_refused(tmp_path, capsys, text, words):
     path = tmp_path / "r.toml"
     path.write_text(text)
     assert __main__.main(["mission", "diff", "CBE,SIM,BLT,DES,REQ", str(path)]) == 2

@@ -1,4 +1,4 @@
-"""Ecliptic coordinates against astropy's, and tiles that cut the sky without gap or overlap."""
+"""Ecliptic coordinates agree with astropy's, and tiles cover the sky without gap or overlap."""
 
 import itertools
 
@@ -26,28 +26,28 @@ def test_ecliptic_coordinates_are_astropy_s():
 
 
 def bounds(tile):
-    """Ecliptic longitudes and latitudes between which a tile lies."""
+    """Return the ranges of ecliptic longitude and latitude of a tile."""
     lon, lat = ecliptic(*tile_corners(tile).T)
-    # At a pole there is no longitude.
+    # A pole has no longitude.
     west, east = (0, 1) if lat[0] > -89.99 else (3, 2)
     return lon[west], lon[east], lat[0], lat[2]
 
 
 def test_tiles_neither_overlap_nor_leave_gaps():
-    """A tile begins where the one before it ends: eastward in a row, then at longitude 0 of the next row."""
+    """A tile begins at the end of the tile before it: eastward in a row, then at longitude 0 of the next row."""
     last = tile_count() - 1
     assert bounds(0)[2] == pytest.approx(-90.0)
     assert bounds(last)[3] == pytest.approx(90.0)
     for start in (0, 2_000, 40_000, 69_121, last - 1_000):
         for before, tile in itertools.pairwise(bounds(tile) for tile in range(start, start + 1_001)):
-            # The same row, or the next one.
+            # The tile is in the same row, or begins the next one.
             if tile[2] == pytest.approx(before[2]):
                 assert tile[3] == pytest.approx(before[3])
             else:
                 assert tile[2] == pytest.approx(before[3])
                 assert (tile[0] + 180) % 360 == pytest.approx(180)
             assert (tile[0] - before[1] + 180) % 360 == pytest.approx(180)
-    # As large as the field of view, and together as large as the sky.
+    # A tile has the area of the field of view, and all tiles together the area of the sky.
     areas = [tile_area(tile) for tile in range(0, tile_count(), 97)]
     assert np.mean(areas) * tile_count() == pytest.approx(360**2 / np.pi, rel=0.01)
     assert 0.4 < np.median(areas) < 0.6

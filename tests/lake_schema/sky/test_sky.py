@@ -1,4 +1,4 @@
-"""The sphere, against astropy, healpy and closed forms."""
+"""Geometry of the sky, compared with astropy, healpy and closed forms."""
 
 import astropy.units as u
 import healpy as hp
@@ -28,7 +28,7 @@ def test_a_cone_never_misses_a_cell(ra, dec, radius, order, seed):
 
 @pytest.mark.parametrize("cones", [1000, pytest.param(100_000, marks=pytest.mark.nightly)])
 def test_no_cell_of_any_cone_is_missed(cones):
-    """Random cones, many at the poles, on RA = 0, on corners and edges of cells; places inside by the closed form."""
+    """Random cones, many at the poles, on RA = 0, and on corners and edges of cells, with positions inside."""
     rng = np.random.default_rng(11)
     ra, dec = rng.uniform(0, 360, cones), np.degrees(np.arcsin(rng.uniform(-1, 1, cones)))
     special = rng.integers(0, 5, cones)
@@ -141,7 +141,7 @@ def test_random_positions_are_uniform_and_sorted(cell):
     assert (sky.cell_at(ra, dec, 5) == cell).all()
     assert np.array_equal(sky.healpix_29(ra, dec), index)
     counts = np.bincount(sky.cell_at(ra, dec, 7) - 16 * cell, minlength=16)
-    assert ((counts - 1250) ** 2 / 1250).sum() < 40  # chi2 of 15 degrees of freedom: 40 is one in 2000
+    assert ((counts - 1250) ** 2 / 1250).sum() < 40  # chi2 of 15 degrees of freedom exceeds 40 once in 2000
 
 
 def test_cells_tile_the_sphere():
@@ -152,7 +152,7 @@ def test_cells_tile_the_sphere():
 
 @pytest.mark.parametrize("cell", [0, 1607, 12287, 4095])
 def test_the_margin_holds_all_within_ten_arcsec(cell):
-    """Points just outside a cell's edge, at random around it, must lie in its rim."""
+    """Random points just outside a cell's edge must be in its margin cells."""
     rim = sky.margin_cells(5, cell, 13)
     assert (sky.parent(rim, 13, 5) != cell).all()
     edge = hp.boundaries(32, cell, step=500, nest=True).T
@@ -171,7 +171,7 @@ def test_a_box_never_misses_a_cell(west, span, south, height, order, seed):
     north = min(south + height, 90.0)
     rng = np.random.default_rng(seed)
     ra, dec = west + span * rng.random(200), south + (north - south) * rng.random(200)
-    # Its four edges, where a polygon of great circles would go astray.
+    # The edges along parallels differ most from a polygon of great circles.
     dec[:40], dec[40:80], ra[80:120], ra[120:160] = south, north, west, west + span
     cells = sky.cells_in_box(west % 360, (west + span) % 360, south, north, order)
     assert np.isin(sky.cell_at(ra, dec, order), cells).all()
@@ -179,14 +179,14 @@ def test_a_box_never_misses_a_cell(west, span, south, height, order, seed):
 
 
 def test_a_box_takes_few_cells_too_many():
-    """380 deg2, and no more than a cell's width along its 96 deg of border."""
+    """The box has 380 deg2; the excess is at most one cell's width along its border of 96 deg."""
     area = len(sky.cells_in_box(0, 90, 60, 70, 7)) * sky.cell_area(7)
     assert 380 < area < 380 + 96 * np.sqrt(sky.cell_area(7)) * 1.1
 
 
 @pytest.mark.parametrize("order", [0, 1, 2, 4, 9, 17, 29])
 def test_corners_are_those_of_healpy(order):
-    """All cells of large ones; of small ones some, and those at the poles and along the edges of base cells."""
+    """All cells of low orders; of high orders some, and cells at the poles and along the edges of base cells."""
     healpy, number = pytest.importorskip("healpy"), 12 * 4**order
     some = np.random.default_rng(2).integers(number, size=3000)
     edges = [k * number // 12 + shift for k in range(13) for shift in (-1, 0) if 0 <= k * number // 12 + shift < number]
@@ -195,7 +195,7 @@ def test_corners_are_those_of_healpy(order):
     places = np.stack(healpy.vec2ang(expected.reshape(-1, 3), lonlat=True), -1).reshape(-1, 4, 2)
     found = sky.cell_corners(order, cells)
     apart = sky.separation(found[..., 0].ravel(), found[..., 1].ravel(), *places.reshape(-1, 2).T)
-    # healpy's own corners at the poles are 0.6 mas away from them at most.
+    # The corners that healpy gives at the poles are up to 0.6 mas away from them.
     assert np.max(apart[np.abs(found[..., 1].ravel()) < 89.99]) < 1e-10
     assert np.max(apart) < 2e-7
     assert ((found[..., 0] >= 0.0) & (found[..., 0] < 360.0)).all()
@@ -214,7 +214,7 @@ def test_corners_lie_about_the_centre(order):
 
 @pytest.mark.parametrize("order", [3, 8])
 def test_cells_of_many_cones_are_those_of_each(order):
-    """As one after another: wherever they lie, small and large, also where they lie far from one another."""
+    """Small and large cones are compared with one call per cone, close together and far apart."""
     rng = np.random.default_rng(5)
     for ra, dec, spread in (
         (0.0, 89.9, 0.5),

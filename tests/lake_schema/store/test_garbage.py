@@ -1,4 +1,4 @@
-"""What gc may remove: nothing that a name links to, nor what that was made of, however far back."""
+"""gc removes no version that a name links to, nor a version from which such a version was made, even indirectly."""
 
 import fcntl
 import tempfile
@@ -23,7 +23,7 @@ def plan_of(table, number, inputs=()):
     return Plan(replace(PLAIN, name=table), facts, (Task("0.parquet", {"part": 0}),))
 
 
-# (table, request or none, which of the versions before it it was made of)
+# (table, request or None, indices of the earlier versions from which it was made)
 PUBLISHED = st.tuples(
     st.sampled_from(TABLES), st.sampled_from(["a", "b", None]), st.lists(st.integers(0, 9), max_size=2)
 )
@@ -32,7 +32,7 @@ PUBLISHED = st.tuples(
 @settings(max_examples=25)
 @given(st.lists(PUBLISHED, min_size=1, max_size=8), st.sampled_from([None, *TABLES]))
 @example([("second", "b", []), ("second", "b", []), ("first", "a", [0, 1]), ("first", "a", [])], None)
-def test_nothing_that_is_reached_from_a_name_is_removed(published, chosen):
+def test_versions_that_a_request_needs_are_kept(published, chosen):
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
         patch.setattr("os.fsync", lambda descriptor: None)
         root, every, pinned, made_of = Path(folder), [], {}, {}
@@ -46,7 +46,7 @@ def test_nothing_that_is_reached_from_a_name_is_removed(published, chosen):
             pinned[table, None] = this
             if request:
                 pinned[table, request] = this
-                # Of two versions of one table that it was made of the first by its key is the request's.
+                # If it was made from two versions of a table, the request is linked to the one with the lower key.
                 for one in sorted(one for one in inputs if one[0] != table):
                     pinned.setdefault((one[0], request), one)
         reached, waiting = set(), list(pinned.values())
@@ -67,7 +67,7 @@ def test_nothing_that_is_reached_from_a_name_is_removed(published, chosen):
         assert not any(layout.version_folder(root, *one).exists() for one in rest)
 
 
-def test_gc_says_and_does_not(lake):
+def test_gc_without_delete_removes_nothing(lake):
     for seed in (1, 2):
         publish.make_version(lake, plain_plan(seed), plain_work, name="a")
     before = sorted(lake.rglob("*"))
@@ -83,7 +83,7 @@ def test_the_images_of_another_request_stay(lake):
 
 
 @pytest.mark.parametrize("what", ["manifest", "version", "link"])
-def test_nothing_is_removed_while_it_is_not_known_what_a_name_needs(lake, what):
+def test_nothing_is_removed_if_inputs_are_unknown(lake, what):
     publish.make_version(lake, plain_plan(1), plain_work)
     first = publish.make_version(lake, toy_plan(1), toy_work, name="a")
     publish.make_version(lake, toy_plan(2), toy_work, name="b")
@@ -102,7 +102,7 @@ def test_nothing_is_removed_while_it_is_not_known_what_a_name_needs(lake, what):
     assert layout.version_folder(lake, "plain", plain_plan(1).key).exists()
 
 
-def test_a_stage_in_use_is_neither_said_nor_removed(lake):
+def test_a_stage_in_use_is_neither_listed_nor_removed(lake):
     plan = plain_plan(1)
     stage = layout.stage_folder(lake, "plain", plan.key)
     stage.mkdir(parents=True)
@@ -112,8 +112,8 @@ def test_a_stage_in_use_is_neither_said_nor_removed(lake):
     assert not stage.exists()
 
 
-def test_nobody_waits_while_manifests_are_read(lake, monkeypatch):
-    """A lake of many versions takes longer to read than a run that publishes waits."""
+def test_manifests_are_read_without_locks(lake, monkeypatch):
+    """Reading the manifests of many versions takes longer than the time limit of a run that publishes."""
     for seed in (1, 2):
         publish.make_version(lake, plain_plan(seed), plain_work, name="a")
     load, held = manifest.load, []
@@ -127,7 +127,7 @@ def test_nobody_waits_while_manifests_are_read(lake, monkeypatch):
     assert held == [False]
 
 
-def test_what_is_published_while_manifests_are_read_stays_with_what_it_was_made_of(lake, monkeypatch):
+def test_versions_published_during_gc_are_kept_with_their_inputs(lake, monkeypatch):
     first, second = (plan_of("first", number) for number in (1, 2))
     for plan in (first, second):
         publish.make_version(lake, plan, plain_work)
@@ -144,12 +144,12 @@ def test_what_is_published_while_manifests_are_read_stays_with_what_it_was_made_
     assert all(layout.version_folder(lake, plan.table.name, plan.key).exists() for plan in (first, second, late))
 
 
-def test_who_asks_for_a_lock_is_in_nobodys_way(lake):
+def test_checking_a_lock_blocks_nothing(lake):
     plan = plain_plan(1)
     lock = layout.table_folder(lake, "plain") / f".lock-{plan.key}"
     lock.parent.mkdir()
     with lock.open("a") as stream:
-        # What is_held does, for longer than it does.
+        # This does the same as is_held, but longer.
         fcntl.flock(stream.fileno(), fcntl.LOCK_EX)
         timer = threading.Timer(0.2, fcntl.flock, (stream.fileno(), fcntl.LOCK_UN))
         timer.start()

@@ -1,4 +1,4 @@
-"""Names: nothing that could leave the lake gets through."""
+"""Names that could lead out of the lake are refused."""
 
 import pytest
 from hypothesis import given
@@ -23,7 +23,7 @@ def test_bad_names_are_refused(text):
 
 
 @given(st.text())
-def test_whatever_is_a_name_stays_in_the_lake(tmp_path_factory, text):
+def test_valid_names_stay_in_the_lake(tmp_path_factory, text):
     root = tmp_path_factory.getbasetemp()
     try:
         name = layout.check_name(text)
@@ -42,7 +42,7 @@ def test_a_link_out_of_the_lake_is_refused(tmp_path):
     (tmp_path / "lake").mkdir()
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "lake" / "galaxies").symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(BadInput, match="leaves"):
+    with pytest.raises(BadInput, match="is outside"):
         layout.table_folder(tmp_path / "lake", "galaxies")
 
 
@@ -61,7 +61,7 @@ def test_object_stores_are_refused(text):
     ("text", "words"),
     [("", "empty"), ("file", "not a folder"), ("~no-such-user/lake", "lake"), ("loop", "lake"), ("a\0b", "lake")],
 )
-def test_what_cannot_be_a_lake_is_refused(tmp_path, monkeypatch, text, words):
+def test_paths_that_cannot_be_lakes_are_refused(tmp_path, monkeypatch, text, words):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
     (tmp_path / "loop").symlink_to("loop")
@@ -69,6 +69,6 @@ def test_what_cannot_be_a_lake_is_refused(tmp_path, monkeypatch, text, words):
         layout.resolve_lake(text)
 
 
-def test_cells_are_filed_as_hats_wants():
+def test_files_of_cells_have_paths_of_hats():
     assert layout.cell_file(5, 1607) == "Norder=5/Dir=0/Npix=1607.parquet"
     assert layout.cell_file(8, 574968) == "Norder=8/Dir=570000/Npix=574968.parquet"

@@ -1,4 +1,4 @@
-"""What goes into the fingerprint of the code."""
+"""Contents of the fingerprint of the code."""
 
 import re
 import tomllib
@@ -9,7 +9,7 @@ from lake_schema.store.provenance import libraries, machine
 from tests.universe import plain_plan, plain_work
 
 PROJECT = Path(__file__).resolve().parents[3] / "pyproject.toml"
-# They transport, query or draw rows and change none of their bytes.
+# These packages transport, query or plot rows and do not change their bytes.
 HARMLESS = {"PyYAML", "duckdb", "fsspec", "h5py", "matplotlib", "pandas", "pyspark", "tqdm", "universal-pathlib"}
 
 

@@ -1,4 +1,4 @@
-"""Publishing: what is made is whole, repeatable and refused when it is not what it should be."""
+"""Published versions are complete and repeatable, and wrong ones are refused."""
 
 import json
 import os
@@ -17,7 +17,7 @@ def sums(lake):
     return {f["path"]: f["sha256"] for f in read.version(lake, "toy").manifest["files"]}
 
 
-def test_what_is_published_can_be_read(lake):
+def test_published_rows_can_be_read(lake):
     folder = publish.make_version(lake, toy_plan(), toy_work)
     version = read.version(lake, "toy")
     assert version.folder == folder
@@ -47,7 +47,7 @@ def test_a_second_run_makes_nothing(lake):
     publish.make_version(lake, toy_plan(), never)
 
 
-def test_what_failed_is_listed_and_the_rest_is_kept(lake):
+def test_failed_tasks_are_listed_and_the_rest_is_kept(lake):
     made = []
 
     def work(root, facts):
@@ -56,7 +56,7 @@ def test_what_failed_is_listed_and_the_rest_is_kept(lake):
             raise ValueError("no luck")
         return toy_work(root, facts)
 
-    with pytest.raises(TasksFailed, match=r"1 of 4 parts failed: .*Npix=1608.*ValueError: no luck"):
+    with pytest.raises(TasksFailed, match=r"1 of 4 tasks failed: .*Npix=1608.*ValueError: no luck"):
         publish.make_version(lake, toy_plan(), work)
     with pytest.raises(BadInput, match="no table toy"):
         read.version(lake, "toy")
@@ -65,7 +65,7 @@ def test_what_failed_is_listed_and_the_rest_is_kept(lake):
     assert read.find_faults(read.version(lake, "toy"), deep=True) == []
 
 
-def test_a_silent_worker_is_found_out(lake):
+def test_a_worker_without_a_receipt_is_detected(lake):
     with pytest.raises(TasksFailed, match="ended without a receipt"):
         publish.make_version(lake, toy_plan(), toy_work, mapper=lambda f, parts: [])
 
@@ -86,7 +86,7 @@ def test_wrong_rows_are_never_published(lake, wrong):
         publish.make_version(lake, toy_plan(), work)
 
 
-def test_whatever_goes_into_a_plan_changes_its_key():
+def test_every_fact_of_a_plan_changes_its_key():
     plan = toy_plan()
     others = [
         toy_plan(seed=2),
@@ -139,7 +139,7 @@ def test_a_version_that_was_overtaken_is_not_published(lake):
     assert read.version(lake, "toy").key == toy_plan(2).key
 
 
-def test_two_runs_of_one_plan_do_not_meet(lake, monkeypatch):
+def test_a_second_run_of_a_running_plan_is_refused(lake, monkeypatch):
     monkeypatch.setattr(locks, "SHORT_TIMEOUT", 0.1)
 
     def work(root, facts):
@@ -166,7 +166,7 @@ def test_a_file_that_would_leave_the_stage_is_refused(lake):
     def work(root, facts):
         return Output(toy_rows(facts["cell"], 3), {"../../../x": lambda path: path.write_text("out")})
 
-    with pytest.raises(TasksFailed, match="leaves"):
+    with pytest.raises(TasksFailed, match="is outside"):
         publish.make_version(lake, toy_plan(), work)
     assert not (lake.parent / "x").exists()
 
@@ -191,7 +191,7 @@ def test_copies_of_a_task_that_are_late_change_nothing(lake, monkeypatch):
     path, first = stage / data_path(TOY, part.name), []
 
     def slow(root, facts):
-        # Another copy ends while this one renders.
+        # Another copy of the task ends while this one renders.
         run_task(root, plan.key, TOY, plan.facts, toy_work, part)
         first.append(path.stat().st_ino)
         return toy_work(root, facts)
@@ -216,8 +216,8 @@ def test_copies_of_a_task_that_are_late_change_nothing(lake, monkeypatch):
     assert publish.make_version(lake, plan, toy_work) == folder
 
 
-def test_what_is_done_needs_no_lock(lake, monkeypatch):
-    """A lake that cannot be written is no reason to fail where nothing is left to do."""
+def test_a_finished_version_needs_no_lock(lake, monkeypatch):
+    """A lake that is not writable is no reason to fail if there is nothing to do."""
     folder = publish.make_version(lake, toy_plan(), toy_work)
     monkeypatch.delattr(locks, "hold")
     assert publish.make_version(lake, toy_plan(), None) == folder
@@ -233,21 +233,21 @@ def test_a_current_version_that_is_gone_can_be_made_again(lake):
     assert read.find_faults(read.version(lake, "toy"), deep=True) == []
 
 
-def test_two_versions_that_changed_names_are_found_out(lake):
+def test_two_exchanged_versions_are_detected(lake):
     first, second = (publish.make_version(lake, toy_plan(seed), toy_work) for seed in (1, 2))
     other = first.with_name("other")
     first.rename(other)
     second.rename(first)
     other.rename(second)
     for key in (None, toy_plan(1).key, toy_plan(2).key):
-        with pytest.raises(Damaged, match="is that of table toy, version"):
+        with pytest.raises(Damaged, match="belongs to table toy, version"):
             read.version(lake, "toy", key)
     for seed in (1, 2):
-        with pytest.raises(Damaged, match="is that of table toy, version"):
+        with pytest.raises(Damaged, match="belongs to table toy, version"):
             publish.make_version(lake, toy_plan(seed), toy_work)
 
 
-def test_a_link_to_another_table_is_found_out(lake):
+def test_a_link_to_another_table_is_detected(lake):
     folder = publish.make_version(lake, toy_plan(), toy_work)
     publish.make_version(lake, plain_plan(), plain_work)
     link = layout.current_link(lake, "plain")
@@ -256,7 +256,7 @@ def test_a_link_to_another_table_is_found_out(lake):
     with pytest.raises(Damaged, match="does not lead to a version of table plain"):
         read.version(lake, "plain")
     shutil.copytree(folder, link.with_name(folder.name))
-    with pytest.raises(Damaged, match="is that of table toy"):
+    with pytest.raises(Damaged, match="belongs to table toy"):
         read.version(lake, "plain", toy_plan().key)
 
 
@@ -283,7 +283,7 @@ def test_a_manifest_of_another_form_is_damage(lake, change):
     read.version(lake, "toy")
     change(facts)
     manifest.write(folder, facts)
-    with pytest.raises(Damaged, match="not a manifest of this form"):
+    with pytest.raises(Damaged, match="not a valid manifest"):
         read.version(lake, "toy")
 
 

@@ -1,4 +1,4 @@
-"""Reading: the right rows, only the files that can hold them, and no damaged byte."""
+"""Reading returns the right rows, opens only files that can contain them, and refuses damaged bytes."""
 
 import os
 
@@ -45,7 +45,7 @@ def test_units_come_back_with_the_rows(toy):
     assert toy.schema.field("flux").metadata[b"unit"] == b"uJy"
 
 
-def test_a_table_that_is_not_there(lake):
+def test_a_missing_table(lake):
     with pytest.raises(BadInput, match="no table galaxies"):
         read.version(lake, "galaxies")
     with pytest.raises(BadInput, match="name"):
@@ -87,7 +87,7 @@ def test_any_hats_reader_can_open_it(toy):
 
 
 def test_pairs_across_cell_edges_are_matched(lake):
-    """Every source has a twin 1" away in another catalogue; with the margin none is lost, edge or not."""
+    """Every source has a twin 1" away in another catalogue; with the margin, no pair is lost at an edge."""
     from lake_schema.store.plan import Output
     from tests.universe import TOY
 
@@ -96,7 +96,7 @@ def test_pairs_across_cell_edges_are_matched(lake):
     def work(root, facts):
         cell, shift = facts["cell"], facts["seed"] / 3600
         rng = np.random.default_rng(7)
-        # Along the border of 1607 and its neighbours, half of the pairs straddle it.
+        # Half of the pairs along the border of cell 1607 have one member on each side.
         rim = np.concatenate([sky.margin_cells(5, 1607, 13), [edge >> 32]])
         index = np.repeat(rim, 4) << 32 | rng.integers(0, 1 << 32, 4 * rim.size)
         import healpy as hp
@@ -118,5 +118,5 @@ def test_pairs_across_cell_edges_are_matched(lake):
     left, right = (hats_readers.open_catalog(layout.current_link(root, "toy")) for root in (lake, other))
     pairs = left.crossmatch(right, radius_arcsec=1.5, n_neighbors=1, suffixes=("_a", "_b")).compute()
     same = (pairs["id_a"] == pairs["id_b"]).sum()
-    assert same > 0.97 * read.version(lake, "toy").num_rows  # the rest have another neighbour within 1"
+    assert same > 0.97 * read.version(lake, "toy").num_rows  # The rest have another neighbour within 1"
     assert len(pairs) == read.version(lake, "toy").num_rows

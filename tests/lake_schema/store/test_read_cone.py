@@ -1,4 +1,4 @@
-"""Selections on the sky: by observed and by true position, across the edges of cells of one or several orders."""
+"""Selections on the sky by observed and by true position, across edges of cells of one or several orders."""
 
 import healpy as hp
 import numpy as np
@@ -22,13 +22,13 @@ LENSED = Table(
     "A toy catalogue with lensed positions.",
     order=5,
 )
-# Where the cells 1607, 1610 and their neighbours meet, and a corner at a pole, and one on RA = 0.
+# Common corners of cells 1607, 1610 and their neighbours, a corner at a pole, and one on RA = 0.
 CORNERS = [hp.vec2ang(hp.boundaries(32, cell, nest=True)[:, 0], lonlat=True) for cell in (1607, 1023, 5461)]
 N, SPREAD, DEFLECTION = 4000, 0.05, 8 / 3600
 
 
 def sources(corner, seed=1):
-    """Random sources about a corner of cells, each moved by up to 8 arcsec."""
+    """Return random sources around a corner of cells, each deflected by up to 8 arcsec."""
     rng = np.random.default_rng(seed)
     centre = hp.ang2vec(*corner, lonlat=True).reshape(3)
     true = centre + np.radians(SPREAD) * rng.normal(size=(N, 3))
@@ -47,7 +47,7 @@ def sources(corner, seed=1):
 
 
 def published(root, rows, orders=(5,)):
-    """The rows as a catalogue, one file a cell; with several orders, every cell of order 5 takes the next of them."""
+    """Publish rows as a catalogue with one file per cell; with several orders, cells of order 5 get them in turn."""
     index = rows["_healpix_29"].to_numpy()
     parts = []
     for n, cell in enumerate(np.unique(index >> 48).tolist()):
@@ -91,7 +91,7 @@ def test_no_source_is_lost_at_an_edge(catalogues, data, on):
 
 
 def test_lensing_moves_sources_over_the_edge(catalogues):
-    """The padding matters: without it, sources whose observed cell is not touched would be lost."""
+    """Without the padded radius, sources whose observed cells are not touched would be lost."""
     lost = 0
     for _, rows, version in catalogues:
         assert 0.3 * DEFLECTION < version.max_deflection() <= DEFLECTION
@@ -112,7 +112,7 @@ def test_all_columns_and_the_whole_sky(catalogues):
     assert version.cone(float(CORNERS[0][0][0]), -float(CORNERS[0][1][0]), 0.001).num_rows == 0
 
 
-def test_what_a_cone_refuses(lake, catalogues):
+def test_wrong_arguments_of_a_cone_are_refused(lake, catalogues):
     _, _, version = catalogues[0]
     for arguments, words in (
         ((0.0, 91.0, 1.0), "dec"),
@@ -130,7 +130,7 @@ def test_what_a_cone_refuses(lake, catalogues):
             version.cone(*arguments)
 
 
-def test_what_is_not_lensed_is_where_it_is_seen(lake):
+def test_without_lensing_both_positions_are_equal(lake):
     publish.make_version(lake, toy_plan(), toy_work)
     version = read.version(lake, "toy")
     ra, dec = sky.cell_centre(5, 1607)
@@ -139,10 +139,10 @@ def test_what_is_not_lensed_is_where_it_is_seen(lake):
     assert found[1].equals(found[0])
 
 
-def test_a_version_that_does_not_know_its_deflection(catalogues):
+def test_a_version_without_deflection_is_refused(catalogues):
     _, _, version = catalogues[0]
     facts = {k: v for k, v in version.manifest.items() if k != "deflection_deg"}
-    with pytest.raises(BadInput, match="how far positions are lensed"):
+    with pytest.raises(BadInput, match="has no largest deflection"):
         read.Version(version.folder, facts, version.schema).cone(0.0, 0.0, 1.0, on="true")
 
 
@@ -158,7 +158,7 @@ def test_other_readers_open_mixed_orders(catalogues):
     assert len(found) > 20
 
 
-def test_the_margin_of_each_cell_is_what_lies_about_it(catalogues):
+def test_the_margin_of_each_cell_surrounds_it(catalogues):
     for _, rows, version in catalogues:
         fine = rows["_healpix_29"].to_numpy() >> 32
         for part in version.parts:
@@ -172,7 +172,7 @@ def test_the_margin_of_each_cell_is_what_lies_about_it(catalogues):
 
 
 def test_a_cross_match_loses_no_pair_across_cells_of_other_orders(catalogues, tmp_path):
-    """Every source has a twin 0.5" to the north, in files cut in another way."""
+    """Every source has a twin 0.5" to the north, in files with cells of other orders."""
     _, rows, version = catalogues[0]
     columns = {name: rows[name].to_numpy() for name in rows.column_names}
     columns["dec"] = columns["dec"] + 0.5 / 3600

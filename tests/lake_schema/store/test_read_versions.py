@@ -1,4 +1,4 @@
-"""A table whose declaration is another than this one's is refused by name, with what differs."""
+"""Tables with another declaration are refused by name, with the difference."""
 
 from dataclasses import replace
 
@@ -29,7 +29,7 @@ BAD = {
     "another type": (with_columns(PLAIN.columns[0], replace(PLAIN.columns[1], type="float32")), "column value is"),
     "another unit": (
         with_columns(PLAIN.columns[0], replace(PLAIN.columns[1], unit="deg")),
-        "column value has unit '', wanted 'deg'",
+        "column value has unit '', but must have 'deg'",
     ),
     "a column less": (with_columns(PLAIN.columns[0]), "column value is not declared"),
 }
@@ -38,21 +38,21 @@ BAD = {
 @pytest.mark.parametrize("name", BAD)
 def test_other_columns_are_refused_by_name(plain, name):
     table, words = BAD[name]
-    with pytest.raises(VersionMismatch, match=f"^table plain: {words}.*: another truesky wrote it$"):
+    with pytest.raises(VersionMismatch, match=f"^table plain: {words}.*: written by another version of truesky$"):
         read.with_declared_schema(plain, table)
 
 
 @pytest.mark.parametrize(("was", "now"), [(3, 1), (1, 2)])
 def test_another_version_is_refused_naming_both(lake, was, now):
     publish.make_version(lake, replace(plain_plan(), table=replace(PLAIN, version=was)), plain_work)
-    who = "another version of truesky wrote it"
-    line = f"table plain: {who}: its declaration is of version {was}, this truesky reads version {now}"
+    who = "written by another version of truesky"
+    line = f"table plain: {who}: it has version {was} of the declaration, but this truesky reads version {now}"
     with pytest.raises(VersionMismatch, match=f"^{line}$"):
         read.with_declared_schema(read.version(lake, "plain"), replace(PLAIN, version=now))
 
 
-def test_a_table_is_compared_with_its_declaration_without_being_asked(lake, monkeypatch):
-    """`read.version` itself looks the table up."""
+def test_reading_compares_a_table_with_its_declaration(lake, monkeypatch):
+    """`read.version` itself looks up the declaration."""
     plan = Plan(GALAXIES, {}, (Task(layout.cell_file(5, 1607), {}),))
     publish.make_version(lake, plan, lambda root, facts: Output(rows_of(GALAXIES, 12)))
     monkeypatch.setattr("lake_schema.tables.galaxies.GALAXIES", replace(GALAXIES, columns=GALAXIES.columns[:-1]))
@@ -61,7 +61,7 @@ def test_a_table_is_compared_with_its_declaration_without_being_asked(lake, monk
 
 
 def test_a_unit_is_refused_after_the_right_one_was_read(plain):
-    """Of the same columns and types: what a process has read before does not stand in for it."""
+    """A cached schema with the same columns and types must not hide another unit."""
     assert read.with_declared_schema(plain, PLAIN).schema.names == plain.schema.names
     own = plain.schema.field(0)
     other = plain.schema.set(0, own.with_metadata({**(own.metadata or {}), b"unit": b"furlong"}))

@@ -1,4 +1,4 @@
-"""Requests side by side in one lake: each has its own versions, and nobody takes one for another's."""
+"""Several requests in one lake have separate versions, which are never confused."""
 
 import os
 import shutil
@@ -16,7 +16,7 @@ from tests.universe import PLAIN, plain_plan, plain_work, toy_plan, toy_work
 
 @pytest.fixture
 def two(lake):
-    """Requests a and b, each with a table of its own and one that they share."""
+    """Publish tables of requests a and b: a separate one for each, and one that they share."""
     for name, seed in (("a", 1), ("b", 2)):
         publish.make_version(lake, toy_plan(), toy_work, name=name)
         publish.make_version(lake, plain_plan(seed), plain_work, name=name)
@@ -24,11 +24,11 @@ def two(lake):
 
 
 def made_from(*keys):
-    """A plan of a table that names what it is made of."""
+    """Return a plan of a table whose facts name its inputs."""
     return Plan(replace(PLAIN, name="derived"), {"seed": 1, "inputs": list(keys)}, plain_plan().tasks)
 
 
-def test_each_request_has_its_own(two):
+def test_each_request_has_its_version(two):
     assert request_links.request_names(two) == ["a", "b"]
     assert [read.version(two, "plain", request=name).key for name in "ab"] == [plain_plan(1).key, plain_plan(2).key]
     assert {read.version(two, "toy", request=name).key for name in "ab"} == {toy_plan().key}
@@ -36,14 +36,14 @@ def test_each_request_has_its_own(two):
     assert request_links.tables_of_request(two, "a") == ["plain", "toy"]
 
 
-def test_without_a_name_nobody_guesses(two):
+def test_several_requests_require_a_name(two):
     assert read.version(two, "toy").key == toy_plan().key
-    with pytest.raises(BadInput, match=r"requests a, b have versions of their own of table plain: name one"):
+    with pytest.raises(BadInput, match=r"requests a, b have different versions of table plain: name one"):
         read.version(two, "plain")
     assert read.version(two, "plain", plain_plan(1).key).key == plain_plan(1).key
 
 
-def test_a_name_that_is_not_there_is_refused(two):
+def test_a_missing_name_is_refused(two):
     with pytest.raises(BadInput, match=r"has no request c; it has a, b"):
         read.version(two, "plain", request="c")
     with pytest.raises(BadInput, match="no table halos of request a"):
@@ -68,7 +68,7 @@ def test_a_request_of_one_lake_keeps_the_paths_that_users_hold(lake):
 
 
 def test_requests_do_not_supersede_each_other(lake):
-    """One publishes while the other still works; a second run of the first is told."""
+    """One request publishes while the other is running; a second run of the first request is refused."""
 
     def work(root, facts):
         if facts["part"] == 0:
@@ -81,11 +81,11 @@ def test_requests_do_not_supersede_each_other(lake):
         publish.make_version(lake, plain_plan(3), plain_work, base=None, name="a")
 
 
-def test_what_a_table_is_made_of_belongs_to_the_request_too(lake):
+def test_inputs_are_linked_to_the_request(lake):
     publish.make_version(lake, plain_plan(1), plain_work, name="a")
 
     def work(root, facts):
-        # Before the first part: nobody removes an input under a job that runs.
+        # The inputs are linked before the first task, so that gc does not remove them while the job runs.
         assert request_links.linked_key(lake, "b", "plain") == plain_plan(1).key
         return plain_work(root, facts)
 
@@ -96,7 +96,7 @@ def test_what_a_table_is_made_of_belongs_to_the_request_too(lake):
     assert request_links.linked_key(lake, "b", "plain") == plain_plan(2).key
 
 
-def test_what_is_done_needs_no_lock(two, monkeypatch):
+def test_a_finished_version_needs_no_lock(two, monkeypatch):
     monkeypatch.delattr(locks, "hold")
     assert publish.make_version(two, plain_plan(2), None, name="b").name == f"v-{plain_plan(2).key}"
 
@@ -125,7 +125,7 @@ def test_parts_of_another_request_are_not_made_again(lake):
 
 
 @pytest.mark.parametrize("to", ["../../toy/v-0123456789abcdef", "v-0123456789abcdef", "/etc"])
-def test_a_link_that_leads_elsewhere_is_found_out(two, to):
+def test_a_link_that_leads_elsewhere_is_detected(two, to):
     link = layout.request_link(two, "a", "plain")
     link.unlink()
     link.symlink_to(to)

@@ -1,4 +1,4 @@
-"""Validation: every declared table, every column, every kind of wrong."""
+"""Validation of all declared tables: every column, every kind of violation."""
 
 import functools
 
@@ -56,7 +56,7 @@ def test_a_wrong_type_unit_or_nullability(table):
         assert field.name == column.name
         other = pa.float64() if field.type != pa.float64() else pa.float32()
         zeros = pa.array([0, 0, 0], other)
-        refused(rows.set_column(place, field.with_type(other), zeros), table, column.name, "wanted")
+        refused(rows.set_column(place, field.with_type(other), zeros), table, column.name, "but must be")
         metadata = {**field.metadata, b"unit": b"furlong"}
         refused(
             rows.set_column(place, field.with_metadata(metadata), rows.column(place)), table, column.name, "furlong"
@@ -67,7 +67,7 @@ def test_a_wrong_type_unit_or_nullability(table):
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @each_table
-def test_a_number_that_is_none(table, bad):
+def test_nan_and_infinity_are_refused(table, bad):
     for column in table.columns:
         if column.is_float or column.type.startswith("list<float"):
             refused(changed(three_rows(table), column, bad), table, column.name, "row 1")
@@ -131,7 +131,7 @@ def test_a_compound_key():
     refused(pa.concat_tables([rows, rows]), tasks, "rows 0 and 3")
 
 
-# Numbers that are strange and legal: kept to the bit where the bounds admit them, refused where they do not.
+# Unusual but valid numbers: kept bit by bit if the bounds allow them, else refused.
 ODD = {
     "minus zero": -0.0,
     "denormal": 5e-324,
@@ -145,10 +145,10 @@ ODD = {
 @pytest.mark.parametrize("number", ODD.values(), ids=ODD)
 @each_table
 def test_an_odd_number_is_kept_or_refused_but_never_changed(table, number, tmp_path):
-    """Of each column alone whether it is legal; what is legal of all columns through one file."""
+    """Each column is checked alone; the allowed numbers of all columns are then written to one file."""
     rows, kept = three_rows(table), {}
     for column in table.columns:
-        # 1e308 is no float32.
+        # 1e308 exceeds the range of float32.
         if not column.is_float or (abs(number) > 1e300 and column.type != "float64"):
             continue
         value = np.dtype(column.type).type(number)
@@ -169,7 +169,7 @@ def test_an_odd_number_is_kept_or_refused_but_never_changed(table, number, tmp_p
 
 @st.composite
 def tables_and_rows(draw):
-    """Any declared table with rows drawn from the bounds of its columns, the bounds themselves among them."""
+    """Draw a declared table and rows within the bounds of its columns, including the bounds themselves."""
     table = draw(st.sampled_from([t for t in TABLES if not t.is_catalogue] + [TOY, TABLES[0], TABLES[1]]))
     rows = rows_of(table, draw(st.integers(1, 20)), draw(st.integers(0, 2**32 - 1)))
     for column in table.columns:
@@ -182,7 +182,7 @@ def tables_and_rows(draw):
 
 
 def mutations(table, rows, column):
-    """Every single way to spoil a column."""
+    """Return every single way to violate the declaration of a column."""
     yield rows.drop_columns([column.name])
     yield rows.rename_columns([f"{n}_" if n == column.name else n for n in rows.column_names])
     place = rows.column_names.index(column.name)
@@ -194,7 +194,7 @@ def mutations(table, rows, column):
 
 
 @given(tables_and_rows(), st.data())
-def test_what_is_declared_passes_and_any_one_mutation_is_refused(example, data):
+def test_declared_rows_pass_and_every_mutation_is_refused(example, data):
     table, rows = example
     assert validate.find_violations(rows, table) == []
     column = data.draw(st.sampled_from(table.columns))

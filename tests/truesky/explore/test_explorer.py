@@ -264,7 +264,7 @@ def test_a_table_of_another_version_is_not_listed_as_damaged(lake):
     with Explorer(lake) as other:
         row = other.tables().loc["galaxies"]
     assert row["version"] == "unreadable version"
-    assert "another version of truesky wrote it" in row["meaning"]
+    assert "written by another version of truesky" in row["meaning"]
 
 
 def test_heatmap_is_numpys(explorer, galaxies):

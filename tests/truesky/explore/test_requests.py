@@ -39,7 +39,7 @@ def test_a_query_of_both(opened):
 
 @pytest.mark.parametrize("call", [lambda e: e.sql("FROM plain"), lambda e: e.describe("plain")])
 def test_a_table_that_two_have_is_not_guessed(opened, call):
-    with pytest.raises(BadInput, match=r"requests a, my-b have versions of their own of table plain: name one"):
+    with pytest.raises(BadInput, match=r"requests a, my-b have different versions of table plain: name one"):
         call(opened)
 
 

@@ -135,7 +135,7 @@ def render(root, request, fail=()):
 
     make(root, request, plan_exposures)
     if fail:
-        with pytest.raises(TasksFailed, match=r"1 of 2 parts failed: .*ValueError: no light"):
+        with pytest.raises(TasksFailed, match=r"1 of 2 tasks failed: .*ValueError: no light"):
             make(root, request, render_exposures, spy=spy)
     else:
         make(root, request, render_exposures, spy=spy)
@@ -226,7 +226,7 @@ def test_a_failed_detector_does_not_end_the_run(lake, monkeypatch, tmp_path, cap
             "render_task",
             lambda root, facts: (bad if facts["detector"] == "R22_S11" else WORK)(root, facts),
         )
-        with pytest.raises(TasksFailed, match=rf"1 of 2 parts failed: {part}: ValueError: no light"):
+        with pytest.raises(TasksFailed, match=rf"1 of 2 tasks failed: {part}: ValueError: no light"):
             submitted_job.run(render_exposures.JOB, lake, wanted())
     assert layout.current_key(lake, "products") is None
     # Planned = made + failed.
@@ -442,7 +442,7 @@ def test_product_keys_depend_on_all_inputs(rendered, monkeypatch, tmp_path):
     found = [keys(rendered, wanted(**some)) for some in ({}, {"effects": {"off": ["poisson"]}}, {"accuracy": "survey"})]
     for table in ("galaxies", "galaxy_fluxes", "stars", "star_fluxes"):
         with monkeypatch.context() as patch:
-            patch.setattr(read.Version, "part_sha256", lambda self, part, name=table: f"{self.table == name}")
+            patch.setattr(read.Version, "partition_sha256", lambda self, part, name=table: f"{self.table == name}")
             found.append(keys(rendered, wanted()))
     with monkeypatch.context() as patch:
         patch.setattr(product_plan, "code_version", lambda: "another")
@@ -680,7 +680,7 @@ def test_requests_with_the_same_universe(lake, tmp_path, capsys):
     assert garbage.collect(lake, delete=True) == []
     assert [archive.products(lake, name).to_pylist() for name in "ab"] == [found["a"], found["b"]]
     assert archive.main(["--lake", str(lake)]) == 2
-    assert "requests a, b have versions of their own of table products" in capsys.readouterr().err
+    assert "requests a, b have different versions of table products" in capsys.readouterr().err
     path = found["a"][0]["path"]
     assert archive.main(["--lake", str(lake), "--name", "a", "--again", path, "--out", str(tmp_path / "x.fits")]) == 0
     assert f"equals {path}" in capsys.readouterr().out

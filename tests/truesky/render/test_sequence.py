@@ -195,7 +195,7 @@ def test_products_depend_on_the_catalogue_of_earlier_exposures(lake, folder, mon
     def other(self, part):
         return "another" if self.table == "stars" and part in there else sums(self, part)
 
-    monkeypatch.setattr(read.Version, "part_sha256", other)
+    monkeypatch.setattr(read.Version, "partition_sha256", other)
     after = keys(lake, request)
     assert {number for number in before if before[number] != after[number]} == {1, 3, 4, 5}
     monkeypatch.setattr(

@@ -94,14 +94,14 @@ def test_a_failure_is_one_line_and_its_traceback_is_in_the_log(run, lake, capsys
     assert run(raising) == 1
     out, err = capsys.readouterr()
     assert out == ""
-    assert err == "toy_job: table plain: 1 of 3 parts failed: 1.parquet: ValueError: row 17\n"
+    assert err == "toy_job: table plain: 1 of 3 tasks failed: 1.parquet: ValueError: row 17\n"
     (log,) = logs(lake)
     (failed,) = [line for line in log if "error" in line and "part" in line]
     assert failed["part"] == "1.parquet"
     assert 'raise ValueError("row 17")' in failed["traceback"]
     assert log[-1]["ended"]
     assert log[-1]["status"] == "failed"
-    assert log[-1]["error"].startswith("TasksFailed: table plain: 1 of 3 parts failed")
+    assert log[-1]["error"].startswith("TasksFailed: table plain: 1 of 3 tasks failed")
     assert "in make" in log[-1]["traceback"]
     assert run(plain_work) == 0
     assert [line["part"] for line in logs(lake)[1] if "part" in line] == ["1.parquet"]

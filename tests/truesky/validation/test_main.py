@@ -76,12 +76,12 @@ def test_remembered_numbers_gate_nothing(found, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("option", "name", "said"),
     [
-        ("--json", "none/figures.json", "its folder is not there"),
-        ("--json", ".", "is no file"),
-        ("--figures", "file", "is no folder"),
-        ("--figures", "file/below", "is no folder"),
-        ("--json", "locked/figures.json", "cannot be written to"),
-        ("--figures", "locked/figures", "cannot be written to"),
+        ("--json", "none/figures.json", "its folder does not exist"),
+        ("--json", ".", "is not a file"),
+        ("--figures", "file", "is not a folder"),
+        ("--figures", "file/below", "is not a folder"),
+        ("--json", "locked/figures.json", "is not writable"),
+        ("--figures", "locked/figures", "is not writable"),
     ],
 )
 def test_paths_are_checked_before_anything_is_computed(monkeypatch, tmp_path, capsys, option, name, said):

@@ -1,4 +1,4 @@
-"""A lake on object storage: all of it or what was there before, whoever is killed, damages or comes in between."""
+"""Readers of a lake on object storage see a complete old or new state, even if pushes or objects fail."""
 
 import os
 import random
@@ -27,7 +27,7 @@ def place(bucket):
 
 @pytest.fixture
 def filled(lake):
-    """A catalogue and a plain table."""
+    """Lake with a catalogue and a plain table."""
     publish.make_version(lake, toy_plan(cells=CELLS), toy_work)
     publish.make_version(lake, plain_plan(1), plain_work, name="first")
     return lake
@@ -42,13 +42,13 @@ def opened(place):
 
 
 def seed(place):
-    """Which version of the plain table readers see, every row of it."""
+    """Return which version of the plain table readers see, after checking all its rows."""
     values = set(read.version(opened(place), "plain").rows()["value"].to_pylist())
     assert len(values) == 1
     return values.pop()
 
 
-def test_what_was_pushed_is_read_as_it_is_in_the_folder(filled, place):
+def test_a_pushed_lake_is_read_like_its_folder(filled, place):
     told = pushed(filled, place)
     assert [one.table for one in told] == ["plain", "toy"]
     assert all(one.sent == one.objects and one.sent_size == one.size for one in told)
@@ -72,11 +72,11 @@ def test_what_was_pushed_is_read_as_it_is_in_the_folder(filled, place):
     )
 
 
-def test_what_is_there_is_not_sent_again(filled, place, bucket):
+def test_existing_objects_are_not_sent_again(filled, place, bucket):
     pushed(filled, place)
     bucket[0].recorder.asked.clear()
     assert {one.sent for one in pushed(filled, place)} == {0}
-    # The one that must be refused.
+    # This push must be refused.
     assert [path.rpartition("/")[2] for path in bucket[0].recorder.sent()] == ["manifest.json"]
     publish.make_version(filled, plain_plan(2), plain_work)
     told = {(one.table, one.key): one.sent for one in pushed(filled, place)}
@@ -86,7 +86,7 @@ def test_what_is_there_is_not_sent_again(filled, place, bucket):
         read.version(opened(place), "plain", request="second")
 
 
-def test_a_reader_stays_with_what_it_opened(filled, place):
+def test_an_open_reader_keeps_its_versions(filled, place):
     pushed(filled, place)
     before = opened(place)
     first = read.version(before, "plain")
@@ -132,13 +132,13 @@ def test_a_push_that_ends_anywhere_is_completed_by_the_next(filled, place, bucke
             assert seed(place) == 1.0
             assert read.table_names(opened(place)) == ["plain"]
     service.recorder.answer = None
-    # The first runs ended before anything was there, and each went farther than the one before.
+    # The first runs end before anything is published, and each run continues the one before.
     assert 2 < most < 20
     assert seed(place) == 2.0
     assert read.find_faults(read.version(opened(place), "toy"), deep=True) == []
 
 
-def test_of_two_who_push_the_second_is_refused(filled, tmp_path, place):
+def test_the_second_of_two_simultaneous_pushes_is_refused(filled, tmp_path, place):
     pushed(filled, place)
     publish.make_version(filled, plain_plan(2), plain_work, name="first")
     other = tmp_path / "other"
@@ -228,9 +228,9 @@ def test_a_service_without_checksums_is_read_back(filled, place, bucket):
 
 def test_a_service_without_conditions_is_refused(filled, place, bucket):
     bucket[0].recorder.answer = lambda environ: environ.pop("HTTP_IF_NONE_MATCH", None) and None
-    with pytest.raises(BadInput, match="takes no conditional puts"):
+    with pytest.raises(BadInput, match="ignores conditions of puts"):
         pushed(filled, place)
-    # It is found out before all of the lake has been sent.
+    # This is detected before the whole lake has been sent.
     assert {name.split("/")[2] for name in bucket[0].names(bucket[1])} == {"plain"}
 
 
@@ -245,7 +245,7 @@ def test_a_large_file_goes_in_parts(place, tmp_path, monkeypatch, bucket):
     there.send(one)
     assert there.has_object(one)
     assert bucket[0].data(bucket[1], "lakes/one/large") == data
-    # Amazon ends the sum of an object that came in parts with their number.
+    # Amazon appends the number of parts to the checksum of an object that was sent in parts.
     head, sums = there._client.head_object, []
 
     def as_amazon(**asked):
@@ -271,7 +271,7 @@ def test_a_version_that_is_not_whole_is_not_pushed(filled, place, bucket):
     with pytest.raises(Damaged, match=r"1\.parquet has other bytes"):
         pushed(filled, place)
     file.write_bytes(data)
-    # What is no table is compared when it is sent.
+    # Files that are not tables are compared when they are sent.
     beside = layout.current_link(filled, "toy").resolve() / "toy" / "hats.properties"
     beside.write_bytes(beside.read_bytes().replace(b"toy", b"TOY"))
     with pytest.raises(Damaged, match=r"hats\.properties has other contents than the manifest says"):
@@ -291,7 +291,7 @@ def told(capsys, *arguments):
     return status, said.err or said.out
 
 
-def test_the_command_says_what_it_did(filled, place, capsys):
+def test_the_command_reports_its_work(filled, place, capsys):
     status, said = told(capsys, filled, place)
     assert status == 0
     assert said.splitlines()[-1] == f"{place} is published"
@@ -304,14 +304,14 @@ def test_the_command_says_what_it_did(filled, place, capsys):
         ("s3://no-such-bucket/lake", "there is no bucket no-such-bucket"),
         ("s3://sky/lake?endpoint_override=http://127.0.0.1:9", "Could not connect"),
         ("s3://sky/lake?endpoint_override=ftp://x", "endpoint ftp://x"),
-        ("s3://sky/lake?colour=red", "wanted s3://BUCKET/PREFIX"),
-        ("s3://Sky!/lake", "is no name of a bucket"),
+        ("s3://sky/lake?colour=red", "must be s3://BUCKET/PREFIX"),
+        ("s3://Sky!/lake", "is not a valid name of a bucket"),
         ("s3://sky/a/../b", "empty part"),
-        ("s3:lake", "wanted s3://BUCKET/PREFIX"),
-        ("lake", "wanted s3://BUCKET/PREFIX"),
+        ("s3:lake", "must be s3://BUCKET/PREFIX"),
+        ("lake", "must be s3://BUCKET/PREFIX"),
     ],
 )
-def test_a_place_that_cannot_be_is_refused_in_one_line(filled, bucket, capsys, there, words):
+def test_a_wrong_address_is_refused_in_one_line(filled, bucket, capsys, there, words):
     began = time.monotonic()
     status, said = told(capsys, filled, there)
     assert status == 2
@@ -319,7 +319,7 @@ def test_a_place_that_cannot_be_is_refused_in_one_line(filled, bucket, capsys, t
     assert time.monotonic() - began < 20
 
 
-def test_what_is_no_lake_is_refused(tmp_path, place, capsys):
+def test_folders_that_are_not_lakes_are_refused(tmp_path, place, capsys):
     (tmp_path / "empty").mkdir()
     for lake, words in (
         (tmp_path / "empty", "holds no table"),

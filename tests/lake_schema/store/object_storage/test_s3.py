@@ -1,4 +1,4 @@
-"""Where a lake on object storage lies, and how it is refused where none is."""
+"""Addresses of lakes on object storage, and errors if there is no lake."""
 
 import time
 
@@ -21,7 +21,7 @@ def test_an_address_is_written_as_it_is_read(text):
     assert layout.open_lake(layout.open_lake(text)) == layout.open_lake(text)
 
 
-def test_an_endpoint_is_what_is_asked_for_or_named_or_in_the_environment(monkeypatch):
+def test_an_endpoint_comes_from_the_call_the_address_or_the_environment(monkeypatch):
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://environment")
     named = "s3://sky/a?endpoint_override=http://address"
     assert s3.parse_address("s3://sky/a").service == "http://environment"
@@ -29,7 +29,7 @@ def test_an_endpoint_is_what_is_asked_for_or_named_or_in_the_environment(monkeyp
     assert s3.parse_address(named, "http://option").service == "http://option"
     assert s3.parse_address("s3://sky/a").key("galaxies", "x") == "a/galaxies/x"
     assert s3.parse_address("s3://sky").key("galaxies", "x") == "galaxies/x"
-    with pytest.raises(BadInput, match="an endpoint does not go with it"):
+    with pytest.raises(BadInput, match="it cannot have an endpoint"):
         layout.open_lake("/lake", "http://option")
 
 
@@ -52,7 +52,7 @@ def test_no_credentials_are_shown(text, endpoint):
         assert "s3://" in str(refused.value) or "host" in str(refused.value)
 
 
-def test_what_is_published_is_written_as_it_is_read():
+def test_published_versions_survive_the_round_trip():
     told = s3.PublishedVersions({"galaxies": "0" * 16}, {"demo": {"galaxies": "1" * 16}})
     assert s3.parse_published(told.to_bytes(), "here") == told
     assert told.links() == {"galaxies/current": "v-" + "0" * 16, "names/demo/galaxies": "../../galaxies/v-" + "1" * 16}
@@ -62,7 +62,7 @@ def test_what_is_published_is_written_as_it_is_read():
     "data",
     [b"", b"[]", b"{}", b'{"tables": {"a": "1"}, "names": {}}', b'{"tables": {"..": "0123456789abcdef"}, "names": {}}'],
 )
-def test_what_is_of_another_form_is_refused(data):
+def test_malformed_lists_of_versions_are_refused(data):
     with pytest.raises(Damaged, match="here does not say"):
         s3.parse_published(data, "here")
 
@@ -71,11 +71,11 @@ def test_what_is_of_another_form_is_refused(data):
     ("place", "words"),
     [
         ("s3://{}/nothing", "no lake was pushed there"),
-        ("s3://no-such-bucket/lake", "the bucket is another"),
+        ("s3://no-such-bucket/lake", "the bucket is wrong"),
         ("s3://sky/lake?endpoint_override=http://127.0.0.1:9", "http://127.0.0.1:9 does not answer"),
     ],
 )
-def test_where_no_lake_is_one_line_says_so(bucket, capsys, place, words):
+def test_a_missing_lake_is_reported_in_one_line(bucket, capsys, place, words):
     began = time.monotonic()
     assert __main__.main(["verify", place.format(bucket[1])]) == 2
     said = capsys.readouterr().err
@@ -84,7 +84,7 @@ def test_where_no_lake_is_one_line_says_so(bucket, capsys, place, words):
     assert time.monotonic() - began < 20
 
 
-def test_a_lake_is_looked_after_where_it_is(lake, bucket, capsys):
+def test_commands_work_on_a_pushed_lake(lake, bucket, capsys):
     publish.make_version(lake, toy_plan(cells=((1607, 30),)), toy_work)
     publish.make_version(lake, plain_plan(1), plain_work, name="first")
     place = f"s3://{bucket[1]}"

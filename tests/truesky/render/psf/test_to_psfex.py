@@ -89,6 +89,6 @@ def test_a_profile_without_planes_is_written_too(tmp_path):
 
 
 def test_planes_of_no_degree_are_refused(tmp_path):
-    with pytest.raises(BadInput, match="4 planes are not those of a polynomial"):
+    with pytest.raises(BadInput, match="4 planes do not fit a polynomial"):
         psfex.write(tmp_path / "a.psf", np.zeros((4, 5, 5), np.float32), 0.5, 3.0, (1.0, 1.0), (1.0, 1.0))
     assert not list(tmp_path.iterdir())

@@ -228,7 +228,7 @@ def test_each_row_has_a_name_where_there_are_names(tmp_path, kind):
     with pytest.raises(BadInput, match=r"absent.*: name of row 2 is missing$"):
         ephemerides.read(written(tmp_path / f"absent.{kind}", {**two, "name": ["Ceres", ""]}), "absent")
     if kind != "csv":
-        with pytest.raises(BadInput, match=r"half.*: column name (is|holds) .*, wanted "):
+        with pytest.raises(BadInput, match=r"half.*: column name (is|holds) .*, but must "):
             ephemerides.read(written(tmp_path / f"half.{kind}", {**two, "name": [0.5, 1.5]}), "half")
 
 

@@ -156,7 +156,7 @@ def test_bad_libraries_are_refused(tmp_path, cube):
             keys.stamp_files(path)
         assert "\n" not in str(refused.value)
     path.write_text("no FITS")
-    with pytest.raises(BadInput, match=r"bad.fits: is no FITS file"):
+    with pytest.raises(BadInput, match=r"bad.fits: is not a FITS file"):
         keys.stamp_files(path)
     with pytest.raises(BadInput, match=r"structure.stamps.file: .*nowhere.fits: no such file"):
         keys.stamp_files(tmp_path / "nowhere.fits")
