@@ -151,7 +151,7 @@ def parts(root, request):
 
 def test_the_last_exposure_rendered_alone_has_the_same_bytes(lake, whole, folder):
     step, found = parts(lake, wanted(folder))
-    publish.make_version(lake, replace(step.plan, parts=(found[5],)), step.run_task)
+    publish.make_version(lake, replace(step.plan, tasks=(found[5],)), step.run_task)
     alone, among = (read.version(root, "products") for root in (lake, whole))
     rows = alone.rows().to_pylist()
     assert {row["content"] for row in rows} == {"science", "noise_free", "sky", "ghosts", "persistence"}
@@ -200,7 +200,7 @@ def test_products_depend_on_the_catalogue_of_earlier_exposures(lake, folder, mon
     assert {number for number in before if before[number] != after[number]} == {1, 3, 4, 5}
     monkeypatch.setattr(
         read.Version,
-        "part_sha256",
+        "partition_sha256",
         lambda self, part: "another" if self.table == "stars" and part in here else sums(self, part),
     )
     after = keys(lake, request)
