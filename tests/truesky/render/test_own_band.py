@@ -71,10 +71,10 @@ def test_another_content_of_its_file_is_another_plan(lake, tmp_path):
         (
             "pointing",
             GROUND,
-            r"pointing\[0\]\.band: mine is your own passband, in which camera lsstcam has no",
+            r"pointing\[0\]\.band: mine is a user passband, in which camera lsstcam has no",
         ),
-        ("pointing", NISP, r"pointing\[0\]\.band: mine is your own passband, in which camera nisp has no"),
-        ("observation", SURVEY, r"observation\[0\]\.bands: mine is your own passband: no survey observes in it"),
+        ("pointing", NISP, r"pointing\[0\]\.band: mine is a user passband, in which camera nisp has no"),
+        ("observation", SURVEY, r"observation\[0\]\.bands: mine is a user passband: no survey observes in it"),
     ],
 )
 def test_other_cameras_have_no_such_band(tmp_path, block, keys, words):

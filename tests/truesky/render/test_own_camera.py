@@ -229,7 +229,7 @@ def test_two_curves_of_one_name_are_refused_with_both_places(tmp_path):
     shutil.copytree(tmp_path / "mini", tmp_path / "maxi")
     words = (
         r"mission\.cameras\[1\]: .*maxi/bands\.csv line 2: band narrow has another curve in "
-        r"mission\.cameras\[0\]: .*mini/bands\.csv line 2: all curves of a request have different names$"
+        r"mission\.cameras\[0\]: .*mini/bands\.csv line 2: all curves must have different names$"
     )
     with pytest.raises(BadInput, match=words):
         parse(request)

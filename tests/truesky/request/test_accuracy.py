@@ -65,7 +65,7 @@ def test_a_quicklook_takes_half_of_a_draft_at_most():
 
 @pytest.mark.parametrize("name", NUMBERS)
 def test_beyond_reach_is_refused_with_the_best_there_is(name):
-    with pytest.raises(BadInput, match=rf"^accuracy\.{name} = 1e-12 is beyond reach, the best is \S+$") as refusal:
+    with pytest.raises(BadInput, match=rf"^accuracy\.{name} = 1e-12 cannot be reached, the best is \S+$") as refusal:
         accuracy.fastest_row(replace(SURVEY, **{name: 1e-12}))
     best = float(str(refusal.value).rpartition(" ")[2])
     row = accuracy.fastest_row(replace(ANYTHING, **{name: best}))
@@ -83,7 +83,7 @@ def test_every_number_that_is_beyond_reach_is_named():
 def test_a_request_is_refused_before_anything_is_made(where):
     own = asdict(SURVEY) | {"shape": 1e-9}
     wanted = {**GOOD, "accuracy": own} if where == "accuracy" else {**GOOD, "explore": {"accuracy": [own]}}
-    with pytest.raises(BadInput, match=r"accuracy\.shape = 1e-09 is beyond reach, the best is"):
+    with pytest.raises(BadInput, match=r"accuracy\.shape = 1e-09 cannot be reached, the best is"):
         from_table(wanted)
 
 

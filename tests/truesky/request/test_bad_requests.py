@@ -39,7 +39,7 @@ BAD = {
     "a seed of text": ('name = "x"\nseed = "1"\n' + CONE, "seed"),
     "a seed of 65 bits": (f'name = "x"\nseed = {2**64}\n' + CONE, "seed"),
     "no area": (HEAD, "area"),
-    "two areas": (GOOD + "box = { ra = [0, 1], dec = [0, 1] }\n", "area wants exactly one"),
+    "two areas": (GOOD + "box = { ra = [0, 1], dec = [0, 1] }\n", "area must have exactly one"),
     "an area larger than the sky": (HEAD + "[area]\ncone = { ra = 0, dec = 0, radius = 181 }\n", "area.cone.radius"),
     "a box round the sky twice": (HEAD + "[area]\nbox = { ra = [0, 720], dec = [0, 1] }\n", "area.box.ra"),
     "a pole too far": (HEAD + "[area]\ncone = { ra = 0, dec = 90.0000001, radius = 1 }\n", "area.cone.dec"),
@@ -92,7 +92,7 @@ BAD = {
         GOOD + f'[explore]\n"vis.gain" = {{ values = {list(range(1, 10_002))}, unit = "electron / adu" }}\n',
         "explore.vis.gain",
     ),
-    "an exploration of no value": (GOOD + '[explore]\naccuracy = []\n', "explore.accuracy names no value"),
+    "an exploration of no value": (GOOD + '[explore]\naccuracy = []\n', "explore.accuracy has no value"),
 }  # fmt: skip
 
 

@@ -69,7 +69,7 @@ def only(channels, kind):
 def test_a_request_of_which_nothing_is_rendered_is_refused_by_the_check_and_the_first_job(
     channels, kind, first, tmp_path
 ):
-    wanted = f"^observation\\[0\\].channels: no simulator renders {first} {kind} yet: it can be planned alone$"
+    wanted = f"^observation\\[0\\].channels: no simulator renders {first} {kind} yet: it can only be planned$"
     for refuse in (
         checks.check_rendered,
         plan.check,
