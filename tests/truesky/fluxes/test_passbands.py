@@ -130,5 +130,5 @@ def test_no_row_replaces_another_of_its_name(tmp_path, monkeypatch):
     (tmp_path / "passbands.csv").write_text(f"{table}{row.replace('Euclid-VIS', 'sdss2010-g')}\n", encoding="utf-8")
     monkeypatch.setattr(passbands, "TABLE", tmp_path / "passbands.csv")
     for ask in (passbands.names, lambda: passbands.load("euclid_vis"), lambda: passbands.provenance("euclid_h")):
-        with pytest.raises(BadInput, match=r"passbands\.csv: passband euclid_vis stands twice"):
+        with pytest.raises(BadInput, match=r"passbands\.csv: passband euclid_vis occurs twice"):
             ask()
