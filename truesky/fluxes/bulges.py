@@ -3,9 +3,9 @@
 In the reference band at rest, the ratio of bulge to disc is that of `bulge_fraction`. In another band it is multiplied
 by a ratio of two templates. The numerator is the light of a template that is redder by `bulge_color` in 0.1(g - r); the
 denominator is the light of the galaxy's template. Templates are ordered by colour, and the logarithm of their light is
-interpolated between neighbours. For the reddest template,
-both templates are the same, and bulge and disc have equal colours. Since the ratio is positive, both components are
-positive at every wavelength. Their sum is always the galaxy's spectrum.
+interpolated between neighbours. For the reddest template, both templates are the same, and bulge and disc have equal
+colours. Since the ratio is positive, both components are positive at every wavelength. Their sum is always the galaxy's
+spectrum.
 
 Notes
 -----

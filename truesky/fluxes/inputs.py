@@ -342,7 +342,7 @@ def _galaxy_origin(template: int) -> Origin:
 
 
 def _star_origins(user_origins: Sequence[Origin]) -> list[Origin]:
-    """Return the origins of the stellar library; `user_origins` has one for each user dwarf, () for the built-in ones."""
+    """Return the origins of the stellar library; `user_origins` has one per user dwarf, () if dwarfs are built in."""
     dwarfs = _origin("Pecaut & Mamajek 2013", stellar.TABLE)
     first = [*user_origins] or [dwarfs] * len(stellar.types().names)
     colours = _origin("Castelli & Kurucz 2003, as astroARIADNE has them", model_stars.TABLE)

@@ -1,4 +1,4 @@
-"""Compute spectra of L and T dwarfs: 365 templates, about 19 realisations of the colour scatter for each of 19 subtypes.
+"""Compute spectra of L and T dwarfs: 365 templates, about 19 realisations of colour scatter for each of 19 subtypes.
 
 The mean colours are from Pecaut & Mamajek 2013: i - z (AB), and J - H and H - Ks (Vega). The colour z - J is computed
 from z - Y with an adopted Y - J.

@@ -32,8 +32,8 @@ CANDIDATES = tuple(
 
 # Factor from the largest measured error to the assumed largest error of all galaxies.
 MARGIN = 1.5
-# If this accuracy or a stricter one is required, no table is used. Table errors are measured relative to integration,
-# whose error must remain negligible.
+# If the allowed error is at most this, all fluxes are integrated. Errors of tables are known only relative to
+# integration.
 _MIN_TABLE_ERROR = 1e-4
 # Error of integration relative to whole spectra in double precision, due to templates in single precision.
 _INTEGRATION_ERROR = 1e-6

@@ -22,9 +22,9 @@ def ecsv(tmp_path):
     ("place", "instead", "words"),
     [
         ("# schema", "# - {name: c, datatype: float64}\n" * 3000 + "# schema", "its header has more than 65536"),
-        ("datatype: float64", 'datatype: string, subtype: "float64[99999999]"', "a curve's columns are numbers"),
-        ("datatype: float64", '"datatyp\\x65": 9999999D', "'9999999D' is no datatype"),
-        ("# schema", "# meta: {a: &b [1], c: *b}\n# schema", "'b' in its header refers to another place"),
+        ("datatype: float64", 'datatype: string, subtype: "float64[99999999]"', "columns of a curve must be numbers"),
+        ("datatype: float64", '"datatyp\\x65": 9999999D', "'9999999D' is not a datatype"),
+        ("# schema", "# meta: {a: &b [1], c: *b}\n# schema", "'b' in its header must not be a reference"),
         ("# schema", "# meta: {a: !numpy.ndarray {shape: [9]}}\n# schema", "'!numpy.ndarray' in its header"),
         ("6000.0 1.0", "6000.0 " + "9" * 4000 + "\n1 1" * 9000, "9[0-9]* rows of 2 words are too many"),
     ],
@@ -41,7 +41,7 @@ def test_what_no_curve_needs_is_refused(ecsv, place, instead, words):
     ("more", "words"),
     [
         ("," * 501 + "\n" + (",x" * 400 + "\n") * 400, "rows of 502 words are too many"),
-        ('"' + "x\n" * 2000 + '",1\n', "a text in quotes goes over more than one line"),
+        ('"' + "x\n" * 2000 + '",1\n', "a text in quotes must not span more than one line"),
     ],
 )
 def test_words_make_no_room_in_every_row(tmp_path, more, words):

@@ -16,13 +16,13 @@ COLUMN = '<FIELD name="Transmission"'
     [
         (COLUMN, FIELD * 2000, "more than 1000 elements"),
         ("</RESOURCE>", "<TABLE/>" * 2000, "more than 1000 elements"),
-        ("<RESOURCE>", "<RESOURCE>" * 40, "more than 32 elements within"),
+        ("<RESOURCE>", "<RESOURCE>" * 40, "more than 32 nested elements"),
         (COLUMN, FIELD.replace("/>", ' arraysize="1x99999999"/>'), "arraysize = '1x99999999' of FIELD"),
         (COLUMN, FIELD.replace("/>", ' arraysize="&#57;99999"/>'), "arraysize = '999999' of FIELD"),
         (COLUMN, FIELD.replace("/>", ' arraysize="500"/>') * 50, "more than 4000000 numbers"),
         (COLUMN, FIELD.replace("/>", f' unit="{"m." * 600}m"/>'), "more than 1000 characters"),
-        ("<TD>5000", '<TD encoding="base64">', "no plain TABLEDATA"),
-        ("<TABLEDATA>", "<BINARY2><STREAM/></BINARY2>", "no plain TABLEDATA"),
+        ("<TD>5000", '<TD encoding="base64">', "not plain TABLEDATA"),
+        ("<TABLEDATA>", "<BINARY2><STREAM/></BINARY2>", "not plain TABLEDATA"),
         ('<?xml version="1.0"?>', '<?xml version="1.0" encoding="utf-16"?>', "'utf-16'"),
     ],
 )
