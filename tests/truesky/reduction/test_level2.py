@@ -287,7 +287,7 @@ def test_what_is_left_as_it_is_is_said(jpcam, tmp_path):
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        (["--level2", "--rate"], "--rate: images of level 2 are in counts"),
+        (["--level2", "--rate"], "--rate is not allowed with --level2"),
         (["--level2", "--threshold", "0"], "--threshold = 0.0 is outside"),
         (["--level2", "--least-pixels", "0"], "--least-pixels = 0 is outside"),
         (["--level2", "--aperture", "-1"], "--aperture = -1.0 is outside"),

@@ -175,7 +175,7 @@ def test_what_does_not_fit_is_refused_in_a_line(made, tmp_path, capsys):
         assert not out.exists() or not list(out.iterdir())
         return error
 
-    assert "--masters: which folder?" in refused()
+    assert "--masters FOLDER is required" in refused()
     assert "no image of detector '1-1'" in refused("--masters", str(made / "masters"), "--detectors", "1-1")
     assert "no image of exposure 999" in refused("--masters", str(made / "masters"), "--exposures", "999")
     assert "VIS_3-4_bias.fits" in refused("--masters", str(tmp_path / "none"))
@@ -185,9 +185,9 @@ def test_what_does_not_fit_is_refused_in_a_line(made, tmp_path, capsys):
     units = images.read_images(other / "VIS_3-4_dark.fits")
     cards = tuple((k, "12" if k == "SEED" else v, c) for k, v, c in units[0].cards)
     images.write_images(other / "VIS_3-4_dark.fits", [images.Image(None, cards), *units[1:]])
-    assert "SEED = 12, the frame's is 7" in refused("--masters", str(other))
+    assert "SEED = 12, the frame has 7" in refused("--masters", str(other))
     shutil.copy(made / "masters" / "VIS_3-4_bias.fits", other / "VIS_3-4_dark.fits")
-    assert "is no master dark" in refused("--masters", str(other))
+    assert "is not a master dark" in refused("--masters", str(other))
 
 
 def test_a_stack_of_them_says_what_it_is(made, tmp_path, capsys):
@@ -212,4 +212,4 @@ def test_a_stack_of_them_says_what_it_is(made, tmp_path, capsys):
     assert "is given twice" in capsys.readouterr().err
     master = str(made / "masters" / "VIS_3-4_bias.fits")
     assert stack.main([paths[0], master, "--out", str(out)]) == 2
-    assert "is no calibrated image" in capsys.readouterr().err
+    assert "is not a calibrated image" in capsys.readouterr().err

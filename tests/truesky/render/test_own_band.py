@@ -71,9 +71,9 @@ def test_another_content_of_its_file_is_another_plan(lake, tmp_path):
         (
             "pointing",
             GROUND,
-            r"pointing\[0\]\.band: mine is a user passband, in which camera lsstcam has no",
+            r"pointing\[0\]\.band: mine is a user passband, for which camera lsstcam has no",
         ),
-        ("pointing", NISP, r"pointing\[0\]\.band: mine is a user passband, in which camera nisp has no"),
+        ("pointing", NISP, r"pointing\[0\]\.band: mine is a user passband, for which camera nisp has no"),
         ("observation", SURVEY, r"observation\[0\]\.bands: mine is a user passband: no survey observes in it"),
     ],
 )

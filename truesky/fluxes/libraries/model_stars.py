@@ -89,7 +89,7 @@ def names() -> tuple[str, ...]:
 
 @lru_cache(maxsize=1)
 def model_share() -> Float:
-    """Return the model's fraction at each node [teff, log_g, metallicity]; the dwarf at that temperature is the rest."""
+    """Return the fraction of the model at each node [teff, log_g, metallicity]; the rest is a dwarf."""
     share = np.ones((TEFF.size, LOG_G.size, METALLICITY.size))
     for k, value in enumerate(_HOT_SHARES):
         share[-1 - k] *= value
