@@ -211,7 +211,7 @@ def image_file(path, **changes):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"IMAGETYP": "stack", "EXPOSURE": None}, "is a stack: give the images that it was made of"),
+        ({"IMAGETYP": "stack", "EXPOSURE": None}, "is a stack: use the images from which it was made"),
         *(({keyword: None}, f"has no card {keyword}") for keyword, *_ in CARDS),
         ({"EXPTIME": 0.0}, "EXPTIME = 0.0 must be a number above 0"),
         ({"PIXSCALE": "0.1"}, "PIXSCALE = '0.1' must be a number above 0"),

@@ -166,7 +166,7 @@ def test_a_folder_with_a_mistake_is_refused_before_anything_is_written(tmp_path,
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ('cameras = ["mini"]', 'cameras = ["mini", "mini/"]', r"mission\.cameras\[1\]: there are two cameras of the n"),
+        ('cameras = ["mini"]', 'cameras = ["mini", "mini/"]', r"mission\.cameras\[1\]: two cameras have the n"),
         ('cameras = ["mini"]', 'cameras = ["none"]', r"mission\.cameras\[0\]: .*none: no such folder"),
         ('cameras = ["mini"]', "cameras = 3", r"mission\.cameras"),
         ('cameras = ["mini"]', f'cameras = ["{"x" * 300}"]', r"mission\.cameras\[0\]: .*: File name too long$"),

@@ -40,8 +40,8 @@ def weights(scene: Scene, lamps: Sequence[int]) -> tuple[float, ...]:
     Notes
     -----
     With many lamps, the mean square of the wavelength is matched as well as possible. An observer can compute the
-    weights from the passband, the spectrum of the Sun and the spectra of the lamps. If all lamps are on one side of the sky's mean
-    wavelength, the nearest lamp is used.
+    weights from the passband, the spectrum of the Sun and the spectra of the lamps. If all lamps are on one side of
+    the sky's mean wavelength, the nearest lamp is used.
     """
     band = chromatic_response.band_of_scene(scene)
     band_width = float(band.wavelength[-1] - band.wavelength[0])

@@ -184,6 +184,6 @@ def test_what_is_missing_is_named(made, tmp_path, capsys):
     call = ["--lake", str(made / "lake"), "--out", str(tmp_path / "out")]
     with small_detectors(192):
         assert reduce.main(call) == 2
-        assert "--masters: which folder? Or --without dark linearity flat" in capsys.readouterr().err
+        assert "--masters FOLDER is required, or --without dark linearity flat" in capsys.readouterr().err
         assert reduce.main([*call, "--masters", str(tmp_path)]) == 2
         assert "NISP-P_4-16-4_DET22_dark.fits" in capsys.readouterr().err
