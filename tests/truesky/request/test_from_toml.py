@@ -1,4 +1,4 @@
-"""Requests: what is good is kept, what is bad is refused with its key."""
+"""Good requests are read completely, and bad requests are refused with the key."""
 
 import copy
 import tomllib
@@ -156,7 +156,7 @@ def test_bad_requests_are_refused_with_their_key(key, value, words):
 
 
 @pytest.mark.parametrize("key", ["name", "seed"])
-def test_what_must_be_there(key):
+def test_required_keys(key):
     table = copy.deepcopy(GOOD)
     del table[key]
     with pytest.raises(BadInput, match=f"{key} is missing"):
@@ -173,7 +173,7 @@ def test_what_must_be_there(key):
         ("# " + "x" * 2_000_000, "larger than"),
     ],
 )
-def test_files_that_are_no_request(tmp_path, text, words):
+def test_files_that_are_not_requests(tmp_path, text, words):
     path = tmp_path / "r.toml"
     path.write_bytes(text.encode("utf-8", "surrogatepass"))
     with pytest.raises(BadInput, match=words) as caught:
@@ -182,7 +182,7 @@ def test_files_that_are_no_request(tmp_path, text, words):
     assert "\n" not in str(caught.value)
 
 
-def test_a_file_that_is_not_there(tmp_path):
+def test_a_missing_file(tmp_path):
     with pytest.raises(BadInput, match="no such file"):
         parse(tmp_path / "x.toml")
 
@@ -195,8 +195,8 @@ def test_the_demo():
     assert set(demo.facts("seed", "universe")) == {"seed", "universe"}
 
 
-def test_discs_have_structure_where_it_is_asked_for():
-    """And what shapes an image says nothing of it where it is not."""
+def test_discs_have_structure_if_requested():
+    """Facts about images mention structure only if it is requested."""
     assert structure.facts(from_table(GOOD).structure) == structure.facts(from_table(with_("structure", {})).structure)
     assert structure.facts(from_table(with_("structure", {"arms": False})).structure) == {}
     assert from_table(with_("structure", {"arms": True})).structure.arms == Arms()
@@ -205,7 +205,7 @@ def test_discs_have_structure_where_it_is_asked_for():
     assert structure.facts(some)["structure"]["arms"]["number"] == 40
     own = from_table(with_("structure", {"stamps": {"file": "a.fits", "nearest": True}}), Path("there")).structure
     assert own.stamps == Stamps(Path("there/a.fits"), True, 0.5)
-    # A library by another name is the same; its sha256 tells.
+    # The name of a library does not matter; its sha256 identifies it.
     assert structure.facts(own) == {"structure": {"stamps": {"nearest": True, "least_radius": 0.5}}}
 
 
@@ -222,7 +222,7 @@ def test_numbers_of_any_size_are_numbers():
         from_table(with_("area", {"cone": {"ra": 10**400, "dec": 0, "radius": 1}}))
 
 
-def test_own_curves_lie_beside_the_request_and_their_bands_are_added(tmp_path):
+def test_user_curves_are_relative_to_the_request_and_add_bands(tmp_path):
     fluxes = """
 [fluxes.passbands.mine]
 file = "filters/mine.dat"

@@ -1,4 +1,4 @@
-"""Mistakes that users make: the check and the forecast refuse each in one line, before anything is written."""
+"""Mistakes of users are refused by the check and the forecast in one line, before anything is written."""
 
 import pytest
 
@@ -147,7 +147,7 @@ CASES |= {
 }  # fmt: skip
 
 
-def test_what_the_mistakes_are_made_in_is_good(tmp_path, capsys):
+def test_requests_without_mistakes_are_valid(tmp_path, capsys):
     (tmp_path / "p.csv").write_text("ra,dec\n53.1,-27.8\n")
     for number, text in enumerate((GOOD, OWN, GROUND, TABLE)):
         (tmp_path / f"{number}.toml").write_text(text)

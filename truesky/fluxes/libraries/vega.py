@@ -58,7 +58,7 @@ def vega() -> tuple[Float, Float]:
 
 
 def spectrum_file(name: str) -> Path:
-    """Return the path of a spectrum distributed with GalSim, without the slow import of GalSim."""
+    """Return the path of a spectrum of GalSim, without its slow import; raises BadInput if it is not installed."""
     spec = importlib.util.find_spec("galsim")
     if spec is None or not spec.submodule_search_locations:
         raise BadInput("package GalSim is not installed: its spectra of galaxies and Vega are required")

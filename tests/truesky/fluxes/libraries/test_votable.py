@@ -1,4 +1,4 @@
-"""VOTables that are small, and would take long or much memory: refused in a line before they are read."""
+"""Refuse small VOTables that would take much time or memory to read."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ COLUMN = '<FIELD name="Transmission"'
         ('<?xml version="1.0"?>', '<?xml version="1.0" encoding="utf-16"?>', "'utf-16'"),
     ],
 )
-def test_what_no_curve_needs_is_refused(tmp_path, place, more, words):
+def test_oversized_tables_are_refused(tmp_path, place, more, words):
     path = votable(tmp_path / "x.xml")
     text = path.read_text()
     assert place in text
@@ -35,8 +35,8 @@ def test_what_no_curve_needs_is_refused(tmp_path, place, more, words):
         from_files.read(path, "passband_svo")
 
 
-def test_what_passbands_have_is_read(tmp_path):
-    """Parameters with texts of any or a fixed length, a column of texts, another prefix of the names."""
+def test_features_of_real_passbands_are_accepted(tmp_path):
+    """Accept parameters with texts of any or fixed length, a column of texts, and another prefix of names."""
     path = votable(tmp_path / "x.xml")
     plain = from_files.read(path, "passband_svo")
     text = path.read_text().replace(
