@@ -1,17 +1,12 @@
-"""Spectra of galaxies and stars as they reach the telescope, and what they give through passbands.
+"""Compute spectra of galaxies and stars as they reach the telescope, and their fluxes in passbands.
 
-galaxy_spectra   combined, extinguished, redshifted, scaled, with lines, magnified, behind the Milky Way
-star_spectra     scaled to H, behind the dust on the way
-band_fluxes      f_nu of any of them
-galaxy_fluxes    table `galaxies` -> table `galaxy_fluxes`
-star_fluxes      table `stars` -> table `star_fluxes`
-galaxy_fluxes_by the same with chosen settings of the tables
-prepare          make the tables that the two need, and compile
+Spectra are on the grid of passbands.grid(), 600 to 24000 A in steps of 1 A. The flux tables contain the same sums. They
+are interpolated in tables (tables/flux_tables.py) if the accuracy permits it. Otherwise they are integrated over the
+wavelengths of the requested bands (integration.py).
 
-Spectra are on the grid of passbands.grid(), 600 .. 24000 A by 1 A. The flux tables are the same sums, interpolated in
-tables (tables/flux_tables.py) where the accuracy allows it, else over the wavelengths of the wanted bands
-(integration.py).
-Ref: Serrano et al. 2024, appendix B, in its order
+References
+----------
+Serrano et al. 2024, appendix B; the steps are in the same order.
 """
 
 from __future__ import annotations
@@ -39,16 +34,30 @@ from truesky.fluxes.tables.settings import stars_tabulated
 from truesky.numerics import matrices
 from truesky.request.accuracy import REFERENCE, Accuracy
 
-# Rows turned into arrays at a time: some 80 MB of them. The more, the more often a part of a table is used.
+# Rows converted to arrays at a time, about 80 MB. With more rows, each section of a table is used more often.
 _SLICE = 200_000
 
 
 def galaxy_spectra(galaxies: pa.Table, library: Library, medium: str = "vacuum") -> Float:
-    """f_lambda of galaxies, float64[n, 23401] erg s-1 cm-2 A-1 (187 kB a row).
+    """Return the spectra of galaxies with dust, redshift, emission lines, magnification and Milky Way extinction.
 
-    galaxies : rows of the table `galaxies`
-    medium   : where lines are seen, "vacuum" (from space) or "air" (from the ground)
-    Error    : 1e-6 relative (the templates are held in single precision)
+    Parameters
+    ----------
+    galaxies : pa.Table
+        Rows of the table `galaxies`.
+    library : Library
+        Templates of galaxies.
+    medium : str, optional
+        Medium in which lines are observed, "vacuum" (from space) or "air" (from the ground).
+
+    Returns
+    -------
+    float array, shape (n, 23401)
+        f_lambda in erg s-1 cm-2 A-1 (187 kB per row).
+
+    Notes
+    -----
+    The relative error is 1e-6, because templates are stored in single precision.
     """
     rows = galaxies_from_table(galaxies, library)
     grid = passbands.grid()
@@ -70,7 +79,20 @@ def galaxy_spectra(galaxies: pa.Table, library: Library, medium: str = "vacuum")
 
 
 def star_spectra(stars: pa.Table, library: Library) -> Float:
-    """f_lambda of stars, float64[n, 23401] erg s-1 cm-2 A-1; `stars`: rows of the table `stars`."""
+    """Return the spectra of stars behind the dust in front of them.
+
+    Parameters
+    ----------
+    stars : pa.Table
+        Rows of the table `stars`.
+    library : Library
+        Templates of stars.
+
+    Returns
+    -------
+    float array, shape (n, 23401)
+        f_lambda in erg s-1 cm-2 A-1.
+    """
     rows = stars_from_table(stars, library)
     spectra = np.zeros((len(rows), len(library.wavelength)))
     for sed, share in zip(rows.sed, rows.frac, strict=True):
@@ -80,7 +102,20 @@ def star_spectra(stars: pa.Table, library: Library) -> Float:
 
 
 def band_fluxes(spectra: Float, bands: Sequence[Passband]) -> Float:
-    """Band-averaged f_nu, float64[n, n_band] microjansky, of spectra [n, 23401] on the grid."""
+    """Return the band-averaged f_nu of spectra.
+
+    Parameters
+    ----------
+    spectra : float array, shape (n, 23401)
+        f_lambda on the grid in erg s-1 cm-2 A-1.
+    bands : sequence of Passband
+        The passbands.
+
+    Returns
+    -------
+    float array, shape (n, n_band)
+        f_nu in microjansky.
+    """
     out = np.empty((len(spectra), len(bands)))
     for k, band in enumerate(bands):
         inside = slice(band.first, band.first + len(band.wavelength))
@@ -91,13 +126,35 @@ def band_fluxes(spectra: Float, bands: Sequence[Passband]) -> Float:
 def galaxy_fluxes(
     galaxies: pa.Table, bands: Sequence[str | Passband], library: Library, accuracy: Accuracy = REFERENCE
 ) -> pa.Table:
-    """f_nu of galaxies through bands: internal dust, lines, magnification and the Milky Way's dust included.
+    """Return the fluxes of galaxies in passbands with internal dust, lines, magnification and Milky Way extinction.
 
-    galaxies : rows of the table `galaxies`, of any kind;  bands : names of passbands, or a user's own
-    library  : of the kinds central, satellite and strong lens
-    returns  : rows of the table `galaxy_fluxes` in the same order, microjansky
-    Error    : |df/f| <= accuracy.flux against band_fluxes of galaxy_spectra (benchmarks/fluxes.py); 1e-6 at best
-    Errors   : BadInput names the column and source of a missing value, OutOfRange what is out of bounds
+    Parameters
+    ----------
+    galaxies : pa.Table
+        Rows of the table `galaxies` of any kind.
+    bands : sequence of str or Passband
+        Names of passbands, or user passbands.
+    library : Library
+        Templates of the kinds central, satellite and strong lens.
+    accuracy : Accuracy, optional
+        Largest errors that are allowed.
+
+    Returns
+    -------
+    pa.Table
+        Rows of the table `galaxy_fluxes` in the same order, in microjansky.
+
+    Raises
+    ------
+    BadInput
+        If a value is missing. The message names the column and the source.
+    OutOfRange
+        If a value is out of range.
+
+    Notes
+    -----
+    The relative error is at most `accuracy.flux`, compared with `band_fluxes` of `galaxy_spectra`
+    (benchmarks/fluxes.py). It is 1e-6 at best.
     """
     curves = _load_passbands(bands)
     settings = [choice.setting for choice in errors_measured.choose(curves, accuracy, library)]
@@ -107,10 +164,23 @@ def galaxy_fluxes(
 def fluxes_with_settings(
     galaxies: pa.Table, curves: Sequence[Passband], settings: Sequence[Setting | None], library: Library
 ) -> pa.Table:
-    """`galaxy_fluxes` from the tables of these settings; bands without one are integrated.
+    """Return the fluxes of galaxies from tables with the given settings; see `galaxy_fluxes`.
 
-    galaxies : rows of table `galaxies`;  curves, settings : passbands, and how fine the table of each is
-    library  : templates of galaxies
+    Parameters
+    ----------
+    galaxies : pa.Table
+        Rows of the table `galaxies`.
+    curves : sequence of Passband
+        The passbands.
+    settings : sequence of Setting or None
+        Resolution of the table of each passband. Passbands with None are integrated.
+    library : Library
+        Templates of galaxies.
+
+    Returns
+    -------
+    pa.Table
+        Rows of the table `galaxy_fluxes` in the same order, in microjansky.
     """
     tabulated = [k for k, setting in enumerate(settings) if setting is not None]
     grid = None
@@ -132,10 +202,23 @@ def fluxes_with_settings(
 def star_fluxes(
     stars: pa.Table, bands: Sequence[str | Passband], library: Library, accuracy: Accuracy = REFERENCE
 ) -> pa.Table:
-    """f_nu of stars through bands, with the dust on the way to each; as `galaxy_fluxes`.
+    """Return the fluxes of stars in passbands, behind the dust in front of each; see `galaxy_fluxes`.
 
-    stars   : rows of table `stars`;  bands : embedded ones by name
-    library : spectra of stars;  accuracy : largest errors that are allowed
+    Parameters
+    ----------
+    stars : pa.Table
+        Rows of the table `stars`.
+    bands : sequence of str or Passband
+        Names of built-in passbands, or user passbands.
+    library : Library
+        Templates of stars.
+    accuracy : Accuracy, optional
+        Largest errors that are allowed.
+
+    Returns
+    -------
+    pa.Table
+        Rows of the table `star_fluxes` in the same order, in microjansky.
     """
     curves = _load_passbands(bands)
     tabulated = stars_tabulated(accuracy)
@@ -155,11 +238,18 @@ def prepare(
     star_library: Library,
     accuracy: Accuracy,
 ) -> None:
-    """Make what the cache lacks for these bands, tables and machine code, so that workers find it there.
+    """Fill the cache with the tables and machine code for these bands, so that workers can load them.
 
-    library, stars : of galaxies, of stars
-    curves, settings : passbands, and how fine the table of each is; None: it is integrated
-    accuracy         : largest errors that are allowed
+    Parameters
+    ----------
+    curves : sequence of Passband
+        The passbands.
+    settings : sequence of Setting or None
+        Resolution of the table of each passband for galaxies; None if it is integrated.
+    galaxy_library, star_library : Library
+        Templates of galaxies and of stars.
+    accuracy : Accuracy
+        Largest errors that are allowed.
     """
     tabulated = [(curve, setting) for curve, setting in zip(curves, settings, strict=True) if setting is not None]
     if tabulated:
@@ -180,7 +270,7 @@ def _galaxy_f_nu(
     grid: flux_tables.Grid | None,
     library: Library,
 ) -> tuple[Float, Bool]:
-    """float64[n, n_band]: from tables where there are any, the rest integrated; bool[n] in no table."""
+    """Return fluxes, float64[n, n_band], from tables if possible, and True for galaxies outside the tables, bool[n]."""
     if grid is None:
         return integration.galaxy_fluxes(rows, curves, library), np.ones(len(rows), bool)
     inside = flux_tables.covered_galaxies(rows)
@@ -212,13 +302,26 @@ def _star_f_nu(rows: Stars, curves: Sequence[Passband], tabulated: bool, library
 
 
 def milky_way_transmission(wavelength: npt.ArrayLike, a_v: Float) -> Float:
-    """10^(-0.4 A(lambda)), float64[n, n_lambda]: A = R_V E(B-V) [A(lambda) / A(V)], a_v = R_V E(B-V)."""
+    """Return the transmission of the Milky Way's dust, 10^(-0.4 A(lambda)).
+
+    Parameters
+    ----------
+    wavelength : float array, shape (n_lambda,)
+        Wavelengths in A.
+    a_v : float array, shape (n,)
+        Extinction A(V) = R_V E(B-V) in mag.
+
+    Returns
+    -------
+    float array, shape (n, n_lambda)
+        Transmission, with A(lambda) = R_V E(B-V) [A(lambda) / A(V)].
+    """
     return np.asarray(extinction.transmission(extinction.milky_way(wavelength), a_v[:, None]))
 
 
 def _load_passbands(bands: Sequence[str | Passband]) -> list[Passband]:
     if not bands:
-        raise BadInput("no passband is asked for")
+        raise BadInput("no passband is requested")
     return [band if isinstance(band, Passband) else passbands.load(band) for band in bands]
 
 

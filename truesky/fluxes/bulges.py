@@ -1,18 +1,20 @@
-"""How much of a galaxy's light is its bulge's, by band: bulges are redder than their discs.
+"""Compute the bulge's fraction of a galaxy's light in each band, since bulges are redder than their discs.
 
-in_band   rows of `galaxies` with the bulge's share of the light in a band for their bulge_fraction
-in_bins   the same share in each of several stretches of the rest frame
-ladder    templates from blue to red
+In the reference band at rest, the ratio of bulge to disc is that of `bulge_fraction`. In another band it is multiplied
+by a ratio of two templates. The numerator is the light of a template that is redder by `bulge_color` in 0.1(g - r); the
+denominator is the light of the galaxy's template. Templates are ordered by colour, and the logarithm of their light is
+interpolated between neighbours. For the reddest template, both templates are the same, and bulge and disc have equal
+colours. Since the ratio is positive, both components are positive at every wavelength. Their sum is always the galaxy's
+spectrum.
 
-The ratio of bulge to disc in the rest-frame reference band is that of `bulge_fraction`. Elsewhere it is times what a
-template that is redder by `bulge_color` in 0.1(g - r) has of the light there, over what the galaxy's own has: the
-sequence of templates, logarithms of light interpolated between neighbours. At the reddest both are the same, and so
-are bulge and disc. A ratio times a positive number leaves both components positive at every wavelength, and their sum
-is the galaxy's spectrum, whatever the numbers are.
+Notes
+-----
+Dust in front of both components changes the ratio within a band. This is neglected: the error is 5 % of the ratio at
+E(B-V) = 0.4. Emission lines are divided like the continuum.
 
-Error : dust lies before both, and what it changes within a band is left out: 5 % of the ratio at E(B-V) = 0.4;
-        emission lines are shared like the continuum
-Ref   : Kennedy et al. 2016, MNRAS 460, 3458 (colours of bulges and discs)
+References
+----------
+Kennedy et al. 2016, MNRAS 460, 3458 (colours of bulges and discs).
 """
 
 from __future__ import annotations
@@ -34,21 +36,29 @@ from truesky.fluxes.spectra.continuum import COMPONENTS, REFERENCE_BAND
 from truesky.numerics import matrices
 
 FRACTION, COLOUR = "bulge_fraction", "bulge_color"
-# What is read of a row besides.
+# Other columns that are read.
 COLUMNS = (COLOUR, "z_obs", *(f"{name}_{k}" for k in COMPONENTS for name in ("sed", "frac")))
 _BLUE_BAND = "sdss_g01"
-# Nodes of the table of a band in ln(1 + z), and wavelengths of the band at each: 1e-3 of a share.
+# Nodes of the table of a band in ln(1 + z), and samples of the band at each. The error of a fraction is 1e-3.
 _FIRST, _LAST, _STEP, _SAMPLES = np.log(0.97), np.log(8.0), 0.01, 500
-# Templates of equal colour are apart by this.
+# Smallest step in colour, so that templates with the same colour stay in increasing order.
 _COLOUR_STEP = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ColourSequence:
-    """Templates from blue to red.
+    """Templates in order from blue to red.
 
-    colour : float64[m] 0.1(g - r), rising;  of : int64[m] template;  rank : int64[template]
-    light  : float64[m] f_nu in the reference band
+    Attributes
+    ----------
+    colour : float array, shape (m,)
+        0.1(g - r) in mag, increasing.
+    template : int array, shape (m,)
+        Index of the template in the library.
+    rank : int array, shape (m,)
+        Position of each template of the library in the sequence.
+    light : float array, shape (m,)
+        f_nu in the reference band.
     """
 
     colour: Float
@@ -59,7 +69,7 @@ class ColourSequence:
 
 @lru_cache(maxsize=4)
 def colour_sequence(library: Library) -> ColourSequence:
-    """Of a library's templates, without dust."""
+    """Return the templates of a library without dust, in order of colour."""
     blue, light = (_rest_frame_light(library, passbands.load(name)) for name in (_BLUE_BAND, REFERENCE_BAND))
     colour = -2.5 * np.log10(blue / light)
     order = np.argsort(colour, kind="stable")
@@ -68,10 +78,21 @@ def colour_sequence(library: Library) -> ColourSequence:
 
 
 def with_fractions_in_band(rows: pa.Table, band: Passband, library: Library) -> pa.Table:
-    """Rows of `galaxies`, those with a colour of the bulge with its share of the light in a band as bulge_fraction.
+    """Replace `bulge_fraction` by the bulge's fraction of the light in a band, for rows with a bulge colour.
 
-    rows    : with `COLUMNS`; without them, or without a colour, a row stays as it is
-    library : what sed_1 and sed_2 count
+    Parameters
+    ----------
+    rows : pa.Table
+        Rows of `galaxies`. Without `COLUMNS`, or without a colour, a row stays unchanged.
+    band : Passband
+        The passband.
+    library : Library
+        Templates to which the columns sed_1 and sed_2 refer.
+
+    Returns
+    -------
+    pa.Table
+        The rows with the new column `bulge_fraction`.
     """
     share, indices, redness, components = _read_rows(rows, library)
     if not indices.size:
@@ -94,10 +115,21 @@ def with_fractions_in_band(rows: pa.Table, band: Passband, library: Library) -> 
 
 
 def fractions_in_bins(rows: pa.Table, light: Float, library: Library) -> Float:
-    """The bulge's share of the light in each bin, float64[n, bins].
+    """Return the bulge's fraction of the light in each bin of rest-frame wavelength.
 
-    rows  : of `galaxies`;  library : what sed_1 and sed_2 count
-    light : float64[template, bins] of each template in bins of the rest frame
+    Parameters
+    ----------
+    rows : pa.Table
+        Rows of `galaxies`.
+    light : float array, shape (n_template, n_bin)
+        Light of each template in the bins.
+    library : Library
+        Templates to which the columns sed_1 and sed_2 refer.
+
+    Returns
+    -------
+    float array, shape (n, n_bin)
+        Fractions from 0 to 1.
     """
     share, indices, redness, components = _read_rows(rows, library)
     sequence, out = colour_sequence(library), np.repeat(share[:, None], light.shape[1], axis=1)
@@ -113,7 +145,11 @@ def fractions_in_bins(rows: pa.Table, light: Float, library: Library) -> Float:
 
 
 def _neighbour_ranks(sequence: ColourSequence, sed: Int, redness: Float) -> tuple[Int, Int, Float]:
-    """Rank[n] of templates; that of the next bluer one than what is redder by `redness`, mag, and how far beyond."""
+    """Find the templates for a bulge that is redder than template `sed` by `redness` (mag).
+
+    Returns the rank of `sed`, the rank of the neighbour on the blue side of the bulge's colour, and the fraction of the
+    way to the next template; arrays of shape (n,).
+    """
     rank = sequence.rank[sed]
     target_colour = np.clip(sequence.colour[rank] + redness, sequence.colour[0], sequence.colour[-1])
     bluer = np.clip(np.searchsorted(sequence.colour, target_colour, side="right") - 1, 0, sequence.colour.size - 2)
@@ -121,12 +157,12 @@ def _neighbour_ranks(sequence: ColourSequence, sed: Int, redness: Float) -> tupl
 
 
 def _log_light_ratio(fraction: Float, low: Float, high: Float, galaxy: Float) -> Float:
-    """ln of the light of what lies a part of the way from one template to the next, over that of the galaxy's own."""
+    """Interpolate the logarithm of light between two templates, and subtract that of the galaxy's template."""
     return np.asarray(low + fraction * (high - low) - galaxy)
 
 
 def _read_rows(rows: pa.Table, library: Library) -> tuple[Float, Int, Float, list[tuple[Int, Float]]]:
-    """Shares[n] in the reference band; which rows have a colour; it; their templates and fractions."""
+    """Return fractions[n] in the reference band; for rows with a colour also indices, colours, templates and shares."""
     share = np.asarray(rows[FRACTION].to_numpy(), float).copy()
     if not set(COLUMNS) <= set(rows.column_names) or len(library) < 2:
         return share, np.zeros(0, np.int64), np.zeros(0), []
@@ -153,18 +189,18 @@ def _rest_frame_light(library: Library, band: Passband) -> Float:
 
 
 def _logarithm(light: Float) -> Float:
-    """Old templates have no light in the far ultraviolet: as faint as single precision goes."""
+    """Return the logarithm of light, with a floor for old templates without light in the far ultraviolet."""
     return np.asarray(np.log(np.maximum(light, np.finfo(np.float32).tiny)))
 
 
 def _band_table(band: Passband, library: Library) -> Float:
-    # By its contents: a passband is read anew for each detector.
+    # Cache by the contents of the passband, since it is read again for each detector.
     return _compute_table(band.response.tobytes(), band.wavelength.tobytes(), library)
 
 
 @lru_cache(maxsize=64)
 def _compute_table(response: bytes, wavelength: bytes, library: Library) -> Float:
-    """ln of the light in the band over that in the reference band at rest: float64[z, m] of the ladder."""
+    """Return ln(light in the band / light in the reference band at rest), float64[z, m] of the colour sequence."""
     band = Passband("", np.frombuffer(wavelength), np.frombuffer(response), "")
     sequence, nodes = colour_sequence(library), np.exp(np.arange(_FIRST, _LAST + 2 * _STEP, _STEP))
     samples = slice(None, None, max(len(band.wavelength) // _SAMPLES, 1))

@@ -1,8 +1,4 @@
-"""What brings a template to the magnitude that the catalogue gives it.
-
-continuum_scale   galaxies: apparent AB magnitude in the reference band
-star_scale        stars: Vega magnitude in 2MASS H
-"""
+"""Compute factors that scale template spectra to the magnitudes in the catalogue."""
 
 from __future__ import annotations
 
@@ -18,15 +14,33 @@ from truesky.fluxes.sources import Stars
 from truesky.numerics import matrices
 
 STAR_BAND = "twomass_h"
-# f_nu of a normalised template is 1e-11; 30 decades below, single precision has run out of digits.
+# f_nu of a normalised template is 1e-11. Single precision has no digits left 30 decades below.
 _MIN_F_NU = 1e-41
 
 
 def continuum_scale(mag_r01: Float, f_nu_observed: Float) -> Float:
-    """Factor for a continuum that gives f_nu_observed (erg s-1 cm-2 Hz-1) in the reference band.
+    """Return the factor that scales the continuum of a galaxy to its magnitude.
 
-    Errors: BadInput where dust has left nothing to scale
-    Ref: Serrano et al. 2024, appendix B, eq. f_continuum
+    Parameters
+    ----------
+    mag_r01 : float array, shape (n,)
+        Apparent AB magnitude in the reference band.
+    f_nu_observed : float array, shape (n,)
+        f_nu of the unscaled continuum in the reference band in erg s-1 cm-2 Hz-1.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Factors.
+
+    Raises
+    ------
+    BadInput
+        If dust leaves no light in the reference band.
+
+    References
+    ----------
+    Serrano et al. 2024, appendix B, eq. f_continuum.
     """
     if dark := int(np.sum(~(f_nu_observed > _MIN_F_NU))):
         raise BadInput(f"{dark} galaxies have no light in the reference band: mag_r01 cannot be met")
@@ -34,9 +48,12 @@ def continuum_scale(mag_r01: Float, f_nu_observed: Float) -> Float:
 
 
 def star_scale(stars: Stars, library: Library) -> Float:
-    """Factor for each star's mixture of templates, from its H magnitude before extinction.
+    """Return the factor for each star's mixture of templates, from its H magnitude before extinction.
 
-    The catalogue's H is Vega, 1.375 mag below AB; Serrano et al. 2024, appendix B, read it by the AB formula.
+    Notes
+    -----
+    H in the catalogue is a Vega magnitude, 1.375 mag below AB. Serrano et al. 2024, appendix B, use the AB formula for
+    it.
     """
     band = passbands.load(STAR_BAND)
     spectra = library.flux[:, band.first : band.first + len(band.wavelength)].astype(float)

@@ -1,10 +1,10 @@
-"""Band fluxes of every source of a lake, and the tables of what they were made with.
+"""Compute band fluxes of every source in a lake, and the tables of spectra, laws, lines and passbands behind them.
 
-spark-submit jobs/fluxes/compute_fluxes.py --lake LAKE --request REQUEST [--bands BAND ...]
+    spark-submit jobs/fluxes/compute_fluxes.py --lake LAKE --request REQUEST [--bands BAND ...]
 
-The tables' manifests say how: facts.accuracy what was asked for, facts.errors the setting and the measured error of
-each band (fractions of the flux), facts.covered where tables were used; what lies beyond was integrated, which the
-column `integrated` says of every source. facts.files holds the sha256 of each file that the request named.
+The facts in the manifests of the tables describe the computation. `accuracy` is the requested accuracy. `errors` has
+the setting and the measured relative error of each band. `covered` has the ranges in which tables were used; sources
+outside were integrated, and their column `integrated` is true. `files` has the sha256 of each file of the request.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,7 +36,7 @@ CATALOGUES = (("galaxy", "galaxies"), ("star", "stars"))
 
 
 def steps(lake: Path, request: Request) -> list[Step]:
-    """What fluxes are made with; then one part a cell of each catalogue, row by row beside it."""
+    """Return the steps that write the input tables, then the fluxes with one task per cell of each catalogue."""
     catalogues = [(kind, read.input_version(lake, name, request.name)) for kind, name in CATALOGUES]
     universe.check_catalogues([version for _, version in catalogues], request)
     flux_inputs = inputs.read(request.curves)
@@ -45,7 +45,7 @@ def steps(lake: Path, request: Request) -> list[Step]:
     choices = errors_measured.choose(curves, request.accuracy, flux_inputs.library)
     flux_steps = [_step(catalogue, kind, request, flux_inputs, choices, sources) for kind, catalogue in catalogues]
     if not all(layout.version_folder(lake, step.plan.table.name, step.plan.key).exists() for step in flux_steps):
-        # Here once, and not in every worker at the same time.
+        # Fill the cache once here, not in every worker at the same time.
         band_fluxes.prepare(
             curves, [choice.setting for choice in choices], flux_inputs.library, flux_inputs.stars, request.accuracy
         )
@@ -53,7 +53,22 @@ def steps(lake: Path, request: Request) -> list[Step]:
 
 
 def flux_step(kind: str, lake: Path, request: Request) -> Step:
-    """The step of the galaxies or of the stars alone."""
+    """Return the step for the fluxes of one kind of source.
+
+    Parameters
+    ----------
+    kind : str
+        "galaxy" or "star".
+    lake : Path
+        Root of the lake.
+    request : Request
+        The request.
+
+    Returns
+    -------
+    Step
+        The step.
+    """
     flux_inputs = inputs.read(request.curves)
     choices = errors_measured.choose(
         inputs.select_passbands(request.bands, flux_inputs.passbands), request.accuracy, flux_inputs.library
@@ -69,7 +84,7 @@ def flux_step(kind: str, lake: Path, request: Request) -> Step:
 
 
 def source_steps(flux_inputs: FluxInputs) -> list[Step]:
-    """The tables `templates`, `extinction_laws`, `emission_lines` and `passbands`."""
+    """Return the steps that write the tables `templates`, `extinction_laws`, `emission_lines` and `passbands`."""
 
     def step(table: Table, rows: Callable[[FluxInputs], pa.Table]) -> Step:
         plan = Plan(table, {"files": flux_inputs.sha256(), "code": code_version()}, (Task("all.parquet", {}),))
@@ -115,7 +130,7 @@ def _error_facts(kind: str, request: Request, choices: Sequence[Choice]) -> dict
 
 
 def compute_partition(lake: Path, facts: Json) -> Output:
-    """The fluxes of one cell, in the order of its rows."""
+    """Return the fluxes of one cell, in the order of its rows."""
     rows = read.version(lake, facts["catalogue"], facts["input"]).rows(partitions=[facts["part"]])
     curves = [inputs.passband_from_facts(lake, facts, band) for band in facts["bands"]]
     if facts["catalogue"] == "galaxies":
@@ -135,5 +150,5 @@ JOB = Job(
     "compute_fluxes",
     "Compute the band fluxes of galaxies and stars.",
     steps,
-    list_options=(("bands", "passbands, instead of those of the request"),),
+    list_options=(("bands", "passbands that replace those of the request"),),
 )

@@ -1,13 +1,8 @@
-"""Quasars, and galaxies beyond z = 6: their templates, and their fluxes by direct integration (they are few).
+"""Compute spectra and fluxes of quasars and of galaxies beyond z = 6.
 
-quasar_library       3 slopes x 3 strengths of the lines: template 3 i + j
-high_redshift_library  5 slopes of the ultraviolet x 3 strengths of Lyman alpha: template 3 i + j
-fluxes               f_nu of rows of `galaxies` of these two kinds
-spectra              their f_lambda;  scale : of a template to a magnitude
-ultraviolet_magnitude  M_UV -> apparent magnitude, the column mag_r01 of these kinds
-
-A row of these kinds has one template, sed_1, without internal dust; its lines are in the template. Its mag_r01 is
-AB, monochromatic, at 1450 A (quasars) or 1500 A (galaxies) in the rest frame: Serrano et al. 2024, appendix B.
+These sources are few, and their fluxes are integrated directly. A row of these kinds has one template, sed_1, without
+internal dust; its lines are in the template. Its mag_r01 is a monochromatic AB magnitude at 1450 A (quasars) or 1500 A
+(galaxies) in the rest frame (Serrano et al. 2024, appendix B).
 """
 
 from __future__ import annotations
@@ -37,9 +32,9 @@ QUASAR, HIGH_REDSHIFT = 2, 3
 MAGNITUDE_WAVELENGTH = {QUASAR: 1450.0, HIGH_REDSHIFT: 1500.0}
 Z_MAX = 15.0
 
-# Rest frame: 600 A seen at z = 15, and 24000 A seen at z = 0.
+# Rest-frame wavelengths, A: 600 A observed at z = 15, and 24000 A observed at z = 0.
 _REST_FIRST, _REST_LAST = 36, 24500
-# Of the galaxies nothing is left below Lyman alpha, beyond z = 6; quasars are seen through the intergalactic medium.
+# Galaxies beyond z = 6 have no flux below Lyman alpha. Quasars are observed through the intergalactic medium.
 _LYMAN_ALPHA = 1215.67
 
 # Vanden Berk et al. 2001: slopes of f_lambda below and above 5000 A; the 3 x 3 of Barnett et al. 2019.
@@ -52,12 +47,12 @@ QUASAR_LINES = Path(__file__).with_name("quasar_lines.csv")
 # Slopes around the mean of Bouwens et al. 2014; equivalent widths of Lyman alpha, A; its width redwards, A (adopted).
 HIGH_REDSHIFT_SLOPES, LYMAN_ALPHA_WIDTHS, _LYMAN_ALPHA_SIGMA = (-2.6, -2.3, -2.0, -1.7, -1.4), (0.0, 25.0, 50.0), 1.0
 
-# Rows whose whole spectra are made at a time.
+# Rows whose whole spectra are computed at a time.
 _BLOCK = 64
 
 
 def quasar_library() -> Library:
-    """The nine quasars."""
+    """Return the nine quasar templates: slope i and line strength j in template 3 i + j."""
     wavelength = _rest_wavelengths()
     flux, names = [], []
     for offset in QUASAR_OFFSETS:
@@ -68,7 +63,7 @@ def quasar_library() -> Library:
 
 
 def high_redshift_library() -> Library:
-    """The fifteen galaxies."""
+    """Return the fifteen galaxy templates: ultraviolet slope i and Lyman alpha width j in template 3 i + j."""
     wavelength = _rest_wavelengths()
     flux, names = [], []
     for slope in HIGH_REDSHIFT_SLOPES:
@@ -79,13 +74,29 @@ def high_redshift_library() -> Library:
 
 
 def ultraviolet_magnitude(abs_mag: npt.ArrayLike, z: npt.ArrayLike) -> Float:
-    """Apparent AB magnitude at the redshifted wavelength: M_UV + DM - 2.5 log10(1 + z), M_UV and DM with h = 0.67."""
+    """Return the apparent AB magnitude at the redshifted wavelength, M_UV + DM - 2.5 log10(1 + z).
+
+    M_UV (`abs_mag`) and the distance modulus DM have h = 0.67. The result is the column mag_r01 of these kinds.
+    """
     distance = cosmology.distance_modulus(z) - 5.0 * np.log10(cosmology.HUBBLE)
     return np.asarray(np.asarray(abs_mag, float) + distance - 2.5 * np.log10(1.0 + np.asarray(z, float)))
 
 
 def fluxes(galaxies: pa.Table, bands: Sequence[Passband]) -> Float:
-    """f_nu, float64[n, n_band] microjansky, of rows of kind 2 or 3: magnified, behind the Milky Way."""
+    """Return the fluxes of quasars and high-redshift galaxies, with magnification and Milky Way extinction.
+
+    Parameters
+    ----------
+    galaxies : pa.Table
+        Rows of the table `galaxies` of kind 2 or 3.
+    bands : sequence of Passband
+        The passbands.
+
+    Returns
+    -------
+    float array, shape (n, n_band)
+        f_nu in microjansky.
+    """
     out = np.zeros((galaxies.num_rows, len(bands)))
     for start in range(0, galaxies.num_rows, _BLOCK):
         f_lambda = spectra(galaxies.slice(start, _BLOCK))
@@ -96,9 +107,24 @@ def fluxes(galaxies: pa.Table, bands: Sequence[Passband]) -> Float:
 
 
 def spectra(galaxies: pa.Table) -> Float:
-    """f_lambda, float64[n, 23401] erg s-1 cm-2 A-1, of rows of kind 2 or 3.
+    """Return the spectra of quasars and high-redshift galaxies.
 
-    Errors: BadInput, OutOfRange name the column and the source
+    Parameters
+    ----------
+    galaxies : pa.Table
+        Rows of the table `galaxies` of kind 2 or 3.
+
+    Returns
+    -------
+    float array, shape (n, 23401)
+        f_lambda in erg s-1 cm-2 A-1.
+
+    Raises
+    ------
+    BadInput
+        If a value is missing or not allowed. The message names the column and the source.
+    OutOfRange
+        If a value is out of range.
     """
     kind, z, mag, a_v = (column(galaxies, name) for name in ("kind", "z_obs", "mag_r01", "a_v"))
     sed = column(galaxies, "sed_1").astype(np.int64)
@@ -125,9 +151,25 @@ def spectra(galaxies: pa.Table) -> Float:
 
 
 def template_scale(code: int, templates: Library, sed: Int, mag: Float, z: Float) -> Float:
-    """What a template's f_lambda at lambda / (1 + z) is multiplied by to be seen at lambda: float64[n].
+    """Return the factor that converts a template's f_lambda at lambda / (1 + z) to the observed f_lambda at lambda.
 
-    code : of the kind;  templates : its library;  sed : int64[n];  mag : float64[n] mag_r01;  z : float64[n]
+    Parameters
+    ----------
+    code : int
+        Kind of source, `QUASAR` or `HIGH_REDSHIFT`.
+    templates : Library
+        Templates of this kind.
+    sed : int array, shape (n,)
+        Index of each source's template.
+    mag : float array, shape (n,)
+        mag_r01 of each source.
+    z : float array, shape (n,)
+        Redshifts.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Factors.
     """
     wavelength = MAGNITUDE_WAVELENGTH[code]
     template_flux = np.array(
@@ -165,7 +207,7 @@ def _quasar_spectrum(wavelength: Float, slope: float, strength: float) -> Float:
 
 
 def _star_forming_spectrum(wavelength: Float, slope: float, width: float) -> Float:
-    """A power law, 1 at 1500 A, with the red half of Lyman alpha, in bins of 1 A."""
+    """Return a power law, 1 at 1500 A, with the red half of Lyman alpha, in bins of 1 A."""
     from scipy.special import erf
 
     flux = np.where(wavelength < _LYMAN_ALPHA, 0.0, (wavelength / MAGNITUDE_WAVELENGTH[HIGH_REDSHIFT]) ** slope)

@@ -1,10 +1,6 @@
-"""What fluxes are made with: the embedded spectra, laws and passbands, and a request's own; all of it as lake tables.
+"""Collect the spectra, laws and passbands with which fluxes are computed, and store them as lake tables.
 
-Own, read             the files that a request names, checked;  filters : those of passbands alone
-curves                passbands by name
-template_rows, law_rows, line_rows, passband_rows   tables `templates`, `extinction_laws`, `emission_lines`, `passbands`
-library_of, stars_of, passband_of     back from these tables, wherever a worker runs
-published_library, published_stars, published_passband
+Inputs are the built-in library and the files that a request names. Workers read them back from the lake tables.
 """
 
 from __future__ import annotations
@@ -50,7 +46,7 @@ from truesky.numerics import cache
 from truesky.numerics.code_fingerprints import code_key
 from truesky.request.files import Curves, UserCurves
 
-# Beginnings of the keys of a request's own files.
+# Prefixes of the keys of user files.
 FILTER_PREFIX, _TEMPLATES_PREFIX, _LAWS_PREFIX, _STARS_PREFIX = (
     f"fluxes.{part}." for part in ("passbands", "templates", "extinction", "stars")
 )
@@ -58,9 +54,20 @@ FILTER_PREFIX, _TEMPLATES_PREFIX, _LAWS_PREFIX, _STARS_PREFIX = (
 
 @dataclass(frozen=True, slots=True)
 class FluxInputs:
-    """passbands : by name;  library : galaxies with their laws;  stars;  origins : of files, by the key in the request.
+    """Passbands and libraries with which fluxes are computed.
 
-    dwarfs : origins of the first of the stars, () = embedded
+    Attributes
+    ----------
+    passbands : mapping of str to Passband
+        User passbands by name.
+    library : Library
+        Galaxy templates with their extinction laws.
+    stars : Library
+        Stellar templates.
+    origins : mapping of str to Origin
+        Origin of each user file, by the key in the request.
+    dwarf_origins : sequence of Origin
+        Origins of the dwarf stars, the first templates of `stars`; () for the built-in ones.
     """
 
     passbands: Mapping[str, Passband]
@@ -70,14 +77,17 @@ class FluxInputs:
     dwarf_origins: Sequence[Origin] = ()
 
     def sha256(self) -> dict[str, str]:
-        """What names the files' contents in a plan."""
+        """Return the checksums of the user files, which identify them in a plan."""
         return {key: origin.sha256 for key, origin in self.origins.items()}
 
 
 def read(user_curves: UserCurves) -> FluxInputs:
-    """The embedded library with whatever the request puts in its place, and its passbands.
+    """Read the built-in libraries with the replacements that a request names, and its passbands.
 
-    Errors: BadInput names the key of the request, the file, and the row where there is one
+    Raises
+    ------
+    BadInput
+        If a file is not valid. The message names the key of the request, the file and, if there is one, the row.
     """
     user_passbands, origins = read_passbands(user_curves)
     library = templates.galaxy_library()
@@ -101,7 +111,13 @@ def read(user_curves: UserCurves) -> FluxInputs:
 
 
 def read_passbands(user_curves: UserCurves) -> tuple[dict[str, Passband], dict[str, Origin]]:
-    """The request's own passbands by name, and their origins by key; errors as of `read`."""
+    """Return the user passbands by name, and their origins by key.
+
+    Raises
+    ------
+    BadInput
+        If a passband has a built-in name, or its file is not valid.
+    """
     user_passbands, origins = {}, {}
     for name, curves in user_curves.passbands:
         key = f"{FILTER_PREFIX}{name}"
@@ -115,7 +131,7 @@ def read_passbands(user_curves: UserCurves) -> tuple[dict[str, Passband], dict[s
 
 
 def _read_stars(user_curves: UserCurves) -> tuple[Library, dict[str, Origin], list[Origin]]:
-    """Stars, the request's files by key, and what each of its own dwarfs was made of."""
+    """Return the stellar library, the origins of the user files by key, and the origins of the user's dwarfs."""
     if user_curves.basel is None and not user_curves.irtf:
         return templates.stellar_library(), {}, []
     low_resolution, reference, origins = stellar.TABLE, "Pecaut & Mamajek 2013", {}
@@ -136,7 +152,7 @@ def _read_stars(user_curves: UserCurves) -> tuple[Library, dict[str, Origin], li
 
 
 def select_passbands(names: Sequence[str], user_passbands: Mapping[str, Passband]) -> list[Passband]:
-    """Passbands by name.  Errors: BadInput for one that is not there"""
+    """Return passbands by name; raises BadInput if a name is unknown."""
     available = (*passbands.names(), *user_passbands)
     for name in names:
         if name not in available:
@@ -145,7 +161,7 @@ def select_passbands(names: Sequence[str], user_passbands: Mapping[str, Passband
 
 
 def template_rows(flux_inputs: FluxInputs) -> pa.Table:
-    """Table `templates`: galaxies (the request's own where it has them), quasars, high-redshift galaxies, stars."""
+    """Return the table `templates`: galaxies (user or built-in), quasars, high-redshift galaxies and stars."""
     libraries = {
         "galaxy": flux_inputs.library,
         "qso": high_redshift.quasar_library(),
@@ -164,7 +180,7 @@ def template_rows(flux_inputs: FluxInputs) -> pa.Table:
 
 
 def law_rows(flux_inputs: FluxInputs) -> pa.Table:
-    """Table `extinction_laws`, on the wavelengths of the galaxies."""
+    """Return the table `extinction_laws` on the wavelengths of the galaxy templates."""
     code = Path(extinction.__file__)
     embedded = (
         _origin("no dust", code),
@@ -177,7 +193,7 @@ def law_rows(flux_inputs: FluxInputs) -> pa.Table:
 
 
 def line_rows(flux_inputs: FluxInputs) -> pa.Table:
-    """Table `emission_lines`; own : the request's files, none of which are lines."""
+    """Return the table `emission_lines`. User files contain no lines, so `flux_inputs` is not used."""
     emission_lines = lines.line_list()
     return line_table.line_rows(
         emission_lines, lines.width_law(), [_origin(line.source, lines.TABLE) for line in emission_lines]
@@ -185,7 +201,7 @@ def line_rows(flux_inputs: FluxInputs) -> pa.Table:
 
 
 def passband_rows(flux_inputs: FluxInputs) -> pa.Table:
-    """Table `passbands`: the embedded ones, and the request's own."""
+    """Return the table `passbands` with built-in and user passbands."""
     bands = [*(passbands.load(name) for name in passbands.names()), *flux_inputs.passbands.values()]
     origins = [_passband_origin(name) for name in passbands.names()]
     origins += [flux_inputs.origins[f"{FILTER_PREFIX}{name}"] for name in flux_inputs.passbands]
@@ -194,7 +210,7 @@ def passband_rows(flux_inputs: FluxInputs) -> pa.Table:
 
 
 def galaxy_library_from_facts(lake: Folder, facts: Mapping[str, Any]) -> Library:
-    """The galaxies that a table of fluxes was, or is to be, made with; facts : of its plan."""
+    """Return the galaxy library with which a flux table is computed, from the facts of its plan."""
     library = templates.galaxy_library()
     if any(key.startswith((_TEMPLATES_PREFIX, _LAWS_PREFIX)) for key in facts.get("files", ())):
         library = published_library(lake, facts["sources"]["templates"], facts["sources"]["extinction_laws"])
@@ -202,14 +218,29 @@ def galaxy_library_from_facts(lake: Folder, facts: Mapping[str, Any]) -> Library
 
 
 def stellar_library_from_facts(lake: Folder, facts: Mapping[str, Any]) -> Library:
-    """The same of stars."""
+    """Return the stellar library with which a flux table is computed, from the facts of its plan."""
     if not any(key.startswith(_STARS_PREFIX) for key in facts.get("files", ())):
         return templates.stellar_library()
     return published_stars(lake, facts["sources"]["templates"])
 
 
 def passband_from_facts(lake: Folder, facts: Mapping[str, Any], name: str) -> Passband:
-    """The same of a passband."""
+    """Return a passband with which a flux table is computed.
+
+    Parameters
+    ----------
+    lake : Folder
+        The lake.
+    facts : mapping of str
+        Facts of the plan of the flux table.
+    name : str
+        Name of the passband.
+
+    Returns
+    -------
+    Passband
+        The built-in or published passband.
+    """
     if f"{FILTER_PREFIX}{name}" not in facts.get("files", ()):
         return passbands.load(name)
     return published_passband(lake, facts["sources"]["passbands"], name)
@@ -217,7 +248,20 @@ def passband_from_facts(lake: Folder, facts: Mapping[str, Any], name: str) -> Pa
 
 @lru_cache(maxsize=2)
 def published_library(lake: Folder, templates_key: str, laws_key: str) -> Library:
-    """The galaxies of published versions of `templates` and `extinction_laws`, kept in the cache and mapped."""
+    """Return the galaxies of published versions of `templates` and `extinction_laws`, memory-mapped from the cache.
+
+    Parameters
+    ----------
+    lake : Folder
+        The lake.
+    templates_key, laws_key : str
+        Keys of the versions.
+
+    Returns
+    -------
+    Library
+        Templates and laws.
+    """
 
     def read_rows() -> dict[str, Array]:
         rows = lake_read.version(lake, "templates", templates_key).rows(where=pc.field("library") == "galaxy")
@@ -235,7 +279,7 @@ def published_library(lake: Folder, templates_key: str, laws_key: str) -> Librar
 
 @lru_cache(maxsize=2)
 def published_stars(lake: Folder, templates_key: str) -> Library:
-    """The stars of a published version of `templates`, kept in the cache and mapped."""
+    """Return the stars of a published version of `templates`, memory-mapped from the cache."""
 
     def read_rows() -> dict[str, Array]:
         rows = lake_read.version(lake, "templates", templates_key).rows(where=pc.field("library") == "star")
@@ -248,7 +292,22 @@ def published_stars(lake: Folder, templates_key: str) -> Library:
 
 
 def published_passband(lake: Folder, key: str, name: str) -> Passband:
-    """A passband of a published version of `passbands`."""
+    """Return a passband of a published version of the table `passbands`.
+
+    Parameters
+    ----------
+    lake : Folder
+        The lake.
+    key : str
+        Key of the version.
+    name : str
+        Name of the passband.
+
+    Returns
+    -------
+    Passband
+        The passband.
+    """
     row = lake_read.version(lake, "passbands", key).rows(where=pc.field("name") == name).to_pylist()[0]
     response = np.array(row["response"])
     wavelength = row["first_wavelength"] + row["wavelength_step"] * np.arange(len(response))
@@ -257,7 +316,7 @@ def published_passband(lake: Folder, key: str, name: str) -> Passband:
 
 @contextmanager
 def _prefix_errors(key: str) -> Iterator[None]:
-    """Whatever is refused is refused with the key of the request."""
+    """Add the key of the request to the message of any error."""
     try:
         yield
     except (BadInput, OSError, ValueError) as error:
@@ -283,11 +342,11 @@ def _galaxy_origin(template: int) -> Origin:
 
 
 def _star_origins(user_origins: Sequence[Origin]) -> list[Origin]:
-    """Of the stellar library; own : of its dwarfs, () = embedded."""
+    """Return the origins of the stellar library; `user_origins` has one per user dwarf, () if dwarfs are built in."""
     dwarfs = _origin("Pecaut & Mamajek 2013", stellar.TABLE)
     first = [*user_origins] or [dwarfs] * len(stellar.types().names)
     colours = _origin("Castelli & Kurucz 2003, as astroARIADNE has them", model_stars.TABLE)
-    # Models go over into dwarfs; a request's own dwarfs stand for them, or lend them their infrared.
+    # Models change smoothly into dwarfs. User dwarfs replace the models, or provide their infrared spectra.
     models = (
         [user_origins[k] for k in model_stars.nearest_dwarfs(stellar.types())]
         if user_origins
@@ -306,6 +365,6 @@ def _passband_origin(name: str) -> Origin:
         return _origin(f"{source}, {note}", passbands.TABLE)
     spec = importlib.util.find_spec("speclite")
     if spec is None or not spec.submodule_search_locations:
-        raise BadInput("speclite is not installed: its passbands are needed")
+        raise BadInput("package speclite is not installed: its passbands are required")
     folder = Path(spec.submodule_search_locations[0]) / "data" / "filters"
     return _origin(f"{note}, as speclite has it", folder / f"{detail}.ecsv")

@@ -1,9 +1,6 @@
-"""Band fluxes of many sources by direct integration over the wavelengths that the bands see.
+"""Compute band fluxes of many sources by direct integration over the wavelengths of the bands.
 
-galaxies   f_nu of the rows of `galaxies`
-stars      f_nu of the rows of `stars`
-
-The same sums as spectra.band_fluxes of whole spectra, in blocks that stay in the processor's cache.
+The sums are the same as band_fluxes.band_fluxes of whole spectra, but in blocks that stay in the processor's cache.
 """
 
 from __future__ import annotations
@@ -25,22 +22,28 @@ from truesky.fluxes.spectra import extinction, lines
 from truesky.fluxes.spectra.continuum import REFERENCE_BAND, amplitudes, dust_curves, observed_shape
 from truesky.numerics import matrices
 
-# Samples (rows times wavelengths) of a block: half a MB a temporary array, which the allocator then keeps.
+# Samples (rows times wavelengths) per block. Temporary arrays of half a MB are kept by the allocator for reuse.
 _BLOCK = 60_000
-# Bands closer than this are integrated as one stretch, A.
+# Bands closer than this are integrated in one window, A.
 _GAP = 300
-# Galaxies whose lines are drawn together.
+# Galaxies whose lines are computed together.
 _LINE_ROWS = 128
 
 
 @dataclass(frozen=True, slots=True)
 class WavelengthWindow:
-    """Neighbouring wavelengths that some band sees.
+    """A range of wavelengths to which at least one band responds.
 
-    first     : wavelength of the first sample, A
-    weights   : float64[w, n_band] of every band here, 0 where it is blind
-    milky_way : float32[w] A(lambda) / A(V)
-    reference : which samples the reference band sees (from, to), None if it lies elsewhere
+    Attributes
+    ----------
+    first : int
+        Wavelength of the first sample in A.
+    weights : float array, shape (w, n_band)
+        Weights of every band, 0 outside the band.
+    milky_way : float32 array, shape (w,)
+        A(lambda) / A(V) of the Milky Way.
+    reference : (int, int), optional
+        First sample of the reference band and the sample after its last; None if it is in another window.
     """
 
     first: int
@@ -53,19 +56,35 @@ class WavelengthWindow:
 
 
 def galaxy_fluxes(rows: Galaxies, bands: Sequence[Passband], library: Library) -> Float:
-    """f_nu, float64[n, n_band] microjansky: internal dust, lines, magnification and the Milky Way included.
+    """Return the fluxes of galaxies with internal dust, lines, magnification and Milky Way extinction.
 
-    Error: 1e-7 relative to the whole spectra's (tests/truesky/fluxes/test_integration.py)
+    Parameters
+    ----------
+    rows : Galaxies
+        The galaxies.
+    bands : sequence of Passband
+        The passbands.
+    library : Library
+        Templates of galaxies.
+
+    Returns
+    -------
+    float array, shape (n, n_band)
+        f_nu in microjansky.
+
+    Notes
+    -----
+    The error relative to integration over whole spectra is 1e-7 (tests/truesky/fluxes/test_integration.py).
     """
     reference, dust = passbands.load(REFERENCE_BAND), dust_curves(library)
     windows, reference_weights = _windows(bands, reference), passbands.weights(reference)
-    # Neighbours in redshift share the width of their windows.
+    # Galaxies with similar redshifts have windows of the same width.
     order = np.argsort(rows.mix.z_obs, kind="stable")
     continuum, observed = np.zeros((len(rows), len(bands))), np.zeros(len(rows))
     for indices in _blocks(order, len(reference.wavelength)):
         block = rows.select(indices)
         amplitude = amplitudes(block.mix, reference, library, dust)
-        # Of order 1 whatever the units, so that single precision does not underflow.
+        # Scale to order 1 for any units, so that single precision does not underflow.
         amplitude /= amplitude.sum(0)
         for window in windows:
             for block_rows in _blocks(np.arange(len(indices)), len(window)):
@@ -82,7 +101,22 @@ def galaxy_fluxes(rows: Galaxies, bands: Sequence[Passband], library: Library) -
 
 
 def star_fluxes(rows: Stars, bands: Sequence[Passband], library: Library) -> Float:
-    """f_nu, float64[n, n_band] microjansky, behind the dust on the way to each star."""
+    """Return the fluxes of stars behind the dust in front of each.
+
+    Parameters
+    ----------
+    rows : Stars
+        The stars.
+    bands : sequence of Passband
+        The passbands.
+    library : Library
+        Templates of stars.
+
+    Returns
+    -------
+    float array, shape (n, n_band)
+        f_nu in microjansky.
+    """
     scale = star_scale(rows, library)
     f_nu = np.zeros((len(rows), len(bands)))
     for window in _windows(bands, None):
@@ -103,7 +137,7 @@ def _blocks(rows: Int, width: int) -> Iterator[Int]:
 
 
 def _line_fluxes(rows: Galaxies, order: Int, bands: Sequence[Passband]) -> Float:
-    """f_nu that the lines add, microjansky, behind the Milky Way but not magnified: float64[n, n_band]."""
+    """Return f_nu of the lines in microjansky, behind the Milky Way but not magnified: float64[n, n_band]."""
     out = np.zeros((len(rows), len(bands)))
     sigma = lines.velocity_dispersion(rows.abs_mag_r01, rows.mix.z_obs)
     for medium in sorted({band.medium for band in bands}):
@@ -129,7 +163,7 @@ def _line_block_fluxes(profiles: lines.Profiles, rows: Galaxies, table: Float) -
 
 
 def _full_weights(bands: Sequence[Passband]) -> Float:
-    """float64[23401, n_band + 1]: each band's weights on the grid, 0 at its ends; last, A(lambda) / A(V)."""
+    """Return each band's weights on the grid, 0 at its ends, and A(lambda) / A(V) last: float64[23401, n_band + 1]."""
     grid = passbands.grid()
     table = np.zeros((len(grid), len(bands) + 1))
     for k, band in enumerate(bands):
@@ -140,10 +174,10 @@ def _full_weights(bands: Sequence[Passband]) -> Float:
 
 
 def _windows(bands: Sequence[Passband], reference: Passband | None) -> list[WavelengthWindow]:
-    """The wavelengths that any band (or the reference) sees."""
+    """Return the windows that contain all bands and the reference band."""
     all_bands = [*bands, *([reference] if reference is not None else [])]
     if not bands:
-        raise BadInput("no passband is asked for")
+        raise BadInput("no passband is requested")
     ends = sorted((int(band.wavelength[0]), int(band.wavelength[-1])) for band in all_bands)
     merged = [ends[0]]
     for first, last in ends[1:]:
@@ -166,6 +200,6 @@ def _window(first: int, last: int, bands: Sequence[Passband], reference: Passban
 
 
 def _band_samples(band: Passband, first: int, last: int) -> tuple[int, int] | None:
-    """Where a band lies in a stretch; it lies in one as a whole or not at all."""
+    """Return the samples of a band in a window. A band is inside a single window."""
     low = int(band.wavelength[0]) - first
     return (low, low + len(band.wavelength)) if 0 <= low <= last - first else None

@@ -1,10 +1,6 @@
-"""Passbands on the one wavelength grid, and what a spectrum gives through them.
+"""Load passbands on the common wavelength grid, and convert spectra to fluxes.
 
-grid            the observed-frame grid of all spectra: 600 .. 24000 A in steps of 1 A
-names, load     what there is (passbands.csv), and one of them
-published       where it is from
-weights         f_nu = weights @ f_lambda
-log_width, pivot_wavelength, ab_flux
+The observed-frame grid of all spectra is 600 to 24000 A in steps of 1 A. passbands.csv lists the built-in passbands.
 """
 
 from __future__ import annotations
@@ -26,10 +22,10 @@ from truesky.numerics.code_fingerprints import code_key
 
 # Serrano et al. 2024, appendix B: every spectrum and response is homogenised to this range and step.
 GRID_FIRST, GRID_LAST = 600, 24000
-# Each end of a curve is cut where this fraction of the photons of a source of constant f_lambda would be
-# detected outside. Never inside: behind dust, a red leak is most of what ultraviolet bands see.
+# Each end of a curve is cut so that this fraction of the photons of a source with constant f_lambda is outside.
+# Nothing is cut inside: for sources behind dust, a red leak has most of the flux in ultraviolet bands.
 END_PHOTON_FRACTION = 1e-7
-# How far out a logistic edge is tabulated, in widths: exp(-20) is below any use.
+# Extent of a logistic edge in widths; exp(-20) is negligible.
 _LOGISTIC_REACH = 20.0
 
 TABLE = Path(__file__).with_suffix(".csv")
@@ -37,11 +33,18 @@ TABLE = Path(__file__).with_suffix(".csv")
 
 @dataclass(frozen=True, slots=True)
 class Passband:
-    """A photon response.
+    """Photon response of a telescope, filter and detector.
 
-    wavelength : float64[n] A, whole numbers in steps of 1, inside the grid, in the band's own medium
-    response   : float64[n], detected per arriving photon (some published curves are on an arbitrary scale)
-    medium     : "air" (from the ground) or "vacuum" (from space): decides where emission lines are seen
+    Attributes
+    ----------
+    name : str
+        Name of the passband.
+    wavelength : float array, shape (n,)
+        Wavelengths inside the grid in A, whole numbers in steps of 1, in the band's medium.
+    response : float array, shape (n,)
+        Detected photons per arriving photon. Some published curves have an arbitrary scale.
+    medium : str
+        "air" (from the ground) or "vacuum" (from space). It sets the observed wavelengths of emission lines.
     """
 
     name: str
@@ -51,22 +54,22 @@ class Passband:
 
     @property
     def first(self) -> int:
-        """Index on the grid of the first wavelength."""
+        """Return the index of the first wavelength on the grid."""
         return int(self.wavelength[0]) - GRID_FIRST
 
 
 def grid() -> Float:
-    """The observed-frame grid, float64[23401] A."""
+    """Return the observed-frame wavelength grid in A, float64[23401]."""
     return np.arange(GRID_FIRST, GRID_LAST + 1, dtype=float)
 
 
 def names() -> tuple[str, ...]:
-    """All passbands, in the order of passbands.csv."""
+    """Return the names of all built-in passbands, in the order of passbands.csv."""
     return tuple(_rows())
 
 
 def load(name: str) -> Passband:
-    """A passband by name, resampled linearly to 1 A.  Errors: BadInput for an unknown name."""
+    """Return a passband by name, resampled linearly to 1 A; raises BadInput if the name is unknown."""
     rows = _rows()
     if name not in rows:
         raise BadInput(f"passband {name!r} is not one of {', '.join(rows)}")
@@ -77,36 +80,64 @@ def load(name: str) -> Passband:
 
 
 def provenance(name: str) -> tuple[str, str]:
-    """Where a passband is from: its source as passbands.csv has it, and a note."""
+    """Return the source of a passband as in passbands.csv, and a note."""
     row = _rows()[name]
     return row["source"], row["note"]
 
 
 def weights(band: Passband) -> Float:
-    """float64[n] such that f_nu = weights @ f_lambda(band.wavelength), erg s-1 cm-2 Hz-1 for f_lambda per A.
+    """Return weights float64[n] such that f_nu = weights @ f_lambda(band.wavelength).
 
-    f_nu = (int f_lambda R lambda dlambda / c) / (int R dlambda / lambda).
-    Ref: Serrano et al. 2024, appendix B, eq. f_nu
+    f_nu is in erg s-1 cm-2 Hz-1 for f_lambda in erg s-1 cm-2 A-1.
+
+    Notes
+    -----
+    The band-averaged flux is::
+
+        f_nu = (int f_lambda R lambda dlambda / c) / (int R dlambda / lambda)
+
+    References
+    ----------
+    Serrano et al. 2024, appendix B, eq. f_nu.
     """
     photons = band.response * band.wavelength
     return photons / (LIGHT_ANGSTROM_S * float(np.sum(band.response / band.wavelength)))
 
 
 def log_width(band: Passband) -> float:
-    """int R dln(lambda): what turns f_nu into detected photons (lake_schema.units.electron_rate)."""
+    """Return int R dln(lambda), which converts f_nu to detected photons (lake_schema.units.electron_rate)."""
     return float(np.sum(band.response / band.wavelength))
 
 
 def pivot_wavelength(band: Passband) -> float:
-    """sqrt(int R lambda dlambda / int R dlambda / lambda), A: f_nu = f_lambda lambda^2 / c on average."""
+    """Return the pivot wavelength in A, sqrt(int R lambda dlambda / int R dlambda / lambda).
+
+    On average, f_nu = f_lambda lambda^2 / c at this wavelength.
+    """
     return float(np.sqrt(np.sum(band.response * band.wavelength) / np.sum(band.response / band.wavelength)))
 
 
 def ab_flux(band: Passband, wavelength: npt.ArrayLike, f_lambda: npt.ArrayLike) -> Float:
-    """Band-averaged f_nu of spectra given on any grid that covers the band.
+    """Return the band-averaged f_nu of spectra on any grid that covers the band.
 
-    wavelength : [m] A, ascending;  f_lambda : [..., m] erg s-1 cm-2 A-1
-    returns    : [...] erg s-1 cm-2 Hz-1.  Errors: BadInput where the spectra do not reach over the band
+    Parameters
+    ----------
+    band : Passband
+        The passband.
+    wavelength : float array, shape (m,)
+        Wavelengths in A, increasing.
+    f_lambda : float array, shape (..., m)
+        Spectra in erg s-1 cm-2 A-1.
+
+    Returns
+    -------
+    float array, shape (...)
+        f_nu in erg s-1 cm-2 Hz-1.
+
+    Raises
+    ------
+    BadInput
+        If the spectra do not cover the band.
     """
     at = np.asarray(wavelength, float)
     spectra = np.asarray(f_lambda, float)
@@ -128,13 +159,13 @@ def _rows() -> dict[str, dict[str, str]]:
     with TABLE.open(newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
             if row["name"] in by_name:
-                raise BadInput(f"{TABLE.name}: passband {row['name']} stands twice: choose another name")
+                raise BadInput(f"{TABLE.name}: passband {row['name']} occurs twice: choose another name")
             by_name[row["name"]] = row
     return by_name
 
 
 def _curve(source: str, shift: float) -> dict[str, Float]:
-    """The response on whole angstroms; `shift` above 1 is to the blue: R_new(lambda) = R(shift lambda)."""
+    """Return the response on whole angstroms. A shift above 1 moves it to the blue: R_new(lambda) = R(shift lambda)."""
     kind, _, detail = source.partition(":")
     wavelength, response = _speclite_curve(detail) if kind == "speclite" else _logistic(detail)
     angstroms, resampled_response = resample_to_grid(wavelength / shift, response)
@@ -142,7 +173,20 @@ def _curve(source: str, shift: float) -> dict[str, Float]:
 
 
 def resample_to_grid(wavelength: Float, response: Float) -> tuple[Float, Float]:
-    """A curve on the whole angstroms of the grid, linearly, without its ends; empty where it lies outside."""
+    """Resample a curve linearly to the whole angstroms of the grid, without its ends; empty if it is outside the grid.
+
+    Parameters
+    ----------
+    wavelength : float array, shape (m,)
+        Wavelengths in A, increasing.
+    response : float array, shape (m,)
+        Response per photon.
+
+    Returns
+    -------
+    wavelength, response : float array, shape (n,)
+        The resampled curve, without `END_PHOTON_FRACTION` of the photons at each end.
+    """
     angstroms = np.arange(np.ceil(wavelength[0]), np.floor(wavelength[-1]) + 1.0)
     angstroms = angstroms[(angstroms >= GRID_FIRST) & (angstroms <= GRID_LAST)]
     if not len(angstroms):
@@ -154,7 +198,7 @@ def resample_to_grid(wavelength: Float, response: Float) -> tuple[Float, Float]:
 
 
 def _speclite_curve(name: str) -> tuple[Float, Float]:
-    # Slow to import, and needed only when a band is not in the cache.
+    # The import is slow, and needed only if a band is not in the cache.
     from speclite.filters import load_filter
 
     # load_filter converts to A; the files themselves are in A, nm or um.
@@ -163,7 +207,7 @@ def _speclite_curve(name: str) -> tuple[Float, Float]:
 
 
 def _logistic(detail: str) -> tuple[Float, Float]:
-    """A top hat with logistic edges: "blue edge:red edge:width of the edges:peak", A."""
+    """Return a top hat with logistic edges from "blue edge:red edge:width of the edges:peak", wavelengths in A."""
     blue, red, width, peak = (float(part) for part in detail.split(":"))
     wavelength = np.arange(np.floor(blue - _LOGISTIC_REACH * width), np.ceil(red + _LOGISTIC_REACH * width) + 1.0)
     edges = 1.0 / ((1.0 + np.exp(-(wavelength - blue) / width)) * (1.0 + np.exp((wavelength - red) / width)))

@@ -1,10 +1,4 @@
-"""Rows of the catalogue tables as checked arrays: what the spectra are made from.
-
-Galaxies, galaxies_of
-Stars, stars_of
-magnification, magnification_of   of the gravitational lens
-column, ids_of          a column without gaps, the identifiers
-"""
+"""Convert rows of the catalogue tables to checked arrays, from which spectra are computed."""
 
 from __future__ import annotations
 
@@ -25,7 +19,7 @@ from truesky.fluxes.spectra import lines
 from truesky.fluxes.spectra.continuum import COMPONENTS, TemplateMix, check_range, mix_from_columns, take_last_axis
 
 MAGNIFICATION_MAX = 100.0
-# Numbers of the templates that a star's spectrum is mixed of beside `sed`.
+# Suffixes of the columns with further templates of a star, in addition to `sed`.
 STAR_COMPONENTS = (2, 3, 4)
 # Kinds whose templates are in the galaxy library: central, satellite, strong lens.
 GALAXY_KINDS = (0, 1, 4)
@@ -33,11 +27,20 @@ GALAXY_KINDS = (0, 1, 4)
 
 @dataclass(frozen=True, slots=True)
 class Galaxies:
-    """n galaxies.
+    """Properties of n galaxies that set their spectra.
 
-    mag_r01, abs_mag_r01 : float64[n] apparent and absolute (- 5 log10 h) magnitude in the reference band
-    lines                : float64[n, n_line] flux of each line of lines.line_list(), 0 where there is none
-    magnification, a_v   : float64[n]
+    Attributes
+    ----------
+    mix : TemplateMix
+        Two templates of each galaxy, with dust.
+    abs_mag_r01, mag_r01 : float array, shape (n,)
+        Absolute (M - 5 log10 h) and apparent AB magnitude in the reference band.
+    lines : float array, shape (n, n_line)
+        Flux of each line of lines.line_list() in erg s-1 cm-2, 0 without a line.
+    magnification : float array, shape (n,)
+        Magnification by gravitational lensing.
+    a_v : float array, shape (n,)
+        Extinction A(V) of the Milky Way in mag.
     """
 
     mix: TemplateMix
@@ -48,7 +51,7 @@ class Galaxies:
     a_v: Float
 
     def __post_init__(self) -> None:
-        # Compiled code reads all of them, and looks at no bounds.
+        # Compiled code reads all lines without a check of array bounds.
         expected_shape = len(self.mix), len(lines.line_list())
         if self.lines.shape != expected_shape:
             raise ValueError(f"lines are of shape {self.lines.shape}, not {expected_shape}")
@@ -57,6 +60,7 @@ class Galaxies:
         return len(self.mix)
 
     def select(self, indices: Int | slice) -> Galaxies:
+        """Return the galaxies with these indices."""
         return Galaxies(
             self.mix.select(indices),
             take_last_axis(self.abs_mag_r01, indices),
@@ -69,9 +73,18 @@ class Galaxies:
 
 @dataclass(frozen=True, slots=True)
 class Stars:
-    """n stars: mag_h (Vega, before extinction), a_v float64[n].
+    """Properties of n stars that set their spectra.
 
-    sed, frac : int64[k, n] templates that a spectrum is mixed of, float64[k, n] their shares of f_lambda at 5500 A
+    Attributes
+    ----------
+    sed : int array, shape (k, n)
+        Indices of the templates that are mixed.
+    frac : float array, shape (k, n)
+        Fractions of f_lambda at 5500 A for these templates.
+    mag_h : float array, shape (n,)
+        H magnitude (Vega) before extinction.
+    a_v : float array, shape (n,)
+        Extinction A(V) in mag.
     """
 
     sed: Int
@@ -83,18 +96,51 @@ class Stars:
         return len(self.mag_h)
 
     def select(self, indices: Int | slice) -> Stars:
+        """Return the stars with these indices."""
         return Stars(self.sed[:, indices], self.frac[:, indices], self.mag_h[indices], self.a_v[indices])
 
     @classmethod
     def from_templates(cls, sed: Int, mag_h: Float, a_v: Float) -> Stars:
-        """Of one template each."""
+        """Return stars with one template each.
+
+        Parameters
+        ----------
+        sed : int array, shape (n,)
+            Indices of the templates.
+        mag_h : float array, shape (n,)
+            H magnitudes (Vega) before extinction.
+        a_v : float array, shape (n,)
+            Extinction A(V) in mag.
+
+        Returns
+        -------
+        Stars
+            The stars.
+        """
         return cls(sed[None, :], np.ones((1, sed.size)), mag_h, a_v)
 
 
 def galaxies_from_table(table: pa.Table, library: Library) -> Galaxies:
-    """Rows of the table `galaxies`, checked.
+    """Return checked rows of the table `galaxies`.
 
-    Errors: BadInput names the column and the source of a missing value or NaN, OutOfRange the column
+    Parameters
+    ----------
+    table : pa.Table
+        Rows of kinds in the galaxy library.
+    library : Library
+        Templates to which sed_1 and sed_2 refer.
+
+    Returns
+    -------
+    Galaxies
+        The galaxies.
+
+    Raises
+    ------
+    BadInput
+        If a value is missing or NaN. The message names the column and the source.
+    OutOfRange
+        If a value is out of range. The message names the column.
     """
     _refuse_other_kinds(table)
     names = ["z_obs", *(f"{name}_{k}" for name in ("sed", "frac", "ext_law", "ebv") for k in COMPONENTS)]
@@ -112,7 +158,7 @@ def galaxies_from_table(table: pa.Table, library: Library) -> Galaxies:
 
 
 def stars_from_table(table: pa.Table, library: Library) -> Stars:
-    """Rows of the table `stars`, checked; errors as `galaxies_of`."""
+    """Return checked rows of the table `stars`; raises the same errors as `galaxies_from_table`."""
     mag_h, a_v = (column(table, name) for name in ("mag_h", "a_v"))
     for name, values in (("mag_h", mag_h), ("a_v", a_v)):
         declared = STARS.column(name)
@@ -128,18 +174,35 @@ def stars_from_table(table: pa.Table, library: Library) -> Stars:
         check_range(f"sed_{k}", sed[-1], 0, len(library) - 1)
     shares = np.stack([np.ones(table.num_rows), *frac])
     shares[0] = 1.0 - shares[1:].sum(0)
-    check_range("what frac_2, frac_3, frac_4 leave to sed", shares[0], -1e-6, 1.0)
+    check_range("1 - frac_2 - frac_3 - frac_4", shares[0], -1e-6, 1.0)
     return Stars(np.stack(sed).astype(np.int64), np.maximum(shares, 0.0), mag_h, a_v)
 
 
 def magnification(
     kappa: npt.ArrayLike, gamma1: npt.ArrayLike, gamma2: npt.ArrayLike, ids: Sequence[int] | Int
 ) -> Float:
-    """mu = 1 / ((1 - kappa)^2 - gamma^2), float64[n].
+    """Return the lensing magnification mu = 1 / ((1 - kappa)^2 - gamma^2).
 
-    kappa, gamma1, gamma2 : float64[n] convergence and shear;  ids : of the sources, named in the refusal
-    Errors: OutOfRange names the source where mu is not in (0, 100], at and inside the critical curve
-    Ref: Serrano et al. 2024, eq. magnification_factor
+    Parameters
+    ----------
+    kappa, gamma1, gamma2 : float array, shape (n,)
+        Convergence and shear.
+    ids : sequence of int, length n
+        Identifiers of the sources for messages.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Magnification, 0 to 100.
+
+    Raises
+    ------
+    OutOfRange
+        If mu is not in (0, 100], which occurs at and inside the critical curve. The message names the source.
+
+    References
+    ----------
+    Serrano et al. 2024, eq. magnification_factor.
     """
     with np.errstate(divide="ignore"):
         mu = 1.0 / determinant(kappa, gamma1, gamma2)
@@ -151,21 +214,32 @@ def magnification(
 
 
 def determinant(kappa: npt.ArrayLike, gamma1: npt.ArrayLike, gamma2: npt.ArrayLike) -> Float:
-    """(1 - kappa)^2 - gamma^2, float64[n]: one over the magnification."""
+    """Return the inverse magnification (1 - kappa)^2 - gamma^2.
+
+    Parameters
+    ----------
+    kappa, gamma1, gamma2 : float array, shape (n,)
+        Convergence and shear.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Determinant of the lensing matrix.
+    """
     stretch = 1.0 - np.asarray(kappa, float)
     shear = np.hypot(np.asarray(gamma1, float), np.asarray(gamma2, float))
-    # A product of differences keeps its digits where the difference of squares loses them.
+    # The product of sum and difference is more precise than the difference of squares.
     return np.asarray((stretch - shear) * (stretch + shear))
 
 
 def table_magnification(table: pa.Table) -> Float:
-    """`magnification` of the rows of the table `galaxies`."""
+    """Return the magnification of rows of the table `galaxies`."""
     kappa, gamma1, gamma2 = (column(table, name) for name in ("kappa", "gamma1", "gamma2"))
     return magnification(kappa, gamma1, gamma2, source_ids(table))
 
 
 def _line_fluxes(table: pa.Table) -> Float:
-    """Fluxes of all lines; a missing column, null or NaN is a line that was not modelled."""
+    """Return the fluxes of all lines; 0 for a missing column, null or NaN, which mark lines that were not modelled."""
     out = np.zeros((table.num_rows, len(lines.line_list())))
     for k, line in enumerate(lines.line_list()):
         if line.column not in table.column_names:
@@ -185,7 +259,7 @@ def _check_declared_range(name: str, values: Float) -> Float:
 
 def _required_bound(value: float | None) -> float:
     if value is None:
-        raise BadInput("a column that is read for its spectrum has no bounds")
+        raise BadInput("a column that is required for spectra has no declared bounds")
     return value
 
 
@@ -201,13 +275,14 @@ def _refuse_other_kinds(table: pa.Table) -> None:
 
 
 def source_ids(table: pa.Table) -> Int:
+    """Return the identifiers of the rows, or row numbers if the table has no column `id`."""
     if "id" not in table.column_names:
         return np.arange(table.num_rows, dtype=np.int64)
     return np.asarray(table["id"].to_numpy(), np.int64)
 
 
 def column(table: pa.Table, name: str) -> Float:
-    """A column as floats without gaps."""
+    """Return a column as floats; raises BadInput if a value is missing."""
     values = _floats(table, name)
     gap = np.isnan(values)
     if gap.any():
@@ -217,7 +292,7 @@ def column(table: pa.Table, name: str) -> Float:
 
 
 def _floats(table: pa.Table, name: str) -> Float:
-    """A column as float64, null -> NaN."""
+    """Return a column as float64, with NaN for null."""
     if name not in table.column_names:
         raise BadInput(f"column {name} is missing")
     return np.asarray(pc.cast(table[name], pa.float64()).to_numpy(), float)

@@ -1,9 +1,7 @@
-"""Spectra of many sources over one stretch of wavelengths: what is spread out by a grism.
+"""Compute spectra of many sources in one range of wavelengths, for grism spectroscopy.
 
-galaxies   f_lambda of rows of `galaxies` whose templates are in the galaxy library
-stars      f_lambda of rows of `stars`
-
-The same as band_fluxes' whole spectra, where they are wanted, in blocks that stay in the processor's cache.
+Results are the same as in band_fluxes, but only in the requested range, and in blocks that stay in the processor's
+cache.
 """
 
 from __future__ import annotations
@@ -19,29 +17,45 @@ from truesky.fluxes.spectra import extinction, lines
 from truesky.fluxes.spectra.continuum import REFERENCE_BAND, amplitudes, dust_curves, observed_shape
 from truesky.numerics import matrices
 
-# Rows of a block: a MB of wavelengths.
+# Rows per block, about 1 MB of wavelengths.
 _ROWS = 32
 
 
 def galaxy_spectra(rows: Galaxies, first: int, count: int, library: Library) -> Float32:
-    """f_lambda, float32[n, count] erg s-1 cm-2 A-1 at whole angstroms from `first`, vacuum.
+    """Return spectra of galaxies with internal dust, lines, magnification and Milky Way extinction.
 
-    Internal dust, lines, magnification and the Milky Way included.
-    rows : galaxies;  first, count : of the stretch, A;  library : templates of galaxies
-    Error: 1e-6 relative to the whole spectra's (tests/truesky/fluxes/test_wavelength_windows.py)
+    Parameters
+    ----------
+    rows : Galaxies
+        The galaxies.
+    first : int
+        First wavelength in A (vacuum).
+    count : int
+        Number of wavelengths in steps of 1 A.
+    library : Library
+        Templates of galaxies.
+
+    Returns
+    -------
+    float32 array, shape (n, count)
+        f_lambda in erg s-1 cm-2 A-1.
+
+    Notes
+    -----
+    The error relative to whole spectra is 1e-6 (tests/truesky/fluxes/test_wavelength_windows.py).
     """
     reference, dust = passbands.load(REFERENCE_BAND), dust_curves(library)
     weights, grid = passbands.weights(reference), first + np.arange(float(count))
     sigma = lines.velocity_dispersion(rows.abs_mag_r01, rows.mix.z_obs)
     milky_way = extinction.milky_way(grid).astype(np.float32)
     out = np.empty((len(rows), count), np.float32)
-    # Neighbours in redshift share the width of their windows.
+    # Galaxies with similar redshifts have windows of the same width.
     order = np.argsort(rows.mix.z_obs, kind="stable")
     for start in range(0, len(rows), _ROWS):
         indices = order[start : start + _ROWS]
         block = rows.select(indices)
         amplitude = amplitudes(block.mix, reference, library, dust)
-        # Of order 1 whatever the units, so that single precision does not underflow.
+        # Scale to order 1 for any units, so that single precision does not underflow.
         amplitude /= amplitude.sum(0)
         reference_shape = observed_shape(
             block.mix, amplitude, library, dust, int(reference.wavelength[0]), len(weights)
@@ -58,9 +72,23 @@ def galaxy_spectra(rows: Galaxies, first: int, count: int, library: Library) -> 
 
 
 def star_spectra(rows: Stars, first: int, count: int, library: Library) -> Float32:
-    """f_lambda, float32[n, count] erg s-1 cm-2 A-1 at whole angstroms from `first`, vacuum.
+    """Return spectra of stars behind the dust in front of each.
 
-    rows : stars;  first, count : of the stretch, A;  library : templates of stars
+    Parameters
+    ----------
+    rows : Stars
+        The stars.
+    first : int
+        First wavelength in A (vacuum).
+    count : int
+        Number of wavelengths in steps of 1 A.
+    library : Library
+        Templates of stars.
+
+    Returns
+    -------
+    float32 array, shape (n, count)
+        f_lambda in erg s-1 cm-2 A-1.
     """
     low = first - int(library.wavelength[0])
     milky_way = extinction.milky_way(first + np.arange(float(count)))

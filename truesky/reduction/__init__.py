@@ -1,1 +1,1 @@
-"""From raw frames to calibrated images, and from these to a stack: what an observatory's pipeline does."""
+"""Reduce raw frames to calibrated images and stacks, as the pipeline of an observatory does."""

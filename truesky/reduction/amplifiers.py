@@ -1,11 +1,6 @@
-"""What the amplifiers of a detector do, as maps of its pixels and undone: of quadrants and of a ground camera's alike.
+"""Map values of amplifiers to pixels, and undo the effects of amplifiers, for quadrants and for ground cameras.
 
-of_pixels         their numbers as a map
-at_least          pixels that reach their amplifier's number
-unread            pixels that none of them reads
-undone            what each sees of the others, taken off, and the inverse of their response
-
-A large detector of a ground camera is taken some rows at a time: memory.
+Large detectors of ground cameras are processed a few rows at a time to limit memory.
 """
 
 from __future__ import annotations
@@ -19,14 +14,26 @@ from truesky.render.channels.readout import assemble_frame, split_frame
 from truesky.render.effects.readout import crosstalk, nonlinearity
 from truesky.render.effects.scene import Scene
 
-# Rows of each amplifier that are taken at a time.
+# Rows of each amplifier that are processed at a time.
 _ROWS = 64
 
 
 def to_pixels(numbers: float | Float, scene: Scene, rows: slice = slice(None)) -> float | Float:
-    """Numbers [q] of the amplifiers as a map [ny, nx] of their pixels, 0 between them; one number stays one.
+    """Return a map of the pixels with the value of each pixel's amplifier.
 
-    rows : of the detector, from the first to one past the last, all of them or some
+    Parameters
+    ----------
+    numbers : float or float array, shape (q,)
+        Values of the amplifiers. A scalar is returned unchanged.
+    scene : Scene
+        Scene with the layout of the amplifiers.
+    rows : slice, optional
+        Rows of the detector; all by default.
+
+    Returns
+    -------
+    float or float array, shape (ny, nx)
+        Map, 0 between amplifiers.
     """
     if np.ndim(numbers) == 0:
         return numbers
@@ -43,7 +50,22 @@ def to_pixels(numbers: float | Float, scene: Scene, rows: slice = slice(None)) -
 
 
 def pixels_at_least(frame: Array, numbers: float | Float, scene: Scene) -> Bool:
-    """Pixels [ny, nx] that are no less than their amplifier's number; those between amplifiers, than 0."""
+    """Return True for pixels at or above the value of their amplifier, or at or above 0 between amplifiers.
+
+    Parameters
+    ----------
+    frame : array, shape (ny, nx)
+        The frame.
+    numbers : float or float array, shape (q,)
+        Values of the amplifiers.
+    scene : Scene
+        Scene with the layout of the amplifiers.
+
+    Returns
+    -------
+    bool array, shape (ny, nx)
+        Mask.
+    """
     out = np.empty(frame.shape, bool)
     for first in range(0, len(frame), _ROWS):
         rows = slice(first, min(first + _ROWS, len(frame)))
@@ -52,7 +74,7 @@ def pixels_at_least(frame: Array, numbers: float | Float, scene: Scene) -> Bool:
 
 
 def unread_pixels(scene: Scene) -> Bool:
-    """[ny, nx] rows between the halves, streets between cells."""
+    """Return True for pixels that no amplifier reads: rows between the halves, streets between cells; bool[ny, nx]."""
     if scene.layout is not None:
         return scene.layout.unread_pixels
     out = np.zeros((scene.ny, scene.nx), bool)
@@ -61,9 +83,21 @@ def unread_pixels(scene: Scene) -> Bool:
 
 
 def undo_effects(frame: Float, scene: Scene, effects: Container[str]) -> Float:
-    """Electrons [ny, nx] above the bias, as the amplifiers gave them -> as they came; 0 where none of them reads.
+    """Undo crosstalk and the nonlinear response of the amplifiers.
 
-    effects : names of what is undone: crosstalk, by the mission, and then the response
+    Parameters
+    ----------
+    frame : float array, shape (ny, nx)
+        Measured electrons above the bias.
+    scene : Scene
+        Scene with the mission parameters of these effects.
+    effects : container of str
+        Names of the effects to undo.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Corrected electrons, 0 in pixels that no amplifier reads.
     """
     table = crosstalk.coefficients(scene) if crosstalk.EFFECT.name in effects else None
     curve = nonlinearity.parameters(scene) if nonlinearity.EFFECT.name in effects else None
@@ -76,7 +110,7 @@ def undo_effects(frame: Float, scene: Scene, effects: Container[str]) -> Float:
 
 
 def _apply_by_rows(frame: Float, scene: Scene, change: Callable[[Float], Float]) -> Float:
-    """What `change` makes of [q, rows, columns] that the amplifiers read at the same time; 0 where none reads."""
+    """Apply `change` to arrays [q, rows, columns] of simultaneously read pixels; pixels without amplifier become 0."""
     layout = scene.layout
     if layout is None:
         return np.asarray(assemble_frame(change(split_frame(frame, scene)), scene))

@@ -1,15 +1,13 @@
-"""Calibration of a frame: what its detector added is taken off, what it kept of the light is divided out.
+"""Calibrate a frame: subtract the contributions of the detector, and divide by its response::
 
-counted = undone(electrons - bias) - dark time;  light = counted / (flat illumination) - fringes of the sky
+    counted = undone(electrons - bias) - dark time
+    light = counted / (flat illumination) - fringes of the sky
 
-Masters        bias, dark and flat of a detector, with their uncertainties and flags
-Reduced        a calibrated image, its weight, its flags
-reduced        a frame's electrons above the overscan -> Reduced
-illuminated    what the optics and the shutter bring to each pixel, as the mission declares it
+A frame is calibrated some rows at a time to limit memory.
 
-A frame is calibrated some rows at a time: memory. What is not undone: charge transfer inefficiency, the brighter-fatter
-effect, ghosts; and the area of the sky that a pixel sees. What a source brings knows nothing of that: a sky made flat
-by it would leave stars wrong by as much. It is the WCS that tells it to who resamples.
+Charge transfer inefficiency, the brighter-fatter effect and ghosts are not corrected. The varying area of pixels on the
+sky is not corrected either. It does not change the counts of a source, so a division that makes the sky flat would give
+wrong fluxes of stars. A resampling program gets the area from the WCS.
 """
 
 from __future__ import annotations
@@ -37,21 +35,21 @@ FLAGS = (
     (SATURATED, "saturated"),
     (UNSURE, "too few frames, or a star in the flat"),
     (COSMIC_RAY, "cosmic ray"),
-    (EDGE, "beside the edge of the detector, good"),
-    (PERSISTENCE, "earlier exposures left more than noise; off, good"),
+    (EDGE, "near the edge of the detector, good"),
+    (PERSISTENCE, "subtracted persistence above noise, good"),
 )
-# What a pixel may have that is used all the same.
+# Flags of pixels that are used.
 GOOD = EDGE | PERSISTENCE
-# Response of a pixel that is used, and its largest difference from its neighbours', in units of their rms.
+# Limits of the response of a pixel that is used, and its largest difference from its neighbours in units of their rms.
 _MIN_RESPONSE, _MAX_RESPONSE, _MAX_DEVIATION = 0.7, 1.3, 8.0
-# Standard deviations of a dark's pixel above the others.
+# Standard deviations of a hot pixel above the others in a dark.
 _HOT_SIGMA = 8.0
-# Pixels beside an edge at which charge is displaced.
+# Distance from an edge, in pixels, within which charge is displaced.
 _BORDER = 10
-# Pixels of the mesh on which the level of the sky is taken, and of a side of the neighbours of a pixel of the flat.
+# Side of a square of the mesh on which the sky is measured, and of the neighbourhood of a flat's pixel, in pixels.
 _MESH, _NEIGHBOURHOOD = 64, 9
-# Standard deviations above the sky, smoothed over a pixel, from which light counts as a source's; pixels that the
-# smoothing reaches.
+# Standard deviations above the sky at which light, smoothed over a pixel, counts as a source; reach of the smoothing in
+# pixels.
 _SOURCE_SIGMA, _SMOOTHING_REACH = 4.0, 4
 # Rows that are calibrated at a time.
 _ROWS = 512
@@ -59,10 +57,20 @@ _ROWS = 512
 
 @dataclass(frozen=True, slots=True)
 class Masters:
-    """Of one detector; without one of them: zeros, or ones.
+    """Masters of one detector; a missing master is replaced by zeros or ones.
 
-    bias : e-;  dark : e-/s;  flat : response, 1 where all light is counted
-    flags : uint8[ny, nx];  dark_time : s that the dark's frames have lasted: the noise of the bias is in them, too
+    Attributes
+    ----------
+    bias : CombinedFrame
+        Bias in electrons.
+    dark : CombinedFrame
+        Dark current in electrons per second.
+    flat : CombinedFrame
+        Response, 1 if all light is counted.
+    flags : uint8 array, shape (ny, nx)
+        Flags of the pixels.
+    dark_time : float
+        Exposure time of the dark frames in seconds. The dark current contains the noise of the bias, too.
     """
 
     bias: CombinedFrame
@@ -74,11 +82,16 @@ class Masters:
 
 @dataclass(frozen=True, slots=True)
 class ReducedImage:
-    """A calibrated image [ny, nx].
+    """A calibrated image.
 
-    image  : float32, electrons of the exposure (or another unit), the sky in it; 0 where there is no value
-    weight : float32, inverse variance, 0 where flags say not to use it
-    flags  : uint8
+    Attributes
+    ----------
+    image : float32 array, shape (ny, nx)
+        Electrons of the exposure (or another unit), including the sky; 0 without a value.
+    weight : float32 array, shape (ny, nx)
+        Inverse variance; 0 for pixels that must not be used according to their flags.
+    flags : uint8 array, shape (ny, nx)
+        Flags, see `FLAGS`.
     """
 
     image: Float
@@ -87,16 +100,28 @@ class ReducedImage:
 
 
 def neutral_master(shape: tuple[int, ...], value: float) -> CombinedFrame:
-    """What stands for a master that there is none of."""
-    # One number for all: it takes no memory.
+    """Return a constant master, which replaces a missing one."""
+    # Broadcast a single number, which takes no memory.
     mean, uncertainty = (np.broadcast_to(np.float32(number), shape) for number in (value, 0.0))
     return CombinedFrame(mean, uncertainty, np.broadcast_to(np.int16(1), shape))
 
 
 def illumination_map(scene: Scene, applied: Container[str], rows: slice = slice(None)) -> Float:
-    """What of the light reaches each pixel [ny, nx], 1 in the middle of the focal plane: as the mission declares it.
+    """Return the relative illumination of each pixel by the optics and the shutter, from the mission parameters.
 
-    rows : of the detector, all of them or some
+    Parameters
+    ----------
+    scene : Scene
+        Scene of the frame.
+    applied : container of str
+        Names of the effects in the frame.
+    rows : slice, optional
+        Rows of the detector; all by default.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Illumination, 1 at the centre of the focal plane.
     """
     out = np.ones((len(range(scene.ny)[rows]), scene.nx))
     for effect in (illumination.EFFECT, illumination.SHUTTER):
@@ -107,42 +132,69 @@ def illumination_map(scene: Scene, applied: Container[str], rows: slice = slice(
 
 
 def reading_variance(scene: Scene, applied: Container[str], rows: slice = slice(None)) -> Float:
-    """Variance [ny, nx] of what is read where there is no light: reading, rounding to whole ADU; e-^2.
+    """Return the variance of a pixel without light, from readout noise and rounding to whole ADU.
 
-    rows : of the detector, all of them or some
+    Parameters
+    ----------
+    scene : Scene
+        Scene of the frame.
+    applied : container of str
+        Names of the effects in the frame.
+    rows : slice, optional
+        Rows of the detector; all by default.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Variance in electrons^2.
     """
     shape = len(range(scene.ny)[rows]), scene.nx
     return np.broadcast_to(amplifiers.to_pixels(_amplifier_read_variance(scene, applied), scene, rows), shape)
 
 
 def _amplifier_read_variance(scene: Scene, applied: Container[str]) -> float | Float:
-    """The same of each amplifier, [q]."""
+    """Return the variance of a pixel without light for each amplifier, in electrons^2."""
     noise = scene.amplifier_values("read_noise", "electron") if "read_noise" in applied else 0.0
     return noise**2 + scene.amplifier_values("gain", "electron / adu") ** 2 / 12.0
 
 
 def response_flags(flat: CombinedFrame) -> Array:
-    """Pixels whose response is far from 1, or in which a star has shone that the clipping left."""
+    """Flag pixels with a response far from 1, and pixels with light of a star that clipping did not remove."""
     flags = np.where((flat.mean > _MIN_RESPONSE) & (flat.mean < _MAX_RESPONSE), 0, RESPONSE).astype(np.uint8)
-    # A median of medians: as robust, and a tenth of the time.
+    # A median of medians is as robust as a median in two dimensions, and takes a tenth of the time.
     smooth = ndimage.median_filter(flat.mean, size=(1, _NEIGHBOURHOOD), mode="nearest")
     off = flat.mean - ndimage.median_filter(smooth, size=(_NEIGHBOURHOOD, 1), mode="nearest")
     rms = 1.4826 * float(np.median(np.abs(off)))
-    # Dust dims a few pixels by more than their neighbours, and is no star.
+    # Only excesses are flagged, since dust dims some pixels more than their neighbours.
     flags[off > _MAX_DEVIATION * rms] |= UNSURE
     flags[flat.count == 0] |= UNSURE
     return flags
 
 
 def dark_flags(dark: CombinedFrame) -> Array:
-    """Pixels in which far more charge is set free than in the others."""
+    """Flag pixels with a much higher dark current than others."""
     above = dark.mean - float(np.median(dark.mean))
     hot = above > _HOT_SIGMA * np.where(np.isfinite(dark.uncertainty), dark.uncertainty, np.inf)
     return (np.where(hot, HOT, 0) | np.where(dark.count == 0, UNSURE, 0)).astype(np.uint8)
 
 
 def master_flags(shape: tuple[int, int], masters: Mapping[str, CombinedFrame], without: Container[str]) -> Array:
-    """Flags [ny, nx] of a detector's pixels by its flat and its dark; without : masters that are not wanted."""
+    """Return flags of a detector's pixels from its flat and its dark.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Shape of the detector.
+    masters : mapping of str to CombinedFrame
+        Masters by kind.
+    without : container of str
+        Kinds of masters that are not used.
+
+    Returns
+    -------
+    uint8 array, shape (ny, nx)
+        Flags.
+    """
     flags = np.zeros(shape, np.uint8)
     if "flat" not in without:
         flags |= response_flags(masters["flat"])
@@ -166,12 +218,32 @@ def calibrate(
 ) -> ReducedImage:
     """Calibrate a frame.
 
-    electrons : [ny, nx] above the level of the overscan;  full : pixels that read no less than a saturated one
-    masters   : of its detector;  scene : what effects may know of it
-    applied   : names of the effects that are in the frame, and are undone
-    unit      : electrons of the exposure that the image's unit is: 1; the exposure time for e-/s; the gain for ADU
-    fringes   : [ny, nx] over the sky that each pixel sees, that are taken off
-    Error     : of the weight: shot noise of the light that is expected (the sky, and what is far above it), not counted
+    Parameters
+    ----------
+    electrons : float array, shape (ny, nx)
+        Electrons above the level of the overscan.
+    saturated : bool array, shape (ny, nx)
+        True for saturated pixels.
+    masters : Masters
+        Masters of the detector.
+    scene : Scene
+        Scene of the frame.
+    applied : container of str
+        Names of the effects in the frame that are undone.
+    unit : float, optional
+        Electrons of the exposure per unit of the image: 1 for electrons, the exposure time for e-/s, the gain for ADU.
+    fringes : float32 array, shape (ny, nx), optional
+        Fringes relative to the sky in each pixel, which are subtracted.
+
+    Returns
+    -------
+    ReducedImage
+        The image in the required unit.
+
+    Notes
+    -----
+    Weights contain the shot noise of the expected light (of the sky, and of sources far above it), not of the counted
+    light.
     """
     time = scene.exposure_time_s
     image = amplifiers.undo_effects(electrons - masters.bias.mean, scene, applied)
@@ -207,20 +279,20 @@ def calibrate(
 
 
 def _response(masters: Masters, scene: Scene, applied: Container[str], rows: slice) -> Float:
-    """What of the light that comes from the sky is counted in each pixel of some rows."""
+    """Return the fraction of light that is counted in each pixel of some rows."""
     flat = masters.flat.mean[rows]
     return np.asarray(flat * (1.0 if masters.flat.vignetted else illumination_map(scene, applied, rows)), float)
 
 
 def _subtract_fringes(image: Float, fringes: Float32, used: Bool) -> None:
-    """Of the image, in place: fringes of the sky, whose level they follow."""
+    """Subtract the fringes of the sky in place; their amplitude is proportional to the level of the sky."""
     sky = SkyMesh.from_image(image / (1.0 + fringes), used)
     for rows in _strips(len(image)):
         image[rows] -= sky.rows(rows) * fringes[rows]
 
 
 def _edge_flags(scene: Scene, applied: Container[str]) -> Array:
-    """Bits [ny, nx] of the last pixels of a detector that the field at its edge displaces."""
+    """Return the flag EDGE for pixels near the edge, which the field at the edge displaces; uint8[ny, nx]."""
     flags = np.zeros((scene.ny, scene.nx), np.uint8)
     if pixel_borders.EDGES.name in applied:
         flags[:_BORDER] = flags[-_BORDER:] = flags[:, :_BORDER] = flags[:, -_BORDER:] = EDGE
@@ -228,15 +300,31 @@ def _edge_flags(scene: Scene, applied: Container[str]) -> Array:
 
 
 def expected_light(image: Float, used: Bool, floor: float) -> Float:
-    """Light of the sky, on a mesh, and of what is far above it, smoothed: e- [ny, nx], nowhere below 0.
+    """Return the expected light: the sky on a mesh, plus smoothed light of sources far above it.
 
-    floor : variance of a pixel without light.  A pixel's own noise must not tell its weight: means would be too low.
+    Parameters
+    ----------
+    image : float array, shape (ny, nx)
+        Image in electrons.
+    used : bool array, shape (ny, nx)
+        True for good pixels.
+    floor : float
+        Variance of a pixel without light in electrons^2.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Expected light in electrons, 0 or more.
+
+    Notes
+    -----
+    A pixel's weight must not depend on the pixel's noise, since weighted means would then be too low.
     """
     return _expected_light(image, used, SkyMesh.from_image(image, used), floor, slice(0, len(image)))
 
 
 def _expected_light(image: Float, used: Bool, mesh: SkyMesh, floor: float, rows: slice) -> Float:
-    """The same of some rows, of which the mesh tells the sky."""
+    """Return the expected light of some rows, with the sky from `mesh`."""
     padded = slice(max(rows.start - _SMOOTHING_REACH, 0), min(rows.stop + _SMOOTHING_REACH, len(image)))
     sky = mesh.rows(padded)
     above = ndimage.gaussian_filter(
@@ -244,21 +332,30 @@ def _expected_light(image: Float, used: Bool, mesh: SkyMesh, floor: float, rows:
     )
     inner = slice(rows.start - padded.start, rows.stop - padded.start)
     sky, above = sky[inner], above[inner]
-    # A Gaussian of one pixel averages the noise of 4 pi of them.
+    # Smoothing with a Gaussian of one pixel averages the noise of 4 pi pixels.
     noise = np.sqrt((np.maximum(sky, 0.0) + floor) / (4.0 * np.pi))
     return np.asarray(np.maximum(sky, 0.0) + np.where(above > _SOURCE_SIGMA * noise, above, 0.0))
 
 
 def sky_level(image: Float, used: Bool) -> Float:
-    """The sky [ny, nx], of its mesh."""
+    """Return the sky of an image from a mesh, float64[ny, nx]."""
     return SkyMesh.from_image(image, used).rows(slice(0, len(image)))
 
 
 @dataclass(frozen=True, slots=True)
 class SkyMesh:
-    """The sky of an image: medians of a mesh's squares, clipped from above twice, linear between their middles.
+    """Sky of an image: clipped medians of squares, interpolated linearly between their centres.
 
-    values : [n, m];  middles : of the squares along the rows and along the columns;  shape : of the image
+    Medians are clipped twice from above.
+
+    Attributes
+    ----------
+    values : float array, shape (n, m)
+        Level of each square.
+    middles : (float array, float array)
+        Centres of the squares in rows and in columns.
+    shape : (int, int)
+        Shape of the image.
     """
 
     values: Float
@@ -267,7 +364,7 @@ class SkyMesh:
 
     @classmethod
     def from_image(cls, image: Float, used: Bool) -> SkyMesh:
-        """Of an image [ny, nx], of the pixels that are used."""
+        """Return the sky of an image [ny, nx], measured in the pixels that are True in `used`."""
         edges = [np.linspace(0, n, max(n // _MESH, 1) + 1).round().astype(int) for n in image.shape]
         mesh = np.zeros((len(edges[0]) - 1, len(edges[1]) - 1))
         for i, (first_row, past_row) in enumerate(zip(edges[0][:-1], edges[0][1:], strict=True)):
@@ -290,9 +387,9 @@ class SkyMesh:
         return cls(mesh, (along, across), (image.shape[0], image.shape[1]))
 
     def rows(self, rows: slice) -> Float:
-        """The sky of some rows, from the first to one past the last."""
+        """Return the sky in some rows."""
         across = np.array([np.interp(np.arange(self.shape[1]), self.middles[1], row) for row in self.values])
-        # In squares; the outermost level is held beyond their middles.
+        # Position in units of squares. Beyond the outermost centres the sky is constant.
         at = np.interp(np.arange(rows.start, rows.stop), self.middles[0], np.arange(len(self.values)))
         low = np.minimum(at.astype(int), max(len(self.values) - 2, 0))
         fraction, high = (at - low)[:, None], np.minimum(low + 1, len(self.values) - 1)

@@ -1,12 +1,12 @@
-"""Sources found in a calibrated image by its pixels alone, under SourceExtractor's names of columns.
+"""Detect and measure sources in a calibrated image, with the column names of SourceExtractor.
 
-detected    an image -> its sources
-columns     the same as a table's columns, with places on the sky and magnitudes
+FLAGS follow SourceExtractor: 1 for bad pixels in the aperture of MAG_AUTO, 2 for deblended sources, 4 for a saturated
+pixel, 8 for sources cut off by the edge, 16 for an aperture beyond the edge. IMAFLAGS_ISO has all bits of the flag map
+in the source's pixels.
 
-FLAGS are SourceExtractor's: 1 bad pixels in the aperture of MAG_AUTO, 2 deblended, 4 a saturated pixel, 8 cut off by
-the edge, 16 an aperture beyond it. IMAFLAGS_ISO has all bits of the flag map in the source's pixels.
-
-Ref : Bertin & Arnouts 1996, A&AS 117, 393; Barbary 2016, JOSS 1, 58 (sep)
+References
+----------
+Bertin & Arnouts 1996, A&AS 117, 393; Barbary 2016, JOSS 1, 58 (sep).
 """
 
 from __future__ import annotations
@@ -25,30 +25,40 @@ from lake_schema.fits.ldac import ColumnData
 from truesky.reduction.calibration import NO_DATA, SATURATED, ReducedImage
 from truesky.render.camera import astrometry
 
-# Side of the mesh of the sky, and how many of its squares a median is of.
+# Side of a square of the sky mesh in pixels, and side of its median filter in squares.
 _MESH, _MESH_FILTER = 64, 3
-# Isophotal axes as far as which a Kron radius is taken; factor of it, and the least radius, pixels, of MAG_AUTO.
+# Extent of the Kron radius in isophotal axes; factor of the Kron radius, and smallest radius (pixels), for MAG_AUTO.
 _ISOPHOTES, _KRON, _MIN_RADIUS = 6.0, 2.5, 1.75
-# Exact overlaps of pixels and apertures.
+# Value of `subpix` with which sep computes exact overlaps of pixels and apertures.
 _EXACT = 0
-# Of a FWHM, the standard deviation of a window about a source's centre.
+# Standard deviation of the window around a source's centre, relative to the half-light radius.
 _WINDOW = 2.0 / (2.0 * np.sqrt(2.0 * np.log(2.0)))
-# Pixels of sources that are held at a time, of a tile; parts that a source is divided into on the way.
+# Size of sep's pixel stack as a fraction of a tile, and largest number of objects during deblending of a source.
 _PIXEL_STACK, _MAX_SUBOBJECTS = 0.5, 8192
-# Sources are found tile by tile, since sep compares each with every other and holds all their pixels: side of a tile,
-# and how far about it is looked at, pixels.
+# Side of a tile, and margin around it, in pixels. Sources are detected by tile, because sep compares all pairs of
+# sources and keeps all their pixels in memory.
 _TILE, _TILE_MARGIN = 2048, 256
-# Pixels about a source that are no sky; what stands for no noise.
+# Margin around a source that is not used for the sky (pixels), and smallest rms of the sky.
 _MARGIN, _FLOOR = 3, np.float32(1e-20)
-# What SourceExtractor writes where there is no magnitude; of a flux of 1, magnitudes.
+# SourceExtractor's value for an undefined magnitude, and magnitudes per relative change of the flux.
 _NO_MAGNITUDE, _MAGNITUDE_PER_LN = 99.0, 2.5 / np.log(10.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What a source is.
+    """Detection limits of sources.
 
-    threshold : standard deviations of the sky above which its pixels are;  pixels : how many there are at least
+    Attributes
+    ----------
+    threshold : float
+        Level of a source's pixels in standard deviations of the sky, 0.5 to 10,000.
+    pixels : int
+        Smallest number of pixels of a source, 1 to 10,000.
+
+    Raises
+    ------
+    OutOfRange
+        If a limit is out of range.
     """
 
     threshold: float = 1.5
@@ -62,11 +72,27 @@ class Limits:
 
 
 def detect_sources(image: ReducedImage, gain: float, radius: float, limits: Limits) -> dict[str, Array]:
-    """Sources, tile by tile from below: columns of SourceExtractor, x and y from 0.
+    """Detect and measure the sources in an image, tile by tile from below.
 
-    gain   : electrons of the exposure in a unit of the image;  radius : of the aperture of MAG_APER, pixels
-    limits : what a source is
-    Error  : a source that reaches farther than 256 pixels from its brightest one may be cut there, and counted twice
+    Parameters
+    ----------
+    image : ReducedImage
+        The image.
+    gain : float
+        Electrons of the exposure per unit of the image.
+    radius : float
+        Radius of the aperture of MAG_APER in pixels.
+    limits : Limits
+        Detection limits.
+
+    Returns
+    -------
+    dict of str to array
+        Measurements of the sources, with x and y in pixels from 0.
+
+    Notes
+    -----
+    A source that extends more than 256 pixels from its brightest pixel may be cut, and counted twice.
     """
     masked = (image.flags & ~np.uint8(SATURATED) != 0) & (image.weight <= 0.0)
     above, noise, sky = _subtract_sky(image, masked, limits)
@@ -99,11 +125,11 @@ def detect_sources(image: ReducedImage, gain: float, radius: float, limits: Limi
 
 
 def _subtract_sky(image: ReducedImage, masked: Bool, limits: Limits) -> tuple[Array, Array, sep.Background]:
-    """float32[ny, nx]: the image without the sky, rms of the sky; its level; what sources cover is none of it.
+    """Return the image without the sky, the rms of the sky (both float32[ny, nx]), and the sky.
 
-    image : with weights;  masked : pixels without value;  limits : what a source is
+    Pixels of sources do not contribute to the sky.
     """
-    # What is not needed any more is freed: of a large detector each array is a third of a gigabyte.
+    # Arrays are freed early, since each takes a third of a gigabyte for a large detector.
     pixels = np.ascontiguousarray(image.image, np.float32)
     mesh = {"bw": _MESH, "bh": _MESH, "fw": _MESH_FILTER, "fh": _MESH_FILTER}
     empty = image.weight > 0.0
@@ -117,9 +143,9 @@ def _subtract_sky(image: ReducedImage, masked: Bool, limits: Limits) -> tuple[Ar
 
 
 def _extract(above: Array, noise: Array, masked: Bool, limits: Limits, **options: float) -> tuple[Array, Array]:
-    """Sources as sep describes them, and int32[ny, nx] the number of each pixel's one, from 1.
+    """Return sources as sep describes them, and the number of each pixel's source from 1 (0 for none), int32[ny, nx].
 
-    above : without the sky;  noise : its rms;  masked : pixels without value;  about : as sep.extract takes it
+    `above` is the image without the sky; `options` are options of sep.extract.
     """
     sep.set_sub_object_limit(_MAX_SUBOBJECTS)
     segmentation, all_sources, count = np.zeros(above.shape, np.int32), [], 0
@@ -135,7 +161,7 @@ def _extract(above: Array, noise: Array, masked: Bool, limits: Limits, **options
         for axis, axis_slice in zip("yx", padded, strict=True):
             for name in (axis, f"{axis}min", f"{axis}max", f"{axis}peak", f"{axis}cpeak"):
                 sources[name] += axis_slice.start
-        # Its brightest pixel is in one tile alone.
+        # Keep a source only in the tile with its brightest pixel.
         in_tile = (sources["ypeak"] // _TILE == first_row // _TILE) & (
             sources["xpeak"] // _TILE == first_column // _TILE
         )
@@ -158,9 +184,9 @@ def _noise(sky: sep.Background) -> Array:
 
 
 def _errors(sources: Array, signal: Float) -> Float:
-    """[3, n] second moments of the error of a source's place; signal : of its light, over the noise.
+    """Return the second moments of the error of the positions, float64[3, n]; `signal` is the S/N of the flux.
 
-    Error : of a source with a masked pixel those of its light over the signal: sep knows no others
+    For a source with a masked pixel, the moments of its light over the squared S/N are used, because sep gives none.
     """
     errors = np.stack([sources[name] for name in ("errx2", "erry2", "errxy")])
     light_errors = np.stack([sources[name] for name in ("x2", "y2", "xy")]) / np.maximum(signal, 1.0) ** 2
@@ -168,10 +194,7 @@ def _errors(sources: Array, signal: Float) -> Float:
 
 
 def _fwhm(above: Array, segmentation: Array, peak: Float) -> Float:
-    """[n] diameter of a circle of as many pixels of a source as have at least half of what its brightest has, pixels.
-
-    above : the image without the sky;  own : number of each pixel's source, from 1;  peak : [n] of the brightest
-    """
+    """Return the diameter of a circle with the area of the pixels above half of the peak, in pixels."""
     inside = segmentation > 0
     source_index = segmentation[inside] - 1
     high = above[inside] >= 0.5 * peak[source_index]
@@ -179,7 +202,7 @@ def _fwhm(above: Array, segmentation: Array, peak: Float) -> Float:
 
 
 def _flag_bits(segmentation: Array, flags: Array, count: int) -> Array:
-    """int16[count] bits of the flag map in the pixels of each source; own : its number from 1, in its pixels."""
+    """Return the bits of the flag map in the pixels of each source, int16[count]."""
     bits = np.zeros(count + 1, np.int16)
     flagged = (segmentation > 0) & (flags > 0)
     np.bitwise_or.at(bits, segmentation[flagged], flags[flagged].astype(np.int16))
@@ -187,7 +210,7 @@ def _flag_bits(segmentation: Array, flags: Array, count: int) -> Array:
 
 
 def _flags(detection_flags: Array, aperture_flags: Array, auto_flags: Array, bits: Array) -> Array:
-    """SourceExtractor's, of sep's."""
+    """Convert the flags of sep to the flags of SourceExtractor."""
     flags = np.where(detection_flags & sep.OBJ_MERGED, 2, 0) | np.where(detection_flags & sep.OBJ_TRUNC, 8, 0)
     flags |= np.where(auto_flags & (sep.APER_HASMASKED | sep.APER_ALLMASKED), 1, 0)
     flags |= np.where(aperture_flags & sep.APER_TRUNC, 16, 0) | np.where(bits & NO_DATA, 8, 0)
@@ -195,10 +218,21 @@ def _flags(detection_flags: Array, aperture_flags: Array, auto_flags: Array, bit
 
 
 def columns(sources: dict[str, Array], system: WCS, zero_point: float) -> list[ColumnData]:
-    """Columns of FITS_LDAC.
+    """Return the columns of a FITS_LDAC catalogue.
 
-    found      : of `detected`;  system : of the image
-    zero_point : AB magnitude of 1 in its unit
+    Parameters
+    ----------
+    sources : dict of str to array
+        Result of `detect_sources`.
+    system : WCS
+        WCS of the image.
+    zero_point : float
+        AB magnitude of 1 unit of the image.
+
+    Returns
+    -------
+    list of ColumnData
+        Name, format, unit and values of each column.
     """
     ra, dec = astrometry.sky_of_pixel(system, sources["x"], sources["y"])
     ra_window, dec_window = astrometry.sky_of_pixel(system, sources["xwin"], sources["ywin"])
@@ -230,7 +264,7 @@ def columns(sources: dict[str, Array], system: WCS, zero_point: float) -> list[C
 
 
 def _axes(xx: Float, yy: Float, xy: Float) -> tuple[Float, Float, Float]:
-    """Of second moments: the long axis, the short one, the angle of the long one, deg."""
+    """Return the long axis, the short axis, and the angle of the long axis in degrees, from second moments."""
     middle, off = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
     angle = np.degrees(0.5 * np.arctan2(2.0 * xy, xx - yy))
     return np.sqrt(middle + off), np.sqrt(np.maximum(middle - off, 0.0)), angle

@@ -1,7 +1,4 @@
-"""Frames of the same kind combined into one: a mean without what is in few of them.
-
-clipped_mean    frames -> mean, its uncertainty, how many frames it is of
-"""
+"""Combine frames of the same kind by a clipped mean."""
 
 from __future__ import annotations
 
@@ -13,7 +10,7 @@ import numpy as np
 from lake_schema.arrays import Array, Float, Float32
 from lake_schema.errors import BadInput
 
-# Rows that are combined at a time: memory.
+# Rows that are combined at a time, to limit memory.
 _ROWS = 64
 
 
@@ -21,9 +18,16 @@ _ROWS = 64
 class CombinedFrame:
     """A combined frame.
 
-    mean, uncertainty : float32[ny, nx], the latter of the mean, infinite where no frame is left
-    count             : int16[ny, nx] frames that are left
-    vignetted         : of a flat, whether its light came through the telescope, whose vignetting is in it
+    Attributes
+    ----------
+    mean : float32 array, shape (ny, nx)
+        Mean of the frames.
+    uncertainty : float32 array, shape (ny, nx)
+        Uncertainty of the mean, infinite if no frame is accepted.
+    count : int16 array, shape (ny, nx)
+        Number of accepted frames.
+    vignetted : bool
+        For a flat, True if its light came through the telescope, so that it contains vignetting.
     """
 
     mean: Float32
@@ -33,10 +37,32 @@ class CombinedFrame:
 
 
 def clipped_mean(frames: Array, variance: Callable[[Float, slice], Float], clip: float = 5.0) -> CombinedFrame:
-    """Mean of frames [n, ny, nx] of what lies within `clip` standard deviations of their median, then of that mean.
+    """Return the mean of the frames that are near their median, then of those near that mean.
 
-    variance : (expected value of pixels [m, nx], their rows) -> variance of one frame's; known, so that few frames do
-    Error    : of two frames, and of one, the lower is believed: rays and stars only add
+    Parameters
+    ----------
+    frames : array, shape (n, ny, nx)
+        The frames.
+    variance : callable
+        Function of the expected values of pixels [m, nx] and their rows (a slice). It returns the variance of these
+        pixels in one frame.
+    clip : float, optional
+        Largest distance in standard deviations.
+
+    Returns
+    -------
+    CombinedFrame
+        The mean with its uncertainty.
+
+    Raises
+    ------
+    BadInput
+        If there are no frames.
+
+    Notes
+    -----
+    The variance is known in advance, so that few frames are sufficient. From one or two frames, the lower value is used
+    for the first step, since cosmic rays and stars only add light.
     """
     if not len(frames):
         raise BadInput("no frames to combine")

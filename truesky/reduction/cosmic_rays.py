@@ -1,9 +1,8 @@
-"""Cosmic rays in one calibrated image: what is sharper than a point source can be.
+"""Find cosmic rays in a calibrated image, which are sharper than point sources.
 
-found       their pixels
-flagged     an image with them
-
-Ref : van Dokkum 2001, PASP 113, 1420 (L.A.Cosmic), as astroscrappy does it
+References
+----------
+van Dokkum 2001, PASP 113, 1420 (L.A.Cosmic), in the implementation of astroscrappy.
 """
 
 from __future__ import annotations
@@ -17,25 +16,37 @@ from lake_schema.arrays import Bool
 from lake_schema.errors import OutOfRange
 from truesky.reduction.calibration import COSMIC_RAY, SATURATED, ReducedImage
 
-# Of the limit, that of a hit's neighbours; contrast with the fine structure; rounds.
+# Limit for the neighbours of a hit relative to the main limit; minimum contrast to fine structure; iterations.
 _NEIGHBOUR_FACTOR, _CONTRAST, _ROUNDS = 0.3, 5.0, 4
-# Rows that are searched at a time (memory), and those beyond that tell what a hit is.
+# Rows that are searched at a time (to limit memory), and additional rows on both sides.
 _ROWS, _MARGIN = 1024, 64
 
 
 def check_limit(limit: float) -> None:
-    """OutOfRange where a limit is none."""
+    """Check the limit of `find_hits`; raises OutOfRange if it is outside 1 to 1000."""
     if not 1.0 <= limit <= 1e3:
         raise OutOfRange("--cosmic-rays", limit, 1.0, 1e3)
 
 
 def find_hits(image: ReducedImage, limit: float) -> Bool:
-    """[ny, nx] pixels that a cosmic ray has hit.
+    """Find the pixels hit by cosmic rays.
 
-    image : with its weights
-    limit : standard deviations of the noise above which a pixel's Laplacian is no source's
-    Error : hits as faint as the noise are not found, nor those on saturated pixels; where a point source is narrower
-            than two pixels its middle may be taken for one
+    Parameters
+    ----------
+    image : ReducedImage
+        Image with weights.
+    limit : float
+        Limit of a pixel's Laplacian in standard deviations of the noise, 1 to 1000.
+
+    Returns
+    -------
+    bool array, shape (ny, nx)
+        True for hit pixels.
+
+    Notes
+    -----
+    Hits as faint as the noise and hits on saturated pixels are not found. If point sources are narrower than two
+    pixels, their central pixels may be flagged.
     """
     check_limit(limit)
     used = image.weight > 0.0
@@ -57,7 +68,7 @@ def find_hits(image: ReducedImage, limit: float) -> Bool:
 
 
 def flag_hits(image: ReducedImage, hit: Bool) -> ReducedImage:
-    """The image with these pixels flagged, and without weight; what is saturated is not one."""
+    """Flag hit pixels, and set their weight to 0, except in saturated pixels."""
     hit = hit & (image.flags & SATURATED == 0)
     flags = np.where(hit, image.flags | COSMIC_RAY, image.flags).astype(np.uint8)
     return replace(image, weight=np.where(hit, np.float32(0.0), image.weight), flags=flags)

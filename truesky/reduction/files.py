@@ -1,10 +1,7 @@
-"""Masters and calibrated images as FITS files, and back.
+"""Write and read masters, calibrated images and stacks as FITS files.
 
-A master has the extensions VALUE, UNCERTAINTY and COUNT, a calibrated image and a stack SCI, WHT (inverse variance)
-and FLG (bits, named in its header); all behind a header that holds for all of them.
-
-write_master, read_master     a combined frame
-write_image, read_image       image, weight, flags
+A master has the extensions VALUE, UNCERTAINTY and COUNT. A calibrated image and a stack have SCI, WHT (inverse
+variance) and FLG (bits with names in its header). A primary header applies to all extensions.
 """
 
 from __future__ import annotations
@@ -33,14 +30,14 @@ from truesky.render.channels import registry
 from truesky.render.effects.light import illumination
 
 KINDS = ("bias", "dark", "flat")
-# Of an infrared detector, whose ramps have no bias.
+# Kinds for infrared detectors, whose ramps have no bias.
 INFRARED_KINDS = ("dark", "linearity", "flat")
-# What can be left as it is.
+# Corrections that can be omitted.
 CORRECTIONS = (*KINDS, "linearity", "crosstalk", "nonlinearity", "fringes", "persistence")
 _UNITS = {"bias": "electron", "dark": "electron/s", "flat": "", "linearity": "electron-1"}
-# What a master must share with the frame that it is applied to: the detector's patterns are keyed by these.
+# Cards that must be equal in a master and the calibrated frame, because the patterns of the detector depend on them.
 SHARED_CARDS = ("INSTRUME", "DETECTOR", "SEED")
-# Of a raw file's header what is not so any more; of amplifiers, with their number or letter at the end.
+# Cards of a raw file's header that do not apply to a calibrated image. Cards of amplifiers end with a number or letter.
 _RAW_CARDS: tuple[str, ...] = (
     "BUNIT",
     "GAIN",
@@ -54,7 +51,7 @@ _RAW_CARDS: tuple[str, ...] = (
 )
 _RAW_CARDS += ("DATASEC", "TRIMSEC", "BIASSEC", "CCDSEC")
 _AMPLIFIER_CARDS = re.compile(r"(AMP|DSEC|CSEC|BSEC|GAIN|RDN)[0-9]+|(DATASEC|BIASSEC|CCDSEC|GAIN|RDNOISE|SATURAT)[A-Z]")
-# Pixels of a master of the user's.
+# Largest number of pixels in a user's master.
 _MAX_PIXELS = 1 << 28
 _NONLINEARITY_EFFECTS = {"nonlinearity", "ramp_nonlinearity", "signal_nonlinearity"}
 _STRUCTURE_CARDS: tuple[str, ...] = (
@@ -80,21 +77,37 @@ class ImageFile:
     cards: tuple[Card, ...]
 
     def card(self, keyword: str) -> Any:
-        """Its value, None = there is none."""
+        """Return the value of a card, or None if the header does not have it."""
         return next((value for key, value, _ in self.cards if key == keyword), None)
 
 
 def master_kinds(frame: Frame) -> tuple[str, ...]:
-    """Kinds of master that a frame is calibrated with."""
+    """Return the kinds of masters with which a frame is calibrated."""
     return INFRARED_KINDS if frame.scene.ramp else KINDS
 
 
 def master_path(folder: Path, frame: Frame, kind: str) -> Path:
-    """The file in a folder of the master for a frame; kind : of KINDS.
+    """Return the path of the master for a frame.
 
-    Of ground cameras, whose channel is one, it has the camera's name; and, a flat, that of the band. Names of a user's
-    camera are joined by dots: with underscores, camera a_b in band c would have the file of camera a in band b_c. Of
-    NISP a dark has its ramp's numbers, and both channels have one linearity.
+    Parameters
+    ----------
+    folder : Path
+        Folder of the masters.
+    frame : Frame
+        The frame.
+    kind : str
+        Kind of master, see `master_kinds`.
+
+    Returns
+    -------
+    Path
+        The file, which may not exist.
+
+    Notes
+    -----
+    Files of ground cameras, which all have one channel, are named by the camera, and flats also by the band. The names
+    of user cameras are joined by dots. With underscores, camera a_b in band c would have the same file as camera a in
+    band b_c. A dark of NISP is named by the numbers of its ramp. Both channels of NISP have the same linearity file.
     """
     exposure = frame.exposure
     if frame.scene.ramp:
@@ -110,16 +123,27 @@ def master_path(folder: Path, frame: Frame, kind: str) -> Path:
 def write_master(
     path: Path, combined: CombinedFrame, kind: str, frames: Sequence[Frame], extra_cards: Sequence[Card] = ()
 ) -> None:
-    """One master of these frames, in one rename.
+    """Write a master atomically.
 
-    path : of its file;  combined : what it holds;  kind : of `kinds`;  more : cards of its header
+    Parameters
+    ----------
+    path : Path
+        The file.
+    combined : CombinedFrame
+        The master.
+    kind : str
+        Kind of master.
+    frames : sequence of Frame
+        Frames that were combined.
+    extra_cards : sequence of Card, optional
+        Further cards of the header.
     """
     first = frames[0]
     cards: tuple[Card, ...] = (
         *(card for card in first.cards if card[0] in (*SHARED_CARDS, "CHANNEL", "MISSION", "TRUESKY")),
         ("IMAGETYP", f"master {kind}", "image type"),
         ("BUNIT", _UNITS[kind], "unit of the pixels"),
-        *((("VIGNETTE", _through_optics(first), "vignetting is in it"),) if kind == "flat" else ()),
+        *((("VIGNETTE", _through_optics(first), "contains vignetting?"),) if kind == "flat" else ()),
         ("NCOMBINE", len(frames), "frames"),
         ("EXPTIME", float(np.mean([frame.exposure.exposure_time_s for frame in frames])), "[s] mean of the frames"),
         *extra_cards,
@@ -130,15 +154,38 @@ def write_master(
 
 
 def _through_optics(flat: Frame) -> bool:
-    """Whether the lamp's light came through the telescope, as a dome's does."""
+    """Return True if the light of the flat came through the telescope, as for a dome flat."""
     return illumination.EFFECT.name in flat.applied and registry.CHANNELS[flat.exposure.channel].on_ground
 
 
 def read_master(path: Path, kind: str, frame: Frame) -> tuple[CombinedFrame, float]:
-    """(a master for a frame, s that its frames lasted); BadInput: it is of another detector, or another seed's.
+    """Read a master for a frame.
 
-    One of the user's is an image of the detector's pixels in the units of ours, NaN where it says nothing; whether
-    vignetting is in a flat its card VIGNETTE says, else it is in that of a ground camera.
+    Parameters
+    ----------
+    path : Path
+        The file.
+    kind : str
+        Kind of master.
+    frame : Frame
+        Frame to calibrate.
+
+    Returns
+    -------
+    combined : CombinedFrame
+        The master.
+    time : float
+        Mean exposure time of its frames in seconds; infinite for a user's master.
+
+    Raises
+    ------
+    BadInput
+        If the file is of another kind, shape or detector, or from another seed.
+
+    Notes
+    -----
+    A user's master is an image of the detector's pixels in the same units, with NaN for unknown pixels. Its card
+    VIGNETTE tells if a flat contains vignetting; without the card, flats of ground cameras do.
     """
     shape = (frame.scene.ny, frame.scene.nx)
     user_plane, user_header = external.read_planes(
@@ -151,10 +198,10 @@ def read_master(path: Path, kind: str, frame: Frame) -> tuple[CombinedFrame, flo
     units = read_images(path)
     header = {keyword: value for keyword, value, _ in units[0].cards}
     if header.get("IMAGETYP") != f"master {kind}" or len(units) != 4:
-        raise BadInput(f"{user_files.format_path(path)}: is no master {kind}")
+        raise BadInput(f"{user_files.format_path(path)}: is not a master {kind}")
     for keyword in SHARED_CARDS:
         if str(header.get(keyword)) != str(frame.card(keyword)):
-            problem = f"{keyword} = {header.get(keyword)}, the frame's is {frame.card(keyword)}"
+            problem = f"{keyword} = {header.get(keyword)}, the frame has {frame.card(keyword)}"
             raise BadInput(f"{user_files.format_path(path)}: {problem}: it cannot calibrate {frame.stem}")
     mean, uncertainty, count = (np.asarray(unit.data) for unit in units[1:])
     for plane in (mean, uncertainty, count):
@@ -169,14 +216,29 @@ def _refuse_other_shape(path: Path, shape: tuple[int, ...], expected: tuple[int,
 
 
 def _user_master(values: Float, neutral: float, vignetted: bool) -> CombinedFrame:
-    """A master without uncertainty; neutral : what stands where it says nothing;  vignetted : of a flat."""
+    """Return a master without uncertainty; `neutral` replaces NaN, `vignetted` is for flats."""
     defined = np.isfinite(values)
     mean = np.where(defined, values, neutral).astype(np.float32)
     return CombinedFrame(mean, np.zeros(values.shape, np.float32), defined.astype(np.int16), vignetted)
 
 
 def read_masters(folder: Path, frame: Frame, without: Sequence[str] = ()) -> calibration.Masters:
-    """The masters of a frame's detector; without : those that are not wanted."""
+    """Read the masters of a frame's detector.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the masters.
+    frame : Frame
+        Frame to calibrate.
+    without : sequence of str, optional
+        Kinds that are not read but replaced by constants.
+
+    Returns
+    -------
+    calibration.Masters
+        The masters.
+    """
     shape, combined, dark_time = (frame.scene.ny, frame.scene.nx), {}, np.inf
     for kind in KINDS:
         if kind in without:
@@ -190,10 +252,23 @@ def read_masters(folder: Path, frame: Frame, without: Sequence[str] = ()) -> cal
 
 
 def reduced_cards(frame: Frame, unit: str, electrons: float, without: Sequence[str]) -> tuple[Card, ...]:
-    """Header of a calibrated image: the raw one's, and what was done.
+    """Return the header of a calibrated image: the cards of the raw image, and cards about the calibration.
 
-    frame     : its raw one;  unit : of its pixels, as FITS writes it
-    electrons : of the exposure that one of them is;  without : of UNDONE what was left as it is
+    Parameters
+    ----------
+    frame : Frame
+        The raw frame.
+    unit : str
+        Unit of the pixels in FITS notation.
+    electrons : float
+        Electrons of the exposure per unit.
+    without : sequence of str
+        Corrections that were not applied, from `CORRECTIONS`.
+
+    Returns
+    -------
+    tuple of Card
+        Cards.
     """
     raw_cards = (
         card
@@ -204,28 +279,37 @@ def reduced_cards(frame: Frame, unit: str, electrons: float, without: Sequence[s
     done = frame.applied - (set(without) | (_NONLINEARITY_EFFECTS if "nonlinearity" in without else set()))
     return (
         *raw_cards,
-        ("BUNIT", unit, "unit of SCI; of WHT its inverse square"),
+        ("BUNIT", unit, "unit of SCI; WHT has its inverse square"),
         ("GAIN", electrons, "[electron/BUNIT] of the pixels"),
         ("MAGZERO", float(frame.card("ZEROPNT")) + 2.5 * math.log10(time / electrons), "[mag] AB magnitude of 1 BUNIT"),
         *((f"CAL{kind.upper()[:5]}", kind not in without, f"master {kind} applied?") for kind in master_kinds(frame)),
-        *((("CALPERS", "persistence" not in without, "foreseen persistence taken off?"),) if frame.scene.ramp else ()),
-        ("CALXTALK", "crosstalk" in done, "crosstalk undone?"),
-        ("CALLIN", bool(_NONLINEARITY_EFFECTS & done), "response undone?"),
-        ("CALFRING", "fringes" in done, "fringes of the sky taken off?"),
-        ("CALILLUM", bool({"illumination", "shutter"} & frame.applied), "vignetting and shutter undone?"),
+        *((("CALPERS", "persistence" not in without, "predicted persistence removed?"),) if frame.scene.ramp else ()),
+        ("CALXTALK", "crosstalk" in done, "crosstalk corrected?"),
+        ("CALLIN", bool(_NONLINEARITY_EFFECTS & done), "response corrected?"),
+        ("CALFRING", "fringes" in done, "fringes of the sky subtracted?"),
+        ("CALILLUM", bool({"illumination", "shutter"} & frame.applied), "vignetting and shutter corrected?"),
         *flag_cards(),
     )
 
 
 def flag_cards() -> tuple[Card, ...]:
-    """Meaning of the bits of FLG."""
+    """Return cards with the meaning of the bits of FLG."""
     return tuple((f"FLAG{bit}", text, "bit of FLG") for bit, text in FLAGS)
 
 
 def write_image(path: Path, reduced: ReducedImage, cards: tuple[Card, ...], extensions: Sequence[Image] = ()) -> None:
-    """A calibrated image or a stack, in one rename.
+    """Write a calibrated image or a stack atomically.
 
-    path : of its file;  reduced : its pixels;  cards : of its header;  more : extensions after it
+    Parameters
+    ----------
+    path : Path
+        The file.
+    reduced : ReducedImage
+        The pixels.
+    cards : tuple of Card
+        Header.
+    extensions : sequence of Image, optional
+        Further extensions.
     """
     wcs_cards = tuple(
         card for card in cards if card[0] in _WCS_CARDS or card[0].startswith(("A_", "B_", "PV1_", "PV2_"))
@@ -245,10 +329,16 @@ _WCS_CARDS = tuple(
 
 
 def read_image(path: Path) -> ImageFile:
-    """A file that `write_image` wrote."""
+    """Read a file of `write_image`.
+
+    Raises
+    ------
+    BadInput
+        If the file has other extensions.
+    """
     units = read_images(user_files.check_file(path, "calibrated image"))
     if [unit.name for unit in units[1:4]] != ["SCI", "WHT", "FLG"]:
-        raise BadInput(f"{user_files.format_path(path)}: is no calibrated image (extensions SCI, WHT, FLG)")
+        raise BadInput(f"{user_files.format_path(path)}: is not a calibrated image (extensions SCI, WHT, FLG)")
     image, weight, flags = (np.asarray(unit.data) for unit in units[1:4])
     astrometry.from_cards(units[0].cards)
     return ImageFile(ReducedImage(image, weight, flags), units[0].cards)

@@ -1,8 +1,4 @@
-"""Frames of a lake: which there are of a detector, what is known of each, and their electrons.
-
-Frame         one raw file of a detector, and what its exposure and its header say
-of_lake       those of the table `products`, by detector
-"""
+"""Read the raw frames of a lake with the facts about each exposure and detector."""
 
 from __future__ import annotations
 
@@ -36,12 +32,22 @@ from truesky.request.accuracy import Accuracy
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A raw file.
+    """A raw frame of one detector.
 
-    scene   : what effects may know of it, from the lake's plan and mission
-    applied : names of the effects that are in it, from its header
-    cards   : of the header that holds for all arrays; the WCS is that of the detector's pixels
-    psf     : the file of its PSF beside it; None: the lake has none
+    Attributes
+    ----------
+    path : Path
+        The file.
+    exposure : ExposureRow
+        Planned exposure.
+    scene : Scene
+        Parameters of the effects, from the lake's plan and mission.
+    applied : frozenset of str
+        Names of the effects in the frame, from its header.
+    cards : tuple of Card
+        Header that applies to all arrays; the WCS is for the detector's pixels.
+    psf : Path, optional
+        File of the PSF in the same folder; None if the lake has none.
     """
 
     path: Path
@@ -53,36 +59,36 @@ class Frame:
 
     @property
     def detector(self) -> str:
-        """Its name."""
+        """Return the name of the detector."""
         assert self.scene.detector is not None
         return self.scene.detector.name
 
     @property
     def stem(self) -> str:
-        """Of files made from it."""
+        """Return the stem of the names of files made from this frame."""
         return f"{self.exposure.exposure_id:06d}_{self.exposure.channel}_{self.exposure.band}_{self.detector}"
 
     @property
     def mean_gain(self) -> float:
-        """Of its amplifiers, electrons an ADU."""
+        """Return the mean gain of the amplifiers in electrons per ADU."""
         return float(np.mean(self.scene.amplifier_values("gain", "electron / adu")))
 
     def card(self, keyword: str) -> Any:
-        """The value of a card of the common header."""
+        """Return the value of a card of the common header, or None."""
         return next((value for key, value, _ in self.cards if key == keyword), None)
 
     def electrons(self) -> Float:
-        """e- [ny, nx] above the level of each amplifier's overscan."""
+        """Return the electrons above the level of each amplifier's overscan, float64[ny, nx]."""
         return np.asarray(read_back.electrons(self.path).data, np.float64)
 
     def saturated_pixels(self) -> Bool:
-        """Pixels [ny, nx] that read no less than a saturated one."""
+        """Return True for pixels at or above the saturation level of their amplifier, bool[ny, nx]."""
         levels = self._amplifier_values("SATURATE")
         adu = np.asarray(read_back.frame(self.path).data)
         return amplifiers.pixels_at_least(adu, levels, self.scene)
 
     def fringes(self) -> Float32 | None:
-        """[ny, nx] over the sky that each pixel sees, as the mission declares them; None where there are none."""
+        """Return the fringes relative to the sky, from the mission parameters, or None without fringes."""
         effect = fringes.EFFECT
         if effect.name not in self.applied:
             return None
@@ -96,23 +102,23 @@ class Frame:
 
     @property
     def ramp(self) -> tuple[int, int, int]:
-        """Groups, reads and drops of its ramp."""
+        """Return groups, reads and drops of the ramp."""
         groups, reads, drops = (int(self.card(key)) for key in ("NG", "NR", "ND"))
         return groups, reads, drops
 
     def misfit_pixels(self) -> Bool:
-        """Pixels [ny, nx] whose ramp does not fit; of two groups nothing is known."""
+        """Return True for pixels whose ramp does not fit, bool[ny, nx]; False everywhere for ramps of two groups."""
         units = images.read_images(self.path)
         if len(units) < 3:
             return np.zeros((self.scene.ny, self.scene.nx), bool)
         border, quality = int(self.card("REFPIX")), np.asarray(units[2].data)
         quality = quality[border : len(quality) - border, border : quality.shape[1] - border]
-        # One bit, or chi^2 itself.
+        # The extension contains either one bit or chi^2.
         flagged = any(key == "QUALFLAG" for key, _, _ in units[2].cards)
         return np.asarray(quality > (0 if flagged else float(self.card("QUALLIM"))))
 
     def _amplifier_values(self, keyword: str) -> float | Float:
-        """A card of the common header, else of the arrays' own, [q]."""
+        """Return the value of a card in the common header, or values per amplifier from the headers of the arrays."""
         if (value := self.card(keyword)) is not None:
             return float(value)
         headers = (dict((key, value) for key, value, _ in unit.cards) for unit in images.read_images(self.path)[1:])
@@ -122,12 +128,28 @@ class Frame:
 def from_lake(
     root: Path, detector_names: Sequence[str] = (), exposures: Iterable[int] = (), request: str | None = None
 ) -> dict[tuple[str, str], list[Frame]]:
-    """(camera, detector) -> its frames, by exposure; only those that are named where some are.
+    """Return the frames in a lake by camera and detector.
 
-    root      : of the lake;  wanted : names of detectors
-    exposures : their numbers
-    request   : whose frames, where a lake has those of several
-    Errors    : BadInput where the lake has no such frames
+    Parameters
+    ----------
+    root : Path
+        Root of the lake.
+    detector_names : sequence of str, optional
+        Detectors to return; all by default.
+    exposures : iterable of int, optional
+        Numbers of the exposures to return; all by default.
+    request : str, optional
+        Request whose frames are returned, if the lake has several.
+
+    Returns
+    -------
+    dict of (str, str) to list of Frame
+        Frames by (camera, detector), in the order of exposures.
+
+    Raises
+    ------
+    BadInput
+        If the lake has no frame of a detector or an exposure.
     """
     version = read.version(root, "products", request=request)
     inputs = version.manifest["facts"]["inputs"]
@@ -168,18 +190,18 @@ def from_lake(
 
 
 def _applied_effects(cards: Iterable[Card]) -> frozenset[str]:
-    """Names of the effects that a header has as `on`."""
+    """Return the names of the effects with the state `on` in a header."""
     texts = [str(value) for keyword, value, _ in cards if keyword.startswith("EFFECT")]
     return frozenset(name for name, _, state in (text.partition(": ") for text in texts) if state.startswith("on"))
 
 
 def select_types(frames: Sequence[Frame], image_types: Sequence[str]) -> list[Frame]:
-    """Those of some image types."""
+    """Return the frames with one of the image types."""
     return [frame for frame in frames if frame.exposure.image_type in image_types]
 
 
 def common_values(frames: Sequence[Frame], keywords: Sequence[str]) -> Mapping[str, Any]:
-    """Values of cards that all frames share; BadInput names one in which they differ."""
+    """Return the values of cards that all frames share; raises BadInput if one differs."""
     for keyword in keywords:
         values = {str(frame.card(keyword)) for frame in frames}
         if len(values) > 1:

@@ -1,9 +1,7 @@
-"""What a survey gives of a detector: the calibrated image, its sources, its PSF, and its place for other tools.
+"""Write the level 2 files of a detector: calibrated image, catalogue, PSF and WCS for other tools.
 
-refuse      frames that there is no level 2 of
-written     an image and all that lies beside it, the image last: where it is, all is
-
-NAME.fits   SCI, WHT, FLG;  NAME.cat: FITS_LDAC;  NAME.psf: PSFEx;  NAME.head: the WCS as TPV, of each array
+NAME.fits has SCI, WHT and FLG, NAME.cat is a FITS_LDAC catalogue, NAME.psf a PSFEx file, and NAME.head has the WCS of
+each array as TPV. The image is written last: if it exists, all files exist.
 """
 
 from __future__ import annotations
@@ -26,15 +24,28 @@ from truesky.reduction.frames import Frame
 from truesky.render.camera import astrometry
 from truesky.render.products import head_files
 
-# Of a point source's FWHM, the diameter of the aperture where none is asked for.
+# Default diameter of the aperture, in FWHM of a point source.
 _APERTURE_FWHM = 3.0
-# Of an image's header, what a catalogue does not repeat.
+# Beginnings of the cards of an image's header that are not copied to the catalogue.
 _OMITTED_CARDS = ("EFFECT", "EFKEY", "COMMENT", "HISTORY")
 
 
 @dataclass(frozen=True, slots=True)
 class CatalogueSettings:
-    """limits : what a source is;  diameter : of the aperture of MAG_APER, arcsec, None = 3 FWHM of a point source."""
+    """Settings of the catalogue.
+
+    Attributes
+    ----------
+    limits : Limits
+        Detection limits.
+    diameter : float, optional
+        Diameter of the aperture of MAG_APER in arcsec, 0.01 to 1000; None for 3 FWHM of a point source.
+
+    Raises
+    ------
+    OutOfRange
+        If the diameter is out of range.
+    """
 
     limits: Limits = field(default_factory=Limits)
     diameter: float | None = None
@@ -45,24 +56,38 @@ class CatalogueSettings:
 
 
 def check_psfs(frames: Sequence[Frame]) -> None:
-    """BadInput where the lake has not the PSF of every frame: before anything is written."""
+    """Check that the lake has the PSF of every frame, before anything is written; raises BadInput otherwise."""
     for frame in frames:
         _psf_file(frame)
 
 
 def _psf_file(frame: Frame) -> Path:
     if frame.psf is None:
-        problem = f"the lake has no PSF beside the image {frame.stem}"
-        raise BadInput(f"--level2: {problem}: choose images of ground cameras by --exposures")
+        problem = f"the lake has no PSF for the image {frame.stem}"
+        raise BadInput(f"--level2: {problem}: choose images of ground cameras with --exposures")
     return frame.psf
 
 
 def write(path: Path, frame: Frame, image: ReducedImage, cards: Sequence[Card], settings: CatalogueSettings) -> int:
-    """Number of sources of an image, of which all files are written.
+    """Write all files of an image.
 
-    path  : of the image;  frame : its raw one
-    image : calibrated;  cards : of its header, with MAGZERO and GAIN
-    settings : of the catalogue
+    Parameters
+    ----------
+    path : Path
+        Path of the image.
+    frame : Frame
+        The raw frame.
+    image : ReducedImage
+        The calibrated image.
+    cards : sequence of Card
+        Header of the image, with MAGZERO and GAIN.
+    settings : CatalogueSettings
+        Settings of the catalogue.
+
+    Returns
+    -------
+    int
+        Number of sources in the catalogue.
     """
     psf = _psf_file(frame)
     header_values = {keyword: value for keyword, value, _ in cards}
@@ -73,9 +98,9 @@ def write(path: Path, frame: Frame, image: ReducedImage, cards: Sequence[Card], 
     header = (
         *cards,
         ("APERDIAM", round(diameter / scale, 6), "[pix] diameter of the aperture of MAG_APER"),
-        ("APERCOR", round(2.5 * float(np.log10(aperture_fraction)), 6), "[mag] MAG_APER + this: all of a star's light"),
-        ("DETTHR", settings.limits.threshold, "threshold of detection, rms of the sky"),
-        ("DETPIX", settings.limits.pixels, "[pix] least pixels of a source"),
+        ("APERCOR", round(2.5 * float(np.log10(aperture_fraction)), 6), "[mag] MAG_APER + this: total light of a star"),
+        ("DETTHR", settings.limits.threshold, "detection threshold, rms of the sky"),
+        ("DETPIX", settings.limits.pixels, "[pix] smallest number of pixels of a source"),
         ("NDETECT", len(sources["x"]), "sources in the catalogue"),
     )
     catalogue_cards = [card for card in header if not card[0].startswith(_OMITTED_CARDS)]

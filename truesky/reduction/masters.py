@@ -1,11 +1,14 @@
-"""Master bias, dark and flat of each detector, from the calibration frames of a lake.
+"""Make master bias, dark and flat frames of each detector from the calibration frames of a lake.
 
     python -m truesky.reduction.masters --lake LAKE [--name REQUEST] --out FOLDER [--detectors 3-4 ..]
 
-FOLDER/VIS_3-4_bias.fits (e-), .._dark.fits (e-/s) and .._flat.fits (response; 1 = all light is counted), each with its
-uncertainty and the number of frames that a pixel is of. A flat is over its lamp's light as the mission declares it.
-Of NISP NISP-P_4-16-4_DET22_dark.fits (of each ramp), NISP_DET22_linearity.fits (b of N (1 - b N), 1/e-, of flats at
-three intensities and more) and NISP-P_euclid_y_DET22_flat.fits (of the lamps' mix that is like the sky).
+Files are FOLDER/VIS_3-4_bias.fits (electrons), .._dark.fits (electrons per second) and .._flat.fits (response; 1 if all
+light is counted). Each has its uncertainty and the number of frames per pixel. A flat is divided by the light of its
+lamp, as the mission parameters define it.
+
+For NISP, files are NISP-P_4-16-4_DET22_dark.fits (for each ramp), NISP_DET22_linearity.fits (b of N (1 - b N) in
+1/electron, from flats at three or more intensities) and NISP-P_euclid_y_DET22_flat.fits (for the mixture of lamps that
+is most similar to the sky).
 """
 
 from __future__ import annotations
@@ -30,14 +33,33 @@ from truesky.render.effects.light import calibration_lamp, illumination
 
 
 def from_frames(frames: Sequence[Frame], scratch: Path) -> Iterator[tuple[str, CombinedFrame, list[Frame]]]:
-    """(kind, master, its frames) of what a detector's calibration frames allow: bias, dark, and a flat of each band.
+    """Make the masters that a detector's calibration frames allow: bias, dark, and a flat of each band.
 
-    scratch : folder for the frames while they are combined: 4 bytes a pixel and frame
+    Parameters
+    ----------
+    frames : sequence of Frame
+        Frames of the detector.
+    scratch : Path
+        Folder for temporary files, 4 bytes per pixel and frame.
+
+    Yields
+    ------
+    kind : str
+        Kind of master.
+    master : CombinedFrame
+        The master.
+    frames : list of Frame
+        Frames that were combined.
+
+    Raises
+    ------
+    BadInput
+        If there is no bias frame.
     """
     shape = frames[0].scene.ny, frames[0].scene.nx
     masters = {kind: calibration.neutral_master(shape, 0.0) for kind in ("bias", "dark")}
     if not lake_frames.select_types(frames, ("bias",)):
-        raise BadInput(f"detector {frames[0].detector}: the lake has no frame of it of the image type bias")
+        raise BadInput(f"detector {frames[0].detector}: the lake has no frame with image type bias")
     for kind in files.KINDS:
         for group in _group_frames(lake_frames.select_types(frames, (kind,)), kind):
             lake_frames.common_values(group, (*files.SHARED_CARDS, "MISSION"))
@@ -49,7 +71,7 @@ def from_frames(frames: Sequence[Frame], scratch: Path) -> Iterator[tuple[str, C
 
 
 def _group_frames(frames: Sequence[Frame], kind: str) -> list[list[Frame]]:
-    """Frames that one master is made of: flats of one band."""
+    """Return the frames by master: flats by band, others together."""
     groups: dict[str, list[Frame]] = {}
     for frame in frames:
         groups.setdefault(frame.exposure.band if kind == "flat" else "", []).append(frame)
@@ -59,10 +81,10 @@ def _group_frames(frames: Sequence[Frame], kind: str) -> list[list[Frame]]:
 def _combine_frames(
     kind: str, frames: Sequence[Frame], masters: Mapping[str, CombinedFrame], stack: Array
 ) -> CombinedFrame:
-    """Frames of a kind -> their master; stack : float32[n, ny, nx] that it fills."""
+    """Combine frames of a kind to a master; `stack`, float32[n, ny, nx], is temporary space."""
     unit = np.zeros(stack.shape[1:])
     for number, frame in enumerate(frames):
-        # Electrons that are 1 in the unit of the master.
+        # Electrons per unit of the master.
         frame_unit = (
             _lamp_charge(frame) if kind == "flat" else frame.exposure.exposure_time_s if kind == "dark" else 1.0
         )
@@ -79,24 +101,26 @@ def _combine_frames(
 
 
 def _counted_charge(frame: Frame, bias: CombinedFrame, dark: CombinedFrame) -> Float:
-    """Electrons as they were counted, without bias and dark current."""
+    """Return the counted electrons without bias and dark current."""
     electrons = amplifiers.undo_effects(frame.electrons() - bias.mean, frame.scene, frame.applied)
     return np.asarray(electrons - dark.mean * frame.scene.exposure_time_s)
 
 
 def _lamp_charge(frame: Frame) -> Float:
-    """Electrons [ny, nx] that the lamp of a flat would bring were all its light counted."""
+    """Return the electrons that the lamp of a flat would give if all light were counted, float64[ny, nx]."""
     electrons, *pattern = calibration_lamp.EFFECT.parameters(frame.scene)
     return np.asarray(electrons * illumination.apply(np.ones((frame.scene.ny, frame.scene.nx)), *pattern))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Prints a line a master."""
+    """Run the command, print a line per master, and return the exit status."""
     parser = argparse.ArgumentParser(prog="truesky masters", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--lake", required=True, help="folder of the lake, with rendered calibration frames")
-    parser.add_argument("--name", help="of the request whose frames are meant, where the lake has several")
+    parser.add_argument("--lake", required=True, help="folder of the lake with rendered calibration frames")
+    parser.add_argument("--name", help="request whose frames are used, if the lake has several")
     parser.add_argument("--out", type=Path, required=True, help="folder of the masters")
-    parser.add_argument("--detectors", nargs="+", default=[], metavar="NAME", help="default: all that have any")
+    parser.add_argument(
+        "--detectors", nargs="+", default=[], metavar="NAME", help="default: all with calibration frames"
+    )
     options = parser.parse_args(argv)
     return command.run("masters", lambda: _write_masters(options))
 
@@ -110,7 +134,7 @@ def _write_masters(options: argparse.Namespace) -> int:
         if options.detectors or lake_frames.select_types(frames, _required_types(frames[0]))
     }
     if not selected:
-        raise BadInput(f"lake {options.lake} has no frames of the image type bias, and none of NISP's darks and flats")
+        raise BadInput(f"lake {options.lake} has no frames of the image type bias, and no darks or flats of NISP")
     out.mkdir(parents=True, exist_ok=True)
     for frames in selected.values():
         with tempfile.TemporaryDirectory(dir=out, prefix=".frames-") as scratch:
@@ -120,13 +144,13 @@ def _write_masters(options: argparse.Namespace) -> int:
                 noise = float(np.median(master.combined.uncertainty))
                 print(
                     f"{path}: {len(master.frames)} frames, median {np.median(master.combined.mean):.5g}, "
-                    f"uncertainty of a pixel {noise:.3g}"
+                    f"uncertainty per pixel {noise:.3g}"
                 )
     return 0
 
 
 def _required_types(frame: Frame) -> tuple[str, ...]:
-    """Image types of which a detector has one at least that masters are made of."""
+    """Return the image types from which masters are made; a detector needs at least one of them."""
     return ("dark", "flat") if frame.scene.ramp else ("bias",)
 
 

@@ -1,8 +1,4 @@
-"""What a point source is on a frame's detector.
-
-profile      the PSF in its middle
-enclosed     the part of a point source's light in an aperture
-"""
+"""Model point sources on a frame's detector."""
 
 from __future__ import annotations
 
@@ -15,12 +11,12 @@ from truesky.reduction.frames import Frame
 from truesky.render.channels import registry
 from truesky.render.psf import from_file
 
-# Places on a detector at which its PSF is known; the middle one is taken.
+# Number of positions on a detector at which the PSF is computed.
 _POSITIONS = 1
 
 
 def profile(frame: Frame) -> Any:
-    """galsim object in the detector's axes, without the pixel: the PSF in the middle of a frame's detector."""
+    """Return the PSF at the centre of a frame's detector, a galsim object in the detector's axes without the pixel."""
     scene, exposure = frame.scene, frame.exposure
     assert scene.detector is not None
     assert scene.band is not None
@@ -32,9 +28,21 @@ def profile(frame: Frame) -> Any:
 
 
 def enclosed_fraction(psf: Any, scale: float, radius: float) -> float:
-    """Part of a point source's light in a circle about it.
+    """Return the fraction of a point source's light in a circular aperture.
 
-    psf : galsim object, without the pixel;  scale : arcsec a pixel;  radius : pixels
+    Parameters
+    ----------
+    psf : galsim object
+        PSF without the pixel.
+    scale : float
+        Pixel scale in arcsec.
+    radius : float
+        Radius of the aperture in pixels.
+
+    Returns
+    -------
+    float
+        Fraction of the light.
     """
     side = 2 * int(np.ceil(radius)) + 5
     image = psf.drawImage(nx=side, ny=side, scale=scale, dtype=float).array

@@ -1,11 +1,12 @@
-"""Calibrated images from the raw frames of a lake: bias, dark, response of the amplifiers, flat, vignetting.
+"""Calibrate the raw frames of a lake: bias, dark, response of the amplifiers, flat, vignetting.
 
     python -m truesky.reduction.reduce --lake LAKE [--name REQUEST] --masters FOLDER --out FOLDER [--detectors ..]
                                  [--exposures ..] [--rate] [--without ..] [--cosmic-rays SIGMA]
                                  [--level2 [--aperture ARCSEC] [--threshold SIGMA] [--least-pixels N]]
 
-A file a frame that sees the sky, with the extensions SCI (electrons, e-/s or, of level 2, counts of the mean gain), WHT
-(inverse variance) and FLG (bits). Of level 2 a catalogue of its sources, its PSF and a .head lie beside it.
+Each frame of the sky gives a file with the extensions SCI, WHT (inverse variance) and FLG (bits). SCI is in electrons,
+in electrons per second, or for level 2 in counts of the mean gain. Level 2 adds a catalogue of sources, the PSF and a
+.head file in the same folder.
 """
 
 from __future__ import annotations
@@ -31,17 +32,22 @@ from truesky.reduction.infrared.persistence_prediction import PersistencePredict
 from truesky.render.channels import registry
 from truesky.render.channels.image_types import SKY_TYPES
 
-# Of a level 2 where none is asked for: van Dokkum 2001.
+# Default limit of cosmic rays for level 2 (van Dokkum 2001).
 _COSMIC_RAY_SIGMA = 4.5
 
 
 @dataclass(frozen=True, slots=True)
 class ReductionOptions:
-    """What is made of a frame.
+    """Options of the reduction of a frame.
 
-    unit        : of the pixels: electron, electron/s or adu
-    without     : of files.UNDONE what is left as it is
-    cosmic_rays : standard deviations above which they are found, 0 = they are not looked for
+    Attributes
+    ----------
+    unit : str
+        Unit of the pixels: electron, electron/s or adu.
+    without : tuple of str
+        Corrections that are omitted, from files.CORRECTIONS.
+    cosmic_rays : float
+        Limit of cosmic rays in standard deviations; 0 to skip the search.
     """
 
     unit: str = "electron"
@@ -52,10 +58,25 @@ class ReductionOptions:
 def reduce_frame(
     frame: Frame, masters: Masters, reduction: ReductionOptions, prediction: PersistencePrediction | None = None
 ) -> tuple[ReducedImage, tuple[Card, ...]]:
-    """A frame with the masters of its detector: the image and its header.
+    """Calibrate a frame with the masters of its detector.
 
-    frame, masters, wish : what is made of it with what
-    foreseen : what earlier exposures leave in a detector of NISP; None: that is left as it is
+    Parameters
+    ----------
+    frame : Frame
+        The raw frame.
+    masters : Masters
+        Masters of the detector.
+    reduction : ReductionOptions
+        Options.
+    prediction : PersistencePrediction, optional
+        Persistence in a NISP detector; None to leave it in the image.
+
+    Returns
+    -------
+    image : ReducedImage
+        The calibrated image.
+    cards : tuple of Card
+        Its header.
     """
     electrons = {"electron": 1.0, "electron/s": frame.scene.exposure_time_s}.get(reduction.unit) or frame.mean_gain
     corrected_effects = frame.applied - set(reduction.without)
@@ -73,25 +94,30 @@ def reduce_frame(
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Prints a line an image."""
+    """Run the command, print a line per image, and return the exit status."""
     parser = argparse.ArgumentParser(prog="truesky reduce", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--lake", required=True, help="folder of the lake, with rendered frames")
-    parser.add_argument("--name", help="of the request whose frames are meant, where the lake has several")
+    parser.add_argument("--lake", required=True, help="folder of the lake with rendered frames")
+    parser.add_argument("--name", help="request whose frames are used, if the lake has several")
     parser.add_argument(
-        "--masters", type=Path, help="folder that truesky.reduction.masters has written, or of your own"
+        "--masters", type=Path, help="folder with masters of truesky.reduction.masters or other masters"
     )
     parser.add_argument("--out", type=Path, required=True, help="folder of the calibrated images")
     parser.add_argument("--detectors", nargs="+", default=[], metavar="NAME", help="default: all")
     parser.add_argument("--exposures", nargs="+", type=int, default=[], metavar="ID", help="default: all")
-    parser.add_argument("--rate", action="store_true", help="electrons a second instead of those of the exposure")
-    parser.add_argument("--without", nargs="+", default=[], choices=files.CORRECTIONS, help="what is left as it is")
+    parser.add_argument("--rate", action="store_true", help="write electrons per second instead of electrons")
+    parser.add_argument("--without", nargs="+", default=[], choices=files.CORRECTIONS, help="corrections to omit")
     parser.add_argument(
-        "--cosmic-rays", type=float, metavar="SIGMA", help=f"flag them; with --level2 {_COSMIC_RAY_SIGMA:g}, 0 = no"
+        "--cosmic-rays",
+        type=float,
+        metavar="SIGMA",
+        help=f"flag cosmic rays; default: {_COSMIC_RAY_SIGMA:g} with --level2, else 0 (no)",
     )
-    parser.add_argument("--level2", action="store_true", help="in counts, with sources, PSF and .head beside")
-    parser.add_argument("--aperture", type=float, metavar="ARCSEC", help="diameter of MAG_APER (3 FWHM)")
-    parser.add_argument("--threshold", type=float, default=Limits().threshold, metavar="SIGMA", help="of sources (1.5)")
-    parser.add_argument("--least-pixels", type=int, default=Limits().pixels, metavar="N", help="of a source (5)")
+    parser.add_argument("--level2", action="store_true", help="write counts, with catalogue, PSF and .head files")
+    parser.add_argument("--aperture", type=float, metavar="ARCSEC", help="diameter of MAG_APER (default: 3 FWHM)")
+    parser.add_argument(
+        "--threshold", type=float, default=Limits().threshold, metavar="SIGMA", help="level of sources (1.5)"
+    )
+    parser.add_argument("--least-pixels", type=int, default=Limits().pixels, metavar="N", help="smallest source (5)")
     options = parser.parse_args(argv)
     return command.run("reduce", lambda: _write_images(options))
 
@@ -105,7 +131,7 @@ def _write_images(options: argparse.Namespace) -> int:
         sky_frames for frames in by_detector.values() if (sky_frames := [frame for frame in frames if _sees_sky(frame)])
     ]
     if not science:
-        raise BadInput(f"lake {options.lake} has no such frame that sees the sky")
+        raise BadInput(f"lake {options.lake} has no frame of the sky for these detectors and exposures")
     if settings is not None:
         level2.check_psfs([frame for frames in science for frame in frames])
     out.mkdir(parents=True, exist_ok=True)
@@ -123,7 +149,7 @@ def _write_images(options: argparse.Namespace) -> int:
             else:
                 suffix = f", {level2.write(path, frame, image, cards, settings)} sources"
             good = image.weight > 0.0
-            sky_text = f"sky {np.median(image.image[good]):.5g}" if good.any() else "no pixel is good"
+            sky_text = f"sky {np.median(image.image[good]):.5g}" if good.any() else "no good pixel"
             print(f"{path}: {sky_text}, {100.0 * good.mean():.2f} % of the pixels are good{suffix}")
     return 0
 
@@ -131,13 +157,13 @@ def _write_images(options: argparse.Namespace) -> int:
 def _with_masters(
     frames: Sequence[Frame], folder: Path | None, without: Sequence[str]
 ) -> Iterator[tuple[Frame, Masters]]:
-    """Frames of a detector with its masters, which are read once a band, and a ramp."""
+    """Yield frames of a detector with masters, which are read once per band and ramp."""
     groups = [(frame.exposure.band, frame.ramp if frame.scene.ramp else ()) for frame in frames]
     for group in dict.fromkeys(groups):
         group_frames = [frame for frame, frame_group in zip(frames, groups, strict=True) if frame_group == group]
         kinds = files.master_kinds(group_frames[0])
         if folder is None and not {*without} >= {*kinds}:
-            raise BadInput(f"--masters: which folder? Or --without {' '.join(kinds)}")
+            raise BadInput(f"--masters FOLDER is required, or --without {' '.join(kinds)}")
         masters = (nisp.read_masters if group_frames[0].scene.ramp else files.read_masters)(
             folder or Path(), group_frames[0], without
         )
@@ -145,14 +171,14 @@ def _with_masters(
 
 
 def _sees_sky(frame: Frame) -> bool:
-    """Of NISP standard stars and nebulae, too."""
+    """Return True for frames of the sky, including NISP frames of standard stars and nebulae."""
     kind = frame.exposure.image_type
     return kind in SKY_TYPES or (bool(frame.scene.ramp) and registry.CHANNELS[frame.exposure.channel].sees_sky(kind))
 
 
 def _reduction_options(options: argparse.Namespace) -> ReductionOptions:
     if options.level2 and options.rate:
-        raise BadInput("--rate: images of level 2 are in counts")
+        raise BadInput("--rate is not allowed with --level2: its images are in counts")
     limit = options.cosmic_rays
     if limit is None:
         limit = _COSMIC_RAY_SIGMA if options.level2 else 0.0

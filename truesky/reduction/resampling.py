@@ -1,14 +1,11 @@
-"""Calibrated images onto the pixels of another map of the sky: drizzle, with pixels of their full size.
+"""Resample calibrated images to the pixels of another map of the sky, by drizzle with pixels of full size.
 
-A pixel's electrons are spread evenly over its place on the sky; a pixel of the grid gets what falls onto it. No light
-is lost or made, and neighbours of the grid share noise.
+The electrons of a pixel are distributed evenly over its area on the sky. A pixel of the grid receives those that fall
+into it. The total light is conserved, and neighbouring pixels of the grid have correlated noise.
 
-Grid          the pixels of the stack
-grid_of       one that covers images, north up
-pixel_map     where an image's pixels lie on a grid, and their areas there
-resampled     an image on a grid
-
-Ref : Fruchter & Hook 2002, PASP 114, 144
+References
+----------
+Fruchter & Hook 2002, PASP 114, 144.
 """
 
 from __future__ import annotations
@@ -26,31 +23,51 @@ from lake_schema.errors import BadInput, OutOfRange
 from truesky.reduction.calibration import ReducedImage
 from truesky.render.camera import astrometry, pointing
 
-# Pixels between the places that are projected; between them the map is a cubic spline: 1e-6 pixels.
+# Distance in pixels of projected positions. A cubic spline between them has an error of 1e-6 pixels.
 _NODES = 64
-# Side of a grid.
+# Largest side of a grid in pixels.
 _MAX_SIDE = 60_000
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Pixels of a map of the sky; shape : (ny, nx)."""
+    """Pixels of a map of the sky, with the shape (ny, nx)."""
 
     wcs: WCS
     shape: tuple[int, int]
 
     def window(self, x: int, y: int, shape: tuple[int, int]) -> Grid:
-        """A part of it, of which (x, y) is the first pixel."""
+        """Return a section of the grid.
+
+        Parameters
+        ----------
+        x, y : int
+            First pixel of the section.
+        shape : (int, int)
+            Shape of the section.
+
+        Returns
+        -------
+        Grid
+            The section.
+        """
         return Grid(astrometry.shift_pixels(self.wcs, -x, -y), shape)
 
 
 @dataclass(frozen=True, slots=True)
 class ResampledImage:
-    """An image on a grid, float32[ny, nx].
+    """An image on a grid; all arrays are float32[ny, nx].
 
-    image    : light in a pixel of the grid, 0 where there is none
-    cover    : which part of the pixel good pixels of the image cover
-    variance : of the pixel;  density : of a sum over many pixels, divided by their number: neighbours share noise
+    Attributes
+    ----------
+    image : float32 array
+        Light in each pixel of the grid, 0 without data.
+    cover : float32 array
+        Fraction of each pixel that good pixels of the image cover.
+    variance : float32 array
+        Variance of each pixel.
+    density : float32 array
+        Variance of a sum over many pixels per pixel. It is larger than `variance`, because neighbours share noise.
     """
 
     image: Float32
@@ -60,7 +77,27 @@ class ResampledImage:
 
 
 def covering_grid(images: Sequence[tuple[WCS, tuple[int, ...]]], scale: float) -> Grid:
-    """A gnomonic map, north up, that covers images (their systems and shapes); scale : arcsec a pixel."""
+    """Return a gnomonic map with north up that covers several images.
+
+    Parameters
+    ----------
+    images : sequence of (WCS, tuple of int)
+        WCS and shape of each image.
+    scale : float
+        Pixel scale in arcsec, 0.001 to 100.
+
+    Returns
+    -------
+    Grid
+        The grid.
+
+    Raises
+    ------
+    OutOfRange
+        If the scale is out of range.
+    BadInput
+        If a side of the grid would be too long.
+    """
     if not 1e-3 <= scale <= 100.0:
         raise OutOfRange("scale of the stack, arcsec", scale, 1e-3, 100.0)
     corners = [astrometry.sky_of_pixel(system, *_corners(shape)) for system, shape in images]
@@ -77,23 +114,40 @@ def covering_grid(images: Sequence[tuple[WCS, tuple[int, ...]]], scale: float) -
     system.wcs.radesys, system.wcs.lonpole = "ICRS", 180.0
     system.wcs.set()
     x, y = astrometry.pixel_of_sky(system, ra, dec)
-    # Edges bend: a pixel more on every side.
+    # Add a pixel on each side, because edges are curved.
     first = [int(np.floor(v.min())) - 1 for v in (x, y)]
     nx, ny = (int(np.ceil(v.max())) + 2 - low for v, low in zip((x, y), first, strict=True))
     if max(nx, ny) > _MAX_SIDE:
-        raise BadInput(f"images so far apart make a stack of {ny} x {nx} pixels: more than {_MAX_SIDE} along a side")
+        raise BadInput(f"images are too far apart: {ny} x {nx} pixels, at most {_MAX_SIDE} are allowed along a side")
     return Grid(astrometry.shift_pixels(system, -first[0], -first[1]), (ny, nx))
 
 
 def _corners(shape: tuple[int, ...]) -> tuple[Float, Float]:
     ny, nx = shape
-    # The middles of the sides, too: distortion bends them.
+    # Include the centres of the sides, since distortion bends the sides.
     x, y = np.meshgrid([-0.5, nx / 2, nx - 0.5], [-0.5, ny / 2, ny - 0.5])
     return x.ravel(), y.ravel()
 
 
 def pixel_map(system: WCS, shape: tuple[int, ...], grid: Grid) -> tuple[Float, Float]:
-    """(x and y on the grid [ny, nx, 2] of an image's pixels, their areas there [ny, nx], in its pixels)."""
+    """Return the positions and areas of an image's pixels on a grid.
+
+    Parameters
+    ----------
+    system : WCS
+        WCS of the image.
+    shape : tuple of int
+        Shape of the image.
+    grid : Grid
+        The grid.
+
+    Returns
+    -------
+    pixmap : float array, shape (ny, nx, 2)
+        x and y on the grid of each pixel of the image.
+    area : float array, shape (ny, nx)
+        Area of each pixel of the image, in pixels of the grid.
+    """
     nodes = [np.linspace(0.0, n - 1.0, max(n // _NODES + 1, 4)) for n in shape]
     columns, rows = np.meshgrid(nodes[1], nodes[0])
     sky = astrometry.sky_of_pixel(system, columns.ravel(), rows.ravel())
@@ -105,10 +159,27 @@ def pixel_map(system: WCS, shape: tuple[int, ...], grid: Grid) -> tuple[Float, F
 
 
 def resample(image: ReducedImage, pixmap: Float, area: Float, shape: tuple[int, int]) -> ResampledImage:
-    """An image on a grid of a shape; of its pixels those that have weight.
+    """Resample the pixels of an image with a weight above 0 to a grid.
 
-    pixmap, area : where its pixels lie, of `pixel_map`
-    Error : float32; a pixel's sides are taken as straight, and its light as even
+    Parameters
+    ----------
+    image : ReducedImage
+        The image.
+    pixmap : float array, shape (ny, nx, 2)
+        Positions of its pixels from `pixel_map`.
+    area : float array, shape (ny, nx)
+        Areas of its pixels from `pixel_map`.
+    shape : (int, int)
+        Shape of the grid.
+
+    Returns
+    -------
+    ResampledImage
+        The image on the grid.
+
+    Notes
+    -----
+    Results are in single precision. Pixels are assumed to have straight sides and uniform light.
     """
     good = image.weight > 0.0
     variance = np.zeros(image.weight.shape, np.float32)
@@ -119,7 +190,7 @@ def resample(image: ReducedImage, pixmap: Float, area: Float, shape: tuple[int, 
     image_drizzle.add_image(brightness, data2=(variance / area**2).astype(np.float32), **common)
     density_drizzle = Drizzle(kernel="square", out_shape=shape, fillval="0", disable_ctx=True)
     density_drizzle.add_image((variance / area).astype(np.float32), **common)
-    # The weight of a pixel is the part of its own area that falls onto the grid's.
+    # Drizzle's weight is the fraction of the image pixel's area that falls into the pixel of the grid.
     cover = np.asarray(image_drizzle.out_wht, np.float32) * float(np.mean(area))
     return ResampledImage(
         _without_nan(image_drizzle.out_img),

@@ -1,10 +1,11 @@
-"""Calibrated images of one field, in one band, onto one map of the sky.
+"""Stack calibrated images of one field in one band on a common map of the sky.
 
     python -m truesky.reduction.stack FILE .. --out FILE.fits [--scale ARCSEC] [--lake LAKE [--name REQUEST]]
 
-The extensions are SCI (e-/s a pixel, the sky in it), WHT (inverse variance a pixel of sums over many pixels), FLG, and
-with --lake PSF: what a point source in the middle is, three samples a pixel. Neighbouring pixels share noise: the
-variance of a pixel alone is less than 1 / WHT by the factor in the card CORRVAR.
+The extensions are SCI (electrons per second and pixel, including the sky), WHT (inverse variance per pixel of sums over
+many pixels) and FLG. With --lake, the extension PSF has a point source near the centre, with three samples per pixel.
+Neighbouring pixels share noise, so the variance of a single pixel is smaller than 1 / WHT, by the factor in the card
+CORRVAR.
 """
 
 from __future__ import annotations
@@ -31,17 +32,17 @@ from truesky.reduction.resampling import Grid, ResampledImage, covering_grid, pi
 from truesky.reduction.stacking import Contribution, Stack
 from truesky.render.camera import astrometry
 
-# What all images of a stack share.
+# Cards that must be equal in all images of a stack.
 _SHARED_CARDS = ("INSTRUME", "CHANNEL", "FILTER", "ZEROPNT")
-# What each of them says besides; the second are numbers above 0.
+# Other required cards; the second group must be numbers above 0.
 _REQUIRED_CARDS, _NUMBER_CARDS = ("IMAGETYP", "DETECTOR"), ("EXPOSURE", "EXPTIME", "GAIN", "PIXSCALE")
 
 
 def to_rate(image: ImageFile) -> ReducedImage:
-    """The image in e-/s."""
+    """Return an image in electrons per second."""
     if image.card("BUNIT") == "electron/s":
         return image.reduced
-    # Seconds in which there is one unit for each e-/s.
+    # Exposure time in which 1 e-/s gives one unit.
     time = float(image.card("EXPTIME")) / float(image.card("GAIN"))
     counts = image.reduced
     return ReducedImage(
@@ -50,7 +51,24 @@ def to_rate(image: ImageFile) -> ReducedImage:
 
 
 def stack_images(images: Sequence[tuple[ReducedImage, WCS]], scale: float) -> tuple[Stack, Grid, list[float]]:
-    """Images in e-/s, with their systems -> their stack, its grid, their weights; scale : arcsec a pixel."""
+    """Stack images.
+
+    Parameters
+    ----------
+    images : sequence of (ReducedImage, WCS)
+        Images in electrons per second, with their WCS.
+    scale : float
+        Pixel scale of the stack in arcsec.
+
+    Returns
+    -------
+    stack : Stack
+        The stack.
+    grid : Grid
+        Its pixels.
+    weights : list of float
+        Weight of each image.
+    """
     grid = covering_grid([(system, image.image.shape) for image, system in images], scale)
     placed: list[ResampledImage] = []
     weights = []
@@ -63,13 +81,13 @@ def stack_images(images: Sequence[tuple[ReducedImage, WCS]], scale: float) -> tu
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Prints a line about the stack."""
+    """Run the command, print a line about the stack, and return the exit status."""
     parser = argparse.ArgumentParser(prog="truesky stack", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("images", nargs="+", type=Path, help="files that truesky.reduction.reduce has written")
+    parser.add_argument("images", nargs="+", type=Path, help="files of truesky.reduction.reduce")
     parser.add_argument("--out", type=Path, required=True, help="FITS file of the stack")
-    parser.add_argument("--scale", type=float, help="arcsec a pixel (default: the detectors')")
-    parser.add_argument("--lake", help="folder of the lake that the images are of: for the PSF")
-    parser.add_argument("--name", help="of the request whose frames are meant, where the lake has several")
+    parser.add_argument("--scale", type=float, help="pixel scale in arcsec (default: the detectors')")
+    parser.add_argument("--lake", help="folder of the lake with the raw images, to add the PSF")
+    parser.add_argument("--name", help="request whose frames are used, if the lake has several")
     options = parser.parse_args(argv)
     return command.run("stack", lambda: _write_stack(options))
 
@@ -98,7 +116,7 @@ def _write_stack(options: argparse.Namespace) -> int:
     print(
         f"{out}: {len(images)} images on {ny} x {nx} pixels of {scale:g} arcsec, "
         f"{100 * hit:.2f} % with a value rejected, "
-        f"variance of 8x8 sums {correlation:.2f} times that of as many pixels alone"
+        f"variance of 8x8 sums {correlation:.2f} times that of independent pixels"
     )
     return 0
 
@@ -108,8 +126,8 @@ def _refuse_different(paths: Sequence[Path], images: Sequence[ImageFile]) -> Non
         _refuse_other(path, image)
         for keyword in _SHARED_CARDS:
             if image.card(keyword) != images[0].card(keyword):
-                problem = f"{keyword} = {image.card(keyword)}, that of {paths[0].name} is {images[0].card(keyword)}"
-                raise BadInput(f"{user_files.format_path(path)}: {problem}: they make no stack")
+                problem = f"{keyword} = {image.card(keyword)}, but {paths[0].name} has {images[0].card(keyword)}"
+                raise BadInput(f"{user_files.format_path(path)}: {problem}: images of a stack must have equal values")
     identities = [(image.card("EXPOSURE"), image.card("DETECTOR")) for image in images]
     for path, identity in zip(paths, identities, strict=True):
         if identities.count(identity) > 1:
@@ -119,19 +137,19 @@ def _refuse_different(paths: Sequence[Path], images: Sequence[ImageFile]) -> Non
 
 
 def _refuse_other(path: Path, image: ImageFile) -> None:
-    """What is no image of truesky.reduction.reduce."""
+    """Check that a file is an image of truesky.reduction.reduce."""
     if image.card("IMAGETYP") == "stack":
-        raise BadInput(f"{user_files.format_path(path)}: is a stack: give the images that it was made of")
+        raise BadInput(f"{user_files.format_path(path)}: is a stack: use the images from which it was made")
     for keyword in (*_SHARED_CARDS, *_REQUIRED_CARDS, *_NUMBER_CARDS):
         value = image.card(keyword)
         if value is None:
             raise BadInput(f"{user_files.format_path(path)}: has no card {keyword}")
         if keyword in _NUMBER_CARDS and not (isinstance(value, int | float) and 0.0 < value < np.inf):
-            raise BadInput(f"{user_files.format_path(path)}: {keyword} = {value!r} is no number above 0")
+            raise BadInput(f"{user_files.format_path(path)}: {keyword} = {value!r} must be a number above 0")
 
 
 def _find_frames(root: Path, images: Sequence[ImageFile], request: str | None) -> list[Frame]:
-    """The lake's frames of the images."""
+    """Return the frames in the lake from which the images were made."""
     numbers = {int(image.card("EXPOSURE")) for image in images}
     names = sorted({str(image.card("DETECTOR")) for image in images})
     frames_by_key = {
@@ -147,19 +165,19 @@ def _find_frames(root: Path, images: Sequence[ImageFile], request: str | None) -
 
 
 def _central_psf(contributions: Sequence[Contribution], grid: Grid, stack: Stack) -> Image:
-    """Where the stack is deepest, as near to its middle as can be."""
+    """Return the PSF near the centre of the stack, at a position where it is deepest."""
     x, y = _deepest_place(stack.reduced.weight)
     ra, dec = astrometry.sky_of_pixel(grid.wcs, [x], [y])
     cards: tuple[Card, ...] = (
-        ("PSFSAMP", stacking.PSF_SAMPLES, "samples a pixel"),
-        ("PSFRA", float(ra[0]), "[deg] place that it is of"),
-        ("PSFDEC", float(dec[0]), "[deg] place that it is of"),
+        ("PSFSAMP", stacking.PSF_SAMPLES, "samples per pixel"),
+        ("PSFRA", float(ra[0]), "[deg] position of the PSF"),
+        ("PSFDEC", float(dec[0]), "[deg] position of the PSF"),
     )
     return Image(stacking.effective_psf(contributions, grid, x, y).astype(np.float32), cards, "PSF")
 
 
 def _deepest_place(weight: Float) -> tuple[float, float]:
-    """(x, y): of the deepest quarter of the pixels, away from edges if some are, the one nearest to their mean."""
+    """Return (x, y) of the central pixel among the deepest quarter, if possible away from edges."""
     if not weight.any():
         return 0.0, 0.0
     deep = weight >= np.percentile(weight[weight > 0.0], 75.0)
@@ -178,8 +196,8 @@ def _stack_cards(images: Sequence[ImageFile], grid: Grid, scale: float, correlat
     return (
         *shared_cards.values(),
         ("IMAGETYP", "stack", "image type"),
-        ("BUNIT", "electron/s", "unit of SCI; of WHT its inverse square"),
-        ("GAIN", sum(time for _, time in exposures), "[electron/(electron/s)] of the deepest places"),
+        ("BUNIT", "electron/s", "unit of SCI; WHT has its inverse square"),
+        ("GAIN", sum(time for _, time in exposures), "[electron/(electron/s)] at the deepest pixels"),
         ("NCOMBINE", len(images), "images"),
         ("TEXPTIME", sum(time for _, time in exposures), "[s] of all exposures"),
         ("PIXSCALE", scale, "[arcsec/pix] pixel scale"),

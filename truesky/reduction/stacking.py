@@ -1,10 +1,8 @@
-"""Resampled images of the same sky combined into one, without cosmic rays and whatever else is in one of them alone.
+"""Combine resampled images of the same sky, without cosmic rays and other outliers of single images.
 
-combined             images on a grid -> their weighted mean, its weight and flags
-noise_correlation    how much more the noise of sums is than their pixels tell
-effective_psf        what a point source is in the stack
-
-Ref : Gruen, Seitz & Bernstein 2014, PASP 126, 158: the clipped mean of SWarp
+References
+----------
+Gruen, Seitz & Bernstein 2014, PASP 126, 158: the clipped mean of SWarp.
 """
 
 from __future__ import annotations
@@ -23,18 +21,20 @@ from truesky.reduction.calibration import COSMIC_RAY, NO_DATA, ReducedImage
 from truesky.reduction.resampling import Grid, ResampledImage, pixel_map, resample
 from truesky.render.camera import astrometry
 
-# Part of a pixel that an image covers, to count there.
+# Smallest fraction of a pixel that an image must cover to be used there.
 _MIN_COVER = 0.5
-# From the median: standard deviations, part of it, and part of its largest step to a neighbour: pixels of undersampled
-# stars differ from dither to dither (Gruen et al. 2014; the last as Fruchter & Hook 2002).
+# Allowed difference from the median: standard deviations, fraction of the median, and fraction of its largest step to
+# a neighbour. Pixels of undersampled stars differ between dithers (Gruen et al. 2014; the last one as in Fruchter &
+# Hook 2002).
 _SIGMAS, _PART, _STEP = 5.0, 0.1, 1.0
-# The same for the neighbours of what is rejected.
+# Factor of the standard deviations for neighbours of rejected pixels.
 _NEIGHBOUR_FACTOR = 0.4
-# Where noise is measured: weight over the median one; widths of the Gaussians, pixels, with which sources are found.
+# Noise is measured in pixels with at least this weight relative to the median. Sources are found with Gaussians of
+# these widths in pixels.
 _MIN_DEPTH, _WIDTHS = 0.7, (1.5, 6.0)
 # Side of the blocks whose sums are compared with pixels.
 BLOCK = 8
-# Side of the effective PSF, grid pixels (odd), and samples of it a pixel.
+# Side of the effective PSF in pixels of the grid (odd), and its samples per pixel.
 PSF_SIDE, PSF_SAMPLES = 41, 3
 
 
@@ -42,8 +42,13 @@ PSF_SIDE, PSF_SAMPLES = 41, 3
 class Stack:
     """A combined image.
 
-    reduced  : e-/s in a pixel of the grid; weight: inverse variance a pixel of sums over many pixels; flags
-    variance : float32[ny, nx] of the pixels alone, which share their noise with their neighbours
+    Attributes
+    ----------
+    reduced : ReducedImage
+        Electrons per second in each pixel of the grid, and flags. The weight is the inverse variance per pixel of sums
+        over many pixels.
+    variance : float32 array, shape (ny, nx)
+        Variance of single pixels, which share noise with their neighbours.
     """
 
     reduced: ReducedImage
@@ -51,9 +56,20 @@ class Stack:
 
 
 def combine(images: Sequence[ResampledImage], weights: Sequence[float]) -> Stack:
-    """The mean of images [ny, nx] on the same grid, each with one weight for all of its pixels.
+    """Return the weighted mean of images on the same grid.
 
-    weights : of the images; the same all over an image, or a star would have another PSF than a faint galaxy
+    Parameters
+    ----------
+    images : sequence of ResampledImage
+        The images.
+    weights : sequence of float
+        Weight of each image. It is the same for all pixels of an image, so that bright and faint sources have the same
+        PSF.
+
+    Returns
+    -------
+    Stack
+        The mean.
     """
     light, cover, variance, density = (
         np.stack([getattr(image, name) for image in images]) for name in ("image", "cover", "variance", "density")
@@ -73,14 +89,30 @@ def combine(images: Sequence[ResampledImage], weights: Sequence[float]) -> Stack
 
 
 def outliers(light: Float, sigma: Float, is_covered: Bool) -> Bool:
-    """Pixels [n, ny, nx] that are unlike those of the other images, and what is a little so beside them.
+    """Find pixels that differ from the other images, and neighbours of such pixels with smaller differences.
 
-    Of two images the fainter one is believed; one alone is.
+    Parameters
+    ----------
+    light : float array, shape (n, ny, nx)
+        Images.
+    sigma : float array, shape (n, ny, nx)
+        Noise of the images.
+    is_covered : bool array, shape (n, ny, nx)
+        True for pixels with data.
+
+    Returns
+    -------
+    bool array, shape (n, ny, nx)
+        True for outliers.
+
+    Notes
+    -----
+    Of two images, the fainter is taken as correct. A single image has no outliers.
     """
     count = is_covered.sum(axis=0)
     inside = np.where(is_covered, light, np.inf)
     ordered = np.sort(inside, axis=0)
-    # The median; of two, and between two, the lower.
+    # The median; for an even number of values, the lower of the two central ones.
     middle = np.take_along_axis(ordered, np.maximum(count - 1, 0)[None] // 2, axis=0)[0]
     middle = np.where(count > 0, middle, 0.0)
     noise = np.where(is_covered, sigma, 0.0).max(axis=0)
@@ -93,28 +125,36 @@ def outliers(light: Float, sigma: Float, is_covered: Bool) -> Bool:
 
 
 def noise_correlation(stack: Stack) -> float:
-    """Variance of sums of blocks of 8 x 8 pixels over 64 times that of the pixels, where there are no sources.
+    """Return the variance of sums over blocks of 8 x 8 pixels without sources, over 64 times the variance of pixels.
 
-    returns : 1 where pixels share no noise; NaN where too few blocks are empty
+    Parameters
+    ----------
+    stack : Stack
+        The stack.
+
+    Returns
+    -------
+    float
+        Ratio, 1 for independent pixels; NaN if there are too few blocks without sources.
     """
     image, good = stack.reduced.image.astype(float), stack.reduced.flags == 0
     weight = stack.reduced.weight.astype(float)
     if not good.any():
         return float("nan")
-    # At the edges the sky is badly known.
+    # The sky is uncertain at the edges.
     good &= weight >= _MIN_DEPTH * np.median(weight[good])
     floor = float(np.median(1.0 / weight[good]))
     above = np.where(good, image - calibration.sky_level(image, good), 0.0)
     source = np.zeros(image.shape, bool)
     for width in _WIDTHS:
-        # Noise of a mean over a Gaussian.
+        # Noise of an average with Gaussian weights.
         noise = np.sqrt(floor / (4.0 * np.pi)) / width
         bright = ndimage.gaussian_filter(above, width) > 4.0 * noise
         source |= ndimage.binary_dilation(bright, iterations=round(2 * width))
     ny, nx = (n // BLOCK * BLOCK for n in image.shape)
     empty = np.where(good & ~source, above * np.sqrt(weight), np.nan)[:ny, :nx]
     blocks = empty.reshape(ny // BLOCK, BLOCK, nx // BLOCK, BLOCK)
-    # Of differences from the next block but one: they share no noise, and next to all of the sky.
+    # Use differences between blocks two apart, which have independent noise and nearly the same sky.
     sums, pixels = (
         _lagged_differences(values, 2) for values in (blocks.sum(axis=(1, 3)), blocks.transpose(0, 2, 1, 3))
     )
@@ -124,20 +164,34 @@ def noise_correlation(stack: Stack) -> float:
 
 
 def _lagged_differences(values: Float, lag: int) -> Float:
-    """Differences of values so far apart along the first two axes, those that are numbers."""
+    """Return finite differences of values at distance `lag` along the first two axes."""
     differences = np.concatenate([(values[lag:] - values[:-lag]).ravel(), (values[:, lag:] - values[:, :-lag]).ravel()])
     return np.asarray(differences[np.isfinite(differences)])
 
 
 def _clipped_variance(values: Float) -> float:
-    """Without what is four standard deviations, of the median's, from the median."""
+    """Return the variance of values within four standard deviations (from the median deviation) of the median."""
     off = values - np.median(values)
     return float(np.var(off[np.abs(off) < 4.0 * 1.4826 * np.median(np.abs(off))]))
 
 
 @dataclass(frozen=True, slots=True)
 class Contribution:
-    """What of an image makes the PSF of a stack; profile : galsim object in its detector's axes, without the pixel."""
+    """Properties of an image that contribute to the PSF of a stack.
+
+    Attributes
+    ----------
+    wcs : WCS
+        WCS of the image.
+    shape : tuple of int
+        Shape of the image.
+    profile : galsim object
+        PSF in the detector's axes, without the pixel.
+    pixel_scale : float
+        Pixel scale in arcsec.
+    weight : float
+        Weight of the image in the stack.
+    """
 
     wcs: WCS
     shape: tuple[int, ...]
@@ -147,12 +201,27 @@ class Contribution:
 
 
 def effective_psf(images: Sequence[Contribution], grid: Grid, x: float, y: float) -> Float:
-    """What a source at (x, y) of the grid is in the stack: float64[side, side], of sum 1 but for what lies beyond.
+    """Return the effective PSF of a stack at a position.
 
-    images  : of the stack
-    returns : PSF_SAMPLES samples a pixel, the pixel in it (an effective PSF: its values are those of pixels at such
-              offsets from the source); its middle sample is the source's place
-    Error   : the PSF is that of the middle of each detector
+    Parameters
+    ----------
+    images : sequence of Contribution
+        Images of the stack.
+    grid : Grid
+        Grid of the stack.
+    x, y : float
+        Position on the grid in pixels.
+
+    Returns
+    -------
+    float array, shape (PSF_SIDE PSF_SAMPLES, PSF_SIDE PSF_SAMPLES)
+        PSF with `PSF_SAMPLES` samples per pixel, with the source at the central sample. It includes the pixel: each
+        value is the value of a pixel at this offset from the source. The sum over samples at whole pixels is 1, less
+        the light outside the array.
+
+    Notes
+    -----
+    The PSF at the centre of each detector is used for the whole detector.
     """
     n, half = PSF_SAMPLES, PSF_SIDE // 2
     out = np.zeros((PSF_SIDE * n, PSF_SIDE * n))
@@ -180,12 +249,12 @@ def _covers(image: Contribution, window: Grid, half: int) -> bool:
 
 
 def _draw_point_source(image: Contribution, window: Grid, x: float, y: float) -> Float | None:
-    """A point source at (x, y) of a window, drawn on the image's pixels about it and resampled like the image."""
+    """Draw a point source at (x, y) of a window on the image's pixels, and resample it; None if it is outside."""
     if not _covers(image, window, PSF_SIDE // 2):
         return None
     sky = astrometry.sky_of_pixel(window.wcs, [x], [y])
     column, row = (float(v[0]) for v in astrometry.pixel_of_sky(image.wcs, *sky))
-    # A quarter more on every side: the detector may be turned against the grid.
+    # Draw an area larger by half, since the detector may be rotated relative to the grid.
     side = 2 * (3 * PSF_SIDE // 4) + 1
     first_column, first_row = round(column) - side // 2, round(row) - side // 2
     offset = column - first_column - (side - 1) / 2, row - first_row - (side - 1) / 2

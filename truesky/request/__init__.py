@@ -1,4 +1,4 @@
-"""The simulation request: what it may hold, how it is read and checked."""
+"""Read and check simulation requests."""
 
 from truesky.request.from_toml import parse
 from truesky.request.schema import Request

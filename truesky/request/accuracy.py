@@ -1,8 +1,6 @@
-"""Accuracy: how wrong a user allows a product to be.  What it buys in speed is looked up, never chosen by name.
+"""Find the fastest drawing settings whose errors are within the accuracy that a request allows.
 
-Accuracy     what is asked for: the presets, or numbers of one's own
-row_for      the cheapest measured settings of drawing (accuracy.csv) that are within it
-reached      what these were measured to be wrong by
+A request sets the accuracy by the name of a preset or by numbers. Settings with measured errors are in accuracy.csv.
 """
 
 from __future__ import annotations
@@ -20,12 +18,23 @@ _TABLE = Path(__file__).with_name("accuracy.csv")
 
 @dataclass(frozen=True, slots=True)
 class Accuracy:
-    """Largest errors that are allowed.
+    """Largest errors that a request allows.
 
-    flux       : fraction of a source's flux
-    shape      : of a reduced-shear component: the multiplicative error of the response to shear, and the additive one
-    position   : pixels
-    background : of the noise of a pixel of the sky, whatever light is drawn on it
+    Attributes
+    ----------
+    flux : float
+        Relative error of a source's flux.
+    shape : float
+        Error of each component of reduced shear: multiplicative error of the response to shear, and additive error.
+    position : float
+        Error of a source's position in pixels.
+    background : float
+        Error of the light drawn in a pixel, as a fraction of the noise of a sky pixel, for any source.
+
+    Raises
+    ------
+    OutOfRange
+        If a value is outside 1e-12 to 1.
     """
 
     flux: float
@@ -43,14 +52,14 @@ class Accuracy:
 QUICKLOOK = Accuracy(flux=1e-2, shape=2e-2, position=3e-2, background=0.5)
 DRAFT = Accuracy(flux=5e-3, shape=1e-3, position=1e-3, background=0.1)
 SURVEY = Accuracy(flux=1e-3, shape=1e-4, position=1e-4, background=0.02)
-# As fine as can be confirmed: of bright bulges the middle is known to 6e-3 of the sky's noise (3e-6 of its light: the
-# table of Sersic profiles), however large the stamp.
+# The finest accuracy that can be verified. The centres of bright bulges are known to 6e-3 of the sky noise for any
+# size of the stamp; the table of Sersic profiles limits them to 3e-6 of the light.
 REFERENCE = Accuracy(flux=1e-4, shape=1e-5, position=1e-5, background=0.006)
 PRESETS = {"quicklook": QUICKLOOK, "draft": DRAFT, "survey": SURVEY, "reference": REFERENCE}
 
 
 def preset(name: str) -> Accuracy:
-    """The accuracy that a preset's name stands for."""
+    """Return the accuracy with the name `name`; raises BadInput if no preset has this name."""
     if name not in PRESETS:
         raise BadInput(f"accuracy = {name!r} is not one of {', '.join(PRESETS)}")
     return PRESETS[name]
@@ -58,10 +67,28 @@ def preset(name: str) -> Accuracy:
 
 @cache
 def fastest_row(allowed: Accuracy) -> dict[str, float]:
-    """The row of accuracy.csv that takes the least time of those within an accuracy.
+    """Return the row of accuracy.csv with the least CPU time among the rows with the allowed accuracy.
 
-    A row is within it if its errors are, of the sources that it was chosen on and of the others (_held).
-    Raises BadInput naming each number that is beyond reach, and the best there is: the last row's, in all four.
+    Parameters
+    ----------
+    allowed : Accuracy
+        Largest errors that are allowed.
+
+    Returns
+    -------
+    dict of str to float
+        Settings, errors and CPU seconds.
+
+    Raises
+    ------
+    BadInput
+        If no row is accurate enough. The message names each number that cannot be reached, and the best value:
+        the value of the last row, which has the smallest errors of all four kinds.
+
+    Notes
+    -----
+    A row qualifies if its errors are small enough for two sets of sources: the sources for which the settings were
+    chosen, and other sources (columns that end with ``_held``).
     """
     table = rows()
     good = [row for row in table if all(_error(row, name) <= value for name, value in asdict(allowed).items())]
@@ -69,7 +96,7 @@ def fastest_row(allowed: Accuracy) -> dict[str, float]:
         return min(good, key=lambda row: row["seconds"])
     best = {name: _error(table[-1], name) for name in asdict(allowed)}
     lines = [
-        f"accuracy.{name} = {value:g} is beyond reach, the best is {_round_up(best[name])}"
+        f"accuracy.{name} = {value:g} cannot be reached, the best is {_round_up(best[name])}"
         for name, value in asdict(allowed).items()
         if value < best[name]
     ]
@@ -77,13 +104,13 @@ def fastest_row(allowed: Accuracy) -> dict[str, float]:
 
 
 def expected_errors(allowed: Accuracy) -> Accuracy:
-    """Largest errors of drawing for an accuracy, of sources that its settings were not chosen on."""
+    """Return the largest errors of the settings for an accuracy, measured on sources for which they were not chosen."""
     row = fastest_row(allowed)
     return Accuracy(**{item.name: row[f"{item.name}_held"] for item in fields(Accuracy)})
 
 
 def rows() -> tuple[dict[str, float], ...]:
-    """accuracy.csv: settings of drawing, the errors they make, the seconds they take."""
+    """Return the rows of accuracy.csv: drawing settings, their errors, and their CPU time in seconds."""
     return _read(_TABLE)
 
 
@@ -99,7 +126,7 @@ def _error(row: dict[str, float], name: str) -> float:
 
 
 def _round_up(value: float) -> str:
-    """Two digits, rounded up: what is said to be the best can be asked for."""
+    """Return a number with two digits, rounded up, so that a request with this number is accepted."""
     low = f"{value:.1e}"
     if float(low) >= value:
         return f"{float(low):g}"

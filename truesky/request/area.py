@@ -1,8 +1,4 @@
-"""A part of the sky that a request asks for: which HEALPix cells it touches, and which places lie in it.
-
-Area       its form
-parse      [area] of a request -> Area
-"""
+"""Area of the sky that a request covers: the HEALPix cells it touches, and tests of positions."""
 
 from __future__ import annotations
 
@@ -21,8 +17,8 @@ from truesky.numerics import matrices
 from truesky.request.toml_values import Toml, as_table, boolean, checked_number, integer, number, number_pair
 
 _FORMS = ("polygon", "cone", "box", "tile", "patches", "wide")
-# The wide survey leaves out what lies nearer to the Galactic and the ecliptic plane, deg: limits that leave about the
-# 15 000 deg2 of Serrano et al. 2024 (adopted; its own region follows maps of stars, dust and zodiacal light).
+# The wide survey omits positions within these angles (deg) of the Galactic and ecliptic planes. The values are adopted:
+# they leave about the 15 000 deg2 of Serrano et al. 2024, whose region follows maps of stars, dust and zodiacal light.
 _GALACTIC_MIN, _ECLIPTIC_MIN = 30.0, 15.0
 _MAX_VERTICES, _MAX_PATCHES = 1000, 1000
 _RA, _DEC = ("ra", -360.0, 360.0), ("dec", -90.0, 90.0)
@@ -30,9 +26,20 @@ _RA, _DEC = ("ra", -360.0, 360.0), ("dec", -90.0, 90.0)
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """A convex spherical polygon (vertices), a box (west, east, south, north), a circle (ra, dec, radius), deg.
+    """A convex spherical polygon, a box, a circle, several circles, or the sky of the wide survey.
 
-    patches : circles (ra, dec, radius);  wide : the sky of the wide survey
+    Attributes
+    ----------
+    vertices : tuple of (float, float)
+        Right ascension and declination of the vertices of a polygon in degrees.
+    box : (float, float, float, float), optional
+        West, east, south and north limits in degrees. East may be smaller than west if the box crosses 0.
+    ra, dec, radius : float
+        Centre and radius of a circle in degrees.
+    patches : tuple of (float, float, float)
+        Right ascension, declination and radius of several circles in degrees.
+    wide : bool
+        True for the sky of the wide survey.
     """
 
     vertices: tuple[tuple[float, float], ...] = ()
@@ -44,7 +51,7 @@ class Area:
     wide: bool = False
 
     def cells(self, order: int = GENERATION_ORDER) -> list[int]:
-        """Nested cells of `order` that the area touches, ascending."""
+        """Return the nested HEALPix cells of `order` that the area touches, in ascending order."""
         if self.wide:
             all_cells = np.arange(12 << (2 * order))
             touched = self.contains(*sky.cell_centres(order, all_cells), 2 * sky.cell_radius(order))
@@ -59,13 +66,38 @@ class Area:
         return [int(cell) for cell in sky.cells_in_cone(self.ra, self.dec, self.radius, order)]
 
     def contains(self, ra: npt.ArrayLike, dec: npt.ArrayLike, margin: float = 0.0) -> Bool:
-        """[n] Which places lie in the area, or not farther than `margin` deg from it."""
+        """Return True for positions in the area, or outside it by at most `margin`.
+
+        Parameters
+        ----------
+        ra, dec : float array, shape (n,)
+            Positions in degrees.
+        margin : float, optional
+            Largest distance from the area in degrees.
+
+        Returns
+        -------
+        bool array, shape (n,)
+            True for positions in the area or its margin.
+        """
         return np.asarray(self.depth(ra, dec) >= -margin)
 
     def depth(self, ra: npt.ArrayLike, dec: npt.ArrayLike) -> Float:
-        """[n] deg from each place to the area's edge, negative outside.
+        """Return the distance from each position to the edge of the area in degrees, negative outside the area.
 
-        Error : outside a corner of a polygon or a box the true distance is larger
+        Parameters
+        ----------
+        ra, dec : float array, shape (n,)
+            Positions in degrees.
+
+        Returns
+        -------
+        float array, shape (n,)
+            Distance to the edge in degrees.
+
+        Notes
+        -----
+        Outside a corner of a polygon or box, the true distance is larger than the result.
         """
         lon, lat = np.asarray(ra, float), np.asarray(dec, float)
         if self.wide:
@@ -85,7 +117,7 @@ class Area:
         return self.radius - sky.separation(lon, lat, self.ra, self.dec)
 
     def bounding_circle(self) -> tuple[float, float, float]:
-        """ra, dec, radius of a circle that holds the area, deg."""
+        """Return right ascension, declination and radius (degrees) of a circle that contains the area."""
         if self.wide:
             return 0.0, 0.0, 180.0
         corners = np.array([patch[:2] for patch in self.patches] or self.vertices or _corners_of(self.box))
@@ -109,7 +141,7 @@ def _polygon_depth(vertices: Sequence[tuple[float, float]], ra: Float, dec: Floa
     corners = sky.unit_vectors(*np.array(vertices).T)
     sides = np.cross(corners, np.roll(corners, -1, 0))
     sides /= np.sqrt(np.sum(sides**2, axis=1, keepdims=True))
-    # Vertices may run either way round.
+    # Vertices may be in clockwise or counterclockwise order.
     sides *= np.sign(matrices.matmul(sides[0], corners[2]))
     x, y = np.radians(ra), np.radians(dec)
     place = np.stack([np.cos(y) * np.cos(x), np.cos(y) * np.sin(x), np.sin(y)])
@@ -121,10 +153,28 @@ def _polygon_depth(vertices: Sequence[tuple[float, float]], ra: Float, dec: Floa
 
 
 def parse(table: Toml, path: str = "area") -> Area:
-    """A parsed [area] -> Area; BadInput names the key."""
+    """Read the section `area` of a request.
+
+    Parameters
+    ----------
+    table : Toml
+        The section, with exactly one key.
+    path : str, optional
+        Name of the section for messages.
+
+    Returns
+    -------
+    Area
+        The area.
+
+    Raises
+    ------
+    BadInput
+        If the section is not valid. The message names the key.
+    """
     table = as_table(table, path, set(_FORMS))
     if len(table) != 1:
-        raise BadInput(f"{path} wants exactly one of {', '.join(_FORMS)}")
+        raise BadInput(f"{path} must have exactly one of {', '.join(_FORMS)}")
     readers = {
         "polygon": lambda: _polygon(table["polygon"], f"{path}.polygon"),
         "cone": lambda: _cone(table["cone"], f"{path}.cone"),
@@ -146,10 +196,10 @@ def _box(value: object, path: str) -> Area:
     box = as_table(value, path, {"ra", "dec"})
     west, east = number_pair(box, f"{path}.ra", -360.0, 720.0)
     south, north = number_pair(box, f"{path}.dec", -90.0, 90.0)
-    # [350, 10] crosses 0.
+    # The range [350, 10] crosses 0.
     width = east - west + (360.0 if east < west else 0.0)
     if not 0.0 < width < 180.0:
-        raise BadInput(f"{path}.ra = [{west}, {east}]: the second must lie to the east of the first, by less than 180")
+        raise BadInput(f"{path}.ra = [{west}, {east}]: the second must be east of the first by less than 180 deg")
     if not north > south:
         raise BadInput(f"{path}.dec = [{south}, {north}]: the second must be larger")
     return Area(box=(west % 360.0, east % 360.0, south, north))
@@ -176,14 +226,14 @@ def _patches(value: object, path: str) -> Area:
 def _coordinate_lists(
     value: object, path: str, min_count: int, max_count: int, *bounds: tuple[str, float, float]
 ) -> list[list[float]]:
-    """A list of lists of numbers, right ascension first; bounds : name, from, to of each number."""
+    """Read a list of lists of numbers, right ascension first. `bounds` has the name and both limits of each number."""
     form = f"[{', '.join(name for name, _, _ in bounds)}]"
     if not isinstance(value, list) or not min_count <= len(value) <= max_count:
-        raise BadInput(f"{path} wants a list of {min_count} to {max_count} {form}")
+        raise BadInput(f"{path} must be a list of {min_count} to {max_count} {form}")
     places = []
     for i, place in enumerate(value):
         if not isinstance(place, list) or len(place) != len(bounds):
-            raise BadInput(f"{path}[{i}] wants {form}")
+            raise BadInput(f"{path}[{i}] must be {form}")
         numbers = zip(place, bounds, strict=True)
         ra, *rest = (checked_number(number, f"{path}[{i}].{name}", lo, hi) for number, (name, lo, hi) in numbers)
         places.append([ra % 360.0, *rest])
@@ -192,5 +242,5 @@ def _coordinate_lists(
 
 def _wide(enabled: bool, path: str) -> Area:
     if not enabled:
-        raise BadInput(f"{path}.wide = false asks for nothing")
+        raise BadInput(f"{path}.wide must be true, got false: select another area or delete the key")
     return Area(wide=True)

@@ -1,7 +1,6 @@
-"""In which passbands a request's exposures are taken: fluxes in these are computed where it names no others.
+"""Find the passbands in which the exposures of a request are taken.
 
-of_request    of all pointings and observations
-of_block      of one observation
+Fluxes are computed in these passbands if the request does not name others.
 """
 
 from __future__ import annotations
@@ -19,9 +18,24 @@ if TYPE_CHECKING:
 
 
 def requested_bands(request: Request, mission: MissionConfiguration) -> tuple[str, ...]:
-    """Each passband once, in the order in which the request names them; then those in which sources are chosen.
+    """Return the passbands of all pointings and observations, then the passbands in which sources are selected.
 
-    Errors : BadInput names the observation that asks for a band which its channels do not have
+    Parameters
+    ----------
+    request : Request
+        The request.
+    mission : MissionConfiguration
+        Mission parameters, with the bands of the ground surveys.
+
+    Returns
+    -------
+    tuple of str
+        Each passband once, in the order of the request.
+
+    Raises
+    ------
+    BadInput
+        If no channel of an observation has a band that the observation names. The message names the observation.
     """
     bands = [pointing.band for pointing in request.pointings]
     for i, block in enumerate(request.observations):
@@ -33,7 +47,7 @@ def requested_bands(request: Request, mission: MissionConfiguration) -> tuple[st
 
 
 def _selection_bands(request: Request) -> list[str]:
-    """Passbands that no exposure need be taken in: sources are chosen by their fluxes in these."""
+    """Return the passbands in which sources are selected; the request may have no exposure in them."""
     channels = [pointing.channel for pointing in request.pointings]
     for block in request.observations:
         channels += block.channels if block.table is None else [channel for channel, _ in block.table.kinds]
@@ -41,7 +55,25 @@ def _selection_bands(request: Request) -> list[str]:
 
 
 def observation_bands(block: Observation, mission: MissionConfiguration) -> tuple[str, ...]:
-    """Passbands in which an observation's exposures may be taken; BadInput names one that nothing of it has."""
+    """Return the passbands in which an observation may take exposures.
+
+    Parameters
+    ----------
+    block : Observation
+        The observation.
+    mission : MissionConfiguration
+        Mission parameters, with the bands of the ground surveys.
+
+    Returns
+    -------
+    tuple of str
+        The passbands.
+
+    Raises
+    ------
+    BadInput
+        If the observation names a passband that its channels or its ground survey do not have.
+    """
     if block.table is not None:
         return block.table.bands
     if "EXT" in block.channels:
@@ -49,7 +81,7 @@ def observation_bands(block: Observation, mission: MissionConfiguration) -> tupl
         return _select(block.bands, [b for rule in rules for b in rule["bands"].split()], f"survey {block.survey}")
     available = [b for channel in block.channels for b in EUCLID_BANDS[channel] if b != "nisp_blue" or block.blue]
     selected = _select(block.bands, available, ", ".join(block.channels))
-    # A choice is one of filters: a channel of which none is named takes all of its own.
+    # A channel without any named filter uses all its filters.
     return tuple(
         band
         for channel in block.channels

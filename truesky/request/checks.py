@@ -1,9 +1,4 @@
-"""What is checked of a whole request: its bands, the mission's parameters, and whether any of it can be rendered.
-
-check_bands, check_mission   of names and values
-check_rendered               all of it can be rendered
-skipped                      what of it cannot, as one line
-"""
+"""Check a whole request: its sources, bands, mission parameters, and whether all of it can be rendered."""
 
 from __future__ import annotations
 
@@ -21,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def check_sources(request: Request) -> None:
-    """Where a request names its sources, nothing else makes some."""
+    """Raise BadInput if a request names all its sources and also has a section that adds other sources."""
     other_sections = {
         "ingest": request.ingest != Ingest(),
         "stars": request.stars != Stars(),
@@ -30,11 +25,14 @@ def check_sources(request: Request) -> None:
     if request.sources is not None:
         for key, is_present in other_sections.items():
             if is_present:
-                raise BadInput(f"sources: those of the tables are the only ones, but there is a section {key}")
+                raise BadInput(f"sources: the tables contain all sources, the section {key} is not allowed")
 
 
 def check_bands(request: Request) -> None:
-    """Refuse a user's passband for a camera that has no zero point, sky and seeing in it: any but VIS and its own."""
+    """Raise BadInput if a camera would observe in a user's passband for which it has no zero point, sky and seeing.
+
+    VIS can observe in any passband of the user, and a user's camera in its passbands.
+    """
     user_passbands = {name for name, _ in request.curves.passbands}
     of_cameras = {(camera.name, curve.band) for camera in request.mission.cameras for curve in camera.curves}
     for i, pointing in enumerate(request.pointings):
@@ -42,16 +40,33 @@ def check_bands(request: Request) -> None:
             continue
         if pointing.band in user_passbands and pointing.channel != "VIS":
             problem = (
-                f"{pointing.band} is your own passband, in which camera {pointing.camera} has no zero point and sky"
+                f"{pointing.band} is a user passband, for which camera {pointing.camera} has no zero point and sky"
             )
-            raise BadInput(f"pointing[{i}].band: {problem}: only VIS can be pointed in it")
+            raise BadInput(f"pointing[{i}].band: {problem}: only VIS can observe in it")
     for i, block in enumerate(request.observations):
         if user_bands := sorted(user_passbands & set(block.bands)):
-            raise BadInput(f"observation[{i}].bands: {user_bands[0]} is your own passband: no survey observes in it")
+            raise BadInput(f"observation[{i}].bands: {user_bands[0]} is a user passband: no survey observes in it")
 
 
 def check_mission(request: Request) -> MissionConfiguration:
-    """The mission that a request chooses: overrides and explored values must be of its names, units and ranges."""
+    """Return the mission parameters that a request selects.
+
+    Parameters
+    ----------
+    request : Request
+        The request.
+
+    Returns
+    -------
+    MissionConfiguration
+        Parameters with the overrides and cameras of the request.
+
+    Raises
+    ------
+    BadInput
+        If an override or an explored value has an unknown name, a wrong unit or is out of range, or if a camera or a
+        ramp is not valid. The message names the key.
+    """
     from lake_schema.mission.checks import camera_faults, ramp_faults
     from lake_schema.mission.configuration import resolve
 
@@ -79,14 +94,14 @@ def check_mission(request: Request) -> MissionConfiguration:
 
 
 def check_rendered(request: Request) -> None:
-    """There must be a simulator for each channel and image type that it wants observed."""
+    """Raise BadInput if no simulator exists for a channel and image type of the request."""
     for key, (channel, image_type) in _requested_types(request):
         if not _is_rendered((channel, image_type)):
-            raise BadInput(f"{key}: no simulator renders {channel} {image_type} yet: it can be planned alone")
+            raise BadInput(f"{key}: no simulator renders {channel} {image_type} yet: it can only be planned")
 
 
 def describe_skipped(request: Request) -> str:
-    """A line about what of a request is planned and forecast and not rendered, empty where all of it is rendered."""
+    """Return a line that lists what is planned and forecast but not rendered, or "" if all can be rendered."""
     names = dict.fromkeys(
         f"{channel} {image_type}" if channel in RENDERED_TYPES else channel
         for _, (channel, image_type) in _requested_types(request)
@@ -98,7 +113,7 @@ def describe_skipped(request: Request) -> str:
 
 
 def _requested_types(request: Request) -> Iterator[tuple[str, tuple[str, str]]]:
-    """The key, channel and image type of all that a request wants observed."""
+    """Yield the key of each pointing and observation, with its channel and image type."""
     for i, pointing in enumerate(request.pointings):
         yield f"pointing[{i}].channel", (pointing.channel, "science")
     for i, block in enumerate(request.observations):

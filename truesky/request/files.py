@@ -1,12 +1,4 @@
-"""External files that a request names.
-
-UserCurves, curves  spectra, filters and extinction laws: the section `fluxes`
-Ingest, ingest      catalogues, halos, a map of dust: the section `ingest`
-psfs                point-spread functions: the section `psf`
-GivenSources, sources   tables of all sources that there are: the section `sources`
-cameras             a user's own cameras: the key `mission.cameras`
-file_of             a file beside the request
-"""
+"""Read the sections of a request that name external files: spectra, filters, catalogues, PSFs, sources and cameras."""
 
 from __future__ import annotations
 
@@ -25,7 +17,7 @@ from truesky.request.toml_values import Toml, as_table, boolean, number, quote_v
 if TYPE_CHECKING:
     from lake_schema.mission.camera_folder import Camera
 
-# A kind of lake_schema.user_files.
+# Kind of file in messages of lake_schema.user_files.
 SOURCES_KIND = "table of sources"
 
 
@@ -41,7 +33,7 @@ class Curves:
         Format of the files, a key of truesky/fluxes/libraries/spectrum_formats.toml.
     medium : str
         Medium in which a filter's wavelengths are measured, "air" or "vacuum".
-    place : str
+    location : str
         Table and line that name the file, for messages; "" if a key of the request names it.
     """
 
@@ -53,10 +45,22 @@ class Curves:
 
 @dataclass(frozen=True, slots=True)
 class UserCurves:
-    """What stands beside the embedded passbands, and in place of the embedded galaxies, extinction laws and dwarfs.
+    """User files that add passbands or replace the built-in galaxy templates, extinction laws and dwarf stars.
 
-    basel : models of dwarfs;  irtf : spectra of stars whose infrared the dwarfs are given
-    intergalactic : galaxies are seen through the hydrogen between them
+    Attributes
+    ----------
+    passbands : tuple of (str, Curves)
+        Name and file of each passband.
+    templates : Curves, optional
+        Spectra of galaxies.
+    extinction : tuple of (int, Curves)
+        Number of the law that is replaced (1 to 4), and its file.
+    basel : Path, optional
+        File of model spectra of dwarf stars (BaSeL).
+    irtf : tuple of Path
+        Spectra of stars (IRTF) that replace the infrared part of the dwarf spectra.
+    intergalactic : bool
+        True if the intergalactic hydrogen absorbs the light of galaxies.
     """
 
     passbands: tuple[tuple[str, Curves], ...] = ()
@@ -69,7 +73,17 @@ class UserCurves:
 
 @dataclass(frozen=True, slots=True)
 class Catalogue:
-    """Files of an external catalogue; columns : (our key, JSON of what stands for it) beside those of the format."""
+    """Files of an external catalogue.
+
+    Attributes
+    ----------
+    files : tuple of Path
+        The files.
+    format : str
+        Format of a catalogue of galaxies, a key of ingest_formats.toml; "" for none.
+    columns : tuple of (str, str)
+        Name of our column and its replacement as JSON, in addition to the columns of the format.
+    """
 
     files: tuple[Path, ...]
     format: str = ""
@@ -78,7 +92,21 @@ class Catalogue:
 
 @dataclass(frozen=True, slots=True)
 class DustMap:
-    """A HEALPix map of E(B-V) or A(V); ordering, coordinates : what its header must say, or does not say."""
+    """A HEALPix map of E(B-V) or A(V).
+
+    Attributes
+    ----------
+    file : Path
+        The file.
+    column : str
+        Name of the column.
+    quantity : str
+        "ebv" or "a_v".
+    ordering : str
+        "RING" or "NESTED": the header must have this value, or none. "" to use the value in the header.
+    coordinates : str
+        "G" (Galactic) or "C" (equatorial): the header must have this value, or none. "" to use the value in the header.
+    """
 
     file: Path
     column: str
@@ -89,7 +117,19 @@ class DustMap:
 
 @dataclass(frozen=True, slots=True)
 class Ingest:
-    """What is taken from others instead of being made; training : galaxies whose spectra ours have."""
+    """External catalogues and maps that replace simulated ones.
+
+    Attributes
+    ----------
+    galaxies : Catalogue, optional
+        A finished catalogue of galaxies.
+    halos : Catalogue, optional
+        A light-cone of halos.
+    training : Catalogue, optional
+        Observed galaxies; each simulated galaxy gets the spectrum of one of these.
+    dust : DustMap, optional
+        Map of the dust of the Milky Way.
+    """
 
     galaxies: Catalogue | None = None
     halos: Catalogue | None = None
@@ -99,10 +139,16 @@ class Ingest:
 
 @dataclass(frozen=True, slots=True)
 class UserSources:
-    """Tables of the only sources that there are (truesky/catalogue/given_sources.py).
+    """Tables that contain all sources of a simulation.
 
-    band    : of their magnitudes
-    spacing : arcsec, of the grid on which their rows stand in turn; 0 = at places of their own
+    Attributes
+    ----------
+    galaxies, stars : Path, optional
+        CSV files (truesky/catalogue/given_sources.py).
+    band : str
+        Passband of their magnitudes.
+    spacing : float
+        Spacing in arcsec of the grid on which the rows are placed in turn; 0 if the tables have positions.
     """
 
     galaxies: Path | None
@@ -111,7 +157,7 @@ class UserSources:
     spacing: float
 
     def facts(self, bounds: tuple[float, float, float]) -> dict[str, Any]:
-        """What tells these sources from others in the key of a plan; bounds : of the request's area."""
+        """Return the facts about these sources for the key of a plan; `bounds` is the bounding circle of the area."""
         files = {"galaxies": self.galaxies, "stars": self.stars}
         checksums = {
             name: file_sha256(_check_csv(file, f"sources.{name}")) for name, file in files.items() if file is not None
@@ -122,24 +168,24 @@ class UserSources:
 
 def _check_csv(file: Path, key: str) -> Path:
     if file.suffix.lower() != ".csv":
-        raise BadInput(f"{key}: {user_files.format_path(file)}: the ending is not .csv")
+        raise BadInput(f"{key}: {user_files.format_path(file)}: the file name must end with .csv")
     return user_files.check_file(file, SOURCES_KIND, key)
 
 
 def resolve_path(folder: Path, name: str) -> Path:
-    """A file by its name, found from the request's folder."""
+    """Return the path of a file that is named relative to the folder of the request."""
     return user_files.expand_path(name, folder)
 
 
 def read_cameras(names: Sequence[str], folder: Path) -> tuple[Camera, ...]:
-    """Read the folders of a user's own cameras.
+    """Read the folders of user cameras.
 
     Parameters
     ----------
     names : sequence of str
         Folders, as the request names them.
     folder : Path
-        Folder from which they are found.
+        Folder of the request; other paths are relative to it.
 
     Returns
     -------
@@ -153,7 +199,7 @@ def read_cameras(names: Sequence[str], folder: Path) -> tuple[Camera, ...]:
     """
     if not names:
         return ()
-    # Reading units takes a second, which a request without cameras need not wait for.
+    # Importing the unit parser takes a second, so requests without cameras skip it.
     from lake_schema.mission import camera_folder
 
     user_cameras: list[Camera] = []
@@ -163,18 +209,18 @@ def read_cameras(names: Sequence[str], folder: Path) -> tuple[Camera, ...]:
         except BadInput as error:
             raise BadInput(f"mission.cameras[{i}]: {error}") from None
         if user_cameras[-1].name in [camera.name for camera in user_cameras[:-1]]:
-            raise BadInput(f"mission.cameras[{i}]: there are two cameras of the name {user_cameras[-1].name}")
+            raise BadInput(f"mission.cameras[{i}]: two cameras have the name {user_cameras[-1].name}")
     return tuple(user_cameras)
 
 
-# By the ending of a file: a key of truesky/fluxes/libraries/spectrum_formats.toml.
+# Format by file name extension, a key of truesky/fluxes/libraries/spectrum_formats.toml.
 _CURVE_FORMATS = {".ecsv": "passband_ecsv", ".xml": "passband_svo", ".vot": "passband_svo"}
 
 
 def with_camera_passbands(
     user_curves: UserCurves, user_cameras: Sequence[Camera], bands: Collection[str]
 ) -> UserCurves:
-    """Add the passbands of a user's cameras that a request observes in.
+    """Add the passbands of user cameras in which a request observes.
 
     Parameters
     ----------
@@ -188,7 +234,7 @@ def with_camera_passbands(
     Returns
     -------
     UserCurves
-        The same with these passbands.
+        The section with these passbands added.
 
     Raises
     ------
@@ -204,14 +250,20 @@ def with_camera_passbands(
         form = _CURVE_FORMATS.get(curve.file.suffix.lower(), "passband_ascii")
         if curve.band in passbands:
             other = passbands[curve.band].location or f"fluxes.passbands.{curve.band}"
-            problem = f"band {curve.band} has another curve in {other}: all curves of a request have different names"
+            problem = f"band {curve.band} has another curve in {other}: all curves must have different names"
             raise BadInput(f"{location}: {problem}")
         passbands[curve.band] = Curves((curve.file,), form, curve.medium, location)
     return replace(user_curves, passbands=tuple(passbands.items()))
 
 
 def parse_curves(table: Toml, folder: Path) -> UserCurves:
-    """The section `fluxes`; files are found from `folder`.  BadInput names the key."""
+    """Read the section `fluxes`; `folder` is the folder of the request.
+
+    Raises
+    ------
+    BadInput
+        If the section is not valid. The message names the key.
+    """
     filters = as_table(table.get("passbands", {}), "fluxes.passbands", None)
     laws = as_table(table.get("extinction", {}), "fluxes.extinction", set("1234"))
     passbands = [
@@ -230,7 +282,7 @@ def parse_curves(table: Toml, folder: Path) -> UserCurves:
         )
     stars = as_table(table.get("stars", {}), "fluxes.stars", {"basel", "irtf"})
     if "stars" in table and not stars:
-        raise BadInput("fluxes.stars names neither basel nor irtf")
+        raise BadInput("fluxes.stars must have basel or irtf")
     return UserCurves(
         tuple(zip(filters, passbands, strict=True)),
         templates,
@@ -248,15 +300,21 @@ def _curves(value: object, path: str, folder: Path, has_medium: bool = False) ->
 
 
 def parse_ingest(table: Toml, folder: Path) -> Ingest:
-    """The section `ingest`; files are found from `folder`.  BadInput names the key."""
+    """Read the section `ingest`; `folder` is the folder of the request.
+
+    Raises
+    ------
+    BadInput
+        If the section is not valid. The message names the key.
+    """
     galaxies = _catalogue(table["galaxies"], "ingest.galaxies", folder) if "galaxies" in table else None
     halos, training = (
         _catalogue(table[name], f"ingest.{name}", folder) if name in table else None for name in ("halos", "training")
     )
     if galaxies and halos:
-        raise BadInput("ingest.halos: a finished catalogue of galaxies wants no halos")
+        raise BadInput("ingest.halos is not allowed with ingest.galaxies, a finished catalogue")
     if galaxies and training:
-        raise BadInput("ingest.training: the galaxies of a finished catalogue have their own spectra")
+        raise BadInput("ingest.training is not allowed with ingest.galaxies, whose galaxies have spectra")
     dust = None
     if "dust" in table:
         dust_table = as_table(table["dust"], "ingest.dust", set(DustMap.__slots__))
@@ -271,9 +329,14 @@ def parse_ingest(table: Toml, folder: Path) -> Ingest:
 
 
 def parse_psfs(table: Toml, folder: Path) -> tuple[tuple[str, str], ...]:
-    """The section `psf`: (band, file), found from `folder`; a band once for each file of a list.
+    """Read the section `psf` and return pairs (band, file); `folder` is the folder of the request.
 
-    Errors : BadInput names the key
+    A band with a list of files has one pair for each file.
+
+    Raises
+    ------
+    BadInput
+        If the section is not valid. The message names the key.
     """
     band_files = []
     for band in sorted(table):
@@ -287,18 +350,24 @@ def parse_psfs(table: Toml, folder: Path) -> tuple[tuple[str, str], ...]:
 
 
 def parse_sources(table: Toml, folder: Path) -> UserSources | None:
-    """The section `sources`; files are found from `folder`.  BadInput names the key."""
+    """Read the section `sources`; `folder` is the folder of the request. Return None if the section is empty.
+
+    Raises
+    ------
+    BadInput
+        If the section is not valid. The message names the key.
+    """
     if not table:
         return None
     grid = string(table, "sources.only", ("table", "grid")) == "grid"
     if "spacing" in table and not grid:
-        raise BadInput('sources.spacing wants only = "grid": the sources of a table have places of their own')
+        raise BadInput('sources.spacing requires only = "grid": with only = "table" the rows have positions')
     spacing = number(table, "sources.spacing", 0.01, 3600.0) if grid else 0.0
     files = {
         name: resolve_path(folder, string(table, f"sources.{name}")) for name in ("galaxies", "stars") if name in table
     }
     if not files:
-        raise BadInput("sources names neither galaxies nor stars")
+        raise BadInput("sources must have galaxies or stars")
     band = string(table, "sources.band", default="euclid_vis")
     return UserSources(files.get("galaxies"), files.get("stars"), band, spacing)
 
@@ -320,4 +389,4 @@ def _to_json(value: object, path: str) -> str:
     try:
         return json.dumps(value, sort_keys=True, allow_nan=False)
     except (TypeError, ValueError):
-        raise BadInput(f"{path} wants texts, numbers and tables, got {quote_value(value)}") from None
+        raise BadInput(f"{path} must contain only texts, numbers and tables, got {quote_value(value)}") from None

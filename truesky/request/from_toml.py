@@ -1,4 +1,6 @@
-"""The simulation request: a TOML file of at most a screen, read into frozen records; every number has bounds.
+"""Read a simulation request: a short TOML file with limits for every number.
+
+All keys::
 
     name = "demo"      seed = 2024      noise_seed = 1 (default: seed)
     accuracy = "survey" | "quicklook" | "draft" | "reference" | {flux = ..}
@@ -6,50 +8,50 @@
                    tile = number | patches = [[ra, dec, radius], ..] | wide = true
     [universe]     galaxy_limit, galaxy_band, star_limit (H, Vega), z_max, box_cells, lensing_nside
                    high_redshift_boost, quasar_boost, alignment
-                   lensing = "box" | "none" | {g1, g2}   a constant reduced shear of all galaxies, frame (east, north)
-                   rotation       deg, added to the position angle of every galaxy, before lensing
+                   lensing = "box" | "none" | {g1, g2}   constant reduced shear of all galaxies, frame (east, north)
+                   rotation       deg, added to the position angle of every galaxy before lensing
     [stars]        density, brown_dwarf_boost, tycho2 = [..], catalogue = {file, columns}, plane_limit, rows_a_file
-                   bright_limit   H (Vega, as observed), brighter stars are left out
-    [ingest.galaxies]  files = [..]  a finished catalogue instead of ours: Parquet, FITS, CSV, HDF5, a HATS folder
+                   bright_limit   H (Vega, as observed); brighter stars are omitted
+    [ingest.galaxies]  files = [..]  finished catalogue that replaces ours: Parquet, FITS, CSV, HDF5, a HATS folder
                        format = "flagship1" | "flagship2" | "euclid" | "skycatalogs" | "opencosmo"
                        columns = {ours = theirs, ..}
-    [ingest.halos]     files = [..]  columns = {ra, dec, z_true, log_mass, ..}   a halo light-cone instead of ours
+    [ingest.halos]     files = [..]  columns = {ra, dec, z_true, log_mass, ..}   halo light-cone that replaces ours
     [ingest.training]  files = [..]  columns = {z_true, abs_mag_r01, color_gr_01, sed, ext_law, ebv}
-                       observed galaxies: each of ours has the spectrum of one like it
-    [ingest.dust]      file, column, quantity = "ebv" | "a_v"   a HEALPix map of the Milky Way's dust instead of ours
-    [sources]      only = "table" | "grid"   galaxies = "file.csv"  stars = "file.csv"   these and no others
-                   band   of their magnitudes (AB), default: "euclid_vis"   spacing   arcsec, of a grid
+                       observed galaxies; each galaxy of ours has the spectrum of a similar one
+    [ingest.dust]      file, column, quantity = "ebv" | "a_v"   HEALPix map of the Milky Way's dust that replaces ours
+    [sources]      only = "table" | "grid"   galaxies = "file.csv"  stars = "file.csv"   all sources of the simulation
+                   band   of their magnitudes (AB), default: "euclid_vis"   spacing   of the grid in arcsec
     [structure]    arms = true | {contrast, knots, number, least_radius}   spiral arms and knots of large discs
-                   (truesky/request/structure.py), default: discs are smooth
-                   stamps = {file, nearest, least_radius}   your own galaxies (truesky/render/sources/galaxy_stamps.py)
-    [strong_lenses]  boost   how many times denser than in nature they are drawn
+                   (truesky/request/structure.py), default: smooth discs
+                   stamps = {file, nearest, least_radius}   user's galaxies (truesky/render/sources/galaxy_stamps.py)
+    [strong_lenses]  boost   density of strong lenses relative to nature
     [mission]      ladder = ["CBE", ..]   overrides = {"vis.read_noise" = {value = 5.0, unit = "electron"}}
-                   cameras = ["my_camera/"]   your own ground cameras (lake_schema/mission/camera_folder.py)
-                   of one detector "vis.dark_current@3-4", amplifier "vis.gain.E", or both "vis.gain@3-4.E"
+                   for one detector "vis.dark_current@3-4", amplifier "vis.gain.E", or both "vis.gain@3-4.E"
+                   cameras = ["my_camera/"]   user's ground cameras (lake_schema/mission/camera_folder.py)
     [fluxes]       bands = [..]           default: the bands of the pointings and observations
-                   intergalactic = true   galaxies are seen through the hydrogen between them
-    [fluxes.passbands.NAME]        your own filter, column f_nu_NAME: file, medium = "air" | "vacuum", format
-    [fluxes.templates]             your own galaxies, earliest first, counted by sed_1 and sed_2: files, format
-    [fluxes.stars]                 your own dwarfs: basel (models, .cor), irtf = [..] (their infrared, by Y - H)
-    [fluxes.extinction.CODE]       your own law in place of law 1 .. 4: file, format
-    [psf]          BAND = "file.fits"   your own PSF in a band: a cube of planes or PSFEx's; of a list of files each
-                   exposure has one, drawn at random
-                   (truesky/render/psf/from_file.py); {detector} in the name stands for the detector's
-    [solar_system] bodies = "file"      your own moving bodies in place of ours (truesky/render/sources/ephemerides.py)
+                   intergalactic = true   intergalactic hydrogen absorbs the light of galaxies
+    [fluxes.passbands.NAME]        user's filter, column f_nu_NAME: file, medium = "air" | "vacuum", format
+    [fluxes.templates]             user's galaxy spectra, earliest type first, counted by sed_1 and sed_2: files, format
+    [fluxes.stars]                 user's dwarf spectra: basel (models, .cor), irtf = [..] (their infrared, by Y - H)
+    [fluxes.extinction.CODE]       user's law that replaces law 1 .. 4: file, format
+    [psf]          BAND = "file.fits"   user's PSF in a band: a cube of planes or a PSFEx file; from a list of files,
+                   each exposure uses one at random (truesky/render/psf/from_file.py);
+                   {detector} in the name is replaced by the detector's name
+    [solar_system] bodies = "file"      user's moving bodies that replace ours (truesky/render/sources/ephemerides.py)
     [effects]      on = [..]  off = [..]  effects forced on or off, default: what a scene needs
-                   off = ["all"]          all that are not in `on`, but for the conversion to whole numbers
+                   off = ["all"]          all except those in `on` and the analogue-to-digital conversion
     [explore]      accuracy = [..]  "effects.<name>" = [true, false]  "vis.gain" = {values = [..], unit = ".."}
     [[pointing]]   channel, camera, band, ra, dec, position_angle, mjd, detectors, centre_on, exposure_time_s,
-                   grism_angle    of NISP-S, deg at which spectra run in the focal plane: -4, 0, 180, 184
-                   realisations   how many exposures, which differ in their noise alone
+                   grism_angle    direction of NISP-S spectra in the focal plane: -4, 0, 180, 184 deg
+                   realisations   number of exposures that differ only in their noise
     [[observation]]
         channels = ["VIS", "NISP-P", "NISP-S"] | ["EXT"]
         image_type = "science" | "deep" | "bias" | "dark" | "flat" | "charge_injection" | "self_calibration"
                      | "standard_star" | "planetary_nebula" | "trap_pumping" | "defocus" | "bleeding"
                      | "stray_light" | "white_dwarf" | "persistence"
         survey = "wide" | "deep" | "edf_north" | .. | "des" | ..     area = {..}   default: the request's
-        ra, dec, position_angle    a field of your own instead of the survey's (docs/own_field.md)
-        pointings = "file.csv"     a table of pointings instead of either (truesky/request/pointing_tables.py)
+        ra, dec, position_angle    user's field instead of the fields of the survey (docs/own_field.md)
+        pointings = "file.csv"     table of pointings instead of both (truesky/request/pointing_tables.py)
         dither = "S" | "J" | "none" | [[x, y], ..] arcsec   fields, visits, exposures, short, flat, blue, bands,
         detectors, mjd, exposure_time_s, realisations
         lamps = [..], intensities = [..] of flats      macc = [groups, reads, drops] of NISP-P, or of NISP-S alone
@@ -58,15 +60,15 @@
         magnitude of bleeding, white_dwarf, stray_light     distance_deg of stray_light
     [products]     truth = ["noise_free", "stars", "sky", "cosmic_rays", "ghosts", "satellites", "saturation",
                             "persistence", "ramp", "order_1", "order_0", "order_2", "order_m1"]
-                   compression = "none" | "rice"   of images of whole numbers, without loss
-                   wcs = "sip" | "tpv"   how headers tell the distortion, default: as the instrument's pipeline;
-                                         source-extractor, SCAMP and SWarp read TPV, or .head beside the image
-                   files = "detector" | "exposure"   also one file of all of an exposure's science images
-                   readout = "raw" | "amplifiers" | "electrons"   of ground cameras: one array, an extension each
-                                         amplifier, or electrons before they are read
+                   compression = "none" | "rice"   lossless, for integer images
+                   wcs = "sip" | "tpv"   convention for distortion in headers, default: the instrument pipeline's;
+                                         source-extractor, SCAMP and SWarp read TPV, or the .head file of the image
+                   files = "detector" | "exposure"   also one file with all science images of an exposure
+                   readout = "raw" | "amplifiers" | "electrons"   for ground cameras: one array, one extension per
+                                         amplifier, or electrons before the readout
 
-Files are found from the folder of the request; their formats are in truesky/fluxes/libraries/spectrum_formats.toml.
-A key that is not here, a wrong type or a number out of bounds is refused with the key's full path:
+File names are relative to the folder of the request; truesky/fluxes/libraries/spectrum_formats.toml has their formats.
+An unknown key, a wrong type or a number out of bounds is refused. The message gives the full path of the key::
 
     truesky check FILE [--plan]
 """
@@ -132,15 +134,12 @@ _SECTIONS = (
     "area", "universe", "stars", "ingest", "sources", "strong_lenses", "structure", "mission", "fluxes",
     "psf", "solar_system", "effects", "explore", "products",
 )  # fmt: skip
-# A request's tables are a schema of its name in SQL (truesky/explore), where these have a meaning of their own.
+# SQL (truesky/explore) uses the request's name as the schema of its tables, and reserves these names.
 _RESERVED_NAMES = ("information_schema", "main", "memory", "pg_catalog", "system", "temp")
 
 
 def parse(path: Path) -> Request:
-    """Read and check a request file.
-
-    Errors : BadInput, one line that names the file and the key
-    """
+    """Read and check a request file; raises BadInput with one line that names the file and the key."""
     try:
         table = user_files.read_toml(path, "request")
     except BadInput as error:
@@ -154,14 +153,30 @@ def parse(path: Path) -> Request:
 def _name(table: Toml) -> str:
     name = layout.check_name(_string(table, "name"))
     if name in _RESERVED_NAMES:
-        raise BadInput(
-            f"name = {name!r} has a meaning of its own in SQL, with {', '.join(_RESERVED_NAMES)}: take another"
-        )
+        raise BadInput(f"name = {name!r} is reserved in SQL; these names are not allowed: {', '.join(_RESERVED_NAMES)}")
     return name
 
 
 def from_table(table: Toml, folder: Path = Path()) -> Request:
-    """A parsed TOML table -> Request; files are found from `folder`.  BadInput names the key."""
+    """Return the request in a parsed TOML table.
+
+    Parameters
+    ----------
+    table : Toml
+        The table.
+    folder : Path, optional
+        Folder to which file names are relative.
+
+    Returns
+    -------
+    Request
+        The checked request.
+
+    Raises
+    ------
+    BadInput
+        If the request is not valid. The message names the key.
+    """
     _check_keys(table, "", {"name", "seed", "noise_seed", "accuracy", "pointing", "observation", *_SECTIONS})
     pointings, blocks = observations.parse_pointings(table), observations.parse_observations(table, folder)
     fluxes = _section(table, "fluxes", {"bands", "intergalactic", "passbands", "templates", "stars", "extinction"})
@@ -221,7 +236,7 @@ def _accuracy(value: object, path: str) -> Accuracy:
         return preset(value)
     table = _as_table(value, path, {"flux", "shape", "position", "background"})
     accuracy = Accuracy(**{key: _number(table, f"{path}.{key}", 1e-12, 1.0) for key in Accuracy.__slots__})
-    # What cannot be had is refused before anything is made.
+    # Refuse an accuracy that cannot be reached before any computation starts.
     fastest_row(accuracy)
     return accuracy
 
@@ -244,14 +259,14 @@ def _universe(table: Toml) -> Universe:
 
 
 def _lensing(value: object) -> tuple[float, float] | None:
-    """None of the box's lensing; else a constant shear, 0 for "none"."""
+    """Return None for the lensing by the box, or a constant shear: (0, 0) for "none"."""
     path = "universe.lensing"
     if isinstance(value, str):
         return None if _string({"lensing": value}, path, ("box", "none")) == "box" else (0.0, 0.0)
     table = _as_table(value, path, {"g1", "g2"})
     g1, g2 = (_number(table, f"{path}.{key}", -1.0, 1.0) for key in ("g1", "g2"))
     if (size := math.hypot(g1, g2)) > MAX_SHEAR:
-        raise BadInput(f"{path} = {_quote_value(value)}: |g| = {size:.4g}, images are ellipses up to {MAX_SHEAR}")
+        raise BadInput(f"{path} = {_quote_value(value)}: |g| = {size:.4g} must be at most {MAX_SHEAR}")
     return g1, g2
 
 
@@ -300,7 +315,7 @@ def _effects(table: Toml) -> Effects:
     if off == (_ALL,):
         return Effects(on, tuple(name for name in EFFECTS if name not in (*ALWAYS_ON, *on)))
     if _ALL in off:
-        raise BadInput("effects.off: 'all' stands alone")
+        raise BadInput("effects.off: 'all' must be the only item")
     if conflicts := sorted(set(on) & set(off)):
         raise BadInput(f"effects: {conflicts[0]!r} is both on and off")
     return Effects(on, off)
@@ -311,28 +326,28 @@ def _explore(table: Toml) -> tuple[tuple[str, tuple[str, ...]], ...]:
     for key in sorted(table):
         values = _choices(key, table[key])
         if not values:
-            raise BadInput(f"explore.{key} names no value")
+            raise BadInput(f"explore.{key} has no value")
         if len(set(values)) != len(values):
-            raise BadInput(f"explore.{key} names a value twice")
+            raise BadInput(f"explore.{key} contains a value twice")
         count *= len(values)
         if count > _MAX_VARIANTS:
-            raise BadInput(f"explore.{key}: the product of the values is more than {_MAX_VARIANTS} requests")
+            raise BadInput(f"explore.{key}: the values give more than {_MAX_VARIANTS} combinations")
         explored.append((key, values))
     return tuple(explored)
 
 
 def _choices(key: str, value: object) -> tuple[str, ...]:
-    """The values of one explored parameter, as JSON."""
+    """Return the values of one explored parameter as JSON."""
     path = f"explore.{key}"
     if key != "accuracy" and not key.startswith("effects."):
         table = _as_table(value, path, {"values", "unit"})
         unit, numbers = _string(table, f"{path}.unit"), _required_value(table, f"{path}.values")
         if not isinstance(numbers, list):
-            raise BadInput(f"{path}.values wants a list of numbers, got {_quote_value(numbers)}")
+            raise BadInput(f"{path}.values must be a list of numbers, got {_quote_value(numbers)}")
         checked = [_checked_number(n, f"{path}.values[{i}]", -math.inf, math.inf) for i, n in enumerate(numbers)]
         return tuple(json.dumps([number, unit]) for number in checked)
     if not isinstance(value, list):
-        raise BadInput(f"{path} wants a list, got {_quote_value(value)}")
+        raise BadInput(f"{path} must be a list, got {_quote_value(value)}")
     if key == "accuracy":
         return tuple(json.dumps(asdict(_accuracy(item, f"{path}[{i}]"))) for i, item in enumerate(value))
     if key.removeprefix("effects.") not in EFFECTS:

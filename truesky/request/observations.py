@@ -1,8 +1,4 @@
-"""What a request wants observed: single pointings, and blocks of exposures that the planner lays out.
-
-Pointing, pointings            the list `pointing`
-Observation, observations      the list `observation`
-"""
+"""Read the observations of a request: single pointings, and blocks of exposures that the planner schedules."""
 
 from __future__ import annotations
 
@@ -33,15 +29,15 @@ from truesky.request.toml_values import (
 )
 
 _MAX_POINTINGS, _MAX_OBSERVATIONS, _MAX_REALISATIONS = 100_000, 1000, 10_000
-# Frames of a sequence whose parameter is listed.
+# Largest length of a list with one value per frame.
 _MAX_VALUES = 1000
-# Dithers of an observation's own: how many, and how far from its place, arcsec.
+# Largest number of user dithers, and their largest offset along each axis (arcsec).
 _MAX_DITHERS, _MAX_OFFSET = 1000, 36_000.0
 DITHERS = ("S", "J", "none")
 EUCLID_SURVEYS = ("wide", "deep", "edf_north", "edf_south", "edf_fornax")
 GROUND_SURVEYS = ("des", "lsst", "cfis", "jedis", "ps1", "wishes", "whigs")
-# What each channel can be asked for besides the sky. Not derived from what is rendered: more than that can be planned
-# (test_checks.py: all that is rendered is in it).
+# Calibrations of each channel. The list is not derived from the rendered types because more can be planned.
+# test_checks.py checks that it contains all rendered types.
 _CALIBRATIONS = {
     "VIS": (
         "bias", "dark", "flat", "charge_injection", "trap_pumping", "self_calibration", "defocus", "bleeding",
@@ -52,13 +48,13 @@ _CALIBRATIONS = {
     "EXT": ("bias", "dark", "flat"),
 }  # fmt: skip
 _SKY_TYPES = ("science", "deep")
-# Kinds of block, as messages call them.
+# Kinds of observation, as messages name them.
 _SURVEY, _USER_FIELD = "fields of a Euclid survey", "a Euclid field at ra, dec"
 _GROUND, _GROUND_USER_FIELD = "a ground survey's pattern", "a ground camera's field at ra, dec"
 _TIMED, _UNTIMED = "dark and flat frames", "bias, charge_injection and trap_pumping frames"
 _DITHERED, _TABLE = "calibrations on the sky", "a table of pointings"
 _CALIBRATION = (_TIMED, _UNTIMED, _DITHERED)
-# The kinds that use a key; a key that is not here is used by all. EXT always has a survey, for its camera.
+# Kinds that use a key; a key that is not listed is used by all. EXT always has a survey, which selects its camera.
 _BLOCKS_OF_KEY = {
     "survey": (_SURVEY, _TABLE),
     "area": (_SURVEY, _GROUND, *_CALIBRATION),
@@ -81,9 +77,9 @@ _BLOCKS_OF_KEY = {
     "macc": (_SURVEY, _USER_FIELD, _TIMED, _DITHERED, _TABLE),
     "exposure_time_s": (_GROUND, _GROUND_USER_FIELD, _TIMED, _DITHERED, _TABLE),
 }
-# Exposures that only one channel has.
+# Keys that only some channels use.
 _CHANNELS_OF_KEY = {"short": ("VIS",), "flat": ("VIS",), "blue": ("NISP-S",), "macc": ("NISP-P", "NISP-S")}
-# Image types that a key of calibrations is for.
+# Image types that use a key of calibrations.
 _TYPES_OF_KEY = {
     "lamps": ("flat", "persistence"),
     "intensities": ("flat", "persistence"),
@@ -94,22 +90,35 @@ _TYPES_OF_KEY = {
     "magnitude": ("bleeding", "white_dwarf", "stray_light"),
     "distance_deg": ("stray_light",),
 }
-# What is bright before darks that show what it left.
+# Sources of the bright exposure before the darks that measure persistence.
 BRIGHT_TYPES = ("flat", "sky")
-# LEDs of a calibration unit. A copy, since requests are read below the renderer (test_survey.py holds it to the lamps).
+# Number of LEDs of each calibration unit. This is a copy because requests must not import the renderer;
+# test_survey.py compares it with the lamps.
 LAMPS = {"VIS": 6, "NISP-P": 5, "NISP-S": 5}
 
 
 @dataclass(frozen=True, slots=True)
 class Pointing:
-    """One exposure that is asked for.
+    """One exposure of the list `pointing`.
 
-    ra, dec         : deg, of the boresight, or of the centre of detector `centre_on` where that is given
-    position_angle  : deg, of the focal plane's y axis, north through east
-    detectors       : names, () = all of the camera
-    exposure_time_s : None = the mission's
-    realisations    : how many exposures, which differ in their noise alone
-    grism_angle     : deg, of NISP-S, at which spectra run in the focal plane, None = 0
+    Attributes
+    ----------
+    ra, dec : float
+        Position in degrees of the boresight, or of the centre of detector `centre_on`.
+    position_angle : float
+        Position angle of the focal plane's y axis in degrees, from north through east.
+    mjd : float
+        Start of the exposure (MJD).
+    detectors : tuple of str
+        Names of detectors; () for all of the camera.
+    centre_on : str, optional
+        Detector whose centre has the position ra, dec.
+    exposure_time_s : float, optional
+        Exposure time in seconds; None for the mission's value.
+    realisations : int
+        Number of exposures that differ only in their noise.
+    grism_angle : float, optional
+        Direction of NISP-S spectra in the focal plane in degrees; None for 0.
     """
 
     channel: str
@@ -128,30 +137,70 @@ class Pointing:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """A block of exposures that the planner lays out.
+    """A block of exposures that the planner schedules.
 
-    survey    : whose pattern
-    pointings : a table of pointings (path) instead;  table : what it holds
-    ra, dec   : deg, the centre of a field of its own instead of the survey's; None = the survey's
-    position_angle : deg, of the focal plane's y axis there, None = Euclid's as the Sun asks, 0 of a ground camera
-    area      : where, None = the request's
-    fields    : how many fields at most, those deepest in the area, 0 = all
-    visits    : how often each field is observed, 0 = the survey's
-    exposures : of a ground survey, in all bands together of which the positions are its own; of calibrations, frames
-    dither    : pattern within a field, or its own offsets (x, y) arcsec along the focal plane's axes
-    short, flat : with the short VIS exposure, the closing flat
-    blue      : with the blue grism besides the red ones
-    mjd       : the earliest date, None = the mission's launch
-    realisations : how many of each exposure, which differ in their noise alone
-    lamps     : of flats, numbers of the LEDs in their turn, () = all;  each in bands that see it
-    macc      : (groups, reads, drops) of NISP-P's ramps, of NISP-S's without NISP-P, () = the mission's
-    intensities : of flats, over the mission's level of the lamp, each for `exposures` frames; () = 1
-    delays_s  : of persistence, s from the end of the bright exposure to the start of each dark, () = the mission's
-    bright    : of persistence, what is bright: of BRIGHT
-    phase_times_s : of trap pumping, s that charge stays under an electrode, a frame each, () = the mission's
-    defocus_nm : of exposures out of focus, rms of the wavefront, one each, () = the mission's, on both sides
-    magnitude  : of calibration stars, AB in the exposure's band, None = the mission's
-    distance_deg : of a star beside the field from the boresight, None = the mission's
+    Attributes
+    ----------
+    channels : tuple of str
+        Channels that observe, or EXT alone.
+    image_type : str
+        Image type of the exposures.
+    survey : str
+        Survey whose pattern is used; it selects the camera of EXT.
+    pointings : str
+        Path of a table of pointings, or "".
+    table : Contents, optional
+        Summary of this table.
+    ra, dec : float, optional
+        Centre of a user's field in degrees; None for the fields of the survey.
+    position_angle : float, optional
+        Position angle in degrees of the focal plane's y axis at ra, dec. None for
+        the angle set by the direction of the Sun (Euclid) or 0 (ground cameras).
+    area : Area, optional
+        Area to observe; None for the area of the request.
+    fields : int
+        Largest number of fields; those deepest in the area are used. 0 for all.
+    visits : int
+        Visits of each field; 0 for the number of the survey.
+    exposures : int
+        Number of exposures. A ground survey that shares positions among bands counts those of all bands together.
+        For calibrations, the number of frames. 0 for the default.
+    dither : str or tuple of (float, float)
+        Pattern within a field, or offsets (x, y) in arcsec along the axes of the focal plane.
+    short, flat : bool
+        True to include the short VIS exposure, and the closing flat.
+    blue : bool
+        True to use the blue grism in addition to the red grisms.
+    bands : tuple of str
+        Passbands; () for all of the channel.
+    detectors : tuple of str
+        Names of detectors; () for all of the camera.
+    mjd : float, optional
+        Earliest date (MJD); None for the launch of the mission.
+    exposure_time_s : float, optional
+        Exposure time in seconds; None for the mission's value.
+    realisations : int
+        Number of copies of each exposure that differ only in their noise.
+    lamps : tuple of int
+        Numbers of the LEDs for flats in their order; () for all. Each is used in the bands that respond to it.
+    macc : tuple of int
+        Groups, reads and drops of NISP-P ramps, or of NISP-S ramps without NISP-P; () for the mission's values.
+    intensities : tuple of float
+        Levels of flats relative to the mission's level of the lamp, each for `exposures` frames; () for 1.
+    delays_s : tuple of float
+        For persistence, seconds from the end of the bright exposure to the start of each dark; () for the mission's
+        values.
+    bright : str
+        For persistence, the source of the bright exposure, one of `BRIGHT_TYPES`.
+    phase_times_s : tuple of float
+        For trap pumping, seconds that charge stays under an electrode, one frame for each; () for the mission's values.
+    defocus_nm : tuple of float
+        For exposures out of focus, rms of the wavefront in nm, one exposure for each; () for the mission's value on
+        both sides of the focus.
+    magnitude : float, optional
+        AB magnitude of calibration stars in the exposure's band; None for the mission's value.
+    distance_deg : float, optional
+        Distance in degrees of a star outside the field from the boresight; None for the mission's value.
     """
 
     channels: tuple[str, ...]
@@ -187,12 +236,12 @@ class Observation:
 
     @property
     def field_centre(self) -> tuple[float, float] | None:
-        """ra, dec deg of the observation's own field, None where it has none."""
+        """Return ra, dec (degrees) of the user's field, or None for fields of the survey."""
         return None if self.ra is None or self.dec is None else (self.ra, self.dec)
 
 
 def parse_pointings(table: Toml) -> tuple[Pointing, ...]:
-    """Of a request's table.  BadInput names the key."""
+    """Read the pointings of a request; raises BadInput that names the key if one is not valid."""
     entries = table_list(table, "pointing", _MAX_POINTINGS)
     return tuple(_pointing(value, f"pointing[{i}]") for i, value in enumerate(entries))
 
@@ -217,7 +266,13 @@ def _pointing(value: object, path: str) -> Pointing:
 
 
 def parse_observations(table: Toml, folder: Path = Path()) -> tuple[Observation, ...]:
-    """Of a request's table; tables of pointings lie in `folder` or below.  BadInput names the key."""
+    """Read the observations of a request; tables of pointings must be in `folder` or below.
+
+    Raises
+    ------
+    BadInput
+        If an observation is not valid. The message names the key.
+    """
     entries = table_list(table, "observation", _MAX_OBSERVATIONS)
     return tuple(_observation(value, f"observation[{i}]", folder) for i, value in enumerate(entries))
 
@@ -229,13 +284,13 @@ def _observation(value: object, path: str, folder: Path) -> Observation:
         raise BadInput(f"{path}.channels is missing or empty")
     ground = "EXT" in channels
     if ground and len(channels) > 1:
-        raise BadInput(f"{path}.channels: EXT stands alone")
+        raise BadInput(f"{path}.channels: EXT must be the only channel")
     image_type = string(table, f"{path}.image_type", IMAGE_TYPES, "science")
     if image_type not in _SKY_TYPES:
         for channel in channels:
             if image_type not in _CALIBRATIONS[channel]:
                 legal = ", ".join((*_SKY_TYPES, *_CALIBRATIONS[channel]))
-                raise BadInput(f"{path}.image_type = {image_type!r} is none of {channel}'s: {legal}")
+                raise BadInput(f"{path}.image_type = {image_type!r} is not a type of {channel}: {legal}")
     surveys = GROUND_SURVEYS if ground else EUCLID_SURVEYS
     _refuse_two_places(table, path)
     _refuse_unused(table, channels, image_type, path)
@@ -275,11 +330,11 @@ def _observation(value: object, path: str, folder: Path) -> Observation:
 
 
 def _lamps(table: Toml, path: str, channels: tuple[str, ...]) -> tuple[int, ...]:
-    """Numbers of LEDs that all of the channels have."""
+    """Return the numbers of LEDs, which all channels must have."""
     lamp_count = min(LAMPS.get(channel, 1) for channel in channels)
     lamps = _integers(table, path, (), ((1, lamp_count),) * lamp_count)
     if len(set(lamps)) < len(lamps):
-        raise BadInput(f"{path} = {quote_value(list(lamps))} names a lamp twice")
+        raise BadInput(f"{path} = {quote_value(list(lamps))} contains a lamp twice")
     return lamps
 
 
@@ -291,12 +346,15 @@ def _macc(table: Toml, path: str) -> tuple[int, ...]:
 
 
 def _integers(table: Toml, path: str, names: tuple[str, ...], bounds: tuple[tuple[int, int], ...]) -> tuple[int, ...]:
-    """A list of whole numbers: as many as are named, or up to as many as have bounds; () where there is none."""
+    """Read a list of whole numbers, () if the key is missing.
+
+    The list must be as long as `names`. If `names` is empty, it may be shorter than `bounds`.
+    """
     values = table.get(path.rpartition(".")[2])
     if values is None:
         return ()
     if not isinstance(values, list) or not values or len(values) > len(bounds) or (names and len(values) != len(names)):
-        raise BadInput(f"{path} = {quote_value(values)} is not [{', '.join(names) or 'numbers'}]")
+        raise BadInput(f"{path} = {quote_value(values)} is not [{', '.join(names) or 'whole numbers'}]")
     numbers = []
     for i, (value, (low, high)) in enumerate(zip(values, bounds, strict=False)):
         if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
@@ -307,7 +365,7 @@ def _integers(table: Toml, path: str, names: tuple[str, ...], bounds: tuple[tupl
 
 
 def _numbers(table: Toml, path: str, lo: float, hi: float) -> tuple[float, ...]:
-    """A list of different numbers; () where there is none."""
+    """Read a list of different numbers, () if the key is missing."""
     values = table.get(path.rpartition(".")[2])
     if values is None:
         return ()
@@ -315,7 +373,7 @@ def _numbers(table: Toml, path: str, lo: float, hi: float) -> tuple[float, ...]:
         raise BadInput(f"{path} = {quote_value(values)} is not a list of 1 to {_MAX_VALUES} numbers")
     numbers = tuple(checked_number(value, f"{path}[{i}]", lo, hi) for i, value in enumerate(values))
     if len(set(numbers)) < len(numbers):
-        raise BadInput(f"{path} = {quote_value(values)} names a number twice")
+        raise BadInput(f"{path} = {quote_value(values)} contains a number twice")
     return numbers
 
 
@@ -324,11 +382,11 @@ def _wrap_ra(ra: float | None) -> float | None:
 
 
 def _refuse_two_places(table: Toml, path: str) -> None:
-    """A place of the observation's own, a table of pointings and an area with a survey's fields exclude one another."""
+    """Check that a user's field, a table of pointings, and an area with survey fields are not combined."""
     if ("ra" in table) != ("dec" in table):
-        raise BadInput(f"{path}.{'dec' if 'ra' in table else 'ra'} is missing: a field has both")
+        raise BadInput(f"{path}.{'dec' if 'ra' in table else 'ra'} is missing: ra and dec must be given together")
     if "position_angle" in table and "ra" not in table:
-        raise BadInput(f"{path}.position_angle wants ra and dec: a survey's fields have their own")
+        raise BadInput(f"{path}.position_angle requires ra and dec: it is not used for fields of a survey")
     for key in ("ra", "pointings"):
         for other in ("pointings", "area", "fields"):
             if key != other and key in table and other in table:
@@ -336,7 +394,7 @@ def _refuse_two_places(table: Toml, path: str) -> None:
 
 
 def _refuse_unused(table: Toml, channels: tuple[str, ...], image_type: str, path: str) -> None:
-    """A key that would change nothing."""
+    """Check that every key has an effect on this kind of observation."""
     ground = "EXT" in channels
     kind = _block_kind(table, ground, image_type)
     for key in table:
@@ -362,7 +420,7 @@ def _block_kind(table: Toml, ground: bool, image_type: str) -> str:
 
 
 def _pointings_file(table: Toml, path: str, folder: Path) -> Path | None:
-    """The table of pointings, which may not lie outside the request's folder."""
+    """Return the path of the table of pointings, which must be inside the request's folder, or None."""
     if not string(table, f"{path}.pointings", default=""):
         return None
     file = folder / string(table, f"{path}.pointings")
@@ -380,17 +438,17 @@ def _contents(file: Path, channels: tuple[str, ...], image_type: str, path: str)
 
 
 def _dither(table: Toml, path: str, ground: bool) -> str | tuple[tuple[float, float], ...]:
-    """A pattern's name, or offsets."""
+    """Return the name of a pattern, or offsets in arcsec."""
     dither = table.get("dither", "none" if ground else "S")
     if not isinstance(dither, list):
         pattern = string({"dither": dither}, path, DITHERS)
         if ground and pattern != "none":
             raise BadInput(
-                f"{path} = {quote_value(dither)} is a pattern of Euclid's: name offsets in arcsec, [[x, y], ..]"
+                f"{path} = {quote_value(dither)} is a Euclid pattern: use a list of offsets in arcsec, [[x, y], ..]"
             )
         return pattern
     if not 1 <= len(dither) <= _MAX_DITHERS or not all(isinstance(step, list) and len(step) == 2 for step in dither):
-        raise BadInput(f"{path} wants one of {', '.join(DITHERS)}, or 1 to {_MAX_DITHERS} offsets [x, y] in arcsec")
+        raise BadInput(f"{path} must be one of {', '.join(DITHERS)}, or 1 to {_MAX_DITHERS} offsets [x, y] in arcsec")
     steps = [
         [checked_number(n, f"{path}[{i}]", -_MAX_OFFSET, _MAX_OFFSET) for n in step] for i, step in enumerate(dither)
     ]

@@ -1,10 +1,6 @@
-"""A table of pointings, a CSV file of the user's: one exposure a line, what is left out has a default.
+"""Read a user's table of pointings: a CSV file with one exposure per line.
 
-COLUMNS     the columns: name, unit, what they are, what stands in place of an empty field
-Row, read   the lines of a file, checked
-Contents    what a plan must know of the file before it is read again
-
-Lines that begin with # are comments.
+Lines that begin with # are comments. `COLUMNS` lists the columns with units and defaults for empty fields.
 """
 
 from __future__ import annotations
@@ -24,28 +20,33 @@ from lake_schema.tables.exposures import EUCLID_BANDS
 CHANNELS = tuple(code for code, _ in declared.CHANNELS)
 IMAGE_TYPES = tuple(code for code, _ in declared.IMAGE_TYPES)
 
-# Name, unit, meaning, default; "" = there is none.
+# Name, unit, meaning and default of each column; "" if the column is required.
 COLUMNS = (
     ("ra", "deg", "right ascension of the boresight, ICRS, -360 to 360", ""),
     ("dec", "deg", "declination of the boresight, ICRS", ""),
-    ("position_angle", "deg", "of the focal plane's y axis, north through east", "Euclid: as the Sun asks; ground: 0"),
+    (
+        "position_angle",
+        "deg",
+        "position angle of the focal plane's y axis, north through east",
+        "Euclid: set by the direction of the Sun; ground: 0",
+    ),
     (
         "mjd",
         "d",
         "start of the exposure, MJD (UTC)",
         "the observation's `mjd`; Euclid: the first date the Sun allows; ground: when the field is next up at night",
     ),
-    ("channel", "", "VIS, NISP-P, NISP-S or EXT", "the observation's, where it has one"),
-    ("camera", "", "of the mission database", "vis, nisp; EXT: the camera of the observation's `survey`"),
+    ("channel", "", "VIS, NISP-P, NISP-S or EXT", "the channel of the observation, if it has only one"),
+    ("camera", "", "camera in the mission database", "vis, nisp; EXT: the camera of the observation's `survey`"),
     ("band", "", "passband", "VIS: euclid_vis"),
     ("exposure_time_s", "s", "effective exposure time", "the observation's, else the mission's"),
-    ("image_type", "", "as in a request", "the observation's"),
+    ("image_type", "", "image type, as in a request", "the observation's"),
     ("detectors", "", "names of detectors, separated by blanks", "the observation's, else all of the camera"),
     ("sky", "electron pix-1 s-1", "diffuse sky", "the mission's"),
-    ("seeing", "arcsec", "FWHM of the atmosphere, of ground cameras", "drawn about the mission's"),
+    ("seeing", "arcsec", "FWHM of the atmosphere for ground cameras", "drawn around the mission's value"),
     ("zero_point", "mag", "AB magnitude of 1 electron/s", "the mission's"),
-    ("psf", "", "file of a PSF, found from the table's folder", "the request's `[psf]`, else the model's"),
-    ("grism_angle", "deg", "at which the spectra of NISP-S run, in the focal plane: -4, 0, 180 or 184", "0"),
+    ("psf", "", "PSF file, relative to the table's folder", "the request's `[psf]`, else the model"),
+    ("grism_angle", "deg", "direction of NISP-S spectra in the focal plane: -4, 0, 180 or 184", "0"),
 )
 _REQUIRED = tuple(name for name, _, _, default in COLUMNS if not default)
 _NAMES = tuple(name for name, *_ in COLUMNS)
@@ -55,9 +56,34 @@ _MAX_LINES, _MAX_LINE_LENGTH = 2 * _MAX_ROWS, 20 * _MAX_LENGTH
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A line: the columns of the table, None or "" where the field is empty and the mission knows the default.
+    """One line of a table of pointings.
 
-    where : file and line, for messages;  psf : path
+    An empty field is None or "" if the default comes from the mission parameters.
+
+    Attributes
+    ----------
+    location : str
+        File and line, for messages.
+    ra, dec : float
+        Position of the boresight in degrees.
+    position_angle : float, optional
+        Position angle of the focal plane's y axis in degrees, from north through east.
+    mjd : float, optional
+        Start of the exposure (MJD, UTC).
+    exposure_time_s : float, optional
+        Effective exposure time in seconds.
+    sky : float, optional
+        Diffuse sky in electrons per pixel and second.
+    seeing : float, optional
+        FWHM of the atmosphere in arcsec, only for ground cameras.
+    zero_point : float, optional
+        AB magnitude of 1 electron per second.
+    psf : str, optional
+        Path of a PSF file.
+    grism_angle : float, optional
+        Direction of NISP-S spectra in the focal plane in degrees.
+    detectors : tuple of str
+        Names of detectors; () for the default.
     """
 
     location: str
@@ -80,7 +106,17 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Contents:
-    """sha256 of the file;  bands : of its rows;  kinds : channels and image types of its rows, each pair once."""
+    """Summary of a table of pointings.
+
+    Attributes
+    ----------
+    sha256 : str
+        Checksum of the file.
+    bands : tuple of str
+        Passbands of the rows, each once.
+    kinds : tuple of (str, str)
+        Pairs (channel, image type) of the rows, each once.
+    """
 
     sha256: str
     bands: tuple[str, ...]
@@ -88,17 +124,53 @@ class Contents:
 
 
 def contents(path: Path, channels: Sequence[str], image_type: str) -> Contents:
-    """Of a file, whose rows are checked; arguments and errors as of `read`."""
+    """Read a table of pointings and return its summary.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    channels : sequence of str
+        Channels of the observation to which the table belongs.
+    image_type : str
+        Image type of the observation.
+
+    Returns
+    -------
+    Contents
+        Checksum, bands and kinds of exposures.
+
+    Raises
+    ------
+    BadInput
+        If the table is not valid, see `read`.
+    """
     rows = read(path, channels, image_type)
     bands = tuple(dict.fromkeys(row.band for row in rows))
     return Contents(file_sha256(path), bands, tuple(dict.fromkeys((row.channel, row.image_type) for row in rows)))
 
 
 def read(path: Path, channels: Sequence[str], image_type: str) -> list[Row]:
-    """The rows of a file, in its order.
+    """Read and check a table of pointings.
 
-    channels, image_type : of the observation that the table belongs to
-    Errors : BadInput names the file, the line and the column
+    Parameters
+    ----------
+    path : Path
+        The file.
+    channels : sequence of str
+        Channels of the observation to which the table belongs.
+    image_type : str
+        Image type of the observation, the default for rows without one.
+
+    Returns
+    -------
+    list of Row
+        The rows in the order of the file.
+
+    Raises
+    ------
+    BadInput
+        If the table is not valid. The message names the file, the line and the column.
     """
     stream = io.StringIO(user_files.read_text(path, "table of pointings"), newline="")
     numbered_lines, line_number = _data_lines(path, stream), 0
@@ -117,7 +189,7 @@ def read(path: Path, channels: Sequence[str], image_type: str) -> list[Row]:
             if len(rows) >= _MAX_ROWS:
                 raise BadInput(f"{path}: more than {_MAX_ROWS} pointings")
             if not all(isinstance(text, str) and len(text) <= _MAX_LENGTH for text in row.values() if text is not None):
-                raise BadInput(f"{path} line {line_number}: a text is too long, or there are more than columns")
+                raise BadInput(f"{path} line {line_number}: a text is too long, or there are more values than columns")
             rows.append(
                 _row_from_line({k: (v or "").strip() for k, v in row.items()}, path, line_number, channels, image_type)
             )
@@ -131,13 +203,13 @@ def _refuse_columns(path: Path, names: Sequence[str], channels: Sequence[str]) -
     if missing := [name for name in required if name not in names]:
         raise BadInput(f"{path}: column {missing[0]} is missing")
     if unknown := [name for name in names if name not in _NAMES]:
-        raise BadInput(f"{path}: column {user_files.format_path(unknown[0])} is not known; known: {', '.join(_NAMES)}")
+        raise BadInput(f"{path}: column {user_files.format_path(unknown[0])} is unknown; allowed: {', '.join(_NAMES)}")
     if twice := [name for name in names if list(names).count(name) > 1]:
-        raise BadInput(f"{path}: column {twice[0]} stands there twice")
+        raise BadInput(f"{path}: column {twice[0]} occurs twice")
 
 
 def _data_lines(path: Path, stream: Iterable[str]) -> Iterator[tuple[int, str]]:
-    """Number and text of each line that is no comment, as many and as long as pointings need."""
+    """Yield number and text of each line that is not a comment; refuse files that are too long."""
     for number, line in enumerate(stream, start=1):
         if number > _MAX_LINES or len(line) > _MAX_LINE_LENGTH:
             raise BadInput(f"{path}: more than {_MAX_LINES} lines, or one of more than {_MAX_LINE_LENGTH} characters")
@@ -149,7 +221,7 @@ def _row_from_line(row: Mapping[str, str], path: Path, line: int, channels: Sequ
     location = f"{path} line {line}"
     channel = row.get("channel") or (channels[0] if len(channels) == 1 else "")
     if channel not in channels:
-        raise BadInput(f"{location}: channel = {channel!r} is none of the observation's: {', '.join(channels)}")
+        raise BadInput(f"{location}: channel = {channel!r} is not one of the observation's: {', '.join(channels)}")
     euclid_bands = EUCLID_BANDS.get(channel, ())
     band = row.get("band") or (euclid_bands[0] if len(euclid_bands) == 1 else "")
     if not band:

@@ -1,4 +1,4 @@
-"""What a request holds: frozen records."""
+"""Define the records that contain a checked request."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ STATUSES = tuple(code for code, _ in database.STATUSES)
 LADDER = database.LADDER
 TRUTH_CONTENTS = tuple(code for code, _ in products.CONTENTS if code != "science")
 COMPRESSIONS = ("none", "rice")
-# As truesky/render/camera/tpv.py (a test compares them).
+# Same as in truesky/render/camera/tpv.py (a test compares them).
 WCS_CONVENTIONS = ("sip", "tpv")
 FILE_LAYOUTS = ("detector", "exposure")
-# Of ground cameras (truesky/render/channels/ground.py; test_readout.py compares them).
+# Readouts of ground cameras, the same as in truesky/render/channels/ground.py (test_readout.py compares them).
 READOUTS = ("raw", "amplifiers", "electrons")
-# Parts of a request that say how images are written.
+# Fields of a request that set the format of images.
 IMAGE_OPTIONS = ("compression", "wcs", "readout")
 DENSITY_MODELS = ("juric", "besancon")
 BOX_CELLS = (192, 256, 384)
 LENSING_NSIDES = (64, 128, 256, 512, 1024, 2048)
-# Largest reduced shear: beyond it, near a critical line, a single source is not a lensed ellipse.
+# Largest reduced shear. Above it, near a critical line, the image of a source is not an ellipse.
 MAX_SHEAR = 0.9
-# Of all channels that are rendered. A copy, since requests are read below the renderer (test_effect.py holds it to the
-# registry of channels).
+# Effects of all rendered channels. This is a copy because requests must not import the renderer; test_effect.py
+# compares it with the registry of channels.
 EFFECTS = (
     "adc", "amplifiers", "background", "bias_structure", "bleeding", "brighter_fatter", "calibration_lamp",
     "charge_injection", "chromatic_response", "cosmic_rays", "crosstalk", "dark_current", "dark_map",
@@ -48,7 +48,7 @@ EFFECTS = (
     "readout_trail", "reset_level", "satellite_trails", "serial_cti", "serial_loss", "shutter", "signal_adc",
     "signal_nonlinearity", "straylight", "trap_pumping", "tree_rings",
 )  # fmt: skip
-# What no image is a product without.
+# Effects without which no image is valid.
 ALWAYS_ON = ("adc", "amplifiers", "macc", "quadrants", "ramp", "signal_adc")
 _NO_FILES = UserCurves()
 _NO_INGEST = Ingest()
@@ -57,21 +57,32 @@ _SMOOTH = Structure()
 
 @dataclass(frozen=True, slots=True)
 class Universe:
-    """How deep and how fine.
+    """Depth and resolution of the simulated universe.
 
-    galaxy_limit, galaxy_band : faintest magnitude (AB, before the Milky Way's dust and intergalactic hydrogen), in
-                               which of the embedded passbands; a shallower or nearer request has the same galaxies
-                               as a deeper one has to its limit
-    star_limit               : H (Vega, as observed);  z_max : highest redshift
-    box_cells                : cells of 4 Mpc/h a side of the box of matter
-    lensing_nside            : HEALPix resolution of the box's lensing maps: 5 GB of the cache for 1024
-    lensing                  : (g1, g2), a constant reduced shear of all galaxies in place of box and halos, in the
-                               frame (east, north): g1 > 0 stretches east-west, g2 > 0 from the south-west to the
-                               north-east; None = the box's
-    alignment                : how many times more strongly than in nature galaxies are aligned with the matter about
-                               them, 0 = not at all
-    rotation                 : deg, added to the position angle of every galaxy, before lensing
-    high_redshift_boost, quasar_boost : how many times denser than in nature these kinds are drawn, 0 = not at all
+    Attributes
+    ----------
+    galaxy_limit : float
+        Faintest AB magnitude of galaxies, before the Milky Way's dust and intergalactic hydrogen. A shallower or nearer
+        request contains the same galaxies as a deeper one up to its limit.
+    galaxy_band : str
+        Built-in passband of `galaxy_limit`.
+    star_limit : float
+        Faintest H magnitude of stars (Vega, as observed).
+    z_max : float
+        Highest redshift.
+    box_cells : int
+        Cells of 4 Mpc/h along each side of the matter box.
+    lensing_nside : int
+        HEALPix resolution of the box's lensing maps, which need 5 GB of cache for 1024.
+    lensing : (float, float), optional
+        Constant reduced shear (g1, g2) of all galaxies instead of the lensing by box and halos. In the frame
+        (east, north), g1 > 0 stretches east-west and g2 > 0 from the south-west to the north-east.
+    alignment : float
+        Strength of the alignment of galaxies with the matter around them, relative to nature; 0 for none.
+    rotation : float
+        Angle in degrees added to the position angle of every galaxy before lensing.
+    high_redshift_boost, quasar_boost : float
+        Density of high-redshift galaxies and of quasars relative to nature; 0 for none.
     """
 
     galaxy_limit: float = 26.0
@@ -89,15 +100,27 @@ class Universe:
 
 @dataclass(frozen=True, slots=True)
 class Stars:
-    """How the Milky Way's stars are drawn.
+    """Model of the Milky Way's stars.
 
-    density           : whose laws of density
-    brown_dwarf_boost : how many times denser than in nature L and T dwarfs are drawn, 0 = not at all
-    tycho2            : files of Tycho-2, which replace the model brighter than V = 11
-    catalogue         : file of other stars to be taken instead of the model's; columns: (ours, theirs)
-    bright_limit      : brightest H (Vega, as observed) that is drawn; None = all
-    plane_limit       : faintest H (Vega, as observed) within 5 deg of the plane and at the bulge; None = refused there
-    rows_a_file       : above so many expected rows a cell's file is split into those of the next HEALPix order
+    Attributes
+    ----------
+    density : str
+        Model of the stellar density, one of `DENSITY_MODELS`.
+    brown_dwarf_boost : float
+        Density of L and T dwarfs relative to nature; 0 for none.
+    tycho2 : tuple of Path
+        Files of Tycho-2, which replace the model above the brightness V = 11.
+    catalogue : Path, optional
+        File of stars that replace the model.
+    columns : tuple of (str, str)
+        Pairs (column of ours, column of the file) for `catalogue`.
+    plane_limit : float, optional
+        Faintest H (Vega, as observed) within 5 deg of the Galactic plane and in the bulge. If None, requests there are
+        refused.
+    bright_limit : float, optional
+        Brightest H (Vega, as observed); None for no limit.
+    rows_a_file : int
+        Expected number of rows above which the file of a cell is split into files of the next HEALPix order.
     """
 
     density: str = "juric"
@@ -112,7 +135,7 @@ class Stars:
 
 @dataclass(frozen=True, slots=True)
 class Override:
-    """A value that replaces what the mission's ladder would choose."""
+    """Value and unit that replace the value of a mission parameter."""
 
     value: float
     unit: str
@@ -120,7 +143,17 @@ class Override:
 
 @dataclass(frozen=True, slots=True)
 class MissionChoice:
-    """Which statuses of the mission's parameters are preferred, what is overridden, and the user's own cameras."""
+    """Selection of mission parameters.
+
+    Attributes
+    ----------
+    ladder : tuple of str
+        Statuses of parameter values, the preferred first.
+    overrides : tuple of (str, Override)
+        Parameters with values from the user.
+    cameras : tuple of Camera
+        The user's cameras.
+    """
 
     ladder: tuple[str, ...] = LADDER
     overrides: tuple[tuple[str, Override], ...] = ()
@@ -129,7 +162,7 @@ class MissionChoice:
 
 @dataclass(frozen=True, slots=True)
 class Effects:
-    """Effects that are forced on or off, whatever a scene needs."""
+    """Effects that are switched on or off for all scenes."""
 
     on: tuple[str, ...] = ()
     off: tuple[str, ...] = ()
@@ -137,19 +170,42 @@ class Effects:
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A simulation request, checked.
+    """A checked simulation request.
 
-    explore : parameter -> the values (JSON) that it takes in turn
-    psfs    : (band, file) of PSFs in place of ours
-    files   : what has a file of its own, one of FILES
-    wcs     : how headers tell the distortion of the optics, one of CONVENTIONS; None = as the instrument's pipeline
-    readout : how files of ground cameras are wanted, one of READOUTS
-    bodies  : file of moving bodies in place of ours
-    sources : the only sources that there are, in place of the universe
-    structure : what galaxies have beside their profiles
-    noise_seed : of all that differs between exposures of the same sky with the same detectors; None = the seed
-    detectors, limit : of a plan, the detectors that are to be rendered now, () = all; and how many at most.  A
-              command line gives them, and the plan is the same without
+    Attributes
+    ----------
+    seed : int
+        Seed of all random numbers.
+    bands : tuple of str
+        Passbands in which fluxes are computed.
+    truth : tuple of str
+        Truth images, from `TRUTH_CONTENTS`.
+    explore : tuple of (str, tuple of str)
+        Explored parameters, each with its values as JSON.
+    strong_lens_boost : float
+        Density of strong lenses relative to nature.
+    compression : str
+        Compression of integer images, one of `COMPRESSIONS`.
+    wcs : str, optional
+        Convention for the distortion in headers, one of `WCS_CONVENTIONS`; None for that of the instrument's pipeline.
+    files : str
+        Whether science images are also stored in one file per exposure, one of `FILE_LAYOUTS`.
+    readout : str
+        Form of the images of ground cameras, one of `READOUTS`.
+    psfs : tuple of (str, str)
+        Pairs (band, file) of PSFs that replace the models.
+    bodies : Path, optional
+        File of moving bodies that replace the simulated ones.
+    noise_seed : int, optional
+        Seed of everything that differs between exposures of the same sky with the same detectors; None to use `seed`.
+    sources : UserSources, optional
+        Tables that contain all sources; None for the simulated universe.
+    structure : Structure
+        Structure of galaxies beyond smooth profiles.
+    detectors : tuple of str
+        Detectors to render now, () for all. Set on the command line; the plan does not depend on it.
+    limit : int, optional
+        Largest number of detectors to render now. Set on the command line; the plan does not depend on it.
     """
 
     name: str
@@ -181,14 +237,14 @@ class Request:
     limit: int | None = None
 
     def facts(self, *names: str) -> dict[str, Any]:
-        """The named parts of the request as JSON values, for the key of what depends on them."""
+        """Return the named fields of the request as JSON values, for the key of the products that depend on them."""
         all_values = asdict(self)
-        # Not where a camera's folder lies, but what it holds.
+        # A camera is identified by the contents of its folder, not by its path.
         all_values["mission"]["cameras"] = {camera.name: camera.sha256 for camera in self.mission.cameras}
         return {name: all_values[name] for name in names}
 
     def variants(self) -> Iterator[dict[str, Any]]:
-        """The product of what is explored: parameter -> value; one empty variant where nothing is."""
+        """Yield all combinations of explored parameters as {parameter: value}; a single {} if nothing is explored."""
         names = [name for name, _ in self.explore]
         for values in product(*(choices for _, choices in self.explore)):
             yield {name: json.loads(value) for name, value in zip(names, values, strict=True)}

@@ -1,9 +1,4 @@
-"""Galaxies that are no smooth profiles: the section `structure`.
-
-Arms, Stamps, Structure   what is asked for
-parse             the section
-facts             what shapes an image, for its key
-"""
+"""Read the section `structure` of a request: spiral arms, knots and postage stamps of galaxies."""
 
 from __future__ import annotations
 
@@ -15,7 +10,7 @@ from lake_schema import user_files
 from lake_schema.errors import BadInput
 from truesky.request.toml_values import Toml, as_table, boolean, integer, number, string
 
-# Fewer knots would be no disc, and each is drawn.
+# Fewer knots do not fill a disc. The upper limit bounds the time, since each knot is drawn.
 _KNOT_LIMITS = (20, 5000)
 
 
@@ -23,10 +18,16 @@ _KNOT_LIMITS = (20, 5000)
 class Arms:
     """Spiral arms and knots of large discs.
 
-    contrast : of an arm's ridge over the mean of its circle, less 1, of the average disc; 0 = no arms
-    knots    : part of the disc's light that is in knots
-    number   : of knots in a disc
-    least_radius : arcsec, half-light radius of the smallest disc that has arms
+    Attributes
+    ----------
+    contrast : float
+        Brightness at the ridge of an arm over the mean at that radius, less 1, for the average disc; 0 for no arms.
+    knots : float
+        Fraction of the disc's light in knots.
+    number : int
+        Number of knots per disc.
+    least_radius : float
+        Half-light radius in arcsec of the smallest disc with arms.
     """
 
     contrast: float = 0.8
@@ -37,10 +38,16 @@ class Arms:
 
 @dataclass(frozen=True, slots=True)
 class Stamps:
-    """A library of galaxies, drawn in place of profiles (truesky/render/sources/galaxy_stamps.py).
+    """A library of galaxy images that replace profiles (truesky/render/sources/galaxy_stamps.py).
 
-    nearest : galaxies that name no stamp have one, too, drawn among those nearest in shape
-    least_radius : arcsec, half-light radius of the smallest of them
+    Attributes
+    ----------
+    file : Path
+        File of the library.
+    nearest : bool
+        True if galaxies without a stamp number get one, drawn among the stamps nearest in shape.
+    least_radius : float
+        Half-light radius in arcsec of the smallest galaxy that gets such a stamp.
     """
 
     file: Path
@@ -50,14 +57,20 @@ class Stamps:
 
 @dataclass(frozen=True, slots=True)
 class Structure:
-    """What galaxies have beside their profiles; arms : None = discs are smooth;  stamps : None = there are none."""
+    """Structure of galaxies beyond smooth profiles; `arms` is None for smooth discs, `stamps` is None for no stamps."""
 
     arms: Arms | None = None
     stamps: Stamps | None = None
 
 
 def parse(table: Toml, folder: Path) -> Structure:
-    """The section `structure`; files are found from `folder`.  BadInput names the key."""
+    """Read the section `structure`; `folder` is the folder of the request.
+
+    Raises
+    ------
+    BadInput
+        If the section is not valid. The message names the key.
+    """
     return Structure(_arms(table.get("arms", False)), _stamps(table["stamps"], folder) if "stamps" in table else None)
 
 
@@ -66,7 +79,7 @@ def _stamps(value: object, folder: Path) -> Stamps:
     stamps_table = as_table(value, path, set(Stamps.__slots__))
     nearest = boolean(stamps_table, f"{path}.nearest", False)
     if "least_radius" in stamps_table and not nearest:
-        raise BadInput(f"{path}.least_radius wants nearest = true: a stamp that is named is drawn at any size")
+        raise BadInput(f"{path}.least_radius requires nearest = true: stamps selected by number are drawn at any size")
     return Stamps(
         user_files.expand_path(string(stamps_table, f"{path}.file"), folder),
         nearest,
@@ -86,12 +99,12 @@ def _arms(value: object) -> Arms | None:
         number(arms_table, f"{path}.least_radius", 0.3, 60.0, default.least_radius),
     )
     if not arms.contrast and not arms.knots:
-        raise BadInput(f"{path}: neither contrast nor knots: false leaves discs smooth")
+        raise BadInput(f"{path}: contrast or knots must be above 0; use arms = false for smooth discs")
     return arms
 
 
 def facts(structure: Structure) -> dict[str, Any]:
-    """Of a request that asks for some structure; nothing where galaxies are smooth.  A file's name is no part of it."""
+    """Return the facts that change the images of galaxies, without file names; {} if all galaxies are smooth."""
     structure_facts: dict[str, Any] = {}
     if structure.arms is not None:
         structure_facts["arms"] = asdict(structure.arms)

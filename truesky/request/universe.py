@@ -1,9 +1,4 @@
-"""The universe that a request asks for, and whether a catalogue is of it: seed, depth, and whatever else shapes it.
-
-wanted          what a request says of its universe
-refuse_other    a catalogue of another universe than the request's
-refuse_others   a request of another universe than that of the requests which a lake holds already
-"""
+"""Compare the universe of a request (seed, depth and all else that shapes it) with catalogues and other requests."""
 
 from __future__ import annotations
 
@@ -23,21 +18,21 @@ from truesky.request.files import Catalogue
 from truesky.request.schema import Request
 
 CATALOGUES = ("galaxies", "stars")
-# What the formats of external catalogues are; some are of two files each.
+# Formats of external catalogues. Some formats have pairs of files.
 _FORMATS = Path(__file__).parents[1] / "catalogue" / "external" / "ingest_formats.toml"
-# What names files, or says how rows are filed.
+# Keys that name files or set how rows are written.
 _FILE_KEYS = {"tycho2", "catalogue", "columns", "rows_a_file"}
 
 
 def requested_values(request: Request) -> dict[str, Any]:
-    """Seed and values of the sections universe and stars, by their names."""
+    """Return the seed and the values of the sections `universe` and `stars` by name, without files."""
     values = request.facts("universe", "stars")
     star_values = {key: value for key, value in values["stars"].items() if key not in _FILE_KEYS}
     return {"seed": request.seed, **values["universe"], **star_values}
 
 
 def check_catalogues(catalogues: Iterable[read.Version], request: Request) -> None:
-    """Every catalogue must be of the request's universe.  Errors: BadInput names the first that is not, and why"""
+    """Check that every catalogue belongs to the universe of the request; raises BadInput at the first that does not."""
     for version in catalogues:
         if different := _difference(version, request):
             first = f"run build_{version.table} first, then compute_fluxes"
@@ -45,7 +40,15 @@ def check_catalogues(catalogues: Iterable[read.Version], request: Request) -> No
 
 
 def check_lake(root: Path, request: Request) -> None:
-    """A lake holds one universe: that of its other requests.  A request that is alone in it may change its own."""
+    """Check that the other requests in a lake have the universe of this request.
+
+    A lake contains one universe. A request may change the universe if it is the only one in the lake.
+
+    Raises
+    ------
+    BadInput
+        If the catalogues of another request differ.
+    """
     for name in request_links.request_names(root):
         for table in CATALOGUES if name != request.name else ():
             if request_links.linked_key(root, name, table) is not None:
@@ -56,13 +59,13 @@ def check_lake(root: Path, request: Request) -> None:
 
 
 def _difference(version: read.Version, request: Request) -> str:
-    """What tells a catalogue's universe from the request's; empty where nothing does."""
+    """Describe how the universe of a catalogue differs from that of the request; "" if they agree."""
     facts = version.manifest["facts"]
     values, sources = requested_values(request), request.sources
     source_facts = None if sources is None else sources.facts(request.area.bounding_circle())
     if canonical(facts.get("sources")) != canonical(source_facts):
         return "other sources than the request"
-    # A catalogue that was not drawn by us has no depth.
+    # Facts of external catalogues do not contain the depth.
     for key in ("seed", *(key for key in values if key in facts and key != "seed")):
         if canonical(facts.get(key)) != canonical(values[key]):
             return f"{key} {facts.get(key)}, the request {values[key]}"
@@ -80,7 +83,17 @@ def _difference(version: read.Version, request: Request) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _NamedFiles:
-    """Files that a request names; about : how they are read; beside : of the names of files that are read in pairs."""
+    """Files that a request names.
+
+    Attributes
+    ----------
+    files : sequence of Path
+        Files and folders.
+    options : mapping of str
+        Options with which the files are read.
+    pair_prefixes : sequence of str
+        Beginnings of the file names of a pair, if rows are split between two files.
+    """
 
     files: Sequence[Path]
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -88,7 +101,7 @@ class _NamedFiles:
 
 
 def _named_files(table: str, request: Request) -> Iterator[tuple[str, _NamedFiles | None]]:
-    """What a catalogue's facts call files, and those that the request names."""
+    """Yield each name under which a catalogue's facts record files, with the files of the request."""
     ingest, stars = request.ingest, request.stars
     dust = {} if ingest.dust is None else {name: value for name, value in asdict(ingest.dust).items() if name != "file"}
     yield "dust", _NamedFiles((ingest.dust.file,), dust) if ingest.dust else None
@@ -114,12 +127,12 @@ def _catalogue_files(catalogue: Catalogue, with_format: bool = False) -> _NamedF
 
 
 def _is_same(facts: Json, named: _NamedFiles) -> bool:
-    """Are they the files that the facts have the sha256 of?  Those that have been moved away cannot be compared."""
+    """Return True if the files have the recorded checksums, or if a file is missing and cannot be compared."""
     if not all(path.exists() for path in named.files):
         return True
     all_files = [file for path in named.files for file in (external_rows.find_files(path) if path.is_dir() else [path])]
     if named.pair_prefixes:
-        # A folder of such pairs holds tables of other things as well.
+        # A folder with pairs of files may contain other tables.
         first, second = named.pair_prefixes
         all_files = [file for file in all_files if file.name.startswith(first) and not file.name.startswith(second)]
         all_files += [file.with_name(second + file.name.removeprefix(first)) for file in all_files]

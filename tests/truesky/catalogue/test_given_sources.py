@@ -112,10 +112,10 @@ BAD = [
     ({"stars": STAR.replace("4000", "4")}, r"stars.csv: teff of row 1 is 4"),
     ({"more": 'only = "grid"\nspacing = 20.0'}, r"galaxies.csv: unknown column ra, must be one of mag"),
     ({"more": 'only = "grid"'}, r"sources.spacing is missing"),
-    ({"more": 'only = "table"\nspacing = 20.0'}, r"sources.spacing wants only"),
+    ({"more": 'only = "table"\nspacing = 20.0'}, r"sources.spacing requires only"),
     ({"more": 'only = "some"'}, r"sources.only = 'some'"),
     ({"more": 'only = "table"\nband = "johnson_q"'}, r"sources.band = 'johnson_q' is not one of"),
-    ({"galaxies": None, "stars": None}, r"sources names neither galaxies nor stars"),
+    ({"galaxies": None, "stars": None}, r"sources must have galaxies or stars"),
     ({"extra": "[stars]\nbright_limit = 15.0"}, r"sources: .* section stars"),
     ({"extra": '[ingest.halos]\nfiles = ["x.csv"]'}, r"sources: .* section ingest"),
 ]

@@ -20,7 +20,7 @@ def stars_library():
 
 @pytest.fixture
 def galaxies():
-    """A maker of random rows of the table `galaxies`, as far as spectra need them; columns override."""
+    """Return a function that makes random rows of `galaxies` with columns for spectra; arguments override them."""
 
     def make(n: int = 20, seed: int = 1, **columns) -> pa.Table:
         rng = np.random.default_rng(seed)
@@ -56,7 +56,7 @@ def galaxies():
 
 @pytest.fixture
 def bare(galaxies):
-    """Galaxies of one template, without lines, dust, lens and Milky Way."""
+    """Return galaxies of one template without lines, dust, lensing and Milky Way extinction."""
 
     def make(n: int = 1, **columns) -> pa.Table:
         nothing = dict.fromkeys(
@@ -81,7 +81,7 @@ def bare(galaxies):
 
 @pytest.fixture
 def stars(stars_library):
-    """A maker of random rows of the table `stars`."""
+    """Return a function that makes random rows of the table `stars`."""
 
     def make(n: int = 20, seed: int = 2, **columns) -> pa.Table:
         rng = np.random.default_rng(seed)

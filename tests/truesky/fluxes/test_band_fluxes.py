@@ -1,4 +1,4 @@
-"""Spectra from end to end: each step of appendix B of Serrano et al. 2024, and its misprints."""
+"""Test spectra end to end: each step of appendix B of Serrano et al. 2024, and its misprints."""
 
 import numpy as np
 import pyarrow as pa
@@ -65,7 +65,7 @@ def test_the_lens_magnifies_continuum_and_lines_alike(galaxies, library):
 
 
 def test_the_milky_way_dims_with_its_curve(galaxies, library):
-    # The printed A = E(B-V) R_V would dim every wavelength alike.
+    # The printed A = E(B-V) R_V would dim all wavelengths equally.
     clear, dusty = (band_fluxes.galaxy_spectra(galaxies(4, a_v=a_v), library) for a_v in (0.0, 1.24))
     seen = clear > 0.0
     magnitudes = -2.5 * np.log10(dusty[seen] / clear[seen])
@@ -82,7 +82,7 @@ def test_internal_dust_reddens_at_fixed_reference_magnitude(bare, library):
     np.testing.assert_allclose(f_nu[:, 1], f_nu[0, 1], rtol=1e-6)
 
 
-def test_overlensed_sources_are_named(galaxies, library):
+def test_message_names_sources_beyond_the_critical_curve(galaxies, library):
     kappa = np.zeros(20)
     kappa[4] = 0.99
     with pytest.raises(OutOfRange, match="magnification of source 104"):
@@ -126,7 +126,7 @@ def test_synthetic_photometry_is_speclites(galaxies, library):
 
 
 def test_dust_is_applied_at_every_wavelength_not_to_the_band(bare, library):
-    """A band's extinction at E(B-V) = 0.2, rescaled to 0.5 as printed, is wrong in wide and in steep bands."""
+    """A band's extinction at E(B-V) = 0.2, scaled to 0.5 as printed, is wrong in wide and in steep bands."""
 
     def dimming(band, **dust):
         clear, dim = (np.asarray(t[f"f_nu_{band}"], float)[0] for t in (flux(), flux(**dust)))
@@ -140,7 +140,7 @@ def test_dust_is_applied_at_every_wavelength_not_to_the_band(bare, library):
     for band, error in worst.items():
         scaled = 2.5 * dimming(band, a_v=3.1 * 0.2)
         assert abs(dimming(band, a_v=3.1 * 0.5) - scaled) > error
-    # Inside the galaxy: behind its own dust, at its E(B-V), against the sum over wavelengths.
+    # For dust inside the galaxy, compare with the sum over wavelengths at its E(B-V).
     rest, band = library.wavelength, passbands.load("lsst_u")
     dusty = library.flux[8] * extinction.transmission(extinction.laws(rest)[2], 0.5)
     ratio = passbands.ab_flux(band, rest * 1.4, dusty) / passbands.ab_flux(R01, rest * 1.4, dusty)

@@ -1,4 +1,4 @@
-"""Bulges redder than their discs: by as much as is asked for, within what templates there are, continuously."""
+"""Test the colours of bulges and discs: bulges are redder by the requested amount, within the range of templates."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ OWN = bulges.colour_sequence(LIBRARY)
 
 
 def rows(share=0.3, colour=0.2, z=0.5, sed=14.0, kind=0):
-    """Rows between neighbours of the sequence; each of them a number or an array."""
+    """Return rows between neighbouring templates; arguments are numbers or arrays."""
     share, colour, z, sed, kind = np.broadcast_arrays(*np.atleast_1d(share, colour, z, sed, kind))
     first = np.minimum(sed.astype(int), len(LIBRARY) - 2)
     return pa.table(
@@ -45,14 +45,14 @@ def odds(share):
 
 
 def test_the_colour_is_that_of_the_column():
-    """Bulge over disc in 0.1g and in 0.1r, at rest; r is what the fraction is of."""
+    """Compare bulge over disc in 0.1g and in 0.1r at rest; the fraction refers to r."""
     table = rows(share=[0.05, 0.3, 0.9], sed=[6.0, 14.4, 28.0], z=0.0)
     blue, red = (share_of(table, passbands.load(f"sdss_{band}01")) for band in "gr")
     np.testing.assert_allclose(red, [0.05, 0.3, 0.9], atol=1e-5)
     np.testing.assert_allclose(-2.5 * np.log10(odds(blue) / odds(red)), 0.2, atol=0.004)
 
 
-def test_what_is_as_red_as_can_be_has_one_colour():
+def test_the_reddest_galaxies_have_one_colour():
     reddest = int(OWN.template[-1])
     np.testing.assert_allclose(share_of(rows(sed=float(reddest)), H), 0.3, rtol=1e-12)
     near = share_of(rows(sed=reddest + 0.01), H)
@@ -60,7 +60,7 @@ def test_what_is_as_red_as_can_be_has_one_colour():
 
 
 @pytest.mark.parametrize("known", [{"colour": np.nan}, {"colour": 0.0}, {"kind": 2}, {"share": 1.0}, {"share": 0.0}])
-def test_what_says_nothing_of_a_colour_is_kept_to_the_bit(known):
+def test_rows_without_a_colour_are_unchanged(known):
     table = rows(**known)
     assert bulges.with_fractions_in_band(table, VIS, LIBRARY) is table
     assert (
@@ -74,7 +74,7 @@ def test_what_says_nothing_of_a_colour_is_kept_to_the_bit(known):
 @pytest.mark.parametrize("band", ["lsst_u", "euclid_vis", "euclid_y", "euclid_h"])
 @pytest.mark.parametrize("ebv", [0.0, 0.4])
 def test_against_whole_spectra(galaxies, band, ebv):
-    """Of templates that are as far apart as the colour asks for, the light of their spectra, of one light in 0.1r."""
+    """Compare with spectra of two templates whose colours differ by the requested amount, with equal light in 0.1r."""
     passband, z, dust = passbands.load(band), np.array([0.01, 0.2, 0.7, 1.4, 2.2, 4.0]), continuum.dust_curves(LIBRARY)
     known = {f"{name}_{k}": value for k in (1, 2) for name, value in (("ebv", ebv), ("ext_law", 2))}
     light, first, count = [], int(passband.wavelength[0]), len(passband.wavelength)
@@ -85,7 +85,7 @@ def test_against_whole_spectra(galaxies, band, ebv):
         light.append(spectra.astype(float) @ passbands.weights(passband) * amplitude.sum())
     redness = OWN.colour[OWN.rank[12]] - OWN.colour[OWN.rank[18]]
     found = odds(share_of(rows(colour=redness, z=z, sed=18.0), passband)) / odds(0.3)
-    # Dust changes where in the band the light is.
+    # Dust changes the distribution of light within the band.
     np.testing.assert_allclose(found, light[1] / light[0], rtol=0.005 if ebv == 0.0 else 0.05)
 
 
@@ -117,7 +117,7 @@ def test_bins_are_narrow_bands():
         np.testing.assert_allclose(share_of(rows(sed=[5.0, 20.5], z=0.0), band), found[:, column], atol=5e-4)
 
 
-def test_fluxes_do_not_know_of_bulges(galaxies):
+def test_fluxes_do_not_depend_on_bulges(galaxies):
     table = galaxies(20)
     other = table.append_column("bulge_color", pa.array(np.full(20, 0.4, np.float32)))
     first, second = (band_fluxes.galaxy_fluxes(one, ["euclid_vis"], LIBRARY) for one in (table, other))

@@ -1,4 +1,4 @@
-"""The job: cell by cell, row by row, with its accuracy in the manifest."""
+"""Test the job: fluxes by cell and row, and the accuracy in the manifest."""
 
 import hashlib
 
@@ -68,12 +68,12 @@ def filled(lake):
 
 def run(lake, asked, sources=False):
     for step in compute_fluxes.steps(lake, asked):
-        # What fluxes were made with is read back only where the request brings its own.
+        # Inputs are read from the lake only if the request has user files.
         if sources or step.plan.table.is_catalogue:
             publish.make_version(lake, step.plan, step.run_task)
 
 
-def test_every_source_has_its_fluxes_beside_it(filled):
+def test_every_source_has_fluxes_in_the_same_row(filled):
     run(filled, wanted())
     for kind, name in compute_fluxes.CATALOGUES:
         source, made = read.version(filled, name), read.version(filled, f"{kind}_fluxes")
@@ -93,7 +93,7 @@ def test_the_manifest_says_how_exact_it_is(filled):
     assert read.version(filled, "star_fluxes").manifest["facts"]["errors"]["euclid_h"]["largest"] <= 1e-5
 
 
-def test_the_accuracy_of_the_request_rules(filled, library):
+def test_the_accuracy_of_the_request_is_used(filled, library):
     run(filled, wanted(accuracy="draft"))
     draft = read.version(filled, "galaxy_fluxes")
     run(filled, wanted(accuracy="reference"))
@@ -108,7 +108,7 @@ def test_the_accuracy_of_the_request_rules(filled, library):
         assert (fast != slow).any()
 
 
-def test_what_they_were_made_with_is_published_with_them(filled):
+def test_inputs_are_published_with_fluxes(filled):
     run(filled, wanted(), sources=True)
     made = read.version(filled, "galaxy_fluxes").manifest["facts"]["sources"]
     for name in ("templates", "extinction_laws", "emission_lines", "passbands"):
@@ -118,7 +118,7 @@ def test_what_they_were_made_with_is_published_with_them(filled):
 
 
 def test_files_of_the_user_make_the_fluxes(filled, tmp_path, library):
-    """A filter, two galaxies and a law of the request's own: through the lake, the tables and the workers."""
+    """A filter, two galaxies and a law of the user are used by the lake, the tables and the workers."""
     slope = WAVELENGTH / 5500.0
     for name, values in (("early", slope), ("late", 1.0 / slope)):
         ascii_file(tmp_path / f"{name}.sed", value=values)
@@ -158,15 +158,15 @@ format = "extinction"
         np.testing.assert_allclose(made.rows()[column], truth[column], rtol=1e-3)
     assert np.abs(np.log(np.asarray(truth["f_nu_euclid_h"]) / np.asarray(embedded["f_nu_euclid_h"]))).min() > 0.1
     assert (read.version(filled, "star_fluxes").rows()["f_nu_mine"].to_numpy() > 0.0).all()
-    # What draws the galaxies finds their spectra, too.
+    # The renderer of the galaxies also loads their spectra.
     np.testing.assert_array_equal(inputs.galaxy_library_from_facts(filled, facts).flux, own.library.flux)
-    # Another content of the same file is another table.
+    # A file with the same name and other contents gives another table.
     ascii_file(tmp_path / "mine.dat", BAND, RESPONSE**2)
     assert compute_fluxes.flux_step("galaxy", filled, parse(path)).plan.key != made.key
 
 
 def test_stars_of_the_user_make_the_fluxes(filled, tmp_path, stars_library):
-    """Models and an infrared spectrum of the request's own, through the lake."""
+    """Models and an infrared spectrum of the user are used for the stars in the lake."""
     black_bodies(tmp_path / "synthetic.cor")
     irtf_file(tmp_path / "star.txt", -2.5, wiggle=0.3)
     own = "[fluxes.stars]\nbasel = 'synthetic.cor'\nirtf = ['star.txt']\n"
@@ -185,7 +185,7 @@ def test_stars_of_the_user_make_the_fluxes(filled, tmp_path, stars_library):
     np.testing.assert_array_equal(inputs.stellar_library_from_facts(filled, facts).flux, own.stars.flux)
 
 
-def test_what_is_there_is_not_prepared_again(filled, monkeypatch):
+def test_published_fluxes_are_not_prepared_again(filled, monkeypatch):
     run(filled, wanted())
     monkeypatch.setattr(band_fluxes, "prepare", None)
     run(filled, wanted())

@@ -1,4 +1,4 @@
-"""Distances against astropy, adaptive quadrature and the small-redshift series."""
+"""Compare distances with astropy, adaptive quadrature and the series for small redshifts."""
 
 import numpy as np
 import pytest
@@ -82,7 +82,7 @@ def test_ends():
 
 
 def test_ages():
-    """Closed form against the integral of dt = dz / ((1 + z) H); 13.47 Gyr with h = 0.7, Omega_m = 0.3."""
+    """Compare the closed form with the integral of dt = dz / ((1 + z) H); 13.47 Gyr with h = 0.7, Omega_m = 0.3."""
     from scipy.integrate import quad
 
     for z in (0.0, 1.0, 5.0):

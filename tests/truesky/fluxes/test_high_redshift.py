@@ -16,7 +16,7 @@ H = passbands.load("euclid_h")
 
 @pytest.fixture
 def distant(galaxies):
-    """A maker of rows of kind 2 or 3."""
+    """Return a function that makes rows of kind 2 or 3."""
 
     def make(n=6, kind=3, **columns):
         plain = {
@@ -50,7 +50,7 @@ def test_slopes_and_lyman_alpha(k):
 
 
 def test_the_continuum_of_quasars_breaks_at_5000_angstrom():
-    """Vanden Berk et al. 2001: -1.56 and 0.45 in f_lambda. Lines are as strong again in the next spectrum."""
+    """Slopes of Vanden Berk et al. 2001: -1.56 and 0.45 in f_lambda. Lines are twice as strong in the next template."""
     library = high_redshift.quasar_library()
     half, whole = library.flux[[3, 4]].astype(float)
     continuum = 2.0 * half - whole
@@ -90,7 +90,7 @@ def test_nothing_is_left_below_lyman_alpha(distant):
 
 
 def test_quasars_are_seen_through_the_intergalactic_medium(distant):
-    """Inoue et al. 2014: of the light below Lyman alpha little is taken at z = 1, a third at z = 3, most at z = 6."""
+    """Below Lyman alpha, little light is absorbed at z = 1, a third at z = 3, and most at z = 6 (Inoue et al. 2014)."""
     z = np.array([1.0, 3.0, 6.0])
     f_lambda = high_redshift.spectra(distant(3, 2, z_obs=z, sed_1=4))
     left = []

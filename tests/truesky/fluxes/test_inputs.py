@@ -1,4 +1,4 @@
-"""What fluxes are made with, as tables: rows that say where they are from, and a request's own files among them."""
+"""Test the lake tables of inputs: origins of the rows, and user files."""
 
 import hashlib
 
@@ -24,7 +24,7 @@ def embedded():
 
 
 def own(tmp_path, **changes):
-    """Two galaxies, a filter and a law, all synthetic."""
+    """Return two galaxies, a filter and a law, all synthetic."""
     slope = (WAVELENGTH / 5500.0) ** -1.0
     files = tuple(ascii_file(tmp_path / f"{name}.sed", value=flux) for name, flux in (("early", FLUX), ("late", slope)))
     mine = ascii_file(tmp_path / "mine.dat", BAND, RESPONSE)
@@ -65,7 +65,7 @@ def test_embedded_passbands_and_laws_say_where_they_are_from(embedded):
 
 
 def test_vegas_level_is_that_of_the_published_spectrum_and_responses(embedded):
-    """By the definition of AB magnitudes, from two tables of a lake alone: one level of the spectrum for all bands."""
+    """Compute AB magnitudes of Vega from two tables of a lake; all bands give the same level of the spectrum."""
     spectra = inputs.template_rows(embedded)
     vega = spectra.filter(pc.equal(spectra["name"], "Vega")).to_pylist()[0]
     at = vega["first_wavelength"] + vega["wavelength_step"] * np.arange(len(vega["flux"]))
@@ -88,7 +88,7 @@ def test_vegas_level_is_that_of_the_published_spectrum_and_responses(embedded):
     assert vega_magnitudes([beyond]) == [None]
 
 
-def test_own_files_take_their_places(tmp_path, embedded):
+def test_user_files_replace_built_in_ones(tmp_path, embedded):
     mine = inputs.read(own(tmp_path))
     assert set(mine.sha256()) == {
         "fluxes.passbands.mine", "fluxes.templates.0", "fluxes.templates.1", "fluxes.extinction.3",
@@ -104,12 +104,12 @@ def test_own_files_take_their_places(tmp_path, embedded):
     assert rows[-1]["sha256"] == mine.sha256()["fluxes.passbands.mine"]
 
 
-def test_a_law_alone_stands_before_the_embedded_galaxies(tmp_path, embedded):
+def test_a_user_law_applies_to_built_in_galaxies(tmp_path, embedded):
     mine = inputs.read(own(tmp_path, templates=None, passbands=()))
     np.testing.assert_array_equal(mine.library.flux, embedded.library.flux)
     k = continuum.dust_curves(mine.library)[3]
     assert k[mine.library.wavelength == 5500.0] == pytest.approx(4.05, rel=1e-4)
-    # Beyond the file its ends go on.
+    # Beyond the wavelengths of the file, the law is constant.
     assert k[0] == k[mine.library.wavelength == 899.0]
 
 
@@ -124,7 +124,7 @@ def test_a_law_alone_stands_before_the_embedded_galaxies(tmp_path, embedded):
         ({"extinction": ((2, ("steep.dat", "extinction")),)}, r"fluxes\.extinction\.2: .*row 1 is more than k = 100"),
     ],
 )
-def test_what_is_wrong_is_refused_with_its_key(tmp_path, changes, message):
+def test_bad_files_are_refused_with_their_key(tmp_path, changes, message):
     own(tmp_path)
     ascii_file(tmp_path / "steep.dat", value=1e4 * FLUX)
 
@@ -147,7 +147,7 @@ def test_a_votable_without_its_own_unit_is_in_angstrom(tmp_path):
 
 
 def test_lines_are_published_with_wavelength_ratio_and_width(embedded, galaxies, library):
-    """A reader with the lake alone has every line: the light that spectra have of it, and where, and how wide."""
+    """The lake contains flux, wavelength and width of each line in the spectra."""
     published = inputs.line_rows(embedded)
     check_rows(published, EMISSION_LINES)
     rows = published.to_pylist()

@@ -1,4 +1,4 @@
-"""The fast band fluxes against the whole spectra, and what must not change them."""
+"""Compare fast band fluxes with whole spectra, and test that irrelevant changes have no effect."""
 
 import numpy as np
 import pyarrow as pa
@@ -27,7 +27,7 @@ def whole(table, library):
     return np.stack(out, 1)
 
 
-def test_galaxies_are_their_spectra(galaxies, library):
+def test_galaxy_fluxes_agree_with_whole_spectra(galaxies, library):
     table = galaxies(40)
     fast = band_fluxes.galaxy_fluxes(table, BANDS, library)
     np.testing.assert_allclose(columns(fast), whole(table, library), rtol=1e-6)
@@ -42,7 +42,7 @@ def test_the_reference_band_may_lie_elsewhere(galaxies, library, band):
     np.testing.assert_allclose(got, whole(table, library)[:, BANDS.index(band)], rtol=1e-6)
 
 
-def test_lines_alone_are_their_spectra(galaxies, library):
+def test_line_fluxes_agree_with_whole_spectra(galaxies, library):
     table = galaxies(30, mag_r01=45.0)
     np.testing.assert_allclose(
         columns(band_fluxes.galaxy_fluxes(table, BANDS, library)), whole(table, library), rtol=1e-6
@@ -71,7 +71,7 @@ def test_a_band_does_not_depend_on_the_others(galaxies, library):
         )
 
 
-def test_stars_are_their_spectra(stars, stars_library):
+def test_star_fluxes_agree_with_whole_spectra(stars, stars_library):
     table = stars(100)
     curves = [passbands.load(name) for name in BANDS]
     wanted = band_fluxes.band_fluxes(band_fluxes.star_spectra(table, stars_library), curves)
@@ -80,8 +80,8 @@ def test_stars_are_their_spectra(stars, stars_library):
     assert got["id"].equals(table["id"])
 
 
-def test_stars_have_the_h_magnitude_that_the_published_level_of_vega_makes_of_it(stars, stars_library):
-    """Of every spectrum, before dust: m_AB of the flux in 2MASS H is mag_h + 1.3753."""
+def test_stars_have_their_vega_magnitude_in_h(stars, stars_library):
+    """For every spectrum before dust, m_AB of the flux in 2MASS H is mag_h + 1.3753."""
     n = len(stars_library)
     table = stars(n, sed=np.arange(n), a_v=0.0)
     flux = band_fluxes.star_fluxes(table, ["twomass_h"], stars_library)["f_nu_twomass_h"].to_numpy()
@@ -109,7 +109,7 @@ def test_no_rows_no_bands(galaxies, stars, library, stars_library):
         band_fluxes.galaxy_fluxes(galaxies().drop_columns(["_healpix_29"]), BANDS, library)
 
 
-def test_a_galaxy_that_dust_has_put_out_is_refused(bare, library):
+def test_a_galaxy_without_light_after_dust_is_refused(bare, library):
     table = bare(z_obs=6.0, sed_1=0, ext_law_1=1, ebv_1=3.0)
     with pytest.raises(BadInput, match="no light in the reference band"):
         band_fluxes.galaxy_fluxes(table, BANDS, library)

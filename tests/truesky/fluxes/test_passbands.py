@@ -1,4 +1,4 @@
-"""Passbands against speclite, closed forms and published zero points."""
+"""Compare passbands with speclite, closed forms and published zero points."""
 
 import astropy.units as u
 import numpy as np
@@ -72,7 +72,7 @@ def test_a_flat_f_nu_comes_back(name, mag):
     assert got == pytest.approx(float(f_nu), rel=1e-12, abs=0.0)
 
 
-def test_pivot_joins_the_two_averages():
+def test_pivot_wavelength_relates_f_nu_and_f_lambda():
     band = passbands.load("euclid_vis")
     f_lambda = 1e-17 * np.exp(-GRID / 3000.0)
     seen = f_lambda[band.first : band.first + len(band.wavelength)]
@@ -86,7 +86,7 @@ def test_the_reference_band_is_shifted_to_the_blue():
     # R_01(lambda) = R(1.1 lambda): pivot 6177 / 1.1; R(lambda / 1.1) would be at 6795.
     r, r01 = passbands.load("sdss_r"), passbands.load("sdss_r01")
     assert passbands.pivot_wavelength(r01) == pytest.approx(passbands.pivot_wavelength(r) / 1.1, rel=1e-4)
-    # It is where r sees a source of z = 0.1.
+    # It is the rest-frame range that r observes at z = 0.1.
     rest = 1.0 + 0.3 * np.sin(GRID / 40.0)
     seen = np.interp(GRID, GRID * 1.1, rest) / 1.1
     wanted = float(passbands.ab_flux(r01, GRID, rest)) * 1.1
@@ -117,18 +117,18 @@ def test_logistic_edges():
     assert band.response.max() == pytest.approx(0.75, rel=1e-4)
 
 
-def test_what_cannot_be_integrated_is_refused():
+def test_uncovered_bands_are_refused():
     with pytest.raises(BadInput, match="euclid_i'"):
         passbands.load("euclid_i")
     with pytest.raises(BadInput, match="does not cover"):
         passbands.ab_flux(passbands.load("euclid_h"), GRID[:10000], np.ones(10000))
 
 
-def test_no_row_replaces_another_of_its_name(tmp_path, monkeypatch):
+def test_duplicate_names_are_refused(tmp_path, monkeypatch):
     table = passbands.TABLE.read_text(encoding="utf-8")
     row = next(line for line in table.splitlines() if line.startswith("euclid_vis,"))
     (tmp_path / "passbands.csv").write_text(f"{table}{row.replace('Euclid-VIS', 'sdss2010-g')}\n", encoding="utf-8")
     monkeypatch.setattr(passbands, "TABLE", tmp_path / "passbands.csv")
     for ask in (passbands.names, lambda: passbands.load("euclid_vis"), lambda: passbands.provenance("euclid_h")):
-        with pytest.raises(BadInput, match=r"passbands\.csv: passband euclid_vis stands twice"):
+        with pytest.raises(BadInput, match=r"passbands\.csv: passband euclid_vis occurs twice"):
             ask()

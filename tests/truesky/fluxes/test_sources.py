@@ -1,4 +1,4 @@
-"""What is refused before any spectrum is made, and the lens."""
+"""Test the checks of catalogue rows, and the magnification."""
 
 import dataclasses
 
@@ -55,14 +55,14 @@ def test_impossible_stars_are_refused(stars, stars_library, name, value):
     ("sed", "frac", "name"), [(768, 0.5, "sed_2"), (3, 1.5, "frac_2"), (3, -0.1, "frac_2"), (3, 0.6, "frac_2")]
 )
 def test_impossible_mixtures_are_refused(stars, stars_library, sed, frac, name):
-    """The last has shares that are together more than all."""
+    """In the last case, the fractions sum to more than 1."""
     table = stars(sed_2=sed, frac_2=frac, sed_3=5, frac_3=0.5 if frac == 0.6 else 0.0)
     with pytest.raises(OutOfRange, match=name):
         sources.stars_from_table(table, stars_library)
 
 
 def test_a_mixture_is_what_its_columns_say(stars, stars_library):
-    """Parts without a share may be missing, or null; `sed` has what is left by the others."""
+    """Templates without a fraction may be missing or null; `sed` has the remaining fraction."""
     table = stars(n=2, sed=[7, 8], sed_2=[1, 2], frac_2=[0.25, 0.0])
     table = table.append_column("sed_3", pa.array([None, 9])).append_column("frac_3", pa.array([None, 0.125]))
     found = sources.stars_from_table(table, stars_library)
@@ -79,8 +79,8 @@ def test_kinds_of_other_libraries_are_refused(galaxies, library):
         sources.galaxies_from_table(galaxies(kind=kinds), library)
 
 
-def test_as_many_lines_as_are_listed_are_held(galaxies, library):
-    """Compiled code would read beyond the end of fewer."""
+def test_a_wrong_number_of_lines_is_refused(galaxies, library):
+    """With fewer lines, compiled code would read beyond the end of the array."""
     rows = sources.galaxies_from_table(galaxies(5), library)
     for fewer in (rows.lines[:, :-1], rows.lines[:4]):
         with pytest.raises(ValueError, match="lines are of shape"):

@@ -1,4 +1,4 @@
-"""Spectra over a stretch of wavelengths: those of whole spectra."""
+"""Compare spectra in one range of wavelengths with whole spectra."""
 
 import numpy as np
 
@@ -19,7 +19,7 @@ def test_galaxies_are_their_whole_spectra(galaxies, library):
     found = wavelength_windows.galaxy_spectra(rows, FIRST, COUNT, library)
     wanted = whole(band_fluxes.galaxy_spectra(galaxies, library))
     np.testing.assert_allclose(found, wanted, rtol=2e-6, atol=1e-6 * np.abs(wanted).max())
-    # Of each alone, too.
+    # The result is the same for each source alone.
     some = wavelength_windows.galaxy_spectra(rows.select(np.array([3, 1])), FIRST, COUNT, library)
     np.testing.assert_allclose(some, found[[3, 1]], rtol=2e-6)
 

@@ -1,4 +1,4 @@
-"""Raw frames of a part of a ground camera's detector, with stars apart, and what an observer's own masters would be."""
+"""Raw frames of a section of a ground camera's detector with isolated stars, and an observer's masters."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,7 +30,7 @@ TRUTH = ("saturation", "cosmic_rays", "sky")
 
 @dataclass(frozen=True)
 class Ground:
-    """A rendered part of a detector, its raw frame, and a folder with masters for it."""
+    """A rendered section of a detector, its raw frame, and a folder with its masters."""
 
     one: RenderedDetector
     frame: Frame
@@ -39,10 +39,28 @@ class Ground:
 
 
 def made(folder, camera, side, electrons, pitch, sky=8.0, rays=1.0, forced=None, overrides=None):
-    """Stars of so many electrons, (least, most) in a logarithmic scale, on a lattice.
+    """Render stars on a lattice, with fluxes distributed uniformly in the logarithm.
 
-    pitch  : pixels from star to star;  sky : e-/s in a pixel;  rays : of the camera's rate of cosmic rays
-    forced : effects on or off;  overrides : of the mission
+    Parameters
+    ----------
+    folder : Path
+        Folder for the files.
+    camera : str
+        Name of the camera.
+    side : int
+        Side of the section in pixels.
+    electrons : (float, float)
+        Smallest and largest number of electrons of a star.
+    pitch : float
+        Distance between stars in pixels.
+    sky : float
+        Sky in electrons per second and pixel.
+    rays : float
+        Rate of cosmic rays relative to the camera's rate.
+    forced : dict of str to bool, optional
+        Effects that are forced on or off.
+    overrides : dict, optional
+        Overrides of mission parameters.
     """
     usual = fields.MISSION.value(f"ext.{camera}.cosmic_rays.rate", "1 / s")
     mission = resolve(overrides={f"ext.{camera}.cosmic_rays.rate": (rays * usual, "1 / s"), **(overrides or {})})
@@ -76,7 +94,7 @@ def _written(folder, one):
     frame = Frame(path, one.exposure, scene, lake_frames._applied_effects(cards), cards, psf)
     masters = folder / "masters"
     masters.mkdir()
-    # What an observer has: images without a word of ours, the flat of light that came through the telescope.
+    # Masters of an observer are plain images, and the flat has light that came through the telescope.
     flat = calibrated.flat(scene, SEED, frame.applied)
     for kind, values in (("flat", flat), ("bias", bias(frame))):
         fits.writeto(files.master_path(masters, frame, kind), values.astype(np.float32))
@@ -84,7 +102,7 @@ def _written(folder, one):
 
 
 def bias(frame):
-    """e- above the overscan."""
+    """Return the electrons above the overscan."""
     scene, layout = frame.scene, frame.scene.layout
     if "bias_structure" not in frame.applied:
         return np.zeros((scene.ny, scene.nx))
@@ -94,11 +112,11 @@ def bias(frame):
     columns = bias_structure.structure(len(layout.amplifiers), width, *bias_structure.EFFECT.parameters(scene), rng)
     behind = columns[:, layout.prescan + layout.width :] if layout.overscan else columns[:, : layout.prescan]
     columns = columns - behind.mean(axis=1, keepdims=True)
-    return layout.assemble(np.repeat(columns[:, None], layout.height + layout.rows, axis=1))
+    return layout.assemble(np.repeat(columns[:, None], layout.height + layout.overscan_rows, axis=1))
 
 
 def truth(ground):
-    """Columns of the table `rendered_truth`, with the places of the stars' centroids."""
+    """Return columns of the table `rendered_truth`, with the positions of the stars' centroids."""
     rows = truth_table.truth(ground.one)
     found = {name: np.asarray(rows[name]) for name in ("x", "y", "psf_x", "psf_y", "mag")}
     return found["x"] + found["psf_x"], found["y"] + found["psf_y"], found["mag"]

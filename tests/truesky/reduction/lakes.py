@@ -1,4 +1,4 @@
-"""A lake with calibration frames and dithers of a small detector, rendered by the jobs."""
+"""Make a lake with calibration frames and dithers of a small detector by the jobs."""
 
 import tomllib
 
@@ -14,7 +14,7 @@ RAYS_OFF = ["cosmic_rays", "readout_cosmic_rays"]
 def request(
     bias=8, dark=4, flat=12, off=(), truth=("noise_free", "sky"), overrides=None, depth=(19.0, 19.0), dither="S"
 ):
-    """A visit of a field in four dithers, or in others, and frames that calibrate it."""
+    """Return a request with a visit of a field in four dithers, or other dithers, and calibration frames."""
     blocks = [{**BLOCK, "fields": 1, "dither": dither, "short": False, "flat": False}]
     for kind, count in (("bias", bias), ("dark", dark), ("flat", flat)):
         blocks += [{**BLOCK, "image_type": kind, "exposures": count}] if count else []
@@ -30,7 +30,7 @@ def request(
 
 
 def make(lake, wanted, side, name=None):
-    """All jobs of a request, detectors of side x side pixels; name : of the request, None = of none."""
+    """Run all jobs of a request for detectors of side x side pixels; `name` is the request's name or None."""
     with small_detectors(side):
         for job in MODULES:
             for step in job.steps(lake, wanted):

@@ -1,4 +1,4 @@
-"""Maps of what amplifiers do, and undone: of quadrants, and of ground cameras' amplifiers."""
+"""Test maps of amplifiers, and the correction of their effects, for quadrants and ground cameras."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ CAMERAS = (("vis", 8, 6), ("decam", 8, 6), ("megacam", 10, 8), ("lsstcam", 32, 1
 
 
 def scene_of(camera, nx, ny, overrides=None):
-    """Of a small detector, VIS's with rows between its halves."""
+    """Return the scene of a small detector; the detector of VIS has rows between its halves."""
     mission = resolve(overrides=overrides or {})
     one = detectors.detectors(camera, mission)[4]
     one = replace(one, nx=nx, ny=ny + 4, injection_rows=4) if camera == "vis" else replace(one, nx=nx, ny=ny)
@@ -24,7 +24,7 @@ def scene_of(camera, nx, ny, overrides=None):
 
 
 @pytest.mark.parametrize(("camera", "nx", "ny"), CAMERAS)
-def test_planes_are_the_pixels_in_another_order(camera, nx, ny):
+def test_planes_contain_all_pixels_in_another_order(camera, nx, ny):
     scene = scene_of(camera, nx, ny)
     frame = np.random.default_rng(1).uniform(1.0, 2.0, (scene.ny, scene.nx))
     unread = amplifiers.unread_pixels(scene)
@@ -33,7 +33,7 @@ def test_planes_are_the_pixels_in_another_order(camera, nx, ny):
     assert unread.any() == (camera == "vis")
 
 
-def test_numbers_lie_on_their_pixels():
+def test_values_of_amplifiers_are_on_their_pixels():
     found = amplifiers.to_pixels(np.array([1.0, 2.0, 3.0, 4.0]), scene_of("vis", 6, 8))
     assert [found[-1, 0], found[-1, -1], found[0, -1], found[0, 0]] == [1, 2, 3, 4]
     assert not found[4:8].any()
@@ -49,8 +49,8 @@ def test_numbers_lie_on_their_pixels():
 
 
 @pytest.mark.parametrize("camera", ["vis", "decam", "lsstcam", "gpc1"])
-def test_what_amplifiers_did_is_undone(camera):
-    """Each its own gain, and so its own response; as large a crosstalk as there is."""
+def test_effects_of_amplifiers_are_undone(camera):
+    """Each amplifier has another gain and response; the crosstalk has the largest allowed value."""
     vis = {"vis.gain.E": (3.0, "electron / adu"), "vis.crosstalk": (1e-3, "")}
     # So many rows of each amplifier that they are taken in more than one piece.
     nx, ny = (64, 16) if camera == "gpc1" else (32, 4 * amplifiers._ROWS + 6)

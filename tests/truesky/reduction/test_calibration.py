@@ -1,4 +1,4 @@
-"""What masters and weights are made with, on arrays."""
+"""Test the combination of frames and the weights on arrays."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def test_a_clipped_mean_is_the_mean_without_what_is_in_few_frames():
     found = clipped_mean(hit, variance)
     assert np.all(found.count[50:55] <= 5)
     assert np.abs(found.mean[50:60].mean() - 100.0) < 1.0
-    # The mean scatters as its uncertainty says.
+    # The scatter of the mean agrees with its uncertainty.
     assert np.std((clean.mean - 100.0) / clean.uncertainty) == pytest.approx(1.0, abs=0.02)
 
 
@@ -55,8 +55,8 @@ def test_the_level_of_the_sky_does_not_see_sources():
     assert calibration.sky_level(image, np.zeros(image.shape, bool)).max() == 0.0
 
 
-def test_the_weight_of_a_pixel_does_not_know_its_own_noise():
-    """Else weighted means would be too low: by 0.6 % for 150 electrons."""
+def test_the_weight_of_a_pixel_does_not_depend_on_its_noise():
+    """Otherwise weighted means would be too low, by 0.6 % for 150 electrons."""
     rng = np.random.default_rng(3)
     image = rng.poisson(150.0, (512, 512)) + rng.normal(0.0, 4.4, (512, 512))
     light = calibration.expected_light(image, np.ones(image.shape, bool), 4.4**2)

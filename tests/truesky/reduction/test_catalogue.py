@@ -1,4 +1,4 @@
-"""Sources of an image that is looked at tile by tile."""
+"""Test the detection of sources by tiles."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ SIDE, WIDTH, NOISE = 512, 2.0, 10.0
 
 @pytest.fixture(scope="module")
 def image():
-    """Stars of one width on a shifted lattice, so that none is blended; some lie on edges of tiles."""
+    """Return stars of one width on a shifted lattice without blends; some are at the edges of tiles."""
     rng = np.random.default_rng(5)
     at = np.stack(np.meshgrid(np.arange(32, SIDE, 64.0), np.arange(32, SIDE, 64.0)), axis=-1).reshape(-1, 2)
     at += rng.uniform(-12.0, 12.0, at.shape)
@@ -32,7 +32,7 @@ def found(image, monkeypatch, tile, beyond):
     return {name: column[..., order] for name, column in rows.items()}
 
 
-def test_tiles_find_what_is_found_in_the_whole_image(image, monkeypatch):
+def test_tiles_find_the_same_sources_as_the_whole_image(image, monkeypatch):
     whole, tiles = (found(image[0], monkeypatch, tile, beyond) for tile, beyond in ((2048, 256), (100, 40)))
     for name, column in whole.items():
         np.testing.assert_allclose(tiles[name], column, rtol=1e-5, atol=1e-5, err_msg=name)

@@ -1,4 +1,4 @@
-"""Level 2 of ground cameras: what a survey's own pipeline gives, against the truth of what was rendered."""
+"""Compare level 2 files of ground cameras with the rendered truth."""
 
 import re
 import shutil
@@ -29,13 +29,13 @@ from truesky.render.camera import astrometry, detectors
 from truesky.request.from_toml import parse
 
 BLOCK = 64
-# Standard deviations of a star's light that count, and above which its place is known to 5 mas.
+# Smallest S/N of the stars that are compared, and S/N above which positions are correct within 5 mas.
 SIGNAL, SHARP = 50.0, 200.0
 
 
 @dataclass(frozen=True)
 class Made:
-    """What was rendered, and what level 2 has of it."""
+    """Rendered frame and its level 2 files."""
 
     ground: ground_frames.Ground
     folder: object
@@ -48,7 +48,7 @@ class Made:
 
 
 def reduced(ground, out, *more, wanted=0):
-    """Level 2 by the command, of a frame as if a lake had it."""
+    """Run the level 2 command on a frame as if it were in a lake."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lake_frames, "from_lake", lambda *_: {("camera", "detector"): [ground.frame]})
         call = ["--lake", str(out.parent), "--masters", str(ground.masters), "--without", "dark", "--out", str(out)]
@@ -64,13 +64,13 @@ def of(folder, camera, side, **field):
 
 @pytest.fixture(scope="module")
 def jpcam(tmp_path_factory):
-    """Stars from faint to saturated, and fifty times as many cosmic rays as there are."""
+    """Render stars from faint to saturated, with fifty times the usual number of cosmic rays."""
     field = {"electrons": (2e4, 4e5), "pitch": 64, "rays": 50.0}
     return of(tmp_path_factory.mktemp("level2"), "jpcam", 448, **field)
 
 
 def check_files(made):
-    """Four files, which are as their standards want them."""
+    """Check the four files against their standards."""
     names = sorted(path.name for path in made.path.parent.iterdir())
     assert names == sorted(made.path.with_suffix(end).name for end in (".fits", ".cat", ".psf", ".head"))
     with warnings.catch_warnings():
@@ -81,7 +81,7 @@ def check_files(made):
     with fits.open(made.path.with_suffix(".cat")) as units:
         assert [unit.name for unit in units] == ["PRIMARY", "LDAC_IMHEAD", "LDAC_OBJECTS"]
         raw = units["LDAC_IMHEAD"].fileinfo()
-    # As readers in C take it: cards of 80 characters, up to END.
+    # Readers in C expect cards of 80 characters up to END.
     with made.path.with_suffix(".cat").open("rb") as stream:
         stream.seek(raw["datLoc"])
         text = stream.read(raw["datSpan"]).rstrip(b"\0").decode("ascii")
@@ -97,7 +97,7 @@ def check_files(made):
 
 
 def check_flags(made):
-    """They agree with the truth in 99 % of the pixels, and where the truth has something."""
+    """Flags agree with the truth in 99 % of the pixels, and in most of the affected pixels."""
     flags, maps = made.image.reduced.flags, made.ground.one.maps
     full = maps["saturation"] > 0
     said = flags & SATURATED > 0
@@ -111,7 +111,7 @@ def check_flags(made):
     clear = (hits > 10.0 * sigma) & ~full & (made.ground.one.noise_free < sigma)
     if clear.sum() > 20:
         assert np.mean(found[clear]) >= 0.9
-    # No core of a star; a hot pixel is as sharp as a ray.
+    # Cores of stars are not flagged. Hot pixels may be, since they are as sharp as cosmic rays.
     near = ndimage.binary_dilation(hits > 0.0, np.ones((3, 3), bool))
     assert np.mean(found & ~near) < 1e-4
     assert np.all((flags & NO_DATA > 0) == made.ground.frame.scene.layout.unread_pixels)
@@ -123,13 +123,13 @@ def check_flags(made):
 
 
 def noise(made):
-    """Of a pixel of the sky, in the image's unit."""
+    """Return the noise of a sky pixel in the image's unit."""
     weight = made.image.reduced.weight
     return float(np.sqrt(1.0 / np.median(weight[weight > 0.0])))
 
 
 def check_stars(made, least):
-    """Isolated ones: magnitudes, their scatter, places; least : how many there are."""
+    """Check magnitudes, their scatter and positions of isolated stars, of which there must be at least `least`."""
     rows, (x, y, mag) = made.catalogue, ground_frames.truth(made.ground)
     distance, which = cKDTree(np.transpose([x, y])).query(np.transpose([rows["XWIN_IMAGE"], rows["YWIN_IMAGE"]]) - 1.0)
     signal = rows["FLUX_APER"] / rows["FLUXERR_APER"]
@@ -148,17 +148,17 @@ def check_stars(made, least):
         f"{clean.sum()} stars: {np.median(off[clean]):.4f} mag, scatter {spread:.2f}; {sharp.sum()}: {places:.2f} mas"
     )
     assert abs(np.median(off[clean])) < 0.01
-    # So few stars know their own scatter to the root of 1 / 2 n.
+    # The relative error of the scatter of n stars is the root of 1 / 2 n.
     assert 0.9 - np.sqrt(2.0 / clean.sum()) < spread < 1.3
     assert sharp.sum() >= least // 3
     assert places < 5.0
-    # Of a Gaussian of the star's second moments, the isophote cuts its wings.
+    # The isophote cuts the wings of a star, so the agreement is limited.
     width = np.median(rows["FWHM_IMAGE"][sharp]) * made.image.card("PIXSCALE")
     assert width == pytest.approx(made.image.card("PSFFWHM"), rel=0.15)
 
 
 def check_sky(made):
-    """Without steps, and as noisy as the weights say."""
+    """The sky has no steps, and its noise agrees with the weights."""
     found, maps = made.image.reduced, made.ground.one.maps
     gain, light, sky = made.image.card("GAIN"), made.ground.one.noise_free, float(np.median(maps["sky"]))
     sources = ndimage.binary_dilation(light > 1e-3 * sky, iterations=2)
@@ -175,18 +175,18 @@ def check_sky(made):
     relative = (means / sky)[enough]
     print(f"{enough.sum()} blocks: mean {relative.mean():.5f}, largest {np.abs(relative).max():.5f}; {product:.4f}")
     assert enough.sum() >= 5
-    # Noise alone leaves as much in a block.
+    # Deviation of a block due to noise alone.
     alone = noise(made) * gain / sky / np.sqrt(count[enough])
     assert np.all(np.abs(relative) <= 0.003 + 2.0 * alone)
     assert product == pytest.approx(1.0, abs=0.03)
 
 
-def test_files_lie_together(jpcam):
+def test_level_2_files_are_in_one_folder(jpcam):
     check_files(jpcam)
 
 
 def test_scamp_reads_the_catalogue(jpcam, tmp_path):
-    """With the head file beside it: places of its rows are those that the catalogue says itself."""
+    """With the .head file, positions agree with those in the catalogue."""
     command = test_tools.tool("scamp")
     for end in (".cat", ".head"):
         shutil.copy(jpcam.path.with_suffix(end), tmp_path / f"a{end}")
@@ -208,20 +208,20 @@ def test_scamp_reads_the_catalogue(jpcam, tmp_path):
     assert max(float(across), float(up)) < 1e-4
 
 
-def test_flags_are_those_of_the_truth(jpcam):
+def test_flags_agree_with_the_truth(jpcam):
     check_flags(jpcam)
 
 
-def test_stars_are_where_and_as_bright_as_they_are(jpcam):
+def test_positions_and_magnitudes_of_stars_are_correct(jpcam):
     check_stars(jpcam, 20)
 
 
-def test_the_sky_is_flat_and_as_noisy_as_the_weights_say(jpcam):
+def test_the_sky_is_flat_and_its_noise_agrees_with_the_weights(jpcam):
     check_sky(jpcam)
 
 
-def test_the_catalogue_is_of_the_pixels_alone(jpcam, tmp_path):
-    """Without a source in the truth there are as many in the catalogue; of what is not there, none."""
+def test_the_catalogue_depends_only_on_pixels(jpcam, tmp_path):
+    """Detection uses only the pixels: sources are complete, and a higher threshold gives fewer."""
     rows = jpcam.catalogue
     assert len(rows) >= len(ground_frames.truth(jpcam.ground)[0]) - 5
     path = reduced(jpcam.ground, tmp_path / "out", "--level2", "--threshold", "30", "--aperture", "4")
@@ -230,7 +230,7 @@ def test_the_catalogue_is_of_the_pixels_alone(jpcam, tmp_path):
     assert bright["FLUX_MAX"].min() > 20.0 * noise(jpcam)
     header = fits.getheader(path)
     assert header["APERDIAM"] == pytest.approx(4.0 / header["PIXSCALE"], rel=1e-5)
-    # More of a star's light is in a larger aperture.
+    # A larger aperture contains more of a star's light.
     assert jpcam.image.card("APERCOR") < header["APERCOR"] < 0.0
 
 
@@ -248,8 +248,8 @@ def test_counts_are_electrons_over_the_mean_gain(jpcam, tmp_path):
     assert not any(key.startswith(("DSEC", "CSEC", "BSEC", "DATASEC")) for key, *_ in electrons.cards)
 
 
-def test_fringes_of_the_sky_are_taken_off(tmp_path):
-    """They are those that were drawn; what is left of them is lost in the noise."""
+def test_fringes_of_the_sky_are_subtracted(tmp_path):
+    """The subtracted fringes are the rendered ones; residuals are below the noise."""
     found = {}
     for name, on in (("with", True), ("none", False)):
         (tmp_path / name).mkdir()
@@ -287,7 +287,7 @@ def test_what_is_left_as_it_is_is_said(jpcam, tmp_path):
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        (["--level2", "--rate"], "--rate: images of level 2 are in counts"),
+        (["--level2", "--rate"], "--rate is not allowed with --level2"),
         (["--level2", "--threshold", "0"], "--threshold = 0.0 is outside"),
         (["--level2", "--least-pixels", "0"], "--least-pixels = 0 is outside"),
         (["--level2", "--aperture", "-1"], "--aperture = -1.0 is outside"),
@@ -380,8 +380,8 @@ truth = ["noise_free", "sky", "cosmic_rays"]
         ("whigs", "hsc", "hsc_g", "1_00", 60905.6, 2048),
     ],
 )
-def test_of_a_lake_with_masters_of_its_own_frames(tmp_path, survey, camera, band, detector, mjd, size):
-    """From a request: biases and dome flats, a master flat that has its band's name, sources of the catalogues."""
+def test_level_2_of_a_lake_with_its_masters(tmp_path, survey, camera, band, detector, mjd, size):
+    """Start from a request with biases and dome flats; the master flat is named by its band."""
     root, listed = layout.resolve_lake(tmp_path / "lake"), detectors._read_layout
     text = LAKE.format(survey=survey, camera=camera, band=band, detector=detector, mjd=mjd)
     wanted = parse(requests.written(tmp_path, text, requests.FIELD.format(0.2), seed=11))

@@ -1,4 +1,4 @@
-"""Masters and calibrated images through real rendered frames of a lake."""
+"""Test masters and calibrated images of rendered frames of a lake."""
 
 import shutil
 from dataclasses import replace
@@ -26,7 +26,7 @@ def made(tmp_path_factory):
 
 
 def build(folder, side, **counts):
-    """A lake without cosmic rays in which the amplifiers have their own gains, its masters and calibrated images."""
+    """Make a lake without cosmic rays, with different gains of the amplifiers, its masters and calibrated images."""
     root = layout.resolve_lake(folder / "lake")
     lakes.make(root, lakes.request(off=lakes.RAYS_OFF, overrides=GAINS, depth=(17.0, 12.0), **counts), side)
     with small_detectors(side):
@@ -37,7 +37,7 @@ def build(folder, side, **counts):
 
 
 def residuals(folder):
-    """Of each science frame: (calibrated - truth, NaN where sources are or flags; weight; the sky's truth)."""
+    """Yield (calibrated - truth, NaN at sources and flags; weight; sky in the truth) of each science frame."""
     products = read.version(layout.resolve_lake(folder / "lake"), "products")
     for row in products.rows().to_pylist():
         path = folder / "images" / f"{row['exposure_id']:06d}_VIS_euclid_vis_3-4.fits"
@@ -53,7 +53,7 @@ def residuals(folder):
 
 
 def blocks(values):
-    """Means of blocks of 64 pixels, NaN where less than 3/4 of one is sky; the rows between the halves left out."""
+    """Return means of blocks of 64 pixels, NaN if less than 3/4 of a block is sky; omit the rows between the halves."""
     half = (len(values) - 4) // 2
     kept = np.concatenate([values[:half], values[half + 4 :]])
     ny, nx = (n // BLOCK for n in kept.shape)
@@ -63,14 +63,14 @@ def blocks(values):
 
 
 def check(folder, within=1.0):
-    """Blocks of 64 pixels within 0.3 % of the sky in the mean of the dithers; weight times variance 1 within 2 %.
+    """In the mean of the dithers, blocks of 64 pixels agree with the sky within 0.3 %; weight times variance is 1.
 
-    within : share of the blocks that must be
+    At least the fraction `within` of the blocks must agree.
     """
     found = list(residuals(folder))
     assert len(found) >= 3
     left = np.mean([blocks(residual) / blocks(sky) for residual, _, sky in found], axis=0)
-    # Of the blocks that are sky in every dither.
+    # Fraction of blocks with sky in every dither.
     assert np.isfinite(left).mean() > 0.7
     left = left[np.isfinite(left)]
     product = [np.nanmean(residual**2 * weight) for residual, weight, _ in found]
@@ -84,10 +84,10 @@ def test_the_sky_comes_back_and_its_weight_is_its_inverse_variance(made):
     check(made)
 
 
-# That a reader wants a name: tests/lake_schema/store/test_request_links.py.
+# Readers require a name: see tests/lake_schema/store/test_request_links.py.
 @pytest.mark.nightly
-def test_of_two_requests_one_is_named(tmp_path, capsys):
-    """Each has its own frames: two bias frames, or three."""
+def test_request_is_selected_by_name(tmp_path, capsys):
+    """The two requests have different numbers of bias frames, two and three."""
     root, side = layout.resolve_lake(tmp_path / "lake"), 64
     for name, count in (("a", 2), ("b", 3)):
         wanted = lakes.request(off=["all"], truth=(), bias=count, dark=0, flat=0, depth=(16.0, 10.0), dither="none")
@@ -113,15 +113,15 @@ def test_of_two_requests_one_is_named(tmp_path, capsys):
 
 @pytest.mark.nightly
 def test_a_sixteenth_of_a_detector(tmp_path):
-    # Noise leaves 0.09 % in the mean of four dithers: of many blocks a few lie beyond 0.3 %, and beside bright stars.
+    # Noise leaves 0.09 % in the mean of four dithers: some of many blocks exceed 0.3 %, as do those near bright stars.
     check(build(tmp_path, 1024, bias=20, dark=3, flat=24), within=0.98)
 
 
-def test_masters_are_what_the_detector_has(made):
+def test_masters_agree_with_the_detector(made):
     bias, dark, flat = (images.read_images(made / "masters" / f"VIS_3-4_{kind}.fits") for kind in files.KINDS)
     pixels = np.ones(bias[1].data.shape, bool)
     pixels[128:132] = False
-    # Noise of the mean of 8 frames: read noise and rounding, in each amplifier its own.
+    # Noise of the mean of 8 frames: read noise and rounding, which differ between amplifiers.
     # Quadrants E and F lie above the rows of charge injection, H and G below.
     gain = np.zeros(pixels.shape)
     gain[132:, :128], gain[132:, 128:], gain[:128, 128:], gain[:128, :128] = 3.0, 3.48, 3.48, 4.0
@@ -140,7 +140,7 @@ def test_masters_are_what_the_detector_has(made):
     assert (header["IMAGETYP"], header["NCOMBINE"], header["DETECTOR"]) == ("master flat", 12, "3-4")
 
 
-def test_a_calibrated_image_says_what_it_is(made):
+def test_header_of_a_calibrated_image(made):
     path = sorted((made / "images").iterdir())[0]
     found = files.read_image(path)
     assert (found.card("BUNIT"), found.card("CALFLAT"), found.card("CALILLUM")) == ("electron", True, True)
@@ -175,23 +175,23 @@ def test_what_does_not_fit_is_refused_in_a_line(made, tmp_path, capsys):
         assert not out.exists() or not list(out.iterdir())
         return error
 
-    assert "--masters: which folder?" in refused()
+    assert "--masters FOLDER is required" in refused()
     assert "no image of detector '1-1'" in refused("--masters", str(made / "masters"), "--detectors", "1-1")
     assert "no image of exposure 999" in refused("--masters", str(made / "masters"), "--exposures", "999")
     assert "VIS_3-4_bias.fits" in refused("--masters", str(tmp_path / "none"))
-    # Of another seed's patterns; and a master of another kind.
+    # Refuse a master with the patterns of another seed, and a master of another kind.
     other = tmp_path / "other"
     shutil.copytree(made / "masters", other)
     units = images.read_images(other / "VIS_3-4_dark.fits")
     cards = tuple((k, "12" if k == "SEED" else v, c) for k, v, c in units[0].cards)
     images.write_images(other / "VIS_3-4_dark.fits", [images.Image(None, cards), *units[1:]])
-    assert "SEED = 12, the frame's is 7" in refused("--masters", str(other))
+    assert "SEED = 12, the frame has 7" in refused("--masters", str(other))
     shutil.copy(made / "masters" / "VIS_3-4_bias.fits", other / "VIS_3-4_dark.fits")
-    assert "is no master dark" in refused("--masters", str(other))
+    assert "is not a master dark" in refused("--masters", str(other))
 
 
-def test_a_stack_of_them_says_what_it_is(made, tmp_path, capsys):
-    """The dithers of so small a detector lie side by side."""
+def test_header_of_a_stack(made, tmp_path, capsys):
+    """The dithers of such a small detector do not overlap."""
     paths = [str(path) for path in sorted((made / "images").iterdir())]
     out = tmp_path / "stack.fits"
     with small_detectors():
@@ -212,4 +212,4 @@ def test_a_stack_of_them_says_what_it_is(made, tmp_path, capsys):
     assert "is given twice" in capsys.readouterr().err
     master = str(made / "masters" / "VIS_3-4_bias.fits")
     assert stack.main([paths[0], master, "--out", str(out)]) == 2
-    assert "is no calibrated image" in capsys.readouterr().err
+    assert "is not a calibrated image" in capsys.readouterr().err

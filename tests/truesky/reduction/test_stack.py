@@ -1,4 +1,4 @@
-"""Dithers onto one map: no light is lost, nothing moves, cosmic rays go, and the noise is what the header says."""
+"""Test stacks of dithers: light and positions are conserved, cosmic rays are rejected, and the noise is correct."""
 
 from functools import cache
 from pathlib import Path
@@ -23,7 +23,7 @@ SKY, NOISE = 130.0, 4.5
 
 @cache
 def dithers(pointed=DITHERS):
-    """(expected electrons of stars of 19 mag, system) of each dither, and where the stars are, deg."""
+    """Return (expected electrons of stars of 19 mag, WCS) of each dither, and the positions of the stars in degrees."""
     detector = small("vis", "3-4", SIDE)
     ra, dec, angle = nominal.pointing(detector)
     first = astrometry.wcs(detector, ra, dec, angle)
@@ -41,7 +41,7 @@ def dithers(pointed=DITHERS):
 
 
 def as_reduced(electrons, weight=None):
-    """e- -> an image in e-/s."""
+    """Convert electrons to an image in electrons per second."""
     weight = np.full(electrons.shape, 1.0 / (SKY + NOISE**2)) if weight is None else weight
     rate, weight = electrons / nominal.TIME, weight * nominal.TIME**2
     return ReducedImage(rate.astype(np.float32), weight.astype(np.float32), np.zeros(rate.shape, np.uint8))
@@ -52,7 +52,7 @@ def fluxes(image, x, y):
 
 
 def centroid(image, x, y):
-    """Windowed: a Gaussian of 1.5 pixels, moved to where it stays."""
+    """Return the centroid with a Gaussian window of 1.5 pixels, iterated until it converges."""
     rows, columns = np.mgrid[: image.shape[0], : image.shape[1]]
     at = np.array([x, y], float)
     for _ in range(30):
@@ -71,9 +71,9 @@ def test_no_light_is_lost_and_nothing_moves():
         [fluxes(light, *astrometry.pixel_of_sky(system, *where)) / nominal.TIME for light, system in images], axis=0
     )
     np.testing.assert_allclose(found, single, rtol=1e-3)
-    # Not even in the middle of an undersampled star is anything rejected.
+    # Nothing is rejected, even at the centre of an undersampled star.
     assert not (made.reduced.flags & COSMIC_RAY).any()
-    # Where the frames see them, each with the same PSF, which is not symmetric.
+    # Stars inside the frames, all with the same asymmetric PSF.
     seen = np.zeros((len(x), 2))
     for light, system in images:
         places = [centroid(light, *at) for at in zip(*astrometry.pixel_of_sky(system, *where), strict=True)]
@@ -97,7 +97,7 @@ def test_all_light_of_an_image_is_on_the_grid():
 
 
 def noisy(seed, hits=0.0):
-    """Dithers with sky, shot and read noise, and charge of cosmic rays in a part of the pixels."""
+    """Return dithers with sky, shot noise and read noise, and cosmic rays in a fraction of the pixels."""
     rng, out = np.random.default_rng(seed), []
     for light, system in dithers()[0]:
         counted = rng.poisson(light + SKY) + rng.normal(0.0, NOISE, light.shape)
@@ -106,10 +106,10 @@ def noisy(seed, hits=0.0):
     return out
 
 
-def test_the_noise_is_as_the_weight_and_the_correlation_say():
-    """Sums of many pixels scatter as the weight says, pixels alone less: by what the header says, and the variance.
+def test_noise_agrees_with_weight_and_correlation():
+    """The scatter of sums over many pixels agrees with the weight; single pixels scatter less, as in the header.
 
-    Sample of 300 sums or more; significance 3e-3 of their variance (3 standard errors).
+    The sample has at least 300 sums; the significance is 3e-3 of their variance (3 standard errors).
     """
     made, *_ = stack.stack_images(noisy(1), SCALE)
     truth, *_ = stack.stack_images([(as_reduced(light + SKY), system) for light, system in dithers()[0]], SCALE)
@@ -140,7 +140,7 @@ def test_cosmic_rays_are_rejected():
     assert abs(np.mean(pull[deep])) < 0.1
 
 
-def test_of_two_the_fainter_is_believed_and_one_alone_is():
+def test_of_two_images_the_fainter_is_used():
     light = np.zeros((2, 9, 9))
     light[0, 4, 4] = 100.0
     there = np.ones(light.shape, bool)
@@ -151,7 +151,7 @@ def test_of_two_the_fainter_is_believed_and_one_alone_is():
     assert not stacking.outliers(light, np.ones(light.shape), there).any()
 
 
-def test_the_effective_psf_is_what_a_star_is_in_the_stack():
+def test_the_effective_psf_agrees_with_a_star_in_the_stack():
     images, where = dithers()
     made, grid, weights = stack.stack_images([(as_reduced(light), system) for light, system in images], SCALE)
     profile = nominal.psf_of(small("vis", "3-4", SIDE)).profile
@@ -179,14 +179,14 @@ def test_the_effective_psf_is_what_a_star_is_in_the_stack():
     np.testing.assert_allclose(scaled, stamp, atol=0.03 * stamp.max())
 
 
-def test_what_makes_no_grid_is_refused():
+def test_bad_grids_are_refused():
     (light, system), *_ = dithers()[0]
     with pytest.raises(OutOfRange, match="scale"):
         resampling.covering_grid([(system, light.shape)], 0.0)
     far = system.deepcopy()
     far.wcs.crval = [system.wcs.crval[0], system.wcs.crval[1] + 5.0]
     far.wcs.set()
-    with pytest.raises(BadInput, match="so far apart"):
+    with pytest.raises(BadInput, match="too far apart"):
         resampling.covering_grid([(system, light.shape), (far, light.shape)], SCALE)
     assert resampling.covering_grid([(system, light.shape)], 1.0).shape[0] < 60
 
@@ -199,7 +199,7 @@ CARDS = (
 
 
 def image_file(path, **changes):
-    """A small calibrated image; changes : of its cards, None = it has none of this name."""
+    """Write a small calibrated image; `changes` replaces cards, None removes a card."""
     detector = small("vis", "3-4", SIDE)
     cards = [(key, changes.get(key, value), text) for key, value, text in CARDS]
     cards = (*(card for card in cards if card[1] is not None), *astrometry.cards(astrometry.wcs(detector, 53, -28, 0)))
@@ -211,28 +211,28 @@ def image_file(path, **changes):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"IMAGETYP": "stack", "EXPOSURE": None}, "is a stack: give the images that it was made of"),
+        ({"IMAGETYP": "stack", "EXPOSURE": None}, "is a stack: use the images from which it was made"),
         *(({keyword: None}, f"has no card {keyword}") for keyword, *_ in CARDS),
-        ({"EXPTIME": 0.0}, "EXPTIME = 0.0 is no number above 0"),
-        ({"PIXSCALE": "0.1"}, "PIXSCALE = '0.1' is no number above 0"),
+        ({"EXPTIME": 0.0}, "EXPTIME = 0.0 must be a number above 0"),
+        ({"PIXSCALE": "0.1"}, "PIXSCALE = '0.1' must be a number above 0"),
     ],
 )
-def test_what_is_no_calibrated_image_is_refused(tmp_path, capsys, changes, words):
+def test_files_other_than_calibrated_images_are_refused(tmp_path, capsys, changes, words):
     path = image_file(tmp_path / "a.fits", **changes)
     assert stack.main([path, "--out", str(tmp_path / "b.fits")]) == 2
     said = capsys.readouterr().err
     assert (words in said, said.count("\n")) == (True, 1)
 
 
-def test_a_scale_of_nothing_is_refused(tmp_path, capsys):
+def test_a_scale_of_zero_is_refused(tmp_path, capsys):
     path = image_file(tmp_path / "a.fits")
     assert stack.main([path, "--out", str(tmp_path / "b.fits"), "--scale", "0"]) == 2
     assert "arcsec = 0.0 is outside" in capsys.readouterr().err
     assert not (tmp_path / "b.fits").exists()
 
 
-def test_an_image_that_the_lake_has_not_is_named(tmp_path, monkeypatch):
-    """The lake has its exposure and its detector, not the one on the other."""
+def test_message_names_an_image_missing_in_the_lake(tmp_path, monkeypatch):
+    """The lake has the exposure and the detector, but not together."""
     monkeypatch.setattr(stack.lake_frames, "from_lake", lambda root, names, numbers, request: {("vis", "3-4"): []})
     image = files.read_image(Path(image_file(tmp_path / "a.fits")))
     with pytest.raises(BadInput, match=r"table products has no image of exposure 1, detector 3-4"):

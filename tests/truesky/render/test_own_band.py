@@ -71,10 +71,10 @@ def test_the_plan_depends_on_the_content_of_the_file(lake, tmp_path):
         (
             "pointing",
             GROUND,
-            r"pointing\[0\]\.band: mine is your own passband, in which camera lsstcam has no",
+            r"pointing\[0\]\.band: mine is a user passband, for which camera lsstcam has no",
         ),
-        ("pointing", NISP, r"pointing\[0\]\.band: mine is your own passband, in which camera nisp has no"),
-        ("observation", SURVEY, r"observation\[0\]\.bands: mine is your own passband: no survey observes in it"),
+        ("pointing", NISP, r"pointing\[0\]\.band: mine is a user passband, for which camera nisp has no"),
+        ("observation", SURVEY, r"observation\[0\]\.bands: mine is a user passband: no survey observes in it"),
     ],
 )
 def test_only_vis_observes_in_a_user_band(tmp_path, block, keys, words):

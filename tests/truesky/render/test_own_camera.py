@@ -166,7 +166,7 @@ def test_an_invalid_folder_is_refused_before_anything_is_written(tmp_path, table
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ('cameras = ["mini"]', 'cameras = ["mini", "mini/"]', r"mission\.cameras\[1\]: there are two cameras of the n"),
+        ('cameras = ["mini"]', 'cameras = ["mini", "mini/"]', r"mission\.cameras\[1\]: two cameras have the n"),
         ('cameras = ["mini"]', 'cameras = ["none"]', r"mission\.cameras\[0\]: .*none: no such folder"),
         ('cameras = ["mini"]', "cameras = 3", r"mission\.cameras"),
         ('cameras = ["mini"]', f'cameras = ["{"x" * 300}"]', r"mission\.cameras\[0\]: .*: File name too long$"),
@@ -231,7 +231,7 @@ def test_two_curves_of_one_name_are_refused_with_both_places(tmp_path):
     shutil.copytree(tmp_path / "mini", tmp_path / "maxi")
     words = (
         r"mission\.cameras\[1\]: .*maxi/bands\.csv line 2: band narrow has another curve in "
-        r"mission\.cameras\[0\]: .*mini/bands\.csv line 2: all curves of a request have different names$"
+        r"mission\.cameras\[0\]: .*mini/bands\.csv line 2: all curves must have different names$"
     )
     with pytest.raises(BadInput, match=words):
         parse(request)

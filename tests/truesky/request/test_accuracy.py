@@ -1,4 +1,4 @@
-"""The knob: each of its numbers decides, what it promises was measured, what cannot be had is refused."""
+"""Test the selection of drawing settings for a requested accuracy."""
 
 import tomllib
 from dataclasses import asdict, fields, replace
@@ -21,8 +21,8 @@ def error(row, name):
 
 
 @pytest.mark.parametrize("name", NUMBERS)
-def test_each_number_alone_decides(name):
-    """Whatever the others allow, a finer number takes another row, of more time."""
+def test_a_stricter_number_selects_a_slower_row(name):
+    """A smaller error of one kind selects another, slower row, whatever the other errors are."""
     asked = sorted((error(row, name) for row in accuracy.rows()), reverse=True)
     seconds = [accuracy.fastest_row(replace(ANYTHING, **{name: value}))["seconds"] for value in asked]
     assert seconds == sorted(seconds)
@@ -30,8 +30,8 @@ def test_each_number_alone_decides(name):
 
 
 @pytest.mark.parametrize("name", NUMBERS)
-def test_a_number_of_its_own_takes_what_it_needs(name):
-    """Asked for no more than a row has, that row or a cheaper one; a little less, another."""
+def test_a_row_is_selected_at_its_errors_and_not_below(name):
+    """The errors of a row select this row or a cheaper one; slightly smaller errors select another row."""
     for row in accuracy.rows():
         own = accuracy.fastest_row(replace(ANYTHING, **{name: error(row, name)}))
         assert own["seconds"] <= row["seconds"]
@@ -39,8 +39,8 @@ def test_a_number_of_its_own_takes_what_it_needs(name):
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_presets_are_held_by_both_samples(preset):
-    """By sources that the settings were chosen on, and by those that they were not."""
+def test_presets_are_met_on_both_samples(preset):
+    """Presets hold for sources for which the settings were chosen, and for other sources."""
     row, wanted = accuracy.fastest_row(PRESETS[preset]), asdict(PRESETS[preset])
     for name, value in wanted.items():
         assert row[name] <= value
@@ -49,7 +49,7 @@ def test_presets_are_held_by_both_samples(preset):
     assert told == {name: row[f"{name}_held"] for name in wanted}
 
 
-def test_no_cheaper_row_would_do():
+def test_no_cheaper_row_is_accurate_enough():
     for wanted in PRESETS.values():
         mine = accuracy.fastest_row(wanted)
         for row in accuracy.rows():
@@ -64,15 +64,15 @@ def test_a_quicklook_takes_half_of_a_draft_at_most():
 
 
 @pytest.mark.parametrize("name", NUMBERS)
-def test_beyond_reach_is_refused_with_the_best_there_is(name):
-    with pytest.raises(BadInput, match=rf"^accuracy\.{name} = 1e-12 is beyond reach, the best is \S+$") as refusal:
+def test_an_unreachable_accuracy_is_refused_with_the_best_value(name):
+    with pytest.raises(BadInput, match=rf"^accuracy\.{name} = 1e-12 cannot be reached, the best is \S+$") as refusal:
         accuracy.fastest_row(replace(SURVEY, **{name: 1e-12}))
     best = float(str(refusal.value).rpartition(" ")[2])
     row = accuracy.fastest_row(replace(ANYTHING, **{name: best}))
     assert error(row, name) <= best <= 1.2 * error(accuracy.rows()[-1], name)
 
 
-def test_every_number_that_is_beyond_reach_is_named():
+def test_every_unreachable_number_is_named():
     with pytest.raises(BadInput) as refusal:
         accuracy.fastest_row(Accuracy(1e-12, 1e-12, 1e-12, 1e-12))
     assert all(f"accuracy.{name} = 1e-12" in str(refusal.value) for name in NUMBERS)
@@ -80,13 +80,13 @@ def test_every_number_that_is_beyond_reach_is_named():
 
 
 @pytest.mark.parametrize("where", ["accuracy", "explore"])
-def test_a_request_is_refused_before_anything_is_made(where):
+def test_a_request_is_refused_before_any_computation(where):
     own = asdict(SURVEY) | {"shape": 1e-9}
     wanted = {**GOOD, "accuracy": own} if where == "accuracy" else {**GOOD, "explore": {"accuracy": [own]}}
-    with pytest.raises(BadInput, match=r"accuracy\.shape = 1e-09 is beyond reach, the best is"):
+    with pytest.raises(BadInput, match=r"accuracy\.shape = 1e-09 cannot be reached, the best is"):
         from_table(wanted)
 
 
-def test_the_best_is_rounded_so_that_it_can_be_asked_for():
+def test_the_best_value_is_rounded_up():
     for value in (1.01e-5, 9.96e-5, 2.0e-3, 0.0949, 1.0):
         assert value <= float(accuracy._round_up(value)) <= 1.11 * value

@@ -1,4 +1,4 @@
-"""Malformed request files: the check and every job refuse them in a line that names the key, and start nothing."""
+"""Malformed request files are refused by the check and by every job in one line that names the key."""
 
 import subprocess
 import sys
@@ -15,7 +15,7 @@ from truesky.running import submitted_job
 JOBS = [module.JOB for module in (build_galaxies, build_stars, build_gaia, compute_fluxes, plan_exposures)]
 JOBS.append(render_exposures.JOB)
 
-# Seconds of processor time that none of them takes on any machine; what each takes is not for a test to say.
+# Limit of CPU seconds, far above the time of any check on any machine.
 HANGS = 60.0
 
 HEAD = 'name = "x"\nseed = 1\n'
@@ -39,7 +39,7 @@ BAD = {
     "a seed of text": ('name = "x"\nseed = "1"\n' + CONE, "seed"),
     "a seed of 65 bits": (f'name = "x"\nseed = {2**64}\n' + CONE, "seed"),
     "no area": (HEAD, "area"),
-    "two areas": (GOOD + "box = { ra = [0, 1], dec = [0, 1] }\n", "area wants exactly one"),
+    "two areas": (GOOD + "box = { ra = [0, 1], dec = [0, 1] }\n", "area must have exactly one"),
     "an area larger than the sky": (HEAD + "[area]\ncone = { ra = 0, dec = 0, radius = 181 }\n", "area.cone.radius"),
     "a box round the sky twice": (HEAD + "[area]\nbox = { ra = [0, 720], dec = [0, 1] }\n", "area.box.ra"),
     "a pole too far": (HEAD + "[area]\ncone = { ra = 0, dec = 90.0000001, radius = 1 }\n", "area.cone.dec"),
@@ -92,7 +92,7 @@ BAD = {
         GOOD + f'[explore]\n"vis.gain" = {{ values = {list(range(1, 10_002))}, unit = "electron / adu" }}\n',
         "explore.vis.gain",
     ),
-    "an exploration of no value": (GOOD + '[explore]\naccuracy = []\n', "explore.accuracy names no value"),
+    "an exploration of no value": (GOOD + '[explore]\naccuracy = []\n', "explore.accuracy has no value"),
 }  # fmt: skip
 
 
@@ -120,16 +120,16 @@ def test_a_malformed_request_is_refused_by_the_check_and_by_every_job(tmp_path, 
     assert not lake.exists()
 
 
-def test_what_the_malformed_ones_are_made_of_is_good(tmp_path, capsys):
+def test_requests_before_malformation_are_valid(tmp_path, capsys):
     for number, text in enumerate((GOOD, GOOD + POINT, GOOD + BLOCK)):
         (tmp_path / f"{number}.toml").write_text(text)
-        # Their area is smaller than the field of view.
+        # The area of these requests is smaller than the field of view.
         assert check.main([str(tmp_path / f"{number}.toml"), "--plan"]) == 0
     assert capsys.readouterr().out.startswith("x: good: 0 pointings, 0 observations, 1 variants\n")
 
 
 def test_the_check_from_a_shell_imports_nothing_slow(tmp_path):
-    """What takes seconds to import, and what takes none of the check's."""
+    """Modules that take seconds to import are not imported by the check."""
     path = tmp_path / "x.toml"
     path.write_text(BAD["magnitude 99"][0])
     code = "import sys; from truesky.commands.check import main; print(main(sys.argv[1:]), *sys.modules)"

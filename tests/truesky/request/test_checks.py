@@ -1,4 +1,4 @@
-"""What nothing renders is planned and named, and skipped; a request of nothing else is refused."""
+"""Exposures without a simulator are planned and skipped; a request with only such exposures is refused."""
 
 import re
 from dataclasses import replace
@@ -23,7 +23,7 @@ REQUESTS = Path(__file__).resolve().parents[3] / "requests"
 SURVEY = REQUESTS / "sc8_pilot.toml"
 
 
-def test_what_is_said_to_be_rendered_has_effects():
+def test_rendered_types_have_effects():
     assert {name: set(kinds) for name, kinds in RENDERED_TYPES.items()} == {
         name: set(channel.effects) for name, channel in registry.CHANNELS.items()
     }
@@ -37,12 +37,12 @@ SHIPPED = [
 
 
 @pytest.mark.parametrize("channel", observations.CHANNELS)
-def test_what_is_rendered_can_be_asked_for(channel):
+def test_rendered_types_are_allowed_in_requests(channel):
     asked = {*observations._SKY_TYPES, *observations._CALIBRATIONS[channel]}
     assert set(RENDERED_TYPES.get(channel, ())) <= asked <= set(observations.IMAGE_TYPES)
 
 
-def test_requests_know_the_bands_that_the_planner_knows():
+def test_bands_of_requests_and_planner_agree():
     cameras = {"VIS": "vis", "NISP-P": "nisp", "NISP-S": "nisp"}
     assert {name: bands_of(name, camera, resolve()) for name, camera in cameras.items()} == EUCLID_BANDS
 
@@ -57,7 +57,7 @@ def test_the_check_takes_every_request(path, capsys):
 
 
 def only(channels, kind):
-    """A request for one block."""
+    """Return a request for one block."""
     request = parse(SURVEY)
     return replace(request, observations=(replace(request.observations[0], channels=channels, image_type=kind),))
 
@@ -66,10 +66,8 @@ def only(channels, kind):
     ("channels", "kind", "first"),
     [(("EXT",), "self_calibration", "EXT"), (("VIS",), "standard_star", "VIS")],
 )
-def test_a_request_of_which_nothing_is_rendered_is_refused_by_the_check_and_the_first_job(
-    channels, kind, first, tmp_path
-):
-    wanted = f"^observation\\[0\\].channels: no simulator renders {first} {kind} yet: it can be planned alone$"
+def test_a_request_without_any_rendered_type_is_refused(channels, kind, first, tmp_path):
+    wanted = f"^observation\\[0\\].channels: no simulator renders {first} {kind} yet: it can only be planned$"
     for refuse in (
         checks.check_rendered,
         plan.check,
@@ -86,7 +84,7 @@ def test_a_request_of_which_nothing_is_rendered_is_refused_by_the_check_and_the_
     ("channels", "kind", "said"),
     [(("EXT",), "science", ""), (("VIS", "EXT"), "self_calibration", "EXT"), (("VIS",), "bias", ""), ((), "", "")],
 )
-def test_what_is_rendered_in_part_is_refused_and_the_rest_named(channels, kind, said):
+def test_a_partly_rendered_request_is_refused_and_skipped_types_are_named(channels, kind, said):
     request = only(channels, kind)
     if said:
         with pytest.raises(BadInput, match=f"no simulator renders {said} {kind}"):
@@ -98,13 +96,13 @@ def test_what_is_rendered_in_part_is_refused_and_the_rest_named(channels, kind, 
 
 
 def stars_by_decam(folder):
-    """A block for what can be planned alone, by a table of pointings."""
+    """Return a block from a table of pointings that can only be planned."""
     (folder / "p.csv").write_text("ra,dec,mjd,band,image_type\n53.1,-27.8,60905.0,des_r,standard_star\n")
     return '[[observation]]\nchannels = ["EXT"]\nsurvey = "des"\npointings = "p.csv"\n'
 
 
 def test_the_command_refuses_in_one_line_and_plans_on_demand(tmp_path, capsys):
-    # Beside what can be rendered, too.
+    # Also if other exposures of the request can be rendered.
     path = requests.written(tmp_path, '[[observation]]\nchannels = ["VIS"]\nfields = 1\n' + stars_by_decam(tmp_path))
     assert check.main([str(path)]) == 2
     said = capsys.readouterr().err
@@ -114,7 +112,7 @@ def test_the_command_refuses_in_one_line_and_plans_on_demand(tmp_path, capsys):
     assert "EXT standard_star: planned and forecast, skipped by rendering" in capsys.readouterr().out
 
 
-def test_every_job_says_what_is_only_planned(tmp_path, capsys):
+def test_every_job_lists_types_that_are_only_planned(tmp_path, capsys):
     path = requests.written(tmp_path, '[[observation]]\nchannels = ["VIS"]\n' + stars_by_decam(tmp_path))
     job = submitted_job.Job("sleep", "", lambda lake, request: [])
     assert submitted_job.main(job, ["--lake", str(tmp_path / "lake"), "--request", str(path)]) == 0
@@ -124,6 +122,6 @@ def test_every_job_says_what_is_only_planned(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("words", [[], ["--plan"], ["a", "--plans"], ["a", "b"], ["a", "b", "--plan"]])
-def test_other_words_show_the_usage(words, capsys):
+def test_unknown_arguments_show_the_usage(words, capsys):
     assert check.main(words) == 2
     assert capsys.readouterr().err == "usage: truesky check REQUEST [--plan]\n"

@@ -1,4 +1,4 @@
-"""Requests: what is good is kept, what is bad is refused with its key."""
+"""Good requests are read completely, and bad requests are refused with the key."""
 
 import copy
 import tomllib
@@ -23,14 +23,14 @@ BAD = [
     ("seed", 2**63, "seed"),
     ("noise_seed", -1, "noise_seed"),
     ("noise_seed", 2**63, "noise_seed"),
-    ("effects", {"off": ["all", "poisson"]}, "effects.off: 'all' stands alone"),
+    ("effects", {"off": ["all", "poisson"]}, "effects.off: 'all' must be the only item"),
     ("effects", {"on": ["all"]}, "effects.on: 'all' is not one of"),
     ("pointing.realisations", 0, r"pointing\[0\].realisations"),
     ("pointing.realisations", 1.0, r"pointing\[0\].realisations"),
     ("name", "../x", "name"),
     ("name", 5, "name"),
-    *(("name", name, f"name = '{name}' has a meaning") for name in ("main", "temp", "system", "memory", "pg_catalog")),
-    ("name", "information_schema", "name = 'information_schema' has a meaning of its own in SQL"),
+    *(("name", name, f"name = '{name}' is reserved") for name in ("main", "temp", "system", "memory", "pg_catalog")),
+    ("name", "information_schema", "name = 'information_schema' is reserved in SQL"),
     ("accuracy", "sloppy", "accuracy"),
     ("accuracy", {"flux": 0.0, "shape": 1e-3, "position": 1e-3, "background": 1e-3}, "accuracy.flux"),
     ("accuracy", {"flux": -1.0, "shape": 1e-3, "position": 1e-3, "background": 1e-3}, "accuracy.flux"),
@@ -39,10 +39,10 @@ BAD = [
     (
         "accuracy",
         {"flux": 1e-3, "shape": 1e-9, "position": 1e-3, "background": 1e-3},
-        "accuracy.shape = 1e-09 is beyond reach, the best is",
+        "accuracy.shape = 1e-09 cannot be reached, the best is",
     ),
-    ("area", {}, "area wants exactly one"),
-    ("area", {"cone": {"ra": 0, "dec": 0, "radius": 1}, "box": {"ra": [0, 1], "dec": [0, 1]}}, "area wants"),
+    ("area", {}, "area must have exactly one"),
+    ("area", {"cone": {"ra": 0, "dec": 0, "radius": 1}, "box": {"ra": [0, 1], "dec": [0, 1]}}, "area must have"),
     ("area", {"cone": {"ra": 0, "dec": 95, "radius": 1}}, "area.cone.dec"),
     ("area", {"cone": {"ra": 0, "dec": 0, "radius": -1}}, "area.cone.radius"),
     ("area", {"cone": {"ra": float("nan"), "dec": 0, "radius": 1}}, "area.cone.ra"),
@@ -57,18 +57,22 @@ BAD = [
     ("area", {"polygon": [[0, 0], 1, [1, 1]]}, r"area.polygon\[1\]"),
     ("area", "all", "area"),
     ("structure", {"bars": True}, "structure.bars"),
-    ("structure", {"arms": "many"}, "structure.arms wants a table"),
+    ("structure", {"arms": "many"}, "structure.arms must be a table"),
     ("structure", {"arms": {"pitch": 20.0}}, "structure.arms.pitch"),
     ("structure", {"arms": {"contrast": -0.1}}, "structure.arms.contrast"),
     ("structure", {"arms": {"knots": 0.6}}, "structure.arms.knots"),
     ("structure", {"arms": {"number": 10**6}}, "structure.arms.number"),
     ("structure", {"arms": {"least_radius": float("nan")}}, "structure.arms.least_radius"),
-    ("structure", {"arms": {"contrast": 0, "knots": 0}}, "structure.arms: neither contrast nor knots"),
-    ("structure", {"stamps": "a.fits"}, "structure.stamps wants a table"),
+    ("structure", {"arms": {"contrast": 0, "knots": 0}}, "structure.arms: contrast or knots must be above 0"),
+    ("structure", {"stamps": "a.fits"}, "structure.stamps must be a table"),
     ("structure", {"stamps": {}}, "structure.stamps.file is missing"),
     ("structure", {"stamps": {"file": "a.fits", "sky": 1}}, "structure.stamps.sky"),
     ("structure", {"stamps": {"file": "a.fits", "nearest": 1}}, "structure.stamps.nearest"),
-    ("structure", {"stamps": {"file": "a.fits", "least_radius": 1.0}}, "structure.stamps.least_radius wants nearest"),
+    (
+        "structure",
+        {"stamps": {"file": "a.fits", "least_radius": 1.0}},
+        "structure.stamps.least_radius requires nearest",
+    ),
     ("universe", {"galaxy_limit": 99}, "universe.galaxy_limit"),
     ("universe", {"galaxy_limit": "26"}, "universe.galaxy_limit"),
     ("universe", {"galaxy_band": 3}, "universe.galaxy_band"),
@@ -77,10 +81,10 @@ BAD = [
     ("fluxes", {"intergalactic": "yes"}, "fluxes.intergalactic"),
     ("ingest", {"training": {"files": []}}, "ingest.training.files"),
     ("ingest", {"training": {"files": ["x"], "format": "flagship2"}}, "ingest.training.format"),
-    ("ingest", {"training": {"files": ["x"]}, "galaxies": {"files": ["y"]}}, "ingest.training: "),
+    ("ingest", {"training": {"files": ["x"]}, "galaxies": {"files": ["y"]}}, "ingest.training is not allowed"),
     ("universe", {"deep": True}, "universe.deep"),
     ("universe", {"lensing": "some"}, "universe.lensing = 'some' is not one of box, none"),
-    ("universe", {"lensing": 0.1}, "universe.lensing wants a table"),
+    ("universe", {"lensing": 0.1}, "universe.lensing must be a table"),
     ("universe", {"lensing": {"g1": 0.1}}, "universe.lensing.g2 is missing"),
     ("universe", {"lensing": {"g1": 0.1, "g2": 1.5}}, "universe.lensing.g2"),
     ("universe", {"lensing": {"g1": 0.7, "g2": 0.7}}, r"universe.lensing = .*: \|g\| = 0.9899"),
@@ -107,22 +111,22 @@ BAD = [
     ("fluxes", {"bands": "r"}, "fluxes.bands"),
     ("fluxes", {"filters": {}}, "fluxes.filters is not a key"),
     ("fluxes", {"passbands": {"a b": {}}}, "name 'a b'"),
-    ("fluxes", {"passbands": {"mine": "file.dat"}}, "fluxes.passbands.mine wants a table"),
+    ("fluxes", {"passbands": {"mine": "file.dat"}}, "fluxes.passbands.mine must be a table"),
     ("fluxes", {"passbands": {"mine": {"format": "passband_ascii", "medium": "air"}}}, "mine.file is missing"),
     ("fluxes", {"passbands": {"mine": {"file": "x", "medium": "air"}}}, "mine.format is missing"),
     ("fluxes", {"passbands": {"mine": {"file": "x", "format": "y", "medium": "sea"}}}, "mine.medium = 'sea'"),
     ("fluxes", {"templates": {"format": "cosmos"}}, "fluxes.templates.files is missing"),
     ("fluxes", {"templates": {"files": ["x"]}}, "fluxes.templates.format is missing"),
     ("fluxes", {"extinction": {"5": {"file": "x", "format": "extinction"}}}, "fluxes.extinction.5 is not a key"),
-    ("fluxes", {"extinction": {"2": {"file": 3, "format": "extinction"}}}, "fluxes.extinction.2.file wants text"),
-    ("fluxes", {"stars": {}}, "fluxes.stars names neither basel nor irtf"),
-    ("fluxes", {"stars": {"basel": ["x.cor"]}}, "fluxes.stars.basel wants text"),
+    ("fluxes", {"extinction": {"2": {"file": 3, "format": "extinction"}}}, "fluxes.extinction.2.file must be text"),
+    ("fluxes", {"stars": {}}, "fluxes.stars must have basel or irtf"),
+    ("fluxes", {"stars": {"basel": ["x.cor"]}}, "fluxes.stars.basel must be text"),
     ("products", {"truth": ["everything"]}, "products.truth"),
     ("products", {"compression": "zip"}, "products.compression"),
     ("products", {"wcs": "zpn"}, "products.wcs"),
     ("products", {"files": "quadrant"}, "products.files = 'quadrant'"),
     ("products", {"readout": "photons"}, "products.readout = 'photons'"),
-    ("pointing", {}, "pointing wants a list"),
+    ("pointing", {}, "pointing must be a list"),
     ("pointing", [3], r"pointing\[0\]"),
     ("pointing.channel", "RADIO", r"pointing\[0\].channel"),
     ("pointing.ra", "north", r"pointing\[0\].ra"),
@@ -152,7 +156,7 @@ def test_bad_requests_are_refused_with_their_key(key, value, words):
 
 
 @pytest.mark.parametrize("key", ["name", "seed"])
-def test_what_must_be_there(key):
+def test_required_keys(key):
     table = copy.deepcopy(GOOD)
     del table[key]
     with pytest.raises(BadInput, match=f"{key} is missing"):
@@ -169,7 +173,7 @@ def test_what_must_be_there(key):
         ("# " + "x" * 2_000_000, "larger than"),
     ],
 )
-def test_files_that_are_no_request(tmp_path, text, words):
+def test_files_that_are_not_requests(tmp_path, text, words):
     path = tmp_path / "r.toml"
     path.write_bytes(text.encode("utf-8", "surrogatepass"))
     with pytest.raises(BadInput, match=words) as caught:
@@ -178,7 +182,7 @@ def test_files_that_are_no_request(tmp_path, text, words):
     assert "\n" not in str(caught.value)
 
 
-def test_a_file_that_is_not_there(tmp_path):
+def test_a_missing_file(tmp_path):
     with pytest.raises(BadInput, match="no such file"):
         parse(tmp_path / "x.toml")
 
@@ -191,8 +195,8 @@ def test_the_demo():
     assert set(demo.facts("seed", "universe")) == {"seed", "universe"}
 
 
-def test_discs_have_structure_where_it_is_asked_for():
-    """And what shapes an image says nothing of it where it is not."""
+def test_discs_have_structure_if_requested():
+    """Facts about images mention structure only if it is requested."""
     assert structure.facts(from_table(GOOD).structure) == structure.facts(from_table(with_("structure", {})).structure)
     assert structure.facts(from_table(with_("structure", {"arms": False})).structure) == {}
     assert from_table(with_("structure", {"arms": True})).structure.arms == Arms()
@@ -201,7 +205,7 @@ def test_discs_have_structure_where_it_is_asked_for():
     assert structure.facts(some)["structure"]["arms"]["number"] == 40
     own = from_table(with_("structure", {"stamps": {"file": "a.fits", "nearest": True}}), Path("there")).structure
     assert own.stamps == Stamps(Path("there/a.fits"), True, 0.5)
-    # A library by another name is the same; its sha256 tells.
+    # The name of a library does not matter; its sha256 identifies it.
     assert structure.facts(own) == {"structure": {"stamps": {"nearest": True, "least_radius": 0.5}}}
 
 
@@ -218,7 +222,7 @@ def test_numbers_of_any_size_are_numbers():
         from_table(with_("area", {"cone": {"ra": 10**400, "dec": 0, "radius": 1}}))
 
 
-def test_own_curves_lie_beside_the_request_and_their_bands_are_added(tmp_path):
+def test_user_curves_are_relative_to_the_request_and_add_bands(tmp_path):
     fluxes = """
 [fluxes.passbands.mine]
 file = "filters/mine.dat"

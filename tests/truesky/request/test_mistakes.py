@@ -1,4 +1,4 @@
-"""Mistakes that users make: the check and the forecast refuse each in one line, before anything is written."""
+"""Mistakes of users are refused by the check and the forecast in one line, before anything is written."""
 
 import pytest
 
@@ -41,7 +41,7 @@ MISTAKES = {
     "a band misspelt": (pointed("euclid_vis", "euclid_viz"), "no band 'euclid_viz'"),
     "a band of another camera": (pointed("euclid_vis", "lsst_r"), "pointing[0].band"),
     "a camera misspelt": (GOOD + 'camera = "viz"\n', "pointing[0].camera"),
-    "a pointing in hours": (pointed("ra = 53.117\ndec", 'ra = "03:32:28"\ndec'), "pointing[0].ra wants a number"),
+    "a pointing in hours": (pointed("ra = 53.117\ndec", 'ra = "03:32:28"\ndec'), "pointing[0].ra must be a number"),
     "a Julian date": (pointed("60905.0", "2460905.5"), "pointing[0].mjd = 2460905.5 is outside"),
     "no date": (pointed("mjd = 60905.0\n", ""), "pointing[0].mjd is missing"),
     "towards the Sun": (pointed("60905.0", "60950.0"), "next allowed: MJD 61042.8 (2026-01-02) to"),
@@ -85,7 +85,7 @@ MISTAKES = {
     ),
     "an effect misspelt": (GOOD + '[effects]\noff = ["cosmics"]\n', "effects.off"),
     "a box the wrong way round": (
-        HEAD + "[area]\nbox = { ra = [54, 52], dec = [-29, -27] }\n" + POINT, "the second must lie to the east",
+        HEAD + "[area]\nbox = { ra = [54, 52], dec = [-29, -27] }\n" + POINT, "the second must be east",
     ),
     "a survey's band in another survey": (
         GROUND + 'bands = ["lsst_r"]\n', "observation[0].bands: survey des has no band",
@@ -97,16 +97,16 @@ MISTAKES = {
     "a place and fields": (OWN + "fields = 3\n", "observation[0]: ra and fields exclude each other"),
     "a place and a table": (OWN + 'pointings = "p.csv"\n', "observation[0]: ra and pointings exclude each other"),
     "an angle of the survey's fields": (
-        WIDE + '[[observation]]\nchannels = ["VIS"]\nposition_angle = 3.0\n', "observation[0].position_angle wants ra",
+        WIDE + '[[observation]]\nchannels = ["VIS"]\nposition_angle = 3.0\n', "observation[0].position_angle requires",
     ),
     "a pattern of no name": (OWN + 'dither = "X"\n', "observation[0].dither = 'X'"),
     "Euclid's pattern on the ground": (
-        GROUND + 'dither = "S"\n', "observation[0].dither = 'S' is a pattern of Euclid's",
+        GROUND + 'dither = "S"\n', "observation[0].dither = 'S' is a Euclid pattern",
     ),
-    "an offset of three numbers": (OWN + "dither = [[0, 0, 0]]\n", "observation[0].dither wants"),
+    "an offset of three numbers": (OWN + "dither = [[0, 0, 0]]\n", "observation[0].dither must be"),
     "a field towards the Sun": (OWN + "mjd = 60950.0\n", "observation[0]: mjd: 126."),
     "no survey": (GROUND.replace('survey = "des"\n', ""), "observation[0].survey"),
-    "Euclid and the ground together": (OWN.replace('"VIS"', '"VIS", "EXT"'), "EXT stands alone"),
+    "Euclid and the ground together": (OWN.replace('"VIS"', '"VIS", "EXT"'), "EXT must be the only channel"),
     "no number of frames": (OWN + 'image_type = "bias"\n', "requires exposures"),
     "a calibration of another channel": (OWN + 'image_type = "standard_star"\n', "observation[0].image_type"),
     "fields that see more than the area": (
@@ -126,8 +126,8 @@ MISTAKES = {
 }  # fmt: skip
 TABLES = {
     "no declination": ("ra,mjd\n53.1,60905\n", "column dec is missing"),
-    "a column of no name": ("ra,dec,mjd,angle\n53.1,-27.8,60905,0\n", "column angle is not known"),
-    "another channel's line": ("ra,dec,channel\n53.1,-27.8,EXT\n", "line 2: channel = 'EXT' is none of"),
+    "a column of no name": ("ra,dec,mjd,angle\n53.1,-27.8,60905,0\n", "column angle is unknown"),
+    "another channel's line": ("ra,dec,channel\n53.1,-27.8,EXT\n", "line 2: channel = 'EXT' is not one of"),
     "another camera's band": ("ra,dec,band\n53.1,-27.8,lsst_r\n", "line 2: camera vis has no band 'lsst_r'"),
     "a line towards the Sun": ("ra,dec,mjd\n53.1,-27.8,60950\n", "pointings: 126."),
     "a line beyond the area": ("ra,dec,mjd\n63.1,-27.8,60905\n", "this area is large enough: [area] cone"),
@@ -147,7 +147,7 @@ CASES |= {
 }  # fmt: skip
 
 
-def test_what_the_mistakes_are_made_in_is_good(tmp_path, capsys):
+def test_requests_without_mistakes_are_valid(tmp_path, capsys):
     (tmp_path / "p.csv").write_text("ra,dec\n53.1,-27.8\n")
     for number, text in enumerate((GOOD, OWN, GROUND, TABLE)):
         (tmp_path / f"{number}.toml").write_text(text)

@@ -1,4 +1,4 @@
-"""Catalogues of one universe are used together, those of two are not."""
+"""Catalogues of one universe can be used together; catalogues of different universes cannot."""
 
 from dataclasses import replace
 from functools import cache
@@ -21,16 +21,16 @@ from truesky.request.from_toml import from_table, parse
 from truesky.running import submitted_job
 
 TABLES = {"galaxies": GALAXIES, "stars": STARS}
-# What a build job adds to the request's own.
+# Further facts that a build job adds.
 ADDED = {"code", "lensing_l_max"}
 
 
 @cache
 def keys():
-    """Of each catalogue, the keys of the facts that its job writes down."""
+    """Return the keys of the facts that the job of each catalogue writes."""
     root, request = Path("/no/lake"), wanted()
     with pytest.MonkeyPatch.context() as patch:
-        # The box would be made here; what is in the plan does not depend on it.
+        # Skip the computation of the box, on which the plan does not depend.
         patch.setattr(build_galaxies, "_universe", lambda *args: None)
         steps = [*build_galaxies.steps(root, request), *build_stars.steps(root, request)]
     return {step.plan.table.name: step.plan.facts.keys() - ADDED for step in steps if step.plan.table.name in TABLES}
@@ -42,15 +42,15 @@ def wanted(name="a", seed=11, **depth):
 
 
 def catalogue(lake, table, request, name=None, **facts):
-    """A catalogue as a build job would publish it for a request."""
+    """Publish a catalogue as a build job would for a request."""
     own = {key: value for key, value in universe.requested_values(request).items() if key in keys()[table]}
     plan = Plan(TABLES[table], {**own, **facts}, (Task(layout.cell_file(5, 1607), {}),))
     publish.make_version(lake, plan, lambda root, facts: Output(rows_of(TABLES[table], 3)), name=name)
     return read.version(lake, table, plan.key)
 
 
-def test_what_shapes_a_catalogue_is_in_the_universe():
-    """A key that a build job writes down and this does not know would never be compared."""
+def test_every_fact_of_a_catalogue_is_compared():
+    """A fact that a build job writes and this module does not list would never be compared."""
     known = universe.requested_values(wanted())
     assert set().union(*keys().values()) <= known.keys()
     assert not known.keys() & {"rows_a_file", "tycho2", "catalogue", "columns"}
@@ -70,18 +70,18 @@ def test_what_shapes_a_catalogue_is_in_the_universe():
         ),
     ],
 )
-def test_another_universe_is_refused_by_what_differs(lake, table, other, words):
+def test_message_names_the_difference_between_universes(lake, table, other, words):
     version = catalogue(lake, table, wanted())
     universe.check_catalogues([version], wanted())
     with pytest.raises(BadInput, match=words):
         universe.check_catalogues([version], other)
 
 
-def test_what_shapes_only_the_other_catalogue_is_no_difference(lake):
+def test_differences_of_the_other_catalogue_are_ignored(lake):
     universe.check_catalogues([catalogue(lake, "galaxies", wanted())], wanted(star_limit=20.0))
 
 
-def test_files_are_compared_by_what_they_hold(lake, tmp_path):
+def test_files_are_compared_by_contents(lake, tmp_path):
     file, same, other = (tmp_path / f"{name}.csv" for name in ("file", "same", "other"))
     for path, text in ((file, "1"), (same, "1"), (other, "2")):
         path.write_text(text)
@@ -99,7 +99,7 @@ def test_files_are_compared_by_what_they_hold(lake, tmp_path):
         universe.check_catalogues([version], request(other))
     with pytest.raises(BadInput, match="table galaxies has files of ingest, the request none"):
         universe.check_catalogues([version], wanted())
-    # One more, or one fewer, is another catalogue.
+    # An additional or missing file makes another catalogue.
     with pytest.raises(BadInput, match="table galaxies has other files of ingest than the request"):
         universe.check_catalogues([version], request(file, other))
     two = catalogue(lake, "galaxies", wanted(), ingest=about(file, other))
@@ -109,7 +109,7 @@ def test_files_are_compared_by_what_they_hold(lake, tmp_path):
     universe.check_catalogues([version], request(file))
 
 
-def test_files_are_compared_by_how_they_are_read(lake, tmp_path):
+def test_files_are_compared_by_reading_options(lake, tmp_path):
     (file := tmp_path / "file.csv").write_text("1")
     sums = {"sha256": [file_sha256(file)]}
 
@@ -132,7 +132,7 @@ def test_files_are_compared_by_how_they_are_read(lake, tmp_path):
 
 
 @pytest.mark.parametrize("listed", [True, False])
-def test_files_in_pairs_and_others_in_their_folder(lake, tmp_path, listed):
+def test_pairs_of_files_are_compared_and_other_files_ignored(lake, tmp_path, listed):
     names = ("galaxy_1.parquet", "galaxy_flux_1.parquet", "pointsource_1.parquet")
     for name in names:
         (tmp_path / name).write_text(name)
@@ -146,7 +146,7 @@ def test_files_in_pairs_and_others_in_their_folder(lake, tmp_path, listed):
         universe.check_catalogues([version], request)
 
 
-def test_dust_is_of_both_catalogues(lake, tmp_path):
+def test_dust_map_affects_both_catalogues(lake, tmp_path):
     (tmp_path / "dust.fits").write_text("x")
     dust = Ingest(dust=DustMap(tmp_path / "dust.fits", "EBV", "ebv", "", ""))
     for table in TABLES:
@@ -164,11 +164,11 @@ def test_a_lake_holds_one_universe(lake):
         universe.check_lake(lake, wanted("b", seed=12))
     with pytest.raises(BadInput, match=r"its stars have star_limit 26.0, .*: use another folder for request b"):
         universe.check_lake(lake, wanted("b", star_limit=20.0))
-    # Alone in its lake, a request may change its own.
+    # A request that is alone in its lake may change its universe.
     universe.check_lake(lake, wanted("a", seed=12))
 
 
-def test_every_job_looks_before_it_computes(lake, tmp_path, capsys):
+def test_every_job_compares_universes_first(lake, tmp_path, capsys):
     catalogue(lake, "stars", wanted("a"), name="a")
     before = sorted(lake.rglob("*"))
     job = submitted_job.Job("toy", "", lambda root, request: pytest.fail("it began"))

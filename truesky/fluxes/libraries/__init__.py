@@ -1,1 +1,1 @@
-"""Spectral libraries."""
+"""Read and compute libraries of template spectra."""

@@ -1,12 +1,7 @@
-"""Spectra of L and T dwarfs: 365 templates, 19 subtypes with about 19 realisations of their scatter in colour.
+"""Compute spectra of L and T dwarfs: 365 templates, about 19 realisations of colour scatter for each of 19 subtypes.
 
-subtypes        L0 .. T8 with their temperatures, magnitudes and colours
-template_names  which subtype each template is
-templates       their temperatures and magnitudes
-spectra         f_lambda of all templates
-
-The mean colours are those of Pecaut & Mamajek 2013: i - z (AB) and J - H, H - Ks (Vega); z - J from z - Y, with Y - J
-adopted.
+The mean colours are from Pecaut & Mamajek 2013: i - z (AB), and J - H and H - Ks (Vega). The colour z - J is computed
+from z - Y with an adopted Y - J.
 """
 
 from __future__ import annotations
@@ -24,19 +19,32 @@ COUNT = 365
 _FIRST, _LAST = "L0V", "T8V"
 _BANDS = ("sdss_i", "sdss_z", "twomass_j", "twomass_h", "twomass_ks")
 _J = _BANDS.index("twomass_j")
-# AB magnitudes; Y - J of UKIDSS varies between 0.7 and 0.9 along the sequence (Hewett et al. 2006).
+# Adopted Y - J in AB magnitudes; in UKIDSS it varies from 0.7 to 0.9 along the sequence (Hewett et al. 2006).
 _COLOR_YJ = 0.8
 # Scatter of J - H and H - Ks within a subtype, mag (adopted).
 _SCATTER = 0.07
 _TOLERANCE = 1e-4, 200
-# Bands of methane and water: centre, width, A, and depth (adopted: texture, the colours come after).
+# Centre (A), width (A) and depth of methane and water bands. They are adopted and give only texture, since colours are
+# corrected afterwards.
 _METHANE = ((11_500.0, 700.0, 0.6), (16_700.0, 900.0, 0.8), (22_500.0, 1200.0, 0.8))
 _WATER = ((9_300.0, 300.0, 0.4), (14_000.0, 700.0, 0.7), (18_700.0, 900.0, 0.8))
 
 
 @dataclass(frozen=True, slots=True)
 class Subtypes:
-    """n subtypes: teff K; abs_mag_j Vega; colors float64[n, 5], m_band - m_J, AB, of i z J H Ks."""
+    """Properties of n subtypes.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Names of the subtypes, L0 to T8.
+    teff : float array, shape (n,)
+        Effective temperature in K.
+    abs_mag_j : float array, shape (n,)
+        Absolute J magnitude (Vega).
+    colors : float array, shape (n, 5)
+        m_band - m_J (AB) of i, z, J, H, Ks.
+    """
 
     names: tuple[str, ...]
     teff: Float
@@ -45,9 +53,9 @@ class Subtypes:
 
 
 def subtypes() -> Subtypes:
-    """L0 .. T8 of Pecaut & Mamajek 2013."""
+    """Return the subtypes L0 to T8 of Pecaut & Mamajek 2013."""
     names, column = stellar.table(_FIRST, _LAST)
-    # T4.5, T5.5 and T7.5 are in the table, too.
+    # The table also contains T4.5, T5.5 and T7.5.
     is_whole_subtype = np.array(["." not in name for name in names])
     names, column = (
         tuple(np.array(names)[is_whole_subtype].tolist()),
@@ -61,7 +69,7 @@ def subtypes() -> Subtypes:
 
 
 def template_names() -> tuple[str, ...]:
-    """Subtype and number ("L0-00") of the 365 templates, subtype after subtype; 00 is the mean."""
+    """Return subtype and number ("L0-00") of the 365 templates in order of subtype; number 00 is the mean."""
     names = subtypes().names
     counts = [COUNT // len(names) + (k < COUNT % len(names)) for k in range(len(names))]
     return tuple(f"{name}-{m:02d}" for name, count in zip(names, counts, strict=True) for m in range(count))
@@ -69,7 +77,17 @@ def template_names() -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class Templates:
-    """The 365 templates: number[365] of the subtype, teff K, abs_mag_j, abs_mag_h (Vega)."""
+    """Properties of the 365 templates.
+
+    Attributes
+    ----------
+    subtype : int array, shape (365,)
+        Index of the subtype.
+    teff : float array, shape (365,)
+        Effective temperature in K.
+    abs_mag_j, abs_mag_h : float array, shape (365,)
+        Absolute magnitudes (Vega).
+    """
 
     subtype: Int
     teff: Float
@@ -78,7 +96,7 @@ class Templates:
 
 
 def templates() -> Templates:
-    """What is known of the templates; realisations of a subtype have its M_J."""
+    """Return the properties of the templates; all realisations of a subtype have its M_J."""
     types = subtypes()
     labels = [name.partition("-")[::2] for name in template_names()]
     subtype = np.array([types.names.index(name) for name, _ in labels])
@@ -90,9 +108,9 @@ def templates() -> Templates:
 
 
 def spectra() -> Float:
-    """f_lambda on the grid of passbands.grid(), float64[365, 23401], mean 1 between 5450 and 5550 A.
+    """Return f_lambda of all templates on passbands.grid(), float64[365, 23401], with mean 1 between 5450 and 5550 A.
 
-    Error: colours within 1e-4 mag
+    Colours are correct within 1e-4 mag.
     """
     grid, types = passbands.grid(), subtypes()
     bands = [passbands.load(name) for name in _BANDS]
@@ -114,7 +132,7 @@ def spectra() -> Float:
 
 
 def _scatter(subtype: str, number: int) -> Float:
-    """What is added to the colours m_band - m_J of a realisation; number 0 is the mean."""
+    """Return the offsets of the colours m_band - m_J of a realisation; 0 for number 0, the mean."""
     if number == 0:
         return np.zeros(len(_BANDS))
     jh, hk = _SCATTER * stream("brown dwarfs", subtype, number).standard_normal(2)
@@ -122,7 +140,10 @@ def _scatter(subtype: str, number: int) -> Float:
 
 
 def _band_transmission(wavelength: Float, position: float) -> Float:
-    """Transmission of water, all along the sequence, and methane, in its second half; place = 0 at L0, 1 at T8."""
+    """Return the transmission of water and methane; position is 0 at L0 and 1 at T8.
+
+    Water absorbs along the whole sequence, methane in its second half.
+    """
     transmission = np.ones_like(wavelength)
     for bands, strength in ((_WATER, 0.5 + 0.5 * position), (_METHANE, max(2.0 * position - 1.0, 0.0))):
         for centre, width, depth in bands:
@@ -131,7 +152,7 @@ def _band_transmission(wavelength: Float, position: float) -> Float:
 
 
 def _vega(band: str) -> float:
-    # calibration needs the library of which this is a part.
+    # Import here, to avoid an import cycle.
     from truesky.fluxes.libraries.vega import vega_magnitude
 
     return vega_magnitude(passbands.load(band))

@@ -1,13 +1,6 @@
-"""Spectra, extinction curves and passbands from external files: checked, named, never guessed.
+"""Read spectra, extinction curves and passbands from external files, and check them.
 
-formats         what can be read (spectrum_formats.toml)
-read            wavelengths and values of one file
-library         galaxy templates on our grid, from files in the order of a list
-law             an extinction law on the wavelengths of a library
-passband        a user's filter
-check, resampled   what they are read with
-
-Every refusal is a BadInput that names the file, and the row where there is one.
+spectrum_formats.toml has the formats. Errors are BadInput; messages name the file and, if there is one, the row.
 """
 
 from __future__ import annotations
@@ -32,34 +25,57 @@ from truesky.fluxes.libraries.templates import Library
 from truesky.fluxes.passbands import Passband
 
 _FORMATS = Path(__file__).with_name("spectrum_formats.toml")
-# Of a VOTable; room would be made for as many rows.
+# Attribute of a VOTable with the number of rows, for which astropy would allocate memory.
 _ROW_COUNT = re.compile(r"""\bnrows\s*=\s*["'][^"']*["']""")
 ANGSTROM = {"Angstrom": 1.0, "nm": 10.0, "um": 1e4}
-# f_lambda beyond the red end of a file of galaxies.
+# Exponent of f_lambda beyond the red end of a galaxy file.
 _RED_SLOPE = -3.2
 
-# k of the steepest law, at 912 A, is some 25.
+# Largest allowed k; the steepest law has about 25 at 912 A.
 _MAX_EXTINCTION = 100.0
 
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """wavelength : float64[n] A, ascending;  value : float64[n] >= 0."""
+    """A spectrum, extinction curve or passband.
+
+    Attributes
+    ----------
+    wavelength : float array, shape (n,)
+        Wavelengths in A, increasing.
+    value : float array, shape (n,)
+        Values, 0 or more.
+    """
 
     wavelength: Float
     value: Float
 
 
 def formats() -> Mapping[str, Mapping[str, Any]]:
-    """The formats by name."""
+    """Return the formats by name."""
     return user_files.parse_toml(_FORMATS.read_text(encoding="utf-8"))
 
 
 def read(path: Path, format_name: str) -> Curve:
-    """A file in one of the `formats`.
+    """Read a curve from a file.
 
-    Errors: BadInput for a file that is absent, too large or not of that form; one row; wavelengths not ascending,
-            repeated or in another unit; negative, infinite or missing values; nothing but zeros; a gap
+    Parameters
+    ----------
+    path : Path
+        The file.
+    format_name : str
+        Name of its format, one of `formats`.
+
+    Returns
+    -------
+    Curve
+        The curve.
+
+    Raises
+    ------
+    BadInput
+        If the format is unknown, the file is absent, too large or in another format, or the curve is not valid
+        (see `check_curve`).
     """
     all_formats = formats()
     if format_name not in all_formats:
@@ -70,17 +86,31 @@ def read(path: Path, format_name: str) -> Curve:
     except LakeError:
         raise
     except Exception as error:
-        # What the libraries' readers raise of a user's file has no end.
+        # The readers of astropy and NumPy may raise many kinds of errors for a user's file.
         raise BadInput(f"{path}: cannot be read as {format_name}: {' '.join(str(error).split())[:200]}") from None
     check_curve(path, wavelength, value, form)
     return Curve(wavelength, value)
 
 
 def library(files: Sequence[Path], format_name: str = "cosmos") -> Library:
-    """Galaxy templates from files, earliest first, on the rest-frame grid of the embedded library, normalised.
+    """Read galaxy templates on the rest-frame grid of the built-in library.
 
-    Each bin of 1 A gets the mean of the file's spectrum over it: flux is conserved. Without flux beyond the blue end;
-    beyond the red end as lambda^-3.2.
+    Parameters
+    ----------
+    files : sequence of Path
+        One file per template, earliest type first.
+    format_name : str, optional
+        Format of the files, one of `formats`.
+
+    Returns
+    -------
+    Library
+        The normalised templates.
+
+    Notes
+    -----
+    Each bin of 1 A gets the mean of the file's spectrum over the bin, which conserves flux. The flux is 0 beyond the
+    blue end, and proportional to lambda^-3.2 beyond the red end.
     """
     from truesky.fluxes.libraries.rest_grid import rest_grid
 
@@ -91,16 +121,50 @@ def library(files: Sequence[Path], format_name: str = "cosmos") -> Library:
 
 
 def law(path: Path, format_name: str, wavelength: Float) -> Float:
-    """k(lambda) = A / E(B-V) of an extinction law, linear between the file's wavelengths, constant beyond them."""
+    """Read an extinction law k(lambda) = A / E(B-V).
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    format_name : str
+        Format of the file, one of `formats`.
+    wavelength : float array, shape (n,)
+        Wavelengths in A.
+
+    Returns
+    -------
+    float array, shape (n,)
+        k at these wavelengths, interpolated linearly, and constant beyond the wavelengths of the file.
+    """
     curve = read(path, format_name)
-    _refuse(path, curve.value > _MAX_EXTINCTION, f"is more than k = {_MAX_EXTINCTION:g}: is it A / E(B-V)?")
+    _refuse(path, curve.value > _MAX_EXTINCTION, f"is more than k = {_MAX_EXTINCTION:g}: the values must be A / E(B-V)")
     return np.interp(wavelength, curve.wavelength, curve.value)
 
 
 def passband(path: Path, name: str, medium: str, form: str = "passband_ascii") -> Passband:
-    """A user's filter, to be given in place of a passband's name; medium is "air" or "vacuum".
+    """Read a user's passband.
 
-    path : of the file;  name : that it is to have;  form : one of spectrum_formats.toml
+    Parameters
+    ----------
+    path : Path
+        The file.
+    name : str
+        Name of the passband.
+    medium : str
+        Medium of the wavelengths, "air" or "vacuum".
+    form : str, optional
+        Format of the file, one of `formats`.
+
+    Returns
+    -------
+    Passband
+        The passband on the common grid.
+
+    Raises
+    ------
+    BadInput
+        If the medium is unknown, or the curve is not valid or outside the grid.
     """
     if medium not in ("air", "vacuum"):
         raise BadInput(f"{path}: medium {medium!r} is not air or vacuum")
@@ -108,12 +172,12 @@ def passband(path: Path, name: str, medium: str, form: str = "passband_ascii") -
     wavelength, response = passbands.resample_to_grid(curve.wavelength, curve.value)
     if not len(wavelength):
         first, last = passbands.GRID_FIRST, passbands.GRID_LAST
-        raise BadInput(f"{path}: lies outside {first} .. {last} A")
+        raise BadInput(f"{path}: the passband is outside {first} .. {last} A")
     return Passband(name, wavelength, response, medium)
 
 
 def _columns(path: Path, form: Mapping[str, Any]) -> tuple[Float, Float]:
-    """Wavelengths, A, and values, as the file has them."""
+    """Return the wavelengths (A) and values of a file."""
     reader, names = form["reader"], (form["wavelength"], form["value"])
     scale = ANGSTROM[form["unit"]]
     if reader == "ascii":
@@ -122,7 +186,7 @@ def _columns(path: Path, form: Mapping[str, Any]) -> tuple[Float, Float]:
             raise BadInput(f"{path}: has no rows")
         rows = np.loadtxt(lines, comments="#", usecols=[names[0] - 1, names[1] - 1], ndmin=2)
         return rows[:, 0] * scale, rows[:, 1]
-    # Slow to import, and not needed for the form that most files have.
+    # The import is slow, and the most common format does not need it.
     from astropy.units import Quantity, dimensionless_unscaled
 
     table = read_table(path, "curve") if reader == "fits" else _table(path, reader)
@@ -133,7 +197,7 @@ def _columns(path: Path, form: Mapping[str, Any]) -> tuple[Float, Float]:
 
 
 def _table(path: Path, reader: str) -> Any:
-    """An astropy table of a text file; given to astropy as text, for a path it would unpack, or fetch."""
+    """Read a text file as an astropy table. Astropy gets the text, since it would unpack or download from a path."""
     from astropy.table import QTable
 
     text = user_files.read_text(path, "table of a curve")
@@ -146,21 +210,35 @@ def _table(path: Path, reader: str) -> Any:
 
 
 def _without_unit(column: Any) -> Float:
-    """A column without its unit; what is masked becomes NaN, to be refused."""
+    """Return a column without unit; masked values become NaN, which `check_curve` refuses."""
     bare = getattr(column, "value", column)
     return np.asarray(np.ma.filled(np.ma.asarray(bare, dtype=float), np.nan), float)
 
 
 def check_curve(path: Path, wavelength: Float, value: Float, form: Mapping[str, Any]) -> None:
-    """Refuse what is no curve, naming the row; form : bounds, largest_gap and covers as in the formats.
+    """Check that wavelengths and values form a valid curve.
 
-    path : named in the refusal;  wavelength, value : float[n] of the curve
+    Parameters
+    ----------
+    path : Path
+        File for messages.
+    wavelength, value : float array, shape (n,)
+        The curve.
+    form : mapping of str
+        Limits `bounds`, `largest_gap` and optionally `covers`, as in the formats.
+
+    Raises
+    ------
+    BadInput
+        If there are fewer than two rows; if a number is missing, infinite or negative; if wavelengths are repeated,
+        decreasing, out of bounds, do not cover the range or have a gap; or if all values are 0. The message names the
+        file and the row.
     """
     lo, hi = form["bounds"]
     if wavelength.ndim != 1 or wavelength.shape != value.shape:
-        raise BadInput(f"{path}: {list(wavelength.shape)} wavelengths and {list(value.shape)} values are no curve")
+        raise BadInput(f"{path}: {list(wavelength.shape)} wavelengths and {list(value.shape)} values are not a curve")
     if len(wavelength) < 2:
-        raise BadInput(f"{path}: {len(wavelength)} rows are no curve")
+        raise BadInput(f"{path}: a curve must have at least 2 rows, got {len(wavelength)}")
     _refuse(path, ~(np.isfinite(wavelength) & np.isfinite(value)), "is not a number")
     _refuse(
         path, (wavelength < lo) | (wavelength > hi), f"wavelength is outside {lo:g} .. {hi:g} A: is the unit right?"
@@ -185,13 +263,13 @@ def _refuse(path: Path, bad: Bool, problem: str) -> None:
 
 
 def resample(grid: Float, curve: Curve) -> Float:
-    """Mean over each bin of 1 A, from the integral of the piecewise linear spectrum."""
+    """Return the mean of a piecewise linear spectrum over each bin of 1 A, computed from its integral."""
     at, value = curve.wavelength, curve.value
     if at[-1] < grid[-1] + 0.5:
         tail = np.arange(at[-1] + 1.0, grid[-1] + 2.0)
         at, value = np.append(at, tail), np.append(value, value[-1] * (tail / at[-1]) ** _RED_SLOPE)
     edges = np.append(grid, grid[-1] + 1.0) - 0.5
-    # The integral is exact where the spectrum is sampled; the edges of the bins are added to the samples.
+    # Add the edges of the bins to the samples. The integral is exact at the samples.
     nodes = np.union1d(at, edges)
     sampled = np.interp(nodes, at, value, left=0.0)
     integral = np.append(0.0, np.cumsum(0.5 * (sampled[1:] + sampled[:-1]) * np.diff(nodes)))

@@ -1,13 +1,9 @@
-"""Spectra of stars by temperature, gravity and metallicity, and stars as mixtures of neighbouring ones.
+"""Compute spectra of stars by temperature, gravity and metallicity, and describe stars as mixtures of these spectra.
 
-TEFF, LOG_G, METALLICITY   nodes of the models
-names, spectra             the models' part of the stellar library
-Mixture, mixture           which spectra a star is made of, and their shares
-bolometric_h, v_minus_h    M_bol - M_H, V - H
-
-The models have the colours of Castelli & Kurucz 2003 (model_stars.csv, where the sources stand); at the hottest nodes,
-and at the coolest of dwarfs, they go over into the dwarfs of `stellar`, which go on beyond.  A star between nodes is a
-mixture of the four corners of the simplex that it lies in, linear and continuous in ln Teff, log g and [M/H].
+The models have the colours of Castelli & Kurucz 2003 (model_stars.csv, which lists the sources). At the hottest nodes,
+and at the coolest nodes of dwarfs, they change smoothly into the dwarfs of `stellar`, which continue beyond the models.
+A star between nodes is a mixture of the four corners of its simplex. The mixture is linear and continuous in ln Teff,
+log g and [M/H].
 """
 
 from __future__ import annotations
@@ -30,22 +26,30 @@ TABLE = Path(__file__).with_name("model_stars.csv")
 TEFF = np.geomspace(3600.0, 8500.0, 18)
 LOG_G = np.array([1.6, 3.2, 4.6])
 METALLICITY = np.array([-2.5, -1.5, -1.0, -0.5, 0.0, 0.5])
-# Spectra that a star is a mixture of.
+# Number of spectra in the mixture of a star.
 MIXTURE_SIZE = 4
 BANDS = ("sdss_u", "sdss_g", "sdss_r", "sdss_i", "sdss_z", "twomass_j", "twomass_h", "twomass_ks")
 _DWARF_GRAVITY = len(LOG_G) - 1
-# The models' share at the hottest nodes, from the last, and at a dwarf's coolest, from the first.
+# Fraction of the model at the hottest nodes (from the last), and at the coolest nodes of dwarfs (from the first).
 _HOT_SHARES, _COOL_SHARES = (0.0, 0.5), (0.0, 1 / 3, 2 / 3)
-# Cooler than the models, stars of lower gravity are giants, and take the coolest of them.
+# Stars cooler than the models are giants if log g is at most this. They use the coolest models.
 _GIANT = 3.9
 _V = "bessell_v"
-# Largest error of a colour, mag, and passes.
+# Largest error of a colour (mag), and largest number of iterations.
 _TOLERANCE = 1e-4, 100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Models:
-    """bolometric_h (AB) [teff, log_g, metallicity] mag, colors [.., 8] m_band - m_V (AB) of BANDS."""
+    """Colours of the models at the nodes.
+
+    Attributes
+    ----------
+    bolometric_h : float array, shape (n_teff, n_log_g, n_metallicity)
+        M_bol - M_H (AB) in mag.
+    colors : float array, shape (n_teff, n_log_g, n_metallicity, 8)
+        m_band - m_V (AB) of `BANDS` in mag.
+    """
 
     bolometric_h: Float
     colors: Float
@@ -53,7 +57,15 @@ class Models:
 
 @dataclass(frozen=True, slots=True)
 class Mixture:
-    """sed int64[PARTS, n] indices in the stellar library, frac float64[PARTS, n] shares of f_lambda at 5500 A."""
+    """Spectra of which stars are mixtures.
+
+    Attributes
+    ----------
+    sed : int array, shape (MIXTURE_SIZE, n)
+        Indices in the stellar library.
+    frac : float array, shape (MIXTURE_SIZE, n)
+        Fractions of f_lambda at 5500 A.
+    """
 
     sed: Int
     frac: Float
@@ -61,7 +73,7 @@ class Mixture:
 
 @lru_cache(maxsize=1)
 def models() -> Models:
-    """The table."""
+    """Read the table of models."""
     with TABLE.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
     shape = (TEFF.size, LOG_G.size, METALLICITY.size)
@@ -71,13 +83,13 @@ def models() -> Models:
 
 
 def names() -> tuple[str, ...]:
-    """Teff, log g and [M/H] of each model, the last the fastest."""
+    """Return Teff, log g and [M/H] of each model as text; [M/H] varies fastest."""
     return tuple(f"{t:.0f} K {g:.1f} {z:+.1f}" for t in TEFF for g in LOG_G for z in METALLICITY)
 
 
 @lru_cache(maxsize=1)
 def model_share() -> Float:
-    """[teff, log_g, metallicity] share of the models at their nodes; the rest is the dwarf of that temperature."""
+    """Return the fraction of the model at each node [teff, log_g, metallicity]; the rest is a dwarf."""
     share = np.ones((TEFF.size, LOG_G.size, METALLICITY.size))
     for k, value in enumerate(_HOT_SHARES):
         share[-1 - k] *= value
@@ -87,10 +99,23 @@ def model_share() -> Float:
 
 
 def spectra(dwarfs: Float, types: StellarTypes) -> Float:
-    """f_lambda of each model on the grid of passbands.grid(), float64[n, 23401], normalised.
+    """Return the normalised spectra of the models on passbands.grid().
 
-    dwarfs : float64[m, 23401] normalised spectra of the types
-    Error  : colours within 1e-4 mag of the table's where nothing of the dwarfs is mixed in
+    Parameters
+    ----------
+    dwarfs : float array, shape (m, 23401)
+        Normalised spectra of the dwarf types.
+    types : StellarTypes
+        The dwarf types.
+
+    Returns
+    -------
+    float array, shape (n, 23401)
+        f_lambda of each model.
+
+    Notes
+    -----
+    Colours are within 1e-4 mag of the table at nodes without a contribution of dwarfs.
     """
     grid, table, share = passbands.grid(), models(), model_share()
     bands = [passbands.load(name) for name in (*BANDS, _V)]
@@ -126,22 +151,50 @@ def spectra(dwarfs: Float, types: StellarTypes) -> Float:
 
 
 def dwarf_spectra(dwarfs: Float, types: StellarTypes) -> Float:
-    """Spectra of dwarfs at the models' temperatures, [n, m], of those of the types, [k, m], linear in ln Teff."""
+    """Interpolate spectra of dwarfs to the temperatures of the models, linearly in ln Teff.
+
+    Parameters
+    ----------
+    dwarfs : float array, shape (k, m)
+        Spectra of the types.
+    types : StellarTypes
+        The dwarf types.
+
+    Returns
+    -------
+    float array, shape (n, m)
+        Spectrum for each model.
+    """
     neighbours, weight = _neighbour_dwarfs(types, TEFF)
     interpolated = (1.0 - weight)[:, None] * dwarfs[neighbours[0]] + weight[:, None] * dwarfs[neighbours[1]]
     return np.repeat(interpolated, LOG_G.size * METALLICITY.size, axis=0)
 
 
 def nearest_dwarfs(types: StellarTypes) -> Int:
-    """Index of the hotter of the two dwarfs that stand beside each model."""
+    """Return for each model the index of the next hotter dwarf."""
     return np.repeat(_neighbour_dwarfs(types, TEFF)[0][0], LOG_G.size * METALLICITY.size)
 
 
 def mixture(types: StellarTypes, first: int, teff: Float, log_g: Float, metallicity: Float) -> Mixture:
-    """What stars are made of, the largest share first.
+    """Return the spectra of which stars are mixtures, the largest fraction first.
 
-    types : the dwarfs, which the library begins with;  first : index in it of the first model
-    teff, log_g, metallicity : float64[n] K, cm s-2, [M/H]
+    Parameters
+    ----------
+    types : StellarTypes
+        The dwarf types, with which the stellar library begins.
+    first : int
+        Index of the first model in the library.
+    teff : float array, shape (n,)
+        Effective temperature in K.
+    log_g : float array, shape (n,)
+        Surface gravity, log10 of cm s-2.
+    metallicity : float array, shape (n,)
+        [M/H].
+
+    Returns
+    -------
+    Mixture
+        Indices and fractions.
     """
     n = teff.size
     sed, frac = np.zeros((MIXTURE_SIZE, n), np.int64), np.zeros((MIXTURE_SIZE, n))
@@ -151,10 +204,25 @@ def mixture(types: StellarTypes, first: int, teff: Float, log_g: Float, metallic
 
 
 def bolometric_h(types: StellarTypes, vega: float, teff: Float, log_g: Float, metallicity: Float) -> Float:
-    """M_bol - M_H (Vega)[n].
+    """Return M_bol - M_H (Vega) of stars.
 
-    types : the dwarfs;  vega : AB magnitude of Vega in H
-    teff, log_g, metallicity : float64[n] K, cm s-2, [M/H]
+    Parameters
+    ----------
+    types : StellarTypes
+        The dwarf types.
+    vega : float
+        AB magnitude of Vega in H.
+    teff : float array, shape (n,)
+        Effective temperature in K.
+    log_g : float array, shape (n,)
+        Surface gravity, log10 of cm s-2.
+    metallicity : float array, shape (n,)
+        [M/H].
+
+    Returns
+    -------
+    float array, shape (n,)
+        Differences in mag.
     """
     mixed = mixture(types, types.teff.size, teff, log_g, metallicity)
     of_models = model_share() * (models().bolometric_h + vega)
@@ -164,9 +232,19 @@ def bolometric_h(types: StellarTypes, vega: float, teff: Float, log_g: Float, me
 
 
 def v_minus_h(types: StellarTypes, vega: tuple[float, float]) -> Float:
-    """V - H (Vega) of the dwarfs and of the models, float64[m]; vega : AB magnitudes of Vega in V and H.
+    """Return V - H (Vega) of the dwarfs and of the models.
 
-    Error: 0.02 mag (the dwarfs' H at the models' temperatures)
+    Parameters
+    ----------
+    types : StellarTypes
+        The dwarf types.
+    vega : (float, float)
+        AB magnitudes of Vega in V and H.
+
+    Returns
+    -------
+    float array, shape (m,)
+        Colours in mag. The error is 0.02 mag, due to the interpolation of the dwarfs' H to the models' temperatures.
     """
     of_models = -models().colors[..., BANDS.index("twomass_h")] - vega[0] + vega[1]
     dwarf = np.interp(-np.log(TEFF), -np.log(types.teff), types.v_minus_h)[:, None, None]
@@ -176,7 +254,7 @@ def v_minus_h(types: StellarTypes, vega: tuple[float, float]) -> Float:
 
 
 def _neighbour_dwarfs(types: StellarTypes, teff: Float) -> tuple[Int, Float]:
-    """The two dwarfs about temperatures [2, n], and the second's share[n], linear in ln Teff."""
+    """Return the two dwarfs next to each temperature [2, n], and the fraction[n] of the second, linear in ln Teff."""
     ln_teff = np.log(types.teff)
     cooler = np.clip(np.searchsorted(-ln_teff, -np.log(teff)), 1, ln_teff.size - 1)
     weight = (ln_teff[cooler - 1] - np.log(teff)) / (ln_teff[cooler - 1] - ln_teff[cooler])
@@ -188,10 +266,18 @@ def _mix(
     teff: Float, log_g: Float, metallicity: Float, ln_teff: Float, gravities: Float, metals: Float, dwarfs: Float,
     first: int, giant: float, sed: Int, frac: Float,
 ) -> None:  # fmt: skip
-    """Fills sed, frac [PARTS, n]; ln_teff, gravities, metals are the nodes, dwarfs the ln Teff of those, falling.
+    """Fill `sed` and `frac`, shape (MIXTURE_SIZE, n), with the mixture of each star.
 
-    The six simplices of a cell share its diagonal: from corner to corner goes first the axis along which the star is
-    farthest.  Ref: Kuhn 1960, IBM J. Res. Dev. 4, 518
+    `ln_teff`, `gravities` and `metals` are the nodes; `dwarfs` has ln Teff of the dwarfs, decreasing.
+
+    Notes
+    -----
+    The six simplices of a cell share its diagonal. The path from corner to corner follows first the axis along which
+    the star is farthest.
+
+    References
+    ----------
+    Kuhn 1960, IBM J. Res. Dev. 4, 518.
     """
     for i in range(teff.size):
         t = math.log(teff[i])
@@ -204,7 +290,7 @@ def _mix(
             b, up = _find_node(gravities, log_g[i])
             c, rich = _find_node(metals, metallicity[i])
             size_a, size_b = gravities.size * metals.size, metals.size
-            # The three axes by falling share of the way.
+            # Sort the three axes by decreasing fraction.
             x, y, z = along, up, rich
             p, q, r = size_a, size_b, 1
             if y > x:
@@ -226,6 +312,6 @@ def _mix(
 
 @exact_jit
 def _find_node(nodes: Float, value: float) -> tuple[int, float]:
-    """(node before, share of the way to the next), inside the nodes."""
+    """Return the node before a value, and the fraction of the way to the next node; values outside are clipped."""
     low = min(max(int(np.searchsorted(nodes, value, side="right")) - 1, 0), nodes.size - 2)
     return low, min(max((value - nodes[low]) / (nodes[low + 1] - nodes[low]), 0.0), 1.0)

@@ -1,7 +1,4 @@
-"""Spectra of calibration sources: Vega, a white dwarf, a planetary nebula.
-
-NAMES, spectra
-"""
+"""Compute spectra of calibration sources: Vega, a white dwarf and a planetary nebula."""
 
 from __future__ import annotations
 
@@ -16,15 +13,28 @@ from truesky.fluxes.libraries import stellar
 
 NAMES = ("Vega", "white dwarf DA", "planetary nebula")
 
-# A hot DA, such as GD 71 (Teff of Bohlin, Hubeny & Rauch 2020); depth and width of its Balmer lines adopted.
+# A hot DA such as GD 71 (Teff of Bohlin, Hubeny & Rauch 2020). Depth and width (A) of its Balmer lines are adopted.
 _WHITE_DWARF_TEFF, _BALMER_DEPTH, _BALMER_WIDTH, _LOWER_LEVEL = 33_590.0, 0.45, 25.0, 2.0
 NEBULA = Path(__file__).with_name("planetary_nebula.csv")
-# Equivalent width of H beta over the nebula's flat continuum, A, and sigma of the lines, A (adopted).
+# Equivalent width of H beta in the nebula's flat continuum (A), and sigma of the lines (A); both are adopted.
 _HBETA_WIDTH, _NEBULA_SIGMA = 500.0, 1.0
 
 
 def spectra(vega_wavelength: Float, vega_flux: Float) -> Float:
-    """f_lambda of NAMES on the grid of passbands.grid(), float64[3, 23401], mean 1 between 5450 and 5550 A."""
+    """Return the spectra of the sources in `NAMES`.
+
+    Parameters
+    ----------
+    vega_wavelength : float array, shape (m,)
+        Wavelengths of Vega's spectrum in A.
+    vega_flux : float array, shape (m,)
+        Vega's f_lambda.
+
+    Returns
+    -------
+    float array, shape (3, 23401)
+        f_lambda on passbands.grid() with mean 1 between 5450 and 5550 A.
+    """
     grid = passbands.grid()
     vega = np.interp(grid, vega_wavelength, vega_flux, left=0.0)
     balmer = stellar.feature_profile("series", grid, _LOWER_LEVEL, _BALMER_WIDTH)
@@ -33,7 +43,7 @@ def spectra(vega_wavelength: Float, vega_flux: Float) -> Float:
 
 
 def _nebula(grid: Float) -> Float:
-    """Lines, in bins of 1 A, over a flat continuum of 1."""
+    """Return lines in bins of 1 A on a flat continuum of 1."""
     from scipy.special import erf
 
     edges = np.append(grid, grid[-1] + 1.0) - 0.5

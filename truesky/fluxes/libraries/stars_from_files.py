@@ -1,11 +1,7 @@
-"""Stars from external files, in place of the embedded dwarfs.
+"""Read stellar spectra from external files, which replace the built-in dwarfs.
 
-library    the stellar library with its dwarfs from models, with infrared spectra spliced on, or both
-basel      model spectra of Lejeune, Cuisinier & Buser 1997 (.cor)
-dwarfs     of these, each dwarf of the embedded sequence at its temperature and gravity
-splice     IRTF spectra of stars onto those of low resolution, by their Y - H colour
-
-Every refusal is a BadInput that names the file.
+Dwarfs come from BaSeL models (Lejeune, Cuisinier & Buser 1997, .cor files), and their infrared spectra from IRTF
+spectra with a similar Y - H colour. Errors are BadInput; messages name the file.
 """
 
 from __future__ import annotations
@@ -34,17 +30,29 @@ from truesky.fluxes.passbands import Passband
 _BASEL_COUNT, _BASEL_WAVELENGTH_WIDTH, _BASEL_FLUX_WIDTH = 1221, 10, 11
 _BASEL_HEADER = (0, 6, 12, 18, 24)
 
-# Where spectra are normalised, A.
+# Wavelength at which spectra are normalised, A.
 _VISUAL = float(np.mean(stellar.NORMALISATION_RANGE))
 
-# The colour by which stars are compared, and the stretch of IRTF spectra that is used, A.
+# Bands of the colour by which stars are compared; range of IRTF spectra that is used, and half-width of the joins, A.
 SPLICE_BANDS = ("euclid_y", "euclid_h")
 _SPLICE_FROM, _SPLICE_TO, _SPLICE_JOIN = 8_200.0, 24_000.0, 200.0
 
 
 @dataclass(frozen=True, slots=True)
 class BaselModels:
-    """wavelength float64[1221] A; teff K, log_g, metallicity float64[n]; flux float64[n, 1221] f_lambda."""
+    """Model spectra of a BaSeL file.
+
+    Attributes
+    ----------
+    wavelength : float array, shape (1221,)
+        Wavelengths in A.
+    teff : float array, shape (n,)
+        Effective temperature in K.
+    log_g, metallicity : float array, shape (n,)
+        log10 of the surface gravity in cm s-2, and [M/H].
+    flux : float array, shape (n, 1221)
+        f_lambda.
+    """
 
     wavelength: Float
     teff: Float
@@ -54,9 +62,21 @@ class BaselModels:
 
 
 def library(models: Path | None, infrared: Sequence[Path]) -> tuple[Library, Int]:
-    """The stellar library, its dwarfs of a BaSeL file and with the infrared of IRTF files where these are given.
+    """Return the stellar library with dwarfs from a BaSeL file, infrared spectra from IRTF files, or both.
 
-    returns : the library, and which infrared file each dwarf has, int64[n] (-1 = none)
+    Parameters
+    ----------
+    models : Path or None
+        BaSeL file; None for the built-in dwarfs.
+    infrared : sequence of Path
+        IRTF files; empty to leave the infrared unchanged.
+
+    Returns
+    -------
+    library : Library
+        The stellar library.
+    infrared_index : int array, shape (n,)
+        Index of the infrared file of each dwarf, -1 for none.
     """
     embedded, types = templates.stellar_library(), stellar.types()
     grid, n = embedded.wavelength, len(types.names)
@@ -70,17 +90,38 @@ def library(models: Path | None, infrared: Sequence[Path]) -> tuple[Library, Int
         model_flux, _ = splice(grid, model_flux, curves)
     flux = normalise(grid, flux)
     if models is not None:
-        # A file is of one metallicity: its dwarfs stand for the stars of any.
+        # A file has a single metallicity, so its dwarfs are used for stars of any metallicity.
         model_flux = model_stars.dwarf_spectra(flux, types)
     all_flux = np.concatenate([flux, embedded.flux[n:first], normalise(grid, model_flux)]).astype(np.float32)
     return replace(embedded, flux=all_flux, external=True), infrared_index
 
 
 def dwarf_spectra(path: Path, types: StellarTypes, grid: Float) -> Float:
-    """f_lambda of each type, float64[n, n_lambda], normalised, from the models of a BaSeL file.
+    """Return the normalised spectrum of each dwarf type from the models of a BaSeL file.
 
-    Of the metallicity nearest to the Sun's; at each model temperature the gravity nearest to the type's; in between
-    ln f is linear in 1 / T, as of black bodies.
+    Parameters
+    ----------
+    path : Path
+        BaSeL file.
+    types : StellarTypes
+        The dwarf types.
+    grid : float array, shape (n_lambda,)
+        Wavelengths in A.
+
+    Returns
+    -------
+    float array, shape (n, n_lambda)
+        f_lambda.
+
+    Raises
+    ------
+    BadInput
+        If the models do not cover the temperatures of the types, or one has no flux at 5500 A.
+
+    Notes
+    -----
+    Only models with the metallicity nearest to the Sun are used. At each model temperature, the model with the gravity
+    nearest to the type is selected. Between temperatures, ln f is linear in 1 / T, as for black bodies.
     """
     models = read_basel(path)
     solar = np.abs(models.metallicity)
@@ -100,7 +141,9 @@ def dwarf_spectra(path: Path, types: StellarTypes, grid: Float) -> Float:
     def ln_flux(k: int) -> Float:
         spectrum = resample(grid, Curve(models.wavelength, models.flux[k]))
         if not np.interp(_VISUAL, grid, spectrum) > 0.0:
-            raise BadInput(f"{path}: the model of {models.teff[k]:g} K, log g = {models.log_g[k]:g} is dark at 5500 A")
+            raise BadInput(
+                f"{path}: the model of {models.teff[k]:g} K, log g = {models.log_g[k]:g} has no flux at 5500 A"
+            )
         return np.asarray(np.log(np.maximum(normalise(grid, spectrum), np.finfo(np.float32).tiny)))
 
     out = np.empty((len(types.teff), len(grid)))
@@ -113,7 +156,7 @@ def dwarf_spectra(path: Path, types: StellarTypes, grid: Float) -> Float:
 
 
 def read_basel(path: Path) -> BaselModels:
-    """All models of a BaSeL file, lcb[mp]NN.cor."""
+    """Read all models of a BaSeL file, lcb[mp]NN.cor; raises BadInput if the file is not valid."""
     try:
         lines = user_files.read_text(path, "library of spectra").splitlines()
         wavelength, at = _read_numbers(lines, 0, _BASEL_COUNT, _BASEL_WAVELENGTH_WIDTH)
@@ -126,7 +169,7 @@ def read_basel(path: Path) -> BaselModels:
     except (ValueError, IndexError) as error:
         raise BadInput(f"{path}: cannot be read as BaSeL: {error}") from None
     if not spectra:
-        raise BadInput(f"{path}: holds no model")
+        raise BadInput(f"{path}: the file contains no model")
     angstrom = wavelength * ANGSTROM["nm"]
     for h_nu in spectra:
         check_curve(path, angstrom, h_nu, {"bounds": [1.0, 1e8], "covers": [2000.0, 20000.0], "largest_gap": 0.1})
@@ -136,10 +179,28 @@ def read_basel(path: Path) -> BaselModels:
 
 
 def splice(wavelength: Float, flux: Float, stars: Sequence[Curve]) -> tuple[Float, Int]:
-    """Low-resolution spectra float64[n, n_lambda] with the infrared of the stars that are nearest in Y - H.
+    """Replace the infrared part of spectra by the IRTF spectrum of the star with the nearest Y - H colour.
 
-    The IRTF spectrum is scaled to meet the other at both ends; the broad shape stays that of the low resolution.
-    returns : the spectra, and which star each was given, int64[n]
+    Parameters
+    ----------
+    wavelength : float array, shape (n_lambda,)
+        Wavelengths in A.
+    flux : float array, shape (n, n_lambda)
+        Low-resolution spectra.
+    stars : sequence of Curve
+        IRTF spectra.
+
+    Returns
+    -------
+    flux : float array, shape (n, n_lambda)
+        The spectra with infrared parts.
+    nearest : int array, shape (n,)
+        Index of the IRTF star of each spectrum.
+
+    Notes
+    -----
+    The IRTF spectrum is scaled to match the other at both ends. The broad shape remains that of the low-resolution
+    spectrum.
     """
     infrared = [np.interp(wavelength, star.wavelength, star.value) for star in stars]
     ends = [(max(star.wavelength[0], _SPLICE_FROM), min(star.wavelength[-1], _SPLICE_TO)) for star in stars]
@@ -163,12 +224,12 @@ def _color(bands: Sequence[Passband], wavelength: Float, flux: Float) -> float:
 
 
 def _read_numbers(lines: Sequence[str], at: int, count: int, width: int) -> tuple[Float, int]:
-    """`count` numbers of fixed width from line `at` on, and the line after them."""
+    """Return `count` numbers of fixed width from line `at` on, and the index of the next line."""
     numbers: list[float] = []
     while len(numbers) < count:
         line = lines[at].rstrip()
         numbers += [float(line[k : k + width]) for k in range(0, len(line), width)]
         at += 1
     if len(numbers) != count:
-        raise ValueError(f"line {at} holds too many numbers")
+        raise ValueError(f"line {at} contains too many numbers")
     return np.array(numbers), at

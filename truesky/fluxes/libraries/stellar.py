@@ -1,13 +1,8 @@
-"""Spectra of dwarf stars from what is published about their colours.
+"""Compute spectra of dwarf stars from published temperatures and colours.
 
-types       the mean dwarf sequence O9V .. M9V of Pecaut & Mamajek 2013: temperatures, magnitudes, colours
-spectra     a Planck spectrum a type, with absorption features, times a smooth curve that brings the colours
-planck      f_lambda of a black body
-normalised  mean f_lambda = 1 between 5450 and 5550 A
-TABLE       file of the published table; table: its columns
-matching, corrected, shape: the steps, for other kinds of stars
-
-Metal-poor stars and giants take the spectrum of the dwarf of their temperature.
+The sequence O9V to M9V is from Pecaut & Mamajek 2013. The spectrum of a type is a Planck spectrum with absorption
+features, times a smooth curve that gives the published colours. Metal-poor stars and giants use the spectrum of the
+dwarf with their temperature.
 """
 
 from __future__ import annotations
@@ -25,11 +20,11 @@ from truesky.fluxes import passbands
 from truesky.numerics import cache, matrices
 from truesky.numerics.code_fingerprints import code_key
 
-# Every spectrum of a library has mean f_lambda = 1 between these, A, so that mixtures are linear in flux.
+# Every spectrum of a library has a mean f_lambda of 1 between these wavelengths (A), so mixtures are linear in flux.
 NORMALISATION_RANGE = (5450.0, 5550.0)
 
 _FIRST, _LAST = "O9V", "M9V"
-# Passbands of the table's colours; all are tied to V.
+# Passbands of the table's colours, which are all relative to V.
 _BANDS = (
     "bessell_u",
     "bessell_b",
@@ -41,14 +36,14 @@ _BANDS = (
     "twomass_ks",
 )
 _V = _BANDS.index("bessell_v")
-# Colours are matched to this, mag; the late M dwarfs take the most passes (about 100).
+# Largest error of colours (mag), and largest number of iterations; late M dwarfs need the most (about 100).
 _TOLERANCE = 2e-7, 400
 # log10 of the Sun's surface gravity, cm s-2 (IAU 2015 nominal values).
 _LOG_G_SUN = 4.438
-# Hydrogen: Rydberg's wavelength in vacuum, A; lines of a series that are drawn.
+# Rydberg wavelength of hydrogen in vacuum (A), and number of lines of a series that are included.
 _RYDBERG = 911.763
 _SERIES_LINES = 12
-# Strength of the hydrogen features: Gaussian in ln(Teff) about A0.
+# The strength of hydrogen features is a Gaussian in ln(Teff), with its peak at type A0.
 _HYDROGEN_PEAK, _HYDROGEN_WIDTH = 9500.0, 0.3
 
 _FEATURES = Path(__file__).with_name("stellar_features.csv")
@@ -57,11 +52,26 @@ TABLE = Path(__file__).with_name("dwarf_sequence.csv")
 
 @dataclass(frozen=True, slots=True)
 class StellarTypes:
-    """The mean dwarf sequence, hottest first; all arrays float64[n], magnitudes Vega.
+    """The mean dwarf sequence, hottest first, with Vega magnitudes.
 
-    teff K, log_g of cm s-2, mass Msun, abs_mag_v (Johnson), abs_mag_j, abs_mag_h, abs_mag_ks (2MASS)
-    bolometric_h : M_bol - M_H
-    colors : m_band - m_V of each of the bands U B V R I J H Ks, float64[n, 8], NaN where unknown
+    Attributes
+    ----------
+    names : tuple of str
+        Spectral types.
+    teff : float array, shape (n,)
+        Effective temperature in K.
+    log_g : float array, shape (n,)
+        log10 of the surface gravity in cm s-2.
+    mass : float array, shape (n,)
+        Mass in solar masses.
+    abs_mag_v : float array, shape (n,)
+        Absolute magnitude in V (Johnson).
+    abs_mag_j, abs_mag_h, abs_mag_ks : float array, shape (n,)
+        Absolute magnitudes (2MASS).
+    bolometric_h : float array, shape (n,)
+        M_bol - M_H.
+    colors : float array, shape (n, 8)
+        m_band - m_V of the bands U B V R I J H Ks, NaN if unknown.
     """
 
     names: tuple[str, ...]
@@ -77,15 +87,17 @@ class StellarTypes:
 
     @property
     def color_bv(self) -> Float:
+        """Return B - V in mag."""
         return self.colors[:, 1]
 
     @property
     def v_minus_h(self) -> Float:
+        """Return V - H in mag."""
         return -self.colors[:, 6]
 
 
 def types() -> StellarTypes:
-    """The table of Pecaut & Mamajek 2013 (version 2022.04.16), O9V to M9V."""
+    """Return the types O9V to M9V of the table of Pecaut & Mamajek 2013 (version 2022.04.16)."""
     names, column = table(_FIRST, _LAST)
     bv, vk, hk = column["B-V"], column["V-Ks"], column["H-Ks"]
     h = hk - vk
@@ -105,7 +117,7 @@ def types() -> StellarTypes:
 
 
 def table(first: str, last: str) -> tuple[tuple[str, ...], dict[str, Float]]:
-    """Spectral types from `first` to `last`, and the columns of the table of dwarfs by title, NaN where unknown."""
+    """Return the spectral types from `first` to `last`, and the columns of the dwarf table by title, NaN if unknown."""
     with TABLE.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
     names = [row["SpT"] for row in rows]
@@ -117,15 +129,31 @@ def table(first: str, last: str) -> tuple[tuple[str, ...], dict[str, Float]]:
 
 
 def fingerprint() -> str:
-    """Key of everything the spectra depend on."""
+    """Return a key of everything on which the spectra depend."""
     responses = [array for name in _BANDS for array in (passbands.load(name).wavelength, passbands.load(name).response)]
     return cache.content_key(code_key(__name__), TABLE.read_bytes(), *responses)
 
 
 def spectra(stars: StellarTypes, vega_wavelength: Float, vega_flux: Float) -> Float:
-    """f_lambda of each type on the grid of passbands.grid(), float64[n, 23401], normalised.
+    """Return the normalised spectrum of each type on passbands.grid().
 
-    Error: Vega colours within 1e-6 mag of the table's, where it has them
+    Parameters
+    ----------
+    stars : StellarTypes
+        The types.
+    vega_wavelength : float array, shape (m,)
+        Wavelengths of Vega's spectrum in A.
+    vega_flux : float array, shape (m,)
+        Vega's f_lambda in erg s-1 cm-2 A-1.
+
+    Returns
+    -------
+    float array, shape (n, 23401)
+        f_lambda with mean 1 between 5450 and 5550 A.
+
+    Notes
+    -----
+    Vega colours are within 1e-6 mag of the table, if the table has them.
     """
     grid = passbands.grid()
     bands = [passbands.load(name) for name in _BANDS]
@@ -142,22 +170,22 @@ def spectra(stars: StellarTypes, vega_wavelength: Float, vega_flux: Float) -> Fl
 
 
 def planck(wavelength: Float, temperature: float) -> Float:
-    """Planck's f_lambda, 1 at 5500 A; wavelength A, temperature K."""
+    """Return Planck's f_lambda, normalised to 1 at 5500 A, for wavelengths in A and a temperature in K."""
     middle = float(np.mean(NORMALISATION_RANGE))
     scale = PLANCK_ERG_S * LIGHT_ANGSTROM_S / (BOLTZMANN_ERG_K * temperature)
     at, reference = scale / wavelength, scale / middle
-    # exp(-x) / (1 - exp(-x)), not 1 / (exp(x) - 1), which overflows in the far ultraviolet of cool stars.
+    # Use exp(-x) / (1 - exp(-x)), because 1 / (exp(x) - 1) overflows in the far ultraviolet of cool stars.
     return np.asarray((middle / wavelength) ** 5 * np.exp(reference - at) * np.expm1(-reference) / np.expm1(-at))
 
 
 def normalise(wavelength: Float, flux: Float) -> Float:
-    """flux [..., n_lambda] divided by its mean between 5450 and 5550 A."""
+    """Return spectra, shape (..., n_lambda), divided by their mean between 5450 and 5550 A."""
     inside = (wavelength >= NORMALISATION_RANGE[0]) & (wavelength <= NORMALISATION_RANGE[1])
     return np.asarray(flux / flux[..., inside].mean(-1, keepdims=True))
 
 
 def _match_colors(log_wavelength: Float, start: Float, response: Float, pivots: Float, colors: Float) -> Float:
-    """`start` times 10^(-0.4 c) with the wanted colours; c is cubic between the pivots, constant outside."""
+    """Return `start` times 10^(-0.4 c) with the given colours; c is cubic between the pivots and constant outside."""
     has_color = np.isfinite(colors)
     at, v = pivots[has_color], int(np.sum(has_color[:_V]))
     correction = color_correction(log_wavelength, start, response[:, has_color], at, colors[has_color], v, _TOLERANCE)
@@ -174,12 +202,31 @@ def color_correction(
     tolerance: tuple[float, int],
     first: Float | None = None,
 ) -> Float:
-    """The correction at the pivots, mag, that brings the colours m_band - m_(band `tied`); see `corrected`.
+    """Return the correction at the pivots that gives a spectrum the colours m_band - m_reference.
 
-    response : float64[n_lambda, n_band] f_nu = f_lambda @ response;  first : where to begin
-    until    : (largest error of a colour, mag; steps), whichever is reached first
-    log_wavelength : float64[n_lambda];  start : f_lambda there, before the correction
-    pivots, colors : float64[n_band] log wavelengths of the correction, and the colours that are wanted, mag
+    Parameters
+    ----------
+    log_wavelength : float array, shape (n_lambda,)
+        ln(wavelength / A).
+    start : float array, shape (n_lambda,)
+        f_lambda before the correction.
+    response : float array, shape (n_lambda, n_band)
+        Weights of the bands: f_nu = f_lambda @ response.
+    pivots : float array, shape (n_band,)
+        ln of the pivot wavelengths at which the correction is defined.
+    colors : float array, shape (n_band,)
+        Required colours in mag.
+    reference : int
+        Index of the reference band.
+    tolerance : (float, int)
+        Largest error of a colour in mag, and largest number of iterations; the first that is reached ends the search.
+    first : float array, shape (n_band,), optional
+        Correction at which to begin; 0 by default.
+
+    Returns
+    -------
+    float array, shape (n_band,)
+        Correction in mag, see `apply_correction`.
     """
     correction = np.zeros(len(pivots)) if first is None else first
     for _ in range(tolerance[1]):
@@ -193,9 +240,23 @@ def color_correction(
 
 
 def apply_correction(log_wavelength: Float, start: Float, pivots: Float, correction: Float) -> Float:
-    """`start` times 10^(-0.4 c): c is the correction, cubic between the pivots, constant outside.
+    """Return a spectrum times 10^(-0.4 c), with the correction c cubic between the pivots and constant outside.
 
-    log_wavelength, start : float64[n_lambda];  pivots, correction : float64[n_band] log wavelengths and mag there
+    Parameters
+    ----------
+    log_wavelength : float array, shape (n_lambda,)
+        ln(wavelength / A).
+    start : float array, shape (n_lambda,)
+        f_lambda before the correction.
+    pivots : float array, shape (n_band,)
+        ln of the pivot wavelengths.
+    correction : float array, shape (n_band,)
+        Correction at the pivots in mag.
+
+    Returns
+    -------
+    float array, shape (n_lambda,)
+        f_lambda after the correction.
     """
     from scipy.interpolate import PchipInterpolator
 
@@ -204,7 +265,10 @@ def apply_correction(log_wavelength: Float, start: Float, pivots: Float, correct
 
 
 def feature_transmission(wavelength: Float, teff: float) -> Float:
-    """Transmission of the features (stellar_features.csv) at a temperature: texture, colours come after."""
+    """Return the transmission of the absorption features (stellar_features.csv) at a temperature in K.
+
+    The features give texture only; colours are corrected afterwards.
+    """
     transmission = np.ones_like(wavelength)
     hydrogen = np.exp(-0.5 * (np.log(teff / _HYDROGEN_PEAK) / _HYDROGEN_WIDTH) ** 2)
     with _FEATURES.open(newline="", encoding="utf-8") as file:
@@ -220,10 +284,28 @@ def feature_transmission(wavelength: Float, teff: float) -> Float:
 
 
 def feature_profile(kind: str, wavelength: Float, centre: float, width: float) -> Float:
-    """Shape with peak 1: line, band shaded to the red, edge, or hydrogen series (centre = lower level).
+    """Return the profile of an absorption feature with peak 1.
 
-    kind       : line, band, edge or series
-    wavelength : float64[n_lambda] A;  centre, width : A
+    Parameters
+    ----------
+    kind : str
+        "line", "band" (shaded to the red), "edge" or "series" (of hydrogen).
+    wavelength : float array, shape (n_lambda,)
+        Wavelengths in A.
+    centre : float
+        Wavelength of the feature in A; for a series, the lower level.
+    width : float
+        Width in A.
+
+    Returns
+    -------
+    float array, shape (n_lambda,)
+        Profile.
+
+    Raises
+    ------
+    BadInput
+        If the kind is unknown.
     """
     if kind == "line":
         return np.asarray(np.exp(-0.5 * ((wavelength - centre) / width) ** 2))

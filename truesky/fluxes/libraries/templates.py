@@ -1,12 +1,8 @@
-"""The embedded libraries of spectra: 31 galaxies, and the stars.
+"""Load the built-in libraries of spectra: 31 galaxies, and the stars.
 
-galaxy_library     early to late, mixed from the four spectra of Coleman, Wu & Weedman 1980 and a young burst
-stellar_library    O9 to T8, shaped until their colours are those of Pecaut & Mamajek 2013, standards, and models by
-                   temperature, gravity and metallicity;  first_model : where these begin
-GALAXY_LIBRARY_SIZE, rest_grid, emission_wavelengths
-anchors_of, spectrum_file   what they are made of
-
-Both are made once (seconds), kept in the cache, and afterwards mapped from disc.
+Galaxies are mixtures of the four spectra of Coleman, Wu & Weedman 1980 and of a young burst. Stars are dwarfs from O9
+to T8 with the colours of Pecaut & Mamajek 2013, calibration sources, and models by temperature, gravity and
+metallicity. Both libraries take seconds to compute, and are then memory-mapped from the cache.
 """
 
 from __future__ import annotations
@@ -26,9 +22,9 @@ from truesky.numerics import cache
 from truesky.numerics.code_fingerprints import code_key
 
 _ANCHORS = ("E", "Sbc", "Scd", "Im")
-# The published spectra end at 22050 A.
+# Exponent of f_lambda beyond 22050 A, where the published spectra end.
 _INFRARED_SLOPE = -3.2
-# The weak lines in the observed spectra are bridged by a straight line this far on both sides.
+# A straight line replaces weak lines in the observed spectra within this distance on both sides, A.
 _LINE_MASK = 40.0
 
 # The sequence: first and last template k, earlier and later anchor, offset, denominator and factor of
@@ -49,15 +45,24 @@ _BALMER_EDGE, _LYMAN_EDGE, _BELOW_LYMAN = 3646.0, 912.0, 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Library:
-    """Template spectra, all on one grid; never changed, and the same only as itself.
+    """Template spectra on a common wavelength grid. Libraries are immutable and compared by identity.
 
-    wavelength : float64[n_lambda] A, whole numbers in steps of 1
-    flux       : float32[n, n_lambda] f_lambda, mean 1 between 5450 and 5550 A
-    names      : n labels
-    types      : what is known of the first stars, the dwarf sequence; None for galaxies
-    dust       : float32[5, n_lambda] k(lambda) of the laws in front of galaxies, None = those of extinction.laws
-    own        : read from external files: what was measured of the embedded one says nothing about it
-    intergalactic : what is between the galaxies absorbs (truesky.fluxes.spectra.intergalactic)
+    Attributes
+    ----------
+    wavelength : float array, shape (n_lambda,)
+        Wavelengths in A, whole numbers in steps of 1.
+    flux : float32 array, shape (n, n_lambda)
+        f_lambda with mean 1 between 5450 and 5550 A.
+    names : tuple of str
+        Label of each template.
+    types : stellar.StellarTypes, optional
+        Properties of the dwarf sequence, the first stars of the library; None for galaxies.
+    dust : float32 array, shape (5, n_lambda), optional
+        k(lambda) of the extinction laws in galaxies; None for those of extinction.laws.
+    external : bool
+        True if the library is from external files. Errors measured for the built-in library do not apply to it.
+    intergalactic : bool
+        True if intergalactic hydrogen absorbs (truesky.fluxes.spectra.intergalactic).
     """
 
     wavelength: Float
@@ -74,7 +79,7 @@ class Library:
 
 @lru_cache(maxsize=1)
 def galaxy_library() -> Library:
-    """The 31 galaxy templates, from 0, elliptical, to 30, starburst; 80 .. 24500 A, rest frame."""
+    """Return the 31 galaxy templates, from 0 (elliptical) to 30 (starburst), at 80 to 24500 A in the rest frame."""
     key = cache.content_key(
         code_key(__name__),
         emission_wavelengths(),
@@ -89,15 +94,19 @@ def galaxy_library() -> Library:
 
 
 def template_anchors(template: int) -> tuple[str, str]:
-    """Names of the two spectra that a galaxy template is mixed of."""
+    """Return the names of the two spectra of which a galaxy template is a mixture."""
     row = next(row for row in _SEQUENCE if row[0] <= template <= row[1])
     return row[2], row[3]
 
 
 @lru_cache(maxsize=1)
 def stellar_library() -> Library:
-    """On the observed grid: 0 .. 75 the dwarfs O9V .. M9V, hottest first (with their table of types), 76 .. 440 the L
-    and T dwarfs, 441 .. 443 Vega, a white dwarf, a planetary nebula, from 444 the models of model_stars.
+    """Return the stellar library on the observed-frame grid.
+
+    Notes
+    -----
+    Templates 0 to 75 are the dwarfs O9V to M9V, hottest first, with their table of types. Templates 76 to 440 are the L
+    and T dwarfs, 441 to 443 Vega, a white dwarf and a planetary nebula. The models of model_stars begin at 444.
     """
     types = stellar.types()
     names = (*types.names, *brown_dwarfs.template_names(), *standards.NAMES, *model_stars.names())
@@ -108,7 +117,7 @@ def stellar_library() -> Library:
 
 
 def first_model() -> int:
-    """Index of the first of model_stars in the stellar library."""
+    """Return the index of the first model of model_stars in the stellar library."""
     return len(stellar.types().names) + brown_dwarfs.COUNT + len(standards.NAMES)
 
 
@@ -119,15 +128,25 @@ def _star_spectra(types: stellar.StellarTypes) -> Float32:
 
 
 def emission_wavelengths() -> Float:
-    """Vacuum wavelengths of the lines that the observed spectra show and are freed of, float64[10] A (lines.csv)."""
+    """Return vacuum wavelengths in A of the lines to remove from the observed spectra, float64[10] (lines.csv)."""
     with (files("truesky.fluxes.spectra") / "lines.csv").open(encoding="utf-8") as file:
         return np.array([float(row["vacuum"]) for row in csv.DictReader(file) if int(row["bridged"])])
 
 
 def galaxy_spectra(wavelength: Float, bridge_width: float = _LINE_MASK) -> Float:
-    """f_lambda of the sequence, float64[31, n_lambda].
+    """Return the spectra of the galaxy templates.
 
-    bridged : a straight line stands in place of the spectrum so far about each emission line, A; < 0 = nowhere
+    Parameters
+    ----------
+    wavelength : float array, shape (n_lambda,)
+        Wavelengths in A.
+    bridge_width : float, optional
+        Distance in A from each emission line within which a straight line replaces the spectrum; below 0 for none.
+
+    Returns
+    -------
+    float array, shape (31, n_lambda)
+        f_lambda.
     """
     anchors = {name: _anchor_spectrum(name, wavelength, bridge_width) for name in _ANCHORS}
     anchors[YOUNG] = _young_spectrum(wavelength)
@@ -142,7 +161,7 @@ def galaxy_spectra(wavelength: Float, bridge_width: float = _LINE_MASK) -> Float
 def _anchor_spectrum(name: str, wavelength: Float, bridge_width: float) -> Float:
     table = np.loadtxt(vega.spectrum_file(f"CWW_{name}_ext.sed").read_text().splitlines())
     at, flux = table[:, 0], table[:, 1]
-    # In the logarithm: the ultraviolet is sampled every 100 A, over which an elliptical fades by half.
+    # Interpolate the logarithm, since an elliptical fades by half between the samples in the ultraviolet, 100 A apart.
     sampled = np.exp(np.interp(wavelength, at, np.log(flux), left=-np.inf))
     sampled = np.where(wavelength > at[-1], flux[-1] * (wavelength / at[-1]) ** _INFRARED_SLOPE, sampled)
     line_free = (np.abs(wavelength[:, None] - emission_wavelengths()) > bridge_width).all(1)

@@ -1,7 +1,7 @@
-"""What an external table in text may have, counted before astropy makes room for any of it.
+"""Check the size of an external text table before astropy allocates memory for it.
 
-Words of a column get as much room each as the longest of them, a header is read as YAML, which is slow and can name
-types of any size, and words in quotes may go over lines.
+Astropy allocates memory for each word of a column as for the longest word. It reads a header as YAML, which is slow and
+can define types of any size. Words in quotes may span several lines.
 """
 
 from __future__ import annotations
@@ -12,20 +12,32 @@ from itertools import takewhile
 
 import yaml
 
-# Characters of a line, of a header, and of all words, were each as long as the longest line.
+# Largest number of characters in a line, in a header, and in all words if each is as long as the longest line.
 _MAX_LINE_LENGTH, _MAX_HEADER_LENGTH, _MAX_CHARACTERS = 4096, 64 << 10, 64 << 20
-# What ECSV names, and no type of numpy's besides: 9999999D is one, of 80 MB a row.
+# Only the types of ECSV are allowed, since NumPy also accepts types such as 9999999D with 80 MB per row.
 _DATATYPES = {"bool", "string"} | {
     f"{kind}{bits}" for kind in ("int", "uint", "float") for bits in (8, 16, 32, 64, 128)
 }
-# What astropy writes of a column with a unit; of its other tags some make arrays of any shape.
+# Tags that astropy writes for columns with units. Other tags can define arrays of any shape.
 _TAGS = ("tag:yaml.org,2002:", "!astropy.units.", "!astropy.table.SerializedColumn")
 
 
 def refuse_large(lines: Sequence[str], has_header: bool) -> None:
-    """Errors : ValueError says what the lines have that no curve needs; yaml.YAMLError where a header is none.
+    """Check that lines contain no more than a curve needs.
 
-    has_header : in YAML, as ECSV has it
+    Parameters
+    ----------
+    lines : sequence of str
+        Lines of the file.
+    has_header : bool
+        True if the file has a YAML header, as in ECSV.
+
+    Raises
+    ------
+    ValueError
+        If a line, the header or the table is too large, or the header contains other types than a curve needs.
+    yaml.YAMLError
+        If the header is not valid YAML.
     """
     if max(map(len, lines), default=0) > _MAX_LINE_LENGTH:
         raise ValueError(f"a line has more than {_MAX_LINE_LENGTH} characters")
@@ -33,10 +45,10 @@ def refuse_large(lines: Sequence[str], has_header: bool) -> None:
     _refuse_header([line.strip()[1:] for line in header])
     rows = lines[len(header) :]
     if any(line.count('"') % 2 for line in rows):
-        raise ValueError("a text in quotes goes over more than one line")
+        raise ValueError("a text in quotes must not span more than one line")
     columns = 1 + max((line.count(",") + line.count(" ") + line.count("\t") for line in rows), default=0)
     if len(rows) * columns * max(map(len, rows), default=0) > _MAX_CHARACTERS:
-        raise ValueError(f"{len(rows)} rows of {columns} words are too many where one is as long as its longest line")
+        raise ValueError(f"{len(rows)} rows of {columns} words are too many for the length of the longest line")
 
 
 def _is_header(line: str) -> bool:
@@ -49,12 +61,12 @@ def _refuse_header(lines: Sequence[str]) -> None:
     previous = None
     for event in yaml.parse(textwrap.dedent("\n".join(lines)), Loader=yaml.SafeLoader):
         if getattr(event, "anchor", None) is not None:
-            raise ValueError(f"{event.anchor[:40]!r} in its header refers to another place of it")
+            raise ValueError(f"{event.anchor[:40]!r} in its header must not be a reference")
         if not (getattr(event, "tag", None) or _TAGS[0]).startswith(_TAGS):
-            raise ValueError(f"{event.tag[:40]!r} in its header is no type of a curve's")
+            raise ValueError(f"{event.tag[:40]!r} in its header is not an allowed type of a curve")
         word = getattr(event, "value", None)
         if word == "subtype":
-            raise ValueError("a curve's columns are numbers, none has a subtype")
+            raise ValueError("columns of a curve must be numbers without subtype")
         if previous == "datatype" and word is not None and word not in _DATATYPES:
-            raise ValueError(f"{word[:40]!r} is no datatype of ECSV")
+            raise ValueError(f"{word[:40]!r} is not a datatype of ECSV")
         previous = word

@@ -1,8 +1,4 @@
-"""Vega: its spectrum, and magnitudes relative to it.
-
-vega_magnitude   AB magnitude of Vega;  vega_magnitudes : in many bands, wherever its spectrum reaches
-vega             the spectrum of Vega, for magnitudes that are not AB
-"""
+"""Load the spectrum of Vega, and compute magnitudes relative to it."""
 
 from __future__ import annotations
 
@@ -21,15 +17,15 @@ from truesky.fluxes.passbands import Passband
 
 
 def vega_magnitude(band: Passband) -> float:
-    """AB magnitude of Vega: m_AB = m_Vega + this (2MASS J 0.9001, H 1.3753, Ks 1.8474).
+    """Return the AB magnitude of Vega in a band, so that m_AB = m_Vega + result (2MASS J 0.9001, H 1.3753, Ks 1.8474).
 
-    Photons are counted, as for all fluxes: were it energy, H would be 1.3718.
+    Photons are counted, as for all fluxes. With energy instead, H would be 1.3718.
     """
     return _magnitude(band, *vega())
 
 
 def vega_magnitudes(bands: Sequence[Passband]) -> list[float | None]:
-    """The same of each band, None where Vega's spectrum does not reach over it."""
+    """Return the AB magnitude of Vega in each band, or None if Vega's spectrum does not cover the band."""
     wavelength, flux = vega()
     return [
         _magnitude(band, wavelength, flux)
@@ -43,14 +39,16 @@ def _magnitude(band: Passband, wavelength: Float, flux: Float) -> float:
     return float(units.mag_of_f_nu(units.ujy_of_cgs(passbands.ab_flux(band, wavelength, flux))))
 
 
-# Vega's Rayleigh-Jeans tail beyond the end of the CALSPEC extract, 22008 A.
+# Exponent of Vega's f_lambda (Rayleigh-Jeans tail) beyond the end of the CALSPEC extract at 22008 A.
 _VEGA_SLOPE = -3.95
 
 
 def vega() -> tuple[Float, Float]:
-    """Vega: wavelength A and f_lambda erg s-1 cm-2 A-1, 900 .. 24500 A.
+    """Return wavelengths (A) and f_lambda (erg s-1 cm-2 A-1) of Vega from 900 to 24500 A.
 
-    Ref: CALSPEC alpha_lyr_mod_001, as shipped by GalSim
+    References
+    ----------
+    CALSPEC alpha_lyr_mod_001, as distributed with GalSim.
     """
     table = np.loadtxt(spectrum_file("vega.txt").read_text().splitlines())
     # The file is in nm and per nm.
@@ -60,8 +58,8 @@ def vega() -> tuple[Float, Float]:
 
 
 def spectrum_file(name: str) -> Path:
-    """A spectrum that GalSim ships; GalSim itself, slow to import, is not loaded."""
+    """Return the path of a spectrum of GalSim, without its slow import; raises BadInput if it is not installed."""
     spec = importlib.util.find_spec("galsim")
     if spec is None or not spec.submodule_search_locations:
-        raise BadInput("GalSim is not installed: its spectra of galaxies and Vega are needed")
+        raise BadInput("package GalSim is not installed: its spectra of galaxies and Vega are required")
     return Path(spec.submodule_search_locations[0]) / "share" / "SEDs" / name

@@ -1,8 +1,8 @@
-"""What an external VOTable may have, counted before astropy makes room for any of it.
+"""Check the size of an external VOTable before astropy allocates memory for it.
 
-An XML parser that keeps nothing goes over the text first. Refused is what takes astropy a square of the time (tables,
-columns of one name), what it makes room for at once (arrays of a fixed size in every row), and what it would unpack or
-look for elsewhere.
+A streaming XML parser reads the text first. It refuses tables for which astropy needs quadratic time (many tables, or
+columns with the same name), large allocations (arrays of fixed size in every row), and data that astropy would unpack
+or load from elsewhere.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import re
 from collections.abc import Mapping
 from xml.parsers import expat
 
-# Elements beside those of rows, elements within one another, characters of an attribute, numbers in a cell and in all
-# rows. A passband has some 50 elements, two columns and at most some ten thousand rows.
+# Largest number of elements outside rows, of nested elements, of characters in an attribute, of numbers in a cell and
+# of numbers in all rows. A passband has about 50 elements, two columns and up to about ten thousand rows.
 _MAX_ELEMENTS, _MAX_DEPTH, _MAX_ATTRIBUTE_LENGTH, _MAX_CELL_SIZE, _MAX_NUMBERS = 1000, 32, 1000, 999, 4_000_000
 _ENCODINGS = {None, "utf-8", "us-ascii"}
 _OTHER_SERIALISATIONS = {"BINARY", "BINARY2", "FITS", "STREAM", "PARQUET"}
@@ -21,7 +21,7 @@ _ROWS = {"TR", "TD"}
 
 
 class _SizeCounter:
-    """The handlers of a pass over a VOTable."""
+    """Handlers of the XML parser that count elements, rows and numbers."""
 
     def __init__(self) -> None:
         self.depth = self.elements = self.rows = self.row_size = 0
@@ -32,11 +32,11 @@ class _SizeCounter:
         self.elements += name not in _ROWS
         self.rows += name == "TR"
         if self.elements > _MAX_ELEMENTS:
-            raise ValueError(f"has more than {_MAX_ELEMENTS} elements beside its rows")
+            raise ValueError(f"has more than {_MAX_ELEMENTS} elements outside its rows")
         if self.depth > _MAX_DEPTH:
-            raise ValueError(f"has more than {_MAX_DEPTH} elements within one another")
+            raise ValueError(f"has more than {_MAX_DEPTH} nested elements")
         if name in _OTHER_SERIALISATIONS or "encoding" in attributes:
-            raise ValueError("has rows that are no plain TABLEDATA")
+            raise ValueError("has rows that are not plain TABLEDATA")
         for key, value in attributes.items():
             if len(value) > _MAX_ATTRIBUTE_LENGTH:
                 raise ValueError(f"an attribute of {name} has more than {_MAX_ATTRIBUTE_LENGTH} characters")
@@ -52,13 +52,13 @@ class _SizeCounter:
 
 
 def _cell_size(text: str) -> int:
-    """Numbers that a cell of that size has room for: 6 for "2x3"; what may be of any length counts as 1."""
+    """Return the number of values in a cell of an array size, for example 6 for "2x3"; variable lengths count as 1."""
     return math.prod(map(int, re.findall(r"\d+", text)))
 
 
 def _check_declaration(version: str, encoding: str | None, standalone: int) -> None:
     if encoding is not None and encoding.lower() not in _ENCODINGS:
-        raise ValueError(f"is said to be in {encoding[:40]!r}, not in UTF-8")
+        raise ValueError(f"has encoding {encoding[:40]!r}: it must be UTF-8")
 
 
 def _refuse_doctype(*_: object) -> None:
@@ -66,7 +66,15 @@ def _refuse_doctype(*_: object) -> None:
 
 
 def refuse_large(text: str) -> None:
-    """Errors : ValueError says what a VOTable has that no curve needs; expat.ExpatError where it is no XML."""
+    """Check that a VOTable contains no more than a curve needs.
+
+    Raises
+    ------
+    ValueError
+        If the table is too large or has a feature that a curve does not need.
+    expat.ExpatError
+        If the text is not XML.
+    """
     counter = _SizeCounter()
     parser = expat.ParserCreate("utf-8")
     parser.StartElementHandler, parser.EndElementHandler = counter.start, counter.end

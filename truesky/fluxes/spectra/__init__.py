@@ -1,1 +1,1 @@
-"""What is done to a spectrum between its source and the telescope."""
+"""Model the effects on a spectrum between its source and the telescope."""

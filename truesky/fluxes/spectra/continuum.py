@@ -1,12 +1,9 @@
-"""The continuum of galaxies: two templates, each behind its own dust, mixed and redshifted.
+"""Compute the continuum of galaxies: two templates, each behind dust, mixed and redshifted.
 
-Mix, mix_of         what shapes the continuum of n galaxies
-rest_flux           f_nu of one component in the rest frame, after its dust
-amplitudes          what each component is multiplied by
-observed_shape      combined, extinguished, redshifted f_lambda on any stretch of whole angstroms
-
-Ref: Serrano et al. 2024, appendix B. There two templates share one law and one E(B-V); here each component
-has its own, and is normalised in the 0.1r band behind it.
+References
+----------
+Serrano et al. 2024, appendix B. There, both templates have the same extinction law and E(B-V). Here, each component has
+a law and E(B-V), and is normalised in the 0.1r band behind its dust.
 """
 
 from __future__ import annotations
@@ -33,11 +30,20 @@ EBV_MAX = 3.0
 
 @dataclass(frozen=True, slots=True)
 class TemplateMix:
-    """Two components of n galaxies.
+    """Two components of each of n galaxies.
 
-    z_obs     : float64[n]
-    sed, law  : int64[2, n] template index, extinction law code
-    frac, ebv : float64[2, n] share of the rest-frame 0.1r flux after dust, E(B-V)
+    Attributes
+    ----------
+    z_obs : float array, shape (n,)
+        Observed redshift.
+    sed : int array, shape (2, n)
+        Index of the template.
+    law : int array, shape (2, n)
+        Code of the extinction law.
+    frac : float array, shape (2, n)
+        Fraction of the rest-frame 0.1r flux after dust.
+    ebv : float array, shape (2, n)
+        E(B-V) in mag.
     """
 
     z_obs: Float
@@ -50,6 +56,7 @@ class TemplateMix:
         return len(self.z_obs)
 
     def select(self, indices: Int | slice) -> TemplateMix:
+        """Return the galaxies with these indices."""
         return TemplateMix(
             take_last_axis(self.z_obs, indices),
             take_last_axis(self.sed, indices),
@@ -63,19 +70,36 @@ _Array = TypeVar("_Array", Float, Int)
 
 
 def take_last_axis(values: _Array, indices: Int | slice) -> _Array:
-    """values[..., chosen]; by `take`, which is twice as fast as indexing."""
+    """Return values[..., indices] with `take`, which is twice as fast as indexing."""
     return values[..., indices] if isinstance(indices, slice) else np.take(values, indices, -1)
 
 
 def dust_curves(library: Library) -> Float32:
-    """k(lambda) of the five laws on the grid of a library, float32[5, n_lambda]."""
+    """Return k(lambda) of the five laws on the grid of a library, float32[5, n_lambda]."""
     return extinction.laws(library.wavelength).astype(np.float32) if library.dust is None else library.dust
 
 
 def mix_from_columns(columns: Mapping[str, npt.ArrayLike], library: Library) -> TemplateMix:
-    """Checked Mix from the columns z_obs, sed_k, frac_k, ext_law_k, ebv_k (k = 1, 2) of the table `galaxies`.
+    """Check columns of the table `galaxies` and return the components.
 
-    Errors: BadInput for a missing column or NaN; OutOfRange names the column
+    Parameters
+    ----------
+    columns : mapping of str to array
+        Columns z_obs, sed_k, frac_k, ext_law_k, ebv_k (k = 1, 2).
+    library : Library
+        Templates to which sed_1 and sed_2 refer.
+
+    Returns
+    -------
+    TemplateMix
+        The components.
+
+    Raises
+    ------
+    BadInput
+        If a column is missing, or frac_1 and frac_2 are both 0.
+    OutOfRange
+        If a value is out of range or NaN. The message names the column.
     """
     required = ["z_obs", *(f"{name}_{k}" for name in ("sed", "frac", "ext_law", "ebv") for k in COMPONENTS)]
     if absent := [name for name in required if name not in columns]:
@@ -100,9 +124,21 @@ def mix_from_columns(columns: Mapping[str, npt.ArrayLike], library: Library) -> 
 
 
 def check_range(name: str, values: Float, lo: float, hi: float) -> None:
-    """OutOfRange for the first value outside [lo, hi]; NaN is outside.
+    """Check that all values are in a range.
 
-    name : in the refusal;  values : float64[...]
+    Parameters
+    ----------
+    name : str
+        Name of the column for the message.
+    values : float array
+        Values.
+    lo, hi : float
+        Limits, both allowed.
+
+    Raises
+    ------
+    OutOfRange
+        If a value is outside [lo, hi] or NaN. The message has the first one.
     """
     bad = ~((values >= lo) & (values <= hi))
     if bad.any():
@@ -110,24 +146,54 @@ def check_range(name: str, values: Float, lo: float, hi: float) -> None:
 
 
 def rest_flux(sed: Int, law: Int, ebv: Float, band: Passband, library: Library, dust: Float32) -> Float:
-    """Band-averaged f_nu of templates behind dust, at z = 0: float64[n], in units of the library.
+    """Return the band-averaged f_nu of templates behind dust at z = 0.
 
-    sed, law : int64[n] template and extinction law;  ebv : float64[n] E(B-V), mag
-    band     : passband;  library : templates;  dust : float32[law, n_lambda] curve of each law
+    Parameters
+    ----------
+    sed : int array, shape (n,)
+        Indices of the templates.
+    law : int array, shape (n,)
+        Codes of the extinction laws.
+    ebv : float array, shape (n,)
+        E(B-V) in mag.
+    band : Passband
+        The passband.
+    library : Library
+        Templates.
+    dust : float32 array, shape (n_law, n_lambda)
+        k(lambda) of each law.
+
+    Returns
+    -------
+    float array, shape (n,)
+        f_nu in units of the library.
     """
     first = int(band.wavelength[0] - library.wavelength[0])
     stretch = slice(first, first + len(band.wavelength))
     ebv32 = ebv.astype(np.float32)[:, None]
     spectra = library.flux[:, stretch][sed] * extinction.transmission(dust[:, stretch][law], ebv32)
-    # Summed in double precision: the rounding then averages out, and no sum depends on its neighbours.
+    # Sum in double precision, so that rounding errors average out and no sum depends on neighbouring rows.
     return np.asarray(matrices.matmul(spectra, passbands.weights(band)))
 
 
 def amplitudes(mix: TemplateMix, band: Passband, library: Library, dust: Float32) -> Float:
-    """float64[2, n]: frac / rest-frame f_nu of each component in the reference band.
+    """Return the factor of each component, its fraction over its rest-frame f_nu in the reference band.
 
-    mix  : components of n galaxies;  band : passband
-    library, dust : as of `rest_flux`
+    Parameters
+    ----------
+    mix : TemplateMix
+        Components of n galaxies.
+    band : Passband
+        Reference band.
+    library : Library
+        Templates.
+    dust : float32 array, shape (n_law, n_lambda)
+        k(lambda) of each law.
+
+    Returns
+    -------
+    float array, shape (2, n)
+        Factors.
     """
     return np.stack(
         [
@@ -140,20 +206,41 @@ def amplitudes(mix: TemplateMix, band: Passband, library: Library, dust: Float32
 def observed_shape(
     mix: TemplateMix, amplitude: Float, library: Library, dust: Float32, first: int, count: int
 ) -> Float32:
-    """f_lambda in the observed frame at `count` whole angstroms from `first`: float32[n, count].
+    """Return the combined, extinguished and redshifted continuum on whole angstroms of the observed frame.
 
-    amplitude : float64[2, n] factor of each component
-    Combined and extinguished on the library's grid; then wavelengths times (1 + z), flux divided by (1 + z),
-    and linear interpolation onto the observed grid, behind what is between the galaxies where the library says so.
-    mix       : components of n galaxies;  library, dust : as of `rest_flux`
+    Parameters
+    ----------
+    mix : TemplateMix
+        Components of n galaxies.
+    amplitude : float array, shape (2, n)
+        Factor of each component.
+    library : Library
+        Templates.
+    dust : float32 array, shape (n_law, n_lambda)
+        k(lambda) of each law.
+    first : int
+        First observed wavelength in A.
+    count : int
+        Number of wavelengths in steps of 1 A.
+
+    Returns
+    -------
+    float32 array, shape (n, count)
+        f_lambda in the observed frame, before scaling.
+
+    Notes
+    -----
+    Components are combined and extinguished on the library's grid. Wavelengths are then multiplied by (1 + z), the flux
+    is divided by (1 + z), and the result is interpolated linearly to the observed grid. If the library has
+    intergalactic absorption, it is applied.
     """
     shrink = 1.0 / (1.0 + mix.z_obs)
     start = first * shrink - library.wavelength[0]
     first_index = np.floor(start).astype(np.int64)
-    # One sample more than the last one needs, to interpolate to.
+    # Interpolation needs one sample beyond the last.
     width = int(np.max(np.floor(start + (count - 1) * shrink).astype(np.int64) - first_index)) + 2
     rest = _rest_shape(mix, (amplitude * shrink).astype(np.float32), library, dust, first_index, width)
-    # Positions in double precision: 24000 A times the single-precision step would be off by 1e-3 A.
+    # Positions need double precision: 24000 A times the single-precision step would be wrong by 1e-3 A.
     position = shrink[:, None] * np.arange(float(count))
     position += (start - first_index + width * np.arange(len(mix)))[:, None]
     floor = np.floor(position)
@@ -161,7 +248,7 @@ def observed_shape(
     position -= floor
     steps = np.empty_like(rest)
     np.subtract(rest[:, 1:], rest[:, :-1], out=steps[:, :-1])
-    # mode="clip" only because it is twice as fast as the checked one: the indices are inside by construction.
+    # mode="clip" is twice as fast as the checked mode. All indices are valid by construction.
     shape = steps.ravel().take(index, mode="clip")
     shape *= position.astype(np.float32)
     shape += rest.ravel().take(index, mode="clip")
@@ -173,7 +260,7 @@ def observed_shape(
 def _rest_shape(
     mix: TemplateMix, amplitude: Float32, library: Library, dust: Float32, start: Int, width: int
 ) -> Float32:
-    """Combined and extinguished on `width` samples of the library's grid from `start`: float32[n, width]."""
+    """Return combined, extinguished spectra on `width` points of the library's grid from `start`: float32[n, width]."""
     shared = bool((mix.law[0] == mix.law[1]).all() and (mix.ebv[0] == mix.ebv[1]).all())
     total = _windows(library.flux, mix.sed[0], start, width)
     total *= amplitude[0][:, None]
@@ -196,7 +283,7 @@ def _transmission(mix: TemplateMix, component: int, dust: Float32, start: Int, w
 
 
 def _windows(table: Float32, row: Int, start: Int, width: int) -> Float32:
-    """table[row[i], start[i] : start[i] + width] for every i; copying slices is faster than indexing."""
+    """Return table[row[i], start[i] : start[i] + width] for every i; copies of slices are faster than indexing."""
     out = np.zeros((len(row), width), np.float32)
     for i, (r, s) in enumerate(zip(row.tolist(), start.tolist(), strict=True)):
         window = table[r, s : s + width]

@@ -1,11 +1,11 @@
-"""What hydrogen between the galaxies lets through: the mean of many lines of sight.
-
-transmission   at observed wavelengths, of sources at redshifts
-sees           whether a band sees any of it
+"""Compute the mean transmission of intergalactic hydrogen over many lines of sight.
 
 Two populations of clouds absorb: the Lyman alpha forest and damped systems. Each absorbs in the lines of the Lyman
-series, at the cloud's own redshift, and in the continuum beyond the Lyman limit.
-Ref: Inoue et al. 2014, MNRAS 442, 1805, eqs. 20 to 29; the lines' depths are in lyman_series.csv
+series, at the redshift of the cloud, and in the continuum beyond the Lyman limit.
+
+References
+----------
+Inoue et al. 2014, MNRAS 442, 1805, eqs. 20 to 29; the depths of the lines are in lyman_series.csv.
 """
 
 from __future__ import annotations
@@ -22,26 +22,36 @@ from truesky.fluxes.passbands import Passband
 
 TABLE = Path(__file__).with_name("lyman_series.csv")
 LYMAN_LIMIT = 911.8
-# Numbers of clouds are broken power laws of 1 + z, each stretch continuous with the one before: (powers, breaks).
-# Lines: depth at 1 + z = 1 in the file.
+# The number of clouds is a continuous broken power law of 1 + z: (powers, breaks). For lines, the depth at 1 + z = 1
+# is in the file.
 _FOREST_LINES, _DAMPED_LINES = ((1.2, 3.7, 5.5), (2.2, 5.7)), ((2.0, 3.0), (3.0,))
-# Continuum: (amplitude, powers, breaks) of what is integrated over 1 + z; the section of hydrogen falls as lambda^-2.1
-# in the forest (its amplitude 0.3248 x 0.9), damped systems are opaque but for a part in lambda^-0.3.
+# For the continuum, (amplitude, powers, breaks) of the integrand over 1 + z. In the forest, the cross section varies as
+# lambda^2.1 (amplitude 0.3248 x 0.9). Damped systems are opaque except for a term in lambda^-0.3.
 _FOREST, _FOREST_CROSS_SECTION = (0.29232, (-1.9, 0.6, 2.4), (2.2, 5.7)), 2.1
 _DAMPED_OPAQUE, _DAMPED_LEAK, _DAMPED_LEAK_CROSS_SECTION = (
     (0.4226, (1.0, 2.0), (3.0,)),
     (0.176203, (1.3, 2.3), (3.0,)),
     -0.3,
 )
-# A damped system of 1 + z lets through, by these laws, more than falls onto it below 912 A (1 + z) / 18.5: nothing is
-# absorbed there.
+# With these laws a damped system at 1 + z would transmit more light than it receives below 912 A (1 + z) / 18.5.
+# Nothing is absorbed there.
 _TRANSPARENCY_LIMIT = (_DAMPED_LEAK[0] / _DAMPED_OPAQUE[0]) ** (1.0 / _DAMPED_LEAK_CROSS_SECTION)
 
 
 def transmission(wavelength: npt.ArrayLike, z: npt.ArrayLike) -> Float:
-    """float64[n, n_lambda], 1 where nothing absorbs.
+    """Return the mean transmission, 1 if nothing absorbs.
 
-    wavelength : [n_lambda] observed, ascending, A, the middle of bins of 1 A;  z : [n] of the sources
+    Parameters
+    ----------
+    wavelength : float array, shape (n_lambda,)
+        Observed wavelengths in A, increasing, at the centres of bins of 1 A.
+    z : float array, shape (n,)
+        Redshifts of the sources.
+
+    Returns
+    -------
+    float array, shape (n, n_lambda)
+        Transmission.
     """
     at, stretch = np.asarray(wavelength, float), 1.0 + np.atleast_1d(np.asarray(z, float))
     depth = np.zeros((stretch.size, at.size))
@@ -53,34 +63,34 @@ def transmission(wavelength: npt.ArrayLike, z: npt.ArrayLike) -> Float:
         cloud_depth = forest * _broken_power_law(cloud, *_FOREST_LINES) + damped * _broken_power_law(
             cloud, *_DAMPED_LINES
         )
-        # The part of a bin in which there are clouds: behind us, and in front of the source.
+        # Fraction of a bin with clouds between the observer and the source.
         inside = np.clip(line * stretch[:, None] - at[:count] + 0.5, 0.0, 1.0) * (cloud > 1.0)
         depth[:, :count] += cloud_depth * inside
-    # Far below the limit the approximation's depth is less than nothing.
+    # Far below the limit the approximation gives a negative depth.
     return np.asarray(np.exp(-np.maximum(depth + _continuum_depth(at, stretch), 0.0)))
 
 
 def is_absorbed(band: Passband, z: float) -> bool:
-    """Does it see absorption of some source up to this redshift?"""
+    """Return True if hydrogen absorbs light in the band for some source up to redshift `z`."""
     return bool(band.wavelength[0] < lyman_series()[0][0] * (1.0 + z))
 
 
 @lru_cache(maxsize=1)
 def lyman_series() -> tuple[tuple[float, ...], ...]:
-    """(wavelength A, descending; depth in the forest; depth in damped systems) of the lines, at z = 0."""
+    """Return wavelengths (A, decreasing) of the lines, and their depths in forest and damped systems at z = 0."""
     with TABLE.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     return tuple(tuple(float(row[name]) for row in rows) for name in ("wavelength", "forest", "damped"))
 
 
 def _continuum_depth(at: Float, stretch: Float) -> Float:
-    """Optical depth beyond the Lyman limit, [n, n_lambda]."""
+    """Return the optical depth beyond the Lyman limit, float64[n, n_lambda]."""
     depth = np.zeros((stretch.size, at.size))
     count = int(np.searchsorted(at, LYMAN_LIMIT * stretch.max(initial=0.0) + 0.5))
     if not count:
         return depth
     x, upper = at[:count] / LYMAN_LIMIT, np.maximum(stretch, 1.0)[:, None]
-    # Clouds between us and the source whose limit lies redwards of the wavelength.
+    # Clouds in front of the source whose redshifted Lyman limit is redward of the wavelength.
     lower = np.minimum(np.maximum(x, 1.0), upper)
     damped = (
         np.maximum(np.minimum(upper, _TRANSPARENCY_LIMIT * x), lower)
@@ -99,7 +109,7 @@ def _continuum_depth(at: Float, stretch: Float) -> Float:
 
 
 def _broken_power_law(u: Float, powers: tuple[float, ...], breaks: tuple[float, ...]) -> Float:
-    """Continuous broken power law, 1 at u = 1."""
+    """Return a continuous broken power law that is 1 at u = 1."""
     value = u ** powers[0]
     for i, edge in enumerate(breaks):
         value *= np.maximum(u / edge, 1.0) ** (powers[i + 1] - powers[i])
@@ -107,7 +117,7 @@ def _broken_power_law(u: Float, powers: tuple[float, ...], breaks: tuple[float, 
 
 
 def _integral(u: Float, amplitude: float, powers: tuple[float, ...], breaks: tuple[float, ...]) -> Float:
-    """Of amplitude times the broken power law from 1 to u >= 1."""
+    """Return the integral of amplitude times the broken power law from 1 to u >= 1."""
     total, lower = np.zeros(np.shape(u)), 1.0
     for power, upper in zip(powers, (*breaks, np.inf), strict=True):
         at_lower = float(_broken_power_law(np.array([lower]), powers, breaks)[0])

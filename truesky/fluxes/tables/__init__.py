@@ -1,1 +1,1 @@
-"""Band fluxes from precomputed tables."""
+"""Compute band fluxes from precomputed tables."""

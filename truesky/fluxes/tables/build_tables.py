@@ -1,10 +1,4 @@
-"""The tables of fluxes: made in seconds, kept in the cache, mapped from disc.
-
-Setting        how fine a table of galaxies is: three numbers
-galaxy_table   continuum of every template behind every law: redshift x E(B-V) x A_V
-star_table     every star behind the dust on the way to it
-line_table     what a band makes of a line: wavelength x width
-"""
+"""Build the tables of fluxes. They take seconds to compute, and are then memory-mapped from the cache."""
 
 from __future__ import annotations
 
@@ -24,14 +18,14 @@ from truesky.fluxes.spectra.continuum import REFERENCE_BAND, dust_curves, rest_f
 from truesky.numerics import cache, matrices
 from truesky.numerics.code_fingerprints import code_key
 
-# What the tables of galaxies cover: any redshift that a request may ask for, with its peculiar velocity.
+# Range of the tables of galaxies: all redshifts that a request may have, with peculiar velocities.
 Z_FIRST, Z_LAST = -0.021, 3.03
 EBV_LAST, A_V_LAST = 0.6, 1.55
-# Stars behind more than this are integrated.
+# Stars behind more dust (A(V) in mag) are integrated.
 STAR_A_V_LAST = 5.0
 STAR_COEFFICIENTS = 12
 
-# Widths of lines that are tabulated, km/s: linear in sigma^2 in between.
+# Tabulated widths of lines, km/s. Values between them are interpolated linearly in sigma^2.
 LINE_SIGMA = lines.SIGMA_MIN * 2.0 ** (np.arange(13) / 4.0)
 LINE_STEP = 25.0 / LIGHT_KM_S
 _LINE_REACH = 6.0
@@ -39,7 +33,15 @@ _LINE_REACH = 6.0
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """step in ln(1 + z); n_ebv, n_av: numbers of coefficients in E(B-V) and in A_V."""
+    """Resolution of a table of galaxies.
+
+    Attributes
+    ----------
+    step : float
+        Step in ln(1 + z).
+    n_ebv, n_av : int
+        Number of Chebyshev coefficients in E(B-V) and in A(V).
+    """
 
     step: float
     n_ebv: int
@@ -47,32 +49,44 @@ class Setting:
 
     @property
     def z_count(self) -> int:
+        """Return the number of nodes in redshift."""
         return int(np.ceil((np.log1p(Z_LAST) - np.log1p(Z_FIRST)) / self.step)) + 1
 
     @property
     def size(self) -> int:
-        """Coefficients a template and law."""
+        """Return the number of coefficients per template and law."""
         return self.z_count * self.n_ebv * self.n_av
 
     def log_z(self, node: int) -> float:
-        """ln(1 + z) of a node."""
+        """Return ln(1 + z) of a node."""
         return float(np.log1p(Z_FIRST)) + self.step * node
 
 
 @lru_cache(maxsize=4)
 def library_key(library: Library) -> str:
-    """Key of a library's spectra and of the dust in front of them; a tenth of a second, once a library."""
+    """Return the key of a library's spectra and extinction laws; takes a tenth of a second once per library."""
     absorbed = [code_key(intergalactic.__name__)] if library.intergalactic else []
     return cache.content_key(library.wavelength, np.asarray(library.flux), dust_curves(library), *absorbed)
 
 
 def galaxy_table(band: Passband, library: Library, setting: Setting, key: str) -> Float32:
-    """ln(f_nu in the band at z / f_nu in the reference band at rest), both behind dust, of each template.
+    """Return the table of ln(f_nu in the band at z / f_nu in the reference band at rest), both behind dust.
 
-    key     : library_key(library)
-    band    : passband;  library : templates;  setting : how fine the table is
-    returns : float32[n_template, 4, n_z, n_ebv * n_av] Chebyshev coefficients; laws 1 .. 4, of which any is none at
-              E(B-V) = 0
+    Parameters
+    ----------
+    band : Passband
+        The passband.
+    library : Library
+        Templates of galaxies.
+    setting : Setting
+        Resolution of the table.
+    key : str
+        `library_key` of the library.
+
+    Returns
+    -------
+    float32 array, shape (n_template, 4, n_z, n_ebv * n_av)
+        Chebyshev coefficients for laws 1 to 4. At E(B-V) = 0 each law stands for no dust.
     """
     reference = passbands.load(REFERENCE_BAND)
     numbers = (setting.step, setting.n_ebv, setting.n_av)
@@ -86,9 +100,25 @@ def galaxy_table(band: Passband, library: Library, setting: Setting, key: str) -
 
 
 def star_table(band: Passband, library: Library, key: str) -> Float32:
-    """ln(f_nu) of each star of a library in units of its spectrum: float32[n_template, 12] coefficients in A_V.
+    """Return the table of ln(f_nu) of each star in units of its spectrum.
 
-    Error: 1e-6 (tests/truesky/fluxes/tables/test_flux_tables.py)
+    Parameters
+    ----------
+    band : Passband
+        The passband.
+    library : Library
+        Templates of stars.
+    key : str
+        `library_key` of the library.
+
+    Returns
+    -------
+    float32 array, shape (n_template, 12)
+        Chebyshev coefficients in A(V).
+
+    Notes
+    -----
+    The error is 1e-6 (tests/truesky/fluxes/tables/test_flux_tables.py).
     """
     full_key = cache.content_key(code_key(__name__), key, *_curve_arrays(band))
     arrays = cache.cached_arrays(
@@ -98,9 +128,19 @@ def star_table(band: Passband, library: Library, key: str) -> Float32:
 
 
 def line_table(band: Passband) -> tuple[float, Float32]:
-    """ln(first wavelength / A) and float32[n_lambda, n_sigma]: f_nu (erg s-1 cm-2 Hz-1) for a line of unit flux.
+    """Return the table of the f_nu in a band of a line with unit flux, by wavelength and width.
 
-    Uniform in ln(lambda) by LINE_STEP; the columns are LINE_SIGMA.
+    Parameters
+    ----------
+    band : Passband
+        The passband.
+
+    Returns
+    -------
+    first : float
+        ln(first wavelength / A).
+    table : float32 array, shape (n_lambda, n_sigma)
+        f_nu in erg s-1 cm-2 Hz-1, in steps of LINE_STEP in ln(lambda) and for the widths LINE_SIGMA.
     """
     full_key = cache.content_key(code_key(__name__), LINE_SIGMA, *_curve_arrays(band))
     arrays = cache.cached_arrays(f"line_table_{band.name}", full_key, lambda: _compute_line_table(band))
@@ -108,14 +148,29 @@ def line_table(band: Passband) -> tuple[float, Float32]:
 
 
 def chebyshev_nodes(count: int, last: float) -> Float:
-    """Chebyshev's nodes in [0, last]; a single one is for what stands before the dust."""
+    """Return Chebyshev nodes in [0, last]; a single node is at 0, for the flux before dust."""
     if count == 1:
         return np.zeros(1)
     return np.asarray(0.5 * last * (1.0 + np.cos(np.pi * (np.arange(count) + 0.5) / count)))
 
 
 def chebyshev(values: Float, last: float, count: int) -> Float:
-    """Polynomials T_0 .. T_(count - 1) on [0, last], float64[..., count]."""
+    """Return Chebyshev polynomials T_0 to T_(count - 1) on [0, last].
+
+    Parameters
+    ----------
+    values : float array
+        Arguments, 0 to `last`.
+    last : float
+        End of the interval.
+    count : int
+        Number of polynomials.
+
+    Returns
+    -------
+    float array, shape (..., count)
+        The polynomials.
+    """
     return np.asarray(np.polynomial.chebyshev.chebvander(2.0 * values / last - 1.0, count - 1))
 
 
@@ -124,7 +179,7 @@ def _curve_arrays(band: Passband) -> tuple[Float, Float]:
 
 
 def _compute_galaxy_table(library: Library, band: Passband, reference: Passband, setting: Setting) -> Float32:
-    """By the transposed problem: at each redshift the weights of the band are moved, once for all spectra."""
+    """Compute the table with shifted weights: at each redshift the band's weights are shifted once for all spectra."""
     dust = dust_curves(library)
     ebv, a_v = chebyshev_nodes(setting.n_ebv, EBV_LAST), chebyshev_nodes(setting.n_av, A_V_LAST)
     shape = (len(library), extinction.LAW_COUNT - 1, setting.n_ebv)
@@ -136,7 +191,7 @@ def _compute_galaxy_table(library: Library, band: Passband, reference: Passband,
     last = int(band.wavelength[-1] / np.exp(nearest) - library.wavelength[0]) + 2
     spectra = library.flux[sed, first:last]
     spectra *= extinction.transmission(dust[law, first:last], ebv[node].astype(np.float32)[:, None])
-    # By wavelength, as the sums go.
+    # Sums run over wavelength, so it becomes the first axis.
     spectra = np.ascontiguousarray(spectra.T)
     weights = passbands.weights(band)
     total = float(weights.sum())
@@ -149,7 +204,7 @@ def _compute_galaxy_table(library: Library, band: Passband, reference: Passband,
             weights_at_z = weights_at_z * intergalactic.transmission(band.wavelength, stretch - 1.0)
         low, shifted = _shift_weights(band.wavelength / stretch - library.wavelength[first], weights_at_z)
         observed[i] = matrices.matmul(shifted, spectra[low : low + shifted.shape[1]]).T
-    # A template without flux that far in the ultraviolet: as faint as single precision goes.
+    # Templates without flux in the far ultraviolet get the smallest flux of single precision.
     np.maximum(observed, np.finfo(np.float32).tiny, out=observed)
     observed *= (total / at_rest)[:, None]
     log_ratio = np.log(observed).reshape(setting.z_count, *shape, setting.n_av)
@@ -164,13 +219,13 @@ def _compute_star_table(library: Library, band: Passband) -> Float32:
     inside = slice(band.first, band.first + len(band.wavelength))
     dimmed = passbands.weights(band) * extinction.transmission(extinction.milky_way(band.wavelength), a_v[:, None])
     f_nu = matrices.matmul(library.flux[:, inside], dimmed.T)
-    # Cool stars have nothing left in the ultraviolet.
+    # Cool stars may have no flux in the ultraviolet.
     f_nu = np.maximum(f_nu, np.finfo(float).tiny)
     return np.asarray(matrices.matmul(np.log(f_nu), _to_coefficients(STAR_COEFFICIENTS).T), np.float32)
 
 
 def _compute_line_table(band: Passband) -> dict[str, npt.NDArray[np.generic]]:
-    """The band's weights, constant over each bin of 1 A, convolved with Gaussians."""
+    """Convolve the band's weights, constant over each bin of 1 A, with Gaussians."""
     from scipy.special import erf
 
     weights = passbands.weights(band)
@@ -189,13 +244,16 @@ def _compute_line_table(band: Passband) -> dict[str, npt.NDArray[np.generic]]:
         inside = index < len(edges)
         index = np.minimum(index, len(edges) - 1)
         cumulative = 0.5 * (1.0 + erf((centre[:, None] - edges[index]) / (np.sqrt(2.0) * width[:, None])))
-        # All steps further down have been passed by the whole line.
+        # The whole line is redward of all edges below `low`.
         out[:, k] = np.where(low > 0, level[low - 1], 0.0) + (np.where(inside, steps[index], 0.0) * cumulative).sum(1)
     return {"first": np.array([first]), "lines": out}
 
 
 def _shift_weights(position: Float, weights: Float) -> tuple[int, Float]:
-    """Weights [m, n] of linear interpolation at positions [n], summed on the whole ones: (first, [m, w])."""
+    """Distribute weights [m, n] at positions [n] over neighbouring whole positions: (first, [m, w]).
+
+    The sum over the result is the sum over linear interpolations at the positions.
+    """
     index = np.floor(position).astype(np.int64)
     fraction = position - index
     low, width = int(index[0]), int(index[-1] - index[0]) + 2
@@ -207,7 +265,7 @@ def _shift_weights(position: Float, weights: Float) -> tuple[int, Float]:
 
 
 def _to_coefficients(count: int) -> Float:
-    """Matrix from values at the nodes to coefficients: at the nodes the polynomials are orthogonal."""
+    """Return the matrix that converts values at the nodes to coefficients; the polynomials are orthogonal there."""
     return np.asarray(
         chebyshev(chebyshev_nodes(count, 1.0), 1.0, count).T * np.where(np.arange(count) > 0, 2.0, 1.0)[:, None] / count
     )

@@ -1,9 +1,4 @@
-"""How wrong the tables are for external spectra and passbands, for which nothing was measured in advance.
-
-choose     setting and error of each band: looked up (flux_errors.csv), or measured here
-measured   the error of one setting, kept in the cache
-drawn      galaxies at random, over all that the tables cover
-"""
+"""Measure the errors of the tables for external spectra and passbands, which were not measured in advance."""
 
 from __future__ import annotations
 
@@ -25,15 +20,32 @@ from truesky.numerics import cache
 from truesky.numerics.code_fingerprints import code_key
 from truesky.request.accuracy import Accuracy
 
-# The largest error of so few is less than that of many; the margin is for that.
+# The largest error of a small sample is smaller than that of all galaxies; MARGIN accounts for the difference.
 _SAMPLE, _SEED = 4000, 5
 
 
 def choose(bands: Sequence[Passband], accuracy: Accuracy, library: Library) -> tuple[Choice, ...]:
-    """For each band the smallest setting that is fine enough, see settings.choose.
+    """Return for each band the smallest setting that is accurate enough.
 
-    For an external passband or library, or one behind absorbing gas, the errors of 4000 random galaxies decide, from
-    the setting upwards that is fine enough for all bands with the embedded library.
+    Parameters
+    ----------
+    bands : sequence of Passband
+        The passbands.
+    accuracy : Accuracy
+        Largest errors that are allowed.
+    library : Library
+        Templates of galaxies.
+
+    Returns
+    -------
+    tuple of Choice
+        Setting and errors of each band.
+
+    Notes
+    -----
+    For built-in passbands and templates, errors are in flux_errors.csv; see settings.choose. For an external passband
+    or library, and for a band with intergalactic absorption, the errors of 4000 random galaxies decide. The search
+    starts at the setting from settings.choose.
     """
     embedded_choices = settings.choose([band.name for band in bands], accuracy)
     return tuple(
@@ -49,7 +61,22 @@ def _is_absorbed(band: Passband, library: Library) -> bool:
 
 
 def measure(band: Passband, setting: Setting, library: Library) -> Choice:
-    """Errors of a setting, rms and largest, against integration."""
+    """Return the errors of a setting, rms and largest, relative to integration.
+
+    Parameters
+    ----------
+    band : Passband
+        The passband.
+    setting : Setting
+        Resolution of the table.
+    library : Library
+        Templates of galaxies.
+
+    Returns
+    -------
+    Choice
+        The setting and its errors as fractions of the flux.
+    """
     library_key = build_tables.library_key(library)
     numbers = (setting.step, setting.n_ebv, setting.n_av)
     key_values = (*numbers, band.wavelength, band.response, band.medium, _SAMPLE, _SEED)
@@ -66,7 +93,22 @@ def measure(band: Passband, setting: Setting, library: Library) -> Choice:
 
 
 def draw_galaxies(n: int, n_template: int, rng: np.random.Generator) -> Galaxies:
-    """Galaxies in two components with all their lines, uniform over all that the tables cover."""
+    """Draw random galaxies with two components and all lines, uniformly over the range of the tables.
+
+    Parameters
+    ----------
+    n : int
+        Number of galaxies.
+    n_template : int
+        Number of templates.
+    rng : np.random.Generator
+        Random numbers.
+
+    Returns
+    -------
+    Galaxies
+        The galaxies.
+    """
     frac = rng.uniform(0.0, 1.0, n)
     mix = TemplateMix(
         rng.uniform(build_tables.Z_FIRST, build_tables.Z_LAST, n),

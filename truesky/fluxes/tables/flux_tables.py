@@ -1,15 +1,12 @@
-"""Band fluxes of galaxies and stars from tables: hundreds of times faster than integrating.
+"""Compute band fluxes of galaxies and stars from tables, hundreds of times faster than by integration.
 
-Grid, open_grid   the tables of some bands, made where the cache has them not
-galaxies, stars   f_nu of checked rows
-warm              compile what computes galaxies
-covered           which galaxies the tables cover; covered_stars
-
-A band's flux is linear in a galaxy's two components and additive in its lines. The logarithm of one template's, behind
-one law, is smooth in E(B-V) and in the Milky Way's A_V, being a cumulant generating function of the extinction in the
-band: a polynomial of low order. In redshift it is interpolated by cubics, uniform in ln(1 + z). The reference band's
-own table brings the sum to the apparent reference magnitude. Lines, the lens and the Milky Way in front of lines need
-no grid.
+Notes
+-----
+A band's flux is linear in a galaxy's two components and additive in its lines. For one template behind one law, the
+logarithm of the flux is smooth in E(B-V) and in the Milky Way's A(V), because it is a cumulant generating function of
+the extinction in the band. It is a polynomial of low order. In redshift it is interpolated by cubics on nodes uniform
+in ln(1 + z). The table of the reference band scales the sum to the apparent reference magnitude. Lines, lensing and the
+extinction of lines by the Milky Way need no table in redshift.
 """
 
 from __future__ import annotations
@@ -40,18 +37,40 @@ from truesky.fluxes.tables.build_tables import (
     Setting,
 )
 
-# Of the reference band: its error is everybody's.
+# Setting of the reference band. Its error enters the fluxes in all bands.
 REFERENCE_SETTING = Setting(0.005, 6, 1)
-# Rows that are interpolated together: what is known of them stays in the processor's cache (a power of two would
-# use but a part of it).
+# Rows that are interpolated together, so that their data stay in the processor's cache. A power of two would use only
+# a fraction of the cache.
 _CHUNK = 2000
-# Which bands see a line is looked up on this grid of ln(lambda); air moves lines by 3e-4.
+# Step in ln(lambda) of the grid on which the bands of a line are looked up, and its margin; air shifts lines by 3e-4.
 _CELL, _AIR = 0.01, 1e-3
 
 
 @dataclass(frozen=True, slots=True)
 class LineGrid:
-    """The line tables of all bands in one, see kernels.add_up; wavelengths of the lines."""
+    """Line tables of all bands and the wavelengths of the lines, as kernels.sum_components needs them.
+
+    Attributes
+    ----------
+    tables : float32 array, shape (sum of n_lambda, n_width)
+        Tables of all bands, one after the other.
+    start : uint32 array, shape (n_band,)
+        First row of each band in `tables`.
+    last : int32 array, shape (n_band,)
+        Number of the last row of each band, from its first row.
+    medium : uint32 array, shape (n_band,)
+        1 for air, 0 for vacuum.
+    first : float array, shape (n_band,)
+        ln(lambda / A) of the first row of each band.
+    cells : int array, shape (n_cell + 1,)
+        Positions in `members` at which the bands of each wavelength cell begin.
+    members : uint32 array
+        Bands that respond in each wavelength cell.
+    cell_first : float
+        ln(lambda / A) at the start of the first cell.
+    vacuum : float array, shape (n_line,)
+        Rest-frame wavelengths of the lines in vacuum in A.
+    """
 
     tables: Float32
     start: UInt32
@@ -66,10 +85,20 @@ class LineGrid:
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Tables of galaxies in some bands, memory-mapped.
+    """Memory-mapped tables of galaxies in some bands.
 
-    settings, tables : of each band;  reference : table of the reference band
-    milky_way        : A(lambda) / A(V) on passbands.grid()
+    Attributes
+    ----------
+    settings : tuple of Setting
+        Resolution of each band's table.
+    tables : tuple of float32 array
+        Table of each band.
+    reference : float32 array
+        Table of the reference band.
+    lines : LineGrid
+        Tables of lines.
+    milky_way : float array, shape (23401,)
+        A(lambda) / A(V) on passbands.grid().
     """
 
     settings: tuple[Setting, ...]
@@ -80,7 +109,22 @@ class Grid:
 
 
 def open_grid(bands: Sequence[Passband], settings: Sequence[Setting], library: Library) -> Grid:
-    """The tables of bands, each with its setting, for a library of galaxies; half a second a band to make."""
+    """Return the tables of bands for a library of galaxies; it takes half a second per band to compute them.
+
+    Parameters
+    ----------
+    bands : sequence of Passband
+        The passbands.
+    settings : sequence of Setting
+        Resolution of each band's table.
+    library : Library
+        Templates of galaxies.
+
+    Returns
+    -------
+    Grid
+        The tables.
+    """
     key = build_tables.library_key(library)
     return Grid(
         tuple(settings),
@@ -92,12 +136,26 @@ def open_grid(bands: Sequence[Passband], settings: Sequence[Setting], library: L
 
 
 def galaxy_fluxes(rows: Galaxies, grid: Grid) -> Float:
-    """f_nu, float64[n, n_band] microjansky, of galaxies that are `covered`: what integration.galaxies gives.
+    """Return the fluxes of galaxies in the range of the tables; approximates integration.galaxy_fluxes.
 
-    Error: as measured of each setting in each band (flux_errors.csv)
+    Parameters
+    ----------
+    rows : Galaxies
+        Galaxies for which `covered_galaxies` is True.
+    grid : Grid
+        Tables.
+
+    Returns
+    -------
+    float array, shape (n, n_band)
+        f_nu in microjansky.
+
+    Notes
+    -----
+    The error of each setting in each band is in flux_errors.csv.
     """
-    # Neighbours in redshift read the same part of a table.
-    # 16 bits of it are enough, and sorted ten times faster.
+    # Sort by redshift, so that successive galaxies read the same rows of a table. Integers of 16 bits are precise
+    # enough, and are sorted ten times faster.
     span = 65_535.0 / np.log1p(Z_LAST - Z_FIRST)
     order = np.argsort((np.log1p(np.maximum(rows.mix.z_obs - Z_FIRST, 0.0)) * span).astype(np.uint16), kind="stable")
     out = np.empty((len(rows), len(grid.tables)))
@@ -108,7 +166,7 @@ def galaxy_fluxes(rows: Galaxies, grid: Grid) -> Float:
 
 
 def _fill_chunk(rows: Galaxies, grid: Grid, indices: Int, out: Float) -> None:
-    """Fills out[part]."""
+    """Write the fluxes of `rows` to out[indices]."""
     log_z = np.log1p(rows.mix.z_obs)
     observed = _component_ratios(rows.mix, log_z, np.zeros(len(rows)), (REFERENCE_SETTING,), (grid.reference,))[0]
     ratios = _component_ratios(rows.mix, log_z, rows.a_v, grid.settings, grid.tables)
@@ -147,7 +205,7 @@ def _fill_chunk(rows: Galaxies, grid: Grid, indices: Int, out: Float) -> None:
 
 
 def compile_kernels(grid: Grid) -> None:
-    """Compile, by computing one galaxy."""
+    """Compile the kernels with one galaxy."""
     ones, zeros = np.ones(1), np.zeros((2, 1))
     mix = TemplateMix(ones, zeros.astype(np.int64), zeros.astype(np.int64), zeros + 0.5, zeros)
     galaxy_fluxes(
@@ -156,7 +214,22 @@ def compile_kernels(grid: Grid) -> None:
 
 
 def star_fluxes(rows: Stars, bands: Sequence[Passband], library: Library) -> Float:
-    """f_nu, float64[n, n_band] microjansky, of stars that are covered: what integration.stars gives, within 1e-6."""
+    """Return the fluxes of stars in the range of the tables; differs from integration.star_fluxes by at most 1e-6.
+
+    Parameters
+    ----------
+    rows : Stars
+        Stars for which `covered_stars` is True.
+    bands : sequence of Passband
+        The passbands.
+    library : Library
+        Templates of stars.
+
+    Returns
+    -------
+    float array, shape (n, n_band)
+        f_nu in microjansky.
+    """
     key = build_tables.library_key(library)
     basis = build_tables.chebyshev(rows.a_v, STAR_A_V_LAST, build_tables.STAR_COEFFICIENTS)
     scale = star_scale(rows, library)
@@ -168,7 +241,10 @@ def star_fluxes(rows: Stars, bands: Sequence[Passband], library: Library) -> Flo
 
 
 def covered_galaxies(rows: Galaxies) -> Bool:
-    """Which galaxies the tables cover, bool[n]; a component without flux, or without a law, may have any E(B-V)."""
+    """Return True for galaxies in the range of the tables, bool[n].
+
+    A component without flux, or without an extinction law, may have any E(B-V).
+    """
     mix = rows.mix
     dusty = (mix.ebv > EBV_LAST) & (mix.law > 0) & (mix.frac > 0.0)
     in_range = (mix.z_obs >= Z_FIRST) & (mix.z_obs <= Z_LAST)
@@ -176,15 +252,15 @@ def covered_galaxies(rows: Galaxies) -> Bool:
 
 
 def covered_stars(rows: Stars) -> Bool:
-    """Which stars the tables cover, bool[n]."""
+    """Return True for stars in the range of the tables, bool[n]."""
     return np.asarray(rows.a_v <= STAR_A_V_LAST)
 
 
 def _component_ratios(
     mix: TemplateMix, log_z: Float, a_v: Float, settings: Sequence[Setting], tables: Sequence[Float32]
 ) -> Float32:
-    """f_nu of each component in each band relative to the reference band at rest: float32[n_band, 2, n]."""
-    # Most bands share their nodes, or their polynomials, with another.
+    """Return f_nu of each component in each band relative to the reference band at rest: float32[n_band, 2, n]."""
+    # Most bands share nodes or polynomials with other bands.
     distinct = set(settings)
     steps = {s.step: s for s in distinct}
     nodes = {step: _find_nodes(setting, mix, log_z) for step, setting in steps.items()}

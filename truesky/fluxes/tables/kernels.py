@@ -1,12 +1,6 @@
-"""The compiled loops of the flux tables.
+"""Compiled loops of the flux tables.
 
-place         where galaxies lie in the tables of a step in redshift
-products      their polynomials in E(B-V) and A_V
-log_ratios    what their two components give in one band
-line_centres  where lines are seen, and what the Milky Way leaves of them
-add_up        components and lines together, in all bands
-
-Plain loops over rows: no source depends on its neighbours, not in the last bit.
+The loops run over rows. No result depends on neighbouring rows, not even in the last bit.
 """
 
 from __future__ import annotations
@@ -22,14 +16,30 @@ def find_nodes(
     log_z: Float, sed: Int, law: Int, n_law: int, log_first: float, step: float, z_count: int,
     first: Int, z_weights: Float32,
 ) -> None:  # fmt: skip
-    """Fills first, int64[2, n], the first of four nodes of each component, and z_weights, float32[n, 4]: Lagrange's.
+    """Find the nodes in redshift of each component, and the weights of cubic interpolation.
 
-    sed, law : int64[2, n];  log_z = ln(1 + z)
-    n_law     : laws of the table;  log_first, step, z_count : its first node in ln(1 + z), their distance and number
+    Parameters
+    ----------
+    log_z : float array, shape (n,)
+        ln(1 + z).
+    sed, law : int array, shape (2, n)
+        Template and extinction law of each component.
+    n_law : int
+        Number of laws in the table.
+    log_first : float
+        First node in ln(1 + z).
+    step : float
+        Distance of nodes in ln(1 + z).
+    z_count : int
+        Number of nodes.
+    first : int array, shape (2, n)
+        Output: index of the first of four nodes.
+    z_weights : float32 array, shape (n, 4)
+        Output: Lagrange weights.
     """
     for i in range(len(log_z)):
         position = (log_z[i] - log_first) / step
-        # One-sided at the ends.
+        # Interpolation is one-sided at the ends of the table.
         row = min(max(int(np.floor(position)) - 1, 0), z_count - 4)
         t = position - row - 1.0
         for k in range(2):
@@ -44,12 +54,24 @@ def find_nodes(
 def chebyshev_products(
     law: Int, ebv: Float, a_v: Float, ebv_last: float, a_v_last: float, n_ebv: int, n_av: int, basis: Float32
 ) -> None:
-    """Fills basis, float32[2, n, n_ebv * n_av]: products of Chebyshev polynomials in E(B-V), [2, n], and A_V, [n].
+    """Compute products of Chebyshev polynomials in E(B-V) and A(V).
 
-    law, ebv, a_v         : int64[2, n], float64[2, n], float64[n]; without a law E(B-V) is 0
-    ebv_last, a_v_last    : where the tables end;  n_ebv, n_av : polynomials in each
+    Parameters
+    ----------
+    law : int array, shape (2, n)
+        Extinction law of each component. Without a law (0) E(B-V) is taken as 0.
+    ebv : float array, shape (2, n)
+        E(B-V) in mag.
+    a_v : float array, shape (n,)
+        A(V) of the Milky Way in mag.
+    ebv_last, a_v_last : float
+        Largest E(B-V) and A(V) of the tables.
+    n_ebv, n_av : int
+        Number of polynomials in each.
+    basis : float32 array, shape (2, n, n_ebv * n_av)
+        Output: products.
     """
-    # Flat arrays and unsigned positions, here and below: nothing is looked up from the end.
+    # Flat arrays and unsigned positions, here and below, avoid the code for negative indices.
     in_av, flat, n, width = np.empty(n_av, np.float32), basis.ravel(), len(a_v), np.uint64(n_av)
     for i in range(n):
         x = 2.0 * a_v[i] / a_v_last - 1.0
@@ -72,10 +94,20 @@ def chebyshev_products(
 
 @jit
 def log_ratios(table: Float32, first: Int, z_weights: Float32, basis: Float32, out: Float32) -> None:
-    """Fills out, float32[2, n]: ln(f_nu in the band / f_nu in the reference band at rest) of each component.
+    """Compute ln(f_nu in the band / f_nu in the reference band at rest) of each component.
 
-    table : float32[n_template, 4, n_z, n_coefficient], laws 1 .. 4; without a law E(B-V) is 0 in any of them
-    first, z_weights, basis : of `place` and `products`
+    Parameters
+    ----------
+    table : float32 array, shape (n_template, 4, n_z, n_coefficient)
+        Table of the band for laws 1 to 4. Without a law, E(B-V) is 0 in any of them.
+    first : int array, shape (2, n)
+        Nodes from `find_nodes`.
+    z_weights : float32 array, shape (n, 4)
+        Weights from `find_nodes`.
+    basis : float32 array, shape (2, n, n_coefficient)
+        Products from `chebyshev_products`.
+    out : float32 array, shape (2, n)
+        Output: logarithms.
     """
     flat, polynomials, count, n = table.ravel(), basis.ravel(), np.uint64(table.shape[3]), len(z_weights)
     for k in range(2):
@@ -96,13 +128,28 @@ def line_centres(
     fluxes: Float, log_z: Float, a_v: Float, vacuum: Float, ciddor: Float, curve: Float, first: float,
     centre: Float, flux: Float,
 ) -> None:  # fmt: skip
-    """Fills centre, ln of the observed wavelength in A in a vacuum and in air, and flux, behind the Milky Way.
+    """Compute observed wavelengths of lines, and their fluxes behind the Milky Way.
 
-    ciddor : float64[2, 2] (strength, resonance) of the refractivity of air
-    curve  : A(lambda) / A(V) in steps of 1 A from `first`; lines beyond it are in no band
-    centre, flux : float64[n, n_line, 2]
-    fluxes, vacuum : float64[n, n_line] before dust, and float64[n_line] wavelengths at rest, A
-    log_z, a_v     : float64[n] ln(1 + z), and A(V) of the Milky Way, mag
+    Parameters
+    ----------
+    fluxes : float array, shape (n, n_line)
+        Fluxes before dust.
+    log_z : float array, shape (n,)
+        ln(1 + z).
+    a_v : float array, shape (n,)
+        A(V) of the Milky Way in mag.
+    vacuum : float array, shape (n_line,)
+        Rest-frame wavelengths in vacuum in A.
+    ciddor : float array, shape (2, 2)
+        (strength, resonance) of the terms of the refractivity of air.
+    curve : float array
+        A(lambda) / A(V) in steps of 1 A from `first`. Lines beyond it are in no band.
+    first : float
+        First wavelength of `curve` in A.
+    centre : float array, shape (n, n_line, 2)
+        Output: ln of the observed wavelength in A, in vacuum and in air.
+    flux : float array, shape (n, n_line, 2)
+        Output: flux behind the Milky Way at these wavelengths.
     """
     log_vacuum = np.log(vacuum)
     for i in range(len(log_z)):
@@ -115,7 +162,7 @@ def line_centres(
                 continue
             square = 1e8 / (lam * lam)
             refractivity = 1e-8 * (ciddor[0, 0] / (ciddor[0, 1] - square) + ciddor[1, 0] / (ciddor[1, 1] - square))
-            # ln(1 + part), to 1e-11.
+            # ln(1 + refractivity) with an error of 1e-11.
             shift = refractivity * (1.0 - 0.5 * refractivity)
             centre[i, j, 0] = log_vacuum[j] + log_z[i]
             centre[i, j, 1] = centre[i, j, 0] - shift
@@ -132,17 +179,46 @@ def sum_components(
     tables: Float32, start: UInt32, last: Int32, medium: UInt32, first: Float, step: float, cells: Int,
     members: UInt32, cell_first: float, cell_step: float, magnification: Float, rows: Int, out: Float,
 ) -> None:  # fmt: skip
-    """Fills out[rows[i], b]: the sum of the components, times scale, and of the lines in band b; times magnification.
+    """Sum components and lines of each galaxy in each band, times magnification.
 
-    ratios       : float32[n_band, 2, n] of each component;  frac : float64[2, n] its share
-    width, share : [n] node of the lines' width below the galaxy's, and how far towards the next, 0 .. 1
-    tables       : float32[sum of n_lambda, n_width] of all bands, uniform in ln(lambda) by `step`: what the band
-                   makes of a line of that width there
-    start, last  : [n_band] first row of a band in `tables`, and its last counted from there
-    medium       : [n_band] 1 for air;  first : [n_band] ln(lambda) of a band's first row
-    cells        : int64[n_cell + 1]: members[cells[c] : cells[c + 1]] are the bands that see wavelength cell c
-    centre, flux : of `line_centres`
-    cell_first, cell_step : ln(lambda) where the first wavelength cell begins, and the width of a cell
+    Parameters
+    ----------
+    ratios : float32 array, shape (n_band, 2, n)
+        f_nu of each component relative to the reference band at rest.
+    frac : float array, shape (2, n)
+        Fraction of each component.
+    scale : float array, shape (n,)
+        Factor of the components.
+    centre, flux : float array, shape (n, n_line, 2)
+        Results of `line_centres`.
+    width : int array, shape (n,)
+        Node in width at or below the width of the galaxy's lines.
+    share : float array, shape (n,)
+        Fraction of the way to the next node in width, 0 to 1.
+    tables : float32 array, shape (sum of n_lambda, n_width)
+        Line tables of all bands, uniform in ln(lambda): f_nu in the band of a line with unit flux.
+    start : uint32 array, shape (n_band,)
+        First row of each band in `tables`.
+    last : int32 array, shape (n_band,)
+        Number of the last row of each band, from its first row.
+    medium : uint32 array, shape (n_band,)
+        1 for air, 0 for vacuum.
+    first : float array, shape (n_band,)
+        ln(lambda) of the first row of each band.
+    step : float
+        Step of `tables` in ln(lambda).
+    cells : int array, shape (n_cell + 1,)
+        members[cells[c] : cells[c + 1]] are the bands that respond in wavelength cell c.
+    members : uint32 array
+        Bands that respond in each cell.
+    cell_first, cell_step : float
+        ln(lambda) at the start of the first wavelength cell, and width of a cell.
+    magnification : float array, shape (n,)
+        Factor of the sum.
+    rows : int array, shape (n,)
+        Rows of `out` to fill.
+    out : float array, shape (m, n_band)
+        Output: fluxes.
     """
     per_row, per_cell, n_band = 1.0 / step, 1.0 / cell_step, len(first)
     flat, widths, unit = tables.ravel(), np.uint32(tables.shape[1]), np.uint32(1)
@@ -174,9 +250,22 @@ def sum_components(
 
 @exact_jit
 def mix_stars(table: Float32, sed: Int, frac: Float, basis: Float, scale: Float, out: Float) -> None:
-    """Fills out[n]: the sum over a star's templates of share times exp(coefficients . basis), times scale.
+    """Compute the flux of each star as the sum over its templates.
 
-    table : float32[n_template, m] coefficients;  sed, frac : [k, n];  basis : [n, m];  scale, out : [n]
+    Parameters
+    ----------
+    table : float32 array, shape (n_template, m)
+        Chebyshev coefficients of ln(f_nu).
+    sed : int array, shape (k, n)
+        Templates of each star.
+    frac : float array, shape (k, n)
+        Fraction of each template.
+    basis : float array, shape (n, m)
+        Chebyshev polynomials.
+    scale : float array, shape (n,)
+        Factor of the sum.
+    out : float array, shape (n,)
+        Output: scale times the sum of frac exp(coefficients . basis).
     """
     for i in range(len(out)):
         total = 0.0

@@ -1,14 +1,7 @@
-"""Which tables are fine enough: the smallest whose measured error is inside what the user allows.
+"""Choose the smallest flux tables whose measured error is within the accuracy that the user allows.
 
-CANDIDATES      settings that were measured, smallest first
-Choice, choose  setting and error of each band, for galaxies
-stars_tabulated, of_stars   the same for stars
-known           bands that were measured
-INTEGRATED      the choice of no table
-COVERED         what the tables cover, as JSON values
-
-The errors (flux_errors.csv) are those of 20,000 random galaxies, lines included, against direct integration:
-python -m benchmarks.fluxes --measure.
+flux_errors.csv has the errors of 20,000 random galaxies, including lines, relative to direct integration. Update it
+with `python -m benchmarks.fluxes --measure`.
 """
 
 from __future__ import annotations
@@ -37,11 +30,12 @@ CANDIDATES = tuple(
     )
 )  # fmt: skip
 
-# The measured largest error times this is taken for the largest of all galaxies.
+# Factor from the largest measured error to the assumed largest error of all galaxies.
 MARGIN = 1.5
-# From here on nothing is interpolated: what the tables are measured against is not measured against itself.
+# If the allowed error is at most this, all fluxes are integrated. Errors of tables are known only relative to
+# integration.
 _MIN_TABLE_ERROR = 1e-4
-# Of integration, against the whole spectrum in double precision (the templates are in single precision).
+# Error of integration relative to whole spectra in double precision, due to templates in single precision.
 _INTEGRATION_ERROR = 1e-6
 
 COVERED_RANGES = {"z_obs": [Z_FIRST, Z_LAST], "ebv": [0.0, EBV_LAST], "a_v": [0.0, A_V_LAST]}
@@ -49,14 +43,22 @@ COVERED_RANGES = {"z_obs": [Z_FIRST, Z_LAST], "ebv": [0.0, EBV_LAST], "a_v": [0.
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """How a band is computed: from tables, or integrated (None), and its measured errors (fractions of the flux)."""
+    """Method for a band and its measured errors.
+
+    Attributes
+    ----------
+    setting : Setting, optional
+        Resolution of the table; None for integration.
+    rms, largest : float
+        Errors as fractions of the flux.
+    """
 
     setting: Setting | None
     rms: float
     largest: float
 
     def facts(self) -> dict[str, Any]:
-        """As JSON values."""
+        """Return the choice as JSON values."""
         setting = [self.setting.step, self.setting.n_ebv, self.setting.n_av] if self.setting else None
         return {"setting": setting, "rms": self.rms, "largest": self.largest}
 
@@ -65,26 +67,40 @@ INTEGRATED = Choice(None, _INTEGRATION_ERROR, _INTEGRATION_ERROR)
 
 
 def choose(bands: Sequence[str], accuracy: Accuracy) -> tuple[Choice, ...]:
-    """For each band the smallest setting with 1.5 x largest error <= accuracy.flux; without one it is integrated.
+    """Return for each band the smallest setting whose largest error times `MARGIN` is at most accuracy.flux.
 
-    A band that was not measured (a user's) takes a setting that is fine enough for every band that was.
+    Parameters
+    ----------
+    bands : sequence of str
+        Names of passbands.
+    accuracy : Accuracy
+        Largest errors that are allowed.
+
+    Returns
+    -------
+    tuple of Choice
+        Setting and errors of each band; `INTEGRATED` if no setting is accurate enough.
+
+    Notes
+    -----
+    A user passband, which was not measured, gets a setting that is accurate enough for all measured bands.
     """
     measured = _read_errors()
     return tuple(_smallest(measured, band, accuracy.flux) for band in bands)
 
 
 def measured_bands() -> frozenset[str]:
-    """Names of the bands that were measured."""
+    """Return the names of the measured bands."""
     return frozenset(name for of_bands in _read_errors().values() for name in of_bands)
 
 
 def stars_tabulated(accuracy: Accuracy) -> bool:
-    """Whether stars come from tables, whose error is 1e-6 in all bands."""
+    """Return True if fluxes of stars come from tables, whose error is 1e-6 in all bands."""
     return accuracy.flux > _MIN_TABLE_ERROR
 
 
 def star_error_facts(accuracy: Accuracy) -> dict[str, Any]:
-    """What is stored with the fluxes of stars, as JSON values."""
+    """Return the facts about errors of stellar fluxes as JSON values."""
     covered = {"a_v": [0.0, STAR_A_V_LAST]} if stars_tabulated(accuracy) else None
     return {"covered": covered, "largest": _INTEGRATION_ERROR}
 

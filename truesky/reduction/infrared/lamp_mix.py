@@ -1,6 +1,6 @@
-"""Which mix of a unit's lamps is like the sky's light in a band: a pixel's response is of the wavelength.
+"""Find the mixture of calibration lamps that is most similar to the sky in a band.
 
-weights   of lamps whose flats are mixed
+A flat of this mixture corrects the response to the sky, because a pixel's response depends on wavelength.
 """
 
 from __future__ import annotations
@@ -16,18 +16,32 @@ from truesky.render.effects.light import calibration_lamp, chromatic_response
 from truesky.render.effects.scene import Scene
 from truesky.render.sky import diffuse_light
 
-# What the sum, the mean wavelength and its square count in the fit, and that weights are alike.
+# Importance in the fit of the sum of weights, the mean wavelength, the mean square, and equal weights.
 _SUM_WEIGHT, _MEAN_WEIGHT, _SQUARE_WEIGHT, _EVENNESS_WEIGHT = 1e4, 1e2, 1.0, 1e-2
-# Sky whose colour is matched, e-/s in a pixel: zodiacal light where surveys look.
+# Level of the sky whose colour is matched, e-/s per pixel: zodiacal light in the fields of surveys.
 _SKY = 1.0
 
 
 def weights(scene: Scene, lamps: Sequence[int]) -> tuple[float, ...]:
-    """Weights of lamps, 0 or more and 1 in all: the mean wavelength of their light in the band is the sky's.
+    """Return weights of lamps such that the mean wavelength of their light in the band equals that of the sky.
 
-    Of many lamps the mean square is as near as it can be. An observer knows the passband, the Sun and the lamps.
-    scene : of a flat in the band;  lamps : their numbers
-    Error : of lamps that all lie on one side of the sky's mean wavelength the nearest is taken
+    Parameters
+    ----------
+    scene : Scene
+        Scene of a flat in the band.
+    lamps : sequence of int
+        Numbers of the lamps.
+
+    Returns
+    -------
+    tuple of float
+        Weights, 0 or more, with sum 1.
+
+    Notes
+    -----
+    With many lamps, the mean square of the wavelength is matched as well as possible. An observer can compute the
+    weights from the passband, the spectrum of the Sun and the spectra of the lamps. If all lamps are on one side of
+    the sky's mean wavelength, the nearest lamp is used.
     """
     band = chromatic_response.band_of_scene(scene)
     band_width = float(band.wavelength[-1] - band.wavelength[0])
@@ -54,6 +68,6 @@ def weights(scene: Scene, lamps: Sequence[int]) -> tuple[float, ...]:
 
 
 def _moments(band: Passband, photons: Float, origin: float, band_width: float) -> Float:
-    """Mean and mean square of the wavelength over the band's width, told from `about`."""
+    """Return mean and mean square of wavelength over the band's width, relative to `origin`."""
     x = band.wavelength / band_width - origin
     return np.array([np.average(x, weights=photons), np.average(x**2, weights=photons)])

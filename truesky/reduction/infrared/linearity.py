@@ -1,9 +1,7 @@
-"""Non-linearity of each pixel from flats of one lamp at several levels.
+"""Measure the nonlinearity of each pixel from flats of one lamp at several levels.
 
-Of x times the lamp's light a pixel gets g x electrons, of which Q are seen; g and b of N (1 - b N) are fitted to them.
-
-series    of flats those that are of use
-fitted    b of each pixel, with its uncertainty
+A lamp at level x gives a pixel g x electrons, of which Q are measured. The gain g and the b of N (1 - b N) are fitted
+for each pixel.
 """
 
 from __future__ import annotations
@@ -19,14 +17,15 @@ from truesky.reduction.combining import CombinedFrame
 from truesky.reduction.frames import Frame
 from truesky.reduction.infrared.ramps import Estimator, RampNonlinearity
 
-# Levels, the brightest over the faintest at least, rounds of the fit, standard deviations of a frame that is left out.
+# Smallest number of levels, smallest ratio of the brightest to the faintest, iterations of the fit, and deviation
+# (in standard deviations) above which a frame is rejected.
 _MIN_LEVELS, _MIN_RANGE, _ROUNDS, _CLIP = 3, 3.0, 4, 5.0
-# Rows that are fitted at a time: memory.
+# Rows that are fitted at a time, to limit memory.
 _ROWS = 32
 
 
 def longest_series(flats: Sequence[Frame]) -> list[Frame]:
-    """Flats of one channel, band, lamp and ramp at three levels or more; of several series the longest; else none."""
+    """Return the longest series of flats with one channel, band, lamp and ramp at three or more levels, else []."""
     groups: dict[tuple[object, ...], list[Frame]] = defaultdict(list)
     for frame in flats:
         groups[frame.exposure.channel, frame.exposure.band, frame.scene.lamp, frame.ramp].append(frame)
@@ -45,11 +44,25 @@ def _level(frame: Frame) -> float:
 def fit(
     frames: Sequence[Frame], extra_charge: Callable[[Frame], tuple[Float, Float | float]], scratch: Path
 ) -> CombinedFrame:
-    """b of every pixel, 1/e-, and its uncertainty: of each pixel's own fit what its noise allows, else the median.
+    """Return b of every pixel in 1/electron, with its uncertainty.
 
-    frames  : of `series`;  added : frame -> e- [ny, nx] of persistence and of dark current in it
-    scratch : folder for the frames meanwhile: 8 bytes a pixel and frame
-    Error   : the lamp's levels are taken as exact, as they are told; what a pixel's traps have of their own is unknown
+    Parameters
+    ----------
+    frames : sequence of Frame
+        Flats of `longest_series`.
+    extra_charge : callable
+        Function that returns the electrons of persistence [ny, nx] and of dark current in a frame.
+    scratch : Path
+        Folder for temporary files, 8 bytes per pixel and frame.
+
+    Returns
+    -------
+    CombinedFrame
+        Weighted mean of each pixel's fit and the median of all pixels.
+
+    Notes
+    -----
+    The levels of the lamp are assumed to be exact. Pixel-to-pixel differences of the traps are not known.
     """
     scene, applied = frames[0].scene, frames[0].applied
     estimator, nonlinearity = Estimator.from_scene(scene, applied), RampNonlinearity.from_scene(scene, applied)
@@ -79,10 +92,21 @@ def fit(
 def _fit_rows(
     observed: Float, extra: Float, levels: Float, noise: Float, nonlinearity: RampNonlinearity
 ) -> tuple[Float, Float, Array]:
-    """(b, its uncertainty, frames that are left) of pixels [rows, nx], of frames of which these [n, rows, nx] are seen.
+    """Fit b of pixels [rows, nx] to frames [n, rows, nx]; return b, its uncertainty, and the number of accepted frames.
 
-    seen, added : e- that are seen, and of these what is no light of the lamp's
-    levels, noise : [n] of the lamp, and variance of what is seen;  bend : of the ramp
+    Parameters
+    ----------
+    observed, extra : float array, shape (n, rows, nx)
+        Measured electrons, and the electrons among them that are not light of the lamp.
+    levels, noise : float array, shape (n,)
+        Relative level of the lamp, and variance of the measured signal.
+    nonlinearity : RampNonlinearity
+        Nonlinearity of the ramp.
+
+    Returns
+    -------
+    b, sigma, count : array, shape (rows, nx)
+        Results.
     """
     b, accepted, x = np.zeros(observed.shape[1:]), np.ones(observed.shape, bool), levels[:, None, None]
     sigma = np.full(b.shape, np.inf)
@@ -97,13 +121,13 @@ def _fit_rows(
         enough = (accepted.sum(axis=0) >= _MIN_LEVELS) & np.isfinite(b_step)
         gain, b_step = np.where(enough, gain, 0.0), np.where(enough, b_step, 0.0)
         accepted = np.abs(y + b_step * c - gain * x) <= _CLIP * np.sqrt(noise)[:, None, None]
-        # A tenth of its own signal at most: a dead pixel has no b.
+        # Limit the nonlinearity to a tenth of the signal, since a dead pixel has no meaningful b.
         b = np.clip(b + b_step, 0.0, 0.1 / np.maximum(y.max(axis=0), 1.0))
     return b, np.where(enough, np.sqrt(sigma), np.inf), accepted.sum(axis=0).astype(np.int16)
 
 
 def _shrink_to_median(b: Float, sigma: Float, count: Array) -> CombinedFrame:
-    """Each pixel's b and the median of all, by their variances."""
+    """Return the mean of each pixel's b and the median of all pixels, weighted by their variances."""
     is_measured = np.isfinite(sigma) & (b > 0.0)
     median = float(np.median(b[is_measured])) if is_measured.any() else 0.0
     width = 1.4826 * float(np.median(np.abs(b[is_measured] - median))) if is_measured.any() else 0.0

@@ -1,8 +1,8 @@
-"""NISP's frames: masters of dark current, linearity and flats, and calibrated images.
+"""Make NISP masters of dark current, linearity and flats, and calibrate NISP images::
 
-signal = (linearised(estimated - bias of the estimator) - dark time - persistence) / flat
+    signal = (linearised(estimated - bias of the estimator) - dark time - persistence) / flat
 
-Detectors   what is done with frames of one detector: .masters, .reduced
+The module `ramps` describes the estimator of the signal of a ramp.
 """
 
 from __future__ import annotations
@@ -27,15 +27,28 @@ from truesky.reduction.infrared.ramps import Estimator, RampNonlinearity
 from truesky.render.effects.charge import ramp_nonlinearity
 from truesky.render.effects.light import calibration_lamp, illumination
 
-# chi^2 that non-linearity alone makes of a ramp, above which that it does not fit says nothing of cosmic rays.
+# Largest chi^2 of a ramp due to nonlinearity alone. Above it, a bad fit is not a sign of a cosmic ray.
 _MAX_NONLINEAR_CHI2 = 1.0
-# Of the pixels of a flat that are full; of its brightest flats the least level of those that a master is of.
+# Flats with this fraction of saturated pixels or more are rejected. A master flat uses flats of at least this fraction
+# of the brightest level.
 _MAX_SATURATED, _MIN_RELATIVE_LEVEL = 0.01, 0.3
 
 
 @dataclass(frozen=True, slots=True)
 class Master:
-    """A master: its kind, what it is, the frames that it is of, and more cards of its header."""
+    """A master frame.
+
+    Attributes
+    ----------
+    kind : str
+        Kind of master.
+    combined : CombinedFrame
+        The master.
+    frames : sequence of Frame
+        Frames that were combined.
+    cards : tuple of Card
+        Further cards of its header.
+    """
 
     kind: str
     combined: CombinedFrame
@@ -44,9 +57,21 @@ class Master:
 
 
 def incoming_charge(frame: Frame, b: Float | float, persistence: Float | float) -> Float:
-    """Electrons [ny, nx] that came into each pixel, dark current with them, without what earlier exposures left.
+    """Return the electrons that each pixel received, including dark current, without persistence.
 
-    b : of N (1 - b N), 1/e-; 0 = as it is read;  left : e- of persistence
+    Parameters
+    ----------
+    frame : Frame
+        The frame.
+    b : float or float array, shape (ny, nx)
+        b of N (1 - b N) in 1/electron; 0 for no correction.
+    persistence : float or float array, shape (ny, nx)
+        Electrons of persistence.
+
+    Returns
+    -------
+    float array, shape (ny, nx)
+        Electrons.
     """
     estimated = frame.electrons()
     estimated -= Estimator.from_scene(frame.scene, frame.applied).bias(estimated)
@@ -56,17 +81,30 @@ def incoming_charge(frame: Frame, b: Float | float, persistence: Float | float) 
 
 
 def declared_nonlinearity(frame: Frame) -> float:
-    """b of the usual pixel as the mission has it; 0 where a frame has none."""
+    """Return b of the typical pixel from the mission parameters, 0 for a frame without nonlinearity."""
     nonlinear_effects = {ramp_nonlinearity.EFFECT.name, ramp_nonlinearity.SIGNAL.name} & frame.applied
     return frame.scene.value("nonlinearity", "1 / electron") if nonlinear_effects else 0.0
 
 
 def make_masters(frames: Sequence[Frame], scratch: Path) -> Iterator[Master]:
-    """Masters of what a detector's frames allow: dark of each ramp, linearity, flat of each band.
+    """Make the masters that a detector's frames allow: a dark of each ramp, linearity, and a flat of each band.
 
-    frames  : all of one detector: of what they show the others' persistence is taken off
-    scratch : folder for the frames while they are combined: 4 bytes a pixel and frame
-    Errors  : BadInput where there is neither a dark nor a flat
+    Parameters
+    ----------
+    frames : sequence of Frame
+        All frames of one detector. Persistence of each frame in later frames is subtracted.
+    scratch : Path
+        Folder for temporary files, 4 bytes per pixel and frame (8 bytes for linearity).
+
+    Yields
+    ------
+    Master
+        The masters.
+
+    Raises
+    ------
+    BadInput
+        If there is neither a dark nor a flat.
     """
     prediction, darks = PersistencePrediction(frames), dict[tuple[int, int, int], CombinedFrame]()
     for group in _group_frames(
@@ -83,7 +121,7 @@ def make_masters(frames: Sequence[Frame], scratch: Path) -> Iterator[Master]:
         if frame.saturated_pixels().mean() < _MAX_SATURATED
     ]
     if not darks and not flats:
-        raise BadInput(f"detector {frames[0].detector}: the lake has no dark and no flat of it")
+        raise BadInput(f"detector {frames[0].detector}: the lake has neither a dark nor a flat")
     b: Float | float | None = None
     if series := linearity.longest_series(flats):
         combined = linearity.fit(
@@ -106,7 +144,7 @@ Corrections = tuple[PersistencePrediction, Float | float, Mapping[tuple[int, int
 
 
 def _dark_charge(frame: Frame, darks: Mapping[tuple[int, int, int], CombinedFrame] | None) -> Float | float:
-    """Electrons of its dark current: of its own ramp's master, else of another's."""
+    """Return the electrons of dark current in a frame, from the master of its ramp, or else of another ramp."""
     if not darks:
         return 0.0
     master = darks.get(frame.ramp) or next(iter(darks.values()))
@@ -116,7 +154,7 @@ def _dark_charge(frame: Frame, darks: Mapping[tuple[int, int, int], CombinedFram
 def _combine_frames(
     frames: Sequence[Frame], units: Sequence[Float | float], corrections: Corrections, scratch: Path
 ) -> CombinedFrame:
-    """Mean of frames in their units; units : electrons [ny, nx] of each that are 1 in the master."""
+    """Return the mean of frames; `units` has the electrons [ny, nx] of each frame per unit of the master."""
     prediction, b, darks = corrections
     lake_frames.common_values(frames, (*files.SHARED_CARDS,))
     scene = frames[0].scene
@@ -141,7 +179,7 @@ def _combine_frames(
 
 
 def _make_flat(frames: Sequence[Frame], corrections: Corrections, scratch: Path) -> Master:
-    """Of each lamp that shines in the band its master over its light; and their mix that the sky's light is like."""
+    """Make a flat of each lamp divided by its light, and return the mixture that is most similar to the sky."""
     brightest = max(frame.scene.value("flat.signal", "electron") for frame in frames)
     bright_frames = [
         frame for frame in frames if frame.scene.value("flat.signal", "electron") >= _MIN_RELATIVE_LEVEL * brightest
@@ -165,12 +203,12 @@ def _make_flat(frames: Sequence[Frame], corrections: Corrections, scratch: Path)
     )
     cards: list[Card] = []
     for i, (number, weight) in enumerate(zip(numbers, weights, strict=True), start=1):
-        cards += [(f"LAMP{i}", number, "LED of the calibration unit"), (f"WEIGHT{i}", weight, "of it in the mix")]
+        cards += [(f"LAMP{i}", number, "LED of the calibration unit"), (f"WEIGHT{i}", weight, "weight in the mixture")]
     return Master("flat", mixed, bright_frames, tuple(cards))
 
 
 def _lamp_charge(frame: Frame) -> Float:
-    """Electrons [ny, nx] that the lamp of a flat would bring were all its light counted."""
+    """Return the electrons that the lamp of a flat would give if all light were counted, float64[ny, nx]."""
     electrons, *pattern = calibration_lamp.EFFECT.parameters(frame.scene)
     return np.asarray(electrons * illumination.apply(np.ones((frame.scene.ny, frame.scene.nx)), *pattern))
 
@@ -178,13 +216,30 @@ def _lamp_charge(frame: Frame) -> Float:
 def calibrate(
     frame: Frame, masters: Masters, prediction: PersistencePrediction | None, effects: Sequence[str], unit: float
 ) -> ReducedImage:
-    """A calibrated frame that sees the sky.
+    """Calibrate a frame of the sky.
 
-    own      : masters of its detector, of which the bias is b of N (1 - b N)
-    foreseen : what is left in the detector's frames; None = it is left as it is
-    undone   : of the frame's effects those that are undone;  unit : electrons that the image's unit is
-    Error    : of the weight: shot noise of the light that is expected, not counted; neighbours share their charge: a
-               pixel's noise is less than that of the mean of many tells
+    Parameters
+    ----------
+    frame : Frame
+        The frame.
+    masters : Masters
+        Masters of the detector. Their `bias` contains b of N (1 - b N).
+    prediction : PersistencePrediction or None
+        Persistence in the detector's frames; None to leave it in the image.
+    effects : sequence of str
+        Effects of the frame that are undone.
+    unit : float
+        Electrons per unit of the image.
+
+    Returns
+    -------
+    ReducedImage
+        The calibrated image.
+
+    Notes
+    -----
+    Weights contain the shot noise of the expected light, not of the counted light. Neighbouring pixels share charge, so
+    the noise of a single pixel is smaller than the noise of sums over many pixels suggests.
     """
     time = frame.scene.exposure_time_s
     dark = masters.dark.mean * time
@@ -211,7 +266,7 @@ def calibrate(
 
 
 def _hit_pixels(frame: Frame, charge: Float, b: Float) -> Bool:
-    """Pixels [ny, nx] whose ramp has a step."""
+    """Return True for pixels with a step in their ramp, bool[ny, nx]."""
     nonlinearity = RampNonlinearity.from_scene(frame.scene, frame.applied)
     return np.asarray(
         frame.misfit_pixels()
@@ -220,7 +275,22 @@ def _hit_pixels(frame: Frame, charge: Float, b: Float) -> Bool:
 
 
 def read_masters(folder: Path, frame: Frame, without: Sequence[str]) -> Masters:
-    """The masters of a frame; without : those that are not wanted, and `nonlinearity`: as it is read."""
+    """Read the masters for a frame.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the masters.
+    frame : Frame
+        Frame to calibrate.
+    without : sequence of str
+        Kinds that are not read but replaced by constants; "nonlinearity" also omits the linearity.
+
+    Returns
+    -------
+    Masters
+        The masters.
+    """
     shape, combined, dark_time = (frame.scene.ny, frame.scene.nx), {}, np.inf
     for kind in files.master_kinds(frame):
         if kind in without or (kind == "linearity" and "nonlinearity" in without):

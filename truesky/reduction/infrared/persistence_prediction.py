@@ -1,7 +1,4 @@
-"""Persistence as an observer foresees it: of the earlier frames of a detector of a lake, by the mission's numbers.
-
-foreseen      electrons that the frames before one left in it
-"""
+"""Predict persistence as an observer can, from earlier frames of a detector and the mission parameters."""
 
 from __future__ import annotations
 
@@ -19,24 +16,31 @@ from truesky.render.effects.charge.persistence import PersistenceModel
 from truesky.render.exposure import persistence
 
 _DAY_S = 86400.0
-# Frames whose charge is kept in memory: 4 bytes a pixel.
+# Number of frames whose charge is kept in memory, 4 bytes per pixel.
 _CACHE_SIZE = 48
-# Nothing shone on them.
+# Image types without light.
 _DARK_TYPES = ("bias", "dark", "persistence")
 
 
 @dataclass(slots=True)
 class PersistencePrediction:
-    """What is left in frames of a detector; frames : all that there are of it, of whatever channel.
+    """Prediction of persistence in the frames of a detector.
 
-    Error : of what each pixel's traps have of their own nothing is known; what no frame of the lake shows is missed
+    Attributes
+    ----------
+    frames : sequence of Frame
+        All frames of the detector, of any channel.
+
+    Notes
+    -----
+    Pixel-to-pixel differences of the traps are not known. Persistence of exposures that are not in the lake is missed.
     """
 
     frames: Sequence[Frame]
     _charge_cache: OrderedDict[int, Float32] = field(default_factory=OrderedDict)
 
     def charge_in(self, frame: Frame) -> Float:
-        """e- [ny, nx] in a frame of it."""
+        """Return the electrons of persistence in a frame, float64[ny, nx]."""
         out = np.zeros((frame.scene.ny, frame.scene.nx))
         exposure, traps = frame.exposure, PersistenceModel.from_scene(frame.scene)
         start_mjd = exposure.mjd - persistence.window_days(exposure.camera, frame.scene.mission)
@@ -57,7 +61,7 @@ class PersistencePrediction:
         return out
 
     def _charge_at_reference(self, previous_frame: Frame, traps: PersistenceModel) -> Float32:
-        """e- of a frame's charge after the reference time, in an exposure of the nominal length."""
+        """Return the persistence of a frame at the reference time, in an exposure of nominal length, in electrons."""
         number = previous_frame.exposure.exposure_id
         if number not in self._charge_cache:
             charge = np.where(previous_frame.saturated_pixels(), traps.full_well, previous_frame.electrons())

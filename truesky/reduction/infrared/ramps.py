@@ -1,19 +1,16 @@
-"""The signal of a ramp as an observer has it: how the estimator errs and scatters, what non-linearity makes of it.
+"""Model the estimated signal of a ramp: bias and noise of the estimator, and the effect of nonlinearity.
 
-With the n differences of groups of mean d (light and beta), the variance a and the covariance b of neighbours, T their
-sum and SS the sum of squares about their mean, the estimated signal is to second order
+Let n be the number of differences of groups, d their mean (light and beta), a their variance, b the covariance of
+neighbours, T their sum, and SS the sum of squares about their mean. To second order the estimated signal is::
 
     Q = S + [2 d (T - E T) + SS - n A d] / (2 d + A),      A = 1 + alpha
 
-so that its mean and variance are those of T and SS (effects/charge/ramp.py, effects/readout/macc.py).  Where of N
-electrons N (1 - b N) are seen, Q is the root mean square of differences that fall:
+Its mean and variance follow from the moments of T and SS (effects/charge/ramp.py, effects/readout/macc.py). If
+N (1 - b N) of N electrons are measured, differences decrease along the ramp, and Q is their root mean square::
 
     Q^2 = S^2 (1 - 2 k1 b S + k2 b^2 S^2)
 
-with k1 and k2 of the frames that a ramp is read in, or 1 where the signal itself is not linear.
-
-Estimator     of a mode: .bias, .variance of a signal
-Bend          of a mode: .linearised, .bent, .slope, .misfit of a signal
+Here k1 and k2 depend on the frames in which a ramp is read. They are 1 if the signal itself is not linear.
 """
 
 from __future__ import annotations
@@ -29,19 +26,28 @@ from truesky.render.effects.charge.ramp import Mode
 from truesky.render.effects.readout import macc, ramp_noise
 from truesky.render.effects.scene import Scene
 
-# Signals at which tables are made, e-.
+# Tabulated signals, e-.
 _LEVELS = np.concatenate([[0.0], np.geomspace(1.0, 2e5, 200)])
-# Rounds in which a signal is linearised: each brings three digits at 1e5 e-.
+# Iterations of the linearisation; each adds three digits at 1e5 e-.
 _ROUNDS = 8
 
 
 @dataclass(frozen=True, slots=True)
 class Estimator:
-    """How the signal of a ramp is estimated.
+    """Estimator of the signal of a ramp.
 
-    read_noise : of one read, e-;  drift : of the outputs in the signal, e-
-    coupling   : what is left of the variance of photons where neighbours share their charge
-    rounding   : variance of whole ADU, e-^2
+    Attributes
+    ----------
+    mode : Mode
+        Readout mode.
+    read_noise : float
+        Noise of one read in electrons.
+    drift : float
+        Drift of the outputs in the signal in electrons.
+    coupling : float
+        Factor of the photon variance that remains if neighbours share charge.
+    rounding : float
+        Variance of rounding to whole ADU in electrons^2.
     """
 
     mode: Mode
@@ -52,7 +58,7 @@ class Estimator:
 
     @classmethod
     def from_scene(cls, scene: Scene, applied: Container[str]) -> Estimator:
-        """Of a frame's detector; applied : names of the effects that are in it."""
+        """Return the estimator for a detector; `applied` has the names of the effects in the frame."""
         side, diagonal = ipc.EFFECT.parameters(scene) if ipc.EFFECT.name in applied else (0.0, 0.0)
         return cls(
             ramp.mode_of_scene(scene),
@@ -63,11 +69,11 @@ class Estimator:
         )
 
     def bias(self, signal: Float) -> Float:
-        """What is estimated less what is there, e-; signal : e-."""
+        """Return the bias of the estimate (estimated minus true signal) in electrons, for a signal in electrons."""
         return np.asarray(np.interp(signal, _LEVELS, self._moments(_LEVELS)[0]))
 
     def variance(self, signal: Float) -> Float:
-        """Of what is estimated of a signal, e-^2; signal : expected, e-."""
+        """Return the variance of the estimate in electrons^2, for an expected signal in electrons."""
         return np.asarray(np.interp(signal, _LEVELS, self._moments(_LEVELS)[1]))
 
     def _moments(self, signal: Float) -> tuple[Float, Float]:
@@ -90,9 +96,14 @@ class Estimator:
 
 @dataclass(frozen=True, slots=True)
 class RampNonlinearity:
-    """What a ramp's frames make of non-linearity.
+    """Effect of nonlinearity on the signal of a ramp.
 
-    first, second : k1 and k2;  uneven : what differences depart from their mean of, of chi^2
+    Attributes
+    ----------
+    k1, k2 : float
+        Coefficients of the loss, see the module's docstring.
+    misfit_factor : float
+        Factor of chi^2 due to the deviation of differences from their mean.
     """
 
     k1: float
@@ -101,7 +112,7 @@ class RampNonlinearity:
 
     @classmethod
     def from_scene(cls, scene: Scene, applied: Container[str]) -> RampNonlinearity:
-        """Of a frame; applied : names of the effects that are in it."""
+        """Return the nonlinearity of a frame's ramp; `applied` has the names of the effects in the frame."""
         mode = ramp.mode_of_scene(scene)
         if ramp_nonlinearity.SIGNAL.name in applied:
             return cls(1.0, 1.0, 0.0)
@@ -112,12 +123,15 @@ class RampNonlinearity:
         return cls(mean / all_frames, square / all_frames**2, (square - mean**2) / all_frames**2 / (1.0 + mode.alpha))
 
     def nonlinear_signal(self, signal: Float, b: Float) -> Float:
-        """What is seen of a signal, e-; b : 1/e-."""
+        """Return the measured signal for a true signal, both in electrons; `b` is in 1/electron."""
         loss = b * np.maximum(signal, 0.0)
         return np.asarray(signal * np.sqrt(np.maximum(1.0 - 2.0 * self.k1 * loss + self.k2 * loss**2, 0.0)))
 
     def linearise(self, observed: Float, b: Float) -> Float:
-        """The signal of which this is seen, e-; b : 1/e-.  Error: of what no signal gives, about the largest."""
+        """Return the true signal for a measured signal, both in electrons; `b` is in 1/electron.
+
+        For a measured signal that no true signal gives, the result is about the largest possible signal.
+        """
         out = np.array(observed, float)
         for _ in range(_ROUNDS):
             loss = b * np.maximum(out, 0.0)
@@ -125,9 +139,9 @@ class RampNonlinearity:
         return out
 
     def slope(self, signal: Float) -> Float:
-        """What a signal changes with b where that is small, e-^2."""
+        """Return the decrease of the measured signal per unit of b, for small b, in electrons^2."""
         return np.asarray(self.k1 * np.maximum(signal, 0.0) ** 2)
 
     def chi_square(self, signal: Float, b: Float) -> Float:
-        """chi^2 that non-linearity alone makes of a ramp."""
+        """Return chi^2 of a ramp due to nonlinearity alone."""
         return np.asarray(self.misfit_factor * b**2 * np.maximum(signal, 0.0) ** 3)

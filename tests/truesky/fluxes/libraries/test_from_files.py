@@ -1,4 +1,4 @@
-"""External files, all synthetic: made here in the published forms, with numbers that nobody measured."""
+"""Read external files. All files are synthetic: they have the published formats and invented numbers."""
 
 import numpy as np
 import pytest
@@ -73,7 +73,7 @@ def test_every_form_gives_the_same_spectrum(tmp_path, form):
 
 
 def broken(name):
-    """A filter file that is wrong in one way."""
+    """Return the columns of a filter with one mistake."""
     wavelength, value = BAND.copy(), RESPONSE.copy()
     match name:
         case "one row":
@@ -107,7 +107,7 @@ def broken(name):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("one row", "1 rows are no curve"),
+        ("one row", "a curve must have at least 2 rows, got 1"),
         ("unsorted", "row 42 goes back in wavelength"),
         ("repeated", "row 42 repeats the wavelength"),
         ("descending", "row 2 goes back"),
@@ -135,7 +135,7 @@ def test_a_spectrum_in_another_unit_is_refused(tmp_path, scale):
         from_files.read(ascii_file(tmp_path / "sed", WAVELENGTH * scale), "cosmos")
 
 
-def test_what_is_not_a_table_is_refused(tmp_path):
+def test_a_file_that_is_not_a_table_is_refused(tmp_path):
     path = tmp_path / "nothing"
     for form in from_files.formats():
         with pytest.raises(BadInput, match="nothing: no such file"):
@@ -191,7 +191,7 @@ def test_a_users_filter_is_used_like_any_other(tmp_path, galaxies, library, form
 
 def test_a_filter_outside_the_grid_or_without_medium_is_refused(tmp_path):
     path = ascii_file(tmp_path / "mid", BAND + 30_000.0, RESPONSE)
-    with pytest.raises(BadInput, match=r"mid: lies outside 600 \.\. 24000 A"):
+    with pytest.raises(BadInput, match=r"mid: the passband is outside 600 \.\. 24000 A"):
         from_files.passband(path, "mine", "air")
     with pytest.raises(BadInput, match="medium 'water'"):
         from_files.passband(path, "mine", "water")
@@ -225,11 +225,11 @@ def test_bins_of_a_straight_spectrum_hold_its_middles_and_those_beyond_it_go_on(
 
 
 def test_a_law_that_is_not_per_colour_excess_is_refused(tmp_path):
-    """The steepest, of the Small Magellanic Cloud, has k = 25 at the Lyman limit."""
+    """The steepest law, of the Small Magellanic Cloud, has k = 25 at the Lyman limit."""
     ascii_file(tmp_path / "steep", value=25.0 * WAVELENGTH[0] / WAVELENGTH)
     assert from_files.law(tmp_path / "steep", "extinction", np.array([900.0]))[0] == pytest.approx(25.0)
     ascii_file(tmp_path / "wrong", value=500.0 * WAVELENGTH[0] / WAVELENGTH)
-    with pytest.raises(BadInput, match=r"wrong: row 1 is more than k = 100: is it A / E\(B-V\)"):
+    with pytest.raises(BadInput, match=r"wrong: row 1 is more than k = 100: the values must be A / E\(B-V\)"):
         from_files.law(tmp_path / "wrong", "extinction", np.array([900.0]))
 
 
@@ -241,14 +241,14 @@ def test_a_column_of_lists_is_no_curve(tmp_path, shape):
         from_files.read(path, "spectrum_fits")
 
 
-def test_no_word_asks_for_more_memory_than_its_file(tmp_path):
-    """A type of 10 MB a row, and a word that would be as wide in every row."""
+def test_no_word_needs_more_memory_than_its_file(tmp_path):
+    """Refuse a type with 10 MB per row, and a word that would have the same width in every row."""
     path = tmp_path / "x.ecsv"
     wavelength = np.linspace(4000.0, 5000.0, 21)
     Table({"wavelength": wavelength, "throughput": np.ones(21)}).write(path, format="ascii.ecsv")
     text = path.read_text()
     path.write_text(text.replace("datatype: float64", "datatype: 9999999D", 1))
-    with pytest.raises(BadInput, match="'9999999D' is no datatype of ECSV"):
+    with pytest.raises(BadInput, match="'9999999D' is not a datatype of ECSV"):
         from_files.read(path, "passband_ecsv")
     path.write_text(text + "9" * 5000 + " 1\n")
     with pytest.raises(BadInput, match="more than 4096 characters"):

@@ -58,8 +58,8 @@ def test_shares_are_a_mixture(teff, log_g, metallicity):
 
 
 @given(st.floats(3700.0, 8400.0), st.floats(1.6, 4.6), st.floats(-2.5, 0.5))
-def test_a_mixture_has_the_star_s_own_labels(teff, log_g, metallicity):
-    """Linear in ln Teff, log g and [M/H]: the shares' mean of the nodes is the star."""
+def test_a_mixture_has_the_parameters_of_the_star(teff, log_g, metallicity):
+    """Mixtures are linear in ln Teff, log g and [M/H]: the weighted mean of the nodes equals the star."""
     found = mix(teff, log_g, metallicity)
     shape = (model_stars.TEFF.size, model_stars.LOG_G.size, model_stars.METALLICITY.size)
     t, g, z = np.unravel_index(np.where(found.frac > 0, found.sed - FIRST, 0), shape)
@@ -70,7 +70,7 @@ def test_a_mixture_has_the_star_s_own_labels(teff, log_g, metallicity):
 
 @pytest.mark.parametrize(("log_g", "metallicity"), [(4.7, 0.0), (4.7, -1.5), (2.0, -1.0), (4.6, 0.3)])
 def test_no_steps_in_colour(light, log_g, metallicity):
-    """Between stars that differ by 0.2 % in temperature g - r differs by less than 0.01, of hardly any by nothing."""
+    """For stars that differ by 0.2 % in temperature, g - r differs by less than 0.01; it is continuous."""
     teff = np.exp(np.arange(np.log(3700.0), np.log(20_000.0), 0.002))
     found = colours(light, teff, np.full(teff.size, log_g), np.full(teff.size, metallicity))
     assert np.abs(np.diff(found[1])).max() < 0.01
@@ -81,7 +81,7 @@ def test_no_steps_in_colour(light, log_g, metallicity):
 
 
 def test_metals_make_u_fainter(light):
-    """At g - r = 0.3 an ultraviolet excess of 0.2 mag between the discs' stars and the halo's."""
+    """At g - r = 0.3, stars of the discs and of the halo differ by an ultraviolet excess of 0.2 mag."""
     teff, found = np.arange(5500.0, 7000.0, 5.0), []
     for metals in (-2.0, -1.5, -1.0, -0.6, 0.0):
         colour = colours(light, teff, np.full(teff.size, 4.2), np.full(teff.size, metals))
@@ -91,7 +91,7 @@ def test_metals_make_u_fainter(light):
 
 
 def test_the_sun_s_bolometric_correction():
-    """M_bol - M_H = 1.44 (Willmer 2018: M_H = 3.30), of dwarfs and models alike; of cool dwarfs as is published."""
+    """Dwarfs and models have M_bol - M_H = 1.44 (Willmer 2018: M_H = 3.30); cool dwarfs have the published values."""
     from truesky.fluxes.libraries.vega import vega_magnitude
 
     vega = vega_magnitude(passbands.load("twomass_h"))

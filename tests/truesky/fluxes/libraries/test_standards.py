@@ -1,4 +1,4 @@
-"""Lines of the planetary nebula that wavelengths are calibrated with, against atomic physics and published lines."""
+"""Compare lines of the planetary nebula, used for wavelength calibration, with atomic physics and published lines."""
 
 import csv
 
@@ -28,7 +28,7 @@ def lines():
 
 
 def vacuum(air):
-    """Morton 2000, ApJS 130, 403, eq. 8, iterated: another formula than the one of the code."""
+    """Convert wavelengths by Morton 2000, ApJS 130, 403, eq. 8, iterated; the code uses another formula."""
     found = air
     for _ in range(5):
         s2 = (1e4 / found) ** 2
@@ -53,17 +53,17 @@ def test_other_lines_are_in_vacuum_and_as_published():
 
 @pytest.mark.parametrize(("name", "least"), [("nisp_red", 7), ("nisp_blue", 6)])
 def test_each_grism_sees_lines_all_over_its_band(name, least):
-    """Of a dispersion's polynomial more than its degree; their contrast is that of the published ratios."""
+    """There are more lines than the degree of the dispersion polynomial, with the contrast of the published ratios."""
     band = passbands.load(name)
     seen = band.wavelength[band.response > 0.5 * band.response.max()]
     own = [wavelength for _, wavelength, _ in lines() if seen[0] <= wavelength <= seen[-1]]
     assert len(own) >= least
-    # Nowhere is a half of the band without one.
+    # No half of the band is without a line.
     assert max(np.diff([seen[0], *own, seen[-1]])) < 0.55 * (seen[-1] - seen[0])
 
 
 def test_ratios_are_those_of_case_b():
-    """Of Storey & Hummer 1995 at 10^4 K and 10^4 cm^-3, H beta 1."""
+    """Ratios are from Storey & Hummer 1995 at 10^4 K and 10^4 cm^-3, relative to H beta."""
     flux = {name: value for name, _, value in lines() if name in SERIES}
     for name, ratio in {"Paalpha": 0.332, "Pabeta": 0.162, "Pagamma": 0.0901, "Brgamma": 0.0275}.items():
         assert flux[name] / flux["Hbeta"] == pytest.approx(ratio, rel=0.05)

@@ -1,4 +1,4 @@
-"""Stars from external files, all synthetic: made here in the published forms, with numbers that nobody measured."""
+"""Read stars from external files. All files are synthetic: they have the published formats and invented numbers."""
 
 import hashlib
 
@@ -32,7 +32,7 @@ def basel_file(
 
 
 def black_bodies(path, temperatures=(2000, 2500, 3500, 5000, 8000, 15_000, 50_000), metallicities=(0.0,)):
-    """Planck spectra at log g = 4.5; those of log g = 1 are another thing, as are the metal-poor ones."""
+    """Write Planck spectra at log g = 4.5. Models with log g = 1 and metal-poor models have other spectra."""
     models = [(t, g, m) for m in metallicities for t in temperatures for g in (1.0, 4.5)]
 
     def shape(teff, log_g):
@@ -85,7 +85,7 @@ def test_dwarfs_have_the_models_of_their_temperature_and_gravity(tmp_path):
     assert library.names == embedded.names
     first = templates.first_model()
     np.testing.assert_array_equal(library.flux[n:first], embedded.flux[n:first])
-    # Stars of any metallicity are the file's black bodies, too.
+    # Stars of any metallicity have the black bodies of the file.
     truth = stellar.normalise(grid, stellar.planck(grid, 3600.0))
     seen = (grid > 4000.0) & (grid < 23_000.0)
     np.testing.assert_allclose(library.flux[first, seen], truth[seen], rtol=0.02)
@@ -100,11 +100,11 @@ def test_dwarfs_that_no_model_covers_are_refused(tmp_path):
         stars_from_files.library(black_bodies(tmp_path / "synthetic.cor", (3500, 5000)), ())
 
 
-def test_infrared_alone_goes_onto_the_embedded_dwarfs(tmp_path):
+def test_infrared_files_alone_change_the_built_in_dwarfs(tmp_path):
     files = [irtf_file(tmp_path / f"{k}.txt", slope) for k, slope in enumerate((-3.5, -1.0))]
     library, infrared = stars_from_files.library(None, files)
     embedded, grid = templates.stellar_library(), passbands.grid()
-    # Hot stars are blue; the optical stays as it was.
+    # Hot stars get the blue spectrum; the optical part is unchanged.
     assert (infrared[0], infrared[-1]) == (0, 1)
     blue = grid < 8100.0
     np.testing.assert_allclose(library.flux[:, blue], embedded.flux[:, blue], rtol=1e-6)
@@ -112,7 +112,7 @@ def test_infrared_alone_goes_onto_the_embedded_dwarfs(tmp_path):
     assert np.ptp(library.flux[0, far] / embedded.flux[0, far]) > 0.05
 
 
-def test_each_star_says_which_files_it_is_of(tmp_path):
+def test_each_star_records_its_files(tmp_path):
     models = black_bodies(tmp_path / "synthetic.cor")
     irtf = tuple(irtf_file(tmp_path / f"{name}.txt", slope) for name, slope in (("hot", -3.5), ("cool", -1.0)))
     own = inputs.read(UserCurves(basel=models, irtf=irtf))
@@ -132,7 +132,7 @@ def test_each_star_says_which_files_it_is_of(tmp_path):
         ({"irtf": ("absent.txt",)}, r"fluxes\.stars: .*absent\.txt"),
     ],
 )
-def test_what_is_wrong_is_refused_with_its_key(tmp_path, given, words):
+def test_bad_files_are_refused_with_their_key(tmp_path, given, words):
     paths = {key: tmp_path / name if key == "basel" else (tmp_path / name[0],) for key, name in given.items()}
     with pytest.raises(BadInput, match=words):
         inputs.read(UserCurves(**paths))
@@ -149,7 +149,7 @@ def test_infrared_stars_are_spliced_by_colour():
     outside = grid < 8200.0
     np.testing.assert_array_equal(out[:, outside], low[:, outside])
     middle = (grid > 8300.0) & (grid < 23_900.0)
-    # The structure is the star's, the shape and the level are the low resolution's.
+    # Fine structure is from the star; the broad shape and the level are from the low-resolution spectrum.
     ratio = out[:, middle] / low[:, middle]
     assert np.abs(ratio - 1.0).max() < 0.12
     for row, slope in ((0, -3.0), (1, -1.0)):

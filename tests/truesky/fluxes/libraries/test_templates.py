@@ -1,4 +1,4 @@
-"""The embedded libraries: normalisation, colours, and where they come from."""
+"""Test normalisation, colours and origins of the built-in libraries."""
 
 import numpy as np
 import pytest
@@ -63,7 +63,7 @@ def test_no_lines_are_left_in_the_continua(library):
     assert {6564.614, 5008.239} <= set(np.round(templates.emission_wavelengths(), 3))
     for centre in templates.emission_wavelengths():
         low = int(centre - 30.0 - library.wavelength[0])
-        # The observed ones; the burst in the later ones is a curve.
+        # Only templates from observed spectra; later templates contain the smooth burst.
         window = library.flux[:20, low : low + 61].astype(float)
         straight = np.linspace(window[:, 0], window[:, -1], 61, axis=1)
         assert np.abs(window / straight - 1.0).max() < 1e-5
@@ -76,8 +76,8 @@ def test_red_tail_and_lyman_edge(library):
     assert library.flux[30, at == 911.0] < 0.05 * library.flux[30, at == 913.0]
 
 
-def test_made_once(library, monkeypatch):
-    """By all processes; within one it is not even read again."""
+def test_library_is_computed_once(library, monkeypatch):
+    """The library is computed once for all processes, and loaded once per process."""
     assert templates.galaxy_library() is library
     monkeypatch.setattr(templates, "galaxy_spectra", lambda *_: pytest.fail("made again"))
     again = templates.galaxy_library.__wrapped__()
@@ -93,7 +93,7 @@ def test_a_new_recipe_is_a_new_key(monkeypatch, tmp_path):
     assert len(list(cache.cache_dir().glob("galaxy_library-*"))) == 2
 
 
-def test_planck_is_plancks_law():
+def test_planck_follows_plancks_law():
     from astropy import units as u
     from astropy.modeling.models import BlackBody
 

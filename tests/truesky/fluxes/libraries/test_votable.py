@@ -1,4 +1,4 @@
-"""VOTables that are small, and would take long or much memory: refused in a line before they are read."""
+"""Refuse small VOTables that would take much time or memory to read."""
 
 import numpy as np
 import pytest
@@ -16,17 +16,17 @@ COLUMN = '<FIELD name="Transmission"'
     [
         (COLUMN, FIELD * 2000, "more than 1000 elements"),
         ("</RESOURCE>", "<TABLE/>" * 2000, "more than 1000 elements"),
-        ("<RESOURCE>", "<RESOURCE>" * 40, "more than 32 elements within"),
+        ("<RESOURCE>", "<RESOURCE>" * 40, "more than 32 nested elements"),
         (COLUMN, FIELD.replace("/>", ' arraysize="1x99999999"/>'), "arraysize = '1x99999999' of FIELD"),
         (COLUMN, FIELD.replace("/>", ' arraysize="&#57;99999"/>'), "arraysize = '999999' of FIELD"),
         (COLUMN, FIELD.replace("/>", ' arraysize="500"/>') * 50, "more than 4000000 numbers"),
         (COLUMN, FIELD.replace("/>", f' unit="{"m." * 600}m"/>'), "more than 1000 characters"),
-        ("<TD>5000", '<TD encoding="base64">', "no plain TABLEDATA"),
-        ("<TABLEDATA>", "<BINARY2><STREAM/></BINARY2>", "no plain TABLEDATA"),
+        ("<TD>5000", '<TD encoding="base64">', "not plain TABLEDATA"),
+        ("<TABLEDATA>", "<BINARY2><STREAM/></BINARY2>", "not plain TABLEDATA"),
         ('<?xml version="1.0"?>', '<?xml version="1.0" encoding="utf-16"?>', "'utf-16'"),
     ],
 )
-def test_what_no_curve_needs_is_refused(tmp_path, place, more, words):
+def test_oversized_tables_are_refused(tmp_path, place, more, words):
     path = votable(tmp_path / "x.xml")
     text = path.read_text()
     assert place in text
@@ -35,8 +35,8 @@ def test_what_no_curve_needs_is_refused(tmp_path, place, more, words):
         from_files.read(path, "passband_svo")
 
 
-def test_what_passbands_have_is_read(tmp_path):
-    """Parameters with texts of any or a fixed length, a column of texts, another prefix of the names."""
+def test_features_of_real_passbands_are_accepted(tmp_path):
+    """Accept parameters with texts of any or fixed length, a column of texts, and another prefix of names."""
     path = votable(tmp_path / "x.xml")
     plain = from_files.read(path, "passband_svo")
     text = path.read_text().replace(

@@ -1,4 +1,4 @@
-"""The two-component continuum against a slow calculation, spectrum by spectrum."""
+"""Compare the two-component continuum with a slow calculation of single spectra."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def random_mix(library, n=40, seed=3, **columns):
 
 
 def slow_shape(mix, i, library, grid):
-    """One galaxy in double precision, by the appendix's steps."""
+    """Compute one galaxy in double precision, following the steps of the appendix."""
     rest = np.zeros(len(library.wavelength))
     for k in range(2):
         law = extinction.laws(library.wavelength)[mix.law[k, i]]
@@ -35,7 +35,7 @@ def slow_shape(mix, i, library, grid):
 
 
 @pytest.mark.parametrize("shared", [True, False])
-def test_shapes_are_the_slow_ones(library, shared):
+def test_shapes_agree_with_a_slow_calculation(library, shared):
     mix = random_mix(library)
     if shared:
         mix = continuum.TemplateMix(mix.z_obs, mix.sed, mix.law[[0, 0]], mix.frac, mix.ebv[[0, 0]])
@@ -74,7 +74,7 @@ def test_components_have_their_share_of_the_reference_flux_after_dust(library):
         np.testing.assert_allclose(shape.astype(float) @ weights * scale, mix.frac[k], rtol=1e-6)
 
 
-def test_one_law_is_the_papers_form(library):
+def test_one_law_agrees_with_the_published_form(library):
     # Combined first, then extinguished, as in Serrano et al. 2024.
     mix = random_mix(library, ext_law_1=2, ext_law_2=2, ebv_1=0.3, ebv_2=0.3, z_obs=0.5, sed_1=12, sed_2=11)
     dust = continuum.dust_curves(library)

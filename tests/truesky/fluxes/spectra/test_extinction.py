@@ -21,15 +21,15 @@ def test_prevot_goes_through_its_table(wavelength, ratio):
     assert k(1, wavelength) == pytest.approx(ratio + 2.72, abs=1e-12)
 
 
-def test_prevot_goes_on_into_the_ultraviolet_as_it_ends():
-    """Its last piece, straight in 1 / lambda."""
+def test_prevot_is_extrapolated_into_the_ultraviolet():
+    """The last segment is extended, linear in 1 / lambda."""
     inner = (k(1, 1275.0) - k(1, 1330.0)) / (1.0 / 1275.0 - 1.0 / 1330.0)
     outer = (k(1, 912.0) - k(1, 1275.0)) / (1.0 / 912.0 - 1.0 / 1275.0)
     assert outer == pytest.approx(inner, rel=1e-9)
     assert outer > 0.0
 
 
-def test_calzetti_where_the_paper_evaluates_it():
+def test_calzetti_has_the_published_values():
     # Calzetti et al. 2000: k(V) = R_V = 4.05 at 5500 A; H alpha 3.33, H beta 4.60, [O II] 5.86.
     for wavelength, wanted in ((5500.0, 4.05), (6563.0, 3.33), (4861.0, 4.60), (3727.0, 5.86)):
         assert k(2, wavelength) == pytest.approx(wanted, abs=0.02)
@@ -49,13 +49,13 @@ def test_curves_have_no_steps_and_never_brighten():
     lam = np.arange(80.0, 24501.0)
     laws = extinction.laws(lam)
     assert (laws >= 0.0).all()
-    # The steepest piece of a published curve is 0.02 a step of 1 A at 1300 A; 0.63 um joins to 0.03.
+    # Published curves change by at most 0.02 per step of 1 A, at 1300 A; the two parts at 0.63 um differ by 0.03.
     for first, last, step in ((800.0, 1300.0, 0.08), (1300.0, 6200.0, 0.025), (6200.0, 24500.0, 0.035)):
         inside = (lam >= first) & (lam <= last)
         assert np.abs(np.diff(laws[:, inside])).max() < step
 
 
-def test_calzetti_goes_on_along_its_tangent():
+def test_calzetti_is_extrapolated_along_its_tangent():
     inner = (k(2, 1201.0) - k(2, 1200.0)) / 1.0
     outer = (k(2, 1200.0) - k(2, 1000.0)) / 200.0
     assert outer == pytest.approx(inner, rel=2e-3)
@@ -92,7 +92,7 @@ def test_milky_way_reaches_over_the_whole_grid():
     ],
 )
 def test_band_coefficients_of_the_milky_way(name, wanted):
-    """A / E(B-V) of a flat f_nu source."""
+    """Compare A / E(B-V) for a source with flat f_nu."""
     assert dimming(name, 0.05) / 0.05 == pytest.approx(wanted, rel=0.02)
 
 
@@ -105,12 +105,12 @@ def dimming(name: str, ebv: float) -> float:
 
 
 def test_scaling_a_bands_extinction_linearly_would_be_wrong():
-    # What Serrano et al. 2024 do from E(B-V) = 0.2; we integrate at the E(B-V) itself.
+    # Serrano et al. 2024 scale from E(B-V) = 0.2; the code integrates at each E(B-V).
     assert abs(dimming("euclid_vis", 0.5) - 2.5 * dimming("euclid_vis", 0.2)) > 0.01
     assert abs(dimming("euclid_h", 0.5) - 2.5 * dimming("euclid_h", 0.2)) < 0.002
 
 
-def test_transmitted_keeps_single_precision():
+def test_transmission_keeps_single_precision():
     curve = np.ones((2, 3), np.float32)
     out = extinction.transmission(curve, np.array([[1.0], [2.0]], np.float32))
     assert out.dtype == np.float32

@@ -1,4 +1,4 @@
-"""Hydrogen between the galaxies: its published formulas, the sky as observed, and the same flux by every way."""
+"""Compare intergalactic absorption with published formulas and observations, and between all ways to compute fluxes."""
 
 import tomllib
 from dataclasses import replace
@@ -50,8 +50,8 @@ def test_the_continuum_is_the_published_one(z, x):
 
 
 @given(st.floats(0.0, 20.0), st.floats(0.0, 0.2), st.floats(0.1, 24000.0))
-def test_more_clouds_let_less_through(z, further, wavelength):
-    """Seen at one wavelength, of ever farther sources; redwards of Lyman alpha nothing is lost."""
+def test_more_clouds_transmit_less(z, further, wavelength):
+    """At a fixed wavelength, transmission decreases with the redshift of the source; redward of Lyman alpha it is 1."""
     near, far = intergalactic.transmission([wavelength], [z, z + further])[:, 0]
     assert 0.0 <= far <= near * (1.0 + 1e-12)
     assert near <= 1.0
@@ -68,16 +68,16 @@ def test_series_of_lines():
     assert np.all(np.diff(np.log(damped)) < 0)
 
 
-def test_neighbours_in_redshift_do_not_jump():
-    """Edges of lines are shared between the bins in which they lie."""
+def test_transmission_is_continuous_in_redshift():
+    """A line edge is distributed over the bins that it crosses."""
     band = passbands.load("lsst_u")
     z = np.linspace(2.0, 2.002, 41)
     seen = intergalactic.transmission(band.wavelength, z) @ passbands.weights(band)
     assert np.abs(np.diff(seen, 2)).max() < 2e-5 * seen[0]
 
 
-def test_only_what_is_blue_and_far_is_dimmed(galaxies, library):
-    """Tables, integration and whole spectra give the same; without the request nothing changes."""
+def test_only_blue_bands_of_distant_galaxies_are_dimmed(galaxies, library):
+    """Tables, integration and whole spectra agree. Without the option in the request, fluxes are unchanged."""
     behind = replace(library, intergalactic=True)
     table = galaxies(60, z_obs=np.linspace(0.05, 2.95, 60))
     names = ("gaia_bp", "lsst_u", "lsst_g", "lsst_r")
@@ -97,20 +97,20 @@ def test_only_what_is_blue_and_far_is_dimmed(galaxies, library):
 
 
 def differing(band, setting, behind, seed):
-    """Largest error of tables against integration."""
+    """Return the largest error of tables relative to integration."""
     rows = errors_measured.draw_galaxies(400, len(behind), np.random.default_rng(seed))
     fast = flux_tables.galaxy_fluxes(rows, flux_tables.open_grid([band], [setting], behind))
     return np.abs(fast / integration.galaxy_fluxes(rows, [band], behind) - 1.0).max()
 
 
-def test_tables_hold_it(library):
+def test_tables_include_intergalactic_absorption(library):
     g, behind = passbands.load("lsst_g"), replace(library, intergalactic=True)
     assert differing(g, Setting(0.007, 6, 3), behind, 8) < 3e-4
     assert build_tables.library_key(behind) != build_tables.library_key(library)
 
 
-def test_a_request_asks_for_it():
-    """From the request to the library of the workers."""
+def test_a_request_enables_intergalactic_absorption():
+    """The option is passed from the request to the library of the workers."""
     wanted = from_table(tomllib.loads(requests.text("[fluxes]\nintergalactic = true\n")))
     assert inputs.read(wanted.curves).library.intergalactic
     assert inputs.galaxy_library_from_facts(Path(), {"intergalactic": True}).intergalactic
@@ -118,8 +118,8 @@ def test_a_request_asks_for_it():
 
 
 @pytest.mark.nightly
-def test_tables_know_their_errors_behind_it(library):
-    """No setting is trusted that was measured without the gas; the chosen one is as good as was asked for."""
+def test_table_errors_are_measured_with_absorption(library):
+    """Settings measured without absorption are not used; the selected setting has the requested accuracy."""
     behind = replace(library, intergalactic=True)
     u, i = passbands.load("lsst_u"), passbands.load("des_i")
     found = errors_measured.choose([u, i], SURVEY, behind)
@@ -129,8 +129,8 @@ def test_tables_know_their_errors_behind_it(library):
 
 
 @pytest.mark.parametrize("z", [0.0, 0.5, 2.0, 6.4])
-def test_nothing_is_brighter_for_it(z):
-    """Down to where the published approximation has gone over to negative depths."""
+def test_absorption_never_brightens(z):
+    """This includes wavelengths at which the published approximation gives negative depths."""
     passed = intergalactic.transmission(np.arange(1.0, 10_000.0), [z])
     assert (passed <= 1.0).all()
     assert (passed >= 0.0).all()

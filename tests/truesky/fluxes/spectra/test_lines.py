@@ -1,4 +1,4 @@
-"""Emission lines: positions, widths and, above all, fluxes."""
+"""Test positions, widths and fluxes of emission lines."""
 
 import csv
 from pathlib import Path
@@ -28,7 +28,7 @@ def bins(found: lines.Profiles) -> np.ndarray:
 
 @given(st.integers(0, len(LINES) - 1), st.floats(0.0, 2.6), st.floats(50.0, 400.0), st.sampled_from(["air", "vacuum"]))
 def test_the_integral_is_the_flux_and_the_width_is_sigma(line, z, sigma, medium):
-    # The printed exponent, with its stray 1 / (1 + z), would hold sqrt(1 + z) times the flux.
+    # The printed exponent, with an additional 1 / (1 + z), would give sqrt(1 + z) times the flux.
     found = lines.profiles(one(line, 3e-16), np.array([z]), np.array([sigma]), medium)
     (f_lambda,), (lam,) = found.f_lambda, bins(found)
     assert f_lambda.sum() == pytest.approx(3e-16, rel=1e-12, abs=0.0)
@@ -53,7 +53,7 @@ def test_narrow_lines_are_binned_not_sampled():
         assert found.f_lambda.sum() == pytest.approx(1.0, rel=1e-6)
 
 
-def test_air_wavelengths_are_the_tables():
+def test_air_wavelengths_agree_with_the_table():
     # Table of Serrano et al. 2024, from NIST.
     with (Path(lines.__file__).with_suffix(".csv")).open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -95,7 +95,7 @@ def test_doublets():
     expected = {"oiii_2": 1 / 2.98, "nii_2": 1 / 3.05, "siii_2": 1 / 2.47}
     assert {name: ratios[name] for name in expected} == pytest.approx(expected)
     assert len(lines.columns()) == 15
-    # A column holds the primary alone: were it the total, as the text may be read, a doublet would sum to 1.
+    # A column contains only the primary line. If it were the total, as the text may suggest, a doublet would sum to 1.
     totals = {column: sum(line.ratio for line in LINES if line.column == column) for column in lines.columns()}
     assert totals == pytest.approx(
         {
@@ -134,7 +134,7 @@ def test_lines_at_the_edge_of_the_grid_are_cut_not_moved():
     assert lines.add(np.zeros((1, 100)), 8000, found).sum() == 0.0
 
 
-def test_lines_outside_the_wanted_range_are_not_made():
+def test_lines_outside_the_range_are_omitted():
     fluxes = np.ones((1, len(LINES)))
     found = lines.profiles(fluxes, np.array([0.5]), np.array([100.0]), "vacuum", 9000.0, 12000.0)
     # H alpha 9847, the two [N II], the two [S II].
@@ -143,7 +143,7 @@ def test_lines_outside_the_wanted_range_are_not_made():
 
 
 def test_a_grism_sees_a_line_at_every_redshift():
-    """Some line is in 0.95 - 2.0 um at any z < 3: no redshift at which slitless spectra of emitters are empty."""
+    """For any z < 3 some line is in 0.95 to 2.0 um, so slitless spectra of emitters are never empty."""
     z = np.arange(0.0, 3.0, 0.01)[:, None]
     seen = np.array([line.vacuum for line in LINES]) * (1.0 + z)
     assert ((seen > 9500.0) & (seen < 20_000.0)).any(1).all()

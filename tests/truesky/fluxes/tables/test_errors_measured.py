@@ -1,4 +1,4 @@
-"""The errors of tables for what was not measured in advance."""
+"""Test the measured errors of tables for external spectra and passbands."""
 
 import dataclasses
 
@@ -13,7 +13,7 @@ from truesky.request.accuracy import DRAFT, REFERENCE, SURVEY
 
 @pytest.fixture
 def mine():
-    """A filter of intermediate width."""
+    """Return a filter of intermediate width."""
     return filter_of(1000)
 
 
@@ -22,7 +22,7 @@ def filter_of(width):
     return passbands.Passband("mine", wavelength, np.hanning(width + 2)[1:-1], "air")
 
 
-def test_what_was_measured_is_looked_up(library):
+def test_measured_bands_are_looked_up(library):
     bands = [passbands.load(name) for name in ("euclid_vis", "lsst_u")]
     for accuracy in (DRAFT, SURVEY, REFERENCE):
         wanted = settings.choose(["euclid_vis", "lsst_u"], accuracy)
@@ -30,7 +30,7 @@ def test_what_was_measured_is_looked_up(library):
 
 
 @pytest.mark.parametrize("accuracy", [DRAFT, SURVEY])
-def test_a_filter_of_others_is_measured(library, mine, accuracy):
+def test_a_user_filter_is_measured(library, mine, accuracy):
     (choice,) = errors_measured.choose([mine], accuracy, library)
     rows = errors_measured.draw_galaxies(1000, len(library), np.random.default_rng(77))
     fast = flux_tables.galaxy_fluxes(rows, flux_tables.open_grid([mine], [choice.setting], library))
@@ -48,12 +48,12 @@ def test_no_table_for_the_reference(library, mine):
     assert errors_measured.choose([mine], REFERENCE, library) == (settings.INTEGRATED,)
 
 
-def test_spectra_of_others_are_measured_although_the_band_is_known(library, monkeypatch):
+def test_external_spectra_are_measured_in_a_built_in_band(library, monkeypatch):
     monkeypatch.setattr(errors_measured, "measure", lambda *_: settings.Choice(None, 1.0, 1.0))
     band = passbands.load("euclid_h")
     assert errors_measured.choose([band], SURVEY, library)[0].setting is not None
-    # No table is fine enough for them.
-    assert errors_measured.choose([band], SURVEY, dataclasses.replace(library, own=True)) == (settings.INTEGRATED,)
+    # No table is accurate enough for these filters.
+    assert errors_measured.choose([band], SURVEY, dataclasses.replace(library, external=True)) == (settings.INTEGRATED,)
 
 
 def test_errors_are_measured_on_every_template_and_law(library):
@@ -62,13 +62,13 @@ def test_errors_are_measured_on_every_template_and_law(library):
     assert set(mix.law.ravel()) == set(range(5))
     assert mix.ebv.shape == mix.frac.shape == (2, 2000)
     assert mix.frac.sum(0) == pytest.approx(1.0)
-    # Of a uniform distribution's ends, 2000 come this near.
+    # The extremes of 2000 uniform random numbers are this near to the ends.
     for found, first, last in ((mix.frac, 0.0, 1.0), (mix.ebv, 0.0, 0.6), (mix.z_obs, -0.03, 3.03)):
         assert (found.min() - first, last - found.max()) == pytest.approx((0.0, 0.0), abs=0.01 * (last - first))
 
 
-def test_numbers_of_the_files_beside_the_code_are_in_the_keys(library, mine, monkeypatch, request):
-    """Depths of hydrogen's lines, and the galaxies' own, are in the key of the errors."""
+def test_data_files_are_in_the_keys(library, mine, monkeypatch, request):
+    """Keys of the errors include the depths of hydrogen's lines and the line data of galaxies."""
     request.addfinalizer(code_fingerprints.code_key.cache_clear)
     keys, changed = [], {}
     content = code_fingerprints._content

@@ -1,4 +1,4 @@
-"""The fast path against the slow one: tables and integration give the same fluxes, everywhere."""
+"""Compare fluxes from tables with integration."""
 
 import dataclasses
 import time
@@ -33,13 +33,13 @@ def grid(library):
 
 
 def drawn(n, seed=5):
-    """Galaxies uniform over all that the tables cover."""
+    """Return galaxies distributed uniformly over the range of the tables."""
     rng = np.random.default_rng(seed)
     return dataclasses.replace(errors_measured.draw_galaxies(n, 31, rng), magnification=rng.uniform(0.5, 3.0, n))
 
 
 @pytest.mark.parametrize("accuracy", [DRAFT, SURVEY])
-def test_fast_is_slow_within_the_accuracy(library, accuracy):
+def test_tables_agree_with_integration_within_the_accuracy(library, accuracy):
     rows = drawn(1500)
     fast = flux_tables.galaxy_fluxes(rows, flux_tables.open_grid(CURVES, chosen(accuracy), library))
     slow = integration.galaxy_fluxes(rows, CURVES, library)
@@ -57,7 +57,7 @@ def test_fast_is_slow_within_the_accuracy(library, accuracy):
     line=st.floats(0.0, 3e-16),
     abs_mag=st.floats(-30.0, 5.0),
 )
-def test_fast_is_slow_for_any_galaxy(library, grid, z, sed, law, ebv, frac, a_v, line, abs_mag):
+def test_tables_agree_with_integration_for_any_galaxy(library, grid, z, sed, law, ebv, frac, a_v, line, abs_mag):
     mix = TemplateMix(*(np.array(x)[..., None] for x in (z, sed, law, (frac, 1.0 - frac), ebv)))
     one = np.ones(1)
     rows = Galaxies(mix, abs_mag * one, 20.0 * one, np.full((1, len(lines.line_list())), line), one, a_v * one)
@@ -67,7 +67,7 @@ def test_fast_is_slow_for_any_galaxy(library, grid, z, sed, law, ebv, frac, a_v,
 
 
 def test_lines_alone(library, grid):
-    # Where a band sees at least 1 % of what it can; out in the wing of a line there is nothing to be right about.
+    # Compare only if the band receives at least 1 % of its maximum, since the flux in the wing of a line is negligible.
     rows = dataclasses.replace(drawn(400), mag_r01=np.full(400, 45.0))
     fast, slow = flux_tables.galaxy_fluxes(rows, grid), integration.galaxy_fluxes(rows, CURVES, library)
     bright = slow > 0.01 * slow.max(0)
@@ -83,7 +83,7 @@ def test_a_source_does_not_depend_on_its_neighbours(grid):
     np.testing.assert_array_equal(flux_tables.galaxy_fluxes(rows.select(slice(7, 8)), grid), wanted[7:8])
 
 
-def test_flux_is_linear_in_what_it_is_linear_in(grid):
+def test_flux_is_linear_in_components_and_lines(grid):
     rows = drawn(100)
     wanted = flux_tables.galaxy_fluxes(rows, grid)
     lensed = dataclasses.replace(rows, magnification=3.0 * rows.magnification)
@@ -129,7 +129,7 @@ def test_a_component_without_flux_may_have_any_dust(grid):
 @pytest.mark.parametrize(
     ("column", "value"), [("ebv_1", 0.61), ("ebv_2", 2.5), ("a_v", 1.56), ("a_v", 30.0), ("z_obs", 3.1)]
 )
-def test_what_lies_beyond_the_tables_is_integrated_not_extrapolated(galaxies, library, column, value):
+def test_galaxies_outside_the_tables_are_integrated(galaxies, library, column, value):
     values = galaxies()[column].to_numpy().copy()
     values[[3, 11]] = value
     table = galaxies(**{column: values, "ext_law_1": 2, "ext_law_2": 1})
@@ -144,7 +144,7 @@ def test_what_lies_beyond_the_tables_is_integrated_not_extrapolated(galaxies, li
         np.testing.assert_allclose(fast, slow, rtol=SURVEY.flux)
 
 
-def test_stars_fast_are_slow(stars_library):
+def test_star_tables_agree_with_integration(stars_library):
     rng = np.random.default_rng(4)
     n = 2000
     frac = rng.dirichlet(np.ones(3), n).T
@@ -192,7 +192,7 @@ def test_another_library_has_other_tables(library, tmp_path, monkeypatch):
 
 
 def test_the_tables_are_small(grid):
-    # 4.5 MB a band.
+    # 4.5 MB per band.
     assert max(table.nbytes for table in grid.tables) <= 4.5e6
 
 
@@ -210,7 +210,7 @@ def test_hundreds_of_times_faster(library, grid):
             work()
             best = min(best, time.process_time() - started)
         times.append(best)
-    # Measured: some 200 with 22 bands, and as much with these three.
+    # Measured: about 200 with 22 bands, and with these three.
     assert times[1] / 200 > 30.0 * times[0] / 20_000
 
 
@@ -225,7 +225,7 @@ def test_a_library_is_hashed_once(monkeypatch):
     assert build_tables.library_key(library) == key
 
 
-def test_prepare_leaves_nothing_to_make(monkeypatch):
+def test_prepare_fills_the_cache(monkeypatch):
     wanted = (CURVES, chosen(SURVEY), templates.galaxy_library(), templates.stellar_library(), SURVEY)
     band_fluxes.prepare(*wanted)
     monkeypatch.setattr(build_tables, "_compute_galaxy_table", None)

@@ -1,4 +1,4 @@
-"""The choice of tables: the smallest whose measured error is inside what is allowed."""
+"""Test the choice of tables: the smallest with a measured error within the allowed error."""
 
 import dataclasses
 import json
@@ -13,7 +13,7 @@ from truesky.fluxes.tables import settings
 from truesky.fluxes.tables.settings import CANDIDATES, MARGIN, choose
 from truesky.request.accuracy import DRAFT, REFERENCE, SURVEY
 
-# Those of Serrano et al. 2024.
+# Bands of Serrano et al. 2024.
 BANDS = (
     "euclid_vis", "euclid_y", "euclid_j", "euclid_h", "gaia_g", "gaia_bp", "gaia_rp", "des_g", "des_r", "des_i",
     "des_z", "lsst_u", "lsst_g", "lsst_r", "lsst_i", "lsst_z", "lsst_y", "cfis_u", "cfis_r", "jedis_g", "ps1_i",
@@ -53,7 +53,7 @@ def test_the_usual_accuracies_are_tabulated_in_every_band(accuracy):
     assert settings.stars_tabulated(accuracy)
 
 
-def test_what_the_paper_reached_is_bettered():
+def test_errors_are_below_the_published_ones():
     # Serrano et al. 2024: 0.005 mag rms.
     rms = np.array([choice.rms for choice in choose(BANDS, SURVEY)])
     assert np.sqrt(np.mean(rms**2)) < 1e-4
@@ -62,18 +62,18 @@ def test_what_the_paper_reached_is_bettered():
     assert np.sqrt(np.mean(draft**2)) < 5e-4
 
 
-def test_more_accurate_is_never_smaller():
+def test_higher_accuracy_never_has_a_smaller_table():
     loose, tight = choose(BANDS, DRAFT), choose(BANDS, SURVEY)
     assert all(a.setting.size <= b.setting.size for a, b in zip(loose, tight, strict=True))
 
 
-def test_an_unknown_band_takes_what_is_right_for_all():
+def test_an_unknown_band_gets_a_setting_for_all_bands():
     [choice] = choose(["my_filter"], SURVEY)
     assert choice.setting is not None
     assert choice.largest == max(c.largest for c in settings._read_errors()[choice.setting].values())
 
 
-def test_what_is_stored_is_json():
+def test_facts_are_json():
     assert json.loads(json.dumps([choice.facts() for choice in choose(BANDS, SURVEY)]))
     assert json.loads(json.dumps(settings.star_error_facts(SURVEY)))["covered"] == {"a_v": [0.0, 5.0]}
     assert json.loads(json.dumps(settings.star_error_facts(REFERENCE)))["covered"] is None

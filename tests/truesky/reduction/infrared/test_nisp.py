@@ -1,4 +1,4 @@
-"""NISP's masters and calibrated images, of real rendered frames of a lake, against what was drawn."""
+"""Compare NISP masters and calibrated images of rendered frames of a lake with the truth."""
 
 import numpy as np
 import pytest
@@ -54,7 +54,7 @@ stars = "stars.csv"
 
 
 def build(folder, side, flats, sources=STARS):
-    """A field in four dithers and frames that calibrate it, their masters and calibrated images."""
+    """Make a field in four dithers with calibration frames, their masters and calibrated images."""
     root = layout.resolve_lake(folder / "lake")
     text = REQUEST.format(flats=flats, sources=sources)
     (folder / "stars.csv").write_text("ra,dec,mag\n53.117,-27.808,17.0\n53.119,-27.807,20.0\n")
@@ -79,7 +79,7 @@ def master(made, name):
 
 
 def residuals(made):
-    """Of each science frame: (calibrated - truth, NaN where sources are or flags; weight; the sky's truth)."""
+    """Yield (calibrated - truth, NaN at sources and flags; weight; sky in the truth) of each science frame."""
     products = read.version(layout.resolve_lake(made / "lake"), "products")
     for row in products.rows().to_pylist():
         found = list((made / "images").glob(f"{row['exposure_id']:06d}_*.fits"))
@@ -94,7 +94,7 @@ def residuals(made):
 
 
 def check(made):
-    """Blocks of 64 pixels within 0.3 % of the sky in the mean of the dithers; weight times variance 1 within 2 %."""
+    """In the mean of the dithers, blocks of 64 pixels agree with the sky within 0.3 %; weight times variance is 1."""
     found = list(residuals(made))
     assert len(found) >= 3
 
@@ -121,7 +121,7 @@ def test_a_quarter_of_a_detector(tmp_path):
     check(build(tmp_path, 1024, 6, requests.shallow(19.0, 19.0) + '[fluxes]\nbands = ["euclid_j"]\n'))
 
 
-def test_masters_are_what_the_detector_has(made):
+def test_masters_agree_with_the_detector(made):
     root = layout.resolve_lake(made / "lake")
     with small_detectors(192):
         (own,) = lake_frames.from_lake(root).values()
@@ -153,7 +153,7 @@ def frames_of_master(mean, error):
     return calibration.CombinedFrame(mean, error, np.ones(mean.shape, np.int16))
 
 
-def test_a_calibrated_image_says_what_it_is(made):
+def test_header_of_a_calibrated_image(made):
     found = files.read_image(sorted((made / "images").iterdir())[0])
     assert (found.card("CALDARK"), found.card("CALLINEA"), found.card("CALFLAT")) == (True, True, True)
     assert (found.card("CALPERS"), found.card("BUNIT")) == (True, "electron")
@@ -165,8 +165,8 @@ def test_a_calibrated_image_says_what_it_is(made):
     assert header["WEIGHT1"] + header["WEIGHT2"] == pytest.approx(1.0)
 
 
-def test_a_frame_alone_foresees_as_much_and_can_be_left_as_it_is(made, tmp_path):
-    """What earlier frames left is of all of the lake; without it the image has more."""
+def test_persistence_of_a_single_frame_is_predicted_or_kept(made, tmp_path):
+    """Persistence is predicted from all frames in the lake; without the correction, the image contains more charge."""
     path = sorted((made / "images").iterdir())[-1]
     call = ["--lake", str(made / "lake"), "--masters", str(made / "masters"), "--exposures", str(int(path.name[:6]))]
     with small_detectors(192):
@@ -180,10 +180,10 @@ def test_a_frame_alone_foresees_as_much_and_can_be_left_as_it_is(made, tmp_path)
     assert 0.05 < np.median(left.reduced.image - usual.reduced.image) < 3.0
 
 
-def test_what_is_missing_is_named(made, tmp_path, capsys):
+def test_message_names_what_is_missing(made, tmp_path, capsys):
     call = ["--lake", str(made / "lake"), "--out", str(tmp_path / "out")]
     with small_detectors(192):
         assert reduce.main(call) == 2
-        assert "--masters: which folder? Or --without dark linearity flat" in capsys.readouterr().err
+        assert "--masters FOLDER is required, or --without dark linearity flat" in capsys.readouterr().err
         assert reduce.main([*call, "--masters", str(tmp_path)]) == 2
         assert "NISP-P_4-16-4_DET22_dark.fits" in capsys.readouterr().err

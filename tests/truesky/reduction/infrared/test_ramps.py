@@ -1,4 +1,4 @@
-"""What an observer makes of a ramp's signal, against ramps that are drawn."""
+"""Compare the model of a ramp's estimated signal with simulated ramps."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ def scene_of(kind="photometric"):
 
 
 def estimated(scene, signal, b=0.0, coupled=False, seed=1):
-    """Signals of SIDE x SIDE ramps, read noise in them and no drift."""
+    """Return signals of SIDE x SIDE ramps with read noise and without drift."""
     rng, mode = np.random.default_rng(seed), ramp.mode_of_scene(scene)
     light = np.full((SIDE, SIDE), signal)
     frame = light if b == 0.0 else np.stack([light, 0 * light, 0 * light, 0 * light + b])
@@ -41,12 +41,12 @@ def test_bias_and_variance_are_those_of_drawn_ramps(kind, signal):
     error = found.std() / SIDE
     assert found.mean() - signal == pytest.approx(float(estimator.bias(np.array(signal))), abs=4 * error)
     assert found.var() == pytest.approx(float(estimator.variance(np.array(signal))), rel=0.02)
-    # What the bias is beside: a third of a per cent of a sky.
+    # For comparison: the bias is a third of a per cent of a typical sky.
     assert -0.8 < float(estimator.bias(np.array(signal))) < -0.05
 
 
 @pytest.mark.parametrize(("kind", "signal"), [("photometric", 6e4), ("spectroscopic", 4e4)])
-def test_a_bent_ramp_is_straightened(kind, signal):
+def test_nonlinearity_of_a_ramp_is_corrected(kind, signal):
     scene, b = scene_of(kind), 6e-7
     bend = RampNonlinearity.from_scene(scene, EVERY)
     found, misfit = estimated(scene, signal, b=b)
@@ -63,7 +63,7 @@ def test_a_bent_ramp_is_straightened(kind, signal):
     ("band", "lamps"), [("euclid_y", (1, 2)), ("euclid_j", (2, 3)), ("euclid_h", (4, 5)), ("nisp_red", (2, 3, 4, 5))]
 )
 def test_a_mix_of_lamps_has_the_sky_s_colour(band, lamps):
-    """The mean wavelength of its light is the sky's, by which a slope of the response by wavelength is matched."""
+    """The mean wavelength of its light is that of the sky, which corrects a response that is linear in wavelength."""
     from truesky.render.effects.light import calibration_lamp
     from truesky.render.sky import diffuse_light
 

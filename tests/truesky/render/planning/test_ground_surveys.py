@@ -46,7 +46,7 @@ def test_a_line_is_an_exposure(tmp_path):
     [
         ("", "column ra is missing"),
         (HEAD.replace(",dec", "") + "\n", "column dec is missing"),
-        (f"{HEAD},colour\n{ROW},red\n", "column colour is not known"),
+        (f"{HEAD},colour\n{ROW},red\n", "column colour is unknown"),
         (f"# one\n# two\n{HEAD}\n{ROW}\n{ROW.replace('20.5', 'x')}\n", "line 5: dec = 'x' is not a number"),
         (f"{HEAD}\n{ROW.replace('20.5', '90.1')}\n", "line 2: dec = 90.1 is outside -90 to 90"),
         (f"{HEAD}\n{ROW.replace('20.5', 'nan')}\n", "line 2: dec = nan is outside"),

@@ -51,7 +51,7 @@ def test_invalid_lamps_are_refused():
         flats(exposures=1, bands=["euclid_y"], lamps=[5])
     for lamps, message in (
         ([6], "6 is not a whole number from 1 to 5"),
-        ([1, 1], "names a lamp twice"),
+        ([1, 1], "contains a lamp twice"),
         ([], "is not"),
     ):
         with pytest.raises(BadInput, match=rf"observation\[0\]\.lamps.*{message}"):
@@ -274,7 +274,7 @@ def test_darks_after_a_bright_exposure():
         ({"bright": "sky", "lamps": [3]}, "lamps must not be set if bright = 'sky'"),
         ({"bright": "moon"}, "bright"),
         ({"image_type": "dark", "exposures": 1, "delays_s": [100.0]}, "delays_s is not for dark: used by persistence"),
-        ({"channels": ["VIS"]}, "image_type = 'persistence' is none of VIS's"),
+        ({"channels": ["VIS"]}, "image_type = 'persistence' is not a type of VIS"),
     ],
 )
 def test_invalid_persistence_darks_are_refused(more, message):

@@ -48,7 +48,7 @@ def test_sections_of_both_amplifiers_cover_the_frame(decam):
             seen[tools.window(header[f"{key}{letter}"])] += 1
     assert seen.max() == 1
     layout = one.scene.layout
-    assert (seen == 0).sum() == layout.rows * layout.scan_columns * 2
+    assert (seen == 0).sum() == layout.overscan_rows * layout.scan_columns * 2
     data = np.zeros(pixels.shape, bool)
     data[tools.window(header["DATASEC"])] = True
     for letter in "AB":

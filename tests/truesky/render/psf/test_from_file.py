@@ -222,7 +222,7 @@ def test_a_request_names_it_by_band_and_detector(lake, tmp_path):
         plan_exposures.plan(lake, asked(tmp_path, lsst_r="{detector}.psf"))
     with pytest.raises(BadInput, match=r"psf.lsst_i: no exposure is taken in this band"):
         plan_exposures.plan(lake, asked(tmp_path, lsst_i="R22_S11.psf"))
-    with pytest.raises(BadInput, match=r"psf.lsst_r wants text, got 3"):
+    with pytest.raises(BadInput, match=r"psf.lsst_r must be text, got 3"):
         asked(tmp_path, lsst_r=3)
 
 
@@ -245,7 +245,7 @@ def test_of_a_set_each_exposure_has_one(tmp_path):
     assert drawn(pointings, 2) != found
     with pytest.raises(BadInput, match=r"psf.lsst_r names no file"):
         asked(tmp_path, lsst_r=[])
-    with pytest.raises(BadInput, match=r"psf.lsst_r wants a list of texts"):
+    with pytest.raises(BadInput, match=r"psf.lsst_r must be a list of texts"):
         asked(tmp_path, lsst_r=[3])
 
 
