@@ -79,7 +79,7 @@ def test_remembered_colours_decide_nothing(tables):
     red = galaxies | {"color_gr_01": np.full(N, 1.0), "z_true": np.full(N, 0.2)}
     found, result = verdicts(red, fluxes)
     assert (found["c_perp_z0.2"], found["c_perp_z0.3"]) == ("undecided", NOT_APPLICABLE)
-    assert "remembered" in next(row.note for row in result.rows if row.quantity == "c_perp_z0.2")
+    assert "quoted from memory" in next(row.note for row in result.rows if row.quantity == "c_perp_z0.2")
 
 
 def test_what_has_no_colours_is_no_failure(tables):

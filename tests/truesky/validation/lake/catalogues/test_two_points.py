@@ -80,7 +80,7 @@ def test_no_shear_is_no_failure(shear):
         assert (row.verdict, words in row.note) == (NOT_APPLICABLE, True)
     without = Version("galaxies", {name: values for name, values in shear.items() if name != "gamma1"})
     (row,) = cosmic_shear.measure(without).rows
-    assert row.note == "galaxies have no gamma1"
+    assert row.note == "table galaxies has no column gamma1"
     (row,) = cosmic_shear.measure(Version("galaxies", none, ())).rows
     assert row.verdict == NOT_APPLICABLE
 
@@ -147,7 +147,7 @@ def test_too_little_to_cluster_is_no_failure(galaxies):
         (row,) = angular_clustering.compare({name: v[:n] for name, v in columns.items()}, mocks.FIELD).rows
         assert (row.verdict, f"{n} galaxies" in row.note) == (NOT_APPLICABLE, True)
     (row,) = angular_clustering.measure(Version("galaxies", {"id": np.arange(3)})).rows
-    assert row.note.startswith("galaxies have no ra and dec")
+    assert row.note.startswith("table galaxies has no column ra, dec")
     # A catalogue that ends before the limits, and halos whose masses nobody knows.
     bright = columns["abs_mag_r01"] < -21.0
     rows = angular_clustering.compare({name: v[bright] for name, v in columns.items()}, mocks.FIELD).rows
