@@ -108,14 +108,14 @@ def test_where_cells_are_not_known_none_are_asked_for(query):
     [
         ("SELECT BOX('', 1, 2, 3, 4) FROM t", "BOX is not possible"),
         ("SELECT POINT(1, 2) FROM t", "POINT is not possible alone"),
-        ("SELECT CONTAINS(POINT(1, 2)) FROM t", "wants 2 arguments, got 1"),
+        ("SELECT CONTAINS(POINT(1, 2)) FROM t", "requires 2 arguments, got 1"),
         ("SELECT CONTAINS(POINT(1, 2), CIRCLE(1, 2)) FROM t", "two coordinates and a radius"),
         ("SELECT CONTAINS(POINT(1), CIRCLE(1, 2, 3)) FROM t", "two coordinates"),
-        ("SELECT CONTAINS(CIRCLE(1, 2, 3), POINT(1, 2)) FROM t", "wants a POINT"),
+        ("SELECT CONTAINS(CIRCLE(1, 2, 3), POINT(1, 2)) FROM t", "requires a POINT"),
         ("SELECT CONTAINS(POINT(1, 2), POLYGON(1, 2, 3, 4)) FROM t", "three corners"),
         ("SELECT CONTAINS(POINT(1, 2), REGION('x')) FROM t", "REGION is not possible"),
         ("SELECT DISTANCE(POINT(1, 2) FROM t", "bracket is not closed"),
-        ("SELECT DISTANCE(, ) FROM t", "wants a POINT"),
+        ("SELECT DISTANCE(, ) FROM t", "requires a POINT"),
         ("SELECT " + "x" * 60_000, "at most"),
     ],
 )

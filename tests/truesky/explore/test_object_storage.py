@@ -80,9 +80,9 @@ def test_lsdb_reads_it_through_pyarrow(explored, there, monkeypatch):
     found = galaxies.cone_search(ra, dec, 1800.0).compute()
     assert sorted(found["id"]) == sorted(here.cone(ra, dec, 0.5)["id"].to_pylist())
     assert 0 < len(found) < 500
-    with pytest.raises(BadInput, match="plain is no catalogue"):
+    with pytest.raises(BadInput, match="plain is not a catalogue"):
         catalogue(there, "plain")
-    with pytest.raises(BadInput, match="is no address"):
+    with pytest.raises(BadInput, match="is not an address"):
         catalogue(str(explored), "galaxies")
 
 
