@@ -1,7 +1,7 @@
 """Count many rows for several linked charts at once; limits set in one chart apply to the others.
 
-A row counts in a chart if it lies within the limits of every column that is not on the chart's axes, and within the
-spans of the chart. Missing values (NaN) are in no bin and within no limits.
+A row counts in a chart if it lies within the limits of every column, except those on the chart's axes, and within
+the spans of the chart. Missing values (NaN) are in no bin and within no limits.
 """
 
 from __future__ import annotations

@@ -129,8 +129,8 @@ class Explorer:
     def is_listed(self, name: str) -> bool:
         """Return True if `tables` lists a table by this name.
 
-        Tables are listed by their plain names. If requests have different versions, names with the request are listed
-        too.
+        A table is listed by its plain name. If requests have different versions, it is also listed by the name with the
+        request.
         """
         table = name.rpartition(".")[2]
         return name == table or table in self._ambiguous

@@ -111,7 +111,7 @@ def test_refusals():
     ]:
         with pytest.raises(BadInput):
             Chart(axes, spans, bins)
-    with pytest.raises(BadInput, match="of the same rows"):
+    with pytest.raises(BadInput, match="columns of equal length"):
         count_rows([np.zeros(2, np.float32), np.zeros(3, np.float32)], CHARTS[:1], {})
     column = [np.zeros(2, np.float32)]
     for charts, limits in ((CHARTS[1:2], {}), ([Chart((-1,), ((0.0, 1.0),), (3,))], {}), (CHARTS[:1], {1: (0.0, 1.0)})):

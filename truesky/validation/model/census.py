@@ -31,7 +31,7 @@ COLUMNS = (
 HALO_COLUMNS = ("z_true", "log_mass")
 HALPHA_LIMITS, HALPHA_SHELLS = (5e-17, 1e-16, 2e-16, 3e-16), ((0.9, 1.8), (0.4, 1.8), (0.7, 2.0))
 SIZE_BINS = ((19, 20), (21, 22), (22, 23), (23, 24), (24, 24.5), (25, 26))
-# Redshift, half width, and the reddest I_E - M_r - DM there; a galaxy counts only if any spectrum is complete to it.
+# Redshift, half width, and the largest I_E - M_r - DM of any spectrum there, which sets the limit of M_r.
 SHELLS = ((0.1, 0.05, 0.2), (0.5, 0.1, 0.4), (1.0, 0.15, 1.5), (2.0, 0.15, 4.0))
 HALO_MASSES, HALO_SHELLS = (11.0, 12.0, 13.0), ((0.5, 0.1), (1.0, 0.1), (2.0, 0.1))
 _SIZED = 20_000

@@ -62,7 +62,7 @@ def cells_at_latitude(b: float, cells: int, south: bool = False) -> list[int]:
 
 
 def counts(b: float, cells: int, universe: stars.StarModel, dust: Float32) -> Float:
-    """Return the number of stars drawn per deg2 at a latitude, to the limits of COUNTS; companions are excluded.
+    """Return the number of stars drawn per deg2 at a latitude, without companions, white dwarfs and brown dwarfs.
 
     Parameters
     ----------
