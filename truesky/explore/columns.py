@@ -54,6 +54,7 @@ class Selection:
     part: int = 1
 
     def condition(self) -> str:
+        """Return the SQL condition of the selected rows."""
         sampled = f" AND hash({', '.join(self.keys)}) % {self.part} = 0" if self.part > 1 else ""
         return f"({self.where}\n){sampled}"
 

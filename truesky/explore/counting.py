@@ -70,6 +70,7 @@ class Chart:
 
     @property
     def cells(self) -> int:
+        """Total number of bins."""
         # Python integers have any size; a 64-bit product could wrap around to a small number.
         return math.prod(int(bins) for bins in self.bins)
 

@@ -31,7 +31,13 @@ _NULLABLE |= {
 
 
 def convert(rows: pa.Table, into: str) -> Any:
-    """Return rows as a pandas DataFrame, an astropy Table with units, or an Arrow table."""
+    """Return rows as a pandas DataFrame, an astropy Table with units, or an Arrow table.
+
+    Raises
+    ------
+    BadInput
+        If `into` is not one of INTO, or astropy cannot represent columns with the same name.
+    """
     if into == "pandas":
         gaps = {column.type for column in rows.columns if column.null_count}
         return rows.to_pandas(types_mapper=lambda kind: _NULLABLE.get(kind) if kind in gaps else None)

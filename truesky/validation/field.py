@@ -43,6 +43,7 @@ class Field:
 
     @property
     def n_patches(self) -> int:
+        """Number of patches."""
         return int(self.patch.max(initial=-1)) + 1
 
     @property

@@ -74,10 +74,12 @@ class Tracers:
     velocity: Float
 
     def select(self, mask: npt.NDArray[np.generic]) -> Tracers:
+        """Return the tracers selected by a mask or by indices."""
         return Tracers(*(getattr(self, name)[mask] for name in self.__slots__))
 
 
 def concatenate(parts: Sequence[Tracers]) -> Tracers:
+    """Return the tracers of several parts together."""
     return Tracers(*(np.concatenate([getattr(part, name) for part in parts]) for name in Tracers.__slots__))
 
 

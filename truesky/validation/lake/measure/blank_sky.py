@@ -63,6 +63,7 @@ class Tiles:
                           & (self.column >= columns.start) & (self.column + SIDE <= columns.stop))  # fmt: skip
 
     def select(self, mask: Bool) -> Tiles:
+        """Return the tiles selected by a mask."""
         return Tiles(self.pixels[mask], self.blank[mask], self.hit[mask], self.row[mask], self.column[mask])
 
 

@@ -76,10 +76,12 @@ class FrameContext:
 
     @property
     def channel(self) -> str:
+        """Channel of the frame, from its header."""
         return str(self.frame.header["CHANNEL"])
 
     @property
     def sees_sky(self) -> bool:
+        """True for images of the sky, not of lamps or darks."""
         return self.frame.header["IMAGETYP"] in SKY_TYPES
 
 

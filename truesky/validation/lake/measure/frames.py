@@ -168,6 +168,7 @@ class Frame:
 
     @property
     def seconds(self) -> float:
+        """Exposure time, s."""
         return float(self.header["EXPTIME"])
 
     @property
@@ -270,7 +271,13 @@ def _amplifier(name: str, ccd: tuple[slice, slice], bias: Array | None, cards: M
 
 
 def section(text: str) -> tuple[slice, slice]:
-    """Return the slices (rows, columns) of a section [x1:x2,y1:y2], which counts from 1 and includes both ends."""
+    """Return the slices (rows, columns) of a section [x1:x2,y1:y2], which counts from 1 and includes both ends.
+
+    Raises
+    ------
+    BadInput
+        If the text does not have this form.
+    """
     match = _SECTION.fullmatch(text.strip())
     if match is None:
         raise BadInput(f"section must be of the form [x1:x2,y1:y2], got {text!r}")

@@ -123,8 +123,7 @@ def gain_partners(science_files: Sequence[ScienceFile]) -> dict[str, ScienceFile
     """Return the partner frame for a gain measurement, by the path of the other frame of the pair.
 
     Partners show the same detector. Two flats of one lamp are a pair. For ground cameras, two sky frames are also a
-    pair; frames of one band and of similar level are preferred,
-    and each detector has one such pair.
+    pair: one per detector, if possible with the same band and similar levels.
     """
     flats: dict[tuple[Any, ...], list[ScienceFile]] = {}
     skies: dict[tuple[Any, ...], list[ScienceFile]] = {}
