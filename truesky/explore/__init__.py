@@ -7,11 +7,15 @@ demo.
 
 Examples
 --------
-from truesky.explore.explorer import Explorer
+In Python::
 
-with Explorer("out/demo/lake") as lake:
-    lake.tables()
-    lake.sql("SELECT z_obs, mag_r01 FROM galaxies WHERE z_obs < $most", most=0.5)
+    from truesky.explore.explorer import Explorer
 
-python -m truesky.explore "SELECT count(*) FROM galaxies" --lake out/demo/lake [--name REQUEST] [--out FILE]
+    with Explorer("out/demo/lake") as lake:
+        lake.tables()
+        lake.sql("SELECT z_obs, mag_r01 FROM galaxies WHERE z_obs < $most", most=0.5)
+
+On the command line::
+
+    python -m truesky.explore "SELECT count(*) FROM galaxies" --lake out/demo/lake [--name REQUEST] [--out FILE]
 """

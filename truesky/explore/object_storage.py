@@ -4,7 +4,9 @@ Files read in this way are not compared with the manifest. Use `truesky verify -
 
 Examples
 --------
-lsdb.open_catalog(catalogue("s3://sky/lake", "galaxies")).cone_search(53.1, -27.8, 60.0).compute()
+Search a cone with lsdb::
+
+    lsdb.open_catalog(catalogue("s3://sky/lake", "galaxies")).cone_search(53.1, -27.8, 60.0).compute()
 """
 
 from __future__ import annotations
