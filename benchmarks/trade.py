@@ -72,6 +72,10 @@ _TRUTH = Settings(edge=1e-6, aliased=1e-8, floor=0.0, min_size_arcsec=25.6, posi
 # Magnitudes per relative error of flux.
 _MAG = 1.0857362
 _NUMBERS = ("flux", "shape", "position", "background")
+_COLUMNS = ",".join(
+    ("edge", "aliased", "floor", "min_size_arcsec", "positions", "colours", *_NUMBERS)
+    + (*(f"{name}_held" for name in _NUMBERS), "seconds")
+)
 _SETTINGS = f"""\
 # Settings of drawing by python -m benchmarks.trade --settings, and the largest errors they make.
 #
@@ -83,7 +87,7 @@ _SETTINGS = f"""\
 # Fourier series of their PSF, pairs against the largest stamps. To each, as the root of the sum of squares, the PSF's
 # own error of {positions.NUM_STARS} and of {positions.NUM_TEST_STARS} stars of other places, their colours of eight
 # sub-bands. CPU seconds of a VIS detector's sources, on {{machine}}.
-edge,aliased,floor,min_size_arcsec,positions,colours,{",".join(_NUMBERS)},{",".join(f"{name}_held" for name in _NUMBERS)},seconds
+{_COLUMNS}
 """
 
 

@@ -90,9 +90,7 @@ def read_batches(
         text_values = {name: _text_column(path, hdu, name) for name in text_columns if name in columns_by_name}
         for first in range(0, len(hdu.data), rows_per_batch):
             batch = slice(first, first + rows_per_batch)
-            numbers = {
-                name: _native_numbers(hdu.data[name][batch], columns_by_name[name].null) for name in columns
-            }
+            numbers = {name: _native_numbers(hdu.data[name][batch], columns_by_name[name].null) for name in columns}
             yield (
                 {**numbers, **{name: _decode_texts(stored[batch]) for name, stored in text_values.items()}},
                 column_units,

@@ -1,12 +1,21 @@
-"""Look at a lake: SQL, cones, histograms, maps and downloads, for notebooks and the command line.
+"""Explore a lake: SQL, cone searches, histograms, maps and exports, for notebooks and the command line.
 
-from truesky.explore.explorer import Explorer
+Notes
+-----
+A lake can contain the tables of several requests. Name a request, or write demo.galaxies for the galaxies of request
+demo.
 
-with Explorer("out/demo/lake") as lake:
-    lake.tables()
-    lake.sql("SELECT z_obs, mag_r01 FROM galaxies WHERE z_obs < $most", most=0.5)
+Examples
+--------
+In Python::
 
-python -m truesky.explore "SELECT count(*) FROM galaxies" --lake out/demo/lake [--name REQUEST] [--out FILE]
+    from truesky.explore.explorer import Explorer
 
-A lake may hold the tables of several requests: name one, or write demo.galaxies for the galaxies of request demo.
+    with Explorer("out/demo/lake") as lake:
+        lake.tables()
+        lake.sql("SELECT z_obs, mag_r01 FROM galaxies WHERE z_obs < $most", most=0.5)
+
+On the command line::
+
+    python -m truesky.explore "SELECT count(*) FROM galaxies" --lake out/demo/lake [--name REQUEST] [--out FILE]
 """

@@ -1,4 +1,4 @@
-"""Ask a lake: python -m truesky.explore "SELECT ..." --lake LAKE [--name REQUEST] [--out FILE].
+"""Query a lake: python -m truesky.explore "SELECT ..." --lake LAKE [--name REQUEST] [--out FILE].
 
 FILE is .csv, .parquet, .fits or .vot.
 """
@@ -20,7 +20,7 @@ _MAX_ROWS_SHOWN = 40
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit status: 0, 1 the lake is damaged, 2 the call or the query is wrong."""
+    """Return the exit status: 0 on success, 1 if the lake is damaged, 2 if the call or the query is wrong."""
     options = _options(argv)
     return command.run("explore", lambda: _answer(options))
 
@@ -52,12 +52,18 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("sql", nargs="?", help="a SELECT, in DuckDB's SQL")
     parser.add_argument("--lake", required=True, help="folder of the lake, or s3://BUCKET/PREFIX")
-    parser.add_argument("--endpoint-url", help="of the object storage (default: $AWS_ENDPOINT_URL, else Amazon S3)")
-    parser.add_argument("--name", help="of the request whose tables are meant, where the lake has several")
+    parser.add_argument(
+        "--endpoint-url", help="endpoint of the object storage (default: $AWS_ENDPOINT_URL, else Amazon S3)"
+    )
+    parser.add_argument("--name", help="request whose tables are queried, if the lake contains several")
     parser.add_argument("--out", type=Path, help="write to this .csv, .parquet, .fits or .vot file")
     limit = MEMORY / _GIGABYTE
-    parser.add_argument("--memory", type=float, default=limit, help=f"GB that it may take (default {limit:g})")
-    parser.add_argument("--timeout", type=float, default=TIMEOUT, help=f"s that it may take (default {TIMEOUT:g})")
+    parser.add_argument(
+        "--memory", type=float, default=limit, help=f"memory limit of the query in GB (default {limit:g})"
+    )
+    parser.add_argument(
+        "--timeout", type=float, default=TIMEOUT, help=f"time limit of the query in s (default {TIMEOUT:g})"
+    )
     return parser.parse_args(argv)
 
 

@@ -1,16 +1,15 @@
-"""ADQL, the query language of the Virtual Observatory, in DuckDB's SQL.
+"""Translate ADQL, the query language of the Virtual Observatory, to DuckDB's SQL.
 
-in_sql      a query in ADQL -> the same in SQL, with the macros of `MACROS`
-in_cone     the condition that a row lies in HEALPix cells that a circle touches
+The translation changes TOP, which becomes LIMIT at the end of its SELECT; names of functions; and geometry: POINT,
+CIRCLE, POLYGON, CONTAINS, INTERSECTS, DISTANCE, COORD1, COORD2, and columns of STC-S polygons. Other geometry raises an
+error with its name. Quoted text does not change. The guard decides if the resulting query may run.
 
-What differs is TOP, which becomes LIMIT at the end of its SELECT; names of functions; and geometry: POINT, CIRCLE,
-POLYGON, CONTAINS, INTERSECTS, DISTANCE, COORD1, COORD2, and columns of STC-S polygons. Other geometry is refused by
-name.
-Where a query wants the rows of a catalogue in a circle, it also wants their cells among those of the circle: files and
-row groups that hold none of these are not read.
-Whatever stands in quotes stays as it is; whether the result may run is the guard's to say.
+If a query selects the rows of a catalogue in a circle, the translation also selects the HEALPix cells that the circle
+touches. Files and row groups without these cells are then not read.
 
-Ref: IVOA Recommendation ADQL 2.1
+References
+----------
+IVOA Recommendation ADQL 2.1
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ import numpy as np
 from lake_schema import sky
 from lake_schema.errors import BadInput
 
-# Vertices are lists of ra, dec, ra, dec ... deg; a side is positive where the place lies to the left of it.
+# Vertices are lists of ra, dec, ra, dec ... in deg. A side is positive if the position lies to its left.
 MACROS = (
     """CREATE MACRO adql_side(a1, d1, a2, d2, a, d) AS
        cos(radians(d1)) * cos(radians(a1)) * (cos(radians(d2)) * sin(radians(a2)) * sin(radians(d))
@@ -37,18 +36,18 @@ MACROS = (
         for i in range(1, len(v), 2)]""",
     """CREATE MACRO adql_cosine(a1, d1, a2, d2) AS
        sin(radians(d1)) * sin(radians(d2)) + cos(radians(d1)) * cos(radians(d2)) * cos(radians(a1 - a2))""",
-    # How often the sides go round a place, in radians: of a polygon with notches the sides themselves tell too little.
+    # Winding angle of the sides around a position, in radians: for concave polygons the signs of sides are not enough.
     """CREATE MACRO adql_turn(a1, d1, a2, d2, a, d) AS
        atan2(adql_side(a1, d1, a2, d2, a, d),
              adql_cosine(a1, d1, a2, d2) - adql_cosine(a1, d1, a, d) * adql_cosine(a2, d2, a, d))""",
     """CREATE MACRO adql_turns(ra, dec, v) AS
        list_sum([adql_turn(v[i], v[i + 1], v[(i + 1) % len(v) + 1], v[(i + 2) % len(v) + 1], ra, dec)
                  for i in range(1, len(v), 2)])""",
-    # Places on a side of one without notches are inside.
+    # Positions on a side of a convex polygon are inside.
     """CREATE MACRO adql_in_polygon(ra, dec, v) AS (separation(ra, dec, v[1], v[2]) < 90
        AND (list_min(adql_sides(ra, dec, v)) >= 0 OR list_max(adql_sides(ra, dec, v)) <= 0
             OR abs(adql_turns(ra, dec, v)) > pi()))""",
-    # Degrees from a place to an arc: to its great circle, or where that is nearest beyond its ends, to an end.
+    # Distance in deg from a position to an arc: to its great circle, or to an end if this is nearest.
     """CREATE MACRO adql_from_arc(a1, d1, a2, d2, a, d) AS
        CASE WHEN adql_cosine(a2, d2, a, d) > adql_cosine(a1, d1, a, d) * adql_cosine(a1, d1, a2, d2)
              AND adql_cosine(a1, d1, a, d) > adql_cosine(a2, d2, a, d) * adql_cosine(a1, d1, a2, d2)
@@ -68,7 +67,7 @@ _TOKEN = re.compile(
     r"""|(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|<>|!=|<=|>=|\|\||.""",
     re.DOTALL,
 )
-# ADQL's LOG is the natural logarithm, DuckDB's that to base 10.
+# LOG is the natural logarithm in ADQL, but the logarithm to base 10 in DuckDB.
 _RENAMED = {"LOG": "ln", "RAND": "random", "TRUNCATE": "trunc"}
 _REGIONS = {"CIRCLE", "POLYGON"}
 _GEOMETRY = {"CONTAINS", "INTERSECTS", "DISTANCE", "COORD1", "COORD2"}
@@ -76,22 +75,36 @@ _REFUSED = {"AREA", "BOX", "CENTROID", "COORDSYS", "REGION"}
 _SET = {"UNION", "INTERSECT", "EXCEPT"}
 _MAX_LENGTH = 50_000
 _CLAUSES = {"SELECT", "FROM", "WHERE", "GROUP", "HAVING", "ORDER", "ON"}
-# Between which a comparison is a condition of its own.
+# A comparison between these tokens is a complete condition.
 _CONDITION_STARTS, _CONDITION_ENDS = (
     {"WHERE", "ON", "AND", "OR", "NOT", "("},
     {"AND", "OR", ")", "GROUP", "ORDER", "LIMIT", "OFFSET", ""},
 )
-# What follows a table's name and is not another name of it.
+# Tokens after the name of a table that are not an alias.
 _NO_NAMES = {*_CLAUSES, *_SET, "JOIN", "INNER", "LEFT", "RIGHT", "FULL", "CROSS", "NATURAL", "USING", "LIMIT", "OFFSET"}
-# Cells of a cover are about this part of its radius wide, and stand in so many ranges at most.
+# Cells per radius of a circle, largest number of cell ranges, largest radius, and margin for rounding.
 _CELLS_A_RADIUS, _MAX_RANGES, _MAX_RADIUS_DEG, _ROUNDING_DEG = 4, 24, 60.0, 1e-7
 
 
 def to_sql(text: str, catalogues: Collection[str] = ()) -> str:
-    """The query in DuckDB's SQL.
+    """Translate a query from ADQL to DuckDB's SQL with the macros of MACROS.
 
-    catalogues : tables, in lower case, whose `_healpix_29` is that of ra and dec
-    Errors     : BadInput names what of ADQL is not understood
+    Parameters
+    ----------
+    text : str
+        The query in ADQL.
+    catalogues : collection of str
+        Tables, in lower case, whose column `_healpix_29` is the index of ra and dec.
+
+    Returns
+    -------
+    str
+        The query in SQL.
+
+    Raises
+    ------
+    BadInput
+        If the query is too long or uses ADQL that cannot be translated; the message names it.
     """
     if len(text) > _MAX_LENGTH:
         raise BadInput(f"ADQL: a query has at most {_MAX_LENGTH} characters")
@@ -102,16 +115,26 @@ def to_sql(text: str, catalogues: Collection[str] = ()) -> str:
 
 
 def cone_condition(column: str, ra: float, dec: float, radius: float) -> str:
-    """The condition that an index of order 29 lies in cells that a circle touches, as few ranges.
+    """Return the SQL condition that an order-29 index lies in cells that a circle touches, as a few ranges.
 
-    column : of the index;  ra, dec, radius : deg
+    Parameters
+    ----------
+    column : str
+        Column of the index.
+    ra, dec, radius : float
+        Centre and radius of the circle, deg.
+
+    Returns
+    -------
+    str
+        Condition in SQL; it can also be true for cells outside the circle.
     """
     order = int(np.clip(np.ceil(np.log2(np.sqrt(sky.cell_area(0)) * _CELLS_A_RADIUS / max(radius, 1e-6))), 0, 20))
     cells = sky.cells_in_cone(ra, dec, min(radius + _ROUNDING_DEG, 180.0), order)
     gaps = np.diff(cells)
     cuts = np.flatnonzero(gaps > 1)
     if len(cuts) >= _MAX_RANGES:
-        # The widest gaps are left out.
+        # Only the widest gaps are kept, so narrow gaps between cells are included in the ranges.
         cuts = np.sort(cuts[np.argsort(gaps[cuts])[-_MAX_RANGES + 1 :]])
     firsts, lasts = cells[np.append(0, cuts + 1)], cells[np.append(cuts, len(cells) - 1)]
     ranges = [(sky.cell_range(order, a)[0], sky.cell_range(order, b)[1]) for a, b in zip(firsts, lasts, strict=True)]
@@ -122,9 +145,9 @@ def cone_condition(column: str, ra: float, dec: float, radius: float) -> str:
 
 
 def _indices(tokens: Sequence[str], catalogues: Collection[str]) -> Mapping[str, str]:
-    """What may stand before `ra` and `dec`, with its full stop or "" -> the index of the same rows.
+    """Index column for each table prefix ("" or "name.") of `ra` and `dec` in a query.
 
-    Where a name may be that of something else than a catalogue it is left out.
+    Names that may refer to something other than a catalogue are left out.
     """
     words = [token for token in tokens if not token.isspace()]
     upper = [word.upper() for word in words]
@@ -132,7 +155,7 @@ def _indices(tokens: Sequence[str], catalogues: Collection[str]) -> Mapping[str,
         return {}
     named_tables: list[tuple[str, bool]] = []
     for k, word in enumerate(upper):
-        # A comma joins, too: what follows one is no table of ours unless it stands alone.
+        # A comma also joins tables: a name counts as a catalogue only if no comma follows.
         if word in ("FROM", "JOIN"):
             name, at = "", k + 1
             while at < len(words) and not (upper[at] in _NO_NAMES or words[at] in ("(", ")", ",")):
@@ -146,7 +169,7 @@ def _indices(tokens: Sequence[str], catalogues: Collection[str]) -> Mapping[str,
             named_tables.append(
                 (alias.lower() or name.rpartition(".")[2], name in catalogues and next_word not in ("(", ","))
             )
-    # Names of subqueries stand behind a bracket.
+    # Aliases of subqueries follow a bracket.
     behind_brackets = " ".join(upper).replace(") AS ", ") ").split(") ")[1:]
     hidden = {text.partition(" ")[0].lower() for text in behind_brackets}
     names = [name for name, _ in named_tables]
@@ -161,9 +184,9 @@ def _indices(tokens: Sequence[str], catalogues: Collection[str]) -> Mapping[str,
 
 
 def _top_to_limit(tokens: Sequence[str]) -> list[str]:
-    """TOP n of every SELECT as LIMIT n where that SELECT ends: at its bracket, at OFFSET, or at the end."""
+    """Move TOP n of every SELECT to LIMIT n at the end of this SELECT: at its bracket, at OFFSET, or at the end."""
     out: list[str] = []
-    # A SELECT's depth of brackets and its limit, innermost last.
+    # Bracket depth and limit of each open SELECT, innermost last.
     open_selects: list[tuple[int, str]] = []
     depth, at = 0, 0
     while at < len(tokens):
@@ -189,7 +212,7 @@ def _top_to_limit(tokens: Sequence[str]) -> list[str]:
 
 
 def _top(tokens: Sequence[str], at: int, out: list[str]) -> tuple[int, str | None]:
-    """Pass over [DISTINCT | ALL] TOP n behind a SELECT; what stays goes to `out`."""
+    """Skip [DISTINCT | ALL] TOP n after a SELECT; append the rest to `out`. Return the next index and n."""
     ahead = [k for k in range(at, min(at + 8, len(tokens))) if not tokens[k].isspace()]
     if ahead and tokens[ahead[0]].upper() in ("DISTINCT", "ALL"):
         out += tokens[at : ahead[0] + 1]
@@ -203,10 +226,7 @@ def _top(tokens: Sequence[str], at: int, out: list[str]) -> tuple[int, str | Non
 
 
 def _translate_functions(tokens: Sequence[str], indices: Mapping[str, str]) -> list[str]:
-    """Calls of functions that have another name or form.
-
-    indices : as of `_indices`
-    """
+    """Translate calls of functions that have another name or form in SQL; `indices` come from `_indices`."""
     out: list[str] = []
     at, clauses = 0, [""]
     while at < len(tokens):
@@ -233,9 +253,9 @@ def _translate_functions(tokens: Sequence[str], indices: Mapping[str, str]) -> l
 
 
 def _cone_cells(word: str, arguments: list[list[str]], indices: Mapping[str, str]) -> str:
-    """The condition that the rows' cells are those of a circle, where a call asks whether they lie in one; else "".
+    """Condition on the cells of a circle if a call tests that catalogue positions lie in a circle, else "".
 
-    Only of places that are columns, and circles that are numbers.
+    This requires a position given as columns and a circle given as numbers.
     """
     if word not in ("CONTAINS", "INTERSECTS") or len(arguments) != 2:
         return ""
@@ -254,9 +274,9 @@ def _cone_cells(word: str, arguments: list[list[str]], indices: Mapping[str, str
 
 
 def _condition_end(tokens: Sequence[str], call_end: int, out: list[str]) -> int | None:
-    """Where what compares a call with 1 ends, `behind` the call or further on; None where it is no condition alone.
+    """Index after the comparison of a call with 1; None if the comparison is not a complete condition.
 
-    out : before the call; a "1 =" is taken away from it
+    `out` contains the tokens before the call; a "1 =" is removed from it.
     """
     following = [k for k in range(call_end, len(tokens)) if not tokens[k].isspace()][:3]
     preceding = [k for k in range(len(out)) if not out[k].isspace()][-3:]
@@ -273,7 +293,7 @@ def _condition_end(tokens: Sequence[str], call_end: int, out: list[str]) -> int 
 
 
 def _arguments(tokens: Sequence[str], bracket: int) -> tuple[list[list[str]], int]:
-    """The arguments of a call whose bracket opens there, and the place behind it."""
+    """Arguments of a call, and the index after its closing bracket."""
     arguments: list[list[str]] = [[]]
     depth = 0
     for at in range(bracket, len(tokens)):
@@ -312,7 +332,7 @@ def _geometry(word: str, arguments: list[list[str]]) -> str:
 
 
 def _inside(ra: str, dec: str, region: list[str]) -> str:
-    """The condition that a place lies in a region: a circle, a polygon, or a column of STC-S polygons."""
+    """Condition that a position lies in a region: a circle, a polygon, or a column of STC-S polygons."""
     kind = _kind(region)
     if kind == "CIRCLE":
         ra0, dec0, radius = _circle(region)
@@ -323,7 +343,7 @@ def _inside(ra: str, dec: str, region: list[str]) -> str:
 
 
 def _vertices(region: list[str]) -> str:
-    """The corners of a polygon, or of a column of STC-S polygons."""
+    """Vertices of a polygon, or of a column of STC-S polygons."""
     if _kind(region) != "POLYGON":
         return f"adql_vertices({_sql(region)})"
     corners = [part for argument in _numbers(region) for part in argument]
@@ -333,7 +353,7 @@ def _vertices(region: list[str]) -> str:
 
 
 def _kind(tokens: list[str]) -> str:
-    """The geometry that an argument calls, "" where it is something else, such as a column."""
+    """Name of the geometry function that an argument calls, "" for other arguments such as columns."""
     words = [token for token in tokens if not token.isspace()]
     word = words[0].upper() if len(words) > 1 and words[1] == "(" else ""
     if word in _REFUSED:
@@ -342,7 +362,7 @@ def _kind(tokens: list[str]) -> str:
 
 
 def _numbers(tokens: list[str]) -> list[list[str]]:
-    """The arguments of such a call, without the frame that ADQL 2.0 wants; points as two numbers."""
+    """Arguments of a geometry call without the coordinate frame of ADQL 2.0; points are pairs of numbers."""
     arguments, _ = _arguments(tokens, tokens.index("("))
     numbers = []
     for number, argument in enumerate(arguments):
@@ -354,7 +374,7 @@ def _numbers(tokens: list[str]) -> list[list[str]]:
 
 def _point(word: str, tokens: list[str]) -> list[str]:
     if _kind(tokens) != "POINT":
-        raise BadInput(f"ADQL: {word} wants a POINT")
+        raise BadInput(f"ADQL: {word} requires a POINT")
     coordinates = [part for argument in _numbers(tokens) for part in argument]
     if len(coordinates) != 2:
         raise BadInput("ADQL: a POINT has two coordinates")
@@ -370,7 +390,7 @@ def _circle(tokens: list[str]) -> list[str]:
 
 def _require_number(word: str, arguments: list[list[str]], number: int) -> list[list[str]]:
     if len(arguments) != number:
-        raise BadInput(f"ADQL: {word} wants {number} arguments, got {len(arguments)}")
+        raise BadInput(f"ADQL: {word} requires {number} arguments, got {len(arguments)}")
     return arguments
 
 
@@ -378,5 +398,5 @@ def _sql(tokens: list[str]) -> str:
     text = "".join(_translate_functions(tokens, {})).strip()
     if not text:
         raise BadInput("ADQL: an argument is missing")
-    # A column, a number or a text needs no brackets.
+    # Columns, numbers and texts need no brackets.
     return text if re.fullmatch(r"'(?:[^']|'')*'|-?[\w.]+", text) else f"({text})"

@@ -1,12 +1,8 @@
-"""Columns of a lake's tables, or expressions of them, kept as float32 files in the cache: what charts are counted from.
+"""Store columns or expressions of a lake as float32 files in the cache, from which charts are counted.
 
-Selection   which rows
-Kept        columns of some rows, row by row the same
-kept        load them, or fill and load them
-trim        remove the oldest
-
-The rows of a join come in another order each time, so that all its columns are filled by one query. Those of a table
-are filled one by one, each with a sum of its rows' keys that would differ in another order: it is compared.
+A join returns its rows in a different order each time, so one query fills all its columns. Columns of a table are
+filled one by one. Each is stored with a sum over the keys of its rows that depends on their order; columns whose sums
+differ are not combined.
 """
 
 from __future__ import annotations
@@ -26,7 +22,7 @@ from lake_schema.arrays import Array, Float32
 from truesky.numerics import cache
 from truesky.numerics.code_fingerprints import code_key
 
-# (query, texts that must each be an expression) -> its rows
+# Function of a query and of texts that must each be an expression; it returns the rows.
 Ask = Callable[[str, Sequence[str]], Iterable[pa.RecordBatch]]
 _NAME = "columns"
 _ORDER = "order"
@@ -35,12 +31,20 @@ MAX_BYTES = 4e9
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Some rows of a lake.
+    """Rows of a lake.
 
-    lake   : key of the versions of its tables
-    source : what may follow FROM;  where : condition of the rows
-    keys   : columns that tell the rows of a table apart; none: the source is no table, or has no keys
-    part   : one row in so many, chosen by its keys
+    Attributes
+    ----------
+    lake : str
+        Key of the versions of its tables.
+    source : str
+        SQL after FROM.
+    where : str
+        SQL condition of the rows.
+    keys : tuple of str
+        Columns that identify the rows of a table; () if the source is not a table or has no keys.
+    part : int
+        One row in this number is selected, by its keys.
     """
 
     lake: str
@@ -50,15 +54,27 @@ class Selection:
     part: int = 1
 
     def condition(self) -> str:
+        """Return the SQL condition of the selected rows."""
         sampled = f" AND hash({', '.join(self.keys)}) % {self.part} = 0" if self.part > 1 else ""
         return f"({self.where}\n){sampled}"
 
 
 def load(selection: Selection, expressions: Sequence[str], ask: Ask) -> list[Float32]:
-    """float32[n] of each expression, NaN where it is missing, row by row of the same rows; mapped from disc.
+    """Load columns, or query and store them if they are not in the cache.
 
-    ask    : runs a query
-    Errors : BadInput for what is no expression
+    Parameters
+    ----------
+    selection : Selection
+        Rows.
+    expressions : sequence of str
+        SQL expressions.
+    ask : callable
+        Function that runs a query; it raises BadInput if a text is not an expression.
+
+    Returns
+    -------
+    list of float32 arrays, shape (n,)
+        Values of each expression for the same rows, NaN if missing; memory-mapped files.
     """
     if selection.keys:
         loaded = [_cached_columns(selection, [text], ask) for text in expressions]
@@ -85,14 +101,14 @@ def _compute_columns(selection: Selection, expressions: Sequence[str], ask: Ask)
     order = f"hash({', '.join(selection.keys)})" if selection.keys else "0::UBIGINT"
     query = f"SELECT {', '.join(select_list)}, {order} AS row_key FROM {selection.source} WHERE {selection.condition()}"
     cache.cache_dir().mkdir(parents=True, exist_ok=True)
-    # On disc, not in memory: of a large table a column is gigabytes.
+    # Columns of large tables can have gigabytes, so they go to disc and not to memory.
     with ExitStack() as open_files:
         files = [open_files.enter_context(tempfile.TemporaryFile(dir=cache.cache_dir())) for _ in expressions]
         return _collect_batches(ask(query, [*expressions, selection.where]), files)
 
 
 def _collect_batches(batches: Iterable[pa.RecordBatch], files: Sequence[IO[bytes]]) -> dict[str, Array]:
-    """Columns, each through its file, and the sum that tells their order; the last column is the rows' keys."""
+    """Write columns to files, and sum the keys in the last column in a way that depends on the order of rows."""
     total, rows = np.zeros(1, np.uint64), 0
     for batch in batches:
         for number, file in enumerate(files):
@@ -108,10 +124,9 @@ def _collect_batches(batches: Iterable[pa.RecordBatch], files: Sequence[IO[bytes
 
 
 def trim(max_bytes: float = MAX_BYTES, folder: Path | None = None) -> int:
-    """Remove kept columns, the oldest first, until they take at most `most` bytes.
+    """Remove stored columns, the oldest first, until at most `max_bytes` bytes remain; return their number.
 
-    folder  : of the cache, None = the project's
-    returns : how many were removed
+    `folder` is the cache folder; None is the cache of the project.
     """
     folders = [path for path in (folder or cache.cache_dir()).glob(f"{_NAME}-*") if path.is_dir()]
     sizes = {path: sum(file.stat().st_size for file in path.iterdir()) for path in folders}

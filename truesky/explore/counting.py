@@ -1,14 +1,7 @@
-"""Counts of many rows for several charts at once, each under the limits that are set in the others.
+"""Count many rows for several linked charts at once; limits set in one chart apply to the others.
 
-Chart       what is counted of which columns
-counted     all charts in one pass over kept columns
-tallied     the same with the rows that lie outside of each chart's spans
-held        columns, with what is told of each at every question
-points      some of the rows that count in a chart
-span        a range that holds nearly all of a column
-
-A row counts in a chart if it lies within the limits of every column that is not the chart's own, and within the
-chart's spans. A missing value (NaN) is in no bin, and within no limits.
+A row counts in a chart if it lies within the limits of every column, except those on the chart's axes, and within
+the spans of the chart. Missing values (NaN) are in no bin and within no limits.
 """
 
 from __future__ import annotations
@@ -25,22 +18,22 @@ from lake_schema.arrays import Bool, Float, Float32, Int
 from lake_schema.errors import BadInput
 from truesky.numerics.compiling import exact_jit
 
-# Rows that are counted at a time: a few columns of them stay in a processor's own cache.
+# Number of rows per block; a few columns of a block fit into the cache of a processor.
 _BLOCK = 32768
 _MAX_COLUMNS, MAX_CELLS = 30, 8_000_000
 _MAX_AXES = 3
-# Counts of all threads together: 128 MB.
+# Largest number of counts of all threads together: 128 MB.
 _MAX_COUNTS = 2 * MAX_CELLS
-# A grid of more cells than so many a row of a block is counted in directly.
+# A grid with more cells per row of a block than this is counted in directly.
 _SPARSE = 4
-# Rows that tell a span, and the part of them that may lie outside on each side.
+# Number of rows from which a span is estimated, and the fraction that may lie outside on each side.
 _SPAN_SAMPLE, _OUTSIDE = 200_000, 2e-3
-# Rows that are looked at for a point, at first.
+# Initial number of rows that are examined per point.
 _ROWS_PER_POINT = 8
 
-# Values of which missing ones are counted at a time.
+# Number of values that are checked for missing ones at a time.
 _PIECE = 1 << 22
-# The bit of a row that has a value on every axis, one of them outside of the spans; those below are of the columns.
+# Bit of a row that has values on all axes but lies outside of the spans; lower bits are for the columns.
 _OUTSIDE_BIT = 1 << _MAX_COLUMNS
 
 Limits = Mapping[int, tuple[float, float]]
@@ -50,8 +43,16 @@ Limits = Mapping[int, tuple[float, float]]
 class Chart:
     """Counts in a grid of equal bins.
 
-    columns : numbers of the kept columns along its axes, one to three;  spans : lowest and highest value of each
-    bins    : of each axis;  own : columns whose limits do not hold here, None = those of its axes
+    Attributes
+    ----------
+    columns : tuple of int
+        Numbers of the columns along its axes, one to three.
+    spans : tuple of (float, float)
+        Lowest and highest value of each axis.
+    bins : tuple of int
+        Number of bins of each axis.
+    ignored_limits : frozenset of int, optional
+        Columns whose limits do not apply to this chart; by default those of its axes.
     """
 
     columns: tuple[int, ...]
@@ -63,22 +64,35 @@ class Chart:
         if not 1 <= len(self.columns) == len(self.spans) == len(self.bins) <= _MAX_AXES:
             raise BadInput("a chart has one to three axes, each with a span and a number of bins")
         if not all(np.isfinite([lo, hi]).all() and lo < hi for lo, hi in self.spans):
-            raise BadInput(f"spans = {self.spans} are not from a finite number to a larger one")
+            raise BadInput(f"spans must be from a finite number to a larger one, got {self.spans}")
         if not (min(self.bins) >= 1 and self.cells <= MAX_CELLS):
-            raise BadInput(f"bins = {self.bins} are not between 1 and {MAX_CELLS} in all")
+            raise BadInput(f"bins must be at least 1 per axis and at most {MAX_CELLS} in total, got {self.bins}")
 
     @property
     def cells(self) -> int:
-        # Whole numbers of any size: a product of 64 bits would wrap around, and pass for a small one.
+        """Total number of bins."""
+        # Python integers have any size; a 64-bit product could wrap around to a small number.
         return math.prod(int(bins) for bins in self.bins)
 
 
 def count_rows(columns: Sequence[Float32], charts: Sequence[Chart], limits: Limits, threads: int = 1) -> list[Int]:
-    """int64[bins of the first axis, of the second ...] of each chart.
+    """Count rows for several charts in one pass.
 
-    columns : float32[n] each;  charts : what to count
-    limits  : number of a column -> lowest and highest value that count, both included
-    threads : that count side by side, fewer where the counts of each would fill much memory
+    Parameters
+    ----------
+    columns : sequence of float32 arrays, shape (n,)
+        Columns.
+    charts : sequence of Chart
+        Charts to count.
+    limits : mapping of int to (float, float)
+        Lowest and highest value, both included, by number of the column.
+    threads : int
+        Number of threads; fewer are used if their counts would need much memory.
+
+    Returns
+    -------
+    list of int arrays, shape (bins of the first axis, bins of the second axis, ...)
+        Counts of each chart.
     """
     return count_with_outside(columns, charts, limits, threads)[0]
 
@@ -86,13 +100,33 @@ def count_rows(columns: Sequence[Float32], charts: Sequence[Chart], limits: Limi
 def count_with_outside(
     columns: Sequence[Float32], charts: Sequence[Chart], limits: Limits, threads: int = 1
 ) -> tuple[list[Int], list[int]]:
-    """(Counts as of `counted`; of each chart the rows within the limits that have a value on each of its axes, one of
-    them outside of the spans).
+    """Count rows for several charts, and rows outside of their spans, in one pass.
 
-    columns, charts, limits, threads : as of `counted`
+    Parameters
+    ----------
+    columns : sequence of float32 arrays, shape (n,)
+        Columns.
+    charts : sequence of Chart
+        Charts to count.
+    limits : mapping of int to (float, float)
+        Lowest and highest value, both included, by number of the column.
+    threads : int
+        Number of threads; fewer are used if their counts would need much memory.
+
+    Returns
+    -------
+    counts : list of int arrays
+        Counts of each chart, see `count_rows`.
+    outside : list of int
+        For each chart, rows within the limits that have a finite value on every axis and lie outside of a span.
+
+    Raises
+    ------
+    BadInput
+        If the number of columns is wrong, a number of a column does not exist, or there are too many bins.
     """
     if not 1 <= len(columns) <= _MAX_COLUMNS or len({len(column) for column in columns}) != 1:
-        raise BadInput(f"counting wants 1 to {_MAX_COLUMNS} columns of the same rows")
+        raise BadInput(f"counting requires 1 to {_MAX_COLUMNS} columns of equal length")
     _check(len(columns), charts, limits)
     tables = _tables(len(columns), charts, limits)
     rows = len(columns[0])
@@ -102,7 +136,7 @@ def count_with_outside(
     cells = sum(chart.cells for chart in charts)
 
     def count_part(number: int) -> Int:
-        # Behind the counts, of each chart the rows outside of its spans.
+        # The numbers of rows outside of each chart's spans follow the counts.
         counts = np.zeros(cells + len(charts), np.int64)
         for first in range(int(edges[number]), int(edges[number + 1]), _BLOCK):
             last = min(first + _BLOCK, int(edges[number + 1]))
@@ -120,15 +154,19 @@ def count_with_outside(
 
 
 def _check(number: int, charts: Sequence[Chart], limits: Limits) -> None:
-    """Refuse what the compiled loops, which look at no bounds, would read or write outside of their arrays."""
+    """Refuse numbers that would lead compiled loops outside of their arrays, since they do not check bounds."""
     if any(not 0 <= column < number for column in [*limits, *(c for chart in charts for c in chart.columns)]):
-        raise BadInput(f"a chart or a limit is of a column that is none of the {number}")
+        raise BadInput(f"a chart or a limit refers to a column that is none of the {number}")
     if sum(chart.cells for chart in charts) > MAX_CELLS:
         raise BadInput(f"the charts have more than {MAX_CELLS} bins together")
 
 
 def _tables(number: int, charts: Sequence[Chart], limits: Limits) -> tuple[Float32, Bool, Int, Float, Int, Int, Int]:
-    """Limits [column, 2], which of them are set [column], and of each chart: axes, spans, bins, the limits it heeds."""
+    """Arrays for the compiled loops: limits of columns, which of them are set, and properties of each chart.
+
+    They have the shapes (column, 2), (column,), and (chart, axis, ...) for axes, spans, bins, limits that apply and
+    starts.
+    """
     bounds, is_set = np.zeros((number, 2), np.float32), np.zeros(number, np.bool_)
     for column, (lo, hi) in limits.items():
         bounds[column], is_set[column] = (_next_float32(lo, up=True), _next_float32(hi, up=False)), True
@@ -145,7 +183,7 @@ def _tables(number: int, charts: Sequence[Chart], limits: Limits) -> tuple[Float
 
 
 def _next_float32(limit: float, up: bool) -> np.float32:
-    """The float32 next to a limit, not below or not above it: float32 values are on the same side of both."""
+    """Nearest float32 that is not below (up) or not above a limit; float32 values compare the same with both."""
     with np.errstate(over="ignore"):
         rounded = np.float32(limit)
     is_past = float(rounded) < limit if up else float(rounded) > limit
@@ -157,10 +195,10 @@ def _count_block(
     values: Float32, bounds: Float32, is_set: Bool, axes: Int, spans: Float, bins: Int, heeded: Int, starts: Int,
     counts: Int, outside: Int,
 ) -> None:  # fmt: skip
-    """Add the rows of a block, float32[column, n], to the counts, and those outside of a chart's spans to `beyond`.
+    """Add the rows of a block, shape (column, n), to the counts and to the numbers of rows outside of the spans.
 
-    Loops over rows have no branches, so that several are done at a time: what does not count is counted in a cell that
-    is thrown away.
+    Loops over rows have no branches, so that the compiler can vectorise them. Rows that do not count are added to an
+    extra cell, which is discarded.
     """
     rows = values.shape[1]
     fails = np.zeros(rows, np.int32)
@@ -187,7 +225,7 @@ def _count_block(
                 place = (x - low) / width * size
                 place = place if place < last else last
                 cell[i] = cell[i] * n + np.int32(place if inside else 0.0)
-                # A missing value, and an infinite one, is nowhere.
+                # Missing and infinite values are not counted anywhere.
                 out[i] |= np.int32(0) if inside else (np.int32(_OUTSIDE_BIT) if abs(x) < np.inf else np.int32(1))
             cells *= n
         if cells > _SPARSE * rows:
@@ -208,16 +246,33 @@ def _count_block(
 
 
 def points(columns: Sequence[Float32], chart: Chart, limits: Limits, max_points: int) -> tuple[Float32, int]:
-    """(float32[n, axes] places of rows that count in a chart, n <= most; one row in how many was looked at).
+    """Return the positions of rows that count in a chart, at most `max_points`.
 
-    columns, limits : as of `counted`;  chart : which;  most : how many points at most, > 0
-    All rows that count where they are no more; else rows at equal steps, the step a power of two.
+    If more rows count, rows at equal steps are returned; the step is a power of two.
+
+    Parameters
+    ----------
+    columns : sequence of float32 arrays, shape (n,)
+        Columns.
+    chart : Chart
+        The chart.
+    limits : mapping of int to (float, float)
+        Lowest and highest value, both included, by number of the column.
+    max_points : int
+        Largest number of points, at least 1.
+
+    Returns
+    -------
+    positions : float32 array, shape (m, axes)
+        Values on the axes of the chart.
+    step : int
+        One row in this number was examined.
     """
     ignored = frozenset(chart.columns) if chart.ignored_limits is None else chart.ignored_limits
     bounds = [(column, limit) for column, limit in limits.items() if column not in ignored]
     bounds += zip(chart.columns, chart.spans, strict=True)
     step = 1
-    # Of many rows few are looked at, and more only where these are not enough.
+    # Few rows of a large table are examined at first, and more only if these are not enough.
     while len(columns[0]) > step * max_points * _ROWS_PER_POINT:
         step *= 2
     while True:
@@ -239,10 +294,7 @@ def points(columns: Sequence[Float32], chart: Chart, limits: Limits, max_points:
 
 
 def span(column: Float32) -> tuple[float, float]:
-    """A range that holds nearly all finite values of a column, judged by some of its rows; (0, 1) where it has none.
-
-    column : float32[n]
-    """
+    """Return a range that contains nearly all finite values of a column, from a sample; (0, 1) if there are none."""
     sample = np.asarray(column[:: max(len(column) // _SPAN_SAMPLE, 1)], float)
     sample = sample[np.isfinite(sample)]
     if not len(sample):
@@ -255,7 +307,17 @@ def span(column: Float32) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class ChartColumns:
-    """Kept columns of the same rows, float32[n] each; of each its span and how many rows have no value."""
+    """Columns of the same rows with their properties.
+
+    Attributes
+    ----------
+    columns : list of float32 arrays, shape (n,)
+        Columns.
+    spans : list of (float, float)
+        Range that contains nearly all values of each column.
+    missing : list of int
+        Number of rows without a finite value, for each column.
+    """
 
     columns: list[Float32]
     spans: list[tuple[float, float]]
@@ -263,11 +325,11 @@ class ChartColumns:
 
 
 def inspect_columns(columns: Sequence[Float32]) -> ChartColumns:
-    """Columns, looked at once: at every move of a brush this would take as long as counting."""
+    """Determine the spans and missing values of columns once; this takes as long as counting."""
     return ChartColumns([*columns], [span(column) for column in columns], [_missing(column) for column in columns])
 
 
 def _missing(column: Float32) -> int:
-    """How many values are NaN or infinite."""
+    """Number of values that are NaN or infinite."""
     pieces = (column[first : first + _PIECE] for first in range(0, len(column), _PIECE))
     return len(column) - sum(int(np.count_nonzero(np.isfinite(piece))) for piece in pieces)

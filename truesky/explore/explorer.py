@@ -1,4 +1,4 @@
-"""A lake, opened for looking: its tables as they were at that moment, whatever is published meanwhile."""
+"""Explore the tables of a lake as they were when it was opened, whatever is published later."""
 
 from __future__ import annotations
 
@@ -19,21 +19,34 @@ from truesky.explore.process import MEMORY, TIMEOUT, TIMEOUT_HI, Process
 
 Range = tuple[float, float]
 
-# Order of the cells of a map of the sky if none is given.
+# Default HEALPix order of sky maps.
 ORDER = 8
 _MAX_BINS = 10_000
-# How a table that cannot be read is listed, by its error; all others are damaged.
+# Status in the list of tables that cannot be read, by error; other errors mean "damaged".
 _UNREADABLE: dict[type[LakeError], str] = {VersionMismatch: "unreadable version"}
 
 
 class Explorer:
-    """Tables of a lake, and the process that answers questions about them; ends with `close` or a `with` block.
+    """Tables of a lake, and a process that answers queries about them. It ends with `close` or a `with` block.
 
-    memory  : bytes that a query and its result may take together
-    timeout : s after which a query is stopped
-    request : whose tables; without it every table that all requests share goes by its name, and any table of a
-              request by both: "demo.products", in SQL too
-    damaged : tables that cannot be opened, and why; the others can be looked at
+    Parameters
+    ----------
+    lake : str or Folder
+        Folder of the lake.
+    memory : float
+        Memory limit of a query and its result together, bytes.
+    timeout : float
+        Time limit of a query, s.
+    request : str, optional
+        Name of the request whose tables are used. Without it, tables that all requests share have their plain names.
+        Any table of a request is also available as "demo.products", in SQL too.
+
+    Attributes
+    ----------
+    versions : dict of str to Version
+        Tables that can be read, by name.
+    damaged : dict of str to LakeError
+        Tables that cannot be opened, and the reasons; the other tables remain usable.
     """
 
     def __init__(
@@ -57,7 +70,7 @@ class Explorer:
         if not self.versions and not self.damaged:
             raise BadInput(f"lake {self.root} holds no table")
         versions = [f"{name}={version.key}" for name, version in self.versions.items()]
-        # Whoever asks for one of these is told what is wrong with it.
+        # The worker raises the error of these tables again if a query uses them.
         versions += [f"{name}=?{request or name.rpartition('.')[0]}" for name in (*self.damaged, *self._ambiguous)]
         self._table_arguments, self._memory = versions, memory
         self._process = self.process()
@@ -72,9 +85,9 @@ class Explorer:
             self.damaged[name] = error
 
     def process(self, extra_tables: Sequence[str] = ()) -> Process:
-        """Another process that answers queries of these versions, for who asks several questions at a time.
+        """Return a new process for the same versions, for use in parallel.
 
-        more : NAME=@FILE of Arrow files that are tables, too
+        `extra_tables` are entries NAME=@FILE of further tables in Arrow files.
         """
         return Process(self.root, [*self._table_arguments, *extra_tables], self._memory)
 
@@ -85,13 +98,13 @@ class Explorer:
         self.close()
 
     def close(self) -> None:
-        """End the process; a later query starts another."""
+        """End the process; a later query starts it again."""
         self._process.close()
 
     # ------------------------------------------------------------------------------------------------ what there is
 
     def tables(self) -> pd.DataFrame:
-        """The tables: rows, megabytes, files, version and meaning."""
+        """Return a list of the tables: rows, megabytes, files, version and meaning."""
         rows = [
             {
                 "table": name,
@@ -114,12 +127,16 @@ class Explorer:
         return frame.set_index("table").sort_index()
 
     def is_listed(self, name: str) -> bool:
-        """Whether a table is listed by this name: by its own; where requests have versions of their own, by both."""
+        """Return True if `tables` lists a table by this name.
+
+        A table is listed by its plain name. If requests have different versions, it is also listed by the name with the
+        request.
+        """
         table = name.rpartition(".")[2]
         return name == table or table in self._ambiguous
 
     def describe(self, table: str) -> pd.DataFrame:
-        """The columns of a table: type, unit, range, UCD, meaning."""
+        """Return a list of the columns of a table: type, unit, range, UCD and meaning."""
         rows = []
         for field in self._version(table).schema:
             facts = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
@@ -139,13 +156,27 @@ class Explorer:
     # ------------------------------------------------------------------------------------------------ rows
 
     def sql(self, text: str, /, into: str = "pandas", **parameters: object) -> Any:
-        """The result of one SELECT over the lake's tables.
+        """Return the result of one SELECT over the tables of the lake.
 
-        text       : DuckDB's SQL, with separation(ra1, dec1, ra2, dec2) in deg and mag_ab(f_nu) of microjansky beside
-                     its own functions; $name stands for a parameter
-        into       : "pandas", "astropy" (a Table with units) or "arrow"
-        parameters : numbers, texts, booleans or lists of them
-        Errors     : BadInput for what is no SELECT of ours, or takes too long or too much; Damaged for a changed byte
+        Parameters
+        ----------
+        text : str
+            Query in DuckDB's SQL; $name is a parameter. Additional functions are separation(ra1, dec1, ra2, dec2) in
+            deg and mag_ab(f_nu) for f_nu in microjansky.
+        into : str
+            "pandas", "astropy" (a Table with units) or "arrow".
+        **parameters : object
+            Numbers, texts, booleans or lists of them.
+
+        Returns
+        -------
+        DataFrame or Table
+            Rows of the result.
+
+        Notes
+        -----
+        BadInput is raised if the text is not an allowed SELECT or exceeds the limits of time or memory. Damaged is
+        raised if a file does not agree with its checksum.
         """
         return results.convert(self._process.ask(text, parameters, self.timeout), into)
 
@@ -153,15 +184,45 @@ class Explorer:
         self, table: str, ra: float, dec: float, radius: float, columns: Sequence[str] | None = None,
         on: str = "observed", into: str = "pandas",
     ) -> Any:  # fmt: skip
-        """Rows of a catalogue within a circle.
+        """Return the rows of a catalogue within a circle.
 
-        ra, dec, radius : deg;  on : "observed" or "true" positions
-        table, columns  : names; columns None: all of them;  into : kind of the result, as of `sql`
+        Parameters
+        ----------
+        table : str
+            Name of the table.
+        ra, dec, radius : float
+            Centre and radius of the circle, deg.
+        columns : sequence of str, optional
+            Columns to return; by default all.
+        on : str
+            "observed" or "true" positions.
+        into : str
+            "pandas", "astropy" or "arrow".
+
+        Returns
+        -------
+        DataFrame or Table
+            Rows inside the circle.
         """
         return results.convert(self._version(table).cone(ra, dec, radius, columns, on), into)
 
     def export(self, text: str, path: str | Path, /, **parameters: object) -> Path:
-        """Write the result of a SELECT to a .csv, .parquet, .fits or .vot file; returns its path."""
+        """Write the result of a SELECT to a .csv, .parquet, .fits or .vot file, and return its path.
+
+        Parameters
+        ----------
+        text : str
+            Query as for `sql`.
+        path : str or Path
+            File to write.
+        **parameters : object
+            Numbers, texts, booleans or lists of them.
+
+        Returns
+        -------
+        Path
+            The file.
+        """
         target = user_files.expand_path(path)
         results.write(self._process.ask(text, parameters, self.timeout), target)
         return target
@@ -177,11 +238,29 @@ class Explorer:
         where: str = "true",
         weight: str | None = None,
     ) -> tuple[Float, Float]:
-        """Counts of an expression in equal bins.
+        """Count the values of an expression in equal bins.
 
-        table            : name, or what may follow FROM, such as "galaxies JOIN galaxy_fluxes USING (id)"
-        x, where, weight : SQL of the table's columns;  span : lowest and highest value, None = all
-        returns          : counts[bins], edges[bins + 1]
+        Parameters
+        ----------
+        table : str
+            Name of a table, or SQL after FROM such as "galaxies JOIN galaxy_fluxes USING (id)".
+        x : str
+            SQL expression.
+        bins : int
+            Number of bins.
+        span : (float, float), optional
+            Lowest and highest value; by default the range of the values.
+        where : str
+            SQL condition of the rows.
+        weight : str, optional
+            SQL expression to sum instead of counting rows.
+
+        Returns
+        -------
+        counts : float array, shape (bins,)
+            Number of rows or sum of weights in each bin.
+        edges : float array, shape (bins + 1,)
+            Edges of the bins.
         """
         bins = arguments.check_integer("bins", bins, 1, _MAX_BINS)
         lo, hi = self._span(table, x, where) if span is None else _check_span(span)
@@ -198,11 +277,29 @@ class Explorer:
         self, table: str, x: str, y: str, bins: tuple[int, int] = (100, 100),
         span: tuple[Range, Range] | None = None, where: str = "true", weight: str | None = None,
     ) -> tuple[Float, Float, Float]:  # fmt: skip
-        """Counts of two expressions in a grid of equal bins.
+        """Count the values of two expressions in a grid of equal bins.
 
-        table   : as of `hist`;  where : SQL condition of the rows that count;  weight : SQL that is summed, None = 1
-        x, y    : SQL expressions;  bins, span : of each of the two; span None: from least to largest
-        returns : counts[y bins, x bins], edges of x, edges of y
+        Parameters
+        ----------
+        table : str
+            Name of a table, or SQL after FROM.
+        x, y : str
+            SQL expressions.
+        bins : (int, int)
+            Number of bins in x and y.
+        span : ((float, float), (float, float)), optional
+            Lowest and highest value of x and y; by default the range of the values.
+        where : str
+            SQL condition of the rows.
+        weight : str, optional
+            SQL expression to sum instead of counting rows.
+
+        Returns
+        -------
+        counts : float array, shape (y bins, x bins)
+            Number of rows or sum of weights in each bin.
+        x_edges, y_edges : float array, shape (x bins + 1,) and (y bins + 1,)
+            Edges of the bins.
         """
         x_bins, y_bins = (arguments.check_integer("bins", axis, 1, _MAX_BINS) for axis in _pair("bins", bins))
         if span is None:
@@ -223,10 +320,25 @@ class Explorer:
     def skymap(
         self, table: str, order: int = ORDER, where: str = "true", weight: str | None = None
     ) -> tuple[Int, Float]:
-        """Counts in nested HEALPix cells of an order: int64[n] cells that hold any, ascending, and their counts [n].
+        """Count rows in nested HEALPix cells.
 
-        table  : as of `hist`;  order : of the cells
-        where  : SQL condition of the rows that count;  weight : SQL that is summed, None = 1
+        Parameters
+        ----------
+        table : str
+            Name of a table, or SQL after FROM.
+        order : int
+            HEALPix order of the cells.
+        where : str
+            SQL condition of the rows.
+        weight : str, optional
+            SQL expression to sum instead of counting rows.
+
+        Returns
+        -------
+        cells : int array, shape (n,)
+            Cells with rows, ascending.
+        counts : float array, shape (n,)
+            Number of rows or sum of weights in each cell.
         """
         order = arguments.check_integer("order", order, 0, sky.MAX_ORDER)
         text = f"""
@@ -257,12 +369,12 @@ def _pair(name: str, value: Any) -> tuple[Any, Any]:
 def _check_span(span: Range) -> Range:
     lo, hi = (arguments.check_number("span", edge) for edge in _pair("span", span))
     if not (np.isfinite([lo, hi]).all() and lo < hi):
-        raise BadInput(f"span = {span} is not from a finite number to a larger one")
+        raise BadInput(f"span must be from a finite number to a larger one, got {span}")
     return lo, hi
 
 
 def _bin_sql(axis: str) -> str:
-    """Number of the bin of a column `x` or `y`; the last bin includes its upper edge."""
+    """SQL for the number of the bin of column `x` or `y`; the last bin includes its upper edge."""
     return f"least(floor(({axis} - ${axis}_lo) / (${axis}_hi - ${axis}_lo) * ${axis}_bins), ${axis}_bins - 1)::INT"
 
 
@@ -271,5 +383,5 @@ def _weight_sql(weight: str | None) -> str:
 
 
 def _count_sql(weight: str | None) -> str:
-    # The sum is NULL if all rows lack a weight; a row without one counts nothing.
+    # The sum is NULL if no row has a weight; rows without a weight add nothing.
     return "count(*)" if weight is None else "coalesce(sum(w), 0)"

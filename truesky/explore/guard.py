@@ -1,6 +1,6 @@
-"""What a query may be: one SELECT over the lake's tables and its own subqueries, with no function that reaches outside.
+"""Check that a query is one SELECT over the tables of the lake that cannot reach anything else.
 
-The text is parsed by DuckDB itself, into the tree that it would run; nothing is guessed from the text.
+DuckDB parses the text into the tree that it would run, and the tree is checked, not the text.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _MAX_CHARACTERS, _MAX_LENGTH = 100_000, 500
 _QUERIES = {"SELECT_NODE", "SET_OPERATION_NODE", "RECURSIVE_CTE_NODE", "CTE_NODE"}
 _SOURCES = {"BASE_TABLE", "JOIN", "SUBQUERY", "EMPTY", "EXPRESSION_LIST", "TABLE_FUNCTION"}
 _TABLE_FUNCTIONS = {"range", "generate_series", "unnest"}
-# Of the scalar functions those that read or change the session, wait, or run other text.
+# Scalar functions that read or change the session, wait, or run other text.
 _FUNCTIONS = {
     "current_query", "current_setting", "currval", "getenv", "getvariable", "json_deserialize_sql",
     "json_serialize_sql", "nextval", "query", "query_table", "setseed", "setval", "sleep_ms", "write_log",
@@ -31,9 +31,14 @@ Tree = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Origins:
-    """Which names of a result, in lower case, are columns of the lake's tables, as they are.
+    """Names of a result's columns, in lower case, that are unchanged columns of the lake's tables.
 
-    names : these, None = every name of a table's column;  other : names that something else has as well
+    Attributes
+    ----------
+    names : frozenset of str, optional
+        These names; None for every name of a column of a table.
+    other : frozenset of str
+        Names that something else has as well; they do not count.
     """
 
     names: frozenset[str] | None
@@ -50,8 +55,14 @@ _NO_ORIGINS = Origins(frozenset())
 class Query:
     """A query that may run.
 
-    tables  : those of the lake that it names
-    columns : of the result, that are columns of these tables
+    Attributes
+    ----------
+    text : str
+        SQL of the query.
+    tables : tuple of str
+        Tables of the lake that it uses.
+    columns : Origins
+        Columns of the result that are unchanged columns of these tables.
     """
 
     text: str
@@ -60,9 +71,26 @@ class Query:
 
 
 def check_query(text: str, table_names: Collection[str], connection: duckdb.DuckDBPyConnection | None = None) -> Query:
-    """The query, if it is harmless.  Errors: BadInput says what it may not do.
+    """Check that a query may run.
 
-    known : names of the lake's tables;  opened : a parser to use, None = a new one
+    Parameters
+    ----------
+    text : str
+        SQL of the query.
+    table_names : collection of str
+        Names of the lake's tables.
+    connection : DuckDBPyConnection, optional
+        Parser to use; by default a new one.
+
+    Returns
+    -------
+    Query
+        The query and the tables that it uses.
+
+    Raises
+    ------
+    BadInput
+        If the text is not one SELECT, or uses anything that is not allowed; the message names it.
     """
     if len(text) > _MAX_CHARACTERS or "\0" in text:
         raise BadInput(f"SQL: a query has at most {_MAX_CHARACTERS} characters and no NUL")
@@ -83,9 +111,19 @@ def check_query(text: str, table_names: Collection[str], connection: duckdb.Duck
 
 
 def check_expression(text: str, connection: duckdb.DuckDBPyConnection | None = None) -> None:
-    """Refuse what is not one expression, which could be more than its place in a query gives it room for.
+    """Check that a text is exactly one SQL expression, so that it cannot extend beyond its place in a query.
 
-    text : SQL;  opened : a parser to use, None = a new one;  Errors: BadInput
+    Parameters
+    ----------
+    text : str
+        SQL expression.
+    connection : DuckDBPyConnection, optional
+        Parser to use; by default a new one.
+
+    Raises
+    ------
+    BadInput
+        If the text is not one expression.
     """
     if not 0 < len(text.strip()) <= _MAX_CHARACTERS or "\0" in text:
         raise BadInput(f"SQL: an expression has 1 to {_MAX_CHARACTERS} characters and no NUL")
@@ -99,7 +137,7 @@ def check_expression(text: str, connection: duckdb.DuckDBPyConnection | None = N
 
 
 def parser() -> duckdb.DuckDBPyConnection:
-    """A database without tables: opening one takes a hundred times as long as parsing a query."""
+    """Return a database without tables for parsing; opening it takes a hundred times as long as parsing a query."""
     return duckdb.connect(":memory:", config={"threads": 1})
 
 
@@ -123,12 +161,12 @@ def _parse(text: str, connection: duckdb.DuckDBPyConnection | None) -> Tree:
 
 
 def one_line(error: BaseException | str) -> str:
-    """An error's text, or a name, without its line breaks and pointers."""
+    """Return the text of an error, or a name, on one line."""
     return " ".join(str(error).split())[:_MAX_LENGTH]
 
 
 def _nodes(tree: Any) -> Iterator[tuple[Tree, frozenset[str]]]:
-    """Every node, and which names of WITH clauses are to be seen from it: elsewhere DuckDB finds its own tables."""
+    """Every node, and the WITH clauses that it can use. Other names could refer to DuckDB's internal tables."""
     stack: list[tuple[Any, frozenset[str]]] = [(tree, frozenset())]
     while stack:
         node, visible = stack.pop()
@@ -136,10 +174,10 @@ def _nodes(tree: Any) -> Iterator[tuple[Tree, frozenset[str]]]:
             yield node, visible
             rest = {key: value for key, value in node.items() if key != "cte_map"}
             for entry in node.get("cte_map", {}).get("map", ()):
-                # A query sees those before it, never itself.
+                # A clause can use those before it, but not itself.
                 stack.append((entry["value"], visible))
                 visible |= {str(entry["key"]).lower()}
-            # But for the second half of a recursive one, and what follows one that is kept.
+            # Exceptions are the second half of a recursive clause, and the query after a materialised clause.
             inner_visible = visible | {str(node["cte_name"]).lower()} if "cte_name" in node else visible
             stack += [(value, inner_visible if key in ("right", "child") else visible) for key, value in rest.items()]
         elif isinstance(node, list):
@@ -151,7 +189,7 @@ def _words(node: Tree) -> str:
 
 
 def _source(node: Tree, table_names: Collection[str], with_names: Collection[str]) -> set[str]:
-    """The lake's table that a FROM entry stands for, if any."""
+    """Table of the lake to which a FROM entry refers, if any."""
     kind = node["type"]
     if kind not in _SOURCES:
         raise BadInput(f"SQL: {_words(node)} is not possible here")
@@ -174,9 +212,9 @@ def _refuse_function(name: str) -> None:
 
 
 def _origins(node: Tree, tables: Collection[str], outer: Mapping[str, Origins]) -> Origins:
-    """Which columns of a query's result are columns of the lake's tables, however deep in it they are chosen.
+    """Unchanged table columns in the result of a query, through any depth of subqueries.
 
-    before : of the WITH clauses that the query sees
+    `outer` contains the origins of the WITH clauses that the query can use.
     """
     visible = dict(outer)
     for entry in node.get("cte_map", {}).get("map", ()):
@@ -194,7 +232,7 @@ def _origins(node: Tree, tables: Collection[str], outer: Mapping[str, Origins]) 
             everything = True
         elif entry["class"] == "COLUMN_REF" and not entry["alias"]:
             *within, name = (str(part).lower() for part in entry["column_names"])
-            # A field of a structure that the query made.
+            # A field of a structure that the query creates is not a column of a table.
             (other if source_origins.other & set(within) else names).add(name)
         else:
             other.add(str(entry["alias"]).lower())
@@ -204,7 +242,7 @@ def _origins(node: Tree, tables: Collection[str], outer: Mapping[str, Origins]) 
 
 
 def _source_origins(source: Tree, tables: Collection[str], visible: Mapping[str, Origins]) -> Origins:
-    """The same of what follows FROM."""
+    """Unchanged table columns in a FROM clause."""
     if source.get("column_name_alias"):
         return _NO_ORIGINS
     if source["type"] == "JOIN":
@@ -228,5 +266,5 @@ def _source_origins(source: Tree, tables: Collection[str], visible: Mapping[str,
 
 
 def _table_name(source: Tree) -> str:
-    """A table as it is called in FROM, with the name of its request where one is given."""
+    """Name of a table in FROM, with the name of its request if it is given."""
     return ".".join(str(source[key]).lower() for key in ("schema_name", "table_name") if source.get(key))

@@ -1,8 +1,12 @@
-"""Catalogues on object storage for programs that read by fsspec, such as lsdb: the objects come through pyarrow.
+"""Open catalogues on object storage for programs that use fsspec, such as lsdb; objects are read with pyarrow.
+
+Files read in this way are not compared with the manifest. Use `truesky verify --deep s3://sky/lake` for this.
+
+Examples
+--------
+Search a cone with lsdb::
 
     lsdb.open_catalog(catalogue("s3://sky/lake", "galaxies")).cone_search(53.1, -27.8, 60.0).compute()
-
-Nothing that is read so is compared with the manifest: `truesky verify --deep s3://sky/lake` is.
 """
 
 from __future__ import annotations
@@ -22,9 +26,12 @@ _PROTOCOL = "truesky"
 
 
 class Objects(ArrowFSWrapper):  # type: ignore[misc]
-    """The buckets of a service, for fsspec; truesky://BUCKET/NAME is an object of it.
+    """Buckets of an object store as a file system for fsspec; truesky://BUCKET/NAME is an object.
 
-    endpoint, region : as of s3.Address
+    Parameters
+    ----------
+    endpoint, region : str
+        Endpoint and region of the store, see s3.Address.
     """
 
     protocol = _PROTOCOL
@@ -45,7 +52,22 @@ class Objects(ArrowFSWrapper):  # type: ignore[misc]
         return str(cls._strip_protocol(path)).rpartition("/")[0]
 
     def cat_file(self, path: str, start: int | None = None, end: int | None = None, **_: Any) -> bytes:
-        """Bytes of an object; places below 0 count from its end, which pyarrow's own files do not know."""
+        """Return the bytes of an object.
+
+        Parameters
+        ----------
+        path : str
+            Path of the object.
+        start, end : int, optional
+            Range of bytes; negative values count from the end, which pyarrow's files do not support.
+        **_
+            Ignored.
+
+        Returns
+        -------
+        bytes
+            Content in this range.
+        """
         with self.fs.open_input_file(self._strip_protocol(path)) as stream:
             first, last, _step = slice(start, end).indices(stream.size())
             content: bytes = stream.read_at(max(last - first, 0), first)
@@ -53,20 +75,36 @@ class Objects(ArrowFSWrapper):  # type: ignore[misc]
 
 
 def catalogue(lake: str, table: str, request: str | None = None) -> UPath:
-    """A catalogue of a lake on object storage as lsdb and hats open it: the version that is published now.
+    """Return the current version of a catalogue on object storage, for lsdb and hats.
 
-    lake    : s3://BUCKET/PREFIX, maybe with ?endpoint_override=URL;  request : whose, where the lake has several
-    Errors  : BadInput for what is no such lake, or no catalogue of it
+    Parameters
+    ----------
+    lake : str
+        s3://BUCKET/PREFIX, optionally with ?endpoint_override=URL.
+    table : str
+        Name of the table.
+    request : str, optional
+        Name of the request, if the lake contains several.
+
+    Returns
+    -------
+    UPath
+        Path of the catalogue.
+
+    Raises
+    ------
+    BadInput
+        If `lake` is not an address on object storage, or the table is not a catalogue.
     """
     root = layout.open_lake(lake)
     if not isinstance(root, s3.ObjectPath):
-        raise BadInput(f"lake {lake} is no address s3://..: lsdb opens a folder by its path")
+        raise BadInput(f"lake {lake} is not an address s3://..: lsdb opens a folder by its path")
     version, place = read.version(root, table, request=request), root.store.address
     if not version.has_file("collection.properties"):
-        raise BadInput(f"table {table} is no catalogue: version {version.key} has no HATS collection")
+        raise BadInput(f"table {table} is not a catalogue: version {version.key} has no HATS collection")
     fsspec.register_implementation(_PROTOCOL, Objects, clobber=True)
     name = root.store.object_path(table, f"v-{version.key}")
     with warnings.catch_warnings():
-        # That UPath does not know this protocol by itself.
+        # UPath warns that it does not know this protocol.
         warnings.simplefilter("ignore")
         return UPath(f"{_PROTOCOL}://{name}", endpoint=place.endpoint, region=place.region)

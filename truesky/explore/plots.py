@@ -1,4 +1,4 @@
-"""Pictures of counts: each function draws the result of the method of `truesky.Lake` that has its name."""
+"""Plot counts: each function draws the result of the method of `truesky.Lake` with the same name."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ def hist(counts: Float, edges: Float, ax: Any = None, **style: Any) -> Any:
 
     Parameters
     ----------
-    counts : ndarray of float64, shape (bins,)
+    counts : float array, shape (bins,)
         Counts of `Lake.hist`.
-    edges : ndarray of float64, shape (bins + 1,)
+    edges : float array, shape (bins + 1,)
         Edges of the bins.
     ax : matplotlib Axes, optional
         Axes to draw in. The default is a new figure.
@@ -28,6 +28,7 @@ def hist(counts: Float, edges: Float, ax: Any = None, **style: Any) -> Any:
     Returns
     -------
     matplotlib Axes
+        Axes with the plot.
     """
     axes = _axes(ax)
     axes.stairs(counts, edges, **style)
@@ -35,15 +36,15 @@ def hist(counts: Float, edges: Float, ax: Any = None, **style: Any) -> Any:
 
 
 def heatmap(counts: Float, x_edges: Float, y_edges: Float, ax: Any = None, **style: Any) -> Any:
-    """Draw counts as colours on a logarithmic scale, with empty bins blank.
+    """Draw counts as colours on a logarithmic scale; empty bins are blank.
 
     Parameters
     ----------
-    counts : ndarray of float64, shape (y bins, x bins)
+    counts : float array, shape (y bins, x bins)
         Counts of `Lake.heatmap`.
-    x_edges : ndarray of float64, shape (x bins + 1,)
+    x_edges : float array, shape (x bins + 1,)
         Edges of the bins in x.
-    y_edges : ndarray of float64, shape (y bins + 1,)
+    y_edges : float array, shape (y bins + 1,)
         Edges of the bins in y.
     ax : matplotlib Axes, optional
         Axes to draw in. The default is a new figure.
@@ -53,6 +54,7 @@ def heatmap(counts: Float, x_edges: Float, y_edges: Float, ax: Any = None, **sty
     Returns
     -------
     matplotlib Axes
+        Axes with the plot.
     """
     from matplotlib.colors import LogNorm
 
@@ -69,12 +71,12 @@ def skymap(cells: Int, counts: Float, order: int = ORDER, ax: Any = None, **styl
 
     Parameters
     ----------
-    cells : ndarray of int64, shape (n,)
+    cells : int array, shape (n,)
         Nested cells of `Lake.skymap`.
-    counts : ndarray of float64, shape (n,)
+    counts : float array, shape (n,)
         Their counts.
     order : int, optional
-        Order of the cells, as it was given to `Lake.skymap`.
+        Order of the cells, as given to `Lake.skymap`.
     ax : matplotlib Axes, optional
         Axes to draw in. The default is a new figure.
     **style
@@ -83,12 +85,13 @@ def skymap(cells: Int, counts: Float, order: int = ORDER, ax: Any = None, **styl
     Returns
     -------
     matplotlib Axes
+        Axes with the plot.
     """
     from matplotlib.collections import PolyCollection
 
     axes = _axes(ax)
     corners = sky.cell_corners(order, cells)
-    # Each cell as it lies about its own first corner: none is torn at RA 0.
+    # Corners are placed relative to the first corner of each cell, so that no cell is split at RA 0.
     corners[:, :, 0] = corners[:, :1, 0] + (corners[:, :, 0] - corners[:, :1, 0] + 180.0) % 360.0 - 180.0
     collection = PolyCollection(list(corners), array=counts / sky.cell_area(order), **{"cmap": "viridis", **style})
     axes.add_collection(collection)

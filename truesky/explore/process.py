@@ -1,4 +1,4 @@
-"""A process that answers queries, with bounds of memory and time that hold; worker.py is its other end."""
+"""Run queries in a separate process with strict limits of memory and time; worker.py is the program of that process."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from lake_schema.errors import BadInput, Damaged, LakeError
 from lake_schema.store.object_storage.s3 import Folder
 
 _ROOT = Path(__file__).resolve().parents[2]
-# Bytes that a query may take, and s, where nobody says otherwise; and between which bounds anybody may.
+# Default memory (bytes) and time (s) of a query, and limits of both.
 MEMORY, TIMEOUT = 4e9, 300.0
 _MEMORY_LO, _MEMORY_HI = 1e7, 1e15
 TIMEOUT_HI = 1e6
-# Of the memory the part that a result may fill that is wanted in one piece.
+# Fraction of the memory that a result in one piece may fill.
 _RESULT_SHARE = 0.5
 _BUFFER = 1 << 20
 _ERRORS = {"BadInput": BadInput, "Damaged": Damaged}
@@ -38,7 +38,7 @@ _INTERRUPTED = "SQL: another query began before all rows of this one were read"
 
 @dataclass(slots=True)
 class _Worker:
-    """The other process; `is_stopped` if a thread ended it while another may have waited for an answer."""
+    """The other process; `is_stopped` is True if a thread stopped it while another may have waited for an answer."""
 
     process: subprocess.Popen[bytes]
     is_stopped: bool = False
@@ -49,13 +49,19 @@ class _Worker:
 
 
 class Process:
-    """Answers queries of some tables. The first query starts it, and `close` ends it until the next query.
+    """Process that answers queries of some tables. The first query starts it; `close` ends it until the next query.
 
-    Several threads may use it. `ask` waits until the queries of other threads are answered. A query whose rows are
-    read piece by piece, with `batches`, ends if any other query begins before its last piece was read.
+    Several threads may use it. `ask` waits until the queries of other threads are answered. A query whose rows are read
+    piece by piece, with `batches`, ends if another query begins before its last piece was read.
 
-    tables  : NAME=KEY or REQUEST.NAME=KEY of tables of the lake `root`, NAME=@FILE of an Arrow file
-    memory  : bytes that a query and its result may take together
+    Parameters
+    ----------
+    root : Folder
+        Folder of the lake.
+    tables : sequence of str
+        NAME=KEY or REQUEST.NAME=KEY for tables of the lake, NAME=@FILE for an Arrow file.
+    memory : float
+        Memory limit of a query and its result together, bytes.
     """
 
     def __init__(self, root: Folder, tables: Sequence[str], memory: float = MEMORY) -> None:
@@ -63,36 +69,52 @@ class Process:
         self.max_bytes = int(memory * _RESULT_SHARE)
         self.command = [sys.executable, "-m", "truesky.explore.worker", str(root), str(int(memory)), *tables]
         self._worker: _Worker | None = None
-        # The answer that is being read, None between two answers.
+        # Answer that is currently read, None between two answers.
         self._answer: _Answer | None = None
         self._numbers = itertools.count(1)
-        # Held by the thread that uses the pipes: `ask` keeps it for the whole answer, `batches` for each piece.
+        # This lock protects the pipes: `ask` holds it for the whole answer, `batches` for each piece.
         self._lock = threading.RLock()
 
     def close(self) -> None:
-        """End the process and the query that it answers; a later query starts another."""
+        """End the process and its current query; a later query starts a new process."""
         self.stop()
         with self._lock:
             self._end()
 
     def _end(self) -> None:
-        # The collection of another generator may call this once more before it returns.
+        # Garbage collection of another generator may call this again before it returns.
         worker, self._worker, self._answer = self._worker, None, None
         if worker is not None:
             worker.process.kill()
             worker.process.communicate()
 
     def stop(self) -> None:
-        """End the query that another thread waits for, without waiting for that thread; a later query is answered."""
-        # Read once, since another thread may end it meanwhile.
+        """Stop the query for which another thread waits, without waiting for it; later queries are answered."""
+        # The attribute is read once, since another thread may change it meanwhile.
         if (worker := self._worker) is not None:
             worker.is_stopped = True
             worker.process.kill()
 
     def ask(self, text: str, parameters: Mapping[str, object], timeout: float = TIMEOUT) -> pa.Table:
-        """Return the result of a SELECT, which is stopped after `timeout` s.
+        """Return the result of a SELECT.
 
-        Errors : BadInput, Damaged, as `Explorer.sql`
+        Parameters
+        ----------
+        text : str
+            SQL of the query.
+        parameters : mapping of str to object
+            Values of its parameters.
+        timeout : float
+            Time after which the query is stopped, s.
+
+        Returns
+        -------
+        Table
+            Rows of the result.
+
+        Notes
+        -----
+        BadInput and Damaged are raised as by `Explorer.sql`.
         """
         with self._lock:
             return pa.Table.from_batches(list(self.batches(text, parameters, timeout, max_bytes=self.max_bytes)))
@@ -106,12 +128,32 @@ class Process:
         max_bytes: int | None = None,
         expressions: Sequence[str] = (),
     ) -> Iterator[pa.RecordBatch]:
-        """Yield the result piece by piece, at least one piece; closing the generator stops the query.
+        """Yield the result of a SELECT piece by piece, at least one piece; closing the generator stops the query.
 
-        text, parameters : as for `ask`;  timeout : s until the last piece
-        rows             : largest number of rows, None = all;  most_bytes : refuse a larger result, None = any size
-        expressions      : parts of the text that a user wrote, each of which must be one expression
-        Errors           : as `ask`, also after some pieces; BadInput if another query began before the last piece
+        Parameters
+        ----------
+        text : str
+            SQL of the query.
+        parameters : mapping of str to object, optional
+            Values of its parameters.
+        timeout : float
+            Time until the last piece, s.
+        max_rows : int, optional
+            Largest number of rows; by default all.
+        max_bytes : int, optional
+            Size above which a result is refused; by default any size is allowed.
+        expressions : sequence of str
+            Parts of the text that a user wrote; each must be exactly one expression.
+
+        Yields
+        ------
+        RecordBatch
+            Piece of the result.
+
+        Notes
+        -----
+        Errors are those of `ask`; they can also be raised after some pieces. BadInput is raised if another query began
+        before the last piece.
         """
         arguments.check_number("timeout", timeout, 0.0, TIMEOUT_HI)
         question = {"sql": text, "parameters": dict(parameters or {}), "rows": max_rows, "bytes": max_bytes}
@@ -123,7 +165,7 @@ class Process:
             self._give_up(answer)
 
     def _send(self, question: dict[str, Any], timeout: float) -> _Answer:
-        """Send a question; an answer that is not yet read to its end is given up."""
+        """Send a question; an answer that is not completely read is abandoned."""
         number = next(self._numbers)
         line = _line_of(question | {"id": number})
         with self._lock:
@@ -143,7 +185,7 @@ class Process:
             return self._answer
 
     def _next(self, answer: _Answer) -> pa.RecordBatch | None:
-        """The next piece, None after the last one."""
+        """Next piece, None after the last one."""
         with self._lock:
             if self._answer is not answer:
                 raise BadInput(_CLOSED if answer.worker.is_stopped else _INTERRUPTED)
@@ -152,7 +194,7 @@ class Process:
             except TimeoutError:
                 message = f"SQL: stopped after {answer.timeout:g} s"
             except (pa.ArrowException, OSError, EOFError):
-                crashed = "SQL: the query needs more memory than it may have, or brought its process down"
+                crashed = "SQL: the query needs more memory than its limit, or brought its process down"
                 message = _CLOSED if answer.worker.is_stopped else crashed
             else:
                 if batch is not None:
@@ -166,8 +208,8 @@ class Process:
 
     def _give_up(self, answer: _Answer) -> None:
         """End the process if it still answers this question."""
-        # A thread that collects a generator must not wait for the answer to another thread's question. Whoever holds
-        # the lock has ended this answer, or does so with the next question.
+        # A thread that collects a generator must not wait for the answer to another thread's question. If another
+        # thread holds the lock, it has ended this answer, or will end it with its next question.
         if self._answer is answer and self._lock.acquire(blocking=False):
             try:
                 if self._answer is answer:
@@ -179,17 +221,25 @@ class Process:
         if self._worker is None or not self._worker.is_alive:
             self._end()
             pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
-            # Arrow's other allocators reserve a gigabyte at the start, which would count against the limit.
+            # Arrow's other allocators reserve a gigabyte at the start, which would count towards the limit.
             environment = {**os.environ, "ARROW_DEFAULT_MEMORY_POOL": "system"}
             self._worker = _Worker(subprocess.Popen(self.command, cwd=_ROOT, env=environment, **pipes))
         return self._worker
 
 
 class _Answer:
-    """The answer to one question, as a worker sends it.
+    """Answer of a worker to one question.
 
-    number  : number of the question, which the answer repeats;  timeout : s from now until its last piece
-    error   : the worker's refusal, known after the last piece
+    Attributes
+    ----------
+    worker : _Worker
+        The worker.
+    number : int
+        Number of the question, which the answer repeats.
+    timeout : float
+        Time from now until the last piece, s.
+    error : LakeError, optional
+        Error from the worker, known after the last piece.
     """
 
     def __init__(self, worker: _Worker, number: int, timeout: float) -> None:
@@ -200,9 +250,9 @@ class _Answer:
         self._stream: pa.RecordBatchStreamReader | None = None
 
     def read(self) -> pa.RecordBatch | None:
-        """The next piece, None after the last one.
+        """Return the next piece, None after the last one.
 
-        Errors : TimeoutError; OSError, EOFError or an error of Arrow if the worker has ended
+        TimeoutError is raised after the timeout; OSError, EOFError or an error of Arrow if the worker has ended.
         """
         if self._stream is None:
             if not self._read_status():
@@ -215,7 +265,7 @@ class _Answer:
             return None
 
     def _read_status(self) -> bool:
-        """Read the line before or after the pieces."""
+        """Read the status line before or after the pieces; True if there is no error."""
         line = self._pipe.readline()
         if not line.endswith(b"\n"):
             raise EOFError
@@ -228,10 +278,10 @@ class _Answer:
 
 
 class _TimedPipe(io.RawIOBase):
-    """A pipe that is read until a moment of the monotonic clock; TimeoutError after it."""
+    """Pipe that can be read until a deadline of the monotonic clock; TimeoutError is raised after it."""
 
     def __init__(self, pipe: IO[bytes], deadline: float) -> None:
-        # The file and not its number, which the next file that is opened may get.
+        # The file object is kept, not its descriptor, which a new file might reuse.
         self.pipe, self.deadline = pipe, deadline
 
     def readable(self) -> bool:
@@ -246,10 +296,10 @@ class _TimedPipe(io.RawIOBase):
 
 
 def _line_of(question: dict[str, Any]) -> bytes:
-    """A question as the worker reads it."""
+    """Encode a question as a line of JSON for the worker."""
     if not isinstance(question["sql"], str):
         raise BadInput(f"SQL: the query must be text, not {type(question['sql']).__name__}")
     try:
         return json.dumps(question, allow_nan=False, default=as_python).encode() + b"\n"
     except (TypeError, ValueError) as error:
-        raise BadInput(f"SQL: a parameter is not a number, text, boolean or list of them: {error}") from None
+        raise BadInput(f"SQL: a parameter must be a number, text, boolean or list of them: {error}") from None

@@ -1,4 +1,4 @@
-"""What becomes of a result: pandas, astropy or Arrow in a notebook, a file on disc."""
+"""Convert query results to pandas, astropy or Arrow, or write them to files."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from lake_schema.columns import Column, Table
 from lake_schema.errors import BadInput
 from truesky.explore import votables
 
-# That a FITS file is made of, and that it may have: of other files no more than a piece is kept.
+# Largest size of a FITS file, and bytes per piece; other file types are written piece by piece without a limit.
 MAX_FITS_BYTES, _PIECE = 8 << 30, 1 << 20
 INTO = ("pandas", "astropy", "arrow")
-# Where some are missing: pandas' own way is to make floats of integers, which rounds an identifier.
+# Types of columns with missing values: by default pandas converts integers to floats, which would round identifiers.
 _NULLABLE: dict[pa.DataType, Any] = {pa.bool_(): pd.BooleanDtype()}
 _NULLABLE |= {
     pa.type_for_alias(kind.lower()): pd.api.types.pandas_dtype(kind)
@@ -31,7 +31,13 @@ _NULLABLE |= {
 
 
 def convert(rows: pa.Table, into: str) -> Any:
-    """The rows as a pandas DataFrame, an astropy Table with units, or as they are."""
+    """Return rows as a pandas DataFrame, an astropy Table with units, or an Arrow table.
+
+    Raises
+    ------
+    BadInput
+        If `into` is not one of INTO, or astropy cannot represent columns with the same name.
+    """
     if into == "pandas":
         gaps = {column.type for column in rows.columns if column.null_count}
         return rows.to_pandas(types_mapper=lambda kind: _NULLABLE.get(kind) if kind in gaps else None)
@@ -52,7 +58,7 @@ def _astropy(rows: pa.Table) -> Any:
     for field, values in zip(rows.schema, rows.columns, strict=True):
         facts = _facts(field)
         attributes: dict[str, Any] = {"unit": facts.get("unit") or None, "description": facts.get("description")}
-        # As astropy does with those of a VOTable.
+        # astropy stores the UCD of VOTable columns in the same place.
         attributes |= {"meta": {"ucd": facts["ucd"]}} if facts.get("ucd") else {}
         if values.null_count:
             filled = values.fill_null(pa.scalar(0).cast(field.type)) if field.type in _NULLABLE else values
@@ -67,10 +73,14 @@ def _facts(field: pa.Field) -> dict[str, str]:
 
 
 def write(rows: pa.Table, path: Path) -> None:
-    """Write rows to a file of the kind that its ending says: .csv, .parquet, .fits or .vot; replaced in one rename.
+    """Write rows to a .csv, .parquet, .fits or .vot file, which is replaced atomically.
 
-    Errors : BadInput for another ending, or names the column that such a file cannot hold; OSError where the disc
-             refuses
+    Raises
+    ------
+    BadInput
+        If the ending is another one, or the file type cannot hold a column; the message names the column.
+    OSError
+        If writing fails.
     """
     writer = _WRITERS[user_files.check_target(path, ENDINGS).suffix.lower()]
     _refuse_same_names(rows)
@@ -81,7 +91,7 @@ def write(rows: pa.Table, path: Path) -> None:
 
 
 def _refusal(writer: Callable[[pa.Table, Path], None], rows: pa.Table, path: Path) -> Exception | None:
-    """Why a kind of file cannot hold the rows, if it cannot."""
+    """Error that prevents a file type from holding the rows, None if there is no error."""
     try:
         writer(rows, path)
     except (pa.ArrowException, ValueError, TypeError, OverflowError) as error:
@@ -103,7 +113,7 @@ def _parquet(rows: pa.Table, path: Path) -> None:
 
 
 def _fits(rows: pa.Table, path: Path) -> None:
-    # astropy's import takes longer than a page of the sky.
+    # This import takes longer than a page of the sky, so it is delayed.
     from lake_schema.fits.tables import table_to_fits
 
     declared = _declare_table(rows.schema)
@@ -115,7 +125,7 @@ def _declare_table(schema: pa.Schema) -> Table:
 
 
 def _column(field: pa.Field) -> Column:
-    """A declaration that suits a result's column."""
+    """Declare a column for a field of a result."""
     facts, kind = _facts(field), _kind(field.type)
     return Column(
         field.name, kind, facts.get("unit", ""), facts.get("ucd", ""), facts.get("description", ""), nullable=True
@@ -146,10 +156,14 @@ ENDINGS = tuple(_WRITERS)
 
 
 def stream_file(batches: Iterator[pa.RecordBatch], ending: str) -> Iterator[bytes]:
-    """The bytes of a .csv, .parquet, .vot or .fits file of any number of rows, piece by piece.
+    """Yield a .csv, .parquet, .vot or .fits file of any number of rows piece by piece.
 
-    batches : at least one; for FITS all of them are read before the first piece
-    Errors  : BadInput before the first piece where such a file cannot hold the columns
+    For FITS all batches are read before the first piece, since the header contains the number of rows.
+
+    Raises
+    ------
+    BadInput
+        If the ending is not supported, or the file type cannot hold the columns; this is raised before the first piece.
     """
     first = next(batches)
     _refuse_same_names(pa.Table.from_batches([first]))
@@ -163,11 +177,11 @@ def stream_file(batches: Iterator[pa.RecordBatch], ending: str) -> Iterator[byte
     elif ending == ".fits":
         yield from _fits_pieces(all_batches, first.schema)
     else:
-        raise BadInput(f"a file of {ending} is not written piece by piece")
+        raise BadInput(f"a {ending} file cannot be written piece by piece")
 
 
 def _fits_pieces(batches: Iterator[pa.RecordBatch], schema: pa.Schema) -> Iterator[bytes]:
-    """A file whose header tells the number of rows and the longest text: through files on disc, not in memory."""
+    """Yield a FITS file through temporary files, since its header contains the number of rows and the longest text."""
     from lake_schema.fits.tables import stream_to_fits
 
     declared = _declare_table(schema)
@@ -185,7 +199,7 @@ def _fits_pieces(batches: Iterator[pa.RecordBatch], schema: pa.Schema) -> Iterat
 
 
 def _spool(batches: Iterator[pa.RecordBatch], spool: IO[bytes], schema: pa.Schema) -> None:
-    """Keep batches on disc, of other types.  Errors: BadInput where they are too many, or names a column"""
+    """Cast batches to a schema and store them on disc; raise BadInput if they are too large or cannot be cast."""
     with pa.ipc.new_stream(spool, schema) as writer:
         for batch in batches:
             columns = []
@@ -197,7 +211,9 @@ def _spool(batches: Iterator[pa.RecordBatch], spool: IO[bytes], schema: pa.Schem
                     raise BadInput(f"column {field.name}: FITS cannot hold it: {message}") from None
             writer.write_batch(pa.RecordBatch.from_arrays(columns, schema=schema))
             if spool.tell() > MAX_FITS_BYTES:
-                raise BadInput(f"the result has more than {MAX_FITS_BYTES / 1e9:.3g} GB: ask for less, or another kind")
+                raise BadInput(
+                    f"the result has more than {MAX_FITS_BYTES / 1e9:.3g} GB: ask for less, or another file type"
+                )
 
 
 def _parquet_writer(sink: Any, schema: pa.Schema) -> pq.ParquetWriter:
@@ -205,7 +221,7 @@ def _parquet_writer(sink: Any, schema: pa.Schema) -> pq.ParquetWriter:
 
 
 def _write_pieces(batches: Iterator[pa.RecordBatch], open_writer: Callable[[Any], Any]) -> Iterator[bytes]:
-    """What a writer puts into its file, as it comes."""
+    """Yield the output of a writer as it is written."""
     sink = _Sink()
     try:
         writer = open_writer(sink)
@@ -214,13 +230,13 @@ def _write_pieces(batches: Iterator[pa.RecordBatch], open_writer: Callable[[Any]
             if piece := sink.take():
                 yield piece
     except (pa.ArrowException, TypeError) as error:
-        raise BadInput(f"such a file cannot hold the result: {' '.join(str(error).split())[:300]}") from None
+        raise BadInput(f"this file type cannot hold the result: {' '.join(str(error).split())[:300]}") from None
     writer.close()
     yield sink.take()
 
 
 class _Sink(io.RawIOBase):
-    """Keeps what is written until it is taken."""
+    """Buffer that keeps written bytes until they are taken."""
 
     def __init__(self) -> None:
         self._buffer, self._position = bytearray(), 0
@@ -237,7 +253,7 @@ class _Sink(io.RawIOBase):
         return self._position
 
     def take(self) -> bytes:
-        """What was written since it was last asked."""
+        """Return the bytes written since the last call."""
         piece = bytes(self._buffer)
         self._buffer.clear()
         return piece

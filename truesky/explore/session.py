@@ -1,4 +1,4 @@
-"""A session of DuckDB over the tables of a lake: locked, kept open from question to question, read in batches."""
+"""DuckDB session over the tables of a lake: locked, kept open between queries, and read in batches."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from truesky.explore import adql
 from truesky.explore.guard import Query, check_expression, check_query, one_line, parser
 
 _MACROS = (
-    # Great-circle distance by the haversine, deg.
+    # Great-circle distance with the haversine formula, deg.
     """CREATE MACRO separation(ra1, dec1, ra2, dec2) AS degrees(2 * asin(least(1.0, sqrt(
        pow(sin(radians(dec2 - dec1) / 2), 2)
        + cos(radians(dec1)) * cos(radians(dec2)) * pow(sin(radians(ra2 - ra1) / 2), 2)))))""",
-    # AB magnitude of f_nu in microjansky, NULL where there is no flux.
+    # AB magnitude of f_nu in microjansky, NULL if the flux is not positive.
     "CREATE MACRO mag_ab(f_nu) AS 23.9 - 2.5 * log10(CASE WHEN f_nu > 0 THEN f_nu END)",
 )
-# From here on the session can reach nothing but what is registered, and can change nothing of this.
+# After these commands the session can only reach registered tables, and cannot change its configuration.
 _LOCKS = (
     "SET python_enable_replacements = false",
     "SET autoload_known_extensions = false",
@@ -33,18 +33,23 @@ _LOCKS = (
     "SET enable_external_access = false",
     "SET lock_configuration = true",
 )
-# Of the memory of a query the part that DuckDB may fill, and that its result may.
+# Fraction of the memory of a query that DuckDB may fill; the same fraction is for its result.
 _SHARE = 0.5
-TOO_LARGE = "SQL: the query or its result needs more memory than it may have: ask for less"
+TOO_LARGE = "SQL: the query or its result needs more memory than its limit: ask for less"
 OpenTable: TypeAlias = read.Version | ds.Dataset
 
 
 class Session:
-    """Answers queries one after another; after an error it begins anew.
+    """Session that answers queries one after another; after an error it starts again.
 
-    root   : of the lake
-    tables : NAME or REQUEST.NAME -> key of a version, ?REQUEST of one that could not be opened, @FILE of Arrow rows
-    memory : bytes that a query and its result may take together
+    Parameters
+    ----------
+    root : Folder
+        Folder of the lake.
+    tables : mapping of str to str
+        NAME or REQUEST.NAME -> key of a version, ?REQUEST for a table that could not be opened, @FILE for Arrow rows.
+    memory : int
+        Memory limit of a query and its result together, bytes.
     """
 
     def __init__(self, root: Folder, tables: Mapping[str, str], memory: int) -> None:
@@ -56,15 +61,15 @@ class Session:
         self._parser = parser()
 
     def check_query(self, text: str) -> Query:
-        """The query, if it may run.  Errors: BadInput"""
+        """Return the query if it may run; raise BadInput otherwise."""
         return check_query(text, self.table_keys, self._parser)
 
     def check_expression(self, text: str) -> None:
-        """Refuse what is not one expression.  Errors: BadInput"""
+        """Raise BadInput if a text is not exactly one expression."""
         check_expression(text, self._parser)
 
     def close(self) -> None:
-        """Forget every table; the next query opens those that it names."""
+        """Close all tables; the next query opens those that it uses."""
         self.open_tables.clear()
         self._rows.clear()
         if self._database is not None:
@@ -72,10 +77,16 @@ class Session:
             self._database = None
 
     def run(self, query: Query, parameters: Mapping[str, object]) -> Iterator[pa.RecordBatch]:
-        """The rows in batches, with the units of columns that a table has as they are; at least one, maybe empty.
+        """Yield the rows of a query in batches, at least one, which may be empty.
 
-        Errors : BadInput for what cannot be run; Damaged names a file that is not as it was written; of either some
-                 batches may have come before
+        Columns that are unchanged columns of a table have its units.
+
+        Raises
+        ------
+        BadInput
+            If the query cannot be run; some batches may have been returned before.
+        Damaged
+            If a file is not as it was written; some batches may have been returned before.
         """
         finished = False
         try:
@@ -85,7 +96,7 @@ class Session:
                     file.forget()
             relation = self._connect().sql(query.text, params=dict(parameters) or None)
             if relation is None:
-                raise BadInput("SQL: gives no rows")
+                raise BadInput("SQL: the query returns no rows")
             batches = pa.RecordBatchReader.from_stream(relation)
             schema = self._with_units(_exportable(batches.schema), query)
             yield pa.RecordBatch.from_pylist([], schema)
@@ -95,7 +106,7 @@ class Session:
         except duckdb.OutOfMemoryException:
             raise BadInput(TOO_LARGE) from None
         except (duckdb.Error, OSError, pa.ArrowException) as error:
-            # Arrow and DuckDB pass the refusal of a file on as an error of their own.
+            # Arrow and DuckDB hide the error of a damaged file in their own errors.
             if fault := next((fault for rows in self._rows.values() if (fault := getattr(rows, "fault", ""))), ""):
                 raise Damaged(fault) from None
             raise BadInput(f"SQL: {one_line(error)}") from None
@@ -116,7 +127,7 @@ class Session:
         return self._database
 
     def _open(self, name: str) -> None:
-        """Open a table by its name, one of a request in a schema of the request's name."""
+        """Open a table by its name; a table of a request goes into a schema with the name of the request."""
         if name in self._rows:
             return
         source = _open_table(self.root, name, self.table_keys[name])
@@ -130,14 +141,14 @@ class Session:
             database.execute(f'CREATE OR REPLACE VIEW "{request}"."{table}" AS SELECT * FROM "{name}"')
 
     def _with_units(self, schema: pa.Schema, query: Query) -> pa.Schema:
-        """Give the columns that came unchanged from a table its unit and description."""
+        """Add unit and description of table columns to result columns that are unchanged."""
         fields = []
         for field in schema:
             name = field.name.lower()
             tables = [self.open_tables[table].schema for table in query.tables]
             columns = [column for table in tables for column in table if column.name.lower() == name]
             candidate_facts = [dict(c.metadata or {}).items() for c in columns if _kind(c.type) == _kind(field.type)]
-            # Which of several tables it is from is not known: what they all say holds.
+            # If several tables have this column, only facts that they share are used.
             facts = (
                 dict(set.intersection(*map(set, candidate_facts)))
                 if candidate_facts and name in query.columns
@@ -152,13 +163,13 @@ def _open_table(root: Folder, name: str, key: str) -> OpenTable:
         return ds.dataset(key[1:], format="ipc")
     table = name.rpartition(".")[2]
     if key.startswith("?"):
-        # Whatever was wrong with it is said again.
+        # Opening it raises the same error again.
         return read.version(root, table, request=key[1:] or None)
     return read.version(root, table, key)
 
 
 def _exportable(schema: pa.Schema) -> pa.Schema:
-    """Sums of integers come as 128-bit decimals, which no file format of astronomy has."""
+    """Replace 128-bit decimals, which are sums of integers, by types that file formats of astronomy have."""
     return pa.schema(
         [
             field.with_type(pa.float64() if field.type.scale else pa.int64())
@@ -181,5 +192,5 @@ def _cast(batch: pa.RecordBatch, schema: pa.Schema) -> pa.RecordBatch:
 
 
 def _kind(kind: pa.DataType) -> pa.DataType:
-    """A type without the name that the elements of a list have: DuckDB has one of its own."""
+    """Type without the name of list elements, which differs in DuckDB."""
     return pa.list_(_kind(kind.value_type)) if pa.types.is_list(kind) else kind

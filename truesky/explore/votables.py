@@ -1,9 +1,9 @@
-"""VOTables of any number of rows, piece by piece: what TAP answers with, and TOPCAT, Aladin and astropy read.
+"""Write VOTables of any number of rows piece by piece, for answers of TAP.
 
-pieces      batches of rows -> the bytes of a VOTable
-refusal     an error as a VOTable
-
-Ref: IVOA Recommendation VOTable 1.4; DALI 1.1, section 4.4 (QUERY_STATUS)
+References
+----------
+IVOA Recommendation VOTable 1.4
+DALI 1.1, section 4.4 (QUERY_STATUS)
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _TYPES = {
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """What a client is told of a field beside its name and type."""
+    """Metadata of a field, in addition to its name and type."""
 
     unit: str = ""
     ucd: str = ""
@@ -45,9 +45,14 @@ class Facts:
 
 @dataclass(slots=True)
 class RowLimit:
-    """How many rows may be sent, and whether there were more.
+    """Largest number of rows to send.
 
-    most : None = all;  overflowed : set when the last piece has been made
+    Attributes
+    ----------
+    max_rows : int, optional
+        Largest number of rows; None for all.
+    overflowed : bool
+        True if there were more rows; set when the last piece has been made.
     """
 
     max_rows: int | None = None
@@ -57,9 +62,21 @@ class RowLimit:
 def pieces(
     batches: Iterable[pa.RecordBatch], row_limit: RowLimit | None = None, infos: Sequence[str] = ()
 ) -> Iterator[bytes]:
-    """The bytes of a VOTable of the rows, serialised as TABLEDATA; at least the first batch is asked for at once.
+    """Yield a VOTable, serialised as TABLEDATA, piece by piece.
 
-    batches : at least one;  cut : how many rows;  infos : further INFO elements, XML
+    Parameters
+    ----------
+    batches : iterable of RecordBatch
+        Rows, at least one batch; the first is read before the first piece is yielded.
+    row_limit : RowLimit, optional
+        Largest number of rows; it also records if there were more.
+    infos : sequence of str
+        Further INFO elements, XML.
+
+    Yields
+    ------
+    bytes
+        Piece of the VOTable.
     """
     row_limit = row_limit or RowLimit()
     remaining_batches = iter(batches)
@@ -73,7 +90,7 @@ def pieces(
         remaining = batch.num_rows if row_limit.max_rows is None else max(row_limit.max_rows - sent, 0)
         row_limit.overflowed |= batch.num_rows > remaining
         limited = batch.slice(0, remaining)
-        # As texts of Python values take many times their size.
+        # Batches are divided, since Python values as text take many times their size.
         for first in range(0, limited.num_rows, _ROWS_A_PIECE):
             yield _rows(limited.slice(first, _ROWS_A_PIECE))
         sent += min(remaining, batch.num_rows)
@@ -83,20 +100,23 @@ def pieces(
 
 
 def refusal(message: str) -> bytes:
-    """A VOTable that says why there is none."""
+    """Return a VOTable with an error message."""
     return f'{_OPEN}<INFO name="QUERY_STATUS" value="ERROR">{_text(message)}</INFO>\n{_CLOSE}'.encode()
 
 
 def field_facts(column: pa.Field) -> Facts:
-    """Of a field its unit, UCD and sentence."""
+    """Return the unit, UCD, description, xtype and utype of a field."""
     metadata = {key.decode(): value.decode() for key, value in (column.metadata or {}).items()}
     return Facts(*(metadata.get(key, "") for key in ("unit", "ucd", "description", "xtype", "utype")))
 
 
 def python_values(column: pa.Array, name: str = "") -> list[Any]:
-    """The values as Python has them.
+    """Return the values of a column as Python objects.
 
-    Errors : BadInput where it has none for them, such as moments before the year 1 or after 9999
+    Raises
+    ------
+    BadInput
+        If Python cannot represent a value, such as a time before the year 1 or after 9999.
     """
     try:
         values: list[Any] = column.to_pylist()
@@ -106,10 +126,10 @@ def python_values(column: pa.Array, name: str = "") -> list[Any]:
 
 
 def datatype(kind: pa.DataType) -> tuple[str, str]:
-    """VOTable's datatype and arraysize ("" of a scalar) of an Arrow type."""
+    """Return the VOTable datatype and arraysize ("" for a scalar) of an Arrow type."""
     if pa.types.is_list(kind):
         inner, size = datatype(kind.value_type)
-        # Texts in an array have no form there.
+        # VOTable cannot represent arrays of texts.
         return ("char", "*") if size else (inner, "*")
     if kind in _TYPES:
         return _TYPES[kind], ""
@@ -127,7 +147,7 @@ def _field(column: pa.Field) -> str:
     return f"<FIELD {words}>{description}{null}</FIELD>\n"
 
 
-# What stands for a missing whole number; VOTable 1.4 also lets a cell be empty, which older readers take for zero.
+# Values for missing integers; VOTable 1.4 also allows empty cells, which older readers take as zero.
 _NULLS = {"short": -32768, "int": -2147483648, "long": -9223372036854775808}
 
 
@@ -163,12 +183,12 @@ def _number(value: float, form: str) -> str:
     return "NaN" if math.isnan(value) else ("+Inf" if value > 0 else "-Inf")
 
 
-# What XML 1.0 leaves out.
+# Characters that XML 1.0 does not allow.
 _NO_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 def _text(text: str) -> str:
-    """XML has no form for most control characters, nor for two that are no characters, nor for halves of pairs."""
+    """Escape a text; characters that XML does not allow are replaced."""
     return escape(_NO_XML.sub("\N{REPLACEMENT CHARACTER}", text))
 
 

@@ -1,9 +1,10 @@
-"""The process that runs queries: python -m truesky.explore.worker LAKE MEMORY TABLE=KEY|@FILE ...; answers on stdout.
+"""Process that runs queries: python -m truesky.explore.worker LAKE MEMORY TABLE=KEY|@FILE ...; answers go to stdout.
 
-DuckDB counts neither the memory of every function nor its result, and some functions do not stop when told to; a
-process has a limit of memory that holds, and can be killed.  A query is a line of JSON on stdin; an answer is a line of
-JSON, then, if it is a result, an Arrow stream, and a line of JSON that says whether the stream is whole.  Both lines
-repeat the number of the query, `id`.
+DuckDB does not count the memory of every function nor of its result, and some functions do not stop on request. A
+process has a strict limit of memory and can be killed.
+
+A query is a line of JSON on stdin. An answer is a line of JSON. If it is a result, an Arrow stream follows, and a line
+of JSON that reports if the stream is complete. Both lines repeat the number of the query, `id`.
 """
 
 from __future__ import annotations
@@ -22,23 +23,23 @@ from lake_schema.errors import BadInput, Damaged, LakeError
 from lake_schema.store import layout
 from truesky.explore.session import TOO_LARGE, Session
 
-# What Python and the libraries take before any query.
+# Memory that Python and the libraries need before any query.
 _BASE_BYTES = 1 << 30
-# Bytes that are sent at a time, and that a row may have.
+# Bytes per piece, and largest size of a row.
 _PIECE_BYTES, _MAX_ROW_BYTES = 8 << 20, 64 << 20
 
 
 def main(argv: Sequence[str]) -> int:
-    """Answer queries until stdin ends.
+    """Answer queries until stdin ends, and return the exit status.
 
-    argv : lake, most bytes of memory, TABLE=KEY or REQUEST.TABLE=KEY of each table, =?REQUEST of one that could not be
-           opened, TABLE=@FILE of rows in an Arrow file
+    `argv` contains the lake, the memory limit in bytes, and entries for the tables: TABLE=KEY or REQUEST.TABLE=KEY,
+    =?REQUEST for a table that could not be opened, TABLE=@FILE for rows in an Arrow file.
     """
     root, memory = layout.open_lake(argv[0]), int(argv[1])
     command.limit_resource("RLIMIT_DATA", memory + _BASE_BYTES)
     command.limit_resource("RLIMIT_CORE", 0)
     session = Session(root, dict(entry.split("=", 1) for entry in argv[2:]), memory)
-    # Whatever a library prints must not get between the answers.
+    # Output of libraries must not get between the answers, so it is redirected to stderr.
     out = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     for line in sys.stdin:
@@ -50,7 +51,7 @@ def _answer(out: IO[bytes], session: Session, question: dict[str, Any]) -> None:
     header, fault = {"id": question["id"]}, dict[str, str]()
     batches = _batches(session, question)
     try:
-        # Whatever is wrong with the text is found before the first of these two.
+        # Errors in the text are raised before the first of these two batches.
         first = list(itertools.islice(batches, 2))
         out.write(json.dumps(header).encode() + b"\n")
         with pa.ipc.new_stream(out, first[0].schema) as stream:
@@ -66,7 +67,7 @@ def _answer(out: IO[bytes], session: Session, question: dict[str, Any]) -> None:
 
 
 def _batches(session: Session, question: dict[str, Any]) -> Iterator[pa.RecordBatch]:
-    """The answer up to its row `rows`, if that is given; BadInput where it is larger than `bytes`, if that is."""
+    """Batches of the answer, at most `rows` rows; raise BadInput if they have more than `bytes` bytes."""
     max_rows, max_bytes = question.get("rows"), question.get("bytes")
     rows = size = 0
     for text in question.get("expressions", ()):
@@ -82,9 +83,9 @@ def _batches(session: Session, question: dict[str, Any]) -> Iterator[pa.RecordBa
 
 
 def _pieces(batch: pa.RecordBatch, max_bytes: int) -> Iterator[pa.RecordBatch]:
-    """The batch in parts of few bytes each: whoever passes them on holds one at a time.
+    """Divide a batch into small pieces, so that receivers hold one piece at a time.
 
-    Errors : BadInput where a row has more bytes than `most`
+    BadInput is raised if a single row has more than `max_bytes` bytes.
     """
     if batch.nbytes <= _PIECE_BYTES:
         yield batch

@@ -1,1 +1,1 @@
-"""Is what is simulated what it should be: figures of it against expectations from theory and from observations."""
+"""Validation: figures of the simulated sky compared with expectations from theory and from observations."""

@@ -1,11 +1,12 @@
-"""Is what is simulated what it should be: python -m truesky.validation [--lake LAKE ..] [--quick] [--json FILE] ..
+"""Validate the simulation: python -m truesky.validation [--lake LAKE ..] [--quick] [--json FILE] ..
 
---lake LAKE   measures what the lake holds, by its published files alone, publishes the table `validation` of it and
-              a report.html beside it. The exit status is 1 where a figure fails that is not known to.
-Without it the universe is drawn, and each figure that expectations.csv has an expectation of, or observed.csv an
-observation, is printed with it and its verdict: pass, fail, or undecided if the expected number is only remembered.
-The exit status is 1 where one fails that its column known_to_fail gives no reason for. results.json holds the figures
-of the last full run.
+With --lake LAKE the products of a lake are measured from its published files alone. The results are published as
+the table `validation` with a report.html. The exit status is 1 if a figure fails that is not known to fail.
+
+Without --lake the universe is drawn. Each figure with an expectation in expectations.csv or an observation in
+observed.csv is printed with its verdict: pass, fail, or undecided if the expected number is quoted from memory. The
+exit status is 1 if a figure fails without a reason in the column known_to_fail. results.json contains the figures of
+the last full run.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-# Before numpy is imported by anything.
+# This must be set before any module imports numpy.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from lake_schema import command, user_files
@@ -31,22 +32,22 @@ from truesky.validation.verdicts import FAIL, UNDECIDED
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit status: 0, 1 a check fails that is not known to fail or the disc refuses, 2 the call is wrong."""
+    """Return the exit status: 0 = success, 1 = unexpected failure of a check or of the disc, 2 = wrong call."""
     parser = argparse.ArgumentParser(
         prog="python -m truesky.validation",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--lake", metavar="LAKE", help="validate what this lake holds")
-    parser.add_argument("--name", help="of the request whose tables are taken, where the lake has those of several")
-    parser.add_argument("--exposures", nargs="+", type=int, default=[], metavar="ID", help="of the lake; default: all")
-    parser.add_argument("--report", type=Path, metavar="FILE", help="copy the report of the lake to this file, too")
+    parser.add_argument("--lake", metavar="LAKE", help="validate the products of this lake")
+    parser.add_argument("--name", help="request whose tables are validated, if the lake contains several")
+    parser.add_argument("--exposures", nargs="+", type=int, default=[], metavar="ID", help="default: all exposures")
+    parser.add_argument("--report", type=Path, metavar="FILE", help="also copy the report of the lake to this file")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1, metavar="N", help="default: all cores")
     parser.add_argument(
-        "--quick", action="store_true", help="a few small blocks and no second box: 20 s, and too little sky to pass"
+        "--quick", action="store_true", help="draw a few small blocks and one box: takes 20 s, too little sky to pass"
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures of the universe to this file")
-    parser.add_argument("--figures", type=Path, metavar="FOLDER", help="draw those of the universe into this folder")
+    parser.add_argument("--figures", type=Path, metavar="FOLDER", help="write plots of the universe to this folder")
     options = parser.parse_args(argv)
     return command.run("validation", lambda: _validate(options))
 
@@ -56,8 +57,8 @@ def _validate(options: argparse.Namespace) -> int:
         return _validate_lake(options)
     for name in ("name", "exposures", "report"):
         if getattr(options, name):
-            raise BadInput(f"--{name}: of which --lake?")
-    # What is computed takes a quarter of an hour: where it is to go is looked at before.
+            raise BadInput(f"--{name} requires --lake")
+    # The figures take a quarter of an hour to compute, so the targets are checked first.
     if options.json is not None:
         user_files.check_target(options.json)
     if options.figures is not None:
@@ -79,12 +80,12 @@ def _validate(options: argparse.Namespace) -> int:
 
 
 def _validate_lake(options: argparse.Namespace) -> int:
-    """Prints what fails or is undecided, and where the report is."""
+    """Validate a lake; print failed and undecided checks and the path of the report."""
     for name in ("json", "figures", "quick"):
         if getattr(options, name):
-            raise BadInput(f"--{name}: of a lake the table and the report have it all")
+            raise BadInput(f"--{name}: must not be used with --lake; the table and the report contain all results")
     if options.processes < 1:
-        raise BadInput(f"--processes: {options.processes} is less than 1")
+        raise BadInput(f"--processes: must be at least 1, got {options.processes}")
     if options.report is not None:
         user_files.check_target(options.report)
     version = publishing.publish(layout.resolve_lake(options.lake), options.name, options.exposures, options.processes)

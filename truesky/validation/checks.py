@@ -1,8 +1,4 @@
-"""Expectations: what a figure should be, from where, and whether it is.
-
-checks   of all figures that expectations.csv and observed.csv have a line for;  read : of one such file
-report   as a table
-"""
+"""Expected values of the figures of the simulated universe, and checks of the figures against them."""
 
 from __future__ import annotations
 
@@ -14,7 +10,7 @@ from pathlib import Path
 
 from truesky.validation.verdicts import AT_LEAST, AT_MOST, FAIL, PASS, UNDECIDED, WITHIN, verdict
 
-# What follows from the models' own sources, and what surveys observed.
+# Expectations from the sources of the models, and observations by surveys.
 _LISTS = (Path(__file__).with_name("expectations.csv"), Path(__file__).with_name("observed.csv"))
 
 
@@ -22,10 +18,24 @@ _LISTS = (Path(__file__).with_name("expectations.csv"), Path(__file__).with_name
 class Check:
     """One figure and its expectation.
 
-    expected, tolerance : of the value that was `found`; kind : "around", "least" or "most", the latter with tolerance 0
-    group : of the expectation, "" = none
-    known : why it is known to fail; empty where it has to pass
-    gates : whether a failure is one of the whole; not where the expectation is itself remembered
+    Attributes
+    ----------
+    name : str
+        Name of the figure.
+    value : float
+        Measured value.
+    expected, tolerance : float
+        Expected value and allowed deviation, in the unit of the value; the tolerance of "least" and "most" is 0.
+    kind : str
+        "around", "least" or "most".
+    source : str
+        Source of the expectation.
+    group : str
+        Group of the expectation, "" if none.
+    known_failure : str
+        Reason for which the check is known to fail, "" if it must pass.
+    is_binding : bool
+        True if a failure counts. False if the expected value is quoted from memory.
     """
 
     name: str
@@ -40,41 +50,53 @@ class Check:
 
     @property
     def lower_limit(self) -> float:
-        """Smallest value that is as expected."""
+        """Smallest value that passes."""
         return -math.inf if self.kind == AT_MOST else self.expected - self.tolerance
 
     @property
     def upper_limit(self) -> float:
-        """Largest value that is as expected."""
+        """Largest value that passes."""
         return math.inf if self.kind == AT_LEAST else self.expected + self.tolerance
 
     @property
     def passes(self) -> bool:
-        """True if the value is as expected; the tolerance has room for its error."""
+        """True if the value is as expected; the tolerance includes its error."""
         return verdict(self.value, 0.0, self.expected, self.tolerance, self.kind) == PASS
 
     @property
     def verdict(self) -> str:
-        """PASS or FAIL; UNDECIDED if the expectation is remembered."""
+        """PASS or FAIL; UNDECIDED if the expectation is not binding."""
         return (PASS if self.passes else FAIL) if self.is_binding else UNDECIDED
 
     @property
     def is_unexpected_failure(self) -> bool:
-        """Does it fail, and is not known to?"""
+        """True if the check fails and is not known to fail."""
         return self.verdict == FAIL and not self.known_failure
 
 
 def evaluate(figures: Mapping[str, float], n_sigma: float = 0.0) -> list[Check]:
-    """Every expectation of a figure that was measured; errors : how many of its own a tolerance is widened by."""
+    """Check every measured figure with an expectation; widen tolerances by at least `n_sigma` errors of the figure."""
     return [check for path in _LISTS for check in read(path, figures, n_sigma)]
 
 
 def read(path: Path, figures: Mapping[str, float], n_sigma: float = 0.0) -> list[Check]:
-    """The expectations of a file.
+    """Check figures against the expectations of a file.
 
-    path : of a CSV with columns name, expected, kind (relative, absolute, factor, least, most), tolerance, source,
-           known_to_fail, and maybe errors (how many of the figure's own widen the tolerance), confidence (M: no gate)
-    figures, errors : as of `checks`
+    Parameters
+    ----------
+    path : Path
+        CSV file with columns name, expected, kind (relative, absolute, factor, least, most), tolerance, source and
+        known_to_fail. Optional columns: group, errors (number of errors of the figure that widen the tolerance) and
+        confidence (M: quoted from memory, not binding).
+    figures : mapping of str to float
+        Measured values by name, with errors by name + "_error".
+    n_sigma : float
+        Smallest number of errors of the figure that widen the tolerance.
+
+    Returns
+    -------
+    list of Check
+        One check for each expectation of a figure that was measured.
     """
     results = []
     with path.open(newline="", encoding="utf-8") as file:
@@ -98,7 +120,7 @@ def read(path: Path, figures: Mapping[str, float], n_sigma: float = 0.0) -> list
 
 
 def report(figures: Mapping[str, float], results: Sequence[Check]) -> list[str]:
-    """Print every figure and every check; returns the names of those that fail."""
+    """Print every figure and every check; return the names of checks that do not pass."""
     expected = {check.name for check in results}
     for name, value in figures.items():
         if name not in expected and not name.endswith("_error"):

@@ -1,4 +1,4 @@
-"""Sums over pairs of places on the sky, compiled: what `pairs` hands over."""
+"""Compiled sums over pairs of positions on the sky, for `truesky.validation.pairs`."""
 
 from __future__ import annotations
 
@@ -12,10 +12,24 @@ from truesky.numerics.compiling import exact_jit
 def count_pairs(
     cube_starts: Int, cube_pairs: Int, place: Float, kind: Int, patch: Int, edge: Float, sums: Float
 ) -> None:
-    """Pairs by the patches of both ends, separation, and kind: sums[patch, patch, bin, kind + kind].
+    """Add pairs to `sums` by the patches of both ends, separation, and kind.
 
-    first : [c + 1] rows at which cubes begin;  pair : [2, m] cubes whose places may be near, each pair once
-    place : [n, 3] unit vectors;  kind : 0 or 1;  edge : squared chords, ascending
+    Parameters
+    ----------
+    cube_starts : int array, shape (c + 1,)
+        Row at which each cube begins; positions are sorted by cube.
+    cube_pairs : int array, shape (2, m)
+        Cubes that may contain close pairs, each pair of cubes once, and each cube with itself.
+    place : float array, shape (n, 3)
+        Unit vectors.
+    kind : int array, shape (n,)
+        0 or 1.
+    patch : int array, shape (n,)
+        Patch of each position, from 0.
+    edge : float array, shape (b + 1,)
+        Edges of the separation bins as squared chords, ascending.
+    sums : float array, shape (patches, patches, b, 3)
+        Numbers of pairs, changed in place; the last axis is the sum of the two kinds.
     """
     last = edge.size - 1
     for p in range(cube_pairs.shape[1]):
@@ -34,9 +48,20 @@ def count_pairs(
 
 @exact_jit
 def sum_products(cube_starts: Int, cube_pairs: Int, place: Float, value: Float, edge: Float, sums: Float) -> None:
-    """Number of pairs, sum of separations (rad) and sums of products of k kinds of values: sums[bin, 2 + k].
+    """Add numbers, separations and products of values of pairs to `sums`, by separation.
 
-    value : [n, k] at each place;  first, pair, place, edge : as of `counted`
+    Parameters
+    ----------
+    cube_starts, cube_pairs : int array
+        Cubes and their pairs, see `count_pairs`.
+    place : float array, shape (n, 3)
+        Unit vectors.
+    value : float array, shape (n, k)
+        Values of k kinds at each position.
+    edge : float array, shape (b + 1,)
+        Edges of the separation bins as squared chords, ascending.
+    sums : float array, shape (b, 2 + k)
+        Number of pairs, sum of separations (rad), and sums of the products of each kind; changed in place.
     """
     last = edge.size - 1
     for p in range(cube_pairs.shape[1]):
@@ -61,10 +86,22 @@ def sum_products(cube_starts: Int, cube_pairs: Int, place: Float, value: Float, 
 def sum_shear_products(
     cube_starts: Int, cube_pairs: Int, frame: Float, shear: Float, patch: Int, edge: Float, sums: Float
 ) -> None:
-    """The same of products of shear: number, xi+, xi-, cross, and of convergence with convergence, gamma_t, gamma_x.
+    """Add numbers of pairs and products of their shear and convergence to `sums`, by patches and separation.
 
-    frame : [n, 3, 3] east, north and direction of each place;  shear : [n, 3] gamma1, gamma2, kappa
-    sums  : [patch, patch, bin, 7];  first, pair, patch, edge : as of `counted`
+    Parameters
+    ----------
+    cube_starts, cube_pairs : int array
+        Cubes and their pairs, see `count_pairs`.
+    frame : float array, shape (n, 3, 3)
+        Unit vectors to the east, to the north and towards each position.
+    shear : float array, shape (n, 3)
+        gamma1, gamma2, kappa at each position.
+    patch : int array, shape (n,)
+        Patch of each position, from 0.
+    edge : float array, shape (b + 1,)
+        Edges of the separation bins as squared chords, ascending.
+    sums : float array, shape (patches, patches, b, 7)
+        Number of pairs, xi+, xi-, cross component, kappa kappa, kappa gamma_t and kappa gamma_x; changed in place.
     """
     last = edge.size - 1
     for p in range(cube_pairs.shape[1]):
@@ -80,7 +117,7 @@ def sum_shear_products(
                 k = last - 1
                 while square < edge[k]:
                     k -= 1
-                # Towards the other, in the frame of each.
+                # Direction to the other position, in the frame of each.
                 x = frame[i, 0, 0] * dx + frame[i, 0, 1] * dy + frame[i, 0, 2] * dz
                 y = frame[i, 1, 0] * dx + frame[i, 1, 1] * dy + frame[i, 1, 2] * dz
                 u = frame[j, 0, 0] * dx + frame[j, 0, 1] * dy + frame[j, 0, 2] * dz

@@ -1,11 +1,7 @@
-"""The part of the sky that a catalogue covers, in patches that are left out in turn.
+"""The area of the sky that a catalogue covers, divided into patches for jackknife errors.
 
-Field    its cells, and the patch of each;  of_version : of a published catalogue
-random   places anywhere in it
-spread   standard errors of what is measured without each patch
-
-Errors hold the structure that patches differ by, which is most of the cosmic variance for separations below a patch's
-side; what all of a small field has in common they do not.
+Jackknife errors contain the structure that differs between patches. This is most of the cosmic variance for
+separations below the side of a patch. Fluctuations that a whole small field shares are not in the errors.
 """
 
 from __future__ import annotations
@@ -21,15 +17,25 @@ from lake_schema.ids import GENERATION_ORDER
 from lake_schema.store import read
 from truesky.randomness.rng import stream
 
-# Patches, and the fewest that tell an error.
+# Number of patches, and the smallest number of patches for which an error is estimated.
 PATCHES, MIN_PATCHES = 16, 6
-# Sources that a cell holds in the mean where nobody says which cells were drawn, and the finest such cells.
+# If the generation cells are not recorded: mean number of sources per cell, and the highest order of such cells.
 _SOURCES_PER_CELL, _FINEST_ORDER = 40.0, 12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Field:
-    """order : of the nested cells;  cells : int[c], ascending;  patch : int[c] of each."""
+    """Cells that a catalogue covers, and the patch of each cell.
+
+    Attributes
+    ----------
+    order : int
+        HEALPix order of the nested cells.
+    cells : int array, shape (c,)
+        Cell numbers, ascending.
+    patch : int array, shape (c,)
+        Patch of each cell, from 0.
+    """
 
     order: int
     cells: Int
@@ -37,20 +43,21 @@ class Field:
 
     @property
     def n_patches(self) -> int:
+        """Number of patches."""
         return int(self.patch.max(initial=-1)) + 1
 
     @property
     def area(self) -> float:
-        """deg2."""
+        """Area of all cells in deg2."""
         return len(self.cells) * sky.cell_area(self.order)
 
     @property
     def patch_side(self) -> float:
-        """Of a patch, deg, as if it were a square."""
+        """Side in deg of a square with the mean area of a patch."""
         return float(np.sqrt(self.area / max(self.n_patches, 1)))
 
     def patch_of(self, index: Int) -> Int:
-        """Patch[n] of order-29 indices, -1 outside."""
+        """Return the patch of each order-29 index, -1 outside the field."""
         cell = index >> 2 * (sky.MAX_ORDER - self.order)
         at = np.minimum(np.searchsorted(self.cells, cell), max(len(self.cells) - 1, 0))
         if not len(self.cells):
@@ -59,9 +66,19 @@ class Field:
 
 
 def from_version(catalogue: read.Version, index: Int) -> Field:
-    """Where a catalogue was drawn; if it does not say, where it has sources.
+    """Return the cells that a catalogue was drawn in or, if they are not recorded, the cells that contain sources.
 
-    catalogue : of a lake;  index : int[n] order-29 indices of its sources
+    Parameters
+    ----------
+    catalogue : Version
+        Catalogue of a lake.
+    index : int array, shape (n,)
+        Order-29 indices of its sources.
+
+    Returns
+    -------
+    Field
+        The cells, in patches.
     """
     generation_cells = {
         cell for part in catalogue.manifest["parts"] for cell in part["facts"].get("generation_cells", ())
@@ -75,7 +92,10 @@ def from_version(catalogue: read.Version, index: Int) -> Field:
 
 
 def from_cells(order: int, cells: Int) -> Field:
-    """In patches of neighbouring cells, none smaller than one that is drawn; cells : int[c] of an order, ascending."""
+    """Divide cells (ascending numbers of one order) into at most PATCHES patches of neighbouring cells.
+
+    No patch is smaller than a generation cell.
+    """
     n_patches = max(min(PATCHES, len(cells) >> 2 * (order - GENERATION_ORDER)), 1)
     return Field(order, cells, np.arange(len(cells)) * n_patches // max(len(cells), 1))
 
@@ -85,9 +105,23 @@ def _occupied_cells(index: Int, order: int) -> Int:
 
 
 def random_positions(field: Field, n: int, *identity: int | str) -> tuple[Float, Int]:
-    """(unit vectors[m, 3], patch[m]) of about n places, as many in each cell.
+    """Draw about `n` random positions, the same number in each cell.
 
-    field : to be filled;  identity : of their stream
+    Parameters
+    ----------
+    field : Field
+        Cells to fill.
+    n : int
+        Approximate number of positions; each cell gets at least one.
+    *identity : int or str
+        Identity of the random stream.
+
+    Returns
+    -------
+    place : float array, shape (m, 3)
+        Unit vectors.
+    patch : int array, shape (m,)
+        Patch of each position.
     """
     per_cell = max(n // max(len(field.cells), 1), 1)
     places = [
@@ -98,9 +132,19 @@ def random_positions(field: Field, n: int, *identity: int | str) -> tuple[Float,
 
 
 def jackknife_error(samples: Float | Sequence[float], min_patches: int = MIN_PATCHES) -> Float:
-    """Standard error[...] of a figure, NaN of fewer than `fewest` patches.
+    """Return the jackknife standard error of a figure, NaN if there are fewer patches than `min_patches`.
 
-    without : float[patch, ...] the figure without each patch;  fewest : patches that tell an error
+    Parameters
+    ----------
+    samples : float array, shape (patches, ...)
+        The figure without each patch.
+    min_patches : int
+        Smallest number of patches for which an error is estimated.
+
+    Returns
+    -------
+    float array, shape (...)
+        Standard error.
     """
     values = np.asarray(samples, float)
     if len(values) < min_patches:

@@ -1,10 +1,6 @@
-"""Pairs of places on the sky within a separation: how many, and what their shears have in common.
+"""Numbers of pairs of positions on the sky within a separation, and sums of products of their shears or other values.
 
-counted   of galaxies and of random places;  sheared : of galaxies with shear;  sum_products : of any values
-Sums      of either, with and without each patch of the sky
-thinned   rows that leave few enough pairs
-
-Places are sorted into cubes as wide as the largest separation: nothing is special about right ascension 0 or a pole.
+Positions are sorted into cubes as wide as the largest separation. Right ascension 0 and the poles need no special case.
 """
 
 from __future__ import annotations
@@ -18,10 +14,10 @@ from lake_schema.arrays import Bool, Float, Int
 from truesky.randomness import rng
 from truesky.validation import compiled_pairs
 
-# Pairs of places in neighbouring cubes that are looked at, at most: 3 s.
+# Largest number of pairs of positions in neighbouring cubes that are examined; this takes 3 s.
 MAX_PAIRS = 1e8
 CHANNELS = 7
-# Half of the 26 neighbours of a cube, and itself.
+# Half of the 26 neighbours of a cube, and the cube itself.
 _OFFSETS = [(0, 0, 0)] + [
     (x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) > (0, 0, 0)
 ]  # fmt: skip
@@ -29,16 +25,38 @@ _OFFSETS = [(0, 0, 0)] + [
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sums:
-    """total : float[c, bin] of all pairs;  without : float[patch, c, bin] of those with no end in a patch."""
+    """Sums over pairs, in total and without each patch.
+
+    Attributes
+    ----------
+    total : float array, shape (c, bins)
+        Sums over all pairs.
+    jackknife : float array, shape (patches, c, bins)
+        Sums over pairs with no end in the given patch.
+    """
 
     total: Float
     jackknife: Float
 
 
 def count_pairs(place: Float, kind: Int, patch: Int, edges: Float) -> Sums:
-    """Pairs of two of kind 0, of one each, and of two of kind 1.
+    """Count pairs with both ends of kind 0, with one end of each kind, and with both ends of kind 1.
 
-    place : float[n, 3] unit vectors;  kind : int[n] 0 or 1;  patch : int[n] from 0 on;  edges : of separations, rad
+    Parameters
+    ----------
+    place : float array, shape (n, 3)
+        Unit vectors.
+    kind : int array, shape (n,)
+        0 or 1.
+    patch : int array, shape (n,)
+        Patch of each position, from 0.
+    edges : float array, shape (b + 1,)
+        Edges of the separation bins, rad, ascending.
+
+    Returns
+    -------
+    Sums
+        Numbers of pairs with c = 3.
     """
     order, cube_starts, cube_pairs = _sort_into_cubes(place, edges[-1])
     sums, sorted_rows = _empty_sums(3, edges, patch), (np.ascontiguousarray(place[order]), kind[order].astype(np.int64))
@@ -49,10 +67,23 @@ def count_pairs(place: Float, kind: Int, patch: Int, edges: Float) -> Sums:
 
 
 def sum_shear_products(ra: Float, dec: Float, shear: Float, patch: Int, edges: Float) -> Sums:
-    """Sums of CHANNELS products: 1, xi+, xi-, cross, kappa kappa, kappa gamma_t, kappa gamma_x.
+    """Sum CHANNELS products over pairs: 1, xi+, xi-, cross, kappa kappa, kappa gamma_t, kappa gamma_x.
 
-    ra, dec : float[n] deg;  shear : float[n, 3] gamma1, gamma2 in the frame (east, north), kappa
-    patch   : int[n] from 0 on;  edges : of separations, rad
+    Parameters
+    ----------
+    ra, dec : float array, shape (n,)
+        Positions, deg.
+    shear : float array, shape (n, 3)
+        gamma1, gamma2 in the frame (east, north), and kappa.
+    patch : int array, shape (n,)
+        Patch of each position, from 0.
+    edges : float array, shape (b + 1,)
+        Edges of the separation bins, rad, ascending.
+
+    Returns
+    -------
+    Sums
+        Sums of the products with c = CHANNELS.
     """
     frame = frames(ra, dec)
     order, cube_starts, cube_pairs = _sort_into_cubes(frame[:, 2], edges[-1])
@@ -67,22 +98,22 @@ def sum_shear_products(ra: Float, dec: Float, shear: Float, patch: Int, edges: F
 
 
 def sum_products(place: Float, values: Float, edges: Float) -> tuple[Float, Float, Float]:
-    """Sums over pairs of places by separation.
+    """Sum products of values over pairs of positions, by separation.
 
     Parameters
     ----------
-    place : ndarray of float64, shape (n, 3)
+    place : float array, shape (n, 3)
         Unit vectors.
-    values : ndarray of float64, shape (n, k)
-        Values of k kinds at each place.
-    edges : ndarray of float64, shape (b + 1,)
-        Edges of the bins of separation, rad, ascending.
+    values : float array, shape (n, k)
+        Values of k kinds at each position.
+    edges : float array, shape (b + 1,)
+        Edges of the separation bins, rad, ascending.
 
     Returns
     -------
-    number, separation : ndarray of float64, shape (b,)
+    number, separation : float array, shape (b,)
         Number of pairs, and the sum of their separations in rad.
-    product : ndarray of float64, shape (k, b)
+    product : float array, shape (k, b)
         Sum of the products of the values at both ends.
     """
     order, cube_starts, cube_pairs = _sort_into_cubes(place, edges[-1])
@@ -93,14 +124,14 @@ def sum_products(place: Float, values: Float, edges: Float) -> tuple[Float, Floa
 
 
 def _sums_with_jackknife(sums: Float) -> Sums:
-    """Of sums[patch, patch, bin, c]."""
+    """Total and jackknife sums from sums of shape (patch, patch, bin, c)."""
     total = sums.sum((0, 1))
     within_patch = np.einsum("iikc->ikc", sums)
     return Sums(total.T, np.swapaxes(total - sums.sum(0) - sums.sum(1) + within_patch, 1, 2))
 
 
 def frames(ra: Float, dec: Float) -> Float:
-    """float[n, 3, 3] unit vectors to the east, to the north, and towards places; ra, dec : float[n] deg."""
+    """Return unit vectors, shape (n, 3, 3), to the east, to the north and towards positions in deg."""
     lon, lat = np.radians(ra), np.radians(dec)
     east = np.stack([-np.sin(lon), np.cos(lon), np.zeros(len(lon))], 1)
     north = np.stack([-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)], 1)
@@ -108,9 +139,23 @@ def frames(ra: Float, dec: Float) -> Float:
 
 
 def thin_sample(ids: Int, place: Float, max_separation: float, max_pairs: float = MAX_PAIRS) -> Bool:
-    """Which of the places are kept, so that no more than `most` pairs are looked at; by their ids alone.
+    """Select a random subset so that at most about `max_pairs` pairs are examined; depends on the identifiers alone.
 
-    ids : int[n];  place : float[n, 3] unit vectors;  widest : separation, rad
+    Parameters
+    ----------
+    ids : int array, shape (n,)
+        Identifiers.
+    place : float array, shape (n, 3)
+        Unit vectors.
+    max_separation : float
+        Largest separation, rad.
+    max_pairs : float
+        Number of pairs in neighbouring cubes above which positions are dropped.
+
+    Returns
+    -------
+    bool array, shape (n,)
+        True for the positions to keep.
     """
     _, cube_starts, cube_pairs = _sort_into_cubes(place, max_separation)
     number = np.diff(cube_starts).astype(float)
@@ -131,7 +176,7 @@ def _empty_sums(channels: int, edges: Float, patch: Int) -> Float:
 
 
 def _sort_into_cubes(place: Float, max_separation: float) -> tuple[Int, Int, Int]:
-    """Order of the places by cube, row at which each cube begins, and pairs [2, m] of cubes that touch."""
+    """Order of the positions by cube, row at which each cube begins, and pairs (2, m) of adjacent cubes."""
     side = 2.0 * np.sin(0.5 * max_separation)
     n_side = int(2.0 / side) + 3
     at = np.floor((place + 1.0) / side).astype(np.int64) + 1

@@ -1,16 +1,16 @@
-"""What non-linear theory expects of two points on the sky: shear, and galaxies of known bias.
+"""Predict two-point statistics of shear and of galaxies with known bias from non-linear theory.
 
-power                non-linear P(k) of matter;  linear : that of linear theory
-lensing_weight       share of the overdensity at a distance in the convergence of sources
-convergence          C_l of the convergence of sources at many distances
-Shells               numbers and bias of galaxies by distance;  galaxies : C_l of their numbers
-shear_correlations   xi+ and xi- of C_l;  correlation : w of C_l
-aperture             mean squares of the aperture mass and of its cross component, of xi+ and xi-
+Notes
+-----
+The power spectrum agrees with that of CAMB within 1 % for 0.01 < k < 50 h/Mpc and z < 1. Projections use Limber's
+approximation.
 
-Error: power within 1 % of the same in CAMB for 0.01 < k < 50 h/Mpc and z < 1; Limber's approximation
-Ref: Smith et al. 2003, MNRAS 341, 1311, with the numbers of Takahashi et al. 2012, ApJ 761, 152; Limber 1953, ApJ 117,
-     134; Bartelmann & Schneider 2001, Phys. Rep. 340, 291, eqs. 6.57 ff.; Schneider, van Waerbeke & Mellier 2002,
-     A&A 389, 729, eqs. 32 ff.
+References
+----------
+Smith et al. 2003, MNRAS 341, 1311, with the coefficients of Takahashi et al. 2012, ApJ 761, 152
+Limber 1953, ApJ 117, 134
+Bartelmann & Schneider 2001, Phys. Rep. 340, 291, eqs. 6.57 ff.
+Schneider, van Waerbeke & Mellier 2002, A&A 389, 729, eqs. 32 ff.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from truesky.catalogue.matter import density_box
 from truesky.fluxes import cosmology
 
 _LN_K = np.linspace(np.log(1e-4), np.log(1e5), 4000)
-# Distances between observer and sources, and nodes of the transforms in ln l.
+# Distances between observer and sources, and nodes of the Hankel transforms in ln l.
 _STEPS, _FINE = 100, 40_000
-# Multipoles that C_l is made at.
+# Multipoles at which C_l is evaluated.
 ELL = np.geomspace(1.0, 2e5, 160)
 
 
 def nonlinear_power(k: Float, z: float) -> Float:
-    """P(k)[n], (Mpc/h)^3, at one redshift; k : float[n] h/Mpc."""
+    """Return the non-linear matter power P(k) in (Mpc/h)^3 at redshift `z`, for k in h/Mpc."""
     nodes, today = np.exp(_LN_K), float(density_box.growth(z)) ** 2
     delta = nodes**3 * _linear_power_today() * today / (2 * np.pi**2)
 
@@ -63,22 +63,34 @@ def nonlinear_power(k: Float, z: float) -> Float:
 
 
 def linear_power(k: Float, z: float) -> Float:
-    """P(k)[n] of linear theory, (Mpc/h)^3, at one redshift; k : float[n] h/Mpc."""
+    """Return the linear matter power P(k) in (Mpc/h)^3 at redshift `z`, for k in h/Mpc."""
     return np.asarray(density_box.linear_power(k) * float(density_box.growth(z)) ** 2)
 
 
 @cache
 def _linear_power_today() -> Float:
-    """Linear power at the nodes, z = 0: read-only."""
+    """Linear power at the nodes at z = 0, read-only."""
     spectrum = np.asarray(density_box.linear_power(np.exp(_LN_K)), float)
     spectrum.flags.writeable = False
     return spectrum
 
 
 def lensing_weight(x: Float, chi: Float, weight: Float) -> Float:
-    """Convergence of sources for each Mpc/h of unit overdensity at x[n] Mpc/h.
+    """Return the mean convergence of sources per Mpc/h of unit overdensity at given distances.
 
-    chi, weight : float[s] of the sources, Mpc/h, and how many lie there
+    Parameters
+    ----------
+    x : float array, shape (n,)
+        Comoving distances of the matter, Mpc/h.
+    chi : float array, shape (s,)
+        Comoving distances of the sources, Mpc/h.
+    weight : float array, shape (s,)
+        Relative number of sources at each distance.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Convergence per Mpc/h.
     """
     efficiency = np.maximum(1.0 - x[:, None] / chi, 0.0)
     lens = 1.5 * cosmology.OMEGA_M / cosmology.HUBBLE_DISTANCE**2 * x * (1 + np.asarray(cosmology.redshift(x)))
@@ -92,10 +104,25 @@ def convergence_power(
     power_spectrum: Callable[[Float, float], Float] = nonlinear_power,
     x: Float | None = None,
 ) -> Float:
-    """C_l[n] of the convergence.
+    """Return C_l of the convergence.
 
-    ell : float[n];  chi, weight : float[s] of the sources, Mpc/h, and how many lie there;  of : P(k, z)
-    x   : float[m] distances that are summed over, Mpc/h, None = 100 up to the sources
+    Parameters
+    ----------
+    ell : float array, shape (n,)
+        Multipoles.
+    chi : float array, shape (s,)
+        Comoving distances of the sources, Mpc/h.
+    weight : float array, shape (s,)
+        Relative number of sources at each distance.
+    power_spectrum : callable
+        Matter power P(k, z) in (Mpc/h)^3.
+    x : float array, shape (m,), optional
+        Comoving distances of the integration, Mpc/h; by default 100 distances up to the sources.
+
+    Returns
+    -------
+    float array, shape (n,)
+        C_l.
     """
     x = np.linspace(5.0, float(chi.max()) - 1.0, _STEPS) if x is None else x
     z, lens = np.asarray(cosmology.redshift(x)), lensing_weight(x, chi, weight)
@@ -105,7 +132,15 @@ def convergence_power(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shells:
-    """Galaxies by comoving distance: float[s] middle and width of each shell, Mpc/h, and share / (Mpc/h) times bias."""
+    """Galaxies in shells of comoving distance.
+
+    Attributes
+    ----------
+    chi, width : float array, shape (s,)
+        Middle and width of each shell, Mpc/h.
+    weight : float array, shape (s,)
+        Fraction of the galaxies per Mpc/h times their mean bias.
+    """
 
     chi: Float
     width: Float
@@ -113,7 +148,22 @@ class Shells:
 
 
 def shells(chi: Float, bias: Float, edges: Float) -> Shells:
-    """Galaxies at chi[n] Mpc/h with these biases[n], in shells with edges[s + 1] Mpc/h."""
+    """Sort galaxies into shells of comoving distance.
+
+    Parameters
+    ----------
+    chi : float array, shape (n,)
+        Comoving distances of the galaxies, Mpc/h.
+    bias : float array, shape (n,)
+        Bias of each galaxy.
+    edges : float array, shape (s + 1,)
+        Edges of the shells, Mpc/h.
+
+    Returns
+    -------
+    Shells
+        Fraction of galaxies times bias in each shell.
+    """
     number = np.histogram(chi, edges)[0].astype(float)
     mean = np.histogram(chi, edges, weights=bias)[0] / np.maximum(number, 1.0)
     width = np.diff(edges)
@@ -123,7 +173,22 @@ def shells(chi: Float, bias: Float, edges: Float) -> Shells:
 def galaxy_power(
     ell: Float, tracers: Shells, power_spectrum: Callable[[Float, float], Float] = nonlinear_power
 ) -> Float:
-    """C_l[n] of galaxies; ell : float[n];  tracers : the galaxies by distance;  of : P(k, z)"""
+    """Return C_l of the numbers of galaxies.
+
+    Parameters
+    ----------
+    ell : float array, shape (n,)
+        Multipoles.
+    tracers : Shells
+        Galaxies by distance.
+    power_spectrum : callable
+        Matter power P(k, z) in (Mpc/h)^3.
+
+    Returns
+    -------
+    float array, shape (n,)
+        C_l.
+    """
     total = np.zeros(len(ell))
     for chi, width, weight in zip(tracers.chi, tracers.width, tracers.weight, strict=True):
         if weight > 0.0:
@@ -132,36 +197,77 @@ def galaxy_power(
 
 
 def correlation(theta: Float, ell: Float, c_l: Float) -> Float:
-    """w[n] at theta rad, of C_l at ascending ell."""
+    """Return the correlation function w of C_l.
+
+    Parameters
+    ----------
+    theta : float array, shape (n,)
+        Separations, rad.
+    ell : float array, shape (m,)
+        Multipoles, ascending.
+    c_l : float array, shape (m,)
+        C_l at these multipoles.
+
+    Returns
+    -------
+    float array, shape (n,)
+        w at each separation.
+    """
     return _hankel_transform(theta, ell, c_l, j0)
 
 
 def shear_correlations(theta: Float, ell: Float, c_l: Float) -> tuple[Float, Float]:
-    """xi+, xi- [n] at theta rad, of C_l at ascending ell."""
+    """Return the shear correlation functions xi+ and xi- of C_l.
+
+    Parameters
+    ----------
+    theta : float array, shape (n,)
+        Separations, rad.
+    ell : float array, shape (m,)
+        Multipoles, ascending.
+    c_l : float array, shape (m,)
+        C_l of the convergence at these multipoles.
+
+    Returns
+    -------
+    xi_plus, xi_minus : float array, shape (n,)
+        Both functions at each separation.
+    """
     return _hankel_transform(theta, ell, c_l, j0), _hankel_transform(theta, ell, c_l, _j4)
 
 
 def _hankel_transform(theta: Float, ell: Float, c_l: Float, bessel: Callable[[Float], Float]) -> Float:
     fine = np.geomspace(ell[0], ell[-1], _FINE)
     weight = fine**2 * np.exp(np.interp(np.log(fine), np.log(ell), np.log(np.maximum(c_l, 1e-300)))) / (2 * np.pi)
-    # The sum ends softly: no ringing at small separations.
+    # A smooth cutoff at high multipoles avoids ringing at small separations.
     weight = weight * np.exp(-((fine / (0.5 * ell[-1])) ** 2))
     step = np.log(fine[1] / fine[0])
     return np.array([step * np.sum(weight * bessel(fine * t)) for t in theta])
 
 
 def _j4(x: Float) -> Float:
-    """Bessel's function of order 4 by those of 0 and 1, which are ten times as fast; by its series where x is small."""
+    """Bessel function J4 from J0 and J1, which are ten times faster, or from its series for small x."""
     large_x = np.maximum(x, 0.5)
     value = (48.0 / large_x**3 - 8.0 / large_x) * j1(large_x) - (24.0 / large_x**2 - 1.0) * j0(large_x)
     return np.where(x < 0.5, x**4 / 384.0 * (1.0 - x**2 / 20.0 + x**4 / 960.0), value)
 
 
 def aperture_mass(edges: Float, plus: Float, minus: Float, radius: float) -> tuple[Float, Float]:
-    """Mean square of the aperture mass and of its cross component, the latter 0 where there are no B modes.
+    """Return the mean squares of the aperture mass and of its cross component; the latter is 0 without B modes.
 
-    edges : float[n + 1] of bins of separation, from 0 on;  plus, minus : float[..., n] xi+ and xi- of each
-    radius : in the unit of the edges, at most half the last edge
+    Parameters
+    ----------
+    edges : float array, shape (n + 1,)
+        Edges of the separation bins, from 0.
+    plus, minus : float array, shape (..., n)
+        xi+ and xi- in each bin.
+    radius : float
+        Radius of the aperture in the unit of `edges`, at most half the last edge.
+
+    Returns
+    -------
+    mass, cross : float array, shape (...)
+        Mean squares.
     """
     middle, width = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
     x = np.minimum(middle / radius, 2.0)

@@ -1,10 +1,9 @@
-"""Correlations of galaxies on the sky, by separation, with what they are without each patch of the field.
+"""Two-point correlations of galaxies by separation on the sky, with jackknife samples without each patch of the field.
 
-angular   w of positions, by Landy & Szalay's estimator
-shear     xi+, xi-, their cross component, and what convergence and shear have in common
-Measured  either
-
-Ref: Landy & Szalay 1993, ApJ 412, 64; Schneider, van Waerbeke & Mellier 2002, A&A 389, 729
+References
+----------
+Landy & Szalay 1993, ApJ 412, 64
+Schneider, van Waerbeke & Mellier 2002, A&A 389, 729
 """
 
 from __future__ import annotations
@@ -21,17 +20,29 @@ from truesky.validation import pairs
 from truesky.validation.field import Field
 
 ARCMIN = np.radians(1.0 / 60.0)
-# Separations, rad, that all galaxies are taken for; of larger ones there are pairs enough of some of them.
+# Up to this separation (rad) all galaxies are used; beyond it a random subset has enough pairs.
 _FULL_SAMPLE_LIMIT = 2.5 * ARCMIN
-# Random places, of one galaxy and at most.
+# Random positions per galaxy, and their largest number.
 _RANDOM_PER_GALAXY, _MAX_RANDOM = 2, 60_000
-# Places whose pairs stand for all of a field.
+# Number of random positions whose pairs represent all pairs of a field.
 _PLACES = 1500
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TwoPointFunction:
-    """edges : float[bin + 1] rad;  number : float[bin] of pairs;  value : float[c, bin];  without : [patch, c, bin]."""
+    """Two-point functions by separation.
+
+    Attributes
+    ----------
+    edges : float array, shape (bins + 1,)
+        Edges of the separation bins, rad.
+    number : float array, shape (bins,)
+        Number of pairs.
+    value : float array, shape (c, bins)
+        Values of c functions.
+    jackknife : float array, shape (patches, c, bins)
+        Values without each patch.
+    """
 
     edges: Float
     number: Float
@@ -40,21 +51,36 @@ class TwoPointFunction:
 
     @property
     def theta(self) -> Float:
-        """Mean separation of pairs spread evenly, rad."""
+        """Mean separation per bin of evenly distributed pairs, rad."""
         low, high = self.edges[:-1], self.edges[1:]
         return np.asarray(2.0 / 3.0 * (high**3 - low**3) / (high**2 - low**2))
 
     @property
     def error(self) -> Float:
-        """float[c, bin]."""
+        """Jackknife standard error, shape (c, bins)."""
         return fields.jackknife_error(self.jackknife)
 
 
 def angular_correlation(ids: Int, ra: Float, dec: Float, index: Int, field: Field, edges: Float) -> TwoPointFunction:
-    """w of galaxies.
+    """Measure the angular correlation function w of galaxies with the estimator of Landy & Szalay.
 
-    ids, index : int[n] identifiers and order-29 indices;  ra, dec : float[n] deg
-    field      : that they lie in;  edges : of separations, rad
+    Parameters
+    ----------
+    ids : int array, shape (n,)
+        Identifiers.
+    ra, dec : float array, shape (n,)
+        Positions, deg.
+    index : int array, shape (n,)
+        Order-29 indices of the positions.
+    field : Field
+        Area of the galaxies; those outside are ignored.
+    edges : float array, shape (bins + 1,)
+        Edges of the separation bins, rad, ascending.
+
+    Returns
+    -------
+    TwoPointFunction
+        w, with c = 1.
     """
     patch, place = field.patch_of(index), sky.unit_vectors(ra, dec)
     inside = patch >= 0
@@ -84,7 +110,7 @@ def angular_correlation(ids: Int, ra: Float, dec: Float, index: Int, field: Fiel
 
 
 def _landy_szalay(count: Float, n_points: Float) -> Float:
-    """w[..., bin] of pairs[..., 3, bin] of many[..., 2] galaxies and random places."""
+    """w, shape (..., bin), from numbers of pairs (..., 3, bin) and of galaxies and random positions (..., 2)."""
     galaxies, scattered = n_points[..., 0, None], n_points[..., 1, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         by_chance = 2.0 * count[..., 2, :] / scattered / (scattered - 1.0)
@@ -95,10 +121,27 @@ def _landy_szalay(count: Float, n_points: Float) -> Float:
 def shear_correlations(
     ids: Int, place: tuple[Float, Float], gamma: Float, index: Int, field: Field, edges: Float
 ) -> TwoPointFunction:
-    """xi+, xi-, cross, <kappa kappa>, <kappa gamma_t>, <kappa gamma_x>.
+    """Measure xi+, xi-, cross, <kappa kappa>, <kappa gamma_t> and <kappa gamma_x>.
 
-    ids, index : as of `angular`;  place : ra, dec[n] deg;  gamma : float[n, 3] gamma1, gamma2 (east, north), kappa
-    field, edges : as of `angular`
+    Parameters
+    ----------
+    ids : int array, shape (n,)
+        Identifiers.
+    place : tuple of float arrays, shape (n,)
+        Right ascension and declination, deg.
+    gamma : float array, shape (n, 3)
+        gamma1, gamma2 in the frame (east, north), and kappa.
+    index : int array, shape (n,)
+        Order-29 indices of the positions.
+    field : Field
+        Area of the galaxies; those outside are ignored.
+    edges : float array, shape (bins + 1,)
+        Edges of the separation bins, rad, ascending.
+
+    Returns
+    -------
+    TwoPointFunction
+        The six functions, with c = 6.
     """
     patch = field.patch_of(index)
     inside = np.flatnonzero(patch >= 0)
@@ -114,7 +157,7 @@ def shear_correlations(
 
 
 def rebin(fine: TwoPointFunction, edges: Float) -> TwoPointFunction:
-    """Of wider bins; edges : some of those of `fine`, rad."""
+    """Average a two-point function in wider bins; `edges` (rad) is a subset of its edges."""
     at = np.searchsorted(fine.edges, edges * (1 + 1e-9)) - 1
     number = np.nan_to_num(fine.number)
 
@@ -128,20 +171,35 @@ def rebin(fine: TwoPointFunction, edges: Float) -> TwoPointFunction:
 
 
 def mean_over_pairs(field: Field, theta: Float, values: Float) -> float:
-    """Mean over all pairs of places in a field of what has values[n] at theta[n] rad, 0 beyond."""
+    """Average a function of separation over all pairs of positions in a field.
+
+    Parameters
+    ----------
+    field : Field
+        Area that the positions fill.
+    theta : float array, shape (n,)
+        Separations, rad, ascending.
+    values : float array, shape (n,)
+        Values of the function, 0 beyond the last separation.
+
+    Returns
+    -------
+    float
+        Mean over random pairs.
+    """
     place, _ = fields.random_positions(field, _PLACES, "validation", "all pairs")
     separations = [np.arccos(np.clip(np.sum(place[i + 1 :] * vector, 1), -1, 1)) for i, vector in enumerate(place)]
     return float(np.mean(np.interp(np.concatenate(separations), theta, values, right=0.0)))
 
 
 def _split_edges(edges: Float) -> list[Float]:
-    """Near and far separations."""
+    """Small separations, for all galaxies, and large separations, for a subset."""
     cut = int(np.searchsorted(edges, _FULL_SAMPLE_LIMIT, side="right")) - 1
     return [part for part in (edges[: cut + 1], edges[max(cut, 0) :]) if len(part) > 1]
 
 
 def _join_bins(edges: Float, parts: list[TwoPointFunction]) -> TwoPointFunction:
     number, value, jackknife = (
-        np.concatenate([getattr(part, name) for part in parts], -1) for name in ("number", "value", "without")
+        np.concatenate([getattr(part, name) for part in parts], -1) for name in ("number", "value", "jackknife")
     )
     return TwoPointFunction(edges, number, value, jackknife)

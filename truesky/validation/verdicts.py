@@ -1,7 +1,4 @@
-"""Verdicts of a figure that is compared with an expectation, for the universe and for lakes.
-
-verdict   pass, fail or undecided, of a value, its error, what is expected and the tolerance
-"""
+"""Verdicts on figures that are compared with an expectation, for the simulated universe and for lakes."""
 
 from __future__ import annotations
 
@@ -9,7 +6,7 @@ import math
 
 PASS, FAIL, UNDECIDED, NOT_APPLICABLE = "pass", "fail", "undecided", "not_applicable"
 WITHIN, AT_LEAST, AT_MOST = "around", "least", "most"
-# Standard errors beyond the tolerance from which a value is wrong, whatever chance does.
+# Standard errors beyond the tolerance above which a value fails; chance does not explain such a deviation.
 FAIL_SIGMAS = 3.0
 
 
@@ -17,15 +14,15 @@ def verdict(value: float, error: float, expected: float, tolerance: float, kind:
     """Return "pass", "fail" or "undecided".
 
     A value fails if it lies more than three standard errors beyond the tolerance. It passes if it lies within the
-    tolerance, and its error is no larger than the tolerance or it lies three errors within. Otherwise there is too
-    little to tell.
+    tolerance and either its error does not exceed the tolerance or it lies at least three errors inside. All other
+    values are undecided.
 
     Parameters
     ----------
     value, error : float
-        The measured value and its standard error.
+        The measured value and its standard error. The verdict is undecided if one is not finite.
     expected, tolerance : float
-        What is expected of the value.
+        Expected value and allowed deviation.
     kind : str
         "around", "least" (at least expected - tolerance) or "most" (at most expected + tolerance).
 

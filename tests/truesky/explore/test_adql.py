@@ -1,4 +1,4 @@
-"""ADQL becomes DuckDB's SQL: what differs is changed, what is quoted stays, what cannot be is named."""
+"""Translation of ADQL to DuckDB's SQL: differences are translated, quotes stay, and errors name unsupported terms."""
 
 import contextlib
 
@@ -36,7 +36,7 @@ def database():
         ("SELECT top FROM t", "SELECT top FROM t"),
     ],
 )
-def test_in_sql(query, sql):
+def test_to_sql(query, sql):
     assert adql.to_sql(query).split() == sql.split()
 
 
@@ -57,7 +57,7 @@ CONE = "CONTAINS(POINT('ICRS', {0}ra, {0}dec), CIRCLE('ICRS', 40, -30, 3)) = 1"
     ],
 )
 def test_a_cone_has_ranges_of_cells(database, query, column):
-    """With them the rows are the same, and a scan that looks at the ranges alone reads fewer."""
+    """The rows stay the same, and a scan that uses only the ranges reads fewer."""
     rng = np.random.default_rng(4)
     ra, dec = rng.uniform(30, 50, 4000), rng.uniform(-40, -20, 4000)
     rows = pa.table({"x": np.arange(4000), "ra": ra, "dec": dec, "_healpix_29": sky.healpix_29(ra, dec)})
@@ -76,7 +76,7 @@ def test_a_cone_has_ranges_of_cells(database, query, column):
 @pytest.mark.parametrize(
     "query",
     [
-        # Of no catalogue, of which of several, of a name that hides one, of columns of another name.
+        # Not a catalogue, an ambiguous table, a name that hides one, columns of another name.
         f"SELECT x FROM u WHERE {CONE.format('')}",
         f"SELECT x FROM t, u WHERE {CONE.format('')}",
         f"SELECT x FROM t JOIN u USING (x) WHERE {CONE.format('')}",
@@ -89,7 +89,7 @@ def test_a_cone_has_ranges_of_cells(database, query, column):
         "SELECT x FROM t WHERE CONTAINS(POINT(dec, ra), CIRCLE(40, -30, 3)) = 1",
         "SELECT x FROM t WHERE CONTAINS(POINT(ra, dec), CIRCLE(40, -30, x)) = 1",
         "SELECT x FROM t WHERE CONTAINS(POINT(ra, dec), CIRCLE(40, -30, 90)) = 1",
-        # Of no condition of its own.
+        # The comparison is not a complete condition.
         f"SELECT {CONE.format('')} FROM t",
         f"SELECT x FROM t WHERE {CONE.format('')} + 1",
         f"SELECT x FROM t WHERE 1 + {CONE.format('')}",
@@ -99,7 +99,7 @@ def test_a_cone_has_ranges_of_cells(database, query, column):
         "SELECT x FROM t WHERE DISTANCE(POINT(ra, dec), POINT(40, -30)) = 1",
     ],
 )
-def test_where_cells_are_not_known_none_are_asked_for(query):
+def test_no_cell_ranges_without_known_index(query):
     assert adql.to_sql(query, {"t"}) == adql.to_sql(query)
 
 
@@ -108,14 +108,14 @@ def test_where_cells_are_not_known_none_are_asked_for(query):
     [
         ("SELECT BOX('', 1, 2, 3, 4) FROM t", "BOX is not possible"),
         ("SELECT POINT(1, 2) FROM t", "POINT is not possible alone"),
-        ("SELECT CONTAINS(POINT(1, 2)) FROM t", "wants 2 arguments, got 1"),
+        ("SELECT CONTAINS(POINT(1, 2)) FROM t", "requires 2 arguments, got 1"),
         ("SELECT CONTAINS(POINT(1, 2), CIRCLE(1, 2)) FROM t", "two coordinates and a radius"),
         ("SELECT CONTAINS(POINT(1), CIRCLE(1, 2, 3)) FROM t", "two coordinates"),
-        ("SELECT CONTAINS(CIRCLE(1, 2, 3), POINT(1, 2)) FROM t", "wants a POINT"),
+        ("SELECT CONTAINS(CIRCLE(1, 2, 3), POINT(1, 2)) FROM t", "requires a POINT"),
         ("SELECT CONTAINS(POINT(1, 2), POLYGON(1, 2, 3, 4)) FROM t", "three corners"),
         ("SELECT CONTAINS(POINT(1, 2), REGION('x')) FROM t", "REGION is not possible"),
         ("SELECT DISTANCE(POINT(1, 2) FROM t", "bracket is not closed"),
-        ("SELECT DISTANCE(, ) FROM t", "wants a POINT"),
+        ("SELECT DISTANCE(, ) FROM t", "requires a POINT"),
         ("SELECT " + "x" * 60_000, "at most"),
     ],
 )
@@ -138,7 +138,7 @@ def test_polygons(database):
 
 
 def test_a_polygon_with_a_notch(database):
-    # An L: its corner at 15, 0 goes inwards.
+    # The polygon is an L whose corner at 15, 0 points inwards.
     corners = "10, -5, 20, -5, 20, 0, 15, 0, 15, 5, 10, 5"
     back = "10, 5, 15, 5, 15, 0, 20, 0, 20, -5, 10, -5"
     for ra, dec, inside in ((12, 3, 1), (18, -3, 1), (12, -3, 1), (18, 3, 0), (9, 0, 0), (21, -3, 0), (192, -3, 0)):
@@ -162,8 +162,8 @@ def test_circles_that_meet_polygons(database):
 @given(
     st.floats(0, 360), st.floats(-89, 89), st.floats(0.01, 5), st.floats(0, 6.28), st.floats(0, 0.9) | st.floats(1.1, 2)
 )
-def test_a_ring_of_corners(database, ra, dec, radius, angle, share):
-    """What lies clearly within or beyond it is told apart."""
+def test_regular_polygons(database, ra, dec, radius, angle, share):
+    """Positions clearly inside or outside are classified correctly."""
 
     def beside(turn, r):
         d, b = np.radians(r), np.radians(dec)
@@ -179,6 +179,6 @@ def test_a_ring_of_corners(database, ra, dec, radius, angle, share):
 
 
 @given(st.text(max_size=60))
-def test_any_text_is_one_or_refused(text):
+def test_any_text_is_translated_or_refused(text):
     with contextlib.suppress(BadInput):
         assert isinstance(adql.to_sql(text), str)

@@ -1,4 +1,4 @@
-"""Kept columns hold the rows of the table in its order, are filled once, and never mixed where rows come otherwise."""
+"""Stored columns hold the rows of the table in its order, are filled once, and are never mixed if rows change order."""
 
 import numpy as np
 import pyarrow as pa
@@ -47,7 +47,7 @@ def test_rows_of_a_table(ask, explored, galaxies):
     assert np.nanmax(ratio) == 1.0
 
 
-def test_a_part_and_a_condition(ask):
+def test_sample_and_condition(ask):
     whole = load(Selection("k", "galaxies", keys=KEYS), ["z_obs"], ask)[0]
     (some,) = load(Selection("k", "galaxies", keys=KEYS, part=8), ["z_obs"], ask)
     assert 0 < len(some) < len(whole) / 4
@@ -63,7 +63,7 @@ def test_a_join_is_one_query(ask):
 
 
 def test_rows_in_another_order_are_not_mixed(monkeypatch, tmp_path):
-    """A made engine that gives the rows of each query in an order of its own."""
+    """The mock engine returns the rows of each query in a different order."""
     monkeypatch.setenv("TRUESKY_CACHE", str(tmp_path))
     asked = []
 
@@ -83,7 +83,7 @@ def test_rows_in_another_order_are_not_mixed(monkeypatch, tmp_path):
     "z_obs) FROM galaxies --", "z_obs), (1", "z_obs) LIMIT (3", "z_obs) ORDER BY (1", "1) UNION SELECT (2", "",
     "z_obs) AS x, (1", "SELECT 1; SELECT 2", "read_text('/etc/passwd')", "z_obs) WHERE (true", "getenv('HOME')",
 ])  # fmt: skip
-def test_only_an_expression_is_one(ask, text):
+def test_only_single_expressions_are_accepted(ask, text):
     for selection, wanted in (
         (Selection("k", "galaxies", keys=KEYS), [text]),
         (Selection("k", "galaxies", text), ["1"]),
@@ -92,7 +92,7 @@ def test_only_an_expression_is_one(ask, text):
             load(selection, wanted, ask)
 
 
-def test_the_oldest_goes_first(ask):
+def test_oldest_columns_are_removed_first(ask):
     for text in ("1", "2", "3"):
         load(Selection("k", "galaxies", keys=KEYS), [text], ask)
     size = sum(file.stat().st_size for file in cache.cache_dir().rglob("*") if file.is_file())

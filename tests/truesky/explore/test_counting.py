@@ -1,4 +1,4 @@
-"""Charts are counted as DuckDB counts them, whatever is missing, infinite or on an edge."""
+"""Counts of charts agree with DuckDB, also for missing and infinite values and values on an edge."""
 
 import duckdb
 import numpy as np
@@ -22,7 +22,7 @@ def rows(seed, number=20_000):
 
 
 def by_duckdb(columns, chart, limits):
-    """The slow reference: one query a chart."""
+    """The slow reference: one query per chart."""
     table = pa.table({f"c{k}": pa.array(column, from_pandas=True) for k, column in enumerate(columns)})
     own = set(chart.columns) if chart.own is None else chart.own
     where = [f"c{k} BETWEEN {lo!r}::DOUBLE AND {hi!r}::DOUBLE" for k, (lo, hi) in limits.items() if k not in own]
@@ -75,7 +75,7 @@ def test_every_value_counts_at_most_once(values, bins):
 @pytest.mark.parametrize("threads", [1, 3])
 @pytest.mark.parametrize("limits", [{}, {1: (0.0, 1.0)}, {0: (-1.0, 0.1), 3: (0.3, 2.0), 2: (-9, 9)}])
 def test_rows_beyond_the_spans(limits, threads):
-    """Those that would count if the spans held every number, and do not: of few bins, and of more than rows."""
+    """Rows that would count with infinite spans, for few bins and for more bins than rows."""
     columns, everything = rows(1), (-3.5e38, 3.5e38)
     grids = [*CHARTS, Chart((0, 3), ((-2.0, 2.0), (-1.0, 1.0)), (600, 700))]
     wide = [
@@ -88,7 +88,7 @@ def test_rows_beyond_the_spans(limits, threads):
     assert min(beyond) > 100
 
 
-def test_held():
+def test_inspect_columns():
     columns = rows(3)
     found = inspect_columns(columns)
     assert found.missing == [int((~np.isfinite(column)).sum()) for column in columns]
@@ -104,14 +104,14 @@ def test_refusals():
         ((0,), ((0.0, 1.0),), (0,)),
         ((0, 1), ((0.0, 1.0),), (3, 3)),
         ((0, 1), ((0.0, 1.0),) * 2, (10_000, 10_000)),
-        # Their product is 0 in 64 bits, that of the last 1.
+        # The products are 0 or 1 in 64 bits.
         ((0, 1), ((0.0, 1.0),) * 2, (2**40, 2**24)),
         ((0, 1), ((0.0, 1.0),) * 2, (np.int64(2**40), np.int64(2**24))),
         ((0, 1), ((0.0, 1.0),) * 2, (2**64 - 1, 2**64 - 1)),
     ]:
         with pytest.raises(BadInput):
             Chart(axes, spans, bins)
-    with pytest.raises(BadInput, match="of the same rows"):
+    with pytest.raises(BadInput, match="columns of equal length"):
         count_rows([np.zeros(2, np.float32), np.zeros(3, np.float32)], CHARTS[:1], {})
     column = [np.zeros(2, np.float32)]
     for charts, limits in ((CHARTS[1:2], {}), ([Chart((-1,), ((0.0, 1.0),), (3,))], {}), (CHARTS[:1], {1: (0.0, 1.0)})):
@@ -136,8 +136,8 @@ def test_span():
 
 @pytest.mark.parametrize("limits", [{}, {2: (-0.5, 0.3), 0: (0.0, 3.0)}, {3: (9.0, 9.1)}])
 @pytest.mark.parametrize("most", [1, 100, 5_000, 10**6])
-def test_points_are_of_the_rows_that_count(limits, most):
-    """Sample of 100,000 rows; significance 2e-9 of the number that is told (6 standard errors)."""
+def test_points_are_rows_that_count(limits, most):
+    """Sample of 100,000 rows; significance 2e-9 for the estimated number of rows (6 standard errors)."""
     columns = rows(4, 100_000)
     chart = Chart((0, 1), ((-1.0, 1.0), (0.0, 0.3)), (1, 1))
     places, step = points(columns, chart, limits, most)
@@ -147,8 +147,8 @@ def test_points_are_of_the_rows_that_count(limits, most):
     found = {tuple(place) for place in places.tolist()}
     assert found <= {*zip(columns[0].tolist(), columns[1].tolist(), strict=True)}
     if total <= most:
-        # Where there is room for all, all are there.
+        # If there is room for all points, all are returned.
         assert (len(places), step) == (total, 1)
     else:
-        # Their number tells that of the rows, as a sample does.
+        # Their number times the step estimates the number of rows.
         assert len(places) * step == pytest.approx(total, abs=6 * np.sqrt(total * step))

@@ -1,4 +1,4 @@
-"""The explorer: the same numbers as numpy on the same rows."""
+"""The explorer returns the same numbers as numpy for the same rows."""
 
 import json
 import os
@@ -113,7 +113,7 @@ def test_astropy_has_no_two_columns_of_one_name(explorer):
     assert explorer.sql("SELECT 1 AS a, 2 AS a").shape == (1, 2)
 
 
-# A unit stays with a column that is the table's own, and with no other.
+# Only unchanged columns of a table have its unit.
 UNITS = [
     ("SELECT ra FROM galaxies", {"ra": "deg"}),
     ("SELECT * FROM galaxies", {"ra": "deg", "a_v": "mag"}),
@@ -196,7 +196,7 @@ def test_a_cone_is_a_cone(explorer, galaxies):
     assert explorer.cone("galaxies", ra, dec, 0.5, into="astropy")["ra"].unit == u.deg
 
 
-def test_hist_is_numpys(explorer, galaxies):
+def test_hist_agrees_with_numpy(explorer, galaxies):
     z = galaxies["z_obs"].to_numpy().astype(float)
     counts, edges = explorer.hist("galaxies", "z_obs", 20)
     wanted, wanted_edges = np.histogram(z, 20)
@@ -238,7 +238,7 @@ def test_wrong_arguments_are_named(explorer, number):
 
 
 @pytest.mark.parametrize("number", ["x", None, float("nan"), -1.0])
-def test_limits_of_a_lake_are_numbers(explored, number):
+def test_limits_must_be_numbers(explored, number):
     for name in ("memory", "timeout"):
         with pytest.raises(BadInput, match=name):
             Explorer(explored, **{name: number})
@@ -267,7 +267,7 @@ def test_a_table_of_another_version_is_not_listed_as_damaged(lake):
     assert "written by another version of truesky" in row["meaning"]
 
 
-def test_heatmap_is_numpys(explorer, galaxies):
+def test_heatmap_agrees_with_numpy(explorer, galaxies):
     x, y = (galaxies[name].to_numpy().astype(float) for name in ("z_obs", "abs_mag_r01"))
     counts, x_edges, y_edges = explorer.heatmap("galaxies", "z_obs", "abs_mag_r01", (8, 5))
     wanted, wanted_x, wanted_y = np.histogram2d(x, y, (8, 5))
@@ -334,13 +334,13 @@ def test_an_explorer_stays_with_the_versions_it_opened(lake):
         assert explorer.sql("SELECT DISTINCT value FROM plain")["value"].tolist() == [2.0]
 
 
-def test_a_changed_byte_is_damage_not_a_number(lake):
+def test_changed_byte_is_damage(lake):
     publish.make_version(lake, plain_plan(), plain_work)
     path = read.version(lake, "plain").partition_path("1.parquet")
     data = bytearray(path.read_bytes())
     with Explorer(lake) as explorer:
         assert explorer.sql("SELECT sum(value) AS s FROM plain")["s"][0] == 60.0
-        # Of a page: the footer has been read.
+        # Change a byte of a page, since the footer has been read already.
         data[60] ^= 1
         path.write_bytes(data)
         with pytest.raises(Damaged):
@@ -376,7 +376,7 @@ def test_results_in_files(explorer, galaxies, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.csv", "a.fits", "a.parquet"]
 
 
-def test_what_fits_cannot_hold(explorer, tmp_path):
+def test_types_that_fits_cannot_hold(explorer, tmp_path):
     from astropy.table import Table
 
     text = "SELECT date '2020-01-01' AS d, [1, 2] AS l, 1::UTINYINT AS k, sum(id) AS s, NULL::BIGINT AS n FROM plain"
@@ -415,7 +415,7 @@ def test_a_column_that_a_file_cannot_hold_is_named(explorer, tmp_path, column, k
 
 
 def test_questions_are_one_line_of_json(explorer):
-    """Whatever is in a text, it cannot become a second question."""
+    """No text in a query can become a second question."""
     text = 'SELECT $x AS a\n{"sql": "SELECT 2"}'
     with pytest.raises(BadInput):
         explorer.sql(text, x=1)
@@ -423,7 +423,7 @@ def test_questions_are_one_line_of_json(explorer):
 
 
 def test_expressions_may_end_in_a_comment(explorer):
-    """Each of them stands alone, whatever follows it in the query."""
+    """Each expression stands alone, whatever follows it in the query."""
     given = {"where": "z_obs > 1 -- far", "weight": "mag_r01 -- light"}
     plain = {"where": "z_obs > 1", "weight": "mag_r01"}
     for name, axes, noted in (

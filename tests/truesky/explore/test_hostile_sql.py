@@ -1,4 +1,4 @@
-"""No query text can read another file, write, attach, install, change the session, or run without end."""
+"""No query text can read other files, write, attach, install, change the session, or run without limits."""
 
 import hashlib
 import time
@@ -12,9 +12,9 @@ from truesky.explore.explorer import Explorer
 from truesky.explore.session import Session
 
 SECRET = "the content of a file outside"
-# {file} is a file outside the lake, {part} one of the lake, {new} a file that must not come into being.
+# {file} is a file outside the lake, {part} a file of the lake, {new} a file that must not be created.
 HOSTILE = [
-    # several statements, or another one
+    # Several statements, or other statements.
     "SELECT 1; SELECT 2",
     "SELECT 1; DROP VIEW galaxies",
     "SELECT 1 /* ; */; COPY galaxies TO '{new}'",
@@ -89,7 +89,7 @@ HOSTILE = [
     "SELECT getvariable('x')",
     "SELECT write_log('x')",
     "SELECT setseed(0.5)",
-    # the catalogue of the session, by a name that a WITH clause has given to something else
+    # The catalogue of the session through a name that a WITH clause uses for something else.
     "WITH pg_class AS (SELECT * FROM pg_class) SELECT * FROM pg_class",
     "WITH a AS (SELECT * FROM pg_class), pg_class AS (SELECT 1) SELECT * FROM a",
     "SELECT * FROM (WITH pg_class AS (SELECT 1) SELECT 1), pg_class",
@@ -154,13 +154,13 @@ def test_hostile_text_is_refused(explorer, explored, outside, before, text):
     assert state(explored, outside) == before
 
 
-def test_enough_of_them():
+def test_number_of_hostile_texts():
     assert len(set(HOSTILE)) >= 50
 
 
 @pytest.mark.parametrize("text", HOSTILE, ids=lambda text: text[:50])
-def test_the_locked_session_is_a_second_fence(explored, outside, before, text, monkeypatch):
-    """Were the guard blind, DuckDB itself would still reach nothing outside."""
+def test_locked_session_is_a_second_protection(explored, outside, before, text, monkeypatch):
+    """Even without the guard, DuckDB cannot reach anything outside."""
     if any(word in text for word in ("POINTER", "5000", "(" * 100, "+1+1", "x" * 100)):
         return
     galaxies = read.version(explored, "galaxies")
@@ -176,7 +176,7 @@ def test_the_locked_session_is_a_second_fence(explored, outside, before, text, m
     assert state(explored, outside) == before
 
 
-# Queries that are allowed and have no end, or no bound.
+# Allowed queries without an end or a bound.
 ENDLESS = [
     "SELECT count(*) FROM range(1000000000) a, range(1000000000) b",
     "WITH RECURSIVE t(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM t) SELECT count(*) FROM t",
@@ -192,14 +192,14 @@ BOUNDLESS = [
 
 @pytest.fixture(scope="module")
 def small(explored):
-    """An explorer of little memory."""
+    """An explorer with little memory."""
     with Explorer(explored, memory=256 << 20) as opened:
         yield opened
 
 
 @pytest.mark.parametrize("text", ENDLESS + BOUNDLESS)
 def test_time_and_memory_have_a_limit(small, text):
-    # The process is there: it is the query that is stopped.
+    # The process is running, so the limit applies to the query.
     small.timeout = 30.0
     assert small.sql("SELECT 1 AS n")["n"][0] == 1
     small.timeout = 0.3 if text in ENDLESS else 1.0
@@ -207,7 +207,7 @@ def test_time_and_memory_have_a_limit(small, text):
     with pytest.raises(BadInput, match=rf"stopped after {small.timeout:g} s|more memory"):
         small.sql(text)
     assert time.monotonic() - started < small.timeout + 60.0
-    # The next question is answered by a new process, or by the same.
+    # The next query is answered by a new process or by the same one.
     small.timeout = 30.0
     assert small.sql("SELECT count(*) AS n FROM plain")["n"][0] == 60
 

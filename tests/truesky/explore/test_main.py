@@ -46,7 +46,7 @@ def test_a_query_into_a_file(explored, tmp_path, capsys):
         ),
     ],
 )
-def test_what_is_wrong_is_one_line(explored, capsys, arguments, words):
+def test_errors_are_one_line(explored, capsys, arguments, words):
     assert main([*arguments, "--lake", str(explored)]) == 2
     err = capsys.readouterr().err
     assert words in err
@@ -54,7 +54,7 @@ def test_what_is_wrong_is_one_line(explored, capsys, arguments, words):
 
 
 @pytest.mark.parametrize(("lake", "words"), [("", "empty"), (__file__, "not a folder"), ("~nouser/x", "nouser")])
-def test_what_is_no_lake_is_one_line(capsys, lake, words):
+def test_missing_lake_is_one_line(capsys, lake, words):
     assert main(["SELECT 1", "--lake", lake]) == 2
     err = capsys.readouterr().err
     assert words in err
@@ -66,7 +66,7 @@ def test_an_identifier_beside_a_missing_one_is_printed_whole(explored, capsys):
     assert capsys.readouterr().out.split() == ["id", str(2**53 + 1), "<NA>", "2", "rows"]
 
 
-def test_one_damaged_table_does_not_shut_the_others(explored, capsys, tmp_path):
+def test_other_tables_remain_usable_beside_a_damaged_one(explored, capsys, tmp_path):
     shutil.copytree(explored, tmp_path / "lake", symlinks=True)
     shutil.rmtree(read.version(tmp_path / "lake", "plain").folder)
     manifest = read.version(tmp_path / "lake", "galaxy_fluxes").folder / "manifest.json"

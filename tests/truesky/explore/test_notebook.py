@@ -1,4 +1,4 @@
-"""The notebook runs on a small field made by the real jobs, and shows what it says."""
+"""The notebook runs on a small field from the real jobs, and its text agrees with its results."""
 
 from pathlib import Path
 
@@ -33,14 +33,14 @@ def field(tmp_path_factory):
 
 @pytest.fixture
 def cells(field, tmp_path, monkeypatch):
-    """The notebook's, with an environment that leads to the field."""
+    """Cells of the notebook, with an environment that points to the field."""
     monkeypatch.setenv("TRUESKY_LAKE", str(field))
     monkeypatch.setenv("TRUESKY_DOWNLOADS", str(tmp_path))
     return [cell.source for cell in nbformat.read(NOTEBOOK, as_version=4).cells if cell.cell_type == "code"]
 
 
 def check(folder):
-    """What the notebook exports."""
+    """Files that the notebook exports."""
     taken = Table.read(folder / "redshift_one.fits")
     assert len(taken) > 100
     assert taken["ra"].unit == "deg"
@@ -48,7 +48,7 @@ def check(folder):
 
 
 def test_every_cell_runs(cells, tmp_path, capsys):
-    """Here; by night in a kernel, which draws the figures."""
+    """Cells run in this process; at night they run in a kernel, which draws the figures."""
     plt.switch_backend("Agg")
     names, before = {}, set(plt.get_fignums())
     for cell in cells:

@@ -1,4 +1,4 @@
-"""A lake on object storage, asked as one in a folder is, and by what others read lakes with."""
+"""A lake on object storage answers queries as a lake in a folder, and other programs can read it."""
 
 import pytest
 
@@ -16,7 +16,7 @@ BUCKET = "explored-by-all"
 
 @pytest.fixture(scope="module")
 def pushed(explored, object_storage):
-    """Address of the lake of this folder, pushed once; a test that changes an object puts it back."""
+    """Address of the pushed lake; a test that changes an object restores it."""
     with pytest.MonkeyPatch.context() as patch:
         for name, value in storage.CREDENTIALS.items():
             patch.setenv(name, value)
@@ -28,12 +28,12 @@ def pushed(explored, object_storage):
 
 @pytest.fixture
 def there(pushed, bucket):
-    """The same with an environment that leads there."""
+    """The same with environment variables that point to the store."""
     return pushed
 
 
-def test_questions_have_the_same_answers(explored, there, monkeypatch):
-    # The address alone says which service it is.
+def test_object_storage_gives_the_same_answers(explored, there, monkeypatch):
+    # The address alone identifies the service.
     monkeypatch.delenv("AWS_ENDPOINT_URL")
     joined = (
         "SELECT count(*) AS n, sum(f_nu_euclid_vis) AS s FROM galaxies JOIN galaxy_fluxes USING (id) WHERE z_obs > 1"
@@ -80,9 +80,9 @@ def test_lsdb_reads_it_through_pyarrow(explored, there, monkeypatch):
     found = galaxies.cone_search(ra, dec, 1800.0).compute()
     assert sorted(found["id"]) == sorted(here.cone(ra, dec, 0.5)["id"].to_pylist())
     assert 0 < len(found) < 500
-    with pytest.raises(BadInput, match="plain is no catalogue"):
+    with pytest.raises(BadInput, match="plain is not a catalogue"):
         catalogue(there, "plain")
-    with pytest.raises(BadInput, match="is no address"):
+    with pytest.raises(BadInput, match="is not an address"):
         catalogue(str(explored), "galaxies")
 
 

@@ -1,4 +1,4 @@
-"""The pictures hold the numbers that were counted."""
+"""Plots contain the counted numbers."""
 
 import matplotlib as mpl
 import numpy as np

@@ -1,4 +1,4 @@
-"""The process of queries: results piece by piece, its session kept open, and nothing of one answer in the next."""
+"""Process of queries: results piece by piece, a persistent session, and no mixing of answers."""
 
 import threading
 import time
@@ -26,20 +26,20 @@ def numbers(batches):
     return [value for batch in batches for value in batch.column(0).to_pylist()]
 
 
-def test_so_many_rows(process):
-    assert numbers(process.batches("SELECT * FROM range(1000000)", rows=100_001)) == list(range(100_001))
-    assert numbers(process.batches("SELECT * FROM range(5)", rows=9)) == list(range(5))
+def test_row_limit(process):
+    assert numbers(process.batches("SELECT * FROM range(1000000)", max_rows=100_001)) == list(range(100_001))
+    assert numbers(process.batches("SELECT * FROM range(5)", max_rows=9)) == list(range(5))
     (empty,) = process.batches("SELECT 1::HUGEINT AS a WHERE false")
     assert (empty.num_rows, str(empty.schema.field("a").type)) == (0, "int64")
 
 
 def test_a_result_that_is_too_large(process):
     with pytest.raises(BadInput, match="needs more memory"):
-        list(process.batches("SELECT * FROM range(10000000)", most_bytes=1_000_000))
+        list(process.batches("SELECT * FROM range(10000000)", max_bytes=1_000_000))
 
 
-def test_an_error_in_the_midst(process):
-    """Some pieces have come before it is known; the same process then answers the next question."""
+def test_error_after_some_pieces(process):
+    """Some pieces arrive before the error; the same process then answers the next question."""
     process.ask("SELECT 1", {})
     worker, got = process._worker, []
     late = "SELECT CASE WHEN range = 4900000 THEN error('no') ELSE range END FROM range(5000000)"
@@ -55,15 +55,15 @@ def test_an_error_in_the_midst(process):
     assert process._worker is worker
 
 
-def test_who_reads_no_further_meets_no_rest(process):
+def test_unread_rows_do_not_reach_the_next_query(process):
     batches = process.batches("SELECT range + 100 FROM range(100000000)")
     assert next(batches).num_rows >= 0
     batches.close()
     assert numbers(process.batches("SELECT 7 AS a")) == [7]
 
 
-def test_what_is_read_no_further_ends_no_later_answer(process):
-    """However late it is found out: a generator that failed is kept alive by the traceback of its error."""
+def test_abandoned_generator_does_not_end_a_later_query(process):
+    """A failed generator is kept alive by the traceback of its error, so its end can be noticed late."""
     given_up = process.batches("SELECT range + 100 FROM range(100000000)")
     assert next(given_up).num_rows >= 0
     later = process.batches("SELECT range FROM range(3000000)")
@@ -75,7 +75,7 @@ def test_what_is_read_no_further_ends_no_later_answer(process):
 
 
 def test_threads_get_their_answers(process):
-    """Each thread gets the rows that it asked for, whatever the others ask meanwhile."""
+    """Each thread gets the rows of its query, whatever other threads query meanwhile."""
 
     def rounds(number):
         return {process.ask(f"SELECT {number} AS a", {})["a"][0].as_py() for _ in range(10)}
@@ -84,8 +84,8 @@ def test_threads_get_their_answers(process):
         assert list(threads.map(rounds, range(4))) == [{number} for number in range(4)]
 
 
-def test_rows_that_are_not_read_let_another_thread_ask(process):
-    """The query whose rows were left ends, and says so to whoever reads on."""
+def test_unread_rows_do_not_block_other_threads(process):
+    """The query with unread rows ends, and further reading raises an error."""
     left = process.batches("SELECT range + 100 FROM range(100000000)")
     assert next(left).num_rows >= 0
     with ThreadPoolExecutor(1) as thread:
@@ -94,7 +94,7 @@ def test_rows_that_are_not_read_let_another_thread_ask(process):
         next(left)
 
 
-def test_rows_that_are_given_up_do_not_wait_for_the_query_of_another_thread(process):
+def test_abandoned_rows_do_not_wait_for_other_threads(process):
     left, is_locked, is_done = process.batches("SELECT * FROM range(9)"), threading.Event(), threading.Event()
     next(left)
 
@@ -112,7 +112,7 @@ def test_rows_that_are_given_up_do_not_wait_for_the_query_of_another_thread(proc
     assert process.ask("SELECT 7 AS a", {})["a"].to_pylist() == [7]
 
 
-def test_a_query_that_another_thread_ends_by_closing_says_so(process):
+def test_query_closed_by_another_thread_raises(process):
     process.ask("SELECT 1", {})
     with ThreadPoolExecutor(1) as thread:
         waiting = thread.submit(process.ask, SLOW, {}, 60.0)
@@ -132,13 +132,13 @@ def test_an_answer_names_its_question(process):
     assert process.ask("SELECT 7 AS a", {})["a"].to_pylist() == [7]
 
 
-def test_it_is_stopped_while_it_sends(process):
+def test_query_is_stopped_while_it_sends(process):
     with pytest.raises(BadInput, match=r"stopped after 0\.3 s"):
         list(process.batches(SLOW, timeout=0.3))
     assert numbers(process.batches("SELECT 7 AS a")) == [7]
 
 
-def test_the_session_is_kept_and_begins_anew_after_an_error(lake):
+def test_session_is_kept_and_restarts_after_an_error(lake):
     publish.make_version(lake, plain_plan(), plain_work)
     version = read.version(lake, "plain")
     session = Session(lake, {"plain": version.key}, 1 << 30)
@@ -154,7 +154,7 @@ def test_the_session_is_kept_and_begins_anew_after_an_error(lake):
         ask("SELECT nothing FROM plain")
     assert session._database is None
     assert ask("SELECT count(*) FROM plain") == [60]
-    # A page that was compared for one question is compared again for the next.
+    # The page's checksum is compared again for the next query.
     path = version.partition_path("1.parquet")
     data = bytearray(path.read_bytes())
     data[60] ^= 1

@@ -1,4 +1,4 @@
-"""Several requests in one lake: one is named, or its tables are called by its name, and no query mixes them unseen."""
+"""Several requests in one lake: name one, or use its name before the table; no query mixes them silently."""
 
 import pytest
 
@@ -38,7 +38,7 @@ def test_a_query_of_both(opened):
 
 
 @pytest.mark.parametrize("call", [lambda e: e.sql("FROM plain"), lambda e: e.describe("plain")])
-def test_a_table_that_two_have_is_not_guessed(opened, call):
+def test_ambiguous_table_is_refused(opened, call):
     with pytest.raises(BadInput, match=r"requests a, my-b have different versions of table plain: name one"):
         call(opened)
 
@@ -46,12 +46,12 @@ def test_a_table_that_two_have_is_not_guessed(opened, call):
 @pytest.mark.parametrize(
     "text", ["FROM c.plain", "FROM a.galaxies", "FROM x.a.plain", "FROM temp.plain", "FROM main.toy"]
 )
-def test_no_other_schema_is_reached(opened, text):
+def test_other_schemas_are_refused(opened, text):
     with pytest.raises(BadInput, match="is not a table of the lake"):
         opened.sql(text)
 
 
-def test_one_is_named(two, capsys):
+def test_name_selects_a_request(two, capsys):
     with Explorer(two, timeout=30.0, request="a") as explorer:
         assert sorted(explorer.tables().index) == ["plain", "toy"]
         assert explorer.sql("SELECT DISTINCT value FROM plain")["value"].tolist() == [1.0]

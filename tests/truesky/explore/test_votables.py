@@ -1,4 +1,4 @@
-"""A VOTable of any rows is read back by astropy, value for value."""
+"""astropy reads VOTables of any rows without a change of values."""
 
 import io
 
@@ -9,7 +9,7 @@ from astropy.io.votable import parse
 
 from truesky.explore import votables
 
-# astropy warns of characters beyond ASCII, which readers of today take; pytest-xdist cannot pass its warnings on.
+# astropy warns of non-ASCII characters, which current readers accept; pytest-xdist cannot pass these warnings on.
 pytestmark = pytest.mark.filterwarnings("ignore:.*non-ASCII")
 
 COLUMNS = {
@@ -52,13 +52,13 @@ def test_values_come_back():
 
 
 @pytest.mark.parametrize(("most", "overflowed"), [(0, True), (1, True), (2, True), (3, False), (None, False)])
-def test_a_cut_is_said(most, overflowed):
+def test_overflow_is_reported(most, overflowed):
     data, cut = made(most)
     assert cut.overflowed == overflowed == (b'value="OVERFLOW"' in data)
     assert len(read(data).get_first_table().array) == (3 if most is None else most)
 
 
-def test_a_refusal():
+def test_error_document():
     (info,) = read(votables.refusal("no <table> & \x01")).resources[0].infos
     assert (info.name, info.value) == ("QUERY_STATUS", "ERROR")
     assert info.content == "no <table> & \N{REPLACEMENT CHARACTER}"
@@ -79,7 +79,7 @@ def test_characters_that_xml_lacks(character):
 
 @pytest.mark.parametrize("most", [None, 50_000, 0])
 def test_pieces_of_many_rows_are_small(most):
-    """However many come at a time: as texts they take many times their size."""
+    """Pieces are small for batches of any size, since values as text need much more memory."""
     batch = pa.RecordBatch.from_pydict({"a": np.arange(100_000), "b": np.arange(100_000) / 7})
     cut = votables.RowLimit(most)
     pieces = [*votables.pieces([batch], cut)]

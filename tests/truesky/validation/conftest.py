@@ -1,4 +1,4 @@
-"""The drawn sky of the catalogue's tests: where both run in one process it is drawn once."""
+"""Share the drawn sky with the tests of the catalogue, so that one process draws it once."""
 
 from tests.truesky.catalogue.conftest import drawn, dust, flat_sky, rng
 

@@ -1,4 +1,4 @@
-"""The command that compares a universe with its expectations: exit status and files, of figures that are given."""
+"""The validation command with given figures: exit status and files."""
 
 import json
 import math
@@ -16,7 +16,7 @@ GOOD = {"sigma_8": 0.83, "chi_2.3": 3844.0, "galaxies": 17.0}
 
 @pytest.fixture
 def found(monkeypatch):
-    """The figures that the long computation is to have found."""
+    """Figures that replace the result of the long computation."""
     figures = dict(GOOD)
     monkeypatch.setattr(universe, "run", lambda size, folder: figures)
     return figures
@@ -32,7 +32,7 @@ def test_all_as_expected(found, tmp_path, capsys):
     assert "2 of 2 as expected" in capsys.readouterr().out
 
 
-def test_a_check_that_fails_is_the_exit_status(found, tmp_path, capsys):
+def test_failed_check_sets_exit_status(found, tmp_path, capsys):
     found["sigma_8"] = 0.7
     file = tmp_path / "figures.json"
     assert __main__.main(["--json", str(file)]) == 1
@@ -40,14 +40,14 @@ def test_a_check_that_fails_is_the_exit_status(found, tmp_path, capsys):
     assert "  not: sigma_8\n" in capsys.readouterr().out
 
 
-def test_a_figure_that_is_no_number_fails(found, tmp_path):
+def test_nan_figure_fails(found, tmp_path):
     found["sigma_8"] = math.nan
     file = tmp_path / "figures.json"
     assert __main__.main(["--json", str(file)]) == 1
     assert json.loads(file.read_text())["sigma_8"] is None
 
 
-def test_what_is_known_to_fail_is_reported_with_its_reason(found, tmp_path, monkeypatch, capsys):
+def test_known_failure_is_reported_with_its_reason(found, tmp_path, monkeypatch, capsys):
     (tmp_path / "list.csv").write_text(
         "name,expected,kind,tolerance,source,known_to_fail\ngalaxies,20,absolute,1,a survey,it was cloudy\n"
     )
@@ -61,7 +61,7 @@ def test_what_is_known_to_fail_is_reported_with_its_reason(found, tmp_path, monk
     assert "listed as known to fail: galaxies" in capsys.readouterr().out
 
 
-def test_remembered_numbers_gate_nothing(found, tmp_path, monkeypatch, capsys):
+def test_numbers_quoted_from_memory_are_not_binding(found, tmp_path, monkeypatch, capsys):
     head = "name,expected,kind,tolerance,source,known_to_fail,confidence\n"
     for confidence, status in (("M", 0), ("P", 1)):
         (tmp_path / "list.csv").write_text(f"{head}galaxies,40,factor,2,a survey,,{confidence}\n")
@@ -88,7 +88,7 @@ def test_paths_are_checked_before_anything_is_computed(monkeypatch, tmp_path, ca
     monkeypatch.setattr(universe, "run", lambda *_: pytest.fail("computed"))
     (tmp_path / "file").touch()
     (tmp_path / "locked").mkdir()
-    # As another user than root finds it.
+    # Only users other than root cannot write here.
     monkeypatch.setattr(os, "access", lambda folder, mode: "locked" not in str(folder))
     assert __main__.main([option, str(tmp_path / name)]) == 2
     lines = capsys.readouterr().err.splitlines()
@@ -98,7 +98,7 @@ def test_paths_are_checked_before_anything_is_computed(monkeypatch, tmp_path, ca
 
 
 def test_the_recorded_figures_are_as_expected():
-    """Of the last full run: every expectation was measured, and what fails is what is known to."""
+    """The last full run measured every expectation, and only known failures fail."""
     figures = json.loads(RECORDED.read_text())
     results = checks.evaluate({name: value for name, value in figures.items() if isinstance(value, float)})
     assert len(results) == figures["checks"]

@@ -1,4 +1,4 @@
-"""Pairs on the sky against every pair, one by one, at right ascension 0 and at the poles."""
+"""Counts of pairs against a loop over all pairs, at right ascension 0 and at the poles."""
 
 from types import SimpleNamespace
 
@@ -15,7 +15,7 @@ EDGES = np.radians([0.01, 0.1, 0.3, 0.8])
 
 
 def around(rng, ra, dec, n=150):
-    """Places within 1 deg."""
+    """Random positions within 1 deg."""
     east, north = np.radians(rng.uniform(-0.7, 0.7, (2, n)))
     ra, dec = sky.offset_positions(np.full(n, ra), np.full(n, dec), east, north)
     return sky.wrap_angle(ra), dec
@@ -38,7 +38,7 @@ def test_every_pair_is_counted_once(centre):
 
 @pytest.mark.parametrize("centre", [(0.0, 0.0), (0.0, 89.9), (120.0, -90.0)])
 def test_shear_about_a_mass_is_tangential_everywhere(centre):
-    """Of a convergence at one place alone: gamma_t of all others, gamma_x 0, whatever the frames there are."""
+    """The convergence is at one position only; gamma_t is that of all others, and gamma_x is 0 in any frame."""
     rng = np.random.default_rng(3)
     ra, dec = around(rng, *centre)
     ra[0], dec[0] = centre

@@ -1,4 +1,4 @@
-"""Correlations of theory against what they must be whatever the power."""
+"""Correlations of theory against relations that hold for any power spectrum."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ ARCMIN = np.radians(1 / 60)
 
 
 def test_the_aperture_mass_of_waves():
-    """Of one multipole: 24 J4(x) / x^2 squared; and nothing of it is a B mode.  Ref: Schneider et al. 1998"""
+    """A single multipole gives 24 J4(x) / x^2 squared and no B mode (Schneider et al. 1998)."""
     edges, radius = np.linspace(0.0, 20.0, 4001), 10.0
     theta = 0.5 * (edges[1:] + edges[:-1])
     for ell in (0.2, 0.5, 1.0):
@@ -39,7 +39,7 @@ def test_a_power_law_has_the_correlation_that_it_must():
 
 
 def test_power_is_linear_where_structure_is():
-    """And eight times that and more within halos, by the published fit."""
+    """Within halos it is at least eight times the linear power, according to the published fit."""
     k = np.array([0.01, 0.02, 5.0])
     ratio = theory.nonlinear_power(k, 0.5) / theory.linear_power(k, 0.5)
     assert ratio[:2] == pytest.approx(np.ones(2), abs=0.03)
@@ -52,7 +52,7 @@ def test_sources_at_two_distances_are_between_those_at_each():
         theory.convergence_power(ell, chi, np.array(weight)) for weight in ((1.0, 1e-9), (1e-9, 1.0), (1.0, 1.0))
     )
     assert np.all((near < both) & (both < far))
-    # Two screens that see the same matter: no less than the geometric mean of both.
+    # Both sources share matter, so the cross power is at least the geometric mean.
     assert np.all(both > np.sqrt(near * far) * 0.9)
 
 

@@ -1,4 +1,4 @@
-"""Verdicts: a fault is told from chance, and chance from too little."""
+"""Verdicts distinguish faults, chance and insufficient data."""
 
 import math
 
@@ -13,9 +13,9 @@ from truesky.validation.verdicts import FAIL, PASS, UNDECIDED, verdict
         (1.0, 0.01, "around", PASS),
         (1.11, 0.001, "around", FAIL),
         (0.89, 0.001, "around", FAIL),
-        # Beyond the tolerance, but no more than chance brings it there.
+        # Beyond the tolerance, but within three errors.
         (1.12, 0.01, "around", UNDECIDED),
-        # Within it by chance.
+        # Within the tolerance, possibly by chance.
         (1.05, 0.2, "around", UNDECIDED),
         (5.0, 0.01, "least", PASS),
         (5.0, 1.0, "least", PASS),

@@ -1,1 +1,1 @@
-"""Measure what a lake contains and compare it with what its request and the mission database imply."""
+"""Measure the contents of a lake and compare them with what its request and the mission database imply."""

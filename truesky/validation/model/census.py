@@ -1,7 +1,6 @@
-"""Galaxies of many small blocks of the sky, counted: counts, colours, sizes, H alpha, luminosities, halos.
+"""Count the galaxies of many small blocks of the sky: counts, colours, sizes, H alpha, luminosities and halos.
 
-draw      galaxies and halos of blocks of generation cells
-figures   what is counted, by name; a count's own error, from the scatter of the blocks, under name + "_error"
+Figures are returned by name. The error of a count is under name + "_error"; it is the scatter between the blocks.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ COLUMNS = (
 HALO_COLUMNS = ("z_true", "log_mass")
 HALPHA_LIMITS, HALPHA_SHELLS = (5e-17, 1e-16, 2e-16, 3e-16), ((0.9, 1.8), (0.4, 1.8), (0.7, 2.0))
 SIZE_BINS = ((19, 20), (21, 22), (22, 23), (23, 24), (24, 24.5), (25, 26))
-# Redshift, half width, and the reddest I_E - M_r - DM there, which every galaxy that is counted has to afford.
+# Redshift, half width, and the largest I_E - M_r - DM of any spectrum there, which sets the limit of M_r.
 SHELLS = ((0.1, 0.05, 0.2), (0.5, 0.1, 0.4), (1.0, 0.15, 1.5), (2.0, 0.15, 4.0))
 HALO_MASSES, HALO_SHELLS = (11.0, 12.0, 13.0), ((0.5, 0.1), (1.0, 0.1), (2.0, 0.1))
 _SIZED = 20_000
@@ -40,7 +39,27 @@ _SIZED = 20_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Census:
-    """Galaxies of the light-cone and halos: columns by name, the block of each row, and magnitudes by band."""
+    """Galaxies of the light cone and halos in blocks of the sky.
+
+    Attributes
+    ----------
+    blocks : int
+        Number of blocks.
+    area : float
+        Area of all blocks, deg2.
+    limit : float
+        Magnitude limit of the galaxies.
+    rows : mapping of str to array, shape (n,)
+        Columns of the galaxies by name.
+    block : int array, shape (n,)
+        Block of each galaxy.
+    mags : mapping of str to array, shape (n,)
+        Magnitudes of the galaxies by band, AB.
+    halos : mapping of str to array, shape (m,)
+        Columns of the halos by name.
+    halo_block : int array, shape (m,)
+        Block of each halo.
+    """
 
     blocks: int
     area: float
@@ -52,19 +71,34 @@ class Census:
     halo_block: Int
 
     def per_deg2(self, selected: Bool) -> Float:
-        """Galaxies[block] deg-2."""
+        """Return the number of selected galaxies per deg2 in each block."""
         return np.asarray(np.bincount(self.block[selected], minlength=self.blocks) * (self.blocks / self.area))
 
 
 def blocks(count: int, side_order: int) -> list[list[int]]:
-    """Nested blocks of 4^side_order generation cells, spread over the sky."""
+    """Return `count` nested blocks of 4^side_order generation cells each, distributed over the sky."""
     n_blocks, inside = 12 << 2 * (GENERATION_ORDER - side_order), 1 << 2 * side_order
     first = ((np.arange(count) + 0.31) * n_blocks / count).astype(int)
     return [[int(block) * inside + i for i in range(inside)] for block in first]
 
 
 def draw(universe: GalaxyModel, dust: Float32, places: Sequence[Sequence[int]]) -> Census:
-    """What the catalogue holds in the blocks."""
+    """Draw the galaxies and halos of blocks as the catalogue contains them.
+
+    Parameters
+    ----------
+    universe : GalaxyModel
+        Model of the galaxies.
+    dust : float32 array, shape (pixels,)
+        Map of A(V), mag.
+    places : sequence of sequences of int
+        Generation cells of each block.
+
+    Returns
+    -------
+    Census
+        Galaxies and halos with their blocks.
+    """
     halo_cells, library = population.CellCache(universe.population), templates.galaxy_library()
     rows, hosts, mags = [], [], []
     for place in places:
@@ -97,7 +131,22 @@ def draw(universe: GalaxyModel, dust: Float32, places: Sequence[Sequence[int]]) 
 
 
 def magnitudes(rows: Mapping[str, Array], library: templates.Library, z_max: float) -> Mapping[str, Array]:
-    """Magnitudes by band, AB, unlensed and before the Milky Way's dust."""
+    """Return AB magnitudes by band, before lensing magnification and the dust of the Milky Way.
+
+    Parameters
+    ----------
+    rows : mapping of str to array, shape (n,)
+        Columns of table `galaxies`.
+    library : Library
+        Galaxy spectra.
+    z_max : float
+        Redshift that the tables of band ratios reach.
+
+    Returns
+    -------
+    mapping of str to float32 array, shape (n,)
+        Magnitudes by band.
+    """
     names = ("sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")
     sed = band_ratios.Sed(*(rows[name] for name in names))
     z = rows["z_true"].astype(float)
@@ -120,7 +169,7 @@ def _with_errors(per_block: dict[str, Float]) -> dict[str, float]:
 
 
 def counts(census: Census) -> dict[str, float]:
-    """Galaxies per arcmin2, their slope, and how many are satellites."""
+    """Galaxies per arcmin2 with I_E < 26, slope of the counts, and fraction of satellites with I_E < 24.5."""
     vis = census.mags["euclid_vis"]
     per_block = {"vis_26": census.per_deg2(vis < 26.0) / ARCMIN2}
     bright = vis < 24.5
@@ -132,7 +181,7 @@ def counts(census: Census) -> dict[str, float]:
 
 
 def colours(census: Census) -> dict[str, float]:
-    """Medians of I_E < 24.5."""
+    """Median colours of galaxies with I_E < 24.5."""
     mags = census.mags
     bright = mags["euclid_vis"] < 24.5
     pairs = {
@@ -146,17 +195,28 @@ def colours(census: Census) -> dict[str, float]:
 
 
 def half_light_of_rows(rows: Mapping[str, Array], part: Int) -> Float:
-    """Half-light radius[n] of both components together, arcsec, by bisection."""
+    """Return the half-light radii (arcsec) of bulge and disc together for rows `part` of table `galaxies`."""
     names = ("bulge_half_light_radius", "disk_half_light_radius", "bulge_fraction", "bulge_sersic_index")
     bulge, disc, fraction, sersic = (rows[name][part].astype(float) for name in names)
     return half_light_radius(bulge, disc, fraction, sersic)
 
 
 def half_light_radius(bulge: Float, disc: Float, fraction: Float, sersic: Float) -> Float:
-    """Half-light radius[n] of a bulge and an exponential disc together, arcsec, by bisection.
+    """Return the half-light radius of a bulge and an exponential disc together, by bisection.
 
-    bulge, disc : float[n] half-light radii of the components, arcsec
-    fraction    : float[n] bulge / total;  sersic : float[n] index of the bulge
+    Parameters
+    ----------
+    bulge, disc : float array, shape (n,)
+        Half-light radii of the components, arcsec.
+    fraction : float array, shape (n,)
+        Bulge-to-total ratio, 0 to 1.
+    sersic : float array, shape (n,)
+        Sersic index of the bulge.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Half-light radius, arcsec.
     """
     low, high = np.minimum(bulge, disc), np.maximum(bulge, disc)
     for _ in range(30):
@@ -168,7 +228,7 @@ def half_light_radius(bulge: Float, disc: Float, fraction: Float, sersic: Float)
 
 
 def sizes(census: Census) -> dict[str, float]:
-    """Median radii by magnitude, the range of the Sersic index, and how well two components have the total's radius."""
+    """Median radii by magnitude, range of the Sersic index, and largest relative error of two-component radii."""
     vis, figures = census.mags["euclid_vis"], {}
     for bright, faint in SIZE_BINS:
         inside = np.flatnonzero((vis >= bright) & (vis < faint))
@@ -187,7 +247,7 @@ def sizes(census: Census) -> dict[str, float]:
 
 
 def halpha(census: Census) -> dict[str, float]:
-    """H alpha emitters / the published numbers, with Poisson's error."""
+    """Ratio of the number of H alpha emitters to the published number, with its Poisson error."""
     z, flux = census.rows["z_true"], census.rows["flux_halpha"]
     figures = {}
     for z_min, z_max in HALPHA_SHELLS:
@@ -200,9 +260,21 @@ def halpha(census: Census) -> dict[str, float]:
 
 
 def luminosities(census: Census, law: luminosity_function.Schechter, z_min: float, z_max: float) -> dict[str, float]:
-    """Galaxies / those of the luminosity function, where all spectra beat the limit; shells between near and far.
+    """Return the ratio of the number of galaxies to the luminosity function in complete samples.
 
-    census : what was drawn;  law : the luminosity function;  near, far : redshifts
+    Parameters
+    ----------
+    census : Census
+        Galaxies that were drawn.
+    law : Schechter
+        Luminosity function.
+    z_min, z_max : float
+        Redshift range of the shells.
+
+    Returns
+    -------
+    dict of str to float
+        Ratios by shell, with errors.
     """
     z, m = census.rows["z_true"], census.rows["abs_mag_r01"]
     ratios = {}
@@ -216,7 +288,20 @@ def luminosities(census: Census, law: luminosity_function.Schechter, z_min: floa
 
 
 def per_deg2(density: Callable[[Float], Float], at: float, half: float) -> float:
-    """Objects deg-2 in a shell of redshift, of a comoving density (Mpc/h)^-3."""
+    """Integrate a comoving density over a shell of redshift.
+
+    Parameters
+    ----------
+    density : callable
+        Density in (Mpc/h)^-3 of redshifts.
+    at, half : float
+        Middle and half width of the shell.
+
+    Returns
+    -------
+    float
+        Number per deg2.
+    """
     grid = np.linspace(at - half, at + half, 41)
     value = density(grid)
     shells = cosmology.comoving_volume(grid[:-1], grid[1:]) * np.radians(1.0) ** 2
@@ -224,7 +309,7 @@ def per_deg2(density: Callable[[Float], Float], at: float, half: float) -> float
 
 
 def halos(census: Census, published: Callable[[float, float], float]) -> dict[str, float]:
-    """Halos above a mass / the published number density(mass, z), in thin shells."""
+    """Ratio of the number of halos above a mass to the number density `published(log_mass, z)` in thin shells."""
     z, mass = census.halos["z_true"], census.halos["log_mass"]
     ratios = {}
     for at, half in HALO_SHELLS:
@@ -237,7 +322,7 @@ def halos(census: Census, published: Callable[[float, float], float]) -> dict[st
 
 
 def redshifts(census: Census) -> tuple[Float, Float]:
-    """n(z) of I_E < 24.5, in shares of 0.2: (edges, shares)."""
+    """Redshift distribution of galaxies with I_E < 24.5: edges of bins of width 0.2, and fraction in each bin."""
     edges = np.arange(0.0, 2.41, 0.2)
     number = np.histogram(census.rows["z_true"][census.mags["euclid_vis"] < 24.5], edges)[0]
     return edges, number / number.sum()

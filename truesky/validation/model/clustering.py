@@ -1,13 +1,13 @@
-"""How the embedded universe clusters: power of the box, bias of its halos, and w(theta) beside Limber's approximation.
+"""Clustering of the simulated universe: power of the box, bias of halos, and w(theta) against Limber's approximation.
 
-box_power         P(k) of the box over that of linear theory;  halo_bias : bias of the fields that halos are drawn from
-velocities        of centrals at z = 0
-population_above  halos and galaxies of a mass or more between two redshifts, to be drawn over hundreds of deg2
-tracers           them, in one block of the sky
-correlation       w(theta) of counts in pixels;  limber : what linear bias makes of linear power
-structure         the Gaussian field along the same lines of sight, whose w(theta) says what the blocks happen to hold
+Halos and galaxies above a mass between two redshifts are drawn in blocks of the sky, hundreds of deg2 in total. Their
+w(theta) is measured from counts in pixels and compared with linear theory and linear bias. The Gaussian field of the
+box along the same lines of sight shows how the structure in these blocks differs from the mean.
 
-Ref: Limber 1953, ApJ 117, 134; Landy & Szalay 1993, ApJ 412, 64 (in pixels their estimator is <delta delta'>)
+References
+----------
+Limber 1953, ApJ 117, 134
+Landy & Szalay 1993, ApJ 412, 64 (in pixels their estimator is <delta delta'>)
 """
 
 from __future__ import annotations
@@ -31,21 +31,38 @@ from truesky.fluxes import cosmology
 from truesky.validation import pairs, theory
 from truesky.validation.theory import Shells
 
-# Blocks are cells of this order (53.7 deg2), in pixels of 6.9 arcmin; small separations are counted in one piece of
-# each, in pixels of 0.9 arcmin: DEPTH orders finer.
+# Blocks are cells of this order (53.7 deg2) in pixels of 6.9 arcmin. Small separations are counted in one smaller
+# cell per block, in pixels of 0.9 arcmin. Pixels are DEPTH orders finer than their block.
 BLOCK_ORDER, PIECE_ORDER, DEPTH = 3, 6, 6
+# One pixel in this number is used as first pixel of a pair in the statistics of separations.
 _SPARSE = 16
-# Nodes of separations: of the pairs of a bin, and of w where it is summed.
+# Nodes of the separations of pairs, and of the separations at which w is summed over multipoles.
 _NODES, _THETAS = 2000, 300
-# Shells in which the redshift distribution and the bias are taken, Mpc/h, and multipoles.
+# Width of shells for the redshift distribution and the bias (Mpc/h), and highest multipole.
 _SHELL, _ELL_MAX = 80.0, 20_000
-# Cells a side that the power of the Gaussian field is tabulated on.
+# Cells per side of the grid on which the power of the Gaussian field is tabulated.
 _MODES = 128
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracers:
-    """n points: deg, Mpc/h, bias times growth of the halo, and is it a satellite, log10 of halo and proxy mass."""
+    """Points that trace the matter: halos and satellites.
+
+    Attributes
+    ----------
+    ra, dec : float array, shape (n,)
+        Position, deg.
+    chi : float array, shape (n,)
+        Comoving distance, Mpc/h.
+    bias_growth : float array, shape (n,)
+        Bias of the halo times the growth factor.
+    satellite : bool array, shape (n,)
+        True for satellites.
+    log_mass, proxy : float array, shape (n,)
+        log10 of halo mass and of proxy mass.
+    velocity : float array, shape (n,)
+        Line-of-sight velocity, km/s.
+    """
 
     ra: Float
     dec: Float
@@ -57,10 +74,12 @@ class Tracers:
     velocity: Float
 
     def select(self, mask: npt.NDArray[np.generic]) -> Tracers:
+        """Return the tracers selected by a mask or by indices."""
         return Tracers(*(getattr(self, name)[mask] for name in self.__slots__))
 
 
 def concatenate(parts: Sequence[Tracers]) -> Tracers:
+    """Return the tracers of several parts together."""
     return Tracers(*(np.concatenate([getattr(part, name) for part in parts]) for name in Tracers.__slots__))
 
 
@@ -68,7 +87,7 @@ def concatenate(parts: Sequence[Tracers]) -> Tracers:
 
 
 def _power_ratio(field: npt.NDArray[np.floating], cell: float, edges: Float) -> Float:
-    """P(k)[bin] of a cube, k h/Mpc between edges."""
+    """P(k) of a cube over linear P(k) in bins of k between edges in h/Mpc."""
     n = field.shape[0]
     power = (np.abs(fft.rfftn(field)) ** 2).ravel() * (cell**3 / n**3)
     axis, half = 2 * np.pi * fft.fftfreq(n, cell), 2 * np.pi * fft.rfftfreq(n, cell)
@@ -82,12 +101,27 @@ def _power_ratio(field: npt.NDArray[np.floating], cell: float, edges: Float) -> 
 
 
 def box_power(box: Box, edges: Float) -> Float:
-    """P(k) / P_linear(k)[bin] of the matter at z = 0."""
+    """Return P(k) / P_linear(k) of the matter at z = 0 in bins of k between edges in h/Mpc."""
     return _power_ratio(np.expm1(box.smoothed[0] - np.float32(0.5 * box.variance[0])), box.model.cell, edges)
 
 
 def halo_bias(box: Box, x: Sequence[float], edges: Float) -> Float:
-    """Bias[x, bin] that the fields of halos of x = b D have against the matter's own, / x."""
+    """Return the measured bias of the fields from which halos are drawn, relative to the requested bias.
+
+    Parameters
+    ----------
+    box : Box
+        Box of matter.
+    x : sequence of float
+        Bias times growth factor.
+    edges : float array, shape (bins + 1,)
+        Edges of the bins, h/Mpc.
+
+    Returns
+    -------
+    float array, shape (x, bins)
+        Bias against the matter of the box, divided by x.
+    """
     matter = box_power(box, edges)
     field, amplitude = density_box.biased_field(box.model, np.array(x))
     rows = []
@@ -98,7 +132,7 @@ def halo_bias(box: Box, x: Sequence[float], edges: Float) -> Float:
 
 
 def velocity_rms(box: Box, x: float) -> float:
-    """rms of one component of the velocity, km/s, of halos of bias x at z = 0, anywhere in the box."""
+    """Return the rms in km/s of one velocity component of halos of bias `x` at z = 0 in the whole box."""
     field, amplitude = (value[0] for value in density_box.biased_field(box.model, np.array([x])))
     weight = np.exp(np.float32(amplitude) * box.smoothed[int(field)])
     square = [np.average(u**2, weights=weight) for u in box.velocity]
@@ -109,10 +143,23 @@ def velocity_rms(box: Box, x: float) -> float:
 
 
 def population_above(seed: int, box_cells: int, z_min: float, z_max: float, log_mass: float) -> Population:
-    """Halos, and galaxies of a proxy mass, above log_mass.
+    """Return halos, and galaxies by their proxy mass, above a mass and between two redshifts.
 
-    seed, box_cells : of the box of matter, and its cells a side
-    near, far       : redshifts;  log_mass : log10 of the least mass, as of table `halos`
+    Parameters
+    ----------
+    seed : int
+        Seed of the box of matter.
+    box_cells : int
+        Cells per side of the box.
+    z_min, z_max : float
+        Redshift range.
+    log_mass : float
+        log10 of the lowest mass, in the unit of table `halos`.
+
+    Returns
+    -------
+    Population
+        Model from which `draw_tracers` draws.
     """
     table, inverse = matching.masses(), luminosity_function.inverse(luminosity_function.schechter(), matching.Z_LAST)
     matched = matching.match_luminosities(table, inverse)
@@ -123,7 +170,20 @@ def population_above(seed: int, box_cells: int, z_min: float, z_max: float, log_
 
 
 def draw_tracers(universe: Population, order: int, block: int) -> Tracers:
-    """Halos of a cell of any order, and their satellites that lie in it."""
+    """Draw the halos and satellites inside a nested cell.
+
+    Parameters
+    ----------
+    universe : Population
+        Model of halos and satellites.
+    order, block : int
+        HEALPix order and number of the cell.
+
+    Returns
+    -------
+    Tracers
+        Halos, followed by satellites, per level of the halo grid.
+    """
     parts = []
     for level in halos.LEVELS:
         n_cells = 1 << 2 * max(level - order, 0)
@@ -148,9 +208,18 @@ def draw_tracers(universe: Population, order: int, block: int) -> Tracers:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Correlation:
-    """theta[bin] deg; w against each block's own mean, and its error from the scatter of the blocks.
+    """Angular correlation function relative to the mean of each block.
 
-    pairs : the separations that w is an average over
+    Attributes
+    ----------
+    theta : float array, shape (bins,)
+        Mean separation, deg.
+    w : float array, shape (bins,)
+        Correlation function.
+    error : float array, shape (bins,)
+        Standard error from the scatter between blocks.
+    pairs : Pairs
+        Separations over which w is averaged.
     """
 
     theta: Float
@@ -161,10 +230,18 @@ class Correlation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
-    """Separations of the pairs of pixels of a block: nodes[m] deg, and the shares of pairs that have them.
+    """Distributions of the separations of pairs of pixels in a block.
 
-    of_bin : [bins, m] of the pairs of a bin;  of_pixel : [bins, m] of the pixels of these pairs with the whole block
-    of_all : [m] of all pairs of the block
+    Attributes
+    ----------
+    nodes : float array, shape (m,)
+        Separations, deg.
+    of_bin : float array, shape (bins, m)
+        Fraction of the pairs of each bin at each separation.
+    of_pixel : float array, shape (bins, m)
+        The same for pairs of the pixels of each bin with the whole block.
+    of_all : float array, shape (m,)
+        The same for all pairs of the block.
     """
 
     nodes: Float
@@ -173,13 +250,28 @@ class Pairs:
     of_all: Float
 
     def subtract_block_mean(self, w: Float) -> tuple[Float, Float]:
-        """w[m] at the nodes -> (w[bin], what is left of it[bin] where each pixel is held against the block's mean)."""
+        """Return w per bin from w at the nodes, and w per bin relative to the mean of each block."""
         mean, pixel, block_mean = (shares @ w for shares in (self.of_bin, self.of_pixel, self.of_all))
         return mean, mean - 2.0 * pixel + block_mean
 
 
 def correlation(blocks: Sequence[tuple[int, Sequence[Tracers | Float]]], order: int, edges: Float) -> list[Correlation]:
-    """w(theta) of each kind of tracer in blocks, cells of an order; or of maps of their pixels."""
+    """Measure w(theta) of each kind of tracer in blocks.
+
+    Parameters
+    ----------
+    blocks : sequence of (int, sequence of Tracers or float arrays)
+        Number of each cell, and tracers, or values of its pixels, for each kind.
+    order : int
+        HEALPix order of the cells.
+    edges : float array, shape (bins + 1,)
+        Edges of the separation bins, deg.
+
+    Returns
+    -------
+    list of Correlation
+        One for each kind.
+    """
     deltas = [[_overdensity(tracers, order, cell) for tracers in by_kind] for cell, by_kind in blocks]
     delta, chance = (np.array([[pair[i] for pair in row] for row in deltas]) for i in range(2))
     bins, n_kinds = edges.size - 1, delta.shape[1]
@@ -198,13 +290,13 @@ def correlation(blocks: Sequence[tuple[int, Sequence[Tracers | Float]]], order: 
 
 
 def _separations(first: Float, second: Float, edges: Float) -> tuple[Int, Float]:
-    """Bin of the separation of each pair, -1 or the number of bins outside; and the separation, deg."""
+    """Bin of the separation of each pair (-1 or the number of bins if outside), and the separation in deg."""
     theta = np.degrees(np.arccos(np.clip(first @ second.T, -1.0, 1.0))).ravel()
     return np.searchsorted(edges, theta) - 1, theta
 
 
 def _pixel_pairs(order: int, cell: int, edges: Float) -> Pairs:
-    """Of every _SPARSE-th pixel with all."""
+    """Separations of every _SPARSE-th pixel from all pixels."""
     place, bins = _vectors(order, cell), edges.size - 1
     fine = np.linspace(0.0, 3.0 * sky.cell_radius(order), _NODES + 1)
     of_bin, of_pixel, of_all = np.zeros((bins, _NODES)), np.zeros((bins, _NODES)), np.zeros(_NODES)
@@ -222,9 +314,10 @@ def _pixel_pairs(order: int, cell: int, edges: Float) -> Pairs:
 
 
 def _overdensity(tracers: Tracers | Float, order: int, cell: int) -> tuple[Float, float]:
-    """Overdensity of the pixels, and what n points, which are nowhere else, keep from one another: 1 / n.
+    """Overdensity of the pixels, and 1 / n, the anticorrelation of n points in a block of fixed total number.
 
-    What is common to a block says nothing of its inside, and is most of the noise.
+    The mean is that of the block. The common overdensity of a block contains no information about smaller scales and
+    dominates the noise.
     """
     if not isinstance(tracers, Tracers):
         return np.asarray(tracers - tracers.mean()), 0.0
@@ -239,18 +332,46 @@ def _vectors(order: int, cell: int) -> Float:
 
 
 def shells(tracers: Tracers, z_min: float, z_max: float) -> Shells:
-    """The tracers between two redshifts, with their bias times growth, in shells of equal width."""
+    """Return tracers between two redshifts in shells of equal width, with bias times growth.
+
+    Parameters
+    ----------
+    tracers : Tracers
+        Halos or galaxies.
+    z_min, z_max : float
+        Redshift range.
+
+    Returns
+    -------
+    Shells
+        Fraction of tracers times bias in each shell.
+    """
     first, last = (float(cosmology.comoving_distance(z)) for z in (z_min, z_max))
     edges = np.linspace(first, last, int(np.ceil((last - first) / _SHELL)) + 1)
     return theory.shells(tracers.chi, tracers.bias_growth, edges)
 
 
 def limber(tracer_shells: Shells, measured: Correlation, power: Callable[[Float], Float]) -> tuple[Float, Float]:
-    """w of a power P(k) over the pairs of each bin, and what is left of it in blocks whose means are their own."""
+    """Predict w for a power spectrum in the separation bins of a measurement.
+
+    Parameters
+    ----------
+    tracer_shells : Shells
+        Tracers by distance.
+    measured : Correlation
+        Measurement whose pairs are used.
+    power : callable
+        P(k) in (Mpc/h)^3 of k in h/Mpc.
+
+    Returns
+    -------
+    w, mean_subtracted : float array, shape (bins,)
+        w, and w relative to the mean of each block.
+    """
     ell = np.geomspace(1.0, _ELL_MAX, 400)
     c_l = theory.galaxy_power(ell, tracer_shells, lambda k, _: power(k))
     multipoles = np.arange(1, _ELL_MAX + 1)
-    # Beyond the multipoles of the smallest separation the sum ends softly.
+    # A smooth cutoff at high multipoles avoids ringing at small separations.
     weight = (2 * multipoles + 1) / (4 * np.pi) * np.interp(np.log(multipoles), np.log(ell), c_l)
     weight *= np.exp(-((multipoles / (0.5 * _ELL_MAX)) ** 2))
     nodes = measured.pairs.nodes
@@ -260,10 +381,21 @@ def limber(tracer_shells: Shells, measured: Correlation, power: Callable[[Float]
 
 
 def projected_field(box: Box, order: int, cell: int, tracer_shells: Shells) -> Float:
-    """The Gaussian field of the box along the lines of sight of a block's pixels, weighted as the tracers are.
+    """Project the Gaussian field of the box along the lines of sight of the pixels of a block.
 
-    box         : of matter;  order, cell : of the nested block
-    seen        : the tracers' numbers by distance
+    Parameters
+    ----------
+    box : Box
+        Box of matter.
+    order, cell : int
+        HEALPix order and number of the nested block.
+    tracer_shells : Shells
+        Tracers by distance; they weight the field.
+
+    Returns
+    -------
+    float array, shape (pixels,)
+        Projected field.
     """
     box_replicas, direction = (
         lightcone.draw_replicas(box, float(tracer_shells.chi[-1] + tracer_shells.width[-1])),
@@ -278,7 +410,7 @@ def projected_field(box: Box, order: int, cell: int, tracer_shells: Shells) -> F
 
 
 def gaussian_power(k: Float) -> Float:
-    """P(k) of the Gaussian field, (Mpc/h)^3, constant within the cells of the box."""
+    """P(k) of the Gaussian field in (Mpc/h)^3 for k in h/Mpc; the field is constant within cells of the box."""
     cell = density_box.box_model().cell
     on_modes = density_box._log_power(_MODES, cell).ravel()
     length = np.sqrt(density_box._k_squared(_MODES, cell)).ravel()

@@ -1,11 +1,9 @@
-"""The galaxies of a sky beside what surveys observed: observed.csv, whose every row is from outside this project.
+"""Galaxies of a sky compared with observations of surveys in observed.csv.
 
-sky_of      columns and magnitudes of rows of table `galaxies`
-figures     what is measured of them, by the names of the list; Poisson errors of densities under name + "_error"
-in_version  the sky of a lake
-
-Rows of confidence P are published numbers that were looked up; those of M are remembered or read off a figure: they are
-shown, and gate nothing. Magnitudes are before magnification and the Milky Way, as surveys correct theirs.
+Every row of the list is from outside this project. Rows of confidence P are published numbers that were looked up.
+Rows of confidence M are quoted from memory or read off a figure; they are shown, but do not count as failures.
+Magnitudes are before magnification and the dust of the Milky Way, as surveys correct theirs. Poisson errors of
+densities are under name + "_error".
 """
 
 from __future__ import annotations
@@ -34,16 +32,30 @@ MASSES, MASS_HALF = (9.5, 10.0, 10.5, 11.0), 0.1
 RED_SHELLS, RED_MASSES, RED_HALF = {0.35: (0.2, 0.5), 0.95: (0.8, 1.1)}, (10.1, 10.6, 11.1), 0.25
 STAR_FORMATION_SHELLS = ((0.05, 0.3), (0.3, 0.7), (0.7, 1.2), (1.2, 1.8), (1.8, 2.5), (2.5, 3.5), (3.5, 4.5))
 ULTRAVIOLET = {3.0: (-22, -21, -20), 3.8: (-22, -21), 4.9: (-22, -21), 5.9: (-22,)}
-# Rest-frame wavelength of ultraviolet magnitudes, A, and the band that is seen there from a redshift.
+# Rest-frame wavelength of ultraviolet magnitudes (A), and the band that observes it at higher redshift.
 _ULTRAVIOLET_AT, _ULTRAVIOLET_BAND = 1500.0, "lsst_i"
 _R_PIVOT = 6200.0
-# H alpha, A, in a vacuum, and the band that its continuum is taken from.
+# Vacuum wavelength of H alpha (A), and the band from which its continuum is derived.
 _HALPHA, _NEAR_INFRARED = 6564.6, "euclid_h"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GalaxySample:
-    """Galaxies of kinds 0 and 1: columns, magnitudes by band, M_UV, area deg2; quasars deg-2 of r < 22.5, if known."""
+    """Galaxies of kinds 0 (central) and 1 (satellite).
+
+    Attributes
+    ----------
+    rows : mapping of str to array, shape (n,)
+        Columns of table `galaxies` by name.
+    mags : mapping of str to float array, shape (n,)
+        Magnitudes by band, AB.
+    ultraviolet : float array, shape (n,)
+        Absolute magnitude at 1500 A.
+    area : float
+        Area, deg2.
+    quasars : float, optional
+        Quasars per deg2 with r < 22.5, if known.
+    """
 
     rows: Mapping[str, Array]
     mags: Mapping[str, Float]
@@ -55,11 +67,11 @@ class GalaxySample:
         return np.asarray(self.rows[name], float)
 
     def per_deg2(self, selected: Bool) -> float:
-        """Of the galaxies that are kept: kept : bool[n]."""
+        """Return the number of selected galaxies per deg2."""
         return float(np.count_nonzero(selected) / self.area)
 
     def volume(self, z_min: float, z_max: float) -> float:
-        """Mpc^3 (h = 0.67) between two redshifts."""
+        """Return the comoving volume of the sample between two redshifts in Mpc^3 (h = 0.67)."""
         steradian = self.area * np.radians(1.0) ** 2
         return float(cosmology.comoving_volume(z_min, z_max) * steradian / cosmology.HUBBLE**3)
 
@@ -72,9 +84,9 @@ COLUMNS = (
 
 
 def from_version(galaxies: read.Version) -> tuple[GalaxySample, Int]:
-    """(galaxies of a version of the table, the generation cell of each that is no quasar).
+    """Return the galaxies of a version of table `galaxies`, and the generation cell of each central and satellite.
 
-    The area is that of the cells which it was drawn in.
+    The area is that of the cells in which the table was drawn.
     """
     table = galaxies.rows([*COLUMNS, "_healpix_29"])
     cell = table["_healpix_29"].to_numpy() >> 2 * (sky.MAX_ORDER - GENERATION_ORDER)
@@ -84,20 +96,32 @@ def from_version(galaxies: read.Version) -> tuple[GalaxySample, Int]:
 
 
 def from_table(table: pa.Table, area: float) -> GalaxySample:
-    """Of rows of table `galaxies` with COLUMNS; area : deg2."""
+    """Return the sample of a table `galaxies` with COLUMNS in an area in deg2."""
     galaxies = table.filter(pa.array(table["kind"].to_numpy() < 2))
     sample = from_columns({name: galaxies[name].to_numpy() for name in COLUMNS}, area)
     quasars = table.filter(pa.array(table["kind"].to_numpy() == QUASAR))
     mag, z, boost = (quasars[name].to_numpy().astype(float) for name in ("mag_r01", "z_true", "density_boost"))
-    # f_nu ~ nu^-0.5 from 1450 A to the middle of r.
+    # The spectrum is f_nu ~ nu^-0.5 from 1450 A to the middle of r.
     red = mag - 1.25 * np.log10(_R_PIVOT / (1450.0 * (1.0 + z)))
     return replace(sample, quasars=float(np.sum((red < 22.5) / boost)) / area)
 
 
 def from_columns(rows: Mapping[str, Array], area: float, z_max: float = matching.Z_LAST) -> GalaxySample:
-    """Of columns[n] by name, of galaxies of kinds 0 and 1.
+    """Return the sample of centrals and satellites given as columns.
 
-    rows : COLUMNS of table `galaxies`;  area : deg2;  z_max : at least the largest redshift
+    Parameters
+    ----------
+    rows : mapping of str to array, shape (n,)
+        COLUMNS of table `galaxies`, without quasars.
+    area : float
+        Area, deg2.
+    z_max : float
+        Redshift that the tables of band ratios reach, at least the largest redshift of the rows.
+
+    Returns
+    -------
+    GalaxySample
+        Sample with magnitudes, without quasars.
     """
     library = templates.galaxy_library()
     sed = _spectra(rows)
@@ -112,14 +136,29 @@ def from_columns(rows: Mapping[str, Array], area: float, z_max: float = matching
 
 
 def apparent_magnitudes(rows: Mapping[str, Array], band: str, z_max: float = matching.Z_LAST) -> Float:
-    """AB[n] in a band, before lines, magnification and the Milky Way; rows, z_max : as of `of_columns`."""
+    """Return AB magnitudes in a band, before emission lines, magnification and the dust of the Milky Way.
+
+    Parameters
+    ----------
+    rows : mapping of str to array, shape (n,)
+        COLUMNS of table `galaxies`.
+    band : str
+        Name of the band.
+    z_max : float
+        Redshift that the table of band ratios reaches, at least the largest redshift of the rows.
+
+    Returns
+    -------
+    float array, shape (n,)
+        Magnitudes.
+    """
     sed, z = _spectra(rows), rows["z_true"].astype(float)
     table = band_ratios.load(templates.galaxy_library(), band, z_max, _dustiest(sed))
     return np.asarray(rows["abs_mag_r01"] + cosmology.distance_modulus(z) + band_ratios.offset(table, z, sed))
 
 
 def figures(sample: GalaxySample) -> dict[str, float]:
-    """Everything that the list has a row for, as far as a sky to I_E < 26 tells."""
+    """Measure every figure of the list that a sky complete to I_E < 26 allows."""
     return {
         **counts(sample),
         **masses(sample),
@@ -132,7 +171,7 @@ def figures(sample: GalaxySample) -> dict[str, float]:
 
 
 def counts(sample: GalaxySample) -> dict[str, float]:
-    """Galaxies by magnitude, and their redshifts."""
+    """Galaxies per arcmin2 or deg2 by magnitude, and median redshifts."""
     i_band, r_band, vis, z = sample.mags["lsst_i"], sample.mags["lsst_r"], sample.mags["euclid_vis"], sample["z_true"]
     values = {f"i_{limit}": sample.per_deg2(i_band < limit) / ARCMIN2 for limit in range(20, 27)}
     for at in 19.25 + 0.5 * np.arange(11):
@@ -143,7 +182,7 @@ def counts(sample: GalaxySample) -> dict[str, float]:
 
 
 def masses(sample: GalaxySample) -> dict[str, float]:
-    """log10 of galaxies / Mpc^3 dex, and the share of red ones, by stellar mass and redshift."""
+    """log10 of the density per Mpc^3 and dex, and the fraction of red galaxies, by stellar mass and redshift."""
     z, mass, red = sample["z_true"], sample["log_stellar_mass"], is_red(sample)
     values: dict[str, float] = {}
     for at, (z_min, z_max) in MASS_SHELLS.items():
@@ -159,7 +198,7 @@ def masses(sample: GalaxySample) -> dict[str, float]:
 
 
 def star_formation(sample: GalaxySample) -> dict[str, float]:
-    """log10 of Msun/yr/Mpc^3 by redshift; median and scatter of the main sequence at 10^10 Msun."""
+    """log10 of Msun/yr/Mpc^3 by redshift; median and scatter of log10 SFR on the main sequence at 10^10 Msun."""
     z, mass, rate, forming = sample["z_true"], sample["log_stellar_mass"], sample["log_sfr"], is_blue(sample)
     values = {}
     for z_min, z_max in STAR_FORMATION_SHELLS:
@@ -174,7 +213,7 @@ def star_formation(sample: GalaxySample) -> dict[str, float]:
 
 
 def lines(sample: GalaxySample) -> dict[str, float]:
-    """Emitters deg-2, the ratio [O III] / H beta by mass, and the equivalent width of the brightest."""
+    """Emitters per deg2, ratio [O III] / H beta by stellar mass, and equivalent width of the brightest emitters."""
     z, mass = sample["z_true"], sample["log_stellar_mass"]
     oiii, halpha_nii = sample["flux_oiii"], sample["flux_halpha"] + (1.0 + 1.0 / 3.05) * sample["flux_nii"]
     halpha_range, oiii_range = (z > 0.9) & (z < 1.6), (z > 1.5) & (z < 2.3)
@@ -194,14 +233,14 @@ def lines(sample: GalaxySample) -> dict[str, float]:
 
 
 def environment(sample: GalaxySample) -> dict[str, float]:
-    """Red centrals of groups and clusters."""
+    """Fraction of red galaxies among centrals of groups and clusters."""
     halo, z, red = sample["log_halo_mass"], sample["z_true"], is_red(sample)
     centrals = (sample.rows["kind"] == 0) & (halo > 13.5) & (z > 0.8) & (z < 1.2)
     return {"red_centrals_13.5_z1": float(np.mean(red[centrals])) if centrals.any() else np.nan}
 
 
 def ultraviolet(sample: GalaxySample) -> dict[str, float]:
-    """Galaxies / Mpc^3 mag at 1500 A, log10, where I_E < 26 sees them all."""
+    """log10 of galaxies per Mpc^3 and mag at 1500 A, at magnitudes complete to I_E < 26."""
     z = sample["z_true"]
     values: dict[str, float] = {}
     for at, magnitudes in ULTRAVIOLET.items():
@@ -214,22 +253,22 @@ def ultraviolet(sample: GalaxySample) -> dict[str, float]:
 
 
 def is_red(sample: GalaxySample) -> Bool:
-    """Redder than what lies half-way between the sequences."""
+    """Select galaxies redder than the middle between the red and the blue sequence."""
     return np.asarray(sample["color_gr_01"] > 0.78 - 0.02 * (sample["abs_mag_r01"] + 20.0))
 
 
 def is_blue(sample: GalaxySample) -> Bool:
-    """Bluer than the valley between the sequences."""
+    """Select galaxies bluer than the valley between the red and the blue sequence."""
     redshift_step = np.clip(sample["z_true"] - 0.1, 0.0, 1.6)
     return np.asarray(sample["color_gr_01"] < 0.80 - 0.07 * (sample["abs_mag_r01"] + 20.0) - 0.16 * redshift_step)
 
 
 def _continuum(sample: GalaxySample, selected: Bool) -> Float:
-    """Observed f_lambda[n] at redshifted H alpha, erg s-1 cm-2 A-1."""
+    """Observed f_lambda at redshifted H alpha of selected galaxies, erg s-1 cm-2 A-1."""
     library, rows = templates.galaxy_library(), {name: values[selected] for name, values in sample.rows.items()}
     sed = _spectra(rows)
     z = rows["z_true"].astype(float)
-    # Seen in a band from the redshift at which H alpha is at its middle.
+    # At this redshift H alpha lies at the pivot wavelength of the band.
     at = passbands.pivot_wavelength(passbands.load(_NEAR_INFRARED)) / _HALPHA - 1.0
     table = band_ratios.load(library, _NEAR_INFRARED, matching.Z_LAST, _dustiest(sed))
     rest = rows["abs_mag_r01"] + band_ratios.offset(table, np.full(z.size, at), sed) + 2.5 * np.log10(1.0 + at)
@@ -243,7 +282,7 @@ def _spectra(rows: Mapping[str, Array]) -> band_ratios.Sed:
 
 
 def _dustiest(sed: band_ratios.Sed) -> float:
-    """As far as tables of E(B-V) are to reach: spectra of another library may be dustier than ours."""
+    """Largest E(B-V) of the tables, at least 0.5; spectra of another library can be dustier."""
     return max(0.5, float(sed.ebv.max(initial=0.0)))
 
 

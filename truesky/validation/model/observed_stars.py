@@ -1,7 +1,7 @@
-"""The Milky Way's stars beside what was observed: observed_stars.csv, whose every row is from outside this project.
+"""Stars of the Milky Way compared with observations in observed_stars.csv.
 
-figures   what is measured of a model of stars, by the names of the list
-checks    of these; rows of confidence M are remembered numbers, which gate nothing
+Every row of the list is from outside this project. Rows of confidence M are quoted from memory and do not count as
+failures.
 """
 
 from __future__ import annotations
@@ -24,17 +24,29 @@ from truesky.validation.model import star_counts
 
 LIST = Path(__file__).with_name("observed_stars.csv")
 _BULGE = ((1, -4), (10, -10))
-# Msun.
+# Mean mass, Msun.
 _WHITE_DWARF_MASS = 0.6
 _SUN_M_BOL = 4.74
-# Distance, pc, at which Oort's constants are read off.
+# Distance (pc) at which Oort's constants are evaluated.
 _OORT_DISTANCE = 50.0
 
 
 def figures(universe: stars.StarModel, dust: Float32, step: int = 61) -> dict[str, float]:
-    """Everything that the list has a row for (2 s).
+    """Measure every figure of the list (takes 2 s).
 
-    dust : float32[pixel] map of A(V), mag;  step : of the cells in which the whole sky is looked at
+    Parameters
+    ----------
+    universe : StarModel
+        Model of the stars.
+    dust : float32 array, shape (pixels,)
+        Map of A(V), mag.
+    step : int
+        Step in the numbers of order-4 cells that sample the whole sky.
+
+    Returns
+    -------
+    dict of str to float
+        Figures by name.
     """
     limits = (15.0, 18.0, 20.0)
     pole = star_counts.count_brighter(universe, (0.0, 90.0), limits)
@@ -50,7 +62,7 @@ def figures(universe: stars.StarModel, dust: Float32, step: int = 61) -> dict[st
 
 
 def checks_by_group(values: Mapping[str, float]) -> dict[str, list[Check]]:
-    """Every row of the list by its group."""
+    """Check figures against every row of the list, by group."""
     groups: dict[str, list[Check]] = {}
     for check in read(LIST, values):
         groups.setdefault(check.group, []).append(check)
@@ -58,7 +70,7 @@ def checks_by_group(values: Mapping[str, float]) -> dict[str, list[Check]]:
 
 
 def local_densities(universe: stars.StarModel) -> dict[str, float]:
-    """Densities at the Sun, pc^-3."""
+    """Densities at the Sun in pc^-3, companions per star, and M_H of the red clump."""
     galaxy, pieces = universe.galaxy, universe.galaxy.pieces
     at_sun = np.arange(pieces.number.size) < galaxy.first[-1, 0]
     number, stage = pieces.number * at_sun, pieces.stage
@@ -75,7 +87,7 @@ def local_densities(universe: stars.StarModel) -> dict[str, float]:
 
 
 def _clump_magnitude(galaxy: milky_way.MilkyWay) -> float:
-    """M_H that most of the thin disc's giants between -3 and 0 have."""
+    """Most frequent M_H, between -3 and 0, of giants of the thin disc."""
     pieces, thin = galaxy.pieces, np.arange(galaxy.pieces.number.size) < galaxy.first[1, 0]
     edges = np.arange(-3.0, 0.01, 0.1)
     number, _ = np.histogram(pieces.m_h.mean(0), edges, weights=pieces.number * thin * (pieces.stage == GIANT))
@@ -84,7 +96,7 @@ def _clump_magnitude(galaxy: milky_way.MilkyWay) -> float:
 
 
 def isochrone_points() -> dict[str, float]:
-    """Points of isochrones."""
+    """Turn-off temperatures (K) and mass (Msun), M_bol of the tip, and M_H of the Sun from isochrones."""
     old = isochrones.isochrones([12.5, 10.0, 4.6], [-1.5, -0.5, 0.0])
     main = old.main_sequence + 4
     hot = old.log_teff[:, :main].argmax(1)
@@ -100,7 +112,7 @@ def isochrone_points() -> dict[str, float]:
 
 
 def colours(universe: stars.StarModel, area: float = 40.0) -> dict[str, float]:
-    """g - r (SDSS) of the stars of so many deg2 at b = 60 with 18 < r < 19.5, without dust."""
+    """Return statistics of g - r (SDSS) of stars with 18 < r < 19.5 in `area` deg2 at b = 60, without dust."""
     galaxy = universe.galaxy
     rngs = (stream(star_counts.SEED, "colours", name) for name in ("number", "labels"))
     drawn = milky_way.draw(galaxy, milky_way.expected_per_bin(galaxy, 90.0, 60.0, area, 21.0), *rngs)
@@ -127,7 +139,7 @@ def colours(universe: stars.StarModel, area: float = 40.0) -> dict[str, float]:
 
 
 def motions() -> dict[str, float]:
-    """Oort's constants, km/s/kpc, of the youngest stars' mean, and the halo's lag and dispersion, km/s."""
+    """Oort's constants (km/s/kpc) of the mean of the youngest stars, and lag and dispersion (km/s) of the halo."""
     lon = np.arange(0.0, 360.0, 5.0)
     zeros, young = np.zeros((3, lon.size)), np.full(lon.size, 0.1)
     mean = [_longitude_motion(lon, distance_pc, zeros, young) for distance_pc in (_OORT_DISTANCE, 0.5 * _OORT_DISTANCE)]
@@ -155,7 +167,7 @@ def motions() -> dict[str, float]:
 
 
 def _longitude_motion(lon: Float, distance_pc: float, deviates: Float, age: Float) -> Float:
-    """Proper motion along Galactic longitude, mas/yr, in the plane: by a step of it."""
+    """Proper motion along Galactic longitude in the plane, mas/yr, from a small step in longitude."""
     ra, dec = sky.equatorial(lon, np.zeros(lon.size))
     distance, thin = np.full(lon.size, distance_pc), np.zeros(lon.size, np.int64)
     east, north, _ = kinematics.velocities(ra, dec, distance, thin, age, deviates)
@@ -166,7 +178,7 @@ def _longitude_motion(lon: Float, distance_pc: float, deviates: Float, age: Floa
 
 
 def bulge(galaxy: milky_way.MilkyWay) -> dict[str, float]:
-    """Msun deg^-2 along lines of sight."""
+    """Mass of the bulge along lines of sight, Msun deg^-2."""
     pieces, inside = galaxy.pieces, np.arange(galaxy.pieces.number.size) >= galaxy.first[-1, 0]
     each = np.where(pieces.stage == WHITE_DWARF, _WHITE_DWARF_MASS, 10.0 ** pieces.log_mass.mean(0))
     mass = float((each * pieces.number * inside).sum() / galaxy.local[-1].sum())

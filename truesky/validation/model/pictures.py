@@ -1,4 +1,4 @@
-"""The figures of the universe."""
+"""Plot the figures of the simulated universe."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from truesky.catalogue.halos import luminosity_function
 from truesky.fluxes import cosmology
 from truesky.validation.model import census
 
-# Galaxies an arcmin2 brighter than i: GAMA and zCOSMOS (Driver et al. 2016), VVDS (Le Fevre et al. 2005), LSST Science
-# Book (2009).
+# Galaxies per arcmin2 brighter than i: GAMA and zCOSMOS (Driver et al. 2016), VVDS (Le Fevre et al. 2005), LSST
+# Science Book (2009).
 _OBSERVED = {20: 0.57, 21: 1.45, 22: 3.7, 23: 9.0, 24: 21.0, 25: 44.5, 26: 94.0}
 
 
@@ -27,11 +27,22 @@ def draw(
     bands: Sequence[int],
     figures: Mapping[str, float],
 ) -> None:
-    """universe.png: counts, redshifts, luminosities, halos, w(theta), C_l of the convergence.
+    """Write universe.png: counts, redshifts, luminosities, halos, w(theta) and C_l of the convergence.
 
-    folder  : where it is written;  seen : galaxies that were counted;  figures : what was measured, by name
-    curves  : by tracer and scale, (theta, w, its error, linear theory)
-    power   : [plane, band] C_l over theory;  bands : edges of the bands in l
+    Parameters
+    ----------
+    folder : Path
+        Folder of the file; it is made if it does not exist.
+    sample : Census
+        Galaxies that were counted.
+    curves : mapping of str to tuple
+        (theta in deg, w, error, linear theory) by tracer and scale, such as "halos_wide".
+    power : float array, shape (planes, bands)
+        C_l of the convergence over theory.
+    bands : sequence of int
+        Edges of the bands in l.
+    figures : mapping of str to float
+        Measured figures by name.
     """
     import matplotlib
 

@@ -1,8 +1,6 @@
-"""How the embedded universe lenses: C_l of the convergence, its rms, B modes, and the shear about massive halos.
+"""Lensing by the simulated universe: C_l and rms of the convergence, B modes, and the shear around massive halos.
 
-maps         what the maps of the catalogue hold
-power_of     C_l of the convergence over that of linear theory, of these maps;  power_of_box : of another seed's
-sight_rms    of the convergence along lines of sight, before it becomes a map;  skipping_rms : of too few cells
+The maps of the catalogue and those of boxes with other seeds are compared with linear theory.
 """
 
 from __future__ import annotations
@@ -21,26 +19,41 @@ from truesky.fluxes import cosmology
 from truesky.validation import theory as theories
 from truesky.validation.model.clustering import Tracers
 
-# Patches of the sky whose scatter gives the error of a mean: cells of this nside.
+# The error of a mean is the scatter of the cells of this nside.
 _PATCHES = 2
 _STEPS = 1500
 _SIGHT_NSIDE = 128
-# Rings about halos, deg, and directions.
+# Radii of rings around halos (deg), and number of directions.
 RINGS, _DIRECTIONS = (0.1, 0.2, 0.4, 0.8), 8
 
 
 def linear_theory(ell: Float, chi: float) -> Float:
-    """C_l of the convergence of sources at chi Mpc/h, linear theory, by Limber's approximation."""
+    """C_l of the convergence of sources at `chi` Mpc/h, from linear theory and Limber's approximation."""
     return theories.convergence_power(ell, np.array([chi]), np.ones(1), theories.linear_power, _distances(chi))
 
 
 def _distances(chi: float) -> Float:
-    """Distances[n] that linear theory is summed over, Mpc/h, up to sources at chi."""
+    """Comoving distances (Mpc/h) up to sources at `chi`, over which linear theory is integrated."""
     return np.linspace(2.0, chi - 0.5, _STEPS)
 
 
 def band_ratio(power: Float, chi: float, edges: Sequence[int]) -> Float:
-    """C_l / theory between multipoles, each l counting as its number of modes."""
+    """Return C_l over theory in bands of l, with each l weighted by its number of modes.
+
+    Parameters
+    ----------
+    power : float array
+        C_l from l = 0.
+    chi : float
+        Comoving distance of the sources, Mpc/h.
+    edges : sequence of int
+        Edges of the bands in l.
+
+    Returns
+    -------
+    float array, shape (bands,)
+        Mean ratio in each band.
+    """
     ell = np.arange(edges[0], edges[-1] + 1)
     nodes = np.unique(np.geomspace(edges[0], edges[-1], 60).astype(int))
     expected = np.exp(np.interp(np.log(ell), np.log(nodes), np.log(linear_theory(nodes.astype(float), chi))))
@@ -52,9 +65,25 @@ def band_ratio(power: Float, chi: float, edges: Sequence[int]) -> Float:
 
 
 def convergence_maps(box: Box, nside: int, redshifts: Sequence[float], l_max: int) -> tuple[Float32, Float]:
-    """Convergence [plane, pixel] (nested) along lines of sight, and what its multipoles are multiplied by for maps.
+    """Return the convergence along lines of sight, and the factors of its multipoles for maps.
 
-    box       : of matter;  nside : of the maps;  redshifts : of the sources, a plane each;  l_max : highest multipole
+    Parameters
+    ----------
+    box : Box
+        Box of matter.
+    nside : int
+        Resolution of the maps.
+    redshifts : sequence of float
+        Redshift of the sources of each plane.
+    l_max : int
+        Highest multipole.
+
+    Returns
+    -------
+    kappa : float32 array, shape (planes, pixels)
+        Convergence, nested.
+    gain : float array, shape (planes, l_max + 1)
+        Factor by which multipoles are multiplied in maps of the catalogue.
     """
     chosen = lensing.settings()
     direction = np.stack(hp.pix2vec(nside, np.arange(hp.nside2npix(nside)), nest=True)).astype(np.float32)
@@ -67,17 +96,32 @@ def convergence_maps(box: Box, nside: int, redshifts: Sequence[float], l_max: in
 
 
 def gaussian_box(seed: int, n: int) -> Box:
-    """A box without its smoothed fields and velocities, which lensing does not ask for; not kept."""
+    """Return a box without smoothed fields and velocities, which lensing does not need; it is not cached."""
     model = density_box.box_model()
     g = density_box._gaussian(seed, n, model.cell)
     return Box(model, n, seed, (g,), np.array([g.var(dtype=float)]), ())
 
 
 def power_of_box(seed: int, n: int, nside: int, redshifts: Sequence[float], edges: Sequence[int]) -> Float:
-    """C_l / theory [plane, band] of the maps that the catalogue would have of another seed.
+    """Return C_l over theory of the maps of a catalogue with another seed.
 
-    seed, n   : of the box of matter, and its cells a side;  nside : of the maps
-    redshifts : of the sources, a plane each;  edges : of the bands in l
+    Parameters
+    ----------
+    seed : int
+        Seed of the box of matter.
+    n : int
+        Cells per side of the box.
+    nside : int
+        Resolution of the maps.
+    redshifts : sequence of float
+        Redshift of the sources of each plane.
+    edges : sequence of int
+        Edges of the bands in l.
+
+    Returns
+    -------
+    float array, shape (planes, bands)
+        Ratio to linear theory.
     """
     kappa, gain = convergence_maps(gaussian_box(seed, n), nside, redshifts, edges[-1])
     rows = []
@@ -88,7 +132,22 @@ def power_of_box(seed: int, n: int, nside: int, redshifts: Sequence[float], edge
 
 
 def power_of_maps(planes: Planes, numbers: Sequence[int], edges: Sequence[int]) -> Float:
-    """C_l / theory [plane, band] of the catalogue's own maps."""
+    """Return C_l over theory of the maps of the catalogue.
+
+    Parameters
+    ----------
+    planes : Planes
+        Lensing maps.
+    numbers : sequence of int
+        Planes to measure.
+    edges : sequence of int
+        Edges of the bands in l.
+
+    Returns
+    -------
+    float array, shape (planes, bands)
+        Ratio to linear theory.
+    """
     rows = []
     for number in numbers:
         ring = hp.reorder(planes.maps[number][:, lensing.KAPPA].astype(float), n2r=True)
@@ -97,7 +156,7 @@ def power_of_maps(planes: Planes, numbers: Sequence[int], edges: Sequence[int]) 
 
 
 def line_of_sight_rms(box: Box, redshifts: Sequence[float]) -> list[tuple[float, float]]:
-    """rms of the convergence along lines of sight through cells of the box, and what linear theory gives such cells."""
+    """Return the rms of the convergence along lines of sight through the box, and the rms from linear theory."""
     chosen, chi = lensing.settings(), np.asarray(cosmology.comoving_distance(np.array(redshifts)))
     direction = np.stack(hp.pix2vec(_SIGHT_NSIDE, np.arange(12 * _SIGHT_NSIDE**2), nest=True)).astype(np.float32)
     kappa = convergence.convergence(box, direction, hp.nside2resol(_SIGHT_NSIDE), chi, 1, chosen.stretch)
@@ -114,7 +173,22 @@ def line_of_sight_rms(box: Box, redshifts: Sequence[float]) -> list[tuple[float,
 
 
 def skipping_rms(box: Box, redshift: float, step: float) -> float:
-    """rms of the sums over single cells every `step` Mpc/h, as if each stood for all between: too large."""
+    """Return the rms of the convergence from single cells at a fixed step; it is larger than that of all cells.
+
+    Parameters
+    ----------
+    box : Box
+        Box of matter.
+    redshift : float
+        Redshift of the sources.
+    step : float
+        Step along the line of sight, Mpc/h.
+
+    Returns
+    -------
+    float
+        rms of the convergence.
+    """
     source_chi, width = float(cosmology.comoving_distance(redshift)), 0.5 * step
     direction = np.stack(hp.pix2vec(_SIGHT_NSIDE // 2, np.arange(3 * _SIGHT_NSIDE**2), nest=True), 1)
     box_replicas, kappa = lightcone.draw_replicas(box, source_chi), np.zeros(len(direction))
@@ -128,7 +202,7 @@ def skipping_rms(box: Box, redshift: float, step: float) -> float:
 
 
 def map_rms(chi: float, l_max: int) -> float:
-    """rms that linear theory gives a map to that multipole."""
+    """Return the rms of a map up to multipole `l_max` from linear theory, for sources at `chi` Mpc/h."""
     ell = np.arange(2, l_max + 1)
     nodes = np.unique(np.geomspace(2, l_max, 80).astype(int))
     power = np.exp(np.interp(np.log(ell), np.log(nodes), np.log(linear_theory(nodes.astype(float), chi))))
@@ -136,7 +210,22 @@ def map_rms(chi: float, l_max: int) -> float:
 
 
 def map_statistics(planes: Planes, number: int, name: str) -> dict[str, float]:
-    """Moments of one plane's maps, and the share of B modes."""
+    """Measure moments and the share of B modes of the maps of one plane.
+
+    Parameters
+    ----------
+    planes : Planes
+        Lensing maps.
+    number : int
+        Number of the plane.
+    name : str
+        Name of the plane in the names of the figures.
+
+    Returns
+    -------
+    dict of str to float
+        Figures by name; deflections are in arcmin.
+    """
     fields, chi, l_max = planes.maps[number], float(planes.chi[number]), int(lensing.settings().l_max * planes.nside)
     kappa = fields[:, lensing.KAPPA].astype(float)
     patches = kappa.reshape(12 * _PATCHES**2, -1).mean(1)
@@ -155,7 +244,22 @@ def map_statistics(planes: Planes, number: int, name: str) -> dict[str, float]:
 
 
 def tangential_shear(planes: Planes, halos: Tracers, chi: float) -> tuple[Float, Float]:
-    """Mean tangential shear[ring] of sources at chi about halos, and its error."""
+    """Return the mean tangential shear of sources around halos, and its error.
+
+    Parameters
+    ----------
+    planes : Planes
+        Lensing maps.
+    halos : Tracers
+        Halos.
+    chi : float
+        Comoving distance of the sources, Mpc/h.
+
+    Returns
+    -------
+    mean, error : float array, shape (rings,)
+        Shear in each ring of RINGS.
+    """
     mean, error = [], []
     for radius in RINGS:
         shear_sum = np.zeros(halos.ra.size)
@@ -164,7 +268,7 @@ def tangential_shear(planes: Planes, halos: Tracers, chi: float) -> tuple[Float,
             offset = np.radians(np.full((2, halos.ra.size), [[east], [north]]))
             ra, dec = lensing.displace(halos.ra, halos.dec, *offset)
             lens_values = lensing.interpolate(planes, ra, dec, np.full(ra.size, chi))
-            # Position angle from north to east; gamma1 > 0 is north-south.
+            # The position angle is from north to east; gamma1 > 0 is north-south.
             shear_sum += lens_values[1] * np.cos(2 * turn) - lens_values[2] * np.sin(2 * turn)
         mean.append(np.mean(shear_sum) / _DIRECTIONS)
         error.append(np.std(shear_sum) / _DIRECTIONS / np.sqrt(shear_sum.size))

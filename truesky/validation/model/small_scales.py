@@ -1,11 +1,17 @@
 """Clustering at and within the size of halos: w(theta) of bright galaxies over that of a power law.
 
-figures   at separations of EDGES, of galaxies of M_r < -20 at z = 0.5
+The galaxies have M_r < -20 and a redshift of about 0.5. Pairs of galaxies in order-5 cells are compared with pairs of
+random points. Both are relative to the mean density of all cells, not to the mean of each cell. The power law is
+projected with Limber's equation and the distances of the galaxies.
 
-Pairs of galaxies in order-5 cells against pairs of random points there, both beside the mean density of all cells: no
-cell's own mean is taken from it. The power law goes by Limber's equation over the galaxies' own distances.
-Error: pairs across the borders of cells are in neither count
-Ref  : Limber 1953, ApJ 117, 134; Peebles 1980, The Large-Scale Structure of the Universe, eq. 52.7
+Notes
+-----
+Pairs across the borders of cells are in neither count.
+
+References
+----------
+Limber 1953, ApJ 117, 134
+Peebles 1980, The Large-Scale Structure of the Universe, eq. 52.7
 """
 
 from __future__ import annotations
@@ -23,26 +29,27 @@ from truesky.randomness.rng import stream
 from truesky.validation import pairs
 from truesky.validation.model import clustering
 
-# Projected separations, Mpc/h; the galaxies' redshifts and luminosities; the power law's length, Mpc/h, and slope.
+# Projected separations (Mpc/h); redshifts and luminosities of the galaxies; length (Mpc/h) and slope of the power law.
 EDGES = np.array([0.04, 0.16, 0.32, 1.28, 5.12])
 Z_MIN, Z_MAX, MAX_ABS_MAG = 0.4, 0.6, -20.0
 LENGTH, SLOPE = 5.5, 1.8
 ORDER = 5
-# Random points of a cell, and bins of distance.
+# Random points per cell, and bins of distance.
 _RANDOM, _BINS = 20_000, 40
 
 
 def galaxy_population(seed: int, box_cells: int) -> Population:
-    """Halos with galaxies as bright as that; seed, box_cells : of the box."""
+    """Return halos that host galaxies brighter than MAX_ABS_MAG in a box with `box_cells` cells per side."""
     matched = luminosity_function.inverse(luminosity_function.schechter(), matching.Z_LAST)
     space = Volume(Z_MIN - 0.05, Z_MAX + 0.05, MAX_ABS_MAG)
     return population.model(seed, box_cells, space, matched, lambda z: np.full(np.size(z), MAX_ABS_MAG))
 
 
 def figures(universe: Population, count: int) -> dict[str, float]:
-    """w over the power law's by the lower edge of each bin, and its error from the scatter of the cells.
+    """Return w over that of the power law in each bin, and its error from the scatter between cells.
 
-    universe : of `universe_of`;  count : order-5 cells, spread over the sky
+    The population comes from `galaxy_population`; `count` order-5 cells are distributed over the sky. Names contain the
+    lower edge of each bin.
     """
     low, high = (float(cosmology.comoving_distance(z)) for z in (Z_MIN, Z_MAX))
     theta = EDGES / (0.75 * (high**4 - low**4) / (high**3 - low**3))
@@ -69,13 +76,16 @@ def figures(universe: Population, count: int) -> dict[str, float]:
 
 
 def _count_pairs(ra: Float, dec: Float, theta: Float) -> Float:
-    """Ordered pairs in each bin of separation, edges theta in rad."""
+    """Ordered pairs in each bin of separation with edges `theta` in rad."""
     same = np.zeros(ra.size, np.int64)
     return np.asarray(2.0 * pairs.count_pairs(sky.unit_vectors(ra, dec), same, same, theta).total[0])
 
 
 def power_law(chi: Float, theta: Float) -> Float:
-    """w of xi = (r / LENGTH)^-SLOPE, mean over the pairs of each bin, of galaxies at comoving distances chi."""
+    """Return w of xi = (r / LENGTH)^-SLOPE, averaged over the pairs of each bin.
+
+    The galaxies lie at comoving distances `chi` (Mpc/h); the bins of separation have edges `theta` (rad).
+    """
     share, edges = np.histogram(chi, _BINS, density=True)
     middle, step = 0.5 * (edges[1:] + edges[:-1]), edges[1] - edges[0]
     depth = float(np.sum(share**2 * middle ** (1.0 - SLOPE)) * step)

@@ -1,8 +1,4 @@
-"""Stars and dwarfs drawn, against counts that other code published.
-
-counts, dwarf_counts : a deg2 at a Galactic latitude, as in COUNTS and DWARFS;  around : the cells that are drawn
-brighter, whole_sky  : to expect brighter than V, a deg2 and on the whole sky;  absolute_v : M_V of what is drawn
-"""
+"""Compare drawn stars and brown dwarfs with published counts of other codes."""
 
 from __future__ import annotations
 
@@ -23,10 +19,11 @@ from truesky.randomness.rng import stream
 
 SEED = 7
 AREA = sky.cell_area(GENERATION_ORDER)
-# Of the cells in which the whole sky is looked at.
+# HEALPix order of the cells that sample the whole sky.
 _SKY_ORDER = 4
-# Northern latitude -> stars deg-2 to H = 18, 22, 26 (Vega), mean over longitude, without dust, companions and white
-# dwarfs: the same laws of density and masses, with the tables of BaSTI (Pietrinferni et al. 2004) above 0.55 Msun.
+# Northern latitude -> stars deg-2 to H = 18, 22, 26 (Vega). The counts are means over longitude without dust,
+# companions and white dwarfs. The laws of density and mass are the same as here; above 0.55 Msun the tables are those
+# of BaSTI (Pietrinferni et al. 2004).
 COUNTS = {
     90: (1997, 10951, 36048),
     60: (2650, 14683, 46733),
@@ -35,28 +32,53 @@ COUNTS = {
     20: (15541, 104005, 247463),
 }
 LIMITS = (18.0, 22.0, 26.0)
-# L, then T dwarfs deg-2 to J = 22, 24, 26 (Vega).
+# L dwarfs deg-2 to J = 22, 24, 26 (Vega), then T dwarfs.
 DWARFS = {30: (62, 267, 458, 6, 60, 330), 60: (32, 81, 105, 5, 35, 116), 90: (25, 57, 69, 5, 29, 83)}
-# mas at G = 15, 17, 20: the law of PyGaia scaled to DR2, which publishes 0.04, 0.1, 0.7.
+# Parallax error (mas) at G = 15, 17, 20: the law of PyGaia scaled to DR2, which publishes 0.04, 0.1, 0.7.
 PARALLAX = {15.0: 0.037, 17.0: 0.098, 20.0: 0.765}
 
 
 def cells_at_latitude(b: float, cells: int, south: bool = False) -> list[int]:
-    """Generation cells at Galactic latitude b, evenly in longitude; with `south`, every other one at -b.
+    """Return generation cells at Galactic latitude `b`, evenly distributed in longitude.
 
-    The Sun stands north of the plane, so that there are more stars in the south.
+    Parameters
+    ----------
+    b : float
+        Galactic latitude, deg.
+    cells : int
+        Number of positions; cells that contain several are returned once.
+    south : bool
+        If True, every other position lies at -b. The Sun is north of the plane, so there are more stars in the south.
+
+    Returns
+    -------
+    list of int
+        Generation cells, ascending.
     """
     lon = np.arange(cells) * 360.0 / cells
-    # At a pole the parallel is too short for them.
+    # The parallel at a pole is too short, so the latitudes there differ.
     lat = np.minimum(b, 89.9 - 0.1 * np.arange(cells)) * np.where(south & (np.arange(cells) % 2 == 1), -1.0, 1.0)
     return sorted({int(cell) for cell in sky.cell_at(*sky.equatorial(lon, lat), GENERATION_ORDER)})
 
 
 def counts(b: float, cells: int, universe: stars.StarModel, dust: Float32) -> Float:
-    """Stars drawn deg-2 at a latitude, as in COUNTS: primaries and single ones.
+    """Return the number of stars drawn per deg2 at a latitude, without companions, white dwarfs and brown dwarfs.
 
-    b        : Galactic latitude, deg;  cells : that are drawn there
-    universe : the model of stars;  dust : float32[pixel] map of A(V), mag
+    Parameters
+    ----------
+    b : float
+        Galactic latitude, deg.
+    cells : int
+        Number of cells to draw there.
+    universe : StarModel
+        Model of the stars.
+    dust : float32 array, shape (pixels,)
+        Map of A(V), mag.
+
+    Returns
+    -------
+    float array, shape (limits,)
+        Stars per deg2 brighter than each of LIMITS.
     """
     drawn, total = cells_at_latitude(b, cells), np.zeros(len(LIMITS))
     for cell in drawn:
@@ -69,7 +91,7 @@ def counts(b: float, cells: int, universe: stars.StarModel, dust: Float32) -> Fl
 
 
 def absolute_v(universe: stars.StarModel) -> Float:
-    """M_V[n] of the stretches of isochrones and of white dwarfs that stars are drawn on, in their middles."""
+    """Return M_V of each piece of an isochrone or white-dwarf track from which stars are drawn, at its middle."""
     galaxy, pieces = universe.galaxy, universe.galaxy.pieces
     metals = np.where(pieces.track < 0, 0.0, galaxy.tracks.metallicity[pieces.track])
     teff, log_g = 10.0 ** pieces.log_teff.mean(0), pieces.log_g.mean(0)
@@ -87,10 +109,23 @@ def absolute_v(universe: stars.StarModel) -> Float:
 def count_brighter(
     universe: stars.StarModel, place: tuple[float, float], limits: Sequence[float], a_v: Float | None = None
 ) -> Float:
-    """Single stars and primaries deg-2 to expect brighter than V (Vega), [limit].
+    """Return the expected number per deg2 of single stars and primaries brighter than V (Vega).
 
-    universe : the model of stars;  place : Galactic l, b, deg
-    limits   : V, mag;  a_v : [s] mag of dust before the shells of distance, None = there is none
+    Parameters
+    ----------
+    universe : StarModel
+        Model of the stars.
+    place : tuple of float
+        Galactic l and b, deg.
+    limits : sequence of float
+        V magnitudes.
+    a_v : float array, shape (s,), optional
+        Dust A(V) in front of each shell of distance, mag; None if there is no dust.
+
+    Returns
+    -------
+    float array, shape (limits,)
+        Stars per deg2.
     """
     galaxy = universe.galaxy
     m_v, owner = (
@@ -111,9 +146,23 @@ def count_brighter(
 
 
 def count_whole_sky(universe: stars.StarModel, limit: float, dust: Float32, step: int) -> float:
-    """Single stars and primaries of the whole sky to expect brighter than V, behind the dust, from every step-th cell.
+    """Return the expected number of single stars and primaries brighter than V on the whole sky, behind dust.
 
-    universe : the model of stars;  limit : V, mag;  dust : float32[pixel] map of A(V), mag;  step : of order-4 cells
+    Parameters
+    ----------
+    universe : StarModel
+        Model of the stars.
+    limit : float
+        V magnitude (Vega).
+    dust : float32 array, shape (pixels,)
+        Map of A(V), mag.
+    step : int
+        Step in the numbers of order-4 cells that sample the sky.
+
+    Returns
+    -------
+    float
+        Number of stars.
     """
     cells, total = np.arange(step // 2, 12 << 2 * _SKY_ORDER, step), 0.0
     distance = milky_way.shell_distances(universe.galaxy)
@@ -126,7 +175,7 @@ def count_whole_sky(universe: stars.StarModel, limit: float, dust: Float32, step
 
 
 def dwarf_counts(b: float, area: float) -> Float:
-    """L and T dwarfs drawn deg-2 at a latitude, as in DWARFS: one draw over so many deg2, without dust."""
+    """Return L and T dwarfs per deg2 at a latitude, as in DWARFS, from one draw over `area` deg2 without dust."""
     galaxy, dwarfs, types = milky_way.milky_way(), brown_dwarfs.brown_dwarfs(1.0), spectra_of_dwarfs.templates()
     drawn = brown_dwarfs.draw(dwarfs, galaxy, 90.0, b, area, 28.0, stream(SEED, "benchmark", int(b)))
     j = types.abs_mag_j[drawn.template] + 5.0 * np.log10(drawn.distance) - 5.0

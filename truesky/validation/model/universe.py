@@ -1,8 +1,8 @@
-"""The universe: counts, sizes, clustering, lensing and stars.
+"""Measure the simulated universe: counts, sizes, clustering, lensing and stars.
 
-Galaxies of cells spread over the sky, drawn at the settings that a request has by default, are counted and measured;
-halos and the galaxies of massive ones over hundreds of deg2 are correlated; the lensing maps are compared with linear
-theory in several boxes, the stars with published counts.
+Galaxies of cells distributed over the sky are drawn with the default settings of a request, counted and measured.
+Halos, and the galaxies of massive halos, are correlated over hundreds of deg2. The lensing maps are compared with
+linear theory in several boxes, and the stars with published counts.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from truesky.validation.theory import Shells
 SEED = 7
 POWER_EDGES = np.array([0.02, 0.05, 0.10, 0.15, 0.20])
 BIASES, BIAS_EDGES = (0.7, 1.0, 1.4, 2.0, 2.9), np.array([0.03, 0.10])
-# Of the sample whose clustering is measured: redshifts, and log10 of the least halo and proxy mass.
+# Sample for the clustering: redshift range, and log10 of the lowest halo and proxy mass.
 Z_MIN, Z_MAX, MIN_LOG_MASS = 0.4, 0.8, 12.0
 WIDE_EDGES, NARROW_EDGES = np.array([0.3, 0.5, 0.7, 1.0, 1.5]), np.array([0.03, 0.05, 0.08, 0.13, 0.2, 0.3])
 TRACERS = ("halos", "galaxies")
 BANDS = (30, 64, 128, 256, 384, 512)
 PLANES = ((7, 1.0), (12, 2.4))
-# Redshifts of sources, and steps along the line of sight, Mpc/h, of which one cell in five is seen.
+# Redshifts of sources, and a step along the line of sight (Mpc/h) that samples only one cell in five.
 SIGHTS, SKIPPING = (1.0, 2.3), 20.0
 # K-corrections and I_E - M_r - DM at z = 0.1, 0.5, 1, 2 of three templates.
 K_REDSHIFTS = (0.1, 0.5, 1.0, 2.0)
@@ -52,12 +52,28 @@ K_CORRECTIONS = {
 
 @dataclass(frozen=True, slots=True)
 class SampleSize:
-    """How much is drawn.
+    """Amount of sky to draw.
 
-    settings : of the universe;  blocks : of 4^side_order generation cells;  deep : blocks of one cell to I_E < 28
-    wide : blocks of 54 deg2 a box whose clustering is measured;  near : of 215 deg2, for satellites at z = 0.1
-    pixels : order-5 cells whose halos are counted; four times as many for clustering at the size of halos
-    boxes : seeds of further boxes whose power, clustering and lensing are measured;  stars : cells a latitude
+    Attributes
+    ----------
+    settings : Universe
+        Settings of the universe.
+    blocks : int
+        Number of blocks of generation cells.
+    side_order : int
+        A block contains 4^side_order generation cells.
+    deep_blocks : int
+        Blocks of one cell to I_E < 28.
+    wide_blocks : int
+        Blocks of 54 deg2 per box for clustering.
+    nearby_blocks : int
+        Blocks of 215 deg2 for satellites at z = 0.1.
+    halo_cells : int
+        Order-5 cells in which halos are counted; clustering at the size of halos uses four times as many.
+    box_seeds : tuple of int
+        Seeds of further boxes for power, clustering and lensing.
+    star_cells : int
+        Cells per latitude for stars.
     """
 
     settings: Universe
@@ -79,14 +95,14 @@ QUICK = SampleSize(Universe(box_cells=192, lensing_nside=64), 4, 0, 0, 2, 0, 0, 
 
 
 def theory() -> dict[str, float]:
-    """sigma_8, distance, K-corrections."""
+    """Compute sigma_8, the distance to z = 2.3 (Mpc/h), and the largest offsets from published K-corrections."""
     k = np.geomspace(1e-4, 50.0, 20_000)
     x = 8.0 * k
     window = 3.0 * (np.sin(x) - x * np.cos(x)) / x**3
     variance = np.trapezoid(density_box.linear_power(k) * window**2 * k**3 / (2 * np.pi**2), np.log(k))
     figures = {"sigma_8": float(np.sqrt(variance)), "chi_2.3": float(cosmology.comoving_distance(2.3))}
     wavelength, template_numbers = rest_grid.rest_grid(), list(K_CORRECTIONS["sdss_r01"])
-    # The numbers are of the observed spectra with their weak lines, which the library bridges.
+    # The published numbers are for observed spectra with weak lines, which the library otherwise bridges.
     flux = templates.galaxy_spectra(wavelength, bridge_width=-1.0)[template_numbers].astype(np.float32)
     library = templates.Library(wavelength, flux, tuple(map(str, template_numbers)))
     z, zeros = np.array(K_REDSHIFTS), np.zeros(len(K_REDSHIFTS), int)
@@ -100,7 +116,7 @@ def theory() -> dict[str, float]:
 
 
 def matter(size: SampleSize) -> dict[str, float]:
-    """Power and bias of the box, velocities."""
+    """Measure the power of the box, the bias of halos, and velocities."""
     cells = size.settings.box_cells
     box = density_box.load(SEED, cells)
     boxes = [box, *(shear.gaussian_box(seed, cells) for seed in size.box_seeds)]
@@ -124,7 +140,7 @@ def _figures_by_edge(pattern: str, edges: Sequence[float] | Float, values: Float
 
 
 def mass_function() -> Callable[[float, float], float]:
-    """Halos above a mass at z, (Mpc/h)^-3: the mass function itself, without what the draw makes of it."""
+    """Return the mass function: number of halos in (Mpc/h)^-3 above a log10 mass at redshift z, before any draw."""
     masses = matching.masses()
 
     def number(min_log_mass: float, z: float) -> float:
@@ -136,7 +152,7 @@ def mass_function() -> Callable[[float, float], float]:
 
 
 def count_galaxies(size: SampleSize) -> tuple[dict[str, float], census.Census]:
-    """Everything that the galaxies of small blocks tell."""
+    """Draw the galaxies of small blocks, and measure all figures from them."""
     universe = galaxies.model(SEED, size.settings)
     dust, law = dust_map.load(SEED), luminosity_function.schechter()
     sample = census.draw(universe, dust, census.blocks(size.blocks, size.side_order))
@@ -154,19 +170,38 @@ def count_galaxies(size: SampleSize) -> tuple[dict[str, float], census.Census]:
 def compare_with_limber(
     measured: clustering.Correlation, tracer_shells: Shells, power: Callable[[Float], Float]
 ) -> tuple[Float, Float, Float, Float]:
-    """theta, w, its error, and Limber's: the mean of a block takes as much from what is found as from that."""
+    """Return a measured w, corrected for the mean of each block, and Limber's w.
+
+    Parameters
+    ----------
+    measured : Correlation
+        Measured w relative to the mean of each block.
+    tracer_shells : Shells
+        Tracers by distance.
+    power : callable
+        P(k) in (Mpc/h)^3 of k in h/Mpc.
+
+    Returns
+    -------
+    theta, w, error, expected : float array, shape (bins,)
+        Separation in deg, corrected w and its error, and Limber's w. The correction for the block mean is that of
+        Limber's w.
+    """
     expected, mean_subtracted = clustering.limber(tracer_shells, measured, power)
     return measured.theta, measured.w + expected - mean_subtracted, measured.error, expected
 
 
 def measure_clustering(size: SampleSize) -> tuple[dict[str, float], dict[str, Any], clustering.Tracers]:
-    """w(theta) of halos and of galaxies over Limber's, all boxes together; the curves; the halos of the first box."""
+    """Measure w(theta) of halos and galaxies over Limber's in all boxes.
+
+    Returns the figures, the curves by tracer and scale, and the halos of the first box.
+    """
     n_blocks, seeds = 12 << 2 * clustering.BLOCK_ORDER, (SEED, *size.box_seeds)
     cells = ((np.arange(size.wide_blocks) + 0.37) * n_blocks / size.wide_blocks).astype(int).tolist()
     wide_samples, narrow_samples, curves = [], [], {}
     figures: dict[str, float] = {}
     for seed in seeds:
-        # The boxes of other seeds are not kept.
+        # Boxes of other seeds are not cached.
         with nullcontext() if seed == SEED else cache.use_temporary_dir():
             universe = clustering.population_above(seed, size.settings.box_cells, Z_MIN, Z_MAX, MIN_LOG_MASS)
             for cell in cells:
@@ -210,7 +245,7 @@ def measure_clustering(size: SampleSize) -> tuple[dict[str, float], dict[str, An
 
 
 def abundances(size: SampleSize) -> dict[str, float]:
-    """Halos above a mass / the mass function, in thin shells of order-5 cells; the error from their scatter."""
+    """Ratio of halos above a mass to the mass function, in thin shells of order-5 cells; errors from their scatter."""
     number, cells = (
         mass_function(),
         ((np.arange(size.halo_cells) + 0.43) * (12 << 10) / size.halo_cells).astype(int).tolist(),
@@ -236,7 +271,7 @@ def abundances(size: SampleSize) -> dict[str, float]:
 
 
 def nearby_satellites(size: SampleSize) -> dict[str, float]:
-    """Satellites of M_r < -20 at z = 0.1, SDSS's limit of volume."""
+    """Fraction of satellites among galaxies with M_r < -20 at z = 0.1, the volume limit of SDSS."""
     universe = clustering.population_above(SEED, size.settings.box_cells, 0.05, 0.15, 11.8)
     cells = ((np.arange(size.nearby_blocks) + 0.4) * 192 / size.nearby_blocks).astype(int).tolist()
     sample = clustering.concatenate([clustering.draw_tracers(universe, 2, cell) for cell in cells])
@@ -247,7 +282,10 @@ def nearby_satellites(size: SampleSize) -> dict[str, float]:
 
 
 def measure_lensing(size: SampleSize, halos: clustering.Tracers) -> tuple[dict[str, float], Float]:
-    """Maps, their power in several boxes, shear about halos; C_l over theory [plane, band]."""
+    """Measure lensing maps, their power in several boxes, and shear around halos.
+
+    Returns the figures, and C_l over theory with shape (planes, bands).
+    """
     cells, nside = size.settings.box_cells, size.settings.lensing_nside
     box = density_box.load(SEED, cells)
     planes = lensing.load(box, nside, with_far_planes=True)
@@ -289,7 +327,7 @@ def milky_way(size: SampleSize) -> dict[str, float]:
 
 
 def run(size: SampleSize, folder: Path | None = None) -> dict[str, float]:
-    """All figures; their pictures into a folder."""
+    """Measure all figures; write their plots to a folder if given."""
     started = time.process_time()
     figures, sample = count_galaxies(size)
     new_figures, curves, halos = measure_clustering(size)

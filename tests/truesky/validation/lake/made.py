@@ -1,4 +1,4 @@
-"""Frames that are made here, by a few lines of arithmetic, so that what a check finds in them is known beforehand."""
+"""Synthetic frames from a few lines of arithmetic, so that the results of checks are known beforehand."""
 
 import numpy as np
 import scipy.stats
@@ -17,7 +17,7 @@ HITS = 0.02
 
 
 def system(shift=(0.0, 0.0), ra=10.0, dec=-20.0, side=2 * SIDE, stretch=1.0):
-    """A plain projection; shift, stretch : pixels and a factor by which its header is wrong."""
+    """A plain projection whose header is wrong by a shift (pixels) and a stretch (factor)."""
     out = WCS(naxis=2)
     out.wcs.ctype = ["RA---TAN", "DEC--TAN"]
     out.wcs.crval = [ra, dec]
@@ -27,19 +27,19 @@ def system(shift=(0.0, 0.0), ra=10.0, dec=-20.0, side=2 * SIDE, stretch=1.0):
 
 
 def scene(rng, n=160, faintest=21.0, side=2 * SIDE):
-    """Stars on a jittered lattice, none beside another."""
+    """Isolated stars on a jittered lattice."""
     per = int(np.ceil(np.sqrt(n)))
     step = (side - 80) / per
     x, y = (axis.ravel()[:n] for axis in np.meshgrid(*[40 + step * (np.arange(per) + 0.5)] * 2))
     x, y = (axis + 0.25 * step * (rng.random(n) - 0.5) for axis in (x, y))
     mag = 18.9 + (faintest - 18.9) * rng.random(n)
-    # Some that must be full.
+    # Some of the stars must saturate.
     mag[:12] = 14.0
     return known(x, y, mag)
 
 
 def known(x, y, mag, seconds=SECONDS):
-    """What the lake would say of these points."""
+    """Reference data of these points, as from the tables of a lake."""
     n = len(x)
     ra, dec = system().all_pix2world(x, y, 0)
     electrons = seconds * 10 ** (-0.4 * (mag - ZERO_POINT))
@@ -48,7 +48,7 @@ def known(x, y, mag, seconds=SECONDS):
 
 
 def light(of, side=2 * SIDE, fwhm=FWHM / SCALE, round_=1.0):
-    """Expected e- of the points, each a Gaussian averaged over pixels; round_ : how much taller than wide."""
+    """Expected e- of points, each a Gaussian averaged over pixels; round_ is the ratio of height to width."""
     out = np.zeros((side, side))
     sigma = np.sqrt(max(fwhm**2 - 0.7, 0.2)) / 2.3548
     edge = np.arange(-24, 26) - 0.5
@@ -103,7 +103,7 @@ def image(data, cards, name=""):
 
 
 def placed(place, x=0, y=0):
-    """Cards of a system whose pixels lie so far into an array."""
+    """WCS cards of pixels that begin at an offset in an array."""
     cards = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CUNIT1": "deg", "CUNIT2": "deg"}
     for i in (0, 1):
         cards |= {f"CRVAL{i + 1}": float(place.wcs.crval[i]), f"CRPIX{i + 1}": float(place.wcs.crpix[i]) + (x, y)[i]}
@@ -112,7 +112,7 @@ def placed(place, x=0, y=0):
 
 
 def vis(folder, rng=None, of=None, hits=HITS, sky=SKY, stretched=1.0, bright=1.0, **wrong):
-    """(what a check is given of a frame of VIS, its stars); wrong : of vis_file."""
+    """Context of a VIS frame, and its stars; wrong are arguments of vis_file."""
     rng = np.random.default_rng(3) if rng is None else rng
     of = scene(rng) if of is None else of
     expected = light(of, round_=stretched) * bright + sky * SECONDS
@@ -141,5 +141,5 @@ def ramp_file(path, chi2, channel="NISP-S", border=4):
 
 
 def verdicts(check, of):
-    """Quantity -> verdict."""
+    """Verdicts by quantity."""
     return {row.quantity: row.verdict for row in check.run(of)}

@@ -1,4 +1,4 @@
-"""The mean sky beside what was observed, and what a wrong recipe does to it."""
+"""The mean sky against observations, and the effect of wrong recipes on the checks."""
 
 import csv
 from dataclasses import replace
@@ -22,7 +22,7 @@ from truesky.validation.model import mean_sky, observed
 from truesky.validation.verdicts import FAIL, PASS
 
 LIST = Path(checks.__file__).with_name("observed.csv")
-# Cells that tell a wrong recipe.
+# Number of cells that suffices to detect a wrong recipe.
 FEW = 4
 
 
@@ -41,11 +41,11 @@ def whole(flat_sky):
 
 
 def off(figures):
-    """Names of what is not as observed."""
+    """Names of checks that do not pass."""
     return {check.name for check in checks.evaluate(figures, 2.0) if not check.passes}
 
 
-def test_the_list_says_where_its_numbers_are_from():
+def test_list_has_sources():
     rows = list(csv.DictReader(LIST.open(newline="")))
     assert len(rows) >= 60
     assert len({row["name"] for row in rows}) == len(rows)
@@ -60,16 +60,16 @@ def test_every_row_is_measured(whole):
 
 
 def test_the_mean_sky_is_as_observed(whole):
-    """1.7 deg2: within two Poisson errors more than the list says."""
+    """In 1.7 deg2 the tolerance is that of the list plus two Poisson errors."""
     results = checks.evaluate(whole, 2.0)
     assert [(check.name, check.value) for check in results if check.is_unexpected_failure] == []
-    # Numbers from memory gate nothing one by one; were many of them off, so would be the sky.
+    # Numbers quoted from memory are not binding, but most of them must pass.
     remembered = [check for check in results if not check.is_binding]
     assert sum(check.passes for check in remembered) > 0.85 * len(remembered)
 
 
 def test_a_lake_is_compared(flat, tmp_path, capsys):
-    """By the command: the same figures as of the rows themselves, in the table that it publishes."""
+    """The command publishes the same figures as those of the rows themselves."""
     rows = mean_sky.rows(flat, 0, 2)
     plan = Plan(GALAXIES, {}, (Task(layout.cell_file(5, 0), {}),))
     publish.make_version(tmp_path, plan, lambda root, facts: Output(rows))
@@ -81,7 +81,7 @@ def test_a_lake_is_compared(flat, tmp_path, capsys):
     assert {row["quantity"]: row["value"] for row in table if row["value"] is not None} == {
         check.name: check.value for check in checks.evaluate(found) if np.isfinite(check.value)
     }
-    # Two cells are too few to tell an error of.
+    # Two cells are too few for an error.
     assert {row["verdict"] for row in table} == {"undecided"}
     assert status == 0
     assert "undecided" in capsys.readouterr().out
@@ -89,7 +89,7 @@ def test_a_lake_is_compared(flat, tmp_path, capsys):
 
 @pytest.fixture(scope="module")
 def patch(flat_sky):
-    """(a lake's sky of eight cells, the cell of each galaxy)."""
+    """Sky of a lake with eight cells, and the cell of each galaxy."""
     rows = flat_sky
     cell = rows["_healpix_29"].to_numpy() >> 2 * (sky.MAX_ORDER - GENERATION_ORDER)
     part = rows.filter(pa.array(cell < 2 * FEW))
@@ -105,7 +105,7 @@ def failed(seen, cell):
 
 
 def columns(seen, **changed):
-    """A sky with some columns multiplied (fluxes) or shifted (the others)."""
+    """A sky with some columns multiplied (fluxes) or shifted (other columns)."""
     return replace(seen, rows={**seen.rows, **{name: change(seen.rows[name]) for name, change in changed.items()}})
 
 
@@ -117,7 +117,7 @@ def test_a_lake_of_the_mean_sky_passes(patch):
 
 
 def test_a_band_whose_magnitudes_are_shifted_in_a_lake(patch):
-    """By 0.3 mag, of which counts make 0.1 dex; the other band's are as they were."""
+    """A shift of 0.3 mag changes counts by 0.1 dex; the other band is unchanged."""
     sky_, cell = patch
     found = failed(replace(sky_, mags={**sky_.mags, "lsst_i": sky_.mags["lsst_i"] + 0.3}), cell)
     assert found
@@ -138,7 +138,7 @@ def test_masses_rates_and_lines_that_are_off_in_a_lake(patch):
 
 
 def test_a_lake_that_counts_its_area_twice(patch):
-    """As where every cell's galaxies are there a second time, with places and identifiers of their own."""
+    """This is the case if all galaxies of a cell are listed twice with different positions and identifiers."""
     sky_, cell = patch
     found = failed(replace(sky_, area=0.5 * sky_.area), cell)
     assert {"log_i_22.25", "mass_function_10_z0.65", "halpha_nii_2e-16"} <= found
@@ -146,7 +146,7 @@ def test_a_lake_that_counts_its_area_twice(patch):
 
 
 def old_metals(flat):
-    """Two scales of metallicity in one: 0.25 dex apart."""
+    """Mix two scales of metallicity that differ by 0.25 dex."""
     return replace(flat, lines=replace(flat.lines, metals=replace(flat.lines.metals, sun=8.44)))
 
 
@@ -155,17 +155,17 @@ def unmatched_lines(flat):
 
 
 def light_stars(flat):
-    """Mass-to-light ratios of half of what they are."""
+    """Halve the mass-to-light ratios."""
     return replace(flat, masses=replace(flat.masses, intercept=flat.masses.intercept - 0.3))
 
 
 def template_rates(flat):
-    """The rates that the ultraviolet light of empirical templates gives are lower."""
+    """Use star formation rates from the ultraviolet light of empirical templates, which are lower."""
     return replace(flat, star_formation=replace(flat.star_formation, median=-0.6))
 
 
 def wide_colours(flat):
-    """Doubled scatters of the sequences."""
+    """Double the scatter of the sequences."""
     law = flat.colours.sequence
     wide = replace(
         law, red_scatter=0.14, red_scatter_limits=(0.06, 0.20), blue_scatter=0.24, blue_scatter_limits=(0.10, 0.40)
@@ -174,19 +174,19 @@ def wide_colours(flat):
 
 
 def idle_halos(flat):
-    """Halos that quench nothing."""
+    """No halo quenches galaxies."""
     law = replace(flat.halo_shares.law, highest=0.0)
     shares = quenching.shares(law, flat.population.masses, flat.population.halos.matching.occupation)
     return replace(flat, halo_shares=shares)
 
 
 def hole(flat):
-    """Nothing from z = 2.3 on."""
+    """No galaxies from z = 2.3."""
     return replace(flat, population=replace(flat.population, halos=replace(flat.population.halos, far=3844.0)))
 
 
 def far_quasars(flat):
-    """None below z = 6."""
+    """No galaxies below z = 6."""
     return replace(flat, distant=high_redshift.model(0.0, 1.0, 26.0, 0.3))
 
 
@@ -203,6 +203,6 @@ def far_quasars(flat):
         (far_quasars, "quasars_r_22.5"),
     ],
 )
-def test_a_wrong_recipe_is_seen(flat, whole, mutant, name):
+def test_wrong_recipe_fails(flat, whole, mutant, name):
     assert name not in off(whole)
     assert name in off(observed.figures(seen(mean_sky.rows(mutant(flat), 0, FEW), FEW)))

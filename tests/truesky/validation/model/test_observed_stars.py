@@ -1,4 +1,4 @@
-"""Stars against observed numbers: all groups pass, and each turns red when its recipe is wrong."""
+"""Stars against observed numbers: all groups pass, and each group fails if its recipe is wrong."""
 
 import csv
 import dataclasses
@@ -16,7 +16,7 @@ def universe():
 
 
 def failed(found):
-    """Names by group of checks that fail and gate."""
+    """Names, by group, of binding checks that fail."""
     return {group: names for group, checks in observed_stars.checks_by_group(found).items()
             if (names := [check.name for check in checks if check.is_unexpected_failure])}  # fmt: skip
 
@@ -30,12 +30,12 @@ def test_all_groups_pass(figures):
     assert failed(figures) == {}
 
 
-def test_remembered_numbers_are_near_too(figures):
+def test_numbers_quoted_from_memory_are_near(figures):
     far = [c.name for checks in observed_stars.checks_by_group(figures).values() for c in checks if not c.passes]
     assert set(far) <= {"giants_local"}
 
 
-def test_rows_are_from_outside_and_say_why():
+def test_rows_have_outside_sources_and_reasons():
     with observed_stars.LIST.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) >= 20
@@ -48,7 +48,7 @@ def test_rows_are_from_outside_and_say_why():
 
 
 def test_without_isochrones_of_old_stars_the_turn_off_fails(monkeypatch, figures):
-    """Solar metals for all: the halo turns off 900 K too cool."""
+    """With solar metallicity for all stars, the turn-off of the halo is 900 K too cool."""
     solar = isochrones.isochrones
     monkeypatch.setattr(isochrones, "isochrones", lambda age, metals: solar(age, 0.0 * np.asarray(metals)))
     assert set(failed(figures | observed_stars.isochrone_points())) == {"halo_turn_off"}
@@ -83,7 +83,7 @@ def test_a_halo_that_turns_with_the_disc_fails(monkeypatch, figures):
         if c.name == "sun_v_lag"
     )
     assert not lag.passes
-    # A remembered number shows it, and gates nothing.
+    # A check that is quoted from memory fails here, but is not binding.
     assert not lag.is_unexpected_failure
 
 

@@ -21,7 +21,7 @@ def test_pairs_are_counted_by_their_separation():
 
 
 def test_the_power_law_is_the_integral_along_the_line_of_sight():
-    """Of galaxies between two distances with a constant number at each: twice the integral of xi over the line."""
+    """With a constant number of galaxies per distance, w is twice the integral of xi along the line of sight."""
     chi, theta = np.linspace(1100.0, 1500.0, 400_001), np.array([3.0e-4, 3.001e-4])
     length, slope, near, far = small_scales.LENGTH, small_scales.SLOPE, 1100.0, 1500.0
 
@@ -39,13 +39,13 @@ def found():
 
 
 def test_galaxies_cluster_as_observed(found):
-    """A few cells: within two of their errors more than the list says."""
+    """With a few cells the tolerance is that of the list plus two errors."""
     results = [check for check in checks.evaluate(found, 2.0) if check.name.startswith("w_m20")]
     assert len(results) == 3
     assert [(check.name, check.value) for check in results if check.is_unexpected_failure] == []
 
 
-def test_with_the_satellites_of_today_they_would_cluster_less(found, monkeypatch):
+def test_galaxies_cluster_less_with_satellites_of_today(found, monkeypatch):
     monkeypatch.setattr(matching, "Occupation", lambda **values: replace(_OCCUPATION(**values), ratio_z=0.0))
     fewer = small_scales.figures(small_scales.galaxy_population(SEED, BOX_CELLS), CELLS)
     assert fewer["w_m20_0.04"] < 0.85 * found["w_m20_0.04"]

@@ -1,4 +1,4 @@
-"""The numbers that the Milky Way must meet, at a few cells; benchmarks/stars.py has the fuller table."""
+"""Published star counts against the Milky Way in a few cells; benchmarks/stars.py has the full table."""
 
 import json
 
@@ -15,7 +15,7 @@ KEYS = ("stars_per_s_core", "cell_peak_gb")
 
 @pytest.mark.parametrize("b", [60, 20])
 def test_counts_of_drawn_stars(b, dust):
-    """Mean over 12 cells to I = 18 .. 24.5 and H = 18 .. 26, each within 15 % and its Poisson error.
+    """The mean of 12 cells to I = 18 .. 24.5 and H = 18 .. 26 is within 15 % and its Poisson error.
 
     Sample of the 12 cells; significance 3e-3 (3 standard errors) beyond the 15 %.
     """
@@ -30,12 +30,12 @@ def test_stars_far_from_the_plane():
 
 
 def test_bright_stars_of_the_whole_sky(dust):
-    """Brighter than V = 11: 1.05e6 in Tycho-2."""
+    """Tycho-2 has 1.05e6 stars brighter than V = 11."""
     assert 0.85e6 < benchmark.brighter_than_11(61, dust) < 1.15e6
 
 
 def test_stars_at_the_pole(dust):
-    """To G = 20 and V = 20, from the flux table: Bahcall & Soneira 1980, good to 15 %."""
+    """Counts to G = 20 and V = 20 from the flux table agree with Bahcall & Soneira 1980, which is good to 15 %."""
     found = benchmark.pole_figures(12, dust)
     assert found["against_pole_g20"] == pytest.approx(1.0, abs=0.2)
     assert found["against_pole_v20"] == pytest.approx(1.0, abs=0.2)

@@ -1,6 +1,6 @@
-"""The universe against its list of expectations: at a few cells, and whole at night.
+"""The simulated universe against its expectations: a few cells in each run, everything at night.
 
-A few cells hold a few structures: here every tolerance is as wide as the list says and two errors of the blocks more.
+A few cells contain few structures, so tolerances are those of the list plus two errors of the blocks.
 """
 
 import json
@@ -21,7 +21,7 @@ from truesky.validation.model import universe as measured
 
 @pytest.fixture(scope="module")
 def seen(drawn):
-    """The drawn sky, as the validation counts it."""
+    """The drawn sky as the validation measures it."""
     first = np.array(drawn.places[::4]) // 4
     deepest = 2 * (sky.MAX_ORDER - GENERATION_ORDER) + 2
 
@@ -72,7 +72,7 @@ def test_a_figure_that_is_off_fails():
     bad = {"sigma_8": 0.81, "log_i_21.75": 3.9}
     assert failed({**good, "log_i_21.75_error": 0.0}) == []
     assert [name for name, _ in failed({**bad, "log_i_21.75_error": 0.03})] == ["sigma_8", "log_i_21.75"]
-    # The share of emitters is given the error of their number.
+    # The error of the fraction of emitters is that of their number.
     counted = {"halpha_2e-16_0.9_1.8": 1.07, "halpha_2e-16_0.9_1.8_error": 0.03}
     (check,) = checks.evaluate(counted)
     assert check.passes
@@ -103,8 +103,8 @@ def test_uniform_points_are_not_correlated(coarse, rng):
     assert pairs.of_bin @ pairs.nodes == pytest.approx(found.theta, rel=0.03)
 
 
-def test_what_the_mean_of_a_block_takes_away(coarse):
-    """Against the covariance of all its pixels, each less the mean."""
+def test_effect_of_the_block_mean(coarse):
+    """Compare with the covariance of all pixels relative to their mean."""
     edges, order, cell = np.array([0.6, 1.0, 2.0]), clustering.BLOCK_ORDER, 100
     pairs = clustering._pixel_pairs(order, cell, edges)
     place = clustering._vectors(order, cell)
@@ -117,12 +117,12 @@ def test_what_the_mean_of_a_block_takes_away(coarse):
         inside = (theta > first) & (theta < last)
         wanted.append((np.exp(-theta[inside]).mean(), left[inside].mean()))
     assert np.transpose(found) == pytest.approx(np.array(wanted), rel=0.02)
-    # A pixel that has neighbours at a separation lies further inside than most: the mean of all pairs takes too little.
+    # A pixel with neighbours at a separation lies further inside than most, so the mean of pairs subtracts too little.
     assert np.all(found[1] < found[0] - pairs.of_all @ np.exp(-pairs.nodes))
 
 
 def test_points_of_a_dense_half_are_correlated(coarse, rng):
-    """Half of a block has three times the density of the other: delta is +-1/2; 16 of 480 neighbours lie across."""
+    """The halves of a block differ in density by a factor of 3: delta is +-1/2, and 16 of 480 neighbours lie across."""
     edges, order, blocks = np.array([0.4, 0.6]), clustering.BLOCK_ORDER, []
     for cell in (3, 100, 500, 767):
         _, ra, dec = sky.random_in_cell(order, cell, 60_000, rng)
@@ -133,8 +133,8 @@ def test_points_of_a_dense_half_are_correlated(coarse, rng):
     assert found.w[0] == pytest.approx(0.25 * (1 - 2 * 16 / 480), abs=0.02)
 
 
-def test_theories_agree():
-    """Of C_l with the sums of the lensing tests; of a band with itself."""
+def test_theory_agrees_with_lensing_sums():
+    """C_l agrees with the sums of the lensing tests, and the ratio of theory to itself is 1."""
     ell = np.array([50.0, 200.0, 400.0])
     chi = float(cosmology.comoving_distance(1.0))
     assert shear.linear_theory(ell, chi) == pytest.approx(limber(ell, chi), rel=0.02)
@@ -143,8 +143,8 @@ def test_theories_agree():
 
 
 @pytest.mark.nightly
-def test_the_fuller_report(tmp_path):
-    """Every expectation, at the settings that a request has by default: a quarter of an hour of one core."""
+def test_full_report(tmp_path):
+    """Run every expectation with the default settings of a request; this takes a quarter of an hour on one core."""
     file = tmp_path / "universe.json"
     assert __main__.main(["--json", str(file), "--figures", str(tmp_path)]) == 0
     assert json.loads(file.read_text())["checks"] > 130

@@ -1,1 +1,1 @@
-"""Checks of catalogues, a file each: what a lake's galaxies are, beside what is observed, required and foreseen."""
+"""Checks of the catalogues of a lake against observations, requirements and theory; one file per check."""

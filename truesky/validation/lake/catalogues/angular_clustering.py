@@ -1,9 +1,15 @@
-"""How a lake's galaxies cluster on the sky: w(theta) to a magnitude, and of luminous galaxies at z = 0.5.
+"""Check the angular clustering of galaxies: w(theta) to limits in I_E, and of luminous galaxies at z = 0.5.
 
-To a magnitude in I_E w is that of non-linear matter by Limber's approximation, with the galaxies' own redshifts and the
-bias of their halos. From 0.3 deg on it is good to 20 %; below, the galaxies of one halo and the cells of the box
-decide, and only a factor is asked for. Luminous galaxies are held against the power law that surveys found.
-Ref: Limber 1953, ApJ 117, 134; Tinker et al. 2010, ApJ 724, 878; Landy & Szalay 1993, ApJ 412, 64
+For limits in I_E the expected w is that of non-linear matter in Limber's approximation, with the redshifts of the
+galaxies and the bias of their halos. From 0.3 deg the prediction is good to 20 %. Below, galaxies within one halo and
+the cells of the box matter, and the tolerance is 50 %. Luminous galaxies are compared with the power law that
+surveys found.
+
+References
+----------
+Limber 1953, ApJ 117, 134
+Tinker et al. 2010, ApJ 724, 878
+Landy & Szalay 1993, ApJ 412, 64
 """
 
 from __future__ import annotations
@@ -29,23 +35,23 @@ SOURCE = "Limber's approximation with the bias of the galaxies' halos (Tinker et
 BAND, LIMITS = "euclid_vis", (22.0, 23.0, 24.0)
 _SED = ("abs_mag_r01", "sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")
 COLUMNS = ("id", "ra", "dec", "_healpix_29", "kind", "z_true", "mag_r01", "log_halo_mass", *_SED)
-# How much fainter than in I_E galaxies may be in their reference band, at 5600 A; how far short a catalogue may fall.
+# Largest magnitude at 5600 A minus I_E of a galaxy, and largest shortfall of the depth of a catalogue, mag.
 _REDDEST, _DEPTH_MARGIN = 3.0, 0.1
 _MIN_GALAXIES = 200
-# Separations, arcmin; from where on theory is good to the smaller tolerance.
+# Edges of the separations, arcmin; lower edge from which the smaller tolerance applies, and both tolerances.
 EDGES = np.array([0.3, 0.6, 1.2, 2.4, 4.8, 9.6, 18.0, 36.0, 60.0, 90.0])
 _LINEAR, _NEAR_TOLERANCE, _FAR_TOLERANCE = 18.0, 0.5, 0.2
-# Shells of distance, Mpc/h.
+# Width of shells of distance, Mpc/h.
 _SHELL = 100.0
-# I_E that luminous galaxies at z < 0.6 have at most.
+# Faintest I_E of luminous galaxies at z < 0.6.
 _LUMINOUS = 23.5
 
 
 def measure(galaxies: read.Version) -> Result:
-    """Of a lake's galaxies."""
+    """Check the angular clustering of table `galaxies` of a lake."""
     missing = [name for name in COLUMNS if name not in galaxies.schema.names]
     if missing:
-        return _no_result(f"galaxies have no {' and '.join(missing)}")
+        return _no_result(f"table galaxies has no column {', '.join(missing)}")
     table = galaxies.rows(list(COLUMNS))
     index, bright = table["_healpix_29"].to_numpy(), table["mag_r01"].to_numpy() < max(LIMITS) + _REDDEST
     field = fields.from_version(galaxies, index)
@@ -54,12 +60,14 @@ def measure(galaxies: read.Version) -> Result:
 
 
 def compare(columns: Mapping[str, Array], field: Field) -> Result:
-    """Of columns[n] by name, of all galaxies that may be brighter than the faintest limit, in a field."""
+    """Check the clustering of galaxies that may be brighter than the faintest limit, given as columns, in a field."""
     if len(columns["id"]) < _MIN_GALAXIES:
-        return _no_result(f"{len(columns['id'])} galaxies brighter than {max(LIMITS):g}; {_MIN_GALAXIES} are wanted")
+        return _no_result(
+            f"{len(columns['id'])} galaxies may be brighter than I_E = {max(LIMITS):g}; {_MIN_GALAXIES} are required"
+        )
     edges = EDGES[60.0 * field.patch_side * (1 + 1e-9) >= EDGES]
     if len(edges) < 3:
-        return _no_result(f"patches of the field are {60.0 * field.patch_side:.1f}' wide: too small")
+        return _no_result(f"patches of the field are {60.0 * field.patch_side:.1f}' wide, which is too small")
     mag = observed.apparent_magnitudes(columns, BAND)
     deepest, rows, series = float(np.percentile(mag, 99.5)), [], {}
     for limit in LIMITS:
@@ -71,7 +79,7 @@ def compare(columns: Mapping[str, Array], field: Field) -> Result:
         correlation = _correlate(columns, brighter, field, edges * ARCMIN)
         with_halo = brighter & np.isfinite(columns["log_halo_mass"])
         if np.count_nonzero(with_halo) < 0.9 * np.count_nonzero(brighter):
-            why = "the halos' masses, and so the bias of the galaxies, are not known"
+            why = "the masses of the halos, and thus the bias of the galaxies, are not known"
             rows.append(not_applicable(NAME, Place(), why, SOURCE, f"w_vis_{limit:g}"))
             continue
         curve, w_theory = expected_correlation(columns, with_halo, field, correlation)
@@ -94,7 +102,7 @@ def _rows(name: str, correlation: TwoPointFunction, w_theory: Float, note: str) 
     rows = []
     for k, low in enumerate(correlation.edges[:-1] / ARCMIN):
         tolerance = _FAR_TOLERANCE if low > _LINEAR * 0.99 else _NEAR_TOLERANCE
-        full_note = f"{correlation.value[0, k]:.3g}, by theory {w_theory[k]:.3g}; {note}"
+        full_note = f"{correlation.value[0, k]:.3g}, theory {w_theory[k]:.3g}; {note}"
         value, error = correlation.value[0, k] / w_theory[k], correlation.error[0, k] / w_theory[k]
         rows.append(
             Row(
@@ -107,9 +115,25 @@ def _rows(name: str, correlation: TwoPointFunction, w_theory: Float, note: str) 
 def expected_correlation(
     columns: Mapping[str, Array], selected: Bool, field: Field, correlation: TwoPointFunction
 ) -> tuple[tuple[Float, Float], Float]:
-    """(separations, arcmin, and w there, as a field that knows its own mean alone shows it; w[bin]).
+    """Return the expected w of galaxies in a field, relative to the mean of the field.
 
-    columns, kept : galaxies;  field : where;  found : of the bins
+    Parameters
+    ----------
+    columns : mapping of str to array, shape (n,)
+        Columns of the galaxies.
+    selected : bool array, shape (n,)
+        Galaxies to use.
+    field : Field
+        Area of the galaxies.
+    correlation : TwoPointFunction
+        Measured w; the expected one is returned for its bins.
+
+    Returns
+    -------
+    curve : tuple of float arrays
+        Separations in arcmin, and w there.
+    w : float array, shape (bins,)
+        w in each bin.
     """
     z, mass = columns["z_true"][selected].astype(float), columns["log_halo_mass"][selected].astype(float)
     chi, halos = np.asarray(cosmology.comoving_distance(z)), matching.masses()
@@ -118,14 +142,14 @@ def expected_correlation(
     c_l = theory.galaxy_power(theory.ELL, theory.shells(chi, bias, edges))
     curve = np.geomspace(EDGES[0] * ARCMIN, np.radians(20.0), 80)
     w = theory.correlation(curve, theory.ELL, c_l)
-    # A field's own mean hides what all of its pairs have in common.
+    # The mean of a field removes what all of its pairs have in common.
     field_mean = two_points.mean_over_pairs(field, curve, w)
     in_range = curve < correlation.edges[-1]
     return (curve[in_range] / ARCMIN, w[in_range] - field_mean), np.interp(correlation.theta, curve, w) - field_mean
 
 
 def _luminous_rows(columns: Mapping[str, Array], field: Field, deepest: float) -> list[Row]:
-    """Galaxies of M_r - 5 log h < -20 at 0.4 < z < 0.6, over the power law."""
+    """Compare galaxies with M_r - 5 log h < -20 at 0.4 < z < 0.6 with the power law."""
     z_min, z_max = small_scales.Z_MIN, small_scales.Z_MAX
     z = columns["z_true"].astype(float)
     selected = (columns["abs_mag_r01"] < small_scales.MAX_ABS_MAG) & (z > z_min) & (z < z_max)
@@ -135,7 +159,7 @@ def _luminous_rows(columns: Mapping[str, Array], field: Field, deepest: float) -
     edges = edges[edges <= np.radians(field.patch_side)]
     names = [f"w_m20_{edge:g}" for edge in small_scales.EDGES[: len(edges) - 1]]
     if deepest < _LUMINOUS - _DEPTH_MARGIN or n_galaxies < _MIN_GALAXIES or not names:
-        why = f"{n_galaxies} galaxies of M_r < -20 at 0.4 < z < 0.6; the catalogue reaches I_E = {deepest:.2f}"
+        why = f"{n_galaxies} galaxies with M_r - 5 log h < -20 at 0.4 < z < 0.6; the depth is I_E = {deepest:.2f}"
         return [not_applicable(NAME, Place(), why, SOURCE, "w_m20")]
     correlation = _correlate(columns, selected, field, edges)
     law = small_scales.power_law(np.asarray(cosmology.comoving_distance(z[selected])), edges)
@@ -143,7 +167,7 @@ def _luminous_rows(columns: Mapping[str, Array], field: Field, deepest: float) -
     error = dict(zip(names, (correlation.error[0] / law).tolist(), strict=True))
     rows = []
     for check in checks.evaluate(value):
-        note = f"{n_galaxies} galaxies of M_r - 5 log h < -20 at 0.4 < z < 0.6, from {check.name[6:]} Mpc/h on"
+        note = f"{n_galaxies} galaxies with M_r - 5 log h < -20 at 0.4 < z < 0.6, from {check.name[6:]} Mpc/h"
         rows.append(row_of_check(NAME, check, error[check.name], note))
     return rows
 

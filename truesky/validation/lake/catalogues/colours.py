@@ -1,10 +1,16 @@
-"""Band fluxes of a lake's galaxies against their own spectra, band by band, and where red galaxies' colours lie.
+"""Check band fluxes of galaxies against their spectra, and the colours of red galaxies against the observed locus.
 
-A band's median magnitude is held against that of the spectra in table `galaxies`, behind the Milky Way and magnified:
-one that is off makes every colour with it wrong.
-Error: emission lines, which these spectra are without, make medians 0.01 mag brighter; extinction is that of
-       flat spectra, 0.06 A(V) off in the widest band for red ones, by which the tolerance is wider
-Ref  : Eisenstein et al. 2001, AJ 122, 2267 (c_perp)
+The median magnitude in each band is compared with that of the spectra in table `galaxies`, behind the Milky Way and
+magnified. An error in one band makes all colours with this band wrong.
+
+Notes
+-----
+The spectra have no emission lines, which make medians 0.01 mag brighter. The extinction is that of flat spectra. For
+red spectra it is off by 0.06 A(V) in the widest band; the tolerance is larger by this amount.
+
+References
+----------
+Eisenstein et al. 2001, AJ 122, 2267 (c_perp)
 """
 
 from __future__ import annotations
@@ -29,22 +35,23 @@ _LOCUS = "Eisenstein et al. 2001, AJ 122, 2267"
 COLUMNS = ("id", "_healpix_29", "kind", "z_true", "mag_r01", "a_v", "kappa", "gamma1", "gamma2", "abs_mag_r01",
            "color_gr_01", "sed_1", "frac_1", "sed_2", "frac_2", "ext_law_1", "ebv_1")  # fmt: skip
 _FLUX = "f_nu_"
-# Galaxies that are taken: to that magnitude, where lines are few and no gas between galaxies absorbs; how many.
+# Limits of magnitude and redshift, within which lines are few and intergalactic gas does not absorb; largest and
+# smallest number of galaxies.
 _MAX_MAG, _MAX_REDSHIFT, _MAX_GALAXIES, _MIN_GALAXIES = 23.0, 1.5, 30_000, 100
 _TOLERANCE, _PER_DUST = 0.03, 0.06
-# Of the extinction, to interpolate between.
+# Nodes of A(V) for the interpolation of the extinction.
 _NODES = 12
-# Redshifts and luminosity of the red galaxies whose colours are known.
+# Redshift ranges and luminosity of red galaxies with known colours.
 _RED, _RED_MAG = ((0.15, 0.25), (0.25, 0.35)), -20.5
 _LOCUS_TOLERANCE, _MIN_RED_GALAXIES = 0.05, 20
 _EDGES = np.linspace(-0.5, 2.5, 91)
 
 
 def measure(galaxies: read.Version, fluxes: read.Version) -> Result:
-    """Of a lake's galaxies and their fluxes."""
+    """Check the colours of tables `galaxies` and `galaxy_fluxes` of a lake."""
     missing = [name for name in COLUMNS if name not in galaxies.schema.names]
     if missing:
-        return _no_result(f"galaxies have no {' and '.join(missing)}")
+        return _no_result(f"table galaxies has no column {', '.join(missing)}")
     names = [name for name in fluxes.schema.names if name.startswith(_FLUX)]
     bands = [name.removeprefix(_FLUX) for name in names if name.removeprefix(_FLUX) in passbands.names()]
     table, light = galaxies.rows(list(COLUMNS)), fluxes.rows(["id", *(_FLUX + band for band in bands)])
@@ -63,14 +70,31 @@ def measure(galaxies: read.Version, fluxes: read.Version) -> Result:
     order = np.argsort(flux_ids)
     at = np.minimum(np.searchsorted(flux_ids[order], columns["id"]), max(len(flux_ids) - 1, 0))
     if len(selected) and (not len(flux_ids) or (flux_ids[order][at] != columns["id"]).any()):
-        return _no_result("galaxy_fluxes lacks galaxies of galaxies: it is of another request, which --name names")
+        return _no_result("table galaxy_fluxes lacks galaxies of table galaxies: select one request with --name")
     return compare(columns, {band: light[_FLUX + band].to_numpy()[order[at]] for band in bands}, field)
 
 
 def compare(columns: Mapping[str, Array], flux: Mapping[str, Array], field: Field) -> Result:
-    """Of columns[n] by name and fluxes[n], uJy, by band, of galaxies in a field."""
+    """Check the fluxes of galaxies in a field.
+
+    Parameters
+    ----------
+    columns : mapping of str to array, shape (n,)
+        COLUMNS of the galaxies.
+    flux : mapping of str to array, shape (n,)
+        Fluxes by band, uJy.
+    field : Field
+        Area of the galaxies.
+
+    Returns
+    -------
+    Result
+        One row per band, rows of the red locus, and series for figures.
+    """
     if len(columns["id"]) < _MIN_GALAXIES or not flux:
-        return _no_result(f"{len(columns['id'])} galaxies with {len(flux)} bands; {_MIN_GALAXIES} and 1 are wanted")
+        return _no_result(
+            f"{len(columns['id'])} galaxies with {len(flux)} bands; {_MIN_GALAXIES} with 1 band are required"
+        )
     patch = field.patch_of(columns["_healpix_29"])
     with np.errstate(divide="ignore", invalid="ignore"):
         mag = {band: 23.9 - 2.5 * np.log10(values.astype(float)) for band, values in flux.items()}
@@ -81,7 +105,7 @@ def compare(columns: Mapping[str, Array], flux: Mapping[str, Array], field: Fiel
     for band, magnitudes in mag.items():
         dust = _transmission(band, columns["a_v"].astype(float))
         offset = magnitudes - observed.apparent_magnitudes(columns, band) + 2.5 * np.log10(magnified * dust)
-        # A band that is empty is wrong, too.
+        # A band without flux is also a fault.
         offset = np.where(np.isfinite(offset), offset, np.inf)
         value, error = _median(offset, patch, field.n_patches)
         note = (
@@ -101,7 +125,7 @@ def compare(columns: Mapping[str, Array], flux: Mapping[str, Array], field: Fiel
 
 
 def _transmission(band: str, a_v: Float) -> Float:
-    """Share of a flat spectrum's light that the Milky Way lets through, [n] of A(V)[n] mag."""
+    """Transmission of the Milky Way for a flat spectrum in a band at A(V) of each galaxy (mag)."""
     curve, nodes = passbands.load(band), np.linspace(0.0, max(float(a_v.max()), 1e-3), _NODES)
     weight = curve.response / curve.wavelength
     through = band_fluxes.milky_way_transmission(curve.wavelength, nodes)
@@ -109,7 +133,7 @@ def _transmission(band: str, a_v: Float) -> Float:
 
 
 def _median(values: Float, patch: Int, n_patches: int) -> tuple[float, float]:
-    """And its error, of the patches or of the values' own scatter, whichever is larger."""
+    """Median and its error, the larger of the jackknife error and the error from the scatter of the values."""
     middle = float(np.median(values))
     rest = [np.median(values[patch != left_out]) for left_out in range(n_patches)]
     typical = values[np.isfinite(values)]
@@ -120,7 +144,7 @@ def _median(values: Float, patch: Int, n_patches: int) -> tuple[float, float]:
 
 
 def _locus_rows(columns: Mapping[str, Array], gr: Float, ri: Float) -> list[Row]:
-    """Red luminous galaxies, whose r - i is (g - r) / 4 + 0.18 up to z = 0.4; the number is remembered."""
+    """Check luminous red galaxies: r - i = (g - r) / 4 + 0.18 up to z = 0.4, a relation quoted from memory."""
     m_r, z = columns["abs_mag_r01"], columns["z_true"]
     red = (columns["color_gr_01"] > 0.78 - 0.02 * (m_r + 20.0)) & (m_r < _RED_MAG)
     rows = []
@@ -129,11 +153,11 @@ def _locus_rows(columns: Mapping[str, Array], gr: Float, ri: Float) -> list[Row]
         n_galaxies = int(np.count_nonzero(in_shell))
         name = f"c_perp_z{0.5 * (z_min + z_max):g}"
         if n_galaxies < _MIN_RED_GALAXIES:
-            why = f"{n_galaxies} red galaxies of M_r - 5 log h < {_RED_MAG:g} at {z_min:g} < z < {z_max:g}"
+            why = f"{n_galaxies} red galaxies with M_r - 5 log h < {_RED_MAG:g} at {z_min:g} < z < {z_max:g}"
             rows.append(not_applicable(NAME, Place(), why, _LOCUS, name))
             continue
         offset = float(np.median((ri - gr / 4.0 - 0.18)[in_shell]))
-        note = f"{n_galaxies} red galaxies; a remembered number: it decides nothing"
+        note = f"{n_galaxies} red galaxies; the expectation is quoted from memory: not binding"
         rows.append(Row(NAME, name, Place(), offset, np.nan, 0.0, _LOCUS_TOLERANCE, "mag", _LOCUS, note=note))
     return rows
 

@@ -1,8 +1,15 @@
-"""Shear of the galaxies at z = 1: xi+ and xi- against theory, no B modes, and shear that belongs to the convergence.
+"""Check the shear of galaxies at z = 1: xi+ and xi- against theory, B modes, and consistency of shear with convergence.
 
-Two points of shear do not tell its sign, and vary from field to field; the mean shear about convergence does, and that
-of the same field: <kappa gamma_t>(theta) is <kappa kappa> within theta less <kappa kappa>(theta).
-Ref: Schneider, van Waerbeke & Mellier 2002, A&A 389, 729; Kaiser 1995, ApJ 439, L1
+Notes
+-----
+Two-point functions of shear do not depend on its sign and vary from field to field. The mean shear around convergence
+depends on the sign and follows from the convergence in the same field: <kappa gamma_t>(theta) is the mean of
+<kappa kappa> within theta minus <kappa kappa>(theta).
+
+References
+----------
+Schneider, van Waerbeke & Mellier 2002, A&A 389, 729
+Kaiser 1995, ApJ 439, L1
 """
 
 from __future__ import annotations
@@ -27,22 +34,22 @@ _NO_B = "gravity makes no B modes (Schneider, van Waerbeke & Mellier 2002, A&A 3
 _BELONGS = "shear and convergence are of one potential (Kaiser 1995, ApJ 439, L1)"
 COLUMNS = ("id", "ra", "dec", "_healpix_29", "kind", "z_true", "gamma1", "gamma2", "kappa")
 Z_MIN, Z_MAX = 0.8, 1.2
-# Galaxies, the fewest that are looked at; shells of distance, points of the curve of theory and of all of it.
+# Smallest number of galaxies; number of shells of distance, of points of the plotted theory and of nodes for its mean.
 _MIN_GALAXIES, _SHELLS, _CURVE, _NODES = 200, 40, 20, 40
-# Separations, arcmin: fine bins, of which four make a wide one; from where on they are compared; apertures' radii.
+# Separations, arcmin: first edge, number of octaves, fine bins per octave, smallest compared separation; apertures.
 _FIRST, _OCTAVES, _EACH, _FROM = 0.15, 9, 4, 0.6
 _APERTURES = (2.4, 4.8, 9.6, 19.2)
 _THEORY, _CROSS, _CONVERGENCE = 0.2, 0.1, 0.2
-# Where xi- is lower than theory, arcmin, and the resolution of the lensing that all of it is asked of.
+# Range in arcmin in which xi- is lower than theory, and the resolution of lensing maps that all checks require.
 _LOW, _NSIDE = (2.4, 19.2), 1024
-_LOW_WHY = "between halos and the box of matter structure is missing: xi- is up to 23 % low from 5' to 10'"
+_LOW_WHY = "structure between the scales of halos and of the box is missing: xi- is up to 23 % low from 5' to 10'"
 
 
 def measure(galaxies: read.Version) -> Result:
-    """Of a lake's galaxies."""
+    """Check the shear of table `galaxies` of a lake."""
     missing = [name for name in COLUMNS if name not in galaxies.schema.names]
     if missing:
-        return _no_result(f"galaxies have no {' and '.join(missing)}")
+        return _no_result(f"table galaxies has no column {', '.join(missing)}")
     table = galaxies.rows(list(COLUMNS))
     columns = {name: table[name].to_numpy() for name in COLUMNS}
     field = fields.from_version(galaxies, columns["_healpix_29"])
@@ -50,7 +57,22 @@ def measure(galaxies: read.Version) -> Result:
 
 
 def compare(columns: dict[str, Array], field: Field, nside: int = _NSIDE) -> Result:
-    """Of columns[n] by name, galaxies in a field; nside : to which structure lenses."""
+    """Check the shear of galaxies in a field.
+
+    Parameters
+    ----------
+    columns : dict of str to array, shape (n,)
+        COLUMNS of the galaxies.
+    field : Field
+        Area of the galaxies.
+    nside : int
+        Resolution of the lensing maps.
+
+    Returns
+    -------
+    Result
+        Rows of all tests of shear, and series for figures.
+    """
     z = columns["z_true"].astype(float)
     indices = np.flatnonzero((columns["kind"] < 2) & (z > Z_MIN) & (z < Z_MAX))
     gamma = np.stack([columns[name][indices].astype(float) for name in ("gamma1", "gamma2", "kappa")], 1)
@@ -58,13 +80,13 @@ def compare(columns: dict[str, Array], field: Field, nside: int = _NSIDE) -> Res
     indices, gamma = indices[is_finite], gamma[is_finite]
     if len(indices) < _MIN_GALAXIES:
         return _no_result(
-            f"{len(indices)} galaxies with shear at {Z_MIN:g} < z < {Z_MAX:g}; {_MIN_GALAXIES} are wanted"
+            f"{len(indices)} galaxies with shear at {Z_MIN:g} < z < {Z_MAX:g}; {_MIN_GALAXIES} are required"
         )
     if not gamma[:, :2].any() or not np.ptp(gamma[:, :2], axis=0).any():
         return _no_result("all galaxies have the same shear")
     wide = [edge for edge in _FIRST * 2.0 ** np.arange(_OCTAVES + 1) if edge <= 60.0 * field.patch_side * (1 + 1e-9)]
     if len(wide) < 4:
-        return _no_result(f"patches of the field are {60.0 * field.patch_side:.1f}' wide: too small")
+        return _no_result(f"patches of the field are {60.0 * field.patch_side:.1f}' wide, which is too small")
     edges = np.append(0.0, _FIRST * 2.0 ** (np.arange(_EACH * (len(wide) - 1) + 1) / _EACH))
     identity = [columns[name][indices] for name in ("id", "ra", "dec", "_healpix_29")]
     fine = two_points.shear_correlations(
@@ -93,7 +115,7 @@ def compare(columns: dict[str, Array], field: Field, nside: int = _NSIDE) -> Res
 
 
 def expected_power(z: Float) -> Float:
-    """C_l of the convergence of galaxies at redshifts z[n], at the multipoles of `theory`."""
+    """Return C_l of the convergence of galaxies with redshifts `z`, at the multipoles theory.ELL."""
     number, edge = np.histogram(np.asarray(cosmology.comoving_distance(z)), _SHELLS)
     return theory.convergence_power(theory.ELL, 0.5 * (edge[1:] + edge[:-1]), number.astype(float))
 
@@ -101,13 +123,17 @@ def expected_power(z: Float) -> Float:
 def _theory_rows(
     coarse: TwoPointFunction, predictions: tuple[Float, Float], common: tuple[float, float], note: str, nside: int
 ) -> list[Row]:
-    """common : of xi+ and xi-, what all of a field shares, and its patches do not tell: it is as uncertain as large."""
+    """Compare xi+ and xi- with theory.
+
+    `common` is the part of both that a whole field shares. Jackknife errors do not contain it; its uncertainty is as
+    large as its value.
+    """
     rows = []
-    rough = f"structure lenses to l = {nside} alone" if nside < _NSIDE else ""
+    rough = f"lensing maps contain structure only to l = {nside}" if nside < _NSIDE else ""
     for c, (name, prediction, shared) in enumerate(zip(("xi_plus", "xi_minus"), predictions, common, strict=True)):
         for k, low in enumerate(coarse.edges[:-1] / ARCMIN):
             known_failure = rough or (_LOW_WHY if c == 1 and _LOW[0] * 0.99 < low < _LOW[1] * 0.99 else "")
-            full_note = f"{coarse.value[c, k]:.3g}, by theory {prediction[k]:.3g}; {note}"
+            full_note = f"{coarse.value[c, k]:.3g}, theory {prediction[k]:.3g}; {note}"
             value, error = coarse.value[c, k] / prediction[k], np.hypot(coarse.error[c, k], shared) / prediction[k]
             rows.append(Row(NAME, f"{name}_{low:g}", Place(), float(value), float(error), 1.0, _THEORY, "", SOURCE,
                             note=full_note, known_failure=known_failure))  # fmt: skip
@@ -115,7 +141,7 @@ def _theory_rows(
 
 
 def _b_mode_rows(fine: TwoPointFunction, coarse: TwoPointFunction, note: str) -> list[Row]:
-    """Share of B modes in apertures; the cross component over xi+."""
+    """Check the share of B modes in apertures, and the cross component over xi+."""
     rows, fine_edges = [], fine.edges / ARCMIN
     for radius in _APERTURES:
         if 2.0 * radius > fine_edges[-1] * (1 + 1e-9):
@@ -155,7 +181,7 @@ def _b_mode_share(mass: Float, cross: Float) -> Float:
 
 
 def _convergence_rows(fine: TwoPointFunction, wide: list[float], note: str) -> list[Row]:
-    """Mean shear about convergence over what the convergence foretells."""
+    """Check the mean shear around convergence against that expected from the convergence."""
     rows = []
     curves = [_tangential_shear(fine.edges, values) for values in (fine.value, fine.jackknife)]
     for low, high in pairwise(wide):
@@ -182,7 +208,7 @@ def _convergence_rows(fine: TwoPointFunction, wide: list[float], note: str) -> l
 
 
 def _tangential_shear(edges: Float, values: Float) -> tuple[Float, Float]:
-    """<kappa gamma_t> as it is[..., bin], and as <kappa kappa> has it."""
+    """<kappa gamma_t>, shape (..., bin), as measured and as derived from <kappa kappa>."""
     kappa_kappa, kappa_gamma = np.nan_to_num(values[..., 3, :]), np.nan_to_num(values[..., 4, :])
     area = edges[1:] ** 2 - edges[:-1] ** 2
     inside = np.cumsum(kappa_kappa * area, -1) - 0.5 * kappa_kappa * area

@@ -1,4 +1,4 @@
-"""No source twice: by identifier, by place, and no cell with far more sources than the others."""
+"""Check that no source is listed twice, by identifier and by position, and that no cell has far too many sources."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from lake_schema.store import read
 from truesky.validation.lake.measure.rows import Place, Row, not_applicable
 
 NAME, SOURCE = "duplicates", "a source has one identifier and one place"
-# Of the galaxies of a cell over the median of the cells: 0.05 deg2 of the deepest sky vary by 20 %.
+# Allowed excess of the densest cell over the median cell: 0.05 deg2 of the deepest sky vary by 20 %.
 _DENSITY_TOLERANCE = 0.6
 
 
 def rows(catalogue: read.Version) -> list[Row]:
-    """Of a catalogue; catalogue : `galaxies` or `stars`."""
+    """Check table `galaxies` or `stars` for duplicates."""
     table = catalogue.rows(["id", "ra", "dec", "_healpix_29"])
     if not table.num_rows:
         return [not_applicable(NAME, Place(), f"table {catalogue.table} has no rows", SOURCE, catalogue.table)]

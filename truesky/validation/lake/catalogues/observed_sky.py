@@ -1,6 +1,6 @@
-"""Counts, redshifts, masses, star formation, lines and colours of a lake's galaxies against what surveys observed.
+"""Check counts, redshifts, masses, star formation, lines and colours of galaxies against observations of surveys.
 
-The list is observed.csv, that of the universe; errors are those of the lake's own patches of sky, left out in turn.
+The list is observed.csv, the same as for the simulated universe. Errors are jackknife errors over patches of the lake.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ from truesky.validation.model import observed
 from truesky.validation.model.observed import GalaxySample
 
 NAME = "observed"
-# Patches that are left out in turn, and the fewest that tell an error.
+# Number of jackknife patches, and smallest number for which an error is estimated.
 _PATCHES, _MIN_PATCHES = 8, 4
-# Counts to a magnitude, i, r or I_E; how much fainter in I_E a galaxy of it may be; depth that all others want, and
-# by how much a catalogue's faintest galaxy may fall short of its limit.
+# Names of figures with a magnitude limit in i, r or I_E; margin by which a galaxy may be fainter in I_E; depth that all
+# other figures require; allowed shortfall of the faintest galaxy of a catalogue.
 _LIMIT = re.compile(r"(?:log_)?(?:z_)?(?:i|r|vis)_([0-9.]+)")
 _REDDER, _FULL_DEPTH, _DEPTH_MARGIN = 0.5, 26.0, 0.1
 
 
-# Bins of redshift, and limits in I_E and i, of what is drawn; percentiles of colours, and galaxies that have some.
+# Plotted bins of redshift with limits in I_E and i; percentiles of the colours, and fewest galaxies per bin.
 _REDSHIFTS, _REDSHIFT_LIMIT = np.linspace(0.0, 3.0, 31), 24.5
 _COLOUR_BINS, _COLOUR_LIMIT, _LEVELS, _MIN_GALAXIES = np.linspace(0.0, 1.2, 25), 22.5, (5, 16, 50, 84, 95), 30
 
 
 def measure(galaxies: read.Version) -> Result:
-    """A row a figure that observed.csv has; galaxies : of the lake."""
+    """Check table `galaxies` of a lake; return one row for each figure in observed.csv."""
     sample, cell = observed.from_version(galaxies)
     return Result(Place(), compare(sample, cell), _series(sample, cell) if len(cell) else {})
 
 
 def _series(sample: GalaxySample, cell: Int) -> dict[str, Float]:
-    """Redshifts of galaxies, arcmin-2 per unit z, and colours against redshift, with errors of the lake's patches."""
+    """Redshift distribution (arcmin-2 per unit z) and colours against redshift, with jackknife errors."""
     groups = _groups(cell)
     patch = np.zeros(len(cell), np.int64)
     for number, group in enumerate(groups):
@@ -72,15 +72,15 @@ def _series(sample: GalaxySample, cell: Int) -> dict[str, Float]:
 
 
 def compare(sample: GalaxySample, cell: Int) -> list[Row]:
-    """The same of a sky; cell : the generation cell of each of its galaxies."""
+    """Check a sample of galaxies; `cell` is the generation cell of each galaxy."""
     figures = observed.figures(sample)
     errors = _errors(sample, cell)
     out = []
-    # Magnitudes here are before magnification: some are fainter than the catalogue's limit.
+    # Magnitudes here are before magnification, so some are fainter than the limit of the catalogue.
     deepest = float(np.percentile(sample.mags["euclid_vis"], 99.0)) if len(cell) else 0.0
     for check in checks.evaluate(figures):
         if (depth := _required_depth(check.name)) > deepest + _DEPTH_MARGIN:
-            why = f"{check.name} wants galaxies to I_E = {depth:g}; 99 % are brighter than {deepest:.2f}"
+            why = f"{check.name} requires galaxies to I_E = {depth:g}; 99 % are brighter than {deepest:.2f}"
             out.append(replace(not_applicable(NAME, Place(), why, check.source), quantity=check.name))
             continue
         out.append(row_of_check(NAME, check, errors.get(check.name, math.nan), ""))
@@ -88,7 +88,7 @@ def compare(sample: GalaxySample, cell: Int) -> list[Row]:
 
 
 def _required_depth(name: str) -> float:
-    """I_E of the faintest galaxies that a figure is of; a sky to 26 tells all of them."""
+    """I_E of the faintest galaxies that a figure contains, at most 26, which is enough for all figures."""
     match = _LIMIT.fullmatch(name)
     return min(float(match[1]) + _REDDER, _FULL_DEPTH) if match else _FULL_DEPTH
 
@@ -99,7 +99,7 @@ def _groups(cell: Int) -> list[Int]:
 
 
 def _errors(sample: GalaxySample, cell: Int) -> dict[str, float]:
-    """Standard error by figure; none where there are too few cells to tell."""
+    """Jackknife error of each figure, empty if there are too few cells."""
     cells, groups = np.unique(cell), _groups(cell)
     if len(groups) < _MIN_PATCHES:
         return {}

@@ -1,6 +1,6 @@
-"""What the mission requires of the sky itself: how many galaxies, how far away, how many emit H alpha.
+"""Check requirements of the mission on the sky: density of galaxies, their redshifts, and density of H alpha emitters.
 
-What no table of a lake tells is said, too.
+Requirements that no table of a lake can test are listed as not applicable.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ SOURCE = "requirements named by Serrano et al. 2024"
 _BAND = "euclid_vis"
 _LIMIT, _PER_ARCMIN2, _REDSHIFT = 24.5, 30.0, 0.8
 _LINE, _EMITTERS, _FROM, _TO = 2e-16, 3500.0, 0.4, 1.8
-# What a lake does not tell, and why.
+# Requirements that a lake cannot test, with reasons.
 _UNDETERMINED = (
     ("mean_redshift_of_bins", "no photometric redshifts are measured"),
     ("psf_ellipticity_known", "no model of the PSF is fitted to the stars"),
-    ("straylight", "frames hold all of the sky together"),
+    ("straylight", "frames contain only the sum of all sky components"),
     ("ghost_contrast", "ghosts are below the noise of single frames"),
-    ("jitter", "it is folded into the PSF"),
+    ("jitter", "the jitter is part of the PSF"),
     ("purity_completeness_of_spectra", "no redshifts are measured"),
     ("photometric_redshifts", "none are measured"),
 )
 
 
 def rows(galaxies: read.Version, fluxes: read.Version) -> list[Row]:
-    """Of the catalogue; galaxies, fluxes : versions of the two tables."""
+    """Check the requirements with tables `galaxies` and `galaxy_fluxes`."""
     out = [_undetermined_row(name, why) for name, why in _UNDETERMINED]
     if f"f_nu_{_BAND}" not in fluxes.schema.names:
-        return [*out, not_applicable(NAME, Place(), "galaxy_fluxes has no I_E", SOURCE)]
+        return [*out, not_applicable(NAME, Place(), f"table galaxy_fluxes has no column f_nu_{_BAND}", SOURCE)]
     facts = galaxies.manifest.get("facts", {})
     band, limit = facts.get("galaxy_band", _BAND), facts.get("galaxy_limit", np.inf)
     if band != _BAND or limit < _LIMIT:
-        why = f"the catalogue ends at {limit:g} in {band}; the requirements are of {_LIMIT:g} in {_BAND}"
+        why = f"the catalogue ends at {limit:g} in {band}; the requirements are for {_LIMIT:g} in {_BAND}"
         return [*out, not_applicable(NAME, Place(), why, SOURCE)]
     light = fluxes.rows(["id", f"f_nu_{_BAND}"])
     table = galaxies.rows(["id", "z_obs", "flux_halpha", "density_boost", "_healpix_29"])
@@ -47,7 +47,7 @@ def rows(galaxies: read.Version, fluxes: read.Version) -> list[Row]:
     order = np.argsort(flux_ids)
     at = order[np.minimum(np.searchsorted(flux_ids[order], ids), max(len(flux_ids) - 1, 0))] if len(flux_ids) else order
     if len(ids) and (not len(flux_ids) or (flux_ids[at] != ids).any()):
-        why = "galaxy_fluxes lacks galaxies of galaxies: it is of another request, which --name names"
+        why = "table galaxy_fluxes lacks galaxies of table galaxies: select one request with --name"
         return [*out, not_applicable(NAME, Place(), why, SOURCE)]
     with np.errstate(divide="ignore"):
         mag = 23.9 - 2.5 * np.log10(flux[at[: len(ids)]].astype(float))
@@ -64,7 +64,7 @@ def rows(galaxies: read.Version, fluxes: read.Version) -> list[Row]:
     density, lines = (_mean(values) for values in per_cell)
     redshifts = z[bright]
     spread = float(redshifts.std() / np.sqrt(max(len(redshifts), 1))) if len(redshifts) else np.nan
-    # Galaxies cluster: medians of cells scatter more than galaxies do.
+    # Because galaxies cluster, medians of cells scatter more than single redshifts imply.
     medians = [float(np.median(z[bright & (cell == c)])) for c in cells if (bright & (cell == c)).sum() > 20]
     error = max(spread, float(np.std(medians) / np.sqrt(len(medians)))) if len(medians) > 1 else np.inf
     median = float(np.median(redshifts)) if len(redshifts) else np.nan

@@ -1,1 +1,1 @@
-"""Checks of images, a file each: what a frame's pixels say beside what its header and the lake's tables say."""
+"""Checks of images against their headers and the tables of the lake; one file per check."""

@@ -1,6 +1,9 @@
-"""Where stars are, against where the catalogue and the frame's WCS put them.
+"""Check the positions of stars against the catalogue and the WCS of the frame.
 
-Windowed centroids of undersampled stars move with the place in the pixel: odd harmonics of that are fitted, too.
+Notes
+-----
+Windowed centroids of undersampled stars depend on the position within the pixel. Odd harmonics of this dependence are
+fitted as well.
 """
 
 from __future__ import annotations
@@ -13,13 +16,13 @@ from truesky.validation.lake.measure.rows import Row
 from truesky.validation.verdicts import AT_MOST
 
 SOURCE = "Serrano et al. 2024, app. C: below 1 mas rms; ground cameras 5 mas"
-# mas: of the mean, and of what a linear term brings to the edge of the detector.
+# Tolerance of the mean offset, mas; that of the linear term at the edge of the detector is twice as large.
 TOLERANCE = {"VIS": 1.0, "NISP-P": 1.0, "EXT": 5.0}
 _MIN_STARS, _CLIP = 12, 4.0
 
 
 def check(context: FrameContext) -> list[Row]:
-    """Mean offset along columns and rows, and the largest that a linear term makes at the detector's edge."""
+    """Check the mean offset along columns and rows, and the linear term at the edge of the detector."""
     assert context.measurements is not None
     stars, mas = context.measurements.stars, 1000.0 * context.frame.scale
     ny, nx = context.frame.electrons.shape
@@ -50,7 +53,7 @@ def check(context: FrameContext) -> list[Row]:
         residuals[axis] = offset - phased
         means.append((value[0], error[0]))
     context.series |= {"u": u, "v": v, "id": stars.id}
-    # On the sky, without what the place in the pixel does.
+    # Offsets on the sky do not include the effect of the position within the pixel.
     cd = context.frame.wcs.pixel_scale_matrix * 3.6e6
     context.series["east"], context.series["north"] = (row[0] * residuals["x"] + row[1] * residuals["y"] for row in cd)
     (x, dx), (y, dy) = means
@@ -59,10 +62,23 @@ def check(context: FrameContext) -> list[Row]:
 
 
 def fit_offsets(offset: Float, noise: Float, u: Float, v: Float, position: Float) -> tuple[Float, Float, Float]:
-    """(mean and linear terms, their errors, what the place in the pixel does to each star [n]).
+    """Fit mean, linear terms and the effect of the position within the pixel to the offsets of stars along one axis.
 
-    off, noise : of stars [n], and their expected errors;  u, v : on the detector, from -1 to 1
-    place      : in pixels, whose fraction the centroid's own error goes with
+    Parameters
+    ----------
+    offset, noise : float array, shape (n,)
+        Offsets of the stars and their expected errors, pixels.
+    u, v : float array, shape (n,)
+        Positions on the detector, -1 to 1.
+    position : float array, shape (n,)
+        Position along the axis in pixels; centroid errors depend on its fraction.
+
+    Returns
+    -------
+    value, error : float array, shape (3,)
+        Mean, and linear terms in u and v, with their errors, pixels.
+    phased : float array, shape (n,)
+        Effect of the position within the pixel on each star, pixels.
     """
     phase = 2.0 * np.pi * position
     columns = [np.ones(len(offset)), u, v, *(np.sin(k * phase) for k in (1, 2, 3))]

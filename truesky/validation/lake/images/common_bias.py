@@ -1,7 +1,4 @@
-"""What all detectors of an exposure have in common: a bias that none of them alone is sure of.
-
-rows   of every exposure of several detectors, and of all exposures of a channel and band
-"""
+"""Check offsets that all detectors of an exposure share; they can be too small to detect on one detector."""
 
 from __future__ import annotations
 
@@ -20,7 +17,7 @@ _NAMES = ("east", "north", "magnitude")
 
 
 def rows(results: Sequence[Result]) -> list[Row]:
-    """Means over the detectors, weighted by their errors."""
+    """Check the weighted means over the detectors of each exposure, and over all exposures of a channel and band."""
     out: list[Row] = []
     with_offsets = [result for result in results if "mean_off" in result.series]
     for channel, band in dict.fromkeys((result.place.channel, result.place.band) for result in with_offsets):
@@ -41,7 +38,7 @@ def rows(results: Sequence[Result]) -> list[Row]:
 
 
 def _mean_rows(place: Place, results: Sequence[Result], label: str) -> list[Row]:
-    """Of results that are averaged; what : they are."""
+    """Average results and check the means; `label` names what is averaged."""
     out = []
     tolerances = TOLERANCE[str(place.channel)], TOLERANCE[str(place.channel)], _MAGNITUDE
     for name, tolerance in zip(_NAMES, tolerances, strict=True):
@@ -57,16 +54,16 @@ def _mean_rows(place: Place, results: Sequence[Result], label: str) -> list[Row]
 
 
 def _value(series: Mapping[str, Float], name: str) -> Float:
-    """(offset of a detector, its error); NaN where it has none."""
+    """Offset of a detector and its error, NaN if not measured."""
     if name == "magnitude":
         return np.asarray(series.get("mean_dm", (np.nan, np.nan)))
     return np.asarray(series["mean_off"][_NAMES.index(name)])
 
 
 def weighted_mean(values: Float, errors: Float) -> tuple[float, float]:
-    """(weighted mean, its error), which is no smaller than the scatter of the values [n] makes it."""
+    """Return the weighted mean and its error, which includes the scatter of the values beyond their errors."""
     middle = float(np.median(values))
-    # What the detectors have of their own comes on top of what photons do.
+    # Differences between detectors add to the photon noise.
     intrinsic_variance = max(float(np.mean((values - middle) ** 2 - errors**2)), 0.0)
     weight = 1.0 / (errors**2 + intrinsic_variance)
     return float((weight * values).sum() / weight.sum()), float(weight.sum() ** -0.5)

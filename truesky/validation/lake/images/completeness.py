@@ -1,8 +1,10 @@
-"""Which of the known sources a program finds in the pixels: sep, in a part of each frame.
+"""Check which of the known sources the program sep detects in a cutout of each frame.
 
-A source is found where an object covers its place, be it one with a cosmic ray or a neighbour. Of all places objects
-cover a part c by chance: where p of the sources are covered, (p - c) / (1 - c) are found. Where they cover most of
-the places that says nothing.
+Notes
+-----
+A source counts as detected if an object covers its position, even if the object is a cosmic ray or a neighbour. Objects
+cover a fraction c of all positions by chance. If a fraction p of the sources is covered, (p - c) / (1 - c) are
+detected. This estimate has no meaning if objects cover most positions.
 """
 
 from __future__ import annotations
@@ -19,24 +21,24 @@ from truesky.validation.verdicts import AT_LEAST
 SOURCE = (
     "sep (Barbary 2016) as SourceExtractor: 5 pixels above 1.5 sigma after a filter of the PSF's width, not deblended"
 )
-# Side of the part that is searched, pixels; magnitudes of a bin.
+# Side of the cutout, pixels, and width of a bin, mag.
 _SIDE, _BIN = 1024, 0.5
 _THRESHOLD, _PIXELS = 1.5, 5
-# Of sources one to four magnitudes above where half are found; of the magnitude of that, against the noise's.
+# Tolerances of the detected fraction one to four magnitudes above the 50 % limit, and of this limit, mag.
 _BRIGHT, _LIMIT = 0.15, 0.75
-# Times the noise, and arcsec about a galaxy, of a source that is found as often as not.
+# Signal-to-noise ratio of sources at the 50 % limit, and typical radius of a galaxy, arcsec.
 _SIGMA, _GALAXY = 10.0, 0.5
 _MIN_SOURCES = 20
-# Part of the pixels that objects may cover.
+# Largest fraction of pixels that objects may cover.
 _CROWDED = 0.75
 
 
 class Crowded(Exception):
-    """More pixels of objects than sep holds at a time."""
+    """Objects cover more pixels than sep can process at a time."""
 
 
 def check(context: FrameContext) -> list[Row]:
-    """Magnitude at which half of the sources are found, against the noise's; part of brighter ones that are."""
+    """Check the 50 % limit against that expected from the noise, and the detected fraction of brighter sources."""
     try:
         magnitude, is_found, chance, note = search_sources(context)
     except Crowded as crowd:
@@ -53,7 +55,7 @@ def check(context: FrameContext) -> list[Row]:
     faintest = [i for i in below if i > 0 and well_sampled[i - 1] and fraction[i - 1] >= 0.5]
     if not faintest or len(magnitude) < _MIN_SOURCES:
         why = "no magnitude at which half are found"
-        # Those that noise hides from nobody are to be found nevertheless.
+        # Sources well above the noise must be detected even if the 50 % limit cannot be measured.
         rows = _bright_rows(context, magnitude, is_found, chance, _expected_limit(context))
         return rows or [not_applicable("completeness", context.place, why, SOURCE)]
     i = faintest[0]
@@ -78,12 +80,12 @@ def check(context: FrameContext) -> list[Row]:
 
 
 def _found_fraction(covered: Float, chance: float) -> Float:
-    """Part that is found, of the part that is covered."""
+    """Fraction of detected sources from the fraction of covered sources."""
     return np.maximum(covered - chance, 0.0) / (1.0 - chance)
 
 
 def _bright_rows(context: FrameContext, magnitude: Float, is_found: Bool, chance: float, limit: float) -> list[Row]:
-    """Part of the sources one to four magnitudes above a limit that are found; nothing of too few."""
+    """Check the detected fraction of sources one to four magnitudes above a limit; no row if there are too few."""
     bright = (magnitude < limit - 1.0) & (magnitude > limit - 4.0)
     n = int(bright.sum())
     if n < _MIN_SOURCES:
@@ -97,13 +99,32 @@ def _bright_rows(context: FrameContext, magnitude: Float, is_found: Bool, chance
 
 
 def search_sources(context: FrameContext) -> tuple[Float, Bool, float, str]:
-    """(magnitudes of the known sources of a part [n], which of them are covered, which part of it is, what it is).
+    """Detect objects in a cutout and compare them with the known sources.
 
-    Errors : Crowded
+    Parameters
+    ----------
+    context : FrameContext
+        A frame with blank sky.
+
+    Returns
+    -------
+    magnitude : float array, shape (n,)
+        AB magnitudes of the known sources in the cutout.
+    is_found : bool array, shape (n,)
+        True if an object covers the source.
+    chance : float
+        Fraction of all pixels that objects cover.
+    note : str
+        Numbers of sources, pixels and objects.
+
+    Raises
+    ------
+    Crowded
+        If objects cover more pixels than sep can process.
     """
     assert context.tiles is not None
     ny, nx = context.frame.electrons.shape
-    # Beside the middle, where detectors that are read in parts have no pixels.
+    # The cutout is next to the middle, since detectors that are read in parts have no pixels there.
     first_row, first_column = (max(min(n // 2 + 8, n - _SIDE), 0) for n in (ny, nx))
     cutout = np.ascontiguousarray(
         context.frame.electrons[first_row : first_row + _SIDE, first_column : first_column + _SIDE], np.float64
@@ -113,7 +134,7 @@ def search_sources(context: FrameContext) -> tuple[Float, Bool, float, str]:
     width = float(context.frame.header["PSFFWHM"]) / context.frame.scale
     axis = np.arange(-int(np.ceil(width)), int(np.ceil(width)) + 1)
     kernel = np.exp(-4.0 * np.log(2.0) * (axis[:, None] ** 2 + axis**2) / width**2)
-    # Those that touch are not told apart: pixels that objects cover are the same to 0.5 %, in a third of the time.
+    # Without deblending the pixels that objects cover are the same to 0.5 %, in a third of the time.
     try:
         objects, segmentation = sep.extract(
             cutout - level,
@@ -126,7 +147,7 @@ def search_sources(context: FrameContext) -> tuple[Float, Bool, float, str]:
             segmentation_map=True,
         )
     except Exception as error:
-        # Of sep's own errors, which have no class: its limit of pixels.
+        # sep raises plain exceptions; this text identifies its limit of pixels.
         if "pixel buffer full" not in str(error):
             raise
         raise Crowded(str(error).partition(".")[0]) from None
@@ -144,7 +165,7 @@ def search_sources(context: FrameContext) -> tuple[Float, Bool, float, str]:
 
 
 def _expected_limit(context: FrameContext) -> float:
-    """AB of a source whose light is ten times the noise within the PSF's width and, of galaxies, 0.5"."""
+    """AB magnitude of a source whose flux is ten times the noise within the PSF; galaxies are wider by 0.5"."""
     extended = _GALAXY * float(np.mean(~context.sources.point))
     radius = np.hypot(float(context.frame.header["PSFFWHM"]), extended) / context.frame.scale
     noise = context.noise * np.sqrt(np.pi) * radius

@@ -1,4 +1,4 @@
-"""How much of blank sky cosmic rays hit: pixels far above the level where no source shines."""
+"""Check the fraction of blank-sky pixels that cosmic rays hit: pixels far above the level without a known source."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ SOURCE = (
     "VIS: 1 cm-2 s-1 with STARDUST track lengths, 2 to 3 % of the pixels in 565 s (Niemi 2015); NISP: 2.6 cm-2 s-1 "
     "through 7 um of HgCdTe"
 )
-# Part of the pixels that are hit a second, and how far from that it may be, as a part of it: VIS.
+# VIS: fraction of the pixels that is hit per second, and its relative tolerance.
 _VIS, _VIS_TOLERANCE = 0.025 / 565.0, 0.4
-# NISP: hits a pixel (18 um) and second, pixels that show one, neighbours to which charge leaks among them.
+# NISP: hits per pixel (18 um) and second, and pixels per hit, including neighbours to which charge leaks; tolerance.
 _NISP, _PIXELS, _NISP_TOLERANCE = 2.6 * 1.8e-3**2, 2.0, 0.6
 
 
 def check(context: FrameContext) -> list[Row]:
-    """Part of the blank pixels that are hit, over what is expected."""
+    """Check the fraction of blank pixels that are hit over the expected fraction."""
     assert context.tiles is not None
     usable = context.tiles.blank | context.tiles.hit
     hit = context.tiles.hit & _has_step(context)
@@ -30,7 +30,7 @@ def check(context: FrameContext) -> list[Row]:
         expected, tolerance = _VIS * context.frame.seconds, _VIS_TOLERANCE
     else:
         expected, tolerance = _NISP * _PIXELS * float(context.frame.header["ELAPTIME"]), _NISP_TOLERANCE
-    # A track is of many pixels that are hit together.
+    # Pixels of one track are not independent, so the error is from the scatter of the tiles.
     tile_shares = hit.sum(axis=(1, 2)) / np.maximum(usable.sum(axis=(1, 2)), 1)
     error = float(tile_shares.std() / np.sqrt(len(tile_shares))) if hits else float(np.sqrt(expected / pixels))
     note = f"{pixels} pixels without sources, {hits} of them hit"
@@ -51,7 +51,7 @@ def check(context: FrameContext) -> list[Row]:
 
 
 def _has_step(context: FrameContext) -> Any:
-    """Pixels of the tiles whose ramp has a step: a hot pixel has none."""
+    """Pixels of the tiles whose ramp has a step; hot pixels have none."""
     assert context.tiles is not None
     if context.frame.quality is None:
         return True
@@ -61,7 +61,7 @@ def _has_step(context: FrameContext) -> Any:
 
 def _why_not_applicable(context: FrameContext) -> str:
     if context.channel not in ("VIS", "NISP-P"):
-        return "no rate of its site is published with its tracks"
+        return "no rate and track lengths are published for its site"
     return require_blank_sky(context)
 
 

@@ -1,7 +1,8 @@
-"""How deep a stack of frames goes: the noise of blank sky in the aperture that a source is measured in.
+"""Check the depth of a stack of frames from the noise of blank sky in the aperture of a source.
 
-Of NISP a point of 5 sigma, by the noise-equivalent area of the stars' own profile; of VIS a galaxy of half-light radius
-0.3" in an aperture of 1.3", S/N 10 at 24.5.
+For NISP the depth is that of a point source at 5 sigma, with the noise-equivalent area of a Gaussian of the width
+PSFFWHM. For VIS it is the S/N at magnitude 24.5 of a galaxy with half-light radius 0.3" in an aperture of diameter
+1.3"; the requirement is 10.
 """
 
 from __future__ import annotations
@@ -13,15 +14,15 @@ from truesky.validation.lake.measure.rows import Row
 from truesky.validation.verdicts import AT_LEAST
 
 SOURCE = "requirements named by Serrano et al. 2024: NISP 24 AB (point, 5 sigma), VIS S/N 10 at 24.5 (extended)"
-# Exposures of a place, in the reference sequence.
+# Number of exposures per position in the reference sequence.
 _DITHERS = 4
 _POINT, _POINT_SIGMA, _GALAXY = 24.0, 5.0, 24.5
-# An exponential disc of 0.3": part of its light within 1.3" of diameter, with the PSF of VIS.
+# Fraction of the light of an exponential disc with radius 0.3" within a diameter of 1.3", with the PSF of VIS.
 _APERTURE_FRACTION, _DIAMETER = 0.80, 1.3
 
 
 def check(context: FrameContext) -> list[Row]:
-    """Of four frames like this one."""
+    """Check the depth of four frames like this one."""
     assert context.tiles is not None
     spread = float(
         np.sqrt(np.mean((context.tiles.pixels - context.tiles.level[:, None, None])[context.tiles.blank] ** 2))
@@ -42,7 +43,11 @@ def check(context: FrameContext) -> list[Row]:
 
 
 def _why_not_applicable(context: FrameContext) -> str:
-    return require_blank_sky(context) if context.channel in ("VIS", "NISP-P") else "no requirement of its depth"
+    return (
+        require_blank_sky(context)
+        if context.channel in ("VIS", "NISP-P")
+        else "no requirement on the depth of this channel"
+    )
 
 
 DEPTH = FrameCheck("requirement", SOURCE, _why_not_applicable, check)

@@ -1,9 +1,16 @@
-"""The gain by two frames of a detector: what the response of its pixels brings is in both and falls out.
+"""Check the gain from two frames of a detector, whose difference is free of the pixel response.
 
-Counts of S electrons have the variance S. Neighbours that share charge, by capacitance or because a full pixel repels
-it, take part of this variance to the covariances with them, whose sum is kept; rows or columns with offsets of their
-own, and slopes, reach further than neighbours do, and are taken off by the covariances there.
-Ref: Janesick 2007, Photon Transfer; Antilogus et al. 2014, JINST 9, C03048; Moore et al. 2006, Opt. Eng. 45, 076402
+Notes
+-----
+Counts of S electrons have the variance S. Charge sharing between neighbours, by capacitance or because full pixels
+repel charge, moves part of this variance to covariances with neighbours; variance and covariances are added. Offsets
+of rows or columns and slopes cause covariances at larger distances, which are measured there and subtracted.
+
+References
+----------
+Janesick 2007, Photon Transfer
+Antilogus et al. 2014, JINST 9, C03048
+Moore et al. 2006, Opt. Eng. 45, 076402
 """
 
 from __future__ import annotations
@@ -21,19 +28,19 @@ from truesky.validation.lake.measure.rows import Row, not_applicable
 
 SOURCE = "photon transfer of two frames (Janesick 2007); covariances: Antilogus et al. 2014, JINST 9, C03048"
 TOLERANCE = 0.015
-# Pixels about one that share its charge, to either side: of the sky, and from so many e- on.
+# Distance in pixels over which charge is shared: for sky, and above the given level in e-.
 _SKY_REACH, _BRIGHT_REACH, _BRIGHT_LEVEL = 1, 2, 5000.0
-# Levels of the two frames, one over the other, at most: of the sky, of flats, which the frames before shine through;
-# part of the full well; pixels that an amplifier wants.
+# Largest ratio of the levels of two frames, for sky and for flats (earlier exposures leave traces in flats); largest
+# level as a fraction of the full well; smallest number of pixels per amplifier.
 _MAX_SKY_RATIO, _MAX_FLAT_RATIO, _MAX_FULL, _MIN_PIXELS = 30.0, 1.03, 0.7, 60_000
 
 
 def check(context: FrameContext) -> list[Row]:
-    """Of each amplifier, and the mean of them."""
+    """Check the gain of each amplifier and their mean."""
     assert context.partner is not None
     other_frame = frames.open_frame(context.partner.path, context.frame.instrument)
     if other_frame.electrons.shape != context.frame.electrons.shape:
-        return [not_applicable("gain", context.place, "the other frame is of another size", SOURCE)]
+        return [not_applicable("gain", context.place, "the other frame has another size", SOURCE)]
     max_ratio = _MAX_SKY_RATIO if context.sees_sky else _MAX_FLAT_RATIO
     tile_pair = [_tiles(context.frame, context.sources), _tiles(other_frame, context.partner.sources)]
     factor = ramp_factor(context) if context.channel in RAMPS else 1.0
@@ -44,7 +51,7 @@ def check(context: FrameContext) -> list[Row]:
             measurements.append((amplifier.name.rpartition(".")[2], *measurement))
     pair_note = f"with exposure {context.partner.exposure_id}"
     if not measurements:
-        why = f"{pair_note}: no {_MIN_PIXELS} blank pixels of an amplifier, or levels that are too unlike or too full"
+        why = f"{pair_note}: too few blank pixels ({_MIN_PIXELS} required), or levels too different or too high"
         return [not_applicable("gain", context.place, why, SOURCE)]
     rows = [Row("gain", f"pair_{name}", context.place, gain, error, 1.0, TOLERANCE, "", SOURCE,
                 note=f"{pixels} blank pixels, level {level:.4g} e-, {pair_note}")
@@ -64,7 +71,7 @@ def _tiles(frame: Frame, sources: Reference) -> Tiles:
 def _pair_gain(
     frame: Frame, tile_pair: list[Tiles], amplifiers: tuple[Amplifier, Amplifier], factor: float, max_ratio: float
 ) -> tuple[float, float, float, int] | None:
-    """(gain over the header's, its error, level e-, pixels) of an amplifier; None where there is too little."""
+    """Gain over that in the header, its error, level (e-), and number of pixels; None if not measurable."""
     a, b = (tiles.in_amplifier(amplifier) for tiles, amplifier in zip(tile_pair, amplifiers, strict=True))
     a, b = a.select(_shared_tiles(a, b)), b.select(_shared_tiles(b, a))
     common = a.blank & b.blank
@@ -91,13 +98,17 @@ def _pair_gain(
 
 
 def _shared_tiles(a: Tiles, b: Tiles) -> Bool:
-    """bool[t] of the tiles of a: those that b has, too."""
+    """True for the tiles of `a` that are also in `b`."""
     positions = set(zip(b.row.tolist(), b.column.tolist(), strict=True))
     return np.array([position in positions for position in zip(a.row.tolist(), a.column.tolist(), strict=True)], bool)
 
 
 def _why_not_applicable(context: FrameContext) -> str:
-    return "" if context.partner is not None else "no other frame of this detector, or another one tells it"
+    return (
+        ""
+        if context.partner is not None
+        else "no other frame of this detector, or the gain is measured with another frame"
+    )
 
 
 GAIN = FrameCheck("gain", SOURCE, _why_not_applicable, check)

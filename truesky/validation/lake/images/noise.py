@@ -1,6 +1,8 @@
-"""Noise of blank sky and of the overscan against what the header foresees; the gain that the sky's own noise tells.
+"""Check the noise of blank sky and overscan against the header, and the gain from the noise of the sky.
 
-Counts of S electrons have the variance S, so S / (variance - that of reading) is the gain over the header's.
+Notes
+-----
+Counts of S electrons have the variance S, so S / (variance - read variance) is the gain over the gain in the header.
 """
 
 from __future__ import annotations
@@ -13,27 +15,27 @@ from truesky.validation.lake.measure.frames import Amplifier
 from truesky.validation.lake.measure.rows import Row
 
 SOURCE = "photon transfer (Janesick 2007); up the ramp: Kubik et al. 2016, PASP 128, 104504"
-# Of the ratio of noises, of the ratio of gains.
+# Tolerances of the ratio of noises and of the ratio of gains.
 _NOISE, _GAIN = 0.05, 0.015
-# Capacitance between pixels takes 5 % of the noise, stripes of the outputs bring about as much.
+# For ramps, capacitance between pixels removes 5 % of the noise, and stripes of the outputs add about the same.
 _GAIN_OF_RAMPS = 0.06
-# Levels up to which the sensor's response, which grows with the level, is no part of the noise: its share of 1 % rms.
+# Up to this level (e-) the pixel response (1 % rms) contributes little noise, as its share grows with the level.
 _MAX_LEVEL = 400.0
-# Pixels that an amplifier's gain wants.
+# Smallest number of pixels per amplifier for the gain.
 _MIN_PIXELS = 60_000
 
 
 def check(context: FrameContext) -> list[Row]:
-    """Of the overscan and of blank sky, and the gain of each amplifier."""
+    """Check the noise of the overscan and of blank sky, and the gain of each amplifier."""
     return [*_overscan_rows(context), *_sky_rows(context)]
 
 
 def _overscan_rows(context: FrameContext) -> list[Row]:
     rows = []
     for amplifier in context.frame.amplifiers:
-        # Where no read noise is drawn, rounding to whole ADU is all there is, and no random number.
+        # Without drawn read noise the overscan has rounding to whole ADU alone, which is not random.
         if amplifier.samples and np.isfinite(amplifier.noise) and amplifier.header_read_noise > 0.0:
-            # A header's read noise is without rounding to whole ADU.
+            # The read noise in the header does not include rounding to whole ADU.
             expected = np.hypot(amplifier.header_read_noise, amplifier.gain / np.sqrt(12.0))
             value = amplifier.noise / expected
             error = value / np.sqrt(amplifier.samples)
@@ -69,7 +71,7 @@ def _sky_rows(context: FrameContext) -> list[Row]:
             value, error = blank_sky.variance(tiles)
         else:
             value, error = covariances.pixel_variance(tiles.pixels, tiles.blank, 0)
-        # Pixels differ in what they make of the same light: noise of one frame, if not of the sky.
+        # Pixel response is noise in a single frame, although not noise of the sky.
         base_variance += (context.frame.instrument.pixel_response_rms * level) ** 2
         expected = factor * level + base_variance
         note = f"{pixels} blank pixels in tiles of {blank_sky.SIDE}, level {level:.4g} e-"
@@ -103,14 +105,14 @@ def _sky_rows(context: FrameContext) -> list[Row]:
 
 
 def read_variance(amplifier: Amplifier) -> float:
-    """Variance of reading a pixel, e-^2: measured where there is an overscan, else as the header has it."""
+    """Return the read variance per pixel in e-^2: measured in the overscan, or from the header if there is none."""
     if amplifier.samples and np.isfinite(amplifier.noise):
         return amplifier.noise**2
     return amplifier.header_read_noise**2 + amplifier.gain**2 / 12.0
 
 
 def ramp_factor(context: FrameContext) -> float:
-    """Variance of a ramp's signal over its electrons, without reading: groups share some of their photons."""
+    """Return the variance of a ramp's signal over its electrons, without read noise; groups share photons."""
     groups, reads, drops = (int(context.frame.header[key]) for key in ("NG", "NR", "ND"))
     n, step = groups - 1, reads + drops
     alpha = (1.0 - reads**2) / (3.0 * reads * step)

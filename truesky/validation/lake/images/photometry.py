@@ -1,7 +1,9 @@
-"""How bright stars are, against the catalogue's band fluxes: all of their light, and how it goes with magnitude.
+"""Check the magnitudes of stars against the band fluxes of the catalogue, and their slope with magnitude.
 
-What is beyond an aperture, and what of it was taken off as the sky beside the star, is told by the wings of the frame's
-brightest stars (measure/wings.py).
+Notes
+-----
+The light beyond an aperture, and the part of it that was subtracted with the sky next to the star, follow from the
+wings of the brightest stars in the frame (measure/wings.py).
 """
 
 from __future__ import annotations
@@ -19,18 +21,18 @@ from truesky.validation.lake.measure.wings import Wings
 
 SOURCE = "Serrano et al. 2024, app. C: below 0.02 mag, aperture and PSF photometry"
 TOLERANCE = 0.02
-# 2.5 / ln 10.
+# Factor 2.5 / ln 10.
 _MAGNITUDE = 1.0857
-# A star's aperture is the one that holds about so much of a point's light.
+# Stars are measured in the aperture that contains about this fraction of a point source; smallest number of stars.
 _APERTURE_FRACTION, _MIN_STARS = 0.8, 8
-# The aperture from which the wings go on: in a wider one the error of its sky weighs more.
+# Index of the aperture at which the wings begin; in wider apertures the error of the sky dominates.
 _JOIN_APERTURE = -3
-# Part of the full well above which what the detector is not linear in shows.
+# Fraction of the full well above which nonlinearity matters.
 _LINEAR = 0.2
 
 
 def check(context: FrameContext) -> list[Row]:
-    """Offset from the catalogue's magnitudes, and its slope with them, of apertures and of a PSF that is fitted."""
+    """Check the offset from the magnitudes of the catalogue and its slope, for apertures and for PSF fits."""
     assert context.measurements is not None
     stars, zero_point = context.measurements.stars, float(context.frame.header["ZEROPNT"])
     magnitude, error = magnitudes(context.measurements, zero_point, context.frame.seconds)
@@ -38,7 +40,9 @@ def check(context: FrameContext) -> list[Row]:
     offset = magnitude - stars.mag
     usable = np.isfinite(offset) & np.isfinite(error) & linear
     if usable.sum() < _MIN_STARS:
-        return [not_applicable("photometry", context.place, "too few stars at which the detector is linear", SOURCE)]
+        return [
+            not_applicable("photometry", context.place, "too few stars in the linear range of the detector", SOURCE)
+        ]
     line, errors, used = _fit_line(offset, error, stars.mag, usable)
     context.series |= {"mag": stars.mag, "dm": offset, "measured": np.where(used, magnitude, np.nan)}
     context.series["mean_dm"] = np.array([line[0], errors[0]])
@@ -51,19 +55,16 @@ def check(context: FrameContext) -> list[Row]:
         error = _MAGNITUDE * light_error / light
     usable = np.isfinite(offset) & np.isfinite(error) & linear
     if usable.sum() < _MIN_STARS:
-        return [*rows, not_applicable("photometry", context.place, "too few stars for a PSF", SOURCE, "psf_offset")]
+        return [*rows, not_applicable("photometry", context.place, "too few stars for a PSF fit", SOURCE, "psf_offset")]
     line, errors, used = _fit_line(offset, error, stars.mag, usable)
     return [*rows, *_rows(context, "psf_", line, np.hypot(errors, (wing_error, 0.0)), used)]
 
 
 def _fit_line(offset: Float, error: Float, mag: Float, usable: Bool) -> tuple[Float, Float, Bool]:
-    """((offset at the median magnitude, slope), their errors, which of the stars [n] they are of).
-
-    off, error : of magnitudes;  mag : of the catalogue;  known : which are asked
-    """
+    """Fit a line to magnitude offsets: (offset at the median magnitude, slope), their errors, and the stars used."""
     used, spread, line = usable, _spread(offset[usable]), np.zeros(2)
     relative_mag = mag - float(np.median(mag[usable]))
-    # Stars that a cosmic ray hit are told by a line through the others.
+    # Stars hit by a cosmic ray are outliers from a line through the others.
     for _ in range(3):
         residual = offset - line[0] - line[1] * relative_mag
         used = usable & (np.abs(residual - np.median(residual[usable])) < 5.0 * spread)
@@ -86,12 +87,12 @@ def _rows(context: FrameContext, name: str, line: Float, errors: Float, used: Bo
 
 
 def _wing_error(measurements: StarMeasurements) -> float:
-    """mag: the offset's error by that of the wings."""
+    """Error of the offset from that of the wings, mag."""
     return _MAGNITUDE * _lost_fraction(measurements, replace(measurements.wings, strength=measurements.wings.error))
 
 
 def _lost_fraction(measurements: StarMeasurements, wings: Wings) -> float:
-    """Part of all light that an aperture lacks: beyond it, and taken off as the sky."""
+    """Fraction of all light that an aperture lacks: beyond it, or subtracted with the sky."""
     join_radius = float(measurements.radii[_JOIN_APERTURE])
     return wings.fraction_beyond(join_radius) + np.pi * join_radius**2 * float(
         wings.profile(measurements.sky_at).mean()
@@ -103,9 +104,21 @@ def _spread(values: Float) -> float:
 
 
 def magnitudes(measurements: StarMeasurements, zero_point: float, seconds: float) -> tuple[Float, Float]:
-    """AB [n] of all light, and its error from the star's own photons and its sky.
+    """Return the AB magnitudes of all light of the stars, and their errors from photons and sky.
 
-    found : stars and their curves of growth;  zero_point : mag of 1 e-/s;  seconds : exposure time
+    Parameters
+    ----------
+    measurements : StarMeasurements
+        Stars and their curves of growth.
+    zero_point : float
+        Magnitude of 1 e-/s.
+    seconds : float
+        Exposure time, s.
+
+    Returns
+    -------
+    magnitude, error : float array, shape (n,)
+        AB magnitudes and their errors.
     """
     enclosed, total = growth_curve(measurements)
     aperture = int(np.argmin(np.abs(enclosed / total - _APERTURE_FRACTION)))
@@ -115,7 +128,7 @@ def magnitudes(measurements: StarMeasurements, zero_point: float, seconds: float
 
 
 def growth_curve(measurements: StarMeasurements) -> tuple[Float, float]:
-    """(mean light within the radii, all light), of a point whose light within the widest aperture is 1."""
+    """Return the mean light of a point source in each aperture, and all its light, relative to the widest one."""
     bright = np.argsort(-measurements.stars.flux, kind="stable")[: max(len(measurements.stars) // 2, _MIN_STARS)]
     growth = measurements.stars.growth[bright]
     enclosed = np.median(growth / growth[:, -1:], axis=0)

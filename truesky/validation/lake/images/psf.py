@@ -1,4 +1,4 @@
-"""How wide and how round points are."""
+"""Check the width and the ellipticity of point sources."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from truesky.validation.lake.measure.rows import Row
 from truesky.validation.verdicts import AT_MOST
 
 SOURCE = 'PSFFWHM of the header; VIS: McCracken et al. 2025 (0.16"), requirement e < 0.15 (Cropper et al. 2016)'
-# Of the FWHM over the header's; and of the ellipticity (a^2 - b^2) / (a^2 + b^2) in space.
+# Tolerance of the FWHM over that in the header, and largest ellipticity (a^2 - b^2) / (a^2 + b^2) in space.
 _WIDTH, _ROUND = 0.08, 0.15
 _MIN_STARS = 12
 
 
 def check(context: FrameContext) -> list[Row]:
-    """FWHM over the header's, and in space the mean ellipticity."""
+    """Check the FWHM over that in the header and, in space, the mean ellipticity."""
     assert context.measurements is not None
     measurements, stars = context.measurements, context.measurements.stars
     header_fwhm = float(context.frame.header["PSFFWHM"]) / context.frame.scale

@@ -1,6 +1,8 @@
-"""How well ramps fit: chi^2 of blank pixels against its distribution, and how many exceed the limit of the header.
+"""Check the fits of ramps: distribution of chi^2 in all pixels, and fraction above the limit in the header.
 
-Of NG groups there are NG - 1 differences, and one number, the signal, is told by them: NG - 2 degrees of freedom.
+Notes
+-----
+NG groups have NG - 1 differences. They determine one number, the signal, so there are NG - 2 degrees of freedom.
 """
 
 from __future__ import annotations
@@ -14,14 +16,14 @@ from truesky.validation.lake.measure.rows import Row
 from truesky.validation.verdicts import AT_MOST
 
 SOURCE = "chi^2 with NG - 2 degrees of freedom (Kubik et al. 2016, PASP 128, 104504)"
-# Of the middle half of the distribution, over what is expected; a rounded chi^2 tells it to a part of one.
+# Tolerance of the quartiles over the expected ones; a rounded chi^2 determines them to a fraction of one.
 _MIDDLE = 0.06
-# Ramps that do not fit although nothing hit them: reads share photons, and cosmic rays hit others.
+# Fraction of ramps that may fail to fit: reads share photons, and cosmic rays hit some pixels.
 _FLAGGED = 0.03
 
 
 def check(context: FrameContext) -> list[Row]:
-    """Median and inner quartiles of chi^2 over the expected ones; part of the pixels that do not fit."""
+    """Check the median and quartiles of chi^2 over the expected ones, and the fraction of pixels that do not fit."""
     quality = np.asarray(context.frame.quality)
     if "QUALFLAG" in context.frame.header:
         return [_flagged_row(context, quality > 0)]
@@ -41,7 +43,7 @@ def check(context: FrameContext) -> list[Row]:
 
 
 def _quantile(count: Array, edges: Array, part: float) -> float:
-    """Of rounded values, as if each were spread over its own interval."""
+    """Quantile of rounded values, as if each were evenly distributed over its interval."""
     below: Float = np.append(0.0, np.cumsum(count)) / count.sum()
     return float(np.interp(part, below, edges - 0.5))
 
@@ -56,8 +58,8 @@ def _flagged_row(context: FrameContext, bad: Array) -> Row:
 
 def _why_not_applicable(context: FrameContext) -> str:
     if context.frame.quality is None:
-        return "no ramp with a quality"
-    return "" if context.sees_sky else "no sky that ramps would climb with"
+        return "no ramp with a plane of chi^2"
+    return "" if context.sees_sky else "no sky signal in the ramps"
 
 
 QUALITY = FrameCheck("quality", SOURCE, _why_not_applicable, check)

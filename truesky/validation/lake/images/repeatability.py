@@ -1,7 +1,4 @@
-"""Positions and magnitudes of the same stars in several images of a channel and band: how these agree.
-
-rows   of every pair of neighbouring exposures that share stars
-"""
+"""Check that positions and magnitudes of the same stars agree between images of a channel and band."""
 
 from __future__ import annotations
 
@@ -21,7 +18,7 @@ _NAMES = ("east", "north", "measured")
 
 
 def rows(results: Sequence[Result]) -> list[Row]:
-    """Mean differences of the stars that two exposures, one after the other, have in common."""
+    """Check the mean differences of stars that two consecutive exposures share."""
     out: list[Row] = []
     with_offsets = [result for result in results if "east" in result.series]
     for channel, band in dict.fromkeys((result.place.channel, result.place.band) for result in with_offsets):
@@ -41,7 +38,7 @@ def rows(results: Sequence[Result]) -> list[Row]:
 
 
 def _star_offsets(results: Sequence[Result]) -> Mapping[int, Float]:
-    """Star -> its offsets (mas) and its magnitude, NaN where one is not known."""
+    """Offsets (mas) and magnitude of each star by identifier, NaN if unknown."""
     by_star: dict[int, Float] = {}
     for result in results:
         n = len(result.series["id"])
@@ -68,7 +65,7 @@ def _pair_rows(place: Place, other: str, a: Mapping[int, Float], b: Mapping[int,
 
 
 def _clipped_mean(values: Float) -> tuple[float, float]:
-    """(mean but for outliers, its standard error)."""
+    """Mean without outliers, and its standard error."""
     middle = np.median(values)
     spread = 1.4826 * float(np.median(np.abs(values - middle))) + 1e-9
     used = values[np.abs(values - middle) < 4.0 * spread]

@@ -1,4 +1,7 @@
-"""Whether the stars that must be full are, and no others: by their flux, and the part of it in the brightest pixel."""
+"""Check that stars saturate if their expected peak is above the full well, and that fainter stars do not.
+
+The expected peak of a star is its flux times the fraction of a point source in its brightest pixel.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +14,13 @@ from truesky.validation.lake.measure.rows import Row, not_applicable
 from truesky.validation.verdicts import AT_LEAST, AT_MOST
 
 SOURCE = "part of a point's light in its brightest pixel, from the frame's own fainter stars; SATURATE of the header"
-# Times the full well from which a star must be full, and up to which it must not.
+# Peaks in units of the full well above which a star must saturate, and below which it must not.
 _OVER, _UNDER = 2.5, 0.4
 _TOLERANCE, _MIN_STARS, _ISOLATION_RADIUS = 0.1, 5, 30.0
 
 
 def check(context: FrameContext) -> list[Row]:
-    """Parts of the stars, bright and fainter, that have a saturated pixel."""
+    """Check the fractions of bright and faint stars that have a saturated pixel."""
     assert context.measurements is not None
     stars = context.measurements.stars
     part = float(np.median(stars.peak / stars.flux))
@@ -36,7 +39,7 @@ def check(context: FrameContext) -> list[Row]:
         n = int(chosen.sum())
         if n >= _MIN_STARS:
             value = float(full[chosen].mean())
-            # Of a share, that of Agresti and Coull, which is not 0 where all are alike.
+            # The error of a fraction after Agresti and Coull is not 0 if all stars agree.
             adjusted_share = (full[chosen].sum() + 2.0) / (n + 4.0)
             error = float(np.sqrt(adjusted_share * (1.0 - adjusted_share) / (n + 4.0)))
             out.append(
@@ -58,7 +61,7 @@ def check(context: FrameContext) -> list[Row]:
 
 
 def _isolated_stars(context: FrameContext) -> tuple[Float, Bool]:
-    """(expected e-, whether a pixel is saturated) of points that no brighter source is near."""
+    """Expected e- of points without a brighter source nearby, and True if they have a saturated pixel."""
     sources, (ny, nx) = context.sources, context.frame.electrons.shape
     inside = sources.point & (sources.x > 8) & (sources.x < nx - 9) & (sources.y > 8) & (sources.y < ny - 9)
     index = np.flatnonzero(inside & (sources.expected > 1e-3 * context.frame.saturation_level))
@@ -80,7 +83,9 @@ def _isolated_stars(context: FrameContext) -> tuple[Float, Bool]:
 def _why_not_applicable(context: FrameContext) -> str:
     if context.measurements is None:
         return "no direct image of the sky"
-    return "" if len(context.measurements.stars) >= _MIN_STARS else "too few stars to tell how peaked a point is"
+    return (
+        "" if len(context.measurements.stars) >= _MIN_STARS else "too few stars to measure the peak of a point source"
+    )
 
 
 SATURATION = FrameCheck("saturation", SOURCE, _why_not_applicable, check)

@@ -1,8 +1,9 @@
-"""Spectra without a slit: the light of first orders, where their traces lie, and where their lines do.
+"""Check slitless spectra: flux of first orders, positions of their traces, and positions of emission lines.
 
-Of points whose first order nobody overlaps, light is summed across the trace, above the level on both sides of it. Of
-any source whose lines are bright enough, a line is the light above its spectrum's own median, and its place is told by
-its centroid.
+Notes
+-----
+For point sources with an isolated first order, light is summed across the trace above the level on both sides. For
+sources with bright lines, a line is the light above the median of its spectrum, and its position is the centroid.
 """
 
 from __future__ import annotations
@@ -20,21 +21,32 @@ from truesky.validation.lake.measure.rows import Row, not_applicable
 from truesky.validation.verdicts import AT_LEAST
 
 SOURCE = "rendered_spectra of the lake; the extracted flux of stars: Serrano et al. 2024, app. C"
-# Of the light over what is expected, pixels of the trace, part of a pixel of a line's wavelength.
+# Tolerances: flux over the expected one, position of the trace (pixels), position of a line (pixels).
 _FLUX, _TRACE, _LINE = 0.05, 0.1, 0.3
-# Half the height that is summed, and where the level is taken, pixels on either side.
+# Half height of the summed strip, and distances from the trace between which the level is measured, pixels.
 _HALF, _FROM, _TO = 6, 9, 15
-# S/N of a spectrum and of a line that are used, and how much of a trace may be overlapped.
+# Smallest S/N of a spectrum and of a line, largest overlapped fraction of a trace, smallest number of values, largest
+# number of spectra.
 _MIN_SNR, _MIN_LINE_SNR, _MAX_OVERLAP, _MIN_NUMBER, _MAX_SPECTRA = 60.0, 8.0, 0.1, 5, 150
-# Pixels about a line that its light and its level are told by.
+# Half widths of the window for a line and of the window for its level, pixels.
 _LINE_REACH, _LEVEL_REACH = 3, 12
-# Standard deviations from which a line is there, and the part of those foreseen that may be missed.
+# Smallest significance of a detected line (sigma), and fraction of the expected lines that may be missed.
 _MIN_SIGNIFICANCE, _MAX_MISSED = 3.0, 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExtractedSpectrum:
-    """Along a trace, a value a pixel: t of the trace, e- of the source, and its centroid across minus the trace."""
+    """Spectrum along a trace, one value per pixel.
+
+    Attributes
+    ----------
+    t : float array, shape (n,)
+        Parameter along the trace, 0 to 1.
+    light : float array, shape (n,)
+        Light of the source, e-.
+    offset : float
+        Centroid across minus the expected trace, pixels.
+    """
 
     t: Float
     light: Float
@@ -42,8 +54,8 @@ class ExtractedSpectrum:
 
 
 def check(context: FrameContext) -> list[Row]:
-    """Of a frame's first orders."""
-    # Of other orders, where they are among the rows, the overlap is null.
+    """Check the first orders of a frame."""
+    # Orders other than the first may be in the table; they have no value in `overlapped`.
     condition = (pc.field("order") == 1) & (pc.field("overlapped") < _MAX_OVERLAP)
     first = context.spectra.filter(condition).to_pylist()
     points = set(context.sources.id[context.sources.point].tolist())
@@ -60,7 +72,7 @@ def check(context: FrameContext) -> list[Row]:
     lines = line_offsets[np.isfinite(line_offsets)].tolist()
     out = []
     if len(line_offsets) >= _MIN_NUMBER:
-        # Where wavelengths are far off, nothing is left at the foreseen places that a shift could be told by.
+        # If wavelengths are far off, no lines are detected at the expected positions, and no shift can be measured.
         part = len(lines) / len(line_offsets)
         adjusted_share = (len(lines) + 2.0) / (len(line_offsets) + 4.0)
         out.append(
@@ -75,7 +87,7 @@ def check(context: FrameContext) -> list[Row]:
                 "",
                 SOURCE,
                 AT_LEAST,
-                f"{len(line_offsets)} lines foreseen at S/N > {_MIN_LINE_SNR:g}",
+                f"{len(line_offsets)} lines expected at S/N > {_MIN_LINE_SNR:g}",
             )
         )
     for name, values, expected, tolerance, unit in (
@@ -84,22 +96,32 @@ def check(context: FrameContext) -> list[Row]:
         ("wavelength", lines, 0.0, _LINE, "pix"),
     ):
         if len(values) < _MIN_NUMBER:
-            why = f"{name}: {len(values)} spectra or lines alone and bright enough; {_MIN_NUMBER} are wanted"
+            why = f"{name}: {len(values)} isolated and bright spectra or lines; {_MIN_NUMBER} are required"
             out.append(not_applicable("spectra", context.place, why, SOURCE, name))
             continue
         found_values = np.array(values)
         middle = float(np.median(found_values))
         error = 1.2533 * 1.4826 * float(np.median(np.abs(found_values - middle))) / np.sqrt(len(values))
         out.append(Row("spectra", name, context.place, middle, error, expected, tolerance, unit, SOURCE,
-                       note=f"{len(values)} of them, median"))  # fmt: skip
+                       note=f"{len(values)} values, median"))  # fmt: skip
     context.series["spectra"] = np.array(ratios)
     return out
 
 
 def extract_spectrum(image: Any, row: Mapping[str, Any]) -> ExtractedSpectrum | None:
-    """The light along a first order; None where it is not wholly on the detector, or lies along rows and columns both.
+    """Extract a first order; None if it is not entirely on the detector.
 
-    image : float[ny, nx] e-;  row : of `rendered_spectra`
+    Parameters
+    ----------
+    image : float array, shape (ny, nx)
+        Pixels of the frame, e-.
+    row : mapping of str to object
+        Row of `rendered_spectra`.
+
+    Returns
+    -------
+    ExtractedSpectrum or None
+        Spectrum along the trace; None also if it covers fewer than 50 columns (or rows) of the detector.
     """
     along_x = abs(row["x_last"] - row["x_first"]) >= abs(row["y_last"] - row["y_first"])
     plane = image if along_x else image.T
@@ -126,7 +148,7 @@ def extract_spectrum(image: Any, row: Mapping[str, Any]) -> ExtractedSpectrum | 
     strip = plane[trace_rows[None, :] + offsets[:, None], columns[None, :]].astype(float)
     level = np.median(strip[np.abs(offsets) >= _FROM], axis=0)
     inner = strip[np.abs(offsets) <= _HALF] - level
-    # One row after the other: light is where the trace is, and what is far from it is of a cosmic ray.
+    # Each row is cleaned along the trace; isolated bright pixels are from cosmic rays.
     inner = _remove_outliers(inner)
     weight = inner.sum(axis=1)
     centre = (weight * np.arange(-_HALF, _HALF + 1)).sum() / weight.sum() if weight.sum() > 0.0 else np.nan
@@ -134,11 +156,11 @@ def extract_spectrum(image: Any, row: Mapping[str, Any]) -> ExtractedSpectrum | 
 
 
 def _remove_outliers(inner: Float) -> Float:
-    """[rows, columns] without single pixels far above their neighbours along the row."""
+    """Replace single pixels far above their neighbours along the row."""
     typical = np.median(np.stack([np.roll(inner, step, axis=1) for step in (-3, -2, -1, 1, 2, 3)]), axis=0)
     spread = 1.4826 * np.median(np.abs(inner - typical))
     is_outlier = inner > typical + 8.0 * spread + 1.0 * np.abs(typical)
-    # A line is bright in several rows.
+    # A line is bright in several rows, a cosmic ray in one or two.
     return np.where(is_outlier & (is_outlier.sum(axis=0) <= 2), typical, inner)
 
 
@@ -150,7 +172,7 @@ def _polynomial(coefficients: Float, t: Float) -> Float:
 
 
 def _line_offsets(context: FrameContext, row: Mapping[str, Any]) -> list[float]:
-    """Of a spectrum's bright lines: measured place minus the foreseen, pixels along the trace; NaN where none is."""
+    """Measured minus expected positions of bright lines in a spectrum, pixels along the trace; NaN if not detected."""
     bright = [
         wavelength
         for wavelength, snr in zip(row["line_wavelength"] or (), row["line_snr"] or (), strict=True)
@@ -173,7 +195,7 @@ def _line_offsets(context: FrameContext, row: Mapping[str, Any]) -> list[float]:
         continuum = spectrum.light[in_window & (np.abs(pixel) > _LINE_REACH)]
         level = np.median(continuum)
         noise = 1.4826 * np.median(np.abs(continuum - level))
-        # About the place that was found, until it stays: light of the continuum pulls to the middle of the window.
+        # The window follows the line until it stays, because continuum light pulls towards the middle of the window.
         centre, significance = 0.0, 0.0
         for _ in range(10):
             window = np.exp(-0.5 * ((pixel - centre) / 1.2) ** 2)
@@ -192,7 +214,7 @@ def _why_not_applicable(context: FrameContext) -> str:
     return (
         ""
         if context.spectra is not None and len(context.spectra)
-        else "the lake's rendered_spectra have no first order on it"
+        else "table rendered_spectra has no first order on this frame"
     )
 
 

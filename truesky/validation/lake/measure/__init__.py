@@ -1,1 +1,1 @@
-"""What the checks share: rows with verdicts, frames by their headers alone, stars, blank sky."""
+"""Tools that the checks share: rows with verdicts, frames read by their headers, stars and blank sky."""

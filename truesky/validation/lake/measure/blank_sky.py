@@ -1,8 +1,4 @@
-"""Blank sky of a frame: tiles without sources, their level, their noise.
-
-tiles     a frame's tiles, sources, saturated pixels and outliers masked
-Tiles     pixels, which of them are blank, and where
-"""
+"""Measure the blank sky of a frame in tiles without sources: level and noise."""
 
 from __future__ import annotations
 
@@ -16,27 +12,37 @@ from truesky.validation.lake.measure import masks
 from truesky.validation.lake.measure.frames import Amplifier, Frame
 from truesky.validation.lake.measure.references import Reference
 
-# Side of a tile, pixels, and every how many of them one is looked at, along rows and columns, of large detectors.
+# Side of a tile, pixels; step in tiles along rows and columns of large detectors.
 SIDE, TILE_STEP = 64, 2
 _LARGE = 2 << 20
-# Light of a point beyond r arcsec falls as this times its flux / r^3, per square arcsec (obscured aperture, 3 bars).
+# The light of a point source at r arcsec is this times its flux / r^3, per square arcsec (obscured aperture, 3 bars).
 _WING = 9.3e-3
-# Part of a pixel's noise that a source may bring to a blank pixel; of galaxies, how much wider; arcsec at least.
+# Fraction of a pixel's noise that a source may contribute to a blank pixel; factor for the radius of galaxies; smallest
+# radius, arcsec.
 _VISIBLE_FRACTION, _GALAXY_WIDENING, _MIN_RADIUS = 0.1, 1.5, 1.0
 _MAX_RADIUS = 400
-# Standard deviations from a tile's median beyond which a pixel is an outlier, and tiles want so many pixels.
+# Standard deviations from the median of a tile beyond which a pixel is an outlier; smallest number of blank pixels.
 _CLIP, _MIN_PIXELS = 5.0, 400
-# Every how many rows and columns a pixel is looked at for the first level.
+# Step in rows and columns of the pixels that give the first estimate of the level.
 _SAMPLE_STEP = 4
-# Standard deviations above its tile from which a pixel is hit.
+# Standard deviations above its tile from which a pixel counts as hit.
 _HIT = 8.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tiles:
-    """float32[t, SIDE, SIDE] e-, bool of blank pixels and of hits, and the tiles' first rows and columns [t].
+    """Square tiles of a frame.
 
-    hit : far above the level of its tile, though no source that is known shines there
+    Attributes
+    ----------
+    pixels : float32 array, shape (t, SIDE, SIDE)
+        Pixels, e-.
+    blank : bool array, shape (t, SIDE, SIDE)
+        True for blank pixels.
+    hit : bool array, shape (t, SIDE, SIDE)
+        True for pixels far above the level of the tile without a known source.
+    row, column : int array, shape (t,)
+        First row and column of each tile.
     """
 
     pixels: Array
@@ -47,21 +53,22 @@ class Tiles:
 
     @property
     def level(self) -> Float:
-        """e- a pixel [t], mean of the blank ones."""
+        """Mean of the blank pixels of each tile, e- per pixel."""
         return np.asarray((self.pixels * self.blank).sum(axis=(1, 2)) / self.blank.sum(axis=(1, 2)))
 
     def in_amplifier(self, amplifier: Amplifier) -> Tiles:
-        """Tiles that lie wholly in an amplifier."""
+        """Return the tiles that lie entirely in an amplifier."""
         rows, columns = amplifier.pixels
         return self.select((self.row >= rows.start) & (self.row + SIDE <= rows.stop)
                           & (self.column >= columns.start) & (self.column + SIDE <= columns.stop))  # fmt: skip
 
     def select(self, mask: Bool) -> Tiles:
+        """Return the tiles selected by a mask."""
         return Tiles(self.pixels[mask], self.blank[mask], self.hit[mask], self.row[mask], self.column[mask])
 
 
 def rough_noise(frame: Frame) -> float:
-    """e- rms of a pixel of blank sky: from differences of neighbours, whose middle half tells it."""
+    """Return the rms noise (e-) of a blank pixel from the middle half of differences of neighbours."""
     sample = frame.electrons[5::37, :].astype(float)
     step = np.diff(sample, axis=1).ravel()
     low, high = np.percentile(step, [25.0, 75.0])
@@ -69,9 +76,23 @@ def rough_noise(frame: Frame) -> float:
 
 
 def tiles(frame: Frame, sources: Reference, noise: float, tile_step: int | None = None) -> Tiles:
-    """Of a frame.
+    """Divide a frame into tiles, and mask sources, outliers and pixels that are not read out.
 
-    known : its sources;  noise : e- rms of a pixel of blank sky;  every : of so many rows of tiles one
+    Parameters
+    ----------
+    frame : Frame
+        A frame.
+    sources : Reference
+        Its known sources.
+    noise : float
+        rms of a pixel of blank sky, e-.
+    tile_step : int, optional
+        Step in tiles along rows and columns; by default TILE_STEP for large detectors, else 1.
+
+    Returns
+    -------
+    Tiles
+        Tiles with enough blank pixels.
     """
     ny, nx = frame.electrons.shape
     if tile_step is None:
@@ -93,9 +114,9 @@ def tiles(frame: Frame, sources: Reference, noise: float, tile_step: int | None 
 
 
 def _not_blank(pixels: Array, hidden: Bool, noise: float) -> Bool:
-    """What is no blank sky: sources, outliers and what touches them, pixels that nobody reads."""
+    """Mask of pixels that are not blank sky: sources, outliers and their neighbours, and pixels not read out."""
     bad = hidden | (pixels == 0.0)
-    # Sources are a minor part of most tiles: their median is where the level is first looked for, in a part of them.
+    # Sources cover little of most tiles, so the median of a sample is a good first level.
     sample = pixels[:, ::_SAMPLE_STEP, ::_SAMPLE_STEP]
     middle = np.median(np.where(bad[:, ::_SAMPLE_STEP, ::_SAMPLE_STEP], np.median(sample), sample), axis=(1, 2))
     out = np.empty(pixels.shape, bool)
@@ -105,9 +126,9 @@ def _not_blank(pixels: Array, hidden: Bool, noise: float) -> Bool:
 
 @exact_jit
 def _mark_outliers(pixels: Array, bad: Bool, middle: Float, noise: float, out: Bool) -> None:
-    """Mark what is far from the mean of its tile's other pixels [t, ny, nx], which is found in three rounds.
+    """Mark pixels (t, ny, nx) far from the mean of the other pixels of their tile, in three iterations.
 
-    bad : no blank sky;  middle : [t] e-, where the first round looks;  noise : e- rms, of the first round
+    The first iteration starts from the levels `middle` and the rms `noise` (e-); pixels that are `bad` do not count.
     """
     tiles, ny, nx = pixels.shape
     for t in range(tiles):
@@ -120,13 +141,13 @@ def _mark_outliers(pixels: Array, bad: Bool, middle: Float, noise: float, out: B
                     out[t, i, j] = is_outlier = abs(off) > limit
                     if not (is_outlier or bad[t, i, j]):
                         n, first, second = n + 1, first + off, second + off * off
-            # About the old mean, which is near the new one: no digits are lost.
+            # Sums are relative to the old mean, which is near the new one, so no digits are lost.
             step = first / max(n, 1)
             mean, spread = mean + step, np.sqrt(max(second / max(n, 1) - step * step, 0.0))
 
 
 def _source_mask(frame: Frame, sources: Reference, noise: float) -> Bool:
-    """bool[ny, nx]: pixels that a known source may show in."""
+    """Pixels in which a known source may be visible."""
     ny, nx = frame.electrons.shape
     out = np.zeros((ny, nx), bool)
     if not len(sources.x):
@@ -134,20 +155,20 @@ def _source_mask(frame: Frame, sources: Reference, noise: float) -> Bool:
     width = float(frame.header["PSFFWHM"])
     radius = np.cbrt(_WING * np.maximum(sources.expected, 0.0) * frame.scale**2 / (_VISIBLE_FRACTION * noise))
     radius = np.maximum(radius * np.where(sources.point, 1.0, _GALAXY_WIDENING), max(2.0 * width, _MIN_RADIUS))
-    # What nobody could see even where it is brightest stays: its light is part of the sky's noise.
+    # Sources that are invisible even at their peak are not masked: their light is part of the noise of the sky.
     radius[sources.expected * frame.scale**2 < _VISIBLE_FRACTION * noise * width**2] = 0.0
     masks.mark_discs(sources.x, sources.y, np.minimum(radius / frame.scale, _MAX_RADIUS), out)
     return out
 
 
 def variance(tiles: Tiles) -> tuple[float, float]:
-    """(e-^2 of a blank pixel about the mean of its tile, its standard error)."""
+    """Return the variance of a blank pixel around the mean of its tile (e-^2), and its standard error."""
     blank = tiles.blank
     n = blank.sum(axis=(1, 2))
     off = np.where(blank, tiles.pixels - tiles.level[:, None, None], 0.0).astype(float)
     tile_variance = (off**2).sum(axis=(1, 2)) / (n - 1)
     weight = n / n.sum()
     value = float((weight * tile_variance).sum())
-    # From the scatter of the tiles themselves.
+    # The error is from the scatter of the tiles.
     error = float(np.sqrt((weight**2 * (tile_variance - value) ** 2).sum())) if len(n) > 1 else np.inf
     return value, error

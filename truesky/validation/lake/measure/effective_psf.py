@@ -1,10 +1,12 @@
-"""Light of stars by fitting a PSF: the effective one of the frame itself, from its brighter stars.
+"""Measure fluxes of stars by fitting the effective PSF of the frame, which is built from its brighter stars.
 
-Effective   part of a point's light in a pixel, by its distance from the point: cubic splines, the pixel's width in them
-built       cuts of stars and their light -> Effective
-lights      stars of a frame -> light of each, by least squares in light and place
+The effective PSF is the fraction of a point source's light in a pixel as a function of the distance from the point. It
+includes the width of the pixel and is represented by cubic splines.
 
-Ref : Anderson & King 2000, PASP 112, 1360 (effective PSF); Stetson 1987, PASP 99, 191 (fitting)
+References
+----------
+Anderson & King 2000, PASP 112, 1360 (effective PSF)
+Stetson 1987, PASP 99, 191 (fitting)
 """
 
 from __future__ import annotations
@@ -19,27 +21,37 @@ from lake_schema.arrays import Bool, Float
 from truesky.validation.lake.measure.frames import Frame
 from truesky.validation.lake.measure.stars import StarMeasurements
 
-# FWHM on either side of a star, and at least pixels; knots a FWHM, and pixels between them at least.
+# Radius of the fit in FWHM, and its smallest value in pixels; knots per FWHM, and their smallest distance in pixels.
 _REACH, _MIN_REACH, _KNOTS, _FINEST = 2.0, 3.0, 4.0, 1.0 / 3.0
-# Of the mean weight of a coefficient, by which second differences are kept small.
+# Weight of the second differences, in units of the mean weight of a coefficient.
 _SMOOTH = 1e-5
-# Stars that it is built from, at least; how much the PSF differs from star to star, of itself and of its peak;
+# Fewest stars for a PSF; relative variation of the PSF between stars, and its floor relative to the peak; standard
 # deviations of an outlier.
 MIN_STARS, _PSF_VARIATION, _FLOOR, _OUTLIER = 8, 0.03, 3e-3, 5.0
-# Rounds of a fit, and how far a place may be moved in one, pixels.
+# Number of iterations of a fit, and largest shift of a position per iteration, pixels.
 _ROUNDS, _STEP = 5, 0.3
 
 
 @dataclass(frozen=True, slots=True)
 class EffectivePsf:
-    """float64[k, k] coefficients of cubic splines (rows, columns), `step` pixels apart, from -reach to reach."""
+    """Effective PSF as cubic splines.
+
+    Attributes
+    ----------
+    coefficients : float array, shape (k, k)
+        Spline coefficients (rows, columns).
+    step : float
+        Distance between knots, pixels.
+    reach : float
+        The PSF extends from -reach to reach, pixels.
+    """
 
     coefficients: Float
     step: float
     reach: float
 
     def evaluate(self, x: Float, y: Float) -> tuple[Float, Float, Float]:
-        """(value, its slopes along columns and rows) [m] at distances from the point, pixels."""
+        """Return the value, and its slopes along columns and rows, at distances (pixels) from the point."""
         (i, first, rise), (j, second, climb) = (_basis(axis, self.step, self.reach) for axis in (x, y))
         coefficients = self.coefficients[j[:, :, None], i[:, None, :]]
         return (
@@ -50,7 +62,7 @@ class EffectivePsf:
 
 
 def _basis(x: Float, step: float, reach: float) -> tuple[np.ndarray, Float, Float]:
-    """(indices, values, slopes) [m, 4] of the splines that are not 0 at x [m]."""
+    """Indices, values and slopes, each of shape (m, 4), of the splines that are not 0 at x."""
     place = (x + reach) / step
     first = np.clip(np.floor(place).astype(int), 0, _knots(step, reach) - 4)
     t = place - first
@@ -64,10 +76,23 @@ def _knots(step: float, reach: float) -> int:
 
 
 def build(x: Float, y: Float, value: Float, weight: Float, fwhm: float) -> EffectivePsf:
-    """Of pixels [m].
+    """Build the effective PSF from pixels of stars.
 
-    x, y : distances from their stars, pixels;  value : part of the star's light in each;  weight : of it
-    fwhm : pixels
+    Parameters
+    ----------
+    x, y : float array, shape (m,)
+        Distances of the pixels from their stars, pixels.
+    value : float array, shape (m,)
+        Fraction of the star's light in each pixel.
+    weight : float array, shape (m,)
+        Inverse variance of the value.
+    fwhm : float
+        FWHM, pixels.
+
+    Returns
+    -------
+    EffectivePsf
+        The PSF; coefficients are NaN if they are not determined.
     """
     step, reach = max(fwhm / _KNOTS, _FINEST), fit_radius(fwhm)
     k = _knots(step, reach)
@@ -85,7 +110,7 @@ def build(x: Float, y: Float, value: Float, weight: Float, fwhm: float) -> Effec
 
 
 def _solve_coefficients(index: np.ndarray, basis: Float, value: Float, weight: Float, k: int) -> Float:
-    """Coefficients [k k]: least squares with small second differences, by a banded normal matrix; else NaN."""
+    """Least-squares coefficients with small second differences, from a banded normal matrix; NaN if it is singular."""
     heavy, width = basis * weight[:, None], 3 * k + 3
     band = np.zeros((width + 1, k * k))
     for i in range(16):
@@ -95,7 +120,7 @@ def _solve_coefficients(index: np.ndarray, basis: Float, value: Float, weight: F
                 band[lag] += np.bincount(index[:, j], heavy[:, i] * basis[:, j], k * k)
     smooth = _SMOOTH * band[0].mean()
     for step in (1, k):
-        # Second differences of three neighbours along a row, or a column.
+        # Second differences are those of three neighbours along a row or a column.
         middle = np.arange(k * k).reshape(k, k)
         first = (middle[:, :-2] if step == 1 else middle[:-2]).ravel()
         for i, a in enumerate((1.0, -2.0, 1.0)):
@@ -109,15 +134,28 @@ def _solve_coefficients(index: np.ndarray, basis: Float, value: Float, weight: F
 
 
 def fit_radius(fwhm: float) -> float:
-    """Pixels from a star that are fitted."""
+    """Return the radius in pixels within which stars are fitted."""
     return max(_REACH * fwhm, _MIN_REACH)
 
 
 def fit_fluxes(frame: Frame, measurements: StarMeasurements, total_light: Float, noise: float) -> tuple[Float, Float]:
-    """(e- [n] of all light of the stars, its error), NaN where they are too few to tell a PSF.
+    """Fit the fluxes and positions of stars with the effective PSF of the frame.
 
-    frame : that shows them;  found : stars;  whole : e- [n] of all light, of the brighter ones at least
-    noise : e- rms of a pixel of blank sky
+    Parameters
+    ----------
+    frame : Frame
+        Frame with the stars.
+    measurements : StarMeasurements
+        Stars of the frame.
+    total_light : float array, shape (n,)
+        All light of each star, e-; required for the brighter stars, NaN if unknown.
+    noise : float
+        rms of a pixel of blank sky, e-.
+
+    Returns
+    -------
+    flux, error : float array, shape (n,)
+        Fitted light and its error, e-; NaN if there are too few stars for a PSF.
     """
     stars, n = measurements.stars, len(measurements.stars)
     bright = np.flatnonzero(np.isfinite(total_light) & (total_light > 0.0))
@@ -128,12 +166,12 @@ def fit_fluxes(frame: Frame, measurements: StarMeasurements, total_light: Float,
     parts = [np.stack([u, v, cut / total_light[i], total_light[i] ** 2 / (noise**2 + np.maximum(cut, 0.0))])
              for i, (u, v, cut) in ((i, pixels[i]) for i in bright)]  # fmt: skip
     u, v, value, weight = np.concatenate(parts, axis=1)
-    # Without a floor the many pixels of the wings would outweigh the few of the core.
+    # Without this floor the many pixels of the wings would outweigh the few pixels of the core.
     variance = 1.0 / weight + (_PSF_VARIATION * value) ** 2 + (_FLOOR * value.max()) ** 2
     psf = build(u, v, value, 1.0 / variance, measurements.fwhm)
     if not np.isfinite(psf.coefficients).all():
         return np.full(n, np.nan), np.full(n, np.nan)
-    # As many pixels of each: those that some have not count for nothing.
+    # Arrays have the same number of pixels for each star; padding is masked.
     max_pixels = max(len(cut) for *_, cut in pixels)
     u, v, cut, is_pixel = (np.zeros((n, max_pixels)) for _ in range(4))
     for i, star_values in enumerate(pixels):
@@ -143,9 +181,9 @@ def fit_fluxes(frame: Frame, measurements: StarMeasurements, total_light: Float,
 
 
 def _star_pixels(frame: Frame, measurements: StarMeasurements, i: int) -> tuple[Float, Float, Float]:
-    """(x, y from the place of a star, e- above the sky as if the optics had no vignetting) of the pixels about it."""
+    """x and y relative to a star, and e- above the sky corrected for vignetting, of the pixels around it."""
     stars, reach = measurements.stars, fit_radius(measurements.fwhm)
-    # A place may move: the PSF is known a little less far than it is asked for.
+    # The position may shift, so the fit uses a slightly smaller radius than that of the PSF.
     x, y, radius = float(stars.x[i]), float(stars.y[i]), reach - 2.0 * _STEP
     across, up = (np.arange(int(np.ceil(at - radius)), int(np.floor(at + radius)) + 1) for at in (x, y))
     cut = frame.linearize(frame.electrons[up[0] : up[-1] + 1, across[0] : across[-1] + 1].astype(float)) - stars.sky[i]
@@ -156,9 +194,9 @@ def _star_pixels(frame: Frame, measurements: StarMeasurements, i: int) -> tuple[
 def _fit_stars(
     psf: EffectivePsf, place: tuple[Float, Float], cut: Float, is_pixel: Bool, flux: Float, noise: float
 ) -> tuple[Float, Float]:
-    """(e- [n], its error) of stars, NaN where too few pixels are good.
+    """Fitted flux (e-) and its error per star, NaN if too few pixels are good.
 
-    place : x, y [n, m] of pixels;  cut : e- [n, m];  there : whether there is such a pixel;  flux : where to begin
+    `place` are x and y of the pixels, `cut` their e-, each of shape (n, m); `flux` is the initial flux.
     """
     flux, good = flux.astype(float), is_pixel
     u, v, failed = np.zeros_like(flux), np.zeros_like(flux), np.zeros(len(flux), bool)
@@ -174,7 +212,7 @@ def _fit_stars(
             )
         failed |= (good.sum(axis=1) < MIN_STARS) | ~(flux > 0.0)
         heavy = weight * (good & ~failed[:, None])
-        # In units of the flux, so that light and place weigh alike.
+        # Dividing by the flux gives flux and position steps similar weights.
         flux_step, du, dv = _solve_step((value, -rise, -climb), heavy, residual / np.where(failed, 1.0, flux)[:, None])
         u, v = (np.clip(a + b, -2 * _STEP, 2 * _STEP) for a, b in ((u, du), (v, dv)))
         flux = flux * (1.0 + flux_step)
@@ -183,9 +221,9 @@ def _fit_stars(
 
 
 def _solve_step(columns: Sequence[Float], weight: Float, residual: Float) -> list[Float]:
-    """Of each star [n] the three numbers by which its columns [n, m] explain what is left; 0 if no pixel is good.
+    """Least-squares solution of the three columns (n, m) for the residuals of each star; 0 if no pixel is good.
 
-    Their matrix is far from singular: a PSF and its slopes along two axes are nearly orthogonal.
+    The matrix is well conditioned, since a PSF and its slopes along two axes are nearly orthogonal.
     """
     basis = np.stack(columns, axis=2)
     weighted = np.swapaxes(basis * weight[:, :, None], 1, 2)

@@ -1,4 +1,4 @@
-"""What a check of images is given: a frame, its references, and what several checks measure of it."""
+"""Input of the checks of images: a frame, its references, and measurements that several checks share."""
 
 from __future__ import annotations
 
@@ -21,7 +21,17 @@ RAMPS = ("NISP-P", "NISP-S")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartnerFrame:
-    """Another frame of the same detector: its file, its exposure, and what is known of its sources."""
+    """Another frame of the same detector.
+
+    Attributes
+    ----------
+    path : Path
+        Science file.
+    exposure_id : int
+        Exposure.
+    sources : Reference
+        Known sources of the frame.
+    """
 
     path: Path
     exposure_id: int
@@ -30,11 +40,28 @@ class PartnerFrame:
 
 @dataclass(slots=True, eq=False)
 class FrameContext:
-    """A frame and what is known of it.
+    """A frame with its references and measurements.
 
-    noise, tiles, measured : of its blank sky and its stars; None where it does not show any
-    spectra : rows of `rendered_spectra` of a dispersed frame, of first orders at least
-    before  : another frame that the gain is told with, None where it is not
+    Attributes
+    ----------
+    place : Place
+        Channel, band, exposure and detector.
+    frame : Frame
+        The frame.
+    sources : Reference
+        Known sources.
+    spectra : Table, optional
+        Rows of `rendered_spectra`, at least those of first orders; only for dispersed frames.
+    noise : float
+        rms of a pixel of blank sky, e-; 0 if not measured.
+    tiles : Tiles, optional
+        Tiles of blank sky; only for direct images of the sky.
+    measurements : StarMeasurements, optional
+        Measured stars; only for direct images of the sky.
+    partner : PartnerFrame, optional
+        Another frame with which the gain is measured.
+    series : dict of str to object
+        Numbers for figures and for checks of several frames, added by the checks.
     """
 
     place: Place
@@ -49,16 +76,28 @@ class FrameContext:
 
     @property
     def channel(self) -> str:
+        """Channel of the frame, from its header."""
         return str(self.frame.header["CHANNEL"])
 
     @property
     def sees_sky(self) -> bool:
+        """True for images of the sky, not of lamps or darks."""
         return self.frame.header["IMAGETYP"] in SKY_TYPES
 
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """Of one frame: its rows, and numbers that figures and checks of several frames want."""
+    """Results of one frame or of a check of catalogues.
+
+    Attributes
+    ----------
+    place : Place
+        Place of the measurement.
+    rows : list of Row
+        Rows with verdicts.
+    series : mapping of str to object
+        Numbers for figures and for checks of several frames.
+    """
 
     place: Place
     rows: list[Row]
@@ -69,9 +108,16 @@ class Result:
 class FrameCheck:
     """A check of one frame.
 
-    source  : where its expectation is from
-    applies : "" where the frame has what it wants, else why not
-    rows    : measures
+    Attributes
+    ----------
+    name : str
+        Name of the check.
+    source : str
+        Source of the expectation.
+    why_not_applicable : callable
+        Function of the context that returns the reason why the check does not apply, "" if it applies.
+    measure : callable
+        Function of the context that returns the rows.
     """
 
     name: str
@@ -80,14 +126,24 @@ class FrameCheck:
     measure: Callable[[FrameContext], list[Row]]
 
     def run(self, context: FrameContext) -> list[Row]:
-        """Its rows; one that says why where it does not apply."""
+        """Return the rows of the check, or one row with the reason if it does not apply."""
         why = self.why_not_applicable(context)
         return [not_applicable(self.name, context.place, why, self.source)] if why else self.measure(context)
 
 
 @dataclass(frozen=True, slots=True)
 class ExposureCheck:
-    """A check of all frames together: name, where its expectations are from, and what it makes of their results."""
+    """A check of all frames together.
+
+    Attributes
+    ----------
+    name : str
+        Name of the check.
+    source : str
+        Source of the expectations.
+    rows : callable
+        Function of the results of all frames that returns the rows.
+    """
 
     name: str
     source: str
@@ -97,10 +153,25 @@ class ExposureCheck:
 def measure_frame(
     path: Path, place: Place, sources: Reference, spectra: Any = None, instrument: Instrument | None = None
 ) -> FrameContext:
-    """Open a file and measure what several checks want.
+    """Open a science file and make the measurements that several checks share.
 
-    path  : of the science file;  place : what it is of;  known : its sources;  spectra : of `Seen`
-    instrument : that took it, None = linear and even
+    Parameters
+    ----------
+    path : Path
+        Science file.
+    place : Place
+        Channel, band, exposure and detector.
+    sources : Reference
+        Known sources of the frame.
+    spectra : Table, optional
+        Rows of `rendered_spectra` of a dispersed frame.
+    instrument : Instrument, optional
+        Camera of the frame; None for a linear detector without vignetting.
+
+    Returns
+    -------
+    FrameContext
+        The frame with noise, tiles and stars if it shows the sky.
     """
     frame = frames.open_frame(path, instrument)
     context = FrameContext(place, frame, sources, spectra)
@@ -113,24 +184,24 @@ def measure_frame(
 
 
 def require_stars(min_stars: int) -> Callable[[FrameContext], str]:
-    """Of a check that wants so many stars."""
+    """Return a function that returns the reason if a frame has fewer than `min_stars` usable stars, else ""."""
 
     def why_not_applicable(context: FrameContext) -> str:
         if context.measurements is None:
             return "no direct image of the sky"
         n = len(context.measurements.stars)
-        return "" if n >= min_stars else f"{n} stars that are alone, bright and not saturated; {min_stars} are wanted"
+        return "" if n >= min_stars else f"{n} isolated, bright and unsaturated stars; {min_stars} are required"
 
     return why_not_applicable
 
 
 def require_blank_sky(context: FrameContext) -> str:
-    """Of a check that wants blank sky."""
+    """Return the reason if a frame has no blank sky, else ""."""
     if context.tiles is None:
         return "no direct image of the sky"
     return "" if len(context.tiles.row) > 1 else "no blank sky between its sources"
 
 
 def all_rows(checks: Sequence[FrameCheck], context: FrameContext) -> list[Row]:
-    """Rows of all checks of a frame."""
+    """Return the rows of all checks of a frame."""
     return [row for check in checks for row in check.run(context)]

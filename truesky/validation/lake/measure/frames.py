@@ -1,9 +1,8 @@
-"""A raw file of a detector as a pipeline opens it: by its header alone.
+"""Read raw files of a detector as a reduction pipeline does: by their headers alone.
 
-Frame     electrons of the detector's pixels above each amplifier's level, and what its header says
-opened    a file -> Frame
-
-Ref : FITS standard 4.0; keywords of sections as NOAO and LSST use them (DATASEC, BIASSEC, CCDSEC)
+References
+----------
+FITS standard 4.0; section keywords as NOAO and LSST use them (DATASEC, BIASSEC, CCDSEC)
 """
 
 from __future__ import annotations
@@ -23,28 +22,43 @@ from lake_schema.errors import BadInput
 from lake_schema.fits import images
 
 _SECTION = re.compile(r"\[(\d+):(\d+),(\d+):(\d+)\]")
-# Of a system on the sky; distortions as SIP or TPV.
+# Keywords of a celestial WCS, with SIP or TPV distortions.
 _WCS_KEYWORD = re.compile(
     r"(CTYPE|CRVAL|CRPIX|CUNIT|CDELT)[12]|(CD|PC)[12]_[12]|PV\d_\d+|[AB]P?_(ORDER|\d_\d)|LONPOLE|LATPOLE|RADESYS"
 )
-# How the plane of a ramp's chi^2 ends its name.
+# Suffix of the name of the chi^2 plane of a ramp.
 _QUALITY = ".CHI2"
 _FLAGS = "QUALFLAG"
-# Of a header that is not sure of its place (FITS, paper I); the true one is then in the .head file beside it.
+# Keyword of a header with an uncertain pointing (FITS paper I); the .head file next to it then has the true WCS.
 _UNCERTAIN_POINTING = "CSYER1"
-# Overscan columns next to the pixels that are left out: charge that traps gave back is in them.
+# Fraction of the overscan columns that is not used, since they contain charge released by traps.
 _SKIPPED = 0.5
-# Differences of neighbours in the overscan that are no noise, in units of their spread.
+# Differences of neighbours in the overscan that are outliers, in units of their scatter.
 _CLIP = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class Amplifier:
-    """What one amplifier read.
+    """Readout of one amplifier.
 
-    pixels  : its part of the detector;  gain : e-/ADU;  level : ADU without light
-    noise   : e- rms of the overscan, NaN where there is none;  told : e- rms read noise, as the header has it drawn
-    samples : pixels of the overscan;  full : e- of the lowest saturated pixel
+    Attributes
+    ----------
+    name : str
+        Name of the amplifier.
+    pixels : (slice, slice)
+        Rows and columns of the detector.
+    gain : float
+        Gain, e-/ADU.
+    level : float
+        Level without light, ADU.
+    noise : float
+        rms of the overscan, e-; NaN if there is no overscan.
+    header_read_noise : float
+        rms read noise in the header, e-.
+    samples : int
+        Number of pixels of the overscan.
+    saturation_level : float
+        Level of the lowest saturated pixel, e-.
     """
 
     name: str
@@ -59,10 +73,22 @@ class Amplifier:
 
 @dataclass(frozen=True, slots=True)
 class NonlinearityCurve:
-    """How an amplifier falls behind: s = n / (1 + high n / range), of which low * knee (1 - exp(-s / knee)) is missing.
+    """Nonlinearity of an amplifier.
 
-    high, low : parts of the signal, at the converter's range and of the first electrons;  knee : e-
-    range     : of the converter, ADU
+    Attributes
+    ----------
+    high : float
+        Relative loss at the converter's range: n is read as n / (1 + high) there.
+    low : float
+        Fraction of the first electrons that is missing.
+    knee : float
+        Scale of the loss of the first electrons, e-.
+    range : float
+        Range of the converter, ADU.
+
+    Notes
+    -----
+    A signal of n electrons is read as s - low * knee * (1 - exp(-s / knee)) with s = n / (1 + high * n / range).
     """
 
     high: float = 0.0
@@ -71,7 +97,7 @@ class NonlinearityCurve:
     range: float = 65535.0
 
     def linearize(self, read: Float, max_signal: float) -> Float:
-        """Electrons [..] of what was read; most : e- of the converter's range."""
+        """Return the collected electrons of electrons that were read; `max_signal` is the converter's range in e-."""
         signal = np.asarray(read, float)
         for _ in range(3):
             signal = read - self.low * self.knee * np.expm1(-np.maximum(signal, 0.0) / self.knee)
@@ -80,10 +106,16 @@ class NonlinearityCurve:
 
 @dataclass(frozen=True, slots=True)
 class Instrument:
-    """What the mission database tells of a camera, and is no error of a frame.
+    """Properties of a camera from the mission database that are not faults of a frame.
 
-    curve    : of its amplifiers;  response : rms by which pixels differ
-    bowl     : part of the light that the optics keep from the corner of the focal plane
+    Attributes
+    ----------
+    curve : NonlinearityCurve
+        Nonlinearity of the amplifiers.
+    vignetting : float
+        Fraction of the light that is lost at the corner of the focal plane.
+    pixel_response_rms : float
+        rms of the relative response of pixels.
     """
 
     curve: NonlinearityCurve = NonlinearityCurve()
@@ -95,11 +127,20 @@ class Instrument:
 class Frame:
     """A detector of an exposure.
 
-    electrons  : float32[ny, nx] above each amplifier's level
-    amplifiers : what read them
-    quality    : uint8[ny, nx] of a ramp, None = there is none
-    header     : of the whole file;  wcs : of the detector's pixels, the first is (0, 0)
-    instrument : that took it
+    Attributes
+    ----------
+    electrons : float32 array, shape (ny, nx)
+        Electrons above the level of each amplifier.
+    amplifiers : tuple of Amplifier
+        Amplifiers of the detector.
+    quality : uint8 array, shape (ny, nx), optional
+        chi^2 of a ramp.
+    header : mapping of str to object
+        Header of the whole file.
+    wcs : WCS
+        World coordinates of the detector's pixels; the first pixel is (0, 0).
+    instrument : Instrument
+        Camera of the frame.
     """
 
     electrons: Float32
@@ -110,7 +151,10 @@ class Frame:
     instrument: Instrument = Instrument()
 
     def illumination(self, x: Float, y: Float) -> Float:
-        """What of the light the optics bring to places [n] in pixels: 1 - bowl r^2, r = 1 at the corner of DETSIZE."""
+        """Return the fraction of light after vignetting at pixel positions.
+
+        The fraction is 1 - vignetting r^2 with r = 1 at the corner of DETSIZE.
+        """
         if self.instrument.vignetting == 0.0:
             return np.ones(len(x))
         wide, high = (axis.stop - axis.start for axis in section(self.header["DETSIZE"]))
@@ -118,26 +162,27 @@ class Frame:
         return np.asarray(1.0 - self.instrument.vignetting * (across**2 + up**2) / (0.25 * (wide**2 + high**2)))
 
     def linearize(self, read: Float) -> Float:
-        """e- [..] that were collected where so many were read."""
+        """Return the collected electrons of electrons that were read."""
         max_signal = self.instrument.curve.range * float(np.mean([amplifier.gain for amplifier in self.amplifiers]))
         return self.instrument.curve.linearize(read, max_signal)
 
     @property
     def seconds(self) -> float:
+        """Exposure time, s."""
         return float(self.header["EXPTIME"])
 
     @property
     def scale(self) -> float:
-        """arcsec a pixel."""
+        """Pixel scale, arcsec per pixel."""
         return float(self.header["PIXSCALE"])
 
     @property
     def saturation_level(self) -> float:
-        """e- of the lowest saturated pixel of all amplifiers."""
+        """Level of the lowest saturated pixel of all amplifiers, e-."""
         return min(amplifier.saturation_level for amplifier in self.amplifiers)
 
     def saturated_pixels(self) -> Bool:
-        """bool[ny, nx]"""
+        """Return a mask of the saturated pixels."""
         out = np.zeros(self.electrons.shape, bool)
         for amplifier in self.amplifiers:
             out[amplifier.pixels] = self.electrons[amplifier.pixels] >= amplifier.saturation_level
@@ -145,17 +190,18 @@ class Frame:
 
 
 def open_frame(path: Path, instrument: Instrument | None = None) -> Frame:
-    """A science file.
+    """Open a science file of an instrument from the mission database; None for a linear detector without vignetting.
 
-    path : of it;  instrument : that took it, as the lake's mission database has it; None = linear and even
-
-    Errors : BadInput where its header lacks what a pipeline needs, naming the keyword
+    Raises
+    ------
+    BadInput
+        If the header lacks a keyword that a pipeline requires.
     """
     units = images.read_images(path)
     try:
         return replace(_frame(units, path), instrument=instrument or Instrument())
     except KeyError as error:
-        raise BadInput(f"{path}: header without {error.args[0]}") from None
+        raise BadInput(f"{path}: header lacks the keyword {error.args[0]}") from None
 
 
 def _frame(units: Sequence[images.Image], path: Path) -> Frame:
@@ -172,7 +218,7 @@ def _frame(units: Sequence[images.Image], path: Path) -> Frame:
     quality = next((unit for unit in planes if unit.name.endswith(_QUALITY)), None)
     quality_header = {} if quality is None else _header(quality)
     quality_plane = None if quality is None else np.asarray(quality.data)[section(quality_header["DATASEC"])]
-    # What the plane is stands in its own header.
+    # The keyword that marks a plane of flags is in the header of the plane.
     first |= {_FLAGS: quality_header[_FLAGS]} if _FLAGS in quality_header else {}
     return Frame(electrons, tuple(amplifiers), quality_plane, first, _wcs(_header(signal[0]), path, first))
 
@@ -185,7 +231,7 @@ _AmplifierData = tuple[tuple[slice, slice], Array, Array | None, Mapping[str, An
 
 
 def _parts(header: dict[str, Any], array: Array) -> list[_AmplifierData]:
-    """Of an array: where its pixels are on the detector, the pixels, columns of bias, cards, the amplifier's name."""
+    """Amplifiers of an array: their pixels on the detector, data, overscan columns (or None), cards and name."""
     if "NAMPS" in header:
         return [_numbered_amplifier(header, array, n) for n in range(1, int(header["NAMPS"]) + 1)]
     ny, nx = array.shape
@@ -197,7 +243,7 @@ def _parts(header: dict[str, Any], array: Array) -> list[_AmplifierData]:
 
 
 def _numbered_amplifier(header: dict[str, Any], array: Array, n: int) -> _AmplifierData:
-    """Amplifier n of several in one array."""
+    """Amplifier `n` of an array that contains several."""
     cards = {**header, "GAIN": header[f"GAIN{n}"]}
     if f"RDN{n}" in header and header.get("RDNDRAWN", 1.0) > 0.0:
         cards["RDNDRAWN"] = header[f"RDN{n}"]
@@ -210,13 +256,13 @@ def _amplifier(name: str, ccd: tuple[slice, slice], bias: Array | None, cards: M
     gain, read_noise = float(cards["GAIN"]), float(cards["RDNDRAWN"])
     level, noise, samples = float(cards.get("BIAS", 0.0)), np.nan, 0
     if bias is not None:
-        # Of whichever side the pixels are on, the middle half is farthest from what follows them.
+        # The middle half of the overscan is farthest from the pixels, whichever side they are on.
         cut = int(0.5 * _SKIPPED * bias.shape[1])
         overscan = bias[:, cut : bias.shape[1] - cut].astype(float)
         level = float(overscan.mean())
-        # Rows and columns have offsets of their own.
+        # Differences in both directions remove offsets of rows and columns.
         step = np.diff(np.diff(overscan, axis=1), axis=0)
-        # But for what a cosmic ray left behind.
+        # Outliers from cosmic rays are left out.
         step = step[np.abs(step) < _CLIP * 1.4826 * max(float(np.median(np.abs(step))), 1.0)]
         noise = float(np.std(step) / 2.0) * gain if step.size else np.nan
         samples = overscan.size
@@ -225,16 +271,22 @@ def _amplifier(name: str, ccd: tuple[slice, slice], bias: Array | None, cards: M
 
 
 def section(text: str) -> tuple[slice, slice]:
-    """[x1:x2,y1:y2] from 1, both ends in it -> slices of an array [ny, nx]."""
+    """Return the slices (rows, columns) of a section [x1:x2,y1:y2], which counts from 1 and includes both ends.
+
+    Raises
+    ------
+    BadInput
+        If the text does not have this form.
+    """
     match = _SECTION.fullmatch(text.strip())
     if match is None:
-        raise BadInput(f"section {text!r} is not of the form [x1:x2,y1:y2]")
+        raise BadInput(f"section must be of the form [x1:x2,y1:y2], got {text!r}")
     x1, x2, y1, y2 = map(int, match.groups())
     return slice(y1 - 1, y2), slice(x1 - 1, x2)
 
 
 def _wcs(header: dict[str, Any], path: Path, first: Mapping[str, Any]) -> WCS:
-    """Of the detector's pixels: what stands before them in the array is taken off; true where the header is unsure."""
+    """WCS of the detector's pixels without leading overscan; the true WCS if the header is uncertain."""
     cards = header if "CTYPE1" in header else first
     head_file = path.with_suffix(".head")
     if (_UNCERTAIN_POINTING in header or _UNCERTAIN_POINTING in first) and head_file.is_file():
@@ -253,7 +305,20 @@ def _wcs(header: dict[str, Any], path: Path, first: Mapping[str, Any]) -> WCS:
 
 
 def sky_to_pixel(wcs: WCS, ra: Float, dec: Float) -> tuple[Float, Float]:
-    """Columns and rows [n] of places, from 0; deg."""
+    """Return pixel columns and rows, from 0, of sky positions.
+
+    Parameters
+    ----------
+    wcs : WCS
+        World coordinates of the pixels.
+    ra, dec : float array, shape (n,)
+        Positions, deg.
+
+    Returns
+    -------
+    x, y : float array, shape (n,)
+        Columns and rows; values are not accurate if the inversion does not converge.
+    """
     if not len(ra):
         return np.zeros(0), np.zeros(0)
     with warnings.catch_warnings():

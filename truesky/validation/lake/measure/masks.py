@@ -1,8 +1,4 @@
-"""Pixels that are left out: discs about sources, and what touches other pixels.
-
-discs    pixels within a radius of places
-grown    pixels of a mask, and their neighbours
-"""
+"""Masks of pixels: discs around sources, and dilation."""
 
 from __future__ import annotations
 
@@ -14,11 +10,16 @@ from truesky.numerics.compiling import exact_jit
 
 @exact_jit
 def mark_discs(x: Float, y: Float, radius: Float, out: Bool) -> None:
-    """Mark pixels within a radius of places.
+    """Mark pixels within a radius of positions.
 
-    x, y   : [n] pixels, no disc where either is not finite
-    radius : [n] pixels, edge included; none where it is 0 or NaN, everything where it is infinite
-    out    : bool[ny, nx], what is marked stays marked
+    Parameters
+    ----------
+    x, y : float array, shape (n,)
+        Positions, pixels; no disc if one is not finite.
+    radius : float array, shape (n,)
+        Radius in pixels, edge included; 0 or NaN marks nothing, infinity marks all pixels.
+    out : bool array, shape (ny, nx)
+        Mask, changed in place; pixels that are already marked stay marked.
     """
     ny, nx = out.shape
     for i in range(len(x)):
@@ -33,9 +34,21 @@ def mark_discs(x: Float, y: Float, radius: Float, out: Bool) -> None:
 
 
 def dilate(mask: Bool, corners: bool = False, times: int = 1) -> Bool:
-    """bool[.., ny, nx]: binary dilation by the neighbours along rows and columns.
+    """Return a mask dilated by neighbours along rows and columns.
 
-    corners : diagonal neighbours, too;  times : number of iterations
+    Parameters
+    ----------
+    mask : bool array, shape (..., ny, nx)
+        Mask.
+    corners : bool
+        If True, diagonal neighbours are included.
+    times : int
+        Number of iterations.
+
+    Returns
+    -------
+    bool array, shape (..., ny, nx)
+        Dilated mask.
     """
     out = mask.copy()
     for _ in range(times):

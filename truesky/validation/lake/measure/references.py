@@ -1,8 +1,4 @@
-"""What is known of a frame's sources: the lake's tables, for one exposure and detector.
-
-Reference   rows of `rendered_truth`, with places and magnitudes of the catalogues
-Catalogue   stars and band fluxes of a lake, sorted by identifier
-"""
+"""Reference data for the sources of a frame, from the tables of the lake."""
 
 from __future__ import annotations
 
@@ -18,16 +14,30 @@ from lake_schema.store import read
 from lake_schema.tables.stars import EPOCH
 
 POINT = 0
-# Columns of `rendered_truth` that a reference is made of.
+# Columns of `rendered_truth` that a reference requires.
 TRUTH = ("id", "x", "y", "expected", "method", "psf_x", "psf_y")
-# Microjansky of AB magnitude 0, as a magnitude.
+# AB magnitude of 1 microjansky.
 ZERO = 23.9
 _JULIAN_2000, _MJD_2000, _YEAR, _MAS_A_DEG = 2000.0, 51544.5, 365.25, 3.6e6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Catalogue:
-    """Stars of a lake[n], ascending id: deg at EPOCH, mas/yr; microjansky by band, of stars and of galaxies."""
+    """Stars of a lake by ascending identifier, and band fluxes.
+
+    Attributes
+    ----------
+    id : int array, shape (n,)
+        Identifiers of the stars.
+    ra, dec : float array, shape (n,)
+        Positions at EPOCH, deg.
+    pm_ra, pm_dec : float array, shape (n,)
+        Proper motions, mas/yr.
+    flux_id : int array, shape (m,)
+        Identifiers of the band fluxes.
+    fluxes : dict of str to float array, shape (m,)
+        Fluxes by band, uJy.
+    """
 
     id: Int
     ra: Float
@@ -38,7 +48,7 @@ class Catalogue:
     fluxes: dict[str, Float]
 
     def positions_at(self, ids: Int, mjd: float) -> tuple[Float, Float]:
-        """Where stars are at a time, deg [n]; NaN of what is not in the catalogue."""
+        """Return right ascension and declination (deg) of stars at a time (MJD), NaN if not in the catalogue."""
         if not self.id.size:
             return np.full(len(ids), np.nan), np.full(len(ids), np.nan)
         at, is_known = _find(self.id, ids)
@@ -48,7 +58,7 @@ class Catalogue:
         return np.where(is_known, ra, np.nan), np.where(is_known, dec, np.nan)
 
     def magnitudes(self, ids: Int, band: str) -> Float:
-        """AB [n]; NaN of what is not there."""
+        """Return AB magnitudes in a band, NaN if not in the catalogue."""
         if band not in self.fluxes or not self.flux_id.size:
             return np.full(len(ids), np.nan)
         at, is_known = _find(self.flux_id, ids)
@@ -59,10 +69,24 @@ class Catalogue:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reference:
-    """Sources of a detector [n]: places in pixels from 0 and electrons as they were drawn, and the catalogue's own.
+    """Known sources of a detector.
 
-    ra, dec : deg, of stars at the time of the exposure, else NaN;  mag : AB of the catalogue
-    psf_x, psf_y : windowed centroid of a point of its colour there, minus its place, pixels
+    Attributes
+    ----------
+    id : int array, shape (n,)
+        Identifiers.
+    x, y : float array, shape (n,)
+        Positions in pixels from 0, as drawn.
+    expected : float array, shape (n,)
+        Expected electrons.
+    point : bool array, shape (n,)
+        True for point sources.
+    psf_x, psf_y : float array, shape (n,)
+        Windowed centroid of a point source of this colour at this position, minus its position, pixels.
+    ra, dec : float array, shape (n,)
+        Catalogue positions of stars at the time of the exposure, deg; NaN for other sources.
+    mag : float array, shape (n,)
+        AB magnitudes of the catalogue.
     """
 
     id: Int
@@ -81,9 +105,21 @@ class Reference:
 
 
 def load_catalogue(tables: Mapping[str, read.Version], ids: Int, bands: Sequence[str]) -> Catalogue:
-    """Of the stars that a lake's frames show; what the lake has no table of is left empty.
+    """Read stars and their fluxes; tables that the lake does not have are left empty.
 
-    tables : of the lake, by name;  ids : that are wanted, ascending;  bands : whose fluxes are wanted
+    Parameters
+    ----------
+    tables : mapping of str to Version
+        Tables of the lake by name.
+    ids : int array, shape (n,)
+        Identifiers of the stars to read, ascending.
+    bands : sequence of str
+        Bands whose fluxes are read.
+
+    Returns
+    -------
+    Catalogue
+        Stars and fluxes.
     """
     empty = np.zeros(0)
     columns = {name: empty for name in ("id", "ra", "dec", "pm_ra", "pm_dec")}
@@ -106,7 +142,24 @@ def load_catalogue(tables: Mapping[str, read.Version], ids: Int, bands: Sequence
 
 
 def build_reference(truth: pa.Table, catalogue: Catalogue, band: str, mjd: float) -> Reference:
-    """Of one frame: truth : its rows of `rendered_truth`;  known : of the lake;  band, mjd : of the exposure."""
+    """Return the reference data of one frame.
+
+    Parameters
+    ----------
+    truth : Table
+        Rows of `rendered_truth` of the frame.
+    catalogue : Catalogue
+        Catalogue of the lake.
+    band : str
+        Band of the exposure.
+    mjd : float
+        Time of the exposure, MJD.
+
+    Returns
+    -------
+    Reference
+        Sources with positions and magnitudes of the catalogue.
+    """
     ids = truth["id"].to_numpy()
     psf_offsets = {name: pc.fill_null(truth[name], np.nan).to_numpy() for name in ("psf_x", "psf_y")}
     ra, dec = catalogue.positions_at(ids, mjd)

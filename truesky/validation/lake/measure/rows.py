@@ -1,9 +1,4 @@
-"""One measurement of a lake, and what it should be.
-
-Row              a row of the table `validation`
-row_of_check     the row of a check of the lists of expectations
-not_applicable   the row of a check that found nothing to measure
-"""
+"""Rows of the table `validation`: a measurement of a lake and its expectation."""
 
 from __future__ import annotations
 
@@ -16,7 +11,7 @@ from truesky.validation.verdicts import NOT_APPLICABLE, WITHIN, verdict
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where something was measured: an exposure's detector, a band of a channel, or the whole lake (all None)."""
+    """Place of a measurement: a detector of an exposure, a band of a channel, or the whole lake (all None)."""
 
     channel: str | None = None
     band: str | None = None
@@ -25,21 +20,37 @@ class Place:
 
     @property
     def text(self) -> str:
-        """Parts that are known, one after the other; "lake" of the whole."""
+        """Known parts of the place, separated by "/"; "lake" for the whole lake."""
         number = None if self.exposure_id is None else f"{self.exposure_id:06d}"
         return "/".join(part for part in (self.channel, self.band, number, self.detector) if part) or "lake"
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """What was measured, where, and what it should be.
+    """A measurement and its expectation.
 
-    check, quantity : names;  place : where
-    value, error    : measured, and its standard error, in `unit`; NaN where nothing could be measured
-    expected, tolerance : of the value; kind : "around" within the tolerance, "least" or "most" beyond it on one side
-    source          : where the expectation and the tolerance are from
-    note            : what was sampled; why the check does not apply
-    known           : why it is known to fail, "" where it has to pass
+    Attributes
+    ----------
+    check, quantity : str
+        Names of the check and of the quantity.
+    place : Place
+        Place of the measurement.
+    value, error : float
+        Measured value and its standard error in `unit`; NaN if not measured.
+    expected, tolerance : float
+        Expected value and allowed deviation.
+    unit : str
+        Unit of the numbers, "" for a ratio.
+    source : str
+        Source of the expectation and the tolerance.
+    kind : str
+        "around" for both sides, "least" or "most" for a limit on one side.
+    note : str
+        Description of the sample, or reason why the check does not apply.
+    applies : bool
+        False if there was nothing to measure.
+    known_failure : str
+        Reason for which the row is known to fail, "" if it must pass.
     """
 
     check: str
@@ -58,17 +69,32 @@ class Row:
 
     @property
     def verdict(self) -> str:
-        """Of the value; "not_applicable" where there was nothing to measure."""
+        """Verdict on the value; "not_applicable" if there was nothing to measure."""
         if not self.applies:
             return NOT_APPLICABLE
         return verdict(self.value, self.error, self.expected, self.tolerance, self.kind)
 
 
 def not_applicable(check: str, place: Place, why: str, source: str, quantity: str = "") -> Row:
-    """A check that found nothing that it could measure.
+    """Return the row of a check that found nothing to measure.
 
-    check, source : its name, and where its expectations are from;  place : where;  why : in a few words
-    quantity      : that could not be measured, "" = none of the check's
+    Parameters
+    ----------
+    check : str
+        Name of the check.
+    place : Place
+        Place that was checked.
+    why : str
+        Reason in a few words.
+    source : str
+        Source of the expectations.
+    quantity : str
+        Quantity that could not be measured, "" for all quantities of the check.
+
+    Returns
+    -------
+    Row
+        Row with the verdict "not_applicable".
     """
     nan = math.nan
     return Row(check, quantity, place, nan, nan, nan, nan, "", source, note=why, applies=False)
@@ -86,15 +112,15 @@ def row_of_check(name: str, check: Check, error: float, note: str) -> Row:
     error : float
         Standard error of the figure; NaN if it is not known.
     note : str
-        What was sampled.
+        Description of the sample.
 
     Returns
     -------
     Row
-        Its verdict is undecided if the expectation is remembered.
+        Its verdict is undecided if the expectation is not binding.
     """
     row_error = error if check.is_binding else math.nan
-    default_note = "" if check.is_binding else "a remembered number: it decides nothing"
+    default_note = "" if check.is_binding else "the expectation is quoted from memory: not binding"
     return Row(
         name,
         check.name,

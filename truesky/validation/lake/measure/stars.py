@@ -1,10 +1,13 @@
-"""Stars of a frame, measured: centroids, curves of growth, moments.
+"""Measure stars of a frame: centroids, curves of growth and moments.
 
-measured   stars that can be trusted, each where the frame's own WCS puts it
-Stars      what was measured of them
+Notes
+-----
+Positions are windowed centroids. The window is a Gaussian whose FWHM is the half-light diameter of a point source, as
+for the centroid offsets in the tables of the lake.
 
-Positions are windowed centroids in the window that the lake's offsets are of: a Gaussian whose FWHM is the half-light
-diameter of a point source.  Ref : Bertin & Arnouts 1996 (XWIN_IMAGE)
+References
+----------
+Bertin & Arnouts 1996 (XWIN_IMAGE)
 """
 
 from __future__ import annotations
@@ -22,35 +25,53 @@ from truesky.validation.lake.measure.references import Reference
 from truesky.validation.lake.measure.wings import Wings
 
 FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
-# Half the side of what is looked at about a star, in FWHM and at least pixels; the outer part of it tells the sky.
+# Half the side of the cutout of a star in FWHM, and at least pixels; the sky is measured outside this fraction of it.
 _REACH, _MIN_REACH, _SKY_FROM = 10.0, 20, 0.75
-# Radii of the apertures, as a part of that reach, and the one that half-light is told by.
+# Radii of the apertures as fractions of half the side; they also give the half-light radius.
 _APERTURES = np.array([0.02, 0.03, 0.04, 0.055, 0.075, 0.1, 0.14, 0.19, 0.26, 0.35, 0.46, 0.6, 0.75])
-# S/N of a star that is used, part of the full well that its brightest pixel may reach, light of others beside it.
+# Smallest S/N, largest fraction of the full well in the brightest pixel, and largest relative light of neighbours.
 _MIN_SNR, _MAX_FULL, _MAX_BLEND = 60.0, 0.6, 0.01
-# Others are looked for within so many FWHM, their light as a part of the star's.
+# Neighbours are searched within this number of FWHM.
 _BLEND_REACH = 8.0
 MAX_STARS = 400
-# Radius at which a Gaussian has fallen to a third, over half its FWHM.
+# Radius at which a Gaussian falls to a third, in units of half its FWHM.
 _PROFILE_EXTENT = 1.26
-# Parts of the stars that are left out in turn for the error of the FWHM.
+# Number of jackknife groups of stars for the error of the FWHM.
 _PARTS = 8
-# Pixels from a star's place in which its light goes with the place in the pixel.
+# Radius in pixels within which the light depends on the position within the pixel.
 _CORE = 3.0
-# Standard deviations above what other stars have there, from which a pixel is another's light.
+# Standard deviations above the mean profile of stars from which a pixel is contaminated.
 _HIT = 5.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stars:
-    """Stars [n] of a frame.
+    """Measured stars of a frame.
 
-    x, y     : where the WCS puts them, pixels from 0;  dx, dy : windowed centroid minus that and the PSF's own offset
-    error    : of either, pixels, of photons and reading;  phase_x, phase_y : of the place in its pixel
-    growth   : float[n, apertures] e- within the radii, had the optics no vignetting
-    flux     : expected e-;  mag : AB of the catalogue
-    size, e1, e2 : rms radius in the window, pixels, and its ellipticity
-    sky, peak, snr : e- a pixel, e-, of all of it
+    Attributes
+    ----------
+    id : int array, shape (n,)
+        Identifiers.
+    x, y : float array, shape (n,)
+        Positions from the catalogue and the WCS, pixels from 0.
+    dx, dy : float array, shape (n,)
+        Windowed centroid minus this position and minus the offset of the PSF, pixels.
+    error : float array, shape (n,)
+        Error of dx and of dy from photons and read noise, pixels.
+    growth : float array, shape (n, apertures)
+        Light within the radii, corrected for vignetting, e-.
+    flux : float array, shape (n,)
+        Expected light, e-.
+    mag : float array, shape (n,)
+        AB magnitude of the catalogue.
+    size, e1, e2 : float array, shape (n,)
+        rms radius in the window, pixels, and ellipticity.
+    sky : float array, shape (n,)
+        Sky level, e- per pixel.
+    peak : float array, shape (n,)
+        Brightest pixel above the sky, e-.
+    snr : float array, shape (n,)
+        Signal-to-noise ratio.
     """
 
     id: Int
@@ -73,15 +94,26 @@ class Stars:
         return len(self.id)
 
     def select(self, mask: Bool) -> Stars:
-        """Those that are kept."""
+        """Return the stars selected by a mask."""
         return Stars(*(getattr(self, field.name)[mask] for field in fields(self)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarMeasurements:
-    """Stars, radii of the apertures, half-light radius and FWHM of a point source, and the latter's error, pixels.
+    """Stars of a frame, and the profile of a point source.
 
-    sky_at : distances from the star at which the sky was taken, pixels;  wings : of a point source
+    Attributes
+    ----------
+    stars : Stars
+        Measured stars.
+    radii : float array, shape (apertures,)
+        Radii of the apertures, pixels.
+    half_light, fwhm, fwhm_error : float
+        Half-light radius and FWHM of a point source, and the error of the FWHM, pixels.
+    sky_at : float array, shape (m,)
+        Distances from the star of the pixels in which the sky is measured, pixels.
+    wings : Wings
+        Wings of a point source.
     """
 
     stars: Stars
@@ -94,9 +126,21 @@ class StarMeasurements:
 
 
 def select_stars(frame: Frame, sources: Reference, noise: float) -> Int:
-    """Indices of stars worth measuring, brightest first: alone, not saturated, of enough signal.
+    """Return indices of isolated, unsaturated and bright stars, brightest first.
 
-    noise : e- rms of a pixel of blank sky
+    Parameters
+    ----------
+    frame : Frame
+        A frame.
+    sources : Reference
+        Known sources of the frame.
+    noise : float
+        rms of a pixel of blank sky, e-.
+
+    Returns
+    -------
+    int array, shape (n,)
+        Indices of the sources.
     """
     width = float(frame.header["PSFFWHM"]) / frame.scale
     area = np.pi * (1.5 * width) ** 2
@@ -122,7 +166,22 @@ def _reach(frame: Frame) -> int:
 
 
 def measure_stars(frame: Frame, sources: Reference, noise: float) -> StarMeasurements:
-    """Up to MOST stars of a frame; noise : e- rms of a pixel of blank sky."""
+    """Measure up to MAX_STARS stars of a frame.
+
+    Parameters
+    ----------
+    frame : Frame
+        A frame.
+    sources : Reference
+        Known sources of the frame.
+    noise : float
+        rms of a pixel of blank sky, e-.
+
+    Returns
+    -------
+    StarMeasurements
+        Stars and the profile of a point source.
+    """
     index = select_stars(frame, sources, noise)
     reach = _reach(frame)
     radii = _APERTURES * reach
@@ -183,7 +242,7 @@ def measure_stars(frame: Frame, sources: Reference, noise: float) -> StarMeasure
 
 
 def _cutouts(image: np.ndarray, x: Float, y: Float, reach: int) -> tuple[Float, Int, Int]:
-    """float[n, side, side] about places, and the column and row of their first pixel."""
+    """Square cutouts around positions, and the column and row of their first pixels."""
     first_column, first_row = (np.rint(axis).astype(int) - reach for axis in (x, y))
     side = 2 * reach + 1
     cuts = [image[b : b + side, a : a + side] for a, b in zip(first_column, first_row, strict=True)]
@@ -191,7 +250,7 @@ def _cutouts(image: np.ndarray, x: Float, y: Float, reach: int) -> tuple[Float, 
 
 
 def _neighbour_mask(sources: Reference, index: Int, first_column: Int, first_row: Int, noise: float, side: int) -> Bool:
-    """bool[n, side, side]: where another source shows in the cut of a star; left, low : of its first pixel."""
+    """Mask of pixels in cutouts of stars in which another source is visible."""
     out = np.zeros((len(index), side, side), bool)
     if not len(index):
         return out
@@ -200,16 +259,16 @@ def _neighbour_mask(sources: Reference, index: Int, first_column: Int, first_row
     for n, (i, nearby) in enumerate(zip(index, neighbours, strict=True)):
         neighbour_indices = np.array([j for j in nearby if j != i], int)
         out[n] = wings.neighbour_mask(sources, neighbour_indices, first_column[n] + axis, first_row[n] + axis, noise)
-    # In the star's own core there is no telling whose light it is.
+    # The core of a star is not masked, since light there cannot be assigned to a neighbour.
     core = np.hypot(axis - side // 2, (axis - side // 2)[:, None]) < _CORE
     return out & ~core
 
 
 def _clipped_mean(values: Float, good: Bool, noise: float) -> Float:
-    """Means [n] of the good ones of values [n, m] but for those far from their median."""
+    """Mean of the good values of each row without outliers."""
     if not len(values):
         return np.zeros(0)
-    # Where nothing is good, all of it has to do.
+    # All values are used if none is good.
     good = good | ~good.any(axis=1, keepdims=True)
     middle = np.nanmedian(np.where(good, values, np.nan), axis=1)
     used = good & (np.abs(values - middle[:, None]) < 3.0 * noise)
@@ -217,22 +276,20 @@ def _clipped_mean(values: Float, good: Bool, noise: float) -> Float:
 
 
 def _replace_contaminated(cuts: Float, neighbour_mask: Bool, flux: Float, noise: float) -> Float:
-    """Without what cosmic rays and neighbours bring: where others are known to shine, and what is far above what other
-    stars have there, is what these have.
-    """
+    """Replace pixels with light of cosmic rays or neighbours by the typical profile of the stars."""
     if len(cuts) < 8:
         return cuts
     typical = np.maximum(np.median(cuts / flux[:, None, None], axis=0), 0.0)
     expected = flux[:, None, None] * typical
     axis = np.arange(cuts.shape[-1]) - cuts.shape[-1] // 2
-    # Near the middle light depends on the place in the pixel.
+    # The core depends on the position within the pixel.
     core = np.hypot(axis, axis[:, None]) < _CORE
     hit = (cuts > expected + _HIT * np.sqrt(noise**2 + expected) + 0.5 * expected) & ~core
     return np.where(hit | neighbour_mask, expected, cuts)
 
 
 def _growth(cuts: Float, x: Float, y: Float, radii: Float) -> Float:
-    """e- [n, apertures] within circles; light is even in a pixel."""
+    """Light (e-) of each star within circles; light is evenly distributed within a pixel."""
     out = np.zeros((len(cuts), len(radii)))
     for i, cut in enumerate(cuts):
         out[i] = [sep.sum_circle(cut, [x[i]], [y[i]], r, subpix=0)[0][0] for r in radii]
@@ -240,17 +297,17 @@ def _growth(cuts: Float, x: Float, y: Float, radii: Float) -> Float:
 
 
 def _half_light(growth: Float, flux: Float, radii: Float) -> float:
-    """Pixels; of the light that the widest aperture holds."""
+    """Half-light radius in pixels relative to the light within the widest aperture."""
     if not len(growth):
         return float(radii[4])
     mean = np.median(growth / flux[:, None], axis=0)
-    # Of a Gaussian's light the part outside is exp(-r^2 / 2 sigma^2): its logarithm is nearly straight in r^2.
+    # For a Gaussian, the log of the fraction outside r, exp(-r^2 / 2 sigma^2), is linear in r^2.
     outside = np.minimum.accumulate(np.clip(1.0 - mean / mean[-1], 1e-6, 1.0))
     return float(np.sqrt(np.interp(np.log(2.0), np.append(0.0, -np.log(outside)), np.append(0.0, radii**2))))
 
 
 def _fwhm_with_error(cuts: Float, x: Float, y: Float, flux: Float, window: float) -> tuple[float, float]:
-    """(FWHM, its error by leaving out parts of the stars in turn); as of `_fwhm`."""
+    """FWHM and its jackknife error over groups of stars."""
     bright = np.argsort(-flux, kind="stable")[: max(len(flux) // 2, 4)]
     fwhm = _fwhm(cuts[bright], x[bright], y[bright], flux[bright], window)
     parts = min(_PARTS, len(bright))
@@ -265,9 +322,9 @@ def _fwhm_with_error(cuts: Float, x: Float, y: Float, flux: Float, window: float
 
 
 def _fwhm(cuts: Float, x: Float, y: Float, flux: Float, window: float) -> float:
-    """Pixels, of the mean profile of stars, whose places in a pixel sample it finely; NaN of too few.
+    """FWHM (pixels) of the mean profile of stars, whose positions sample a pixel finely; NaN if there are too few.
 
-    The logarithm of the light is told by r^2 and r^4 as far as it falls to a third.
+    The logarithm of the light is fitted with r^2 and r^4 down to a third of the peak.
     """
     if len(flux) < 3:
         return np.nan
@@ -284,7 +341,7 @@ def _fwhm(cuts: Float, x: Float, y: Float, flux: Float, window: float) -> float:
         residual = log_light - first - second * square - fourth * square**2
         used = np.abs(residual) < 4.0 * 1.4826 * np.median(np.abs(residual)) + 1e-9
         square, log_light = square[used], log_light[used]
-    # Where second u + fourth u^2 = -ln 2, u = r^2.
+    # Half maximum is at u = r^2 with second u + fourth u^2 = -ln 2.
     root = second**2 - 4.0 * fourth * np.log(2.0)
     if second >= 0.0 or root <= 0.0:
         return np.nan
@@ -292,7 +349,7 @@ def _fwhm(cuts: Float, x: Float, y: Float, flux: Float, window: float) -> float:
 
 
 def _windowed_moments(cuts: Float, x: Float, y: Float, window: float) -> tuple[Float, ...]:
-    """Centroids (pixels of the cut), second moments in the window, and the light in it, of each [n]."""
+    """Centroids (pixels of the cutout), second moments in the window, and the light in it, of each star."""
     axis = np.arange(cuts.shape[-1])
     cx, cy = x.copy(), y.copy()
     for _ in range(12):

@@ -1,10 +1,10 @@
-"""Wings of a frame's point source, where the noise of a pixel hides them: a power law through rings about its stars.
+"""Measure the wings of a frame's point source, a power law, from rings around its brightest stars.
 
-Where the rings do not tell it, wings are those that telescopes have, to a half: a frame without bright stars, or whose
-sky is uneven, says so by the error.
-
-Wings   what of a point's light lies in a pixel, and beyond a radius
-told    a frame's stars -> Wings
+Notes
+-----
+The noise of single pixels hides the wings, so rings are averaged. If the rings contain little information, typical
+wings of telescopes are used, with an error of a half. A frame without bright stars or with an uneven sky therefore has
+a large error.
 """
 
 from __future__ import annotations
@@ -19,30 +19,42 @@ from truesky.validation.lake.measure import masks
 from truesky.validation.lake.measure.frames import Frame
 from truesky.validation.lake.measure.references import Reference
 
-# Far wings fall as r^-3 (obscured aperture) or r^-11/3 (turbulence); nearer ones, with their rings, a little less.
+# Far wings fall as r^-3 (obscured aperture) or r^-11/3 (turbulence); nearer wings with diffraction rings are shallower.
 _SLOPES = np.arange(2.4, 4.01, 0.05)
 _TYPICAL_SLOPE, _SLOPE_SPREAD = 3.0, 0.03
-# All light of a star of the ground is what lies within so many arcsec: zero points are of standard stars in apertures.
+# All light of a star in ground images is that within this radius (arcsec), since zero points use standard stars in
+# apertures.
 _GROUND_EXTENT = 25.0
-# Rings, from a part of the reach of a star's aperture to several times that; pixels at most; the least that tell it.
+# Inner and outer edge of the rings in units of the reach of the stars' apertures; largest radius, pixels; number of
+# rings, and smallest number of usable rings.
 _FROM, _TO, _MAX_RADIUS, _RINGS, _MIN_RINGS = 0.5, 4.0, 120, 14, 6
-# Of a point's light in an arcsec2 at 1": diffraction by the edges of Euclid's pupil, by filter; of turbulence and an
-# aureole, which fall so together from 5" to 25". Part of itself by which either may be wrong.
+# Light per arcsec2 at 1" relative to all light. Space: diffraction by the edges of Euclid's pupil, by filter. Ground:
+# turbulence and an aureole, which together fall this way from 5" to 25". Relative errors of both.
 _SPACE = {"euclid_vis": 9.3e-3, "euclid_y": 1.4e-2, "euclid_j": 1.8e-2, "euclid_h": 2.3e-2}
 _GROUND, _UNSURE_SPACE, _UNSURE_GROUND = 1.5e-2, 0.2, 0.5
-# Stars that are asked, the fewest that tell anything, and what another nearby may have of a star's light.
+# Largest and smallest number of stars, and largest flux of a nearby source relative to the star.
 _MAX_STARS, _MIN_STARS, _MAX_NEIGHBOUR = 24, 2, 1.0
-# Where another source's wings, r^-3 of this part of its light at a pixel, bring more than so much of the noise.
+# Wings of neighbours are this fraction of their light times r^-3; they are visible above this fraction of the noise, at
+# least within this radius (pixels).
 _WING, _SHOWS, _CORE = 0.1, 0.1, 6.0
-# Standard deviations above the ring from which a pixel is hit; how much brighter spikes may be, whose light counts.
+# Standard deviations above a ring from which a pixel is hit; factor by which diffraction spikes may exceed the ring.
 _HIT, _SPIKE = 4.0, 8.0
 
 
 @dataclass(frozen=True, slots=True)
 class Wings:
-    """strength r^-slope of a point's light is in a pixel at r pixels.
+    """Power-law wings: strength * r^-slope is the fraction of a point source's light in a pixel at r pixels.
 
-    whole : pixels, within which all light lies;  error : of the strength
+    Attributes
+    ----------
+    strength : float
+        Fraction of the light in a pixel at 1 pixel.
+    slope : float
+        Negative exponent of the power law.
+    outer_radius : float
+        Radius that contains all light, pixels.
+    error : float
+        Error of the strength.
     """
 
     strength: float
@@ -51,20 +63,26 @@ class Wings:
     error: float = 0.0
 
     def profile(self, radius: Float) -> Float:
-        """Part of all light in a pixel, pix^-2."""
+        """Return the fraction of all light per pixel at a radius in pixels."""
         return np.asarray(self.strength * radius**-self.slope)
 
     def fraction_beyond(self, radius: float) -> float:
-        """Part of all light."""
+        """Return the fraction of all light beyond a radius in pixels."""
         power = 2.0 - self.slope
         return float(2.0 * np.pi * self.strength * (radius**power - max(self.outer_radius, radius) ** power) / -power)
 
 
 def typical(frame: Frame) -> Wings:
-    """Of a telescope of its kind.
+    """Return typical wings of a telescope of this kind.
 
-    Ref : edges of length P about a pupil of area A bring lambda P / (4 pi^3 A theta^3) of the light into a solid angle
-          (the mean over all directions; Born & Wolf 1999, Principles of Optics, sec. 8.8)
+    Notes
+    -----
+    Edges of length P around a pupil of area A diffract the fraction lambda P / (4 pi^3 A theta^3) of the light into a
+    solid angle, averaged over all directions.
+
+    References
+    ----------
+    Born & Wolf 1999, Principles of Optics, sec. 8.8
     """
     if frame.header["CHANNEL"] == "EXT":
         strength = _GROUND / frame.scale
@@ -74,10 +92,25 @@ def typical(frame: Frame) -> Wings:
 
 
 def measure(frame: Frame, sources: Reference, index: Int, noise: float, reach: int) -> Wings:
-    """Of the frame's brightest stars, and the usual ones, each by its error.
+    """Measure the wings from the brightest stars, and combine them with typical wings weighted by their errors.
 
-    known : sources of the frame;  index : of the stars in it, brightest first, none of them saturated
-    noise : e- rms of a pixel of blank sky;  reach : of the stars' apertures, pixels
+    Parameters
+    ----------
+    frame : Frame
+        A frame.
+    sources : Reference
+        Known sources of the frame.
+    index : int array, shape (n,)
+        Indices of unsaturated stars, brightest first.
+    noise : float
+        rms of a pixel of blank sky, e-.
+    reach : int
+        Reach of the stars' apertures, pixels.
+
+    Returns
+    -------
+    Wings
+        Measured wings, or typical ones if there are too few stars.
     """
     outer_radius = min(round(_TO * reach), _MAX_RADIUS)
     edges = np.geomspace(_FROM * reach, outer_radius, _RINGS + 1)
@@ -99,7 +132,7 @@ def measure(frame: Frame, sources: Reference, index: Int, noise: float, reach: i
     if len(means) < _MIN_STARS:
         return expected
     fit = _fit_wings(np.array(means), np.array(weights), np.array(fluxes), np.sqrt(edges[1:] * edges[:-1]))
-    # Slopes turn about the aperture's edge.
+    # The strengths at the reach of the aperture are compared, so the typical strength is scaled to the fitted slope.
     as_steep = float(reach) ** (fit.slope - expected.slope)
     first, second = fit.error**-2, (expected.error * as_steep) ** -2
     strength = (first * fit.strength + second * expected.strength * as_steep) / (first + second)
@@ -109,7 +142,7 @@ def measure(frame: Frame, sources: Reference, index: Int, noise: float, reach: i
 def _rings(
     frame: Frame, sources: Reference, i: int, neighbours: Int, edges: Float, noise: float
 ) -> tuple[Float, Float]:
-    """(e- a pixel of each ring about a source, its weight e-^-2), 0 where little of the ring is left."""
+    """Mean e- per pixel of each ring around a source and its weight (e-^-2), 0 if too little of the ring is usable."""
     ny, nx = frame.electrons.shape
     outer_radius = int(np.ceil(edges[-1]))
     column, row = round(float(sources.x[i])), round(float(sources.y[i]))
@@ -124,7 +157,7 @@ def _rings(
         values = cut[inside & good]
         if values.size < 0.2 * inside.sum() or values.size < 8:
             continue
-        # Spikes are light, too: only what is above them is put down to cosmic rays.
+        # Diffraction spikes also count as light; only pixels above them are attributed to cosmic rays.
         middle = float(np.median(values))
         wing_signal = sources.expected[i] * _WING * edges[k] ** -_TYPICAL_SLOPE
         values = values[np.abs(values - middle) < _HIT * np.hypot(noise, np.sqrt(wing_signal)) + _SPIKE * wing_signal]
@@ -133,10 +166,23 @@ def _rings(
 
 
 def neighbour_mask(sources: Reference, neighbours: Int, across: Int, up: Int, noise: float) -> Bool:
-    """bool[ny, nx]: pixels of a cut in which another source shows.
+    """Return a mask of pixels of a cutout in which another source is visible.
 
-    known, near : sources of the frame, and indices of those that are looked at
-    across, up  : columns [nx] and rows [ny] of the cut;  noise : e- rms of a pixel of blank sky
+    Parameters
+    ----------
+    sources : Reference
+        Known sources of the frame.
+    neighbours : int array, shape (n,)
+        Indices of the sources to mask.
+    across, up : int array, shape (nx,) and (ny,)
+        Columns and rows of the cutout.
+    noise : float
+        rms of a pixel of blank sky, e-.
+
+    Returns
+    -------
+    bool array, shape (ny, nx)
+        Mask.
     """
     out = np.zeros((len(up), len(across)), bool)
     reach = np.cbrt(_WING * sources.expected[neighbours] / (_SHOWS * noise))
@@ -146,12 +192,12 @@ def neighbour_mask(sources: Reference, neighbours: Int, across: Int, up: Int, no
 
 
 def _fit_wings(mean: Float, weight: Float, flux: Float, radius: Float) -> Wings:
-    """Of all stars together: mean = sky of each star + flux strength r^-slope.
+    """Fit mean = sky of each star + flux strength r^-slope to all stars together.
 
-    mean, weight : [n, rings];  flux : [n] e-;  radius : [rings]
+    `mean` and `weight` have the shape (n, rings); `flux` is in e-, `radius` in pixels.
     """
     total = weight.sum(axis=1, keepdims=True)
-    # The sky of each star is what the weighted means of both leave.
+    # The sky of each star is removed with weighted means.
     offset = mean - (weight * mean).sum(axis=1, keepdims=True) / total
     fits, residuals = [], []
     for slope in _SLOPES:
@@ -162,7 +208,7 @@ def _fit_wings(mean: Float, weight: Float, flux: Float, radius: Float) -> Wings:
         residuals.append(float((weight * (offset - strength * bent) ** 2).sum()))
         fits.append(Wings(strength, float(slope), error=power**-0.5))
     freedom = max(int((weight > 0.0).sum()) - len(flux) - 2, 1)
-    # What rings differ by beyond their noise tells the slope no better than the noise does.
+    # Scatter of the rings beyond their noise lowers their weight relative to the typical slope.
     scale = max(min(residuals) / freedom, 1.0)
     best = fits[int(np.argmin(np.array(residuals) / scale + ((_SLOPES - _TYPICAL_SLOPE) / _SLOPE_SPREAD) ** 2))]
     return replace(best, error=best.error * scale**0.5)

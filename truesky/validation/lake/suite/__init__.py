@@ -1,1 +1,1 @@
-"""The checks of a lake together: what it holds, which checks that asks for, the table `validation` and its report."""
+"""All checks of a lake: inventory of its contents, choice of checks, table `validation` and HTML report."""

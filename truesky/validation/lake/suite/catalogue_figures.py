@@ -1,7 +1,4 @@
-"""Pictures of the catalogue in the report: counts, redshifts, colours, clustering and shear, with what is expected.
-
-drawn   (caption, figure) of whatever there is something of
-"""
+"""Plot catalogue results for the report: counts, redshifts, colours, clustering and shear with their expectations."""
 
 from __future__ import annotations
 
@@ -18,25 +15,40 @@ from truesky.validation.lake.measure.rows import Row
 
 _INK, _PALETTE = "#1f4e79", ("#1f4e79", "#b8541a", "#2e7d4f")
 _COUNT = re.compile(r"log_i_([0-9.]+)")
-_ERROR_NOTE = "Errors leave out patches of the field in turn"
+_ERROR_NOTE = "Errors are jackknife errors over patches of the field"
 
 
 def draw_all(rows: Sequence[Row], series: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
-    """Of the rows and the series of all checks of catalogues."""
+    """Yield a caption and a figure for every catalogue result that has data.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows of all checks of catalogues.
+    series : mapping of str to array
+        Series of all checks of catalogues by name.
+
+    Yields
+    ------
+    caption : str
+        Caption of the figure.
+    figure : Figure
+        The figure.
+    """
     counts = [row for row in rows if row.check == "observed" and _COUNT.fullmatch(row.quantity)]
     counts = [row for row in counts if np.isfinite(row.value)]
     if counts:
         yield (
-            f"galaxies: counts against magnitude, and those of {counts[0].source}. {_ERROR_NOTE}.",
+            f"galaxies: counts against magnitude, compared with {counts[0].source}. {_ERROR_NOTE}.",
             _plot_counts(counts),
         )
     if "redshifts" in series and "colours" in series:
-        text = "galaxies: redshifts of those with I_E < 24.5, and colours of those with i < 22.5 against redshift"
+        text = "galaxies: redshifts for I_E < 24.5, and colours against redshift for i < 22.5"
         yield f"{text}. {_ERROR_NOTE}.", _plot_redshifts(series)
     if "colour_colour" in series:
-        text = "galaxies: colours of the fluxes of those brighter than 23 at 5600 A and nearer than z = 1.5"
+        text = "galaxies: colours of the fluxes for magnitudes below 23 at 5600 A and z < 1.5"
         yield (
-            f"{text}; the line is where red ones at z < 0.4 are observed (Eisenstein et al. 2001).",
+            f"{text}; the line is the observed locus of red galaxies at z < 0.4 (Eisenstein et al. 2001).",
             _plot_colours(series),
         )
     limits = [name.removeprefix("w_theory_") for name in series if name.startswith("w_theory_")]
@@ -44,7 +56,7 @@ def draw_all(rows: Sequence[Row], series: Mapping[str, Any]) -> Iterator[tuple[s
         text = "galaxies: how they cluster on the sky, and non-linear theory with the bias of their halos"
         yield f"{text}. {_ERROR_NOTE}.", _plot_clustering(series, limits)
     if "shear" in series:
-        text = "galaxies: two points of shear at 0.8 < z < 1.2, and non-linear theory"
+        text = "galaxies: shear correlation functions at 0.8 < z < 1.2, and non-linear theory"
         yield f"{text}. {_ERROR_NOTE}; neighbouring points are not independent.", _plot_shear(series)
 
 
@@ -58,11 +70,11 @@ def _plot_counts(rows: Sequence[Row]) -> Figure:
     error = np.nan_to_num(error)
     for axis, zero in ((left_axes, 0.0), (right_axes, expected)):
         axis.fill_between(mag, expected - tolerance - zero, expected + tolerance - zero, color="k", alpha=0.12, lw=0)
-        axis.plot(mag, expected - zero, "k-", lw=1, label="observed, and its tolerance")
+        axis.plot(mag, expected - zero, "k-", lw=1, label="observed, with tolerance")
         axis.errorbar(mag, value - zero, error, fmt="o", ms=4, color=_INK, capsize=2, label="this lake")
         axis.set_xlabel("i, AB mag")
     left_axes.set_ylabel("log$_{10}$ of galaxies mag$^{-1}$ deg$^{-2}$")
-    right_axes.set_ylabel("the same less that observed, dex")
+    right_axes.set_ylabel("simulated - observed, dex")
     left_axes.legend()
     return figure
 
@@ -74,7 +86,7 @@ def _plot_redshifts(series: Mapping[str, Any]) -> Figure:
     middle = 0.5 * (low + high)
     left_axes.stairs(number, np.append(low, high[-1]), color=_INK, label="this lake")
     left_axes.errorbar(middle, number, np.nan_to_num(error), fmt="none", ecolor=_INK, capsize=2, lw=1)
-    # The distribution that forecasts of Euclid take: a median of 0.9.
+    # Redshift distribution of Euclid forecasts, with a median of 0.9.
     z = np.linspace(0.0, float(high[-1]), 200)
     shape = z**2 * np.exp(-((z * 1.412 / 0.9) ** 1.5))
     total = float(np.sum(number * (high - low)))
@@ -149,12 +161,12 @@ def _plot_shear(series: Mapping[str, Any]) -> Figure:
 
 
 def _plot_points(axis: Any, x: Float, y: Float, error: Float, color: str, label: str) -> None:
-    """Points on logarithmic axes; open ones below 0, at what they would be above."""
+    """Plot points on logarithmic axes; negative values are open symbols at their absolute value."""
     for sign, fill in ((1.0, color), (-1.0, "none")):
         has_sign = sign * y > 0.0
         if has_sign.any():
             bar = np.nan_to_num(error[has_sign])
-            # A bar that reaches below 0 ends near the axis.
+            # A bar that would reach below 0 ends near the axis.
             bars = np.stack([np.minimum(bar, 0.9 * np.abs(y[has_sign])), bar])
             axis.errorbar(x[has_sign], sign * y[has_sign], bars, fmt="o", ms=4, color=color, mfc=fill, capsize=2,
                           label=label if sign > 0 else f"-{label}")  # fmt: skip
@@ -168,5 +180,5 @@ def _format_ratio_axes(axis: Any, label: str, tolerance: float) -> None:
 
 
 def _plain_ticks(axis: Any) -> None:
-    """1 and 10 for 10^0 and 10^1."""
+    """Label ticks 1 and 10 instead of 10^0 and 10^1."""
     axis.xaxis.set_major_formatter("{x:g}")

@@ -1,4 +1,4 @@
-"""Which checks there are; each is a file of its own."""
+"""List of all checks of a lake."""
 
 from __future__ import annotations
 
@@ -35,7 +35,16 @@ from truesky.validation.lake.measure.rows import Place, Row
 class CatalogueCheck:
     """A check of catalogues.
 
-    tables : that it wants, in the order in which `measured` takes their versions;  source : of its expectations
+    Attributes
+    ----------
+    name : str
+        Name of the check.
+    tables : tuple of str
+        Tables that `measure` requires, in the order of its arguments.
+    measure : callable
+        Function of the versions of these tables that returns a Result.
+    source : str
+        Source of the expectations.
     """
 
     name: str
@@ -45,11 +54,11 @@ class CatalogueCheck:
 
 
 def _without_series(rows: Callable[..., list[Row]]) -> Callable[..., Result]:
-    """Of a check that no figure is drawn of."""
+    """Wrap a check that returns rows alone, without series for figures."""
     return lambda *versions: Result(Place(), rows(*versions), {})
 
 
-# Of one frame each.
+# Checks of single frames.
 FRAME_CHECKS = (
     ASTROMETRY,
     PHOTOMETRY,
@@ -64,9 +73,9 @@ FRAME_CHECKS = (
     COMPLETENESS,
     SPECTRA,
 )
-# Of all frames together.
+# Checks of all frames together.
 EXPOSURE_CHECKS = (REPEATABILITY, COMMON_BIAS)
-# Of the lake's tables.
+# Checks of the tables of a lake.
 CATALOGUE_CHECKS = (
     CatalogueCheck(observed_sky.NAME, ("galaxies",), observed_sky.measure, "observed.csv"),
     CatalogueCheck(angular_clustering.NAME, ("galaxies",), angular_clustering.measure, angular_clustering.SOURCE),

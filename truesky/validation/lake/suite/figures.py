@@ -1,7 +1,4 @@
-"""Pictures of the report, as base64 of PNG.
-
-drawn   (caption, picture) of whatever there is something of
-"""
+"""Plot the results of a lake for the report, as base64-encoded PNG."""
 
 from __future__ import annotations
 
@@ -23,7 +20,7 @@ _WIDTH = 10.0
 
 
 def draw_all(lake_results: LakeResults) -> Iterator[tuple[str, str]]:
-    """Of what was found."""
+    """Yield the caption and the PNG (base64) of every figure for which there are data."""
     channels = dict.fromkeys(str(result.place.channel) for result in lake_results.frame_results)
     for channel in channels:
         channel_results = [result for result in lake_results.frame_results if result.place.channel == channel]
@@ -50,10 +47,10 @@ def _concatenate_series(results: list[Result], name: str) -> Any:
 
 
 def _plot_astrometry(figure: Figure, results: list[Result]) -> None:
-    """Residuals as vectors over the detector, and their scatter."""
+    """Plot residuals as vectors over the detector, and their scatter."""
     u, v, x, y = (_concatenate_series(results, name) for name in ("u", "v", "off_x", "off_y"))
     left_axes, right_axes = figure.subplots(1, 2)
-    # Hit by a cosmic ray, or beside something that nobody knows: no residuals of the system.
+    # Cosmic rays and unknown neighbours cause outliers that are not astrometric residuals.
     is_typical = np.hypot(x - np.median(x), y - np.median(y)) < 6.0 * np.median(np.hypot(x, y))
     u, v, x, y = u[is_typical], v[is_typical], x[is_typical], y[is_typical]
     sampled = np.linspace(0, len(u) - 1, min(len(u), 500)).astype(int)
@@ -90,19 +87,19 @@ def _plot_noise(figure: Figure, results: list[Result]) -> None:
     predicted, measured = _concatenate_series(results, "noise").T
     axis.loglog(predicted, measured, ".", color="#1f4e79")
     for ticks in (axis.xaxis, axis.yaxis):
-        # 14 for 1.4 x 10^1.
+        # Labels are 14 instead of 1.4 x 10^1.
         ticks.set_major_formatter(LogFormatter())
         ticks.set_minor_formatter(LogFormatter(minor_thresholds=(2.0, 0.5)))
     ends = np.array([predicted.min() * 0.95, predicted.max() * 1.05])
     axis.plot(ends, ends, "k-", lw=0.7)
-    axis.set(xlabel="foreseen by the header, e- rms", ylabel="blank sky, e- rms")
+    axis.set(xlabel="expected from the header, e- rms", ylabel="blank sky, e- rms")
 
 
 def _plot_background(figure: Figure, results: list[Result]) -> None:
     axis = figure.subplots()
     column, row, level = _concatenate_series(results, "background").T
     points = axis.scatter(column, row, c=level, s=6, cmap="viridis")
-    figure.colorbar(points, label="blank sky / foreseen")
+    figure.colorbar(points, label="blank sky / expected")
     axis.set(xlabel="column", ylabel="row")
     axis.set_aspect("equal")
 
@@ -128,12 +125,12 @@ def _plot_quality(figure: Figure, results: list[Result]) -> None:
     x = np.linspace(0.5, 60.0, 300)
     freedom = results[0].series["freedom"]
     axis.plot(x, scipy.stats.chi2.pdf(x, freedom), "k-", lw=0.8, label=f"{freedom} degrees of freedom")
-    axis.set(xlabel="chi^2", ylabel="part of the pixels", xlim=(0, 60))
+    axis.set(xlabel="chi^2", ylabel="fraction of the pixels", xlim=(0, 60))
     axis.legend()
 
 
 def _plot_whiskers(figure: Figure, results: list[Result]) -> None:
-    """Ellipticities as whiskers along the long axis, over the detector."""
+    """Plot ellipticities over the detector as whiskers along the long axis."""
     u, v, e1, e2 = (
         _concatenate_series([r for r in results if "u" in r.series], name) for name in ("u", "v", "e1", "e2")
     )
@@ -159,11 +156,11 @@ def _plot_whiskers(figure: Figure, results: list[Result]) -> None:
 
 _Draw = Callable[[Figure, list[Result]], None]
 _FIGURES: tuple[tuple[str, str, _Draw], ...] = (
-    ("off_x", "positions of stars against the catalogue by the WCS of the frame", _plot_astrometry),
+    ("off_x", "positions of stars against the catalogue and the WCS of the frame", _plot_astrometry),
     ("dm", "magnitudes of stars against the catalogue", _plot_photometry),
     ("e1", "ellipticities of stars in a window of their half-light diameter", _plot_whiskers),
     ("completeness", "sources that are found, by magnitude", _plot_completeness),
-    ("chi2", "how well ramps fit", _plot_quality),
-    ("noise", "noise of blank sky, an amplifier a point", _plot_noise),
-    ("background", "level of blank sky, tile by tile", _plot_background),
+    ("chi2", "chi^2 of the ramp fits", _plot_quality),
+    ("noise", "noise of blank sky, one point per amplifier", _plot_noise),
+    ("background", "level of blank sky per tile", _plot_background),
 )

@@ -1,9 +1,4 @@
-"""What a lake holds that can be checked.
-
-Held       its tables and its frames
-look       of a lake
-partners   frames that are looked at with another one
-"""
+"""Find the contents of a lake that can be validated: tables, science files, and what is known about their frames."""
 
 from __future__ import annotations
 
@@ -26,7 +21,7 @@ from truesky.validation.lake.measure.frames import Instrument, NonlinearityCurve
 from truesky.validation.lake.measure.references import Catalogue
 from truesky.validation.lake.measure.rows import Place
 
-# What verdicts may come from; their versions name the version of `validation`.
+# Input tables of the checks; the key of the table `validation` depends on their versions.
 TABLES = (
     "galaxies", "stars", "mission", "galaxy_fluxes", "star_fluxes", "exposures", "products", "rendered_truth",
     "rendered_spectra",
@@ -38,7 +33,17 @@ _CURVE = ("nonlinearity.high", "nonlinearity.low", "nonlinearity.low_scale")
 
 @dataclass(frozen=True, slots=True)
 class ScienceFile:
-    """A science file: its path in the version of `products`, where it was taken, the row of its exposure."""
+    """A science file.
+
+    Attributes
+    ----------
+    path : str
+        Path in the version of table `products`.
+    place : Place
+        Channel, band, exposure and detector.
+    exposure : mapping of str to object
+        Row of table `exposures`.
+    """
 
     path: str
     place: Place
@@ -47,7 +52,19 @@ class ScienceFile:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LakeContents:
-    """Tables by name, science files, and where files of a content are: (exposure, detector, content) -> path."""
+    """Contents of a lake that can be validated.
+
+    Attributes
+    ----------
+    root : Path
+        Folder of the lake.
+    tables : mapping of str to Version
+        Versions of the tables by name.
+    science_files : tuple of ScienceFile
+        Science files, by exposure and detector.
+    paths : mapping of (int, str, str) to str
+        Paths in table `products` by exposure, detector and content.
+    """
 
     root: Path
     tables: Mapping[str, read.Version]
@@ -56,20 +73,36 @@ class LakeContents:
 
     @property
     def version_keys(self) -> dict[str, str]:
-        """Of the versions that were read."""
+        """Keys of the table versions by table name."""
         return {name: version.key for name, version in self.tables.items()}
 
 
 def read_contents(root: Path, request: str | None = None, exposures: Sequence[int] = ()) -> LakeContents:
-    """Of a lake.
+    """Find the tables and science files of a lake.
 
-    root : of it;  request : whose tables, where it has those of several;  exposures : only these, () = all
-    Errors : BadInput where there is nothing to check, and for exposures that it has no images of
+    Parameters
+    ----------
+    root : Path
+        Folder of the lake.
+    request : str, optional
+        Name of the request whose tables are read, if the lake contains several.
+    exposures : sequence of int
+        Exposures to validate; () for all.
+
+    Returns
+    -------
+    LakeContents
+        Tables and science files.
+
+    Raises
+    ------
+    BadInput
+        If the lake contains no table to validate, or has no images of a requested exposure.
     """
     names = layout.table_names(root)
     versions = {name: _open_version(root, name, request) for name in TABLES if name in names}
     if not versions:
-        raise BadInput(f"lake {root}: none of {', '.join(TABLES)} is there to be validated")
+        raise BadInput(f"lake {root}: no table to validate, expected one of {', '.join(TABLES)}")
     if "products" not in versions:
         return LakeContents(root, versions, (), {})
     rows = versions["products"].rows(["path", "content", "exposure_id", "detector", "channel", "band"]).to_pylist()
@@ -87,9 +120,10 @@ def read_contents(root: Path, request: str | None = None, exposures: Sequence[in
 
 
 def gain_partners(science_files: Sequence[ScienceFile]) -> dict[str, ScienceFile]:
-    """Path of a frame -> another one of its detector that its gain is told with, where there is one: flats of one lamp.
+    """Return the partner frame for a gain measurement, by the path of the other frame of the pair.
 
-    Of ground cameras two of the sky, too, of levels that are alike; of one band, where there are such.
+    Partners show the same detector. Two flats of one lamp are a pair. For ground cameras, two sky frames are also a
+    pair: one per detector, if possible with the same band and similar levels.
     """
     flats: dict[tuple[Any, ...], list[ScienceFile]] = {}
     skies: dict[tuple[Any, ...], list[ScienceFile]] = {}
@@ -115,12 +149,12 @@ def gain_partners(science_files: Sequence[ScienceFile]) -> dict[str, ScienceFile
 
 
 def _sky_level(file: ScienceFile) -> float:
-    """Electrons of the sky."""
+    """Sky level in electrons per pixel."""
     return float(file.exposure["sky"] * file.exposure["exposure_time_s"])
 
 
 def _level_difference(pair: tuple[ScienceFile, ScienceFile]) -> float:
-    """How unlike the sky of two frames is, in the logarithm."""
+    """Absolute difference of the logarithms of two sky levels."""
     return abs(float(np.log(max(_sky_level(pair[0]), 1e-9) / max(_sky_level(pair[1]), 1e-9))))
 
 
@@ -129,14 +163,14 @@ def _open_version(root: Path, name: str, request: str | None) -> read.Version:
 
 
 def _exposure_rows(root: Path, products: read.Version) -> dict[int, Mapping[str, Any]]:
-    """Rows of the exposures that the images were made of."""
+    """Rows of the exposures of the images, by exposure."""
     condition = pc.field("exposure_id").isin(products.rows(["exposure_id"])["exposure_id"].unique())
     rows = read.version(root, "exposures", products.manifest["facts"]["inputs"]["exposures"]).rows(where=condition)
     return {row["exposure_id"]: row for row in rows.to_pylist()}
 
 
 def instruments(contents: LakeContents) -> dict[str, Instrument]:
-    """Of each camera that images are of, by the mission database; of amplifiers and pixels their mean."""
+    """Return the instrument of each camera from the mission database; amplifiers and pixels share mean values."""
     curves = _mission_values(contents, (*_CURVE, "adc_max"), "nonlinearity")
     bowls, responses = (
         _mission_values(contents, ("illumination",), "illumination"),
@@ -152,7 +186,7 @@ def instruments(contents: LakeContents) -> dict[str, Instrument]:
 
 
 def _mission_values(contents: LakeContents, names: Sequence[str], effect: str) -> dict[str, list[float]]:
-    """Camera -> values of these names in the mission database that images are of; none where an effect is off."""
+    """Values of parameters in the mission database by camera; empty if `effect` is switched off in the request."""
     if "mission" not in contents.tables or "products" not in contents.tables:
         return {}
     facts = contents.tables["products"].manifest["facts"]
@@ -170,12 +204,12 @@ def _mission_values(contents: LakeContents, names: Sequence[str], effect: str) -
 
 
 def truth(contents: LakeContents) -> dict[tuple[int, str], pa.Table]:
-    """Rows of `rendered_truth` by exposure and detector, of it what references are made of."""
+    """Return the rows of `rendered_truth` by exposure and detector, with the columns that references require."""
     return _by_frame(contents, "rendered_truth", references.TRUTH)
 
 
 def spectra(contents: LakeContents) -> dict[tuple[int, str], pa.Table]:
-    """The same of `rendered_spectra`: of first orders, which are measured."""
+    """Return the rows of `rendered_spectra` by exposure and detector; only first orders are measured."""
     return _by_frame(contents, "rendered_spectra", where=pc.field("order") == 1)
 
 
@@ -193,14 +227,14 @@ def _by_frame(
     if not len(rows):
         return {}
     groups = rows.select(["exposure_id", "detector"]).to_pandas().groupby(["exposure_id", "detector"]).indices
-    # Not sliced: a slice goes to another process with all that it was cut from. Of one chunk taking rows is fast.
+    # A slice would be pickled with the whole table, so rows are copied. Taking rows from a single chunk is fast.
     rows = rows.combine_chunks()
     by_frame = {key: rows.take(pa.array(index)) for key, index in groups.items() if key in frames}
     return by_frame
 
 
 def star_catalogue(contents: LakeContents, rows: Mapping[tuple[int, str], pa.Table]) -> Catalogue:
-    """Stars that the frames show, from the catalogue of the lake."""
+    """Read the stars that the frames show from the catalogue of the lake."""
     points = [
         part["id"].to_numpy()[part["method"].to_numpy() == references.POINT] for part in rows.values() if len(part)
     ]

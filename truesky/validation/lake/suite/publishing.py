@@ -1,8 +1,4 @@
-"""From a lake to its table `validation`, published as every table is, and the report beside it.
-
-plan      what the table is made of
-publish   makes it where it is not there yet; returns the version
-"""
+"""Validate a lake and publish the table `validation` with a report."""
 
 from __future__ import annotations
 
@@ -26,17 +22,29 @@ _PART = "all.parquet"
 
 
 def plan(contents: LakeContents, exposures: Sequence[int] = ()) -> Plan:
-    """Of what a lake holds; exposures : only these, () = all."""
+    """Return the plan of table `validation` for the contents of a lake; `exposures` selects some, () means all."""
     facts = {"inputs": contents.version_keys, "exposures": sorted(exposures), "code": code_version()}
     return Plan(VALIDATION, facts, (Task(_PART, {}),))
 
 
 def publish(root: Path, request: str | None = None, exposures: Sequence[int] = (), processes: int = 2) -> read.Version:
-    """The table of a lake, made where it is not there yet.
+    """Return the table `validation` of a lake; it is made if it does not exist.
 
-    root      : of the lake;  request : whose tables, where it has those of several
-    exposures : only these, () = all;  processes : that look at frames and catalogues at a time
-    Errors    : as of `inventory.look`
+    Parameters
+    ----------
+    root : Path
+        Folder of the lake.
+    request : str, optional
+        Name of the request whose tables are read, if the lake contains several.
+    exposures : sequence of int
+        Exposures to validate; () for all.
+    processes : int
+        Number of processes that check frames and catalogues.
+
+    Returns
+    -------
+    Version
+        Published version of the table. `inventory.read_contents` raises BadInput if there is nothing to validate.
     """
     contents = inventory.read_contents(root, request, exposures)
     table_plan = plan(contents, exposures)
@@ -55,7 +63,7 @@ def publish(root: Path, request: str | None = None, exposures: Sequence[int] = (
 
 
 def build_table(rows: Sequence[Row]) -> pa.Table:
-    """Rows of the table `validation`."""
+    """Return the table `validation` of rows."""
     numbers = {
         name: np.ma.masked_invalid(np.array([getattr(row, name) for row in rows], float))
         for name in ("value", "error", "expected", "tolerance")

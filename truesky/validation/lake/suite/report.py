@@ -1,7 +1,4 @@
-"""The report: one HTML file with its figures in it, which a browser opens without a network.
-
-page   of what was found
-"""
+"""Write the report: one HTML file that contains its figures, so that a browser can open it without a network."""
 
 from __future__ import annotations
 
@@ -27,36 +24,38 @@ details { margin-bottom: 1em; } summary { cursor: pointer; }
 
 
 def page(name: str, results: LakeResults) -> str:
-    """HTML; name : of the lake."""
+    """Return the HTML report of the lake `name`."""
     verdict_counts = Counter(row.verdict for row in results.rows)
     summary = ", ".join(f'<span class="{v}">{verdict_counts[v]} {v.replace("_", " ")}</span>' for v in _ORDER)
     parts = [
         f"<!DOCTYPE html><html lang='en'><head><meta charset='utf-8'><title>Validation of {escape(name)}</title>",
         f"<style>{_STYLE}</style></head><body><h1>Validation of {escape(name)}</h1>",
         f"<p>truesky {__version__}: {len(results.rows)} figures, {summary}.</p>",
-        "<p>A figure fails where it is more than three standard errors beyond its tolerance; it is undecided where its "
-        "error is too large to tell.</p>",
+        "<p>A figure fails if it is more than three standard errors beyond its tolerance; it is undecided if its "
+        "error is too large for a decision.</p>",
         _summary(results.rows),
         *(
             f"<figure><img alt='{escape(text)}' src='data:image/png;base64,{image}'><figcaption>{escape(text)}"
             "</figcaption></figure>"
             for text, image in figures.draw_all(results)
         ),
-        _details("What fails", [row for row in results.rows if row.verdict == FAIL], True),
-        _details("What is undecided", [row for row in results.rows if row.verdict == UNDECIDED], False),
-        _details("What does not apply, and why", [row for row in results.rows if row.verdict == NOT_APPLICABLE], False),
-        _details("What passes", [row for row in results.rows if row.verdict == PASS], False),
+        _details("Failed", [row for row in results.rows if row.verdict == FAIL], True),
+        _details("Undecided", [row for row in results.rows if row.verdict == UNDECIDED], False),
+        _details("Not applicable, with reasons", [row for row in results.rows if row.verdict == NOT_APPLICABLE], False),
+        _details("Passed", [row for row in results.rows if row.verdict == PASS], False),
         "</body></html>",
     ]
     return "\n".join(parts)
 
 
 def _summary(rows: Sequence[Row]) -> str:
-    """Verdicts by check and channel."""
+    """HTML table of the numbers of verdicts by check and channel."""
     groups: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         groups.setdefault((row.check, " ".join(filter(None, (row.place.channel, row.place.band)))), []).append(row)
-    head = "<table><tr><th>check</th><th>of</th>" + "".join(f"<th>{v.replace('_', ' ')}</th>" for v in _ORDER)
+    head = "<table><tr><th>check</th><th>channel and band</th>" + "".join(
+        f"<th>{v.replace('_', ' ')}</th>" for v in _ORDER
+    )
     lines = [f"{head}<th>source</th></tr>"]
     for (check, place), group in sorted(groups.items()):
         verdict_counts = Counter(row.verdict for row in group)
@@ -97,7 +96,7 @@ def _note_text(row: Row) -> str:
 
 
 def format_value(row: Row) -> str:
-    """A value with its error; "" of what was not measured."""
+    """Return a value with its error and unit, "" if it was not measured."""
     if row.value != row.value:
         return ""
     error = f" ± {row.error:.2g}" if row.error == row.error and row.error > 0.0 else ""
@@ -105,7 +104,7 @@ def format_value(row: Row) -> str:
 
 
 def format_expected(row: Row) -> str:
-    """What a value should be; "" of what does not apply."""
+    """Return the expected value and its tolerance, "" if the check does not apply."""
     if not row.applies:
         return ""
     sign = {"around": "±", "least": "at least, −", "most": "at most, +"}[row.kind]

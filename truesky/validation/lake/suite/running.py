@@ -1,7 +1,4 @@
-"""All checks of a lake: of its catalogues and of each frame in several processes, then what needs frames together.
-
-validated   a lake -> rows and what figures are drawn of
-"""
+"""Run all checks of a lake: catalogues and single frames in several processes, then checks of all frames together."""
 
 from __future__ import annotations
 
@@ -27,9 +24,24 @@ from truesky.validation.lake.suite.inventory import LakeContents, ScienceFile
 
 @dataclass(frozen=True, slots=True)
 class FrameTask:
-    """One frame: its file, what it is of, and what is known of its sources and its camera.
+    """Inputs for the checks of one frame.
 
-    before : the path in `products`, exposure and sources of another frame that its gain is told with
+    Attributes
+    ----------
+    products : Version
+        Version of table `products`.
+    path : str
+        Path of the science file in this version.
+    place : Place
+        Channel, band, exposure and detector.
+    sources : Reference
+        Known sources of the frame.
+    spectra : Table, optional
+        Rows of `rendered_spectra` of the frame.
+    instrument : Instrument, optional
+        Camera of the frame.
+    partner : (str, int, Reference), optional
+        Path, exposure and sources of another frame, with which the gain is measured.
     """
 
     products: read.Version
@@ -43,7 +55,15 @@ class FrameTask:
 
 @dataclass(frozen=True, slots=True)
 class LakeResults:
-    """All rows of a lake, and the numbers of its frames and of its catalogues that figures are drawn of."""
+    """Results of all checks of a lake.
+
+    Attributes
+    ----------
+    rows : list of Row
+        Rows of all checks.
+    frame_results, catalogue_results : list of Result
+        Results of frames and of catalogues, with the series for figures.
+    """
 
     rows: list[Row]
     frame_results: list[Result]
@@ -51,7 +71,7 @@ class LakeResults:
 
 
 def run_checks(contents: LakeContents, processes: int = 2) -> LakeResults:
-    """Run all checks that a lake has something for; processes : at a time, for frames and checks of catalogues."""
+    """Run all checks for which a lake has data, in `processes` parallel processes."""
     if processes <= 1:
         catalogues, results = (
             [*map(run_catalogue_check, _catalogue_tasks(contents))],
@@ -60,14 +80,14 @@ def run_checks(contents: LakeContents, processes: int = 2) -> LakeResults:
     else:
         with ProcessPoolExecutor(processes, multiprocessing.get_context("forkserver")) as pool:
             try:
-                # A few that take long: begun while the frames' sources are looked up.
+                # These few tasks take long, so they start while the sources of the frames are looked up.
                 futures = [
                     pool.submit(run_catalogue_check, catalogue_task) for catalogue_task in _catalogue_tasks(contents)
                 ]
                 results = [*_with_progress_bar(pool.map(check_frame, _frame_tasks(contents)), contents)]
                 catalogues = [future.result() for future in futures]
             except BaseException:
-                # Of what has not begun nothing begins.
+                # Tasks that have not started are cancelled.
                 pool.shutdown(cancel_futures=True)
                 raise
     rows = [row for result in results for row in result.rows]
@@ -78,17 +98,17 @@ def run_checks(contents: LakeContents, processes: int = 2) -> LakeResults:
 
 
 def _with_progress_bar(results: Iterator[Result], contents: LakeContents) -> Iterator[Result]:
-    """The results of frames, under a bar that counts them."""
+    """Pass on the results of frames and show a progress bar."""
     return iter(tqdm(results, total=len(contents.science_files), unit="detector", desc="validation", disable=None))
 
 
 def _catalogue_tasks(contents: LakeContents) -> list[tuple[int, tuple[read.Version | None, ...]]]:
-    """Each check of catalogues by its number, and the tables that it wants, None where the lake has not one."""
+    """Number of each check of catalogues, and versions of the tables that it requires (None if missing)."""
     return [(n, tuple(map(contents.tables.get, check.tables))) for n, check in enumerate(checks.CATALOGUE_CHECKS)]
 
 
 def run_catalogue_check(catalogue_task: tuple[int, tuple[read.Version | None, ...]]) -> Result:
-    """What a check of catalogues measures; a row that says what is missing where it has not its tables."""
+    """Run a check of catalogues; return a row that names the missing tables if there are any."""
     number, versions = catalogue_task
     check = checks.CATALOGUE_CHECKS[number]
     missing = [name for name, version in zip(check.tables, versions, strict=True) if version is None]
@@ -126,7 +146,7 @@ def _frame_tasks(contents: LakeContents) -> Sequence[FrameTask]:
 
 
 def check_frame(task: FrameTask) -> Result:
-    """Rows of one frame."""
+    """Run all checks of one frame."""
     path: Path = task.products.sidecar_path(task.path)
     context = frame_context.measure_frame(path, task.place, task.sources, task.spectra, task.instrument)
     if task.partner is not None:

@@ -1,4 +1,4 @@
-"""Galaxies and shear of many plane waves on a field around right ascension 0, whose correlations are known."""
+"""Mock galaxies and shear from many plane waves on a field around right ascension 0, with known correlations."""
 
 import numpy as np
 
@@ -14,13 +14,13 @@ WAVES, LOWEST, HIGHEST = 500, 100.0, 2e4
 
 
 def scattered(rng, n):
-    """About n places in the field: (order-29 indices, ra, dec)."""
+    """About n positions in the field: order-29 indices, ra, dec."""
     parts = [sky.random_in_cell(GENERATION_ORDER, int(cell), n // len(CELLS), rng) for cell in CELLS]
     return tuple(np.concatenate(one) for one in zip(*parts, strict=True))
 
 
 def waves(rng, c_l):
-    """(multipoles, their variances, wave vectors [2, w], phases) of a field with C_l at the multipoles of theory."""
+    """Multipoles, variances, wave vectors (2, w) and phases of a field with given C_l."""
     ell = np.geomspace(LOWEST, HIGHEST, WAVES)
     power = np.exp(np.interp(np.log(ell), np.log(theory.ELL), np.log(c_l)))
     variance = power * ell**2 * np.log(ell[1] / ell[0]) / (2 * np.pi)
@@ -29,12 +29,12 @@ def waves(rng, c_l):
 
 
 def plane(ra, dec):
-    """rad to the east and to the north, of places near (0, 0)."""
+    """Offsets to the east and north in rad of positions near (0, 0)."""
     return np.radians((ra + 180.0) % 360.0 - 180.0), np.radians(dec)
 
 
 def sheared(seed=1, n=8000):
-    """Columns of galaxies at z = 1, whose shear and convergence are derivatives of one potential."""
+    """Columns of galaxies at z = 1 whose shear and convergence are derivatives of one potential."""
     rng = np.random.default_rng(seed)
     index, ra, dec = scattered(rng, n)
     c_l = theory.convergence_power(theory.ELL, cosmology.comoving_distance(np.ones(1)), np.ones(1))
@@ -50,7 +50,7 @@ def sheared(seed=1, n=8000):
 
 
 def clustered(seed=1, n=6000, log_mass=12.5):
-    """(columns of galaxies at 0.6 < z < 0.8 that cluster as halos of that mass, the variances of their waves)."""
+    """Columns of galaxies at 0.6 < z < 0.8 that cluster as halos of a mass, and the variances of their waves."""
     rng = np.random.default_rng(seed)
     index, ra, dec = scattered(rng, 4 * n)
     columns = {
@@ -73,7 +73,7 @@ def clustered(seed=1, n=6000, log_mass=12.5):
 
 
 def bias(log_mass):
-    """Of halos at z = 0.7, by Tinker et al. 2010 in their own formula: an overdensity of 200 times the mean."""
+    """Bias of halos at z = 0.7 from the formula of Tinker et al. 2010 for an overdensity of 200 times the mean."""
     from colossus.lss import bias as halo_bias
 
     theory.linear_power(np.ones(1), 0.0)

@@ -1,4 +1,4 @@
-"""Fluxes that belong to their galaxies' spectra, made by integration, and others."""
+"""Fluxes that agree with the spectra of their galaxies, and fluxes that do not."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ N = 600
 
 @pytest.fixture(scope="module")
 def tables():
-    """(columns of galaxies, magnified and behind dust; their fluxes by integrals over spectra, in another order)."""
+    """Columns of magnified galaxies behind dust, and their fluxes by integration over spectra, in another order."""
     rng = np.random.default_rng(3)
     library = templates.galaxy_library()
     like = rows_of(GALAXIES, N)
@@ -74,15 +74,15 @@ def test_a_band_without_light(tables):
     assert {name for name, verdict in found.items() if verdict == FAIL} == {"flux_lsst_i"}
 
 
-def test_remembered_colours_decide_nothing(tables):
+def test_colours_quoted_from_memory_are_undecided(tables):
     galaxies, fluxes = tables
     red = galaxies | {"color_gr_01": np.full(N, 1.0), "z_true": np.full(N, 0.2)}
     found, result = verdicts(red, fluxes)
     assert (found["c_perp_z0.2"], found["c_perp_z0.3"]) == ("undecided", NOT_APPLICABLE)
-    assert "remembered" in next(row.note for row in result.rows if row.quantity == "c_perp_z0.2")
+    assert "quoted from memory" in next(row.note for row in result.rows if row.quantity == "c_perp_z0.2")
 
 
-def test_what_has_no_colours_is_no_failure(tables):
+def test_missing_colours_are_not_applicable(tables):
     galaxies, fluxes = tables
     for many in (0, 1):
         few = {name: values[:many] for name, values in galaxies.items()}

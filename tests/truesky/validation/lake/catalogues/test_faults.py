@@ -1,4 +1,4 @@
-"""Each check of catalogues passes a catalogue as it should be, and turns by the fault that it is there for."""
+"""Each check of catalogues passes for a correct catalogue and fails for the fault that it must detect."""
 
 from types import SimpleNamespace
 
@@ -15,7 +15,7 @@ CELLS = np.arange(400_000, 400_009)
 
 
 class Version:
-    """A published table, as much of it as the checks ask for."""
+    """Stand-in for a published table with the attributes that checks use."""
 
     def __init__(self, name, columns, cells=CELLS):
         self.table, self.data = name, pa.table(columns)
@@ -27,7 +27,7 @@ class Version:
 
 
 def galaxies(seed=1, per_cell=12_000, z=1.0, line=5e-16, **more):
-    """In nine cells; a quarter emits."""
+    """Galaxies in nine cells; a quarter are emitters."""
     rng = np.random.default_rng(seed)
     parts = [sky.random_in_cell(GENERATION_ORDER, int(cell), per_cell, rng) for cell in CELLS]
     index, ra, dec = (np.concatenate(columns) for columns in zip(*parts, strict=True))
@@ -42,7 +42,7 @@ def galaxies(seed=1, per_cell=12_000, z=1.0, line=5e-16, **more):
 def light(columns, mag=24.0):
     n = len(columns["id"])
     rng = np.random.default_rng(4)
-    # Of another order of rows.
+    # The rows of fluxes are in another order.
     order = rng.permutation(n)
     flux = np.full(n, 10 ** (-0.4 * (mag - 23.9)))
     return Version("galaxy_fluxes", {"id": columns["id"][order], "f_nu_euclid_vis": flux})
@@ -58,7 +58,7 @@ def test_no_source_twice():
 
 
 def test_a_duplicated_cell_is_found():
-    """Once with the identifiers that it had, once with others; once its sources moved a little as well."""
+    """The copies have the same identifiers, other identifiers, or other identifiers and slightly shifted positions."""
     good = galaxies(per_cell=500)
     for quantity, move in (("galaxies_ids", 0.0), ("galaxies_places", 0.0), ("galaxies_densest_cell", 1e-5)):
         again = {name: values[:500].copy() for name, values in good.items()}
@@ -100,14 +100,14 @@ def test_requirements_that_are_not_met(quantity, columns, mag):
     assert found[quantity] in ((FAIL,) if mag < 24.5 else (FAIL, UNDECIDED))
 
 
-def test_no_rows_pass_nothing():
+def test_empty_tables_are_not_applicable():
     (row,) = duplicates.rows(Version("galaxies", galaxies(per_cell=0)))
     assert (row.verdict, row.quantity) == (NOT_APPLICABLE, "galaxies")
     assert row.note == "table galaxies has no rows"
 
 
 @pytest.mark.parametrize("kept", [0, 5, 89])
-def test_fluxes_of_other_galaxies_are_not_taken(kept):
+def test_fluxes_of_other_galaxies_are_refused(kept):
     columns = galaxies(per_cell=10)
     fluxes = light({name: values[:kept] for name, values in columns.items()})
     rows = requirements.rows(Version("galaxies", columns), fluxes)
@@ -135,7 +135,7 @@ def test_a_catalogue_that_ends_before_the_requirements_do_does_not_fail_them(fac
         assert verdicts(rows)["galaxies_24.5"] == PASS
 
 
-def test_without_the_band_it_says_so():
+def test_missing_band_is_not_applicable():
     columns = galaxies(per_cell=10)
     fluxes = Version("galaxy_fluxes", {"id": columns["id"]})
     rows = requirements.rows(Version("galaxies", columns), fluxes)

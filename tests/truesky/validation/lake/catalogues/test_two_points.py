@@ -1,4 +1,4 @@
-"""Clustering and shear of mock galaxies whose correlations are known, and what each fault makes of the verdicts."""
+"""Clustering and shear of mock galaxies with known correlations, and the effect of faults on the verdicts."""
 
 import numpy as np
 import pytest
@@ -46,7 +46,7 @@ def test_shear_of_a_potential_passes(shear):
 
 
 def test_shear_that_is_turned_by_45_degrees(shear):
-    """E modes become B modes; xi+ stays."""
+    """E modes become B modes; xi+ does not change."""
     turned = shear | {"gamma1": -shear["gamma2"], "gamma2": shear["gamma1"]}
     wrong = failed(cosmic_shear.compare(turned, mocks.FIELD))
     assert {"b_share_4.8", "b_share_9.6", "xi_minus_1.2", "about_convergence_1.2"} <= wrong
@@ -59,7 +59,7 @@ def test_one_component_of_shear_with_the_wrong_sign(shear, column):
 
 
 def test_shear_of_the_wrong_sign(shear):
-    """Two points of shear do not see it."""
+    """Two-point functions of shear do not depend on its sign."""
     minus = shear | {name: -shear[name] for name in ("gamma1", "gamma2")}
     wrong = failed(cosmic_shear.compare(minus, mocks.FIELD))
     assert {"about_convergence_0.6", "about_convergence_1.2", "about_convergence_2.4"} <= wrong
@@ -71,7 +71,7 @@ def test_shear_that_is_half_as_large_again(shear):
     assert {"about_convergence_1.2", "xi_plus_0.6", "xi_plus_1.2"} <= failed(cosmic_shear.compare(large, mocks.FIELD))
 
 
-def test_no_shear_is_no_failure(shear):
+def test_missing_shear_is_not_applicable(shear):
     equal = shear | {"gamma1": np.full(len(shear["id"]), 0.05), "gamma2": np.zeros(len(shear["id"]))}
     few = {name: values[:1] for name, values in shear.items()}
     none = {name: values[:0] for name, values in shear.items()}
@@ -80,7 +80,7 @@ def test_no_shear_is_no_failure(shear):
         assert (row.verdict, words in row.note) == (NOT_APPLICABLE, True)
     without = Version("galaxies", {name: values for name, values in shear.items() if name != "gamma1"})
     (row,) = cosmic_shear.measure(without).rows
-    assert row.note == "galaxies have no gamma1"
+    assert row.note == "table galaxies has no column gamma1"
     (row,) = cosmic_shear.measure(Version("galaxies", none, ())).rows
     assert row.verdict == NOT_APPLICABLE
 
@@ -94,7 +94,7 @@ def test_shear_of_a_lake_is_that_of_its_columns(shear):
 
 
 def test_w_is_that_of_the_field(galaxies):
-    """Of a log-normal field: exp of that of the Gaussian one, less what its own mean hides."""
+    """The field is log-normal: its w is exp of that of the Gaussian field, minus the effect of the field's mean."""
     columns, (ell, variance) = galaxies
     edges = np.array([0.6, 1.2, 2.4, 4.8]) * ARCMIN
     own = (columns[name] for name in ("id", "ra", "dec", "_healpix_29"))
@@ -122,14 +122,14 @@ def test_places_that_are_shuffled(galaxies, to_24):
 
 
 def test_galaxies_of_other_halos(galaxies, to_24):
-    """Of clusters: they should cluster ten times as much."""
+    """Galaxies in clusters should cluster ten times as strongly."""
     columns, _ = galaxies
     heavy = columns | {"log_halo_mass": columns["log_halo_mass"] + 1.8}
     assert {"w_vis_24_0.6", "w_vis_24_1.2"} <= failed(angular_clustering.compare(heavy, mocks.FIELD))
 
 
 def test_clustering_of_luminous_galaxies_that_are_shuffled(galaxies, monkeypatch):
-    """At 0.4 < z < 0.6 and M_r < -20."""
+    """The sample is 0.4 < z < 0.6 and M_r < -20."""
     monkeypatch.setattr(angular_clustering, "LIMITS", (26.0,))
     monkeypatch.setattr(angular_clustering, "_LUMINOUS", 20.0)
     columns, _ = galaxies
@@ -141,14 +141,14 @@ def test_clustering_of_luminous_galaxies_that_are_shuffled(galaxies, monkeypatch
     assert "w_m20_0.16" in failed(result)
 
 
-def test_too_little_to_cluster_is_no_failure(galaxies):
+def test_too_few_galaxies_are_not_applicable(galaxies):
     columns, _ = galaxies
     for n in (0, 1):
         (row,) = angular_clustering.compare({name: v[:n] for name, v in columns.items()}, mocks.FIELD).rows
         assert (row.verdict, f"{n} galaxies" in row.note) == (NOT_APPLICABLE, True)
     (row,) = angular_clustering.measure(Version("galaxies", {"id": np.arange(3)})).rows
-    assert row.note.startswith("galaxies have no ra and dec")
-    # A catalogue that ends before the limits, and halos whose masses nobody knows.
+    assert row.note.startswith("table galaxies has no column ra, dec")
+    # The catalogue ends before the limits, or the halo masses are unknown.
     bright = columns["abs_mag_r01"] < -21.0
     rows = angular_clustering.compare({name: v[bright] for name, v in columns.items()}, mocks.FIELD).rows
     assert {row.verdict for row in rows if row.quantity == "w_vis_24"} == {NOT_APPLICABLE}

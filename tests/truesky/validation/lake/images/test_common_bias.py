@@ -1,4 +1,4 @@
-"""Detectors together: a bias that none of them alone is sure of is found in their mean."""
+"""A bias that is too small to detect on one detector is detected in the mean of several."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from truesky.validation.verdicts import FAIL, NOT_APPLICABLE, PASS, UNDECIDED, v
 
 
 def detectors(rng, east=0.0, mag=0.0, exposures=(1,), n=36):
-    """Offsets of 1 mas and 0.01 mag rms, which their errors say."""
+    """Offsets of 1 mas and 0.01 mag rms, equal to their errors."""
     out = []
     for number in exposures:
         for detector in range(n):
@@ -32,14 +32,14 @@ def test_detectors_without_a_bias():
 
 
 def test_a_bias_that_all_detectors_share():
-    """Of 2 mas and of 0.03 mag: a detector alone could not tell either."""
+    """A bias of 2 mas and of 0.03 mag is not detectable on a single detector."""
     assert verdict(2.0, 1.0, 0.0, 1.0) == verdict(0.03, 0.01, 0.0, 0.02) == UNDECIDED
     found = verdicts(detectors(np.random.default_rng(1), east=2.0, mag=0.03))
     assert found == {(1, "east"): FAIL, (1, "north"): PASS, (1, "magnitude"): FAIL}
 
 
-def test_detectors_that_differ_tell_less():
-    """Scatter beyond what their errors foresee is in the error of the mean."""
+def test_scatter_between_detectors_widens_the_error():
+    """The error of the mean includes scatter beyond the single errors."""
     rng = np.random.default_rng(2)
     values = 5.0 * rng.standard_normal(400)
     mean, error = common_bias.weighted_mean(values, np.full(400, 0.1))
@@ -47,7 +47,7 @@ def test_detectors_that_differ_tell_less():
     assert abs(mean) < 4.0 * error
 
 
-def test_one_detector_is_no_average():
+def test_one_detector_is_not_averaged():
     (row,) = common_bias.rows(detectors(np.random.default_rng(1), n=1))
     assert row.verdict == NOT_APPLICABLE
     assert row.note

@@ -1,4 +1,4 @@
-"""What a program finds of the sources that are there, and of those that only the truth knows."""
+"""Detection of sources that are in the image, and of sources that are only in the truth table."""
 
 from dataclasses import replace
 
@@ -12,17 +12,17 @@ from truesky.validation.verdicts import FAIL, NOT_APPLICABLE, PASS
 
 @pytest.fixture(scope="module")
 def faint(tmp_path_factory):
-    """Points down to what nobody finds."""
+    """Points down to undetectable magnitudes."""
     of = made.scene(np.random.default_rng(3), 900, faintest=28.5)
     return made.vis(tmp_path_factory.mktemp("faint"), of=of)[0]
 
 
-def test_half_are_found_where_noise_says(faint):
+def test_half_are_found_at_the_expected_limit(faint):
     assert made.verdicts(COMPLETENESS, faint) == {"half": PASS, "bright": PASS}
 
 
 def test_sources_that_were_not_drawn(faint):
-    """Every third is somewhere else."""
+    """Every third source is drawn at another position."""
     known = faint.known
     off = np.where(np.arange(len(known)) % 3 == 0, 14.0, 0.0)
     wrong = replace(faint, known=replace(known, x=known.x + off), series={})
@@ -30,7 +30,7 @@ def test_sources_that_were_not_drawn(faint):
 
 
 def test_an_image_of_another_sky(faint):
-    """Nothing is where it should be: there is no magnitude at which half are found, and that is no excuse."""
+    """No source is at its position, so there is no 50 % limit; the check must fail nevertheless."""
     known = faint.known
     wrong = replace(faint, known=replace(known, x=known.x + 14.0), series={})
     assert made.verdicts(COMPLETENESS, wrong) == {"bright": FAIL}
@@ -44,8 +44,8 @@ def test_sources_that_are_fainter_than_they_should_be(faint):
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(("noise", "why"), [(0.07, "objects cover"), (0.01, "sep: internal pixel buffer full")])
-def test_objects_that_cover_everything_tell_nothing(faint, noise, why):
-    """Of a noise that is too small most pixels are of objects, and of one that is far too small more than sep holds."""
+def test_crowded_frames_are_not_applicable(faint, noise, why):
+    """With noise that is too small most pixels belong to objects, and with even smaller noise sep's buffer is full."""
     wrong = replace(faint, noise=noise * faint.noise, series={})
     (row,) = COMPLETENESS.run(wrong)
     assert row.verdict == NOT_APPLICABLE

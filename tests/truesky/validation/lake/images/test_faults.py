@@ -1,4 +1,4 @@
-"""Each check of images passes a frame as it should be, and turns by the fault that it is there for."""
+"""Each check of images passes for a correct frame and fails for the fault that it must detect."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def good(folder):
-    """A frame of VIS as it should be."""
+    """A correct frame of VIS."""
     return made.vis(folder)
 
 
@@ -42,10 +42,10 @@ def test_a_good_frame_passes(good, check):
     assert set(found.values()) == {PASS}
 
 
-def test_numbers_are_those_that_were_put_in(good):
-    """Of a frame whose arithmetic is known: half-light and width of the points, level and noise of its sky."""
+def test_measurements_agree_with_input(good):
+    """The frame's arithmetic is known: half-light radius and width of points, level and noise of the sky."""
     of, _ = good
-    # A Gaussian that is averaged over pixels is not quite one.
+    # A Gaussian averaged over pixels is not exactly a Gaussian.
     assert of.measured.fwhm == pytest.approx(made.FWHM / made.SCALE, rel=0.05)
     assert of.tiles.level.mean() == pytest.approx(made.SKY * made.SECONDS, rel=2e-3)
     assert np.abs(np.median(of.measured.stars.dx)) < 0.01
@@ -64,7 +64,7 @@ def test_a_wcs_off_by_a_tenth_of_a_pixel(folder, good):
 
 
 def test_a_scale_that_is_wrong(good):
-    """By 0.2 pixels at the edge."""
+    """The scale is off by 0.2 pixels at the edge."""
     of, stars = good
     frame = replace(of.frame, wcs=made.system(stretch=1.0 + 4e-4))
     wrong = replace(of, frame=frame, measured=frame_context.stars.measure_stars(frame, stars, of.noise), series={})
@@ -94,8 +94,8 @@ def test_a_band_whose_flux_is_shifted(good):
         assert turned(PHOTOMETRY, replace(of, measured=measured, series={}), quantity)
 
 
-def test_optics_that_keep_light_from_the_corners(folder, good):
-    """A tenth of it, 0.03 to 0.05 mag in the mean, unless it is known."""
+def test_vignetting(folder, good):
+    """Vignetting of a tenth changes magnitudes by 0.03 to 0.05 on average, unless it is known."""
     axis = np.linspace(-1.0, 1.0, 2 * made.SIDE)
     bowl = 1.0 - 0.05 * (axis**2 + axis[:, None] ** 2)
     of, stars = made.vis(folder, of=good[1], bright=bowl)
@@ -120,7 +120,7 @@ def test_a_sky_that_is_too_bright(folder, good):
     assert turned(BACKGROUND, of, "level")
 
 
-def test_points_that_are_no_points(folder, good):
+def test_extended_points_fail(folder, good):
     of, _ = made.vis(folder, of=good[1], stretched=2.0)
     found = made.verdicts(PSF, of)
     assert found["ellipticity"] == FAIL
@@ -139,7 +139,7 @@ def test_cosmic_rays_that_are_off_or_too_many(folder, good, hits):
     assert turned(COSMIC_RAYS, of, "cover")
 
 
-def test_no_cosmic_ray_where_one_is_expected_decides_nothing(folder, good):
+def test_one_missing_cosmic_ray_is_undecided(folder, good):
     of, _ = made.vis(folder, of=good[1], hits=0.0)
     few = np.arange(len(of.tiles.row)) < 2
     short = replace(
@@ -149,14 +149,14 @@ def test_no_cosmic_ray_where_one_is_expected_decides_nothing(folder, good):
 
 
 def test_stars_that_do_not_saturate(good):
-    """A header that promises a saturation which nothing reaches, and one that is below the sky."""
+    """One header has a saturation level that no star reaches, another one below the sky."""
     of, _ = good
     for factor, quantity in ((1.5, "bright_full"), (0.2, "faint_full")):
         amplifiers = tuple(replace(a, saturation_level=a.saturation_level * factor) for a in of.frame.amplifiers)
         frame = replace(of.frame, amplifiers=amplifiers)
         wrong = replace(of, frame=frame)
         if factor < 1.0:
-            # The stars are judged by what they should be.
+            # The verdict uses the expected flux of the stars.
             wrong.frame = replace(of.frame, electrons=of.frame.electrons * np.float32(8.0))
         assert turned(SATURATION, wrong, quantity)
 
@@ -171,16 +171,16 @@ def test_ramps_that_fit_and_others(folder):
     chi2 = scipy.stats.chi2(13).rvs((400, 400), random_state=1)
     assert set(made.verdicts(QUALITY, ramps(folder, chi2)).values()) == {PASS}
     assert turned(QUALITY, ramps(folder, 1.15 * chi2), "median")
-    # Of noise that is not that of photons.
+    # These ramps have noise other than photon noise.
     assert turned(QUALITY, ramps(folder, scipy.stats.chi2(15).rvs((400, 400), random_state=1)), "median")
-    # Of ramps that nobody fitted.
+    # These ramps were not fitted.
     assert set(made.verdicts(QUALITY, ramps(folder, 0.0 * chi2)).values()) == {FAIL, PASS}
     assert turned(QUALITY, ramps(folder, 0.0 * chi2), "median")
     chi2[:40] = 255
     assert turned(QUALITY, ramps(folder, chi2), "not_fitting")
 
 
-def test_a_frame_without_stars_is_said_to_have_none(folder):
+def test_frame_without_stars_is_not_applicable(folder):
     of, _ = made.vis(folder, of=made.known(np.zeros(0), np.zeros(0), np.zeros(0)))
     for check in (ASTROMETRY, PHOTOMETRY, PSF, SATURATION, QUALITY):
         (row,) = check.run(of)
@@ -189,7 +189,7 @@ def test_a_frame_without_stars_is_said_to_have_none(folder):
 
 
 def test_a_stack_that_is_not_deep_enough(folder, good):
-    """Of a sky that hides a galaxy of 24.5; of a band whose zero point is off."""
+    """The sky hides a galaxy of magnitude 24.5, or the zero point of the band is off."""
     assert made.verdicts(DEPTH, good[0]) == {"vis_snr_24.5": PASS}
     of, _ = made.vis(folder, of=good[1], sky=10.0 * made.SKY)
     assert turned(DEPTH, of, "vis_snr_24.5")

@@ -1,4 +1,4 @@
-"""The gain of two frames whose pixels differ in response, against that which they were made with."""
+"""The gain from two frames with different pixel response agrees with the gain of the frames."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ def empty():
 
 
 def pair(folder, levels=(350.0, 300.0), told=made.GAIN, sharing=0.0, response=0.03):
-    """Of a detector whose pixels differ by 3 %, with fringes; sharing : of a pixel's charge to each side."""
+    """A frame with 3 % pixel response and fringes; sharing is the fraction of charge that goes to each side."""
     rng = np.random.default_rng(11)
     own = 1.0 + response * rng.standard_normal((SIDE, SIDE))
     across = np.arange(SIDE)
@@ -35,7 +35,7 @@ def pair(folder, levels=(350.0, 300.0), told=made.GAIN, sharing=0.0, response=0.
         counted = rng.poisson(level * own * (waves if n else 1.0)).astype(float)
         shared = scipy.ndimage.convolve(counted, kernel, mode="reflect")
         path = folder / f"{n}.fits"
-        # The sky is flat enough that the level itself is shared out evenly.
+        # The sky is flat enough that charge sharing does not change the level.
         paths.append(made.vis_file(path, shared, rng, told=told))
     of = frame_context.measure_frame(paths[0], Place("EXT", "des_g", 2, "N4"), empty())
     of.partner = frame_context.PartnerFrame(paths[1], 1, empty())
@@ -47,7 +47,7 @@ def rows(of):
 
 
 @pytest.mark.parametrize("sharing", [0.0, 0.005])
-def test_a_response_that_a_single_frame_takes_for_noise(tmp_path, sharing):
+def test_pixel_response_cancels_in_two_frames(tmp_path, sharing):
     found = rows(pair(tmp_path, sharing=sharing))
     assert found["pair"].value == pytest.approx(1.0, abs=4.0 * found["pair"].error)
     assert found["pair"].error < 0.008
@@ -55,7 +55,7 @@ def test_a_response_that_a_single_frame_takes_for_noise(tmp_path, sharing):
     assert {f"pair_{quadrant}" for quadrant in "EFGH"} < set(found)
 
 
-def test_a_single_frame_is_misled(tmp_path):
+def test_pixel_response_misleads_a_single_frame(tmp_path):
     single = {row.quantity: row for row in NOISE.run(pair(tmp_path)) if row.check == "gain"}
     assert single["ratio"].value < 0.9
 
@@ -65,7 +65,7 @@ def test_a_gain_that_is_off(tmp_path, wrong):
     assert rows(pair(tmp_path, told=wrong * made.GAIN))["pair"].verdict == FAIL
 
 
-def test_frames_that_are_too_unlike(tmp_path):
+def test_frames_of_too_different_levels(tmp_path):
     of = pair(tmp_path, levels=(3500.0, 50.0))
     assert {row.verdict for row in GAIN.run(of)} == {NOT_APPLICABLE}
     of = pair(tmp_path, levels=(350.0, 300.0))
@@ -79,8 +79,8 @@ def shot(number, band, image_type="science", channel="EXT", sky=10.0, lamp=None)
     return inventory.ScienceFile(f"{number}.fits", Place(channel, band, number, "N4"), exposure)
 
 
-def test_which_frames_are_told_together():
-    """Of one band before any other, else of levels that are alike; flats of one lamp alone; none of VIS's sky."""
+def test_choice_of_frame_pairs():
+    """Pairs prefer one band, then similar levels; flats need the same lamp; sky frames of VIS have no partner."""
     bands = [
         shot(1, "des_g", sky=3.0),
         shot(2, "des_r", sky=9.0),

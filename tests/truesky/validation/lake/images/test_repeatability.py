@@ -1,4 +1,4 @@
-"""Frames against each other: the one that is off is told from the others, though each alone would not tell."""
+"""A faulty frame is detected by comparison with other frames, although each alone looks correct."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from truesky.validation.verdicts import FAIL, NOT_APPLICABLE, PASS
 
 
 def frame(number, rng, east=0.0, mag=0.0, first=0, n=60):
-    """Stars [n] with offsets of 0.5 mas rms."""
+    """n stars with offsets of 0.5 mas rms."""
     ids = np.arange(first, first + n)
     series = {
         "id": ids, "east": east + 0.5 * rng.standard_normal(n), "north": 0.5 * rng.standard_normal(n),
@@ -37,7 +37,7 @@ def test_the_frame_that_is_off():
     assert found[3, "magnitude"] == FAIL
 
 
-def test_frames_of_other_places():
+def test_frames_without_common_stars():
     rng = np.random.default_rng(1)
     (row,) = repeatability.rows([frame(1, rng), frame(2, rng, first=1000)])
     assert row.verdict == NOT_APPLICABLE

@@ -1,4 +1,4 @@
-"""Spectra that are made here: traces, light and lines as foreseen, and each of them off."""
+"""The check of spectra passes for synthetic traces, light and lines, and fails if one of them is off."""
 
 import numpy as np
 import pyarrow as pa
@@ -18,7 +18,7 @@ SIDE, LONG, FIRST, LAST, LINE = 700, 500, 12_500.0, 18_500.0, 15_300.0
 
 
 def frame(up=0.0, brighter=1.0, redder=0.0, n=12):
-    """(a frame of slightly sloping traces, what the lake says of them); up, redder : pixels, brighter : a factor."""
+    """A frame with slightly sloping traces, and its rows; up and redder are shifts in pixels, brighter is a factor."""
     rng = np.random.default_rng(2)
     image = rng.poisson(np.full((SIDE, SIDE), 100.0)).astype(float)
     rows, axis = [], np.arange(SIDE)
@@ -50,30 +50,30 @@ def made_gauss(x, middle, sigma):
     return np.exp(-0.5 * ((x - middle) / sigma) ** 2) / (np.sqrt(2.0 * np.pi) * sigma)
 
 
-def test_spectra_as_foreseen():
+def test_correct_spectra_pass():
     assert made.verdicts(SPECTRA, frame()) == dict.fromkeys(("flux", "trace", "wavelength", "lines"), PASS)
 
 
 @pytest.mark.parametrize(
     ("wrong", "quantity"), [({"up": 0.3}, "trace"), ({"brighter": 1.1}, "flux"), ({"redder": 0.8}, "wavelength")]
 )
-def test_what_is_off_is_found(wrong, quantity):
+def test_faulty_spectra_fail(wrong, quantity):
     found = made.verdicts(SPECTRA, frame(**wrong))
     assert found.pop(quantity) == FAIL
     assert set(found.values()) == {PASS}
 
 
 @pytest.mark.parametrize("redder", [5.0, 8.0, -20.0])
-def test_lines_far_from_their_places_are_missed(redder):
-    """What lies at the foreseen places then is noise, whose centroids scatter about 0."""
+def test_lines_far_from_expected_positions_fail(redder):
+    """The expected positions then contain noise, whose centroids scatter around 0."""
     found = made.verdicts(SPECTRA, frame(redder=redder))
     assert found["lines"] == FAIL
     assert found["wavelength"] != PASS
 
 
-def test_too_few_are_said():
+def test_too_few_spectra_are_not_applicable():
     found = SPECTRA.run(frame(n=2))
     assert [row.verdict for row in found] == [NOT_APPLICABLE] * 3
-    assert found[0].note.startswith("flux: 2 spectra")
-    # They are rows of a table, whose keys differ.
+    assert found[0].note.startswith("flux: 2 isolated and bright spectra")
+    # Quantities differ because they are part of the key of the table.
     validate.check_rows(publishing.build_table(found), VALIDATION)

@@ -1,4 +1,4 @@
-"""A pixel's own variance, where neighbours share it and rows, columns and slopes add to it."""
+"""Variance of a pixel with charge shared by neighbours, and with offsets of rows, columns and slopes."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from truesky.validation.lake.measure.covariances import pixel_variance
 
 @pytest.mark.parametrize("near", [0, 1, 2])
 def test_the_variance_that_neighbours_share(near):
-    """Also where rows and columns have offsets of their own, and a slope lies over it; half of the pixels count."""
+    """Rows and columns have offsets, a slope is added, and half of the pixels are masked."""
     rng = np.random.default_rng(5)
     size, reach = 2 * near + 1, 0.02
     kernel = np.full((size, size), reach / max(size**2 - 1, 1))

@@ -1,4 +1,4 @@
-"""The effective PSF of stars whose light is known, and stars fitted with it, against least squares by scipy."""
+"""Effective PSF of stars with known light, and fits with it against least squares by scipy."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def point(x, y):
 
 
 def cut(rng, flux, noise):
-    """Distances of the pixels from a star anywhere in its pixel, and their electrons."""
+    """Distances of pixels from a star at a random position in its pixel, and their electrons."""
     near = int(effective_psf.fit_radius(FWHM) - 0.6)
     axis = np.arange(-near, near + 1.0)
     u, v = (side.ravel() for side in np.meshgrid(axis - rng.uniform(-0.5, 0.5), axis - rng.uniform(-0.5, 0.5)))
@@ -34,7 +34,7 @@ def psf():
     return effective_psf.build(u, v, read / 1e5, np.full(len(u), 1e5**2 / NOISE**2), FWHM)
 
 
-def test_it_is_the_point_that_was_drawn(psf):
+def test_psf_agrees_with_input(psf):
     rng = np.random.default_rng(6)
     x, y = rng.uniform(-1.8, 1.8, (2, 500))
     value, rise, climb = psf.evaluate(x, y)
@@ -45,13 +45,13 @@ def test_it_is_the_point_that_was_drawn(psf):
 
 
 def fitted(psf, u, v, read, flux):
-    """Of stars [n] whose pixels are all there."""
+    """Fit stars without missing pixels."""
     u, v, read = np.atleast_2d(u), np.atleast_2d(v), np.atleast_2d(read)
     return effective_psf._fit_stars(psf, (u, v), read, np.ones(u.shape, bool), np.full(len(u), flux), NOISE)
 
 
 def test_light_of_fainter_stars(psf):
-    """5,000 e-, a tenth of a pixel from where they are looked for; within 1 % in the mean, and as noisy as is said."""
+    """Stars of 5,000 e- a tenth of a pixel off: fluxes within 1 % on average, with scatter equal to their errors."""
     rng = np.random.default_rng(7)
     u, v, read = np.array([cut(rng, 5000.0, NOISE) for _ in range(150)]).transpose(1, 0, 2)
     light, error = fitted(psf, u + 0.1, v - 0.1, read, 4000.0)
@@ -73,7 +73,7 @@ def test_a_cosmic_ray_is_left_out_and_a_fit_is_that_of_scipy(psf):
 
 
 def test_stars_side_by_side_are_fitted_as_each_alone(psf):
-    """Of stars that have fewer pixels, what fills them up counts for nothing; one without any has no light."""
+    """Padding of stars with fewer pixels has no effect; a star without pixels has no flux."""
     rng = np.random.default_rng(9)
     pixels = [cut(rng, flux, NOISE) for flux in (3000.0, 20000.0, 400.0)]
     keep = [len(pixels[0][0]), 20, 0]
@@ -95,7 +95,7 @@ def test_stars_side_by_side_are_fitted_as_each_alone(psf):
 
 
 def test_coefficients_are_those_of_a_dense_solution():
-    """Least squares, the second differences as further equations of little weight."""
+    """The second differences are additional equations with small weight."""
     rng, k = np.random.default_rng(10), 9
     x, y = rng.uniform(-1.4, 1.4, (2, 600))
     step, reach = 0.5, 1.5

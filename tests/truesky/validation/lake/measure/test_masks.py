@@ -1,4 +1,4 @@
-"""Discs and grown masks against scipy's morphology and distances."""
+"""Discs and dilated masks against scipy's distances and morphology."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def test_no_disc_without_a_radius(radius):
 
 
 @given(st.integers(0, 2**32 - 1), st.booleans(), st.integers(0, 4))
-def test_a_mask_grows_as_scipy_has_it(seed, corners, times):
+def test_dilation_agrees_with_scipy(seed, corners, times):
     mask = np.random.default_rng(seed).random((3, 9, 11)) < 0.05
     before = mask.copy()
     told = mask

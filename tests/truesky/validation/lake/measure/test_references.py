@@ -1,4 +1,4 @@
-"""What is known of a frame's sources."""
+"""Reference data for the sources of a frame."""
 
 import numpy as np
 import pyarrow as pa

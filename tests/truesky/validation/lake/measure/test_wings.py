@@ -1,4 +1,4 @@
-"""Wings that were put into rings about stars are found again, whatever the sky below them."""
+"""Known wings in rings around stars are recovered, whatever the sky level."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ SIDE, NOISE, SKY = 700, 14.0, 175.0
 
 
 def frame(rng, strength, slope, band="euclid_vis"):
-    """Stars of 4e5 to 1e6 e- and faint ones, whose light is a power law from three pixels on."""
+    """Stars of 4e5 to 1e6 e- and faint ones, with power-law wings from three pixels."""
     x, y = (axis.ravel() for axis in np.meshgrid(*[np.linspace(130, 570, 4)] * 2))
     x, y = (np.concatenate([axis, rng.uniform(0, SIDE, 60)]) for axis in (x, y))
     mag = np.concatenate([rng.uniform(17.8, 18.8, 16), np.full(60, 23.0)])
@@ -30,7 +30,7 @@ def frame(rng, strength, slope, band="euclid_vis"):
 
 
 @pytest.mark.parametrize("slope", [2.8, 3.1])
-def test_wings_that_were_put_in(slope):
+def test_input_wings_are_recovered(slope):
     there = Wings(0.09, slope)
     of, known = frame(np.random.default_rng(4), there.strength, slope)
     found = wings.measure(of, known, np.arange(16), NOISE, 20)
@@ -39,7 +39,7 @@ def test_wings_that_were_put_in(slope):
     assert found.error < 0.1 * found.strength
 
 
-def test_all_light_of_the_ground_has_an_end():
+def test_ground_wings_have_an_outer_radius():
     of, known = frame(np.random.default_rng(4), 0.09, 3.0, "des_r")
     found = wings.measure(of, known, np.arange(16), NOISE, 20)
     assert found.outer_radius == pytest.approx(250.0)
@@ -54,12 +54,12 @@ def test_points_without_wings():
 
 
 @pytest.mark.parametrize(("band", "unsure"), [("euclid_vis", 0.2), ("des_r", 0.5)])
-def test_a_frame_that_does_not_tell_its_wings_has_the_usual_ones(band, unsure):
+def test_faint_frames_have_typical_wings(band, unsure):
     of, known = frame(np.random.default_rng(4), 0.0, 3.0, band)
     alone, usual = wings.measure(of, known, np.arange(1), NOISE, 20), wings.typical(of)
     assert alone == usual
     assert usual.error == unsure * usual.strength
-    # Of faint stars nothing is seen.
+    # Wings of faint stars are invisible.
     faint = wings.measure(of, known, np.arange(16, 30), NOISE, 20)
     assert faint.strength == pytest.approx(usual.strength * 20.0 ** (faint.slope - usual.slope), rel=0.3)
 
@@ -69,7 +69,7 @@ def test_a_frame_that_does_not_tell_its_wings_has_the_usual_ones(band, unsure):
     [("euclid_vis", 0.72e-6), ("euclid_y", 1.08e-6), ("euclid_j", 1.37e-6), ("euclid_h", 1.77e-6)],
 )
 def test_the_usual_wings_of_space_are_those_of_the_edges_of_the_pupil(band, wavelength):
-    """Of a stop of 1.2 m, a central one of 0.42 m, and three bars of 12 mm between them."""
+    """The pupil has a stop of 1.2 m, a central obstruction of 0.42 m, and three bars of 12 mm between them."""
     outer, inner, bar = 0.6, 0.21, 0.012
     area = np.pi * (outer**2 - inner**2) - 3 * bar * (outer - inner)
     edges = 2 * np.pi * (outer + inner) + 6 * (outer - inner)

@@ -1,4 +1,4 @@
-"""A lake of frames that are made here: products, their truth, the stars, published as the jobs publish them."""
+"""A lake of synthetic frames: products, truth and stars, published as by the jobs."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Figures of the catalogue: what they show, that axes say of what, and that there is none of nothing."""
+"""Figures of catalogues: labels of axes, error bars, and no figure without data."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ def series():
     }  # fmt: skip
 
 
-def test_each_axis_says_what_it_is_and_points_have_errors(series):
+def test_axes_have_labels_and_points_have_errors(series):
     drawn = list(catalogue_figures.draw_all(ROWS, series))
     assert len(drawn) == 5
     for caption, figure in drawn:
@@ -44,14 +44,14 @@ def test_each_axis_says_what_it_is_and_points_have_errors(series):
     assert all(axis.containers for axis in points)
 
 
-def test_what_was_not_measured_is_not_drawn():
+def test_no_figure_without_data():
     assert list(catalogue_figures.draw_all([], {})) == []
     assert list(catalogue_figures.draw_all(ROWS[2:], {})) == []
     (one,) = catalogue_figures.draw_all(ROWS, {})
     assert "a survey" in one[0]
 
 
-def test_the_report_has_them(series):
+def test_report_contains_figures(series):
     text = report.page("lake", LakeResults(ROWS, [], [Result(Place(), ROWS, series)]))
     assert text.count("src='data:image/png;base64,") == 5
     assert "non-linear theory" in text

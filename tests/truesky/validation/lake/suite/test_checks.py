@@ -1,4 +1,4 @@
-"""Every check of a lake has a test that injects the fault which it is there for."""
+"""Every check of a lake has a test that injects the fault that the check must detect."""
 
 import inspect
 
@@ -18,7 +18,7 @@ from tests.truesky.validation.model import test_observed
 from truesky.validation.lake.suite import checks
 from truesky.validation.verdicts import FAIL
 
-# Check -> (test, fault).
+# Test and fault by check.
 FAULTS = {
     "astrometry": ((images.test_a_wcs_off_by_a_tenth_of_a_pixel, "WCS off by 0.1 pixels"),
                    (images.test_a_scale_that_is_wrong, "scale off by 4e-4")),
@@ -28,7 +28,7 @@ FAULTS = {
     "noise": ((images.test_a_read_noise_that_is_a_fifth_off, "read noise 20 % off"),
               (images.test_a_gain_that_is_three_percent_off, "gain 3 % off")),
     "gain": ((test_gain.test_a_gain_that_is_off, "gain 4.5 % off"),),
-    "psf": ((images.test_points_that_are_no_points, "PSF twice as long as wide"),
+    "psf": ((images.test_extended_points_fail, "PSF twice as long as wide"),
             (images.test_points_that_are_wider_than_the_header_says, "PSF wider by 18 %")),
     "quality": ((images.test_ramps_that_fit_and_others, "ramps noisier than they say"),),
     "cosmic_rays": ((images.test_cosmic_rays_that_are_off_or_too_many, "cosmic rays off, and too many"),),
@@ -37,7 +37,7 @@ FAULTS = {
                     (catalogues.test_requirements_that_are_not_met, "galaxies too few, too near, too few lines")),
     "completeness": ((test_completeness.test_sources_that_were_not_drawn, "a third of the sources elsewhere"),
                      (test_completeness.test_sources_that_are_fainter_than_they_should_be, "two magnitudes fainter")),
-    "spectra": ((test_spectra.test_what_is_off_is_found, "trace, flux and wavelength off"),),
+    "spectra": ((test_spectra.test_faulty_spectra_fail, "trace, flux and wavelength off"),),
     "between_images": ((test_repeatability.test_the_frame_that_is_off, "one frame off by 10 mas, one by 0.05 mag"),),
     "common_offset": ((test_common_bias.test_a_bias_that_all_detectors_share, "all detectors off by 2 mas, 0.03 mag"),),
     "clustering": ((test_two_points.test_places_that_are_shuffled, "positions shuffled"),
@@ -66,8 +66,8 @@ def test_no_check_without_a_fault():
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_each_fault_is_one_that_turns_a_verdict(name):
-    """Its test is collected by pytest, and asks for a failure."""
+def test_each_fault_changes_a_verdict(name):
+    """Its test is collected by pytest and expects a failed verdict."""
     for test, fault in FAULTS[name]:
         assert fault
         assert test.__name__.startswith("test_")

@@ -1,4 +1,4 @@
-"""From a lake to its table and its report: what is there is looked at, what is not is said, faults are found."""
+"""Validation of a lake: table and report, rows that do not apply, and detected faults."""
 
 import re
 
@@ -13,7 +13,7 @@ from truesky.validation.lake.suite import inventory, publishing
 
 @pytest.fixture(scope="module")
 def lake(tmp_path_factory):
-    """Two frames, of which the second has a WCS that is a tenth of a pixel off."""
+    """Two frames; the WCS of the second is off by a tenth of a pixel."""
     return lakes.lake(tmp_path_factory.mktemp("validated") / "lake", shift=(0.1, 0.0))
 
 
@@ -31,20 +31,20 @@ def test_the_fault_is_found_where_it_is(version):
     assert {"astrometry", "photometry", "noise", "gain", "psf", "cosmic_rays", "background", "saturation"} <= passed
 
 
-def test_what_does_not_apply_says_why(version):
+def test_not_applicable_rows_have_reasons(version):
     rows = [row for row in version.rows().to_pylist() if row["verdict"] == "not_applicable"]
     assert {"observed", "quality"} <= {row["check_name"] for row in rows}
     assert all(row["note"] for row in rows)
 
 
-def test_the_report_wants_no_network(version):
+def test_report_requires_no_network(version):
     page = version.file(publishing.REPORT).read_text()
     assert len(re.findall(r"src='data:image/png;base64,[A-Za-z0-9+/=]+'", page)) >= 4
     assert not re.search(r"https?://|<script|<link|@import|url\(", page)
     assert "offset_x" in page
 
 
-def test_a_second_run_finds_it_there(lake, version, capsys, tmp_path):
+def test_second_run_reuses_the_table(lake, version, capsys, tmp_path):
     report = tmp_path / "r.html"
     assert __main__.main(["--lake", str(lake), "--report", str(report)]) == 1
     assert report.read_bytes() == version.file(publishing.REPORT).read_bytes()
@@ -52,7 +52,7 @@ def test_a_second_run_finds_it_there(lake, version, capsys, tmp_path):
     assert re.search(r"^fail +VIS/euclid_vis/000002/1-1 +astrometry offset_x: -(9|10)\.", said, re.M)
 
 
-def test_it_is_named_by_what_it_is_made_of(lake, version):
+def test_version_key_depends_on_inputs(lake, version):
     held = inventory.read_contents(lake)
     assert publishing.plan(held).key == version.key
     assert publishing.plan(inventory.read_contents(lake, exposures=[1]), [1]).key != version.key
@@ -69,7 +69,7 @@ def test_frames_in_several_processes_give_the_same(lake, version):
     assert publishing.build_table(found.rows).to_pylist() == version.rows().to_pylist()
 
 
-def test_what_is_not_there_is_refused(lake, tmp_path, capsys):
+def test_missing_inputs_are_refused(lake, tmp_path, capsys):
     with pytest.raises(BadInput, match="no image of exposure 7"):
         inventory.read_contents(lake, exposures=[7])
     (tmp_path / "empty").mkdir()
