@@ -72,10 +72,8 @@ _TRUTH = Settings(edge=1e-6, aliased=1e-8, floor=0.0, min_size_arcsec=25.6, posi
 # Magnitudes per relative error of flux.
 _MAG = 1.0857362
 _NUMBERS = ("flux", "shape", "position", "background")
-_COLUMNS = ",".join(
-    ("edge", "aliased", "floor", "min_size_arcsec", "positions", "colours", *_NUMBERS)
-    + (*(f"{name}_held" for name in _NUMBERS), "seconds")
-)
+_SETTING_NAMES = ("edge", "aliased", "floor", "min_size_arcsec", "positions", "colours")
+_COLUMNS = ",".join((*_SETTING_NAMES, *_NUMBERS, *(f"{name}_held" for name in _NUMBERS), "seconds"))
 _SETTINGS = f"""\
 # Settings of drawing by python -m benchmarks.trade --settings, and the largest errors they make.
 #
