@@ -24,8 +24,8 @@ ID = Column(
 )
 RA = Column("ra", "float64", "deg", "pos.eq.ra;meta.main", "right ascension, ICRS, true (unlensed)", 0.0, 360.0)
 DEC = Column("dec", "float64", "deg", "pos.eq.dec;meta.main", "declination, ICRS, true (unlensed)", -90.0, 90.0)
-OBSERVED_RA = replace(RA, doc="right ascension, ICRS, where a telescope sees it (lensed)")
-OBSERVED_DEC = replace(DEC, doc="declination, ICRS, where a telescope sees it (lensed)")
+OBSERVED_RA = replace(RA, doc="right ascension, ICRS, as observed (lensed)")
+OBSERVED_DEC = replace(DEC, doc="declination, ICRS, as observed (lensed)")
 TRUE_RA = Column("ra_true", "float64", "deg", "pos.eq.ra", "right ascension, ICRS, true (unlensed)", 0.0, 360.0)
 TRUE_DEC = Column("dec_true", "float64", "deg", "pos.eq.dec", "declination, ICRS, true (unlensed)", -90.0, 90.0)
 HEALPIX_29 = Column(
@@ -63,5 +63,5 @@ def density_boost_column(sources: str) -> Column:
 
     `sources` is the subject and verb of its description, such as "this kind was".
     """
-    doc = f"how many times denser than in nature {sources} drawn; weight by its inverse"
+    doc = f"factor by which {sources} drawn denser than in nature; weight by its inverse"
     return Column("density_boost", "float32", ucd="stat.weight", doc=doc, lo=1e-3, hi=1e6)

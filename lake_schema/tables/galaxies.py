@@ -34,7 +34,7 @@ DISK_SCALE_HEIGHT = 0.1
 
 _LINE_DOC = (
     "observed flux of the primary component, dimmed by the galaxy's own dust, before magnification and the Milky Way; "
-    "missing where it was not modelled"
+    "missing if it was not modelled"
 )
 
 
@@ -105,7 +105,7 @@ _OTHER_COLUMNS = (
         "float32",
         "mag",
         "phot.color;em.opt.B;em.opt.R",
-        "rest-frame colour 0.1(g - r); missing of kinds 2 (QSO) and 3 (high redshift)",
+        "rest-frame colour 0.1(g - r); missing for kinds 2 (QSO) and 3 (high redshift)",
         -2.0,
         4.0,
         True,
@@ -183,7 +183,7 @@ _OTHER_COLUMNS = (
         "mag",
         "phot.color;em.opt.B;em.opt.R",
         "rest-frame 0.1(g - r) of the bulge less that of the disc, as far as there are templates that are redder "
-        "than the galaxy's own; missing where both have one spectrum",
+        "than the galaxy's own; missing if both have the same spectrum",
         -2.0,
         2.0,
         True,
@@ -207,7 +207,15 @@ _OTHER_COLUMNS = (
         0.0,
         90.0,
     ),
-    Column("position_angle", "float32", "deg", "pos.posAng", "of the major axis, north through east", 0.0, 180.0),
+    Column(
+        "position_angle",
+        "float32",
+        "deg",
+        "pos.posAng",
+        "position angle of the major axis, north through east",
+        0.0,
+        180.0,
+    ),
     # 9 lensing
     Column("kappa", "float32", ucd="arith.factor", doc="convergence", lo=-1.0, hi=2.0),
     Column(
@@ -241,14 +249,14 @@ _OTHER_COLUMNS = (
         "origin_id",
         "int64",
         ucd="meta.id",
-        doc="identifier in the catalogue that the galaxy was taken from; missing where it was drawn here",
+        doc="identifier in the catalogue from which the galaxy was taken; missing if truesky drew it",
         nullable=True,
     ),
     Column(
         "stamp",
         "int32",
         ucd="meta.number",
-        doc="picture of a library of yours that is drawn in place of the profile, counted from 0; missing: none",
+        doc="number of the image in a user's library that is drawn instead of the profile, from 0; missing if none",
         lo=0,
         hi=1e6,
         nullable=True,
@@ -264,7 +272,10 @@ GALAXIES = Table(
     order=5,
 )
 
-_WIDTH = "of log10 sigma/(km/s) = (width_slope + width_slope_z z_obs) (abs_mag_r01 - width_magnitude) + width_z z_obs"
+_WIDTH = (
+    "coefficient of log10 sigma/(km/s) = (width_slope + width_slope_z z_obs) (abs_mag_r01 - width_magnitude) "
+    "+ width_z z_obs"
+)
 
 EMISSION_LINES = Table(
     "emission_lines",
@@ -272,19 +283,19 @@ EMISSION_LINES = Table(
     (
         Column("name", "string", ucd="meta.id;spect.line", doc="name of the line"),
         Column("flux_column", "string", ucd="meta.code", doc="column of table galaxies with the flux of its primary"),
-        Column("ratio", "float64", "", "phot.flux;arith.ratio", "flux / that of the column", 0.0, 1e3),
-        Column("vacuum_wavelength", "float64", "Angstrom", "em.wl", "in a vacuum, at rest", 100.0, 1e6),
-        Column("air_wavelength", "float64", "Angstrom", "em.wl", "in air, at rest", 100.0, 1e6),
+        Column("ratio", "float64", "", "phot.flux;arith.ratio", "flux relative to the flux of the column", 0.0, 1e3),
+        Column("vacuum_wavelength", "float64", "Angstrom", "em.wl", "rest wavelength in vacuum", 100.0, 1e6),
+        Column("air_wavelength", "float64", "Angstrom", "em.wl", "rest wavelength in air", 100.0, 1e6),
         Column("width_slope", "float64", "", "stat.fit.param", _WIDTH, -10.0, 10.0),
         Column("width_slope_z", "float64", "", "stat.fit.param", _WIDTH, -10.0, 10.0),
         Column("width_magnitude", "float64", "mag", "stat.fit.param", _WIDTH, -50.0, 50.0),
         Column("width_z", "float64", "", "stat.fit.param", _WIDTH, -10.0, 10.0),
-        Column("width_least", "float64", "km / s", "spect.line.width;stat.min", "least sigma", 0.0, 1e5),
+        Column("width_least", "float64", "km / s", "spect.line.width;stat.min", "smallest sigma", 0.0, 1e5),
         Column("width_most", "float64", "km / s", "spect.line.width;stat.max", "largest sigma", 0.0, 1e5),
-        Column("source", "string", ucd="meta.ref", doc="of wavelength and ratio; file that it was made from"),
-        Column("sha256", "string", ucd="meta.checksum", doc="of that file, hexadecimal"),
+        Column("source", "string", ucd="meta.ref", doc="source of wavelength and ratio, and its file"),
+        Column("sha256", "string", ucd="meta.checksum", doc="sha256 of that file, hexadecimal"),
     ),
-    "Emission lines of galaxies: Gaussian in wavelength, of the integral that table galaxies gives.",
+    "Emission lines of galaxies: Gaussian in wavelength, with the flux in table galaxies.",
     key=("name",),
 )
 

@@ -21,7 +21,7 @@ HALOS = Table(
         ),
     ),
     "Halos of the True Universe; a galaxy's halo_id is the id of a row here, also the id of its central galaxy. "
-    "From which mass on all are listed: table halo_limits.",
+    "Table halo_limits gives the mass above which all are listed.",
     order=5,
 )
 
@@ -35,8 +35,8 @@ HALO_LIMITS = Table(
             "float64",
             "",
             "phys.mass;stat.min",
-            "log10 of M_200m / (Msun/h) from which on table halos lists all of this redshift; of lighter ones it lists "
-            "those whose central may be seen",
+            "log10 of M_200m / (Msun/h) above which table halos lists all halos of this redshift; below, it lists "
+            "halos whose central galaxy may be visible",
             5.0,
             17.0,
         ),

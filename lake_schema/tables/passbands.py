@@ -20,14 +20,18 @@ PASSBANDS = Table(
     1,
     (
         Column("name", "string", ucd="meta.id;instr.bandpass", doc="name, the <band> of f_nu_<band>"),
-        Column("medium", "string", ucd="meta.code", doc="in which the wavelengths are measured", codes=MEDIA),
+        Column("medium", "string", ucd="meta.code", doc="medium in which the wavelengths are measured", codes=MEDIA),
         Column("pivot_wavelength", "float64", "Angstrom", "em.wl.central", "pivot wavelength", 100.0, 1e6),
         Column("log_width", "float64", "", "instr.bandwidth", "integral of the response over ln(wavelength)", 0.0, 1e3),
-        Column("first_wavelength", "float64", "Angstrom", "em.wl;stat.min", "of the first sample", 100.0, 1e6),
-        Column("wavelength_step", "float64", "Angstrom", "em.wl;spect.binSize", "between samples", 1e-3, 1e3),
-        Column("response", "list<float64>", "", "phys.transmission", "detected per photon that arrives", 0.0, 1e9),
-        Column("source", "string", ucd="meta.ref", doc="file that it was made from, and its reference"),
-        Column("sha256", "string", ucd="meta.checksum", doc="of that file, hexadecimal"),
+        Column(
+            "first_wavelength", "float64", "Angstrom", "em.wl;stat.min", "wavelength of the first sample", 100.0, 1e6
+        ),
+        Column("wavelength_step", "float64", "Angstrom", "em.wl;spect.binSize", "distance between samples", 1e-3, 1e3),
+        Column(
+            "response", "list<float64>", "", "phys.transmission", "detected electrons per arriving photon", 0.0, 1e9
+        ),
+        Column("source", "string", ucd="meta.ref", doc="file from which it was made, and its reference"),
+        Column("sha256", "string", ucd="meta.checksum", doc="sha256 of that file, hexadecimal"),
         Column(
             "ab_minus_vega",
             "float64",
@@ -36,7 +40,7 @@ PASSBANDS = Table(
             "AB magnitude of Vega in this band, m_AB - m_Vega of any source; the zero point of Vega magnitudes is "
             "3631 Jy x 10^(-0.4 ab_minus_vega). Vega's spectrum is star Vega of table templates "
             "at the level of its source, f_lambda = 3.531e-9 erg s-1 cm-2 A-1 at 5500 A; photons are counted, as for "
-            "all fluxes; missing where the spectrum ends",
+            "all fluxes; missing if the spectrum does not cover the band",
             -10.0,
             20.0,
             True,

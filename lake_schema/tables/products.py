@@ -29,7 +29,7 @@ PRODUCTS = Table(
     1,
     (
         Column("path", "string", ucd="meta.ref.uri", doc="file, relative to this version of the table"),
-        Column("content", "string", ucd="meta.code.class", doc="what the file holds", codes=CONTENTS),
+        Column("content", "string", ucd="meta.code.class", doc="content of the file", codes=CONTENTS),
         Column("exposure_id", "int64", ucd="meta.id;obs.exposure", doc="exposure", lo=0),
         Column("detector", "string", ucd="meta.id;instr.det", doc="detector name"),
         Column("channel", "string", ucd="instr", doc="channel", codes=CHANNELS),

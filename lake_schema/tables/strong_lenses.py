@@ -26,14 +26,28 @@ _OTHER_COLUMNS = (
     density_boost_column("strong lenses were"),
     Column("z_lens", "float32", "", "src.redshift", "redshift of the lens", 0.0, 15.0),
     Column("z_source", "float32", "", "src.redshift", "redshift of the source", 0.0, 15.0),
-    Column("velocity_dispersion", "float32", "km/s", "phys.veloc.dispersion", "of the lens", 10.0, 1000.0),
-    Column("einstein_radius", "float32", "arcsec", "phys.angSize", "of the isothermal ellipsoid", 0.0, 30.0),
+    Column(
+        "velocity_dispersion",
+        "float32",
+        "km/s",
+        "phys.veloc.dispersion",
+        "velocity dispersion of the lens",
+        10.0,
+        1000.0,
+    ),
+    Column(
+        "einstein_radius", "float32", "arcsec", "phys.angSize", "Einstein radius of the isothermal ellipsoid", 0.0, 30.0
+    ),
     Column("axis_ratio", "float32", ucd="phys.size.axisRatio", doc="minor / major axis of the mass", lo=0.1, hi=1.0),
-    Column("position_angle", "float32", "deg", "pos.posAng", "of the mass, north through east", 0.0, 180.0),
+    Column(
+        "position_angle", "float32", "deg", "pos.posAng", "position angle of the mass, north through east", 0.0, 180.0
+    ),
     Column("source_east", "float32", "arcsec", "pos", "true place of the source, east of the lens", -30.0, 30.0),
     Column("source_north", "float32", "arcsec", "pos", "true place of the source, north of the lens", -30.0, 30.0),
     Column("images", "int8", ucd="meta.number", doc="images of the source's centre", lo=1, hi=4),
-    Column("magnification", "float32", ucd="arith.factor", doc="flux of the arcs / that of the source", lo=0.0, hi=1e4),
+    Column(
+        "magnification", "float32", ucd="arith.factor", doc="flux of the arcs relative to the source", lo=0.0, hi=1e4
+    ),
     Column("stamp_side", "int16", "pixel", "meta.number", "pixels of the stamp's side, of 0.05 arcsec", 1, 4096),
     Column(
         "stamp",

@@ -9,7 +9,7 @@ TASKS = Table(
     "tasks",
     1,
     (
-        Column("exposure_id", "int64", ucd="meta.id;obs.exposure", doc="exposure it belongs to", lo=0),
+        Column("exposure_id", "int64", ucd="meta.id;obs.exposure", doc="exposure of the detector", lo=0),
         Column("detector", "string", ucd="meta.id;instr.det", doc="detector name"),
         Column("channel", "string", ucd="instr", doc="channel", codes=CHANNELS),
         Column("ra", "float64", "deg", "pos.eq.ra", "right ascension of the detector's centre", 0.0, 360.0),

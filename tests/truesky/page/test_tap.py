@@ -25,7 +25,7 @@ def test_tables_have_units_and_sentences(service):
     assert {"galaxies", "stars", "ivoa.obscore", "tap_schema.columns"} <= set(service.tables.keys())
     columns = {column.name: column for column in service.tables["galaxies"].columns}
     assert str(columns["ra"].unit) == "deg"
-    assert columns["ra"].description == "right ascension, ICRS, where a telescope sees it (lensed)"
+    assert columns["ra"].description == "right ascension, ICRS, as observed (lensed)"
     assert '"_healpix_29"' in columns
     found = service.search("SELECT unit FROM tap_schema.columns WHERE table_name = 'galaxies' AND column_name = 'a_v'")
     assert found["unit"].tolist() == ["mag"]
