@@ -112,7 +112,7 @@ def test_what_a_request_gives_is_taken_as_it_is():
 
 
 def test_a_detector_too_small_for_its_amplifiers_is_refused():
-    with pytest.raises(BadInput, match=r"detector S29: 1 x 8 pixels for 2 amplifiers"):
+    with pytest.raises(BadInput, match=r"detector S29: 1 x 8 pixels are too few for 2 amplifiers"):
         layout_of(replace(detectors.detector("decam", "S29", MISSION), nx=1, ny=8))
 
 
