@@ -115,7 +115,7 @@ def mosaic_size(detectors: Sequence[Detector]) -> str:
 
 
 def _align_to_mosaic(detectors: Sequence[Detector]) -> Sequence[Detector]:
-    """Return the detectors in the axes along which most of them lie: those of the focal plane, or turned by 90 deg."""
+    """Return the detectors in the focal plane's axes, or in axes turned by 90 deg if most detectors lie along these."""
     if 2 * sum(_quarter_turns(d) in _ALONG for d in detectors) >= len(detectors):
         return detectors
     return [replace(d, x=d.y, y=-d.x, rotation=d.rotation - 90.0) for d in detectors]

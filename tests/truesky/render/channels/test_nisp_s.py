@@ -264,7 +264,7 @@ def test_spectra_before_an_image_leave_their_mean_sky():
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"grism": None}, "a spectrum wants a grism and its angle"),
+        ({"grism": None}, "a spectrum requires a grism and its angle"),
         ({"grism": "RGS270"}, "'RGS270' is not one of"),
         ({"angle": 90.0}, "turns RGS000 by 90 deg, more than 45"),
         ({"psf": "psf.fits"}, "spectra are drawn through the camera's own PSF alone"),
