@@ -126,7 +126,7 @@ def add_samples(
 def _add_line(
     line: Float32, row: float, n: int, oy: int, low: int, wrapped: Float32, fine: Float32, out: Float32
 ) -> None:
-    """Add a column of an image, with `oy` samples per row and its middle at `row`, to `out` [h] that starts at row `low`."""
+    """Add a column of an image, with `oy` samples per row and its middle at `row`, to `out` [h] from row `low`."""
     tall, begin = len(line), int(np.ceil(row - n // 2))
     v = oy * (begin - row + n // 2)
     floor_v = int(np.floor(v))
@@ -224,7 +224,7 @@ def _convolve_strip(
     low: int,
     out: Float32,
 ) -> None:
-    """Add the result of `convolve_trace` for one strip, with the parts [b + 1, ox, n x wide] of `_by_phase`, to `out` [w, wide]."""
+    """Add the result of `convolve_trace` for one strip, from the parts of `_by_phase`, to `out` [w, wide]."""
     n, ox, _ = shape
     tall, pad = out.shape[1], STEP - 1
     mixed, amounts = np.zeros((ox, (n + 2 * pad) * tall), np.float32), np.empty(len(parts), np.float32)

@@ -18,8 +18,8 @@ from truesky.render.sources.source_list import Sources
 
 # Sides of stamps with fast transforms, pixels.
 SIZES = np.array([16, 20, 24, 28, 32, 36, 40, 48, 56, 64, 80, 96, 128, 160, 192, 256, 320, 384, 512])
-# Largest side for a galaxy. Larger galaxies are drawn in two parts (large_galaxies.py): the smooth part uses a stamp with
-# one of LARGE_GALAXY_SIZES and pixels that are COARSE times as wide.
+# Largest side for a galaxy. Larger galaxies are drawn in two parts (large_galaxies.py): the smooth part uses a stamp
+# with one of LARGE_GALAXY_SIZES and pixels that are COARSE times as wide.
 LARGEST, COARSE = 256, 4
 LARGE_GALAXY_SIZES = COARSE * np.array([160, 256, 512, 1024])
 _ALL_SIZES = np.concatenate([SIZES, LARGE_GALAXY_SIZES])

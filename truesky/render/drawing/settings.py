@@ -27,7 +27,7 @@ class Settings:
     positions : int
         Number of PSF positions on a detector, one of `euclid.DEGREES`.
     colours : int
-        Number of colours of the PSF, a divisor of `sub_bands.SUB_BANDS`.
+        Number of colours of the PSF, a divisor of `sub_bands.N_SUB_BANDS`.
     """
 
     edge: float

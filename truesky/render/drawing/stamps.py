@@ -156,7 +156,7 @@ def _net_electrons(pieces: Sources) -> Float:
 
 
 def _split_with_structure(sources: Sources, structured: Int) -> tuple[Sources, Float, Int]:
-    """Result of `split_into_pieces` with structured discs [m]: first the smooth sources, then the structures."""
+    """Result of `split_into_pieces` if discs have a structure: first the smooth sources, then the structures."""
     assert sources.picture is not None
     bare = sources.picture.copy()
     bare[structured] = -1
@@ -285,8 +285,8 @@ def _prepare(
         deep=_extend_reach(cut, sources.electrons, sizes, left_out, psf, reach_arguments),
         reach=transfer.STEP * len(max_transfer),
         left_out=left_out,
-        # For stamps that are not drawn, the aliased light approximates the removed light: to 5 % for single sources, and
-        # to 0.1 % for many together.
+        # For stamps that are not drawn, the aliased light approximates the removed light: to 5 % for single sources,
+        # and to 0.1 % for many together.
         outside=wings.OutsideLight(profile, curve[:, -1].copy(), farthest),
         curve=curve,
         has_far_light=stamp_sizes.has_far_light(sources.electrons, sizes, sources.shape, sources.picture, psf),
@@ -382,7 +382,7 @@ def in_double_precision(sources: Sources, neglected: Float | None) -> Bool:
 
 
 def split_by_size(sources: Sources, sizes: Int, psf: Psf, size: int, precise: Bool) -> tuple[Int, Int]:
-    """Split the sources of one stamp size into those with individual PSFs and those that share the PSF's planes.
+    """Find sources of one stamp size that have individual PSFs, and sources that share the PSF's planes.
 
     Parameters
     ----------

@@ -21,8 +21,8 @@ from truesky.render.psf.model import SIDE, Planes, Psf, galsim_profile, profile_
 STEP = 2 * np.pi / 32
 # Transfer functions below this are negligible, in single and in double precision.
 NEGLIGIBLE, NEGLIGIBLE_DOUBLE = 1e-7, 1e-14
-# A PSF without planes has no last frequency. It is followed up to 2.5 times the Nyquist frequency, and up to 4 times for
-# bright sources.
+# A PSF without planes has no last frequency. It is followed up to 2.5 times the Nyquist frequency, and up to 4 times
+# for bright sources.
 HIGHEST, _HIGHEST_BRIGHT = 2.5 * np.pi, 4.0 * np.pi
 # Number of samples that the kernel processes together, so that their planes stay in the cache.
 _PIECE_SAMPLES = 1024
