@@ -234,7 +234,7 @@ def trailed_sources(
 def _bodies_in_reach(
     begin: tuple[Float, Float], end: tuple[Float, Float], centre: tuple[float, float], reach: float
 ) -> tuple[Int, Float, Float]:
-    """Indices of bodies that come within `reach` deg of a centre, and the fractions between which their trails are kept."""
+    """Indices of bodies that come within `reach` deg of a centre, and the fractions between which trails are kept."""
     there, start, stop = (pointing.basis(*place)[2] for place in (np.reshape(centre, (2, 1)), begin, end))
     way = stop - start
     length = np.sqrt(np.sum(way**2, axis=0))
