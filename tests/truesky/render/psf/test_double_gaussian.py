@@ -52,7 +52,7 @@ def test_radii_that_do_not_rise_are_refused(radii):
 
 @pytest.mark.parametrize("core", [0.5, 0.8, float("nan")])
 def test_a_core_of_which_there_are_no_such_gaussians_is_refused(core):
-    with pytest.raises(BadInput, match=r"not between 0\.5 and 0\.8"):
+    with pytest.raises(BadInput, match=r"between 0\.5 and 0\.8 of the light, got"):
         double_gaussian.widths(0.2, 0.5, core)
 
 
