@@ -1,7 +1,8 @@
 """Readout modes of detectors: from the charge in pixels to the arrays of a file, and back from the file.
 
-Each array has a unit and FITS cards. The modes at the end of each section differ in the arrays of the file: one frame,
-the signal of a ramp with its quality, quadrants, amplifiers in one array or in separate ones, or electrons in pixels.
+Each array has a unit and FITS cards. The modes are FRAME (one array), RAMP and RAMP_AND_CHI2 (signal of a ramp with a
+quality flag or with chi^2), QUADRANTS (four arrays), AMPLIFIERS (all amplifiers in one array), BY_AMPLIFIER (one array
+per amplifier) and ELECTRONS (charge in the pixels before readout).
 """
 
 from __future__ import annotations

@@ -68,9 +68,9 @@ class Outskirts:
     light : float array, shape (11,)
         Row of `galaxy_shapes.real_space_profile`, electrons, with matrix and light of the disc seen face-on.
     disk : float array, shape (n, n)
-        Logarithm of the disc's light at u, v = sinh of the nodes.
+        Logarithm of the disc's light at u = sinh and v = w sinh of the nodes.
     across : float
-        Ratio of v to the coordinate v of the table.
+        Ratio w of v to the sinh of the nodes, see `surface_disk`.
     blurred : float array, shape (m, m)
         Light that the PSF adds to a pixel, at nodes `block` pixels apart with the galaxy in the middle.
     block : int

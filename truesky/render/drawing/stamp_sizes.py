@@ -141,7 +141,7 @@ def smallest_allowed_sizes(sizes: Int, min_sides: Float) -> Int:
 
 
 def reach(pixel_scale: float) -> float:
-    """Distance from the largest stamp's middle up to which sources may shine, beyond its corners, arcsec.
+    """Largest distance from a source at which its light is drawn, beyond the corners of the largest stamp, arcsec.
 
     Sources up to this distance from a detector are read.
     """

@@ -20,7 +20,7 @@ from lake_schema.mission.configuration import MissionConfiguration
 from lake_schema.units import LIGHT_ANGSTROM_S
 from truesky.fluxes.passbands import Passband
 
-# h c / k, A K (CODATA 2018).
+# Constant h c / k, Angstrom K (CODATA 2018).
 _SECOND_RADIATION = 1.438776877e8
 # Emitting bodies: the mirrors, and everything between them and the detectors.
 _BODIES = ("telescope", "instrument")

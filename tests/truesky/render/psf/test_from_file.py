@@ -86,7 +86,7 @@ def test_colours_are_interpolated_between_planes(tmp_path, how):
         assert np.trace(second) / 2 * 0.01 == pytest.approx(sigma2 + 0.01 / 12, rel=2e-3)
 
 
-def test_a_detector_that_is_mounted_turned_sees_it_turned(tmp_path):
+def test_psf_is_rotated_for_a_detector_that_is_mounted_rotated(tmp_path):
     path = cube(tmp_path / "a.fits", gaussian(0.15, x=0.3, y=0.1))
     upright, turned = (from_file.read(path, small("vis", name), BAND) for name in ("2-3", "2-4"))
     centre, _ = moments(star(upright, small("vis", "2-3")))

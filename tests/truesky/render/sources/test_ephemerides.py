@@ -249,8 +249,8 @@ def test_names_without_end_are_refused(tmp_path):
             ephemerides.read(written(tmp_path / f"endless-{length}.{kind}", values), f"{kind} {length}")
 
 
-def test_what_no_table_of_ours_looks_like_is_refused(tmp_path):
-    """Parquet of users is read by a process of its own, with its bounds."""
+def test_parquet_with_too_many_columns_is_refused(tmp_path):
+    """Parquet files of users are read by a separate process with limits."""
     names = [*ephemerides.KEYS, *(f"c{i}" for i in range(6000))]
     file = tmp_path / "wide.parquet"
     pq.write_table(pa.table([pa.array([1.0])] * len(names), names=names), file)
@@ -286,7 +286,7 @@ def test_a_table_that_no_worker_can_hold_is_refused(tmp_path, monkeypatch, kind)
         ephemerides.read(file, "too long")
 
 
-def test_what_a_file_is_its_bytes_say_and_not_its_name(tmp_path):
+def test_file_format_is_recognised_by_content_not_by_name(tmp_path):
     """FITS under any name, packed as well."""
     values = columns(solar_system.population(*PLACE, 0.1, DAY, MISSION, 1))
     plain = written(tmp_path / "bodies.fits", values)

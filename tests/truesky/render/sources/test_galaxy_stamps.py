@@ -167,7 +167,7 @@ def test_bad_libraries_are_refused(tmp_path, cube):
         galaxy_stamps.from_file(Stamps(cube), 1, "another")
 
 
-def test_a_galaxy_that_no_stamp_of_the_drawing_holds_is_a_profile(cube):
+def test_galaxy_larger_than_the_largest_stamp_is_drawn_as_a_profile(cube):
     table = rows([0, 0], disk_half_light_radius=[1.0, 40.0])
     own = GalaxyStamps(library(cube), Stamps(cube), 1)
     number, found = galaxy_stamps.assign_pictures(table, galaxy_shapes.shapes(table), own)

@@ -1,8 +1,8 @@
 """Compiled loops for the light of stars far from them: rings, aureole and diffraction spikes.
 
-In all functions, `level` / r^3 is the light of the rings and `halo` / (r^2 + `core`) that of the aureole, with r in
-pixels. `bar_directions` [b, 2] are unit vectors of the pupil's bars, and `lines` [b, i, j] tabulates the light of a
-bar's spike at the distance i LONG along the spike and j STEP across it.
+In all functions, `level` / r^3 is the light of the rings and `halo` / (r^2 + `core`) that of the aureole; r is in
+pixels. `bar_directions` [b, 2] are unit vectors of the pupil's bars. The light of a bar's spike is in the table `lines`
+[b, i, j], at the distance i LONG along the spike and j STEP across it.
 """
 
 from __future__ import annotations
