@@ -1,6 +1,6 @@
 """Compiled loops for the light of stars far from them: rings, aureole and diffraction spikes.
 
-In all functions, `level` / r^3 is the light of the rings and `halo` / (r^2 + `core`) that of the aureole; r is in
+In all functions, `level` / r^3 is the light of the rings and `halo` / (r^2 + `core`) that of the aureole, for r in
 pixels. `bar_directions` [b, 2] are unit vectors of the pupil's bars. The light of a bar's spike is in the table `lines`
 [b, i, j], at the distance i LONG along the spike and j STEP across it.
 """
